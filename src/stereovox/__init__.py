@@ -1,0 +1,48 @@
+# SPDX-License-Identifier: Apache-2.0
+"""stereovox: depth and stereo camera streams with poses in, calibrated occupancy maps out."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from stereovox.cameras import PinholeCamera as PinholeCamera
+    from stereovox.config import Config as Config
+    from stereovox.config import load_config as load_config
+    from stereovox.errors import StereovoxError as StereovoxError
+    from stereovox.frame import DepthImage as DepthImage
+    from stereovox.frame import Frame as Frame
+    from stereovox.frame import Reason as Reason
+    from stereovox.mapper import Mapper as Mapper
+    from stereovox.mapper import UpdateReport as UpdateReport
+    from stereovox.maps import State as State
+    from stereovox.maps import VoxelMap as VoxelMap
+    from stereovox.maps import load_map as load_map
+    from stereovox.sources import open_source as open_source
+
+__version__ = "0.1.0"
+
+_HOMES = {
+    "PinholeCamera": "cameras",
+    "Config": "config",
+    "load_config": "config",
+    "StereovoxError": "errors",
+    "DepthImage": "frame",
+    "Frame": "frame",
+    "Reason": "frame",
+    "Mapper": "mapper",
+    "UpdateReport": "mapper",
+    "State": "maps",
+    "VoxelMap": "maps",
+    "load_map": "maps",
+    "open_source": "sources",
+}
+__all__ = [*_HOMES, "__version__"]  # pyright: ignore[reportUnsupportedDunderAll]
+
+
+def __getattr__(name: str) -> Any:
+    """Import public names when they are first used: `import stereovox` alone stays fast."""
+    if name in _HOMES:
+        return getattr(import_module(f"stereovox.{_HOMES[name]}"), name)
+    raise AttributeError(f"module 'stereovox' has no attribute '{name}'")

@@ -1,0 +1,78 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The one decorator for kernels: compile flags, and a disk cache that a change of any kernel file renews.
+
+Numba renews a cached kernel when its own file changes but not when a file it calls does; so the cache folder's name
+holds the hash of all kernel files (and of numba's version).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+from collections.abc import Callable
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numba
+from numba import config as numba_config
+
+FAST_MATH = {"nsz", "arcp", "contract", "afn", "reassoc"}
+"""Without `nnan` and `ninf`: depth images hold NaN and infinity."""
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def kernel(function: F) -> F:
+    """Compile `function` to machine code that releases the GIL and is cached on disk."""
+    return _compile(function, fastmath=FAST_MATH, nogil=True)
+
+
+def cell(function: F) -> F:
+    """Compile a small scalar function that kernels call and that is inlined into them."""
+    return _compile(function, fastmath=FAST_MATH, nogil=True, inline="never")
+
+
+@lru_cache
+def cache_folder() -> Path | None:
+    """Return the folder compiled kernels are kept in, None where nothing can be written."""
+    name = f"stereovox-kernels-{_source_hash()}"
+    for base in (os.environ.get("STEREOVOX_CACHE"), _user_cache(), tempfile.gettempdir()):
+        folder = Path(base) / "stereovox" / name if base else None
+        if folder and _writable(folder):
+            return folder
+    return None
+
+
+def _compile(function: F, **flags: Any) -> F:
+    folder = cache_folder()
+    before = numba_config.CACHE_DIR
+    numba_config.CACHE_DIR = str(folder or "")
+    try:
+        return numba.njit(function, cache=folder is not None, error_model="numpy", **flags)
+    finally:
+        numba_config.CACHE_DIR = before
+
+
+def _source_hash() -> str:
+    digest = hashlib.sha256(numba.__version__.encode())
+    for path in sorted(Path(__file__).parent.rglob("_*.py")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def _user_cache() -> str | None:
+    try:
+        return os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
+    except RuntimeError:
+        return None
+
+
+def _writable(folder: Path) -> bool:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return True
+    except OSError:
+        return False

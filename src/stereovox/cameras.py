@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Camera models: how a pixel becomes a ray. Optical frame: x right, y down, z forward; pixel centres at whole numbers."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.errors import StereovoxError
+
+
+@dataclass(frozen=True)
+class PinholeCamera:
+    """An undistorted pinhole camera.
+
+    `fx, fy, cx, cy` are in pixels; pixel (u, v) has its centre at (u, v). `baseline` is the distance in metres
+    between the two eyes (or projector and eye) of a stereo depth camera, None when not known.
+    Raises StereovoxError for sizes or focal lengths that are not positive and finite.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    baseline: float | None = None
+
+    def __post_init__(self) -> None:
+        numbers = (self.width, self.height, self.fx, self.fy, self.baseline or 1.0)
+        if not (all(math.isfinite(n) and n > 0 for n in numbers) and math.isfinite(self.cx) and math.isfinite(self.cy)):
+            raise StereovoxError(f"camera {self}: sizes, focal lengths and baseline must be positive and finite")
+
+    @classmethod
+    def from_field_of_view(cls, width: int, height: int, hfov_deg: float, baseline: float | None = None) -> PinholeCamera:
+        """Return a camera with square pixels and a centred axis (Chien 2020, Eq 3.6)."""
+        focal = 0.5 * width / math.tan(math.radians(hfov_deg) / 2)
+        return cls(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2, baseline)
+
+    def ray_slopes(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return x/z of every column (width,) and y/z of every row (height,), float32."""
+        x = (np.arange(self.width) - self.cx) / self.fx
+        y = (np.arange(self.height) - self.cy) / self.fy
+        return x.astype(np.float32), y.astype(np.float32)
+
+    def back_project(self, depth_m: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Return (height, width, 3) points in the optical frame for a depth image in metres (NaN stays NaN)."""
+        depth = np.asarray(depth_m, float)
+        v, u = np.mgrid[: self.height, : self.width]
+        return np.stack([(u - self.cx) / self.fx * depth, (v - self.cy) / self.fy * depth, depth], axis=-1)

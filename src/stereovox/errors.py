@@ -1,0 +1,50 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Errors a user can cause. Each message is one line that names the file or value and the cure."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class StereovoxError(ValueError):
+    """Bad input or bad usage; commands print its one line and exit with status 2."""
+
+
+class ConfigError(StereovoxError):
+    """A setting is unknown, of the wrong type or out of range."""
+
+
+class SourceError(StereovoxError):
+    """A recording or device cannot be opened."""
+
+
+class MapFileError(StereovoxError):
+    """A saved map cannot be read or written."""
+
+
+class MissingExtra(StereovoxError, ImportError):
+    """An optional library is not installed."""
+
+    def __init__(self, library: str, extra: str):
+        super().__init__(f"{library} is not installed; run: pip install 'stereovox[{extra}]'")
+
+
+class FrameRefused(StereovoxError):
+    """A frame cannot be trusted and must not change the map.
+
+    `reason` is a short fixed word that is counted (`pose_not_rigid`); the message says more.
+    """
+
+    def __init__(self, reason: str, message: str):
+        super().__init__(message)
+        self.reason = reason
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """Return " (did you mean 'x'?)" for the closest known word, else the list of known words."""
+    known = sorted(known)
+    close = difflib.get_close_matches(word, known, n=1)
+    if close:
+        return f" (did you mean '{close[0]}'?)"
+    return f" (known: {', '.join(known)})" if known else ""

@@ -1,0 +1,67 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What flows through the house: a `Frame` as a source delivers it, a `DepthImage` as an integrator needs it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.cameras import PinholeCamera
+from stereovox.geometry import Transform
+
+
+class Reason(IntEnum):
+    """Why a depth pixel has no value. Only TOO_FAR may clear cells, and only up to the maximum range."""
+
+    VALID = 0
+    UNMATCHED = 1
+    TOO_NEAR = 2
+    TOO_FAR = 3
+    MASKED = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One depth image with its camera and pose, as a source delivers it.
+
+    depth: (height, width) uint16 or float32/float64; times `depth_scale` it is the depth along the optical axis in
+        metres. No value: 0, negative, NaN, infinite, and 65535 in uint16.
+    camera: the camera that took it; its size must be the image's.
+    T_world_sensor: (4, 4) float64, maps the optical frame (x right, y down, z forward) into the world (z up).
+    stamp_ns: time of the image in int64 nanoseconds.
+    depth_scale: metres per unit of `depth` (0.001 for millimetres).
+    reason: (height, width) uint8 of `Reason`, where the source knows why a pixel has no value; else None.
+    name: where the frame came from, for messages.
+    fault: why the source could not deliver this frame (`unreadable`, `no_pose`); such a frame is refused and counted.
+    fault_detail: the same in one line that names file, value and cure.
+    """
+
+    depth: NDArray[np.generic]
+    camera: PinholeCamera
+    T_world_sensor: Transform
+    stamp_ns: int = 0
+    depth_scale: float = 1.0
+    reason: NDArray[np.uint8] | None = None
+    name: str = ""
+    fault: str | None = None
+    fault_detail: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class DepthImage:
+    """A depth image that can be trusted, in metres, with the reason of every pixel that has no value.
+
+    depth_m: (height, width) float32 along the optical axis. Without value (REP 117): NaN unmatched or masked,
+        -inf too near, +inf too far (nothing up to the maximum range).
+    reason: (height, width) uint8 of `Reason`.
+    T_world_sensor: (4, 4) float64, exactly rigid.
+    """
+
+    depth_m: NDArray[np.float32]
+    reason: NDArray[np.uint8]
+    camera: PinholeCamera
+    T_world_sensor: Transform
+    stamp_ns: int = 0

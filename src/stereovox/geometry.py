@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Rigid motions as plain 4x4 float64 arrays. `T_a_b` maps coordinates in frame b to frame a."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Transform = NDArray[np.float64]
+"""(4, 4) float64 rigid motion."""
+
+
+def inverse(T_a_b: Transform) -> Transform:
+    """Return T_b_a, exact for rigid motions."""
+    T_b_a = np.eye(4)
+    T_b_a[:3, :3] = T_a_b[:3, :3].T
+    T_b_a[:3, 3] = -T_a_b[:3, :3].T @ T_a_b[:3, 3]
+    return T_b_a
+
+
+def transform_points(T_a_b: Transform, points_b: ArrayLike) -> NDArray[np.float64]:
+    """Map (N, 3) points in frame b to frame a."""
+    return np.asarray(points_b, float) @ T_a_b[:3, :3].T + T_a_b[:3, 3]
+
+
+def rigidity_error(T: ArrayLike) -> float:
+    """Return how far `T` is from a rigid motion: the largest entry of |R^T R - I|; inf for mirrors, NaN or bad shape."""
+    T = np.asarray(T)
+    if T.shape != (4, 4) or not np.isfinite(T).all() or not np.allclose(T[3], [0, 0, 0, 1], atol=1e-6):
+        return np.inf
+    R = T[:3, :3]
+    return float(np.abs(R.T @ R - np.eye(3)).max()) if np.linalg.det(R) > 0 else np.inf
+
+
+def orthonormalise(T: Transform) -> Transform:
+    """Return the rigid motion nearest to `T` (polar decomposition); files often hold rotations of few digits."""
+    u, _, vt = np.linalg.svd(T[:3, :3])
+    rigid = np.array(T, float)
+    rigid[:3, :3] = u @ vt
+    rigid[3] = 0, 0, 0, 1
+    return rigid
+
+
+def from_quaternion(translation: ArrayLike, quaternion_xyzw: ArrayLike) -> Transform:
+    """Return the motion with this (3,) translation in metres and (4,) quaternion x, y, z, w (any length but zero)."""
+    x, y, z, w = np.asarray(quaternion_xyzw, float) / np.linalg.norm(quaternion_xyzw)
+    T = np.eye(4)
+    T[:3, :3] = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    T[:3, 3] = translation
+    return T
+
+
+def rotation_vector(R: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the (3,) axis times angle in radians of a rotation matrix (logarithm of SO(3))."""
+    axis = np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / 2
+    sine, cosine = np.linalg.norm(axis), (np.trace(R) - 1) / 2
+    angle = np.arctan2(sine, cosine)
+    if sine > 1e-9:
+        return axis * (angle / sine)
+    if cosine > 0:
+        return axis
+    column = np.argmax(np.diag(R))  # half a turn: R = 2 a a^T - I
+    a = R[:, column] + np.eye(3)[column]
+    return np.pi * a / np.linalg.norm(a)
+
+
+def rotation_matrix(vector: ArrayLike) -> NDArray[np.float64]:
+    """Return the rotation matrix of an axis times angle in radians (Rodrigues)."""
+    vector = np.asarray(vector, float)
+    angle = np.linalg.norm(vector)
+    if angle < 1e-12:
+        return np.eye(3)
+    x, y, z = vector / angle
+    K = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * (K @ K)
+
+
+def interpolate(T_a_b0: Transform, T_a_b1: Transform, share: float) -> Transform:
+    """Return the motion at `share` (0 to 1) of the way: straight line in position, constant turn rate in rotation."""
+    T = np.eye(4)
+    R0 = T_a_b0[:3, :3]
+    T[:3, :3] = R0 @ rotation_matrix(share * rotation_vector(R0.T @ T_a_b1[:3, :3]))
+    T[:3, 3] = (1 - share) * T_a_b0[:3, 3] + share * T_a_b1[:3, 3]
+    return T
+
+
+def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0, 0, 1)) -> Transform:
+    """Return T_world_camera of a camera at `eye` whose optical axis (z forward, x right, y down) meets `target`."""
+    eye = np.asarray(eye, float)
+    forward = np.asarray(target, float) - eye
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, up)
+    right /= np.linalg.norm(right)
+    T = np.eye(4)
+    T[:3, :3] = np.column_stack([right, np.cross(forward, right), forward])
+    T[:3, 3] = eye
+    return T

@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Kernel cells of the block hash: where a block of 8x8x8 cells lies in its pool."""
+
+import numpy as np
+
+from stereovox._jit import cell
+
+EMPTY = np.int32(-1)
+
+
+@cell
+def home_slot(bx, by, bz, mask):
+    """Return the slot of the hash table where the search for block (bx, by, bz) starts."""
+    h = np.uint64(np.uint32(bx)) * np.uint64(0x9E3779B97F4A7C15)
+    h ^= np.uint64(np.uint32(by)) * np.uint64(0xC2B2AE3D27D4EB4F)
+    h ^= np.uint64(np.uint32(bz)) * np.uint64(0x165667B19E3779F9)
+    h ^= h >> np.uint64(32)
+    h *= np.uint64(0xD6E8FEB86659FD93)
+    return np.int64((h >> np.uint64(32)) & np.uint64(mask))
+
+
+@cell
+def find(table, coords, bx, by, bz):
+    """Return the pool index of block (bx, by, bz), -1 when there is none."""
+    mask = table.size - 1
+    slot = home_slot(bx, by, bz, mask)
+    while True:
+        i = table[slot]
+        if i == EMPTY:
+            return np.int64(-1)
+        if coords[i, 0] == bx and coords[i, 1] == by and coords[i, 2] == bz:
+            return np.int64(i)
+        slot = (slot + 1) & mask
+
+
+@cell
+def find_or_insert(table, coords, count, bx, by, bz):
+    """Return the pool index of block (bx, by, bz), making it when needed; -1 when the pool is full.
+
+    `count` is a (1,) int64 array: the number of blocks in the pool.
+    """
+    mask = table.size - 1
+    slot = home_slot(bx, by, bz, mask)
+    while True:
+        i = table[slot]
+        if i == EMPTY:
+            break
+        if coords[i, 0] == bx and coords[i, 1] == by and coords[i, 2] == bz:
+            return np.int64(i)
+        slot = (slot + 1) & mask
+    n = count[0]
+    if n >= coords.shape[0]:
+        return np.int64(-1)
+    coords[n, 0] = bx
+    coords[n, 1] = by
+    coords[n, 2] = bz
+    table[slot] = n
+    count[0] = n + 1
+    return np.int64(n)

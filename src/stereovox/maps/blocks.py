@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A sparse set of blocks of 8x8x8 cells: a pool of values and a hash from block coordinates to the pool."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from stereovox.maps import _cpu
+
+SIDE = 8
+"""Cells along each side of a block."""
+CELLS = SIDE**3
+
+
+class BlockPool:
+    """Blocks in the order they were made. Cell (i, j, k) of a block stands at `64 i + 8 j + k` of its row.
+
+    coords: (capacity, 3) int32 block coordinates; block (0, 0, 0) holds cells 0..7 on each axis.
+    values: (capacity, 512) of the chosen dtype, zero where never written.
+    count: (1,) int64, the number of blocks in use.
+    """
+
+    def __init__(self, dtype: DTypeLike, capacity: int = 256):
+        self.count = np.zeros(1, np.int64)
+        self.coords = np.zeros((capacity, 3), np.int32)
+        self.values = np.zeros((capacity, CELLS), dtype)
+        self.table = np.full(_table_size(capacity), -1, np.int32)
+
+    def __len__(self) -> int:
+        return int(self.count[0])
+
+    @property
+    def memory_bytes(self) -> int:
+        """Bytes of all arrays in use: filled blocks and the hash."""
+        return len(self) * (self.values.itemsize * CELLS + self.coords.itemsize * 3) + self.table.nbytes
+
+    def reserve(self, more: int) -> None:
+        """Make room for `more` further blocks; existing blocks keep their place."""
+        needed = len(self) + more
+        if needed <= self.coords.shape[0]:
+            return
+        capacity = max(needed, 2 * self.coords.shape[0])
+        self.coords = _grown(self.coords, capacity, len(self))
+        self.values = _grown(self.values, capacity, len(self))
+        self.table = np.empty(_table_size(capacity), np.int32)
+        _cpu.rebuild(self.table, self.coords, len(self))
+
+    def insert(self, coords: NDArray[np.int32]) -> NDArray[np.int64]:
+        """Find or make blocks (n, 3); return their places in the pool (n,)."""
+        self.reserve(len(coords))
+        places = np.empty(len(coords), np.int64)
+        _cpu.insert_all(self.table, self.coords, self.count, np.ascontiguousarray(coords, np.int32), places)
+        return places
+
+    def clear(self) -> None:
+        """Forget all blocks and zero what they held; the memory stays for the next use."""
+        self.values[: len(self)] = 0
+        self.table.fill(-1)
+        self.count[0] = 0
+
+
+def _table_size(capacity: int) -> int:
+    return 1 << int(2 * capacity - 1).bit_length()
+
+
+def _grown(array: NDArray, capacity: int, used: int) -> NDArray:
+    grown = np.zeros((capacity, *array.shape[1:]), array.dtype)
+    grown[:used] = array[:used]
+    return grown

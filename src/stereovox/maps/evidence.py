@@ -1,0 +1,31 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What one frame says about the world, before any map knows it: integrators make it, a map adds it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+LOG_ODDS_SCALE = 1000
+"""Log-odds are kept as whole thousandths; zero means "nothing is known"."""
+
+
+def to_units(log_odds: float | NDArray[np.floating]) -> NDArray[np.int32]:
+    """Return log-odds as whole thousandths."""
+    return np.rint(np.asarray(log_odds) * LOG_ODDS_SCALE).astype(np.int32)
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """Log-odds of one frame in thousandths, block by block; no block stands in it twice.
+
+    coords: (n, 3) int32 block coordinates; values: (n, 512) int16, zero where the frame says nothing.
+    uniform: (m, 3) int32 blocks all of whose cells get `uniform_value`, a negative number (wholly free blocks).
+    """
+
+    coords: NDArray[np.int32]
+    values: NDArray[np.int16]
+    uniform: NDArray[np.int32]
+    uniform_value: int

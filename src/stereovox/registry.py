@@ -1,0 +1,31 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Look up a class by name in a room's `name -> "module:Class"` dict, importing it only when asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from importlib import import_module
+from importlib.metadata import entry_points
+from typing import Any
+
+from stereovox.errors import ConfigError, did_you_mean
+
+
+def find(room: str, builtin: Mapping[str, str], name: str) -> Any:
+    """Return the object registered as `name` in `room`.
+
+    Other packages add to a room with an entry point in the group `stereovox.<room>`.
+    Raises ConfigError that lists or suggests the known names.
+    """
+    if name in builtin:
+        module, _, attribute = builtin[name].partition(":")
+        return getattr(import_module(module), attribute)
+    others = {entry.name: entry for entry in entry_points(group=f"stereovox.{room}")}
+    if name in others:
+        return others[name].load()
+    raise ConfigError(f"unknown {room} '{name}'{did_you_mean(name, [*builtin, *others])}")
+
+
+def names(room: str, builtin: Mapping[str, str]) -> list[str]:
+    """Return all names in `room`, built-in ones first."""
+    return [*builtin, *(entry.name for entry in entry_points(group=f"stereovox.{room}"))]

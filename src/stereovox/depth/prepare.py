@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Check a frame, convert its depth to metres, give every pixel without a value its reason."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox import geometry
+from stereovox.config import Config
+from stereovox.depth import _cpu
+from stereovox.errors import FrameRefused
+from stereovox.frame import DepthImage, Frame, Reason
+
+DTYPES = (np.dtype(np.uint16), np.dtype(np.float32), np.dtype(np.float64))
+FARTHEST = 1e6
+"""Positions beyond this many metres are taken for errors."""
+
+
+def prepare(frame: Frame, config: Config) -> DepthImage:
+    """Return the frame's depth image in metres.
+
+    A pixel is UNMATCHED where the value is zero, negative, not finite or a saturated uint16; TOO_NEAR and TOO_FAR
+    outside [min_range, max_range]. The source's own reason, where it has one, comes first.
+    Raises FrameRefused with the reason: the source's `fault`, `bad_dtype`, `bad_shape`, `bad_scale`, `bad_reason`,
+    `pose_not_finite`, `pose_not_rigid`, `no_valid_depth`.
+    """
+    _check_image(frame)
+    T_world_sensor = _rigid_pose(frame, config.pose_rigidity_tolerance)
+    depth_m = np.empty(frame.depth.shape, np.float32)
+    reason = np.empty(frame.depth.shape, np.uint8)
+    usable = _classify(frame, config, depth_m, reason)
+    if not usable and not (reason == Reason.TOO_FAR).any():
+        raise FrameRefused("no_valid_depth", f"{_name(frame)}: not one pixel has a valid depth; is the lens covered?")
+    return DepthImage(depth_m, reason, frame.camera, T_world_sensor, frame.stamp_ns)
+
+
+def _classify(frame: Frame, config: Config, depth_m: NDArray, reason: NDArray) -> int:
+    raw = np.ascontiguousarray(frame.depth).reshape(-1)
+    given = np.zeros(0, np.uint8) if frame.reason is None else np.ascontiguousarray(frame.reason, np.uint8).reshape(-1)
+    limits = (np.float32(frame.depth_scale), np.float32(config.min_range), np.float32(config.max_range))
+    return _cpu.classify(raw, given, *limits, raw.dtype == np.uint16, depth_m.reshape(-1), reason.reshape(-1))
+
+
+def _check_image(frame: Frame) -> None:
+    name, depth, camera = _name(frame), frame.depth, frame.camera
+    if frame.fault:
+        raise FrameRefused(frame.fault, frame.fault_detail or f"{name}: {frame.fault}")
+    if not isinstance(depth, np.ndarray) or depth.dtype not in DTYPES:
+        kind = getattr(depth, "dtype", type(depth).__name__)
+        raise FrameRefused("bad_dtype", f"{name}: depth is {kind}; give a uint16, float32 or float64 array")
+    if depth.shape != (camera.height, camera.width):
+        wanted = f"({camera.height}, {camera.width})"
+        raise FrameRefused("bad_shape", f"{name}: depth image is {depth.shape}, its camera says {wanted}")
+    if not (np.isfinite(frame.depth_scale) and frame.depth_scale > 0):
+        raise FrameRefused("bad_scale", f"{name}: depth_scale {frame.depth_scale} must be positive and finite")
+    if frame.reason is not None and (frame.reason.shape != depth.shape or frame.reason.max(initial=0) > max(Reason)):
+        raise FrameRefused("bad_reason", f"{name}: reason must be {depth.shape} uint8 of values 0 to {max(Reason)}")
+
+
+def _rigid_pose(frame: Frame, tolerance: float) -> geometry.Transform:
+    try:
+        T = np.asarray(frame.T_world_sensor, float)
+    except (TypeError, ValueError):
+        T = np.empty(0)
+    if T.shape == (4, 4) and not (np.isfinite(T).all() and (np.abs(T) < FARTHEST).all()):
+        raise FrameRefused("pose_not_finite", f"{_name(frame)}: the pose holds NaN, infinity or absurdly large numbers")
+    error = geometry.rigidity_error(T)
+    if error > tolerance:
+        raise FrameRefused("pose_not_rigid", f"{_name(frame)}: the pose is no rigid 4x4 motion (off by {error:.2g})")
+    return geometry.orthonormalise(T)
+
+
+def _name(frame: Frame) -> str:
+    return frame.name or f"frame at {frame.stamp_ns} ns"

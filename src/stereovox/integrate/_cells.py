@@ -1,0 +1,35 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Kernel cells shared by the integrators: one idea a function, float32 throughout."""
+
+import numpy as np
+
+from stereovox._jit import cell
+
+ZERO, HALF, ONE = np.float32(0), np.float32(0.5), np.float32(1)
+NEAR_PLANE = np.float32(1e-3)
+"""Cells whose centre lies nearer to the image plane of the camera than this (metres) are not looked at."""
+NO_RETURN = np.float32(1e6)
+"""Depth that stands for "nothing up to the maximum range"."""
+
+
+@cell
+def stronger(old, new):
+    """Return the stronger evidence on one cell: positive beats negative, then the larger amount wins."""
+    if new > 0:
+        return max(old, new)
+    return old if old > 0 else min(old, new)
+
+
+@cell
+def table_row(depth, rows_per_metre, rows):
+    """Return the table row of a measured depth."""
+    return min(np.int32(depth * rows_per_metre), np.int32(rows - 1))
+
+
+@cell
+def window_level(spread):
+    """Return which window image serves a cell: 0 for the pixel itself, l for 3x3 tiles of 2^(l-1) pixels.
+
+    `spread` is the wanted tile size in pixels; the binary exponent of a float32 is its logarithm rounded down.
+    """
+    return (np.float32(spread).view(np.int32) >> np.int32(23)) - np.int32(125)

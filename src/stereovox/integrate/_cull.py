@@ -1,0 +1,142 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Kernel that finds, from coarse to fine, which blocks a depth image says anything about."""
+
+import numpy as np
+
+from stereovox._jit import cell, kernel
+from stereovox.integrate._cells import HALF, NEAR_PLANE, NO_RETURN, ONE, ZERO, table_row, window_level
+from stereovox.maps._cells import find
+
+SKIP, FREE, MIXED = 0, 1, 2
+SLACK = np.float32(1e-3)
+"""Pixels and parts of a depth by which boxes are taken too large: culling may err only to the safe side."""
+COARSE = 4
+"""Blocks along each side of a coarse box."""
+
+
+@kernel
+def candidates(view, table, windows, nearest, low, high, hit_table, hit_coords, free, mixed):
+    """List the blocks that are wholly free and those that need a look at each cell; return both numbers.
+
+    low, high: (3,) first and last coarse box, counted in coarse boxes from the camera's block. A free block that
+    holds a hit is listed as mixed. free, mixed: (capacity, 3) int32 block coordinates from the camera's block.
+    """
+    side = np.float32(8) * view.voxel_size
+    coarse_half = (np.float32(4 * COARSE) - HALF) * view.voxel_size
+    block_half = (np.float32(4) - HALF) * view.voxel_size
+    n_free, n_mixed = 0, 0
+    for bx in range(low[0] * COARSE, (high[0] + 1) * COARSE, COARSE):
+        for by in range(low[1] * COARSE, (high[1] + 1) * COARSE, COARSE):
+            for bz in range(low[2] * COARSE, (high[2] + 1) * COARSE, COARSE):
+                middle = np.float32(COARSE) * HALF
+                coarse = _classify(
+                    view, table, windows, nearest, 1, coarse_half,
+                    (bx + middle) * side, (by + middle) * side, (bz + middle) * side,
+                )  # fmt: skip
+                if coarse == SKIP:
+                    continue
+                for x in range(bx, bx + COARSE):
+                    for y in range(by, by + COARSE):
+                        for z in range(bz, bz + COARSE):
+                            kind = coarse
+                            if kind == MIXED:
+                                kind = _classify(
+                                    view, table, windows, nearest, 0, block_half,
+                                    (x + HALF) * side, (y + HALF) * side, (z + HALF) * side,
+                                )  # fmt: skip
+                            if kind == SKIP:
+                                continue
+                            if kind == FREE and find(hit_table, hit_coords, x, y, z) < 0:
+                                free[n_free, 0], free[n_free, 1], free[n_free, 2] = x, y, z
+                                n_free += 1
+                            else:
+                                mixed[n_mixed, 0], mixed[n_mixed, 1], mixed[n_mixed, 2] = x, y, z
+                                n_mixed += 1
+    return n_free, n_mixed
+
+
+@cell
+def _classify(view, table, windows, nearest, tile, half, wx, wy, wz):
+    """Tell whether all cells with centres within `half` of (wx, wy, wz) are free (FREE), untouched (SKIP) or neither.
+
+    tile: 0 to look at tiles of 16 pixels (blocks), 1 for 64 (coarse boxes).
+    """
+    R = view.rotation
+    px, py, pz = wx - view.position[0], wy - view.position[1], wz - view.position[2]
+    z = R[2, 0] * px + R[2, 1] * py + R[2, 2] * pz
+    ez = half * (abs(R[2, 0]) + abs(R[2, 1]) + abs(R[2, 2]))
+    z_low, z_high = z - ez, z + ez
+    if z_high <= NEAR_PLANE or z_low > view.max_range:
+        return SKIP
+    if z_low <= NEAR_PLANE:
+        return MIXED
+    x = R[0, 0] * px + R[0, 1] * py + R[0, 2] * pz
+    y = R[1, 0] * px + R[1, 1] * py + R[1, 2] * pz
+    ex = half * (abs(R[0, 0]) + abs(R[0, 1]) + abs(R[0, 2]))
+    ey = half * (abs(R[1, 0]) + abs(R[1, 1]) + abs(R[1, 2]))
+    near, far = ONE / z_low, ONE / z_high
+    u_low = view.intrinsics[0] * (x - ex) * (near if x < ex else far) + view.intrinsics[2] - SLACK
+    u_high = view.intrinsics[0] * (x + ex) * (near if x > -ex else far) + view.intrinsics[2] + SLACK
+    v_low = view.intrinsics[1] * (y - ey) * (near if y < ey else far) + view.intrinsics[3] - SLACK
+    v_high = view.intrinsics[1] * (y + ey) * (near if y > -ey else far) + view.intrinsics[3] + SLACK
+    rim = view.rim * near + HALF + SLACK
+    right, bottom = np.float32(view.width - 1), np.float32(view.height - 1)
+    if u_high < -rim or v_high < -rim or u_low > right + rim or v_low > bottom + rim:
+        return SKIP
+    u0, u1 = _pixel(u_low, right), _pixel(u_high, right)
+    v0, v1 = _pixel(v_low, bottom), _pixel(v_high, bottom)
+    last = windows.shape.shape[0] - 1
+    level = min(max(window_level(view.spread * near), windows.first), last)
+    farthest = _extreme(windows, windows.highs, level, tile, u0, u1, v0, v1, True)
+    behind = table.reach[table_row(min(farthest, view.max_range), table.rows_per_metre, table.hit.size)] if table.marks else ZERO
+    if z_low > (farthest + behind) * (ONE + SLACK):
+        return SKIP
+    whole = u_low >= -HALF and v_low >= -HALF and u_high <= right + HALF and v_high <= bottom + HALF
+    if not whole or z_high > view.max_range:
+        return MIXED
+    level = min(max(window_level(view.spread * far), windows.first), last)
+    closest = _extreme(windows, windows.lows, level, tile, u0, u1, v0, v1, False)
+    if table.marks:
+        closest = min(closest, _nearest(nearest, tile, u0, u1, v0, v1))
+    return FREE if z_high < _clear_to(table, closest) * (ONE - SLACK) else MIXED
+
+
+@cell
+def _pixel(x, last):
+    return np.int32(min(max(x + HALF, ZERO), last))
+
+
+@cell
+def _clear_to(table, depth):
+    """Return the z up to which every measurement of at least `depth` says "free" and nothing else."""
+    if depth <= ZERO:
+        return ZERO
+    if depth >= NO_RETURN:
+        return NO_RETURN
+    row = table_row(depth, table.rows_per_metre, table.hit.size)
+    return min(depth - table.reach[row], table.safe[row + 1])
+
+
+@cell
+def _extreme(windows, image, level, tile, u0, u1, v0, v1, highest):
+    """Return the highest (or lowest) window value over the tiles that pixels u0..u1, v0..v1 touch."""
+    shift = max(level - 1, 0) + (4 if tile == 0 else 6)
+    width = windows.tile_width[level, tile]
+    start = windows.tile_offset[level, tile]
+    best = ZERO if highest else NO_RETURN
+    for v in range(v0 >> shift, (v1 >> shift) + 1):
+        for u in range(u0 >> shift, (u1 >> shift) + 1):
+            value = image[start + v * width + u]
+            best = max(best, value) if highest else min(best, value)
+    return best
+
+
+@cell
+def _nearest(nearest, tile, u0, u1, v0, v1):
+    image = nearest[tile]
+    shift = 4 if tile == 0 else 6
+    best = NO_RETURN
+    for v in range(v0 >> shift, (v1 >> shift) + 1):
+        for u in range(u0 >> shift, (u1 >> shift) + 1):
+            best = min(best, image[v, u])
+    return best

@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Kernel that evaluates every cell of the blocks that culling could not decide, in rows the compiler vectorises."""
+
+import numpy as np
+
+from stereovox._jit import cell, kernel
+from stereovox.integrate._cells import HALF, NEAR_PLANE, NO_RETURN, ONE, ZERO, table_row, window_level
+from stereovox.maps._cells import find
+from stereovox.sensors.model import COLUMNS
+
+LAST_COLUMN = np.float32(COLUMNS - 1)
+MIDDLE_COLUMN = np.float32(COLUMNS / 2)
+
+
+@kernel
+def evaluate(view, table, windows, blocks, values, hit_table, hit_coords, hit_values, hit_used):
+    """Fill `values` (n, 512) int16 with the evidence on the cells of `blocks` (n, 3), hits included.
+
+    hit_used: (hits,) uint8, set for each hit block that was taken in.
+    """
+    side = np.float32(8) * view.voxel_size
+    for i in range(blocks.shape[0]):
+        x, y, z = blocks[i, 0], blocks[i, 1], blocks[i, 2]
+        px = x * side - view.position[0]
+        py = y * side - view.position[1]
+        pz = z * side - view.position[2]
+        R = view.rotation
+        cx = (R[0, 0] * px + R[0, 1] * py + R[0, 2] * pz) * view.intrinsics[0]
+        cy = (R[1, 0] * px + R[1, 1] * py + R[1, 2] * pz) * view.intrinsics[1]
+        cz = R[2, 0] * px + R[2, 1] * py + R[2, 2] * pz
+        out = values[i]
+        _clear(view, table, windows, cx, cy, cz, out)
+        if table.marks:
+            _mark(view, table, windows, cx, cy, cz, out)
+        h = find(hit_table, hit_coords, x, y, z)
+        if h >= 0:
+            hits = hit_values[h]
+            hit_used[h] = 1
+            for c in range(512):
+                out[c] = max(out[c], hits[c]) if hits[c] > 0 else out[c]
+
+
+@cell
+def _clear(view, table, windows, cx, cy, cz, out):
+    """Write the negative evidence: what the farthest pixel in a window about the cell's size says."""
+    fx_steps, fy_steps, z_steps = view.steps[0], view.steps[1], view.steps[2]
+    u_centre, v_centre = view.intrinsics[2] + HALF, view.intrinsics[3] + HALF
+    right, bottom = np.float32(view.width - 1), np.float32(view.height - 1)
+    u_end, v_end = np.float32(view.width), np.float32(view.height)
+    rows = np.int32(table.hit.size)
+    first, last = np.int32(windows.first), np.int32(windows.shape.shape[0] - 1)
+    for c in range(512):
+        z = cz + z_steps[c]
+        ahead = (z > NEAR_PLANE) & (z <= view.max_range)
+        inverse = ONE / (z if ahead else ONE)
+        u = (cx + fx_steps[c]) * inverse + u_centre
+        v = (cy + fy_steps[c]) * inverse + v_centre
+        rim = view.rim * inverse
+        seen = ahead & (u >= -rim) & (v >= -rim) & (u < u_end + rim) & (v < v_end + rim)
+        level = min(max(window_level(view.spread * inverse), first), last)
+        shift = max(level - np.int32(1), np.int32(0))
+        column = np.int32(min(max(u, ZERO), right)) >> shift
+        line = np.int32(min(max(v, ZERO), bottom)) >> shift
+        d = windows.image[np.uint32(windows.offset[level] + line * windows.width[level] + column)]
+        row = min(np.int32(min(d, view.max_range) * table.rows_per_metre), rows - np.int32(1))
+        t = (z - d) * table.columns_per_metre[np.uint32(row)] + MIDDLE_COLUMN
+        k = np.int32(min(max(t, ZERO), LAST_COLUMN))
+        e = table.clear[np.uint32(row * np.int32(COLUMNS) + k)]
+        out[c] = np.int16(e if seen & (d > ZERO) else np.int32(0))
+
+
+@cell
+def _mark(view, table, windows, cx, cy, cz, out):
+    """Overwrite with the positive evidence, where there is any, of the pixel at the cell's centre."""
+    u_centre, v_centre = view.intrinsics[2] + HALF, view.intrinsics[3] + HALF
+    rows = table.hit.size
+    for c in range(512):
+        z = cz + view.steps[2, c]
+        if z <= NEAR_PLANE or z > view.max_range:
+            continue
+        u = (cx + view.steps[0, c]) / z + u_centre
+        v = (cy + view.steps[1, c]) / z + v_centre
+        if not (u >= ZERO and v >= ZERO and u < np.float32(view.width) and v < np.float32(view.height)):
+            continue
+        d = windows.image[np.int32(v) * view.width + np.int32(u)]
+        if d <= ZERO or d >= NO_RETURN:
+            continue
+        row = table_row(d, table.rows_per_metre, rows)
+        t = (z - d) * table.columns_per_metre[row] + MIDDLE_COLUMN
+        if t < ZERO or t > LAST_COLUMN:
+            continue
+        e = table.mark[row * COLUMNS + np.int32(t)]
+        if e > 0:
+            out[c] = np.int16(e)

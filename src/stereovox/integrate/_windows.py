@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Kernels that make the window images: at each pixel the farthest depth within a window, for windows of all sizes.
+
+Level 0 is the depth image itself, level l >= 1 holds, for each tile of 2^(l-1) pixels, the farthest depth in the
+3x3 tiles around it. For fast culling each level also has the nearest and farthest value of tiles of 16 and 64 of its
+own pixels. No value is 0, so it is the nearest of all and never clears anything.
+"""
+
+import numpy as np
+
+from stereovox._jit import cell, kernel
+from stereovox.integrate._cells import NO_RETURN, ZERO
+
+
+@kernel
+def load(depth_m, z):
+    """Copy a REP 117 depth image to `z`: no value becomes 0, too far NO_RETURN; return the farthest."""
+    farthest = ZERO
+    for i in range(depth_m.size):
+        d = depth_m[i]
+        d = d if d > ZERO else ZERO
+        d = d if d < NO_RETURN else NO_RETURN
+        z[i] = d
+        farthest = d if d > farthest else farthest
+    return farthest
+
+
+@kernel
+def build(base, window, row, lows, highs, shape, offset, base_offset, tile_offset, tile_width, first):
+    """Fill window images and tiles of all levels from `first` on.
+
+    window: flat images of all levels, level l from offset[l] on with shape[l] rows and columns; level 0 is already
+    loaded. base: scratch for the images before dilation; row: scratch of one row.
+    lows, highs: flat tile images, at tile_offset[level, 0] for tiles of 16 and [level, 1] for 64.
+    """
+    if first == 0:
+        _tiles(window[: shape[0, 0] * shape[0, 1]], lows, highs, shape[0], tile_offset[0], tile_width[0])
+    source, height, width = window, shape[0, 0], shape[0, 1]
+    for level in range(1, shape.shape[0]):
+        if level > 1:
+            target = base[base_offset[level] :]
+            _halve(source, height, width, target, shape[level, 1])
+            source, height, width = target, shape[level, 0], shape[level, 1]
+        if level >= first:
+            image = window[offset[level] : offset[level] + height * width]
+            _dilate(source, height, width, image, row)
+            _tiles(image, lows, highs, shape[level], tile_offset[level], tile_width[level])
+
+
+@cell
+def _halve(source, height, width, target, target_width):
+    for v in range((height + 1) // 2):
+        upper = source[2 * v * width : (2 * v + 1) * width]
+        lower = source[min(2 * v + 1, height - 1) * width : (min(2 * v + 1, height - 1) + 1) * width]
+        out = target[v * target_width : (v + 1) * target_width]
+        for u in range(width // 2):
+            a = max(upper[2 * u], upper[2 * u + 1])
+            b = max(lower[2 * u], lower[2 * u + 1])
+            out[u] = max(a, b)
+        if width % 2:
+            out[target_width - 1] = max(upper[width - 1], lower[width - 1])
+
+
+@cell
+def _dilate(source, height, width, target, row):
+    for v in range(height):
+        above = source[max(v - 1, 0) * width : (max(v - 1, 0) + 1) * width]
+        here = source[v * width : (v + 1) * width]
+        below = source[min(v + 1, height - 1) * width : (min(v + 1, height - 1) + 1) * width]
+        out = target[v * width : (v + 1) * width]
+        for u in range(width):
+            row[u] = max(max(above[u], below[u]), here[u])
+        for u in range(1, width - 1):
+            out[u] = max(max(row[u - 1], row[u + 1]), row[u])
+        out[0] = max(row[0], row[min(1, width - 1)])
+        out[width - 1] = max(row[width - 1], row[max(width - 2, 0)])
+
+
+@cell
+def _tiles(image, lows, highs, shape, tile_offset, tile_width):
+    height, width = shape[0], shape[1]
+    tiles, wide = tile_width[0], tile_width[1]
+    low64 = lows[tile_offset[1] :]
+    high64 = highs[tile_offset[1] :]
+    for i in range(wide * ((height + 63) // 64)):
+        low64[i] = NO_RETURN
+        high64[i] = ZERO
+    for tv in range((height + 15) // 16):
+        for tu in range(tiles):
+            low, high = NO_RETURN, ZERO
+            for v in range(16 * tv, min(16 * tv + 16, height)):
+                line = image[v * width + 16 * tu : v * width + min(16 * tu + 16, width)]
+                for u in range(line.size):
+                    low = min(low, line[u])
+                    high = max(high, line[u])
+            lows[tile_offset[0] + tv * tiles + tu] = low
+            highs[tile_offset[0] + tv * tiles + tu] = high
+            big = (tv >> 2) * wide + (tu >> 2)
+            low64[big] = min(low64[big], low)
+            high64[big] = max(high64[big], high)
+
+
+@kernel
+def nearest_tiles(z, height, width, lows16, lows64):
+    """Fill tiles of 16 and 64 pixels with the nearest depth in them, pixels without value left out."""
+    wide = (width + 63) // 64
+    lows64[:] = NO_RETURN
+    for tv in range((height + 15) // 16):
+        for tu in range((width + 15) // 16):
+            low = NO_RETURN
+            for v in range(16 * tv, min(16 * tv + 16, height)):
+                for u in range(16 * tu, min(16 * tu + 16, width)):
+                    d = z[v * width + u]
+                    low = min(low, d if d > ZERO else NO_RETURN)
+            lows16[tv * ((width + 15) // 16) + tu] = low
+            big = (tv >> 2) * wide + (tu >> 2)
+            lows64[big] = min(lows64[big], low)

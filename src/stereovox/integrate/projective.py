@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The projective integrator: cells are projected into the depth image, from coarse boxes to single cells.
+
+A frame updates each cell at most once. Cells that hold a measured point get its hit evidence, scattered from the
+pixels; every other cell gets what the farthest pixel in a window about its own size says. So thin near obstacles
+stay, small holes do not matter, and the outcome is what exact ray casting gives (docs/integrators.md has figures).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.cameras import PinholeCamera
+from stereovox.config import Config
+from stereovox.frame import DepthImage
+from stereovox.integrate import _cull, _evaluate, _hits
+from stereovox.integrate._cells import NEAR_PLANE, NO_RETURN
+from stereovox.integrate.shards import in_shards
+from stereovox.integrate.views import KernelTable, View, kernel_table, origin_block, view_of
+from stereovox.integrate.windows import WindowBuilder, Windows
+from stereovox.maps.blocks import CELLS, SIDE, BlockPool
+from stereovox.maps.evidence import Evidence
+from stereovox.sensors import make_sensor
+from stereovox.sensors.model import tabulate
+from stereovox.sensors.noise import RangeNoise
+
+
+class Projective:
+    """Evidence by projection, coarse to fine. Raises ConfigError for a bad sensor model."""
+
+    def __init__(self, config: Config):
+        self._config = config
+        self._sensor = make_sensor(config.sensor)
+        self._hits = BlockPool(np.int16, capacity=4096)
+        self._camera: PinholeCamera | None = None
+
+    def evidence(self, image: DepthImage) -> Evidence:
+        """Return what `image` says about the cells it sees."""
+        self._prepare(image.camera)
+        view = view_of(image, self._config.voxel_size, self._config.max_range)
+        farthest = self._builder.load(image.depth_m)
+        end = self._end_of_view(farthest)
+        windows = self._builder.build(float(view.spread) / end)
+        if self._table.marks:
+            self._builder.build_nearest()
+        self._scatter_hits(view)
+        free, mixed = self._candidates(view, windows, end)
+        values, used = self._evaluate(view, windows, mixed)
+        coords, values = self._with_leftovers(mixed, values, used)
+        origin = origin_block(image.T_world_sensor, self._config.voxel_size).astype(np.int32)
+        return Evidence(coords + origin, values, free + origin, int(self._table.free))
+
+    def _prepare(self, camera: PinholeCamera) -> None:
+        if camera == self._camera:
+            return
+        noise = RangeNoise.of(self._config.noise, camera)
+        self._table: KernelTable = kernel_table(
+            tabulate(self._sensor, noise, self._config.max_range), self._config.max_range
+        )
+        self._builder = WindowBuilder(camera)
+        self._keys = np.zeros((2, camera.width), np.int64)
+        self._camera = camera
+
+    def _end_of_view(self, farthest: float) -> float:
+        """Return the depth in metres beyond which this image says nothing."""
+        limit = self._config.max_range
+        if farthest >= NO_RETURN:
+            return limit
+        behind = float(self._table.reach[-1]) if self._table.marks else 0.0
+        return min(limit, max(float(farthest), 10 * float(NEAR_PLANE)) * 1.001 + behind)
+
+    def _scatter_hits(self, view: View) -> None:
+        hits, z = self._hits, self._builder.depths
+        hits.clear()
+        while not _hits.scatter(
+            z, view, self._table, self._keys, hits.table, hits.coords, hits.count, hits.values, 0, z.shape[0]
+        ):
+            hits.reserve(len(hits.coords))
+
+    def _candidates(self, view: View, windows: Windows, end: float) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+        low, high = _coarse_range(view, end)
+        most = int((high - low + 1).prod()) * _cull.COARSE**3
+        free, mixed = np.empty((most, 3), np.int32), np.empty((most, 3), np.int32)
+        hits = self._hits
+        n_free, n_mixed = _cull.candidates(
+            view, self._table, windows, self._builder.nearest, low, high, hits.table, hits.coords, free, mixed
+        )
+        return free[:n_free], mixed[:n_mixed]
+
+    def _evaluate(self, view: View, windows: Windows, mixed: NDArray) -> tuple[NDArray[np.int16], NDArray[np.uint8]]:
+        hits = self._hits
+        values = np.empty((len(mixed), CELLS), np.int16)
+        used = np.zeros(len(hits), np.uint8)
+
+        def one_shard(part: slice) -> None:
+            _evaluate.evaluate(
+                view, self._table, windows, mixed[part], values[part], hits.table, hits.coords, hits.values, used
+            )
+
+        in_shards(one_shard, len(mixed), self._config.threads)
+        return values, used
+
+    def _with_leftovers(self, mixed: NDArray, values: NDArray, used: NDArray) -> tuple[NDArray, NDArray]:
+        """Append hit blocks that culling did not list (points on the very border of the view)."""
+        left = np.flatnonzero(used == 0)
+        if not len(left):
+            return mixed, values
+        return np.concatenate([mixed, self._hits.coords[left]]), np.concatenate([values, self._hits.values[left]])
+
+
+def _coarse_range(view: View, end: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the first and last coarse box (3,) that the view up to depth `end` can touch."""
+    rim = float(view.rim) / end
+    fx, fy = view.intrinsics[:2]
+    x = np.array([view.columns[0] - (rim + 1) / fx, view.columns[-1] + (rim + 1) / fx]) * end
+    y = np.array([view.rows[0] - (rim + 1) / fy, view.rows[-1] + (rim + 1) / fy]) * end
+    corners = np.array([[0, 0, 0], *[[a, b, end] for a in x for b in y]], float)
+    world = corners @ view.rotation.astype(float) + view.position
+    side = _cull.COARSE * SIDE * float(view.voxel_size)
+    margin = float(view.voxel_size)
+    return (
+        np.floor((world.min(0) - margin) / side).astype(np.int64),
+        np.floor((world.max(0) + margin) / side).astype(np.int64),
+    )

@@ -1,0 +1,109 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What kernels need to know of a camera, a pose and a sensor table, as tuples of float32 numbers and arrays."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.cameras import PinholeCamera
+from stereovox.frame import DepthImage
+from stereovox.geometry import Transform
+from stereovox.maps.blocks import SIDE
+from stereovox.maps.evidence import to_units
+from stereovox.sensors.model import COLUMNS, REACH_SIGMA, SensorTable
+
+WINDOW_SHARE = 0.27
+"""Tile size of a cell's window image over the cell's size in the image; a window is three tiles wide.
+
+Chosen so that a cell is cleared when any ray through it goes on, as exact ray casting does (see docs/integrators.md).
+"""
+RIM_SHARE = 0.35
+"""A cell still counts as inside the image when its centre lies this share of its size outside."""
+
+
+class KernelTable(NamedTuple):
+    """A sensor table in whole thousandths of log-odds, split by sign. All flat, row-major (rows, COLUMNS)."""
+
+    clear: NDArray[np.int32]  # negative evidence, 0 elsewhere; column 0 exactly the free value
+    mark: NDArray[np.int32]  # positive evidence beside the hit, 0 elsewhere
+    hit: NDArray[np.int32]  # (rows,) evidence of the cell that holds the measured point
+    columns_per_metre: NDArray[np.float32]  # (rows,) table columns one metre spans
+    reach: NDArray[np.float32]  # (rows,) half width of the table in metres
+    safe: NDArray[np.float32]  # (rows + 1,) nearest z that any later row does not call wholly free
+    rows_per_metre: np.float32
+    free: np.int32  # evidence far before a measurement
+    marks: bool  # whether there is any positive evidence beside the hit
+
+
+class View(NamedTuple):
+    """A camera at its pose, in metres relative to the corner of the block it stands in."""
+
+    rotation: NDArray[np.float32]  # (3, 3) world to camera
+    position: NDArray[np.float32]  # (3,) of the camera, from the corner of its block
+    columns: NDArray[np.float32]  # (width,) x/z of pixel columns
+    rows: NDArray[np.float32]  # (height,) y/z of pixel rows
+    intrinsics: NDArray[np.float32]  # fx, fy, cx, cy
+    width: np.int32
+    height: np.int32
+    voxel_size: np.float32
+    max_range: np.float32
+    spread: np.float32  # window tile size in pixels times depth
+    rim: np.float32  # border within which cells count as seen, pixels times depth
+    steps: NDArray[np.float32]  # (3, 512) fx * x, fy * y and z of a block's cells from its corner, camera axes
+
+
+def kernel_table(table: SensorTable, max_range: float) -> KernelTable:
+    """Return `table` as kernels read it."""
+    units = to_units(table.log_odds)
+    clear, mark = np.minimum(units, 0), np.maximum(units, 0)
+    free = int(to_units(table.log_odds[:, 0].mean()))
+    clear[:, 0] = free
+    reach = REACH_SIGMA * table.sigma
+    edges = np.arange(len(reach)) / table.rows_per_metre
+    safe = np.append(np.minimum.accumulate((edges - reach)[::-1])[::-1], max_range)
+    return KernelTable(
+        clear.ravel(),
+        mark.ravel(),
+        to_units(table.hit),
+        (COLUMNS / (2 * reach)).astype(np.float32),
+        reach.astype(np.float32),
+        safe.astype(np.float32),
+        np.float32(table.rows_per_metre),
+        np.int32(free),
+        bool((mark > 0).any()),
+    )
+
+
+def origin_block(T_world_camera: Transform, voxel_size: float) -> NDArray[np.int64]:
+    """Return the block (3,) the camera stands in; kernels count blocks and metres from there to keep float32 exact."""
+    return np.floor(T_world_camera[:3, 3] / (SIDE * voxel_size)).astype(np.int64)
+
+
+def view_of(image: DepthImage, voxel_size: float, max_range: float) -> View:
+    """Return the kernel view of a depth image's camera and pose."""
+    camera, T = image.camera, image.T_world_sensor
+    corner = origin_block(T, voxel_size) * (SIDE * voxel_size)
+    columns, rows = camera.ray_slopes()
+    return View(
+        np.ascontiguousarray(T[:3, :3].T, np.float32),
+        (T[:3, 3] - corner).astype(np.float32),
+        columns,
+        rows,
+        np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32),
+        np.int32(camera.width),
+        np.int32(camera.height),
+        np.float32(voxel_size),
+        np.float32(max_range),
+        np.float32(WINDOW_SHARE * camera.fx * voxel_size),
+        np.float32(RIM_SHARE * camera.fx * voxel_size),
+        _cell_steps(camera, T, voxel_size),
+    )
+
+
+def _cell_steps(camera: PinholeCamera, T: Transform, voxel_size: float) -> NDArray[np.float32]:
+    cells = np.stack(np.meshgrid(*[np.arange(SIDE)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    steps = ((cells + 0.5) * voxel_size) @ T[:3, :3]
+    return np.ascontiguousarray((steps * [camera.fx, camera.fy, 1.0]).T, np.float32)

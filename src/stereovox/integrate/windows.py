@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Window images of a depth image, made anew for each frame in memory that stays."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.cameras import PinholeCamera
+from stereovox.integrate import _windows
+
+LEVELS = 9
+"""Windows of one pixel, and of three tiles of 1 to 128 pixels."""
+
+
+class Windows(NamedTuple):
+    """All window images in flat arrays; see `_windows.py`."""
+
+    image: NDArray[np.float32]
+    offset: NDArray[np.int32]  # (levels,) where each level starts in `image`
+    width: NDArray[np.int32]  # (levels,) columns of each level
+    shape: NDArray[np.int32]  # (levels, 2) rows and columns
+    lows: NDArray[np.float32]
+    highs: NDArray[np.float32]
+    tile_offset: NDArray[np.int32]  # (levels, 2) where tiles of 16 and of 64 start
+    tile_width: NDArray[np.int32]  # (levels, 2) tiles in a row
+    first: np.int32  # lowest level that is filled
+
+
+class WindowBuilder:
+    """Keeps the memory for one camera's window images and fills it for each depth image."""
+
+    def __init__(self, camera: PinholeCamera):
+        h, w = camera.height, camera.width
+        strides = np.array([1] + [1 << level for level in range(LEVELS - 1)])
+        self._shape = np.stack([-(-h // strides), -(-w // strides)], axis=1).astype(np.int32)
+        sizes = self._shape.prod(axis=1)
+        self._offset = _starts(sizes)
+        tiles = np.stack([-(-self._shape // 16), -(-self._shape // 64)], axis=1)
+        self._tile_offset = _starts(tiles.prod(axis=2).ravel()).reshape(LEVELS, 2)
+        self._tile_width = np.ascontiguousarray(tiles[:, :, 1], np.int32)
+        self._image = np.zeros(sizes.sum(), np.float32)
+        self._base = np.zeros(sizes.sum(), np.float32)
+        self._row = np.zeros(w, np.float32)
+        self._lows, self._highs = np.zeros((2, tiles.prod(axis=2).sum()), np.float32)
+        self.nearest = tuple(np.zeros((-(-h // size), -(-w // size)), np.float32) for size in (16, 64))
+        self.depths = self._image[: h * w].reshape(h, w)
+
+    def load(self, depth_m: NDArray[np.float32]) -> float:
+        """Take in a REP 117 depth image; return its farthest depth (`NO_RETURN` where a pixel saw nothing)."""
+        return _windows.load(depth_m.reshape(-1), self.depths.reshape(-1))
+
+    def build(self, smallest_tile: float) -> Windows:
+        """Fill all levels whose tiles are at least about `smallest_tile` pixels and return them."""
+        first = int(np.clip(np.floor(np.log2(max(smallest_tile, 1e-9))) + 2, 0, LEVELS - 1))
+        _windows.build(
+            self._base, self._image, self._row, self._lows, self._highs,
+            self._shape, self._offset, self._offset, self._tile_offset, self._tile_width, first,
+        )  # fmt: skip
+        return Windows(
+            self._image, self._offset, self._shape[:, 1].copy(), self._shape, self._lows, self._highs,
+            self._tile_offset, self._tile_width, np.int32(first),
+        )  # fmt: skip
+
+    def build_nearest(self) -> None:
+        """Fill `nearest`, for sensor models that mark cells beside the hit."""
+        h, w = self.depths.shape
+        _windows.nearest_tiles(self.depths.reshape(-1), h, w, self.nearest[0].reshape(-1), self.nearest[1].reshape(-1))
+
+
+def _starts(sizes: NDArray[np.int64]) -> NDArray[np.int32]:
+    return np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.int32)

@@ -1,0 +1,44 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Inverse sensor models: what a measured depth says about a point before, at or behind it. Plain NumPy."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from typing import Any
+
+from stereovox import registry
+from stereovox.config import SensorConfig
+from stereovox.errors import ConfigError, did_you_mean
+from stereovox.sensors.model import InverseSensorModel
+
+SENSORS = {
+    "stereo": "stereovox.sensors.stereo:Stereo",
+    "andert": "stereovox.sensors.andert:Andert",
+    "valenti": "stereovox.sensors.valenti:Valenti",
+    "constant": "stereovox.sensors.constant:Constant",
+}
+
+
+def make_sensor(config: SensorConfig) -> InverseSensorModel:
+    """Return the model that `config` names, made with its parameters. Raises ConfigError, one line."""
+    model = registry.find("sensors", SENSORS, config.model)
+    parameters = config.parameters()
+    known = {field.name for field in fields(model)}
+    for name, value in parameters.items():
+        if name not in known:
+            raise ConfigError(f"sensor.{name}: unknown for model '{config.model}'{did_you_mean(name, known)}")
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise ConfigError(f"sensor.{name} {value!r}: must be a number")
+    return _checked(model(**parameters), config.model)
+
+
+def _checked(model: Any, name: str) -> InverseSensorModel:
+    for field in fields(model):
+        value = getattr(model, field.name)
+        if field.name.startswith("p_") and not 0 < value < 1:
+            raise ConfigError(f"sensor.{field.name} {value}: a probability must lie between 0 and 1, both excluded")
+        if not value > 0:
+            raise ConfigError(f"sensor.{field.name} {value}: must be greater than 0")
+    if not model.p_free < model.p_unknown:
+        raise ConfigError(f"sensor: p_free {model.p_free} must be smaller than p_unknown {model.p_unknown} ({name})")
+    return model

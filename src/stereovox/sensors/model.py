@@ -1,0 +1,85 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What an inverse sensor model is, and how it becomes the table that kernels read."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.sensors.noise import RangeNoise
+
+Array = NDArray[np.float64]
+
+ROWS = 128
+"""Table rows: measured depths from 0 to the maximum range."""
+COLUMNS = 128
+"""Table columns: distances from the measurement. Even, so that no column stands exactly on the measurement."""
+REACH_SIGMA = 4.0
+"""The table ends this many sigma before and behind the measurement; beyond it the model is p_free or p_unknown."""
+
+
+class InverseSensorModel(Protocol):
+    """A sensor model: a dataclass of numbers with one function. Write one in plain NumPy and register it.
+
+    `p_free` is what the model says far before a measurement, `p_unknown` what it says far behind one.
+    """
+
+    @property
+    def p_free(self) -> float:
+        """Probability of occupancy far before a measurement."""
+        ...
+
+    @property
+    def p_unknown(self) -> float:
+        """Probability of occupancy far behind a measurement."""
+        ...
+
+    def probability(self, z: Array, z_measured: Array, sigma: Array) -> Array:
+        """Return p(occupied) of points at depth `z` on a ray that measured `z_measured` with noise `sigma`.
+
+        All in metres along the ray's depth axis, any shapes that broadcast. Strictly inside (0, 1).
+        """
+        ...
+
+
+@dataclass(frozen=True, eq=False)
+class SensorTable:
+    """A sensor model as numbers.
+
+    log_odds: (ROWS, COLUMNS) of a point at `z = z_measured + offset_sigma[column] * sigma[row]`, p_unknown counting as 0.
+    hit: (ROWS,) log-odds of the cell that holds the measured point.
+    sigma: (ROWS,) noise in metres; row r stands for measured depths around `(r + 0.5) / rows_per_metre`.
+    """
+
+    log_odds: Array
+    hit: Array
+    sigma: Array
+    rows_per_metre: float
+
+
+def tabulate(model: InverseSensorModel, noise: RangeNoise, max_range: float) -> SensorTable:
+    """Return `model` as a table for measured depths up to `max_range` metres.
+
+    Evidence is log(p / (1 - p)) less that of p_unknown (Valenti 2018, Eq 6.2: the prior is not counted twice).
+    Raises ValueError when the model leaves (0, 1).
+    """
+    z_measured = (np.arange(ROWS) + 0.5) * (max_range / ROWS)
+    sigma = np.maximum(noise.sigma(z_measured), 1e-6)
+    z = z_measured[:, None] + offset_sigma() * sigma[:, None]
+    log_odds = _log_odds(model, model.probability(z, z_measured[:, None], sigma[:, None]))
+    hit = _log_odds(model, model.probability(z_measured, z_measured, sigma))
+    return SensorTable(log_odds, hit, sigma, ROWS / max_range)
+
+
+def offset_sigma() -> Array:
+    """Return the distance (COLUMNS,) of each table column from the measurement, in sigma."""
+    return ((np.arange(COLUMNS) + 0.5) / COLUMNS * 2 - 1) * REACH_SIGMA
+
+
+def _log_odds(model: InverseSensorModel, p: Array) -> Array:
+    if not ((p > 0) & (p < 1)).all():
+        raise ValueError(f"{type(model).__name__}.probability must stay strictly inside (0, 1)")
+    return np.log(p / (1 - p)) - np.log(model.p_unknown / (1 - model.p_unknown))

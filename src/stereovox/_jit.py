@@ -17,6 +17,7 @@ from typing import Any, TypeVar
 
 import numba
 from numba import config as numba_config
+from numba.core.compiler import CompilerBase, DefaultPassBuilder
 
 FAST_MATH = {"nsz", "arcp", "contract", "afn", "reassoc"}
 """Without `nnan` and `ninf`: depth images hold NaN and infinity."""
@@ -24,14 +25,25 @@ FAST_MATH = {"nsz", "arcp", "contract", "afn", "reassoc"}
 F = TypeVar("F", bound=Callable[..., Any])
 
 
+class _NoAlias(CompilerBase):
+    """Numba's pipeline with the promise that array arguments do not overlap; without it no gather is vectorised."""
+
+    def define_pipelines(self) -> list[Any]:
+        self.state.flags.noalias = True
+        return [DefaultPassBuilder.define_nopython_pipeline(self.state)]
+
+
 def kernel(function: F) -> F:
-    """Compile `function` to machine code that releases the GIL and is cached on disk."""
-    return _compile(function, fastmath=FAST_MATH, nogil=True)
+    """Compile `function` to machine code that releases the GIL and is cached on disk.
+
+    An array that a kernel writes to must not overlap another array it is given.
+    """
+    return _compile(function)
 
 
 def cell(function: F) -> F:
-    """Compile a small scalar function that kernels call and that is inlined into them."""
-    return _compile(function, fastmath=FAST_MATH, nogil=True, inline="never")
+    """Compile a small function that becomes part of every kernel that calls it."""
+    return _compile(function, forceinline=True)
 
 
 @lru_cache
@@ -45,12 +57,15 @@ def cache_folder() -> Path | None:
     return None
 
 
-def _compile(function: F, **flags: Any) -> F:
+def _compile(function: F, **options: Any) -> F:
     folder = cache_folder()
     before = numba_config.CACHE_DIR
     numba_config.CACHE_DIR = str(folder or "")
     try:
-        return numba.njit(function, cache=folder is not None, error_model="numpy", **flags)
+        return numba.njit(
+            function, cache=folder is not None, error_model="numpy", fastmath=FAST_MATH, nogil=True,
+            pipeline_class=_NoAlias, **options,
+        )  # fmt: skip
     finally:
         numba_config.CACHE_DIR = before
 

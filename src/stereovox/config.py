@@ -11,7 +11,7 @@ import tomllib
 from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -47,6 +47,12 @@ class SensorConfig(BaseModel):
         return dict(self.model_extra or {})
 
 
+class RayConfig(_Section):
+    """How rays of one frame share a cell: `every` ray adds its weighted part, or the cell changes `once` a frame."""
+
+    update: Literal["every", "once"] = "every"
+
+
 class MapConfig(_Section):
     """Clamping range of a cell's log-odds, and the probabilities that tell the states apart."""
 
@@ -75,6 +81,7 @@ class Config(_Section):
     sensor: SensorConfig = SensorConfig()
     noise: NoiseConfig = NoiseConfig()
     map: MapConfig = MapConfig()
+    ray: RayConfig = RayConfig()
 
     @model_validator(mode="after")
     def _ordered(self) -> Config:

@@ -27,9 +27,21 @@ def table_row(depth, rows_per_metre, rows):
 
 
 @cell
+def bits_of(x):
+    """Return the bits of a float32 as int32; for numbers that are not negative they order like the numbers."""
+    return np.float32(x).view(np.int32)
+
+
+@cell
+def float_of(bits):
+    """Return the float32 with these int32 bits."""
+    return np.int32(bits).view(np.float32)
+
+
+@cell
 def window_level(spread):
     """Return which window image serves a cell: 0 for the pixel itself, l for 3x3 tiles of 2^(l-1) pixels.
 
     `spread` is the wanted tile size in pixels; the binary exponent of a float32 is its logarithm rounded down.
     """
-    return (np.float32(spread).view(np.int32) >> np.int32(23)) - np.int32(125)
+    return (bits_of(spread) >> np.int32(23)) - np.int32(125)

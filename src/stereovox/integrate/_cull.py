@@ -21,75 +21,65 @@ def candidates(view, table, windows, nearest, low, high, hit_table, hit_coords, 
     low, high: (3,) first and last coarse box, counted in coarse boxes from the camera's block. A free block that
     holds a hit is listed as mixed. free, mixed: (capacity, 3) int32 block coordinates from the camera's block.
     """
-    side = np.float32(8) * view.voxel_size
-    coarse_half = (np.float32(4 * COARSE) - HALF) * view.voxel_size
-    block_half = (np.float32(4) - HALF) * view.voxel_size
     n_free, n_mixed = 0, 0
     for bx in range(low[0] * COARSE, (high[0] + 1) * COARSE, COARSE):
         for by in range(low[1] * COARSE, (high[1] + 1) * COARSE, COARSE):
             for bz in range(low[2] * COARSE, (high[2] + 1) * COARSE, COARSE):
-                middle = np.float32(COARSE) * HALF
-                coarse = _classify(
-                    view, table, windows, nearest, 1, coarse_half,
-                    (bx + middle) * side, (by + middle) * side, (bz + middle) * side,
-                )  # fmt: skip
+                coarse = _classify(view, table, windows, nearest, 1, COARSE, bx, by, bz)
                 if coarse == SKIP:
                     continue
-                for x in range(bx, bx + COARSE):
-                    for y in range(by, by + COARSE):
-                        for z in range(bz, bz + COARSE):
-                            kind = coarse
-                            if kind == MIXED:
-                                kind = _classify(
-                                    view, table, windows, nearest, 0, block_half,
-                                    (x + HALF) * side, (y + HALF) * side, (z + HALF) * side,
-                                )  # fmt: skip
-                            if kind == SKIP:
-                                continue
-                            if kind == FREE and find(hit_table, hit_coords, x, y, z) < 0:
-                                free[n_free, 0], free[n_free, 1], free[n_free, 2] = x, y, z
-                                n_free += 1
-                            else:
-                                mixed[n_mixed, 0], mixed[n_mixed, 1], mixed[n_mixed, 2] = x, y, z
-                                n_mixed += 1
+                for i in range(COARSE**3):
+                    x, y, z = bx + (i >> 4), by + ((i >> 2) & 3), bz + (i & 3)
+                    kind = coarse
+                    if kind == MIXED:
+                        kind = _classify(view, table, windows, nearest, 0, 1, x, y, z)
+                    if kind == SKIP:
+                        continue
+                    if kind == FREE and find(hit_table, hit_coords, x, y, z) < 0:
+                        free[n_free, 0], free[n_free, 1], free[n_free, 2] = x, y, z
+                        n_free += 1
+                    else:
+                        mixed[n_mixed, 0], mixed[n_mixed, 1], mixed[n_mixed, 2] = x, y, z
+                        n_mixed += 1
     return n_free, n_mixed
 
 
 @cell
-def _classify(view, table, windows, nearest, tile, half, wx, wy, wz):
-    """Tell whether all cells with centres within `half` of (wx, wy, wz) are free (FREE), untouched (SKIP) or neither.
+def _classify(view, table, windows, nearest, tile, blocks, bx, by, bz):
+    """Tell whether all cells of a box are free (FREE), untouched (SKIP) or neither (MIXED).
 
+    The box is `blocks` blocks wide and starts at block (bx, by, bz); only the centres of its cells count.
     tile: 0 to look at tiles of 16 pixels (blocks), 1 for 64 (coarse boxes).
     """
+    side = np.float32(8) * view.voxel_size
+    half = (np.float32(4 * blocks) - HALF) * view.voxel_size
+    middle = np.float32(blocks) * HALF
+    px = (bx + middle) * side - view.position[0]
+    py = (by + middle) * side - view.position[1]
+    pz = (bz + middle) * side - view.position[2]
     R = view.rotation
-    px, py, pz = wx - view.position[0], wy - view.position[1], wz - view.position[2]
     z = R[2, 0] * px + R[2, 1] * py + R[2, 2] * pz
-    ez = half * (abs(R[2, 0]) + abs(R[2, 1]) + abs(R[2, 2]))
+    ez = half * view.extent[2]
     z_low, z_high = z - ez, z + ez
-    if z_high <= NEAR_PLANE or z_low > view.max_range:
+    if z_high <= NEAR_PLANE or z_low > view.max_range or _outside(view, half, px, py, pz):
         return SKIP
     if z_low <= NEAR_PLANE:
         return MIXED
     x = R[0, 0] * px + R[0, 1] * py + R[0, 2] * pz
     y = R[1, 0] * px + R[1, 1] * py + R[1, 2] * pz
-    ex = half * (abs(R[0, 0]) + abs(R[0, 1]) + abs(R[0, 2]))
-    ey = half * (abs(R[1, 0]) + abs(R[1, 1]) + abs(R[1, 2]))
+    ex, ey = half * view.extent[0], half * view.extent[1]
     near, far = ONE / z_low, ONE / z_high
     u_low = view.intrinsics[0] * (x - ex) * (near if x < ex else far) + view.intrinsics[2] - SLACK
     u_high = view.intrinsics[0] * (x + ex) * (near if x > -ex else far) + view.intrinsics[2] + SLACK
     v_low = view.intrinsics[1] * (y - ey) * (near if y < ey else far) + view.intrinsics[3] - SLACK
     v_high = view.intrinsics[1] * (y + ey) * (near if y > -ey else far) + view.intrinsics[3] + SLACK
-    rim = view.rim * near + HALF + SLACK
     right, bottom = np.float32(view.width - 1), np.float32(view.height - 1)
-    if u_high < -rim or v_high < -rim or u_low > right + rim or v_low > bottom + rim:
-        return SKIP
     u0, u1 = _pixel(u_low, right), _pixel(u_high, right)
     v0, v1 = _pixel(v_low, bottom), _pixel(v_high, bottom)
     last = windows.shape.shape[0] - 1
     level = min(max(window_level(view.spread * near), windows.first), last)
     farthest = _extreme(windows, windows.highs, level, tile, u0, u1, v0, v1, True)
-    behind = table.reach[table_row(min(farthest, view.max_range), table.rows_per_metre, table.hit.size)] if table.marks else ZERO
-    if z_low > (farthest + behind) * (ONE + SLACK):
+    if z_low > (farthest + _behind(table, farthest, view.max_range)) * (ONE + SLACK):
         return SKIP
     whole = u_low >= -HALF and v_low >= -HALF and u_high <= right + HALF and v_high <= bottom + HALF
     if not whole or z_high > view.max_range:
@@ -99,6 +89,25 @@ def _classify(view, table, windows, nearest, tile, half, wx, wy, wz):
     if table.marks:
         closest = min(closest, _nearest(nearest, tile, u0, u1, v0, v1))
     return FREE if z_high < _clear_to(table, closest) * (ONE - SLACK) else MIXED
+
+
+@cell
+def _outside(view, half, px, py, pz):
+    """Tell whether a box of half width `half` about (px, py, pz) lies wholly beyond one side of the image."""
+    for side in range(4):
+        plane = view.sides[side]
+        height = plane[0] * px + plane[1] * py + plane[2] * pz + half * plane[3] + plane[4]
+        if height < ZERO:
+            return True
+    return False
+
+
+@cell
+def _behind(table, farthest, max_range):
+    """Return how far behind a measurement the sensor model still marks cells."""
+    if not table.marks:
+        return ZERO
+    return table.reach[table_row(min(farthest, max_range), table.rows_per_metre, table.hit.size)]
 
 
 @cell

@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernel that scatters measured points into their cells."""
+"""Kernel that scatters measured points into their cells.
+
+Most pixels fall into the cell of their left or upper neighbour. Each pixel's cell is packed into one number, and only
+pixels whose number differs from both neighbours' are looked at further; groups without any cost one test.
+"""
 
 import numpy as np
 
@@ -7,80 +11,95 @@ from stereovox._jit import cell, kernel
 from stereovox.integrate._cells import NO_RETURN, ZERO, table_row
 from stereovox.maps._cells import find_or_insert
 
-GROUP = 32
-"""Pixels looked at together: most groups hold no new cell and cost one test."""
-OFFSET = np.int64(1 << 18)
-"""Added to cell indices so that a packed key has no negative part; cells lie within this many of the camera."""
-NO_KEY = np.int64(-1)
-WITHIN_BLOCK = np.int64((7 << 45) | (7 << 26) | 0x3FF)
-"""Bits of a packed key that tell cells of one block apart: the low three of x, y and z, and the table row."""
+GROUP = 8
+"""Pixels tested together, as one 64-bit word of eight flags."""
+NOTHING = -1
+"""Key of a pixel without a measurement."""
+NARROW = 10
+"""Bits for each cell coordinate in an int32 key, which has no room for the table row."""
+WIDE = 19
+"""Bits for each cell coordinate in an int64 key."""
+ROW_BITS = 7
+"""Bits for the table row in an int64 key."""
 
 
 @kernel
-def scatter(z, view, table, keys, pool_table, coords, count, values, first_row, last_row):
+def scatter(z, view, table, keys, news, pool_table, coords, count, values, first_row, last_row):
     """Give every cell that holds a measured point its hit evidence; return False when the block pool is full.
 
-    z: (h, w) depths, 0 none; keys: (2, w) int64 scratch. Blocks count from the camera's own. A pixel whose cell and
-    table row equal those of its left or upper neighbour brings nothing new and is skipped.
+    z: (h, w) depths, 0 none. keys: (2, 1 + w rounded up to GROUP) scratch; int32 serves cells within 2^9 of the
+    camera when `table.hit` is one number for all depths, int64 the rest. news: (w rounded up) uint8 scratch. Blocks count from the camera's own.
     """
-    room = True
     size = np.float32(1) / view.voxel_size
-    rotation, position = view.rotation, view.position * size
-    last_block = NO_KEY
-    place = np.int64(-1)
-    keys[:, :] = NO_KEY
+    position = view.position * size
+    last, place = (np.int32(0), np.int32(0), np.int32(0)), np.int64(-1)
+    rows = table.hit.size
+    keys[:, :] = NOTHING
     for v in range(first_row, last_row):
         now, before = keys[v & 1], keys[1 - (v & 1)]
-        _row_keys(z[v], view.columns, view.rows[v], rotation, position, size, table, now)
-        for start in range(0, z.shape[1], GROUP):
-            stop = min(start + GROUP, z.shape[1])
-            news = now[start] != before[start]
-            for u in range(max(start, 1), stop):
-                news |= (now[u] != before[u]) & (now[u] != now[u - 1])
-            if not news:
+        ray = _row_rays(view.rotation, view.rows[v], size)
+        _row_keys(z[v], view.columns, ray, position, table, now[1:])
+        _mark_news(now[1:], now[:-1], before[1:], news)
+        groups = news.view(np.uint64)
+        for group in range(groups.size):
+            if groups[group] == 0:
                 continue
-            for u in range(start, stop):
-                key = now[u]
-                if key < 0 or key == before[u] or (u > 0 and key == now[u - 1]):
+            for u in range(GROUP * group, GROUP * group + GROUP):
+                if news[u] == 0:
                     continue
-                block = key & ~WITHIN_BLOCK
-                x, y, zz = key_cell(key)
-                if block != last_block:
-                    place = find_or_insert(pool_table, coords, count, x >> 3, y >> 3, zz >> 3)
-                    last_block = block
+                d = z[v, u]
+                x, y, zz = _point_cell(d, view.columns[u], ray, position)
+                block = (x >> 3, y >> 3, zz >> 3)
+                if place < 0 or block != last:
+                    place = find_or_insert(pool_table, coords, count, block[0], block[1], block[2])
+                    last = block
                 if place < 0:
-                    room = False
-                    last_block = NO_KEY
-                    continue
+                    return False
                 c = ((x & 7) << 6) | ((y & 7) << 3) | (zz & 7)
-                hit = table.hit[key & 127]
+                hit = table.hit[table_row(d, table.rows_per_metre, rows)]
                 values[place, c] = max(np.int32(values[place, c]), hit)
-    return room
+    return True
 
 
 @cell
-def key_cell(key):
-    """Return the cell of a packed key."""
+def _row_rays(rotation, slope, size):
+    """Return, in cells, how the world point of a pixel of this row at depth 1 depends on its x/z: slope and offset."""
     return (
-        np.int32(((key >> 45) & 0x7FFFF) - OFFSET),
-        np.int32(((key >> 26) & 0x7FFFF) - OFFSET),
-        np.int32(((key >> 7) & 0x7FFFF) - OFFSET),
+        rotation[0, 0] * size, (rotation[1, 0] * slope + rotation[2, 0]) * size,
+        rotation[0, 1] * size, (rotation[1, 1] * slope + rotation[2, 1]) * size,
+        rotation[0, 2] * size, (rotation[1, 2] * slope + rotation[2, 2]) * size,
+    )  # fmt: skip
+
+
+@cell
+def _point_cell(d, column, ray, position):
+    """Return the cell that holds the point at depth `d` of the pixel with x/z `column`."""
+    return (
+        np.int32(np.floor(d * (ray[0] * column + ray[1]) + position[0])),
+        np.int32(np.floor(d * (ray[2] * column + ray[3]) + position[1])),
+        np.int32(np.floor(d * (ray[4] * column + ray[5]) + position[2])),
     )
 
 
 @cell
-def _row_keys(depths, columns, slope, rotation, position, size, table, keys):
-    ax, ay, az = rotation[0, 0] * size, rotation[0, 1] * size, rotation[0, 2] * size
-    bx = (rotation[1, 0] * slope + rotation[2, 0]) * size
-    by = (rotation[1, 1] * slope + rotation[2, 1]) * size
-    bz = (rotation[1, 2] * slope + rotation[2, 2]) * size
-    px, py, pz = position[0], position[1], position[2]
+def _row_keys(depths, columns, ray, position, table, keys):
+    wide = keys.itemsize == 8
+    bits, row_bits = (WIDE, ROW_BITS) if wide else (NARROW, 0)
+    middle = np.int32(1 << (bits - 1))
     rows = table.hit.size
+    whole = keys.dtype.type
     for u in range(depths.size):
         d = depths[u]
-        x = np.int64(np.int32(np.floor(d * (ax * columns[u] + bx) + px)))
-        y = np.int64(np.int32(np.floor(d * (ay * columns[u] + by) + py)))
-        z = np.int64(np.int32(np.floor(d * (az * columns[u] + bz) + pz)))
-        row = np.int64(table_row(d, table.rows_per_metre, rows))
-        key = ((x + OFFSET) << 45) | ((y + OFFSET) << 26) | ((z + OFFSET) << 7) | row
-        keys[u] = key if (d > ZERO) & (d < NO_RETURN) else NO_KEY
+        x, y, z = _point_cell(d, columns[u], ray, position)
+        key = (whole(x + middle) << whole(2 * bits)) | (whole(y + middle) << whole(bits)) | whole(z + middle)
+        row = table_row(d, table.rows_per_metre, rows)
+        key = (key << whole(row_bits)) | whole(row if wide else 0)
+        keys[u] = key if (d > ZERO) & (d < NO_RETURN) else whole(NOTHING)
+
+
+@cell
+def _mark_news(now, left, above, news):
+    """Set `news` where a pixel holds a measurement and its key differs from that of its left and its upper neighbour."""
+    for u in range(news.size):
+        fresh = (now[u] != above[u]) & (now[u] != left[u]) & (now[u] != NOTHING)
+        news[u] = np.uint8(fresh)

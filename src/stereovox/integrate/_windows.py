@@ -9,32 +9,32 @@ own pixels. No value is 0, so it is the nearest of all and never clears anything
 import numpy as np
 
 from stereovox._jit import cell, kernel
-from stereovox.integrate._cells import NO_RETURN, ZERO
+from stereovox.integrate._cells import NO_RETURN, ZERO, bits_of, float_of
 
 
 @kernel
 def load(depth_m, z):
     """Copy a REP 117 depth image to `z`: no value becomes 0, too far NO_RETURN; return the farthest."""
-    farthest = ZERO
+    farthest = np.int32(0)
     for i in range(depth_m.size):
         d = depth_m[i]
         d = d if d > ZERO else ZERO
         d = d if d < NO_RETURN else NO_RETURN
         z[i] = d
-        farthest = d if d > farthest else farthest
-    return farthest
+        farthest = max(farthest, bits_of(d))  # a maximum of whole numbers vectorises, one of floats does not
+    return float_of(farthest)
 
 
 @kernel
-def build(base, window, row, lows, highs, shape, offset, base_offset, tile_offset, tile_width, first):
+def build(base, window, row, low_row, lows, highs, shape, offset, base_offset, tile_offset, tile_width, first):
     """Fill window images and tiles of all levels from `first` on.
 
     window: flat images of all levels, level l from offset[l] on with shape[l] rows and columns; level 0 is already
-    loaded. base: scratch for the images before dilation; row: scratch of one row.
+    loaded. base: scratch for the images before dilation; row, low_row: scratch of one row.
     lows, highs: flat tile images, at tile_offset[level, 0] for tiles of 16 and [level, 1] for 64.
     """
     if first == 0:
-        _tiles(window[: shape[0, 0] * shape[0, 1]], lows, highs, shape[0], tile_offset[0], tile_width[0])
+        _tiles(window[: shape[0, 0] * shape[0, 1]], row, low_row, lows, highs, shape[0], tile_offset[0], tile_width[0])
     source, height, width = window, shape[0, 0], shape[0, 1]
     for level in range(1, shape.shape[0]):
         if level > 1:
@@ -44,7 +44,7 @@ def build(base, window, row, lows, highs, shape, offset, base_offset, tile_offse
         if level >= first:
             image = window[offset[level] : offset[level] + height * width]
             _dilate(source, height, width, image, row)
-            _tiles(image, lows, highs, shape[level], tile_offset[level], tile_width[level])
+            _tiles(image, row, low_row, lows, highs, shape[level], tile_offset[level], tile_width[level])
 
 
 @cell
@@ -77,27 +77,40 @@ def _dilate(source, height, width, target, row):
 
 
 @cell
-def _tiles(image, lows, highs, shape, tile_offset, tile_width):
+def _tiles(image, row, low_row, lows, highs, shape, tile_offset, tile_width):
     height, width = shape[0], shape[1]
-    tiles, wide = tile_width[0], tile_width[1]
-    low64 = lows[tile_offset[1] :]
-    high64 = highs[tile_offset[1] :]
-    for i in range(wide * ((height + 63) // 64)):
-        low64[i] = NO_RETURN
-        high64[i] = ZERO
+    _fill_big(lows, highs, tile_offset[1], tile_width[1] * ((height + 63) // 64))
     for tv in range((height + 15) // 16):
-        for tu in range(tiles):
+        _extremes_of_rows(image, 16 * tv, min(16 * tv + 16, height), width, row, low_row)
+        for tu in range(tile_width[0]):
             low, high = NO_RETURN, ZERO
-            for v in range(16 * tv, min(16 * tv + 16, height)):
-                line = image[v * width + 16 * tu : v * width + min(16 * tu + 16, width)]
-                for u in range(line.size):
-                    low = min(low, line[u])
-                    high = max(high, line[u])
-            lows[tile_offset[0] + tv * tiles + tu] = low
-            highs[tile_offset[0] + tv * tiles + tu] = high
-            big = (tv >> 2) * wide + (tu >> 2)
-            low64[big] = min(low64[big], low)
-            high64[big] = max(high64[big], high)
+            for u in range(16 * tu, min(16 * tu + 16, width)):
+                low = min(low, low_row[u])
+                high = max(high, row[u])
+            lows[tile_offset[0] + tv * tile_width[0] + tu] = low
+            highs[tile_offset[0] + tv * tile_width[0] + tu] = high
+            big = tile_offset[1] + (tv >> 2) * tile_width[1] + (tu >> 2)
+            lows[big] = min(lows[big], low)
+            highs[big] = max(highs[big], high)
+
+
+@cell
+def _fill_big(lows, highs, start, number):
+    for i in range(start, start + number):
+        lows[i] = NO_RETURN
+        highs[i] = ZERO
+
+
+@cell
+def _extremes_of_rows(image, first, last, width, high_row, low_row):
+    for u in range(width):
+        high_row[u] = ZERO
+        low_row[u] = NO_RETURN
+    for v in range(first, last):
+        line = image[v * width : (v + 1) * width]
+        for u in range(width):
+            high_row[u] = max(high_row[u], line[u])
+            low_row[u] = min(low_row[u], line[u])
 
 
 @kernel

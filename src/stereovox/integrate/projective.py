@@ -17,13 +17,11 @@ from stereovox.frame import DepthImage
 from stereovox.integrate import _cull, _evaluate, _hits
 from stereovox.integrate._cells import NEAR_PLANE, NO_RETURN
 from stereovox.integrate.shards import in_shards
-from stereovox.integrate.views import KernelTable, View, kernel_table, origin_block, view_of
+from stereovox.integrate.views import KernelTable, View, origin_block, sensor_table, view_of
 from stereovox.integrate.windows import WindowBuilder, Windows
 from stereovox.maps.blocks import CELLS, SIDE, BlockPool
 from stereovox.maps.evidence import Evidence
 from stereovox.sensors import make_sensor
-from stereovox.sensors.model import tabulate
-from stereovox.sensors.noise import RangeNoise
 
 
 class Projective:
@@ -54,13 +52,18 @@ class Projective:
     def _prepare(self, camera: PinholeCamera) -> None:
         if camera == self._camera:
             return
-        noise = RangeNoise.of(self._config.noise, camera)
-        self._table: KernelTable = kernel_table(
-            tabulate(self._sensor, noise, self._config.max_range), self._config.max_range
-        )
+        self._table: KernelTable = sensor_table(self._sensor, self._config, camera)
         self._builder = WindowBuilder(camera)
-        self._keys = np.zeros((2, camera.width), np.int64)
+        self._keys = self._key_rows(camera)
+        self._news = np.zeros(self._keys.shape[1] - 1, np.uint8)
         self._camera = camera
+
+    def _key_rows(self, camera: PinholeCamera) -> NDArray[np.int32] | NDArray[np.int64]:
+        """Return scratch for the keys of two pixel rows, of the narrowest kind that tells all cells apart."""
+        corner = np.hypot(1.0, np.hypot(*(np.abs(slopes).max() for slopes in camera.ray_slopes())))
+        cells = corner * self._config.max_range / self._config.voxel_size + SIDE
+        narrow = cells < 1 << (_hits.NARROW - 1) and (self._table.hit == self._table.hit[0]).all()
+        return np.zeros((2, 1 + _hits.GROUP * -(-camera.width // _hits.GROUP)), np.int32 if narrow else np.int64)
 
     def _end_of_view(self, farthest: float) -> float:
         """Return the depth in metres beyond which this image says nothing."""
@@ -74,7 +77,7 @@ class Projective:
         hits, z = self._hits, self._builder.depths
         hits.clear()
         while not _hits.scatter(
-            z, view, self._table, self._keys, hits.table, hits.coords, hits.count, hits.values, 0, z.shape[0]
+            z, view, self._table, self._keys, self._news, hits.table, hits.coords, hits.count, hits.values, 0, z.shape[0]
         ):
             hits.reserve(len(hits.coords))
 

@@ -10,13 +10,19 @@ from functools import lru_cache
 
 def in_shards(work: Callable[[slice], None], length: int, threads: int) -> None:
     """Call `work(part)` for `threads` slices that together cover range(length); the outcome must not depend on the cut."""
-    if threads == 1 or length < 2 * threads:
-        work(slice(0, length))
+    parts = shards(length, threads)
+    if len(parts) == 1:
+        work(parts[0])
         return
-    cuts = [length * i // threads for i in range(threads + 1)]
-    pending = [_pool(threads).submit(work, slice(a, b)) for a, b in zip(cuts[:-1], cuts[1:], strict=True)]
-    for future in pending:
+    for future in [_pool(threads).submit(work, part) for part in parts]:
         future.result()
+
+
+def shards(length: int, threads: int) -> list[slice]:
+    """Return slices of nearly equal size that cover range(length): one a thread, or just one where little is to do."""
+    if threads == 1 or length < 2 * threads:
+        return [slice(0, length)]
+    return [slice(length * i // threads, length * (i + 1) // threads) for i in range(threads)]
 
 
 @lru_cache

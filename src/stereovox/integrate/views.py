@@ -9,11 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.cameras import PinholeCamera
+from stereovox.config import Config
 from stereovox.frame import DepthImage
 from stereovox.geometry import Transform
 from stereovox.maps.blocks import SIDE
 from stereovox.maps.evidence import to_units
-from stereovox.sensors.model import COLUMNS, REACH_SIGMA, SensorTable
+from stereovox.sensors.model import COLUMNS, REACH_SIGMA, InverseSensorModel, SensorTable, tabulate
+from stereovox.sensors.noise import RangeNoise
 
 WINDOW_SHARE = 0.27
 """Tile size of a cell's window image over the cell's size in the image; a window is three tiles wide.
@@ -43,6 +45,8 @@ class View(NamedTuple):
 
     rotation: NDArray[np.float32]  # (3, 3) world to camera
     position: NDArray[np.float32]  # (3,) of the camera, from the corner of its block
+    extent: NDArray[np.float32]  # (3,) half width along x, y, z of the camera of a box of half width 1
+    sides: NDArray[np.float32]  # (4, 5) the image's sides as planes: normal, half width of a unit box, offset
     columns: NDArray[np.float32]  # (width,) x/z of pixel columns
     rows: NDArray[np.float32]  # (height,) y/z of pixel rows
     intrinsics: NDArray[np.float32]  # fx, fy, cx, cy
@@ -53,6 +57,11 @@ class View(NamedTuple):
     spread: np.float32  # window tile size in pixels times depth
     rim: np.float32  # border within which cells count as seen, pixels times depth
     steps: NDArray[np.float32]  # (3, 512) fx * x, fy * y and z of a block's cells from its corner, camera axes
+
+
+def sensor_table(sensor: InverseSensorModel, config: Config, camera: PinholeCamera) -> KernelTable:
+    """Return the kernel table of a sensor model for a camera with the configured noise."""
+    return kernel_table(tabulate(sensor, RangeNoise.of(config.noise, camera), config.max_range), config.max_range)
 
 
 def kernel_table(table: SensorTable, max_range: float) -> KernelTable:
@@ -85,11 +94,14 @@ def origin_block(T_world_camera: Transform, voxel_size: float) -> NDArray[np.int
 def view_of(image: DepthImage, voxel_size: float, max_range: float) -> View:
     """Return the kernel view of a depth image's camera and pose."""
     camera, T = image.camera, image.T_world_sensor
+    rim = RIM_SHARE * camera.fx * voxel_size
     corner = origin_block(T, voxel_size) * (SIDE * voxel_size)
     columns, rows = camera.ray_slopes()
     return View(
         np.ascontiguousarray(T[:3, :3].T, np.float32),
         (T[:3, 3] - corner).astype(np.float32),
+        np.abs(T[:3, :3]).sum(axis=0).astype(np.float32),
+        _sides(camera, T, rim),
         columns,
         rows,
         np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32),
@@ -98,9 +110,21 @@ def view_of(image: DepthImage, voxel_size: float, max_range: float) -> View:
         np.float32(voxel_size),
         np.float32(max_range),
         np.float32(WINDOW_SHARE * camera.fx * voxel_size),
-        np.float32(RIM_SHARE * camera.fx * voxel_size),
+        np.float32(rim),
         _cell_steps(camera, T, voxel_size),
     )
+
+
+def _sides(camera: PinholeCamera, T: Transform, rim: float) -> NDArray[np.float32]:
+    """A point counts as seen when fx x + (cx + 0.5) z + rim >= 0, and the like for the other three sides."""
+    right, bottom = camera.width - 0.5 - camera.cx, camera.height - 0.5 - camera.cy
+    inward = np.array(
+        [[camera.fx, 0, camera.cx + 0.5], [-camera.fx, 0, right], [0, camera.fy, camera.cy + 0.5], [0, -camera.fy, bottom]]
+    )
+    normals = inward @ T[:3, :3].T
+    unit_box = np.abs(normals).sum(axis=1, keepdims=True)
+    slack = 1e-3 * np.abs(inward).max()
+    return np.hstack([normals, unit_box, np.full((4, 1), rim + slack)]).astype(np.float32)
 
 
 def _cell_steps(camera: PinholeCamera, T: Transform, voxel_size: float) -> NDArray[np.float32]:

@@ -43,7 +43,7 @@ class WindowBuilder:
         self._tile_width = np.ascontiguousarray(tiles[:, :, 1], np.int32)
         self._image = np.zeros(sizes.sum(), np.float32)
         self._base = np.zeros(sizes.sum(), np.float32)
-        self._row = np.zeros(w, np.float32)
+        self._row, self._low_row = np.zeros((2, w), np.float32)
         self._lows, self._highs = np.zeros((2, tiles.prod(axis=2).sum()), np.float32)
         self.nearest = tuple(np.zeros((-(-h // size), -(-w // size)), np.float32) for size in (16, 64))
         self.depths = self._image[: h * w].reshape(h, w)
@@ -56,7 +56,7 @@ class WindowBuilder:
         """Fill all levels whose tiles are at least about `smallest_tile` pixels and return them."""
         first = int(np.clip(np.floor(np.log2(max(smallest_tile, 1e-9))) + 2, 0, LEVELS - 1))
         _windows.build(
-            self._base, self._image, self._row, self._lows, self._highs,
+            self._base, self._image, self._row, self._low_row, self._lows, self._highs,
             self._shape, self._offset, self._offset, self._tile_offset, self._tile_width, first,
         )  # fmt: skip
         return Windows(

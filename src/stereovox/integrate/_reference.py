@@ -1,0 +1,173 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Slow, obvious twins of the integrators in float64 NumPy. They share no code with the kernels.
+
+Both return evidence on cells as two arrays: indices (N, 3) int64 in ascending order, log-odds (N,) float64 without
+zeros. Tests compare the kernels with them, and them with OctoMap.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.config import Config
+from stereovox.frame import DepthImage
+from stereovox.sensors.model import COLUMNS, REACH_SIGMA, ROWS, InverseSensorModel, SensorTable, tabulate
+from stereovox.sensors.noise import RangeNoise
+
+WINDOW_SHARE, RIM_SHARE, NEAR_PLANE, LARGEST_LEVEL = 0.27, 0.35, 1e-3, 8
+
+Cells = tuple[NDArray[np.int64], NDArray[np.float64]]
+
+
+def cast_rays(image: DepthImage, config: Config, sensor: InverseSensorModel) -> Cells:
+    """Walk every pixel's ray through all grid planes it crosses; `config.ray.update` says how rays share a cell."""
+    table = _table(image, config, sensor)
+    indices, evidence, depths = zip(*_rays(image, config, table), strict=True)
+    indices, evidence, depths = np.concatenate(indices), np.concatenate(evidence), np.concatenate(depths)
+    if config.ray.update == "once":
+        return _strongest(indices, evidence)
+    weight = np.minimum(1.0, (depths / (image.camera.fx * config.voxel_size)) ** 2)  # Chien 2020, Eq 3.21
+    cells, of_cell = np.unique(indices, axis=0, return_inverse=True)
+    return _known(cells, np.bincount(of_cell.ravel(), weight * evidence))
+
+
+def project(image: DepthImage, config: Config, sensor: InverseSensorModel) -> Cells:
+    """Project every cell within range into the image.
+
+    Cells that hold a measured point get the hit evidence. Other cells get the positive evidence of the pixel at their
+    centre where there is any, else the negative evidence of the farthest pixel in a window about their own size.
+    """
+    table = _table(image, config, sensor)
+    hits, hit_evidence, _ = _hits(image, config, table)
+    cells = _cells_in_range(image, config)
+    pixels, z, size_px, seen = _projected(cells, image, config)
+    cells, pixels, z, size_px = cells[seen], pixels[seen], z[seen], size_px[seen]
+    clear = np.minimum(_look_up(table, z, _farthest_in_window(image, pixels, size_px), config), 0)
+    mark = np.maximum(_look_up(table, z, _at_centre(image, pixels), config), 0)
+    beside = np.where(mark > 0, mark, clear)
+    return _strongest(np.concatenate([hits, cells]), np.concatenate([hit_evidence, beside]))
+
+
+def _table(image: DepthImage, config: Config, sensor: InverseSensorModel) -> SensorTable:
+    table = tabulate(sensor, RangeNoise.of(config.noise, image.camera), config.max_range)
+    return replace(table, log_odds=np.round(table.log_odds, 3), hit=np.round(table.hit, 3))  # as a map keeps them
+
+
+def _rays(image: DepthImage, config: Config, table: SensorTable) -> Iterator[tuple[NDArray, NDArray, NDArray]]:
+    """Yield for each ray the cells it gives evidence to, that evidence, and the depth at the middle of each cell."""
+    slopes = image.camera.back_project(np.ones(image.depth_m.shape)).reshape(-1, 3)
+    T = image.T_world_sensor
+    marks = (table.log_odds > 0).any()
+    for d, slope in zip(image.depth_m.ravel().astype(float), slopes, strict=True):
+        if not d > 0:
+            continue
+        row = _row(table, min(d, config.max_range))
+        end = config.max_range if np.isinf(d) else d + (REACH_SIGMA * table.sigma[row] if marks else 0)
+        direction = T[:3, :3] @ slope
+        start = T[:3, 3] / config.voxel_size
+        cuts = np.concatenate([[0.0], _plane_crossings(start, direction / config.voxel_size, end), [end]])
+        middle = (cuts[:-1] + cuts[1:]) / 2
+        cells = np.floor(start + middle[:, None] * direction / config.voxel_size).astype(np.int64)
+        evidence = _look_up(table, middle, np.full(len(middle), d), config)
+        if np.isfinite(d):
+            hit = np.floor((T[:3, 3] + d * direction) / config.voxel_size).astype(np.int64)
+            others = (cells != hit).any(axis=1)
+            cells, evidence, middle = cells[others], evidence[others], middle[others]
+            cells, evidence, middle = np.vstack([cells, hit]), np.append(evidence, table.hit[row]), np.append(middle, d)
+        yield cells, evidence, middle
+
+
+def _plane_crossings(start: NDArray, direction: NDArray, end: float) -> NDArray:
+    """Return the sorted depths at which start + depth * direction meets whole numbers on any axis, below `end`."""
+    found = []
+    for s, step in zip(start, direction, strict=True):
+        if step != 0:
+            low, high = sorted((s, s + step * end))
+            found.append((np.arange(np.ceil(low), np.floor(high) + 1) - s) / step)
+    depths = np.sort(np.concatenate(found))
+    return depths[(depths > 0) & (depths < end)]
+
+
+def _hits(image: DepthImage, config: Config, table: SensorTable) -> tuple[NDArray, NDArray, NDArray]:
+    depth = image.depth_m.astype(float)
+    points = image.camera.back_project(depth)[np.isfinite(depth)]
+    world = points @ image.T_world_sensor[:3, :3].T + image.T_world_sensor[:3, 3]
+    d = points[:, 2]
+    return np.floor(world / config.voxel_size).astype(np.int64), table.hit[_row(table, d)], d
+
+
+def _cells_in_range(image: DepthImage, config: Config) -> NDArray[np.int64]:
+    reach = config.max_range * 1.1 * np.linalg.norm(image.camera.back_project(np.ones(image.depth_m.shape))[0, 0]) + 1
+    centre = image.T_world_sensor[:3, 3]
+    low, high = (np.floor((centre + side * reach) / config.voxel_size).astype(int) for side in (-1, 1))
+    return np.stack(np.meshgrid(*map(np.arange, low, high + 1), indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def _projected(cells: NDArray, image: DepthImage, config: Config) -> tuple[NDArray, NDArray, NDArray, NDArray]:
+    """Return pixel (N, 2) column and row, clipped to the image, depth and size in pixels of each cell, and whether seen."""
+    camera, T = image.camera, image.T_world_sensor
+    x, y, z = (((cells + 0.5) * config.voxel_size - T[:3, 3]) @ T[:3, :3]).T
+    ahead = (z > NEAR_PLANE) & (z <= config.max_range)
+    z_safe = np.where(ahead, z, 1.0)
+    size_px = camera.fx * config.voxel_size / z_safe
+    uv = np.stack([camera.fx * x / z_safe + camera.cx, camera.fy * y / z_safe + camera.cy], axis=1) + 0.5
+    rim, end = RIM_SHARE * size_px[:, None], [camera.width, camera.height]
+    seen = ahead & ((uv >= -rim) & (uv < end + rim)).all(axis=1)
+    return uv, z, size_px, seen
+
+
+def _farthest_in_window(image: DepthImage, uv: NDArray, size_px: NDArray) -> NDArray:
+    """Return the farthest depth (N,) in 3x3 tiles about the pixel; tiles of a power of two near 0.27 cell sizes.
+
+    Cells much smaller than a pixel take the pixel itself. Depths that see nothing are infinite; no value is 0.
+    """
+    depth = np.where(image.depth_m > 0, image.depth_m, 0).astype(float)
+    height, width = depth.shape
+    level = np.clip(np.floor(np.log2(WINDOW_SHARE * size_px)) + 2, 0, LARGEST_LEVEL).astype(int)
+    u, v = np.clip(uv[:, 0], 0, width - 1).astype(int), np.clip(uv[:, 1], 0, height - 1).astype(int)
+    farthest = depth[v, u]
+    for i in np.flatnonzero(level > 0):
+        tile = 1 << (level[i] - 1)
+        left, top = (u[i] // tile - 1) * tile, (v[i] // tile - 1) * tile
+        farthest[i] = depth[max(top, 0) : top + 3 * tile, max(left, 0) : left + 3 * tile].max()
+    return farthest
+
+
+def _at_centre(image: DepthImage, uv: NDArray) -> NDArray:
+    height, width = image.depth_m.shape
+    inside = (uv >= 0).all(axis=1) & (uv < [width, height]).all(axis=1)
+    u, v = np.where(inside[:, None], uv, 0).astype(int).T
+    return np.where(inside & np.isfinite(image.depth_m[v, u]), image.depth_m[v, u], 0).astype(float)
+
+
+def _look_up(table: SensorTable, z: NDArray, d: NDArray, config: Config) -> NDArray[np.float64]:
+    """Return the evidence (N,) at depth z on rays that measured d; nothing where d is 0."""
+    row = _row(table, np.minimum(d, config.max_range))
+    t = (z - d) / table.sigma[row]
+    column = np.floor((t / REACH_SIGMA + 1) / 2 * COLUMNS)
+    inside = np.clip(column, 0, COLUMNS - 1)
+    evidence = table.log_odds[row, np.where(np.isfinite(inside), inside, 0).astype(int)]
+    evidence = np.where(column < 1, table.log_odds[:, 0].mean(), evidence)
+    return np.where(d > 0, evidence, 0.0)
+
+
+def _row(table: SensorTable, d: NDArray | float) -> NDArray[np.int64]:
+    return np.minimum(np.asarray(d) * table.rows_per_metre, ROWS - 1).astype(int)
+
+
+def _strongest(indices: NDArray, evidence: NDArray) -> Cells:
+    """Keep for each cell its largest positive evidence, or without any its most negative."""
+    cells, of_cell = np.unique(indices, axis=0, return_inverse=True)
+    best, worst = np.zeros(len(cells)), np.zeros(len(cells))
+    np.maximum.at(best, of_cell.ravel(), evidence)
+    np.minimum.at(worst, of_cell.ravel(), evidence)
+    return _known(cells, np.where(best > 0, best, worst))
+
+
+def _known(cells: NDArray, evidence: NDArray) -> Cells:
+    known = np.abs(evidence) >= 0.0005
+    return cells[known], evidence[known]

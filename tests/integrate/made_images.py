@@ -1,0 +1,24 @@
+"""Depth images made for tests: slanted walls, thin things, holes, no returns."""
+
+import numpy as np
+
+from stereovox.cameras import PinholeCamera
+from stereovox.frame import DepthImage, Reason
+from stereovox.geometry import from_quaternion
+
+CAMERA = PinholeCamera(64, 48, 40.0, 40.0, 31.3, 23.8, 0.05)
+
+
+def made_image(seed: int, camera: PinholeCamera = CAMERA, far_share: float = 0.1) -> DepthImage:
+    """A slanted wall with a thin pole and a box before it, 10 % holes, a region without return, a random pose."""
+    rng = np.random.default_rng(seed)
+    v, u = np.mgrid[: camera.height, : camera.width] / [[[camera.height]], [[camera.width]]]
+    depth = 1.6 + rng.uniform(-1, 1) * u + rng.uniform(-0.5, 0.5) * v + 0.01 * rng.normal(size=u.shape)
+    depth[:, camera.width // 3] = 0.8
+    depth[camera.height // 2 :, camera.width // 2 : camera.width // 2 + 9] = 1.1
+    depth[: int(far_share * camera.height)] = np.inf
+    depth[rng.random(u.shape) < 0.1] = np.nan
+    depth[-3:, -6:] = np.nan
+    reason = np.select([np.isnan(depth), np.isinf(depth)], [Reason.UNMATCHED, Reason.TOO_FAR], Reason.VALID)
+    T = from_quaternion(rng.uniform(-20, 20, 3), rng.normal(size=4))
+    return DepthImage(depth.astype(np.float32), reason.astype(np.uint8), camera, T)

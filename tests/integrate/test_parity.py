@@ -1,0 +1,112 @@
+"""The ladder: NumPy reference = kernels on one thread = kernels on many threads."""
+
+import numpy as np
+import pytest
+from made_images import CAMERA, made_image
+
+from stereovox.cameras import PinholeCamera
+from stereovox.config import load_config
+from stereovox.integrate import _reference, make_integrator
+from stereovox.sensors import SENSORS, make_sensor
+
+SIZES = [0.4, 0.1, 0.05]
+
+
+def cells_of(evidence):
+    """Evidence as a dict from cell to thousandths."""
+    coords = np.concatenate([evidence.coords, evidence.uniform])
+    uniform = np.full((len(evidence.uniform), 512), evidence.uniform_value)
+    values = np.concatenate([evidence.values, uniform])
+    assert len(np.unique(coords, axis=0)) == len(coords), "a block stands in the evidence twice"
+    block, column = np.nonzero(values)
+    cells = coords[block] * 8 + np.stack([column >> 6, (column >> 3) & 7, column & 7], axis=1)
+    return dict(zip(map(tuple, cells.tolist()), values[block, column].tolist(), strict=True))
+
+
+def reference_of(reference, image, config):
+    cells, log_odds = reference(image, config, make_sensor(config.sensor))
+    return dict(zip(map(tuple, cells.tolist()), np.rint(1000 * log_odds).astype(int).tolist(), strict=True))
+
+
+def share_that_differs(ours, theirs, tolerance=0):
+    keys = ours.keys() | theirs.keys()
+    return sum(abs(ours.get(k, 0) - theirs.get(k, 0)) > tolerance for k in keys) / len(keys)
+
+
+@pytest.mark.parametrize("model", SENSORS)
+@pytest.mark.parametrize("voxel_size", SIZES)
+def test_projective_equals_its_reference(model, voxel_size):
+    config = load_config(voxel_size=voxel_size, max_range=2.5, **{"sensor.model": model})
+    integrator = make_integrator(config)
+    for seed in range(3):
+        image = made_image(seed)
+        ours = cells_of(integrator.evidence(image))
+        theirs = reference_of(_reference.project, image, config)
+        assert len(theirs) > 60
+        # float32 against float64: a few cells project on a pixel's edge or lie on a table column's edge
+        assert share_that_differs(ours, theirs, tolerance=25) < 0.002
+        assert share_that_differs(ours, theirs) < 0.02
+
+
+@pytest.mark.parametrize("model", SENSORS)
+@pytest.mark.parametrize("voxel_size", SIZES)
+@pytest.mark.parametrize("update", ["once", "every"])
+def test_ray_equals_its_reference(model, voxel_size, update):
+    config = load_config(
+        voxel_size=voxel_size, max_range=2.5, integrator="ray", **{"sensor.model": model, "ray.update": update}
+    )
+    image = made_image(5)
+    ours = cells_of(make_integrator(config).evidence(image))
+    theirs = reference_of(_reference.cast_rays, image, config)
+    assert len(theirs) > 60
+    assert share_that_differs(ours, theirs, tolerance=25) < 0.002
+    assert share_that_differs(ours, theirs, tolerance=2) < 0.02
+
+
+@pytest.mark.parametrize("integrator", ["projective", "ray"])
+@pytest.mark.parametrize("model", ["stereo", "andert"])
+def test_threads_change_nothing(integrator, model):
+    images = [made_image(seed) for seed in range(4)]
+    outcomes = []
+    for threads in (1, 2, 3):
+        config = load_config(voxel_size=0.05, integrator=integrator, threads=threads, **{"sensor.model": model})
+        each = make_integrator(config)
+        outcomes.append([cells_of(each.evidence(image)) for image in images])
+    assert outcomes[0] == outcomes[1] == outcomes[2]
+
+
+@pytest.mark.parametrize("integrator", ["projective", "ray"])
+def test_far_from_the_origin_nothing_changes(integrator):
+    """Cells are counted from the camera's block, so float32 is as good at 100 km as at home."""
+    config = load_config(voxel_size=0.125, integrator=integrator, **{"ray.update": "once"})
+    image = made_image(1)
+    blocks = np.array([800_000, -700_000, 3])
+    moved_pose = image.T_world_sensor.copy()
+    moved_pose[:3, 3] += blocks  # a block is 1 m wide: whole blocks, exact in float64
+    moved = type(image)(image.depth_m, image.reason, image.camera, moved_pose)
+    here, there = (cells_of(make_integrator(config).evidence(each)) for each in (image, moved))
+    back = {tuple(np.array(cell) - 8 * blocks): value for cell, value in there.items()}
+    assert share_that_differs(here, back) < 0.001
+
+
+def test_wide_and_narrow_keys_agree():
+    """Cells beyond 512 from the camera need 64-bit pixel keys; the hits must not depend on it."""
+    image = made_image(2)
+    narrow, wide = (load_config(voxel_size=0.02, max_range=reach, **{"noise.s2": 0.0}) for reach in (5.0, 9.0))
+    hits = [
+        {cell for cell, value in cells_of(make_integrator(config).evidence(image)).items() if value > 0}
+        for config in (narrow, wide)
+    ]
+    assert hits[0] == hits[1]
+
+
+def test_odd_image_sizes():
+    for width, height in [(1, 1), (7, 3), (33, 65), (130, 1)]:
+        camera = PinholeCamera(width, height, 40.0, 40.0, width / 2, height / 2, 0.05)
+        image = made_image(3, camera, far_share=0)
+        depth = np.where(np.isfinite(image.depth_m), image.depth_m, 1.5).astype(np.float32)
+        image = type(image)(depth, np.zeros_like(image.reason), camera, image.T_world_sensor)
+        config = load_config(voxel_size=0.1, max_range=2.5)
+        ours = cells_of(make_integrator(config).evidence(image))
+        assert share_that_differs(ours, reference_of(_reference.project, image, config), tolerance=25) < 0.01
+    assert CAMERA.width == 64

@@ -5,33 +5,43 @@ import numpy as np
 
 from stereovox._jit import kernel
 
-VALID, UNMATCHED, TOO_NEAR, TOO_FAR, MASKED = np.uint8(0), np.uint8(1), np.uint8(2), np.uint8(3), np.uint8(4)
+VALID, UNMATCHED, TOO_NEAR, TOO_FAR = np.uint8(0), np.uint8(1), np.uint8(2), np.uint8(3)
 NAN, NEAR, FAR = np.float32(np.nan), np.float32(-np.inf), np.float32(np.inf)
 ZERO = np.float32(0)
-SATURATED = np.float32(65535)
 
 
 @kernel
-def classify(raw, given, scale, min_range, max_range, saturates, depth_m, reason):
-    """Fill `depth_m` (float32) and `reason` (uint8) from flat `raw`; return the number of valid pixels.
+def classify(raw, scale, min_range, max_range, none, depth_m, reason):
+    """Fill `depth_m` (float32, REP 117) and `reason` (uint8) from flat `raw`; return the number of valid pixels.
 
-    `given` holds the source's own reasons, or is empty. `saturates`: the value 65535 means "none" (uint16 images).
+    none: a raw value that means "no value" beside zero, negative and not finite ones (65535 in uint16 images).
     """
-    known = given.size == raw.size
-    valid = 0
-    for i in range(raw.size):
+    for i in range(raw.size):  # single selects, no nested ones: those become branches and stop vectorisation
         value = np.float32(raw[i])
         d = value * scale
-        finite = (d > ZERO) & (d < FAR) & ~(saturates & (value == SATURATED))
-        why = VALID if finite else UNMATCHED
-        why = TOO_NEAR if finite & (d < min_range) else why
-        why = TOO_FAR if finite & (d > max_range) else why
-        if known:
-            why = given[i] if given[i] != VALID else why
-        reason[i] = why
-        d = NAN if (why == UNMATCHED) | (why == MASKED) else d
-        d = NEAR if why == TOO_NEAR else d
-        d = FAR if why == TOO_FAR else d
+        d = NAN if (value == none) | (d <= ZERO) | (d == FAR) else d
+        d = NEAR if d < min_range else d
+        d = FAR if d > max_range else d
         depth_m[i] = d
-        valid += 1 if why == VALID else 0
+    valid = np.int32(0)
+    for i in range(raw.size):
+        d = depth_m[i]
+        why = np.int32(VALID) if d == d else np.int32(UNMATCHED)  # noqa: PLR0124 - NaN differs from itself
+        why = np.int32(TOO_NEAR) if d == NEAR else why
+        why = np.int32(TOO_FAR) if d == FAR else why
+        reason[i] = np.uint8(why)
+        valid += np.int32(1) if why == 0 else np.int32(0)
+    return valid
+
+
+@kernel
+def take_given(given, depth_m, reason):
+    """Let the source's own reasons, where it has any, come first; return the number of valid pixels."""
+    valid = np.int32(0)
+    for i in range(given.size):
+        why = given[i] if given[i] != VALID else reason[i]
+        without = NEAR if why == TOO_NEAR else (FAR if why == TOO_FAR else NAN)
+        depth_m[i] = depth_m[i] if why == VALID else without
+        reason[i] = why
+        valid += np.int32(why == VALID)
     return valid

@@ -13,6 +13,8 @@ from stereovox.errors import FrameRefused
 from stereovox.frame import DepthImage, Frame, Reason
 
 DTYPES = (np.dtype(np.uint16), np.dtype(np.float32), np.dtype(np.float64))
+SATURATED = 65535
+"""What many cameras write into uint16 images for "no value"."""
 FARTHEST = 1e6
 """Positions beyond this many metres are taken for errors."""
 
@@ -37,9 +39,13 @@ def prepare(frame: Frame, config: Config) -> DepthImage:
 
 def _classify(frame: Frame, config: Config, depth_m: NDArray, reason: NDArray) -> int:
     raw = np.ascontiguousarray(frame.depth).reshape(-1)
-    given = np.zeros(0, np.uint8) if frame.reason is None else np.ascontiguousarray(frame.reason, np.uint8).reshape(-1)
     limits = (np.float32(frame.depth_scale), np.float32(config.min_range), np.float32(config.max_range))
-    return _cpu.classify(raw, given, *limits, raw.dtype == np.uint16, depth_m.reshape(-1), reason.reshape(-1))
+    none = np.float32(SATURATED if raw.dtype == np.uint16 else 0)
+    usable = _cpu.classify(raw, *limits, none, depth_m.reshape(-1), reason.reshape(-1))
+    if frame.reason is not None:
+        given = np.ascontiguousarray(frame.reason, np.uint8).reshape(-1)
+        usable = _cpu.take_given(given, depth_m.reshape(-1), reason.reshape(-1))
+    return usable
 
 
 def _check_image(frame: Frame) -> None:

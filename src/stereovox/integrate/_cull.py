@@ -11,7 +11,7 @@ SKIP, FREE, MIXED = 0, 1, 2
 SLACK = np.float32(1e-3)
 """Pixels and parts of a depth by which boxes are taken too large: culling may err only to the safe side."""
 COARSE = 4
-"""Blocks along each side of a coarse box."""
+"""Blocks along each side of a coarse box; between it and a block stand boxes of two blocks."""
 
 
 @kernel
@@ -28,19 +28,22 @@ def candidates(view, table, windows, nearest, low, high, hit_table, hit_coords, 
                 coarse = _classify(view, table, windows, nearest, 1, COARSE, bx, by, bz)
                 if coarse == SKIP:
                     continue
-                for i in range(COARSE**3):
-                    x, y, z = bx + (i >> 4), by + ((i >> 2) & 3), bz + (i & 3)
-                    kind = coarse
-                    if kind == MIXED:
-                        kind = _classify(view, table, windows, nearest, 0, 1, x, y, z)
-                    if kind == SKIP:
+                for i in range(8):
+                    hx, hy, hz = bx + 2 * (i >> 2), by + 2 * ((i >> 1) & 1), bz + 2 * (i & 1)
+                    half = coarse if coarse == FREE else _classify(view, table, windows, nearest, 1, 2, hx, hy, hz)
+                    if half == SKIP:
                         continue
-                    if kind == FREE and find(hit_table, hit_coords, x, y, z) < 0:
-                        free[n_free, 0], free[n_free, 1], free[n_free, 2] = x, y, z
-                        n_free += 1
-                    else:
-                        mixed[n_mixed, 0], mixed[n_mixed, 1], mixed[n_mixed, 2] = x, y, z
-                        n_mixed += 1
+                    for j in range(8):
+                        x, y, z = hx + (j >> 2), hy + ((j >> 1) & 1), hz + (j & 1)
+                        kind = half if half == FREE else _classify(view, table, windows, nearest, 0, 1, x, y, z)
+                        if kind == SKIP:
+                            continue
+                        if kind == FREE and find(hit_table, hit_coords, x, y, z) < 0:
+                            free[n_free, 0], free[n_free, 1], free[n_free, 2] = x, y, z
+                            n_free += 1
+                        else:
+                            mixed[n_mixed, 0], mixed[n_mixed, 1], mixed[n_mixed, 2] = x, y, z
+                            n_mixed += 1
     return n_free, n_mixed
 
 
@@ -49,7 +52,7 @@ def _classify(view, table, windows, nearest, tile, blocks, bx, by, bz):
     """Tell whether all cells of a box are free (FREE), untouched (SKIP) or neither (MIXED).
 
     The box is `blocks` blocks wide and starts at block (bx, by, bz); only the centres of its cells count.
-    tile: 0 to look at tiles of 16 pixels (blocks), 1 for 64 (coarse boxes).
+    tile: 0 to look at tiles of 16 pixels (blocks), 1 for 64 (larger boxes).
     """
     side = np.float32(8) * view.voxel_size
     half = (np.float32(4 * blocks) - HALF) * view.voxel_size

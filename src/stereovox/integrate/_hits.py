@@ -24,11 +24,12 @@ ROW_BITS = 7
 
 
 @kernel
-def scatter(z, view, table, keys, news, pool_table, coords, count, values, first_row, last_row):
+def scatter(z, view, table, keys, news, fresh, pool_table, coords, count, values, first_row, last_row):
     """Give every cell that holds a measured point its hit evidence; return False when the block pool is full.
 
     z: (h, w) depths, 0 none. keys: (2, 1 + w rounded up to GROUP) scratch; int32 serves cells within 2^9 of the
-    camera when `table.hit` is one number for all depths, int64 the rest. news: (w rounded up) uint8 scratch. Blocks count from the camera's own.
+    camera when `table.hit` is one number for all depths, int64 the rest. news, fresh: scratch of one row,
+    uint8 and int32, w rounded up to GROUP and one more for `fresh`. Blocks count from the camera's own.
     """
     size = np.float32(1) / view.voxel_size
     position = view.position * size
@@ -38,26 +39,24 @@ def scatter(z, view, table, keys, news, pool_table, coords, count, values, first
     for v in range(first_row, last_row):
         now, before = keys[v & 1], keys[1 - (v & 1)]
         ray = _row_rays(view.rotation, view.rows[v], size)
-        _row_keys(z[v], view.columns, ray, position, table, now[1:])
+        if keys.itemsize == 4:
+            _narrow_keys(z[v], view.columns, ray, position, now[1:])
+        else:
+            _wide_keys(z[v], view.columns, ray, position, table, now[1:])
         _mark_news(now[1:], now[:-1], before[1:], news)
-        groups = news.view(np.uint64)
-        for group in range(groups.size):
-            if groups[group] == 0:
-                continue
-            for u in range(GROUP * group, GROUP * group + GROUP):
-                if news[u] == 0:
-                    continue
-                d = z[v, u]
-                x, y, zz = _point_cell(d, view.columns[u], ray, position)
-                block = (x >> 3, y >> 3, zz >> 3)
-                if place < 0 or block != last:
-                    place = find_or_insert(pool_table, coords, count, block[0], block[1], block[2])
-                    last = block
-                if place < 0:
-                    return False
-                c = ((x & 7) << 6) | ((y & 7) << 3) | (zz & 7)
-                hit = table.hit[table_row(d, table.rows_per_metre, rows)]
-                values[place, c] = max(np.int32(values[place, c]), hit)
+        for i in range(_gather_news(news, fresh)):
+            u = fresh[i]
+            d = z[v, u]
+            x, y, zz = _point_cell(d, view.columns[u], ray, position)
+            block = (x >> 3, y >> 3, zz >> 3)
+            if place < 0 or block != last:
+                place = find_or_insert(pool_table, coords, count, block[0], block[1], block[2])
+                last = block
+            if place < 0:
+                return False
+            c = ((x & 7) << 6) | ((y & 7) << 3) | (zz & 7)
+            hit = table.hit[table_row(d, table.rows_per_metre, rows)]
+            values[place, c] = max(np.int32(values[place, c]), hit)
     return True
 
 
@@ -82,19 +81,30 @@ def _point_cell(d, column, ray, position):
 
 
 @cell
-def _row_keys(depths, columns, ray, position, table, keys):
-    wide = keys.itemsize == 8
-    bits, row_bits = (WIDE, ROW_BITS) if wide else (NARROW, 0)
-    middle = np.int32(1 << (bits - 1))
+def _narrow_keys(depths, columns, ray, position, keys):
+    """Pack each pixel's cell into an int32; offsets keep all numbers positive, so cutting off digits is the floor."""
+    middle = np.float32(1 << (NARROW - 1))
+    x0, y0, z0 = position[0] + middle, position[1] + middle, position[2] + middle
+    for u in range(depths.size):
+        d = depths[u]
+        x = np.int32(d * (ray[0] * columns[u] + ray[1]) + x0)
+        y = np.int32(d * (ray[2] * columns[u] + ray[3]) + y0)
+        z = np.int32(d * (ray[4] * columns[u] + ray[5]) + z0)
+        key = (x << np.int32(2 * NARROW)) | (y << np.int32(NARROW)) | z
+        keys[u] = key if (d > ZERO) & (d < NO_RETURN) else np.int32(NOTHING)
+
+
+@cell
+def _wide_keys(depths, columns, ray, position, table, keys):
+    """Pack each pixel's cell and table row into an int64."""
+    middle = np.int64(1 << (WIDE - 1))
     rows = table.hit.size
-    whole = keys.dtype.type
     for u in range(depths.size):
         d = depths[u]
         x, y, z = _point_cell(d, columns[u], ray, position)
-        key = (whole(x + middle) << whole(2 * bits)) | (whole(y + middle) << whole(bits)) | whole(z + middle)
-        row = table_row(d, table.rows_per_metre, rows)
-        key = (key << whole(row_bits)) | whole(row if wide else 0)
-        keys[u] = key if (d > ZERO) & (d < NO_RETURN) else whole(NOTHING)
+        key = ((np.int64(x) + middle) << (2 * WIDE)) | ((np.int64(y) + middle) << WIDE) | (np.int64(z) + middle)
+        key = (key << ROW_BITS) | np.int64(table_row(d, table.rows_per_metre, rows))
+        keys[u] = key if (d > ZERO) & (d < NO_RETURN) else np.int64(NOTHING)
 
 
 @cell
@@ -103,3 +113,16 @@ def _mark_news(now, left, above, news):
     for u in range(news.size):
         fresh = (now[u] != above[u]) & (now[u] != left[u]) & (now[u] != NOTHING)
         news[u] = np.uint8(fresh)
+
+
+@cell
+def _gather_news(news, fresh):
+    """List the pixels that are news; return how many. Free of unforeseeable branches within a group."""
+    groups = news.view(np.uint64)
+    n = 0
+    for group in range(groups.size):
+        if groups[group] != 0:
+            for u in range(GROUP * group, GROUP * group + GROUP):
+                fresh[n] = u
+                n += news[u]
+    return n

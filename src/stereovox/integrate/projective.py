@@ -56,6 +56,7 @@ class Projective:
         self._builder = WindowBuilder(camera)
         self._keys = self._key_rows(camera)
         self._news = np.zeros(self._keys.shape[1] - 1, np.uint8)
+        self._fresh = np.zeros(self._keys.shape[1], np.int32)
         self._camera = camera
 
     def _key_rows(self, camera: PinholeCamera) -> NDArray[np.int32] | NDArray[np.int64]:
@@ -77,7 +78,7 @@ class Projective:
         hits, z = self._hits, self._builder.depths
         hits.clear()
         while not _hits.scatter(
-            z, view, self._table, self._keys, self._news, hits.table, hits.coords, hits.count, hits.values, 0, z.shape[0]
+            z, view, self._table, self._keys, self._news, self._fresh, hits.table, hits.coords, hits.count, hits.values, 0, z.shape[0]
         ):
             hits.reserve(len(hits.coords))
 

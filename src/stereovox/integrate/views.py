@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -24,6 +25,10 @@ Chosen so that a cell is cleared when any ray through it goes on, as exact ray c
 """
 RIM_SHARE = 0.35
 """A cell still counts as inside the image when its centre lies this share of its size outside."""
+
+
+CELL_CENTRES = np.stack([axis.ravel() for axis in np.mgrid[:SIDE, :SIDE, :SIDE]]) + 0.5
+"""(3, 512) centres of a block's cells from its corner, in cells."""
 
 
 class KernelTable(NamedTuple):
@@ -96,7 +101,7 @@ def view_of(image: DepthImage, voxel_size: float, max_range: float) -> View:
     camera, T = image.camera, image.T_world_sensor
     rim = RIM_SHARE * camera.fx * voxel_size
     corner = origin_block(T, voxel_size) * (SIDE * voxel_size)
-    columns, rows = camera.ray_slopes()
+    columns, rows, intrinsics = _camera_arrays(camera)
     return View(
         np.ascontiguousarray(T[:3, :3].T, np.float32),
         (T[:3, 3] - corner).astype(np.float32),
@@ -104,7 +109,7 @@ def view_of(image: DepthImage, voxel_size: float, max_range: float) -> View:
         _sides(camera, T, rim),
         columns,
         rows,
-        np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32),
+        intrinsics,
         np.int32(camera.width),
         np.int32(camera.height),
         np.float32(voxel_size),
@@ -127,7 +132,12 @@ def _sides(camera: PinholeCamera, T: Transform, rim: float) -> NDArray[np.float3
     return np.hstack([normals, unit_box, np.full((4, 1), rim + slack)]).astype(np.float32)
 
 
+@lru_cache
+def _camera_arrays(camera: PinholeCamera) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    columns, rows = camera.ray_slopes()
+    return columns, rows, np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)
+
+
 def _cell_steps(camera: PinholeCamera, T: Transform, voxel_size: float) -> NDArray[np.float32]:
-    cells = np.stack(np.meshgrid(*[np.arange(SIDE)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-    steps = ((cells + 0.5) * voxel_size) @ T[:3, :3]
-    return np.ascontiguousarray((steps * [camera.fx, camera.fy, 1.0]).T, np.float32)
+    to_pixels = T[:3, :3].T * (np.array([[camera.fx], [camera.fy], [1.0]]) * voxel_size)
+    return (to_pixels @ CELL_CENTRES).astype(np.float32)

@@ -11,6 +11,7 @@ import json
 import os
 import shutil
 import uuid
+import zlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -40,7 +41,7 @@ def save_map(voxel_map: VoxelMap, path: str | Path) -> None:
         data = f"cells-{uuid.uuid4().hex[:12]}"
         coords, cells = voxel_map.blocks()
         _write_arrays(folder / data, {"coords": coords, "cells": cells})
-        _write_manifest(folder, _manifest(voxel_map, data, len(coords)))
+        _write_manifest(folder, _manifest(voxel_map, data, len(coords), _checksum(coords, cells)))
     except OSError as error:
         raise MapFileError(f"{folder}: cannot save the map ({error.strerror or error}); choose a writable folder") from None
     for old in folder.glob("cells-*"):
@@ -58,11 +59,11 @@ def load_map(path: str | Path) -> VoxelMap:
         voxel_map = VoxelMap(load_config(manifest["config"]))
         voxel_map.frames = int(manifest["frames"])
         coords, cells = _read_arrays(folder / str(manifest["data"]), int(manifest["blocks"]))
-    except (KeyError, TypeError, ValueError, OSError, ConfigError) as error:
+        if _checksum(coords, cells) != manifest["checksum"]:
+            raise ValueError("the cells do not match their checksum")
+    except (KeyError, TypeError, ValueError, OSError, RuntimeError, ConfigError) as error:
         raise MapFileError(f"{folder}: damaged map ({type(error).__name__}: {error}); make it anew") from None
     voxel_map._pool.insert(coords)
-    if len(voxel_map._pool) != len(coords):
-        raise MapFileError(f"{folder}: damaged map (a block stands in it twice); make it anew")
     voxel_map._pool.values[: len(cells)] = np.clip(cells, voxel_map._lowest, voxel_map._highest)
     voxel_map._match_flags()
     return voxel_map
@@ -90,9 +91,24 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     return manifest
 
 
-def _manifest(voxel_map: VoxelMap, data: str, blocks: int) -> dict[str, Any]:
-    config = voxel_map.config.model_dump()
-    return {"format": FORMAT, "version": VERSION, "frames": voxel_map.frames, "blocks": blocks, "data": data, "config": config}
+def _manifest(voxel_map: VoxelMap, data: str, blocks: int, checksum: int) -> dict[str, Any]:
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "frames": voxel_map.frames,
+        "blocks": blocks,
+        "data": data,
+        "checksum": checksum,
+        "config": voxel_map.config.model_dump(),
+    }
+
+
+def _checksum(*arrays: NDArray) -> int:
+    """Zarr reads a chunk whose file is gone as empty cells; this number tells."""
+    checksum = 0
+    for array in arrays:
+        checksum = zlib.crc32(np.ascontiguousarray(array).tobytes(), checksum)
+    return checksum
 
 
 def _write_manifest(folder: Path, manifest: dict[str, Any]) -> None:

@@ -1,0 +1,181 @@
+"""The voxel map against a plain dict of cells."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from stereovox.config import load_config
+from stereovox.errors import MapFileError
+from stereovox.maps import State, VoxelMap, load_map
+from stereovox.maps.evidence import Evidence
+
+CONFIG = load_config(voxel_size=0.1)
+LOWEST, HIGHEST = -2000, 3500
+
+
+def evidence_of(coords, values, uniform=(), uniform_value=-405):
+    return Evidence(
+        np.array(coords, np.int32).reshape(-1, 3),
+        np.array(values, np.int16).reshape(-1, 512),
+        np.array(uniform, np.int32).reshape(-1, 3),
+        uniform_value,
+    )
+
+
+def cells_of(voxel_map):
+    indices, log_odds = voxel_map.cells()
+    return dict(zip(map(tuple, indices.tolist()), np.rint(log_odds * 1000).astype(int).tolist(), strict=True))
+
+
+def test_adding_evidence_equals_a_dict():
+    rng = np.random.default_rng(1)
+    voxel_map, plain = VoxelMap(CONFIG), {}
+    for _ in range(30):
+        coords = np.unique(rng.integers(-2, 3, (12, 3)), axis=0)
+        half = len(coords) // 2
+        values = rng.integers(-1500, 1500, (half, 512)) * (rng.random((half, 512)) < 0.3)
+        changed = voxel_map.add(evidence_of(coords[:half], values, coords[half:]))
+        before = dict(plain)
+        everything = np.concatenate([values, np.full((len(coords) - half, 512), -405)])
+        for block, row in zip(coords, everything, strict=True):
+            for c in np.flatnonzero(row):
+                cell = tuple((block * 8 + [c >> 6, (c >> 3) & 7, c & 7]).tolist())
+                total = min(max(plain.get(cell, 0) + int(row[c]), LOWEST), HIGHEST)
+                plain[cell] = total or 1
+        assert changed == sum(plain[cell] != before.get(cell) for cell in plain)
+    assert cells_of(voxel_map) == plain
+
+
+def test_saturated_free_blocks_still_take_hits():
+    voxel_map = VoxelMap(CONFIG)
+    free = evidence_of([], [], [[0, 0, 0]])
+    assert voxel_map.add(free) == 512
+    for _ in range(10):
+        voxel_map.add(free)
+    assert voxel_map.add(free) == 0
+    hit = np.zeros(512)
+    hit[7] = 847
+    assert voxel_map.add(evidence_of([[0, 0, 0]], [hit])) == 1
+    assert voxel_map.log_odds([[0.05, 0.05, 0.75]])[0] == pytest.approx(-2 + 0.847)
+    assert voxel_map.add(free) == 1, "the hit cell must be cleared again, the flag is gone"
+
+
+def test_blocks_without_evidence_are_not_made():
+    voxel_map = VoxelMap(CONFIG)
+    before = voxel_map.memory_bytes
+    voxel_map.add(evidence_of([[5, 5, 5]], [np.zeros(512)]))
+    assert voxel_map.memory_bytes == before
+    assert voxel_map.bounds() is None
+
+
+def test_states_and_probabilities():
+    cells = [[0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0]]
+    voxel_map = VoxelMap.from_cells(CONFIG, cells, [-1.0, 0.5, 1.0, 0.0])
+    points = voxel_map.centers([*cells, [9, 9, 9]])
+    states = [State.FREE, State.TENTATIVE, State.OCCUPIED, State.TENTATIVE, State.UNKNOWN]
+    assert voxel_map.state(points).tolist() == states
+    assert voxel_map.probability(points)[:3] == pytest.approx(1 / (1 + np.exp([1.0, -0.5, -1.0])), abs=1e-3)
+    assert voxel_map.probability(points)[4] == 0.5
+    assert voxel_map.counts() == {"free": 1, "tentative": 2, "occupied": 1}
+    assert voxel_map.occupied() == pytest.approx(np.array([[0.25, 0.05, 0.05]]))
+    assert voxel_map.free() == pytest.approx(np.array([[0.05, 0.05, 0.05]]))
+    assert voxel_map.bounds() == pytest.approx(np.array([[0, 0, 0], [0.4, 0.1, 0.1]]))
+
+
+def test_strange_points_are_unknown():
+    voxel_map = VoxelMap.from_cells(CONFIG, [[-1, -1, -1]], [3.0])
+    points = [[np.nan, 0, 0], [np.inf, 0, 0], [1e300, 0, 0], [-1e12, 0, 0], [-0.05, -0.05, -0.05]]
+    assert voxel_map.state(points).tolist() == [0, 0, 0, 0, State.OCCUPIED]
+    assert voxel_map.log_odds(np.empty((0, 3))).shape == (0,)
+
+
+cell_lists = st.lists(
+    st.tuples(*[st.integers(-300, 300)] * 3), min_size=0, max_size=60, unique=True
+).flatmap(lambda cells: st.tuples(st.just(cells), st.lists(st.integers(-1999, 3499), min_size=len(cells), max_size=len(cells))))
+
+
+@settings(max_examples=60, deadline=None)
+@given(cell_lists)
+def test_cells_come_back_as_they_went_in(case):
+    cells, units = case
+    voxel_map = VoxelMap.from_cells(CONFIG, cells, np.array(units) / 1000)
+    assert cells_of(voxel_map) == {cell: unit or 1 for cell, unit in zip(cells, units, strict=True)}
+    shuffled = VoxelMap.from_cells(CONFIG, cells[::-1], np.array(units[::-1]) / 1000)
+    assert [a.tolist() for a in shuffled.blocks()] == [a.tolist() for a in voxel_map.blocks()]
+
+
+def random_map(seed=0, number=4000):
+    rng = np.random.default_rng(seed)
+    voxel_map = VoxelMap.from_cells(CONFIG, rng.integers(-90, 90, (number, 3)), rng.normal(0, 2, number))
+    voxel_map.frames = 17
+    return voxel_map
+
+
+def test_save_load_save(tmp_path):
+    first = random_map()
+    first.save(tmp_path / "a.svox")
+    second = load_map(tmp_path / "a.svox")
+    second.save(tmp_path / "b.svox")
+    third = load_map(tmp_path / "b.svox")
+    for other in (second, third):
+        assert all((a == b).all() for a, b in zip(first.blocks(), other.blocks(), strict=True))
+        assert other.frames == 17
+        assert other.config == CONFIG
+    second.add(evidence_of([], [], [[0, 0, 0]]))  # a loaded map goes on
+
+
+def test_saving_again_replaces_and_leaves_nothing_behind(tmp_path):
+    random_map(1).save(tmp_path / "m")
+    random_map(2).save(tmp_path / "m")
+    assert (load_map(tmp_path / "m").blocks()[1] == random_map(2).blocks()[1]).all()
+    assert len(list((tmp_path / "m").glob("cells-*"))) == 1
+
+
+def test_a_save_that_dies_leaves_the_old_map(tmp_path, monkeypatch):
+    random_map(1).save(tmp_path / "m")
+    monkeypatch.setattr("pathlib.Path.replace", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left on device")))
+    with pytest.raises(MapFileError, match="No space left"):
+        random_map(2).save(tmp_path / "m")
+    assert (load_map(tmp_path / "m").blocks()[1] == random_map(1).blocks()[1]).all()
+
+
+def test_empty_map(tmp_path):
+    empty = VoxelMap(CONFIG)
+    assert empty.cells()[0].shape == (0, 3)
+    assert empty.occupied().shape == (0, 3)
+    empty.save(tmp_path / "e")
+    assert load_map(tmp_path / "e").counts() == {"free": 0, "tentative": 0, "occupied": 0}
+
+
+def test_damaged_maps_end_in_one_line(tmp_path):
+    with pytest.raises(MapFileError, match="no stereovox map here"):
+        load_map(tmp_path / "nothing")
+    random_map().save(tmp_path / "m")
+    manifest = tmp_path / "m" / "manifest.json"
+    good = manifest.read_text()
+    for bad in ["", "[]", "{}", good[: len(good) // 2], good.replace("stereovox-map", "x"), good.replace('"version": 1', '"version": 9'),
+                good.replace('"blocks": ', '"blocks": 9'), good.replace('"data": "', '"data": "../'),
+                good.replace('"voxel_size": 0.1', '"voxel_size": -1')]:  # fmt: skip
+        manifest.write_text(bad)
+        with pytest.raises(MapFileError) as caught:
+            load_map(tmp_path / "m")
+        assert "\n" not in str(caught.value)
+        assert str(tmp_path / "m") in str(caught.value)
+    manifest.write_text(good)
+    chunk = max((tmp_path / "m").rglob("c/0/0"), key=lambda path: path.stat().st_size)
+    chunk.write_bytes(chunk.read_bytes()[:50])
+    with pytest.raises(MapFileError):
+        load_map(tmp_path / "m")
+    chunk.unlink()
+    with pytest.raises(MapFileError, match="checksum"):
+        load_map(tmp_path / "m")
+
+
+def test_refuses_to_overwrite_what_is_no_map(tmp_path):
+    (tmp_path / "thesis.txt").write_text("years of work")
+    with pytest.raises(MapFileError, match="not a stereovox map"):
+        random_map().save(tmp_path)
+    with pytest.raises(MapFileError, match="not a stereovox map"):
+        random_map().save(tmp_path / "thesis.txt")
+    assert (tmp_path / "thesis.txt").read_text() == "years of work"

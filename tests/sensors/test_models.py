@@ -1,0 +1,134 @@
+"""The contract every registered sensor model keeps, and each model's own formula."""
+
+import numpy as np
+import pytest
+
+from stereovox.cameras import PinholeCamera
+from stereovox.config import NoiseConfig, SensorConfig
+from stereovox.errors import ConfigError
+from stereovox.sensors import SENSORS, make_sensor
+from stereovox.sensors.model import COLUMNS, REACH_SIGMA, ROWS, offset_sigma, tabulate
+from stereovox.sensors.noise import RangeNoise
+
+CASES = [(0.5, 0.002), (2.0, 0.01), (4.0, 0.08), (8.0, 0.3)]
+HALF = np.sqrt(2 * np.log(2))
+
+
+def model_of(name, **parameters):
+    return make_sensor(SensorConfig(model=name, **parameters))
+
+
+def width_at(model, level, z_measured, sigma, side):
+    """Distance from the measurement at which the model falls through `level`, by dense sampling."""
+    offset = np.linspace(0, 8 * sigma, 200_001)[1:]
+    p = model.probability(z_measured + side * offset, z_measured, sigma)
+    below = np.flatnonzero(p < level)
+    return offset[below[0]]
+
+
+@pytest.mark.parametrize("name", SENSORS)
+@pytest.mark.parametrize(("z_measured", "sigma"), CASES)
+def test_contract(name, z_measured, sigma):
+    model = model_of(name)
+    offset = np.linspace(-12, 12, 4801) * sigma
+    p = model.probability(z_measured + offset, z_measured, sigma)
+    peak = model.probability(np.array(z_measured), z_measured, sigma)
+    assert ((p > 0) & (p < 1)).all()
+    assert p[0] == pytest.approx(model.p_free, abs=1e-9)
+    assert p[-1] == pytest.approx(model.p_unknown, abs=1e-9)
+    assert peak == pytest.approx(p.max())
+    assert peak > model.p_unknown
+    assert (np.diff(p[offset < 0]) >= 0).all()
+    assert (np.diff(p[offset > 0]) <= 0).all()
+
+
+@pytest.mark.parametrize(("z_measured", "sigma"), CASES)
+@pytest.mark.parametrize("p_unknown", [0.5, 0.45])
+def test_valenti_half_height_widths_agree(z_measured, sigma, p_unknown):
+    """Valenti 2018, Eq 6.6 corrected: at p_unknown + a / 2 both sides are equally wide."""
+    model = model_of("valenti", p_unknown=p_unknown)
+    a = 0.75 * (1 - p_unknown) * np.exp(-sigma)
+    level = p_unknown + a / 2
+    before, behind = (width_at(model, level, z_measured, sigma, side) for side in (-1, 1))
+    assert before == pytest.approx(behind, rel=1e-3)
+    assert behind == pytest.approx(model.tail(sigma) * HALF, rel=1e-3)
+    assert model.probability(z_measured, z_measured, sigma) == pytest.approx(p_unknown + a)
+
+
+def test_valenti_as_printed_for_one_half():
+    sigma, a = 0.1, 0.75 * 0.5 * np.exp(-0.1)
+    printed = sigma * np.sqrt(np.log(1 + a / (a + 1 - 2 * 0.3)) / np.log(2))
+    assert model_of("valenti").tail(sigma) == pytest.approx(printed)
+
+
+@pytest.mark.parametrize(("z_measured", "sigma"), [(2.0, 0.03), (4.0, 0.1)])
+def test_andert_half_height_widths(z_measured, sigma):
+    """A Gaussian on a step: each side falls to half its own height at sigma sqrt(2 ln 2)."""
+    model = model_of("andert", k=0.02)
+    peak = 0.5 + 0.02 / (sigma * np.sqrt(2 * np.pi))
+    assert model.probability(z_measured, z_measured, sigma) == pytest.approx(peak)
+    assert width_at(model, (peak + 0.3) / 2, z_measured, sigma, -1) == pytest.approx(sigma * HALF, rel=1e-3)
+    assert width_at(model, (peak + 0.5) / 2, z_measured, sigma, 1) == pytest.approx(sigma * HALF, rel=1e-3)
+
+
+def test_andert_is_clamped_below_one():
+    assert model_of("andert", k=1.0).probability(1.0, 1.0, 0.001) == 0.95
+
+
+@pytest.mark.parametrize("name", ["constant", "stereo"])
+def test_point_models_mark_nothing_beside_the_hit(name):
+    model = model_of(name)
+    offset = np.array([-1e-6, 1e-6]) * 0.05
+    assert (model.probability(2 + offset, 2.0, 0.05) <= model.p_unknown + 1e-9).all()
+    assert model.probability(2.0, 2.0, 0.05) == 0.7
+
+
+def test_stereo_clears_half_as_much_where_the_gaussian_is_half():
+    p = model_of("stereo").probability(2.0 - 0.05 * HALF, 2.0, 0.05)
+    assert p == pytest.approx(0.4 + 0.1 * 0.5)
+
+
+def test_table_holds_the_model():
+    model, noise = model_of("valenti"), RangeNoise(0.01, 0.002, 0.003)
+    table = tabulate(model, noise, 6.0)
+    assert table.log_odds.shape == (ROWS, COLUMNS)
+    row, column = 57, 71
+    z_measured = (row + 0.5) * 6.0 / ROWS
+    sigma = 0.01 + 0.002 * z_measured + 0.003 * z_measured**2
+    assert table.sigma[row] == pytest.approx(sigma)
+    p = model.probability(z_measured + offset_sigma()[column] * sigma, z_measured, sigma)
+    assert table.log_odds[row, column] == pytest.approx(np.log(p / (1 - p)))
+    assert np.abs(offset_sigma()).max() < REACH_SIGMA
+    assert (np.abs(offset_sigma()) > 0).all()
+
+
+def test_prior_is_not_counted_twice():
+    """Valenti 2018, Eq 6.2: behind the measurement nothing is added, whatever p_unknown is."""
+    table = tabulate(model_of("valenti", p_unknown=0.4), RangeNoise(0.05, 0, 0), 5.0)
+    assert np.abs(table.log_odds[:, -1]).max() < 0.01
+
+
+def test_stereo_noise_from_geometry():
+    """Chien 2020, Eq 3.5 with the square: 848 px at 91.2 deg, 50 mm, 0.08 px give 15 mm at 2 m."""
+    camera = PinholeCamera.from_field_of_view(848, 480, 91.2, 0.05)
+    noise = RangeNoise.of(NoiseConfig(), camera)
+    assert noise.sigma(2.0) == pytest.approx(2.0**2 * 0.08 / (camera.fx * 0.05))
+    assert noise.sigma(2.0) == pytest.approx(0.0154, abs=2e-4)
+    assert RangeNoise.of(NoiseConfig(s0=0.01, s2=0.002), camera).sigma(3.0) == pytest.approx(0.01 + 0.018)
+
+
+@pytest.mark.parametrize(
+    ("name", "parameters", "said"),
+    [
+        ("sterio", {}, "did you mean 'stereo'"),
+        ("stereo", {"p_hitt": 0.7}, "did you mean 'p_hit'"),
+        ("stereo", {"p_hit": 1.0}, "between 0 and 1"),
+        ("stereo", {"p_hit": "high"}, "must be a number"),
+        ("valenti", {"p_free": 0.6}, "smaller than p_unknown"),
+        ("andert", {"k": 0.0}, "greater than 0"),
+    ],
+)
+def test_bad_settings_end_in_one_line(name, parameters, said):
+    with pytest.raises(ConfigError, match=said) as caught:
+        model_of(name, **parameters)
+    assert "\n" not in str(caught.value)

@@ -31,12 +31,12 @@ class Mapper:
     """Builds a map from frames. A frame that cannot be trusted is refused and changes nothing.
 
     Give a profile name, a TOML file or a Config; settings by name on top (`voxel_size=0.1`, `**{"sensor.p_hit": 0.8}`).
-    `resume` is a map to go on with. Raises ConfigError for bad settings.
+    `resume` is a map to go on with; what its cells mean must not change. Raises ConfigError for bad settings.
     """
 
     def __init__(self, profile: str | Path | Config = "default", *, resume: VoxelMap | None = None, **overrides: Any):
         self.config = load_config(profile, **overrides)
-        self.map = VoxelMap(self.config) if resume is None else resume
+        self.map = VoxelMap(self.config) if resume is None else resume.with_config(self.config)
         self._integrator = make_integrator(self.config)
 
     def add(self, frame: Frame) -> UpdateReport:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stereovox.config import Config
+from stereovox.errors import ConfigError
 from stereovox.maps import _cpu
 from stereovox.maps.blocks import CELLS, SIDE, BlockPool
 from stereovox.maps.evidence import LOG_ODDS_SCALE, Evidence, to_units
@@ -62,6 +63,18 @@ class VoxelMap:
         voxel_map._pool.values[places[of_cell.ravel()], column] = np.where(units == 0, 1, units)
         voxel_map._match_flags()
         return voxel_map
+
+    def with_config(self, config: Config) -> VoxelMap:
+        """Take over the settings of a run that goes on with this map.
+
+        Raises ConfigError when they would change what its cells mean: the voxel size or the `map` section.
+        """
+        for name in ("voxel_size", "map"):
+            old, new = getattr(self.config, name), getattr(config, name)
+            if old != new:
+                raise ConfigError(f"cannot go on: the map was made with {name} {old}, now {new} is wanted")
+        self.config = config
+        return self
 
     def add(self, evidence: Evidence) -> int:
         """Add what one frame says; return the number of cells whose value changed."""

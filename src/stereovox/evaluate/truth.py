@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The exact occupancy of a scene: which cells its surfaces touch, and which lie wholly in its solids.
+
+Cell i covers [i, i + 1) * voxel_size on each axis. Exact means the triangle-box separating axis test (Akenine-Moeller
+2001), not samples on the surface.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.evaluate.cells import Keys, indices, keys
+from stereovox.sources.scene import Scene, Solid
+
+_COARSE = 16
+"""The search starts with cells this many times larger and halves them."""
+
+
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """One solid of a scene as cells: its part, its own name, its longest axis (3,), the cells its surface touches."""
+
+    part: str
+    name: str
+    axis: NDArray[np.float64]
+    cells: Keys
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """Exact occupancy. `surface` and `inside` are disjoint sets of cell keys; every other cell is free.
+
+    surface: cells that a surface touches and that are not wholly in a solid.
+    inside: cells wholly in solids: no camera can see them, so they are neither right nor wrong to mark.
+    pieces: the solids one by one.
+    """
+
+    voxel_size: float
+    surface: Keys
+    inside: Keys
+    pieces: tuple[Piece, ...]
+
+    @cached_property
+    def parts(self) -> list[str]:
+        """Names of the parts in the order of the scene."""
+        return list(dict.fromkeys(piece.part for piece in self.pieces))
+
+
+def exact_occupancy(scene: Scene, voxel_size: float) -> Truth:
+    """Return the exact occupancy of `scene` in cells of `voxel_size` metres."""
+    touched = [keys(touched_cells(solid.triangles, voxel_size)) for solid in scene.solids]
+    surface = np.unique(np.concatenate(touched))
+    buried = covered(scene.solids, surface, voxel_size)
+    within_solids = np.concatenate([keys(interior_cells(solid, voxel_size)) for solid in scene.solids])
+    inside = np.union1d(np.setdiff1d(within_solids, surface), surface[buried])
+    open_surface = surface[~buried]
+    pieces = tuple(
+        Piece(solid.part, solid.name, longest_axis(solid), np.intersect1d(cells, open_surface, assume_unique=True))
+        for solid, cells in zip(scene.solids, touched, strict=True)
+    )
+    return Truth(voxel_size, open_surface, inside, pieces)
+
+
+def touched_cells(triangles: NDArray[np.floating], voxel_size: float) -> NDArray[np.int32]:
+    """Return the cells (M, 3), ascending and each once, that any triangle (N, 3, 3) in metres touches.
+
+    A triangle that lies in the face between two cells belongs to the upper one.
+    """
+    corners = np.asarray(triangles, float) / voxel_size
+    size = _COARSE
+    owner, cell = _boxes_around(corners, size)
+    while True:
+        keep = overlaps(corners[owner], cell.astype(float) * size, size)
+        owner, cell = owner[keep], cell[keep]
+        if size == 1:
+            return indices(np.unique(keys(cell)))
+        size //= 2
+        owner, cell = np.repeat(owner, 8), (2 * cell[:, None, :] + _OCTANTS).reshape(-1, 3)
+
+
+_OCTANTS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
+
+
+def overlaps(triangles: NDArray[np.float64], low: NDArray[np.floating], size: float) -> NDArray[np.bool_]:
+    """Tell for each pair whether triangle (N, 3, 3) and box [low, low + size), low (N, 3), share a point.
+
+    They do not where one of 13 directions separates them: the box's axes, the triangle's normal, and the products of
+    box axes and triangle edges. A triangle that merely touches a box's edge or corner counts as sharing it.
+    """
+    half = size / 2
+    a, b, c = np.moveaxis(triangles - (low + half)[:, None, :], 1, 0)
+    lowest, highest = np.minimum(np.minimum(a, b), c), np.maximum(np.maximum(a, b), c)
+    hit = ((lowest < half) & (highest >= -half)).T.copy().all(axis=0)
+    normal = np.cross(b - a, c - a)
+    hit &= np.abs((normal * a).sum(1)) <= half * np.abs(normal).sum(1)
+    for start, end, opposite in ((a, b, c), (b, c, a), (c, a, b)):
+        edge = end - start
+        for y, z in ((1, 2), (2, 0), (0, 1)):  # direction: box axis x edge; (0, -edge_z, edge_y) for axis x
+            near = start[:, z] * edge[:, y] - start[:, y] * edge[:, z]
+            far = opposite[:, z] * edge[:, y] - opposite[:, y] * edge[:, z]
+            reach = half * (np.abs(edge[:, y]) + np.abs(edge[:, z]))
+            hit &= (np.minimum(near, far) <= reach) & (np.maximum(near, far) >= -reach)
+    return hit
+
+
+def interior_cells(solid: Solid, voxel_size: float) -> NDArray[np.int32]:
+    """Return the cells (M, 3) whose centre lies in the solid."""
+    low, high = np.floor(solid.bounds / voxel_size).astype(int)
+    cells = np.stack(np.meshgrid(*map(np.arange, low, high + 1), indexing="ij"), axis=-1).reshape(-1, 3)
+    return cells[solid.contains((cells + 0.5) * voxel_size)].astype(np.int32)
+
+
+def covered(solids: Sequence[Solid], cell_keys: Keys, voxel_size: float) -> NDArray[np.bool_]:
+    """Tell which cells lie wholly in solids taken together: all eight corners and the centre are in some solid.
+
+    Such cells hold the faces where two solids touch, which nobody can see.
+    """
+    probes = np.concatenate([_OCTANTS, [[0.5, 0.5, 0.5]]])
+    cell = indices(cell_keys)
+    in_solid = np.zeros((len(cell), len(probes)), bool)
+    for solid in solids:
+        low, high = np.floor(solid.bounds / voxel_size)
+        near = np.flatnonzero(((cell >= low) & (cell <= high)).all(axis=1))
+        points = (cell[near][:, None, :] + probes) * voxel_size
+        in_solid[near] |= solid.contains(points.reshape(-1, 3)).reshape(-1, len(probes))
+    return np.all(in_solid, axis=1)
+
+
+def longest_axis(solid: Solid) -> NDArray[np.float64]:
+    """Return the unit vector (3,) along which the solid is longest."""
+    corners = np.unique(solid.triangles.reshape(-1, 3).round(9), axis=0)
+    return np.linalg.svd(corners - corners.mean(0), full_matrices=False)[2][0]
+
+
+def _boxes_around(corners: NDArray[np.float64], size: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return pairs (triangle, box) of all boxes of `size` cells that the triangles' bounding boxes touch."""
+    low = np.floor(corners.min(1) / size).astype(np.int64)
+    counts = np.floor(corners.max(1) / size).astype(np.int64) - low + 1
+    number = counts.prod(axis=1)
+    owner = np.repeat(np.arange(len(corners)), number)
+    rank = np.arange(len(owner)) - np.repeat(np.cumsum(number) - number, number)
+    ny, nz = counts[owner, 1:].T
+    return owner, low[owner] + np.stack([rank // (ny * nz), rank // nz % ny, rank % nz], axis=1)

@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where frames come from: recorded folders and simulations, recognised by what they hold."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+from stereovox import registry
+from stereovox.errors import SourceError
+from stereovox.sources.base import Selection as Selection
+from stereovox.sources.base import Source as Source
+from stereovox.sources.base import parse_slice as parse_slice
+
+SOURCES = {
+    "seven_scenes": "stereovox.sources.seven_scenes:SevenScenes",
+    "tum": "stereovox.sources.tum:TumRgbd",
+    "simulation": "stereovox.sources.simulation:Simulation",
+}
+"""Asked in this order, then those of other packages (entry points in the group `stereovox.sources`)."""
+
+
+def open_source(path_or_name: str | os.PathLike[str], frames: str | None = None) -> Source:
+    """Return the frames of a recorded folder or of a simulation (`sim:room`).
+
+    The layout is recognised by content. `frames` picks some of them as a Python slice does (`A:B:S`).
+    Raises SourceError, one line, where there is nothing, nothing known or nothing usable, or `frames` picks nothing.
+    """
+    where = os.fspath(path_or_name)
+    if frames is not None:
+        parse_slice(frames)  # a slip of the pen shows before a long recording is opened
+    source = _recognise(where)(where)
+    return source if frames is None else Selection(source, frames)
+
+
+def _recognise(where: str) -> Any:
+    kinds = []
+    for name in registry.names("sources", SOURCES):  # one by one: what is not needed is not imported
+        kinds.append(registry.find("sources", SOURCES, name))
+        if kinds[-1].recognises(where):
+            return kinds[-1]
+    known = ", ".join(getattr(kind, "layout", "") or kind.__name__ for kind in kinds)
+    raise SourceError(f"{where}: {_problem(where, kinds)}; known: {known}")
+
+
+def _problem(where: str, kinds: list[Any]) -> str:
+    """Return why nothing can be made of `where`, and the folder below it that was perhaps meant."""
+    if not os.path.exists(where):
+        return "no such folder"
+    if not os.path.isdir(where):
+        return "is a file, not the folder of a recording"
+    try:
+        below = sorted(entry.path for entry in os.scandir(where) if entry.is_dir())
+    except OSError as error:
+        return f"{error.strerror}, so it cannot be listed"
+    meant = next((folder for folder in below for kind in kinds if kind.recognises(folder)), None)
+    return "not a recording of a known layout" + (f" (did you mean {meant}?)" if meant else "")

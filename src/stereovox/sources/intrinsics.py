@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Focal lengths and optical centre from the small text files that lie beside recordings."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from stereovox.cameras import PinholeCamera
+from stereovox.errors import SourceError, StereovoxError
+
+MATRIX, LIST = "camera-intrinsics.txt", "calibration.txt"
+VGA = (640, 480)
+Intrinsics = tuple[float, float, float, float]
+"""fx, fy, cx, cy in pixels."""
+
+
+def find_camera(
+    folders: Sequence[Path], size: tuple[int, int], baseline: float, default: Intrinsics
+) -> tuple[PinholeCamera, tuple[str, ...]]:
+    """Return the camera of images of (width, height) = `size`, and a note where its numbers had to be assumed.
+
+    The first file found counts: `camera-intrinsics.txt` (3x3 matrix), then `calibration.txt` (fx fy cx cy), in the
+    order of `folders`. Without one, 640x480 images get `default`. `baseline` in metres.
+    Raises SourceError for a bad file, or where there is none and the images have another size.
+    """
+    for path in (folder / name for folder in folders for name in (MATRIX, LIST)):
+        if os.path.isfile(path):  # Path.is_file may raise
+            return _camera(path, size, read_intrinsics(path), baseline), ()
+    if size != VGA:
+        raise SourceError(
+            f"{folders[0] / MATRIX}: no such file, and {size[0]}x{size[1]} images have no standard calibration; "
+            "write the 3x3 camera matrix into it"
+        )
+    numbers = " ".join(f"{n:g}" for n in default)
+    note = f"{folders[0]} has no {MATRIX}: assuming the data set's standard fx fy cx cy = {numbers}"
+    return PinholeCamera(*size, *default, baseline), (note,)
+
+
+def read_intrinsics(path: Path) -> Intrinsics:
+    """Return fx, fy, cx, cy in pixels from a 3x3 matrix or from these four numbers; `#` starts a comment.
+
+    Raises SourceError naming the file for anything else, also for skew: such a camera is no plain pinhole.
+    """
+    numbers = _numbers(path)
+    if len(numbers) == 4:
+        fx, fy, cx, cy = numbers
+    elif len(numbers) == 9 and numbers[6:] == [0, 0, 1] and numbers[1] == numbers[3] == 0:
+        fx, _, cx, _, fy, cy, *_ = numbers
+    else:
+        raise SourceError(f"{path}: needs the matrix 'fx 0 cx / 0 fy cy / 0 0 1' or the four numbers fx fy cx cy")
+    return fx, fy, cx, cy
+
+
+def _numbers(path: Path) -> list[float]:
+    try:
+        lines = path.read_text("utf-8-sig").splitlines()
+        numbers = [float(word) for line in lines for word in line.partition("#")[0].replace(",", " ").split()]
+    except OSError as error:
+        raise SourceError(f"{path}: {error.strerror}; make it readable") from None
+    except ValueError as error:
+        raise SourceError(f"{path}: {error}; write plain numbers") from None
+    if not all(map(math.isfinite, numbers)):
+        raise SourceError(f"{path}: holds NaN or infinity; write plain numbers")
+    return numbers
+
+
+def _camera(path: Path, size: tuple[int, int], intrinsics: Intrinsics, baseline: float) -> PinholeCamera:
+    try:
+        return PinholeCamera(*size, *intrinsics, baseline)
+    except StereovoxError as error:
+        raise SourceError(f"{path}: {error}") from None

@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A map made ready for drawing: turned upright, with the layers at which to cut it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stereovox.errors import StereovoxError, did_you_mean
+from stereovox.maps import State, VoxelMap
+
+UPS = {"z": (0, 1, 2), "-z": (1, 0, 2), "y": (2, 0, 1), "-y": (0, 2, 1), "x": (1, 2, 0), "-x": (2, 1, 0)}
+"""For each axis that may point up: the map's axes that go right, away and up (the last flipped where minus)."""
+SLAB = 1.6
+"""A layer that holds so many times the cells of the median layer is a floor or a ceiling."""
+
+
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """A map whose third axis points up.
+
+    cells: (N, 3) int32 known cells; state: (N,) uint8 of `State`; path: camera positions (M, 3) in metres, or None;
+    names: the map's own names of the three axes.
+    """
+
+    cells: NDArray[np.int32]
+    state: NDArray[np.uint8]
+    voxel_size: float
+    path: NDArray[np.float64] | None
+    names: tuple[str, str, str]
+
+    @cached_property
+    def occupied(self) -> NDArray[np.int32]:
+        """Occupied cells (K, 3)."""
+        return self.cells[self.state == State.OCCUPIED]
+
+    @cached_property
+    def below_ceiling(self) -> NDArray[np.int32]:
+        """Occupied cells without a ceiling."""
+        return self.occupied[self.occupied[:, 2] < ceiling(self.occupied)]
+
+    @cached_property
+    def cut(self) -> float | None:
+        """Height in metres from which cells are left out, None where all are drawn."""
+        if len(self.below_ceiling) == len(self.occupied):
+            return None
+        return ceiling(self.occupied) * self.voxel_size
+
+    @cached_property
+    def layer(self) -> int:
+        """The layer that tells most: many known cells, no floor or ceiling, and of those the most occupied cells."""
+        low, known = _layers(self.cells)
+        occupied = np.bincount(self.occupied[:, 2] - low, minlength=len(known))
+        usual = np.median(occupied[occupied > 0]) if occupied.any() else np.inf
+        known = np.where(occupied > SLAB * usual, 0, known)
+        return int(low + np.argmax(np.where(known >= 0.9 * known.max(), occupied + 1, 0)))
+
+
+def upright(voxel_map: VoxelMap, trajectory: ArrayLike | None, up: str) -> Drawn:
+    """Turn a map so that its axis `up` (`z`, `-y`, ...) becomes the third. Raises StereovoxError for another word."""
+    if up not in UPS:
+        raise StereovoxError(f"up '{up}' is no axis of the map{did_you_mean(up, UPS)}")
+    order = list(UPS[up])
+    cells, _ = voxel_map.cells()
+    state = voxel_map.state(voxel_map.centers(cells))
+    cells = cells[:, order]
+    path = None if trajectory is None else np.asarray(trajectory, float).reshape(-1, 3)[:, order]
+    if up.startswith("-"):
+        cells[:, 2] = -1 - cells[:, 2]
+        path = path if path is None else path * [1, 1, -1]
+    return Drawn(cells, state, voxel_map.voxel_size, path, ("xyz"[order[0]], "xyz"[order[1]], up))
+
+
+def ceiling(occupied: NDArray[np.int32]) -> int:
+    """Return the layer (third index) at which the ceiling of occupied cells (K, 3) begins; beyond the highest if none.
+
+    A ceiling is a layer in the upper part of the map that holds far more cells than layers usually do.
+    """
+    if not len(occupied):
+        return 0
+    low, count = _layers(occupied)
+    upper = np.arange(len(count)) > 0.55 * len(count)
+    slabs = np.flatnonzero(upper & (count > SLAB * np.median(count)))
+    return int(low + (slabs[0] - 1 if len(slabs) else len(count)))
+
+
+def _layers(cells: NDArray[np.int32]) -> tuple[int, NDArray[np.int64]]:
+    low = int(cells[:, 2].min())
+    return low, np.bincount(cells[:, 2] - low)

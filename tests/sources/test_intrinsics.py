@@ -1,0 +1,61 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import pytest
+
+from stereovox.errors import SourceError
+from stereovox.sources.intrinsics import find_camera, read_intrinsics
+
+DEFAULT = (525.0, 525.0, 319.5, 239.5)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "500 0 320\n0 501 240\n0 0 1\n",
+        "500 501 320 240",
+        "# fx fy cx cy\n500,501,320,240 # pixels\n",
+        "\ufeff500 501 320 240",
+    ],
+)
+def test_a_matrix_and_four_numbers_say_the_same(tmp_path, text):
+    path = tmp_path / "calibration.txt"
+    path.write_text(text, "utf-8")
+    assert read_intrinsics(path) == (500, 501, 320, 240)
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "500 501 320", "500 0.3 320 0 501 240 0 0 1", "500 0 320 0 501 240 0 0 2", "fx fy cx cy", "nan 501 320 240"],
+)
+def test_anything_else_is_an_error_that_names_the_file(tmp_path, text):
+    path = tmp_path / "calibration.txt"
+    path.write_text(text)
+    with pytest.raises(SourceError, match=r"calibration\.txt"):
+        read_intrinsics(path)
+
+
+def test_the_first_file_counts_and_leaves_no_note(tmp_path):
+    near, far = tmp_path / "near", tmp_path / "far"
+    near.mkdir()
+    far.mkdir()
+    (far / "camera-intrinsics.txt").write_text("1 0 2 0 3 4 0 0 1")
+    camera, notes = find_camera([near, far], (640, 480), 0.075, DEFAULT)
+    assert (camera.fx, camera.fy, camera.cx, camera.cy, camera.baseline) == (1, 3, 2, 4, 0.075)
+    assert notes == ()
+    (near / "calibration.txt").write_text("9 9 9 9")
+    assert find_camera([near, far], (640, 480), 0.075, DEFAULT)[0].fx == 9
+
+
+def test_without_a_file_only_640x480_has_a_default_and_the_user_is_told(tmp_path):
+    camera, (note,) = find_camera([tmp_path], (640, 480), 0.075, DEFAULT)
+    assert (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy) == (640, 480, *DEFAULT)
+    assert "525" in note
+    with pytest.raises(SourceError, match=r"camera-intrinsics\.txt.*320x240"):
+        find_camera([tmp_path], (320, 240), 0.075, DEFAULT)
+
+
+def test_impossible_focal_lengths_name_the_file(tmp_path):
+    (tmp_path / "calibration.txt").write_text("0 500 320 240")
+    with pytest.raises(SourceError, match=r"calibration\.txt.*positive"):
+        find_camera([tmp_path], (640, 480), 0.075, DEFAULT)

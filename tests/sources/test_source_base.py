@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+import pytest
+
+from stereovox.cameras import PinholeCamera
+from stereovox.errors import SourceError
+from stereovox.frame import Frame
+from stereovox.sources import Selection, Source, parse_slice
+from stereovox.sources.base import AHEAD, prefetch
+
+
+class Counting(Source):
+    """Ten frames whose stamp is their number."""
+
+    def __init__(self):
+        self.name, self.camera = "counting", PinholeCamera(4, 3, 5, 5, 2, 1)
+
+    def __len__(self):
+        return 10
+
+    def frame(self, i):
+        i = range(10)[i]
+        return Frame(np.ones((3, 4), np.uint16), self.camera, np.eye(4), stamp_ns=i)
+
+
+@pytest.mark.parametrize("text", ["0:10:3", "2:", ":4", ":", "::2", "-3:", "::-1", "9:2:-3", " 1 : 5 ", "5:100"])
+def test_a_selection_is_what_python_slices(text):
+    expected = list(range(10))[slice(*(int(part) if part.strip() else None for part in text.split(":")))]
+    source = Selection(Counting(), text)
+    assert [frame.stamp_ns for frame in source] == expected
+    assert len(source) == len(expected)
+    assert source.frame(-1).stamp_ns == expected[-1]
+    assert (source.name, source.camera.width) == ("counting", 4)
+    with pytest.raises(IndexError):
+        source.frame(len(expected))
+
+
+@pytest.mark.parametrize("text", ["", "5", "a:b", "1:2:3:4", "::0", "1.5:", "1-5", "0:10:3:"])
+def test_other_text_is_an_error_with_an_example(text):
+    with pytest.raises(SourceError, match="A:B:S"):
+        parse_slice(text)
+
+
+@pytest.mark.parametrize("text", ["10:", "5:5", "3:1", "0:5:-1"])
+def test_an_empty_selection_is_an_error(text):
+    with pytest.raises(SourceError, match=f"'{text}' picks none of the 10 frames of counting"):
+        Selection(Counting(), text)
+
+
+def test_selections_can_be_selected_from():
+    assert [frame.stamp_ns for frame in Selection(Selection(Counting(), "::2"), "1:3")] == [2, 4]
+
+
+def test_a_source_can_be_run_through_twice():
+    source = Counting()
+    assert [f.stamp_ns for f in source] == [f.stamp_ns for f in source] == list(range(10))
+
+
+@pytest.mark.parametrize("count", [0, 1, AHEAD, 3 * AHEAD])
+def test_prefetch_keeps_the_order(count):
+    assert list(prefetch(lambda i: i * i, count)) == [i * i for i in range(count)]
+
+
+def test_prefetch_reads_in_the_background_but_not_too_far():
+    begun, ahead_reached = [], threading.Event()
+
+    def read(i):
+        begun.append(i)
+        if i == 3:
+            ahead_reached.set()
+        return i, threading.current_thread()
+
+    items = prefetch(read, 100, ahead=3)
+    first, thread = next(items)
+    assert first == 0
+    assert thread is not threading.current_thread()
+    assert ahead_reached.wait(10)
+    items.close()
+    assert max(begun) == 3
+
+
+def test_prefetch_stops_with_its_consumer():
+    before = set(threading.enumerate())
+    begun = []
+    for item in prefetch(lambda i: begun.append(i) or i, 1000):
+        if item == 2:
+            break
+    else:
+        pytest.fail("never reached")
+    assert max(begun) <= 2 + AHEAD
+    assert not {t for t in set(threading.enumerate()) - before if t.name.startswith("stereovox-source")}
+
+
+def test_what_goes_wrong_in_the_background_is_raised_in_its_turn():
+    def read(i):
+        if i == 2:
+            raise RuntimeError("disk on fire")
+        return i
+
+    seen = []
+    with pytest.raises(RuntimeError, match="disk on fire"):
+        seen.extend(prefetch(read, 10))
+    items = prefetch(read, 10)
+    assert [next(items), next(items)] == [0, 1]
+    with pytest.raises(RuntimeError):
+        next(items)

@@ -1,0 +1,149 @@
+"""The whole flow by its Python API."""
+
+import numpy as np
+import pytest
+from made_images import made_image
+
+import stereovox as sv
+
+
+def frame_of(image, **changes):
+    depth = np.where(np.isfinite(image.depth_m), image.depth_m, 0)
+    return sv.Frame(**{"depth": depth, "camera": image.camera, "T_world_sensor": image.T_world_sensor, **changes})
+
+
+def wall_frame(distance=2.0, camera=None):
+    camera = camera or sv.PinholeCamera(80, 60, 60.0, 60.0, 39.5, 29.5, 0.05)
+    pose = np.array([[0, 0, 1, 0.03], [-1, 0, 0, 0.02], [0, -1, 0, 0.01], [0, 0, 0, 1.0]])  # looks along world x
+    return sv.Frame(np.full((60, 80), distance, np.float32), camera, pose)
+
+
+@pytest.mark.parametrize("integrator", ["projective", "ray"])
+def test_a_wall_is_found_with_free_space_before_and_unknown_behind(integrator):
+    mapper = sv.Mapper("default", voxel_size=0.1, integrator=integrator)
+    for _ in range(8):
+        report = mapper.add(wall_frame())
+    assert report.refused is None
+    on_axis = np.array([[x, 0.02, 0.01] for x in (0.55, 1.05, 1.55, 2.05, 2.35, 3.0)])
+    F, O, U = sv.State.FREE, sv.State.OCCUPIED, sv.State.UNKNOWN
+    assert mapper.map.state(on_axis).tolist() == [F, F, F, O, U, U]
+    assert mapper.map.frames == 8
+
+
+@pytest.mark.parametrize("integrator", ["projective", "ray"])
+def test_nothing_clears_through_pixels_without_a_value(integrator):
+    """ROG-Map#18: a wall too near for the camera must not be erased by the frames that cannot see it."""
+    mapper = sv.Mapper("default", voxel_size=0.1, integrator=integrator)
+    for _ in range(8):
+        mapper.add(wall_frame(1.0))
+    before = mapper.map.occupied()
+    frame = wall_frame(4.5)
+    depth = frame.depth.copy()
+    depth[:, 3:] = 0  # only a sliver still has a value
+    blind = sv.Frame(depth, frame.camera, frame.T_world_sensor)
+    for _ in range(20):
+        mapper.add(blind)
+    left = {tuple(p) for p in mapper.map.occupied().round(3)}
+    centre = [p for p in before if abs(p[1]) < 0.3]
+    assert len(centre) > 10
+    assert all(tuple(np.round(p, 3)) in left for p in centre)
+
+
+@pytest.mark.parametrize("integrator", ["projective", "ray"])
+def test_too_far_clears_up_to_the_maximum_range_and_no_further(integrator):
+    mapper = sv.Mapper("default", voxel_size=0.1, integrator=integrator, max_range=3.0)
+    for _ in range(5):
+        assert mapper.add(wall_frame(50.0)).refused is None
+    x = np.arange(0.55, 4.0, 0.1)
+    states = mapper.map.state(np.stack([x, 0 * x + 0.02, 0 * x + 0.01], axis=1))
+    assert (states[x < 2.9] == sv.State.FREE).all()
+    assert (states[x > 3.1] == sv.State.UNKNOWN).all()
+    assert len(mapper.map.occupied()) == 0
+
+
+@pytest.mark.parametrize("integrator", ["projective", "ray"])
+def test_a_refused_frame_changes_nothing(integrator):
+    mapper = sv.Mapper("default", voxel_size=0.1, max_range=2.5, integrator=integrator)
+    image = made_image(0)
+    mapper.add(frame_of(image))
+    before = [array.copy() for array in mapper.map.blocks()]
+    bad_pose = image.T_world_sensor.copy()
+    bad_pose[1, 3] = np.nan
+    for bad in (
+        frame_of(image, T_world_sensor=bad_pose),
+        frame_of(image, depth=np.zeros((3, 3), np.uint16)),
+        frame_of(image, depth=np.full(image.depth_m.shape, np.nan)),
+        frame_of(image, fault="unreadable"),
+    ):
+        report = mapper.add(bad)
+        assert report.refused
+        assert report.detail
+        assert report.cells == 0
+    after = mapper.map.blocks()
+    assert all((a == b).all() for a, b in zip(before, after, strict=True))
+    assert mapper.map.frames == 1
+    assert mapper.add(frame_of(image)).refused is None
+
+
+@pytest.mark.parametrize("integrator", ["projective", "ray"])
+def test_thread_count_and_a_stop_between_change_no_bit(integrator, tmp_path):
+    frames = [frame_of(made_image(seed)) for seed in range(6)]
+    settings = {"voxel_size": 0.05, "max_range": 2.5, "integrator": integrator}
+    maps = []
+    for threads in (1, 2):
+        mapper = sv.Mapper("default", threads=threads, **settings)
+        for frame in frames:
+            mapper.add(frame)
+        maps.append(mapper.map)
+    halfway = sv.Mapper("default", **settings)
+    for frame in frames[:3]:
+        halfway.add(frame)
+    halfway.map.save(tmp_path / "half.svox")
+    resumed = sv.Mapper("default", resume=sv.load_map(tmp_path / "half.svox"), **settings)
+    for frame in frames[3:]:
+        resumed.add(frame)
+    for other in (maps[1], resumed.map):
+        assert all((a == b).all() for a, b in zip(maps[0].blocks(), other.blocks(), strict=True))
+
+
+def test_resuming_with_another_voxel_size_is_refused():
+    with pytest.raises(sv.StereovoxError, match=r"0\.1"):
+        sv.Mapper("default", voxel_size=0.05, resume=sv.Mapper("default", voxel_size=0.1).map)
+
+
+def test_a_user_writes_a_sensor_model_in_plain_numpy(monkeypatch):
+    """What extending.md promises: a dataclass with one NumPy function, found by its name."""
+    import sys
+    import types
+    from dataclasses import dataclass
+
+    from stereovox.sensors import SENSORS
+
+    @dataclass(frozen=True)
+    class Careful:
+        p_free: float = 0.45
+        p_unknown: float = 0.5
+
+        def probability(self, z, z_measured, sigma):
+            return np.where(z < z_measured, self.p_free, np.where(z > z_measured, 0.5, 0.6))
+
+    module = types.ModuleType("careful_sensor")
+    module.Careful = Careful
+    monkeypatch.setitem(sys.modules, "careful_sensor", module)
+    monkeypatch.setitem(SENSORS, "careful", "careful_sensor:Careful")
+    mapper = sv.Mapper("default", voxel_size=0.1, **{"sensor.model": "careful"})
+    mapper.add(wall_frame())
+    assert mapper.map.probability([[2.05, 0.02, 0.01], [1.0, 0.02, 0.01]]) == pytest.approx([0.6, 0.45], abs=1e-3)
+
+
+def test_cameras_may_change_between_frames():
+    mapper = sv.Mapper("default", voxel_size=0.1)
+    small = sv.PinholeCamera(8, 6, 6.0, 6.0, 3.5, 2.5, 0.05)
+    mapper.add(wall_frame())
+    wall = wall_frame()
+    mapper.add(sv.Frame(np.full((6, 8), 2.0, np.float32), small, wall.T_world_sensor))
+    mapper.add(wall)
+    same = sv.Mapper("default", voxel_size=0.1)
+    for camera_frame in (wall, sv.Frame(np.full((6, 8), 2.0, np.float32), small, wall.T_world_sensor), wall):
+        same.add(camera_frame)
+    assert all((a == b).all() for a, b in zip(mapper.map.blocks(), same.map.blocks(), strict=True))

@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: Apache-2.0
+import numpy as np
+import pytest
+from matplotlib.image import imread
+
+from stereovox.config import load_config
+from stereovox.errors import StereovoxError
+from stereovox.maps import State, VoxelMap
+from stereovox.view.drawn import ceiling, upright
+from stereovox.view.panels import STATE_COLOURS, round_length
+from stereovox.view.picture import picture
+from stereovox.view.render import LIGHT, Direction, render
+
+CONFIG = load_config("default", voxel_size=0.1)
+RED, GREEN = np.array([1.0, 0, 0]), np.array([0, 1.0, 0])
+
+
+def a_room():
+    """A closed room of 40 x 20 x 20 cells with a pole, free inside, one tentative cell."""
+    grid = np.full((40, 20, 20), -1.5)
+    for axis in range(3):
+        shell = np.moveaxis(grid, axis, 0)
+        shell[0] = shell[-1] = 3.0
+    grid[12, 12, :] = 3.0
+    grid[20, 5, 5:15] = 0.2
+    return VoxelMap.from_cells(CONFIG, np.argwhere(np.ones_like(grid)), grid.ravel())
+
+
+def has_colour(image, colour, tolerance=0.02):
+    rgb = np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)]) / 255
+    return (np.abs(image[..., :3] - rgb).max(-1) < tolerance).sum()
+
+
+def test_a_picture_shows_all_states_and_heights(tmp_path):
+    picture(a_room(), tmp_path / "map.png", title="A room", trajectory=[[0.5, 0.5, 1], [3, 1, 1]])
+    image = imread(tmp_path / "map.png")
+    for state in (State.FREE, State.TENTATIVE, State.OCCUPIED, State.UNKNOWN):
+        assert has_colour(image, STATE_COLOURS[state]) > 100, state
+    assert has_colour(image, "#e0452f", 0.05) > 50, "the path"
+    coloured = image[..., :3].max(-1) - image[..., :3].min(-1) > 0.25
+    assert coloured.mean() > 0.05, "cells coloured by height"
+    assert (image[..., :3] > 0.99).all(-1).mean() > 0.2, "a white page round them"
+
+
+@pytest.mark.parametrize("log_odds", [None, -1.5])
+def test_maps_without_anything_to_draw_say_so(tmp_path, log_odds):
+    cells = np.zeros((0, 3), int) if log_odds is None else [[0, 0, 0], [1, 0, 0]]
+    picture(VoxelMap.from_cells(CONFIG, cells, np.full(len(cells), log_odds or 0.0)), tmp_path / "map.png")
+    image = imread(tmp_path / "map.png")
+    assert (image[..., :3].min(-1) < 0.6).sum() > 200
+
+
+def test_one_single_cell_can_be_drawn(tmp_path):
+    picture(VoxelMap.from_cells(CONFIG, [[3, -4, 5]], [3.0]), tmp_path / "map.png")
+    assert (tmp_path / "map.png").stat().st_size > 5000
+
+
+def test_user_mistakes_are_one_line(tmp_path):
+    with pytest.raises(StereovoxError, match=r"map\.jpg.*\.png"):
+        picture(a_room(), tmp_path / "map.jpg")
+    with pytest.raises(StereovoxError, match="cannot write"):
+        picture(VoxelMap.from_cells(CONFIG, np.zeros((0, 3)), []), tmp_path / "no" / "map.png")
+    with pytest.raises(StereovoxError, match="up 'w'"):
+        picture(a_room(), tmp_path / "map.png", up="w")
+
+
+def test_the_ceiling_is_cut_away_and_a_landscape_is_not():
+    room = upright(a_room(), None, "z")
+    assert 12 < ceiling(room.occupied) <= 19
+    assert room.below_ceiling[:, 2].max() < 19
+    hill = np.array([[x, y, z] for x in range(20) for y in range(20) for z in range(10 - max(x, y) // 2)])
+    assert ceiling(hill) == 10
+
+
+def test_the_slice_is_no_floor_or_ceiling():
+    assert 0 < upright(a_room(), None, "z").layer < 19
+
+
+@pytest.mark.parametrize("up", ["x", "-x", "y", "-y", "z", "-z"])
+def test_any_axis_can_point_up_and_nothing_is_mirrored(up):
+    cells = np.array([[0, 0, 0], [5, 0, 0], [0, 7, 0], [0, 0, 9]])
+    voxel_map = VoxelMap.from_cells(CONFIG, cells, [3.0] * 4)
+    drawn = upright(voxel_map, voxel_map.centers(cells), up)
+    turned = drawn.path[1:] - drawn.path[0]
+    assert np.linalg.det(turned) > 0
+    axis = "xyz".index(up[-1])
+    assert turned[axis, 2] == pytest.approx([0.5, 0.7, 0.9][axis] * (-1 if up.startswith("-") else 1))
+    assert sorted(map(tuple, np.floor(drawn.path / 0.1 + 1e-9).astype(int))) == sorted(map(tuple, drawn.cells))
+
+
+def test_nearer_cells_hide_farther_ones():
+    cells, colours = np.array([[0, 0, 0], [0, 0, 5]]), np.stack([RED, GREEN])
+    from_above = render(cells, colours, 0.1, Direction.of(-90, 90), 40, 40).image
+    np.testing.assert_allclose(from_above[5, 5], [0, LIGHT["top"], 0, 1], atol=0.02)
+    from_below = render(cells, colours, 0.1, Direction.of(-90, -90), 40, 40).image
+    np.testing.assert_allclose(from_below[5, 5, :2], [LIGHT["top"], 0], atol=0.02)
+
+
+def test_a_view_shows_the_sides_that_look_at_the_viewer():
+    seen = render(np.zeros((1, 3), int), RED[None], 1.0, Direction.of(0, 0), 30, 30).image
+    np.testing.assert_allclose(seen[5, 5], [LIGHT["x"], 0, 0, 1], atol=0.02)
+    oblique = render(np.zeros((1, 3), int), RED[None], 1.0, Direction.of(30, 35), 60, 60).image
+    shades = oblique[oblique[..., 3] == 1][:, 0]
+    assert all(np.isclose(shades, LIGHT[name], atol=0.02).sum() > 5 for name in ("top", "x", "y"))
+
+
+def test_top_view_keeps_x_right_and_y_up_without_gaps():
+    cells = np.array([[x, y, 0] for x in range(30) for y in range(12)])
+    colours = np.where((cells[:, :1] > 14) & (cells[:, 1:2] > 5), GREEN, RED)
+    rendering = render(cells, colours, 0.05, Direction.of(-90, 90), 333, 333)
+    assert rendering.extent == pytest.approx((0, 1.5, 0, 0.6))
+    image = rendering.image
+    assert (image[..., 3] == 1).all()
+    assert (image[20, -20, :2] == [0, 1]).all()
+    assert all((image[row, column, :2] == [1, 0]).all() for row, column in ((20, 20), (-20, 20), (-20, -20)))
+
+
+@pytest.mark.parametrize(("length", "rounded"), [(0.037, 0.02), (1.0, 1.0), (7.3, 5.0), (26, 20)])
+def test_scale_bars_have_round_lengths(length, rounded):
+    assert round_length(length) == pytest.approx(rounded)

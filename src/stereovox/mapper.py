@@ -45,6 +45,7 @@ class Mapper:
         try:
             image = prepare(frame, self.config)
         except FrameRefused as refused:
+            self.map.frames_refused += 1
             return UpdateReport(refused=refused.reason, detail=str(refused))
         prepared = perf_counter()
         evidence = self._integrator.evidence(image)

@@ -3,7 +3,7 @@ import json
 
 import pytest
 
-from stereovox.cli.demo import demo
+from stereovox.evaluate.demo import demo
 from stereovox.maps import load_map
 from stereovox.sources.simulation import Simulation
 

@@ -61,8 +61,10 @@ def test_a_source_can_be_run_through_twice():
 
 
 @pytest.mark.parametrize("count", [0, 1, AHEAD, 3 * AHEAD])
-def test_prefetch_keeps_the_order(count):
-    assert list(prefetch(lambda i: i * i, count)) == [i * i for i in range(count)]
+def test_prefetch_reads_each_item_once_and_keeps_the_order(count):
+    begun = []
+    assert list(prefetch(lambda i: begun.append(i) or i * i, count)) == [i * i for i in range(count)]
+    assert begun == list(range(count))
 
 
 def test_prefetch_reads_in_the_background_but_not_too_far():

@@ -1,133 +1,49 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The demo: a simulated camera flies through the built-in room; map, picture and report are made and checked."""
+"""Fly a simulated camera through a built-in room: map, picture and report in under a minute.
+
+The report compares the map with the scene's exact occupancy.
+"""
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Iterator
-from pathlib import Path
-from time import perf_counter
+from argparse import ArgumentParser, Namespace
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
+from stereovox.cli.terminal import milliseconds, progress_bar, say, say_about_compiling, size, thousands
 
-from stereovox.errors import StereovoxError
-from stereovox.evaluate.metrics import by_part, compare_map, find_pieces
-from stereovox.evaluate.report import write_report
-from stereovox.evaluate.sightings import Sightings
-from stereovox.evaluate.truth import Truth, exact_occupancy
-from stereovox.frame import Frame
-from stereovox.mapper import Mapper, UpdateReport
-from stereovox.sources.base import prefetch
-from stereovox.sources.simulation import Simulation
-from stereovox.view.picture import picture
-
-MIN_FRAMES = 20
-"""A cell must stand in the map once so many frames saw it."""
-
-Progress = Callable[[int, int, str], None]
-"""Called with steps done, steps in all, and what is being done."""
+EXAMPLE = "stereovox demo --out my-first-map"
 
 
-def demo(
-    out: str | Path,
-    *,
-    voxel_size: float = 0.05,
-    progress: Progress | None = None,
-    source: Simulation | None = None,
-    min_frames: int = MIN_FRAMES,
-) -> dict[str, Any]:
-    """Run the whole flow on the built-in scene and write `room.svox`, `room.png` and `report.html` into folder `out`.
-
-    A part of the scene must stand in the map once `min_frames` frames saw it.
-    Returns a summary fit for JSON: the keys of `map --json`, and `accuracy`, `parts`, `missing`, `files`, `seconds`.
-    Raises StereovoxError when the folder cannot be written.
-    """
-    start = perf_counter()
-    folder = _folder(out)
-    source = source or Simulation()
-    tell = progress or (lambda done, total, text: None)
-    mapper = Mapper(voxel_size=voxel_size)
-    truth = exact_occupancy(source.scene, voxel_size)
-    sightings = Sightings(truth.surface, voxel_size)
-    reports = _map(mapper, source, sightings, tell)
-    mapped = perf_counter()
-    tell(len(source), len(source), "checking the map and drawing it")
-    files = {"map": folder / "room.svox", "picture": folder / "room.png", "report": folder / "report.html"}
-    mapper.map.save(files["map"])
-    summary = {**_facts(source, mapper, reports), **_quality(mapper, truth, sightings.frames, min_frames)}
-    trajectory = [source.pose(i)[:3, 3] for i in range(len(source))]
-    picture(mapper.map, files["picture"], title=f"stereovox demo: {source.name}", trajectory=trajectory)
-    write_report(files["report"], summary, files["picture"])
-    end = perf_counter()
-    seconds = {"simulate_and_map": mapped - start, "check_and_draw": end - mapped, "total": end - start}
-    return {**summary, "files": {name: str(path) for name, path in files.items()}, "seconds": _rounded(seconds)}
+def add_arguments(parser: ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("--out", default="stereovox-demo", metavar="DIR", help="folder for the results (%(default)s)")
+    parser.add_argument("--voxel-size", type=float, default=0.05, metavar="M", help="cell size in metres (%(default)s)")
 
 
-def _folder(out: str | Path) -> Path:
-    folder = Path(out)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        why = error.strerror or error
-        raise StereovoxError(f"{folder}: cannot make this folder ({why}); choose another --out") from None
-    return folder
+def run(arguments: Namespace) -> dict[str, Any]:
+    """Run the demo and tell where its results are."""
+    from stereovox.evaluate.demo import demo
+
+    say_about_compiling()
+    with progress_bar() as bar:
+        task = bar.add_task("starting", note="")
+        result = demo(
+            arguments.out,
+            voxel_size=arguments.voxel_size,
+            progress=lambda done, total, text: bar.update(task, completed=done, total=total, description=text),
+        )
+    _tell(result)
+    return result
 
 
-def _map(mapper: Mapper, source: Simulation, sightings: Sightings, tell: Progress) -> list[UpdateReport]:
-    reports = []
-    for i, (depth, frame) in enumerate(_ahead(source)):
-        reports.append(mapper.add(frame))
-        sightings.add(depth, frame.camera, frame.T_world_sensor, mapper.config.max_range)
-        tell(i + 1, len(source), "flying and mapping")
-    return reports
-
-
-def _ahead(source: Simulation) -> Iterator[tuple[NDArray[np.float32], Frame]]:
-    """Yield exact depth and frame in order, simulated in a second thread; ray casting releases the GIL."""
-
-    def simulate(i: int) -> tuple[NDArray[np.float32], Frame]:
-        depth = source.true_depth(i)
-        return depth, source.observe(i, depth)
-
-    return prefetch(simulate, len(source))
-
-
-def _facts(source: Simulation, mapper: Mapper, reports: list[UpdateReport]) -> dict[str, Any]:
-    refused = Counter(report.refused for report in reports if report.refused)
-    camera = source.camera
-    return {
-        "source": source.name,
-        "camera": f"RealSense D435 ({camera.width}x{camera.height})",
-        "voxel_size": mapper.map.voxel_size,
-        "settings": mapper.config.model_dump(),
-        "frames": mapper.map.frames,
-        "frames_refused": refused.total(),
-        "refused": dict(refused),
-        "depth_ms": _percentiles([report.depth_ms for report in reports]),
-        "integrate_ms": _percentiles([report.integrate_ms for report in reports]),
-        **mapper.map.counts(),
-        "memory_bytes": mapper.map.memory_bytes,
-    }
-
-
-def _percentiles(milliseconds: list[float]) -> dict[str, float]:
-    """Return median, 90 %, 99 % and maximum without the first frame, which may compile."""
-    later = milliseconds[1:] or milliseconds
-    values = np.percentile(later, [50, 90, 99, 100])
-    return _rounded(dict(zip(("median", "p90", "p99", "max"), values, strict=True)))
-
-
-def _rounded(numbers: dict[str, float]) -> dict[str, float]:
-    return {name: round(float(number), 3) for name, number in numbers.items()}
-
-
-def _quality(mapper: Mapper, truth: Truth, frames_seen: NDArray[np.int32], min_frames: int) -> dict[str, Any]:
-    pieces = find_pieces(mapper.map, truth, frames_seen, min_frames)
-    return {
-        "accuracy": compare_map(mapper.map, truth),
-        "min_frames": min_frames,
-        "parts": by_part(pieces),
-        "missing": [piece.name for piece in pieces if piece.missing],
-    }
+def _tell(result: dict[str, Any]) -> None:
+    accuracy = result["accuracy"]
+    say(f"{result['frames']} frames, {milliseconds(result['integrate_ms'])} a frame")
+    say(f"{thousands(result['occupied'])} occupied and {thousands(result['free'])} free cells in {size(result['memory_bytes'])}")
+    say(
+        f"against the exact scene, within one cell: precision {accuracy['tolerance_precision']:.3f}, "
+        f"recall {accuracy['tolerance_recall']:.3f}"
+    )
+    say(f"missing parts: {', '.join(result['missing']) or 'none'}")
+    for name, path in result["files"].items():
+        say(f"{name:>8}: {path}")

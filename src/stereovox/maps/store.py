@@ -34,8 +34,7 @@ BLOCKS_PER_CHUNK = 4096
 def save_map(voxel_map: VoxelMap, path: str | Path) -> None:
     """Write `voxel_map` to the folder `path`. Raises MapFileError when it cannot be written or is no map."""
     folder = Path(path)
-    if folder.exists() and not is_map(folder) and (not folder.is_dir() or any(folder.iterdir())):
-        raise MapFileError(f"{folder}: exists and is not a stereovox map; choose another --out or remove it")
+    check_target(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         data = f"cells-{uuid.uuid4().hex[:12]}"
@@ -49,6 +48,15 @@ def save_map(voxel_map: VoxelMap, path: str | Path) -> None:
             shutil.rmtree(old, ignore_errors=True)
 
 
+def check_target(folder: Path) -> None:
+    """Raise MapFileError when a map cannot be saved to `folder`: it holds something else or cannot be written."""
+    if folder.exists() and not is_map(folder) and (not folder.is_dir() or any(folder.iterdir())):
+        raise MapFileError(f"{folder}: exists and is not a stereovox map; choose another name or remove it")
+    there = next(parent for parent in (folder, *folder.absolute().parents) if parent.exists())
+    if not there.is_dir() or not os.access(there, os.W_OK | os.X_OK):
+        raise MapFileError(f"{folder}: {there} cannot be written to; choose a writable folder")
+
+
 def load_map(path: str | Path) -> VoxelMap:
     """Read a map saved by `VoxelMap.save`. Raises MapFileError: one line with the file and what is wrong."""
     from stereovox.maps.voxel_map import VoxelMap
@@ -57,7 +65,7 @@ def load_map(path: str | Path) -> VoxelMap:
     manifest = read_manifest(folder)
     try:
         voxel_map = VoxelMap(load_config(manifest["config"]))
-        voxel_map.frames = int(manifest["frames"])
+        voxel_map.frames, voxel_map.frames_refused = int(manifest["frames"]), int(manifest["frames_refused"])
         coords, cells = _read_arrays(folder / str(manifest["data"]), int(manifest["blocks"]))
         if _checksum(coords, cells) != manifest["checksum"]:
             raise ValueError("the cells do not match their checksum")
@@ -96,6 +104,7 @@ def _manifest(voxel_map: VoxelMap, data: str, blocks: int, checksum: int) -> dic
         "format": FORMAT,
         "version": VERSION,
         "frames": voxel_map.frames,
+        "frames_refused": voxel_map.frames_refused,
         "blocks": blocks,
         "data": data,
         "checksum": checksum,

@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The command line. Human text goes to stderr; with --json the last line of stdout is one JSON object.
+
+Exit status: 0 ok, 2 bad usage or bad input (one line says what and how to cure it), 130 stopped by Ctrl-C.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+from collections.abc import Sequence
+from importlib import import_module
+from typing import Any, NoReturn
+
+import stereovox
+from stereovox.errors import StereovoxError, did_you_mean
+
+COMMANDS = ("demo", "map", "info", "picture", "export", "bench")
+"""Each is a module here with a docstring, `EXAMPLE`, `add_arguments(parser)` and `run(arguments) -> dict`."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit status."""
+    words = sys.argv[1:] if argv is None else argv
+    try:
+        _check_command(words)
+        arguments = _parser().parse_args(words)
+        result = _module(arguments.command).run(arguments)
+        if arguments.json:
+            print(json.dumps(result, allow_nan=False))
+            sys.stdout.flush()
+        return 0
+    except StereovoxError as error:
+        return _fail(" ".join(str(error).split()), 2)
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the reader of our output has gone: nothing to say
+        return 0
+    except KeyboardInterrupt:
+        return _fail("stopped", 130)
+
+
+def _fail(message: str, status: int) -> int:
+    print(f"stereovox: {message}", file=sys.stderr)
+    return status
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        raise StereovoxError(f"{message}; see: {self.prog} --help")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(prog="stereovox", description=stereovox.__doc__)
+    parser.add_argument("--version", action="version", version=f"stereovox {stereovox.__version__}")
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True, parser_class=_Parser)
+    for name in COMMANDS:
+        module = _module(name)
+        about = str(module.__doc__).strip()
+        command = commands.add_parser(
+            name, help=about.splitlines()[0], description=about, epilog=f"example: {module.EXAMPLE}"
+        )
+        module.add_arguments(command)
+        command.add_argument("--json", action="store_true", help="print one JSON object as the last line of stdout")
+    return parser
+
+
+def _check_command(words: Sequence[str]) -> None:
+    """Name the command that was perhaps meant, which argparse does not."""
+    if words and not words[0].startswith("-") and words[0] not in COMMANDS:
+        raise StereovoxError(f"unknown command '{words[0]}'{did_you_mean(words[0], COMMANDS)}; see: stereovox --help")
+
+
+def _module(name: str) -> Any:
+    return import_module(f"stereovox.cli.{name}")

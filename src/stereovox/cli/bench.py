@@ -1,0 +1,42 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Time stereovox and other mapping libraries on the same frames, in one process."""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser, Namespace
+from typing import Any
+
+from stereovox.cli.terminal import say
+
+EXAMPLE = "stereovox bench recordings/kitchen --voxel-size 0.1 --voxel-size 0.05 --peers octomap,pyoctomap"
+VOXEL_SIZES = (0.2, 0.1, 0.05, 0.02)
+
+
+def add_arguments(parser: ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("source", metavar="SOURCE", help="folder of a recording, or sim:room")
+    parser.add_argument("--voxel-size", type=float, action="append", metavar="M", help="cell size in metres; may be repeated")
+    parser.add_argument("--peers", default="octomap,pyoctomap", metavar="A,B", help="libraries to compare with (%(default)s)")
+    parser.add_argument("--threads", type=int, default=1, metavar="N", help="threads for stereovox (%(default)s)")
+    parser.add_argument("--frames", metavar="A:B:S", help="only these frames, as a Python slice")
+
+
+def run(arguments: Namespace) -> dict[str, Any]:
+    """Run the comparison and print its table."""
+    from stereovox.cli.terminal import progress_bar
+    from stereovox.evaluate.bench import bench, format_table
+    from stereovox.sources import open_source
+
+    source = open_source(arguments.source, arguments.frames)
+    peers = [name.strip() for name in arguments.peers.split(",") if name.strip()]
+    with progress_bar() as bar:
+        task = bar.add_task("loading", note="")
+        result = bench(
+            source,
+            arguments.voxel_size or VOXEL_SIZES,
+            peers,
+            threads=arguments.threads,
+            progress=lambda done, total, text: bar.update(task, completed=done, total=total, description=text),
+        )
+    say(format_table(result))
+    return result

@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Turn a recording into a map.
+
+SOURCE is a 7-Scenes or TUM RGB-D folder, recognised by its files, or the simulation sim:room.
+"""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser, Namespace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from stereovox.cli.terminal import milliseconds, say, say_about_compiling, size, thousands, tracked
+from stereovox.errors import StereovoxError
+
+if TYPE_CHECKING:
+    from stereovox.mapper import Mapper, UpdateReport
+    from stereovox.sources import Source
+
+EXAMPLE = "stereovox map recordings/kitchen --out kitchen.svox --voxel-size 0.05"
+
+
+def add_arguments(parser: ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("source", metavar="SOURCE", help="folder of a recording, or sim:room")
+    parser.add_argument("--out", required=True, metavar="MAP", help="folder of the map to write, for example room.svox")
+    parser.add_argument("--profile", default="default", metavar="P", help="profile name or TOML file (%(default)s)")
+    parser.add_argument("--voxel-size", type=float, metavar="M", help="cell size in metres")
+    parser.add_argument("--integrator", metavar="NAME", help="projective (default) or ray")
+    parser.add_argument("--max-range", type=float, metavar="M", help="depth in metres up to which pixels count")
+    parser.add_argument("--frames", metavar="A:B:S", help="only these frames, as a Python slice")
+    parser.add_argument("--threads", type=int, metavar="N", help="threads; the map does not depend on it")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="settings", help="any other setting")
+    parser.add_argument("--resume", action="store_true", help="go on with the map at --out where an earlier run stopped")
+
+
+def run(arguments: Namespace) -> dict[str, Any]:
+    """Map the source, save the map and tell what was done."""
+    from stereovox.evaluate.summary import summarise
+    from stereovox.sources import open_source
+
+    out = Path(arguments.out)
+    _check_target(out, arguments.resume)
+    source = open_source(arguments.source, arguments.frames)
+    for note in source.notes:
+        say(f"note: {note}")
+    mapper = _mapper(arguments, out)
+    say_about_compiling()
+    reports = _add_all(mapper, source, out)
+    result = summarise(mapper.map, reports)
+    if not mapper.map.frames:
+        raise StereovoxError(f"{arguments.source}: not one frame could be used, no map is written ({_first_refusal(reports)})")
+    mapper.map.save(out)
+    _tell(result, reports, out)
+    return result
+
+
+def _check_target(out: Path, resume: bool) -> None:
+    """Find out before the work, not after it, that the map could not be saved."""
+    from stereovox.maps.store import check_target, is_map
+
+    check_target(out)
+    if resume and not is_map(out):
+        raise StereovoxError(f"{out}: no map to go on with; leave --resume out")
+
+
+def _mapper(arguments: Namespace, out: Path) -> Mapper:
+    from stereovox.mapper import Mapper
+    from stereovox.maps import load_map
+
+    return Mapper(arguments.profile, resume=load_map(out) if arguments.resume else None, **_overrides(arguments))
+
+
+def _overrides(arguments: Namespace) -> dict[str, Any]:
+    from stereovox.config import parse_value
+
+    overrides = {}
+    for setting in arguments.settings:
+        key, equals, value = setting.partition("=")
+        if not equals or not key:
+            raise StereovoxError(f"--set {setting}: write KEY=VALUE, for example --set sensor.p_hit=0.8")
+        overrides[key.strip()] = parse_value(value.strip())
+    named = {name: getattr(arguments, name) for name in ("voxel_size", "integrator", "max_range", "threads")}
+    return {**overrides, **{name: value for name, value in named.items() if value is not None}}
+
+
+def _add_all(mapper: Mapper, source: Source, out: Path) -> list[UpdateReport]:
+    """Add all frames that the map does not hold yet; on Ctrl-C save what there is."""
+    reports: list[UpdateReport] = []
+    done = mapper.map.frames + mapper.map.frames_refused
+    if done:
+        from stereovox.sources import Selection
+
+        if done >= len(source):
+            raise StereovoxError(f"{out}: already holds all {len(source)} frames of {source.name}; nothing to go on with")
+        source = Selection(source, f"{done}:")
+        say(f"going on after frame {done}")
+    try:
+        for frame in tracked(source, len(source), "mapping"):
+            reports.append(mapper.add(frame))
+    except KeyboardInterrupt:
+        if mapper.map.frames:
+            mapper.map.save(out)
+            say(f"stopped after {len(reports)} frames; they are saved in {out}, go on with --resume")
+        raise
+    return reports
+
+
+def _first_refusal(reports: list[UpdateReport]) -> str:
+    return next((report.detail for report in reports if report.refused), "the source is empty")
+
+
+def _tell(result: dict[str, Any], reports: list[UpdateReport], out: Path) -> None:
+    say(f"{result['frames']} frames mapped, {result['frames_refused']} refused")
+    for reason, number in result["refused"].items():
+        example = next(report.detail for report in reports if report.refused == reason)
+        say(f"  {number} x {reason}, first: {example}")
+    say(f"a frame: depth {milliseconds(result['depth_ms'])}; map {milliseconds(result['integrate_ms'])}")
+    say(f"{thousands(result['occupied'])} occupied and {thousands(result['free'])} free cells in {size(result['memory_bytes'])}")
+    say(f"saved in {out}; look at it with: stereovox picture {out} {out.stem}.png")

@@ -1,0 +1,35 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Draw a map: from above, from three sides, and a slice of its states."""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser, Namespace
+from pathlib import Path
+from typing import Any
+
+from stereovox.cli.terminal import say
+from stereovox.errors import StereovoxError
+
+EXAMPLE = "stereovox picture kitchen.svox kitchen.png --up=-y"
+
+
+def add_arguments(parser: ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("map", metavar="MAP", help="folder of a map")
+    parser.add_argument("file", metavar="FILE.png", help="picture to write")
+    parser.add_argument("--up", default="z", metavar="AXIS", help="which way is up in the map: z, -y, x ... (%(default)s)")
+    parser.add_argument("--title", metavar="TEXT", help="title instead of the map's name")
+
+
+def run(arguments: Namespace) -> dict[str, Any]:
+    """Load the map and write its picture."""
+    from stereovox.maps import load_map
+    from stereovox.view.picture import picture
+
+    file = Path(arguments.file)
+    if file.suffix.lower() != ".png":
+        raise StereovoxError(f"{file}: pictures are written as .png; name the file so")
+    voxel_map = load_map(arguments.map)
+    picture(voxel_map, file, title=arguments.title or Path(arguments.map).stem, up=arguments.up)
+    say(f"saved {file}")
+    return {"picture": str(file)}

@@ -1,0 +1,37 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a run did, as a dict of numbers: the same for every command."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from stereovox.mapper import UpdateReport
+from stereovox.maps import VoxelMap
+
+
+def summarise(voxel_map: VoxelMap, reports: Sequence[UpdateReport]) -> dict[str, Any]:
+    """Return frames, refusals by reason, milliseconds a frame, cells and memory of a run.
+
+    Times leave out the first frame that was taken in, which may compile kernels.
+    """
+    taken = [report for report in reports if not report.refused]
+    refused = Counter(report.refused for report in reports if report.refused)
+    return {
+        "frames": len(taken),
+        "frames_refused": refused.total(),
+        "refused": dict(refused.most_common()),
+        "depth_ms": percentiles([report.depth_ms for report in taken]),
+        "integrate_ms": percentiles([report.integrate_ms for report in taken]),
+        **voxel_map.counts(),
+        "memory_bytes": voxel_map.memory_bytes,
+    }
+
+
+def percentiles(milliseconds: Sequence[float]) -> dict[str, float]:
+    """Return median, p90, p99 and max, the first value left out where there are more; zeros for no value at all."""
+    values = np.percentile(milliseconds[1:] or milliseconds or [0.0], [50, 90, 99, 100])
+    return {name: round(float(value), 4) for name, value in zip(("median", "p90", "p99", "max"), values, strict=True)}

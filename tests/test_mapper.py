@@ -25,8 +25,8 @@ def test_a_wall_is_found_with_free_space_before_and_unknown_behind(integrator):
         report = mapper.add(wall_frame())
     assert report.refused is None
     on_axis = np.array([[x, 0.02, 0.01] for x in (0.55, 1.05, 1.55, 2.05, 2.35, 3.0)])
-    F, O, U = sv.State.FREE, sv.State.OCCUPIED, sv.State.UNKNOWN
-    assert mapper.map.state(on_axis).tolist() == [F, F, F, O, U, U]
+    free, occupied, unknown = sv.State.FREE, sv.State.OCCUPIED, sv.State.UNKNOWN
+    assert mapper.map.state(on_axis).tolist() == [free, free, free, occupied, unknown, unknown]
     assert mapper.map.frames == 8
 
 

@@ -13,16 +13,16 @@ import tempfile
 from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numba
-from numba import config as numba_config
+from numba.core import config as numba_config
 from numba.core.compiler import CompilerBase, DefaultPassBuilder
 
 FAST_MATH = {"nsz", "arcp", "contract", "afn", "reassoc"}
 """Without `nnan` and `ninf`: depth images hold NaN and infinity."""
 
-F = TypeVar("F", bound=Callable[..., Any])
+Function = Callable[..., Any]
 
 
 class _NoAlias(CompilerBase):
@@ -33,7 +33,7 @@ class _NoAlias(CompilerBase):
         return [DefaultPassBuilder.define_nopython_pipeline(self.state)]
 
 
-def kernel(function: F) -> F:
+def kernel(function: Function) -> Function:
     """Compile `function` to machine code that releases the GIL and is cached on disk.
 
     An array that a kernel writes to must not overlap another array it is given.
@@ -41,7 +41,7 @@ def kernel(function: F) -> F:
     return _compile(function)
 
 
-def cell(function: F) -> F:
+def cell(function: Function) -> Function:
     """Compile a small function that becomes part of every kernel that calls it."""
     return _compile(function, forceinline=True)
 
@@ -57,17 +57,18 @@ def cache_folder() -> Path | None:
     return None
 
 
-def _compile(function: F, **options: Any) -> F:
+def _compile(function: Function, **options: Any) -> Function:
     folder = cache_folder()
-    before = numba_config.CACHE_DIR
-    numba_config.CACHE_DIR = str(folder or "")
+    settings: Any = numba_config
+    before = settings.CACHE_DIR
+    settings.CACHE_DIR = str(folder or "")
     try:
         return numba.njit(
             function, cache=folder is not None, error_model="numpy", fastmath=FAST_MATH, nogil=True,
             pipeline_class=_NoAlias, **options,
         )  # fmt: skip
     finally:
-        numba_config.CACHE_DIR = before
+        settings.CACHE_DIR = before
 
 
 def _source_hash() -> str:

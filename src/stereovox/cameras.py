@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Camera models: how a pixel becomes a ray. Optical frame: x right, y down, z forward; pixel centres at whole numbers."""
+"""Camera models: how a pixel becomes a ray.
+
+Optical frame: x right, y down, z forward. Pixel centres stand at whole numbers.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +38,9 @@ class PinholeCamera:
             raise StereovoxError(f"camera {self}: sizes, focal lengths and baseline must be positive and finite")
 
     @classmethod
-    def from_field_of_view(cls, width: int, height: int, hfov_deg: float, baseline: float | None = None) -> PinholeCamera:
+    def from_field_of_view(
+        cls, width: int, height: int, hfov_deg: float, baseline: float | None = None
+    ) -> PinholeCamera:
         """Return a camera with square pixels and a centred axis (Chien 2020, Eq 3.6)."""
         focal = 0.5 * width / math.tan(math.radians(hfov_deg) / 2)
         return cls(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2, baseline)

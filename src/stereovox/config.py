@@ -78,10 +78,10 @@ class Config(_Section):
     integrator: str = "projective"
     threads: int = Field(1, ge=1, le=256)
     pose_rigidity_tolerance: float = Field(5e-3, gt=0, le=0.1)
-    sensor: SensorConfig = SensorConfig()
-    noise: NoiseConfig = NoiseConfig()
-    map: MapConfig = MapConfig()
-    ray: RayConfig = RayConfig()
+    sensor: SensorConfig = Field(default_factory=SensorConfig)
+    noise: NoiseConfig = Field(default_factory=lambda: NoiseConfig.model_validate({}))
+    map: MapConfig = Field(default_factory=lambda: MapConfig.model_validate({}))
+    ray: RayConfig = Field(default_factory=RayConfig)
 
     @model_validator(mode="after")
     def _ordered(self) -> Config:
@@ -169,5 +169,8 @@ def _one_line(error: ValidationError, where: str) -> str:
     first = error.errors()[0]
     name = ".".join(map(str, first["loc"])) or "settings"
     value = first["input"] if not isinstance(first["input"], dict) else ""
-    return f"{where}: {name} {value!r}: {first['msg'].removeprefix('Value error, ')}" if value != "" else \
-        f"{where}: {name}: {first['msg'].removeprefix('Value error, ')}"
+    return (
+        f"{where}: {name} {value!r}: {first['msg'].removeprefix('Value error, ')}"
+        if value != ""
+        else f"{where}: {name}: {first['msg'].removeprefix('Value error, ')}"
+    )

@@ -23,14 +23,14 @@ class MapFileError(StereovoxError):
     """A saved map cannot be read or written."""
 
 
-class MissingExtra(StereovoxError, ImportError):
+class MissingExtra(StereovoxError, ImportError):  # noqa: N818 - reads as what happened
     """An optional library is not installed."""
 
     def __init__(self, library: str, extra: str):
         super().__init__(f"{library} is not installed; run: pip install 'stereovox[{extra}]'")
 
 
-class FrameRefused(StereovoxError):
+class FrameRefused(StereovoxError):  # noqa: N818 - reads as what happened
     """A frame cannot be trusted and must not change the map.
 
     `reason` is a short fixed word that is counted (`pose_not_rigid`); the message says more.

@@ -24,7 +24,7 @@ def transform_points(T_a_b: Transform, points_b: ArrayLike) -> NDArray[np.float6
 
 
 def rigidity_error(T: ArrayLike) -> float:
-    """Return how far `T` is from a rigid motion: the largest entry of |R^T R - I|; inf for mirrors, NaN or bad shape."""
+    """Return how far `T` is from a rigid motion: the largest entry of |R^T R - I|; inf for mirrors, NaN, bad shape."""
     T = np.asarray(T)
     if T.shape != (4, 4) or not np.isfinite(T).all() or not np.allclose(T[3], [0, 0, 0, 1], atol=1e-6):
         return np.inf
@@ -93,7 +93,7 @@ def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0, 0, 1)) -> Tra
     eye = np.asarray(eye, float)
     forward = np.asarray(target, float) - eye
     forward /= np.linalg.norm(forward)
-    right = np.cross(forward, up)
+    right = np.cross(forward, np.asarray(up, float))
     right /= np.linalg.norm(right)
     T = np.eye(4)
     T[:3, :3] = np.column_stack([right, np.cross(forward, right), forward])

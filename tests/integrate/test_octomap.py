@@ -20,7 +20,9 @@ KITCHEN = Path(__file__).resolve().parents[2] / "../shared/data/sevenscenes_redk
 
 def settings(voxel_size, **more):
     return load_config(
-        voxel_size=voxel_size, integrator="ray", **{"sensor.model": "constant", "ray.update": "once", "noise.s2": 0, **more}
+        voxel_size=voxel_size,
+        integrator="ray",
+        **{"sensor.model": "constant", "ray.update": "once", "noise.s2": 0, **more},
     )
 
 
@@ -34,7 +36,9 @@ def octree_of(images, config):
     for image in images:
         points = image.camera.back_project(image.depth_m)[np.isfinite(image.depth_m)]
         T = image.T_world_sensor
-        tree.insertPointCloud(np.ascontiguousarray(points @ T[:3, :3].T + T[:3, 3]), T[:3, 3].copy(), -1.0, False, False)
+        tree.insertPointCloud(
+            np.ascontiguousarray(points @ T[:3, :3].T + T[:3, 3]), T[:3, 3].copy(), -1.0, False, False
+        )
     return tree
 
 

@@ -90,9 +90,11 @@ def test_strange_points_are_unknown():
     assert voxel_map.log_odds(np.empty((0, 3))).shape == (0,)
 
 
-cell_lists = st.lists(
-    st.tuples(*[st.integers(-300, 300)] * 3), min_size=0, max_size=60, unique=True
-).flatmap(lambda cells: st.tuples(st.just(cells), st.lists(st.integers(-1999, 3499), min_size=len(cells), max_size=len(cells))))
+cell_lists = st.lists(st.tuples(*[st.integers(-300, 300)] * 3), min_size=0, max_size=60, unique=True).flatmap(
+    lambda cells: st.tuples(
+        st.just(cells), st.lists(st.integers(-1999, 3499), min_size=len(cells), max_size=len(cells))
+    )
+)
 
 
 @settings(max_examples=60, deadline=None)
@@ -134,7 +136,9 @@ def test_saving_again_replaces_and_leaves_nothing_behind(tmp_path):
 
 def test_a_save_that_dies_leaves_the_old_map(tmp_path, monkeypatch):
     random_map(1).save(tmp_path / "m")
-    monkeypatch.setattr("pathlib.Path.replace", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left on device")))
+    monkeypatch.setattr(
+        "pathlib.Path.replace", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left on device"))
+    )
     with pytest.raises(MapFileError, match="No space left"):
         random_map(2).save(tmp_path / "m")
     assert (load_map(tmp_path / "m").blocks()[1] == random_map(1).blocks()[1]).all()
@@ -154,9 +158,12 @@ def test_damaged_maps_end_in_one_line(tmp_path):
     random_map().save(tmp_path / "m")
     manifest = tmp_path / "m" / "manifest.json"
     good = manifest.read_text()
-    for bad in ["", "[]", "{}", good[: len(good) // 2], good.replace("stereovox-map", "x"), good.replace('"version": 1', '"version": 9'),
+    # fmt: off
+    for bad in ["", "[]", "{}", good[: len(good) // 2], good.replace("stereovox-map", "x"),
+                good.replace('"version": 1', '"version": 9'),
                 good.replace('"blocks": ', '"blocks": 9'), good.replace('"data": "', '"data": "../'),
-                good.replace('"voxel_size": 0.1', '"voxel_size": -1')]:  # fmt: skip
+                good.replace('"voxel_size": 0.1', '"voxel_size": -1')]:
+    # fmt: on
         manifest.write_text(bad)
         with pytest.raises(MapFileError) as caught:
             load_map(tmp_path / "m")

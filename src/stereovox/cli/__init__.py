@@ -35,7 +35,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except StereovoxError as error:
         return _fail(" ".join(str(error).split()), 2)
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # the reader of our output has gone: nothing to say
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
     except KeyboardInterrupt:
         return _fail("stopped", 130)

@@ -15,8 +15,10 @@ VOXEL_SIZES = (0.2, 0.1, 0.05, 0.02)
 def add_arguments(parser: ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("source", metavar="SOURCE", help="folder of a recording, or sim:room")
-    parser.add_argument("--voxel-size", type=float, action="append", metavar="M", help="cell size in metres; may be repeated")
-    parser.add_argument("--peers", default="octomap,pyoctomap", metavar="A,B", help="libraries to compare with (%(default)s)")
+    parser.add_argument(
+        "--voxel-size", type=float, action="append", metavar="M", help="cell size in metres; repeatable"
+    )
+    parser.add_argument("--peers", default="octomap,pyoctomap", metavar="A,B", help="other libraries (%(default)s)")
     parser.add_argument("--threads", type=int, default=1, metavar="N", help="threads for stereovox (%(default)s)")
     parser.add_argument("--frames", metavar="A:B:S", help="only these frames, as a Python slice")
 

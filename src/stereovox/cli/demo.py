@@ -9,7 +9,7 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 from typing import Any
 
-from stereovox.cli.terminal import milliseconds, progress_bar, say, say_about_compiling, size, thousands
+from stereovox.cli.terminal import cells_line, milliseconds, progress_bar, say, say_about_compiling
 
 EXAMPLE = "stereovox demo --out my-first-map"
 
@@ -39,7 +39,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
 def _tell(result: dict[str, Any]) -> None:
     accuracy = result["accuracy"]
     say(f"{result['frames']} frames, {milliseconds(result['integrate_ms'])} a frame")
-    say(f"{thousands(result['occupied'])} occupied and {thousands(result['free'])} free cells in {size(result['memory_bytes'])}")
+    say(cells_line(result))
     say(
         f"against the exact scene, within one cell: precision {accuracy['tolerance_precision']:.3f}, "
         f"recall {accuracy['tolerance_recall']:.3f}"

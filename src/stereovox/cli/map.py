@@ -10,7 +10,7 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stereovox.cli.terminal import milliseconds, say, say_about_compiling, size, thousands, tracked
+from stereovox.cli.terminal import cells_line, milliseconds, say, say_about_compiling, tracked
 from stereovox.errors import StereovoxError
 
 if TYPE_CHECKING:
@@ -30,8 +30,10 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--max-range", type=float, metavar="M", help="depth in metres up to which pixels count")
     parser.add_argument("--frames", metavar="A:B:S", help="only these frames, as a Python slice")
     parser.add_argument("--threads", type=int, metavar="N", help="threads; the map does not depend on it")
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", dest="settings", help="any other setting")
-    parser.add_argument("--resume", action="store_true", help="go on with the map at --out where an earlier run stopped")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", dest="settings", help="any other setting"
+    )
+    parser.add_argument("--resume", action="store_true", help="go on with the map at --out")
 
 
 def run(arguments: Namespace) -> dict[str, Any]:
@@ -49,7 +51,9 @@ def run(arguments: Namespace) -> dict[str, Any]:
     reports = _add_all(mapper, source, out)
     result = summarise(mapper.map, reports)
     if not mapper.map.frames:
-        raise StereovoxError(f"{arguments.source}: not one frame could be used, no map is written ({_first_refusal(reports)})")
+        raise StereovoxError(
+            f"{arguments.source}: not one frame could be used, no map is written ({_first_refusal(reports)})"
+        )
     mapper.map.save(out)
     _tell(result, reports, out)
     return result
@@ -92,7 +96,7 @@ def _add_all(mapper: Mapper, source: Source, out: Path) -> list[UpdateReport]:
         from stereovox.sources import Selection
 
         if done >= len(source):
-            raise StereovoxError(f"{out}: already holds all {len(source)} frames of {source.name}; nothing to go on with")
+            raise StereovoxError(f"{out}: already holds all {len(source)} frames of {source.name}")
         source = Selection(source, f"{done}:")
         say(f"going on after frame {done}")
     try:
@@ -116,5 +120,5 @@ def _tell(result: dict[str, Any], reports: list[UpdateReport], out: Path) -> Non
         example = next(report.detail for report in reports if report.refused == reason)
         say(f"  {number} x {reason}, first: {example}")
     say(f"a frame: depth {milliseconds(result['depth_ms'])}; map {milliseconds(result['integrate_ms'])}")
-    say(f"{thousands(result['occupied'])} occupied and {thousands(result['free'])} free cells in {size(result['memory_bytes'])}")
+    say(cells_line(result))
     say(f"saved in {out}; look at it with: stereovox picture {out} {out.stem}.png")

@@ -17,7 +17,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("map", metavar="MAP", help="folder of a map")
     parser.add_argument("file", metavar="FILE.png", help="picture to write")
-    parser.add_argument("--up", default="z", metavar="AXIS", help="which way is up in the map: z, -y, x ... (%(default)s)")
+    parser.add_argument("--up", default="z", metavar="AXIS", help="which way is up: z, -y, x ... (%(default)s)")
     parser.add_argument("--title", metavar="TEXT", help="title instead of the map's name")
 
 

@@ -68,3 +68,9 @@ def size(number_of_bytes: float) -> str:
 def thousands(number: Any) -> str:
     """Return a whole number with thin marks: 1,234,567."""
     return f"{number:,}"
+
+
+def cells_line(result: dict[str, Any]) -> str:
+    """Return one line about the cells of a map and the memory they need."""
+    occupied, free = thousands(result["occupied"]), thousands(result["free"])
+    return f"{occupied} occupied and {free} free cells in {size(result['memory_bytes'])}"

@@ -26,7 +26,7 @@ def classify(raw, scale, min_range, max_range, none, depth_m, reason):
     valid = np.int32(0)
     for i in range(raw.size):
         d = depth_m[i]
-        why = np.int32(VALID) if d == d else np.int32(UNMATCHED)  # noqa: PLR0124 - NaN differs from itself
+        why = np.int32(VALID) if d == d else np.int32(UNMATCHED)
         why = np.int32(TOO_NEAR) if d == NEAR else why
         why = np.int32(TOO_FAR) if d == FAR else why
         reason[i] = np.uint8(why)

@@ -27,15 +27,16 @@ def table_row(depth, rows_per_metre, rows):
 
 
 @cell
-def bits_of(x):
-    """Return the bits of a float32 as int32; for numbers that are not negative they order like the numbers."""
-    return np.float32(x).view(np.int32)
+def usable(depth):
+    """Return a REP 117 depth as a plain number: no value (NaN, too near) is 0, too far NO_RETURN."""
+    positive = depth if depth > ZERO else ZERO
+    return positive if positive < NO_RETURN else NO_RETURN
 
 
 @cell
-def float_of(bits):
-    """Return the float32 with these int32 bits."""
-    return np.int32(bits).view(np.float32)
+def bits_of(x):
+    """Return the bits of a float32 as int32; for numbers that are not negative they order like the numbers."""
+    return np.float32(x).view(np.int32)
 
 
 @cell

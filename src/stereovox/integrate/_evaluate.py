@@ -13,9 +13,10 @@ MIDDLE_COLUMN = np.float32(COLUMNS / 2)
 
 
 @kernel
-def evaluate(view, table, windows, blocks, values, hit_table, hit_coords, hit_values, hit_used):
+def evaluate(depth_m, view, table, windows, blocks, values, hit_table, hit_coords, hit_values, hit_used):
     """Fill `values` (n, 512) int16 with the evidence on the cells of `blocks` (n, 3), hits included.
 
+    depth_m: (h, w) REP 117 depth image, from which `windows` was made.
     hit_used: (hits,) uint8, set for each hit block that was taken in.
     """
     side = np.float32(8) * view.voxel_size
@@ -31,7 +32,7 @@ def evaluate(view, table, windows, blocks, values, hit_table, hit_coords, hit_va
         out = values[i]
         _clear(view, table, windows, cx, cy, cz, out)
         if table.marks:
-            _mark(view, table, windows, cx, cy, cz, out)
+            _mark(depth_m, view, table, cx, cy, cz, out)
         h = find(hit_table, hit_coords, x, y, z)
         if h >= 0:
             hits = hit_values[h]
@@ -70,7 +71,7 @@ def _clear(view, table, windows, cx, cy, cz, out):
 
 
 @cell
-def _mark(view, table, windows, cx, cy, cz, out):
+def _mark(depth_m, view, table, cx, cy, cz, out):
     """Overwrite with the positive evidence, where there is any, of the pixel at the cell's centre."""
     u_centre, v_centre = view.intrinsics[2] + HALF, view.intrinsics[3] + HALF
     rows = table.hit.size
@@ -82,8 +83,8 @@ def _mark(view, table, windows, cx, cy, cz, out):
         v = (cy + view.steps[1, c]) / z + v_centre
         if not (u >= ZERO and v >= ZERO and u < np.float32(view.width) and v < np.float32(view.height)):
             continue
-        d = windows.image[np.int32(v) * view.width + np.int32(u)]
-        if d <= ZERO or d >= NO_RETURN:
+        d = depth_m[np.int32(v), np.int32(u)]
+        if not (d > ZERO and d < NO_RETURN):
             continue
         row = table_row(d, table.rows_per_metre, rows)
         t = (z - d) * table.columns_per_metre[row] + MIDDLE_COLUMN

@@ -24,11 +24,11 @@ ROW_BITS = 7
 
 
 @kernel
-def scatter(z, view, table, keys, news, fresh, pool_table, coords, count, values, first_row, last_row):
+def scatter(depth_m, view, table, keys, news, fresh, pool_table, coords, count, values, first_row, last_row):
     """Give every cell that holds a measured point its hit evidence; return False when the block pool is full.
 
-    z: (h, w) depths, 0 none. keys: (2, 1 + w rounded up to GROUP) scratch; int32 serves cells within 2^9 of the
-    camera when `table.hit` is one number for all depths, int64 the rest. news, fresh: scratch of one row,
+    depth_m: (h, w) REP 117 depth image. keys: (2, 1 + w rounded up to GROUP) scratch; int32 serves cells within 2^9
+    of the camera when `table.hit` is one number for all depths, int64 the rest. news, fresh: scratch of one row,
     uint8 and int32, w rounded up to GROUP and one more for `fresh`. Blocks count from the camera's own.
     """
     size = np.float32(1) / view.voxel_size
@@ -40,13 +40,13 @@ def scatter(z, view, table, keys, news, fresh, pool_table, coords, count, values
         now, before = keys[v & 1], keys[1 - (v & 1)]
         ray = _row_rays(view.rotation, view.rows[v], size)
         if keys.itemsize == 4:
-            _narrow_keys(z[v], view.columns, ray, position, now[1:])
+            _narrow_keys(depth_m[v], view.columns, ray, position, now[1:])
         else:
-            _wide_keys(z[v], view.columns, ray, position, table, now[1:])
+            _wide_keys(depth_m[v], view.columns, ray, position, table, now[1:])
         _mark_news(now[1:], now[:-1], before[1:], news)
         for i in range(_gather_news(news, fresh)):
             u = fresh[i]
-            d = z[v, u]
+            d = depth_m[v, u]
             x, y, zz = _point_cell(d, view.columns[u], ray, position)
             block = (x >> 3, y >> 3, zz >> 3)
             if place < 0 or block != last:
@@ -109,7 +109,7 @@ def _wide_keys(depths, columns, ray, position, table, keys):
 
 @cell
 def _mark_news(now, left, above, news):
-    """Set `news` where a pixel holds a measurement and its key differs from that of its left and its upper neighbour."""
+    """Set `news` where a pixel holds a measurement and its key differs from its left and its upper neighbour's."""
     for u in range(news.size):
         fresh = (now[u] != above[u]) & (now[u] != left[u]) & (now[u] != NOTHING)
         news[u] = np.uint8(fresh)

@@ -4,7 +4,7 @@
 import numpy as np
 
 from stereovox._jit import cell, kernel
-from stereovox.integrate._cells import HALF, NO_RETURN, ONE, ZERO, stronger, table_row
+from stereovox.integrate._cells import HALF, NO_RETURN, ONE, ZERO, stronger, table_row, usable
 from stereovox.integrate._hits import _point_cell, _row_rays
 from stereovox.maps._cells import find_or_insert
 from stereovox.sensors.model import COLUMNS
@@ -18,10 +18,10 @@ BEYOND = np.float32(1e30)
 
 
 @kernel
-def cast(z, view, table, weight, pool_table, coords, count, values, first_row, last_row):
+def cast(depth_m, view, table, weight, pool_table, coords, count, values, first_row, last_row):
     """Add the evidence of all rays of rows first_row..last_row; return the first row not done (the pool is full).
 
-    z: (h, w) depths, 0 none. weight > 0: every ray adds its evidence to every cell it crosses, times
+    depth_m: (h, w) REP 117 depth image. weight > 0: every ray adds its evidence to every cell it crosses, times
     min(1, weight * depth^2) (Chien 2020, Eq 3.21), in units of 1/1024 thousandths; 0: a cell keeps the strongest.
     Blocks count from the camera's own. A row begun twice does no harm to strongest evidence only, so the pool must
     have room for what one row can touch before the row is begun.
@@ -30,12 +30,13 @@ def cast(z, view, table, weight, pool_table, coords, count, values, first_row, l
     position = view.position * size
     longest = np.int64(3) * np.int64(view.max_range * size * np.float32(4)) + 16
     for v in range(first_row, last_row):
-        if coords.shape[0] - count[0] < (longest >> 3) * 4 + z.shape[1]:
+        if coords.shape[0] - count[0] < (longest >> 3) * 4 + depth_m.shape[1]:
             return v
         ray = _row_rays(view.rotation, view.rows[v], size)
-        for u in range(z.shape[1]):
-            if z[v, u] > ZERO:
-                _walk(z[v, u], view.columns[u], ray, position, view, table, weight, pool_table, coords, count, values)
+        for u in range(depth_m.shape[1]):
+            d = usable(depth_m[v, u])
+            if d > ZERO:
+                _walk(d, view.columns[u], ray, position, view, table, weight, pool_table, coords, count, values)
     return last_row
 
 
@@ -49,7 +50,11 @@ def _walk(d, column, ray, position, view, table, weight, pool_table, coords, cou
     x, y, zz = np.int32(np.floor(position[0])), np.int32(np.floor(position[1])), np.int32(np.floor(position[2]))
     hx, hy, hz = _point_cell(d if real else ZERO, column, ray, position)
     sx, sy, sz = _step(dx), _step(dy), _step(dz)
-    tx, ty, tz = _crossing(x, sx, position[0], ix), _crossing(y, sy, position[1], iy), _crossing(zz, sz, position[2], iz)
+    tx, ty, tz = (
+        _crossing(x, sx, position[0], ix),
+        _crossing(y, sy, position[1], iy),
+        _crossing(zz, sz, position[2], iz),
+    )
     entered = ZERO
     place = np.int64(-1)
     while True:

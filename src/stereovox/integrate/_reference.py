@@ -61,7 +61,7 @@ def _rays(image: DepthImage, config: Config, table: SensorTable) -> Iterator[tup
     """Yield for each ray the cells it gives evidence to, that evidence, and the depth at the middle of each cell."""
     slopes = image.camera.back_project(np.ones(image.depth_m.shape)).reshape(-1, 3)
     T = image.T_world_sensor
-    marks = (table.log_odds > 0).any()
+    marks = bool((table.log_odds > 0).any())
     for d, slope in zip(image.depth_m.ravel().astype(float), slopes, strict=True):
         if not d > 0:
             continue
@@ -108,7 +108,7 @@ def _cells_in_range(image: DepthImage, config: Config) -> NDArray[np.int64]:
 
 
 def _projected(cells: NDArray, image: DepthImage, config: Config) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-    """Return pixel (N, 2) column and row, clipped to the image, depth and size in pixels of each cell, and whether seen."""
+    """Return pixel (N, 2) column and row, depth and size in pixels of each cell, and whether it is seen."""
     camera, T = image.camera, image.T_world_sensor
     x, y, z = (((cells + 0.5) * config.voxel_size - T[:3, 3]) @ T[:3, :3]).T
     ahead = (z > NEAR_PLANE) & (z <= config.max_range)

@@ -6,45 +6,42 @@ Level 0 is the depth image itself, level l >= 1 holds, for each tile of 2^(l-1) 
 own pixels. No value is 0, so it is the nearest of all and never clears anything.
 """
 
-import numpy as np
-
 from stereovox._jit import cell, kernel
-from stereovox.integrate._cells import NO_RETURN, ZERO, bits_of, float_of
+from stereovox.integrate._cells import NO_RETURN, ZERO, usable
 
 
 @kernel
-def load(depth_m, z):
-    """Copy a REP 117 depth image to `z`: no value becomes 0, too far NO_RETURN; return the farthest."""
-    farthest = np.int32(0)
-    for i in range(depth_m.size):
-        d = depth_m[i]
-        d = d if d > ZERO else ZERO
-        d = d if d < NO_RETURN else NO_RETURN
-        z[i] = d
-        farthest = max(farthest, bits_of(d))  # a maximum of whole numbers vectorises, one of floats does not
-    return float_of(farthest)
+def build(depth_m, base, window, row, low_row, lows, highs, shape, offset, tile_offset, tile_width, first):
+    """Fill window images and tiles of all levels from `first` on; return the farthest depth of the image.
 
-
-@kernel
-def build(base, window, row, low_row, lows, highs, shape, offset, base_offset, tile_offset, tile_width, first):
-    """Fill window images and tiles of all levels from `first` on.
-
-    window: flat images of all levels, level l from offset[l] on with shape[l] rows and columns; level 0 is already
-    loaded. base: scratch for the images before dilation; row, low_row: scratch of one row.
+    depth_m: flat REP 117 depth image. window: flat images of all levels, level l from offset[l] on with shape[l] rows
+    and columns. base: scratch for the images before dilation; row, low_row: scratch of one row.
     lows, highs: flat tile images, at tile_offset[level, 0] for tiles of 16 and [level, 1] for 64.
     """
+    height, width = shape[0, 0], shape[0, 1]
+    if first <= 1:
+        for i in range(height * width):
+            window[i] = usable(depth_m[i])
     if first == 0:
-        _tiles(window[: shape[0, 0] * shape[0, 1]], row, low_row, lows, highs, shape[0], tile_offset[0], tile_width[0])
-    source, height, width = window, shape[0, 0], shape[0, 1]
+        _tiles(window[: height * width], row, low_row, lows, highs, shape[0], tile_offset[0], tile_width[0])
+    source = window
     for level in range(1, shape.shape[0]):
         if level > 1:
-            target = base[base_offset[level] :]
-            _halve(source, height, width, target, shape[level, 1])
+            target = base[offset[level] :]
+            if level == 2 and first > 1:
+                _halve(depth_m, height, width, target, shape[level, 1])
+            else:
+                _halve(source, height, width, target, shape[level, 1])
             source, height, width = target, shape[level, 0], shape[level, 1]
         if level >= first:
             image = window[offset[level] : offset[level] + height * width]
             _dilate(source, height, width, image, row)
             _tiles(image, row, low_row, lows, highs, shape[level], tile_offset[level], tile_width[level])
+    top = shape.shape[0] - 1
+    farthest = ZERO
+    for i in range(tile_offset[top, 0], tile_offset[top, 1]):
+        farthest = max(farthest, highs[i])
+    return farthest
 
 
 @cell
@@ -54,11 +51,11 @@ def _halve(source, height, width, target, target_width):
         lower = source[min(2 * v + 1, height - 1) * width : (min(2 * v + 1, height - 1) + 1) * width]
         out = target[v * target_width : (v + 1) * target_width]
         for u in range(width // 2):
-            a = max(upper[2 * u], upper[2 * u + 1])
-            b = max(lower[2 * u], lower[2 * u + 1])
+            a = max(usable(upper[2 * u]), usable(upper[2 * u + 1]))
+            b = max(usable(lower[2 * u]), usable(lower[2 * u + 1]))
             out[u] = max(a, b)
         if width % 2:
-            out[target_width - 1] = max(upper[width - 1], lower[width - 1])
+            out[target_width - 1] = max(usable(upper[width - 1]), usable(lower[width - 1]))
 
 
 @cell
@@ -114,7 +111,7 @@ def _extremes_of_rows(image, first, last, width, high_row, low_row):
 
 
 @kernel
-def nearest_tiles(z, height, width, lows16, lows64):
+def nearest_tiles(depth_m, height, width, lows16, lows64):
     """Fill tiles of 16 and 64 pixels with the nearest depth in them, pixels without value left out."""
     wide = (width + 63) // 64
     lows64[:] = NO_RETURN
@@ -123,7 +120,7 @@ def nearest_tiles(z, height, width, lows16, lows64):
             low = NO_RETURN
             for v in range(16 * tv, min(16 * tv + 16, height)):
                 for u in range(16 * tu, min(16 * tu + 16, width)):
-                    d = z[v * width + u]
+                    d = depth_m[v * width + u]
                     low = min(low, d if d > ZERO else NO_RETURN)
             lows16[tv * ((width + 15) // 16) + tu] = low
             big = (tv >> 2) * wide + (tu >> 2)

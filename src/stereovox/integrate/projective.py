@@ -16,7 +16,7 @@ from stereovox.config import Config
 from stereovox.frame import DepthImage
 from stereovox.integrate import _cull, _evaluate, _hits
 from stereovox.integrate._cells import NEAR_PLANE, NO_RETURN
-from stereovox.integrate.shards import in_shards
+from stereovox.integrate.shards import in_shards, shards
 from stereovox.integrate.views import KernelTable, View, origin_block, sensor_table, view_of
 from stereovox.integrate.windows import WindowBuilder, Windows
 from stereovox.maps.blocks import CELLS, SIDE, BlockPool
@@ -37,14 +37,12 @@ class Projective:
         """Return what `image` says about the cells it sees."""
         self._prepare(image.camera)
         view = view_of(image, self._config.voxel_size, self._config.max_range)
-        farthest = self._builder.load(image.depth_m)
-        end = self._end_of_view(farthest)
-        windows = self._builder.build(float(view.spread) / end)
+        windows, farthest = self._builder.build(image.depth_m, float(view.spread) / self._config.max_range)
         if self._table.marks:
-            self._builder.build_nearest()
-        self._scatter_hits(view)
-        free, mixed = self._candidates(view, windows, end)
-        values, used = self._evaluate(view, windows, mixed)
+            self._builder.build_nearest(image.depth_m)
+        self._scatter_hits(image.depth_m, view)
+        free, mixed = self._candidates(view, windows, self._end_of_view(farthest))
+        values, used = self._evaluate(image.depth_m, view, windows, mixed)
         coords, values = self._with_leftovers(mixed, values, used)
         origin = origin_block(image.T_world_sensor, self._config.voxel_size).astype(np.int32)
         return Evidence(coords + origin, values, free + origin, int(self._table.free))
@@ -59,7 +57,7 @@ class Projective:
         self._fresh = np.zeros(self._keys.shape[1], np.int32)
         self._camera = camera
 
-    def _key_rows(self, camera: PinholeCamera) -> NDArray[np.int32] | NDArray[np.int64]:
+    def _key_rows(self, camera: PinholeCamera) -> NDArray[np.signedinteger]:
         """Return scratch for the keys of two pixel rows, of the narrowest kind that tells all cells apart."""
         corner = np.hypot(1.0, np.hypot(*(np.abs(slopes).max() for slopes in camera.ray_slopes())))
         cells = corner * self._config.max_range / self._config.voxel_size + SIDE
@@ -74,11 +72,22 @@ class Projective:
         behind = float(self._table.reach[-1]) if self._table.marks else 0.0
         return min(limit, max(float(farthest), 10 * float(NEAR_PLANE)) * 1.001 + behind)
 
-    def _scatter_hits(self, view: View) -> None:
-        hits, z = self._hits, self._builder.depths
+    def _scatter_hits(self, depth_m: NDArray[np.float32], view: View) -> None:
+        hits = self._hits
         hits.clear()
         while not _hits.scatter(
-            z, view, self._table, self._keys, self._news, self._fresh, hits.table, hits.coords, hits.count, hits.values, 0, z.shape[0]
+            depth_m,
+            view,
+            self._table,
+            self._keys,
+            self._news,
+            self._fresh,
+            hits.table,
+            hits.coords,
+            hits.count,
+            hits.values,
+            0,
+            len(depth_m),
         ):
             hits.reserve(len(hits.coords))
 
@@ -92,17 +101,28 @@ class Projective:
         )
         return free[:n_free], mixed[:n_mixed]
 
-    def _evaluate(self, view: View, windows: Windows, mixed: NDArray) -> tuple[NDArray[np.int16], NDArray[np.uint8]]:
+    def _evaluate(
+        self, depth_m: NDArray[np.float32], view: View, windows: Windows, mixed: NDArray[np.int32]
+    ) -> tuple[NDArray[np.int16], NDArray[np.uint8]]:
         hits = self._hits
         values = np.empty((len(mixed), CELLS), np.int16)
         used = np.zeros(len(hits), np.uint8)
 
         def one_shard(part: slice) -> None:
             _evaluate.evaluate(
-                view, self._table, windows, mixed[part], values[part], hits.table, hits.coords, hits.values, used
+                depth_m,
+                view,
+                self._table,
+                windows,
+                mixed[part],
+                values[part],
+                hits.table,
+                hits.coords,
+                hits.values,
+                used,
             )
 
-        in_shards(one_shard, len(mixed), self._config.threads)
+        in_shards(one_shard, shards(len(mixed), self._config.threads))
         return values, used
 
     def _with_leftovers(self, mixed: NDArray, values: NDArray, used: NDArray) -> tuple[NDArray, NDArray]:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stereovox.cameras import PinholeCamera
 from stereovox.config import Config
@@ -11,7 +12,6 @@ from stereovox.frame import DepthImage
 from stereovox.integrate import _ray
 from stereovox.integrate.shards import in_shards, shards
 from stereovox.integrate.views import KernelTable, View, origin_block, sensor_table, view_of
-from stereovox.integrate.windows import WindowBuilder
 from stereovox.maps.blocks import CELLS, BlockPool
 from stereovox.maps.evidence import Evidence
 from stereovox.sensors import make_sensor
@@ -35,25 +35,24 @@ class Ray:
         config, camera = self._config, image.camera
         if camera != self._camera:
             self._table: KernelTable = sensor_table(self._sensor, config, camera)
-            self._builder = WindowBuilder(camera)
             self._camera = camera
         view = view_of(image, config.voxel_size, config.max_range)
-        self._builder.load(image.depth_m)
         weight = np.float32((camera.fx * config.voxel_size) ** -2 if config.ray.update == "every" else 0)
-        pool_of = {part.start: pool for part, pool in zip(shards(camera.height, config.threads), self._pools, strict=False)}
-        in_shards(lambda part: self._cast(view, weight, pool_of[part.start], part), camera.height, config.threads)
-        pool = self._merged([*pool_of.values()], weight > 0)
+        parts = shards(camera.height, config.threads)
+        pool_of = {part.start: pool for part, pool in zip(parts, self._pools, strict=False)}
+        in_shards(lambda part: self._cast(image.depth_m, view, weight, pool_of[part.start], part), parts)
+        pool = self._merged([*pool_of.values()], bool(weight > 0))
         values = np.empty((len(pool), CELLS), np.int16)
         _ray.to_thousandths(pool.values[: len(pool)], _ray.FRACTION_BITS if weight > 0 else 0, values)
         origin = origin_block(image.T_world_sensor, config.voxel_size).astype(np.int32)
         return Evidence(pool.coords[: len(pool)] + origin, values, np.empty((0, 3), np.int32), 0)
 
-    def _cast(self, view: View, weight: np.float32, pool: BlockPool, part: slice) -> None:
+    def _cast(self, depth_m: NDArray[np.float32], view: View, weight: np.float32, pool: BlockPool, part: slice) -> None:
         pool.clear()
         row = part.start
         while row < part.stop:
             row = _ray.cast(
-                self._builder.depths, view, self._table, weight,
+                depth_m, view, self._table, weight,
                 pool.table, pool.coords, pool.count, pool.values, row, part.stop,
             )  # fmt: skip
             if row < part.stop:

@@ -8,13 +8,12 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 
 
-def in_shards(work: Callable[[slice], None], length: int, threads: int) -> None:
-    """Call `work(part)` for `threads` slices that together cover range(length); the outcome must not depend on the cut."""
-    parts = shards(length, threads)
+def in_shards(work: Callable[[slice], None], parts: list[slice]) -> None:
+    """Call `work(part)` for all parts at the same time; the outcome must not depend on the cut."""
     if len(parts) == 1:
         work(parts[0])
         return
-    for future in [_pool(threads).submit(work, part) for part in parts]:
+    for future in [_pool(len(parts)).submit(work, part) for part in parts]:
         future.result()
 
 

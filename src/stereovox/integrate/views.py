@@ -124,7 +124,12 @@ def _sides(camera: PinholeCamera, T: Transform, rim: float) -> NDArray[np.float3
     """A point counts as seen when fx x + (cx + 0.5) z + rim >= 0, and the like for the other three sides."""
     right, bottom = camera.width - 0.5 - camera.cx, camera.height - 0.5 - camera.cy
     inward = np.array(
-        [[camera.fx, 0, camera.cx + 0.5], [-camera.fx, 0, right], [0, camera.fy, camera.cy + 0.5], [0, -camera.fy, bottom]]
+        [
+            [camera.fx, 0, camera.cx + 0.5],
+            [-camera.fx, 0, right],
+            [0, camera.fy, camera.cy + 0.5],
+            [0, -camera.fy, bottom],
+        ]
     )
     normals = inward @ T[:3, :3].T
     unit_box = np.abs(normals).sum(axis=1, keepdims=True)

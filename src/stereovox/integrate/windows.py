@@ -36,6 +36,7 @@ class WindowBuilder:
         h, w = camera.height, camera.width
         strides = np.array([1] + [1 << level for level in range(LEVELS - 1)])
         self._shape = np.stack([-(-h // strides), -(-w // strides)], axis=1).astype(np.int32)
+        self._width = self._shape[:, 1].copy()
         sizes = self._shape.prod(axis=1)
         self._offset = _starts(sizes)
         tiles = np.stack([-(-self._shape // 16), -(-self._shape // 64)], axis=1)
@@ -46,28 +47,27 @@ class WindowBuilder:
         self._row, self._low_row = np.zeros((2, w), np.float32)
         self._lows, self._highs = np.zeros((2, tiles.prod(axis=2).sum()), np.float32)
         self.nearest = tuple(np.zeros((-(-h // size), -(-w // size)), np.float32) for size in (16, 64))
-        self.depths = self._image[: h * w].reshape(h, w)
 
-    def load(self, depth_m: NDArray[np.float32]) -> float:
-        """Take in a REP 117 depth image; return its farthest depth (`NO_RETURN` where a pixel saw nothing)."""
-        return _windows.load(depth_m.reshape(-1), self.depths.reshape(-1))
+    def build(self, depth_m: NDArray[np.float32], smallest_tile: float) -> tuple[Windows, float]:
+        """Return the window images of a REP 117 depth image, from tiles of about `smallest_tile` pixels on.
 
-    def build(self, smallest_tile: float) -> Windows:
-        """Fill all levels whose tiles are at least about `smallest_tile` pixels and return them."""
+        With them the image's farthest depth in metres, `NO_RETURN` where a pixel saw nothing.
+        """
         first = int(np.clip(np.floor(np.log2(max(smallest_tile, 1e-9))) + 2, 0, LEVELS - 1))
-        _windows.build(
-            self._base, self._image, self._row, self._low_row, self._lows, self._highs,
-            self._shape, self._offset, self._offset, self._tile_offset, self._tile_width, first,
+        farthest = _windows.build(
+            depth_m.reshape(-1), self._base, self._image, self._row, self._low_row, self._lows, self._highs,
+            self._shape, self._offset, self._tile_offset, self._tile_width, first,
         )  # fmt: skip
-        return Windows(
-            self._image, self._offset, self._shape[:, 1].copy(), self._shape, self._lows, self._highs,
+        windows = Windows(
+            self._image, self._offset, self._width, self._shape, self._lows, self._highs,
             self._tile_offset, self._tile_width, np.int32(first),
         )  # fmt: skip
+        return windows, farthest
 
-    def build_nearest(self) -> None:
+    def build_nearest(self, depth_m: NDArray[np.float32]) -> None:
         """Fill `nearest`, for sensor models that mark cells beside the hit."""
-        h, w = self.depths.shape
-        _windows.nearest_tiles(self.depths.reshape(-1), h, w, self.nearest[0].reshape(-1), self.nearest[1].reshape(-1))
+        low16, low64 = (tiles.reshape(-1) for tiles in self.nearest)
+        _windows.nearest_tiles(depth_m.reshape(-1), *depth_m.shape, low16, low64)
 
 
 def _starts(sizes: NDArray[np.int64]) -> NDArray[np.int32]:

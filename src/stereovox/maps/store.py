@@ -42,7 +42,9 @@ def save_map(voxel_map: VoxelMap, path: str | Path) -> None:
         _write_arrays(folder / data, {"coords": coords, "cells": cells})
         _write_manifest(folder, _manifest(voxel_map, data, len(coords), _checksum(coords, cells)))
     except OSError as error:
-        raise MapFileError(f"{folder}: cannot save the map ({error.strerror or error}); choose a writable folder") from None
+        raise MapFileError(
+            f"{folder}: cannot save the map ({error.strerror or error}); choose a writable folder"
+        ) from None
     for old in folder.glob("cells-*"):
         if old.name != data:
             shutil.rmtree(old, ignore_errors=True)
@@ -85,7 +87,9 @@ def is_map(path: str | Path) -> bool:
 def read_manifest(folder: Path) -> dict[str, Any]:
     """Return the manifest of a saved map: format, version, config, frames, data, blocks."""
     if not is_map(folder):
-        raise MapFileError(f"{folder}: no stereovox map here (no {MANIFEST}); make one with: stereovox map SOURCE --out {folder}")
+        raise MapFileError(
+            f"{folder}: no stereovox map here (no {MANIFEST}); make one with: stereovox map SOURCE --out {folder}"
+        )
     try:
         manifest = json.loads((folder / MANIFEST).read_text())
     except (OSError, ValueError) as error:
@@ -93,7 +97,9 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
         raise MapFileError(f"{folder / MANIFEST}: not a stereovox map")
     if manifest.get("version") != VERSION:
-        raise MapFileError(f"{folder}: map format {manifest.get('version')}, this program reads {VERSION}; update stereovox")
+        raise MapFileError(
+            f"{folder}: map format {manifest.get('version')}, this program reads {VERSION}; update stereovox"
+        )
     if "/" in str(manifest.get("data")) or ".." in str(manifest.get("data")):
         raise MapFileError(f"{folder / MANIFEST}: data '{manifest['data']}' points outside the map")
     return manifest
@@ -135,7 +141,9 @@ def _write_arrays(folder: Path, arrays: dict[str, NDArray]) -> None:
     group = zarr.open_group(folder, mode="w", zarr_format=3)
     for name, array in arrays.items():
         rows = max(1, min(BLOCKS_PER_CHUNK, len(array)))
-        stored = group.create_array(name, shape=array.shape, dtype=array.dtype, chunks=(rows, array.shape[1]), fill_value=0)
+        stored = group.create_array(
+            name, shape=array.shape, dtype=array.dtype, chunks=(rows, array.shape[1]), fill_value=0
+        )
         if len(array):
             stored[:] = array
 
@@ -144,7 +152,8 @@ def _read_arrays(folder: Path, blocks: int) -> tuple[NDArray[np.int32], NDArray[
     import zarr
 
     group = zarr.open_group(folder, mode="r")
-    coords, cells = group["coords"], group["cells"]
+    coords: Any = group["coords"]
+    cells: Any = group["cells"]
     for array, shape, dtype in ((coords, (blocks, 3), np.int32), (cells, (blocks, CELLS), np.int16)):
         if array.shape != shape or array.dtype != dtype:
             raise ValueError(f"array of {array.shape} {array.dtype} where {shape} {np.dtype(dtype)} belongs")

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from stereovox.config import Config
 from stereovox.errors import ConfigError
 from stereovox.maps import _cpu
-from stereovox.maps.blocks import CELLS, SIDE, BlockPool
+from stereovox.maps.blocks import SIDE, BlockPool
 from stereovox.maps.evidence import LOG_ODDS_SCALE, Evidence, to_units
 
 INDEX_LIMIT = 2**30
@@ -44,7 +44,9 @@ class VoxelMap:
         self.frames_refused = 0
         self._pool = BlockPool(np.int16)
         self._at_floor = np.zeros(self._pool.coords.shape[0], np.uint8)
-        self._lowest, self._highest = (np.int32(to_units(x)) for x in (config.map.log_odds_min, config.map.log_odds_max))
+        self._lowest, self._highest = (
+            np.int32(to_units(x)) for x in (config.map.log_odds_min, config.map.log_odds_max)
+        )
         self._free_below, self._occupied_above = (
             float(np.log(p / (1 - p)) * LOG_ODDS_SCALE) for p in (config.map.free_below, config.map.occupied_above)
         )
@@ -89,11 +91,11 @@ class VoxelMap:
 
     def log_odds(self, points: ArrayLike) -> NDArray[np.float32]:
         """Return the log-odds (N,) at points (N, 3) in metres, world frame; 0 where unknown or not finite."""
-        return self._units_at(points) / np.float32(LOG_ODDS_SCALE)
+        return _from_units(self._units_at(points))
 
     def probability(self, points: ArrayLike) -> NDArray[np.float32]:
         """Return the occupancy probability (N,) at points (N, 3) in metres, world frame; 0.5 where unknown."""
-        return 1 / (1 + np.exp(-self.log_odds(points)))
+        return np.asarray(1 / (1 + np.exp(-self.log_odds(points))), np.float32)
 
     def state(self, points: ArrayLike) -> NDArray[np.uint8]:
         """Return the `State` (N,) uint8 at points (N, 3) in metres, world frame."""
@@ -106,7 +108,7 @@ class VoxelMap:
         low = np.stack([column >> 6, (column >> 3) & 7, column & 7], axis=1)
         indices = (coords[block] * SIDE + low).astype(np.int32)
         order = np.lexsort(indices.T[::-1])
-        return indices[order], values[block, column][order] / np.float32(LOG_ODDS_SCALE)
+        return indices[order], _from_units(values[block, column][order])
 
     def blocks(self) -> tuple[NDArray[np.int32], NDArray[np.int16]]:
         """Return block coordinates (n, 3) in ascending order and their cells (n, 512) in thousandths of log-odds."""
@@ -177,3 +179,7 @@ class VoxelMap:
     def _centers_of(self, state: State) -> NDArray[np.float64]:
         indices, log_odds = self.cells()
         return self.centers(indices[self._states(to_units(log_odds).astype(np.int16)) == state])
+
+
+def _from_units(units: NDArray[np.int16]) -> NDArray[np.float32]:
+    return units.astype(np.float32) / np.float32(LOG_ODDS_SCALE)

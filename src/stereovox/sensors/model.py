@@ -49,7 +49,7 @@ class InverseSensorModel(Protocol):
 class SensorTable:
     """A sensor model as numbers.
 
-    log_odds: (ROWS, COLUMNS) of a point at `z = z_measured + offset_sigma[column] * sigma[row]`, p_unknown counting as 0.
+    log_odds: (ROWS, COLUMNS) of a point at `z = z_measured + offset_sigma[column] * sigma[row]`; p_unknown is 0.
     hit: (ROWS,) log-odds of the cell that holds the measured point.
     sigma: (ROWS,) noise in metres; row r stands for measured depths around `(r + 0.5) / rows_per_metre`.
     """
@@ -66,7 +66,7 @@ def tabulate(model: InverseSensorModel, noise: RangeNoise, max_range: float) -> 
     Evidence is log(p / (1 - p)) less that of p_unknown (Valenti 2018, Eq 6.2: the prior is not counted twice).
     Raises ValueError when the model leaves (0, 1).
     """
-    z_measured = (np.arange(ROWS) + 0.5) * (max_range / ROWS)
+    z_measured: Array = (np.arange(ROWS, dtype=float) + 0.5) * (max_range / ROWS)
     sigma = np.maximum(noise.sigma(z_measured), 1e-6)
     z = z_measured[:, None] + offset_sigma() * sigma[:, None]
     log_odds = _log_odds(model, model.probability(z, z_measured[:, None], sigma[:, None]))
@@ -76,7 +76,7 @@ def tabulate(model: InverseSensorModel, noise: RangeNoise, max_range: float) -> 
 
 def offset_sigma() -> Array:
     """Return the distance (COLUMNS,) of each table column from the measurement, in sigma."""
-    return ((np.arange(COLUMNS) + 0.5) / COLUMNS * 2 - 1) * REACH_SIGMA
+    return ((np.arange(COLUMNS, dtype=float) + 0.5) / COLUMNS * 2 - 1) * REACH_SIGMA
 
 
 def _log_odds(model: InverseSensorModel, p: Array) -> Array:

@@ -29,7 +29,7 @@ class RangeNoise:
     def of(cls, config: NoiseConfig, camera: PinholeCamera) -> RangeNoise:
         """Return the configured noise; where s2 is not set, that of the camera's stereo geometry.
 
-        s2 = subpixel / (focal_px * baseline): Chien 2020, Eq 3.5 with the square missing in print (as his Alg 3 has it).
+        s2 = subpixel / (focal_px * baseline): Chien 2020, Eq 3.5 with the square that print lacks (Alg 3 has it).
         """
         baseline = camera.baseline or config.default_baseline
         s2 = config.subpixel / (camera.fx * baseline) if config.s2 is None else config.s2

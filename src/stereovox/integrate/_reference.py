@@ -139,7 +139,7 @@ def _farthest_in_window(image: DepthImage, uv: NDArray, size_px: NDArray) -> NDA
 
 def _at_centre(image: DepthImage, uv: NDArray) -> NDArray:
     height, width = image.depth_m.shape
-    inside = (uv >= 0).all(axis=1) & (uv < [width, height]).all(axis=1)
+    inside = np.all((uv >= 0) & (uv < [width, height]), axis=1)
     u, v = np.where(inside[:, None], uv, 0).astype(int).T
     return np.where(inside & np.isfinite(image.depth_m[v, u]), image.depth_m[v, u], 0).astype(float)
 

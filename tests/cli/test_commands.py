@@ -1,0 +1,224 @@
+"""Every command as a user runs it: what it prints, what it leaves behind, how it fails."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from made_recordings import write_png
+
+import stereovox as sv
+from stereovox.cli import COMMANDS, main
+
+
+def write_recording(folder: Path, frames: int = 6) -> Path:
+    """A 7-Scenes folder: a camera that looks along z at a wall 2 m away with a box before it."""
+    folder.mkdir()
+    np.savetxt(folder / "camera-intrinsics.txt", [[60.0, 0, 39.5], [0, 60.0, 29.5], [0, 0, 1]])
+    depth = np.full((60, 80), 2000, np.uint16)
+    depth[20:40, 30:50] = 1200
+    depth[:5] = 0
+    for i in range(frames):
+        pose = np.eye(4)
+        pose[0, 3] = 0.02 * i + 0.013
+        write_png(folder / f"frame-{i:06d}.depth.png", depth)
+        np.savetxt(folder / f"frame-{i:06d}.pose.txt", pose)
+    return folder
+
+
+@pytest.fixture
+def recording(tmp_path):
+    return write_recording(tmp_path / "my recording")
+
+
+def run(*words):
+    return main([str(word) for word in words])
+
+
+def last_json(capsys):
+    out = capsys.readouterr().out
+    return json.loads(out.splitlines()[-1])
+
+
+def fails_with_one_line(capsys, said, *words):
+    assert run(*words) == 2
+    captured = capsys.readouterr()
+    lines = captured.err.strip().splitlines()
+    assert lines[-1].startswith("stereovox: "), captured.err
+    assert said in lines[-1]
+    assert "Traceback" not in captured.err
+    assert captured.out == ""
+
+
+def test_map_then_everything_else(recording, tmp_path, capsys):
+    out = tmp_path / "wall map.svox"
+    assert run("map", recording, "--out", out, "--voxel-size", 0.1, "--json") == 0
+    told = last_json(capsys)
+    assert told["frames"] == 6
+    assert told["frames_refused"] == 0
+    assert told["refused"] == {}
+    assert set(told["integrate_ms"]) == set(told["depth_ms"]) == {"median", "p90", "p99", "max"}
+    assert told["occupied"] > 100
+    assert told["free"] > 1000
+    assert told["memory_bytes"] > 0
+
+    assert run("info", out, "--json") == 0
+    info = last_json(capsys)
+    assert info["voxel_size"] == 0.1
+    assert info["frames"] == 6
+    assert info["profile"] == "default"
+    assert (info["occupied"], info["free"]) == (told["occupied"], told["free"])
+    assert np.shape(info["bounds"]) == (2, 3)
+    loaded = sv.load_map(out)
+    assert loaded.state([[0.05, 0.0, 1.25], [0.05, 0.0, 0.55]]).tolist() == [sv.State.OCCUPIED, sv.State.FREE]
+
+    assert run("picture", out, tmp_path / "wall.png", "--up=-y", "--json") == 0
+    assert (tmp_path / "wall.png").read_bytes().startswith(b"\x89PNG")
+    for ending in ("bt", "ot", "ply", "npz"):
+        assert run("export", out, tmp_path / f"wall.{ending}") == 0
+        assert (tmp_path / f"wall.{ending}").stat().st_size > 100
+
+
+def test_frames_settings_and_integrators(recording, tmp_path, capsys):
+    common = ["--voxel-size", 0.1, "--set", "sensor.p_hit=0.8", "--set", "map.log_odds_max=2.5", "--json"]
+    for name in ("projective", "ray"):
+        out = tmp_path / f"{name}.svox"
+        assert run("map", recording, "--out", out, "--integrator", name, "--frames", "::2", *common) == 0
+        assert last_json(capsys)["frames"] == 3
+        config = sv.load_map(out).config
+        assert config.integrator == name
+        assert config.sensor.parameters() == {"p_hit": 0.8}
+        assert config.map.log_odds_max == 2.5
+        assert sv.load_map(out).cells()[1].max() <= 2.5
+
+
+def test_resume_equals_one_run(recording, tmp_path, capsys):
+    bad = recording / "frame-000001.pose.txt"
+    bad.write_text("nan " * 16)
+    assert run("map", recording, "--out", tmp_path / "whole", "--voxel-size", 0.1) == 0
+    assert run("map", recording, "--out", tmp_path / "parts", "--voxel-size", 0.1, "--frames", ":3") == 0
+    assert run("map", recording, "--out", tmp_path / "parts", "--voxel-size", 0.1, "--resume", "--json") == 0
+    assert last_json(capsys)["frames"] == 3
+    whole, parts = sv.load_map(tmp_path / "whole"), sv.load_map(tmp_path / "parts")
+    assert all((a == b).all() for a, b in zip(whole.blocks(), parts.blocks(), strict=True))
+    assert (parts.frames, parts.frames_refused) == (whole.frames, whole.frames_refused) == (5, 1)
+    fails_with_one_line(
+        capsys, "already holds all", "map", recording, "--out", tmp_path / "parts", "--voxel-size", 0.1, "--resume"
+    )
+    fails_with_one_line(capsys, "voxel_size 0.1", "map", recording, "--out", tmp_path / "parts", "--resume")
+
+
+def test_bad_frames_are_counted_by_reason(recording, tmp_path, capsys):
+    image = recording / "frame-000002.depth.png"
+    image.write_bytes(image.read_bytes()[:100])
+    (recording / "frame-000003.pose.txt").write_text("1 0 0 0  0 1 0 0  0 0 2 0  0 0 0 1")
+    assert run("map", recording, "--out", tmp_path / "m", "--voxel-size", 0.1, "--json") == 0
+    captured = capsys.readouterr()
+    told = json.loads(captured.out.splitlines()[-1])
+    assert told["frames"] == 4
+    assert told["refused"] == {"unreadable": 1, "pose_not_rigid": 1}
+    assert "frame-000002.depth.png" in captured.err
+
+
+def test_nothing_but_bad_frames_writes_no_map(recording, tmp_path, capsys):
+    for pose in recording.glob("*.pose.txt"):
+        pose.write_text("0 " * 16)
+    fails_with_one_line(capsys, "one frame could be used", "map", recording, "--out", tmp_path / "m")
+    assert not (tmp_path / "m").exists()
+
+
+def test_ctrl_c_saves_what_there_is(recording, tmp_path, capsys, monkeypatch):
+    from stereovox.mapper import Mapper
+
+    add, done = Mapper.add, []
+
+    def add_three(self, frame):
+        if len(done) == 3:
+            raise KeyboardInterrupt
+        done.append(frame)
+        return add(self, frame)
+
+    monkeypatch.setattr(Mapper, "add", add_three)
+    assert run("map", recording, "--out", tmp_path / "m", "--voxel-size", 0.1) == 130
+    assert "--resume" in capsys.readouterr().err
+    assert sv.load_map(tmp_path / "m").frames == 3
+
+
+MISTAKES = [
+    ("did you mean 'map'", ["mpa"]),
+    ("--help", []),
+    ("required: MAP", ["info"]),
+    ("no such folder", ["map", "/no/such/recording", "--out", "m"]),
+    ("not a recording", ["map", "{tmp}", "--out", "{tmp}/m"]),
+    ("did you mean 'voxel_size'", ["map", "{rec}", "--out", "{tmp}/m", "--set", "voxel_sise=1"]),
+    ("write KEY=VALUE", ["map", "{rec}", "--out", "{tmp}/m", "--set", "voxel_size"]),
+    ("greater than 0", ["map", "{rec}", "--out", "{tmp}/m", "--voxel-size", "-1"]),
+    ("invalid float", ["map", "{rec}", "--out", "{tmp}/m", "--voxel-size", "small"]),
+    ("did you mean 'projective'", ["map", "{rec}", "--out", "{tmp}/m", "--integrator", "projectiv"]),
+    ("did you mean 'stereo'", ["map", "{rec}", "--out", "{tmp}/m", "--set", "sensor.model=stero"]),
+    ("unknown profile", ["map", "{rec}", "--out", "{tmp}/m", "--profile", "chien"]),
+    ("is no slice", ["map", "{rec}", "--out", "{tmp}/m", "--frames", "1-5"]),
+    ("picks none", ["map", "{rec}", "--out", "{tmp}/m", "--frames", "90:"]),
+    ("not a stereovox map", ["map", "{rec}", "--out", "{rec}"]),
+    ("no map to go on with", ["map", "{rec}", "--out", "{tmp}/m", "--resume"]),
+    ("unrecognized arguments", ["map", "{rec}", "--out", "{tmp}/m", "--fast"]),
+    ("no stereovox map here", ["info", "{rec}"]),
+    ("no stereovox map here", ["export", "{tmp}/gone", "{tmp}/x.bt"]),
+    ("written as .png", ["picture", "{tmp}/gone", "x.jpg"]),
+    ("must be smaller", ["map", "{rec}", "--out", "{tmp}/m", "--set", "map.free_below=0.9"]),
+    ("log_odds_min", ["map", "{rec}", "--out", "{tmp}/m", "--set", "map.log_odds_min=high"]),
+]
+
+
+@pytest.mark.parametrize(
+    ("said", "words"), MISTAKES, ids=lambda value: " ".join(value) if isinstance(value, list) else ""
+)
+def test_mistakes_end_in_one_line(said, words, recording, tmp_path, capsys):
+    fails_with_one_line(capsys, said, *(word.format(tmp=tmp_path, rec=recording) for word in words))
+    assert not (tmp_path / "m").exists()
+
+
+def test_a_broken_map_file_ends_in_one_line(recording, tmp_path, capsys):
+    out = tmp_path / "m"
+    assert run("map", recording, "--out", out, "--voxel-size", 0.1) == 0
+    (out / "manifest.json").write_text("{")
+    capsys.readouterr()
+    for words in (["info", out], ["picture", out, tmp_path / "p.png"], ["export", out, tmp_path / "m.bt"]):
+        fails_with_one_line(capsys, "manifest.json", *words)
+
+
+def test_unknown_export_names_the_known(recording, tmp_path, capsys):
+    out = tmp_path / "m"
+    assert run("map", recording, "--out", out, "--voxel-size", 0.1) == 0
+    capsys.readouterr()
+    fails_with_one_line(capsys, ".bt", "export", out, tmp_path / "m.xyz")
+
+
+def test_help_of_every_command_names_an_example(capsys):
+    for command in COMMANDS:
+        with pytest.raises(SystemExit) as stopped:
+            run(command, "--help")
+        assert stopped.value.code == 0
+        assert f"stereovox {command}" in capsys.readouterr().out
+
+
+def test_help_and_import_stay_light():
+    """The command line answers at once: heavy libraries are imported by the commands that need them."""
+    code = "import sys, stereovox.cli as c\ntry: c.main(['--help'])\nexcept SystemExit: pass\n"
+    code += "print([m for m in ('numba', 'cv2', 'matplotlib', 'zarr', 'trimesh', 'rich', 'scipy') if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1] == "[]"
+
+
+def test_as_a_program(recording, tmp_path):
+    command = [sys.executable, "-m", "stereovox", "map", str(recording), "--out", str(tmp_path / "m"), "--json"]
+    done = subprocess.run([*command, "--voxel-size", "0.1"], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["frames"] == 6
+    assert "6 frames mapped" in done.stderr
+    version = subprocess.run(
+        [sys.executable, "-m", "stereovox", "--version"], capture_output=True, text=True, check=True
+    )
+    assert version.stdout.strip() == f"stereovox {sv.__version__}"

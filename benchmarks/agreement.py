@@ -12,9 +12,8 @@ from stereovox.evaluate.agreement import agreement
 
 
 def main(recording: str, frames: str = "::1", sensor: str = "stereo") -> None:
-    print(
-        f"{'cell':>5} {'prec':>7} {'rec':>7} {'prec 1':>7} {'rec 1':>7} {'wr.free':>7} {'free p':>7} {'free r':>7}   ms, rays ms"
-    )
+    columns = ("prec", "rec", "prec 1", "rec 1", "wr.free", "free p", "free r")
+    print(" cell", *(f"{column:>7}" for column in columns), "  ms, rays ms")
     for voxel_size in (0.2, 0.1, 0.05, 0.02):
         settings = {"voxel_size": voxel_size, "sensor.model": sensor}
         projective = sv.Mapper("default", **settings)

@@ -14,6 +14,9 @@ from numpy.typing import NDArray
 
 from stereovox.errors import StereovoxError
 
+STEEPEST = 20.0
+"""Largest x/z or y/z of a pinhole camera's rays: 87 degrees off the axis."""
+
 
 @dataclass(frozen=True)
 class PinholeCamera:
@@ -21,7 +24,8 @@ class PinholeCamera:
 
     `fx, fy, cx, cy` are in pixels; pixel (u, v) has its centre at (u, v). `baseline` is the distance in metres
     between the two eyes (or projector and eye) of a stereo depth camera, None when not known.
-    Raises StereovoxError for sizes or focal lengths that are not positive and finite.
+    Raises StereovoxError for sizes or focal lengths that are not positive and finite, and for rays that leave the axis
+    by more than 87 degrees.
     """
 
     width: int
@@ -36,6 +40,13 @@ class PinholeCamera:
         numbers = (self.width, self.height, self.fx, self.fy, self.baseline or 1.0)
         if not (all(math.isfinite(n) and n > 0 for n in numbers) and math.isfinite(self.cx) and math.isfinite(self.cy)):
             raise StereovoxError(f"camera {self}: sizes, focal lengths and baseline must be positive and finite")
+        across = max(abs(self.cx), abs(self.width - 1 - self.cx)) / self.fx
+        steepest = max(across, abs(self.cy) / self.fy, abs(self.height - 1 - self.cy) / self.fy)
+        if steepest > STEEPEST:
+            angle = math.degrees(math.atan(steepest))
+            raise StereovoxError(
+                f"camera {self}: a ray {angle:.1f} deg off the axis is none of a pinhole; check fx, fy, cx, cy"
+            )
 
     @classmethod
     def from_field_of_view(

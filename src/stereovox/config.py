@@ -17,6 +17,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from stereovox.errors import ConfigError, did_you_mean
 
+MOST_CELLS = 8192
+"""Cells that fit between the camera and the maximum range."""
+
 
 class _Section(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -87,6 +90,10 @@ class Config(_Section):
     def _ordered(self) -> Config:
         if self.min_range >= self.max_range:
             raise ValueError("min_range must be smaller than max_range")
+        if self.max_range / self.voxel_size > MOST_CELLS:
+            raise ValueError(
+                f"max_range {self.max_range} spans more than {MOST_CELLS} cells of {self.voxel_size}; use larger cells"
+            )
         return self
 
 

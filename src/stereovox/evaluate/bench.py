@@ -56,7 +56,8 @@ def bench(
 
     Timed: for stereovox the `integrate_ms` of each frame, after all frames went once through a map that is thrown away,
     so that kernels are compiled; its depth preparation stands apart as `depth_ms_median`. For a peer its insertion
-    alone, in one thread, after one frame into a map that is thrown away; its points are made before. A peer stops
+    alone, in one thread, after one frame into a map that is thrown away; its points are made before, but what its
+    Python binding does with them is in it: that is what a user of it pays, and more than a C++ program would. A peer stops
     after `budget_s` seconds of inserting at one voxel size, with at least 5 frames: `frames` tells how many it did,
     and if that is fewer than ours, its cells and bytes cannot be compared.
 
@@ -94,7 +95,7 @@ def bench(
 
 
 def _configs(voxel_sizes: Sequence[float], threads: int, max_range: float | None) -> list[Config]:
-    more = {} if max_range is None else {"max_range": max_range}
+    more: dict[str, Any] = {} if max_range is None else {"max_range": max_range}
     configs = [load_config(voxel_size=float(size), threads=threads, **more) for size in dict.fromkeys(voxel_sizes)]
     if not configs:
         raise StereovoxError("no voxel size to time; give at least one in metres, for example 0.05")

@@ -18,6 +18,8 @@ COARSE = 4
 def candidates(view, table, windows, nearest, low, high, hit_table, hit_coords, free, mixed):
     """List the blocks that are wholly free and those that need a look at each cell; return both numbers.
 
+    Both are -1 when a list is too short.
+
     low, high: (3,) first and last coarse box, counted in coarse boxes from the camera's block. A free block that
     holds a hit is listed as mixed. free, mixed: (capacity, 3) int32 block coordinates from the camera's block.
     """
@@ -28,6 +30,8 @@ def candidates(view, table, windows, nearest, low, high, hit_table, hit_coords, 
                 coarse = _classify(view, table, windows, nearest, 1, COARSE, bx, by, bz)
                 if coarse == SKIP:
                     continue
+                if max(n_free, n_mixed) + COARSE**3 > free.shape[0]:
+                    return -1, -1
                 for i in range(8):
                     hx, hy, hz = bx + 2 * (i >> 2), by + 2 * ((i >> 1) & 1), bz + 2 * (i & 1)
                     half = coarse if coarse == FREE else _classify(view, table, windows, nearest, 1, 2, hx, hy, hz)

@@ -6,10 +6,6 @@ import numpy as np
 from stereovox._jit import cell, kernel
 from stereovox.integrate._cells import HALF, NEAR_PLANE, NO_RETURN, ONE, ZERO, table_row, window_level
 from stereovox.maps._cells import find
-from stereovox.sensors.model import COLUMNS
-
-LAST_COLUMN = np.float32(COLUMNS - 1)
-MIDDLE_COLUMN = np.float32(COLUMNS / 2)
 
 
 @kernel
@@ -49,6 +45,7 @@ def _clear(view, table, windows, cx, cy, cz, out):
     right, bottom = np.float32(view.width - 1), np.float32(view.height - 1)
     u_end, v_end = np.float32(view.width), np.float32(view.height)
     rows = np.int32(table.hit.size)
+    last_column, middle_column = np.float32(table.clear.shape[1] - 1), np.float32(table.clear.shape[1]) * HALF
     first, last = np.int32(windows.first), np.int32(windows.shape.shape[0] - 1)
     for c in range(512):
         z = cz + z_steps[c]
@@ -56,17 +53,17 @@ def _clear(view, table, windows, cx, cy, cz, out):
         inverse = ONE / (z if ahead else ONE)
         u = (cx + fx_steps[c]) * inverse + u_centre
         v = (cy + fy_steps[c]) * inverse + v_centre
-        rim = view.rim * inverse
-        seen = ahead & (u >= -rim) & (v >= -rim) & (u < u_end + rim) & (v < v_end + rim)
+        u_rim, v_rim = view.rim[0] * inverse, view.rim[1] * inverse
+        seen = ahead & (u >= -u_rim) & (v >= -v_rim) & (u < u_end + u_rim) & (v < v_end + v_rim)
         level = min(max(window_level(view.spread * inverse), first), last)
         shift = max(level - np.int32(1), np.int32(0))
         column = np.int32(min(max(u, ZERO), right)) >> shift
         line = np.int32(min(max(v, ZERO), bottom)) >> shift
         d = windows.image[np.uint32(windows.offset[level] + line * windows.width[level] + column)]
         row = min(np.int32(min(d, view.max_range) * table.rows_per_metre), rows - np.int32(1))
-        t = (z - d) * table.columns_per_metre[np.uint32(row)] + MIDDLE_COLUMN
-        k = np.int32(min(max(t, ZERO), LAST_COLUMN))
-        e = table.clear[np.uint32(row * np.int32(COLUMNS) + k)]
+        t = (z - d) * table.columns_per_metre[np.uint32(row)] + middle_column
+        k = np.int32(min(max(t, ZERO), last_column))
+        e = table.clear[np.uint32(row), np.uint32(k)]
         out[c] = np.int16(e if seen & (d > ZERO) else np.int32(0))
 
 
@@ -75,6 +72,7 @@ def _mark(depth_m, view, table, cx, cy, cz, out):
     """Overwrite with the positive evidence, where there is any, of the pixel at the cell's centre."""
     u_centre, v_centre = view.intrinsics[2] + HALF, view.intrinsics[3] + HALF
     rows = table.hit.size
+    last_column, middle_column = np.float32(table.mark.shape[1] - 1), np.float32(table.mark.shape[1]) * HALF
     for c in range(512):
         z = cz + view.steps[2, c]
         if z <= NEAR_PLANE or z > view.max_range:
@@ -87,9 +85,9 @@ def _mark(depth_m, view, table, cx, cy, cz, out):
         if not (d > ZERO and d < NO_RETURN):
             continue
         row = table_row(d, table.rows_per_metre, rows)
-        t = (z - d) * table.columns_per_metre[row] + MIDDLE_COLUMN
-        if t < ZERO or t > LAST_COLUMN:
+        t = (z - d) * table.columns_per_metre[row] + middle_column
+        if t < ZERO or t > last_column:
             continue
-        e = table.mark[row * COLUMNS + np.int32(t)]
+        e = table.mark[row, np.int32(t)]
         if e > 0:
             out[c] = np.int16(e)

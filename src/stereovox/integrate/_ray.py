@@ -7,13 +7,10 @@ from stereovox._jit import cell, kernel
 from stereovox.integrate._cells import HALF, NO_RETURN, ONE, ZERO, stronger, table_row, usable
 from stereovox.integrate._hits import _point_cell, _row_rays
 from stereovox.maps._cells import find_or_insert
-from stereovox.sensors.model import COLUMNS
 
 FRACTION_BITS = 10
 """Weighted evidence is summed in thousandths times 2^10: whole numbers, so the order of rays does not matter."""
 FRACTION = np.float32(1 << FRACTION_BITS)
-MIDDLE_COLUMN = np.float32(COLUMNS / 2)
-LAST_COLUMN = np.float32(COLUMNS - 1)
 BEYOND = np.float32(1e30)
 
 
@@ -106,9 +103,10 @@ def _crossing(index, step, start, inverse):
 
 @cell
 def _evidence(z, d, row, table):
-    t = (z - d) * table.columns_per_metre[row] + MIDDLE_COLUMN
-    k = np.int64(row) * COLUMNS + np.int64(min(max(t, ZERO), LAST_COLUMN))
-    return table.clear[k] + table.mark[k]
+    columns = np.float32(table.clear.shape[1])
+    t = (z - d) * table.columns_per_metre[row] + columns * HALF
+    k = np.int32(min(max(t, ZERO), columns - ONE))
+    return table.clear[row, k] + table.mark[row, k]
 
 
 @cell

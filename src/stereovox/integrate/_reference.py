@@ -115,7 +115,7 @@ def _projected(cells: NDArray, image: DepthImage, config: Config) -> tuple[NDArr
     z_safe = np.where(ahead, z, 1.0)
     size_px = camera.fx * config.voxel_size / z_safe
     uv = np.stack([camera.fx * x / z_safe + camera.cx, camera.fy * y / z_safe + camera.cy], axis=1) + 0.5
-    rim, end = RIM_SHARE * size_px[:, None], [camera.width, camera.height]
+    rim, end = RIM_SHARE * config.voxel_size / z_safe[:, None] * [camera.fx, camera.fy], [camera.width, camera.height]
     seen = ahead & ((uv >= -rim) & (uv < end + rim)).all(axis=1)
     return uv, z, size_px, seen
 

@@ -31,6 +31,7 @@ class Projective:
         self._config = config
         self._sensor = make_sensor(config.sensor)
         self._hits = BlockPool(np.int16, capacity=4096)
+        self._free, self._mixed = (np.empty((16384, 3), np.int32) for _ in range(2))
         self._camera: PinholeCamera | None = None
 
     def evidence(self, image: DepthImage) -> Evidence:
@@ -93,13 +94,15 @@ class Projective:
 
     def _candidates(self, view: View, windows: Windows, end: float) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
         low, high = _coarse_range(view, end)
-        most = int((high - low + 1).prod()) * _cull.COARSE**3
-        free, mixed = np.empty((most, 3), np.int32), np.empty((most, 3), np.int32)
         hits = self._hits
-        n_free, n_mixed = _cull.candidates(
-            view, self._table, windows, self._builder.nearest, low, high, hits.table, hits.coords, free, mixed
-        )
-        return free[:n_free], mixed[:n_mixed]
+        while True:
+            n_free, n_mixed = _cull.candidates(
+                view, self._table, windows, self._builder.nearest, low, high,
+                hits.table, hits.coords, self._free, self._mixed,
+            )  # fmt: skip
+            if n_free >= 0:
+                return self._free[:n_free], self._mixed[:n_mixed]
+            self._free, self._mixed = (np.empty((4 * len(self._free), 3), np.int32) for _ in range(2))
 
     def _evaluate(
         self, depth_m: NDArray[np.float32], view: View, windows: Windows, mixed: NDArray[np.int32]
@@ -135,10 +138,9 @@ class Projective:
 
 def _coarse_range(view: View, end: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the first and last coarse box (3,) that the view up to depth `end` can touch."""
-    rim = float(view.rim) / end
-    fx, fy = view.intrinsics[:2]
-    x = np.array([view.columns[0] - (rim + 1) / fx, view.columns[-1] + (rim + 1) / fx]) * end
-    y = np.array([view.rows[0] - (rim + 1) / fy, view.rows[-1] + (rim + 1) / fy]) * end
+    rim_x, rim_y = (view.rim / end + 1) / view.intrinsics[:2]
+    x = np.array([view.columns[0] - rim_x, view.columns[-1] + rim_x]) * end
+    y = np.array([view.rows[0] - rim_y, view.rows[-1] + rim_y]) * end
     corners = np.array([[0, 0, 0], *[[a, b, end] for a in x for b in y]], float)
     world = corners @ view.rotation.astype(float) + view.position
     side = _cull.COARSE * SIDE * float(view.voxel_size)

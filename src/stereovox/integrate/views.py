@@ -32,10 +32,10 @@ CELL_CENTRES = np.stack([axis.ravel() for axis in np.mgrid[:SIDE, :SIDE, :SIDE]]
 
 
 class KernelTable(NamedTuple):
-    """A sensor table in whole thousandths of log-odds, split by sign. All flat, row-major (rows, COLUMNS)."""
+    """A sensor table in whole thousandths of log-odds, split by sign."""
 
-    clear: NDArray[np.int32]  # negative evidence, 0 elsewhere; column 0 exactly the free value
-    mark: NDArray[np.int32]  # positive evidence beside the hit, 0 elsewhere
+    clear: NDArray[np.int32]  # (rows, columns) negative evidence, 0 elsewhere; column 0 exactly the free value
+    mark: NDArray[np.int32]  # (rows, columns) positive evidence beside the hit, 0 elsewhere
     hit: NDArray[np.int32]  # (rows,) evidence of the cell that holds the measured point
     columns_per_metre: NDArray[np.float32]  # (rows,) table columns one metre spans
     reach: NDArray[np.float32]  # (rows,) half width of the table in metres
@@ -60,7 +60,7 @@ class View(NamedTuple):
     voxel_size: np.float32
     max_range: np.float32
     spread: np.float32  # window tile size in pixels times depth
-    rim: np.float32  # border within which cells count as seen, pixels times depth
+    rim: NDArray[np.float32]  # (2,) border to the sides and above within which cells count as seen, pixels times depth
     steps: NDArray[np.float32]  # (3, 512) fx * x, fy * y and z of a block's cells from its corner, camera axes
 
 
@@ -79,8 +79,8 @@ def kernel_table(table: SensorTable, max_range: float) -> KernelTable:
     edges = np.arange(len(reach)) / table.rows_per_metre
     safe = np.append(np.minimum.accumulate((edges - reach)[::-1])[::-1], max_range)
     return KernelTable(
-        clear.ravel(),
-        mark.ravel(),
+        clear,
+        mark,
         to_units(table.hit),
         (COLUMNS / (2 * reach)).astype(np.float32),
         reach.astype(np.float32),
@@ -99,7 +99,7 @@ def origin_block(T_world_camera: Transform, voxel_size: float) -> NDArray[np.int
 def view_of(image: DepthImage, voxel_size: float, max_range: float) -> View:
     """Return the kernel view of a depth image's camera and pose."""
     camera, T = image.camera, image.T_world_sensor
-    rim = RIM_SHARE * camera.fx * voxel_size
+    rim = RIM_SHARE * voxel_size * np.array([camera.fx, camera.fy])
     corner = origin_block(T, voxel_size) * (SIDE * voxel_size)
     columns, rows, intrinsics = _camera_arrays(camera)
     return View(
@@ -115,12 +115,12 @@ def view_of(image: DepthImage, voxel_size: float, max_range: float) -> View:
         np.float32(voxel_size),
         np.float32(max_range),
         np.float32(WINDOW_SHARE * camera.fx * voxel_size),
-        np.float32(rim),
+        rim.astype(np.float32),
         _cell_steps(camera, T, voxel_size),
     )
 
 
-def _sides(camera: PinholeCamera, T: Transform, rim: float) -> NDArray[np.float32]:
+def _sides(camera: PinholeCamera, T: Transform, rim: NDArray[np.float64]) -> NDArray[np.float32]:
     """A point counts as seen when fx x + (cx + 0.5) z + rim >= 0, and the like for the other three sides."""
     right, bottom = camera.width - 0.5 - camera.cx, camera.height - 0.5 - camera.cy
     inward = np.array(
@@ -133,8 +133,8 @@ def _sides(camera: PinholeCamera, T: Transform, rim: float) -> NDArray[np.float3
     )
     normals = inward @ T[:3, :3].T
     unit_box = np.abs(normals).sum(axis=1, keepdims=True)
-    slack = 1e-3 * np.abs(inward).max()
-    return np.hstack([normals, unit_box, np.full((4, 1), rim + slack)]).astype(np.float32)
+    border = np.repeat(rim, 2)[:, None] + 1e-3 * np.abs(inward).max(axis=1, keepdims=True)
+    return np.hstack([normals, unit_box, border]).astype(np.float32)
 
 
 @lru_cache

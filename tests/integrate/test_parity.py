@@ -100,6 +100,19 @@ def test_wide_and_narrow_keys_agree():
     assert hits[0] == hits[1]
 
 
+def test_a_ray_pool_that_is_too_small_grows_and_starts_over(monkeypatch):
+    from stereovox.integrate import ray
+
+    image = made_image(4)
+    for update in ("every", "once"):
+        config = load_config(voxel_size=0.02, max_range=2.5, integrator="ray", **{"ray.update": update})
+        enough = cells_of(make_integrator(config).evidence(image))
+        pool = ray.BlockPool
+        monkeypatch.setattr(ray, "BlockPool", lambda dtype, capacity, pool=pool: pool(dtype, 2))
+        assert cells_of(make_integrator(config).evidence(image)) == enough
+        monkeypatch.undo()
+
+
 def test_odd_image_sizes():
     for width, height in [(1, 1), (7, 3), (33, 65), (130, 1)]:
         camera = PinholeCamera(width, height, 40.0, 40.0, width / 2, height / 2, 0.05)

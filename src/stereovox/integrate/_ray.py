@@ -16,25 +16,23 @@ BEYOND = np.float32(1e30)
 
 @kernel
 def cast(depth_m, view, table, weight, pool_table, coords, count, values, first_row, last_row):
-    """Add the evidence of all rays of rows first_row..last_row; return the first row not done (the pool is full).
+    """Add the evidence of all rays of rows first_row..last_row to an empty pool; return False when it is too small.
 
     depth_m: (h, w) REP 117 depth image. weight > 0: every ray adds its evidence to every cell it crosses, times
     min(1, weight * depth^2) (Chien 2020, Eq 3.21), in units of 1/1024 thousandths; 0: a cell keeps the strongest.
-    Blocks count from the camera's own. A row begun twice does no harm to strongest evidence only, so the pool must
-    have room for what one row can touch before the row is begun.
+    Blocks count from the camera's own.
     """
     size = ONE / view.voxel_size
     position = view.position * size
-    longest = np.int64(3) * np.int64(view.max_range * size * np.float32(4)) + 16
     for v in range(first_row, last_row):
-        if coords.shape[0] - count[0] < (longest >> 3) * 4 + depth_m.shape[1]:
-            return v
         ray = _row_rays(view.rotation, view.rows[v], size)
         for u in range(depth_m.shape[1]):
             d = usable(depth_m[v, u])
-            if d > ZERO:
-                _walk(d, view.columns[u], ray, position, view, table, weight, pool_table, coords, count, values)
-    return last_row
+            if d > ZERO and not _walk(
+                d, view.columns[u], ray, position, view, table, weight, pool_table, coords, count, values
+            ):
+                return False
+    return True
 
 
 @cell
@@ -58,6 +56,8 @@ def _walk(d, column, ray, position, view, table, weight, pool_table, coords, cou
         left = min(min(tx, ty), tz)
         if place < 0:
             place = find_or_insert(pool_table, coords, count, x >> 3, y >> 3, zz >> 3)
+            if place < 0:
+                return False
         if not (real and x == hx and y == hy and zz == hz):
             middle = HALF * (entered + min(left, end))
             e = _evidence(middle, d, row, table)
@@ -80,7 +80,10 @@ def _walk(d, column, ray, position, view, table, weight, pool_table, coords, cou
             tz = _crossing(zz, sz, position[2], iz)
     if real:
         place = find_or_insert(pool_table, coords, count, hx >> 3, hy >> 3, hz >> 3)
+        if place < 0:
+            return False
         _give(values, place, hx, hy, hz, table.hit[row], d, weight)
+    return True
 
 
 @cell

@@ -49,14 +49,12 @@ class Ray:
 
     def _cast(self, depth_m: NDArray[np.float32], view: View, weight: np.float32, pool: BlockPool, part: slice) -> None:
         pool.clear()
-        row = part.start
-        while row < part.stop:
-            row = _ray.cast(
-                depth_m, view, self._table, weight,
-                pool.table, pool.coords, pool.count, pool.values, row, part.stop,
-            )  # fmt: skip
-            if row < part.stop:
-                pool.reserve(2 * len(pool.coords))
+        while not _ray.cast(
+            depth_m, view, self._table, weight,
+            pool.table, pool.coords, pool.count, pool.values, part.start, part.stop,
+        ):  # fmt: skip
+            pool.clear()
+            pool.reserve(2 * len(pool.coords))
 
     def _merged(self, pools: list[BlockPool], weighted: bool) -> BlockPool:
         first, *others = pools

@@ -56,10 +56,11 @@ def bench(
 
     Timed: for stereovox the `integrate_ms` of each frame, after all frames went once through a map that is thrown away,
     so that kernels are compiled; its depth preparation stands apart as `depth_ms_median`. For a peer its insertion
-    alone, in one thread, after one frame into a map that is thrown away; its points are made before, but what its
-    Python binding does with them is in it: that is what a user of it pays, and more than a C++ program would. A peer stops
-    after `budget_s` seconds of inserting at one voxel size, with at least 5 frames: `frames` tells how many it did,
-    and if that is fewer than ours, its cells and bytes cannot be compared.
+    alone, in one thread, after one frame into a map that is thrown away; its points are made before. What a peer's
+    Python binding does with the points is part of it: a Python user pays that, a C++ program would not.
+
+    A peer stops after `budget_s` seconds of inserting at one voxel size, with at least 5 frames: `frames` tells how
+    many it did, and if that is fewer than ours, its cells and bytes cannot be compared.
 
     Returns `rows` of `library, voxel_size, threads, frames, integrate_ms_median, integrate_ms_p90, occupied, free,
     map_bytes`; `ratio[str(voxel_size)][peer]` = peer's median / our median; and `source, image, frames,
@@ -231,7 +232,7 @@ def _faster(times: float) -> str:
 
 def _notes(result: dict[str, Any]) -> list[str]:
     notes = [
-        "ms/frame: median time to take one frame into the map; making depth images or points is not in it.",
+        "ms/frame: median time of the call that takes a frame in; making depth images or points is not part of it.",
         "Cells as each library defines them: occupied above p = 0.7, free below 0.3; for OctoMap above, below 0.5.",
     ]
     for row in result["rows"]:

@@ -1,0 +1,251 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The comparison with other libraries: same frames and pixels, a complete result, a table people understand."""
+
+from dataclasses import replace
+from importlib.util import find_spec
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from stereovox.cameras import PinholeCamera
+from stereovox.errors import ConfigError, MissingExtra, StereovoxError
+from stereovox.evaluate import peers as peers_module
+from stereovox.evaluate.bench import bench, format_table
+from stereovox.evaluate.peers import PEERS, find_peer
+from stereovox.frame import Frame, Reason
+
+CAMERA = PinholeCamera(64, 48, 40.0, 40.0, 31.5, 23.5, 0.05)
+ROW_KEYS = {
+    "library", "voxel_size", "threads", "frames", "integrate_ms_median", "integrate_ms_p90", "occupied", "free",
+    "map_bytes",
+}  # fmt: skip
+LIBRARY = {"octomap": "octomap", "octomap-rays": "octomap", "pyoctomap": "pyoctomap"}
+
+
+def a_frame(i=0, wall=2.0):
+    """A wall with a box before it, a hole, and a strip beyond any range; the camera looks along world x."""
+    depth = np.full((48, 64), 1000 * wall, np.uint16)
+    depth[20:40, 20:40] = 1500
+    depth[:5, :5] = 0
+    depth[:, -4:] = 9000
+    T = np.eye(4)
+    T[:3, :3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]
+    T[:3, 3] = 0.01 * i, 0.02, 1.0
+    return Frame(depth, CAMERA, T, stamp_ns=i, depth_scale=0.001, name=f"frame {i}")
+
+
+def installed(*names):
+    missing = [name for name in names if not find_spec(LIBRARY[name])]
+    if missing:
+        pytest.skip(f"{', '.join(missing)} not installed: pip install 'stereovox[bench]'")
+    return list(names)
+
+
+class Recorder:
+    """A peer that needs no library and remembers what it was given."""
+
+    made: list["Recorder"] = []  # noqa: RUF012
+
+    def __init__(self, voxel_size):
+        self.voxel_size, self.inserted = voxel_size, []
+        Recorder.made.append(self)
+
+    def insert(self, points, origin):
+        self.inserted.append((points, origin))
+
+    def counts(self):
+        return 3, 4
+
+    def bytes(self):
+        return 5
+
+
+@pytest.fixture
+def recorder(monkeypatch):
+    """Put the peer `recorder` into the registry; return all that are made."""
+    monkeypatch.setattr(Recorder, "made", [])
+    monkeypatch.setitem(PEERS, "recorder", "a_made_module:Recorder")
+    monkeypatch.setitem(__import__("sys").modules, "a_made_module", SimpleNamespace(Recorder=Recorder))
+    return Recorder.made
+
+
+def test_every_library_gives_a_complete_row_with_cells_that_agree():
+    names = installed(*LIBRARY)
+    result = bench([a_frame(i) for i in range(6)], [0.2, 0.1], names, threads=2)
+    rows = {(row["library"], row["voxel_size"]): row for row in result["rows"]}
+    assert list(rows) == [(library, size) for size in (0.2, 0.1) for library in ("stereovox", *names)]
+    assert result["ratio"].keys() == {"0.2", "0.1"}
+    for (library, size), row in rows.items():
+        assert row.keys() >= ROW_KEYS
+        assert row["frames"] == 6
+        assert row["threads"] == (2 if library == "stereovox" else 1)
+        assert row["map_bytes"] > row["occupied"] > 20
+        assert row["free"] > 20
+        assert 0 < row["integrate_ms_median"] <= 1.001 * row["integrate_ms_p90"]
+        ours = rows["stereovox", size]
+        assert ours["occupied"] / 2 < row["occupied"] < 2 * ours["occupied"], library
+        assert ours["free"] / 2 < row["free"] < 2 * ours["free"], library
+        if library != "stereovox":
+            ratio = row["integrate_ms_median"] / ours["integrate_ms_median"]
+            assert result["ratio"][str(size)][library] == pytest.approx(ratio, rel=1e-2)
+    assert all("depth_ms_median" in rows["stereovox", size] for size in (0.2, 0.1))
+
+
+@pytest.mark.parametrize("name", list(LIBRARY))
+def test_a_peer_counts_cells_and_not_nodes(name):
+    """A full cube of 4x4x4 cells at the clamping limit is pruned to one node; it still is 64 cells."""
+    installed(name)
+    voxel_size = 0.25
+    peer = find_peer(name)(voxel_size)
+    inside = (np.stack(np.mgrid[:4, :4, :4], axis=-1).reshape(-1, 3) + 0.5) * voxel_size
+    for point in inside:
+        for _ in range(20):
+            peer._tree.updateNode(point, True)
+    peer._tree.updateNode(np.array([-3.1, 0.1, 0.1]), False)
+    assert peer._tree.getNumLeafNodes() == 2
+    assert peer.counts() == (64, 1)
+    assert peer.bytes() > 0
+
+
+def test_two_bindings_of_octomap_build_the_same_tree_in_one_process():
+    result = bench([a_frame(i) for i in range(3)], [0.1], installed("octomap", "pyoctomap"))
+    _, one, other = result["rows"]
+    assert (one["occupied"], one["free"]) == (other["occupied"], other["free"])
+
+
+def test_peers_get_the_points_of_the_pixels_that_count(recorder):
+    frame = a_frame()
+    bench([frame], [0.1], ["recorder"], max_range=1.8)
+    points, origin = recorder[-1].inserted[0]
+    assert origin == pytest.approx(frame.T_world_sensor[:3, 3])
+    assert points.shape == (20 * 20, 3)
+    assert points.dtype == np.float64
+    assert points.flags.c_contiguous
+    v, u = np.mgrid[20:40, 20:40].reshape(2, -1)
+    slopes = (u - 31.5) / 40.0, (v - 23.5) / 40.0
+    wanted = np.stack([np.full(400, 1.5), 0.02 - 1.5 * slopes[0], 1.0 - 1.5 * slopes[1]], axis=1)
+    assert points == pytest.approx(wanted, abs=1e-6)
+
+
+def test_stereovox_gets_no_pixel_that_peers_do_not_get(recorder):
+    """Beyond the maximum range it would clear space, which no peer may; so it must not either."""
+    with_strip = [a_frame(i) for i in range(6)]
+    only_box = [replace(f, depth=np.where(f.depth == 1500, f.depth, 0).astype(np.uint16)) for f in with_strip]
+    with_far = bench(with_strip, [0.1], ["recorder"], max_range=1.8)["rows"][0]
+    without = bench(only_box, [0.1], ["recorder"], max_range=1.8)["rows"][0]
+    assert without["free"] > 0
+    assert (with_far["occupied"], with_far["free"]) == (without["occupied"], without["free"])
+
+
+def test_pixels_the_source_masked_are_left_out_for_all(recorder):
+    frame = a_frame()
+    reason = np.where(frame.depth == 1500, Reason.MASKED, Reason.VALID).astype(np.uint8)
+    bench([replace(frame, reason=reason)], [0.1], ["recorder"])
+    points, _ = recorder[-1].inserted[0]
+    assert len(points) == 48 * 60 - 25 - 400
+
+
+def test_a_peer_is_timed_on_a_fresh_map_after_a_warm_up(recorder):
+    bench([a_frame(i) for i in range(3)], [0.2, 0.1], ["recorder"])
+    used = [(peer.voxel_size, len(peer.inserted)) for peer in recorder if peer.inserted]
+    assert used == [(0.2, 1), (0.2, 3), (0.1, 1), (0.1, 3)]
+
+
+def test_a_peer_stops_when_its_time_is_over_but_not_before_five_frames(recorder):
+    result = bench([a_frame(i) for i in range(8)], [0.2], ["recorder"], budget_s=0.0)
+    ours, peer = result["rows"]
+    assert (ours["frames"], peer["frames"]) == (8, 5)
+    assert "recorder at 0.2 m stopped at its time limit after 5 of 8 frames" in format_table(result)
+
+
+def test_bad_frames_are_left_out_for_all_and_counted(recorder):
+    far = a_frame(1, wall=9.0)
+    far.depth[20:40, 20:40] = 0
+    crooked = replace(a_frame(2), T_world_sensor=np.diag([1.0, 1.0, 3.0, 1.0]))
+    result = bench([far, a_frame(0), crooked], [0.2], ["recorder"])
+    assert (result["frames"], result["frames_refused"]) == (1, 2)
+    assert [row["frames"] for row in result["rows"]] == [1, 1]
+
+
+def test_frames_limit_and_progress(recorder):
+    told = []
+    frames = (a_frame(i) for i in range(1000))
+    result = bench(frames, [0.2], ["recorder"], frames_limit=4, progress=lambda *done: told.append(done))
+    assert result["frames"] == 4
+    assert next(frames).stamp_ns == 4
+    texts = list(dict.fromkeys(text for _, _, text in told))
+    assert texts == [
+        "reading frames", "stereovox at 0.2 m, warming up", "stereovox at 0.2 m, timing", "recorder at 0.2 m"
+    ]  # fmt: skip
+    assert told[-1][:2] == (4, 4)
+
+
+def test_slips_of_the_user_are_one_line_before_any_frame_is_read():
+    def unread():
+        raise AssertionError("a frame was asked for")
+        yield
+
+    with pytest.raises(ConfigError, match=r"unknown peer 'octomop' \(did you mean 'octomap'\?\)$"):
+        bench(unread(), [0.1], ["octomop"])
+    with pytest.raises(ConfigError, match="voxel_size"):
+        bench(unread(), [0.1, -1.0], [])
+    with pytest.raises(ConfigError, match="threads"):
+        bench(unread(), [0.1], [], threads=0)
+    with pytest.raises(StereovoxError, match=r"^no voxel size"):
+        bench(unread(), [], [])
+
+
+@pytest.mark.parametrize(("name", "package"), [("octomap", "octomap-python"), ("pyoctomap", "pyoctomap")])
+def test_a_library_that_is_missing_is_named_with_the_cure(monkeypatch, name, package):
+    def missing(module):
+        raise ModuleNotFoundError(module)
+
+    monkeypatch.setattr(peers_module, "import_module", missing)
+    with pytest.raises(MissingExtra, match=rf"^{package} is not installed; run: pip install 'stereovox\[bench\]'$"):
+        bench([a_frame()], [0.1], [name])
+
+
+def test_no_usable_frame_is_one_line():
+    blind = replace(a_frame(), depth=np.zeros((48, 64), np.uint16))
+    with pytest.raises(StereovoxError, match=r"not one frame can be used \(frame 0: not one pixel"):
+        bench([blind, blind], [0.1], [])
+    with pytest.raises(StereovoxError, match="the source is empty"):
+        bench([], [0.1], [])
+
+
+def made_result():
+    rows = []
+    for size, ours_ms in ((0.2, 0.5), (0.05, 2.0)):
+        for library, ms, frames in (("stereovox", ours_ms, 50), ("octomap", 21.0, 50), ("slow", 1.0, 7)):
+            rows.append(
+                {"library": library, "voxel_size": size, "threads": 1, "frames": frames, "integrate_ms_median": ms,
+                 "integrate_ms_p90": 2 * ms, "occupied": 1234567, "free": 20, "map_bytes": 2_500_000}
+            )  # fmt: skip
+    ratio = {"0.2": {"octomap": 42.0, "slow": 2.0}, "0.05": {"octomap": 10.5, "slow": 0.5}}
+    return {"source": "kitchen", "image": "640x480", "frames": 50, "frames_refused": 0, "max_range": 5.0,
+            "budget_s": 60.0, "rows": rows, "ratio": ratio}  # fmt: skip
+
+
+def test_the_table_shows_our_row_first_and_how_many_times_faster():
+    text = format_table(made_result())
+    lines = text.splitlines()
+    assert lines[0] == "kitchen: 50 frames of 640x480, depth up to 5 m"
+    head = next(line for line in lines if line.startswith("voxel"))
+    start = lines.index(next(line for line in lines if line.startswith("0.2 m")))
+    assert [line.split()[0] for line in lines[start + 1 : start + 3]] == ["octomap", "slow"]
+    assert lines[start].split()[2:] == ["stereovox", "1", "50", "0.50", "1.00", "1,234,567", "20", "2.5"]
+    assert "42 x faster" in lines[start + 1]
+    end = head.index("stereovox is") + len("stereovox is")
+    assert lines[start + 1][:end].endswith(" 42 x faster")
+    assert "2.0 x faster" in lines[start + 2]
+    assert text.count("2.0 x slower") == 1
+    assert text.count("stopped at its time limit after 7 of 50 frames") == 2
+    assert all(len(line) <= 120 for line in lines)
+
+
+def test_a_result_without_peers_is_a_table_too():
+    result = bench([a_frame()], [0.2], [])
+    assert result["ratio"] == {"0.2": {}}
+    assert "stereovox" in format_table(result)
+    assert [row["library"] for row in result["rows"]] == ["stereovox"]

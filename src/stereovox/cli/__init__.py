@@ -26,19 +26,29 @@ def main(argv: Sequence[str] | None = None) -> int:
     words = sys.argv[1:] if argv is None else argv
     try:
         _check_command(words)
-        arguments = _parser().parse_args(words)
+        arguments = _parse(words)
         result = _module(arguments.command).run(arguments)
-        if arguments.json:
-            print(json.dumps(result, allow_nan=False))
-            sys.stdout.flush()
-        return 0
+        return _print_json(result) if arguments.json else 0
     except StereovoxError as error:
         return _fail(" ".join(str(error).split()), 2)
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
+    except OSError as error:  # what no command foresaw: a folder that may not be searched, a full disk
+        where = f"{error.filename}: " if error.filename else ""
+        return _fail(f"{where}{error.strerror or error}; check that it exists and that you may use it", 2)
+    except MemoryError:
+        return _fail("not enough memory; use larger cells (--voxel-size) or a shorter --max-range", 2)
     except KeyboardInterrupt:
         return _fail("stopped", 130)
+
+
+def _print_json(result: dict[str, Any]) -> int:
+    try:
+        print(json.dumps(result, allow_nan=False))
+        sys.stdout.flush()
+    except OSError as error:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or Python tries again at exit
+        if not isinstance(error, BrokenPipeError):  # a reader that has read enough is no mistake
+            return _fail(f"standard output: {error.strerror}; send it to a place that has room", 2)
+    return 0
 
 
 def _fail(message: str, status: int) -> int:
@@ -47,11 +57,31 @@ def _fail(message: str, status: int) -> int:
 
 
 class _Parser(argparse.ArgumentParser):
+    """Options by their full name only, and errors that `main` prints as one line."""
+
+    def __init__(self, **settings: Any):
+        self.options: list[str] = []
+        super().__init__(**settings, allow_abbrev=False)
+
+    def add_argument(self, *names: Any, **settings: Any) -> argparse.Action:
+        self.options += [name for name in names if name.startswith("--")]
+        return super().add_argument(*names, **settings)
+
     def error(self, message: str) -> NoReturn:
         raise StereovoxError(f"{message}; see: {self.prog} --help")
 
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """Refuse what is left over where it is still known which command it was meant for."""
+        found, left = super().parse_known_args(args, namespace)
+        if left:
+            option = left[0].partition("=")[0]
+            if option.startswith("-"):
+                self.error(f"unknown option '{option}'{did_you_mean(option, self.options)}")
+            self.error(f"'{left[0]}' is one argument too many")
+        return found, left
 
-def _parser() -> argparse.ArgumentParser:
+
+def _parse(words: Sequence[str]) -> argparse.Namespace:
     parser = _Parser(prog="stereovox", description=stereovox.__doc__)
     parser.add_argument("--version", action="version", version=f"stereovox {stereovox.__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True, parser_class=_Parser)
@@ -63,7 +93,7 @@ def _parser() -> argparse.ArgumentParser:
         )
         module.add_arguments(command)
         command.add_argument("--json", action="store_true", help="print one JSON object as the last line of stdout")
-    return parser
+    return parser.parse_args(words)
 
 
 def _check_command(words: Sequence[str]) -> None:

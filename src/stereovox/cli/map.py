@@ -10,7 +10,15 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stereovox.cli.terminal import cells_line, milliseconds, say, say_about_compiling, tracked
+from stereovox.cli.terminal import (
+    cells_line,
+    command_line,
+    interrupt_between_steps,
+    milliseconds,
+    say,
+    say_about_compiling,
+    tracked,
+)
 from stereovox.errors import StereovoxError
 
 if TYPE_CHECKING:
@@ -29,11 +37,20 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--integrator", metavar="NAME", help="projective (default) or ray")
     parser.add_argument("--max-range", type=float, metavar="M", help="depth in metres up to which pixels count")
     parser.add_argument("--frames", metavar="A:B:S", help="only these frames, as a Python slice")
-    parser.add_argument("--threads", type=int, metavar="N", help="threads; the map does not depend on it")
+    parser.add_argument("--threads", type=int, metavar="N", help="threads (1); the map does not depend on it")
     parser.add_argument(
-        "--set", action="append", default=[], metavar="KEY=VALUE", dest="settings", help="any other setting"
+        "--set",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        dest="settings",
+        help="any other setting, for example sensor.model=andert; repeatable",
     )
-    parser.add_argument("--resume", action="store_true", help="go on with the map at --out")
+    parser.add_argument(
+        "--resume",
+        action="store_true",
+        help="go on with the map at --out: as many frames of SOURCE are skipped as it has seen",
+    )
 
 
 def run(arguments: Namespace) -> dict[str, Any]:
@@ -44,9 +61,9 @@ def run(arguments: Namespace) -> dict[str, Any]:
     out = Path(arguments.out)
     _check_target(out, arguments.resume)
     source = open_source(arguments.source, arguments.frames)
+    mapper = _mapper(arguments, out)
     for note in source.notes:
         say(f"note: {note}")
-    mapper = _mapper(arguments, out)
     say_about_compiling()
     reports = _add_all(mapper, source, out)
     result = summarise(mapper.map, reports)
@@ -100,8 +117,10 @@ def _add_all(mapper: Mapper, source: Source, out: Path) -> list[UpdateReport]:
         source = Selection(source, f"{done}:")
         say(f"going on after frame {done}")
     try:
-        for frame in tracked(source, len(source), "mapping"):
-            reports.append(mapper.add(frame))
+        with interrupt_between_steps() as check:
+            for frame in tracked(source, len(source), "mapping"):
+                reports.append(mapper.add(frame))
+                check()
     except KeyboardInterrupt:
         if mapper.map.frames:
             mapper.map.save(out)
@@ -121,4 +140,4 @@ def _tell(result: dict[str, Any], reports: list[UpdateReport], out: Path) -> Non
         say(f"  {number} x {reason}, first: {example}")
     say(f"a frame: depth {milliseconds(result['depth_ms'])}; map {milliseconds(result['integrate_ms'])}")
     say(cells_line(result))
-    say(f"saved in {out}; look at it with: stereovox picture {out} {out.stem}.png")
+    say(f"saved in {out}; look at it with: {command_line('picture', out, f'{out.stem}.png')}")

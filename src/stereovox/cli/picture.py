@@ -30,6 +30,11 @@ def run(arguments: Namespace) -> dict[str, Any]:
     if file.suffix.lower() != ".png":
         raise StereovoxError(f"{file}: pictures are written as .png; name the file so")
     voxel_map = load_map(arguments.map)
-    picture(voxel_map, file, title=arguments.title or Path(arguments.map).stem, up=arguments.up)
+    picture(voxel_map, file, title=_plain(arguments.title or Path(arguments.map).stem), up=arguments.up)
     say(f"saved {file}")
     return {"picture": str(file)}
+
+
+def _plain(text: str) -> str:
+    """Return text that is drawn letter by letter: no formulas, no bytes that are no letters."""
+    return text.encode("utf-8", "replace").decode().replace("$", r"\$")

@@ -3,8 +3,11 @@
 
 from __future__ import annotations
 
+import shlex
+import signal
 import sys
-from collections.abc import Iterable, Iterator
+import threading
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -32,12 +35,12 @@ def say_about_compiling() -> None:
 
 @contextmanager
 def progress_bar() -> Iterator[Progress]:
-    """Give a progress bar with rate and time left that lives on stderr."""
+    """Give a progress bar with rate and time left that lives on stderr and goes away at the end."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[note]}"))
-    with Progress(*columns, TimeRemainingColumn(), console=Console(stderr=True)) as bar:
+    with Progress(*columns, TimeRemainingColumn(), console=Console(stderr=True), transient=True) as bar:
         yield bar
 
 
@@ -49,6 +52,37 @@ def tracked(items: Iterable[T], total: int, text: str) -> Iterator[T]:
             yield item
             speed = bar.tasks[0].finished_speed or bar.tasks[0].speed
             bar.update(task, advance=1, note=f"{speed:.0f} a second" if speed else "")
+
+
+@contextmanager
+def interrupt_between_steps() -> Iterator[Callable[[], None]]:
+    """Give a function that raises KeyboardInterrupt if Ctrl-C was pressed: a step is never cut in half by it.
+
+    A second Ctrl-C is obeyed at once.
+    """
+    pressed: list[int] = []
+
+    def remember(number: int, _: object) -> None:
+        pressed.append(number)
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    def check() -> None:
+        if pressed:
+            raise KeyboardInterrupt
+
+    if threading.current_thread() is not threading.main_thread():
+        yield check
+        return
+    before = signal.signal(signal.SIGINT, remember)
+    try:
+        yield check
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def command_line(*words: object) -> str:
+    """Return a stereovox command that can be copied to a shell, whatever the file names hold."""
+    return shlex.join(["stereovox", *map(str, words)])
 
 
 def milliseconds(figures: dict[str, float]) -> str:
@@ -66,7 +100,7 @@ def size(number_of_bytes: float) -> str:
 
 
 def thousands(number: Any) -> str:
-    """Return a whole number with thin marks: 1,234,567."""
+    """Return a whole number with commas: 1,234,567."""
     return f"{number:,}"
 
 

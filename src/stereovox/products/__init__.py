@@ -1,0 +1,34 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a map becomes for other programs: one writer a file type, chosen by the file's ending."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from stereovox import registry
+from stereovox.errors import StereovoxError
+from stereovox.maps import VoxelMap
+from stereovox.products.octomap_read import read_octomap
+
+EXPORTS = {
+    ".bt": "stereovox.products.octomap_write:write_bt",
+    ".ot": "stereovox.products.octomap_write:write_ot",
+    ".ply": "stereovox.products.points:write_ply",
+    ".npz": "stereovox.products.points:write_npz",
+}
+"""File ending -> writer `(voxel_map, path) -> None`; other packages add theirs as entry points `stereovox.export`."""
+
+__all__ = ["EXPORTS", "export", "read_octomap"]
+
+
+def export(voxel_map: VoxelMap, path: str | Path) -> None:
+    """Write `voxel_map` to the file `path` in the format its ending names; a failed export leaves an older file whole.
+
+    Raises StereovoxError: one line about an unknown ending, a place that cannot be written, or cells the format
+    cannot hold.
+    """
+    ending = Path(path).suffix.lower()
+    known = registry.names("export", EXPORTS)
+    if ending not in known:
+        raise StereovoxError(f"{path}: cannot export to '{ending}'; end the file's name with one of {', '.join(known)}")
+    registry.find("export", EXPORTS, ending)(voxel_map, path)

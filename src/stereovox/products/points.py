@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A map as plain points: `.ply` for point cloud viewers, `.npz` for NumPy."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.maps import VoxelMap
+from stereovox.products.files import replacing
+
+PLY_POINT = np.dtype(
+    [
+        ("x", "<f4"), ("y", "<f4"), ("z", "<f4"),
+        ("red", "u1"), ("green", "u1"), ("blue", "u1"),
+        ("probability", "<f4"),
+    ]
+)  # fmt: skip
+PLY_TYPES = {"f": "float", "u": "uchar"}
+HEIGHT_RAMP = ((40, 60, 180), (30, 160, 210), (70, 190, 90), (240, 200, 50), (200, 40, 30))
+"""Red, green and blue at equal steps from the lowest to the highest point."""
+
+
+def write_ply(voxel_map: VoxelMap, path: str | Path) -> None:
+    """Write the occupied cells as a binary point cloud: centre in metres (world frame), colour by height, probability.
+
+    Raises MapFileError when the place cannot be written.
+    """
+    centers = voxel_map.occupied()
+    points = np.empty(len(centers), PLY_POINT)
+    for axis, name in enumerate("xyz"):
+        points[name] = centers[:, axis]
+    colours = height_colours(centers[:, 2])
+    for channel, name in enumerate(("red", "green", "blue")):
+        points[name] = colours[:, channel]
+    points["probability"] = voxel_map.probability(centers)
+    with replacing(path) as file:
+        file.write(_ply_header(len(points), voxel_map.voxel_size).encode("ascii"))
+        file.write(points.tobytes())
+
+
+def write_npz(voxel_map: VoxelMap, path: str | Path) -> None:
+    """Write every known cell for `numpy.load`.
+
+    Arrays: `indices` (N, 3) int32, cell i covers [i, i + 1) * voxel_size; `log_odds` (N,) float32; and the numbers
+    `voxel_size` in metres, `free_below` and `occupied_above` (probabilities). What is not named is unknown.
+    Raises MapFileError when the place cannot be written.
+    """
+    indices, log_odds = voxel_map.cells()
+    limits = voxel_map.config.map
+    with replacing(path) as file:
+        np.savez_compressed(
+            file,
+            indices=indices,
+            log_odds=log_odds,
+            voxel_size=np.float64(voxel_map.voxel_size),
+            free_below=np.float64(limits.free_below),
+            occupied_above=np.float64(limits.occupied_above),
+        )
+
+
+def height_colours(z: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """Return colours (N, 3) from blue at the lowest through green to red at the highest of the heights (N,)."""
+    if not len(z):
+        return np.zeros((0, 3), np.uint8)
+    share = (z - z.min()) / max(float(np.ptp(z)), 1e-9)
+    at = np.linspace(0, 1, len(HEIGHT_RAMP))
+    return np.stack([np.interp(share, at, channel) for channel in np.transpose(HEIGHT_RAMP)], axis=1).astype(np.uint8)
+
+
+def _ply_header(number: int, voxel_size: float) -> str:
+    properties = [f"property {PLY_TYPES[PLY_POINT[name].kind]} {name}" for name in PLY_POINT.names or ()]
+    lines = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"comment centres of occupied cells of {voxel_size!r} m",
+        f"element vertex {number}",
+        *properties,
+        "end_header",
+    ]
+    return "\n".join([*lines, ""])

@@ -1,0 +1,154 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The kernels' decorator and where it keeps machine code."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import numba
+import numpy as np
+import pytest
+
+from stereovox import _jit
+
+PACKAGE = Path(_jit.__file__).parent
+fresh_cache_folder = _jit.cache_folder.__wrapped__
+ENVIRONMENT = ("STEREOVOX_CACHE", "XDG_CACHE_HOME", "HOME")
+ASK_THE_MAP = """
+import json
+import numpy as np
+from stereovox import VoxelMap, load_config
+from stereovox._jit import cache_folder
+from stereovox.maps import _cpu
+
+voxel_map = VoxelMap.from_cells(load_config(voxel_size=1.0), [[0, 0, 0], [9, -9, 3]], [2.0, -1.0])
+stats = [kernel.stats for kernel in (_cpu.insert_all, _cpu.look_up)]
+print(json.dumps({
+    "folder": str(cache_folder()),
+    "log_odds": voxel_map.log_odds([[0.5, 0.5, 0.5], [9.5, -8.5, 3.5], [5, 5, 5]]).tolist(),
+    "hits": sum(sum(s.cache_hits.values()) for s in stats),
+    "misses": sum(sum(s.cache_misses.values()) for s in stats),
+}))
+"""
+ASK_THE_PROBE = "from stereovox._probe import f; print(f(1))"
+
+
+def run(program, **environment):
+    kept = {name: value for name, value in os.environ.items() if name not in ENVIRONMENT}
+    command = [sys.executable, "-B", "-c", program]
+    done = subprocess.run(command, env={**kept, **environment}, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)
+
+
+@pytest.fixture
+def a_file(tmp_path):
+    """Where a folder should be: nothing can be made below it, not even by root."""
+    file = tmp_path / "a_file"
+    file.touch()
+    return str(file)
+
+
+def test_a_second_process_compiles_nothing_again(tmp_path):
+    first, second = (run(ASK_THE_MAP, STEREOVOX_CACHE=str(tmp_path), HOME=str(tmp_path)) for _ in range(2))
+    assert first["log_odds"] == second["log_odds"] == [2, -1, 0]
+    assert (first["hits"], first["misses"]) == (0, 2)
+    assert (second["hits"], second["misses"]) == (2, 0)
+    assert Path(first["folder"]).is_relative_to(tmp_path)
+
+
+def test_kernels_run_where_home_cannot_be_written(tmp_path, a_file):
+    answer = run(ASK_THE_MAP, HOME=a_file, XDG_CACHE_HOME=a_file, TMPDIR=str(tmp_path))
+    assert answer["log_odds"] == [2, -1, 0]
+    assert Path(answer["folder"]).is_relative_to(tmp_path)
+
+
+def test_kernels_run_where_nothing_can_be_written(monkeypatch):
+    monkeypatch.setattr(_jit, "_writable", lambda folder: False)
+    assert fresh_cache_folder() is None
+    monkeypatch.setattr(_jit, "cache_folder", fresh_cache_folder)
+    double = _jit.kernel(lambda x: 2 * x)
+    assert double(4) == 8
+    assert double.stats.cache_path is None
+
+
+def test_the_cache_is_looked_for_in_this_order(monkeypatch, tmp_path, a_file):
+    def found():
+        return fresh_cache_folder().relative_to(tmp_path).parts[0]
+
+    for name, folder in zip(ENVIRONMENT, ("own", "xdg", "home"), strict=True):
+        monkeypatch.setenv(name, str(tmp_path / folder))
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
+    assert found() == "own"
+    monkeypatch.setenv("STEREOVOX_CACHE", a_file)
+    assert found() == "xdg"
+    monkeypatch.delenv("STEREOVOX_CACHE")
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    assert found() == "home"
+    monkeypatch.setattr(Path, "home", _no_home)
+    assert found() == "temporary"
+
+
+def _no_home():
+    raise RuntimeError("Could not determine home directory.")
+
+
+@pytest.mark.parametrize("function", [lambda x: x, "no function"])
+def test_numbas_own_setting_is_left_as_it_was(monkeypatch, function):
+    monkeypatch.setattr(numba.core.config, "CACHE_DIR", "theirs")
+    try:
+        _jit.kernel(function)
+    except Exception:
+        assert function == "no function"
+    assert numba.core.config.CACHE_DIR == "theirs"
+
+
+@pytest.fixture
+def copied_package(tmp_path):
+    copy = tmp_path / "package" / "stereovox"
+    shutil.copytree(PACKAGE, copy, ignore=shutil.ignore_patterns("__pycache__"))
+    return copy
+
+
+def test_only_kernel_files_change_the_hash(monkeypatch, copied_package):
+    here = _jit._source_hash()
+    monkeypatch.setattr(_jit, "__file__", str(copied_package / "_jit.py"))
+    assert _jit._source_hash() == here
+    for file, renews in (("mapper.py", False), ("integrate/_cells.py", True), ("maps/_cpu.py", True)):
+        before = _jit._source_hash()
+        with (copied_package / file).open("a") as opened:
+            opened.write("# a change\n")
+        assert (_jit._source_hash() != before) == renews, file
+
+
+def test_a_change_in_a_called_file_reaches_the_cached_caller(tmp_path, copied_package):
+    cells = copied_package / "_probe_cells.py"
+    cells.write_text("from stereovox._jit import cell\n\n\n@cell\ndef g(x):\n    return x + 1\n")
+    caller = "from stereovox._jit import kernel\nfrom stereovox._probe_cells import g\n\n\n"
+    (copied_package / "_probe.py").write_text(f"{caller}@kernel\ndef f(x):\n    return 10 * g(x)\n")
+    where = {"PYTHONPATH": str(copied_package.parent), "STEREOVOX_CACHE": str(tmp_path / "cache")}
+    assert run(ASK_THE_PROBE, **where) == 20
+    cells.write_text(cells.read_text().replace("x + 1", "x + 2"))
+    assert run(ASK_THE_PROBE, **where) == 30
+
+
+def test_kernels_see_nan_and_infinity():
+    """Full fast-math promises the compiler that there are none, and it then drops these tests."""
+
+    @_jit.kernel
+    def kinds(values, out):
+        for i in range(values.size):
+            out[i] = 1 if values[i] != values[i] else (2 if values[i] == np.float32(np.inf) else 0)
+
+    out = np.zeros(4, np.int32)
+    kinds(np.array([np.nan, np.inf, -np.inf, 1], np.float32), out)
+    assert out.tolist() == [1, 2, 0, 0]
+
+
+def test_a_division_by_zero_in_a_kernel_is_no_error():
+    divide = _jit.kernel(lambda a, b: a / b)
+    assert divide(np.float32(1), np.float32(0)) == np.inf

@@ -39,12 +39,12 @@ def test_the_first_file_counts_and_leaves_no_note(tmp_path):
     near, far = tmp_path / "near", tmp_path / "far"
     near.mkdir()
     far.mkdir()
-    (far / "camera-intrinsics.txt").write_text("1 0 2 0 3 4 0 0 1")
+    (far / "camera-intrinsics.txt").write_text("100 0 2 0 300 4 0 0 1")
     camera, notes = find_camera([near, far], (640, 480), 0.075, DEFAULT)
-    assert (camera.fx, camera.fy, camera.cx, camera.cy, camera.baseline) == (1, 3, 2, 4, 0.075)
+    assert (camera.fx, camera.fy, camera.cx, camera.cy, camera.baseline) == (100, 300, 2, 4, 0.075)
     assert notes == ()
-    (near / "calibration.txt").write_text("9 9 9 9")
-    assert find_camera([near, far], (640, 480), 0.075, DEFAULT)[0].fx == 9
+    (near / "calibration.txt").write_text("90 90 9 9")
+    assert find_camera([near, far], (640, 480), 0.075, DEFAULT)[0].fx == 90
 
 
 def test_without_a_file_only_640x480_has_a_default_and_the_user_is_told(tmp_path):

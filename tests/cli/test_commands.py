@@ -1,6 +1,10 @@
+# SPDX-License-Identifier: Apache-2.0
 """Every command as a user runs it: what it prints, what it leaves behind, how it fails."""
 
 import json
+import os
+import shlex
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -10,7 +14,9 @@ import pytest
 from made_recordings import write_png
 
 import stereovox as sv
+from stereovox import VoxelMap, load_config
 from stereovox.cli import COMMANDS, main
+from stereovox.mapper import Mapper
 
 
 def write_recording(folder: Path, frames: int = 6) -> Path:
@@ -45,10 +51,10 @@ def last_json(capsys):
 def fails_with_one_line(capsys, said, *words):
     assert run(*words) == 2
     captured = capsys.readouterr()
-    lines = captured.err.strip().splitlines()
-    assert lines[-1].startswith("stereovox: "), captured.err
-    assert said in lines[-1]
-    assert "Traceback" not in captured.err
+    lines = [line for line in captured.err.splitlines() if not line.startswith(("note: ", "compiling "))]
+    assert len(lines) == 1, captured.err
+    assert lines[0].startswith("stereovox: ")
+    assert said in lines[0]
     assert captured.out == ""
 
 
@@ -130,8 +136,6 @@ def test_nothing_but_bad_frames_writes_no_map(recording, tmp_path, capsys):
 
 
 def test_ctrl_c_saves_what_there_is(recording, tmp_path, capsys, monkeypatch):
-    from stereovox.mapper import Mapper
-
     add, done = Mapper.add, []
 
     def add_three(self, frame):
@@ -163,7 +167,22 @@ MISTAKES = [
     ("picks none", ["map", "{rec}", "--out", "{tmp}/m", "--frames", "90:"]),
     ("not a stereovox map", ["map", "{rec}", "--out", "{rec}"]),
     ("no map to go on with", ["map", "{rec}", "--out", "{tmp}/m", "--resume"]),
-    ("unrecognized arguments", ["map", "{rec}", "--out", "{tmp}/m", "--fast"]),
+    ("did you mean 'threads'", ["map", "{rec}", "--out", "{tmp}/m", "--thread", "2"]),
+    ("unknown option '--zebra' (known: frames", ["map", "{rec}", "--out", "{tmp}/m", "--zebra"]),
+    ("'extra' is one argument too many", ["map", "{rec}", "extra", "--out", "{tmp}/m"]),
+    ("expected one argument", ["map", "{rec}", "--out"]),
+    ("unknown option '--jsn'", ["--jsn", "info", "m"]),
+    ("a_file", ["map", "{rec}", "--out", "{tmp}/a_file/m"]),
+    ("a_file", ["demo", "--out", "{tmp}/a_file"]),
+    ("a_file", ["export", "{map}", "{tmp}/a_file/x.bt"]),
+    ("a_file", ["picture", "{map}", "{tmp}/a_file/x.png"]),
+    ("no_folder", ["export", "{map}", "{tmp}/no_folder/x.ply"]),
+    ("no_folder", ["picture", "{map}", "{tmp}/no_folder/x.png"]),
+    ("'w' is no axis", ["picture", "{map}", "{tmp}/x.png", "--up", "w"]),
+    ("greater than 0", ["demo", "--out", "{tmp}/d", "--voxel-size", "-1"]),
+    ("unknown peer 'octomp' (did you mean 'octomap'?)", ["bench", "{rec}", "--peers", "octomp"]),
+    ("greater than 0", ["bench", "{rec}", "--voxel-size", "0"]),
+    ("threads 0", ["bench", "{rec}", "--threads", "0"]),
     ("no stereovox map here", ["info", "{rec}"]),
     ("no stereovox map here", ["export", "{tmp}/gone", "{tmp}/x.bt"]),
     ("written as .png", ["picture", "{tmp}/gone", "x.jpg"]),
@@ -176,8 +195,91 @@ MISTAKES = [
     ("said", "words"), MISTAKES, ids=lambda value: " ".join(value) if isinstance(value, list) else ""
 )
 def test_mistakes_end_in_one_line(said, words, recording, tmp_path, capsys):
-    fails_with_one_line(capsys, said, *(word.format(tmp=tmp_path, rec=recording) for word in words))
+    (tmp_path / "a_file").write_text("not a folder")
+    saved = tmp_path / "saved"
+    if "{map}" in words:
+        VoxelMap.from_cells(load_config(), [[0, 0, 0]], [1.0]).save(saved)
+    fails_with_one_line(capsys, said, *(word.format(tmp=tmp_path, rec=recording, map=saved) for word in words))
     assert not (tmp_path / "m").exists()
+
+
+def test_ctrl_c_never_cuts_a_frame_in_half(recording, tmp_path, monkeypatch):
+    add = Mapper.add
+
+    def add_and_press(self, frame):
+        if self.map.frames == 2:
+            signal.raise_signal(signal.SIGINT)
+        return add(self, frame)
+
+    before = signal.getsignal(signal.SIGINT)
+    monkeypatch.setattr(Mapper, "add", add_and_press)
+    assert run("map", recording, "--out", tmp_path / "m", "--voxel-size", 0.1) == 130
+    assert signal.getsignal(signal.SIGINT) is before
+    monkeypatch.undo()
+    assert run("map", recording, "--out", tmp_path / "three", "--voxel-size", 0.1, "--frames", ":3") == 0
+    stopped, three = sv.load_map(tmp_path / "m"), sv.load_map(tmp_path / "three")
+    assert stopped.frames == 3
+    assert all((a == b).all() for a, b in zip(stopped.blocks(), three.blocks(), strict=True))
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [(PermissionError(13, "Permission denied", "/a/b"), "/a/b: Permission denied"), (MemoryError(), "larger cells")],
+)
+def test_what_no_command_foresaw_is_one_line_too(error, said, recording, tmp_path, capsys, monkeypatch):
+    def fail(*_):
+        raise error
+
+    monkeypatch.setattr("stereovox.sources.open_source", fail)
+    fails_with_one_line(capsys, said, "map", recording, "--out", tmp_path / "m")
+
+
+@pytest.mark.parametrize("name", ["price $x^b$ _{", "größe"])
+def test_any_name_can_be_drawn_and_told(name, recording, tmp_path, capsys):
+    assert run("map", recording, "--out", tmp_path / name, "--voxel-size", 0.1) == 0
+    capsys.readouterr()
+    no_letter = os.fsdecode(b"\xff")
+    assert run("picture", tmp_path / name, tmp_path / "p.png", "--title", f"$\\frac $ {no_letter}", "--json") == 0
+    assert run("picture", tmp_path / name, tmp_path / "p.png", "--json") == 0
+    assert last_json(capsys) == {"picture": str(tmp_path / "p.png")}
+
+
+def test_the_next_command_can_be_copied(recording, tmp_path, capsys):
+    assert run("map", recording, "--out", tmp_path / "it's a map.svox", "--voxel-size", 0.1) == 0
+    offered = capsys.readouterr().err.splitlines()[-1].partition("with: stereovox ")[2]
+    command, path, picture = shlex.split(offered)
+    assert (command, path, picture) == ("picture", str(tmp_path / "it's a map.svox"), "it's a map.png")
+
+
+def test_a_full_or_closed_output_is_no_traceback(recording, tmp_path):
+    VoxelMap.from_cells(load_config(), [[0, 0, 0]], [1.0]).save(tmp_path / "m")
+    command = f"'{sys.executable}' -m stereovox info '{tmp_path / 'm'}' --json"
+    full = subprocess.run(["bash", "-c", f"{command} > /dev/full"], capture_output=True, text=True, check=False)
+    assert (full.returncode, full.stderr.splitlines()[-1][:11]) == (2, "stereovox: ")
+    closed = subprocess.run(
+        ["bash", "-c", f"set -o pipefail; {command} | true"], capture_output=True, text=True, check=False
+    )
+    assert closed.returncode == 0
+    assert "Traceback" not in full.stderr + closed.stderr
+    assert "Exception" not in full.stderr + closed.stderr
+
+
+def test_bench_prints_rows_and_ratios(recording, capsys):
+    sizes = ["--voxel-size", 0.2, "--voxel-size", 0.1]
+    assert run("bench", recording, *sizes, "--peers", "octomap, pyoctomap", "--frames", ":3", "--json") == 0
+    told = last_json(capsys)
+    assert [(row["library"], row["voxel_size"]) for row in told["rows"]] == [
+        (library, size) for size in (0.2, 0.1) for library in ("stereovox", "octomap", "pyoctomap")
+    ]
+    for row in told["rows"]:
+        assert row["threads"] == 1
+        assert row["integrate_ms_median"] > 0
+        assert row["occupied"] > 0
+        assert row["free"] > 0
+        assert row["map_bytes"] > 0
+    assert {size: set(peers) for size, peers in told["ratio"].items()} == {
+        size: {"octomap", "pyoctomap"} for size in ("0.2", "0.1")
+    }
 
 
 def test_a_broken_map_file_ends_in_one_line(recording, tmp_path, capsys):

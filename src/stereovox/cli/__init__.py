@@ -64,21 +64,18 @@ class _Parser(argparse.ArgumentParser):
         super().__init__(**settings, allow_abbrev=False)
 
     def add_argument(self, *names: Any, **settings: Any) -> argparse.Action:
-        self.options += [name for name in names if name.startswith("--")]
+        self.options += [name.removeprefix("--") for name in names if name.startswith("--")]
         return super().add_argument(*names, **settings)
 
     def error(self, message: str) -> NoReturn:
         raise StereovoxError(f"{message}; see: {self.prog} --help")
 
-    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """Refuse what is left over where it is still known which command it was meant for."""
-        found, left = super().parse_known_args(args, namespace)
-        if left:
-            option = left[0].partition("=")[0]
-            if option.startswith("-"):
-                self.error(f"unknown option '{option}'{did_you_mean(option, self.options)}")
-            self.error(f"'{left[0]}' is one argument too many")
-        return found, left
+    def refuse(self, word: str) -> NoReturn:
+        """Say what is wrong with a word that is left over."""
+        option = word.partition("=")[0]
+        if option.startswith("-"):
+            self.error(f"unknown option '{option}'{did_you_mean(option.strip('-'), self.options)}")
+        self.error(f"'{word}' is one argument too many")
 
 
 def _parse(words: Sequence[str]) -> argparse.Namespace:
@@ -93,7 +90,10 @@ def _parse(words: Sequence[str]) -> argparse.Namespace:
         )
         module.add_arguments(command)
         command.add_argument("--json", action="store_true", help="print one JSON object as the last line of stdout")
-    return parser.parse_args(words)
+    arguments, left = parser.parse_known_args(words)
+    if left:
+        commands.choices[arguments.command].refuse(left[0])
+    return arguments
 
 
 def _check_command(words: Sequence[str]) -> None:

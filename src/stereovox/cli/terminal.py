@@ -35,12 +35,14 @@ def say_about_compiling() -> None:
 
 @contextmanager
 def progress_bar() -> Iterator[Progress]:
-    """Give a progress bar with rate and time left that lives on stderr and goes away at the end."""
+    """Give a progress bar with rate and time left on stderr, if that is a terminal; it goes away at the end."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+    console = Console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[note]}"))
-    with Progress(*columns, TimeRemainingColumn(), console=Console(stderr=True), transient=True) as bar:
+    hidden = not console.is_terminal  # a log has no use for it
+    with Progress(*columns, TimeRemainingColumn(), console=console, transient=True, disable=hidden) as bar:
         yield bar
 
 

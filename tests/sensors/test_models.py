@@ -132,3 +132,27 @@ def test_bad_settings_end_in_one_line(name, parameters, said):
     with pytest.raises(ConfigError, match=said) as caught:
         model_of(name, **parameters)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("p_far_before", "p_far_behind", "said"),
+    [
+        (0.4, 0.5, None),
+        (0.45, 0.5, "must be p_free"),
+        (0.4, 0.6, "must be p_unknown"),
+        (0.0, 0.5, "p_free"),
+        (0.4, np.nan, "p_unknown"),
+    ],
+)
+def test_models_that_break_the_contract_are_refused(p_far_before, p_far_behind, said):
+    class Broken:
+        p_free, p_unknown = 0.4, 0.5
+
+        def probability(self, z, z_measured, sigma):
+            return np.where(z < z_measured, p_far_before, np.where(z > z_measured, p_far_behind, 0.7)) + 0 * sigma
+
+    if said is None:
+        tabulate(Broken(), RangeNoise(0.01, 0, 0), 5.0)
+        return
+    with pytest.raises(ConfigError, match=said):
+        tabulate(Broken(), RangeNoise(0.01, 0, 0), 5.0)

@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from stereovox.errors import ConfigError
 from stereovox.sensors.noise import RangeNoise
 
 Array = NDArray[np.float64]
@@ -19,6 +20,9 @@ COLUMNS = 128
 """Table columns: distances from the measurement. Even, so that no column stands exactly on the measurement."""
 REACH_SIGMA = 4.0
 """The table ends this many sigma before and behind the measurement; beyond it the model is p_free or p_unknown."""
+
+END_TOLERANCE = 0.02
+"""How far a model may still be from p_free and p_unknown at the ends of the table."""
 
 
 class InverseSensorModel(Protocol):
@@ -64,12 +68,14 @@ def tabulate(model: InverseSensorModel, noise: RangeNoise, max_range: float) -> 
     """Return `model` as a table for measured depths up to `max_range` metres.
 
     Evidence is log(p / (1 - p)) less that of p_unknown (Valenti 2018, Eq 6.2: the prior is not counted twice).
-    Raises ValueError when the model leaves (0, 1).
+    Raises ConfigError when the model leaves (0, 1), or has not reached p_free and p_unknown at the table's ends.
     """
     z_measured: Array = (np.arange(ROWS, dtype=float) + 0.5) * (max_range / ROWS)
     sigma = np.maximum(noise.sigma(z_measured), 1e-6)
     z = z_measured[:, None] + offset_sigma() * sigma[:, None]
-    log_odds = _log_odds(model, model.probability(z, z_measured[:, None], sigma[:, None]))
+    p = model.probability(z, z_measured[:, None], sigma[:, None])
+    _check_ends(model, p)
+    log_odds = _log_odds(model, p)
     hit = _log_odds(model, model.probability(z_measured, z_measured, sigma))
     return SensorTable(log_odds, hit, sigma, ROWS / max_range)
 
@@ -79,7 +85,15 @@ def offset_sigma() -> Array:
     return ((np.arange(COLUMNS, dtype=float) + 0.5) / COLUMNS * 2 - 1) * REACH_SIGMA
 
 
+def _check_ends(model: InverseSensorModel, p: Array) -> None:
+    for name, end, wanted in (("p_free", p[:, 0], model.p_free), ("p_unknown", p[:, -1], model.p_unknown)):
+        worst = end[np.argmax(np.abs(end - wanted))]
+        if not abs(worst - wanted) <= END_TOLERANCE:
+            where = f"{REACH_SIGMA:g} sigma {'before' if name == 'p_free' else 'behind'} a measurement"
+            raise ConfigError(f"sensor model {type(model).__name__}: says {worst:.3g} {where}, must be {name} {wanted}")
+
+
 def _log_odds(model: InverseSensorModel, p: Array) -> Array:
     if not ((p > 0) & (p < 1)).all():
-        raise ValueError(f"{type(model).__name__}.probability must stay strictly inside (0, 1)")
+        raise ConfigError(f"sensor model {type(model).__name__}: probability must stay strictly inside (0, 1)")
     return np.log(p / (1 - p)) - np.log(model.p_unknown / (1 - model.p_unknown))

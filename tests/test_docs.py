@@ -1,3 +1,4 @@
+# SPDX-License-Identifier: Apache-2.0
 """Every Python example in README.md, CONTRIBUTING.md and docs/ runs as it is printed."""
 
 import re

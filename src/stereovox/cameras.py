@@ -37,7 +37,7 @@ class PinholeCamera:
     baseline: float | None = None
 
     def __post_init__(self) -> None:
-        numbers = (self.width, self.height, self.fx, self.fy, self.baseline or 1.0)
+        numbers = (self.width, self.height, self.fx, self.fy, 1.0 if self.baseline is None else self.baseline)
         if not (all(math.isfinite(n) and n > 0 for n in numbers) and math.isfinite(self.cx) and math.isfinite(self.cy)):
             raise StereovoxError(f"camera {self}: sizes, focal lengths and baseline must be positive and finite")
         across = max(abs(self.cx), abs(self.width - 1 - self.cx)) / self.fx
@@ -52,7 +52,12 @@ class PinholeCamera:
     def from_field_of_view(
         cls, width: int, height: int, hfov_deg: float, baseline: float | None = None
     ) -> PinholeCamera:
-        """Return a camera with square pixels and a centred axis (Chien 2020, Eq 3.6)."""
+        """Return a camera with square pixels and a centred axis (Chien 2020, Eq 3.6).
+
+        Raises StereovoxError for angles outside (0, 180) degrees.
+        """
+        if not 0 < hfov_deg < 180:
+            raise StereovoxError(f"camera: field of view {hfov_deg} deg must lie between 0 and 180")
         focal = 0.5 * width / math.tan(math.radians(hfov_deg) / 2)
         return cls(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2, baseline)
 

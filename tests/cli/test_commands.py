@@ -158,6 +158,7 @@ MISTAKES = [
     ("not a recording", ["map", "{tmp}", "--out", "{tmp}/m"]),
     ("did you mean 'voxel_size'", ["map", "{rec}", "--out", "{tmp}/m", "--set", "voxel_sise=1"]),
     ("write KEY=VALUE", ["map", "{rec}", "--out", "{tmp}/m", "--set", "voxel_size"]),
+    ("use --profile", ["map", "{rec}", "--out", "{tmp}/m", "--set", "profile=x"]),
     ("greater than 0", ["map", "{rec}", "--out", "{tmp}/m", "--voxel-size", "-1"]),
     ("invalid float", ["map", "{rec}", "--out", "{tmp}/m", "--voxel-size", "small"]),
     ("did you mean 'projective'", ["map", "{rec}", "--out", "{tmp}/m", "--integrator", "projectiv"]),
@@ -203,6 +204,15 @@ def test_mistakes_end_in_one_line(said, words, recording, tmp_path, capsys):
     assert not (tmp_path / "m").exists()
 
 
+@pytest.fixture
+def obeys_ctrl_c():
+    """A process that was started in the background ignores Ctrl-C, and so would its tests."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("obeys_ctrl_c")
 def test_ctrl_c_never_cuts_a_frame_in_half(recording, tmp_path, monkeypatch):
     add = Mapper.add
 
@@ -211,10 +221,9 @@ def test_ctrl_c_never_cuts_a_frame_in_half(recording, tmp_path, monkeypatch):
             signal.raise_signal(signal.SIGINT)
         return add(self, frame)
 
-    before = signal.getsignal(signal.SIGINT)
     monkeypatch.setattr(Mapper, "add", add_and_press)
     assert run("map", recording, "--out", tmp_path / "m", "--voxel-size", 0.1) == 130
-    assert signal.getsignal(signal.SIGINT) is before
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     monkeypatch.undo()
     assert run("map", recording, "--out", tmp_path / "three", "--voxel-size", 0.1, "--frames", ":3") == 0
     stopped, three = sv.load_map(tmp_path / "m"), sv.load_map(tmp_path / "three")

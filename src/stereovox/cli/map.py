@@ -100,6 +100,8 @@ def _overrides(arguments: Namespace) -> dict[str, Any]:
         key, equals, value = setting.partition("=")
         if not equals or not key:
             raise StereovoxError(f"--set {setting}: write KEY=VALUE, for example --set sensor.p_hit=0.8")
+        if key.strip() in ("profile", "resume"):
+            raise StereovoxError(f"--set {setting}: this is no setting; use --{key.strip()}")
         overrides[key.strip()] = parse_value(value.strip())
     named = {name: getattr(arguments, name) for name in ("voxel_size", "integrator", "max_range", "threads")}
     return {**overrides, **{name: value for name, value in named.items() if value is not None}}

@@ -105,7 +105,7 @@ def test_resume_equals_one_run(recording, tmp_path, capsys):
     bad.write_text("nan " * 16)
     assert run("map", recording, "--out", tmp_path / "whole", "--voxel-size", 0.1) == 0
     assert run("map", recording, "--out", tmp_path / "parts", "--voxel-size", 0.1, "--frames", ":3") == 0
-    assert run("map", recording, "--out", tmp_path / "parts", "--voxel-size", 0.1, "--resume", "--json") == 0
+    assert run("map", recording, "--out", tmp_path / "parts", "--resume", "--json") == 0
     assert last_json(capsys)["frames"] == 3
     whole, parts = sv.load_map(tmp_path / "whole"), sv.load_map(tmp_path / "parts")
     assert all((a == b).all() for a, b in zip(whole.blocks(), parts.blocks(), strict=True))
@@ -113,7 +113,8 @@ def test_resume_equals_one_run(recording, tmp_path, capsys):
     fails_with_one_line(
         capsys, "already holds all", "map", recording, "--out", tmp_path / "parts", "--voxel-size", 0.1, "--resume"
     )
-    fails_with_one_line(capsys, "voxel_size 0.1", "map", recording, "--out", tmp_path / "parts", "--resume")
+    other_size = ["--resume", "--voxel-size", 0.2]
+    fails_with_one_line(capsys, "voxel_size 0.1", "map", recording, "--out", tmp_path / "parts", *other_size)
 
 
 def test_bad_frames_are_counted_by_reason(recording, tmp_path, capsys):

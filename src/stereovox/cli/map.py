@@ -32,7 +32,9 @@ def add_arguments(parser: ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("source", metavar="SOURCE", help="folder of a recording, or sim:room")
     parser.add_argument("--out", required=True, metavar="MAP", help="folder of the map to write, for example room.svox")
-    parser.add_argument("--profile", default="default", metavar="P", help="profile name or TOML file (%(default)s)")
+    parser.add_argument(
+        "--profile", metavar="P", help="profile name or TOML file (default; with --resume the map's own settings)"
+    )
     parser.add_argument("--voxel-size", type=float, metavar="M", help="cell size in metres")
     parser.add_argument("--integrator", metavar="NAME", help="projective (default) or ray")
     parser.add_argument("--max-range", type=float, metavar="M", help="depth in metres up to which pixels count")
@@ -49,7 +51,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--resume",
         action="store_true",
-        help="go on with the map at --out: as many frames of SOURCE are skipped as it has seen",
+        help="go on with the map at --out; as many frames of SOURCE are skipped as it has seen",
     )
 
 
@@ -89,7 +91,11 @@ def _mapper(arguments: Namespace, out: Path) -> Mapper:
     from stereovox.mapper import Mapper
     from stereovox.maps import load_map
 
-    return Mapper(arguments.profile, resume=load_map(out) if arguments.resume else None, **_overrides(arguments))
+    saved = load_map(out) if arguments.resume else None
+    settings = arguments.profile
+    if settings is None:
+        settings = saved.config if saved else "default"
+    return Mapper(settings, resume=saved, **_overrides(arguments))
 
 
 def _overrides(arguments: Namespace) -> dict[str, Any]:

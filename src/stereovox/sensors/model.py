@@ -21,8 +21,10 @@ COLUMNS = 128
 REACH_SIGMA = 4.0
 """The table ends this many sigma before and behind the measurement; beyond it the model is p_free or p_unknown."""
 
+FAR_SIGMA = 12.0
+"""So far from a measurement a model must have come to p_free and p_unknown."""
 END_TOLERANCE = 0.02
-"""How far a model may still be from p_free and p_unknown at the ends of the table."""
+"""How far it may still be from them there."""
 
 
 class InverseSensorModel(Protocol):
@@ -68,14 +70,13 @@ def tabulate(model: InverseSensorModel, noise: RangeNoise, max_range: float) -> 
     """Return `model` as a table for measured depths up to `max_range` metres.
 
     Evidence is log(p / (1 - p)) less that of p_unknown (Valenti 2018, Eq 6.2: the prior is not counted twice).
-    Raises ConfigError when the model leaves (0, 1), or has not reached p_free and p_unknown at the table's ends.
+    Raises ConfigError when the model leaves (0, 1), or does not come to p_free and p_unknown far off.
     """
     z_measured: Array = (np.arange(ROWS, dtype=float) + 0.5) * (max_range / ROWS)
     sigma = np.maximum(noise.sigma(z_measured), 1e-6)
     z = z_measured[:, None] + offset_sigma() * sigma[:, None]
-    p = model.probability(z, z_measured[:, None], sigma[:, None])
-    _check_ends(model, p)
-    log_odds = _log_odds(model, p)
+    _check_ends(model, z_measured, sigma)
+    log_odds = _log_odds(model, model.probability(z, z_measured[:, None], sigma[:, None]))
     hit = _log_odds(model, model.probability(z_measured, z_measured, sigma))
     return SensorTable(log_odds, hit, sigma, ROWS / max_range)
 
@@ -85,11 +86,12 @@ def offset_sigma() -> Array:
     return ((np.arange(COLUMNS, dtype=float) + 0.5) / COLUMNS * 2 - 1) * REACH_SIGMA
 
 
-def _check_ends(model: InverseSensorModel, p: Array) -> None:
-    for name, end, wanted in (("p_free", p[:, 0], model.p_free), ("p_unknown", p[:, -1], model.p_unknown)):
-        worst = end[np.argmax(np.abs(end - wanted))]
+def _check_ends(model: InverseSensorModel, z_measured: Array, sigma: Array) -> None:
+    for name, side, wanted in (("p_free", -1, model.p_free), ("p_unknown", 1, model.p_unknown)):
+        p = model.probability(z_measured + side * FAR_SIGMA * sigma, z_measured, sigma)
+        worst = p[np.argmax(np.abs(p - wanted))]
         if not abs(worst - wanted) <= END_TOLERANCE:
-            where = f"{REACH_SIGMA:g} sigma {'before' if name == 'p_free' else 'behind'} a measurement"
+            where = f"{FAR_SIGMA:g} sigma {'before' if side < 0 else 'behind'} a measurement"
             raise ConfigError(f"sensor model {type(model).__name__}: says {worst:.3g} {where}, must be {name} {wanted}")
 
 

@@ -117,6 +117,15 @@ def test_resume_equals_one_run(recording, tmp_path, capsys):
     fails_with_one_line(capsys, "voxel_size 0.1", "map", recording, "--out", tmp_path / "parts", *other_size)
 
 
+def test_resume_with_another_recording_is_refused(recording, tmp_path, capsys):
+    other = write_recording(tmp_path / "another")
+    out = tmp_path / "m"
+    assert run("map", recording, "--out", out, "--voxel-size", 0.1, "--frames", ":3") == 0
+    capsys.readouterr()
+    fails_with_one_line(capsys, "'my recording', not of 'another'", "map", other, "--out", out, "--resume")
+    assert sv.load_map(out).frames == 3
+
+
 def test_bad_frames_are_counted_by_reason(recording, tmp_path, capsys):
     image = recording / "frame-000002.depth.png"
     image.write_bytes(image.read_bytes()[:100])

@@ -64,6 +64,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
     _check_target(out, arguments.resume)
     source = open_source(arguments.source, arguments.frames)
     mapper = _mapper(arguments, out)
+    _check_recording(mapper, source, out)
     for note in source.notes:
         say(f"note: {note}")
     say_about_compiling()
@@ -96,6 +97,16 @@ def _mapper(arguments: Namespace, out: Path) -> Mapper:
     if settings is None:
         settings = saved.config if saved else "default"
     return Mapper(settings, resume=saved, **_overrides(arguments))
+
+
+def _check_recording(mapper: Mapper, source: Source, out: Path) -> None:
+    """Frames are counted, not recognised: going on with another recording would skip its first ones."""
+    made_of = mapper.map.recording
+    if made_of and made_of != source.name:
+        raise StereovoxError(
+            f"{out}: was made of '{made_of}', not of '{source.name}'; go on with that or leave --resume out"
+        )
+    mapper.map.recording = source.name
 
 
 def _overrides(arguments: Namespace) -> dict[str, Any]:

@@ -68,6 +68,7 @@ def load_map(path: str | Path) -> VoxelMap:
     try:
         voxel_map = VoxelMap(load_config(manifest["config"]))
         voxel_map.frames, voxel_map.frames_refused = int(manifest["frames"]), int(manifest["frames_refused"])
+        voxel_map.recording = str(manifest["recording"])
         coords, cells = _read_arrays(folder / str(manifest["data"]), int(manifest["blocks"]))
         if _checksum(coords, cells) != manifest["checksum"]:
             raise ValueError("the cells do not match their checksum")
@@ -111,6 +112,7 @@ def _manifest(voxel_map: VoxelMap, data: str, blocks: int, checksum: int) -> dic
         "version": VERSION,
         "frames": voxel_map.frames,
         "frames_refused": voxel_map.frames_refused,
+        "recording": voxel_map.recording,
         "blocks": blocks,
         "data": data,
         "checksum": checksum,

@@ -34,7 +34,7 @@ class VoxelMap:
     Cell i covers [i, i + 1) * voxel_size on each axis. A cell without evidence is unknown: log-odds 0, probability
     0.5. With evidence it is free (p < free_below), occupied (p > occupied_above) or tentative between them.
     `config` holds the settings the map was made with, `frames` the number of frames that are in it, `frames_refused`
-    the number that were offered and refused.
+    the number that were offered and refused, `recording` the name of what they came from, if known.
     """
 
     def __init__(self, config: Config):
@@ -42,6 +42,7 @@ class VoxelMap:
         self.voxel_size = config.voxel_size
         self.frames = 0
         self.frames_refused = 0
+        self.recording = ""
         self._pool = BlockPool(np.int16)
         self._at_floor = np.zeros(self._pool.coords.shape[0], np.uint8)
         self._lowest, self._highest = (

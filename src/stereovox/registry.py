@@ -23,7 +23,7 @@ def find(room: str, builtin: Mapping[str, str], name: str) -> Any:
     others = {entry.name: entry for entry in entry_points(group=f"stereovox.{room}")}
     if name in others:
         return others[name].load()
-    raise ConfigError(f"unknown {room} '{name}'{did_you_mean(name, [*builtin, *others])}")
+    raise ConfigError(f"unknown {room.removesuffix('s')} '{name}'{did_you_mean(name, [*builtin, *others])}")
 
 
 def names(room: str, builtin: Mapping[str, str]) -> list[str]:

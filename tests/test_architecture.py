@@ -12,7 +12,7 @@ SOURCE = Path(__file__).resolve().parents[1] / "src/stereovox"
 LAYERS = (
     {"errors", "registry", "frame", "geometry", "cameras", "config", "_jit"},
     {"sources", "depth", "sensors", "maps"},
-    {"integrate", "products", "localize"},
+    {"integrate", "products", "localize", "calibrate"},
     {"mapper", "evaluate", "view"},
     {"batch", "cli", "ros", "__main__"},
 )
@@ -25,9 +25,13 @@ HOMES = {
     "octomap": r"evaluate/.*",
     "pydantic": r"config\.py",
     "pyoctomap": r"evaluate/.*",
+    "pyrealsense2": r"sources/.*",
     "rich": r"cli/.*",
+    "rosbags": r"sources/.*",
+    "small_gicp": r"calibrate/.*",
     "trimesh": r"sources/.*",
     "typer": r"cli/.*",
+    "viser": r"view/.*",
     "zarr": r"maps/.*",
 }
 NAMED_CLASS = re.compile(r"(stereovox(?:\.\w+)+):\w+")

@@ -7,12 +7,23 @@ Optical frame: x right, y down, z forward. Pixel centres stand at whole numbers.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.errors import StereovoxError
+
+@dataclass(frozen=True)
+class DepthCorrection:
+    """What a depth camera measures wrongly, as found on flat walls (`stereovox calibrate wall`; Chien 2020, App. A).
+
+    model: how `coefficients` are to be read; see `depth/correct.py`.
+    """
+
+    model: str
+    coefficients: tuple[float, ...]
+
 
 STEEPEST = 20.0
 """Largest x/z or y/z of a pinhole camera's rays: 87 degrees off the axis."""
@@ -23,7 +34,8 @@ class PinholeCamera:
     """An undistorted pinhole camera.
 
     `fx, fy, cx, cy` are in pixels; pixel (u, v) has its centre at (u, v). `baseline` is the distance in metres
-    between the two eyes (or projector and eye) of a stereo depth camera, None when not known.
+    between the two eyes (or projector and eye) of a stereo depth camera, None when not known. `binning` sensor pixels
+    along each side make one pixel (see `binned`); `correction` is what its depth is to be corrected by.
     Raises StereovoxError for sizes or focal lengths that are not positive and finite, and for rays that leave the axis
     by more than 87 degrees.
     """
@@ -35,6 +47,8 @@ class PinholeCamera:
     cx: float
     cy: float
     baseline: float | None = None
+    binning: int = 1
+    correction: DepthCorrection | None = None
 
     def __post_init__(self) -> None:
         numbers = (self.width, self.height, self.fx, self.fy, 1.0 if self.baseline is None else self.baseline)
@@ -60,6 +74,20 @@ class PinholeCamera:
             raise StereovoxError(f"camera: field of view {hfov_deg} deg must lie between 0 and 180")
         focal = 0.5 * width / math.tan(math.radians(hfov_deg) / 2)
         return cls(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2, baseline)
+
+    def binned(self, n: int) -> PinholeCamera:
+        """Return the camera whose pixels are blocks of n by n of this one's; blocks at the far borders may be cut."""
+        middle = (n - 1) / 2
+        return replace(
+            self,
+            width=-(-self.width // n),
+            height=-(-self.height // n),
+            fx=self.fx / n,
+            fy=self.fy / n,
+            cx=(self.cx - middle) / n,
+            cy=(self.cy - middle) / n,
+            binning=self.binning * n,
+        )
 
     def ray_slopes(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Return x/z of every column (width,) and y/z of every row (height,), float32."""

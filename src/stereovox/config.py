@@ -56,9 +56,40 @@ class RayConfig(_Section):
     update: Literal["every", "once"] = "every"
 
 
-class MapConfig(_Section):
-    """Clamping range of a cell's log-odds, and the probabilities that tell the states apart."""
+class DepthConfig(_Section):
+    """What happens to a depth image before it becomes evidence.
 
+    downsample: n by n pixels become one that holds the smallest valid depth of its block (Chien 2020, 3.2); 1: none.
+    """
+
+    downsample: int = Field(1, ge=1, le=64)
+
+
+class WindowConfig(_Section):
+    """A box that moves with the camera by whole cells and bounds the map's memory (Chien 2020, 3.6).
+
+    size: extents along the world's axes in metres; without them the map is unbounded and the rest has no meaning.
+    trigger: half width in metres of the box round the window's centre in which the camera moves freely.
+    lead_s: the centre runs ahead of the camera by so many seconds of its flight.
+    grow_s: the window is longer by so many seconds of flight along each axis, up to `largest`.
+    outside: cells that leave are lost (`drop`), or kept in tiles on disk and restored when they return (`keep`).
+    """
+
+    size: tuple[float, float, float] | None = None
+    largest: tuple[float, float, float] | None = None
+    trigger: float = Field(1.0, ge=0)
+    lead_s: float = Field(0.0, ge=0, le=10)
+    grow_s: float = Field(0.0, ge=0, le=10)
+    outside: Literal["drop", "keep"] = "drop"
+
+
+class MapConfig(_Section):
+    """What a cell is kept in, the range of its log-odds, and the probabilities that tell the states apart.
+
+    cell: `int16` holds thousandths of log-odds; `uint8` is Chien's byte (2020, 3.5): 127 unknown, 0 free, 255 occupied.
+    """
+
+    cell: Literal["int16", "uint8"] = "int16"
     log_odds_min: float = Field(-2.0, lt=0, ge=-30)
     log_odds_max: float = Field(3.5, gt=0, le=30)
     free_below: float = Field(0.3, gt=0, lt=1)
@@ -83,7 +114,9 @@ class Config(_Section):
     pose_rigidity_tolerance: float = Field(5e-3, gt=0, le=0.1)
     sensor: SensorConfig = Field(default_factory=SensorConfig)
     noise: NoiseConfig = Field(default_factory=lambda: NoiseConfig.model_validate({}))
+    depth: DepthConfig = Field(default_factory=lambda: DepthConfig.model_validate({}))
     map: MapConfig = Field(default_factory=lambda: MapConfig.model_validate({}))
+    window: WindowConfig = Field(default_factory=lambda: WindowConfig.model_validate({}))
     ray: RayConfig = Field(default_factory=RayConfig)
 
     @model_validator(mode="after")

@@ -32,5 +32,6 @@ class RangeNoise:
         s2 = subpixel / (focal_px * baseline): Chien 2020, Eq 3.5 with the square that print lacks (Alg 3 has it).
         """
         baseline = camera.baseline or config.default_baseline
-        s2 = config.subpixel / (camera.fx * baseline) if config.s2 is None else config.s2
+        focal_px = camera.fx * camera.binning  # disparity is measured in the sensor's own pixels
+        s2 = config.subpixel / (focal_px * baseline) if config.s2 is None else config.s2
         return cls(config.s0, config.s1, s2)

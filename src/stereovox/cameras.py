@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from stereovox.errors import StereovoxError
 
+
 @dataclass(frozen=True)
 class DepthCorrection:
     """What a depth camera measures wrongly, as found on flat walls (`stereovox calibrate wall`; Chien 2020, App. A).

@@ -82,6 +82,16 @@ class WindowConfig(_Section):
     grow_s: float = Field(0.0, ge=0, le=10)
     outside: Literal["drop", "keep"] = "drop"
 
+    @model_validator(mode="after")
+    def _fitting(self) -> WindowConfig:
+        if self.size is None:
+            return self
+        if min(self.size) <= 0 or any(b < a for a, b in zip(self.size, self.largest or self.size, strict=True)):
+            raise ValueError("size must be positive, and largest no smaller than size")
+        if 2 * self.trigger >= min(self.size):
+            raise ValueError(f"trigger {self.trigger} must be less than half of the smallest size")
+        return self
+
 
 class MapConfig(_Section):
     """What a cell is kept in, the range of its log-odds, and the probabilities that tell the states apart.
@@ -103,12 +113,16 @@ class MapConfig(_Section):
 
 
 class Config(_Section):
-    """Every setting of a run; the resolved one is saved inside the map."""
+    """Every setting of a run; the resolved one is saved inside the map.
+
+    up: which axis of the world points up (`z`, `-y`, ...): pictures and heights follow it.
+    """
 
     profile: str = "default"
     voxel_size: float = Field(0.05, gt=0, le=100)
     min_range: float = Field(0.1, ge=0)
     max_range: float = Field(5.0, gt=0, le=1000)
+    up: str = Field("z", pattern="^[+-]?[xyz]$")
     integrator: str = "projective"
     threads: int = Field(1, ge=1, le=256)
     pose_rigidity_tolerance: float = Field(5e-3, gt=0, le=0.1)

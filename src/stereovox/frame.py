@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +22,14 @@ class Reason(IntEnum):
     TOO_NEAR = 2
     TOO_FAR = 3
     MASKED = 4
+
+
+class Viewpoint(NamedTuple):
+    """Where a camera stood: T_world_camera (4, 4) maps its optical frame into the world; time in nanoseconds."""
+
+    camera: PinholeCamera
+    T_world_camera: Transform
+    stamp_ns: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,3 +74,8 @@ class DepthImage:
     camera: PinholeCamera
     T_world_sensor: Transform
     stamp_ns: int = 0
+
+    @property
+    def viewpoint(self) -> Viewpoint:
+        """Where the camera stood."""
+        return Viewpoint(self.camera, self.T_world_sensor, self.stamp_ns)

@@ -13,7 +13,7 @@ from stereovox.depth import prepare
 from stereovox.errors import FrameRefused
 from stereovox.frame import Frame
 from stereovox.integrate import make_integrator
-from stereovox.maps import VoxelMap
+from stereovox.maps import VoxelMap, make_map
 
 
 @dataclass(frozen=True)
@@ -31,12 +31,20 @@ class Mapper:
     """Builds a map from frames. A frame that cannot be trusted is refused and changes nothing.
 
     Give a profile name, a TOML file or a Config; settings by name on top (`voxel_size=0.1`, `**{"sensor.p_hit": 0.8}`).
-    `resume` is a map to go on with; what its cells mean must not change. Raises ConfigError for bad settings.
+    `resume` is a map to go on with; what its cells mean must not change. `tiles` is the folder for cells that leave a
+    window (`window.outside = "keep"`). Raises ConfigError for bad settings.
     """
 
-    def __init__(self, profile: str | Path | Config = "default", *, resume: VoxelMap | None = None, **overrides: Any):
+    def __init__(
+        self,
+        profile: str | Path | Config = "default",
+        *,
+        resume: VoxelMap | None = None,
+        tiles: Path | None = None,
+        **overrides: Any,
+    ):
         self.config = load_config(profile, **overrides)
-        self.map = VoxelMap(self.config) if resume is None else resume.with_config(self.config)
+        self.map = make_map(self.config, resume, tiles)
         self._integrator = make_integrator(self.config)
 
     def add(self, frame: Frame) -> UpdateReport:
@@ -48,6 +56,7 @@ class Mapper:
             self.map.frames_refused += 1
             return UpdateReport(refused=refused.reason, detail=str(refused))
         prepared = perf_counter()
+        self.map.look_from(image.viewpoint)
         evidence = self._integrator.evidence(image)
         cells = self.map.add(evidence)
         self.map.frames += 1

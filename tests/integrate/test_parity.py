@@ -51,19 +51,21 @@ def test_projective_equals_its_reference(model, voxel_size):
 @pytest.mark.parametrize("model", SENSORS)
 @pytest.mark.parametrize("voxel_size", SIZES)
 @pytest.mark.parametrize("update", ["once", "every"])
-def test_ray_equals_its_reference(model, voxel_size, update):
+@pytest.mark.parametrize("integrator", ["ray", "line"])
+def test_ray_and_line_equal_their_references(integrator, model, voxel_size, update):
     config = load_config(
-        voxel_size=voxel_size, max_range=2.5, integrator="ray", **{"sensor.model": model, "ray.update": update}
+        voxel_size=voxel_size, max_range=2.5, integrator=integrator, **{"sensor.model": model, "ray.update": update}
     )
     image = made_image(5)
     ours = cells_of(make_integrator(config).evidence(image))
-    theirs = reference_of(_reference.cast_rays, image, config)
+    reference = {"ray": _reference.cast_rays, "line": _reference.draw_lines}[integrator]
+    theirs = reference_of(reference, image, config)
     assert len(theirs) > 60
     assert share_that_differs(ours, theirs, tolerance=25) < 0.002
     assert share_that_differs(ours, theirs, tolerance=2) < 0.02
 
 
-@pytest.mark.parametrize("integrator", ["projective", "ray"])
+@pytest.mark.parametrize("integrator", ["projective", "ray", "line"])
 @pytest.mark.parametrize("model", ["stereo", "andert"])
 def test_threads_change_nothing(integrator, model):
     images = [made_image(seed) for seed in range(4)]
@@ -75,7 +77,7 @@ def test_threads_change_nothing(integrator, model):
     assert outcomes[0] == outcomes[1] == outcomes[2]
 
 
-@pytest.mark.parametrize("integrator", ["projective", "ray"])
+@pytest.mark.parametrize("integrator", ["projective", "ray", "line"])
 def test_far_from_the_origin_nothing_changes(integrator):
     """Cells are counted from the camera's block, so float32 is as good at 100 km as at home."""
     config = load_config(voxel_size=0.125, integrator=integrator, **{"ray.update": "once"})

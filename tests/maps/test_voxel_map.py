@@ -160,7 +160,7 @@ def test_damaged_maps_end_in_one_line(tmp_path):
     good = manifest.read_text()
     # fmt: off
     for bad in ["", "[]", "{}", good[: len(good) // 2], good.replace("stereovox-map", "x"),
-                good.replace('"version": 1', '"version": 9'),
+                good.replace('"version": 2', '"version": 9'),
                 good.replace('"blocks": ', '"blocks": 9'), good.replace('"data": "', '"data": "../'),
                 good.replace('"voxel_size": 0.1', '"voxel_size": -1')]:
     # fmt: on

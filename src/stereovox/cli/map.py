@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Turn a recording into a map.
 
-SOURCE is a 7-Scenes or TUM RGB-D folder, recognised by its files, or the simulation sim:room.
+SOURCE is a 7-Scenes or TUM RGB-D folder, a camera pair, a RealSense .db3 or a ROS 1 .bag, all recognised by what they
+hold, the simulation sim:room, or a connected camera, realsense:.
 """
 
 from __future__ import annotations
@@ -19,18 +20,20 @@ from stereovox.cli.terminal import (
     say_about_compiling,
     tracked,
 )
-from stereovox.errors import StereovoxError
+from stereovox.errors import SourceError, StereovoxError
 
 if TYPE_CHECKING:
     from stereovox.mapper import Mapper, UpdateReport
-    from stereovox.sources import Source
+    from stereovox.sources import Stream
 
+PATIENCE = 100
+"""Frames of a live camera that may be refused before the first one that is not."""
 EXAMPLE = "stereovox map recordings/kitchen --out kitchen.svox --voxel-size 0.05"
 
 
 def add_arguments(parser: ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("source", metavar="SOURCE", help="folder of a recording, or sim:room")
+    parser.add_argument("source", metavar="SOURCE", help="recorded folder or file, sim:room, or realsense:")
     parser.add_argument("--out", required=True, metavar="MAP", help="folder of the map to write, for example room.svox")
     parser.add_argument(
         "--profile", metavar="P", help="profile name or TOML file (default; with --resume the map's own settings)"
@@ -58,11 +61,11 @@ def add_arguments(parser: ArgumentParser) -> None:
 def run(arguments: Namespace) -> dict[str, Any]:
     """Map the source, save the map and tell what was done."""
     from stereovox.evaluate.summary import summarise
-    from stereovox.sources import open_source
+    from stereovox.sources import open_stream
 
     out = Path(arguments.out)
     _check_target(out, arguments.resume)
-    source = open_source(arguments.source, arguments.frames)
+    source = open_stream(arguments.source, arguments.frames)
     mapper = _mapper(arguments, out)
     _check_recording(mapper, source, out)
     for note in source.notes:
@@ -75,6 +78,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
             f"{arguments.source}: not one frame could be used, no map is written ({_first_refusal(reports)})"
         )
     mapper.map.save(out)
+    mapper.map.close()
     _tell(result, reports, out)
     return result
 
@@ -96,10 +100,11 @@ def _mapper(arguments: Namespace, out: Path) -> Mapper:
     settings = arguments.profile
     if settings is None:
         settings = saved.config if saved else "default"
-    return Mapper(settings, resume=saved, **_overrides(arguments))
+    tiles = out.parent / f".{out.name}-tiles"  # beside the map, not in a temporary folder that may lie in memory
+    return Mapper(settings, resume=saved, tiles=tiles, **_overrides(arguments))
 
 
-def _check_recording(mapper: Mapper, source: Source, out: Path) -> None:
+def _check_recording(mapper: Mapper, source: Stream, out: Path) -> None:
     """Frames are counted, not recognised: going on with another recording would skip its first ones."""
     made_of = mapper.map.recording
     if made_of and made_of != source.name:
@@ -124,23 +129,23 @@ def _overrides(arguments: Namespace) -> dict[str, Any]:
     return {**overrides, **{name: value for name, value in named.items() if value is not None}}
 
 
-def _add_all(mapper: Mapper, source: Source, out: Path) -> list[UpdateReport]:
+def _add_all(mapper: Mapper, source: Stream, out: Path) -> list[UpdateReport]:
     """Add all frames that the map does not hold yet; on Ctrl-C save what there is."""
     reports: list[UpdateReport] = []
     done = mapper.map.frames + mapper.map.frames_refused
     if done:
-        from stereovox.sources import Selection
-
-        if done >= len(source):
-            raise StereovoxError(f"{out}: already holds all {len(source)} frames of {source.name}")
-        source = Selection(source, f"{done}:")
+        if source.length is not None and done >= source.length:
+            raise StereovoxError(f"{out}: already holds all {source.length} frames of {source.name}")
+        source = source.after(done)
         say(f"going on after frame {done}")
     try:
         with interrupt_between_steps() as check:
-            for frame in tracked(source, len(source), "mapping"):
+            for frame in tracked(source, source.length, "mapping"):
                 reports.append(mapper.add(frame))
                 check()
-    except KeyboardInterrupt:
+                if source.length is None and not mapper.map.frames and len(reports) == PATIENCE:
+                    break  # a live camera would be refused for ever
+    except (KeyboardInterrupt, SourceError):
         if mapper.map.frames:
             mapper.map.save(out)
             say(f"stopped after {len(reports)} frames; they are saved in {out}, go on with --resume")

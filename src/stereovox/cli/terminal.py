@@ -46,8 +46,8 @@ def progress_bar() -> Iterator[Progress]:
         yield bar
 
 
-def tracked(items: Iterable[T], total: int, text: str) -> Iterator[T]:
-    """Yield `items` with a progress bar."""
+def tracked(items: Iterable[T], total: int | None, text: str) -> Iterator[T]:
+    """Yield `items` with a progress bar; `total` is None where nobody knows how many there are."""
     with progress_bar() as bar:
         task = bar.add_task(text, total=total, note="")
         for item in items:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from stereovox import geometry
 from stereovox.config import Config
 from stereovox.depth import _cpu
+from stereovox.depth.downsample import downsample
 from stereovox.errors import FrameRefused
 from stereovox.frame import DepthImage, Frame, Reason
 
@@ -34,7 +35,8 @@ def prepare(frame: Frame, config: Config) -> DepthImage:
     usable = _classify(frame, config, depth_m, reason)
     if not usable and not (reason == Reason.TOO_FAR).any():
         raise FrameRefused("no_valid_depth", f"{_name(frame)}: not one pixel has a valid depth; is the lens covered?")
-    return DepthImage(depth_m, reason, frame.camera, T_world_sensor, frame.stamp_ns)
+    image = DepthImage(depth_m, reason, frame.camera, T_world_sensor, frame.stamp_ns)
+    return downsample(image, config.depth.downsample)
 
 
 def _classify(frame: Frame, config: Config, depth_m: NDArray, reason: NDArray) -> int:

@@ -13,6 +13,7 @@ from stereovox.maps.evidence import Evidence
 INTEGRATORS = {
     "projective": "stereovox.integrate.projective:Projective",
     "ray": "stereovox.integrate.ray:Ray",
+    "line": "stereovox.integrate.ray:Line",
 }
 
 

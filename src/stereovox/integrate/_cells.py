@@ -40,6 +40,12 @@ def bits_of(x):
 
 
 @cell
+def float_of(bits):
+    """Return the float32 with these bits."""
+    return np.int32(bits).view(np.float32)
+
+
+@cell
 def window_level(spread):
     """Return which window image serves a cell: 0 for the pixel itself, l for 3x3 tiles of 2^(l-1) pixels.
 

@@ -7,7 +7,7 @@ zeros. Tests compare the kernels with them, and them with OctoMap.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -25,8 +25,17 @@ Cells = tuple[NDArray[np.int64], NDArray[np.float64]]
 
 def cast_rays(image: DepthImage, config: Config, sensor: InverseSensorModel) -> Cells:
     """Walk every pixel's ray through all grid planes it crosses; `config.ray.update` says how rays share a cell."""
+    return _shared(image, config, sensor, _crossed)
+
+
+def draw_lines(image: DepthImage, config: Config, sensor: InverseSensorModel) -> Cells:
+    """Sample every pixel's ray once in each layer of cells along its longest axis (Chien 2020, Alg 1)."""
+    return _shared(image, config, sensor, _sampled)
+
+
+def _shared(image: DepthImage, config: Config, sensor: InverseSensorModel, depths_of: Callable) -> Cells:
     table = _table(image, config, sensor)
-    indices, evidence, depths = zip(*_rays(image, config, table), strict=True)
+    indices, evidence, depths = zip(*_rays(image, config, table, depths_of), strict=True)
     indices, evidence, depths = np.concatenate(indices), np.concatenate(evidence), np.concatenate(depths)
     if config.ray.update == "once":
         return _strongest(indices, evidence)
@@ -57,8 +66,10 @@ def _table(image: DepthImage, config: Config, sensor: InverseSensorModel) -> Sen
     return replace(table, log_odds=np.round(table.log_odds, 3), hit=np.round(table.hit, 3))  # as a map keeps them
 
 
-def _rays(image: DepthImage, config: Config, table: SensorTable) -> Iterator[tuple[NDArray, NDArray, NDArray]]:
-    """Yield for each ray the cells it gives evidence to, that evidence, and the depth at the middle of each cell."""
+def _rays(
+    image: DepthImage, config: Config, table: SensorTable, depths_of: Callable
+) -> Iterator[tuple[NDArray, NDArray, NDArray]]:
+    """Yield for each ray the cells it gives evidence to, that evidence, and the depth that stands for each cell."""
     slopes = image.camera.back_project(np.ones(image.depth_m.shape)).reshape(-1, 3)
     T = image.T_world_sensor
     marks = bool((table.log_odds > 0).any())
@@ -69,8 +80,7 @@ def _rays(image: DepthImage, config: Config, table: SensorTable) -> Iterator[tup
         end = config.max_range if np.isinf(d) else d + (REACH_SIGMA * table.sigma[row] if marks else 0)
         direction = T[:3, :3] @ slope
         start = T[:3, 3] / config.voxel_size
-        cuts = np.concatenate([[0.0], _plane_crossings(start, direction / config.voxel_size, end), [end]])
-        middle = (cuts[:-1] + cuts[1:]) / 2
+        middle = depths_of(start, direction / config.voxel_size, end)
         cells = np.floor(start + middle[:, None] * direction / config.voxel_size).astype(np.int64)
         evidence = _look_up(table, middle, np.full(len(middle), d), config)
         if np.isfinite(d):
@@ -79,6 +89,18 @@ def _rays(image: DepthImage, config: Config, table: SensorTable) -> Iterator[tup
             cells, evidence, middle = cells[others], evidence[others], middle[others]
             cells, evidence, middle = np.vstack([cells, hit]), np.append(evidence, table.hit[row]), np.append(middle, d)
         yield cells, evidence, middle
+
+
+def _crossed(start: NDArray, direction: NDArray, end: float) -> NDArray:
+    """Return the depth at the middle of every cell that a ray crosses."""
+    cuts = np.concatenate([[0.0], _plane_crossings(start, direction, end), [end]])
+    return (cuts[:-1] + cuts[1:]) / 2
+
+
+def _sampled(start: NDArray, direction: NDArray, end: float) -> NDArray:
+    """Return the depths of samples one cell apart along the longest axis, from the camera on."""
+    step = 1 / np.abs(direction).max()
+    return step * np.arange(int(end / step) + 1)
 
 
 def _plane_crossings(start: NDArray, direction: NDArray, end: float) -> NDArray:

@@ -1,7 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
 """Occupancy maps: sparse voxel blocks in memory, Zarr on disk."""
 
+from __future__ import annotations
+
+from pathlib import Path
+
+from stereovox.config import Config
 from stereovox.maps.store import load_map
 from stereovox.maps.voxel_map import State, VoxelMap
 
-__all__ = ["State", "VoxelMap", "load_map"]
+__all__ = ["State", "VoxelMap", "load_map", "make_map"]
+
+
+def make_map(config: Config, resume: VoxelMap | None = None, tiles: Path | None = None) -> VoxelMap:
+    """Return the map that `config` asks for: unbounded, or in a window that moves with the camera.
+
+    resume: a map to go on with. tiles: folder for the cells that leave a window, a temporary one by default.
+    Raises ConfigError when the settings would change what the cells of `resume` mean.
+    """
+    if config.window.size is None:
+        return VoxelMap(config) if resume is None else resume.with_config(config)
+    from stereovox.maps.rolling import RollingMap
+
+    rolling = RollingMap(config, tiles)
+    if resume is not None:
+        resume.check_cells(config)
+        rolling.go_on_with(resume)
+    return rolling

@@ -22,6 +22,13 @@ def home_slot(bx, by, bz, mask):
 @cell
 def find(table, coords, bx, by, bz):
     """Return the pool index of block (bx, by, bz), -1 when there is none."""
+    slot = slot_of(table, coords, bx, by, bz)
+    return np.int64(table[slot]) if slot >= 0 else np.int64(-1)
+
+
+@cell
+def slot_of(table, coords, bx, by, bz):
+    """Return the slot of the hash table that holds block (bx, by, bz), -1 when there is none."""
     mask = table.size - 1
     slot = home_slot(bx, by, bz, mask)
     while True:
@@ -29,8 +36,23 @@ def find(table, coords, bx, by, bz):
         if i == EMPTY:
             return np.int64(-1)
         if coords[i, 0] == bx and coords[i, 1] == by and coords[i, 2] == bz:
-            return np.int64(i)
+            return slot
         slot = (slot + 1) & mask
+
+
+@cell
+def empty_slot(table, coords, slot):
+    """Empty a slot of the hash table and close the gap: entries behind it move up if their search passes it."""
+    mask = table.size - 1
+    gap, slot = slot, (slot + 1) & mask
+    while table[slot] != EMPTY:
+        i = table[slot]
+        home = home_slot(coords[i, 0], coords[i, 1], coords[i, 2], mask)
+        if (slot - home) & mask >= (slot - gap) & mask:
+            table[gap] = i
+            gap = slot
+        slot = (slot + 1) & mask
+    table[gap] = EMPTY
 
 
 @cell

@@ -4,7 +4,7 @@
 import numpy as np
 
 from stereovox._jit import kernel
-from stereovox.maps._cells import EMPTY, find, find_or_insert, home_slot
+from stereovox.maps._cells import EMPTY, empty_slot, find, find_or_insert, home_slot, slot_of
 
 
 @kernel
@@ -27,10 +27,46 @@ def insert_all(table, coords, count, wanted, indices):
 
 
 @kernel
-def add_values(table, coords, count, cells, at_floor, wanted, values, lowest, highest):
+def find_all(table, coords, wanted, indices):
+    """Write the pool indices of blocks `wanted` (n, 3) to `indices` (n,), -1 where there is none."""
+    for i in range(wanted.shape[0]):
+        indices[i] = find(table, coords, wanted[i, 0], wanted[i, 1], wanted[i, 2])
+
+
+@kernel
+def remove_all(table, coords, count, cells, flags, fill, gone):
+    """Take blocks `gone` (n, 3), each there or not, out of the pool; the last block moves into each gap."""
+    for k in range(gone.shape[0]):
+        slot = slot_of(table, coords, gone[k, 0], gone[k, 1], gone[k, 2])
+        if slot < 0:
+            continue
+        i = table[slot]
+        empty_slot(table, coords, slot)
+        last = np.int32(count[0] - 1)
+        if i != last:
+            table[slot_of(table, coords, coords[last, 0], coords[last, 1], coords[last, 2])] = i
+            coords[i] = coords[last]
+            cells[i] = cells[last]
+            flags[i] = flags[last]
+        cells[last] = fill
+        flags[last] = 0
+        count[0] = last
+
+
+@kernel
+def rescale(values, factor, out):
+    """Write `values` (n, 512) times `factor`, rounded to whole numbers, to `out` (n, 512) int16."""
+    for i in range(values.shape[0]):
+        for c in range(512):
+            out[i, c] = np.int16(np.rint(np.float32(values[i, c]) * factor))
+
+
+@kernel
+def add_values(table, coords, count, cells, at_floor, wanted, values, unknown, lowest, highest):
     """Add `values` (n, 512) to blocks `wanted` (n, 3) with clamping; return how many cells changed.
 
-    A block whose values are all zero is not made. A sum of zero is stored as 1: zero is kept for "unknown".
+    A block whose values are all zero is not made. `unknown` is what cells without evidence hold; where a sum comes to
+    just that, one more is stored.
     """
     changed = 0
     for i in range(wanted.shape[0]):
@@ -47,16 +83,16 @@ def add_values(table, coords, count, cells, at_floor, wanted, values, lowest, hi
             old = np.int32(block[c])
             step = np.int32(value[c])
             new = min(max(old + step, lowest), highest)
-            new += np.int32(1) if (new == 0) & (step != 0) else np.int32(0)
+            new += np.int32(1) if (new == unknown) & (step != 0) else np.int32(0)
             moved += np.int32(1) if new != old else np.int32(0)
-            block[c] = np.int16(new)
+            block[c] = new
         at_floor[b] = 0
         changed += moved
     return changed
 
 
 @kernel
-def add_constant(table, coords, count, cells, at_floor, wanted, step, lowest):
+def add_constant(table, coords, count, cells, at_floor, wanted, step, unknown, lowest):
     """Add the negative number `step` to all cells of blocks `wanted` (n, 3); return how many cells changed.
 
     A block whose cells all sit at the floor already costs one look.
@@ -72,10 +108,10 @@ def add_constant(table, coords, count, cells, at_floor, wanted, step, lowest):
         for c in range(512):
             old = np.int32(block[c])
             new = max(old + step, lowest)
-            new += np.int32(1) if new == 0 else np.int32(0)
+            new += np.int32(1) if new == unknown else np.int32(0)
             moved += np.int32(1) if new != old else np.int32(0)
             above += np.int32(1) if new != lowest else np.int32(0)
-            block[c] = np.int16(new)
+            block[c] = new
         at_floor[b] = 1 if above == 0 else 0
         changed += moved
     return changed
@@ -83,8 +119,9 @@ def add_constant(table, coords, count, cells, at_floor, wanted, step, lowest):
 
 @kernel
 def look_up(table, coords, cells, indices, out):
-    """Write the value of each cell of `indices` (n, 3) int64 to `out` (n,); 0 where there is no block."""
+    """Write the value of each cell of `indices` (n, 3) int64 to `out` (n,), which stays as it is where no block is."""
     for i in range(indices.shape[0]):
         x, y, z = indices[i, 0], indices[i, 1], indices[i, 2]
         b = find(table, coords, x >> 3, y >> 3, z >> 3)
-        out[i] = cells[b, ((x & 7) << 6) | ((y & 7) << 3) | (z & 7)] if b >= 0 else np.int16(0)
+        if b >= 0:
+            out[i] = cells[b, ((x & 7) << 6) | ((y & 7) << 3) | (z & 7)]

@@ -17,14 +17,17 @@ class BlockPool:
     """Blocks in the order they were made. Cell (i, j, k) of a block stands at `64 i + 8 j + k` of its row.
 
     coords: (capacity, 3) int32 block coordinates; block (0, 0, 0) holds cells 0..7 on each axis.
-    values: (capacity, 512) of the chosen dtype, zero where never written.
+    values: (capacity, 512) of the chosen dtype, `fill` where never written.
+    flags: (capacity,) uint8 for the owner's use, zero for a new block.
     count: (1,) int64, the number of blocks in use.
     """
 
-    def __init__(self, dtype: DTypeLike, capacity: int = 256):
+    def __init__(self, dtype: DTypeLike, capacity: int = 256, fill: int = 0):
+        self.fill = fill
         self.count = np.zeros(1, np.int64)
         self.coords = np.zeros((capacity, 3), np.int32)
-        self.values = np.zeros((capacity, CELLS), dtype)
+        self.values = np.full((capacity, CELLS), fill, dtype)
+        self.flags = np.zeros(capacity, np.uint8)
         self.table = np.full(_table_size(capacity), -1, np.int32)
 
     def __len__(self) -> int:
@@ -41,8 +44,9 @@ class BlockPool:
         if needed <= self.coords.shape[0]:
             return
         capacity = max(needed, 2 * self.coords.shape[0])
-        self.coords = _grown(self.coords, capacity, len(self))
-        self.values = _grown(self.values, capacity, len(self))
+        self.coords = _grown(self.coords, capacity, len(self), 0)
+        self.values = _grown(self.values, capacity, len(self), self.fill)
+        self.flags = _grown(self.flags, capacity, len(self), 0)
         self.table = np.empty(_table_size(capacity), np.int32)
         _cpu.rebuild(self.table, self.coords, len(self))
 
@@ -53,9 +57,20 @@ class BlockPool:
         _cpu.insert_all(self.table, self.coords, self.count, np.ascontiguousarray(coords, np.int32), places)
         return places
 
+    def find(self, coords: NDArray[np.int32]) -> NDArray[np.int64]:
+        """Return the places in the pool (n,) of blocks (n, 3), -1 for those that are not there."""
+        places = np.empty(len(coords), np.int64)
+        _cpu.find_all(self.table, self.coords, coords, places)
+        return places
+
+    def remove(self, coords: NDArray[np.int32]) -> None:
+        """Forget blocks (n, 3), each there or not; others may change their places."""
+        _cpu.remove_all(self.table, self.coords, self.count, self.values, self.flags, self.fill, coords)
+
     def clear(self) -> None:
-        """Forget all blocks and zero what they held; the memory stays for the next use."""
-        self.values[: len(self)] = 0
+        """Forget all blocks and what they held; the memory stays for the next use."""
+        self.values[: len(self)] = self.fill
+        self.flags[: len(self)] = 0
         self.table.fill(-1)
         self.count[0] = 0
 
@@ -64,7 +79,7 @@ def _table_size(capacity: int) -> int:
     return 1 << int(2 * capacity - 1).bit_length()
 
 
-def _grown(array: NDArray, capacity: int, used: int) -> NDArray:
-    grown = np.zeros((capacity, *array.shape[1:]), array.dtype)
+def _grown(array: NDArray, capacity: int, used: int, fill: int) -> NDArray:
+    grown = np.full((capacity, *array.shape[1:]), fill, array.dtype)
     grown[:used] = array[:used]
     return grown

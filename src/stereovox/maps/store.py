@@ -12,21 +12,24 @@ import os
 import shutil
 import uuid
 import zlib
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from stereovox.cameras import DepthCorrection, PinholeCamera
 from stereovox.config import load_config
 from stereovox.errors import ConfigError, MapFileError
+from stereovox.frame import Viewpoint
 from stereovox.maps.blocks import CELLS
 
 if TYPE_CHECKING:
     from stereovox.maps.voxel_map import VoxelMap
 
 FORMAT = "stereovox-map"
-VERSION = 1
+VERSION, READABLE = 2, (1, 2)
 MANIFEST = "manifest.json"
 BLOCKS_PER_CHUNK = 4096
 
@@ -38,9 +41,8 @@ def save_map(voxel_map: VoxelMap, path: str | Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         data = f"cells-{uuid.uuid4().hex[:12]}"
-        coords, cells = voxel_map.blocks()
-        _write_arrays(folder / data, {"coords": coords, "cells": cells})
-        _write_manifest(folder, _manifest(voxel_map, data, len(coords), _checksum(coords, cells)))
+        blocks, checksum = _write_arrays(folder / data, voxel_map)
+        _write_manifest(folder, _manifest(voxel_map, data, blocks, checksum))
     except OSError as error:
         raise MapFileError(
             f"{folder}: cannot save the map ({error.strerror or error}); choose a writable folder"
@@ -60,7 +62,10 @@ def check_target(folder: Path) -> None:
 
 
 def load_map(path: str | Path) -> VoxelMap:
-    """Read a map saved by `VoxelMap.save`. Raises MapFileError: one line with the file and what is wrong."""
+    """Read a map saved by `VoxelMap.save`, all of it, whatever window it was made in.
+
+    Raises MapFileError: one line with the file and what is wrong.
+    """
     from stereovox.maps.voxel_map import VoxelMap
 
     folder = Path(path)
@@ -69,14 +74,14 @@ def load_map(path: str | Path) -> VoxelMap:
         voxel_map = VoxelMap(load_config(manifest["config"]))
         voxel_map.frames, voxel_map.frames_refused = int(manifest["frames"]), int(manifest["frames_refused"])
         voxel_map.recording = str(manifest["recording"])
-        coords, cells = _read_arrays(folder / str(manifest["data"]), int(manifest["blocks"]))
-        if _checksum(coords, cells) != manifest["checksum"]:
+        voxel_map.viewpoint = _viewpoint_from(manifest.get("viewpoint"))
+        voxel_map.window_state = manifest.get("window")
+        coords, cells = _read_arrays(folder / str(manifest["data"]), int(manifest["blocks"]), voxel_map)
+        if _checksums(coords, cells, manifest["checksum"]) != manifest["checksum"]:
             raise ValueError("the cells do not match their checksum")
     except (KeyError, TypeError, ValueError, OSError, RuntimeError, ConfigError) as error:
         raise MapFileError(f"{folder}: damaged map ({type(error).__name__}: {error}); make it anew") from None
-    voxel_map._pool.insert(coords)
-    voxel_map._pool.values[: len(cells)] = np.clip(cells, voxel_map._lowest, voxel_map._highest)
-    voxel_map._match_flags()
+    voxel_map.insert(coords, cells)
     return voxel_map
 
 
@@ -97,7 +102,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
         raise MapFileError(f"{folder / MANIFEST}: cannot be read ({error}); make the map anew") from None
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
         raise MapFileError(f"{folder / MANIFEST}: not a stereovox map")
-    if manifest.get("version") != VERSION:
+    if manifest.get("version") not in READABLE:
         raise MapFileError(
             f"{folder}: map format {manifest.get('version')}, this program reads {VERSION}; update stereovox"
         )
@@ -106,7 +111,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     return manifest
 
 
-def _manifest(voxel_map: VoxelMap, data: str, blocks: int, checksum: int) -> dict[str, Any]:
+def _manifest(voxel_map: VoxelMap, data: str, blocks: int, checksum: list[int]) -> dict[str, Any]:
     return {
         "format": FORMAT,
         "version": VERSION,
@@ -116,16 +121,36 @@ def _manifest(voxel_map: VoxelMap, data: str, blocks: int, checksum: int) -> dic
         "blocks": blocks,
         "data": data,
         "checksum": checksum,
+        "viewpoint": _viewpoint_to(voxel_map.viewpoint),
+        "window": voxel_map.window_state,
         "config": voxel_map.config.model_dump(),
     }
 
 
-def _checksum(*arrays: NDArray) -> int:
-    """Zarr reads a chunk whose file is gone as empty cells; this number tells."""
-    checksum = 0
-    for array in arrays:
-        checksum = zlib.crc32(np.ascontiguousarray(array).tobytes(), checksum)
-    return checksum
+def _checksums(coords: NDArray, cells: NDArray, wanted: Any) -> int | list[int]:
+    """Zarr reads a chunk whose file is gone as empty cells; these numbers tell. Version 1 had one for both arrays."""
+    of_coords = zlib.crc32(np.ascontiguousarray(coords).data)
+    if isinstance(wanted, int):
+        return zlib.crc32(np.ascontiguousarray(cells).data, of_coords)
+    return [of_coords, zlib.crc32(np.ascontiguousarray(cells).data)]
+
+
+def _viewpoint_to(viewpoint: Viewpoint | None) -> dict[str, Any] | None:
+    if viewpoint is None:
+        return None
+    camera, T_world_camera, stamp_ns = viewpoint
+    return {"camera": asdict(camera), "T_world_camera": T_world_camera.tolist(), "stamp_ns": stamp_ns}
+
+
+def _viewpoint_from(saved: dict[str, Any] | None) -> Viewpoint | None:
+    if saved is None:
+        return None
+    numbers = dict(saved["camera"])
+    correction = numbers.pop("correction", None)
+    if correction:
+        correction = DepthCorrection(str(correction["model"]), tuple(map(float, correction["coefficients"])))
+    T_world_camera = np.array(saved["T_world_camera"], float).reshape(4, 4)
+    return Viewpoint(PinholeCamera(**numbers, correction=correction), T_world_camera, int(saved["stamp_ns"]))
 
 
 def _write_manifest(folder: Path, manifest: dict[str, Any]) -> None:
@@ -137,26 +162,39 @@ def _write_manifest(folder: Path, manifest: dict[str, Any]) -> None:
     temporary.replace(folder / MANIFEST)
 
 
-def _write_arrays(folder: Path, arrays: dict[str, NDArray]) -> None:
+def _write_arrays(folder: Path, voxel_map: VoxelMap) -> tuple[int, list[int]]:
+    """Write all blocks, piece by piece; return their number and the checksums of coordinates and cells."""
     import zarr
 
     group = zarr.open_group(folder, mode="w", zarr_format=3)
-    for name, array in arrays.items():
-        rows = max(1, min(BLOCKS_PER_CHUNK, len(array)))
-        stored = group.create_array(
-            name, shape=array.shape, dtype=array.dtype, chunks=(rows, array.shape[1]), fill_value=0
-        )
-        if len(array):
-            stored[:] = array
+    arrays, checksums = None, [0, 0]
+    for slab in voxel_map.slabs():
+        if arrays is None:
+            fills = (0, voxel_map.cell_format.unknown)
+            arrays = [_new_array(group, *what) for what in zip(("coords", "cells"), slab, fills, strict=True)]
+        for n, part in enumerate(slab):
+            if len(part):
+                arrays[n].append(part)
+            checksums[n] = zlib.crc32(np.ascontiguousarray(part).data, checksums[n])
+    return (arrays[0].shape[0] if arrays else 0), checksums
 
 
-def _read_arrays(folder: Path, blocks: int) -> tuple[NDArray[np.int32], NDArray[np.int16]]:
+def _new_array(group: Any, name: str, like: NDArray, fill: int) -> Any:
+    rows = max(1, min(BLOCKS_PER_CHUNK, len(like)))
+    shape, chunks = (0, like.shape[1]), (rows, like.shape[1])
+    return group.create_array(name, shape=shape, dtype=like.dtype, chunks=chunks, fill_value=fill)
+
+
+def _read_arrays(folder: Path, blocks: int, voxel_map: VoxelMap) -> tuple[NDArray[np.int32], NDArray[np.integer]]:
     import zarr
 
     group = zarr.open_group(folder, mode="r")
     coords: Any = group["coords"]
     cells: Any = group["cells"]
-    for array, shape, dtype in ((coords, (blocks, 3), np.int32), (cells, (blocks, CELLS), np.int16)):
+    for array, shape, dtype in (
+        (coords, (blocks, 3), np.int32),
+        (cells, (blocks, CELLS), voxel_map.cell_format.dtype),
+    ):
         if array.shape != shape or array.dtype != dtype:
             raise ValueError(f"array of {array.shape} {array.dtype} where {shape} {np.dtype(dtype)} belongs")
     return np.asarray(coords[:]), np.asarray(cells[:])

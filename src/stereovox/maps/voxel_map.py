@@ -1,19 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The voxel map: unbounded, sparse, fixed-point log-odds in 16 bits a cell."""
+"""The voxel map: unbounded, sparse, fixed-point log-odds in 16 or 8 bits a cell."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from enum import IntEnum
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stereovox.config import Config
 from stereovox.errors import ConfigError
+from stereovox.frame import Viewpoint
 from stereovox.maps import _cpu
 from stereovox.maps.blocks import SIDE, BlockPool
-from stereovox.maps.evidence import LOG_ODDS_SCALE, Evidence, to_units
+from stereovox.maps.cell_format import CellFormat, CellRules
+from stereovox.maps.evidence import LOG_ODDS_SCALE, Evidence
 
 INDEX_LIMIT = 2**30
 """Cell indices lie in [-INDEX_LIMIT, INDEX_LIMIT); beyond it everything is unknown."""
@@ -34,7 +38,8 @@ class VoxelMap:
     Cell i covers [i, i + 1) * voxel_size on each axis. A cell without evidence is unknown: log-odds 0, probability
     0.5. With evidence it is free (p < free_below), occupied (p > occupied_above) or tentative between them.
     `config` holds the settings the map was made with, `frames` the number of frames that are in it, `frames_refused`
-    the number that were offered and refused, `recording` the name of what they came from, if known.
+    the number that were offered and refused, `recording` the name of what they came from, if known, `viewpoint` where
+    the camera stood last, `window_state` where its window was, if it had one.
     """
 
     def __init__(self, config: Config):
@@ -43,56 +48,74 @@ class VoxelMap:
         self.frames = 0
         self.frames_refused = 0
         self.recording = ""
-        self._pool = BlockPool(np.int16)
-        self._at_floor = np.zeros(self._pool.coords.shape[0], np.uint8)
-        self._lowest, self._highest = (
-            np.int32(to_units(x)) for x in (config.map.log_odds_min, config.map.log_odds_max)
-        )
-        self._free_below, self._occupied_above = (
-            float(np.log(p / (1 - p)) * LOG_ODDS_SCALE) for p in (config.map.free_below, config.map.occupied_above)
-        )
+        self.viewpoint: Viewpoint | None = None
+        self.window_state: dict[str, Any] | None = None
+        self._rules = CellRules(config.map)
+        self._format = self._rules.format
+        self._pool = BlockPool(self._format.dtype, fill=self._format.unknown)
 
     @classmethod
     def from_cells(cls, config: Config, indices: ArrayLike, log_odds: ArrayLike) -> VoxelMap:
         """Return a map of these cells: (N, 3) whole cell indices and (N,) log-odds, clamped as `config` says.
 
-        A cell named twice keeps its last value; a log-odds of zero is stored as "just known" (0.001).
+        A cell named twice keeps its last value; a log-odds of zero is stored as the smallest positive one.
         """
         voxel_map = cls(config)
         indices = np.asarray(indices, np.int64).reshape(-1, 3)
         blocks, of_cell = np.unique(indices >> 3, axis=0, return_inverse=True)
         places = voxel_map._pool.insert(blocks.astype(np.int32))
-        units = np.clip(to_units(np.asarray(log_odds, float)), voxel_map._lowest, voxel_map._highest)
+        rules, unknown = voxel_map._rules, voxel_map._format.unknown
+        stored = np.clip(voxel_map._format.stored(log_odds), rules.lowest, rules.highest)
         low = indices & (SIDE - 1)
         column = (low[:, 0] << 6) | (low[:, 1] << 3) | low[:, 2]
-        voxel_map._pool.values[places[of_cell.ravel()], column] = np.where(units == 0, 1, units)
-        voxel_map._match_flags()
+        voxel_map._pool.values[places[of_cell.ravel()], column] = np.where(stored == unknown, unknown + 1, stored)
         return voxel_map
 
     def with_config(self, config: Config) -> VoxelMap:
         """Take over the settings of a run that goes on with this map.
 
-        Raises ConfigError when they would change what its cells mean: the voxel size or the `map` section.
+        Raises ConfigError when they would change what its cells mean.
         """
+        self.check_cells(config)
+        self.config = config
+        return self
+
+    def check_cells(self, config: Config) -> None:
+        """Raise ConfigError when `config` gives cells another meaning: the voxel size or the `map` section."""
         for name in ("voxel_size", "map"):
             old, new = getattr(self.config, name), getattr(config, name)
             if old != new:
                 raise ConfigError(f"cannot go on: the map was made with {name} {old}, now {new} is wanted")
-        self.config = config
-        return self
+
+    def look_from(self, viewpoint: Viewpoint) -> None:
+        """Remember where the camera stands; a bounded map moves with it."""
+        self.viewpoint = viewpoint
+
+    @property
+    def cell_format(self) -> CellFormat:
+        """What the log-odds of a cell are kept in."""
+        return self._format
+
+    def insert(self, coords: NDArray[np.int32], cells: NDArray[np.integer]) -> None:
+        """Set whole blocks: coordinates (n, 3), cells (n, 512) as stored; what stood there before is lost."""
+        places = self._pool.insert(coords)
+        self._pool.values[places] = np.clip(cells, self._rules.lowest, self._rules.highest)
+        self._pool.flags[places] = 0
 
     def add(self, evidence: Evidence) -> int:
         """Add what one frame says; return the number of cells whose value changed."""
-        self._pool.reserve(len(evidence.coords) + len(evidence.uniform))
-        self._match_flags()
-        pool = self._pool
-        blocks = (pool.table, pool.coords, pool.count, pool.values, self._at_floor)
-        changed = _cpu.add_values(*blocks, evidence.coords, evidence.values, self._lowest, self._highest)
-        return changed + _cpu.add_constant(*blocks, evidence.uniform, np.int32(evidence.uniform_value), self._lowest)
+        values, uniform = self._in_my_units(evidence)
+        pool, rules, unknown = self._pool, self._rules, self._format.unknown
+        self._make_room(len(evidence.coords) + len(evidence.uniform))
+        blocks = (pool.table, pool.coords, pool.count, pool.values, pool.flags)
+        changed = _cpu.add_values(*blocks, evidence.coords, values, unknown, rules.lowest, rules.highest)
+        if uniform:
+            changed += _cpu.add_constant(*blocks, evidence.uniform, uniform, unknown, rules.lowest)
+        return changed
 
     def log_odds(self, points: ArrayLike) -> NDArray[np.float32]:
         """Return the log-odds (N,) at points (N, 3) in metres, world frame; 0 where unknown or not finite."""
-        return _from_units(self._units_at(points))
+        return self._format.log_odds(self._stored_at(points))
 
     def probability(self, points: ArrayLike) -> NDArray[np.float32]:
         """Return the occupancy probability (N,) at points (N, 3) in metres, world frame; 0.5 where unknown."""
@@ -100,22 +123,27 @@ class VoxelMap:
 
     def state(self, points: ArrayLike) -> NDArray[np.uint8]:
         """Return the `State` (N,) uint8 at points (N, 3) in metres, world frame."""
-        return self._states(self._units_at(points))
+        return self._states(self._stored_at(points))
 
     def cells(self) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
         """Return all known cells: indices (N, 3) int32 in ascending order, and their log-odds (N,)."""
         coords, values = self.blocks()
-        block, column = np.nonzero(values)
+        block, column = np.nonzero(values != self._format.unknown)
         low = np.stack([column >> 6, (column >> 3) & 7, column & 7], axis=1)
         indices = (coords[block] * SIDE + low).astype(np.int32)
         order = np.lexsort(indices.T[::-1])
-        return indices[order], _from_units(values[block, column][order])
+        return indices[order], self._format.log_odds(values[block, column][order])
 
-    def blocks(self) -> tuple[NDArray[np.int32], NDArray[np.int16]]:
-        """Return block coordinates (n, 3) in ascending order and their cells (n, 512) in thousandths of log-odds."""
+    def blocks(self) -> tuple[NDArray[np.int32], NDArray[np.integer]]:
+        """Return block coordinates (n, 3) in ascending order and their cells (n, 512) as they are stored."""
+        coords, values = zip(*self.slabs(), strict=True)
+        return np.concatenate(coords), np.concatenate(values)
+
+    def slabs(self) -> Iterator[tuple[NDArray[np.int32], NDArray[np.integer]]]:
+        """Yield all blocks as in `blocks`, piece by piece in ascending order."""
         n = len(self._pool)
         order = np.lexsort(self._pool.coords[:n].T[::-1])
-        return self._pool.coords[order], self._pool.values[order]
+        yield self._pool.coords[order], self._pool.values[order]
 
     def centers(self, indices: ArrayLike) -> NDArray[np.float64]:
         """Return the centres (N, 3) in metres of cells (N, 3)."""
@@ -131,7 +159,9 @@ class VoxelMap:
 
     def counts(self) -> dict[str, int]:
         """Return the number of cells in each known state: `free`, `tentative`, `occupied`."""
-        number = np.bincount(self._states(self._pool.values[: len(self._pool)]).ravel(), minlength=4)
+        number = np.zeros(4, np.int64)
+        for _, values in self.slabs():
+            number += np.bincount(self._states(values).ravel(), minlength=4)
         return {state.name.lower(): int(number[state]) for state in (State.FREE, State.TENTATIVE, State.OCCUPIED)}
 
     def bounds(self) -> NDArray[np.float64] | None:
@@ -152,35 +182,40 @@ class VoxelMap:
 
         save_map(self, path)
 
-    def _match_flags(self) -> None:
-        if len(self._at_floor) != self._pool.coords.shape[0]:
-            flags = np.zeros(self._pool.coords.shape[0], np.uint8)
-            flags[: len(self._at_floor)] = self._at_floor
-            self._at_floor = flags
+    def close(self) -> None:
+        """Give back what the map holds outside memory (nothing, unless it keeps tiles on disk)."""
 
-    def _units_at(self, points: ArrayLike) -> NDArray[np.int16]:
+    def _in_my_units(self, evidence: Evidence) -> tuple[NDArray[np.int16], np.int32]:
+        """Return the values of `evidence` and its uniform value, both as differences of stored numbers."""
+        factor = self._format.per_log_odds / LOG_ODDS_SCALE
+        if factor == 1:
+            return evidence.values, np.int32(evidence.uniform_value)
+        values = np.empty_like(evidence.values)
+        _cpu.rescale(evidence.values, np.float32(factor), values)
+        return values, np.int32(round(evidence.uniform_value * factor))
+
+    def _make_room(self, blocks: int) -> None:
+        self._pool.reserve(blocks)
+
+    def _stored_at(self, points: ArrayLike) -> NDArray[np.integer]:
         points = np.asarray(points, float).reshape(-1, 3)
         with np.errstate(invalid="ignore"):
             indices = np.floor(points / self.voxel_size)
         inside = (np.abs(indices) < INDEX_LIMIT).all(axis=1)
-        units = np.zeros(len(points), np.int16)
-        found = np.empty(int(inside.sum()), np.int16)
+        stored = np.full(len(points), self._format.unknown, self._format.dtype)
+        found = stored[inside]
         pool = self._pool
         _cpu.look_up(pool.table, pool.coords, pool.values, indices[inside].astype(np.int64), found)
-        units[inside] = found
-        return units
+        stored[inside] = found
+        return stored
 
-    def _states(self, units: NDArray[np.int16]) -> NDArray[np.uint8]:
-        states = np.full(units.shape, State.TENTATIVE, np.uint8)
-        states[units == 0] = State.UNKNOWN
-        states[units < self._free_below] = State.FREE
-        states[units > self._occupied_above] = State.OCCUPIED
+    def _states(self, stored: NDArray[np.integer]) -> NDArray[np.uint8]:
+        states = np.full(stored.shape, State.TENTATIVE, np.uint8)
+        states[stored < self._rules.free_below] = State.FREE
+        states[stored > self._rules.occupied_above] = State.OCCUPIED
+        states[stored == self._format.unknown] = State.UNKNOWN
         return states
 
     def _centers_of(self, state: State) -> NDArray[np.float64]:
         indices, log_odds = self.cells()
-        return self.centers(indices[self._states(to_units(log_odds).astype(np.int16)) == state])
-
-
-def _from_units(units: NDArray[np.int16]) -> NDArray[np.float32]:
-    return units.astype(np.float32) / np.float32(LOG_ODDS_SCALE)
+        return self.centers(indices[self._states(self._format.stored(log_odds)) == state])

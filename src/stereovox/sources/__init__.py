@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where frames come from: recorded folders and simulations, recognised by what they hold."""
+"""Where frames come from: recordings and simulations, recognised by what they hold, and live cameras."""
 
 from __future__ import annotations
 
@@ -8,20 +8,26 @@ from typing import Any
 
 from stereovox import registry
 from stereovox.errors import SourceError
+from stereovox.sources.base import Excerpt as Excerpt
 from stereovox.sources.base import Selection as Selection
 from stereovox.sources.base import Source as Source
+from stereovox.sources.base import Stream as Stream
 from stereovox.sources.base import parse_slice as parse_slice
 
 SOURCES = {
+    "pair": "stereovox.sources.pair:CameraPair",  # first: such a folder may hold groundtruth.txt as well
     "seven_scenes": "stereovox.sources.seven_scenes:SevenScenes",
     "tum": "stereovox.sources.tum:TumRgbd",
     "simulation": "stereovox.sources.simulation:Simulation",
+    "bag": "stereovox.sources.bag:Bag",
 }
 """Asked in this order, then those of other packages (entry points in the group `stereovox.sources`)."""
+STREAMS = {"realsense": "stereovox.sources.realsense:RealSense"}
+"""Live cameras, which can only be followed; entry points in the group `stereovox.streams`."""
 
 
 def open_source(path_or_name: str | os.PathLike[str], frames: str | None = None) -> Source:
-    """Return the frames of a recorded folder or of a simulation (`sim:room`).
+    """Return the frames of a recorded folder or file or of a simulation (`sim:room`).
 
     The layout is recognised by content. `frames` picks some of them as a Python slice does (`A:B:S`).
     Raises SourceError, one line, where there is nothing, nothing known or nothing usable, or `frames` picks nothing.
@@ -31,6 +37,26 @@ def open_source(path_or_name: str | os.PathLike[str], frames: str | None = None)
         parse_slice(frames)  # a slip of the pen shows before a long recording is opened
     source = _recognise(where)(where)
     return source if frames is None else Selection(source, frames)
+
+
+def open_stream(path_or_name: str | os.PathLike[str], frames: str | None = None) -> Stream:
+    """Return what `open_source` returns, or the frames that a live camera (`realsense:`) delivers from now on.
+
+    Of a live camera, `frames` can only count forwards: `:300` are its next 300. Raises SourceError as `open_source`.
+    """
+    where = os.fspath(path_or_name)
+    live = _live(where)
+    if live is None:
+        return open_source(where, frames)
+    if frames is not None:
+        parse_slice(frames)
+    return live(where) if frames is None else Excerpt(live(where), frames)
+
+
+def _live(where: str) -> Any:
+    """Return the class of the live camera that `where` names, if it does."""
+    kinds = (registry.find("streams", STREAMS, name) for name in registry.names("streams", STREAMS))
+    return next((kind for kind in kinds if kind.recognises(where)), None)
 
 
 def _recognise(where: str) -> Any:
@@ -45,10 +71,12 @@ def _recognise(where: str) -> Any:
 
 def _problem(where: str, kinds: list[Any]) -> str:
     """Return why nothing can be made of `where`, and the folder below it that was perhaps meant."""
+    if _live(where):
+        return "a live camera can be mapped, but has no frames to go back to: record it into a file first"
     if not os.path.exists(where):
-        return "no such folder"
+        return "no such folder or file"
     if not os.path.isdir(where):
-        return "is a file, not the folder of a recording"
+        return "is a file, but no recording of a known kind"
     try:
         below = sorted(entry.path for entry in os.scandir(where) if entry.is_dir())
     except OSError as error:

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from itertools import islice
 from typing import Protocol, TypeVar
 
 from stereovox.cameras import PinholeCamera
@@ -17,8 +18,8 @@ AHEAD = 4
 """Frames read before they are asked for: enough to even out slow ones, at 0.6 MB each for 640x480."""
 
 
-class Source(Protocol):
-    """Frames that can be counted, asked for one by one in any order, or run through in time order.
+class Stream(Protocol):
+    """Frames one after the other in time order: a recording, or a live camera, which nobody can count or rewind.
 
     name: short name for messages and reports.
     camera: the camera of all frames.
@@ -26,13 +27,37 @@ class Source(Protocol):
     layout: how to recognise this kind of source, for messages.
 
     A class that is registered also has `recognises(where: str) -> bool`, which is cheap and never raises, and is made
-    from that `where` alone; it raises SourceError where the recording as a whole cannot be used.
+    from that `where` alone; it raises SourceError where the recording or device as a whole cannot be used.
     """
 
     name: str
     camera: PinholeCamera
     notes: tuple[str, ...] = ()
     layout: str = ""
+
+    @property
+    def length(self) -> int | None:
+        """Number of frames; None where more come for as long as somebody asks for them."""
+        return None
+
+    def after(self, count: int) -> Stream:
+        """Return what is left after `count` frames; of a live camera that is itself, its past frames are gone."""
+        return self
+
+    def __iter__(self) -> Iterator[Frame]: ...
+
+
+class Source(Stream, Protocol):
+    """A stream that is recorded: its frames can be counted, and asked for one by one in any order."""
+
+    @property
+    def length(self) -> int | None:
+        """Number of frames."""
+        return len(self)
+
+    def after(self, count: int) -> Stream:
+        """Return the frames from number `count` on; raises SourceError where there is none."""
+        return Selection(self, f"{count}:")
 
     def __len__(self) -> int: ...
 
@@ -67,6 +92,31 @@ class Selection(Source):
     def frame(self, i: int) -> Frame:
         """Return the frame that was picked as number `i`."""
         return self._source.frame(self._picked[i])
+
+
+class Excerpt(Stream):
+    """Of the frames that a live camera delivers from now on those that the Python slice text `frames` (`A:B:S`) picks.
+
+    Raises SourceError for text that is no slice, that picks none, or that counts from an end which does not exist.
+    """
+
+    def __init__(self, stream: Stream, frames: str):
+        picked = parse_slice(frames)
+        start, step = picked.start or 0, 1 if picked.step is None else picked.step
+        if start < 0 or step < 0 or (picked.stop is not None and picked.stop <= start):
+            raise SourceError(f"frames '{frames}' of a live camera: count forwards from its first, for example :300")
+        self._stream, self._bounds = stream, (start, picked.stop, step)
+        self.name, self.camera = stream.name, stream.camera
+        self.notes = getattr(stream, "notes", ())
+
+    def __iter__(self) -> Iterator[Frame]:
+        frames = iter(self._stream)
+        try:
+            yield from islice(frames, *self._bounds)
+        finally:
+            close = getattr(frames, "close", None)
+            if close:  # a generator: the camera is to stop now, not when it happens to be collected
+                close()
 
 
 def parse_slice(text: str) -> slice:

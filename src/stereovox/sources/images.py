@@ -33,7 +33,14 @@ def read_depth_png(path: Path, size: tuple[int, int]) -> NDArray[np.uint16]:
     Raises FrameRefused, one line: `missing_file`; `unreadable` (no PNG, cut off, damaged, absurdly large); `bad_dtype`
     (not 16-bit grey); `bad_shape` (another size).
     """
-    data = _read(path)
+    return decode_depth_png(path, _read(path), size)
+
+
+def decode_depth_png(path: Path | str, data: bytes, size: tuple[int, int]) -> NDArray[np.uint16]:
+    """Return the (height, width) uint16 image in the bytes of a PNG; `path` names it in messages.
+
+    Raises FrameRefused as `read_depth_png`.
+    """
     found = _header_size(path, data)
     if found != size:
         raise FrameRefused("bad_shape", f"{path}: {_times(found)} pixels, the recording has {_times(size)}; remove it")
@@ -76,7 +83,7 @@ def _read(path: Path, count: int = -1) -> bytes:
         raise FrameRefused("unreadable", f"{path}: {error.strerror}; make it readable or remove it") from None
 
 
-def _header_size(path: Path, data: bytes) -> tuple[int, int]:
+def _header_size(path: Path | str, data: bytes) -> tuple[int, int]:
     header = data[12 : HEADER_BYTES - 4]
     if data[:16] != START or zlib.crc32(header) != int.from_bytes(data[HEADER_BYTES - 4 : HEADER_BYTES]):
         raise FrameRefused("unreadable", f"{path}: no PNG file, or its header is damaged; copy it again or remove it")
@@ -103,7 +110,7 @@ def _is_whole(data: bytes) -> bool:
     return True
 
 
-def _decode(path: Path, data: bytes) -> NDArray[np.uint16]:
+def _decode(path: Path | str, data: bytes) -> NDArray[np.uint16]:
     import cv2
 
     try:

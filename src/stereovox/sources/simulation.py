@@ -1,75 +1,108 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A recording that needs no files: a simulated D435 flies through the built-in room and along its corridor."""
+"""Recordings that need no files: a simulated D435 in a built-in scene."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox.errors import SourceError, did_you_mean
+from stereovox import registry
+from stereovox.errors import ConfigError, SourceError
 from stereovox.frame import Frame, Reason
-from stereovox.geometry import Transform, look_at
+from stereovox.geometry import Transform, inverse
+from stereovox.sources import parameters
 from stereovox.sources.base import Source
-from stereovox.sources.d435 import D435, classify
-from stereovox.sources.room import SHIFT, room
+from stereovox.sources.d435 import D435, classify, depth_camera
 from stereovox.sources.scene import Scene
+from stereovox.sources.stage import Face, Stage, one_of, within
 
-SCENES: dict[str, Callable[[], Scene]] = {"room": room}
-FRAMES = 240
-PERIOD_NS = 33_333_333
-"""Time between frames: 30 Hz."""
-WAYPOINTS = np.array([
-    # eye x, y, z         looks at x, y, z
-    [4.90, -1.55, 1.30, 2.20, -2.40, 0.50],
-    [4.30, -1.30, 1.30, 0.60, -2.00, 0.55],
-    [3.50, -0.95, 1.32, 0.40, -0.60, 0.60],
-    [2.70, -0.75, 1.34, 0.20, 0.80, 0.80],
-    [1.90, -0.75, 1.34, 0.60, 2.00, 0.95],
-    [1.30, -0.65, 1.34, 1.90, 2.60, 0.95],
-    [1.10, -0.35, 1.34, 3.00, 2.20, 0.65],
-    [1.30, -0.55, 1.34, 3.90, 1.00, 0.55],
-    [1.90, -0.85, 1.34, 4.60, -1.20, 0.50],
-    [2.60, -0.95, 1.36, 5.30, -1.90, 0.70],
-    [3.30, -0.75, 1.40, 6.00, -0.20, 0.85],
-    [3.90, -0.40, 1.42, 5.10, 2.00, 0.95],
-    [4.50, 0.10, 1.40, 6.20, 2.00, 1.10],
-    [5.20, 0.55, 1.34, 8.00, 0.30, 1.20],
-    [5.90, 0.60, 1.30, 9.00, 0.60, 1.20],
-    [6.90, 0.62, 1.30, 10.00, 0.20, 1.10],
-    [8.00, 0.75, 1.32, 10.80, -0.10, 1.05],
-    [9.20, 0.85, 1.34, 11.90, 0.60, 1.15],
-    [10.40, 0.85, 1.34, 13.00, 1.20, 1.20],
-    [11.60, 0.70, 1.32, 14.30, 0.60, 1.50],
-    [12.90, 0.55, 1.30, 15.80, 0.20, 1.30],
-    [14.30, 0.50, 1.28, 17.20, 0.80, 0.90],
-    [15.60, 0.55, 1.28, 18.40, 0.60, 1.00],
-])  # fmt: skip
-"""Plan coordinates in metres, at equal steps of time; the path runs smoothly through them."""
+SCENES = {
+    "room": "stereovox.sources.room_flight:stage",
+    "box": "stereovox.sources.boxes:stage",
+    "aisle": "stereovox.sources.aisle:stage",
+    "apartment": "stereovox.sources.apartment:stage",
+    "wall": "stereovox.sources.walls:stage",
+    "flight": "stereovox.sources.flight:stage",
+}
+"""Functions that return a `Stage`; their keyword arguments and defaults are the scene's parameters."""
+AXES = ("world", "optical")
+
+
+@dataclass(frozen=True)
+class Options:
+    """Parameters of every simulation. Where 0 stands for "the scene's own", the scene chooses.
+
+    axes: `world` (z up) or `optical` (Chien 2020: x right, y down, z forward, origin at the first camera).
+    frames: number of frames on the same way (0: the scene's own); noise: see `Simulation`; seed: of the noise.
+    image_width: pixels (0: the scene's own, mostly 848), the height follows; the field of view stays.
+    barrel, toe_in (degrees), subpixel, farthest (metres, 0: the scene's own): see `D435`.
+    """
+
+    axes: str = "world"
+    frames: int = 0
+    noise: bool = True
+    seed: int = 0
+    image_width: int = 0
+    barrel: float = 0.0
+    toe_in: float = 0.0
+    subpixel: float = D435.subpixel
+    farthest: float = 0.0
+
+    def __post_init__(self) -> None:
+        one_of("axes", self.axes, AXES)
+        within("frames", self.frames, 0, 10_000_000)
+        within("seed", self.seed, 0, 2**63)
+        if self.image_width:
+            within("image_width", self.image_width, 16, 1920)
+        within("barrel", self.barrel, -0.5, 1)
+        within("toe_in", self.toe_in, -1, 1)
+        within("subpixel", self.subpixel, 0, 5)
+        within("farthest", self.farthest, 0, 65)
 
 
 class Simulation(Source):
-    """Frames of a simulated D435 in a built-in scene; world z up, x forward, y left, metres.
+    """Frames of a simulated D435 in a built-in scene.
 
-    location: `sim:room`. Every frame can be asked for by itself and is always the same for the same `seed`.
+    location: `sim:SCENE`, or with parameters `sim:SCENE?key=value&key=value`:
+
+        sim:room                                    furnished room and corridor (the demo)
+        sim:box?size=large|small&distance=2&x=0&y=0&wall=4.1        a box before a wall; the camera stands
+        sim:aisle?length=12&width=1.27&speed=0       a narrow aisle; the camera stands, or walks at `speed`
+        sim:apartment?speed=0.8                     six rooms, scanned by hand
+        sim:wall?distance=1.4&tilt=0&turn=0         a flat wall that fills the view
+        sim:flight?length=2000&speed=5              out and back along the same hall
+
+    The scene functions' docstrings tell their parameters, `Options` those of every scene. World: z up, x forward, y
+    left, metres; with `axes=optical` x right, y down, z forward from the first camera. Every frame can be asked for by
+    itself and is always the same for the same `seed`.
     noise: False gives exact depth in metres (float32, inf where nothing is) without noise or holes.
-    Raises SourceError for an unknown scene.
+    frames: how many frames are taken on the whole way; None leaves it to the scene.
+    Raises SourceError, one line, for an unknown scene or parameter and for values out of range.
     """
 
-    layout = "simulation (sim:room)"
+    layout = f"simulation ({', '.join(f'sim:{name}' for name in SCENES)})"
 
-    def __init__(self, location: str | Path = "sim:room", *, noise: bool = True, frames: int = FRAMES, seed: int = 0):
-        scene = str(location).removeprefix("sim:")
-        if scene not in SCENES:
-            raise SourceError(f"{location}: no built-in scene '{scene}'{did_you_mean(scene, SCENES)}; use sim:room")
-        self.name = f"sim:{scene}"
-        self.device = D435()
+    def __init__(
+        self, location: str | Path = "sim:room", *, noise: bool = True, frames: int | None = None, seed: int = 0
+    ):
+        self.name = str(location)
+        given = {"noise": noise, "frames": frames or 0, "seed": seed}
+        try:
+            self.options, stage = _read(self.name.removeprefix("sim:"), given)
+        except (SourceError, ConfigError) as error:
+            raise SourceError(f"{location}: {error}") from None
+        self.device = _device(stage.device, self.options)
         self.camera = self.device.camera
-        self.noise, self.seed = noise, seed
-        self._frames = frames
+        self.noise, self.seed = self.options.noise, self.options.seed
+        self.period_ns = round(1e9 / stage.hz)
+        self._world = stage
+        self._frames = self.options.frames or stage.frames
+        self._seen: tuple[Transform, NDArray[np.float32]] | None = None
 
     @classmethod
     def recognises(cls, location: str | Path) -> bool:
@@ -77,9 +110,20 @@ class Simulation(Source):
         return str(location).startswith("sim:")
 
     @cached_property
+    def stage(self) -> Stage:
+        """The scene and the way through it, in the frame of the poses."""
+        first = self._world.path(0.0)
+        return self._world if self.options.axes == "world" else self._world.moved(inverse(first))
+
+    @property
     def scene(self) -> Scene:
-        """What the camera flies through."""
-        return SCENES[self.name.removeprefix("sim:")]()
+        """What the camera flies through, in the frame of the poses."""
+        return self.stage.scene
+
+    @property
+    def faces(self) -> tuple[Face, ...]:
+        """Flat surfaces by which a map can be judged, in the frame of the poses; empty for `sim:room`."""
+        return self.stage.faces
 
     def __len__(self) -> int:
         return self._frames
@@ -90,10 +134,12 @@ class Simulation(Source):
         return self.observe(i, self.true_depth(i))
 
     def true_depth(self, i: int) -> NDArray[np.float32]:
-        """Return the exact depth (height, width) in metres along the optical axis, inf where nothing is."""
-        T = self.pose(i)
-        directions = self._directions @ T[:3, :3].T.astype(np.float32)
-        return self.scene.cast(T[:3, 3], directions).reshape(self.camera.height, self.camera.width)
+        """Return the exact depth (height, width) in metres along the optical axis, inf where nothing is; read only."""
+        T = self._world.path(self._share(i))  # the frame of the poses must not change the image
+        seen = self._seen
+        if seen is None or not np.array_equal(seen[0], T):
+            seen = self._seen = (T, self._cast(T))  # a camera that stands looks once
+        return seen[1]
 
     def observe(self, i: int, true_depth_m: NDArray[np.float32]) -> Frame:
         """Return what the camera delivers as frame `i` where `true_depth_m` is the exact depth (height, width)."""
@@ -101,26 +147,54 @@ class Simulation(Source):
             depth, reason = self.device.measure(true_depth_m, [self.seed, i])
             scale = 0.001
         else:
-            depth, scale = true_depth_m, 1.0
+            depth, scale = self.device.distorted(true_depth_m), 1.0
             reason = classify(depth, self.device.nearest, self.device.farthest)
             depth = np.where(reason == Reason.VALID, depth, np.float32(0))
-        return Frame(depth, self.camera, self.pose(i), i * PERIOD_NS, scale, reason, f"{self.name} frame {i}")
+        return Frame(depth, self.camera, self.pose(i), i * self.period_ns, scale, reason, f"{self.name} frame {i}")
 
     def pose(self, i: int) -> Transform:
         """Return T_world_camera (4, 4) of frame `i`; raises IndexError beyond the last."""
         if not 0 <= i < len(self):
             raise IndexError(f"{self.name} has frames 0 to {len(self) - 1}, not {i}")
-        point = self._path(i / max(len(self) - 1, 1))
-        return look_at(point[:3], point[3:])
+        return self.stage.path(self._share(i))
 
-    @cached_property
-    def _path(self) -> Callable[[float], NDArray[np.float64]]:
-        from scipy.interpolate import CubicSpline
+    def upright_pose_at(self, stamp_ns: float) -> Transform:
+        """Return T_world_camera (4, 4) at any time, world z up whatever `axes` says; it stands before and after."""
+        last = max(len(self) - 1, 1) * self.period_ns
+        return self._world.path(min(max(stamp_ns / last, 0.0), 1.0))
 
-        return CubicSpline(np.linspace(0, 1, len(WAYPOINTS)), WAYPOINTS + np.tile(SHIFT, 2))
+    def _share(self, i: int) -> float:
+        return i / max(len(self) - 1, 1)
+
+    def _cast(self, T_world_camera: Transform) -> NDArray[np.float32]:
+        directions = self._directions @ T_world_camera[:3, :3].T.astype(np.float32)
+        depth = self._world.scene.cast(T_world_camera[:3, 3], directions)
+        depth.setflags(write=False)
+        return depth.reshape(self.camera.height, self.camera.width)
 
     @cached_property
     def _directions(self) -> NDArray[np.float32]:
         x, y = self.camera.ray_slopes()
         grid = np.stack(np.broadcast_arrays(x[None, :], y[:, None], np.float32(1)), axis=-1)
         return np.ascontiguousarray(grid.reshape(-1, 3))
+
+
+def _read(text: str, given: dict[str, Any]) -> tuple[Options, Stage]:
+    """Return what a location without its `sim:` asks for; `given` counts where it says nothing."""
+    name, written = parameters.split(text)
+    build = registry.find("scenes", SCENES, name)
+    own, common = parameters.defaults(build), parameters.defaults(Options)
+    values = parameters.typed(written, {**common, **own})
+    options = Options(**{**given, **{key: value for key, value in values.items() if key in common}})
+    return options, build(**{key: value for key, value in values.items() if key in own})
+
+
+def _device(own: D435, options: Options) -> D435:
+    return replace(
+        own,
+        camera=depth_camera(options.image_width) if options.image_width else own.camera,
+        farthest=options.farthest or own.farthest,
+        subpixel=options.subpixel,
+        barrel=options.barrel,
+        toe_in=float(np.radians(options.toe_in)),
+    )

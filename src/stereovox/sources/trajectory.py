@@ -1,24 +1,28 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Poses over time from text files of the TUM format, and the pose at a time between two of them."""
+"""Poses over time from text files of the TUM format, and the stamped lines of its other files."""
 
 from __future__ import annotations
 
 import math
-from bisect import bisect_left
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
-from stereovox.errors import FrameRefused, SourceError
-from stereovox.geometry import Transform, from_quaternion, interpolate
+import numpy as np
+from numpy.typing import NDArray
 
-MAX_GAP_NS = 100_000_000
-"""A pose this far (0.1 s) or further from an image, on either side, says too little about the image's own."""
+from stereovox.errors import SourceError
+from stereovox.sources.poses import Poses
+from stereovox.sources.poses import seconds_from_ns as seconds_from_ns
+
 LIMIT = 9_223_372_036
 """Seconds whose nanoseconds still fit into int64."""
+FORMAT = "stamp tx ty tz qx qy qz qw"
+StampedLine = tuple[int, str, str]
+"""Time in nanoseconds, the rest of the line, and `file:line` for messages."""
 
 
-class Trajectory:
+class Trajectory(Poses):
     """Poses in a file of lines `stamp tx ty tz qx qy qz qw`: seconds, metres, quaternion of any length but zero.
 
     Lines may be in any order; of several with one stamp the first counts. A line that has a stamp but no usable pose
@@ -27,54 +31,49 @@ class Trajectory:
     """
 
     def __init__(self, path: Path):
-        self._path = path
-        self._lines = by_time(stamped_lines(path))
-        self._stamps = [stamp_ns for stamp_ns, _, _ in self._lines]
-        if not self._lines:
-            raise SourceError(f"{path}: holds no pose; write lines 'stamp tx ty tz qx qy qz qw'")
+        lines = pose_lines(path, FORMAT)
+        numbers, faults = pose_numbers(lines, 7, FORMAT)
+        super().__init__([line[0] for line in lines], transforms(numbers), where=str(path), faults=faults)
 
-    def __len__(self) -> int:
-        return len(self._lines)
 
-    def at(self, stamp_ns: int) -> Transform:
-        """Return the pose at `stamp_ns`: a line's own, else interpolated between the neighbours before and after.
+def pose_lines(path: Path, wanted: str) -> list[StampedLine]:
+    """Return the lines of a file of poses in order of time; raises SourceError where there is none or no stamp."""
+    lines = by_time(stamped_lines(path))
+    if not lines:
+        raise SourceError(f"{path}: holds no pose; write lines '{wanted}'")
+    return lines
 
-        Raises FrameRefused: `no_pose` where one of the neighbours is missing or 0.1 s or more away, `bad_pose_file`
-        where a neighbour's line holds no pose.
-        """
-        after = bisect_left(self._stamps, stamp_ns)
-        if after < len(self._stamps) and self._stamps[after] == stamp_ns:
-            return self._pose(after)
-        self._check_gap(stamp_ns, after)
-        start, end = self._stamps[after - 1], self._stamps[after]
-        return interpolate(self._pose(after - 1), self._pose(after), (stamp_ns - start) / (end - start))
 
-    def _check_gap(self, stamp_ns: int, after: int) -> None:
-        gaps = {
-            "before": stamp_ns - self._stamps[after - 1] if after else None,
-            "after": self._stamps[after] - stamp_ns if after < len(self._stamps) else None,
-        }
-        for side, gap in gaps.items():
-            if gap is None or gap >= MAX_GAP_NS:
-                found = "there is none" if gap is None else f"the nearest is {gap / 1e9:.3f} s away"
-                wanted = f"needs a pose less than {MAX_GAP_NS / 1e9:g} s {side} {seconds_from_ns(stamp_ns)} s"
-                raise FrameRefused("no_pose", f"{self._path}: {wanted}, {found}; leave the image out or add poses")
-
-    def _pose(self, k: int) -> Transform:
-        _, rest, where = self._lines[k]
+def pose_numbers(lines: Sequence[StampedLine], count: int, wanted: str) -> tuple[NDArray[np.float64], dict[int, str]]:
+    """Return the (N, count) numbers of the lines, NaN where a line is of no use, and by stamp what is wrong there."""
+    rows, faults = np.full((len(lines), count), np.nan), {}
+    for row, (stamp_ns, rest, where) in zip(rows, lines, strict=True):
         try:
-            numbers = [float(word) for word in rest.split()]
+            row[:] = _numbers(rest, count, wanted)
         except ValueError as error:
-            raise FrameRefused("bad_pose_file", f"{where}: {error}; correct or delete the line") from None
-        if len(numbers) != 7 or not all(map(math.isfinite, numbers)):
-            raise FrameRefused("bad_pose_file", f"{where}: needs 'stamp tx ty tz qx qy qz qw'; correct or delete it")
-        if math.hypot(*numbers[3:]) < 1e-6:
-            raise FrameRefused("bad_pose_file", f"{where}: quaternion of length zero; correct or delete the line")
-        return from_quaternion(numbers[:3], numbers[3:])
+            faults[stamp_ns] = f"{where}: {error}; correct or delete the line"
+    return rows, faults
 
 
-StampedLine = tuple[int, str, str]
-"""Time in nanoseconds, the rest of the line, and `file:line` for messages."""
+def transforms(numbers: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return (N, 4, 4) motions of (N, 7) numbers tx ty tz qx qy qz qw; NaN stays NaN."""
+    x, y, z, w = (numbers[:, 3:7] / np.linalg.norm(numbers[:, 3:7], axis=1, keepdims=True)).T
+    T = np.zeros((len(numbers), 4, 4))
+    T[:, 3, 3] = 1
+    T[:, :3, 3] = numbers[:, :3]
+    T[:, :3, 0] = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + z * w), 2 * (x * z - y * w)], 1)
+    T[:, :3, 1] = np.stack([2 * (x * y - z * w), 1 - 2 * (x * x + z * z), 2 * (y * z + x * w)], 1)
+    T[:, :3, 2] = np.stack([2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)], 1)
+    return T
+
+
+def _numbers(text: str, count: int, wanted: str) -> list[float]:
+    numbers = [float(word) for word in text.split()]
+    if len(numbers) != count or not all(map(math.isfinite, numbers)):
+        raise ValueError(f"needs '{wanted}'")
+    if math.hypot(*numbers[3:7]) < 1e-6:
+        raise ValueError("quaternion of length zero")
+    return numbers
 
 
 def stamped_lines(path: Path) -> list[StampedLine]:
@@ -110,11 +109,6 @@ def ns_from_seconds(text: str) -> int:
     if not (seconds.is_finite() and -LIMIT < seconds < LIMIT):  # abs() may overflow
         raise ValueError(f"'{text}' is no time in seconds")
     return round(seconds * 1_000_000_000)
-
-
-def seconds_from_ns(stamp_ns: int) -> str:
-    """Return nanoseconds as seconds with all nine decimals."""
-    return f"{Decimal(stamp_ns).scaleb(-9):.9f}"
 
 
 def _plain(line: str) -> str:

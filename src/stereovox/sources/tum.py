@@ -6,6 +6,8 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+import numpy as np
+
 from stereovox.errors import SourceError
 from stereovox.geometry import Transform
 from stereovox.sources.folder import DepthFolder, file_names
@@ -14,20 +16,17 @@ from stereovox.sources.trajectory import StampedLine, Trajectory, by_time, ns_fr
 LIST, IMAGES, POSES = "depth.txt", "depth", "groundtruth.txt"
 
 
-class TumRgbd(DepthFolder):
-    """`depth.txt` (lines `stamp file`), else all `depth/<stamp>.png`; with `groundtruth.txt`. uint16, 5000 per metre.
+class StampedImages(DepthFolder):
+    """`depth.txt` (lines `stamp file`), else all `depth/<stamp>.png`; uint16, 5000 per metre. No poses: all are NaN.
 
-    World: that of groundtruth.txt (TUM's motion capture: z up); poses are those of the optical frame.
-    Pose: between the neighbours before and after the image's time, straight in position, even in turning; both must
-    be less than 0.1 s away (see `Trajectory`).
     Camera: `camera-intrinsics.txt` (3x3) or `calibration.txt` (fx fy cx cy) in the folder. The layout has no such file
     of its own; without one, 640x480 images get 525 525 319.5 239.5, which TUM recommends for all its sequences
     because the depth is registered to the colour image with it. Baseline 0.075 m (Kinect v1, Xtion).
     Images are in order of time, of several with one stamp the first counts; stamps are exact to the nanosecond.
-    Faults: those of `read_depth_png` and `Trajectory.at`. Raises SourceError with file and line for a bad depth.txt.
+    Faults: those of `read_depth_png`. Raises SourceError with file and line for a bad depth.txt.
     """
 
-    layout = "a TUM RGB-D folder (depth.txt or depth/*.png, with groundtruth.txt)"
+    layout = "stamped depth images (depth.txt or depth/*.png)"
     depth_scale = 1 / 5000
     baseline = 0.075
     intrinsics = (525.0, 525.0, 319.5, 239.5)
@@ -40,14 +39,12 @@ class TumRgbd(DepthFolder):
             self.notes = (f"{self.folder}: left out {len(lines) - len(self._images)} images with a stamp used before",)
         if not self._images:
             raise SourceError(f"{self.folder}: {LIST} and {IMAGES}/ name no image; give a folder that has some")
-        self._trajectory = Trajectory(self.folder / POSES)
         self._set_camera(self.folder)
 
     @classmethod
     def recognises(cls, where: str) -> bool:
-        """Tell whether `where` is a folder that has poses, and a list of depth images or a folder of them."""
-        has_images = os.path.isfile(os.path.join(where, LIST)) or os.path.isdir(os.path.join(where, IMAGES))
-        return has_images and os.path.isfile(os.path.join(where, POSES))
+        """Tell whether `where` is a folder with a list of depth images or a folder of them."""
+        return os.path.isfile(os.path.join(where, LIST)) or os.path.isdir(os.path.join(where, IMAGES))
 
     def __len__(self) -> int:
         return len(self._images)
@@ -56,6 +53,30 @@ class TumRgbd(DepthFolder):
         """Return the image file of frame `i` and its time in nanoseconds."""
         stamp_ns, name, _ = self._images[i]
         return self.folder / name, stamp_ns
+
+    def pose(self, i: int) -> Transform:
+        """Return a (4, 4) of NaN: nothing is known."""
+        return np.full((4, 4), np.nan)
+
+
+class TumRgbd(StampedImages):
+    """Stamped images (see `StampedImages`) with `groundtruth.txt`, the poses of the optical frame.
+
+    World: that of groundtruth.txt (TUM's motion capture: z up).
+    Pose: between the neighbours before and after the image's time, straight in position, even in turning; both must
+    be less than 0.1 s away. Further faults: those of `Poses.at`.
+    """
+
+    layout = "a TUM RGB-D folder (depth.txt or depth/*.png, with groundtruth.txt)"
+
+    def __init__(self, where: str | os.PathLike[str]):
+        self._trajectory = Trajectory(Path(where) / POSES)
+        super().__init__(where)
+
+    @classmethod
+    def recognises(cls, where: str) -> bool:
+        """Tell whether `where` is a folder that has poses, and a list of depth images or a folder of them."""
+        return super().recognises(where) and os.path.isfile(os.path.join(where, POSES))
 
     def pose(self, i: int) -> Transform:
         """Return T_world_camera (4, 4) at the image's time; raises FrameRefused `no_pose` or `bad_pose_file`."""

@@ -1,0 +1,160 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where a depth camera sits on a tracker, and how their clocks differ, from a recording of both.
+
+The camera's motion comes from its depth images, the tracker's from its poses. How fast both turn gives the offset of
+the clocks, whatever the extrinsics; hand-eye calibration gives rotation and translation; then all are refined together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.calibrate.clock import Offset, find_offsets
+from stereovox.calibrate.hand_eye import check_turning, hand_eye
+from stereovox.calibrate.odometry import CameraMotion, camera_motion
+from stereovox.calibrate.points import reduced_points
+from stereovox.calibrate.pose_track import PoseTrack
+from stereovox.calibrate.refine import Refined, refine, tracker_motion, usable_pairs
+from stereovox.config import load_config
+from stereovox.depth import prepare
+from stereovox.errors import FrameRefused, StereovoxError
+from stereovox.frame import Frame
+from stereovox.geometry import Transform
+from stereovox.sources import Source
+from stereovox.sources.poses import Poses
+
+FEWEST = 20
+"""Registered images with trusted poses that a calibration needs."""
+REGISTERED = 0.5
+"""Share of the images that must be registered."""
+MAX_RANGE = 5.0
+"""Metres; depth beyond is too noisy to register."""
+
+UNIQUE, SAME_S = 2.0, 0.05
+"""A second offset (further away than SAME_S seconds) must fit so many times worse."""
+
+
+@dataclass(frozen=True, eq=False)
+class PairCalibration:
+    """What was found.
+
+    T_tracker_camera: (4, 4) metres, depth camera's optical frame to the tracker's body, both in optical axes.
+    clock_offset_s: depth stamp = tracker stamp + offset, seconds.
+    offset_std_s, rotation_std_deg (3,) about the camera's axes, translation_std_m (3,) along the tracker's: standard
+        deviations. rotation_residual_deg, translation_residual_m: median misfit of a registered pair of images.
+    correlation: of the two angular speeds. images, registered, pairs: how many there were and how many counted.
+    """
+
+    T_tracker_camera: Transform
+    clock_offset_s: float
+    offset_std_s: float
+    rotation_std_deg: NDArray[np.float64]
+    translation_std_m: NDArray[np.float64]
+    rotation_residual_deg: float
+    translation_residual_m: float
+    correlation: float
+    images: int
+    registered: int
+    pairs: int
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the same with lists instead of arrays."""
+        return {key: getattr(value, "tolist", lambda value=value: value)() for key, value in vars(self).items()}
+
+
+def calibrate_pair(
+    depth: Source,
+    poses: Poses,
+    *,
+    min_confidence: float = 2.0,
+    max_speed_mps: float = 10.0,
+    max_turn_dps: float = 720.0,
+    guess_s: float = 0.0,
+    within_s: float | None = None,
+    progress: Callable[[Iterable[Frame], int], Iterable[Frame]] | None = None,
+) -> PairCalibration:
+    """Return extrinsics and clock offset of a depth camera and a tracker.
+
+    poses: T_world_tracker with the body in optical axes, on the tracker's own clock. The three limits are those of a
+    `pair.toml`. within_s: only offsets this near to `guess_s`; None: any. progress: wraps the frames as they are read.
+    Raises StereovoxError, one line, where motion or depth do not suffice or the recordings do not overlap;
+    MissingExtra without small_gicp.
+    """
+    motion = camera_motion(_clouds(depth, progress))
+    _check_depth(motion, depth)
+    track = PoseTrack(poses, min_confidence, max_speed_mps, max_turn_dps)
+    starts = (int(motion.stamps_ns[0]) - track.start_ns) / 1e9
+    between = None if within_s is None else (guess_s - starts - within_s, guess_s - starts + within_s)
+    check_turning(_rotation_vectors(motion))
+    found, correlation = _best(motion, track, find_offsets(motion, track, between))
+    return _result(found, starts, correlation, motion)
+
+
+def _best(motion: CameraMotion, track: PoseTrack, offsets: list[Offset]) -> tuple[Refined, float]:
+    """Return what fits best of all that the angular speeds allow; where a camera sits tells the false ones."""
+    tried = [(found, rough.correlation) for rough in offsets if (found := _refined(motion, track, rough.seconds))]
+    if not tried:
+        raise StereovoxError(f"poses: fewer than {FEWEST} images have trusted poses; record for longer, or slower")
+    tried.sort(key=lambda one: one[0].misfit)
+    if len(tried) > 1 and tried[1][0].misfit < UNIQUE * tried[0][0].misfit:
+        apart = abs(tried[1][0].offset - tried[0][0].offset)
+        if apart > SAME_S:
+            found = f"two offsets {apart:.2f} s apart fit equally well"
+            raise StereovoxError(f"clocks: {found}; turn irregularly, or allow fewer with --within")
+    return tried[0]
+
+
+def _refined(motion: CameraMotion, track: PoseTrack, offset: float) -> Refined | None:
+    pairs = usable_pairs(motion, track, offset)
+    if len(pairs.first) < FEWEST:
+        return None
+    return refine(pairs, track, offset, hand_eye(tracker_motion(pairs, track, offset), pairs.T_first_second))
+
+
+def _clouds(
+    depth: Source, progress: Callable[[Iterable[Frame], int], Iterable[Frame]] | None
+) -> Iterator[tuple[int, NDArray[np.float64]]]:
+    """Yield time and points of every image that can be used; the poses of the source do not count."""
+    config = load_config("default", max_range=2 * MAX_RANGE)
+    for frame in progress(depth, len(depth)) if progress else depth:
+        try:
+            image = prepare(replace(frame, T_world_sensor=np.eye(4)), config)
+            yield frame.stamp_ns, reduced_points(image, MAX_RANGE)
+        except FrameRefused:
+            continue
+
+
+def _check_depth(motion: CameraMotion, depth: Source) -> None:
+    registered = int((motion.reference >= 0).sum())
+    if registered < max(FEWEST, REGISTERED * len(depth)):
+        raise StereovoxError(
+            f"{depth.name}: only {registered} of {len(depth)} depth images could be registered with another; film "
+            f"corners and furniture within {MAX_RANGE:g} m, for at least some seconds, and move slowly"
+        )
+
+
+def _rotation_vectors(motion: CameraMotion) -> NDArray[np.float64]:
+    from scipy.spatial.transform import Rotation
+
+    return Rotation.from_matrix(motion.T_reference_camera[motion.reference >= 0, :3, :3]).as_rotvec()
+
+
+def _result(found: Refined, starts: float, correlation: float, motion: CameraMotion) -> PairCalibration:
+    return PairCalibration(
+        T_tracker_camera=found.X,
+        clock_offset_s=found.offset + starts,
+        offset_std_s=float(found.deviations[0]),
+        rotation_std_deg=np.degrees(found.deviations[1:4]),
+        translation_std_m=found.deviations[4:],
+        rotation_residual_deg=float(np.degrees(found.residual_rotation)),
+        translation_residual_m=found.residual_translation,
+        correlation=correlation,
+        images=len(motion.stamps_ns),
+        registered=int((motion.reference >= 0).sum()),
+        pairs=found.pairs,
+    )

@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Find where a depth camera sits on a tracker, and how their clocks differ, from a recording of both.
+
+RECORDING is a folder with depth images and a tracker's poses (tracker.txt, or as its pair.toml says). Wave both for ten
+seconds or more, in a furnished room: pitch, yaw and roll by 20 degrees and more, not too fast.
+"""
+
+from __future__ import annotations
+
+import os
+from argparse import ArgumentParser, Namespace
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from stereovox.cli.terminal import command_line, say, tracked
+from stereovox.errors import StereovoxError
+
+if TYPE_CHECKING:
+    from stereovox.calibrate.pair import PairCalibration
+    from stereovox.sources.pair_file import PairSettings
+
+EXAMPLE = "stereovox calibrate pair recordings/flight --out recordings/flight/pair.toml"
+UNCERTAIN = (0.5, 0.02)
+"""Standard deviations (degrees, metres) above which the user is warned."""
+
+
+def add_arguments(parser: ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("recording", metavar="RECORDING", help="folder with depth images and a tracker's poses")
+    parser.add_argument("--out", metavar="FILE", help="pair.toml to write; without it the result is only printed")
+    parser.add_argument("--frames", metavar="A:B:S", help="only these images, as a Python slice")
+    parser.add_argument(
+        "--within", type=float, metavar="S", help="only clock offsets within S seconds of the one in pair.toml (any)"
+    )
+
+
+def run(arguments: Namespace) -> dict[str, Any]:
+    """Calibrate, print the result and write it."""
+    from stereovox.calibrate.pair import calibrate_pair
+    from stereovox.sources import Selection
+    from stereovox.sources.pair import open_depth, open_poses
+
+    folder = Path(arguments.recording)
+    settings = _settings(folder)
+    if arguments.within is not None and not 0 < arguments.within < 1e9:
+        raise StereovoxError(f"--within {arguments.within:g}: give a number of seconds above 0")
+    depth = open_depth(folder, settings)
+    for note in getattr(depth, "notes", ()):
+        say(f"note: {note}")
+    found = calibrate_pair(
+        Selection(depth, arguments.frames) if arguments.frames else depth,
+        open_poses(folder, replace(settings, clock_offset_s=0.0)),
+        min_confidence=settings.min_confidence,
+        max_speed_mps=settings.max_speed_mps,
+        max_turn_dps=settings.max_turn_dps,
+        guess_s=settings.clock_offset_s,
+        within_s=arguments.within,
+        progress=lambda frames, total: tracked(frames, total, "registering images"),
+    )
+    _tell(found)
+    _write(arguments, folder, settings, found)
+    return {**found.as_dict(), "out": arguments.out}
+
+
+def _settings(folder: Path) -> PairSettings:
+    from stereovox.sources.pair_file import FILE, PairSettings, read_pair
+
+    file, usual = folder / FILE, PairSettings()
+    if os.path.isfile(file):
+        return read_pair(file)
+    if not os.path.isfile(folder / usual.poses):
+        raise StereovoxError(f"{folder}: neither {FILE} nor {usual.poses} in it; put the tracker's poses there")
+    return usual
+
+
+def _tell(found: PairCalibration) -> None:
+    import numpy as np
+
+    from stereovox.geometry import rotation_vector
+
+    turn = np.degrees(rotation_vector(found.T_tracker_camera[:3, :3]))
+    place = 1000 * found.T_tracker_camera[:3, 3]
+    say(f"clock_offset_s {found.clock_offset_s:.4f}, standard deviation {1000 * found.offset_std_s:.1f} ms")
+    say(f"camera seen from the tracker (x right, y down, z forward): {_three(place, '+.1f')} mm,")
+    say(f"  standard deviations {_three(1000 * found.translation_std_m, '.1f')} mm")
+    say(f"  turned by {_three(turn, '+.2f')} deg, standard deviations {_three(found.rotation_std_deg, '.2f')} deg")
+    fit = f"{found.rotation_residual_deg:.2f} deg and {1000 * found.translation_residual_m:.1f} mm"
+    say(f"{found.pairs} of {found.images} images count; camera and tracker agree within {fit} (median)")
+    degrees, metres = UNCERTAIN
+    if found.rotation_std_deg.max() > degrees or found.translation_std_m.max() > metres:
+        say("note: this is uncertain; record for longer, with more pitch, yaw and roll, near corners and furniture")
+
+
+def _three(numbers: Any, form: str) -> str:
+    return " ".join(f"{name} {number:{form}}" for name, number in zip("xyz", numbers, strict=True))
+
+
+def _write(arguments: Namespace, folder: Path, settings: PairSettings, found: PairCalibration) -> None:
+    from stereovox.products.files import replacing
+    from stereovox.sources.pair_file import FILE, pair_text
+
+    if not arguments.out:
+        say(f"nothing is written; keep it with: {command_line('calibrate', 'pair', folder, '--out', folder / FILE)}")
+        return
+    out = Path(arguments.out)
+    paths = {key: os.path.relpath(folder / getattr(settings, key), out.parent) for key in ("depth", "poses")}
+    result = {"T_tracker_camera": found.T_tracker_camera, "clock_offset_s": found.clock_offset_s}
+    remarks = (
+        f"T_tracker_camera and clock_offset_s: stereovox calibrate pair, {found.pairs} of {found.images} images",
+        f"standard deviations: {1000 * found.offset_std_s:.2g} ms, {found.rotation_std_deg.max():.2g} deg, "
+        f"{1000 * found.translation_std_m.max():.2g} mm",
+    )
+    with replacing(out) as file:
+        file.write(pair_text(replace(settings, **paths, **result), remarks).encode())
+    say(f"saved {out}")

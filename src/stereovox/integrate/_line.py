@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Kernel of line drawing: one sample in each layer of cells along the ray's longest axis (Chien 2020, Alg 1).
+
+Thinner than ray casting: a ray skips the cells it only grazes.
+"""
+
+import numpy as np
+
+from stereovox._jit import cell, kernel
+from stereovox.integrate._cells import NO_RETURN, ONE, ZERO, bits_of, float_of
+from stereovox.integrate._hits import _row_rays
+from stereovox.integrate._lanes import aim, aim_at_hits, evidence, give, pack, weighted
+
+
+@kernel
+def draw(depth_m, view, table, look_up, weight, lanes, pool_table, coords, count, values, first_row, last_row):
+    """Add the evidence of all lines of rows first_row..last_row to an empty pool; arguments as in `_ray.cast`."""
+    size = ONE / view.voxel_size
+    position = view.position * size
+    together = lanes.depth.size
+    for v in range(first_row, last_row):
+        ray = _row_rays(view.rotation, view.rows[v], size)
+        for u in range(0, depth_m.shape[1], together):
+            columns = view.columns[u : u + together]
+            free_to = aim(depth_m[v, u : u + together], columns, ray, position, view, table, lanes)
+            if free_to >= NO_RETURN:
+                continue
+            _start(columns, ray, lanes)
+            number, reached, going = ZERO, ZERO, True
+            while going:
+                if reached < free_to:  # plain free space needs no table
+                    reached, going = _step(lanes, number, position, False, table, look_up, weight)
+                else:
+                    reached, going = _step(lanes, number, position, True, table, look_up, weight)
+                number += ONE
+                if not give(lanes, weight, pool_table, coords, count, values):
+                    return False
+            aim_at_hits(lanes, table, weight)
+            if not give(lanes, weight, pool_table, coords, count, values):
+                return False
+    return True
+
+
+@cell
+def _start(columns, ray, lanes):
+    """Set each ray's cells a metre of depth, and the depth that one cell along its longest axis takes."""
+    last = columns.size - 1
+    for i in range(lanes.depth.size):
+        column = columns[min(i, last)]
+        dx, dy, dz = ray[0] * column + ray[1], ray[2] * column + ray[3], ray[4] * column + ray[5]
+        lanes.per_x[i], lanes.per_y[i], lanes.per_z[i] = dx, dy, dz
+        lanes.entered[i] = ONE / max(max(abs(dx), abs(dy)), abs(dz))
+
+
+@cell
+def _step(lanes, number, position, near, table, look_up, weight):
+    """Take the evidence on the cells at sample `number` of every lane; see `_ray._step`."""
+    px, py, pz = position[0], position[1], position[2]
+    width = table.clear.shape[1]
+    reached = np.int32(0)  # the bits of a float that is not negative: those can be compared many at once
+    for i in range(lanes.depth.size):
+        depth, end = number * lanes.entered[i], lanes.end[i]
+        x = np.int32(np.floor(depth * lanes.per_x[i] + px))
+        y = np.int32(np.floor(depth * lanes.per_y[i] + py))
+        z = np.int32(np.floor(depth * lanes.per_z[i] + pz))
+        key = pack(x, y, z, lanes.key)
+        if near:
+            e = evidence(depth, lanes.depth[i], lanes.row[i], lanes.columns[i], look_up, width, weight)
+            counts = (depth <= end) & (key != lanes.hit[i])
+        else:
+            e = weighted(table.free, depth, weight)
+            counts = depth <= end
+        lanes.key[i] = key
+        lanes.gain[i] = e if counts else np.int32(0)
+        following = depth + lanes.entered[i]
+        reached = max(reached, bits_of(following if following <= end else ZERO))
+    return float_of(reached), reached > 0

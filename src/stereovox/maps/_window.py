@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Kernels of the rolling map: forget what left the window, cut evidence at its border."""
+
+from stereovox._jit import cell, kernel
+from stereovox.maps._cells import find
+
+
+@kernel
+def vacate(table, coords, cells, flags, fill, slab_low, slab_high, low, high, gone):
+    """Set the cells of a slab that lie outside the window to `fill`; list blocks wholly outside in `gone`.
+
+    slab_low, slab_high, low, high: (3,) int32 first cell and first cell beyond, of the slab and of the window.
+    Returns the number of blocks listed; they are left as they are.
+    """
+    n = 0
+    for bx in range(slab_low[0] >> 3, ((slab_high[0] - 1) >> 3) + 1):
+        for by in range(slab_low[1] >> 3, ((slab_high[1] - 1) >> 3) + 1):
+            for bz in range(slab_low[2] >> 3, ((slab_high[2] - 1) >> 3) + 1):
+                b = find(table, coords, bx, by, bz)
+                if b < 0:
+                    continue
+                if _disjoint(bx, by, bz, low, high):
+                    gone[n, 0], gone[n, 1], gone[n, 2] = bx, by, bz
+                    n += 1
+                else:
+                    flags[b] = 0
+                    _keep_inside(bx, by, bz, low, high, cells[b], fill)
+    return n
+
+
+@kernel
+def clip(coords, values, uniform, uniform_value, low, high, out_coords, out_values, out_uniform):
+    """Copy the evidence on cells of the window [low, high); return the number of blocks, and of uniform blocks.
+
+    Uniform blocks on the border become ordinary ones.
+    """
+    n = 0
+    for i in range(coords.shape[0]):
+        x, y, z = coords[i, 0], coords[i, 1], coords[i, 2]
+        if not _disjoint(x, y, z, low, high):
+            out_coords[n] = coords[i]
+            out_values[n] = values[i]
+            if not _contained(x, y, z, low, high):
+                _keep_inside(x, y, z, low, high, out_values[n], 0)
+            n += 1
+    whole = 0
+    for i in range(uniform.shape[0]):
+        x, y, z = uniform[i, 0], uniform[i, 1], uniform[i, 2]
+        if _contained(x, y, z, low, high):
+            out_uniform[whole] = uniform[i]
+            whole += 1
+        elif not _disjoint(x, y, z, low, high):
+            out_coords[n] = uniform[i]
+            out_values[n] = uniform_value
+            _keep_inside(x, y, z, low, high, out_values[n], 0)
+            n += 1
+    return n, whole
+
+
+@cell
+def _disjoint(x, y, z, low, high):
+    below = (x + 1) * 8 <= low[0] or (y + 1) * 8 <= low[1] or (z + 1) * 8 <= low[2]
+    return below or x * 8 >= high[0] or y * 8 >= high[1] or z * 8 >= high[2]
+
+
+@cell
+def _contained(x, y, z, low, high):
+    above = x * 8 >= low[0] and y * 8 >= low[1] and z * 8 >= low[2]
+    return above and (x + 1) * 8 <= high[0] and (y + 1) * 8 <= high[1] and (z + 1) * 8 <= high[2]
+
+
+@cell
+def _keep_inside(x, y, z, low, high, block, fill):
+    """Set the cells of block (x, y, z) outside [low, high) to `fill`."""
+    for i in range(8):
+        for j in range(8):
+            outside = x * 8 + i < low[0] or x * 8 + i >= high[0] or y * 8 + j < low[1] or y * 8 + j >= high[1]
+            for k in range(8):
+                if outside or z * 8 + k < low[2] or z * 8 + k >= high[2]:
+                    block[64 * i + 8 * j + k] = fill

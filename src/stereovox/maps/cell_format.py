@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a cell's log-odds are kept in: thousandths in 16 bits, or the byte of Chien 2020."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from math import log
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stereovox.config import MapConfig
+
+BYTE_THRESHOLD = 180
+"""Byte above which Chien 2020 (3.5) shows a cell as occupied; it is taken to stand for a probability of 0.7."""
+
+
+@dataclass(frozen=True)
+class CellFormat:
+    """Stored number = `unknown` + log-odds * `per_log_odds`, rounded and cut to the type's range."""
+
+    dtype: np.dtype
+    unknown: int
+    per_log_odds: float
+
+    def stored(self, log_odds: ArrayLike) -> NDArray[np.int32]:
+        """Return the stored numbers of log-odds."""
+        limits = np.iinfo(self.dtype)
+        number = self.unknown + np.rint(np.asarray(log_odds, float) * self.per_log_odds)
+        return np.clip(number, limits.min, limits.max).astype(np.int32)
+
+    def log_odds(self, stored: NDArray[np.integer]) -> NDArray[np.float32]:
+        """Return the log-odds of stored numbers."""
+        return (stored.astype(np.float32) - np.float32(self.unknown)) / np.float32(self.per_log_odds)
+
+
+@dataclass(frozen=True)
+class CellRules:
+    """The `map` section of the settings in stored numbers.
+
+    A cell is free below `free_below`, occupied above `occupied_above`; it never leaves [lowest, highest].
+    """
+
+    config: MapConfig
+
+    @cached_property
+    def format(self) -> CellFormat:
+        """How numbers are stored."""
+        return FORMATS[self.config.cell]
+
+    @cached_property
+    def lowest(self) -> np.int32:
+        """Smallest stored number."""
+        return np.int32(self.format.stored(self.config.log_odds_min))
+
+    @cached_property
+    def highest(self) -> np.int32:
+        """Largest stored number."""
+        return np.int32(self.format.stored(self.config.log_odds_max))
+
+    @cached_property
+    def free_below(self) -> float:
+        """Stored numbers below it are free."""
+        return self._exact(self.config.free_below)
+
+    @cached_property
+    def occupied_above(self) -> float:
+        """Stored numbers above it are occupied."""
+        return self._exact(self.config.occupied_above)
+
+    def _exact(self, p: float) -> float:
+        return self.format.unknown + round(log(p / (1 - p)) * self.format.per_log_odds, 6)
+
+
+FORMATS = {
+    "int16": CellFormat(np.dtype(np.int16), 0, 1000.0),
+    "uint8": CellFormat(np.dtype(np.uint8), 127, (BYTE_THRESHOLD - 127) / log(0.7 / 0.3)),
+}

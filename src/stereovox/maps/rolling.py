@@ -1,0 +1,197 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A map in a window that moves with the camera: bounded memory, the far past dropped or kept in tiles on disk."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.config import Config
+from stereovox.errors import ConfigError
+from stereovox.frame import Viewpoint
+from stereovox.maps import _window
+from stereovox.maps.blocks import CELLS, SIDE, BlockPool
+from stereovox.maps.evidence import Evidence
+from stereovox.maps.tiles import BLOCKS, TILE, Tile, TileStore, blocks_of, slabs_of
+from stereovox.maps.voxel_map import VoxelMap
+from stereovox.maps.window import Box, Window, coarser, most_touched, without
+
+
+class RollingMap(VoxelMap):
+    """A map whose cells are updated only within a window (Chien 2020, 3.6: map shifting).
+
+    With `window.outside = "drop"` cells that leave become unknown; with "keep" they go to tiles on disk (`tiles`: the
+    folder, a temporary one by default) and come back with the window. All memory is taken at the start:
+    `memory_bytes` never changes.
+    """
+
+    def __init__(self, config: Config, tiles: Path | None = None):
+        super().__init__(config)
+        self._window = Window(config)
+        self._store = TileStore(self._format, tiles) if config.window.outside == "keep" else None
+        unit = TILE if self._store else SIDE
+        capacity = most_touched(self._window.largest, unit) * (unit // SIDE) ** 3
+        self._pool = BlockPool(self._format.dtype, capacity, self._format.unknown)
+        self._earlier: VoxelMap | None = None
+
+    @property
+    def window(self) -> NDArray[np.float64] | None:
+        """Lowest and highest corner (2, 3) of the window in metres, None before the first frame."""
+        return None if self._window.box is None else np.array(self._window.box) * self.voxel_size
+
+    @property
+    def memory_bytes(self) -> int:
+        """Bytes of the whole window, full or empty."""
+        pool = self._pool
+        return sum(array.nbytes for array in (pool.coords, pool.values, pool.flags, pool.table))
+
+    @property
+    def store(self) -> TileStore | None:
+        """Where cells outside the window are kept, if they are."""
+        return self._store
+
+    def go_on_with(self, earlier: VoxelMap) -> None:
+        """Start from the cells of a map made before; they enter when the window is placed.
+
+        Raises ConfigError when what the map says of its window cannot be understood.
+        """
+        self.frames, self.frames_refused = earlier.frames, earlier.frames_refused
+        self.recording, self.viewpoint = earlier.recording, earlier.viewpoint
+        self._earlier = earlier
+        if earlier.window_state is not None and earlier.config.window == self.config.window:
+            try:
+                self._window.restore(earlier.window_state)
+            except (KeyError, TypeError, ValueError) as error:
+                raise ConfigError(f"cannot go on: the map's window is damaged ({error}); make the map anew") from None
+            self._take_over()
+
+    def look_from(self, viewpoint: Viewpoint) -> None:
+        """Remember where the camera stands and move the window after it."""
+        super().look_from(viewpoint)
+        before = self._window.box
+        position = viewpoint.T_world_camera[:3, 3].tolist()
+        now = self._window.follow(position, viewpoint.stamp_ns)
+        self.window_state = self._window.state
+        if before is None:
+            self._take_over()
+        elif now != before:
+            self._move(before, now)
+
+    def add(self, evidence: Evidence) -> int:
+        """Add what one frame says about the cells of the window; return the number of cells whose value changed."""
+        return super().add(self._within(evidence))
+
+    def slabs(self) -> Iterator[tuple[NDArray[np.int32], NDArray[np.integer]]]:
+        """Yield all blocks, those on disk with them, piece by piece in ascending order."""
+        if self._store is None:
+            yield from super().slabs()
+            return
+        n = len(self._pool)
+        here = {tuple(tile) for tile in np.unique(self._pool.coords[:n] // BLOCKS, axis=0).tolist()}
+        empty = True
+        for slab in slabs_of(sorted(here | set(self._store.tiles()))):
+            parts = [self._blocks_of(tile) if tile in here else self._store.get(tile) for tile in slab]
+            coords, cells = (np.concatenate(part) for part in zip(*parts, strict=True))
+            order = np.lexsort(coords.T[::-1])
+            yield coords[order], cells[order]
+            empty = False
+        if empty:
+            yield from super().slabs()
+
+    def close(self) -> None:
+        """Remove the tiles on disk; save the map before."""
+        if self._store:
+            self._store.close()
+
+    def _make_room(self, blocks: int) -> None:
+        """All the room the window can need was made at the start."""
+
+    def _within(self, evidence: Evidence) -> Evidence:
+        assert self._window.box is not None
+        low, high = (np.array(corner, np.int32) for corner in self._window.box)
+        n, m = len(evidence.coords), len(evidence.uniform)
+        coords, values = np.empty((n + m, 3), np.int32), np.empty((n + m, CELLS), np.int16)
+        uniform = np.empty((m, 3), np.int32)
+        kept, whole = _window.clip(
+            evidence.coords, evidence.values, evidence.uniform, np.int16(evidence.uniform_value),
+            low, high, coords, values, uniform,
+        )  # fmt: skip
+        return Evidence(coords[:kept], values[:kept], uniform[:whole], evidence.uniform_value)
+
+    def _move(self, before: Box, now: Box) -> None:
+        if self._store is None:
+            for slab in without(before, now):
+                self._drop(slab, now)
+            return
+        tiles_before, tiles_now = coarser(before, TILE), coarser(now, TILE)
+        for tile in _listed(tiles_before, tiles_now):
+            self._put_away(tile)
+        for tile in _listed(tiles_now, tiles_before):
+            self._bring_back(tile)
+
+    def _drop(self, slab: Box, now: Box) -> None:
+        pool = self._pool
+        corners = (np.array(corner, np.int32) for corner in (*slab, *now))
+        gone = np.empty((most_touched_by(slab), 3), np.int32)
+        number = _window.vacate(pool.table, pool.coords, pool.values, pool.flags, pool.fill, *corners, gone)
+        pool.remove(gone[:number])
+
+    def _put_away(self, tile: Tile) -> None:
+        coords, cells = self._blocks_of(tile)
+        if len(coords) and self._store is not None:
+            self._store.put(tile, coords, cells)
+            self._pool.remove(coords)
+
+    def _bring_back(self, tile: Tile) -> None:
+        if self._store is not None and tile in self._store:
+            self.insert(*self._store.get(tile))
+
+    def _blocks_of(self, tile: Tile) -> tuple[NDArray[np.int32], NDArray[np.integer]]:
+        coords = blocks_of(tile)
+        places = self._pool.find(coords)
+        return coords[places >= 0], self._pool.values[places[places >= 0]]
+
+    def _take_over(self) -> None:
+        """Put the cells of an earlier map where they belong: into the window, or to the tiles, or nowhere."""
+        if self._earlier is None or self._window.box is None:
+            return
+        coords, cells = self._earlier.blocks()
+        self._earlier = None
+        unit = TILE if self._store else SIDE
+        low, high = np.array(coarser(self._window.box, unit)) * (unit // SIDE)
+        inside = ((coords >= low) & (coords < high)).all(axis=1)
+        self.insert(coords[inside], cells[inside])
+        self._keep_others(coords[~inside], cells[~inside])
+        if self._store is None:
+            self._clear_borders()
+
+    def _keep_others(self, coords: NDArray[np.int32], cells: NDArray[np.integer]) -> None:
+        if self._store is None or not len(coords):
+            return
+        tiles, of_block = np.unique(coords // BLOCKS, axis=0, return_inverse=True)
+        for n, tile in enumerate(tiles.tolist()):
+            mine = of_block.ravel() == n
+            self._store.put(tuple(tile), coords[mine], cells[mine])
+
+    def _clear_borders(self) -> None:
+        assert self._window.box is not None
+        blocks = coarser(self._window.box, SIDE)
+        around = tuple(tuple(SIDE * x for x in corner) for corner in blocks)
+        for slab in without(around, self._window.box):  # pyright: ignore
+            self._drop(slab, self._window.box)
+
+
+def most_touched_by(box: Box) -> int:
+    """Return how many blocks a box of cells touches."""
+    low, high = coarser(box, SIDE)
+    return (high[0] - low[0]) * (high[1] - low[1]) * (high[2] - low[2])
+
+
+def _listed(box: Box, other: Box) -> Iterator[Tile]:
+    """Yield the tiles of `box` that are not in `other`."""
+    for low, high in without(box, other):
+        yield from product(*(range(a, b) for a, b in zip(low, high, strict=True)))  # pyright: ignore

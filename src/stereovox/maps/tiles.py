@@ -1,0 +1,146 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Cells that left a window, in tiles on disk: one Zarr v3 array without practical bounds, one tile a chunk.
+
+A background thread writes, so that mapping does not wait for the disk; what is still to be written is bounded.
+"""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+import weakref
+from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.errors import MapFileError
+from stereovox.maps.blocks import CELLS, SIDE
+from stereovox.maps.cell_format import CellFormat
+
+BLOCKS = 4
+"""Blocks along each side of a tile."""
+TILE = BLOCKS * SIDE
+"""Cells along each side of a tile."""
+OFFSET = 1 << 30
+"""Cell 0 stands here in the array: Zarr knows no negative indices."""
+WAITING = 128
+"""Tiles that may wait to be written; one more and mapping waits."""
+
+Tile = tuple[int, int, int]
+
+
+class TileStore:
+    """Tiles of 32x32x32 cells by their coordinates (cell index // 32).
+
+    folder: kept and used if given, it must be empty or not exist; else a temporary one that goes with this object.
+    Raises MapFileError where the folder cannot be used.
+    """
+
+    def __init__(self, cell_format: CellFormat, folder: Path | None = None):
+        self._format = cell_format
+        self.folder = Path(tempfile.mkdtemp(prefix="stereovox-tiles-")) if folder is None else folder
+        self._array = self._create()
+        self._tiles: set[Tile] = set()
+        self._waiting: dict[Tile, tuple[NDArray, Future[None]]] = {}
+        self._writer = ThreadPoolExecutor(1, thread_name_prefix="stereovox-tiles")
+        if folder is None:
+            weakref.finalize(self, shutil.rmtree, self.folder, ignore_errors=True)
+
+    def __contains__(self, tile: Tile) -> bool:
+        return tile in self._tiles
+
+    def tiles(self) -> list[Tile]:
+        """Return the coordinates of all tiles, ascending."""
+        return sorted(self._tiles)
+
+    def put(self, tile: Tile, coords: NDArray[np.int32], cells: NDArray[np.integer]) -> None:
+        """Store the blocks of one tile: block coordinates (n, 3), cells (n, 512). They replace what stood there."""
+        while len(self._waiting) >= WAITING:
+            self._settle(next(iter(self._waiting)))
+        if tile in self._waiting:
+            self._settle(tile)
+        dense = np.full((BLOCKS,) * 3 + (CELLS,), self._format.unknown, self._format.dtype)
+        dense[tuple((coords - np.multiply(tile, BLOCKS)).T)] = cells
+        self._tiles.add(tile)
+        self._waiting[tile] = dense, self._writer.submit(self._write, tile, dense)
+        self._forget_written()
+
+    def get(self, tile: Tile) -> tuple[NDArray[np.int32], NDArray[np.integer]]:
+        """Return the blocks of one tile that hold any known cell: coordinates (n, 3), cells (n, 512)."""
+        waiting = self._waiting.get(tile)
+        dense = waiting[0] if waiting else self._read(tile)
+        known = (dense != self._format.unknown).any(axis=3)
+        return np.argwhere(known).astype(np.int32) + np.multiply(tile, BLOCKS).astype(np.int32), dense[known]
+
+    def flush(self) -> None:
+        """Wait until everything is on disk. Raises MapFileError where it could not be written."""
+        for tile in list(self._waiting):
+            self._settle(tile)
+
+    def close(self) -> None:
+        """Write what waits and remove the folder."""
+        self._writer.shutdown(wait=True)
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    def _create(self) -> Any:
+        import zarr
+
+        try:
+            if self.folder.exists() and any(self.folder.iterdir()):
+                raise MapFileError(f"{self.folder}: holds something, perhaps tiles of another run; move it away")
+            return zarr.create_array(
+                self.folder, shape=(2 * OFFSET,) * 3, chunks=(TILE,) * 3,
+                dtype=self._format.dtype, fill_value=self._format.unknown, zarr_format=3,
+            )  # fmt: skip
+        except OSError as error:
+            raise MapFileError(f"{self.folder}: cannot keep tiles here ({error.strerror or error})") from None
+
+    def _write(self, tile: Tile, dense: NDArray) -> None:
+        self._array[_place(tile)] = _to_cells(dense)
+
+    def _read(self, tile: Tile) -> NDArray:
+        return _to_blocks(np.asarray(self._array[_place(tile)]))
+
+    def _settle(self, tile: Tile) -> None:
+        _, written = self._waiting.pop(tile)
+        try:
+            written.result()
+        except OSError as error:
+            raise MapFileError(f"{self.folder}: a tile cannot be written ({error.strerror or error})") from None
+
+    def _forget_written(self) -> None:
+        for tile in [tile for tile, (_, written) in self._waiting.items() if written.done()]:
+            self._settle(tile)
+
+
+def blocks_of(tile: Tile) -> NDArray[np.int32]:
+    """Return the coordinates (64, 3) of a tile's blocks."""
+    return (_WITHIN + np.multiply(tile, BLOCKS)).astype(np.int32)
+
+
+def slabs_of(tiles: list[Tile]) -> Iterator[list[Tile]]:
+    """Yield ascending tiles in groups of the same x."""
+    for x in dict.fromkeys(tile[0] for tile in tiles):
+        yield [tile for tile in tiles if tile[0] == x]
+
+
+_WITHIN = np.stack(np.meshgrid(*[np.arange(BLOCKS)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def _place(tile: Tile) -> tuple[slice, ...]:
+    return tuple(slice(OFFSET + TILE * t, OFFSET + TILE * (t + 1)) for t in tile)
+
+
+def _to_cells(blocks: NDArray) -> NDArray:
+    """Return blocks (4, 4, 4, 512) as cells (32, 32, 32)."""
+    return blocks.reshape((BLOCKS,) * 3 + (SIDE,) * 3).transpose(0, 3, 1, 4, 2, 5).reshape((TILE,) * 3)
+
+
+def _to_blocks(cells: NDArray) -> NDArray:
+    """Return cells (32, 32, 32) as blocks (4, 4, 4, 512)."""
+    split = cells.reshape(BLOCKS, SIDE, BLOCKS, SIDE, BLOCKS, SIDE).transpose(0, 2, 4, 1, 3, 5)
+    return np.ascontiguousarray(split).reshape((BLOCKS,) * 3 + (CELLS,))

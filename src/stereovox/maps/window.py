@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The box of cells a rolling map covers, and how it follows the camera (Chien 2020, 3.6)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from math import ceil, exp, floor, hypot
+from typing import Any
+
+from stereovox.config import Config
+
+Cell = tuple[int, int, int]
+Box = tuple[Cell, Cell]
+"""Lowest cell, and the first cell beyond the highest, on each axis."""
+GROWTH = 8
+"""Cells by which the window grows and shrinks: so that a trembling speed does not make it breathe."""
+SMOOTHING_S = 0.3
+"""Time over which the camera's velocity is averaged."""
+JUMP_MPS = 60.0
+"""Faster than this nothing flies: the camera was carried, or its poses jumped; it then counts as standing still."""
+
+
+class Window:
+    """A box that moves by whole cells so that the camera stays within the trigger box about its centre.
+
+    The centre runs `lead_s` seconds of flight ahead of the camera, and the box is longer by `grow_s` seconds of flight
+    along each axis, up to `largest`.
+    """
+
+    def __init__(self, config: Config):
+        window, self._cell = config.window, config.voxel_size
+        assert window.size is not None
+        self._trigger, self._lead_s, self._grow_s = window.trigger, window.lead_s, window.grow_s
+        self._size = _cells(window.size, self._cell)
+        self.largest = _cells(window.largest or window.size, self._cell)
+        self._extent = self._size
+        self._velocity = (0.0, 0.0, 0.0)
+        self._last: tuple[Sequence[float], int] | None = None
+        self.box: Box | None = None
+
+    def follow(self, position: Sequence[float], stamp_ns: int) -> Box:
+        """Return the box (also as `box`) for a camera at `position` (3,) in metres at this time."""
+        self._track(position, stamp_ns)
+        self._extent = self._wanted_extent()
+        centre = [self._centre(axis, position[axis]) for axis in range(3)]
+        low = tuple(c - n // 2 for c, n in zip(centre, self._extent, strict=True))
+        self.box = (low, tuple(a + n for a, n in zip(low, self._extent, strict=True)))  # pyright: ignore
+        return self.box  # pyright: ignore
+
+    @property
+    def state(self) -> dict[str, Any] | None:
+        """What `restore` needs, as plain numbers; None before the first frame."""
+        if self.box is None or self._last is None:
+            return None
+        (position, stamp_ns), velocity = self._last, list(self._velocity)
+        return {"box": [list(c) for c in self.box], "velocity": velocity, "position": position, "stamp_ns": stamp_ns}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on where another run was. Raises KeyError, TypeError or ValueError for what is no `state`."""
+        low, high = ([int(x) for x in corner] for corner in state["box"])
+        self.box = (tuple(low), tuple(high))  # pyright: ignore
+        self._extent = tuple(b - a for a, b in zip(low, high, strict=True))  # pyright: ignore
+        self._velocity = tuple(float(v) for v in state["velocity"])  # pyright: ignore
+        self._last = [float(x) for x in state["position"]], int(state["stamp_ns"])
+
+    def _track(self, position: Sequence[float], stamp_ns: int) -> None:
+        last, self._last = self._last, (list(map(float, position)), stamp_ns)
+        if last is None or stamp_ns <= last[1]:
+            return
+        seconds = (stamp_ns - last[1]) / 1e9
+        now = [(b - a) / seconds for a, b in zip(last[0], self._last[0], strict=True)]
+        if hypot(*now) > JUMP_MPS:
+            now = self._velocity = (0.0, 0.0, 0.0)
+        share = 1 - exp(-seconds / SMOOTHING_S)
+        self._velocity = tuple(v + share * (n - v) for v, n in zip(self._velocity, now, strict=True))  # pyright: ignore
+
+    def _wanted_extent(self) -> Cell:
+        if not self._grow_s:
+            return self._size
+        sizes = zip(self._size, self.largest, self._extent, self._velocity, strict=True)
+        return tuple(self._grown(*numbers) for numbers in sizes)  # pyright: ignore
+
+    def _grown(self, least: int, most: int, now: int, velocity: float) -> int:
+        extra = abs(velocity) * self._grow_s / self._cell
+        up, down = (least + GROWTH * ceil(extra / GROWTH), least + GROWTH * ceil((extra + GROWTH / 2) / GROWTH))
+        return min(max(up, min(now, down)), most)
+
+    def _centre(self, axis: int, camera: float) -> int:
+        """Return the middle cell face of the box on one axis: moved by whole cells, no further than needed."""
+        reach = self._extent[axis] * self._cell / 2
+        lead = self._velocity[axis] * self._lead_s
+        limit = max(reach - self._trigger - self._cell, 0.0)
+        wanted = camera + min(max(lead, -limit), limit)
+        if self.box is None:
+            return round(wanted / self._cell)
+        now = (self.box[0][axis] + self.box[1][axis]) // 2
+        off = wanted - now * self._cell
+        if abs(off) <= self._trigger:
+            return now
+        cells = ceil((abs(off) - self._trigger) / self._cell - 1e-9)
+        return now + (cells if off > 0 else -cells)
+
+
+def without(box: Box, other: Box) -> Iterator[Box]:
+    """Yield boxes, at most six and none twice the same cell, that hold what of `box` is not in `other`."""
+    low, high = list(box[0]), list(box[1])
+    for axis in range(3):
+        start, end = max(other[0][axis], low[axis]), min(other[1][axis], high[axis])
+        if start >= end:
+            yield (tuple(low), tuple(high))  # pyright: ignore
+            return
+        for a, b in ((low[axis], start), (end, high[axis])):
+            if a < b:
+                piece_low, piece_high = low.copy(), high.copy()
+                piece_low[axis], piece_high[axis] = a, b
+                yield (tuple(piece_low), tuple(piece_high))  # pyright: ignore
+        low[axis], high[axis] = start, end
+
+
+def coarser(box: Box, cells: int) -> Box:
+    """Return the box of larger cells (`cells` along each side) that `box` touches."""
+    low, high = box
+    return tuple(a // cells for a in low), tuple(-(-b // cells) for b in high)  # pyright: ignore
+
+
+def most_touched(extent: Cell, cells: int) -> int:
+    """Return how many larger cells (`cells` along each side) a box of this extent touches at most, wherever it is."""
+    number = 1
+    for n in extent:
+        number *= (n - 2) // cells + 2 if n > 1 else 1
+    return number
+
+
+def _cells(size: Sequence[float], cell: float) -> Cell:
+    return tuple(max(1, floor(x / cell + 0.5)) for x in size)  # pyright: ignore

@@ -1,0 +1,86 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Recordings in one SQLite file, by any message."""
+
+from __future__ import annotations
+
+import sqlite3
+import threading
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.errors import FrameRefused, SourceError
+from stereovox.sources.bag_files import MAX_BYTES, BagFile, one_line
+from stereovox.sources.bag_messages import Wire
+
+ZSTD = b"\x28\xb5\x2f\xfd"
+
+
+class Db3File(BagFile):
+    """A ROS 2 recording in one SQLite file, as realsense-viewer and pyrealsense2 2.57 and later write it.
+
+    Read with Python's own sqlite3: neither ROS nor pyrealsense2 is needed.
+    """
+
+    def __init__(self, path: Path):
+        self.path = path
+        self._lock = threading.Lock()
+        try:
+            self._file = sqlite3.connect(
+                f"{path.resolve().as_uri()}?mode=ro&immutable=1", uri=True, check_same_thread=False
+            )
+            self._file.text_factory = lambda data: data.decode("utf-8", "replace")
+            self._file.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_BYTES)
+            rows = self._file.execute("SELECT id, name, type FROM topics").fetchall()
+            used = {row[0] for row in self._file.execute("SELECT DISTINCT topic_id FROM messages")}
+        except (sqlite3.Error, MemoryError, ValueError) as error:  # ValueError: messages that are no text
+            raise SourceError(
+                f"{path}: {one_line(error)}; no .db3 recording, or damaged: record or copy it again"
+            ) from None
+        known = [(key, one_line(name), one_line(kind).replace("/msg/", "/")) for key, name, kind in rows if key in used]
+        self._keys = {name: key for key, name, _ in known}
+        self.types = {name: kind for _, name, kind in known}
+        self._ids: dict[str, tuple[NDArray[np.int64], NDArray[np.int64]]] = {}
+
+    def stamps(self, topic: str) -> NDArray[np.int64]:
+        """Return the times at which the messages of `topic` were recorded; raises SourceError for a damaged file."""
+        return self._index(topic)[0]
+
+    def read(self, topic: str, i: int) -> Wire:
+        """Return message `i`; raises FrameRefused `unreadable` where the file is damaged."""
+        try:
+            with self._lock:
+                key = int(self._index(topic)[1][i])
+                row = self._file.execute("SELECT data FROM messages WHERE id = ?", (key,)).fetchone()
+            if row is None or not isinstance(row[0], bytes):
+                raise ValueError("holds no message")
+            data = _unzstd(row[0]) if row[0][:4] == ZSTD else row[0]
+            return Wire(data, cdr=True)
+        except (sqlite3.Error, SourceError, ValueError, OverflowError, MemoryError) as error:
+            raise FrameRefused("unreadable", f"{self.path}: message {i} of {topic}: {one_line(error)}") from None
+
+    def _index(self, topic: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return times and row numbers of a topic's messages."""
+        if topic not in self._ids:
+            query = "SELECT timestamp, id FROM messages WHERE topic_id = ? ORDER BY timestamp, id"
+            try:
+                rows = np.array(self._file.execute(query, (self._keys[topic],)).fetchall(), np.int64)
+            except (sqlite3.Error, ValueError, TypeError, OverflowError) as error:
+                raise SourceError(f"{self.path}: topic {topic}: {one_line(error)}; record or copy it again") from None
+            self._ids[topic] = rows[:, 0], rows[:, 1]
+        return self._ids[topic]
+
+
+def _unzstd(data: bytes) -> bytes:
+    """Return an unpacked message: until 2.58, librealsense packed every message by itself."""
+    try:
+        import zstandard
+    except ImportError:
+        raise SourceError("packed with zstd; install what unpacks it: pip install zstandard") from None
+    try:
+        if not 0 < zstandard.get_frame_parameters(data).content_size <= MAX_BYTES:
+            raise ValueError("tells of an absurd size")
+        return zstandard.ZstdDecompressor().decompress(data)
+    except zstandard.ZstdError as error:
+        raise ValueError(str(error)) from None

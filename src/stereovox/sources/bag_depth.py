@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The topic of a recording that holds depth images, and its images as arrays."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.errors import FrameRefused, SourceError, did_you_mean
+from stereovox.sources.bag_camera import find_camera
+from stereovox.sources.bag_files import BagFile
+from stereovox.sources.bag_messages import Picture, ns_from_ms, read_compressed, read_image
+from stereovox.sources.bag_metadata import Metadata, option
+from stereovox.sources.images import decode_depth_png
+
+REALSENSE = re.compile(r"((/device_\d+/sensor_\d+)/Depth_\d+)/image/data(/compressedDepth)?")
+IMAGE, COMPRESSED = "sensor_msgs/Image", "sensor_msgs/CompressedImage"
+PACKED = "compressedDepth"
+UNITS = {"16UC1": 0.001, "mono16": 0.001, "32FC1": 1.0}
+"""Encodings and the metres per unit they usually have (REP 118); librealsense calls its own images mono16."""
+DTYPES = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
+DEPTH = ("16UC1", "32FC1")
+"""Encodings that are depth; mono16 is so only in RealSense files or where the user says so."""
+PNG_AT = 12
+"""A compressedDepth image starts with 12 bytes about how floats were packed; the PNG follows."""
+
+
+class DepthTopic:
+    """Depth images of one topic, of one camera; see `Bag`.
+
+    frame_id: what the first image calls the frame it is in, "" where unknown.
+    """
+
+    def __init__(self, file: BagFile, topic: str, info: str = ""):
+        self._file, self.topic = file, topic
+        match = REALSENSE.fullmatch(topic)
+        stream, sensor = (match[1], match[2]) if match else (None, "")
+        self.camera, self.notes = find_camera(file, topic, info, stream, sensor)
+        self._stamps = file.stamps(topic)
+        metadata = f"{stream}/image/metadata"
+        self._metadata = Metadata(file, metadata) if file.types.get(metadata) == "std_msgs/String" else None
+        self._unit = option(file, sensor, "Depth Units") if sensor else None
+        first = first_picture(file, topic)
+        self.frame_id = first.frame_id if first and not stream else ""
+
+    def __len__(self) -> int:
+        return len(self._stamps)
+
+    def stamp_ns(self, i: int) -> int:
+        """Return the time at which image `i` was recorded."""
+        return int(self._stamps[i])
+
+    def image(self, i: int, name: str) -> tuple[NDArray[np.generic], int, float]:
+        """Return depth (height, width) uint16 or float32, its time in nanoseconds, and metres per unit.
+
+        Raises FrameRefused `unreadable`, `bad_dtype` or `bad_shape`; `name` stands in its message.
+        """
+        picture = read_picture(self._file, self.topic, i, name)
+        depth, encoding = self._decoded(picture, name)
+        stamp_ns, unit = picture.stamp_ns, picture.depth_units
+        told = self._metadata.at(self.stamp_ns(i)) if self._metadata else {}
+        if "timestamp" in told:  # only .db3 has it: there the header counts from the start of the recording
+            stamp_ns = ns_from_ms(told["timestamp"]) or stamp_ns
+        unit = unit or _positive(told.get("depth_units", "")) or self._unit
+        return depth, stamp_ns, unit or UNITS[encoding]
+
+    def _decoded(self, picture: Picture, name: str) -> tuple[NDArray[np.generic], str]:
+        size = self.camera.width, self.camera.height
+        if self._file.types[self.topic] == COMPRESSED:
+            encoding = picture.encoding.partition(";")[0].strip()
+            if PACKED not in picture.encoding or encoding not in ("16UC1", "mono16"):
+                raise FrameRefused("bad_dtype", f"{name}: '{picture.encoding}' is not read; record it as 16UC1")
+            return decode_depth_png(name, bytes(picture.data[PNG_AT:]), size), encoding
+        if picture.encoding not in DTYPES:
+            raise FrameRefused("bad_dtype", f"{name}: '{picture.encoding}' is no depth; it must be 16UC1 or 32FC1")
+        if (picture.width, picture.height) != size:
+            found, wanted = f"{picture.width}x{picture.height}", f"{size[0]}x{size[1]}"
+            raise FrameRefused("bad_shape", f"{name}: {found} pixels, its camera has {wanted}; give ?info=/topic")
+        return _pixels(picture, name), picture.encoding
+
+
+def find_depth(file: BagFile, topic: str = "", info: str = "") -> DepthTopic:
+    """Return the depth images of `topic`, or of the only topic that has some.
+
+    Raises SourceError where there is no such topic, none or several.
+    """
+    for given in filter(None, (topic, info)):
+        if given not in file.types:
+            raise SourceError(f"{file.path}: no topic {given} with messages{did_you_mean(given, file.types)}")
+    if topic and file.types[topic] not in (IMAGE, COMPRESSED):
+        raise SourceError(f"{file.path}: {topic} holds {file.types[topic]}, no images; leave ?depth= out")
+    found = [topic] if topic else depth_topics(file)
+    if len(found) > 1:
+        raise SourceError(f"{file.path}: several topics with depth, say which: ?depth={' or ?depth='.join(found)}")
+    if not found:
+        seen = ", ".join(f"{name} ({kind})" for name, kind in sorted(file.types.items())[:5]) or "nothing at all"
+        raise SourceError(f"{file.path}: no depth images ({', '.join(DEPTH)} or {PACKED}) in it; it holds {seen}")
+    return DepthTopic(file, found[0], info)
+
+
+def depth_topics(file: BagFile) -> list[str]:
+    """Return the topics with depth images: RealSense's own if there are some, else by the encoding of the images."""
+    realsense = sorted(filter(REALSENSE.fullmatch, file.types))
+    found = realsense or sorted(topic for topic in file.types if _is_depth(file, topic))
+    return [topic for topic in found if topic.removesuffix(f"/{PACKED}") not in set(found) - {topic}]
+
+
+def first_picture(file: BagFile, topic: str, looks: int = 3) -> Picture | None:
+    """Return the first readable image of a topic, None where none of the first few is."""
+    for i in range(min(looks, len(file.stamps(topic)))):
+        try:
+            return read_picture(file, topic, i, topic)
+        except FrameRefused:
+            continue  # it is reported when its turn comes
+    return None
+
+
+def read_picture(file: BagFile, topic: str, i: int, name: str) -> Picture:
+    """Return image `i` of a topic; raises FrameRefused `unreadable`."""
+    wire = file.read(topic, i)
+    try:
+        return read_image(wire) if file.types[topic] == IMAGE else read_compressed(wire)
+    except ValueError as error:
+        raise FrameRefused("unreadable", f"{name}: {error}; the message is damaged, leave the frame out") from None
+
+
+def _is_depth(file: BagFile, topic: str) -> bool:
+    if file.types[topic] not in (IMAGE, COMPRESSED):
+        return False
+    picture = first_picture(file, topic)
+    return picture is not None and (picture.encoding in DEPTH or PACKED in picture.encoding)
+
+
+def _pixels(picture: Picture, name: str) -> NDArray[np.generic]:
+    dtype = np.dtype(DTYPES[picture.encoding]).newbyteorder(">" if picture.big_endian else "<")
+    shape = picture.height, picture.width
+    try:
+        if picture.step < picture.width * dtype.itemsize:
+            raise ValueError(f"a row of {picture.width} pixels does not fit into {picture.step} bytes")
+        strided = np.ndarray(shape, dtype, picture.data, strides=(picture.step, dtype.itemsize))
+    except (TypeError, ValueError) as error:
+        raise FrameRefused("unreadable", f"{name}: {error}; the message is damaged, leave the frame out") from None
+    return strided.astype(dtype.newbyteorder("="))
+
+
+def _positive(text: str) -> float | None:
+    try:
+        value = float(text)
+    except ValueError:
+        return None
+    return value if 0 < value < np.inf else None

@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The two kinds of files that hold recorded ROS messages: `.bag` (ROS 1) and `.db3` (ROS 2, SQLite).
+
+Both give any message of any topic by its number. Whatever is wrong with a file ends in one line, and nothing is
+allocated because a damaged file says so: reads are bounded by the size of the file, unpacking by `MAX_BYTES`.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.errors import SourceError
+from stereovox.sources.bag_messages import Wire
+
+MAX_BYTES = 256 * 1024 * 1024
+"""A message or chunk that unpacks to more than this is taken for damaged."""
+MAGIC = {b"#ROSBAG V": ".bag", b"SQLite fo": ".db3"}
+
+
+class BagFile(Protocol):
+    """Recorded messages by topic and number, in order of the time at which they were recorded.
+
+    types: message type of every topic that has messages, as `sensor_msgs/Image`.
+    """
+
+    path: Path
+    types: dict[str, str]
+
+    def stamps(self, topic: str) -> NDArray[np.int64]:
+        """Return the (N,) times in nanoseconds at which the messages of `topic` were recorded, in order."""
+        ...
+
+    def read(self, topic: str, i: int) -> Wire:
+        """Return message `i`; raises FrameRefused `unreadable` where the file is damaged."""
+        ...
+
+
+def suffix_of(path: str) -> str:
+    """Return `.bag` or `.db3` for a file that is, or by its name should be, such a recording; else "". Never raises."""
+    try:
+        with open(path, "rb") as file:
+            start = file.read(9)
+    except (OSError, ValueError):
+        return ""
+    named = os.path.splitext(path)[1].lower()
+    return MAGIC.get(start) or (named if named in MAGIC.values() else "")
+
+
+def open_bag(path: Path) -> BagFile:
+    """Open a `.bag` or `.db3`; raises SourceError, one line, where it is empty, something else or damaged."""
+    try:
+        with path.open("rb") as file:
+            start = file.read(9)
+    except OSError as error:
+        raise SourceError(f"{path}: {error.strerror}; make it readable") from None
+    if not start:
+        raise SourceError(f"{path}: the file is empty; record or copy it again")
+    if start not in MAGIC:
+        raise SourceError(f"{path}: neither a ROS 1 bag (version 2.0) nor a .db3 recording, whatever its name says")
+    if MAGIC[start] == ".bag":
+        from stereovox.sources.bag_ros1 import Ros1File
+
+        return Ros1File(path)
+    from stereovox.sources.bag_db3 import Db3File
+
+    return Db3File(path)
+
+
+def one_line(said: object) -> str:
+    """Return the text of an error or name in one line, without a full stop."""
+    return " ".join(str(said).split()).rstrip(".") or f"damaged ({type(said).__name__})"

@@ -1,0 +1,187 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A depth camera and a tracking camera that move together (Chien 2020: D435 and T265), each with a clock of its own."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from stereovox import registry
+from stereovox.cameras import PinholeCamera
+from stereovox.errors import FrameRefused, SourceError
+from stereovox.frame import Frame
+from stereovox.geometry import Transform
+from stereovox.sources.bag_files import suffix_of
+from stereovox.sources.base import Source
+from stereovox.sources.pair_file import FILE, PairSettings, read_pair
+from stereovox.sources.poses import Poses, seconds_from_ns
+from stereovox.sources.tracker import jumps, on_clock, read_tracker
+from stereovox.sources.tum import StampedImages
+
+NEAR_JUMP_NS = 100_000_000
+"""Frames this near (0.1 s) to a jump, on either side, are refused: a tracker is rarely right just before one."""
+CALIBRATE = "stereovox calibrate pair"
+
+
+class CameraPair(Source):
+    """A folder with `pair.toml` (see `PairSettings`): depth images, and the poses of a tracker beside them.
+
+    Pose of an image: the tracker's, interpolated at the image's time on the depth camera's clock, times
+    T_tracker_camera. World: as `world` says; gravity is the tracker's business.
+    Faults besides those of the depth source: `no_pose` and `bad_pose_file` (see `Poses.at`), `low_confidence` (a pose
+    next to the image's time is below `min_confidence`), `pose_jump` (the image was taken within 0.1 s of a jump).
+    After a jump the tracker's new poses count again as they are: a T265 jumps when it recognises a place, and is then
+    nearer to where it was when it first mapped that place. What was mapped just before the jump stays where it is.
+    Raises SourceError, one line, for a bad `pair.toml`, without T_tracker_camera, for depth images or poses that
+    cannot be opened, and where the two clocks have no time in common.
+    """
+
+    layout = f"a camera pair ({FILE} that names depth images and a tracker's poses)"
+
+    def __init__(self, where: str | os.PathLike[str]):
+        self.folder = Path(where)
+        self.name = self.folder.resolve().name
+        file = self.folder / FILE
+        settings = read_pair(file)
+        if settings.T_tracker_camera is None:
+            raise SourceError(f"{file}: T_tracker_camera is missing; find it with: {CALIBRATE} {self.folder}")
+        self._T_tracker_camera = settings.T_tracker_camera
+        self._min_confidence = settings.min_confidence
+        self._depth = open_depth(self.folder, settings)
+        self.camera = self._depth.camera
+        self._poses = open_poses(self.folder, settings)
+        check_clocks(image_times(self._depth), self._poses, str(file))
+        self._jumps = jumps(self._poses, settings.max_speed_mps, settings.max_turn_dps)
+        self.notes = (*getattr(self._depth, "notes", ()), *self._jump_note())
+
+    @classmethod
+    def recognises(cls, where: str) -> bool:
+        """Tell whether `where` is a folder with a `pair.toml`."""
+        return os.path.isfile(os.path.join(where, FILE))
+
+    def __len__(self) -> int:
+        return len(self._depth)
+
+    def frame(self, i: int) -> Frame:
+        """Return frame `i` of the depth camera with the tracker's pose, or with the `fault` that forbids it."""
+        frame = self._depth.frame(i)
+        if frame.fault:
+            return frame
+        try:
+            return replace(frame, T_world_sensor=self.pose_at(frame.stamp_ns))
+        except FrameRefused as refused:
+            nowhere = np.full((4, 4), np.nan)
+            return replace(frame, T_world_sensor=nowhere, fault=refused.reason, fault_detail=f"{frame.name}: {refused}")
+
+    def pose_at(self, stamp_ns: int) -> Transform:
+        """Return T_world_camera (4, 4) at a time of the depth camera's clock; raises FrameRefused (see the class)."""
+        poses = self._poses
+        T_world_tracker = poses.at(stamp_ns)
+        around = list(poses.neighbours(stamp_ns))
+        if poses.confidence is not None and poses.confidence[around].min() < self._min_confidence:
+            found = f"confidence is {poses.confidence[around].min():g} at {seconds_from_ns(stamp_ns)} s"
+            raise FrameRefused(
+                "low_confidence", f"{poses.where}: {found}, below min_confidence {self._min_confidence:g}"
+            )
+        self._check_jumps(stamp_ns)
+        return T_world_tracker @ self._T_tracker_camera
+
+    def _check_jumps(self, stamp_ns: int) -> None:
+        """Refuse what was taken near a jump; jump k lies between pose k and pose k + 1."""
+        stamps = self._poses.stamps_ns
+        near = (stamps[self._jumps] - NEAR_JUMP_NS < stamp_ns) & (stamp_ns < stamps[self._jumps + 1] + NEAR_JUMP_NS)
+        if near.any():
+            k = self._jumps[np.argmax(near)]
+            step = np.linalg.norm(self._poses.T_world_body[k + 1, :3, 3] - self._poses.T_world_body[k, :3, 3])
+            when = f"{step:.2f} m at {seconds_from_ns(int(stamps[k]))} s"
+            raise FrameRefused(
+                "pose_jump", f"{self._poses.where}: the pose jumps by {when}; see max_speed_mps in {FILE}"
+            )
+
+    def _jump_note(self) -> tuple[str, ...]:
+        if not len(self._jumps):
+            return ()
+        T = self._poses.T_world_body
+        largest = np.linalg.norm(T[self._jumps + 1, :3, 3] - T[self._jumps, :3, 3], axis=1).max()
+        many = f"{len(self._jumps)} jumps" if len(self._jumps) > 1 else "one jump"
+        left_out = "images near are left out, later ones count as they are"
+        return (f"{self._poses.where}: {many} of up to {largest:.2f} m; {left_out}",)
+
+
+def open_depth(folder: Path, settings: PairSettings) -> Source:
+    """Return the depth images of a pair; their own poses, if there are any, do not count.
+
+    A folder with `depth.txt` or `depth/` holds stamped images (see `StampedImages`); anything else is opened by the
+    source that recognises it, by its `depth_only(where)` where it has one.
+    Raises SourceError where there are no depth images.
+    """
+    where = os.path.join(folder, settings.depth)
+    source = StampedImages(where) if StampedImages.recognises(where) else _recognised(where)
+    if settings.depth_scale is None and settings.baseline is None:
+        return source
+    return _Corrected(source, settings)
+
+
+def open_poses(folder: Path, settings: PairSettings) -> Poses:
+    """Return the poses of a pair's tracker on the depth camera's clock, in the world and axes of the map."""
+    where = os.path.join(folder, settings.poses)
+    if suffix_of(where.partition("?")[0]):  # a recorded file, perhaps with a topic behind its name
+        from stereovox.sources.bag import tracker_poses
+
+        poses = tracker_poses(where, settings.axes, settings.world)
+    else:
+        poses = read_tracker(Path(where), settings.axes, settings.world)
+    return on_clock(poses, settings.clock_offset_s, settings.clock_rate)
+
+
+def image_times(depth: Source) -> tuple[int, int]:
+    """Return the times in nanoseconds of the first and of the last image."""
+    return depth.frame(0).stamp_ns, depth.frame(-1).stamp_ns
+
+
+def check_clocks(image_ns: tuple[int, int], poses: Poses, file: str) -> None:
+    """Raise SourceError where images and poses have no time in common."""
+    pose_ns = int(poses.stamps_ns[0]), int(poses.stamps_ns[-1])
+    if image_ns[0] > pose_ns[1] or pose_ns[0] > image_ns[1]:
+        ours, theirs = (f"{seconds_from_ns(a)} to {seconds_from_ns(b)} s" for a, b in (image_ns, pose_ns))
+        raise SourceError(
+            f"{file}: the clocks do not overlap: images from {ours}, poses with clock_offset_s from {theirs}; "
+            f"set clock_offset_s or find it with: {CALIBRATE}"
+        )
+
+
+def _recognised(where: str) -> Source:
+    from stereovox.sources import SOURCES
+
+    for kind in _others(SOURCES):
+        if kind.recognises(where):
+            return kind.depth_only(where) if hasattr(kind, "depth_only") else kind(where)
+    raise SourceError(f"{where}: no depth images; name a folder with depth.txt or depth/, or a recording, as 'depth'")
+
+
+def _others(sources: dict[str, str]) -> Iterable[type]:
+    kinds = (registry.find("sources", sources, name) for name in registry.names("sources", sources))
+    return (kind for kind in kinds if kind is not CameraPair)
+
+
+class _Corrected(Source):
+    """A depth source whose unit or baseline `pair.toml` knows better."""
+
+    def __init__(self, source: Source, settings: PairSettings):
+        self._source, self._scale = source, settings.depth_scale
+        self.name, self.notes = source.name, getattr(source, "notes", ())
+        self.camera: PinholeCamera = source.camera
+        if settings.baseline is not None:
+            self.camera = replace(source.camera, baseline=settings.baseline)
+
+    def __len__(self) -> int:
+        return len(self._source)
+
+    def frame(self, i: int) -> Frame:
+        frame = self._source.frame(i)
+        scale = frame.depth_scale if self._scale is None else self._scale
+        return replace(frame, camera=self.camera, depth_scale=scale)

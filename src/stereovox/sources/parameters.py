@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Names with parameters, written like a web address: `sim:box?size=small&distance=2`."""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from stereovox.errors import SourceError, did_you_mean
+
+SWITCHES = {"1": True, "true": True, "yes": True, "on": True, "0": False, "false": False, "no": False, "off": False}
+
+
+def split(location: str) -> tuple[str, dict[str, str]]:
+    """Return the name before `?` and the parameters `key=value` behind it, which stand between `&`.
+
+    Raises SourceError for a parameter without a value and for one that is given twice.
+    """
+    name, _, query = location.partition("?")
+    given: dict[str, str] = {}
+    for text in filter(None, query.split("&")):
+        key, equals, value = text.partition("=")
+        if not (key and equals and value):
+            raise SourceError(f"'{text}' is no parameter; write key=value")
+        if key in given:
+            raise SourceError(f"'{key}' is given twice; give it once")
+        given[key] = value
+    return name, given
+
+
+def defaults(function: Callable[..., Any]) -> dict[str, Any]:
+    """Return the parameters that `function` takes and their default values."""
+    return {name: parameter.default for name, parameter in inspect.signature(function).parameters.items()}
+
+
+def typed(given: Mapping[str, str], known: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the parameters as values of the types that the defaults in `known` have: bool, int, float or str.
+
+    Raises SourceError for an unknown parameter, with the one that was perhaps meant, and for unreadable values.
+    """
+    return {key: _value(key, text, known) for key, text in given.items()}
+
+
+def _value(key: str, text: str, known: Mapping[str, Any]) -> Any:
+    if key not in known:
+        raise SourceError(f"unknown parameter '{key}'{did_you_mean(key, known)}")
+    kind = type(known[key])
+    if kind is bool and text.lower() not in SWITCHES:
+        raise SourceError(f"{key}={text} must be 1 or 0")
+    try:
+        value = SWITCHES[text.lower()] if kind is bool else kind(text)
+    except ValueError:
+        raise SourceError(f"{key}={text} must be a {'whole ' if kind is int else ''}number") from None
+    if kind is float and not math.isfinite(value):
+        raise SourceError(f"{key}={text} must be a finite number")
+    return value

@@ -1,0 +1,237 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A RealSense depth camera that is connected now (D400 series); recorded files are `bag.py`'s."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, NoReturn
+
+import numpy as np
+
+from stereovox.cameras import PinholeCamera
+from stereovox.errors import MissingExtra, SourceError, StereovoxError
+from stereovox.frame import Frame
+from stereovox.sources import parameters
+from stereovox.sources.base import Stream
+
+PREFIX = "realsense:"
+WAITING = 2
+"""Frames that wait while the map is busy; what is older is dropped, so the map never falls behind the camera."""
+PATIENCE_MS = 5000
+PREFERRED = (848, 480, 30)
+"""Width, height, frames a second: where the D435 measures best, and what Chien 2020 used."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """What may stand behind the name, as in `realsense:?width=848&height=480&fps=30`; 0 or -1: as the camera has it.
+
+    width, height in pixels, fps in frames a second. emitter: 0 off, 1 on. laser_power in milliwatts (D435: 0 to 360).
+    baseline: metres between the two infrared cameras, where the camera does not tell it.
+    pose: `fixed` for a camera that stands still; every pose is then the identity.
+    """
+
+    width: int = 0
+    height: int = 0
+    fps: int = 0
+    emitter: int = -1
+    laser_power: float = -1.0
+    baseline: float = 0.0
+    pose: str = ""
+
+    def __post_init__(self) -> None:
+        if self.pose not in ("", "fixed"):
+            raise SourceError(f"pose={self.pose} must be fixed")
+        for key in ("width", "height", "fps", "baseline"):
+            if getattr(self, key) < 0:
+                raise SourceError(f"{key}={getattr(self, key):g} must be a positive number")
+
+
+class RealSense(Stream):
+    """Depth images of a connected camera, from now on, until nobody asks for more: it has no length and no frame(i).
+
+    location: `realsense:` or, where several are connected, `realsense:SERIAL`; see `Options` for what may follow.
+    context: what lists the devices; pyrealsense2's own unless a test brings another.
+    Time: the frame's, in the clock domain of the camera. Camera, unit and baseline are told by the device. Without
+    `pose=fixed` every frame has the fault `no_pose`, but its depth all the same: a camera does not know where it is,
+    and pyrealsense2 2.55 and later no longer supports the T265.
+    Raises MissingExtra without pyrealsense2; SourceError, one line, where no camera or not the right one is connected,
+    for modes and settings that it does not have, and while frames are taken, where none came for 5 s.
+    """
+
+    layout = "a connected RealSense camera (realsense: or realsense:SERIAL)"
+
+    def __init__(self, location: str, context: Any = None):
+        self._rs = _library()
+        serial, self.options = _parse(location)
+        location = location.removesuffix(":")  # what messages begin with
+        try:
+            self._device = _device(self._rs, context or self._rs.context(), location, serial)
+            self._sensor = _depth_sensor(self._device, location)
+            self._profile = _profile(self._rs, self._sensor, self.options, location)
+            _apply(self._rs, self._sensor, self.options, location)
+            baseline = self.options.baseline or _baseline(self._rs, self._sensor)
+            self.camera, self.notes = _camera(self._profile, baseline, location)
+        except RuntimeError as error:
+            _failed(location, error)
+        self.name = PREFIX + _serial(self._rs, self._device)
+
+    @classmethod
+    def recognises(cls, location: str) -> bool:
+        """Tell whether `location` names a connected camera."""
+        return location.startswith(PREFIX)
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Start the camera, yield its frames, and stop it when the consumer does; frames nobody took are dropped."""
+        queue = self._rs.frame_queue(WAITING)
+        try:
+            self._sensor.open(self._profile)
+            self._sensor.start(queue)
+        except RuntimeError as error:
+            _failed(self.name, error)
+        try:
+            while True:
+                arrived, image = queue.try_wait_for_frame(PATIENCE_MS)
+                if not arrived:
+                    raise SourceError(f"{self.name}: no frame for {PATIENCE_MS / 1000:g} s; check cable and USB port")
+                yield self._frame(image)
+        finally:
+            self._stop()
+
+    def _stop(self) -> None:
+        for end in (self._sensor.stop, self._sensor.close):
+            try:
+                end()
+            except RuntimeError:
+                continue  # pulled out: there is nothing left to stop
+
+    def _frame(self, image: Any) -> Frame:
+        depth = np.array(image.get_data())  # a copy: the library uses its memory again
+        stamp_ns = _ns_from_ms(image.get_timestamp())
+        name = f"{self.name} frame {image.get_frame_number()}"
+        unit = float(image.as_depth_frame().get_units())
+        if self.options.pose == "fixed":
+            return Frame(depth, self.camera, np.eye(4), stamp_ns, unit, name=name)
+        detail = f"{name}: the camera does not know where it is; add ?pose=fixed if it stands still, else record it"
+        detail += " and put poses beside the recording in a camera pair (pair.toml)"
+        return Frame(
+            depth, self.camera, np.full((4, 4), np.nan), stamp_ns, unit, name=name, fault="no_pose", fault_detail=detail
+        )
+
+
+def _ns_from_ms(milliseconds: float) -> int:
+    """Return whole nanoseconds; times 1e6 as a float, today's dates would be off by up to 128 ns."""
+    whole, rest = divmod(milliseconds, 1.0)
+    return int(whole) * 1_000_000 + round(rest * 1e6)
+
+
+def _library() -> Any:
+    try:
+        import pyrealsense2
+    except ImportError:
+        raise MissingExtra("pyrealsense2", "realsense") from None
+    return pyrealsense2
+
+
+def _parse(location: str) -> tuple[str, Options]:
+    try:
+        serial, given = parameters.split(location.removeprefix(PREFIX))
+        return serial, Options(**parameters.typed(given, parameters.defaults(Options)))
+    except SourceError as error:
+        raise SourceError(f"{location}: {error}") from None
+
+
+def _device(rs: Any, context: Any, location: str, serial: str) -> Any:
+    devices = {_serial(rs, device): device for device in context.query_devices()}
+    if not devices:
+        cure = "plug one into a USB 3 port, or give a recorded .db3 or .bag file"
+        raise SourceError(f"{location}: no RealSense camera is connected; {cure}")
+    if serial:
+        if serial not in devices:
+            raise SourceError(f"{location}: not connected; there is {_ways(devices)}")
+        return devices[serial]
+    if len(devices) > 1:
+        raise SourceError(f"{location}: several cameras are connected, say which: {_ways(devices)}")
+    return next(iter(devices.values()))
+
+
+def _ways(devices: dict[str, Any]) -> str:
+    return " or ".join(PREFIX + serial for serial in devices)
+
+
+def _serial(rs: Any, device: Any) -> str:
+    key = rs.camera_info.serial_number
+    return device.get_info(key) if device.supports(key) else "unnamed"
+
+
+def _depth_sensor(device: Any, location: str) -> Any:
+    for sensor in device.query_sensors():
+        if sensor.is_depth_sensor():
+            return sensor
+    raise SourceError(f"{location}: this camera has no depth sensor; give the serial number of one that has")
+
+
+def _profile(rs: Any, sensor: Any, options: Options, location: str) -> Any:
+    """Return the mode that was asked for; what was not asked for is as in PREFERRED, or near it."""
+    modes = {}
+    for profile in sensor.get_stream_profiles():
+        if profile.stream_type() == rs.stream.depth and profile.format() == rs.format.z16:
+            video = profile.as_video_stream_profile()
+            modes[video.width(), video.height(), profile.fps()] = video
+    asked = (options.width, options.height, options.fps)
+    fitting = [mode for mode in modes if all(want in (0, has) for want, has in zip(asked, mode, strict=True))]
+    if not fitting:
+        known = ", ".join("{}x{} at {}".format(*mode) for mode in sorted(modes)) or "none at all"
+        raise SourceError(f"{location}: the camera has no such depth mode; it has {known} Hz")
+    return modes[min(fitting, key=lambda mode: [abs(has - want) for has, want in zip(mode, PREFERRED, strict=True)])]
+
+
+def _apply(rs: Any, sensor: Any, options: Options, location: str) -> None:
+    settings = (
+        ("emitter", rs.option.emitter_enabled, options.emitter),
+        ("laser_power", rs.option.laser_power, options.laser_power),
+    )
+    for key, option, value in settings:
+        if value < 0:
+            continue
+        if not sensor.supports(option):
+            raise SourceError(f"{location}: this camera has no {key} to set; leave {key}= out")
+        try:
+            sensor.set_option(option, float(value))
+        except RuntimeError:
+            limits = sensor.get_option_range(option)
+            raise SourceError(f"{location}: {key} must be {limits.min:g} to {limits.max:g}") from None
+
+
+def _baseline(rs: Any, sensor: Any) -> float | None:
+    """Return the metres between the infrared cameras: as the sensor says, else from their extrinsics."""
+    if sensor.supports(rs.option.stereo_baseline):
+        return sensor.get_option(rs.option.stereo_baseline) / 1000 or None
+    eyes = {
+        profile.stream_index(): profile
+        for profile in sensor.get_stream_profiles()
+        if profile.stream_type() == rs.stream.infrared
+    }
+    if 1 not in eyes or 2 not in eyes:
+        return None
+    try:
+        apart = eyes[1].get_extrinsics_to(eyes[2]).translation
+    except RuntimeError:
+        return None
+    return float(np.linalg.norm(apart)) or None
+
+
+def _camera(profile: Any, baseline: float | None, location: str) -> tuple[PinholeCamera, tuple[str, ...]]:
+    told = profile.get_intrinsics()
+    numbers = (told.width, told.height, told.fx, told.fy, told.ppx, told.ppy)
+    note = f"{location}: the camera tells of lens distortion in its depth, which is not corrected"
+    try:
+        return PinholeCamera(*numbers, None if baseline is None else abs(baseline)), (note,) if any(told.coeffs) else ()
+    except StereovoxError as error:
+        raise SourceError(f"{location}: {error}") from None
+
+
+def _failed(location: str, error: Exception) -> NoReturn:
+    said = " ".join(str(error).split()).rstrip(".")
+    raise SourceError(f"{location}: {said}; is another program using the camera? plug it in again") from None

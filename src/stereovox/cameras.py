@@ -12,18 +12,39 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox.errors import StereovoxError
+from stereovox.errors import StereovoxError, did_you_mean
+
+
+CORRECTIONS = {"scale": 6, "disparity": 6, "scale+disparity": 12, "thesis": 3}
+"""Models of a depth correction and the number of their coefficients; see `DepthCorrection`."""
 
 
 @dataclass(frozen=True)
 class DepthCorrection:
     """What a depth camera measures wrongly, as found on flat walls (`stereovox calibrate wall`; Chien 2020, App. A).
 
-    model: how `coefficients` are to be read; see `depth/correct.py`.
+    x = (u - cx) / fx and y = (v - cy) / fy are a pixel's slopes, z its measured depth in metres. With the quadratics
+    s and q, each of six coefficients in the order 1, x, y, x^2, x y, y^2, the true depth is
+
+        scale             z / (1 + s)          an error that is a share of the depth
+        disparity         z / (1 + q z)        one of the disparity, q times focal length and baseline: eyes out of line
+        scale+disparity   z / (1 + s + q z)    both; first the six of s, then those of q
+        thesis            z - (p1 X^2 + p2 X + p3) with X = x z: Chien 2020, Eq A.3
+
+    Raises StereovoxError for an unknown model, a wrong number of coefficients, or one that is not finite.
     """
 
     model: str
     coefficients: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        if self.model not in CORRECTIONS:
+            raise StereovoxError(f"correction: unknown model '{self.model}'{did_you_mean(self.model, CORRECTIONS)}")
+        numbers = tuple(float(number) for number in self.coefficients)  # a list from a file cannot be hashed
+        if len(numbers) != CORRECTIONS[self.model] or not all(map(math.isfinite, numbers)):
+            needed = f"{CORRECTIONS[self.model]} finite coefficients"
+            raise StereovoxError(f"correction: model '{self.model}' needs {needed}, not {list(numbers)}")
+        object.__setattr__(self, "coefficients", numbers)
 
 
 STEEPEST = 20.0

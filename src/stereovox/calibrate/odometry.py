@@ -112,10 +112,12 @@ class _Registration:
         limits = {"max_correspondence_distance": REACH, "max_iterations": 30}
         rough = self._gicp.align(target, cloud, tree, guess, registration_type="GICP", **limits)
         link = refined(np.array(rough.T_target_source), Surface.of(cloud), Surface.of(target), tree)
-        worst = np.sqrt(
-            [np.linalg.eigvalsh(block).max() for block in (link.covariance[:3, :3], link.covariance[3:, 3:])]
-        )
-        return link if link.share >= INLIERS and (worst < WEAKEST).all() else None
+        return link if link.share >= INLIERS and _is_certain(link) else None
+
+
+def _is_certain(link: Link) -> bool:
+    parts = link.covariance[:3, :3], link.covariance[3:, 3:]
+    return all(np.linalg.eigvalsh(part).max() < limit**2 for part, limit in zip(parts, WEAKEST, strict=True))
 
 
 def _small_gicp() -> Any:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from stereovox import geometry
 from stereovox.config import Config
 from stereovox.depth import _cpu
+from stereovox.depth.correct import corrected
 from stereovox.depth.downsample import downsample
 from stereovox.errors import FrameRefused
 from stereovox.frame import DepthImage, Frame, Reason
@@ -21,7 +22,7 @@ FARTHEST = 1e6
 
 
 def prepare(frame: Frame, config: Config) -> DepthImage:
-    """Return the frame's depth image in metres.
+    """Return the frame's depth image in metres, corrected where its camera has a `correction`.
 
     A pixel is UNMATCHED where the value is zero, negative, not finite or a saturated uint16; TOO_NEAR and TOO_FAR
     outside [min_range, max_range]. The source's own reason, where it has one, comes first.
@@ -40,10 +41,12 @@ def prepare(frame: Frame, config: Config) -> DepthImage:
 
 
 def _classify(frame: Frame, config: Config, depth_m: NDArray, reason: NDArray) -> int:
-    raw = np.ascontiguousarray(frame.depth).reshape(-1)
-    limits = (np.float32(frame.depth_scale), np.float32(config.min_range), np.float32(config.max_range))
+    raw, scale = np.ascontiguousarray(frame.depth).reshape(-1), np.float32(frame.depth_scale)
     none = np.float32(SATURATED if raw.dtype == np.uint16 else 0)
-    usable = _cpu.classify(raw, *limits, none, depth_m.reshape(-1), reason.reshape(-1))
+    if frame.camera.correction:  # before the limits, which hold for true depths
+        raw, scale, none = corrected(raw, scale, none, frame.camera), np.float32(1), np.float32(0)
+    limits = (np.float32(config.min_range), np.float32(config.max_range))
+    usable = _cpu.classify(raw, scale, *limits, none, depth_m.reshape(-1), reason.reshape(-1))
     if frame.reason is not None:
         given = np.ascontiguousarray(frame.reason, np.uint8).reshape(-1)
         usable = _cpu.take_given(given, depth_m.reshape(-1), reason.reshape(-1))

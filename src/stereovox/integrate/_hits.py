@@ -2,7 +2,7 @@
 """Kernel that scatters measured points into their cells.
 
 Most pixels fall into the cell of their left or upper neighbour. Each pixel's cell is packed into one number, and only
-pixels whose number differs from both neighbours' are looked at further; groups without any cost one test.
+pixels whose number differs from their neighbours' are looked at further; groups without any cost one test.
 """
 
 import numpy as np
@@ -11,6 +11,10 @@ from stereovox._jit import cell, kernel
 from stereovox.integrate._cells import NO_RETURN, ZERO, table_row
 from stereovox.maps._cells import find_or_insert
 
+LEFT, RIGHT = 2, 1
+"""Entries before and behind a row of keys, so that every pixel has neighbours."""
+SEEN_BITS = 11
+SEEN = 1 << SEEN_BITS
 GROUP = 8
 """Pixels tested together, as one 64-bit word of eight flags."""
 NOTHING = -1
@@ -24,28 +28,35 @@ ROW_BITS = 7
 
 
 @kernel
-def scatter(depth_m, view, table, keys, news, fresh, pool_table, coords, count, values, first_row, last_row):
+def scatter(depth_m, view, table, keys, news, fresh, seen, pool_table, coords, count, values, first_row, last_row):
     """Give every cell that holds a measured point its hit evidence; return False when the block pool is full.
 
-    depth_m: (h, w) REP 117 depth image. keys: (2, 1 + w rounded up to GROUP) scratch; int32 serves cells within 2^9
-    of the camera when `table.hit` is one number for all depths, int64 the rest. news, fresh: scratch of one row,
-    uint8 and int32, w rounded up to GROUP and one more for `fresh`. Blocks count from the camera's own.
+    depth_m: (h, w) REP 117 depth image. keys: (2, LEFT + w rounded up to GROUP + RIGHT) scratch; int32 serves cells
+    within 2^9 of the camera when `table.hit` is one number for all depths, int64 the rest. news, fresh: scratch of one
+    row, uint8 and int32, w rounded up to GROUP and one more for `fresh`. seen: (SEEN,) scratch of the keys' kind.
+    Blocks count from the camera's own.
     """
     size = np.float32(1) / view.voxel_size
     position = view.position * size
     last, place = (np.int32(0), np.int32(0), np.int32(0)), np.int64(-1)
     rows = table.hit.size
     keys[:, :] = NOTHING
+    seen[:] = NOTHING
     for v in range(first_row, last_row):
         now, before = keys[v & 1], keys[1 - (v & 1)]
         ray = _row_rays(view.rotation, view.rows[v], size)
         if keys.itemsize == 4:
-            _narrow_keys(depth_m[v], view.columns, ray, position, now[1:])
+            _narrow_keys(depth_m[v], view.columns, ray, position, now[LEFT:])
         else:
-            _wide_keys(depth_m[v], view.columns, ray, position, table, now[1:])
-        _mark_news(now[1:], now[:-1], before[1:], news)
+            _wide_keys(depth_m[v], view.columns, ray, position, table, now[LEFT:])
+        _mark_news(now, before, news)
         for i in range(_gather_news(news, fresh)):
             u = fresh[i]
+            key = now[LEFT + u]
+            slot = _slot(key)
+            if seen[slot] == key:
+                continue
+            seen[slot] = key
             d = depth_m[v, u]
             x, y, zz = _point_cell(d, view.columns[u], ray, position)
             block = (x >> 3, y >> 3, zz >> 3)
@@ -58,6 +69,13 @@ def scatter(depth_m, view, table, keys, news, fresh, pool_table, coords, count, 
             hit = table.hit[table_row(d, table.rows_per_metre, rows)]
             values[place, c] = max(np.int32(values[place, c]), hit)
     return True
+
+
+@cell
+def _slot(key):
+    """Return where a key stands in `seen`: a small memory of the cells entered lately."""
+    mixed = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
+    return np.int64(mixed >> np.uint64(64 - SEEN_BITS))
 
 
 @cell
@@ -108,11 +126,17 @@ def _wide_keys(depths, columns, ray, position, table, keys):
 
 
 @cell
-def _mark_news(now, left, above, news):
-    """Set `news` where a pixel holds a measurement and its key differs from its left and its upper neighbour's."""
+def _mark_news(now, before, news):
+    """Set `news` where a pixel holds a measurement and its key differs from those of five pixels seen before.
+
+    Five, because noise makes the pixels of a surface near a cell's face fall into two cells by turns.
+    """
     for u in range(news.size):
-        fresh = (now[u] != above[u]) & (now[u] != left[u]) & (now[u] != NOTHING)
-        news[u] = np.uint8(fresh)
+        i = u + LEFT
+        key = now[i]
+        beside = (key != now[i - 1]) & (key != now[i - 2])
+        above = (key != before[i]) & (key != before[i - 1]) & (key != before[i + 1])
+        news[u] = np.uint8(beside & above & (key != NOTHING))
 
 
 @cell

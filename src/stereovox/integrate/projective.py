@@ -54,8 +54,10 @@ class Projective:
         self._table: KernelTable = sensor_table(self._sensor, self._config, camera)
         self._builder = WindowBuilder(camera)
         self._keys = self._key_rows(camera)
-        self._news = np.zeros(self._keys.shape[1] - 1, np.uint8)
-        self._fresh = np.zeros(self._keys.shape[1], np.int32)
+        pixels = self._keys.shape[1] - _hits.LEFT - _hits.RIGHT
+        self._news = np.zeros(pixels, np.uint8)
+        self._fresh = np.zeros(pixels + 1, np.int32)
+        self._seen = np.zeros(_hits.SEEN, self._keys.dtype)
         self._camera = camera
 
     def _key_rows(self, camera: PinholeCamera) -> NDArray[np.signedinteger]:
@@ -63,7 +65,8 @@ class Projective:
         corner = np.hypot(1.0, np.hypot(*(np.abs(slopes).max() for slopes in camera.ray_slopes())))
         cells = corner * self._config.max_range / self._config.voxel_size + SIDE
         narrow = cells < 1 << (_hits.NARROW - 1) and (self._table.hit == self._table.hit[0]).all()
-        return np.zeros((2, 1 + _hits.GROUP * -(-camera.width // _hits.GROUP)), np.int32 if narrow else np.int64)
+        pixels = _hits.GROUP * -(-camera.width // _hits.GROUP)
+        return np.zeros((2, _hits.LEFT + pixels + _hits.RIGHT), np.int32 if narrow else np.int64)
 
     def _end_of_view(self, farthest: float) -> float:
         """Return the depth in metres beyond which this image says nothing."""
@@ -83,6 +86,7 @@ class Projective:
             self._keys,
             self._news,
             self._fresh,
+            self._seen,
             hits.table,
             hits.coords,
             hits.count,

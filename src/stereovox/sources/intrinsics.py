@@ -1,15 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Focal lengths and optical centre from the small text files that lie beside recordings."""
+"""The camera of a recording, from the small text files that lie beside it."""
 
 from __future__ import annotations
 
 import math
 import os
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from stereovox.cameras import PinholeCamera
 from stereovox.errors import SourceError, StereovoxError
+from stereovox.sources.camera_file import FILE, read_camera
 
 MATRIX, LIST = "camera-intrinsics.txt", "calibration.txt"
 VGA = (640, 480)
@@ -22,12 +24,15 @@ def find_camera(
 ) -> tuple[PinholeCamera, tuple[str, ...]]:
     """Return the camera of images of (width, height) = `size`, and a note where its numbers had to be assumed.
 
-    The first file found counts: `camera-intrinsics.txt` (3x3 matrix), then `calibration.txt` (fx fy cx cy), in the
-    order of `folders`. Without one, 640x480 images get `default`. `baseline` in metres.
+    The first file found counts: `camera.toml` (see `camera_file`), `camera-intrinsics.txt` (3x3 matrix), then
+    `calibration.txt` (fx fy cx cy), in the order of `folders`. Without one, 640x480 images get `default`. `baseline` in
+    metres, where the file tells none.
     Raises SourceError for a bad file, or where there is none and the images have another size.
     """
-    for path in (folder / name for folder in folders for name in (MATRIX, LIST)):
+    for path in (folder / name for folder in folders for name in (FILE, MATRIX, LIST)):
         if os.path.isfile(path):  # Path.is_file may raise
+            if path.name == FILE:
+                return _of_size(path, size, baseline), ()
             return _camera(path, size, read_intrinsics(path), baseline), ()
     if size != VGA:
         raise SourceError(
@@ -52,6 +57,16 @@ def read_intrinsics(path: Path) -> Intrinsics:
     else:
         raise SourceError(f"{path}: needs the matrix 'fx 0 cx / 0 fy cy / 0 0 1' or the four numbers fx fy cx cy")
     return fx, fy, cx, cy
+
+
+def _of_size(path: Path, size: tuple[int, int], baseline: float) -> PinholeCamera:
+    camera = read_camera(path)
+    if (camera.width, camera.height) != size:
+        raise SourceError(
+            f"{path}: is of a camera with {camera.width}x{camera.height} pixels, the images have {size[0]}x{size[1]}; "
+            "replace or remove it"
+        )
+    return camera if camera.baseline else replace(camera, baseline=baseline)
 
 
 def _numbers(path: Path) -> list[float]:

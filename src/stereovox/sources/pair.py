@@ -54,7 +54,7 @@ class CameraPair(Source):
         self._depth = open_depth(self.folder, settings)
         self.camera = self._depth.camera
         self._poses = open_poses(self.folder, settings)
-        check_clocks(image_times(self._depth), self._poses, str(file))
+        check_clocks(image_times(self._depth), self._poses, file)
         self._jumps = jumps(self._poses, settings.max_speed_mps, settings.max_turn_dps)
         self.notes = (*getattr(self._depth, "notes", ()), *self._jump_note())
 
@@ -143,14 +143,14 @@ def image_times(depth: Source) -> tuple[int, int]:
     return depth.frame(0).stamp_ns, depth.frame(-1).stamp_ns
 
 
-def check_clocks(image_ns: tuple[int, int], poses: Poses, file: str) -> None:
+def check_clocks(image_ns: tuple[int, int], poses: Poses, file: Path) -> None:
     """Raise SourceError where images and poses have no time in common."""
     pose_ns = int(poses.stamps_ns[0]), int(poses.stamps_ns[-1])
     if image_ns[0] > pose_ns[1] or pose_ns[0] > image_ns[1]:
         ours, theirs = (f"{seconds_from_ns(a)} to {seconds_from_ns(b)} s" for a, b in (image_ns, pose_ns))
         raise SourceError(
             f"{file}: the clocks do not overlap: images from {ours}, poses with clock_offset_s from {theirs}; "
-            f"set clock_offset_s or find it with: {CALIBRATE}"
+            f"set clock_offset_s or find it with: {CALIBRATE} {file.parent}"
         )
 
 

@@ -1,0 +1,189 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How noisy a depth camera is, from recordings of a flat wall at several distances (Chien 2020, 2.2.4 and 3.3)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.calibrate.recording import WallRecording
+from stereovox.calibrate.surface import Array, find_wall, fit_plane, slopes
+from stereovox.calibrate.wall import distance_groups
+from stereovox.errors import StereovoxError
+
+REGION = (0.6, 0.4)
+"""Width and height in metres of the part of the wall round the optical axis that counts (Chien 2020, 3.3)."""
+FEWEST_PIXELS = 30
+TERMS = {1: (2,), 2: (0, 2), 3: (0, 1, 2)}
+"""Powers of z that so many different distances can tell apart."""
+
+
+@dataclass(frozen=True)
+class NoiseAt:
+    """The error of single measurements at one distance, against the plane through their mean.
+
+    rmse_m: root mean square error in metres, Chien's RMSE; its square is the sum of those of its two parts.
+    temporal_m: what differs from frame to frame. fixed_m: what stays the same in all frames, 0 where it drowns in the
+    noise. Both are None where there is a single frame. offset_m: how much too far the wall is seen, None where its distance was not measured.
+    valid_share: share of the region's pixels that have a value, of all frames; image_share: of the whole image.
+    gross_share: share of the image's values that are gross errors; they are in no other figure.
+    subpixel: the disparity error in pixels that makes rmse_m (Chien 2020, Eq 3.5), None without a baseline.
+    """
+
+    name: str
+    distance_m: float
+    rmse_m: float
+    temporal_m: float | None
+    fixed_m: float | None
+    offset_m: float | None
+    valid_share: float
+    image_share: float
+    gross_share: float
+    subpixel: float | None
+    pixels: int
+    frames: int
+
+
+@dataclass(frozen=True)
+class NoiseCalibration:
+    """sigma(z) = s0 + s1 z + s2 z^2 in metres, and what it was fitted to, nearest first.
+
+    subpixel: s2 * focal length * baseline in pixels, None without a baseline. worst_percent: by how much the curve
+    misses a point at most.
+    """
+
+    s0: float
+    s1: float
+    s2: float
+    subpixel: float | None
+    focal_px: float
+    baseline: float | None
+    region: tuple[float, float]
+    points: tuple[NoiseAt, ...]
+    notes: tuple[str, ...]
+
+    def sigma(self, z: Array) -> Array:
+        """Return the standard deviation in metres at depths `z` in metres."""
+        return self.s0 + self.s1 * z + self.s2 * z * z
+
+    @property
+    def worst_percent(self) -> float:
+        """Largest distance between the curve and a point, in percent of the point."""
+        z, rmse = np.array([(point.distance_m, point.rmse_m) for point in self.points]).T
+        return float(100 * np.max(np.abs(self.sigma(z) / rmse - 1)))
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return all figures."""
+        fit = {name: getattr(self, name) for name in ("s0", "s1", "s2", "subpixel", "focal_px", "baseline")}
+        rest = {"worst_percent": self.worst_percent, "region_m": list(self.region), "notes": list(self.notes)}
+        return {**fit, **rest, "points": [vars(point) for point in self.points]}
+
+
+def calibrate_noise(recordings: Sequence[WallRecording], region: tuple[float, float] = REGION) -> NoiseCalibration:
+    """Return the noise of the camera that took all recordings, fitted to the whole RMSE of single measurements.
+
+    The fixed part belongs into sigma as well: it does not average out where the camera stands, and where it moves the
+    map meets it as one more error of each measurement. One distance gives s2 alone, two s0 and s2, three or more all.
+    Raises StereovoxError, one line: no wall, nothing in the region, different cameras.
+    """
+    if not recordings:
+        raise StereovoxError("no recording of a wall; give several, at different distances")
+    camera = recordings[0].camera
+    for recording in recordings:
+        if recording.camera != camera:
+            raise StereovoxError(f"{recording.name}: is of another camera than {recordings[0].name}; use one camera")
+    points = sorted((noise_at(recording, region) for recording in recordings), key=lambda point: point.distance_m)
+    distances = [point.distance_m for point in points]
+    count = min(3, len(set(distance_groups(distances))))
+    s = fit_noise(np.array(distances), np.array([point.rmse_m for point in points]), TERMS[count])
+    focal_px = camera.fx * camera.binning
+    subpixel = s[2] * focal_px * camera.baseline if camera.baseline else None
+    notes = _notes(points, count, camera.baseline)
+    return NoiseCalibration(*s, subpixel, focal_px, camera.baseline, region, tuple(points), notes)
+
+
+def noise_at(recording: WallRecording, region: tuple[float, float] = REGION) -> NoiseAt:
+    """Return the noise within `region` (width, height in metres on the wall) round the optical axis.
+
+    Raises StereovoxError where there is no wall or where too few pixels of the region have depth.
+    """
+    camera = recording.camera
+    wall = find_wall(recording.inverse, camera, recording.name)
+    x, y = slopes(camera)
+    inside = (np.abs(x) <= region[0] / 2 / wall.distance) & (np.abs(y) <= region[1] / 2 / wall.distance)
+    used = inside & wall.on_wall
+    if used.sum() < FEWEST_PIXELS:
+        raise StereovoxError(
+            f"{recording.name}: only {used.sum()} pixels of the middle {region[0]:g} x {region[1]:g} m have depth; "
+            "use a larger --region, or a wall that is nearer or has more texture"
+        )
+    plane = fit_plane(x[used], y[used], recording.inverse[used])
+    rmse, temporal, fixed = _errors(recording.sums[:, used], 1 / (plane[0] + plane[1] * x[used] + plane[2] * y[used]))
+    distance = float(1 / plane[0])
+    values = recording.count.sum()
+    return NoiseAt(
+        recording.name,
+        distance,
+        rmse,
+        temporal,
+        fixed,
+        None if recording.distance is None else distance - recording.distance,
+        float(recording.count[inside].sum() / (inside.sum() * recording.frames)),
+        recording.valid_share,
+        float(recording.gross / (values + recording.gross)),
+        rmse * camera.fx * camera.binning * camera.baseline / distance**2 if camera.baseline else None,
+        int(used.sum()),
+        recording.frames,
+    )
+
+
+def fit_noise(z: Array, rmse: Array, powers: Sequence[int] = (0, 1, 2)) -> tuple[float, float, float]:
+    """Return s0, s1, s2 >= 0 of the curve nearest to `rmse` (N,) at depths `z` (N,); those not in `powers` are 0.
+
+    Errors count as shares of the RMSE, because that is how precisely a standard deviation is known.
+    """
+    from scipy.optimize import nnls
+
+    columns = np.stack([z**power / rmse for power in powers], axis=1)
+    s = np.zeros(3)
+    s[list(powers)] = nnls(columns, np.ones(len(z)))[0]
+    return float(s[0]), float(s[1]), float(s[2])
+
+
+def _errors(sums: NDArray[np.float64], wall_z: Array) -> tuple[float, float | None, float | None]:
+    """Return RMSE, its temporal and its fixed part in metres, of pixels with `sums` (4, N) on a wall at `wall_z` (N,).
+
+    A pixel's variance from frame to frame is taken out of the error of its mean, or noise would pass for fixed error.
+    """
+    count, _, first, second = sums
+    mean = first / count
+    total = float(np.sum(second - 2 * wall_z * first + count * wall_z**2) / np.sum(count))
+    rmse = float(np.sqrt(max(total, 0.0)))
+    degrees = np.sum(count - 1)
+    if degrees <= 0:
+        return rmse, None, None
+    temporal = float(np.sum(second - count * mean**2) / degrees)
+    fixed, of_noise = total - temporal, temporal / count.mean() * np.sqrt(2 / count.size)
+    seen = fixed > 3 * of_noise + 1e-12
+    return rmse, float(np.sqrt(max(temporal, 0.0))), float(np.sqrt(fixed)) if seen else 0.0
+
+
+def _notes(points: Sequence[NoiseAt], count: int, baseline: float | None) -> tuple[str, ...]:
+    notes = []
+    if count < 3:
+        what = {1: "s2 alone", 2: "s0 and s2"}[count]
+        notes.append(f"{count} different distance{'s' * (count > 1)}: only {what} can be fitted; record three or more")
+    if points[-1].distance_m < 2 * points[0].distance_m and count > 1:
+        notes.append("the farthest wall is less than twice as far as the nearest: s0, s1 and s2 are hard to tell apart")
+    if baseline is None:
+        notes.append("the camera's baseline is not known: no equivalent sub-pixel; put it into camera.toml")
+    for point in points:
+        if point.valid_share < 0.5:
+            notes.append(f"{point.name}: only {point.valid_share:.0%} of the region has depth; the rest may be noisier")
+        if point.temporal_m is None:
+            notes.append(f"{point.name}: a single frame, noise and fixed error cannot be told apart")
+    return tuple(notes)

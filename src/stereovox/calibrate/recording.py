@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A recording of a flat wall by a camera that stands, boiled down to a few numbers for each pixel."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.calibrate.surface import find_wall
+from stereovox.cameras import PinholeCamera
+from stereovox.depth.correct import correct
+from stereovox.errors import StereovoxError
+from stereovox.frame import Frame, Reason
+
+GROSS = 0.25
+"""Values off by a larger share of the depth are no noise: mismatches, or somebody who walks through."""
+USUAL = 0.5
+"""A pixel counts if it has a value in this share of the frames; rarer ones are those that scatter in one direction."""
+
+
+@dataclass(eq=False)
+class WallRecording:
+    """What the frames of one recording say about each pixel, without its gross errors.
+
+    camera: its correction, if any, is in the numbers already. distance: where the optical axis meets the wall, as
+    measured by hand, in metres, or None.
+    sums (4, height, width) float64: number of values, then the sums of 1/z, z and z^2 (z in metres).
+    gross: number of values left out as gross errors; skipped: frames without usable depth, first_fault: why the first
+    of them was. Poses do not count.
+    """
+
+    name: str
+    camera: PinholeCamera
+    distance: float | None = None
+    frames: int = 0
+    skipped: int = 0
+    first_fault: str = ""
+    gross: int = 0
+    sums: NDArray[np.float64] = field(default_factory=lambda: np.zeros((4, 0, 0)))
+
+    @property
+    def count(self) -> NDArray[np.float64]:
+        """Number of values of each pixel, (height, width)."""
+        return self.sums[0]
+
+    @property
+    def inverse(self) -> NDArray[np.float64]:
+        """Mean of 1/z in 1/m, (height, width), NaN where fewer than half the frames have a value.
+
+        Not of z: a stereo camera's noise is even in disparity, which is proportional to 1/z; far away the mean of z is
+        too large.
+        """
+        enough = self.count >= max(1.0, USUAL * self.frames)
+        return np.where(enough, self.sums[1] / np.maximum(self.count, 1), np.nan)
+
+    @property
+    def valid_share(self) -> float:
+        """Share of all pixels of all frames that have a value, gross errors left out."""
+        return float(self.count.sum() / max(1, self.frames * self.count.size))
+
+
+def read_wall(
+    frames: Iterable[Frame],
+    name: str,
+    camera: PinholeCamera,
+    distance: float | None = None,
+) -> WallRecording:
+    """Return the sums over `frames`, which may lack poses; depths are corrected where `camera` has a correction.
+
+    The first frame tells where the wall is, and so what is a gross error.
+    Raises StereovoxError where not one frame has usable depth, and as `find_wall` where the first shows no wall.
+    """
+    wall = WallRecording(name, camera, distance, sums=np.zeros((4, camera.height, camera.width)))
+    expected, gross = None, GROSS
+    for frame in frames:
+        depth_m = metres(frame)
+        if depth_m.shape != wall.count.shape or not np.isfinite(depth_m).any():
+            wall.skipped += 1
+            wall.first_fault = wall.first_fault or frame.fault_detail or f"{frame.name}: no valid depth"
+            continue
+        correct(depth_m, camera)
+        if expected is None:
+            found = find_wall(1 / depth_m.astype(float), camera, name)
+            expected, gross = found.inverse(camera), max(GROSS, 6 * found.noise)
+        _add(wall, depth_m, expected, gross)
+    if not wall.frames:
+        raise StereovoxError(f"{name}: no valid depth in any frame ({wall.first_fault or 'it has none'})")
+    return wall
+
+
+def metres(frame: Frame) -> NDArray[np.float32]:
+    """Return the depth as measured in metres, float32, NaN where there is none; poses and corrections do not count."""
+    raw = np.asarray(frame.depth)
+    depth_m = raw.astype(np.float32) * np.float32(frame.depth_scale)
+    usable = np.isfinite(depth_m) & (depth_m > 0)
+    if raw.dtype == np.uint16:
+        usable &= raw != np.iinfo(np.uint16).max
+    if frame.reason is not None and frame.reason.shape == raw.shape:
+        usable &= frame.reason == Reason.VALID
+    return np.where(usable, depth_m, np.float32(np.nan))
+
+
+def _add(wall: WallRecording, depth_m: NDArray[np.float32], expected: NDArray[np.float64], gross: float) -> None:
+    z = depth_m.astype(float)
+    known = np.isfinite(z)
+    with np.errstate(invalid="ignore"):
+        usable = known & (np.abs(z * expected - 1) <= gross)
+    wall.gross += int(known.sum() - usable.sum())
+    z[~usable] = 0
+    wall.sums += [usable, np.divide(1, z, out=np.zeros_like(z), where=usable), z, z * z]
+    wall.frames += 1

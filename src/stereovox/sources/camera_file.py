@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`camera.toml`: the numbers of a depth camera, and what a calibration found that it measures wrongly."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from stereovox.cameras import DepthCorrection, PinholeCamera
+from stereovox.errors import SourceError, StereovoxError, did_you_mean
+
+FILE = "camera.toml"
+SIZES = ("width", "height")
+INTRINSICS = ("fx", "fy", "cx", "cy")
+KEYS = (*SIZES, *INTRINSICS, "baseline", "correction")
+CORRECTION = ("model", "coefficients", "provenance")
+
+
+def read_camera(path: Path) -> PinholeCamera:
+    """Return the camera in `path`; raises SourceError, one line with file and key, for anything wrong in it.
+
+    Keys: width, height, fx, fy, cx, cy in pixels, perhaps baseline in metres, perhaps a table [correction] with model
+    and coefficients as `DepthCorrection` has them, and a table [correction.provenance] of anything.
+    """
+    try:
+        table = tomllib.loads(path.read_text("utf-8-sig"))
+    except OSError as error:
+        raise SourceError(f"{path}: {error.strerror}; give a camera file you may read") from None
+    except ValueError as error:  # bad TOML, bad UTF-8
+        raise SourceError(f"{path}: {error}; correct it") from None
+    try:
+        return _camera(table)
+    except StereovoxError as error:
+        raise SourceError(f"{path}: {error}") from None
+
+
+def camera_text(camera: PinholeCamera, provenance: Mapping[str, Any] | None = None, remarks: Sequence[str] = ()) -> str:
+    """Return a camera as the text of a camera file, `remarks` as comments at its top.
+
+    provenance: texts, numbers and lists of them that tell where the correction comes from.
+    """
+    lines = [f"# {remark}" for remark in remarks]
+    lines += [f"{key} = {_text(getattr(camera, key))}" for key in (*SIZES, *INTRINSICS)]
+    if camera.baseline is not None:
+        lines.append(f"baseline = {_text(camera.baseline)}")
+    if camera.correction:
+        lines += ["", "[correction]", f"model = {_text(camera.correction.model)}"]
+        lines.append(f"coefficients = {_text(camera.correction.coefficients)}")
+    if camera.correction and provenance:
+        lines += ["", "[correction.provenance]", *(f"{key} = {_text(value)}" for key, value in provenance.items())]
+    return "\n".join(lines) + "\n"
+
+
+def _camera(table: dict[str, Any]) -> PinholeCamera:
+    _check_keys(table, KEYS, "")
+    for key in (*SIZES, *INTRINSICS):
+        if key not in table:
+            raise SourceError(f"{key} is missing; write {key} = its number of pixels")
+    sizes = [_number(table, key) for key in SIZES]
+    if not all(size.is_integer() and 0 < size < 100_000 for size in sizes):
+        raise SourceError(f"width and height must be whole numbers of pixels, not {sizes[0]:g} and {sizes[1]:g}")
+    baseline = _number(table, "baseline") if "baseline" in table else None
+    correction = _correction(table["correction"]) if "correction" in table else None
+    intrinsics = [_number(table, key) for key in INTRINSICS]
+    return PinholeCamera(int(sizes[0]), int(sizes[1]), *intrinsics, baseline, correction=correction)
+
+
+def _correction(table: Any) -> DepthCorrection:
+    if not isinstance(table, dict):
+        raise SourceError("correction must be a table [correction] with model and coefficients")
+    _check_keys(table, CORRECTION, "correction.")
+    model, numbers = table.get("model"), table.get("coefficients")
+    if not isinstance(model, str) or not isinstance(numbers, list):
+        raise SourceError("[correction] needs model, a text, and coefficients, a list of numbers")
+    if not all(_is_number(number) for number in numbers):
+        raise SourceError(f"correction.coefficients {numbers} must be numbers")
+    return DepthCorrection(model, tuple(map(float, numbers)))
+
+
+def _check_keys(table: dict[str, Any], known: Sequence[str], prefix: str) -> None:
+    for key in table:
+        if key not in known:
+            raise SourceError(f"unknown key '{prefix}{key}'{did_you_mean(key, known)}")
+
+
+def _number(table: dict[str, Any], key: str) -> float:
+    value = table[key]
+    if not _is_number(value):
+        raise SourceError(f"{key} = {value!r} must be a number")
+    return float(value)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, str):
+        escaped = "".join(f"\\u{ord(c):04x}" if ord(c) < 32 or c in '"\\\x7f' else c for c in value)
+        return f'"{escaped}"'
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(_text, value))}]"
+    return repr(value if isinstance(value, int) else float(value))

@@ -1,0 +1,165 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pictures of calibrations: walls before and after a correction, noise against distance and against theory."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.calibrate.noise import NoiseCalibration
+from stereovox.calibrate.wall import WallCalibration, WallResult
+from stereovox.view.panels import GREY, INK, LINE, title
+
+DPI = 110
+WIDTH = 16.0
+"""Inches."""
+BEFORE, AFTER, WALL = "#d1603d", "#23618c", "#1b2333"
+THEORY = ((0.08, "--"), (0.04, ":"))
+"""Sub-pixels of the curves in Chien 2020, Fig 3.9."""
+DOTS = 6000
+BAND = 0.1
+"""Share of the rows in a top view: a wall that leans back would blur the rest."""
+
+
+def wall_png(calibration: WallCalibration) -> bytes:
+    """Return a PNG: for each wall histogram, top view, and error over the image before and after (after Fig A.1-A.3)."""
+    walls = calibration.walls
+    made = _figure(3.4 * len(walls) + 0.2)
+    grid = made.subplots(len(walls), 4, squeeze=False, width_ratios=[1, 1.25, 1.15, 1.15])
+    for axes, wall in zip(grid, walls, strict=True):
+        _histogram(axes[0], wall)
+        _top_view(axes[1], wall)
+        _error_map(made, axes[2], wall.before, "Before")
+        _error_map(made, axes[3], wall.after, "After")
+    return _png(made)
+
+
+def noise_png(calibration: NoiseCalibration) -> bytes:
+    """Return a PNG: RMSE against distance with theory (after Fig 3.7 and 3.9), sub-pixel, and share of valid pixels."""
+    made = _figure(6.4)
+    axes = made.subplot_mosaic([["rmse", "subpixel"], ["rmse", "shares"]], width_ratios=[1.7, 1])
+    _rmse(axes["rmse"], calibration)
+    _subpixel(axes["subpixel"], calibration)
+    _shares(axes["shares"], calibration)
+    return _png(made)
+
+
+def _histogram(axis: Any, wall: WallResult) -> None:
+    depths = [_depths(points) for points in (wall.points_before, wall.points_after)]
+    low, high = np.percentile(np.concatenate(depths), [0.2, 99.8])
+    bins = np.linspace(low, high, 90).tolist()
+    for values, colour, name in zip(depths, (BEFORE, AFTER), ("before", "after"), strict=True):
+        axis.hist(values, bins, color=colour, alpha=0.65, label=name)
+    axis.axvline(wall.distance, color=WALL, linewidth=1.2, linestyle="--", label="wall, on the axis")
+    axis.legend(frameon=False, fontsize=9)
+    axis.set_yticks([])
+    title(axis, f"Wall at {wall.distance:.2f} m" + ("" if wall.fitted else " (only checked)"))
+    _labels(axis, "depth [m]", "pixels")
+
+
+def _top_view(axis: Any, wall: WallResult) -> None:
+    known = np.isfinite(wall.points_before[..., 2])
+    rows = np.arange(len(known))[:, None] - round(wall.recording.camera.cy)
+    shown = np.flatnonzero(known & (np.abs(rows) <= len(known) * BAND / 2))
+    shown = np.random.default_rng(0).choice(shown, min(DOTS, len(shown)), replace=False)
+    for points, colour, name in ((wall.points_before, BEFORE, "before"), (wall.points_after, AFTER, "after")):
+        x, _, z = points.reshape(-1, 3)[shown].T
+        axis.plot(x, z, ".", color=colour, markersize=1.6, alpha=0.5, label=name)
+    a, b, _ = wall.plane
+    x = np.array(axis.get_xlim())
+    axis.plot(x, (1 - b * x) / a, color=WALL, linewidth=1.2, linestyle="--", label="wall, on the axis")
+    axis.legend(frameon=False, fontsize=9, markerscale=6, loc="best")
+    title(axis, "Top view, middle rows")
+    _labels(axis, "x, to the right [m]", "z, depth [m]")
+
+
+def _error_map(made: Any, axis: Any, error: NDArray[np.float64], name: str) -> None:
+    limit = max(0.1, 100 * float(np.nanpercentile(np.abs(error), 98)))
+    rms = 100 * np.sqrt(np.nanmean(error**2))
+    drawn = axis.imshow(100 * error, cmap="RdBu_r", vmin=-limit, vmax=limit, interpolation="antialiased")
+    axis.set(xticks=[], yticks=[], facecolor="#d9d9d9")
+    title(axis, f"{name}: {rms:.2f} % RMS")
+    bar = made.colorbar(drawn, ax=axis, orientation="horizontal", pad=0.02, fraction=0.06, aspect=30)
+    bar.set_label("too far [% of the depth]", color=GREY, fontsize=9)
+    bar.ax.tick_params(colors=GREY, labelsize=8)
+    bar.outline.set_visible(False)
+
+
+def _rmse(axis: Any, calibration: NoiseCalibration) -> None:
+    distance = np.array([point.distance_m for point in calibration.points])
+    z = np.linspace(0, 1.12 * distance.max(), 200)
+    if calibration.baseline:
+        for subpixel, style in THEORY:
+            s2 = subpixel / (calibration.focal_px * calibration.baseline)
+            axis.plot(z, 1000 * s2 * z * z, style, color=GREY, label=f"theory, sub-pixel {subpixel:g}")
+    axis.plot(z, 1000 * calibration.sigma(z), color="#9cc3dc", linewidth=5, label="fit, what the map uses", zorder=1)
+    for name, marker, colour in (("rmse_m", "o", BEFORE), ("temporal_m", "^", "#5b8c5a"), ("fixed_m", "s", "#a07cc0")):
+        values = [getattr(point, name) for point in calibration.points]
+        known = [(d, 1000 * value) for d, value in zip(distance, values, strict=True) if value is not None]
+        if known:
+            label = {"rmse_m": "measured RMSE", "temporal_m": "of it from frame to frame", "fixed_m": "of it fixed"}[name]
+            axis.plot(*zip(*known, strict=True), marker, color=colour, markersize=8 if marker == "o" else 5, label=label)
+    axis.legend(frameon=False, fontsize=10)
+    axis.set(xlim=(0, z[-1]), ylim=(0, None))
+    title(axis, "Error of one measurement against distance")
+    _labels(axis, "distance [m]", "error [mm]")
+
+
+def _subpixel(axis: Any, calibration: NoiseCalibration) -> None:
+    known = [(point.distance_m, point.subpixel) for point in calibration.points if point.subpixel is not None]
+    title(axis, "The same as a disparity error")
+    _labels(axis, "distance [m]", "sub-pixel [px]")
+    if not known:
+        axis.text(0.5, 0.5, "baseline not known", ha="center", color=GREY, transform=axis.transAxes)
+        return
+    axis.plot(*zip(*known, strict=True), "o-", color=BEFORE)
+    for subpixel, style in THEORY:
+        axis.axhline(subpixel, linestyle=style, color=GREY)
+    axis.set(xlim=(0, 1.12 * max(known)[0]), ylim=(0, 1.15 * max(0.08, *(value for _, value in known))))
+
+
+def _shares(axis: Any, calibration: NoiseCalibration) -> None:
+    distance = [point.distance_m for point in calibration.points]
+    width, height = calibration.region
+    for name, label, colour in (
+        ("valid_share", f"middle {width:g} x {height:g} m", AFTER),
+        ("image_share", "whole image", BEFORE),
+    ):
+        shares = [100 * getattr(point, name) for point in calibration.points]
+        axis.plot(distance, shares, "o-", color=colour, label=label)
+    axis.set(xlim=(0, 1.12 * max(distance)), ylim=(0, 104))
+    axis.legend(frameon=False, fontsize=10, loc="lower left")
+    title(axis, "Pixels that have a value")
+    _labels(axis, "distance [m]", "share [%]")
+
+
+def _depths(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    z = points[..., 2]
+    return z[np.isfinite(z)]
+
+
+def _labels(axis: Any, x: str, y: str) -> None:
+    axis.set_xlabel(x, color=GREY)
+    axis.set_ylabel(y, color=GREY)
+    axis.tick_params(colors=GREY, labelsize=9)
+    for spine in axis.spines.values():
+        spine.set_color(LINE)
+
+
+def _figure(height: float) -> Any:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    made = Figure((WIDTH, height), facecolor="white", layout="constrained")
+    FigureCanvasAgg(made)
+    return made
+
+
+def _png(made: Any) -> bytes:
+    out = io.BytesIO()
+    made.savefig(out, dpi=DPI, format="png")
+    return out.getvalue()

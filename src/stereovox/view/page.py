@@ -1,0 +1,47 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Parts of a report: one page of HTML without any outside file. All texts are escaped here."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Iterable, Sequence
+from html import escape
+from importlib.resources import files
+from typing import Any
+
+
+def page(title: str, lead: str, *parts: str) -> str:
+    """Return a whole page; `parts` are what the functions below return."""
+    text = (files("stereovox.view") / "page.html").read_text(encoding="utf-8")
+    fields = {"title": escape(title), "lead": escape(lead), "body": "\n".join(parts)}
+    for name, value in fields.items():
+        text = text.replace(f"{{{{{name}}}}}", value)
+    return text
+
+
+def section(heading: str, text: str, *parts: str) -> str:
+    """Return a heading, a paragraph and `parts` below it."""
+    return "\n".join([f"<h2>{escape(heading)}</h2>", f"<p>{escape(text)}</p>" if text else "", *parts])
+
+
+def tiles(pairs: Iterable[tuple[str, str]]) -> str:
+    """Return a row of boxes, each with a value and what it is."""
+    boxes = (f'<div class="tile"><b>{escape(value)}</b><span>{escape(what)}</span></div>' for value, what in pairs)
+    return f'<div class="tiles">{"".join(boxes)}</div>'
+
+
+def table(heads: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+    """Return a table."""
+    head = "".join(f"<th>{escape(text)}</th>" for text in heads)
+    body = "".join("<tr>" + "".join(f"<td>{escape(str(cell))}</td>" for cell in row) + "</tr>" for row in rows)
+    return f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+
+
+def figure(png: bytes, alt: str) -> str:
+    """Return a picture that lies inside the page."""
+    return f'<img alt="{escape(alt)}" src="data:image/png;base64,{base64.b64encode(png).decode()}">'
+
+
+def code(text: str) -> str:
+    """Return text as it stands in a file."""
+    return f"<pre>{escape(text)}</pre>"

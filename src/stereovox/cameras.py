@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from stereovox.errors import StereovoxError, did_you_mean
 
-
 CORRECTIONS = {"scale": 6, "disparity": 6, "scale+disparity": 12, "thesis": 3}
 """Models of a depth correction and the number of their coefficients; see `DepthCorrection`."""
 

@@ -28,7 +28,8 @@ class NoiseAt:
 
     rmse_m: root mean square error in metres, Chien's RMSE; its square is the sum of those of its two parts.
     temporal_m: what differs from frame to frame. fixed_m: what stays the same in all frames, 0 where it drowns in the
-    noise. Both are None where there is a single frame. offset_m: how much too far the wall is seen, None where its distance was not measured.
+    noise. Both are None where there is a single frame.
+    offset_m: how much too far the wall is seen, None where its distance was not measured.
     valid_share: share of the region's pixels that have a value, of all frames; image_share: of the whole image.
     gross_share: share of the image's values that are gross errors; they are in no other figure.
     subpixel: the disparity error in pixels that makes rmse_m (Chien 2020, Eq 3.5), None without a baseline.

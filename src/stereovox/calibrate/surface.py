@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Find the wall in a depth image that may be distorted, and the plane it is.
 
-Seen from a pinhole camera a plane is linear in the slopes x = X/Z and y = Y/Z of the pixels: 1/z = a + b x + c y. So the
-wall, however it leans, costs three numbers, and a distorted one is a little more: a quadratic.
+Seen from a pinhole camera a plane is linear in the slopes x = X/Z and y = Y/Z of the pixels: 1/z = a + b x + c y. So
+the wall, however it leans, costs three numbers, and a distorted one is a little more: a quadratic.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ LEAST_VALID = 0.3
 LEAST_WALL = 0.6
 """Share of the pixels with depth that must lie on the wall."""
 TOLERANCE = 0.03
-"""Share of the depth by which a pixel of the wall may lie off the quadratic, or four times the noise if that is more."""
+"""Share of the depth by which a pixel of the wall may lie off the quadratic; four times the noise if that is more."""
 STEEPEST_DEG = 20.0
 """A wall that leans more is refused."""
 MOST_CURVED = 0.4
@@ -69,7 +69,7 @@ def terms(x: Array, y: Array) -> Array:
 
 
 def tilt_deg(plane: Array) -> float:
-    """Return the angle in degrees between the optical axis and the normal (b, c, a) of the plane 1/z = a + b x + c y."""
+    """Return the angle in degrees between the optical axis and the normal (b, c, a) of 1/z = a + b x + c y."""
     a, b, c = plane
     return float(np.degrees(np.arctan2(np.hypot(b, c), a)))
 
@@ -83,7 +83,7 @@ def find_wall(inverse: Array, camera: PinholeCamera, name: str) -> Wall:
     valid = np.isfinite(inverse)
     if valid.mean() < LEAST_VALID:
         raise StereovoxError(
-            f"{name}: only {valid.mean():.0%} of the pixels have depth; stand before a textured wall, nearer, in more light"
+            f"{name}: only {valid.mean():.0%} of the pixels have depth; take a textured wall, nearer, in more light"
         )
     x, y = slopes(camera)
     noise = _noise(inverse)
@@ -130,7 +130,7 @@ def _guess(x: Array, y: Array, inverse: Array, tolerance: float) -> Array:
     A, columns = terms(u, v)[picks], terms(u, v)
     possible = np.linalg.cond(A) < 1e6
     if not possible.any():
-        return np.linalg.lstsq(columns, m, rcond=None)[0]
+        return np.asarray(np.linalg.lstsq(columns, m, rcond=None)[0], float)
     guesses = np.linalg.solve(A[possible], m[picks[possible]][..., None])[..., 0]
     hits = (np.abs(columns @ guesses.T - m[:, None]) < tolerance * m[:, None]).sum(axis=0)
     return guesses[np.argmax(hits)]
@@ -154,7 +154,7 @@ def _refined(x: Array, y: Array, inverse: Array, coefficients: Array, tolerance:
         if near.sum() < TERMS:
             break
         A = columns[near]
-        coefficients = np.linalg.solve(A.T @ A + 1e-12 * np.eye(TERMS), A.T @ inverse[near])
+        coefficients = np.asarray(np.linalg.solve(A.T @ A + 1e-12 * np.eye(TERMS), A.T @ inverse[near]), float)
     return coefficients
 
 

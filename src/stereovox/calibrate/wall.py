@@ -113,8 +113,7 @@ def calibrate_wall(
     Raises StereovoxError, one line: no wall, distances for some of the walls only or that cannot be, another camera,
     an unknown model.
     """
-    if model not in MODELS:
-        raise StereovoxError(f"unknown model '{model}'{did_you_mean(model, MODELS)}")
+    check_model(model)
     _check(recordings, check)
     found = [find_wall(recording.inverse, recording.camera, recording.name) for recording in recordings]
     for recording, wall in zip(recordings, found, strict=True):
@@ -131,6 +130,12 @@ def calibrate_wall(
         results.append(_result(recording, wall, correction, square, False))
     camera = replace(recordings[0].camera, correction=correction)
     return WallCalibration(camera, why, scores, tuple(results), _notes(results))
+
+
+def check_model(model: str) -> None:
+    """Raise StereovoxError for a model that does not exist."""
+    if model not in MODELS:
+        raise StereovoxError(f"unknown model '{model}'{did_you_mean(model, MODELS)}")
 
 
 def distance_groups(distances: Sequence[float]) -> list[int]:
@@ -227,21 +232,22 @@ def _result(
         return result
 
     before, after = (image(residual(points, used, plane)) for used in (None, correction))
-    depths = (image(1 / corrected_inverse(used, points.x, points.y, points.inverse)) for used in (None, correction))
-    return WallResult(recording, plane, before, after, *map(camera.back_project, depths), fitted)
+    seen, right = (
+        camera.back_project(image(1 / corrected_inverse(used, points.x, points.y, points.inverse)))
+        for used in (None, correction)
+    )
+    return WallResult(recording, plane, before, after, seen, right, fitted)
 
 
 def _notes(results: Sequence[WallResult]) -> tuple[str, ...]:
     notes = []
     for wall in results:
         on_wall = np.isfinite(wall.before)
-        spans = [np.flatnonzero(on_wall.any(axis=axis)) for axis in (0, 1)]
-        shares = [(span[-1] - span[0] + 1) / size for span, size in zip(spans, on_wall.shape[::-1], strict=True)]
+        seen = [np.flatnonzero(on_wall.any(axis=axis)) for axis in (0, 1)]
+        shares = [(span[-1] - span[0] + 1) / size for span, size in zip(seen, on_wall.shape[::-1], strict=True)]
         if wall.fitted and min(shares) < NARROW:
-            notes.append(
-                f"{wall.recording.name}: the wall spans {shares[0]:.0%} of the width and {shares[1]:.0%} of the height; "
-                "beyond it the correction is a guess"
-            )
+            spans = f"{shares[0]:.0%} of the width and {shares[1]:.0%} of the height"
+            notes.append(f"{wall.recording.name}: the wall spans {spans}; beyond it the correction is a guess")
     if any(wall.recording.frames < 10 for wall in results):
         notes.append("some recordings have less than 10 frames; noise then counts as error")
     return tuple(notes)

@@ -42,6 +42,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--integrator", metavar="NAME", help="projective (default) or ray")
     parser.add_argument("--max-range", type=float, metavar="M", help="depth in metres up to which pixels count")
     parser.add_argument("--frames", metavar="A:B:S", help="only these frames, as a Python slice")
+    parser.add_argument("--camera", metavar="FILE", help="camera file (camera.toml) that replaces the recording's own")
     parser.add_argument("--threads", type=int, metavar="N", help="threads (1); the map does not depend on it")
     parser.add_argument(
         "--set",
@@ -66,6 +67,10 @@ def run(arguments: Namespace) -> dict[str, Any]:
     out = Path(arguments.out)
     _check_target(out, arguments.resume)
     source = open_stream(arguments.source, arguments.frames)
+    if arguments.camera is not None:
+        from stereovox.sources.with_camera import with_camera
+
+        source = with_camera(source, arguments.camera)
     mapper = _mapper(arguments, out)
     _check_recording(mapper, source, out)
     for note in source.notes:

@@ -35,4 +35,3 @@ def thesis(p, x, depth_m):
             across = x[u] * z
             d = z - (across * (p[0] * across + p[1]) + p[2])
             row[u] = d if d > ZERO else NAN
-

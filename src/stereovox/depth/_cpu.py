@@ -3,11 +3,15 @@
 
 import numpy as np
 
-from stereovox._jit import kernel
+from stereovox._jit import cell, kernel
 
-VALID, UNMATCHED, TOO_NEAR, TOO_FAR = np.uint8(0), np.uint8(1), np.uint8(2), np.uint8(3)
+VALID, UNMATCHED, TOO_NEAR, TOO_FAR, MASKED = np.uint8(0), np.uint8(1), np.uint8(2), np.uint8(3), np.uint8(4)
 NAN, NEAR, FAR = np.float32(np.nan), np.float32(-np.inf), np.float32(np.inf)
 ZERO = np.float32(0)
+
+
+CHUNK = 4096
+"""Pixels that stay in the fastest cache from one look at them to the next."""
 
 
 @kernel
@@ -16,6 +20,26 @@ def classify(raw, scale, min_range, max_range, none, depth_m, reason):
 
     none: a raw value that means "no value" beside zero, negative and not finite ones (65535 in uint16 images).
     """
+    valid = np.int64(0)
+    for start in range(0, raw.size, CHUNK):
+        part = slice(start, start + CHUNK)
+        _metres(raw[part], scale, min_range, max_range, none, depth_m[part])
+        valid += _reasons(depth_m[part], reason[part])
+    return valid
+
+
+@kernel
+def take_given(given, depth_m, reason):
+    """Let the source's own reasons, where it has any, come first; return the number of valid pixels."""
+    valid = np.int64(0)
+    for start in range(0, given.size, CHUNK):
+        part = slice(start, start + CHUNK)
+        valid += _take(given[part], depth_m[part], reason[part])
+    return valid
+
+
+@cell
+def _metres(raw, scale, min_range, max_range, none, depth_m):
     for i in range(raw.size):  # single selects, no nested ones: those become branches and stop vectorisation
         value = np.float32(raw[i])
         d = value * scale
@@ -23,8 +47,12 @@ def classify(raw, scale, min_range, max_range, none, depth_m, reason):
         d = NEAR if d < min_range else d
         d = FAR if d > max_range else d
         depth_m[i] = d
+
+
+@cell
+def _reasons(depth_m, reason):
     valid = np.int32(0)
-    for i in range(raw.size):
+    for i in range(depth_m.size):
         d = depth_m[i]
         why = np.int32(VALID) if d == d else np.int32(UNMATCHED)
         why = np.int32(TOO_NEAR) if d == NEAR else why
@@ -34,14 +62,16 @@ def classify(raw, scale, min_range, max_range, none, depth_m, reason):
     return valid
 
 
-@kernel
-def take_given(given, depth_m, reason):
-    """Let the source's own reasons, where it has any, come first; return the number of valid pixels."""
+@cell
+def _take(given, depth_m, reason):
+    for i in range(given.size):
+        reason[i] = given[i] if given[i] != VALID else reason[i]
     valid = np.int32(0)
     for i in range(given.size):
-        why = given[i] if given[i] != VALID else reason[i]
-        without = NEAR if why == TOO_NEAR else (FAR if why == TOO_FAR else NAN)
-        depth_m[i] = depth_m[i] if why == VALID else without
-        reason[i] = why
-        valid += np.int32(why == VALID)
+        why, d = reason[i], depth_m[i]
+        d = NAN if (why == UNMATCHED) | (why == MASKED) else d
+        d = NEAR if why == TOO_NEAR else d
+        d = FAR if why == TOO_FAR else d
+        depth_m[i] = d
+        valid += np.int32(1) if why == VALID else np.int32(0)
     return valid

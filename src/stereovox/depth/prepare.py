@@ -46,10 +46,10 @@ def _classify(frame: Frame, config: Config, depth_m: NDArray, reason: NDArray) -
     if frame.camera.correction:  # before the limits, which hold for true depths
         raw, scale, none = corrected(raw, scale, none, frame.camera), np.float32(1), np.float32(0)
     limits = (np.float32(config.min_range), np.float32(config.max_range))
-    usable = _cpu.classify(raw, scale, *limits, none, depth_m.reshape(-1), reason.reshape(-1))
+    into = depth_m.reshape(-1), reason.reshape(-1)
+    usable = _cpu.classify(raw, scale, *limits, none, *into)
     if frame.reason is not None:
-        given = np.ascontiguousarray(frame.reason, np.uint8).reshape(-1)
-        usable = _cpu.take_given(given, depth_m.reshape(-1), reason.reshape(-1))
+        usable = _cpu.take_given(np.ascontiguousarray(frame.reason, np.uint8).reshape(-1), *into)
     return usable
 
 

@@ -53,6 +53,23 @@ def open_stream(path_or_name: str | os.PathLike[str], frames: str | None = None)
     return live(where) if frames is None else Excerpt(live(where), frames)
 
 
+def open_images(path_or_name: str | os.PathLike[str], frames: str | None = None) -> Stream:
+    """Return what `open_stream` returns, but without poses where the recording can do without them.
+
+    So a folder of stamped images needs no groundtruth.txt. Raises SourceError as `open_stream`.
+    """
+    from stereovox.sources.pair_file import FILE
+    from stereovox.sources.tum import StampedImages
+
+    where = os.fspath(path_or_name)
+    if _live(where):
+        return open_stream(where, frames)
+    stamped = StampedImages.recognises(where) and not os.path.isfile(os.path.join(where, FILE))
+    kind: Any = StampedImages if stamped else _recognise(where)
+    source = kind.depth_only(where) if hasattr(kind, "depth_only") else kind(where)
+    return source if frames is None else Selection(source, frames)
+
+
 def _live(where: str) -> Any:
     """Return the class of the live camera that `where` names, if it does."""
     kinds = (registry.find("streams", STREAMS, name) for name in registry.names("streams", STREAMS))

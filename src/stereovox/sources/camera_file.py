@@ -64,8 +64,8 @@ def _camera(table: dict[str, Any]) -> PinholeCamera:
         raise SourceError(f"width and height must be whole numbers of pixels, not {sizes[0]:g} and {sizes[1]:g}")
     baseline = _number(table, "baseline") if "baseline" in table else None
     correction = _correction(table["correction"]) if "correction" in table else None
-    intrinsics = [_number(table, key) for key in INTRINSICS]
-    return PinholeCamera(int(sizes[0]), int(sizes[1]), *intrinsics, baseline, correction=correction)
+    fx, fy, cx, cy = (_number(table, key) for key in INTRINSICS)
+    return PinholeCamera(int(sizes[0]), int(sizes[1]), fx, fy, cx, cy, baseline, correction=correction)
 
 
 def _correction(table: Any) -> DepthCorrection:

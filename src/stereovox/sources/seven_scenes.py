@@ -74,3 +74,13 @@ class SevenScenes(DepthFolder):
         if len(numbers) != 16:
             raise FrameRefused("bad_pose_file", f"{path}: holds {len(numbers)} numbers; write a 4x4 matrix")
         return np.array(numbers).reshape(4, 4)
+
+    @classmethod
+    def depth_only(cls, where: str) -> SevenScenes:
+        """Return the images without looking for poses: every pose is NaN."""
+        return _Images(where)
+
+
+class _Images(SevenScenes):
+    def pose(self, i: int) -> Transform:
+        return np.full((4, 4), np.nan)

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 
 from stereovox.calibrate.noise import NoiseCalibration
 from stereovox.calibrate.wall import WallCalibration, WallResult
-from stereovox.view.panels import GREY, INK, LINE, title
+from stereovox.view.panels import GREY, LINE, title
 
 DPI = 110
 WIDTH = 16.0
@@ -20,13 +19,18 @@ WIDTH = 16.0
 BEFORE, AFTER, WALL = "#d1603d", "#23618c", "#1b2333"
 THEORY = ((0.08, "--"), (0.04, ":"))
 """Sub-pixels of the curves in Chien 2020, Fig 3.9."""
+ERRORS = (
+    ("rmse_m", "measured RMSE", "o", BEFORE),
+    ("temporal_m", "of it from frame to frame", "^", "#5b8c5a"),
+    ("fixed_m", "of it fixed", "s", "#a07cc0"),
+)
 DOTS = 6000
 BAND = 0.1
 """Share of the rows in a top view: a wall that leans back would blur the rest."""
 
 
 def wall_png(calibration: WallCalibration) -> bytes:
-    """Return a PNG: for each wall histogram, top view, and error over the image before and after (after Fig A.1-A.3)."""
+    """Return a PNG: histogram, top view, error over the image before and after, for each wall (after Fig A.1-A.3)."""
     walls = calibration.walls
     made = _figure(3.4 * len(walls) + 0.2)
     grid = made.subplots(len(walls), 4, squeeze=False, width_ratios=[1, 1.25, 1.15, 1.15])
@@ -97,12 +101,11 @@ def _rmse(axis: Any, calibration: NoiseCalibration) -> None:
             s2 = subpixel / (calibration.focal_px * calibration.baseline)
             axis.plot(z, 1000 * s2 * z * z, style, color=GREY, label=f"theory, sub-pixel {subpixel:g}")
     axis.plot(z, 1000 * calibration.sigma(z), color="#9cc3dc", linewidth=5, label="fit, what the map uses", zorder=1)
-    for name, marker, colour in (("rmse_m", "o", BEFORE), ("temporal_m", "^", "#5b8c5a"), ("fixed_m", "s", "#a07cc0")):
+    for name, label, marker, colour in ERRORS:
         values = [getattr(point, name) for point in calibration.points]
         known = [(d, 1000 * value) for d, value in zip(distance, values, strict=True) if value is not None]
         if known:
-            label = {"rmse_m": "measured RMSE", "temporal_m": "of it from frame to frame", "fixed_m": "of it fixed"}[name]
-            axis.plot(*zip(*known, strict=True), marker, color=colour, markersize=8 if marker == "o" else 5, label=label)
+            axis.plot(*zip(*known, strict=True), marker, color=colour, label=label)
     axis.legend(frameon=False, fontsize=10)
     axis.set(xlim=(0, z[-1]), ylim=(0, None))
     title(axis, "Error of one measurement against distance")

@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Measure how noisy a depth camera is before flat walls, and write a profile that makes the map use it.
+
+Let the camera stand before a flat, textured wall at three or more distances, some 30 frames each, from near to as far
+as it is to be used. The middle of the image counts. Use the result with: stereovox map SOURCE --profile FILE.
+"""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser, Namespace
+from typing import TYPE_CHECKING, Any
+
+from stereovox.cli.recordings import add_recordings, check_distances, check_outputs, read_walls
+from stereovox.cli.terminal import say, say_about_compiling
+from stereovox.errors import StereovoxError
+
+if TYPE_CHECKING:
+    from stereovox.calibrate.noise import NoiseCalibration
+
+EXAMPLE = "stereovox calibrate noise wall-1m wall-2m wall-4m --out my-d435.toml --report noise-report"
+
+
+def add_arguments(parser: ArgumentParser) -> None:
+    """Declare the options."""
+    add_recordings(parser)
+    parser.add_argument("--out", required=True, metavar="FILE", help="profile to write, for example my-d435.toml")
+    parser.add_argument(
+        "--camera", metavar="FILE", help="camera file that replaces the recordings' own, with correction"
+    )
+    parser.add_argument(
+        "--region",
+        default="0.6x0.4",
+        metavar="WxH",
+        help="metres of the wall round the middle that count (%(default)s)",
+    )
+
+
+def run(arguments: Namespace) -> dict[str, Any]:
+    """Measure, write the profile and tell what was found."""
+    from stereovox.calibrate.noise import calibrate_noise
+
+    region = _region(arguments.region)
+    check_distances(arguments.recordings, arguments.distance)
+    check_outputs(arguments.out, arguments.report)
+    say_about_compiling()
+    walls = read_walls(arguments.recordings, arguments.distance, arguments.frames, arguments.camera)
+    found = calibrate_noise(walls, region)
+    _write(arguments.out, found)
+    _tell(found, arguments.out)
+    result = {**found.as_dict(), "out": arguments.out}
+    if arguments.report:
+        from stereovox.view.calibration_report import write_noise_report
+
+        result["report"] = str(write_noise_report(arguments.report, found, arguments.out))
+        say(f"report: {result['report']}")
+    return result
+
+
+def _region(text: str) -> tuple[float, float]:
+    try:
+        width, height = (float(word) for word in text.lower().split("x"))
+    except ValueError:
+        width = height = 0.0
+    if not (0 < width < 1000 and 0 < height < 1000):
+        raise StereovoxError(f"--region {text}: write width x height in metres, for example 0.6x0.4")
+    return width, height
+
+
+def _write(out: str, found: NoiseCalibration) -> None:
+    from stereovox.products.files import replacing
+
+    with replacing(out) as file:
+        file.write(profile_text(found).encode())
+
+
+def profile_text(found: NoiseCalibration) -> str:
+    """Return a profile that holds the noise, with what it was fitted to as comments."""
+    lines = ["# range noise sigma(z) = s0 + s1 z + s2 z^2 in metres, measured by stereovox calibrate noise"]
+    if found.subpixel is not None:
+        lines.append(f"# s2 is a disparity error of {found.subpixel:.4f} px")
+    lines += [f"# {point.distance_m:.3f} m: RMSE {1000 * point.rmse_m:.2f} mm" for point in found.points]
+    lines += ["[noise]", *(f"{name} = {float(getattr(found, name))!r}" for name in ("s0", "s1", "s2"))]
+    return "\n".join(lines) + "\n"
+
+
+def _tell(found: NoiseCalibration, out: str) -> None:
+    for note in found.notes:
+        say(f"note: {note}")
+    for point in found.points:
+        parts = ""
+        if point.temporal_m is not None and point.fixed_m is not None:
+            parts = f" ({1000 * point.temporal_m:.2f} from frame to frame, {1000 * point.fixed_m:.2f} fixed)"
+        subpixel = "" if point.subpixel is None else f", sub-pixel {point.subpixel:.3f}"
+        say(
+            f"  at {point.distance_m:.2f} m: RMSE {1000 * point.rmse_m:.2f} mm{parts}{subpixel}, "
+            f"{point.valid_share:.1%} of the pixels valid"
+        )
+    subpixel = "" if found.subpixel is None else f"; s2 is {found.subpixel:.4f} px of disparity"
+    say(f"sigma(z) = {found.s0:.3g} + {found.s1:.3g} z + {found.s2:.3g} z^2 m{subpixel}")
+    say("fitted to the whole RMSE: an error that stays the same does not average out, so it belongs into sigma")
+    say(f"saved {out}; use it with: stereovox map SOURCE --out MAP --profile {out}")

@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the calibrations have in common: recordings of walls with their distances, and files that can be written."""
+
+from __future__ import annotations
+
+import os
+from argparse import ArgumentParser
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from stereovox.cli.terminal import say, tracked
+from stereovox.errors import StereovoxError
+
+if TYPE_CHECKING:
+    from stereovox.calibrate.recording import WallRecording
+    from stereovox.sources import Stream
+
+LIVE_FRAMES = 60
+"""Frames taken of a live camera that are not counted by --frames."""
+
+
+def add_recordings(parser: ArgumentParser) -> None:
+    """Declare the options that tell where the walls are."""
+    parser.add_argument(
+        "recordings", nargs="+", metavar="RECORDING", help="a still camera before a flat wall; no poses"
+    )
+    parser.add_argument(
+        "--distance",
+        action="append",
+        type=float,
+        default=[],
+        metavar="M",
+        help="measured metres from the camera to the wall along its axis, once for each RECORDING",
+    )
+    parser.add_argument("--frames", metavar="A:B:S", help="only these frames of each, as a Python slice")
+    parser.add_argument("--report", metavar="DIR", help="folder for a page with figures and pictures")
+
+
+def check_outputs(out: str, report: str | None) -> None:
+    """Find out before the work, not after it, that a result could not be written.
+
+    Raises StereovoxError, one line, also for a name that does not end in .toml.
+    """
+    if Path(out).suffix != ".toml":
+        raise StereovoxError(f"--out {out}: give a name that ends in .toml")
+    if os.path.isdir(out):
+        raise StereovoxError(f"--out {out}: is a folder; name a file")
+    _check_folder(Path(out).absolute().parent, "--out", out)
+    if report is not None:
+        if os.path.exists(report) and not os.path.isdir(report):
+            raise StereovoxError(f"--report {report}: is a file; name a folder")
+        there = next(path for path in (Path(report).absolute(), *Path(report).absolute().parents) if path.exists())
+        _check_folder(there, "--report", report)
+
+
+def read_walls(
+    names: Sequence[str], distances: Sequence[float], frames: str | None, camera: str | None = None, raw: bool = False
+) -> list[WallRecording]:
+    """Return what the recordings show; `distances` as `check_distances` has them.
+
+    camera: a camera file that replaces theirs. raw: the depths are taken as measured, whatever correction there is.
+    """
+    measured = distances or [None] * len(names)
+    return [_read(name, distance, frames, camera, raw) for name, distance in zip(names, measured, strict=True)]
+
+
+def _read(name: str, distance: float | None, frames: str | None, camera: str | None, raw: bool) -> WallRecording:
+    from stereovox.calibrate.recording import read_wall
+    from stereovox.sources import open_images
+    from stereovox.sources.with_camera import with_camera
+
+    stream: Stream = open_images(name, frames)
+    if camera is not None:
+        stream = with_camera(stream, camera)
+    for note in getattr(stream, "notes", ()):
+        say(f"note: {note}")
+    count = stream.length
+    if count is None and frames is None:
+        count = LIVE_FRAMES
+    shown = tracked(islice(stream, count), count, name)
+    return read_wall(shown, name, replace(stream.camera, correction=None) if raw else stream.camera, distance)
+
+
+def check_distances(names: Sequence[str], distances: Sequence[float], option: str = "--distance") -> None:
+    """Raise StereovoxError unless there is a distance for each recording, or none at all, and each can be."""
+    if distances and len(distances) != len(names):
+        many = f"{len(names)} recording{'s' * (len(names) != 1)}"
+        raise StereovoxError(f"{many} but {len(distances)} x {option}: give one for each, in the same order, or none")
+    for distance in distances:
+        if not 0 < distance < 1000:
+            raise StereovoxError(f"{option} {distance:g}: give metres, above 0")
+
+
+def _check_folder(folder: Path, option: str, name: str) -> None:
+    if not folder.is_dir():
+        raise StereovoxError(f"{option} {name}: there is no folder {folder}; make it or choose another")
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise StereovoxError(f"{option} {name}: {folder} cannot be written to; choose another folder")

@@ -18,8 +18,7 @@ from stereovox.errors import StereovoxError
 REGION = (0.6, 0.4)
 """Width and height in metres of the part of the wall round the optical axis that counts (Chien 2020, 3.3)."""
 FEWEST_PIXELS = 30
-TERMS = {1: (2,), 2: (0, 2), 3: (0, 1, 2)}
-"""Powers of z that so many different distances can tell apart."""
+TERMS = ("s0", "s1", "s2")
 
 
 @dataclass(frozen=True)
@@ -84,12 +83,15 @@ class NoiseCalibration:
         return {**fit, **rest, "points": [vars(point) for point in self.points]}
 
 
-def calibrate_noise(recordings: Sequence[WallRecording], region: tuple[float, float] = REGION) -> NoiseCalibration:
+def calibrate_noise(
+    recordings: Sequence[WallRecording], region: tuple[float, float] = REGION, fitted: Sequence[str] = TERMS
+) -> NoiseCalibration:
     """Return the noise of the camera that took all recordings, fitted to the whole RMSE of single measurements.
 
     The fixed part belongs into sigma as well: it does not average out where the camera stands, and where it moves the
-    map meets it as one more error of each measurement. One distance gives s2 alone, two s0 and s2, three or more all.
-    Raises StereovoxError, one line: no wall, nothing in the region, different cameras.
+    map meets it as one more error of each measurement. `fitted` names those of s0, s1, s2 that need not be 0; each
+    needs a distance of its own.
+    Raises StereovoxError, one line: no wall, nothing in the region, different cameras, too few distances.
     """
     if not recordings:
         raise StereovoxError("no recording of a wall; give several, at different distances")
@@ -99,11 +101,11 @@ def calibrate_noise(recordings: Sequence[WallRecording], region: tuple[float, fl
             raise StereovoxError(f"{recording.name}: is of another camera than {recordings[0].name}; use one camera")
     points = sorted((noise_at(recording, region) for recording in recordings), key=lambda point: point.distance_m)
     distances = [point.distance_m for point in points]
-    count = min(3, len(set(distance_groups(distances))))
-    s = fit_noise(np.array(distances), np.array([point.rmse_m for point in points]), TERMS[count])
+    _check_count(distances, fitted)
+    s = fit_noise(np.array(distances), np.array([point.rmse_m for point in points]), fitted)
     focal_px = camera.fx * camera.binning
     subpixel = s[2] * focal_px * camera.baseline if camera.baseline else None
-    notes = _notes(points, count, camera.baseline)
+    notes = _notes(points, fitted, camera.baseline)
     return NoiseCalibration(*s, subpixel, focal_px, camera.baseline, region, tuple(points), notes)
 
 
@@ -119,8 +121,8 @@ def noise_at(recording: WallRecording, region: tuple[float, float] = REGION) -> 
     used = inside & wall.on_wall
     if used.sum() < FEWEST_PIXELS:
         raise StereovoxError(
-            f"{recording.name}: only {used.sum()} pixels of the middle {region[0]:g} x {region[1]:g} m have depth; "
-            "use a larger --region, or a wall that is nearer or has more texture"
+            f"{recording.name}: only {used.sum()} pixels of the middle {region[0]:g} x {region[1]:g} m show the wall; "
+            "clear what stands before it, give it more texture, or use a larger --region"
         )
     plane = fit_plane(x[used], y[used], recording.inverse[used])
     rmse, temporal, fixed = _errors(recording.sums[:, used], 1 / (plane[0] + plane[1] * x[used] + plane[2] * y[used]))
@@ -142,16 +144,17 @@ def noise_at(recording: WallRecording, region: tuple[float, float] = REGION) -> 
     )
 
 
-def fit_noise(z: Array, rmse: Array, powers: Sequence[int] = (0, 1, 2)) -> tuple[float, float, float]:
-    """Return s0, s1, s2 >= 0 of the curve nearest to `rmse` (N,) at depths `z` (N,); those not in `powers` are 0.
+def fit_noise(z: Array, rmse: Array, fitted: Sequence[str] = TERMS) -> tuple[float, float, float]:
+    """Return s0, s1, s2 >= 0 of the curve nearest to `rmse` (N,) at depths `z` (N,); those not in `fitted` are 0.
 
     Errors count as shares of the RMSE, because that is how precisely a standard deviation is known.
     """
     from scipy.optimize import nnls
 
+    powers = [TERMS.index(name) for name in fitted]
     columns = np.stack([z**power / rmse for power in powers], axis=1)
-    s = np.zeros(3)
-    s[list(powers)] = nnls(columns, np.ones(len(z)))[0]
+    s = np.zeros(len(TERMS))
+    s[powers] = nnls(columns, np.ones(len(z)))[0]
     return float(s[0]), float(s[1]), float(s[2])
 
 
@@ -173,13 +176,24 @@ def _errors(sums: NDArray[np.float64], wall_z: Array) -> tuple[float, float | No
     return rmse, float(np.sqrt(max(temporal, 0.0))), float(np.sqrt(fixed)) if seen else 0.0
 
 
-def _notes(points: Sequence[NoiseAt], count: int, baseline: float | None) -> tuple[str, ...]:
+def _check_count(distances: Sequence[float], fitted: Sequence[str]) -> None:
+    count = len(set(distance_groups(distances)))
+    if count >= len(fitted):
+        return
+    seen = ", ".join(f"{distance:.2f}" for distance in distances)
+    less = {1: "s2", 2: "s0,s2 or --terms s2"}[count]
+    raise StereovoxError(
+        f"too few distances ({seen} m) to tell {', '.join(fitted)} apart: record {len(fitted) - count} more, "
+        f"or fit less with --terms {less}"
+    )
+
+
+def _notes(points: Sequence[NoiseAt], fitted: Sequence[str], baseline: float | None) -> tuple[str, ...]:
     notes = []
-    if count < 3:
-        what = {1: "s2 alone", 2: "s0 and s2"}[count]
-        notes.append(f"{count} different distance{'s' * (count > 1)}: only {what} can be fitted; record three or more")
-    if points[-1].distance_m < 2 * points[0].distance_m and count > 1:
-        notes.append("the farthest wall is less than twice as far as the nearest: s0, s1 and s2 are hard to tell apart")
+    if points[-1].distance_m < 2 * points[0].distance_m and len(fitted) > 1:
+        notes.append(
+            f"the farthest wall is not twice as far as the nearest: {', '.join(fitted)} are hard to tell apart"
+        )
     if baseline is None:
         notes.append("the camera's baseline is not known: no equivalent sub-pixel; put it into camera.toml")
     for point in points:

@@ -14,7 +14,7 @@ VOXEL_SIZES = (0.2, 0.1, 0.05, 0.02)
 
 def add_arguments(parser: ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("source", metavar="SOURCE", help="folder of a recording, or sim:room")
+    parser.add_argument("source", metavar="SOURCE", help="recorded folder or file, or a simulation (sim:room)")
     parser.add_argument(
         "--voxel-size", type=float, action="append", metavar="M", help="cell size in metres; repeatable"
     )

@@ -11,7 +11,7 @@ from argparse import ArgumentParser, Namespace
 from typing import TYPE_CHECKING, Any
 
 from stereovox.cli.recordings import add_recordings, check_distances, check_outputs, read_walls
-from stereovox.cli.terminal import say, say_about_compiling
+from stereovox.cli.terminal import say
 from stereovox.errors import StereovoxError
 
 if TYPE_CHECKING:
@@ -33,18 +33,20 @@ def add_arguments(parser: ArgumentParser) -> None:
         metavar="WxH",
         help="metres of the wall round the middle that count (%(default)s)",
     )
+    parser.add_argument(
+        "--terms", default="s0,s1,s2", metavar="S,...", help="what is fitted, each needs a distance (%(default)s)"
+    )
 
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Measure, write the profile and tell what was found."""
     from stereovox.calibrate.noise import calibrate_noise
 
-    region = _region(arguments.region)
+    region, terms = _region(arguments.region), _terms(arguments.terms)
     check_distances(arguments.recordings, arguments.distance)
     check_outputs(arguments.out, arguments.report)
-    say_about_compiling()
     walls = read_walls(arguments.recordings, arguments.distance, arguments.frames, arguments.camera)
-    found = calibrate_noise(walls, region)
+    found = calibrate_noise(walls, region, terms)
     _write(arguments.out, found)
     _tell(found, arguments.out)
     result = {**found.as_dict(), "out": arguments.out}
@@ -64,6 +66,15 @@ def _region(text: str) -> tuple[float, float]:
     if not (0 < width < 1000 and 0 < height < 1000):
         raise StereovoxError(f"--region {text}: write width x height in metres, for example 0.6x0.4")
     return width, height
+
+
+def _terms(text: str) -> list[str]:
+    from stereovox.calibrate.noise import TERMS
+
+    terms = [word.strip() for word in text.split(",")]
+    if len(set(terms)) < len(terms) or not set(terms) <= set(TERMS):
+        raise StereovoxError(f"--terms {text}: name some of {', '.join(TERMS)}, for example s0,s2")
+    return terms
 
 
 def _write(out: str, found: NoiseCalibration) -> None:

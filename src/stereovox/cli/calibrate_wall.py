@@ -12,7 +12,7 @@ from argparse import ArgumentParser, Namespace
 from typing import TYPE_CHECKING, Any
 
 from stereovox.cli.recordings import add_recordings, check_distances, check_outputs, read_walls
-from stereovox.cli.terminal import say, say_about_compiling
+from stereovox.cli.terminal import say
 
 if TYPE_CHECKING:
     from stereovox.calibrate.wall import WallCalibration
@@ -49,7 +49,6 @@ def run(arguments: Namespace) -> dict[str, Any]:
     check_distances(arguments.recordings, arguments.distance)
     check_distances(arguments.check, arguments.check_distance, "--check-distance")
     check_outputs(arguments.out, arguments.report)
-    say_about_compiling()
     walls = read_walls(arguments.recordings, arguments.distance, arguments.frames, raw=True)
     check = read_walls(arguments.check, arguments.check_distance, arguments.frames, raw=True)
     found = calibrate_wall(walls, arguments.model, arguments.square, check)

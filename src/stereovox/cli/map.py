@@ -33,13 +33,13 @@ EXAMPLE = "stereovox map recordings/kitchen --out kitchen.svox --voxel-size 0.05
 
 def add_arguments(parser: ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("source", metavar="SOURCE", help="recorded folder or file, sim:room, or realsense:")
+    parser.add_argument("source", metavar="SOURCE", help="recorded folder or file, sim:room and the like, or realsense:")
     parser.add_argument("--out", required=True, metavar="MAP", help="folder of the map to write, for example room.svox")
     parser.add_argument(
         "--profile", metavar="P", help="profile name or TOML file (default; with --resume the map's own settings)"
     )
     parser.add_argument("--voxel-size", type=float, metavar="M", help="cell size in metres")
-    parser.add_argument("--integrator", metavar="NAME", help="projective (default) or ray")
+    parser.add_argument("--integrator", metavar="NAME", help="projective (default), ray or line")
     parser.add_argument("--max-range", type=float, metavar="M", help="depth in metres up to which pixels count")
     parser.add_argument("--frames", metavar="A:B:S", help="only these frames, as a Python slice")
     parser.add_argument("--camera", metavar="FILE", help="camera file (camera.toml) that replaces the recording's own")

@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Chien's byte: 127 unknown, 0 free, 255 occupied, shown as occupied above 180 (Chien 2020, 3.5)."""
+
+import numpy as np
+import pytest
+
+from stereovox.config import load_config
+from stereovox.maps import State, VoxelMap, load_map, make_map
+from stereovox.maps.cell_format import FORMATS
+from stereovox.maps.evidence import Evidence
+
+CENTRES = np.array([[0.05, 0.05, 0.05 + 0.1 * k] for k in range(8)])
+
+
+def byte_map():
+    return VoxelMap(load_config("default", voxel_size=0.1, **{
+        "map.cell": "uint8", "map.log_odds_min": -2.1, "map.log_odds_max": 2.1}))  # fmt: skip
+
+
+def add(voxel_map, *first_cells):
+    values = np.zeros((1, 512), np.int16)
+    values[0, : len(first_cells)] = first_cells
+    voxel_map.add(Evidence(np.zeros((1, 3), np.int32), values, np.empty((0, 3), np.int32), 0))
+
+
+def stored(voxel_map):
+    return voxel_map.blocks()[1][0][:8].tolist()
+
+
+def test_the_thesis_numbers():
+    bytes_ = FORMATS["uint8"]
+    assert bytes_.stored([0, 100, -100]).tolist() == [127, 255, 0]
+    assert bytes_.stored(np.log(0.7 / 0.3)) == 180
+    np.testing.assert_allclose(bytes_.log_odds(np.array([180, 127], np.uint8)), [np.log(0.7 / 0.3), 0], rtol=1e-5)
+
+
+def test_a_byte_adds_up_saturates_and_never_looks_unknown_again():
+    one = byte_map()
+    per_step = 1000 / FORMATS["uint8"].per_log_odds
+    add(one, 800, -800, 8000, -8000, 3, round(per_step))
+    assert stored(one) == [177, 77, 255, 0, 127, 128, 127, 127]  # 3 thousandths are less than half a step
+    add(one, -800, 800, 8000, -8000, 0, -round(per_step))
+    assert stored(one) == [128, 128, 255, 0, 127, 128, 127, 127]  # back at the start is not "unknown"
+    add(one, 840)
+    assert one.state(CENTRES[:1]) == State.OCCUPIED
+    assert one.memory_bytes < 0.6 * VoxelMap(load_config("default")).memory_bytes + 1024 * 20
+
+
+STATES = [(180, "TENTATIVE"), (181, "OCCUPIED"), (127, "UNKNOWN"), (128, "TENTATIVE"), (73, "FREE"), (75, "TENTATIVE")]
+
+
+@pytest.mark.parametrize(("number", "state"), STATES)
+def test_states_of_bytes(number, state):
+    one = byte_map()
+    one.insert(np.zeros((1, 3), np.int32), np.full((1, 512), number, np.uint8))
+    assert one.state(CENTRES[:1]) == State[state]
+
+
+def test_free_blocks_reach_zero_and_stay():
+    one = byte_map()
+    for _ in range(10):
+        one.add(Evidence(np.empty((0, 3), np.int32), np.empty((0, 512), np.int16), np.zeros((1, 3), np.int32), -400))
+    assert set(stored(one)) == {0}
+    add(one, 500)
+    assert stored(one)[0] == 31
+
+
+def test_evidence_too_small_for_a_byte_changes_nothing():
+    one = byte_map()
+    one.add(Evidence(np.empty((0, 3), np.int32), np.empty((0, 512), np.int16), np.zeros((1, 3), np.int32), -5))
+    assert one.counts() == {"free": 0, "tentative": 0, "occupied": 0}
+
+
+def test_save_and_load(tmp_path):
+    one = byte_map()
+    add(one, 800, -800, 8000)
+    one.save(tmp_path / "map")
+    again = load_map(tmp_path / "map")
+    assert again.blocks()[1].dtype == np.uint8
+    np.testing.assert_array_equal(again.blocks()[1], one.blocks()[1])
+    np.testing.assert_array_equal(again.cells()[1], one.cells()[1])
+
+
+def test_the_profile_of_the_thesis():
+    config = load_config("chien2020")
+    rolling = make_map(config)
+    assert rolling.cell_format.dtype == np.uint8
+    assert (rolling._rules.lowest, rolling._rules.highest) == (0, 255)
+    assert (config.voxel_size, config.depth.downsample, config.integrator) == (0.2, 8, "line")
+    assert np.prod(np.array(config.window.size) / 0.2).round() == 100 * 30 * 100

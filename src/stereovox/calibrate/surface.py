@@ -23,6 +23,8 @@ LEAST_WALL = 0.6
 """Share of the pixels with depth that must lie on the wall."""
 TOLERANCE = 0.03
 """Share of the depth by which a pixel of the wall may lie off the quadratic; four times the noise if that is more."""
+NOISIEST = 0.15
+"""Noise, as a share of the depth, above which nothing can be told from an image."""
 STEEPEST_DEG = 20.0
 """A wall that leans more is refused."""
 MOST_CURVED = 0.4
@@ -87,6 +89,10 @@ def find_wall(inverse: Array, camera: PinholeCamera, name: str) -> Wall:
         )
     x, y = slopes(camera)
     noise = _noise(inverse)
+    if noise > NOISIEST:
+        raise StereovoxError(
+            f"{name}: no flat wall in view: neighbouring pixels differ by {noise:.0%} of the depth; let a wall fill the image"
+        )
     tolerance = max(TOLERANCE, 4 * noise)
     coefficients = _refined(x[valid], y[valid], inverse[valid], _guess(x, y, inverse, tolerance), tolerance)
     surface = terms(x, y) @ coefficients

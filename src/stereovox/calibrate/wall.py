@@ -24,6 +24,8 @@ ALIKE = 1.1
 """Distances whose ratio is smaller count as one."""
 SIMPLER = 1.1
 """A simpler model is taken unless its error on walls it has not seen is so many times the best one's."""
+ROUGH = 0.01
+"""Error after the correction, as a share of the depth, that the user should know about."""
 NARROW = 0.8
 """Share of the image's width and height that the wall should span."""
 
@@ -248,6 +250,9 @@ def _notes(results: Sequence[WallResult]) -> tuple[str, ...]:
         if wall.fitted and min(shares) < NARROW:
             spans = f"{shares[0]:.0%} of the width and {shares[1]:.0%} of the height"
             notes.append(f"{wall.recording.name}: the wall spans {spans}; beyond it the correction is a guess")
+    for name, error in ((wall.recording.name, rms(wall.after)) for wall in results):
+        if error > ROUGH:
+            notes.append(f"{name}: still off by {100 * error:.1f} %; is the wall flat, and are there enough frames?")
     if any(wall.recording.frames < 10 for wall in results):
         notes.append("some recordings have less than 10 frames; noise then counts as error")
     return tuple(notes)

@@ -47,10 +47,10 @@ def _invert(depths, inverse):
 def _along_row(line, noise, fine, wide, out):
     for u in range(out.size):
         c = line[u + 3]
-        total, weight = _sums(
+        total, weight, wanted = _sums(
             c, line[u], line[u + 1], line[u + 2], line[u + 4], line[u + 5], line[u + 6], noise, fine, wide
         )
-        out[u] = c + total / weight
+        out[u] = c + total / weight if wanted else c
 
 
 @cell
@@ -60,14 +60,14 @@ def _along_columns(ring, v, noise, fine, wide, low, high, depths):
     b1, b2, b3 = ring[(v + 5) % RING], ring[(v + 6) % RING], ring[v % RING]
     for u in range(depths.size):
         c = centre[u]
-        total, weight = _sums(c, a3[u], a2[u], a1[u], b1[u], b2[u], b3[u], noise, fine, wide)
+        total, weight, wanted = _sums(c, a3[u], a2[u], a1[u], b1[u], b2[u], b3[u], noise, fine, wide)
         d = min(max(weight / (c * weight + total), low), high)
-        depths[u] = d if c > ZERO else depths[u]
+        depths[u] = d if wanted else depths[u]
 
 
 @cell
 def _sums(c, a3, a2, a1, b1, b2, b3, noise, fine, wide):
-    """Return the weighted sum of differences from `c`, and the sum of weights; `c` itself differs by 0.
+    """Return the weighted sum of differences from `c`, the sum of weights, and whether `c` is to change at all.
 
     A weight is (wide sigma)^2 - difference^2, not below 0. The farther neighbours count where noise is large.
     """
@@ -82,4 +82,4 @@ def _sums(c, a3, a2, a1, b1, b2, b3, noise, fine, wide):
     f2, g2 = max(top2 - p2 * p2, ZERO), max(top2 - q2 * q2, ZERO)
     f3, g3 = max(top3 - p3 * p3, ZERO), max(top3 - q3 * q3, ZERO)
     total = (f1 * p1 + g1 * q1) + (f2 * p2 + g2 * q2) + (f3 * p3 + g3 * q3)
-    return total, square + ((f1 + g1) + (f2 + g2) + (f3 + g3))
+    return total, square + ((f1 + g1) + (f2 + g2) + (f3 + g3)), (sigma > step) & (c > ZERO)

@@ -10,6 +10,7 @@ from stereovox import geometry
 from stereovox.config import Config
 from stereovox.depth import _cpu
 from stereovox.depth.correct import corrected
+from stereovox.depth.denoise import denoise
 from stereovox.depth.downsample import downsample
 from stereovox.errors import FrameRefused
 from stereovox.frame import DepthImage, Frame, Reason
@@ -36,6 +37,7 @@ def prepare(frame: Frame, config: Config) -> DepthImage:
     usable = _classify(frame, config, depth_m, reason)
     if not usable and not (reason == Reason.TOO_FAR).any():
         raise FrameRefused("no_valid_depth", f"{_name(frame)}: not one pixel has a valid depth; is the lens covered?")
+    denoise(depth_m, frame.camera, config)
     image = DepthImage(depth_m, reason, frame.camera, T_world_sensor, frame.stamp_ns)
     return downsample(image, config.depth.downsample)
 

@@ -85,7 +85,7 @@ def noise_page(found: NoiseCalibration, png: bytes, profile: str) -> str:
 
 
 def _wall_table(walls: list[dict[str, Any]]) -> tuple[list[str], list[list[str]]]:
-    heads = ["recording", "distance", "lean", "before", "after", "99 % of pixels within", "wall fills", "frames"]
+    heads = ["recording", "distance", "lean", "before", "after", "99 % of pixels within", "of the image", "frames"]
     heads.append("used for")
     rows = [
         [
@@ -95,7 +95,7 @@ def _wall_table(walls: list[dict[str, Any]]) -> tuple[list[str], list[list[str]]
             f"{wall['before_percent']:.2f} %",
             f"{wall['after_percent']:.2f} %",
             f"{wall['worst_after_percent']:.2f} %",
-            f"{wall['wall_share']:.0%} of the image",
+            f"{wall['wall_share']:.0%}",
             str(wall["frames"]),
             "the fit" if wall["fitted"] else "a check",
         ]

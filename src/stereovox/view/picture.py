@@ -9,15 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stereovox.errors import StereovoxError
 from stereovox.maps import VoxelMap
 from stereovox.view.drawn import Drawn, upright
-from stereovox.view.panels import GREY, INK, measured, oblique, slice_, title, view
+from stereovox.view.figures import DPI, WIDTH, figure_of, headline, save
+from stereovox.view.panels import GREY, measured, oblique, slice_, title, view
 from stereovox.view.render import Direction, extent
 
-DPI = 120
-WIDTH = 16.0
-"""Width of the page in inches."""
 LONG = 1.8
 """A map so many times longer than wide runs across the whole page."""
 HEIGHT_COLOURS = "viridis"
@@ -38,20 +35,11 @@ def picture(
     A ceiling is cut away. An empty map gives a picture that says so. Raises StereovoxError for a bad `up`, a name that
     does not end in .png or a file that cannot be written.
     """
-    if Path(path).suffix.lower() != ".png":
-        raise StereovoxError(f"{path}: pictures are PNG files; give a name that ends in .png")
-    figure = draw(voxel_map, heading=title or "Occupancy map", trajectory=trajectory, up=up)
-    try:
-        figure.savefig(path, dpi=DPI)
-    except OSError as error:
-        why = error.strerror or error
-        raise StereovoxError(f"{path}: cannot write the picture ({why}); name a writable file") from None
+    save(draw(voxel_map, heading=title or "Occupancy map", trajectory=trajectory, up=up), path)
 
 
 def draw(voxel_map: VoxelMap, *, heading: str, trajectory: ArrayLike | None = None, up: str = "z") -> Any:
     """Return the matplotlib figure that `picture` saves."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
     drawn = upright(voxel_map, trajectory, up)
     if not len(drawn.cells):
         figure = _note("This map is empty: no cell is known yet.")
@@ -59,32 +47,18 @@ def draw(voxel_map: VoxelMap, *, heading: str, trajectory: ArrayLike | None = No
         figure = _only_slice(drawn)
     else:
         figure = _page(drawn)
-    FigureCanvasAgg(figure)
-    counts = voxel_map.counts()
-    facts = [f"cells of {voxel_map.voxel_size:g} m", f"{voxel_map.frames:,} frames"]
-    facts += [f"{counts[state]:,} {state}" for state in ("occupied", "free", "tentative")]
-    figure.text(0.02, 1 - 0.42 / figure.get_figheight(), heading, fontsize=20, weight="bold", color=INK)
-    figure.text(0.02, 1 - 0.76 / figure.get_figheight(), "   ·   ".join(facts), fontsize=12.5, color=GREY)
+    headline(figure, voxel_map, heading)
     return figure
 
 
-def _figure(height: float) -> Any:
-    from matplotlib.figure import Figure
-    from matplotlib.layout_engine import ConstrainedLayoutEngine
-
-    headline = 0.95
-    layout = ConstrainedLayoutEngine(rect=(0.005, 0.005, 0.99, 1 - headline / height))
-    return Figure((WIDTH, height), facecolor="white", layout=layout)
-
-
 def _note(text: str) -> Any:
-    figure = _figure(4)
+    figure = figure_of(4)
     figure.text(0.5, 0.4, text, ha="center", fontsize=20, color=GREY)
     return figure
 
 
 def _only_slice(drawn: Drawn) -> Any:
-    figure = _figure(9)
+    figure = figure_of(9)
     slice_(figure.add_subplot(), drawn)
     figure.text(0.5, 0.01, "No cell is occupied.", ha="center", fontsize=14, color=GREY)
     return figure
@@ -96,7 +70,7 @@ def _page(drawn: Drawn) -> Any:
     lay_out = _long_page if across > LONG * away else _square_page
     figure, spots, directions = lay_out(solid, away / across)
     axes = [figure.add_subplot(spot) for spot, _ in spots]
-    colours, mappable = _height_colours(drawn)
+    colours, mappable = height_colours(drawn)
     view(axes[0], drawn, colours, TOP, int(spots[0][1] * DPI))
     cut = "" if drawn.cut is None else f", cut open at {drawn.names[2]} = {drawn.cut:.2f} m"
     title(axes[0], f"From above{cut}")
@@ -105,11 +79,16 @@ def _page(drawn: Drawn) -> Any:
         oblique(axis, drawn, colours, direction, int(width * DPI))
         title(axis, f"View {name}")
     slice_(axes[4], drawn)
-    bar = figure.colorbar(mappable, ax=axes[0], pad=0.01, fraction=0.03, aspect=25)
+    height_bar(figure, axes[0], mappable, drawn)
+    return figure
+
+
+def height_bar(figure: Any, axis: Any, mappable: Any, drawn: Drawn) -> None:
+    """Put the colour bar of heights beside a panel."""
+    bar = figure.colorbar(mappable, ax=axis, pad=0.01, fraction=0.03, aspect=25)
     bar.set_label(f"height {drawn.names[2]} [m]", color=GREY)
     bar.ax.tick_params(colors=GREY)
     bar.outline.set_visible(False)
-    return figure
 
 
 def _long_page(solid: NDArray[np.int32], shape: float) -> tuple[Any, list[Any], list[Direction]]:
@@ -119,7 +98,7 @@ def _long_page(solid: NDArray[np.int32], shape: float) -> tuple[Any, list[Any], 
     top = 14.2 * shape + 0.8
     middle = _row_height(solid, [(wide, directions[0]), (narrow, directions[1])])
     low = max(_row_height(solid, [(narrow, directions[2])]), wide * shape + 0.8)
-    figure = _figure(top + middle + low + 1.0)
+    figure = figure_of(top + middle + low + 1.0)
     rows = figure.add_gridspec(3, 1, height_ratios=[top, middle, low])
     upper, lower = rows[1].subgridspec(1, 3), rows[2].subgridspec(1, 3)
     spots = [(rows[0], 14.2), (upper[:2], wide), (upper[2], narrow), (lower[0], narrow), (lower[1:], wide)]
@@ -131,7 +110,7 @@ def _square_page(solid: NDArray[np.int32], shape: float) -> tuple[Any, list[Any]
     half, third = WIDTH * 0.45, WIDTH * 0.32
     top = min(half * shape, 9.0) + 0.8
     low = _row_height(solid, [(third, direction) for direction in directions])
-    figure = _figure(top + low + 1.0)
+    figure = figure_of(top + low + 1.0)
     rows = figure.add_gridspec(2, 1, height_ratios=[top, low])
     upper, lower = rows[0].subgridspec(1, 2), rows[1].subgridspec(1, 3)
     spots = [(upper[0], half), *((lower[n], third) for n in range(3)), (upper[1], half)]
@@ -144,7 +123,7 @@ def _row_height(solid: NDArray[np.int32], panels: list[tuple[float, Direction]])
     return float(np.clip(1.1 * max(needed) + 0.4, 3.0, 6.0))
 
 
-def _height_colours(drawn: Drawn) -> tuple[NDArray[np.float64], Any]:
+def height_colours(drawn: Drawn) -> tuple[NDArray[np.float64], Any]:
     """Return the colour (N, 3) of every drawn cell, pale enough for shading to show, and what a colour bar needs."""
     from matplotlib import colormaps
     from matplotlib.cm import ScalarMappable

@@ -91,7 +91,8 @@ def find_wall(inverse: Array, camera: PinholeCamera, name: str) -> Wall:
     noise = _noise(inverse)
     if noise > NOISIEST:
         raise StereovoxError(
-            f"{name}: no flat wall in view: neighbouring pixels differ by {noise:.0%} of the depth; let a wall fill the image"
+            f"{name}: no flat wall in view: neighbouring pixels differ by {noise:.0%} of the depth; "
+            "let a wall fill the image"
         )
     tolerance = max(TOLERANCE, 4 * noise)
     coefficients = _refined(x[valid], y[valid], inverse[valid], _guess(x, y, inverse, tolerance), tolerance)

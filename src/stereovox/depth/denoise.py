@@ -13,7 +13,7 @@ from stereovox.sensors.noise import RangeNoise
 
 FINE = 0.15
 """Noise of this share of a cell does not thicken a surface noticeably."""
-WIDTHS = (4.0, 3.0)
+WIDTHS = (5.0, 3.0)
 """A neighbour counts less the more it differs, and not at all from so many sigma on: along rows, along columns."""
 
 

@@ -66,7 +66,7 @@ def open_images(path_or_name: str | os.PathLike[str], frames: str | None = None)
         return open_stream(where, frames)
     stamped = StampedImages.recognises(where) and not os.path.isfile(os.path.join(where, FILE))
     kind: Any = StampedImages if stamped else _recognise(where)
-    source = kind.depth_only(where) if hasattr(kind, "depth_only") else kind(where)
+    source = kind.depth_only(where)
     return source if frames is None else Selection(source, frames)
 
 

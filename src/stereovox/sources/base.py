@@ -71,6 +71,11 @@ class Source(Stream, Protocol):
     def __iter__(self) -> Iterator[Frame]:
         return prefetch(self.frame, len(self))
 
+    @classmethod
+    def depth_only(cls, where: str) -> Source:
+        """Open `where` for its depth images alone; a recording that can do without its poses says so here."""
+        return cls(where)  # pyright: ignore[reportCallIssue] - what is registered is made from its place
+
 
 class Selection(Source):
     """The frames of `source` that the Python slice text `frames` (`A:B:S`) picks, in its order.

@@ -7,6 +7,7 @@ import os
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -116,7 +117,7 @@ def open_depth(folder: Path, settings: PairSettings) -> Source:
     """Return the depth images of a pair; their own poses, if there are any, do not count.
 
     A folder with `depth.txt` or `depth/` holds stamped images (see `StampedImages`); anything else is opened by the
-    source that recognises it, by its `depth_only(where)` where it has one.
+    source that recognises it, by its `depth_only(where)`.
     Raises SourceError where there are no depth images.
     """
     where = os.path.join(folder, settings.depth)
@@ -159,11 +160,11 @@ def _recognised(where: str) -> Source:
 
     for kind in _others(SOURCES):
         if kind.recognises(where):
-            return kind.depth_only(where) if hasattr(kind, "depth_only") else kind(where)
+            return kind.depth_only(where)
     raise SourceError(f"{where}: no depth images; name a folder with depth.txt or depth/, or a recording, as 'depth'")
 
 
-def _others(sources: dict[str, str]) -> Iterable[type]:
+def _others(sources: dict[str, str]) -> Iterable[Any]:
     kinds = (registry.find("sources", sources, name) for name in registry.names("sources", sources))
     return (kind for kind in kinds if kind is not CameraPair)
 

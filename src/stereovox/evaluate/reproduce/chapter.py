@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What an experiment has to say: claims that hold or not, tables and pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+Progress = Callable[[int, int, str], None]
+"""Called with steps done, steps in all, and what is being done."""
+
+
+@dataclass(frozen=True)
+class Claim:
+    """One row of "does it hold?". holds: None where nobody claimed anything and the number only stands beside."""
+
+    text: str
+    thesis: str
+    ours: str
+    holds: bool | None
+
+    @property
+    def verdict(self) -> str:
+        """`yes`, `no` or `-`."""
+        return "-" if self.holds is None else "yes" if self.holds else "no"
+
+
+@dataclass(frozen=True)
+class Shown:
+    """A picture (PNG) with its place in the thesis (`Fig 4.6`), what the thesis says of its own, and what ours shows."""
+
+    place: str
+    said: str
+    ours: str
+    png: bytes
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """A table with a heading."""
+
+    heading: str
+    heads: Sequence[str]
+    rows: Sequence[Sequence[Any]]
+
+
+@dataclass(frozen=True)
+class Chapter:
+    """One experiment of a report.
+
+    method: what was done, in a few sentences. remarks: what a reader must know to judge it, one paragraph each.
+    numbers: everything that was measured, fit for JSON.
+    """
+
+    name: str
+    title: str
+    method: str
+    claims: Sequence[Claim]
+    shown: Sequence[Shown] = ()
+    sheets: Sequence[Sheet] = ()
+    remarks: Sequence[str] = ()
+    numbers: dict[str, Any] = field(default_factory=dict)
+
+    def summary(self) -> dict[str, Any]:
+        """Return the chapter without its pictures, fit for JSON."""
+        return {"title": self.title, "claims": [asdict(claim) for claim in self.claims], "numbers": self.numbers}
+
+
+def percent(share: float) -> str:
+    """Return `94.3 %`."""
+    return f"{100 * share:.1f} %"

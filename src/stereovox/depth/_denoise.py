@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernel that averages each pixel with those neighbours that its noise cannot tell from it: rows first, then columns."""
+"""Kernel that averages each pixel with the neighbours that noise cannot tell from it: along rows, then columns."""
 
 import numpy as np
 

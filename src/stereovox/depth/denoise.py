@@ -31,8 +31,8 @@ def denoise(depth_m: NDArray[np.float32], camera: PinholeCamera, config: Config)
     keeps every detail, and with large cells nothing is done at all.
 
     What it cannot do: neighbouring errors of real stereo matching are alike over about the matching window, and what
-    they have in common stays in the mean. Two surfaces within some sigma of each other are blended over 3 pixels; a D435
-    at 3 m cannot tell 10 cm apart pixel by pixel.
+    they have in common stays in the mean. Two surfaces within some sigma of each other are blended over 3 pixels: at 3 m
+    a D435's sigma is 3.5 cm.
     """
     noise = RangeNoise.of(config.noise, camera)
     fine = FINE * config.voxel_size
@@ -46,6 +46,4 @@ def _run(depth_m: NDArray[np.float32], noise: RangeNoise, fine: float, config: C
     ring = np.empty((_denoise.RING, width), np.float32)
     coefficients = np.array([noise.s0, noise.s1, noise.s2], np.float32)
     low, high = np.float32(config.min_range), np.float32(config.max_range)
-    _denoise.denoise(
-        depth_m, coefficients, np.float32(fine), np.array(WIDTHS, np.float32), low, high, line, ring
-    )
+    _denoise.denoise(depth_m, coefficients, np.float32(fine), np.array(WIDTHS, np.float32), low, high, line, ring)

@@ -83,7 +83,8 @@ def measure_wall(
     size = voxel_map.voxel_size
     axis = int(np.argmax(np.abs(wall.normal)))
     occupied = _near(np.floor(voxel_map.occupied() / size).astype(np.int64), wall, size, reach)
-    columns = np.unique(_column(_over(wall, size, axis) if only is None else _near(indices(only), wall, size, size), axis))
+    face = _over(wall, size) if only is None else indices(only)
+    columns = np.unique(_column(_near(face, wall, size, size), axis))
     if others is not None:
         columns = np.setdiff1d(columns, _column(_near(indices(others), wall, size, reach), axis))
     of_column = position(_column(occupied, axis), columns)
@@ -111,7 +112,7 @@ def fit_plane(points: NDArray[np.float64], towards: ArrayLike) -> tuple[NDArray[
 
 
 def corner_deg(one: WallFound, other: WallFound) -> float:
-    """Return the angle in degrees, 0 to 180, between two walls; 90 where they stand square."""
+    """Return the angle in degrees, 0 to 180, inside the corner of two walls, on the side from which both are seen."""
     cosine = np.clip(-one.normal @ other.normal, -1, 1)
     return float(np.degrees(np.arccos(cosine)))
 
@@ -141,12 +142,11 @@ def _near(cells: NDArray[np.integer], wall: Wall, size: float, reach: float) -> 
     return np.asarray(cells[inside & (np.abs(centre @ wall.normal) <= reach)], np.int64)
 
 
-def _over(wall: Wall, size: float, axis: int) -> NDArray[np.int64]:
-    """Return at least one cell (N, 3) of the face for each column."""
+def _over(wall: Wall, size: float) -> NDArray[np.int64]:
+    """Return the cells (N, 3) that the face lies in."""
     steps = [np.arange(0, 1, size / 4 / np.linalg.norm(side)) for side in wall.along]
     a, b = (grid.ravel()[:, None] for grid in np.meshgrid(*steps, indexing="ij"))
-    cells = np.unique(np.floor((wall.corner + a * wall.along[0] + b * wall.along[1]) / size).astype(np.int64), axis=0)
-    return _near(cells, wall, size, size)
+    return np.unique(np.floor((wall.corner + a * wall.along[0] + b * wall.along[1]) / size).astype(np.int64), axis=0)
 
 
 def _column(cells: NDArray[np.integer], axis: int) -> Keys:

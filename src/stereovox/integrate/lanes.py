@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,4 +42,5 @@ def make_lanes(wide: bool) -> Lanes:
     """Return scratch with keys of 64 bits (`wide`) or 32 bits, which serve cells within 2^9 of the camera."""
     types = {"Floats": np.float32, "Ints": np.int32, "Keys": np.int64 if wide else np.int32}
     kinds = {name: getattr(kind, "__forward_arg__", kind) for name, kind in Lanes.__annotations__.items()}
-    return Lanes(**{name: np.zeros(LANES, types[kind]) for name, kind in kinds.items()})
+    arrays: dict[str, Any] = {name: np.zeros(LANES, types[kind]) for name, kind in kinds.items()}
+    return Lanes(**arrays)

@@ -13,7 +13,7 @@ from stereovox.cameras import PinholeCamera
 from stereovox.config import Config
 from stereovox.frame import DepthImage
 from stereovox.integrate import _lanes, _line, _ray
-from stereovox.integrate.lanes import Lanes, make_lanes
+from stereovox.integrate.lanes import make_lanes
 from stereovox.integrate.shards import in_shards, shards
 from stereovox.integrate.views import KernelTable, View, origin_block, sensor_table, view_of
 from stereovox.maps.blocks import CELLS, SIDE, BlockPool
@@ -44,10 +44,9 @@ class Ray:
         view = view_of(image, config.voxel_size, config.max_range)
         weight = np.float32((camera.fx * config.voxel_size) ** -2 if config.ray.update == "every" else 0)
         parts = shards(camera.height, config.threads)
-        workers = list(zip(parts, self._pools, self._lanes, strict=False))
-        of_part = {part.start: worker for part, *worker in workers}
-        in_shards(lambda part: self._follow(image.depth_m, view, weight, *of_part[part.start], part), parts)
-        pool = self._merged([pool for _, pool, _ in workers], bool(weight > 0))
+        number = {part.start: n for n, part in enumerate(parts)}
+        in_shards(lambda part: self._follow(image.depth_m, view, weight, number[part.start], part), parts)
+        pool = self._merged(self._pools[: len(parts)], bool(weight > 0))
         values = np.empty((len(pool), CELLS), np.int16)
         _lanes.to_thousandths(pool.values[: len(pool)], _lanes.FRACTION_BITS if weight > 0 else 0, values)
         origin = origin_block(image.T_world_sensor, config.voxel_size).astype(np.int32)
@@ -64,9 +63,8 @@ class Ray:
         self._lanes = [make_lanes(wide) for _ in self._pools]
         self._camera = camera
 
-    def _follow(
-        self, depth_m: NDArray[np.float32], view: View, weight: np.float32, pool: BlockPool, lanes: Lanes, part: slice
-    ) -> None:
+    def _follow(self, depth_m: NDArray[np.float32], view: View, weight: np.float32, worker: int, part: slice) -> None:
+        pool, lanes = self._pools[worker], self._lanes[worker]
         pool.clear()
         while not self._kernel(
             depth_m, view, self._table, self._look_up, weight, lanes,

@@ -9,7 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stereovox.errors import StereovoxError
-from stereovox.maps import VoxelMap
+from stereovox.maps import State, VoxelMap
+from stereovox.maps.blocks import SIDE
+from stereovox.maps.cell_format import CellRules
 
 ACROSS = {"x": ("y", "z"), "y": ("x", "z"), "z": ("x", "y")}
 """For the axis a layer stands across: the axes of its columns and of its rows."""
@@ -32,30 +34,30 @@ class Layer:
     at_m: float
 
 
-def layer(voxel_map: VoxelMap, across: str, at_m: float) -> Layer:
+def layer(voxel_map: VoxelMap, across: str, at_m: float, bounds: NDArray[np.float64] | None = None) -> Layer:
     """Return the layer that holds the plane `across` = `at_m` metres, as large as the map's known cells.
 
-    Raises StereovoxError where `across` is none of x, y, z, or the map is empty.
+    bounds: `voxel_map.bounds()`, if the caller has it already: it takes longer than the rest.
+    Raises StereovoxError where `across` is none of x, y, z, `at_m` is no number, or the map is empty.
     """
     if across not in ACROSS:
         raise StereovoxError(f"layer across '{across}': name one of x, y, z")
-    indices, log_odds = voxel_map.cells()
-    if not len(indices):
+    if not np.isfinite(at_m):
+        raise StereovoxError(f"layer at {at_m}: give a place in metres")
+    bounds = voxel_map.bounds() if bounds is None else bounds
+    if bounds is None:
         raise StereovoxError("the map is empty: there is no layer to show")
+    size = voxel_map.voxel_size
     normal, columns, rows = ("xyz".index(name) for name in (across, *ACROSS[across]))
-    low, high = indices.min(0), indices.max(0) + 1
-    number = int(np.floor(at_m / voxel_map.voxel_size))
-    here = indices[:, normal] == number
-    values = np.full((high[rows] - low[rows], high[columns] - low[columns]), np.nan, np.float32)
-    values[indices[here, rows] - low[rows], indices[here, columns] - low[columns]] = log_odds[here]
-    centres = np.empty((*values.shape, 3))
-    centres[..., normal] = number
-    centres[..., rows] = np.arange(low[rows], high[rows])[:, None]
-    centres[..., columns] = np.arange(low[columns], high[columns])[None, :]
-    state = voxel_map.state((centres.reshape(-1, 3) + 0.5) * voxel_map.voxel_size).reshape(values.shape)
-    edges = np.array([low[columns], high[columns], low[rows], high[rows]]) * voxel_map.voxel_size
-    extent = (float(edges[0]), float(edges[1]), float(edges[2]), float(edges[3]))
-    return Layer(values, state, extent, ACROSS[across], across, (number + 0.5) * voxel_map.voxel_size)
+    (left, bottom), (right, top) = np.rint(bounds[:, [columns, rows]] / size).astype(int).tolist()
+    number = int(np.floor(at_m / size))
+    stored = _stored(voxel_map, number, (normal, columns, rows), (left >> 3, bottom >> 3, right >> 3, top >> 3))
+    row, column = bottom & 7, left & 7
+    stored = stored[row : row + top - bottom, column : column + right - left]
+    known = stored != voxel_map.cell_format.unknown
+    log_odds = np.where(known, voxel_map.cell_format.log_odds(stored), np.float32(np.nan))
+    extent = (left * size, right * size, bottom * size, top * size)
+    return Layer(log_odds, _states(voxel_map, stored), extent, ACROSS[across], across, (number + 0.5) * size)
 
 
 def along_ray(
@@ -78,3 +80,31 @@ def along_ray(
     distance = distance[np.append(True, np.diff(distance) > 1e-9)]
     middle = (distance[:-1] + distance[1:]) / 2
     return distance, voxel_map.log_odds(start + middle[:, None] * towards)
+
+
+def _stored(
+    voxel_map: VoxelMap, number: int, axes: tuple[int, int, int], blocks: tuple[int, int, int, int]
+) -> NDArray[np.integer]:
+    """Return the cells (rows, columns) as stored of layer `number`, of the blocks left, bottom, right, top, all in."""
+    normal, columns, rows = axes
+    low, high = np.array(blocks).reshape(2, 2)
+    cell_format = voxel_map.cell_format
+    across, up = (high - low + 1).tolist()
+    shape = (up, SIDE, across, SIDE)
+    found = np.full(shape, cell_format.unknown, cell_format.dtype)
+    for coords, cells in voxel_map.slabs():
+        place = coords[:, [columns, rows]]
+        here = (coords[:, normal] == number >> 3) & (place >= low).all(axis=1) & (place <= high).all(axis=1)
+        column, row = (place[here] - low).T
+        cubes = np.moveaxis(cells[here].reshape(-1, SIDE, SIDE, SIDE), 1 + normal, 1)
+        found[row, :, column] = cubes[:, number & 7].swapaxes(1, 2)  # a block counts its lower axis first: the columns
+    return found.reshape(shape[0] * SIDE, -1)
+
+
+def _states(voxel_map: VoxelMap, stored: NDArray[np.integer]) -> NDArray[np.uint8]:
+    rules = CellRules(voxel_map.config.map)
+    state = np.full(stored.shape, State.TENTATIVE, np.uint8)
+    state[stored < rules.free_below] = State.FREE
+    state[stored > rules.occupied_above] = State.OCCUPIED
+    state[stored == voxel_map.cell_format.unknown] = State.UNKNOWN
+    return state

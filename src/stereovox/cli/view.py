@@ -1,0 +1,34 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Look at a map in the browser: turn it, cut it, and see what the camera's optical axis meets."""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser, Namespace
+from contextlib import closing, suppress
+from pathlib import Path
+from typing import Any
+
+from stereovox.cli.terminal import say
+
+EXAMPLE = "stereovox view kitchen.svox"
+
+
+def add_arguments(parser: ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("map", metavar="MAP", help="folder of a map")
+    parser.add_argument("--host", default="127.0.0.1", help="address to serve; 0.0.0.0 lets others look (default here)")
+    parser.add_argument("--port", type=int, default=8080, help="port of the page; 0 for any that is free (8080)")
+
+
+def run(arguments: Namespace) -> dict[str, Any]:
+    """Serve the page until Ctrl-C."""
+    from stereovox.maps import load_map
+    from stereovox.view.viewer import is_private, open_viewer
+
+    viewer = open_viewer(load_map(arguments.map), Path(arguments.map).stem, arguments.host, arguments.port)
+    with closing(viewer), suppress(KeyboardInterrupt):
+        if not is_private(arguments.host):
+            say(f"warning: anyone who can reach {arguments.host} over the network can look at this map")
+        say(f"open {viewer.url} in a browser; Ctrl-C ends")
+        viewer.wait()
+    return {"url": viewer.url}

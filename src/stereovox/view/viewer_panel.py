@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the viewer's panel says about a map: statistics, colour bars, and the log-odds along the optical axis."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.maps import VoxelMap
+from stereovox.view.axis import draw_profile
+from stereovox.view.panels import GREY
+
+WIDTH_IN, DPI = 4.2, 200
+"""Width of the panel's pictures: in inches as text size sees it, and pixels an inch."""
+
+
+def statistics(voxel_map: VoxelMap) -> str:
+    """Return what a map holds, as Markdown."""
+    counts, bounds = voxel_map.counts(), voxel_map.bounds()
+    rows = {state: f"{counts[state]:,}" for state in ("occupied", "free", "tentative")}
+    rows["cell"] = f"{voxel_map.voxel_size:g} m"
+    for axis, name in enumerate("xyz" if bounds is not None else ""):
+        low, high = bounds[:, axis] if bounds is not None else (0, 0)
+        rows[name] = f"{low:.2f} to {high:.2f} m"
+    rows["frames"] = f"{voxel_map.frames:,} ({voxel_map.frames_refused:,} refused)"
+    rows["memory"] = f"{voxel_map.memory_bytes / 1e6:,.1f} MB"
+    rows["profile"] = plain(voxel_map.config.profile)
+    if voxel_map.recording:
+        rows["recording"] = plain(voxel_map.recording)
+    lines = ["| map | |", "|:--|:--|", *(f"| {name} | {value} |" for name, value in rows.items())]
+    return "\n".join(lines if bounds is not None else ["This map is empty: no cell is known yet.", "", *lines])
+
+
+def plain(text: str) -> str:
+    """Return text for Markdown that is shown letter by letter.
+
+    The page would run `{...}` and `<...>` as program text, and a map may come from somebody else.
+    """
+    text = " ".join(text.encode("utf-8", "replace").decode().split())
+    return re.sub(r"([!-/:-@\[-`{-~])", r"\\\1", text)
+
+
+def colour_bar(scale: Any, label: str) -> NDArray[np.uint8]:
+    """Return a picture (H, W, 3) of a colour bar for a matplotlib mappable."""
+    figure = _figure(0.75)
+    bar = figure.colorbar(scale, cax=figure.add_subplot(), orientation="horizontal")
+    bar.set_label(label, color=GREY)
+    bar.ax.tick_params(colors=GREY)
+    bar.outline.set_visible(False)
+    return _pixels(figure)
+
+
+def axis_chart(voxel_map: VoxelMap) -> NDArray[np.uint8]:
+    """Return a picture (H, W, 3) of the log-odds along the optical axis (Chien 2020, Fig 4.6).
+
+    Raises StereovoxError where the map does not know its camera.
+    """
+    figure = _figure(2.9)
+    draw_profile(figure.add_subplot(), voxel_map)
+    return _pixels(figure)
+
+
+def _figure(height: float) -> Any:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure((WIDTH_IN, height), dpi=DPI, facecolor="white", layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def _pixels(figure: Any) -> NDArray[np.uint8]:
+    figure.canvas.draw()
+    return np.asarray(figure.canvas.buffer_rgba())[..., :3].copy()

@@ -1,0 +1,147 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Noise goes, edges stay, and nothing is made up."""
+
+import numpy as np
+import pytest
+
+from stereovox.cameras import PinholeCamera
+from stereovox.config import load_config
+from stereovox.depth import prepare
+from stereovox.depth.denoise import denoise
+from stereovox.frame import Frame, Reason
+
+CAMERA = PinholeCamera(64, 48, 415.0, 415.0, 31.5, 23.5, baseline=0.05)
+S2 = 0.08 / (415.0 * 0.05)
+CONFIG = load_config(voxel_size=0.05, min_range=0.2, max_range=6.0)
+
+
+def slow_denoise(depth_m, s0, s1, s2, voxel_size, low, high):
+    """The same in plain words and float64: two passes, pixel by pixel, neighbour by neighbour."""
+    inverse = {vu: 1.0 / d for vu, d in np.ndenumerate(depth_m.astype(float)) if 0 < d < np.inf}
+    untouched = set()
+    for (down, right), k in (((0, 1), 5.0), ((1, 0), 3.0)):
+        averaged = {}
+        for (v, u), centre in inverse.items():
+            z = 1 / centre
+            noise = s0 + s1 * z + s2 * z**2
+            steps = sum(noise > (2 * s - 1) * 0.15 * voxel_size for s in (1, 2, 3))
+            if steps == 0:
+                untouched.add((v, u))
+            near = [inverse.get((v + s * down, u + s * right)) for s in range(-steps, steps + 1)]
+            near = [w for w in near if w is not None and abs(w - centre) < k * noise / z**2]
+            weights = [1 - ((w - centre) / (k * noise / z**2)) ** 2 for w in near]
+            averaged[v, u] = sum(w * g for w, g in zip(near, weights, strict=True)) / sum(weights)
+        inverse = averaged
+    result = depth_m.astype(float).copy()
+    for vu, value in inverse.items():
+        result[vu] = depth_m[vu] if vu in untouched else np.clip(1 / value, low, high)
+    return result
+
+
+def measured(true_depth_m, seed=0, s2=S2):
+    """Depths whose inverse has Gaussian noise of s2."""
+    random = np.random.default_rng(seed)
+    return (1 / (1 / true_depth_m + s2 * random.standard_normal(true_depth_m.shape))).astype(np.float32)
+
+
+def cleaned(depth_m, config=CONFIG, camera=CAMERA):
+    result = depth_m.copy()
+    denoise(result, camera, config)
+    return result
+
+
+def steps_and_holes(shape, seed):
+    random = np.random.default_rng(seed)
+    v, u = np.mgrid[: shape[0], : shape[1]]
+    true = np.where((u // 5 + v // 9) % 2, 2.0 + 0.03 * u, 3.4 - 0.02 * v)
+    depth = measured(true, seed)
+    for value in (np.nan, np.inf, -np.inf):
+        depth[random.random(shape) < 0.06] = value
+    return depth
+
+
+@pytest.mark.parametrize("noise", [{}, {"s0": 0.01, "s1": 0.004}, {"s0": 0.02, "s2": 0.0}, {"s1": 0.01, "s2": 0.0}])
+@pytest.mark.parametrize("shape", [(48, 64), (1, 9), (9, 1), (2, 3), (1, 1)])
+def test_same_as_the_slow_one(shape, noise):
+    config = load_config(CONFIG, **{f"noise.{name}": value for name, value in noise.items()})
+    depth = steps_and_holes(shape, seed=sum(shape))
+    depth.flat[0] = 4.0  # at least one far value, whatever the shape
+    numbers = (noise.get("s0", 0.0), noise.get("s1", 0.0), noise.get("s2", S2))
+    np.testing.assert_allclose(cleaned(depth, config), slow_denoise(depth, *numbers, 0.05, 0.2, 6.0), rtol=2e-5)
+
+
+def test_a_slanted_wall_loses_its_noise_and_stays_where_it_is():
+    true = 1 / np.linspace(1 / 3.5, 1 / 4.5, 64)[None, :].repeat(48, 0)
+    raw = 1 / measured(true) - 1 / true
+    after = (1 / cleaned(measured(true)) - 1 / true)[3:-3, 3:-3]
+    assert raw.std() == pytest.approx(S2, rel=0.05)
+    assert after.std() < raw.std() / 4
+    assert abs(after.mean()) < raw.std() / 20
+
+
+def test_no_value_appears_between_two_surfaces():
+    near, far = 2.0, 4.0
+    true = np.full((48, 64), far)
+    true[:, 20:40] = near
+    result = cleaned(measured(true))
+    assert (np.abs(1 / result - 1 / true) < 4 * S2).all()
+
+
+@pytest.mark.parametrize("width_px", [1, 2, 4])
+def test_a_thin_pole_keeps_its_depth(width_px):
+    true = np.full((48, 64), 4.0)
+    true[:, 30 : 30 + width_px] = 2.0
+    raw = measured(true)
+    pole, raw_pole = (1 / image[:, 30 : 30 + width_px] - 0.5 for image in (cleaned(raw), raw))
+    assert np.abs(pole).max() <= np.abs(raw_pole).max() + 1e-6
+    assert np.abs(pole).std() < np.abs(raw_pole).std() / 1.05
+
+
+def test_pixels_without_value_stay_without_and_count_nowhere():
+    depth = np.full((48, 64), 4.0, np.float32)
+    depth[10:30:2] = np.nan
+    depth[:, 7::5], depth[:, 8::5] = np.inf, -np.inf
+    np.testing.assert_array_equal(np.isfinite(cleaned(depth)), np.isfinite(depth))
+    np.testing.assert_allclose(cleaned(depth), depth, rtol=1e-6)
+
+
+def test_reasons_stay_and_only_values_change():
+    true = np.full((48, 64), 4.0)
+    true[:10], true[10:20] = 0.1, 9.0
+    depth = measured(true)
+    depth[25, 30] = np.nan
+    plain = prepare(Frame(depth, CAMERA, np.eye(4)), load_config(CONFIG, **{"depth.denoise": False}))
+    image = prepare(Frame(depth, CAMERA, np.eye(4)), CONFIG)
+    np.testing.assert_array_equal(image.reason, plain.reason)
+    valid = plain.reason == Reason.VALID
+    np.testing.assert_array_equal(image.depth_m[~valid], plain.depth_m[~valid])
+    assert image.depth_m[valid].std() < plain.depth_m[valid].std() / 3
+
+
+def test_near_pixels_keep_every_bit():
+    config = load_config(CONFIG, voxel_size=0.1)
+    nearest_noisy = np.sqrt(0.15 * 0.1 / S2)
+    depth = measured(np.linspace(1.0, 3.0, 64)[None, :].repeat(48, 0), s2=1e-5)
+    changed = cleaned(depth, config) != depth
+    assert not changed[depth < nearest_noisy].any()
+    assert changed[depth > nearest_noisy + 0.05].mean() > 0.9
+
+
+@pytest.mark.parametrize("settings", [{"voxel_size": 1.0}, {"depth.denoise": False}, {"noise.s2": 0.0}])
+def test_nothing_is_done_where_noise_is_small_or_it_is_switched_off(settings):
+    depth = steps_and_holes((48, 64), 3)
+    np.testing.assert_array_equal(cleaned(depth, load_config(CONFIG, **settings)), depth)
+
+
+def test_values_stay_within_the_range():
+    depth = measured(np.full((48, 64), 5.9)).clip(0.2, 6.0)
+    config = load_config(CONFIG, **{"noise.subpixel": 0.3})
+    assert cleaned(depth, config).max() <= np.float32(6.0)
+    assert (cleaned(np.full((48, 64), 6.0, np.float32), config) <= np.float32(6.0)).all()
+
+
+def test_a_binned_camera_has_the_noise_of_its_sensor():
+    """Disparity is measured in the sensor's own pixels, so binning changes neither noise nor result."""
+    depth = measured(np.full((48, 64), 4.0))
+    binned = PinholeCamera(128, 96, 830.0, 830.0, 63.5, 47.5, baseline=0.025).binned(2)
+    np.testing.assert_allclose(cleaned(depth, camera=binned), cleaned(depth), rtol=1e-6)

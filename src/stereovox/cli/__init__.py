@@ -17,7 +17,7 @@ from typing import Any, NoReturn
 import stereovox
 from stereovox.errors import StereovoxError, did_you_mean
 
-COMMANDS = ("demo", "map", "info", "picture", "view", "export", "bench", "calibrate")
+COMMANDS = ("demo", "map", "info", "picture", "view", "export", "bench", "calibrate", "reproduce")
 """Each is a module here with a docstring, `EXAMPLE`, `add_arguments(parser)` and `run(arguments) -> dict`."""
 
 

@@ -31,8 +31,8 @@ def denoise(depth_m: NDArray[np.float32], camera: PinholeCamera, config: Config)
     keeps every detail, and with large cells nothing is done at all.
 
     What it cannot do: neighbouring errors of real stereo matching are alike over about the matching window, and what
-    they have in common stays in the mean. Two surfaces within some sigma of each other are blended over 3 pixels: at 3 m
-    a D435's sigma is 3.5 cm.
+    they have in common stays in the mean. Two surfaces within some sigma of each other are blended over 3 pixels;
+    sigma of a D435 is 3.5 cm at 3 m.
     """
     noise = RangeNoise.of(config.noise, camera)
     fine = FINE * config.voxel_size

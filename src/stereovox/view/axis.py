@@ -6,45 +6,85 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from stereovox.maps import VoxelMap
+from stereovox.frame import Viewpoint
+from stereovox.maps import State, VoxelMap
 from stereovox.products.slices import along_ray
 from stereovox.view.figures import figure_of, headline
-from stereovox.view.layer import known_viewpoint
-from stereovox.view.panels import GREY, INK, LINE, title
+from stereovox.view.panels import GREY, INK, LINE, STATE_COLOURS, title
+from stereovox.view.scale import Scale, scale_of
+from stereovox.view.whereabouts import known_viewpoint
+
+BEYOND = 6
+"""Cells that are drawn after the last known one."""
 
 
-def draw_axis(voxel_map: VoxelMap, heading: str, length_m: float | None = None) -> Any:
-    """Return a figure of the log-odds of the cells that the last frame's optical axis crosses.
+def draw_axis(
+    voxel_map: VoxelMap, heading: str, length_m: float | None = None, viewpoint: Viewpoint | None = None
+) -> Any:
+    """Return a figure of the log-odds of the cells that the camera's optical axis crosses.
 
-    length_m: how far; by default the map's `max_range`. Raises StereovoxError where the map does not know its camera.
+    length_m: how far; by default the map's `max_range`. viewpoint: by default the map's last.
+    Raises StereovoxError where nobody knows the camera.
     """
-    figure = figure_of(6.0)
-    draw_profile(figure.add_subplot(), voxel_map, length_m)
+    figure = figure_of(6.5)
+    axis = figure.add_subplot()
+    hit = draw_profile(axis, voxel_map, length_m, viewpoint)
+    reached = "no cell is occupied" if hit is None else f"first occupied from {hit[0]:.2f} to {hit[1]:.2f} m"
+    title(axis, f"Along the optical axis: {reached}")
+    axis.legend(loc="lower right", bbox_to_anchor=(1.005, 1), ncols=4, frameon=False, fontsize=10, borderaxespad=0.3)
     headline(figure, voxel_map, heading)
     return figure
 
 
-def draw_profile(axis: Any, voxel_map: VoxelMap, length_m: float | None = None) -> None:
-    """Draw one step a cell, with the limits of free and occupied; a map of bytes is drawn in bytes."""
-    T = known_viewpoint(voxel_map).T_world_camera
+def draw_profile(
+    axis: Any, voxel_map: VoxelMap, length_m: float | None = None, viewpoint: Viewpoint | None = None
+) -> tuple[float, float] | None:
+    """Draw one step a cell in its state's colour, with the limits of free and occupied; bytes where the map has them.
+
+    Returns where the first occupied cells begin and end in metres, None where all are free or unknown.
+    """
+    T = known_viewpoint(viewpoint or voxel_map.viewpoint).T_world_camera
     distance, log_odds = along_ray(voxel_map, T[:3, 3], T[:3, 2], length_m or voxel_map.config.max_range)
-    limits = {name: getattr(voxel_map.config.map, name) for name in ("free_below", "occupied_above")}
-    lines = np.array([np.log(p / (1 - p)) for p in limits.values()])
-    values, unknown, label = log_odds, 0, "log-odds"
-    if voxel_map.cell_format.unknown:
-        values, lines = (voxel_map.cell_format.stored(numbers) for numbers in (log_odds, lines))
-        unknown, label = voxel_map.cell_format.unknown, "cell value"
-    axis.stairs(values, distance, baseline=unknown, fill=True, color="#9fb6d8", label="cells on the axis")
-    axis.stairs(values, distance, baseline=unknown, color=INK, linewidth=1.3)
-    for value, text in zip((lines[0], unknown, lines[1]), ("free below", "unknown", "occupied above"), strict=True):
-        axis.axhline(value, color=GREY, linewidth=1, linestyle="--" if text != "unknown" else "-")
-        axis.annotate(text, (1.0, value), xycoords=("axes fraction", "data"), xytext=(6, 0),
-                      textcoords="offset points", va="center", color=GREY, fontsize=10)  # fmt: skip
+    scale = scale_of(voxel_map)
+    values = scale.shown(log_odds)
+    _steps(axis, distance, values, scale)
     known = np.flatnonzero(log_odds)
-    last = distance[min(known[-1] + 6, len(distance) - 1)] if len(known) else distance[-1]
-    axis.set(xlim=(0, last), xlabel="distance from the camera [m]", ylabel=label)
+    last = distance[min(known[-1] + BEYOND, len(distance) - 1)] if len(known) else distance[-1]
+    room = 0.06 * (scale.highest - scale.lowest)
+    axis.set(xlim=(0, last), ylim=(scale.lowest - room, scale.highest + room))
+    axis.set_xlabel("distance from the camera along its optical axis [m]", color=GREY)
+    axis.set_ylabel(scale.label, color=GREY)
     axis.tick_params(colors=GREY)
     for spine in axis.spines.values():
         spine.set_color(LINE)
     title(axis, "Along the optical axis")
+    return _first_hit(distance, values, scale)
+
+
+def _steps(axis: Any, distance: NDArray[np.float64], values: NDArray[np.float64], scale: Scale) -> None:
+    of_state = {
+        State.FREE: values < scale.free_below,
+        State.OCCUPIED: values > scale.occupied_above,
+        State.TENTATIVE: (values >= scale.free_below) & (values <= scale.occupied_above) & (values != scale.unknown),
+    }
+    axis.stairs(values, distance, baseline=scale.unknown, color=INK, linewidth=1.3, label="cells on the axis")
+    for state, mine in of_state.items():
+        height = np.where(mine, values, scale.unknown)
+        colour = "#dcd7bd" if state is State.FREE else STATE_COLOURS[state]  # a free cell's own colour is nearly white
+        if mine.any():
+            axis.stairs(height, distance, baseline=scale.unknown, fill=True, color=colour, label=state.name.lower())
+    limits = ((scale.free_below, "free below"), (scale.unknown, "unknown"), (scale.occupied_above, "occupied above"))
+    for value, text in limits:
+        axis.axhline(value, color=GREY, linewidth=1, linestyle="-" if text == "unknown" else "--")
+        axis.annotate(f"{text} {value:.3g}", (1.0, value), xycoords=("axes fraction", "data"), xytext=(6, 0),
+                      textcoords="offset points", va="center", color=GREY, fontsize=10)  # fmt: skip
+
+
+def _first_hit(distance: NDArray[np.float64], values: NDArray[np.float64], scale: Scale) -> tuple[float, float] | None:
+    hits = np.flatnonzero(values > scale.occupied_above)
+    if not len(hits):
+        return None
+    run = hits[: int(np.argmax(np.append(np.diff(hits), 2) > 1)) + 1]
+    return float(distance[run[0]]), float(distance[run[-1] + 1])

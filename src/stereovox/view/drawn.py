@@ -59,18 +59,29 @@ class Drawn:
         return int(low + np.argmax(np.where(known >= 0.9 * known.max(), occupied + 1, 0)))
 
 
+def checked_up(up: str) -> str:
+    """Return a key of `UPS` (`+z` is `z`). Raises StereovoxError for a word that is no axis."""
+    if up.removeprefix("+") not in UPS:
+        raise StereovoxError(f"up '{up}' is no axis of the map{did_you_mean(up, UPS)}")
+    return up.removeprefix("+")
+
+
+def turned(points: ArrayLike, up: str) -> NDArray[np.float64]:
+    """Return points (..., 3) of a map in the axes of its picture: right, away, up."""
+    points = np.asarray(points, float)[..., list(UPS[up])]
+    return points * [1, 1, -1] if up.startswith("-") else points
+
+
 def upright(voxel_map: VoxelMap, trajectory: ArrayLike | None, up: str) -> Drawn:
     """Turn a map so that its axis `up` (`z`, `-y`, ...) becomes the third. Raises StereovoxError for another word."""
-    if up not in UPS:
-        raise StereovoxError(f"up '{up}' is no axis of the map{did_you_mean(up, UPS)}")
+    up = checked_up(up)
     order = list(UPS[up])
     cells, _ = voxel_map.cells()
     state = voxel_map.state(voxel_map.centers(cells))
     cells = cells[:, order]
-    path = None if trajectory is None else np.asarray(trajectory, float).reshape(-1, 3)[:, order]
+    path = None if trajectory is None else turned(np.reshape(np.asarray(trajectory, float), (-1, 3)), up)
     if up.startswith("-"):
         cells[:, 2] = -1 - cells[:, 2]
-        path = path if path is None else path * [1, 1, -1]
     return Drawn(cells, state, voxel_map.voxel_size, path, ("xyz"[order[0]], "xyz"[order[1]], up))
 
 

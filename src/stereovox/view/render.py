@@ -18,7 +18,7 @@ LIGHT = {"top": 1.0, "x": 0.80, "y": 0.62}
 """Brightness of the faces across each axis."""
 _SUPERSAMPLING = 2
 _MAX_WRITES = 60_000_000
-_MAX_CELL_PX = 10
+_MAX_CELL_PX = 32
 """A cell is drawn at most so many pixels wide; whoever shows the image may enlarge it."""
 
 
@@ -45,10 +45,29 @@ class Direction:
 
 @dataclass(frozen=True, eq=False)
 class Rendering:
-    """An RGBA image (height, width, 4) float32 and what it covers: left, right, bottom, top in picture metres."""
+    """An RGBA image (height, width, 4) float32 and what it covers: left, right, bottom, top in picture metres.
+
+    near: (rows, columns) float32, how far towards the viewer the middle of the cell in each pixel is, in metres; -inf
+    where none is. It may be finer than the image.
+    """
 
     image: NDArray[np.float32]
     extent: tuple[float, float, float, float]
+    near: NDArray[np.float32]
+
+    def hidden(self, flat: NDArray[np.float64], toward: NDArray[np.float64], slack: float) -> NDArray[np.bool_]:
+        """Tell which points lie behind cells: picture coordinates (N, 2), and metres towards the viewer (N,).
+
+        slack: metres that a cell's middle may be nearer before the cell counts as in front.
+        """
+        left, right, bottom, top = self.extent
+        rows, columns = self.near.shape
+        column = np.floor((flat[:, 0] - left) / (right - left) * columns).astype(int)
+        row = np.floor((top - flat[:, 1]) / (top - bottom) * rows).astype(int)
+        inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
+        found = np.zeros(len(flat), bool)
+        found[inside] = self.near[row[inside], column[inside]] > toward[inside] + slack
+        return found
 
 
 def render(
@@ -71,8 +90,9 @@ def render(
     for axis, face in enumerate(faces):
         canvas.draw(cells[face], face * 3 + axis, axis, voxel_size, direction)
     depth = (cells + 0.5) @ direction.toward * voxel_size
-    image = _shade(canvas.front, colours.astype(np.float32), depth, voxel_size)
-    return Rendering(_reduced(image, finer), (low[0], high[0], low[1], high[1]))
+    near = np.where(canvas.front >= 0, depth[np.maximum(canvas.front, 0) // 3], -np.inf).astype(np.float32)
+    image = _shade(canvas.front, near, colours.astype(np.float32), voxel_size)
+    return Rendering(_reduced(image, finer), (low[0], high[0], low[1], high[1]), near)
 
 
 class _Canvas:
@@ -141,12 +161,11 @@ def _pattern(sides: NDArray[np.float64]) -> NDArray[np.int64]:
 
 
 def _shade(
-    front: NDArray[np.int32], colours: NDArray[np.float32], depth: NDArray[np.float64], voxel_size: float
+    front: NDArray[np.int32], near: NDArray[np.float32], colours: NDArray[np.float32], voxel_size: float
 ) -> NDArray[np.float32]:
     light = np.array([LIGHT["x"], LIGHT["y"], LIGHT["top"]], np.float32)
     drawn = front >= 0
     cell, side = np.divmod(np.maximum(front, 0), 3)
-    near = np.where(drawn, depth[cell].astype(np.float32), np.float32(-np.inf))
     image = np.zeros((*front.shape, 4), np.float32)
     image[..., :3] = colours[cell] * (light[side] * _contour(near, voxel_size))[..., None]
     image[..., 3] = drawn

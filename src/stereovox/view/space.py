@@ -11,56 +11,72 @@ from numpy.typing import NDArray
 from stereovox.errors import StereovoxError
 from stereovox.frame import Viewpoint
 from stereovox.maps import VoxelMap
-from stereovox.view.drawn import UPS, Drawn, upright
+from stereovox.view.drawn import Drawn, checked_up, turned, upright
 from stereovox.view.figures import DPI, WIDTH, figure_of, headline
-from stereovox.view.panels import PATH_COLOUR, oblique
+from stereovox.view.frame3d import draw_frame, fit, numbers
+from stereovox.view.panels import PATH_COLOUR, title
 from stereovox.view.picture import height_bar, height_colours
-from stereovox.view.render import Direction
+from stereovox.view.render import Direction, Rendering, render
+from stereovox.view.whereabouts import FIELD_M, field_of_view
 
-DEPTH_M = 1.0
-"""Depth of the drawn field of view, as in the thesis."""
 BEHIND_DEG, ABOVE_DEG = 32.0, 38.0
 """From where the map is seen: turned so far from straight behind the camera, and so far above the horizon."""
+DOTS = 300
+"""Points of a line at which it is asked whether cells hide it."""
 
 
-def draw_space(voxel_map: VoxelMap, heading: str, up: str) -> Any:
+def draw_space(voxel_map: VoxelMap, heading: str, up: str, viewpoint: Viewpoint | None = None) -> Any:
     """Return a figure of the occupied cells, seen from behind the camera and above, with its field of view in red.
 
-    A ceiling is cut away. Raises StereovoxError for an empty map or an `up` that is no axis.
+    viewpoint: by default the map's last; the lines are left out where nobody knows it. A ceiling is cut away.
+    Raises StereovoxError for a map without occupied cells or an `up` that is no axis.
     """
+    up = checked_up(up)
+    viewpoint = viewpoint or voxel_map.viewpoint
     drawn = upright(voxel_map, None, up)
     if not len(drawn.below_ceiling):
         raise StereovoxError("the map holds no occupied cell to draw; look at a layer instead (--view layer)")
-    lines = None if voxel_map.viewpoint is None else field_of_view(voxel_map.viewpoint)
-    lines = None if lines is None else _turned(lines, up)
-    figure = figure_of(10.0)
-    draw_cells(figure, figure.add_subplot(), drawn, lines)
+    lines = None if viewpoint is None else turned(field_of_view(viewpoint), up)
+    figure = figure_of(9.0)
+    axis = figure.add_subplot()
+    shape = draw_cells(figure, axis, drawn, lines)
+    figure.set_figheight(float(np.clip(0.86 * WIDTH * shape, 5.0, 12.0)) + 1.4)
+    figure.get_layout_engine().set(rect=(0.015, 0.005, 0.98, 1 - 0.95 / figure.get_figheight()))
+    cut = "" if drawn.cut is None else f", cut open at {drawn.names[2]} = {drawn.cut:.2f} m"
+    seen = "" if lines is None else f"; red: the camera and its field of view, {FIELD_M:g} m deep"
+    title(axis, f"Occupied cells{cut}{seen}")
     headline(figure, voxel_map, heading)
     return figure
 
 
-def draw_cells(figure: Any, axis: Any, drawn: Drawn, lines: NDArray[np.float64] | None) -> None:
-    """Draw cells coloured by height and lines (N, 2, 3), both with the third axis up."""
+def draw_cells(figure: Any, axis: Any, drawn: Drawn, lines: NDArray[np.float64] | None) -> float:
+    """Draw cells coloured by height and lines (N, 2, 3), both with the third axis up; return height over width."""
     colours, mappable = height_colours(drawn)
     direction = Direction.of(_azimuth(lines), ABOVE_DEG)
-    oblique(axis, drawn, colours, direction, int(0.8 * WIDTH * DPI))
+    width_px = int(0.85 * WIDTH * DPI)
+    rendering = render(drawn.below_ceiling, colours, drawn.voxel_size, direction, width_px, width_px)
+    axis.imshow(rendering.image, extent=rendering.extent, interpolation="antialiased", zorder=2)
+    corners = [drawn.below_ceiling.min(0) * drawn.voxel_size, (drawn.below_ceiling.max(0) + 1) * drawn.voxel_size]
+    corners = np.concatenate([corners, *([] if lines is None else [lines.reshape(-1, 3)])])
+    low, high = corners.min(0), corners.max(0)
+    shape = fit(axis, direction, low, high)
+    edges = [numbers(f"{name} [m]", a, b) for name, a, b in zip(drawn.names, low, high, strict=True)]
+    draw_frame(axis, direction, low, high, (edges[0], edges[1], edges[2]))
     for line in lines if lines is not None else ():
-        axis.plot(*direction.flat(line).T, color=PATH_COLOUR, linewidth=2)
+        _line(axis, line, direction, rendering, drawn.voxel_size)
+    if lines is not None:
+        axis.plot(*direction.flat(lines[:1, 0]).T, "o", color=PATH_COLOUR, markeredgecolor="white", markersize=8)
     height_bar(figure, axis, mappable, drawn)
+    return shape
 
 
-def field_of_view(viewpoint: Viewpoint, depth_m: float = DEPTH_M) -> NDArray[np.float64]:
-    """Return the edges (8, 2, 3) in metres, world frame, of the pyramid that the camera sees up to `depth_m`.
-
-    First the four from the camera to the corners, then the four round the far side.
-    """
-    camera, T = viewpoint.camera, viewpoint.T_world_camera
-    u, v = np.array([-0.5, camera.width - 0.5]), np.array([-0.5, camera.height - 0.5])
-    x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
-    corners = np.array([[x[0], y[0], 1], [x[1], y[0], 1], [x[1], y[1], 1], [x[0], y[1], 1]]) * depth_m
-    world = corners @ T[:3, :3].T + T[:3, 3]
-    spokes = np.stack([np.broadcast_to(T[:3, 3], (4, 3)), world], axis=1)
-    return np.concatenate([spokes, np.stack([world, np.roll(world, -1, axis=0)], axis=1)])
+def _line(axis: Any, line: NDArray[np.float64], direction: Direction, rendering: Rendering, slack: float) -> None:
+    """Draw a line (2, 3), strong where it is seen and faint where cells stand before it."""
+    points = line[0] + np.linspace(0, 1, DOTS)[:, None] * (line[1] - line[0])
+    flat = direction.flat(points)
+    hidden = rendering.hidden(flat, points @ direction.toward, slack)
+    axis.plot(*flat.T, color=PATH_COLOUR, linewidth=1.1, alpha=0.4, zorder=3)
+    axis.plot(*np.where(hidden[:, None], np.nan, flat).T, color=PATH_COLOUR, linewidth=2.2, zorder=4)
 
 
 def _azimuth(lines: NDArray[np.float64] | None) -> float:
@@ -69,8 +85,3 @@ def _azimuth(lines: NDArray[np.float64] | None) -> float:
         return -60.0
     forward = (lines[:4, 1] - lines[:4, 0]).mean(axis=0)
     return float(np.degrees(np.arctan2(-forward[1], -forward[0]))) + BEHIND_DEG
-
-
-def _turned(lines: NDArray[np.float64], up: str) -> NDArray[np.float64]:
-    turned = lines[..., list(UPS[up])]
-    return turned * [1, 1, -1] if up.startswith("-") else turned

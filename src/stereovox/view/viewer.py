@@ -112,6 +112,8 @@ def _serve(name: str, host: str, port: int) -> ViserServer:
     with redirect_stdout(io.StringIO()):  # viser introduces itself there
         server: Any = viser.ViserServer(host=host, port=port, label=name, verbose=False)
     server.request_share_url = lambda *_, **__: None  # else any page in the browser could ask it to publish the map
+    server.scene.configure_environment_map(hdri=None)  # its reflections make all heights look alike
+    server.scene.add_light_ambient("/light", intensity=1.5)
     server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
     if port and server.get_port() != port:  # somebody took it in the meantime
         server.stop()
@@ -124,4 +126,4 @@ def _legend(server: ViserServer, cells: Cells, plane: LayerPlane | None, up: str
         if cells.scale is not None:
             server.gui.add_image(colour_bar(cells.scale, f"height of occupied cells {up} [m]"), format="png")
         if plane is not None:
-            server.gui.add_image(colour_bar(plane.scale, "log-odds in the layer: free < 0 < occupied"), format="png")
+            server.gui.add_image(colour_bar(plane.colours, f"in the layer: {plane.scale.label}"), format="png")

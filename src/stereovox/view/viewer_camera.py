@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from viser import FrameHandle, ViserServer
 
 AXES_M = 0.3
-FAR = 0.8
+FAR = 0.65
 """How far the page stands from the middle of the map, in diagonals of the map."""
 
 

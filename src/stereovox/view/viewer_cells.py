@@ -81,11 +81,9 @@ class Cells:
     def _height_slider(self) -> Any:
         """Return a slider from the lowest to the highest layer; at first it leaves out a ceiling."""
         size = self._drawn.voxel_size
-        low, high = float(self._heights.min() + size / 2), float(self._heights.max() + size / 2)
-        first = high if self._drawn.cut is None else self._drawn.cut
-        return self._server.gui.add_slider(
-            f"below {self._drawn.names[2]} [m]", low, high, size, float(np.clip(first, low, high))
-        )
+        low, high = (round(float(height + size / 2), 6) for height in (self._heights.min(), self._heights.max()))
+        first = high if self._drawn.cut is None else round(self._drawn.cut, 6)
+        return self._server.gui.add_slider(f"below {self._drawn.names[2]} [m]", low, high, size, first)
 
     def _draw_occupied(self) -> SceneNodeHandle:
         drawn = self._heights < self.below.value

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from stereovox.maps import VoxelMap
 from stereovox.products.slices import Layer, layer
 from stereovox.view.drawn import Drawn
+from stereovox.view.scale import Scale, scale_of
 
 if TYPE_CHECKING:
     from viser import ImageHandle, ViserServer
@@ -26,13 +27,14 @@ class LayerPlane:
     """The plane, and the controls for it.
 
     node: the scene's image, None before it is first asked for. show: check box. across: drop-down with the axis
-    that the plane stands across. at: for each axis a slider in metres, of which one is visible. scale: what a colour
-    bar of log-odds needs.
+    that the plane stands across. at: for each axis a slider in metres, of which one is visible. scale and colours:
+    the numbers that it shows, and what a colour bar of them needs.
     """
 
     def __init__(self, server: ViserServer, voxel_map: VoxelMap, drawn: Drawn):
         self.node: ImageHandle | None = None
-        self.scale = log_odds_scale(voxel_map)
+        self.scale = scale_of(voxel_map)
+        self.colours = layer_colours(self.scale)
         self._server, self._map = server, voxel_map
         self._lock = threading.Lock()
         first = _first_place(voxel_map, drawn)
@@ -43,9 +45,10 @@ class LayerPlane:
         with gui.add_folder("Layer"):
             self.show = gui.add_checkbox("show", False)
             self.across = gui.add_dropdown("across", ("x", "y", "z"), initial_value=drawn.names[2][-1])
-            self.at = {name: self._slider(name, *bounds[:, axis], first[axis]) for axis, name in enumerate("xyz")}
-        self.show.on_update(lambda _: self.draw())
-        self.across.on_update(lambda _: self.draw())
+            self.at = {name: self._slider(name, bounds[:, axis], first[axis]) for axis, name in enumerate("xyz")}
+        for control in (self.show, self.across, *self.at.values()):
+            control.on_update(lambda _: self.draw())
+        self.draw()
 
     def draw(self) -> None:
         """Put the plane where the controls say."""
@@ -54,34 +57,30 @@ class LayerPlane:
             for name, slider in self.at.items():
                 slider.visible = name == across
             if self.show.value:
-                self.node = add_plane(self._server, layer(self._map, across, self.at[across].value), self.scale)
+                one = layer(self._map, across, self.at[across].value)
+                image = self.colours.to_rgba(self.scale.shown(one.log_odds), bytes=True)
+                self.node = add_plane(self._server, one, image)
             elif self.node is not None:
                 self.node.visible = False
 
-    def _slider(self, name: str, low: float, high: float, first: float) -> Any:
+    def _slider(self, name: str, bounds: NDArray[np.float64], first: float) -> Any:
         """Return a slider with one step a layer: the middle of each layer between two faces of the map."""
-        half = self._map.voxel_size / 2
-        visible = name == self.across.value
-        low, high = float(low + half), float(high - half)
-        first = float(np.clip(first, low, high))
-        slider = self._server.gui.add_slider(f"{name} [m]", low, high, 2 * half, first, visible=visible)
-        slider.on_update(lambda _: self.draw())
-        return slider
+        size = self._map.voxel_size
+        low, high = (round(float(face), 6) for face in (bounds[0] + size / 2, bounds[1] - size / 2))
+        steps = round((np.clip(first, low, high) - low) / size)
+        return self._server.gui.add_slider(f"{name} [m]", low, high, size, round(low + steps * size, 6))
 
 
-def log_odds_scale(voxel_map: VoxelMap) -> Any:
-    """Return the colours of log-odds: blue where free, red where occupied, see-through where unknown."""
-    from matplotlib import colormaps
+def layer_colours(scale: Scale) -> Any:
+    """Return matplotlib's colours of the numbers that a scale shows; unknown cells are see-through."""
     from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import TwoSlopeNorm
 
-    limits = voxel_map.config.map
-    colours = colormaps["coolwarm"].with_extremes(bad=(0, 0, 0, 0))
-    return ScalarMappable(TwoSlopeNorm(0.0, limits.log_odds_min, limits.log_odds_max), colours)
+    colours, norm = scale.colours()
+    return ScalarMappable(norm, colours.with_extremes(bad=(0, 0, 0, 0)))
 
 
-def add_plane(server: ViserServer, one: Layer, scale: Any) -> ImageHandle:
-    """Add a layer as an image that lies in the world where its cells lie, at the middle of them."""
+def add_plane(server: ViserServer, one: Layer, image: NDArray[np.uint8]) -> ImageHandle:
+    """Add an image (rows, columns, 4) of a layer where its cells lie in the world, in the middle of them."""
     from viser.transforms import SO3
 
     left, right, bottom, top = one.extent
@@ -91,7 +90,7 @@ def add_plane(server: ViserServer, one: Layer, scale: Any) -> ImageHandle:
     turn = SO3.from_matrix(np.column_stack([columns, rows, np.cross(columns, rows)]))
     return server.scene.add_image(
         "/layer",
-        sharp(scale.to_rgba(one.log_odds, bytes=True)),
+        sharp(image),
         right - left,
         top - bottom,
         wxyz=turn.wxyz,
@@ -102,7 +101,7 @@ def add_plane(server: ViserServer, one: Layer, scale: Any) -> ImageHandle:
 
 
 def sharp(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return an image (H, W, 4) with its pixels repeated, so that cells keep their edges; a too large one is thinned."""
+    """Return an image (H, W, 4) with its pixels repeated, so that cells keep their edges; a too large one thinned."""
     longer = max(image.shape[:2])
     if longer > MOST_PX:
         step = -(-longer // MOST_PX)

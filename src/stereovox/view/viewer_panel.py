@@ -13,7 +13,7 @@ from stereovox.maps import VoxelMap
 from stereovox.view.axis import draw_profile
 from stereovox.view.panels import GREY
 
-WIDTH_IN, DPI = 4.2, 200
+WIDTH_IN, DPI = 4.8, 180
 """Width of the panel's pictures: in inches as text size sees it, and pixels an inch."""
 
 
@@ -45,7 +45,7 @@ def plain(text: str) -> str:
 
 def colour_bar(scale: Any, label: str) -> NDArray[np.uint8]:
     """Return a picture (H, W, 3) of a colour bar for a matplotlib mappable."""
-    figure = _figure(0.75)
+    figure = _figure(0.8)
     bar = figure.colorbar(scale, cax=figure.add_subplot(), orientation="horizontal")
     bar.set_label(label, color=GREY)
     bar.ax.tick_params(colors=GREY)
@@ -59,7 +59,12 @@ def axis_chart(voxel_map: VoxelMap) -> NDArray[np.uint8]:
     Raises StereovoxError where the map does not know its camera.
     """
     figure = _figure(2.9)
-    draw_profile(figure.add_subplot(), voxel_map)
+    axis = figure.add_subplot()
+    draw_profile(axis, voxel_map)
+    axis.set_title("", loc="left")  # what a page has room for, a panel has not
+    axis.set_xlabel("distance from the camera [m]")
+    if axis.get_legend() is not None:
+        axis.get_legend().remove()
     return _pixels(figure)
 
 

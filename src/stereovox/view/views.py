@@ -6,8 +6,10 @@ from __future__ import annotations
 from typing import Any
 
 from stereovox.errors import StereovoxError, did_you_mean
+from stereovox.frame import Viewpoint
 from stereovox.maps import VoxelMap
 from stereovox.view.axis import draw_axis
+from stereovox.view.drawn import checked_up
 from stereovox.view.layer import draw_layer
 from stereovox.view.picture import draw
 from stereovox.view.space import draw_space
@@ -15,19 +17,27 @@ from stereovox.view.space import draw_space
 VIEWS = ("overview", "layer", "axis", "space")
 
 
-def draw_view(voxel_map: VoxelMap, view: str, heading: str, up: str, at_m: float | None = None) -> Any:
+def draw_view(
+    voxel_map: VoxelMap,
+    view: str,
+    heading: str,
+    up: str,
+    at_m: float | None = None,
+    viewpoint: Viewpoint | None = None,
+) -> Any:
     """Return the matplotlib figure of one view of a map.
 
-    overview: from above, from three sides, and a slice. layer: one layer across `up`, at `at_m` metres or at the
-    camera's height. axis: log-odds along the optical axis. space: cells and field of view in space.
-    Raises StereovoxError for an unknown view, or where the view needs a camera that the map does not know.
+    overview: from above, from three sides, and a slice. layer: one layer across `up`, at height `at_m` along it or at
+    the camera's. axis: log-odds along the optical axis. space: cells and field of view in space. viewpoint: by default
+    the map's last. Raises StereovoxError for an unknown view, or where the view needs a camera that nobody knows.
     """
+    up = checked_up(up)
     if view == "overview":
         return draw(voxel_map, heading=heading, up=up)
     if view == "layer":
-        return draw_layer(voxel_map, heading, up, at_m)
+        return draw_layer(voxel_map, heading, up, at_m, viewpoint)
     if view == "axis":
-        return draw_axis(voxel_map, heading)
+        return draw_axis(voxel_map, heading, None, viewpoint)
     if view == "space":
-        return draw_space(voxel_map, heading, up)
+        return draw_space(voxel_map, heading, up, viewpoint)
     raise StereovoxError(f"unknown view '{view}'{did_you_mean(view, VIEWS)}")

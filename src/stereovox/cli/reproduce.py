@@ -1,0 +1,49 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Make the experiments of a paper again: one report with its figures beside ours.
+
+All of Chien 2020 is simulated and takes some minutes. --data also maps a recording of your own under its profile.
+"""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser, Namespace
+from typing import Any
+
+from stereovox.cli.terminal import progress_bar, say, say_about_compiling
+
+EXAMPLE = "stereovox reproduce chien2020 --out chien2020"
+
+
+def add_arguments(parser: ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("paper", metavar="PAPER", help="chien2020 (valenti2018 and ist2019 are not in this version)")
+    parser.add_argument("--out", required=True, metavar="DIR", help="folder for report.html and numbers.json")
+    parser.add_argument("--data", metavar="SOURCE", help="a recording of your own, as for `map`, to be mapped as well")
+    parser.add_argument("--quick", action="store_true", help="few frames: to see that it works, not to quote")
+
+
+def run(arguments: Namespace) -> dict[str, Any]:
+    """Run the experiments and tell what holds."""
+    from stereovox.evaluate.reproduce import reproduce
+
+    say_about_compiling()
+    with progress_bar() as bar:
+        task = bar.add_task("starting", note="")
+        result = reproduce(
+            arguments.paper,
+            arguments.out,
+            data=arguments.data,
+            quick=arguments.quick,
+            progress=lambda done, total, text: bar.update(task, completed=done, total=total, description=text),
+        )
+    _tell(result)
+    return result
+
+
+def _tell(result: dict[str, Any]) -> None:
+    failed = result["does_not_hold"]
+    say(f"{result['holds']} claims hold, {len(failed)} do not, in {result['seconds']:.0f} s")
+    for text in failed:
+        say(f"does not hold: {text}")
+    for name, path in result["files"].items():
+        say(f"{name:>8}: {path}")

@@ -1,0 +1,47 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A recording of one's own under the profile of a paper, beside the same under `default`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from stereovox.errors import StereovoxError
+from stereovox.evaluate.reproduce.chapter import Chapter, Sheet, Shown
+from stereovox.evaluate.summary import summarise
+from stereovox.mapper import Mapper
+from stereovox.sources import open_source
+from stereovox.view.reproduce import overview_png
+
+PROFILES = ("chien2020", "default")
+
+
+def map_own(where: str | Path, step: Callable[[], None] = lambda: None) -> Chapter:
+    """Return a chapter about the recording at `where`; without truth there is nothing to claim.
+
+    Raises SourceError where it cannot be opened, StereovoxError where no frame can be used.
+    """
+    source = open_source(str(where))
+    mappers = {name: Mapper(name, **{"window.size": None, "up": "z"}) for name in PROFILES}
+    reports = {name: [] for name in PROFILES}
+    way = []
+    for frame in source:
+        for name, mapper in mappers.items():
+            reports[name].append(mapper.add(frame))
+        if not reports[PROFILES[0]][-1].refused:
+            way.append(frame.T_world_sensor[:3, 3])
+        step()
+    if not way:
+        raise StereovoxError(f"{where}: not one frame can be used; see: stereovox map {where} --out FILE")
+    figures = {name: summarise(mapper.map, reports[name]) for name, mapper in mappers.items()}
+    rows = [(name, one["frames"], one["frames_refused"], f"{one['depth_ms']['median'] + one['integrate_ms']['median']:.2f}",
+             f"{one['occupied']:,}", f"{one['free']:,}") for name, one in figures.items()]  # fmt: skip
+    heads = ("profile", "frames", "refused", "ms a frame, median", "occupied", "free")
+    shown = [
+        Shown("Fig 4.11", "The thesis maps an apartment of its own.", f"{source.name} under `{name}`.",
+              overview_png(mapper.map, np.array(way), f"{source.name}, {name}")) for name, mapper in mappers.items()
+    ]  # fmt: skip
+    return Chapter("own", f"Your recording: {source.name}", "The recording given with --data, mapped under both profiles.",
+                   [], shown, [Sheet("Figures", heads, rows)], numbers=figures)  # fmt: skip

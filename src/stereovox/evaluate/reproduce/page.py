@@ -1,0 +1,49 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The report of a reproduction as one page of HTML: chapter by chapter claims, pictures and tables."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from html import escape
+
+from stereovox.evaluate.reproduce.chapter import Chapter, Sheet, Shown
+from stereovox.view.page import figure, page, section, table, tiles
+
+HEADS = ("claim", "thesis", "ours", "holds?")
+
+
+def report(title: str, lead: str, facts: Sequence[tuple[str, str]], chapters: Sequence[Chapter]) -> str:
+    """Return the page. facts: value and label of the boxes at the top."""
+    return page(
+        title, lead, tiles(facts), _contents(chapters), *(_chapter(n, one) for n, one in enumerate(chapters, 1))
+    )
+
+
+def _contents(chapters: Sequence[Chapter]) -> str:
+    rows = []
+    for n, one in enumerate(chapters, 1):
+        verdicts = [claim.verdict for claim in one.claims]
+        rows.append((f"{n}. {one.title}", verdicts.count("yes"), verdicts.count("no"), verdicts.count("-")))
+    return section("What holds", "", table(("experiment", "holds", "does not", "no claim, figure only"), rows))
+
+
+def _chapter(number: int, one: Chapter) -> str:
+    rows = [(claim.text, claim.thesis, claim.ours, claim.verdict) for claim in one.claims]
+    parts = [table(HEADS, rows), *map(_shown, one.shown), *map(_sheet, one.sheets), *map(_paragraph, one.remarks)]
+    return section(f"{number}. {one.title}", one.method, *parts)
+
+
+def _shown(shown: Shown) -> str:
+    said = f"<p><b>{escape(shown.place)} of the thesis</b> (in words; the picture itself is not at hand): "
+    return (
+        f"<h3>{escape(shown.place)}</h3>\n{said}{escape(shown.said)}</p>\n<p><b>Ours:</b> {escape(shown.ours)}</p>\n"
+        + (figure(shown.png, f"Ours, beside {shown.place}"))
+    )
+
+
+def _sheet(sheet: Sheet) -> str:
+    return f"<h3>{escape(sheet.heading)}</h3>\n{table(sheet.heads, sheet.rows)}"
+
+
+def _paragraph(text: str) -> str:
+    return f"<p>{escape(text)}</p>"

@@ -60,7 +60,7 @@ def steps_and_holes(shape, seed):
     return depth
 
 
-@pytest.mark.parametrize("noise", [{}, {"s0": 0.01, "s1": 0.004}, {"s0": 0.02, "s2": 0.0}, {"s1": 0.01, "s2": 0.0}])
+@pytest.mark.parametrize("noise", [{}, {"s0": 0.01, "s1": 0.004}, {"s0": 0.03, "s2": 0.0}, {"s1": 0.01, "s2": 0.0}])
 @pytest.mark.parametrize("shape", [(48, 64), (1, 9), (9, 1), (2, 3), (1, 1)])
 def test_same_as_the_slow_one(shape, noise):
     config = load_config(CONFIG, **{f"noise.{name}": value for name, value in noise.items()})
@@ -125,6 +125,13 @@ def test_near_pixels_keep_every_bit():
     changed = cleaned(depth, config) != depth
     assert not changed[depth < nearest_noisy].any()
     assert changed[depth > nearest_noisy + 0.05].mean() > 0.9
+
+
+def test_noise_of_less_than_half_a_cell_is_left_alone():
+    depth = steps_and_holes((48, 64), 3)
+    farthest = S2 * 6.0**2
+    np.testing.assert_array_equal(cleaned(depth, load_config(CONFIG, voxel_size=2.05 * farthest)), depth)
+    assert (cleaned(depth, load_config(CONFIG, voxel_size=1.95 * farthest)) != depth).any()
 
 
 @pytest.mark.parametrize("settings", [{"voxel_size": 1.0}, {"depth.denoise": False}, {"noise.s2": 0.0}])

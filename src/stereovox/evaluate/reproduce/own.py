@@ -13,7 +13,7 @@ from stereovox.evaluate.reproduce.chapter import Chapter, Sheet, Shown
 from stereovox.evaluate.summary import summarise
 from stereovox.mapper import Mapper
 from stereovox.sources import open_source
-from stereovox.view.reproduce import overview_png
+from stereovox.view.reproduce.own import overview_png
 
 PROFILES = ("chien2020", "default")
 

@@ -12,14 +12,15 @@ from stereovox.frame import Viewpoint
 from stereovox.maps import VoxelMap
 from stereovox.view.drawn import UPS, Drawn
 from stereovox.view.panels import PATH_COLOUR
-from stereovox.view.space import ABOVE_DEG, BEHIND_DEG, field_of_view
+from stereovox.view.space import ABOVE_DEG, BEHIND_DEG
 from stereovox.view.viewer_cells import rgb
+from stereovox.view.whereabouts import field_of_view
 
 if TYPE_CHECKING:
     from viser import FrameHandle, ViserServer
 
 AXES_M = 0.3
-FAR = 0.65
+FAR = 0.8
 """How far the page stands from the middle of the map, in diagonals of the map."""
 
 
@@ -42,7 +43,8 @@ def add_camera(server: ViserServer, viewpoint: Viewpoint, reach_m: float) -> Fra
 def first_look(voxel_map: VoxelMap, drawn: Drawn) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return from where the page looks at first, and at what: (3,) each in metres.
 
-    It looks from behind the depth camera and above at the middle of the occupied cells, of all cells if none is.
+    It looks from behind the depth camera and above at the middle of the camera and the occupied cells, or of all
+    cells if none is occupied.
     """
     centres = voxel_map.occupied() if len(drawn.occupied) else voxel_map.centers(voxel_map.cells()[0])
     if not len(centres):
@@ -51,7 +53,8 @@ def first_look(voxel_map: VoxelMap, drawn: Drawn) -> tuple[NDArray[np.float64], 
     up = up_vector(drawn.names[2])
     back = -np.eye(3)[UPS[drawn.names[2]][1]]
     if voxel_map.viewpoint is not None:
-        behind = -voxel_map.viewpoint.T_world_camera[:3, 2]
+        T = voxel_map.viewpoint.T_world_camera
+        low, high, behind = np.minimum(low, T[:3, 3]), np.maximum(high, T[:3, 3]), -T[:3, 2]
         level = behind - (behind @ up) * up
         back = level / np.linalg.norm(level) if np.linalg.norm(level) > 0.1 else back  # it may look straight down
     aside, above = np.radians(BEHIND_DEG), np.radians(ABOVE_DEG)

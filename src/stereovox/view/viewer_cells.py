@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 MOST_CUBES = 300_000
 """More cells than this are drawn as flat squares that face the viewer: a browser stays fluent with millions of them."""
 FREE_COLOUR = "#6fa8dc"
-DOT = 0.3
+DOT = 0.12
 """Side of the squares that stand for free and tentative cells, in cells: one can look through between them."""
 CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], np.float32) - 0.5
 FACES = np.array(

@@ -29,28 +29,28 @@ FULL = "ray, full resolution"
 
 @dataclass(frozen=True)
 class Variant:
-    """One way to map the aisle. whose: `thesis` or `ours`."""
+    """One way to map the aisle. wanted: whether it must find nearly all that full resolution does."""
 
     name: str
     integrator: str
     downsample: int
-    whose: str
+    wanted: bool = False
 
 
 VARIANTS = (
-    Variant(FULL, "ray", 1, "thesis"),
-    Variant("4x4 minimum, line", "line", 4, "thesis"),
-    Variant("8x8 minimum, line", "line", 8, "thesis"),
-    Variant("10x10 minimum, line", "line", 10, "thesis"),
-    Variant("8x8 minimum, ray", "ray", 8, "thesis"),
-    Variant("footprint rule, full resolution", "projective", 1, "ours"),
-    Variant("footprint rule, 2x2 minimum", "projective", 2, "ours"),
+    Variant(FULL, "ray", 1),
+    Variant("4x4 minimum, line", "line", 4),
+    Variant("8x8 minimum, line", "line", 8),
+    Variant("10x10 minimum, line", "line", 10),
+    Variant("8x8 minimum, ray", "ray", 8),
+    Variant("footprint rule, full resolution", "projective", 1, wanted=True),
+    Variant("footprint rule, 2x2 minimum", "projective", 2),
 )
 
 
 @dataclass(frozen=True, eq=False)
 class AisleFound:
-    """One variant's map. far_cells: cells of walls beyond `FAR_M` that the camera sees; found: share of them that is occupied.
+    """One variant's map. far_cells: cells of walls beyond `FAR_M` that the camera sees; found: share of them occupied.
 
     near_found: the same for the walls before. against_full: `found` over that of full resolution. stray: share of the
     occupied cells beyond `FAR_M` that have no wall, floor or ceiling within one cell. ms: a frame, median.

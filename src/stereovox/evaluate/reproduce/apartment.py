@@ -20,7 +20,6 @@ from stereovox.evaluate.sightings import Sightings
 from stereovox.evaluate.truth import touched_cells
 from stereovox.evaluate.walls import Wall, WallFound, corner_deg, measure_wall, thickness_figures
 from stereovox.frame import Frame
-from stereovox.geometry import Transform
 from stereovox.mapper import Mapper
 from stereovox.maps import VoxelMap
 from stereovox.sources.apartment import ROOMS
@@ -124,7 +123,7 @@ class Apartment:
 
 def scan_apartment(
     *,
-    frames: int | None = None,
+    every: int = 1,
     scans: Sequence[Scan] = SCANS,
     tracker: T265 | None = None,
     location: str = "sim:apartment",
@@ -132,16 +131,17 @@ def scan_apartment(
 ) -> Apartment:
     """Walk through the apartment once and map the same images in every way.
 
-    frames: images on the whole way (None: 902, 15 a second). step: called after each.
+    every: only each so many-th of the 902 images, 15 a second, is mapped. step: called after each.
     """
-    simulation = Simulation(location, frames=frames)
+    simulation = Simulation(location)
+    chosen = range(0, len(simulation), every)
     with tempfile.TemporaryDirectory(prefix="stereovox-reproduce-") as folder:
         recording, pair = _recorded(simulation, tracker or T265(), Path(folder) / "pair")
         mappers = [Mapper(scan.config()) for scan in scans]
         stage = simulation.stage.moved(recording.T_map_world)
         sightings = {size: _wall_sightings(stage, size) for size in {mapper.map.voxel_size for mapper in mappers}}
         way, reported = [], []
-        for i, (depth, frame) in enumerate(_images(simulation)):
+        for i, depth, frame in _images(simulation, chosen):
             exact = replace(frame, T_world_sensor=recording.T_map_world @ frame.T_world_sensor)
             tracked = _tracked(pair, i, exact)
             for scan, mapper in zip(scans, mappers, strict=True):
@@ -150,7 +150,7 @@ def scan_apartment(
             way.append(exact.T_world_sensor[:3, 3])
             reported.append(tracked.T_world_sensor[:3, 3])
             step()
-    needed = max(2, round(SEEN_FRAMES * len(simulation) / 902))
+    needed = max(2, round(SEEN_FRAMES / every))
     found = [_measure(scan, mapper.map, stage, sightings[mapper.map.voxel_size], needed)
              for scan, mapper in zip(scans, mappers, strict=True)]  # fmt: skip
     return Apartment(found, stage, np.array(way), np.array(reported))
@@ -158,8 +158,7 @@ def scan_apartment(
 
 def _recorded(simulation: Simulation, tracker: T265, folder: Path) -> tuple[Recording, CameraPair]:
     """Record the tracker beside tiny images: the pair tells where the large ones were taken."""
-    tiny = Simulation(f"{simulation.name}{'&' if '?' in simulation.name else '?'}image_width=16", noise=False,
-                      frames=len(simulation))  # fmt: skip
+    tiny = Simulation(f"{simulation.name}{'&' if '?' in simulation.name else '?'}image_width=16", noise=False)
     recording = record(tiny, folder, tracker, MOUNT)
     return recording, CameraPair(folder)
 
@@ -173,16 +172,16 @@ def _tracked(pair: CameraPair, i: int, exact: Frame) -> Frame:
         return replace(exact, T_world_sensor=np.full((4, 4), np.nan), fault=refused.reason, fault_detail=str(refused))
 
 
-def _images(simulation: Simulation) -> Iterator[tuple[NDArray[np.float32], Frame]]:
-    """Yield exact depth and frame in order; two threads simulate a batch."""
+def _images(simulation: Simulation, chosen: Sequence[int]) -> Iterator[tuple[int, NDArray[np.float32], Frame]]:
+    """Yield number, exact depth and frame in order; two threads simulate a batch."""
 
-    def simulate(i: int) -> tuple[NDArray[np.float32], Frame]:
+    def simulate(i: int) -> tuple[int, NDArray[np.float32], Frame]:
         depth = simulation.true_depth(i)
-        return depth, simulation.observe(i, depth)
+        return i, depth, simulation.observe(i, depth)
 
     with ThreadPoolExecutor(2) as threads:
-        for start in range(0, len(simulation), BATCH):
-            yield from list(threads.map(simulate, range(start, min(start + BATCH, len(simulation)))))
+        for start in range(0, len(chosen), BATCH):
+            yield from list(threads.map(simulate, chosen[start : start + BATCH]))
 
 
 def _wall_sightings(stage: Stage, size: float) -> Sightings:
@@ -210,6 +209,8 @@ def _measure(scan: Scan, voxel_map: VoxelMap, stage: Stage, seen: Sightings, nee
             walls[face.name] = measure_face(occupied, face, well_seen, others)
         except StereovoxError:
             missing.append(face.name)
+    if not walls:
+        raise StereovoxError(f"{scan.name}: not one wall stands in the map of {voxel_map.frames} frames; map more of them")
     return ScanFound(scan, voxel_map, walls, _corners(walls), missing)
 
 

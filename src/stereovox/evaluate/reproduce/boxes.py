@@ -44,8 +44,8 @@ class Placement:
     def bounds(self) -> NDArray[np.float64]:
         """Lowest and highest corner (2, 3) in metres: x right, y down, z forward."""
         width, height, depth = SIZES[self.size]
-        low = np.array([self.x - width / 2, self.y - height / 2, self.distance])
-        return np.stack([low, low + [width, height, depth]])
+        low = (self.x - width / 2, self.y - height / 2, self.distance)
+        return np.array([low, (low[0] + width, low[1] + height, low[2] + depth)])
 
     def simulation(self, frames: int) -> Simulation:
         """Return what a D435 sees of it, in Chien's map frame."""
@@ -163,7 +163,7 @@ def hidden_centres(place: Placement, size: float) -> NDArray[np.float64]:
         start, end = cells[:, axis] * size, (cells[:, axis] + 1) * size
         inside &= np.minimum(start / near, start / far_side) >= low / front
         inside &= np.maximum(end / near, end / far_side) <= high / front
-    return (cells[inside] + 0.5) * size
+    return np.asarray(cells[inside] + 0.5, float) * size
 
 
 def _errors(cells: NDArray[np.int64], place: Placement, size: float) -> NDArray[np.int64] | None:

@@ -28,7 +28,7 @@ class Claim:
 
 @dataclass(frozen=True)
 class Shown:
-    """A picture (PNG) with its place in the thesis (`Fig 4.6`), what the thesis says of its own, and what ours shows."""
+    """A picture (PNG), its place in the paper (`Fig 4.6`), what the paper says of its own, and what ours shows."""
 
     place: str
     said: str

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -36,12 +37,21 @@ def map_own(where: str | Path, step: Callable[[], None] = lambda: None) -> Chapt
     if not way:
         raise StereovoxError(f"{where}: not one frame can be used; see: stereovox map {where} --out FILE")
     figures = {name: summarise(mapper.map, reports[name]) for name, mapper in mappers.items()}
-    rows = [(name, one["frames"], one["frames_refused"], f"{one['depth_ms']['median'] + one['integrate_ms']['median']:.2f}",
-             f"{one['occupied']:,}", f"{one['free']:,}") for name, one in figures.items()]  # fmt: skip
     heads = ("profile", "frames", "refused", "ms a frame, median", "occupied", "free")
+    rows = [(name, *_row(one)) for name, one in figures.items()]
     shown = [
         Shown("Fig 4.11", "The thesis maps an apartment of its own.", f"{source.name} under `{name}`.",
-              overview_png(mapper.map, np.array(way), f"{source.name}, {name}")) for name, mapper in mappers.items()
+              overview_png(mapper.map, np.array(way), f"{source.name}, {name}"))
+        for name, mapper in mappers.items()
     ]  # fmt: skip
-    return Chapter("own", f"Your recording: {source.name}", "The recording given with --data, mapped under both profiles.",
-                   [], shown, [Sheet("Figures", heads, rows)], numbers=figures)  # fmt: skip
+    method = (
+        "The recording given with --data, mapped under both profiles. Its truth is not known, so nothing is claimed."
+    )
+    sheets = [Sheet("Figures", heads, rows)]
+    return Chapter("own", f"Your recording: {source.name}", method, [], shown, sheets, numbers=figures)
+
+
+def _row(figures: dict[str, Any]) -> tuple[str, ...]:
+    ms = figures["depth_ms"]["median"] + figures["integrate_ms"]["median"]
+    counts = (f"{figures[name]:,}" for name in ("occupied", "free"))
+    return (f"{figures['frames']:,}", f"{figures['frames_refused']:,}", f"{ms:.2f}", *counts)

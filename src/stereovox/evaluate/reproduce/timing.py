@@ -159,9 +159,9 @@ class _Condition:
     """Times one row of Table 4.3."""
 
     def __init__(self, condition: Condition):
-        settings = {"depth.downsample": condition.downsample}
+        settings = {"integrator": condition.integrator, "depth.downsample": condition.downsample}
         self._condition = condition
-        self._mapper = Mapper("chien2020", integrator=condition.integrator, **settings)
+        self._mapper = Mapper(load_config("chien2020", **settings))
         self._ms: list[float] = []
 
     def take(self, batch: Sequence[Frame], counted: bool) -> None:

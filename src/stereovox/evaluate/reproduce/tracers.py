@@ -135,4 +135,4 @@ def _count(found: Comparison, image: DepthImage, size: float) -> None:
 def _compare_maps(found: Comparison, ray: VoxelMap, line: VoxelMap) -> None:
     cells = [keys(np.floor(one.occupied() / one.voxel_size).astype(np.int64)) for one in (ray, line)]
     found.occupied_ray, found.occupied_line = (len(one) for one in cells)
-    found.occupied_both = len(np.intersect1d(*cells))
+    found.occupied_both = len(np.intersect1d(cells[0], cells[1]))

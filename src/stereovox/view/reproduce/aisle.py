@@ -18,7 +18,8 @@ from stereovox.view.reproduce.shared import SECOND, cut, figure_of, labels, png
 def aisle_png(found: Sequence[AisleFound], solids: Sequence[Solid]) -> bytes:
     """Return the layer at the camera's height of every variant, the aisle lying on its side (after Fig 4.12)."""
     figure = figure_of(1.45 * len(found) + 0.4)
-    for axis, one in zip(figure.subplots(len(found), 1, sharex=True), found, strict=True):
+    axes = figure.subplots(len(found), 1, sharex=True, squeeze=False)[:, 0]
+    for axis, one in zip(axes, found, strict=True):
         cut_open = layer(one.voxel_map, "y", 0.0)
         axis.imshow(_state_image(cut_open.state.T), origin="lower", interpolation="nearest",
                     extent=(*cut_open.extent[2:], *cut_open.extent[:2]))  # fmt: skip
@@ -30,7 +31,7 @@ def aisle_png(found: Sequence[AisleFound], solids: Sequence[Solid]) -> bytes:
         axis.set(xlim=(-0.3, 13.0), ylim=(-1.0, 1.0))
         title(axis, f"{one.variant.name}: {100 * one.found:.0f} % of the far walls' cells")
         labels(axis, "", "x [m]")
-    axis.set_xlabel("distance [m]; right of the dotted line is far", color=GREY)
+    axes[-1].set_xlabel("distance [m]; right of the dotted line is far", color=GREY)
     return png(figure)
 
 

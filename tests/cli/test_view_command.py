@@ -1,0 +1,56 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`stereovox view` as a user runs it: it says where the page is, serves it, and ends at Ctrl-C."""
+
+import json
+import signal
+import socket
+import subprocess
+import sys
+import urllib.request
+
+import pytest
+
+import stereovox as sv
+from stereovox.cli import main
+
+
+@pytest.fixture
+def saved(tmp_path):
+    voxel_map = sv.VoxelMap.from_cells(sv.load_config(), [[0, 0, 0], [1, 0, 2]], [2.0, -1.0])
+    voxel_map.save(tmp_path / "two cells.svox")
+    return tmp_path / "two cells.svox"
+
+
+def start(*words):
+    command = [sys.executable, "-m", "stereovox", "view", *map(str, words)]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def test_it_serves_until_ctrl_c(saved):
+    running = start(saved, "--port", 0, "--json")
+    line = running.stderr.readline()
+    url = next(word for word in line.split() if word.startswith("http://127.0.0.1:"))
+    with urllib.request.urlopen(url, timeout=10) as page:
+        assert page.status == 200
+    running.send_signal(signal.SIGINT)
+    out, err = running.communicate(timeout=20)
+    assert (running.returncode, err) == (0, "")
+    assert json.loads(out) == {"url": url}
+
+
+def test_a_page_for_everybody_comes_with_a_warning(saved):
+    running = start(saved, "--port", 0, "--host", "0.0.0.0")
+    assert running.stderr.readline().startswith("warning: anyone who can reach 0.0.0.0")
+    assert "http://localhost:" in running.stderr.readline()
+    running.send_signal(signal.SIGINT)
+    out, _ = running.communicate(timeout=20)
+    assert (running.returncode, out) == (0, "")
+
+
+def test_a_taken_port_is_one_line(saved, capsys):
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        assert main(["view", str(saved), "--port", str(other.getsockname()[1])]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.count("\n") == 1
+    assert "this port is in use; give another one (--port" in captured.err

@@ -120,7 +120,7 @@ def _clouds(
     depth: Source, progress: Callable[[Iterable[Frame], int], Iterable[Frame]] | None
 ) -> Iterator[tuple[int, NDArray[np.float64]]]:
     """Yield time and points of every image that can be used; the poses of the source do not count."""
-    config = load_config("default", max_range=2 * MAX_RANGE)
+    config = load_config("default", max_range=2 * MAX_RANGE, **{"depth.denoise": False})  # registration wants it raw
     for frame in progress(depth, len(depth)) if progress else depth:
         try:
             image = prepare(replace(frame, T_world_sensor=np.eye(4)), config)

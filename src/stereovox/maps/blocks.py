@@ -26,7 +26,7 @@ class BlockPool:
         self.fill = fill
         self.count = np.zeros(1, np.int64)
         self.coords = np.zeros((capacity, 3), np.int32)
-        self.values = np.full((capacity, CELLS), fill, dtype)
+        self.values = np.full((capacity, CELLS), fill, dtype) if fill else np.zeros((capacity, CELLS), dtype)
         self.flags = np.zeros(capacity, np.uint8)
         self.table = np.full(_table_size(capacity), -1, np.int32)
 

@@ -20,6 +20,9 @@ from stereovox.maps.tiles import BLOCKS, TILE, Tile, TileStore, blocks_of, slabs
 from stereovox.maps.voxel_map import VoxelMap
 from stereovox.maps.window import Box, Window, coarser, most_touched, without
 
+MOST_BYTES = 8_000_000_000
+"""A window that would need more memory is taken for a mistake."""
+
 
 class RollingMap(VoxelMap):
     """A map whose cells are updated only within a window (Chien 2020, 3.6: map shifting).
@@ -32,9 +35,11 @@ class RollingMap(VoxelMap):
     def __init__(self, config: Config, tiles: Path | None = None):
         super().__init__(config)
         self._window = Window(config)
-        self._store = TileStore(self._format, tiles) if config.window.outside == "keep" else None
-        unit = TILE if self._store else SIDE
+        keep = config.window.outside == "keep"
+        unit = TILE if keep else SIDE
         capacity = most_touched(self._window.largest, unit) * (unit // SIDE) ** 3
+        _check_memory(capacity * CELLS * self._format.dtype.itemsize, config)
+        self._store = TileStore(self._format, tiles) if keep else None
         self._pool = BlockPool(self._format.dtype, capacity, self._format.unknown)
         self._earlier: VoxelMap | None = None
 
@@ -183,6 +188,19 @@ class RollingMap(VoxelMap):
         around = tuple(tuple(SIDE * x for x in corner) for corner in blocks)
         for slab in without(around, self._window.box):  # pyright: ignore
             self._drop(slab, self._window.box)
+
+
+def _check_memory(needed: int, config: Config) -> None:
+    if needed > MOST_BYTES:
+        size = " x ".join(f"{x:g}" for x in config.window.largest or config.window.size or ())
+        raise ConfigError(
+            f"window of {size} m in cells of {config.voxel_size:g} m needs {_read(needed)} of memory, more than "
+            f"{_read(MOST_BYTES)}; choose a smaller window.size or larger cells"
+        )
+
+
+def _read(number_of_bytes: float) -> str:
+    return f"{number_of_bytes / 1e12:.0f} TB" if number_of_bytes >= 1e12 else f"{number_of_bytes / 1e9:.0f} GB"
 
 
 def most_touched_by(box: Box) -> int:

@@ -84,14 +84,14 @@ def is_private(host: str) -> bool:
 
 def check_address(host: str, port: int) -> None:
     """Raise StereovoxError where no page can be served at an address; viser would take another or wait for ever."""
+    if not 0 <= port <= 65535:
+        raise StereovoxError(f"port {port} does not exist; give one from 0 to 65535")
     place = f"{host}:{port}"
     try:
         family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
         with socket.socket(family, kind, protocol) as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as the server will
             probe.bind(address)
-    except OverflowError:
-        raise StereovoxError(f"port {port} does not exist; give one from 0 to 65535") from None
     except OSError as error:
         cures = {
             errno.EADDRINUSE: "in use; give another one (--port 8081), or --port 0 for any that is free",

@@ -23,29 +23,34 @@ FAR_M = 8.0
 """From this distance on a wall counts as far."""
 MAX_RANGE_M = 13.0
 """Depths that count here: the profile's 10 m would end before the aisle does."""
-FULL = "ray, full resolution"
-"""The variant that all are measured by."""
 
 
 @dataclass(frozen=True)
 class Variant:
-    """One way to map the aisle. wanted: whether it must find nearly all that full resolution does."""
+    """One way to map the aisle.
+
+    update: see the setting `ray.update`. wanted: whether it must find nearly all that full resolution does.
+    """
 
     name: str
     integrator: str
     downsample: int
+    update: str = "every"
     wanted: bool = False
 
 
 VARIANTS = (
-    Variant(FULL, "ray", 1),
-    Variant("4x4 minimum, line", "line", 4),
-    Variant("8x8 minimum, line", "line", 8),
-    Variant("10x10 minimum, line", "line", 10),
-    Variant("8x8 minimum, ray", "ray", 8),
+    Variant("exact rays, strongest evidence of a frame, full resolution", "ray", 1, "once"),
+    Variant("line, full resolution", "line", 1),
+    Variant("line, 4x4 minimum", "line", 4),
+    Variant("line, 8x8 minimum", "line", 8),
+    Variant("line, 10x10 minimum", "line", 10),
+    Variant("voxel traversal, full resolution", "ray", 1),
+    Variant("voxel traversal, 8x8 minimum", "ray", 8),
     Variant("footprint rule, full resolution", "projective", 1, wanted=True),
     Variant("footprint rule, 2x2 minimum", "projective", 2),
 )
+"""The first one is what all are measured by: whatever a pixel saw is in it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,8 +121,9 @@ def share_found(voxel_map: VoxelMap, cells: Keys) -> float:
 
 
 def _config(variant: Variant) -> Any:
-    settings = {"depth.downsample": variant.downsample, "window.size": None, "max_range": MAX_RANGE_M}
-    return load_config("chien2020", integrator=variant.integrator, **settings)
+    settings = {"depth.downsample": variant.downsample, "ray.update": variant.update}
+    settings |= {"integrator": variant.integrator, "window.size": None, "max_range": MAX_RANGE_M}
+    return load_config("chien2020", **settings)
 
 
 def _add(mapper: Mapper, frame: Frame) -> float:

@@ -210,7 +210,9 @@ def _measure(scan: Scan, voxel_map: VoxelMap, stage: Stage, seen: Sightings, nee
         except StereovoxError:
             missing.append(face.name)
     if not walls:
-        raise StereovoxError(f"{scan.name}: not one wall stands in the map of {voxel_map.frames} frames; map more of them")
+        raise StereovoxError(
+            f"{scan.name}: not one wall stands in the map of {voxel_map.frames} frames; map more of them"
+        )
     return ScanFound(scan, voxel_map, walls, _corners(walls), missing)
 
 

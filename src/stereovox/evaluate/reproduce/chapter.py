@@ -9,6 +9,7 @@ from typing import Any
 
 Progress = Callable[[int, int, str], None]
 """Called with steps done, steps in all, and what is being done."""
+YES, NO = "\u2713 yes", "\u2717 no"
 
 
 @dataclass(frozen=True)
@@ -22,8 +23,8 @@ class Claim:
 
     @property
     def verdict(self) -> str:
-        """`yes`, `no` or `-`."""
-        return "-" if self.holds is None else "yes" if self.holds else "no"
+        """Whether it holds, in a word."""
+        return "-" if self.holds is None else YES if self.holds else NO
 
 
 @dataclass(frozen=True)

@@ -41,7 +41,7 @@ class Sizes:
     flight_m: float = 80.0
 
 
-QUICK = Sizes(100, 6, 20, 12, 15, 25, 10, 40.0)
+QUICK = Sizes(100, 6, 20, 12, 40, 25, 10, 40.0)
 
 
 def reproduce(out: Path, data: str | Path | None, quick: bool, progress: Progress) -> dict[str, Any]:
@@ -113,7 +113,13 @@ class _Steps:
 
 def _total(sizes: Sizes) -> int:
     flight_frames = 2 * (round(sizes.flight_m / 5 * 30) + 1)
-    images = -(-APARTMENT_FRAMES // sizes.apartment_every) + sizes.aisle_frames + FIRST + sizes.timed_frames + 2 * sizes.tracer_frames
+    images = (
+        -(-APARTMENT_FRAMES // sizes.apartment_every)
+        + sizes.aisle_frames
+        + FIRST
+        + sizes.timed_frames
+        + 2 * sizes.tracer_frames
+    )
     return 2 + sizes.placements + images + flight_frames
 
 
@@ -133,7 +139,6 @@ def _facts(found: list[Chapter], seconds: float) -> list[tuple[str, str]]:
         (f"{verdicts.count(False)}", "claims do not"),
         (f"{verdicts.count(None)}", "figures without a claim"),
         (f"{seconds / 60:.1f} min", "for everything"),
-        (processor(), "processor"),
     ]
 
 

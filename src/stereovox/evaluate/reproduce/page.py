@@ -22,9 +22,12 @@ def report(title: str, lead: str, facts: Sequence[tuple[str, str]], chapters: Se
 def _contents(chapters: Sequence[Chapter]) -> str:
     rows = []
     for n, one in enumerate(chapters, 1):
-        verdicts = [claim.verdict for claim in one.claims]
-        rows.append((f"{n}. {one.title}", verdicts.count("yes"), verdicts.count("no"), verdicts.count("-")))
-    return section("What holds", "", table(("experiment", "holds", "does not", "no claim, figure only"), rows))
+        verdicts = [claim.holds for claim in one.claims]
+        rows.append((f"{n}. {one.title}", *(verdicts.count(verdict) for verdict in (True, False, None))))
+    heads = ("experiment", "claims that hold", "claims that do not", "figures without a claim")
+    broken = [f"{n}. {claim.text}" for n, one in enumerate(chapters, 1) for claim in one.claims if claim.holds is False]
+    text = f"Does not hold: {'; '.join(broken)}." if broken else "Every claim holds."
+    return section("What holds", text, table(heads, rows))
 
 
 def _chapter(number: int, one: Chapter) -> str:

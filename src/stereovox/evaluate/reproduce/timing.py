@@ -60,8 +60,8 @@ STEPS = (
     Step("Resolution downsampling (10x10)", 5.48, "block minimum of 848x480 pixels with their reasons"),
     Step("Point cloud extraction", 19.16, "none is needed; nearest equivalent: back-projecting every pixel (NumPy)"),
     Step("Colorized depth image (optional)", 21.79, "colour map by table look-up (NumPy)"),
-    Step("Fast voxel traversal + map update", 10.49, "10x10, `ray`: evidence and adding it to the map"),
-    Step("Line drawing + map update", 9.77, "10x10, `line`: evidence and adding it to the map"),
+    Step("Fast voxel traversal + map update", 10.49, "10x10: evidence of all rays, and adding it to the map"),
+    Step("Line drawing + map update", 9.77, "10x10: evidence of all lines, and adding it to the map"),
     Step(
         "Check and convert the depth image", None, "raw 16-bit image to metres and reasons; not in the thesis's table"
     ),
@@ -73,9 +73,9 @@ CONDITIONS = (
     Condition("10x10, line drawing, no visualization", 28.475, downsample=10),
     Condition("8x8, line drawing, no visualization", 36.517),
     Condition("Full resolution, line drawing, no visualization", 665.320, downsample=1),
-    Condition("8x8, voxel traversal (`ray`)", None, "ray"),
-    Condition("Full resolution, voxel traversal (`ray`)", None, "ray", 1),
-    Condition("Full resolution, `projective`", None, "projective", 1),
+    Condition("8x8, voxel traversal", None, "ray"),
+    Condition("Full resolution, voxel traversal", None, "ray", 1),
+    Condition("Full resolution, projective (the default)", None, "projective", 1),
 )
 
 

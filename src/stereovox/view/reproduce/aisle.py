@@ -17,7 +17,7 @@ from stereovox.view.reproduce.shared import SECOND, cut, figure_of, labels, png
 
 def aisle_png(found: Sequence[AisleFound], solids: Sequence[Solid]) -> bytes:
     """Return the layer at the camera's height of every variant, the aisle lying on its side (after Fig 4.12)."""
-    figure = figure_of(1.45 * len(found) + 0.4)
+    figure = figure_of(1.75 * len(found) + 0.5)
     axes = figure.subplots(len(found), 1, sharex=True, squeeze=False)[:, 0]
     for axis, one in zip(axes, found, strict=True):
         cut_open = layer(one.voxel_map, "y", 0.0)
@@ -28,7 +28,7 @@ def aisle_png(found: Sequence[AisleFound], solids: Sequence[Solid]) -> bytes:
             if len(polygon) > 2:
                 axis.fill(*polygon[:, ::-1].T, fill=False, edgecolor=SECOND, linewidth=0.9)
         axis.axvline(FAR_M, color=GREY, linewidth=1, linestyle=":")
-        axis.set(xlim=(-0.3, 13.0), ylim=(-1.0, 1.0))
+        axis.set(xlim=(-0.3, 13.0), ylim=(-0.85, 0.85))
         title(axis, f"{one.variant.name}: {100 * one.found:.0f} % of the far walls' cells")
         labels(axis, "", "x [m]")
     axes[-1].set_xlabel("distance [m]; right of the dotted line is far", color=GREY)

@@ -29,7 +29,7 @@ def apartment_png(
     at_m = float(way[0, 1])
     plan = [(solid.part, cut(solid, at_m)) for solid in solids]
     plan = [(part, polygon) for part, polygon in plan if len(polygon) > 2]
-    figure = figure_of(5.0 * (1 + -(-len(maps) // 2)))
+    figure = figure_of(6.4 * (1 + -(-len(maps) // 2)))
     spots = figure.add_gridspec(1 + -(-len(maps) // 2), 2)
     _floor_plan(figure.add_subplot(spots[0, 0]), plan, way)
     _drift(figure.add_subplot(spots[0, 1]), way, reported)

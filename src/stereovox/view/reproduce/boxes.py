@@ -19,12 +19,15 @@ from stereovox.view.reproduce.shared import figure_of, labels, png
 from stereovox.view.space import draw_space
 
 
+NAMES = {"line": "Line drawing", "ray": "Voxel traversal"}
+
+
 def box_png(line: BoxFound, ray: BoxFound) -> bytes:
     """Return the layer at the camera's height by both tracers, the optical axis and the landscape (after Fig 4.6)."""
     figure = figure_of(11.0)
     top, low = figure.add_gridspec(2, 1, height_ratios=[1, 1])
     upper, lower = top.subgridspec(1, 2), low.subgridspec(1, 2, width_ratios=[1.1, 1])
-    for spot, found, name in ((upper[0], line, "Line drawing"), (upper[1], ray, "Voxel traversal")):
+    for spot, found, name in ((upper[0], line, NAMES["line"]), (upper[1], ray, NAMES["ray"])):
         axis = figure.add_subplot(spot)
         draw_plan(axis, layer(found.voxel_map, "y", 0.0), found.voxel_map.viewpoint)
         _true_box(axis, found)
@@ -55,7 +58,7 @@ def placements_png(found: Sequence[BoxFound]) -> bytes:
         axis.legend(
             title="cells outwards", frameon=False, ncols=3, loc="lower right", bbox_to_anchor=(1, 1), fontsize=9
         )
-        title(axis, f"`{name}`, {len(errors)} boxes")
+        title(axis, f"{NAMES[name]}, {len(errors)} boxes")
         labels(axis, "share of boxes [%]", "side of the box")
     return png(figure)
 

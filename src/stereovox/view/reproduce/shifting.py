@@ -13,6 +13,10 @@ from stereovox.view.panels import INK, PATH_COLOUR, title
 from stereovox.view.reproduce.shared import OURS, SECOND, THESIS, figure_of, labels, png
 
 
+NEAR_M = 0.5
+"""Cells up to so far above and below the first camera are drawn: without floor and ceiling."""
+
+
 def flight_png(flight: Flight) -> bytes:
     """Return the flight from above with windows and tiles (after Fig 3.14 to 3.16), and what moves cost."""
     figure = figure_of(7.0)
@@ -26,6 +30,7 @@ def flight_png(flight: Flight) -> bytes:
 
 def _flight_plan(axis: Any, flight: Flight) -> None:
     occupied = flight.voxel_map.occupied()
+    occupied = occupied[np.abs(occupied[:, 1] - flight.way[0, 1]) < NEAR_M]
     cells = np.unique(np.floor(occupied[:, [0, 2]] / flight.voxel_map.voxel_size), axis=0) + 0.5
     x, z = cells.T * flight.voxel_map.voxel_size
     axis.plot(z, x, "s", color=INK, markersize=1.1)
@@ -40,7 +45,7 @@ def _flight_plan(axis: Any, flight: Flight) -> None:
         axis.fill(*_rectangle(middle - trigger, middle + trigger), fill=False, edgecolor=PATH_COLOUR, linewidth=1.4)
     axis.plot(flight.way[:, 2], flight.way[:, 0], color=PATH_COLOUR, linewidth=1)
     axis.set_aspect("equal")
-    title(axis, "Occupied cells, way, four windows with trigger boxes, tiles on disk (grey)")
+    title(axis, "Occupied cells near the flight's height, way, windows, trigger boxes, tiles")
     labels(axis, "z, ahead [m]", "x, to the right [m]")
 
 

@@ -19,6 +19,7 @@ SAID = {
     "small": "The small box also occupies two cells, although it is 22 cm narrower: 12.5 cm of it lie in each, more "
     "than half of the cell. It barely blocks the wall.",
 }
+NAMES = {"line": "line drawing", "ray": "voxel traversal"}
 MARGIN = (
     "The accuracy is practical for the positions of obstacles but not for exact dimensions, therefore a margin of one "
     "cell is required (chapter 5)."
@@ -63,7 +64,7 @@ def chapter(two: Sequence[BoxFound], many: Sequence[BoxFound], updates: int) -> 
 
 
 def _width(size: str, found: Sequence[BoxFound]) -> Claim:
-    ours = ", ".join(f"{one.width} ({one.integrator})" for one in found)
+    ours = ", ".join(f"{one.width} ({NAMES[one.integrator]})" for one in found)
     text = f"{size.capitalize()} box ({SIZES_CM[size]}): cells side by side"
     return Claim(text, "2", ours, all(one.width == 2 for one in found))
 
@@ -78,7 +79,7 @@ def _shadow(whose: str, found: Sequence[BoxFound]) -> Claim:
 
 def _placed(name: str, found: Sequence[BoxFound]) -> Claim:
     good = sum(one.within_one_cell for one in found)
-    text = f"Random places, `{name}`: the box is there and no side is more than one cell off"
+    text = f"Random places, {NAMES[name]}: the box is there and no side is more than one cell off"
     return Claim(text, "one cell of margin", f"{good} of {len(found)} boxes", good == len(found))
 
 
@@ -103,7 +104,7 @@ def _errors(tracers: Sequence[str], many: Sequence[BoxFound]) -> Sheet:
     for name in tracers:
         errors = np.array([one.errors for one in many if one.integrator == name and one.errors is not None])
         for value in range(int(min(errors.min(), -1)), int(max(errors.max(), 1)) + 1):
-            rows.append((name, f"{value:+d}" if value else "0", *(errors == value).sum(axis=0).tolist()))
+            rows.append((NAMES[name], f"{value:+d}" if value else "0", *(errors == value).sum(axis=0).tolist()))
     return Sheet("Boxes at random places: how many are off by so many cells", ("tracer", "cells", *DIRECTIONS), rows)
 
 
@@ -113,7 +114,9 @@ def _broken(many: Sequence[BoxFound]) -> list[str]:
     for one in many:
         if not one.within_one_cell:
             place = one.placement
-            where = f"{place.size} box at {place.distance:g} m, x {place.x:g}, y {place.y:g}, by `{one.integrator}`"
+            where = (
+                f"{place.size} box at {place.distance:g} m, x {place.x:g}, y {place.y:g}, by {NAMES[one.integrator]}"
+            )
             told.append(f"Breaks the claim: {where}: {_why(one)}.")
     return told or ["No box breaks the claim."]
 

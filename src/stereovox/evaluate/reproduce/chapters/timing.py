@@ -19,7 +19,7 @@ MEANS = (
 VIEWS = (
     "With visualization: after a frame the map is turned into pixels on the same processor core. 2D is the layer at "
     "the camera's height, 3D the occupied cells as shaded cubes, 640x640, both by NumPy and without a window; the "
-    "thesis's pictures come from a graphics card. Every fifth frame was timed. In practice `stereovox view` draws in "
+    "thesis's pictures come from a graphics card. Every fifth frame was timed. In practice stereovox view draws in "
     "the browser and takes nothing of the mapping's time."
 )
 

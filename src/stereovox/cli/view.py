@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import logging
 from argparse import ArgumentParser, Namespace
 from contextlib import closing, suppress
 from pathlib import Path
@@ -25,6 +26,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
     from stereovox.maps import load_map
     from stereovox.view.viewer import is_private, open_viewer
 
+    logging.getLogger("websockets.server").setLevel(logging.CRITICAL)  # tells of every browser that hangs up early
     viewer = open_viewer(load_map(arguments.map), Path(arguments.map).stem, arguments.host, arguments.port)
     with closing(viewer), suppress(KeyboardInterrupt):
         if not is_private(arguments.host):

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from stereovox.config import Config, load_config
 from stereovox.errors import FrameRefused, StereovoxError
-from stereovox.evaluate.cells import Keys, keys
+from stereovox.evaluate.cells import Keys, indices, keys
 from stereovox.evaluate.sightings import Sightings
 from stereovox.evaluate.truth import touched_cells
 from stereovox.evaluate.walls import Wall, WallFound, corner_deg, measure_wall, thickness_figures
@@ -33,6 +33,8 @@ SEEN_FRAMES = 10
 """A wall is judged where so many frames saw it, of those of a whole scan (902)."""
 INSET_M = 0.15
 """So much of a wall beside a corner, the floor and the ceiling is not judged: the other wall stands there too."""
+LONG_M = 2.0
+"""A wall has a direction worth giving if it was measured over so many metres: one cell of 5 cm on them is 1.4 deg."""
 IN_FRONT_M = 0.4
 """Occupied cells up to so far before a face are taken for its wall; behind it, up to the wall's middle."""
 INNER_HALF_M, OUTER_M = 0.06, 0.25
@@ -70,17 +72,23 @@ SCANS = (
 
 @dataclass(frozen=True, eq=False)
 class ScanFound:
-    """The walls of one map. walls: one for each face that could be measured; corners_deg: angles by name."""
+    """The walls of one map.
+
+    walls: one for each face that could be measured; lengths_m: over which length each was; corners_deg: angles by name,
+    `long_corners` those of them whose both walls were measured over `LONG_M` or more.
+    """
 
     scan: Scan
     voxel_map: VoxelMap
     walls: dict[str, WallFound]
+    lengths_m: dict[str, float]
     corners_deg: dict[str, float]
+    long_corners: list[str]
     missing: list[str]
 
     def figures(self) -> dict[str, Any]:
         """Return its numbers, fit for JSON."""
-        angles = np.array(list(self.corners_deg.values()))
+        angles = np.array([self.corners_deg[name] for name in self.long_corners])
         offsets = np.array([wall.offset for wall in self.walls.values()])
         straight = np.array([wall.straightness for wall in self.walls.values()])
         return {
@@ -98,7 +106,7 @@ class ScanFound:
             "corner_error_median_deg": float(np.median(np.abs(angles - 90))),
             "corner_error_max_deg": float(np.abs(angles - 90).max()),
             "corners_within_1_deg": float((np.abs(angles - 90) <= 1).mean()),
-            "each_wall": [wall.figures() for wall in self.walls.values()],
+            "each_wall": [wall.figures() | {"length_m": self.lengths_m[name]} for name, wall in self.walls.items()],
             "corners_deg": self.corners_deg,
         }
 
@@ -213,7 +221,10 @@ def _measure(scan: Scan, voxel_map: VoxelMap, stage: Stage, seen: Sightings, nee
         raise StereovoxError(
             f"{scan.name}: not one wall stands in the map of {voxel_map.frames} frames; map more of them"
         )
-    return ScanFound(scan, voxel_map, walls, _corners(walls), missing)
+    lengths = {face.name: seen_length(face, well_seen, others, voxel_map.voxel_size) for face in stage.faces}
+    corners = _corners(walls)
+    long = [name for name in corners if min(lengths[wall] for wall in _walls_of(name)) >= LONG_M]
+    return ScanFound(scan, voxel_map, walls, lengths, corners, long, missing)
 
 
 def measure_face(voxel_map: VoxelMap, face: Face, only: Keys | None = None, others: Keys | None = None) -> WallFound:
@@ -223,6 +234,27 @@ def measure_face(voxel_map: VoxelMap, face: Face, only: Keys | None = None, othe
     """
     behind = OUTER_M if _outer(face.name) else INNER_HALF_M
     return measure_wall(_only_near(voxel_map, face, behind), _inset(face), only=only, others=others, reach=IN_FRONT_M)
+
+
+def seen_length(face: Face, only: Keys, others: Keys, size: float) -> float:
+    """Return over how many metres from side to side a face can be judged: where it was seen and nothing stands."""
+    wall = _inset(face)
+    length = np.linalg.norm(wall.along, axis=1)
+    units = wall.along / length[:, None]
+    level = int(np.argmin(np.abs(units[:, 1])))  # y points down
+
+    def places(cells: Keys, reach: float) -> NDArray[np.int64]:
+        centre = (indices(cells) + 0.5) * size - wall.corner
+        along = centre @ units.T
+        near = ((along > size) & (along < length - size)).all(axis=1) & (np.abs(centre @ wall.normal) <= reach)
+        return np.unique(np.floor(along[near] / size).astype(np.int64), axis=0)
+
+    free = np.setdiff1d(keys(_flat(places(only, size))), keys(_flat(places(others, IN_FRONT_M))))
+    return len(np.unique(indices(free)[:, level])) * size
+
+
+def _flat(places: NDArray[np.int64]) -> NDArray[np.int64]:
+    return np.column_stack([places, np.zeros(len(places), np.int64)])
 
 
 def _occupied(voxel_map: VoxelMap) -> VoxelMap:
@@ -262,10 +294,11 @@ def _other_things(stage: Stage, size: float) -> Keys:
 
 def _corners(walls: dict[str, WallFound]) -> dict[str, float]:
     """Return the angle in every corner of a room both of whose walls were measured."""
-    angles = {}
-    for room in ROOMS:
-        for a, b in (("west", "south"), ("south", "east"), ("east", "north"), ("north", "west")):
-            one, other = (walls.get(f"{room} {side}") for side in (a, b))
-            if one and other:
-                angles[f"{room} {a} {b}"] = corner_deg(one, other)
-    return angles
+    names = [f"{room} {sides}" for room in ROOMS for sides in ("west south", "south east", "east north", "north west")]
+    pairs = {name: [walls.get(wall) for wall in _walls_of(name)] for name in names}
+    return {name: corner_deg(one, other) for name, (one, other) in pairs.items() if one and other}
+
+
+def _walls_of(corner: str) -> tuple[str, str]:
+    room, first, second = corner.rsplit(" ", 2)
+    return f"{room} {first}", f"{room} {second}"

@@ -42,10 +42,51 @@ def test_along_a_ray_each_cell_is_met_once_where_it_is_entered():
     np.testing.assert_allclose(log_odds, [-1, 3])
 
 
+@pytest.mark.parametrize("cell", ["int16", "uint8"])
+def test_layers_of_random_maps_say_what_each_cell_says(cell):
+    numbers = np.random.default_rng(3)
+    indices = np.unique(numbers.integers(-21, 13, (4000, 3)), axis=0)
+    config = load_config(voxel_size=0.25, **{"map.cell": cell})
+    one = VoxelMap.from_cells(config, indices, numbers.uniform(-2, 3, len(indices)))
+    for across in "xyz":
+        at_m = numbers.uniform(-21, 13) * 0.25
+        found = layer(one, across, at_m, one.bounds())
+        left, right, bottom, top = found.extent
+        assert found.state.shape == (round((top - bottom) / 0.25), round((right - left) / 0.25))
+        for row, column in np.ndindex(found.state.shape):
+            place = {
+                across: at_m,
+                found.axes[0]: left + 0.25 * (column + 0.5),
+                found.axes[1]: bottom + 0.25 * (row + 0.5),
+            }
+            point = [[place[name] for name in "xyz"]]
+            assert found.state[row, column] == one.state(point)[0]
+            assert np.nan_to_num(found.log_odds[row, column]) == one.log_odds(point)[0]
+        assert found.at_m == pytest.approx((np.floor(at_m / 0.25) + 0.5) * 0.25)
+
+
+def test_rays_of_random_maps_say_what_fine_steps_say():
+    numbers = np.random.default_rng(4)
+    indices = np.argwhere(np.ones((12, 12, 12))) - 6
+    one = VoxelMap.from_cells(load_config(voxel_size=0.3), indices, numbers.uniform(-2, 3, len(indices)))
+    for _ in range(20):
+        start, towards = numbers.uniform(-1, 1, 3), numbers.normal(size=3)
+        distance, log_odds = along_ray(one, start, towards, 3.0)
+        assert (np.diff(distance) > 0).all()
+        assert (distance[0], distance[-1]) == (0, 3)
+        at = (np.arange(3000) + 0.5) / 1000
+        fine = one.log_odds(start + at[:, None] * towards / np.linalg.norm(towards))
+        coarse = log_odds[np.searchsorted(distance, at) - 1]
+        assert (fine != coarse).mean() < 0.001
+        assert len(distance) - 1 <= 3 * 3 / 0.3 + 1, "each cell once"
+
+
 def test_wrong_use_ends_in_one_line():
     with pytest.raises(StereovoxError, match="name one of x, y, z"):
         layer(made_map(), "up", 0)
     with pytest.raises(StereovoxError, match="map is empty"):
         layer(VoxelMap(load_config()), "z", 0)
+    with pytest.raises(StereovoxError, match="layer at nan"):
+        layer(made_map(), "z", np.nan)
     with pytest.raises(StereovoxError, match="points nowhere"):
         along_ray(made_map(), (0, 0, 0), (0, 0, 0), 1)

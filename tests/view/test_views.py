@@ -8,10 +8,17 @@ from stereovox.cameras import PinholeCamera
 from stereovox.config import load_config
 from stereovox.errors import StereovoxError
 from stereovox.frame import Viewpoint
+from stereovox.geometry import rigidity_error
 from stereovox.maps import VoxelMap, load_map
+from stereovox.view.drawn import UPS, upright
 from stereovox.view.figures import save
-from stereovox.view.space import field_of_view
+from stereovox.view.landscape import FROM, columns, thinned
+from stereovox.view.layer import upright_layer
+from stereovox.view.panels import PATH_COLOUR
+from stereovox.view.render import render
+from stereovox.view.scale import scale_of
 from stereovox.view.views import VIEWS, draw_view
+from stereovox.view.whereabouts import field_of_view, viewpoint_at
 
 CAMERA = PinholeCamera.from_field_of_view(100, 60, 90, 0.05)
 
@@ -37,7 +44,7 @@ def test_every_view_becomes_a_picture(view, tmp_path):
 def test_the_layer_is_at_the_height_of_the_camera():
     figure = draw_view(made_map(), "layer", "a map", "-y")
     plan = figure.axes[0]
-    assert "y = 0.25" in plan.get_title(loc="left")
+    assert "-y = -0.50 to 0.00 m" in plan.get_title(loc="left")
     states = np.asarray(plan.images[0].get_array())
     assert states.shape == (5, 6)
     assert states[4].tolist() == [3] * 6
@@ -45,6 +52,52 @@ def test_the_layer_is_at_the_height_of_the_camera():
     wedge = [line.get_xydata() for line in plan.lines[:2]]
     np.testing.assert_allclose([line[0] for line in wedge], [[0.1, 0.25]] * 2)
     np.testing.assert_allclose([line[1] for line in wedge], [[0.1 - 1, 1.25], [0.1 + 1, 1.25]], atol=0.02)
+
+
+@pytest.mark.parametrize("up", UPS)
+def test_a_layer_shows_what_lies_at_its_height_and_is_never_mirrored(up):
+    one = made_map()
+    drawn = upright(one, None, up)
+    for number in (0, -1):
+        found = upright_layer(one, up, (number + 0.5) * 0.5)
+        assert (found.across, found.at_m) == (up, pytest.approx((number + 0.5) * 0.5))
+        assert found.axes == drawn.names[:2]
+        here = drawn.cells[:, 2] == number
+        left, _, bottom, _ = found.extent
+        column, row = (drawn.cells[here, :2] - np.rint([left / 0.5, bottom / 0.5]).astype(int)).T
+        assert (found.state[row, column] == drawn.state[here]).all()
+        assert (found.state > 0).sum() == here.sum()
+        assert np.isnan(found.log_odds).sum() == found.state.size - here.sum()
+
+
+@pytest.mark.parametrize(("cell", "free", "occupied", "unknown"), [("int16", -1.5, 2.0, 0), ("uint8", 33, 252, 127)])
+def test_values_are_coloured_as_the_map_keeps_them(cell, free, occupied, unknown):
+    axis = draw_view(made_map(cell), "layer", "a map", "-y").axes[1]
+    shown = np.ma.filled(np.ma.asarray(axis.images[0].get_array(), float), np.nan)
+    assert np.unique(shown[~np.isnan(shown)]).tolist() == pytest.approx([free, occupied], abs=1e-3)
+    colours, norm = scale_of(made_map(cell)).colours()
+    assert norm(unknown) == pytest.approx(0.5)
+    assert colours(norm(free))[2] > colours(norm(free))[0], "free is blue"
+    assert colours(norm(occupied))[0] > colours(norm(occupied))[2], "occupied is red"
+
+
+def test_the_landscape_leaves_out_only_what_nobody_can_see():
+    heights = np.random.default_rng(1).integers(1, 9, (7, 9))
+    every = np.array([[x, y, z] for y in range(7) for x in range(9) for z in range(heights[y, x])])
+    some = columns(heights)
+    assert set(map(tuple, some.tolist())) < set(map(tuple, every.tolist()))
+    paint = np.random.default_rng(2).uniform(size=(7, 9, 3))
+    pictures = [render(cells, paint[cells[:, 1], cells[:, 0]], 1.0, FROM, 300, 300) for cells in (some, every)]
+    np.testing.assert_array_equal(pictures[0].image, pictures[1].image)
+
+
+def test_a_thinned_landscape_keeps_what_is_furthest_from_unknown():
+    values = np.full((3, 400), np.nan)
+    values[0, 3], values[2, 4], values[1, 399] = -1.0, 2.0, 0.5
+    few, step = thinned(values, 0.0)
+    assert step == 3
+    assert few.shape == (1, 134)
+    assert {n: float(few[0, n]) for n in np.flatnonzero(~np.isnan(few[0]))} == {1: 2.0, 133: 0.5}
 
 
 @pytest.mark.parametrize(("cell", "free", "wall"), [("int16", -1.5, 2.0), ("uint8", 33, 252)])
@@ -63,14 +116,57 @@ def test_the_field_of_view_is_a_pyramid_of_one_metre():
     assert lines[:4, 1, 0].tolist() == pytest.approx([-0.9, 1.1, 1.1, -0.9], abs=0.02)
 
 
+def test_the_axis_tells_where_the_first_occupied_cells_are():
+    title = draw_view(made_map(), "axis", "a map", "-y").axes[0].get_title(loc="left")
+    assert "first occupied from 1.75 to 2.25 m" in title
+    away = viewpoint_at(made_map(), (0.1, 0.1, 0.25), (0.1, 0.1, -9), "-y")
+    title = draw_view(made_map(), "axis", "a map", "-y", viewpoint=away).axes[0].get_title(loc="left")
+    assert "no cell is occupied" in title
+
+
+def test_the_camera_may_be_told():
+    one = made_map()
+    told = viewpoint_at(one, (1, 2, 3), (1, 2, 7), "-y")
+    assert told.camera == CAMERA
+    np.testing.assert_allclose(told.T_world_camera[:3, 3], [1, 2, 3])
+    np.testing.assert_allclose(told.T_world_camera[:3, :3], np.eye(3), atol=1e-12)
+    down = viewpoint_at(one, (1, 2, 3), (1, 5, 3), "-y").T_world_camera
+    np.testing.assert_allclose(down[:3, 2], [0, 1, 0], atol=1e-12)
+    assert rigidity_error(down) < 1e-9
+    assert viewpoint_at(one, None, None, "-y") is one.viewpoint
+    one.viewpoint = None
+    assert viewpoint_at(one, (1, 2, 3), (1, 2, 7), "-y").camera.width == 848
+    assert viewpoint_at(one, None, None, "-y") is None
+    with pytest.raises(StereovoxError, match="needs both"):
+        viewpoint_at(one, (1, 2, 3), None, "-y")
+    with pytest.raises(StereovoxError, match="same point"):
+        viewpoint_at(one, (1, 2, 3), (1, 2, 3), "-y")
+
+
+def test_cells_hide_lines_behind_them():
+    rendering = render(np.array([[0, 0, 0], [4, 0, 0]]), np.ones((2, 3)), 1.0, FROM, 200, 200)
+    middle = np.array([[0.5, 0.5, 0.5], [2.5, 0.5, 0.5]])
+    points = np.concatenate([middle - 3 * FROM.toward, middle + 3 * FROM.toward, [[99, 0, 0]]])
+    hidden = rendering.hidden(FROM.flat(points), points @ FROM.toward, 1.0)
+    assert hidden.tolist() == [True, False, False, False, False]
+
+
+def test_the_whole_field_of_view_is_in_the_picture_in_space():
+    axis = draw_view(made_map(), "space", "a map", "-y").axes[0]
+    red = np.concatenate([line.get_xydata() for line in axis.lines if line.get_color() == PATH_COLOUR])
+    (left, right), (bottom, top) = axis.get_xlim(), axis.get_ylim()
+    red = red[~np.isnan(red).any(axis=1)]
+    assert ((red > [left, bottom]) & (red < [right, top])).all()
+    assert axis.get_aspect() == 1
+
+
 def test_a_map_without_camera_says_so():
     one = made_map()
     one.viewpoint = None
     draw_view(one, "space", "a map", "-y")
-    draw_view(one, "layer", "a map", "-y", at_m=0.2)
-    for view in ("layer", "axis"):
-        with pytest.raises(StereovoxError, match="does not know where its camera stood"):
-            draw_view(one, view, "a map", "-y")
+    draw_view(one, "layer", "a map", "-y")
+    with pytest.raises(StereovoxError, match=r"does not know where its camera stood.*--eye=X,Y,Z --toward=X,Y,Z"):
+        draw_view(one, "axis", "a map", "-y")
     with pytest.raises(StereovoxError, match="did you mean 'layer'"):
         draw_view(one, "layers", "a map", "-y")
 

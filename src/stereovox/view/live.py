@@ -58,7 +58,7 @@ def colour_depth(depth_m: NDArray[np.floating], max_range: float) -> NDArray[np.
 
 
 def _cube(scale: float) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Return the pixels of a cube `scale` pixels long, from its middle: columns, rows, and the axis of the face seen."""
+    """Return the pixels of a cube `scale` pixels long, from its middle: columns, rows, and the axis of their face."""
     reach = int(np.ceil(0.9 * scale)) + 1
     down, across = (grid.ravel() for grid in np.mgrid[-reach : reach + 1, -reach : reach + 1])
     points = (across[:, None] * FROM.right - down[:, None] * FROM.up) / scale

@@ -18,7 +18,7 @@ LIGHT = {"top": 1.0, "x": 0.80, "y": 0.62}
 """Brightness of the faces across each axis."""
 _SUPERSAMPLING = 2
 _MAX_WRITES = 60_000_000
-_MAX_CELL_PX = 32
+_MAX_CELL_PX = 20
 """A cell is drawn at most so many pixels wide; whoever shows the image may enlarge it."""
 
 

@@ -41,7 +41,7 @@ def draw_space(voxel_map: VoxelMap, heading: str, up: str, viewpoint: Viewpoint 
     axis = figure.add_subplot()
     shape = draw_cells(figure, axis, drawn, lines)
     figure.set_figheight(float(np.clip(0.86 * WIDTH * shape, 5.0, 12.0)) + 1.4)
-    figure.get_layout_engine().set(rect=(0.015, 0.005, 0.98, 1 - 0.95 / figure.get_figheight()))
+    figure.get_layout_engine().set(rect=(0.015, 0.005, 0.98, 1 - 1.05 / figure.get_figheight()))
     cut = "" if drawn.cut is None else f", cut open at {drawn.names[2]} = {drawn.cut:.2f} m"
     seen = "" if lines is None else f"; red: the camera and its field of view, {FIELD_M:g} m deep"
     title(axis, f"Occupied cells{cut}{seen}")

@@ -20,7 +20,7 @@ from stereovox.evaluate.reproduce.chapters import aisle, apartment, boxes, shift
 from stereovox.evaluate.reproduce.own import map_own
 from stereovox.evaluate.reproduce.page import report
 from stereovox.evaluate.reproduce.shifting import OUTSIDE, fly
-from stereovox.evaluate.reproduce.timing import FIRST, processor, time_tables
+from stereovox.evaluate.reproduce.timing import FIRST, time_tables
 from stereovox.evaluate.reproduce.tracers import compare_tracers
 
 TITLE = "Chien 2020, made again"
@@ -32,7 +32,7 @@ class Sizes:
     """How much of each experiment is done."""
 
     box_updates: int = 100
-    placements: int = 50
+    placements: int = 100
     placement_updates: int = 100
     apartment_every: int = 2
     aisle_frames: int = 100

@@ -18,7 +18,6 @@ from stereovox.view.panels import INK, PATH_COLOUR, title
 from stereovox.view.reproduce.shared import figure_of, labels, png
 from stereovox.view.space import draw_space
 
-
 NAMES = {"line": "Line drawing", "ray": "Voxel traversal"}
 
 

@@ -12,7 +12,6 @@ from stereovox.evaluate.reproduce.shifting import Flight
 from stereovox.view.panels import INK, PATH_COLOUR, title
 from stereovox.view.reproduce.shared import OURS, SECOND, THESIS, figure_of, labels, png
 
-
 NEAR_M = 0.5
 """Cells up to so far above and below the first camera are drawn: without floor and ceiling."""
 

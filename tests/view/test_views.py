@@ -12,6 +12,7 @@ from stereovox.geometry import rigidity_error
 from stereovox.maps import VoxelMap, load_map
 from stereovox.view.drawn import UPS, upright
 from stereovox.view.figures import save
+from stereovox.view.frame3d import numbers
 from stereovox.view.landscape import FROM, columns, thinned
 from stereovox.view.layer import upright_layer
 from stereovox.view.panels import PATH_COLOUR
@@ -158,6 +159,11 @@ def test_the_whole_field_of_view_is_in_the_picture_in_space():
     red = red[~np.isnan(red).any(axis=1)]
     assert ((red > [left, bottom]) & (red < [right, top])).all()
     assert axis.get_aspect() == 1
+
+
+def test_edges_bear_round_numbers_that_do_not_crowd():
+    assert numbers("z", -0.3, 2.5)[1].tolist() == pytest.approx([0, 0.5, 1, 1.5, 2, 2.5])
+    assert numbers("z", -0.9, 3.4, 4.0)[1].tolist() == pytest.approx([0, 2])
 
 
 def test_a_map_without_camera_says_so():

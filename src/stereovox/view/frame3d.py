@@ -15,9 +15,9 @@ Numbers = tuple[str, NDArray[np.float64], NDArray[np.float64]]
 """Label of an edge, where its ticks stand in metres, and the numbers written there."""
 
 
-def numbers(label: str, low: float, high: float, step: float | None = None) -> Numbers:
-    """Return round numbers between `low` and `high` for the edge `label`."""
-    step = step or round_length(max(high - low, 1e-6) / 4)
+def numbers(label: str, low: float, high: float, least_m: float = 1e-6) -> Numbers:
+    """Return round numbers between `low` and `high`, about `least_m` or more apart, for the edge `label`."""
+    step = round_length(max((high - low) / 4, least_m))
     at = np.arange(np.ceil(low / step - 1e-9), np.floor(high / step + 1e-9) + 1) * step + 0.0  # no "-0"
     return label, at, at
 

@@ -60,7 +60,8 @@ def draw_cells(figure: Any, axis: Any, drawn: Drawn, lines: NDArray[np.float64] 
     corners = np.concatenate([corners, *([] if lines is None else [lines.reshape(-1, 3)])])
     low, high = corners.min(0), corners.max(0)
     shape = fit(axis, direction, low, high)
-    edges = [numbers(f"{name} [m]", a, b) for name, a, b in zip(drawn.names, low, high, strict=True)]
+    least = 0.04 * float((high - low).max())  # nearer, and the numbers of a flat map would cover each other
+    edges = [numbers(f"{name} [m]", a, b, least) for name, a, b in zip(drawn.names, low, high, strict=True)]
     draw_frame(axis, direction, low, high, (edges[0], edges[1], edges[2]))
     for line in lines if lines is not None else ():
         _line(axis, line, direction, rendering, drawn.voxel_size)

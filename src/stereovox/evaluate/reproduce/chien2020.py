@@ -32,7 +32,7 @@ class Sizes:
     """How much of each experiment is done."""
 
     box_updates: int = 100
-    placements: int = 100
+    placements: int = 50
     placement_updates: int = 100
     apartment_every: int = 2
     aisle_frames: int = 100

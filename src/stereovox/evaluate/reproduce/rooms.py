@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stereovox.errors import StereovoxError
-from stereovox.evaluate.cells import Keys, indices, keys
+from stereovox.evaluate.cells import Keys, keys
+from stereovox.evaluate.reproduce.outer import SIDES, measure_outer, outer_corners
 from stereovox.evaluate.truth import touched_cells
 from stereovox.evaluate.walls import Wall, WallFound, corner_deg, measure_wall, thickness_figures
 from stereovox.maps import VoxelMap
@@ -19,8 +19,6 @@ from stereovox.sources.stage import Face, Stage
 
 INSET_M = 0.15
 """So much of a wall beside a corner, the floor and the ceiling is not judged: the other wall stands there too."""
-LONG_M = 2.5
-"""A wall has a direction worth giving if it was measured over so many metres: one cell of 5 cm on them is 1.1 deg."""
 IN_FRONT_M = 0.4
 """Occupied cells up to so far before a face are taken for its wall; behind it, up to the wall's middle."""
 INNER_HALF_M, OUTER_M = 0.06, 0.25
@@ -31,22 +29,21 @@ INNER_HALF_M, OUTER_M = 0.06, 0.25
 class RoomsFound:
     """The walls of one map, `name` in tables and pictures.
 
-    walls: one for each face that could be measured; lengths_m: over which length each was; corners_deg: angles by name,
-    `long_corners` those of them whose both walls were measured over `LONG_M` or more.
+    walls: one for each side of a room that could be measured, missing: the others; corners_deg: the rooms' angles.
+    outer: the apartment's own four walls, along several rooms each.
     """
 
     name: str
     voxel_map: VoxelMap
     walls: dict[str, WallFound]
-    lengths_m: dict[str, float]
-    corners_deg: dict[str, float]
-    long_corners: list[str]
     missing: list[str]
+    corners_deg: dict[str, float]
+    outer: dict[str, WallFound]
 
     def figures(self) -> dict[str, Any]:
         """Return its numbers, fit for JSON."""
         off = {name: abs(angle - 90) for name, angle in self.corners_deg.items()}
-        long = np.array([off[corner] for corner in self.long_corners] or [0.0])
+        outer = outer_corners(self.outer)
         offsets = np.array([wall.offset for wall in self.walls.values()])
         straight = np.array([wall.straightness for wall in self.walls.values()])
         return {
@@ -63,11 +60,11 @@ class RoomsFound:
             "corners": len(off),
             "corner_error_median_deg": float(np.median(list(off.values()) or [0.0])),
             "corner_error_max_deg": max(off.values(), default=0.0),
-            "long_corners": self.long_corners,
-            "long_corner_error_median_deg": float(np.median(long)),
-            "long_corner_error_max_deg": float(long.max()),
-            "each_wall": [wall.figures() | {"length_m": self.lengths_m[side]} for side, wall in self.walls.items()],
             "corners_deg": self.corners_deg,
+            "outer_corner_error_max_deg": max(abs(angle - 90) for angle in outer.values()),
+            "outer_corners_deg": outer,
+            "outer_walls": [wall.figures() for wall in self.outer.values()],
+            "each_wall": [wall.figures() for wall in self.walls.values()],
         }
 
 
@@ -88,10 +85,8 @@ def measure_rooms(name: str, voxel_map: VoxelMap, stage: Stage, well_seen: Keys)
             missing.append(face.name)
     if not walls:
         raise StereovoxError(f"{name}: not one wall stands in the map of {voxel_map.frames} frames; map more of them")
-    lengths = {face.name: seen_length(face, well_seen, others, voxel_map.voxel_size) for face in stage.faces}
-    corners = _corners(walls)
-    long = [name for name in corners if min(lengths[wall] for wall in walls_of(name)) >= LONG_M]
-    return RoomsFound(name, voxel_map, walls, lengths, corners, long, missing)
+    outer = measure_outer(occupied, stage, well_seen, others)
+    return RoomsFound(name, voxel_map, walls, missing, _corners(walls), outer)
 
 
 def measure_face(voxel_map: VoxelMap, face: Face, only: Keys | None = None, others: Keys | None = None) -> WallFound:
@@ -101,27 +96,6 @@ def measure_face(voxel_map: VoxelMap, face: Face, only: Keys | None = None, othe
     """
     behind = OUTER_M if _outer(face.name) else INNER_HALF_M
     return measure_wall(_only_near(voxel_map, face, behind), _inset(face), only=only, others=others, reach=IN_FRONT_M)
-
-
-def seen_length(face: Face, only: Keys, others: Keys, size: float) -> float:
-    """Return over how many metres from side to side a face can be judged: where it was seen and nothing stands."""
-    wall = _inset(face)
-    length = np.linalg.norm(wall.along, axis=1)
-    units = wall.along / length[:, None]
-    level = int(np.argmin(np.abs(units[:, 1])))  # y points down
-
-    def places(cells: Keys, reach: float) -> NDArray[np.int64]:
-        centre = (indices(cells) + 0.5) * size - wall.corner
-        along = centre @ units.T
-        near = ((along > size) & (along < length - size)).all(axis=1) & (np.abs(centre @ wall.normal) <= reach)
-        return np.unique(np.floor(along[near] / size).astype(np.int64), axis=0)
-
-    free = np.setdiff1d(keys(_flat(places(only, size))), keys(_flat(places(others, IN_FRONT_M))))
-    return len(np.unique(indices(free)[:, level])) * size
-
-
-def _flat(places: NDArray[np.int64]) -> NDArray[np.int64]:
-    return np.column_stack([places, np.zeros(len(places), np.int64)])
 
 
 def _occupied(voxel_map: VoxelMap) -> VoxelMap:
@@ -148,7 +122,7 @@ def _inset(face: Face) -> Wall:
 def _outer(name: str) -> bool:
     """Tell whether there is no other room behind a face: it stands at the apartment's rim."""
     room, _, side = name.rpartition(" ")
-    index = {"west": 0, "south": 1, "east": 2, "north": 3}[side]
+    index = SIDES.index(side)
     rim = [limits[index] for limits in ROOMS.values()]
     return ROOMS[room][index] == (min(rim) if index < 2 else max(rim))
 
@@ -161,12 +135,10 @@ def _other_things(stage: Stage, size: float) -> Keys:
 
 def _corners(walls: dict[str, WallFound]) -> dict[str, float]:
     """Return the angle in every corner of a room both of whose walls were measured."""
-    names = [f"{room} {sides}" for room in ROOMS for sides in ("west south", "south east", "east north", "north west")]
-    pairs = {name: [walls.get(wall) for wall in walls_of(name)] for name in names}
-    return {name: corner_deg(one, other) for name, (one, other) in pairs.items() if one and other}
-
-
-def walls_of(corner: str) -> tuple[str, str]:
-    """Return the names of the two walls of a corner (`hall west south`)."""
-    room, first, second = corner.rsplit(" ", 2)
-    return f"{room} {first}", f"{room} {second}"
+    angles = {}
+    for room in ROOMS:
+        for a, b in zip(SIDES, (*SIDES[1:], SIDES[0]), strict=True):
+            one, other = walls.get(f"{room} {a}"), walls.get(f"{room} {b}")
+            if one and other:
+                angles[f"{room} {a} {b}"] = corner_deg(one, other)
+    return angles

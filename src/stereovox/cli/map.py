@@ -33,7 +33,7 @@ EXAMPLE = "stereovox map recordings/kitchen --out kitchen.svox --voxel-size 0.05
 
 def add_arguments(parser: ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("source", metavar="SOURCE", help="recorded folder or file, sim:room and the like, or realsense:")
+    parser.add_argument("source", metavar="SOURCE", help="recorded folder or file, sim:room etc., or realsense:")
     parser.add_argument("--out", required=True, metavar="MAP", help="folder of the map to write, for example room.svox")
     parser.add_argument(
         "--profile", metavar="P", help="profile name or TOML file (default; with --resume the map's own settings)"

@@ -30,7 +30,8 @@ def measure_outer(voxel_map: VoxelMap, stage: Stage, only: Keys, others: Keys) -
     Raises StereovoxError where one of them stands in too few columns.
     """
     ends = _inner_walls(stage, voxel_map.voxel_size)
-    faces = {side: _whole_face([face for face in stage.faces if face.name.endswith(f" {side}")]) for side in SIDES}
+    of_side = {side: [face for face in stage.faces if face.name.endswith(f" {side}")] for side in SIDES}
+    faces = {side: _whole_face(side, several) for side, several in of_side.items()}
     blocked = np.union1d(others, ends)
     return {
         side: measure_wall(voxel_map, wall, only=only, others=blocked, reach=REACH_M) for side, wall in faces.items()
@@ -51,7 +52,7 @@ def grown(solid: Solid, metres: float) -> Solid:
     return Solid(solid.part, solid.name, (corners + metres * (on @ normals)).reshape(-1, 3, 3))
 
 
-def _whole_face(faces: Sequence[Face]) -> Wall:
+def _whole_face(side: str, faces: Sequence[Face]) -> Wall:
     """Return the outermost of these faces, which look one way, made as long as all that lie in its plane."""
     normal = faces[0].normal
     depth = [float(face.corners[0] @ normal) for face in faces]
@@ -63,7 +64,7 @@ def _whole_face(faces: Sequence[Face]) -> Wall:
     low, high = reach.min(0), reach.max(0)
     inset = BESIDE_M
     start = corner + (low + inset) @ units
-    return Wall(coplanar[0].name, start, units * (high - low - 2 * inset)[:, None], normal)
+    return Wall(f"outer wall, {side}", start, units * (high - low - 2 * inset)[:, None], normal)
 
 
 def _inner_walls(stage: Stage, size: float) -> NDArray[np.int64]:

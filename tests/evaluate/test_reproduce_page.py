@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: Apache-2.0
+import json
+import re
+from html.parser import HTMLParser
+
+import pytest
+
+from stereovox.errors import StereovoxError
+from stereovox.evaluate.reproduce import PAPERS, chien2020, reproduce
+from stereovox.evaluate.reproduce.chapter import NO, YES, Chapter, Claim, Sheet, Shown
+from stereovox.evaluate.reproduce.page import report
+
+CHAPTER = Chapter(
+    "boxes",
+    "Boxes <2>",
+    "What was done.",
+    [
+        Claim("wide", "2", "2 cells", True),
+        Claim("late & slow", "1 ms", "3 ms", False),
+        Claim("beside", "-", "7", None),
+    ],
+    [Shown("Fig 4.6", "two cells", "ours & yours", b"png")],
+    [Sheet("Rows", ("a", "b"), [(1, "<x>")])],
+    ["A remark."],
+    {"answer": 42},
+)
+
+
+class _Balanced(HTMLParser):
+    def __init__(self):
+        super().__init__()
+        self.open = []
+
+    def handle_starttag(self, tag, attrs):
+        if tag not in ("meta", "img"):
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+
+def test_the_page_says_what_holds_and_needs_no_other_file():
+    page = report("Title <1>", "Lead", [("3", "claims")], [CHAPTER])
+    for text in ("Title &lt;1&gt;", "Boxes &lt;2&gt;", YES, NO, "late &amp; slow", "cG5n", "&lt;x&gt;", "A remark."):
+        assert text in page, text
+    assert "Does not hold: 1. late &amp; slow." in page
+    assert not re.search(r"""(src|href)\s*=\s*["'](?!data:)|url\(|@import""", page)
+    parser = _Balanced()
+    parser.feed(page)
+    assert parser.open == []
+
+
+@pytest.fixture
+def one_chapter(monkeypatch):
+    monkeypatch.setattr(chien2020, "experiments", lambda sizes, steps: [CHAPTER])
+
+
+def test_both_files_are_written_and_say_the_same(one_chapter, tmp_path):
+    result = reproduce("chien2020", tmp_path / "new" / "folder", quick=True)
+    assert result["holds"] == 1
+    assert result["does_not_hold"] == ["late & slow"]
+    numbers = json.loads((tmp_path / "new" / "folder" / "numbers.json").read_text())
+    assert numbers["experiments"]["boxes"]["numbers"] == {"answer": 42}
+    assert [claim["holds"] for claim in numbers["experiments"]["boxes"]["claims"]] == [True, False, None]
+    page = (tmp_path / "new" / "folder" / "report.html").read_text()
+    assert "do not quote it" in page
+
+
+def test_what_goes_wrong_is_one_line(one_chapter, tmp_path):
+    with pytest.raises(StereovoxError, match=r"valenti2018: .* not in this version; there is chien2020"):
+        reproduce("valenti2018", tmp_path)
+    with pytest.raises(StereovoxError, match=r"unknown paper 'chien'.*chien2020"):
+        reproduce("chien", tmp_path)
+    (tmp_path / "file").write_text("")
+    with pytest.raises(StereovoxError, match="choose another --out"):
+        reproduce("chien2020", tmp_path / "file")
+    assert set(PAPERS) == {"chien2020", "valenti2018", "ist2019"}

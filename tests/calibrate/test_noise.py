@@ -145,6 +145,11 @@ def test_nothing_in_the_middle_is_one_line():
         noise_at(recorded(depths, name="hole"), (0.3, 0.2))
 
 
+def test_a_wall_without_any_noise_is_refused():
+    with pytest.raises(StereovoxError, match="exact: shows no noise at all"):
+        calibrate_noise([recorded([np.full((100, 160), 1.5)] * 3, name="exact")], fitted=("s2",))
+
+
 def test_another_camera_and_no_recording_are_refused():
     with pytest.raises(StereovoxError, match="no recording"):
         calibrate_noise([])

@@ -180,6 +180,14 @@ def test_recordings_that_have_nothing_in_common_are_refused():
         find_offsets(camera_track(a, swung(a)), track)
 
 
+@pytest.mark.parametrize("seconds", [np.zeros(60), -np.arange(60) / 15, np.append(-1e9, np.arange(59) / 15)])
+def test_times_that_cannot_be_are_refused_before_they_fill_the_memory(seconds):
+    right = np.arange(0, 4, 1 / 15)
+    track = PoseTrack(Poses(np.rint(right * 1e9).astype(np.int64), swung(right)), 2, 10, 7200)
+    with pytest.raises(StereovoxError, match="clocks: the images span .* wrong time"):
+        find_offsets(camera_track(seconds, swung(np.arange(60) / 15)), track)
+
+
 def test_a_track_interpolates_as_poses_do_and_breaks_at_jumps_and_gaps():
     seconds = np.concatenate([np.arange(0, 1, 0.05), np.arange(1.5, 2.5, 0.05)])
     T = swung(seconds)

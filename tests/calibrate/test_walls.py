@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Calibration on flat walls: finding the wall, exact recovery of every model, and choosing the right one."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -217,6 +218,20 @@ def test_recordings_that_do_not_fit_together(walls, said):
     with pytest.raises(StereovoxError, match=said) as refused:
         calibrate_wall(walls)
     assert "\n" not in str(refused.value)
+
+
+def test_a_model_that_leaves_no_depth_is_refused_and_its_score_is_no_number():
+    near, far = recorded(plane(0.5), 0.58, "near"), recorded(plane(6.0), 6.0, "far")
+    with pytest.raises(StereovoxError, match=r"far: the model disparity leaves no depth at 6.00 m; check the dist"):
+        calibrate_wall([near], "disparity", check=[far])
+    told = calibrate_wall([near, far]).as_dict()
+    assert told["models"]["disparity"]["unseen"] is None
+    json.dumps(told, allow_nan=False)
+
+
+def test_one_distance_is_too_few_for_two_quadratics():
+    with pytest.raises(StereovoxError, match=r"too few distances for --model scale\+disparity"):
+        calibrate_wall([recorded(plane(1.5)), recorded(plane(1.55))], "scale+disparity")
 
 
 def test_the_user_hears_of_a_wall_that_is_too_small_and_of_few_frames():

@@ -126,6 +126,9 @@ WRONG = [
     ("fit less with --terms s2", ["noise", "{wall}", "--out", "{tmp}/c.toml"]),
     ("--region 3", ["noise", "{wall}", "--region", "3", "--out", "{tmp}/c.toml"]),
     ("--terms s3", ["noise", "{wall}", "--terms", "s3", "--out", "{tmp}/c.toml"]),
+    ("there is no folder", ["pair", "{tmp}/pair", "--out", "{tmp}/no/pair.toml"]),
+    ("too few distances for --model", ["wall", "{wall}", "--model", "scale+disparity", "--out", "{tmp}/c.toml"]),
+    ("shows no noise at all", ["noise", "{wall}&noise=0", "--terms", "s2", "--out", "{tmp}/c.toml"]),
     ("nothing.toml", ["noise", "{wall}", "--camera", "{tmp}/nothing.toml", "--out", "{tmp}/c.toml"]),
 ]
 
@@ -134,6 +137,8 @@ WRONG = [
 def test_wrong_use_ends_in_one_line(tmp_path, capsys, said, words):
     (tmp_path / "folder.toml").mkdir()
     (tmp_path / "file").write_text("")
+    (tmp_path / "pair").mkdir()
+    (tmp_path / "pair" / "pair.toml").write_text("")
     wall = "sim:wall?image_width=212&frames=2"
     assert run("calibrate", *(word.format(tmp=tmp_path, wall=wall) for word in words)) == 2
     captured = capsys.readouterr()

@@ -8,7 +8,9 @@ import pytest
 from stereovox.errors import StereovoxError
 from stereovox.evaluate.reproduce import PAPERS, chien2020, reproduce
 from stereovox.evaluate.reproduce.chapter import NO, YES, Chapter, Claim, Sheet, Shown
+from stereovox.evaluate.reproduce.own import map_own
 from stereovox.evaluate.reproduce.page import report
+from stereovox.sources.simulation import Simulation
 
 CHAPTER = Chapter(
     "boxes",
@@ -64,6 +66,19 @@ def test_both_files_are_written_and_say_the_same(one_chapter, tmp_path):
     assert [claim["holds"] for claim in numbers["experiments"]["boxes"]["claims"]] == [True, False, None]
     page = (tmp_path / "new" / "folder" / "report.html").read_text()
     assert "do not quote it" in page
+
+
+def test_a_recording_of_ones_own_is_mapped_under_both_profiles(one_chapter, tmp_path):
+    steps = []
+    own = map_own(Simulation("sim:wall?image_width=64&frames=3"), lambda: steps.append(1))
+    assert len(steps) == 3
+    assert [row[:2] for row in own.sheets[0].rows] == [("chien2020", "3"), ("default", "3")]
+    assert all(figures["occupied"] > 0 for figures in own.numbers.values())
+    assert len(own.shown) == 2
+    reproduce("chien2020", tmp_path, data="sim:wall?image_width=64&frames=3")
+    assert "Your recording" in (tmp_path / "report.html").read_text()
+    with pytest.raises(StereovoxError, match="nowhere"):
+        reproduce("chien2020", tmp_path, data=tmp_path / "nowhere")
 
 
 def test_what_goes_wrong_is_one_line(one_chapter, tmp_path):

@@ -1,5 +1,7 @@
 """The ladder: NumPy reference = kernels on one thread = kernels on many threads."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from made_images import CAMERA, made_image
@@ -125,3 +127,18 @@ def test_odd_image_sizes():
         ours = cells_of(make_integrator(config).evidence(image))
         assert share_that_differs(ours, reference_of(_reference.project, image, config), tolerance=25) < 0.01
     assert CAMERA.width == 64
+
+
+@pytest.mark.parametrize("integrator", ["projective", "ray"])
+def test_a_camera_where_cells_meet_sees_all_it_should(integrator):
+    """At a corner of cells a ray that goes towards smaller indices leaves its first cell at depth zero."""
+    config = load_config(voxel_size=0.2, max_range=2.5, integrator=integrator, **{"sensor.model": "constant"})
+    slow = {"ray": _reference.cast_rays, "projective": _reference.project}[integrator]
+    for seed in range(3):
+        image = made_image(seed)
+        pose = image.T_world_sensor.copy()
+        pose[:3, 3] = 0.0
+        image = replace(image, T_world_sensor=pose)
+        ours = cells_of(make_integrator(config).evidence(image))
+        theirs = reference_of(slow, image, config)
+        assert share_that_differs(ours, theirs, tolerance=25) < 0.02

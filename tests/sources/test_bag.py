@@ -180,7 +180,9 @@ def test_a_question_mark_in_the_name_is_part_of_it(tmp_path):
         ("depth=/chatter", "/chatter holds std_msgs/String, no images"),
         ("poses=/chatter", "/chatter holds std_msgs/String, no poses"),
         ("poses=/nowhere", "no topic /nowhere"),
-        ("info=/chatter", "/chatter: 'width' is missing"),
+        ("info=/chatter", "/chatter: 'width' is missing; name a topic"),
+        ("pose=fixed&poses=/odom", "pose=fixed and poses=/odom contradict each other"),
+        ("pose=fixed&axes=ros", "pose=fixed and axes=ros contradict each other"),
         ("axes=ross", "axes=ross must be"),
         ("pose=moving", "pose=moving must be fixed"),
         ("scale=-1", "scale=-1 must be a positive number"),
@@ -194,6 +196,13 @@ def test_wrong_options_end_in_one_line(tmp_path, options, said):
         BagSource(f"{path}?{options}")
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_direct_is_not_rectified(tmp_path):
+    with Bag(tmp_path / "a.bag") as bag:
+        bag.add("/direct/image", "sensor_msgs/Image", stamp(0), image(depth(0), "16UC1", stamp(0)))
+        bag.add("/direct/camera_info", "sensor_msgs/CameraInfo", stamp(0), camera_info())
+    assert BagSource(bag.path).camera.fx == 10.0
 
 
 def test_without_camera_info_the_cure_is_named(tmp_path):

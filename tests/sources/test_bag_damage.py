@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import random
 import sqlite3
 import struct
@@ -306,6 +307,41 @@ def test_a_time_that_is_none_is_told_in_one_line(tmp_path):
     file.commit()
     file.close()
     assert outcomes(path) == {"closed"}
+
+
+def test_a_topic_without_a_number_is_none(tmp_path):
+    path = db3(tmp_path / "a.db3")
+    file = sqlite3.connect(path)
+    file.execute("CREATE TABLE loose(id, name, type)")
+    file.execute("INSERT INTO loose SELECT nullif(id, 2), name, type FROM topics")
+    file.execute("DROP TABLE topics")
+    file.execute("ALTER TABLE loose RENAME TO topics")
+    file.execute("CREATE TABLE others(id INTEGER PRIMARY KEY, topic_id, timestamp, data)")
+    file.execute("INSERT INTO others SELECT id, nullif(topic_id, 2), timestamp, data FROM messages")
+    file.execute("DROP TABLE messages")
+    file.execute("ALTER TABLE others RENAME TO messages")
+    file.commit()
+    file.close()
+    assert outcomes(path) == {"closed"}
+
+
+def test_a_named_pipe_is_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "walk.db3")
+    with pytest.raises(SourceError, match="no recording of a known kind"):
+        open_source(tmp_path / "walk.db3")
+
+
+def test_a_damaged_last_image_does_not_hide_the_clocks_of_a_pair(tmp_path):
+    path = db3(tmp_path / "walk.db3")
+    file = sqlite3.connect(path)
+    file.execute("UPDATE messages SET data = 'text' WHERE topic_id = 2 AND timestamp = 1002")
+    file.commit()
+    file.close()
+    poses = (f"{stamp(0) // 10**9 + 0.01 * k:.2f} 0 0 0 0 0 0 1\n" for k in range(-5, 20))
+    (tmp_path / "tracker.txt").write_text("".join(poses))
+    identity = "[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]"
+    (tmp_path / "pair.toml").write_text(f"depth = 'walk.db3'\nT_tracker_camera = {identity}\n")
+    assert [frame.fault for frame in open_source(tmp_path)] == [None, None, "unreadable"]
 
 
 def test_huge_header_times_do_not_overflow(tmp_path):

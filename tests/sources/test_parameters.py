@@ -37,6 +37,7 @@ def test_what_is_no_parameter_is_refused(text):
         ("distance", "nan", "distance=nan must be a finite number"),
         ("frames", "1.5", "frames=1.5 must be a whole number"),
         ("noise", "2", "noise=2 must be 1 or 0"),
+        ("frames", "-" + "9" * 400, "frames=-9+ is too large"),
     ],
 )
 def test_bad_values_name_key_value_and_cure(key, text, complaint):

@@ -13,7 +13,7 @@ rs = pytest.importorskip("pyrealsense2", reason="pyrealsense2 has no wheel for t
 
 from made_realsense import FPS, HEIGHT, UNIT, WIDTH, SoftwareCamera, depth, stamp_ns  # noqa: E402
 
-from stereovox.cli import main  # noqa: E402
+from stereovox.cli import main, recordings  # noqa: E402
 from stereovox.errors import MissingExtra, SourceError  # noqa: E402
 from stereovox.maps import load_map  # noqa: E402
 from stereovox.sources import Excerpt, open_source, open_stream, realsense  # noqa: E402
@@ -91,6 +91,21 @@ def test_every_second_frame(camera):
 def test_a_live_camera_counts_forwards_only(camera, frames):
     with pytest.raises(SourceError, match="count forwards"):
         open_stream(STILL, frames)
+
+
+def test_more_frames_than_can_be_counted_are_refused(camera):
+    with pytest.raises(SourceError, match="give smaller numbers"):
+        open_stream(STILL, f":{10**20}")
+
+
+def test_a_calibration_of_a_live_camera_ends_where_frames_names_no_end(camera, monkeypatch):
+    monkeypatch.setattr(recordings, "LIVE_FRAMES", 5)
+    for frames, count in ((None, 5), ("1:", 5), (":3", 3)):
+        seen = []
+        monkeypatch.setattr("stereovox.calibrate.recording.read_wall", lambda shown, *_: seen.extend(shown))  # noqa: B023
+        with camera.sending():
+            recordings.read_walls([STILL], [], frames)
+        assert len(seen) == count
 
 
 def test_a_camera_that_falls_silent_is_an_error_not_a_wait(camera, monkeypatch):
@@ -172,7 +187,11 @@ def test_a_setting_that_the_camera_lacks():
 
 
 @pytest.mark.parametrize(
-    "options", ["?width=wide", "?fps=-1", "?pose=moving", "?colour=1", "?width", "?baseline=nan", "?fps=30&fps=30"]
+    "options",
+    [
+        *("?width=wide", "?fps=-1", "?pose=moving", "?colour=1", "?width", "?baseline=nan", "?fps=30&fps=30"),
+        *("?laser_power=-5", "?emitter=-2", "?width=-1"),
+    ],
 )
 def test_bad_options_end_in_one_line(camera, options):
     with pytest.raises(SourceError) as caught:

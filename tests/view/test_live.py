@@ -32,10 +32,8 @@ def test_the_plan_shows_the_layer_of_the_camera():
 
 
 def test_nearer_cubes_hide_farther_ones():
-    nearer = np.array([4, -7, 6])
-    assert (
-        np.linalg.norm(np.cross(nearer, FROM.toward)) < 0.3
-    )  # right before the other, less than a third of a cell off
+    nearer = np.array([4, -7, 6])  # right before the other one, less than a third of a cell off
+    assert np.linalg.norm(np.cross(nearer, FROM.toward)) < 0.3
     for order in (1, -1):
         image = space_pixels(made_map([tuple(nearer), (0, 0, 0)][::order]))
         reds = (image[..., 0] > 60) & (image[..., 2] == 0)  # the upper of the two is red

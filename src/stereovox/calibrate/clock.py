@@ -21,6 +21,8 @@ CLEAR = 0.6
 """Least correlation of a match."""
 APART, ALMOST, MOST = 0.3, 0.85, 5
 """Other matches that are looked at: so far beside better ones (seconds), so well correlated (share of the best)."""
+LONGEST = 86_400.0
+"""Seconds; what seems to last longer holds a wrong time, and its samples would fill the memory."""
 
 
 @dataclass(frozen=True)
@@ -37,6 +39,8 @@ def find_offsets(motion: CameraMotion, track: PoseTrack, between: tuple[float, f
     Times of the camera count from its first image, those of the track from its first pose. `between`: only offsets in
     this range, in seconds. Raises StereovoxError, one line, where no offset fits.
     """
+    _check_span("images", (motion.stamps_ns[-1] - motion.stamps_ns[0]) / 1e9)
+    _check_span("poses", track.times[-1])
     lags, correlation = _correlate(_camera_speed(motion), _track_speed(track, _frame_time(motion)))
     offsets = lags * STEP
     allowed = np.isfinite(correlation)
@@ -56,6 +60,12 @@ def find_offsets(motion: CameraMotion, track: PoseTrack, between: tuple[float, f
         chosen.append(int(np.argmax(left)))
         left[np.abs(offsets - offsets[chosen[-1]]) < APART] = -1.0
     return [Offset(float(offsets[k] + STEP * _peak(correlation, k)), float(correlation[k])) for k in chosen]
+
+
+def _check_span(what: str, seconds: float) -> None:
+    if not STEP < seconds < LONGEST:
+        cure = "record for some seconds, and remove what has a wrong time (longest: a day)"
+        raise StereovoxError(f"clocks: the {what} span {seconds:.9g} s from first to last; {cure}")
 
 
 def _frame_time(motion: CameraMotion) -> float:

@@ -18,6 +18,8 @@ from stereovox.errors import StereovoxError
 REGION = (0.6, 0.4)
 """Width and height in metres of the part of the wall round the optical axis that counts (Chien 2020, 3.3)."""
 FEWEST_PIXELS = 30
+LEAST_RMSE = 1e-6
+"""Error, as a share of the depth, below which there is nothing but rounding."""
 TERMS = ("s0", "s1", "s2")
 
 
@@ -101,6 +103,7 @@ def calibrate_noise(
             raise StereovoxError(f"{recording.name}: is of another camera than {recordings[0].name}; use one camera")
     points = sorted((noise_at(recording, region) for recording in recordings), key=lambda point: point.distance_m)
     distances = [point.distance_m for point in points]
+    _check_noisy(points)
     _check_count(distances, fitted)
     s = fit_noise(np.array(distances), np.array([point.rmse_m for point in points]), fitted)
     focal_px = camera.fx * camera.binning
@@ -174,6 +177,12 @@ def _errors(sums: NDArray[np.float64], wall_z: Array) -> tuple[float, float | No
     fixed, of_noise = total - temporal, temporal / count.mean() * np.sqrt(2 / count.size)
     seen = fixed > 3 * of_noise + 1e-12
     return rmse, float(np.sqrt(max(temporal, 0.0))), float(np.sqrt(fixed)) if seen else 0.0
+
+
+def _check_noisy(points: Sequence[NoiseAt]) -> None:
+    for point in points:
+        if point.rmse_m <= LEAST_RMSE * point.distance_m:
+            raise StereovoxError(f"{point.name}: shows no noise at all; record a real camera, with its noise")
 
 
 def _check_count(distances: Sequence[float], fitted: Sequence[str]) -> None:

@@ -74,7 +74,7 @@ class WallCalibration:
     """The camera with its correction, how the model was chosen, and what it does to each wall.
 
     scores: for each model its error in percent on the walls it was fitted to (`fit`), and, where there are several
-    distances, on those left out in turn (`unseen`).
+    distances, on those left out in turn (`unseen`), infinite where it leaves no depth there.
     """
 
     camera: PinholeCamera
@@ -95,7 +95,7 @@ class WallCalibration:
             "model": self.correction.model,
             "coefficients": list(self.correction.coefficients),
             "why": self.why,
-            "models": self.scores,
+            "models": {model: {key: _finite(error) for key, error in of.items()} for model, of in self.scores.items()},
             "walls": [wall.as_dict() for wall in self.walls],
             "notes": list(self.notes),
         }
@@ -124,6 +124,8 @@ def calibrate_wall(
     groups = distance_groups([wall.distance for wall in found])
     scores = _scores(points, groups)
     chosen, why = _choose(scores, groups) if model == "auto" else (model, "it was asked for")
+    if chosen == "scale+disparity" and len(set(groups)) < 2:
+        raise StereovoxError(f"too few distances for --model {chosen}: record another, or use scale or disparity")
     correction = fit(chosen, points)
     results = [_result(*pair, correction, square, True) for pair in zip(recordings, found, strict=True)]
     for recording in check:
@@ -132,6 +134,10 @@ def calibrate_wall(
         results.append(_result(recording, wall, correction, square, False))
     camera = replace(recordings[0].camera, correction=correction)
     return WallCalibration(camera, why, scores, tuple(results), _notes(results))
+
+
+def _finite(error: float) -> float | None:
+    return error if np.isfinite(error) else None
 
 
 def check_model(model: str) -> None:
@@ -233,6 +239,11 @@ def _result(
         result[on_wall] = values
         return result
 
+    if not np.isfinite(corrected_inverse(correction, points.x, points.y, points.inverse)).any():
+        raise StereovoxError(
+            f"{recording.name}: the model {correction.model} leaves no depth at {wall.distance:.2f} m; check the "
+            "distances, or use another --model"
+        )
     before, after = (image(residual(points, used, plane)) for used in (None, correction))
     seen, right = (
         camera.back_project(image(1 / corrected_inverse(used, points.x, points.y, points.inverse)))

@@ -13,6 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from stereovox.cli.recordings import check_outputs
 from stereovox.cli.terminal import command_line, say, tracked
 from stereovox.errors import StereovoxError
 
@@ -45,6 +46,8 @@ def run(arguments: Namespace) -> dict[str, Any]:
     settings = _settings(folder)
     if arguments.within is not None and not 0 < arguments.within < 1e9:
         raise StereovoxError(f"--within {arguments.within:g}: give a number of seconds above 0")
+    if arguments.out is not None:
+        check_outputs(arguments.out)
     depth = open_depth(folder, settings)
     for note in getattr(depth, "notes", ()):
         say(f"note: {note}")

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from stereovox.sources import Stream
 
 LIVE_FRAMES = 60
-"""Frames taken of a live camera that are not counted by --frames."""
+"""Frames taken of a live camera where --frames names no last one."""
 
 
 def add_recordings(parser: ArgumentParser) -> None:
@@ -39,7 +39,7 @@ def add_recordings(parser: ArgumentParser) -> None:
     parser.add_argument("--report", metavar="DIR", help="folder for a page with figures and pictures")
 
 
-def check_outputs(out: str, report: str | None) -> None:
+def check_outputs(out: str, report: str | None = None) -> None:
     """Find out before the work, not after it, that a result could not be written.
 
     Raises StereovoxError, one line, also for a name that does not end in .toml.
@@ -69,7 +69,7 @@ def read_walls(
 
 def _read(name: str, distance: float | None, frames: str | None, camera: str | None, raw: bool) -> WallRecording:
     from stereovox.calibrate.recording import read_wall
-    from stereovox.sources import open_images
+    from stereovox.sources import open_images, parse_slice
     from stereovox.sources.with_camera import with_camera
 
     stream: Stream = open_images(name, frames)
@@ -78,7 +78,7 @@ def _read(name: str, distance: float | None, frames: str | None, camera: str | N
     for note in getattr(stream, "notes", ()):
         say(f"note: {note}")
     count = stream.length
-    if count is None and frames is None:
+    if count is None and (frames is None or parse_slice(frames).stop is None):
         count = LIVE_FRAMES
     shown = tracked(islice(stream, count), count, name)
     return read_wall(shown, name, replace(stream.camera, correction=None) if raw else stream.camera, distance)

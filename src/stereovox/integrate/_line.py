@@ -11,12 +11,16 @@ from stereovox.integrate._cells import NO_RETURN, ONE, ZERO, bits_of, float_of
 from stereovox.integrate._hits import _row_rays
 from stereovox.integrate._lanes import aim, aim_at_hits, evidence, give, pack, weighted
 
+OFF_FACE = np.float32(1e-3)
+"""Cells by which samples are kept off the faces of cells: on them, rounding would choose the cell."""
+
 
 @kernel
 def draw(depth_m, view, table, look_up, weight, lanes, pool_table, coords, count, values, first_row, last_row):
     """Add the evidence of all lines of rows first_row..last_row to an empty pool; arguments as in `_ray.cast`."""
     size = ONE / view.voxel_size
     position = view.position * size
+    start = _off_faces(position[0]), _off_faces(position[1]), _off_faces(position[2])
     together = lanes.depth.size
     for v in range(first_row, last_row):
         ray = _row_rays(view.rotation, view.rows[v], size)
@@ -29,9 +33,9 @@ def draw(depth_m, view, table, look_up, weight, lanes, pool_table, coords, count
             number, reached, going = ZERO, ZERO, True
             while going:
                 if reached < free_to:  # plain free space needs no table
-                    reached, going = _step(lanes, number, position, False, table, look_up, weight)
+                    reached, going = _step(lanes, number, start, False, table, look_up, weight)
                 else:
-                    reached, going = _step(lanes, number, position, True, table, look_up, weight)
+                    reached, going = _step(lanes, number, start, True, table, look_up, weight)
                 number += ONE
                 if not give(lanes, weight, pool_table, coords, count, values):
                     return False
@@ -39,6 +43,13 @@ def draw(depth_m, view, table, look_up, weight, lanes, pool_table, coords, count
             if not give(lanes, weight, pool_table, coords, count, values):
                 return False
     return True
+
+
+@cell
+def _off_faces(place):
+    """Return a camera's place on one axis, in cells, a little off the faces: its samples lie as it does."""
+    cell_number = np.floor(place)
+    return cell_number + min(max(place - cell_number, OFF_FACE), ONE - OFF_FACE)
 
 
 @cell
@@ -53,9 +64,9 @@ def _start(columns, ray, lanes):
 
 
 @cell
-def _step(lanes, number, position, near, table, look_up, weight):
+def _step(lanes, number, start, near, table, look_up, weight):
     """Take the evidence on the cells at sample `number` of every lane; see `_ray._step`."""
-    px, py, pz = position[0], position[1], position[2]
+    px, py, pz = start
     width = table.clear.shape[1]
     reached = np.int32(0)  # the bits of a float that is not negative: those can be compared many at once
     for i in range(lanes.depth.size):

@@ -46,14 +46,13 @@ def cast(depth_m, view, table, look_up, weight, lanes, pool_table, coords, count
 
 @cell
 def _start(columns, ray, position, lanes):
-    """Put all rays into the camera's cell."""
-    x, y, z = np.floor(position[0]), np.floor(position[1]), np.floor(position[2])
+    """Put all rays into the first cell they cross."""
     last = columns.size - 1
     for i in range(lanes.depth.size):
         column = columns[min(i, last)]
         dx, dy, dz = ray[0] * column + ray[1], ray[2] * column + ray[3], ray[4] * column + ray[5]
         lanes.entered[i] = ZERO
-        lanes.x[i], lanes.y[i], lanes.z[i] = x, y, z
+        lanes.x[i], lanes.y[i], lanes.z[i] = _first(position[0], dx), _first(position[1], dy), _first(position[2], dz)
         lanes.step_x[i], lanes.step_y[i], lanes.step_z[i] = _sign(dx), _sign(dy), _sign(dz)
         lanes.per_x[i], lanes.per_y[i], lanes.per_z[i] = _inverse(dx), _inverse(dy), _inverse(dz)
 
@@ -67,6 +66,7 @@ def _step(lanes, position, near, table, look_up, weight):
     """
     px, py, pz = position[0], position[1], position[2]
     width = table.clear.shape[1]
+    going = np.int32(0)
     reached = np.int32(0)  # the bits of a float that is not negative: those can be compared many at once
     for i in range(lanes.depth.size):
         x, y, z = lanes.x[i], lanes.y[i], lanes.z[i]
@@ -92,8 +92,15 @@ def _step(lanes, position, near, table, look_up, weight):
         lanes.y[i] = y + (sy if along_y else ZERO)
         lanes.z[i] = z + (ZERO if along_x | along_y else sz)
         lanes.entered[i] = left if left < end else BEYOND
+        going |= np.int32(1) if left < end else np.int32(0)  # a ray may leave its first cell at depth zero
         reached = max(reached, bits_of(left if left < end else ZERO))
-    return float_of(reached), reached > 0
+    return float_of(reached), going != 0
+
+
+@cell
+def _first(start, direction):
+    """Return the first cell along one axis: from a face on, a ray goes back into the cell before it."""
+    return np.ceil(start) - ONE if direction < ZERO else np.floor(start)
 
 
 @cell

@@ -50,6 +50,9 @@ class Options:
             word = getattr(self, key)
             if word and word not in known:
                 raise SourceError(f"{key}={word} must be {' or '.join(filter(None, known))}")
+        for key in ("poses", "axes", "world"):
+            if self.pose and getattr(self, key):
+                raise SourceError(f"pose={self.pose} and {key}={getattr(self, key)} contradict each other; give one")
         for key in ("scale", "baseline"):
             if getattr(self, key) < 0:
                 raise SourceError(f"{key}={getattr(self, key):g} must be a positive number")
@@ -167,7 +170,7 @@ def tracker_poses(where: str | Path, axes: str = "", world: str = "") -> Poses:
     Raises SourceError where there is none.
     """
     path, options = parse(str(where))
-    options = replace(options, axes=axes or options.axes, world=world or options.world)
+    options = replace(options, pose="", axes=axes or options.axes, world=world or options.world)
     poses, missing, _ = read_poses(open_bag(path), options, "")
     if poses is None:
         raise SourceError(missing)

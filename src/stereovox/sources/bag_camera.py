@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import re
+
 from stereovox.cameras import PinholeCamera
 from stereovox.errors import FrameRefused, SourceError, StereovoxError
 from stereovox.sources.bag_files import BagFile
@@ -11,6 +13,8 @@ from stereovox.sources.bag_metadata import option, sibling
 from stereovox.sources.images import MAX_PIXELS
 
 CAMERA_INFO = "sensor_msgs/CameraInfo"
+RECTIFIED = re.compile(r"(?<![a-z])rect")
+"""In the names of topics: `image_rect`, `rectified`, but not `direct`."""
 
 
 def find_camera(
@@ -28,13 +32,14 @@ def find_camera(
         known = sorted(name for name, kind in file.types.items() if kind == CAMERA_INFO)
         say = f"give one with ?info=/topic{f' (there are: {_few(known)})' if known else ', for example of another bag'}"
         raise SourceError(f"{file.path}: no {where[0]} that tells the camera of {topic}; {say}")
+    rectified = RECTIFIED.search(topic) is not None
     try:
         told = _read(file, found)
         millimetres = option(file, sensor, "Stereo Baseline") if sensor else None
-        camera = _camera(told, "rect" in topic, millimetres and millimetres / 1000)
+        camera = _camera(told, rectified, millimetres and millimetres / 1000)
     except (FrameRefused, StereovoxError, ValueError) as error:
         raise SourceError(f"{file.path}: {found}: {error}") from None
-    if any(told.D) and "rect" not in topic:
+    if any(told.D) and not rectified:
         return camera, (f"{file.path}: {found} tells of lens distortion, which is not corrected in {topic}",)
     return camera, ()
 
@@ -53,7 +58,7 @@ def _read(file: BagFile, topic: str) -> CameraInfo:
         width, height = int(pairs["width"]), int(pairs["height"])
         fx, fy, cx, cy = (float(pairs[key]) for key in ("fx", "fy", "ppx", "ppy"))
     except KeyError as error:
-        raise ValueError(f"{error} is missing") from None
+        raise ValueError(f"{error} is missing; name a topic of {CAMERA_INFO} with ?info=/topic") from None
     D = tuple(float(word) for word in pairs.get("coeffs", "").split(",") if word)
     return CameraInfo(width, height, (fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0), D)
 

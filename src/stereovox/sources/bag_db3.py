@@ -32,7 +32,7 @@ class Db3File(BagFile):
             )
             self._file.text_factory = lambda data: data.decode("utf-8", "replace")
             self._file.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MAX_BYTES)
-            rows = self._file.execute("SELECT id, name, type FROM topics").fetchall()
+            rows = self._file.execute("SELECT id, name, type FROM topics WHERE id IS NOT NULL").fetchall()
             used = {row[0] for row in self._file.execute("SELECT DISTINCT topic_id FROM messages")}
         except (sqlite3.Error, MemoryError, ValueError) as error:  # ValueError: messages that are no text
             raise SourceError(

@@ -43,6 +43,8 @@ class BagFile(Protocol):
 def suffix_of(path: str) -> str:
     """Return `.bag` or `.db3` for a file that is, or by its name should be, such a recording; else "". Never raises."""
     try:
+        if not os.path.isfile(path):  # a named pipe would be waited for
+            return ""
         with open(path, "rb") as file:
             start = file.read(9)
     except (OSError, ValueError):

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -111,6 +112,8 @@ class Excerpt(Stream):
         if start < 0 or step < 0 or (picked.stop is not None and picked.stop <= start):
             raise SourceError(f"frames '{frames}' of a live camera: count forwards from its first, for example :300")
         self._stream, self._bounds = stream, (start, picked.stop, step)
+        if max(start, picked.stop or 0, step) > sys.maxsize:
+            raise SourceError(f"frames '{frames}' of a live camera: so many never come; give smaller numbers")
         self.name, self.camera = stream.name, stream.camera
         self.notes = getattr(stream, "notes", ())
 

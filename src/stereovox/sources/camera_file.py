@@ -3,14 +3,13 @@
 
 from __future__ import annotations
 
-import math
-import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from stereovox.cameras import DepthCorrection, PinholeCamera
 from stereovox.errors import SourceError, StereovoxError, did_you_mean
+from stereovox.sources.toml_file import is_number, read_table, toml_text
 
 FILE = "camera.toml"
 SIZES = ("width", "height")
@@ -25,12 +24,7 @@ def read_camera(path: Path) -> PinholeCamera:
     Keys: width, height, fx, fy, cx, cy in pixels, perhaps baseline in metres, perhaps a table [correction] with model
     and coefficients as `DepthCorrection` has them, and a table [correction.provenance] of anything.
     """
-    try:
-        table = tomllib.loads(path.read_text("utf-8-sig"))
-    except OSError as error:
-        raise SourceError(f"{path}: {error.strerror}; give a camera file you may read") from None
-    except ValueError as error:  # bad TOML, bad UTF-8
-        raise SourceError(f"{path}: {error}; correct it") from None
+    table = read_table(path)
     try:
         return _camera(table)
     except StereovoxError as error:
@@ -43,14 +37,14 @@ def camera_text(camera: PinholeCamera, provenance: Mapping[str, Any] | None = No
     provenance: texts, numbers and lists of them that tell where the correction comes from.
     """
     lines = [f"# {remark}" for remark in remarks]
-    lines += [f"{key} = {_text(getattr(camera, key))}" for key in (*SIZES, *INTRINSICS)]
+    lines += [f"{key} = {toml_text(getattr(camera, key))}" for key in (*SIZES, *INTRINSICS)]
     if camera.baseline is not None:
-        lines.append(f"baseline = {_text(camera.baseline)}")
+        lines.append(f"baseline = {toml_text(camera.baseline)}")
     if camera.correction:
-        lines += ["", "[correction]", f"model = {_text(camera.correction.model)}"]
-        lines.append(f"coefficients = {_text(camera.correction.coefficients)}")
+        lines += ["", "[correction]", f"model = {toml_text(camera.correction.model)}"]
+        lines.append(f"coefficients = {toml_text(camera.correction.coefficients)}")
     if camera.correction and provenance:
-        lines += ["", "[correction.provenance]", *(f"{key} = {_text(value)}" for key, value in provenance.items())]
+        lines += ["", "[correction.provenance]", *(f"{key} = {toml_text(value)}" for key, value in provenance.items())]
     return "\n".join(lines) + "\n"
 
 
@@ -75,7 +69,7 @@ def _correction(table: Any) -> DepthCorrection:
     model, numbers = table.get("model"), table.get("coefficients")
     if not isinstance(model, str) or not isinstance(numbers, list):
         raise SourceError("[correction] needs model, a text, and coefficients, a list of numbers")
-    if not all(_is_number(number) for number in numbers):
+    if not all(is_number(number) for number in numbers):
         raise SourceError(f"correction.coefficients {numbers} must be numbers")
     return DepthCorrection(model, tuple(map(float, numbers)))
 
@@ -88,19 +82,6 @@ def _check_keys(table: dict[str, Any], known: Sequence[str], prefix: str) -> Non
 
 def _number(table: dict[str, Any], key: str) -> float:
     value = table[key]
-    if not _is_number(value):
+    if not is_number(value):
         raise SourceError(f"{key} = {value!r} must be a number")
     return float(value)
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-
-
-def _text(value: Any) -> str:
-    if isinstance(value, str):
-        escaped = "".join(f"\\u{ord(c):04x}" if ord(c) < 32 or c in '"\\\x7f' else c for c in value)
-        return f'"{escaped}"'
-    if isinstance(value, list | tuple):
-        return f"[{', '.join(map(_text, value))}]"
-    return repr(value if isinstance(value, int) else float(value))

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -25,6 +25,7 @@ from stereovox.sources.tum import StampedImages
 
 NEAR_JUMP_NS = 100_000_000
 """Frames this near (0.1 s) to a jump, on either side, are refused: a tracker is rarely right just before one."""
+LOOKS = 5
 CALIBRATE = "stereovox calibrate pair"
 
 
@@ -140,8 +141,21 @@ def open_poses(folder: Path, settings: PairSettings) -> Poses:
 
 
 def image_times(depth: Source) -> tuple[int, int]:
-    """Return the times in nanoseconds of the first and of the last image."""
-    return depth.frame(0).stamp_ns, depth.frame(-1).stamp_ns
+    """Return the times in nanoseconds of the first and of the last image.
+
+    A damaged message of a recorded file has only the time at which it was recorded, perhaps by another clock: where
+    there is a sound one among the first or last few, that counts.
+    """
+    few = range(min(LOOKS, len(depth)))
+    return _stamp(depth, few), _stamp(depth, [-1 - i for i in few])
+
+
+def _stamp(depth: Source, numbers: Sequence[int]) -> int:
+    for i in numbers:
+        frame = depth.frame(i)
+        if frame.depth.size:
+            return frame.stamp_ns
+    return depth.frame(numbers[0]).stamp_ns
 
 
 def check_clocks(image_ns: tuple[int, int], poses: Poses, file: Path) -> None:

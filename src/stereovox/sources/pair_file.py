@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-import math
-import tomllib
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -13,6 +11,7 @@ import numpy as np
 
 from stereovox.errors import SourceError, did_you_mean
 from stereovox.geometry import Transform, orthonormalise, rigidity_error
+from stereovox.sources.toml_file import is_number, read_table, toml_text
 from stereovox.sources.tracker import AXES, HIGHEST_CONFIDENCE, WORLDS
 
 FILE = "pair.toml"
@@ -66,12 +65,7 @@ WORDS = {"axes": tuple(AXES), "world": WORLDS}
 
 def read_pair(path: Path) -> PairSettings:
     """Return the settings in `path`; raises SourceError, one line with file and key, for anything wrong in it."""
-    try:
-        table = tomllib.loads(path.read_text("utf-8-sig"))
-    except OSError as error:
-        raise SourceError(f"{path}: {error.strerror}; make it readable") from None
-    except ValueError as error:  # bad TOML, bad UTF-8
-        raise SourceError(f"{path}: {error}; correct it") from None
+    table = read_table(path)
     known = [field.name for field in fields(PairSettings)]
     for key in table:
         if key not in known:
@@ -97,8 +91,7 @@ def _value(key: str, value: Any) -> Any:
         return _matrix(key, value)
     if key in LIMITS:
         low, high = LIMITS[key]
-        number = isinstance(value, int | float) and not isinstance(value, bool)
-        if not (number and math.isfinite(value) and low <= value <= high):
+        if not (is_number(value) and low <= value <= high):
             raise ValueError(f"{key} = {value!r} must be a number from {low:g} to {high:g}")
         return float(value)
     if not isinstance(value, str) or not value or "\0" in value:
@@ -111,7 +104,7 @@ def _value(key: str, value: Any) -> Any:
 def _matrix(key: str, value: Any) -> Transform:
     try:
         T = np.array(value, float)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         T = np.empty(0)
     if rigidity_error(T) > TOLERANCE:
         raise ValueError(f"{key} must be four rows of four numbers, a rotation and metres, below them 0 0 0 1")
@@ -122,7 +115,4 @@ def _text(value: Any) -> str:
     if isinstance(value, np.ndarray):
         rows = ("    [" + ", ".join(f"{number:.9g}" for number in row) + "]," for row in value + 0.0)
         return "\n".join(["[", *rows, "]"])
-    if isinstance(value, str):
-        escaped = "".join(f"\\u{ord(c):04x}" if ord(c) < 32 or c in '"\\\x7f' else c for c in value)
-        return f'"{escaped}"'
-    return repr(float(value))
+    return toml_text(value)

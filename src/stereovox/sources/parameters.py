@@ -11,6 +11,8 @@ from typing import Any
 from stereovox.errors import SourceError, did_you_mean
 
 SWITCHES = {"1": True, "true": True, "yes": True, "on": True, "0": False, "false": False, "no": False, "off": False}
+LARGEST = 2**63
+"""Whole numbers beyond it are of use to nobody, and do not fit into a float when an error names them."""
 
 
 def split(location: str) -> tuple[str, dict[str, str]]:
@@ -55,4 +57,6 @@ def _value(key: str, text: str, known: Mapping[str, Any]) -> Any:
         raise SourceError(f"{key}={text} must be a {'whole ' if kind is int else ''}number") from None
     if kind is float and not math.isfinite(value):
         raise SourceError(f"{key}={text} must be a finite number")
+    if kind is int and abs(value) > LARGEST:
+        raise SourceError(f"{key}={text} is too large")
     return value

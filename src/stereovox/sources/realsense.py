@@ -43,8 +43,9 @@ class Options:
     def __post_init__(self) -> None:
         if self.pose not in ("", "fixed"):
             raise SourceError(f"pose={self.pose} must be fixed")
-        for key in ("width", "height", "fps", "baseline"):
-            if getattr(self, key) < 0:
+        for key in ("width", "height", "fps", "baseline", "emitter", "laser_power"):
+            unset = key in ("emitter", "laser_power") and getattr(self, key) == -1
+            if getattr(self, key) < 0 and not unset:
                 raise SourceError(f"{key}={getattr(self, key):g} must be a positive number")
 
 

@@ -69,5 +69,5 @@ class Chapter:
 
 
 def percent(share: float) -> str:
-    """Return `94.3 %`."""
-    return f"{100 * share:.1f} %"
+    """Return `94.3 %`, which no line break divides."""
+    return f"{100 * share:.1f}\u00a0%"

@@ -22,6 +22,7 @@ from stereovox.evaluate.reproduce.page import report
 from stereovox.evaluate.reproduce.shifting import OUTSIDE, fly
 from stereovox.evaluate.reproduce.timing import FIRST, time_tables
 from stereovox.evaluate.reproduce.tracers import compare_tracers
+from stereovox.sources import open_source
 
 TITLE = "Chien 2020, made again"
 APARTMENT_FRAMES = 902
@@ -48,11 +49,12 @@ def reproduce(out: Path, data: str | Path | None, quick: bool, progress: Progres
     """Run all experiments; see `stereovox.evaluate.reproduce.reproduce`."""
     start = perf_counter()
     folder = _folder(out)
+    own = None if data is None else open_source(str(data))  # what cannot be opened is said at once
     sizes = QUICK if quick else Sizes()
     steps = _Steps(progress, _total(sizes))
     found = experiments(sizes, steps)
-    if data is not None:
-        found.append(map_own(data, steps.of("your own recording")))
+    if own is not None:
+        found.append(map_own(own, steps.of("your own recording")))
     seconds = perf_counter() - start
     files = {"report": folder / "report.html", "numbers": folder / "numbers.json"}
     claims = [claim for chapter in found for claim in chapter.claims]

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,18 +12,17 @@ from stereovox.errors import StereovoxError
 from stereovox.evaluate.reproduce.chapter import Chapter, Sheet, Shown
 from stereovox.evaluate.summary import summarise
 from stereovox.mapper import Mapper
-from stereovox.sources import open_source
+from stereovox.sources.base import Stream
 from stereovox.view.reproduce.own import overview_png
 
 PROFILES = ("chien2020", "default")
 
 
-def map_own(where: str | Path, step: Callable[[], None] = lambda: None) -> Chapter:
-    """Return a chapter about the recording at `where`; without truth there is nothing to claim.
+def map_own(source: Stream, step: Callable[[], None] = lambda: None) -> Chapter:
+    """Return a chapter about a recording; without truth there is nothing to claim.
 
-    Raises SourceError where it cannot be opened, StereovoxError where no frame can be used.
+    Raises StereovoxError where no frame of it can be used.
     """
-    source = open_source(str(where))
     mappers = {name: Mapper(name, **{"window.size": None, "up": "z"}) for name in PROFILES}
     reports = {name: [] for name in PROFILES}
     way = []
@@ -35,7 +33,7 @@ def map_own(where: str | Path, step: Callable[[], None] = lambda: None) -> Chapt
             way.append(frame.T_world_sensor[:3, 3])
         step()
     if not way:
-        raise StereovoxError(f"{where}: not one frame can be used; see: stereovox map {where} --out FILE")
+        raise StereovoxError(f"{source.name}: not one frame can be used; stereovox map tells why")
     figures = {name: summarise(mapper.map, reports[name]) for name, mapper in mappers.items()}
     heads = ("profile", "frames", "refused", "ms a frame, median", "occupied", "free")
     rows = [(name, *_row(one)) for name, one in figures.items()]

@@ -15,7 +15,7 @@ def tracers_png(found: Comparison, size: float) -> bytes:
     """Return which cells of one frame, in the layer at the camera's height, are updated by both tracers or one."""
     from matplotlib.patches import Patch
 
-    figure = figure_of(6.5)
+    figure = figure_of(5.2)
     axis = figure.add_subplot()
     height = int(np.floor(found.eye[1] / size))
     layers = {name: indices(cells)[indices(cells)[:, 1] == height][:, [0, 2]] for name, cells in found.updated.items()}

@@ -42,10 +42,10 @@ STRAY = (
 def chapter(found: Sequence[AisleFound], scene: Scene) -> Chapter:
     """Return the chapter."""
     lines = [one for one in found if one.variant.integrator == "line" and one.variant.downsample > 1]
-    falling = all(a.found > b.found for a, b in pairwise(lines))
+    falling = all(a.found >= b.found for a, b in pairwise(lines)) and lines[0].found > lines[-1].found
     ours = ", ".join(f"{one.variant.downsample}x{one.variant.downsample}: {percent(one.found)}" for one in lines)
     claims = [Claim("Line drawing: the higher the ratio, the fewer far cells are found", "yes", ours, falling)]
-    claims += [_claim(one) for one in found]
+    claims += [_claim(one) for one in found if one.variant.wanted]
     rows = [
         (one.variant.name, percent(one.found), percent(one.against_full), percent(one.near_found), percent(one.stray),
          f"{one.ms:.2f}")
@@ -56,8 +56,7 @@ def chapter(found: Sequence[AisleFound], scene: Scene) -> Chapter:
         "Aisle of 12 m",
         "The camera stands at one end of an aisle 1.27 m wide and looks along it. Far cells are those beyond "
         f"{FAR_M:g} m that a side wall or the end wall touches and a pixel sees: {found[0].far_cells} cells of 0.2 m. "
-        "All variants get the same images and the sensor model of chien2020, with depths up to 13 m and no window. "
-        "Voxel traversal at full resolution is the yardstick.",
+        "All variants get the same images and the sensor model of chien2020, with depths up to 13 m and no window.",
         claims,
         [Shown("Fig 4.12", SAID, OURS, aisle_png(found, scene.solids))],
         [Sheet("All variants", HEADS, rows)],
@@ -67,11 +66,6 @@ def chapter(found: Sequence[AisleFound], scene: Scene) -> Chapter:
 
 
 def _claim(one: AisleFound) -> Claim:
-    """Return what is claimed of a variant; stereovox's own must find 95 % of what full resolution does."""
-    wanted = one.variant.wanted
-    thesis = "a challenge left open" if wanted else "-"
-    ours = f"{percent(one.found)}; {percent(one.against_full)} of what exact rays find"
-    text = f"{one.variant.name}: far walls found" + (
-        f", at least {100 * WANTED:.0f} % of what exact rays find" if wanted else ""
-    )
-    return Claim(text, thesis, ours, one.against_full >= WANTED if wanted else None)
+    """Return what is claimed of stereovox's own rule: it must find nearly all that exact rays do."""
+    text = f"{one.variant.name}: at least {100 * WANTED:.0f} % of the far cells that exact rays find"
+    return Claim(text, "a challenge left open", percent(one.against_full), one.against_full >= WANTED)

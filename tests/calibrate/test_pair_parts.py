@@ -184,7 +184,7 @@ def test_recordings_that_have_nothing_in_common_are_refused():
 def test_times_that_cannot_be_are_refused_before_they_fill_the_memory(seconds):
     right = np.arange(0, 4, 1 / 15)
     track = PoseTrack(Poses(np.rint(right * 1e9).astype(np.int64), swung(right)), 2, 10, 7200)
-    with pytest.raises(StereovoxError, match="clocks: the images span .* wrong time"):
+    with pytest.raises(StereovoxError, match=r"clocks: the images span .* wrong time"):
         find_offsets(camera_track(seconds, swung(np.arange(60) / 15)), track)
 
 

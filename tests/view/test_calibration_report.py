@@ -18,9 +18,9 @@ CAMERA = PinholeCamera(80, 60, 60.0, 60.0, 39.5, 29.5, 0.05)
 
 
 def wall_calibration(model="auto"):
-    bent = 1.5 * (1 + 0.1 * ((np.arange(80) - 39.5) / 39.5) ** 2) * np.ones((60, 1))
-    wall = read_wall([Frame(bent, CAMERA, np.eye(4))] * 3, "<b>office</b>", CAMERA, 1.5)
-    return calibrate_wall([wall], model)
+    bent = (1 + 0.1 * ((np.arange(80) - 39.5) / 39.5) ** 2) * np.ones((60, 1))
+    walls = [read_wall([Frame(z * bent, CAMERA, np.eye(4))] * 3, "<b>office</b>", CAMERA, z) for z in (1.5, 3.0)]
+    return calibrate_wall(walls, model)
 
 
 def noise_calibration(subpixel=0.08):

@@ -22,7 +22,7 @@ def read_table(path: Path) -> dict[str, Any]:
     except ValueError as error:  # bad TOML, bad UTF-8
         raise SourceError(f"{path}: {error}; correct it") from None
     except RecursionError:
-        raise SourceError(f"{path}: is nested too deeply; correct it") from None
+        raise SourceError(f"{path}: nested too deeply; correct it") from None
 
 
 def is_number(value: Any) -> bool:

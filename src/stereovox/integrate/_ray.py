@@ -9,6 +9,7 @@ from stereovox.integrate._hits import _row_rays
 from stereovox.integrate._lanes import aim, aim_at_hits, evidence, give, pack, weighted
 
 BEYOND = np.float32(1e30)
+TINY = np.float32(1e-30)
 
 
 @kernel
@@ -66,7 +67,6 @@ def _step(lanes, position, near, table, look_up, weight):
     """
     px, py, pz = position[0], position[1], position[2]
     width = table.clear.shape[1]
-    going = np.int32(0)
     reached = np.int32(0)  # the bits of a float that is not negative: those can be compared many at once
     for i in range(lanes.depth.size):
         x, y, z = lanes.x[i], lanes.y[i], lanes.z[i]
@@ -92,9 +92,8 @@ def _step(lanes, position, near, table, look_up, weight):
         lanes.y[i] = y + (sy if along_y else ZERO)
         lanes.z[i] = z + (ZERO if along_x | along_y else sz)
         lanes.entered[i] = left if left < end else BEYOND
-        going |= np.int32(1) if left < end else np.int32(0)  # a ray may leave its first cell at depth zero
-        reached = max(reached, bits_of(left if left < end else ZERO))
-    return float_of(reached), going != 0
+        reached = max(reached, bits_of(max(left, TINY) if left < end else ZERO))  # the first cell may end at depth zero
+    return float_of(reached), reached > 0
 
 
 @cell

@@ -10,7 +10,7 @@ import pytest
 
 SOURCE = Path(__file__).resolve().parents[1] / "src/stereovox"
 LAYERS = (
-    {"errors", "registry", "frame", "geometry", "cameras", "config", "_jit"},
+    {"errors", "registry", "frame", "geometry", "cameras", "wide", "lenses", "rigs", "config", "_jit"},
     {"sources", "depth", "sensors", "maps"},
     {"integrate", "products", "localize", "calibrate"},
     {"mapper", "evaluate", "view"},
@@ -18,7 +18,7 @@ LAYERS = (
 )
 LEVEL = {room: level for level, rooms in enumerate(LAYERS) for room in rooms}
 HOMES = {
-    "cv2": r"(depth|sources)/.*",
+    "cv2": r"(calibrate|depth|sources)/.*",
     "embreex": r"sources/.*",
     "matplotlib": r"(view|products)/.*",
     "numba": r"(.*/)?_[a-z]\w*\.py",

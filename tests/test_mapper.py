@@ -133,7 +133,9 @@ def test_a_user_writes_a_sensor_model_in_plain_numpy(monkeypatch):
     monkeypatch.setitem(SENSORS, "careful", "careful_sensor:Careful")
     mapper = sv.Mapper("default", voxel_size=0.1, **{"sensor.model": "careful"})
     mapper.add(wall_frame())
-    assert mapper.map.probability([[2.05, 0.02, 0.01], [1.0, 0.02, 0.01]]) == pytest.approx([0.6, 0.45], abs=1e-3)
+    said = np.array([0.6, 0.45])
+    with_prior = 0.1 * said / (0.1 * said + 0.9 * (1 - said))  # Bayes, with `map.prior` of the default profile
+    assert mapper.map.probability([[2.05, 0.02, 0.01], [1.0, 0.02, 0.01]]) == pytest.approx(with_prior, abs=1e-3)
 
 
 def test_cameras_may_change_between_frames():

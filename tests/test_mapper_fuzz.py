@@ -56,6 +56,6 @@ def test_any_frame(integrator, sequence):
             assert report.detail
             assert "\n" not in report.detail
     _, values = mapper.map.blocks()
-    assert values.min(initial=0) >= -2000
+    assert values.min(initial=0) >= -4000
     assert values.max(initial=0) <= 3500
     assert mapper.map.frames + mapper.map.frames_refused == len(sequence)

@@ -14,12 +14,16 @@ if TYPE_CHECKING:
     from stereovox.frame import DepthImage as DepthImage
     from stereovox.frame import Frame as Frame
     from stereovox.frame import Reason as Reason
+    from stereovox.frame import StereoFrame as StereoFrame
     from stereovox.mapper import Mapper as Mapper
     from stereovox.mapper import UpdateReport as UpdateReport
     from stereovox.maps import State as State
     from stereovox.maps import VoxelMap as VoxelMap
     from stereovox.maps import load_map as load_map
+    from stereovox.rigs import StereoPair as StereoPair
     from stereovox.sources import open_source as open_source
+    from stereovox.wide import CylindricalCamera as CylindricalCamera
+    from stereovox.wide import SphericalCamera as SphericalCamera
 
 __version__ = "0.1.0"
 
@@ -30,6 +34,10 @@ _HOMES = {
     "StereovoxError": "errors",
     "DepthImage": "frame",
     "Frame": "frame",
+    "StereoFrame": "frame",
+    "StereoPair": "rigs",
+    "SphericalCamera": "wide",
+    "CylindricalCamera": "wide",
     "Reason": "frame",
     "Mapper": "mapper",
     "UpdateReport": "mapper",

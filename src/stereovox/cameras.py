@@ -1,7 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Camera models: how a pixel becomes a ray.
 
-Optical frame: x right, y down, z forward. Pixel centres stand at whole numbers.
+Optical frame: x right, y down, z forward. Pixel centres stand at whole numbers. In all cameras here the point that
+pixel (u, v) sees at depth d is
+
+    d * (columns[u], rows[v, 0], rows[v, 1])        with `columns, rows = camera.rays()`
+
+so rows are straight lines of an image pair whose eyes stand side by side along x. What depth is: the distance along z
+for a pinhole camera; the distance from the x axis, on which both eyes stand, for a spherical and a cylindrical one.
 """
 
 from __future__ import annotations
@@ -56,7 +62,8 @@ class PinholeCamera:
 
     `fx, fy, cx, cy` are in pixels; pixel (u, v) has its centre at (u, v). `baseline` is the distance in metres
     between the two eyes (or projector and eye) of a stereo depth camera, None when not known. `binning` sensor pixels
-    along each side make one pixel (see `binned`); `correction` is what its depth is to be corrected by.
+    along each side make one pixel (see `binned`); `correction` is what its depth is to be corrected by; `subpixel` the
+    noise of its disparity in pixels, None when not known.
     Raises StereovoxError for sizes or focal lengths that are not positive and finite, and for rays that leave the axis
     by more than 87 degrees.
     """
@@ -70,6 +77,7 @@ class PinholeCamera:
     baseline: float | None = None
     binning: int = 1
     correction: DepthCorrection | None = None
+    subpixel: float | None = None
 
     def __post_init__(self) -> None:
         numbers = (self.width, self.height, self.fx, self.fy, 1.0 if self.baseline is None else self.baseline)
@@ -109,6 +117,25 @@ class PinholeCamera:
             cy=(self.cy - middle) / n,
             binning=self.binning * n,
         )
+
+    @property
+    def middle(self) -> PinholeCamera:
+        """The camera itself; of a wide one, the pinhole camera that sees its middle."""
+        return self
+
+    @property
+    def focal_px(self) -> float:
+        """Pixels of the sensor per radian along a row, at its centre: what disparity is counted in."""
+        return self.fx * self.binning
+
+    def rays(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Return the columns (width,) and rows (height, 2) of the rays, float32, as the module says."""
+        columns, slopes = self.ray_slopes()
+        return columns, np.stack([slopes, np.ones_like(slopes)], axis=1)
+
+    def depth_of(self, disparity: NDArray[np.floating], aligned: str = "left") -> NDArray[np.float64]:
+        """Return the depth in metres for disparities (height, width) in pixels > 0 (Valenti 2018, Eq 4.1)."""
+        return self.fx * (self.baseline or np.nan) / np.asarray(disparity, float)
 
     def ray_slopes(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Return x/z of every column (width,) and y/z of every row (height,), float32."""

@@ -11,7 +11,7 @@ import tomllib
 from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -19,6 +19,8 @@ from stereovox.errors import ConfigError, did_you_mean
 
 MOST_CELLS = 8192
 """Cells that fit between the camera and the maximum range."""
+LARGEST_WINDOW = 1e6
+"""Metres along each side of a window."""
 
 
 class _Section(BaseModel):
@@ -29,13 +31,14 @@ class NoiseConfig(_Section):
     """Range noise sigma(z) = s0 + s1 z + s2 z^2 in metres.
 
     Where `s2` is not set it follows from the camera: `subpixel / (focal_px * baseline)` (Chien 2020, Eq 3.5 with the
-    square that is missing in print). `default_baseline` serves cameras whose file does not tell theirs.
+    square that is missing in print). Where `subpixel` is not set it is the camera's own (`stereo.subpixel` for images
+    that are matched here), else 0.08. `default_baseline` serves cameras whose file does not tell theirs.
     """
 
     s0: float = Field(0.0, ge=0)
     s1: float = Field(0.0, ge=0)
     s2: float | None = Field(None, ge=0)
-    subpixel: float = Field(0.08, gt=0)
+    subpixel: float | None = Field(None, gt=0)
     default_baseline: float = Field(0.05, gt=0)
 
 
@@ -56,6 +59,16 @@ class RayConfig(_Section):
     update: Literal["every", "once"] = "every"
 
 
+class ProjectiveConfig(_Section):
+    """How the projective integrator counts hits.
+
+    full_share: a cell's hit counts in full when so much of the cell's footprint in the image falls into it, with less
+    by the square root of the part, since a few pixels may be wrong; 0: every hit counts in full.
+    """
+
+    full_share: float = Field(0.0, ge=0, le=1)
+
+
 class DepthConfig(_Section):
     """What happens to a depth image before it becomes evidence.
 
@@ -67,11 +80,93 @@ class DepthConfig(_Section):
     downsample: int = Field(1, ge=1, le=64)
 
 
+class StereoConfig(_Section):
+    """How the disparity of a stereo pair is found (Valenti 2018, 5.1 and 5.2); lengths are pixels of the full image.
+
+    method: `sgm` (OpenCV's semi-global matching along three paths), `sgm8` (eight), `hh4` (four), `block`, `onnx`.
+    model: the file of a network for `onnx`: two images in, a disparity out.
+    disparities: how many are searched, from 0 on.
+    block_size: side of the window by which two pixels are compared; odd. p1, p2: what a step of one disparity and of
+        more costs, for each pixel of the window. uniqueness: per cent by which the best match must beat the second.
+    from_below: the vertical path of `sgm` comes from below: better where a road fills the lower half of the view.
+    unlock: spread fractions of a pixel evenly, which semi-global matching pulls towards whole ones.
+    speckle_size, speckle_range: smaller patches are dropped; a step of more disparity ends a patch. 0: none dropped.
+    left_right: most by which the disparities of both images may differ; 0: not checked.
+    aligned: the image whose pixels get a depth (Valenti 2018: right).
+    halve: match at half the resolution: four to five times as quick, smoother, twice the error (Valenti 2018, 5.1).
+        The result is of full size, and the numbers above stand for full pixels all the same, but `block_size`.
+    rcrop: columns dropped at the border that the other eye cannot see: the right one for the right image (Valenti
+        2018, Eq 5.1). Pixels whose match lies outside of the other image are dropped in any case.
+    min_confidence: pixels that are less sure have no value (0 to 1, see docs/stereo.md).
+    texture: mean step of grey over two columns below which pixels have no value. 1 drops what is quite flat, 2 to 3
+        also clear skies, and smooth roads with them; 0: not asked for.
+    subpixel: standard deviation of the disparities that are left, in pixels; what the map takes for their noise.
+    threads: threads of the matcher; the disparity does not depend on it.
+    """
+
+    method: str = "sgm"
+    model: str | None = None
+    disparities: int = Field(128, ge=16, le=1024, multiple_of=16)
+    block_size: int = Field(5, ge=1, le=51)
+    p1: float = Field(16.0, ge=0, le=100)
+    p2: float = Field(64.0, gt=0, le=400)
+    uniqueness: int = Field(15, ge=0, le=99)
+    from_below: bool = False
+    unlock: bool = True
+    speckle_size: int = Field(400, ge=0)
+    speckle_range: float = Field(2.0, gt=0)
+    left_right: float = Field(1.0, ge=0)
+    aligned: Literal["left", "right"] = "left"
+    halve: bool = False
+    rcrop: int = Field(0, ge=0)
+    min_confidence: float = Field(0.5, ge=0, le=1)
+    texture: float = Field(1.0, ge=0)
+    subpixel: float = Field(0.4, gt=0)
+    threads: int = Field(2, ge=1, le=256)
+
+    @model_validator(mode="after")
+    def _fitting(self) -> StereoConfig:
+        if self.block_size % 2 == 0:
+            raise ValueError(f"block_size {self.block_size} must be odd")
+        if self.p1 >= self.p2:
+            raise ValueError(f"p1 {self.p1} must be smaller than p2 {self.p2}")
+        return self
+
+
+class SphereConfig(_Section):
+    """The spherical grid round the vehicle between depth and map (Valenti 2018, 5.3): none without `step_deg`.
+
+    step_deg: width of a cell in both angles; must go into 180 degrees a whole number of times.
+    statistic: what a cell keeps of the ranges in it: `robust` is their mean less `spread` standard deviations where
+        the standard deviation is below `std_threshold` metres, else the smallest (Eq 5.4); `minimum` the smallest.
+    polar_deg, azimuth_deg: from and to; polar from the body's z axis (0: up, 90: level, 180: down), azimuth from its x
+        axis to its y axis (0: forward, 90: left, 270 or -90: right). They are widened to whole cells.
+    """
+
+    step_deg: float | None = Field(None, gt=0, le=30)
+    statistic: Literal["robust", "minimum"] = "robust"
+    std_threshold: float = Field(0.1, gt=0)
+    spread: float = Field(3.0, ge=0, le=10)
+    polar_deg: tuple[float, float] = (0.0, 180.0)
+    azimuth_deg: tuple[float, float] = (-180.0, 180.0)
+
+    @model_validator(mode="after")
+    def _fitting(self) -> SphereConfig:
+        if self.step_deg is not None and abs(180 / self.step_deg - round(180 / self.step_deg)) > 1e-6:
+            raise ValueError("step_deg must go into 180 a whole number of times, as 0.5, 1, 1.5, 2, 3, 5 do")
+        if not 0 <= self.polar_deg[0] < self.polar_deg[1] <= 180:
+            raise ValueError("polar_deg must rise, from 0 (up) to 180 (down)")
+        if not (-180 <= self.azimuth_deg[0] < self.azimuth_deg[1] <= self.azimuth_deg[0] + 360):
+            raise ValueError("azimuth_deg must rise from -180 or more, and span 360 at most")
+        return self
+
+
 class WindowConfig(_Section):
     """A box that moves with the camera by whole cells and bounds the map's memory (Chien 2020, 3.6).
 
     size: extents along the world's axes in metres; without them the map is unbounded and the rest has no meaning.
-    trigger: half width in metres of the box round the window's centre in which the camera moves freely.
+    trigger: half width in metres of the box round the window's centre in which the camera moves freely; half a cell at
+        least.
     lead_s: the centre runs ahead of the camera by so many seconds of its flight.
     grow_s: the window is longer by so many seconds of flight along each axis, up to `largest`.
     outside: cells that leave are lost (`drop`), or kept in tiles on disk and restored when they return (`keep`).
@@ -90,6 +185,8 @@ class WindowConfig(_Section):
             return self
         if min(self.size) <= 0 or any(b < a for a, b in zip(self.size, self.largest or self.size, strict=True)):
             raise ValueError("size must be positive, and largest no smaller than size")
+        if max(self.largest or self.size) > LARGEST_WINDOW:
+            raise ValueError(f"size and largest must be at most {LARGEST_WINDOW:g} m")
         if 2 * self.trigger >= min(self.size):
             raise ValueError(f"trigger {self.trigger} must be less than half of the smallest size")
         return self
@@ -99,11 +196,14 @@ class MapConfig(_Section):
     """What a cell is kept in, the range of its log-odds, and the probabilities that tell the states apart.
 
     cell: `int16` holds thousandths of log-odds; `uint8` is Chien's byte (2020, 3.5): 127 unknown, 0 free, 255 occupied.
+    prior: probability that a cell is occupied before the first evidence on it (l0 of Valenti 2018, Eq 6.2). Most cells
+    a camera sees are free, so probabilities agree with what is really there when it is well below a half.
     """
 
     cell: Literal["int16", "uint8"] = "int16"
     log_odds_min: float = Field(-2.0, lt=0, ge=-30)
     log_odds_max: float = Field(3.5, gt=0, le=30)
+    prior: float = Field(0.5, gt=0, lt=1)
     free_below: float = Field(0.3, gt=0, lt=1)
     occupied_above: float = Field(0.7, gt=0, lt=1)
 
@@ -131,14 +231,17 @@ class Config(_Section):
     sensor: SensorConfig = Field(default_factory=SensorConfig)
     noise: NoiseConfig = Field(default_factory=lambda: NoiseConfig.model_validate({}))
     depth: DepthConfig = Field(default_factory=lambda: DepthConfig.model_validate({}))
+    stereo: StereoConfig = Field(default_factory=lambda: StereoConfig.model_validate({}))
+    sphere: SphereConfig = Field(default_factory=lambda: SphereConfig.model_validate({}))
     map: MapConfig = Field(default_factory=lambda: MapConfig.model_validate({}))
     window: WindowConfig = Field(default_factory=lambda: WindowConfig.model_validate({}))
     ray: RayConfig = Field(default_factory=RayConfig)
+    projective: ProjectiveConfig = Field(default_factory=lambda: ProjectiveConfig.model_validate({}))
 
     @model_validator(mode="after")
     def _ordered(self) -> Config:
         if self.min_range >= self.max_range:
-            raise ValueError("min_range must be smaller than max_range")
+            raise ValueError(f"min_range {self.min_range:g} must be smaller than max_range {self.max_range:g}")
         if self.max_range / self.voxel_size > MOST_CELLS:
             raise ValueError(
                 f"max_range {self.max_range} spans more than {MOST_CELLS} cells of {self.voxel_size}; use larger cells"
@@ -153,6 +256,7 @@ def load_config(profile: str | Path | Config | Mapping[str, Any] = "default", **
     Raises ConfigError: one line with the setting, its value and the cure.
     """
     where = str(profile) if isinstance(profile, str | Path) else "config"
+    where = "" if where in profile_names() else f"{where}: "  # what is built in is right: a setting on top is not
     settings = _as_settings(profile)
     for key, value in overrides.items():
         _put(settings, key, value)
@@ -172,7 +276,7 @@ def parse_value(text: str) -> Any:
     """Return a command line value as TOML reads it (`0.5`, `true`, `[1, 2]`); anything else is a plain string."""
     try:
         return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
+    except (tomllib.TOMLDecodeError, RecursionError):
         return text
 
 
@@ -195,7 +299,8 @@ def _read_profile(profile: str | Path) -> dict[str, Any]:
         if builtin.is_file():
             return {"profile": str(profile), **tomllib.loads(builtin.read_text())}
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot read the profile ({error}); give a readable TOML file") from None
+        why = getattr(error, "strerror", None) or "it is no text"
+        raise ConfigError(f"{path}: cannot read the profile ({why}); give a readable TOML file") from None
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{path}: not valid TOML: {error}") from None
     raise ConfigError(f"unknown profile '{profile}'{did_you_mean(str(profile), profile_names())}; or name a .toml file")
@@ -215,7 +320,7 @@ def _check_keys(settings: dict[str, Any], where: str, model: type[BaseModel] = C
         if key not in model.model_fields:
             if model.model_config.get("extra") == "allow":
                 continue
-            raise ConfigError(f"{where}: unknown setting '{prefix}{key}'{did_you_mean(key, model.model_fields)}")
+            raise ConfigError(f"{where}unknown setting '{prefix}{key}'{did_you_mean(key, model.model_fields)}")
         section = model.model_fields[key].annotation
         if isinstance(value, dict) and isinstance(section, type) and issubclass(section, BaseModel):
             _check_keys(value, where, section, f"{prefix}{key}.")
@@ -223,10 +328,22 @@ def _check_keys(settings: dict[str, Any], where: str, model: type[BaseModel] = C
 
 def _one_line(error: ValidationError, where: str) -> str:
     first = error.errors()[0]
-    name = ".".join(map(str, first["loc"])) or "settings"
-    value = first["input"] if not isinstance(first["input"], dict) else ""
-    return (
-        f"{where}: {name} {value!r}: {first['msg'].removeprefix('Value error, ')}"
-        if value != ""
-        else f"{where}: {name}: {first['msg'].removeprefix('Value error, ')}"
-    )
+    location, value, message = first["loc"], first["input"], first["msg"].removeprefix("Value error, ")
+    at = next((n for n in range(1, len(location) + 1) if _tuple_length(location[:n])), None)
+    if at and first["type"] in ("tuple_type", "missing", "too_long"):
+        length, location = _tuple_length(location[:at]), location[:at]
+        letters = "xyz" if length == 3 else "abcdefgh"
+        message = f"give a list of {length} numbers, [{', '.join(letters[:length])}]"
+    name = ".".join(map(str, location)) or "settings"
+    shown = "" if isinstance(value, dict) or value == "" else f" {value!r}"
+    return f"{where}{name}{shown}: {message}"
+
+
+def _tuple_length(location: tuple[int | str, ...]) -> int:
+    """Return how many numbers belong into the setting at `location`; 0 where it is no list."""
+    model: Any = Config
+    for name in location:
+        field = getattr(model, "model_fields", {}).get(name)
+        model = field.annotation if field else None
+    kinds = [kind for kind in (model, *get_args(model)) if get_origin(kind) is tuple]
+    return len(get_args(kinds[0])) if kinds else 0

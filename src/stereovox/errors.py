@@ -41,10 +41,13 @@ class FrameRefused(StereovoxError):  # noqa: N818 - reads as what happened
         self.reason = reason
 
 
-def did_you_mean(word: str, known: Iterable[str]) -> str:
-    """Return " (did you mean 'x'?)" for the closest known word, else the list of known words."""
+def did_you_mean(word: str, known: Iterable[str], prefix: str = "") -> str:
+    """Return " (did you mean 'x'?)" for the closest known word, else the list of known words.
+
+    prefix: what stands before each word where it is shown, but says nothing about which is near (`--`).
+    """
     known = sorted(known)
     close = difflib.get_close_matches(word, known, n=1)
     if close:
-        return f" (did you mean '{close[0]}'?)"
-    return f" (known: {', '.join(known)})" if known else ""
+        return f" (did you mean '{prefix}{close[0]}'?)"
+    return f" (known: {', '.join(prefix + name for name in known)})" if known else ""

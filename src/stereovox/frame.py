@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from stereovox.cameras import PinholeCamera
 from stereovox.geometry import Transform
+from stereovox.rigs import StereoPair, VirtualCamera
 
 
 class Reason(IntEnum):
@@ -33,11 +34,31 @@ class Viewpoint(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
+class StereoFrame:
+    """Two images taken at one moment by a stereo pair, as a source delivers them.
+
+    left, right: (height, width) uint8 grey or (height, width, 3) uint8 RGB; as the lenses made them where `pair` has
+        `eyes`, else rectified, of the size of its camera.
+    T_world_sensor: (4, 4) float64, maps the rectified left optical frame into the world.
+    stamp_ns, name, fault, fault_detail: as in `Frame`.
+    """
+
+    left: NDArray[np.uint8]
+    right: NDArray[np.uint8]
+    pair: StereoPair
+    T_world_sensor: Transform
+    stamp_ns: int = 0
+    name: str = ""
+    fault: str | None = None
+    fault_detail: str = ""
+
+
+@dataclass(frozen=True, eq=False)
 class Frame:
     """One depth image with its camera and pose, as a source delivers it.
 
-    depth: (height, width) uint16 or float32/float64; times `depth_scale` it is the depth along the optical axis in
-        metres. No value: 0, negative, NaN, infinite, and 65535 in uint16.
+    depth: (height, width) uint16 or float32/float64; times `depth_scale` it is the depth in metres, for a pinhole along
+        the optical axis. No value: 0, negative, NaN, infinite, and 65535 in uint16.
     camera: the camera that took it; its size must be the image's.
     T_world_sensor: (4, 4) float64, maps the optical frame (x right, y down, z forward) into the world (z up).
     stamp_ns: time of the image in int64 nanoseconds.
@@ -49,7 +70,7 @@ class Frame:
     """
 
     depth: NDArray[np.generic]
-    camera: PinholeCamera
+    camera: VirtualCamera
     T_world_sensor: Transform
     stamp_ns: int = 0
     depth_scale: float = 1.0
@@ -59,23 +80,27 @@ class Frame:
     fault_detail: str = ""
 
 
+AnyFrame = Frame | StereoFrame
+"""What a source delivers and a mapper takes."""
+
+
 @dataclass(frozen=True, eq=False)
 class DepthImage:
     """A depth image that can be trusted, in metres, with the reason of every pixel that has no value.
 
-    depth_m: (height, width) float32 along the optical axis. Without value (REP 117): NaN unmatched or masked,
-        -inf too near, +inf too far (nothing up to the maximum range).
+    depth_m: (height, width) float32, for a pinhole along the optical axis (see `stereovox.cameras`). Without value
+        (REP 117): NaN unmatched or masked, -inf too near, +inf too far (nothing up to the maximum range).
     reason: (height, width) uint8 of `Reason`.
     T_world_sensor: (4, 4) float64, exactly rigid.
     """
 
     depth_m: NDArray[np.float32]
     reason: NDArray[np.uint8]
-    camera: PinholeCamera
+    camera: VirtualCamera
     T_world_sensor: Transform
     stamp_ns: int = 0
 
     @property
     def viewpoint(self) -> Viewpoint:
-        """Where the camera stood."""
-        return Viewpoint(self.camera, self.T_world_sensor, self.stamp_ns)
+        """Where the camera stood, and what it saw at least (a wide camera: its middle)."""
+        return Viewpoint(self.camera.middle, self.T_world_sensor, self.stamp_ns)

@@ -8,23 +8,29 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
+import numpy as np
+
 from stereovox.config import Config, load_config
-from stereovox.depth import prepare
+from stereovox.depth import DepthPath
 from stereovox.errors import FrameRefused
-from stereovox.frame import Frame
+from stereovox.frame import AnyFrame
 from stereovox.integrate import make_integrator
 from stereovox.maps import VoxelMap, make_map
 
 
 @dataclass(frozen=True)
 class UpdateReport:
-    """What one frame did: time spent, the number of cells whose value changed, and why it was refused, if it was."""
+    """What one frame did: milliseconds spent, cells whose value changed, and why it was refused, if it was.
+
+    match_ms: rectify and match a stereo pair; depth_ms: prepare the depth image; integrate_ms: put it into the map.
+    """
 
     depth_ms: float = 0.0
     integrate_ms: float = 0.0
     cells: int = 0
     refused: str | None = None
     detail: str = ""
+    match_ms: float = 0.0
 
 
 class Mapper:
@@ -44,14 +50,17 @@ class Mapper:
         **overrides: Any,
     ):
         self.config = load_config(profile, **overrides)
-        self.map = make_map(self.config, resume, tiles)
+        self._depth = DepthPath(self.config)
         self._integrator = make_integrator(self.config)
+        self.map = make_map(self.config, resume, tiles)  # last: it may leave tiles on the disk
 
-    def add(self, frame: Frame) -> UpdateReport:
+    def add(self, frame: AnyFrame) -> UpdateReport:
         """Take one frame into the map and tell what it did."""
         start = perf_counter()
         try:
-            image = prepare(frame, self.config)
+            matched = self._depth.matched(frame)
+            between = perf_counter()
+            image = self._depth.image(matched)
         except FrameRefused as refused:
             self.map.frames_refused += 1
             return UpdateReport(refused=refused.reason, detail=str(refused))
@@ -60,4 +69,6 @@ class Mapper:
         evidence = self._integrator.evidence(image)
         cells = self.map.add(evidence)
         self.map.frames += 1
-        return UpdateReport(1e3 * (prepared - start), 1e3 * (perf_counter() - prepared), cells)
+        done = perf_counter()
+        times = np.diff([start, between, prepared, done]) * 1e3
+        return UpdateReport(float(times[1]), float(times[2]), cells, match_ms=float(times[0]))

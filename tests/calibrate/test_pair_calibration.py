@@ -173,3 +173,17 @@ def test_the_command_says_what_is_missing(tmp_path):
         command.run(parser.parse_args([str(tmp_path), "--within=-1"]))
     with pytest.raises(StereovoxError, match="no depth images"):
         command.run(parser.parse_args([str(tmp_path)]))
+
+
+def test_a_second_of_images_is_told_to_be_too_short(tmp_path, images):
+    usual, made.WIDTH = made.WIDTH, WIDTH
+    try:
+        folder = made.write_depth(tmp_path / "flight", images[:13], STAMPS[:13])
+    finally:
+        made.WIDTH = usual
+    poses = on_clock(waved_tracker(), made.OFFSET_S)
+    (folder / "tracker.txt").write_text(made.tracker_lines(poses, confidence=[3] * len(poses)))
+    parser = ArgumentParser()
+    command.add_arguments(parser)
+    with pytest.raises(StereovoxError, match=r"^flight: 13 images in 1\.0 s are too few; record for ten seconds"):
+        command.run(parser.parse_args([str(folder)]))

@@ -128,8 +128,9 @@ def corner():
         (corner(), "bends by"),
         (plane(2.0, 30), "leans by 30 deg"),
         (2 + 2 * np.hypot(X, Y) ** 2, "bends by"),
+        (np.where(np.arange(9600).reshape(80, 120) % 3 == 0, plane(2.0), np.nan), "too scattered"),
     ],
-    ids=["few", "noise", "corner", "lean", "bowl"],
+    ids=["few", "noise", "corner", "lean", "bowl", "scattered"],
 )
 def test_what_is_no_wall_is_said_in_one_line(depth, said):
     with pytest.raises(StereovoxError, match=said) as refused:

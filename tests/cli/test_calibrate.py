@@ -109,7 +109,7 @@ WRONG = [
     ("'wal'", ["wal"]),
     ("RECORDING", ["wall", "--out", "{tmp}/c.toml"]),
     ("required: --out", ["wall", "{wall}"]),
-    ("did you mean 'distance'", ["wall", "{wall}", "--distence", "1", "--out", "{tmp}/c.toml"]),
+    ("did you mean '--distance'", ["wall", "{wall}", "--distence", "1", "--out", "{tmp}/c.toml"]),
     ("ends in .toml", ["wall", "{wall}", "--out", "{tmp}/c.txt"]),
     ("there is no folder", ["wall", "{wall}", "--out", "{tmp}/no/c.toml"]),
     ("is a folder", ["wall", "{wall}", "--out", "{tmp}/folder.toml"]),

@@ -178,11 +178,18 @@ MISTAKES = [
     ("picks none", ["map", "{rec}", "--out", "{tmp}/m", "--frames", "90:"]),
     ("not a stereovox map", ["map", "{rec}", "--out", "{rec}"]),
     ("no map to go on with", ["map", "{rec}", "--out", "{tmp}/m", "--resume"]),
-    ("did you mean 'threads'", ["map", "{rec}", "--out", "{tmp}/m", "--thread", "2"]),
-    ("unknown option '--zebra' (known: camera, frames", ["map", "{rec}", "--out", "{tmp}/m", "--zebra"]),
+    ("did you mean '--threads'", ["map", "{rec}", "--out", "{tmp}/m", "--thread", "2"]),
+    ("unknown option '--zebra' (known: --camera, --frames", ["map", "{rec}", "--out", "{tmp}/m", "--zebra"]),
     ("'extra' is one argument too many", ["map", "{rec}", "extra", "--out", "{tmp}/m"]),
     ("expected one argument", ["map", "{rec}", "--out"]),
-    ("unknown option '--jsn'", ["--jsn", "info", "m"]),
+    ("'--jsn' stands before the command; write it after: stereovox info ... --jsn", ["--jsn", "info", "m"]),
+    ("expected one argument (write --up=-y)", ["picture", "{map}", "{tmp}/x.png", "--up", "-y"]),
+    ("write --eye=-1,2,3", ["picture", "{map}", "{tmp}/x.png", "--eye", "-1,2,3"]),
+    ("min_range 0.1 must be smaller than max_range 0.05", ["map", "{rec}", "--out", "{tmp}/m", "--max-range", "0.05"]),
+    ("stereovox: voxel_size -1.0: ", ["map", "{rec}", "--out", "{tmp}/m", "--voxel-size=-1"]),
+    ("give a list of 3 numbers, [x, y, z]", ["map", "{rec}", "--out", "{tmp}/m", "--set", "window.size=20"]),
+    ("a recording; make a map of it with: stereovox map ", ["info", "{rec}"]),
+    ("no stereovox map here, nor anything else", ["info", "{tmp}/gone"]),
     ("a_file", ["map", "{rec}", "--out", "{tmp}/a_file/m"]),
     ("a_file", ["demo", "--out", "{tmp}/a_file"]),
     ("a_file", ["export", "{map}", "{tmp}/a_file/x.bt"]),
@@ -212,6 +219,60 @@ def test_mistakes_end_in_one_line(said, words, recording, tmp_path, capsys):
         VoxelMap.from_cells(load_config(), [[0, 0, 0]], [1.0]).save(saved)
     fails_with_one_line(capsys, said, *(word.format(tmp=tmp_path, rec=recording, map=saved) for word in words))
     assert not (tmp_path / "m").exists()
+
+
+def test_a_source_that_is_not_there_is_told_without_a_list_of_formats(tmp_path, capsys):
+    assert run("map", tmp_path / "gone", "--out", tmp_path / "m") == 2
+    assert capsys.readouterr().err == f"stereovox: {tmp_path / 'gone'}: no such folder or file\n"
+
+
+def test_the_map_in_a_folder_is_suggested(tmp_path, capsys):
+    VoxelMap.from_cells(load_config(), [[0, 0, 0]], [1.0]).save(tmp_path / "demo" / "room.svox")
+    for words in (["info"], ["view"], ["picture", "x.png"], ["export", "x.bt"]):
+        given = [words[0], tmp_path / "demo", *words[1:]]
+        fails_with_one_line(capsys, f"(did you mean {tmp_path / 'demo' / 'room.svox'}?)", *given)
+
+
+def test_info_tells_what_the_map_was_made_of_and_how(recording, tmp_path, capsys):
+    made = ["--voxel-size", 0.1, "--integrator", "ray", "--max-range", 4, "--set", "noise.subpixel=0.1", "--profile"]
+    (tmp_path / "mine.toml").write_text("[depth]\ndenoise = false\n")
+    for profile, changed in (
+        ("default", {"noise.subpixel": 0.1}),
+        (tmp_path / "mine.toml", {"depth.denoise": False, "noise.subpixel": 0.1}),
+    ):
+        assert run("map", recording, "--out", tmp_path / "m", *made, profile) == 0
+        capsys.readouterr()
+        assert run("info", tmp_path / "m", "--json") == 0
+        captured = capsys.readouterr()
+        told = json.loads(captured.out)
+        assert (told["recording"], told["changed"]) == ("my recording", changed)
+        first, second, third, *_ = captured.err.splitlines()
+        assert first.startswith("made of my recording, profile ")
+        assert second == "cells of 0.1 m, ray, depth up to 4 m"
+        words = third.removeprefix("changed: ").split(", ")
+        assert sorted(words) == sorted(f"{name} = {value}" for name, value in changed.items())
+
+
+def test_memory_of_a_window_is_told_apart(recording, tmp_path, capsys):
+    window = ["--set", "window.size=[4,4,4]", "--set", "window.trigger=0.5"]
+    assert run("map", recording, "--out", tmp_path / "m", "--voxel-size", 0.1, *window) == 0
+    assert ", reserved for the window" in capsys.readouterr().err
+    assert run("info", tmp_path / "m") == 0
+    assert "in memory once loaded, whatever its window took" in capsys.readouterr().err
+    assert run("map", recording, "--out", tmp_path / "n", "--voxel-size", 0.1) == 0
+    assert "reserved" not in capsys.readouterr().err
+    assert run("info", tmp_path / "n") == 0
+    assert "whatever its window took" not in capsys.readouterr().err
+
+
+def test_bench_without_peers_installed_times_stereovox_and_says_what_to_install(recording, capsys, monkeypatch):
+    for module in ("octomap", "pyoctomap"):
+        monkeypatch.setitem(sys.modules, module, None)  # as if not installed
+    assert run("bench", recording, "--voxel-size", 0.2, "--frames", ":2", "--json") == 0
+    captured = capsys.readouterr()
+    assert [row["library"] for row in json.loads(captured.out)["rows"]] == ["stereovox"]
+    assert captured.err.count("pip install 'stereovox[bench]'") == 2
+    fails_with_one_line(capsys, "pip install", "bench", recording, "--voxel-size", 0.2, "--peers", "octomap")
 
 
 @pytest.fixture

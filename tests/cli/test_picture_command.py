@@ -19,11 +19,15 @@ def saved(tmp_path):
     return tmp_path / "map.svox"
 
 
-@pytest.mark.parametrize("words", [["layer", "--at", "0.7"], ["axis"], ["space"], ["overview"]])
+CAMERA = ["--eye=0.2,1,1.2", "--toward=3,1,1.2"]
+
+
+@pytest.mark.parametrize(
+    "words", [["layer", "--at", "0.7", *CAMERA], ["axis", *CAMERA], ["space", *CAMERA], ["overview"]]
+)
 def test_each_view_is_written(saved, tmp_path, capsys, words):
     file = tmp_path / "map.png"
-    camera = ["--eye=0.2,1,1.2", "--toward=3,1,1.2"]
-    assert main(["picture", str(saved), str(file), "--json", "--view", *words, *camera]) == 0
+    assert main(["picture", str(saved), str(file), "--json", "--view", *words]) == 0
     assert json.loads(capsys.readouterr().out.splitlines()[-1]) == {"picture": str(file)}
     assert file.read_bytes().startswith(b"\x89PNG")
 
@@ -38,6 +42,9 @@ def test_each_view_is_written(saved, tmp_path, capsys, words):
         (["--view", "axes"], "did you mean 'axis'"),
         (["--view", "layer", "--at", "inf"], "layer at inf"),
         (["--view", "layer", "--up", "w"], "up 'w' is no axis"),
+        (["--at", "1"], "--at: the view 'overview' does not use it; it goes with: --view layer"),
+        (["--view", "space", "--at", "1"], "--at: the view 'space' does not use it"),
+        (["--eye=1,2,3"], "--eye: the view 'overview' does not use it; it goes with: --view layer, --view axis, --vi"),
     ],
 )
 def test_mistakes_are_one_line(saved, tmp_path, capsys, words, said):
@@ -46,3 +53,13 @@ def test_mistakes_are_one_line(saved, tmp_path, capsys, words, said):
     assert len(err) == 1
     assert said in err[0]
     assert not (tmp_path / "map.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("up", "at", "said"),
+    [("z", "500", "z = 0 to 2.5 m"), ("-y", "0.1", "-y = -2 to 0 m"), ("z", "1", None), ("-y", "-0.3", None)],
+)
+def test_a_layer_outside_the_map_is_told(saved, tmp_path, capsys, up, at, said):
+    assert main(["picture", str(saved), str(tmp_path / "map.png"), "--view", "layer", f"--up={up}", f"--at={at}"]) == 0
+    err = capsys.readouterr().err
+    assert f"outside the map ({said})" in err if said else "note:" not in err

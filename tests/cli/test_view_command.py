@@ -41,6 +41,18 @@ def test_it_serves_until_ctrl_c(saved):
     assert json.loads(out) == {"url": url}
 
 
+def test_up_is_taken_or_refused(saved, capsys, monkeypatch):
+    from stereovox.view import viewer
+
+    told = []
+    monkeypatch.setattr(viewer.Viewer, "wait", lambda self: told.append(self.layer.across.value))
+    assert main(["view", str(saved), "--port", "0", "--up=-y"]) == 0
+    assert main(["view", str(saved), "--port", "0"]) == 0
+    assert told == ["y", "z"]
+    assert main(["view", str(saved), "--port", "0", "--up=w"]) == 2
+    assert "up 'w' is no axis" in capsys.readouterr().err
+
+
 def test_a_page_for_everybody_comes_with_a_warning(saved):
     running = start(saved, "--port", 0, "--host", "0.0.0.0")
     assert running.stderr.readline().startswith("warning: anyone who can reach 0.0.0.0")

@@ -38,6 +38,9 @@ def test_files_summary_and_progress(run):
     folder, summary, steps = run
     assert sorted(path.name for path in folder.iterdir()) == ["report.html", "room.png", "room.svox"]
     assert load_map(folder / "room.svox").counts()["occupied"] == summary["occupied"]
+    assert load_map(folder / "room.svox").recording == "sim:room"
+    assert summary["frame_ms"]["median"] > summary["integrate_ms"]["median"] + 0.5 * summary["depth_ms"]["median"]
+    assert f"<b>{summary['frame_ms']['median']:.1f} ms</b>" in (folder / "report.html").read_text()
     assert json.loads(json.dumps(summary)) == summary
     assert (summary["frames"], summary["frames_refused"]) == (60, 0)
     assert [step[0] for step in steps] == [*range(1, 61), 60]

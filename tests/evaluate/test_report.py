@@ -24,6 +24,7 @@ SUMMARY = {
     "settings": {"noise": {"s2": None}, "x": 7},
     "depth_ms": TIMES,
     "integrate_ms": TIMES,
+    "frame_ms": {"median": 2.53, "p90": 4.0, "p99": 6.0, "max": 7.77},
     "occupied": 4321,
     "memory_bytes": 2_500_000,
     "min_frames": 20,
@@ -62,10 +63,11 @@ class _Balanced(HTMLParser):
 
 def test_the_page_holds_the_figures_and_needs_no_other_file():
     page = report(SUMMARY, b"png")
-    figures = ("98.7 %", "4,321", "2.5 ms", "2.5 MB", "25 cm", "cG5n")
+    figures = ("98.7 %", "4,321", "2.5 ms", "7.77 ms", "2.5 MB", "25 cm", "cG5n")
     for text in (*figures, "pole &lt;2 cm&gt;", "noise.s2", "from the camera"):
         assert text in page, text
     assert "{{" not in page
+    assert "through the window" in page.partition("<img")[2].partition("<h2>")[0], "what lies outside is explained"
     assert not re.search(r"""(src|href)\s*=\s*["'](?!data:)|url\(|@import""", page)
     parser = _Balanced()
     parser.feed(page)

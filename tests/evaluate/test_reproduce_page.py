@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 import json
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import pytest
@@ -70,15 +71,33 @@ def test_both_files_are_written_and_say_the_same(one_chapter, tmp_path):
 
 def test_a_recording_of_ones_own_is_mapped_under_both_profiles(one_chapter, tmp_path):
     steps = []
-    own = map_own(Simulation("sim:wall?image_width=64&frames=3"), lambda: steps.append(1))
-    assert len(steps) == 3
-    assert [row[:2] for row in own.sheets[0].rows] == [("chien2020", "3"), ("default", "3")]
+    own = map_own(Simulation("sim:wall?image_width=212&frames=6"), lambda: steps.append(1))
+    assert len(steps) == 6
+    assert [row[:2] for row in own.sheets[0].rows] == [("chien2020", "6"), ("default", "6")]
     assert all(figures["occupied"] > 0 for figures in own.numbers.values())
-    assert len(own.shown) == 2
     reproduce("chien2020", tmp_path, data="sim:wall?image_width=64&frames=3")
-    assert "Your recording" in (tmp_path / "report.html").read_text()
+    chapter = (tmp_path / "report.html").read_text().partition("<h2>2. Your recording")[2]
+    assert "<h3>Your recording, chien2020</h3>" in chapter
+    assert "<h3>Your recording, default</h3>" in chapter
+    assert "Fig 4.11" not in chapter
+    assert "of the thesis" not in chapter
+    assert "holds?" not in chapter  # no table of no claims
     with pytest.raises(StereovoxError, match="nowhere"):
         reproduce("chien2020", tmp_path, data=tmp_path / "nowhere")
+
+
+def test_mistakes_are_told_before_the_work(monkeypatch, tmp_path):
+    done = []
+    monkeypatch.setattr(chien2020, "experiments", lambda sizes, steps: done.append(1) or [CHAPTER])
+    nothing = Simulation("sim:wall?image_width=16&frames=3")
+    monkeypatch.setattr(nothing, "frame", lambda i: replace(Simulation.frame(nothing, i), fault="no_pose"))
+    monkeypatch.setattr(chien2020, "open_source", lambda where: nothing)
+    with pytest.raises(StereovoxError, match="not one frame can be used"):
+        reproduce("chien2020", tmp_path, data="mine")
+    (tmp_path / "numbers.json").mkdir()
+    with pytest.raises(StereovoxError, match="choose another --out"):
+        reproduce("chien2020", tmp_path)
+    assert done == []
 
 
 def test_what_goes_wrong_is_one_line(one_chapter, tmp_path):
@@ -89,4 +108,9 @@ def test_what_goes_wrong_is_one_line(one_chapter, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(StereovoxError, match="choose another --out"):
         reproduce("chien2020", tmp_path / "file")
+    (tmp_path / "report.html").mkdir()
+    with pytest.raises(StereovoxError, match=r"report\.html: cannot be written; choose another --out"):
+        reproduce("chien2020", tmp_path)
+    with pytest.raises(StereovoxError, match="choose another --out"):
+        reproduce("chien2020", "a\0b")
     assert set(PAPERS) == {"chien2020", "valenti2018", "ist2019"}

@@ -40,10 +40,17 @@ def compared():
 def test_line_drawing_updates_fewer_cells_than_traversal(compared):
     assert 0 < compared.only_line < compared.only_ray < 0.3 * compared.ray
     assert compared.only_ray > compared.at_rim > 0
-    assert compared.ray == compared.both + compared.only_ray
     assert 0 < compared.occupied_both <= min(compared.occupied_ray, compared.occupied_line)
     assert len(compared.ms["ray"]) == 4
     assert compared.figures()["line_ms"] > 0
+
+
+def test_what_is_counted_is_the_difference_of_the_cells():
+    one = compare_tracers(8, frames=1)
+    ray, line = (set(one.updated[name].tolist()) for name in ("ray", "line"))
+    assert (one.ray, one.line, one.both) == (len(ray), len(line), len(ray & line))
+    assert (one.only_ray, one.only_line) == (len(ray - line), len(line - ray))
+    assert 0 < one.at_rim < len(ray - line)
 
 
 @pytest.mark.parametrize("place", [(0.0, 0.0, 0.0), (0.2, 0.1, 0.1), (0.1, -0.4, 0.6)])

@@ -22,7 +22,15 @@ def settings(voxel_size, **more):
     return load_config(
         voxel_size=voxel_size,
         integrator="ray",
-        **{"sensor.model": "constant", "ray.update": "once", "noise.s2": 0, **more},
+        **{
+            "sensor.model": "constant",
+            "ray.update": "once",
+            "noise.s2": 0,
+            "map.prior": 0.5,  # OctoMap's tree starts from even odds and clamps at these
+            "map.log_odds_min": -2.0,
+            "map.log_odds_max": 3.5,
+            **more,
+        },
     )
 
 

@@ -4,25 +4,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from made_images import CAMERA, made_image
+from made_images import CAMERA, cells_of, made_image
 
 from stereovox.cameras import PinholeCamera
 from stereovox.config import load_config
 from stereovox.integrate import _reference, make_integrator
 from stereovox.sensors import SENSORS, make_sensor
+from stereovox.wide import CylindricalCamera, SphericalCamera
 
 SIZES = [0.4, 0.1, 0.05]
-
-
-def cells_of(evidence):
-    """Evidence as a dict from cell to thousandths."""
-    coords = np.concatenate([evidence.coords, evidence.uniform])
-    uniform = np.full((len(evidence.uniform), 512), evidence.uniform_value)
-    values = np.concatenate([evidence.values, uniform])
-    assert len(np.unique(coords, axis=0)) == len(coords), "a block stands in the evidence twice"
-    block, column = np.nonzero(values)
-    cells = coords[block] * 8 + np.stack([column >> 6, (column >> 3) & 7, column & 7], axis=1)
-    return dict(zip(map(tuple, cells.tolist()), values[block, column].tolist(), strict=True))
+WIDE = {
+    "sphere": SphericalCamera.from_field_of_view(40, 30, 150, 110, 0.1),
+    "cylinder": CylindricalCamera.from_field_of_view(40, 30, 120, 220, 0.1),  # its outer rows look back
+}
 
 
 def reference_of(reference, image, config):
@@ -67,13 +61,64 @@ def test_ray_and_line_equal_their_references(integrator, model, voxel_size, upda
     assert share_that_differs(ours, theirs, tolerance=2) < 0.02
 
 
+@pytest.mark.parametrize(("model", "update"), [("stereo", "once"), ("stereo", "every"), ("valenti", "every")])
+@pytest.mark.parametrize("camera", WIDE)
+@pytest.mark.parametrize("integrator", ["ray", "line"])
+def test_rays_of_wide_cameras_equal_their_references(integrator, camera, model, update):
+    """Depth is the distance from the x axis, and rays may look sideways and back."""
+    settings = {"sensor.model": model, "ray.update": update, "noise.s2": 0.01}
+    config = load_config(voxel_size=0.1, max_range=2.5, integrator=integrator, **settings)
+    image = made_image(5, WIDE[camera])
+    ours = cells_of(make_integrator(config).evidence(image))
+    reference = {"ray": _reference.cast_rays, "line": _reference.draw_lines}[integrator]
+    theirs = reference_of(reference, image, config)
+    assert len(theirs) > 1000
+    assert share_that_differs(ours, theirs, tolerance=25) < 0.002
+    assert share_that_differs(ours, theirs, tolerance=2) < 0.02
+
+
+@pytest.mark.parametrize("camera", WIDE)
+@pytest.mark.parametrize("integrator", ["ray", "line"])
+def test_wide_cameras_hit_where_their_definition_says(integrator, camera):
+    """The angles of the thesis instead of `rays()`: theta from the y-z plane, phi about the x axis, down from z."""
+    camera = WIDE[camera]
+    config = load_config(voxel_size=0.1, max_range=2.5, integrator=integrator, **{"sensor.model": "constant"})
+    config = load_config(config, **{"ray.update": "once"})
+    for u, v in [(3, 2), (20, 15), (38, 28)]:
+        depth = np.full((camera.height, camera.width), np.nan, np.float32)
+        depth[v, u] = 2.0
+        down = (v - camera.cv) * camera.step_v
+        sphere = isinstance(camera, SphericalCamera)
+        across = np.tan((u - camera.cu) * camera.step_u) if sphere else (u - camera.cx) / camera.fx
+        point = 2.0 * np.array([across, np.sin(down), np.cos(down)]) + 0.03
+        pose = np.eye(4)
+        pose[:3, 3] = 0.03
+        image = replace(made_image(0, camera), depth_m=depth, T_world_sensor=pose)
+        found = [cell for cell, value in cells_of(make_integrator(config).evidence(image)).items() if value > 0]
+        assert found == [tuple(np.floor(point / 0.1).astype(int).tolist())]
+
+
+@pytest.mark.parametrize("camera", WIDE)
+@pytest.mark.parametrize("integrator", ["ray", "line"])
+@pytest.mark.parametrize("update", ["once", "every"])
+def test_threads_change_nothing_for_wide_cameras(integrator, camera, update):
+    image = made_image(2, WIDE[camera])
+    outcomes = []
+    for threads in (1, 2, 3):
+        config = load_config(voxel_size=0.1, integrator=integrator, threads=threads, **{"ray.update": update})
+        outcomes.append(cells_of(make_integrator(config).evidence(image)))
+    assert outcomes[0] == outcomes[1] == outcomes[2]
+    assert len(outcomes[0]) > 1000
+
+
 @pytest.mark.parametrize("integrator", ["projective", "ray", "line"])
 @pytest.mark.parametrize("model", ["stereo", "andert"])
 def test_threads_change_nothing(integrator, model):
     images = [made_image(seed) for seed in range(4)]
     outcomes = []
     for threads in (1, 2, 3):
-        config = load_config(voxel_size=0.05, integrator=integrator, threads=threads, **{"sensor.model": model})
+        more = {"sensor.model": model, "projective.full_share": 0.4}  # many hits are weighed
+        config = load_config(voxel_size=0.05, integrator=integrator, threads=threads, **more)
         each = make_integrator(config)
         outcomes.append([cells_of(each.evidence(image)) for image in images])
     assert outcomes[0] == outcomes[1] == outcomes[2]

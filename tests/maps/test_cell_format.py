@@ -12,9 +12,9 @@ from stereovox.maps.evidence import Evidence
 CENTRES = np.array([[0.05, 0.05, 0.05 + 0.1 * k] for k in range(8)])
 
 
-def byte_map():
+def byte_map(prior=0.5):
     return VoxelMap(load_config("default", voxel_size=0.1, **{
-        "map.cell": "uint8", "map.log_odds_min": -2.1, "map.log_odds_max": 2.1}))  # fmt: skip
+        "map.cell": "uint8", "map.log_odds_min": -2.1, "map.log_odds_max": 2.1, "map.prior": prior}))  # fmt: skip
 
 
 def add(voxel_map, *first_cells):
@@ -54,6 +54,16 @@ def test_states_of_bytes(number, state):
     one = byte_map()
     one.insert(np.zeros((1, 3), np.int32), np.full((1, 512), number, np.uint8))
     assert one.state(CENTRES[:1]) == State[state]
+
+
+def test_a_byte_starts_from_the_prior():
+    one = byte_map(prior=0.25)
+    start = 127 + round(np.log(0.25 / 0.75) * FORMATS["uint8"].per_log_odds)
+    assert start == 58
+    step = round(0.4 * FORMATS["uint8"].per_log_odds)
+    for n in (1, 2):
+        add(one, 400, -400)
+        assert stored(one)[:3] == [start + n * step, start - n * step, 127]
 
 
 def test_free_blocks_reach_zero_and_stay():

@@ -11,7 +11,7 @@ from stereovox.maps import State, VoxelMap, load_map
 from stereovox.maps.evidence import Evidence
 
 CONFIG = load_config(voxel_size=0.1)
-LOWEST, HIGHEST = -2000, 3500
+LOWEST, HIGHEST = -4000, 3500
 
 
 def evidence_of(coords, values, uniform=(), uniform_value=-405):
@@ -28,9 +28,11 @@ def cells_of(voxel_map):
     return dict(zip(map(tuple, indices.tolist()), np.rint(log_odds * 1000).astype(int).tolist(), strict=True))
 
 
-def test_adding_evidence_equals_a_dict():
+@pytest.mark.parametrize(("prior", "first"), [(0.1, -2197), (0.5, 0), (0.7, 847)])
+def test_adding_evidence_equals_a_dict(prior, first):
+    """`first`: the prior's log-odds in thousandths, from which a cell leaves "unknown"."""
     rng = np.random.default_rng(1)
-    voxel_map, plain = VoxelMap(CONFIG), {}
+    voxel_map, plain = VoxelMap(load_config(CONFIG, **{"map.prior": prior})), {}
     for _ in range(30):
         coords = np.unique(rng.integers(-2, 3, (12, 3)), axis=0)
         half = len(coords) // 2
@@ -41,23 +43,58 @@ def test_adding_evidence_equals_a_dict():
         for block, row in zip(coords, everything, strict=True):
             for c in np.flatnonzero(row):
                 cell = tuple((block * 8 + [c >> 6, (c >> 3) & 7, c & 7]).tolist())
-                total = min(max(plain.get(cell, 0) + int(row[c]), LOWEST), HIGHEST)
+                total = min(max(plain.get(cell, first) + int(row[c]), LOWEST), HIGHEST)
                 plain[cell] = total or 1
         assert changed == sum(plain[cell] != before.get(cell) for cell in plain)
     assert cells_of(voxel_map) == plain
+
+
+def test_the_prior_counts_once_and_says_nothing_of_unknown_cells():
+    """Valenti 2018, Eq 6.2: l = l0 + sum of evidence."""
+    voxel_map = VoxelMap(load_config(CONFIG, **{"map.prior": 0.2}))
+    values = np.zeros(512)
+    values[0] = 500
+    for _ in range(3):
+        voxel_map.add(evidence_of([[0, 0, 0]], [values], [[1, 0, 0]], -300))
+    hit, beside, free, elsewhere = [0.05] * 3, [0.05, 0.05, 0.15], [0.85, 0.05, 0.05], [5.0, 5.0, 5.0]
+    l0 = np.log(0.2 / 0.8)
+    assert voxel_map.log_odds([hit, beside, free, elsewhere]) == pytest.approx([l0 + 1.5, 0, l0 - 0.9, 0], abs=1e-3)
+    assert voxel_map.probability([beside, elsewhere]).tolist() == [0.5, 0.5]
+    assert voxel_map.state([beside, elsewhere]).tolist() == [State.UNKNOWN, State.UNKNOWN]
+
+
+def test_evidence_that_just_undoes_the_prior_is_known():
+    voxel_map = VoxelMap(load_config(CONFIG, **{"map.prior": 0.1}))
+    voxel_map.add(evidence_of([[0, 0, 0]], [np.full(512, 2197)]))
+    assert set(cells_of(voxel_map).values()) == {1}
+    voxel_map = VoxelMap(load_config(CONFIG, **{"map.prior": 0.7}))
+    voxel_map.add(evidence_of([], [], [[0, 0, 0]], -847))
+    assert set(cells_of(voxel_map).values()) == {1}
+
+
+@pytest.mark.parametrize("cell", ["int16", "uint8"])
+def test_limits_near_zero_still_tell_known_from_unknown(cell):
+    """Limits that round to "unknown" itself are moved one beyond it: every clamped cell stays known, on its side."""
+    narrow = {"map.cell": cell, "map.log_odds_min": -1e-5, "map.log_odds_max": 1e-5, "map.prior": 0.5}
+    voxel_map = VoxelMap(load_config(CONFIG, **narrow))
+    voxel_map.add(evidence_of([[0, 0, 0]], [np.tile([-900, 900], 256)], [[1, 0, 0]], -900))
+    low = voxel_map.log_odds([[0.05, 0.05, 0.05], [0.05, 0.05, 0.15], [0.85, 0.05, 0.05]])
+    assert (np.sign(low) == [-1, 1, -1]).all()
+    assert voxel_map.counts()["tentative"] == 1024
 
 
 def test_saturated_free_blocks_still_take_hits():
     voxel_map = VoxelMap(CONFIG)
     free = evidence_of([], [], [[0, 0, 0]])
     assert voxel_map.add(free) == 512
+    assert voxel_map.log_odds([[0.05, 0.05, 0.75]])[0] == pytest.approx(-2.197 - 0.405)
     for _ in range(10):
         voxel_map.add(free)
     assert voxel_map.add(free) == 0
     hit = np.zeros(512)
     hit[7] = 847
     assert voxel_map.add(evidence_of([[0, 0, 0]], [hit])) == 1
-    assert voxel_map.log_odds([[0.05, 0.05, 0.75]])[0] == pytest.approx(-2 + 0.847)
+    assert voxel_map.log_odds([[0.05, 0.05, 0.75]])[0] == pytest.approx(-4 + 0.847)
     assert voxel_map.add(free) == 1, "the hit cell must be cleared again, the flag is gone"
 
 

@@ -26,18 +26,25 @@ def width_at(model, level, z_measured, sigma, side):
     return offset[below[0]]
 
 
+def said_of_the_hit(model, z_measured, sigma, voxel_size):
+    """What a model says of the cell that holds the measured point."""
+    if hasattr(model, "hit"):
+        return float(model.hit(np.array([z_measured]), np.array([sigma]), voxel_size)[0])
+    return float(model.probability(np.array(z_measured), z_measured, sigma))
+
+
 @pytest.mark.parametrize("name", SENSORS)
 @pytest.mark.parametrize(("z_measured", "sigma"), CASES)
 def test_contract(name, z_measured, sigma):
     model = model_of(name)
     offset = np.linspace(-12, 12, 4801) * sigma
     p = model.probability(z_measured + offset, z_measured, sigma)
-    peak = model.probability(np.array(z_measured), z_measured, sigma)
+    peak = said_of_the_hit(model, z_measured, sigma, 0.05)
     assert ((p > 0) & (p < 1)).all()
     assert p[0] == pytest.approx(model.p_free, abs=1e-9)
     assert p[-1] == pytest.approx(model.p_unknown, abs=1e-9)
-    assert peak == pytest.approx(p.max())
-    assert peak > model.p_unknown
+    assert peak == pytest.approx(p.max()) if not hasattr(model, "hit") else peak > p.max()
+    assert model.p_unknown < peak < 1
     assert (np.diff(p[offset < 0]) >= 0).all()
     assert (np.diff(p[offset > 0]) <= 0).all()
 
@@ -80,12 +87,64 @@ def test_point_models_mark_nothing_beside_the_hit(name):
     model = model_of(name)
     offset = np.array([-1e-6, 1e-6]) * 0.05
     assert (model.probability(2 + offset, 2.0, 0.05) <= model.p_unknown + 1e-9).all()
-    assert model.probability(2.0, 2.0, 0.05) == 0.7
+    assert said_of_the_hit(model, 2.0, 0.05, 0.1) >= 0.7
 
 
 def test_stereo_clears_half_as_much_where_the_gaussian_is_half():
     p = model_of("stereo").probability(2.0 - 0.05 * HALF, 2.0, 0.05)
-    assert p == pytest.approx(0.4 + 0.1 * 0.5)
+    assert p == pytest.approx(0.35 + 0.15 * 0.5)
+    assert model_of("constant").probability(2.0, 2.0, 0.05) == 0.7
+
+
+@pytest.mark.parametrize("ratio", [0.02, 0.3, 1.0, 4.0])
+def test_a_hit_counts_as_its_noise_leaves_it_in_its_cell(ratio):
+    """Points evenly spread over a cell, moved by noise of `ratio` cells, counted by hand; then the formula on top."""
+    rng = np.random.default_rng(4)
+    stays = np.mean(np.floor(rng.random(1_000_000) + ratio * rng.normal(size=1_000_000)) == 0)
+    p = 0.9 * stays
+    evidence = 0.5 * (np.log(p / (1 - p)) - np.log(0.2 / 0.8))
+    model = model_of("stereo", p_right=0.9, prior=0.2, trust=0.5)
+    expected = 1 / (1 + np.exp(-max(evidence, 0.05)))  # a measured point is never evidence for free space
+    assert said_of_the_hit(model, 3.0, ratio * 0.08, 0.08) == pytest.approx(expected, abs=2e-3)
+
+
+def test_a_hit_counts_less_with_more_noise_and_more_in_larger_cells_but_always_something():
+    model = model_of("stereo")
+    sigma = np.geomspace(1e-6, 100.0, 60)
+    p = np.array([model.hit(sigma, sigma, size) for size in (0.02, 0.05, 0.2, 1.0)])
+    assert (np.diff(p, axis=1) <= 1e-12).all()
+    assert (np.diff(p, axis=0) >= -1e-12).all()
+    assert p[:, 0] == pytest.approx(1 / (1 + np.exp(-0.8 * (np.log(0.95 / 0.05) - np.log(0.1 / 0.9)))), abs=1e-4)
+    assert p[:, -1] == pytest.approx(1 / (1 + np.exp(-0.05)))
+
+
+def test_table_asks_a_model_that_knows_cells_for_its_hits():
+    """`hit` is optional; the rest of the table does not depend on the voxel size."""
+    noise = RangeNoise(0.01, 0, 0.004)
+    small, large = (tabulate(model_of("stereo"), noise, 6.0, size) for size in (0.02, 0.2))
+    assert (small.log_odds == large.log_odds).all()
+    z_measured = (np.arange(ROWS) + 0.5) * 6 / ROWS
+    p = model_of("stereo").hit(z_measured, noise.sigma(z_measured), 0.02)
+    assert small.hit == pytest.approx(np.log(p / (1 - p)))
+    assert (large.hit > small.hit).all()
+    assert (small.hit > 0).all()
+    for name in ("constant", "valenti"):
+        assert (tabulate(model_of(name), noise, 6.0, 0.02).hit == tabulate(model_of(name), noise, 6.0, 0.2).hit).all()
+
+
+def test_a_hit_beyond_certainty_is_refused():
+    class Sure:
+        p_free, p_unknown = 0.4, 0.5
+
+        def probability(self, z, z_measured, sigma):
+            return np.where(z < z_measured, 0.4, 0.5) + 0 * sigma
+
+        def hit(self, z_measured, sigma, voxel_size):
+            return np.ones_like(sigma)
+
+    with pytest.raises(ConfigError, match="inside") as caught:
+        tabulate(Sure(), RangeNoise(0.01, 0, 0), 5.0)
+    assert "\n" not in str(caught.value)
 
 
 def test_table_holds_the_model():
@@ -121,9 +180,13 @@ def test_stereo_noise_from_geometry():
     ("name", "parameters", "said"),
     [
         ("sterio", {}, "did you mean 'stereo'"),
-        ("stereo", {"p_hitt": 0.7}, "did you mean 'p_hit'"),
-        ("stereo", {"p_hit": 1.0}, "between 0 and 1"),
-        ("stereo", {"p_hit": "high"}, "must be a number"),
+        ("constant", {"p_hitt": 0.7}, "did you mean 'p_hit'"),
+        ("constant", {"p_hit": 1.0}, "between 0 and 1"),
+        ("constant", {"p_hit": "high"}, "must be a number"),
+        ("stereo", {"p_rihgt": 0.9}, "did you mean 'p_right'"),
+        ("stereo", {"p_right": 1.0}, "between 0 and 1"),
+        ("stereo", {"p_right": "high"}, "must be a number"),
+        ("stereo", {"trust": 0.0}, "greater than 0"),
         ("valenti", {"p_free": 0.6}, "smaller than p_unknown"),
         ("andert", {"k": 0.0}, "greater than 0"),
     ],

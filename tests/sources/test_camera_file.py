@@ -29,7 +29,11 @@ def test_what_is_written_is_read_exactly(tmp_path, camera):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("width = 16", "height is missing"),
+        ("width = 16", "height is missing; write height = its number of pixels"),
+        (GOOD.replace("cy = 5", ""), "cy is missing; write cy = where the optical axis meets the image"),
+        (GOOD.replace("fx = 20", ""), "fx is missing; write fx = its focal length"),
+        (GOOD.replace("fx = 20", "fx = -585"), "fx = -585 must be positive$"),
+        (GOOD.replace("fx = 20", "fx = 0.1"), "fx fy cx cy = 0.1 21.5 7 5: a ray 89.* deg off the axis"),
         (GOOD + "base_line = 1", "unknown key 'base_line' .did you mean 'baseline'"),
         (GOOD.replace("16", "16.5"), "whole numbers"),
         (GOOD.replace("16", "-3"), "whole numbers"),
@@ -81,6 +85,8 @@ def test_another_camera_for_any_source(tmp_path):
     other = with_camera(source, file)
     assert other.camera == replace(CAMERA, baseline=0.075)
     assert (other.name, other.length) == (source.name, 4)
+    told = f"{file} is used in place of the recording's own camera (depth correction 'scale')"
+    assert other.notes == other.after(1).notes == (*source.notes, told)
     frames = list(other)
     assert [frame.camera for frame in frames] == [other.camera] * 4
     np.testing.assert_array_equal(frames[2].depth, source.frame(2).depth)

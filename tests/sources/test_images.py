@@ -7,7 +7,7 @@ import pytest
 from made_recordings import SIZE, depth_image, png_bytes, write_png
 
 from stereovox.errors import FrameRefused
-from stereovox.sources.images import common_size, png_size, read_depth_png
+from stereovox.sources.images import PICTURE, common_size, png_size, read_depth_png, read_picture_png
 
 
 @pytest.fixture
@@ -101,3 +101,36 @@ def test_the_common_size_is_that_of_most_readable_images(tmp_path):
     for path in paths[2:5]:
         write_png(path, depth_image(0))
     assert common_size(paths) == SIZE
+
+
+def test_pictures_come_back_value_by_value_in_grey_or_rgb(tmp_path):
+    path = tmp_path / "p.png"
+    grey = np.arange(SIZE[0] * SIZE[1], dtype=np.uint8).reshape(SIZE[1], SIZE[0])
+    write_png(path, grey)
+    np.testing.assert_array_equal(read_picture_png(path, SIZE), grey)
+    rgb = np.stack([grey, grey[::-1], 255 - grey], axis=2)
+    write_png(path, rgb[..., ::-1])  # OpenCV writes BGR
+    found = read_picture_png(path, SIZE)
+    np.testing.assert_array_equal(found, rgb)
+    assert found.dtype == np.uint8
+    assert png_size(path, PICTURE) == SIZE
+    assert common_size([path], kinds=PICTURE) == SIZE
+
+
+def test_a_picture_is_no_depth_and_depth_no_picture(tmp_path, good):
+    path = tmp_path / "p.png"
+    write_png(path, np.ones((SIZE[1], SIZE[0]), np.uint8))
+    assert refusal(path) == "bad_dtype"
+    with pytest.raises(FrameRefused, match="16-bit grey image; pictures must be 8-bit grey or RGB"):
+        read_picture_png(good, SIZE)
+    write_png(path, np.ones((SIZE[1], SIZE[0], 4), np.uint8))
+    with pytest.raises(FrameRefused, match="8-bit colour image"):
+        read_picture_png(path, SIZE)
+
+
+def test_a_picture_that_is_cut_off_is_refused(tmp_path):
+    path = tmp_path / "p.png"
+    write_png(path, np.random.default_rng(0).integers(0, 256, (SIZE[1], SIZE[0], 3), np.uint8))
+    path.write_bytes(path.read_bytes()[:-15])
+    with pytest.raises(FrameRefused, match="cut off or damaged"):
+        read_picture_png(path, SIZE)

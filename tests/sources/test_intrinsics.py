@@ -44,7 +44,29 @@ def test_the_first_file_counts_and_leaves_no_note(tmp_path):
     assert (camera.fx, camera.fy, camera.cx, camera.cy, camera.baseline) == (100, 300, 2, 4, 0.075)
     assert notes == ()
     (near / "calibration.txt").write_text("90 90 9 9")
-    assert find_camera([near, far], (640, 480), 0.075, DEFAULT)[0].fx == 90
+    camera, (note,) = find_camera([near, far], (640, 480), 0.075, DEFAULT)
+    assert camera.fx == 90
+    assert note == f"{far / 'camera-intrinsics.txt'} is not used: {near / 'calibration.txt'} comes first"
+
+
+def test_a_camera_toml_counts_only_in_the_own_folder_and_is_always_told(tmp_path):
+    near = tmp_path / "near"
+    near.mkdir()
+    (tmp_path / "camera.toml").write_text("this would be an error")
+    camera, notes = find_camera([near, tmp_path], (640, 480), 0.075, DEFAULT)
+    assert camera.fx == DEFAULT[0]
+    assert f"{tmp_path / 'camera.toml'} is not used: it counts only in the recording's own folder" in notes[1]
+    (near / "camera-intrinsics.txt").write_text("90 0 9 0 90 9 0 0 1")
+    own = "width = 640\nheight = 480\nfx = 80\nfy = 80\ncx = 7\ncy = 5\n"
+    for correction, words in (
+        ("", "no depth correction"),
+        ("[correction]\nmodel = 'thesis'\ncoefficients = [0, 0, 1]", "depth correction 'thesis'"),
+    ):
+        (near / "camera.toml").write_text(own + correction)
+        camera, notes = find_camera([near, tmp_path], (640, 480), 0.075, DEFAULT)
+        assert camera.fx == 80
+        assert notes[0] == f"{near / 'camera.toml'} is used ({words})"
+        assert notes[2] == f"{near / 'camera-intrinsics.txt'} is not used: {near / 'camera.toml'} comes first"
 
 
 def test_without_a_file_only_640x480_has_a_default_and_the_user_is_told(tmp_path):
@@ -57,5 +79,8 @@ def test_without_a_file_only_640x480_has_a_default_and_the_user_is_told(tmp_path
 
 def test_impossible_focal_lengths_name_the_file(tmp_path):
     (tmp_path / "calibration.txt").write_text("0 500 320 240")
-    with pytest.raises(SourceError, match=r"calibration\.txt.*positive"):
+    with pytest.raises(SourceError, match=r"calibration\.txt: fx = 0 must be positive$"):
+        find_camera([tmp_path], (640, 480), 0.075, DEFAULT)
+    (tmp_path / "calibration.txt").write_text("1 500 320 240")
+    with pytest.raises(SourceError, match=r"calibration\.txt: fx fy cx cy = 1 500 320 240: a ray 8\d\.\d deg"):
         find_camera([tmp_path], (640, 480), 0.075, DEFAULT)

@@ -35,7 +35,7 @@ def test_bad_frames_are_told_before_the_folder_is_looked_at():
 
 @pytest.mark.parametrize("where", ["no-such-folder", "x" * 5000, "nul\0byte", ""])
 def test_a_missing_folder(where):
-    with pytest.raises(SourceError, match=r"no such folder or file; known: .*7-Scenes.*TUM"):
+    with pytest.raises(SourceError, match=r": no such folder or file$"):
         open_source(where)
 
 

@@ -95,6 +95,29 @@ def test_low_confidence_refuses_only_what_lies_beside_it(recording):
     assert [frame.fault for frame in strict][2:4] == ["low_confidence", None]
 
 
+def test_a_confidence_that_is_no_number_is_none(recording):
+    source = open_source(recording(confidence=[3] * 300))
+    assert source.frame(2).fault is None
+    trust = np.full(300, 3.0)
+    trust[60 + 2 * 20] = np.nan  # a damaged message of a recorded file
+    source._poses.confidence = trust
+    assert [frame.fault for frame in source] == [None, None, "low_confidence"] + [None] * 5
+
+
+def test_a_jump_beside_a_line_of_no_use_is_a_jump(recording, poses):
+    T = poses.T_world_body.copy()
+    T[129:, 0, 3] += 0.4
+    source = open_source(recording(Poses(poses.stamps_ns, T)))
+    folder = source.folder
+    lines = (folder / "tracker.txt").read_text().splitlines()
+    lines[129] = lines[129].split()[0] + " broken"
+    (folder / "tracker.txt").write_text("\n".join(lines))
+    again = open_source(folder)
+    assert [frame.fault for frame in again] == [frame.fault for frame in source]
+    assert "0.40 m" in again.frame(3).fault_detail
+    assert "one jump of up to 0.40 m" in again.notes[0]
+
+
 def test_near_a_jump_frames_are_refused_and_then_count_as_the_tracker_says(recording, poses):
     T = poses.T_world_body.copy()
     T[129:, 0, 3] += 0.4  # between 0.34 and 0.345 s

@@ -116,6 +116,29 @@ def test_a_camera_that_falls_silent_is_an_error_not_a_wait(camera, monkeypatch):
         camera.sensor.stop()
 
 
+def test_a_camera_that_cannot_start_is_closed_again(camera, monkeypatch):
+    calls = []
+
+    class Sensor:
+        def open(self, profile):
+            calls.append("open")
+
+        def start(self, queue):
+            raise RuntimeError("Resource temporarily unavailable")
+
+        def stop(self):
+            raise RuntimeError("not streaming")
+
+        def close(self):
+            calls.append("close")
+
+    stream = open_stream(STILL)
+    stream._sensor = Sensor()
+    with pytest.raises(SourceError, match="temporarily unavailable"):
+        next(iter(stream))
+    assert calls == ["open", "close"]
+
+
 def test_no_camera():
     with pytest.raises(SourceError, match=r"no RealSense camera is connected; plug one .* or give a recorded"):
         RealSense("realsense:", Context())
@@ -230,7 +253,7 @@ def test_map_gives_up_on_a_camera_without_poses(camera, tmp_path, capsys):
     with camera.sending():
         code, said = mapped(capsys, "realsense:", "--out", tmp_path / "m.svox")
     assert code == 2
-    assert "not one frame could be used" in said.err
+    assert "not one of 100 frames could be used" in said.err
     assert "?pose=fixed" in said.err.splitlines()[-1]
 
 

@@ -107,9 +107,9 @@ def poses_at(positions, degrees, step_ms=5):
 
 def test_a_jump_is_what_no_vehicle_can_do():
     still = [0.0] * 4
-    assert jumps(poses_at([0, 0.01, 0.5, 0.51], still), 10, 720).tolist() == [1]
+    assert jumps(poses_at([0, 0.01, 0.5, 0.51], still), 10, 720).tolist() == [[1, 2]]
     assert jumps(poses_at([0, 0.04, 0.08, 0.12], still), 10, 720).tolist() == []
-    assert jumps(poses_at(still, [0, 3, 6, 12]), 10, 720).tolist() == [2]
+    assert jumps(poses_at(still, [0, 3, 6, 12]), 10, 720).tolist() == [[2, 3]]
 
 
 def test_two_stamps_that_almost_coincide_are_no_jump():
@@ -117,7 +117,13 @@ def test_two_stamps_that_almost_coincide_are_no_jump():
     T[1, 0, 3] = 0.002
     assert jumps(Poses([0, 1000], T), 10, 720).tolist() == []
     T[1, 0, 3] = 0.02
-    assert jumps(Poses([0, 1000], T), 10, 720).tolist() == [0]
+    assert jumps(Poses([0, 1000], T), 10, 720).tolist() == [[0, 1]]
+
+
+def test_a_jump_is_seen_across_poses_that_cannot_be_used():
+    poses = poses_at([0, 0.01, np.nan, 0.5, np.nan, np.nan, 0.51], [0.0] * 7)
+    assert jumps(poses, 10, 720).tolist() == [[1, 3]]
+    assert jumps(poses_at([np.nan] * 3, [0.0] * 3), 10, 720).shape == (0, 2)
 
 
 @pytest.mark.parametrize("degrees", [1e-7, 0.01, 30, 179.99])

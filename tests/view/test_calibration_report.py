@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Pages and pictures of calibrations."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -11,7 +13,7 @@ from stereovox.cameras import PinholeCamera
 from stereovox.errors import StereovoxError
 from stereovox.frame import Frame
 from stereovox.view import page
-from stereovox.view.calibration import noise_png, wall_png
+from stereovox.view.calibration import DPI, noise_png, wall_png
 from stereovox.view.calibration_report import noise_page, wall_page, write_wall_report
 
 CAMERA = PinholeCamera(80, 60, 60.0, 60.0, 39.5, 29.5, 0.05)
@@ -72,6 +74,27 @@ def test_a_page_needs_no_other_file_and_is_filled():
     assert "T &amp; t" in text
     assert "<td>&lt;x&gt;</td>" in text
     assert "http" not in text
+
+
+def test_wide_tables_are_set_smaller_and_their_units_stay_with_the_numbers():
+    assert '<div class="wide many">' in page.table(list("abcdefgh"), [])
+    assert '<div class="wide">' in page.table(list("abcdefg"), [])
+    assert ".many" in page.page("t", "")
+    found = wall_calibration()
+    assert f"<td>{found.as_dict()['walls'][0]['after_percent']:.2f}\u00a0%</td>" in wall_page(found, b"", "c.toml")
+
+
+def test_walls_are_counted_in_words_that_fit():
+    found = wall_calibration()
+    assert "with 2 flat walls (after" in wall_page(found, b"", "c.toml")
+    one = replace(found, walls=found.walls[:1])
+    assert "with 1 flat wall (after" in wall_page(one, b"", "c.toml")
+
+
+def test_pictures_are_no_wider_than_letters_stay_readable():
+    """A page shows them 1080 pixels wide: 11 inches of letters of ten points."""
+    for png in (wall_png(wall_calibration()), noise_png(noise_calibration())):
+        assert drawn(png).shape[1] <= 11 * DPI
 
 
 def test_a_report_that_cannot_be_written_is_one_line(tmp_path):

@@ -14,11 +14,12 @@ from stereovox.errors import MissingExtra, StereovoxError
 from stereovox.frame import Viewpoint
 from stereovox.maps import State
 from stereovox.view import viewer_cells
+from stereovox.view.scale import scale_of
 from stereovox.view.viewer import is_private, open_viewer, url_of
 from stereovox.view.viewer_camera import first_look, up_vector
 from stereovox.view.viewer_cells import CORNERS, FACES
-from stereovox.view.viewer_layer import MOST_PX, sharp
-from stereovox.view.viewer_panel import plain, statistics
+from stereovox.view.viewer_layer import MOST_PX, layer_colours, sharp
+from stereovox.view.viewer_panel import colour_bar, plain, statistics
 
 CAMERA = PinholeCamera(640, 480, 500.0, 500.0, 319.5, 239.5, 0.05)
 LOOKS_ALONG_X = np.array([[0.0, 0, 1, 0.3], [-1, 0, 0, 0.1], [0, -1, 0, 0.7], [0, 0, 0, 1]])
@@ -227,6 +228,23 @@ def test_statistics_count_what_is_there():
         "| y | 0.00 to 0.60 m |",
     ):
         assert line in text
+
+
+def test_the_legend_of_the_layer_ends_where_log_odds_end():
+    scale = scale_of(box_map())
+    bar = colour_bar(layer_colours(scale), "log-odds", (scale.lowest, scale.highest))
+    row = bar[bar.shape[0] // 8].astype(int)
+    row = row[(row < 250).any(axis=1)][5:-5]
+    colours, norm = scale.colours()
+    for pixel, value in ((row[0], scale.lowest), (row[-1], scale.highest)):
+        assert np.abs(pixel - 255 * np.array(colours(norm(value))[:3])).max() < 8
+
+
+def test_up_may_be_told():
+    with closing(open_viewer(box_map(), port=0, up="-y")) as viewer:
+        assert viewer.cells.below.label == "below -y [m]"
+    with pytest.raises(StereovoxError, match="no axis"):
+        open_viewer(box_map(), port=0, up="w")
 
 
 def test_names_from_a_map_are_no_program_text():

@@ -161,6 +161,18 @@ def test_the_whole_field_of_view_is_in_the_picture_in_space():
     assert axis.get_aspect() == 1
 
 
+def test_what_cells_hide_of_the_field_of_view_is_dashed():
+    behind = viewpoint_at(made_map(), (0, 0, 3.4), (0, 0, 9.0), "-y")
+    axis = draw_view(made_map(), "space", "a map", "-y", viewpoint=behind).axes[0]
+    styles = {True: 0, False: 0}
+    for line in axis.lines:
+        if line.get_color() == PATH_COLOUR and line.get_marker() == "None":
+            styles[line.get_linestyle() == "--"] += int(np.isfinite(line.get_xydata()).all(axis=1).sum())
+    assert styles[True] > 100, "behind the wall"
+    assert styles[True] + styles[False] == 8 * 300, "each point of a line is drawn once"
+    assert "dashed behind cells" in axis.get_title(loc="left")
+
+
 def test_edges_bear_round_numbers_that_do_not_crowd():
     assert numbers("z", -0.3, 2.5)[1].tolist() == pytest.approx([0, 0.5, 1, 1.5, 2, 2.5])
     assert numbers("z", -0.9, 3.4, 4.0)[1].tolist() == pytest.approx([0, 2])

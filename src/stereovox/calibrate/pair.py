@@ -25,7 +25,7 @@ from stereovox.depth import prepare
 from stereovox.errors import FrameRefused, StereovoxError
 from stereovox.frame import Frame
 from stereovox.geometry import Transform
-from stereovox.sources import Source
+from stereovox.sources import DepthSource
 from stereovox.sources.poses import Poses
 
 FEWEST = 20
@@ -68,7 +68,7 @@ class PairCalibration:
 
 
 def calibrate_pair(
-    depth: Source,
+    depth: DepthSource,
     poses: Poses,
     *,
     min_confidence: float = 2.0,
@@ -117,7 +117,7 @@ def _refined(motion: CameraMotion, track: PoseTrack, offset: float) -> Refined |
 
 
 def _clouds(
-    depth: Source, progress: Callable[[Iterable[Frame], int], Iterable[Frame]] | None
+    depth: DepthSource, progress: Callable[[Iterable[Frame], int], Iterable[Frame]] | None
 ) -> Iterator[tuple[int, NDArray[np.float64]]]:
     """Yield time and points of every image that can be used; the poses of the source do not count."""
     config = load_config("default", max_range=2 * MAX_RANGE, **{"depth.denoise": False})  # registration wants it raw
@@ -129,7 +129,7 @@ def _clouds(
             continue
 
 
-def _check_depth(motion: CameraMotion, depth: Source) -> None:
+def _check_depth(motion: CameraMotion, depth: DepthSource) -> None:
     registered = int((motion.reference >= 0).sum())
     if registered < max(FEWEST, REGISTERED * len(depth)):
         raise StereovoxError(

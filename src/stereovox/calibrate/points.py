@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from stereovox.cameras import PinholeCamera
 from stereovox.frame import DepthImage, Reason
 
 COLUMNS = 106
@@ -32,6 +33,7 @@ def reduced_points(image: DepthImage, farthest: float) -> NDArray[np.float64]:
     usable &= (highest - lowest <= SPREAD * mean) & (mean * farthest >= 1)
     rows, columns = np.nonzero(usable)
     camera, middle = image.camera, (n - 1) / 2
+    assert isinstance(camera, PinholeCamera)
     depth = 1 / mean[rows, columns]
     x = (columns * n + middle - camera.cx) / camera.fx
     y = (rows * n + middle - camera.cy) / camera.fy

@@ -34,7 +34,7 @@ class PoseTrack:
         self.start_ns = int(kept.stamps_ns[0])
         times = (kept.stamps_ns - self.start_ns) / 1e9
         breaks = np.zeros(len(times), np.intp)
-        breaks[jumps(kept, max_speed_mps, max_turn_dps) + 1] = 1
+        breaks[jumps(kept, max_speed_mps, max_turn_dps)[:, 1]] = 1
         count = _poses_to_average(times)
         middle = slice(count // 2, len(times) - count // 2)
         self._breaks = np.cumsum(breaks)[middle]

@@ -79,8 +79,8 @@ def tilt_deg(plane: Array) -> float:
 def find_wall(inverse: Array, camera: PinholeCamera, name: str) -> Wall:
     """Return the wall that fills most of an image of 1/z (height, width, NaN: no value).
 
-    Raises StereovoxError, one line that begins with `name`: too few pixels with depth, no surface that is nearly flat,
-    too tilted, too curved.
+    Raises StereovoxError, one line that begins with `name`: too few pixels with depth or too scattered ones, no surface
+    that is nearly flat, too tilted, too curved.
     """
     valid = np.isfinite(inverse)
     if valid.mean() < LEAST_VALID:
@@ -95,7 +95,7 @@ def find_wall(inverse: Array, camera: PinholeCamera, name: str) -> Wall:
             "let a wall fill the image"
         )
     tolerance = max(TOLERANCE, 4 * noise)
-    coefficients = _refined(x[valid], y[valid], inverse[valid], _guess(x, y, inverse, tolerance), tolerance)
+    coefficients = _refined(x[valid], y[valid], inverse[valid], _guess(x, y, inverse, tolerance, name), tolerance)
     surface = terms(x, y) @ coefficients
     on_wall = valid & (np.abs(inverse - surface) < tolerance * np.abs(surface))
     wall = Wall(coefficients, on_wall, noise)
@@ -127,10 +127,15 @@ def _noise(inverse: Array) -> float:
     return float(1.4826 * np.median(steps) / np.sqrt(2) / np.nanmedian(inverse)) if len(steps) else 0.0
 
 
-def _guess(x: Array, y: Array, inverse: Array, tolerance: float) -> Array:
+def _guess(x: Array, y: Array, inverse: Array, tolerance: float, name: str) -> Array:
     """Return the quadratic through six blocks of pixels on which most other blocks lie."""
     u, v, m = _blocks(x), _blocks(y), _blocks(inverse)
     known = np.isfinite(m)
+    if known.sum() < TERMS:
+        raise StereovoxError(
+            f"{name}: the pixels with depth are too scattered, hardly any patch is half full; "
+            "take a textured wall, nearer, in more light"
+        )
     u, v, m = u[known], v[known], m[known]
     random = np.random.default_rng(0)
     picks = random.integers(len(m), size=(GUESSES, TERMS))

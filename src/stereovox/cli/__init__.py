@@ -12,13 +12,30 @@ import os
 import sys
 from collections.abc import Sequence
 from importlib import import_module
+from itertools import pairwise
 from typing import Any, NoReturn
 
 import stereovox
 from stereovox.errors import StereovoxError, did_you_mean
 
-COMMANDS = ("demo", "map", "info", "picture", "view", "export", "bench", "calibrate", "reproduce")
+COMMANDS = (
+    "demo",
+    "map",
+    "info",
+    "picture",
+    "view",
+    "sphere",
+    "export",
+    "bench",
+    "calibrate",
+    "truth",
+    "eval",
+    "reproduce",
+)
 """Each is a module here with a docstring, `EXAMPLE`, `add_arguments(parser)` and `run(arguments) -> dict`."""
+
+ALONE = ("-h", "--help", "--version")
+"""Options that stand before a command, or without one."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -61,20 +78,35 @@ class _Parser(argparse.ArgumentParser):
 
     def __init__(self, **settings: Any):
         self.options: list[str] = []
+        self._words: Sequence[str] = ()
         super().__init__(**settings, allow_abbrev=False)
 
     def add_argument(self, *names: Any, **settings: Any) -> argparse.Action:
         self.options += [name.removeprefix("--") for name in names if name.startswith("--")]
         return super().add_argument(*names, **settings)
 
+    def parse_known_args(  # pyright: ignore[reportIncompatibleMethodOverride] - it has many signatures
+        self, args: Any = None, namespace: Any = None
+    ) -> Any:
+        self._words = args or ()
+        return super().parse_known_args(args, namespace)
+
     def error(self, message: str) -> NoReturn:
-        raise StereovoxError(f"{message}; see: {self.prog} --help")
+        raise StereovoxError(f"{message}{self._joined(message)}; see: {self.prog} --help")
+
+    def _joined(self, message: str) -> str:
+        """Return how to write a value that begins with a minus, if that is what is wrong."""
+        option = message.partition(":")[0].split("/")[-1].removeprefix("argument ")
+        for word, value in pairwise(self._words):
+            if word == option and value.startswith("-") and value.removeprefix("--") not in self.options:
+                return f" (write {option}={value})"
+        return ""
 
     def refuse(self, word: str) -> NoReturn:
         """Say what is wrong with a word that is left over."""
         option = word.partition("=")[0]
         if option.startswith("-"):
-            self.error(f"unknown option '{option}'{did_you_mean(option.strip('-'), self.options)}")
+            self.error(f"unknown option '{option}'{did_you_mean(option.strip('-'), self.options, '--')}")
         self.error(f"'{word}' is one argument too many")
 
 
@@ -97,7 +129,10 @@ def _parse(words: Sequence[str]) -> argparse.Namespace:
 
 
 def _check_command(words: Sequence[str]) -> None:
-    """Name the command that was perhaps meant, which argparse does not."""
+    """Name the command that was perhaps meant, and where options stand, which argparse does not."""
+    if words and words[0].startswith("-") and words[0] not in ALONE:
+        option, command = words[0].partition("=")[0], next((word for word in words if word in COMMANDS), "COMMAND")
+        raise StereovoxError(f"'{option}' stands before the command; write it after: stereovox {command} ... {option}")
     if words and not words[0].startswith("-") and words[0] not in COMMANDS:
         raise StereovoxError(f"unknown command '{words[0]}'{did_you_mean(words[0], COMMANDS)}; see: stereovox --help")
 

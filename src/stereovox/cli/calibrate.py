@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Find out from recordings what a camera measures wrongly, how noisy it is, or how it sits on a tracker.
+"""Find out from recordings what a camera measures wrongly, how noisy it is, or how cameras and trackers stand.
 
-`stereovox calibrate wall --help`, `noise --help` and `pair --help` tell more.
+`stereovox calibrate wall --help`, `noise --help`, `pair --help`, `stereo --help` and `import --help` tell more.
 """
 
 from __future__ import annotations
@@ -10,13 +10,13 @@ from argparse import SUPPRESS, ArgumentParser, Namespace
 from importlib import import_module
 from typing import Any
 
-KINDS = ("wall", "noise", "pair")
+KINDS = ("wall", "noise", "pair", "stereo", "import")
 """Each is a module `calibrate_*` here, made as those of the commands."""
 EXAMPLE = "stereovox calibrate wall recordings/wall --distance 1.4 --out camera.toml"
 
 
 def add_arguments(parser: ArgumentParser) -> None:
-    """Declare the three kinds with their options."""
+    """Declare the kinds with their options."""
     kinds = parser.add_subparsers(dest="kind", metavar="|".join(KINDS), required=True)
     options: list[str] = getattr(parser, "options", [])  # those that a slip of the pen is compared with
     for name in KINDS:

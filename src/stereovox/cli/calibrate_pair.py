@@ -19,11 +19,15 @@ from stereovox.errors import StereovoxError
 
 if TYPE_CHECKING:
     from stereovox.calibrate.pair import PairCalibration
+    from stereovox.sources import Source
     from stereovox.sources.pair_file import PairSettings
 
 EXAMPLE = "stereovox calibrate pair recordings/flight --out recordings/flight/pair.toml"
 UNCERTAIN = (0.5, 0.02)
 """Standard deviations (degrees, metres) above which the user is warned."""
+
+SHORT_S = 3.0
+"""What fails with a recording shorter than this many seconds fails because of that, most likely."""
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -38,9 +42,8 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Calibrate, print the result and write it."""
-    from stereovox.calibrate.pair import calibrate_pair
     from stereovox.sources import Selection
-    from stereovox.sources.pair import open_depth, open_poses
+    from stereovox.sources.pair import open_depth
 
     folder = Path(arguments.recording)
     settings = _settings(folder)
@@ -51,19 +54,43 @@ def run(arguments: Namespace) -> dict[str, Any]:
     depth = open_depth(folder, settings)
     for note in getattr(depth, "notes", ()):
         say(f"note: {note}")
-    found = calibrate_pair(
-        Selection(depth, arguments.frames) if arguments.frames else depth,
+    depth = Selection(depth, arguments.frames) if arguments.frames else depth
+    try:
+        found = _calibrated(depth, folder, settings, arguments.within)
+    except StereovoxError as error:
+        if type(error) is not StereovoxError:
+            raise  # a file or library that is missing
+        raise StereovoxError(f"{_too_short(depth)}{error}") from None
+    _tell(found)
+    _write(arguments, folder, settings, found)
+    return {**found.as_dict(), "out": arguments.out}
+
+
+def _calibrated(depth: Source, folder: Path, settings: PairSettings, within_s: float | None) -> PairCalibration:
+    from stereovox.calibrate.pair import calibrate_pair
+    from stereovox.sources.pair import open_poses
+
+    return calibrate_pair(
+        depth,
         open_poses(folder, replace(settings, clock_offset_s=0.0)),
         min_confidence=settings.min_confidence,
         max_speed_mps=settings.max_speed_mps,
         max_turn_dps=settings.max_turn_dps,
         guess_s=settings.clock_offset_s,
-        within_s=arguments.within,
+        within_s=within_s,
         progress=lambda frames, total: tracked(frames, total, "registering images"),
     )
-    _tell(found)
-    _write(arguments, folder, settings, found)
-    return {**found.as_dict(), "out": arguments.out}
+
+
+def _too_short(depth: Source) -> str:
+    """Return the first thing to say of a recording that was too short, whatever failed for it."""
+    from stereovox.sources.pair import image_times
+
+    first_ns, last_ns = image_times(depth)
+    seconds = (last_ns - first_ns) / 1e9
+    if seconds >= SHORT_S:
+        return ""
+    return f"{depth.name}: {len(depth)} images in {max(seconds, 0):.1f} s are too few; record for ten seconds or more: "
 
 
 def _settings(folder: Path) -> PairSettings:

@@ -38,7 +38,9 @@ def run(arguments: Namespace) -> dict[str, Any]:
 
 def _tell(result: dict[str, Any]) -> None:
     accuracy = result["accuracy"]
-    say(f"{result['frames']} frames, {milliseconds(result['integrate_ms'])} a frame")
+    parts = [f"{result[name]['median']:.2f} ms" for name in ("depth_ms", "integrate_ms")]
+    say(f"{result['frames']} frames; a frame: {milliseconds(result['frame_ms'])}")
+    say(f"medians of its parts: {parts[0]} to prepare the depth image, {parts[1]} to put it into the map")
     say(cells_line(result))
     say(
         f"against the exact scene, within one cell: precision {accuracy['tolerance_precision']:.3f}, "

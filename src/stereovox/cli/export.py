@@ -10,6 +10,7 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import Any
 
+from stereovox.cli.saved_map import open_map
 from stereovox.cli.terminal import say, size
 
 EXAMPLE = "stereovox export kitchen.svox kitchen.bt"
@@ -23,10 +24,9 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Load the map and write it in the other format."""
-    from stereovox.maps import load_map
     from stereovox.products import export
 
     file = Path(arguments.file)
-    export(load_map(arguments.map), file)
+    export(open_map(arguments.map), file)
     say(f"saved {file} ({size(file.stat().st_size)})")
     return {"file": str(file), "bytes": file.stat().st_size}

@@ -4,11 +4,18 @@
 from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
-from typing import Any
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any
 
+from stereovox.cli.saved_map import open_map
 from stereovox.cli.terminal import say, size, thousands
 
+if TYPE_CHECKING:
+    from stereovox.config import Config
+
 EXAMPLE = "stereovox info kitchen.svox"
+TOLD = ("profile", "voxel_size", "integrator", "max_range")
+"""Settings that are told in any case."""
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -18,10 +25,8 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Load the map and tell about it."""
-    from stereovox.maps import load_map
-
-    voxel_map = load_map(arguments.map)
-    bounds = voxel_map.bounds()
+    voxel_map = open_map(arguments.map)
+    bounds, config = voxel_map.bounds(), voxel_map.config
     result = {
         "voxel_size": voxel_map.voxel_size,
         "bounds": None if bounds is None else bounds.round(6).tolist(),
@@ -29,17 +34,45 @@ def run(arguments: Namespace) -> dict[str, Any]:
         "memory_bytes": voxel_map.memory_bytes,
         "frames": voxel_map.frames,
         "frames_refused": voxel_map.frames_refused,
-        "profile": voxel_map.config.profile,
-        "settings": voxel_map.config.model_dump(),
+        "recording": voxel_map.recording,
+        "profile": config.profile,
+        "settings": config.model_dump(mode="json"),
+        "changed": _changed(config),
     }
     _tell(result)
     return result
 
 
 def _tell(result: dict[str, Any]) -> None:
-    say(f"cells of {result['voxel_size']:g} m, profile {result['profile']}")
+    settings = result["settings"]
+    say(f"made of {result['recording'] or 'frames without a name'}, profile {result['profile']}")
+    say(f"cells of {result['voxel_size']:g} m, {settings['integrator']}, depth up to {settings['max_range']:g} m")
+    if result["changed"]:
+        say(f"changed: {', '.join(f'{name} = {value}' for name, value in result['changed'].items())}")
     if result["bounds"]:
         (x0, y0, z0), (x1, y1, z1) = result["bounds"]
         say(f"from ({x0:g}, {y0:g}, {z0:g}) to ({x1:g}, {y1:g}, {z1:g}) m")
     say(", ".join(f"{thousands(result[state])} {state}" for state in ("occupied", "free", "tentative")))
-    say(f"{result['frames']} frames ({result['frames_refused']} refused), {size(result['memory_bytes'])} in memory")
+    loaded = "in memory once loaded" + ("" if settings["window"]["size"] is None else ", whatever its window took")
+    say(f"{result['frames']} frames ({result['frames_refused']} refused), {size(result['memory_bytes'])} {loaded}")
+
+
+def _changed(config: Config) -> dict[str, Any]:
+    """Return the settings that are not those of the map's profile, or that a profile file itself changed."""
+    from stereovox.config import load_config, profile_names
+
+    profile = config.profile if config.profile in profile_names() else {}  # a file lies on what is built into Config
+    usual = dict(_flat(load_config(profile).model_dump(mode="json")))
+    return {
+        name: value
+        for name, value in _flat(config.model_dump(mode="json"))
+        if name not in TOLD and (name not in usual or usual[name] != value)
+    }
+
+
+def _flat(settings: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for name, value in settings.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{prefix}{name}.")
+        else:
+            yield prefix + name, value

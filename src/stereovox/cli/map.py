@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from stereovox.sources import Stream
 
 PATIENCE = 100
-"""Frames of a live camera that may be refused before the first one that is not."""
+"""Frames of a live camera that a run may refuse before the first that it does not."""
 EXAMPLE = "stereovox map recordings/kitchen --out kitchen.svox --voxel-size 0.05"
 
 
@@ -72,18 +72,20 @@ def run(arguments: Namespace) -> dict[str, Any]:
 
         source = with_camera(source, arguments.camera)
     mapper = _mapper(arguments, out)
-    _check_recording(mapper, source, out)
-    for note in source.notes:
-        say(f"note: {note}")
-    say_about_compiling()
-    reports = _add_all(mapper, source, out)
-    result = summarise(mapper.map, reports)
-    if not mapper.map.frames:
-        raise StereovoxError(
-            f"{arguments.source}: not one frame could be used, no map is written ({_first_refusal(reports)})"
-        )
-    mapper.map.save(out)
-    mapper.map.close()
+    try:
+        _check_recording(mapper, source, out)
+        for note in source.notes:
+            say(f"note: {note}")
+        say_about_compiling()
+        reports = _add_all(mapper, source, out)
+        result = summarise(mapper.map, reports)
+        if not mapper.map.frames:
+            raise StereovoxError(
+                f"{arguments.source}: not one frame could be used, no map is written ({_first_refusal(reports)})"
+            )
+        mapper.map.save(out)
+    finally:
+        mapper.map.close()  # whatever went wrong: tiles that stay behind would be in the next run's way
     _tell(result, reports, out)
     return result
 
@@ -129,6 +131,8 @@ def _overrides(arguments: Namespace) -> dict[str, Any]:
             raise StereovoxError(f"--set {setting}: write KEY=VALUE, for example --set sensor.p_hit=0.8")
         if key.strip() in ("profile", "resume"):
             raise StereovoxError(f"--set {setting}: this is no setting; use --{key.strip()}")
+        if key.strip() in ("tiles", "self"):  # other names that `Mapper` knows
+            raise StereovoxError(f"--set {setting}: this is no setting; leave it out")
         overrides[key.strip()] = parse_value(value.strip())
     named = {name: getattr(arguments, name) for name in ("voxel_size", "integrator", "max_range", "threads")}
     return {**overrides, **{name: value for name, value in named.items() if value is not None}}
@@ -148,8 +152,11 @@ def _add_all(mapper: Mapper, source: Stream, out: Path) -> list[UpdateReport]:
             for frame in tracked(source, source.length, "mapping"):
                 reports.append(mapper.add(frame))
                 check()
-                if source.length is None and not mapper.map.frames and len(reports) == PATIENCE:
-                    break  # a live camera would be refused for ever
+                if source.length is None and len(reports) == PATIENCE and all(one.refused for one in reports):
+                    left = f"{out} stays as it is" if done else "no map is written"  # it would be refused for ever
+                    raise StereovoxError(
+                        f"{source.name}: not one of {PATIENCE} frames could be used, {left} ({_first_refusal(reports)})"
+                    )
     except (KeyboardInterrupt, SourceError):
         if mapper.map.frames:
             mapper.map.save(out)

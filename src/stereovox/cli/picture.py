@@ -6,12 +6,19 @@ from __future__ import annotations
 import math
 from argparse import ArgumentParser, ArgumentTypeError, Namespace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from stereovox.cli.saved_map import open_map
 from stereovox.cli.terminal import say
 from stereovox.errors import StereovoxError
 
+if TYPE_CHECKING:
+    from stereovox.maps import VoxelMap
+
 EXAMPLE = "stereovox picture kitchen.svox kitchen.png --view layer --up=-y"
+
+USED = {"overview": (), "layer": ("at", "eye", "toward"), "axis": ("eye", "toward"), "space": ("eye", "toward")}
+"""Options that only some views can use."""
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -30,7 +37,6 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Load the map and write its picture."""
-    from stereovox.maps import load_map
     from stereovox.view.drawn import checked_up
     from stereovox.view.figures import save
     from stereovox.view.views import draw_view
@@ -39,13 +45,33 @@ def run(arguments: Namespace) -> dict[str, Any]:
     file = Path(arguments.file)
     if file.suffix.lower() != ".png":
         raise StereovoxError(f"{file}: pictures are written as .png; name the file so")
-    voxel_map = load_map(arguments.map)
+    _check_use(arguments)
+    voxel_map = open_map(arguments.map)
     up = checked_up(arguments.up or voxel_map.config.up)
     viewpoint = viewpoint_at(voxel_map, arguments.eye, arguments.toward, up)
     heading = _plain(arguments.title or Path(arguments.map).stem)
     save(draw_view(voxel_map, arguments.view, heading, up, arguments.at, viewpoint), file)
+    if arguments.at is not None:
+        _tell_if_outside(voxel_map, up, arguments.at)
     say(f"saved {file}")
     return {"picture": str(file)}
+
+
+def _check_use(arguments: Namespace) -> None:
+    """Refuse an option that the view would not look at."""
+    for name in ("at", "eye", "toward") if arguments.view in USED else ():
+        if getattr(arguments, name) is not None and name not in USED[arguments.view]:
+            users = ", ".join(f"--view {view}" for view, options in USED.items() if name in options)
+            raise StereovoxError(f"--{name}: the view '{arguments.view}' does not use it; it goes with: {users}")
+
+
+def _tell_if_outside(voxel_map: VoxelMap, up: str, at_m: float) -> None:
+    bounds = voxel_map.bounds()
+    if bounds is None:
+        return
+    low, high = sorted(bounds[:, "xyz".index(up[-1])] * (-1 if up.startswith("-") else 1) + 0.0)  # no "-0"
+    if not low <= at_m < high:
+        say(f"note: --at {at_m:g} is outside the map ({up} = {low:g} to {high:g} m): all cells there are unknown")
 
 
 def _point(text: str) -> tuple[float, float, float]:

@@ -69,6 +69,8 @@ def read_walls(
 
 def _read(name: str, distance: float | None, frames: str | None, camera: str | None, raw: bool) -> WallRecording:
     from stereovox.calibrate.recording import read_wall
+    from stereovox.config import load_config
+    from stereovox.depth import DepthPath
     from stereovox.sources import open_images, parse_slice
     from stereovox.sources.with_camera import with_camera
 
@@ -77,11 +79,16 @@ def _read(name: str, distance: float | None, frames: str | None, camera: str | N
         stream = with_camera(stream, camera)
     for note in getattr(stream, "notes", ()):
         say(f"note: {note}")
+    if raw and stream.camera.correction:
+        say(f"note: {name}: its depth correction is left out here: a new one is to be found")
     count = stream.length
     if count is None and (frames is None or parse_slice(frames).stop is None):
         count = LIVE_FRAMES
+    path = DepthPath(load_config())
     shown = tracked(islice(stream, count), count, name)
-    return read_wall(shown, name, replace(stream.camera, correction=None) if raw else stream.camera, distance)
+    return read_wall(
+        map(path.matched, shown), name, replace(stream.camera, correction=None) if raw else stream.camera, distance
+    )
 
 
 def check_distances(names: Sequence[str], distances: Sequence[float], option: str = "--distance") -> None:

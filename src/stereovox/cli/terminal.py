@@ -110,4 +110,5 @@ def thousands(number: Any) -> str:
 def cells_line(result: dict[str, Any]) -> str:
     """Return one line about the cells of a map and the memory they need."""
     occupied, free = thousands(result["occupied"]), thousands(result["free"])
-    return f"{occupied} occupied and {free} free cells in {size(result['memory_bytes'])}"
+    reserved = ", reserved for the window" if result.get("memory_reserved") else ""
+    return f"{occupied} occupied and {free} free cells in {size(result['memory_bytes'])}{reserved}"

@@ -9,6 +9,7 @@ from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
+from stereovox.cli.saved_map import open_map
 from stereovox.cli.terminal import say
 
 EXAMPLE = "stereovox view kitchen.svox"
@@ -17,17 +18,20 @@ EXAMPLE = "stereovox view kitchen.svox"
 def add_arguments(parser: ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("map", metavar="MAP", help="folder of a map")
+    parser.add_argument(
+        "--up", metavar="AXIS", help="which way is up: z, -y, x ... (default: as the map's settings say)"
+    )
     parser.add_argument("--host", default="127.0.0.1", help="address to serve; 0.0.0.0 lets others look (default here)")
     parser.add_argument("--port", type=int, default=8080, help="port of the page; 0 for any that is free (8080)")
 
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Serve the page until Ctrl-C."""
-    from stereovox.maps import load_map
     from stereovox.view.viewer import is_private, open_viewer
 
     logging.getLogger("websockets.server").setLevel(logging.CRITICAL)  # tells of every browser that hangs up early
-    viewer = open_viewer(load_map(arguments.map), Path(arguments.map).stem, arguments.host, arguments.port)
+    name = Path(arguments.map).stem
+    viewer = open_viewer(open_map(arguments.map), name, arguments.host, arguments.port, arguments.up)
     with closing(viewer), suppress(KeyboardInterrupt):
         if not is_private(arguments.host):
             say(f"warning: anyone who can reach {arguments.host} over the network can look at this map")

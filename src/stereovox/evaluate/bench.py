@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.config import Config, load_config
-from stereovox.depth import prepare
+from stereovox.depth import DepthPath, prepare
 from stereovox.errors import FrameRefused, StereovoxError
 from stereovox.evaluate.peers import Peer, find_peer
-from stereovox.frame import Frame, Reason
+from stereovox.frame import AnyFrame, Frame, Reason
 from stereovox.mapper import Mapper
 
 OURS = "stereovox"
@@ -39,7 +39,7 @@ class _Limits:
 
 
 def bench(
-    source: Iterable[Frame],
+    source: Iterable[AnyFrame],
     voxel_sizes: Sequence[float],
     peers: Sequence[str],
     threads: int = 1,
@@ -103,15 +103,16 @@ def _configs(voxel_sizes: Sequence[float], threads: int, max_range: float | None
     return configs
 
 
-def _load(source: Iterable[Frame], config: Config, limit: int | None, tell: Progress) -> tuple[list[Frame], int]:
+def _load(source: Iterable[AnyFrame], config: Config, limit: int | None, tell: Progress) -> tuple[list[Frame], int]:
     """Return the frames that can be used, only the pixels in them that count, and the number of those refused."""
     total = operator.length_hint(source)
     total = total if limit is None else min(total, limit)
     frames: list[Frame] = []
+    path = DepthPath(config)
     done, first_refusal = 0, "the source is empty"
     for done, frame in enumerate(islice(source, limit), start=1):
         try:
-            frames.append(_only_valid_pixels(frame, config))
+            frames.append(_only_valid_pixels(path.matched(frame), config))
         except FrameRefused as refused:
             first_refusal = first_refusal if len(frames) + 1 < done else str(refused)
         tell(done, total, "reading frames")

@@ -8,11 +8,18 @@ import itertools
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from stereovox.maps import VoxelMap
+
 _BITS = 21
 _HALF = 1 << (_BITS - 1)
 
 Keys = NDArray[np.int64]
 """(N,) int64, ascending and without repeats where it stands for a set."""
+
+
+def occupied_cells(voxel_map: VoxelMap) -> NDArray[np.int64]:
+    """Return the indices (N, 3) of all occupied cells of a map, ascending."""
+    return np.floor(voxel_map.occupied() / voxel_map.voxel_size).astype(np.int64)
 
 
 def keys(indices: ArrayLike) -> Keys:

@@ -52,6 +52,7 @@ def demo(
     source = source or Simulation()
     tell = progress or (lambda done, total, text: None)
     mapper = Mapper(voxel_size=voxel_size)
+    mapper.map.recording = source.name
     truth = exact_occupancy(source.scene, voxel_size)
     sightings = Sightings(truth.surface, voxel_size)
     reports = _map(mapper, source, sightings, tell)
@@ -82,7 +83,7 @@ def _map(mapper: Mapper, source: Simulation, sightings: Sightings, tell: Progres
     reports = []
     for i, (depth, frame) in enumerate(_simulated(source)):
         reports.append(mapper.add(frame))
-        sightings.add(depth, frame.camera, frame.T_world_sensor, mapper.config.max_range)
+        sightings.add(depth, source.camera, frame.T_world_sensor, mapper.config.max_range)
         tell(i + 1, len(source), "flying and mapping")
     return reports
 
@@ -105,7 +106,7 @@ def _facts(source: Simulation, mapper: Mapper, reports: list[UpdateReport]) -> d
         "source": source.name,
         "camera": f"RealSense D435 ({camera.width}x{camera.height})",
         "voxel_size": mapper.map.voxel_size,
-        "settings": mapper.config.model_dump(),
+        "settings": mapper.config.model_dump(mode="json"),
         **summarise(mapper.map, reports),
     }
 

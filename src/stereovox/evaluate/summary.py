@@ -16,7 +16,8 @@ from stereovox.maps import VoxelMap
 def summarise(voxel_map: VoxelMap, reports: Sequence[UpdateReport]) -> dict[str, Any]:
     """Return frames, refusals by reason, milliseconds a frame, cells and memory of a run.
 
-    Times leave out the first frame that was taken in, which may compile kernels.
+    `frame_ms` is the whole of a frame, `match_ms` (stereo pairs), `depth_ms` and `integrate_ms` are its parts. Times leave out the first frame
+    that was taken in, which may compile kernels. `memory_reserved`: the memory is that of a window, taken at the start.
     """
     taken = [report for report in reports if not report.refused]
     refused = Counter(report.refused for report in reports if report.refused)
@@ -24,10 +25,13 @@ def summarise(voxel_map: VoxelMap, reports: Sequence[UpdateReport]) -> dict[str,
         "frames": len(taken),
         "frames_refused": refused.total(),
         "refused": dict(refused.most_common()),
+        "match_ms": percentiles([report.match_ms for report in taken]),
         "depth_ms": percentiles([report.depth_ms for report in taken]),
         "integrate_ms": percentiles([report.integrate_ms for report in taken]),
+        "frame_ms": percentiles([report.match_ms + report.depth_ms + report.integrate_ms for report in taken]),
         **voxel_map.counts(),
         "memory_bytes": voxel_map.memory_bytes,
+        "memory_reserved": voxel_map.config.window.size is not None,
     }
 
 

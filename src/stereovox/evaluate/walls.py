@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stereovox.errors import StereovoxError
-from stereovox.evaluate.cells import Keys, indices, keys, position
+from stereovox.evaluate.cells import Keys, indices, keys, occupied_cells, position
 from stereovox.maps import VoxelMap
 from stereovox.sources.scene import Solid
 
@@ -82,7 +82,7 @@ def measure_wall(
     """
     size = voxel_map.voxel_size
     axis = int(np.argmax(np.abs(wall.normal)))
-    occupied = _near(np.floor(voxel_map.occupied() / size).astype(np.int64), wall, size, reach)
+    occupied = _near(occupied_cells(voxel_map), wall, size, reach)
     face = _over(wall, size) if only is None else indices(only)
     columns = np.unique(_column(_near(face, wall, size, size), axis))
     if others is not None:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Slow, obvious twins of the integrators in float64 NumPy. They share no code with the kernels.
 
-Both return evidence on cells as two arrays: indices (N, 3) int64 in ascending order, log-odds (N,) float64 without
+All return evidence on cells as two arrays: indices (N, 3) int64 in ascending order, log-odds (N,) float64 without
 zeros. Tests compare the kernels with them, and them with OctoMap.
 """
 
@@ -13,8 +13,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from stereovox.cameras import PinholeCamera
 from stereovox.config import Config
 from stereovox.frame import DepthImage
+from stereovox.rigs import VirtualCamera
 from stereovox.sensors.model import COLUMNS, REACH_SIGMA, ROWS, InverseSensorModel, SensorTable, tabulate
 from stereovox.sensors.noise import RangeNoise
 
@@ -39,7 +41,8 @@ def _shared(image: DepthImage, config: Config, sensor: InverseSensorModel, depth
     indices, evidence, depths = np.concatenate(indices), np.concatenate(evidence), np.concatenate(depths)
     if config.ray.update == "once":
         return _strongest(indices, evidence)
-    weight = np.minimum(1.0, (depths / (image.camera.fx * config.voxel_size)) ** 2)  # Chien 2020, Eq 3.21
+    focal_px = image.camera.focal_px / image.camera.binning
+    weight = np.minimum(1.0, (depths / (focal_px * config.voxel_size)) ** 2)  # Chien 2020, Eq 3.21
     cells, of_cell = np.unique(indices, axis=0, return_inverse=True)
     return _known(cells, np.bincount(of_cell.ravel(), weight * evidence))
 
@@ -47,11 +50,13 @@ def _shared(image: DepthImage, config: Config, sensor: InverseSensorModel, depth
 def project(image: DepthImage, config: Config, sensor: InverseSensorModel) -> Cells:
     """Project every cell within range into the image.
 
-    Cells that hold a measured point get the hit evidence. Other cells get the positive evidence of the pixel at their
-    centre where there is any, else the negative evidence of the farthest pixel in a window about their own size.
+    Cells that hold a measured point get the hit evidence at their centre's depth: in full where `full_share` of their
+    footprint measures a depth within half a cell, with less by the square root of the part. Other cells get the
+    positive evidence of the pixel at their centre where there is any, else the negative evidence of the farthest pixel
+    in a window about their own size.
     """
     table = _table(image, config, sensor)
-    hits, hit_evidence, _ = _hits(image, config, table)
+    hits, hit_evidence = _weighed(np.unique(_hit_cells(image, config), axis=0), image, config, table)
     cells = _cells_in_range(image, config)
     pixels, z, size_px, seen = _projected(cells, image, config)
     cells, pixels, z, size_px = cells[seen], pixels[seen], z[seen], size_px[seen]
@@ -62,7 +67,7 @@ def project(image: DepthImage, config: Config, sensor: InverseSensorModel) -> Ce
 
 
 def _table(image: DepthImage, config: Config, sensor: InverseSensorModel) -> SensorTable:
-    table = tabulate(sensor, RangeNoise.of(config.noise, image.camera), config.max_range)
+    table = tabulate(sensor, RangeNoise.of(config.noise, image.camera), config.max_range, config.voxel_size)
     return replace(table, log_odds=np.round(table.log_odds, 3), hit=np.round(table.hit, 3))  # as a map keeps them
 
 
@@ -70,7 +75,7 @@ def _rays(
     image: DepthImage, config: Config, table: SensorTable, depths_of: Callable
 ) -> Iterator[tuple[NDArray, NDArray, NDArray]]:
     """Yield for each ray the cells it gives evidence to, that evidence, and the depth that stands for each cell."""
-    slopes = image.camera.back_project(np.ones(image.depth_m.shape)).reshape(-1, 3)
+    slopes = _points_at_one(image.camera).reshape(-1, 3)
     T = image.T_world_sensor
     marks = bool((table.log_odds > 0).any())
     for d, slope in zip(image.depth_m.ravel().astype(float), slopes, strict=True):
@@ -89,6 +94,18 @@ def _rays(
             cells, evidence, middle = cells[others], evidence[others], middle[others]
             cells, evidence, middle = np.vstack([cells, hit]), np.append(evidence, table.hit[row]), np.append(middle, d)
         yield cells, evidence, middle
+
+
+def _points_at_one(camera: VirtualCamera) -> NDArray[np.float64]:
+    """Return the point (height, width, 3) that each pixel sees at depth 1; see `stereovox.cameras` for wide ones."""
+    if isinstance(camera, PinholeCamera):
+        return camera.back_project(np.ones((camera.height, camera.width)))
+    columns, rows = camera.rays()
+    points = np.empty((camera.height, camera.width, 3))
+    for v in range(camera.height):
+        for u in range(camera.width):
+            points[v, u] = columns[u], rows[v, 0], rows[v, 1]
+    return points
 
 
 def _crossed(start: NDArray, direction: NDArray, end: float) -> NDArray:
@@ -114,12 +131,36 @@ def _plane_crossings(start: NDArray, direction: NDArray, end: float) -> NDArray:
     return depths[(depths > 0) & (depths < end)]
 
 
-def _hits(image: DepthImage, config: Config, table: SensorTable) -> tuple[NDArray, NDArray, NDArray]:
+def _hit_cells(image: DepthImage, config: Config) -> NDArray[np.int64]:
     depth = image.depth_m.astype(float)
     points = image.camera.back_project(depth)[np.isfinite(depth)]
     world = points @ image.T_world_sensor[:3, :3].T + image.T_world_sensor[:3, 3]
-    d = points[:, 2]
-    return np.floor(world / config.voxel_size).astype(np.int64), table.hit[_row(table, d)], d
+    return np.floor(world / config.voxel_size).astype(np.int64)
+
+
+def _weighed(
+    cells: NDArray[np.int64], image: DepthImage, config: Config, table: SensorTable
+) -> tuple[NDArray, NDArray]:
+    x, y, z = _centres_in_camera(cells, image, config)
+    z = np.maximum(z, NEAR_PLANE)  # large cells hold points before the camera although their centre lies behind it
+    uv, size_px = _pixels_at(x, y, z, image, config)
+    evidence = table.hit[_row(table, np.minimum(z, config.max_range))]
+    full, weights = config.projective.full_share, np.ones(len(cells))
+    if full > 0:
+        shares = [_share(image, *numbers, config.voxel_size) for numbers in zip(uv, z, size_px, strict=True)]
+        weights = np.where(evidence > 0, np.sqrt(np.minimum(1, np.array(shares) / full)), 1.0)
+    return cells, np.where(evidence > 0, np.maximum(np.round(evidence * weights, 3), 0.001), 0.0)
+
+
+def _share(image: DepthImage, uv: NDArray, z: float, size_px: float, voxel_size: float) -> float:
+    height, width = image.depth_m.shape
+    size_px = min(size_px, width)
+    n = int(np.clip(size_px, 1, 4))
+    steps = ((np.arange(n) + 0.5) / n - 0.5) * size_px
+    u, v = np.floor(uv[0] + steps).astype(int), np.floor(uv[1] + steps).astype(int)
+    u, v = u[(u >= 0) & (u < width)], v[(v >= 0) & (v < height)]
+    samples = image.depth_m[np.ix_(v, u)]
+    return max(float((np.abs(samples - z) <= voxel_size / 2).sum()), 0.5) / max(samples.size, 1)
 
 
 def _cells_in_range(image: DepthImage, config: Config) -> NDArray[np.int64]:
@@ -131,15 +172,27 @@ def _cells_in_range(image: DepthImage, config: Config) -> NDArray[np.int64]:
 
 def _projected(cells: NDArray, image: DepthImage, config: Config) -> tuple[NDArray, NDArray, NDArray, NDArray]:
     """Return pixel (N, 2) column and row, depth and size in pixels of each cell, and whether it is seen."""
-    camera, T = image.camera, image.T_world_sensor
-    x, y, z = (((cells + 0.5) * config.voxel_size - T[:3, 3]) @ T[:3, :3]).T
+    camera = image.camera
+    x, y, z = _centres_in_camera(cells, image, config)
     ahead = (z > NEAR_PLANE) & (z <= config.max_range)
     z_safe = np.where(ahead, z, 1.0)
-    size_px = camera.fx * config.voxel_size / z_safe
-    uv = np.stack([camera.fx * x / z_safe + camera.cx, camera.fy * y / z_safe + camera.cy], axis=1) + 0.5
+    uv, size_px = _pixels_at(x, y, z_safe, image, config)
     rim, end = RIM_SHARE * config.voxel_size / z_safe[:, None] * [camera.fx, camera.fy], [camera.width, camera.height]
     seen = ahead & ((uv >= -rim) & (uv < end + rim)).all(axis=1)
     return uv, z, size_px, seen
+
+
+def _centres_in_camera(cells: NDArray, image: DepthImage, config: Config) -> NDArray[np.float64]:
+    """Return x, y and z (3, N) of the cells' centres along the camera's axes, in metres."""
+    T = image.T_world_sensor
+    return (((cells + 0.5) * config.voxel_size - T[:3, 3]) @ T[:3, :3]).T
+
+
+def _pixels_at(x: NDArray, y: NDArray, z: NDArray, image: DepthImage, config: Config) -> tuple[NDArray, NDArray]:
+    """Return column and row (N, 2), counted from the image's border, and the size of a cell in pixels (N,)."""
+    camera = image.camera
+    uv = np.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], axis=1) + 0.5
+    return uv, camera.fx * config.voxel_size / z
 
 
 def _farthest_in_window(image: DepthImage, uv: NDArray, size_px: NDArray) -> NDArray:

@@ -16,8 +16,10 @@ from stereovox.config import Config
 from stereovox.frame import DepthImage
 from stereovox.integrate import _cull, _evaluate, _hits
 from stereovox.integrate._cells import NEAR_PLANE, NO_RETURN
+from stereovox.integrate.faces import faces_of
+from stereovox.integrate.merging import strongest
 from stereovox.integrate.shards import in_shards, shards
-from stereovox.integrate.views import KernelTable, View, origin_block, sensor_table, view_of
+from stereovox.integrate.views import KernelTable, View, farthest_cells, origin_block, sensor_table, view_of
 from stereovox.integrate.windows import WindowBuilder, Windows
 from stereovox.maps.blocks import CELLS, SIDE, BlockPool
 from stereovox.maps.evidence import Evidence
@@ -35,8 +37,13 @@ class Projective:
         self._camera: PinholeCamera | None = None
 
     def evidence(self, image: DepthImage) -> Evidence:
-        """Return what `image` says about the cells it sees."""
-        self._prepare(image.camera)
+        """Return what `image` says about the cells it sees; that of a wide camera is cut into pinhole images."""
+        if isinstance(image.camera, PinholeCamera):
+            return self._of_pinhole(image, image.camera)
+        return strongest([self._of_pinhole(face, face.camera) for face in faces_of(image)])  # pyright: ignore
+
+    def _of_pinhole(self, image: DepthImage, camera: PinholeCamera) -> Evidence:
+        self._prepare(camera)
         view = view_of(image, self._config.voxel_size, self._config.max_range)
         windows, farthest = self._builder.build(image.depth_m, float(view.spread) / self._config.max_range)
         if self._table.marks:
@@ -62,9 +69,8 @@ class Projective:
 
     def _key_rows(self, camera: PinholeCamera) -> NDArray[np.signedinteger]:
         """Return scratch for the keys of two pixel rows, of the narrowest kind that tells all cells apart."""
-        corner = np.hypot(1.0, np.hypot(*(np.abs(slopes).max() for slopes in camera.ray_slopes())))
-        cells = corner * self._config.max_range / self._config.voxel_size + SIDE
-        narrow = cells < 1 << (_hits.NARROW - 1) and (self._table.hit == self._table.hit[0]).all()
+        cells = farthest_cells(camera, self._config.max_range, self._config.voxel_size)
+        narrow = cells < 1 << (_hits.NARROW - 1)
         pixels = _hits.GROUP * -(-camera.width // _hits.GROUP)
         return np.zeros((2, _hits.LEFT + pixels + _hits.RIGHT), np.int32 if narrow else np.int64)
 
@@ -79,22 +85,11 @@ class Projective:
     def _scatter_hits(self, depth_m: NDArray[np.float32], view: View) -> None:
         hits = self._hits
         hits.clear()
-        while not _hits.scatter(
-            depth_m,
-            view,
-            self._table,
-            self._keys,
-            self._news,
-            self._fresh,
-            self._seen,
-            hits.table,
-            hits.coords,
-            hits.count,
-            hits.values,
-            0,
-            len(depth_m),
-        ):
+        scratch = (self._keys, self._news, self._fresh, self._seen)
+        while not _hits.scatter(depth_m, view, *scratch, hits.table, hits.coords, hits.count, hits.values):
             hits.reserve(len(hits.coords))
+        full_share = np.float32(self._config.projective.full_share)
+        _hits.weigh(depth_m, view, self._table, full_share, hits.coords, hits.count, hits.values)
 
     def _candidates(self, view: View, windows: Windows, end: float) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
         low, high = _coarse_range(view, end)
@@ -144,7 +139,7 @@ def _coarse_range(view: View, end: float) -> tuple[NDArray[np.int64], NDArray[np
     """Return the first and last coarse box (3,) that the view up to depth `end` can touch."""
     rim_x, rim_y = (view.rim / end + 1) / view.intrinsics[:2]
     x = np.array([view.columns[0] - rim_x, view.columns[-1] + rim_x]) * end
-    y = np.array([view.rows[0] - rim_y, view.rows[-1] + rim_y]) * end
+    y = np.array([view.rows[0, 0] - rim_y, view.rows[-1, 0] + rim_y]) * end
     corners = np.array([[0, 0, 0], *[[a, b, end] for a in x for b in y]], float)
     world = corners @ view.rotation.astype(float) + view.position
     side = _cull.COARSE * SIDE * float(view.voxel_size)

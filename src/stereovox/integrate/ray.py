@@ -9,15 +9,15 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox.cameras import PinholeCamera
 from stereovox.config import Config
 from stereovox.frame import DepthImage
 from stereovox.integrate import _lanes, _line, _ray
 from stereovox.integrate.lanes import make_lanes
 from stereovox.integrate.shards import in_shards, shards
-from stereovox.integrate.views import KernelTable, View, origin_block, sensor_table, view_of
-from stereovox.maps.blocks import CELLS, SIDE, BlockPool
+from stereovox.integrate.views import KernelTable, Rays, farthest_cells, origin_block, rays_of, sensor_table
+from stereovox.maps.blocks import CELLS, BlockPool
 from stereovox.maps.evidence import Evidence
+from stereovox.rigs import VirtualCamera
 from stereovox.sensors import make_sensor
 
 
@@ -35,14 +35,15 @@ class Ray:
         self._config = config
         self._sensor = make_sensor(config.sensor)
         self._pools = [BlockPool(np.int32, capacity=8192) for _ in range(config.threads)]
-        self._camera: PinholeCamera | None = None
+        self._camera: VirtualCamera | None = None
 
     def evidence(self, image: DepthImage) -> Evidence:
         """Return what `image` says about the cells its rays cross."""
         config, camera = self._config, image.camera
         self._prepare(camera)
-        view = view_of(image, config.voxel_size, config.max_range)
-        weight = np.float32((camera.fx * config.voxel_size) ** -2 if config.ray.update == "every" else 0)
+        view = rays_of(image, config.voxel_size, config.max_range)
+        cell_px = camera.focal_px / camera.binning * config.voxel_size  # at a depth of one metre
+        weight = np.float32(cell_px**-2 if config.ray.update == "every" else 0)
         parts = shards(camera.height, config.threads)
         number = {part.start: n for n, part in enumerate(parts)}
         in_shards(lambda part: self._follow(image.depth_m, view, weight, number[part.start], part), parts)
@@ -52,18 +53,18 @@ class Ray:
         origin = origin_block(image.T_world_sensor, config.voxel_size).astype(np.int32)
         return Evidence(pool.coords[: len(pool)] + origin, values, np.empty((0, 3), np.int32), 0)
 
-    def _prepare(self, camera: PinholeCamera) -> None:
+    def _prepare(self, camera: VirtualCamera) -> None:
         if camera == self._camera:
             return
         self._table: KernelTable = sensor_table(self._sensor, self._config, camera)
         self._look_up = (self._table.clear + self._table.mark).ravel()
-        corner = np.hypot(1.0, np.hypot(*(np.abs(slopes).max() for slopes in camera.ray_slopes())))
-        cells = corner * (self._config.max_range + self._table.reach[-1]) / self._config.voxel_size + SIDE
+        reach = self._config.max_range + float(self._table.reach[-1])
+        cells = farthest_cells(camera, reach, self._config.voxel_size)
         wide = bool(cells >= 1 << (_lanes.NARROW - 1))
         self._lanes = [make_lanes(wide) for _ in self._pools]
         self._camera = camera
 
-    def _follow(self, depth_m: NDArray[np.float32], view: View, weight: np.float32, worker: int, part: slice) -> None:
+    def _follow(self, depth_m: NDArray[np.float32], view: Rays, weight: np.float32, worker: int, part: slice) -> None:
         pool, lanes = self._pools[worker], self._lanes[worker]
         pool.clear()
         while not self._kernel(

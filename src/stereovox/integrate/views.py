@@ -15,6 +15,7 @@ from stereovox.frame import DepthImage
 from stereovox.geometry import Transform
 from stereovox.maps.blocks import SIDE
 from stereovox.maps.evidence import to_units
+from stereovox.rigs import VirtualCamera
 from stereovox.sensors.model import COLUMNS, REACH_SIGMA, InverseSensorModel, SensorTable, tabulate
 from stereovox.sensors.noise import RangeNoise
 
@@ -45,15 +46,26 @@ class KernelTable(NamedTuple):
     marks: bool  # whether there is any positive evidence beside the hit
 
 
+class Rays(NamedTuple):
+    """The rays of any camera at its pose, in metres relative to the corner of the block it stands in."""
+
+    rotation: NDArray[np.float32]  # (3, 3) world to camera
+    position: NDArray[np.float32]  # (3,) of the camera, from the corner of its block
+    columns: NDArray[np.float32]  # (width,) of `camera.rays()`
+    rows: NDArray[np.float32]  # (height, 2)
+    voxel_size: np.float32
+    max_range: np.float32
+
+
 class View(NamedTuple):
-    """A camera at its pose, in metres relative to the corner of the block it stands in."""
+    """A pinhole camera at its pose, in metres relative to the corner of the block it stands in."""
 
     rotation: NDArray[np.float32]  # (3, 3) world to camera
     position: NDArray[np.float32]  # (3,) of the camera, from the corner of its block
     extent: NDArray[np.float32]  # (3,) half width along x, y, z of the camera of a box of half width 1
     sides: NDArray[np.float32]  # (4, 5) the image's sides as planes: normal, half width of a unit box, offset
     columns: NDArray[np.float32]  # (width,) x/z of pixel columns
-    rows: NDArray[np.float32]  # (height,) y/z of pixel rows
+    rows: NDArray[np.float32]  # (height, 2) y/z of pixel rows, and 1
     intrinsics: NDArray[np.float32]  # fx, fy, cx, cy
     width: np.int32
     height: np.int32
@@ -64,9 +76,10 @@ class View(NamedTuple):
     steps: NDArray[np.float32]  # (3, 512) fx * x, fy * y and z of a block's cells from its corner, camera axes
 
 
-def sensor_table(sensor: InverseSensorModel, config: Config, camera: PinholeCamera) -> KernelTable:
+def sensor_table(sensor: InverseSensorModel, config: Config, camera: VirtualCamera) -> KernelTable:
     """Return the kernel table of a sensor model for a camera with the configured noise."""
-    return kernel_table(tabulate(sensor, RangeNoise.of(config.noise, camera), config.max_range), config.max_range)
+    noise = RangeNoise.of(config.noise, camera)
+    return kernel_table(tabulate(sensor, noise, config.max_range, config.voxel_size), config.max_range)
 
 
 def kernel_table(table: SensorTable, max_range: float) -> KernelTable:
@@ -96,24 +109,32 @@ def origin_block(T_world_camera: Transform, voxel_size: float) -> NDArray[np.int
     return np.floor(T_world_camera[:3, 3] / (SIDE * voxel_size)).astype(np.int64)
 
 
-def view_of(image: DepthImage, voxel_size: float, max_range: float) -> View:
-    """Return the kernel view of a depth image's camera and pose."""
-    camera, T = image.camera, image.T_world_sensor
-    rim = RIM_SHARE * voxel_size * np.array([camera.fx, camera.fy])
+def rays_of(image: DepthImage, voxel_size: float, max_range: float) -> Rays:
+    """Return the kernel rays of a depth image's camera and pose."""
+    T, (columns, rows) = image.T_world_sensor, camera_rays(image.camera)
     corner = origin_block(T, voxel_size) * (SIDE * voxel_size)
-    columns, rows, intrinsics = _camera_arrays(camera)
+    rotation, position = np.ascontiguousarray(T[:3, :3].T, np.float32), (T[:3, 3] - corner).astype(np.float32)
+    return Rays(rotation, position, columns, rows, np.float32(voxel_size), np.float32(max_range))
+
+
+def view_of(image: DepthImage, voxel_size: float, max_range: float) -> View:
+    """Return the kernel view of a pinhole camera's depth image and its pose."""
+    camera, T = image.camera, image.T_world_sensor
+    assert isinstance(camera, PinholeCamera)
+    rays = rays_of(image, voxel_size, max_range)
+    rim = RIM_SHARE * voxel_size * np.array([camera.fx, camera.fy])
     return View(
-        np.ascontiguousarray(T[:3, :3].T, np.float32),
-        (T[:3, 3] - corner).astype(np.float32),
+        rays.rotation,
+        rays.position,
         np.abs(T[:3, :3]).sum(axis=0).astype(np.float32),
         _sides(camera, T, rim),
-        columns,
-        rows,
-        intrinsics,
+        rays.columns,
+        rays.rows,
+        np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32),
         np.int32(camera.width),
         np.int32(camera.height),
-        np.float32(voxel_size),
-        np.float32(max_range),
+        rays.voxel_size,
+        rays.max_range,
         np.float32(WINDOW_SHARE * camera.fx * voxel_size),
         rim.astype(np.float32),
         _cell_steps(camera, T, voxel_size),
@@ -138,9 +159,16 @@ def _sides(camera: PinholeCamera, T: Transform, rim: NDArray[np.float64]) -> NDA
 
 
 @lru_cache
-def _camera_arrays(camera: PinholeCamera) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    columns, rows = camera.ray_slopes()
-    return columns, rows, np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)
+def camera_rays(camera: VirtualCamera) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return `camera.rays()`, made once."""
+    return camera.rays()
+
+
+def farthest_cells(camera: VirtualCamera, reach: float, voxel_size: float) -> float:
+    """Return how many cells from its block's corner a camera can see at most, at depths up to `reach` metres."""
+    columns, rows = camera_rays(camera)
+    corner = np.hypot(np.abs(columns).max(), np.hypot(*rows.T).max())
+    return float(corner * reach / voxel_size + SIDE)
 
 
 def _cell_steps(camera: PinholeCamera, T: Transform, voxel_size: float) -> NDArray[np.float32]:

@@ -15,15 +15,20 @@ __all__ = ["State", "VoxelMap", "load_map", "make_map"]
 def make_map(config: Config, resume: VoxelMap | None = None, tiles: Path | None = None) -> VoxelMap:
     """Return the map that `config` asks for: unbounded, or in a window that moves with the camera.
 
-    resume: a map to go on with. tiles: folder for the cells that leave a window, a temporary one by default.
-    Raises ConfigError when the settings would change what the cells of `resume` mean.
+    resume: a map to go on with. tiles: folder for the cells that leave a window, a temporary one by default; it is not
+    there where this raises. Raises ConfigError when the settings would change what the cells of `resume` mean.
     """
+    if resume is not None:
+        resume.check_cells(config)  # before anything lies on the disk
     if config.window.size is None:
         return VoxelMap(config) if resume is None else resume.with_config(config)
     from stereovox.maps.rolling import RollingMap
 
     rolling = RollingMap(config, tiles)
     if resume is not None:
-        resume.check_cells(config)
-        rolling.go_on_with(resume)
+        try:
+            rolling.go_on_with(resume)
+        except BaseException:
+            rolling.close()
+            raise
     return rolling

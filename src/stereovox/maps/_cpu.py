@@ -62,11 +62,11 @@ def rescale(values, factor, out):
 
 
 @kernel
-def add_values(table, coords, count, cells, at_floor, wanted, values, unknown, lowest, highest):
+def add_values(table, coords, count, cells, at_floor, wanted, values, unknown, prior, lowest, highest):
     """Add `values` (n, 512) to blocks `wanted` (n, 3) with clamping; return how many cells changed.
 
-    A block whose values are all zero is not made. `unknown` is what cells without evidence hold; where a sum comes to
-    just that, one more is stored.
+    A block whose values are all zero is not made. `unknown` is what cells without evidence hold: they start from
+    `prior`; where a sum comes to just `unknown`, one more is stored.
     """
     changed = 0
     for i in range(wanted.shape[0]):
@@ -82,8 +82,10 @@ def add_values(table, coords, count, cells, at_floor, wanted, values, unknown, l
         for c in range(512):
             old = np.int32(block[c])
             step = np.int32(value[c])
-            new = min(max(old + step, lowest), highest)
-            new += np.int32(1) if (new == unknown) & (step != 0) else np.int32(0)
+            start = prior if old == unknown else old
+            new = min(max(start + step, lowest), highest)
+            new += np.int32(1) if new == unknown else np.int32(0)
+            new = new if step != 0 else old
             moved += np.int32(1) if new != old else np.int32(0)
             block[c] = new
         at_floor[b] = 0
@@ -92,7 +94,7 @@ def add_values(table, coords, count, cells, at_floor, wanted, values, unknown, l
 
 
 @kernel
-def add_constant(table, coords, count, cells, at_floor, wanted, step, unknown, lowest):
+def add_constant(table, coords, count, cells, at_floor, wanted, step, unknown, prior, lowest):
     """Add the negative number `step` to all cells of blocks `wanted` (n, 3); return how many cells changed.
 
     A block whose cells all sit at the floor already costs one look.
@@ -107,7 +109,7 @@ def add_constant(table, coords, count, cells, at_floor, wanted, step, unknown, l
         above = np.int32(0)
         for c in range(512):
             old = np.int32(block[c])
-            new = max(old + step, lowest)
+            new = max((prior if old == unknown else old) + step, lowest)
             new += np.int32(1) if new == unknown else np.int32(0)
             moved += np.int32(1) if new != old else np.int32(0)
             above += np.int32(1) if new != lowest else np.int32(0)

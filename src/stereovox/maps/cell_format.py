@@ -52,12 +52,18 @@ class CellRules:
     @cached_property
     def lowest(self) -> np.int32:
         """Smallest stored number."""
-        return np.int32(self.format.stored(self.config.log_odds_min))
+        return np.int32(min(self.format.stored(self.config.log_odds_min), self.format.unknown - 1))
 
     @cached_property
     def highest(self) -> np.int32:
         """Largest stored number."""
-        return np.int32(self.format.stored(self.config.log_odds_max))
+        return np.int32(max(self.format.stored(self.config.log_odds_max), self.format.unknown + 1))
+
+    @cached_property
+    def prior(self) -> np.int32:
+        """Stored number from which a cell starts with its first evidence."""
+        p = self.config.prior
+        return np.int32(self.format.stored(log(p / (1 - p))))
 
     @cached_property
     def free_below(self) -> float:

@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 
 LOG_ODDS_SCALE = 1000
 """Log-odds are kept as whole thousandths; zero means "nothing is known"."""
+LARGEST = 32767
 
 
 def to_units(log_odds: float | NDArray[np.floating]) -> NDArray[np.int32]:
-    """Return log-odds as whole thousandths."""
-    return np.rint(np.asarray(log_odds) * LOG_ODDS_SCALE).astype(np.int32)
+    """Return log-odds as whole thousandths that fit into 16 bits."""
+    return np.clip(np.rint(np.asarray(log_odds) * LOG_ODDS_SCALE), -LARGEST, LARGEST).astype(np.int32)
 
 
 @dataclass(frozen=True, eq=False)

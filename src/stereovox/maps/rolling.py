@@ -8,7 +8,7 @@ from itertools import product
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from stereovox.config import Config
 from stereovox.errors import ConfigError
@@ -17,19 +17,23 @@ from stereovox.maps import _window
 from stereovox.maps.blocks import CELLS, SIDE, BlockPool
 from stereovox.maps.evidence import Evidence
 from stereovox.maps.tiles import BLOCKS, TILE, Tile, TileStore, blocks_of, slabs_of
-from stereovox.maps.voxel_map import VoxelMap
+from stereovox.maps.voxel_map import INDEX_LIMIT, VoxelMap
 from stereovox.maps.window import Box, Window, coarser, most_touched, without
 
 MOST_BYTES = 8_000_000_000
 """A window that would need more memory is taken for a mistake."""
+MOST_TOLD = 10**24
+"""More bytes than that are told as that many: a whole number may be larger than any float."""
 
 
 class RollingMap(VoxelMap):
     """A map whose cells are updated only within a window (Chien 2020, 3.6: map shifting).
 
     With `window.outside = "drop"` cells that leave become unknown; with "keep" they go to tiles on disk (`tiles`: the
-    folder, a temporary one by default) and come back with the window. All memory is taken at the start:
-    `memory_bytes` never changes.
+    folder, a temporary one by default) and come back with the window. All memory of the window is taken at the start:
+    `memory_bytes` never changes. Up to `tiles.WAITING` tiles that wait for the disk come on top, and the map that
+    another run left until the first frame places the window. Whoever asks for a cell is answered wherever it lies;
+    cells in tiles are read from the disk, which is slow. `close` removes the tiles.
     """
 
     def __init__(self, config: Config, tiles: Path | None = None):
@@ -39,9 +43,9 @@ class RollingMap(VoxelMap):
         unit = TILE if keep else SIDE
         capacity = most_touched(self._window.largest, unit) * (unit // SIDE) ** 3
         _check_memory(capacity * CELLS * self._format.dtype.itemsize, config)
-        self._store = TileStore(self._format, tiles) if keep else None
         self._pool = BlockPool(self._format.dtype, capacity, self._format.unknown)
         self._earlier: VoxelMap | None = None
+        self._store = TileStore(self._format, tiles) if keep else None  # last: it leaves a folder
 
     @property
     def window(self) -> NDArray[np.float64] | None:
@@ -60,19 +64,33 @@ class RollingMap(VoxelMap):
         return self._store
 
     def go_on_with(self, earlier: VoxelMap) -> None:
-        """Start from the cells of a map made before; they enter when the window is placed.
+        """Start from the cells of a map made before; they enter when the window is placed, and are the map till then.
 
-        Raises ConfigError when what the map says of its window cannot be understood.
+        A window with the same settings goes on where it was; any other is placed by the first frame.
+        Raises ConfigError when the cells would get another meaning, and when what the map says of its window cannot be
+        understood.
         """
-        self.frames, self.frames_refused = earlier.frames, earlier.frames_refused
-        self.recording, self.viewpoint = earlier.recording, earlier.viewpoint
+        earlier.check_cells(self.config)
+        _copy_history(earlier, self)
         self._earlier = earlier
         if earlier.window_state is not None and earlier.config.window == self.config.window:
             try:
                 self._window.restore(earlier.window_state)
-            except (KeyError, TypeError, ValueError) as error:
+            except (KeyError, TypeError, ValueError, OverflowError) as error:
                 raise ConfigError(f"cannot go on: the map's window is damaged ({error}); make the map anew") from None
+            self.window_state = earlier.window_state
             self._take_over()
+
+    def with_config(self, config: Config) -> VoxelMap:
+        """Return an unbounded map of all cells, with the settings of a run that goes on with it.
+
+        Raises ConfigError when they would change what its cells mean.
+        """
+        self.check_cells(config)
+        unbounded = VoxelMap(config)
+        unbounded.insert(*self.blocks())
+        _copy_history(self, unbounded)
+        return unbounded
 
     def look_from(self, viewpoint: Viewpoint) -> None:
         """Remember where the camera stands and move the window after it."""
@@ -92,6 +110,9 @@ class RollingMap(VoxelMap):
 
     def slabs(self) -> Iterator[tuple[NDArray[np.int32], NDArray[np.integer]]]:
         """Yield all blocks, those on disk with them, piece by piece in ascending order."""
+        if self._earlier is not None:  # no frame has placed the window so far
+            yield from self._earlier.slabs()
+            return
         if self._store is None:
             yield from super().slabs()
             return
@@ -111,6 +132,35 @@ class RollingMap(VoxelMap):
         """Remove the tiles on disk; save the map before."""
         if self._store:
             self._store.close()
+
+    def _stored_at(self, points: ArrayLike) -> NDArray[np.integer]:
+        if self._earlier is not None:
+            return self._earlier._stored_at(points)
+        stored = super()._stored_at(points)
+        if self._store is not None:
+            self._look_into_tiles(np.asarray(points, float).reshape(-1, 3), stored)
+        return stored
+
+    def _look_into_tiles(self, points: NDArray[np.float64], stored: NDArray[np.integer]) -> None:
+        """Set what the window does not know and a tile does, tile by tile."""
+        assert self._store is not None
+        within = (np.abs(points) < INDEX_LIMIT * self.voxel_size).all(axis=1)  # False for NaN
+        asked = np.flatnonzero(within & (stored == self._format.unknown))
+        if not len(asked):
+            return
+        cells = np.floor(points[asked] / self.voxel_size).astype(np.int64)
+        tiles, of_cell, number = np.unique(cells // TILE, axis=0, return_inverse=True, return_counts=True)
+        groups = np.split(np.argsort(of_cell.ravel(), kind="stable"), np.cumsum(number)[:-1])
+        for tile, group in zip(map(tuple, tiles.tolist()), groups, strict=True):
+            if tile in self._store and not self._in_window(tile):
+                stored[asked[group]] = self._store.stored_at(tile, cells[group])
+
+    def _in_window(self, tile: Tile) -> bool:
+        """Tell whether the window touches a tile; what the disk says of it is then out of date."""
+        if self._window.box is None:
+            return False
+        low, high = coarser(self._window.box, TILE)
+        return all(a <= t < b for a, t, b in zip(low, tile, high, strict=True))
 
     def _make_room(self, blocks: int) -> None:
         """All the room the window can need was made at the start."""
@@ -190,12 +240,17 @@ class RollingMap(VoxelMap):
             self._drop(slab, self._window.box)
 
 
+def _copy_history(earlier: VoxelMap, later: VoxelMap) -> None:
+    later.frames, later.frames_refused = earlier.frames, earlier.frames_refused
+    later.recording, later.viewpoint = earlier.recording, earlier.viewpoint
+
+
 def _check_memory(needed: int, config: Config) -> None:
     if needed > MOST_BYTES:
         size = " x ".join(f"{x:g}" for x in config.window.largest or config.window.size or ())
         raise ConfigError(
-            f"window of {size} m in cells of {config.voxel_size:g} m needs {_read(needed)} of memory, more than "
-            f"{_read(MOST_BYTES)}; choose a smaller window.size or larger cells"
+            f"window of {size} m in cells of {config.voxel_size:g} m needs {_read(min(needed, MOST_TOLD))} of memory, "
+            f"more than {_read(MOST_BYTES)}; choose a smaller window.size or larger cells"
         )
 
 

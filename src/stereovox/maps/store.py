@@ -9,9 +9,11 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import uuid
 import zlib
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,7 +23,7 @@ from numpy.typing import NDArray
 
 from stereovox.cameras import DepthCorrection, PinholeCamera
 from stereovox.config import load_config
-from stereovox.errors import ConfigError, MapFileError
+from stereovox.errors import MapFileError
 from stereovox.frame import Viewpoint
 from stereovox.maps.blocks import CELLS
 
@@ -32,17 +34,25 @@ FORMAT = "stereovox-map"
 VERSION, READABLE = 2, (1, 2)
 MANIFEST = "manifest.json"
 BLOCKS_PER_CHUNK = 4096
+UNFINISHED = re.compile(r"cells-[0-9a-f]{12}|\.manifest\.json\.new")
+"""What a save that was killed leaves."""
+Slab = tuple[NDArray[np.int32], NDArray[np.integer]]
+"""Block coordinates (n, 3) and cells (n, 512)."""
 
 
 def save_map(voxel_map: VoxelMap, path: str | Path) -> None:
     """Write `voxel_map` to the folder `path`. Raises MapFileError when it cannot be written or is no map."""
     folder = Path(path)
     check_target(folder)
+    data = f"cells-{uuid.uuid4().hex[:12]}"
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        data = f"cells-{uuid.uuid4().hex[:12]}"
-        blocks, checksum = _write_arrays(folder / data, voxel_map)
-        _write_manifest(folder, _manifest(voxel_map, data, blocks, checksum))
+        try:
+            blocks, checksum = _write_arrays(folder / data, voxel_map)
+            _write_manifest(folder, _manifest(voxel_map, data, blocks, checksum))
+        except BaseException:
+            _clean_up(folder, data)
+            raise
     except OSError as error:
         raise MapFileError(
             f"{folder}: cannot save the map ({error.strerror or error}); choose a writable folder"
@@ -54,7 +64,9 @@ def save_map(voxel_map: VoxelMap, path: str | Path) -> None:
 
 def check_target(folder: Path) -> None:
     """Raise MapFileError when a map cannot be saved to `folder`: it holds something else or cannot be written."""
-    if folder.exists() and not is_map(folder) and (not folder.is_dir() or any(folder.iterdir())):
+    if "\0" in str(folder):
+        raise MapFileError(f"{str(folder)!r}: no file name holds the character 0; choose another name")
+    if folder.exists() and not is_map(folder) and not _is_free(folder):
         raise MapFileError(f"{folder}: exists and is not a stereovox map; choose another name or remove it")
     there = next(parent for parent in (folder, *folder.absolute().parents) if parent.exists())
     if not there.is_dir() or not os.access(there, os.W_OK | os.X_OK):
@@ -71,6 +83,8 @@ def load_map(path: str | Path) -> VoxelMap:
     folder = Path(path)
     manifest = read_manifest(folder)
     try:
+        if not isinstance(manifest["config"], dict):
+            raise TypeError("config is no table of settings")
         voxel_map = VoxelMap(load_config(manifest["config"]))
         voxel_map.frames, voxel_map.frames_refused = int(manifest["frames"]), int(manifest["frames_refused"])
         voxel_map.recording = str(manifest["recording"])
@@ -79,7 +93,7 @@ def load_map(path: str | Path) -> VoxelMap:
         coords, cells = _read_arrays(folder / str(manifest["data"]), int(manifest["blocks"]), voxel_map)
         if _checksums(coords, cells, manifest["checksum"]) != manifest["checksum"]:
             raise ValueError("the cells do not match their checksum")
-    except (KeyError, TypeError, ValueError, OSError, RuntimeError, ConfigError) as error:
+    except (KeyError, TypeError, ValueError, OSError, RuntimeError, OverflowError, AttributeError) as error:
         raise MapFileError(f"{folder}: damaged map ({type(error).__name__}: {error}); make it anew") from None
     voxel_map.insert(coords, cells)
     return voxel_map
@@ -98,7 +112,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
         )
     try:
         manifest = json.loads((folder / MANIFEST).read_text())
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise MapFileError(f"{folder / MANIFEST}: cannot be read ({error}); make the map anew") from None
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
         raise MapFileError(f"{folder / MANIFEST}: not a stereovox map")
@@ -109,6 +123,21 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     if "/" in str(manifest.get("data")) or ".." in str(manifest.get("data")):
         raise MapFileError(f"{folder / MANIFEST}: data '{manifest['data']}' points outside the map")
     return manifest
+
+
+def _is_free(folder: Path) -> bool:
+    """Tell whether a folder holds nothing but what a save left that was killed."""
+    return folder.is_dir() and all(UNFINISHED.fullmatch(entry.name) for entry in folder.iterdir())
+
+
+def _clean_up(folder: Path, data: str) -> None:
+    """Remove what a save that failed has written, and the folder if nothing else is in it."""
+    shutil.rmtree(folder / data, ignore_errors=True)
+    try:
+        (folder / f".{MANIFEST}.new").unlink(missing_ok=True)
+        folder.rmdir()
+    except OSError:
+        return  # an older map stands there
 
 
 def _manifest(voxel_map: VoxelMap, data: str, blocks: int, checksum: list[int]) -> dict[str, Any]:
@@ -156,10 +185,17 @@ def _viewpoint_from(saved: dict[str, Any] | None) -> Viewpoint | None:
 def _write_manifest(folder: Path, manifest: dict[str, Any]) -> None:
     temporary = folder / f".{MANIFEST}.new"
     with temporary.open("w") as file:
-        json.dump(manifest, file, indent=2)
+        json.dump(manifest, file, indent=2, default=_as_number)
         file.flush()
         os.fsync(file.fileno())
     temporary.replace(folder / MANIFEST)
+
+
+def _as_number(number: Any) -> Any:
+    """Return Python's own number for one of NumPy, which JSON does not know: `np.int64(5)` as a time, for example."""
+    if not isinstance(number, np.generic):
+        raise TypeError(f"{type(number).__name__} cannot be saved")
+    return number.item()
 
 
 def _write_arrays(folder: Path, voxel_map: VoxelMap) -> tuple[int, list[int]]:
@@ -168,7 +204,7 @@ def _write_arrays(folder: Path, voxel_map: VoxelMap) -> tuple[int, list[int]]:
 
     group = zarr.open_group(folder, mode="w", zarr_format=3)
     arrays, checksums = None, [0, 0]
-    for slab in voxel_map.slabs():
+    for slab in _whole_chunks(voxel_map.slabs()):
         if arrays is None:
             fills = (0, voxel_map.cell_format.unknown)
             arrays = [_new_array(group, *what) for what in zip(("coords", "cells"), slab, fills, strict=True)]
@@ -179,13 +215,34 @@ def _write_arrays(folder: Path, voxel_map: VoxelMap) -> tuple[int, list[int]]:
     return (arrays[0].shape[0] if arrays else 0), checksums
 
 
+def _whole_chunks(slabs: Iterable[Slab]) -> Iterator[Slab]:
+    """Yield the same blocks in pieces of whole chunks, the last one shorter: so no chunk is written twice."""
+    held: list[Slab] = []
+    rows = 0
+    for slab in slabs:
+        held.append(slab)
+        rows += len(slab[0])
+        if rows >= BLOCKS_PER_CHUNK:
+            coords, cells = _joined(held)
+            whole = rows // BLOCKS_PER_CHUNK * BLOCKS_PER_CHUNK
+            yield coords[:whole], cells[:whole]
+            held, rows = [(coords[whole:], cells[whole:])], rows - whole
+    if held:
+        yield _joined(held)
+
+
+def _joined(slabs: list[Slab]) -> Slab:
+    coords, cells = zip(*slabs, strict=True)
+    return (coords[0], cells[0]) if len(slabs) == 1 else (np.concatenate(coords), np.concatenate(cells))
+
+
 def _new_array(group: Any, name: str, like: NDArray, fill: int) -> Any:
     rows = max(1, min(BLOCKS_PER_CHUNK, len(like)))
     shape, chunks = (0, like.shape[1]), (rows, like.shape[1])
     return group.create_array(name, shape=shape, dtype=like.dtype, chunks=chunks, fill_value=fill)
 
 
-def _read_arrays(folder: Path, blocks: int, voxel_map: VoxelMap) -> tuple[NDArray[np.int32], NDArray[np.integer]]:
+def _read_arrays(folder: Path, blocks: int, voxel_map: VoxelMap) -> Slab:
     import zarr
 
     group = zarr.open_group(folder, mode="r")

@@ -36,8 +36,8 @@ Tile = tuple[int, int, int]
 class TileStore:
     """Tiles of 32x32x32 cells by their coordinates (cell index // 32).
 
-    folder: kept and used if given, it must be empty or not exist; else a temporary one that goes with this object.
-    Raises MapFileError where the folder cannot be used.
+    folder: it must be empty or not exist, and is removed by `close`; by default a temporary one that goes with this
+    object. Raises MapFileError where the folder cannot be used.
     """
 
     def __init__(self, cell_format: CellFormat, folder: Path | None = None):
@@ -71,33 +71,49 @@ class TileStore:
 
     def get(self, tile: Tile) -> tuple[NDArray[np.int32], NDArray[np.integer]]:
         """Return the blocks of one tile that hold any known cell: coordinates (n, 3), cells (n, 512)."""
-        waiting = self._waiting.get(tile)
-        dense = waiting[0] if waiting else self._read(tile)
+        dense = self._dense(tile)
         known = (dense != self._format.unknown).any(axis=3)
         return np.argwhere(known).astype(np.int32) + np.multiply(tile, BLOCKS).astype(np.int32), dense[known]
 
-    def flush(self) -> None:
-        """Wait until everything is on disk. Raises MapFileError where it could not be written."""
-        for tile in list(self._waiting):
-            self._settle(tile)
+    def stored_at(self, tile: Tile, cells: NDArray[np.int64]) -> NDArray[np.integer]:
+        """Return the stored numbers (n,) of cells (n, 3) that lie in `tile`."""
+        block, cell = np.divmod(cells - np.multiply(tile, TILE), SIDE)
+        column = (cell[:, 0] * SIDE + cell[:, 1]) * SIDE + cell[:, 2]
+        return self._dense(tile)[(*block.T, column)]
 
     def close(self) -> None:
-        """Write what waits and remove the folder."""
-        self._writer.shutdown(wait=True)
+        """Remove the folder; what still waits to be written is not needed any more."""
+        self._writer.shutdown(wait=True, cancel_futures=True)
         shutil.rmtree(self.folder, ignore_errors=True)
 
     def _create(self) -> Any:
         import zarr
 
         try:
-            if self.folder.exists() and any(self.folder.iterdir()):
-                raise MapFileError(f"{self.folder}: holds something, perhaps tiles of another run; move it away")
-            return zarr.create_array(
-                self.folder, shape=(2 * OFFSET,) * 3, chunks=(TILE,) * 3,
-                dtype=self._format.dtype, fill_value=self._format.unknown, zarr_format=3,
-            )  # fmt: skip
+            self._check_empty()
+            try:
+                return zarr.create_array(
+                    self.folder, shape=(2 * OFFSET,) * 3, chunks=(TILE,) * 3,
+                    dtype=self._format.dtype, fill_value=self._format.unknown, zarr_format=3,
+                )  # fmt: skip
+            except BaseException:
+                shutil.rmtree(self.folder, ignore_errors=True)  # half a store would be in the next run's way
+                raise
         except OSError as error:
             raise MapFileError(f"{self.folder}: cannot keep tiles here ({error.strerror or error})") from None
+
+    def _check_empty(self) -> None:
+        if not self.folder.exists() or not any(self.folder.iterdir()):
+            return
+        if (self.folder / "zarr.json").is_file():
+            raise MapFileError(
+                f"{self.folder}: tiles of a run that still goes on or was killed; if it was killed, remove this folder"
+            )
+        raise MapFileError(f"{self.folder}: holds something that is no tile; move it away")
+
+    def _dense(self, tile: Tile) -> NDArray:
+        waiting = self._waiting.get(tile)
+        return waiting[0] if waiting else self._read(tile)
 
     def _write(self, tile: Tile, dense: NDArray) -> None:
         self._array[_place(tile)] = _to_cells(dense)

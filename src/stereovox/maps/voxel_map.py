@@ -108,9 +108,9 @@ class VoxelMap:
         pool, rules, unknown = self._pool, self._rules, self._format.unknown
         self._make_room(len(evidence.coords) + len(evidence.uniform))
         blocks = (pool.table, pool.coords, pool.count, pool.values, pool.flags)
-        changed = _cpu.add_values(*blocks, evidence.coords, values, unknown, rules.lowest, rules.highest)
+        changed = _cpu.add_values(*blocks, evidence.coords, values, unknown, rules.prior, rules.lowest, rules.highest)
         if uniform:
-            changed += _cpu.add_constant(*blocks, evidence.uniform, uniform, unknown, rules.lowest)
+            changed += _cpu.add_constant(*blocks, evidence.uniform, uniform, unknown, rules.prior, rules.lowest)
         return changed
 
     def log_odds(self, points: ArrayLike) -> NDArray[np.float32]:

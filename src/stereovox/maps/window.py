@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from math import ceil, exp, floor, hypot
+from math import ceil, exp, floor, hypot, isfinite
 from typing import Any
 
 from stereovox.config import Config
@@ -16,6 +16,8 @@ GROWTH = 8
 """Cells by which the window grows and shrinks: so that a trembling speed does not make it breathe."""
 SMOOTHING_S = 0.3
 """Time over which the camera's velocity is averaged."""
+FURTHEST = 1 << 30
+"""No cell lies further out."""
 JUMP_MPS = 60.0
 """Faster than this nothing flies: the camera was carried, or its poses jumped; it then counts as standing still."""
 
@@ -24,13 +26,14 @@ class Window:
     """A box that moves by whole cells so that the camera stays within the trigger box about its centre.
 
     The centre runs `lead_s` seconds of flight ahead of the camera, and the box is longer by `grow_s` seconds of flight
-    along each axis, up to `largest`.
+    along each axis, up to `largest`. A trigger box smaller than a cell counts as one cell: the middle cannot come
+    nearer to the camera than half a cell, and would swing to and fro.
     """
 
     def __init__(self, config: Config):
         window, self._cell = config.window, config.voxel_size
         assert window.size is not None
-        self._trigger, self._lead_s, self._grow_s = window.trigger, window.lead_s, window.grow_s
+        self._trigger, self._lead_s, self._grow_s = max(window.trigger, self._cell / 2), window.lead_s, window.grow_s
         self._size = _cells(window.size, self._cell)
         self.largest = _cells(window.largest or window.size, self._cell)
         self._extent = self._size
@@ -56,12 +59,17 @@ class Window:
         return {"box": [list(c) for c in self.box], "velocity": velocity, "position": position, "stamp_ns": stamp_ns}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on where another run was. Raises KeyError, TypeError or ValueError for what is no `state`."""
-        low, high = ([int(x) for x in corner] for corner in state["box"])
-        self.box = (tuple(low), tuple(high))  # pyright: ignore
-        self._extent = tuple(b - a for a, b in zip(low, high, strict=True))  # pyright: ignore
-        self._velocity = tuple(float(v) for v in state["velocity"])  # pyright: ignore
-        self._last = [float(x) for x in state["position"]], int(state["stamp_ns"])
+        """Go on where another run was.
+
+        Raises KeyError, TypeError, ValueError or OverflowError for what is no `state`, and changes nothing then.
+        """
+        low, high = (_three(corner, int, FURTHEST) for corner in state["box"])
+        extent = tuple(b - a for a, b in zip(low, high, strict=True))
+        if any(n < least or n > most for n, least, most in zip(extent, self._size, self.largest, strict=True)):
+            raise ValueError(f"a box of {extent} cells")
+        velocity = _three(state["velocity"], float, JUMP_MPS)
+        last = list(_three(state["position"], float)), int(state["stamp_ns"])
+        self.box, self._extent, self._velocity, self._last = (low, high), extent, velocity, last  # pyright: ignore
 
     def _track(self, position: Sequence[float], stamp_ns: int) -> None:
         last, self._last = self._last, (list(map(float, position)), stamp_ns)
@@ -129,6 +137,14 @@ def most_touched(extent: Cell, cells: int) -> int:
     for n in extent:
         number *= (n - 2) // cells + 2 if n > 1 else 1
     return number
+
+
+def _three(numbers: Any, kind: Any, most: float = 1e300) -> tuple[Any, Any, Any]:
+    """Return three finite numbers of this kind, none beyond +-most."""
+    x, y, z = (kind(number) for number in numbers)
+    if not all(isfinite(number) and abs(number) <= most for number in (x, y, z)):
+        raise ValueError(f"{list(numbers)} cannot be")
+    return x, y, z
 
 
 def _cells(size: Sequence[float], cell: float) -> Cell:

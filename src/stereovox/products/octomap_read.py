@@ -20,6 +20,8 @@ from stereovox.products.octree import BRANCH
 MOST_BLOCKS = 2**18
 """Blocks of 8x8x8 cells a file may unfold to (134 million cells); one node can claim 35 million million cells."""
 LARGEST_LOG_ODDS = 30.0
+OCTOMAP = {"map.prior": 0.5, "map.log_odds_min": -2.0, "map.log_odds_max": 3.5}
+"""What OctoMap does when nothing else is said; the files do not tell."""
 LONGEST_HEADER = 1 << 16
 
 
@@ -33,16 +35,16 @@ class _Leaves:
 def read_octomap(path: str | Path) -> VoxelMap:
     """Return the map in an OctoMap file of the tree type OcTree; pruned nodes become the cells they stand for.
 
-    `.bt` cells get the clamping limits of the default profile, OctoMap's own (log-odds -2 and 3.5). `.ot` cells keep
-    their log-odds to the nearest thousandth, at most 30 either way; a log-odds of zero becomes 0.001, "just known".
-    The map's settings are the default profile's with the file's voxel size and clamping limits that hold its values.
+    `.bt` cells get OctoMap's own clamping limits (log-odds -2 and 3.5). `.ot` cells keep their log-odds to the nearest
+    thousandth, at most 30 either way; a log-odds of zero becomes 0.001, "just known". The map's settings are the
+    default profile's with the file's voxel size, OctoMap's prior of 0.5, and limits that hold the file's values.
     Raises MapFileError: one line with the file and what is wrong.
     """
     content = _read(Path(path))
     try:
         title, header, body = _split(content)
         size, voxel_size = _size(header), _voxel_size(header)
-        config = load_config(voxel_size=voxel_size)
+        config = load_config(voxel_size=voxel_size, **OCTOMAP)
         leaves = _binary_leaves(body, size, config) if title == BINARY_TITLE else _tree_leaves(body, size)
         return _map_of(leaves, _with_limits(config, leaves.log_odds))
     except (ValueError, ConfigError) as error:

@@ -30,7 +30,9 @@ END_TOLERANCE = 0.02
 class InverseSensorModel(Protocol):
     """A sensor model: a dataclass of numbers with one function. Write one in plain NumPy and register it.
 
-    `p_free` is what the model says far before a measurement, `p_unknown` what it says far behind one.
+    `p_free` is what the model says far before a measurement, `p_unknown` what it says far behind one. What it says of
+    the cell that holds the measured point is `probability` at that point; a model that knows better, since a cell has
+    a size, has another function `hit(z_measured, sigma, voxel_size)`.
     """
 
     @property
@@ -66,8 +68,8 @@ class SensorTable:
     rows_per_metre: float
 
 
-def tabulate(model: InverseSensorModel, noise: RangeNoise, max_range: float) -> SensorTable:
-    """Return `model` as a table for measured depths up to `max_range` metres.
+def tabulate(model: InverseSensorModel, noise: RangeNoise, max_range: float, voxel_size: float = 0.05) -> SensorTable:
+    """Return `model` as a table for measured depths up to `max_range` metres and cells of `voxel_size` metres.
 
     Evidence is log(p / (1 - p)) less that of p_unknown (Valenti 2018, Eq 6.2: the prior is not counted twice).
     Raises ConfigError when the model leaves (0, 1), or does not come to p_free and p_unknown far off.
@@ -77,7 +79,8 @@ def tabulate(model: InverseSensorModel, noise: RangeNoise, max_range: float) -> 
     z = z_measured[:, None] + offset_sigma() * sigma[:, None]
     _check_ends(model, z_measured, sigma)
     log_odds = _log_odds(model, model.probability(z, z_measured[:, None], sigma[:, None]))
-    hit = _log_odds(model, model.probability(z_measured, z_measured, sigma))
+    at = model.probability(z_measured, z_measured, sigma)
+    hit = _log_odds(model, model.hit(z_measured, sigma, voxel_size) if hasattr(model, "hit") else at)  # pyright: ignore
     return SensorTable(log_odds, hit, sigma, ROWS / max_range)
 
 

@@ -8,8 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stereovox.cameras import PinholeCamera
 from stereovox.config import NoiseConfig
+from stereovox.rigs import VirtualCamera
+from stereovox.wide import SphericalCamera
+
+SUBPIXEL = 0.08
+"""Noise in pixels of a camera nothing is known of: that of a RealSense D435 (Chien 2020, 2.2.4)."""
 
 
 @dataclass(frozen=True)
@@ -26,12 +30,18 @@ class RangeNoise:
         return self.s0 + self.s1 * z + self.s2 * z * z
 
     @classmethod
-    def of(cls, config: NoiseConfig, camera: PinholeCamera) -> RangeNoise:
+    def of(cls, config: NoiseConfig, camera: VirtualCamera) -> RangeNoise:
         """Return the configured noise; where s2 is not set, that of the camera's stereo geometry.
 
-        s2 = subpixel / (focal_px * baseline): Chien 2020, Eq 3.5 with the square that print lacks (Alg 3 has it).
+        s2 = subpixel / (focal_px * baseline): Chien 2020, Eq 3.5 with the square that print lacks (Alg 3 has it), which
+        is also Valenti 2018, Eq 6.9. A spherical camera has subpixel * baseline / focal_px more at every depth: Eq 6.11
+        in 6.10, with 1 / focal_px for the angle of a pixel. That holds at the middle of its rows; towards the sides
+        the noise grows (`stereovox.depth.reproject`), which the thesis leaves out as well.
         """
+        if config.s2 is not None:
+            return cls(config.s0, config.s1, config.s2)
         baseline = camera.baseline or config.default_baseline
-        focal_px = camera.fx * camera.binning  # disparity is measured in the sensor's own pixels
-        s2 = config.subpixel / (focal_px * baseline) if config.s2 is None else config.s2
-        return cls(config.s0, config.s1, s2)
+        subpixel = config.subpixel or camera.subpixel or SUBPIXEL
+        noise_rad = subpixel / camera.focal_px  # disparity is measured in the sensor's own pixels
+        always = baseline * noise_rad if isinstance(camera, SphericalCamera) else 0.0
+        return cls(config.s0 + always, config.s1, noise_rad / baseline)

@@ -18,6 +18,12 @@ SOURCES = {
     "pair": "stereovox.sources.pair:CameraPair",  # first: such a folder may hold groundtruth.txt as well
     "seven_scenes": "stereovox.sources.seven_scenes:SevenScenes",
     "tum": "stereovox.sources.tum:TumRgbd",
+    "rig": "stereovox.sources.rig:StereoRig",
+    "kitti_raw": "stereovox.sources.kitti_raw:KittiRaw",
+    "kitti_tracking": "stereovox.sources.kitti_tracking:KittiTracking",
+    "kitti_odometry": "stereovox.sources.kitti_odometry:KittiOdometry",
+    "kitti_stereo2015": "stereovox.sources.kitti_stereo2015:KittiStereo2015",
+    "surround": "stereovox.sources.surround:Surround",  # before all others of sim:
     "simulation": "stereovox.sources.simulation:Simulation",
     "bag": "stereovox.sources.bag:Bag",
 }
@@ -70,6 +76,12 @@ def open_images(path_or_name: str | os.PathLike[str], frames: str | None = None)
     return source if frames is None else Selection(source, frames)
 
 
+def is_recording(path: str | os.PathLike[str]) -> bool:
+    """Tell whether `path` is a folder or file that `open_source` knows."""
+    kinds = (registry.find("sources", SOURCES, name) for name in registry.names("sources", SOURCES))
+    return any(kind.recognises(os.fspath(path)) for kind in kinds)
+
+
 def _live(where: str) -> Any:
     """Return the class of the live camera that `where` names, if it does."""
     kinds = (registry.find("streams", STREAMS, name) for name in registry.names("streams", STREAMS))
@@ -82,6 +94,8 @@ def _recognise(where: str) -> Any:
         kinds.append(registry.find("sources", SOURCES, name))
         if kinds[-1].recognises(where):
             return kinds[-1]
+    if not os.path.exists(where) and not _live(where):
+        raise SourceError(f"{where}: no such folder or file")
     known = ", ".join(getattr(kind, "layout", "") or kind.__name__ for kind in kinds)
     raise SourceError(f"{where}: {_problem(where, kinds)}; known: {known}")
 
@@ -90,8 +104,6 @@ def _problem(where: str, kinds: list[Any]) -> str:
     """Return why nothing can be made of `where`, and the folder below it that was perhaps meant."""
     if _live(where):
         return "a live camera can be mapped, but has no frames to go back to: record it into a file first"
-    if not os.path.exists(where):
-        return "no such folder or file"
     if not os.path.isdir(where):
         return "is a file, but no recording of a known kind"
     try:

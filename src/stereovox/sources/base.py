@@ -12,7 +12,7 @@ from typing import Protocol, TypeVar
 
 from stereovox.cameras import PinholeCamera
 from stereovox.errors import SourceError
-from stereovox.frame import Frame
+from stereovox.frame import AnyFrame, Frame
 
 T = TypeVar("T")
 AHEAD = 4
@@ -23,7 +23,7 @@ class Stream(Protocol):
     """Frames one after the other in time order: a recording, or a live camera, which nobody can count or rewind.
 
     name: short name for messages and reports.
-    camera: the camera of all frames.
+    camera: the camera of all frames; of stereo pairs the rectified left eye of the first (of a wide one its `middle`).
     notes: lines a user should see, for example a calibration that had to be assumed.
     layout: how to recognise this kind of source, for messages.
 
@@ -45,7 +45,7 @@ class Stream(Protocol):
         """Return what is left after `count` frames; of a live camera that is itself, its past frames are gone."""
         return self
 
-    def __iter__(self) -> Iterator[Frame]: ...
+    def __iter__(self) -> Iterator[AnyFrame]: ...
 
 
 class Source(Stream, Protocol):
@@ -62,20 +62,31 @@ class Source(Stream, Protocol):
 
     def __len__(self) -> int: ...
 
-    def frame(self, i: int) -> Frame:
+    def frame(self, i: int) -> AnyFrame:
         """Return frame `i` (negative: from the end); never fails for bad files: the frame then has a `fault`.
 
         Raises IndexError for a frame that does not exist.
         """
         ...
 
-    def __iter__(self) -> Iterator[Frame]:
+    def __iter__(self) -> Iterator[AnyFrame]:
         return prefetch(self.frame, len(self))
 
     @classmethod
     def depth_only(cls, where: str) -> Source:
         """Open `where` for its depth images alone; a recording that can do without its poses says so here."""
         return cls(where)  # pyright: ignore[reportCallIssue] - what is registered is made from its place
+
+
+class DepthSource(Source, Protocol):
+    """A source of depth images, not of stereo pairs."""
+
+    def frame(self, i: int) -> Frame:
+        """Return frame `i` as `Source.frame` does."""
+        ...
+
+    def __iter__(self) -> Iterator[Frame]:
+        return prefetch(self.frame, len(self))
 
 
 class Selection(Source):
@@ -95,7 +106,7 @@ class Selection(Source):
     def __len__(self) -> int:
         return len(self._picked)
 
-    def frame(self, i: int) -> Frame:
+    def frame(self, i: int) -> AnyFrame:
         """Return the frame that was picked as number `i`."""
         return self._source.frame(self._picked[i])
 
@@ -117,7 +128,7 @@ class Excerpt(Stream):
         self.name, self.camera = stream.name, stream.camera
         self.notes = getattr(stream, "notes", ())
 
-    def __iter__(self) -> Iterator[Frame]:
+    def __iter__(self) -> Iterator[AnyFrame]:
         frames = iter(self._stream)
         try:
             yield from islice(frames, *self._bounds)

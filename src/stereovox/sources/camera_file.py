@@ -14,6 +14,12 @@ from stereovox.sources.toml_file import is_number, read_table, toml_text
 FILE = "camera.toml"
 SIZES = ("width", "height")
 INTRINSICS = ("fx", "fy", "cx", "cy")
+NEEDED = {
+    **dict.fromkeys(SIZES, "its number of pixels"),
+    **dict.fromkeys(("fx", "fy"), "its focal length in pixels"),
+    **dict.fromkeys(("cx", "cy"), "where the optical axis meets the image, in pixels"),
+}
+"""What a key is, for those who left it out."""
 KEYS = (*SIZES, *INTRINSICS, "baseline", "correction")
 CORRECTION = ("model", "coefficients", "provenance")
 
@@ -50,16 +56,37 @@ def camera_text(camera: PinholeCamera, provenance: Mapping[str, Any] | None = No
 
 def _camera(table: dict[str, Any]) -> PinholeCamera:
     _check_keys(table, KEYS, "")
-    for key in (*SIZES, *INTRINSICS):
+    for key, what in NEEDED.items():
         if key not in table:
-            raise SourceError(f"{key} is missing; write {key} = its number of pixels")
+            raise SourceError(f"{key} is missing; write {key} = {what}")
     sizes = [_number(table, key) for key in SIZES]
     if not all(size.is_integer() and 0 < size < 100_000 for size in sizes):
         raise SourceError(f"width and height must be whole numbers of pixels, not {sizes[0]:g} and {sizes[1]:g}")
     baseline = _number(table, "baseline") if "baseline" in table else None
     correction = _correction(table["correction"]) if "correction" in table else None
     fx, fy, cx, cy = (_number(table, key) for key in INTRINSICS)
-    return PinholeCamera(int(sizes[0]), int(sizes[1]), fx, fy, cx, cy, baseline, correction=correction)
+    return pinhole((int(sizes[0]), int(sizes[1])), (fx, fy, cx, cy), baseline, correction)
+
+
+def pinhole(
+    size: tuple[int, int],
+    intrinsics: tuple[float, float, float, float],
+    baseline: float | None,
+    correction: DepthCorrection | None = None,
+) -> PinholeCamera:
+    """Return a camera from numbers in a file: (width, height), and fx, fy, cx, cy; all finite.
+
+    Raises SourceError that names the number which cannot be.
+    """
+    named = {"fx": intrinsics[0], "fy": intrinsics[1], "baseline": 1.0 if baseline is None else baseline}
+    for name, number in named.items():
+        if number <= 0:
+            raise SourceError(f"{name} = {number:g} must be positive")
+    try:
+        return PinholeCamera(*size, *intrinsics, baseline, correction=correction)
+    except StereovoxError as error:  # which shows the whole camera; its last words tell what is wrong
+        numbers = " ".join(f"{number:g}" for number in intrinsics)
+        raise SourceError(f"fx fy cx cy = {numbers}: {str(error).rpartition(': ')[2]}") from None
 
 
 def _correction(table: Any) -> DepthCorrection:

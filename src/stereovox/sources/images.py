@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Depth images in 16-bit PNG files, trusted only when they are whole.
+"""Images in PNG files, trusted only when they are whole: depth in 16 bits, pictures in 8.
 
 Decoders differ in what they do with a damaged file: a half image, noise, or lines on the terminal from the C library.
 So the file's own check sums are verified first (0.02 ms for 90 kB) and only a whole file is decoded.
@@ -25,6 +25,11 @@ HEADER_BYTES = 33  # signature, then IHDR: length, name, 13 bytes, check sum
 MAX_PIXELS = 100_000_000
 """A header that tells of more pixels than this is taken for a lie; nothing is allocated for it."""
 GREY_16 = (16, 0)  # bit depth and colour type
+DEPTH = frozenset({GREY_16})
+PICTURE = frozenset({(8, 0), (8, 2)})
+"""Kinds of PNG that are read: 16-bit grey; 8-bit grey and RGB."""
+WANTED = {DEPTH: "depth must be a 16-bit grey PNG", PICTURE: "pictures must be 8-bit grey or RGB PNGs"}
+Kinds = frozenset[tuple[int, int]]
 
 
 def read_depth_png(path: Path, size: tuple[int, int]) -> NDArray[np.uint16]:
@@ -41,25 +46,37 @@ def decode_depth_png(path: Path | str, data: bytes, size: tuple[int, int]) -> ND
 
     Raises FrameRefused as `read_depth_png`.
     """
-    found = _header_size(path, data)
-    if found != size:
-        raise FrameRefused("bad_shape", f"{path}: {_times(found)} pixels, the recording has {_times(size)}; remove it")
-    if not _is_whole(data):
-        raise FrameRefused("unreadable", f"{path}: the PNG is cut off or damaged; copy it again or remove it")
-    return _decode(path, data)
+    _check(path, data, size, DEPTH)
+    image = _decode(path, data)
+    if image.dtype != np.uint16 or image.ndim != 2:
+        raise _undecodable(path)
+    return image.astype(np.uint16, copy=False)
 
 
-def png_size(path: Path) -> tuple[int, int]:
-    """Return (width, height) as the header of a 16-bit grey PNG tells; raises FrameRefused as `read_depth_png`."""
-    return _header_size(path, _read(path, HEADER_BYTES))
+def read_picture_png(path: Path, size: tuple[int, int]) -> NDArray[np.uint8]:
+    """Return the (height, width) uint8 grey or (height, width, 3) uint8 RGB image in `path`.
+
+    Its size must be (width, height) = `size`. Raises FrameRefused as `read_depth_png`; `bad_dtype`: neither of both.
+    """
+    data = _read(path)
+    _check(path, data, size, PICTURE)
+    image = _decode(path, data)
+    if image.dtype != np.uint8 or image.shape[2:] not in ((), (3,)):
+        raise _undecodable(path)
+    return np.ascontiguousarray(image[..., ::-1] if image.ndim == 3 else image, np.uint8)  # OpenCV gives BGR
 
 
-def common_size(paths: Sequence[Path], looks: int = 5) -> tuple[int, int] | None:
+def png_size(path: Path, kinds: Kinds = DEPTH) -> tuple[int, int]:
+    """Return (width, height) as the header of a PNG of these kinds tells; raises FrameRefused as `read_depth_png`."""
+    return _header_size(path, _read(path, HEADER_BYTES), kinds)
+
+
+def common_size(paths: Sequence[Path], looks: int = 5, kinds: Kinds = DEPTH) -> tuple[int, int] | None:
     """Return the (width, height) that most of `looks` readable images spread over `paths` have; None if none is."""
     found: Counter[tuple[int, int]] = Counter()
     for path in _spread(paths, looks):
         try:
-            found[png_size(path)] += 1
+            found[png_size(path, kinds)] += 1
         except FrameRefused:
             continue  # it is reported when its turn comes
         if found.total() == looks:
@@ -83,16 +100,25 @@ def _read(path: Path, count: int = -1) -> bytes:
         raise FrameRefused("unreadable", f"{path}: {error.strerror}; make it readable or remove it") from None
 
 
-def _header_size(path: Path | str, data: bytes) -> tuple[int, int]:
+def _check(path: Path | str, data: bytes, size: tuple[int, int], kinds: Kinds) -> None:
+    """Raise FrameRefused unless `data` is a whole PNG of one of `kinds` and of this size."""
+    found = _header_size(path, data, kinds)
+    if found != size:
+        raise FrameRefused("bad_shape", f"{path}: {_times(found)} pixels, the recording has {_times(size)}; remove it")
+    if not _is_whole(data):
+        raise FrameRefused("unreadable", f"{path}: the PNG is cut off or damaged; copy it again or remove it")
+
+
+def _header_size(path: Path | str, data: bytes, kinds: Kinds) -> tuple[int, int]:
     header = data[12 : HEADER_BYTES - 4]
     if data[:16] != START or zlib.crc32(header) != int.from_bytes(data[HEADER_BYTES - 4 : HEADER_BYTES]):
         raise FrameRefused("unreadable", f"{path}: no PNG file, or its header is damaged; copy it again or remove it")
     width, height, bits, colour = struct.unpack_from(">IIBB", header, 4)
     if not 0 < width * height <= MAX_PIXELS:
         raise FrameRefused("unreadable", f"{path}: its header tells of {_times((width, height))} pixels; remove it")
-    if (bits, colour) != GREY_16:
+    if (bits, colour) not in kinds:
         kind = "grey" if colour == 0 else "colour"
-        raise FrameRefused("bad_dtype", f"{path}: {bits}-bit {kind} image; depth must be a 16-bit grey PNG")
+        raise FrameRefused("bad_dtype", f"{path}: {bits}-bit {kind} image; {WANTED[kinds]}")
     return width, height
 
 
@@ -110,16 +136,20 @@ def _is_whole(data: bytes) -> bool:
     return True
 
 
-def _decode(path: Path | str, data: bytes) -> NDArray[np.uint16]:
+def _decode(path: Path | str, data: bytes) -> NDArray[np.generic]:
     import cv2
 
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
         image = None
-    if image is None or image.dtype != np.uint16 or image.ndim != 2:
-        raise FrameRefused("unreadable", f"{path}: OpenCV cannot decode it; write it again as a 16-bit grey PNG")
-    return image.astype(np.uint16, copy=False)
+    if image is None:
+        raise _undecodable(path)
+    return image
+
+
+def _undecodable(path: Path | str) -> FrameRefused:
+    return FrameRefused("unreadable", f"{path}: OpenCV cannot decode it; write it again as a plain PNG")
 
 
 def _times(size: tuple[int, int]) -> str:

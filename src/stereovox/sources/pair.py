@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stereovox import registry
 from stereovox.cameras import PinholeCamera
@@ -17,7 +18,7 @@ from stereovox.errors import FrameRefused, SourceError
 from stereovox.frame import Frame
 from stereovox.geometry import Transform
 from stereovox.sources.bag_files import suffix_of
-from stereovox.sources.base import Source
+from stereovox.sources.base import DepthSource
 from stereovox.sources.pair_file import FILE, PairSettings, read_pair
 from stereovox.sources.poses import Poses, seconds_from_ns
 from stereovox.sources.tracker import jumps, on_clock, read_tracker
@@ -29,7 +30,7 @@ LOOKS = 5
 CALIBRATE = "stereovox calibrate pair"
 
 
-class CameraPair(Source):
+class CameraPair(DepthSource):
     """A folder with `pair.toml` (see `PairSettings`): depth images, and the poses of a tracker beside them.
 
     Pose of an image: the tracker's, interpolated at the image's time on the depth camera's clock, times
@@ -84,7 +85,7 @@ class CameraPair(Source):
         poses = self._poses
         T_world_tracker = poses.at(stamp_ns)
         around = list(poses.neighbours(stamp_ns))
-        if poses.confidence is not None and poses.confidence[around].min() < self._min_confidence:
+        if poses.confidence is not None and not poses.confidence[around].min() >= self._min_confidence:  # NaN as well
             found = f"confidence is {poses.confidence[around].min():g} at {seconds_from_ns(stamp_ns)} s"
             raise FrameRefused(
                 "low_confidence", f"{poses.where}: {found}, below min_confidence {self._min_confidence:g}"
@@ -93,28 +94,31 @@ class CameraPair(Source):
         return T_world_tracker @ self._T_tracker_camera
 
     def _check_jumps(self, stamp_ns: int) -> None:
-        """Refuse what was taken near a jump; jump k lies between pose k and pose k + 1."""
-        stamps = self._poses.stamps_ns
-        near = (stamps[self._jumps] - NEAR_JUMP_NS < stamp_ns) & (stamp_ns < stamps[self._jumps + 1] + NEAR_JUMP_NS)
+        """Refuse what was taken near a jump."""
+        before, after = self._poses.stamps_ns[self._jumps].T
+        near = (before - NEAR_JUMP_NS < stamp_ns) & (stamp_ns < after + NEAR_JUMP_NS)
         if near.any():
-            k = self._jumps[np.argmax(near)]
-            step = np.linalg.norm(self._poses.T_world_body[k + 1, :3, 3] - self._poses.T_world_body[k, :3, 3])
-            when = f"{step:.2f} m at {seconds_from_ns(int(stamps[k]))} s"
+            k = int(np.argmax(near))
+            when = f"{self._jump_steps()[k]:.2f} m at {seconds_from_ns(int(before[k]))} s"
             raise FrameRefused(
                 "pose_jump", f"{self._poses.where}: the pose jumps by {when}; see max_speed_mps in {FILE}"
             )
 
+    def _jump_steps(self) -> NDArray[np.float64]:
+        """Return how far (K,) metres the pose moves in each jump."""
+        before, after = np.moveaxis(self._poses.T_world_body[self._jumps, :3, 3], 1, 0)
+        return np.linalg.norm(after - before, axis=1)
+
     def _jump_note(self) -> tuple[str, ...]:
         if not len(self._jumps):
             return ()
-        T = self._poses.T_world_body
-        largest = np.linalg.norm(T[self._jumps + 1, :3, 3] - T[self._jumps, :3, 3], axis=1).max()
+        largest = self._jump_steps().max()
         many = f"{len(self._jumps)} jumps" if len(self._jumps) > 1 else "one jump"
         left_out = "images near are left out, later ones count as they are"
         return (f"{self._poses.where}: {many} of up to {largest:.2f} m; {left_out}",)
 
 
-def open_depth(folder: Path, settings: PairSettings) -> Source:
+def open_depth(folder: Path, settings: PairSettings) -> DepthSource:
     """Return the depth images of a pair; their own poses, if there are any, do not count.
 
     A folder with `depth.txt` or `depth/` holds stamped images (see `StampedImages`); anything else is opened by the
@@ -140,7 +144,7 @@ def open_poses(folder: Path, settings: PairSettings) -> Poses:
     return on_clock(poses, settings.clock_offset_s, settings.clock_rate)
 
 
-def image_times(depth: Source) -> tuple[int, int]:
+def image_times(depth: DepthSource) -> tuple[int, int]:
     """Return the times in nanoseconds of the first and of the last image.
 
     A damaged message of a recorded file has only the time at which it was recorded, perhaps by another clock: where
@@ -150,7 +154,7 @@ def image_times(depth: Source) -> tuple[int, int]:
     return _stamp(depth, few), _stamp(depth, [-1 - i for i in few])
 
 
-def _stamp(depth: Source, numbers: Sequence[int]) -> int:
+def _stamp(depth: DepthSource, numbers: Sequence[int]) -> int:
     for i in numbers:
         frame = depth.frame(i)
         if frame.depth.size:
@@ -169,7 +173,7 @@ def check_clocks(image_ns: tuple[int, int], poses: Poses, file: Path) -> None:
         )
 
 
-def _recognised(where: str) -> Source:
+def _recognised(where: str) -> DepthSource:
     from stereovox.sources import SOURCES
 
     for kind in _others(SOURCES):
@@ -183,10 +187,10 @@ def _others(sources: dict[str, str]) -> Iterable[Any]:
     return (kind for kind in kinds if kind is not CameraPair)
 
 
-class _Corrected(Source):
+class _Corrected(DepthSource):
     """A depth source whose unit or baseline `pair.toml` knows better."""
 
-    def __init__(self, source: Source, settings: PairSettings):
+    def __init__(self, source: DepthSource, settings: PairSettings):
         self._source, self._scale = source, settings.depth_scale
         self.name, self.notes = source.name, getattr(source, "notes", ())
         self.camera: PinholeCamera = source.camera

@@ -88,10 +88,13 @@ class RealSense(Stream):
         queue = self._rs.frame_queue(WAITING)
         try:
             self._sensor.open(self._profile)
-            self._sensor.start(queue)
         except RuntimeError as error:
             _failed(self.name, error)
         try:
+            try:
+                self._sensor.start(queue)
+            except RuntimeError as error:
+                _failed(self.name, error)
             while True:
                 arrived, image = queue.try_wait_for_frame(PATIENCE_MS)
                 if not arrived:

@@ -73,6 +73,16 @@ class Scene:
         share[share > 1e6] = np.inf
         return share
 
+    def hits(
+        self, origin: ArrayLike, directions: NDArray[np.floating]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int32]]:
+        """Return what `cast` does, the unit normals (N, 3) of the surfaces met, and their triangles (N,), -1: none."""
+        directions = np.ascontiguousarray(directions, np.float32)
+        origins = np.broadcast_to(np.asarray(origin, np.float32), directions.shape)
+        found = self._embree.run(np.ascontiguousarray(origins), directions, query="INTERSECT", output=True)
+        share, normals = np.where(found["primID"] < 0, np.float32(np.inf), found["tfar"]), found["Ng"]
+        return share, normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30), found["primID"]
+
     @cached_property
     def _embree(self) -> Any:
         # trimesh's own ray interface copies rays to float64 and back: twice the time of the cast itself.

@@ -23,8 +23,8 @@ class SevenScenes(DepthFolder):
     World: exactly that of the pose files. In 7-Scenes it is the optical frame of the first camera of the scene's model:
     x right, y down, z forward, so z is NOT up. It is left so because ground truth and other results for these folders
     are in it; heights in a picture are therefore distances from that first camera.
-    Camera: `camera-intrinsics.txt` in the folder or the one above; without it, 585 585 320 240 as the data set's
-    authors state, for 640x480 only. Baseline 0.075 m (Kinect v1).
+    Camera: `camera.toml` in the folder, else `camera-intrinsics.txt` there or one folder up; without them, 585 585 320
+    240 as the data set's authors state, for 640x480 only. Baseline 0.075 m (Kinect v1).
     Time: the files hold none; frame number / 30 Hz, rounded down to whole nanoseconds.
     Every number that has an image or a pose is a frame. Faults: those of `read_depth_png`, `no_pose` (no file),
     `bad_pose_file` (not 16 numbers).

@@ -16,7 +16,7 @@ from stereovox.errors import ConfigError, SourceError
 from stereovox.frame import Frame, Reason
 from stereovox.geometry import Transform, inverse
 from stereovox.sources import parameters
-from stereovox.sources.base import Source
+from stereovox.sources.base import DepthSource
 from stereovox.sources.d435 import D435, classify, depth_camera
 from stereovox.sources.scene import Scene
 from stereovox.sources.stage import Face, Stage, one_of, within
@@ -65,7 +65,7 @@ class Options:
         within("farthest", self.farthest, 0, 65)
 
 
-class Simulation(Source):
+class Simulation(DepthSource):
     """Frames of a simulated D435 in a built-in scene.
 
     location: `sim:SCENE`, or with parameters `sim:SCENE?key=value&key=value`:

@@ -76,15 +76,19 @@ def on_clock(poses: Poses, offset_s: float, rate: float = 1.0) -> Poses:
 
 
 def jumps(poses: Poses, max_speed_mps: float, max_turn_dps: float) -> NDArray[np.intp]:
-    """Return the numbers k of the poses after which the tracker jumped: from k to k + 1 it moved or turned too fast.
+    """Return the numbers (K, 2) of the poses before and after each jump, between which the tracker moved or turned too
+    fast.
 
     Speeds are over at least 1 ms, so that two stamps that almost coincide make no jump of a tremble. Gaps count by
-    their average speed. Poses that cannot be used make no jump.
+    their average speed. Poses that cannot be used are passed over: a jump may lie across them.
     """
-    T, seconds = poses.T_world_body, np.maximum(np.diff(poses.stamps_ns) / 1e9, 1e-3)
+    usable = np.flatnonzero(np.isfinite(poses.T_world_body).all(axis=(1, 2)))
+    T, stamps_ns = poses.T_world_body[usable], poses.stamps_ns[usable]
+    seconds = np.maximum(np.diff(stamps_ns) / 1e9, 1e-3)
     steps = np.linalg.norm(np.diff(T[:, :3, 3], axis=0), axis=1)
     turns = angles(np.swapaxes(T[:-1, :3, :3], 1, 2) @ T[1:, :3, :3])
-    return np.flatnonzero((steps > max_speed_mps * seconds) | (turns > np.radians(max_turn_dps) * seconds))
+    fast = (steps > max_speed_mps * seconds) | (turns > np.radians(max_turn_dps) * seconds)
+    return np.stack([usable[:-1], usable[1:]], axis=1)[fast]
 
 
 def angles(R: NDArray[np.float64]) -> NDArray[np.float64]:

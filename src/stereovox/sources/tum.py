@@ -19,9 +19,9 @@ LIST, IMAGES, POSES = "depth.txt", "depth", "groundtruth.txt"
 class StampedImages(DepthFolder):
     """`depth.txt` (lines `stamp file`), else all `depth/<stamp>.png`; uint16, 5000 per metre. No poses: all are NaN.
 
-    Camera: `camera-intrinsics.txt` (3x3) or `calibration.txt` (fx fy cx cy) in the folder. The layout has no such file
-    of its own; without one, 640x480 images get 525 525 319.5 239.5, which TUM recommends for all its sequences
-    because the depth is registered to the colour image with it. Baseline 0.075 m (Kinect v1, Xtion).
+    Camera: `camera.toml`, else `camera-intrinsics.txt` (3x3), else `calibration.txt` (fx fy cx cy) in the folder. The
+    layout has no such file of its own; without one, 640x480 images get 525 525 319.5 239.5, which TUM recommends for
+    all its sequences because the depth is registered to the colour image with it. Baseline 0.075 m (Kinect v1, Xtion).
     Images are in order of time, of several with one stamp the first counts; stamps are exact to the nanosecond.
     Faults: those of `read_depth_png`. Raises SourceError with file and line for a bad depth.txt.
     """

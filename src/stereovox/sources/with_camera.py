@@ -10,17 +10,18 @@ from pathlib import Path
 
 from stereovox.cameras import PinholeCamera
 from stereovox.errors import SourceError
-from stereovox.frame import Frame
+from stereovox.frame import Frame, StereoFrame
 from stereovox.sources.base import Stream
 from stereovox.sources.camera_file import read_camera
+from stereovox.sources.intrinsics import correction_words
 
 
 class WithCamera(Stream):
-    """The frames of `stream`, all with `camera`, which has the same number of pixels."""
+    """The frames of `stream`, all with `camera`, which has as many pixels; `notes` follow its own."""
 
-    def __init__(self, stream: Stream, camera: PinholeCamera):
-        self._stream, self.camera = stream, camera
-        self.name, self.notes = stream.name, getattr(stream, "notes", ())
+    def __init__(self, stream: Stream, camera: PinholeCamera, notes: tuple[str, ...] = ()):
+        self._stream, self.camera, self._notes = stream, camera, notes
+        self.name, self.notes = stream.name, (*getattr(stream, "notes", ()), *notes)
 
     @property
     def length(self) -> int | None:
@@ -29,12 +30,14 @@ class WithCamera(Stream):
 
     def after(self, count: int) -> Stream:
         """Return what is left after `count` frames, with the same camera."""
-        return WithCamera(self._stream.after(count), self.camera)
+        return WithCamera(self._stream.after(count), self.camera, self._notes)
 
     def __iter__(self) -> Iterator[Frame]:
         frames = iter(self._stream)
         try:
             for frame in frames:
+                if isinstance(frame, StereoFrame):
+                    raise SourceError(f"{self.name}: has stereo pairs, which no camera file fits; correct its rig file")
                 yield replace(frame, camera=self.camera)
         finally:
             close = getattr(frames, "close", None)
@@ -53,4 +56,5 @@ def with_camera(stream: Stream, file: str | os.PathLike[str]) -> Stream:
             f"{file}: is of a camera with {camera.width}x{camera.height} pixels, {stream.name} has "
             f"{own.width}x{own.height}; give the file of its own camera"
         )
-    return WithCamera(stream, camera if camera.baseline else replace(camera, baseline=own.baseline))
+    note = f"{file} is used in place of the recording's own camera ({correction_words(camera)})"
+    return WithCamera(stream, camera if camera.baseline else replace(camera, baseline=own.baseline), (note,))

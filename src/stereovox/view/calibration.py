@@ -13,9 +13,9 @@ from stereovox.calibrate.noise import NoiseCalibration
 from stereovox.calibrate.wall import WallCalibration, WallResult
 from stereovox.view.panels import GREY, LINE, title
 
-DPI = 110
-WIDTH = 16.0
-"""Inches."""
+DPI = 150
+WIDTH = 11.0
+"""Inches: as wide as a page shows it, so that letters keep their size."""
 BEFORE, AFTER, WALL = "#d1603d", "#23618c", "#1b2333"
 THEORY = ((0.08, "--"), (0.04, ":"))
 """Sub-pixels of the curves in Chien 2020, Fig 3.9."""
@@ -32,24 +32,24 @@ BAND = 0.1
 def wall_png(calibration: WallCalibration) -> bytes:
     """Return a PNG: histogram, top view, error over the image before and after, for each wall (after Fig A.1-A.3)."""
     walls = calibration.walls
-    made = _figure(3.4 * len(walls) + 0.2)
-    grid = made.subplots(len(walls), 4, squeeze=False, width_ratios=[1, 1.25, 1.15, 1.15])
-    for axes, wall in zip(grid, walls, strict=True):
+    made = blank(7.4 * len(walls))
+    grid = made.subplots(2 * len(walls), 2, squeeze=False, height_ratios=[3.1, 4.3] * len(walls))
+    for axes, wall in zip(grid.reshape(-1, 4), walls, strict=True):
         _histogram(axes[0], wall)
         _top_view(axes[1], wall)
         _error_map(made, axes[2], wall.before, "Before")
         _error_map(made, axes[3], wall.after, "After")
-    return _png(made)
+    return png_of(made)
 
 
 def noise_png(calibration: NoiseCalibration) -> bytes:
     """Return a PNG: RMSE against distance with theory (after Fig 3.7 and 3.9), sub-pixel, and share of valid pixels."""
-    made = _figure(6.4)
+    made = blank(6.2)
     axes = made.subplot_mosaic([["rmse", "subpixel"], ["rmse", "shares"]], width_ratios=[1.7, 1])
     _rmse(axes["rmse"], calibration)
     _subpixel(axes["subpixel"], calibration)
     _shares(axes["shares"], calibration)
-    return _png(made)
+    return png_of(made)
 
 
 def _histogram(axis: Any, wall: WallResult) -> None:
@@ -59,7 +59,7 @@ def _histogram(axis: Any, wall: WallResult) -> None:
     for values, colour, name in zip(depths, (BEFORE, AFTER), ("before", "after"), strict=True):
         axis.hist(values, bins, color=colour, alpha=0.65, label=name)
     axis.axvline(wall.distance, color=WALL, linewidth=1.2, linestyle="--", label="wall, on the axis")
-    axis.legend(frameon=False, fontsize=9)
+    axis.legend(frameon=False, fontsize=10)
     axis.set_yticks([])
     title(axis, f"Wall at {wall.distance:.2f} m" + ("" if wall.fitted else " (only checked)"))
     _labels(axis, "depth [m]", "pixels")
@@ -76,7 +76,7 @@ def _top_view(axis: Any, wall: WallResult) -> None:
     a, b, _ = wall.plane
     x = np.array(axis.get_xlim())
     axis.plot(x, (1 - b * x) / a, color=WALL, linewidth=1.2, linestyle="--", label="wall, on the axis")
-    axis.legend(frameon=False, fontsize=9, markerscale=6, loc="best")
+    axis.legend(frameon=False, fontsize=10, markerscale=6, loc="best")
     title(axis, "Top view, middle rows")
     _labels(axis, "x, to the right [m]", "z, depth [m]")
 
@@ -88,8 +88,8 @@ def _error_map(made: Any, axis: Any, error: NDArray[np.float64], name: str) -> N
     axis.set(xticks=[], yticks=[], facecolor="#d9d9d9")
     title(axis, f"{name}: {rms:.2f} % RMS")
     bar = made.colorbar(drawn, ax=axis, orientation="horizontal", pad=0.02, fraction=0.06, aspect=30)
-    bar.set_label("too far [% of the depth]", color=GREY, fontsize=9)
-    bar.ax.tick_params(colors=GREY, labelsize=8)
+    bar.set_label("too far [% of the depth]", color=GREY)
+    bar.ax.tick_params(colors=GREY)
     bar.outline.set_visible(False)
 
 
@@ -148,12 +148,13 @@ def _depths(points: NDArray[np.float64]) -> NDArray[np.float64]:
 def _labels(axis: Any, x: str, y: str) -> None:
     axis.set_xlabel(x, color=GREY)
     axis.set_ylabel(y, color=GREY)
-    axis.tick_params(colors=GREY, labelsize=9)
+    axis.tick_params(colors=GREY)
     for spine in axis.spines.values():
         spine.set_color(LINE)
 
 
-def _figure(height: float) -> Any:
+def blank(height: float) -> Any:
+    """Return an empty figure, `height` inches high."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -162,7 +163,8 @@ def _figure(height: float) -> Any:
     return made
 
 
-def _png(made: Any) -> bytes:
+def png_of(made: Any) -> bytes:
+    """Return a figure as the bytes of a PNG."""
     out = io.BytesIO()
     made.savefig(out, dpi=DPI, format="png")
     return out.getvalue()

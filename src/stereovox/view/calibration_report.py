@@ -18,6 +18,8 @@ FORMULAS = {
     "scale+disparity": "true depth = z / (1 + s + q z)",
     "thesis": "true depth = z - (p1 X^2 + p2 X + p3)",
 }
+HOLD = "\u00a0"
+"""A space at which no line ends: a unit stays with its number."""
 PERCENT = (
     "Errors are root mean squares over the wall of (depth - wall) / wall, of the mean of all frames. Walls may lean a "
     "little; how much was found together with the correction."
@@ -30,13 +32,13 @@ def write_wall_report(folder: str | Path, found: WallCalibration, camera_file: s
     Raises StereovoxError where they cannot be written.
     """
     png = wall_png(found)
-    return _write(Path(folder), "wall", wall_page(found, png, camera_file), png)
+    return write_page(Path(folder), "wall", wall_page(found, png, camera_file), png)
 
 
 def write_noise_report(folder: str | Path, found: NoiseCalibration, profile: str) -> Path:
     """Write `noise.html` and `noise.png`; else as `write_wall_report`."""
     png = noise_png(found)
-    return _write(Path(folder), "noise", noise_page(found, png, profile), png)
+    return write_page(Path(folder), "noise", noise_page(found, png, profile), png)
 
 
 def wall_page(found: WallCalibration, png: bytes, camera_file: str) -> str:
@@ -49,7 +51,8 @@ def wall_page(found: WallCalibration, png: bytes, camera_file: str) -> str:
     ]
     return page.page(
         "Depth calibration on flat walls",
-        f"The camera's depth was compared with {len(walls)} flat walls (after Chien 2020, App. A) and corrected by the "
+        f"The camera's depth was compared with {len(walls)} flat wall{'s' * (len(walls) != 1)} "
+        "(after Chien 2020, App. A) and corrected by the "
         f"model '{model}'. The correction is in {camera_file}; stereovox map applies it.",
         page.tiles(boxes),
         page.figure(png, "Histogram, top view and error over the image for each wall, before and after"),
@@ -90,11 +93,11 @@ def _wall_table(walls: list[dict[str, Any]]) -> tuple[list[str], list[list[str]]
     rows = [
         [
             wall["name"],
-            f"{wall['distance_m']:.3f} m ({'measured' if wall['distance_given'] else 'as seen'})",
-            f"{wall['tilt_deg']:.1f} deg",
-            f"{wall['before_percent']:.2f} %",
-            f"{wall['after_percent']:.2f} %",
-            f"{wall['worst_after_percent']:.2f} %",
+            f"{wall['distance_m']:.3f}{HOLD}m ({'measured' if wall['distance_given'] else 'as seen'})",
+            f"{wall['tilt_deg']:.1f}{HOLD}deg",
+            f"{wall['before_percent']:.2f}{HOLD}%",
+            f"{wall['after_percent']:.2f}{HOLD}%",
+            f"{wall['worst_after_percent']:.2f}{HOLD}%",
             f"{wall['wall_share']:.0%}",
             str(wall["frames"]),
             "the fit" if wall["fitted"] else "a check",
@@ -152,7 +155,8 @@ def _noise_table(found: NoiseCalibration) -> tuple[list[str], list[list[str]]]:
     return heads, rows
 
 
-def _write(folder: Path, name: str, text: str, png: bytes) -> Path:
+def write_page(folder: Path, name: str, text: str, png: bytes) -> Path:
+    """Write NAME.html and NAME.png into `folder`, made where it is missing, and return the page's path."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / f"{name}.png").write_bytes(png)

@@ -9,6 +9,9 @@ from html import escape
 from importlib.resources import files
 from typing import Any
 
+MANY = 7
+"""Columns of a table up to which a page has room for large letters."""
+
 
 def page(title: str, lead: str, *parts: str) -> str:
     """Return a whole page; `parts` are what the functions below return."""
@@ -31,10 +34,11 @@ def tiles(pairs: Iterable[tuple[str, str]]) -> str:
 
 
 def table(heads: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-    """Return a table."""
+    """Return a table; one of many columns is set smaller, so that it fits the page."""
     head = "".join(f"<th>{escape(text)}</th>" for text in heads)
     body = "".join("<tr>" + "".join(f"<td>{escape(str(cell))}</td>" for cell in row) + "</tr>" for row in rows)
-    return f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
+    size = "wide many" if len(heads) > MANY else "wide"
+    return f'<div class="{size}"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
 
 
 def figure(png: bytes, alt: str) -> str:

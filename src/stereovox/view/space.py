@@ -43,7 +43,7 @@ def draw_space(voxel_map: VoxelMap, heading: str, up: str, viewpoint: Viewpoint 
     figure.set_figheight(float(np.clip(0.86 * WIDTH * shape, 5.0, 12.0)) + 1.4)
     figure.get_layout_engine().set(rect=(0.015, 0.005, 0.98, 1 - 1.05 / figure.get_figheight()))
     cut = "" if drawn.cut is None else f", cut open at {drawn.names[2]} = {drawn.cut:.2f} m"
-    seen = "" if lines is None else f"; red: the camera and its field of view, {FIELD_M:g} m deep"
+    seen = "" if lines is None else f"; red: the camera and its field of view, {FIELD_M:g} m deep, dashed behind cells"
     title(axis, f"Occupied cells{cut}{seen}")
     headline(figure, voxel_map, heading)
     return figure
@@ -66,18 +66,27 @@ def draw_cells(figure: Any, axis: Any, drawn: Drawn, lines: NDArray[np.float64] 
     for line in lines if lines is not None else ():
         _line(axis, line, direction, rendering, drawn.voxel_size)
     if lines is not None:
-        axis.plot(*direction.flat(lines[:1, 0]).T, "o", color=PATH_COLOUR, markeredgecolor="white", markersize=8)
+        _eye(axis, lines[:1, 0], direction, rendering, drawn.voxel_size)
     height_bar(figure, axis, mappable, drawn)
     return shape
 
 
 def _line(axis: Any, line: NDArray[np.float64], direction: Direction, rendering: Rendering, slack: float) -> None:
-    """Draw a line (2, 3), strong where it is seen and faint where cells stand before it."""
+    """Draw a line (2, 3), strong where it is seen, dashed and pale where cells stand before it."""
     points = line[0] + np.linspace(0, 1, DOTS)[:, None] * (line[1] - line[0])
     flat = direction.flat(points)
     hidden = rendering.hidden(flat, points @ direction.toward, slack)
-    axis.plot(*flat.T, color=PATH_COLOUR, linewidth=1.1, alpha=0.4, zorder=3)
+    axis.plot(*np.where(hidden[:, None], flat, np.nan).T, color=PATH_COLOUR, linewidth=1.1, alpha=0.55, zorder=3,
+              linestyle=(0, (4, 3)))  # fmt: skip
     axis.plot(*np.where(hidden[:, None], np.nan, flat).T, color=PATH_COLOUR, linewidth=2.2, zorder=4)
+
+
+def _eye(axis: Any, place: NDArray[np.float64], direction: Direction, rendering: Rendering, slack: float) -> None:
+    """Draw the camera at `place` (1, 3) as a dot, as a ring where cells stand before it."""
+    flat = direction.flat(place)
+    behind = rendering.hidden(flat, place @ direction.toward, slack)[0]
+    fill, edge = ("none", PATH_COLOUR) if behind else (PATH_COLOUR, "white")
+    axis.plot(*flat.T, "o", color=PATH_COLOUR, markerfacecolor=fill, markeredgecolor=edge, markersize=8, zorder=5)
 
 
 def _azimuth(lines: NDArray[np.float64] | None) -> float:

@@ -45,13 +45,16 @@ class Viewer:
             self.server.stop()
 
 
-def open_viewer(voxel_map: VoxelMap, name: str = "map", host: str = HERE, port: int = PORT) -> Viewer:
+def open_viewer(
+    voxel_map: VoxelMap, name: str = "map", host: str = HERE, port: int = PORT, up: str | None = None
+) -> Viewer:
     """Serve a page of a map, under the heading `name`, until it is closed; port 0 takes any free one.
 
+    up: the map's axis that points up (`z`, `-y`, ...); by default as its settings say.
     Whoever reaches `host` can look, but nobody can change or share the map. Raises MissingExtra without viser, and
-    StereovoxError where the address cannot be used.
+    StereovoxError for an `up` that is no axis and where the address cannot be used.
     """
-    drawn = upright(voxel_map, None, voxel_map.config.up)
+    drawn = upright(voxel_map, None, up or voxel_map.config.up)
     server = _serve(name.encode("utf-8", "replace").decode(), host, port)
     server.scene.set_up_direction(as_tuple(up_vector(drawn.names[2])))
     look_from, look_at = first_look(voxel_map, drawn)
@@ -126,4 +129,5 @@ def _legend(server: ViserServer, cells: Cells, plane: LayerPlane | None, up: str
         if cells.scale is not None:
             server.gui.add_image(colour_bar(cells.scale, f"height of occupied cells {up} [m]"), format="png")
         if plane is not None:
-            server.gui.add_image(colour_bar(plane.colours, f"in the layer: {plane.scale.label}"), format="png")
+            label, ends = f"in the layer: {plane.scale.label}", (plane.scale.lowest, plane.scale.highest)
+            server.gui.add_image(colour_bar(plane.colours, label, ends), format="png")

@@ -43,10 +43,12 @@ def plain(text: str) -> str:
     return re.sub(r"([!-/:-@\[-`{-~])", r"\\\1", text)
 
 
-def colour_bar(scale: Any, label: str) -> NDArray[np.uint8]:
-    """Return a picture (H, W, 3) of a colour bar for a matplotlib mappable."""
+def colour_bar(scale: Any, label: str, limits: tuple[float, float] | None = None) -> NDArray[np.uint8]:
+    """Return a picture (H, W, 3) of a colour bar for a matplotlib mappable; `limits`: where it begins and ends."""
     figure = _figure(0.8)
     bar = figure.colorbar(scale, cax=figure.add_subplot(), orientation="horizontal")
+    if limits is not None:
+        bar.ax.set_xlim(limits)
     bar.set_label(label, color=GREY)
     bar.ax.tick_params(colors=GREY)
     bar.outline.set_visible(False)

@@ -11,7 +11,11 @@ from typing import Any
 from stereovox.errors import StereovoxError, did_you_mean
 from stereovox.evaluate.reproduce.chapter import Progress
 
-PAPERS = {"chien2020": "stereovox.evaluate.reproduce.chien2020:reproduce", "valenti2018": "", "ist2019": ""}
+PAPERS = {
+    "chien2020": "stereovox.evaluate.reproduce.chien2020:reproduce",
+    "valenti2018": "stereovox.evaluate.reproduce.valenti2018:reproduce",
+    "ist2019": "",
+}
 """Function `(out, data, quick, progress) -> dict` of each paper; empty: known, but not in this version."""
 
 
@@ -25,7 +29,8 @@ def reproduce(
 ) -> dict[str, Any]:
     """Make the experiments of a paper again and write `report.html` and `numbers.json` into folder `out`.
 
-    data: what the paper's experiments need besides simulation (chien2020: a recording of your own, mapped as well).
+    data: what the paper's experiments need besides simulation (chien2020: a recording of your own, mapped as well;
+    valenti2018: a folder with KITTI tracking sequences, or a drive of KITTI raw data).
     quick: fewer frames; enough to see that all works, not to quote. Returns the numbers, fit for JSON.
     Raises StereovoxError, one line, for an unknown paper and one that is not in this version.
     """

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from stereovox.config import load_config
-from stereovox.evaluate.cells import Keys, keys, position, within
+from stereovox.evaluate.cells import Keys, keys, occupied_cells, position, within
 from stereovox.evaluate.sightings import Sightings
 from stereovox.evaluate.truth import touched_cells
 from stereovox.frame import Frame
@@ -116,8 +116,7 @@ def seen_cells(simulation: Simulation, cells: Keys, size: float) -> Keys:
 
 def share_found(voxel_map: VoxelMap, cells: Keys) -> float:
     """Return the share of `cells` that the map calls occupied."""
-    occupied = np.floor(voxel_map.occupied() / voxel_map.voxel_size).astype(np.int64)
-    return float((position(cells, np.sort(keys(occupied))) >= 0).mean())
+    return float((position(cells, np.sort(keys(occupied_cells(voxel_map)))) >= 0).mean())
 
 
 def _config(variant: Variant) -> Any:
@@ -132,6 +131,6 @@ def _add(mapper: Mapper, frame: Frame) -> float:
 
 
 def _stray(voxel_map: VoxelMap, surfaces: Keys) -> float:
-    occupied = np.floor(voxel_map.occupied() / voxel_map.voxel_size).astype(np.int64)
+    occupied = occupied_cells(voxel_map)
     far = keys(occupied[occupied[:, 2] * voxel_map.voxel_size >= FAR_M])
     return float(1 - within(far, surfaces, 1).mean()) if len(far) else 0.0

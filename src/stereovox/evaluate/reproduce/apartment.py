@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stereovox.cameras import PinholeCamera
 from stereovox.config import Config, load_config
 from stereovox.errors import FrameRefused
 from stereovox.evaluate.cells import keys
@@ -150,6 +151,7 @@ def _wall_sightings(stage: Stage, size: float) -> Sightings:
 def _look(sightings: dict[float, Sightings], depth_m: NDArray[np.float32], frame: Frame) -> None:
     thinned, n = depth_m[::THINNED, ::THINNED], THINNED
     camera = frame.camera
+    assert isinstance(camera, PinholeCamera)  # what the simulation has
     smaller = replace(camera, width=thinned.shape[1], height=thinned.shape[0],
                       fx=camera.fx / n, fy=camera.fy / n, cx=camera.cx / n, cy=camera.cy / n)  # fmt: skip
     for one in sightings.values():

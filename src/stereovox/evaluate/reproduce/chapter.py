@@ -29,7 +29,10 @@ class Claim:
 
 @dataclass(frozen=True)
 class Shown:
-    """A picture (PNG), its place in the paper (`Fig 4.6`), what the paper says of its own, and what ours shows."""
+    """A picture (PNG), its place in the paper (`Fig 4.6`), what the paper says of its own, and what ours shows.
+
+    A picture that the paper has none of has a heading as `place`, and `said` is empty.
+    """
 
     place: str
     said: str

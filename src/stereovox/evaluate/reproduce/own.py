@@ -38,7 +38,7 @@ def map_own(source: Stream, step: Callable[[], None] = lambda: None) -> Chapter:
     heads = ("profile", "frames", "refused", "ms a frame, median", "occupied", "free")
     rows = [(name, *_row(one)) for name, one in figures.items()]
     shown = [
-        Shown("Fig 4.11", "The thesis maps an apartment of its own.", f"{source.name} under `{name}`.",
+        Shown(f"Your recording, {name}", "", f"{source.name} under the profile {name}, without its window.",
               overview_png(mapper.map, np.array(way), f"{source.name}, {name}"))
         for name, mapper in mappers.items()
     ]  # fmt: skip

@@ -12,11 +12,16 @@ from stereovox.view.page import figure, page, section, table, tiles
 HEADS = ("claim", "thesis", "ours", "holds?")
 
 
-def report(title: str, lead: str, facts: Sequence[tuple[str, str]], chapters: Sequence[Chapter]) -> str:
-    """Return the page. facts: value and label of the boxes at the top."""
-    return page(
-        title, lead, tiles(facts), _contents(chapters), *(_chapter(n, one) for n, one in enumerate(chapters, 1))
-    )
+def report(
+    title: str,
+    lead: str,
+    facts: Sequence[tuple[str, str]],
+    chapters: Sequence[Chapter],
+    heads: Sequence[str] = HEADS,
+) -> str:
+    """Return the page. facts: value and label of the boxes at the top; heads: of the four columns of claims."""
+    parts = (_chapter(n, one, heads) for n, one in enumerate(chapters, 1))
+    return page(title, lead, tiles(facts), _contents(chapters), *parts)
 
 
 def _contents(chapters: Sequence[Chapter]) -> str:
@@ -30,18 +35,20 @@ def _contents(chapters: Sequence[Chapter]) -> str:
     return section("What holds", text, table(heads, rows))
 
 
-def _chapter(number: int, one: Chapter) -> str:
+def _chapter(number: int, one: Chapter, heads: Sequence[str]) -> str:
     rows = [(claim.text, claim.thesis, claim.ours, claim.verdict) for claim in one.claims]
-    parts = [table(HEADS, rows), *map(_shown, one.shown), *map(_sheet, one.sheets), *map(_paragraph, one.remarks)]
+    claims = [table(heads, rows)] if rows else []
+    parts = [*claims, *map(_shown, one.shown), *map(_sheet, one.sheets), *map(_paragraph, one.remarks)]
     return section(f"{number}. {one.title}", one.method, *parts)
 
 
 def _shown(shown: Shown) -> str:
+    heading, ours = f"<h3>{escape(shown.place)}</h3>\n", escape(shown.ours)
+    if not shown.said:
+        return f"{heading}<p>{ours}</p>\n{figure(shown.png, shown.place)}"
     said = f"<p><b>{escape(shown.place)} of the thesis</b> (in words; the picture itself is not at hand): "
-    return (
-        f"<h3>{escape(shown.place)}</h3>\n{said}{escape(shown.said)}</p>\n<p><b>Ours:</b> {escape(shown.ours)}</p>\n"
-        + (figure(shown.png, f"Ours, beside {shown.place}"))
-    )
+    picture = figure(shown.png, f"Ours, beside {shown.place}")
+    return f"{heading}{said}{escape(shown.said)}</p>\n<p><b>Ours:</b> {ours}</p>\n{picture}"
 
 
 def _sheet(sheet: Sheet) -> str:

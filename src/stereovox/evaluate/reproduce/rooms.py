@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from stereovox.errors import StereovoxError
-from stereovox.evaluate.cells import Keys, keys
+from stereovox.evaluate.cells import Keys, keys, occupied_cells
 from stereovox.evaluate.reproduce.outer import SIDES, measure_outer, outer_corners
 from stereovox.evaluate.truth import touched_cells
 from stereovox.evaluate.walls import Wall, WallFound, corner_deg, measure_wall, thickness_figures
@@ -100,7 +100,7 @@ def measure_face(voxel_map: VoxelMap, face: Face, only: Keys | None = None, othe
 
 def _occupied(voxel_map: VoxelMap) -> VoxelMap:
     """Return a map of the occupied cells alone: smaller, for what looks at no others."""
-    cells = np.floor(voxel_map.occupied() / voxel_map.voxel_size).astype(np.int64)
+    cells = occupied_cells(voxel_map)
     return VoxelMap.from_cells(voxel_map.config, cells, np.full(len(cells), voxel_map.config.map.log_odds_max))
 
 

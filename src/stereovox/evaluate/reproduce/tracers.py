@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from stereovox.cameras import PinholeCamera
 from stereovox.config import load_config
 from stereovox.depth import prepare
-from stereovox.evaluate.cells import Keys, indices, keys
+from stereovox.evaluate.cells import Keys, indices, keys, occupied_cells
 from stereovox.frame import DepthImage
 from stereovox.geometry import Transform, inverse, transform_points
 from stereovox.integrate import make_integrator
@@ -129,10 +129,11 @@ def _count(found: Comparison, image: DepthImage, size: float) -> None:
     both = np.intersect1d(ray, line, assume_unique=True)
     found.ray, found.line, found.both = found.ray + len(ray), found.line + len(line), found.both + len(both)
     only = np.setdiff1d(ray, line, assume_unique=True)
+    assert isinstance(image.camera, PinholeCamera)  # what the simulation has
     found.at_rim += int(near_rim(indices(only), image.camera, image.T_world_sensor, size).sum())
 
 
 def _compare_maps(found: Comparison, ray: VoxelMap, line: VoxelMap) -> None:
-    cells = [keys(np.floor(one.occupied() / one.voxel_size).astype(np.int64)) for one in (ray, line)]
+    cells = [keys(occupied_cells(one)) for one in (ray, line)]
     found.occupied_ray, found.occupied_line = (len(one) for one in cells)
     found.occupied_both = len(np.intersect1d(cells[0], cells[1]))

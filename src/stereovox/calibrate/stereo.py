@@ -1,0 +1,230 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A stereo pair's lenses and their places, from pairs of images of a chessboard."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.calibrate.chessboard import Board, find_corners, image_pairs, read_grey, same_order
+from stereovox.calibrate.stereo_fit import Fit, fit_stereo, missed_pixels, refined
+from stereovox.errors import StereovoxError
+from stereovox.geometry import inverse
+from stereovox.lenses import MODELS, Lens
+from stereovox.rigs import Eyes
+
+FEWEST = 3
+"""Pairs of images that say enough."""
+FAR_PX, FAR_TIMES = 0.5, 3.0
+"""A pair is dropped where its RMS is larger than this and than this many times the median of all pairs."""
+FOLDS = 6
+"""Parts of the pairs that are left out in turn, to see how good the rest predicts them."""
+Names = tuple[str, Path, Path]
+Shown = Callable[[list[Names]], Iterable[Names]]
+Pixels = NDArray[np.float64]
+
+
+@dataclass(eq=False)
+class BoardPair:
+    """One pair of images.
+
+    left, right: (N, 2) pixels of the corners; None where no board was seen. why: the reason where it was dropped.
+    rms_px: root mean square of the distance from each corner to where calibration and board put it, both images.
+    epipolar_px: RMS difference of the rows of a corner in both images after rectification; unseen_px: the same, from a
+        calibration without this pair. NaN where it does not count.
+    """
+
+    name: str
+    left_file: Path
+    right_file: Path
+    left: Pixels | None = None
+    right: Pixels | None = None
+    size: tuple[int, int] = (0, 0)
+    why: str = ""
+    rms_px: float = np.nan
+    epipolar_px: float = np.nan
+    unseen_px: float = np.nan
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return what is worth telling, with None for what is not known."""
+        told = {key: _known(getattr(self, key)) for key in ("rms_px", "epipolar_px", "unseen_px")}
+        return {"name": self.name, "used": not self.why, "why": self.why, **told}
+
+
+@dataclass(frozen=True, eq=False)
+class StereoCalibration:
+    """What was found: both lenses and the right eye's place, and how well all pairs agree with it."""
+
+    eyes: Eyes
+    board: Board
+    pairs: list[BoardPair] = field(repr=False)
+
+    @property
+    def used(self) -> list[BoardPair]:
+        """The pairs that count."""
+        return [pair for pair in self.pairs if not pair.why]
+
+    def overall(self, key: str) -> float:
+        """Return the root mean square of `rms_px`, `epipolar_px` or `unseen_px` over the pairs used."""
+        return float(np.sqrt(np.mean([getattr(pair, key) ** 2 for pair in self.used])))
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return all figures for people and programs."""
+        return {
+            "lens": self.eyes.left.model,
+            "pairs": [pair.as_dict() for pair in self.pairs],
+            "used": len(self.used),
+            **{key: _known(self.overall(key)) for key in ("rms_px", "epipolar_px", "unseen_px")},
+            "baseline_m": self.eyes.baseline,
+            "field_of_view_deg": [field_of_view(lens) for lens in (self.eyes.left, self.eyes.right)],
+        }
+
+
+def calibrate_stereo(pairs: Iterable[BoardPair], board: Board, model: str = "pinhole") -> StereoCalibration:
+    """Return the calibration of `model` lenses from the corners of all pairs; those that do not fit are dropped.
+
+    Raises StereovoxError, one line, for an unknown model, or where fewer than three pairs are left.
+    """
+    check_model(model)
+    pairs = list(pairs)
+    fit = None
+    while fit is None or _drop_worst(pairs):
+        used = _used(pairs)
+        left, right = _corners(used)
+        fit = fit_stereo(model, used[0].size, board.points(), left, right)
+        _measure(used, fit, board)
+    _predict(_used(pairs), fit, board)
+    return StereoCalibration(fit.eyes, board, pairs)
+
+
+def check_model(model: str) -> None:
+    """Raise StereovoxError for a model of a lens that there is not."""
+    if model not in MODELS:
+        raise StereovoxError(f"--lens {model}: must be one of {', '.join(MODELS)}")
+
+
+def read_boards(folder: str | Path, board: Board, shown: Shown = iter) -> list[BoardPair]:
+    """Return the pairs of images in `folder` with their corners; those without are marked with the reason.
+
+    shown: is given the list of pairs and yields them one by one; it may tell a person how far they are.
+    Raises StereovoxError where there is no pair at all.
+    """
+    pairs = [_seen(BoardPair(*names), board) for names in shown(image_pairs(folder))]
+    sizes = [pair.size for pair in pairs if not pair.why]
+    usual = max(set(sizes), key=sizes.count, default=(0, 0))
+    for pair in pairs:
+        if not pair.why and pair.size != usual:
+            pair.why = f"{_times(pair.size)} pixels, most others have {_times(usual)}"
+    return pairs
+
+
+def epipolar_errors(eyes: Eyes, left: Pixels, right: Pixels) -> Pixels:
+    """Return by how many pixels (N,) the rows of points (N, 2) of both images differ after rectification.
+
+    Rows are those of a pinhole with the lenses' focal length; of fisheyes, even in angle, as those of wide cameras.
+    """
+    focal = (eyes.left.fy + eyes.right.fy) / 2
+    rays = [
+        lens.directions(pixels) @ R
+        for (lens, pixels), R in zip(((eyes.left, left), (eyes.right, right)), eyes.rectifying_rotations(), strict=True)
+    ]
+    if eyes.left.model == "fisheye":
+        a, b = (np.arctan2(ray[:, 1], ray[:, 2]) for ray in rays)
+    else:
+        a, b = (ray[:, 1] / ray[:, 2] for ray in rays)
+    return focal * (a - b)
+
+
+def field_of_view(lens: Lens) -> tuple[float, float]:
+    """Return the degrees that a lens sees across and down, through the middle, between the borders of its image."""
+    ends = [[-0.5, lens.cy], [lens.width - 0.5, lens.cy], [lens.cx, -0.5], [lens.cx, lens.height - 0.5]]
+    off = np.degrees(np.nan_to_num(np.arccos(np.clip(lens.directions(ends)[:, 2], -1, 1)), nan=lens.widest))
+    return float(off[0] + off[1]), float(off[2] + off[3])
+
+
+def _seen(pair: BoardPair, board: Board) -> BoardPair:
+    images = [read_grey(path) for path in (pair.left_file, pair.right_file)]
+    for path, image in zip((pair.left_file, pair.right_file), images, strict=True):
+        if image is None:
+            pair.why = f"{path.name} cannot be read as an image"
+            return pair
+    left, right = (image for image in images if image is not None)
+    pair.size = left.shape[1], left.shape[0]
+    if left.shape != right.shape:
+        pair.why = f"left {_times(pair.size)} pixels, right {right.shape[1]}x{right.shape[0]}"
+        return pair
+    pair.left, pair.right = find_corners(left, board), find_corners(right, board)
+    blind = [path.name for path, found in ((pair.left_file, pair.left), (pair.right_file, pair.right)) if found is None]
+    if pair.left is not None and pair.right is not None:
+        pair.right = same_order(pair.right, pair.left)
+    else:
+        pair.why = f"no board of {board.columns}x{board.rows} inner corners in {' and '.join(blind)}"
+    return pair
+
+
+def _used(pairs: Sequence[BoardPair]) -> list[BoardPair]:
+    used = [pair for pair in pairs if not pair.why]
+    if len(used) < FEWEST:
+        reasons = "; ".join(f"{pair.name}: {pair.why}" for pair in pairs if pair.why)
+        said = f" ({reasons})" if reasons else ""
+        raise StereovoxError(f"only {len(used)} pairs of images are of use, {FEWEST} are needed{said}; take more")
+    return used
+
+
+def _corners(pairs: Sequence[BoardPair]) -> tuple[list[Pixels], list[Pixels]]:
+    left = [pair.left for pair in pairs if pair.left is not None]
+    return left, [pair.right for pair in pairs if pair.right is not None]
+
+
+def _measure(used: Sequence[BoardPair], fit: Fit, board: Board) -> None:
+    left, right = _corners(used)
+    T_right = [inverse(fit.eyes.T_left_right) @ T for T in fit.T_left_board]
+    ours = missed_pixels(fit.eyes.left, fit.T_left_board, board.points(), left)
+    theirs = missed_pixels(fit.eyes.right, T_right, board.points(), right)
+    for k, pair in enumerate(used):
+        both = np.concatenate([ours[k], theirs[k]]).reshape(-1, 2)
+        pair.rms_px = float(np.sqrt((both**2).sum(axis=1).mean()))
+        pair.epipolar_px = _rms(epipolar_errors(fit.eyes, left[k], right[k]))
+
+
+def _drop_worst(pairs: Sequence[BoardPair]) -> bool:
+    """Drop the pair that fits worst, if it fits much worse than the others, and tell whether there was one."""
+    used = [pair for pair in pairs if not pair.why]
+    worst, usual = max(used, key=lambda pair: pair.rms_px), float(np.median([pair.rms_px for pair in used]))
+    if worst.rms_px <= max(FAR_PX, FAR_TIMES * usual):
+        return False
+    worst.why = f"corners missed by {worst.rms_px:.2f} px RMS, the others by about {usual:.2f}; did the board move?"
+    return True
+
+
+def _predict(used: Sequence[BoardPair], fit: Fit, board: Board) -> None:
+    """Tell of each pair how far its rows differ by a calibration that has not seen it."""
+    if len(used) <= FEWEST:
+        return
+    left, right = _corners(used)
+    for fold in range(min(FOLDS, len(used))):
+        rest = [k for k in range(len(used)) if k % FOLDS != fold]
+        if len(rest) < FEWEST:
+            continue
+        eyes = fit.eyes
+        T, a, b = ([many[k] for k in rest] for many in (fit.T_left_board, left, right))
+        without = refined(eyes.left, eyes.right, eyes.T_left_right, T, board.points(), a, b)
+        for k in set(range(len(used))) - set(rest):
+            used[k].unseen_px = _rms(epipolar_errors(without.eyes, left[k], right[k]))
+
+
+def _known(number: float) -> float | None:
+    return float(number) if np.isfinite(number) else None
+
+
+def _rms(numbers: Pixels) -> float:
+    return float(np.sqrt(np.mean(numbers**2)))
+
+
+def _times(size: tuple[int, int]) -> str:
+    return f"{size[0]}x{size[1]}"

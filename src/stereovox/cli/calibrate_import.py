@@ -1,0 +1,79 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Make a rig file of a stereo calibration that another tool wrote.
+
+Known are KITTI (calib_cam_to_cam.txt, or calib.txt with --size), ROS (camera_info yaml of the left and of the right
+eye), OpenCV (yml with M1 D1 M2 D2 R T, or intrinsics.yml and extrinsics.yml) and Kalibr (camchain yaml, pinhole-radtan
+and pinhole-equi).
+"""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser, Namespace
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from stereovox.cli.recordings import check_outputs
+from stereovox.cli.terminal import say
+from stereovox.errors import StereovoxError
+
+EXAMPLE = "stereovox calibrate import camchain.yaml --out recordings/flight/rig.toml"
+
+
+def add_arguments(parser: ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument(
+        "files", nargs="+", metavar="FILE", help="the calibration; two files of ROS, first the left eye"
+    )
+    parser.add_argument("--out", required=True, metavar="FILE", help="rig file to write, for example rig.toml")
+    parser.add_argument("--size", metavar="WxH", help="pixels of the images, where the file does not tell")
+    parser.add_argument("--lens", default="", metavar="MODEL", help="fisheye, where an OpenCV file is of fisheyes")
+    parser.add_argument("--name", default="stereo", metavar="NAME", help="name of the pair (%(default)s)")
+    parser.add_argument(
+        "--rectify",
+        default="",
+        metavar="MODEL",
+        help="pinhole, spherical or cylindrical (a pinhole; fisheyes: spherical)",
+    )
+
+
+def run(arguments: Namespace) -> dict[str, Any]:
+    """Read, write the rig file and tell what is in it."""
+    from stereovox.products.files import replacing
+    from stereovox.sources.calibration_files import import_rig
+    from stereovox.sources.rig_file import Virtual
+    from stereovox.sources.rig_tables import rig_text
+
+    check_outputs(arguments.out)
+    files = [Path(name) for name in arguments.files]
+    rig = import_rig(files, image_size(arguments.size), arguments.lens, arguments.name)
+    pairs = tuple(replace(pair, virtual=Virtual(_model(pair.eyes, arguments.rectify))) for pair in rig.pairs)
+    rig = replace(rig, pairs=pairs)
+    stereo = rig.stereo_pairs(Path(arguments.out).parent)
+    remarks = (f"stereovox calibrate import {' '.join(path.name for path in files)}",)
+    with replacing(arguments.out) as file:
+        file.write(rig_text(rig, remarks).encode())
+    for pair in stereo:
+        camera = pair.camera
+        kind = "rectified images" if pair.eyes is None else f"{pair.eyes.left.model} lenses"
+        say(f"  {pair.name}: {kind}, {camera.width}x{camera.height} pixels, baseline {camera.baseline:.4f} m")
+    say(f"saved {arguments.out}; put the images and poses beside it: docs/rigs.md")
+    told = [{"name": pair.name, "baseline_m": pair.camera.baseline, "rectified": pair.eyes is None} for pair in stereo]
+    return {"pairs": told, "out": arguments.out}
+
+
+def image_size(text: str | None) -> tuple[int, int] | None:
+    """Return width and height of `640x480`; raises StereovoxError for anything else."""
+    if text is None:
+        return None
+    try:
+        width, height = (int(word) for word in text.lower().split("x"))
+    except ValueError:
+        width = height = 0
+    if not (0 < width < 100_000 and 0 < height < 100_000):
+        raise StereovoxError(f"--size {text}: write width x height in pixels, for example 640x480")
+    return width, height
+
+
+def _model(eyes: Any, wanted: str) -> str:
+    return wanted or ("spherical" if eyes is not None and eyes.left.model == "fisheye" else "pinhole")

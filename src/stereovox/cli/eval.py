@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Compare a map with the truth, cell by cell.
+
+MAP and TRUTH are folders of stereovox or OctoMap files (.bt, .ot) with cells of the same size.
+"""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser, Namespace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from stereovox.cli.terminal import say, thousands
+
+if TYPE_CHECKING:
+    from stereovox.evaluate.scores import Scores
+
+EXAMPLE = "stereovox eval drive.svox truth.svox --report drive-report"
+MEASURES = {
+    "precision": "of the cells called occupied, hold a surface",
+    "recall": "of the surface cells, are called occupied",
+    "tolerance_precision": "precision, a surface within {} is enough",
+    "tolerance_recall": "recall, an occupied cell within {} is enough",
+    "accuracy": "of all cells, are called right",
+    "specificity": "of the free cells, are not called occupied",
+    "npv": "of the cells not called occupied, are free",
+    "correlation": "of probability and truth, 1 is perfect",
+}
+AUC = "area under the ROC curve, 1 is perfect"
+SINGLE = {
+    "error": "mean squared error of the probabilities (Brier score), 0 is perfect",
+    "ece": "how far probabilities lie from the true shares (ECE), 0 is perfect",
+}
+
+
+def add_arguments(parser: ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("map", metavar="MAP", help="map to be judged")
+    parser.add_argument(
+        "truth", metavar="TRUTH", help="map whose occupied cells hold a surface and free cells hold none"
+    )
+    parser.add_argument(
+        "--threshold", type=float, default=0.7, metavar="P", help="a cell is called occupied above it (default: 0.7)"
+    )
+    parser.add_argument(
+        "--tolerance", type=int, default=1, metavar="CELLS", help="distance that is forgiven (default: 1)"
+    )
+    parser.add_argument("--path", metavar="FILE", help="poses of the camera, for precision and recall by distance")
+    parser.add_argument("--report", metavar="DIR", help="write a page with charts there")
+
+
+def run(arguments: Namespace) -> dict[str, Any]:
+    """Load both maps, compare them, tell and report."""
+    from stereovox.evaluate.camera_path import read_camera_path
+    from stereovox.evaluate.outcomes import outcomes
+    from stereovox.evaluate.read_map import read_map
+    from stereovox.evaluate.scores import score
+    from stereovox.evaluate.truth_cells import TruthCells, level
+
+    level(arguments.threshold)  # a wrong number shows before large maps are read
+    path = None if arguments.path is None else read_camera_path(arguments.path)
+    truth = TruthCells(read_map(arguments.truth), arguments.tolerance)
+    voxel_map = read_map(arguments.map)
+    scores = score(voxel_map, truth, arguments.threshold, path=path)
+    result = scores.as_dict()
+    if scores.distance is not None:
+        result["distance"] = scores.distance.rows()
+    _tell(scores)
+    if arguments.report:
+        from stereovox.view.evaluation_report import Evaluated, write_evaluation_report
+
+        shown = outcomes(truth.read(voxel_map), truth, arguments.threshold)
+        evaluated = Evaluated(Path(arguments.map).name, scores, outcomes=shown)
+        page = write_evaluation_report(arguments.report, [evaluated], Path(arguments.truth).name)
+        say(f"report: {page}")
+        result["report"] = str(page)
+    return result
+
+
+def _tell(scores: Scores) -> None:
+    observed = scores.observed
+    say(f"{thousands(scores.cells)} cells of the truth, {scores.coverage:.1%} of them observed by the map")
+    if not observed.cells:
+        say("the map knows none of them: are both in the same world frame?")
+    say(f"occupied: p > {scores.threshold:g}")
+    say(f"{'':20}  {'all cells':>11}  {'observed':>11}")
+    for name in ("tp", "fp", "tn", "fn"):
+        say(f"{name:20}  {thousands(getattr(scores, name)):>11}  {thousands(getattr(observed, name)):>11}")
+    within = "1 cell" if scores.tolerance_cells == 1 else f"{scores.tolerance_cells} cells"
+    for name, text in MEASURES.items():
+        values = (_number(getattr(one, name)) for one in (scores, observed))
+        say(f"{name:20}  {next(values):>11}  {next(values):>11}  {text.format(within)}")
+    say(f"{'auc':20}  {_number(scores.auc):>11}  {_number(scores.observed_auc):>11}  {AUC}")
+    for name, text in SINGLE.items():
+        say(f"{name:20}  {'':>11}  {_number(getattr(scores, name)):>11}  {text}")
+
+
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3f}"

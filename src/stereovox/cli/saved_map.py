@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Open the map that a command was given, or say what the folder holds instead."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from stereovox.cli.terminal import command_line
+from stereovox.errors import MapFileError
+
+if TYPE_CHECKING:
+    from stereovox.maps import VoxelMap
+
+
+def open_map(path: str) -> VoxelMap:
+    """Return the map saved at `path`; raises MapFileError, one line that names the map or recording perhaps meant."""
+    from stereovox.maps import load_map
+    from stereovox.maps.store import is_map
+
+    if not is_map(path):
+        raise MapFileError(f"{path}: {_instead(Path(path))}")
+    return load_map(path)
+
+
+def _instead(path: Path) -> str:
+    from stereovox.maps.store import is_map
+    from stereovox.sources import is_recording
+
+    if not os.path.exists(path):
+        return "no stereovox map here, nor anything else; check the name"
+    below = sorted(path.iterdir()) if path.is_dir() else []
+    meant = next((folder for folder in below if is_map(folder)), None)
+    if meant:
+        return f"no stereovox map here (did you mean {meant}?)"
+    if is_recording(path):
+        make = command_line("map", path, "--out", f"{path.resolve().stem}.svox")
+        return f"no stereovox map here but a recording; make a map of it with: {make}"
+    return "no stereovox map here (a map is a folder with a manifest.json); make one with: stereovox map"

@@ -1,0 +1,170 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Kernels on disparity images (height, width) float32 in pixels; NaN: none."""
+
+import numpy as np
+
+from stereovox._jit import cell, kernel
+
+VALID, UNMATCHED, TOO_NEAR, TOO_FAR, MASKED = np.uint8(0), np.uint8(1), np.uint8(2), np.uint8(3), np.uint8(4)
+NAN, ZERO, HALF, ONE = np.float32(np.nan), np.float32(0), np.float32(0.5), np.float32(1)
+ONE_PX, FOUR, FIFTEEN, PER_ROW = np.int32(16), np.int32(4), np.int32(15), np.float32(1 / 32)
+SLOPE = np.float32(0.1)
+UNITS = np.float32(64)
+"""Sums are whole numbers of 1/64 px, so that they come and go without a trace."""
+
+
+@kernel
+def pixels(raw, fractions, lag, out):
+    """Fill `out` from `raw` (h, w) int16: counts of 1/16 px, negative: none.
+
+    fractions: (16,) float32, what the last four bits of a count stand for, in pixels. lag: rows by which the disparity
+    drags behind going down; taken back along the vertical slope, where that is less than one pixel a row.
+    """
+    height, width = raw.shape
+    for v in range(height):
+        above, row, below = raw[max(v - 1, 0)], raw[v], raw[min(v + 1, height - 1)]
+        for u in range(width):
+            a, c, b = np.int32(above[u]), np.int32(row[u]), np.int32(below[u])
+            smooth = (a >= 0) & (b >= 0) & (abs(b - c) < ONE_PX) & (abs(c - a) < ONE_PX)
+            slope = np.float32(b - a) * PER_ROW if smooth else ZERO
+            d = np.float32(c >> FOUR) + fractions[c & FIFTEEN] + lag * slope
+            d = d if d > ZERO else ZERO
+            out[v, u] = d if c >= 0 else NAN
+
+
+@kernel
+def cross_check(disparity, side, most, seen):
+    """Drop pixels in place that share their partner in the other image with one nearer by more than `most` pixels.
+
+    side: -1: the partner of u is u - disparity, 1: u + disparity. seen: (w,) float32 scratch.
+    """
+    height, width = disparity.shape
+    for v in range(height):
+        row = disparity[v]
+        seen[:] = ZERO
+        for u in range(width):
+            d = row[u]
+            if d == d:
+                x = _partner(u, d, side, width)
+                seen[x] = max(seen[x], d)
+        for u in range(width):
+            d = row[u]
+            if d == d and seen[_partner(u, d, side, width)] - d > most:
+                row[u] = NAN
+
+
+@kernel
+def confidence(disparity, radius, columns, filled, line, line_filled, out):
+    """Fill `out` with the share of a window that has a disparity, less where the pixel is off the window's mean.
+
+    radius: the window spans so many pixels to each side. columns, filled: (w,) int32; line, line_filled: (w + 1,)
+    int32, scratch. No value: 0.
+    """
+    height, width = disparity.shape
+    columns[:] = np.int32(0)
+    filled[:] = np.int32(0)
+    for v in range(min(radius, height)):
+        _put(disparity[v], np.int32(1), columns, filled)
+    for v in range(height):
+        if v + radius < height:
+            _put(disparity[v + radius], np.int32(1), columns, filled)
+        if v - radius - 1 >= 0:
+            _put(disparity[v - radius - 1], np.int32(-1), columns, filled)
+        rows = min(v + radius, height - 1) - max(v - radius, 0) + 1
+        _running(columns, line)
+        _running(filled, line_filled)
+        row, result = disparity[v], out[v]
+        for u in range(width):
+            first, end = max(u - radius, 0), min(u + radius + 1, width)
+            count = np.float32(line_filled[end] - line_filled[first])
+            total = np.float32(line[end] - line[first]) / UNITS
+            d = row[u]
+            off = abs(d - total / count) / (ONE + SLOPE * d)
+            share = count / np.float32(rows * (end - first))
+            result[u] = share / (ONE + off) if d == d else ZERO
+
+
+@kernel
+def texture(image, down, across, columns, line, out):
+    """Fill `out` (h, w) with the mean of |image[v, u + 1] - image[v, u - 1]| over a window.
+
+    The window spans `down` rows and `across` columns to each side; at the image's sides there is no step, so 0 counts.
+    columns: (w,) and line: (w + 1,) int32, scratch.
+    """
+    height, width = image.shape
+    columns[:] = np.int32(0)
+    for v in range(min(down, height)):
+        _put_steps(image[v], np.int32(1), columns)
+    for v in range(height):
+        if v + down < height:
+            _put_steps(image[v + down], np.int32(1), columns)
+        if v - down - 1 >= 0:
+            _put_steps(image[v - down - 1], np.int32(-1), columns)
+        rows = min(v + down, height - 1) - max(v - down, 0) + 1
+        _running(columns, line)
+        for u in range(width):
+            first, end = max(u - across, 0), min(u + across + 1, width)
+            out[v, u] = np.float32(line[end] - line[first]) / np.float32(rows * (end - first))
+
+
+@kernel
+def explain(disparity, sure, steps, valid, valid_other, side, settings, reason):
+    """Drop in place what has no place in the other image, is too near, too far or not sure; fill `reason`.
+
+    sure: (h, w) confidence, made 0 where nothing stays. steps: (h, w) float32, the texture. valid, valid_other: (h, w)
+    bool of the aligned and of the other image, or (0, 0): all may be used. side: as in `cross_check`. settings: (9,)
+    float32: most disparity, least, least confidence of any pixel and of a far one, columns cropped at the left and at
+    the right, least texture of any pixel, disparity below which more is asked for, and how much.
+    """
+    height, width = disparity.shape
+    nearest, farthest, least, least_far = settings[0], settings[1], settings[2], settings[3]
+    first, end = np.int64(settings[4]), width - np.int64(settings[5])
+    textured, doubtful, seen = settings[6], settings[7], settings[8]
+    own, other = valid.size > 0, valid_other.size > 0
+    for v in range(height):
+        for u in range(width):
+            d, c = disparity[v, u], sure[v, u]
+            x = np.float32(u) + np.float32(side) * d
+            outside = (x < -HALF) | (x > np.float32(width) - HALF) | (u < first) | (u >= end)
+            why = VALID if (d == d) & (not outside) & (c >= least) else UNMATCHED
+            why = UNMATCHED if (why == VALID) & (steps[v, u] < (seen if d < doubtful else textured)) else why
+            far = d < farthest
+            why = (TOO_FAR if c >= least_far else UNMATCHED) if (why == VALID) & far else why
+            why = TOO_NEAR if (d >= nearest) & (not outside) else why
+            if own and not valid[v, u]:
+                why = MASKED
+            if other and d == d and not valid_other[v, _partner(u, d, side, width)]:
+                why = MASKED
+            reason[v, u] = why
+            disparity[v, u] = d if why == VALID else NAN
+            sure[v, u] = c if why == VALID else ZERO
+
+
+@cell
+def _partner(u, d, side, width):
+    x = np.int64(np.float32(u) + np.float32(side) * d + HALF)
+    return min(max(x, 0), width - 1)
+
+
+@cell
+def _put(row, sign, columns, filled):
+    for u in range(row.size):
+        d = row[u]
+        there = d == d
+        columns[u] += sign * (np.int32(d * UNITS) if there else np.int32(0))
+        filled[u] += sign if there else np.int32(0)
+
+
+@cell
+def _put_steps(row, sign, columns):
+    for u in range(1, row.size - 1):
+        columns[u] += sign * abs(np.int32(row[u + 1]) - np.int32(row[u - 1]))
+
+
+@cell
+def _running(values, sums):
+    total = np.int32(0)
+    sums[0] = total
+    for u in range(values.size):
+        total += values[u]
+        sums[u + 1] = total

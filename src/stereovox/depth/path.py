@@ -1,0 +1,32 @@
+# SPDX-License-Identifier: Apache-2.0
+"""All that happens between a frame and its depth image: match, check, clean, and gather on the sphere."""
+
+from __future__ import annotations
+
+from functools import cached_property
+
+from stereovox.config import Config
+from stereovox.depth.prepare import prepare
+from stereovox.depth.sphere_image import through_sphere
+from stereovox.depth.stereo import StereoDepth
+from stereovox.frame import AnyFrame, DepthImage, Frame, StereoFrame
+
+
+class DepthPath:
+    """Makes depth images of frames as `config` says."""
+
+    def __init__(self, config: Config):
+        self._config = config
+
+    def matched(self, frame: AnyFrame) -> Frame:
+        """Return a stereo frame as one with depth, any other as it is. Raises FrameRefused as `StereoDepth`."""
+        return self._stereo(frame) if isinstance(frame, StereoFrame) else frame
+
+    def image(self, frame: Frame) -> DepthImage:
+        """Return the frame's depth image. Raises FrameRefused as `prepare`."""
+        return through_sphere(prepare(frame, self._config), self._config)
+
+    @cached_property
+    def _stereo(self) -> StereoDepth:
+        """Made with the first stereo frame: other recordings need no OpenCV."""
+        return StereoDepth(self._config.stereo)

@@ -1,0 +1,31 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Read where a camera was from a text file of poses."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.errors import SourceError
+
+COLUMNS = {3: (0, 1, 2), 8: (1, 2, 3), 9: (1, 2, 3), 12: (3, 7, 11), 16: (3, 7, 11)}
+"""Where x, y, z stand, by the numbers in a line: x y z; TUM's, with or without a confidence; 3x4 and 4x4 matrices."""
+
+
+def read_camera_path(path: str | Path) -> NDArray[np.float64]:
+    """Return the camera positions (P, 3) in metres of a text file with one pose a line; `#` begins a comment.
+
+    A line holds x y z, or `stamp x y z qx qy qz qw` (TUM), or the 12 (KITTI) or 16 numbers of a matrix row by row.
+    Raises SourceError: one line with the file and what is wrong.
+    """
+    try:
+        with warnings.catch_warnings(action="ignore"):  # an empty file is refused below
+            table = np.loadtxt(path, ndmin=2)
+    except (OSError, ValueError) as error:
+        raise SourceError(f"{path}: cannot be read as poses ({error}); give one pose a line") from None
+    if table.shape[1] not in COLUMNS or not np.isfinite(table).all() or not len(table):
+        raise SourceError(f"{path}: {len(table)} lines of {table.shape[1]} numbers; give 3, 8, 12 or 16 a line")
+    return table[:, COLUMNS[table.shape[1]]]

@@ -1,0 +1,83 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How a map does at every threshold: ROC, and precision and recall with a tolerance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stereovox.evaluate.truth_cells import Reading, level
+
+THRESHOLDS = np.arange(1, 100) / 100
+
+
+@dataclass(frozen=True, eq=False)
+class Roc:
+    """Receiver operating characteristic: what is gained and what it costs as the threshold falls from 1 to 0.
+
+    threshold: (M,) falling, inf first; at each, cells with p >= threshold are called occupied.
+    false_positive_rate: (M,) share of the free cells that are called so; true_positive_rate: (M,) of the occupied ones.
+    """
+
+    threshold: NDArray[np.float64]
+    false_positive_rate: NDArray[np.float64]
+    true_positive_rate: NDArray[np.float64]
+
+    @property
+    def auc(self) -> float:
+        """Area under it: how often an occupied cell has a higher p than a free one, ties half; 0.5 is guessing."""
+        return float(np.trapezoid(self.true_positive_rate, self.false_positive_rate))
+
+
+def roc(p: NDArray[np.floating], actual: NDArray[np.bool_]) -> Roc | None:
+    """Return the curve of probabilities (N,); None unless some cells are occupied and some free."""
+    values, of_cell = np.unique(p, return_inverse=True)
+    occupied = np.bincount(of_cell, actual, len(values))[::-1]
+    free = np.bincount(of_cell, ~actual, len(values))[::-1]
+    if not occupied.sum() or not free.sum():
+        return None
+    rates = [np.concatenate([[0], np.cumsum(part) / part.sum()]) for part in (free, occupied)]
+    return Roc(np.concatenate([[np.inf], values[::-1]]), *rates)
+
+
+@dataclass(frozen=True, eq=False)
+class PrecisionRecall:
+    """Precision and recall at each threshold (M,), exact and with the tolerance; NaN where nothing can be divided."""
+
+    threshold: NDArray[np.float64]
+    precision: NDArray[np.float64]
+    recall: NDArray[np.float64]
+    tolerance_precision: NDArray[np.float64]
+    tolerance_recall: NDArray[np.float64]
+
+
+def precision_recall(
+    reading: Reading, actual: NDArray[np.bool_], near: NDArray[np.bool_], thresholds: ArrayLike = THRESHOLDS
+) -> PrecisionRecall:
+    """Return precision and recall over all cells of the truth at `thresholds` (M,).
+
+    actual, near: (N,) cells that hold a surface, that have one within the tolerance. Unobserved cells count as free.
+    """
+    thresholds = np.asarray(thresholds, float)
+    levels = np.array([level(threshold) for threshold in thresholds])
+    seen = reading.observed
+    marked, right, close = (
+        above(reading.log_odds[seen & chosen], levels) for chosen in (np.ones_like(seen), actual, near)
+    )
+    found, surface = above(reading.best, levels), int(actual.sum())
+    return PrecisionRecall(
+        thresholds, shares(right, marked), shares(right, surface), shares(close, marked), shares(found, surface)
+    )
+
+
+def above(values: NDArray[np.floating], levels: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return how many `values` (N,) are greater than each of the `levels` (M,)."""
+    return len(values) - np.searchsorted(np.sort(values), levels, side="right")
+
+
+def shares(part: NDArray[np.integer], whole: NDArray[np.integer] | int) -> NDArray[np.float64]:
+    """Return part / whole, NaN where there is nothing to divide by."""
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.where(np.asarray(whole) > 0, part / np.asarray(whole, float), np.nan)

@@ -1,0 +1,167 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How good is a map beside the truth? All measures of Valenti 2018, 8.3, and what they leave out."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stereovox.evaluate.curves import THRESHOLDS, PrecisionRecall, Roc, precision_recall, roc
+from stereovox.evaluate.distance import ByDistance, by_distance
+from stereovox.evaluate.metrics import Confusion, ratio
+from stereovox.evaluate.reliability import BINS, Reliability, brier, correlation, reliability
+from stereovox.evaluate.truth_cells import Reading, TruthCells
+from stereovox.maps import VoxelMap
+
+_NOT_NUMBERS = {"observed", "reliability", "roc", "curve", "distance"}
+
+
+@dataclass(frozen=True)
+class Tally:
+    """Measures over one set of cells; None where there is nothing to divide by.
+
+    cells: how many; tp, fp, tn, fn: counts, positive = called occupied; accuracy to npv: Eq 8.2 to 8.6; correlation:
+    Pearson's, of probability and truth (Eq 8.8-8.9, divided by N); tolerance_precision: share of the cells called
+    occupied with a surface within the tolerance; tolerance_recall: share of the surface cells with a cell called
+    occupied within it, wherever that lies.
+    """
+
+    cells: int
+    tp: int
+    fp: int
+    tn: int
+    fn: int
+    accuracy: float | None
+    precision: float | None
+    recall: float | None
+    specificity: float | None
+    npv: float | None
+    tolerance_precision: float | None
+    tolerance_recall: float | None
+    correlation: float | None
+
+
+@dataclass(frozen=True)
+class QuickScores(Tally):
+    """What can be told after every frame. The measures of `Tally` over all cells of the truth, unobserved ones free.
+
+    threshold, tolerance_cells: as asked; coverage: share of the cells the map knows something about. Over observed
+    cells: error, mean squared error of the probabilities (Eq 8.7); brier, the same under its other name; ece, expected
+    calibration error; observed, the measures of `Tally`.
+    """
+
+    threshold: float
+    tolerance_cells: int
+    coverage: float
+    error: float | None
+    brier: float | None
+    ece: float | None
+    observed: Tally
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return all single numbers, with `observed` as a dict: JSON without NaN."""
+        numbers = {field.name: getattr(self, field.name) for field in fields(self) if field.name not in _NOT_NUMBERS}
+        return {**numbers, "observed": asdict(self.observed)}
+
+
+@dataclass(frozen=True, eq=False)
+class Scores(QuickScores):
+    """All measures. auc: area under the ROC curve, over all cells (p = 0.5 where unobserved); observed_auc likewise.
+
+    reliability: over observed cells; roc: over all cells, None unless some are occupied and some free; curve: precision
+    and recall against the threshold; distance: the same against distance, None where no path was given.
+    """
+
+    auc: float | None
+    observed_auc: float | None
+    reliability: Reliability
+    roc: Roc | None
+    curve: PrecisionRecall
+    distance: ByDistance | None
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return all single numbers, with `observed` as a dict: JSON without NaN."""
+        numbers = super().as_dict()
+        numbers["observed"]["auc"] = numbers.pop("observed_auc")
+        return numbers
+
+
+def score(
+    voxel_map: VoxelMap,
+    truth_map: VoxelMap | TruthCells,
+    threshold: float = 0.7,
+    tolerance: int = 1,
+    *,
+    bins: int = BINS,
+    thresholds: ArrayLike = THRESHOLDS,
+    path: ArrayLike | None = None,
+    edges: ArrayLike | None = None,
+) -> Scores:
+    """Compare a map with the truth over the cells that the truth knows.
+
+    truth_map: a map whose occupied cells hold a surface and whose free cells were in view and hold none; or
+    `TruthCells`, made once for many maps, which has its own tolerance. threshold: a cell is called occupied where
+    p > threshold (Eq 8.1). tolerance: cells along each axis. bins: of the reliability diagram; thresholds: (M,) of the
+    curve of precision and recall. path: camera positions (P, 3) or one (3,) in metres, world frame, for `distance`;
+    edges: its rings in metres. Raises StereovoxError for maps of different cells, a truth that holds nothing, and
+    numbers out of range.
+    """
+    truth = truth_map if isinstance(truth_map, TruthCells) else TruthCells(truth_map, tolerance)
+    reading = truth.read(voxel_map)
+    seen, p = reading.observed, reading.probability
+    over_all, over_seen = roc(p, truth.occupied), roc(p[seen], truth.occupied[seen])
+    quick = score_reading(reading, truth, threshold, bins)
+    return Scores(
+        **{field.name: getattr(quick, field.name) for field in fields(quick)},
+        auc=over_all.auc if over_all else None,
+        observed_auc=over_seen.auc if over_seen else None,
+        reliability=reliability(p[seen], truth.occupied[seen], bins),
+        roc=over_all,
+        curve=precision_recall(reading, truth.occupied, truth.near, thresholds),
+        distance=None if path is None else by_distance(reading, truth, path, threshold, edges),
+    )
+
+
+def score_reading(reading: Reading, truth: TruthCells, threshold: float = 0.7, bins: int = BINS) -> QuickScores:
+    """Return the measures that need no sorting: a few milliseconds for 100,000 cells."""
+    seen, p, actual = reading.observed, reading.probability, truth.occupied
+    marked, found = reading.marked(threshold), reading.found(threshold)
+    close = ratio(float((marked & truth.near).sum()), float(marked.sum()))
+    over_all = _tally(marked, actual, found, p, close)
+    over_seen = over_all if seen.all() else _tally(marked[seen], actual[seen], found[seen[actual]], p[seen], close)
+    error = brier(p[seen], actual[seen])
+    return QuickScores(
+        **vars(over_all),
+        threshold=threshold,
+        tolerance_cells=truth.tolerance,
+        coverage=float(seen.mean()),
+        error=error,
+        brier=error,
+        ece=reliability(p[seen], actual[seen], bins).ece,
+        observed=over_seen,
+    )
+
+
+def _tally(
+    marked: NDArray[np.bool_],
+    actual: NDArray[np.bool_],
+    found: NDArray[np.bool_],
+    p: NDArray[np.float64],
+    close: float | None,
+) -> Tally:
+    """Return the measures over N cells; found: (S,) for each truly occupied one; close: the tolerance precision."""
+    counted = Confusion.count(marked, actual)
+    return Tally(
+        cells=len(actual),
+        tp=counted.tp,
+        fp=counted.fp,
+        tn=counted.tn,
+        fn=counted.fn,
+        **counted.rates(),
+        tolerance_precision=close,
+        tolerance_recall=ratio(float(found.sum()), len(found)),
+        correlation=correlation(p, actual),
+    )

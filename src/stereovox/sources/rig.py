@@ -1,0 +1,118 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Recordings of stereo rigs: a folder with a rig file, images of each pair, and the vehicle's poses."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from stereovox.errors import FrameRefused, SourceError
+from stereovox.frame import StereoFrame
+from stereovox.geometry import Transform
+from stereovox.rigs import StereoPair
+from stereovox.sources.base import Source
+from stereovox.sources.folder import file_names
+from stereovox.sources.images import read_picture_png
+from stereovox.sources.rig_file import FILE, RigPair, read_rig
+from stereovox.sources.trajectory import Trajectory, by_time, stamped_lines
+
+
+class _Shot(NamedTuple):
+    """One picture of one pair: time, number of the pair, both files."""
+
+    stamp_ns: int
+    pair: int
+    left: Path
+    right: Path
+
+
+class StereoRig(Source):
+    """A folder with `rig.toml` (see `Rig`), images of each pair, and a file of poses T_world_body in TUM format.
+
+    Frames: a `StereoFrame` for each left image of each pair, in order of time; of one time in the rig file's order.
+    Both images of a moment have the same name, their time in nanoseconds, or stand in a line of the pair's index.
+    Pose: between the neighbours before and after the image's time, times T_body_camera; both must be less than 0.1 s
+    away. World: that of the poses.
+    Faults: those of `read_picture_png` and of `Poses.at`. Raises SourceError, one line, for a bad rig file, masks or
+    folders that cannot be read, names that are no times, and where there is no image or no file of poses.
+    """
+
+    layout = f"a stereo rig ({FILE} that names pairs, folders of images and poses)"
+
+    def __init__(self, where: str | os.PathLike[str]):
+        self.folder = Path(where)
+        self.name = self.folder.resolve().name
+        file = self.folder / FILE
+        rig = read_rig(file)
+        try:
+            self.pairs: list[StereoPair] = rig.stereo_pairs(self.folder)
+        except SourceError as error:
+            raise SourceError(f"{file}: {error}") from None
+        self.camera = self.pairs[0].camera.middle
+        shots = [_shots(self.folder, number, pair) for number, pair in enumerate(rig.pairs)]
+        self._shots = sorted((shot for some in shots for shot in some), key=lambda shot: (shot.stamp_ns, shot.pair))
+        self._poses = Trajectory(self.folder / rig.poses)
+
+    @classmethod
+    def recognises(cls, where: str) -> bool:
+        """Tell whether `where` is a folder with a `rig.toml`."""
+        return os.path.isfile(os.path.join(where, FILE))
+
+    def __len__(self) -> int:
+        return len(self._shots)
+
+    def frame(self, i: int) -> StereoFrame:
+        """Return frame `i`; its images are (0, 0) and its pose NaN where it has a `fault`."""
+        shot = self._shots[range(len(self))[i]]
+        pair = self.pairs[shot.pair]
+        nothing, nowhere = np.empty((0, 0), np.uint8), np.full((4, 4), np.nan)
+        frame = StereoFrame(nothing, nothing, pair, nowhere, shot.stamp_ns, str(shot.left))
+        try:
+            T_world_camera = self._pose(shot, pair)
+            left, right = (read_picture_png(path, size) for path, size in zip(shot[2:], _sizes(pair), strict=True))
+        except FrameRefused as refused:
+            return replace(frame, fault=refused.reason, fault_detail=str(refused))
+        return replace(frame, left=left, right=right, T_world_sensor=T_world_camera)
+
+    def _pose(self, shot: _Shot, pair: StereoPair) -> Transform:
+        try:
+            return self._poses.at(shot.stamp_ns) @ pair.T_body_camera
+        except FrameRefused as refused:
+            raise FrameRefused(refused.reason, f"{shot.left}: {refused}") from None
+
+
+def _sizes(pair: StereoPair) -> tuple[tuple[int, int], tuple[int, int]]:
+    left, right = (pair.eyes.left, pair.eyes.right) if pair.eyes else (pair.camera, pair.camera)
+    return (left.width, left.height), (right.width, right.height)
+
+
+def _shots(folder: Path, number: int, pair: RigPair) -> list[_Shot]:
+    left, right = (folder / name for name in pair.folders())
+    if pair.index:
+        return _listed(folder / pair.index, number, left, right)
+    names = sorted(name for name in file_names(left) if name.endswith(".png"))
+    if not names:
+        raise SourceError(f"{left}: holds no PNG; put the left images of pair '{pair.name}' there, named by ns")
+    return [_Shot(_stamp(left / name), number, left / name, right / name) for name in names]
+
+
+def _listed(path: Path, number: int, left: Path, right: Path) -> list[_Shot]:
+    shots = []
+    for stamp_ns, rest, where in by_time(stamped_lines(path)):
+        names = rest.split()
+        if len(names) not in (1, 2):
+            raise SourceError(f"{where}: needs 'stamp left [right]'; correct or delete the line")
+        shots.append(_Shot(stamp_ns, number, left / names[0], right / names[-1]))
+    if not shots:
+        raise SourceError(f"{path}: names no image; write lines 'stamp left [right]'")
+    return shots
+
+
+def _stamp(path: Path) -> int:
+    if not (path.stem.isascii() and path.stem.isdecimal() and int(path.stem) < 2**63):
+        raise SourceError(f"{path}: its name is no time in nanoseconds; rename it, or list the images in an index file")
+    return int(path.stem)

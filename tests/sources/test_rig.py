@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Recorded rigs: all pairs in order of time, with the poses of their cameras."""
+
+import numpy as np
+import pytest
+from made_recordings import write_png
+from made_rigs import CAMERA, FORWARD, picture, poses_text, recorded, rig
+
+from stereovox.depth.rectify import rectified
+from stereovox.errors import SourceError
+from stereovox.frame import StereoFrame
+from stereovox.sources import open_source
+from stereovox.sources.rig_file import Rig, RigPair, write_rig
+
+
+def test_frames_of_all_pairs_come_in_order_of_time(tmp_path):
+    source = open_source(recorded(tmp_path))
+    frames = list(source)
+    assert all(isinstance(frame, StereoFrame) for frame in frames)
+    order = [(frame.stamp_ns // 1_000_000, frame.pair.name) for frame in frames]
+    assert order == [(100, "front"), (100, "side"), (150, "side"), (200, "front")]
+    assert not any(frame.fault for frame in frames)
+    np.testing.assert_array_equal(frames[3].left, picture(2, (32, 24)))
+    np.testing.assert_array_equal(frames[3].right, picture(3, (32, 24)))
+    assert frames[0].pair is frames[3].pair, "one and the same pair, so that its maps are made once"
+    assert source.camera == CAMERA
+
+
+def test_the_pose_is_that_of_the_rectified_left_eye(tmp_path):
+    front, side, *_ = open_source(recorded(tmp_path))
+    T = np.eye(4)
+    T[:3, 3] = 0.1, 2, 3
+    np.testing.assert_allclose(front.T_world_sensor, T @ FORWARD, atol=1e-9)
+    np.testing.assert_allclose(side.T_world_sensor, T @ side.pair.T_body_camera, atol=1e-9)
+    assert np.abs(side.pair.T_body_camera[:3, :3] - np.eye(3)).max() > 1e-3, "the eyes are toed in"
+    assert rectified(side).left.shape == (40, 60)
+
+
+def test_frames_that_cannot_be_used_have_a_fault(tmp_path):
+    folder = recorded(tmp_path)
+    (folder / "poses.txt").write_text(poses_text(50_000_000, 120_000_000))
+    (folder / "front/right/100000000.png").unlink()
+    write_png(folder / "side/left/100000000.png", picture(0, (30, 36)))
+    frames = list(open_source(folder))
+    assert [frame.fault for frame in frames] == ["missing_file", "bad_shape", "no_pose", "no_pose"]
+    assert "front/right/100000000.png" in frames[0].fault_detail
+    assert "side/left/150000000.png" in frames[2].fault_detail
+    assert frames[2].left.shape == (0, 0)
+    assert np.isnan(frames[2].T_world_sensor).all()
+
+
+def test_one_rectified_folder_with_an_index(tmp_path):
+    write_rig(tmp_path / "rig.toml", Rig((RigPair(left="left", right="right", index="times.txt", camera=CAMERA),)))
+    for name in ("b", "a"):
+        write_png(tmp_path / "left" / f"{name}.png", picture(1, (32, 24)))
+        write_png(tmp_path / "right" / f"{name}.png", picture(2, (32, 24)))
+    (tmp_path / "times.txt").write_text("# stamp left right\n0.2 b.png\n0.1 a.png b.png\n")
+    (tmp_path / "poses.txt").write_text(poses_text(100_000_000, 190_000_000, 200_000_000))
+    frames = list(open_source(tmp_path))
+    assert [frame.stamp_ns for frame in frames] == [100_000_000, 200_000_000]
+    assert [frame.fault for frame in frames] == [None, None]
+    assert frames[0].name.endswith("a.png")
+
+
+def test_what_cannot_be_opened(tmp_path):
+    folder = recorded(tmp_path / "rig")
+    (folder / "front/left/noon.png").write_bytes(b"")
+    with pytest.raises(SourceError, match="no time in nanoseconds"):
+        open_source(folder)
+    (folder / "front/left/noon.png").unlink()
+    (folder / "poses.txt").unlink()
+    with pytest.raises(SourceError, match=r"poses\.txt"):
+        open_source(folder)
+    write_rig(folder / "rig.toml", Rig((RigPair("other", camera=CAMERA),)))
+    with pytest.raises(SourceError, match="other"):
+        open_source(folder)
+    (folder / "empty").mkdir()
+    write_rig(folder / "rig.toml", Rig((RigPair("e", left="empty", camera=CAMERA),)))
+    with pytest.raises(SourceError, match="holds no PNG"):
+        open_source(folder)
+    write_rig(folder / "rig.toml", Rig((RigPair("front", camera=CAMERA, mask="no.png"), rig().pairs[1])))
+    with pytest.raises(SourceError, match=r"rig\.toml: pair 'front'.*no\.png"):
+        open_source(folder)
+    (folder / "list.txt").write_text("0.1 a b c\n")
+    write_rig(folder / "rig.toml", Rig((RigPair("front", index="list.txt", camera=CAMERA),)))
+    with pytest.raises(SourceError, match=r"list\.txt:1: needs"):
+        open_source(folder)

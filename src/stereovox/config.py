@@ -66,7 +66,7 @@ class ProjectiveConfig(_Section):
     by the square root of the part, since a few pixels may be wrong; 0: every hit counts in full.
     """
 
-    full_share: float = Field(0.0, ge=0, le=1)
+    full_share: float = Field(0.1, ge=0, le=1)
 
 
 class DepthConfig(_Section):
@@ -201,9 +201,9 @@ class MapConfig(_Section):
     """
 
     cell: Literal["int16", "uint8"] = "int16"
-    log_odds_min: float = Field(-2.0, lt=0, ge=-30)
+    log_odds_min: float = Field(-4.0, lt=0, ge=-30)
     log_odds_max: float = Field(3.5, gt=0, le=30)
-    prior: float = Field(0.5, gt=0, lt=1)
+    prior: float = Field(0.1, gt=0, lt=1)
     free_below: float = Field(0.3, gt=0, lt=1)
     occupied_above: float = Field(0.7, gt=0, lt=1)
 

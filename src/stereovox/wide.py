@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox.cameras import DepthCorrection, PinholeCamera
+from stereovox.cameras import PinholeCamera
 from stereovox.errors import StereovoxError
 
 WIDEST_DEG = 88.0
@@ -25,7 +25,7 @@ class SphericalCamera:
     """An equirectangular camera: columns are even in the angle from the y-z plane (Valenti 2018, 4.2).
 
     cu, cv: column and row of the z axis. step_u, step_v: radians a pixel. baseline: metres between both eyes, None when
-    not known. binning, correction, subpixel: as in `PinholeCamera`.
+    not known. binning, subpixel: as in `PinholeCamera`.
     Raises StereovoxError for sizes or steps that are not positive and finite, and for columns more than 88 degrees off.
     """
 
@@ -37,7 +37,6 @@ class SphericalCamera:
     cv: float
     baseline: float | None = None
     binning: int = 1
-    correction: DepthCorrection | None = None
     subpixel: float | None = None
 
     def __post_init__(self) -> None:
@@ -99,7 +98,6 @@ class CylindricalCamera:
     cv: float
     baseline: float | None = None
     binning: int = 1
-    correction: DepthCorrection | None = None
     subpixel: float | None = None
 
     def __post_init__(self) -> None:

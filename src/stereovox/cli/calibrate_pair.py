@@ -19,7 +19,7 @@ from stereovox.errors import StereovoxError
 
 if TYPE_CHECKING:
     from stereovox.calibrate.pair import PairCalibration
-    from stereovox.sources import Source
+    from stereovox.sources import DepthSource
     from stereovox.sources.pair_file import PairSettings
 
 EXAMPLE = "stereovox calibrate pair recordings/flight --out recordings/flight/pair.toml"
@@ -66,7 +66,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
     return {**found.as_dict(), "out": arguments.out}
 
 
-def _calibrated(depth: Source, folder: Path, settings: PairSettings, within_s: float | None) -> PairCalibration:
+def _calibrated(depth: DepthSource, folder: Path, settings: PairSettings, within_s: float | None) -> PairCalibration:
     from stereovox.calibrate.pair import calibrate_pair
     from stereovox.sources.pair import open_poses
 
@@ -82,7 +82,7 @@ def _calibrated(depth: Source, folder: Path, settings: PairSettings, within_s: f
     )
 
 
-def _too_short(depth: Source) -> str:
+def _too_short(depth: DepthSource) -> str:
     """Return the first thing to say of a recording that was too short, whatever failed for it."""
     from stereovox.sources.pair import image_times
 

@@ -6,9 +6,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox.cameras import PinholeCamera
 from stereovox.config import Config
 from stereovox.depth import _denoise
+from stereovox.rigs import VirtualCamera
 from stereovox.sensors.noise import RangeNoise
 
 FINE = 0.15
@@ -19,7 +19,7 @@ WIDTHS = (5.0, 3.0)
 """A neighbour counts less the more it differs, and not at all from so many sigma on: along rows, along columns."""
 
 
-def denoise(depth_m: NDArray[np.float32], camera: PinholeCamera, config: Config) -> None:
+def denoise(depth_m: NDArray[np.float32], camera: VirtualCamera, config: Config) -> None:
     """Average each depth with its like neighbours, in place.
 
     depth_m: (height, width) float32 metres with REP 117's special values, contiguous. Pixels without value stay as they

@@ -5,7 +5,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from stereovox.cameras import PinholeCamera
 from stereovox.depth import _downsample
+from stereovox.errors import ConfigError
 from stereovox.frame import DepthImage
 
 
@@ -13,10 +15,12 @@ def downsample(image: DepthImage, n: int) -> DepthImage:
     """Return the image of block minima and its camera; n = 1 returns the image itself.
 
     A block without any valid pixel is TOO_NEAR where one of its pixels is, TOO_FAR only where all of them are, else
-    MASKED where one is, else UNMATCHED. Blocks at the right and lower border may be cut.
+    MASKED where one is, else UNMATCHED. Blocks at the right and lower border may be cut. Raises ConfigError for a wide camera.
     """
     if n == 1:
         return image
+    if not isinstance(image.camera, PinholeCamera):
+        raise ConfigError(f"depth.downsample {n}: a wide camera's image cannot be downsampled; use sphere.step_deg")
     camera = image.camera.binned(n)
     depth_m = np.empty((camera.height, camera.width), np.float32)
     reason = np.empty(depth_m.shape, np.uint8)

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox import geometry
+from stereovox.cameras import PinholeCamera
 from stereovox.config import Config
 from stereovox.depth import _cpu
 from stereovox.depth.correct import corrected
@@ -45,7 +46,9 @@ def prepare(frame: Frame, config: Config) -> DepthImage:
 def _classify(frame: Frame, config: Config, depth_m: NDArray, reason: NDArray) -> int:
     raw, scale = np.ascontiguousarray(frame.depth).reshape(-1), np.float32(frame.depth_scale)
     none = np.float32(SATURATED if raw.dtype == np.uint16 else 0)
-    if frame.camera.correction:  # before the limits, which hold for true depths
+    if (
+        isinstance(frame.camera, PinholeCamera) and frame.camera.correction
+    ):  # before the limits, which hold for true depths
         raw, scale, none = corrected(raw, scale, none, frame.camera), np.float32(1), np.float32(0)
     limits = (np.float32(config.min_range), np.float32(config.max_range))
     into = depth_m.reshape(-1), reason.reshape(-1)

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stereovox.cameras import PinholeCamera
 from stereovox.config import Config, load_config
 from stereovox.depth import DepthPath, prepare
 from stereovox.errors import FrameRefused, StereovoxError
@@ -135,6 +136,7 @@ def _points(frame: Frame, config: Config) -> tuple[NDArray[np.float64], NDArray[
     """Return the frame's points (N, 3) in the world and the camera's position (3,)."""
     image = prepare(frame, config)
     T = image.T_world_sensor
+    assert isinstance(frame.camera, PinholeCamera)
     points = frame.camera.back_project(image.depth_m)[image.reason == Reason.VALID]
     return np.ascontiguousarray(points @ T[:3, :3].T + T[:3, 3]), T[:3, 3].copy()
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +21,7 @@ from stereovox.products.octree import BRANCH
 MOST_BLOCKS = 2**18
 """Blocks of 8x8x8 cells a file may unfold to (134 million cells); one node can claim 35 million million cells."""
 LARGEST_LOG_ODDS = 30.0
-OCTOMAP = {"map.prior": 0.5, "map.log_odds_min": -2.0, "map.log_odds_max": 3.5}
+OCTOMAP: dict[str, Any] = {"map.prior": 0.5, "map.log_odds_min": -2.0, "map.log_odds_max": 3.5}
 """What OctoMap does when nothing else is said; the files do not tell."""
 LONGEST_HEADER = 1 << 16
 

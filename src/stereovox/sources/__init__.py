@@ -8,6 +8,7 @@ from typing import Any
 
 from stereovox import registry
 from stereovox.errors import SourceError
+from stereovox.sources.base import DepthSource as DepthSource
 from stereovox.sources.base import Excerpt as Excerpt
 from stereovox.sources.base import Selection as Selection
 from stereovox.sources.base import Source as Source

@@ -16,7 +16,7 @@ from stereovox.sources import parameters
 from stereovox.sources.bag_depth import DepthTopic, find_depth
 from stereovox.sources.bag_files import open_bag, suffix_of
 from stereovox.sources.bag_poses import find_poses
-from stereovox.sources.base import Source
+from stereovox.sources.base import DepthSource
 from stereovox.sources.poses import Poses
 from stereovox.sources.tracker import AXES, WORLDS, turned
 
@@ -58,7 +58,7 @@ class Options:
                 raise SourceError(f"{key}={getattr(self, key):g} must be a positive number")
 
 
-class Bag(Source):
+class Bag(DepthSource):
     """Depth images of one topic of a `.db3` or `.bag` file, with poses of another topic where there is one.
 
     Realsense-viewer writes `.db3` since librealsense 2.57 and `.bag` before; both are recognised by their topics and

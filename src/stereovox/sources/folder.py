@@ -13,12 +13,12 @@ import numpy as np
 from stereovox.errors import FrameRefused, SourceError
 from stereovox.frame import Frame
 from stereovox.geometry import Transform
-from stereovox.sources.base import Source
+from stereovox.sources.base import DepthSource
 from stereovox.sources.images import common_size, read_depth_png
 from stereovox.sources.intrinsics import Intrinsics, find_camera
 
 
-class DepthFolder(Source, ABC):
+class DepthFolder(DepthSource, ABC):
     """Frames from depth PNGs, one file each; a file that cannot be used becomes a frame with a `fault`.
 
     A layout sets `depth_scale` (metres per unit), `baseline` (metres) and `intrinsics` (what 640x480 images have

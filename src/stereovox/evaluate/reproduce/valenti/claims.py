@@ -30,16 +30,29 @@ ERROR, ECE, HERTZ = 0.10, 0.05, 20.0
 """Most mean squared error, most calibration error, and least frames a second."""
 NOT_THERE = "octomap-python is not installed"
 KINDS = {"view": "free: all in view", "rays": "free: what the lidar looked into"}
-"""Kinds of truth, the one that is claimed first."""
+"""Kinds of truth."""
+CLAIMED = "view"
 Found = Mapping[tuple[Setting, str], Judged]
 """All maps of a drive by setting and mapper."""
 
 
+class Result(NamedTuple):
+    """One target, and what a map reached of it; holds: None where there is nothing to compare with."""
+
+    letter: str
+    text: str
+    wanted: str
+    ours: str
+    holds: bool | None
+
+
 def claims_of(judged: Sequence[Judged]) -> list[Claim]:
-    """Return the claims about one drive, (a) to (f); those without a target carry the figure and no verdict."""
+    """Return the claims about one drive: (a) to (e) of `default` up to TARGET_RANGE, (f) at every setting."""
     found = {(one.setting, one.mapper): one for one in judged}
     settings = list(dict.fromkeys(one.setting for one in judged))
-    told = [claim for setting in settings if setting.voxel_size in TARGETS for claim in _of_setting(found, setting)]
+    claimed = [one for one in settings if one.voxel_size in TARGETS and one.max_range == TARGET_RANGE]
+    told = [Claim(f"({one.letter}) {setting}: {one.text}", one.wanted, one.ours, one.holds)
+            for setting in claimed for one in results(found, setting, DEFAULT, CLAIMED)]  # fmt: skip
     return [*told, *(_wins(found, setting, rival) for setting in settings for rival in (THESIS, OCTOMAP))]
 
 
@@ -51,51 +64,41 @@ def speed_claim(speed: Speed) -> Claim:
     return Claim(text, f"at least {HERTZ:g} Hz", ours, speed.hertz >= HERTZ if speed.profile == DEFAULT else None)
 
 
-def meets(scores: Scores, octomap: Scores | None, size: float) -> dict[str, bool | None]:
-    """Return by letter which targets a map meets; None: nothing to compare with."""
-    target = TARGETS[size]
-    rival = None if octomap is None else _better_of(octomap.curve)
-    return {
-        "a": None if rival is None else _reached(scores.curve, EXACT, rival),
-        "b": _reached(scores.curve, TOLERANT, target[:2]),
-        "c": _most(scores.error, ERROR),
-        "d": _least(scores.observed.correlation, target.correlation),
-        "e": _most(scores.ece, ECE),
-    }
-
-
-def _of_setting(found: Found, setting: Setting) -> list[Claim]:
-    claims = []
-    for kind in KINDS:
-        ours, octomap = found[setting, DEFAULT].scores[kind], found.get((setting, OCTOMAP))
-        told = _told(ours, octomap.scores[kind] if octomap else None, setting, kind)
-        claimed = kind == "view" and setting.max_range == TARGET_RANGE
-        claims += told if claimed else [Claim(one.text, one.thesis, one.ours, None) for one in told]
-    return claims
-
-
-def _told(ours: Scores, octomap: Scores | None, setting: Setting, kind: str) -> list[Claim]:
-    target, head = TARGETS[setting.voxel_size], f"{setting}; {KINDS[kind]}"
-    met = meets(ours, octomap, setting.voxel_size)
-    exact = "exact precision and recall at one threshold: OctoMap's better precision and its better recall at once"
-    wanted, shown = NOT_THERE, best(ours.curve, EXACT)
-    if octomap is not None:
-        rival = _better_of(octomap.curve)
-        wanted, shown = "{:.3f} and {:.3f}".format(*rival), best(ours.curve, EXACT, rival)
-    within = best(ours.curve, TOLERANT, target[:2])
-    observed, everywhere = ours.observed.correlation, ours.correlation
+def results(found: Found, setting: Setting, mapper: str, kind: str) -> list[Result]:
+    """Return what one map reaches of the targets for its cell size, (a) to (e), against one kind of truth."""
+    ours, target = found[setting, mapper].scores[kind], TARGETS[setting.voxel_size]
+    octomap = found.get((setting, OCTOMAP))
+    correlations = {"observed cells": ours.observed.correlation, "all cells": ours.correlation}
     return [
-        Claim(f"(a) {head}: {exact}", wanted, _pair(shown, EXACT), met["a"]),
-        Claim(f"(b) {head}: precision and recall within one cell, at one threshold",
-              f"at least {target.precision:.2f} and {target.recall:.2f}", _pair(within, TOLERANT), met["b"]),
-        Claim(f"(c) {head}: error (MSE, observed cells)", f"at most {ERROR:.2f} (thesis 0.074 to 0.089)",
-              _number(ours.error), met["c"]),
-        Claim(f"(d) {head}: correlation, observed cells", f"at least {target.correlation:.2f} (thesis 0.49 to 0.63)",
-              _number(observed), met["d"]),
-        Claim(f"(d) {head}: correlation, all cells of the truth", f"at least {target.correlation:.2f}",
-              _number(everywhere), _least(everywhere, target.correlation)),
-        Claim(f"(e) {head}: expected calibration error", f"at most {ECE:.2f}", _number(ours.ece), met["e"]),
+        _against_octomap(ours.curve, octomap.scores[kind].curve if octomap else None),
+        _pair("b", "precision and recall within one cell, at one threshold", ours.curve, TOLERANT, target[:2], ""),
+        Result("c", "error (MSE)", f"at most {ERROR:.2f} (thesis 0.074 to 0.089)", _number(ours.error),
+               ours.error is not None and ours.error <= ERROR),
+        *(Result("d", f"correlation, {cells}", f"at least {target.correlation:.2f} (thesis 0.49 to 0.63)",
+                 _number(value), value is not None and value >= target.correlation)
+          for cells, value in correlations.items()),
+        Result("e", "expected calibration error", f"at most {ECE:.2f}", _number(ours.ece),
+               ours.ece is not None and ours.ece <= ECE),
     ]  # fmt: skip
+
+
+def _against_octomap(curve: PrecisionRecall, octomap: PrecisionRecall | None) -> Result:
+    """Return (a): OctoMap's better precision and its better recall, of p > 0.7 and p >= 0.7, at once."""
+    text = "exact precision and recall, at one threshold"
+    if octomap is None:
+        return Result("a", text, NOT_THERE, _told(best(curve, EXACT), EXACT), None)
+    points = [at(octomap, threshold) for threshold in (STRICT, AT_LEAST)]
+    precision, recall = (max(point[name] or 0.0 for point in points) for name in EXACT)
+    return _pair("a", text, curve, EXACT, (precision, recall), " (OctoMap's better ones)")
+
+
+def _pair(
+    letter: str, text: str, curve: PrecisionRecall, names: tuple[str, str], wanted: tuple[float, float], why: str
+) -> Result:
+    point = best(curve, names, wanted)
+    holds = all((point[name] or 0.0) >= goal for name, goal in zip(names, wanted, strict=True))
+    goal = "at least {:.3f} and {:.3f}".format(*wanted)
+    return Result(letter, text, f"{goal}{why}", _told(point, names), holds)
 
 
 def _wins(found: Found, setting: Setting, rival: str) -> Claim:
@@ -111,43 +114,23 @@ def _wins(found: Found, setting: Setting, rival: str) -> Claim:
 
 
 def _measures(scores: Scores) -> dict[str, float]:
-    """Return what is compared; more is better, so errors are negative."""
+    """Return what is compared: of precision and recall the lesser, more is better, so errors are negative."""
     exact, within = best(scores.curve, EXACT), best(scores.curve, TOLERANT)
     return {
-        "lesser of exact precision and recall": min(exact[name] or 0.0 for name in EXACT),
-        "the same within one cell": min(within[name] or 0.0 for name in TOLERANT),
+        "precision and recall, exact": min(exact[name] or 0.0 for name in EXACT),
+        "within one cell": min(within[name] or 0.0 for name in TOLERANT),
         "error": -_or(scores.error, 1.0),
-        "correlation of observed cells": _or(scores.observed.correlation, -1.0),
-        "correlation of all cells": _or(scores.correlation, -1.0),
+        "correlation, observed": _or(scores.observed.correlation, -1.0),
+        "correlation, all cells": _or(scores.correlation, -1.0),
         "calibration error": -_or(scores.ece, 1.0),
     }
-
-
-def _better_of(curve: PrecisionRecall) -> tuple[float, float]:
-    """Return OctoMap's better precision and its better recall, of p > 0.7 and p >= 0.7."""
-    points = [at(curve, threshold) for threshold in (STRICT, AT_LEAST)]
-    precision, recall = (max(point[name] or 0.0 for point in points) for name in EXACT)
-    return precision, recall
-
-
-def _reached(curve: PrecisionRecall, names: tuple[str, str], wanted: tuple[float, float]) -> bool:
-    point = best(curve, names, wanted)
-    return all((point[name] or 0.0) >= goal for name, goal in zip(names, wanted, strict=True))
-
-
-def _least(value: float | None, goal: float) -> bool:
-    return value is not None and value >= goal
-
-
-def _most(value: float | None, goal: float) -> bool:
-    return value is not None and value <= goal
 
 
 def _or(value: float | None, otherwise: float) -> float:
     return otherwise if value is None else value
 
 
-def _pair(point: Mapping[str, float | None], names: tuple[str, str]) -> str:
+def _told(point: Mapping[str, float | None], names: tuple[str, str]) -> str:
     precision, recall = (_number(point[name]) for name in names)
     return f"{precision} and {recall} at p > {point['threshold']:.4g}"
 

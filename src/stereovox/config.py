@@ -165,6 +165,8 @@ class WindowConfig(_Section):
     """A box that moves with the camera by whole cells and bounds the map's memory (Chien 2020, 3.6).
 
     size: extents along the world's axes in metres; without them the map is unbounded and the rest has no meaning.
+    centre: the middle of a window that stays where it is, a fixed box (Valenti 2018, 7.1: the global map); without it
+        the window follows the camera (7.2: the local map), and only then the rest but `outside` has a meaning.
     trigger: half width in metres of the box round the window's centre in which the camera moves freely; half a cell at
         least.
     lead_s: the centre runs ahead of the camera by so many seconds of its flight.
@@ -174,6 +176,7 @@ class WindowConfig(_Section):
 
     size: tuple[float, float, float] | None = None
     largest: tuple[float, float, float] | None = None
+    centre: tuple[float, float, float] | None = None
     trigger: float = Field(1.0, ge=0)
     lead_s: float = Field(0.0, ge=0, le=10)
     grow_s: float = Field(0.0, ge=0, le=10)

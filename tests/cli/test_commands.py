@@ -88,14 +88,14 @@ def test_map_then_everything_else(recording, tmp_path, capsys):
 
 
 def test_frames_settings_and_integrators(recording, tmp_path, capsys):
-    common = ["--voxel-size", 0.1, "--set", "sensor.p_hit=0.8", "--set", "map.log_odds_max=2.5", "--json"]
+    common = ["--voxel-size", 0.1, "--set", "sensor.p_right=0.8", "--set", "map.log_odds_max=2.5", "--json"]
     for name in ("projective", "ray"):
         out = tmp_path / f"{name}.svox"
         assert run("map", recording, "--out", out, "--integrator", name, "--frames", "::2", *common) == 0
         assert last_json(capsys)["frames"] == 3
         config = sv.load_map(out).config
         assert config.integrator == name
-        assert config.sensor.parameters() == {"p_hit": 0.8}
+        assert config.sensor.parameters() == {"p_right": 0.8}
         assert config.map.log_odds_max == 2.5
         assert sv.load_map(out).cells()[1].max() <= 2.5
 

@@ -22,7 +22,7 @@ def test_it_makes_a_map_and_tells_what_it_did(tmp_path, capsys):
     assert {state: result[state] for state in ("occupied", "free")}.items() <= voxel_map.counts().items()
     assert result["occupied"] > 100
     assert (result["frames"], result["frames_refused"], result["in_boxes"]) == (4, 0, 4 * 9**3)
-    dropped = sum(result[key] for key in ("outside_view", "out_of_range", "in_boxes", "moving"))
+    dropped = sum(result[key] for key in ("outside_view", "in_boxes", "moving"))
     assert result["points"] == result["used"] + dropped
     assert "in annotated boxes" in said.err
     assert "4 scans used, 0 refused" in said.err
@@ -37,7 +37,7 @@ def test_options_reach_the_truth(tmp_path, capsys):
     assert "1 x missing_file" in capsys.readouterr().err
     free = load_map(out).free()
     assert len(free) > 0
-    assert free[:, 0].max() < 15.5
+    assert (free[:, 0] < 15.5).mean() > 0.98  # behind the wall only the way to the one point beyond it
     assert np.isclose(load_map(out).voxel_size, 0.4)
 
 

@@ -43,10 +43,10 @@ def test_occupied_are_the_cells_with_a_point_in_view(tmp_path):
     wall = made.wall()
     seen = [seen_by(n, wall) for n in range(4)]
     assert occupied(voxel_map) == set().union(*(cells_of(wall[some]) for some in seen))
-    assert counts.used == sum(some.sum() for some in seen)
+    assert counts.used == sum(some.sum() for some in seen) + 4
     assert counts.points == 4 * (len(wall) + 3)
-    assert counts.out_of_range == 4  # the point 90 m ahead
-    assert counts.outside_view == counts.points - counts.used - 4
+    assert counts.out_of_range == 4  # the point 90 m ahead, in a cell that no frame has within its range
+    assert counts.outside_view == counts.points - counts.used
     assert (counts.frames, counts.in_boxes, counts.moving) == (4, 0, 0)
     assert (voxel_map.config.voxel_size, voxel_map.config.max_range) == (SIZE, RANGE)
     assert (voxel_map.frames, voxel_map.recording) == (4, source.name)
@@ -72,7 +72,13 @@ def test_with_rays_free_are_only_cells_on_the_way_to_a_point(tmp_path):
     free = by_rays.free()
     assert 0 < len(free) < 0.5 * len(by_view.free())
     assert cells_of(free) < cells_of(by_view.free())
-    assert free[:, 0].max() < 15.07 + SIZE  # nothing behind the wall
+    behind = free[free[:, 0] > 15.07 + SIZE]  # nothing behind the wall but on the way to the point 90 m ahead
+    ends = [transform_points(made.cam0_pose(n), np.array([[3.0, 0.1, 90.0]]))[0] for n in range(4)]
+    starts = [source.scan(n).T_world_lidar[:3, 3] for n in range(4)]
+    ways = [a + np.linspace(0, 1, 2000)[:, None] * (b - a) for a, b in zip(starts, ends, strict=True)]
+    nearest = np.min([np.abs(behind[:, None] - way[None]).max(axis=2).min(axis=1) for way in ways], axis=0)
+    assert len(behind) > 0
+    assert nearest.max() < 0.6 * SIZE
     scan = source.scan(0)
     start, end = scan.T_world_lidar[:3, 3], made.wall()[len(made.wall()) // 2 + 3]
     way = start + np.linspace(0, 1, 500)[:, None] * (end - start)
@@ -167,3 +173,14 @@ def test_bad_values_are_one_line(tmp_path):
         lidar_truth(source, 0.0, RANGE)
     with pytest.raises(SourceError, match="has no lidar"):
         lidar_truth(open_source("sim:room"), SIZE, RANGE)
+
+
+def test_what_one_frame_sees_beyond_its_range_counts_for_another(tmp_path):
+    """A short range: the wall is out of it for the first frame, and in it for the last."""
+    source = open_source(made.raw(tmp_path))
+    last = source.viewpoint(3).T_world_camera[0, 3]
+    reach = 15.07 - last + 0.3
+    every, counts = lidar_truth(source, SIZE, reach)
+    alone, _ = lidar_truth(source, SIZE, reach, frames=[3])
+    assert counts.out_of_range > 100
+    assert occupied(alone) < occupied(every)

@@ -101,8 +101,8 @@ def test_mistakes_are_told_before_the_work(monkeypatch, tmp_path):
 
 
 def test_what_goes_wrong_is_one_line(one_chapter, tmp_path):
-    with pytest.raises(StereovoxError, match=r"valenti2018: .* not in this version; there is chien2020"):
-        reproduce("valenti2018", tmp_path)
+    with pytest.raises(StereovoxError, match=r"ist2019: .* not in this version; there is chien2020, valenti2018"):
+        reproduce("ist2019", tmp_path)
     with pytest.raises(StereovoxError, match=r"unknown paper 'chien'.*chien2020"):
         reproduce("chien", tmp_path)
     (tmp_path / "file").write_text("")

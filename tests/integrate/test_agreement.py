@@ -74,8 +74,8 @@ def test_what_the_share_of_the_footprint_changes(name):
     shares, in_full = shares_of(name, 0.1), shares_of(name, 0.1, **ALL_IN_FULL)
     assert shares["precision"] >= 0.97, shares
     assert min(shares["precision_1"], shares["recall_1"]) >= 0.995, shares
-    assert 0.9 <= shares["recall"] < in_full["recall"], shares  # 0.906 in the kitchen, 0.942 in the room
-    assert shares["wrongly_free"] <= 0.02, shares  # 0.016 and 0.006
+    assert 0.92 <= shares["recall"] < in_full["recall"], shares  # 0.928 in the kitchen, 0.959 in the room
+    assert shares["wrongly_free"] <= 0.01, shares  # 0.0071 and 0.0017
 
 
 def test_agreement_by_hand():

@@ -245,3 +245,19 @@ def test_bad_settings_and_folders(tmp_path):
     (tmp_path / "something").write_text("x")
     with pytest.raises(MapFileError, match="move it away"):
         make_map(settings(outside="keep"), tiles=tmp_path)
+
+
+def test_a_fixed_box_stays_and_takes_only_what_lies_in_it():
+    """The global map of Valenti 2018, 7.1."""
+    config = load_config(voxel_size=0.5, **{"window.size": [4.0, 2.0, 1.0], "window.centre": [1.0, 0.0, 0.0]})
+    voxel_map = make_map(config)
+    coords = np.array([[x, y, z] for x in (-1, 0, 1) for y in (-1, 0) for z in (-1, 0)], np.int32)
+    for x in (0.0, 30.0, -7.0):
+        T = np.eye(4)
+        T[0, 3] = x
+        voxel_map.look_from(Viewpoint(PinholeCamera.from_field_of_view(64, 48, 90), T, int(1e9 * abs(x))))
+        voxel_map.add(Evidence(coords, np.full((len(coords), 512), 3000, np.int16), np.empty((0, 3), np.int32), 0))
+        np.testing.assert_allclose(voxel_map.window, [[-1, -1, -0.5], [3, 1, 0.5]])
+    cells, _ = voxel_map.cells()
+    assert len(cells) == 8 * 4 * 2
+    np.testing.assert_allclose(voxel_map.bounds(), [[-1, -1, -0.5], [3, 1, 0.5]])

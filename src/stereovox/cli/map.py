@@ -174,6 +174,8 @@ def _tell(result: dict[str, Any], reports: list[UpdateReport], out: Path) -> Non
     for reason, number in result["refused"].items():
         example = next(report.detail for report in reports if report.refused == reason)
         say(f"  {number} x {reason}, first: {example}")
+    if result["match_ms"]["max"] > 1:  # stereo pairs
+        say(f"a pair: matching {milliseconds(result['match_ms'])}")
     say(f"a frame: depth {milliseconds(result['depth_ms'])}; map {milliseconds(result['integrate_ms'])}")
     say(cells_line(result))
     say(f"saved in {out}; look at it with: {command_line('picture', out, f'{out.stem}.png')}")

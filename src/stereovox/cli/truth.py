@@ -2,7 +2,7 @@
 """Make a map of what is really there from a recording's lidar.
 
 SOURCE is a KITTI recording with lidar: a raw drive, a tracking or odometry sequence, or stereo 2015 scenes. A cell is
-occupied where one lidar point falls into it that is in the left image, within the range and in no annotated box.
+occupied where one lidar point falls into it that is in the left image and in no annotated box.
 """
 
 from __future__ import annotations
@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 EXAMPLE = "stereovox truth 2011_09_26/2011_09_26_drive_0005_sync --out truth.svox --voxel-size 0.2 --max-range 20"
 DROPPED = {
     "outside_view": "outside the left image",
-    "out_of_range": "farther than the range",
     "in_boxes": "in annotated boxes",
     "moving": "on something moving",
 }
@@ -83,7 +82,8 @@ def _tell(counts: TruthCounts, memory_bytes: int, out: Path) -> None:
         say(f"  {number} x {reason}")
     if counts.first_refusal:
         say(f"  first: {counts.first_refusal}")
-    say(f"{thousands(counts.used)} of {thousands(counts.points)} points used; dropped:")
+    far = f"{thousands(counts.out_of_range)} of them from beyond the range of their own frame"
+    say(f"{thousands(counts.used)} of {thousands(counts.points)} points used, {far}; dropped:")
     for name, words in DROPPED.items():
         say(f"  {thousands(getattr(counts, name)):>11} {words}")
     say(cells_line({"occupied": counts.occupied, "free": counts.free, "memory_bytes": memory_bytes}))

@@ -37,7 +37,8 @@ def prepare(frame: Frame, config: Config) -> DepthImage:
     reason = np.empty(frame.depth.shape, np.uint8)
     usable = _classify(frame, config, depth_m, reason)
     if not usable and not (reason == Reason.TOO_FAR).any():
-        raise FrameRefused("no_valid_depth", f"{_name(frame)}: not one pixel has a valid depth; is the lens covered?")
+        cure = "check its depth correction" if getattr(frame.camera, "correction", None) else "is the lens covered?"
+        raise FrameRefused("no_valid_depth", f"{_name(frame)}: not one pixel has a valid depth; {cure}")
     denoise(depth_m, frame.camera, config)
     image = DepthImage(depth_m, reason, frame.camera, T_world_sensor, frame.stamp_ns)
     return downsample(image, config.depth.downsample)
@@ -49,7 +50,7 @@ def _classify(frame: Frame, config: Config, depth_m: NDArray, reason: NDArray) -
     if (
         isinstance(frame.camera, PinholeCamera) and frame.camera.correction
     ):  # before the limits, which hold for true depths
-        raw, scale, none = corrected(raw, scale, none, frame.camera), np.float32(1), np.float32(0)
+        raw, scale, none = corrected(raw, scale, none, camera), np.float32(1), np.float32(0)
     limits = (np.float32(config.min_range), np.float32(config.max_range))
     into = depth_m.reshape(-1), reason.reshape(-1)
     usable = _cpu.classify(raw, scale, *limits, none, *into)

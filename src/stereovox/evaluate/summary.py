@@ -17,7 +17,8 @@ def summarise(voxel_map: VoxelMap, reports: Sequence[UpdateReport]) -> dict[str,
     """Return frames, refusals by reason, milliseconds a frame, cells and memory of a run.
 
     `frame_ms` is the whole of a frame, `match_ms` (stereo pairs), `depth_ms` and `integrate_ms` are its parts. Times
-    leave out the first frame that was taken in, which may compile kernels. `memory_reserved`: the memory is that of a window, taken at the start.
+    leave out the first frame that was taken in, which may compile kernels. `memory_reserved`: the memory is that of a
+    window, taken at the start.
     """
     taken = [report for report in reports if not report.refused]
     refused = Counter(report.refused for report in reports if report.refused)

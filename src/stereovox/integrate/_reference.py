@@ -96,6 +96,11 @@ def _rays(
         yield cells, evidence, middle
 
 
+def _pinhole(image: DepthImage) -> PinholeCamera:
+    assert isinstance(image.camera, PinholeCamera)
+    return image.camera
+
+
 def _points_at_one(camera: VirtualCamera) -> NDArray[np.float64]:
     """Return the point (height, width, 3) that each pixel sees at depth 1; see `stereovox.cameras` for wide ones."""
     if isinstance(camera, PinholeCamera):
@@ -133,7 +138,7 @@ def _plane_crossings(start: NDArray, direction: NDArray, end: float) -> NDArray:
 
 def _hit_cells(image: DepthImage, config: Config) -> NDArray[np.int64]:
     depth = image.depth_m.astype(float)
-    points = image.camera.back_project(depth)[np.isfinite(depth)]
+    points = _pinhole(image).back_project(depth)[np.isfinite(depth)]
     world = points @ image.T_world_sensor[:3, :3].T + image.T_world_sensor[:3, 3]
     return np.floor(world / config.voxel_size).astype(np.int64)
 
@@ -164,7 +169,7 @@ def _share(image: DepthImage, uv: NDArray, z: float, size_px: float, voxel_size:
 
 
 def _cells_in_range(image: DepthImage, config: Config) -> NDArray[np.int64]:
-    reach = config.max_range * 1.1 * np.linalg.norm(image.camera.back_project(np.ones(image.depth_m.shape))[0, 0]) + 1
+    reach = config.max_range * 1.1 * np.linalg.norm(_points_at_one(image.camera)[0, 0]) + 1
     centre = image.T_world_sensor[:3, 3]
     low, high = (np.floor((centre + side * reach) / config.voxel_size).astype(int) for side in (-1, 1))
     return np.stack(np.meshgrid(*map(np.arange, low, high + 1), indexing="ij"), axis=-1).reshape(-1, 3)
@@ -172,7 +177,7 @@ def _cells_in_range(image: DepthImage, config: Config) -> NDArray[np.int64]:
 
 def _projected(cells: NDArray, image: DepthImage, config: Config) -> tuple[NDArray, NDArray, NDArray, NDArray]:
     """Return pixel (N, 2) column and row, depth and size in pixels of each cell, and whether it is seen."""
-    camera = image.camera
+    camera = _pinhole(image)
     x, y, z = _centres_in_camera(cells, image, config)
     ahead = (z > NEAR_PLANE) & (z <= config.max_range)
     z_safe = np.where(ahead, z, 1.0)
@@ -190,7 +195,7 @@ def _centres_in_camera(cells: NDArray, image: DepthImage, config: Config) -> NDA
 
 def _pixels_at(x: NDArray, y: NDArray, z: NDArray, image: DepthImage, config: Config) -> tuple[NDArray, NDArray]:
     """Return column and row (N, 2), counted from the image's border, and the size of a cell in pixels (N,)."""
-    camera = image.camera
+    camera = _pinhole(image)
     uv = np.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], axis=1) + 0.5
     return uv, camera.fx * config.voxel_size / z
 

@@ -23,7 +23,7 @@ JUMP_MPS = 60.0
 
 
 class Window:
-    """A box that moves by whole cells so that the camera stays within the trigger box about its centre.
+    """A box that moves by whole cells so that the camera stays within the trigger box about its centre, or stays fixed.
 
     The centre runs `lead_s` seconds of flight ahead of the camera, and the box is longer by `grow_s` seconds of flight
     along each axis, up to `largest`. A trigger box smaller than a cell counts as one cell: the middle cannot come
@@ -34,6 +34,7 @@ class Window:
         window, self._cell = config.window, config.voxel_size
         assert window.size is not None
         self._trigger, self._lead_s, self._grow_s = max(window.trigger, self._cell / 2), window.lead_s, window.grow_s
+        self._fixed = window.centre
         self._size = _cells(window.size, self._cell)
         self.largest = _cells(window.largest or window.size, self._cell)
         self._extent = self._size
@@ -83,7 +84,7 @@ class Window:
         self._velocity = tuple(v + share * (n - v) for v, n in zip(self._velocity, now, strict=True))  # pyright: ignore
 
     def _wanted_extent(self) -> Cell:
-        if not self._grow_s:
+        if not self._grow_s or self._fixed is not None:
             return self._size
         sizes = zip(self._size, self.largest, self._extent, self._velocity, strict=True)
         return tuple(self._grown(*numbers) for numbers in sizes)  # pyright: ignore
@@ -95,6 +96,8 @@ class Window:
 
     def _centre(self, axis: int, camera: float) -> int:
         """Return the middle cell face of the box on one axis: moved by whole cells, no further than needed."""
+        if self._fixed is not None:
+            return round(self._fixed[axis] / self._cell)
         reach = self._extent[axis] * self._cell / 2
         lead = self._velocity[axis] * self._lead_s
         limit = max(reach - self._trigger - self._cell, 0.0)

@@ -35,7 +35,7 @@ def make_sensor(config: SensorConfig) -> InverseSensorModel:
 def _checked(model: Any, name: str) -> InverseSensorModel:
     for field in fields(model):
         value = getattr(model, field.name)
-        if field.name.startswith("p_") and not 0 < value < 1:
+        if (field.name.startswith("p_") or field.name == "prior") and not 0 < value < 1:
             raise ConfigError(f"sensor.{field.name} {value}: a probability must lie between 0 and 1, both excluded")
         if not value > 0:
             raise ConfigError(f"sensor.{field.name} {value}: must be greater than 0")

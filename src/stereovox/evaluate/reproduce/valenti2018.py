@@ -30,10 +30,10 @@ from stereovox.evaluate.reproduce.valenti.speed import MOST, time_mapping
 TITLE = "Valenti 2018, made again"
 LEAD = (
     "Stereo pairs of a driving car become maps, which are compared with what the car's lidar saw (PhD thesis, Parma "
-    "2018, chapter 8). Three mappers on the same frames: `valenti2018`, which does as the thesis does; `default`, "
-    "stereovox's own way; and OctoMap on the disparities of `default`."
+    "2018, chapter 8). Three mappers on the same frames: valenti2018, which does as the thesis does; default, "
+    "stereovox's own way; and OctoMap on the disparities of default."
 )
-HEADS = ("claim", "wanted", "ours", "holds?")
+HEADS = ("claim", "wanted, or thesis", "ours", "holds?")
 TABLE = Setting(0.5, 20.0)
 """Shown frame by frame, and beside Table 8.1."""
 TIMED = Setting(0.2, 20.0)

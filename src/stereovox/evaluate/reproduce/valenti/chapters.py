@@ -4,14 +4,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from itertools import product
 from typing import Any
 
-from stereovox.evaluate.reproduce.chapter import NO, YES, Chapter, Claim, Sheet, Shown
-from stereovox.evaluate.reproduce.valenti.claims import CLAIMED, KINDS, TARGETS, claims_of, results, speed_claim
-from stereovox.evaluate.reproduce.valenti.figures import figures
+from stereovox.evaluate.reproduce.chapter import Chapter, Claim, Sheet, Shown
+from stereovox.evaluate.reproduce.valenti.claims import CLAIMED, KINDS, claims_of, speed_claim
 from stereovox.evaluate.reproduce.valenti.judge import Judged
 from stereovox.evaluate.reproduce.valenti.mappers import DEFAULT, OCTOMAP, THESIS, Setting
+from stereovox.evaluate.reproduce.valenti.sheets import (
+    points_sheet,
+    probabilities_sheet,
+    row_of,
+    targets_sheet,
+    text_of,
+    thresholds_sheet,
+)
 from stereovox.evaluate.reproduce.valenti.speed import Speed
 from stereovox.evaluate.reproduce.valenti.table81 import PRINTED
 from stereovox.view.evaluation import curves_png, series_png
@@ -35,23 +41,31 @@ MEASURES = (
     "p >= 0.7 is told as well. Balanced: the threshold at which the lesser of precision and recall within one cell is "
     "largest. Cells never observed count as free; error and calibration are over observed cells, as in the thesis."
 )
+ALL_CELLS = (
+    "The correlation over all cells of the truth has no target: cells that a map never observed stand at p = 0.5, most "
+    "of them behind surfaces, so it mostly tells how much of the box was never seen, the more so the surer a map is "
+    "of the free air that it did see."
+)
 RIVAL = (
     "OctoMap (octomap-python, its own settings, one ray for the points of a cell) gets the points of the same "
     "disparities as `default`, and pixels beyond the range clear their rays up to it. Its range is a distance, ours a "
     "depth; points in the image's corners between the two are marked occupied for it all the same."
 )
+FIG_8_4 = (
+    "Recall and correlation rise while the drive goes on and more of the scene is seen; precision and error stay about "
+    "level."
+)
 BETTER = (
     "Claims are made against the first truth, free is all in view. Better in every measure (f): each map is taken at "
     "the threshold that suits it best, and of precision and recall the lesser counts."
 )
-VERDICTS = {True: YES, False: NO, None: "-"}
 
 
 def table_chapter(judged: Sequence[Judged], setting: Setting, missing: str) -> Chapter:
     """Return Table 8.1 beside the same of all drives at one setting. missing: why there is no OctoMap."""
     shown = [one for one in judged if one.setting == setting]
-    rows = [(f"{one.drive}, {one.mapper}", *_row(vars(one.scores[CLAIMED]), TABLE)) for one in shown]
-    thesis = [(f"thesis, {row.sequence}", *_row(vars(row), TABLE)) for row in PRINTED]
+    rows = [(f"{one.drive}, {one.mapper}", *row_of(vars(one.scores[CLAIMED]), TABLE)) for one in shown]
+    thesis = [(f"thesis, {row.sequence}", *row_of(vars(row), TABLE)) for row in PRINTED]
     rows += [(f"{OCTOMAP}: {missing}", *["-"] * len(TABLE))] if missing else []
     claims = [_beside(one, name) for one in shown if one.mapper == THESIS for name in TABLE[4:]]
     return Chapter(
@@ -68,9 +82,11 @@ def table_chapter(judged: Sequence[Judged], setting: Setting, missing: str) -> C
 def drive_chapter(name: str, judged: Sequence[Judged], counts: Mapping[str, Any], missing: str) -> Chapter:
     """Return all about one drive. counts: what became of the lidar's points, by setting; missing: as above."""
     frames = max(one.frames for one in judged)
-    sheets = [_scores_sheet(judged, kind, missing) for kind in KINDS]
-    sheets += [_thresholds_sheet(judged), _targets_sheet(judged)]
-    method = f"{frames} stereo pairs, mapped at {len({one.setting for one in judged})} settings. {TRUTH}"
+    sheets = [points_sheet(judged, kind, missing) for kind in KINDS]
+    sheets += [probabilities_sheet(judged), thresholds_sheet(judged), targets_sheet(judged)]
+    method = (
+        f"{frames} stereo pairs, mapped at {len({one.setting for one in judged})} settings. Truth: as in chapter 1."
+    )
     return Chapter(
         f"drive_{name}",
         f"Drive {name}",
@@ -78,7 +94,7 @@ def drive_chapter(name: str, judged: Sequence[Judged], counts: Mapping[str, Any]
         claims_of(judged),
         list(_shown(judged)),
         sheets,
-        [MEASURES, RIVAL, BETTER],
+        [MEASURES, ALL_CELLS, RIVAL, BETTER],
         {"maps": [one.numbers() for one in judged], "lidar": counts, "missing": missing},
     )
 
@@ -104,49 +120,7 @@ def speed_chapter(speeds: Sequence[Speed]) -> Chapter:
 def _beside(one: Judged, name: str) -> Claim:
     printed = [getattr(row, name) for row in PRINTED]
     text = f"{one.drive}, profile {THESIS}, {one.setting}: {name}"
-    return Claim(text, f"{min(printed):.3f} to {max(printed):.3f}", _text(getattr(one.scores[CLAIMED], name)), None)
-
-
-def _scores_sheet(judged: Sequence[Judged], kind: str, missing: str) -> Sheet:
-    heads = ("cell, range", "mapper", "p > 0.7: precision, recall", "within one cell", "p >= 0.7: precision, recall",
-             "within one cell", "balanced at", "precision, recall", "within one cell", "error", "correlation, all",
-             "correlation, observed", "ECE", "observed")  # fmt: skip
-    rows = []
-    for one in judged:
-        told = figures(one.scores[kind])
-        points = [part for name in ("strict", "at_least") for part in _pairs(told[name])]
-        balanced = told["balanced"]
-        rows.append((str(one.setting), one.mapper, *points, f"p > {balanced['threshold']:.4g}", *_pairs(balanced),
-                     _text(told["error"]), _text(told["correlation"]), _text(told["observed"]["correlation"]),
-                     _text(told["ece"]), _text(told["coverage"])))  # fmt: skip
-    if missing:
-        rows.append(("all", OCTOMAP, missing, *["-"] * (len(heads) - 3)))
-    return Sheet(f"All maps; {KINDS[kind]}", heads, rows)
-
-
-def _thresholds_sheet(judged: Sequence[Judged]) -> Sheet:
-    listed = [figures(one.scores[CLAIMED])["listed"] for one in judged]
-    heads = ("cell, range", "mapper", *(f"p > {point['threshold']:g}" for point in listed[0]))
-    rows = [
-        (str(one.setting), one.mapper, *(_pairs(point)[1] for point in points))
-        for one, points in zip(judged, listed, strict=True)
-    ]
-    return Sheet(f"Precision, recall within one cell by threshold; {KINDS[CLAIMED]}", heads, rows)
-
-
-def _targets_sheet(judged: Sequence[Judged]) -> Sheet:
-    """Return what each map reaches of the targets, also where nothing is claimed."""
-    found = {(one.setting, one.mapper): one for one in judged}
-    rows, heads = [], ()
-    for (setting, mapper), kind in product(found, KINDS):
-        if setting.voxel_size in TARGETS:
-            told = results(found, setting, mapper, kind)
-            heads = tuple(f"({one.letter}) {one.text}" for one in told)
-            signs = (VERDICTS[one.holds] for one in told)
-            rows.append((f"{setting}; {KINDS[kind]}", mapper, *map("{} {}".format, (o.ours for o in told), signs)))
-    return Sheet(
-        "What each map reaches of the targets (to 40 m none are set: those of 20 m)", ("map", "of", *heads), rows
-    )
+    return Claim(text, f"{min(printed):.3f} to {max(printed):.3f}", text_of(getattr(one.scores[CLAIMED], name)), None)
 
 
 def _shown(judged: Sequence[Judged]) -> list[Shown]:
@@ -160,28 +134,13 @@ def _shown(judged: Sequence[Judged]) -> list[Shown]:
     ]  # fmt: skip
     for one in judged:
         if one.series is not None and len(one.series["frame"]):
-            place = f"Fig 8.4, {one.mapper}, {one.setting}"
-            said = "Recall and correlation rise while the drive goes on; precision and error stay about level."
-            pictures.append(Shown(place, said, "After each frame, against the truth of the whole drive.",
-                                  series_png(one.series)))  # fmt: skip
+            thesis = one.mapper == THESIS
+            place = "Fig 8.4" if thesis else f"Frame by frame, {one.mapper}, {one.setting}"
+            ours = f"{one.mapper}, {one.setting}, after each frame, against the truth of the whole drive."
+            pictures.append(Shown(place, FIG_8_4 if thesis else "", ours, series_png(one.series)))
         if one.mapper == DEFAULT and one.shown is not None and len(one.shown.cells):
             pictures.append(Shown(f"Right and wrong from above, {one.mapper}, {one.setting}", "",
                                   "Columns in the mixed colours of their cells.", outcomes_png(one.shown)))  # fmt: skip
             pictures.append(Shown(f"Thresholds, ROC and reliability, {one.mapper}, {one.setting}", "",
                                   "Truth: free is all in view.", curves_png(one.scores[CLAIMED])))  # fmt: skip
     return pictures
-
-
-def _pairs(point: Mapping[str, float | None]) -> tuple[str, str]:
-    exact = f"{_text(point['precision'])}, {_text(point['recall'])}"
-    return exact, f"{_text(point['tolerance_precision'])}, {_text(point['tolerance_recall'])}"
-
-
-def _row(values: Mapping[str, Any], names: Sequence[str]) -> list[str]:
-    return [_text(values[name]) for name in names]
-
-
-def _text(value: float | None) -> str:
-    if value is None:
-        return "-"
-    return f"{value:,}" if isinstance(value, int) else f"{value:.3f}"

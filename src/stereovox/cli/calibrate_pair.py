@@ -11,7 +11,7 @@ import os
 from argparse import ArgumentParser, Namespace
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 from stereovox.cli.recordings import check_outputs
 from stereovox.cli.terminal import command_line, say, tracked
@@ -54,7 +54,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
     depth = open_depth(folder, settings)
     for note in getattr(depth, "notes", ()):
         say(f"note: {note}")
-    depth = Selection(depth, arguments.frames) if arguments.frames else depth
+    depth = cast("DepthSource", Selection(depth, arguments.frames)) if arguments.frames else depth
     try:
         found = _calibrated(depth, folder, settings, arguments.within)
     except StereovoxError as error:

@@ -47,9 +47,8 @@ def prepare(frame: Frame, config: Config) -> DepthImage:
 def _classify(frame: Frame, config: Config, depth_m: NDArray, reason: NDArray) -> int:
     raw, scale = np.ascontiguousarray(frame.depth).reshape(-1), np.float32(frame.depth_scale)
     none = np.float32(SATURATED if raw.dtype == np.uint16 else 0)
-    if (
-        isinstance(frame.camera, PinholeCamera) and frame.camera.correction
-    ):  # before the limits, which hold for true depths
+    camera = frame.camera
+    if isinstance(camera, PinholeCamera) and camera.correction:  # before the limits, which hold for true depths
         raw, scale, none = corrected(raw, scale, none, camera), np.float32(1), np.float32(0)
     limits = (np.float32(config.min_range), np.float32(config.max_range))
     into = depth_m.reshape(-1), reason.reshape(-1)

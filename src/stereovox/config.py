@@ -93,8 +93,9 @@ class StereoConfig(_Section):
     speckle_size, speckle_range: smaller patches are dropped; a step of more disparity ends a patch. 0: none dropped.
     left_right: most by which the disparities of both images may differ; 0: not checked.
     aligned: the image whose pixels get a depth (Valenti 2018: right).
-    halve: match at half the resolution: four to five times as quick, smoother, twice the error (Valenti 2018, 5.1).
-        The result is of full size, and the numbers above stand for full pixels all the same, but `block_size`.
+    halve: match at half the resolution: four to five times as quick and smoother (Valenti 2018, 5.1); maps of streets
+        come out the same. The result is of full size, and the numbers above stand for full pixels all the same. Not
+        set: images of more than 450,000 pixels are halved.
     rcrop: columns dropped at the border that the other eye cannot see: the right one for the right image (Valenti
         2018, Eq 5.1). Pixels whose match lies outside of the other image are dropped in any case.
     min_confidence: pixels that are less sure have no value (0 to 1, see docs/stereo.md).
@@ -117,7 +118,7 @@ class StereoConfig(_Section):
     speckle_range: float = Field(2.0, gt=0)
     left_right: float = Field(1.0, ge=0)
     aligned: Literal["left", "right"] = "left"
-    halve: bool = False
+    halve: bool | None = None
     rcrop: int = Field(0, ge=0)
     min_confidence: float = Field(0.5, ge=0, le=1)
     texture: float = Field(1.0, ge=0)

@@ -17,6 +17,9 @@ from stereovox.geometry import Transform
 
 __all__ = ["Disparity", "StereoDepth"]
 
+LARGE = 450_000
+"""Images of more pixels are halved where the settings leave it open: a street camera's, not a 848x480 depth camera's."""
+
 
 class StereoDepth:
     """Makes depth images of stereo frames, as `config` says. One object serves one thread at a time."""
@@ -24,7 +27,7 @@ class StereoDepth:
     def __init__(self, config: StereoConfig) -> None:
         """Raises ConfigError for an unknown method, MissingExtra where its library is missing."""
         self.config = config
-        self._match = make_matcher(_of_half(config) if config.halve else config)
+        self._matchers = {bool(config.halve): make_matcher(_of_half(config) if config.halve else config)}
 
     def __call__(self, frame: StereoFrame) -> Frame:
         """Return the frame as a depth image: float32 metres, reasons, camera and pose of the aligned eye.
@@ -50,22 +53,32 @@ class StereoDepth:
             raise FrameRefused(frame.fault, frame.fault_detail or f"{frame.name}: {frame.fault}")
         frame = _rectified(frame)
         left, right = (_grey(image, frame, side) for image, side in ((frame.left, "left"), (frame.right, "right")))
-        raw = self._raw(left, right)
+        config = self._decided(left.shape)
+        raw = self._raw(left, right, config)
         sides = (left, _checked(frame.pair.valid, frame)), (right, _checked(frame.pair.valid_right, frame))
         (image, valid), (_, valid_other) = sides if self.config.aligned == "left" else sides[::-1]
-        return explained(raw, image, valid, valid_other, self.config)
+        return explained(raw, image, valid, valid_other, config)
 
-    def _raw(self, left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray[np.float32]:
-        if not self.config.halve:
-            return match_aligned(self._match, left, right, self.config.aligned)
-        half = match_aligned(self._match, halved(left), halved(right), self.config.aligned)
-        return doubled(half, left.shape)
+    def _decided(self, shape: tuple[int, ...]) -> StereoConfig:
+        """Return the settings with `halve` decided for images of this shape."""
+        if self.config.halve is not None:
+            return self.config
+        return self.config.model_copy(update={"halve": shape[0] * shape[1] > LARGE})
+
+    def _raw(self, left: NDArray[np.uint8], right: NDArray[np.uint8], config: StereoConfig) -> NDArray[np.float32]:
+        halve = bool(config.halve)
+        if halve not in self._matchers:
+            self._matchers[halve] = make_matcher(_of_half(config) if halve else config)
+        if not halve:
+            return match_aligned(self._matchers[halve], left, right, config.aligned)
+        return doubled(match_aligned(self._matchers[halve], halved(left), halved(right), config.aligned), left.shape)
 
 
 def _of_half(config: StereoConfig) -> StereoConfig:
     """Return the settings in pixels of halved images."""
     return config.model_copy(
         update={
+            "block_size": max(3, config.block_size // 2 | 1),
             "disparities": max(16, -(-config.disparities // 32) * 16),
             "speckle_size": config.speckle_size // 4,
             "speckle_range": config.speckle_range / 2,

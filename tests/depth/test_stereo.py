@@ -298,3 +298,15 @@ def test_a_street_scene_against_lidar():
     assert kept.sum() > 0.8 * (truth > 0).sum()
     assert wrong.mean() < 0.015
     assert wrong[sure > np.median(sure)].mean() < 0.25 * wrong.mean()
+
+
+def test_only_large_images_are_halved_unless_told_otherwise(monkeypatch):
+    from stereovox.depth import stereo as module
+
+    frame = plane(20.4)
+    whole, half, open_ = (StereoDepth(stereo(halve=halve)) for halve in (False, True, None))
+    found = {name: make.disparity(frame).disparity for name, make in (("whole", whole), ("half", half))}
+    assert not np.array_equal(found["whole"], found["half"], equal_nan=True)
+    np.testing.assert_array_equal(open_.disparity(frame).disparity, found["whole"])
+    monkeypatch.setattr(module, "LARGE", HEIGHT * WIDTH - 1)
+    np.testing.assert_array_equal(open_.disparity(frame).disparity, found["half"])

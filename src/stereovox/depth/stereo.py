@@ -18,7 +18,7 @@ from stereovox.geometry import Transform
 __all__ = ["Disparity", "StereoDepth"]
 
 LARGE = 450_000
-"""Images of more pixels are halved where the settings leave it open: a street camera's, not a 848x480 depth camera's."""
+"""Images of more pixels are halved where the settings leave it open: those of street cameras, not 848x480 ones."""
 
 
 class StereoDepth:

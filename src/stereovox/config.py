@@ -19,6 +19,8 @@ from stereovox.errors import ConfigError, did_you_mean
 
 MOST_CELLS = 8192
 """Cells that fit between the camera and the maximum range."""
+MOST_UNEQUAL = 16
+"""Largest over smallest side of a cell."""
 LARGEST_WINDOW = 1e6
 """Metres along each side of a window."""
 
@@ -191,7 +193,7 @@ class WindowConfig(_Section):
             raise ValueError("size must be positive, and largest no smaller than size")
         if max(self.largest or self.size) > LARGEST_WINDOW:
             raise ValueError(f"size and largest must be at most {LARGEST_WINDOW:g} m")
-        if 2 * self.trigger >= min(self.size):
+        if self.centre is None and 2 * self.trigger >= min(self.size):
             raise ValueError(f"trigger {self.trigger} must be less than half of the smallest size")
         return self
 
@@ -221,11 +223,13 @@ class MapConfig(_Section):
 class Config(_Section):
     """Every setting of a run; the resolved one is saved inside the map.
 
+    steps: sides of a cell along x, y and z where they differ (Valenti 2018, 7.1); `voxel_size` is then the largest.
     up: which axis of the world points up (`z`, `-y`, ...): pictures and heights follow it.
     """
 
     profile: str = "default"
     voxel_size: float = Field(0.05, gt=0, le=100)
+    steps: tuple[float, float, float] | None = None
     min_range: float = Field(0.1, ge=0)
     max_range: float = Field(5.0, gt=0, le=1000)
     up: str = Field("z", pattern="^[+-]?[xyz]$")
@@ -242,8 +246,25 @@ class Config(_Section):
     ray: RayConfig = Field(default_factory=RayConfig)
     projective: ProjectiveConfig = Field(default_factory=lambda: ProjectiveConfig.model_validate({}))
 
+    @model_validator(mode="before")
+    @classmethod
+    def _largest_step(cls, settings: Any) -> Any:
+        steps = settings.get("steps") if isinstance(settings, dict) else None
+        if not (isinstance(steps, list | tuple) and steps and all(isinstance(step, int | float) for step in steps)):
+            return settings
+        return {**settings, "voxel_size": max(steps)}
+
+    @property
+    def cell(self) -> tuple[float, float, float]:
+        """Sides of a cell along x, y and z in metres."""
+        return self.steps or (self.voxel_size,) * 3
+
     @model_validator(mode="after")
     def _ordered(self) -> Config:
+        if min(self.cell) < self.voxel_size / MOST_UNEQUAL or min(self.cell) <= 0:
+            raise ValueError(
+                f"steps {list(self.cell)} must be above 0 and differ by a factor of at most {MOST_UNEQUAL}"
+            )
         if self.min_range >= self.max_range:
             raise ValueError(f"min_range {self.min_range:g} must be smaller than max_range {self.max_range:g}")
         if self.max_range / self.voxel_size > MOST_CELLS:

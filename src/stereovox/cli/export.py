@@ -10,7 +10,7 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import Any
 
-from stereovox.cli.saved_map import open_map
+from stereovox.cli.saved_map import open_cubes
 from stereovox.cli.terminal import say, size
 
 EXAMPLE = "stereovox export kitchen.svox kitchen.bt"
@@ -27,6 +27,6 @@ def run(arguments: Namespace) -> dict[str, Any]:
     from stereovox.products import export
 
     file = Path(arguments.file)
-    export(open_map(arguments.map), file)
+    export(open_cubes(arguments.map), file)
     say(f"saved {file} ({size(file.stat().st_size)})")
     return {"file": str(file), "bytes": file.stat().st_size}

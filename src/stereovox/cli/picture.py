@@ -8,7 +8,7 @@ from argparse import ArgumentParser, ArgumentTypeError, Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stereovox.cli.saved_map import open_map
+from stereovox.cli.saved_map import open_cubes
 from stereovox.cli.terminal import say
 from stereovox.errors import StereovoxError
 
@@ -46,7 +46,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
     if file.suffix.lower() != ".png":
         raise StereovoxError(f"{file}: pictures are written as .png; name the file so")
     _check_use(arguments)
-    voxel_map = open_map(arguments.map)
+    voxel_map = open_cubes(arguments.map)
     up = checked_up(arguments.up or voxel_map.config.up)
     viewpoint = viewpoint_at(voxel_map, arguments.eye, arguments.toward, up)
     heading = _plain(arguments.title or Path(arguments.map).stem)

@@ -14,6 +14,13 @@ if TYPE_CHECKING:
     from stereovox.maps import VoxelMap
 
 
+def open_cubes(path: str) -> VoxelMap:
+    """Return the map saved at `path` for those who know only cubes; raises MapFileError as `open_map`."""
+    from stereovox.maps.cubes import in_cubes
+
+    return in_cubes(open_map(path))
+
+
 def open_map(path: str) -> VoxelMap:
     """Return the map saved at `path`; raises MapFileError, one line that names the map or recording perhaps meant."""
     from stereovox.maps import load_map

@@ -9,7 +9,7 @@ from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
-from stereovox.cli.saved_map import open_map
+from stereovox.cli.saved_map import open_cubes
 from stereovox.cli.terminal import say
 
 EXAMPLE = "stereovox view kitchen.svox"
@@ -31,7 +31,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
 
     logging.getLogger("websockets.server").setLevel(logging.CRITICAL)  # tells of every browser that hangs up early
     name = Path(arguments.map).stem
-    viewer = open_viewer(open_map(arguments.map), name, arguments.host, arguments.port, arguments.up)
+    viewer = open_viewer(open_cubes(arguments.map), name, arguments.host, arguments.port, arguments.up)
     with closing(viewer), suppress(KeyboardInterrupt):
         if not is_private(arguments.host):
             say(f"warning: anyone who can reach {arguments.host} over the network can look at this map")

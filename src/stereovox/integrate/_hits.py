@@ -40,7 +40,7 @@ def scatter(depth_m, view, keys, news, fresh, seen, pool_table, coords, count, v
     seen[:] = NOTHING
     for v in range(depth_m.shape[0]):
         now, before = keys[v & 1], keys[1 - (v & 1)]
-        ray = _row_rays(view.rotation, view.rows[v], size)
+        ray = _row_rays(view.forward, view.rows[v], size)
         if keys.itemsize == 4:
             _narrow_keys(depth_m[v], view.columns, ray, position, now[LEFT:])
         else:
@@ -134,16 +134,16 @@ def _cell_of(key, keys):
 
 
 @cell
-def _row_rays(rotation, row, size):
+def _row_rays(forward, row, size):
     """Return, in cells, how the world point of a pixel of this row at depth 1 depends on its column: slope, offset.
 
     row: (2,) y and z of the row's rays at depth 1; see `stereovox.cameras`.
     """
     y, z = row[0], row[1]
     return (
-        rotation[0, 0] * size, (rotation[1, 0] * y + rotation[2, 0] * z) * size,
-        rotation[0, 1] * size, (rotation[1, 1] * y + rotation[2, 1] * z) * size,
-        rotation[0, 2] * size, (rotation[1, 2] * y + rotation[2, 2] * z) * size,
+        forward[0, 0] * size, (forward[1, 0] * y + forward[2, 0] * z) * size,
+        forward[0, 1] * size, (forward[1, 1] * y + forward[2, 1] * z) * size,
+        forward[0, 2] * size, (forward[1, 2] * y + forward[2, 2] * z) * size,
     )  # fmt: skip
 
 

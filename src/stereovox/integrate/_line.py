@@ -23,7 +23,7 @@ def draw(depth_m, view, table, look_up, weight, lanes, pool_table, coords, count
     start = _off_faces(position[0]), _off_faces(position[1]), _off_faces(position[2])
     together = lanes.depth.size
     for v in range(first_row, last_row):
-        ray = _row_rays(view.rotation, view.rows[v], size)
+        ray = _row_rays(view.forward, view.rows[v], size)
         for u in range(0, depth_m.shape[1], together):
             columns = view.columns[u : u + together]
             free_to = aim(depth_m[v, u : u + together], columns, ray, position, view, table, lanes)

@@ -24,7 +24,7 @@ def cast(depth_m, view, table, look_up, weight, lanes, pool_table, coords, count
     position = view.position * size
     together = lanes.depth.size
     for v in range(first_row, last_row):
-        ray = _row_rays(view.rotation, view.rows[v], size)
+        ray = _row_rays(view.forward, view.rows[v], size)
         for u in range(0, depth_m.shape[1], together):
             columns = view.columns[u : u + together]
             free_to = aim(depth_m[v, u : u + together], columns, ray, position, view, table, lanes)

@@ -44,7 +44,7 @@ class Projective:
 
     def _of_pinhole(self, image: DepthImage, camera: PinholeCamera) -> Evidence:
         self._prepare(camera)
-        view = view_of(image, self._config.voxel_size, self._config.max_range)
+        view = view_of(image, self._config)
         windows, farthest = self._builder.build(image.depth_m, float(view.spread) / self._config.max_range)
         if self._table.marks:
             self._builder.build_nearest(image.depth_m)
@@ -52,7 +52,7 @@ class Projective:
         free, mixed = self._candidates(view, windows, self._end_of_view(farthest))
         values, used = self._evaluate(image.depth_m, view, windows, mixed)
         coords, values = self._with_leftovers(mixed, values, used)
-        origin = origin_block(image.T_world_sensor, self._config.voxel_size).astype(np.int32)
+        origin = origin_block(image.T_world_sensor, self._config).astype(np.int32)
         return Evidence(coords + origin, values, free + origin, int(self._table.free))
 
     def _prepare(self, camera: PinholeCamera) -> None:
@@ -69,7 +69,7 @@ class Projective:
 
     def _key_rows(self, camera: PinholeCamera) -> NDArray[np.signedinteger]:
         """Return scratch for the keys of two pixel rows, of the narrowest kind that tells all cells apart."""
-        cells = farthest_cells(camera, self._config.max_range, self._config.voxel_size)
+        cells = farthest_cells(camera, self._config.max_range, self._config)
         narrow = cells < 1 << (_hits.NARROW - 1)
         pixels = _hits.GROUP * -(-camera.width // _hits.GROUP)
         return np.zeros((2, _hits.LEFT + pixels + _hits.RIGHT), np.int32 if narrow else np.int64)
@@ -141,7 +141,7 @@ def _coarse_range(view: View, end: float) -> tuple[NDArray[np.int64], NDArray[np
     x = np.array([view.columns[0] - rim_x, view.columns[-1] + rim_x]) * end
     y = np.array([view.rows[0, 0] - rim_y, view.rows[-1, 0] + rim_y]) * end
     corners = np.array([[0, 0, 0], *[[a, b, end] for a in x for b in y]], float)
-    world = corners @ view.rotation.astype(float) + view.position
+    world = corners @ view.forward.astype(float) + view.position
     side = _cull.COARSE * SIDE * float(view.voxel_size)
     margin = float(view.voxel_size)
     return (

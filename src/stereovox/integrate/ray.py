@@ -41,7 +41,7 @@ class Ray:
         """Return what `image` says about the cells its rays cross."""
         config, camera = self._config, image.camera
         self._prepare(camera)
-        view = rays_of(image, config.voxel_size, config.max_range)
+        view = rays_of(image, config)
         cell_px = camera.focal_px / camera.binning * config.voxel_size  # at a depth of one metre
         weight = np.float32(cell_px**-2 if config.ray.update == "every" else 0)
         parts = shards(camera.height, config.threads)
@@ -50,7 +50,7 @@ class Ray:
         pool = self._merged(self._pools[: len(parts)], bool(weight > 0))
         values = np.empty((len(pool), CELLS), np.int16)
         _lanes.to_thousandths(pool.values[: len(pool)], _lanes.FRACTION_BITS if weight > 0 else 0, values)
-        origin = origin_block(image.T_world_sensor, config.voxel_size).astype(np.int32)
+        origin = origin_block(image.T_world_sensor, config).astype(np.int32)
         return Evidence(pool.coords[: len(pool)] + origin, values, np.empty((0, 3), np.int32), 0)
 
     def _prepare(self, camera: VirtualCamera) -> None:
@@ -59,7 +59,7 @@ class Ray:
         self._table: KernelTable = sensor_table(self._sensor, self._config, camera)
         self._look_up = (self._table.clear + self._table.mark).ravel()
         reach = self._config.max_range + float(self._table.reach[-1])
-        cells = farthest_cells(camera, reach, self._config.voxel_size)
+        cells = farthest_cells(camera, reach, self._config)
         wide = bool(cells >= 1 << (_lanes.NARROW - 1))
         self._lanes = [make_lanes(wide) for _ in self._pools]
         self._camera = camera

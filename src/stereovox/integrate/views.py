@@ -47,9 +47,12 @@ class KernelTable(NamedTuple):
 
 
 class Rays(NamedTuple):
-    """The rays of any camera at its pose, in metres relative to the corner of the block it stands in."""
+    """The rays of any camera at its pose, in metres relative to the corner of the block it stands in.
 
-    rotation: NDArray[np.float32]  # (3, 3) world to camera
+    Where the sides of a cell differ, the world is stretched to make cells cubes of `voxel_size`; depths stay metres.
+    """
+
+    forward: NDArray[np.float32]  # (3, 3) camera to world, transposed: row a is the camera's axis a in the world
     position: NDArray[np.float32]  # (3,) of the camera, from the corner of its block
     columns: NDArray[np.float32]  # (width,) of `camera.rays()`
     rows: NDArray[np.float32]  # (height, 2)
@@ -58,9 +61,10 @@ class Rays(NamedTuple):
 
 
 class View(NamedTuple):
-    """A pinhole camera at its pose, in metres relative to the corner of the block it stands in."""
+    """A pinhole camera at its pose, in metres relative to the corner of the block it stands in; as in `Rays`."""
 
     rotation: NDArray[np.float32]  # (3, 3) world to camera
+    forward: NDArray[np.float32]  # (3, 3) as in `Rays`
     position: NDArray[np.float32]  # (3,) of the camera, from the corner of its block
     extent: NDArray[np.float32]  # (3,) half width along x, y, z of the camera of a box of half width 1
     sides: NDArray[np.float32]  # (4, 5) the image's sides as planes: normal, half width of a unit box, offset
@@ -104,30 +108,38 @@ def kernel_table(table: SensorTable, max_range: float) -> KernelTable:
     )
 
 
-def origin_block(T_world_camera: Transform, voxel_size: float) -> NDArray[np.int64]:
+def origin_block(T_world_camera: Transform, config: Config) -> NDArray[np.int64]:
     """Return the block (3,) the camera stands in; kernels count blocks and metres from there to keep float32 exact."""
-    return np.floor(T_world_camera[:3, 3] / (SIDE * voxel_size)).astype(np.int64)
+    return np.floor(T_world_camera[:3, 3] / np.multiply(SIDE, config.cell)).astype(np.int64)
 
 
-def rays_of(image: DepthImage, voxel_size: float, max_range: float) -> Rays:
+def rays_of(image: DepthImage, config: Config) -> Rays:
     """Return the kernel rays of a depth image's camera and pose."""
-    T, (columns, rows) = image.T_world_sensor, camera_rays(image.camera)
-    corner = origin_block(T, voxel_size) * (SIDE * voxel_size)
-    rotation, position = np.ascontiguousarray(T[:3, :3].T, np.float32), (T[:3, 3] - corner).astype(np.float32)
-    return Rays(rotation, position, columns, rows, np.float32(voxel_size), np.float32(max_range))
+    T, (columns, rows), stretch = image.T_world_sensor, camera_rays(image.camera), _stretch(config)
+    corner = origin_block(T, config) * np.multiply(SIDE, config.cell)
+    forward = np.ascontiguousarray((stretch[:, None] * T[:3, :3]).T, np.float32)
+    position = (stretch * (T[:3, 3] - corner)).astype(np.float32)
+    return Rays(forward, position, columns, rows, np.float32(config.voxel_size), np.float32(config.max_range))
 
 
-def view_of(image: DepthImage, voxel_size: float, max_range: float) -> View:
+def _stretch(config: Config) -> NDArray[np.float64]:
+    """Return the factors (3,) that make cells cubes of `voxel_size`."""
+    return config.voxel_size / np.array(config.cell)
+
+
+def view_of(image: DepthImage, config: Config) -> View:
     """Return the kernel view of a pinhole camera's depth image and its pose."""
-    camera, T = image.camera, image.T_world_sensor
+    camera, voxel_size = image.camera, config.voxel_size
     assert isinstance(camera, PinholeCamera)
-    rays = rays_of(image, voxel_size, max_range)
+    rays = rays_of(image, config)
+    to_camera = image.T_world_sensor[:3, :3].T / _stretch(config)
     rim = RIM_SHARE * voxel_size * np.array([camera.fx, camera.fy])
     return View(
-        rays.rotation,
+        np.ascontiguousarray(to_camera, np.float32),
+        rays.forward,
         rays.position,
-        np.abs(T[:3, :3]).sum(axis=0).astype(np.float32),
-        _sides(camera, T, rim),
+        np.abs(to_camera).sum(axis=1).astype(np.float32),
+        _sides(camera, to_camera, rim),
         rays.columns,
         rays.rows,
         np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32),
@@ -137,11 +149,11 @@ def view_of(image: DepthImage, voxel_size: float, max_range: float) -> View:
         rays.max_range,
         np.float32(WINDOW_SHARE * camera.fx * voxel_size),
         rim.astype(np.float32),
-        _cell_steps(camera, T, voxel_size),
+        _cell_steps(camera, to_camera, voxel_size),
     )
 
 
-def _sides(camera: PinholeCamera, T: Transform, rim: NDArray[np.float64]) -> NDArray[np.float32]:
+def _sides(camera: PinholeCamera, to_camera: NDArray[np.float64], rim: NDArray[np.float64]) -> NDArray[np.float32]:
     """A point counts as seen when fx x + (cx + 0.5) z + rim >= 0, and the like for the other three sides."""
     right, bottom = camera.width - 0.5 - camera.cx, camera.height - 0.5 - camera.cy
     inward = np.array(
@@ -152,7 +164,7 @@ def _sides(camera: PinholeCamera, T: Transform, rim: NDArray[np.float64]) -> NDA
             [0, -camera.fy, bottom],
         ]
     )
-    normals = inward @ T[:3, :3].T
+    normals = inward @ to_camera
     unit_box = np.abs(normals).sum(axis=1, keepdims=True)
     border = np.repeat(rim, 2)[:, None] + 1e-3 * np.abs(inward).max(axis=1, keepdims=True)
     return np.hstack([normals, unit_box, border]).astype(np.float32)
@@ -164,13 +176,13 @@ def camera_rays(camera: VirtualCamera) -> tuple[NDArray[np.float32], NDArray[np.
     return camera.rays()
 
 
-def farthest_cells(camera: VirtualCamera, reach: float, voxel_size: float) -> float:
+def farthest_cells(camera: VirtualCamera, reach: float, config: Config) -> float:
     """Return how many cells from its block's corner a camera can see at most, at depths up to `reach` metres."""
     columns, rows = camera_rays(camera)
     corner = np.hypot(np.abs(columns).max(), np.hypot(*rows.T).max())
-    return float(corner * reach / voxel_size + SIDE)
+    return float(corner * reach / min(config.cell) + SIDE)
 
 
-def _cell_steps(camera: PinholeCamera, T: Transform, voxel_size: float) -> NDArray[np.float32]:
-    to_pixels = T[:3, :3].T * (np.array([[camera.fx], [camera.fy], [1.0]]) * voxel_size)
+def _cell_steps(camera: PinholeCamera, to_camera: NDArray[np.float64], voxel_size: float) -> NDArray[np.float32]:
+    to_pixels = to_camera * (np.array([[camera.fx], [camera.fy], [1.0]]) * voxel_size)
     return (to_pixels @ CELL_CENTRES).astype(np.float32)

@@ -50,7 +50,7 @@ class RollingMap(VoxelMap):
     @property
     def window(self) -> NDArray[np.float64] | None:
         """Lowest and highest corner (2, 3) of the window in metres, None before the first frame."""
-        return None if self._window.box is None else np.array(self._window.box) * self.voxel_size
+        return None if self._window.box is None else np.array(self._window.box) * self.config.cell
 
     @property
     def memory_bytes(self) -> int:
@@ -144,11 +144,11 @@ class RollingMap(VoxelMap):
     def _look_into_tiles(self, points: NDArray[np.float64], stored: NDArray[np.integer]) -> None:
         """Set what the window does not know and a tile does, tile by tile."""
         assert self._store is not None
-        within = (np.abs(points) < INDEX_LIMIT * self.voxel_size).all(axis=1)  # False for NaN
+        within = (np.abs(points) < INDEX_LIMIT * np.array(self.config.cell)).all(axis=1)  # False for NaN
         asked = np.flatnonzero(within & (stored == self._format.unknown))
         if not len(asked):
             return
-        cells = np.floor(points[asked] / self.voxel_size).astype(np.int64)
+        cells = np.floor(points[asked] / self.config.cell).astype(np.int64)
         tiles, of_cell, number = np.unique(cells // TILE, axis=0, return_inverse=True, return_counts=True)
         groups = np.split(np.argsort(of_cell.ravel(), kind="stable"), np.cumsum(number)[:-1])
         for tile, group in zip(map(tuple, tiles.tolist()), groups, strict=True):

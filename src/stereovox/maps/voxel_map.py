@@ -35,8 +35,9 @@ class State(IntEnum):
 class VoxelMap:
     """A sparse occupancy map in the world frame (z up unless the recording says otherwise).
 
-    Cell i covers [i, i + 1) * voxel_size on each axis. A cell without evidence is unknown: log-odds 0, probability
-    0.5. With evidence it is free (p < free_below), occupied (p > occupied_above) or tentative between them.
+    Cell i covers [i, i + 1) * voxel_size on each axis, or of `config.cell` where its sides differ. A cell without
+    evidence is unknown: log-odds 0, probability 0.5. With evidence it is free (p < free_below), occupied
+    (p > occupied_above) or tentative between them.
     `config` holds the settings the map was made with, `frames` the number of frames that are in it, `frames_refused`
     the number that were offered and refused, `recording` the name of what they came from, if known, `viewpoint` where
     the camera stood last, `window_state` where its window was, if it had one.
@@ -81,8 +82,8 @@ class VoxelMap:
         return self
 
     def check_cells(self, config: Config) -> None:
-        """Raise ConfigError when `config` gives cells another meaning: the voxel size or the `map` section."""
-        for name in ("voxel_size", "map"):
+        """Raise ConfigError when `config` gives cells another meaning: their size or the `map` section."""
+        for name in ("voxel_size", "steps", "map"):
             old, new = getattr(self.config, name), getattr(config, name)
             if old != new:
                 raise ConfigError(f"cannot go on: the map was made with {name} {old}, now {new} is wanted")
@@ -147,7 +148,7 @@ class VoxelMap:
 
     def centers(self, indices: ArrayLike) -> NDArray[np.float64]:
         """Return the centres (N, 3) in metres of cells (N, 3)."""
-        return (np.asarray(indices) + 0.5) * self.voxel_size
+        return (np.asarray(indices) + 0.5) * self.config.cell
 
     def occupied(self) -> NDArray[np.float64]:
         """Return the centres (N, 3) in metres of all occupied cells."""
@@ -169,7 +170,7 @@ class VoxelMap:
         indices, _ = self.cells()
         if not len(indices):
             return None
-        return np.stack([indices.min(0), indices.max(0) + 1]) * self.voxel_size
+        return np.stack([indices.min(0), indices.max(0) + 1]) * self.config.cell
 
     @property
     def memory_bytes(self) -> int:
@@ -200,7 +201,7 @@ class VoxelMap:
     def _stored_at(self, points: ArrayLike) -> NDArray[np.integer]:
         points = np.asarray(points, float).reshape(-1, 3)
         with np.errstate(invalid="ignore"):
-            indices = np.floor(points / self.voxel_size)
+            indices = np.floor(points / self.config.cell)
         inside = (np.abs(indices) < INDEX_LIMIT).all(axis=1)
         stored = np.full(len(points), self._format.unknown, self._format.dtype)
         found = stored[inside]

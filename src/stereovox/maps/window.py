@@ -31,9 +31,10 @@ class Window:
     """
 
     def __init__(self, config: Config):
-        window, self._cell = config.window, config.voxel_size
+        window, self._cell = config.window, config.cell
         assert window.size is not None
-        self._trigger, self._lead_s, self._grow_s = max(window.trigger, self._cell / 2), window.lead_s, window.grow_s
+        self._trigger = max(window.trigger, max(self._cell) / 2)
+        self._lead_s, self._grow_s = window.lead_s, window.grow_s
         self._fixed = window.centre
         self._size = _cells(window.size, self._cell)
         self.largest = _cells(window.largest or window.size, self._cell)
@@ -86,29 +87,30 @@ class Window:
     def _wanted_extent(self) -> Cell:
         if not self._grow_s or self._fixed is not None:
             return self._size
-        sizes = zip(self._size, self.largest, self._extent, self._velocity, strict=True)
+        sizes = zip(self._size, self.largest, self._extent, self._velocity, self._cell, strict=True)
         return tuple(self._grown(*numbers) for numbers in sizes)  # pyright: ignore
 
-    def _grown(self, least: int, most: int, now: int, velocity: float) -> int:
-        extra = abs(velocity) * self._grow_s / self._cell
+    def _grown(self, least: int, most: int, now: int, velocity: float, cell: float) -> int:
+        extra = abs(velocity) * self._grow_s / cell
         up, down = (least + GROWTH * ceil(extra / GROWTH), least + GROWTH * ceil((extra + GROWTH / 2) / GROWTH))
         return min(max(up, min(now, down)), most)
 
     def _centre(self, axis: int, camera: float) -> int:
         """Return the middle cell face of the box on one axis: moved by whole cells, no further than needed."""
+        cell = self._cell[axis]
         if self._fixed is not None:
-            return round(self._fixed[axis] / self._cell)
-        reach = self._extent[axis] * self._cell / 2
+            return round(self._fixed[axis] / cell)
+        reach = self._extent[axis] * cell / 2
         lead = self._velocity[axis] * self._lead_s
-        limit = max(reach - self._trigger - self._cell, 0.0)
+        limit = max(reach - self._trigger - cell, 0.0)
         wanted = camera + min(max(lead, -limit), limit)
         if self.box is None:
-            return round(wanted / self._cell)
+            return round(wanted / cell)
         now = (self.box[0][axis] + self.box[1][axis]) // 2
-        off = wanted - now * self._cell
+        off = wanted - now * cell
         if abs(off) <= self._trigger:
             return now
-        cells = ceil((abs(off) - self._trigger) / self._cell - 1e-9)
+        cells = ceil((abs(off) - self._trigger) / cell - 1e-9)
         return now + (cells if off > 0 else -cells)
 
 
@@ -150,5 +152,5 @@ def _three(numbers: Any, kind: Any, most: float = 1e300) -> tuple[Any, Any, Any]
     return x, y, z
 
 
-def _cells(size: Sequence[float], cell: float) -> Cell:
-    return tuple(max(1, floor(x / cell + 0.5)) for x in size)  # pyright: ignore
+def _cells(size: Sequence[float], cell: Sequence[float]) -> Cell:
+    return tuple(max(1, floor(x / c + 0.5)) for x, c in zip(size, cell, strict=True))  # pyright: ignore

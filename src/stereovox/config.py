@@ -257,7 +257,8 @@ class Config(_Section):
     @property
     def cell(self) -> tuple[float, float, float]:
         """Sides of a cell along x, y and z in metres."""
-        return self.steps or (self.voxel_size,) * 3
+        side = self.voxel_size
+        return self.steps or (side, side, side)
 
     @model_validator(mode="after")
     def _ordered(self) -> Config:

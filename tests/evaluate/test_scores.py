@@ -211,3 +211,16 @@ def test_what_came_of_each_cell():
     shown = outcomes(cells.read(made({(9, 0, 0): 2.0})), cells)
     assert Outcome.FOUND in shown.outcome
     assert Outcome.UNSEEN in shown.outcome
+
+
+def test_maps_of_unequal_steps_are_compared_in_cubes():
+    from stereovox.config import load_config
+    from stereovox.maps import VoxelMap
+
+    flat = load_config(steps=(0.2, 0.2, 0.1))
+    ours = VoxelMap.from_cells(flat, [[0, 0, 0], [1, 0, 0], [0, 0, 1]], [3, 3, -3])
+    cubes = load_config(voxel_size=0.1)
+    one = [[x, y, 0] for x in (0, 1) for y in (0, 1)]
+    truth = VoxelMap.from_cells(cubes, one + [[x, y, 1] for x, y, _ in one], [3] * 4 + [-3] * 4)
+    found = score(ours, truth)
+    assert (found.tp, found.fp, found.tn, found.fn) == (4, 0, 4, 0)

@@ -14,6 +14,7 @@ from stereovox.evaluate.cell_reader import CellReader, Neighbourhood
 from stereovox.evaluate.cells import Keys, indices, position
 from stereovox.evaluate.metrics import known_cells
 from stereovox.maps import State, VoxelMap
+from stereovox.maps.cubes import in_cubes
 
 MOST_TOLERANCE = 20
 _ROUNDING = 1e-6
@@ -60,6 +61,7 @@ class TruthCells:
     """
 
     def __init__(self, truth_map: VoxelMap, tolerance: int = 1):
+        truth_map = in_cubes(truth_map)
         if not 0 <= tolerance <= MOST_TOLERANCE:
             raise StereovoxError(f"tolerance {tolerance} is out of range; give 0 to {MOST_TOLERANCE} cells")
         known, state = known_cells(truth_map)
@@ -78,6 +80,7 @@ class TruthCells:
 
     def read(self, voxel_map: VoxelMap) -> Reading:
         """Return what `voxel_map` says. Raises StereovoxError where its cells are not those of the truth."""
+        voxel_map = in_cubes(voxel_map)
         if not np.allclose(voxel_map.voxel_size, self.voxel_size, rtol=1e-5, atol=0):
             raise StereovoxError(
                 f"cells of {voxel_map.voxel_size:g} m cannot be compared with a truth of {self.voxel_size:g} m; "

@@ -2,6 +2,8 @@
 """Disparity against lidar on scenes in the layout of KITTI stereo 2015 (training/image_2, image_3, disp_occ_0).
 
 python benchmarks/stereo2015.py FOLDER [setting=value ...]      for example: ~/kitti_stereo2015 method=block
+
+FOLDER is that which holds `training`, or `training` itself.
 """
 
 import sys
@@ -26,7 +28,7 @@ def main(folder: str, *settings: str) -> None:
         sys.exit("the reference is the left image's: leave aligned=left")
     depth = StereoDepth(config)
     lines, errors, sure, missed = [], [], [], 0
-    for path in sorted((Path(folder) / "training/image_2").glob("*_10.png")):
+    for path in scenes(Path(folder)):
         frame, truth = scene(path)
         depth.disparity(frame)
         start, busy = time.perf_counter(), time.process_time()
@@ -52,6 +54,12 @@ def main(folder: str, *settings: str) -> None:
         density = 100 * len(best) / (len(error) + missed)
         print(f"surest {share:4.0%}: confidence {confidence[best[-1]]:.2f}, density {density:.1f} %, bad-3 ", end="")
         print(f"{bad3(error[best]):.2f} %")
+
+
+def scenes(folder: Path) -> list[Path]:
+    """The left images with a reference."""
+    parent = folder if (folder / "image_2").is_dir() else folder / "training"
+    return sorted((parent / "image_2").glob("*_10.png")) or sys.exit(f"{parent}: no image_2/*_10.png")
 
 
 def scene(path: Path) -> tuple[StereoFrame, np.ndarray]:

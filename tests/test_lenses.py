@@ -116,8 +116,10 @@ def test_nobody_finds_two_pixels_of_a_lens_in_one_direction():
         ({"model": "fishye"}, "did you mean 'fisheye'"),
         ({"fx": 0.0}, "must be positive"),
         ({"cx": np.nan}, "must be positive"),
-        ({"model": "fisheye", "distortion": (1, 2, 3, 4, 5)}, "at most 4"),
-        ({"distortion": (np.inf,)}, "finite"),
+        ({"model": "fisheye", "distortion": (1, 2, 3, 4, 5)}, "0 or 4 finite"),
+        ({"model": "fisheye", "distortion": (1,)}, "0 or 4 finite"),
+        ({"distortion": (1, 2, 3)}, "0, 4, 5 or 8 finite"),
+        ({"distortion": (0, 0, 0, np.inf)}, "finite"),
     ],
 )
 def test_what_is_no_lens(change, said):

@@ -188,6 +188,8 @@ class WindowConfig(_Section):
     @model_validator(mode="after")
     def _fitting(self) -> WindowConfig:
         if self.size is None:
+            if self.centre is not None:
+                raise ValueError("window.centre needs window.size, for example window.size=[20,20,5]")
             return self
         if min(self.size) <= 0 or any(b < a for a, b in zip(self.size, self.largest or self.size, strict=True)):
             raise ValueError("size must be positive, and largest no smaller than size")
@@ -203,7 +205,8 @@ class MapConfig(_Section):
 
     cell: `int16` holds thousandths of log-odds; `uint8` is Chien's byte (2020, 3.5): 127 unknown, 0 free, 255 occupied.
     prior: probability that a cell is occupied before the first evidence on it (l0 of Valenti 2018, Eq 6.2). Most cells
-    a camera sees are free, so probabilities agree with what is really there when it is well below a half.
+    a camera sees are free, so probabilities agree with what is really there when it is well below a half. `prior` of
+    the sensor model `stereo` should be the same. A cell that evidence made likelier than that is never free.
     """
 
     cell: Literal["int16", "uint8"] = "int16"
@@ -217,6 +220,8 @@ class MapConfig(_Section):
     def _ordered(self) -> MapConfig:
         if self.free_below >= self.occupied_above:
             raise ValueError("free_below must be smaller than occupied_above")
+        if self.prior >= self.occupied_above:
+            raise ValueError(f"prior {self.prior} must be smaller than occupied_above {self.occupied_above}")
         return self
 
 

@@ -162,3 +162,11 @@ def test_camera_of_a_frame_knows_the_noisier_pair():
     for order in (grids, grids[::-1]):
         frame = frame_of(stitch(order), np.eye(4), 8.0)
         assert RangeNoise.of(config.noise, frame.camera).s2 == pytest.approx(SUBPIXEL / 15)
+
+
+@pytest.mark.parametrize("camera", [PinholeCamera.from_field_of_view(320, 200, 91, 0.15)])
+def test_an_empty_view_straight_ahead_stays_free(camera):
+    image = checked(camera, np.zeros((200, 320)), np.full((200, 320), Reason.TOO_FAR, np.uint8))
+    sphere = through_sphere(image, load_config("default", max_range=20.0, **{"sphere.step_deg": 2.0}))
+    ahead = sphere.reason[np.abs(np.arange(len(sphere.reason)) - len(sphere.reason) / 2) < 3]
+    assert (ahead == Reason.TOO_FAR).mean() > 0.9

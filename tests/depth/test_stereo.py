@@ -310,3 +310,17 @@ def test_only_large_images_are_halved_unless_told_otherwise(monkeypatch):
     np.testing.assert_array_equal(open_.disparity(frame).disparity, found["whole"])
     monkeypatch.setattr(module, "LARGE", HEIGHT * WIDTH - 1)
     np.testing.assert_array_equal(open_.disparity(frame).disparity, found["half"])
+
+
+@pytest.mark.parametrize("method", ["sgm", "sgm8", "hh4"])
+def test_windows_whose_costs_overflow_are_refused(method):
+    StereoDepth(stereo(method=method, block_size=15))
+    with pytest.raises(ConfigError, match="block_size 21 with p2 64: too large"):
+        StereoDepth(stereo(method=method, block_size=21))
+
+
+def test_images_smaller_than_the_window_are_refused():
+    camera = PinholeCamera(32, 24, 30.0, 30.0, 15.5, 11.5, baseline=0.1)
+    image = np.zeros((24, 32), np.uint8)
+    with pytest.raises(FrameRefused, match="smaller than stereo"):
+        StereoDepth(stereo(method="block", block_size=51))(StereoFrame(image, image, StereoPair(camera), np.eye(4)))

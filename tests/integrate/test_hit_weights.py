@@ -131,3 +131,10 @@ def test_a_point_a_hair_before_a_face_does_not_hide_the_cell_behind_it():
         both_sides.add(len(hits))
         before = np.nextafter(before, np.float32(0))
     assert both_sides == {1, 2}, "the face was not crossed: nothing was tested"
+
+
+def test_nothing_seen_is_no_evidence():
+    from stereovox.integrate.merging import strongest
+
+    nothing = strongest([])
+    assert len(nothing.coords) == len(nothing.uniform) == 0

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from stereovox.config import load_config
+from stereovox.errors import ConfigError
 from stereovox.maps import State, VoxelMap, load_map, make_map
 from stereovox.maps.cell_format import FORMATS
 from stereovox.maps.evidence import Evidence
@@ -98,3 +99,21 @@ def test_the_profile_of_the_thesis():
     assert (rolling._rules.lowest, rolling._rules.highest) == (0, 255)
     assert (config.voxel_size, config.depth.downsample, config.integrator) == (0.2, 8, "line")
     assert np.prod(np.array(config.window.size) / 0.2).round() == 100 * 30 * 100
+
+
+@pytest.mark.parametrize("cell", ["int16", "uint8"])
+@pytest.mark.parametrize("prior", [0.05, 0.1, 0.4])
+def test_what_evidence_made_likelier_is_never_free(cell, prior):
+    config = load_config(**{"map.prior": prior, "map.cell": cell, "map.log_odds_min": -2.0})
+    for steps, wanted in (((60,), State.TENTATIVE), ((60, 60), State.TENTATIVE), ((-400,), State.FREE)):
+        voxel_map = VoxelMap(config)
+        for step in steps:
+            values = np.full((1, 512), step, np.int16)
+            voxel_map.add(Evidence(np.zeros((1, 3), np.int32), values, np.empty((0, 3), np.int32), 0))
+        at_most_free = prior < 0.3 or wanted != State.FREE
+        assert voxel_map.state([[0.01, 0.01, 0.01]]).tolist() == [wanted if at_most_free else State.TENTATIVE]
+
+
+def test_a_prior_that_makes_all_occupied_is_refused():
+    with pytest.raises(ConfigError, match=r"prior 0\.8 must be smaller"):
+        load_config(**{"map.prior": 0.8})

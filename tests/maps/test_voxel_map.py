@@ -1,5 +1,7 @@
 """The voxel map against a plain dict of cells."""
 
+import json
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -28,7 +30,7 @@ def cells_of(voxel_map):
     return dict(zip(map(tuple, indices.tolist()), np.rint(log_odds * 1000).astype(int).tolist(), strict=True))
 
 
-@pytest.mark.parametrize(("prior", "first"), [(0.1, -2197), (0.5, 0), (0.7, 847)])
+@pytest.mark.parametrize(("prior", "first"), [(0.1, -2197), (0.5, 0), (0.6, 405)])
 def test_adding_evidence_equals_a_dict(prior, first):
     """`first`: the prior's log-odds in thousandths, from which a cell leaves "unknown"."""
     rng = np.random.default_rng(1)
@@ -67,8 +69,8 @@ def test_evidence_that_just_undoes_the_prior_is_known():
     voxel_map = VoxelMap(load_config(CONFIG, **{"map.prior": 0.1}))
     voxel_map.add(evidence_of([[0, 0, 0]], [np.full(512, 2197)]))
     assert set(cells_of(voxel_map).values()) == {1}
-    voxel_map = VoxelMap(load_config(CONFIG, **{"map.prior": 0.7}))
-    voxel_map.add(evidence_of([], [], [[0, 0, 0]], -847))
+    voxel_map = VoxelMap(load_config(CONFIG, **{"map.prior": 0.6}))
+    voxel_map.add(evidence_of([], [], [[0, 0, 0]], -405))
     assert set(cells_of(voxel_map).values()) == {1}
 
 
@@ -108,11 +110,11 @@ def test_blocks_without_evidence_are_not_made():
 
 def test_states_and_probabilities():
     cells = [[0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0]]
-    voxel_map = VoxelMap.from_cells(CONFIG, cells, [-1.0, 0.5, 1.0, 0.0])
+    voxel_map = VoxelMap.from_cells(CONFIG, cells, [-3.0, 0.5, 1.0, 0.0])
     points = voxel_map.centers([*cells, [9, 9, 9]])
     states = [State.FREE, State.TENTATIVE, State.OCCUPIED, State.TENTATIVE, State.UNKNOWN]
     assert voxel_map.state(points).tolist() == states
-    assert voxel_map.probability(points)[:3] == pytest.approx(1 / (1 + np.exp([1.0, -0.5, -1.0])), abs=1e-3)
+    assert voxel_map.probability(points)[:3] == pytest.approx(1 / (1 + np.exp([3.0, -0.5, -1.0])), abs=1e-3)
     assert voxel_map.probability(points)[4] == 0.5
     assert voxel_map.counts() == {"free": 1, "tentative": 2, "occupied": 1}
     assert voxel_map.occupied() == pytest.approx(np.array([[0.25, 0.05, 0.05]]))
@@ -223,3 +225,13 @@ def test_refuses_to_overwrite_what_is_no_map(tmp_path):
     with pytest.raises(MapFileError, match="not a stereovox map"):
         random_map().save(tmp_path / "thesis.txt")
     assert (tmp_path / "thesis.txt").read_text() == "years of work"
+
+
+def test_a_map_from_before_there_was_a_prior_keeps_its_meaning(tmp_path):
+    voxel_map = VoxelMap.from_cells(load_config(CONFIG, **{"map.prior": 0.5}), [[0, 0, 0]], [1.0])
+    voxel_map.save(tmp_path / "old.svox")
+    file = tmp_path / "old.svox" / "manifest.json"
+    manifest = json.loads(file.read_text())
+    del manifest["config"]["map"]["prior"]
+    file.write_text(json.dumps(manifest))
+    assert load_map(tmp_path / "old.svox").config.map.prior == 0.5

@@ -24,7 +24,7 @@ def eyes() -> Eyes:
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = rotation_matrix([0.01, -0.02, 0.005]), (0.15, 0.001, -0.002)
     left = Lens("fisheye", 48, 36, 16.0, 16.1, 23.2, 17.9, (-0.02, 0.011, -0.008, 0.0014))
-    return Eyes(left, Lens("fisheye", 48, 36, 15.9, 16.2, 24.0, 18.1, (0.01,)), T)
+    return Eyes(left, Lens("fisheye", 48, 36, 15.9, 16.2, 24.0, 18.1, (0.01, 0.0, 0.0, 0.0)), T)
 
 
 def rig() -> Rig:

@@ -78,6 +78,14 @@ def read_grey(path: Path) -> NDArray[np.uint8] | None:
     return None if image is None else np.asarray(image, np.uint8)
 
 
+def unmatched(folder: str | os.PathLike[str]) -> list[str]:
+    """Return the names of the images in `folder` of an eye that have no partner of the other eye's."""
+    eyes = _eyes(Path(folder))
+    return sorted(
+        path.name for ours, theirs in ("lr", "rl") for key, path in eyes[ours].items() if key not in eyes[theirs]
+    )
+
+
 def image_pairs(folder: str | os.PathLike[str]) -> list[tuple[str, Path, Path]]:
     """Return name, left file and right file of each pair in `folder`, in order of name.
 
@@ -87,6 +95,17 @@ def image_pairs(folder: str | os.PathLike[str]) -> list[tuple[str, Path, Path]]:
     where = Path(folder)
     if not where.is_dir():
         raise StereovoxError(f"{folder}: no such folder; give the one with the images of the chessboard")
+    eyes = _eyes(where)
+    pairs = [(key, left, eyes["r"][key]) for key, left in eyes["l"].items() if key in eyes["r"]]
+    if not pairs:
+        raise StereovoxError(f"{folder}: holds no pair of images; name them left01.png and right01.png, and so on")
+    return sorted(
+        pairs, key=lambda pair: [int(word) if word.isdigit() else word for word in re.split(r"(\d+)", pair[0])]
+    )
+
+
+def _eyes(where: Path) -> dict[str, dict[str, Path]]:
+    """Return for `l` and `r` the images of that eye by what is the same in both names."""
     below = [where / "left", where / "right"]
     files = [path for place in (below if all(map(Path.is_dir, below)) else [where]) for path in sorted(place.iterdir())]
     eyes: dict[str, dict[str, Path]] = {"l": {}, "r": {}}
@@ -94,12 +113,7 @@ def image_pairs(folder: str | os.PathLike[str]) -> list[tuple[str, Path, Path]]:
         side, key = _side(path) if path.suffix.lower() in ENDINGS else ("", "")
         if side:
             eyes[side].setdefault(key, path)
-    pairs = [(key, left, eyes["r"][key]) for key, left in eyes["l"].items() if key in eyes["r"]]
-    if not pairs:
-        raise StereovoxError(f"{folder}: holds no pair of images; name them left01.png and right01.png, and so on")
-    return sorted(
-        pairs, key=lambda pair: [int(word) if word.isdigit() else word for word in re.split(r"(\d+)", pair[0])]
-    )
+    return eyes
 
 
 def _side(path: Path) -> tuple[str, str]:

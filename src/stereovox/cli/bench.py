@@ -26,6 +26,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         help="other libraries: octomap, pyoctomap, octomap-rays (default: the first two, where installed)",
     )
     parser.add_argument("--threads", type=int, default=1, metavar="N", help="threads for stereovox (%(default)s)")
+    parser.add_argument("--max-range", type=float, metavar="M", help="depth in metres up to which pixels count (5)")
     parser.add_argument("--frames", metavar="A:B:S", help="only these frames, as a Python slice")
 
 
@@ -44,6 +45,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
             arguments.voxel_size or VOXEL_SIZES,
             peers,
             threads=arguments.threads,
+            max_range=arguments.max_range,
             progress=lambda done, total, text: bar.update(task, completed=done, total=total, description=text),
         )
     say(format_table(result))

@@ -19,6 +19,9 @@ from stereovox.errors import StereovoxError
 
 EXAMPLE = "stereovox calibrate import camchain.yaml --out recordings/flight/rig.toml"
 
+LONGEST = 5.0
+"""Metres between two eyes; more is likely a calibration in millimetres."""
+
 
 def add_arguments(parser: ArgumentParser) -> None:
     """Declare the options."""
@@ -57,6 +60,8 @@ def run(arguments: Namespace) -> dict[str, Any]:
         camera = pair.camera
         kind = "rectified images" if pair.eyes is None else f"{pair.eyes.left.model} lenses"
         say(f"  {pair.name}: {kind}, {camera.width}x{camera.height} pixels, baseline {camera.baseline:.4f} m")
+        if (camera.baseline or 0) > LONGEST:
+            say(f"  note: that is far apart; was {pair.name} calibrated in millimetres? The rig file needs metres")
     say(f"saved {arguments.out}; put the images and poses beside it: docs/rigs.md")
     told = [{"name": pair.name, "baseline_m": pair.camera.baseline, "rectified": pair.eyes is None} for pair in stereo]
     return {"pairs": told, "out": arguments.out}

@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 
 EXAMPLE = "stereovox calibrate stereo boards --board 9x6 --square 0.025 --out rig.toml --report boards-report"
 GOOD_PX = 0.5
+LONGEST = 5.0
+"""Metres between two eyes; more is likely a square given in millimetres."""
+SHOWN = 5
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -36,6 +39,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Calibrate, write the rig file and tell how good it is."""
+    from stereovox.calibrate.chessboard import unmatched
     from stereovox.calibrate.stereo import calibrate_stereo, check_model, read_boards
 
     board = _board(arguments.board, arguments.square)
@@ -44,8 +48,9 @@ def run(arguments: Namespace) -> dict[str, Any]:
     pairs = read_boards(arguments.folder, board, lambda items: tracked(items, len(items), "finding the board"))
     found = calibrate_stereo(pairs, board, arguments.lens)
     _write(arguments, found)
-    _tell(found, arguments.out)
-    result = {**found.as_dict(), "out": arguments.out}
+    alone = unmatched(arguments.folder)
+    _tell(found, arguments, alone)
+    result = {**found.as_dict(), "unmatched": alone, "out": arguments.out}
     if arguments.report:
         from stereovox.view.calibration_stereo import write_stereo_report
 
@@ -78,22 +83,29 @@ def _write(arguments: Namespace, found: StereoCalibration) -> None:
         file.write(rig_text(Rig((pair,)), (f"stereovox calibrate stereo: {used}", figures)).encode())
 
 
-def _tell(found: StereoCalibration, out: str) -> None:
+def _tell(found: StereoCalibration, arguments: Namespace, alone: list[str]) -> None:
     for pair in found.pairs:
         if pair.why:
             say(f"  {pair.name}: left out, {pair.why}")
         else:
             say(f"  {pair.name}: corners missed by {pair.rms_px:.3f} px RMS, rows by {pair.epipolar_px:.3f} px")
+    if alone:
+        more = f" and {len(alone) - SHOWN} more" if len(alone) > SHOWN else ""
+        say(f"note: no partner of the other eye for {', '.join(alone[:SHOWN])}{more}")
     told = found.as_dict()
     unseen = "" if told["unseen_px"] is None else f" ({told['unseen_px']:.3f} px in pairs the calibration has not seen)"
     say(f"{told['used']} of {len(found.pairs)} pairs: corners missed by {told['rms_px']:.3f} px RMS,")
     say(f"  rows after rectification by {told['epipolar_px']:.3f} px{unseen}")
     say(f"baseline {1000 * told['baseline_m']:.2f} mm; fields of view {_fields(told)} deg")
+    if told["baseline_m"] > LONGEST:
+        say(
+            f"note: a baseline of {told['baseline_m']:.4g} m; is --square {arguments.square:g} in millimetres? Give metres"
+        )
     if max(told["rms_px"], told["epipolar_px"]) > GOOD_PX:
         say("note: that is a lot; is the board flat, the picture sharp, and --lens right? See the report")
     if len(found.used) < 10:
         say("note: few pairs; take ten or more, in all corners of the images")
-    say(f"saved {out}")
+    say(f"saved {arguments.out}")
 
 
 def _fields(told: dict[str, Any]) -> str:

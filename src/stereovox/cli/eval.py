@@ -51,7 +51,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Load both maps, compare them, tell and report."""
-    from stereovox.evaluate.camera_path import read_camera_path
+    from stereovox.evaluate.camera_path import path_fits, read_camera_path
     from stereovox.evaluate.outcomes import outcomes
     from stereovox.evaluate.read_map import read_map
     from stereovox.evaluate.scores import score
@@ -66,6 +66,8 @@ def run(arguments: Namespace) -> dict[str, Any]:
     if scores.distance is not None:
         result["distance"] = scores.distance.rows()
     _tell(scores)
+    if path is not None and not path_fits(path, truth, voxel_map.config.max_range):
+        say("the path does not fit the map: is it in the map's world frame?")
     if arguments.report:
         from stereovox.view.evaluation_report import Evaluated, write_evaluation_report
 

@@ -18,11 +18,13 @@ from stereovox.cli.terminal import (
     milliseconds,
     say,
     say_about_compiling,
+    thousands,
     tracked,
 )
 from stereovox.errors import SourceError, StereovoxError
 
 if TYPE_CHECKING:
+    from stereovox.config import WindowConfig
     from stereovox.mapper import Mapper, UpdateReport
     from stereovox.sources import Stream
 
@@ -86,7 +88,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
         mapper.map.save(out)
     finally:
         mapper.map.close()  # whatever went wrong: tiles that stay behind would be in the next run's way
-    _tell(result, reports, out)
+    _tell(result, reports, out, mapper.config.window)
     return result
 
 
@@ -169,7 +171,7 @@ def _first_refusal(reports: list[UpdateReport]) -> str:
     return next((report.detail for report in reports if report.refused), "the source is empty")
 
 
-def _tell(result: dict[str, Any], reports: list[UpdateReport], out: Path) -> None:
+def _tell(result: dict[str, Any], reports: list[UpdateReport], out: Path, window: WindowConfig) -> None:
     say(f"{result['frames']} frames mapped, {result['frames_refused']} refused")
     for reason, number in result["refused"].items():
         example = next(report.detail for report in reports if report.refused == reason)
@@ -178,4 +180,16 @@ def _tell(result: dict[str, Any], reports: list[UpdateReport], out: Path) -> Non
         say(f"a pair: matching {milliseconds(result['match_ms'])}")
     say(f"a frame: depth {milliseconds(result['depth_ms'])}; map {milliseconds(result['integrate_ms'])}")
     say(cells_line(result))
+    if not result["occupied"]:
+        say(f"note: {_why_nothing(result, window)}")
     say(f"saved in {out}; look at it with: {command_line('picture', out, f'{out.stem}.png')}")
+
+
+def _why_nothing(result: dict[str, Any], window: WindowConfig) -> str:
+    """Return what to look at when a map ends without an occupied cell."""
+    if window.centre is not None and not result["free"] + result["tentative"]:
+        return "no cell is known; the camera never was in the box of window.centre and window.size"
+    if result["tentative"]:
+        tentative = thousands(result["tentative"])
+        return f"no cell is occupied, but {tentative} are tentative; is --max-range large enough, map.prior too low?"
+    return "no cell is occupied; is --max-range large enough?"

@@ -44,9 +44,9 @@ def run(arguments: Namespace) -> dict[str, Any]:
     if stream.length is None and arguments.frames is None:
         raise StereovoxError(f"{arguments.source}: a live camera never ends; give --frames, for example :30")
     for note in stream.notes:
-        say(f"note: {note}")
+        _note(note)
     say_about_compiling()
-    grid, now_ns, refused = look_round(tracked(stream, stream.length, "looking"), config)
+    grid, now_ns, refused = look_round(tracked(stream, stream.length, "looking"), config, _note)
     sights = surroundings(grid)
     result = {
         "step_deg": config.sphere.step_deg,
@@ -62,6 +62,10 @@ def run(arguments: Namespace) -> dict[str, Any]:
         sphere_picture(grid, arguments.out, title=str(arguments.source).replace("$", r"\$"), now_ns=now_ns)
         say(f"saved {arguments.out}")
     return {**result, "picture": arguments.out}
+
+
+def _note(line: str) -> None:
+    say(f"note: {line}")
 
 
 def _check_picture(out: str | None) -> None:

@@ -77,7 +77,7 @@ def confidence(disparity, radius, columns, filled, line, line_filled, out):
         for u in range(width):
             first, end = max(u - radius, 0), min(u + radius + 1, width)
             count = np.float32(line_filled[end] - line_filled[first])
-            total = np.float32(line[end] - line[first]) / UNITS
+            total = np.float32(np.int32(line[end] - line[first])) / UNITS  # sums may wrap round, differences not
             d = row[u]
             off = abs(d - total / count) / (ONE + SLOPE * d)
             share = count / np.float32(rows * (end - first))

@@ -94,7 +94,9 @@ def _depth(
     """Return the distance from the polar axis, 0 where there is none, and the reasons."""
     depth = grid.range_m[:, columns] * np.cos(camera.angles()).astype(np.float32)
     reason = grid.reason[:, columns].copy()
-    reason[(reason == Reason.TOO_FAR) & (depth < max_range * (1 - 1e-6))] = Reason.UNMATCHED
+    inner = np.cos(np.maximum(np.abs(camera.angles()) - camera.step_u / 2, 0)).astype(np.float32)
+    farthest = grid.range_m[:, columns] * inner  # at the cell's edge nearest to the equator
+    reason[(reason == Reason.TOO_FAR) & (farthest < max_range * (1 - 1e-5))] = Reason.UNMATCHED
     return np.where(reason == Reason.VALID, depth, np.float32(0)), reason
 
 

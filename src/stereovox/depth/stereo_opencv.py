@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from stereovox.config import StereoConfig
 from stereovox.depth import _disparity
+from stereovox.errors import ConfigError, FrameRefused
 
 COUNTS = 16
 """OpenCV counts disparities in sixteenths of a pixel."""
@@ -20,6 +21,8 @@ ROUNDED = -1 / 32
 LOCKING = 0.62
 """Its semi-global matching pulls fractions to whole pixels: 0.5 (2 f)^0.62 makes them as frequent as they should be."""
 PREFILTER = 63
+MOST_COST = 32767
+"""OpenCV's semi-global matching adds costs up in 16 bits."""
 """Gradients along a row count up to this."""
 
 
@@ -57,6 +60,11 @@ class _SemiGlobal(_OpenCv):
         import cv2
 
         window = config.block_size**2
+        if (config.p2 + PREFILTER) * window > MOST_COST:
+            raise ConfigError(
+                f"stereo.block_size {config.block_size} with p2 {config.p2:g}: too large, OpenCV's costs overflow; use "
+                "less, or stereo.method=block"
+            )
         return cv2.StereoSGBM.create(
             numDisparities=config.disparities, blockSize=config.block_size,
             P1=round(config.p1 * window), P2=round(config.p2 * window),
@@ -110,6 +118,11 @@ class Block(_OpenCv):
         matcher.setSpeckleWindowSize(config.speckle_size)
         matcher.setSpeckleRange(max(1, round(config.speckle_range * COUNTS)))  # in its raw counts, other than SGBM
         return matcher
+
+    def _compute(self, left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray[np.int16]:
+        if min(left.shape) <= max(5, self._config.block_size):
+            raise FrameRefused("bad_shape", f"images of {left.shape}: smaller than stereo.block_size; use less")
+        return super()._compute(left, right)
 
 
 def _fractions(locking: float) -> NDArray[np.float32]:

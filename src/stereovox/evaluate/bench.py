@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox.cameras import PinholeCamera
 from stereovox.config import Config, load_config
 from stereovox.depth import DepthPath, prepare
 from stereovox.errors import FrameRefused, StereovoxError
@@ -65,7 +64,7 @@ def bench(
 
     Returns `rows` of `library, voxel_size, threads, frames, integrate_ms_median, integrate_ms_p90, occupied, free,
     map_bytes`; `ratio[str(voxel_size)][peer]` = peer's median / our median; and `source, image, frames,
-    frames_refused, max_range, budget_s`. Cells count as each library defines them: occupied above p = 0.7 and free
+    frames_refused, first_refusal, max_range, budget_s`. Cells count as each library defines them: occupied above p = 0.7 and free
     below 0.3 for stereovox, above and below 0.5 for OctoMap.
     Raises ConfigError for an unknown peer or bad setting, MissingExtra for a peer that is not installed,
     StereovoxError when no frame can be used: one line each.
@@ -88,7 +87,8 @@ def bench(
         "source": getattr(source, "name", "frames"),
         "image": f"{camera.width}x{camera.height}",
         "frames": len(frames),
-        "frames_refused": refused,
+        "frames_refused": len(refused),
+        "first_refusal": next(iter(refused), ""),
         "max_range": configs[0].max_range,
         "budget_s": budget_s,
         "rows": rows,
@@ -104,22 +104,25 @@ def _configs(voxel_sizes: Sequence[float], threads: int, max_range: float | None
     return configs
 
 
-def _load(source: Iterable[AnyFrame], config: Config, limit: int | None, tell: Progress) -> tuple[list[Frame], int]:
-    """Return the frames that can be used, only the pixels in them that count, and the number of those refused."""
+def _load(
+    source: Iterable[AnyFrame], config: Config, limit: int | None, tell: Progress
+) -> tuple[list[Frame], list[str]]:
+    """Return the frames that can be used, only the pixels in them that count, and why others were refused."""
     total = operator.length_hint(source)
     total = total if limit is None else min(total, limit)
     frames: list[Frame] = []
+    refusals: list[str] = []
     path = DepthPath(config)
-    done, first_refusal = 0, "the source is empty"
     for done, frame in enumerate(islice(source, limit), start=1):
         try:
             frames.append(_only_valid_pixels(path.matched(frame), config))
         except FrameRefused as refused:
-            first_refusal = first_refusal if len(frames) + 1 < done else str(refused)
+            refusals.append(str(refused))
         tell(done, total, "reading frames")
     if not frames:
-        raise StereovoxError(f"{getattr(source, 'name', 'frames')}: not one frame can be used ({first_refusal})")
-    return frames, done - len(frames)
+        why = next(iter(refusals), "the source is empty")
+        raise StereovoxError(f"{getattr(source, 'name', 'frames')}: not one frame can be used ({why})")
+    return frames, refusals
 
 
 def _only_valid_pixels(frame: Frame, config: Config) -> Frame:
@@ -136,8 +139,9 @@ def _points(frame: Frame, config: Config) -> tuple[NDArray[np.float64], NDArray[
     """Return the frame's points (N, 3) in the world and the camera's position (3,)."""
     image = prepare(frame, config)
     T = image.T_world_sensor
-    assert isinstance(frame.camera, PinholeCamera)
-    points = frame.camera.back_project(image.depth_m)[image.reason == Reason.VALID]
+    v, u = np.nonzero(image.reason == Reason.VALID)
+    columns, rows = frame.camera.rays()
+    points = np.column_stack([columns[u], rows[v]]) * image.depth_m[v, u, None].astype(float)
     return np.ascontiguousarray(points @ T[:3, :3].T + T[:3, 3]), T[:3, 3].copy()
 
 
@@ -238,6 +242,8 @@ def _notes(result: dict[str, Any]) -> list[str]:
         "ms/frame: median time of the call that takes a frame in; making depth images or points is not part of it.",
         "Cells as each library defines them: occupied above p = 0.7, free below 0.3; for OctoMap above, below 0.5.",
     ]
+    if result["frames_refused"]:
+        notes.append(f"{result['frames_refused']} frames were refused, first: {result['first_refusal']}")
     for row in result["rows"]:
         if row["frames"] < result["frames"]:
             done = f"{row['frames']} of {result['frames']} frames"

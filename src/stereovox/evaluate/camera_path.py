@@ -10,9 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.errors import SourceError
+from stereovox.evaluate.distance import distances
+from stereovox.evaluate.truth_cells import TruthCells
 
 COLUMNS = {3: (0, 1, 2), 8: (1, 2, 3), 9: (1, 2, 3), 12: (3, 7, 11), 16: (3, 7, 11)}
 """Where x, y, z stand, by the numbers in a line: x y z; TUM's, with or without a confidence; 3x4 and 4x4 matrices."""
+
+
+STRAYING = 1.5
+"""Surfaces farther from the camera than this times the map's range were not seen from there."""
 
 
 def read_camera_path(path: str | Path) -> NDArray[np.float64]:
@@ -29,3 +35,12 @@ def read_camera_path(path: str | Path) -> NDArray[np.float64]:
     if table.shape[1] not in COLUMNS or not np.isfinite(table).all() or not len(table):
         raise SourceError(f"{path}: {len(table)} lines of {table.shape[1]} numbers; give 3, 8, 12 or 16 a line")
     return table[:, COLUMNS[table.shape[1]]]
+
+
+def path_fits(path: NDArray[np.float64], truth: TruthCells, max_range: float) -> bool:
+    """Tell whether a path (P, 3) passes the truth's surfaces: half of them lie within reach of a position.
+
+    max_range: of the map, in metres. A path in another frame than the map's world seldom does.
+    """
+    surfaces = truth.centers()[truth.occupied]
+    return not np.count_nonzero(distances(surfaces, path) > STRAYING * max_range) * 2 > len(surfaces)

@@ -17,6 +17,8 @@ from stereovox.wide import CylindricalCamera, SphericalCamera
 WideCamera = SphericalCamera | CylindricalCamera
 FORWARD = ((0, 0, 1), (0, 1, 0), (0, 0, -1), (0, -1, 0), (1, 0, 0), (-1, 0, 0))
 """Directions of the six faces in the optical frame of the wide camera."""
+LARGEST = 4096
+"""Pixels along a side of a face."""
 
 
 class Face(NamedTuple):
@@ -28,7 +30,7 @@ class Face(NamedTuple):
 
     camera: PinholeCamera
     T_wide_face: Transform
-    pixel: NDArray[np.int64]
+    pixel: NDArray[np.int32]
     scale: NDArray[np.float32]
 
 
@@ -52,9 +54,13 @@ def _faces(camera: WideCamera) -> list[Face]:
 
 
 def _face(camera: WideCamera, forward: NDArray[np.float64]) -> Face:
-    size = max(2, round(2 * camera.focal_px / camera.binning))
+    focal = camera.focal_px / camera.binning
+    size = int(min(max(2, round(2 * max(focal, 1 / camera.step_v))), LARGEST))  # no row and no column is passed over
     middle = (size - 1) / 2
-    pinhole = PinholeCamera(size, size, size / 2, size / 2, middle, middle, camera.baseline, subpixel=camera.subpixel)
+    baseline = None if camera.baseline is None else camera.baseline * focal / (size / 2)  # focal length times baseline
+    pinhole = PinholeCamera(
+        size, size, size / 2, size / 2, middle, middle, baseline, binning=camera.binning, subpixel=camera.subpixel
+    )
     T = np.eye(4)
     T[:3, :3] = _rotation(forward)
     directions = pinhole.back_project(np.ones((size, size))) @ T[:3, :3].T
@@ -69,7 +75,7 @@ def _rotation(forward: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.stack([right, np.cross(forward, right), forward], axis=1)
 
 
-def _pixels(camera: WideCamera, directions: NDArray[np.float64], across: NDArray[np.float64]) -> NDArray[np.int64]:
+def _pixels(camera: WideCamera, directions: NDArray[np.float64], across: NDArray[np.float64]) -> NDArray[np.int32]:
     """Return the index of the pixel that looks in each direction (..., 3), -1 where none does."""
     if isinstance(camera, SphericalCamera):
         u = np.arctan2(directions[..., 0], across) / camera.step_u + camera.cu
@@ -81,4 +87,4 @@ def _pixels(camera: WideCamera, directions: NDArray[np.float64], across: NDArray
     v = v - turn * np.floor((v + 0.5) / turn)  # rows that look back are counted on from the first
     inside = (u >= -0.5) & (u < camera.width - 0.5) & (v < camera.height - 0.5)
     column, row = (np.where(inside, np.floor(x + 0.5), 0).astype(np.int64) for x in (u, v))
-    return np.where(inside, row * camera.width + column, -1)
+    return np.where(inside, row * camera.width + column, -1).astype(np.int32)

@@ -20,6 +20,8 @@ def strongest(parts: Sequence[Evidence]) -> Evidence:
     """
     if len(parts) == 1:
         return parts[0]
+    if not parts:
+        return Evidence(np.empty((0, 3), np.int32), np.empty((0, CELLS), np.int16), np.empty((0, 3), np.int32), 0)
     pool = BlockPool(np.int16, capacity=max(1, sum(len(part.coords) + len(part.uniform) for part in parts)))
     value = min((part.uniform_value for part in parts), default=0)
     free, shared = _alone(parts)

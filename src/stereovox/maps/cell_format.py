@@ -61,14 +61,14 @@ class CellRules:
 
     @cached_property
     def prior(self) -> np.int32:
-        """Stored number from which a cell starts with its first evidence."""
+        """Stored number from which a cell starts with its first evidence, within the limits of all cells."""
         p = self.config.prior
-        return np.int32(self.format.stored(log(p / (1 - p))))
+        return np.int32(np.clip(self.format.stored(log(p / (1 - p))), self.lowest, self.highest))
 
     @cached_property
     def free_below(self) -> float:
-        """Stored numbers below it are free."""
-        return self._exact(self.config.free_below)
+        """Stored numbers below it are free: unlikely, and no likelier than before the first evidence."""
+        return min(self._exact(self.config.free_below), float(self.prior) + 0.5)
 
     @cached_property
     def occupied_above(self) -> float:

@@ -85,6 +85,8 @@ def load_map(path: str | Path) -> VoxelMap:
     try:
         if not isinstance(manifest["config"], dict):
             raise TypeError("config is no table of settings")
+        if isinstance(cells_of := manifest["config"].get("map"), dict):
+            cells_of.setdefault("prior", 0.5)  # that of maps from before there was one
         voxel_map = VoxelMap(load_config(manifest["config"]))
         voxel_map.frames, voxel_map.frames_refused = int(manifest["frames"]), int(manifest["frames_refused"])
         voxel_map.recording = str(manifest["recording"])

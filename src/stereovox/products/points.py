@@ -56,7 +56,7 @@ def write_npz(voxel_map: VoxelMap, path: str | Path) -> None:
             indices=indices,
             log_odds=log_odds,
             voxel_size=np.float64(voxel_map.voxel_size),
-            free_below=np.float64(limits.free_below),
+            free_below=np.float64(min(limits.free_below, limits.prior)),
             occupied_above=np.float64(limits.occupied_above),
         )
 

@@ -98,7 +98,7 @@ def _kalibr_lens(table: Table, name: str) -> Lens:
     if not isinstance(camera, dict):
         raise SourceError(f"{name} is no table; give the camchain as Kalibr wrote it")
     model, distortion = camera.get("camera_model"), camera.get("distortion_model", "none")
-    if model != "pinhole" or distortion not in KALIBR:
+    if model != "pinhole" or not isinstance(distortion, str) or distortion not in KALIBR:
         known = ", ".join(f"pinhole-{word}" for word in KALIBR)
         raise SourceError(f"{name}: {model}-{distortion} is no lens we have ({known}); calibrate with one of them")
     fx, fy, cx, cy = _numbers(_needed(camera, name, "intrinsics"), f"{name}.intrinsics", 4)
@@ -127,7 +127,7 @@ def _camera_info(left: Table, right: Table) -> Found:
 
 def _info_lens(table: Table, eye: str) -> Lens:
     model = table.get("distortion_model", "plumb_bob")
-    if model not in ROS:
+    if not isinstance(model, str) or model not in ROS:
         raise SourceError(
             f"the {eye} distortion_model '{model}' is none of {', '.join(ROS)}; calibrate with one of them"
         )

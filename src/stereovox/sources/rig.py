@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stereovox.errors import FrameRefused, SourceError
 from stereovox.frame import StereoFrame
@@ -16,9 +17,12 @@ from stereovox.geometry import Transform
 from stereovox.rigs import StereoPair
 from stereovox.sources.base import Source
 from stereovox.sources.folder import file_names
-from stereovox.sources.images import read_picture_png
+from stereovox.sources.images import PICTURE, png_size, read_picture_png
 from stereovox.sources.rig_file import FILE, RigPair, read_rig
 from stereovox.sources.trajectory import Trajectory, by_time, stamped_lines
+
+SHORTEST_NS = 1_000_000
+"""Names of a pair's images that span less are their numbers, not their times."""
 
 
 class _Shot(NamedTuple):
@@ -39,6 +43,7 @@ class StereoRig(Source):
     away. World: that of the poses.
     Faults: those of `read_picture_png` and of `Poses.at`. Raises SourceError, one line, for a bad rig file, masks or
     folders that cannot be read, names that are no times, and where there is no image or no file of poses.
+    Names of several images that span less than a millisecond are no times.
     """
 
     layout = f"a stereo rig ({FILE} that names pairs, folders of images and poses)"
@@ -55,7 +60,7 @@ class StereoRig(Source):
         self.camera = self.pairs[0].camera.middle
         shots = [_shots(self.folder, number, pair) for number, pair in enumerate(rig.pairs)]
         self._shots = sorted((shot for some in shots for shot in some), key=lambda shot: (shot.stamp_ns, shot.pair))
-        self._poses = Trajectory(self.folder / rig.poses)
+        self._poses = _poses(self.folder, rig.poses)
 
     @classmethod
     def recognises(cls, where: str) -> bool:
@@ -73,7 +78,7 @@ class StereoRig(Source):
         frame = StereoFrame(nothing, nothing, pair, nowhere, shot.stamp_ns, str(shot.left))
         try:
             T_world_camera = self._pose(shot, pair)
-            left, right = (read_picture_png(path, size) for path, size in zip(shot[2:], _sizes(pair), strict=True))
+            left, right = (_picture(path, size) for path, size in zip(shot[2:], _sizes(pair), strict=True))
         except FrameRefused as refused:
             return replace(frame, fault=refused.reason, fault_detail=str(refused))
         return replace(frame, left=left, right=right, T_world_sensor=T_world_camera)
@@ -85,6 +90,23 @@ class StereoRig(Source):
             raise FrameRefused(refused.reason, f"{shot.left}: {refused}") from None
 
 
+def _poses(folder: Path, name: str) -> Trajectory:
+    if not os.path.isfile(folder / name):
+        raise SourceError(f"{folder / name}: no such file of poses; write it, or set poses = in {folder / FILE}")
+    return Trajectory(folder / name)
+
+
+def _picture(path: Path, size: tuple[int, int]) -> NDArray[np.uint8]:
+    try:
+        return read_picture_png(path, size)
+    except FrameRefused as refused:
+        if refused.reason != "bad_shape":
+            raise
+    (width, height), told = png_size(path, PICTURE), f"{size[0]}x{size[1]}"
+    message = f"{path}: {width}x{height} pixels, {FILE} says {told}; correct width and height there, or the image"
+    raise FrameRefused("bad_shape", message) from None
+
+
 def _sizes(pair: StereoPair) -> tuple[tuple[int, int], tuple[int, int]]:
     left, right = (pair.eyes.left, pair.eyes.right) if pair.eyes else (pair.camera, pair.camera)
     return (left.width, left.height), (right.width, right.height)
@@ -92,12 +114,21 @@ def _sizes(pair: StereoPair) -> tuple[tuple[int, int], tuple[int, int]]:
 
 def _shots(folder: Path, number: int, pair: RigPair) -> list[_Shot]:
     left, right = (folder / name for name in pair.folders())
+    for side, place in (("left", left), ("right", right)):
+        if not os.path.isdir(place):
+            cure = f"put the {side} images of pair '{pair.name}' there, or set its {side} = in {folder / FILE}"
+            raise SourceError(f"{place}: no such folder; {cure}")
     if pair.index:
         return _listed(folder / pair.index, number, left, right)
     names = sorted(name for name in file_names(left) if name.endswith(".png"))
     if not names:
         raise SourceError(f"{left}: holds no PNG; put the left images of pair '{pair.name}' there, named by ns")
-    return [_Shot(_stamp(left / name), number, left / name, right / name) for name in names]
+    shots = [_Shot(_stamp(left / name), number, left / name, right / name) for name in names]
+    stamps = [shot.stamp_ns for shot in shots]
+    if len(shots) > 1 and max(stamps) - min(stamps) < SHORTEST_NS:
+        said = f"its {len(shots)} images would all be taken within a millisecond ({names[0]} to {names[-1]})"
+        raise SourceError(f"{left}: {said}; name them by time in ns or give an index file")
+    return shots
 
 
 def _listed(path: Path, number: int, left: Path, right: Path) -> list[_Shot]:

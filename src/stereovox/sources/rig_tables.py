@@ -24,8 +24,8 @@ EYES = ("left_lens", "right_lens", "T_left_right")
 KEYS = ("name", "left", "right", "index", "T_body_left", "mask_rectangles", "mask", "camera", "virtual", *EYES)
 WORDS = ("left", "right", "index", "mask")
 SIZES = ("width", "height")
-LARGEST = 100_000
-"""Pixels; more are taken for a mistake."""
+LARGEST = 32_767
+"""Pixels along a side; OpenCV takes no more."""
 TOLERANCE = 5e-3
 """Largest entry of abs(R^T R - I) that passes for rounding."""
 UNWRITTEN = ("binning", "correction")

@@ -16,6 +16,7 @@ from stereovox.view.axis import draw_profile
 from stereovox.view.drawn import UPS, checked_up, upright
 from stereovox.view.figures import WIDTH, figure_of, headline
 from stereovox.view.landscape import draw_landscape
+from stereovox.view.legends import keep_clear
 from stereovox.view.panels import GREY, LINE, PATH_COLOUR, STATE_COLOURS, measured, title
 from stereovox.view.scale import scale_of
 from stereovox.view.whereabouts import FIELD_M
@@ -40,11 +41,13 @@ def draw_layer(
     figure = figure_of(plan_height + 6.3)
     grid = figure.add_gridspec(2, 1, height_ratios=[plan_height, 5.4])
     plans, below = grid[0].subgridspec(1, 2), grid[1].subgridspec(1, 2, width_ratios=[1, 0.8])
-    draw_plan(figure.add_subplot(plans[0]), one, viewpoint)
+    plan = figure.add_subplot(plans[0])
+    draw_plan(plan, one, viewpoint)
     draw_values(figure, figure.add_subplot(plans[1]), one, voxel_map, viewpoint)
     draw_landscape(figure.add_subplot(below[0] if viewpoint else grid[1]), one, voxel_map)
     if viewpoint is not None:
         draw_profile(figure.add_subplot(below[1]), voxel_map, None, viewpoint)
+    keep_clear(plan)
     headline(figure, voxel_map, heading)
     return figure
 

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from stereovox.maps import VoxelMap
 from stereovox.view.drawn import Drawn, upright
 from stereovox.view.figures import DPI, WIDTH, figure_of, headline, save
+from stereovox.view.legends import keep_clear
 from stereovox.view.panels import GREY, measured, oblique, slice_, title, view
 from stereovox.view.render import Direction, extent
 
@@ -59,7 +60,9 @@ def _note(text: str) -> Any:
 
 def _only_slice(drawn: Drawn) -> Any:
     figure = figure_of(9)
-    slice_(figure.add_subplot(), drawn)
+    axis = figure.add_subplot()
+    slice_(axis, drawn)
+    keep_clear(axis)
     figure.text(0.5, 0.01, "No cell is occupied.", ha="center", fontsize=14, color=GREY)
     return figure
 
@@ -80,6 +83,7 @@ def _page(drawn: Drawn) -> Any:
         title(axis, f"View {name}")
     slice_(axes[4], drawn)
     height_bar(figure, axes[0], mappable, drawn)
+    keep_clear(axes[4])
     return figure
 
 

@@ -186,3 +186,8 @@ def test_config_cannot_be_changed_by_accident():
 def test_did_you_mean_lists_all_where_nothing_is_near():
     assert did_you_mean("zebra", ["map", "info"]) == " (known: info, map)"
     assert did_you_mean("zebra", []) == ""
+
+
+def test_a_fixed_box_needs_a_size():
+    refused("window.centre needs window.size", **{"window.centre": [1, 2, 3]})
+    assert load_config(**{"window.centre": [1, 2, 3], "window.size": [4, 4, 4]}).window.centre == (1, 2, 3)

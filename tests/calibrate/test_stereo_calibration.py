@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from made_boards import BOARD, fisheye_eyes, pinhole_eyes, poses, seen, write_boards
 
-from stereovox.calibrate.chessboard import Board, find_corners, image_pairs, same_order
+from stereovox.calibrate.chessboard import Board, find_corners, image_pairs, same_order, unmatched
 from stereovox.calibrate.stereo import (
     BoardPair,
     calibrate_stereo,
@@ -148,6 +148,12 @@ def test_files_that_belong_together(tmp_path, left, right, name):
         (tmp_path / file).parent.mkdir(exist_ok=True)
         (tmp_path / file).touch()
     assert image_pairs(tmp_path) == [(name, tmp_path / left, tmp_path / right)]
+
+
+def test_images_without_a_partner_are_named(tmp_path):
+    for name in ("left01.png", "right01.png", "left02.png", "right10.png", "notes.txt", "board.png"):
+        (tmp_path / name).touch()
+    assert unmatched(tmp_path) == ["left02.png", "right10.png"]
 
 
 def test_images_that_cannot_be_used_say_why(tmp_path):

@@ -27,6 +27,7 @@ def test_boards_become_a_rig_file_and_a_report(tmp_path, capsys):
     folder = write_boards(tmp_path / "boards", eyes, poses(0.5, 0.16, 4))
     for name in ("left99.png", "right99.png"):
         cv2.imwrite(str(folder / name), np.full((240, 320), 90, np.uint8))
+    cv2.imwrite(str(folder / "left77.png"), np.full((240, 320), 90, np.uint8))
     out, report = tmp_path / "rig.toml", tmp_path / "report"
     words = ["--board", f"{BOARD.columns}x{BOARD.rows}", "--square", BOARD.square, "--out", out, "--name", "front"]
     assert run("calibrate", "stereo", folder, *words, "--report", report, "--json") == 0
@@ -36,6 +37,9 @@ def test_boards_become_a_rig_file_and_a_report(tmp_path, capsys):
     assert told["out"] == str(out)
     assert "99: left out, no board of 7x5 inner corners in left99.png and right99.png" in streams.err
     assert "rows after rectification" in streams.err
+    assert "note: no partner of the other eye for left77.png\n" in streams.err
+    assert told["unmatched"] == ["left77.png"]
+    assert "millimetres" not in streams.err
     (pair,) = read_rig(out).pairs
     assert pair.name == "front"
     assert pair.eyes.baseline == pytest.approx(eyes.baseline, rel=0.03)
@@ -53,6 +57,17 @@ def test_a_calibration_is_imported(tmp_path, capsys):
     told = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert told["pairs"] == [{"name": "grey", "baseline_m": 0.5, "rectified": True}]
     assert read_rig(tmp_path / "rig.toml").pairs[0].camera.height == 375
+
+
+def test_millimetres_are_suspected(tmp_path, capsys):
+    folder = write_boards(tmp_path / "boards", pinhole_eyes(), poses(0.5, 0.16, 3))
+    words = ["--board", f"{BOARD.columns}x{BOARD.rows}", "--square", 1000 * BOARD.square, "--out", tmp_path / "r.toml"]
+    assert run("calibrate", "stereo", folder, *words) == 0
+    assert "--square 40: millimetres?" in capsys.readouterr().err
+    for apart, suspected in ((-3.6e2, False), (-3.6e5, True)):
+        (tmp_path / "calib.txt").write_text(KITTI.replace("-3.6e+02", str(apart)))
+        assert run("calibrate", "import", tmp_path / "calib.txt", "--out", tmp_path / "rig.toml") == 0
+        assert ("millimetres?" in capsys.readouterr().err) is suspected
 
 
 @pytest.mark.parametrize(

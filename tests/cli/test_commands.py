@@ -404,3 +404,26 @@ def test_as_a_program(recording, tmp_path):
         [sys.executable, "-m", "stereovox", "--version"], capture_output=True, text=True, check=True
     )
     assert version.stdout.strip() == f"stereovox {sv.__version__}"
+
+
+def test_bench_takes_a_range(recording, capsys, monkeypatch):
+    monkeypatch.setattr("stereovox.cli.bench._installed", list)
+    assert run("bench", recording, "--voxel-size", 0.2, "--frames", ":1", "--max-range", 1.5, "--json") == 0
+    captured = capsys.readouterr()
+    assert json.loads(captured.out.splitlines()[-1])["max_range"] == 1.5
+    assert "depth up to 1.5 m" in captured.err
+    fails_with_one_line(capsys, "no depth up to 1 m", "bench", recording, "--voxel-size", 0.2, "--max-range", 1)
+
+
+def test_a_map_without_an_occupied_cell_asks_for_the_range(recording, tmp_path, capsys):
+    common = ["map", recording, "--out", tmp_path / "m", "--voxel-size", 0.1]
+    assert run(*common) == 0
+    assert "note: no cell is" not in capsys.readouterr().err
+    assert run(*common[:2], "--out", tmp_path / "near", "--voxel-size", 0.1, "--max-range", 0.8) == 0
+    assert "note: no cell is occupied; is --max-range large enough?\n" in capsys.readouterr().err
+    far = ["--set", "window.size=[4,4,4]", "--set", "window.centre=[90,0,0]"]
+    assert run(*common[:2], "--out", tmp_path / "far", "--voxel-size", 0.1, *far) == 0
+    assert "the camera never was in the box" in capsys.readouterr().err
+    unsure = ["--frames", ":1", "--set", "map.prior=0.001"]
+    assert run(*common[:2], "--out", tmp_path / "unsure", "--voxel-size", 0.1, *unsure) == 0
+    assert "are tentative; is --max-range large enough, map.prior too low?" in capsys.readouterr().err

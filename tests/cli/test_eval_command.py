@@ -98,3 +98,14 @@ def test_mistakes_are_one_line(capsys, words, said):
     assert said in err[-1]
     assert err[-1].startswith("stereovox: ")
     assert len(err) == 1 or "--report" in words
+
+
+def test_a_path_of_another_world_gets_a_hint(folder, capsys):
+    hint = "the path does not fit the map: is it in the map's world frame?"
+    _, _, err = run(capsys, "map.svox", "truth.svox", "--path", "path.txt")
+    assert hint not in err
+    np.savetxt(folder / "path.txt", [[0.25, 0.25, 0.25 + 1.4 * CONFIG.max_range]])
+    assert hint not in run(capsys, "map.svox", "truth.svox", "--path", "path.txt")[2]
+    np.savetxt(folder / "path.txt", [[0.25, 0.25, 0.25 + 1.6 * CONFIG.max_range]])
+    status, _, err = run(capsys, "map.svox", "truth.svox", "--path", "path.txt")
+    assert (status, hint in err) == (0, True)

@@ -14,6 +14,7 @@ from stereovox.evaluate import peers as peers_module
 from stereovox.evaluate.bench import bench, format_table
 from stereovox.evaluate.peers import PEERS, find_peer
 from stereovox.frame import Frame, Reason
+from stereovox.wide import SphericalCamera
 
 CAMERA = PinholeCamera(64, 48, 40.0, 40.0, 31.5, 23.5, 0.05)
 ROW_KEYS = {
@@ -128,6 +129,19 @@ def test_peers_get_the_points_of_the_pixels_that_count(recorder):
     assert points == pytest.approx(wanted, abs=1e-6)
 
 
+def test_peers_get_the_points_of_a_wide_camera(recorder):
+    """A wide camera's depth is the distance from its x axis: the pixel is found again from the angles of its point."""
+    camera = SphericalCamera.from_field_of_view(64, 48, 150, 100)
+    depth = np.zeros((48, 64), np.float32)
+    depth[[3, 30], [5, 60]] = 1.5, 2.5
+    bench([Frame(depth, camera, a_frame().T_world_sensor)], [0.1], ["recorder"])
+    points, origin = recorder[-1].inserted[0]
+    z, x, y = ((points - origin) * [1, -1, -1]).T
+    assert np.hypot(y, z) == pytest.approx([1.5, 2.5], abs=1e-5)
+    assert np.degrees(np.arctan2(x, np.hypot(y, z))) == pytest.approx((np.array([5, 60]) - 31.5) * 150 / 64, abs=1e-3)
+    assert np.degrees(np.arctan2(y, z)) == pytest.approx((np.array([3, 30]) - 23.5) * 100 / 48, abs=1e-3)
+
+
 def test_stereovox_gets_no_pixel_that_peers_do_not_get(recorder):
     """Beyond the maximum range it would clear space, which no peer may; so it must not either."""
     with_strip = [a_frame(i) for i in range(6)]
@@ -166,6 +180,7 @@ def test_bad_frames_are_left_out_for_all_and_counted(recorder):
     result = bench([far, a_frame(0), crooked], [0.2], ["recorder"])
     assert (result["frames"], result["frames_refused"]) == (1, 2)
     assert [row["frames"] for row in result["rows"]] == [1, 1]
+    assert "2 frames were refused, first: frame 1: no depth up to 5 m" in format_table(result).splitlines()
 
 
 def test_frames_limit_and_progress(recorder):
@@ -223,8 +238,8 @@ def made_result():
                  "integrate_ms_p90": 2 * ms, "occupied": 1234567, "free": 20, "map_bytes": 2_500_000}
             )  # fmt: skip
     ratio = {"0.2": {"octomap": 42.0, "slow": 2.0}, "0.05": {"octomap": 10.5, "slow": 0.5}}
-    return {"source": "kitchen", "image": "640x480", "frames": 50, "frames_refused": 0, "max_range": 5.0,
-            "budget_s": 60.0, "rows": rows, "ratio": ratio}  # fmt: skip
+    return {"source": "kitchen", "image": "640x480", "frames": 50, "frames_refused": 0, "first_refusal": "",
+            "max_range": 5.0, "budget_s": 60.0, "rows": rows, "ratio": ratio}  # fmt: skip
 
 
 def test_the_table_shows_our_row_first_and_how_many_times_faster():

@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Maps and camera paths that a comparison reads from files."""
 
+import re
+
 import numpy as np
 import pytest
+from made_kitti import raw
 
 import stereovox as sv
 from stereovox.errors import MapFileError, SourceError
@@ -32,6 +35,16 @@ def test_all_kinds_of_maps_score_alike(tmp_path, size):
 def test_a_map_that_is_not_there_is_named(tmp_path, name):
     with pytest.raises(MapFileError, match=name):
         read_map(tmp_path / name)
+
+
+def test_a_recording_is_no_map(tmp_path):
+    drive = raw(tmp_path, 1)
+    with pytest.raises(MapFileError, match=f"is a recording, no map; .*stereovox truth {re.escape(str(drive))} --out"):
+        read_map(drive)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(MapFileError) as caught:
+        read_map(tmp_path / "empty")
+    assert "recording" not in str(caught.value)
 
 
 POSITIONS = np.array([[1.0, 2, 3], [4, 5, 6], [7, 8, 9.5]])

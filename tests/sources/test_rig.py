@@ -43,6 +43,7 @@ def test_frames_that_cannot_be_used_have_a_fault(tmp_path):
     write_png(folder / "side/left/100000000.png", picture(0, (30, 36)))
     frames = list(open_source(folder))
     assert [frame.fault for frame in frames] == ["missing_file", "bad_shape", "no_pose", "no_pose"]
+    assert "100000000.png: 30x36 pixels, rig.toml says 48x36; correct width and height there" in frames[1].fault_detail
     assert "front/right/100000000.png" in frames[0].fault_detail
     assert "side/left/150000000.png" in frames[2].fault_detail
     assert frames[2].left.shape == (0, 0)
@@ -69,13 +70,18 @@ def test_what_cannot_be_opened(tmp_path):
         open_source(folder)
     (folder / "front/left/noon.png").unlink()
     (folder / "poses.txt").unlink()
-    with pytest.raises(SourceError, match=r"poses\.txt"):
+    with pytest.raises(
+        SourceError, match=r"poses\.txt: no such file of poses; write it, or set poses = in .*rig\.toml"
+    ):
         open_source(folder)
     write_rig(folder / "rig.toml", Rig((RigPair("other", camera=CAMERA),)))
     with pytest.raises(SourceError, match="other"):
         open_source(folder)
     (folder / "empty").mkdir()
-    write_rig(folder / "rig.toml", Rig((RigPair("e", left="empty", camera=CAMERA),)))
+    write_rig(folder / "rig.toml", Rig((RigPair("front", right="fornt", camera=CAMERA),)))
+    with pytest.raises(SourceError, match=r"fornt: no such folder; put the right images .* right = in .*rig\.toml"):
+        open_source(folder)
+    write_rig(folder / "rig.toml", Rig((RigPair("e", left="empty", right="empty", camera=CAMERA),)))
     with pytest.raises(SourceError, match="holds no PNG"):
         open_source(folder)
     write_rig(folder / "rig.toml", Rig((RigPair("front", camera=CAMERA, mask="no.png"), rig().pairs[1])))
@@ -85,3 +91,19 @@ def test_what_cannot_be_opened(tmp_path):
     write_rig(folder / "rig.toml", Rig((RigPair("front", index="list.txt", camera=CAMERA),)))
     with pytest.raises(SourceError, match=r"list\.txt:1: needs"):
         open_source(folder)
+
+
+def test_numbers_are_no_times(tmp_path):
+    write_rig(tmp_path / "rig.toml", Rig((RigPair(left="left", right="right", camera=CAMERA),)))
+    (tmp_path / "poses.txt").write_text(poses_text(0, 10_000_000))
+    for side in ("left", "right"):
+        write_png(tmp_path / side / "0000000007.png", picture(1, (32, 24)))
+    assert len(open_source(tmp_path)) == 1, "one image may be taken at any time"
+    write_png(tmp_path / "left" / "0000000008.png", picture(1, (32, 24)))
+    with pytest.raises(
+        SourceError, match=r"left: .*millisecond .*; name them by time in ns or give an index"
+    ) as caught:
+        open_source(tmp_path)
+    assert "\n" not in str(caught.value)
+    (tmp_path / "left" / "0000000008.png").rename(tmp_path / "left" / "0001000007.png")
+    assert [frame.stamp_ns for frame in open_source(tmp_path)] == [7, 1_000_007]

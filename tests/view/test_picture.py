@@ -2,6 +2,7 @@
 import numpy as np
 import pytest
 from matplotlib.image import imread
+from matplotlib.text import Text
 
 from stereovox.config import load_config
 from stereovox.errors import StereovoxError
@@ -10,6 +11,7 @@ from stereovox.view.drawn import ceiling, upright
 from stereovox.view.panels import STATE_COLOURS, round_length
 from stereovox.view.picture import picture
 from stereovox.view.render import LIGHT, Direction, render
+from stereovox.view.views import draw_view
 
 CONFIG = load_config("default", voxel_size=0.1)
 RED, GREEN = np.array([1.0, 0, 0]), np.array([0, 1.0, 0])
@@ -118,3 +120,19 @@ def test_top_view_keeps_x_right_and_y_up_without_gaps():
 @pytest.mark.parametrize(("length", "rounded"), [(0.037, 0.02), (1.0, 1.0), (7.3, 5.0), (26, 20)])
 def test_scale_bars_have_round_lengths(length, rounded):
     assert round_length(length) == pytest.approx(rounded)
+
+
+@pytest.mark.parametrize("view", ["overview", "layer"])
+@pytest.mark.parametrize(("shape", "beside"), [((6, 60, 20), False), ((40, 20, 20), True)])
+def test_the_legend_leaves_the_title_of_a_narrow_map_alone(view, shape, beside):
+    grid = np.full(shape, -1.5)
+    grid[0] = grid[-1] = 3.0
+    voxel_map = VoxelMap.from_cells(CONFIG, np.argwhere(np.ones_like(grid)), grid.ravel())
+    figure = draw_view(voxel_map, view, "Narrow", "z")
+    figure.draw_without_rendering()
+    (axis,) = (axis for axis in figure.axes if axis.get_legend())
+    legend = axis.get_legend().get_window_extent()
+    titles = [child for one in figure.axes for child in one.get_children() if isinstance(child, Text)]
+    assert not any(title.get_text() and legend.overlaps(title.get_window_extent()) for title in titles)
+    assert [text.get_text() for text in axis.get_legend().get_texts()] == ["unknown", "free", "tentative", "occupied"]
+    assert (legend.y0 > axis.get_window_extent().y1 - 2) == beside

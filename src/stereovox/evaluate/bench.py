@@ -64,8 +64,8 @@ def bench(
 
     Returns `rows` of `library, voxel_size, threads, frames, integrate_ms_median, integrate_ms_p90, occupied, free,
     map_bytes`; `ratio[str(voxel_size)][peer]` = peer's median / our median; and `source, image, frames,
-    frames_refused, first_refusal, max_range, budget_s`. Cells count as each library defines them: occupied above p = 0.7 and free
-    below 0.3 for stereovox, above and below 0.5 for OctoMap.
+    frames_refused, first_refusal, max_range, budget_s`. Cells count as each library defines them: occupied above
+    p = 0.7 and free below 0.3 for stereovox, above and below 0.5 for OctoMap.
     Raises ConfigError for an unknown peer or bad setting, MissingExtra for a peer that is not installed,
     StereovoxError when no frame can be used: one line each.
     """

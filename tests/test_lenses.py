@@ -103,7 +103,7 @@ def test_what_a_lens_does_not_see_is_nan():
 
 
 def test_nobody_finds_two_pixels_of_a_lens_in_one_direction():
-    radial = [replace(narrow(name), distortion=(*k[:2], 0, 0, *k[4:]) if k else ()) for name, k in NARROW.items()]
+    radial = [replace(narrow(name), distortion=(*NARROW[name][:2], 0, 0, *NARROW[name][4:])) for name in NARROW]
     for lens in (*radial, wide("usual"), wide("strong")):
         angles = np.linspace(0, lens.widest * 0.9999, 3000)
         radius = lens.project(np.column_stack([np.sin(angles), 0 * angles, np.cos(angles)]))[:, 0]
@@ -116,10 +116,8 @@ def test_nobody_finds_two_pixels_of_a_lens_in_one_direction():
         ({"model": "fishye"}, "did you mean 'fisheye'"),
         ({"fx": 0.0}, "must be positive"),
         ({"cx": np.nan}, "must be positive"),
-        ({"model": "fisheye", "distortion": (1, 2, 3, 4, 5)}, "0 or 4 finite"),
-        ({"model": "fisheye", "distortion": (1,)}, "0 or 4 finite"),
-        ({"distortion": (1, 2, 3)}, "0, 4, 5 or 8 finite"),
-        ({"distortion": (0, 0, 0, np.inf)}, "finite"),
+        ({"model": "fisheye", "distortion": (1, 2, 3, 4, 5)}, "at most 4"),
+        ({"distortion": (np.inf,)}, "finite"),
     ],
 )
 def test_what_is_no_lens(change, said):

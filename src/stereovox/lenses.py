@@ -19,7 +19,7 @@ from stereovox.errors import StereovoxError, did_you_mean
 MODELS = {"pinhole": 8, "fisheye": 4}
 """Models of a lens and the largest number of their coefficients."""
 COUNTS = {"pinhole": (0, 4, 5, 8), "fisheye": (0, 4)}
-"""How many coefficients a lens may have."""
+"""How many coefficients a calibration has; another number in a file is a slip."""
 FARTHEST = {"pinhole": math.radians(89.9), "fisheye": math.pi}
 """Angle off the axis in radians at which the model ends by its nature."""
 STEPS = 2000
@@ -33,9 +33,9 @@ GOOD = 1e-10
 class Lens:
     """A camera as calibrated.
 
-    model: `pinhole` with 0, 4, 5 or 8 coefficients of Brown and Conrady (k1 k2 p1 p2 k3 k4 k5 k6, OpenCV's order), or
-    `fisheye` with none or the four of Kannala and Brandt; missing ones are zero. fx, fy, cx, cy in pixels.
-    Raises StereovoxError for another model, sizes or focal lengths that are not positive and finite, another number of
+    model: `pinhole` with up to 8 coefficients of Brown and Conrady (k1 k2 p1 p2 k3 k4 k5 k6, OpenCV's order), or
+    `fisheye` with the four of Kannala and Brandt; missing ones are zero. fx, fy, cx, cy in pixels.
+    Raises StereovoxError for another model, sizes or focal lengths that are not positive and finite, too many
     coefficients, or one that is not finite.
     """
 
@@ -55,9 +55,8 @@ class Lens:
         if not (all(math.isfinite(n) and n > 0 for n in numbers) and math.isfinite(self.cx) and math.isfinite(self.cy)):
             raise StereovoxError(f"lens {numbers}, {self.cx}, {self.cy}: sizes and focal lengths must be positive")
         coefficients = tuple(float(number) for number in self.distortion)  # a list from a file cannot be hashed
-        if len(coefficients) not in COUNTS[self.model] or not all(map(math.isfinite, coefficients)):
-            *counts, most = COUNTS[self.model]
-            wanted = f"{', '.join(map(str, counts))} or {most} finite coefficients"
+        if len(coefficients) > MODELS[self.model] or not all(map(math.isfinite, coefficients)):
+            wanted = f"at most {MODELS[self.model]} finite coefficients"
             raise StereovoxError(f"lens: model '{self.model}' takes {wanted}, not {list(coefficients)}")
         object.__setattr__(self, "distortion", coefficients)
 

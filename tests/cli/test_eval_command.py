@@ -17,8 +17,8 @@ CELLS = [[x, y, 0] for x in range(6) for y in range(6)]
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     """A truth with a wall at x = 2, and a map that has most of it one cell off."""
-    truth = sv.VoxelMap.from_cells(CONFIG, CELLS, [3.0 if x == 2 else -2.0 for x, _, _ in CELLS])
-    ours = [3.0 if (x, y) in ((2, 0), (3, 1), (3, 2), (3, 3), (5, 5)) else -1.0 for x, y, _ in CELLS]
+    truth = sv.VoxelMap.from_cells(CONFIG, CELLS, [3.0 if x == 2 else -3.0 for x, _, _ in CELLS])
+    ours = [3.0 if (x, y) in ((2, 0), (3, 1), (3, 2), (3, 3), (5, 5)) else -3.0 for x, y, _ in CELLS]
     one = sv.VoxelMap.from_cells(CONFIG, CELLS, ours)
     truth.save(tmp_path / "truth.svox")
     one.save(tmp_path / "map.svox")
@@ -51,9 +51,9 @@ def test_the_measures_are_printed_and_one_object_of_json(capsys, ours, truth):
 
 @pytest.mark.usefixtures("folder")
 def test_threshold_and_tolerance_are_used(capsys):
-    _, out, _ = run(capsys, "map.svox", "truth.svox", "--json", "--tolerance", "4", "--threshold", "0.2")
+    _, out, _ = run(capsys, "map.svox", "truth.svox", "--json", "--tolerance", "4", "--threshold", "0.02")
     found = json.loads(out)
-    assert (found["threshold"], found["tolerance_cells"], found["fn"]) == (0.2, 4, 0)
+    assert (found["threshold"], found["tolerance_cells"], found["fn"]) == (0.02, 4, 0)
     assert found["tolerance_precision"] == pytest.approx(1)
 
 

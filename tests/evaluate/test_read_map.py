@@ -15,7 +15,7 @@ from stereovox.evaluate.scores import score
 from stereovox.products import export
 
 CELLS = [[x, y, -3] for x in range(-5, 5) for y in range(9)]
-VALUES, OURS = np.random.default_rng(3).choice([3.0, -1.5], (2, len(CELLS)), p=[0.3, 0.7])
+VALUES, OURS = np.random.default_rng(3).choice([3.0, -3.0], (2, len(CELLS)), p=[0.3, 0.7])
 
 
 @pytest.mark.parametrize("size", [0.2, 0.08, 1 / 3])
@@ -42,9 +42,8 @@ def test_a_recording_is_no_map(tmp_path):
     with pytest.raises(MapFileError, match=f"is a recording, no map; .*stereovox truth {re.escape(str(drive))} --out"):
         read_map(drive)
     (tmp_path / "empty").mkdir()
-    with pytest.raises(MapFileError) as caught:
+    with pytest.raises(MapFileError, match="no stereovox map here"):
         read_map(tmp_path / "empty")
-    assert "recording" not in str(caught.value)
 
 
 POSITIONS = np.array([[1.0, 2, 3], [4, 5, 6], [7, 8, 9.5]])

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Rig files: written and read back, masks, and one line for each mistake."""
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +10,7 @@ from made_recordings import write_png
 from made_rigs import CAMERA, FORWARD, cylinder, eyes, rig
 
 from stereovox.errors import SourceError
-from stereovox.rigs import StereoPair
+from stereovox.rigs import Eyes, StereoPair
 from stereovox.sources.rig_file import Rig, RigPair, Virtual, read_rig, write_rig
 
 MINIMAL = """
@@ -76,6 +76,13 @@ def test_a_rig_comes_back_as_it_was_written(tmp_path):
     assert (tmp_path / "rig.toml").read_text().startswith("# made by a test\n# twice\n")
 
 
+def test_a_lens_with_few_coefficients_is_written_with_zeros(tmp_path):
+    few = [replace(lens, distortion=lens.distortion[:2]) for lens in (eyes().left, eyes().right)]
+    write_rig(tmp_path / "rig.toml", Rig((RigPair("a", eyes=Eyes(*few, eyes().T_left_right)),)))
+    left = read_rig(tmp_path / "rig.toml").pairs[0].eyes.left
+    assert left.distortion == (*eyes().left.distortion[:2], 0, 0)
+
+
 def test_little_is_needed(tmp_path):
     (tmp_path / "rig.toml").write_text(MINIMAL)
     read = read_rig(tmp_path / "rig.toml")
@@ -93,7 +100,7 @@ def test_eyes_become_a_pair_with_the_virtual_camera(tmp_path):
     expected = StereoPair.from_eyes(pair.eyes, "spherical", size=(30, 20), hfov_deg=60).camera
     assert asdict(pair.camera) == asdict(expected)
     assert pair.camera.baseline == pytest.approx(0.1)
-    assert pair.eyes.right.distortion == (-0.1, 0.01)
+    assert pair.eyes.right.distortion == (-0.1, 0.01, 0, 0)
 
 
 def test_masks_are_rectangles_and_what_is_not_white(tmp_path):
@@ -127,7 +134,7 @@ def test_masks_are_rectangles_and_what_is_not_white(tmp_path):
         (EYED.replace('"pinhole"', '"omni"'), "left_lens: lens: unknown model 'omni'"),
         (
             EYED.replace("-0.1, 0.01, 0.0", "-0.1, 0.01"),
-            "right_lens: lens: model 'pinhole' takes 0, 4, 5 or 8 finite coefficients",
+            "right_lens: distortion must have 0, 4, 5 or 8 numbers .* not 3",
         ),
         (EYED + "k1 = 3", "unknown key 'right_lens.k1'"),
         (EYED + "[pair.virtual]\nsize = 3", r"virtual.size = 3 must be \[width, height\]"),

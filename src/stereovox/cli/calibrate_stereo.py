@@ -98,9 +98,8 @@ def _tell(found: StereoCalibration, arguments: Namespace, alone: list[str]) -> N
     say(f"  rows after rectification by {told['epipolar_px']:.3f} px{unseen}")
     say(f"baseline {1000 * told['baseline_m']:.2f} mm; fields of view {_fields(told)} deg")
     if told["baseline_m"] > LONGEST:
-        say(
-            f"note: {told['baseline_m']:.4g} m is a long baseline; --square {arguments.square:g}: millimetres? Give metres"
-        )
+        length = f"{told['baseline_m']:.4g} m is a long baseline"
+        say(f"note: {length}; --square {arguments.square:g}: millimetres? Give metres")
     if max(told["rms_px"], told["epipolar_px"]) > GOOD_PX:
         say("note: that is a lot; is the board flat, the picture sharp, and --lens right? See the report")
     if len(found.used) < 10:

@@ -43,4 +43,4 @@ def path_fits(path: NDArray[np.float64], truth: TruthCells, max_range: float) ->
     max_range: of the map, in metres. A path in another frame than the map's world seldom does.
     """
     surfaces = truth.centers()[truth.occupied]
-    return 2 * np.count_nonzero(distances(surfaces, path) > STRAYING * max_range) <= len(surfaces)
+    return bool(2 * np.count_nonzero(distances(surfaces, path) > STRAYING * max_range) <= len(surfaces))

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import MISSING, fields
+from dataclasses import MISSING, fields, replace
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ import numpy as np
 from stereovox.cameras import PinholeCamera
 from stereovox.errors import SourceError, StereovoxError, did_you_mean
 from stereovox.geometry import Transform, orthonormalise, rigidity_error
-from stereovox.lenses import Lens
+from stereovox.lenses import COUNTS, Lens
 from stereovox.rigs import Eyes, VirtualCamera
 from stereovox.sources.rig_file import Rig, RigPair, Virtual
 from stereovox.sources.toml_file import is_number, toml_text
@@ -100,7 +100,12 @@ def _lens(table: dict[str, Any], prefix: str) -> Lens:
         distortion = table.get("distortion", [])
         if not isinstance(distortion, list) or not all(map(is_number, distortion)):
             raise SourceError(f"distortion = {distortion!r} must be a list of numbers")
-        return Lens(_word(table, "model"), width, height, fx, fy, cx, cy, tuple(map(float, distortion)))
+        lens = Lens(_word(table, "model"), width, height, fx, fy, cx, cy, tuple(map(float, distortion)))
+        *counts, most = COUNTS[lens.model]
+        if len(distortion) not in COUNTS[lens.model]:
+            wanted = f"{', '.join(map(str, counts))} or {most} numbers for a {lens.model}, not {len(distortion)}"
+            raise SourceError(f"distortion must have {wanted}")
+        return lens
     except StereovoxError as error:
         raise SourceError(f"{prefix.removesuffix('.')}: {error}") from None
 
@@ -182,8 +187,14 @@ def _pair_lines(pair: RigPair) -> list[str]:
         return [*lines, "", "[pair.camera]", f'model = "{model}"', *_lines(pair.camera, named)]
     lines += _matrix_lines("T_left_right", pair.eyes.T_left_right)
     for side in ("left", "right"):
-        lines += ["", f"[pair.{side}_lens]", *_lines(getattr(pair.eyes, side), LENS)]
+        lines += ["", f"[pair.{side}_lens]", *_lines(_filled(getattr(pair.eyes, side)), LENS)]
     return [*lines, "", "[pair.virtual]", *_lines(pair.virtual, [entry.name for entry in fields(Virtual)])]
+
+
+def _filled(lens: Lens) -> Lens:
+    """Return the same lens with as many coefficients as `_lens` takes."""
+    count = next(count for count in COUNTS[lens.model] if count >= len(lens.distortion))
+    return replace(lens, distortion=lens.distortion + (0.0,) * (count - len(lens.distortion)))
 
 
 def _lines(what: Any, names: Sequence[str]) -> list[str]:

@@ -220,8 +220,6 @@ class MapConfig(_Section):
     def _ordered(self) -> MapConfig:
         if self.free_below >= self.occupied_above:
             raise ValueError("free_below must be smaller than occupied_above")
-        if self.prior >= self.occupied_above:
-            raise ValueError(f"prior {self.prior} must be smaller than occupied_above {self.occupied_above}")
         return self
 
 

@@ -10,7 +10,7 @@ import stereovox as sv
 from stereovox.cli import main
 from stereovox.products import export
 
-CONFIG = sv.load_config(voxel_size=0.5)
+CONFIG = sv.load_config(voxel_size=0.5, **{"map.prior": 0.5})
 CELLS = [[x, y, 0] for x in range(6) for y in range(6)]
 
 
@@ -26,7 +26,9 @@ def folder(tmp_path, monkeypatch):
     export(truth, tmp_path / "truth.ot")
     monkeypatch.chdir(tmp_path)
     np.savetxt(tmp_path / "path.txt", [[0.25, 0.25, 0.25]])
-    sv.VoxelMap.from_cells(sv.load_config(voxel_size=0.25), CELLS, ours).save(tmp_path / "fine.svox")
+    sv.VoxelMap.from_cells(sv.load_config(voxel_size=0.25, **{"map.prior": 0.5}), CELLS, ours).save(
+        tmp_path / "fine.svox"
+    )
     return tmp_path
 
 

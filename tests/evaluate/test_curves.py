@@ -55,7 +55,7 @@ def test_correlation_is_numpys_and_none_where_nothing_varies():
     assert correlation(p[:0], actual[:0]) is None
 
 
-CONFIG = sv.load_config(voxel_size=1.0)
+CONFIG = sv.load_config(voxel_size=1.0, **{"map.prior": 0.5})
 
 
 def test_precision_and_recall_by_distance_by_hand():

@@ -85,7 +85,7 @@ def test_cells_nobody_saw_do_not_count():
 
 
 def test_map_against_truth():
-    config = load_config("default", voxel_size=0.05)
+    config = load_config("default", voxel_size=0.05, **{"map.prior": 0.5})
     cells = [*([0, 0, z] for z in range(40)), [5, 0, 0], [6, 0, 0], [7, 0, 0]]
     voxel_map = VoxelMap.from_cells(config, cells, [3.0] * 20 + [-1.0] * 20 + [-1.0, 0.1, 3.0])
     pole = _pole()

@@ -20,7 +20,7 @@ VALUES, OURS = np.random.default_rng(3).choice([3.0, -3.0], (2, len(CELLS)), p=[
 
 @pytest.mark.parametrize("size", [0.2, 0.08, 1 / 3])
 def test_all_kinds_of_maps_score_alike(tmp_path, size):
-    one = sv.VoxelMap.from_cells(sv.load_config(voxel_size=size), CELLS, VALUES)
+    one = sv.VoxelMap.from_cells(sv.load_config(voxel_size=size, **{"map.prior": 0.5}), CELLS, VALUES)
     one.save(tmp_path / "a.svox")
     export(one, tmp_path / "a.bt")
     export(one, tmp_path / "a.ot")

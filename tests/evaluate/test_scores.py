@@ -23,7 +23,13 @@ from stereovox.maps.evidence import Evidence
 from stereovox.maps.rolling import RollingMap
 
 SIZE = 0.5
-MEANING = {"map.log_odds_min": -2.5, "map.log_odds_max": 3.5, "map.free_below": 0.3, "map.occupied_above": 0.7}
+MEANING = {
+    "map.prior": 0.5,
+    "map.log_odds_min": -2.5,
+    "map.log_odds_max": 3.5,
+    "map.free_below": 0.3,
+    "map.occupied_above": 0.7,
+}
 CONFIG = sv.load_config(voxel_size=SIZE, **MEANING)
 WIDE = sv.load_config(CONFIG, **{"map.log_odds_min": -30.0, "map.log_odds_max": 30.0})
 CELL = st.tuples(*[st.integers(-9, -5) | st.integers(6, 9)] * 3)  # across the borders of blocks, below zero too

@@ -79,7 +79,7 @@ def test_what_the_share_of_the_footprint_changes(name):
 
 
 def test_agreement_by_hand():
-    config = sv.load_config(voxel_size=0.1)
+    config = sv.load_config(voxel_size=0.1, **{"map.prior": 0.5})
     ours = sv.VoxelMap.from_cells(config, [[0, 0, 0], [1, 0, 0], [9, 0, 0], [5, 5, 5]], [2, 2, 2, -1.5])
     theirs = sv.VoxelMap.from_cells(config, [[0, 0, 0], [2, 0, 0], [5, 5, 5]], [2, 2, 2])
     shares = agreement(ours, theirs)

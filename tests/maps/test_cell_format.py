@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 
 from stereovox.config import load_config
-from stereovox.errors import ConfigError
 from stereovox.maps import State, VoxelMap, load_map, make_map
 from stereovox.maps.cell_format import FORMATS
 from stereovox.maps.evidence import Evidence
@@ -112,8 +111,3 @@ def test_what_evidence_made_likelier_is_never_free(cell, prior):
             voxel_map.add(Evidence(np.zeros((1, 3), np.int32), values, np.empty((0, 3), np.int32), 0))
         at_most_free = prior < 0.3 or wanted != State.FREE
         assert voxel_map.state([[0.01, 0.01, 0.01]]).tolist() == [wanted if at_most_free else State.TENTATIVE]
-
-
-def test_a_prior_that_makes_all_occupied_is_refused():
-    with pytest.raises(ConfigError, match=r"prior 0\.8 must be smaller"):
-        load_config(**{"map.prior": 0.8})

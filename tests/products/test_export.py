@@ -9,7 +9,7 @@ from stereovox.errors import MapFileError, StereovoxError
 from stereovox.maps import VoxelMap
 from stereovox.products import EXPORTS, export
 
-CONFIG = load_config(voxel_size=0.25)
+CONFIG = load_config(voxel_size=0.25, **{"map.prior": 0.5})
 
 
 @pytest.fixture

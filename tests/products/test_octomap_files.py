@@ -16,7 +16,7 @@ from stereovox.maps import VoxelMap
 from stereovox.products import export, read_octomap
 
 VOXEL_SIZE = 0.1
-CONFIG = load_config(voxel_size=VOXEL_SIZE)
+CONFIG = load_config(voxel_size=VOXEL_SIZE, **{"map.prior": 0.5})
 REAL_FILE = Path(__file__).resolve().parents[2] / "../shared/data/octomap/geb079.bt"
 FREE, TENTATIVE_LOW, TENTATIVE_HIGH, OCCUPIED = -1.5, -0.4, 0.4, 2.5
 FULL_CUBE = np.argwhere(np.ones((4, 4, 4)))

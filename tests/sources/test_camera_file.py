@@ -114,3 +114,10 @@ def test_images_need_no_poses(tmp_path):
     assert source.camera == CAMERA
     assert [frame.stamp_ns for frame in source] == [12_500_000_000]
     assert open_images("sim:wall?image_width=32").length == 30
+
+
+def test_a_rig_file_is_named_as_such(tmp_path):
+    path = tmp_path / "rig.toml"
+    path.write_text("[[pair]]\nname = 'front'\n")
+    with pytest.raises(SourceError, match="is a rig file, no camera file"):
+        read_camera(path)

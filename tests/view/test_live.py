@@ -13,7 +13,7 @@ OCCUPIED, FREE, UNKNOWN = (34, 48, 74), (251, 250, 245), (201, 206, 214)
 
 
 def made_map(occupied, free=(), up="z"):
-    config = load_config(voxel_size=1.0, up=up)
+    config = load_config(voxel_size=1.0, up=up, **{"map.prior": 0.5})
     cells, values = [*occupied, *free], [3.0] * len(occupied) + [-1.0] * len(free)
     return VoxelMap.from_cells(config, cells, values)
 

@@ -31,7 +31,7 @@ def box_map(up="z", camera=True):
     indices = np.stack(np.meshgrid(range(4), range(3), range(5), indexing="ij"), axis=-1).reshape(-1, 3)
     log_odds = np.where(indices[:, 0] >= 2, 2.0, -1.5)
     log_odds[0] = 0.1
-    voxel_map = VoxelMap.from_cells(load_config(voxel_size=SIZE, up=up), indices, log_odds)
+    voxel_map = VoxelMap.from_cells(load_config(voxel_size=SIZE, up=up, **{"map.prior": 0.5}), indices, log_odds)
     voxel_map.viewpoint = Viewpoint(CAMERA, LOOKS_ALONG_X) if camera else None
     return voxel_map
 

@@ -26,7 +26,7 @@ CAMERA = PinholeCamera.from_field_of_view(100, 60, 90, 0.05)
 
 def made_map(cell="int16"):
     """Free cells along z with a wall behind them, in Chien's frame: x right, y down, z forward."""
-    config = load_config(voxel_size=0.5, up="-y", max_range=4.0, **{"map.cell": cell})
+    config = load_config(voxel_size=0.5, up="-y", max_range=4.0, **{"map.cell": cell, "map.prior": 0.5})
     cells = {(x, y, z): -1.5 for x in (-1, 0) for y in (-1, 0) for z in range(4)}
     cells |= {(x, y, 4): 2.0 for x in range(-3, 3) for y in range(-2, 2)}
     one = VoxelMap.from_cells(config, list(cells), list(cells.values()))

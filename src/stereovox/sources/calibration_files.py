@@ -56,9 +56,8 @@ def _kitti(path: Path, size: Size | None) -> Rig:
     pairs = []
     for name, left in (("grey", 0), ("colour", 2)):
         if {left, left + 1} <= set(calibration.projections):
-            told = values.get(f"S_rect_0{left}", ())
-            finite = len(told) == 2 and all(map(math.isfinite, told))
-            pixels = size or ((int(told[0]), int(told[1])) if finite else None)
+            told = [number for number in values.get(f"S_rect_0{left}", ()) if math.isfinite(number)]
+            pixels = size or ((int(told[0]), int(told[1])) if len(told) == 2 else None)
             if pixels is None:
                 raise SourceError(f"{path}: does not tell the size of the images; give it with --size WIDTHxHEIGHT")
             T_cam0_left = inverse(calibration.offset_of(left))

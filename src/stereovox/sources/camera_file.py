@@ -55,6 +55,8 @@ def camera_text(camera: PinholeCamera, provenance: Mapping[str, Any] | None = No
 
 
 def _camera(table: dict[str, Any]) -> PinholeCamera:
+    if "pair" in table:
+        raise SourceError("is a rig file, no camera file; put it into the recording's folder as rig.toml")
     _check_keys(table, KEYS, "")
     for key, what in NEEDED.items():
         if key not in table:

@@ -26,8 +26,8 @@ from stereovox.view.reproduce.valenti import reliabilities_png, tolerances_png
 
 TABLE = ("tp", "fp", "tn", "fn", "accuracy", "precision", "recall", "specificity", "npv", "error", "correlation")
 TRUTH = (
-    "Truth: a cell is occupied where one lidar point of any frame falls into it that is in the left image, within the "
-    "range and on nothing annotated as an object. Free are all other cells in view of some frame up to the range; "
+    "Truth: a cell is occupied where one lidar point of any frame falls into it that is in the left image and on "
+    "nothing annotated as an object. Cells count that some frame has in view and in range. Free are all others; "
     "beside it stands a second, kinder truth, whose free cells are only those that a lidar ray crossed. The first "
     "blames a map for every surface that the sparse lidar missed, the second asks only where the lidar knows."
 )

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 import re
-from html.parser import HTMLParser
 
 import pytest
+from made_pages import Balanced
 
 from stereovox.errors import StereovoxError
 from stereovox.evaluate.report import report, write_report
@@ -48,19 +48,6 @@ SUMMARY = {
 }
 
 
-class _Balanced(HTMLParser):
-    def __init__(self):
-        super().__init__()
-        self.open = []
-
-    def handle_starttag(self, tag, attrs):
-        if tag not in ("meta", "img"):
-            self.open.append(tag)
-
-    def handle_endtag(self, tag):
-        assert self.open.pop() == tag
-
-
 def test_the_page_holds_the_figures_and_needs_no_other_file():
     page = report(SUMMARY, b"png")
     figures = ("98.7 %", "4,321", "2.5 ms", "7.77 ms", "2.5 MB", "25 cm", "cG5n")
@@ -69,7 +56,7 @@ def test_the_page_holds_the_figures_and_needs_no_other_file():
     assert "{{" not in page
     assert "through the window" in page.partition("<img")[2].partition("<h2>")[0], "what lies outside is explained"
     assert not re.search(r"""(src|href)\s*=\s*["'](?!data:)|url\(|@import""", page)
-    parser = _Balanced()
+    parser = Balanced()
     parser.feed(page)
     assert parser.open == []
 

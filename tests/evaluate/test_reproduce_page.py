@@ -2,9 +2,9 @@
 import json
 import re
 from dataclasses import replace
-from html.parser import HTMLParser
 
 import pytest
+from made_pages import Balanced
 
 from stereovox.errors import StereovoxError
 from stereovox.evaluate.reproduce import PAPERS, chien2020, reproduce
@@ -29,26 +29,13 @@ CHAPTER = Chapter(
 )
 
 
-class _Balanced(HTMLParser):
-    def __init__(self):
-        super().__init__()
-        self.open = []
-
-    def handle_starttag(self, tag, attrs):
-        if tag not in ("meta", "img"):
-            self.open.append(tag)
-
-    def handle_endtag(self, tag):
-        assert self.open.pop() == tag
-
-
 def test_the_page_says_what_holds_and_needs_no_other_file():
     page = report("Title <1>", "Lead", [("3", "claims")], [CHAPTER])
     for text in ("Title &lt;1&gt;", "Boxes &lt;2&gt;", YES, NO, "late &amp; slow", "cG5n", "&lt;x&gt;", "A remark."):
         assert text in page, text
     assert "Does not hold: 1. late &amp; slow." in page
     assert not re.search(r"""(src|href)\s*=\s*["'](?!data:)|url\(|@import""", page)
-    parser = _Balanced()
+    parser = Balanced()
     parser.feed(page)
     assert parser.open == []
 

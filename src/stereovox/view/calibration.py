@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import io
 from typing import Any
 
 import numpy as np
@@ -11,10 +10,13 @@ from numpy.typing import NDArray
 
 from stereovox.calibrate.noise import NoiseCalibration
 from stereovox.calibrate.wall import WallCalibration, WallResult
-from stereovox.view.panels import GREY, LINE, title
+from stereovox.view.charts import blank, labels, png_of
+from stereovox.view.panels import GREY, title
 
 DPI = 150
 WIDTH = 11.0
+LETTERS = 10
+"""Size of the numbers along an axis, in points."""
 """Inches: as wide as a page shows it, so that letters keep their size."""
 BEFORE, AFTER, WALL = "#d1603d", "#23618c", "#1b2333"
 THEORY = ((0.08, "--"), (0.04, ":"))
@@ -32,24 +34,24 @@ BAND = 0.1
 def wall_png(calibration: WallCalibration) -> bytes:
     """Return a PNG: histogram, top view, error over the image before and after, for each wall (after Fig A.1-A.3)."""
     walls = calibration.walls
-    made = blank(7.4 * len(walls))
+    made = blank(WIDTH, 7.4 * len(walls))
     grid = made.subplots(2 * len(walls), 2, squeeze=False, height_ratios=[3.1, 4.3] * len(walls))
     for axes, wall in zip(grid.reshape(-1, 4), walls, strict=True):
         _histogram(axes[0], wall)
         _top_view(axes[1], wall)
         _error_map(made, axes[2], wall.before, "Before")
         _error_map(made, axes[3], wall.after, "After")
-    return png_of(made)
+    return png_of(made, DPI)
 
 
 def noise_png(calibration: NoiseCalibration) -> bytes:
     """Return a PNG: RMSE against distance with theory (after Fig 3.7 and 3.9), sub-pixel, and share of valid pixels."""
-    made = blank(6.2)
+    made = blank(WIDTH, 6.2)
     axes = made.subplot_mosaic([["rmse", "subpixel"], ["rmse", "shares"]], width_ratios=[1.7, 1])
     _rmse(axes["rmse"], calibration)
     _subpixel(axes["subpixel"], calibration)
     _shares(axes["shares"], calibration)
-    return png_of(made)
+    return png_of(made, DPI)
 
 
 def _histogram(axis: Any, wall: WallResult) -> None:
@@ -62,7 +64,7 @@ def _histogram(axis: Any, wall: WallResult) -> None:
     axis.legend(frameon=False, fontsize=10)
     axis.set_yticks([])
     title(axis, f"Wall at {wall.distance:.2f} m" + ("" if wall.fitted else " (only checked)"))
-    _labels(axis, "depth [m]", "pixels")
+    labels(axis, "depth [m]", "pixels", LETTERS)
 
 
 def _top_view(axis: Any, wall: WallResult) -> None:
@@ -78,7 +80,7 @@ def _top_view(axis: Any, wall: WallResult) -> None:
     axis.plot(x, (1 - b * x) / a, color=WALL, linewidth=1.2, linestyle="--", label="wall, on the axis")
     axis.legend(frameon=False, fontsize=10, markerscale=6, loc="best")
     title(axis, "Top view, middle rows")
-    _labels(axis, "x, to the right [m]", "z, depth [m]")
+    labels(axis, "x, to the right [m]", "z, depth [m]", LETTERS)
 
 
 def _error_map(made: Any, axis: Any, error: NDArray[np.float64], name: str) -> None:
@@ -109,13 +111,13 @@ def _rmse(axis: Any, calibration: NoiseCalibration) -> None:
     axis.legend(frameon=False, fontsize=10)
     axis.set(xlim=(0, z[-1]), ylim=(0, None))
     title(axis, "Error of one measurement against distance")
-    _labels(axis, "distance [m]", "error [mm]")
+    labels(axis, "distance [m]", "error [mm]", LETTERS)
 
 
 def _subpixel(axis: Any, calibration: NoiseCalibration) -> None:
     known = [(point.distance_m, point.subpixel) for point in calibration.points if point.subpixel is not None]
     title(axis, "The same as a disparity error")
-    _labels(axis, "distance [m]", "sub-pixel [px]")
+    labels(axis, "distance [m]", "sub-pixel [px]", LETTERS)
     if not known:
         axis.text(0.5, 0.5, "baseline not known", ha="center", color=GREY, transform=axis.transAxes)
         return
@@ -137,34 +139,9 @@ def _shares(axis: Any, calibration: NoiseCalibration) -> None:
     axis.set(xlim=(0, 1.12 * max(distance)), ylim=(0, 104))
     axis.legend(frameon=False, fontsize=10, loc="lower left")
     title(axis, "Pixels that have a value")
-    _labels(axis, "distance [m]", "share [%]")
+    labels(axis, "distance [m]", "share [%]", LETTERS)
 
 
 def _depths(points: NDArray[np.float64]) -> NDArray[np.float64]:
     z = points[..., 2]
     return z[np.isfinite(z)]
-
-
-def _labels(axis: Any, x: str, y: str) -> None:
-    axis.set_xlabel(x, color=GREY)
-    axis.set_ylabel(y, color=GREY)
-    axis.tick_params(colors=GREY)
-    for spine in axis.spines.values():
-        spine.set_color(LINE)
-
-
-def blank(height: float) -> Any:
-    """Return an empty figure, `height` inches high."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    made = Figure((WIDTH, height), facecolor="white", layout="constrained")
-    FigureCanvasAgg(made)
-    return made
-
-
-def png_of(made: Any) -> bytes:
-    """Return a figure as the bytes of a PNG."""
-    out = io.BytesIO()
-    made.savefig(out, dpi=DPI, format="png")
-    return out.getvalue()

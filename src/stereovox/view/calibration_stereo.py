@@ -15,8 +15,9 @@ from stereovox.depth.rectify import rectified
 from stereovox.frame import StereoFrame
 from stereovox.rigs import StereoPair
 from stereovox.view import page
-from stereovox.view.calibration import blank, png_of
+from stereovox.view.calibration import DPI, WIDTH
 from stereovox.view.calibration_report import write_page
+from stereovox.view.charts import blank, png_of
 from stereovox.view.panels import GREY, title
 
 USED, DROPPED, ROW = "#2f9e62", "#d1603d", "#e8a33d"
@@ -76,14 +77,14 @@ def stereo_png(found: StereoCalibration) -> bytes:
     wide = _rectified(found, example)
     height = 16.0 * wide.shape[0] / wide.shape[1]
     small = rows * (16.0 / ACROSS * wide.shape[0] / wide.shape[1] + 0.45)
-    made = blank(small + height + 0.8)
+    made = blank(WIDTH, small + height + 0.8)
     above, below = made.subfigures(2, 1, height_ratios=[small, height + 0.8])
     for axis, pair in zip(above.subplots(rows, ACROSS, squeeze=False).flat, shown, strict=False):
         _corners(axis, pair)
     for axis in above.axes:
         axis.set_axis_off()
     _lines(below.subplots(), wide, example.name)
-    return png_of(made)
+    return png_of(made, DPI)
 
 
 def _corners(axis: Any, pair: BoardPair) -> None:

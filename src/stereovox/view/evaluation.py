@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping
 from textwrap import fill
 from typing import Any
@@ -15,7 +14,8 @@ from stereovox.evaluate.curves import PrecisionRecall, Roc
 from stereovox.evaluate.distance import ByDistance
 from stereovox.evaluate.reliability import Reliability
 from stereovox.evaluate.scores import Scores
-from stereovox.view.panels import GREY, INK, LINE
+from stereovox.view.charts import blank, labels, png_of
+from stereovox.view.panels import GREY, INK
 
 DPI = 140
 WIDTH = 12.0
@@ -36,7 +36,7 @@ LIKENESS = (("correlation", "correlation", THIRD), ("error", "error", INK), ("co
 
 def series_png(arrays: Mapping[str, NDArray[Any]]) -> bytes:
     """Return a PNG of measures against the frame, `arrays` as `ScoreSeries.arrays` returns them, at least one frame."""
-    made = figure_of(4.4)
+    made = blank(WIDTH, 4.4)
     left, right = made.subplots(1, 2)
     frame = arrays["frame"]
     dot = "o" if len(frame) < 60 else ""
@@ -52,12 +52,12 @@ def series_png(arrays: Mapping[str, NDArray[Any]]) -> bytes:
         labels(axis, "frame", "")
     told(left, "Right or wrong, all cells", "A cell counts as free until the map calls it occupied.")
     told(right, "Likeness, and with tolerance", "Error should fall or stay level, all others should rise.")
-    return png_of(made)
+    return png_of(made, DPI)
 
 
 def curves_png(scores: Scores) -> bytes:
     """Return a PNG: precision and recall against the threshold, reliability with counts, ROC, and against distance."""
-    made = figure_of(8.8)
+    made = blank(WIDTH, 8.8)
     upper, lower = made.subplots(2, 2)
     _thresholds(upper[0], scores.curve, scores.threshold, scores.tolerance_cells)
     _reliability(upper[1], scores.reliability, scores.ece)
@@ -66,7 +66,7 @@ def curves_png(scores: Scores) -> bytes:
         _both(lower[1], scores.curve, scores.threshold)
     else:
         _distance(lower[1], scores.distance)
-    return png_of(made)
+    return png_of(made, DPI)
 
 
 def _thresholds(axis: Any, curve: PrecisionRecall, threshold: float, tolerance: int) -> None:
@@ -158,30 +158,3 @@ def legend_below(axis: Any, columns: int) -> None:
     axis.legend(
         loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=columns, frameon=False, fontsize=9.5, columnspacing=1.4
     )
-
-
-def labels(axis: Any, x: str, y: str) -> None:
-    """Label a chart's axes, in grey."""
-    if x:
-        axis.set_xlabel(x, color=GREY)
-    axis.set_ylabel(y, color=GREY)
-    axis.tick_params(colors=GREY, labelsize=9)
-    for spine in axis.spines.values():
-        spine.set_color(LINE)
-
-
-def figure_of(height: float) -> Any:
-    """Return an empty figure, `height` inches high."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    made = Figure((WIDTH, height), facecolor="white", layout="constrained")
-    FigureCanvasAgg(made)
-    return made
-
-
-def png_of(made: Any) -> bytes:
-    """Return a figure as PNG."""
-    out = io.BytesIO()
-    made.savefig(out, dpi=DPI, format="png")
-    return out.getvalue()

@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.evaluate.outcomes import Outcome, Outcomes
+from stereovox.view.charts import blank, png_of
 from stereovox.view.drawn import UPS, checked_up
-from stereovox.view.evaluation import WIDTH, figure_of, png_of
+from stereovox.view.evaluation import DPI, WIDTH
 from stereovox.view.panels import measured, title
 
 RIGHT, WRONG, MISS, NEVER = "#2f7fb8", "#e59a1f", "#b3205f", "#b9bec7"
@@ -42,7 +43,7 @@ def outcomes_png(shown: Outcomes, up: str | None = None) -> bytes:
     size = (places.max(axis=0) - low + 1) if len(places) else np.ones(2, int)
     tall = size[1] > 0.6 * size[0]
     height = 0.8 + float(np.clip((0.46 if tall else 0.92) * WIDTH * size[1] / size[0], 2.0, 9.0))
-    made = figure_of(height if tall else 2 * height)
+    made = blank(WIDTH, height if tall else 2 * height)
     panels = made.subplots(*((1, 2) if tall else (2, 1)), squeeze=False).ravel()
     extent = np.stack([low, low + size], axis=1).ravel() * shown.voxel_size
     names = ("xyz"[across], "xyz"[away], up)
@@ -52,7 +53,7 @@ def outcomes_png(shown: Outcomes, up: str | None = None) -> bytes:
         title(axis, text)
         measured(axis, names)
     _legend(made)
-    return png_of(made)
+    return png_of(made, DPI)
 
 
 def mixed(

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from stereovox.evaluate.reproduce.aisle import FAR_M, AisleFound
 from stereovox.products.slices import layer
 from stereovox.sources.scene import Solid
+from stereovox.view.charts import labels
 from stereovox.view.panels import GREY, STATE_COLOURS, title
-from stereovox.view.reproduce.shared import SECOND, cut, figure_of, labels, png
+from stereovox.view.reproduce.shared import SECOND, cut, figure_of, png
 
 
 def aisle_png(found: Sequence[AisleFound], solids: Sequence[Solid]) -> bytes:

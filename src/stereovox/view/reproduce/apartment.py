@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from stereovox.maps import VoxelMap
 from stereovox.products.slices import layer
 from stereovox.sources.scene import Solid
+from stereovox.view.charts import labels
 from stereovox.view.panels import GREY, INK, PATH_COLOUR, measured, title
-from stereovox.view.reproduce.shared import OURS, SECOND, cut, figure_of, labels, png
+from stereovox.view.reproduce.shared import OURS, SECOND, cut, figure_of, png
 
 
 def apartment_png(

@@ -12,10 +12,11 @@ from stereovox.evaluate.reproduce.boxes import DIRECTIONS, BoxFound
 from stereovox.maps import VoxelMap
 from stereovox.products.slices import layer
 from stereovox.view.axis import draw_profile
+from stereovox.view.charts import labels
 from stereovox.view.landscape import draw_landscape
 from stereovox.view.layer import draw_plan
 from stereovox.view.panels import INK, PATH_COLOUR, title
-from stereovox.view.reproduce.shared import figure_of, labels, png
+from stereovox.view.reproduce.shared import figure_of, png
 from stereovox.view.space import draw_space
 
 NAMES = {"line": "Line drawing", "ray": "Voxel traversal"}

@@ -3,14 +3,13 @@
 
 from __future__ import annotations
 
-import io
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.sources.scene import Solid
-from stereovox.view.panels import GREY, LINE
+from stereovox.view.charts import blank, png_of
 
 DPI = 90
 WIDTH = 14.0
@@ -31,27 +30,11 @@ def cut(solid: Solid, y: float) -> NDArray[np.float64]:
     return points[np.argsort(np.arctan2(around[:, 1], around[:, 0]))]
 
 
-def labels(axis: Any, x: str, y: str) -> None:
-    """Label both axes of a chart in grey."""
-    axis.set_xlabel(x, color=GREY)
-    axis.set_ylabel(y, color=GREY)
-    axis.tick_params(colors=GREY, labelsize=9)
-    for spine in axis.spines.values():
-        spine.set_color(LINE)
-
-
 def figure_of(height: float) -> Any:
     """Return an empty figure, `height` inches high."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    made = Figure((WIDTH, height), facecolor="white", layout="constrained")
-    FigureCanvasAgg(made)
-    return made
+    return blank(WIDTH, height)
 
 
 def png(figure: Any, dpi: int = DPI) -> bytes:
     """Return a figure as a PNG file."""
-    out = io.BytesIO()
-    figure.savefig(out, dpi=dpi, format="png")
-    return out.getvalue()
+    return png_of(figure, dpi)

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.evaluate.reproduce.shifting import Flight
+from stereovox.view.charts import labels
 from stereovox.view.panels import INK, PATH_COLOUR, title
-from stereovox.view.reproduce.shared import OURS, SECOND, THESIS, figure_of, labels, png
+from stereovox.view.reproduce.shared import OURS, SECOND, THESIS, figure_of, png
 
 NEAR_M = 0.5
 """Cells up to so far above and below the first camera are drawn: without floor and ceiling."""

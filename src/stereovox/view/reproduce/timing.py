@@ -8,7 +8,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from stereovox.evaluate.reproduce.timing import Timed
-from stereovox.view.reproduce.shared import OURS, THESIS, figure_of, labels, png
+from stereovox.view.charts import labels
+from stereovox.view.reproduce.shared import OURS, THESIS, figure_of, png
 
 
 def times_png(rows: Sequence[Timed]) -> bytes:

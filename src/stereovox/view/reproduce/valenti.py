@@ -12,8 +12,9 @@ from stereovox.evaluate.reproduce.valenti.claims import TARGET_RANGE, TARGETS
 from stereovox.evaluate.reproduce.valenti.figures import AT_LEAST, STRICT, TOLERANT, at
 from stereovox.evaluate.reproduce.valenti.judge import Judged
 from stereovox.evaluate.reproduce.valenti.mappers import DEFAULT, OCTOMAP, THESIS
+from stereovox.view.charts import labels
 from stereovox.view.panels import GREY
-from stereovox.view.reproduce.shared import OURS, SECOND, figure_of, labels, png
+from stereovox.view.reproduce.shared import OURS, SECOND, figure_of, png
 
 COLOURS = {THESIS: "#8a8f99", DEFAULT: OURS, OCTOMAP: SECOND}
 TARGET = "#5b8c5a"

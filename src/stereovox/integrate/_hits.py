@@ -9,6 +9,7 @@ import numpy as np
 
 from stereovox._jit import cell, kernel
 from stereovox.integrate._cells import HALF, NEAR_PLANE, NO_RETURN, ONE, ZERO, table_row
+from stereovox.integrate._keys import NARROW, WIDE, bits, unpack
 from stereovox.maps._cells import find_or_insert
 
 LEFT, RIGHT = 2, 1
@@ -19,8 +20,6 @@ GROUP = 8
 """Pixels tested together, as one 64-bit word of eight flags."""
 NOTHING = -1
 """Key of a pixel without a measurement."""
-NARROW, WIDE = 10, 20
-"""Bits for each cell coordinate in a key of 32 and of 64 bits."""
 SIDE_SAMPLES = 4
 """Samples along each side of a cell's footprint, at most."""
 
@@ -36,6 +35,7 @@ def scatter(depth_m, view, keys, news, fresh, seen, pool_table, coords, count, v
     size = np.float32(1) / view.voxel_size
     position = view.position * size
     last, place = (np.int32(0), np.int32(0), np.int32(0)), np.int64(-1)
+    b = np.int64(bits(keys))
     keys[:, :] = NOTHING
     seen[:] = NOTHING
     for v in range(depth_m.shape[0]):
@@ -52,7 +52,7 @@ def scatter(depth_m, view, keys, news, fresh, seen, pool_table, coords, count, v
             if seen[slot] == key:
                 continue
             seen[slot] = key
-            x, y, zz = _cell_of(key, keys)
+            x, y, zz = unpack(key, b)
             block = (x >> 3, y >> 3, zz >> 3)
             if place < 0 or block != last:
                 place = find_or_insert(pool_table, coords, count, block[0], block[1], block[2])
@@ -123,14 +123,6 @@ def _slot(key):
     """Return where a key stands in `seen`: a small memory of the cells entered lately."""
     mixed = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
     return np.int64(mixed >> np.uint64(64 - SEEN_BITS))
-
-
-@cell
-def _cell_of(key, keys):
-    """Return the cell that a key stands for."""
-    b = np.int64(NARROW if keys.itemsize == 4 else WIDE)
-    k, half, mask = np.int64(key), np.int64(1) << (b - 1), (np.int64(1) << b) - 1
-    return np.int32((k >> (2 * b)) - half), np.int32(((k >> b) & mask) - half), np.int32((k & mask) - half)
 
 
 @cell

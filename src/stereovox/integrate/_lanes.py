@@ -10,6 +10,7 @@ import numpy as np
 from stereovox._jit import cell, kernel
 from stereovox.integrate._cells import HALF, NO_RETURN, ONE, ZERO, stronger, table_row, usable
 from stereovox.integrate._hits import _point_cell
+from stereovox.integrate._keys import bits, pack, unpack
 from stereovox.maps._cells import find_or_insert
 
 FRACTION_BITS = 10
@@ -17,23 +18,6 @@ FRACTION_BITS = 10
 FRACTION = np.float32(1 << FRACTION_BITS)
 HALF_DIAGONAL = np.float32(0.8661)
 """Depth, in cells, from where a ray enters a cell to the middle of its way through it, at most."""
-NARROW, WIDE = 10, 20
-"""Bits for each cell coordinate in a key of 32 and of 64 bits."""
-
-
-@cell
-def bits(keys):
-    """Return the bits for each cell coordinate in keys of this kind."""
-    return NARROW if keys.itemsize == 4 else WIDE
-
-
-@cell
-def pack(x, y, z, keys):
-    """Return the key of a cell, of the kind that `keys` holds; negative coordinates down to half the range fit."""
-    kind = keys.dtype.type
-    b = kind(bits(keys))
-    half = kind(1) << (b - kind(1))
-    return kind(((kind(x) + half) << (b + b)) | ((kind(y) + half) << b) | (kind(z) + half))
 
 
 @cell
@@ -125,10 +109,8 @@ def _enter(key, b, gain, adds, pool_table, coords, count, values):
     """Give evidence to the cell with this key of `b` bits an axis; return False when the block pool is full."""
     if gain == 0:
         return True
-    half, mask = np.int64(1) << (b - 1), (np.int64(1) << b) - 1
-    k = np.int64(key)
-    x, y, z = (k >> (2 * b)) - half, ((k >> b) & mask) - half, (k & mask) - half
-    place = find_or_insert(pool_table, coords, count, np.int32(x >> 3), np.int32(y >> 3), np.int32(z >> 3))
+    x, y, z = unpack(key, b)
+    place = find_or_insert(pool_table, coords, count, x >> 3, y >> 3, z >> 3)
     if place < 0:
         return False
     c = ((x & 7) << 6) | ((y & 7) << 3) | (z & 7)

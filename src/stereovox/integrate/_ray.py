@@ -6,7 +6,8 @@ import numpy as np
 from stereovox._jit import cell, kernel
 from stereovox.integrate._cells import HALF, NO_RETURN, ONE, ZERO, bits_of, float_of
 from stereovox.integrate._hits import _row_rays
-from stereovox.integrate._lanes import aim, aim_at_hits, evidence, give, pack, weighted
+from stereovox.integrate._keys import pack
+from stereovox.integrate._lanes import aim, aim_at_hits, evidence, give, weighted
 
 BEYOND = np.float32(1e30)
 TINY = np.float32(1e-30)

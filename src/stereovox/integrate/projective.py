@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from stereovox.cameras import PinholeCamera
 from stereovox.config import Config
 from stereovox.frame import DepthImage
-from stereovox.integrate import _cull, _evaluate, _hits
+from stereovox.integrate import _cull, _evaluate, _hits, _keys
 from stereovox.integrate._cells import NEAR_PLANE, NO_RETURN
 from stereovox.integrate.faces import faces_of
 from stereovox.integrate.merging import strongest
@@ -70,7 +70,7 @@ class Projective:
     def _key_rows(self, camera: PinholeCamera) -> NDArray[np.signedinteger]:
         """Return scratch for the keys of two pixel rows, of the narrowest kind that tells all cells apart."""
         cells = farthest_cells(camera, self._config.max_range, self._config)
-        narrow = cells < 1 << (_hits.NARROW - 1)
+        narrow = cells < 1 << (_keys.NARROW - 1)
         pixels = _hits.GROUP * -(-camera.width // _hits.GROUP)
         return np.zeros((2, _hits.LEFT + pixels + _hits.RIGHT), np.int32 if narrow else np.int64)
 

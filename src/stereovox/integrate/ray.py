@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from stereovox.config import Config
 from stereovox.frame import DepthImage
-from stereovox.integrate import _lanes, _line, _ray
+from stereovox.integrate import _keys, _lanes, _line, _ray
 from stereovox.integrate.lanes import make_lanes
 from stereovox.integrate.shards import in_shards, shards
 from stereovox.integrate.views import KernelTable, Rays, farthest_cells, origin_block, rays_of, sensor_table
@@ -60,7 +60,7 @@ class Ray:
         self._look_up = (self._table.clear + self._table.mark).ravel()
         reach = self._config.max_range + float(self._table.reach[-1])
         cells = farthest_cells(camera, reach, self._config)
-        wide = bool(cells >= 1 << (_lanes.NARROW - 1))
+        wide = bool(cells >= 1 << (_keys.NARROW - 1))
         self._lanes = [make_lanes(wide) for _ in self._pools]
         self._camera = camera
 

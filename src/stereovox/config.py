@@ -45,7 +45,7 @@ class NoiseConfig(_Section):
 
 
 class SensorConfig(BaseModel):
-    """The inverse sensor model by name, and its own parameters beside it (`p_hit`, `p_free`, ...)."""
+    """The inverse sensor model by name, and its own parameters beside it (`p_free`, ...)."""
 
     model_config = ConfigDict(frozen=True, extra="allow")
     model: str = "stereo"
@@ -281,7 +281,7 @@ class Config(_Section):
 def load_config(profile: str | Path | Config | Mapping[str, Any] = "default", **overrides: Any) -> Config:
     """Return the settings of a profile (built-in name, TOML file, Config or plain dict) with `overrides` on top.
 
-    Overrides name settings as in the file; a dot reaches into a section (`{"sensor.p_hit": 0.8}`).
+    Overrides name settings as in the file; a dot reaches into a section (`{"sensor.p_free": 0.3}`).
     Raises ConfigError: one line with the setting, its value and the cure.
     """
     where = str(profile) if isinstance(profile, str | Path) else "config"

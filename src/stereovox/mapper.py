@@ -8,8 +8,6 @@ from pathlib import Path
 from time import perf_counter
 from typing import Any
 
-import numpy as np
-
 from stereovox.config import Config, load_config
 from stereovox.depth import DepthPath
 from stereovox.errors import FrameRefused
@@ -36,7 +34,8 @@ class UpdateReport:
 class Mapper:
     """Builds a map from frames. A frame that cannot be trusted is refused and changes nothing.
 
-    Give a profile name, a TOML file or a Config; settings by name on top (`voxel_size=0.1`, `**{"sensor.p_hit": 0.8}`).
+    Give a profile name, a TOML file or a Config; settings by name on top (`voxel_size=0.1`,
+    `**{"sensor.p_free": 0.3}`).
     `resume` is a map to go on with; what its cells mean must not change. `tiles` is the folder for cells that leave a
     window (`window.outside = "keep"`). Raises ConfigError for bad settings.
     """
@@ -70,5 +69,6 @@ class Mapper:
         cells = self.map.add(evidence)
         self.map.frames += 1
         done = perf_counter()
-        times = np.diff([start, between, prepared, done]) * 1e3
-        return UpdateReport(float(times[1]), float(times[2]), cells, match_ms=float(times[0]))
+        return UpdateReport(
+            1e3 * (prepared - between), 1e3 * (done - prepared), cells, match_ms=1e3 * (between - start)
+        )

@@ -130,7 +130,7 @@ def _overrides(arguments: Namespace) -> dict[str, Any]:
     for setting in arguments.settings:
         key, equals, value = setting.partition("=")
         if not equals or not key:
-            raise StereovoxError(f"--set {setting}: write KEY=VALUE, for example --set sensor.p_hit=0.8")
+            raise StereovoxError(f"--set {setting}: write KEY=VALUE, for example --set sensor.p_free=0.3")
         if key.strip() in ("profile", "resume"):
             raise StereovoxError(f"--set {setting}: this is no setting; use --{key.strip()}")
         if key.strip() in ("tiles", "self"):  # other names that `Mapper` knows

@@ -8,17 +8,16 @@ from collections.abc import Callable, Iterable
 import numpy as np
 
 from stereovox.config import Config
-from stereovox.depth import prepare
+from stereovox.depth import DepthPath, prepare
 from stereovox.depth.sphere import T_BODY_OPTICAL, SphereGrid, SphereLayout, accumulate, empty, moved, stitch
-from stereovox.depth.stereo import StereoDepth
 from stereovox.errors import FrameRefused, StereovoxError
-from stereovox.frame import Frame, StereoFrame
+from stereovox.frame import AnyFrame, StereoFrame
 from stereovox.geometry import Transform, inverse, orthonormalise
 from stereovox.rigs import StereoPair
 
 
 def look_round(
-    frames: Iterable[Frame | StereoFrame], config: Config, tell: Callable[[str], object] = lambda line: None
+    frames: Iterable[AnyFrame], config: Config, tell: Callable[[str], object] = lambda line: None
 ) -> tuple[SphereGrid, int, dict[str, int]]:
     """Return the grid of all pairs' last frames, the time of the newest in ns, and how many were refused and why.
 
@@ -29,11 +28,11 @@ def look_round(
     Raises StereovoxError where no frame at all could be used.
     """
     newest, why, refused = _newest(frames)
-    depth_of, T_ahead_body = StereoDepth(config.stereo), _axes(newest.values())
+    path, T_ahead_body = DepthPath(config), _axes(newest.values())
     last: dict[str, tuple[SphereGrid, Transform]] = {}
     for name, frame in newest.items():
         try:
-            last[name] = _grid_of(frame, T_ahead_body, depth_of, config)
+            last[name] = _grid_of(frame, T_ahead_body, path, config)
         except FrameRefused as error:
             refused[error.reason] = refused.get(error.reason, 0) + 1
             why[name] = str(error)
@@ -46,10 +45,10 @@ def look_round(
 
 
 def _newest(
-    frames: Iterable[Frame | StereoFrame],
-) -> tuple[dict[str, Frame | StereoFrame], dict[str, str], dict[str, int]]:
+    frames: Iterable[AnyFrame],
+) -> tuple[dict[str, AnyFrame], dict[str, str], dict[str, int]]:
     """Return each pair's last frame without a fault, why there is a later one with a fault, and how many have which."""
-    newest: dict[str, Frame | StereoFrame] = {}
+    newest: dict[str, AnyFrame] = {}
     why: dict[str, str] = {}
     refused: dict[str, int] = {}
     for frame in frames:
@@ -63,7 +62,7 @@ def _newest(
     return newest, why, refused
 
 
-def _axes(frames: Iterable[Frame | StereoFrame]) -> Transform:
+def _axes(frames: Iterable[AnyFrame]) -> Transform:
     """Return T_ahead_body: what turns the axes of the poses' frame to x forward, y left, z up."""
     optical = any(isinstance(frame, StereoFrame) and _is_body(frame.pair) for frame in frames)
     return T_BODY_OPTICAL if optical else np.eye(4)
@@ -77,12 +76,10 @@ def _is_body(pair: StereoPair) -> bool:
     return np.allclose(pair.T_body_camera, T_left_camera, atol=1e-6)
 
 
-def _grid_of(
-    frame: Frame | StereoFrame, T_ahead_body: Transform, depth_of: StereoDepth, config: Config
-) -> tuple[SphereGrid, Transform]:
+def _grid_of(frame: AnyFrame, T_ahead_body: Transform, path: DepthPath, config: Config) -> tuple[SphereGrid, Transform]:
     """Return the grid of one frame in the frame of the body that looks ahead, and T_world_ahead."""
     mounted = T_ahead_body @ frame.pair.T_body_camera if isinstance(frame, StereoFrame) else T_BODY_OPTICAL
-    image = prepare(depth_of(frame) if isinstance(frame, StereoFrame) else frame, config)
+    image = prepare(path.matched(frame), config)
     T_world_body = orthonormalise(np.asarray(frame.T_world_sensor, float)) @ inverse(mounted)
     T_body_eye = inverse(T_world_body) @ image.T_world_sensor  # the right eye's, where that is the one with depth
     return accumulate(image, T_body_eye, config, SphereLayout.configured(config.sphere)), T_world_body

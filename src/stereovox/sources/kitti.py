@@ -133,6 +133,17 @@ def location(where: str | os.PathLike[str], known: dict[str, str]) -> tuple[Path
         raise SourceError(f"{where}: {error}") from None
 
 
+def time_lines(path: Path, whose: str) -> list[str]:
+    """Return the lines of a file of times, stripped; raises SourceError, one line, where there is none."""
+    try:
+        lines = path.read_text("utf-8-sig", errors="replace").rstrip().splitlines()
+    except OSError as error:
+        raise SourceError(f"{path}: {error.strerror}; put the {whose}'s own file there") from None
+    if not lines:
+        raise SourceError(f"{path}: holds no time; put the {whose}'s own file there")
+    return [line.strip() for line in lines]
+
+
 def folder_of(where: str) -> str:
     """Return what stands before the parameters; never raises."""
     return where.partition("?")[0]

@@ -8,7 +8,16 @@ import re
 from pathlib import Path
 
 from stereovox.errors import SourceError
-from stereovox.sources.kitti import PAIRS, KittiSource, choose_pair, folder_of, location, named_file, numbers_in
+from stereovox.sources.kitti import (
+    PAIRS,
+    KittiSource,
+    choose_pair,
+    folder_of,
+    location,
+    named_file,
+    numbers_in,
+    time_lines,
+)
 from stereovox.sources.kitti_calibration import KittiCalibration, read_calibration
 from stereovox.sources.kitti_poses import read_pose_file
 from stereovox.sources.trajectory import ns_from_seconds
@@ -78,16 +87,10 @@ def _has(folder: Path, pair: str) -> bool:
 
 def _stamps(path: Path) -> list[int]:
     """Return the times in nanoseconds; raises SourceError with the line."""
-    try:
-        lines = path.read_text("utf-8-sig", errors="replace").rstrip().splitlines()
-    except OSError as error:
-        raise SourceError(f"{path}: {error.strerror}; put the sequence's own file there") from None
-    if not lines:
-        raise SourceError(f"{path}: holds no time; put the sequence's own file there")
     stamps = []
-    for n, line in enumerate(lines, 1):
+    for n, line in enumerate(time_lines(path, "sequence"), 1):
         try:
-            stamps.append(ns_from_seconds(line.strip()))
+            stamps.append(ns_from_seconds(line))
         except ValueError as error:
             raise SourceError(f"{path}:{n}: {error}; correct the line") from None
     return stamps

@@ -10,7 +10,16 @@ from pathlib import Path
 import numpy as np
 
 from stereovox.errors import SourceError
-from stereovox.sources.kitti import PAIRS, KittiSource, choose_pair, folder_of, location, named_file, numbers_in
+from stereovox.sources.kitti import (
+    PAIRS,
+    KittiSource,
+    choose_pair,
+    folder_of,
+    location,
+    named_file,
+    numbers_in,
+    time_lines,
+)
 from stereovox.sources.kitti_calibration import CAM_TO_CAM, KittiCalibration, read_raw_calibration
 from stereovox.sources.kitti_poses import FramePoses, read_oxts_files, read_pose_file
 
@@ -102,13 +111,7 @@ def _calibration(drive: Path) -> KittiCalibration:
 
 def _stamps(path: Path) -> list[int]:
     """Return the times `2011-09-26 14:05:35.913420800` in nanoseconds; raises SourceError with the line."""
-    try:
-        lines = path.read_text("utf-8-sig", errors="replace").rstrip().splitlines()
-    except OSError as error:
-        raise SourceError(f"{path}: {error.strerror}; put the drive's own file there") from None
-    if not lines:
-        raise SourceError(f"{path}: holds no time; put the drive's own file there")
-    return [_stamp(line.strip(), f"{path}:{n}") for n, line in enumerate(lines, 1)]
+    return [_stamp(line, f"{path}:{n}") for n, line in enumerate(time_lines(path, "drive"), 1)]
 
 
 def _stamp(text: str, where: str) -> int:

@@ -10,20 +10,34 @@ import pytest
 
 SOURCE = Path(__file__).resolve().parents[1] / "src/stereovox"
 LAYERS = (
-    {"errors", "registry", "frame", "geometry", "cameras", "wide", "lenses", "rigs", "config", "_jit"},
+    {
+        "errors",
+        "registry",
+        "frame",
+        "geometry",
+        "cameras",
+        "wide",
+        "lenses",
+        "rigs",
+        "planar",
+        "config",
+        "config_robot",
+        "_jit",
+    },
     {"sources", "depth", "sensors", "maps"},
     {"integrate", "products", "localize", "calibrate"},
-    {"mapper", "evaluate", "view"},
+    {"mapper", "grid_mapper", "evaluate", "view"},
     {"batch", "cli", "ros", "__main__"},
 )
 LEVEL = {room: level for level, rooms in enumerate(LAYERS) for room in rooms}
 HOMES = {
     "cv2": r"(calibrate|depth|sources)/.*",
     "embreex": r"sources/.*",
+    "gtsam": r"localize/.*",
     "matplotlib": r"(view|products)/.*",
     "numba": r"(.*/)?_[a-z]\w*\.py",
     "octomap": r"evaluate/.*",
-    "pydantic": r"config\.py",
+    "pydantic": r"config(_robot)?\.py",
     "pyoctomap": r"evaluate/.*",
     "pyrealsense2": r"sources/.*",
     "rich": r"cli/.*",

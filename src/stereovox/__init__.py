@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from stereovox.frame import DepthImage as DepthImage
     from stereovox.frame import Frame as Frame
     from stereovox.frame import Reason as Reason
+    from stereovox.frame import Scan as Scan
     from stereovox.frame import StereoFrame as StereoFrame
     from stereovox.mapper import Mapper as Mapper
     from stereovox.mapper import UpdateReport as UpdateReport
@@ -34,6 +35,7 @@ _HOMES = {
     "StereovoxError": "errors",
     "DepthImage": "frame",
     "Frame": "frame",
+    "Scan": "frame",
     "StereoFrame": "frame",
     "StereoPair": "rigs",
     "SphericalCamera": "wide",

@@ -15,6 +15,7 @@ from typing import Any, Literal, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from stereovox.config_robot import AmclConfig, GridConfig, ScanConfig, Section, SlamConfig
 from stereovox.errors import ConfigError, did_you_mean
 
 MOST_CELLS = 8192
@@ -25,11 +26,7 @@ LARGEST_WINDOW = 1e6
 """Metres along each side of a window."""
 
 
-class _Section(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
-
-
-class NoiseConfig(_Section):
+class NoiseConfig(Section):
     """Range noise sigma(z) = s0 + s1 z + s2 z^2 in metres.
 
     Where `s2` is not set it follows from the camera: `subpixel / (focal_px * baseline)` (Chien 2020, Eq 3.5 with the
@@ -55,13 +52,13 @@ class SensorConfig(BaseModel):
         return dict(self.model_extra or {})
 
 
-class RayConfig(_Section):
+class RayConfig(Section):
     """How rays of one frame share a cell: `every` ray adds its weighted part, or the cell changes `once` a frame."""
 
     update: Literal["every", "once"] = "every"
 
 
-class ProjectiveConfig(_Section):
+class ProjectiveConfig(Section):
     """How the projective integrator counts hits.
 
     full_share: a cell's hit counts in full when so much of the cell's footprint in the image falls into it, with less
@@ -71,7 +68,7 @@ class ProjectiveConfig(_Section):
     full_share: float = Field(0.1, ge=0, le=1)
 
 
-class DepthConfig(_Section):
+class DepthConfig(Section):
     """What happens to a depth image before it becomes evidence.
 
     denoise: average depths that the camera's noise cannot tell apart, where it is large against the cells.
@@ -82,7 +79,7 @@ class DepthConfig(_Section):
     downsample: int = Field(1, ge=1, le=64)
 
 
-class StereoConfig(_Section):
+class StereoConfig(Section):
     """How the disparity of a stereo pair is found (Valenti 2018, 5.1 and 5.2); lengths are pixels of the full image.
 
     method: `sgm` (OpenCV's semi-global matching along three paths), `sgm8` (eight), `hh4` (four), `block`, `onnx`.
@@ -136,7 +133,7 @@ class StereoConfig(_Section):
         return self
 
 
-class SphereConfig(_Section):
+class SphereConfig(Section):
     """The spherical grid round the vehicle between depth and map (Valenti 2018, 5.3): none without `step_deg`.
 
     step_deg: width of a cell in both angles; must go into 180 degrees a whole number of times.
@@ -164,7 +161,7 @@ class SphereConfig(_Section):
         return self
 
 
-class WindowConfig(_Section):
+class WindowConfig(Section):
     """A box that moves with the camera by whole cells and bounds the map's memory (Chien 2020, 3.6).
 
     size: extents along the world's axes in metres; without them the map is unbounded and the rest has no meaning.
@@ -200,7 +197,7 @@ class WindowConfig(_Section):
         return self
 
 
-class MapConfig(_Section):
+class MapConfig(Section):
     """What a cell is kept in, the range of its log-odds, and the probabilities that tell the states apart.
 
     cell: `int16` holds thousandths of log-odds; `uint8` is Chien's byte (2020, 3.5): 127 unknown, 0 free, 255 occupied.
@@ -223,7 +220,7 @@ class MapConfig(_Section):
         return self
 
 
-class Config(_Section):
+class Config(Section):
     """Every setting of a run; the resolved one is saved inside the map.
 
     steps: sides of a cell along x, y and z where they differ (Valenti 2018, 7.1); `voxel_size` is then the largest.
@@ -248,6 +245,10 @@ class Config(_Section):
     window: WindowConfig = Field(default_factory=lambda: WindowConfig.model_validate({}))
     ray: RayConfig = Field(default_factory=RayConfig)
     projective: ProjectiveConfig = Field(default_factory=lambda: ProjectiveConfig.model_validate({}))
+    scan: ScanConfig = Field(default_factory=lambda: ScanConfig.model_validate({}))
+    grid: GridConfig = Field(default_factory=lambda: GridConfig.model_validate({}))
+    amcl: AmclConfig = Field(default_factory=lambda: AmclConfig.model_validate({}))
+    slam: SlamConfig = Field(default_factory=lambda: SlamConfig.model_validate({}))
 
     @model_validator(mode="before")
     @classmethod

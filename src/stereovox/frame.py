@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import NamedTuple
 
@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.cameras import PinholeCamera
-from stereovox.geometry import Transform
+from stereovox.geometry import Transform, inverse
+from stereovox.planar import flattened
 from stereovox.rigs import StereoPair, VirtualCamera
 
 
@@ -78,6 +79,44 @@ class Frame:
     name: str = ""
     fault: str | None = None
     fault_detail: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """One turn of a 2-D lidar, or what a depth image would look like to one.
+
+    ranges: (N,) float32 metres from the sensor. No value (REP 117): NaN no reading, -inf too near, +inf nothing up to
+        `range_max`.
+    angle_min, angle_step: radians; beam i points `angle_min + i * angle_step` from the sensor's x axis (forward)
+        towards its y axis (left).
+    range_min, range_max: metres between which the sensor measures.
+    T_world_sensor: (4, 4) float64, maps the sensor's frame (x forward, y left, z up) into the world (z up). As a source
+        delivers it the world is that of the odometry.
+    T_base_sensor: (4, 4) float64, where the sensor sits on the robot, whose frame stands on the floor.
+    stamp_ns, name, fault, fault_detail: as in `Frame`.
+    """
+
+    ranges: NDArray[np.float32]
+    angle_min: float
+    angle_step: float
+    range_min: float
+    range_max: float
+    T_world_sensor: Transform
+    T_base_sensor: Transform = field(default_factory=lambda: np.eye(4))
+    stamp_ns: int = 0
+    name: str = ""
+    fault: str | None = None
+    fault_detail: str = ""
+
+    @property
+    def angles(self) -> NDArray[np.float64]:
+        """Direction of each beam in the sensor's frame, (N,) radians."""
+        return self.angle_min + self.angle_step * np.arange(len(self.ranges))
+
+    @property
+    def pose_world_base(self) -> NDArray[np.float64]:
+        """Where the robot stood, seen from above: (3,) x, y, yaw."""
+        return flattened(self.T_world_sensor @ inverse(self.T_base_sensor))
 
 
 AnyFrame = Frame | StereoFrame

@@ -1,0 +1,45 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What localisation finds: by how much the odometry has drifted, over time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox import planar
+from stereovox.frame import Frame, Scan
+
+Posed = TypeVar("Posed", Frame, Scan)
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """A robot's way through a map, and its odometry's drift.
+
+    stamps_ns: (N,) int64 nanoseconds, rising.
+    pose_map_base: (N, 3) float64, where the robot stood in the map.
+    pose_map_odom: (N, 3) float64, what turns the odometry's poses into those (the `map -> odom` of ROS).
+    """
+
+    stamps_ns: NDArray[np.int64]
+    pose_map_base: planar.Pose
+    pose_map_odom: planar.Pose
+
+    def correction(self, stamp_ns: int) -> planar.Pose:
+        """Return pose_map_odom (3,) at a time: interpolated, and held before the first and after the last."""
+        after = int(np.searchsorted(self.stamps_ns, stamp_ns, side="right"))
+        if after in (0, len(self.stamps_ns)):
+            return np.asarray(self.pose_map_odom[max(after - 1, 0)], float)
+        before, start, end = after - 1, self.stamps_ns[after - 1], self.stamps_ns[after]
+        share = float(stamp_ns - start) / float(end - start)
+        step = self.pose_map_odom[after] - self.pose_map_odom[before]
+        step[2] = float(planar.wrapped(step[2]))
+        return np.asarray(self.pose_map_odom[before] + share * step, float)
+
+    def corrected(self, seen: Posed) -> Posed:
+        """Return a frame or scan whose pose is in the odometry's world with its pose in the map."""
+        T_map_odom = planar.lifted(self.correction(seen.stamp_ns))
+        return replace(seen, T_world_sensor=T_map_odom @ seen.T_world_sensor)

@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Recordings of ground robots: lidar scans, depth images and odometry, in order of time."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from heapq import merge
+from typing import Protocol
+
+from stereovox import registry
+from stereovox.errors import SourceError
+from stereovox.frame import Frame, Scan
+from stereovox.sources.poses import Poses
+
+ROBOTS = {
+    "floor": "stereovox.sources.floor:Floor",
+    "carmen": "stereovox.sources.carmen:CarmenLog",
+    "bag": "stereovox.sources.robot_bag:RobotBag",
+}
+"""Kinds of recordings, asked in this order, then those of other packages (entry points `stereovox.robots`)."""
+
+
+class Robot(Protocol):
+    """What a ground robot recorded. Poses are those of its odometry (`T_world_sensor` = T_odom_sensor).
+
+    name: what the recording is called; notes: what had to be assumed, one line each.
+    scans: the lidar's scans in order of time, read when they are asked for; empty where there is no lidar.
+    frames: the depth images in order of time, likewise.
+    truth: T_world_base where it is known (simulation), else None.
+    """
+
+    name: str
+    notes: tuple[str, ...]
+    scans: Sequence[Scan]
+    frames: Sequence[Frame]
+    truth: Poses | None
+
+    @classmethod
+    def recognises(cls, where: str) -> bool:
+        """Tell whether `where` is, or by its name should be, such a recording. Never raises."""
+        ...
+
+
+def open_robot(where: str | os.PathLike[str]) -> Robot:
+    """Return the recording of a ground robot: a bag, a CARMEN log (`.clf`, `.clf.bz2`) or `sim:floor`.
+
+    Raises SourceError, one line, where there is nothing, nothing known or nothing usable.
+    """
+    place = os.fspath(where)
+    for name in registry.names("robots", ROBOTS):
+        kind = registry.find("robots", ROBOTS, name)
+        if kind.recognises(place):
+            return kind(place)
+    if not os.path.exists(place):
+        raise SourceError(f"{place}: no such file or folder")
+    raise SourceError(f"{place}: no recording of a ground robot; give a bag with scans, a CARMEN log or sim:floor")
+
+
+def in_time_order(robot: Robot) -> Iterator[Scan | Frame]:
+    """Yield scans and depth images as they came."""
+    yield from merge(robot.scans, robot.frames, key=lambda seen: seen.stamp_ns)

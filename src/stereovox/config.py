@@ -223,11 +223,13 @@ class MapConfig(Section):
 class Config(Section):
     """Every setting of a run; the resolved one is saved inside the map.
 
+    dimensions: 3 for a voxel map, 2 for the grid of a floor (IST 2019).
     steps: sides of a cell along x, y and z where they differ (Valenti 2018, 7.1); `voxel_size` is then the largest.
     up: which axis of the world points up (`z`, `-y`, ...): pictures and heights follow it.
     """
 
     profile: str = "default"
+    dimensions: Literal[2, 3] = 3
     voxel_size: float = Field(0.05, gt=0, le=100)
     steps: tuple[float, float, float] | None = None
     min_range: float = Field(0.1, ge=0)

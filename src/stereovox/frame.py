@@ -93,6 +93,12 @@ class Scan:
     T_world_sensor: (4, 4) float64, maps the sensor's frame (x forward, y left, z up) into the world (z up). As a source
         delivers it the world is that of the odometry.
     T_base_sensor: (4, 4) float64, where the sensor sits on the robot, whose frame stands on the floor.
+    clear: (N,) float32 metres up to which each beam is known to be free, 0 for not at all; never more than the beam's
+        hit. None: as `ranges` alone tell it: a hit clears up to itself, +inf up to `range_max`, NaN and -inf nothing.
+        Scans out of depth images have it: a camera that looks down sees a beam's floor at 2 m and nothing beyond, so
+        that beam is free up to 2 m (its range: NaN).
+    clear_from: (N,) float32 metres from which on a beam is known to be free up to `clear`; None: from the sensor on. A
+        camera over the height band of its scan does not see into the band close by.
     stamp_ns, name, fault, fault_detail: as in `Frame`.
     """
 
@@ -103,6 +109,8 @@ class Scan:
     range_max: float
     T_world_sensor: Transform
     T_base_sensor: Transform = field(default_factory=lambda: np.eye(4))
+    clear: NDArray[np.float32] | None = None
+    clear_from: NDArray[np.float32] | None = None
     stamp_ns: int = 0
     name: str = ""
     fault: str | None = None

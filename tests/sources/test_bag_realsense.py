@@ -175,7 +175,7 @@ def test_two_depth_cameras_need_a_choice(tmp_path):
 def test_without_rosbags_the_cure_is_one_line(tmp_path, monkeypatch):
     path = realsense_bag(tmp_path / "walk.bag", 1)
     monkeypatch.setitem(sys.modules, "rosbags.rosbag1", None)
-    with pytest.raises(MissingExtra, match=r"pip install 'stereovox\[realsense\]'"):
+    with pytest.raises(MissingExtra, match=r"pip install 'stereovox\[bags\]'"):
         BagSource(path)
 
 

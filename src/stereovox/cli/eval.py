@@ -1,16 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
 """Compare a map with the truth, cell by cell.
 
-MAP and TRUTH are folders of stereovox or OctoMap files (.bt, .ot) with cells of the same size.
+MAP and TRUTH are folders of stereovox or OctoMap files (.bt, .ot) with cells of the same size; or both are floors' maps
+in map_server files (.yaml), of any cells, which are laid on each other first.
 """
 
 from __future__ import annotations
 
-from argparse import ArgumentParser, Namespace
+import math
+from argparse import ArgumentParser, ArgumentTypeError, Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stereovox.cli.terminal import say, thousands
+from stereovox.cli.saved_map import dimensions, refuse_options
+from stereovox.cli.terminal import command_line, say, thousands
+from stereovox.errors import StereovoxError
 
 if TYPE_CHECKING:
     from stereovox.evaluate.scores import Scores
@@ -39,29 +43,61 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "truth", metavar="TRUTH", help="map whose occupied cells hold a surface and free cells hold none"
     )
-    parser.add_argument(
-        "--threshold", type=float, default=0.7, metavar="P", help="a cell is called occupied above it (default: 0.7)"
-    )
+    said = "a cell is called occupied above it (default: 0.7; of a floor's map what its file says)"
+    parser.add_argument("--threshold", type=float, metavar="P", help=said)
     parser.add_argument(
         "--tolerance", type=int, default=1, metavar="CELLS", help="distance that is forgiven (default: 1)"
     )
     parser.add_argument("--path", metavar="FILE", help="poses of the camera, for precision and recall by distance")
     parser.add_argument("--report", metavar="DIR", help="write a page with charts there")
+    floors = parser.add_argument_group("only for floors' maps")
+    said = "region that does not count, metres in TRUTH's frame; may be given several times"
+    floors.add_argument("--exclude", action="append", default=[], type=region, metavar="X0,Y0,X1,Y1", help=said)
+    floors.add_argument("--no-align", action="store_true", help="both maps are in one frame: do not move MAP")
 
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Load both maps, compare them, tell and report."""
+    kinds = {dimensions(path) for path in (arguments.map, arguments.truth)}
+    if len(kinds) == 2:
+        space = arguments.map if dimensions(arguments.map) == 3 else arguments.truth
+        cure = command_line("export", space, "floor.yaml")
+        raise StereovoxError(f"{space}: no floor's map, the other one is; make one of it with: {cure}")
+    return JUDGED[kinds.pop()](arguments)
+
+
+def region(text: str) -> tuple[float, ...]:
+    """Return four finite numbers."""
+    try:
+        numbers = tuple(map(float, text.split(",")))
+    except ValueError:
+        numbers = ()
+    if len(numbers) != 4 or not all(map(math.isfinite, numbers)):
+        raise ArgumentTypeError(f"'{text}' is no region; give X0,Y0,X1,Y1 in metres, two opposite corners")
+    return numbers
+
+
+def _judge_grids(arguments: Namespace) -> dict[str, Any]:
+    from stereovox.cli.eval_grid import judge
+
+    refuse_options(arguments, ("path",), "distances from a camera are not for floors' maps")
+    return judge(arguments)
+
+
+def _judge_cells(arguments: Namespace) -> dict[str, Any]:
     from stereovox.evaluate.camera_path import path_fits, read_camera_path
     from stereovox.evaluate.outcomes import outcomes
     from stereovox.evaluate.read_map import read_map
     from stereovox.evaluate.scores import score
     from stereovox.evaluate.truth_cells import TruthCells, level
 
-    level(arguments.threshold)  # a wrong number shows before large maps are read
+    refuse_options(arguments, ("exclude", "no_align"), "only for floors' maps (.yaml)")
+    threshold = 0.7 if arguments.threshold is None else arguments.threshold
+    level(threshold)  # a wrong number shows before large maps are read
     path = None if arguments.path is None else read_camera_path(arguments.path)
     truth = TruthCells(read_map(arguments.truth), arguments.tolerance)
     voxel_map = read_map(arguments.map)
-    scores = score(voxel_map, truth, arguments.threshold, path=path)
+    scores = score(voxel_map, truth, threshold, path=path)
     result = scores.as_dict()
     if scores.distance is not None:
         result["distance"] = scores.distance.rows()
@@ -71,12 +107,15 @@ def run(arguments: Namespace) -> dict[str, Any]:
     if arguments.report:
         from stereovox.view.evaluation_report import Evaluated, write_evaluation_report
 
-        shown = outcomes(truth.read(voxel_map), truth, arguments.threshold)
+        shown = outcomes(truth.read(voxel_map), truth, threshold)
         evaluated = Evaluated(Path(arguments.map).name, scores, outcomes=shown)
         page = write_evaluation_report(arguments.report, [evaluated], Path(arguments.truth).name)
         say(f"report: {page}")
         result["report"] = str(page)
     return result
+
+
+JUDGED = {2: _judge_grids, 3: _judge_cells}
 
 
 def _tell(scores: Scores) -> None:

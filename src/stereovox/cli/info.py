@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tell what a map holds and how it was made."""
+"""Tell what a map holds and how it was made.
+
+MAP is a folder of stereovox, or a floor's map in map_server files (.yaml).
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,7 @@ from argparse import ArgumentParser, Namespace
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
-from stereovox.cli.saved_map import open_map
+from stereovox.cli.saved_map import dimensions, open_map
 from stereovox.cli.terminal import say, size, thousands
 
 if TYPE_CHECKING:
@@ -20,12 +23,16 @@ TOLD = ("profile", "voxel_size", "integrator", "max_range")
 
 def add_arguments(parser: ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("map", metavar="MAP", help="folder of a map")
+    parser.add_argument("map", metavar="MAP", help="folder of a map, or the .yaml of a floor's map")
 
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Load the map and tell about it."""
-    voxel_map = open_map(arguments.map)
+    return ABOUT[dimensions(arguments.map)](arguments.map)
+
+
+def _about_cells(path: str) -> dict[str, Any]:
+    voxel_map = open_map(path)
     bounds, config = voxel_map.bounds(), voxel_map.config
     result = {
         "voxel_size": voxel_map.voxel_size,
@@ -41,6 +48,15 @@ def run(arguments: Namespace) -> dict[str, Any]:
     }
     _tell(result)
     return result
+
+
+def _about_grid(path: str) -> dict[str, Any]:
+    from stereovox.cli.floor_map import about
+
+    return about(path)
+
+
+ABOUT = {2: _about_grid, 3: _about_cells}
 
 
 def _tell(result: dict[str, Any]) -> None:

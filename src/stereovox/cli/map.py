@@ -2,7 +2,8 @@
 """Turn a recording into a map.
 
 SOURCE is a 7-Scenes or TUM RGB-D folder, a camera pair, a RealSense .db3 or a ROS 1 .bag, all recognised by what they
-hold, the simulation sim:room, or a connected camera, realsense:.
+hold, the simulation sim:room, or a connected camera, realsense:. Under a profile of two dimensions (ist2019) it is the
+recording of a ground robot, as for `stereovox grid`.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from stereovox.cli.settings import add_settings, overrides
 from stereovox.cli.terminal import (
     cells_line,
     command_line,
@@ -46,14 +48,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--frames", metavar="A:B:S", help="only these frames, as a Python slice")
     parser.add_argument("--camera", metavar="FILE", help="camera file (camera.toml) that replaces the recording's own")
     parser.add_argument("--threads", type=int, metavar="N", help="threads (1); the map does not depend on it")
-    parser.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="KEY=VALUE",
-        dest="settings",
-        help="any other setting, for example sensor.model=andert; repeatable",
-    )
+    add_settings(parser, "sensor.model=andert")
     parser.add_argument(
         "--resume",
         action="store_true",
@@ -63,6 +58,8 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Map the source, save the map and tell what was done."""
+    if _of_a_floor(arguments):
+        return _grid(arguments)
     from stereovox.evaluate.summary import summarise
     from stereovox.sources import open_stream
 
@@ -92,6 +89,23 @@ def run(arguments: Namespace) -> dict[str, Any]:
     return result
 
 
+def _of_a_floor(arguments: Namespace) -> bool:
+    """Tell whether the settings ask for the 2-D map of a ground robot, as profile ist2019 does."""
+    from stereovox.config import load_config
+
+    return load_config(arguments.profile or "default", **overrides(arguments)).dimensions == 2
+
+
+def _grid(arguments: Namespace) -> dict[str, Any]:
+    """Do what `stereovox grid` does; it has more options."""
+    from stereovox.cli import grid
+
+    if arguments.camera is not None:
+        raise StereovoxError("--camera: cannot replace the camera of a ground robot; leave it out")
+    resume = arguments.out if arguments.resume else None
+    return grid.run(Namespace(**{**grid.defaults(), **vars(arguments), "resume": resume}))
+
+
 def _check_target(out: Path, resume: bool) -> None:
     """Find out before the work, not after it, that the map could not be saved."""
     from stereovox.maps.store import check_target, is_map
@@ -110,7 +124,7 @@ def _mapper(arguments: Namespace, out: Path) -> Mapper:
     if settings is None:
         settings = saved.config if saved else "default"
     tiles = out.parent / f".{out.name}-tiles"  # beside the map, not in a temporary folder that may lie in memory
-    return Mapper(settings, resume=saved, tiles=tiles, **_overrides(arguments))
+    return Mapper(settings, resume=saved, tiles=tiles, **overrides(arguments))
 
 
 def _check_recording(mapper: Mapper, source: Stream, out: Path) -> None:
@@ -121,23 +135,6 @@ def _check_recording(mapper: Mapper, source: Stream, out: Path) -> None:
             f"{out}: was made of '{made_of}', not of '{source.name}'; go on with that or leave --resume out"
         )
     mapper.map.recording = source.name
-
-
-def _overrides(arguments: Namespace) -> dict[str, Any]:
-    from stereovox.config import parse_value
-
-    overrides = {}
-    for setting in arguments.settings:
-        key, equals, value = setting.partition("=")
-        if not equals or not key:
-            raise StereovoxError(f"--set {setting}: write KEY=VALUE, for example --set sensor.p_free=0.3")
-        if key.strip() in ("profile", "resume"):
-            raise StereovoxError(f"--set {setting}: this is no setting; use --{key.strip()}")
-        if key.strip() in ("tiles", "self"):  # other names that `Mapper` knows
-            raise StereovoxError(f"--set {setting}: this is no setting; leave it out")
-        overrides[key.strip()] = parse_value(value.strip())
-    named = {name: getattr(arguments, name) for name in ("voxel_size", "integrator", "max_range", "threads")}
-    return {**overrides, **{name: value for name, value in named.items() if value is not None}}
 
 
 def _add_all(mapper: Mapper, source: Stream, out: Path) -> list[UpdateReport]:

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Draw a map as a whole, one layer of it, what the camera's optical axis meets, or its cells in space."""
+"""Draw a map as a whole, one layer of it, what the camera's optical axis meets, or its cells in space.
+
+A floor's map in map_server files (.yaml) is drawn as a plan; --view and what goes with it is for maps in space.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,7 @@ from argparse import ArgumentParser, ArgumentTypeError, Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stereovox.cli.saved_map import open_cubes
+from stereovox.cli.saved_map import dimensions, open_cubes, refuse_options
 from stereovox.cli.terminal import say
 from stereovox.errors import StereovoxError
 
@@ -23,9 +26,9 @@ USED = {"overview": (), "layer": ("at", "eye", "toward"), "axis": ("eye", "towar
 
 def add_arguments(parser: ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("map", metavar="MAP", help="folder of a map")
+    parser.add_argument("map", metavar="MAP", help="folder of a map, or the .yaml of a floor's map")
     parser.add_argument("file", metavar="FILE.png", help="picture to write")
-    parser.add_argument("--view", default="overview", metavar="NAME", help="overview (default), layer, axis or space")
+    parser.add_argument("--view", metavar="NAME", help="overview (default), layer, axis or space")
     parser.add_argument("--at", type=float, metavar="M", help="height of the layer along --up (default: the camera's)")
     parser.add_argument(
         "--up", metavar="AXIS", help="which way is up: z, -y, x ... (default: as the map's settings say)"
@@ -37,24 +40,45 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Load the map and write its picture."""
-    from stereovox.view.drawn import checked_up
     from stereovox.view.figures import save
-    from stereovox.view.views import draw_view
-    from stereovox.view.whereabouts import viewpoint_at
 
     file = Path(arguments.file)
     if file.suffix.lower() != ".png":
         raise StereovoxError(f"{file}: pictures are written as .png; name the file so")
+    heading = _plain(arguments.title or Path(arguments.map).stem)
+    save(DRAWN[dimensions(arguments.map)](arguments, heading), file)
+    say(f"saved {file}")
+    return {"picture": str(file)}
+
+
+def _draw_cells(arguments: Namespace, heading: str) -> Any:
+    """Return the figure of a map in space."""
+    from stereovox.view.drawn import checked_up
+    from stereovox.view.views import draw_view
+    from stereovox.view.whereabouts import viewpoint_at
+
+    arguments.view = arguments.view or "overview"
     _check_use(arguments)
     voxel_map = open_cubes(arguments.map)
     up = checked_up(arguments.up or voxel_map.config.up)
     viewpoint = viewpoint_at(voxel_map, arguments.eye, arguments.toward, up)
-    heading = _plain(arguments.title or Path(arguments.map).stem)
-    save(draw_view(voxel_map, arguments.view, heading, up, arguments.at, viewpoint), file)
+    drawn = draw_view(voxel_map, arguments.view, heading, up, arguments.at, viewpoint)
     if arguments.at is not None:
         _tell_if_outside(voxel_map, up, arguments.at)
-    say(f"saved {file}")
-    return {"picture": str(file)}
+    return drawn
+
+
+def _draw_grid(arguments: Namespace, heading: str) -> Any:
+    """Return the figure of a floor's map."""
+    from stereovox.cli.floor_map import check_not_its_own, open_grid
+    from stereovox.view.grid import draw_grid
+
+    refuse_options(arguments, ("view", "at", "up", "eye", "toward"), f"{arguments.map} is a floor's map, always a plan")
+    check_not_its_own(arguments.file, arguments.map)
+    return draw_grid(open_grid(arguments.map), heading)
+
+
+DRAWN = {2: _draw_grid, 3: _draw_cells}
 
 
 def _check_use(arguments: Namespace) -> None:

@@ -4,14 +4,29 @@
 from __future__ import annotations
 
 import os
+from argparse import Namespace
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from stereovox.cli.robots import GRID_ENDINGS
 from stereovox.cli.terminal import command_line
-from stereovox.errors import MapFileError
+from stereovox.errors import MapFileError, StereovoxError
 
 if TYPE_CHECKING:
     from stereovox.maps import VoxelMap
+
+
+def dimensions(path: str) -> int:
+    """Return 2 for the name of a map_server file, and 3 for all else."""
+    return 2 if Path(path).suffix.lower() in GRID_ENDINGS and not os.path.isdir(path) else 3
+
+
+def refuse_options(arguments: Namespace, names: Iterable[str], why: str) -> None:
+    """Raise StereovoxError for the first of these options that was given although it says nothing here."""
+    for name in names:
+        if getattr(arguments, name) not in (None, False, []):
+            raise StereovoxError(f"--{name.replace('_', '-')}: {why}; leave the option out")
 
 
 def open_cubes(path: str) -> VoxelMap:

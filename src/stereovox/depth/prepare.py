@@ -14,7 +14,7 @@ from stereovox.depth.correct import corrected
 from stereovox.depth.denoise import denoise
 from stereovox.depth.downsample import downsample
 from stereovox.errors import FrameRefused
-from stereovox.frame import DepthImage, Frame, Reason
+from stereovox.frame import DepthImage, Frame, Reason, Scan
 
 DTYPES = (np.dtype(np.uint16), np.dtype(np.float32), np.dtype(np.float64))
 SATURATED = 65535
@@ -32,7 +32,7 @@ def prepare(frame: Frame, config: Config) -> DepthImage:
     `pose_not_finite`, `pose_not_rigid`, `no_valid_depth`.
     """
     _check_image(frame)
-    T_world_sensor = _rigid_pose(frame, config.pose_rigidity_tolerance)
+    T_world_sensor = rigid_pose(frame, config.pose_rigidity_tolerance)
     depth_m = np.empty(frame.depth.shape, np.float32)
     reason = np.empty(frame.depth.shape, np.uint8)
     usable = _classify(frame, config, depth_m, reason)
@@ -74,7 +74,8 @@ def _check_image(frame: Frame) -> None:
         raise FrameRefused("bad_reason", f"{name}: reason must be {depth.shape} uint8 of values 0 to {max(Reason)}")
 
 
-def _rigid_pose(frame: Frame, tolerance: float) -> geometry.Transform:
+def rigid_pose(frame: Frame | Scan, tolerance: float) -> geometry.Transform:
+    """Return the rigid motion nearest to the pose; raises FrameRefused: `pose_not_finite`, `pose_not_rigid`."""
     try:
         T = np.asarray(frame.T_world_sensor, float)
     except (TypeError, ValueError):
@@ -87,5 +88,5 @@ def _rigid_pose(frame: Frame, tolerance: float) -> geometry.Transform:
     return geometry.orthonormalise(T)
 
 
-def _name(frame: Frame) -> str:
+def _name(frame: Frame | Scan) -> str:
     return frame.name or f"frame at {frame.stamp_ns} ns"

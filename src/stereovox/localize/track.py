@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
@@ -11,6 +12,8 @@ from numpy.typing import NDArray
 
 from stereovox import planar
 from stereovox.frame import Frame, Scan
+from stereovox.products.files import replacing
+from stereovox.sources.poses import seconds_from_ns
 
 Posed = TypeVar("Posed", Frame, Scan)
 
@@ -43,3 +46,14 @@ class Track:
         """Return a frame or scan whose pose is in the odometry's world with its pose in the map."""
         T_map_odom = planar.lifted(self.correction(seen.stamp_ns))
         return replace(seen, T_world_sensor=T_map_odom @ seen.T_world_sensor)
+
+    def save(self, path: str | Path) -> None:
+        """Write where the robot stood as lines `stamp tx ty tz qx qy qz qw` (TUM): seconds, metres, quaternion.
+
+        Raises MapFileError, one line, where the file cannot be written; an older one is then still there.
+        """
+        with replacing(path) as file:
+            file.write(b"# stamp tx ty tz qx qy qz qw: robot in the map, on the floor\n")
+            for stamp_ns, (x, y, yaw) in zip(self.stamps_ns.tolist(), self.pose_map_base, strict=True):
+                turn = f"{np.sin(yaw / 2):.9f} {np.cos(yaw / 2):.9f}"
+                file.write(f"{seconds_from_ns(stamp_ns)} {x:.6f} {y:.6f} 0 0 0 {turn}\n".encode())

@@ -6,6 +6,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from stereovox.config import Config
+from stereovox.errors import ConfigError
 from stereovox.maps.store import load_map
 from stereovox.maps.voxel_map import State, VoxelMap
 
@@ -18,6 +19,10 @@ def make_map(config: Config, resume: VoxelMap | None = None, tiles: Path | None 
     resume: a map to go on with. tiles: folder for the cells that leave a window, a temporary one by default; it is not
     there where this raises. Raises ConfigError when the settings would change what the cells of `resume` mean.
     """
+    if config.dimensions == 2:
+        raise ConfigError(
+            f"profile {config.profile}: dimensions 2 is a floor's grid; use GridMapper or `stereovox grid`"
+        )
     if resume is not None:
         resume.check_cells(config)  # before anything lies on the disk
     if config.window.size is None:

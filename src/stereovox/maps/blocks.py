@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A sparse set of blocks of 8x8x8 cells: a pool of values and a hash from block coordinates to the pool."""
+"""A sparse set of blocks of 8x8x8 cells: a pool of values and a hash from block coordinates to the pool.
+
+Grids keep their tiles in it too: blocks of other sizes at height 0.
+"""
 
 from __future__ import annotations
 
@@ -17,16 +20,16 @@ class BlockPool:
     """Blocks in the order they were made. Cell (i, j, k) of a block stands at `64 i + 8 j + k` of its row.
 
     coords: (capacity, 3) int32 block coordinates; block (0, 0, 0) holds cells 0..7 on each axis.
-    values: (capacity, 512) of the chosen dtype, `fill` where never written.
+    values: (capacity, `cells`) of the chosen dtype, `fill` where never written.
     flags: (capacity,) uint8 for the owner's use, zero for a new block.
     count: (1,) int64, the number of blocks in use.
     """
 
-    def __init__(self, dtype: DTypeLike, capacity: int = 256, fill: int = 0):
+    def __init__(self, dtype: DTypeLike, capacity: int = 256, fill: int = 0, cells: int = CELLS):
         self.fill = fill
         self.count = np.zeros(1, np.int64)
         self.coords = np.zeros((capacity, 3), np.int32)
-        self.values = np.full((capacity, CELLS), fill, dtype) if fill else np.zeros((capacity, CELLS), dtype)
+        self.values = np.full((capacity, cells), fill, dtype) if fill else np.zeros((capacity, cells), dtype)
         self.flags = np.zeros(capacity, np.uint8)
         self.table = np.full(_table_size(capacity), -1, np.int32)
 
@@ -36,7 +39,7 @@ class BlockPool:
     @property
     def memory_bytes(self) -> int:
         """Bytes of all arrays in use: filled blocks and the hash."""
-        return len(self) * (self.values.itemsize * CELLS + self.coords.itemsize * 3) + self.table.nbytes
+        return len(self) * (self.values[0].nbytes + self.coords.itemsize * 3) + self.table.nbytes
 
     def reserve(self, more: int) -> None:
         """Make room for `more` further blocks; existing blocks keep their place."""

@@ -15,20 +15,28 @@ EXPORTS = {
     ".ot": "stereovox.products.octomap_write:write_ot",
     ".ply": "stereovox.products.points:write_ply",
     ".npz": "stereovox.products.points:write_npz",
+    ".pgm": "stereovox.products.projection:write_grid",
+    ".png": "stereovox.products.projection:write_grid",
+    ".yaml": "stereovox.products.projection:write_grid",
 }
 """File ending -> writer `(voxel_map, path) -> None`; other packages add theirs as entry points `stereovox.export`."""
+FLAT = (".pgm", ".png", ".yaml")
+"""Endings of 2-D maps, whose writer takes `heights` too."""
 
-__all__ = ["EXPORTS", "export", "read_octomap"]
+__all__ = ["EXPORTS", "FLAT", "export", "read_octomap"]
 
 
-def export(voxel_map: VoxelMap, path: str | Path) -> None:
+def export(voxel_map: VoxelMap, path: str | Path, heights: tuple[float, float] | None = None) -> None:
     """Write `voxel_map` to the file `path` in the format its ending names; a failed export leaves an older file whole.
 
-    Raises StereovoxError: one line about an unknown ending, a place that cannot be written, or cells the format
-    cannot hold.
+    heights: for 2-D maps, the lowest and highest metres that mark cells (see `projection.project`).
+    Raises StereovoxError: one line about an unknown ending, a place that cannot be written, cells the format cannot
+    hold, or heights where they have no meaning.
     """
     ending = Path(path).suffix.lower()
     known = registry.names("export", EXPORTS)
     if ending not in known:
         raise StereovoxError(f"{path}: cannot export to '{ending}'; end the file's name with one of {', '.join(known)}")
-    registry.find("export", EXPORTS, ending)(voxel_map, path)
+    if heights is not None and ending not in FLAT:
+        raise StereovoxError(f"{path}: heights are for 2-D maps alone; end the file's name with {' or '.join(FLAT)}")
+    registry.find("export", EXPORTS, ending)(voxel_map, path, *([] if heights is None else [heights]))

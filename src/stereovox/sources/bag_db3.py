@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from stereovox.errors import FrameRefused, SourceError
 from stereovox.sources.bag_files import MAX_BYTES, BagFile, one_line
 from stereovox.sources.bag_messages import Wire
-
-ZSTD = b"\x28\xb5\x2f\xfd"
+from stereovox.sources.bag_unpack import unzipped
 
 
 class Db3File(BagFile):
@@ -55,8 +54,7 @@ class Db3File(BagFile):
                 row = self._file.execute("SELECT data FROM messages WHERE id = ?", (key,)).fetchone()
             if row is None or not isinstance(row[0], bytes):
                 raise ValueError("holds no message")
-            data = _unzstd(row[0]) if row[0][:4] == ZSTD else row[0]
-            return Wire(data, cdr=True)
+            return Wire(unzipped(row[0], MAX_BYTES), cdr=True)
         except (sqlite3.Error, SourceError, ValueError, OverflowError, MemoryError) as error:
             raise FrameRefused("unreadable", f"{self.path}: message {i} of {topic}: {one_line(error)}") from None
 
@@ -70,17 +68,3 @@ class Db3File(BagFile):
                 raise SourceError(f"{self.path}: topic {topic}: {one_line(error)}; record or copy it again") from None
             self._ids[topic] = rows[:, 0], rows[:, 1]
         return self._ids[topic]
-
-
-def _unzstd(data: bytes) -> bytes:
-    """Return an unpacked message: until 2.58, librealsense packed every message by itself."""
-    try:
-        import zstandard
-    except ImportError:
-        raise SourceError("packed with zstd; install what unpacks it: pip install zstandard") from None
-    try:
-        if not 0 < zstandard.get_frame_parameters(data).content_size <= MAX_BYTES:
-            raise ValueError("tells of an absurd size")
-        return zstandard.ZstdDecompressor().decompress(data)
-    except zstandard.ZstdError as error:
-        raise ValueError(str(error)) from None

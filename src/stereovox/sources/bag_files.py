@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The two kinds of files that hold recorded ROS messages: `.bag` (ROS 1) and `.db3` (ROS 2, SQLite).
+"""The kinds of files that hold recorded ROS messages: `.bag` (ROS 1), `.db3` and `.mcap` (ROS 2), and rosbag2 folders.
 
-Both give any message of any topic by its number. Whatever is wrong with a file ends in one line, and nothing is
+All give any message of any topic by its number. Whatever is wrong with a file ends in one line, and nothing is
 allocated because a damaged file says so: reads are bounded by the size of the file, unpacking by `MAX_BYTES`.
 """
 
@@ -19,17 +19,21 @@ from stereovox.sources.bag_messages import Wire
 
 MAX_BYTES = 256 * 1024 * 1024
 """A message or chunk that unpacks to more than this is taken for damaged."""
-MAGIC = {b"#ROSBAG V": ".bag", b"SQLite fo": ".db3"}
+MAGIC = {b"#ROSBAG V": ".bag", b"SQLite fo": ".db3", b"\x89MCAP0\r\n\1": ".mcap"}
+FOLDER = "folder"
+"""What `suffix_of` calls a folder of rosbag2."""
 
 
 class BagFile(Protocol):
     """Recorded messages by topic and number, in order of the time at which they were recorded.
 
     types: message type of every topic that has messages, as `sensor_msgs/Image`.
+    notes: what is wrong with the file though it can be read, one line each.
     """
 
     path: Path
     types: dict[str, str]
+    notes: tuple[str, ...] = ()
 
     def stamps(self, topic: str) -> NDArray[np.int64]:
         """Return the (N,) times in nanoseconds at which the messages of `topic` were recorded, in order."""
@@ -41,8 +45,15 @@ class BagFile(Protocol):
 
 
 def suffix_of(path: str) -> str:
-    """Return `.bag` or `.db3` for a file that is, or by its name should be, such a recording; else "". Never raises."""
+    """Return `.bag`, `.db3` or `.mcap` for a file that is, or by its name should be, such a recording, else "".
+
+    `FOLDER` for a folder that rosbag2 made. Never raises.
+    """
     try:
+        if os.path.isdir(path):
+            from stereovox.sources.bag_folder import is_bag_folder
+
+            return FOLDER if is_bag_folder(path) else ""
         if not os.path.isfile(path):  # a named pipe would be waited for
             return ""
         with open(path, "rb") as file:
@@ -54,7 +65,11 @@ def suffix_of(path: str) -> str:
 
 
 def open_bag(path: Path) -> BagFile:
-    """Open a `.bag` or `.db3`; raises SourceError, one line, where it is empty, something else or damaged."""
+    """Open a `.bag`, `.db3`, `.mcap` or rosbag2 folder; raises SourceError, one line, for anything else or damage."""
+    if path.is_dir():
+        from stereovox.sources.bag_folder import FolderFile
+
+        return FolderFile(path)
     try:
         with path.open("rb") as file:
             start = file.read(9)
@@ -63,11 +78,16 @@ def open_bag(path: Path) -> BagFile:
     if not start:
         raise SourceError(f"{path}: the file is empty; record or copy it again")
     if start not in MAGIC:
-        raise SourceError(f"{path}: neither a ROS 1 bag (version 2.0) nor a .db3 recording, whatever its name says")
+        what = "neither a ROS 1 bag (version 2.0) nor a .db3 or .mcap recording"
+        raise SourceError(f"{path}: {what}, whatever its name says")
     if MAGIC[start] == ".bag":
         from stereovox.sources.bag_ros1 import Ros1File
 
         return Ros1File(path)
+    if MAGIC[start] == ".mcap":
+        from stereovox.sources.bag_mcap import McapFile
+
+        return McapFile(path)
     from stereovox.sources.bag_db3 import Db3File
 
     return Db3File(path)

@@ -11,7 +11,10 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
-from typing import Any
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
 
 STAMP_LIMIT = 2**63
 STAMPED = ("PoseStamped", "PoseWithCovarianceStamped", "TransformStamped", "Odometry")
@@ -27,7 +30,7 @@ class Wire:
 
     def __init__(self, data: bytes | memoryview, cdr: bool):
         self._view, self._cdr, self._at, self._start = memoryview(data), cdr, 0, 0
-        self._order = "<"
+        self._order: Literal["<", ">"] = "<"
         if cdr:
             self._order = "<" if bytes(self.block(4))[1:2] == b"\1" else ">"
             self._start = 4
@@ -47,6 +50,14 @@ class Wire:
     def number(self, code: str = "I") -> Any:
         """Return one number of the struct type `code`."""
         return self.numbers(code)[0]
+
+    def array(self, code: str, count: int) -> NDArray[np.generic]:
+        """Return `count` numbers of the NumPy type `code` (`f4`) as an array (count,) in the machine's byte order."""
+        dtype = np.dtype(code)
+        if self._cdr and count:  # aligned only where something follows
+            self._at += -(self._at - self._start) % dtype.itemsize
+        stored = np.frombuffer(self.block(dtype.itemsize * count), dtype.newbyteorder(self._order))
+        return stored.astype(dtype)
 
     def block(self, size: int) -> memoryview:
         """Return the next `size` bytes, not copied."""

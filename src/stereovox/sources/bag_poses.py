@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The topic of a recording that holds poses: a T265's own, or those of ordinary ROS messages."""
+"""What tells poses in a recording: a T265's own topic, /tf, or a topic of ordinary ROS messages."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from stereovox.errors import FrameRefused, SourceError, did_you_mean
 from stereovox.sources.bag_files import BagFile
 from stereovox.sources.bag_messages import POSE_TYPES, StampedPose, ns_from_ms, read_pose
 from stereovox.sources.bag_metadata import Metadata
+from stereovox.sources.bag_tf import TfPoses, read_tf, tf_poses
 from stereovox.sources.poses import Poses
 from stereovox.sources.trajectory import transforms
 
@@ -29,31 +30,54 @@ class FoundPoses:
     assumed: else, what is assumed about them.
     """
 
-    poses: Poses | None
+    poses: Poses | TfPoses | None
     missing: str = ""
     tracker: bool = False
     of_camera: bool = False
     assumed: str = ""
 
 
-def find_poses(file: BagFile, topic: str = "", frame_id: str = "") -> FoundPoses:
-    """Return the poses of `topic`, or of the only topic that has some; `frame_id`: frame of the depth images.
+def find_poses(file: BagFile, topic: str = "", frame_id: str = "", world_frame: str = "") -> FoundPoses:
+    """Return the poses of `topic`, else what /tf tells of the camera, else those of the only topic that has some.
 
-    Raises SourceError where the named topic does not exist or has no poses.
+    frame_id: frame of the depth images, "" to leave /tf alone. world_frame: see `bag_tf.tf_poses`.
+    Raises SourceError where the named topic does not exist or has no poses, and where /tf does not know `world_frame`.
     """
     if topic:
-        if topic not in file.types:
-            raise SourceError(f"{file.path}: no topic {topic} with messages{did_you_mean(topic, file.types)}")
-        if file.types[topic] not in POSE_TYPES:
-            raise SourceError(f"{file.path}: {topic} holds {file.types[topic]}, no poses; name one of {_known()}")
-    found = [topic] if topic else pose_topics(file)
+        return topic_poses(file, topic, frame_id)
+    found, by_tf, why = pose_topics(file), None, ""
+    if frame_id or world_frame:
+        by_tf, why = _from_tf(file, frame_id, world_frame)
+    if by_tf:
+        others = f"; ?poses={' or ?poses='.join(found)} for others" if found else ""
+        return FoundPoses(by_tf, assumed=f"{by_tf.where}: these poses count{others}")
     if len(found) > 1:
         say = f"several topics with poses, say which: ?poses={' or ?poses='.join(found)}"
         return FoundPoses(None, f"{file.path}: {say}")
     if not found:
-        tf = " (/tf is not read)" if "/tf" in file.types else ""
-        return FoundPoses(None, f"{file.path}: holds no poses{tf}; {CURE}")
+        return FoundPoses(None, f"{why or f'{file.path}: holds no poses'}; {CURE}")
     return _read(file, found[0], frame_id)
+
+
+def topic_poses(file: BagFile, topic: str, frame_id: str = "") -> FoundPoses:
+    """Return the poses of `topic`; raises SourceError where there is no such topic or it has no poses."""
+    if topic not in file.types:
+        raise SourceError(f"{file.path}: no topic {topic} with messages{did_you_mean(topic, file.types)}")
+    if file.types[topic] not in POSE_TYPES:
+        raise SourceError(f"{file.path}: {topic} holds {file.types[topic]}, no poses; name one of {_known()}")
+    return _read(file, topic, frame_id)
+
+
+def _from_tf(file: BagFile, frame_id: str, world_frame: str) -> tuple[TfPoses | None, str]:
+    """Return what /tf tells of the camera; without it, why it does not."""
+    tf = read_tf(file)
+    if tf is None or not frame_id:
+        if world_frame:
+            lacks = "no /tf" if tf is None else "no frame_id with its depth images"
+            raise SourceError(f"{file.path}: has {lacks}; leave ?world_frame={world_frame} out")
+        return None, ""
+    found = tf_poses(tf, frame_id, world_frame)
+    return (None, found) if isinstance(found, str) else (found, "")
 
 
 def pose_topics(file: BagFile) -> list[str]:

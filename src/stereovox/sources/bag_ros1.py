@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from stereovox.errors import FrameRefused, MissingExtra, SourceError
 from stereovox.sources.bag_files import MAX_BYTES, BagFile, one_line
 from stereovox.sources.bag_messages import Wire
+from stereovox.sources.bag_unpack import unpacked
 
-STEP = 4 * 1024 * 1024
 CHUNKS = 4
 """Unpacked chunks kept: enough for an image, its metadata and the poses around it."""
 
@@ -29,7 +29,7 @@ class Ros1File(BagFile):
         try:
             from rosbags.rosbag1 import Reader
         except ImportError:
-            raise MissingExtra("rosbags", "realsense") from None
+            raise MissingExtra("rosbags", "bags") from None
         self.path = path
         self._reader = Reader(cast(Any, _Bounded(path)))
         try:
@@ -116,20 +116,7 @@ class _BoundedFile:
 
 def _unpacked(data: bytes, decompressor: Any) -> bytes:
     """Return the contents of a chunk; raises ValueError for one that is damaged or swells beyond `MAX_BYTES`."""
-    import bz2
-
-    import lz4.frame
     from rosbags.rosbag1.reader import decompressors
 
-    kinds = {decompressors["bz2"]: bz2.BZ2Decompressor, decompressors["lz4"]: lz4.frame.LZ4FrameDecompressor}
-    if decompressor not in kinds:
-        return data
-    unpacking, parts, size = kinds[decompressor](), [], 0
-    while not unpacking.eof and size <= MAX_BYTES:  # in steps: lz4 makes room for all of `max_length` at once
-        parts.append(unpacking.decompress(b"" if parts else data, max_length=STEP))
-        if unpacking.needs_input and not unpacking.eof:
-            raise ValueError("a chunk is cut off")
-        size += len(parts[-1])
-    if size > MAX_BYTES:
-        raise ValueError("a chunk unpacks to an absurd size")
-    return b"".join(parts)
+    packing = next((name for name in ("bz2", "lz4") if decompressors[name] is decompressor), "")
+    return unpacked(data, packing, MAX_BYTES)

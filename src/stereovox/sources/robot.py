@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from heapq import merge
 from typing import Protocol
 
@@ -57,6 +57,6 @@ def open_robot(where: str | os.PathLike[str]) -> Robot:
     raise SourceError(f"{place}: no recording of a ground robot; give a bag with scans, a CARMEN log or sim:floor")
 
 
-def in_time_order(robot: Robot) -> Iterator[Scan | Frame]:
-    """Yield scans and depth images as they came."""
-    yield from merge(robot.scans, robot.frames, key=lambda seen: seen.stamp_ns)
+def in_time_order(*streams: Iterable[Scan | Frame]) -> Iterator[Scan | Frame]:
+    """Yield what several streams hold, each in order of time, as it came."""
+    yield from merge(*streams, key=lambda seen: seen.stamp_ns)

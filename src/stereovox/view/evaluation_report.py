@@ -78,14 +78,7 @@ def write_evaluation_report(
     truth: what the maps were compared with, in words or as a file name. Raises StereovoxError for no result at all and
     where the page cannot be written.
     """
-    text = evaluation_page(results, truth, heading)
-    file = Path(folder) / "evaluation.html"
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise StereovoxError(f"{folder}: cannot write the report ({error.strerror or error}); name a folder") from None
-    return file
+    return page.write_page(folder, "evaluation.html", evaluation_page(results, truth, heading))
 
 
 def evaluation_page(results: Sequence[Evaluated], truth: str, heading: str = "How good is the map?") -> str:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +34,11 @@ def headline(figure: Any, voxel_map: VoxelMap, text: str) -> None:
     counts = voxel_map.counts()
     facts = [f"cells of {voxel_map.voxel_size:g} m", f"{voxel_map.frames:,} frames"]
     facts += [f"{counts[state]:,} {state}" for state in ("occupied", "free", "tentative")]
+    words_above(figure, text, facts)
+
+
+def words_above(figure: Any, text: str, facts: Sequence[str]) -> None:
+    """Write a title, and below it a line of facts."""
     figure.text(0.02, 1 - 0.42 / figure.get_figheight(), text, fontsize=20, weight="bold", color=INK)
     figure.text(0.02, 1 - 0.76 / figure.get_figheight(), "   ·   ".join(facts), fontsize=12.5, color=GREY)
 

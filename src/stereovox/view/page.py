@@ -7,7 +7,10 @@ import base64
 from collections.abc import Iterable, Sequence
 from html import escape
 from importlib.resources import files
+from pathlib import Path
 from typing import Any
+
+from stereovox.errors import StereovoxError
 
 MANY = 7
 """Columns of a table up to which a page has room for large letters."""
@@ -20,6 +23,20 @@ def page(title: str, lead: str, *parts: str) -> str:
     for name, value in fields.items():
         text = text.replace(f"{{{{{name}}}}}", value)
     return text
+
+
+def write_page(folder: str | Path, name: str, text: str) -> Path:
+    """Write a page into `folder`, made where it is missing, and return its path.
+
+    Raises StereovoxError, one line, where it cannot be written.
+    """
+    file = Path(folder) / name
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise StereovoxError(f"{folder}: cannot write the report ({error.strerror or error}); name a folder") from None
+    return file
 
 
 def section(heading: str, text: str, *parts: str) -> str:

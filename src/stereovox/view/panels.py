@@ -42,7 +42,7 @@ def oblique(axis: Any, drawn: Drawn, colours: NDArray[np.floating], direction: D
     left, right = axis.get_xlim()
     bottom, top = axis.get_ylim()
     axis.set(xlim=(left, right), ylim=(bottom - 0.1 * (top - bottom), top))
-    _scale_bar(axis)
+    scale_bar(axis)
     _triad(axis, direction, drawn.names, _emptiest_corner(axis.images[0].get_array()))
 
 
@@ -95,7 +95,8 @@ def _trajectory(axis: Any, points: NDArray[np.float64]) -> None:
     axis.plot(*points[-1:].T, "s", color=PATH_COLOUR, markeredgecolor="white", markersize=7)
 
 
-def _scale_bar(axis: Any) -> None:
+def scale_bar(axis: Any) -> None:
+    """Draw a bar of a round length, with that length, at the lower right of a panel in metres."""
     left, right = axis.get_xlim()
     bottom, top = axis.get_ylim()
     length = round_length((right - left) / 6)

@@ -14,9 +14,9 @@ from stereovox.evaluate.reproduce.chapter import Progress
 PAPERS = {
     "chien2020": "stereovox.evaluate.reproduce.chien2020:reproduce",
     "valenti2018": "stereovox.evaluate.reproduce.valenti2018:reproduce",
-    "ist2019": "",
+    "ist2019": "stereovox.evaluate.reproduce.ist2019:reproduce",
 }
-"""Function `(out, data, quick, progress) -> dict` of each paper; empty: known, but not in this version."""
+"""Function `(out, data, quick, progress) -> dict` of each paper."""
 
 
 def reproduce(
@@ -30,15 +30,13 @@ def reproduce(
     """Make the experiments of a paper again and write `report.html` and `numbers.json` into folder `out`.
 
     data: what the paper's experiments need besides simulation (chien2020: a recording of your own, mapped as well;
-    valenti2018: a folder with KITTI tracking sequences, or a drive of KITTI raw data).
+    valenti2018: a folder with KITTI tracking sequences, or a drive of KITTI raw data; ist2019: a bag of your own, in
+    place of the simulated ones).
     quick: fewer frames; enough to see that all works, not to quote. Returns the numbers, fit for JSON.
-    Raises StereovoxError, one line, for an unknown paper and one that is not in this version.
+    Raises StereovoxError, one line, for an unknown paper.
     """
     if paper not in PAPERS:
         raise StereovoxError(f"unknown paper '{paper}'{did_you_mean(paper, PAPERS)}")
-    if not PAPERS[paper]:
-        known = ", ".join(name for name, where in PAPERS.items() if where)
-        raise StereovoxError(f"{paper}: its experiments are not in this version; there is {known}")
     module, _, name = PAPERS[paper].partition(":")
     run: Callable[..., dict[str, Any]] = getattr(import_module(module), name)
     return run(Path(out), data, quick, progress or (lambda done, total, text: None))

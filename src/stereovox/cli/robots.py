@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the commands for ground robots have in common: recordings, settings, and the files they write."""
+
+from __future__ import annotations
+
+import os
+from argparse import ArgumentParser, Namespace
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from stereovox.cli.recordings import check_folder
+from stereovox.cli.settings import add_settings, overrides
+from stereovox.cli.terminal import say
+from stereovox.errors import StereovoxError
+
+if TYPE_CHECKING:
+    from stereovox.config import Config
+    from stereovox.sources.robot import Robot
+
+GRID_ENDINGS = (".yaml", ".pgm", ".png")
+"""Files of a 2-D map: the picture and its .yaml are written together, whichever is named."""
+
+
+def add_robot(parser: ArgumentParser) -> None:
+    """Declare the recording and the settings."""
+    parser.add_argument("source", metavar="ROBOT", help="a bag with scans, a CARMEN log (.clf, .clf.bz2) or sim:floor")
+    parser.add_argument("--profile", default="default", metavar="P", help="profile name or TOML file (default)")
+    add_settings(parser, "slam.voxel_size=0.1")
+
+
+def settings_of(arguments: Namespace) -> Config:
+    """Return the settings that profile and options ask for."""
+    from stereovox.config import load_config
+
+    return load_config(arguments.profile, **overrides(arguments))
+
+
+def opened(where: str) -> Robot:
+    """Open the recording and say what had to be assumed about it."""
+    from stereovox.sources.robot import open_robot
+
+    robot = open_robot(where)
+    for note in robot.notes:
+        say(f"note: {note}")
+    return robot
+
+
+def check_file(out: str, endings: Iterable[str], option: str = "--out") -> Path:
+    """Return `out` as a path; raises StereovoxError before the work where it could not be written after it."""
+    path = Path(out)
+    if path.suffix.lower() not in endings:
+        raise StereovoxError(f"{option} {out}: give a name that ends in {' or '.join(endings)}")
+    if os.path.isdir(out):
+        raise StereovoxError(f"{option} {out}: is a folder; name a file")
+    check_folder(path.absolute().parent, option, out)
+    return path

@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Kernel that gathers the pixels of a depth image in the beams of a scan."""
+
+import numpy as np
+
+from stereovox._jit import cell, kernel
+from stereovox.depth._sphere import _arctan2
+
+VALID, TOO_NEAR, TOO_FAR = np.uint8(0), np.uint8(2), np.uint8(3)
+ZERO, HALF, TINY, INF = np.float32(0), np.float32(0.5), np.float32(1e-12), np.float32(np.inf)
+
+
+@kernel
+def gather(depth_m, reason, columns, rows, edge_columns, edge_rows, turn, band, fan, beams, scratch):
+    """Fill `beams` from a REP 117 depth image (height, width) and its reasons.
+
+    columns, rows: `camera.rays()`; edge_columns (width + 1,), edge_rows (height + 1, 2): those of the pixels' borders.
+    turn: (3, 3) maps the optical frame into the scan's: forward, left, up. band, fan, beams: see scan.py.
+    scratch: (7, width + 1) float32.
+    """
+    height, width = depth_m.shape
+    before, after, hits, starts, ends = scratch[0], scratch[1], scratch[2], scratch[3], scratch[4]
+    firsts, lasts = scratch[5, :width].view(np.int32), scratch[6, :width].view(np.int32)
+    above = band.camera > band.high  # the steepest rays meet the band first, and they are in the lowest rows
+    within = (band.camera >= band.low) & (band.camera <= band.high)
+    _places(edge_columns, edge_rows[height if above else 0], turn, fan, before)
+    for i in range(height):
+        v = height - 1 - i if above else i
+        _places(edge_columns, edge_rows[v if above else v + 1], turn, fan, after)
+        _cover(before, after, fan, firsts, lasts)
+        _rays(depth_m[v], reason[v], columns, rows[v], turn, band, hits, starts, ends)
+        if within:
+            _add(firsts, lasts, hits, ends, beams)
+        else:
+            _join(firsts, lasts, hits, starts, ends, beams)
+        before, after = after, before
+
+
+@cell
+def _places(columns, row, turn, fan, places):
+    """Fill where in the fan the rays of one row point."""
+    down, ahead = row[0], row[1]
+    f0, l0 = turn[0, 1] * down + turn[0, 2] * ahead, turn[1, 1] * down + turn[1, 2] * ahead
+    for u in range(columns.size):
+        angle = _arctan2(turn[1, 0] * columns[u] + l0, turn[0, 0] * columns[u] + f0)
+        places[u] = angle * fan.per_radian + fan.offset
+
+
+@cell
+def _cover(before, after, fan, firsts, lasts):
+    """Fill the first and last beam of each pixel: those whose middle it covers, else the one its own middle is in."""
+    for u in range(firsts.size):
+        low = min(min(before[u], before[u + 1]), min(after[u], after[u + 1]))
+        high = max(max(before[u], before[u + 1]), max(after[u], after[u + 1]))
+        first, last = np.ceil(low), np.floor(high)
+        middle = np.floor(HALF * (low + high) + HALF)
+        none = first > last
+        first, last = middle if none else first, middle if none else last
+        firsts[u] = np.int32(min(max(first, ZERO), fan.last))
+        lasts[u] = np.int32(min(max(last, ZERO), fan.last))
+
+
+@cell
+def _rays(depth, reason, columns, row, turn, band, hits, starts, ends):
+    """Fill what each ray of a row says, in metres along the floor: its hit, from where to where in the band it is free.
+
+    The hit is -inf where something too near may be in the band, inf where there is none. A ray that says nothing, is
+    too steep or looks back is free up to 0.
+    """
+    down, ahead = row[0], row[1]
+    f0, l0 = turn[0, 1] * down + turn[0, 2] * ahead, turn[1, 1] * down + turn[1, 2] * ahead
+    z0 = turn[2, 1] * down + turn[2, 2] * ahead
+    for u in range(columns.size):
+        forward, left, z = turn[0, 0] * columns[u] + f0, turn[1, 0] * columns[u] + l0, turn[2, 0] * columns[u] + z0
+        way = np.sqrt(forward * forward + left * left)
+        counts = (forward > ZERO) & (abs(z) < band.steepest * way)
+        rise = z if abs(z) > TINY else TINY
+        a, b = (band.low - band.camera) / rise, (band.high - band.camera) / rise
+        enter, leave = max(min(a, b), ZERO), max(a, b)
+        why = reason[u]
+        seen = depth[u] if why == VALID else (band.far if why == TOO_FAR else ZERO)
+        level = band.camera + seen * z
+        inside = (why == VALID) & (level >= band.low) & (level <= band.high) & (seen * way <= band.range_max)
+        near = (why == TOO_NEAR) & (enter <= leave) & (enter < band.near)
+        hit = seen * way if inside & counts else INF
+        hits[u] = -INF if near & counts else hit
+        starts[u] = enter * way
+        ends[u] = min(min(seen, leave) * way, band.range_max) if counts else ZERO
+
+
+@cell
+def _add(firsts, lasts, hits, ends, beams):
+    """Take in the rays of a row that are in the band from the camera on."""
+    for u in range(firsts.size):
+        b = firsts[u]
+        beams.hit[b] = min(beams.hit[b], hits[u])
+        beams.end[b] = max(beams.end[b], ends[u])
+        for more in range(b + 1, lasts[u] + 1):
+            beams.hit[more] = min(beams.hit[more], hits[u])
+            beams.end[more] = max(beams.end[more], ends[u])
+
+
+@cell
+def _join(firsts, lasts, hits, starts, ends, beams):
+    """Take in the rays of a row that enter the band somewhere; what lies in a gap between two rays nobody has seen."""
+    for u in range(firsts.size):
+        for b in range(firsts[u], lasts[u] + 1):
+            beams.hit[b] = min(beams.hit[b], hits[u])
+            start, end = starts[u], ends[u]
+            first = beams.end[b] == ZERO
+            if (end > start) & (first | ((start <= beams.end[b]) & (end >= beams.start[b]))):
+                beams.start[b] = start if first else min(beams.start[b], start)
+                beams.end[b] = max(beams.end[b], end)

@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A depth image as a scan: what a 2-D lidar would see in the camera's place (IST 2019, III-C)."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.config import Config
+from stereovox.depth import _scan
+from stereovox.depth.scan_view import (
+    STEEPEST_DEG,
+    Directions,
+    Rays,
+    check_heights,
+    directions,
+    level_rows,
+    levelled,
+    pixel_angle,
+    rays_of,
+)
+from stereovox.errors import ConfigError
+from stereovox.frame import DepthImage, Scan
+from stereovox.planar import lifted
+
+STEEPEST = np.tan(np.radians(STEEPEST_DEG))
+WHOLE = 1e-3
+"""What is free up to `range_max` but for this share of it is free up to it: rays are not exactly level."""
+
+
+class Band(NamedTuple):
+    """Which heights count and how far, in metres; near and far are depths, range_max a way along the floor."""
+
+    low: np.float32
+    high: np.float32
+    camera: np.float32
+    near: np.float32
+    far: np.float32
+    range_max: np.float32
+    steepest: np.float32  # rise over way from which on a ray says nothing
+
+
+class Fan(NamedTuple):
+    """A ray at `angle` radians to the left points to angle * per_radian + offset; beam b is there from b - 0.5 on."""
+
+    per_radian: np.float32
+    offset: np.float32
+    last: np.float32
+
+
+class Beams(NamedTuple):
+    """What is known of each beam, (N,) arrays as the kernel writes them, in metres along the floor."""
+
+    hit: NDArray[np.float32]  # inf: none; -inf: something is nearer than the camera can tell
+    start: NDArray[np.float32]  # free from here
+    end: NDArray[np.float32]  # up to here; 0: nowhere
+
+
+def scan_of(image: DepthImage, config: Config) -> Scan:
+    """Return the scan that a depth image stands for; the world's z is the height over the floor.
+
+    The scan's sensor stands in the camera, upright, with its x axis where the camera looks; ranges are metres along
+    the floor. `scan.method` `rows` takes the nearest of a few rows round the one that looks level (the job of
+    depthimage_to_laserscan), `cloud` the nearest of all points within `scan.heights` (pointcloud_to_laserscan). A
+    pixel belongs to each beam whose middle it covers, or else to the one in which its own middle is. Any camera will
+    do; rays that look back or are steeper than 80 degrees say nothing.
+
+    A beam is -inf, and free nowhere, where something is too near that may be within the heights; else it has the range
+    of its nearest point; else +inf where it is free all the way to `max_range`, else NaN. `clear` says how far: up to
+    where some ray of the beam was seen to be free *within the heights*. Where all its rays end or leave the heights,
+    so does the knowledge. One ray is enough, as with a lidar: what stands lower than all rays of its beam goes unseen.
+    Points farther than `max_range` along the floor are none: their rays are free up to there.
+
+    Raises FrameRefused: `camera_tilted` where no row looks level (method `rows`), `camera_vertical` where the camera
+    looks straight up or down, `heights_not_seen` where no ray meets the heights; ConfigError where z is not up.
+    """
+    if config.up.removeprefix("+") != "z":
+        raise ConfigError(f"up {config.up}: scans need a world whose z axis points up; turn the poses, and set up=z")
+    turn, yaw = levelled(image)
+    rays, rows, heights = rays_of(image.camera), slice(0, image.camera.height), config.scan.heights
+    if config.scan.method == "rows":
+        rows = level_rows(image, rays, turn, config.scan.rows, config.scan.off_level_deg)
+        rays, heights = rays.of_rows(rows), (-np.inf, np.inf)
+    check_heights(image, rays, turn, heights, config.max_range)
+    step = config.scan.angle_step_deg
+    where, flattest = directions(rays, turn, pixel_angle(image.camera) if step is None else np.radians(step))
+    camera, depths = image.T_world_sensor[2, 3], (config.min_range, config.max_range)
+    band = Band(*np.array([*heights, camera, *depths, config.max_range, STEEPEST], np.float32))
+    beams = _gathered(image.depth_m[rows], image.reason[rows], rays, turn, band, where)
+    ranges, clear, clear_from = _told(beams, config.max_range)
+    T = lifted([*image.T_world_sensor[:2, 3], yaw])
+    T[2, 3] = image.T_world_sensor[2, 3]
+    return Scan(
+        ranges, where.first, where.step, config.min_range * flattest, config.max_range, T,
+        clear=clear, clear_from=clear_from, stamp_ns=image.stamp_ns,
+    )  # fmt: skip
+
+
+def _gathered(
+    depth_m: NDArray[np.float32],
+    reason: NDArray[np.uint8],
+    rays: Rays,
+    turn: NDArray[np.float64],
+    band: Band,
+    where: Directions,
+) -> Beams:
+    n = where.number
+    beams = Beams(np.full(n, np.inf, np.float32), *np.zeros((2, n), np.float32))
+    fan = Fan(np.float32(1 / where.step), np.float32(-where.first / where.step), np.float32(n - 1))
+    _scan.gather(
+        depth_m, reason, rays.columns, rays.rows, rays.edge_columns, rays.edge_rows, turn.astype(np.float32), band, fan,
+        beams, np.empty((7, len(rays.edge_columns)), np.float32),
+    )  # fmt: skip
+    return beams
+
+
+def _told(beams: Beams, range_max: float) -> tuple[NDArray[np.float32], ...]:
+    """Return the ranges of the beams (REP 117), up to where they are free, and from where on."""
+    clear = np.minimum(beams.end, beams.hit).clip(min=0)
+    clear[clear <= beams.start] = 0
+    beams.start[clear == 0] = 0
+    whole = (clear >= range_max * (1 - WHOLE)) & (beams.start == 0)
+    ranges = np.where(whole, np.float32(np.inf), np.float32(np.nan))
+    np.copyto(ranges, beams.hit, where=beams.hit < np.inf)
+    return ranges, clear, beams.start

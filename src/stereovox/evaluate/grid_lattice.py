@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Two 2-D maps on the cells of one of them, whatever the sides, origins and turns of their own cells."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stereovox import planar
+from stereovox.errors import StereovoxError
+from stereovox.maps.occupancy import UNKNOWN, OccupancyGrid
+from stereovox.maps.voxel_map import State
+
+MOST_CELLS = 40_000_000
+"""Cells of the rectangle that holds both maps: 126 m x 126 m in cells of 2 cm. Distances take 40 bytes a cell."""
+NOTHING = "the reference has no free and no occupied cell: there is nothing to compare with; give another"
+ROWS_AT_ONCE = 256
+TIE = 1e-6
+"""Share of a cell by which points that lie between two cells are pushed, so that rounding does not choose."""
+Rectangle = tuple[float, float, float, float]
+"""x0, y0, x1, y1 in metres: two opposite corners, in the reference's map frame."""
+
+
+@dataclass(frozen=True, eq=False)
+class Laid:
+    """A map laid on a reference: both have the same cells, those of the reference, in the reference's map frame.
+
+    map, reference: cover all that either knows, at least one cell.
+    excluded: (rows, columns) bool, cells whose middle lies in an excluded region.
+    motion: (3,) pose_reference_map, how the map was moved to lie on the reference.
+    """
+
+    map: OccupancyGrid
+    reference: OccupancyGrid
+    excluded: NDArray[np.bool_]
+    motion: planar.Pose
+
+
+def lay(
+    grid: OccupancyGrid, reference: OccupancyGrid, motion: ArrayLike = (0, 0, 0), exclude: Iterable[Rectangle] = ()
+) -> Laid:
+    """Lay `grid` on the cells of `reference`, moved by `motion`: (3,) pose_reference_map of the two map frames.
+
+    A cell takes the value at its middle; an occupied cell of the map in which no middle lies (a coarser reference, a
+    turn) is entered where its own middle lies, so that no obstacle is lost. Raises StereovoxError for a region that is
+    no rectangle, a reference that knows nothing, and maps so far apart that no picture holds both.
+    """
+    motion = np.asarray(motion, float)
+    pose = planar.compose(planar.inverse(reference.origin), planar.compose(motion, grid.origin))
+    corners = planar.transform(pose, _known_corners(grid) * grid.resolution)[:, ::-1] / reference.resolution
+    known = np.concatenate([_known_corners(reference)[:, ::-1], corners])
+    if not (reference.cells != UNKNOWN).any():
+        raise StereovoxError(NOTHING)
+    first = np.floor(known.min(axis=0) + TIE).astype(int)
+    rows, columns = (max(1, int(n)) for n in np.ceil(known.max(axis=0) - TIE) - first)
+    _check_size(rows, columns, reference.resolution)
+    offset = (first[1] * reference.resolution, first[0] * reference.resolution, 0.0)
+    x, y, yaw = planar.compose(reference.origin, offset).tolist()
+    there = replace(reference, cells=_window(reference.cells, first, (rows, columns)), origin=(x, y, yaw))
+    pose_there_map = planar.compose(planar.inverse(offset), pose)
+    here = replace(there, cells=resampled(grid, pose_there_map, there))
+    here = replace(here, free_below=grid.free_below, occupied_above=grid.occupied_above)
+    return Laid(here, there, excluded_cells(there, exclude), motion)
+
+
+def three_states(grid: OccupancyGrid) -> NDArray[np.uint8]:
+    """Return (rows, columns) uint8 of UNKNOWN, FREE and OCCUPIED: what is between is unknown, as to map_server."""
+    states = grid.states
+    states[states == State.TENTATIVE] = State.UNKNOWN
+    return states
+
+
+def resampled(grid: OccupancyGrid, pose_there_here: ArrayLike, there: OccupancyGrid) -> NDArray[np.int8]:
+    """Return the values of `grid` in the cells of `there`, (rows, columns) int8.
+
+    pose_there_here: (3,), the lower left corner of `grid` seen from that of `there`.
+    """
+    shape = there.cells.shape
+    cells, found = np.full(shape, UNKNOWN, np.int8), np.zeros(grid.cells.shape, bool)
+    back = planar.inverse(pose_there_here)
+    for start in range(0, shape[0], ROWS_AT_ONCE):
+        rows = np.arange(start, min(start + ROWS_AT_ONCE, shape[0]))
+        row, column = _landed(back, rows[:, None], np.arange(shape[1]), there.resolution, grid.resolution)
+        inside = _inside(row, column, grid.cells.shape)
+        row, column = row[inside], column[inside]
+        cells[rows[0] : rows[-1] + 1][inside] = grid.cells[row, column]
+        found[row, column] = True
+    lost = np.nonzero((grid.states == State.OCCUPIED) & ~found)
+    row, column = _landed(pose_there_here, lost[0], lost[1], grid.resolution, there.resolution)
+    inside = _inside(row, column, shape)
+    np.maximum.at(cells, (row[inside], column[inside]), grid.cells[lost][inside])
+    return cells
+
+
+def excluded_cells(grid: OccupancyGrid, exclude: Iterable[Rectangle]) -> NDArray[np.bool_]:
+    """Return which cells (rows, columns) have their middle in one of the regions of the map frame."""
+    out = np.zeros(grid.cells.shape, bool)
+    rows, columns = (np.arange(n) for n in out.shape)
+    for region in exclude:
+        x0, y0, x1, y1 = _checked(region)
+        for start in range(0, len(rows), ROWS_AT_ONCE):
+            part = rows[start : start + ROWS_AT_ONCE]
+            x, y = _moved(grid.origin, part[:, None], columns, grid.resolution)
+            out[part] |= (x >= x0) & (x <= x1) & (y >= y0) & (y <= y1)
+    return out
+
+
+def _checked(region: Rectangle) -> Rectangle:
+    numbers = np.asarray(region, float)
+    if numbers.shape != (4,) or not np.isfinite(numbers).all():
+        raise StereovoxError(f"{region}: no region; give X0,Y0,X1,Y1 in metres, two opposite corners")
+    (x0, y0), (x1, y1) = numbers.reshape(2, 2).min(axis=0), numbers.reshape(2, 2).max(axis=0)
+    return float(x0), float(y0), float(x1), float(y1)
+
+
+def _known_corners(grid: OccupancyGrid) -> NDArray[np.float64]:
+    """Return the corners (4, 2) x, y, in cells, of the rectangle that holds all known cells; (0, 2) where none is."""
+    rows, columns = (np.flatnonzero((grid.cells != UNKNOWN).any(axis=other)) for other in (1, 0))
+    if not len(rows):
+        return np.zeros((0, 2))
+    x, y = (columns[0], columns[-1] + 1), (rows[0], rows[-1] + 1)
+    return np.array([[a, b] for a in x for b in y], float)
+
+
+def _check_size(rows: int, columns: int, resolution: float) -> None:
+    if rows * columns > MOST_CELLS:
+        size = f"{columns * resolution:.0f} m x {rows * resolution:.0f} m in cells of {resolution:g} m"
+        raise StereovoxError(f"both maps together cover {size}: too far apart; are they in one frame? align them")
+
+
+def _window(cells: NDArray[np.int8], first: NDArray[np.int_], shape: tuple[int, int]) -> NDArray[np.int8]:
+    """Return `shape` cells from the row and column `first` on; unknown where there are none."""
+    out = np.full(shape, UNKNOWN, np.int8)
+    low = np.maximum(first, 0)
+    high = np.minimum(first + shape, cells.shape)
+    if (high > low).all():
+        (r, c), (r1, c1) = low - first, high - first
+        out[r:r1, c:c1] = cells[low[0] : high[0], low[1] : high[1]]
+    return out
+
+
+def _moved(
+    pose: ArrayLike, rows: NDArray, columns: NDArray, side: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return x and y of the middles of cells, moved by `pose`; rows and columns are broadcast."""
+    x, y, yaw = np.asarray(pose, float)
+    cosine, sine = np.cos(yaw), np.sin(yaw)
+    along, up = (columns + 0.5) * side, (rows + 0.5) * side
+    return x + cosine * along - sine * up, y + sine * along + cosine * up
+
+
+def _landed(pose: ArrayLike, rows: NDArray, columns: NDArray, side: float, other_side: float) -> tuple[NDArray, ...]:
+    """Return rows and columns of the cells, `other_side` large, that the middles of cells fall into."""
+    x, y = _moved(pose, rows, columns, side)
+    return tuple(np.floor(value / other_side + TIE).astype(np.int64) for value in (y, x))
+
+
+def _inside(rows: NDArray, columns: NDArray, shape: tuple[int, ...]) -> NDArray[np.bool_]:
+    return (rows >= 0) & (rows < shape[0]) & (columns >= 0) & (columns < shape[1])

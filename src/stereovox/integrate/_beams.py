@@ -1,0 +1,168 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Kernels of scan beams: where they go, and the cells they go through.
+
+Unlike elsewhere numbers are float64: beams are walked one by one, so wide registers gain nothing, and far from the
+origin cells keep their edges. Places are in cells, whole multiples of 2^-20, so that differences are exact.
+"""
+
+import numpy as np
+
+from stereovox._jit import cell, kernel
+
+UNSIGNED = np.uint64
+"""Kind of index that costs no test whether it counts from the end."""
+GRAIN = 2.0**20
+SIDE_BITS = 6
+SIDE = 1 << SIDE_BITS
+POINT = 48
+ONE = 2.0**POINT
+"""Lines run in whole numbers, with so many bits behind the point: after 4,096 cells they are off by 2^-36."""
+CORNER = 1 << (POINT - 35)
+"""A line that passes a corner of cells so closely touches two of its four cells."""
+
+
+@cell
+def _grain(place):
+    """Return a place rounded to the grain that all places are multiples of."""
+    return np.rint(place * GRAIN) / GRAIN
+
+
+@kernel
+def aim(ranges, clear, directions, turn, position, limits, behind, free, hits, taken_back, box):
+    """Write where beams clear and where they hit, as lines (n, 4) from x, y to x, y in cells; return how many of each.
+
+    directions: (N, 2) cosines and sines in the sensor's frame. turn: (2, 2) from there to cells. position: (2,) of the
+    sensor in cells. limits: (3,) float32 nearest range that counts, farthest that does, farthest the sensor measures.
+    clear: (N,), or empty where ranges alone tell. taken_back: points in cells that are hit and that the line before
+    clears. box: (4,) lowest column and row, highest column and row of all.
+    """
+    nearest, reach, farthest = limits[0], limits[1], limits[2]
+    x, y = _grain(position[0]), _grain(position[1])
+    lines, ends, both = 0, 0, 0
+    low_x, low_y, high_x, high_y = np.floor(x), np.floor(y), np.floor(x), np.floor(y)
+    for i in range(ranges.size):
+        measured = ranges[i]
+        hit = measured >= nearest and measured <= reach and measured > 0
+        known = (
+            measured if hit else reach if (measured > reach and (measured <= farthest or measured == np.inf)) else 0.0
+        )
+        if clear.size > 0:
+            known = min(clear[i], measured if hit else reach) if clear[i] > 0 else 0.0
+        dx = turn[0, 0] * directions[i, 0] + turn[0, 1] * directions[i, 1]
+        dy = turn[1, 0] * directions[i, 0] + turn[1, 1] * directions[i, 1]
+        to_x, to_y = _grain(position[0] + dx * known), _grain(position[1] + dy * known)
+        if known > 0:
+            free[lines, 0], free[lines, 1], free[lines, 2], free[lines, 3] = x, y, to_x, to_y
+            lines += 1
+            low_x, low_y = min(low_x, np.floor(to_x)), min(low_y, np.floor(to_y))
+            high_x, high_y = max(high_x, np.floor(to_x)), max(high_y, np.floor(to_y))
+        if hit:
+            at_x, at_y = _grain(position[0] + dx * measured), _grain(position[1] + dy * measured)
+            end = measured + behind
+            end_x, end_y = _grain(position[0] + dx * end), _grain(position[1] + dy * end)
+            hits[ends, 0], hits[ends, 1], hits[ends, 2], hits[ends, 3] = at_x, at_y, end_x, end_y
+            ends += 1
+            low_x, low_y = min(low_x, np.floor(at_x), np.floor(end_x)), min(low_y, np.floor(at_y), np.floor(end_y))
+            high_x, high_y = max(high_x, np.floor(at_x), np.floor(end_x)), max(high_y, np.floor(at_y), np.floor(end_y))
+            if known > 0 and np.floor(to_x) == np.floor(at_x) and np.floor(to_y) == np.floor(at_y):
+                taken_back[both, 0], taken_back[both, 1] = at_x, at_y
+                taken_back[both, 2], taken_back[both, 3] = at_x, at_y
+                both += 1
+    box[0], box[1], box[2], box[3] = low_x, low_y, high_x, high_y
+    return lines, ends, both
+
+
+@kernel
+def lay_out(first, across, coords, values):
+    """Empty the tiles `values` (n, 4096) of a patch that is `across` tiles wide from tile `first` on; name them."""
+    for i in range(coords.shape[0]):
+        coords[i, 0] = first[0] + i % across
+        coords[i, 1] = first[1] + i // across
+        coords[i, 2] = 0
+        values[i] = 0
+
+
+@cell
+def _give(values, place, gain, adding):
+    """Add `gain` to a cell, or where `adding` is None let the cell have nothing else."""
+    if adding is None:
+        values[place] = gain
+    else:
+        values[place] += gain
+
+
+@cell
+def _give_twice(values, place, other, gain, adding):
+    """Give `gain` to two cells, which may be the same: once then."""
+    if adding is None:
+        values[place] = gain
+        values[other] = gain
+    else:
+        values[place] += gain
+        values[other] += gain if other != place else values.dtype.type(0)
+
+
+@kernel
+def places(across, up):
+    """Return how far into a patch of tiles each of its columns lies, and each row: their sum is a cell's place."""
+    columns, rows = np.empty(across << SIDE_BITS, np.uint32), np.empty(up << SIDE_BITS, np.uint32)
+    for x in range(columns.size):
+        columns[x] = ((x >> SIDE_BITS) << 2 * SIDE_BITS) + (x & SIDE - 1)
+    for y in range(rows.size):
+        rows[y] = ((y >> SIDE_BITS) * across << 2 * SIDE_BITS) + ((y & SIDE - 1) << SIDE_BITS)
+    return columns, rows
+
+
+@kernel
+def exact(lines, first, columns, rows, gain, adding, values):
+    """Give `gain` to every cell that lines (n, 4) touch (the cells of Amanatides and Woo 1987).
+
+    values: the cells of a patch of tiles, one after the other. first: (2,) its lowest column and row. columns, rows:
+    see `places`. adding: 1 adds to what a cell has, None replaces it.
+    """
+    left, bottom = float(first[0]), float(first[1])
+    for n in range(lines.shape[0]):
+        u0, v0, u1, v1 = lines[n, 0] - left, lines[n, 1] - bottom, lines[n, 2] - left, lines[n, 3] - bottom
+        along, aside = columns, rows
+        if abs(v1 - v0) > abs(u1 - u0):
+            u0, v0, u1, v1, along, aside = v0, u0, v1, u1, rows, columns
+        if u0 > u1:
+            u0, v0, u1, v1 = u1, v1, u0, v0
+        begin, last = int(u0), int(u1)
+        slope = (v1 - v0) / (u1 - u0) if u1 > u0 else 0.0
+        step = int(slope * ONE)  # towards zero: the line never leaves its box
+        v = int(v0 * ONE) + int(slope * (begin + 1 - u0) * ONE)
+        corner = CORNER if slope > 0 else -CORNER if slope < 0 else 0
+        lowest = int(min(v0, v1))
+        enters = aside[int(v0)]
+        for i in range(begin, last):  # one layer of cells: from where the line enters it to where it leaves
+            place, leaves = along[UNSIGNED(i)], aside[UNSIGNED((v - corner) >> POINT)]
+            _give_twice(values, place + enters, place + leaves, gain, adding)
+            enters = aside[UNSIGNED(max((v + corner) >> POINT, lowest))]
+            v += step
+        _give_twice(values, along[last] + enters, along[last] + aside[int(v1)], gain, adding)
+
+
+@kernel
+def bresenham(lines, first, columns, rows, gain, adding, values):
+    """Give `gain` to the cells of Bresenham's lines between the cells that lines (n, 4) begin and end in.
+
+    Arguments as in `exact`. A line from the sensor's cell (IST 2019, II-B); a tie stays on the near side.
+    """
+    left, bottom = float(first[0]), float(first[1])
+    for n in range(lines.shape[0]):
+        u0, v0 = np.floor(lines[n, 0]) - left, np.floor(lines[n, 1]) - bottom
+        u1, v1 = np.floor(lines[n, 2]) - left, np.floor(lines[n, 3]) - bottom
+        along, aside = columns, rows
+        if abs(v1 - v0) > abs(u1 - u0):
+            u0, v0, u1, v1, along, aside = v0, u0, v1, u1, rows, columns
+        i, k = int(u0), int(v0)
+        step = 1 if u1 >= u0 else -1
+        turn = 1 if v1 >= v0 else -1
+        length = int(abs(u1 - u0))
+        slope = int(abs(v1 - v0) / max(length, 1) * ONE)
+        v = int(ONE / 2) - 1  # one less: a tie stays on the near side
+        for _ in range(length + 1):
+            _give(values, along[UNSIGNED(i)] + aside[UNSIGNED(k + turn * (v >> POINT))], gain, adding)
+            v += slope
+            i += step

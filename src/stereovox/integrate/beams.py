@@ -1,0 +1,136 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From a scan to evidence on the cells of a floor: what its beams pass is free, where they end is occupied.
+
+IST 2019, section II. The map's Eq 5 adds what is found here.
+"""
+
+from __future__ import annotations
+
+from math import log
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stereovox import planar, registry
+from stereovox.config import Config
+from stereovox.errors import ConfigError, FrameRefused
+from stereovox.frame import Scan
+from stereovox.integrate import _beams
+from stereovox.maps.evidence import to_units
+from stereovox.maps.grid_evidence import CELLS, SIDE, GridEvidence
+from stereovox.maps.voxel_map import INDEX_LIMIT
+
+TRAVERSALS = {
+    "bresenham": "stereovox.integrate._beams:bresenham",
+    "exact": "stereovox.integrate._beams:exact",
+}
+"""Name -> kernel `(lines, first, columns, rows, gain, adding, values)`, see `_beams.exact`; others as entry points."""
+MOST_CELLS = 4096
+"""Cells a beam may be long: a scan's patch is at most four times the square of it."""
+MOST_BEAMS = 65536
+"""Beams of a scan: so many times the largest evidence fit into 32 bits."""
+UPDATES = {"once": (None, np.int16), "every": (1, np.int32)}
+"""Whether what beams say of a cell is added up (None: the last one counts), and what the sum is kept in."""
+
+
+def make_beams(config: Config) -> Beams:
+    """Return what turns scans into evidence as `config.grid` says. Raises ConfigError for what cannot be done."""
+    return Beams(config)
+
+
+class Beams:
+    """Turns scans into evidence, on cells of `config.voxel_size`; it never sees the map."""
+
+    def __init__(self, config: Config):
+        grid = config.grid
+        if config.max_range + grid.thickness > MOST_CELLS * config.voxel_size:
+            raise ConfigError(
+                f"max_range {config.max_range:g} spans more than {MOST_CELLS} cells of {config.voxel_size:g} in a "
+                "grid; use larger cells"
+            )
+        self._config = config
+        self._traverse = registry.find("traversals", TRAVERSALS, grid.traversal)
+        self._adding, dtype = UPDATES[grid.update]
+        occupied, free = (to_units(log(p / (1 - p))) for p in (grid.p_occupied, grid.p_free))
+        self._occupied, self._free = int(max(occupied, 1)), int(min(free, -1))
+        self._values, self._coords = np.empty((0, CELLS), dtype), np.empty((0, 3), np.int32)
+        self._lines = tuple(np.empty((0, 4)) for _ in range(3))
+        self._seen: tuple[float, float, int] | None = None
+        self._directions = np.empty((0, 2))
+
+    def evidence(self, scan: Scan, origin: ArrayLike = (0.0, 0.0, 0.0)) -> GridEvidence:
+        """Return what a scan that can be trusted says about the cells of a grid with this `origin` (3,): x, y, yaw.
+
+        A range from max(`range_min`, `min_range`) to min(`range_max`, `max_range`) is a hit: its beam is free up to
+        it, and occupied from it to `grid.thickness` behind. +inf, and a hit beyond `max_range`, is free up to the
+        latter. All else says nothing, and where the scan has `clear` it tells how far beams are free. A beam never
+        clears the cell it hits. Lengths are seen from above where the sensor leans.
+        The memory that evidence lies in is used again by the next call.
+        Raises FrameRefused: `too_many_beams`, `bad_clear`, `pose_too_far`.
+        """
+        lines, box = self._aim(scan, np.asarray(origin, float))
+        if not sum(map(len, lines)):
+            return GridEvidence.nothing()
+        low, high = np.floor_divide(box.reshape(2, 2), SIDE)
+        across, up = (high - low + 1).tolist()
+        coords, values = self._patch(low, across, across * up)
+        columns, rows = _beams.places(across, up)
+        flat, dtype = values.reshape(-1), values.dtype.type
+        free, hits, taken_back = lines
+        passes = [(free, self._free), (hits, self._occupied)]
+        if self._adding:  # else hits, which come last, replace what they hit
+            passes.append((taken_back, -self._free))
+        for what, gain in passes:
+            self._traverse(what, low * SIDE, columns, rows, dtype(gain), self._adding, flat)
+        return GridEvidence(coords, values)
+
+    def _aim(self, scan: Scan, origin: NDArray[np.float64]) -> tuple[list[NDArray[np.float64]], NDArray[np.int64]]:
+        """Return the lines to clear, to occupy, and those that a hit takes back, in cells, and the box they lie in."""
+        size, config = self._config.voxel_size, self._config
+        ranges, clear = _beams_of(scan)
+        T = planar.lifted(planar.inverse(origin)) @ scan.T_world_sensor
+        position = T[:2, 3] / size
+        if not (np.abs(position) < INDEX_LIMIT - 2 * MOST_CELLS).all():
+            raise FrameRefused("pose_too_far", f"{_name(scan)}: is more than {INDEX_LIMIT} cells from the map's origin")
+        reach = np.fmin(scan.range_max, config.max_range)
+        limits = np.array([np.fmax(scan.range_min, config.min_range), reach, scan.range_max], np.float32)
+        if len(self._lines[0]) < len(ranges):
+            self._lines = tuple(np.empty((len(ranges), 4)) for _ in range(3))
+        box = np.empty(4, np.int64)
+        counts = _beams.aim(
+            ranges, clear, self._directions_of(scan), T[:2, :2] / size, position, limits, config.grid.thickness,
+            *self._lines, box,
+        )  # fmt: skip
+        return [lines[:count] for lines, count in zip(self._lines, counts, strict=True)], box
+
+    def _directions_of(self, scan: Scan) -> NDArray[np.float64]:
+        """Return cosine and sine (N, 2) of each beam; those of the scan before, where it had the same angles."""
+        seen = scan.angle_min, scan.angle_step, len(scan.ranges)
+        if seen != self._seen:
+            self._directions, self._seen = np.column_stack([np.cos(scan.angles), np.sin(scan.angles)]), seen
+        return self._directions
+
+    def _patch(self, low: NDArray[np.int64], across: int, tiles: int) -> tuple[Any, Any]:
+        """Return coordinates and empty values of the tiles of a patch."""
+        if len(self._values) < tiles:
+            self._values = np.empty((tiles, CELLS), self._values.dtype)
+            self._coords = np.empty((tiles, 3), np.int32)
+        coords, values = self._coords[:tiles], self._values[:tiles]
+        _beams.lay_out(low, across, coords, values)
+        return coords, values
+
+
+def _beams_of(scan: Scan) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return ranges and how far beams are known to be free (empty: ranges alone tell)."""
+    ranges = np.ascontiguousarray(scan.ranges, np.float32)
+    clear = np.ascontiguousarray(() if scan.clear is None else scan.clear, np.float32)
+    if len(ranges) > MOST_BEAMS:
+        raise FrameRefused("too_many_beams", f"{_name(scan)}: {len(ranges)} beams; at most {MOST_BEAMS} are taken")
+    if scan.clear is not None and clear.shape != ranges.shape:
+        raise FrameRefused("bad_clear", f"{_name(scan)}: clear is {clear.shape}, ranges are {ranges.shape}")
+    return ranges, clear
+
+
+def _name(scan: Scan) -> str:
+    return scan.name or f"scan at {scan.stamp_ns} ns"

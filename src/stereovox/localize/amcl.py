@@ -1,0 +1,211 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Adaptive Monte Carlo localisation: where a robot is in a known map (Fox 2003; Thrun, Burgard and Fox 2005, ch. 8)."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from time import perf_counter
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stereovox import planar
+from stereovox.config import Config
+from stereovox.errors import FrameRefused, SourceError
+from stereovox.frame import Scan
+from stereovox.localize.amcl_cluster import Clusters, mean_pose, spread
+from stereovox.localize.amcl_kld import draw
+from stereovox.localize.amcl_motion import moved, turn_go_turn
+from stereovox.localize.amcl_recovery import Recovery
+from stereovox.localize.amcl_sensor import MODELS
+from stereovox.localize.amcl_spread import FreeFloor, checked_start, near
+from stereovox.localize.scan_beams import Beams, beams_of
+from stereovox.localize.track import Track
+from stereovox.maps.occupancy import OccupancyGrid
+
+MOST_AT_START = 1_000_000
+"""Poses that are tried at once where the robot may be anywhere."""
+SETTLED_SHARE, SETTLED_M = 0.95, 0.3
+"""The robot knows where it is when so much weight is in one cluster, which is so wide (standard deviation)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """Where the robot is after a scan, as ROS's amcl gives it.
+
+    pose_map_base: (3,) float64, the mean of the heaviest cluster of particles, moved by the odometry since.
+    covariance: (3, 3) float64, mean square of how far the particles of all clusters are from it (metres, radians).
+    pose_map_odom: (3,) float64, what turns the odometry's poses into those of the map.
+    particles: (N, 3) float64, equally likely poses in the map, as of the last update.
+    moved: tells whether the scan was compared with the map: at first, and then after moving far enough.
+    settled: tells whether nearly all particles agree; False while the robot may be in several places.
+    ms: milliseconds the scan took.
+    """
+
+    pose_map_base: planar.Pose
+    covariance: NDArray[np.float64]
+    pose_map_odom: planar.Pose
+    particles: planar.Pose
+    moved: bool
+    settled: bool
+    ms: float
+
+
+class Localiser:
+    """Follows a robot through a map by its scans and odometry.
+
+    start: (3,) x, y, yaw where the robot is at the first scan, good to `amcl.start_std`; None: it may be anywhere.
+    seed: of all random numbers; the same scans then give the same estimates.
+    refused: how many scans were refused, by reason.
+    Raises MapFileError for a map without free or occupied cells, ConfigError for a start that is no pose.
+    """
+
+    def __init__(self, grid: OccupancyGrid, config: Config, start: ArrayLike | None = None, seed: int = 0):
+        self.config = config.amcl
+        self.refused: Counter[str] = Counter()
+        self._rng = np.random.default_rng(seed)
+        self._floor = FreeFloor(grid)
+        self._sensor = MODELS[self.config.model](grid, self.config)
+        self._recovery = Recovery(self.config)
+        self._particles = self._first(None if start is None else checked_start(start))
+        self._weights = np.full(len(self._particles), 1 / len(self._particles))
+        self._pose_odom_base: planar.Pose | None = None
+        self._updates = 0
+        self._pose_map_odom, self._covariance, self._settled = np.zeros(3), np.zeros((3, 3)), False
+
+    def add(self, scan: Scan) -> Estimate:
+        """Return where the robot is after one more scan.
+
+        Raises FrameRefused, and changes nothing but `refused`, where the scan cannot be trusted (`scan_beams`).
+        """
+        start = perf_counter()
+        try:
+            beams = beams_of(scan, self.config.max_range)
+        except FrameRefused as refusal:
+            self.refused[refusal.reason] += 1
+            raise
+        pose_odom_base = scan.pose_world_base
+        if due := self._far_enough(pose_odom_base):
+            self._update(pose_odom_base, beams)
+        pose = planar.compose(self._pose_map_odom, pose_odom_base)
+        ms = 1e3 * (perf_counter() - start)
+        return Estimate(pose, self._covariance, self._pose_map_odom, self._particles, due, self._settled, ms)
+
+    def _first(self, start: planar.Pose | None) -> planar.Pose:
+        most = self.config.particles_max
+        if start is None:
+            return self._floor.anywhere(max(min(most * self.config.candidates, MOST_AT_START), most), self._rng)
+        return near(start, self.config.start_std, most, self._rng)
+
+    def _far_enough(self, pose_odom_base: planar.Pose) -> bool:
+        if self._pose_odom_base is None:
+            return True
+        step = planar.relative(self._pose_odom_base, pose_odom_base)
+        return bool(np.hypot(*step[:2]) >= self.config.update_min_d or abs(step[2]) >= self.config.update_min_a)
+
+    def _update(self, pose_odom_base: planar.Pose, beams: Beams) -> None:
+        if self._pose_odom_base is not None:
+            motion = turn_go_turn(self._pose_odom_base, pose_odom_base)
+            self._particles = moved(self._particles, motion, self.config, self._rng)
+        self._pose_odom_base = pose_odom_base
+        self._updates += 1
+        chosen = beams.some(self.config.max_beams, self._sensor.hits_only)
+        self._weigh(chosen)
+        clusters = Clusters(self._particles, self.config)
+        self._estimate(clusters, pose_odom_base)
+        if self._updates % self.config.resample_interval == 0 or len(self._particles) > self.config.particles_max:
+            self._resample(clusters, chosen)
+
+    def _weigh(self, beams: Beams) -> None:
+        if not len(beams.ranges):
+            return
+        log_likelihood = self._sensor.log_likelihood(self._particles, beams).astype(float)
+        self._recovery.see(log_likelihood, self._weights, len(beams.ranges))  # all: skipping would hide that it is lost
+        fitting = self._fitting(beams)
+        if fitting is not beams:
+            log_likelihood = self._sensor.log_likelihood(self._particles, fitting).astype(float)
+        self._weights = _times(self._weights, log_likelihood * self.config.trust)
+
+    def _fitting(self, beams: Beams) -> Beams:
+        """Return the beams that enough particles agree with, or all of them (`amcl.beam_skip`)."""
+        if not (self.config.beam_skip and self._settled):
+            return beams
+        lost = self._sensor.agreeing(self._particles, beams) < self.config.beam_skip_share
+        return beams.only(~lost) if 0 < lost.mean() <= self.config.beam_skip_most else beams
+
+    def _estimate(self, clusters: Clusters, pose_odom_base: planar.Pose) -> None:
+        inside, share = clusters.heaviest(self._weights)
+        particles, weights = self._particles[inside], self._weights[inside]
+        pose = mean_pose(particles, weights)
+        wide = np.sqrt(np.trace(spread(particles, weights, pose)[:2, :2]))
+        self._settled = bool(share >= SETTLED_SHARE and wide <= SETTLED_M)
+        self._covariance = spread(self._particles, self._weights, pose)
+        self._pose_map_odom = planar.compose(pose, planar.inverse(pose_odom_base))
+
+    def _resample(self, clusters: Clusters, beams: Beams) -> None:
+        share, bins = self._recovery.strangers, clusters.bins
+        strangers, likely = np.empty((0, 3)), None
+        if share > 0:
+            strangers, likely = self._strangers(share, beams)
+            bins = Clusters(np.concatenate([self._particles, strangers]), self.config).bins
+        kept, taken = draw(self._weights, bins, self.config, self._rng.random(), share, likely)
+        self._particles = np.concatenate([self._particles[kept], strangers[taken]])
+        self._weights = np.full(len(self._particles), 1 / len(self._particles))
+
+    def _strangers(self, share: float, beams: Beams) -> tuple[planar.Pose, NDArray[np.float64]]:
+        """Return poses from anywhere, and how likely each is by the scan alone (Lenser and Veloso 2000)."""
+        tried = self.config.candidates
+        count = int(np.clip(np.ceil(share * len(self._particles)), 50, 5000)) * tried
+        poses = self._floor.anywhere(count, self._rng)
+        weights = np.full(count, 1 / count)
+        if tried > 1 and len(beams.ranges):
+            log_likelihood = self._sensor.log_likelihood(poses, beams).astype(float)
+            weights = _times(weights, log_likelihood * self.config.trust)
+        return poses, weights
+
+
+def localise(
+    grid: OccupancyGrid,
+    scans: Iterable[Scan],
+    config: Config,
+    start: ArrayLike | None = None,
+    seed: int = 0,
+    progress: Callable[[int], object] | None = None,
+) -> Track:
+    """Return a robot's way through a map; scans that cannot be trusted are left out.
+
+    start, seed: as in `Localiser`; progress: called with the number of scans done.
+    The way before the robot first knew where it was is that of its odometry, from where it then was backwards.
+    Raises what `Localiser` raises, and SourceError where not one scan can be trusted.
+    """
+    localiser = Localiser(grid, config, start, seed)
+    stamps, estimates = [], []
+    for done, scan in enumerate(scans, 1):
+        try:
+            estimates.append(localiser.add(scan))
+            stamps.append(scan.stamp_ns)
+        except FrameRefused as refusal:
+            last = refusal
+        if progress:
+            progress(done)
+    if not estimates:
+        said = f"every one was refused, the last: {last}" if localiser.refused else "there are none"  # pyright: ignore
+        raise SourceError(f"no scan to localise by: {said}")
+    return _track(np.array(stamps, np.int64), estimates)
+
+
+def _track(stamps_ns: NDArray[np.int64], estimates: list[Estimate]) -> Track:
+    base = np.array([estimate.pose_map_base for estimate in estimates])
+    odom = np.array([estimate.pose_map_odom for estimate in estimates])
+    known = next((i for i, estimate in enumerate(estimates) if estimate.settled), 0)
+    early = planar.compose(planar.inverse(odom[:known]), base[:known])
+    base[:known], odom[:known] = planar.compose(odom[known], early), odom[known]
+    return Track(stamps_ns, base, odom)
+
+
+def _times(weights: NDArray[np.float64], log_factors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return weights of sum 1 times the exponentials of log factors."""
+    weights = weights * np.exp(log_factors - log_factors.max())
+    return weights / weights.sum()

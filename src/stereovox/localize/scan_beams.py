@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A scan that can be trusted, as beams in the robot's frame seen from above."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox import geometry
+from stereovox.errors import FrameRefused
+from stereovox.frame import Scan
+
+FARTHEST = 1e6
+"""Positions beyond this many metres are taken for errors."""
+RIGID = 5e-3
+"""How far a pose may be off from a rigid motion (docs/conventions.md)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Beams:
+    """The beams of a scan that say something: hits, and those that met nothing up to `range_max`.
+
+    origin: (2,) float64 x, y of the sensor in the robot's frame.
+    directions: (K, 2) float64, the way a beam goes for each metre of its length, seen from above in the robot's frame.
+        Shorter than one where the sensor is tilted.
+    ranges: (K,) float64 metres; `range_max` where nothing was met.
+    at_max: (K,) bool, tells which met nothing.
+    range_max: metres.
+    """
+
+    origin: NDArray[np.float64]
+    directions: NDArray[np.float64]
+    ranges: NDArray[np.float64]
+    at_max: NDArray[np.bool_]
+    range_max: float
+
+    @property
+    def ends(self) -> NDArray[np.float64]:
+        """Where the beams end in the robot's frame, (K, 2) metres."""
+        return self.origin + self.directions * self.ranges[:, None]
+
+    def some(self, most: int, hits_only: bool = False) -> Beams:
+        """Return at most so many beams, evenly chosen among all or among those that hit something."""
+        chosen = np.flatnonzero(~self.at_max) if hits_only else np.arange(len(self.ranges))
+        if len(chosen) > most:
+            chosen = chosen[np.linspace(0, len(chosen) - 1, most).round().astype(int)]
+        return self.only(chosen)
+
+    def only(self, chosen: NDArray[np.integer] | NDArray[np.bool_]) -> Beams:
+        """Return the chosen beams."""
+        return replace(self, directions=self.directions[chosen], ranges=self.ranges[chosen], at_max=self.at_max[chosen])
+
+
+def beams_of(scan: Scan, max_range: float | None = None) -> Beams:
+    """Return what a scan says: NaN, -inf and what lies below `range_min` say nothing, +inf that nothing was met.
+
+    max_range: metres beyond which nothing counts as met; None: the scan's own.
+    Raises FrameRefused with the reason: the source's `fault`, `bad_shape`, `bad_scan`, `pose_not_finite`,
+    `pose_not_rigid`, `no_valid_range`.
+    """
+    ranges, farthest = _checked(scan, max_range)
+    known = (ranges >= scan.range_min) & (ranges > 0)
+    if not known.any():
+        raise FrameRefused("no_valid_range", f"{_name(scan)}: not one beam has a range; is the lidar covered?")
+    angles = scan.angles[known]
+    across = np.column_stack([np.cos(angles), np.sin(angles)]) @ scan.T_base_sensor[:2, :2].T
+    at_max = ranges[known] >= farthest
+    return Beams(scan.T_base_sensor[:2, 3], across, np.minimum(ranges[known], farthest), at_max, farthest)
+
+
+def _checked(scan: Scan, max_range: float | None) -> tuple[NDArray[np.float64], float]:
+    name = _name(scan)
+    if scan.fault:
+        raise FrameRefused(scan.fault, scan.fault_detail or f"{name}: {scan.fault}")
+    ranges = np.asarray(scan.ranges)
+    if ranges.ndim != 1 or not ranges.size or not np.issubdtype(ranges.dtype, np.floating):
+        raise FrameRefused("bad_shape", f"{name}: ranges are {ranges.shape} {ranges.dtype}; give (N,) float32 metres")
+    farthest = scan.range_max if max_range is None else min(max_range, scan.range_max)
+    if not (np.isfinite([scan.angle_min, scan.angle_step, scan.range_min]).all() and 0 < farthest < np.inf):
+        said = f"angles from {scan.angle_min} by {scan.angle_step}, ranges from {scan.range_min} to {scan.range_max}"
+        raise FrameRefused("bad_scan", f"{name}: {said}; they must be finite (amcl.max_range bounds the ranges)")
+    for T in (scan.T_world_sensor, scan.T_base_sensor):
+        _check_pose(T, name)
+    return ranges.astype(float), float(farthest)
+
+
+def _check_pose(T: geometry.Transform, name: str) -> None:
+    T = np.asarray(T)
+    if T.shape == (4, 4) and not (np.isfinite(T).all() and (np.abs(T) < FARTHEST).all()):
+        raise FrameRefused("pose_not_finite", f"{name}: the pose holds NaN, infinity or absurdly large numbers")
+    if not (error := geometry.rigidity_error(T)) <= RIGID:
+        raise FrameRefused("pose_not_rigid", f"{name}: the pose is no rigid 4x4 motion (off by {error:.2g})")
+
+
+def _name(scan: Scan) -> str:
+    return scan.name or f"scan at {scan.stamp_ns} ns"

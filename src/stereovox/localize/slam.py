@@ -1,0 +1,169 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Simultaneous localisation and mapping from a 2-D lidar: what gmapping does in IST 2019, by matching and a pose graph.
+
+Each scan is laid onto the lines of the last keyframes (correlative search as Olson 2009, then point to line). Submaps
+are laid onto earlier ones by branch and bound (Hess et al. 2016); closures that agree enter a pose graph (gtsam). At
+the end all keyframes are matched with all others that saw the same walls.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sized
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox import planar
+from stereovox.config import Config, load_config
+from stereovox.errors import FrameRefused, StereovoxError
+from stereovox.frame import Scan
+from stereovox.integrate.beams import make_beams
+from stereovox.integrate.scan_check import trusted
+from stereovox.localize.slam_front import Follower
+from stereovox.localize.slam_graph import optimised
+from stereovox.localize.slam_keyframe import Edge, Keyframe, step_edges
+from stereovox.localize.slam_loops import LoopFinder
+from stereovox.localize.slam_refine import patch_edges
+from stereovox.localize.track import Track
+from stereovox.maps.grid_map import GridMap
+from stereovox.maps.occupancy import OccupancyGrid
+
+Progress = Callable[[int, int, str], object]
+
+CLOSURE_TRUST, PATCH_TRUST = 0.02, 0.1
+"""What a match's information is worth: its points are not independent, nor is what they lie on exact."""
+JUMP, JUMP_TURN = 0.05, 0.01
+"""Metres and radians that a closure must be off, before the graph is solved anew on the way."""
+
+
+@dataclass(frozen=True, eq=False)
+class SlamResult:
+    """A robot's way, and the map of what it saw.
+
+    track: the pose of every scan. grid: the map, made of the keyframes. keyframes: with their final poses.
+    closures: loops closed. edges: those, between keyframes. refused: scans by the reason why they could not be used.
+    """
+
+    track: Track
+    grid: OccupancyGrid
+    keyframes: list[Keyframe]
+    edges: list[Edge]
+    refused: dict[str, int]
+
+    @property
+    def closures(self) -> int:
+        """How many pairs of submaps were found to show one place."""
+        return len(self.edges)
+
+
+class Slam:
+    """Takes scans in order of time, with the odometry as pose; the map's frame is the odometry's at the first scan.
+
+    refused: scans by the reason why they could not be used; they change nothing.
+    """
+
+    def __init__(self, config: Config):
+        self.refused: dict[str, int] = {}
+        self._config = config
+        self._follower = Follower(config.slam)
+        self._loops = LoopFinder(config.slam, self._follower.keyframes)
+        self._stamps: list[int] = []
+        self._odometry: list[planar.Pose] = []
+        self._since: list[planar.Pose] = []
+        self._keyframe: list[int] = []
+
+    @property
+    def pose(self) -> planar.Pose:
+        """Where the robot stood at the last scan, (3,) pose_map_base."""
+        return self._follower.pose
+
+    @property
+    def keyframes(self) -> list[Keyframe]:
+        """The scans that the map is made of, with their poses as now believed."""
+        return self._follower.keyframes
+
+    def add(self, scan: Scan) -> planar.Pose:
+        """Take the next scan; return (3,) pose_map_base as known by now. Later loops may move it."""
+        try:
+            scan = trusted(scan, self._config)
+            if self._stamps and scan.stamp_ns <= self._stamps[-1]:
+                raise FrameRefused("not_in_order", f"{scan.name}: is not later than the scan before")
+        except FrameRefused as refused:
+            self.refused[refused.reason] = self.refused.get(refused.reason, 0) + 1
+            return self.pose
+        is_key = self._follower.add(scan)
+        if self.keyframes:
+            self._remember(scan)
+        if is_key and self._loops.update() and self._is_off():
+            self._solve(self._loops.edges, CLOSURE_TRUST)
+        return self.pose
+
+    def finish(self, progress: Progress | None = None) -> SlamResult:
+        """Return the way and the map, after a last search for loops and a last polish.
+
+        Raises StereovoxError where no scan could be used, MissingExtra where loops were found and gtsam is missing.
+        """
+        if not self.keyframes:
+            raise StereovoxError(f"not one of the scans could be used ({self.refused or 'none has enough hits'})")
+        self._loops.update(end=True)
+        self._solve(self._loops.edges, CLOSURE_TRUST)
+        rounds = self._config.slam.refine_rounds if self._loops.edges else 0
+        for done in range(rounds):
+            if progress:
+                progress(done, rounds, "polishing the map")
+            self._solve(list(patch_edges(self.keyframes, self._config.slam)), PATCH_TRUST)
+        return SlamResult(self._track(), self._grid(), self.keyframes, self._loops.edges, self.refused)
+
+    def _remember(self, scan: Scan) -> None:
+        self._stamps.append(scan.stamp_ns)
+        self._odometry.append(scan.pose_world_base)
+        self._since.append(planar.relative(self.keyframes[-1].pose, self.pose))
+        self._keyframe.append(len(self.keyframes) - 1)
+
+    def _is_off(self) -> bool:
+        return any(_off(self.keyframes, edge) for edge in self._loops.edges[-8:])
+
+    def _solve(self, edges: list[Edge], trust: float) -> None:
+        if not edges:
+            return
+        last = self.keyframes[-1].pose
+        poses = optimised(self._poses(), step_edges(self.keyframes), edges, trust)
+        for keyframe, pose in zip(self.keyframes, poses, strict=True):
+            keyframe.pose = pose
+        self._follower.moved(last)
+
+    def _poses(self) -> NDArray[np.float64]:
+        return np.array([keyframe.pose for keyframe in self.keyframes])
+
+    def _track(self) -> Track:
+        poses = planar.compose(self._poses()[self._keyframe], np.array(self._since))
+        corrections = planar.compose(poses, planar.inverse(np.array(self._odometry)))
+        return Track(np.array(self._stamps, np.int64), poses, corrections)
+
+    def _grid(self) -> OccupancyGrid:
+        settings = self._config.slam
+        config = load_config(self._config, voxel_size=settings.voxel_size, max_range=settings.max_range)
+        grid, beams = GridMap(config), make_beams(config)
+        track = self._track()
+        for keyframe in self.keyframes:
+            grid.add(beams.evidence(track.corrected(keyframe.scan), grid.origin))
+        return grid.occupancy()
+
+
+def map_scans(scans: Iterable[Scan], config: Config, progress: Progress | None = None) -> SlamResult:
+    """Return the way and the map of scans in order of time, whose poses are those of the odometry.
+
+    progress: called with how many are done, how many there are (0: not known) and what is going on.
+    """
+    slam, total = Slam(config), len(scans) if isinstance(scans, Sized) else 0
+    for done, scan in enumerate(scans, 1):
+        slam.add(scan)
+        if progress:
+            progress(done, total, "matching scans")
+    return slam.finish(progress)
+
+
+def _off(keyframes: list[Keyframe], edge: Edge) -> bool:
+    left = planar.relative(edge.motion, planar.relative(keyframes[edge.first].pose, keyframes[edge.second].pose))
+    return bool(np.hypot(left[0], left[1]) > JUMP or abs(left[2]) > JUMP_TURN)

@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Kernels over tiles of 64x64 cells: add evidence, look cells up, show them as one picture."""
+
+import numpy as np
+
+from stereovox._jit import cell, kernel
+from stereovox.maps._cells import find, find_or_insert
+
+
+@kernel
+def add_tiles(table, coords, count, cells, wanted, values, unknown, prior, lowest, highest):
+    """Add `values` (n, 4096) to tiles `wanted` (n, 3) with clamping; return how many cells changed.
+
+    As `_cpu.add_values` does to blocks: a tile whose values are all zero is not made, cells without evidence start from
+    `prior`, and a sum of just `unknown` is stored as one more.
+    """
+    changed = 0
+    for i in range(wanted.shape[0]):
+        value = values[i]
+        anything = np.int32(0)
+        for c in range(4096):
+            anything |= np.int32(value[c])
+        if anything == 0:
+            continue
+        tile = cells[find_or_insert(table, coords, count, wanted[i, 0], wanted[i, 1], wanted[i, 2])]
+        for row in range(0, 4096, 64):
+            changed += _add_row(tile[row : row + 64], value[row : row + 64], unknown, prior, lowest, highest)
+    return changed
+
+
+@cell
+def _add_row(cells, value, unknown, prior, lowest, highest):
+    """Add `value` (64,) to cells of a row; return how many changed."""
+    anything = np.int32(0)
+    for c in range(64):
+        anything |= np.int32(value[c])
+    moved = np.int32(0)
+    if anything != 0:
+        for c in range(64):
+            old = np.int32(cells[c])
+            step = np.int32(value[c])
+            start = prior if old == unknown else old
+            new = min(max(np.int32(start + step), lowest), highest)
+            new = np.int32(new + (np.int32(1) if new == unknown else np.int32(0)))
+            new = new if step != 0 else old
+            moved = np.int32(moved + (np.int32(1) if new != old else np.int32(0)))
+            cells[c] = new
+    return moved
+
+
+@kernel
+def look_up(table, coords, cells, indices, out):
+    """Write the number of each cell (column, row) of `indices` (n, 2) int64 to `out` (n,), left as it is without."""
+    for i in range(indices.shape[0]):
+        x, y = indices[i, 0], indices[i, 1]
+        tile = find(table, coords, x >> 6, y >> 6, 0)
+        if tile >= 0:
+            out[i] = cells[tile, ((y & 63) << 6) | (x & 63)]
+
+
+@kernel
+def show(coords, cells, first_column, first_row, shown, lowest, picture):
+    """Write what all tiles `cells` (n, 4096) show, by the table `shown` that begins with `lowest`, to `picture`."""
+    rows, columns = picture.shape
+    for i in range(coords.shape[0]):
+        left, bottom = (coords[i, 0] << 6) - first_column, (coords[i, 1] << 6) - first_row
+        column, until = max(left, 0), min(left + 64, columns)
+        for row in range(max(bottom, 0), min(bottom + 64, rows)):
+            start = ((row - bottom) << 6) - left
+            for k in range(column, until):
+                picture[row, k] = shown[np.int32(cells[i, start + k]) - lowest]

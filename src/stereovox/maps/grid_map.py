@@ -1,0 +1,207 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The 2-D occupancy grid of a floor: no frame to run out of, fixed-point log-odds in 16 or 8 bits a cell."""
+
+from __future__ import annotations
+
+from math import isclose
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stereovox import planar
+from stereovox.config import Config
+from stereovox.errors import ConfigError
+from stereovox.maps import _grid
+from stereovox.maps.blocks import BlockPool
+from stereovox.maps.cell_format import CellFormat, CellRules
+from stereovox.maps.evidence import LOG_ODDS_SCALE
+from stereovox.maps.grid_evidence import CELLS, SIDE, GridEvidence
+from stereovox.maps.occupancy import UNKNOWN, OccupancyGrid
+from stereovox.maps.percent import Percent
+from stereovox.maps.voxel_map import INDEX_LIMIT, State
+
+
+class GridMap:
+    """A sparse 2-D occupancy map: tiles of 64x64 cells, made where a scan says something.
+
+    Cell (i, j) covers `[i, i + 1) x [j, j + 1)` times `config.voxel_size` in the grid's own frame, which stands at
+    `origin` (x, y, yaw) in the map's. Points and poses are in the map's frame. Cells, their states and the settings
+    `config.map` mean what they do in a `VoxelMap`.
+    `frames` counts the scans and images that are in it, `frames_refused` those that were offered and refused;
+    `recording` is the name of what they came from, if known.
+    """
+
+    def __init__(self, config: Config, origin: ArrayLike = (0.0, 0.0, 0.0)):
+        self.config = config
+        self.voxel_size = config.voxel_size
+        self.origin = np.array(origin, float).reshape(3)
+        self.frames = 0
+        self.frames_refused = 0
+        self.recording = ""
+        self._rules = CellRules(config.map)
+        self._format = self._rules.format
+        self._percent = Percent(self._rules)
+        self._pool = BlockPool(self._format.dtype, capacity=64, fill=self._format.unknown, cells=CELLS)
+
+    @classmethod
+    def from_occupancy(cls, grid: OccupancyGrid, config: Config) -> GridMap:
+        """Return a map to go on with: the cells of `grid`, whose frame it keeps, with the settings of `config`.
+
+        0 and 100 per cent become the surest cells that `config.map` allows. Raises ConfigError for another cell size.
+        """
+        if not isclose(grid.resolution, config.voxel_size, rel_tol=1e-5):
+            raise ConfigError(
+                f"cannot go on: the map has cells of {grid.resolution:g} m, not {config.voxel_size:g}; "
+                f"set voxel_size to {grid.resolution:g}"
+            )
+        grid_map = cls(config, grid.origin)
+        rows, columns = grid.cells.shape
+        tiles_up, tiles_across = -(-rows // SIDE), -(-columns // SIDE)
+        cells = np.full((tiles_up * SIDE, tiles_across * SIDE), UNKNOWN, np.int8)
+        cells[:rows, :columns] = grid.cells
+        cells = cells.reshape(tiles_up, SIDE, tiles_across, SIDE).swapaxes(1, 2).reshape(-1, CELLS)
+        known = np.flatnonzero((cells >= 0).any(axis=1))
+        up, across = np.divmod(known, max(tiles_across, 1))
+        grid_map.insert(np.column_stack([across, up, 0 * up]).astype(np.int32), grid_map._percent.stored(cells[known]))
+        return grid_map
+
+    def with_config(self, config: Config) -> GridMap:
+        """Take over the settings of a run that goes on; raises ConfigError if they change what the cells mean."""
+        for name in ("voxel_size", "map"):
+            old, new = getattr(self.config, name), getattr(config, name)
+            if old != new:
+                raise ConfigError(f"cannot go on: the map was made with {name} {old}, now {new} is wanted")
+        self.config = config
+        return self
+
+    @property
+    def cell_format(self) -> CellFormat:
+        """What the log-odds of a cell are kept in."""
+        return self._format
+
+    def insert(self, coords: NDArray[np.int32], cells: NDArray[np.integer]) -> None:
+        """Set whole tiles: coordinates (n, 3) x, y, 0; cells (n, 4096) as stored, at least one of each tile known.
+
+        What stood there before is lost.
+        """
+        places = self._pool.insert(coords)
+        known = np.clip(cells, self._rules.lowest, self._rules.highest)
+        self._pool.values[places] = np.where(cells == self._format.unknown, self._format.unknown, known)
+
+    def add(self, evidence: GridEvidence) -> int:
+        """Add what one scan says (IST 2019, Eq 5); return the number of cells whose value changed."""
+        values = evidence.values
+        if self._format.per_log_odds != LOG_ODDS_SCALE:
+            values = np.rint(values * (self._format.per_log_odds / LOG_ODDS_SCALE)).astype(np.int32)
+        pool, rules = self._pool, self._rules
+        pool.reserve(len(evidence.coords))
+        return _grid.add_tiles(
+            pool.table, pool.coords, pool.count, pool.values, evidence.coords, values,
+            np.int32(self._format.unknown), rules.prior, rules.lowest, rules.highest,
+        )  # fmt: skip
+
+    def log_odds(self, points: ArrayLike) -> NDArray[np.float32]:
+        """Return the log-odds (N,) at points (N, 2) in metres; 0 where unknown or not finite."""
+        return self._format.log_odds(self._stored_at(points))
+
+    def probability(self, points: ArrayLike) -> NDArray[np.float32]:
+        """Return the occupancy probability (N,) at points (N, 2) in metres; 0.5 where unknown."""
+        return np.asarray(1 / (1 + np.exp(-self.log_odds(points))), np.float32)
+
+    def state(self, points: ArrayLike) -> NDArray[np.uint8]:
+        """Return the `State` (N,) uint8 at points (N, 2) in metres."""
+        return self._percent.states(self._stored_at(points))
+
+    def cells(self) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+        """Return all known cells: column and row (N, 2) in ascending order, and their log-odds (N,)."""
+        coords, values = self.tiles()
+        tile, place = np.nonzero(values != self._format.unknown)
+        indices = coords[tile, :2].astype(np.int64) * SIDE + np.column_stack([place % SIDE, place // SIDE])
+        order = np.lexsort(indices.T[::-1])
+        return indices[order], self._format.log_odds(values[tile, place][order])
+
+    def tiles(self) -> tuple[NDArray[np.int32], NDArray[np.integer]]:
+        """Return tile coordinates (n, 3) x, y, 0 in ascending order and their cells (n, 4096) as they are stored."""
+        n = len(self._pool)
+        order = np.lexsort(self._pool.coords[:n].T[::-1])
+        return self._pool.coords[order], self._pool.values[order]
+
+    def occupied(self) -> NDArray[np.float64]:
+        """Return the centres (N, 2) in metres of all occupied cells."""
+        return self._centres_of(State.OCCUPIED)
+
+    def free(self) -> NDArray[np.float64]:
+        """Return the centres (N, 2) in metres of all free cells."""
+        return self._centres_of(State.FREE)
+
+    def counts(self) -> dict[str, int]:
+        """Return the number of cells in each known state: `free`, `tentative`, `occupied`."""
+        number = np.bincount(self._percent.states(self._pool.values[: len(self._pool)]).ravel(), minlength=4)
+        return {state.name.lower(): int(number[state]) for state in (State.FREE, State.TENTATIVE, State.OCCUPIED)}
+
+    def bounds(self) -> NDArray[np.float64] | None:
+        """Return the lowest and highest corner (2, 2) in metres of all known cells; None for an empty map.
+
+        In the grid's own frame, which is the map's where `origin` is 0, 0, 0.
+        """
+        box = self._box()
+        return None if box is None else np.asarray(box * self.voxel_size, float)
+
+    def occupancy(self) -> OccupancyGrid:
+        """Return all known cells as per cent, in a picture just large enough; no cells at all for an empty map.
+
+        Cells are of the same state here and there (see `Percent`).
+        """
+        box = self._box()
+        (left, bottom), (right, top) = np.zeros((2, 2), int).tolist() if box is None else box.tolist()
+        picture = np.full((top - bottom, right - left), UNKNOWN, np.int8)
+        n, percent = len(self._pool), self._percent
+        _grid.show(self._pool.coords[:n], self._pool.values[:n], left, bottom, percent.shown, percent.lowest, picture)
+        x, y, yaw = planar.compose(self.origin, [left * self.voxel_size, bottom * self.voxel_size, 0.0]).tolist()
+        return OccupancyGrid(picture, self.voxel_size, (x, y, yaw), percent.free_below, percent.occupied_above)
+
+    @property
+    def memory_bytes(self) -> int:
+        """Bytes the map needs in memory: cells, tile coordinates and hash."""
+        return self._pool.memory_bytes
+
+    def save(self, path: str | Path) -> None:
+        """Save to the file `path` (`.npz`), exactly; an older file stays whole until the new one is complete.
+
+        `load_grid` reads it. For other programs write `occupancy()` as map_server files.
+        """
+        from stereovox.maps.grid_store import save_grid
+
+        save_grid(self, path)
+
+    def _box(self) -> NDArray[np.int64] | None:
+        """Return the lowest column and row of known cells, and one past the highest, (2, 2); None for an empty map."""
+        n = len(self._pool)
+        if not n:
+            return None
+        tiles = self._pool.coords[:n, :2].astype(np.int64)
+        box = np.stack([tiles.min(axis=0), tiles.max(axis=0)])
+        for end, axis in np.ndindex(2, 2):  # every tile has a known cell, so those at the rim tell
+            rim = np.flatnonzero(tiles[:, axis] == box[end, axis])
+            known = (self._pool.values[rim] != self._format.unknown).reshape(-1, SIDE, SIDE)
+            there = np.flatnonzero(known.any(axis=(0, 1 + axis)))
+            box[end, axis] = box[end, axis] * SIDE + (there[-1] + 1 if end else there[0])
+        return box
+
+    def _stored_at(self, points: ArrayLike) -> NDArray[np.integer]:
+        points = np.asarray(points, float).reshape(-1, 2)
+        with np.errstate(invalid="ignore"):
+            indices = np.floor(planar.transform(planar.inverse(self.origin), points) / self.voxel_size)
+        inside = (np.abs(indices) < INDEX_LIMIT).all(axis=1)
+        stored = np.full(len(points), self._format.unknown, self._format.dtype)
+        found = stored[inside]
+        pool = self._pool
+        _grid.look_up(pool.table, pool.coords, pool.values, indices[inside].astype(np.int64), found)
+        stored[inside] = found
+        return stored
+
+    def _centres_of(self, state: State) -> NDArray[np.float64]:
+        indices, log_odds = self.cells()
+        chosen = indices[self._percent.states(self._format.stored(log_odds)) == state]
+        return planar.transform(self.origin, (chosen + 0.5) * self.voxel_size)

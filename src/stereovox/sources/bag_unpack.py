@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Unpack what recordings pack, chunk by chunk or message by message, without room for more than a limit."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+from stereovox.errors import MissingExtra
+
+STEP = 4 * 1024 * 1024
+ZSTD = b"\x28\xb5\x2f\xfd"
+"""What a zstd frame starts with; no serialised ROS message does."""
+
+
+def unpacked(data: bytes | memoryview, packing: str, limit: int) -> bytes:
+    """Return unpacked bytes; packing: `bz2`, `lz4`, `zstd`, or "" and `none` for what is not packed.
+
+    Raises ValueError for data that are damaged, cut off, of another packing, or swell beyond `limit` bytes, and
+    MissingExtra where the library that unpacks them is not installed.
+    """
+    if packing in ("", "none"):
+        return bytes(data)
+    if packing == "zstd" and _announced(data) > limit:
+        raise ValueError("tells of an absurd size")
+    parts, size, rest = [], 0, bytes(data)
+    while rest and size <= limit:  # several packed pieces may follow each other
+        unpacking = _unpacking(packing)
+        while not unpacking.eof and size <= limit:  # in steps: lz4 makes room for all of `max_length` at once
+            parts.append(_step(unpacking, rest))
+            rest = b""
+            size += len(parts[-1])
+            if unpacking.needs_input and not unpacking.eof:
+                raise ValueError("a packed part is cut off")
+        rest = unpacking.unused_data if unpacking.eof else b""
+    if size > limit:
+        raise ValueError("a chunk unpacks to an absurd size")
+    return b"".join(parts)
+
+
+def unzipped(data: bytes, limit: int) -> bytes:
+    """Return a message, unpacked where it was packed by itself: rosbag2's mode `message`, and librealsense 2.57.
+
+    Raises as `unpacked`.
+    """
+    return unpacked(data, "zstd", limit) if data[:4] == ZSTD else data
+
+
+def _announced(data: bytes | memoryview) -> int:
+    zstd = _zstd()
+    try:
+        return zstd.get_frame_info(bytes(data[:32])).decompressed_size or 0  # it need not be told
+    except zstd.ZstdError as error:
+        raise ValueError(f"cannot be unpacked: {error}") from None
+
+
+def _step(unpacking: Any, data: bytes) -> bytes:
+    try:
+        return unpacking.decompress(data, max_length=STEP)
+    except Exception as error:  # bz2, lz4 and zstd each have their own
+        raise ValueError(f"cannot be unpacked: {error}") from None
+
+
+def _unpacking(packing: str) -> Any:
+    if packing == "bz2":
+        import bz2
+
+        return bz2.BZ2Decompressor()
+    if packing == "lz4":
+        return _lz4().LZ4FrameDecompressor()
+    if packing == "zstd":
+        return _zstd().ZstdDecompressor()
+    raise ValueError(f"packed with '{packing[:20]}', which is not known")
+
+
+def _lz4() -> Any:
+    try:
+        import lz4.frame
+    except ImportError:
+        raise MissingExtra("lz4", "bags") from None
+    return lz4.frame
+
+
+def _zstd() -> Any:
+    try:
+        if sys.version_info >= (3, 14):
+            from compression import zstd
+        else:
+            from backports import zstd  # comes with rosbags
+    except ImportError:
+        raise MissingExtra("zstd", "bags") from None
+    return zstd

@@ -1,0 +1,170 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Write bags that other ROS tools play back: scans, depth images, odometry, transforms and maps of a robot."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stereovox.cameras import PinholeCamera
+from stereovox.errors import SourceError
+from stereovox.frame import Frame, Scan
+from stereovox.geometry import Transform, rigidity_error
+from stereovox.maps.occupancy import OccupancyGrid
+from stereovox.planar import lifted
+from stereovox.sources.bag_metadata import sibling
+from stereovox.sources.bag_writer_file import TF_MESSAGE, BagFileWriter
+from stereovox.sources.bag_writer_messages import Messages, metres, millimetres, packed_png
+
+IMAGE, PACKED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+RIGID = 1e-6
+
+
+class BagWriter:
+    """Writes a recording, all or nothing: it stands at `path` when the `with` block ends well, else nothing does.
+
+    path: ends in `.bag` for ROS 1, in `.db3` or `.mcap` for one file of ROS 2; any other name is a rosbag2 folder,
+        with an `.mcap` in it. An older file is replaced, and stays whole if writing fails; a folder must be new or
+        empty.
+    packed: chunks of a `.bag` are packed with lz4, those of `.mcap` with zstd; `.db3` is never packed.
+
+    Times are int64 nanoseconds since whatever the clock counts from, not negative; each message is recorded at its own
+    time. Messages may come in any order, but readers are quickest where they come in order of time.
+    Raises MissingExtra without rosbags; SourceError, one line, for what cannot be written.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], *, packed: bool = True):
+        self.path = Path(path)
+        self._file = BagFileWriter(self.path, packed)
+        self._messages = Messages(self._file.store, self._file.ros)
+        self._fixed: dict[str, tuple[str, str, Transform]] = {}
+        self._last_ns = 0
+        self._due = False
+
+    def __enter__(self) -> Self:
+        self._file.open()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if kind is not None:
+            self._file.abort()
+            return
+        try:
+            self._tell_fixed()
+        except BaseException:
+            self._file.abort()
+            raise
+        self._file.finish()
+
+    def scan(self, scan: Scan, topic: str = "/scan", frame_id: str = "laser") -> None:
+        """Write a `sensor_msgs/LaserScan`; where the lidar sits and stood is told by `fixed` and `odometry`."""
+        if scan.fault:
+            raise SourceError(f"{self.path}: {scan.name or topic} has a fault ({scan.fault}); leave it out")
+        self._write(topic, "sensor_msgs/msg/LaserScan", scan.stamp_ns, self._messages.scan(scan, frame_id))
+
+    def depth(
+        self,
+        frame: Frame,
+        topic: str = "/camera/depth/image_raw",
+        frame_id: str = "camera_depth_optical_frame",
+        *,
+        compressed: bool = False,
+    ) -> None:
+        """Write a depth image and, on `camera_info` beside it, its camera; the pose is not written.
+
+        uint16 depth becomes 16UC1 millimetres, float depth 32FC1 metres (REP 118). compressed: whole millimetres as PNG
+        on `<topic>/compressedDepth`. What a `sensor_msgs/CameraInfo` does not hold is lost: the baseline, a correction,
+        and the reasons why pixels have no value.
+        """
+        camera = frame.camera
+        if not isinstance(camera, PinholeCamera) or frame.depth.shape != (camera.height, camera.width):
+            what = frame.fault or f"{frame.depth.shape} pixels of a {type(camera).__name__}"
+            raise SourceError(f"{self.path}: {frame.name or topic}: {what}; only whole images of a pinhole are written")
+        stamp_ns, messages = frame.stamp_ns, self._messages
+        if compressed:
+            picture = messages.compressed(packed_png(millimetres(frame)), stamp_ns, frame_id)
+            self._write(f"{topic}/compressedDepth", PACKED, stamp_ns, picture)
+        else:
+            depth = millimetres(frame) if frame.depth.dtype.kind == "u" else metres(frame)
+            self._write(topic, IMAGE, stamp_ns, messages.image(depth, stamp_ns, frame_id))
+        info = messages.camera_info(camera, stamp_ns, frame_id)
+        self._write(sibling(topic, "camera_info"), "sensor_msgs/msg/CameraInfo", stamp_ns, info)
+
+    def odometry(
+        self,
+        stamp_ns: int,
+        pose_odom_base: ArrayLike,
+        topic: str = "/odom",
+        odom_frame: str = "odom",
+        base_frame: str = "base_link",
+    ) -> None:
+        """Write a `nav_msgs/Odometry`, and the same as transform odom -> base_link on `/tf`; pose: (3,) x, y, yaw."""
+        pose = self._planar(pose_odom_base)
+        message = self._messages.odometry(pose, stamp_ns, odom_frame, base_frame)
+        self._write(topic, "nav_msgs/msg/Odometry", stamp_ns, message)
+        self.transform(stamp_ns, odom_frame, base_frame, lifted(pose))
+
+    def transform(self, stamp_ns: int, parent: str, child: str, T_parent_child: Transform) -> None:
+        """Write where a frame stands in its parent at one moment, (4, 4), on `/tf`."""
+        edge = parent, child, self._rigid(T_parent_child, parent, child)
+        self._write("/tf", TF_MESSAGE, stamp_ns, self._messages.transforms(stamp_ns, [edge]))
+
+    def fixed(self, parent: str, child: str, T_parent_child: Transform) -> None:
+        """Write where a frame stands in its parent for good, (4, 4), on `/tf_static`.
+
+        All that were told so far go into one message before the next of another kind, since only the last message of
+        this topic is kept for who comes later.
+        """
+        self._fixed[child] = parent, child, self._rigid(T_parent_child, parent, child)
+        self._due = True
+
+    def pose(
+        self,
+        stamp_ns: int,
+        pose_map_base: ArrayLike,
+        covariance: ArrayLike | None = None,
+        topic: str = "/amcl_pose",
+        frame_id: str = "map",
+    ) -> None:
+        """Write a `geometry_msgs/PoseWithCovarianceStamped` of a (3,) pose x, y, yaw.
+
+        covariance: (3, 3) of x, y, yaw in m^2, m rad and rad^2, (6, 6) in ROS's order, or None for zeros.
+        """
+        if covariance is not None and np.shape(covariance) not in ((3, 3), (6, 6)):
+            raise SourceError(f"{self.path}: a covariance of {np.shape(covariance)} on {topic}; give (3, 3) or (6, 6)")
+        message = self._messages.pose(self._planar(pose_map_base), covariance, stamp_ns, frame_id)
+        self._write(topic, "geometry_msgs/msg/PoseWithCovarianceStamped", stamp_ns, message)
+
+    def occupancy(self, stamp_ns: int, grid: OccupancyGrid, topic: str = "/map_mapping", frame_id: str = "map") -> None:
+        """Write a `nav_msgs/OccupancyGrid`, kept for who comes later (latched)."""
+        message = self._messages.occupancy(grid, stamp_ns, frame_id)
+        self._write(topic, "nav_msgs/msg/OccupancyGrid", stamp_ns, message, latched=True)
+
+    def _write(self, topic: str, kind: str, stamp_ns: int, message: Any, latched: bool = False) -> None:
+        self._last_ns = stamp_ns
+        self._tell_fixed()
+        self._file.write(topic, kind, stamp_ns, message, latched)
+
+    def _tell_fixed(self) -> None:
+        if self._due:
+            self._due = False
+            message = self._messages.transforms(self._last_ns, list(self._fixed.values()))
+            self._file.write("/tf_static", TF_MESSAGE, self._last_ns, message, latched=True)
+
+    def _planar(self, pose: ArrayLike) -> NDArray[np.float64]:
+        numbers = np.asarray(pose, float)
+        if numbers.shape != (3,) or not np.isfinite(numbers).all():
+            raise SourceError(f"{self.path}: {pose} is no pose; give x, y and yaw, all finite")
+        return numbers
+
+    def _rigid(self, T: Transform, parent: str, child: str) -> Transform:
+        if rigidity_error(T) > RIGID:
+            raise SourceError(f"{self.path}: {parent} -> {child} is no rigid motion; give a (4, 4) rotation and shift")
+        return np.asarray(T, float)

@@ -1,0 +1,158 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Recordings of ground robots in bags of ROS 1 and ROS 2: scans, depth images, odometry, tf."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from stereovox.errors import FrameRefused, SourceError
+from stereovox.frame import Frame, Scan
+from stereovox.geometry import Transform, inverse
+from stereovox.sources.bag import depth_frame, file_part, parse_as
+from stereovox.sources.bag_depth import DepthTopic, depth_topics, find_depth
+from stereovox.sources.bag_files import BagFile, open_bag, suffix_of
+from stereovox.sources.bag_poses import topic_poses
+from stereovox.sources.bag_robot_messages import LaserScan, frame_name
+from stereovox.sources.bag_scans import find_scans, most
+from stereovox.sources.cloud_scan import CloudBand, scan_of_cloud
+from stereovox.sources.lazy import Lazy
+from stereovox.sources.poses import Poses
+from stereovox.sources.robot_frames import FrameOptions, RobotFrames
+from stereovox.sources.robot_options import RobotOptions, mounted
+from stereovox.sources.tf_edge import Limits
+from stereovox.sources.tracker import AXES
+
+NOWHERE = np.full((4, 4), np.nan)
+T_BODY_OPTICAL = np.eye(4)
+"""An optical frame (z forward) in a body that looks the same way (x forward, z up)."""
+T_BODY_OPTICAL[:3, :3] = AXES["ros"].T
+
+
+class RobotBag:
+    """A ground robot's scans, depth images and odometry in a bag of ROS 1 (`.bag`) or ROS 2.
+
+    Topics are found by their types; where there are several the one with most messages counts, and a note names the
+    others. Scans are those of a lidar (LaserScan), without one what a lidar would see of point clouds.
+
+    World: the frame of the odometry (`odom` in tf); without it poses of a nav_msgs/Odometry topic; without that the
+    robot is taken to stand still, which SLAM can put right. A pose is looked up in tf at the time of the scan or image,
+    interpolated; gaps longer than `max_gap` are not bridged. Sensors that tf does not mount are taken for mounted at
+    the robot's own frame (`base_footprint`, else `base_link`). All that is assumed is told in `notes`.
+
+    Order: as recorded, which is that of the stamps unless the clock was set back meanwhile.
+    Faults: `unreadable`, `no_pose`, for images also `bad_dtype` and `bad_shape`.
+    Raises SourceError, one line, for files that are empty, damaged or without scans and depth, and for bad options.
+    """
+
+    layout = "a bag with scans or depth images of a robot"
+
+    def __init__(self, where: str | Path):
+        path, options = parse_as(str(where), RobotOptions)
+        file = open_bag(path)
+        self.name, self._options = path.name, options
+        self._depth, depth_notes = _find_depth(file, options)
+        depth_frame_id = frame_name(self._depth.frame_id) if self._depth else ""
+        self._scans, scan_notes = find_scans(file, options.scan, options.range_max, depth_frame_id)
+        if not (self._scans or self._depth):
+            seen = ", ".join(f"{name} ({kind})" for name, kind in sorted(file.types.items())[:5]) or "nothing at all"
+            why = f"{depth_notes[0]}; else" if depth_notes else f"{path}:"
+            raise SourceError(f"{why} no scans, point clouds or depth images in it; it holds {seen}")
+        limits = Limits(options.max_gap, options.extrapolate)
+        chosen = FrameOptions(options.odom, options.base_frame, options.odom_frame, options.truth, limits)
+        scan_frame_id = self._scans.frame_id if self._scans else ""
+        self.where = RobotFrames(file, chosen, (scan_frame_id, depth_frame_id))
+        self._lidar, lidar_notes = self._mount_lidar(scan_frame_id)
+        self._camera, camera_notes = self._mount_camera(depth_frame_id)
+        self.truth: Poses | None = _truth(file, options.truth)
+        self.notes = (*scan_notes, *depth_notes, *self.where.notes, *lidar_notes, *camera_notes)
+        self.scans: Sequence[Scan] = Lazy(self._scan, range(len(self._scans or ())))
+        self.frames: Sequence[Frame] = Lazy(self._frame, range(len(self._depth or ())))
+
+    @classmethod
+    def recognises(cls, where: str) -> bool:
+        """Tell whether `where` is, or by its name should be, a bag; options may follow. Never raises."""
+        return bool(suffix_of(file_part(where)))
+
+    def _mount_lidar(self, frame_id: str) -> tuple[str, tuple[str, ...]]:
+        if not self._scans:
+            return "", ()
+        return self.where.mount(frame_id, "lidar", mounted("mount", self._options.mount), np.eye(4))
+
+    def _mount_camera(self, frame_id: str) -> tuple[str, tuple[str, ...]]:
+        if not self._depth:
+            return "", ()
+        T_frame = T_BODY_OPTICAL if self._options.axes == "optical" else np.eye(4)
+        given = mounted("camera_mount", self._options.camera_mount)
+        camera, notes = self.where.mount(frame_id, "camera", given, T_frame)
+        return camera, (*self._depth.notes, *notes)
+
+    def _scan(self, i: int) -> Scan:
+        topic = self._scans
+        assert topic
+        blank = Scan(
+            np.empty(0, np.float32), 0.0, 0.0, 0.0, 0.0, NOWHERE, stamp_ns=topic.recorded_ns(i), name=topic.name(i)
+        )
+        try:
+            told = topic.read(i)
+            blank = replace(blank, stamp_ns=told.stamp_ns)
+            sensor = self._lidar if told.frame_id == topic.frame_id else told.frame_id
+            T_base, T_odom = (look(sensor, told.stamp_ns) for look in (self.where.in_base, self.where.in_odom))
+        except FrameRefused as refused:
+            return replace(blank, fault=refused.reason, fault_detail=str(refused))
+        if isinstance(told, LaserScan):
+            return _scan(told, T_odom, T_base, blank.name)
+        band = CloudBand(self._options.lowest, self._options.highest)
+        band = replace(band, range_max=self._options.range_max or band.range_max)
+        flat, T_base_scan = scan_of_cloud(told, T_base, band)
+        return _scan(flat, T_odom @ inverse(T_base) @ T_base_scan, T_base_scan, blank.name)
+
+    def _frame(self, i: int) -> Frame:
+        images = self._depth
+        assert images
+        name = f"{self.where.path} {images.topic} message {i}"
+        return depth_frame(images, i, name, self._camera_pose, images.camera, self._options.scale)
+
+    def _camera_pose(self, stamp_ns: int) -> Transform:
+        T = self.where.in_odom(self._camera, stamp_ns)
+        return T if self._options.axes == "optical" else T @ T_BODY_OPTICAL
+
+
+def _scan(told: LaserScan, T_odom_sensor: Transform, T_base_sensor: Transform, name: str) -> Scan:
+    angles = told.angle_min, told.angle_step
+    limits = told.range_min, told.range_max
+    return Scan(told.ranges, *angles, *limits, T_odom_sensor, T_base_sensor, stamp_ns=told.stamp_ns, name=name)
+
+
+def _find_depth(file: BagFile, options: RobotOptions) -> tuple[DepthTopic | None, tuple[str, ...]]:
+    """Return the depth images that are named, or else the topic with most, and notes; None where there are none.
+
+    Without being asked for, images that cannot be used (without CameraInfo) only make a note.
+    """
+    if options.depth:
+        return find_depth(file, options.depth, options.info), ()
+    found, notes = depth_topics(file), ()
+    if not found:
+        return None, ()
+    best = most(file, found)
+    if len(found) > 1:
+        others = ", ".join(name for name in found if name != best)
+        notes = (f"{file.path}: depth images of {best}; there are {others} too: say ?depth=/topic for those",)
+    try:
+        return find_depth(file, best, options.info), notes
+    except SourceError as error:
+        if options.info:
+            raise
+        return None, (f"{error}; depth images are left out",)
+
+
+def _truth(file: BagFile, topic: str) -> Poses | None:
+    if not topic:
+        return None
+    found = topic_poses(file, topic)
+    if not isinstance(found.poses, Poses):
+        raise SourceError(f"{file.path}: {topic}: not one pose can be read; name another with ?truth=/topic")
+    return found.poses

@@ -1,0 +1,173 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A picture of a floor's map: free, occupied and unknown cells, metres at the edges, and a robot's way through it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stereovox import planar
+from stereovox.maps import State
+from stereovox.maps.occupancy import UNKNOWN, OccupancyGrid
+from stereovox.view.figures import WIDTH, figure_of, save, words_above
+from stereovox.view.panels import GREY, INK, PATH_COLOUR, STATE_COLOURS, measured, scale_bar
+
+MOST_PIXELS = 1500
+"""Cells along the longer side up to which each has a pixel of its own; beyond, one of several is shown."""
+Box = tuple[NDArray[np.float64], NDArray[np.float64]]
+"""Lowest and highest (2,) x, y in metres."""
+NAMES = {State.UNKNOWN: "unknown", State.FREE: "free", State.TENTATIVE: "between", State.OCCUPIED: "occupied"}
+
+
+def picture_grid(
+    grid: OccupancyGrid, path: str | Path, *, title: str | None = None, track: ArrayLike | None = None
+) -> None:
+    """Write a PNG of a floor's map.
+
+    track: (N, 2) or (N, 3) places x, y (and yaw) of a robot in the map's frame, drawn as a line. A map that knows
+    nothing gives a picture that says so. Raises StereovoxError for a name that does not end in .png or a file that
+    cannot be written.
+    """
+    save(draw_grid(grid, title or "Floor map", track), path)
+
+
+def draw_grid(grid: OccupancyGrid, heading: str, track: ArrayLike | None = None) -> Any:
+    """Return the matplotlib figure that `picture_grid` saves."""
+    box = bounds(grid, track)
+    if box is None:
+        figure = figure_of(4)
+        figure.text(0.5, 0.4, "This map is empty: no cell is known yet.", ha="center", fontsize=20, color=GREY)
+    else:
+        (x0, y0), (x1, y1) = box
+        figure = figure_of(float(np.clip(0.92 * WIDTH * (y1 - y0) / (x1 - x0), 3, 15)) + 1.6)
+        axis = figure.add_subplot()
+        plan(axis, trimmed(grid), track)
+        framed(axis, box)
+        _legend(figure, track is not None)
+    words_above(figure, heading, facts(grid))
+    return figure
+
+
+def framed(axis: Any, box: Box) -> None:
+    """Show a rectangle of a panel in metres, with a scale bar in a strip below it."""
+    (x0, y0), (x1, y1) = box
+    axis.set(xlim=(x0, x1), ylim=(y0 - 0.06 * (y1 - y0), y1))
+    scale_bar(axis)
+    axis.set_xlim(x0, x1 + 0.01 * (x1 - x0))
+
+
+def facts(grid: OccupancyGrid) -> list[str]:
+    """Return what a map holds, in words."""
+    rows, columns = grid.cells.shape
+    counts = np.bincount(grid.states.ravel(), minlength=len(State))
+    size = f"{columns * grid.resolution:.1f} x {rows * grid.resolution:.1f} m"
+    return [f"cells of {grid.resolution:g} m", size, *(f"{counts[state]:,} {NAMES[state]}" for state in
+            (State.OCCUPIED, State.FREE, State.TENTATIVE) if counts[state] or state != State.TENTATIVE)]  # fmt: skip
+
+
+def bounds(grid: OccupancyGrid, track: ArrayLike | None = None) -> Box | None:
+    """Return lowest and highest (2,) x, y of what is known and of the track, with a margin; None where nothing is."""
+    corners = _corners(grid)
+    if track is not None and np.size(track):
+        corners = np.concatenate([corners, np.asarray(track, float)[:, :2]])
+    if not len(corners):
+        return None
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    margin = 0.02 * float((high - low).max()) + grid.resolution
+    return low - margin, high + margin
+
+
+def plan(axis: Any, grid: OccupancyGrid, track: ArrayLike | None = None, most: int = MOST_PIXELS) -> None:
+    """Draw the states of a map's cells into a panel in metres of the map's frame, and a robot's way if there is one."""
+    paint(axis, grid, grid.states, {int(state): STATE_COLOURS[state] for state in State}, most)
+    axis.set_facecolor(STATE_COLOURS[State.UNKNOWN])
+    if track is not None and np.size(track):
+        x, y = np.asarray(track, float)[:, :2].T
+        axis.plot(x, y, color=PATH_COLOUR, linewidth=1.6, solid_capstyle="round")
+        axis.plot(x[:1], y[:1], "o", color=PATH_COLOUR, markeredgecolor="white", markersize=7)
+        axis.plot(x[-1:], y[-1:], "s", color=PATH_COLOUR, markeredgecolor="white", markersize=7)
+
+
+def paint(
+    axis: Any, grid: OccupancyGrid, classes: NDArray[np.uint8], colours: Mapping[int, str], most: int = MOST_PIXELS
+) -> None:
+    """Draw classes (rows, columns) uint8 of the cells of `grid` into a panel.
+
+    colours: of each class, and in this order they cover each other where one pixel stands for several cells, so that a
+    wall one cell wide is not lost. most: pixels along the longer side.
+    """
+    from matplotlib.colors import ListedColormap
+    from matplotlib.transforms import Affine2D
+
+    x, y, yaw = grid.origin
+    step = -(-max(classes.shape) // most)
+    ranks = pooled(classes, list(colours), step)
+    rows, columns = (n * step * grid.resolution for n in ranks.shape)
+    axis.imshow(
+        ranks,
+        cmap=ListedColormap(list(colours.values())),
+        vmin=0,
+        vmax=len(colours) - 1,
+        origin="lower",
+        extent=(0, columns, 0, rows),
+        interpolation="nearest",
+        transform=Affine2D().rotate(yaw).translate(x, y) + axis.transData,
+    )
+    axis.set_aspect("equal")
+    measured(axis, ("x", "y", "z"))
+
+
+def pooled(classes: NDArray[np.uint8], rising: Sequence[int], step: int) -> NDArray[np.uint8]:
+    """Return the place in `rising` of the class that comes last there, in each square of `step` cells a side."""
+    rank = np.zeros(256, np.uint8)
+    rank[np.asarray(rising, int)] = np.arange(len(rising))
+    rows, columns = (-(-n // step) * step for n in classes.shape)
+    ranks = np.zeros((rows, columns), np.uint8)
+    ranks[: classes.shape[0], : classes.shape[1]] = rank[classes]
+    return ranks.reshape(rows // step, step, columns // step, step).max(axis=(1, 3))
+
+
+def trimmed(grid: OccupancyGrid) -> OccupancyGrid:
+    """Return a map without the rows and columns at its rim of which nothing is known."""
+    rows, columns = known_span(grid)
+    x, y, yaw = planar.compose(grid.origin, [columns.start * grid.resolution, rows.start * grid.resolution, 0]).tolist()
+    return replace(grid, cells=grid.cells[rows, columns], origin=(x, y, yaw))
+
+
+def known_span(grid: OccupancyGrid) -> tuple[slice, slice]:
+    """Return the rows and columns from the first to the last of which a cell is known; both empty where none is."""
+    known = grid.cells != UNKNOWN
+    ends = (np.flatnonzero(known.any(axis=axis)) for axis in (1, 0))
+    rows, columns = (slice(int(n[0]), int(n[-1]) + 1) if len(n) else slice(0, 0) for n in ends)
+    return rows, columns
+
+
+def known_bounds(grid: OccupancyGrid) -> NDArray[np.float64] | None:
+    """Return lowest and highest (2, 2) x, y in metres of what is known, in the map's frame; None where nothing is."""
+    corners = _corners(grid)
+    return np.stack([corners.min(axis=0), corners.max(axis=0)]) if len(corners) else None
+
+
+def _corners(grid: OccupancyGrid) -> NDArray[np.float64]:
+    """Return the corners (4, 2) of the known cells' rectangle in the map's frame; (0, 2) where none is known."""
+    rows, columns = known_span(grid)
+    if rows.stop == rows.start:
+        return np.zeros((0, 2))
+    ends = [(c, r) for c in (columns.start, columns.stop) for r in (rows.start, rows.stop)]
+    return planar.transform(grid.origin, np.array(ends) * grid.resolution)
+
+
+def _legend(figure: Any, with_track: bool) -> None:
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    states = (State.OCCUPIED, State.FREE, State.UNKNOWN)
+    handles: list[Any] = [Patch(fc=STATE_COLOURS[state], ec="#888", label=NAMES[state]) for state in states]
+    if with_track:
+        handles.append(Line2D([], [], color=PATH_COLOUR, label="the robot's way, from dot to square"))
+    figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False, fontsize=11, labelcolor=INK)

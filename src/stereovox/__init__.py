@@ -16,11 +16,14 @@ if TYPE_CHECKING:
     from stereovox.frame import Reason as Reason
     from stereovox.frame import Scan as Scan
     from stereovox.frame import StereoFrame as StereoFrame
+    from stereovox.grid_mapper import GridMapper as GridMapper
     from stereovox.mapper import Mapper as Mapper
     from stereovox.mapper import UpdateReport as UpdateReport
     from stereovox.maps import State as State
     from stereovox.maps import VoxelMap as VoxelMap
     from stereovox.maps import load_map as load_map
+    from stereovox.maps.grid_map import GridMap as GridMap
+    from stereovox.maps.occupancy import OccupancyGrid as OccupancyGrid
     from stereovox.rigs import StereoPair as StereoPair
     from stereovox.sources import open_source as open_source
     from stereovox.wide import CylindricalCamera as CylindricalCamera
@@ -41,11 +44,14 @@ _HOMES = {
     "SphericalCamera": "wide",
     "CylindricalCamera": "wide",
     "Reason": "frame",
+    "GridMapper": "grid_mapper",
     "Mapper": "mapper",
     "UpdateReport": "mapper",
     "State": "maps",
     "VoxelMap": "maps",
     "load_map": "maps",
+    "GridMap": "maps.grid_map",
+    "OccupancyGrid": "maps.occupancy",
     "open_source": "sources",
 }
 __all__ = [*_HOMES, "__version__"]  # pyright: ignore[reportUnsupportedDunderAll]

@@ -80,13 +80,14 @@ class AmclConfig(Section):
         out where it fits less than beam_skip_share of them; all are used where more than beam_skip_most would be lost.
     alpha_slow, alpha_fast: how quickly the long and the short memory of the likelihood fade (table 8.3); where the
         short one falls below the long one, random particles help to find the robot again. 0: never.
+    recovery_least: a smaller share of random particles is taken for chance, and none are drawn; 0: as printed.
     candidates: random poses that are tried for each random particle, of which the scan chooses; 1: any, as printed.
     start_std: standard deviation of the first pose where it is given: metres, metres, radians.
     """
 
     particles_min: int = Field(500, ge=10)
     particles_max: int = Field(30000, ge=10, le=1_000_000)
-    kld_error: float = Field(0.05, gt=0, lt=1)
+    kld_error: float = Field(0.01, gt=0, lt=1)
     kld_z: float = Field(2.33, gt=0, le=6)
     kld_bin: float = Field(0.5, gt=0)
     kld_bin_deg: float = Field(10.0, gt=0, le=360)
@@ -100,20 +101,21 @@ class AmclConfig(Section):
     model: Literal["field", "beam"] = "field"
     max_beams: int = Field(60, ge=2)
     max_range: float | None = Field(None, gt=0)
-    trust: float = Field(0.25, gt=0, le=1)
+    trust: float = Field(0.1, gt=0, le=1)
     z_hit: float = Field(0.75, gt=0, le=1)
     z_short: float = Field(0.05, ge=0, le=1)
     z_max: float = Field(0.05, ge=0, le=1)
     z_rand: float = Field(0.15, gt=0, le=1)
-    sigma_hit: float = Field(0.2, gt=0)
+    sigma_hit: float = Field(0.1, gt=0)
     lambda_short: float = Field(0.1, gt=0)
     field_distance: float = Field(2.0, gt=0)
     beam_skip: bool = True
     beam_skip_distance: float = Field(0.5, gt=0)
     beam_skip_share: float = Field(0.3, ge=0, le=1)
     beam_skip_most: float = Field(0.9, ge=0, le=1)
-    alpha_slow: float = Field(0.001, ge=0, le=1)
-    alpha_fast: float = Field(0.1, ge=0, le=1)
+    alpha_slow: float = Field(0.01, ge=0, le=1)
+    alpha_fast: float = Field(0.3, ge=0, le=1)
+    recovery_least: float = Field(0.1, ge=0, lt=1)
     candidates: int = Field(20, ge=1, le=1000)
     start_std: tuple[float, float, float] = (0.5, 0.5, 0.26)
 
@@ -147,9 +149,11 @@ class SlamConfig(Section):
     closure_share: share of the points that must then lie on the earlier map's lines.
     refine_rounds: how often all keyframes are matched with all that saw the same walls, at the end; 0 is quickest.
     refine_distance: metres between keyframes that are matched with each other.
+    clear_far: whether a beam that saw nothing clears the map up to `max_range`. Off, as many lidars tell black and
+        dazzling things in the same way.
     """
 
-    voxel_size: float = Field(0.05, gt=0, le=1)
+    voxel_size: float = Field(0.05, ge=0.01, le=0.5)
     max_range: float = Field(30.0, gt=0, le=1000)
     sigma: float = Field(0.06, gt=0, le=1)
     odometry: tuple[float, float, float, float] = (0.1, 0.4, 0.07, 0.5)
@@ -167,3 +171,10 @@ class SlamConfig(Section):
     closure_share: float = Field(0.5, gt=0, lt=1)
     refine_rounds: int = Field(1, ge=0, le=20)
     refine_distance: float = Field(5.0, gt=0, le=100)
+    clear_far: bool = False
+
+    @model_validator(mode="after")
+    def _not_too_fine(self) -> SlamConfig:
+        if self.max_range > 2000 * self.voxel_size:
+            raise ValueError(f"max_range {self.max_range:g} spans more than 2000 cells of {self.voxel_size:g}")
+        return self

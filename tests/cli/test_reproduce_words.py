@@ -4,7 +4,7 @@ import pytest
 from stereovox.cli import main
 
 
-@pytest.mark.parametrize(("paper", "said"), [("ist2019", "not in this version"), ("chien", "chien2020")])
+@pytest.mark.parametrize(("paper", "said"), [("ist", "ist2019"), ("chien", "chien2020")])
 def test_a_paper_that_is_not_there(paper, said, tmp_path, capsys):
     assert main(["reproduce", paper, "--out", str(tmp_path)]) == 2
     captured = capsys.readouterr()

@@ -156,6 +156,7 @@ CASES = {
     "up": (pose(0.3, tilt=-15), {}),
     "on its side": (pose(tilt=10, roll=90), {}),
     "above the heights": (pose(2.2, tilt=25), {"heights": [0.1, 1.2]}),
+    "above, on its side": (pose(2.2, tilt=25, roll=-90), {"heights": [0.1, 1.2]}),
     "below the heights": (pose(0.1, tilt=-20), {"heights": [0.4, 1.2]}),
     "steep": (pose(1.5, tilt=60), {}),
     "fine": (pose(tilt=20), {"angle_step_deg": 0.3}),

@@ -57,7 +57,7 @@ def seen_within(scene, scan, T, angles):
 
     Both along the floor, of what is between the heights alone; (N,) each, inf and 0 for none.
     """
-    height, rows = T[2, 3], np.linspace(-0.5, CAMERA.height - 0.5, 900)[1:-1]
+    height, rows = T[2, 3], np.linspace(-0.5, CAMERA.height - 0.5, 500)[1:-1]
     found, sight = np.full(len(angles), np.inf), np.zeros(len(angles))
     R = scan.T_world_sensor[:3, :3]
     tilt = np.arcsin(-T[2, 2])
@@ -83,7 +83,7 @@ def seen_within(scene, scan, T, angles):
 def test_a_furnished_room_as_rays_at_all_heights_see_it(height, tilt):
     scene, T = Scene([*ROOM, *THINGS]), pose(height, tilt)
     scan = scan_of(image_of(scene, T), settings())
-    parts = np.linspace(-1.0, 1.0, 9)  # a beam and its pixels reach into the next ones
+    parts = np.linspace(-1.0, 1.0, 5)  # a beam and its pixels reach into the next ones
     casts = [seen_within(scene, scan, T, scan.angles + part * scan.angle_step) for part in parts]
     hits, sights = (np.array(kind) for kind in zip(*casts, strict=True))
     inner = slice(3, -3)
@@ -94,7 +94,7 @@ def test_a_furnished_room_as_rays_at_all_heights_see_it(height, tilt):
     slack = 0.05 * ranges[hit]  # between two rows the camera sees a slanting edge a bit later
     assert (ranges[hit] >= nearest[hit] - 1e-3).all()
     assert (ranges[hit] <= farthest[hit] + slack).all()
-    plain = hit & (farthest - nearest < 0.02)
+    plain = hit & (farthest < nearest + 0.02)
     assert plain.sum() > 60
     assert np.abs(ranges - nearest)[plain].max() < 0.03
     assert (clear <= sights.max(0)[inner] + 1e-3).all()

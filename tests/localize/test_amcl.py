@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -36,14 +37,14 @@ def seen(pose, odom, n, rng, **changes):
 def drive(stops, rng, step=0.15):
     """True poses along straight ways, and those of an odometer that is off by a few per cent."""
     poses = [np.array([*stops[0], np.arctan2(*np.subtract(stops[1], stops[0])[::-1])])]
-    for a, b in zip(stops[:-1], stops[1:], strict=True):
+    for a, b in pairwise(stops):
         way, yaw = np.hypot(*np.subtract(b, a)), np.arctan2(*np.subtract(b, a)[::-1])
         turn = planar.wrapped(yaw - poses[-1][2])
         start = poses[-1][2]
         poses += [np.array([*a, start + turn * share]) for share in np.linspace(0.2, 1, 5)]
         poses += [np.array([*(np.asarray(a) + s * np.subtract(b, a)), yaw]) for s in np.arange(step, way, step) / way]
     odom = [ODOM]
-    for before, after in zip(poses[:-1], poses[1:], strict=True):
+    for before, after in pairwise(poses):
         noise = 1 + rng.normal(0, [0.03, 0.03, 0.05])
         odom.append(planar.compose(odom[-1], planar.relative(before, after) * [1.02, 1.02, 0.98] * noise))
     return np.array(poses), np.array(odom)
@@ -223,7 +224,7 @@ def test_without_a_good_scan_there_is_no_track(driven):
 
 @pytest.mark.parametrize("value", [0, 100, -1])
 def test_maps_that_tell_nothing_are_errors(value):
-    with pytest.raises(MapFileError, match="no (free|occupied) cell"):
+    with pytest.raises(MapFileError, match=r"no (free|occupied) cell"):
         Localiser(OccupancyGrid(np.full((5, 5), value, np.int8), 0.1), load_config())
 
 

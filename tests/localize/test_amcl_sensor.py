@@ -145,8 +145,10 @@ def test_each_part_of_the_beam_model_is_that_of_the_book():
 def test_beams_agree_with_the_particles_that_they_fit(model):
     cells = np.zeros((50, 50), np.int8)
     cells[:, 40] = 100
-    sensor = model(OccupancyGrid(cells, 0.1), AmclConfig(beam_skip_distance=0.3))
+    sensor = model(OccupancyGrid(cells, 0.1), AmclConfig(beam_skip_distance=0.25))
     scan = Scan(np.array([2.05, 1.0, np.inf], np.float32), 0.0, 1e-9, 0.02, 3.0, np.eye(4))
-    particles = np.array([[2.0, 2, 0], [2.0, 2.5, 0], [2.0, 3, 0], [2.6, 2, 0]])
+    particles = np.array([[2.0, 2, 0], [2.2, 2.5, 0], [1.8, 2, 0], [1.7, 2, 0], [2.3, 2, 0]])
     fits = sensor.agreeing(particles, beams_of(scan).some(9, sensor.hits_only))
-    assert fits.tolist() == ([0.75, 0.0] if sensor.hits_only else [0.75, 0.0, 1.0])
+    assert fits.tolist() == ([0.6, 0.0] if sensor.hits_only else [0.6, 0.0, 1.0])
+    one = sensor.agreeing(particles[2:4], beams_of(scan))[0]
+    assert one == 0.5  # column 38 does and 37 does not

@@ -15,7 +15,7 @@ import lz4.frame
 from backports import zstd
 
 MAGIC = b"\x89MCAP0\r\n"
-PACKERS = {"": bytes, "lz4": lz4.frame.compress, "zstd": zstd.compress}
+PACKERS = {"": bytes, "brotli": bytes, "lz4": lz4.frame.compress, "zstd": zstd.compress}
 
 
 @dataclass(frozen=True)
@@ -27,8 +27,12 @@ class Message:
 
 @dataclass(frozen=True)
 class Style:
-    """packing: of chunks. chunk: messages in each, 0 for none at all. crc: checksums. index, summary: whether there are
-    message indexes and a summary; repeated: whether the summary repeats the channels; encoding: of the messages."""
+    """How a file is written.
+
+    packing: of chunks. chunk: messages in each, 0 for no chunks at all. crc: checksums. index, summary: whether there
+    are message indexes and a summary; repeated: whether the summary repeats the channels; twice: whether it tells of
+    every chunk twice. encoding: of the messages.
+    """
 
     packing: str = ""
     chunk: int = 3
@@ -36,6 +40,7 @@ class Style:
     index: bool = True
     summary: bool = True
     repeated: bool = True
+    twice: bool = False
     encoding: str = "cdr"
     profile: str = "ros2"
 
@@ -95,10 +100,14 @@ def mcap(path: Path, types: dict[str, str], messages: list[Message], style: Styl
         chunks += 1
     data += record(15, struct.pack("<I", 0))
     summary_start = len(data) if style.summary else 0
-    summary = (told if style.repeated else b"") + chunk_indexes
+    times_told = 2 if style.twice else 1
+    summary = (told if style.repeated else b"") + chunk_indexes * times_told
     times = [said.time for said in messages] or [0]
     summary += record(
-        11, struct.pack("<QHIIIIQQI", len(messages), len(types), len(types), 0, 0, chunks, min(times), max(times), 0)
+        11,
+        struct.pack(
+            "<QHIIIIQQI", len(messages) * times_told, len(types), len(types), 0, 0, chunks, min(times), max(times), 0
+        ),
     )
     summary = summary if style.summary else b""
     footer = struct.pack("<BQQQ", 2, 20, summary_start, 0)

@@ -10,6 +10,7 @@ import tracemalloc
 from collections.abc import Iterator
 from pathlib import Path
 
+import made_mcap
 import numpy as np
 import pytest
 from made_bags import stamp
@@ -22,6 +23,7 @@ from stereovox.frame import Frame
 from stereovox.sources import bag_mcap_index, bag_mcap_records, open_source
 from stereovox.sources.bag_files import open_bag, suffix_of
 from stereovox.sources.bag_mcap import McapFile
+from stereovox.sources.bag_mcap_records import message_at
 from stereovox.sources.bag_writer import BagWriter
 
 TYPES = {"/a": "std_msgs/msg/String", "/b": "sensor_msgs/msg/Imu"}
@@ -37,6 +39,7 @@ UNINDEXED = [
     Style(index=False),
     Style(summary=False, packing="lz4"),
     Style(repeated=False, packing="zstd"),
+    Style(twice=True, packing="zstd"),
     Style(summary=False, chunk=0),
 ]
 
@@ -142,6 +145,26 @@ def test_messages_packed_by_themselves(tmp_path):
 
     said = Message("/a", 5, zstd.compress(cdr("hello")))
     assert open_bag(mcap(tmp_path / "a.mcap", TYPES, [said])).read("/a", 0).text() == "hello"
+
+
+def test_a_packing_that_nobody_knows(tmp_path):
+    file = open_bag(mcap(tmp_path / "a.mcap", TYPES, spoken(), Style(packing="brotli")))
+    with pytest.raises(FrameRefused, match="packed with 'brotli', which is not known"):
+        file.read("/a", 0)
+
+
+def test_messages_of_one_time_keep_their_order(tmp_path):
+    messages = [Message("/a", 5 - k % 2, cdr(str(k))) for k in range(200)]
+    file = open_bag(mcap(tmp_path / "a.mcap", TYPES, messages))
+    found = [file.read("/a", i).text() for i in range(200)]
+    assert found == [str(k) for k in (*range(1, 200, 2), *range(0, 200, 2))]
+
+
+def test_places_before_the_chunk_are_refused():
+    data = made_mcap.message(1, 0, Message("/a", 5, cdr("hello"))) * 2
+    assert message_at(data, len(data) // 2)[:2] == (1, 5)
+    with pytest.raises(ValueError, match="points to nowhere"):
+        message_at(data, -len(data))
 
 
 def test_content_counts_more_than_the_name(tmp_path):

@@ -206,6 +206,15 @@ def test_a_scan_of_another_frame_has_that_frame_s_place(tmp_path):
     assert (found[2].fault, "no frame 'nowhere'" in found[2].fault_detail) == ("no_pose", True)
 
 
+def test_odometry_without_a_time_has_that_of_recording(tmp_path):
+    def stampless(bag: RobotBagMaker) -> None:
+        for k in BETWEEN:
+            bag.add("/odom", "nav_msgs/Odometry", at(k), bag.odometry(0, planar_numbers(*pose(k))))
+
+    scan = RobotBag(made(tmp_path / "a.bag", mounts, stampless, scans)).scans[2]
+    np.testing.assert_allclose(scan.pose_world_base, pose(2), atol=1e-9)
+
+
 def test_scans_without_a_time_have_that_of_recording(tmp_path):
     def stampless(bag: RobotBagMaker) -> None:
         bag.add("/scan", "sensor_msgs/LaserScan", at(1), bag.scan(0, [1.0]))
@@ -254,6 +263,26 @@ def test_odometry_of_a_body_above_the_robot_s_frame(tmp_path):
     assert scan.T_base_sensor[2, 3] == pytest.approx(0.325)
 
 
+def test_odometry_of_a_body_that_nothing_connects_with_the_robot(tmp_path):
+    path = made(tmp_path / "a.bag", mounts, lambda bag: wheels(bag, child="chassis"), scans)
+    robot = RobotBag(path)
+    assert robot.notes == (f"{path}: /odom tells where chassis is: taken for base_link",)
+    np.testing.assert_allclose(robot.scans[1].pose_world_base, pose(1), atol=1e-9)
+    nameless = RobotBag(made(tmp_path / "b.bag", mounts, lambda bag: wheels(bag, child=""), scans))
+    assert nameless.notes == ()
+    np.testing.assert_allclose(nameless.scans[1].pose_world_base, pose(1), atol=1e-9)
+
+
+def test_a_camera_in_a_tree_of_its_own_sits_where_the_robot_does(tmp_path):
+    def apart(bag: RobotBagMaker) -> None:
+        bag.tf(START_NS, "camera_link", "optical", CAMERA, "/tf_static")
+
+    robot = RobotBag(made(tmp_path / "a.bag", apart, drive, images))
+    assert "where the camera (camera_link) sits on the robot: taken for base_link itself" in robot.notes[0]
+    assert len(robot.notes) == 1
+    np.testing.assert_allclose(robot.frames[1].T_world_sensor, planar_motion(*pose(1)) @ T_BASE_CAMERA, atol=1e-9)
+
+
 def test_frames_of_a_namespace_and_of_several_robots(tmp_path):
     def robots(*names: str):
         def part(bag: RobotBagMaker) -> None:
@@ -269,6 +298,12 @@ def test_frames_of_a_namespace_and_of_several_robots(tmp_path):
 
     def second(bag: RobotBagMaker) -> None:
         bag.tf(START_NS, "r1/odom", "r2/base_link", LASER, "/tf_static")
+
+    def plain(bag: RobotBagMaker) -> None:
+        bag.tf(START_NS, "r1/base_link", "base_link", LASER, "/tf_static")
+
+    path = made(tmp_path / "c.bag", robots("r1"), plain, lambda bag: bag.scans(2, frame_id="laser"))
+    assert RobotBag(path).where.base == "base_link"  # the plain name comes first
 
     path = made(tmp_path / "b.bag", robots("r1"), second, lambda bag: bag.scans(2, frame_id="laser"))
     with pytest.raises(SourceError, match=r"several robots, .*\?base_frame=r1/base_link or \?base_frame=r2/base"):
@@ -318,6 +353,21 @@ def test_point_clouds_stand_in_for_a_lidar(tmp_path, ending):
     assert np.nanmin(low.ranges) == 2.5
     near = RobotBag(f"{path}?range_max=2").scans[0]
     assert (near.range_max, np.isposinf(near.ranges).sum(), np.isfinite(near.ranges).sum()) == (2, 1, 1)
+
+
+def test_the_scan_of_a_turned_cloud_is_upright(tmp_path):
+    """In optical axes: 2 m ahead and 0.1 m below the camera, which is 0.28 m high."""
+
+    def clouds(bag: RobotBagMaker) -> None:
+        bag.add("/points", "sensor_msgs/PointCloud2", at(1), bag.cloud(at(1), [[0, 0.1, 2.0]], "optical"))
+
+    scan = RobotBag(made(tmp_path / "a.bag", mounts, drive, clouds)).scans[0]
+    np.testing.assert_allclose(scan.pose_world_base, pose(1), atol=1e-9)
+    beam = int(np.flatnonzero(np.isfinite(scan.ranges))[0])
+    angle, range_m = scan.angles[beam], scan.ranges[beam]
+    point = scan.T_world_sensor @ [range_m * np.cos(angle), range_m * np.sin(angle), 0, 1]
+    wanted = planar_motion(*pose(1)) @ [2.1, 0, 0.28, 1]  # at the height of the scan
+    np.testing.assert_allclose(point, wanted, atol=0.01)
 
 
 def test_a_lidar_comes_before_clouds_and_depth_before_its_own_cloud(tmp_path):

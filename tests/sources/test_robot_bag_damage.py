@@ -14,7 +14,7 @@ import pytest
 from made_robot_bags import MS, START_NS, RobotBagMaker, planar_numbers
 
 from stereovox.errors import SourceError
-from stereovox.sources.robot import open_robot
+from stereovox.sources.robot_bag import RobotBag
 
 ENDINGS = pytest.mark.parametrize("ending", [".bag", ".db3"])
 FAULTS = {None, "unreadable", "no_pose", "bad_dtype", "bad_shape"}
@@ -55,7 +55,7 @@ def outcomes(path: Path) -> set[str | None]:
     found: set[str | None] = set()
     for query in ("", "?scan=/points&odom=/odom"):
         try:
-            robot = open_robot(f"{path}{query}")
+            robot = RobotBag(f"{path}{query}")
         except SourceError as error:
             found.add(f"{error}")
             continue

@@ -151,6 +151,15 @@ def test_fixed_frames_hold_at_all_times_and_the_last_one_counts():
     assert not tf.moving("base_link", "laser")
 
 
+def test_what_lies_above_the_common_ancestor_does_not_matter():
+    tf = line((0, 0.0), (100, 1.0))
+    for child, x in (("laser", 1.0), ("camera", 3.0)):
+        tf.add("base_link", child, 0, [x, *STILL[1:]], fixed=True)
+    assert tf.lookup("laser", "camera", 10**15)[0, 3] == 2  # where the robot was then is not known
+    assert tf.lookup("base_link", "camera", 10**15)[0, 3] == 3
+    refused(tf, "odom", "camera", 10**9)
+
+
 def test_of_several_with_one_time_the_first_counts():
     assert x_at(line((0, 1.0), (0, 9.0), (100, 2.0)), 0) == 1
 

@@ -33,12 +33,13 @@ from stereovox.view.grid_report import write_grid_report
 from stereovox.view.panels import PATH_COLOUR, STATE_COLOURS
 
 
-def colour_at(figure, axis, point):
-    """The colour of a rendered figure at a point of a panel, in metres."""
+def colours_at(figure, axis, points):
+    """The colours (N, 3) of a rendered figure at points of a panel, in metres."""
+    figure.set_dpi(40)
     figure.canvas.draw()
-    x, y = axis.transData.transform(point)
+    x, y = axis.transData.transform(points).astype(int).T
     image = np.asarray(figure.canvas.buffer_rgba())
-    return image[image.shape[0] - 1 - int(y), int(x), :3] / 255
+    return image[image.shape[0] - 1 - y, x, :3] / 255
 
 
 @pytest.mark.parametrize("origin", [(0.0, 0.0, 0.0), (-3.0, 7.0, 0.6)])
@@ -46,13 +47,10 @@ def test_cells_are_drawn_where_they_lie(origin):
     grid = random_floor(3, side=1.0, origin=origin)
     figure = draw_grid(grid, "A floor")
     axis = figure.axes[0]
-    wanted = {at: to_rgb(STATE_COLOURS[State(int(grid.states[at]))]) for at in np.ndindex(grid.cells.shape)}
-    seen = set()
-    for (row, column), colour in wanted.items():
-        point = grid.centres([row], [column])[0]
-        assert colour_at(figure, axis, point) == pytest.approx(colour, abs=0.01), (row, column)
-        seen.add(colour)
-    assert len(seen) == 4
+    wanted = [to_rgb(STATE_COLOURS[State(int(state))]) for state in grid.states.ravel()]
+    rows, columns = np.divmod(np.arange(grid.cells.size), grid.cells.shape[1])
+    np.testing.assert_allclose(colours_at(figure, axis, grid.centres(rows, columns)), wanted, atol=0.01)
+    assert len(set(wanted)) == 4
 
 
 def test_the_way_is_drawn_in_the_map_s_frame_and_what_is_known_fills_the_picture():
@@ -105,7 +103,7 @@ def test_each_kind_of_cell_has_a_colour_of_its_own():
         assert (np.abs(drawn - to_rgb(colour)).max(axis=2) < 0.01).sum() > 20, name
 
 
-@pytest.mark.parametrize("shape", [(20, 90), (60, 60), (90, 20)])
+@pytest.mark.parametrize("shape", [(20, 90), (60, 40)])
 def test_maps_of_any_shape_are_shown_side_by_side(shape):
     laid = lay(random_floor(2, shape), random_floor(1, shape))
     drawn = imread(io.BytesIO(side_by_side_png(laid)))[..., :3]

@@ -54,10 +54,12 @@ def _tell(scores: GridScores, regions: int) -> None:
     x, y, yaw = scores.motion
     if scores.aligned:
         say(f"the map was moved by {x:.3f}, {y:.3f} m and {np.degrees(yaw):.2f} degrees to lie on the reference")
-    say(f"error {errors.eq7_percent:.2f} % (IST 2019, Eq 7): {_parts(scores)}")
+    say(f"error {errors.eq7_percent:.2f} % (IST 2019, Eq 7): cells that differ, for 100 known to the reference")
+    for kind, what in KINDS.items():
+        say(f"{thousands(getattr(errors, kind)):>11} {kind.replace('_', ' ')}: {what}")
     if regions:
-        say(f"excluded: {thousands(errors.excluded)} cells, of which {thousands(errors.forgiven)} differ; with them out "
-            f"of the number below too the error is {_percent(errors.eq7_outside_percent)}")  # fmt: skip
+        say(f"excluded: {thousands(errors.excluded)} cells, of which {thousands(errors.forgiven)} differ; with them "
+            f"out of the number below too the error is {_percent(errors.eq7_outside_percent)}")  # fmt: skip
     if regions and not errors.excluded:
         say("no cell lies in an excluded region: are they in metres, in the reference's frame?")
     say(f"of the {thousands(errors.known_in_both)} cells known to both {_percent(errors.known_error_percent)} differ")
@@ -70,11 +72,6 @@ def _tell(scores: GridScores, regions: int) -> None:
         if figures.mean is not None:
             say(f"walls, {what}: mean {figures.mean:.3f}, median {figures.median:.3f}, 95 % {figures.p95:.3f} m")
     say(f"free cells: IoU {_number(scores.free_iou)}; the map knows {_number(scores.coverage)} of the reference")
-
-
-def _parts(scores: GridScores) -> str:
-    return ", ".join(f"{thousands(getattr(scores.errors, kind))} {kind.replace('_', ' ')} ({what})"
-                     for kind, what in KINDS.items())  # fmt: skip
 
 
 def _percent(value: float | None) -> str:

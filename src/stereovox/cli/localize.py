@@ -74,10 +74,8 @@ def localised(robot: Robot, grid: OccupancyGrid, config: Config, start: np.ndarr
     if not len(robot.scans):
         raise StereovoxError(f"{robot.name}: holds no lidar scans to localise with; give a bag with a LaserScan topic")
     with progress_bar() as bar:
-        task = bar.add_task("localising", note="")
-        return localise(
-            grid, robot.scans, config, start, progress=lambda done, total: bar.update(task, completed=done, total=total)
-        )
+        task = bar.add_task("localising", total=len(robot.scans), note="")
+        return localise(grid, robot.scans, config, start, progress=lambda done: bar.update(task, completed=done))
 
 
 def _error(track: Track, robot: Robot) -> dict[str, Any]:

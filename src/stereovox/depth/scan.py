@@ -62,16 +62,17 @@ def scan_of(image: DepthImage, config: Config) -> Scan:
     """Return the scan that a depth image stands for; the world's z is the height over the floor.
 
     The scan's sensor stands in the camera, upright, with its x axis where the camera looks; ranges are metres along
-    the floor. `scan.method` `rows` takes the nearest of a few rows round the one that looks level (the job of
-    depthimage_to_laserscan), `cloud` the nearest of all points within `scan.heights` (pointcloud_to_laserscan). A
-    pixel belongs to each beam whose middle it covers, or else to the one in which its own middle is. Any camera will
-    do; rays that look back or are steeper than 80 degrees say nothing.
+    the floor. Where it sits on the robot is not known here: `T_base_sensor` is the identity. `scan.method` `rows` takes
+    the nearest of a few rows round the one that looks level (the job of depthimage_to_laserscan), `cloud` the nearest
+    of all points within `scan.heights` (pointcloud_to_laserscan). A pixel belongs to each beam whose middle it covers,
+    or else to the one in which its own middle is. Any camera will do; rays that look back or are steeper than 80
+    degrees say nothing.
 
     A beam is -inf, and free nowhere, where something is too near that may be within the heights; else it has the range
     of its nearest point; else +inf where it is free all the way to `max_range`, else NaN. `clear` says how far: up to
     where some ray of the beam was seen to be free *within the heights*. Where all its rays end or leave the heights,
-    so does the knowledge. One ray is enough, as with a lidar: what stands lower than all rays of its beam goes unseen.
-    Points farther than `max_range` along the floor are none: their rays are free up to there.
+    so does the knowledge. One ray is enough, as with a lidar: what stands lower than all rays of its beam goes unseen,
+    and is taken for free. Points farther than `max_range` along the floor are none: their rays are free up to there.
 
     Raises FrameRefused: `camera_tilted` where no row looks level (method `rows`), `camera_vertical` where the camera
     looks straight up or down, `heights_not_seen` where no ray meets the heights; ConfigError where z is not up.

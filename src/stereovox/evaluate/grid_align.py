@@ -17,8 +17,8 @@ from stereovox.evaluate.grid_fit import FEW, Fit, evenly
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.maps.voxel_map import State
 
-COARSE = 128
-"""Cells along the longer side of the larger small picture."""
+COARSE, MOST_COARSE = 128, 512
+"""Pixels along the longer side of the smaller map's small picture, as far as the larger map's then has no more."""
 CANDIDATES, BEST = 12, 4
 """Motions that are looked at closely, and very closely."""
 MOST_POINTS = 500_000
@@ -59,8 +59,8 @@ def _seen(grid: OccupancyGrid) -> _Seen:
 
 def _best(ours: _Seen, theirs: _Seen, resolution: float, start: planar.Pose) -> planar.Pose:
     """Return the pose of our corner seen from theirs."""
-    side = max(float(np.ptp(one.walls, axis=0).max()) for one in (ours, theirs)) / COARSE
-    side = max(side, 2 * resolution)
+    small, large = sorted(float(np.ptp(one.walls, axis=0).max()) for one in (ours, theirs))
+    side = max(small / COARSE, large / MOST_COARSE, 2 * resolution)
     fit = Fit(ours.walls, theirs.walls, ours.floor, theirs.floor, resolution, side)
     poses = [fit.refined(pose, side, side / 8, FEW) for pose in (start, *_candidates(ours, theirs, side))]
     poses = sorted(poses, key=fit.agreement, reverse=True)[:BEST]

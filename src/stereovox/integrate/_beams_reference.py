@@ -69,7 +69,7 @@ def _beams(
     T = np.eye(4)
     T[:2, :2], T[:2, 3] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]], (x, y)
     T_grid_sensor = np.linalg.inv(T) @ scan.T_world_sensor
-    nearest = np.float32(max(scan.range_min, config.min_range))
+    nearest = np.float32(scan.range_min)
     reach = np.float32(min(scan.range_max, config.max_range))
     for i, measured in enumerate(np.asarray(scan.ranges, np.float32)):
         angle = scan.angle_min + i * scan.angle_step

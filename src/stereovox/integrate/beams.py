@@ -62,12 +62,12 @@ class Beams:
     def evidence(self, scan: Scan, origin: ArrayLike = (0.0, 0.0, 0.0)) -> GridEvidence:
         """Return what a scan that can be trusted says about the cells of a grid with this `origin` (3,): x, y, yaw.
 
-        A range from max(`range_min`, `min_range`) to min(`range_max`, `max_range`) is a hit: its beam is free up to
-        it, and occupied from it to `grid.thickness` behind. +inf, and a hit beyond `max_range`, is free up to the
-        latter. All else says nothing, and where the scan has `clear` it tells how far beams are free. A beam never
+        A range from `range_min` to min(`range_max`, `config.max_range`) is a hit: its beam is free up to it, and
+        occupied from it to `grid.thickness` behind. +inf, and a hit beyond `config.max_range`, is free up to that
+        minimum. All else says nothing, and where the scan has `clear` it tells how far beams are free. A beam never
         clears the cell it hits. Lengths are seen from above where the sensor leans.
         The memory that evidence lies in is used again by the next call.
-        Raises FrameRefused: `too_many_beams`, `bad_clear`, `pose_too_far`.
+        Raises FrameRefused: `too_many_beams`, `bad_clear`, `bad_scan`, `pose_too_far`.
         """
         lines, box = self._aim(scan, np.asarray(origin, float))
         if not sum(map(len, lines)):
@@ -91,10 +91,11 @@ class Beams:
         ranges, clear = _beams_of(scan)
         T = planar.lifted(planar.inverse(origin)) @ scan.T_world_sensor
         position = T[:2, 3] / size
-        if not (np.abs(position) < INDEX_LIMIT - 2 * MOST_CELLS).all():
+        if not ((np.abs(position) < INDEX_LIMIT - 2 * MOST_CELLS).all() and (np.abs(T[:2, :2]) < 1.01).all()):
             raise FrameRefused("pose_too_far", f"{_name(scan)}: is more than {INDEX_LIMIT} cells from the map's origin")
         reach = np.fmin(scan.range_max, config.max_range)
-        limits = np.array([np.fmax(scan.range_min, config.min_range), reach, scan.range_max], np.float32)
+        with np.errstate(over="ignore"):
+            limits = np.array([scan.range_min, reach, scan.range_max], np.float32)
         if len(self._lines[0]) < len(ranges):
             self._lines = tuple(np.empty((len(ranges), 4)) for _ in range(3))
         box = np.empty(4, np.int64)
@@ -108,6 +109,8 @@ class Beams:
         """Return cosine and sine (N, 2) of each beam; those of the scan before, where it had the same angles."""
         seen = scan.angle_min, scan.angle_step, len(scan.ranges)
         if seen != self._seen:
+            if not np.isfinite(scan.angle_min + scan.angle_step * len(scan.ranges)):
+                raise FrameRefused("bad_scan", f"{_name(scan)}: its angles are not finite")
             self._directions, self._seen = np.column_stack([np.cos(scan.angles), np.sin(scan.angles)]), seen
         return self._directions
 
@@ -123,8 +126,9 @@ class Beams:
 
 def _beams_of(scan: Scan) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return ranges and how far beams are known to be free (empty: ranges alone tell)."""
-    ranges = np.ascontiguousarray(scan.ranges, np.float32)
-    clear = np.ascontiguousarray(() if scan.clear is None else scan.clear, np.float32)
+    with np.errstate(over="ignore", invalid="ignore"):
+        ranges = np.ascontiguousarray(scan.ranges, np.float32)
+        clear = np.ascontiguousarray(() if scan.clear is None else scan.clear, np.float32)
     if len(ranges) > MOST_BEAMS:
         raise FrameRefused("too_many_beams", f"{_name(scan)}: {len(ranges)} beams; at most {MOST_BEAMS} are taken")
     if scan.clear is not None and clear.shape != ranges.shape:

@@ -26,7 +26,11 @@ def trusted(scan: Scan, config: Config) -> Scan:
     if ranges.ndim != 1 or not ranges.size or not np.issubdtype(ranges.dtype, np.floating):
         raise FrameRefused("bad_shape", f"{name}: ranges are {ranges.shape} {ranges.dtype}; give (N,) float32 metres")
     angles, limits = (scan.angle_min, scan.angle_step), (scan.range_min, scan.range_max)
-    if not np.isfinite(angles).all() or scan.angle_step == 0 or not (0 <= limits[0] < limits[1]):
+    if (
+        not np.isfinite([*angles, angles[0] + angles[1] * ranges.size]).all()
+        or scan.angle_step == 0
+        or not (0 <= limits[0] < limits[1])
+    ):
         said = f"angles from {angles[0]} by {angles[1]}, ranges from {limits[0]} to {limits[1]}"
         raise FrameRefused("bad_scan", f"{name}: {said}; steps must not be 0, and ranges must rise")
     T = rigid_pose(scan, config.pose_rigidity_tolerance)

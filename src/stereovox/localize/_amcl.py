@@ -9,7 +9,7 @@ ZERO, ONE, HALF = np.float32(0), np.float32(1), np.float32(0.5)
 SAFE = np.float32(1.4143)
 """Two points are nearer to each other than the middles of their cells by a diagonal at most."""
 NUDGE = np.float32(1e-3)
-FAR = np.float32(1e9)
+LEVEL, FAR = np.float32(1e-6), np.float32(1e9)
 
 
 @kernel
@@ -83,26 +83,23 @@ def _cast(clear, x, y, u, v, farthest):
     Far from all obstacles it leaps as far as none can be; near them it goes from cell to cell.
     """
     rows, columns = np.float32(clear.shape[0]), np.float32(clear.shape[1])
-    to_right = ONE / u if abs(u) > NUDGE * NUDGE else FAR
-    to_top = ONE / v if abs(v) > NUDGE * NUDGE else FAR
+    to_right = ONE / u if abs(u) > LEVEL else FAR
+    to_top = ONE / v if abs(v) > LEVEL else FAR
+    ahead_x = ONE if u > -LEVEL else ZERO
+    ahead_y = ONE if v > -LEVEL else ZERO
     way = ZERO
     while way < farthest:
         px, py = x + way * u, y + way * v
         if not ((px >= ZERO) & (py >= ZERO) & (px < columns) & (py < rows)):
             return farthest
         column, row = np.int32(px), np.int32(py)
-        free = clear[row, column]
-        if free > SAFE + ONE:
-            way += free - SAFE
-            continue
-        border_x = np.float32(column) + (ONE if u > ZERO else ZERO)
-        border_y = np.float32(row) + (ONE if v > ZERO else ZERO)
-        out_x = (border_x - x) * to_right if to_right != FAR else FAR
-        out_y = (border_y - y) * to_top if to_top != FAR else FAR
+        out_x = (np.float32(column) + ahead_x - x) * to_right
+        out_y = (np.float32(row) + ahead_y - y) * to_top
         leaves = max(min(out_x, out_y), way)
+        free = clear[row, column]
         if free == ZERO:
             return min((way + leaves) * HALF, farthest)
-        way = leaves + NUDGE
+        way = max(leaves + NUDGE, way + free - SAFE)  # without a branch, which would be hard to predict
     return farthest
 
 

@@ -19,15 +19,26 @@ ROUND = np.float32(0.12)
 
 
 @kernel
-def gather(points, views, cell, index, cells, sums):
+def bounds(points, least, most):
+    """Write the lowest and highest x, y of points (N, 2); leaves both as they are where there is none."""
+    for i in range(len(points)):
+        for axis in range(2):
+            value = points[i, axis]
+            least[axis] = value if i == 0 else min(least[axis], value)
+            most[axis] = value if i == 0 else max(most[axis], value)
+
+
+@kernel
+def gather(points, corner, views, cell, index, cells, sums):
     """Sum points (N, 2) and directions towards the sensor (N, 2) by cell; return how many slots there are.
 
+    corner: (2,) float64 of the grid, in the points' frame.
     cells: (N, 2) int32 row, column; sums: (N, 8) float32 n, x, y, xx, xy, yy from the cell's middle, view x, view y.
     """
     count = 0
     rows, columns = index.shape
     for i in range(len(points)):
-        x, y = points[i, 0], points[i, 1]
+        x, y = np.float32(points[i, 0] - corner[0]), np.float32(points[i, 1] - corner[1])
         if not (x >= ZERO and y >= ZERO and x < cell * np.float32(columns) and y < cell * np.float32(rows)):
             continue
         row, column = min(int(y / cell), rows - 1), min(int(x / cell), columns - 1)

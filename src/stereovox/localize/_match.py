@@ -66,7 +66,7 @@ def refine(points, views, near, lines, cell, sigma, point_weight, prior, informa
     gradient = np.empty(3)
     narrow = 1.0 / (sigma * sigma)
     on = 0
-    for turn in range(iterations):
+    for _ in range(iterations):
         cosine, sine = np.cos(pose[2]), np.sin(pose[2])
         normal[:] = 0.0
         gradient[:] = 0.0

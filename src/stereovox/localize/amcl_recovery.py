@@ -12,7 +12,7 @@ from stereovox.config_robot import AmclConfig
 class Recovery:
     """A long and a short memory of how well scans fit the map.
 
-    strangers: share of particles that should be drawn at random, `max(0, 1 - short / long)`.
+    strangers: share of particles that should be drawn at random, `max(0, 1 - short / long)`; 0 below `recovery_least`.
 
     What is remembered is the likelihood per beam: the K-th root of that of K beams, whose own scale would be left to
     chance. At first both memories are the plain mean of all that was seen, so that a start from anywhere fades.
@@ -20,6 +20,7 @@ class Recovery:
 
     def __init__(self, config: AmclConfig):
         self._alpha_slow, self._alpha_fast = config.alpha_slow, config.alpha_fast
+        self._least = config.recovery_least
         self._long = self._short = 0.0
         self._seen = 0
 
@@ -36,4 +37,5 @@ class Recovery:
     @property
     def strangers(self) -> float:
         """Share of particles to be drawn at random, 0 to 1."""
-        return max(0.0, 1 - self._short / self._long) if self._long > 0 else 0.0
+        share = 1 - self._short / self._long if self._long > 0 else 0.0
+        return share if share > self._least else 0.0

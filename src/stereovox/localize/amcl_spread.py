@@ -18,16 +18,16 @@ class FreeFloor:
     def __init__(self, grid: OccupancyGrid):
         states = grid.states
         self.grid = grid
-        self._rows, self._columns = np.nonzero(states == State.FREE)
-        for state, count in (("free", len(self._rows)), ("occupied", int((states == State.OCCUPIED).sum()))):
+        self._free = np.flatnonzero(states == State.FREE).astype(np.uint32)
+        for state, count in (("free", len(self._free)), ("occupied", int((states == State.OCCUPIED).sum()))):
             if not count:
                 raise MapFileError(f"the map has no {state} cell: nobody can be localised in it; give a finished map")
 
     def anywhere(self, count: int, rng: np.random.Generator) -> planar.Pose:
         """Return (count, 3) poses evenly spread over all free cells and directions."""
-        chosen = rng.integers(len(self._rows), size=count)
-        cells = np.column_stack([self._columns[chosen], self._rows[chosen]])
-        local = (cells + rng.random((count, 2))) * self.grid.resolution
+        chosen = self._free[rng.integers(len(self._free), size=count)]
+        rows, columns = np.divmod(chosen, np.uint32(self.grid.cells.shape[1]))
+        local = (np.column_stack([columns, rows]) + rng.random((count, 2))) * self.grid.resolution
         turns = rng.uniform(-np.pi, np.pi, count)
         return np.column_stack([planar.transform(self.grid.origin, local), turns])
 

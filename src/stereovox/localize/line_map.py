@@ -89,14 +89,15 @@ class LineMap:
         _lines.wipe(self.cells, self._reach, self.index, self.near, self.score)
         points = cloud.points
         margin = (self._reach + 2) * self.cell
-        least = points.min(axis=0).astype(float) if len(points) else np.zeros(2)
-        most = points.max(axis=0).astype(float) if len(points) else np.zeros(2)
+        least, most = np.zeros(2), np.zeros(2)
+        _lines.bounds(points, least, most)
         corner = np.floor((least - margin) / self.cell) * self.cell
-        self._resize(np.ceil((most + margin - corner) / self.cell).astype(int)[::-1])
+        columns, rows = np.ceil((most + margin - corner) / self.cell).astype(int).tolist()
+        self._resize(rows, columns)
         self.corner = corner + np.asarray(shift, float)
         cells, sums = np.empty((len(points), 2), np.int32), np.empty((len(points), 8), np.float32)
         cell = np.float32(self.cell)
-        count = _lines.gather((points - corner).astype(np.float32), cloud.views, cell, self.index, cells, sums)
+        count = _lines.gather(points, corner, cloud.views, cell, self.index, cells, sums)
         self.cells = cells[:count]
         self.lines = np.empty((count, 8), np.float32)
         _lines.fit(self.index, self.cells, sums[:count], cell, self._radius, self.lines)
@@ -108,22 +109,29 @@ class LineMap:
         """Rows and columns that the map of now takes up; there is room for more."""
         return self._extent
 
-    def _resize(self, shape: NDArray[np.int64]) -> None:
-        self._extent = (int(shape[0]), int(shape[1]))
-        if shape[0] > self.near.shape[0] or shape[1] > self.near.shape[1]:
-            shape = np.maximum(shape, self.near.shape) + 40
-            self.near = np.full(tuple(shape), -1, np.int32)
+    def _resize(self, rows: int, columns: int) -> None:
+        self._extent = rows, columns
+        if rows > self.near.shape[0] or columns > self.near.shape[1]:
+            room = max(rows, self.near.shape[0]) + 40, max(columns, self.near.shape[1]) + 40
+            self.near = np.full(room, -1, np.int32)
             self.index = self.near.copy()
-            self.score = np.zeros(tuple(shape), np.float32)
+            self.score = np.zeros(room, np.float32)
 
     def search(
-        self, cloud: Cloud, guess: ArrayLike, side: float, side_yaw: float, step_yaw: float, slope: float, slope_yaw: float
+        self,
+        points: NDArray[np.float32],
+        guess: ArrayLike,
+        side: float,
+        side_yaw: float,
+        step_yaw: float,
+        slope: float,
+        slope_yaw: float,
     ) -> tuple[planar.Pose, float]:
         """Return the likeliest pose in a window round a guess, and its likelihood (see `_match.search`)."""
         start, best = self._local(guess), np.empty(3)
         cells, turns = int(np.ceil(side / self.cell)), int(np.ceil(side_yaw / step_yaw))
         top = _match.search(
-            cloud.points, start, self.score, np.float32(self.cell), cells, turns, step_yaw, slope, slope_yaw, best
+            points, start, self.score, np.float32(self.cell), cells, turns, step_yaw, slope, slope_yaw, best
         )
         return self._global(best), float(top)
 

@@ -9,7 +9,7 @@ the end all keyframes are matched with all others that saw the same walls.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sized
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -147,7 +147,10 @@ class Slam:
         grid, beams = GridMap(config), make_beams(config)
         track = self._track()
         for keyframe in self.keyframes:
-            grid.add(beams.evidence(track.corrected(keyframe.scan), grid.origin))
+            scan = track.corrected(keyframe.scan)
+            if not settings.clear_far:
+                scan = replace(scan, ranges=np.where(np.isposinf(scan.ranges), np.float32(np.nan), scan.ranges))
+            grid.add(beams.evidence(scan, grid.origin))
         return grid.occupancy()
 
 

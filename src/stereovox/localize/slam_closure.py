@@ -54,9 +54,7 @@ class ClosureSearch:
             match = self._fine.refine(cloud, match.pose, sigma)
         return match
 
-    def place(
-        self, seeds: NDArray[np.float32], guess: planar.Pose, side: float, side_yaw: float
-    ) -> planar.Pose | None:
+    def place(self, seeds: NDArray[np.float32], guess: planar.Pose, side: float, side_yaw: float) -> planar.Pose | None:
         """Return the pose with the best score, None where it is below `closure_score` or has a rival."""
         cell, config = self._coarse.cell, self._config
         step = cell / max(float(np.sqrt((seeds**2).sum(axis=1).max())), 1.0)
@@ -72,7 +70,7 @@ class ClosureSearch:
         if top <= least:
             return None
         least = np.float32(config.closure_rival * top)
-        apart = int(round(RIVAL / cell))
+        apart = round(RIVAL / cell)
         if _bound.climb(places, cells, self._pyramid, self._pad, least, best, apart, rival) > least:
             return None
         return np.array([guess[0] + best[2] * cell, guess[1] + best[1] * cell, yaws[best[0]]])

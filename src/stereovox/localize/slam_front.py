@@ -13,6 +13,12 @@ from stereovox.localize.slam_keyframe import Keyframe
 
 STEP_YAW = 0.01
 """Radians between the turns that the search tries."""
+WINDOW, WINDOW_TURN = 1.0, 1.5
+"""Metres and radians that are searched at most, whatever the odometry says."""
+SLOPE = 0.005
+"""Likelihood that the search takes off at one standard deviation of the odometry."""
+SEARCHED = 100
+"""Points that the search looks at: it need only come near."""
 FEWEST = 10
 """Hits below which a scan is not matched: its pose is the odometry's."""
 
@@ -28,15 +34,18 @@ class Follower:
         self.keyframes: list[Keyframe] = []
         self.pose: planar.Pose = np.zeros(3)
         self._config = config
-        self._map = LineMap(config.voxel_size)
+        self._map = LineMap(config.voxel_size, reach=0.2)
         self._odometry: planar.Pose | None = None
         self._travelled = 0.0
+        self._start: planar.Pose = np.zeros(3)
+        self._moved: list[Cloud] = []
 
     def add(self, scan: Scan) -> bool:
         """Find the pose of the next scan; tell whether it became a keyframe."""
         odometry, cloud = scan.pose_world_base, cloud_of(scan, self._config.max_range)
         if self._odometry is None:
             self.pose = odometry
+            self._start[:2] = np.floor(odometry[:2])  # float32 points stay exact far from the world's origin
         else:
             step = planar.relative(self._odometry, odometry)
             before, self.pose = self.pose, self._matched(cloud, planar.compose(self.pose, step), step)
@@ -52,6 +61,7 @@ class Follower:
     def moved(self, keyframe_before: planar.Pose) -> None:
         """Go on from where the last keyframe now stands; it stood at `keyframe_before` (3,)."""
         self.pose = planar.compose(self.keyframes[-1].pose, planar.relative(keyframe_before, self.pose))
+        self._moved.clear()
         self._rebuild()
 
     def _matched(self, cloud: Cloud, guess: planar.Pose, step: planar.Pose) -> planar.Pose:
@@ -60,9 +70,10 @@ class Follower:
         config = self._config
         metres, radians = odometry_sigmas(config, step)
         information = np.diag([metres**-2, metres**-2, radians**-2])
-        start, _ = self._map.search(
-            cloud, guess, metres, 2 * radians, STEP_YAW, 0.005 / metres**2, 0.005 / radians**2,
-        )  # fmt: skip
+        seeds = cloud.points[:: max(len(cloud.points) // SEARCHED, 1)]
+        slopes = SLOPE / metres**2, SLOPE / radians**2
+        window = min(metres, WINDOW), min(2 * radians, WINDOW_TURN)
+        start, _ = self._map.search(seeds, guess, *window, STEP_YAW, *slopes)
         start = self._map.refine(cloud, start, 2 * config.sigma, guess, information).pose
         return self._map.refine(cloud, start, config.sigma, guess, information).pose
 
@@ -74,9 +85,19 @@ class Follower:
         return bool(far) and len(cloud.points) >= FEWEST
 
     def _rebuild(self) -> None:
-        recent = self.keyframes[-self._config.local_keyframes :]
-        here = np.append(np.floor(recent[-1].pose[:2]), 0.0)  # float32 points stay exact far from the world's origin
-        self._map.build(joined([keyframe.cloud.moved(keyframe.pose - here) for keyframe in recent]), here[:2])
+        """Make the map of the last keyframes; clouds that are in the map's frame stay so until poses change."""
+        recent = self._recent()
+        missing = max(len(recent) - len(self._moved), 1)
+        for keyframe in recent[-missing:]:
+            self._moved.append(keyframe.cloud.moved(keyframe.pose - self._start))
+        del self._moved[: -len(recent)]
+        self._map.build(joined(self._moved), self._start[:2])
+
+    def _recent(self) -> list[Keyframe]:
+        """The last keyframes, back to where the robot was out of sight: where odometry jumps, all starts anew."""
+        here, recent = self.keyframes[-1].pose, self.keyframes[-self._config.local_keyframes :]
+        far = [np.hypot(*(keyframe.pose - here)[:2]) > self._config.max_range for keyframe in recent]
+        return recent[max((i + 1 for i, away in enumerate(far) if away), default=0) :]
 
 
 def odometry_sigmas(config: SlamConfig, step: planar.Pose) -> tuple[float, float]:

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from stereovox import planar
 from stereovox.config_robot import SlamConfig
+from stereovox.localize.line_map import Cloud
 from stereovox.localize.slam_closure import ClosureSearch
 from stereovox.localize.slam_keyframe import Edge, Keyframe, in_second_frame
 from stereovox.localize.slam_submap import Submap, submap_cloud
@@ -20,7 +21,7 @@ both."""
 BASE_WINDOW, BASE_WINDOW_TURN = 0.5, 0.1
 """Metres and radians that are searched even where no drift is to be feared."""
 CORRIDOR = 0.03
-"""Share of the strongest direction's information below which the weakest is a corridor's: such a closure is not used."""
+"""Share of the strongest direction's information below which the weakest is a corridor's: no closure there."""
 WITNESS_PATH = 15.0
 """Metres of way within which two findings can bear each other out."""
 WITNESS = (0.1, 0.02, 0.02)
@@ -61,7 +62,7 @@ class LoopFinder:
             self._search.onto(submap_cloud(self._keyframes, earlier, FAR_RANGE))
             self._lay(earlier, later, cloud, window)
 
-    def _lay(self, earlier: Submap, later: Submap, cloud, window: tuple[float, float]) -> None:  # pyright: ignore[reportMissingParameterType]
+    def _lay(self, earlier: Submap, later: Submap, cloud: Cloud, window: tuple[float, float]) -> None:
         first, second = earlier.anchor, later.anchor
         guess = planar.relative(self._keyframes[first].pose, self._keyframes[second].pose)
         match = self._search.lay(cloud, guess, *window)
@@ -82,7 +83,9 @@ class LoopFinder:
 
     def _agree(self, a: Edge, b: Edge) -> bool:
         keyframes = self._keyframes
-        way = sum(abs(keyframes[i].travelled - keyframes[k].travelled) for i, k in ((a.first, b.first), (a.second, b.second)))
+        way = sum(
+            abs(keyframes[i].travelled - keyframes[k].travelled) for i, k in ((a.first, b.first), (a.second, b.second))
+        )
         if way > WITNESS_PATH:
             return False
         over = planar.relative(keyframes[a.first].pose, keyframes[b.first].pose)

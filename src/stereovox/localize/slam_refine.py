@@ -36,10 +36,11 @@ def patch_edges(keyframes: list[Keyframe], config: SlamConfig) -> Iterator[Edge]
         others = _others(places, middle, first, last, config)
         if not len(others):
             continue
-        pose = keyframes[middle].pose
+        pose = places[middle]
         patch.build(joined([k.cloud.moved(planar.relative(pose, k.pose)) for k in keyframes[first:last]]))
-        for other in others:
-            edge = _edge(patch, keyframes, middle, int(other), config)
+        guesses = planar.relative(pose, places[others])
+        for other, guess in zip(others.tolist(), guesses, strict=True):
+            edge = _edge(patch, keyframes, (middle, other), guess, config)
             if edge is not None:
                 yield edge
 
@@ -50,13 +51,14 @@ def _others(places: planar.Pose, middle: int, first: int, last: int, config: Sla
     return near[(near < first) | (near >= last)]
 
 
-def _edge(patch: LineMap, keyframes: list[Keyframe], middle: int, other: int, config: SlamConfig) -> Edge | None:
-    guess = planar.relative(keyframes[middle].pose, keyframes[other].pose)
-    cloud = keyframes[other].cloud
+def _edge(
+    patch: LineMap, keyframes: list[Keyframe], pair: tuple[int, int], guess: planar.Pose, config: SlamConfig
+) -> Edge | None:
+    cloud = keyframes[pair[1]].cloud
     match = patch.refine(cloud, guess, 2 * config.sigma, iterations=6)
     match = patch.refine(cloud, match.pose, config.sigma, iterations=8)
-    moved = planar.relative(guess, match.pose)
-    if match.share < LEAST_SHARE or np.hypot(moved[0], moved[1]) > 0.3 or abs(moved[2]) > 0.1:
+    moved = match.pose - guess
+    if match.share < LEAST_SHARE or moved[0] ** 2 + moved[1] ** 2 > 0.1 or abs(moved[2]) > 0.1:
         return None
     information = without_weak(in_second_frame(match.information, float(match.pose[2])), WEAK)
-    return Edge(middle, other, match.pose, information, match.share)
+    return Edge(*pair, match.pose, information, match.share)

@@ -33,12 +33,15 @@ def submap_cloud(keyframes: list[Keyframe], submap: Submap, max_range: float, ce
     pose = keyframes[submap.anchor].pose
     clouds = []
     for keyframe in keyframes[submap.first : submap.last]:
+        if np.hypot(*(keyframe.pose - pose)[:2]) > max_range:
+            continue  # the odometry jumped
         near = (keyframe.cloud.points**2).sum(axis=1) < max_range**2
         part = Cloud(keyframe.cloud.points[near], keyframe.cloud.views[near])
         clouds.append(part.moved(planar.relative(pose, keyframe.pose)))
     cloud = joined(clouds)
     if not cell or not len(cloud.points):
         return cloud
-    _, first = np.unique(np.floor(cloud.points / cell).astype(np.int64), axis=0, return_index=True)
+    squares = np.floor(cloud.points / cell).astype(np.int64)
+    _, first = np.unique(squares[:, 0] * (1 << 32) + squares[:, 1], return_index=True)
     first.sort()
     return Cloud(cloud.points[first], cloud.views[first])

@@ -66,6 +66,9 @@ def show(coords, cells, first_column, first_row, shown, lowest, picture):
         left, bottom = (coords[i, 0] << 6) - first_column, (coords[i, 1] << 6) - first_row
         column, until = max(left, 0), min(left + 64, columns)
         for row in range(max(bottom, 0), min(bottom + 64, rows)):
-            start = ((row - bottom) << 6) - left
-            for k in range(column, until):
-                picture[row, k] = shown[np.int32(cells[i, start + k]) - lowest]
+            start = ((row - bottom) << 6) + column - left
+            stored, out = cells[i, start : start + until - column], picture[row, column:until]
+            for k in range(out.size):
+                out[k] = shown[
+                    np.uint32(np.int32(stored[k]) - lowest)
+                ]  # unsigned: no test whether it counts from the end

@@ -106,7 +106,6 @@ def _plain(number: float) -> str:
 
 def _quoted(name: str) -> str:
     """Return a file name as YAML takes it for text, whatever is in it."""
-    import json
+    import yaml
 
-    plain = name.replace("-", "").replace("_", "").replace(".", "")
-    return name if plain.isalnum() and plain.isascii() and name[0].isalpha() else json.dumps(name)
+    return yaml.safe_dump(name, allow_unicode=True, width=10**6).removesuffix("\n").removesuffix("\n...")

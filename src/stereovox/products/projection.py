@@ -133,7 +133,7 @@ def _grid(voxel_map: VoxelMap, patch: _Patch, side: float) -> OccupancyGrid:
     number = number[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
     percent = Percent(CellRules(voxel_map.config.map))
     known = percent.shown[np.maximum(number, percent.lowest).astype(np.int32) - percent.lowest]
-    left, bottom = ((patch.corner + np.array([columns[0], rows[0]])) * side).tolist()
+    left, bottom = ((patch.corner + np.array([columns[0], rows[0]])) * side).round(9).tolist()
     return OccupancyGrid(
         np.where(number == NOTHING, np.int8(UNKNOWN), known), side, (left, bottom, 0.0),
         percent.free_below, percent.occupied_above,

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-
 from stereovox.errors import FrameRefused, SourceError
 from stereovox.sources.bag_files import BagFile
 from stereovox.sources.bag_robot_messages import ODOMETRY, StampedTransform, is_motion, read_odometry

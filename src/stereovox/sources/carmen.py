@@ -90,8 +90,8 @@ def _scan(reading: Reading, max_range: float) -> Scan:
     ranges[ranges >= max_range] = np.inf
     T_base_sensor = lifted(reading.pose_base_sensor)
     return Scan(
-        ranges, reading.angle_min, reading.angle_step, 0.0, max_range,
-        lifted(reading.pose_odom_base) @ T_base_sensor, T_base_sensor, stamp_ns=reading.stamp_ns, name=f"line {reading.line}",
+        ranges, reading.angle_min, reading.angle_step, 0.0, max_range, lifted(reading.pose_odom_base) @ T_base_sensor,
+        T_base_sensor, stamp_ns=reading.stamp_ns, name=f"line {reading.line}",
     )  # fmt: skip
 
 

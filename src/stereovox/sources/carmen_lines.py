@@ -20,7 +20,7 @@ FARTHEST = 1e6
 MOST_BEAMS = 100_000
 
 
-class DamagedLine(ValueError):
+class DamagedLine(ValueError):  # noqa: N818 - reads as what happened
     """A line does not make sense; the message says why."""
 
 

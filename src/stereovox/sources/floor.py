@@ -21,6 +21,7 @@ from stereovox.sources.floor_drive import STEP_NS, Odometry, drive
 from stereovox.sources.floor_kinect import Kinect, kinect_camera
 from stereovox.sources.floor_layout import Layout
 from stereovox.sources.floor_plan import FloorPlan, Rectangle, cast
+from stereovox.sources.floor_view import LevelView
 from stereovox.sources.lazy import Lazy
 from stereovox.sources.poses import Poses
 from stereovox.sources.stage import one_of, within
@@ -140,9 +141,9 @@ class Floor:
 
     def true_depth(self, stamp_ns: int) -> NDArray[np.float32]:
         """Return the exact depth (height, width) in metres along the camera's optical axis."""
-        T = self.truth.at(stamp_ns) @ self.T_base_camera
-        directions = self._directions @ T[:3, :3].T.astype(np.float32)
-        return self.plan.scene.cast(T[:3, 3], directions).reshape(self.camera.height, self.camera.width)
+        x, y, yaw = planar.flattened(self.truth.at(stamp_ns))
+        forward, side = self.T_base_camera[:2, 3]
+        return self._view.depth(planar.compose((x, y, yaw), (forward, side, 0.0)))
 
     def _scan(self, i: int) -> Scan:
         stamp = self._stamp(i, self.options.scan_hz, SCAN_DELAY_NS)
@@ -201,10 +202,8 @@ class Floor:
         return self.plan.outline(height, height)
 
     @cached_property
-    def _directions(self) -> NDArray[np.float32]:
-        x, y = self.camera.ray_slopes()
-        grid = np.stack(np.broadcast_arrays(x[None, :], y[:, None], np.float32(1)), axis=-1)
-        return np.ascontiguousarray(grid.reshape(-1, 3))
+    def _view(self) -> LevelView:
+        return LevelView(self.plan, self.camera, float(self.T_base_camera[2, 3]))
 
 
 def _angles() -> NDArray[np.float64]:

@@ -22,7 +22,9 @@ TRUTH = "/ground_truth"
 Told = tuple[int, Scan | Frame | planar.Pose]
 
 
-def write_bag(robot: Robot, path: str | os.PathLike[str], progress: Callable[[int, int], None] | None = None) -> None:
+def write_bag(
+    robot: Robot | Floor, path: str | os.PathLike[str], progress: Callable[[int, int], None] | None = None
+) -> None:
     """Write all that a simulated robot records: ROS 1 for `.bag`, ROS 2 for `.mcap` and `.db3`.
 
     Topics: /scan, /camera/depth/image_raw and its camera_info, /odom, /tf (odom -> base_link), /tf_static, and the true

@@ -98,12 +98,12 @@ def _office_things() -> list[Thing]:
 
 
 def _stops(shut: bool) -> list[Stop]:
-    stairs = [] if shut else [Stop(1.9, 1.0), Stop(1.9, 2.8), Stop(1.9, 4.9, 180), Stop(1.9, 2.8), Stop(1.9, 1.0)]
+    stairs = [] if shut else [Stop(1.9, 2.8), Stop(1.9, 4.9, 180), Stop(1.9, 2.8), Stop(1.9, 1.0)]
     return [
-        Stop(3.6, 1.0, 360),
+        Stop(0.9, 1.0),
+        Stop(1.9, 1.0, 360),
         *stairs,
-        Stop(0.9, 1.0, 180),
-        *zigzag((1.4, 1.0), (10.0, 1.0), 0.4),
+        *zigzag((2.4, 1.0), (10.0, 1.0), 0.4),
         *(Stop(10.75, 1.0), Stop(10.75, -0.95, 360), Stop(10.75, 1.0)),
         *(Stop(10.7, 2.85), Stop(9.2, 2.9, -360), Stop(10.7, 2.85), Stop(10.7, 1.0)),
         *zigzag((11.2, 1.0), (16.2, 1.0), -0.35),

@@ -134,18 +134,26 @@ def cast(
 
     segments: (M, 4) x, y from and to. angles: (N,) radians, 0 along x, to the left. longest: what is farther is inf.
     """
-    near = within_reach(segments, origin, longest)
-    start = near[:, :2] - np.asarray(origin, float)
-    along = near[:, 2:] - near[:, :2]
-    cosine, sine = np.cos(angles)[:, None], np.sin(angles)[:, None]
-    # start + s along = t (cosine, sine): Cramer's rule
-    across = cosine * along[:, 1] - sine * along[:, 0]
+    directions = np.column_stack([np.cos(angles), np.sin(angles)])
+    t = cast_along(within_reach(segments, origin, longest), origin, directions)
+    return np.where(t <= longest, t, np.inf)
+
+
+def cast_along(
+    segments: NDArray[np.float64], origin: ArrayLike, directions: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return how often `directions` (N, 2) fit between `origin` (2,) and the first segment, (N,), inf where none is."""
+    start = segments[:, :2] - np.asarray(origin, float)
+    along = segments[:, 2:] - segments[:, :2]
+    x, y = directions[:, :1], directions[:, 1:]
+    # start + s along = t (x, y): Cramer's rule
+    across = x * along[:, 1] - y * along[:, 0]
     t = np.full(across.shape, np.inf)
     met = across != 0
     np.divide(start[:, 0] * along[:, 1] - start[:, 1] * along[:, 0], across, out=t, where=met)
-    s = sine * start[:, 0] - cosine * start[:, 1]
+    s = y * start[:, 0] - x * start[:, 1]
     # 0 <= s / across <= 1 without dividing
-    on = met & (s * across >= 0) & (np.abs(s) <= np.abs(across)) & (t >= 0) & (t <= longest)
+    on = met & (s * across >= 0) & (np.abs(s) <= np.abs(across)) & (t >= 0)
     return np.where(on, t, np.inf).min(axis=1, initial=np.inf)
 
 

@@ -25,7 +25,7 @@ class PairSettings:
     """What a `pair.toml` says; every key has a default but `T_tracker_camera`, which must be measured.
 
     depth: folder or file of the depth images, from the file's own folder on.
-    poses: text file of the tracker, lines `stamp tx ty tz qx qy qz qw [confidence]`, or a `.bag` or `.db3` with poses.
+    poses: text file of the tracker, lines `stamp tx ty tz qx qy qz qw [confidence]`, or a bag with poses.
     axes: axes of the poses in that file, `opengl` (T265), `optical` or `ros`; world: axes of the map, `up` (z up),
         `optical` (Chien 2020) or `file` (see `tracker.py`).
     T_tracker_camera: (4, 4) metres; maps the depth camera's optical frame into the tracker's body frame, both in

@@ -53,9 +53,9 @@ class RobotFrames:
         self._edge: Edge | None = None
         self.odom, how = "" if options.odom else self._odom_in_tf(frame_name(options.odom_frame), bool(first)), ()
         if not self.odom and first and topic:
-            child = first.child if first.child in self.tf.frames else self.base
+            child, said = self._body(first.child, topic)
             self._edge = odometry_edge(file, topic, first.parent or ODOMS[0], child)
-            self.odom, how = self._edge.parent, noted
+            self.odom, how = self._edge.parent, (*noted, *said)
         if not self.odom:
             self.odom, how = self._anything_moving()
         self.notes = (*based, *how, *self.tf.notes)
@@ -110,14 +110,16 @@ class RobotFrames:
         said = f"no {' or '.join(BASES)} in /tf: {self._sensors[0]} is taken for the robot; else give ?base_frame="
         return self._sensors[0], (f"{self.path}: {said}",)
 
+    def _body(self, child: str, topic: str) -> tuple[str, Notes]:
+        """Return the frame whose pose an odometry topic tells: what it says, where that has to do with the robot."""
+        if child in ("", self.base) or self.tf.connected(child, self.base):
+            return child or self.base, ()
+        return self.base, (f"{self.path}: {topic} tells where {child} is: taken for {self.base}",)
+
     def _named(self, name: str, option: str) -> str:
         """Return the frame of that name, or the only one of a namespace (`robot/base_link`), "" where there is none."""
-        near = [
-            frame
-            for frame in self.tf.frames
-            if frame.rpartition("/")[2] == name
-            and (not self._sensors or any(self.tf.connected(frame, sensor) for sensor in self._sensors))
-        ]
+        near = [frame for frame in self.tf.frames if frame.rpartition("/")[2] == name]
+        near = [frame for frame in near if any(self.tf.connected(frame, other) for other in self._sensors)] or near
         if len(near) > 1 and name not in near:
             raise SourceError(f"{self.path}: several robots, say which: ?{option}={f' or ?{option}='.join(near)}")
         return name if name in near else "".join(near)

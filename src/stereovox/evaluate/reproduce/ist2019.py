@@ -43,7 +43,7 @@ class Sizes:
     published: int = SIDE
 
 
-QUICK = Sizes(Extent("depth_hz=1&image_width=320&seconds=45&scan_hz=5", "seconds=70&scan_hz=5"), VARIANTS[:5], 1000)
+QUICK = Sizes(Extent("depth_hz=4&image_width=320&seconds=45&scan_hz=5", "seconds=70&scan_hz=5"), VARIANTS[:5], 1000)
 
 
 def reproduce(out: Path, data: str | Path | None, quick: bool, progress: Progress) -> dict[str, Any]:

@@ -46,7 +46,7 @@ def _shown(shown: Shown) -> str:
     heading, ours = f"<h3>{escape(shown.place)}</h3>\n", escape(shown.ours)
     if not shown.said:
         return f"{heading}<p>{ours}</p>\n{figure(shown.png, shown.place)}"
-    said = f"<p><b>{escape(shown.place)} of the thesis</b> (in words; the picture itself is not at hand): "
+    said = f"<p><b>{escape(shown.place)} as published</b> (in words; the picture itself is not at hand): "
     picture = figure(shown.png, f"Ours, beside {shown.place}")
     return f"{heading}{said}{escape(shown.said)}</p>\n<p><b>Ours:</b> {ours}</p>\n{picture}"
 

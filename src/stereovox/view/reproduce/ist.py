@@ -20,7 +20,7 @@ MAP_DPI = 75
 
 def fans_png(fans: Sequence[Fan]) -> bytes:
     """Return the maps that synthetic beams made, side by side, with counted cells (after Fig 3)."""
-    figure = figure_of(6.5)
+    figure = figure_of(8.0)
     for axis, fan in zip(figure.subplots(1, len(fans), squeeze=False)[0], fans, strict=True):
         _fan(axis, fan)
     return png(figure)

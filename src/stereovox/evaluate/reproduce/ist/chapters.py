@@ -77,7 +77,7 @@ def floor_chapter(found: Survey, place: Place | None) -> Chapter:
 
 def time_chapter(many: Fan, surveys: Sequence[tuple[Place | None, Survey]], published: Published | None) -> Chapter:
     """Return Table I."""
-    rows = [("Simulation", "0.031", f"{many.ms['median'] / 1e3:.5f}", "-")]
+    rows: list[tuple[str, ...]] = [("Simulation", "0.031", f"{many.ms['median'] / 1e3:.5f}", "-")]
     for place, found in surveys:
         ms = [f"{update_ms(found, name) / 1e3:.5f}" for name in (THEIRS, OURS)]
         rows.append((place.title if place else found.recording.name, f"{place.update_s:.3f}" if place else "-", *ms))

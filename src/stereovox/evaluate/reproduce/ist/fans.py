@@ -30,8 +30,10 @@ UPDATES = 60
 class Fan:
     """What beams made of an empty map.
 
-    right: share of places along all beams (before the object and in it) whose cell has the state it should have.
-    free, occupied: cells; expected_free, expected_occupied: what the areas of sector and ring give (None: few beams).
+    right: share of places along all beams (before the object and in it) that have a cell of the state they should have
+    no further than one cell away: a line in a grid leaves the beam by so much.
+    free, occupied: cells; expected_free, expected_occupied: what the areas of sector and ring give, the ring a cell
+    wider than the thickness, since both its ends are drawn (None: few beams).
     beyond: known cells that no beam reaches. ms: of one update.
     """
 
@@ -54,7 +56,7 @@ def simulate(distances: ArrayLike, step: Callable[[], None] = lambda: None) -> F
     grid = mapper.occupancy()
     step()
     states = grid.states
-    sector = np.radians(FIELD_DEG) / 2 / config.voxel_size**2
+    sector = float(np.radians(FIELD_DEG)) / 2 / config.voxel_size**2
     alike, r, deep = len(set(scan.ranges.tolist())) == 1, float(scan.ranges[0]), config.grid.thickness
     return Fan(
         scan,
@@ -63,7 +65,7 @@ def simulate(distances: ArrayLike, step: Callable[[], None] = lambda: None) -> F
         free=int((states == State.FREE).sum()),
         occupied=int((states == State.OCCUPIED).sum()),
         expected_free=sector * r**2 if alike else None,
-        expected_occupied=sector * ((r + deep) ** 2 - r**2) if alike else None,
+        expected_occupied=sector * ((r + deep + config.voxel_size) ** 2 - r**2) if alike else None,
         beyond=_beyond(grid, scan, config),
         ms=percentiles([one.depth_ms + one.integrate_ms for one in reports]),
     )
@@ -75,13 +77,20 @@ def _scan(distances: NDArray[np.float32]) -> Scan:
 
 
 def _right(mapper: GridMapper, scan: Scan, config: Config) -> float:
-    """Return the share of places on the beams, a cell's side clear of where they end, that are as they should be."""
+    """Return `Fan.right`; places a cell's side or less from where the measurement ends are left out."""
     directions, size, right = np.column_stack([np.cos(scan.angles), np.sin(scan.angles)]), config.voxel_size, []
     for direction, r in zip(directions, scan.ranges.astype(float), strict=True):
         before = np.arange(size, r - size, size / 2)[:, None] * direction
         within = np.arange(r + size, r + config.grid.thickness - size, size / 2)[:, None] * direction
-        right += [mapper.map.state(before) == State.FREE, mapper.map.state(within) == State.OCCUPIED]
+        right += [_there(mapper, before, State.FREE), _there(mapper, within, State.OCCUPIED)]
     return float(np.concatenate(right).mean())
+
+
+def _there(mapper: GridMapper, points: NDArray[np.float64], state: State) -> NDArray[np.bool_]:
+    """Tell which points (N, 2) have a cell of this state at most one cell away."""
+    size = mapper.map.voxel_size
+    around = [points + (x * size, y * size) for x in (-1, 0, 1) for y in (-1, 0, 1)]
+    return np.any([mapper.map.state(one) == state for one in around], axis=0)
 
 
 def _beyond(grid: OccupancyGrid, scan: Scan, config: Config) -> int:

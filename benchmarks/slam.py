@@ -11,8 +11,9 @@ import numpy as np
 
 from stereovox.config import load_config, parse_value
 from stereovox.evaluate.relations import score_relations
-from stereovox.localize import _bound
+from stereovox.localize.line_map import cloud_of
 from stereovox.localize.slam import Slam, SlamResult, map_scans
+from stereovox.localize.slam_closure import ClosureSearch
 from stereovox.localize.track import Track
 from stereovox.products.map_server import write_map_server
 from stereovox.sources.robot import open_robot
@@ -56,7 +57,9 @@ def timed(config, scans) -> tuple[list, list[float], SlamResult, float]:
     import gtsam  # noqa: F401 - once in a process, half a second
 
     map_scans(scans[:3], config)  # compiles
-    _bound.coarsen(np.zeros((4, 4), np.float32), 2, np.zeros((2, 6, 6), np.float32))
+    search, cloud = ClosureSearch(config.slam), cloud_of(scans[0], 20.0)
+    search.onto(cloud)
+    search.lay(cloud, np.zeros(3), 0.3, 0.1)
     slam, live, each = Slam(config), [], []
     for scan in scans:
         start = time.process_time()

@@ -51,7 +51,7 @@ class GridConfig(Section):
     traversal: str = "exact"
     update: Literal["once", "every"] = "once"
     thickness: float = Field(0.0, ge=0, le=5)
-    p_occupied: float = Field(0.7, gt=0.5, lt=1)
+    p_occupied: float = Field(0.85, gt=0.5, lt=1)
     p_free: float = Field(0.4, gt=0, lt=0.5)
     max_tilt_deg: float = Field(5.0, ge=0, le=45)
 
@@ -137,7 +137,7 @@ class SlamConfig(Section):
     max_range: metres up to which hits are matched; what is further is too sparse to lie on a line.
     sigma: metres that a hit may stand off a wall; beyond, it counts less and less (Geman and McClure).
     odometry: how far the odometry's step between two scans may be off: metres, metres per metre, radians, radians per
-        radian. Wide on purpose: odometry and lidar seldom have one clock, and matching knows better but in corridors.
+        radian. Turns are wide on purpose: odometry and lidar seldom have one clock, and matching knows better.
     keyframe_distance, keyframe_turn: metres and radians between the scans that the map is made of.
     local_keyframes: a scan is matched with the map of this many last keyframes.
     submap_keyframes: keyframes of a submap, the unit that loops are closed with.
@@ -155,11 +155,11 @@ class SlamConfig(Section):
 
     voxel_size: float = Field(0.05, ge=0.01, le=0.5)
     max_range: float = Field(30.0, gt=0, le=1000)
-    sigma: float = Field(0.06, gt=0, le=1)
-    odometry: tuple[float, float, float, float] = (0.1, 0.4, 0.07, 0.5)
+    sigma: float = Field(0.04, gt=0, le=1)
+    odometry: tuple[float, float, float, float] = (0.02, 0.2, 0.07, 0.5)
     keyframe_distance: float = Field(0.25, gt=0, le=10)
     keyframe_turn: float = Field(0.2, gt=0, le=3.2)
-    local_keyframes: int = Field(60, ge=1, le=1000)
+    local_keyframes: int = Field(50, ge=1, le=1000)
     submap_keyframes: int = Field(24, ge=2, le=1000)
     closure_path: float = Field(12.0, gt=0)
     drift: float = Field(0.03, ge=0, le=1)

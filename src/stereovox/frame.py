@@ -98,7 +98,7 @@ class Scan:
         Scans out of depth images have it: a camera that looks down sees a beam's floor at 2 m and nothing beyond, so
         that beam is free up to 2 m (its range: NaN).
     clear_from: (N,) float32 metres from which on a beam is known to be free up to `clear`; None: from the sensor on. A
-        camera over the height band of its scan does not see into the band close by.
+        camera does not see what stands on the floor right before it.
     stamp_ns, name, fault, fault_detail: as in `Frame`.
     """
 
@@ -119,7 +119,7 @@ class Scan:
     @property
     def angles(self) -> NDArray[np.float64]:
         """Direction of each beam in the sensor's frame, (N,) radians."""
-        return self.angle_min + self.angle_step * np.arange(len(self.ranges))
+        return self.angle_min + self.angle_step * np.arange(len(self.ranges), dtype=np.float64)
 
     @property
     def pose_world_base(self) -> NDArray[np.float64]:

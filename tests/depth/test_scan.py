@@ -80,7 +80,14 @@ def halfway(values):
     return np.array([2 * values[0] - middle[0], *middle, 2 * values[-1] - middle[-1]])
 
 
-def what_it_says(why, d, ray, height, heights):
+def floor_limit(image, low):
+    """Depth up to which the floor may be too near: 1.25 times about the least that is measured."""
+    depths = np.sort(image.depth_m[::4, ::4][image.reason[::4, ::4] == Reason.VALID])
+    least = depths[len(depths) // 100] if len(depths) else 0.0
+    return 1.25 * max(NEAR, least) if low > 0 else 0.0
+
+
+def what_it_says(why, d, ray, height, heights, floor):
     """One ray, step by step: (hit or None, whether too near, from, to), along the floor."""
     low, high = heights
     way = math.hypot(ray[0], ray[1])
@@ -91,7 +98,8 @@ def what_it_says(why, d, ray, height, heights):
         at = (limit - height) / ray[2]
         enter, leave = (max(enter, at), leave) if inwards else (enter, min(leave, at))
     if why == Reason.TOO_NEAR:
-        return None, enter <= leave and enter < NEAR, 0.0, 0.0
+        is_floor = ray[2] < 0 and height / -ray[2] < floor
+        return None, enter <= leave and enter < NEAR and not is_floor, 0.0, 0.0
     d = FAR if why == Reason.TOO_FAR else float(d)
     hit = d * way if why == Reason.VALID and low <= height + d * ray[2] <= high and d * way <= FAR else None
     return hit, False, enter * way, min(min(d, leave) * way, FAR)
@@ -117,17 +125,17 @@ def beams_of_pixels(image, scan):
 
 def slow(image, scan, config, rows=None):
     """Ranges, clear and clear_from by a loop over pixels; and which beams rounding may change."""
-    n, height = len(scan.ranges), image.T_world_sensor[2, 3]
+    n, height, rows_only = len(scan.ranges), image.T_world_sensor[2, 3], bool(rows)
     heights = (-math.inf, math.inf) if rows else config.scan.heights
     hits, near, start, end = np.full(n, np.inf), np.zeros(n, bool), np.zeros(n), np.zeros(n)
-    unsure = np.zeros(n, bool)
+    unsure, floor = np.zeros(n, bool), floor_limit(image, heights[0])
     of_pixel, doubtful = beams_of_pixels(image, scan)
     rays = rays_in_scan(image)
     order = list(rows or range(image.camera.height))
     for v in reversed(order) if height > heights[1] else order:
         for u in range(image.camera.width):
             why, d = Reason(image.reason[v, u]), image.depth_m[v, u]
-            hit, too_near, first, last = what_it_says(why, d, rays[v, u], height, heights)
+            hit, too_near, first, last = what_it_says(why, d, rays[v, u], height, heights, floor)
             level_at = height + (float(d) if why == Reason.VALID else 0) * rays[v, u, 2]
             edge = why == Reason.VALID and min(abs(level_at - limit) for limit in heights) < 1e-4
             for b in of_pixel[v, u]:
@@ -143,10 +151,33 @@ def slow(image, scan, config, rows=None):
                     unsure[max(b, 0) : b + 1] = True
     clear = np.where(near, 0, np.minimum(end, hits))
     clear[clear <= start] = 0
-    start[clear == 0] = 0
     free = (clear >= FAR * 0.999) & (start == 0)
     ranges = np.where(near, -np.inf, np.where(np.isfinite(hits), hits, np.where(free, np.inf, np.nan)))
+    closest = np.zeros(n) if rows_only else blind_lengths(image, rays, of_pixel, n, heights[0], floor)
+    start = np.maximum(start, closest)
+    unsure |= np.abs(clear - closest) < 0.1 * closest
+    clear[clear <= start] = 0
+    start[clear == 0] = 0
     return ranges, clear, start, unsure
+
+
+def blind_lengths(image, rays, of_pixel, n, low, floor):
+    """Metres of each beam in which a thing on the floor may stand below the view, or nearer than depths are known."""
+    lowest, unmeasured, height = np.full(n, np.inf), np.zeros(n), image.T_world_sensor[2, 3]
+    drop = height - low
+    for (v, u), beams in of_pixel.items():
+        forward, left, up = rays[v, u]
+        way = math.hypot(forward, left)
+        if forward <= 0 or abs(up) >= math.tan(math.radians(80)) * way:
+            continue
+        depth = NEAR
+        if image.reason[v, u] == Reason.TOO_NEAR and up < 0 and height / -up < floor:
+            depth = max(NEAR, height / -up)
+        for b in beams:
+            if 0 <= b < n:
+                lowest[b], unmeasured[b] = min(lowest[b], up / way), max(unmeasured[b], depth * way)
+    sunk = [(drop / -falls if falls < 0 else math.inf) if drop > 0 else 0.0 for falls in lowest]
+    return np.maximum(sunk, unmeasured)
 
 
 CASES = {
@@ -185,10 +216,12 @@ def compare(scan, wanted):
     *wanted, unsure = wanted
     sure = ~unsure
     assert sure.sum() > 0.3 * len(sure)
-    for found, right in zip((scan.ranges, scan.clear, scan.clear_from), wanted, strict=True):
+    for name, right in zip(("ranges", "clear", "clear_from"), wanted, strict=True):
+        found = getattr(scan, name)
         assert found.dtype == np.float32
         assert found.shape == unsure.shape
-        np.testing.assert_allclose(found[sure], right[sure], rtol=3e-5, atol=3e-5)
+        close = 0.1 if name == "clear_from" else 3e-5  # a ray at the border of two beams may belong to either
+        np.testing.assert_allclose(found[sure], right[sure], rtol=close, atol=3e-5, err_msg=name)
 
 
 def test_beams_cover_the_field_of_view_in_equal_steps():
@@ -224,10 +257,11 @@ def test_nothing_is_cleared_beyond_an_obstacle_of_any_ray_of_the_beam(seed):
     beam = np.rint((np.arctan2(rays[..., 1], rays[..., 0]) - scan.angle_min) / scan.angle_step).astype(int)
     assert (scan.clear <= np.where(np.isfinite(scan.ranges), scan.ranges, np.inf)).all()
     assert not scan.clear[scan.ranges == -np.inf].any()
+    floor = floor_limit(image, low)
     obstacles, farthest = 0, np.zeros(len(scan.ranges))
     for (v, u), b in np.ndenumerate(beam):
         why = Reason(image.reason[v, u])
-        hit, near, _, end = what_it_says(why, image.depth_m[v, u], rays[v, u], T[2, 3], config.scan.heights)
+        hit, near, _, end = what_it_says(why, image.depth_m[v, u], rays[v, u], T[2, 3], config.scan.heights, floor)
         if near:
             assert scan.ranges[b] == -np.inf
         if hit is not None:
@@ -237,7 +271,7 @@ def test_nothing_is_cleared_beyond_an_obstacle_of_any_ray_of_the_beam(seed):
         farthest[max(b - 2, 0) : b + 3] = np.maximum(farthest[max(b - 2, 0) : b + 3], end)  # and pixels that overlap
     assert obstacles > 10
     assert (scan.clear <= farthest + 1e-4).all()
-    assert (scan.clear > 0).sum() > 10
+    assert (scan.clear[scan.clear > 0] > scan.clear_from[scan.clear > 0]).all()
 
 
 def hall(tilt, height=1.0, reason=Reason.TOO_FAR):
@@ -257,7 +291,40 @@ def test_in_an_empty_hall_a_level_camera_sees_nothing_up_to_its_range():
         scan = scan_of(hall(0), settings(method=method))
         assert (scan.ranges[1:-1] == np.inf).all()
         assert scan.clear[1:-1] == pytest.approx(FAR, rel=1e-3)
-        assert not scan.clear_from.any()
+        lowest = 0.9 / ((47 - 24.2) / 58)  # there the lowest ray of a level camera at 1 m is 0.1 m high
+        middle = int(np.argmin(np.abs(scan.angles)))
+        assert scan.clear_from[middle] == pytest.approx(0 if method == "rows" else lowest, rel=0.02)
+
+
+def test_a_box_that_has_sunk_below_the_view_is_not_cleared():
+    """Rays over a low box see far; the box, now nearer than the lowest ray comes down, must not be forgotten."""
+    scan = scan_of(hall(0, height=0.6), settings())
+    box = 0.7  # metres ahead, 0.2 m high: the camera, at 0.6 m, sees down to 0.32 m there
+    assert (scan.clear[1:-1] > 5).all()
+    assert (scan.clear_from[1:-1] > box).all()
+
+
+def test_the_floor_right_before_the_camera_is_too_near_and_no_obstacle():
+    image = hall(0, height=0.15)  # its lowest rows meet the floor at 0.38 m, nearer than `min_range`
+    near = (image.reason == Reason.VALID) & (image.depth_m < NEAR)
+    assert near.any()
+    image.depth_m[near], image.reason[near] = -np.inf, Reason.TOO_NEAR
+    scan = scan_of(image, settings())
+    assert (scan.ranges[1:-1] == np.inf).all()
+    assert (scan.clear_from[1:-1] >= NEAR).all()
+    image.depth_m[20], image.reason[20] = -np.inf, Reason.TOO_NEAR  # a row that looks up
+    assert (scan_of(image, settings()).ranges[1:-1] == -np.inf).all()
+
+
+def test_a_camera_with_a_nearest_depth_of_its_own():
+    """A Kinect measures from 0.8 m on, whatever `min_range` is: its own reasons say so, on the floor before it."""
+    image = hall(0, height=0.3)  # its lowest rows meet the floor at 0.76 m
+    own = (image.reason == Reason.VALID) & (image.depth_m < 0.8)
+    assert own.any()
+    image.depth_m[own], image.reason[own] = -np.inf, Reason.TOO_NEAR
+    scan = scan_of(image, settings())
+    assert (scan.ranges[1:-1] == np.inf).all()
+    assert (scan.clear_from[1:-1] > 0.7).all()
 
 
 def test_a_camera_that_looks_down_knows_no_more_than_it_sees():
@@ -303,8 +370,8 @@ def test_a_camera_over_the_heights_knows_nothing_close_by():
     scan = scan_of(hall(20, height=2.0), settings(heights=[0.2, 1.0]))
     beam = int(np.argmin(np.abs(scan.angles)))
     lowest = np.radians(20) + np.arctan((47 - 24.2) / 58)
-    assert scan.clear_from[beam] == pytest.approx(1.0 / np.tan(lowest), rel=0.02)
-    assert scan.clear[beam] > 2 * scan.clear_from[beam]
+    assert scan.clear_from[beam] == pytest.approx(1.8 / np.tan(lowest), rel=0.02)  # there it is 0.2 m high
+    assert scan.clear[beam] > 1.5 * scan.clear_from[beam]
     assert np.isnan(scan.ranges[beam])
 
 

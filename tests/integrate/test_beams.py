@@ -52,7 +52,8 @@ def test_kernels_equal_the_reference(traversal, update, thickness, voxel_size):
     rng = np.random.default_rng(7)
     for seed in range(3):
         clear = rng.uniform(-0.5, 4, 60).astype(np.float32) if seed == 2 else None
-        scan = made_scan(seed, rng.uniform([-90, -90, -3], [90, 90, 3]), clear=clear)
+        since = rng.uniform(-0.5, 2, 60).astype(np.float32) if seed == 2 else None
+        scan = made_scan(seed, rng.uniform([-90, -90, -3], [90, 90, 3]), clear=clear, clear_from=since)
         origin = rng.uniform(-3, 3, 3)
         ours = cells_of(config, scan, origin)
         assert len(ours) > 100
@@ -118,6 +119,9 @@ def test_what_each_kind_of_beam_says(traversal):
     assert row(along_x(np.nan, clear=np.array([0.22], np.float32))) == [PASS] * 3
     assert row(along_x(0.52, clear=np.array([0.22], np.float32))) == [PASS] * 3 + [0, 0, HIT]
     assert row(along_x(np.inf, clear=np.array([0], np.float32))) == []
+    since = np.array([0.22], np.float32)
+    assert row(along_x(0.52, clear_from=since)) == [0, 0, PASS, PASS, PASS, HIT]
+    assert row(along_x(0.52, clear=since, clear_from=since)) == [0] * 5 + [HIT]
 
 
 @pytest.mark.parametrize("traversal", ["exact", "bresenham"])

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Drives of a robot with a lidar between walls, with odometry that drifts: slow and obvious ray casting."""
 
+import itertools
+
 import numpy as np
 
 from stereovox import planar
@@ -14,7 +16,13 @@ def box(x0, y0, x1, y1):
 
 def ring():
     """A corridor round a block, with things in it that no two sides have alike."""
-    things = [(3.0, 1.4, 3.6, 2.0), (8.2, 0.0, 9.0, 0.4), (13.6, 4.0, 14.0, 5.1), (9.0, 9.6, 9.7, 10.0), (0.0, 6.0, 0.5, 6.9)]
+    things = [
+        (3.0, 1.4, 3.6, 2.0),
+        (8.2, 0.0, 9.0, 0.4),
+        (13.6, 4.0, 14.0, 5.1),
+        (9.0, 9.6, 9.7, 10.0),
+        (0.0, 6.0, 0.5, 6.9),
+    ]
     return np.vstack([box(0, 0, 14, 10), box(2, 2, 12, 8), *(box(*thing) for thing in things)])
 
 
@@ -36,7 +44,7 @@ def ranges(walls, pose, angles, limit):
 def along(corners, step=0.1, turn=0.1):
     """Poses (N, 3) from corner to corner, turning on the spot."""
     poses = []
-    for (x0, y0), (x1, y1) in zip(corners, corners[1:], strict=False):
+    for (x0, y0), (x1, y1) in itertools.pairwise(corners):
         way, yaw = np.hypot(x1 - x0, y1 - y0), np.arctan2(y1 - y0, x1 - x0)
         if poses:
             swing = float(planar.wrapped(yaw - poses[-1][2]))

@@ -13,7 +13,7 @@ from stereovox.geometry import inverse, rigidity_error, transform_points
 from stereovox.sources.floor import PLANS, Floor
 from stereovox.sources.floor_drive import STEP_NS, Odometry, Stop, drive, metres, zigzag
 from stereovox.sources.floor_kinect import Kinect, kinect_camera
-from stereovox.sources.floor_plan import distance_to
+from stereovox.sources.floor_rays import distance_to
 from stereovox.sources.robot import open_robot
 
 SMALL = "image_width=80"

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from stereovox.sources.floor import Floor
-from stereovox.sources.floor_plan import FloorPlan, block, cast, distance_to, post
+from stereovox.sources.floor_plan import FloorPlan, block, post
+from stereovox.sources.floor_rays import cast, distance_to
 
 BENT = FloorPlan(
     [(0.0, 0.0, 4.0, 2.0), (3.0, 1.0, 4.0, 5.0)],

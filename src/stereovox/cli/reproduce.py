@@ -3,6 +3,7 @@
 
 All of Chien 2020 is simulated and takes some minutes. --data also maps a recording of your own under its profile.
 Valenti 2018 maps recordings with lidar: --data is a folder with KITTI tracking sequences, or a drive of KITTI raw data.
+IST 2019 drives a simulated robot through two floors and maps them from the bags; --data is a bag of your own instead.
 """
 
 from __future__ import annotations
@@ -17,9 +18,9 @@ EXAMPLE = "stereovox reproduce chien2020 --out chien2020"
 
 def add_arguments(parser: ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("paper", metavar="PAPER", help="chien2020 or valenti2018 (ist2019 is not in this version)")
+    parser.add_argument("paper", metavar="PAPER", help="chien2020, valenti2018 or ist2019")
     parser.add_argument("--out", required=True, metavar="DIR", help="folder for report.html and numbers.json")
-    parser.add_argument("--data", metavar="SOURCE", help="valenti2018: folder of recordings; chien2020: one of yours")
+    parser.add_argument("--data", metavar="SOURCE", help="valenti2018: folder of recordings; others: one of yours")
     parser.add_argument("--quick", action="store_true", help="few frames: to see that it works, not to quote")
 
 

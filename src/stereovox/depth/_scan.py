@@ -16,11 +16,12 @@ def gather(depth_m, reason, columns, rows, edge_columns, edge_rows, turn, band, 
 
     columns, rows: `camera.rays()`; edge_columns (width + 1,), edge_rows (height + 1, 2): those of the pixels' borders.
     turn: (3, 3) maps the optical frame into the scan's: forward, left, up. band, fan, beams: see scan.py.
-    scratch: (7, width + 1) float32.
+    scratch: (9, width + 1) float32.
     """
     height, width = depth_m.shape
     before, after, hits, starts, ends = scratch[0], scratch[1], scratch[2], scratch[3], scratch[4]
     firsts, lasts = scratch[5, :width].view(np.int32), scratch[6, :width].view(np.int32)
+    slopes, ways = scratch[7], scratch[8]
     above = band.camera > band.high  # the steepest rays meet the band first, and they are in the lowest rows
     within = (band.camera >= band.low) & (band.camera <= band.high)
     _places(edge_columns, edge_rows[height if above else 0], turn, fan, before)
@@ -28,7 +29,8 @@ def gather(depth_m, reason, columns, rows, edge_columns, edge_rows, turn, band, 
         v = height - 1 - i if above else i
         _places(edge_columns, edge_rows[v if above else v + 1], turn, fan, after)
         _cover(before, after, fan, firsts, lasts)
-        _rays(depth_m[v], reason[v], columns, rows[v], turn, band, hits, starts, ends)
+        _rays(depth_m[v], reason[v], columns, rows[v], turn, band, hits, starts, ends, slopes, ways)
+        _reach(firsts, lasts, slopes, ways, beams)
         if within:
             _add(firsts, lasts, hits, ends, beams)
         else:
@@ -61,10 +63,13 @@ def _cover(before, after, fan, firsts, lasts):
 
 
 @cell
-def _rays(depth, reason, columns, row, turn, band, hits, starts, ends):
+def _rays(depth, reason, columns, row, turn, band, hits, starts, ends, slopes, ways):
     """Fill what each ray of a row says, in metres along the floor: its hit, from where to where in the band it is free.
 
-    The hit is -inf where something too near may be in the band, inf where there is none. A ray that says nothing, is
+    And where it goes: how much it rises a metre along the floor, and up to where nothing is measured on it.
+
+    The hit is -inf where something too near may be in the band, inf where there is none. The floor right before the
+    camera is too near as well, and no obstacle: rays that would meet it there say nothing. A ray that says nothing, is
     too steep or looks back is free up to 0.
     """
     down, ahead = row[0], row[1]
@@ -81,11 +86,24 @@ def _rays(depth, reason, columns, row, turn, band, hits, starts, ends):
         seen = depth[u] if why == VALID else (band.far if why == TOO_FAR else ZERO)
         level = band.camera + seen * z
         inside = (why == VALID) & (level >= band.low) & (level <= band.high) & (seen * way <= band.range_max)
-        near = (why == TOO_NEAR) & (enter <= leave) & (enter < band.near)
+        floor = (why == TOO_NEAR) & (band.camera < -z * band.floor)
+        near = (why == TOO_NEAR) & (enter <= leave) & (enter < band.near) & (not floor)
         hit = seen * way if inside & counts else INF
         hits[u] = -INF if near & counts else hit
         starts[u] = enter * way
         ends[u] = min(min(seen, leave) * way, band.range_max) if counts else ZERO
+        slopes[u] = z / way if counts else INF
+        unmeasured = max(band.near, band.camera / max(-z, TINY) if floor else ZERO)
+        ways[u] = unmeasured * way if counts else ZERO
+
+
+@cell
+def _reach(firsts, lasts, slopes, ways, beams):
+    """Take in where the rays of a row go, whatever they met."""
+    for u in range(firsts.size):
+        for b in range(firsts[u], lasts[u] + 1):
+            beams.lowest[b] = min(beams.lowest[b], slopes[u])
+            beams.unmeasured[b] = max(beams.unmeasured[b], ways[u])
 
 
 @cell

@@ -22,10 +22,14 @@ from stereovox.depth.scan_view import (
     rays_of,
 )
 from stereovox.errors import ConfigError
-from stereovox.frame import DepthImage, Scan
+from stereovox.frame import DepthImage, Reason, Scan
 from stereovox.planar import lifted
 
 STEEPEST = np.tan(np.radians(STEEPEST_DEG))
+FLOOR_NOISE = 1.25
+"""The floor may be too near up to so many times the least depth that the camera measured elsewhere."""
+SPARSE = 4
+"""Every so manieth row and column is enough to find it."""
 WHOLE = 1e-3
 """What is free up to `range_max` but for this share of it is free up to it: rays are not exactly level."""
 
@@ -40,6 +44,7 @@ class Band(NamedTuple):
     far: np.float32
     range_max: np.float32
     steepest: np.float32  # rise over way from which on a ray says nothing
+    floor: np.float32  # depth up to which the floor may be what is too near; 0 where the floor is an obstacle
 
 
 class Fan(NamedTuple):
@@ -56,6 +61,8 @@ class Beams(NamedTuple):
     hit: NDArray[np.float32]  # inf: none; -inf: something is nearer than the camera can tell
     start: NDArray[np.float32]  # free from here
     end: NDArray[np.float32]  # up to here; 0: nowhere
+    lowest: NDArray[np.float32]  # rise of its lowest ray for a metre along the floor; inf: it has no ray
+    unmeasured: NDArray[np.float32]  # so near nothing is measured
 
 
 def scan_of(image: DepthImage, config: Config) -> Scan:
@@ -88,9 +95,11 @@ def scan_of(image: DepthImage, config: Config) -> Scan:
     step = config.scan.angle_step_deg
     where, flattest = directions(rays, turn, pixel_angle(image.camera) if step is None else np.radians(step))
     camera, depths = image.T_world_sensor[2, 3], (config.min_range, config.max_range)
-    band = Band(*np.array([*heights, camera, *depths, config.max_range, STEEPEST], np.float32))
+    floor = FLOOR_NOISE * max(config.min_range, nearest(image)) if heights[0] > 0 else 0.0
+    band = Band(*np.array([*heights, camera, *depths, config.max_range, STEEPEST, floor], np.float32))
     beams = _gathered(image.depth_m[rows], image.reason[rows], rays, turn, band, where)
-    ranges, clear, clear_from = _told(beams, config.max_range)
+    closest = blind(beams, band) if config.scan.method == "cloud" else np.zeros(1, np.float32)
+    ranges, clear, clear_from = _told(beams, config.max_range, closest)
     T = lifted([*image.T_world_sensor[:2, 3], yaw])
     T[2, 3] = image.T_world_sensor[2, 3]
     return Scan(
@@ -108,21 +117,47 @@ def _gathered(
     where: Directions,
 ) -> Beams:
     n = where.number
-    beams = Beams(np.full(n, np.inf, np.float32), *np.zeros((2, n), np.float32))
+    start, end, unmeasured = np.zeros((3, n), np.float32)
+    beams = Beams(np.full(n, np.inf, np.float32), start, end, np.full(n, np.inf, np.float32), unmeasured)
     fan = Fan(np.float32(1 / where.step), np.float32(-where.first / where.step), np.float32(n - 1))
     _scan.gather(
         depth_m, reason, rays.columns, rays.rows, rays.edge_columns, rays.edge_rows, turn.astype(np.float32), band, fan,
-        beams, np.empty((7, len(rays.edge_columns)), np.float32),
+        beams, np.empty((9, len(rays.edge_columns)), np.float32),
     )  # fmt: skip
     return beams
 
 
-def _told(beams: Beams, range_max: float) -> tuple[NDArray[np.float32], ...]:
-    """Return the ranges of the beams (REP 117), up to where they are free, and from where on."""
+def _told(
+    beams: Beams, range_max: float, closest: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
+    """Return the ranges of the beams (REP 117), up to where they are free, and from where on, at least `closest`."""
     clear = np.minimum(beams.end, beams.hit).clip(min=0)
     clear[clear <= beams.start] = 0
-    beams.start[clear == 0] = 0
     whole = (clear >= range_max * (1 - WHOLE)) & (beams.start == 0)
     ranges = np.where(whole, np.float32(np.inf), np.float32(np.nan))
     np.copyto(ranges, beams.hit, where=beams.hit < np.inf)
-    return ranges, clear, beams.start
+    clear_from = np.maximum(beams.start, closest)
+    clear[clear <= clear_from] = 0
+    clear_from[clear == 0] = 0
+    return ranges, clear, clear_from
+
+
+def blind(beams: Beams, band: Band) -> NDArray[np.float32]:
+    """Return how far each beam is blind to what may stand on the floor, (N,) metres along it; inf: all the way.
+
+    Its lowest ray comes down to the lowest of the heights no earlier, and some way from the camera nothing is measured.
+    """
+    drop = max(band.camera - band.low, np.float32(0))
+    with np.errstate(divide="ignore"):
+        sunk = np.where(beams.lowest < 0, drop / -beams.lowest, np.float32(np.inf if drop else 0))
+    return np.maximum(sunk, beams.unmeasured)
+
+
+def nearest(image: DepthImage) -> float:
+    """Return about the least depth in metres that the image holds, whatever a few pixels say; 0: it holds none.
+
+    The camera may well know a nearest depth of its own that is larger than `min_range`, but not tell.
+    """
+    some = (slice(None, None, SPARSE), slice(None, None, SPARSE))
+    known = image.depth_m[some][image.reason[some] == Reason.VALID]
+    return float(np.partition(known, len(known) // 100)[len(known) // 100]) if known.size else 0.0

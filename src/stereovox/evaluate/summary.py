@@ -11,9 +11,10 @@ import numpy as np
 
 from stereovox.mapper import UpdateReport
 from stereovox.maps import VoxelMap
+from stereovox.maps.grid_map import GridMap
 
 
-def summarise(voxel_map: VoxelMap, reports: Sequence[UpdateReport]) -> dict[str, Any]:
+def summarise(voxel_map: VoxelMap | GridMap, reports: Sequence[UpdateReport]) -> dict[str, Any]:
     """Return frames, refusals by reason, milliseconds a frame, cells and memory of a run.
 
     `frame_ms` is the whole of a frame, `match_ms` (stereo pairs), `depth_ms` and `integrate_ms` are its parts. Times

@@ -12,6 +12,7 @@ from stereovox._jit import cell, kernel
 UNSIGNED = np.uint64
 """Kind of index that costs no test whether it counts from the end."""
 GRAIN = 2.0**20
+ZERO = np.float32(0)
 SIDE_BITS = 6
 SIDE = 1 << SIDE_BITS
 POINT = 48
@@ -28,13 +29,14 @@ def _grain(place):
 
 
 @kernel
-def aim(ranges, clear, directions, turn, position, limits, behind, free, hits, taken_back, box):
+def aim(ranges, clear, clear_from, directions, turn, position, limits, behind, free, hits, taken_back, box):
     """Write where beams clear and where they hit, as lines (n, 4) from x, y to x, y in cells; return how many of each.
 
     directions: (N, 2) cosines and sines in the sensor's frame. turn: (2, 2) from there to cells. position: (2,) of the
     sensor in cells. limits: (3,) float32 nearest range that counts, farthest that does, farthest the sensor measures.
-    clear: (N,), or empty where ranges alone tell. taken_back: points in cells that are hit and that the line before
-    clears. box: (4,) lowest column and row, highest column and row of all.
+    clear: (N,), or empty where ranges alone tell; clear_from: (N,), or empty where it is from the sensor on.
+    taken_back: points in cells that are hit and that the line before clears. box: (4,) lowest column and row, highest
+    column and row of all.
     """
     nearest, reach, farthest = limits[0], limits[1], limits[2]
     x, y = _grain(position[0]), _grain(position[1])
@@ -51,8 +53,11 @@ def aim(ranges, clear, directions, turn, position, limits, behind, free, hits, t
         dx = turn[0, 0] * directions[i, 0] + turn[0, 1] * directions[i, 1]
         dy = turn[1, 0] * directions[i, 0] + turn[1, 1] * directions[i, 1]
         to_x, to_y = _grain(position[0] + dx * known), _grain(position[1] + dy * known)
+        since = max(clear_from[i], ZERO) if clear_from.size > 0 else ZERO
+        known = known if since < known else 0.0
         if known > 0:
-            free[lines, 0], free[lines, 1], free[lines, 2], free[lines, 3] = x, y, to_x, to_y
+            from_x, from_y = _grain(position[0] + dx * since), _grain(position[1] + dy * since)
+            free[lines, 0], free[lines, 1], free[lines, 2], free[lines, 3] = from_x, from_y, to_x, to_y
             lines += 1
             low_x, low_y = min(low_x, np.floor(to_x)), min(low_y, np.floor(to_y))
             high_x, high_y = max(high_x, np.floor(to_x)), max(high_y, np.floor(to_y))

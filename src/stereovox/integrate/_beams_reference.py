@@ -86,7 +86,9 @@ def _beams(
             free_to = min(scan.clear[i], measured if is_hit else reach) if scan.clear[i] > 0 else 0
         hit = place(measured) if is_hit else None
         behind = place(float(measured) + config.grid.thickness) if is_hit else None
-        yield place(0), place(float(free_to)) if free_to > 0 else None, hit, behind
+        since = 0.0 if scan.clear_from is None else float(scan.clear_from[i])
+        free_to = free_to if since < free_to else 0
+        yield place(max(since, 0.0)), place(float(free_to)) if free_to > 0 else None, hit, behind
 
 
 def _cell(place: Place) -> Cell:

@@ -64,7 +64,8 @@ class Beams:
 
         A range from `range_min` to min(`range_max`, `config.max_range`) is a hit: its beam is free up to it, and
         occupied from it to `grid.thickness` behind. +inf, and a hit beyond `config.max_range`, is free up to that
-        minimum. All else says nothing, and where the scan has `clear` it tells how far beams are free. A beam never
+        minimum. All else says nothing, and where the scan has `clear` it tells how far beams are free,
+        `clear_from` from where on. A beam never
         clears the cell it hits. Lengths are seen from above where the sensor leans.
         The memory that evidence lies in is used again by the next call.
         Raises FrameRefused: `too_many_beams`, `bad_clear`, `bad_scan`, `pose_too_far`.
@@ -88,7 +89,7 @@ class Beams:
     def _aim(self, scan: Scan, origin: NDArray[np.float64]) -> tuple[list[NDArray[np.float64]], NDArray[np.int64]]:
         """Return the lines to clear, to occupy, and those that a hit takes back, in cells, and the box they lie in."""
         size, config = self._config.voxel_size, self._config
-        ranges, clear = _beams_of(scan)
+        ranges, clear, clear_from = _beams_of(scan)
         T = planar.lifted(planar.inverse(origin)) @ scan.T_world_sensor
         position = T[:2, 3] / size
         if not ((np.abs(position) < INDEX_LIMIT - 2 * MOST_CELLS).all() and (np.abs(T[:2, :2]) < 1.01).all()):
@@ -100,8 +101,8 @@ class Beams:
             self._lines = tuple(np.empty((len(ranges), 4)) for _ in range(3))
         box = np.empty(4, np.int64)
         counts = _beams.aim(
-            ranges, clear, self._directions_of(scan), T[:2, :2] / size, position, limits, config.grid.thickness,
-            *self._lines, box,
+            ranges, clear, clear_from, self._directions_of(scan), T[:2, :2] / size, position, limits,
+            config.grid.thickness, *self._lines, box,
         )  # fmt: skip
         return [lines[:count] for lines, count in zip(self._lines, counts, strict=True)], box
 
@@ -124,16 +125,20 @@ class Beams:
         return coords, values
 
 
-def _beams_of(scan: Scan) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return ranges and how far beams are known to be free (empty: ranges alone tell)."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        ranges = np.ascontiguousarray(scan.ranges, np.float32)
-        clear = np.ascontiguousarray(() if scan.clear is None else scan.clear, np.float32)
+def _beams_of(scan: Scan) -> tuple[NDArray[np.float32], ...]:
+    """Return ranges, how far beams are known to be free (empty: ranges alone tell), and from where on (empty: 0)."""
+    ranges, clear, clear_from = (_floats(part) for part in (scan.ranges, scan.clear, scan.clear_from))
     if len(ranges) > MOST_BEAMS:
         raise FrameRefused("too_many_beams", f"{_name(scan)}: {len(ranges)} beams; at most {MOST_BEAMS} are taken")
-    if scan.clear is not None and clear.shape != ranges.shape:
-        raise FrameRefused("bad_clear", f"{_name(scan)}: clear is {clear.shape}, ranges are {ranges.shape}")
-    return ranges, clear
+    for what, part in (("clear", clear), ("clear_from", clear_from)):
+        if getattr(scan, what) is not None and part.shape != ranges.shape:
+            raise FrameRefused("bad_clear", f"{_name(scan)}: {what} is {part.shape}, ranges are {ranges.shape}")
+    return ranges, clear, clear_from
+
+
+def _floats(part: ArrayLike | None) -> NDArray[np.float32]:
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.ascontiguousarray(() if part is None else part, np.float32)
 
 
 def _name(scan: Scan) -> str:

@@ -8,7 +8,8 @@ from stereovox._jit import cell, kernel
 ZERO, ONE, HALF = np.float32(0), np.float32(1), np.float32(0.5)
 SAFE = np.float32(1.4143)
 """Two points are nearer to each other than the middles of their cells by a diagonal at most."""
-NUDGE = np.float32(1e-3)
+NUDGE, GROW = np.float32(1e-3), np.float32(1.000001)
+"""A step over a cell's border, also far out, where float32 no longer knows a thousandth."""
 LEVEL, FAR = np.float32(1e-6), np.float32(1e9)
 
 
@@ -99,7 +100,7 @@ def _cast(clear, x, y, u, v, farthest):
         free = clear[row, column]
         if free == ZERO:
             return min((way + leaves) * HALF, farthest)
-        way = max(leaves + NUDGE, way + free - SAFE)  # without a branch, which would be hard to predict
+        way = max(leaves * GROW + NUDGE, way + free - SAFE)  # without a branch, which would be hard to predict
     return farthest
 
 

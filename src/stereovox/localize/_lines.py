@@ -67,7 +67,7 @@ def fit(index, cells, sums, cell, radius, lines):
     """Lay a line through the points round each slot that were seen from its side.
 
     radius: cells on each side. lines: (S, 8) float32: mean of the slot itself x, y; mean of its neighbourhood x, y; the
-    line's normal towards the sensor x, y; 1 for a line, 0 for a mere point; 0.
+    line's normal, for a mere point the direction, towards the sensor x, y; 1 for a line, 0 for a mere point; 0.
     """
     rows, columns = index.shape
     for slot in range(len(lines)):
@@ -100,8 +100,11 @@ def fit(index, cells, sums, cell, radius, lines):
         lines[slot, 0] = middle_x + sums[slot, 1] / sums[slot, 0]
         lines[slot, 1] = middle_y + sums[slot, 2] / sums[slot, 0]
         lines[slot, 2], lines[slot, 3] = middle_x + x, middle_y + y
-        lines[slot, 4], lines[slot, 5] = nx, ny
         lines[slot, 6] = ONE if n > FEW and small < ROUND * large else ZERO
+        if lines[slot, 6] == ZERO:
+            length = np.sqrt(vx * vx + vy * vy) + TINY
+            nx, ny = vx / length, vy / length
+        lines[slot, 4], lines[slot, 5] = nx, ny
         lines[slot, 7] = ZERO
 
 

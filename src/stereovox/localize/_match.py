@@ -11,6 +11,8 @@ import numpy as np
 from stereovox._jit import kernel
 
 ZERO, ONE = np.float32(0), np.float32(1)
+FACING = np.float32(0.05)
+"""Cosine between a line's normal and the direction towards the sensor, below which the other side was seen."""
 
 
 @kernel
@@ -85,10 +87,10 @@ def refine(points, views, near, lines, cell, sigma, point_weight, prior, informa
             nx, ny = lines[slot, 4], lines[slot, 5]
             vx = cosine * views[i, 0] - sine * views[i, 1]
             vy = sine * views[i, 0] + cosine * views[i, 1]
-            dx, dy = x - lines[slot, 2], y - lines[slot, 3]
+            if nx * vx + ny * vy < FACING:
+                continue
             if lines[slot, 6] > ZERO:
-                if nx * vx + ny * vy < 0.05:
-                    continue
+                dx, dy = x - lines[slot, 2], y - lines[slot, 3]
                 r = nx * dx + ny * dy
                 w = 1.0 / (1.0 + r * r * narrow)
                 w *= w

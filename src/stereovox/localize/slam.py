@@ -33,6 +33,8 @@ Progress = Callable[[int, int, str], object]
 
 CLOSURE_TRUST, PATCH_TRUST = 0.02, 0.1
 """What a match's information is worth: its points are not independent, nor is what they lie on exact."""
+MOST_CELLS = 40_000
+"""Cells on a side of the finished map."""
 JUMP, JUMP_TURN = 0.05, 0.01
 """Metres and radians that a closure must be off, before the graph is solved anew on the way."""
 
@@ -144,6 +146,7 @@ class Slam:
     def _grid(self) -> OccupancyGrid:
         settings = self._config.slam
         config = load_config(self._config, voxel_size=settings.voxel_size, max_range=settings.max_range)
+        _check_extent(self._poses(), settings.voxel_size)
         grid, beams = GridMap(config), make_beams(config)
         track = self._track()
         for keyframe in self.keyframes:
@@ -165,6 +168,15 @@ def map_scans(scans: Iterable[Scan], config: Config, progress: Progress | None =
         if progress:
             progress(done, total, "matching scans")
     return slam.finish(progress)
+
+
+def _check_extent(poses: planar.Pose, cell: float) -> None:
+    span = float(np.ptp(poses[:, :2], axis=0).max())
+    if span > MOST_CELLS * cell:
+        raise StereovoxError(
+            f"the robot's way spans {span:.0f} m, more than {MOST_CELLS} cells of {cell:g} m; does its odometry jump? "
+            "Else set slam.voxel_size larger"
+        )
 
 
 def _off(keyframes: list[Keyframe], edge: Edge) -> bool:

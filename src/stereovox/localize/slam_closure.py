@@ -50,7 +50,7 @@ class ClosureSearch:
         if pose is None:
             return None
         match = self._fine.refine(cloud, pose, 0.3)
-        for sigma in (0.15, self._config.sigma):
+        for sigma in (0.15, 1.5 * self._config.sigma):
             match = self._fine.refine(cloud, match.pose, sigma)
         return match
 

@@ -22,6 +22,8 @@ BASE_WINDOW, BASE_WINDOW_TURN = 0.5, 0.1
 """Metres and radians that are searched even where no drift is to be feared."""
 CORRIDOR = 0.03
 """Share of the strongest direction's information below which the weakest is a corridor's: no closure there."""
+MOST_TRIED = 16
+"""Earlier submaps that a new one is laid onto, the nearest: a robot may pass the same place all day."""
 WITNESS_PATH = 15.0
 """Metres of way within which two findings can bear each other out."""
 WITNESS = (0.1, 0.02, 0.02)
@@ -55,12 +57,16 @@ class LoopFinder:
     def _close(self, later: Submap) -> None:
         ways = self._ways()
         cloud = submap_cloud(self._keyframes, later, NEAR_RANGE, cell=2 * self._config.voxel_size)
-        for number, earlier in enumerate(self._submaps[:-1]):
-            window = self._window(earlier, later, float(ways[number]))
-            if window is None:
-                continue
+        windows: dict[Submap, tuple[float, float]] = {}
+        for earlier, way in zip(self._submaps[:-1], ways.tolist(), strict=False):
+            window = self._window(earlier, later, way)
+            if window is not None:
+                windows[earlier] = window
+        there = self._keyframes[later.anchor].pose
+        near = sorted(windows, key=lambda e: float(np.hypot(*(self._keyframes[e.anchor].pose - there)[:2])))
+        for earlier in near[:MOST_TRIED]:
             self._search.onto(submap_cloud(self._keyframes, earlier, FAR_RANGE))
-            self._lay(earlier, later, cloud, window)
+            self._lay(earlier, later, cloud, windows[earlier])
 
     def _lay(self, earlier: Submap, later: Submap, cloud: Cloud, window: tuple[float, float]) -> None:
         first, second = earlier.anchor, later.anchor

@@ -19,6 +19,8 @@ STRIDE = 3
 """Keyframes from one patch's middle to the next."""
 WEAK = 0.1
 """Share of information below which a direction is a corridor's."""
+MOST_OTHERS = 120
+"""Keyframes that are laid onto a patch: a robot may pass the same place all day."""
 LEAST_SHARE = 0.4
 """Share of a keyframe's points that must lie on a patch's lines."""
 
@@ -48,7 +50,8 @@ def patch_edges(keyframes: list[Keyframe], config: SlamConfig) -> Iterator[Edge]
 def _others(places: planar.Pose, middle: int, first: int, last: int, config: SlamConfig) -> NDArray[np.int64]:
     far = np.hypot(*(places[:, :2] - places[middle, :2]).T)
     near = np.nonzero(far < config.refine_distance)[0]
-    return near[(near < first) | (near >= last)]
+    near = near[(near < first) | (near >= last)]
+    return near[:: len(near) // MOST_OTHERS + 1]
 
 
 def _edge(

@@ -98,7 +98,7 @@ def _scan(reading: Reading, max_range: float) -> Scan:
 def _readings(path: Path, damaged: list[str]) -> list[Reading]:
     offset, found = 0.0, []
     for number, line in _lines(path, damaged):
-        word = line[:24].partition(b" ")[0]
+        word = next(iter(line[:24].split()), b"")
         if word == b"PARAM":
             offset = _offset(line, offset)
         elif word in LASERS:
@@ -140,7 +140,7 @@ def _opened(path: Path) -> BinaryIO | bz2.BZ2File:
 
 def _no_echo(readings: list[Reading]) -> float:
     """The range from which on a SICK means "no echo": one of its two conventions that is a peak in the log."""
-    largest = max(float(reading.ranges.max(initial=0.0)) for reading in readings)
+    largest = max(float(np.max(reading.ranges, initial=0.0, where=np.isfinite(reading.ranges))) for reading in readings)
     return min((limit for limit in NO_ECHO if limit <= largest < 1.1 * limit), default=NO_ECHO[-1])
 
 

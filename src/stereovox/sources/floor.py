@@ -20,7 +20,8 @@ from stereovox.sources.d435 import classify
 from stereovox.sources.floor_drive import STEP_NS, Odometry, drive
 from stereovox.sources.floor_kinect import Kinect, kinect_camera
 from stereovox.sources.floor_layout import Layout
-from stereovox.sources.floor_plan import FloorPlan, Rectangle, cast
+from stereovox.sources.floor_plan import FloorPlan, Rectangle
+from stereovox.sources.floor_rays import cast
 from stereovox.sources.floor_view import LevelView
 from stereovox.sources.lazy import Lazy
 from stereovox.sources.poses import Poses

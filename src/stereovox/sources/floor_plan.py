@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The plan of one floor of a building: rooms, upright things that stand in them, and rays cast at their outlines.
+"""The plan of one floor of a building: rooms, and upright things that stand in them.
 
 Metres; x, y on the floor, z up from it.
 """
@@ -125,58 +125,6 @@ class FloorPlan:
         for a, b, c, d in free:
             inside |= ((y > b) & (y < d))[:, None] & ((x > a) & (x < c))
         return xs, ys, inside
-
-
-def cast(
-    segments: NDArray[np.float64], origin: ArrayLike, angles: ArrayLike, longest: float = np.inf
-) -> NDArray[np.float64]:
-    """Return how far rays from `origin` (2,) run until they meet a segment, (N,) metres, inf where they meet none.
-
-    segments: (M, 4) x, y from and to. angles: (N,) radians, 0 along x, to the left. longest: what is farther is inf.
-    """
-    directions = np.column_stack([np.cos(angles), np.sin(angles)])
-    t = cast_along(within_reach(segments, origin, longest), origin, directions)
-    return np.where(t <= longest, t, np.inf)
-
-
-def cast_along(
-    segments: NDArray[np.float64], origin: ArrayLike, directions: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Return how often `directions` (N, 2) fit between `origin` (2,) and the first segment, (N,), inf where none is."""
-    start = segments[:, :2] - np.asarray(origin, float)
-    along = segments[:, 2:] - segments[:, :2]
-    x, y = directions[:, :1], directions[:, 1:]
-    # start + s along = t (x, y): Cramer's rule
-    across = x * along[:, 1] - y * along[:, 0]
-    t = np.full(across.shape, np.inf)
-    met = across != 0
-    np.divide(start[:, 0] * along[:, 1] - start[:, 1] * along[:, 0], across, out=t, where=met)
-    s = y * start[:, 0] - x * start[:, 1]
-    # 0 <= s / across <= 1 without dividing
-    on = met & (s * across >= 0) & (np.abs(s) <= np.abs(across)) & (t >= 0)
-    return np.where(on, t, np.inf).min(axis=1, initial=np.inf)
-
-
-def within_reach(segments: NDArray[np.float64], origin: ArrayLike, reach: float) -> NDArray[np.float64]:
-    """Return the segments that touch the square of half width `reach` round `origin`, or nearly so."""
-    x, y = np.asarray(origin, float)
-    near = (np.minimum(segments[:, 0], segments[:, 2]) <= x + reach) & (
-        np.maximum(segments[:, 0], segments[:, 2]) >= x - reach
-    )
-    near &= np.minimum(segments[:, 1], segments[:, 3]) <= y + reach
-    near &= np.maximum(segments[:, 1], segments[:, 3]) >= y - reach
-    return segments[near]
-
-
-def distance_to(segments: NDArray[np.float64], points: ArrayLike) -> NDArray[np.float64]:
-    """Return how far points (N, 2) are from the nearest segment, (N,) metres."""
-    nearest = np.full(len(np.asarray(points)), np.inf)
-    for x0, y0, x1, y1 in segments:
-        along = np.array([x1 - x0, y1 - y0])
-        start = np.asarray(points, float) - (x0, y0)
-        share = np.clip(start @ along / max(along @ along, 1e-12), 0, 1)
-        nearest = np.minimum(nearest, np.linalg.norm(start - share[:, None] * along, axis=1))
-    return nearest
 
 
 def block(

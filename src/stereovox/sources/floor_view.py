@@ -11,7 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from stereovox import planar
 from stereovox.cameras import PinholeCamera
-from stereovox.sources.floor_plan import CEILING, FloorPlan, Thing, cast_along
+from stereovox.sources.floor_plan import CEILING, FloorPlan, Thing
+from stereovox.sources.floor_rays import cast_along
 
 NONE = np.float32(np.inf)
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -43,7 +44,9 @@ class Sizes:
     published: int = SIDE
 
 
-QUICK = Sizes(Extent("depth_hz=4&image_width=320&seconds=45&scan_hz=5", "seconds=70&scan_hz=5"), VARIANTS[:5], 1000)
+FAST = "speed=1.5&scan_hz=4"
+QUICK = Sizes(Extent(f"{FAST}&depth_hz=2&image_width=320", FAST), (*VARIANTS[:3], VARIANTS[4]), 1000)
+"""Whole drives, but fewer scans and images, and small ones."""
 
 
 def reproduce(out: Path, data: str | Path | None, quick: bool, progress: Progress) -> dict[str, Any]:
@@ -75,7 +78,8 @@ def floors(out: Path, sizes: Sizes, progress: Progress, places: tuple[Place, ...
 def own(robot: Robot, out: Path, sizes: Sizes, progress: Progress) -> list[Chapter]:
     """Return the chapters on somebody's own recording, which need no truth."""
     steps = Steps(progress, _steps(robot, robot) + _OTHERS)
-    recording = Recording(Path(robot.name).stem, robot, robot)
+    name = re.sub(r"[^\w.-]+", "_", Path(robot.name).stem)  # it becomes part of files' names
+    recording = Recording(name, robot, robot)
     found = survey(recording, sizes.variants, out, steps.of(f"mapping: {recording.name}"))
     return _chapters([(None, found)], sizes, steps.of)
 

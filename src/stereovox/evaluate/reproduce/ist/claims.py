@@ -54,8 +54,7 @@ def claims_of(found: Survey, place: Place | None) -> list[Claim]:
     ]
     if place is None:
         return [*claims, *(_beside(one) for one in (middle, ours))]
-    claims += [_target(one) for one in (middle, ours)]
-    claims += [_walls(middle), *_ways(found)]
+    claims += [_target(middle), _beside(ours), *_band(ours, theirs), _walls(middle), *_ways(found)]
     odometry = found.judged.get(DRAWN_ODOMETRY)
     if odometry is not None:
         less = theirs.scores.eq7_percent < odometry.scores.eq7_percent
@@ -93,7 +92,21 @@ def _target(one: Judged) -> Claim:
 
 
 def _beside(one: Judged) -> Claim:
-    return Claim(f"{one.made.variant.name}: error (Eq 7)", "-", _percent(one), None)
+    text = f"{one.made.variant.name} ({one.made.variant.what}): error (Eq 7)"
+    return Claim(text, "-", _percent(one), None)
+
+
+def _band(ours: Judged, theirs: Judged) -> list[Claim]:
+    """Return what a robot needs to know: all that stands in its way, which the lidar's reference does not."""
+    if not (ours.of_building and theirs.of_building):
+        return []
+    mine, printed = (one.of_building["band"].eq7_percent for one in (ours, theirs))
+    text = f"{ours.made.variant.name}: error (Eq 7) against all that stands 0.1 to 1.8 m over the building's floor"
+    less = f"{ours.made.variant.name}: less of it than {theirs.made.variant.name}, which sees one height only"
+    return [
+        Claim(text, f"at most {TARGET_PERCENT:g} % (our target)", f"{mine:.1f}\u00a0%", mine <= TARGET_PERCENT),
+        Claim(less, "less", f"{mine:.1f}\u00a0% against {printed:.1f}\u00a0%", mine < printed),
+    ]
 
 
 def _walls(one: Judged) -> Claim:

@@ -89,7 +89,7 @@ def _right(mapper: GridMapper, scan: Scan, config: Config) -> float:
 def _there(mapper: GridMapper, points: NDArray[np.float64], state: State) -> NDArray[np.bool_]:
     """Tell which points (N, 2) have a cell of this state at most one cell away."""
     size = mapper.map.voxel_size
-    around = [points + (x * size, y * size) for x in (-1, 0, 1) for y in (-1, 0, 1)]
+    around = [points + np.array([x, y]) * size for x in (-1, 0, 1) for y in (-1, 0, 1)]
     return np.any([mapper.map.state(one) == state for one in around], axis=0)
 
 

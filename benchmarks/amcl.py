@@ -26,7 +26,8 @@ from stereovox.frame import Scan
 from stereovox.localize.amcl import Localiser
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.sources.floor import Floor
-from stereovox.sources.floor_plan import FloorPlan, block, cast
+from stereovox.sources.floor_plan import FloorPlan, block
+from stereovox.sources.floor_rays import cast
 
 REACH, WAY, STEP, TURN = 5.6, 40.0, 0.1, 0.25
 ANGLES = np.radians(np.arange(-120, 120.1, 1.44))

@@ -49,7 +49,7 @@ def update_ms(
     fov_deg: float, distance: float, size: float, max_range: float, traversal: str, update: str, repeats: int
 ):
     """Return the time of each update, all Python included, of a robot that drives and turns."""
-    settings = {"grid.traversal": traversal, "grid.update": update, "map.prior": 0.5, "min_range": 0.05}
+    settings = {"grid.traversal": traversal, "grid.update": update, "min_range": 0.05}
     mapper = GridMapper(voxel_size=size, max_range=max_range, resume=full_map(size), **settings)
     rng, fov, times = np.random.default_rng(0), np.radians(fov_deg), []
     for i in range(repeats + 5):
@@ -69,7 +69,7 @@ def full_map(size: float) -> OccupancyGrid:
 
 def map_ms() -> dict[str, np.ndarray]:
     grid = full_map(0.02)
-    mapper = GridMapper(voxel_size=0.02, resume=grid, **{"map.prior": 0.5})
+    mapper = GridMapper(voxel_size=0.02, resume=grid)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "map.yaml"
         return {

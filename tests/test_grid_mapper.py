@@ -42,7 +42,7 @@ def leaning(degrees):
 
 @pytest.mark.parametrize("profile", ["default", "ist2019"])
 def test_a_room_is_mapped_from_several_places(profile):
-    mapper = GridMapper(profile, voxel_size=0.05, **{"map.prior": 0.5, "min_range": 0.1})
+    mapper = GridMapper(profile, voxel_size=0.05, **{"grid.prior": 0.5, "min_range": 0.1})
     for pose in [(0, 0, 0), (0.5, -0.5, 1), (-1, 0.7, 2), (1, 1, -2), (0.3, -1.2, 3), (0, 0, -1)] * 2:
         report = mapper.add(made_scan(pose))
         assert report.refused is None
@@ -119,7 +119,7 @@ def wall_frame(distance=2.0):
 
 @pytest.mark.parametrize("method", ["rows", "cloud"])
 def test_depth_images_are_mapped_too(method):
-    mapper = GridMapper(voxel_size=0.1, **{"scan.method": method, "map.prior": 0.5})
+    mapper = GridMapper(voxel_size=0.1, **{"scan.method": method, "grid.prior": 0.5})
     for _ in range(8):
         assert mapper.add(wall_frame()).refused is None
     assert mapper.map.state([[x, 0.05] for x in (0.55, 1.05, 1.55, 2.05, 2.35, 3.0)]).tolist() == [1, 1, 1, 3, 0, 0]
@@ -130,7 +130,7 @@ def test_depth_images_are_mapped_too(method):
 
 @pytest.mark.parametrize("as_picture", [True, False])
 def test_going_on_with_a_map_keeps_its_frame(as_picture):
-    settings = {"voxel_size": 0.05, "map.prior": 0.5}
+    settings = {"voxel_size": 0.05, "grid.prior": 0.5}
     first = GridMapper(**settings)
     for _ in range(6):
         first.add(made_scan())

@@ -51,8 +51,9 @@ class GridConfig(Section):
     traversal: str = "exact"
     update: Literal["once", "every"] = "once"
     thickness: float = Field(0.0, ge=0, le=5)
-    p_occupied: float = Field(0.85, gt=0.5, lt=1)
+    p_occupied: float = Field(0.7, gt=0.5, lt=1)
     p_free: float = Field(0.4, gt=0, lt=0.5)
+    prior: float = Field(0.5, gt=0, lt=1)
     max_tilt_deg: float = Field(5.0, ge=0, le=45)
 
 

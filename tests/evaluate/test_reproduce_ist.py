@@ -14,9 +14,10 @@ from made_pages import Balanced
 from stereovox.cli import main
 from stereovox.evaluate.reproduce import ist2019, reproduce
 from stereovox.evaluate.reproduce.ist.claims import fan_claims
-from stereovox.evaluate.reproduce.ist.drives import PLACES, Drive, Extent
+from stereovox.evaluate.reproduce.ist.drives import PLACES, Drive, Extent, record
 from stereovox.evaluate.reproduce.ist.fans import DISTANCE, FEW, MANY, simulate
 from stereovox.evaluate.reproduce.ist.publish import time_publishing
+from stereovox.evaluate.reproduce.ist.survey import survey
 from stereovox.evaluate.reproduce.ist.variants import MIDDLE, OURS, THEIRS, VARIANTS
 from stereovox.evaluate.reproduce.ist2019 import QUICK, Sizes
 from stereovox.products.map_server import read_map_server
@@ -104,6 +105,18 @@ def test_a_bag_that_will_not_do_ends_in_one_line(given, tmp_path, capsys):
     said = {"nowhere.bag": "no such file", "no_depth.bag": "no depth images", "no_scans.bag": "no lidar scans"}[given]
     assert said in error
     assert error.count("\n") <= 2  # a word about compiling may stand before
+
+
+def test_the_whole_chain_reaches_its_target(tmp_path):
+    drive = Drive.through(PLACES[1], Extent("speed=1.5&scan_hz=3&depth_hz=2&image_width=160"))
+    found = survey(record(drive, tmp_path), (VARIANTS[0], VARIANTS[2]), tmp_path, lambda: None)
+    theirs, ours = (found.judged[name].scores for name in (THEIRS, MIDDLE))
+    assert max(theirs.eq7_percent, ours.eq7_percent) < 10
+    assert found.reference.way_error.position_rms_m < 0.1
+    assert found.way_error.position_rms_m < 0.1
+    assert theirs.free_iou > 0.9
+    assert theirs.occupied.tolerance_recall > 0.9
+    assert ours.occupied.tolerance_precision > 0.7
 
 
 def test_synthetic_beams_mark_what_the_report_says():

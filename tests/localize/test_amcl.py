@@ -11,7 +11,8 @@ from stereovox.frame import Scan
 from stereovox.localize.amcl import Localiser, localise
 from stereovox.localize.scan_beams import beams_of
 from stereovox.maps.occupancy import OccupancyGrid
-from stereovox.sources.floor_plan import FloorPlan, block, cast
+from stereovox.sources.floor_plan import FloorPlan, block
+from stereovox.sources.floor_rays import cast
 
 PLAN = FloorPlan(
     [(0, 0, 4, 3), (4, 1, 9, 2.4), (9, 0, 13, 3), (6, 2.4, 7.2, 5)],

@@ -14,6 +14,7 @@ from stereovox.config import load_config
 from stereovox.errors import ConfigError, MissingExtra, StereovoxError
 from stereovox.evaluate.relations import read_relations, relation_errors
 from stereovox.localize.slam import Slam, map_scans
+from stereovox.maps import State
 from stereovox.sources.carmen import CarmenLog
 
 DATA = Path(__file__).resolve().parents[3] / "shared/data/carmen"
@@ -60,15 +61,15 @@ def test_loops_are_found_where_the_robot_came_by_again(loop):
 
 def test_walls_are_thin_and_where_they_are(loop):
     _poses, _, _, result = loop
-    rows, columns = np.nonzero(result.grid.cells > 65)
+    rows, columns = np.nonzero(result.grid.states == State.OCCUPIED)
     points = result.grid.centres(rows, columns)
     walls = ring()
     ends, ways = walls[:, :2], walls[:, 2:] - walls[:, :2]
     share = np.clip(((points[:, None] - ends) * ways).sum(-1) / (ways**2).sum(-1), 0, 1)
     gap = np.linalg.norm(points[:, None] - ends - share[..., None] * ways, axis=-1).min(axis=1)
-    assert len(points) > 600
     assert np.quantile(gap, 0.98) < 0.08
-    assert (result.grid.cells == 0).sum() + (result.grid.cells > 0).sum() > 15 * len(points)
+    length = np.linalg.norm(ways, axis=1).sum() / result.grid.resolution
+    assert 0.6 * length < len(points) < 1.3 * length  # about one cell thick
 
 
 def test_the_track_turns_odometry_into_the_map(loop):

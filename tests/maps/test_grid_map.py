@@ -14,7 +14,7 @@ from stereovox.maps.grid_map import GridMap
 from stereovox.maps.grid_store import load_grid
 from stereovox.maps.occupancy import OccupancyGrid
 
-EVEN = {"map.prior": 0.5, "map.log_odds_min": -4.0, "map.log_odds_max": 4.0, "voxel_size": 0.1}
+EVEN = {"grid.prior": 0.5, "map.log_odds_min": -4.0, "map.log_odds_max": 4.0, "voxel_size": 0.1}
 
 
 def evidence_of(cells):
@@ -49,7 +49,7 @@ cells = st.dictionaries(
 @settings(max_examples=60, deadline=None)
 @given(scans=st.lists(cells, max_size=5), prior=st.sampled_from([0.1, 0.5]))
 def test_any_sequence_of_evidence_equals_a_dict(scans, prior):
-    grid_map = GridMap(load_config(**{**EVEN, "map.prior": prior}))
+    grid_map = GridMap(load_config(**{**EVEN, "grid.prior": prior}))
     start = round(1000 * np.log(prior / (1 - prior)))
     wanted = {}
     for scan in scans:
@@ -122,7 +122,7 @@ def test_a_cell_has_one_state_in_the_map_and_in_the_picture(cell, prior, thresho
     config = load_config(
         **{
             "map.cell": cell,
-            "map.prior": prior,
+            "grid.prior": prior,
             "map.free_below": free,
             "map.occupied_above": occupied,
             "voxel_size": 0.1,
@@ -168,7 +168,7 @@ def test_other_cells_cannot_be_gone_on_with():
     with pytest.raises(ConfigError, match=r"cells of 0\.05 m, not 0\.1; set voxel_size to 0\.05"):
         GridMap.from_occupancy(grid, load_config(**EVEN))
     with pytest.raises(ConfigError, match="cannot go on"):
-        GridMap(load_config(**EVEN)).with_config(load_config(**{**EVEN, "map.prior": 0.2}))
+        GridMap(load_config(**EVEN)).with_config(load_config(**{**EVEN, "grid.prior": 0.2}))
     ros = OccupancyGrid(np.zeros((2, 2), np.int8), float(np.float32(0.1)))  # messages hold 32 bits
     assert GridMap.from_occupancy(ros, load_config(**EVEN)).counts()["free"] == 4
 

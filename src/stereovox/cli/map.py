@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Turn a recording into a map.
 
-SOURCE is a 7-Scenes or TUM RGB-D folder, a camera pair, a RealSense .db3 or a ROS bag, all recognised by what they hold,
-the simulation sim:room, or a connected camera, realsense:. Under a profile of two dimensions (ist2019) it is the
+SOURCE is a 7-Scenes or TUM RGB-D folder, a camera pair, a RealSense .db3 or a ROS bag, all recognised by what they
+hold, the simulation sim:room, or a connected camera, realsense:. Under a profile of two dimensions (ist2019) it is the
 recording of a ground robot, as for `stereovox grid`.
 """
 

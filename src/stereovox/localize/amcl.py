@@ -177,7 +177,8 @@ def localise(
     """Return a robot's way through a map; scans that cannot be trusted are left out.
 
     start, seed: as in `Localiser`; progress: called with the number of scans done.
-    The way before the robot first knew where it was is that of its odometry, from where it then was backwards.
+    Where the particles disagree, the way is that of the odometry, with a drift in between those of the sure poses
+    before and after; before the first sure pose it has that one's.
     Raises what `Localiser` raises, and SourceError where not one scan can be trusted.
     """
     localiser = Localiser(grid, config, start, seed)
@@ -197,12 +198,15 @@ def localise(
 
 
 def _track(stamps_ns: NDArray[np.int64], estimates: list[Estimate]) -> Track:
+    """Return the way by what was sure alone: between, the odometry's drift is taken to be in between."""
     base = np.array([estimate.pose_map_base for estimate in estimates])
     odom = np.array([estimate.pose_map_odom for estimate in estimates])
-    known = next((i for i, estimate in enumerate(estimates) if estimate.settled), 0)
-    early = planar.compose(planar.inverse(odom[:known]), base[:known])
-    base[:known], odom[:known] = planar.compose(odom[known], early), odom[known]
-    return Track(stamps_ns, base, odom)
+    sure = np.array([estimate.settled for estimate in estimates])
+    if not sure.any() or sure.all():
+        return Track(stamps_ns, base, odom)
+    known = Track(stamps_ns[sure], base[sure], odom[sure])
+    drift = np.array([known.correction(int(stamp_ns)) for stamp_ns in stamps_ns])
+    return Track(stamps_ns, planar.compose(drift, planar.compose(planar.inverse(odom), base)), drift)
 
 
 def _times(weights: NDArray[np.float64], log_factors: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -15,7 +15,7 @@ from stereovox.frame import Frame, Scan
 from stereovox.products.files import replacing
 from stereovox.sources.poses import seconds_from_ns
 
-Posed = TypeVar("Posed", Frame, Scan)
+Posed = TypeVar("Posed", bound=Frame | Scan)
 
 
 @dataclass(frozen=True, eq=False)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from math import isclose
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
@@ -27,7 +28,7 @@ class GridMap:
 
     Cell (i, j) covers `[i, i + 1) x [j, j + 1)` times `config.voxel_size` in the grid's own frame, which stands at
     `origin` (x, y, yaw) in the map's. Points and poses are in the map's frame. Cells, their states and the settings
-    `config.map` mean what they do in a `VoxelMap`.
+    `config.map` mean what they do in a `VoxelMap`, but for the prior: that is `config.grid.prior`.
     `frames` counts the scans and images that are in it, `frames_refused` those that were offered and refused;
     `recording` is the name of what they came from, if known.
     """
@@ -39,7 +40,7 @@ class GridMap:
         self.frames = 0
         self.frames_refused = 0
         self.recording = ""
-        self._rules = CellRules(config.map)
+        self._rules = CellRules(config.map.model_copy(update={"prior": config.grid.prior}))
         self._format = self._rules.format
         self._percent = Percent(self._rules)
         self._pool = BlockPool(self._format.dtype, capacity=64, fill=self._format.unknown, cells=CELLS)
@@ -68,8 +69,8 @@ class GridMap:
 
     def with_config(self, config: Config) -> GridMap:
         """Take over the settings of a run that goes on; raises ConfigError if they change what the cells mean."""
-        for name in ("voxel_size", "map"):
-            old, new = getattr(self.config, name), getattr(config, name)
+        for name in ("voxel_size", "map", "grid.prior"):
+            old, new = (attrgetter(name)(settings) for settings in (self.config, config))
             if old != new:
                 raise ConfigError(f"cannot go on: the map was made with {name} {old}, now {new} is wanted")
         self.config = config

@@ -27,7 +27,7 @@ class Percent:
 
     @cached_property
     def free_below(self) -> float:
-        """Probability below which cells are free: what evidence made likelier than `map.prior` is not."""
+        """Probability below which cells are free: what evidence made likelier than the prior is not."""
         just_above = (self._rules.prior + 0.5 - self._format.unknown) / self._format.per_log_odds
         return min(self._rules.config.free_below, float(1 / (1 + np.exp(-just_above))))
 

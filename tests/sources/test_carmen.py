@@ -61,10 +61,10 @@ def test_beams_are_those_of_a_sick(tmp_path, beams, step, last):
 @pytest.mark.parametrize(
     ("far", "option", "infinite"),
     [
-        ((30.0, 50.0), "", [False, True]),
-        ((30.0, 49.8), "", [False, False]),
-        ((50.5, 81.91), "", [False, True]),
-        ((30.0, 50.0), "?max_range=20", [True, True]),
+        ((30.0, 50.0), "?no_echo=free", [False, True]),
+        ((30.0, 49.8), "?no_echo=free", [False, False]),
+        ((50.5, 81.91), "?no_echo=free", [False, True]),
+        ((30.0, 50.0), "?max_range=20&no_echo=free", [True, True]),
     ],
 )
 def test_ranges_that_mean_nothing_seen_are_infinite(tmp_path, far, option, infinite):
@@ -77,6 +77,14 @@ def test_ranges_that_mean_nothing_seen_are_infinite(tmp_path, far, option, infin
     assert f"{scan.range_max:g} m" in robot.notes[0]
 
 
+def test_without_an_echo_nothing_is_known_unless_one_says_so(tmp_path):
+    path = log(tmp_path, flaser([1.0, 81.91]))
+    assert np.isnan(CarmenLog(path).scans[0].ranges[1])
+    assert "no echo: unknown" in CarmenLog(path).notes[0]
+    with pytest.raises(SourceError, match="no_echo=maybe must be unknown or free"):
+        CarmenLog(path + "?no_echo=maybe")
+
+
 def test_the_new_format_tells_angles_and_mount(tmp_path):
     laser = planar.compose([1.0, -2.0, 0.3], [0.25, 0.1, 0.05])
     robot = CarmenLog(log(tmp_path, HEAD + robotlaser([1, 2, 25, 3, 4], laser, [1.0, -2.0, 0.3])))
@@ -84,7 +92,7 @@ def test_the_new_format_tells_angles_and_mount(tmp_path):
     assert np.allclose(scan.angles, [-1.2, -0.6, 0.0, 0.6, 1.2])
     assert np.allclose(planar.flattened(scan.T_base_sensor), [0.25, 0.1, 0.05])
     assert np.allclose(scan.pose_world_base, [1.0, -2.0, 0.3])
-    assert np.isposinf(scan.ranges[2])
+    assert np.isnan(scan.ranges[2])  # no echo
     assert scan.stamp_ns == 11_500_000_000
 
 

@@ -22,6 +22,7 @@ from stereovox.sources.poses import Poses
 ENDINGS = (".clf", ".log", ".clf.bz2", ".log.bz2")
 LONGEST = 1 << 20
 """Bytes of a line; what is longer is no line of a log."""
+NO_ECHO_MEANS = {"unknown": np.nan, "free": np.inf}
 OFFSETS = {"robot_frontlaser_offset", "robot_front_laser_offset", "frontlaser_offset"}
 
 
@@ -29,15 +30,19 @@ OFFSETS = {"robot_frontlaser_offset", "robot_front_laser_offset", "frontlaser_of
 class Options:
     """What may stand behind the file's name, as in `aces.clf.bz2?max_range=40`.
 
-    max_range: metres from which on a range says "nothing up to here"; 0: what the file says, else what its numbers say:
-        the least of 50 m and 81.9 m (a SICK's "no echo") that the log holds as such.
+    max_range: metres from which on a range says "no echo"; 0: what the file says, else what its numbers say: the least
+        of 50 m and 81.9 m (a SICK's "no echo") that the log holds as such.
+    no_echo: what that means: `unknown`, since black and dazzling things give no echo either, or `free` up to there.
     """
 
     max_range: float = 0.0
+    no_echo: str = "unknown"
 
     def __post_init__(self) -> None:
         if self.max_range < 0:
             raise SourceError(f"max_range={self.max_range:g} must be a positive number")
+        if self.no_echo not in NO_ECHO_MEANS:
+            raise SourceError(f"no_echo={self.no_echo} must be {' or '.join(NO_ECHO_MEANS)}")
 
 
 class CarmenLog:
@@ -60,8 +65,8 @@ class CarmenLog:
         if not self._readings:
             raise SourceError(f"{path}: holds no scan (FLASER or ROBOTLASER1 line)")
         self._max_range = options.max_range or self._readings[0].max_range or _no_echo(self._readings)
-        self.notes = tuple(_notes(path, self.damaged, self._max_range))
-        self.scans: Sequence[Scan] = _Scans(self._readings, self._max_range)
+        self.notes = tuple(_notes(path, self.damaged, self._max_range, options.no_echo))
+        self.scans: Sequence[Scan] = _Scans(self._readings, self._max_range, NO_ECHO_MEANS[options.no_echo])
         self.frames: Sequence[Frame] = ()
         self.truth: Poses | None = None
 
@@ -72,8 +77,8 @@ class CarmenLog:
 
 
 class _Scans(Sequence[Scan]):
-    def __init__(self, readings: list[Reading], max_range: float):
-        self._readings, self._max_range = readings, max_range
+    def __init__(self, readings: list[Reading], max_range: float, no_echo: float):
+        self._readings, self._max_range, self._no_echo = readings, max_range, no_echo
 
     def __len__(self) -> int:
         return len(self._readings)
@@ -81,13 +86,13 @@ class _Scans(Sequence[Scan]):
     def __getitem__(self, i):  # pyright: ignore[reportIncompatibleMethodOverride, reportMissingParameterType]
         if isinstance(i, slice):
             return [self[k] for k in range(*i.indices(len(self)))]
-        return _scan(self._readings[i], self._max_range)
+        return _scan(self._readings[i], self._max_range, self._no_echo)
 
 
-def _scan(reading: Reading, max_range: float) -> Scan:
+def _scan(reading: Reading, max_range: float, no_echo: float) -> Scan:
     ranges = reading.ranges.copy()
     ranges[~(ranges > 0)] = np.nan
-    ranges[ranges >= max_range] = np.inf
+    ranges[ranges >= max_range] = no_echo
     T_base_sensor = lifted(reading.pose_base_sensor)
     return Scan(
         ranges, reading.angle_min, reading.angle_step, 0.0, max_range, lifted(reading.pose_odom_base) @ T_base_sensor,
@@ -144,7 +149,7 @@ def _no_echo(readings: list[Reading]) -> float:
     return min((limit for limit in NO_ECHO if limit <= largest < 1.1 * limit), default=NO_ECHO[-1])
 
 
-def _notes(path: Path, damaged: list[str], max_range: float) -> Iterator[str]:
-    yield f"{path.name}: ranges of {max_range:g} m and more count as nothing seen (?max_range= says otherwise)"
+def _notes(path: Path, damaged: list[str], max_range: float, no_echo: str) -> Iterator[str]:
+    yield f"{path.name}: ranges of {max_range:g} m and more are no echo: {no_echo} (or ?max_range=, ?no_echo=free)"
     if damaged:
         yield f"{path.name}: {len(damaged)} damaged lines left out, the first: {damaged[0]}"

@@ -7,6 +7,7 @@ import pytest
 from stereovox.errors import FrameRefused
 from stereovox.frame import Scan
 from stereovox.geometry import rotation_matrix
+from stereovox.integrate.scan_check import sound
 from stereovox.localize.scan_beams import beams_of
 
 MANY = np.array([np.nan, -np.inf, 0.01, 0.0, -1.0, 1.0, 2.0, 4.0, 5.0, np.inf], np.float32)
@@ -64,7 +65,7 @@ NOWHERE = np.full((4, 4), np.nan)
         ("bad_scan", {"range_max": np.inf}),
         ("bad_scan", {"range_max": 0.0}),
         ("pose_not_finite", {"T_world_sensor": NOWHERE}),
-        ("pose_not_finite", {"T_base_sensor": NOWHERE}),
+        ("mount_not_rigid", {"T_base_sensor": NOWHERE}),
         ("pose_not_rigid", {"T_world_sensor": NOT_RIGID}),
         ("pose_not_rigid", {"T_world_sensor": np.eye(3)}),
         ("no_valid_range", {"ranges": np.full(5, np.nan, np.float32)}),
@@ -72,7 +73,7 @@ NOWHERE = np.full((4, 4), np.nan)
 )
 def test_what_cannot_be_trusted_is_refused(reason, changes):
     with pytest.raises(FrameRefused) as caught:
-        beams_of(replace(scan(name="scan 7"), **changes))
+        beams_of(sound(replace(scan(name="scan 7"), **changes), 5e-3))
     assert caught.value.reason == reason
     assert "\n" not in str(caught.value)
     assert "scan 7" in str(caught.value)

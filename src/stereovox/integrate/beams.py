@@ -17,6 +17,7 @@ from stereovox.config import Config
 from stereovox.errors import ConfigError, FrameRefused
 from stereovox.frame import Scan
 from stereovox.integrate import _beams
+from stereovox.integrate.scan_check import name_of
 from stereovox.maps.evidence import to_units
 from stereovox.maps.grid_evidence import CELLS, SIDE, GridEvidence
 from stereovox.maps.voxel_map import INDEX_LIMIT
@@ -93,7 +94,9 @@ class Beams:
         T = planar.lifted(planar.inverse(origin)) @ scan.T_world_sensor
         position = T[:2, 3] / size
         if not ((np.abs(position) < INDEX_LIMIT - 2 * MOST_CELLS).all() and (np.abs(T[:2, :2]) < 1.01).all()):
-            raise FrameRefused("pose_too_far", f"{_name(scan)}: is more than {INDEX_LIMIT} cells from the map's origin")
+            raise FrameRefused(
+                "pose_too_far", f"{name_of(scan)}: is more than {INDEX_LIMIT} cells from the map's origin"
+            )
         reach = np.fmin(scan.range_max, config.max_range)
         with np.errstate(over="ignore"):
             limits = np.array([scan.range_min, reach, scan.range_max], np.float32)
@@ -111,7 +114,7 @@ class Beams:
         seen = scan.angle_min, scan.angle_step, len(scan.ranges)
         if seen != self._seen:
             if not np.isfinite(scan.angle_min + scan.angle_step * len(scan.ranges)):
-                raise FrameRefused("bad_scan", f"{_name(scan)}: its angles are not finite")
+                raise FrameRefused("bad_scan", f"{name_of(scan)}: its angles are not finite")
             self._directions, self._seen = np.column_stack([np.cos(scan.angles), np.sin(scan.angles)]), seen
         return self._directions
 
@@ -129,17 +132,13 @@ def _beams_of(scan: Scan) -> tuple[NDArray[np.float32], ...]:
     """Return ranges, how far beams are known to be free (empty: ranges alone tell), and from where on (empty: 0)."""
     ranges, clear, clear_from = (_floats(part) for part in (scan.ranges, scan.clear, scan.clear_from))
     if len(ranges) > MOST_BEAMS:
-        raise FrameRefused("too_many_beams", f"{_name(scan)}: {len(ranges)} beams; at most {MOST_BEAMS} are taken")
+        raise FrameRefused("too_many_beams", f"{name_of(scan)}: {len(ranges)} beams; at most {MOST_BEAMS} are taken")
     for what, part in (("clear", clear), ("clear_from", clear_from)):
         if getattr(scan, what) is not None and part.shape != ranges.shape:
-            raise FrameRefused("bad_clear", f"{_name(scan)}: {what} is {part.shape}, ranges are {ranges.shape}")
+            raise FrameRefused("bad_clear", f"{name_of(scan)}: {what} is {part.shape}, ranges are {ranges.shape}")
     return ranges, clear, clear_from
 
 
 def _floats(part: ArrayLike | None) -> NDArray[np.float32]:
     with np.errstate(over="ignore", invalid="ignore"):
         return np.ascontiguousarray(() if part is None else part, np.float32)
-
-
-def _name(scan: Scan) -> str:
-    return scan.name or f"scan at {scan.stamp_ns} ns"

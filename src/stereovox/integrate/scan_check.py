@@ -16,10 +16,25 @@ from stereovox.frame import Scan
 def trusted(scan: Scan, config: Config) -> Scan:
     """Return the scan with an exactly rigid pose.
 
-    Raises FrameRefused with the reason: the source's `fault`, `bad_shape`, `bad_scan`, `pose_not_finite`,
-    `pose_not_rigid`, `tilted`, `no_valid_range`.
+    Raises FrameRefused as `sound` does, or `tilted` where the sensor leans by more than `grid.max_tilt_deg`.
     """
-    name = scan.name or f"scan at {scan.stamp_ns} ns"
+    scan = sound(scan, config.pose_rigidity_tolerance)
+    upright = abs(scan.T_world_sensor[2, 2])  # a sensor may hang upside down
+    tilt_deg = np.degrees(np.arccos(min(upright, 1.0)))
+    if tilt_deg > config.grid.max_tilt_deg:
+        raise FrameRefused(
+            "tilted", f"{name_of(scan)}: leans {tilt_deg:.1f} degrees (grid.max_tilt_deg); its beams meet the floor"
+        )
+    return scan
+
+
+def sound(scan: Scan, rigidity: float) -> Scan:
+    """Return the scan with an exactly rigid pose; one that was off by more than `rigidity` is refused.
+
+    Raises FrameRefused with the reason: the source's `fault`, `bad_shape`, `bad_scan`, `pose_not_finite`,
+    `pose_not_rigid`, `no_valid_range`.
+    """
+    name = name_of(scan)
     if scan.fault:
         raise FrameRefused(scan.fault, scan.fault_detail or f"{name}: {scan.fault}")
     ranges = np.asarray(scan.ranges)
@@ -33,12 +48,12 @@ def trusted(scan: Scan, config: Config) -> Scan:
     ):
         said = f"angles from {angles[0]} by {angles[1]}, ranges from {limits[0]} to {limits[1]}"
         raise FrameRefused("bad_scan", f"{name}: {said}; steps must not be 0, and ranges must rise")
-    T = rigid_pose(scan, config.pose_rigidity_tolerance)
-    tilt_deg = np.degrees(np.arccos(min(abs(T[2, 2]), 1.0)))  # a sensor may hang upside down
-    if tilt_deg > config.grid.max_tilt_deg:
-        raise FrameRefused(
-            "tilted", f"{name}: leans {tilt_deg:.1f} degrees (grid.max_tilt_deg); its beams meet the floor"
-        )
+    T = rigid_pose(scan, rigidity)
     if np.isnan(ranges).all() and scan.clear is None:
         raise FrameRefused("no_valid_range", f"{name}: not one beam has a range; is the lidar covered?")
     return replace(scan, T_world_sensor=T)
+
+
+def name_of(scan: Scan) -> str:
+    """Return what to call a scan in a message."""
+    return scan.name or f"scan at {scan.stamp_ns} ns"

@@ -15,6 +15,7 @@ from stereovox import planar
 from stereovox.config import Config
 from stereovox.errors import FrameRefused, SourceError
 from stereovox.frame import Scan
+from stereovox.integrate.scan_check import sound
 from stereovox.localize.amcl_cluster import Clusters, mean_pose, spread
 from stereovox.localize.amcl_kld import draw
 from stereovox.localize.amcl_motion import moved, turn_go_turn
@@ -63,7 +64,7 @@ class Localiser:
     """
 
     def __init__(self, grid: OccupancyGrid, config: Config, start: ArrayLike | None = None, seed: int = 0):
-        self.config = config.amcl
+        self.config, self._rigidity = config.amcl, config.pose_rigidity_tolerance
         self.refused: Counter[str] = Counter()
         self._rng = np.random.default_rng(seed)
         self._floor = FreeFloor(grid)
@@ -78,10 +79,11 @@ class Localiser:
     def add(self, scan: Scan) -> Estimate:
         """Return where the robot is after one more scan.
 
-        Raises FrameRefused, and changes nothing but `refused`, where the scan cannot be trusted (`scan_beams`).
+        Raises FrameRefused, and changes nothing but `refused`, where the scan cannot be trusted (`scan_check`, `scan_beams`).
         """
         start = perf_counter()
         try:
+            scan = sound(scan, self._rigidity)
             beams = beams_of(scan, self.config.max_range)
         except FrameRefused as refusal:
             self.refused[refusal.reason] += 1

@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 from stereovox import geometry
 from stereovox.errors import FrameRefused
 from stereovox.frame import Scan
+from stereovox.integrate.scan_check import name_of
 
-FARTHEST = 1e6
-"""Positions beyond this many metres are taken for errors."""
 RIGID = 5e-3
-"""How far a pose may be off from a rigid motion (docs/conventions.md)."""
+"""How far a mount may be off from a rigid motion (docs/conventions.md)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,13 +56,12 @@ def beams_of(scan: Scan, max_range: float | None = None) -> Beams:
     """Return what a scan says: NaN, -inf and what lies below `range_min` say nothing, +inf that nothing was met.
 
     max_range: metres beyond which nothing counts as met; None: the scan's own.
-    Raises FrameRefused with the reason: the source's `fault`, `bad_shape`, `bad_scan`, `pose_not_finite`,
-    `pose_not_rigid`, `no_valid_range`.
+    The scan must be `sound`. Raises FrameRefused with the reason: `bad_scan`, `mount_not_rigid`, `no_valid_range`.
     """
     ranges, farthest = _checked(scan, max_range)
     known = (ranges >= scan.range_min) & (ranges > 0)
     if not known.any():
-        raise FrameRefused("no_valid_range", f"{_name(scan)}: not one beam has a range; is the lidar covered?")
+        raise FrameRefused("no_valid_range", f"{name_of(scan)}: not one beam has a range; is the lidar covered?")
     angles = scan.angles[known]
     across = np.column_stack([np.cos(angles), np.sin(angles)]) @ scan.T_base_sensor[:2, :2].T
     at_max = ranges[known] >= farthest
@@ -71,28 +69,11 @@ def beams_of(scan: Scan, max_range: float | None = None) -> Beams:
 
 
 def _checked(scan: Scan, max_range: float | None) -> tuple[NDArray[np.float64], float]:
-    name = _name(scan)
-    if scan.fault:
-        raise FrameRefused(scan.fault, scan.fault_detail or f"{name}: {scan.fault}")
-    ranges = np.asarray(scan.ranges)
-    if ranges.ndim != 1 or not ranges.size or not np.issubdtype(ranges.dtype, np.floating):
-        raise FrameRefused("bad_shape", f"{name}: ranges are {ranges.shape} {ranges.dtype}; give (N,) float32 metres")
     farthest = scan.range_max if max_range is None else min(max_range, scan.range_max)
-    if not (np.isfinite([scan.angle_min, scan.angle_step, scan.range_min]).all() and 0 < farthest < np.inf):
-        said = f"angles from {scan.angle_min} by {scan.angle_step}, ranges from {scan.range_min} to {scan.range_max}"
-        raise FrameRefused("bad_scan", f"{name}: {said}; they must be finite (amcl.max_range bounds the ranges)")
-    for T in (scan.T_world_sensor, scan.T_base_sensor):
-        _check_pose(T, name)
-    return ranges.astype(float), float(farthest)
-
-
-def _check_pose(T: geometry.Transform, name: str) -> None:
-    T = np.asarray(T)
-    if T.shape == (4, 4) and not (np.isfinite(T).all() and (np.abs(T) < FARTHEST).all()):
-        raise FrameRefused("pose_not_finite", f"{name}: the pose holds NaN, infinity or absurdly large numbers")
-    if not (error := geometry.rigidity_error(T)) <= RIGID:
-        raise FrameRefused("pose_not_rigid", f"{name}: the pose is no rigid 4x4 motion (off by {error:.2g})")
-
-
-def _name(scan: Scan) -> str:
-    return scan.name or f"scan at {scan.stamp_ns} ns"
+    if not 0 < farthest < np.inf:
+        said = f"{name_of(scan)}: the lidar measures up to {scan.range_max:g} m; amcl.max_range must bound that"
+        raise FrameRefused("bad_scan", said)
+    if not (error := geometry.rigidity_error(scan.T_base_sensor)) <= RIGID:
+        said = f"{name_of(scan)}: T_base_sensor is no rigid 4x4 motion (off by {error:.2g})"
+        raise FrameRefused("mount_not_rigid", said)
+    return np.asarray(scan.ranges, float), float(farthest)

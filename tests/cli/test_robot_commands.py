@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`simulate`, `slam`, `localize`, `grid`, and `map` under a profile of two dimensions: a robot's bag becomes a map."""
+
+import json
+
+import numpy as np
+import pytest
+
+from stereovox.cli import main
+from stereovox.products.map_server import read_map_server
+from stereovox.sources.robot import open_robot
+from stereovox.sources.trajectory import Trajectory
+
+DRIVE = "sim:floor?plan=testbed&seconds=24&scan_hz=4&depth_hz=2&image_width=160"
+
+
+def run(capsys, *words):
+    assert main([*map(str, words), "--json"]) == 0
+    said = capsys.readouterr()
+    return json.loads(said.out.splitlines()[-1]), said.err
+
+
+def refused(capsys, *words):
+    assert main([str(word) for word in words]) == 2
+    said = capsys.readouterr().err.strip().splitlines()
+    return said[-1]
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory):
+    path = tmp_path_factory.mktemp("robot") / "floor.bag"
+    assert main(["simulate", DRIVE, "--out", str(path)]) == 0
+    return path
+
+
+@pytest.fixture(scope="module")
+def reference(bag):
+    out = bag.with_name("reference.yaml")
+    assert main(["slam", str(bag), "--out", str(out)]) == 0
+    return out
+
+
+def test_simulate_writes_what_the_robot_saw(bag):
+    robot, simulated = open_robot(bag), open_robot(DRIVE)
+    assert (len(robot.scans), len(robot.frames)) == (len(simulated.scans), len(simulated.frames))
+    np.testing.assert_allclose(robot.scans[20].ranges, simulated.scans[20].ranges)
+    np.testing.assert_allclose(robot.scans[20].pose_world_base, simulated.scans[20].pose_world_base, atol=1e-6)
+
+
+def test_slam_saves_map_and_way(bag, reference, tmp_path, capsys):
+    floor = read_map_server(reference)
+    assert (floor.cells == 100).sum() > 100
+    assert (floor.cells == 0).sum() > 3000
+    way = Trajectory(reference.with_suffix(".tum"))
+    assert len(way) == len(open_robot(bag).scans)
+    result, _ = run(capsys, "slam", DRIVE, "--out", tmp_path / "again.pgm")  # the simulation knows the truth
+    assert result["position_rms_m"] < 0.1
+    assert result["scans"] == len(way)
+    np.testing.assert_array_equal(read_map_server(tmp_path / "again.yaml").cells, floor.cells)
+
+
+def test_slam_scores_relations(tmp_path, capsys):
+    scans = open_robot(DRIVE).scans
+    first, second = scans[8], scans[40]
+    from stereovox import planar
+
+    x, y, yaw = planar.relative(*(one.pose_world_base for one in (first, second)))
+    line = f"{first.stamp_ns / 1e9:.6f} {second.stamp_ns / 1e9:.6f} {x} {y} 0 0 0 {yaw}\n"
+    (tmp_path / "floor.relations").write_text(line)
+    result, said = run(capsys, "slam", DRIVE, "--out", tmp_path / "a.yaml", "--relations", tmp_path / "floor.relations")
+    assert result["relations"]
+    assert "relations" in said
+
+
+def test_localize_says_where_the_robot_was(bag, reference, tmp_path, capsys):
+    result, _ = run(capsys, "localize", bag, reference, "--out", tmp_path / "way.tum", "--start=0,0,0")
+    found, known = Trajectory(tmp_path / "way.tum"), Trajectory(reference.with_suffix(".tum"))
+    assert result["poses"] == len(found)
+    gap = np.linalg.norm(found.T_world_body[:, :2, 3] - known.T_world_body[:, :2, 3], axis=1)
+    assert np.sqrt(np.mean(gap**2)) < 0.15
+    assert result["last"][:2] == pytest.approx(found.T_world_body[-1, :2, 3], abs=1e-5)
+
+
+def test_grid_maps_depth_images_where_the_map_says_the_robot_was(bag, reference, tmp_path, capsys):
+    out = tmp_path / "kinect.yaml"
+    result, _ = run(capsys, "grid", bag, "--poses", reference, "--start=0,0,0", "--out", out)
+    assert result["frames"] + result["frames_refused"] == len(open_robot(bag).frames)
+    score, _ = run(capsys, "eval", out, reference)
+    assert score["known_error_percent"] < 12
+
+
+def test_grid_finds_the_way_itself_and_goes_on_with_a_map(bag, tmp_path, capsys):
+    half, whole, both = tmp_path / "half.yaml", tmp_path / "whole.yaml", tmp_path / "both.yaml"
+    lidar = ("grid", bag, "--use", "lidar", "--poses", "odometry", "--mode", "raw")
+    run(capsys, *lidar, "--out", half, "--frames", ":40")
+    run(capsys, *lidar, "--out", both, "--frames", "40:", "--resume", half)
+    run(capsys, *lidar, "--out", whole)
+    cells = [read_map_server(path).states for path in (whole, both)]
+    assert cells[0].shape == cells[1].shape
+    assert (cells[0] == cells[1]).mean() > 0.98  # per cents are rounded in between
+    result, said = run(capsys, "grid", bag, "--use", "both", "--out", tmp_path / "a.yaml", "--frames", "::8")
+    assert "SLAM" in said
+    assert result["occupied"] > 50
+
+
+def test_map_under_profile_ist2019_is_a_grid(bag, tmp_path, capsys):
+    result, _ = run(capsys, "map", bag, "--profile", "ist2019", "--out", tmp_path / "floor.yaml", "--frames", "::4")
+    assert result["free"] > 1000
+    assert read_map_server(tmp_path / "floor.yaml").resolution == 0.02
+    assert "ends in .yaml" in refused(capsys, "map", bag, "--profile", "ist2019", "--out", tmp_path / "floor.svox")
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("slam", "nowhere.bag", "--out", "a.yaml"), "nowhere.bag: no such file"),
+        (("slam", DRIVE, "--out", "a.svox"), "give a name that ends in .yaml"),
+        (("grid", DRIVE, "--out", "a.yaml", "--poses", "gps"), "--poses gps: give slam, odometry, or the .yaml"),
+        (("grid", DRIVE, "--out", "a.yaml", "--frames", "9999:"), "picks none"),
+        (("grid", DRIVE, "--out", "a.yaml", "--set", "grid.thick=1"), "did you mean 'thickness'"),
+        (("localize", DRIVE, "nowhere.yaml", "--out", "a.tum"), "nowhere.yaml"),
+        (("localize", DRIVE, "nowhere.yaml", "--out", "a.tum", "--start", "1,2"), "--start 1,2: give X,Y,DEG"),
+        (("simulate", "sim:floor?plan=castle", "--out", "a.bag"), "castle"),
+        (("simulate", DRIVE, "--out", "a.txt"), "ends in .bag or .mcap or .db3"),
+    ],
+)
+def test_mistakes_end_in_one_line(words, said, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(list(words)) == 2
+    lines = [line for line in capsys.readouterr().err.splitlines() if not line.startswith(("note:", "compiling"))]
+    assert len(lines) == 1
+    assert said in lines[0]
+    assert not list(tmp_path.iterdir())

@@ -19,6 +19,8 @@ from stereovox.frame import DepthImage, Frame, Reason, Scan
 DTYPES = (np.dtype(np.uint16), np.dtype(np.float32), np.dtype(np.float64))
 SATURATED = 65535
 """What many cameras write into uint16 images for "no value"."""
+EXACT = 1e-14
+"""How far a rotation of doubles may be off and still be the nearest there is."""
 FARTHEST = 1e6
 """Positions beyond this many metres are taken for errors."""
 
@@ -85,7 +87,7 @@ def rigid_pose(frame: Frame | Scan, tolerance: float) -> geometry.Transform:
     error = geometry.rigidity_error(T)
     if error > tolerance:
         raise FrameRefused("pose_not_rigid", f"{_name(frame)}: the pose is no rigid 4x4 motion (off by {error:.2g})")
-    return geometry.orthonormalise(T)
+    return geometry.orthonormalise(T) if error > EXACT else T
 
 
 def _name(frame: Frame | Scan) -> str:

@@ -79,7 +79,7 @@ class Localiser:
     def add(self, scan: Scan) -> Estimate:
         """Return where the robot is after one more scan.
 
-        Raises FrameRefused, and changes nothing but `refused`, where the scan cannot be trusted (`scan_check`, `scan_beams`).
+        Raises FrameRefused, and changes nothing but `refused`, where the scan cannot be trusted (`sound`, `beams_of`).
         """
         start = perf_counter()
         try:

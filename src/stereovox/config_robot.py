@@ -74,6 +74,7 @@ class AmclConfig(Section):
         scan's own.
     trust: power of a scan's likelihood: 1 takes the beams for independent (as printed), 1 / max_beams for a single one.
     z_hit, z_short, z_max, z_rand: shares of beams that end at what the map holds, before it, nowhere, and anywhere;
+        only their proportions matter: `beam` divides them by their sum, which need not be 1 (it is not in ROS's amcl);
         `field` knows z_hit and z_rand only. sigma_hit: metres; lambda_short: 1 / metres.
     field_distance: metres from an obstacle beyond which all places are equal.
     beam_skip: leave out beams that most particles find in the open, once they agree with each other: people, and what
@@ -137,8 +138,9 @@ class SlamConfig(Section):
     voxel_size: side in metres of a cell of the map, and of the grid that scans are matched in.
     max_range: metres up to which hits are matched; what is further is too sparse to lie on a line.
     sigma: metres that a hit may stand off a wall; beyond, it counts less and less (Geman and McClure).
-    odometry: how far the odometry's step between two scans may be off: metres, metres per metre, radians, radians per
-        radian. Turns are wide on purpose: odometry and lidar seldom have one clock, and matching knows better.
+    odometry: how far the odometry's step between two scans may be off: metres (above 0), metres per metre, radians
+        (above 0), radians per radian. Turns are wide on purpose: odometry and lidar seldom have one clock, and matching
+        knows better.
     keyframe_distance, keyframe_turn: metres and radians between the scans that the map is made of.
     local_keyframes: a scan is matched with the map of this many last keyframes.
     submap_keyframes: keyframes of a submap, the unit that loops are closed with.
@@ -175,7 +177,13 @@ class SlamConfig(Section):
     clear_far: bool = False
 
     @model_validator(mode="after")
-    def _not_too_fine(self) -> SlamConfig:
+    def _possible(self) -> SlamConfig:
         if self.max_range > 2000 * self.voxel_size:
             raise ValueError(f"max_range {self.max_range:g} spans more than 2000 cells of {self.voxel_size:g}")
+        base, per_metre, base_turn, per_radian = self.odometry
+        if min(base, base_turn) <= 0 or min(per_metre, per_radian) < 0:
+            raise ValueError(
+                f"odometry {list(self.odometry)} must be [metres, metres per metre, radians, radians per radian]: "
+                "the first and the third above 0, the others at least 0"
+            )
         return self

@@ -8,6 +8,8 @@ import pytest
 
 from stereovox.cli import main
 from stereovox.products.map_server import read_map_server
+from stereovox.sources.bag_files import open_bag
+from stereovox.sources.bag_messages import read_pose
 from stereovox.sources.robot import open_robot
 from stereovox.sources.trajectory import Trajectory
 
@@ -103,17 +105,51 @@ def test_grid_finds_the_way_itself_and_goes_on_with_a_map(bag, tmp_path, capsys)
     assert result["occupied"] > 50
 
 
+def test_grid_takes_both_kinds_of_readings(tmp_path, capsys):
+    drive = "sim:floor?plan=testbed&seconds=8&scan_hz=1&depth_hz=3&image_width=80"
+    robot = open_robot(drive)
+    result, _ = run(capsys, "grid", drive, "--use", "both", "--poses", "odometry", "--out", tmp_path / "a.yaml")
+    assert len(robot.frames) > len(robot.scans) > 4
+    assert result["frames"] + result["frames_refused"] == len(robot.frames) + len(robot.scans)
+
+
+def test_going_on_localises_in_the_map_and_takes_its_cells(bag, reference, tmp_path, capsys):
+    out = tmp_path / "more.yaml"
+    _, said = run(capsys, "grid", bag, "--resume", reference, "--start=0,0,0", "--out", out, "--profile", "ist2019")
+    assert f"way in {reference}" in said
+    assert read_map_server(out).resolution == read_map_server(reference).resolution
+    assert "SLAM makes a frame of its own" in refused(
+        capsys, "grid", bag, "--resume", reference, "--poses", "slam", "--out", out
+    )
+
+
+def test_localize_writes_what_amcl_would_publish(bag, reference, tmp_path, capsys):
+    out = tmp_path / "way.bag"
+    run(capsys, "localize", bag, reference, "--out", out, "--start=0,0,0")
+    run(capsys, "localize", bag, reference, "--out", tmp_path / "way.tum", "--start=0,0,0")
+    file, way = open_bag(out), Trajectory(tmp_path / "way.tum")
+    assert file.types == {"/amcl_pose": "geometry_msgs/PoseWithCovarianceStamped", "/tf": "tf2_msgs/TFMessage"}
+    pose = read_pose(file.read("/amcl_pose", 30), file.types["/amcl_pose"])
+    assert pose.stamp_ns == way.stamps_ns[30]
+    assert pose.numbers[:2] == pytest.approx(way.T_world_body[30, :2, 3], abs=1e-5)
+
+
 def test_map_under_profile_ist2019_is_a_grid(bag, tmp_path, capsys):
     result, _ = run(capsys, "map", bag, "--profile", "ist2019", "--out", tmp_path / "floor.yaml", "--frames", "::4")
     assert result["free"] > 1000
     assert read_map_server(tmp_path / "floor.yaml").resolution == 0.02
-    assert "ends in .yaml" in refused(capsys, "map", bag, "--profile", "ist2019", "--out", tmp_path / "floor.svox")
+    words = ("map", bag, "--profile", "ist2019", "--out")
+    assert "ends in .yaml" in refused(capsys, *words, tmp_path / "floor.svox")
+    assert "--integrator: has no meaning" in refused(capsys, *words, tmp_path / "a.yaml", "--integrator", "ray")
+    assert "no map to go on with" in refused(capsys, *words, tmp_path / "a.yaml", "--resume")
+    run(capsys, "map", bag, "--set", "dimensions=2", "--out", tmp_path / "b.yaml", "--frames", "::8")
 
 
 @pytest.mark.parametrize(
     ("words", "said"),
     [
         (("slam", "nowhere.bag", "--out", "a.yaml"), "nowhere.bag: no such file"),
+        (("slam", DRIVE, "--out", "a.yaml", "--relations", "nope"), "nope"),
         (("slam", DRIVE, "--out", "a.svox"), "give a name that ends in .yaml"),
         (("grid", DRIVE, "--out", "a.yaml", "--poses", "gps"), "--poses gps: give slam, odometry, or the .yaml"),
         (("grid", DRIVE, "--out", "a.yaml", "--frames", "9999:"), "picks none"),

@@ -239,12 +239,14 @@ def test_beams_cover_the_field_of_view_in_equal_steps():
 
 def test_the_scan_stands_upright_in_the_camera():
     T = pose(1.3, tilt=20, roll=5, yaw=70)
-    scan = scan_of(image_of(PINHOLE, T), settings())
+    image = image_of(PINHOLE, T)
+    scan, rays = scan_of(image, settings()), corners(image)
     assert scan.T_world_sensor[:3, 3] == pytest.approx(T[:3, 3])
     assert scan.T_world_sensor[:3, 0] == pytest.approx([np.cos(np.radians(70)), np.sin(np.radians(70)), 0])
     assert scan.T_world_sensor[:3, 2] == pytest.approx([0, 0, 1])
-    assert (scan.range_min, scan.range_max) == (pytest.approx(0.2, abs=0.2), FAR)
-    assert scan.range_min > 0
+    flattest = (np.hypot(rays[..., 0], rays[..., 1]) / np.linalg.norm(rays, axis=-1)).min()
+    assert flattest < 0.8  # nearer than that along the floor no ray of `min_range` of depth ends
+    assert (scan.range_min, scan.range_max) == (pytest.approx(NEAR * flattest, rel=0.01), FAR)
 
 
 @pytest.mark.parametrize("seed", range(12))

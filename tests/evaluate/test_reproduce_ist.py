@@ -55,7 +55,7 @@ def test_both_floors_give_a_page_maps_and_all_numbers(tmp_path):
         assert ours["figures"]["frames"] > 35  # an image whose middle row shows nothing is refused
         assert theirs["scores"]["occupied_iou_tolerant"] > 0.3
         assert theirs["scores"]["distance_m"]["to_reference"]["median"] < 0.1
-        assert set(theirs["of_building"]) == {"lidar", "band"}
+        assert set(theirs["of_building"]) == {"lidar", "band", "above"}
         saved = [read_map_server(tmp_path / f"{name}_{kind}.yaml") for kind in ("reference", "ist2019", "default")]
         assert {grid.resolution for grid in saved} == {0.02}
         assert all((grid.cells == 100).sum() > 50 for grid in saved)

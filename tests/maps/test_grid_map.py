@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from stereovox import planar
 from stereovox.config import load_config
-from stereovox.errors import ConfigError, MapFileError
+from stereovox.errors import ConfigError, MapFileError, StereovoxError
 from stereovox.maps import State
 from stereovox.maps.grid_evidence import CELLS, GridEvidence
 from stereovox.maps.grid_map import GridMap
@@ -232,3 +232,13 @@ def test_damaged_files_end_in_one_line(tmp_path):
         load_grid(path)
     with pytest.raises(MapFileError, match="No such file"):
         load_grid(tmp_path / "none.npz")
+
+
+def test_a_map_too_large_for_a_picture_says_so():
+    grid_map = GridMap(load_config(**EVEN))
+    tile = np.full((1, CELLS), 500, np.int16)
+    for x in (0, 40_000):
+        grid_map.add(GridEvidence(np.array([[x, x, 0]], np.int32), tile))
+    with pytest.raises(StereovoxError, match=r"256006 x 256006 m .* does the odometry jump"):
+        grid_map.occupancy()
+    assert grid_map.memory_bytes < 3e6

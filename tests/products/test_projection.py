@@ -1,17 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
 """Maps seen from above: against loops over cells, and what marks, clears and stays unknown."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from stereovox.cli import main
 from stereovox.config import load_config
 from stereovox.errors import StereovoxError
+from stereovox.evaluate.grid_scores import score_grids
+from stereovox.mapper import Mapper
 from stereovox.maps import State, VoxelMap
 from stereovox.maps.cubes import in_cubes
 from stereovox.products import export
 from stereovox.products.map_server import read_map_server
 from stereovox.products.projection import project
+from stereovox.sources.floor import Floor
 
 SIZE = 0.1
 FREE, PERHAPS, WALL = -3.0, 0.2, 3.0
@@ -192,3 +197,22 @@ def test_the_command(tmp_path, capsys):
         assert main(["export", where, str(tmp_path / "c.pgm"), f"--heights={heights}"]) == 2
         assert words in capsys.readouterr().err
     assert not (tmp_path / "c.pgm").exists()
+
+
+def test_a_floor_seen_by_a_kinect():
+    """With true poses occupied cells are where walls, things, and tops and undersides are, or right beside."""
+    floor = Floor("sim:floor?plan=testbed&scan_hz=0&depth_hz=0.5&image_width=160")
+    mapper = Mapper("default", voxel_size=0.05, max_range=5.0)
+    for frame in floor.frames:
+        T = floor.truth.at(frame.stamp_ns) @ floor.T_base_camera
+        assert mapper.add(replace(frame, T_world_sensor=T)).refused in (None, "no_valid_depth")
+    heights = (0.1, 1.8)
+    grid = project(mapper.map, heights)
+    scores = score_grids(grid, floor.true_grid(0.05, heights, lids=True), align=False)
+    assert scores.occupied.tolerance_precision > 0.97
+    assert scores.to_reference.p95 <= 0.051
+    for thing in floor.plan.things:
+        if thing.name in ("table 2: top", "table 3: top", "hung panel"):  # one cell thick, and free below
+            assert (grid.states[tuple(grid.indices([thing.corners.mean(axis=0)]).T)] == State.OCCUPIED).all(), (
+                thing.name
+            )

@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 
 from stereovox import planar
+from stereovox.config import NoiseConfig
 from stereovox.errors import SourceError
 from stereovox.frame import Reason
 from stereovox.geometry import inverse, rigidity_error, transform_points
+from stereovox.sensors.noise import RangeNoise
 from stereovox.sources.floor import PLANS, Floor
 from stereovox.sources.floor_drive import STEP_NS, Odometry, Stop, drive, metres, zigzag
 from stereovox.sources.floor_kinect import Kinect, kinect_camera
@@ -165,6 +167,15 @@ def test_the_kinect_measures_in_steps_and_tells_why_a_pixel_is_empty():
     assert (beside[-15:] == Reason.UNMATCHED).all()  # in the shadow of what is nearer
     assert (beside[:10] == Reason.VALID).all()
     assert not measured[reason != Reason.VALID].any()
+
+
+@pytest.mark.parametrize("width", [640, 160])
+def test_the_kinect_tells_its_noise(width):
+    kinect = Kinect(kinect_camera(width))
+    noise = RangeNoise.of(NoiseConfig.model_validate({}), kinect.camera)
+    for depth in (2.0, 3.0, 5.0):
+        measured, _ = kinect.measure(np.full((kinect.camera.height, width), depth, np.float32), 1)
+        assert noise.sigma(depth) == pytest.approx(measured.std() / 1000, rel=0.06)
 
 
 def test_without_noise_all_is_exact():

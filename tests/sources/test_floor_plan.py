@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from stereovox.sources.floor import Floor
+from stereovox.sources.floor_lids import with_lids
 from stereovox.sources.floor_plan import FloorPlan, block, post
 from stereovox.sources.floor_rays import cast, distance_to
 
@@ -88,3 +89,47 @@ def test_the_perfect_map_is_of_a_band_of_heights():
     free = (under.truth(0.05, (0.2, 0.2), (0.2, 0.3)).cells == 0).sum()
     less = (under.truth(0.05, (0.2, 0.2), (0.2, 1.0)).cells == 0).sum()
     assert free - less == pytest.approx(1.1**2 / 0.05**2, rel=0.15)
+
+
+LIDS = [  # x from, heights, whether a camera at 0.3 m sees a lid between 0.1 and 1.8 m; each 0.5 m wide
+    ("table", 0.5, (0.7, 0.75), True),
+    ("pallet", 1.5, (0.0, 0.15), True),
+    ("crate", 2.5, (0.0, 0.5), False),
+    ("beam", 3.5, (1.9, 2.0), False),
+    ("mat", 4.5, (0.0, 0.05), False),
+    ("below", 5.5, (0.0, 0.4), False),
+    ("on top", 5.5, (0.4, 0.9), False),
+    ("pillar", 6.5, (0.0, 2.6), False),
+]
+
+
+def test_a_camera_sees_tops_below_and_undersides_above_it():
+    things = [block("boxes", name, (x, 0.5, x + 0.5, 1.0), heights) for name, x, heights, _ in LIDS]
+    things.append(block("legs", "leg", (0.6, 0.6, 0.7, 0.7), (0.0, 0.7)))
+    things.append(block("tables", "shut away", (9.0, 0.5, 9.5, 1.0), (0.7, 0.75)))
+    plan = FloorPlan([(0.0, 0.0, 8.0, 2.0), (8.5, 0.0, 10.0, 2.0)], things)
+    slice_ = plan.truth(0.02, (0.1, 0.1))
+    grid = with_lids(slice_, things, (0.1, 1.8), 0.3)
+    at = lambda cells, x, y: int(cells[tuple(grid.indices([(x, y)])[0])])  # noqa: E731 - short and local
+    for name, x, heights, seen in LIDS:
+        passed = heights[0] > 1.8 or heights[1] < 0.1  # nothing between the heights: the floor there is free
+        before = 0 if passed else -1
+        assert at(slice_.cells, x + 0.25, 0.75) == before, name
+        assert at(grid.cells, x + 0.25, 0.75) == (100 if seen else before), name
+    assert at(grid.cells, 0.65, 0.65) == -1  # inside of the leg
+    assert at(grid.cells, 9.25, 0.75) == -1  # no way leads there
+    area = (grid.cells == 100).sum() - (slice_.cells == 100).sum()
+    assert area == pytest.approx((2 * 0.48**2 - 0.1**2) / 0.02**2, rel=0.05)
+    assert ((grid.cells == slice_.cells) | ((grid.cells == 100) & (slice_.cells == -1))).all()
+
+
+def test_a_perfect_map_of_a_floor_can_have_lids():
+    floor = Floor("sim:floor?plan=testbed&seconds=1")
+    slice_, whole = (floor.true_grid(0.05, (0.1, 1.8), lids=lids) for lids in (False, True))
+    table = next(thing for thing in floor.plan.things if thing.name == "table 2: top")
+    crate = next(thing for thing in floor.plan.things if thing.name == "crate")
+    for thing, seen in ((table, 100), (crate, -1)):
+        row, column = slice_.indices([thing.corners.mean(axis=0)])[0]
+        assert slice_.cells[row, column] == -1
+        assert whole.cells[row, column] == seen
+    np.testing.assert_array_equal(floor.true_grid(0.05, lids=True).cells, floor.true_grid(0.05).cells)  # the lidar's

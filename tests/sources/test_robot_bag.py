@@ -15,6 +15,7 @@ from stereovox.frame import Frame, Scan
 from stereovox.geometry import inverse
 from stereovox.sources.robot import in_time_order, open_robot
 from stereovox.sources.robot_bag import RobotBag
+from stereovox.sources.robot_options import mounted
 
 ENDINGS = pytest.mark.parametrize("ending", [".bag", ".db3"])
 LASER = [0.2, 0.0, 0.225, 0, 0, 0, 1]
@@ -461,3 +462,12 @@ def test_a_real_bag_with_two_lidars_and_no_tf():
     known = ranges[np.isfinite(ranges)]
     assert known.size > 331 * 726 / 2
     assert 0.02 <= known.min() < known.max() < 5.6
+
+
+def test_a_mount_turns_by_yaw_then_pitch_then_roll():
+    from scipy.spatial.transform import Rotation
+
+    T = mounted("mount", "1,2,3,0.5,-0.4,0.3")
+    assert T is not None
+    np.testing.assert_allclose(T[:3, :3], Rotation.from_euler("ZYX", [0.5, -0.4, 0.3]).as_matrix(), atol=1e-12)
+    assert T[:3, 3].tolist() == [1, 2, 3]

@@ -14,6 +14,8 @@ import pytest
 from made_robot_bags import MS, START_NS, RobotBagMaker, planar_numbers
 
 from stereovox.errors import SourceError
+from stereovox.frame import Scan
+from stereovox.sources.bag_writer import BagWriter
 from stereovox.sources.robot_bag import RobotBag
 
 ENDINGS = pytest.mark.parametrize("ending", [".bag", ".db3"])
@@ -109,3 +111,19 @@ def test_damaged_messages_in_a_file_that_is_whole(tmp_path, ending):
     for seed in range(12):
         found |= bounded(record(Scrambler(tmp_path / f"scrambled{seed}{ending}", seed)))
     assert {None, "unreadable", "no_pose"} <= found
+
+
+def test_a_recording_that_was_cut_off_says_so(tmp_path):
+    whole = tmp_path / "whole.mcap"
+    with BagWriter(whole) as bag:
+        for k in range(200):
+            stamp_ns = START_NS + k * 100 * MS
+            bag.odometry(stamp_ns, [0.1 * k, 0, 0])
+            noise = np.random.default_rng(k).uniform(1, 4, 2000).astype(np.float32)
+            bag.scan(Scan(noise, -1.0, 1e-3, 0.1, 5.0, np.eye(4), stamp_ns=stamp_ns))
+    assert not any("gone through" in note for note in RobotBag(str(whole)).notes)
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(whole.read_bytes()[: whole.stat().st_size * 6 // 10])
+    robot = RobotBag(str(cut))
+    assert 0 < len(robot.scans) < 200
+    assert any(note.startswith(str(cut)) and "gone through" in note for note in robot.notes)

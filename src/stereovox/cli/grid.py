@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stereovox.cli.localize import add_start, localised, parse_start
-from stereovox.cli.robots import GRID_ENDINGS, add_robot, check_file, opened, settings_of
+from stereovox.cli.robots import GRID_ENDINGS, GRID_FILES, add_robot, check_file, opened, say_refused, settings_of
+from stereovox.cli.settings import overrides
 from stereovox.cli.slam import mapped
 from stereovox.cli.terminal import (
     cells_line,
@@ -48,7 +49,9 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--voxel-size", type=float, metavar="M", help="cell size in metres")
     parser.add_argument("--max-range", type=float, metavar="M", help="metres up to which readings count")
     parser.add_argument("--mode", choices=MODES, default="trinary", help="how the file tells probabilities (trinary)")
-    parser.add_argument("--resume", metavar="MAP", help="go on with this map; the poses must be in its frame")
+    parser.add_argument(
+        "--resume", metavar="MAP", help="go on with this map; without --poses the robot is localised in it"
+    )
     add_start(parser)
 
 
@@ -59,14 +62,24 @@ def defaults() -> dict[str, Any]:
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Find the way, map along it, save the map and tell what was done."""
+    from stereovox.products.map_server import write_map_server
+
     out = check_file(arguments.out, GRID_ENDINGS)
     start, config = parse_start(arguments.start), settings_of(arguments)
     robot = opened(arguments.source)
     seen, count = _chosen(robot, arguments.use, arguments.frames)
-    mapper = _mapper(config, arguments.resume)
+    how = _poses(arguments.poses, robot, arguments.resume)
+    mapper = _mapper(config, arguments.resume, any_size="voxel_size" not in overrides(arguments))
     say_about_compiling()
-    track = _track(robot, arguments.poses, config, start)
-    reports = _add_all(mapper, (track.corrected(one) if track else one for one in seen), count)
+    track = _track(robot, how, config, start)
+    reports: list[UpdateReport] = []
+    try:
+        _add_all(mapper, (track.corrected(one) if track else one for one in seen), count, reports)
+    except KeyboardInterrupt:
+        if mapper.map.frames:
+            write_map_server(mapper.occupancy(), out, mode=arguments.mode)
+            say(f"stopped after {len(reports)} of {count} readings; they are saved in {out.with_suffix('.yaml')}")
+        raise
     return _finished(mapper, reports, out, arguments.mode)
 
 
@@ -87,39 +100,56 @@ def _chosen(robot: Robot, use: str | None, frames: str | None) -> tuple[Iterator
     picked = {name: range(len(there))[parse_slice(frames or ":")] for name, there in wanted.items()}
     if not all(picked.values()):
         raise StereovoxError(f"--frames {frames}: picks none of {robot.name}; widen it")
-    streams = [(wanted[name][i] for i in numbers) for name, numbers in picked.items()]
+    streams = [map(wanted[name].__getitem__, numbers) for name, numbers in picked.items()]
     return in_time_order(*streams), sum(map(len, picked.values()))
 
 
-def _track(robot: Robot, how: str | None, config: Config, start: Any) -> Track | None:
+def _poses(how: str | None, robot: Robot, resume: str | None) -> str:
+    """Return whose poses to take: `slam`, `odometry`, or the file of a map to localise in."""
+    if how == "slam" and resume:
+        raise StereovoxError(
+            f"--resume {resume}: SLAM makes a frame of its own; leave --poses out to localise in the map"
+        )
+    if how is None:
+        how = (resume or "slam") if len(robot.scans) else "odometry"
+    if how not in ("slam", "odometry") and Path(how).suffix.lower() not in GRID_FILES:
+        raise StereovoxError(f"--poses {how}: give slam, odometry, or the .yaml of a map to localise in")
+    return how
+
+
+def _track(robot: Robot, how: str, config: Config, start: Any) -> Track | None:
     """Return the robot's way in the map; None: as its odometry has it."""
     from stereovox.products.map_server import read_map_server
 
-    how = how or ("slam" if len(robot.scans) else "odometry")
     if how == "odometry":
         return None
     if how == "slam":
         say("finding the robot's way by SLAM; --poses MAP.yaml would localise it in a map, --poses odometry not at all")
-        return mapped(robot, config).track
-    if Path(how).suffix.lower() not in GRID_ENDINGS:
-        raise StereovoxError(f"--poses {how}: give slam, odometry, or the .yaml of a map to localise in")
-    return localised(robot, read_map_server(how), config, start)
+        found = mapped(robot, config)
+        say_refused(found.refused)
+        return found.track
+    say(f"finding the robot's way in {how}")
+    track = localised(robot, read_map_server(how), config, start)
+    say_refused(track.refused, track.first_refusal)
+    return track
 
 
-def _mapper(config: Config, resume: str | None) -> GridMapper:
+def _mapper(config: Config, resume: str | None, any_size: bool) -> GridMapper:
+    from stereovox.config import load_config
     from stereovox.grid_mapper import GridMapper
     from stereovox.products.map_server import read_map_server
 
-    return GridMapper(config, resume=None if resume is None else read_map_server(resume))
+    if resume is None:
+        return GridMapper(config)
+    before = read_map_server(resume)
+    return GridMapper(load_config(config, voxel_size=before.resolution) if any_size else config, resume=before)
 
 
-def _add_all(mapper: GridMapper, seen: Iterator[Scan | Frame], count: int) -> list[UpdateReport]:
-    reports: list[UpdateReport] = []
+def _add_all(mapper: GridMapper, seen: Iterator[Scan | Frame], count: int, reports: list[UpdateReport]) -> None:
     with interrupt_between_steps() as check:
         for one in tracked(seen, count, "mapping"):
             reports.append(mapper.add(one))
             check()
-    return reports
 
 
 def _finished(mapper: GridMapper, reports: list[UpdateReport], out: Path, mode: str) -> dict[str, Any]:

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
 from math import radians
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from stereovox.cli.robots import add_robot, check_file, opened, settings_of
+from stereovox.cli.robots import add_robot, check_file, opened, say_refused, settings_of, way_error
 from stereovox.cli.terminal import progress_bar, say, say_about_compiling
 from stereovox.errors import StereovoxError
 
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from stereovox.maps.occupancy import OccupancyGrid
     from stereovox.sources.robot import Robot
 
+TEXT, BAGS = (".tum", ".txt"), (".bag", ".mcap", ".db3")
 EXAMPLE = "stereovox localize floor.bag reference.yaml --out way.tum"
 
 
@@ -29,7 +31,12 @@ def add_arguments(parser: ArgumentParser) -> None:
     """Declare the options."""
     add_robot(parser)
     parser.add_argument("map", metavar="MAP", help="map to localise in: .yaml of map_server")
-    parser.add_argument("--out", required=True, metavar="FILE.tum", help="poses to write: stamp tx ty tz qx qy qz qw")
+    parser.add_argument(
+        "--out",
+        required=True,
+        metavar="FILE",
+        help="poses to write: .tum (stamp tx ty tz qx qy qz qw), or .bag, .mcap, .db3 with /amcl_pose and map -> odom",
+    )
     add_start(parser)
 
 
@@ -42,16 +49,34 @@ def run(arguments: Namespace) -> dict[str, Any]:
     """Localise, save the way and tell where it ended."""
     from stereovox.products.map_server import read_map_server
 
-    out, config = check_file(arguments.out, (".tum", ".txt")), settings_of(arguments)
+    out, config = check_file(arguments.out, (*TEXT, *BAGS)), settings_of(arguments)
     start, grid = parse_start(arguments.start), read_map_server(arguments.map)
     robot = opened(arguments.source)
     say_about_compiling()
     track = localised(robot, grid, config, start)
-    track.save(out)
+    _save(track, out)
+    say_refused(track.refused, track.first_refusal)
     x, y, yaw = track.pose_map_base[-1]
     say(f"{len(track.stamps_ns)} poses saved in {out}")
     say(f"the robot ended at x {x:.2f} m, y {y:.2f} m, {np.degrees(yaw):.0f} degrees")
-    return {"poses": len(track.stamps_ns), "last": [x, y, float(np.degrees(yaw))], **_error(track, robot)}
+    refused = {"scans_refused": sum(track.refused.values()), "refused": dict(track.refused)}
+    found = {"poses": len(track.stamps_ns), "last": [x, y, float(np.degrees(yaw))]}
+    return {**found, **refused, **way_error(track, robot)}
+
+
+def _save(track: Track, out: Path) -> None:
+    """Write the way as text, or as ROS's amcl tells it: /amcl_pose, and map -> odom on /tf."""
+    if out.suffix.lower() in TEXT:
+        return track.save(out)
+    from stereovox import planar
+    from stereovox.sources.bag_writer import BagWriter
+
+    with BagWriter(out) as bag:
+        for stamp_ns, base, odom in zip(
+            track.stamps_ns.tolist(), track.pose_map_base, track.pose_map_odom, strict=True
+        ):
+            bag.pose(stamp_ns, base)
+            bag.transform(stamp_ns, "map", "odom", planar.lifted(odom))
 
 
 def parse_start(text: str | None) -> np.ndarray | None:
@@ -76,13 +101,3 @@ def localised(robot: Robot, grid: OccupancyGrid, config: Config, start: np.ndarr
     with progress_bar() as bar:
         task = bar.add_task("localising", total=len(robot.scans), note="")
         return localise(grid, robot.scans, config, start, progress=lambda done: bar.update(task, completed=done))
-
-
-def _error(track: Track, robot: Robot) -> dict[str, Any]:
-    if robot.truth is None:
-        return {}
-    from stereovox.evaluate.trajectory_error import trajectory_error
-
-    error = trajectory_error(track, robot.truth)
-    say(f"the way is off by {100 * error.position_rms_m:.1f} cm (RMS) and {error.yaw_rms_deg:.2f} degrees")
-    return {"position_rms_m": error.position_rms_m, "yaw_rms_deg": error.yaw_rms_deg}

@@ -100,10 +100,13 @@ def _grid(arguments: Namespace) -> dict[str, Any]:
     """Do what `stereovox grid` does; it has more options."""
     from stereovox.cli import grid
 
-    if arguments.camera is not None:
-        raise StereovoxError("--camera: cannot replace the camera of a ground robot; leave it out")
-    resume = arguments.out if arguments.resume else None
-    return grid.run(Namespace(**{**grid.defaults(), **vars(arguments), "resume": resume}))
+    for option in ("camera", "integrator", "threads"):
+        if getattr(arguments, option) is not None:
+            raise StereovoxError(f"--{option}: has no meaning for the map of a floor; leave it out")
+    if arguments.resume and not Path(arguments.out).exists():
+        raise StereovoxError(f"{arguments.out}: no map to go on with; leave --resume out")
+    given = {**vars(arguments), "profile": arguments.profile or "default"}
+    return grid.run(Namespace(**{**grid.defaults(), **given, "resume": arguments.out if arguments.resume else None}))
 
 
 def _check_target(out: Path, resume: bool) -> None:

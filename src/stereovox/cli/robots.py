@@ -5,9 +5,9 @@ from __future__ import annotations
 
 import os
 from argparse import ArgumentParser, Namespace
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from stereovox.cli.recordings import check_folder
 from stereovox.cli.settings import add_settings, overrides
@@ -16,15 +16,20 @@ from stereovox.errors import StereovoxError
 
 if TYPE_CHECKING:
     from stereovox.config import Config
+    from stereovox.localize.track import Track
     from stereovox.sources.robot import Robot
 
 GRID_ENDINGS = (".yaml", ".pgm", ".png")
 """Files of a 2-D map: the picture and its .yaml are written together, whichever is named."""
+GRID_FILES = (*GRID_ENDINGS, ".yml")
+"""Those that can be read."""
 
 
 def add_robot(parser: ArgumentParser) -> None:
     """Declare the recording and the settings."""
-    parser.add_argument("source", metavar="ROBOT", help="a bag with scans, a CARMEN log (.clf, .clf.bz2) or sim:floor")
+    parser.add_argument(
+        "source", metavar="ROBOT", help="a bag with scans, a CARMEN log (.clf, .log, packed or not) or sim:floor"
+    )
     parser.add_argument("--profile", default="default", metavar="P", help="profile name or TOML file (default)")
     add_settings(parser, "slam.voxel_size=0.1")
 
@@ -44,6 +49,25 @@ def opened(where: str) -> Robot:
     for note in robot.notes:
         say(f"note: {note}")
     return robot
+
+
+def say_refused(refused: Mapping[str, int], first: str = "") -> None:
+    """Say how many scans could not be used, by reason."""
+    if refused:
+        reasons = ", ".join(f"{number} x {reason}" for reason, number in refused.items())
+        say(f"{sum(refused.values())} scans refused: {reasons}" + (f", first: {first}" if first else ""))
+
+
+def way_error(track: Track, robot: Robot) -> dict[str, Any]:
+    """Say how far the way found is from the true one, where that is known, and return it."""
+    if robot.truth is None:
+        return {}
+    from stereovox.evaluate.trajectory_error import trajectory_error
+
+    error = trajectory_error(track, robot.truth)
+    off = f"{100 * error.position_rms_m:.1f} cm (RMS) and {error.yaw_rms_deg:.2f} degrees"
+    say(f"laid on the true way as a whole, it is off by {off}")
+    return {"position_rms_m": error.position_rms_m, "yaw_rms_deg": error.yaw_rms_deg}
 
 
 def check_file(out: str, endings: Iterable[str], option: str = "--out") -> Path:

@@ -9,7 +9,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from stereovox.cli.robots import GRID_ENDINGS
+from stereovox.cli.robots import GRID_FILES
 from stereovox.cli.terminal import command_line
 from stereovox.errors import MapFileError, StereovoxError
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 def dimensions(path: str) -> int:
     """Return 2 for the name of a map_server file, and 3 for all else."""
-    return 2 if Path(path).suffix.lower() in GRID_ENDINGS and not os.path.isdir(path) else 3
+    return 2 if Path(path).suffix.lower() in GRID_FILES and not os.path.isdir(path) else 3
 
 
 def refuse_options(arguments: Namespace, names: Iterable[str], why: str) -> None:
@@ -52,6 +52,8 @@ def _instead(path: Path) -> str:
 
     if not os.path.exists(path):
         return "no stereovox map here, nor anything else; check the name"
+    if dimensions(str(path)) == 2:
+        return "is the map of a floor; eval, info, picture and grid take it, this command wants one in space"
     below = sorted(path.iterdir()) if path.is_dir() else []
     meant = next((folder for folder in below if is_map(folder)), None)
     if meant:

@@ -7,13 +7,14 @@ Scans are matched, loops closed, and the way and the map made to agree. The way 
 from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
+from importlib.util import find_spec
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
-from stereovox.cli.robots import GRID_ENDINGS, add_robot, check_file, opened, settings_of
+from stereovox.cli.robots import GRID_ENDINGS, add_robot, check_file, opened, say_refused, settings_of, way_error
 from stereovox.cli.terminal import command_line, progress_bar, say, say_about_compiling
-from stereovox.errors import StereovoxError
+from stereovox.errors import MissingExtra, StereovoxError
 
 if TYPE_CHECKING:
     from stereovox.config import Config
@@ -32,9 +33,12 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Map, save map and way, and tell how it went."""
+    from stereovox.evaluate.relations import read_relations
     from stereovox.products.map_server import write_map_server
 
     out, config = check_file(arguments.out, GRID_ENDINGS), settings_of(arguments)
+    if arguments.relations is not None:
+        read_relations(Path(arguments.relations))  # what is wrong with it shows before the work
     robot = opened(arguments.source)
     say_about_compiling()
     start = perf_counter()
@@ -52,6 +56,8 @@ def mapped(robot: Robot, config: Config) -> SlamResult:
     """Return what SLAM makes of the robot's scans, with a progress bar."""
     from stereovox.localize.slam import map_scans
 
+    if find_spec("gtsam") is None:
+        raise MissingExtra("gtsam", "slam")  # not after an hour, when the first loop is found
     if not len(robot.scans):
         raise StereovoxError(f"{robot.name}: holds no lidar scans to make a map of; give a bag with a LaserScan topic")
     with progress_bar() as bar:
@@ -68,14 +74,10 @@ def _told(robot: Robot, found: SlamResult, seconds: float) -> dict[str, Any]:
     recorded = 1e-9 * float(track.stamps_ns[-1] - track.stamps_ns[0])
     say(f"{len(track.stamps_ns)} scans, {found.closures} loops closed, in {seconds:.1f} s "
         f"({recorded / seconds:.0f} times as fast as recorded)")  # fmt: skip
-    result = {"scans": len(track.stamps_ns), "closures": found.closures, "seconds": seconds, "recorded_s": recorded}
-    if robot.truth is None:
-        return result
-    from stereovox.evaluate.trajectory_error import trajectory_error
-
-    error = trajectory_error(track, robot.truth)
-    say(f"the way is off by {100 * error.position_rms_m:.1f} cm (RMS) and {error.yaw_rms_deg:.2f} degrees")
-    return {**result, "position_rms_m": error.position_rms_m, "yaw_rms_deg": error.yaw_rms_deg}
+    say_refused(found.refused)
+    told = {"scans": len(track.stamps_ns), "scans_refused": sum(found.refused.values()), "refused": found.refused}
+    times = {"closures": found.closures, "seconds": seconds, "recorded_s": recorded}
+    return {**told, **times, **way_error(track, robot)}
 
 
 def _scored(found: SlamResult, relations: str | None) -> dict[str, Any]:

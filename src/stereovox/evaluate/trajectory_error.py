@@ -14,6 +14,9 @@ from stereovox.errors import FrameRefused, StereovoxError
 from stereovox.localize.track import Track
 from stereovox.sources.poses import Poses
 
+LEVER_M, LEAST_LEVER_M = 0.3, 0.001
+"""What headings weigh in an alignment at most and at least: that of a point so far ahead of the robot."""
+
 
 @dataclass(frozen=True, eq=False)
 class TrajectoryError:
@@ -47,7 +50,7 @@ class TrajectoryError:
 def trajectory_error(track: Track, truth: Poses, align: bool = True, step_m: float = 1.0) -> TrajectoryError:
     """Compare a track with true poses of the robot's base.
 
-    align: move the whole track first, rigidly and without a scale, to where its positions lie best on the true ones;
+    align: move the whole track first, rigidly and without a scale, to where it lies best on the true one (`best_motion`);
     for SLAM, whose map stands in a frame of its own. step_m: metres of the true way over which motions are compared.
     Raises StereovoxError where the truth knows no time of the track.
     """
@@ -55,7 +58,7 @@ def trajectory_error(track: Track, truth: Poses, align: bool = True, step_m: flo
     if not known.any():
         raise StereovoxError(f"{truth.where}: knows no time of the track; give the truth of the same recording")
     true, found = true[known], np.asarray(track.pose_map_base, float)[known]
-    motion = best_motion(found[:, :2], true[:, :2]) if align else np.zeros(3)
+    motion = best_motion(found, true) if align else np.zeros(3)
     moved = planar.compose(motion, found)
     metres, turns = _gaps(true, moved)
     step, step_turns = _gaps(*(_steps(poses, true, step_m) for poses in (true, moved)))
@@ -86,12 +89,23 @@ def true_poses(stamps_ns: NDArray[np.int64], truth: Poses) -> tuple[planar.Pose,
     return poses, np.isfinite(poses[:, 0])
 
 
-def best_motion(points_here: ArrayLike, points_there: ArrayLike) -> planar.Pose:
-    """Return (3,) pose_there_here that lays (N, 2) points best on (N, 2) others, by least squares (Horn 1987)."""
-    here, there = np.asarray(points_here, float), np.asarray(points_there, float)
-    a, b = here - here.mean(axis=0), there - there.mean(axis=0)
-    yaw = float(np.arctan2((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum(), (a * b).sum()))
-    shift = there.mean(axis=0) - planar.transform((0, 0, yaw), here.mean(axis=0)[None])[0]
+def best_motion(poses_here: ArrayLike, poses_there: ArrayLike) -> planar.Pose:
+    """Return (3,) pose_there_here that lays (N, 3) poses best on (N, 3) others, by least squares (Horn 1987).
+
+    Nearly by positions alone, as is usual; but where the robot hardly went anywhere they do not tell the turn, and its
+    headings do. So a heading counts like a point ahead of the robot, as far as positions and headings are off from each
+    other (metres per radian), and LEVER_M at most.
+    """
+    here, there = np.asarray(poses_here, float), np.asarray(poses_there, float)
+    a, b = (poses[:, :2] - poses[:, :2].mean(axis=0) for poses in (here, there))
+    fit = complex((a * b).sum(), (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum())
+    turns = there[:, 2] - here[:, 2]
+    turn = complex(np.cos(turns).sum(), np.sin(turns).sum())
+    off = np.sqrt(max((a**2).sum() + (b**2).sum() - 2 * abs(fit), 0.0))
+    off_turn = np.sqrt((planar.wrapped(turns - np.angle(turn)) ** 2).sum())
+    lever = np.clip(off / max(off_turn, 1e-12), LEAST_LEVER_M, LEVER_M)
+    yaw = float(np.angle(fit + lever**2 * turn))
+    shift = there[:, :2].mean(axis=0) - planar.transform((0, 0, yaw), here[:, :2].mean(axis=0)[None])[0]
     return np.array([*shift, yaw])
 
 

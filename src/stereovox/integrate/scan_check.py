@@ -7,8 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from stereovox import geometry
 from stereovox.config import Config
-from stereovox.depth.prepare import rigid_pose
+from stereovox.depth.prepare import EXACT, FARTHEST, rigid_pose
 from stereovox.errors import FrameRefused
 from stereovox.frame import Scan
 
@@ -29,10 +30,10 @@ def trusted(scan: Scan, config: Config) -> Scan:
 
 
 def sound(scan: Scan, rigidity: float) -> Scan:
-    """Return the scan with an exactly rigid pose; one that was off by more than `rigidity` is refused.
+    """Return the scan with an exactly rigid pose and mount; one off by more than `rigidity` is refused.
 
     Raises FrameRefused with the reason: the source's `fault`, `bad_shape`, `bad_scan`, `pose_not_finite`,
-    `pose_not_rigid`, `no_valid_range`.
+    `pose_not_rigid`, `mount_not_rigid`, `no_valid_range`.
     """
     name = name_of(scan)
     if scan.fault:
@@ -48,10 +49,22 @@ def sound(scan: Scan, rigidity: float) -> Scan:
     ):
         said = f"angles from {angles[0]} by {angles[1]}, ranges from {limits[0]} to {limits[1]}"
         raise FrameRefused("bad_scan", f"{name}: {said}; steps must not be 0, and ranges must rise")
-    T = rigid_pose(scan, rigidity)
+    T, mount = rigid_pose(scan, rigidity), _mount(scan, rigidity)
     if np.isnan(ranges).all() and scan.clear is None:
         raise FrameRefused("no_valid_range", f"{name}: not one beam has a range; is the lidar covered?")
-    return replace(scan, T_world_sensor=T)
+    return replace(scan, T_world_sensor=T, T_base_sensor=mount)
+
+
+def _mount(scan: Scan, rigidity: float) -> geometry.Transform:
+    try:
+        T = np.asarray(scan.T_base_sensor, float)
+    except (TypeError, ValueError):
+        T = np.empty(0)
+    error = geometry.rigidity_error(T)
+    if error > rigidity or (np.abs(T) >= FARTHEST).any():
+        said = "T_base_sensor, where the lidar sits on the robot, is no rigid 4x4 motion"
+        raise FrameRefused("mount_not_rigid", f"{name_of(scan)}: {said} (off by {error:.2g})")
+    return geometry.orthonormalise(T) if error > EXACT else T
 
 
 def name_of(scan: Scan) -> str:

@@ -16,6 +16,7 @@ from stereovox.config import Config
 from stereovox.errors import FrameRefused, SourceError
 from stereovox.frame import Scan
 from stereovox.integrate.scan_check import sound
+from stereovox.localize.amcl_clock import Clock
 from stereovox.localize.amcl_cluster import Clusters, mean_pose, spread
 from stereovox.localize.amcl_kld import draw
 from stereovox.localize.amcl_motion import moved, turn_go_turn
@@ -59,13 +60,14 @@ class Localiser:
 
     start: (3,) x, y, yaw where the robot is at the first scan, good to `amcl.start_std`; None: it may be anywhere.
     seed: of all random numbers; the same scans then give the same estimates.
-    refused: how many scans were refused, by reason.
+    refused: how many scans were refused, by reason. clock: of the scans; `clock.set_back` tells how often it jumped back.
     Raises MapFileError for a map without free or occupied cells, ConfigError for a start that is no pose.
     """
 
     def __init__(self, grid: OccupancyGrid, config: Config, start: ArrayLike | None = None, seed: int = 0):
         self.config, self._rigidity = config.amcl, config.pose_rigidity_tolerance
         self.refused: Counter[str] = Counter()
+        self.clock = Clock()
         self._rng = np.random.default_rng(seed)
         self._floor = FreeFloor(grid)
         self._sensor = MODELS[self.config.model](grid, self.config)
@@ -79,12 +81,14 @@ class Localiser:
     def add(self, scan: Scan) -> Estimate:
         """Return where the robot is after one more scan.
 
-        Raises FrameRefused, and changes nothing but `refused`, where the scan cannot be trusted (`sound`, `beams_of`).
+        Raises FrameRefused, and changes nothing but `refused`, where the scan cannot be trusted (`sound`, `beams_of`), or
+        is not later than the one before (`Clock`).
         """
         start = perf_counter()
         try:
             scan = sound(scan, self._rigidity)
             beams = beams_of(scan, self.config.max_range)
+            self.clock.take(scan)
         except FrameRefused as refusal:
             self.refused[refusal.reason] += 1
             raise
@@ -176,39 +180,59 @@ def localise(
     seed: int = 0,
     progress: Callable[[int], object] | None = None,
 ) -> Track:
-    """Return a robot's way through a map; scans that cannot be trusted are left out.
+    """Return a robot's way through a map; scans that cannot be trusted are left out, and counted in `Track.refused`.
 
     start, seed: as in `Localiser`; progress: called with the number of scans done.
     Where the particles disagree, the way is that of the odometry, with a drift in between those of the sure poses
     before and after; before the first sure pose it has that one's.
+    Where the clock was set back, what lies after its new time is taken out of the way, and counted as `clock_set_back`.
     Raises what `Localiser` raises, and SourceError where not one scan can be trusted.
     """
-    localiser = Localiser(grid, config, start, seed)
-    stamps, estimates = [], []
+    localiser, way, first_refusal = Localiser(grid, config, start, seed), _Way(), ""
     for done, scan in enumerate(scans, 1):
         try:
-            estimates.append(localiser.add(scan))
-            stamps.append(scan.stamp_ns)
+            way.add(scan.stamp_ns, localiser.add(scan))
         except FrameRefused as refusal:
-            last = refusal
+            first_refusal = first_refusal or str(refusal)
         if progress:
             progress(done)
-    if not estimates:
-        said = f"every one was refused, the last: {last}" if localiser.refused else "there are none"  # pyright: ignore
+    if not way.stamps_ns:
+        said = f"every one was refused, the first: {first_refusal}" if first_refusal else "there are none"
         raise SourceError(f"no scan to localise by: {said}")
-    return _track(np.array(stamps, np.int64), estimates)
+    taken_out = {"clock_set_back": way.taken_out} if way.taken_out else {}
+    return way.track({**localiser.refused, **taken_out}, first_refusal)
 
 
-def _track(stamps_ns: NDArray[np.int64], estimates: list[Estimate]) -> Track:
-    """Return the way by what was sure alone: between, the odometry's drift is taken to be in between."""
-    base = np.array([estimate.pose_map_base for estimate in estimates])
-    odom = np.array([estimate.pose_map_odom for estimate in estimates])
-    sure = np.array([estimate.settled for estimate in estimates])
-    if not sure.any() or sure.all():
-        return Track(stamps_ns, base, odom)
-    known = Track(stamps_ns[sure], base[sure], odom[sure])
-    drift = np.array([known.correction(int(stamp_ns)) for stamp_ns in stamps_ns])
-    return Track(stamps_ns, planar.compose(drift, planar.compose(planar.inverse(odom), base)), drift)
+class _Way:
+    """What is kept of the estimates: all but the particles, of which hours would not fit into memory."""
+
+    def __init__(self):
+        self.stamps_ns: list[int] = []
+        self.taken_out = 0
+        self._base: list[planar.Pose] = []
+        self._odom: list[planar.Pose] = []
+        self._sure: list[bool] = []
+
+    def add(self, stamp_ns: int, estimate: Estimate) -> None:
+        """Take in the next estimate; earlier ones that claim to be as late or later go (`Clock`)."""
+        while self.stamps_ns and self.stamps_ns[-1] >= stamp_ns:
+            for kept in (self.stamps_ns, self._base, self._odom, self._sure):
+                kept.pop()
+            self.taken_out += 1
+        self.stamps_ns.append(stamp_ns)
+        self._base.append(estimate.pose_map_base)
+        self._odom.append(estimate.pose_map_odom)
+        self._sure.append(estimate.settled)
+
+    def track(self, refused: dict[str, int], first_refusal: str) -> Track:
+        """Return the way by what was sure alone: between, the odometry's drift is taken to be in between."""
+        stamps_ns, base, odom = np.array(self.stamps_ns, np.int64), np.array(self._base), np.array(self._odom)
+        sure = np.array(self._sure)
+        if sure.any() and not sure.all():
+            known = Track(stamps_ns[sure], base[sure], odom[sure])
+            drift = np.array([known.correction(stamp_ns) for stamp_ns in self.stamps_ns])
+            base, odom = planar.compose(drift, planar.compose(planar.inverse(odom), base)), drift
+        return Track(stamps_ns, base, odom, refused, first_refusal)
 
 
 def _times(weights: NDArray[np.float64], log_factors: NDArray[np.float64]) -> NDArray[np.float64]:

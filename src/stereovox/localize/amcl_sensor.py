@@ -108,7 +108,8 @@ def beam_likelihood(
     measured, expected: metres; at_max: bool, tells which met nothing up to `range_max`. Broadcast against each other.
 
     Beams that met nothing have a probability and no density; it counts as if spread over a metre (table 6.1). Noise
-    that carries a beam beyond `range_max` makes it one of them, so the whole has the sum of the four shares.
+    that carries a beam beyond `range_max` makes it one of them, so that the whole is 1, as the four shares are divided
+    by their sum.
     """
     from scipy.special import ndtr
 
@@ -119,8 +120,9 @@ def beam_likelihood(
     least = np.maximum(longest, 1e-6)
     short = np.where(z <= longest, rate * np.exp(-rate * z) / -np.expm1(-rate * least), 0)
     beyond = np.where(open_, 1, ndtr((longest - range_max) / sigma) / above_zero)
+    whole = config.z_hit + config.z_short + config.z_max + config.z_rand
     ends = config.z_hit * hit + config.z_short * short + config.z_rand / range_max
-    return np.where(np.asarray(at_max), config.z_hit * beyond + config.z_max, ends)
+    return np.where(np.asarray(at_max), config.z_hit * beyond + config.z_max, ends) / whole
 
 
 def _normal(off: NDArray[np.float64], sigma: float) -> NDArray[np.float64]:

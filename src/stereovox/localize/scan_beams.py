@@ -8,13 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox import geometry
 from stereovox.errors import FrameRefused
 from stereovox.frame import Scan
 from stereovox.integrate.scan_check import name_of
-
-RIGID = 5e-3
-"""How far a mount may be off from a rigid motion (docs/conventions.md)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,9 +52,9 @@ def beams_of(scan: Scan, max_range: float | None = None) -> Beams:
     """Return what a scan says: NaN, -inf and what lies below `range_min` say nothing, +inf that nothing was met.
 
     max_range: metres beyond which nothing counts as met; None: the scan's own.
-    The scan must be `sound`. Raises FrameRefused with the reason: `bad_scan`, `mount_not_rigid`, `no_valid_range`.
+    The scan must be `sound`. Raises FrameRefused with the reason: `bad_scan`, `no_valid_range`.
     """
-    ranges, farthest = _checked(scan, max_range)
+    ranges, farthest = np.asarray(scan.ranges, float), _farthest(scan, max_range)
     known = (ranges >= scan.range_min) & (ranges > 0)
     if not known.any():
         raise FrameRefused("no_valid_range", f"{name_of(scan)}: not one beam has a range; is the lidar covered?")
@@ -68,12 +64,9 @@ def beams_of(scan: Scan, max_range: float | None = None) -> Beams:
     return Beams(scan.T_base_sensor[:2, 3], across, np.minimum(ranges[known], farthest), at_max, farthest)
 
 
-def _checked(scan: Scan, max_range: float | None) -> tuple[NDArray[np.float64], float]:
+def _farthest(scan: Scan, max_range: float | None) -> float:
     farthest = scan.range_max if max_range is None else min(max_range, scan.range_max)
     if not 0 < farthest < np.inf:
         said = f"{name_of(scan)}: the lidar measures up to {scan.range_max:g} m; amcl.max_range must bound that"
         raise FrameRefused("bad_scan", said)
-    if not (error := geometry.rigidity_error(scan.T_base_sensor)) <= RIGID:
-        said = f"{name_of(scan)}: T_base_sensor is no rigid 4x4 motion (off by {error:.2g})"
-        raise FrameRefused("mount_not_rigid", said)
-    return np.asarray(scan.ranges, float), float(farthest)
+    return float(farthest)

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox import planar
+from stereovox.errors import StereovoxError
 from stereovox.frame import Frame, Scan
 from stereovox.products.files import replacing
 from stereovox.sources.poses import seconds_from_ns
@@ -25,11 +26,23 @@ class Track:
     stamps_ns: (N,) int64 nanoseconds, rising.
     pose_map_base: (N, 3) float64, where the robot stood in the map.
     pose_map_odom: (N, 3) float64, what turns the odometry's poses into those (the `map -> odom` of ROS).
+    refused: how many scans were left out, by reason; first_refusal: what was said of the first one.
+    Raises StereovoxError, one line, where stamps do not rise: times between them would then be looked up wrongly.
     """
 
     stamps_ns: NDArray[np.int64]
     pose_map_base: planar.Pose
     pose_map_odom: planar.Pose
+    refused: dict[str, int] = field(default_factory=dict)
+    first_refusal: str = ""
+
+    def __post_init__(self):
+        stamps_ns = np.asarray(self.stamps_ns)
+        late = np.flatnonzero(stamps_ns[1:] <= stamps_ns[:-1])
+        if len(late):
+            before, after = stamps_ns[late[0]], stamps_ns[late[0] + 1]
+            said = f"pose {late[0] + 1} at {after} ns comes after one at {before} ns"
+            raise StereovoxError(f"the times of a track must rise: {said}; leave out scans that are not in order")
 
     def correction(self, stamp_ns: int) -> planar.Pose:
         """Return pose_map_odom (3,) at a time: interpolated, and held before the first and after the last."""

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from stereovox import planar
 from stereovox.config import Config
-from stereovox.errors import ConfigError
+from stereovox.errors import ConfigError, StereovoxError
 from stereovox.maps import _grid
 from stereovox.maps.blocks import BlockPool
 from stereovox.maps.cell_format import CellFormat, CellRules
@@ -21,6 +21,9 @@ from stereovox.maps.grid_evidence import CELLS, SIDE, GridEvidence
 from stereovox.maps.occupancy import UNKNOWN, OccupancyGrid
 from stereovox.maps.percent import Percent
 from stereovox.maps.voxel_map import INDEX_LIMIT, State
+
+MOST_PICTURED = 2**29
+"""Cells of the largest picture; the map itself holds only what was seen and may reach farther."""
 
 
 class GridMap:
@@ -152,10 +155,16 @@ class GridMap:
     def occupancy(self) -> OccupancyGrid:
         """Return all known cells as per cent, in a picture just large enough; no cells at all for an empty map.
 
-        Cells are of the same state here and there (see `Percent`).
+        Cells are of the same state here and there (see `Percent`). Raises StereovoxError for more than MOST_PICTURED.
         """
         box = self._box()
         (left, bottom), (right, top) = np.zeros((2, 2), int).tolist() if box is None else box.tolist()
+        if (top - bottom) * (right - left) > MOST_PICTURED:
+            across, up = ((b - a) * self.voxel_size for a, b in ((left, right), (bottom, top)))
+            raise StereovoxError(
+                f"a map of {across:.0f} x {up:.0f} m has too many cells of {self.voxel_size:g} m for a picture; "
+                "does the odometry jump? Else use larger cells"
+            )
         picture = np.full((top - bottom, right - left), UNKNOWN, np.int8)
         n, percent = len(self._pool), self._percent
         _grid.show(self._pool.coords[:n], self._pool.values[:n], left, bottom, percent.shown, percent.lowest, picture)

@@ -41,8 +41,9 @@ def project(voxel_map: VoxelMap, heights: Heights | None = None) -> OccupancyGri
     heights: lowest and highest metres along the map's `up`, from the world's origin; a cell whose middle is between
     them marks. Without it those of the map's own `scan.heights`.
     The heights are for marking alone. A column has the largest probability of all its known cells between them: one
-    that is occupied makes it occupied, one that is neither keeps it from being free. Where nothing between them is
-    known, free cells at any other height clear it, and it has the largest probability of those. Else it is unknown.
+    that is occupied makes it occupied (a table top is not thicker), one that is neither keeps it from being free. Where
+    nothing between them is known, free cells at any other height clear it, and it has the largest probability of those.
+    Else it is unknown.
     The grid's x and y are the map's, where z is up; else the two axes that make a right-handed frame with `up`: y and z
     for x, z and x for y, and with a minus the same two swapped. Uneven cells become cubes where the floor needs it.
     Raises StereovoxError, one line, where no cell between the heights is known, or the grid were too large.

@@ -20,6 +20,7 @@ from stereovox.sources.d435 import classify
 from stereovox.sources.floor_drive import STEP_NS, Odometry, drive
 from stereovox.sources.floor_kinect import Kinect, kinect_camera
 from stereovox.sources.floor_layout import Layout
+from stereovox.sources.floor_lids import with_lids
 from stereovox.sources.floor_plan import FloorPlan, Rectangle
 from stereovox.sources.floor_rays import cast
 from stereovox.sources.floor_view import LevelView
@@ -131,9 +132,16 @@ class Floor:
         """Where the robot starts (3,), in the world of `truth`: there the odometry's world has its origin."""
         return self._poses[0].copy()
 
-    def true_grid(self, resolution: float = 0.05, heights: tuple[float, float] = (0.225, 0.225)) -> OccupancyGrid:
-        """Return a perfect map of the floor between two heights (the lidar's), in the world of `truth`."""
-        return self.plan.truth(resolution, self.start[:2], heights)
+    def true_grid(
+        self, resolution: float = 0.05, heights: tuple[float, float] = (0.225, 0.225), lids: bool = False
+    ) -> OccupancyGrid:
+        """Return a perfect map of the floor between two heights (the lidar's), in the world of `truth`.
+
+        lids: with the tops and undersides that the Kinect looks at, as a 3-D map seen from above has them: a table is
+        occupied as a whole. Without them its rim is, as beams on the floor have it.
+        """
+        grid = self.plan.truth(resolution, self.start[:2], heights)
+        return with_lids(grid, self.plan.things, heights, float(self.T_base_camera[2, 3])) if lids else grid
 
     def true_ranges(self, stamp_ns: int) -> NDArray[np.float64]:
         """Return the exact distances (N,) in metres that the lidar's beams run, inf beyond its reach."""

@@ -16,14 +16,21 @@ from stereovox.sources.d435 import beside_nearer_surface, classify, hidden_from_
 HFOV_DEG, VFOV_DEG = 57.0, 43.0
 BASELINE = 0.075
 """Metres from the infrared projector to the camera."""
+STEP, NOISE = 0.125, 0.0625
+"""Pixels of the full image: disparity comes in whole steps, after Gaussian noise of this standard deviation."""
+WIDTH = 640
 
 
-def kinect_camera(width: int = 640) -> PinholeCamera:
-    """Return the Kinect's depth camera (IST 2019, III-C), or a smaller image of the same field of view."""
-    height = round(width * 480 / 640)
+def kinect_camera(width: int = WIDTH) -> PinholeCamera:
+    """Return the Kinect's depth camera (IST 2019, III-C), or a smaller image of the same field of view.
+
+    It tells its baseline and the noise of its disparity, whole steps included, so a mapper knows how sure depth is.
+    """
+    height = round(width * 480 / WIDTH)
+    subpixel = math.hypot(NOISE, STEP / math.sqrt(12)) * width / WIDTH
     fx = 0.5 * width / math.tan(math.radians(HFOV_DEG) / 2)
     fy = 0.5 * height / math.tan(math.radians(VFOV_DEG) / 2)
-    return PinholeCamera(width, height, fx, fy, (width - 1) / 2, (height - 1) / 2, BASELINE)
+    return PinholeCamera(width, height, fx, fy, (width - 1) / 2, (height - 1) / 2, BASELINE, subpixel=subpixel)
 
 
 @dataclass(frozen=True)
@@ -37,8 +44,8 @@ class Kinect:
     """
 
     camera: PinholeCamera
-    step: float = 0.125
-    noise: float = 0.0625
+    step: float = STEP
+    noise: float = NOISE
     nearest: float = 0.8
     farthest: float = 6.0
     edge_px: int = 2
@@ -53,12 +60,12 @@ class Kinect:
         """
         random = np.random.default_rng(seed)
         # of the full image: a smaller one is a picture of it, with the same noise
-        scale = np.float32(self.camera.fx * BASELINE * 640 / self.camera.width)
+        scale = np.float32(self.camera.fx * BASELINE * WIDTH / self.camera.width)
         disparity = scale / np.asarray(true_depth_m, np.float32)
         noisy = disparity + np.float32(self.noise) * random.standard_normal(disparity.shape, np.float32)
         steps = np.maximum(np.rint(noisy / np.float32(self.step)), np.float32(0.5))
         depth = scale / (steps * np.float32(self.step))
-        own = disparity * np.float32(self.camera.width / 640)
+        own = disparity * np.float32(self.camera.width / WIDTH)
         lost = _in_shadow(own) | beside_nearer_surface(own, self.edge_px)
         lost |= on_border(own) & (random.random(disparity.shape, np.float32) < self.edge_loss)
         reason = classify(depth, self.nearest, self.farthest)

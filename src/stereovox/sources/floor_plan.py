@@ -81,9 +81,9 @@ class FloorPlan:
     def truth(self, resolution: float, inside: ArrayLike, heights: tuple[float, float] = (0.1, 1.8)) -> OccupancyGrid:
         """Return what a perfect map shows of the floor as seen from the place `inside` (2,).
 
-        Occupied: cells that a surface between `heights` crosses and that border on free ones. Free: the others that
-        can be reached from `inside`. Unknown: what is behind the surfaces. Cell corners lie at whole multiples of
-        `resolution`.
+        Occupied: cells that an upright surface between `heights` crosses and that border on free ones. Free: the others
+        that can be reached from `inside`. Unknown: what is behind the surfaces; `floor_lids` adds tops and undersides.
+        Cell corners lie at whole multiples of `resolution`.
         """
         from scipy import ndimage
 

@@ -68,7 +68,7 @@ class RobotBag:
         self._lidar, lidar_notes = self._mount_lidar(scan_frame_id)
         self._camera, camera_notes = self._mount_camera(depth_frame_id)
         self.truth: Poses | None = _truth(file, options.truth)
-        self.notes = (*scan_notes, *depth_notes, *self.where.notes, *lidar_notes, *camera_notes)
+        self.notes = (*file.notes, *scan_notes, *depth_notes, *self.where.notes, *lidar_notes, *camera_notes)
         self.scans: Sequence[Scan] = Lazy(self._scan, range(len(self._scans or ())))
         self.frames: Sequence[Frame] = Lazy(self._frame, range(len(self._depth or ())))
 

@@ -7,7 +7,11 @@ from stereovox.evaluate.grid_scores import GridScores
 from stereovox.evaluate.reproduce.chapter import Sheet
 from stereovox.evaluate.reproduce.ist.survey import Survey
 
-HEIGHTS = {"lidar": "slice at the lidar's height", "band": "0.1 to 1.8 m over the floor"}
+HEIGHTS = {
+    "lidar": "slice at the lidar's height",
+    "band": "0.1 to 1.8 m over the floor",
+    "above": "the same, with table tops",
+}
 
 
 def maps_sheet(found: Survey) -> Sheet:

@@ -28,8 +28,10 @@ from stereovox.sources.robot import Robot
 
 CELL = 0.02
 """Metres (II-B); the reference has cells of the same size."""
-HEIGHTS = {"lidar": (0.225, 0.225), "band": (0.1, 1.8)}
-"""Slices of the building that maps are compared with: what the lidar sees, and what a robot bumps into."""
+BAND = (0.1, 1.8)
+HEIGHTS = {"lidar": (0.225, 0.225), "band": BAND, "above": BAND}
+"""Slices of the building that maps are compared with: what the lidar sees, what a robot bumps into, and the same with
+the tops and undersides that a 3-D map has inside of the rims (`sources/floor_lids.py`)."""
 Step = Callable[[], None]
 
 
@@ -106,11 +108,6 @@ def survey(recording: Recording, variants: Sequence[Variant], out: Path, step: S
     )
 
 
-def steps(recording_scans: int, first_scans: int, frames: int) -> int:
-    """Return how many steps `survey` takes."""
-    return recording_scans + first_scans + frames
-
-
 def _check(robot: Robot) -> None:
     for what, there in (("lidar scans", robot.scans), ("depth images", robot.frames)):
         if not len(there):
@@ -156,6 +153,6 @@ def _of_building(
     if recording.drive is None or pose is None:
         return None
     floor = recording.drive.first if first else recording.drive.floor
-    truth = floor.true_grid(CELL, HEIGHTS[heights])
+    truth = floor.true_grid(grid.resolution, HEIGHTS[heights], lids=heights == "above")  # in the map's own cells
     laid = laid_on(grid, truth, align=False, start=pose)
     return score_laid(laid, grid.resolution, aligned=False)

@@ -68,7 +68,7 @@ def test_overrides_never_change_what_they_were_given():
     ],
 )
 def test_unknown_settings_suggest_the_nearest(name, meant):
-    refused(name, f"did you mean '{meant}'?", **{name: 1})
+    refused(name, f"did you mean '{name.rpartition('.')[0] + '.' if '.' in name else ''}{meant}'?", **{name: 1})
 
 
 @pytest.mark.parametrize("value", [20, [20, 20], [1, 2, 3, 4], "large"])

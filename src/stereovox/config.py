@@ -352,7 +352,7 @@ def _check_keys(settings: dict[str, Any], where: str, model: type[BaseModel] = C
         if key not in model.model_fields:
             if model.model_config.get("extra") == "allow":
                 continue
-            raise ConfigError(f"{where}unknown setting '{prefix}{key}'{did_you_mean(key, model.model_fields)}")
+            raise ConfigError(f"{where}unknown setting '{prefix}{key}'{did_you_mean(key, model.model_fields, prefix)}")
         section = model.model_fields[key].annotation
         if isinstance(value, dict) and isinstance(section, type) and issubclass(section, BaseModel):
             _check_keys(value, where, section, f"{prefix}{key}.")

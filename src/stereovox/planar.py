@@ -17,7 +17,8 @@ Pose = NDArray[np.float64]
 
 def wrapped(angle: ArrayLike) -> NDArray[np.float64]:
     """Return angles in radians brought into [-pi, pi)."""
-    return (np.asarray(angle, float) + np.pi) % (2 * np.pi) - np.pi
+    turned = (np.asarray(angle, float) + np.pi) % (2 * np.pi) - np.pi
+    return turned - 2 * np.pi * (turned >= np.pi)  # a hair below -pi is rounded up to pi
 
 
 def compose(pose_a_b: ArrayLike, pose_b_c: ArrayLike) -> Pose:

@@ -83,6 +83,14 @@ def test_localize_says_where_the_robot_was(bag, reference, tmp_path, capsys):
     assert result["last"][:2] == pytest.approx(found.T_world_body[-1, :2, 3], abs=1e-5)
 
 
+def test_a_start_outside_of_the_map_is_refused_and_the_fit_is_told(bag, reference, tmp_path, capsys):
+    words = ("localize", bag, reference, "--out", tmp_path / "a.tum")
+    assert "lies outside of the map" in refused(capsys, *words, "--start=900,0,0")
+    right, said = run(capsys, *words, "--start=0,0,0")
+    assert right["fit"] > 0.8
+    assert "is it the right map" not in said
+
+
 def test_grid_maps_depth_images_where_the_map_says_the_robot_was(bag, reference, tmp_path, capsys):
     out = tmp_path / "kinect.yaml"
     result, _ = run(capsys, "grid", bag, "--poses", reference, "--start=0,0,0", "--out", out)
@@ -153,8 +161,12 @@ def test_map_under_profile_ist2019_is_a_grid(bag, tmp_path, capsys):
         (("slam", DRIVE, "--out", "a.svox"), "give a name that ends in .yaml"),
         (("grid", DRIVE, "--out", "a.yaml", "--poses", "gps"), "--poses gps: give slam, odometry, or the .yaml"),
         (("grid", DRIVE, "--out", "a.yaml", "--frames", "9999:"), "picks none"),
-        (("grid", DRIVE, "--out", "a.yaml", "--set", "grid.thick=1"), "did you mean 'thickness'"),
+        (("grid", DRIVE, "--out", "a.yaml", "--set", "grid.thick=1"), "did you mean 'grid.thickness'"),
         (("localize", DRIVE, "nowhere.yaml", "--out", "a.tum"), "nowhere.yaml"),
+        (("grid", DRIVE, "--out", "a.yaml", "--poses", "odometry", "--start", "0,0,0"), "says where in a map"),
+        (("grid", DRIVE, "--out", "a.pgm", "--mode", "scale"), "mode scale has no grey for unknown cells"),
+        (("map", "sim:room", "--out", "a.yaml"), "names a floor's map"),
+        (("slam", "sim:room", "--out", "a.yaml"), "there is sim:floor"),
         (("localize", DRIVE, "nowhere.yaml", "--out", "a.tum", "--start", "1,2"), "--start 1,2: give X,Y,DEG"),
         (("simulate", "sim:floor?plan=castle", "--out", "a.bag"), "castle"),
         (("simulate", DRIVE, "--out", "a.txt"), "ends in .bag or .mcap or .db3"),

@@ -62,15 +62,43 @@ def test_position_and_steps_against_plain_loops():
 
 def test_the_best_motion_beats_all_near_it():
     random = np.random.default_rng(2)
-    here = random.normal(0, 3, (40, 2))
-    there = planar.transform((1.0, 2.0, -0.7), here) + random.normal(0, 0.3, here.shape)
+    here = random.normal(0, [3, 3, 1], (40, 3))
+    there = planar.compose((1.0, 2.0, -0.7), here) + random.normal(0, [0.3, 0.3, 0.01], here.shape)
     best = best_motion(here, there)
 
-    def cost(pose):
-        return ((planar.transform(pose, here) - there) ** 2).sum()
+    def cost(pose):  # positions, and points 0.3 m ahead of them
+        moved = planar.compose(pose, here)
+        ahead = [np.column_stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])]) for poses in (moved, there)]
+        return ((moved - there)[:, :2] ** 2).sum() + 0.3**2 * ((ahead[0] - ahead[1]) ** 2).sum()
 
-    for step in np.concatenate([np.eye(3), -np.eye(3)]) * 1e-3:
+    for step in np.concatenate([np.eye(3), -np.eye(3)]) * 1e-4:
         assert cost(best) < cost(best + step)
+
+
+def test_on_a_long_way_headings_hardly_matter():
+    random = np.random.default_rng(3)
+    wrong = TRUE + random.normal(0, [0.05, 0.05, 0.01], TRUE.shape)
+    wrong[:, 2] = 0  # the truth of a tracker without a heading
+    assert planar.wrapped(best_motion(wrong, TRUE)[2]) == pytest.approx(0, abs=0.005)
+    turned = TRUE + random.normal(0, [0.05, 0.05, 0.01], TRUE.shape) + [0, 0, 0.1]  # mounted askew
+    assert best_motion(turned, TRUE)[2] == pytest.approx(0, abs=0.005)
+
+
+@pytest.mark.parametrize("shaken", [0.0, 1e-9, 0.002])
+def test_a_robot_that_only_turns_is_laid_on_the_truth_by_its_headings(shaken):
+    random = np.random.default_rng(4)
+    turning = np.column_stack([np.zeros((101, 2)), np.linspace(-9, 9, 101)])
+    ours = planar.compose((4.0, 1.0, 2.0), turning) + random.normal(0, [shaken, shaken, 0.01], turning.shape)
+    found = trajectory_error(track(ours), truth(poses=turning))
+    assert found.motion[2] == pytest.approx(-2.0, abs=0.01)
+    assert found.yaw_rms_deg == pytest.approx(np.degrees(0.01), rel=0.3)
+    assert found.position_rms_m == pytest.approx(shaken * np.sqrt(2), abs=1e-9, rel=0.2)
+
+
+def test_one_pose_is_laid_on_another():
+    assert best_motion([[1.0, 2.0, 0.5]], [[0.0, 0.0, -0.5]]) == pytest.approx(
+        planar.compose((0, 0, -0.5), planar.inverse((1.0, 2.0, 0.5)))
+    )
 
 
 def test_poses_without_truth_are_left_out_and_counted():

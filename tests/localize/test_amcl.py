@@ -1,4 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
+import weakref
 from dataclasses import replace
 from itertools import pairwise
 
@@ -9,6 +10,7 @@ from stereovox import load_config, planar
 from stereovox.errors import ConfigError, FrameRefused, MapFileError, SourceError
 from stereovox.frame import Scan
 from stereovox.localize.amcl import Localiser, localise
+from stereovox.localize.amcl_clock import Clock
 from stereovox.localize.scan_beams import beams_of
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.sources.floor_plan import FloorPlan, block
@@ -24,6 +26,8 @@ ANGLES = np.radians(np.arange(-120, 121, 4.0))
 MOUNT = planar.lifted((0.15, 0.0, 0.3))
 ODOM = np.array([-4.0, 7.0, 2.0])
 SMALL = {"amcl.particles_max": 3000, "amcl.particles_min": 100, "amcl.candidates": 10}
+
+SOME_SCAN = Scan(np.ones(3, np.float32), 0.0, 0.1, 0.02, 5.0, np.eye(4))
 
 
 def seen(pose, odom, n, rng, **changes):
@@ -212,6 +216,94 @@ def test_a_track_leaves_refused_scans_out(driven):
     track = localise(GRID, mixed, load_config(**SMALL), start=poses[0], progress=done.append)
     assert track.stamps_ns.tolist() == [*range(10), 11]
     assert done == list(range(1, 14))
+    assert track.refused == {"unreadable": 1, "no_pose": 1}
+    assert "unreadable" in track.first_refusal
+    sound = localise(GRID, scans[:5], load_config(**SMALL), start=poses[0])
+    assert (sound.refused, sound.first_refusal) == ({}, "")
+
+
+def stamped(scans, stamps):
+    return [replace(scan, stamp_ns=stamp_ns) for scan, stamp_ns in zip(scans, stamps, strict=True)]
+
+
+@pytest.mark.parametrize("late", [5, 3, -(10**15)])
+def test_scans_that_come_too_late_are_refused_and_change_nothing(driven, late):
+    poses, _, scans = driven
+    one_late = [*scans[:6], replace(scans[3], stamp_ns=late), *scans[6:25]]
+    found = localise(GRID, one_late, load_config(**SMALL), poses[0], seed=2)
+    expected = localise(GRID, scans[:25], load_config(**SMALL), poses[0], seed=2)
+    assert np.array_equal(found.stamps_ns, expected.stamps_ns)
+    assert np.array_equal(found.pose_map_base, expected.pose_map_base)
+    assert found.refused == {"not_in_order": 1}
+    assert "is not later than the scan before" in found.first_refusal
+
+
+def test_one_stamp_from_the_future_ends_nothing(driven):
+    poses, _, scans = driven
+    stamps = np.arange(40)
+    stamps[20] = 10**18
+    found = localise(GRID, stamped(scans[:40], stamps.tolist()), load_config(**SMALL), poses[0])
+    kept = [*range(20), *range(24, 40)]
+    assert found.stamps_ns.tolist() == kept
+    assert found.refused == {"not_in_order": 4}
+    assert off(found.pose_map_base, poses[kept])[-3:].max() < 0.2
+
+
+@pytest.mark.parametrize("before", [1, 7])
+def test_where_the_clock_is_set_back_the_majority_is_believed(before):
+    clock = Clock()
+    for stamp_ns in range(100, 100 + before):
+        assert clock.take(replace(SOME_SCAN, stamp_ns=stamp_ns)) == 0
+    patience = max(before, 3)
+    for stamp_ns in range(patience):
+        with pytest.raises(FrameRefused):
+            clock.take(replace(SOME_SCAN, stamp_ns=stamp_ns))
+    wrong = [clock.take(replace(SOME_SCAN, stamp_ns=patience + stamp_ns)) for stamp_ns in (0, 1, 50)]
+    assert wrong == [before, 0, 0]
+
+
+def test_late_scans_are_only_believed_where_they_rise_in_a_row():
+    clock = Clock()
+    clock.take(replace(SOME_SCAN, stamp_ns=1000))
+    stuck = [7] * (20)
+    with_good_ones = [stamp_ns for n in range(20) for stamp_ns in (n, 1001 + n)]
+    for stamp_ns in stuck + with_good_ones:
+        if stamp_ns > 1000:
+            assert clock.take(replace(SOME_SCAN, stamp_ns=stamp_ns)) == 0
+            continue
+        with pytest.raises(FrameRefused) as caught:
+            clock.take(replace(SOME_SCAN, stamp_ns=stamp_ns))
+        assert caught.value.reason == "not_in_order"
+
+
+def test_a_refused_scan_does_not_set_the_clock(driven):
+    poses, _, scans = driven
+    dark = replace(scans[1], ranges=np.full(61, np.nan, np.float32), stamp_ns=10**18)
+    found = localise(
+        GRID, [scans[0], dark, replace(dark, fault="no_pose"), *scans[1:5]], load_config(**SMALL), poses[0]
+    )
+    assert found.stamps_ns.tolist() == list(range(5))
+
+
+def test_the_way_does_not_keep_the_particles(driven, monkeypatch):
+    poses, _, scans = driven
+    clouds = []
+
+    def watched(self, scan):
+        estimate = add(self, scan)
+        clouds.append(weakref.ref(estimate.particles))
+        return estimate
+
+    add = Localiser.add
+    monkeypatch.setattr(Localiser, "add", watched)
+    alive = []
+    localise(GRID, scans[:30], load_config(**SMALL), poses[0], progress=lambda _: alive.append(clouds_alive(clouds)))
+    assert len({id(cloud) for cloud in clouds}) > 10
+    assert max(alive) <= 3
+
+
+def clouds_alive(clouds):
+    return len({id(cloud()) for cloud in clouds if cloud() is not None})
 
 
 def test_without_a_good_scan_there_is_no_track(driven):

@@ -120,9 +120,10 @@ def test_the_beam_model_is_table_6_1_by_slow_rays():
 @pytest.mark.parametrize("expected", [0.1, 0.7, 2.0, 2.9, 3.0])
 def test_the_beam_model_is_a_distribution(expected):
     z = (np.arange(300_000) + 0.5) * 1e-5
-    density = beam_likelihood(z, False, expected, 3.0, CONFIG)
-    whole = density.sum() * 1e-5 + float(beam_likelihood(3.0, True, expected, 3.0, CONFIG))
-    assert whole == pytest.approx(0.6 + 0.2 + 0.05 + 0.15, abs=1e-4)
+    config = AmclConfig(**{**CONFIG.model_dump(), "z_hit": 0.95, "z_short": 0.1})  # of sum 1.25: not as printed
+    density = beam_likelihood(z, False, expected, 3.0, config)
+    whole = density.sum() * 1e-5 + float(beam_likelihood(3.0, True, expected, 3.0, config))
+    assert whole == pytest.approx(1, abs=1e-4)
 
 
 def test_each_part_of_the_beam_model_is_that_of_the_book():
@@ -137,8 +138,23 @@ def test_each_part_of_the_beam_model_is_that_of_the_book():
     )
     assert at(1.5, z_short=1) == pytest.approx(0.4 * math.exp(-0.4 * 1.5) / (1 - math.exp(-0.4 * 2.0)))
     assert at(2.1, z_short=1) < 1e-9
-    assert at(3.0, z_max=0.7) == pytest.approx(0.7, abs=1e-6)
+    assert at(3.0, z_max=0.7, z_rand=0.3) == pytest.approx(0.7, abs=1e-6)
     assert at(1.0, z_rand=1) == pytest.approx(1 / 3)
+
+
+def test_the_beam_model_takes_the_shares_in_proportion():
+    z, at_max = np.append(np.linspace(0.1, 2.9, 15), 3.0), np.arange(16) == 15
+    half = {name: getattr(CONFIG, name) / 2 for name in ("z_hit", "z_short", "z_max", "z_rand")}
+    halved = AmclConfig(**{**CONFIG.model_dump(), **half})
+    whole, half_as_much = (beam_likelihood(z, at_max, 2.0, 3.0, config) for config in (CONFIG, halved))
+    assert np.allclose(whole, half_as_much, rtol=1e-12, atol=0)
+
+
+def test_the_field_model_knows_two_shares_only():
+    others = AmclConfig(**{**CONFIG.model_dump(), "z_short": 0.9, "z_max": 0.9})
+    beams, poses = beams_of(some_scan(np.random.default_rng(5))), some_poses(9, np.random.default_rng(6))
+    found = [FieldModel(some_map(), config).log_likelihood(poses, beams) for config in (CONFIG, others)]
+    assert np.array_equal(*found)
 
 
 @pytest.mark.parametrize("model", [FieldModel, BeamModel])

@@ -259,6 +259,9 @@ def complaint_about(path):
 def test_missing_files_are_told(tmp_path):
     with pytest.raises(MapFileError, match=r"map\.yaml: no such file"):
         read_map_server(tmp_path / "map.yaml")
+    with pytest.raises(MapFileError, match=r"map\.pgm: no such file"):
+        read_map_server(tmp_path / "map.pgm")
+    (tmp_path / "map.pgm").write_bytes(b"P5 1 1 255 a")
     with pytest.raises(MapFileError, match=r"map\.pgm: no map\.yaml beside it"):
         read_map_server(tmp_path / "map.pgm")
     (tmp_path / "map.yaml").write_text("a: 1\n")

@@ -58,10 +58,13 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Load both maps, compare them, tell and report."""
+    from stereovox.maps.store import is_map
+
     kinds = {dimensions(path) for path in (arguments.map, arguments.truth)}
     if len(kinds) == 2:
         space = arguments.map if dimensions(arguments.map) == 3 else arguments.truth
-        cure = command_line("export", space, "floor.yaml")
+        words = ("export", space) if is_map(space) else ("grid", space, "--out")
+        cure = command_line(*words, "floor.yaml")
         raise StereovoxError(f"{space}: no floor's map, the other one is; make one of it with: {cure}")
     return JUDGED[kinds.pop()](arguments)
 

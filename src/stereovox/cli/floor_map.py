@@ -71,4 +71,5 @@ def _tell(result: dict[str, Any]) -> None:
         (x0, y0), (x1, y1) = result["bounds"]
         say(f"known from ({x0:g}, {y0:g}) to ({x1:g}, {y1:g}) m")
     say(", ".join(f"{thousands(result[state])} {state}" for state in ("occupied", "free", "tentative", "unknown")))
-    say(f"free: p < {result['free_below']:g}; occupied: p > {result['occupied_above']:g}")
+    if result["tentative"]:
+        say(f"free: p < {result['free_below']:g}; occupied: p > {result['occupied_above']:g}")

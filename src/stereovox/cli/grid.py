@@ -12,13 +12,21 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stereovox.cli.localize import add_start, localised, parse_start
-from stereovox.cli.robots import GRID_ENDINGS, GRID_FILES, add_robot, check_file, opened, say_refused, settings_of
+from stereovox.cli.localize import add_start, check_start, localised, parse_start, say_fit
+from stereovox.cli.robots import (
+    GRID_ENDINGS,
+    GRID_FILES,
+    add_robot,
+    check_file,
+    opened,
+    picture_line,
+    say_refused,
+    settings_of,
+)
 from stereovox.cli.settings import overrides
 from stereovox.cli.slam import mapped
 from stereovox.cli.terminal import (
     cells_line,
-    command_line,
     interrupt_between_steps,
     milliseconds,
     say,
@@ -65,13 +73,17 @@ def run(arguments: Namespace) -> dict[str, Any]:
     from stereovox.products.map_server import write_map_server
 
     out = check_file(arguments.out, GRID_ENDINGS)
+    if arguments.mode == "scale" and out.suffix.lower() == ".pgm":
+        raise StereovoxError(f"--out {out}: mode scale has no grey for unknown cells; name a .yaml or .png")
     start, config = parse_start(arguments.start), settings_of(arguments)
     robot = opened(arguments.source)
     seen, count = _chosen(robot, arguments.use, arguments.frames)
     how = _poses(arguments.poses, robot, arguments.resume)
+    if start is not None and how in ("slam", "odometry"):
+        raise StereovoxError(f"--start {arguments.start}: says where in a map; give --poses MAP.yaml, or leave it out")
     mapper = _mapper(config, arguments.resume, any_size="voxel_size" not in overrides(arguments))
     say_about_compiling()
-    track = _track(robot, how, config, start)
+    track = _track(robot, how, config, arguments.start)
     reports: list[UpdateReport] = []
     try:
         _add_all(mapper, (track.corrected(one) if track else one for one in seen), count, reports)
@@ -117,10 +129,11 @@ def _poses(how: str | None, robot: Robot, resume: str | None) -> str:
     return how
 
 
-def _track(robot: Robot, how: str, config: Config, start: Any) -> Track | None:
-    """Return the robot's way in the map; None: as its odometry has it."""
+def _track(robot: Robot, how: str, config: Config, text: str | None) -> Track | None:
+    """Return the robot's way in the map; None: as its odometry has it. text: what --start says."""
     from stereovox.products.map_server import read_map_server
 
+    start = parse_start(text)
     if how == "odometry":
         return None
     if how == "slam":
@@ -129,8 +142,11 @@ def _track(robot: Robot, how: str, config: Config, start: Any) -> Track | None:
         say_refused(found.refused)
         return found.track
     say(f"finding the robot's way in {how}")
-    track = localised(robot, read_map_server(how), config, start)
+    floor = read_map_server(how)
+    check_start(start, floor, text)
+    track = localised(robot, floor, config, start)
     say_refused(track.refused, track.first_refusal)
+    say_fit(robot, floor, track)
     return track
 
 
@@ -165,6 +181,7 @@ def _finished(mapper: GridMapper, reports: list[UpdateReport], out: Path, mode: 
         say(f"  {number} x {reason}, first: {next(one.detail for one in reports if one.refused == reason)}")
     say(f"a reading: scan {milliseconds(result['depth_ms'])}; map {milliseconds(result['integrate_ms'])}")
     say(cells_line(result))
-    yaml = out.with_suffix(".yaml")
-    say(f"saved in {yaml}; look at it with: {command_line('picture', yaml, f'{out.stem}.png')}")
+    say(f"saved in {out.with_suffix('.yaml')}; look at it with: {picture_line(out)}")
+    if not result["occupied"] and not result["free"]:
+        say("note: no cell is known yet: one look decides nothing; map more readings")
     return result

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from stereovox.sources.robot import Robot
 
 TEXT, BAGS = (".tum", ".txt"), (".bag", ".mcap", ".db3")
+DOUBTFUL = 0.6
+"""Share of beams that fit the map below which the way may be wrong."""
 EXAMPLE = "stereovox localize floor.bag reference.yaml --out way.tum"
 
 
@@ -51,16 +53,18 @@ def run(arguments: Namespace) -> dict[str, Any]:
 
     out, config = check_file(arguments.out, (*TEXT, *BAGS)), settings_of(arguments)
     start, grid = parse_start(arguments.start), read_map_server(arguments.map)
+    check_start(start, grid, arguments.start)
     robot = opened(arguments.source)
     say_about_compiling()
     track = localised(robot, grid, config, start)
     _save(track, out)
     say_refused(track.refused, track.first_refusal)
     x, y, yaw = track.pose_map_base[-1]
+    fit = say_fit(robot, grid, track)
     say(f"{len(track.stamps_ns)} poses saved in {out}")
     say(f"the robot ended at x {x:.2f} m, y {y:.2f} m, {np.degrees(yaw):.0f} degrees")
     refused = {"scans_refused": sum(track.refused.values()), "refused": dict(track.refused)}
-    found = {"poses": len(track.stamps_ns), "last": [x, y, float(np.degrees(yaw))]}
+    found = {"poses": len(track.stamps_ns), "last": [x, y, float(np.degrees(yaw))], "fit": fit}
     return {**found, **refused, **way_error(track, robot)}
 
 
@@ -90,6 +94,30 @@ def parse_start(text: str | None) -> np.ndarray | None:
     if not np.isfinite([x, y, degrees]).all():
         raise StereovoxError(f"--start {text}: give finite numbers")
     return np.array([x, y, radians(degrees)])
+
+
+def check_start(start: np.ndarray | None, grid: OccupancyGrid, text: str | None) -> None:
+    """Raise StereovoxError for a start outside of the map."""
+    if start is None:
+        return
+    row, column = grid.indices(start[None, :2])[0]
+    rows, columns = grid.cells.shape
+    if not (0 <= row < rows and 0 <= column < columns):
+        (x0, y0), (x1, y1) = grid.centres([0, rows - 1], [0, columns - 1])
+        raise StereovoxError(
+            f"--start {text}: lies outside of the map, from ({x0:.1f}, {y0:.1f}) to ({x1:.1f}, {y1:.1f}) m"
+        )
+
+
+def say_fit(robot: Robot, grid: OccupancyGrid, track: Track) -> float | None:
+    """Say how well the scans fit the map along the way, and doubt it where they do not; return the share of beams."""
+    from stereovox.localize.fit import NEAR, fit_share
+
+    fit = fit_share(grid, robot.scans, track)
+    if fit is not None:
+        doubt = "; is it the right map, and the right start?" if fit < DOUBTFUL else ""
+        say(f"{100 * fit:.0f} % of the beams end within {NEAR:g} m of an obstacle of the map{doubt}")
+    return fit
 
 
 def localised(robot: Robot, grid: OccupancyGrid, config: Config, start: np.ndarray | None) -> Track:

@@ -12,6 +12,7 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from stereovox.cli.robots import GRID_FILES
 from stereovox.cli.settings import add_settings, overrides
 from stereovox.cli.terminal import (
     cells_line,
@@ -113,6 +114,10 @@ def _check_target(out: Path, resume: bool) -> None:
     """Find out before the work, not after it, that the map could not be saved."""
     from stereovox.maps.store import check_target, is_map
 
+    if out.suffix.lower() in GRID_FILES:
+        raise StereovoxError(
+            f"--out {out}: names a floor's map; end the name of a map in space in .svox, or leave it bare"
+        )
     check_target(out)
     if resume and not is_map(out):
         raise StereovoxError(f"{out}: no map to go on with; leave --resume out")

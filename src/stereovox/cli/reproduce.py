@@ -45,6 +45,8 @@ def run(arguments: Namespace) -> dict[str, Any]:
 def _tell(result: dict[str, Any]) -> None:
     failed = result["does_not_hold"]
     say(f"{result['holds']} claims hold, {len(failed)} do not, in {result['seconds']:.0f} s")
+    if result["quick"] and failed:
+        say("these were few frames (--quick): what does not hold here may hold of the whole run")
     for text in failed:
         say(f"does not hold: {text}")
     for name, path in result["files"].items():

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from stereovox.cli.recordings import check_folder
 from stereovox.cli.settings import add_settings, overrides
-from stereovox.cli.terminal import say
+from stereovox.cli.terminal import command_line, say
 from stereovox.errors import StereovoxError
 
 if TYPE_CHECKING:
@@ -68,6 +68,12 @@ def way_error(track: Track, robot: Robot) -> dict[str, Any]:
     off = f"{100 * error.position_rms_m:.1f} cm (RMS) and {error.yaw_rms_deg:.2f} degrees"
     say(f"laid on the true way as a whole, it is off by {off}")
     return {"position_rms_m": error.position_rms_m, "yaw_rms_deg": error.yaw_rms_deg}
+
+
+def picture_line(out: Path) -> str:
+    """Return the command that draws the map at `out`, whose own cells may lie in a .png of its name."""
+    name = f"{out.stem}-picture.png" if out.with_suffix(".png").exists() else f"{out.stem}.png"
+    return command_line("picture", out.with_suffix(".yaml"), name)
 
 
 def check_file(out: str, endings: Iterable[str], option: str = "--out") -> Path:

@@ -12,8 +12,17 @@ from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
-from stereovox.cli.robots import GRID_ENDINGS, add_robot, check_file, opened, say_refused, settings_of, way_error
-from stereovox.cli.terminal import command_line, progress_bar, say, say_about_compiling
+from stereovox.cli.robots import (
+    GRID_ENDINGS,
+    add_robot,
+    check_file,
+    opened,
+    picture_line,
+    say_refused,
+    settings_of,
+    way_error,
+)
+from stereovox.cli.terminal import progress_bar, say, say_about_compiling
 from stereovox.errors import MissingExtra, StereovoxError
 
 if TYPE_CHECKING:
@@ -27,7 +36,12 @@ EXAMPLE = "stereovox slam floor.bag --out reference.yaml"
 def add_arguments(parser: ArgumentParser) -> None:
     """Declare the options."""
     add_robot(parser)
-    parser.add_argument("--out", required=True, metavar="MAP", help="map_server files to write, for example floor.yaml")
+    parser.add_argument(
+        "--out",
+        required=True,
+        metavar="MAP",
+        help="map_server files to write, for example floor.yaml; floor.tum beside it holds the way",
+    )
     parser.add_argument("--relations", metavar="FILE", help="true relations between places, to score the way with")
 
 
@@ -47,8 +61,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
     write_map_server(found.grid, out)
     found.track.save(out.with_suffix(".tum"))
     result = {**_told(robot, found, seconds), **_scored(found, arguments.relations)}
-    say(f"saved in {out}, the way in {out.with_suffix('.tum')}; look at it with: "
-        f"{command_line('picture', out.with_suffix('.yaml'), f'{out.stem}.png')}")  # fmt: skip
+    say(f"saved in {out}, the way in {out.with_suffix('.tum')}; look at it with: {picture_line(out)}")
     return result
 
 

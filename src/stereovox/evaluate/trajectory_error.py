@@ -50,8 +50,9 @@ class TrajectoryError:
 def trajectory_error(track: Track, truth: Poses, align: bool = True, step_m: float = 1.0) -> TrajectoryError:
     """Compare a track with true poses of the robot's base.
 
-    align: move the whole track first, rigidly and without a scale, to where it lies best on the true one (`best_motion`);
-    for SLAM, whose map stands in a frame of its own. step_m: metres of the true way over which motions are compared.
+    align: move the whole track first, rigidly and without a scale, to where it lies best on the true poses
+    (`best_motion`); for SLAM, whose map stands in a frame of its own.
+    step_m: metres of the true way over which motions are compared.
     Raises StereovoxError where the truth knows no time of the track.
     """
     true, known = true_poses(track.stamps_ns, truth)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from stereovox._jit import kernel
+from stereovox._jit import cell, kernel
 
 ZERO, ONE = np.float32(0), np.float32(1)
 FACING = np.float32(0.05)
@@ -53,6 +53,45 @@ def search(points, guess, score, cell, side, side_yaw, step_yaw, slope, slope_ya
     return top
 
 
+@cell
+def _on_line(dx, dy, ax, ay, nx, ny, narrow, normal, gradient):
+    """Add what a point off a line by dx, dy says; return its squared distance from it and its weight.
+
+    ax, ay: from the robot to the point. nx, ny: the line's normal.
+    """
+    r = nx * dx + ny * dy
+    w = 1.0 / (1.0 + r * r * narrow)
+    w *= w
+    jt = -nx * ay + ny * ax
+    normal[0, 0] += w * nx * nx
+    normal[0, 1] += w * nx * ny
+    normal[1, 1] += w * ny * ny
+    normal[0, 2] += w * nx * jt
+    normal[1, 2] += w * ny * jt
+    normal[2, 2] += w * jt * jt
+    gradient[0] += w * nx * r
+    gradient[1] += w * ny * r
+    gradient[2] += w * jt * r
+    return r * r, w
+
+
+@cell
+def _at_point(dx, dy, ax, ay, point_weight, narrow, normal, gradient):
+    """Add what a point off another one by dx, dy says; return its squared distance from it and its weight."""
+    square = dx * dx + dy * dy
+    w = 1.0 / (1.0 + square * narrow)
+    w *= w * point_weight
+    normal[0, 0] += w
+    normal[1, 1] += w
+    normal[0, 2] += -w * ay
+    normal[1, 2] += w * ax
+    normal[2, 2] += w * (ax * ax + ay * ay)
+    gradient[0] += w * dx
+    gradient[1] += w * dy
+    gradient[2] += w * (ax * dy - ay * dx)
+    return square, w
+
+
 @kernel
 def refine(points, views, near, lines, cell, sigma, point_weight, prior, information, iterations, pose, normal, cost):
     """Move `pose` (3,) to where the points lie on the lines, and near `prior`; return how many points are on lines.
@@ -90,41 +129,14 @@ def refine(points, views, near, lines, cell, sigma, point_weight, prior, informa
             if nx * vx + ny * vy < FACING:
                 continue
             if lines[slot, 6] > ZERO:
-                dx, dy = x - lines[slot, 2], y - lines[slot, 3]
-                r = nx * dx + ny * dy
-                w = 1.0 / (1.0 + r * r * narrow)
-                w *= w
-                jt = -nx * ay + ny * ax
-                normal[0, 0] += w * nx * nx
-                normal[0, 1] += w * nx * ny
-                normal[1, 1] += w * ny * ny
-                normal[0, 2] += w * nx * jt
-                normal[1, 2] += w * ny * jt
-                normal[2, 2] += w * jt * jt
-                gradient[0] += w * nx * r
-                gradient[1] += w * ny * r
-                gradient[2] += w * jt * r
-                squares += w * r * r
-                weights += w
-                if r * r < sigma * sigma:
-                    on += 1
+                square, w = _on_line(x - lines[slot, 2], y - lines[slot, 3], ax, ay, nx, ny, narrow, normal, gradient)
             else:
                 dx, dy = x - lines[slot, 0], y - lines[slot, 1]
-                square = dx * dx + dy * dy
-                w = 1.0 / (1.0 + square * narrow)
-                w *= w * point_weight
-                normal[0, 0] += w
-                normal[1, 1] += w
-                normal[0, 2] += -w * ay
-                normal[1, 2] += w * ax
-                normal[2, 2] += w * (ax * ax + ay * ay)
-                gradient[0] += w * dx
-                gradient[1] += w * dy
-                gradient[2] += w * (ax * dy - ay * dx)
-                squares += w * square
-                weights += w
-                if square < sigma * sigma:
-                    on += 1
+                square, w = _at_point(dx, dy, ax, ay, point_weight, narrow, normal, gradient)
+            squares += w * square
+            weights += w
+            if square < sigma * sigma:
+                on += 1
         for a in range(3):
             for b in range(a):
                 normal[a, b] = normal[b, a]

@@ -60,14 +60,14 @@ class Localiser:
 
     start: (3,) x, y, yaw where the robot is at the first scan, good to `amcl.start_std`; None: it may be anywhere.
     seed: of all random numbers; the same scans then give the same estimates.
-    refused: how many scans were refused, by reason. clock: of the scans; `clock.set_back` tells how often it jumped back.
+    refused: how many scans were refused, by reason; `not_in_order` are also those that later ones show to be.
     Raises MapFileError for a map without free or occupied cells, ConfigError for a start that is no pose.
     """
 
     def __init__(self, grid: OccupancyGrid, config: Config, start: ArrayLike | None = None, seed: int = 0):
         self.config, self._rigidity = config.amcl, config.pose_rigidity_tolerance
         self.refused: Counter[str] = Counter()
-        self.clock = Clock()
+        self._clock = Clock()
         self._rng = np.random.default_rng(seed)
         self._floor = FreeFloor(grid)
         self._sensor = MODELS[self.config.model](grid, self.config)
@@ -81,17 +81,19 @@ class Localiser:
     def add(self, scan: Scan) -> Estimate:
         """Return where the robot is after one more scan.
 
-        Raises FrameRefused, and changes nothing but `refused`, where the scan cannot be trusted (`sound`, `beams_of`), or
-        is not later than the one before (`Clock`).
+        Raises FrameRefused, and changes nothing but what is counted, where the scan cannot be trusted (`sound`,
+        `beams_of`) or is not later than the one before (`Clock`).
         """
         start = perf_counter()
         try:
             scan = sound(scan, self._rigidity)
             beams = beams_of(scan, self.config.max_range)
-            self.clock.take(scan)
+            wrong = self._clock.take(scan)
         except FrameRefused as refusal:
             self.refused[refusal.reason] += 1
             raise
+        if wrong:
+            self.refused["not_in_order"] += wrong
         pose_odom_base = scan.pose_world_base
         if due := self._far_enough(pose_odom_base):
             self._update(pose_odom_base, beams)
@@ -185,7 +187,7 @@ def localise(
     start, seed: as in `Localiser`; progress: called with the number of scans done.
     Where the particles disagree, the way is that of the odometry, with a drift in between those of the sure poses
     before and after; before the first sure pose it has that one's.
-    Where the clock was set back, what lies after its new time is taken out of the way, and counted as `clock_set_back`.
+    Scans that later ones show to have a wrong stamp (`Clock`) are taken out of the way again, and counted too.
     Raises what `Localiser` raises, and SourceError where not one scan can be trusted.
     """
     localiser, way, first_refusal = Localiser(grid, config, start, seed), _Way(), ""
@@ -199,8 +201,7 @@ def localise(
     if not way.stamps_ns:
         said = f"every one was refused, the first: {first_refusal}" if first_refusal else "there are none"
         raise SourceError(f"no scan to localise by: {said}")
-    taken_out = {"clock_set_back": way.taken_out} if way.taken_out else {}
-    return way.track({**localiser.refused, **taken_out}, first_refusal)
+    return way.track(dict(localiser.refused), first_refusal)
 
 
 class _Way:
@@ -208,17 +209,15 @@ class _Way:
 
     def __init__(self):
         self.stamps_ns: list[int] = []
-        self.taken_out = 0
         self._base: list[planar.Pose] = []
         self._odom: list[planar.Pose] = []
         self._sure: list[bool] = []
 
     def add(self, stamp_ns: int, estimate: Estimate) -> None:
-        """Take in the next estimate; earlier ones that claim to be as late or later go (`Clock`)."""
+        """Take in the next estimate; earlier ones of the same time or later go (`Clock`)."""
         while self.stamps_ns and self.stamps_ns[-1] >= stamp_ns:
             for kept in (self.stamps_ns, self._base, self._odom, self._sure):
                 kept.pop()
-            self.taken_out += 1
         self.stamps_ns.append(stamp_ns)
         self._base.append(estimate.pose_map_base)
         self._odom.append(estimate.pose_map_odom)

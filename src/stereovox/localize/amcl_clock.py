@@ -1,38 +1,46 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether scans come in order of time, though a single stamp may be wrong."""
+"""Whether scans come in order of time, though a few stamps may be wrong."""
 
 from __future__ import annotations
+
+from array import array
+from bisect import bisect_left
 
 from stereovox.errors import FrameRefused
 from stereovox.frame import Scan
 from stereovox.integrate.scan_check import name_of
 
-LATE_IN_A_ROW = 10
-"""So many scans that come too late, each later than the one before, and the stamp before them was the wrong one."""
+LATE = 3
+"""Scans in a row that are too late, and in order among themselves, before it is asked who is right."""
 
 
 class Clock:
-    """Refuses scans that are not later than the last one, until so many in a row agree that the clock was set back.
+    """The stamps of the scans so far, rising.
 
-    set_back: how often that was found, and a scan taken in whose stamp is not later than that of the one before.
+    A lone stamp in the future would make all later scans too late. So once more scans in a row are late than there are
+    scans that they would have to come before, it is those before that had the wrong stamps (as `slam_way.Way`).
     """
 
     def __init__(self):
-        self.set_back = 0
-        self._last_ns: int | None = None
-        self._late_ns: int | None = None
+        self._stamps_ns = array("q")
+        self._late, self._late_ns = 0, 0
+
+    def take(self, scan: Scan) -> int:
+        """Go on to the time of a scan; return how many of the last scans turn out to have had a wrong stamp.
+
+        Raises FrameRefused with the reason `not_in_order` where the scan is not later than the one before.
+        """
+        ahead = len(self._stamps_ns) - bisect_left(self._stamps_ns, scan.stamp_ns)
+        if ahead:
+            self._count_late(scan, ahead)
+            del self._stamps_ns[-ahead:]
+        self._stamps_ns.append(scan.stamp_ns)
         self._late = 0
+        return ahead
 
-    def take(self, scan: Scan) -> None:
-        """Go on to the stamp of a scan. Raises FrameRefused with the reason `not_in_order` where it does not rise."""
-        if self._last_ns is not None and scan.stamp_ns <= self._last_ns:
-            self._take_late(scan, self._last_ns)
-        self._last_ns, self._late_ns, self._late = scan.stamp_ns, None, 0
-
-    def _take_late(self, scan: Scan, last_ns: int) -> None:
-        rises = self._late_ns is None or scan.stamp_ns > self._late_ns
-        self._late_ns, self._late = scan.stamp_ns, self._late + 1 if rises else 1
-        if self._late <= LATE_IN_A_ROW:
-            said = f"at {scan.stamp_ns} ns, is not later than the scan before it at {last_ns} ns"
+    def _count_late(self, scan: Scan, ahead: int) -> None:
+        self._late = self._late + 1 if self._late and scan.stamp_ns > self._late_ns else 1
+        self._late_ns = scan.stamp_ns
+        if self._late <= max(ahead, LATE):
+            said = f"at {scan.stamp_ns} ns, is not later than the scan before it at {self._stamps_ns[-1]} ns"
             raise FrameRefused("not_in_order", f"{name_of(scan)}: {said}; give scans in order of time")
-        self.set_back += 1

@@ -22,9 +22,10 @@ from stereovox.integrate.beams import make_beams
 from stereovox.integrate.scan_check import trusted
 from stereovox.localize.slam_front import Follower
 from stereovox.localize.slam_graph import optimised
-from stereovox.localize.slam_keyframe import Edge, Keyframe, step_edges
+from stereovox.localize.slam_keyframe import Edge, Keyframe, in_map, step_edges
 from stereovox.localize.slam_loops import LoopFinder
 from stereovox.localize.slam_refine import patch_edges
+from stereovox.localize.slam_way import Way
 from stereovox.localize.track import Track
 from stereovox.maps.grid_map import GridMap
 from stereovox.maps.occupancy import OccupancyGrid
@@ -43,8 +44,9 @@ JUMP, JUMP_TURN = 0.05, 0.01
 class SlamResult:
     """A robot's way, and the map of what it saw.
 
-    track: the pose of every scan. grid: the map, made of the keyframes. keyframes: with their final poses.
-    closures: loops closed. edges: those, between keyframes. refused: scans by the reason why they could not be used.
+    track: the pose of every scan that was not refused. grid: the map, made of the keyframes. keyframes: with their
+    final poses. closures: loops closed. edges: those, between keyframes. refused: scans by the reason why they could
+    not be used.
     """
 
     track: Track
@@ -62,7 +64,8 @@ class SlamResult:
 class Slam:
     """Takes scans in order of time, with the odometry as pose; the map's frame is the odometry's at the first scan.
 
-    refused: scans by the reason why they could not be used; they change nothing.
+    refused: scans by the reason why they could not be used; they change nothing. `not_in_order`: those not later than
+    the one before, and those whose stamp most scans after them show to be wrong; these are only left out of the track.
     """
 
     def __init__(self, config: Config):
@@ -70,10 +73,7 @@ class Slam:
         self._config = config
         self._follower = Follower(config.slam)
         self._loops = LoopFinder(config.slam, self._follower.keyframes)
-        self._stamps: list[int] = []
-        self._odometry: list[planar.Pose] = []
-        self._since: list[planar.Pose] = []
-        self._keyframe: list[int] = []
+        self._way = Way()
 
     @property
     def pose(self) -> planar.Pose:
@@ -89,15 +89,16 @@ class Slam:
         """Take the next scan; return (3,) pose_map_base as known by now. Later loops may move it."""
         try:
             scan = trusted(scan, self._config)
-            if self._stamps and scan.stamp_ns <= self._stamps[-1]:
-                raise FrameRefused("not_in_order", f"{scan.name}: is not later than the scan before")
         except FrameRefused as refused:
-            self.refused[refused.reason] = self.refused.get(refused.reason, 0) + 1
+            self._refuse(refused.reason)
+            return self.pose
+        wrong = self._way.room(scan.stamp_ns)
+        self._refuse("not_in_order", 1 if wrong is None else wrong)
+        if wrong is None:
             return self.pose
         is_key = self._follower.add(scan)
-        if self.keyframes:
-            self._remember(scan)
-        if is_key and self._loops.update() and self._is_off():
+        self._way.add(scan, self.pose, self.keyframes)
+        if is_key and any(_off(self.keyframes, edge) for edge in self._loops.update()):
             self._solve(self._loops.edges, CLOSURE_TRUST)
         return self.pose
 
@@ -115,16 +116,12 @@ class Slam:
             if progress:
                 progress(done, rounds, "polishing the map")
             self._solve(list(patch_edges(self.keyframes, self._config.slam)), PATCH_TRUST)
-        return SlamResult(self._track(), self._grid(), self.keyframes, self._loops.edges, self.refused)
+        track = self._way.track(self.keyframes)
+        return SlamResult(track, self._grid(), self.keyframes, self._loops.edges, self.refused)
 
-    def _remember(self, scan: Scan) -> None:
-        self._stamps.append(scan.stamp_ns)
-        self._odometry.append(scan.pose_world_base)
-        self._since.append(planar.relative(self.keyframes[-1].pose, self.pose))
-        self._keyframe.append(len(self.keyframes) - 1)
-
-    def _is_off(self) -> bool:
-        return any(_off(self.keyframes, edge) for edge in self._loops.edges[-8:])
+    def _refuse(self, reason: str, count: int = 1) -> None:
+        if count:
+            self.refused[reason] = self.refused.get(reason, 0) + count
 
     def _solve(self, edges: list[Edge], trust: float) -> None:
         if not edges:
@@ -138,19 +135,12 @@ class Slam:
     def _poses(self) -> NDArray[np.float64]:
         return np.array([keyframe.pose for keyframe in self.keyframes])
 
-    def _track(self) -> Track:
-        poses = planar.compose(self._poses()[self._keyframe], np.array(self._since))
-        corrections = planar.compose(poses, planar.inverse(np.array(self._odometry)))
-        return Track(np.array(self._stamps, np.int64), poses, corrections)
-
     def _grid(self) -> OccupancyGrid:
         settings = self._config.slam
         config = load_config(self._config, voxel_size=settings.voxel_size, max_range=settings.max_range)
         _check_extent(self._poses(), settings.voxel_size)
         grid, beams = GridMap(config), make_beams(config)
-        track = self._track()
-        for keyframe in self.keyframes:
-            scan = track.corrected(keyframe.scan)
+        for scan in map(in_map, self.keyframes):
             if not settings.clear_far:
                 scan = replace(scan, ranges=np.where(np.isposinf(scan.ranges), np.float32(np.nan), scan.ranges))
             grid.add(beams.evidence(scan, grid.origin))

@@ -42,7 +42,7 @@ class Follower:
         self._odometry: planar.Pose | None = None
         self._travelled = 0.0
         self._start: planar.Pose = np.zeros(3)
-        self._moved: list[Cloud] = []
+        self._moved: dict[int, Cloud] = {}
 
     def add(self, scan: Scan) -> bool:
         """Find the pose of the next scan; tell whether it became a keyframe."""
@@ -90,18 +90,19 @@ class Follower:
 
     def _rebuild(self) -> None:
         """Make the map of the last keyframes; clouds that are in the map's frame stay so until poses change."""
-        recent = self._recent()
-        missing = max(len(recent) - len(self._moved), 1)
-        for keyframe in recent[-missing:]:
-            self._moved.append(keyframe.cloud.moved(keyframe.pose - self._start))
-        del self._moved[: -len(recent)]
-        self._map.build(joined(self._moved), self._start[:2])
+        known = self._moved  # by the keyframe's number: where the robot turns back, old ones come within reach again
+        self._moved = {i: known[i] if i in known else self._in_map(self.keyframes[i]) for i in self._recent()}
+        self._map.build(joined(list(self._moved.values())), self._start[:2])
 
-    def _recent(self) -> list[Keyframe]:
+    def _in_map(self, keyframe: Keyframe) -> Cloud:
+        return keyframe.cloud.moved(keyframe.pose - self._start)
+
+    def _recent(self) -> range:
         """The last keyframes, back to where the robot was out of sight: where odometry jumps, all starts anew."""
-        here, recent = self.keyframes[-1].pose, self.keyframes[-self._config.local_keyframes :]
-        far = [np.hypot(*(keyframe.pose - here)[:2]) > self._config.max_range for keyframe in recent]
-        return recent[max((i + 1 for i, away in enumerate(far) if away), default=0) :]
+        here, count = self.keyframes[-1].pose, len(self.keyframes)
+        first = max(count - self._config.local_keyframes, 0)
+        far = [np.hypot(*(k.pose - here)[:2]) > self._config.max_range for k in self.keyframes[first:]]
+        return range(max((first + i + 1 for i, away in enumerate(far) if away), default=first), count)
 
 
 def odometry_sigmas(config: SlamConfig, step: planar.Pose) -> tuple[float, float]:

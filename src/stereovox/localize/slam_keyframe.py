@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,6 +54,12 @@ def step_edges(keyframes: list[Keyframe]) -> list[Edge]:
         radians = STEP_SIGMA[2] + STEP_SIGMA[3] * turn
         edges.append(Edge(i, i + 1, keyframe.step, np.diag([metres**-2, metres**-2, radians**-2])))
     return edges
+
+
+def in_map(keyframe: Keyframe) -> Scan:
+    """Return a keyframe's scan with its pose in the map, whatever its stamp says."""
+    T_map_odom = planar.lifted(planar.compose(keyframe.pose, planar.inverse(keyframe.scan.pose_world_base)))
+    return replace(keyframe.scan, T_world_sensor=T_map_odom @ keyframe.scan.T_world_sensor)
 
 
 def in_second_frame(information: NDArray[np.float64], yaw: float) -> NDArray[np.float64]:

@@ -29,6 +29,9 @@ WITNESS_PATH = 15.0
 WITNESS = (0.1, 0.02, 0.02)
 """How far they may disagree: metres, metres per metre of way, radians."""
 
+SHORT_CUT = 1e-3
+"""Metres along which drift adds up over a closure: none, but a graph has no edges of length 0."""
+
 
 class LoopFinder:
     """Keeps the submaps so far, and finds edges between those that show the same place.
@@ -43,14 +46,14 @@ class LoopFinder:
         self._search = ClosureSearch(config)
         self._submaps: list[Submap] = []
 
-    def update(self, end: bool = False) -> bool:
-        """Search for the places of submaps that are complete since the last call; tell whether edges were added."""
+    def update(self, end: bool = False) -> list[Edge]:
+        """Search for the places of submaps that are complete since the last call; return the edges now believed too."""
         before, size = len(self.edges), self._config.submap_keyframes
         while True:
             first = len(self._submaps) * max(size // 2, 1)
             last = first + size
             if len(self._keyframes) < last and not (end and len(self._keyframes) > first + size // 2):
-                return len(self.edges) > before
+                return self.edges[before:]
             self._submaps.append(Submap(first, min(last, len(self._keyframes))))
             self._close(self._submaps[-1])
 
@@ -117,8 +120,9 @@ class LoopFinder:
         anchors = [submap.anchor for submap in self._submaps]
         number = {anchor: i for i, anchor in enumerate(anchors)}
         along = np.array([self._keyframes[anchor].travelled for anchor in anchors])
-        rows = [*range(len(anchors) - 1), *(number[edge.first] for edge in self.edges)]
-        columns = [*range(1, len(anchors)), *(number[edge.second] for edge in self.edges)]
-        lengths = [*np.maximum(np.diff(along), 1e-3), *([1e-3] * len(self.edges))]
-        graph = coo_matrix((lengths, (rows, columns)), shape=(len(anchors), len(anchors)))
+        steps = {(i, i + 1): max(float(way), SHORT_CUT) for i, way in enumerate(np.diff(along))}
+        # One length for each pair: a matrix made of several adds them up.
+        lengths = steps | {(number[edge.first], number[edge.second]): SHORT_CUT for edge in self.edges}
+        rows, columns = np.array(list(lengths), np.int64).reshape(-1, 2).T
+        graph = coo_matrix((list(lengths.values()), (rows, columns)), shape=(len(anchors), len(anchors)))
         return dijkstra(graph.tocsr(), directed=False, indices=len(anchors) - 1)

@@ -131,6 +131,8 @@ def _yaml_of(path: Path) -> Path:
     if path.suffix.lower() not in (".pgm", ".png", ".bmp"):
         return path
     there = [path.with_suffix(ending) for ending in (".yaml", ".yml") if path.with_suffix(ending).is_file()]
+    if not path.is_file():
+        raise MapFileError(f"{path}: no such file; give the .yaml of a map_server map")
     if not there:
         raise MapFileError(f"{path}: no {path.stem}.yaml beside it, which tells what its greys mean")
     return there[0]

@@ -8,6 +8,7 @@ allocated because a damaged file says so: reads are bounded by the size of the f
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
 from typing import Protocol
 
@@ -95,4 +96,5 @@ def open_bag(path: Path) -> BagFile:
 
 def one_line(said: object) -> str:
     """Return the text of an error or name in one line, without a full stop."""
-    return " ".join(str(said).split()).rstrip(".") or f"damaged ({type(said).__name__})"
+    plain = re.sub(r"\('(.*?)',?\)", r"\1", str(said))  # some print the arguments of an exception as they are
+    return " ".join(plain.split()).rstrip(".") or f"damaged ({type(said).__name__})"

@@ -52,6 +52,8 @@ def open_robot(where: str | os.PathLike[str]) -> Robot:
         kind = registry.find("robots", ROBOTS, name)
         if kind.recognises(place):
             return kind(place)
+    if place.startswith("sim:"):
+        raise SourceError(f"{place}: no simulation of a ground robot; there is sim:floor")
     if not os.path.exists(place):
         raise SourceError(f"{place}: no such file or folder")
     raise SourceError(f"{place}: no recording of a ground robot; give a bag with scans, a CARMEN log or sim:floor")

@@ -131,7 +131,7 @@ class RobotFrames:
             return next((name for name in names if self.tf.connected(name, self.base)), "")
         if self.tf.connected(given, self.base):
             return given
-        if has_topic:
+        if has_topic and not self.tf.frames:
             return ""
         try:
             self.tf.moving(given, self.base)  # says what is wrong

@@ -113,6 +113,8 @@ def _walls(scores: GridScores) -> list[tuple[str, str, str]]:
 
 
 def _moved(scores: GridScores) -> str:
+    if not scores.aligned and not np.any(scores.motion):
+        return "The maps were compared as they stand, in one frame."
     x, y, yaw = scores.motion
     by = f"{x:.3f} m in x, {y:.3f} m in y and {np.degrees(yaw):.2f} degrees"
     return f"The map was moved by {by} " + ("to lie best on the reference." if scores.aligned else "as asked.")

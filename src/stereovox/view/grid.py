@@ -48,7 +48,7 @@ def draw_grid(grid: OccupancyGrid, heading: str, track: ArrayLike | None = None)
         axis = figure.add_subplot()
         plan(axis, trimmed(grid), track)
         framed(axis, box)
-        _legend(figure, track is not None)
+        _legend(figure, grid.states, track is not None)
     words_above(figure, heading, facts(grid))
     return figure
 
@@ -162,11 +162,13 @@ def _corners(grid: OccupancyGrid) -> NDArray[np.float64]:
     return planar.transform(grid.origin, np.array(ends) * grid.resolution)
 
 
-def _legend(figure: Any, with_track: bool) -> None:
+def _legend(figure: Any, shown: NDArray[np.uint8], with_track: bool) -> None:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    states = (State.OCCUPIED, State.FREE, State.UNKNOWN)
+    states = [State.OCCUPIED, State.FREE, State.UNKNOWN]
+    if (shown == State.TENTATIVE).any():
+        states.insert(1, State.TENTATIVE)
     handles: list[Any] = [Patch(fc=STATE_COLOURS[state], ec="#888", label=NAMES[state]) for state in states]
     if with_track:
         handles.append(Line2D([], [], color=PATH_COLOUR, label="the robot's way, from dot to square"))

@@ -265,10 +265,12 @@ def test_where_the_clock_is_set_back_the_majority_is_believed(before):
 def test_late_scans_are_only_believed_where_they_rise_in_a_row():
     clock = Clock()
     clock.take(replace(SOME_SCAN, stamp_ns=1000))
-    stuck = [7] * (20)
-    with_good_ones = [stamp_ns for n in range(20) for stamp_ns in (n, 1001 + n)]
-    for stamp_ns in stuck + with_good_ones:
-        if stamp_ns > 1000:
+    stuck = [7] * 20
+    overtaken = [stamp_ns for n in range(1002, 1030, 2) for stamp_ns in (n, n - 1)]  # two by two in the wrong order
+    last_ns = 1000
+    for stamp_ns in stuck + overtaken:
+        if stamp_ns > last_ns:
+            last_ns = stamp_ns
             assert clock.take(replace(SOME_SCAN, stamp_ns=stamp_ns)) == 0
             continue
         with pytest.raises(FrameRefused) as caught:

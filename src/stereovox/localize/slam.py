@@ -34,6 +34,8 @@ Progress = Callable[[int, int, str], object]
 
 CLOSURE_TRUST, PATCH_TRUST = 0.02, 0.1
 """What a match's information is worth: its points are not independent, nor is what they lie on exact."""
+LOOKS = 2.25
+"""A keyframe counts in the map as so many scans: it stands for those around it, and one is enough to know a cell."""
 MOST_CELLS = 40_000
 """Cells on a side of the finished map."""
 JUMP, JUMP_TURN = 0.05, 0.01
@@ -137,7 +139,8 @@ class Slam:
 
     def _grid(self) -> OccupancyGrid:
         settings = self._config.slam
-        config = load_config(self._config, voxel_size=settings.voxel_size, max_range=settings.max_range)
+        evidence = {f"grid.{name}": _said_again(getattr(self._config.grid, name)) for name in ("p_occupied", "p_free")}
+        config = load_config(self._config, voxel_size=settings.voxel_size, max_range=settings.max_range, **evidence)
         _check_extent(self._poses(), settings.voxel_size)
         grid, beams = GridMap(config), make_beams(config)
         for scan in map(in_map, self.keyframes):
@@ -145,6 +148,12 @@ class Slam:
                 scan = replace(scan, ranges=np.where(np.isposinf(scan.ranges), np.float32(np.nan), scan.ranges))
             grid.add(beams.evidence(scan, grid.origin))
         return grid.occupancy()
+
+
+def _said_again(p: float) -> float:
+    """Return what a keyframe says of a cell where a scan says `p`."""
+    odds = (p / (1 - p)) ** LOOKS
+    return odds / (1 + odds)
 
 
 def map_scans(scans: Iterable[Scan], config: Config, progress: Progress | None = None) -> SlamResult:

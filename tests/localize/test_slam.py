@@ -193,3 +193,11 @@ def test_aces_slice():
     errors = relation_errors(read_relations(relations), result.track.stamps_ns, result.track.pose_map_base)
     assert len(errors.metres) > 200
     assert errors.metres.mean() < 0.045
+
+
+def test_a_robot_that_stands_still_has_a_map_too(loop):
+    _, scans, _, _ = loop
+    still = [replace(scans[0], stamp_ns=scan.stamp_ns) for scan in scans[:20]]
+    states = map_scans(still, load_config()).grid.states
+    assert (states == State.FREE).sum() > 100
+    assert (states == State.OCCUPIED).sum() > 20

@@ -83,10 +83,10 @@ def add_values(table, coords, count, cells, at_floor, wanted, values, unknown, p
             old = np.int32(block[c])
             step = np.int32(value[c])
             start = prior if old == unknown else old
-            new = min(max(start + step, lowest), highest)
-            new += np.int32(1) if new == unknown else np.int32(0)
+            new = min(max(np.int32(start + step), lowest), highest)
+            new = np.int32(new + (np.int32(1) if new == unknown else np.int32(0)))
             new = new if step != 0 else old
-            moved += np.int32(1) if new != old else np.int32(0)
+            moved = np.int32(moved + (np.int32(1) if new != old else np.int32(0)))
             block[c] = new
         at_floor[b] = 0
         changed += moved
@@ -109,10 +109,10 @@ def add_constant(table, coords, count, cells, at_floor, wanted, step, unknown, p
         above = np.int32(0)
         for c in range(512):
             old = np.int32(block[c])
-            new = max((prior if old == unknown else old) + step, lowest)
-            new += np.int32(1) if new == unknown else np.int32(0)
-            moved += np.int32(1) if new != old else np.int32(0)
-            above += np.int32(1) if new != lowest else np.int32(0)
+            new = max(np.int32((prior if old == unknown else old) + step), lowest)
+            new = np.int32(new + (np.int32(1) if new == unknown else np.int32(0)))
+            moved = np.int32(moved + (np.int32(1) if new != old else np.int32(0)))
+            above = np.int32(above + (np.int32(1) if new != lowest else np.int32(0)))
             block[c] = new
         at_floor[b] = 1 if above == 0 else 0
         changed += moved

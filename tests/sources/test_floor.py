@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from made_segments import distance_to
 
 from stereovox import planar
 from stereovox.config import NoiseConfig
@@ -15,7 +16,6 @@ from stereovox.sensors.noise import RangeNoise
 from stereovox.sources.floor import PLANS, Floor
 from stereovox.sources.floor_drive import STEP_NS, Odometry, Stop, drive, metres, zigzag
 from stereovox.sources.floor_kinect import Kinect, kinect_camera
-from stereovox.sources.floor_rays import distance_to
 from stereovox.sources.robot import open_robot
 
 SMALL = "image_width=80"

@@ -5,11 +5,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from made_segments import distance_to
 
 from stereovox.sources.floor import Floor
 from stereovox.sources.floor_lids import with_lids
 from stereovox.sources.floor_plan import FloorPlan, block, post
-from stereovox.sources.floor_rays import cast, distance_to
+from stereovox.sources.floor_rays import cast
 
 BENT = FloorPlan(
     [(0.0, 0.0, 4.0, 2.0), (3.0, 1.0, 4.0, 5.0)],

@@ -22,6 +22,8 @@ KINDS = {
     "wrongly_free": "occupied in the reference",
     "extra": "known to the map only",
 }
+ALIKE = 0.3
+"""IoU of walls within a cell below which two maps may be of different places."""
 
 
 def judge(arguments: Namespace) -> dict[str, Any]:
@@ -72,6 +74,8 @@ def _tell(scores: GridScores, regions: int) -> None:
         if figures.mean is not None:
             say(f"walls, {what}: mean {figures.mean:.3f}, median {figures.median:.3f}, 95 % {figures.p95:.3f} m")
     say(f"free cells: IoU {_number(scores.free_iou)}; the map knows {_number(scores.coverage)} of the reference")
+    if walls.iou_tolerant is not None and walls.iou_tolerant < ALIKE:
+        say("note: their walls hardly match: are they of one place? --report DIR shows both")
 
 
 def _percent(value: float | None) -> str:

@@ -72,6 +72,7 @@ class Slam:
 
     def __init__(self, config: Config):
         self.refused: dict[str, int] = {}
+        self._first = ""
         self._config = config
         self._follower = Follower(config.slam)
         self._loops = LoopFinder(config.slam, self._follower.keyframes)
@@ -93,6 +94,7 @@ class Slam:
             scan = trusted(scan, self._config)
         except FrameRefused as refused:
             self._refuse(refused.reason)
+            self._first = self._first or f", first: {refused}"
             return self.pose
         wrong = self._way.room(scan.stamp_ns)
         self._refuse("not_in_order", 1 if wrong is None else wrong)
@@ -110,7 +112,10 @@ class Slam:
         Raises StereovoxError where no scan could be used, MissingExtra where loops were found and gtsam is missing.
         """
         if not self.keyframes:
-            raise StereovoxError(f"not one of the scans could be used ({self.refused or 'none has enough hits'})")
+            counted = ", ".join(f"{number} x {reason}" for reason, number in self.refused.items())
+            raise StereovoxError(
+                f"not one of the scans could be used: {counted or 'none has enough hits'}{self._first}"
+            )
         self._loops.update(end=True)
         self._solve(self._loops.edges, CLOSURE_TRUST)
         rounds = self._config.slam.refine_rounds if self._loops.edges else 0

@@ -60,9 +60,11 @@ def flattened(T_a_b: Transform) -> Pose:
 
 
 def lifted(pose_a_b: ArrayLike) -> Transform:
-    """Return the (4, 4) motion of a (3,) pose: upright, at height 0."""
-    x, y, yaw = np.asarray(pose_a_b, float)
-    T = np.eye(4)
-    T[:2, :2] = [[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]]
-    T[:2, 3] = x, y
+    """Return the (..., 4, 4) motions of (..., 3) poses: upright, at height 0."""
+    pose = np.asarray(pose_a_b, float)
+    cosine, sine = np.cos(pose[..., 2]), np.sin(pose[..., 2])
+    T = np.zeros((*pose.shape[:-1], 4, 4))
+    T[..., 0, 0], T[..., 0, 1], T[..., 1, 0], T[..., 1, 1] = cosine, -sine, sine, cosine
+    T[..., 2, 2] = T[..., 3, 3] = 1
+    T[..., :2, 3] = pose[..., :2]
     return T

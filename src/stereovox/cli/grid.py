@@ -36,6 +36,8 @@ from stereovox.cli.terminal import (
 from stereovox.errors import StereovoxError
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from stereovox.config import Config
     from stereovox.frame import Frame, Scan
     from stereovox.grid_mapper import GridMapper
@@ -83,7 +85,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
         raise StereovoxError(f"--start {arguments.start}: says where in a map; give --poses MAP.yaml, or leave it out")
     mapper = _mapper(config, arguments.resume, any_size="voxel_size" not in overrides(arguments))
     say_about_compiling()
-    track = _track(robot, how, config, arguments.start)
+    track = _track(robot, how, config, start)
     reports: list[UpdateReport] = []
     try:
         _add_all(mapper, (track.corrected(one) if track else one for one in seen), count, reports)
@@ -129,11 +131,10 @@ def _poses(how: str | None, robot: Robot, resume: str | None) -> str:
     return how
 
 
-def _track(robot: Robot, how: str, config: Config, text: str | None) -> Track | None:
-    """Return the robot's way in the map; None: as its odometry has it. text: what --start says."""
+def _track(robot: Robot, how: str, config: Config, start: np.ndarray | None) -> Track | None:
+    """Return the robot's way in the map; None: as its odometry has it."""
     from stereovox.products.map_server import read_map_server
 
-    start = parse_start(text)
     if how == "odometry":
         return None
     if how == "slam":
@@ -143,7 +144,7 @@ def _track(robot: Robot, how: str, config: Config, text: str | None) -> Track | 
         return found.track
     say(f"finding the robot's way in {how}")
     floor = read_map_server(how)
-    check_start(start, floor, text)
+    check_start(start, floor)
     track = localised(robot, floor, config, start)
     say_refused(track.refused, track.first_refusal)
     say_fit(robot, floor, track)

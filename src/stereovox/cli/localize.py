@@ -53,7 +53,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
 
     out, config = check_file(arguments.out, (*TEXT, *BAGS)), settings_of(arguments)
     start, grid = parse_start(arguments.start), read_map_server(arguments.map)
-    check_start(start, grid, arguments.start)
+    check_start(start, grid)
     robot = opened(arguments.source)
     say_about_compiling()
     track = localised(robot, grid, config, start)
@@ -96,7 +96,7 @@ def parse_start(text: str | None) -> np.ndarray | None:
     return np.array([x, y, radians(degrees)])
 
 
-def check_start(start: np.ndarray | None, grid: OccupancyGrid, text: str | None) -> None:
+def check_start(start: np.ndarray | None, grid: OccupancyGrid) -> None:
     """Raise StereovoxError for a start outside of the map."""
     if start is None:
         return
@@ -104,9 +104,8 @@ def check_start(start: np.ndarray | None, grid: OccupancyGrid, text: str | None)
     rows, columns = grid.cells.shape
     if not (0 <= row < rows and 0 <= column < columns):
         (x0, y0), (x1, y1) = grid.centres([0, rows - 1], [0, columns - 1])
-        raise StereovoxError(
-            f"--start {text}: lies outside of the map, from ({x0:.1f}, {y0:.1f}) to ({x1:.1f}, {y1:.1f}) m"
-        )
+        given = f"--start {start[0]:g},{start[1]:g},{np.degrees(start[2]):g}"
+        raise StereovoxError(f"{given}: lies outside of the map, from ({x0:.1f}, {y0:.1f}) to ({x1:.1f}, {y1:.1f}) m")
 
 
 def say_fit(robot: Robot, grid: OccupancyGrid, track: Track) -> float | None:

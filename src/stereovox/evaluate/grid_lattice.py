@@ -50,8 +50,8 @@ def lay(
     """
     motion = np.asarray(motion, float)
     pose = planar.compose(planar.inverse(reference.origin), planar.compose(motion, grid.origin))
-    corners = planar.transform(pose, _known_corners(grid) * grid.resolution)[:, ::-1] / reference.resolution
-    known = np.concatenate([_known_corners(reference)[:, ::-1], corners])
+    corners = planar.transform(pose, grid.known_corners * grid.resolution)[:, ::-1] / reference.resolution
+    known = np.concatenate([reference.known_corners[:, ::-1], corners])
     if not (reference.cells != UNKNOWN).any():
         raise StereovoxError(NOTHING)
     first = np.floor(known.min(axis=0) + TIE).astype(int)
@@ -114,15 +114,6 @@ def _checked(region: Rectangle) -> Rectangle:
         raise StereovoxError(f"{region}: no region; give X0,Y0,X1,Y1 in metres, two opposite corners")
     (x0, y0), (x1, y1) = numbers.reshape(2, 2).min(axis=0), numbers.reshape(2, 2).max(axis=0)
     return float(x0), float(y0), float(x1), float(y1)
-
-
-def _known_corners(grid: OccupancyGrid) -> NDArray[np.float64]:
-    """Return the corners (4, 2) x, y, in cells, of the rectangle that holds all known cells; (0, 2) where none is."""
-    rows, columns = (np.flatnonzero((grid.cells != UNKNOWN).any(axis=other)) for other in (1, 0))
-    if not len(rows):
-        return np.zeros((0, 2))
-    x, y = (columns[0], columns[-1] + 1), (rows[0], rows[-1] + 1)
-    return np.array([[a, b] for a in x for b in y], float)
 
 
 def _check_size(rows: int, columns: int, resolution: float) -> None:

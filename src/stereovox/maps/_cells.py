@@ -1,11 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernel cells of the block hash: where a block of 8x8x8 cells lies in its pool."""
+"""Kernel cells: where a block lies in its pool, and what evidence makes of one of its cells."""
 
 import numpy as np
 
 from stereovox._jit import cell
 
 EMPTY = np.int32(-1)
+
+
+@cell
+def added(old, step, unknown, prior, lowest, highest):
+    """Return what a cell holds after evidence `step`, clamped; all int32.
+
+    One without evidence, `unknown`, starts from `prior`; where a sum comes to just `unknown`, one more is stored.
+    """
+    start = prior if old == unknown else old
+    new = min(max(np.int32(start + step), lowest), highest)
+    new = np.int32(new + (np.int32(1) if new == unknown else np.int32(0)))
+    return new if step != 0 else old
 
 
 @cell

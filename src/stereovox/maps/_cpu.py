@@ -4,7 +4,7 @@
 import numpy as np
 
 from stereovox._jit import kernel
-from stereovox.maps._cells import EMPTY, empty_slot, find, find_or_insert, home_slot, slot_of
+from stereovox.maps._cells import EMPTY, added, empty_slot, find, find_or_insert, home_slot, slot_of
 
 
 @kernel
@@ -81,11 +81,7 @@ def add_values(table, coords, count, cells, at_floor, wanted, values, unknown, p
         moved = np.int32(0)
         for c in range(512):
             old = np.int32(block[c])
-            step = np.int32(value[c])
-            start = prior if old == unknown else old
-            new = min(max(np.int32(start + step), lowest), highest)
-            new = np.int32(new + (np.int32(1) if new == unknown else np.int32(0)))
-            new = new if step != 0 else old
+            new = added(old, np.int32(value[c]), unknown, prior, lowest, highest)
             moved = np.int32(moved + (np.int32(1) if new != old else np.int32(0)))
             block[c] = new
         at_floor[b] = 0

@@ -4,7 +4,7 @@
 import numpy as np
 
 from stereovox._jit import cell, kernel
-from stereovox.maps._cells import find, find_or_insert
+from stereovox.maps._cells import added, find, find_or_insert
 
 
 @kernel
@@ -38,11 +38,7 @@ def _add_row(cells, value, unknown, prior, lowest, highest):
     if anything != 0:
         for c in range(64):
             old = np.int32(cells[c])
-            step = np.int32(value[c])
-            start = prior if old == unknown else old
-            new = min(max(np.int32(start + step), lowest), highest)
-            new = np.int32(new + (np.int32(1) if new == unknown else np.int32(0)))
-            new = new if step != 0 else old
+            new = added(old, np.int32(value[c]), unknown, prior, lowest, highest)
             moved = np.int32(moved + (np.int32(1) if new != old else np.int32(0)))
             cells[c] = new
     return moved

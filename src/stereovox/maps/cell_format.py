@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import IntEnum
 from functools import cached_property
 from math import log
 
@@ -14,6 +15,15 @@ from stereovox.config import MapConfig
 
 BYTE_THRESHOLD = 180
 """Byte above which Chien 2020 (3.5) shows a cell as occupied; it is taken to stand for a probability of 0.7."""
+
+
+class State(IntEnum):
+    """What a map says about a cell."""
+
+    UNKNOWN = 0
+    FREE = 1
+    TENTATIVE = 2
+    OCCUPIED = 3
 
 
 @dataclass(frozen=True)
@@ -74,6 +84,14 @@ class CellRules:
     def occupied_above(self) -> float:
         """Stored numbers above it are occupied."""
         return self._exact(self.config.occupied_above)
+
+    def states(self, stored: NDArray[np.integer]) -> NDArray[np.uint8]:
+        """Return the `State` of stored numbers, uint8 of the same shape."""
+        states = np.full(stored.shape, State.TENTATIVE, np.uint8)
+        states[stored < self.free_below] = State.FREE
+        states[stored > self.occupied_above] = State.OCCUPIED
+        states[stored == self.format.unknown] = State.UNKNOWN
+        return states
 
     def _exact(self, p: float) -> float:
         return self.format.unknown + round(log(p / (1 - p)) * self.format.per_log_odds, 6)

@@ -115,7 +115,7 @@ class GridMap:
 
     def state(self, points: ArrayLike) -> NDArray[np.uint8]:
         """Return the `State` (N,) uint8 at points (N, 2) in metres."""
-        return self._percent.states(self._stored_at(points))
+        return self._rules.states(self._stored_at(points))
 
     def cells(self) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
         """Return all known cells: column and row (N, 2) in ascending order, and their log-odds (N,)."""
@@ -141,7 +141,7 @@ class GridMap:
 
     def counts(self) -> dict[str, int]:
         """Return the number of cells in each known state: `free`, `tentative`, `occupied`."""
-        number = np.bincount(self._percent.states(self._pool.values[: len(self._pool)]).ravel(), minlength=4)
+        number = np.bincount(self._rules.states(self._pool.values[: len(self._pool)]).ravel(), minlength=4)
         return {state.name.lower(): int(number[state]) for state in (State.FREE, State.TENTATIVE, State.OCCUPIED)}
 
     def bounds(self) -> NDArray[np.float64] | None:
@@ -213,5 +213,5 @@ class GridMap:
 
     def _centres_of(self, state: State) -> NDArray[np.float64]:
         indices, log_odds = self.cells()
-        chosen = indices[self._percent.states(self._format.stored(log_odds)) == state]
+        chosen = indices[self._rules.states(self._format.stored(log_odds)) == state]
         return planar.transform(self.origin, (chosen + 0.5) * self.voxel_size)

@@ -41,6 +41,22 @@ class OccupancyGrid:
         states[percent < 0] = State.UNKNOWN
         return states[self.cells.view(np.uint8)]
 
+    @property
+    def known_span(self) -> tuple[slice, slice]:
+        """The rows and columns from the first to the last of which a cell is known; both empty where none is."""
+        known = self.cells != UNKNOWN
+        ends = (np.flatnonzero(known.any(axis=axis)) for axis in (1, 0))
+        rows, columns = (slice(int(n[0]), int(n[-1]) + 1) if len(n) else slice(0, 0) for n in ends)
+        return rows, columns
+
+    @property
+    def known_corners(self) -> NDArray[np.float64]:
+        """Corners (4, 2) x, y, in cells, of the rectangle that holds all known cells; (0, 2) where none is."""
+        rows, columns = self.known_span
+        if rows.stop == rows.start:
+            return np.zeros((0, 2))
+        return np.array([(x, y) for x in (columns.start, columns.stop) for y in (rows.start, rows.stop)], float)
+
     def indices(self, points: ArrayLike) -> NDArray[np.int64]:
         """Return the (N, 2) row and column of the cells that hold (N, 2) points x, y; may lie outside."""
         local = planar.transform(planar.inverse(self.origin), points)

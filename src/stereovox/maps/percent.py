@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stored cells of a grid as per cent and states, and back."""
+"""Stored cells of a grid as per cent, and back."""
 
 from __future__ import annotations
 
@@ -8,9 +8,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox.maps.cell_format import CellRules
+from stereovox.maps.cell_format import CellRules, State
 from stereovox.maps.occupancy import UNKNOWN
-from stereovox.maps.voxel_map import State
 
 
 class Percent:
@@ -40,7 +39,7 @@ class Percent:
     def shown(self) -> NDArray[np.int8]:
         """Per cent of each number that can be stored, from `lowest` on; -1 unknown."""
         stored = np.arange(self.lowest, np.iinfo(self._format.dtype).max + 1)
-        states = self.states(stored)
+        states = self._rules.states(stored)
         free, occupied = 100 * self.free_below, 100 * self.occupied_above
         percent = np.rint(100 / (1 + np.exp(-self._format.log_odds(stored).astype(float))))
         percent[(stored <= self._rules.lowest) & (states == State.FREE)] = 0
@@ -53,14 +52,6 @@ class Percent:
             percent = np.where(states == state, np.clip(percent, least, most), percent)
         percent[states == State.UNKNOWN] = UNKNOWN
         return percent.astype(np.int8)
-
-    def states(self, stored: NDArray[np.integer]) -> NDArray[np.uint8]:
-        """Return the `State` of stored numbers, uint8 of the same shape."""
-        states = np.full(stored.shape, State.TENTATIVE, np.uint8)
-        states[stored < self._rules.free_below] = State.FREE
-        states[stored > self._rules.occupied_above] = State.OCCUPIED
-        states[stored == self._format.unknown] = State.UNKNOWN
-        return states
 
     def stored(self, percent: NDArray[np.int8]) -> NDArray[np.integer]:
         """Return what cells of so many per cent are stored as; less than 0 is unknown."""

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from enum import IntEnum
 from pathlib import Path
 from typing import Any
 
@@ -17,19 +16,11 @@ from stereovox.frame import Viewpoint
 from stereovox.maps import _cpu
 from stereovox.maps.blocks import SIDE, BlockPool
 from stereovox.maps.cell_format import CellFormat, CellRules
+from stereovox.maps.cell_format import State as State
 from stereovox.maps.evidence import LOG_ODDS_SCALE, Evidence
 
 INDEX_LIMIT = 2**30
 """Cell indices lie in [-INDEX_LIMIT, INDEX_LIMIT); beyond it everything is unknown."""
-
-
-class State(IntEnum):
-    """What a map says about a cell."""
-
-    UNKNOWN = 0
-    FREE = 1
-    TENTATIVE = 2
-    OCCUPIED = 3
 
 
 class VoxelMap:
@@ -124,7 +115,7 @@ class VoxelMap:
 
     def state(self, points: ArrayLike) -> NDArray[np.uint8]:
         """Return the `State` (N,) uint8 at points (N, 3) in metres, world frame."""
-        return self._states(self._stored_at(points))
+        return self._rules.states(self._stored_at(points))
 
     def cells(self) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
         """Return all known cells: indices (N, 3) int32 in ascending order, and their log-odds (N,)."""
@@ -162,7 +153,7 @@ class VoxelMap:
         """Return the number of cells in each known state: `free`, `tentative`, `occupied`."""
         number = np.zeros(4, np.int64)
         for _, values in self.slabs():
-            number += np.bincount(self._states(values).ravel(), minlength=4)
+            number += np.bincount(self._rules.states(values).ravel(), minlength=4)
         return {state.name.lower(): int(number[state]) for state in (State.FREE, State.TENTATIVE, State.OCCUPIED)}
 
     def bounds(self) -> NDArray[np.float64] | None:
@@ -210,13 +201,6 @@ class VoxelMap:
         stored[inside] = found
         return stored
 
-    def _states(self, stored: NDArray[np.integer]) -> NDArray[np.uint8]:
-        states = np.full(stored.shape, State.TENTATIVE, np.uint8)
-        states[stored < self._rules.free_below] = State.FREE
-        states[stored > self._rules.occupied_above] = State.OCCUPIED
-        states[stored == self._format.unknown] = State.UNKNOWN
-        return states
-
     def _centers_of(self, state: State) -> NDArray[np.float64]:
         indices, log_odds = self.cells()
-        return self.centers(indices[self._states(self._format.stored(log_odds)) == state])
+        return self.centers(indices[self._rules.states(self._format.stored(log_odds)) == state])

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stereovox.errors import StereovoxError
-from stereovox.maps import State, VoxelMap
+from stereovox.maps import VoxelMap
 from stereovox.maps.blocks import SIDE
 from stereovox.maps.cell_format import CellRules
 
@@ -57,7 +57,9 @@ def layer(voxel_map: VoxelMap, across: str, at_m: float, bounds: NDArray[np.floa
     known = stored != voxel_map.cell_format.unknown
     log_odds = np.where(known, voxel_map.cell_format.log_odds(stored), np.float32(np.nan))
     extent = (left * size, right * size, bottom * size, top * size)
-    return Layer(log_odds, _states(voxel_map, stored), extent, ACROSS[across], across, (number + 0.5) * size)
+    return Layer(
+        log_odds, CellRules(voxel_map.config.map).states(stored), extent, ACROSS[across], across, (number + 0.5) * size
+    )
 
 
 def along_ray(
@@ -99,12 +101,3 @@ def _stored(
         cubes = np.moveaxis(cells[here].reshape(-1, SIDE, SIDE, SIDE), 1 + normal, 1)
         found[row, :, column] = cubes[:, number & 7].swapaxes(1, 2)  # a block counts its lower axis first: the columns
     return found.reshape(shape[0] * SIDE, -1)
-
-
-def _states(voxel_map: VoxelMap, stored: NDArray[np.integer]) -> NDArray[np.uint8]:
-    rules = CellRules(voxel_map.config.map)
-    state = np.full(stored.shape, State.TENTATIVE, np.uint8)
-    state[stored < rules.free_below] = State.FREE
-    state[stored > rules.occupied_above] = State.OCCUPIED
-    state[stored == voxel_map.cell_format.unknown] = State.UNKNOWN
-    return state

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from stereovox import planar, registry
 from stereovox.errors import ConfigError, SourceError
 from stereovox.frame import Frame, Reason, Scan
-from stereovox.geometry import Transform
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.sources import parameters
 from stereovox.sources.d435 import classify
@@ -102,7 +101,7 @@ class Floor:
         self.camera = self.kinect.camera
         self._poses = self._driven()
         self._stamps = START_NS + STEP_NS * np.arange(len(self._poses))
-        self.truth = Poses(self._stamps, _lifted(self._poses), where=self.name)
+        self.truth = Poses(self._stamps, planar.lifted(self._poses), where=self.name)
         self.odometry = self._odometry()
         self.scans: Sequence[Scan] = Lazy(self._scan, range(self._count(self.options.scan_hz, SCAN_DELAY_NS)))
         self.frames: Sequence[Frame] = Lazy(self._frame, range(self._count(self.options.depth_hz, FRAME_DELAY_NS)))
@@ -194,7 +193,7 @@ class Floor:
     def _odometry(self) -> Poses:
         believed = Odometry().measured(self._poses, [self.options.seed, 0], self.options.drift)
         every = round(1e9 / ODOMETRY_HZ / STEP_NS)
-        return Poses(self._stamps[::every], _lifted(believed[::every]), where=f"{self.name}: odometry")
+        return Poses(self._stamps[::every], planar.lifted(believed[::every]), where=f"{self.name}: odometry")
 
     def _count(self, hz: float, delay_ns: int) -> int:
         """Return how many are taken while there is odometry."""
@@ -218,12 +217,3 @@ class Floor:
 def _angles() -> NDArray[np.float64]:
     """Return where the lidar's beams point, (N,) radians from straight ahead: 240 degrees in all."""
     return np.radians(STEP_DEG) * (np.arange(BEAMS) - (BEAMS - 1) / 2)
-
-
-def _lifted(poses: planar.Pose) -> NDArray[np.float64]:
-    """Return upright motions (N, 4, 4) of poses (N, 3)."""
-    T: Transform = np.tile(np.eye(4), (len(poses), 1, 1))
-    cosine, sine = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-    T[:, 0, 0], T[:, 0, 1], T[:, 1, 0], T[:, 1, 1] = cosine, -sine, sine, cosine
-    T[:, :2, 3] = poses[:, :2]
-    return T

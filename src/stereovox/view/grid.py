@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from stereovox import planar
 from stereovox.maps import State
-from stereovox.maps.occupancy import UNKNOWN, OccupancyGrid
+from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.view.figures import WIDTH, figure_of, save, words_above
 from stereovox.view.panels import GREY, INK, PATH_COLOUR, STATE_COLOURS, measured, scale_bar
 
@@ -72,7 +72,7 @@ def facts(grid: OccupancyGrid) -> list[str]:
 
 def bounds(grid: OccupancyGrid, track: ArrayLike | None = None) -> Box | None:
     """Return lowest and highest (2,) x, y of what is known and of the track, with a margin; None where nothing is."""
-    corners = _corners(grid)
+    corners = planar.transform(grid.origin, grid.known_corners * grid.resolution)
     if track is not None and np.size(track):
         corners = np.concatenate([corners, np.asarray(track, float)[:, :2]])
     if not len(corners):
@@ -134,32 +134,15 @@ def pooled(classes: NDArray[np.uint8], rising: Sequence[int], step: int) -> NDAr
 
 def trimmed(grid: OccupancyGrid) -> OccupancyGrid:
     """Return a map without the rows and columns at its rim of which nothing is known."""
-    rows, columns = known_span(grid)
+    rows, columns = grid.known_span
     x, y, yaw = planar.compose(grid.origin, [columns.start * grid.resolution, rows.start * grid.resolution, 0]).tolist()
     return replace(grid, cells=grid.cells[rows, columns], origin=(x, y, yaw))
 
 
-def known_span(grid: OccupancyGrid) -> tuple[slice, slice]:
-    """Return the rows and columns from the first to the last of which a cell is known; both empty where none is."""
-    known = grid.cells != UNKNOWN
-    ends = (np.flatnonzero(known.any(axis=axis)) for axis in (1, 0))
-    rows, columns = (slice(int(n[0]), int(n[-1]) + 1) if len(n) else slice(0, 0) for n in ends)
-    return rows, columns
-
-
 def known_bounds(grid: OccupancyGrid) -> NDArray[np.float64] | None:
     """Return lowest and highest (2, 2) x, y in metres of what is known, in the map's frame; None where nothing is."""
-    corners = _corners(grid)
+    corners = planar.transform(grid.origin, grid.known_corners * grid.resolution)
     return np.stack([corners.min(axis=0), corners.max(axis=0)]) if len(corners) else None
-
-
-def _corners(grid: OccupancyGrid) -> NDArray[np.float64]:
-    """Return the corners (4, 2) of the known cells' rectangle in the map's frame; (0, 2) where none is known."""
-    rows, columns = known_span(grid)
-    if rows.stop == rows.start:
-        return np.zeros((0, 2))
-    ends = [(c, r) for c in (columns.start, columns.stop) for r in (rows.start, rows.stop)]
-    return planar.transform(grid.origin, np.array(ends) * grid.resolution)
 
 
 def _legend(figure: Any, shown: NDArray[np.uint8], with_track: bool) -> None:

@@ -6,6 +6,8 @@ import numpy as np
 from stereovox._jit import cell
 
 EMPTY = np.int32(-1)
+NO_ROW, AT_FLOOR = np.int64(-1), np.int64(-2)
+"""In place of a row of values: the block is not there; all its cells hold the lowest number there is."""
 
 
 @cell
@@ -36,6 +38,20 @@ def find(table, coords, bx, by, bz):
     """Return the pool index of block (bx, by, bz), -1 when there is none."""
     slot = slot_of(table, coords, bx, by, bz)
     return np.int64(table[slot]) if slot >= 0 else np.int64(-1)
+
+
+@cell
+def row_of(stored, bx, by, bz):
+    """Return the row that holds the cells of block (bx, by, bz), or NO_ROW, or AT_FLOOR; see `StoredCells`."""
+    return find(stored.table, stored.coords, bx, by, bz)
+
+
+@cell
+def number_in(stored, row, x, y, z):
+    """Return the stored number of cell (x, y, z), whose block has the row that `row_of` gave."""
+    if row < 0:
+        return stored.unknown if row == NO_ROW else stored.lowest
+    return np.int32(stored.values[row, ((x & 7) << 6) | ((y & 7) << 3) | (z & 7)])
 
 
 @cell

@@ -4,7 +4,7 @@
 import numpy as np
 
 from stereovox._jit import kernel
-from stereovox.maps._cells import EMPTY, added, empty_slot, find, find_or_insert, home_slot, slot_of
+from stereovox.maps._cells import EMPTY, added, empty_slot, find, find_or_insert, home_slot, number_in, row_of, slot_of
 
 
 @kernel
@@ -116,10 +116,8 @@ def add_constant(table, coords, count, cells, at_floor, wanted, step, unknown, p
 
 
 @kernel
-def look_up(table, coords, cells, indices, out):
-    """Write the value of each cell of `indices` (n, 3) int64 to `out` (n,), which stays as it is where no block is."""
+def look_up(stored, indices, out):
+    """Write the stored number of each cell of `indices` (n, 3) int64 to `out` (n,)."""
     for i in range(indices.shape[0]):
         x, y, z = indices[i, 0], indices[i, 1], indices[i, 2]
-        b = find(table, coords, x >> 3, y >> 3, z >> 3)
-        if b >= 0:
-            out[i] = cells[b, ((x & 7) << 6) | ((y & 7) << 3) | (z & 7)]
+        out[i] = number_in(stored, row_of(stored, x >> 3, y >> 3, z >> 3), x, y, z)

@@ -6,6 +6,8 @@ Grids keep their tiles in it too: blocks of other sizes at height 0.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
@@ -14,6 +16,16 @@ from stereovox.maps import _cpu
 SIDE = 8
 """Cells along each side of a block."""
 CELLS = SIDE**3
+
+
+class StoredCells(NamedTuple):
+    """All cells of a map as kernels read them, with `row_of` and `number_in` of `_cells.py`; never written to."""
+
+    table: NDArray[np.int32]
+    coords: NDArray[np.int32]  # (capacity, 3)
+    values: NDArray[np.integer]  # (capacity, 512)
+    unknown: np.int32  # what a cell without evidence holds
+    lowest: np.int32  # the lowest number a cell can hold
 
 
 class BlockPool:

@@ -14,7 +14,7 @@ from stereovox.config import Config
 from stereovox.errors import ConfigError
 from stereovox.frame import Viewpoint
 from stereovox.maps import _cpu
-from stereovox.maps.blocks import SIDE, BlockPool
+from stereovox.maps.blocks import SIDE, BlockPool, StoredCells
 from stereovox.maps.cell_format import CellFormat, CellRules
 from stereovox.maps.cell_format import State as State
 from stereovox.maps.evidence import LOG_ODDS_SCALE, Evidence
@@ -87,6 +87,12 @@ class VoxelMap:
     def cell_format(self) -> CellFormat:
         """What the log-odds of a cell are kept in."""
         return self._format
+
+    @property
+    def stored_cells(self) -> StoredCells:
+        """What kernels that only read need; holds until the map changes."""
+        pool, unknown = self._pool, np.int32(self._format.unknown)
+        return StoredCells(pool.table, pool.coords, pool.values, unknown, self._rules.lowest)
 
     def insert(self, coords: NDArray[np.int32], cells: NDArray[np.integer]) -> None:
         """Set whole blocks: coordinates (n, 3), cells (n, 512) as stored; what stood there before is lost."""
@@ -196,8 +202,7 @@ class VoxelMap:
         inside = (np.abs(indices) < INDEX_LIMIT).all(axis=1)
         stored = np.full(len(points), self._format.unknown, self._format.dtype)
         found = stored[inside]
-        pool = self._pool
-        _cpu.look_up(pool.table, pool.coords, pool.values, indices[inside].astype(np.int64), found)
+        _cpu.look_up(self.stored_cells, indices[inside].astype(np.int64), found)
         stored[inside] = found
         return stored
 

@@ -18,6 +18,9 @@ from typing import Any
 import numba
 from numba.core import config as numba_config
 from numba.core.compiler import CompilerBase, DefaultPassBuilder
+from numba.core.compiler_machinery import register_pass
+from numba.core.lowering import Lower
+from numba.core.typed_passes import NativeLowering
 
 FAST_MATH = {"nsz", "arcp", "contract", "afn", "reassoc"}
 """Without `nnan` and `ninf`: depth images hold NaN and infinity."""
@@ -25,12 +28,32 @@ FAST_MATH = {"nsz", "arcp", "contract", "afn", "reassoc"}
 Function = Callable[..., Any]
 
 
-class _NoAlias(CompilerBase):
+class _WideLower(Lower):
+    """Allows vectors of 512 bits where the processor has them; LLVM takes half of that by itself."""
+
+    def setup_function(self, fndesc: Any) -> None:
+        super().setup_function(fndesc)
+        set.add(self.function.attributes, '"prefer-vector-width"="512"')  # llvmlite knows only attributes without value
+
+
+@register_pass(mutates_CFG=True, analysis_only=False)
+class _WideLowering(NativeLowering):
+    _name = "stereovox_wide_lowering"
+
+    @property
+    def lowering_class(self) -> type[Lower]:
+        return _WideLower
+
+
+class _KernelCompiler(CompilerBase):
     """Numba's pipeline with the promise that array arguments do not overlap; without it no gather is vectorised."""
 
     def define_pipelines(self) -> list[Any]:
         self.state.flags.noalias = True
-        return [DefaultPassBuilder.define_nopython_pipeline(self.state)]
+        pipeline = DefaultPassBuilder.define_nopython_pipeline(self.state)
+        pipeline.passes = [(_WideLowering if p is NativeLowering else p, name) for p, name in pipeline.passes]
+        pipeline.finalize()
+        return [pipeline]
 
 
 def kernel(function: Function) -> Function:
@@ -65,7 +88,7 @@ def _compile(function: Function, **options: Any) -> Function:
     try:
         return numba.njit(
             function, cache=folder is not None, error_model="numpy", fastmath=FAST_MATH, nogil=True,
-            pipeline_class=_NoAlias, **options,
+            pipeline_class=_KernelCompiler, **options,
         )  # fmt: skip
     finally:
         settings.CACHE_DIR = before

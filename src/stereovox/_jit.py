@@ -59,14 +59,20 @@ class _KernelCompiler(CompilerBase):
 def kernel(function: Function) -> Function:
     """Compile `function` to machine code that releases the GIL and is cached on disk.
 
-    An array that a kernel writes to must not overlap another array it is given.
+    An array that a kernel writes to must not overlap another array it is given. It cannot make arrays: so none has to be
+    counted, which takes longer than the work where cells are small.
     """
+    return _compile(function, _nrt=False)
+
+
+def allocating_kernel(function: Function) -> Function:
+    """Compile `function` as `kernel` does, but let it make arrays."""
     return _compile(function)
 
 
 def cell(function: Function) -> Function:
-    """Compile a small function that becomes part of every kernel that calls it."""
-    return _compile(function, forceinline=True)
+    """Compile a small function that becomes part of every kernel that calls it; it makes no arrays."""
+    return _compile(function, forceinline=True, _nrt=False)
 
 
 @lru_cache

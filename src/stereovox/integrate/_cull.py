@@ -61,9 +61,9 @@ def _classify(view, table, windows, nearest, tile, blocks, bx, by, bz):
     side = np.float32(8) * view.voxel_size
     half = (np.float32(4 * blocks) - HALF) * view.voxel_size
     middle = np.float32(blocks) * HALF
-    px = (bx + middle) * side - view.position[0]
-    py = (by + middle) * side - view.position[1]
-    pz = (bz + middle) * side - view.position[2]
+    px = (np.float32(bx) + middle) * side - view.position[0]
+    py = (np.float32(by) + middle) * side - view.position[1]
+    pz = (np.float32(bz) + middle) * side - view.position[2]
     R = view.rotation
     z = R[2, 0] * px + R[2, 1] * py + R[2, 2] * pz
     ez = half * view.extent[2]

@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernel that evaluates every cell of the blocks that culling could not decide, in rows the compiler vectorises."""
+"""Kernel that evaluates every cell of the blocks that culling could not decide, in rows the compiler vectorises.
+
+Nearly all cells are plain: free, for they lie well before what was measured, or behind it. So a layer of cells is first
+told apart by two comparisons, and only a layer with cells near a measurement is looked up in the sensor table.
+"""
 
 import numpy as np
 
@@ -7,9 +11,14 @@ from stereovox._jit import cell, kernel
 from stereovox.integrate._cells import HALF, NEAR_PLANE, NO_RETURN, ONE, ZERO, table_row, window_level
 from stereovox.maps._cells import find
 
+LAYER = 64
+"""Cells told apart together: one layer of a block."""
+UNSEEN = np.float32(-1e9)
+"""Depth that stands for "nothing was measured where this cell is": every cell lies behind it."""
+
 
 @kernel
-def evaluate(depth_m, view, table, windows, blocks, values, hit_table, hit_coords, hit_values, hit_used):
+def evaluate(depth_m, view, table, windows, blocks, values, hit_table, hit_coords, hit_values, hit_used, depths, measured):
     """Fill `values` (n, 512) int16 with the evidence on the cells of `blocks` (n, 3), hits included.
 
     depth_m: (h, w) REP 117 depth image, from which `windows` was made.
@@ -18,15 +27,15 @@ def evaluate(depth_m, view, table, windows, blocks, values, hit_table, hit_coord
     side = np.float32(8) * view.voxel_size
     for i in range(blocks.shape[0]):
         x, y, z = blocks[i, 0], blocks[i, 1], blocks[i, 2]
-        px = x * side - view.position[0]
-        py = y * side - view.position[1]
-        pz = z * side - view.position[2]
+        px = np.float32(x) * side - view.position[0]
+        py = np.float32(y) * side - view.position[1]
+        pz = np.float32(z) * side - view.position[2]
         R = view.rotation
         cx = (R[0, 0] * px + R[0, 1] * py + R[0, 2] * pz) * view.intrinsics[0]
         cy = (R[1, 0] * px + R[1, 1] * py + R[1, 2] * pz) * view.intrinsics[1]
         cz = R[2, 0] * px + R[2, 1] * py + R[2, 2] * pz
         out = values[i]
-        _clear(view, table, windows, cx, cy, cz, out)
+        _clear(view, table, windows, cx, cy, cz, depths, measured, out)
         if table.marks:
             _mark(depth_m, view, table, cx, cy, cz, out)
         h = find(hit_table, hit_coords, x, y, z)
@@ -38,16 +47,30 @@ def evaluate(depth_m, view, table, windows, blocks, values, hit_table, hit_coord
 
 
 @cell
-def _clear(view, table, windows, cx, cy, cz, out):
-    """Write the negative evidence: what the farthest pixel in a window about the cell's size says."""
-    fx_steps, fy_steps, z_steps = view.steps[0], view.steps[1], view.steps[2]
+def _clear(view, table, windows, cx, cy, cz, depths, measured, out):
+    """Write the negative evidence: what the farthest pixel in a window about the cell's size says.
+
+    depths, measured: (LAYER,) scratch.
+    """
+    z_most = max(cz + view.z_most, ZERO)
+    before = table.before[table_row(min(z_most, view.max_range), table.rows_per_metre, table.before.size)]
+    for layer in range(0, 512, LAYER):
+        cells = slice(layer, layer + LAYER)
+        steps = view.steps[0, cells], view.steps[1, cells], view.steps[2, cells]
+        _measure(view, windows, cx, cy, cz, steps, depths, measured)
+        if _tell_apart(depths, measured, before, table.behind, np.int32(table.free), out[cells]):
+            _look_up(view, table, depths, measured, before, out[cells])
+
+
+@cell
+def _measure(view, windows, cx, cy, cz, steps, depths, measured):
+    """Fill `depths` with the depth of each cell's centre and `measured` with what was measured there."""
+    fx_steps, fy_steps, z_steps = steps
     u_centre, v_centre = view.intrinsics[2] + HALF, view.intrinsics[3] + HALF
     right, bottom = np.float32(view.width - 1), np.float32(view.height - 1)
     u_end, v_end = np.float32(view.width), np.float32(view.height)
-    rows = np.int32(table.hit.size)
-    last_column, middle_column = np.float32(table.clear.shape[1] - 1), np.float32(table.clear.shape[1]) * HALF
     first, last = np.int32(windows.first), np.int32(windows.shape.shape[0] - 1)
-    for c in range(512):
+    for c in range(LAYER):
         z = cz + z_steps[c]
         ahead = (z > NEAR_PLANE) & (z <= view.max_range)
         inverse = ONE / (z if ahead else ONE)
@@ -60,11 +83,34 @@ def _clear(view, table, windows, cx, cy, cz, out):
         column = np.int32(min(max(u, ZERO), right)) >> shift
         line = np.int32(min(max(v, ZERO), bottom)) >> shift
         d = windows.image[np.uint32(windows.offset[level] + line * windows.width[level] + column)]
-        row = min(np.int32(min(d, view.max_range) * table.rows_per_metre), rows - np.int32(1))
-        t = (z - d) * table.columns_per_metre[np.uint32(row)] + middle_column
+        depths[c] = z
+        measured[c] = d if seen else UNSEEN
+
+
+@cell
+def _tell_apart(depths, measured, before, behind, free, out):
+    """Write `free` for cells wholly before their measurement, else 0; return whether any lies near it."""
+    near = np.int32(0)
+    for c in range(LAYER):
+        ahead = measured[c] - depths[c]
+        out[c] = np.int16(free if ahead > before else np.int32(0))
+        near |= np.int32((ahead <= before) & (ahead >= -behind) & (measured[c] > ZERO))
+    return near != 0
+
+
+@cell
+def _look_up(view, table, depths, measured, before, out):
+    """Write what the sensor table says of cells that are not wholly before their measurement."""
+    rows = np.int32(table.hit.size)
+    columns = np.int32(table.clear.shape[1])
+    last_column, middle_column = np.float32(columns - 1), np.float32(columns) * HALF
+    for c in range(LAYER):
+        d = measured[c]
+        row = min(np.int32(min(max(d, ZERO), view.max_range) * table.rows_per_metre), rows - np.int32(1))
+        t = (depths[c] - d) * table.columns_per_metre[np.uint32(row)] + middle_column
         k = np.int32(min(max(t, ZERO), last_column))
         e = table.clear[np.uint32(row), np.uint32(k)]
-        out[c] = np.int16(e if seen & (d > ZERO) else np.int32(0))
+        out[c] = np.int16(e if d > ZERO else np.int32(0))
 
 
 @cell

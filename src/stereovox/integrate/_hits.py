@@ -33,7 +33,7 @@ def scatter(depth_m, view, keys, news, fresh, seen, pool_table, coords, count, v
     and one more for `fresh`. seen: (SEEN,) scratch of the keys' kind. Blocks count from the camera's own.
     """
     size = np.float32(1) / view.voxel_size
-    position = view.position * size
+    position = view.position[0] * size, view.position[1] * size, view.position[2] * size
     last, place = (np.int32(0), np.int32(0), np.int32(0)), np.int64(-1)
     b = np.int64(bits(keys))
     keys[:, :] = NOTHING
@@ -73,9 +73,9 @@ def weigh(depth_m, view, table, full_share, coords, count, values):
     side = np.float32(8) * view.voxel_size
     R, rows = view.rotation, table.hit.size
     for i in range(count[0]):
-        px = coords[i, 0] * side - view.position[0]
-        py = coords[i, 1] * side - view.position[1]
-        pz = coords[i, 2] * side - view.position[2]
+        px = np.float32(coords[i, 0]) * side - view.position[0]
+        py = np.float32(coords[i, 1]) * side - view.position[1]
+        pz = np.float32(coords[i, 2]) * side - view.position[2]
         cx = (R[0, 0] * px + R[0, 1] * py + R[0, 2] * pz) * view.intrinsics[0]
         cy = (R[1, 0] * px + R[1, 1] * py + R[1, 2] * pz) * view.intrinsics[1]
         cz = R[2, 0] * px + R[2, 1] * py + R[2, 2] * pz

@@ -20,7 +20,7 @@ OFF_FACE = np.float32(1e-3)
 def draw(depth_m, view, table, look_up, weight, lanes, pool_table, coords, count, values, first_row, last_row):
     """Add the evidence of all lines of rows first_row..last_row to an empty pool; arguments as in `_ray.cast`."""
     size = ONE / view.voxel_size
-    position = view.position * size
+    position = view.position[0] * size, view.position[1] * size, view.position[2] * size
     start = _off_faces(position[0]), _off_faces(position[1]), _off_faces(position[2])
     together = lanes.depth.size
     for v in range(first_row, last_row):

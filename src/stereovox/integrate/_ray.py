@@ -22,7 +22,7 @@ def cast(depth_m, view, table, look_up, weight, lanes, pool_table, coords, count
     Eq 3.21), in units of 1/1024 thousandths; 0: a cell keeps the strongest. Blocks count from the camera's own.
     """
     size = ONE / view.voxel_size
-    position = view.position * size
+    position = view.position[0] * size, view.position[1] * size, view.position[2] * size
     together = lanes.depth.size
     for v in range(first_row, last_row):
         ray = _row_rays(view.forward, view.rows[v], size)

@@ -121,7 +121,7 @@ class Projective:
                 hits.table,
                 hits.coords,
                 hits.values,
-                used,
+                used, *np.empty((2,64),np.float32)
             )
 
         in_shards(one_shard, shards(len(mixed), self._config.threads))

@@ -41,6 +41,8 @@ class KernelTable(NamedTuple):
     columns_per_metre: NDArray[np.float32]  # (rows,) table columns one metre spans
     reach: NDArray[np.float32]  # (rows,) half width of the table in metres
     safe: NDArray[np.float32]  # (rows + 1,) nearest z that any later row does not call wholly free
+    before: NDArray[np.float32]  # (rows,) cells at z up to the row's end are wholly free so far before a measurement
+    behind: np.float32  # metres behind a measurement from which on there is no negative evidence
     rows_per_metre: np.float32
     free: np.int32  # evidence far before a measurement
     marks: bool  # whether there is any positive evidence beside the hit
@@ -77,6 +79,7 @@ class View(NamedTuple):
     max_range: np.float32
     spread: np.float32  # window tile size in pixels times depth
     rim: NDArray[np.float32]  # (2,) border to the sides and above within which cells count as seen, pixels times depth
+    z_most: np.float32  # depth of a block's farthest point from its corner, camera axes
     steps: NDArray[np.float32]  # (3, 512) fx * x, fy * y and z of a block's cells from its corner, camera axes
 
 
@@ -102,10 +105,25 @@ def kernel_table(table: SensorTable, max_range: float) -> KernelTable:
         (COLUMNS / (2 * reach)).astype(np.float32),
         reach.astype(np.float32),
         safe.astype(np.float32),
+        _before(edges, reach),
+        _behind(clear, reach),
         np.float32(table.rows_per_metre),
         np.int32(free),
         bool((mark > 0).any()),
     )
+
+
+def _before(edges: NDArray[np.float64], reach: NDArray[np.float64]) -> NDArray[np.float32]:
+    """Return, for z up to each row's end, the largest reach of all rows that can reach back so far."""
+    ends = np.append(edges[1:], np.inf)
+    reaches_back = ends[:, None] + reach >= edges
+    return (1.001 * np.where(reaches_back, reach, 0).max(axis=1)).astype(np.float32)
+
+
+def _behind(clear: NDArray[np.int32], reach: NDArray[np.float64]) -> np.float32:
+    said = clear != 0
+    last = np.where(said.any(axis=1), COLUMNS - np.argmax(said[:, ::-1], axis=1), 0)  # columns from the first
+    return np.float32(max(1.001 * ((last / COLUMNS - 0.5) * 2 * reach).max(), 0))
 
 
 def origin_block(T_world_camera: Transform, config: Config) -> NDArray[np.int64]:
@@ -149,6 +167,7 @@ def view_of(image: DepthImage, config: Config) -> View:
         rays.max_range,
         np.float32(WINDOW_SHARE * camera.fx * voxel_size),
         rim.astype(np.float32),
+        np.float32(SIDE * voxel_size * np.maximum(to_camera[2], 0).sum()),
         _cell_steps(camera, to_camera, voxel_size),
     )
 

@@ -7,7 +7,7 @@ origin cells keep their edges. Places are in cells, whole multiples of 2^-20, so
 
 import numpy as np
 
-from stereovox._jit import cell, kernel
+from stereovox._jit import allocating_kernel, cell, kernel
 
 UNSIGNED = np.uint64
 """Kind of index that costs no test whether it counts from the end."""
@@ -107,7 +107,7 @@ def _give_twice(values, place, other, gain, adding):
         values[other] += gain if other != place else values.dtype.type(0)
 
 
-@kernel
+@allocating_kernel
 def places(across, up):
     """Return how far into a patch of tiles each of its columns lies, and each row: their sum is a cell's place."""
     columns, rows = np.empty(across << SIDE_BITS, np.uint32), np.empty(up << SIDE_BITS, np.uint32)

@@ -34,6 +34,12 @@ def usable(depth):
 
 
 @cell
+def index(i):
+    """Return an int32 that is not negative as an index: no test for counting from the end, and gathers of 32 bits."""
+    return np.uint32(i & np.int32(0x7FFFFFFF))
+
+
+@cell
 def bits_of(x):
     """Return the bits of a float32 as int32; for numbers that are not negative they order like the numbers."""
     return np.float32(x).view(np.int32)

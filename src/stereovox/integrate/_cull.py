@@ -5,6 +5,7 @@ import numpy as np
 
 from stereovox._jit import cell, kernel
 from stereovox.integrate._cells import HALF, NEAR_PLANE, NO_RETURN, ONE, ZERO, table_row, window_level
+from stereovox.integrate._windows import COARSEST
 from stereovox.maps._cells import find
 
 SKIP, FREE, MIXED = 0, 1, 2
@@ -83,15 +84,14 @@ def _classify(view, table, windows, nearest, tile, blocks, bx, by, bz):
     right, bottom = np.float32(view.width - 1), np.float32(view.height - 1)
     u0, u1 = _pixel(u_low, right), _pixel(u_high, right)
     v0, v1 = _pixel(v_low, bottom), _pixel(v_high, bottom)
-    last = windows.shape.shape[0] - 1
-    level = min(max(window_level(view.spread * near), windows.first), last)
+    level = min(max(window_level(view.spread * near), windows.first), np.int32(COARSEST))
     farthest = _extreme(windows, windows.highs, level, tile, u0, u1, v0, v1, True)
     if z_low > (farthest + _behind(table, farthest, view.max_range)) * (ONE + SLACK):
         return SKIP
     whole = u_low >= -HALF and v_low >= -HALF and u_high <= right + HALF and v_high <= bottom + HALF
     if not whole or z_high > view.max_range:
         return MIXED
-    level = min(max(window_level(view.spread * far), windows.first), last)
+    level = min(max(window_level(view.spread * far), windows.first), np.int32(COARSEST))
     closest = _extreme(windows, windows.lows, level, tile, u0, u1, v0, v1, False)
     if table.marks:
         closest = min(closest, _nearest(nearest, tile, u0, u1, v0, v1))

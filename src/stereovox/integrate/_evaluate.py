@@ -8,7 +8,8 @@ told apart by two comparisons, and only a layer with cells near a measurement is
 import numpy as np
 
 from stereovox._jit import cell, kernel
-from stereovox.integrate._cells import HALF, NEAR_PLANE, NO_RETURN, ONE, ZERO, table_row, window_level
+from stereovox.integrate._cells import HALF, NEAR_PLANE, NO_RETURN, ONE, ZERO, index, table_row, window_level
+from stereovox.integrate._windows import COARSEST, place
 from stereovox.maps._cells import find
 
 LAYER = 64
@@ -69,7 +70,7 @@ def _measure(view, windows, cx, cy, cz, steps, depths, measured):
     u_centre, v_centre = view.intrinsics[2] + HALF, view.intrinsics[3] + HALF
     right, bottom = np.float32(view.width - 1), np.float32(view.height - 1)
     u_end, v_end = np.float32(view.width), np.float32(view.height)
-    first, last = np.int32(windows.first), np.int32(windows.shape.shape[0] - 1)
+    first, last = np.int32(windows.first), np.int32(COARSEST)
     for c in range(LAYER):
         z = cz + z_steps[c]
         ahead = (z > NEAR_PLANE) & (z <= view.max_range)
@@ -79,10 +80,8 @@ def _measure(view, windows, cx, cy, cz, steps, depths, measured):
         u_rim, v_rim = view.rim[0] * inverse, view.rim[1] * inverse
         seen = ahead & (u >= -u_rim) & (v >= -v_rim) & (u < u_end + u_rim) & (v < v_end + v_rim)
         level = min(max(window_level(view.spread * inverse), first), last)
-        shift = max(level - np.int32(1), np.int32(0))
-        column = np.int32(min(max(u, ZERO), right)) >> shift
-        line = np.int32(min(max(v, ZERO), bottom)) >> shift
-        d = windows.image[np.uint32(windows.offset[level] + line * windows.width[level] + column)]
+        i = place(level, min(max(v, ZERO), bottom), min(max(u, ZERO), right), windows.pitch, windows.height)
+        d = windows.image[index(i)]
         depths[c] = z
         measured[c] = d if seen else UNSEEN
 
@@ -101,15 +100,15 @@ def _tell_apart(depths, measured, before, behind, free, out):
 @cell
 def _look_up(view, table, depths, measured, before, out):
     """Write what the sensor table says of cells that are not wholly before their measurement."""
-    rows = np.int32(table.hit.size)
-    columns = np.int32(table.clear.shape[1])
+    last_row = np.int32(table.hit.size - 1)
+    columns, clear = np.int32(table.clear.shape[1]), table.clear.reshape(table.clear.size)
     last_column, middle_column = np.float32(columns - 1), np.float32(columns) * HALF
     for c in range(LAYER):
         d = measured[c]
-        row = min(np.int32(min(max(d, ZERO), view.max_range) * table.rows_per_metre), rows - np.int32(1))
-        t = (depths[c] - d) * table.columns_per_metre[np.uint32(row)] + middle_column
+        row = min(np.int32(min(max(d, ZERO), view.max_range) * table.rows_per_metre), last_row)
+        t = (depths[c] - d) * table.columns_per_metre[index(row)] + middle_column
         k = np.int32(min(max(t, ZERO), last_column))
-        e = table.clear[np.uint32(row), np.uint32(k)]
+        e = clear[index(np.int32(np.int32(row * columns) + k))]
         out[c] = np.int16(e if d > ZERO else np.int32(0))
 
 

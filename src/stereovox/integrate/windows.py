@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from math import floor, log2
 from typing import NamedTuple
 
 import numpy as np
@@ -11,17 +12,16 @@ from numpy.typing import NDArray
 from stereovox.cameras import PinholeCamera
 from stereovox.integrate import _windows
 
-LEVELS = 9
+LEVELS = _windows.COARSEST + 1
 """Windows of one pixel, and of three tiles of 1 to 128 pixels."""
 
 
 class Windows(NamedTuple):
-    """All window images in flat arrays; see `_windows.py`."""
+    """All window images in one; see `_windows.py`."""
 
-    image: NDArray[np.float32]
-    offset: NDArray[np.int32]  # (levels,) where each level starts in `image`
-    width: NDArray[np.int32]  # (levels,) columns of each level
-    shape: NDArray[np.int32]  # (levels, 2) rows and columns
+    image: NDArray[np.float32]  # flat; `_windows.place` says where a pixel stands
+    pitch: np.int32
+    height: np.int32
     lows: NDArray[np.float32]
     highs: NDArray[np.float32]
     tile_offset: NDArray[np.int32]  # (levels, 2) where tiles of 16 and of 64 start
@@ -34,18 +34,19 @@ class WindowBuilder:
 
     def __init__(self, camera: PinholeCamera):
         h, w = camera.height, camera.width
+        coarsest = 1 << (LEVELS - 2)
         strides = np.array([1] + [1 << level for level in range(LEVELS - 1)])
         self._shape = np.stack([-(-h // strides), -(-w // strides)], axis=1).astype(np.int32)
-        self._width = self._shape[:, 1].copy()
-        sizes = self._shape.prod(axis=1)
-        self._offset = _starts(sizes)
         tiles = np.stack([-(-self._shape // 16), -(-self._shape // 64)], axis=1)
-        self._tile_offset = _starts(tiles.prod(axis=2).ravel()).reshape(LEVELS, 2)
-        self._tile_width = np.ascontiguousarray(tiles[:, :, 1], np.int32)
-        self._image = np.zeros(sizes.sum(), np.float32)
-        self._base = np.zeros(sizes.sum(), np.float32)
-        self._row, self._low_row = np.zeros((2, w), np.float32)
-        self._lows, self._highs = np.zeros((2, tiles.prod(axis=2).sum()), np.float32)
+        tile_offset = _starts(tiles.prod(axis=2).ravel()).reshape(LEVELS, 2)
+        pitch = coarsest * -(-w // coarsest)
+        size = pitch * (2 * h + -(-h // 2))
+        self._base, self._row, self._other = np.zeros(size, np.float32), *np.zeros((2, pitch), np.float32)
+        lows, highs = np.zeros((2, tiles.prod(axis=2).sum()), np.float32)
+        self._windows = Windows(
+            np.zeros(size, np.float32), np.int32(pitch), np.int32(h), lows, highs,
+            tile_offset, np.ascontiguousarray(tiles[:, :, 1], np.int32), np.int32(0),
+        )  # fmt: skip
         self.nearest = tuple(np.zeros((-(-h // size), -(-w // size)), np.float32) for size in (16, 64))
 
     def build(self, depth_m: NDArray[np.float32], smallest_tile: float) -> tuple[Windows, float]:
@@ -53,14 +54,11 @@ class WindowBuilder:
 
         With them the image's farthest depth in metres, `NO_RETURN` where a pixel saw nothing.
         """
-        first = int(np.clip(np.floor(np.log2(max(smallest_tile, 1e-9))) + 2, 0, LEVELS - 1))
+        first = min(max(floor(log2(max(smallest_tile, 1e-9))) + 2, 0), LEVELS - 1)
+        windows = self._windows._replace(first=np.int32(first))
         farthest = _windows.build(
-            depth_m.reshape(-1), self._base, self._image, self._row, self._low_row, self._lows, self._highs,
-            self._shape, self._offset, self._tile_offset, self._tile_width, first,
-        )  # fmt: skip
-        windows = Windows(
-            self._image, self._offset, self._width, self._shape, self._lows, self._highs,
-            self._tile_offset, self._tile_width, np.int32(first),
+            depth_m.reshape(-1), self._base, windows.image, self._row, self._other, windows.lows, windows.highs,
+            self._shape, windows.tile_offset, windows.tile_width, windows.pitch, first,
         )  # fmt: skip
         return windows, farthest
 

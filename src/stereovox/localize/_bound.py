@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from stereovox._jit import cell, kernel
+from stereovox._jit import allocating_kernel, cell, kernel
 
 ZERO = np.float32(0)
 
@@ -47,7 +47,7 @@ def _total(places, k, row, column, level, pyramid, pad):
     return total
 
 
-@kernel
+@allocating_kernel
 def climb(places, side, pyramid, pad, least, taken, apart, best):
     """Find the turn and shift of a cloud with the largest score, if it is above `least`; return that score.
 

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from stereovox._jit import cell, kernel
+from stereovox._jit import allocating_kernel, cell, kernel
 
 ZERO, ONE = np.float32(0), np.float32(1)
 FACING = np.float32(0.05)
 """Cosine between a line's normal and the direction towards the sensor, below which the other side was seen."""
 
 
-@kernel
+@allocating_kernel
 def search(points, guess, score, cell, side, side_yaw, step_yaw, slope, slope_yaw, best):
     """Try all poses within `side` cells and `side_yaw` steps of the guess; return the likelihood of the best.
 
@@ -92,7 +92,7 @@ def _at_point(dx, dy, ax, ay, point_weight, narrow, normal, gradient):
     return square, w
 
 
-@kernel
+@allocating_kernel
 def refine(points, views, near, lines, cell, sigma, point_weight, prior, information, iterations, pose, normal, cost):
     """Move `pose` (3,) to where the points lie on the lines, and near `prior`; return how many points are on lines.
 

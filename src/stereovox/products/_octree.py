@@ -7,14 +7,14 @@ last first, so that they are popped in file order; a stack never holds more than
 
 import numpy as np
 
-from stereovox._jit import kernel
+from stereovox._jit import allocating_kernel, kernel
 
 HEIGHT = 16
 STACK = 8 * HEIGHT
 BLOCK_HEIGHT = 3
 
 
-@kernel
+@allocating_kernel
 def read_binary_leaves(records, corners, heights, occupied):
     """Read the leaves of a `.bt` tree from its branches (n,) uint16; return their number.
 
@@ -58,7 +58,7 @@ def read_binary_leaves(records, corners, heights, occupied):
     return leaves
 
 
-@kernel
+@allocating_kernel
 def read_tree_leaves(children, corners, heights, records):
     """Read the leaves of an `.ot` tree from its nodes' child bits (n,) uint8; return their number.
 

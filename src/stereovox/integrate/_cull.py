@@ -16,18 +16,19 @@ COARSE = 4
 
 
 @kernel
-def candidates(view, table, windows, nearest, low, high, hit_table, hit_coords, free, mixed):
+def candidates(view, table, windows, nearest, end, hit_table, hit_coords, free, mixed):
     """List the blocks that are wholly free and those that need a look at each cell; return both numbers.
 
     Both are -1 when a list is too short.
 
-    low, high: (3,) first and last coarse box, counted in coarse boxes from the camera's block. A free block that
-    holds a hit is listed as mixed. free, mixed: (capacity, 3) int32 block coordinates from the camera's block.
+    end: depth in metres beyond which the image says nothing. A free block that holds a hit is listed as mixed.
+    free, mixed: (capacity, 3) int32 block coordinates from the camera's block.
     """
     n_free, n_mixed = 0, 0
-    for bx in range(low[0] * COARSE, (high[0] + 1) * COARSE, COARSE):
-        for by in range(low[1] * COARSE, (high[1] + 1) * COARSE, COARSE):
-            for bz in range(low[2] * COARSE, (high[2] + 1) * COARSE, COARSE):
+    (low_x, high_x), (low_y, high_y), (low_z, high_z) = _touched(view, end, 0), _touched(view, end, 1), _touched(view, end, 2)
+    for bx in range(low_x, high_x + 1, COARSE):
+        for by in range(low_y, high_y + 1, COARSE):
+            for bz in range(low_z, high_z + 1, COARSE):
                 coarse = _classify(view, table, windows, nearest, 1, COARSE, bx, by, bz)
                 if coarse == SKIP:
                     continue
@@ -53,6 +54,24 @@ def candidates(view, table, windows, nearest, low, high, hit_table, hit_coords, 
 
 
 @cell
+def _touched(view, end, axis):
+    """Return the first block of the first and of the last coarse box along an axis that the view up to `end` touches."""
+    last_u, last_v = view.columns.size - 1, view.rows.shape[0] - 1
+    rim_x = (view.rim[0] / end + ONE) / view.intrinsics[0]
+    rim_y = (view.rim[1] / end + ONE) / view.intrinsics[1]
+    low = high = ZERO
+    for corner in range(4):
+        x = view.columns[last_u] + rim_x if corner & 1 else view.columns[0] - rim_x
+        y = view.rows[last_v, 0] + rim_y if corner & 2 else view.rows[0, 0] - rim_y
+        reached = end * (x * view.forward[0, axis] + y * view.forward[1, axis] + view.forward[2, axis])
+        low, high = min(low, reached), max(high, reached)
+    side = np.float32(8 * COARSE) * view.voxel_size
+    first = np.int64(np.floor((view.position[axis] + low - view.voxel_size) / side))
+    last = np.int64(np.floor((view.position[axis] + high + view.voxel_size) / side))
+    return first * COARSE, last * COARSE
+
+
+@cell
 def _classify(view, table, windows, nearest, tile, blocks, bx, by, bz):
     """Tell whether all cells of a box are free (FREE), untouched (SKIP) or neither (MIXED).
 
@@ -67,7 +86,7 @@ def _classify(view, table, windows, nearest, tile, blocks, bx, by, bz):
     pz = (np.float32(bz) + middle) * side - view.position[2]
     R = view.rotation
     z = R[2, 0] * px + R[2, 1] * py + R[2, 2] * pz
-    ez = half * view.extent[2]
+    ez = half * _extent(R, 2)
     z_low, z_high = z - ez, z + ez
     if z_high <= NEAR_PLANE or z_low > view.max_range or _outside(view, half, px, py, pz):
         return SKIP
@@ -75,7 +94,7 @@ def _classify(view, table, windows, nearest, tile, blocks, bx, by, bz):
         return MIXED
     x = R[0, 0] * px + R[0, 1] * py + R[0, 2] * pz
     y = R[1, 0] * px + R[1, 1] * py + R[1, 2] * pz
-    ex, ey = half * view.extent[0], half * view.extent[1]
+    ex, ey = half * _extent(R, 0), half * _extent(R, 1)
     near, far = ONE / z_low, ONE / z_high
     u_low = view.intrinsics[0] * (x - ex) * (near if x < ex else far) + view.intrinsics[2] - SLACK
     u_high = view.intrinsics[0] * (x + ex) * (near if x > -ex else far) + view.intrinsics[2] + SLACK
@@ -96,6 +115,12 @@ def _classify(view, table, windows, nearest, tile, blocks, bx, by, bz):
     if table.marks:
         closest = min(closest, _nearest(nearest, tile, u0, u1, v0, v1))
     return FREE if z_high < _clear_to(table, closest) * (ONE - SLACK) else MIXED
+
+
+@cell
+def _extent(rotation, axis):
+    """Return the half width along one axis of the camera of a box of half width 1."""
+    return abs(rotation[axis, 0]) + abs(rotation[axis, 1]) + abs(rotation[axis, 2])
 
 
 @cell

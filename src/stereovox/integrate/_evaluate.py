@@ -53,7 +53,9 @@ def _clear(view, table, windows, cx, cy, cz, depths, measured, out):
 
     depths, measured: (LAYER,) scratch.
     """
-    z_most = max(cz + view.z_most, ZERO)
+    R = view.rotation
+    farther = max(R[2, 0], ZERO) + max(R[2, 1], ZERO) + max(R[2, 2], ZERO)
+    z_most = max(cz + np.float32(8) * view.voxel_size * farther, ZERO)
     before = table.before[table_row(min(z_most, view.max_range), table.rows_per_metre, table.before.size)]
     for layer in range(0, 512, LAYER):
         cells = slice(layer, layer + LAYER)

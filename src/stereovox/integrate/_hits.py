@@ -8,7 +8,7 @@ pixels whose number differs from their neighbours' are looked at further; groups
 import numpy as np
 
 from stereovox._jit import cell, kernel
-from stereovox.integrate._cells import HALF, NEAR_PLANE, NO_RETURN, ONE, ZERO, table_row
+from stereovox.integrate._cells import HALF, NEAR_PLANE, NO_RETURN, ONE, ZERO, index, table_row
 from stereovox.integrate._keys import NARROW, WIDE, bits, unpack
 from stereovox.maps._cells import find_or_insert
 
@@ -22,20 +22,23 @@ NOTHING = -1
 """Key of a pixel without a measurement."""
 SIDE_SAMPLES = 4
 """Samples along each side of a cell's footprint, at most."""
+LANES = 64
+"""Cells that are weighed together."""
 
 
 @kernel
-def scatter(depth_m, view, keys, news, fresh, seen, pool_table, coords, count, values):
-    """Set every cell that holds a measured point to 1; return False when the block pool is full.
+def scatter(depth_m, view, keys, news, fresh, seen, listed, pool_table, coords, count, values):
+    """Set every cell that holds a measured point to 1; return how many there are, -1 when the block pool is full.
 
     depth_m: (h, w) REP 117 depth image. keys: (2, LEFT + w rounded up to GROUP + RIGHT) scratch; int32 serves cells
     within 2^9 of the camera, int64 the rest. news, fresh: scratch of one row, uint8 and int32, w rounded up to GROUP
     and one more for `fresh`. seen: (SEEN,) scratch of the keys' kind. Blocks count from the camera's own.
+    listed: (pixels,) int32, written: the cells that were set, as 512 * their place in the pool + their number there.
     """
     size = np.float32(1) / view.voxel_size
     position = view.position[0] * size, view.position[1] * size, view.position[2] * size
     last, place = (np.int32(0), np.int32(0), np.int32(0)), np.int64(-1)
-    b = np.int64(bits(keys))
+    b, n = np.int64(bits(keys)), 0
     keys[:, :] = NOTHING
     seen[:] = NOTHING
     for v in range(depth_m.shape[0]):
@@ -58,64 +61,97 @@ def scatter(depth_m, view, keys, news, fresh, seen, pool_table, coords, count, v
                 place = find_or_insert(pool_table, coords, count, block[0], block[1], block[2])
                 last = block
             if place < 0:
-                return False
-            values[place, ((x & 7) << 6) | ((y & 7) << 3) | (zz & 7)] = 1
-    return True
+                return -1
+            c = ((x & 7) << 6) | ((y & 7) << 3) | (zz & 7)
+            if values[place, c] == 0:
+                values[place, c] = 1
+                listed[n] = (place << 9) | c
+                n += 1
+    return n
 
 
 @kernel
-def weigh(depth_m, view, table, full_share, coords, count, values):
+def weigh(depth_m, view, table, full_share, listed, n, coords, values, lanes):
     """Replace the ones that `scatter` set by evidence: that of a hit at the depth of the cell's centre.
 
     It counts in full where at least `full_share` of the cell's footprint in the image measures a depth within the cell;
     with less, by the square root of the part: a few pixels may be a slip of the matcher. full_share 0: always in full.
+    listed: the cells that `scatter` set, in its first `n` entries. lanes: (8, LANES) float32 scratch.
     """
-    side = np.float32(8) * view.voxel_size
-    R, rows = view.rotation, table.hit.size
-    for i in range(count[0]):
-        px = np.float32(coords[i, 0]) * side - view.position[0]
-        py = np.float32(coords[i, 1]) * side - view.position[1]
-        pz = np.float32(coords[i, 2]) * side - view.position[2]
-        cx = (R[0, 0] * px + R[0, 1] * py + R[0, 2] * pz) * view.intrinsics[0]
-        cy = (R[1, 0] * px + R[1, 1] * py + R[1, 2] * pz) * view.intrinsics[1]
-        cz = R[2, 0] * px + R[2, 1] * py + R[2, 2] * pz
-        out = values[i]
-        for c in range(512):
-            if out[c] == 0:
-                continue
-            z = max(cz + view.steps[2, c], NEAR_PLANE)
-            hit = np.float32(table.hit[table_row(min(z, view.max_range), table.rows_per_metre, rows)])
-            if full_share > ZERO and hit > ZERO:
-                share = _share(depth_m, view, cx + view.steps[0, c], cy + view.steps[1, c], z)
-                hit *= np.sqrt(min(ONE, share / full_share))
-            out[c] = np.int16(max(np.floor(hit + HALF), ONE)) if hit > ZERO else np.int16(0)
+    flat, values_flat = depth_m.reshape(depth_m.size), values.reshape(values.size)
+    x, y, z, share = lanes[0], lanes[1], lanes[2], lanes[3]
+    for start in range(0, n, LANES):
+        some = listed[start : min(start + LANES, n)]
+        _centres(view, coords, some, x, y, z)
+        for i in range(some.size):
+            share[i] = full_share
+        if full_share > ZERO:
+            _share(flat, view, some.size, x, y, z, share, lanes[4], lanes[5], lanes[6], lanes[7])
+        _evidence(view, table, full_share, some, z, share, values_flat)
 
 
 @cell
-def _share(depth_m, view, x, y, z):
-    """Return the part of a cell's footprint whose pixels measure a depth within half a cell of its centre.
+def _centres(view, coords, listed, x, y, z):
+    """Write where the centres of listed cells stand, camera axes, x and y times the focal length."""
+    side = np.float32(8) * view.voxel_size
+    R = view.rotation
+    for i in range(listed.size):
+        block, c = listed[i] >> 9, listed[i] & 511
+        px = np.float32(coords[block, 0]) * side - view.position[0]
+        py = np.float32(coords[block, 1]) * side - view.position[1]
+        pz = np.float32(coords[block, 2]) * side - view.position[2]
+        x[i] = (R[0, 0] * px + R[0, 1] * py + R[0, 2] * pz) * view.intrinsics[0] + view.steps[0, c]
+        y[i] = (R[1, 0] * px + R[1, 1] * py + R[1, 2] * pz) * view.intrinsics[1] + view.steps[1, c]
+        z[i] = max(R[2, 0] * px + R[2, 1] * py + R[2, 2] * pz + view.steps[2, c], NEAR_PLANE)
 
-    x, y: of the cell's centre, times the focal length. Samples stand at even distances; at least half of one counts.
+
+@cell
+def _share(depth_m, view, n, x, y, z, share, u, v, step, looked):
+    """Write the part of each cell's footprint whose pixels measure a depth within half a cell of its centre.
+
+    Samples stand at even distances, up to SIDE_SAMPLES a side; at least half of one counts. u, v, step, looked: scratch.
     """
-    inverse = ONE / z
-    wide = min(view.voxel_size * view.intrinsics[0] * inverse, np.float32(depth_m.shape[1]))
-    u0 = x * inverse + view.intrinsics[2] + HALF - HALF * wide
-    v0 = y * inverse + view.intrinsics[3] + HALF - HALF * wide
-    n = min(max(np.int32(wide), np.int32(1)), np.int32(SIDE_SAMPLES))
-    step = wide / np.float32(n)
+    width, height = np.float32(view.width), np.float32(view.height)
     limit = HALF * view.voxel_size
-    found, looked = np.int32(0), np.int32(0)
-    for j in range(n):
-        v = np.int32(np.floor(v0 + (np.float32(j) + HALF) * step))
-        if v < 0 or v >= depth_m.shape[0]:
-            continue
-        for k in range(n):
-            u = np.int32(np.floor(u0 + (np.float32(k) + HALF) * step))
-            if u < 0 or u >= depth_m.shape[1]:
-                continue
-            looked += 1
-            found += 1 if abs(depth_m[v, u] - z) <= limit else 0
-    return max(np.float32(found), HALF) / np.float32(max(looked, np.int32(1)))
+    for i in range(n):
+        inverse = ONE / z[i]
+        wide = min(view.voxel_size * view.intrinsics[0] * inverse, width)
+        step[i] = wide / _samples(wide)
+        u[i] = x[i] * inverse + view.intrinsics[2] + HALF - HALF * wide
+        v[i] = y[i] * inverse + view.intrinsics[3] + HALF - HALF * wide
+        share[i] = ZERO
+        looked[i] = ZERO
+    for j in range(SIDE_SAMPLES):
+        row = np.float32(j) + HALF
+        for k in range(SIDE_SAMPLES):
+            column = np.float32(k) + HALF
+            for i in range(n):
+                wide = min(view.voxel_size * view.intrinsics[0] / z[i], width)
+                samples = _samples(wide)
+                su, sv = u[i] + column * step[i], v[i] + row * step[i]
+                inside = (row < samples) & (column < samples) & (su >= ZERO) & (su < width) & (sv >= ZERO) & (sv < height)
+                at = np.int32(np.int32(sv if inside else ZERO) * view.width) + np.int32(su if inside else ZERO)
+                d = depth_m[index(np.int32(at))]
+                share[i] += ONE if inside & (abs(d - z[i]) <= limit) else ZERO
+                looked[i] += ONE if inside else ZERO
+    for i in range(n):
+        share[i] = max(share[i], HALF) / max(looked[i], ONE)
+
+
+@cell
+def _samples(wide):
+    """Return how many samples a footprint `wide` pixels across has along each side, as a float."""
+    return np.float32(np.int32(min(max(wide, ONE), np.float32(SIDE_SAMPLES))))
+
+
+@cell
+def _evidence(view, table, full_share, listed, z, share, values):
+    rows = np.int32(table.hit.size)
+    for i in range(listed.size):
+        hit = np.float32(table.hit[table_row(min(z[i], view.max_range), table.rows_per_metre, rows)])
+        part = min(ONE, share[i] / full_share) if full_share > ZERO else ONE
+        weighed = max(np.floor(hit * np.sqrt(part) + HALF), ONE)
+        values[index(listed[i])] = np.int16(weighed if hit > ZERO else ZERO)
 
 
 @cell

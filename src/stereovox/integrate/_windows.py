@@ -34,30 +34,41 @@ def place(level, v, u, pitch, height):
 
 
 @kernel
-def build(depth_m, base, window, row, other, lows, highs, shape, tile_offset, tile_width, pitch, first):
+def build(depth_m, base, window, ring, row, other, high_row, low_row, lows, highs, shape, tile_offset, tile_width, first):
     """Fill window images and tiles of all levels from `first` on; return the farthest depth of the image.
 
     depth_m: flat REP 117 depth image. window: flat image of all levels; shape: (levels, 2) rows and columns of each.
-    base: like `window`, scratch for the images before dilation; row, other: (pitch,) scratch.
-    lows, highs: flat tile images, at tile_offset[level, 0] for tiles of 16 and [level, 1] for 64.
+    base: like `window`, scratch for the images before dilation. Scratch too: ring (4, pitch), row, other, high_row,
+    low_row (pitch,). lows, highs: flat tile images, at tile_offset[level, 0] for tiles of 16 and [level, 1] for 64.
     """
-    height, width = shape[0, 0], shape[0, 1]
-    if first == 0:
-        level_0 = window[place(np.int32(0), ZERO, ZERO, pitch, height) :]
-        for v in range(height):
-            _copy_row(depth_m[v * width : (v + 1) * width], level_0[v * pitch :])
-        _tiles(level_0, pitch, row, other, lows, highs, shape[0], tile_offset[0], tile_width[0])
+    height, width, pitch = shape[0, 0], shape[0, 1], np.int32(row.size)
     lowest = max(first, 1)
-    for level in range(lowest, COARSEST + 1):
+    for level in range(first, COARSEST + 1):
+        rows, columns = shape[level, 0], shape[level, 1]
         start = place(np.int32(level), ZERO, ZERO, pitch, height)
-        target, image = base[start:], window[start:]
-        if level == lowest:
-            _shrink(depth_m, height, width, level - 1, row, other, target, pitch)
-        else:
-            finer = base[place(np.int32(level - 1), ZERO, ZERO, pitch, height) :]
-            _halve(finer, shape[level - 1, 0], shape[level - 1, 1], row, target, pitch)
-        _dilate(target, shape[level, 0], shape[level, 1], row, image, pitch)
-        _tiles(image, pitch, row, other, lows, highs, shape[level], tile_offset[level], tile_width[level])
+        coarser = place(np.int32(level + 1), ZERO, ZERO, pitch, height)
+        _fill_big(lows, highs, tile_offset[level, 1], tile_width[level, 1] * ((rows + 63) >> 6))
+        for v in range(rows + 1):
+            here = ring[v & 3]
+            if v < rows:
+                if level <= lowest:
+                    _shrunk_row(depth_m, v, height, width, max(level - 1, 0), row, other, here)
+                else:
+                    _copy(base[start + v * pitch :], columns, here)
+                if 0 < level < COARSEST and (v % 2 == 1 or v == rows - 1):
+                    _halved_rows(ring[v & 2], here, columns, row, base[coarser + (v >> 1) * pitch :])
+            if v > 0:
+                out = window[start + (v - 1) * pitch :]
+                if level == 0:
+                    _copy(ring[(v - 1) & 3], columns, out)
+                else:
+                    _window_row(ring[max(v - 2, 0) & 3], ring[(v - 1) & 3], ring[min(v, rows - 1) & 3], columns, row, out)
+                _take_in(out, columns, v - 1, high_row, low_row)
+                if v % 16 == 0 or v == rows:
+                    offsets = tile_offset[level, 0] + ((v - 1) >> 4) * tile_width[level, 0]
+                    big = tile_offset[level, 1] + ((v - 1) >> 6) * tile_width[level, 1]
+                    _put(_least_of_16(low_row, columns, other), tile_width[level, 0], lows, offsets, big, False)
+                    _put(_most_of_16(high_row, columns, other), tile_width[level, 0], highs, offsets, big, True)
     farthest = ZERO
     for i in range(tile_offset[COARSEST, 0], tile_offset[COARSEST, 1]):
         farthest = max(farthest, highs[i])
@@ -65,49 +76,47 @@ def build(depth_m, base, window, row, other, lows, highs, shape, tile_offset, ti
 
 
 @cell
-def _copy_row(depths, out):
-    for u in range(depths.size):
-        out[u] = usable(depths[u])
+def _copy(source, width, out):
+    for u in range(width):
+        out[u] = source[u]
 
 
 @cell
-def _shrink(depth_m, height, width, halvings, row, other, target, pitch):
-    """Write to `target` the farthest depth in tiles of 2^halvings pixels."""
-    tile = 1 << halvings
-    for v in range(0, height, tile):
-        out = target[(v >> halvings) * pitch :]
-        if halvings == 0:
-            _copy_row(depth_m[v * width : (v + 1) * width], out)
-            continue
+def _shrunk_row(depth_m, v, height, width, halvings, row, other, out):
+    """Write to `out` the farthest depth in each tile of 2^halvings pixels of row v of tiles."""
+    first = v << halvings
+    if halvings == 0:
+        depths = depth_m[first * width :]
         for u in range(width):
-            row[u] = ZERO
-        for line in range(v, min(v + tile, height)):
-            depths = depth_m[line * width : (line + 1) * width]
-            for u in range(width):
-                row[u] = max(row[u], depths[u])  # a NaN does not win: see `max`
-        size = width
-        for halving in range(halvings):
-            if halving % 2:
-                _halve_row(other, size, row)
-            else:
-                _halve_row(row, size, other)
-            size = (size + 1) >> 1
-        shrunk = other if halvings % 2 else row
-        for u in range(size):
-            out[u] = min(shrunk[u], NO_RETURN)
-
-
-@cell
-def _halve(source, height, width, row, target, pitch):
-    for v in range((height + 1) // 2):
-        upper, lower = source[2 * v * pitch :], source[min(2 * v + 1, height - 1) * pitch :]
+            out[u] = usable(depths[u])
+        return
+    for u in range(width):
+        row[u] = ZERO
+    for line in range(first, min(first + (1 << halvings), height)):
+        depths = depth_m[line * width :]
         for u in range(width):
-            row[u] = max(upper[u], lower[u])
-        _halve_row(row, width, target[v * pitch :])
+            row[u] = max(row[u], depths[u])  # what is not a number is never the larger one
+    size = width
+    for halving in range(halvings):
+        if halving % 2:
+            _halved_row(other, size, row)
+        else:
+            _halved_row(row, size, other)
+        size = (size + 1) >> 1
+    shrunk = other if halvings % 2 else row
+    for u in range(size):
+        out[u] = min(shrunk[u], NO_RETURN)
 
 
 @cell
-def _halve_row(row, width, out):
+def _halved_rows(upper, lower, width, row, out):
+    for u in range(width):
+        row[u] = max(upper[u], lower[u])
+    _halved_row(row, width, out)
+
+
+@cell
+def _halved_row(row, width, out):
     for u in range(width // 2):
         out[u] = max(row[2 * u], row[2 * u + 1])
     if width % 2:
@@ -115,34 +124,63 @@ def _halve_row(row, width, out):
 
 
 @cell
-def _dilate(source, height, width, row, target, pitch):
-    for v in range(height):
-        above, here, below = source[max(v - 1, 0) * pitch :], source[v * pitch :], source[min(v + 1, height - 1) * pitch :]
-        out = target[v * pitch :]
-        for u in range(width):
-            row[u] = max(max(above[u], below[u]), here[u])
-        for u in range(1, width - 1):
-            out[u] = max(max(row[u - 1], row[u + 1]), row[u])
-        out[0] = max(row[0], row[min(1, width - 1)])
-        out[width - 1] = max(row[width - 1], row[max(width - 2, 0)])
+def _halved_row_least(row, width, out):
+    for u in range(width // 2):
+        out[u] = min(row[2 * u], row[2 * u + 1])
+    if width % 2:
+        out[width // 2] = row[width - 1]
 
 
 @cell
-def _tiles(image, pitch, high_row, low_row, lows, highs, shape, tile_offset, tile_width):
-    height, width = shape[0], shape[1]
-    _fill_big(lows, highs, tile_offset[1], tile_width[1] * ((height + 63) // 64))
-    for tv in range((height + 15) // 16):
-        _extremes_of_rows(image, pitch, 16 * tv, min(16 * tv + 16, height), width, high_row, low_row)
-        for tu in range(tile_width[0]):
-            low, high = NO_RETURN, ZERO
-            for u in range(16 * tu, min(16 * tu + 16, width)):
-                low = min(low, low_row[u])
-                high = max(high, high_row[u])
-            lows[tile_offset[0] + tv * tile_width[0] + tu] = low
-            highs[tile_offset[0] + tv * tile_width[0] + tu] = high
-            big = tile_offset[1] + (tv >> 2) * tile_width[1] + (tu >> 2)
-            lows[big] = min(lows[big], low)
-            highs[big] = max(highs[big], high)
+def _window_row(above, here, below, width, row, out):
+    for u in range(width):
+        row[u] = max(max(above[u], below[u]), here[u])
+    for u in range(1, width - 1):
+        out[u] = max(max(row[u - 1], row[u + 1]), row[u])
+    out[0] = max(row[0], row[min(1, width - 1)])
+    out[width - 1] = max(row[width - 1], row[max(width - 2, 0)])
+
+
+@cell
+def _take_in(line, width, v, high_row, low_row):
+    """Take row v of window values into the highest and lowest values of up to 16 rows."""
+    if v % 16 == 0:
+        for u in range(width):
+            high_row[u] = line[u]
+            low_row[u] = line[u]
+        return
+    for u in range(width):
+        high_row[u] = max(high_row[u], line[u])
+        low_row[u] = min(low_row[u], line[u])
+
+
+@cell
+def _most_of_16(row, width, other):
+    """Return `row` with the highest value of each 16 columns in its first ones."""
+    for _ in range(2):
+        _halved_row(row, width, other)
+        _halved_row(other, (width + 1) >> 1, row)
+        width = (width + 3) >> 2
+    return row
+
+
+@cell
+def _least_of_16(row, width, other):
+    """Return `row` with the lowest value of each 16 columns in its first ones."""
+    for _ in range(2):
+        _halved_row_least(row, width, other)
+        _halved_row_least(other, (width + 1) >> 1, row)
+        width = (width + 3) >> 2
+    return row
+
+
+@cell
+def _put(row, number, tiles, start, big, highest):
+    """Enter a row of tiles of 16, and take it into that of tiles of 64."""
+    for tu in range(number):
+        tiles[start + tu] = row[tu]
+        k = big + (tu >> 2)
+        tiles[k] = max(tiles[k], row[tu]) if highest else min(tiles[k], row[tu])
 
 
 @cell
@@ -150,18 +188,6 @@ def _fill_big(lows, highs, start, number):
     for i in range(start, start + number):
         lows[i] = NO_RETURN
         highs[i] = ZERO
-
-
-@cell
-def _extremes_of_rows(image, pitch, first, last, width, high_row, low_row):
-    for u in range(width):
-        high_row[u] = ZERO
-        low_row[u] = NO_RETURN
-    for v in range(first, last):
-        line = image[v * pitch :]
-        for u in range(width):
-            high_row[u] = max(high_row[u], line[u])
-            low_row[u] = min(low_row[u], line[u])
 
 
 @kernel

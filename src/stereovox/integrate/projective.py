@@ -19,7 +19,7 @@ from stereovox.integrate._cells import NEAR_PLANE, NO_RETURN
 from stereovox.integrate.faces import faces_of
 from stereovox.integrate.merging import strongest
 from stereovox.integrate.shards import in_shards, shards
-from stereovox.integrate.views import KernelTable, View, farthest_cells, origin_block, sensor_table, view_of
+from stereovox.integrate.views import KernelTable, View, Views, farthest_cells, sensor_table
 from stereovox.integrate.windows import WindowBuilder, Windows
 from stereovox.maps.blocks import CELLS, SIDE, BlockPool
 from stereovox.maps.evidence import Evidence
@@ -44,7 +44,7 @@ class Projective:
 
     def _of_pinhole(self, image: DepthImage, camera: PinholeCamera) -> Evidence:
         self._prepare(camera)
-        view = view_of(image, self._config)
+        view = self._views.at(image.T_world_sensor)
         windows, farthest = self._builder.build(image.depth_m, float(view.spread) / self._config.max_range)
         if self._table.marks:
             self._builder.build_nearest(image.depth_m)
@@ -52,19 +52,22 @@ class Projective:
         free, mixed = self._candidates(view, windows, self._end_of_view(farthest))
         values, used = self._evaluate(image.depth_m, view, windows, mixed)
         coords, values = self._with_leftovers(mixed, values, used)
-        origin = origin_block(image.T_world_sensor, self._config).astype(np.int32)
+        origin = self._views.block
         return Evidence(coords + origin, values, free + origin, int(self._table.free))
 
     def _prepare(self, camera: PinholeCamera) -> None:
         if camera == self._camera:
             return
         self._table: KernelTable = sensor_table(self._sensor, self._config, camera)
+        self._views = Views(camera, self._config)
         self._builder = WindowBuilder(camera)
         self._keys = self._key_rows(camera)
         pixels = self._keys.shape[1] - _hits.LEFT - _hits.RIGHT
         self._news = np.zeros(pixels, np.uint8)
         self._fresh = np.zeros(pixels + 1, np.int32)
         self._seen = np.zeros(_hits.SEEN, self._keys.dtype)
+        self._listed = np.zeros(camera.height * camera.width, np.int32)
+        self._weighing = np.zeros((8, _hits.LANES), np.float32)
         self._camera = camera
 
     def _key_rows(self, camera: PinholeCamera) -> NDArray[np.signedinteger]:
@@ -85,18 +88,18 @@ class Projective:
     def _scatter_hits(self, depth_m: NDArray[np.float32], view: View) -> None:
         hits = self._hits
         hits.clear()
-        scratch = (self._keys, self._news, self._fresh, self._seen)
-        while not _hits.scatter(depth_m, view, *scratch, hits.table, hits.coords, hits.count, hits.values):
-            hits.reserve(len(hits.coords))
-        full_share = np.float32(self._config.projective.full_share)
-        _hits.weigh(depth_m, view, self._table, full_share, hits.coords, hits.count, hits.values)
+        scratch = (self._keys, self._news, self._fresh, self._seen, self._listed)
+        while (n := _hits.scatter(depth_m, view, *scratch, hits.table, hits.coords, hits.count, hits.values)) < 0:
+            hits.clear()
+            hits.reserve(2 * len(hits.coords))
+        share = np.float32(self._config.projective.full_share)
+        _hits.weigh(depth_m, view, self._table, share, self._listed, n, hits.coords, hits.values, self._weighing)
 
     def _candidates(self, view: View, windows: Windows, end: float) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-        low, high = _coarse_range(view, end)
         hits = self._hits
         while True:
             n_free, n_mixed = _cull.candidates(
-                view, self._table, windows, self._builder.nearest, low, high,
+                view, self._table, windows, self._builder.nearest, np.float32(end),
                 hits.table, hits.coords, self._free, self._mixed,
             )  # fmt: skip
             if n_free >= 0:
@@ -134,17 +137,3 @@ class Projective:
             return mixed, values
         return np.concatenate([mixed, self._hits.coords[left]]), np.concatenate([values, self._hits.values[left]])
 
-
-def _coarse_range(view: View, end: float) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the first and last coarse box (3,) that the view up to depth `end` can touch."""
-    rim_x, rim_y = (view.rim / end + 1) / view.intrinsics[:2]
-    x = np.array([view.columns[0] - rim_x, view.columns[-1] + rim_x]) * end
-    y = np.array([view.rows[0, 0] - rim_y, view.rows[-1, 0] + rim_y]) * end
-    corners = np.array([[0, 0, 0], *[[a, b, end] for a in x for b in y]], float)
-    world = corners @ view.forward.astype(float) + view.position
-    side = _cull.COARSE * SIDE * float(view.voxel_size)
-    margin = float(view.voxel_size)
-    return (
-        np.floor((world.min(0) - margin) / side).astype(np.int64),
-        np.floor((world.max(0) + margin) / side).astype(np.int64),
-    )

@@ -13,6 +13,7 @@ from stereovox.cameras import PinholeCamera
 from stereovox.config import Config
 from stereovox.frame import DepthImage
 from stereovox.geometry import Transform
+from stereovox.integrate import _views
 from stereovox.maps.blocks import SIDE
 from stereovox.maps.evidence import to_units
 from stereovox.rigs import VirtualCamera
@@ -28,7 +29,7 @@ RIM_SHARE = 0.35
 """A cell still counts as inside the image when its centre lies this share of its size outside."""
 
 
-CELL_CENTRES = np.stack([axis.ravel() for axis in np.mgrid[:SIDE, :SIDE, :SIDE]]) + 0.5
+CELL_CENTRES = (np.stack([axis.ravel() for axis in np.mgrid[:SIDE, :SIDE, :SIDE]]) + 0.5).astype(np.float32)
 """(3, 512) centres of a block's cells from its corner, in cells."""
 
 
@@ -68,7 +69,6 @@ class View(NamedTuple):
     rotation: NDArray[np.float32]  # (3, 3) world to camera
     forward: NDArray[np.float32]  # (3, 3) as in `Rays`
     position: NDArray[np.float32]  # (3,) of the camera, from the corner of its block
-    extent: NDArray[np.float32]  # (3,) half width along x, y, z of the camera of a box of half width 1
     sides: NDArray[np.float32]  # (4, 5) the image's sides as planes: normal, half width of a unit box, offset
     columns: NDArray[np.float32]  # (width,) x/z of pixel columns
     rows: NDArray[np.float32]  # (height, 2) y/z of pixel rows, and 1
@@ -79,7 +79,6 @@ class View(NamedTuple):
     max_range: np.float32
     spread: np.float32  # window tile size in pixels times depth
     rim: NDArray[np.float32]  # (2,) border to the sides and above within which cells count as seen, pixels times depth
-    z_most: np.float32  # depth of a block's farthest point from its corner, camera axes
     steps: NDArray[np.float32]  # (3, 512) fx * x, fy * y and z of a block's cells from its corner, camera axes
 
 
@@ -145,48 +144,30 @@ def _stretch(config: Config) -> NDArray[np.float64]:
     return config.voxel_size / np.array(config.cell)
 
 
-def view_of(image: DepthImage, config: Config) -> View:
-    """Return the kernel view of a pinhole camera's depth image and its pose."""
-    camera, voxel_size = image.camera, config.voxel_size
-    assert isinstance(camera, PinholeCamera)
-    rays = rays_of(image, config)
-    to_camera = image.T_world_sensor[:3, :3].T / _stretch(config)
-    rim = RIM_SHARE * voxel_size * np.array([camera.fx, camera.fy])
-    return View(
-        np.ascontiguousarray(to_camera, np.float32),
-        rays.forward,
-        rays.position,
-        np.abs(to_camera).sum(axis=1).astype(np.float32),
-        _sides(camera, to_camera, rim),
-        rays.columns,
-        rays.rows,
-        np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32),
-        np.int32(camera.width),
-        np.int32(camera.height),
-        rays.voxel_size,
-        rays.max_range,
-        np.float32(WINDOW_SHARE * camera.fx * voxel_size),
-        rim.astype(np.float32),
-        np.float32(SIDE * voxel_size * np.maximum(to_camera[2], 0).sum()),
-        _cell_steps(camera, to_camera, voxel_size),
-    )
+class Views:
+    """Makes the kernel views of one pinhole camera; a view holds until the next is made."""
 
+    def __init__(self, camera: PinholeCamera, config: Config):
+        size, fx, fy = config.voxel_size, camera.fx, camera.fy
+        rim = RIM_SHARE * size * np.array([fx, fy])
+        intrinsics = np.array([fx, fy, camera.cx, camera.cy])
+        shape = np.array([camera.width, camera.height], float)
+        self._given = np.array(config.cell, float), size, intrinsics, shape, rim, CELL_CENTRES
+        self.block = np.zeros(3, np.int32)
+        columns, rows = camera_rays(camera)
+        self._view = View(
+            *(np.zeros((3, 3), np.float32) for _ in range(2)), np.zeros(3, np.float32), np.zeros((4, 5), np.float32),
+            columns, rows, intrinsics.astype(np.float32), np.int32(camera.width), np.int32(camera.height),
+            np.float32(size), np.float32(config.max_range), np.float32(WINDOW_SHARE * fx * size),
+            rim.astype(np.float32), np.zeros((3, SIDE**3), np.float32),
+        )  # fmt: skip
 
-def _sides(camera: PinholeCamera, to_camera: NDArray[np.float64], rim: NDArray[np.float64]) -> NDArray[np.float32]:
-    """A point counts as seen when fx x + (cx + 0.5) z + rim >= 0, and the like for the other three sides."""
-    right, bottom = camera.width - 0.5 - camera.cx, camera.height - 0.5 - camera.cy
-    inward = np.array(
-        [
-            [camera.fx, 0, camera.cx + 0.5],
-            [-camera.fx, 0, right],
-            [0, camera.fy, camera.cy + 0.5],
-            [0, -camera.fy, bottom],
-        ]
-    )
-    normals = inward @ to_camera
-    unit_box = np.abs(normals).sum(axis=1, keepdims=True)
-    border = np.repeat(rim, 2)[:, None] + 1e-3 * np.abs(inward).max(axis=1, keepdims=True)
-    return np.hstack([normals, unit_box, border]).astype(np.float32)
+    def at(self, T_world_camera: Transform) -> View:
+        """Return the view from this pose; `block` is then the block (3,) the camera stands in."""
+        view = self._view
+        written = view.rotation, view.forward, view.position, view.sides, view.steps
+        _views.aim(np.ascontiguousarray(T_world_camera, float), *self._given, self.block, *written)
+        return view
 
 
 @lru_cache
@@ -200,8 +181,3 @@ def farthest_cells(camera: VirtualCamera, reach: float, config: Config) -> float
     columns, rows = camera_rays(camera)
     corner = np.hypot(np.abs(columns).max(), np.hypot(*rows.T).max())
     return float(corner * reach / min(config.cell) + SIDE)
-
-
-def _cell_steps(camera: PinholeCamera, to_camera: NDArray[np.float64], voxel_size: float) -> NDArray[np.float32]:
-    to_pixels = to_camera * (np.array([[camera.fx], [camera.fy], [1.0]]) * voxel_size)
-    return (to_pixels @ CELL_CENTRES).astype(np.float32)

@@ -41,7 +41,7 @@ class WindowBuilder:
         tile_offset = _starts(tiles.prod(axis=2).ravel()).reshape(LEVELS, 2)
         pitch = coarsest * -(-w // coarsest)
         size = pitch * (2 * h + -(-h // 2))
-        self._base, self._row, self._other = np.zeros(size, np.float32), *np.zeros((2, pitch), np.float32)
+        self._scratch = np.zeros(size, np.float32), np.zeros((4, pitch), np.float32), *np.zeros((4, pitch), np.float32)
         lows, highs = np.zeros((2, tiles.prod(axis=2).sum()), np.float32)
         self._windows = Windows(
             np.zeros(size, np.float32), np.int32(pitch), np.int32(h), lows, highs,
@@ -56,9 +56,10 @@ class WindowBuilder:
         """
         first = min(max(floor(log2(max(smallest_tile, 1e-9))) + 2, 0), LEVELS - 1)
         windows = self._windows._replace(first=np.int32(first))
+        base, *rows = self._scratch
         farthest = _windows.build(
-            depth_m.reshape(-1), self._base, windows.image, self._row, self._other, windows.lows, windows.highs,
-            self._shape, windows.tile_offset, windows.tile_width, windows.pitch, first,
+            depth_m.reshape(-1), base, windows.image, *rows, windows.lows, windows.highs,
+            self._shape, windows.tile_offset, windows.tile_width, first,
         )  # fmt: skip
         return windows, farthest
 

@@ -152,7 +152,7 @@ def refine(points, views, near, lines, cell, sigma, point_weight, prior, informa
     return on
 
 
-@kernel
+@allocating_kernel
 def _step(normal, information, gradient, pose, prior):
     a = normal + information
     off = pose - prior

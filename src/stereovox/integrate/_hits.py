@@ -12,8 +12,6 @@ from stereovox.integrate._cells import HALF, NEAR_PLANE, NO_RETURN, ONE, ZERO, i
 from stereovox.integrate._keys import NARROW, WIDE, bits, unpack
 from stereovox.maps._cells import find_or_insert
 
-LEFT, RIGHT = 2, 1
-"""Entries before and behind a row of keys, so that every pixel has neighbours."""
 SEEN_BITS = 11
 SEEN = 1 << SEEN_BITS
 GROUP = 8
@@ -30,9 +28,9 @@ LANES = 64
 def scatter(depth_m, view, keys, news, fresh, seen, listed, pool_table, coords, count, values):
     """Set every cell that holds a measured point to 1; return how many there are, -1 when the block pool is full.
 
-    depth_m: (h, w) REP 117 depth image. keys: (2, LEFT + w rounded up to GROUP + RIGHT) scratch; int32 serves cells
-    within 2^9 of the camera, int64 the rest. news, fresh: scratch of one row, uint8 and int32, w rounded up to GROUP
-    and one more for `fresh`. seen: (SEEN,) scratch of the keys' kind. Blocks count from the camera's own.
+    depth_m: (h, w) REP 117 depth image. keys: (2, w + 1) scratch; int32 serves cells within 2^9 of the camera, int64 the
+    rest. news: (w rounded up to GROUP,) uint8 zeros, scratch; fresh: int32 scratch, one longer. seen: (SEEN,) scratch
+    of the keys' kind. Blocks count from the camera's own.
     listed: (pixels,) int32, written: the cells that were set, as 512 * their place in the pool + their number there.
     """
     size = np.float32(1) / view.voxel_size
@@ -45,12 +43,11 @@ def scatter(depth_m, view, keys, news, fresh, seen, listed, pool_table, coords, 
         now, before = keys[v & 1], keys[1 - (v & 1)]
         ray = _row_rays(view.forward, view.rows[v], size)
         if keys.itemsize == 4:
-            _narrow_keys(depth_m[v], view.columns, ray, position, now[LEFT:])
+            _narrow_row(depth_m[v], view.columns, ray, position, now, before, news)
         else:
-            _wide_keys(depth_m[v], view.columns, ray, position, now[LEFT:])
-        _mark_news(now, before, news)
+            _wide_row(depth_m[v], view.columns, ray, position, now, before, news)
         for i in range(_gather_news(news, fresh)):
-            key = now[LEFT + fresh[i]]
+            key = now[fresh[i]]
             slot = _slot(key)
             if seen[slot] == key:
                 continue
@@ -186,42 +183,49 @@ def _point_cell(d, column, ray, position):
 
 
 @cell
-def _narrow_keys(depths, columns, ray, position, keys):
-    """Pack each pixel's cell into an int32; offsets keep all numbers positive, so cutting off digits is the floor."""
+def _narrow_row(depths, columns, ray, position, now, before, news):
+    """Pack each pixel's cell into an int32 and mark news.
+
+    Offsets keep all numbers positive, so that cutting off digits is the floor.
+    """
     middle = np.float32(1 << (NARROW - 1))
     x0, y0, z0 = position[0] + middle, position[1] + middle, position[2] + middle
+    last = np.int32(NOTHING)
     for u in range(depths.size):
-        d = depths[u]
-        x = np.int32(d * (ray[0] * columns[u] + ray[1]) + x0)
-        y = np.int32(d * (ray[2] * columns[u] + ray[3]) + y0)
-        z = np.int32(d * (ray[4] * columns[u] + ray[5]) + z0)
-        key = (x << np.int32(2 * NARROW)) | (y << np.int32(NARROW)) | z
-        keys[u] = key if (d > ZERO) & (d < NO_RETURN) else np.int32(NOTHING)
+        d, column = depths[u], columns[u]
+        x = np.int32(d * (ray[0] * column + ray[1]) + x0)
+        y = np.int32(d * (ray[2] * column + ray[3]) + y0)
+        z = np.int32(d * (ray[4] * column + ray[5]) + z0)
+        key = np.int32((x << np.int32(2 * NARROW)) | (y << np.int32(NARROW)) | z)
+        key = key if (d > ZERO) & (d < NO_RETURN) else np.int32(NOTHING)
+        now[u] = key
+        news[u] = _is_new(key, last, before[u], before[u + 1])
+        last = key
 
 
 @cell
-def _wide_keys(depths, columns, ray, position, keys):
-    """Pack each pixel's cell into an int64."""
+def _wide_row(depths, columns, ray, position, now, before, news):
+    """Pack each pixel's cell into an int64 and mark news."""
     middle = np.int64(1 << (WIDE - 1))
+    last = np.int64(NOTHING)
     for u in range(depths.size):
         d = depths[u]
         x, y, z = _point_cell(d, columns[u], ray, position)
         key = ((np.int64(x) + middle) << (2 * WIDE)) | ((np.int64(y) + middle) << WIDE) | (np.int64(z) + middle)
-        keys[u] = key if (d > ZERO) & (d < NO_RETURN) else np.int64(NOTHING)
+        key = key if (d > ZERO) & (d < NO_RETURN) else np.int64(NOTHING)
+        now[u] = key
+        news[u] = _is_new(key, last, before[u], before[u + 1])
+        last = key
 
 
 @cell
-def _mark_news(now, before, news):
-    """Set `news` where a pixel holds a measurement and its key differs from those of five pixels seen before.
+def _is_new(key, left, above, above_right):
+    """Tell whether a pixel holds a measurement whose cell none of three pixels seen before it has.
 
-    Five, because noise makes the pixels of a surface near a cell's face fall into two cells by turns.
+    Noise makes the pixels of a surface near a cell's face fall into two cells by turns; these three were found to be
+    worth their comparisons, further ones not.
     """
-    for u in range(news.size):
-        i = u + LEFT
-        key = now[i]
-        beside = (key != now[i - 1]) & (key != now[i - 2])
-        above = (key != before[i]) & (key != before[i - 1]) & (key != before[i + 1])
-        news[u] = np.uint8(beside & above & (key != NOTHING))
+    return np.uint8((key != left) & (key != above) & (key != above_right) & (key != NOTHING))
 
 
 @cell

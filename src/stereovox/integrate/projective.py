@@ -62,7 +62,7 @@ class Projective:
         self._views = Views(camera, self._config)
         self._builder = WindowBuilder(camera)
         self._keys = self._key_rows(camera)
-        pixels = self._keys.shape[1] - _hits.LEFT - _hits.RIGHT
+        pixels = _hits.GROUP * -(-camera.width // _hits.GROUP)
         self._news = np.zeros(pixels, np.uint8)
         self._fresh = np.zeros(pixels + 1, np.int32)
         self._seen = np.zeros(_hits.SEEN, self._keys.dtype)
@@ -74,8 +74,7 @@ class Projective:
         """Return scratch for the keys of two pixel rows, of the narrowest kind that tells all cells apart."""
         cells = farthest_cells(camera, self._config.max_range, self._config)
         narrow = cells < 1 << (_keys.NARROW - 1)
-        pixels = _hits.GROUP * -(-camera.width // _hits.GROUP)
-        return np.zeros((2, _hits.LEFT + pixels + _hits.RIGHT), np.int32 if narrow else np.int64)
+        return np.zeros((2, camera.width + 1), np.int32 if narrow else np.int64)
 
     def _end_of_view(self, farthest: float) -> float:
         """Return the depth in metres beyond which this image says nothing."""

@@ -23,6 +23,7 @@ LAYERS = (
         "config",
         "config_robot",
         "_jit",
+        "shards",
     },
     {"sources", "depth", "sensors", "maps"},
     {"integrate", "products", "localize", "calibrate"},

@@ -59,8 +59,8 @@ class _KernelCompiler(CompilerBase):
 def kernel(function: Function) -> Function:
     """Compile `function` to machine code that releases the GIL and is cached on disk.
 
-    An array that a kernel writes to must not overlap another array it is given. It cannot make arrays: so none has to be
-    counted, which takes longer than the work where cells are small.
+    An array that a kernel writes to must not overlap another array it is given. It cannot make arrays: so none has to
+    be counted, which takes longer than the work where kernel cells are small.
     """
     return _compile(function, _nrt=False)
 

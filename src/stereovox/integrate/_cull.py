@@ -16,16 +16,18 @@ COARSE = 4
 
 
 @kernel
-def candidates(view, table, windows, nearest, end, hit_table, hit_coords, free, mixed):
+def candidates(view, table, windows, nearest, end, free, mixed):
     """List the blocks that are wholly free and those that need a look at each cell; return both numbers.
 
     Both are -1 when a list is too short.
 
-    end: depth in metres beyond which the image says nothing. A free block that holds a hit is listed as mixed.
+    end: depth in metres beyond which the image says nothing.
     free, mixed: (capacity, 3) int32 block coordinates from the camera's block.
     """
     n_free, n_mixed = 0, 0
-    (low_x, high_x), (low_y, high_y), (low_z, high_z) = _touched(view, end, 0), _touched(view, end, 1), _touched(view, end, 2)
+    low_x, high_x = _touched(view, end, 0)
+    low_y, high_y = _touched(view, end, 1)
+    low_z, high_z = _touched(view, end, 2)
     for bx in range(low_x, high_x + 1, COARSE):
         for by in range(low_y, high_y + 1, COARSE):
             for bz in range(low_z, high_z + 1, COARSE):
@@ -42,20 +44,45 @@ def candidates(view, table, windows, nearest, end, hit_table, hit_coords, free, 
                     for j in range(8):
                         x, y, z = hx + (j >> 2), hy + ((j >> 1) & 1), hz + (j & 1)
                         kind = half if half == FREE else _classify(view, table, windows, nearest, 0, 1, x, y, z)
-                        if kind == SKIP:
-                            continue
-                        if kind == FREE and find(hit_table, hit_coords, x, y, z) < 0:
+                        if kind == FREE:
                             free[n_free, 0], free[n_free, 1], free[n_free, 2] = x, y, z
                             n_free += 1
-                        else:
+                        elif kind == MIXED:
                             mixed[n_mixed, 0], mixed[n_mixed, 1], mixed[n_mixed, 2] = x, y, z
                             n_mixed += 1
     return n_free, n_mixed
 
 
+@kernel
+def with_hits(hit_table, hit_coords, n_hits, free, n_free, mixed, n_mixed, hit_of, listed):
+    """Put all blocks that hold hits among the mixed ones; return the numbers of free and of mixed blocks.
+
+    `mixed` must have room for `n_hits` more. hit_of: as long as `mixed`, written: the place of each mixed block among
+    the hits, -1 for none. listed: (n_hits,) uint8 zeros, scratch.
+    """
+    for i in range(n_mixed):
+        h = find(hit_table, hit_coords, mixed[i, 0], mixed[i, 1], mixed[i, 2])
+        hit_of[i] = h
+        if h >= 0:
+            listed[h] = 1
+    kept = 0
+    for i in range(n_free):
+        x, y, z = free[i, 0], free[i, 1], free[i, 2]
+        if find(hit_table, hit_coords, x, y, z) < 0:
+            free[kept, 0], free[kept, 1], free[kept, 2] = x, y, z
+            kept += 1
+    for h in range(n_hits):  # in blocks called free, and in those on the very border of the view
+        if not listed[h]:
+            for axis in range(3):
+                mixed[n_mixed, axis] = hit_coords[h, axis]
+            hit_of[n_mixed] = h
+            n_mixed += 1
+    return kept, n_mixed
+
+
 @cell
 def _touched(view, end, axis):
-    """Return the first block of the first and of the last coarse box along an axis that the view up to `end` touches."""
+    """Return the first blocks of the first and the last coarse box along an axis that the view up to `end` touches."""
     last_u, last_v = view.columns.size - 1, view.rows.shape[0] - 1
     rim_x = (view.rim[0] / end + ONE) / view.intrinsics[0]
     rim_y = (view.rim[1] / end + ONE) / view.intrinsics[1]

@@ -10,7 +10,6 @@ import numpy as np
 from stereovox._jit import cell, kernel
 from stereovox.integrate._cells import HALF, NEAR_PLANE, NO_RETURN, ONE, ZERO, index, table_row, window_level
 from stereovox.integrate._windows import COARSEST, place
-from stereovox.maps._cells import find
 
 LAYER = 64
 """Cells told apart together: one layer of a block."""
@@ -19,11 +18,11 @@ UNSEEN = np.float32(-1e9)
 
 
 @kernel
-def evaluate(depth_m, view, table, windows, blocks, values, hit_table, hit_coords, hit_values, hit_used, depths, measured):
+def evaluate(depth_m, view, table, windows, blocks, hit_of, hit_values, values, depths, measured):
     """Fill `values` (n, 512) int16 with the evidence on the cells of `blocks` (n, 3), hits included.
 
-    depth_m: (h, w) REP 117 depth image, from which `windows` was made.
-    hit_used: (hits,) uint8, set for each hit block that was taken in.
+    depth_m: (h, w) REP 117 depth image, from which `windows` was made. hit_of: (n,) place of each block among the hits,
+    -1 for none. depths, measured: (LAYER,) float32 scratch.
     """
     side = np.float32(8) * view.voxel_size
     for i in range(blocks.shape[0]):
@@ -39,10 +38,8 @@ def evaluate(depth_m, view, table, windows, blocks, values, hit_table, hit_coord
         _clear(view, table, windows, cx, cy, cz, depths, measured, out)
         if table.marks:
             _mark(depth_m, view, table, cx, cy, cz, out)
-        h = find(hit_table, hit_coords, x, y, z)
-        if h >= 0:
-            hits = hit_values[h]
-            hit_used[h] = 1
+        if hit_of[i] >= 0:
+            hits = hit_values[hit_of[i]]
             for c in range(512):
                 out[c] = max(out[c], hits[c]) if hits[c] > 0 else out[c]
 

@@ -28,9 +28,9 @@ LANES = 64
 def scatter(depth_m, view, keys, news, fresh, seen, listed, pool_table, coords, count, values):
     """Set every cell that holds a measured point to 1; return how many there are, -1 when the block pool is full.
 
-    depth_m: (h, w) REP 117 depth image. keys: (2, w + 1) scratch; int32 serves cells within 2^9 of the camera, int64 the
-    rest. news: (w rounded up to GROUP,) uint8 zeros, scratch; fresh: int32 scratch, one longer. seen: (SEEN,) scratch
-    of the keys' kind. Blocks count from the camera's own.
+    depth_m: (h, w) REP 117 depth image. keys: (2, w + 1) scratch; int32 serves cells within 2^9 of the camera, int64
+    the rest. news: (w rounded up to GROUP,) uint8 zeros, scratch; fresh: int32 scratch, one longer.
+    seen: (SEEN,) scratch of the keys' kind. Blocks count from the camera's own.
     listed: (pixels,) int32, written: the cells that were set, as 512 * their place in the pool + their number there.
     """
     size = np.float32(1) / view.voxel_size
@@ -73,7 +73,7 @@ def weigh(depth_m, view, table, full_share, listed, n, coords, values, lanes):
 
     It counts in full where at least `full_share` of the cell's footprint in the image measures a depth within the cell;
     with less, by the square root of the part: a few pixels may be a slip of the matcher. full_share 0: always in full.
-    listed: the cells that `scatter` set, in its first `n` entries. lanes: (8, LANES) float32 scratch.
+    listed: the cells that `scatter` set, in its first `n` entries. lanes: (9, LANES) float32 scratch.
     """
     flat, values_flat = depth_m.reshape(depth_m.size), values.reshape(values.size)
     x, y, z, share = lanes[0], lanes[1], lanes[2], lanes[3]
@@ -83,7 +83,7 @@ def weigh(depth_m, view, table, full_share, listed, n, coords, values, lanes):
         for i in range(some.size):
             share[i] = full_share
         if full_share > ZERO:
-            _share(flat, view, some.size, x, y, z, share, lanes[4], lanes[5], lanes[6], lanes[7])
+            _share(flat, view, some.size, x, y, z, share, lanes[4], lanes[5], lanes[6], lanes[7], lanes[8])
         _evidence(view, table, full_share, some, z, share, values_flat)
 
 
@@ -103,17 +103,18 @@ def _centres(view, coords, listed, x, y, z):
 
 
 @cell
-def _share(depth_m, view, n, x, y, z, share, u, v, step, looked):
+def _share(depth_m, view, n, x, y, z, share, u, v, samples, step, looked):
     """Write the part of each cell's footprint whose pixels measure a depth within half a cell of its centre.
 
-    Samples stand at even distances, up to SIDE_SAMPLES a side; at least half of one counts. u, v, step, looked: scratch.
+    Samples stand at even distances, up to SIDE_SAMPLES a side; at least half of one counts. The last five are scratch.
     """
     width, height = np.float32(view.width), np.float32(view.height)
     limit = HALF * view.voxel_size
     for i in range(n):
         inverse = ONE / z[i]
         wide = min(view.voxel_size * view.intrinsics[0] * inverse, width)
-        step[i] = wide / _samples(wide)
+        samples[i] = np.float32(np.int32(min(max(wide, ONE), np.float32(SIDE_SAMPLES))))
+        step[i] = wide / samples[i]
         u[i] = x[i] * inverse + view.intrinsics[2] + HALF - HALF * wide
         v[i] = y[i] * inverse + view.intrinsics[3] + HALF - HALF * wide
         share[i] = ZERO
@@ -123,22 +124,21 @@ def _share(depth_m, view, n, x, y, z, share, u, v, step, looked):
         for k in range(SIDE_SAMPLES):
             column = np.float32(k) + HALF
             for i in range(n):
-                wide = min(view.voxel_size * view.intrinsics[0] / z[i], width)
-                samples = _samples(wide)
                 su, sv = u[i] + column * step[i], v[i] + row * step[i]
-                inside = (row < samples) & (column < samples) & (su >= ZERO) & (su < width) & (sv >= ZERO) & (sv < height)
+                inside = (
+                    (row < samples[i])
+                    & (column < samples[i])
+                    & (su >= ZERO)
+                    & (su < width)
+                    & (sv >= ZERO)
+                    & (sv < height)
+                )
                 at = np.int32(np.int32(sv if inside else ZERO) * view.width) + np.int32(su if inside else ZERO)
                 d = depth_m[index(np.int32(at))]
                 share[i] += ONE if inside & (abs(d - z[i]) <= limit) else ZERO
                 looked[i] += ONE if inside else ZERO
     for i in range(n):
         share[i] = max(share[i], HALF) / max(looked[i], ONE)
-
-
-@cell
-def _samples(wide):
-    """Return how many samples a footprint `wide` pixels across has along each side, as a float."""
-    return np.float32(np.int32(min(max(wide, ONE), np.float32(SIDE_SAMPLES))))
 
 
 @cell

@@ -34,7 +34,9 @@ def place(level, v, u, pitch, height):
 
 
 @kernel
-def build(depth_m, base, window, ring, row, other, high_row, low_row, lows, highs, shape, tile_offset, tile_width, first):
+def build(
+    depth_m, base, window, ring, row, other, high_row, low_row, lows, highs, shape, tile_offset, tile_width, first
+):
     """Fill window images and tiles of all levels from `first` on; return the farthest depth of the image.
 
     depth_m: flat REP 117 depth image. window: flat image of all levels; shape: (levels, 2) rows and columns of each.
@@ -62,7 +64,9 @@ def build(depth_m, base, window, ring, row, other, high_row, low_row, lows, high
                 if level == 0:
                     _copy(ring[(v - 1) & 3], columns, out)
                 else:
-                    _window_row(ring[max(v - 2, 0) & 3], ring[(v - 1) & 3], ring[min(v, rows - 1) & 3], columns, row, out)
+                    _window_row(
+                        ring[max(v - 2, 0) & 3], ring[(v - 1) & 3], ring[min(v, rows - 1) & 3], columns, row, out
+                    )
                 _take_in(out, columns, v - 1, high_row, low_row)
                 if v % 16 == 0 or v == rows:
                     offsets = tile_offset[level, 0] + ((v - 1) >> 4) * tile_width[level, 0]

@@ -18,12 +18,12 @@ from stereovox.integrate import _cull, _evaluate, _hits, _keys
 from stereovox.integrate._cells import NEAR_PLANE, NO_RETURN
 from stereovox.integrate.faces import faces_of
 from stereovox.integrate.merging import strongest
-from stereovox.integrate.shards import in_shards, shards
 from stereovox.integrate.views import KernelTable, View, Views, farthest_cells, sensor_table
 from stereovox.integrate.windows import WindowBuilder, Windows
-from stereovox.maps.blocks import CELLS, SIDE, BlockPool
+from stereovox.maps.blocks import CELLS, BlockPool
 from stereovox.maps.evidence import Evidence
 from stereovox.sensors import make_sensor
+from stereovox.shards import in_shards, shards, together
 
 
 class Projective:
@@ -44,16 +44,14 @@ class Projective:
 
     def _of_pinhole(self, image: DepthImage, camera: PinholeCamera) -> Evidence:
         self._prepare(camera)
-        view = self._views.at(image.T_world_sensor)
-        windows, farthest = self._builder.build(image.depth_m, float(view.spread) / self._config.max_range)
-        if self._table.marks:
-            self._builder.build_nearest(image.depth_m)
-        self._scatter_hits(image.depth_m, view)
-        free, mixed = self._candidates(view, windows, self._end_of_view(farthest))
-        values, used = self._evaluate(image.depth_m, view, windows, mixed)
-        coords, values = self._with_leftovers(mixed, values, used)
+        depth_m, view = image.depth_m, self._views.at(image.T_world_sensor)
+        (windows, n_free, n_mixed), _ = together(
+            self._config.threads, lambda: self._candidates(depth_m, view), lambda: self._scatter_hits(depth_m, view)
+        )
+        free, mixed, hit_of = self._with_hits(n_free, n_mixed)
+        values = self._evaluate(depth_m, view, windows, mixed, hit_of)
         origin = self._views.block
-        return Evidence(coords + origin, values, free + origin, int(self._table.free))
+        return Evidence(mixed + origin, values, free + origin, int(self._table.free))
 
     def _prepare(self, camera: PinholeCamera) -> None:
         if camera == self._camera:
@@ -67,7 +65,7 @@ class Projective:
         self._fresh = np.zeros(pixels + 1, np.int32)
         self._seen = np.zeros(_hits.SEEN, self._keys.dtype)
         self._listed = np.zeros(camera.height * camera.width, np.int32)
-        self._weighing = np.zeros((8, _hits.LANES), np.float32)
+        self._weighing = np.zeros((9, _hits.LANES), np.float32)
         self._camera = camera
 
     def _key_rows(self, camera: PinholeCamera) -> NDArray[np.signedinteger]:
@@ -94,45 +92,54 @@ class Projective:
         share = np.float32(self._config.projective.full_share)
         _hits.weigh(depth_m, view, self._table, share, self._listed, n, hits.coords, hits.values, self._weighing)
 
-    def _candidates(self, view: View, windows: Windows, end: float) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-        hits = self._hits
+    def _candidates(self, depth_m: NDArray[np.float32], view: View) -> tuple[Windows, int, int]:
+        """List free and mixed blocks in `_free` and `_mixed`; return how many, and the window images."""
+        windows, farthest = self._builder.build(depth_m, float(view.spread) / self._config.max_range)
+        if self._table.marks:
+            self._builder.build_nearest(depth_m)
+        end = np.float32(self._end_of_view(farthest))
         while True:
             n_free, n_mixed = _cull.candidates(
-                view, self._table, windows, self._builder.nearest, np.float32(end),
-                hits.table, hits.coords, self._free, self._mixed,
-            )  # fmt: skip
+                view, self._table, windows, self._builder.nearest, end, self._free, self._mixed
+            )
             if n_free >= 0:
-                return self._free[:n_free], self._mixed[:n_mixed]
+                return windows, n_free, n_mixed
             self._free, self._mixed = (np.empty((4 * len(self._free), 3), np.int32) for _ in range(2))
 
+    def _with_hits(self, n_free: int, n_mixed: int) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
+        """Return the free blocks, the mixed ones, those with hits included, and where each has its hits."""
+        hits, most = self._hits, n_mixed + len(self._hits)
+        if most > len(self._mixed):
+            self._mixed = np.concatenate([self._mixed, np.empty((most, 3), np.int32)])
+        hit_of, listed = np.empty(most, np.int32), np.zeros(len(hits), np.uint8)
+        n_free, n_mixed = _cull.with_hits(
+            hits.table, hits.coords, len(hits), self._free, n_free, self._mixed, n_mixed, hit_of, listed
+        )
+        return self._free[:n_free], self._mixed[:n_mixed], hit_of[:n_mixed]
+
     def _evaluate(
-        self, depth_m: NDArray[np.float32], view: View, windows: Windows, mixed: NDArray[np.int32]
-    ) -> tuple[NDArray[np.int16], NDArray[np.uint8]]:
-        hits = self._hits
+        self,
+        depth_m: NDArray[np.float32],
+        view: View,
+        windows: Windows,
+        mixed: NDArray[np.int32],
+        hit_of: NDArray[np.int32],
+    ) -> NDArray[np.int16]:
         values = np.empty((len(mixed), CELLS), np.int16)
-        used = np.zeros(len(hits), np.uint8)
 
         def one_shard(part: slice) -> None:
+            scratch = np.empty((2, _evaluate.LAYER), np.float32)
             _evaluate.evaluate(
                 depth_m,
                 view,
                 self._table,
                 windows,
                 mixed[part],
+                hit_of[part],
+                self._hits.values,
                 values[part],
-                hits.table,
-                hits.coords,
-                hits.values,
-                used, *np.empty((2,64),np.float32)
+                *scratch,
             )
 
         in_shards(one_shard, shards(len(mixed), self._config.threads))
-        return values, used
-
-    def _with_leftovers(self, mixed: NDArray, values: NDArray, used: NDArray) -> tuple[NDArray, NDArray]:
-        """Append hit blocks that culling did not list (points on the very border of the view)."""
-        left = np.flatnonzero(used == 0)
-        if not len(left):
-            return mixed, values
-        return np.concatenate([mixed, self._hits.coords[left]]), np.concatenate([values, self._hits.values[left]])
-
+        return values

@@ -13,12 +13,12 @@ from stereovox.config import Config
 from stereovox.frame import DepthImage
 from stereovox.integrate import _keys, _lanes, _line, _ray
 from stereovox.integrate.lanes import make_lanes
-from stereovox.integrate.shards import in_shards, shards
 from stereovox.integrate.views import KernelTable, Rays, farthest_cells, origin_block, rays_of, sensor_table
 from stereovox.maps.blocks import CELLS, BlockPool
 from stereovox.maps.evidence import Evidence
 from stereovox.rigs import VirtualCamera
 from stereovox.sensors import make_sensor
+from stereovox.shards import in_shards, shards
 
 
 class Ray:

@@ -6,15 +6,30 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
+from typing import TypeVar
+
+First = TypeVar("First")
+Second = TypeVar("Second")
 
 
 def in_shards(work: Callable[[slice], None], parts: list[slice]) -> None:
     """Call `work(part)` for all parts at the same time; the outcome must not depend on the cut."""
-    if len(parts) == 1:
-        work(parts[0])
+    mine, *others = parts
+    if not others:
+        work(mine)
         return
-    for future in [_pool(len(parts)).submit(work, part) for part in parts]:
+    running = [_pool(len(others)).submit(work, part) for part in others]
+    work(mine)
+    for future in running:
         future.result()
+
+
+def together(threads: int, first: Callable[[], First], second: Callable[[], Second]) -> tuple[First, Second]:
+    """Return what two calls return that have nothing to do with each other, made at the same time if threads allow."""
+    if threads == 1:
+        return first(), second()
+    running = _pool(threads - 1).submit(second)
+    return first(), running.result()
 
 
 def shards(length: int, threads: int) -> list[slice]:

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from math import isfinite
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -26,10 +28,13 @@ def transform_points(T_a_b: Transform, points_b: ArrayLike) -> NDArray[np.float6
 def rigidity_error(T: ArrayLike) -> float:
     """Return how far `T` is from a rigid motion: the largest entry of |R^T R - I|; inf for mirrors, NaN, bad shape."""
     T = np.asarray(T)
-    if T.shape != (4, 4) or not np.isfinite(T).all() or np.abs(T[3] - (0, 0, 0, 1)).max() > 1e-6:
+    if T.shape != (4, 4):
         return np.inf
-    (a, b, c), (d, e, f), (g, h, i) = T[:3, :3].tolist()  # plain numbers: asked of each frame, five times as quick
-    if a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) <= 0:
+    # Plain numbers, for it is asked of each frame: five times as quick.
+    (a, b, c, x), (d, e, f, y), (g, h, i, z), (j, k, m, n) = T.tolist()
+    if not (isfinite(x + y + z) and abs(j) + abs(k) + abs(m) + abs(n - 1) <= 1e-6):
+        return np.inf
+    if not a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g) > 0:
         return np.inf
     lengths = a * a + d * d + g * g - 1, b * b + e * e + h * h - 1, c * c + f * f + i * i - 1
     angles = a * b + d * e + g * h, a * c + d * f + g * i, b * c + e * f + h * i

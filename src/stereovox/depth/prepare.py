@@ -82,7 +82,7 @@ def rigid_pose(frame: Frame | Scan, tolerance: float) -> geometry.Transform:
         T = np.asarray(frame.T_world_sensor, float)
     except (TypeError, ValueError):
         T = np.empty(0)
-    if T.shape == (4, 4) and not (np.isfinite(T).all() and (np.abs(T) < FARTHEST).all()):
+    if T.shape == (4, 4) and not all(-FARTHEST < x < FARTHEST for x in T.ravel().tolist()):
         raise FrameRefused("pose_not_finite", f"{_name(frame)}: the pose holds NaN, infinity or absurdly large numbers")
     error = geometry.rigidity_error(T)
     if error > tolerance:

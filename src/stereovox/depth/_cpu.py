@@ -58,7 +58,7 @@ def _reasons(depth_m, reason):
         why = np.int32(TOO_NEAR) if d == NEAR else why
         why = np.int32(TOO_FAR) if d == FAR else why
         reason[i] = np.uint8(why)
-        valid += np.int32(1) if why == 0 else np.int32(0)
+        valid = np.int32(valid + (np.int32(1) if why == 0 else np.int32(0)))
     return valid
 
 
@@ -73,5 +73,5 @@ def _take(given, depth_m, reason):
         d = NEAR if why == TOO_NEAR else d
         d = FAR if why == TOO_FAR else d
         depth_m[i] = d
-        valid += np.int32(1) if why == VALID else np.int32(0)
+        valid = np.int32(valid + (np.int32(1) if why == VALID else np.int32(0)))
     return valid

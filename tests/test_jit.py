@@ -15,12 +15,7 @@ import numpy as np
 import pytest
 from llvmlite.binding import get_host_cpu_features as host_features
 
-from stereovox import _jit, load_config, open_source
-from stereovox.depth import _cpu as _depth_kernels
-from stereovox.depth import prepare
-from stereovox.integrate import _cull, _evaluate, _hits, _windows, make_integrator
-from stereovox.maps import _cpu as _map_kernels
-from stereovox.maps import make_map
+from stereovox import _jit
 
 PACKAGE = Path(_jit.__file__).parent
 fresh_cache_folder = _jit.cache_folder.__wrapped__
@@ -40,6 +35,18 @@ print(json.dumps({
     "hits": sum(sum(s.cache_hits.values()) for s in stats),
     "misses": sum(sum(s.cache_misses.values()) for s in stats),
 }))
+"""
+MAP_A_FRAME = """
+import json
+import stereovox as sv
+from stereovox.depth import _cpu as depth
+from stereovox.integrate import _cull, _evaluate, _hits, _windows
+from stereovox.maps import _cpu as maps
+
+sv.Mapper(voxel_size=0.1).add(next(iter(sv.open_source("sim:room", "0:1"))))
+kernels = [value for room in (depth, _cull, _evaluate, _hits, _windows, maps) for value in vars(room).values()]
+compiled = [kernel for kernel in kernels if getattr(kernel, "signatures", None)]
+print(json.dumps({kernel.py_func.__name__: "".join(kernel.inspect_asm().values()) for kernel in compiled}))
 """
 ASK_THE_PROBE = "from stereovox._probe import f; print(f(1))"
 
@@ -178,20 +185,14 @@ def test_rows_of_numbers_use_the_widest_vectors():
     assert "zmm" in assembly(double)
 
 
-def test_the_kernels_of_the_default_integrator_compute_no_vectors_of_doubles():
+def test_the_kernels_of_the_default_integrator_compute_no_vectors_of_doubles(tmp_path):
     """An int32 times a float32 is a float64 in numba: easily written, never seen, and twice as slow."""
-    config = load_config(voxel_size=0.1)
-    image = prepare(next(iter(open_source("sim:room", "0:1"))), config)
-    make_map(config).add(make_integrator(config).evidence(image))
-    kernels = (
-        _hits.scatter, _hits.weigh, _cull.candidates, _cull.with_hits, _evaluate.evaluate, _windows.build,
-        _map_kernels.add_values, _map_kernels.add_constant, _depth_kernels.classify,
-    )  # fmt: skip
-    for kernel in kernels:
-        text = assembly(kernel)
-        assert text
-        doubles = {name for name in re.findall(r"^\s+(v\w+pd)\b", text, re.MULTILINE) if "mov" not in name}
-        assert not doubles, (kernel.py_func.__name__, doubles)
+    compiled = run(MAP_A_FRAME, STEREOVOX_CACHE=str(tmp_path))
+    assert {"scatter", "weigh", "candidates", "evaluate", "build", "classify"} <= compiled.keys()
+    for name, text in compiled.items():
+        assert "\tret" in text, name
+        doubles = {word for word in re.findall(r"^\s+(v\w+pd)\b", text, re.MULTILINE) if "mov" not in word}
+        assert not doubles, (name, doubles)
 
 
 def test_kernels_make_no_arrays():

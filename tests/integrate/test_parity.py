@@ -162,6 +162,29 @@ def test_a_ray_pool_that_is_too_small_grows_and_starts_over(monkeypatch):
         monkeypatch.undo()
 
 
+def test_projective_lists_that_are_too_small_grow_and_start_over(monkeypatch):
+    from stereovox.integrate import hits, projective
+
+    images = [made_image(seed) for seed in range(2)]
+    config = load_config(voxel_size=0.02, max_range=2.5)
+    enough = [cells_of(make_integrator(config).evidence(image)) for image in images]
+    pool = hits.BlockPool
+    monkeypatch.setattr(hits, "BlockPool", lambda dtype, capacity: pool(dtype, 2))
+    monkeypatch.setattr(projective, "ROOM", 70)
+    integrator = make_integrator(config)
+    assert [cells_of(integrator.evidence(image)) for image in images] == enough
+
+
+@pytest.mark.parametrize("integrator", ["projective", "ray"])
+def test_one_integrator_serves_many_cameras_by_turns(integrator):
+    cameras = [replace(CAMERA, fx=50.0 + n, width=CAMERA.width - n) for n in range(20)]
+    images = [made_image(n, camera) for n, camera in enumerate(cameras)]
+    config = load_config(voxel_size=0.1, max_range=2.5, integrator=integrator)
+    each = make_integrator(config)
+    for n in (0, 1, 0, 1, *range(20), 0, 7):
+        assert cells_of(each.evidence(images[n])) == cells_of(make_integrator(config).evidence(images[n]))
+
+
 def test_odd_image_sizes():
     for width, height in [(1, 1), (7, 3), (33, 65), (130, 1)]:
         camera = PinholeCamera(width, height, 40.0, 40.0, width / 2, height / 2, 0.05)

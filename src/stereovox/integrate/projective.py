@@ -26,6 +26,8 @@ from stereovox.maps.evidence import Evidence
 from stereovox.sensors import make_sensor
 from stereovox.shards import in_shards, shards, together
 
+ROOM = 4096
+"""Blocks that a camera's lists have room for at first."""
 MOST_CAMERAS = 16
 """Cameras whose tables and memory are kept; where more come, all are forgotten."""
 
@@ -82,7 +84,7 @@ class _Eye:
         self.hits = HitFinder(camera, table, config)
         self._windows = WindowBuilder(camera)
         self._max_range = config.max_range
-        self._free, self._mixed = (np.empty((4096, 3), np.int32) for _ in range(2))
+        self._free, self._mixed = (np.empty((ROOM, 3), np.int32) for _ in range(2))
 
     def candidates(self, depth_m: NDArray[np.float32], view: View) -> tuple[Windows, int, int]:
         """List free and mixed blocks; return the window images, and how many there are of each."""

@@ -206,7 +206,7 @@ class MapConfig(Section):
     the sensor model `stereo` should be the same. A cell that evidence made likelier than that is never free.
     """
 
-    cell: Literal["int16", "uint8"] = "int16"
+    cell: Literal["int16", "int8", "uint8"] = "int16"
     log_odds_min: float = Field(-4.0, lt=0, ge=-30)
     log_odds_max: float = Field(3.5, gt=0, le=30)
     prior: float = Field(0.1, gt=0, lt=1)

@@ -43,7 +43,8 @@ def find(table, coords, bx, by, bz):
 @cell
 def row_of(stored, bx, by, bz):
     """Return the row that holds the cells of block (bx, by, bz), or NO_ROW, or AT_FLOOR; see `StoredCells`."""
-    return find(stored.table, stored.coords, bx, by, bz)
+    place = find(stored.table, stored.coords, bx, by, bz)
+    return AT_FLOOR if place >= stored.values.shape[0] else place
 
 
 @cell

@@ -3,29 +3,26 @@
 
 from stereovox._jit import cell, kernel
 from stereovox.maps._cells import find
+from stereovox.maps._pool import NOTHING, forget, need, with_row
 
 
 @kernel
-def vacate(table, coords, cells, flags, fill, slab_low, slab_high, low, high, gone):
-    """Set the cells of a slab that lie outside the window to `fill`; list blocks wholly outside in `gone`.
+def vacate(table, coords, values, count, unknown, lowest, slab_low, slab_high, low, high):
+    """Forget the cells of a slab that lie outside the window, and blocks of which nothing known is left.
 
     slab_low, slab_high, low, high: (3,) int32 first cell and first cell beyond, of the slab and of the window.
-    Returns the number of blocks listed; they are left as they are.
     """
-    n = 0
     for bx in range(slab_low[0] >> 3, ((slab_high[0] - 1) >> 3) + 1):
         for by in range(slab_low[1] >> 3, ((slab_high[1] - 1) >> 3) + 1):
             for bz in range(slab_low[2] >> 3, ((slab_high[2] - 1) >> 3) + 1):
-                b = find(table, coords, bx, by, bz)
-                if b < 0:
-                    continue
-                if _disjoint(bx, by, bz, low, high):
-                    gone[n, 0], gone[n, 1], gone[n, 2] = bx, by, bz
-                    n += 1
-                else:
-                    flags[b] = 0
-                    _keep_inside(bx, by, bz, low, high, cells[b], fill)
-    return n
+                place = find(table, coords, bx, by, bz)
+                known = place >= 0 and not _disjoint(bx, by, bz, low, high)
+                if known:
+                    row = with_row(table, coords, values, count, place, lowest)
+                    _keep_inside(bx, by, bz, low, high, values[row], unknown)
+                    known = need(values[row], unknown, lowest) != NOTHING
+                if not known:
+                    forget(table, coords, values, count, bx, by, bz)
 
 
 @kernel

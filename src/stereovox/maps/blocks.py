@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A sparse set of blocks of 8x8x8 cells: a pool of values and a hash from block coordinates to the pool.
 
-Grids keep their tiles in it too: blocks of other sizes at height 0.
+Integrators collect evidence in it, and grids keep their tiles: blocks of other sizes at height 0. Voxel maps have a
+pool of their own (`CellPool`).
 """
 
 from __future__ import annotations
@@ -22,8 +23,8 @@ class StoredCells(NamedTuple):
     """All cells of a map as kernels read them, with `row_of` and `number_in` of `_cells.py`; never written to."""
 
     table: NDArray[np.int32]
-    coords: NDArray[np.int32]  # (capacity, 3)
-    values: NDArray[np.integer]  # (capacity, 512)
+    coords: NDArray[np.int32]  # (rows + bare, 3): of blocks with a row, then of those without, all at `lowest`
+    values: NDArray[np.integer]  # (rows, 512)
     unknown: np.int32  # what a cell without evidence holds
     lowest: np.int32  # the lowest number a cell can hold
 
@@ -33,7 +34,6 @@ class BlockPool:
 
     coords: (capacity, 3) int32 block coordinates; block (0, 0, 0) holds cells 0..7 on each axis.
     values: (capacity, `cells`) of the chosen dtype, `fill` where never written.
-    flags: (capacity,) uint8 for the owner's use, zero for a new block.
     count: (1,) int64, the number of blocks in use.
     """
 
@@ -42,8 +42,7 @@ class BlockPool:
         self.count = np.zeros(1, np.int64)
         self.coords = np.zeros((capacity, 3), np.int32)
         self.values = np.full((capacity, cells), fill, dtype) if fill else np.zeros((capacity, cells), dtype)
-        self.flags = np.zeros(capacity, np.uint8)
-        self.table = np.full(_table_size(capacity), -1, np.int32)
+        self.table = np.full(table_size(capacity), -1, np.int32)
 
     def __len__(self) -> int:
         return int(self.count[0])
@@ -61,8 +60,7 @@ class BlockPool:
         capacity = max(needed, 2 * self.coords.shape[0])
         self.coords = _grown(self.coords, capacity, len(self), 0)
         self.values = _grown(self.values, capacity, len(self), self.fill)
-        self.flags = _grown(self.flags, capacity, len(self), 0)
-        self.table = np.empty(_table_size(capacity), np.int32)
+        self.table = np.empty(table_size(capacity), np.int32)
         _cpu.rebuild(self.table, self.coords, len(self))
 
     def insert(self, coords: NDArray[np.int32]) -> NDArray[np.int64]:
@@ -72,25 +70,15 @@ class BlockPool:
         _cpu.insert_all(self.table, self.coords, self.count, np.ascontiguousarray(coords, np.int32), places)
         return places
 
-    def find(self, coords: NDArray[np.int32]) -> NDArray[np.int64]:
-        """Return the places in the pool (n,) of blocks (n, 3), -1 for those that are not there."""
-        places = np.empty(len(coords), np.int64)
-        _cpu.find_all(self.table, self.coords, coords, places)
-        return places
-
-    def remove(self, coords: NDArray[np.int32]) -> None:
-        """Forget blocks (n, 3), each there or not; others may change their places."""
-        _cpu.remove_all(self.table, self.coords, self.count, self.values, self.flags, self.fill, coords)
-
     def clear(self) -> None:
         """Forget all blocks and what they held; the memory stays for the next use."""
         self.values[: len(self)] = self.fill
-        self.flags[: len(self)] = 0
         self.table.fill(-1)
         self.count[0] = 0
 
 
-def _table_size(capacity: int) -> int:
+def table_size(capacity: int) -> int:
+    """Return the number of slots of a hash table for so many blocks, a power of two: less than half of it is in use."""
     return 1 << int(2 * capacity - 1).bit_length()
 
 

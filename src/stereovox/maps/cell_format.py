@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a cell's log-odds are kept in: thousandths in 16 bits, or the byte of Chien 2020."""
+"""What a cell's log-odds are kept in: thousandths in 16 bits, steps of 1/32 in 8, or the byte of Chien 2020."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property
-from math import log
+from math import log, sqrt
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -28,11 +28,15 @@ class State(IntEnum):
 
 @dataclass(frozen=True)
 class CellFormat:
-    """Stored number = `unknown` + log-odds * `per_log_odds`, rounded and cut to the type's range."""
+    """Stored number = `unknown` + log-odds * `per_log_odds`, rounded and cut to the type's range.
+
+    drift: what `shift` moves by from frame to frame.
+    """
 
     dtype: np.dtype
     unknown: int
     per_log_odds: float
+    drift: float = 0.0
 
     def stored(self, log_odds: ArrayLike) -> NDArray[np.int32]:
         """Return the stored numbers of log-odds."""
@@ -43,6 +47,14 @@ class CellFormat:
     def log_odds(self, stored: NDArray[np.integer]) -> NDArray[np.float32]:
         """Return the log-odds of stored numbers."""
         return (stored.astype(np.float32) - np.float32(self.unknown)) / np.float32(self.per_log_odds)
+
+    def shift(self, frame: int) -> float:
+        """Return what is added to the evidence of a frame, in stored numbers, before it is rounded down: 0 to 1.
+
+        A half rounds to the nearest number. Where it drifts by the golden ratio, evidence of a tenth of a step counts
+        as a whole one in every tenth frame: nothing weak is lost, nothing is counted double, and no number is drawn.
+        """
+        return (0.5 + frame * self.drift) % 1.0
 
 
 @dataclass(frozen=True)
@@ -99,5 +111,6 @@ class CellRules:
 
 FORMATS = {
     "int16": CellFormat(np.dtype(np.int16), 0, 1000.0),
+    "int8": CellFormat(np.dtype(np.int8), 0, 32.0, drift=(sqrt(5) - 1) / 2),
     "uint8": CellFormat(np.dtype(np.uint8), 127, (BYTE_THRESHOLD - 127) / log(0.7 / 0.3)),
 }

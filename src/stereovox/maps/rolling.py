@@ -14,7 +14,8 @@ from stereovox.config import Config
 from stereovox.errors import ConfigError
 from stereovox.frame import Viewpoint
 from stereovox.maps import _window
-from stereovox.maps.blocks import CELLS, SIDE, BlockPool
+from stereovox.maps.blocks import CELLS, SIDE
+from stereovox.maps.cell_pool import CellPool
 from stereovox.maps.evidence import Evidence
 from stereovox.maps.tiles import BLOCKS, TILE, Tile, TileStore, blocks_of, slabs_of
 from stereovox.maps.voxel_map import INDEX_LIMIT, VoxelMap
@@ -43,7 +44,7 @@ class RollingMap(VoxelMap):
         unit = TILE if keep else SIDE
         capacity = most_touched(self._window.largest, unit) * (unit // SIDE) ** 3
         _check_memory(capacity * CELLS * self._format.dtype.itemsize, config)
-        self._pool = BlockPool(self._format.dtype, capacity, self._format.unknown)
+        self._pool = CellPool(self._rules, capacity, capacity)
         self._earlier: VoxelMap | None = None
         self._store = TileStore(self._format, tiles) if keep else None  # last: it leaves a folder
 
@@ -55,8 +56,7 @@ class RollingMap(VoxelMap):
     @property
     def memory_bytes(self) -> int:
         """Bytes of the whole window, full or empty."""
-        pool = self._pool
-        return sum(array.nbytes for array in (pool.coords, pool.values, pool.flags, pool.table))
+        return self.reserved_bytes
 
     @property
     def store(self) -> TileStore | None:
@@ -116,11 +116,10 @@ class RollingMap(VoxelMap):
         if self._store is None:
             yield from super().slabs()
             return
-        n = len(self._pool)
-        here = {tuple(tile) for tile in np.unique(self._pool.coords[:n] // BLOCKS, axis=0).tolist()}
+        here = {tuple(tile) for tile in np.unique(self._pool.block_coords // BLOCKS, axis=0).tolist()}
         empty = True
         for slab in slabs_of(sorted(here | set(self._store.tiles()))):
-            parts = [self._blocks_of(tile) if tile in here else self._store.get(tile) for tile in slab]
+            parts = [self._pool.get(blocks_of(tile)) if tile in here else self._store.get(tile) for tile in slab]
             coords, cells = (np.concatenate(part) for part in zip(*parts, strict=True))
             order = np.lexsort(coords.T[::-1])
             yield coords[order], cells[order]
@@ -162,9 +161,6 @@ class RollingMap(VoxelMap):
         low, high = coarser(self._window.box, TILE)
         return all(a <= t < b for a, t, b in zip(low, tile, high, strict=True))
 
-    def _make_room(self, blocks: int) -> None:
-        """All the room the window can need was made at the start."""
-
     def _within(self, evidence: Evidence) -> Evidence:
         assert self._window.box is not None
         low, high = (np.array(corner, np.int32) for corner in self._window.box)
@@ -189,14 +185,11 @@ class RollingMap(VoxelMap):
             self._bring_back(tile)
 
     def _drop(self, slab: Box, now: Box) -> None:
-        pool = self._pool
         corners = (np.array(corner, np.int32) for corner in (*slab, *now))
-        gone = np.empty((most_touched_by(slab), 3), np.int32)
-        number = _window.vacate(pool.table, pool.coords, pool.values, pool.flags, pool.fill, *corners, gone)
-        pool.remove(gone[:number])
+        _window.vacate(*self._pool.arrays, np.int16(self._format.unknown), self._rules.lowest, *corners)
 
     def _put_away(self, tile: Tile) -> None:
-        coords, cells = self._blocks_of(tile)
+        coords, cells = self._pool.get(blocks_of(tile))
         if len(coords) and self._store is not None:
             self._store.put(tile, coords, cells)
             self._pool.remove(coords)
@@ -204,11 +197,6 @@ class RollingMap(VoxelMap):
     def _bring_back(self, tile: Tile) -> None:
         if self._store is not None and tile in self._store:
             self.insert(*self._store.get(tile))
-
-    def _blocks_of(self, tile: Tile) -> tuple[NDArray[np.int32], NDArray[np.integer]]:
-        coords = blocks_of(tile)
-        places = self._pool.find(coords)
-        return coords[places >= 0], self._pool.values[places[places >= 0]]
 
     def _take_over(self) -> None:
         """Put the cells of an earlier map where they belong: into the window, or to the tiles, or nowhere."""
@@ -256,12 +244,6 @@ def _check_memory(needed: int, config: Config) -> None:
 
 def _read(number_of_bytes: float) -> str:
     return f"{number_of_bytes / 1e12:.0f} TB" if number_of_bytes >= 1e12 else f"{number_of_bytes / 1e9:.0f} GB"
-
-
-def most_touched_by(box: Box) -> int:
-    """Return how many blocks a box of cells touches."""
-    low, high = coarser(box, SIDE)
-    return (high[0] - low[0]) * (high[1] - low[1]) * (high[2] - low[2])
 
 
 def _listed(box: Box, other: Box) -> Iterator[Tile]:

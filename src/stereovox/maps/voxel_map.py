@@ -3,7 +3,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from math import floor
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,11 @@ from numpy.typing import ArrayLike, NDArray
 from stereovox.config import Config
 from stereovox.errors import ConfigError
 from stereovox.frame import Viewpoint
-from stereovox.maps import _cpu
-from stereovox.maps.blocks import SIDE, BlockPool, StoredCells
+from stereovox.maps import _add, _cpu
+from stereovox.maps.blocks import CELLS, SIDE, StoredCells
 from stereovox.maps.cell_format import CellFormat, CellRules
 from stereovox.maps.cell_format import State as State
+from stereovox.maps.cell_pool import CellPool
 from stereovox.maps.evidence import LOG_ODDS_SCALE, Evidence
 
 INDEX_LIMIT = 2**30
@@ -44,7 +46,7 @@ class VoxelMap:
         self.window_state: dict[str, Any] | None = None
         self._rules = CellRules(config.map)
         self._format = self._rules.format
-        self._pool = BlockPool(self._format.dtype, fill=self._format.unknown)
+        self._pool = CellPool(self._rules)
 
     @classmethod
     def from_cells(cls, config: Config, indices: ArrayLike, log_odds: ArrayLike) -> VoxelMap:
@@ -55,12 +57,13 @@ class VoxelMap:
         voxel_map = cls(config)
         indices = np.asarray(indices, np.int64).reshape(-1, 3)
         blocks, of_cell = np.unique(indices >> 3, axis=0, return_inverse=True)
-        places = voxel_map._pool.insert(blocks.astype(np.int32))
         rules, unknown = voxel_map._rules, voxel_map._format.unknown
         stored = np.clip(voxel_map._format.stored(log_odds), rules.lowest, rules.highest)
         low = indices & (SIDE - 1)
         column = (low[:, 0] << 6) | (low[:, 1] << 3) | low[:, 2]
-        voxel_map._pool.values[places[of_cell.ravel()], column] = np.where(stored == unknown, unknown + 1, stored)
+        cells = np.full((len(blocks), CELLS), unknown, voxel_map._format.dtype)
+        cells[of_cell.ravel(), column] = np.where(stored == unknown, unknown + 1, stored)
+        voxel_map._pool.put(blocks.astype(np.int32), cells)
         return voxel_map
 
     def with_config(self, config: Config) -> VoxelMap:
@@ -91,25 +94,20 @@ class VoxelMap:
     @property
     def stored_cells(self) -> StoredCells:
         """What kernels that only read need; holds until the map changes."""
-        pool, unknown = self._pool, np.int32(self._format.unknown)
-        return StoredCells(pool.table, pool.coords, pool.values, unknown, self._rules.lowest)
+        return self._pool.stored_cells
 
     def insert(self, coords: NDArray[np.int32], cells: NDArray[np.integer]) -> None:
         """Set whole blocks: coordinates (n, 3), cells (n, 512) as stored; what stood there before is lost."""
-        places = self._pool.insert(coords)
-        self._pool.values[places] = np.clip(cells, self._rules.lowest, self._rules.highest)
-        self._pool.flags[places] = 0
+        cells = np.clip(cells, self._rules.lowest, self._rules.highest)
+        self._pool.put(coords, cells.astype(self._format.dtype, copy=False))
 
     def add(self, evidence: Evidence) -> int:
         """Add what one frame says; return the number of cells whose value changed."""
-        values, uniform = self._in_my_units(evidence)
-        pool, rules, unknown = self._pool, self._rules, self._format.unknown
-        self._make_room(len(evidence.coords) + len(evidence.uniform))
-        blocks = (pool.table, pool.coords, pool.count, pool.values, pool.flags)
-        changed = _cpu.add_values(*blocks, evidence.coords, values, unknown, rules.prior, rules.lowest, rules.highest)
-        if uniform:
-            changed += _cpu.add_constant(*blocks, evidence.uniform, uniform, unknown, rules.prior, rules.lowest)
-        return changed
+        if not (len(evidence.coords) or len(evidence.uniform)):
+            return 0
+        values, step = self._in_my_units(evidence)
+        uniform = evidence.uniform if step else evidence.uniform[:0]
+        return self._pool.add(evidence.coords, values, uniform, step, self.config.threads)
 
     def log_odds(self, points: ArrayLike) -> NDArray[np.float32]:
         """Return the log-odds (N,) at points (N, 3) in metres, world frame; 0 where unknown or not finite."""
@@ -125,12 +123,8 @@ class VoxelMap:
 
     def cells(self) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
         """Return all known cells: indices (N, 3) int32 in ascending order, and their log-odds (N,)."""
-        coords, values = self.blocks()
-        block, column = np.nonzero(values != self._format.unknown)
-        low = np.stack([column >> 6, (column >> 3) & 7, column & 7], axis=1)
-        indices = (coords[block] * SIDE + low).astype(np.int32)
-        order = np.lexsort(indices.T[::-1])
-        return indices[order], self._format.log_odds(values[block, column][order])
+        indices, stored = self._where(lambda values: values != self._format.unknown)
+        return indices, self._format.log_odds(stored)
 
     def blocks(self) -> tuple[NDArray[np.int32], NDArray[np.integer]]:
         """Return block coordinates (n, 3) in ascending order and their cells (n, 512) as they are stored."""
@@ -138,10 +132,8 @@ class VoxelMap:
         return np.concatenate(coords), np.concatenate(values)
 
     def slabs(self) -> Iterator[tuple[NDArray[np.int32], NDArray[np.integer]]]:
-        """Yield all blocks as in `blocks`, piece by piece in ascending order."""
-        n = len(self._pool)
-        order = np.lexsort(self._pool.coords[:n].T[::-1])
-        yield self._pool.coords[order], self._pool.values[order]
+        """Yield all blocks as in `blocks`, piece by piece in ascending order; the map must not change meanwhile."""
+        yield from self._pool.pieces()
 
     def centers(self, indices: ArrayLike) -> NDArray[np.float64]:
         """Return the centres (N, 3) in metres of cells (N, 3)."""
@@ -159,20 +151,28 @@ class VoxelMap:
         """Return the number of cells in each known state: `free`, `tentative`, `occupied`."""
         number = np.zeros(4, np.int64)
         for _, values in self.slabs():
-            number += np.bincount(self._rules.states(values).ravel(), minlength=4)
+            states = self._rules.states(values)
+            number += [np.count_nonzero(states == state) for state in State]
         return {state.name.lower(): int(number[state]) for state in (State.FREE, State.TENTATIVE, State.OCCUPIED)}
 
     def bounds(self) -> NDArray[np.float64] | None:
         """Return the lowest and highest corner (2, 3) in metres of all known cells; None for an empty map."""
-        indices, _ = self.cells()
-        if not len(indices):
+        pieces = (_span(coords, values != self._format.unknown) for coords, values in self.slabs())
+        spans = [span for span in pieces if span is not None]
+        if not spans:
             return None
-        return np.stack([indices.min(0), indices.max(0) + 1]) * self.config.cell
+        lowest, highest = zip(*spans, strict=True)
+        return np.stack([np.min(lowest, axis=0), np.max(highest, axis=0)]) * self.config.cell
 
     @property
     def memory_bytes(self) -> int:
-        """Bytes the map needs in memory: cells, block coordinates and hash."""
+        """Bytes the map uses: stored numbers, block coordinates and hash."""
         return self._pool.memory_bytes
+
+    @property
+    def reserved_bytes(self) -> int:
+        """Bytes the map has taken: those in use, and room to grow (which the system gives when it is first used)."""
+        return self._pool.reserved_bytes
 
     def save(self, path: str | Path) -> None:
         """Save to the folder `path` (Zarr inside); an older map there stays whole until the new one is complete."""
@@ -183,17 +183,15 @@ class VoxelMap:
     def close(self) -> None:
         """Give back what the map holds outside memory (nothing, unless it keeps tiles on disk)."""
 
-    def _in_my_units(self, evidence: Evidence) -> tuple[NDArray[np.int16], np.int32]:
+    def _in_my_units(self, evidence: Evidence) -> tuple[NDArray[np.int16], int]:
         """Return the values of `evidence` and its uniform value, both as differences of stored numbers."""
         factor = self._format.per_log_odds / LOG_ODDS_SCALE
         if factor == 1:
-            return evidence.values, np.int32(evidence.uniform_value)
+            return evidence.values, evidence.uniform_value
+        shift = self._format.shift(self.frames)
         values = np.empty_like(evidence.values)
-        _cpu.rescale(evidence.values, np.float32(factor), values)
-        return values, np.int32(round(evidence.uniform_value * factor))
-
-    def _make_room(self, blocks: int) -> None:
-        self._pool.reserve(blocks)
+        _add.rescale(evidence.values, np.float32(factor), np.float32(shift), values)
+        return values, floor(evidence.uniform_value * factor + shift)
 
     def _stored_at(self, points: ArrayLike) -> NDArray[np.integer]:
         points = np.asarray(points, float).reshape(-1, 3)
@@ -207,5 +205,35 @@ class VoxelMap:
         return stored
 
     def _centers_of(self, state: State) -> NDArray[np.float64]:
-        indices, log_odds = self.cells()
-        return self.centers(indices[self._rules.states(self._format.stored(log_odds)) == state])
+        return self.centers(self._where(lambda values: self._rules.states(values) == state)[0])
+
+    def _where(
+        self, chosen: Callable[[NDArray[np.integer]], NDArray[np.bool_]]
+    ) -> tuple[NDArray[np.int32], NDArray[np.integer]]:
+        """Return indices (N, 3) of the cells whose stored numbers are `chosen`, in ascending order, and these (N,)."""
+        found = [_cells_where(coords, values, chosen(values)) for coords, values in self.slabs()]
+        indices, stored = (np.concatenate(part) for part in zip(*found, strict=True))
+        order = np.lexsort(indices.T[::-1])
+        return indices[order], stored[order]
+
+
+def _cells_where(
+    coords: NDArray[np.int32], values: NDArray[np.integer], chosen: NDArray[np.bool_]
+) -> tuple[NDArray[np.int32], NDArray[np.integer]]:
+    """Return indices (N, 3) and stored numbers (N,) of the `chosen` cells (n, 512) of blocks (n, 3)."""
+    block, column = np.nonzero(chosen)
+    low = np.stack([column >> 6, (column >> 3) & 7, column & 7], axis=1)
+    return (coords[block] * SIDE + low).astype(np.int32), values[block, column]
+
+
+def _span(coords: NDArray[np.int32], known: NDArray[np.bool_]) -> tuple[list[int], list[int]] | None:
+    """Return the lowest `known` cell (n, 512) of blocks (n, 3) on each axis, and the first beyond the highest."""
+    if not known.any():
+        return None
+    known = known.reshape(-1, SIDE, SIDE, SIDE)
+    ends = []
+    for axis in range(3):
+        layers = (coords[:, axis, None] * SIDE + np.arange(SIDE))[known.any(axis=tuple({1, 2, 3} - {axis + 1}))]
+        ends.append((int(layers.min()), int(layers.max()) + 1))
+    lowest, beyond = zip(*ends, strict=True)
+    return list(lowest), list(beyond)

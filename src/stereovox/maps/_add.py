@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Kernels that add a frame's evidence to the blocks of a map, in four steps.
+
+`places` looks where the blocks of the evidence are, `make_rows` makes the rows that are missing, `add` fills them, on
+any number of threads, and `settle` takes the rows from blocks that have sunk to the floor. The evidence is `coords`
+(n, 3) with `values` (n, 512) int16, then `uniform` (m, 3), all of whose cells get one negative `step`.
+"""
+
+import numpy as np
+
+from stereovox._jit import cell, kernel
+from stereovox.maps._cells import find
+from stereovox.maps._pool import BARE, make_bare, need, new_row, with_row
+
+SKIP, MAKE = np.int32(-1), np.int32(-2)
+"""In place of a row: the evidence changes nothing in this block; it needs a row."""
+LOW, HIGH = np.int64(-32768), np.int64(32767)
+NIL, ONE = np.int16(0), np.int16(1)
+
+
+@kernel
+def places(table, coords, values, wanted, steps, uniform, out):
+    """Write the row of each block, or SKIP, or MAKE, to `out` (n + m,) int32; return the number of rows to make.
+
+    A block at the floor stays as it is unless something in it rises; one without any evidence is not made.
+    """
+    rows, n, made = values.shape[0], wanted.shape[0], 0
+    for i in range(n + uniform.shape[0]):
+        block = wanted[i] if i < n else uniform[i - n]
+        place = find(table, coords, block[0], block[1], block[2])
+        if place < 0:
+            place = MAKE if i >= n or _says_something(steps[i]) else SKIP
+        elif place >= rows:
+            place = MAKE if i < n and _raises(steps[i]) else SKIP
+        made += place == MAKE
+        out[i] = place
+    return made
+
+
+@kernel
+def make_rows(table, coords, values, count, wanted, uniform, unknown, lowest, rows):
+    """Make a row for each block marked MAKE in `rows` (n + m,), and write it there."""
+    n = wanted.shape[0]
+    for i in range(rows.size):
+        if rows[i] == MAKE:
+            block = wanted[i] if i < n else uniform[i - n]
+            x, y, z = block[0], block[1], block[2]
+            place = find(table, coords, x, y, z)
+            if place >= 0:
+                rows[i] = with_row(table, coords, values, count, place, lowest)
+            else:
+                rows[i] = row = new_row(table, coords, count, x, y, z)
+                values[row] = unknown
+
+
+@kernel
+def add(values, rows, start, stop, steps, step, unknown, prior, lowest, highest, floored):
+    """Add the evidence of blocks `start` to `stop`; return how many cells changed.
+
+    All numbers are int16. `floored` (n + m,) is set to 1 for blocks whose cells are all at the floor now.
+    """
+    changed = 0
+    for i in range(start, stop):
+        if rows[i] >= 0:
+            block = values[rows[i]]
+            if i < steps.shape[0]:
+                moved, above = _add_to_row(block, steps[i], unknown, prior, lowest, highest)
+            else:
+                moved, above = _add_step_to_row(block, step, unknown, prior, lowest, highest)
+            changed += np.int64(moved)
+            floored[i] = above == 0
+    return changed
+
+
+@kernel
+def settle(table, coords, values, count, wanted, uniform, floored, unknown, lowest):
+    """Take the rows from the blocks marked in `floored` (n + m,)."""
+    n = wanted.shape[0]
+    for i in range(floored.size):
+        if floored[i]:
+            block = wanted[i] if i < n else uniform[i - n]
+            row = find(table, coords, block[0], block[1], block[2])
+            if row < values.shape[0] and need(values[row], unknown, lowest) == BARE:
+                make_bare(table, coords, values, count, row)
+
+
+@kernel
+def rescale(values, factor, shift, out):
+    """Write `values` (n, 512) times `factor`, plus `shift`, rounded down to whole numbers, to `out` (n, 512) int16."""
+    for i in range(values.shape[0]):
+        for c in range(512):
+            out[i, c] = np.int16(np.floor(np.float32(values[i, c]) * factor + shift))
+
+
+@cell
+def _add_to_row(block, steps, unknown, prior, lowest, highest):
+    """Add `steps` (512,) to the cells of a block; return how many changed, and 0 if all are at the floor now."""
+    moved, above = NIL, NIL
+    for c in range(512):
+        old = np.int16(block[c])
+        new = _added(old, steps[c], unknown, prior, lowest, highest)
+        moved = np.int16(moved + (ONE if new != old else NIL))
+        above = np.int16(above | np.int16(new ^ lowest))
+        block[c] = new
+    return moved, above
+
+
+@cell
+def _add_step_to_row(block, step, unknown, prior, lowest, highest):
+    """As `_add_to_row`, with the same `step` for all cells."""
+    moved, above = NIL, NIL
+    for c in range(512):
+        old = np.int16(block[c])
+        new = _added(old, step, unknown, prior, lowest, highest)
+        moved = np.int16(moved + (ONE if new != old else NIL))
+        above = np.int16(above | np.int16(new ^ lowest))
+        block[c] = new
+    return moved, above
+
+
+@cell
+def _added(old, step, unknown, prior, lowest, highest):
+    """What `_cells.added` says, all in int16: twice as many cells in one instruction. The compiler makes of the first
+    clamp an addition that saturates."""
+    start = prior if old == unknown else old
+    total = np.int16(min(max(np.int64(start) + np.int64(step), LOW), HIGH))
+    new = min(max(total, lowest), highest)
+    new = np.int16(new + (ONE if new == unknown else NIL))
+    return new if step != NIL else old
+
+
+@cell
+def _says_something(steps):
+    anything = NIL
+    for c in range(512):
+        anything = np.int16(anything | steps[c])
+    return anything != NIL
+
+
+@cell
+def _raises(steps):
+    most = NIL
+    for c in range(512):
+        most = max(most, steps[c])
+    return most > NIL

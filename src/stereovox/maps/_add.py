@@ -25,31 +25,35 @@ def places(table, coords, values, wanted, steps, uniform, out):
     A block at the floor stays as it is unless something in it rises; one without any evidence is not made.
     """
     rows, n, made = values.shape[0], wanted.shape[0], 0
-    for i in range(n + uniform.shape[0]):
-        block = wanted[i] if i < n else uniform[i - n]
-        place = find(table, coords, block[0], block[1], block[2])
+    for i in range(n):
+        place = _find(table, coords, wanted, i)
         if place < 0:
-            place = MAKE if i >= n or _says_something(steps[i]) else SKIP
+            place = MAKE if _says_something(steps[i]) else SKIP
         elif place >= rows:
-            place = MAKE if i < n and _raises(steps[i]) else SKIP
+            place = MAKE if _raises(steps[i]) else SKIP
         made += place == MAKE
         out[i] = place
+    for i in range(uniform.shape[0]):
+        place = _find(table, coords, uniform, i)
+        if place < 0:
+            place = MAKE
+        elif place >= rows:
+            place = SKIP
+        made += place == MAKE
+        out[n + i] = place
     return made
 
 
 @kernel
-def make_rows(table, coords, values, count, wanted, uniform, unknown, lowest, rows):
-    """Make a row for each block marked MAKE in `rows` (n + m,), and write it there."""
-    n = wanted.shape[0]
+def make_rows(table, coords, values, count, wanted, unknown, lowest, rows):
+    """Make a row for each block of `wanted` (n, 3) marked MAKE in `rows` (n,), and write it there."""
     for i in range(rows.size):
         if rows[i] == MAKE:
-            block = wanted[i] if i < n else uniform[i - n]
-            x, y, z = block[0], block[1], block[2]
-            place = find(table, coords, x, y, z)
+            place = _find(table, coords, wanted, i)
             if place >= 0:
                 rows[i] = with_row(table, coords, values, count, place, lowest)
             else:
-                rows[i] = row = new_row(table, coords, count, x, y, z)
+                rows[i] = row = new_row(table, coords, count, wanted[i, 0], wanted[i, 1], wanted[i, 2])
                 values[row] = unknown
 
 
@@ -73,13 +77,11 @@ def add(values, rows, start, stop, steps, step, unknown, prior, lowest, highest,
 
 
 @kernel
-def settle(table, coords, values, count, wanted, uniform, floored, unknown, lowest):
-    """Take the rows from the blocks marked in `floored` (n + m,)."""
-    n = wanted.shape[0]
+def settle(table, coords, values, count, wanted, floored, unknown, lowest):
+    """Take the rows from the blocks of `wanted` (n, 3) marked in `floored` (n,)."""
     for i in range(floored.size):
         if floored[i]:
-            block = wanted[i] if i < n else uniform[i - n]
-            row = find(table, coords, block[0], block[1], block[2])
+            row = _find(table, coords, wanted, i)
             if row < values.shape[0] and need(values[row], unknown, lowest) == BARE:
                 make_bare(table, coords, values, count, row)
 
@@ -127,6 +129,11 @@ def _added(old, step, unknown, prior, lowest, highest):
     new = min(max(total, lowest), highest)
     new = np.int16(new + (ONE if new == unknown else NIL))
     return new if step != NIL else old
+
+
+@cell
+def _find(table, coords, wanted, i):
+    return find(table, coords, wanted[i, 0], wanted[i, 1], wanted[i, 2])
 
 
 @cell

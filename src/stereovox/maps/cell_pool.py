@@ -123,7 +123,8 @@ class CellPool:
         made = _add.places(self.table, self.coords, self.values, coords, values, uniform, rows)
         if made:
             self._reserve(made, 0)
-            _add.make_rows(*self.arrays, coords, uniform, unknown, lowest, rows)
+            for blocks, their_rows in ((coords, rows[: len(coords)]), (uniform, rows[len(coords) :])):
+                _add.make_rows(*self.arrays, blocks, unknown, lowest, their_rows)
         floored, changed = np.zeros(n, np.uint8), []
 
         def one_shard(part: slice) -> None:
@@ -133,7 +134,8 @@ class CellPool:
         in_shards(one_shard, shards(n, min(threads, n // WORTH_A_THREAD or 1)))
         if sunk := int(floored.sum()):
             self._reserve(0, sunk)
-            _add.settle(*self.arrays, coords, uniform, floored, unknown, lowest)
+            for blocks, sunk_ones in ((coords, floored[: len(coords)]), (uniform, floored[len(coords) :])):
+                _add.settle(*self.arrays, blocks, sunk_ones, unknown, lowest)
             self._shrink()
         return sum(changed)
 

@@ -23,6 +23,13 @@ def added(old, step, unknown, prior, lowest, highest):
 
 
 @cell
+def copy_row(target, source):
+    """Copy `source` (n,) to `target` (n,); numba's own `target[:] = source` takes memory, which kernels have none of."""
+    for c in range(target.size):
+        target[c] = source[c]
+
+
+@cell
 def home_slot(bx, by, bz, mask):
     """Return the slot of the hash table where the search for block (bx, by, bz) starts."""
     h = np.uint64(np.uint32(bx)) * np.uint64(0x9E3779B97F4A7C15)

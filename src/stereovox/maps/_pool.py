@@ -8,7 +8,7 @@ a row, a place from there on that of a bare block. The caller has made room.
 import numpy as np
 
 from stereovox._jit import cell, kernel
-from stereovox.maps._cells import EMPTY, empty_slot, find, home_slot, slot_of
+from stereovox.maps._cells import EMPTY, copy_row, empty_slot, find, home_slot, slot_of
 
 NOTHING, BARE, ROW = np.uint8(0), np.uint8(1), np.uint8(2)
 """What a block of cells needs: no place at all, as none is known; a bare one, as all are at the floor; a row."""
@@ -38,7 +38,7 @@ def put(table, coords, values, count, wanted, cells, kinds):
         x, y, z = wanted[i, 0], wanted[i, 1], wanted[i, 2]
         forget(table, coords, values, count, x, y, z)
         if kinds[i] == ROW:
-            values[new_row(table, coords, count, x, y, z)] = cells[i]
+            copy_row(values[new_row(table, coords, count, x, y, z)], cells[i])
         elif kinds[i] == BARE:
             place = values.shape[0] + count[1]
             coords[place, 0], coords[place, 1], coords[place, 2] = x, y, z
@@ -139,7 +139,7 @@ def _close_row_gap(table, coords, values, count, row):
     last = count[0] - 1
     if row != last:
         _move(table, coords, last, row)
-        values[row] = values[last]
+        copy_row(values[row], values[last])
     count[0] = last
 
 

@@ -2,7 +2,7 @@
 """Kernels of the rolling map: forget what left the window, cut evidence at its border."""
 
 from stereovox._jit import cell, kernel
-from stereovox.maps._cells import find
+from stereovox.maps._cells import copy_row, find
 from stereovox.maps._pool import NOTHING, forget, need, with_row
 
 
@@ -35,8 +35,8 @@ def clip(coords, values, uniform, uniform_value, low, high, out_coords, out_valu
     for i in range(coords.shape[0]):
         x, y, z = coords[i, 0], coords[i, 1], coords[i, 2]
         if not _disjoint(x, y, z, low, high):
-            out_coords[n] = coords[i]
-            out_values[n] = values[i]
+            copy_row(out_coords[n], coords[i])
+            copy_row(out_values[n], values[i])
             if not _contained(x, y, z, low, high):
                 _keep_inside(x, y, z, low, high, out_values[n], 0)
             n += 1
@@ -44,10 +44,10 @@ def clip(coords, values, uniform, uniform_value, low, high, out_coords, out_valu
     for i in range(uniform.shape[0]):
         x, y, z = uniform[i, 0], uniform[i, 1], uniform[i, 2]
         if _contained(x, y, z, low, high):
-            out_uniform[whole] = uniform[i]
+            copy_row(out_uniform[whole], uniform[i])
             whole += 1
         elif not _disjoint(x, y, z, low, high):
-            out_coords[n] = uniform[i]
+            copy_row(out_coords[n], uniform[i])
             out_values[n] = uniform_value
             _keep_inside(x, y, z, low, high, out_values[n], 0)
             n += 1

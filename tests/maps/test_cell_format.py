@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Chien's byte: 127 unknown, 0 free, 255 occupied, shown as occupied above 180 (Chien 2020, 3.5)."""
+"""Cells of one byte: Chien's, 127 unknown, 0 free, 255 occupied above 180 (Chien 2020, 3.5), and the signed one."""
 
 import numpy as np
 import pytest
@@ -100,7 +100,7 @@ def test_the_profile_of_the_thesis():
     assert np.prod(np.array(config.window.size) / 0.2).round() == 100 * 30 * 100
 
 
-@pytest.mark.parametrize("cell", ["int16", "uint8"])
+@pytest.mark.parametrize("cell", ["int16", "int8", "uint8"])
 @pytest.mark.parametrize("prior", [0.05, 0.1, 0.4])
 def test_what_evidence_made_likelier_is_never_free(cell, prior):
     config = load_config(**{"map.prior": prior, "map.cell": cell, "map.log_odds_min": -2.0})
@@ -111,3 +111,68 @@ def test_what_evidence_made_likelier_is_never_free(cell, prior):
             voxel_map.add(Evidence(np.zeros((1, 3), np.int32), values, np.empty((0, 3), np.int32), 0))
         at_most_free = prior < 0.3 or wanted != State.FREE
         assert voxel_map.state([[0.01, 0.01, 0.01]]).tolist() == [wanted if at_most_free else State.TENTATIVE]
+
+
+def signed_map(**limits):
+    return VoxelMap(load_config(voxel_size=0.1, **{"map.cell": "int8", "map.prior": 0.5}, **limits))
+
+
+def test_the_signed_byte_holds_the_default_limits():
+    signed = FORMATS["int8"]
+    assert signed.stored([0, 1, -1, 3.5, -4, -30, 30]).tolist() == [0, 32, -32, 112, -128, -128, 127]
+    np.testing.assert_array_equal(signed.log_odds(np.array([112, -128, 0], np.int8)), [3.5, -4, 0])
+    one = signed_map()
+    assert (one._rules.lowest, one._rules.highest) == (-128, 112)
+    add(one, 800, -800, 8000, -8000, 32, -31)
+    assert stored(one) == [26, -26, 112, -128, 1, -1, 0, 0]
+    add(one, -800, 800, 8000, -8000)
+    assert stored(one)[:4] == [1, 1, 112, -128]  # back at the start is not "unknown"
+    assert one.blocks()[1].dtype == np.int8
+    assert one.memory_bytes < 512 + 12 + VoxelMap(load_config()).memory_bytes + 1
+
+
+SIGNED_STATES = [
+    (-28, "FREE"),
+    (-27, "TENTATIVE"),
+    (1, "TENTATIVE"),
+    (27, "TENTATIVE"),
+    (28, "OCCUPIED"),
+    (0, "UNKNOWN"),
+]
+
+
+@pytest.mark.parametrize(("number", "state"), SIGNED_STATES)  # 0.3 and 0.7 are -27.1 and 27.1
+def test_states_of_signed_bytes(number, state):
+    one = signed_map()
+    one.insert(np.zeros((1, 3), np.int32), np.full((1, 512), number, np.int8))
+    assert one.state(CENTRES[:1]) == State[state]
+
+
+@pytest.mark.parametrize(("frames", "weak"), [(100, [1, 3, -1, -3, 14, -14, 23, -23]), (1000, [1, 3, -1, -3])])
+def test_weak_evidence_adds_up_over_frames(frames, weak):
+    """Less than a step in each frame; after a while as many steps as int16 would have counted, to one or two."""
+    one = signed_map()
+    for one.frames in range(frames):
+        add(one, *weak)
+    np.testing.assert_allclose(stored(one)[: len(weak)], np.array(weak) * 0.032 * frames, atol=2)
+
+
+def test_a_frame_before_and_after_a_save_count_alike(tmp_path):
+    """What is rounded up in a frame depends on its number, which is saved."""
+    whole, half = signed_map(), signed_map()
+    steps = np.random.default_rng(0).integers(-60, 60, (50, 512))
+    for frame, values in enumerate(steps):
+        if frame == 20:
+            half.save(tmp_path / "half")
+            half = load_map(tmp_path / "half")
+        for one in (whole, half):
+            add(one, *values)
+            one.frames += 1
+    np.testing.assert_array_equal(whole.blocks()[1], half.blocks()[1])
+
+
+def test_chiens_byte_rounds_to_the_nearest_in_every_frame():
+    one = byte_map()
+    for one.frames in (0, 1, 17):
+        add(one, 7, -7, 9)
+    assert stored(one)[:3] == [127, 127, 130]

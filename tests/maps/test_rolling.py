@@ -29,14 +29,14 @@ def at(position, stamp_ns=0):
     return Viewpoint(CAMERA, T, stamp_ns)
 
 
-def evidence_about(random, position, reach=3):
-    """Random values in random blocks about a place, and some uniform blocks."""
+def evidence_about(random, position, reach=3, uniform=-400):
+    """Random values in random blocks about a place, and some `uniform` blocks."""
     centre = np.floor(np.asarray(position) / 0.8).astype(int)
     around = centre + np.array(list(itertools.product(range(-reach, reach + 1), repeat=3)))
     picked = random.permutation(around)[:60].astype(np.int32)
     values = random.integers(-900, 900, (40, 512)).astype(np.int16)
     values[random.random(values.shape) < 0.5] = 0
-    return Evidence(picked[:40].copy(), values, picked[40:].copy(), -400)
+    return Evidence(picked[:40].copy(), values, picked[40:].copy(), uniform)
 
 
 class Slow:
@@ -75,15 +75,16 @@ PATH = [(0, 0, 0), (0.3, 0, 0), (0.5, 0.1, 0), (0.9, -0.4, 0.2), (2.9, -0.4, 0.2
         (2.0, 0.2, 0.1), (0.05, 0.01, 0.0), (-1.2, -0.9, -0.8), (0, 0, 0)]  # fmt: skip
 
 
+@pytest.mark.parametrize("uniform", [-400, -4000])  # the latter takes whole blocks to the floor
 @pytest.mark.parametrize("outside", ["drop", "keep"])
-def test_equals_a_dictionary(outside):
+def test_equals_a_dictionary(outside, uniform):
     config = settings(outside=outside)
     fast, slow = make_map(config), Slow(config)
     random = np.random.default_rng(1)
     for position in PATH:
         fast.look_from(at(position))
         slow.look_from(position)
-        evidence = evidence_about(random, position)
+        evidence = evidence_about(random, position, uniform=uniform)
         slow.add(evidence)
         fast.add(evidence)
         indices, log_odds = fast.cells()
@@ -91,6 +92,8 @@ def test_equals_a_dictionary(outside):
             tuple(map(int, cell)): round(float(value) * 1000) for cell, value in zip(indices, log_odds, strict=True)
         }
         assert found == slow.cells
+        here = {tuple(x // 8 for x in cell) for cell in slow.cells if slow.inside(cell)}
+        assert outside == "keep" or {tuple(block) for block in fast.blocks()[0].tolist()} == here
     assert len(slow.cells) > 1000
 
 
@@ -100,7 +103,7 @@ def test_keep_equals_an_unbounded_map_where_the_window_holds_all_evidence(tmp_pa
     random = np.random.default_rng(2)
     way = np.linspace(0, 30, 60)
     for x in [*way, *way[::-1]]:
-        evidence = evidence_about(random, (x, x / 7, 0))
+        evidence = evidence_about(random, (x, x / 7, 0), uniform=-1800)
         for one in (rolling, unbounded):
             one.look_from(at((x, x / 7, 0)))
             one.add(evidence)
@@ -148,7 +151,7 @@ def test_memory_is_constant_and_bounded():
     for x in np.linspace(0, 50, 80):
         rolling.look_from(at((x, 0, 0)))
         rolling.add(evidence_about(random, (x, 0, 0)))
-    assert rolling.memory_bytes == before < 100 * 1100 * 2
+    assert rolling.memory_bytes == rolling.reserved_bytes == before < 100 * 1100 * 2
 
 
 def test_bytes_roll_like_thousandths():

@@ -24,7 +24,7 @@ def added(old, step, unknown, prior, lowest, highest):
 
 @cell
 def copy_row(target, source):
-    """Copy `source` (n,) to `target` (n,); numba's own `target[:] = source` takes memory, which kernels have none of."""
+    """Copy `source` (n,) to `target` (n,). Numba's `target[:] = source` would take memory, which no kernel may."""
     for c in range(target.size):
         target[c] = source[c]
 

@@ -114,7 +114,7 @@ def test_the_picture_is_just_large_enough_and_stands_where_the_cells_are():
     assert grid_map.state(grid.centres([0, 127, 61], [0, 75, 70])).tolist() == [1, 3, 2]
 
 
-@pytest.mark.parametrize("cell", ["int16", "uint8"])
+@pytest.mark.parametrize("cell", ["int16", "int8", "uint8"])
 @pytest.mark.parametrize("prior", [0.03, 0.1, 0.5, 0.9])
 @pytest.mark.parametrize("thresholds", [(0.3, 0.7), (0.196, 0.65), (0.005, 0.995)])
 def test_a_cell_has_one_state_in_the_map_and_in_the_picture(cell, prior, thresholds):
@@ -184,7 +184,7 @@ def test_an_empty_map_says_so():
     assert GridMap.from_occupancy(grid_map.occupancy(), load_config(**EVEN)).bounds() is None
 
 
-@pytest.mark.parametrize("cell", ["int16", "uint8"])
+@pytest.mark.parametrize("cell", ["int16", "int8", "uint8"])
 def test_saved_and_loaded_it_is_the_same(tmp_path, cell):
     grid_map = GridMap(load_config(**{**EVEN, "map.cell": cell}), (1.0, 2.0, 3.0))
     grid_map.add(evidence_of({(i * 7, -i * 31): 10 * i + 100 for i in range(40)}))

@@ -74,7 +74,7 @@ def test_evidence_that_just_undoes_the_prior_is_known():
     assert set(cells_of(voxel_map).values()) == {1}
 
 
-@pytest.mark.parametrize("cell", ["int16", "uint8"])
+@pytest.mark.parametrize("cell", ["int16", "int8", "uint8"])
 def test_limits_near_zero_still_tell_known_from_unknown(cell):
     """Limits that round to "unknown" itself are moved one beyond it: every clamped cell stays known, on its side."""
     narrow = {"map.cell": cell, "map.log_odds_min": -1e-5, "map.log_odds_max": 1e-5, "map.prior": 0.5}

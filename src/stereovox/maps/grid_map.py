@@ -97,7 +97,8 @@ class GridMap:
         """Add what one scan says (IST 2019, Eq 5); return the number of cells whose value changed."""
         values = evidence.values
         if self._format.per_log_odds != LOG_ODDS_SCALE:
-            values = np.rint(values * (self._format.per_log_odds / LOG_ODDS_SCALE)).astype(np.int32)
+            factor, shift = self._format.per_log_odds / LOG_ODDS_SCALE, self._format.shift(self.frames)
+            values = np.floor(values * factor + shift).astype(np.int32)
         pool, rules = self._pool, self._rules
         pool.reserve(len(evidence.coords))
         return _grid.add_tiles(

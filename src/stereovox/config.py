@@ -200,7 +200,8 @@ class WindowConfig(Section):
 class MapConfig(Section):
     """What a cell is kept in, the range of its log-odds, and the probabilities that tell the states apart.
 
-    cell: `int16` holds thousandths of log-odds; `uint8` is Chien's byte (2020, 3.5): 127 unknown, 0 free, 255 occupied.
+    cell: `int16` holds thousandths of log-odds, `int8` steps of 1/32 from -4 to 3.97; `uint8` is Chien's byte (2020,
+    3.5): 127 unknown, 0 free, 255 occupied.
     prior: probability that a cell is occupied before the first evidence on it (l0 of Valenti 2018, Eq 6.2). Most cells
     a camera sees are free, so probabilities agree with what is really there when it is well below a half. `prior` of
     the sensor model `stereo` should be the same. A cell that evidence made likelier than that is never free.

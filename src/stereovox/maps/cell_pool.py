@@ -18,7 +18,7 @@ GROWTH = 1.5
 SPARE = 4
 PIECE = 1024
 """Blocks that `pieces` yields at once."""
-WORTH_A_THREAD = 256
+WORTH_A_THREAD = 512
 """Blocks of evidence that take as long as it takes to wake a thread."""
 
 
@@ -132,7 +132,7 @@ class CellPool:
             changed.append(_add.add(*evidence, *limits, floored))
 
         in_shards(one_shard, shards(n, min(threads, n // WORTH_A_THREAD or 1)))
-        if sunk := int(floored.sum()):
+        if sunk := np.count_nonzero(floored):
             self._reserve(0, sunk)
             for blocks, sunk_ones in ((coords, floored[: len(coords)]), (uniform, floored[len(coords) :])):
                 _add.settle(*self.arrays, blocks, sunk_ones, unknown, lowest)

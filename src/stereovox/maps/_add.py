@@ -61,16 +61,14 @@ def make_rows(table, coords, values, count, wanted, unknown, lowest, rows):
 def add(values, rows, start, stop, steps, step, unknown, prior, lowest, highest, floored):
     """Add the evidence of blocks `start` to `stop`; return how many cells changed.
 
-    All numbers are int16. `floored` (n + m,) is set to 1 for blocks whose cells are all at the floor now.
+    All numbers are int16, and `step` is (512,), the same for all cells. `floored` (n + m,) is set to 1 for blocks whose
+    cells are all at the floor now.
     """
     changed = 0
     for i in range(start, stop):
         if rows[i] >= 0:
-            block = values[rows[i]]
-            if i < steps.shape[0]:
-                moved, above = _add_to_row(block, steps[i], unknown, prior, lowest, highest)
-            else:
-                moved, above = _add_step_to_row(block, step, unknown, prior, lowest, highest)
+            given = steps[i] if i < steps.shape[0] else step
+            moved, above = _add_to_row(values[rows[i]], given, unknown, prior, lowest, highest)
             changed += np.int64(moved)
             floored[i] = above == 0
     return changed
@@ -101,19 +99,6 @@ def _add_to_row(block, steps, unknown, prior, lowest, highest):
     for c in range(512):
         old = np.int16(block[c])
         new = _added(old, steps[c], unknown, prior, lowest, highest)
-        moved = np.int16(moved + (ONE if new != old else NIL))
-        above = np.int16(above | np.int16(new ^ lowest))
-        block[c] = new
-    return moved, above
-
-
-@cell
-def _add_step_to_row(block, step, unknown, prior, lowest, highest):
-    """As `_add_to_row`, with the same `step` for all cells."""
-    moved, above = NIL, NIL
-    for c in range(512):
-        old = np.int16(block[c])
-        new = _added(old, step, unknown, prior, lowest, highest)
         moved = np.int16(moved + (ONE if new != old else NIL))
         above = np.int16(above | np.int16(new ^ lowest))
         block[c] = new

@@ -126,9 +126,10 @@ class CellPool:
             for blocks, their_rows in ((coords, rows[: len(coords)]), (uniform, rows[len(coords) :])):
                 _add.make_rows(*self.arrays, blocks, unknown, lowest, their_rows)
         floored, changed = np.zeros(n, np.uint8), []
+        everywhere = np.full(CELLS, step, np.int16)
 
         def one_shard(part: slice) -> None:
-            evidence = self.values, rows, part.start, part.stop, values, np.int16(step)
+            evidence = self.values, rows, part.start, part.stop, values, everywhere
             changed.append(_add.add(*evidence, *limits, floored))
 
         in_shards(one_shard, shards(n, min(threads, n // WORTH_A_THREAD or 1)))

@@ -168,6 +168,15 @@ def test_a_pool_never_shrinks_below_its_first_size():
     assert pool.reserved_bytes == before
 
 
+def test_what_is_free_already_needs_no_rows():
+    pool = CellPool(rules_of("int16"), rows=1)
+    pool.add(NONE, NOTHING, many(200), -30000, 1)
+    before = pool.values
+    steps = np.where(np.random.default_rng(0).random((100, 512)) < 0.5, 0, -300).astype(np.int16)
+    assert pool.add(many(200)[:100], steps, many(200)[100:], -300, 1) == 0
+    assert pool.values is before, "no row was made and taken back"
+
+
 def test_evidence_that_names_a_block_twice_does_no_harm():
     """It breaks the rule of `Evidence`; yet the pool stays whole."""
     rules = rules_of("int16")

@@ -73,7 +73,7 @@ class CellPool:
     @property
     def block_coords(self) -> NDArray[np.int32]:
         """Coordinates (n, 3) of all blocks, in no order."""
-        return self.coords[self._places]
+        return self.coords[self._places()]
 
     def put(self, coords: NDArray[np.int32], cells: NDArray[np.integer]) -> None:
         """Set whole blocks: coordinates (n, 3), cells (n, 512) as stored; what stood there before is lost."""
@@ -82,12 +82,13 @@ class CellPool:
         _pool.needs(cells, self._limits[0], self._limits[2], kinds)
         self._reserve(int((kinds == _pool.ROW).sum()), int((kinds == _pool.BARE).sum()))
         _pool.put(*self.arrays, coords, cells, kinds)
+        self._shrink()
 
     def get(self, coords: NDArray[np.int32]) -> tuple[NDArray[np.int32], NDArray[np.integer]]:
         """Return those of the blocks (n, 3) that are there, and their cells (n, 512) as stored."""
         places = np.empty(len(coords), np.int64)
         _pool.find_all(self.table, self.coords, coords, places)
-        return coords[places >= 0], self._cells_at(places[places >= 0])
+        return coords[places >= 0], self._cells_at(places[places >= 0], self.values)
 
     def remove(self, coords: NDArray[np.int32]) -> None:
         """Forget blocks (n, 3), each there or not."""
@@ -99,11 +100,11 @@ class CellPool:
 
         The pool must not change meanwhile.
         """
-        places = self._places
-        places = places[np.lexsort(self.coords[places].T[::-1])]
+        places, coords, values = self._places(), self.coords, self.values
+        places = places[np.lexsort(coords[places].T[::-1])]
         for start in range(0, max(len(places), 1), PIECE):
             some = places[start : start + PIECE]
-            yield self.coords[some], self._cells_at(some)
+            yield coords[some], self._cells_at(some, values)
 
     def add(
         self,
@@ -117,38 +118,50 @@ class CellPool:
 
         In differences of stored numbers; no block is named twice. Returns the number of cells that changed.
         """
-        unknown, _, lowest, _ = limits = self._limits
-        n = len(coords) + len(uniform)
-        rows = np.empty(n, np.int32)
-        made = _add.places(self.table, self.coords, self.values, coords, values, uniform, rows)
-        if made:
-            self._reserve(made, 0)
-            for blocks, their_rows in ((coords, rows[: len(coords)]), (uniform, rows[len(coords) :])):
-                _add.make_rows(*self.arrays, blocks, unknown, lowest, their_rows)
-        floored, changed = np.zeros(n, np.uint8), []
+        rows = self._rows_for(coords, values, uniform)
+        floored, changed = np.zeros(len(rows), np.uint8), []
         everywhere = np.full(CELLS, step, np.int16)
 
         def one_shard(part: slice) -> None:
             evidence = self.values, rows, part.start, part.stop, values, everywhere
-            changed.append(_add.add(*evidence, *limits, floored))
+            changed.append(_add.add(*evidence, *self._limits, floored))
 
-        in_shards(one_shard, shards(n, min(threads, n // WORTH_A_THREAD or 1)))
-        if sunk := np.count_nonzero(floored):
-            self._reserve(0, sunk)
-            for blocks, sunk_ones in ((coords, floored[: len(coords)]), (uniform, floored[len(coords) :])):
-                _add.settle(*self.arrays, blocks, sunk_ones, unknown, lowest)
-            self._shrink()
+        in_shards(one_shard, shards(len(rows), min(threads, len(rows) // WORTH_A_THREAD or 1)))
+        if sunk := int(np.count_nonzero(floored)):
+            self._settle(sunk, coords, uniform, floored)
         return sum(changed)
 
-    @property
+    def _rows_for(
+        self, coords: NDArray[np.int32], values: NDArray[np.int16], uniform: NDArray[np.int32]
+    ) -> NDArray[np.int32]:
+        """Return the rows (n + m,) that evidence goes to, made where there was none; below 0 where it says nothing."""
+        n, (unknown, _, lowest, _) = len(coords), self._limits
+        rows = np.empty(n + len(uniform), np.int32)
+        made = _add.places(self.table, self.coords, self.values, coords, values, uniform, rows)
+        if made:
+            self._reserve(made, 0)
+            for blocks, theirs in ((coords, rows[:n]), (uniform, rows[n:])):
+                _add.make_rows(*self.arrays, blocks, unknown, lowest, theirs)
+        return rows
+
+    def _settle(
+        self, sunk: int, coords: NDArray[np.int32], uniform: NDArray[np.int32], floored: NDArray[np.uint8]
+    ) -> None:
+        """Take the rows from as many blocks as have `sunk` to the floor, marked in `floored` (n + m,)."""
+        n, (unknown, _, lowest, _) = len(coords), self._limits
+        self._reserve(0, sunk)
+        for blocks, theirs in ((coords, floored[:n]), (uniform, floored[n:])):
+            _add.settle(*self.arrays, blocks, theirs, unknown, lowest)
+        self._shrink()
+
     def _places(self) -> NDArray[np.int64]:
         rows, bare = self.count.tolist()
         return np.concatenate([np.arange(rows), len(self.values) + np.arange(bare)])
 
-    def _cells_at(self, places: NDArray[np.int64]) -> NDArray[np.integer]:
-        cells = np.full((len(places), CELLS), self._rules.lowest, self.values.dtype)
-        has_row = places < len(self.values)
-        cells[has_row] = self.values[places[has_row]]
+    def _cells_at(self, places: NDArray[np.int64], values: NDArray[np.integer]) -> NDArray[np.integer]:
+        cells = np.full((len(places), CELLS), self._rules.lowest, values.dtype)
+        has_row = places < len(values)
+        cells[has_row] = values[places[has_row]]
         return cells
 
     def _room(self) -> tuple[int, int]:

@@ -154,6 +154,17 @@ def test_memory_is_constant_and_bounded():
     assert rolling.memory_bytes == rolling.reserved_bytes == before < 100 * 1100 * 2
 
 
+def test_a_block_on_the_border_goes_with_its_last_known_cell():
+    rolling = make_map(settings())
+    rolling.look_from(at((0, 0, 0)))  # the window begins at cell -16
+    values = np.zeros((1, 512), np.int16)
+    values[0, 0] = 500
+    rolling.add(Evidence(np.array([[-2, 0, 0]], np.int32), values, np.empty((0, 3), np.int32), 0))
+    assert rolling.cells()[0].tolist() == [[-16, 0, 0]]
+    rolling.look_from(at((0.36, 0, 0)))  # now at -15: half of the block is still in it
+    assert len(rolling.blocks()[0]) == 0
+
+
 def test_bytes_roll_like_thousandths():
     config = settings(cell="uint8")
     rolling = make_map(config)

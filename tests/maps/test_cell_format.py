@@ -79,6 +79,7 @@ def test_evidence_too_small_for_a_byte_changes_nothing():
     one = byte_map()
     one.add(Evidence(np.empty((0, 3), np.int32), np.empty((0, 512), np.int16), np.zeros((1, 3), np.int32), -5))
     assert one.counts() == {"free": 0, "tentative": 0, "occupied": 0}
+    assert len(one.blocks()[0]) == 0
 
 
 def test_save_and_load(tmp_path):

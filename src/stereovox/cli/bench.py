@@ -1,70 +1,168 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Time stereovox and other mapping libraries on the same frames, in one process."""
+"""Time stereovox and other mapping libraries on the same frames, in one process.
+
+Without SOURCE the frames come from the built-in room, so that anyone can run it. Figures are worth something only on a
+machine that does nothing else.
+"""
 
 from __future__ import annotations
 
+import os
+import sys
 from argparse import ArgumentParser, Namespace
-from typing import Any
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from stereovox.cli.terminal import say
-from stereovox.errors import MissingExtra
+from stereovox.cli.terminal import progress_bar, say, say_about_compiling
+
+if TYPE_CHECKING:
+    from stereovox.evaluate.bench import Variant
 
 EXAMPLE = "stereovox bench recordings/kitchen --voxel-size 0.1 --voxel-size 0.05 --peers octomap,pyoctomap"
 VOXEL_SIZES = (0.2, 0.1, 0.05, 0.02)
-USUAL_PEERS = ("octomap", "pyoctomap")
+BUILT_IN = "sim:room?frames=60"
 
 
 def add_arguments(parser: ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("source", metavar="SOURCE", help="recorded folder or file, or a simulation (sim:room)")
+    parser.add_argument(
+        "source",
+        metavar="SOURCE",
+        nargs="?",
+        default=BUILT_IN,
+        help="recorded folder or file, or a simulation (%(default)s)",
+    )
+    parser.add_argument("--out", metavar="DIR", help="folder for bench.json, bench.md and bench.png")
     parser.add_argument(
         "--voxel-size", type=float, action="append", metavar="M", help="cell size in metres; repeatable"
     )
     parser.add_argument(
         "--peers",
         metavar="A,B",
-        help="other libraries: octomap, pyoctomap, octomap-rays (default: the first two, where installed)",
+        help="other libraries: octomap, pyoctomap, wavemap, octomap-rays, or a class of yours, module:Class (default: "
+        "the first three, where installed)",
     )
-    parser.add_argument("--threads", type=int, default=1, metavar="N", help="threads for stereovox (%(default)s)")
+    parser.add_argument(
+        "--integrators", metavar="A,B", default="projective", help="of stereovox: projective, ray, line (%(default)s)"
+    )
+    parser.add_argument("--threads", type=int, metavar="N", help="threads for stereovox (1, and then all cores)")
     parser.add_argument("--max-range", type=float, metavar="M", help="depth in metres up to which pixels count (5)")
     parser.add_argument("--frames", metavar="A:B:S", help="only these frames, as a Python slice")
+    parser.add_argument(
+        "--also",
+        metavar="A,B",
+        default="",
+        help="measure more: threads, first-frame, start-up, overhead, map-size, path",
+    )
+    parser.add_argument("--all", action="store_true", help="measure all of these")
+    parser.add_argument(
+        "--frames-long", type=int, metavar="N", help="frames of the simulated flight of `path` (6000, a minute)"
+    )
+    parser.add_argument("--most-cells", type=int, metavar="N", help="largest map of `map-size` (100000000)")
 
 
 def run(arguments: Namespace) -> dict[str, Any]:
-    """Run the comparison and print its table."""
-    from stereovox.cli.terminal import progress_bar
-    from stereovox.evaluate.bench import bench, format_table
+    """Run the comparison and what else was asked for; print the tables and write the files."""
+    from stereovox.evaluate import bench_files
+
+    folder = bench_files.make_folder(arguments.out) if arguments.out is not None else None
+    result: dict[str, Any] = {}
+
+    def so_far(found: dict[str, Any]) -> None:
+        result.update(found)
+        if folder is not None:
+            bench_files.write(result, folder)
+
+    try:
+        _measure(arguments, so_far)
+    except KeyboardInterrupt:
+        say(f"stopped; this much is done{f' and written into {folder}' if folder else ''}:" if result else "")
+        _tell(result, folder)
+        raise
+    _tell(result, folder)
+    return result
+
+
+def _measure(arguments: Namespace, so_far: Callable[[dict[str, Any]], None]) -> None:
+    """Measure all that was asked for, and hand over what is done whenever something is."""
+    from stereovox.evaluate.bench import compare, find_peers
+    from stereovox.evaluate.bench_frames import read_frames
+    from stereovox.evaluate.bench_more import MEASUREMENTS, Given, check_names
     from stereovox.sources import open_source
 
+    wanted = check_names(list(MEASUREMENTS) if arguments.all else _named(arguments.also))
+    sizes = arguments.voxel_size or VOXEL_SIZES
+    ways = _ways(arguments)
+    configs = [way.config(size, arguments.max_range) for way in ways for size in sizes]  # slips show before the work
+    peers, missing = _peers(arguments.peers)
+    kinds = find_peers(peers, configs[0].voxel_size)
     source = open_source(arguments.source, arguments.frames)
-    peers = _installed() if arguments.peers is None else _named(arguments.peers)
+    say_about_compiling()
     with progress_bar() as bar:
         task = bar.add_task("loading", note="")
-        result = bench(
-            source,
-            arguments.voxel_size or VOXEL_SIZES,
-            peers,
-            threads=arguments.threads,
-            max_range=arguments.max_range,
-            progress=lambda done, total, text: bar.update(task, completed=done, total=total, description=text),
+
+        def tell(done: int, total: int, text: str) -> None:
+            bar.update(task, completed=done, total=total, description=text)
+
+        recording = read_frames(source, configs[0], tell=tell)
+        missed = {"not_installed": missing}
+        result = compare(
+            recording, sizes, kinds, ways, arguments.max_range, tell, so_far=lambda found: so_far(found | missed)
         )
-    say(format_table(result))
-    return result
+        given = Given(recording, sizes, ways[0], arguments.max_range, tell=tell, **_limits(arguments))
+        more: dict[str, Any] = {}
+        for name in wanted:
+            more[name] = MEASUREMENTS[name].run(given)
+            so_far(result | missed | {"more": more})
+
+
+def _ways(arguments: Namespace) -> list[Variant]:
+    """Return how stereovox is run: each integrator on one thread and on all cores, or on as many as asked for."""
+    from stereovox.errors import StereovoxError
+    from stereovox.evaluate.bench import Variant
+    from stereovox.evaluate.bench_machine import cores
+
+    threads = dict.fromkeys((1, cores())) if arguments.threads is None else (arguments.threads,)
+    integrators = _named(arguments.integrators)
+    if not integrators:
+        raise StereovoxError("--integrators: name at least one, for example projective")
+    return [Variant(name, number) for name in integrators for number in threads]
+
+
+def _limits(arguments: Namespace) -> dict[str, int]:
+    """Return the sizes of measurements that were asked for; raises StereovoxError for those that cannot be."""
+    from stereovox.errors import StereovoxError
+
+    given = {"path_frames": arguments.frames_long, "most_cells": arguments.most_cells}
+    for (name, number), option in zip(given.items(), ("--frames-long", "--most-cells"), strict=True):
+        if number is not None and number < 1:
+            raise StereovoxError(f"{option} {number}: give a number above 0 ({name.replace('_', ' ')})")
+    return {name: number for name, number in given.items() if number is not None}
+
+
+def _peers(text: str | None) -> tuple[list[str], list[str]]:
+    """Return the peers to compare with, and a line for each usual one that is not installed."""
+    from stereovox.evaluate.peers import installed
+
+    if text is None:
+        return installed()
+    if os.getcwd() not in sys.path:
+        sys.path.append(os.getcwd())  # where a user's module:Class lies, as for `python -m`
+    return _named(text), []
 
 
 def _named(text: str) -> list[str]:
     return [name.strip() for name in text.split(",") if name.strip()]
 
 
-def _installed() -> list[str]:
-    """Return the usual peers that are here, and say what to install for the others."""
-    from stereovox.evaluate.peers import find_peer
+def _tell(result: dict[str, Any], folder: Path | None) -> None:
+    """Print the tables, draw the picture and say where the files are."""
+    from stereovox.evaluate import bench_files
 
-    here = []
-    for name in USUAL_PEERS:
-        try:
-            find_peer(name)(1.0)
-            here.append(name)
-        except MissingExtra as missing:
-            say(f"note: without {name}: {missing}")
-    return here
+    if not result:
+        return
+    say(bench_files.text(result))
+    if folder is not None:
+        bench_files.write_picture(result, folder)
+        say(f"written into {folder}: bench.json, bench.md, bench.png")

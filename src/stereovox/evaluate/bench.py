@@ -3,29 +3,51 @@
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
-from itertools import islice
+from dataclasses import dataclass
 from time import perf_counter
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stereovox.config import Config, load_config
-from stereovox.depth import DepthPath, prepare
-from stereovox.errors import FrameRefused, StereovoxError
-from stereovox.evaluate.peers import Peer, find_peer
+from stereovox.depth import prepare
+from stereovox.errors import StereovoxError
+from stereovox.evaluate.bench_frames import Progress, Recording, points_of, read_frames, silent
+from stereovox.evaluate.bench_machine import machine
+from stereovox.evaluate.bench_table import LIBRARY
+from stereovox.evaluate.bench_table import format_table as format_table
+from stereovox.evaluate.peers import ImagePeer, Peer, PeerClass, find_peer
 from stereovox.frame import AnyFrame, Frame, Reason
-from stereovox.mapper import Mapper
+from stereovox.mapper import Mapper, UpdateReport
 
-OURS = "stereovox"
 MIN_FRAMES = 5
 """A peer does so many frames however long they take."""
+PASSES = 3
+"""stereovox flies all frames so many times, and once more after each peer, so that a machine's moods meet all."""
+ENOUGH_S = 5.0
+"""A variant of stereovox whose timed frames took so many seconds flies no further pass."""
 
-Progress = Callable[[int, int, str], None]
-"""Called with frames done, frames in all (0: not known), and what is being done."""
+SoFar = Callable[[dict[str, Any]], None]
+"""Called with the result so far."""
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One way to run stereovox: an integrator by name, on so many threads."""
+
+    integrator: str = "projective"
+    threads: int = 1
+
+    @property
+    def library(self) -> str:
+        """What its rows are called: `stereovox`, or `stereovox-ray`."""
+        return LIBRARY if self.integrator == "projective" else f"{LIBRARY}-{self.integrator}"
+
+    def config(self, voxel_size: float, max_range: float | None = None) -> Config:
+        """Return the default profile's settings with those of this variant; raises ConfigError."""
+        more: dict[str, Any] = {} if max_range is None else {"max_range": max_range}
+        return load_config(voxel_size=float(voxel_size), threads=self.threads, integrator=self.integrator, **more)
 
 
 @dataclass(frozen=True)
@@ -47,125 +69,166 @@ def bench(
     frames_limit: int | None = None,
     progress: Progress | None = None,
     budget_s: float = 60.0,
+    variants: Sequence[Variant] = (),
 ) -> dict[str, Any]:
-    """Time stereovox and `peers` (names in `PEERS`) on the same frames at each voxel size in metres.
+    """Time stereovox and `peers` (names in `PEERS`, or `module:Class`) on the same frames at each voxel size in metres.
 
     Same pixels: those without a value and those beyond `max_range` (None: the default profile's) are left out for all,
     ours included, so nobody clears space through them. Same poses: made exactly rigid once. All frames (at most
     `frames_limit`) are in memory before the clock starts.
 
-    Timed: for stereovox the `integrate_ms` of each frame, after all frames went once through a map that is thrown away,
-    so that kernels are compiled; its depth preparation stands apart as `depth_ms_median`. For a peer its insertion
-    alone, in one thread, after one frame into a map that is thrown away; its points are made before. What a peer's
-    Python binding does with the points is part of it: a Python user pays that, a C++ program would not.
+    Timed: for stereovox the `integrate_ms` of each frame that `Mapper.add` reports, after all frames went once through
+    a map that is thrown away, so that kernels are compiled; several passes, one before each peer, and their frames
+    together give the figures. Its depth preparation stands apart as `depth_ms_median`, the whole call as
+    `add_ms_median`. For a peer its insertion alone, in one thread, after one frame into a map that is thrown away; its
+    points are made before. What a peer's Python binding does with the points is part of it: a Python user pays that, a
+    C++ program would not.
 
     A peer stops after `budget_s` seconds of inserting at one voxel size, with at least 5 frames: `frames` tells how
     many it did, and if that is fewer than ours, its cells and bytes cannot be compared.
 
-    Returns `rows` of `library, voxel_size, threads, frames, integrate_ms_median, integrate_ms_p90, occupied, free,
-    map_bytes`; `ratio[str(voxel_size)][peer]` = peer's median / our median; and `source, image, frames,
-    frames_refused, first_refusal, max_range, budget_s`. Cells count as each library defines them: occupied above
-    p = 0.7 and free below 0.3 for stereovox, above and below 0.5 for OctoMap.
+    Returns `rows` of `library, voxel_size, threads, frames, integrate_ms_median, integrate_ms_p90, integrate_ms_p99,
+    occupied, free, map_bytes`; `variants`: rows like these of further ways to run stereovox; `ratio[str(voxel_size)]
+    [peer]` = peer's median / our median; and `source, image, frames, frames_refused, first_refusal, max_range,
+    budget_s, machine`. Cells count as each library defines them: occupied above p = 0.7 and free below 0.3 for
+    stereovox, above and below 0.5 for OctoMap.
     Raises ConfigError for an unknown peer or bad setting, MissingExtra for a peer that is not installed,
     StereovoxError when no frame can be used: one line each.
     """
-    tell = progress or (lambda done, total, text: None)
-    configs = _configs(voxel_sizes, threads, max_range)
-    kinds = {name: find_peer(name) for name in peers}
+    ways = [Variant(threads=threads), *variants]
+    configs = _configs(voxel_sizes, ways, max_range)
+    kinds = find_peers(peers, configs[0][0].voxel_size)
+    recording = read_frames(source, configs[0][0], frames_limit, progress or silent)
+    return compare(recording, voxel_sizes, kinds, ways, max_range, progress or silent, budget_s)
+
+
+def find_peers(names: Sequence[str], voxel_size: float) -> dict[str, PeerClass]:
+    """Return peers by name; one that is missing shows here, before a long recording is read."""
+    kinds = {name: find_peer(name) for name in names}
     for kind in kinds.values():
-        kind(configs[0].voxel_size)  # a library that is missing shows before a long recording is read
-    frames, refused = _load(source, configs[0], frames_limit, tell)
-    rows: list[dict[str, Any]] = []
-    ratio: dict[str, dict[str, float]] = {}
-    for config in configs:
-        ours = _time_ours(frames, config, tell)
-        theirs = [_time_peer(name, kind, frames, config, _Limits(budget_s), tell) for name, kind in kinds.items()]
-        rows += [ours, *theirs]
-        ratio[str(config.voxel_size)] = {row["library"]: _ratio(row, ours) for row in theirs}
-    camera = frames[0].camera
-    return {
-        "source": getattr(source, "name", "frames"),
-        "image": f"{camera.width}x{camera.height}",
-        "frames": len(frames),
-        "frames_refused": len(refused),
-        "first_refusal": next(iter(refused), ""),
-        "max_range": configs[0].max_range,
+        kind(voxel_size)
+    return kinds
+
+
+def compare(
+    recording: Recording,
+    voxel_sizes: Sequence[float],
+    peers: dict[str, PeerClass],
+    ways: Sequence[Variant],
+    max_range: float | None = None,
+    tell: Progress = silent,
+    budget_s: float = 60.0,
+    so_far: SoFar = lambda result: None,
+) -> dict[str, Any]:
+    """Do what `bench` does with frames in memory; the first of `ways` is what peers are compared with.
+
+    so_far: called with the result after each voxel size, so that a long run can be stopped.
+    """
+    sizes = _configs(voxel_sizes, ways, max_range)
+    result: dict[str, Any] = {
+        "source": recording.name,
+        "image": recording.size,
+        "frames": len(recording.frames),
+        "frames_refused": len(recording.refusals),
+        "first_refusal": next(iter(recording.refusals), ""),
+        "max_range": sizes[0][0].max_range,
         "budget_s": budget_s,
-        "rows": rows,
-        "ratio": ratio,
+        "machine": machine(),
+        "rows": [],
+        "variants": [],
+        "ratio": {},
     }
+    for configs in sizes:
+        flights = [_Flights(way, config, recording.frames, tell) for way, config in zip(ways, configs, strict=True)]
+        theirs = _timed(flights, peers, recording.frames, configs[0], _Limits(budget_s), tell)
+        ours, *others = [flight.row() for flight in flights]
+        result["rows"] += [ours, *theirs]
+        result["variants"] += others
+        result["ratio"][str(configs[0].voxel_size)] = {row["library"]: _ratio(row, ours) for row in theirs}
+        so_far(result)
+    return result
 
 
-def _configs(voxel_sizes: Sequence[float], threads: int, max_range: float | None) -> list[Config]:
-    more: dict[str, Any] = {} if max_range is None else {"max_range": max_range}
-    configs = [load_config(voxel_size=float(size), threads=threads, **more) for size in dict.fromkeys(voxel_sizes)]
+def _configs(voxel_sizes: Sequence[float], ways: Sequence[Variant], max_range: float | None) -> list[list[Config]]:
+    configs = [[way.config(size, max_range) for way in ways] for size in dict.fromkeys(voxel_sizes)]
     if not configs:
         raise StereovoxError("no voxel size to time; give at least one in metres, for example 0.05")
     return configs
 
 
-def _load(
-    source: Iterable[AnyFrame], config: Config, limit: int | None, tell: Progress
-) -> tuple[list[Frame], list[str]]:
-    """Return the frames that can be used, only the pixels in them that count, and why others were refused."""
-    total = operator.length_hint(source)
-    total = total if limit is None else min(total, limit)
-    frames: list[Frame] = []
-    refusals: list[str] = []
-    path = DepthPath(config)
-    for done, frame in enumerate(islice(source, limit), start=1):
-        try:
-            frames.append(_only_valid_pixels(path.matched(frame), config))
-        except FrameRefused as refused:
-            refusals.append(str(refused))
-        tell(done, total, "reading frames")
-    if not frames:
-        why = next(iter(refusals), "the source is empty")
-        raise StereovoxError(f"{getattr(source, 'name', 'frames')}: not one frame can be used ({why})")
-    return frames, refusals
+def _timed(
+    flights: Sequence[_Flights],
+    peers: dict[str, PeerClass],
+    frames: list[Frame],
+    config: Config,
+    limits: _Limits,
+    tell: Progress,
+) -> list[dict[str, Any]]:
+    """Fly stereovox and let each peer do the frames, by turns; return the peers' rows."""
+    for flight in flights:
+        flight.fly("warming up")
+    waiting, rows = list(peers.items()), []
+    for _ in range(max(PASSES, len(waiting) + 1)):
+        for flight in flights:
+            if flight.seconds < ENOUGH_S:
+                flight.fly("timing", timed=True)
+        if waiting:
+            name, kind = waiting.pop(0)
+            rows.append(_time_peer(name, kind, frames, config, limits, tell))
+    return rows
 
 
-def _only_valid_pixels(frame: Frame, config: Config) -> Frame:
-    """Return the frame in its own units, all that has no value up to the maximum range set to 0."""
-    image = prepare(frame, config)
-    valid = image.reason == Reason.VALID
-    if not valid.any():
-        raise FrameRefused("no_valid_depth", f"{frame.name or 'a frame'}: no depth up to {config.max_range:g} m")
-    depth = np.where(valid, frame.depth, 0).astype(frame.depth.dtype)
-    return replace(frame, depth=depth, reason=None, T_world_sensor=image.T_world_sensor)
+class _Flights:
+    """The frames through stereovox, as often as it is flown: each time into a new map."""
 
+    def __init__(self, way: Variant, config: Config, frames: list[Frame], tell: Progress):
+        self._way, self._config, self._frames, self._tell = way, config, frames, tell
+        self._reports: list[UpdateReport] = []
+        self._add_ms: list[float] = []
+        self._map: dict[str, Any] = {}
 
-def _points(frame: Frame, config: Config) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the frame's points (N, 3) in the world and the camera's position (3,)."""
-    image = prepare(frame, config)
-    T = image.T_world_sensor
-    v, u = np.nonzero(image.reason == Reason.VALID)
-    columns, rows = frame.camera.rays()
-    points = np.column_stack([columns[u], rows[v]]) * image.depth_m[v, u, None].astype(float)
-    return np.ascontiguousarray(points @ T[:3, :3].T + T[:3, 3]), T[:3, 3].copy()
+    @property
+    def seconds(self) -> float:
+        """How long the timed frames took."""
+        return sum(self._add_ms) / 1e3
 
+    def fly(self, text: str, timed: bool = False) -> None:
+        """Add all frames to a new map, and remember the times if they are `timed`."""
+        mapper, threads = Mapper(self._config), self._way.threads
+        where = f"{self._way.library}{f', {threads} threads,' * (threads > 1)} at {self._config.voxel_size:g} m"
+        for i, frame in enumerate(self._frames):
+            start = perf_counter()
+            report = mapper.add(frame)
+            took = 1e3 * (perf_counter() - start)
+            if timed:
+                self._reports.append(report)
+                self._add_ms.append(took)
+            self._tell(i + 1, len(self._frames), f"{where}, {text}")
+        counts = mapper.map.counts()
+        self._map = {"occupied": counts["occupied"], "free": counts["free"], "map_bytes": mapper.map.memory_bytes}
 
-def _time_ours(frames: list[Frame], config: Config, tell: Progress) -> dict[str, Any]:
-    for text in ("warming up", "timing"):
-        mapper, reports = Mapper(config), []
-        for i, frame in enumerate(frames):
-            reports.append(mapper.add(frame))
-            tell(i + 1, len(frames), f"{OURS} at {config.voxel_size:g} m, {text}")
-    counts = mapper.map.counts()
-    row = _row(OURS, config, config.threads, [report.integrate_ms for report in reports])
-    row |= {"occupied": counts["occupied"], "free": counts["free"], "map_bytes": mapper.map.memory_bytes}
-    return row | {"depth_ms_median": _median([report.depth_ms for report in reports])}
+    def row(self) -> dict[str, Any]:
+        """Return the row of this way to run stereovox."""
+        row = _row(self._way.library, self._config, self._way.threads, [r.integrate_ms for r in self._reports])
+        more = {
+            "frames": len(self._frames),
+            "passes": len(self._reports) // len(self._frames),
+            "integrator": self._way.integrator,
+            "depth_ms_median": median([report.depth_ms for report in self._reports]),
+            "add_ms_median": median(self._add_ms),
+        }
+        return row | self._map | more
 
 
 def _time_peer(
-    name: str, kind: type[Peer], frames: list[Frame], config: Config, limits: _Limits, tell: Progress
+    name: str, kind: PeerClass, frames: list[Frame], config: Config, limits: _Limits, tell: Progress
 ) -> dict[str, Any]:
-    kind(config.voxel_size).insert(*_points(frames[0], config))
+    _insertion(kind(config.voxel_size), frames[0], config)()
     peer, times_ms = kind(config.voxel_size), []
     for frame in frames:
-        points, origin = _points(frame, config)
+        insert = _insertion(peer, frame, config)
         start = perf_counter()
-        peer.insert(points, origin)
+        insert()
         times_ms.append(1e3 * (perf_counter() - start))
         tell(len(times_ms), len(frames), f"{name} at {config.voxel_size:g} m")
         if limits.reached(times_ms):
@@ -174,79 +237,32 @@ def _time_peer(
     return _row(name, config, 1, times_ms) | {"occupied": occupied, "free": free, "map_bytes": peer.bytes()}
 
 
+def _insertion(peer: Peer | ImagePeer, frame: Frame, config: Config) -> Callable[[], None]:
+    """Return the call that is timed; all that it needs is made here."""
+    image = prepare(frame, config)
+    if isinstance(peer, ImagePeer):
+        depth_m = np.where(image.reason == Reason.VALID, image.depth_m, np.float32(0))
+        return lambda: peer.insert_image(depth_m, image.camera, image.T_world_sensor)
+    points, origin = points_of(image)
+    return lambda: peer.insert(points, origin)
+
+
 def _row(library: str, config: Config, threads: int, times_ms: Sequence[float]) -> dict[str, Any]:
     return {
         "library": library,
         "voxel_size": config.voxel_size,
         "threads": threads,
         "frames": len(times_ms),
-        "integrate_ms_median": _median(times_ms),
+        "integrate_ms_median": median(times_ms),
         "integrate_ms_p90": round(float(np.percentile(times_ms, 90)), 4),
+        "integrate_ms_p99": round(float(np.percentile(times_ms, 99)), 4),
     }
 
 
-def _median(times_ms: Sequence[float]) -> float:
-    return round(float(np.median(times_ms)), 4)
+def median(times: Sequence[float]) -> float:
+    """Return the median to four places."""
+    return round(float(np.median(times)), 4)
 
 
 def _ratio(peer: dict[str, Any], ours: dict[str, Any]) -> float:
     return round(peer["integrate_ms_median"] / max(ours["integrate_ms_median"], 1e-4), 3)
-
-
-def format_table(result: dict[str, Any]) -> str:
-    """Return the result of `bench` as plain text: a block of lines for each voxel size, stereovox first."""
-    head = ("voxel", "library", "threads", "frames", "ms/frame", "p90", "stereovox is", "occupied", "free", "map MB")
-    lines = [head, *(_cells(row, result["ratio"]) for row in result["rows"])]
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    text = [_title(result), ""]
-    for line in lines:
-        if line[1] == OURS:
-            text.append("")
-        aligned = [
-            cell.ljust(w) if i < 2 else cell.rjust(w) for i, (cell, w) in enumerate(zip(line, widths, strict=True))
-        ]
-        text.append("  ".join(aligned).rstrip())
-    return "\n".join([*text, "", *_notes(result)])
-
-
-def _title(result: dict[str, Any]) -> str:
-    return f"{result['source']}: {result['frames']} frames of {result['image']}, depth up to {result['max_range']:g} m"
-
-
-def _cells(row: dict[str, Any], ratio: dict[str, dict[str, float]]) -> tuple[str, ...]:
-    times = ratio[str(row["voxel_size"])].get(row["library"])
-    ours = row["library"] == OURS
-    return (
-        f"{row['voxel_size']:g} m" if ours else "",
-        row["library"],
-        str(row["threads"]),
-        str(row["frames"]),
-        f"{row['integrate_ms_median']:.2f}",
-        f"{row['integrate_ms_p90']:.2f}",
-        "" if times is None else _faster(times),
-        f"{row['occupied']:,}",
-        f"{row['free']:,}",
-        f"{row['map_bytes'] / 1e6:.1f}",
-    )
-
-
-def _faster(times: float) -> str:
-    """Return a ratio in words, from our side."""
-    if times < 1:
-        return f"{1 / max(times, 1e-3):.1f} x slower"
-    return f"{times:.0f} x faster" if times >= 10 else f"{times:.1f} x faster"
-
-
-def _notes(result: dict[str, Any]) -> list[str]:
-    notes = [
-        "ms/frame: median time of the call that takes a frame in; making depth images or points is not part of it.",
-        "Cells as each library defines them: occupied above p = 0.7, free below 0.3; for OctoMap above, below 0.5.",
-    ]
-    if result["frames_refused"]:
-        notes.append(f"{result['frames_refused']} frames were refused, first: {result['first_refusal']}")
-    for row in result["rows"]:
-        if row["frames"] < result["frames"]:
-            done = f"{row['frames']} of {result['frames']} frames"
-            which = f"{row['library']} at {row['voxel_size']:g} m"
-            notes.append(f"{which} stopped at its time limit after {done}: do not compare its cells and MB.")
-    return notes

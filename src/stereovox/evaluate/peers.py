@@ -8,23 +8,34 @@ the same trees.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import os
+from collections.abc import Iterator, Sequence
 from importlib import import_module
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stereovox import registry
-from stereovox.errors import ConfigError, MissingExtra, did_you_mean
+from stereovox.cameras import PinholeCamera
+from stereovox.errors import ConfigError, MissingExtra, StereovoxError, did_you_mean
+from stereovox.rigs import VirtualCamera
 
 PEERS = {
     "octomap": "stereovox.evaluate.peers:OctomapPython",
     "octomap-rays": "stereovox.evaluate.peers:OctomapPythonRays",
     "pyoctomap": "stereovox.evaluate.peers:PyOctomap",
+    "wavemap": "stereovox.evaluate.peers:Wavemap",
 }
 """Libraries by name; other packages add theirs with entry points in the group `stereovox.peers`."""
 
+USUAL = ("octomap", "pyoctomap", "wavemap")
+"""What stereovox is compared with where nothing else is asked for, as far as it is installed."""
+
+WAVEMAP_FROM = "git+https://github.com/ethz-asl/wavemap#subdirectory=library/python"
+"""Where its own pages say pip finds it; it is not on PyPI."""
+UNKNOWN = 1e-6
+"""Log-odds nearer to zero than this are no evidence in wavemap's maps, whose cells are sums of wavelets."""
 TREE_DEPTH = 16
 """Levels of an octree of OctoMap; a leaf at this depth is one cell."""
 
@@ -47,12 +58,61 @@ class Peer(Protocol):
         ...
 
 
-def find_peer(name: str) -> type[Peer]:
-    """Return the class registered as `name`. Raises ConfigError that suggests a known name."""
+@runtime_checkable
+class ImagePeer(Protocol):
+    """A peer that takes depth images in place of points."""
+
+    def __init__(self, voxel_size: float): ...
+
+    def insert_image(
+        self, depth_m: NDArray[np.float32], camera: VirtualCamera, T_world_camera: NDArray[np.float64]
+    ) -> None:
+        """Take in a depth image (height, width) in metres, 0 where it has no value. This, and only this, is timed."""
+        ...
+
+    def counts(self) -> tuple[int, int]:
+        """Return the numbers of occupied and of free cells."""
+        ...
+
+    def bytes(self) -> int:
+        """Return the memory the map needs."""
+        ...
+
+
+PeerClass = type[Peer] | type[ImagePeer]
+
+
+def find_peer(name: str) -> PeerClass:
+    """Return the class registered as `name`, or for `module:Class` that class of a module that Python finds.
+
+    Raises ConfigError, one line, that suggests a known name or tells what could not be imported.
+    """
+    if ":" in name:
+        return _class_in(name)
     known = registry.names("peers", PEERS)
     if name not in known:
         raise ConfigError(f"unknown peer '{name}'{did_you_mean(name, known)}")
     return registry.find("peers", PEERS, name)
+
+
+def installed(names: Sequence[str] = USUAL) -> tuple[list[str], list[str]]:
+    """Return those of `names` that can be used here, and a line for each of the others that says what to install."""
+    here, missing = [], []
+    for name in names:
+        try:
+            find_peer(name)(1.0)
+            here.append(name)
+        except MissingExtra as why:
+            missing.append(f"{name}: {why}")
+    return here, missing
+
+
+def _class_in(name: str) -> PeerClass:
+    module, _, attribute = name.partition(":")
+    try:
+        return getattr(import_module(module), attribute)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ConfigError(f"peer '{name}': {error}; write module:Class, the module where Python finds it") from None
 
 
 class OctomapPython:
@@ -104,6 +164,95 @@ class PyOctomap:
     def bytes(self) -> int:
         """Return what `memoryUsage` tells: the nodes and their child arrays."""
         return self._tree.memoryUsage()
+
+
+class Wavemap:
+    """wavemap's hashed, chunked wavelet octree with the settings of its Python example, on one thread.
+
+    It takes depth images of a pinhole camera. A cell is occupied above p = 0.5 and free below it.
+    """
+
+    NEAREST_M = 0.1
+    """Where depths begin; nearer ones, and so zeros, have no value for wavemap."""
+
+    def __init__(self, voxel_size: float):
+        try:
+            self._wave = import_module("pywavemap")
+        except ImportError:
+            raise MissingPackage("pywavemap", WAVEMAP_FROM) from None
+        kind = {"type": "hashed_chunked_wavelet_octree", "min_cell_width": {"meters": voxel_size}}
+        self._map = self._wave.Map.create(kind)
+        self._pipeline = _on_one_processor(self._wave.Pipeline, self._map)
+        self._voxel_size = voxel_size
+        self._camera: VirtualCamera | None = None
+        self._reach = 0.0
+        self._seen: list[NDArray[np.float64]] = []
+
+    def insert_image(
+        self, depth_m: NDArray[np.float32], camera: VirtualCamera, T_world_camera: NDArray[np.float64]
+    ) -> None:
+        """Let the pipeline integrate the image."""
+        deepest = float(depth_m.max())
+        if camera is not self._camera or deepest > self._reach:
+            self._look_through(camera, np.ceil(deepest))
+        wave = self._wave
+        posed = wave.PosedImage(wave.Pose(T_world_camera), wave.Image(depth_m.T))
+        self._pipeline.run_pipeline(["camera"], posed)
+        self._seen.append(T_world_camera[:3, 3])
+
+    def counts(self) -> tuple[int, int]:
+        """Return occupied and free cells of the smallest size."""
+        far = self._reach * self._widest
+        low = np.floor((np.min(self._seen, axis=0) - far) / self._voxel_size).astype(int)
+        high = np.ceil((np.max(self._seen, axis=0) + far) / self._voxel_size).astype(int)
+        layer = np.mgrid[0:1, low[1] : high[1], low[2] : high[2]].reshape(3, -1).T.astype(np.int32)
+        occupied = free = 0
+        for x in range(low[0], high[0]):
+            layer[:, 0] = x
+            values = self._map.get_cell_values(layer)
+            occupied, free = occupied + int((values > UNKNOWN).sum()), free + int((values < -UNKNOWN).sum())
+        return occupied, free
+
+    def bytes(self) -> int:
+        """Return what `memory_usage` tells."""
+        return self._map.memory_usage
+
+    def _look_through(self, camera: VirtualCamera, reach: float) -> None:
+        """Set up for this camera; cells beyond `reach` metres, where the images end, are not looked at."""
+        if not isinstance(camera, PinholeCamera):
+            raise StereovoxError("wavemap is compared on pinhole cameras only; leave it out with --peers")
+        columns, rows = camera.ray_slopes()
+        self._widest = float(np.sqrt(1 + np.square(columns).max() + np.square(rows).max()))
+        self._camera, self._reach = camera, reach
+        size = {"width": camera.width, "height": camera.height}
+        lens = {"fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy}
+        limits = {"min_range": {"meters": self.NEAREST_M}, "max_range": {"meters": reach}}
+        self._pipeline.clear_integrators()
+        self._pipeline.add_integrator("camera", {
+            "projection_model": {"type": "pinhole_camera_projector", **size, **lens},
+            "measurement_model": {"type": "continuous_ray", "range_sigma": {"meters": 0.01},
+                                  "scaling_free": 0.2, "scaling_occupied": 0.4},
+            "integration_method": {"type": "hashed_chunked_wavelet_integrator", **limits},
+        })  # fmt: skip
+
+
+def _on_one_processor(make: Any, *arguments: Any) -> Any:
+    """Call `make` while this thread may use one processor only: a pool that counts them makes one thread."""
+    if not hasattr(os, "sched_setaffinity"):
+        return make(*arguments)
+    allowed = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(allowed)})
+    try:
+        return make(*arguments)
+    finally:
+        os.sched_setaffinity(0, allowed)
+
+
+class MissingPackage(MissingExtra):
+    """A library that no extra of stereovox brings is not installed."""
+
+    def __init__(self, library: str, source: str):
+        StereovoxError.__init__(self, f"{library} is not installed; run: pip install '{source}'")
 
 
 def _library(module: str, package: str) -> Any:

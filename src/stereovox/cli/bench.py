@@ -95,6 +95,7 @@ def _measure(arguments: Namespace, so_far: Callable[[dict[str, Any]], None]) -> 
     sizes = arguments.voxel_size or VOXEL_SIZES
     ways = _ways(arguments)
     configs = [way.config(size, arguments.max_range) for way in ways for size in sizes]  # slips show before the work
+    limits = _limits(arguments)
     peers, missing = _peers(arguments.peers)
     kinds = find_peers(peers, configs[0].voxel_size)
     source = open_source(arguments.source, arguments.frames)
@@ -110,7 +111,7 @@ def _measure(arguments: Namespace, so_far: Callable[[dict[str, Any]], None]) -> 
         result = compare(
             recording, sizes, kinds, ways, arguments.max_range, tell, so_far=lambda found: so_far(found | missed)
         )
-        given = Given(recording, sizes, ways[0], arguments.max_range, tell=tell, **_limits(arguments))
+        given = Given(recording, sizes, ways[0], arguments.max_range, tell=tell, **limits)
         more: dict[str, Any] = {}
         for name in wanted:
             more[name] = MEASUREMENTS[name].run(given)
@@ -119,14 +120,18 @@ def _measure(arguments: Namespace, so_far: Callable[[dict[str, Any]], None]) -> 
 
 def _ways(arguments: Namespace) -> list[Variant]:
     """Return how stereovox is run: each integrator on one thread and on all cores, or on as many as asked for."""
+    from stereovox import registry
     from stereovox.errors import StereovoxError
     from stereovox.evaluate.bench import Variant
     from stereovox.evaluate.bench_machine import cores
+    from stereovox.integrate import INTEGRATORS
 
     threads = dict.fromkeys((1, cores())) if arguments.threads is None else (arguments.threads,)
     integrators = _named(arguments.integrators)
     if not integrators:
         raise StereovoxError("--integrators: name at least one, for example projective")
+    for name in integrators:
+        registry.find("integrators", INTEGRATORS, name)
     return [Variant(name, number) for name in integrators for number in threads]
 
 

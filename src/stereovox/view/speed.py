@@ -6,6 +6,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from stereovox.evaluate.bench_machine import machine_line
 from stereovox.evaluate.bench_table import LIBRARY, rows_by_size
 from stereovox.view.charts import blank, labels, png_of
@@ -31,9 +33,10 @@ def speed_png(result: dict[str, Any]) -> bytes:
     lines = _lines(result)
     _panel(left, lines, "integrate_ms_median", 1.0)
     _panel(right, {name: rows for name, rows in lines.items() if not _again(rows[0], result)}, "map_bytes", 1e-6)
-    left.axhline(CAMERA_MS, color=GREY, linewidth=1, zorder=0)
-    place = {"xycoords": ("axes fraction", "data"), "textcoords": "offset points", "ha": "center"}
-    left.annotate("30 frames a second", (0.5, CAMERA_MS), (0, 3), fontsize=9, color=GREY, **place)
+    if left.get_ylim()[0] < CAMERA_MS < left.get_ylim()[1]:
+        left.axhline(CAMERA_MS, color=GREY, linewidth=1, zorder=0)
+        place = {"xycoords": ("axes fraction", "data"), "textcoords": "offset points", "ha": "center"}
+        left.annotate("30 frames a second", (0.5, CAMERA_MS), (0, 3), fontsize=9, color=GREY, **place)
     _words(left, "Time to take in a frame", "median milliseconds (lower is better)")
     _words(right, "Memory of the finished map", "megabytes (lower is better)")
     handles, names = left.get_legend_handles_labels()
@@ -63,6 +66,7 @@ def _panel(axis: Any, lines: Mapping[str, Sequence[dict[str, Any]]], key: str, f
     ours = list(dict.fromkeys(rows[0]["library"] for rows in lines.values() if _ours(rows[0])))
     threads = list(dict.fromkeys(rows[0]["threads"] for rows in lines.values() if _ours(rows[0])))
     others = [name for name, rows in lines.items() if not _ours(rows[0])]
+    first = next(iter(lines))
     for name, rows in lines.items():
         if _ours(rows[0]):
             colour = (OURS, *FURTHER)[ours.index(rows[0]["library"]) % 3]
@@ -79,10 +83,11 @@ def _panel(axis: Any, lines: Mapping[str, Sequence[dict[str, Any]]], key: str, f
             look = {"linewidth": 1.6, "markersize": 6, "zorder": 3, "marker": MARKERS[1 + number % 5]}
         sizes, values = [row["voxel_size"] for row in rows], [factor * row[key] for row in rows]
         axis.plot(sizes, values, linestyle=dash, color=colour, label=name, **look)
-        if name == next(iter(lines)):
+        if name == first:
             _numbers(axis, sizes, values)
     axis.set(xscale="log", yscale="log")
-    _ticks(axis, sorted({row["voxel_size"] for rows in lines.values() for row in rows}))
+    seen = [row for rows in lines.values() for row in rows]
+    _ticks(axis, sorted({row["voxel_size"] for row in seen}), [factor * row[key] for row in seen])
 
 
 def _numbers(axis: Any, sizes: Sequence[float], values: Sequence[float]) -> None:
@@ -93,15 +98,18 @@ def _numbers(axis: Any, sizes: Sequence[float], values: Sequence[float]) -> None
         )
 
 
-def _ticks(axis: Any, sizes: Sequence[float]) -> None:
-    """Name the voxel sizes that were measured, and write numbers as people do."""
-    from matplotlib.ticker import FuncFormatter, NullLocator
+def _ticks(axis: Any, sizes: Sequence[float], values: Sequence[float]) -> None:
+    """Name the voxel sizes that were measured, and write numbers as people do; two powers of ten at least."""
+    from matplotlib.ticker import FuncFormatter, NullFormatter, NullLocator
 
     axis.set_xticks(sizes, [f"{size:g}" for size in sizes])
+    axis.set_xlim(sizes[0] / 1.2, 1.2 * sizes[-1])
     axis.xaxis.set_minor_locator(NullLocator())
+    low, high = min(values) / 2, 1.6 * max(values)
+    middle = np.sqrt(low * high)
+    axis.set_ylim(min(low, middle / 10), max(high, 10 * middle))
     axis.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    low, high = axis.get_ylim()
-    axis.set_ylim(low / 1.6, high)
+    axis.yaxis.set_minor_formatter(NullFormatter())
     axis.grid(True, color=LINE, linewidth=0.5, alpha=0.7)
     axis.set_axisbelow(True)
 

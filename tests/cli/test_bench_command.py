@@ -13,6 +13,7 @@ from made_recordings import write_png
 
 from stereovox.cli import bench as command
 from stereovox.cli import main
+from stereovox.errors import StereovoxError
 from stereovox.evaluate import bench_more
 from stereovox.evaluate.bench_table import Table
 
@@ -183,3 +184,17 @@ def test_slips_are_one_line_before_the_work(said, words, recording, tmp_path, ca
     lines = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("compiling")]
     assert len(lines) == 1
     assert lines[0].startswith(f"stereovox: {said.format(tmp=tmp_path)}")
+
+
+def test_a_measurement_that_fails_leaves_what_is_done(recording, tmp_path, capsys, monkeypatch):
+    def fail(given):
+        raise StereovoxError("no process could be started")
+
+    broken = bench_more.Measurement("a fake", fail, bench_more.MEASUREMENTS["start-up"].table)
+    monkeypatch.setitem(bench_more.MEASUREMENTS, "start-up", broken)
+    out = tmp_path / "bench"
+    assert run(recording, "--voxel-size", 0.2, "--peers", "", "--also", "start-up", "--out", out) == 2
+    said = capsys.readouterr().err
+    assert "stopped; this much is done" in said
+    assert said.splitlines()[-1] == "stereovox: no process could be started"
+    assert len(json.loads((out / "bench.json").read_text())["rows"]) == 1

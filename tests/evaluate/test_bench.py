@@ -382,6 +382,15 @@ def test_a_class_that_is_not_there_is_one_line(name, said):
     assert "\n" not in str(error.value)
 
 
+def test_another_package_adds_a_peer_by_an_entry_point(monkeypatch):
+    entry = SimpleNamespace(name="theirs", load=lambda: Recorder)
+    groups = {"stereovox.peers": [entry]}
+    monkeypatch.setattr("stereovox.registry.entry_points", lambda group: groups.get(group, []))
+    assert find_peer("theirs") is Recorder
+    with pytest.raises(ConfigError, match="did you mean 'theirs'"):
+        find_peer("their")
+
+
 def test_libraries_that_are_missing_are_told_with_what_to_install(monkeypatch):
     for module in ("octomap", "pywavemap"):
         monkeypatch.setitem(sys.modules, module, None)

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stereovox.cli.terminal import progress_bar, say, say_about_compiling
+from stereovox.errors import StereovoxError
 
 if TYPE_CHECKING:
     from stereovox.evaluate.bench import Variant
@@ -76,9 +77,10 @@ def run(arguments: Namespace) -> dict[str, Any]:
 
     try:
         _measure(arguments, so_far)
-    except KeyboardInterrupt:
-        say(f"stopped; this much is done{f' and written into {folder}' if folder else ''}:" if result else "")
-        _tell(result, folder)
+    except (KeyboardInterrupt, StereovoxError, MemoryError):
+        if result:
+            say(f"stopped; this much is done{f' and written into {folder}' if folder else ''}:\n")
+            _tell(result, folder)
         raise
     _tell(result, folder)
     return result
@@ -121,7 +123,6 @@ def _measure(arguments: Namespace, so_far: Callable[[dict[str, Any]], None]) -> 
 def _ways(arguments: Namespace) -> list[Variant]:
     """Return how stereovox is run: each integrator on one thread and on all cores, or on as many as asked for."""
     from stereovox import registry
-    from stereovox.errors import StereovoxError
     from stereovox.evaluate.bench import Variant
     from stereovox.evaluate.bench_machine import cores
     from stereovox.integrate import INTEGRATORS
@@ -137,8 +138,6 @@ def _ways(arguments: Namespace) -> list[Variant]:
 
 def _limits(arguments: Namespace) -> dict[str, int]:
     """Return the sizes of measurements that were asked for; raises StereovoxError for those that cannot be."""
-    from stereovox.errors import StereovoxError
-
     given = {"path_frames": arguments.frames_long, "most_cells": arguments.most_cells}
     for (name, number), option in zip(given.items(), ("--frames-long", "--most-cells"), strict=True):
         if number is not None and number < 1:
@@ -165,8 +164,6 @@ def _tell(result: dict[str, Any], folder: Path | None) -> None:
     """Print the tables, draw the picture and say where the files are."""
     from stereovox.evaluate import bench_files
 
-    if not result:
-        return
     say(bench_files.text(result))
     if folder is not None:
         bench_files.write_picture(result, folder)

@@ -51,11 +51,11 @@ def overhead(
 
 
 def empty_frame(width: int, height: int) -> Frame:
-    """Return a frame without any value, but for one pixel in its middle."""
-    depth_m = np.zeros((height, width), np.float32)
-    depth_m[height // 2, width // 2] = DEPTH_M
+    """Return a frame in millimetres (uint16) without any value, but for one pixel in its middle."""
+    depth = np.zeros((height, width), np.uint16)
+    depth[height // 2, width // 2] = round(1000 * DEPTH_M)
     camera = PinholeCamera.from_field_of_view(width, height, 60.0, baseline=0.05)
-    return Frame(depth_m, camera, np.eye(4))
+    return Frame(depth, camera, np.eye(4), depth_scale=0.001)
 
 
 def _row(width: int, height: int, times_us: NDArray[np.float64]) -> dict[str, Any]:

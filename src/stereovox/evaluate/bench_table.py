@@ -29,7 +29,7 @@ class Table:
         text = [self.title, "", self._aligned(self.head, widths)]
         for group in self.groups:
             text += ["", *(self._aligned(row, widths) for row in group)]
-        return "\n".join([*text, "", *self.notes])
+        return "\n".join([*text, *([""] if self.notes else []), *self.notes])
 
     def markdown(self, level: int = 2) -> str:
         """Return the table in Markdown under a heading of this level."""

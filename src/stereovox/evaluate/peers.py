@@ -167,7 +167,7 @@ class PyOctomap:
 
 
 class Wavemap:
-    """wavemap's hashed, chunked wavelet octree with the settings of its Python example, on one thread.
+    """wavemap's hashed, chunked wavelet octree with the settings of its Python example, on one processor.
 
     It takes depth images of a pinhole camera. A cell is occupied above p = 0.5 and free below it.
     """
@@ -237,7 +237,7 @@ class Wavemap:
 
 
 def _on_one_processor(make: Any, *arguments: Any) -> Any:
-    """Call `make` while this thread may use one processor only: a pool that counts them makes one thread."""
+    """Call `make` while this thread may use one processor only; the threads it starts keep to that one for good."""
     if not hasattr(os, "sched_setaffinity"):
         return make(*arguments)
     allowed = os.sched_getaffinity(0)

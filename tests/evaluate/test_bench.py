@@ -3,6 +3,7 @@
 
 import os
 import sys
+import time
 from dataclasses import replace
 from importlib.util import find_spec
 from types import SimpleNamespace
@@ -23,7 +24,7 @@ from stereovox.wide import SphericalCamera
 
 ROW_KEYS = {
     "library", "voxel_size", "threads", "frames", "integrate_ms_median", "integrate_ms_p90", "integrate_ms_p99",
-    "occupied", "free", "map_bytes",
+    "occupied", "free", "map_bytes", "cpu_share",
 }  # fmt: skip
 LIBRARY = {"octomap": "octomap", "octomap-rays": "octomap", "pyoctomap": "pyoctomap"}
 
@@ -470,3 +471,24 @@ def test_wavemap_itself_sees_the_wall():
     ours, peer = bench([a_frame(i) for i in range(6)], [0.05], ["wavemap"])["rows"]
     assert ours["free"] / 2 < peer["free"] < 2 * ours["free"]
     assert peer["occupied"] > 20
+
+
+def test_a_busy_machine_is_told():
+    """A peer that waits as long as it works, as if another program had the processor."""
+    calm = made_result()
+    for row in calm["rows"]:
+        row["cpu_share"] = 0.97
+    assert "in the way" not in format_table(calm)
+    calm["rows"][4]["cpu_share"] = 0.42
+    assert "Other programs were in the way: octomap at 0.05 m got 42% of a processor." in format_table(calm)
+
+
+def test_waiting_takes_no_processor(monkeypatch):
+    class Waits(Recorder):
+        def insert(self, points, origin):
+            time.sleep(0.01)
+
+    monkeypatch.setitem(sys.modules, "a_made_module", SimpleNamespace(Waits=Waits))
+    ours, peer = bench([a_frame(i) for i in range(3)], [0.2], ["a_made_module:Waits"])["rows"]
+    assert peer["cpu_share"] < 0.5
+    assert ours["cpu_share"] > 0

@@ -4,9 +4,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
-from time import perf_counter
-from typing import Any
+from dataclasses import dataclass, field
+from time import perf_counter, process_time
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -28,6 +28,7 @@ PASSES = 3
 ENOUGH_S = 5.0
 """A variant of stereovox whose timed frames took so many seconds flies no further pass."""
 
+T = TypeVar("T")
 SoFar = Callable[[dict[str, Any]], None]
 """Called with the result so far."""
 
@@ -48,6 +49,27 @@ class Variant:
         """Return the default profile's settings with those of this variant; raises ConfigError."""
         more: dict[str, Any] = {} if max_range is None else {"max_range": max_range}
         return load_config(voxel_size=float(voxel_size), threads=self.threads, integrator=self.integrator, **more)
+
+
+@dataclass
+class _Watch:
+    """Times of calls in milliseconds, and the processor's time they got in all."""
+
+    times_ms: list[float] = field(default_factory=list)
+    cpu_ms: float = 0.0
+
+    def call(self, function: Callable[[], T]) -> T:
+        """Time a call and return its result."""
+        cpu, start = process_time(), perf_counter()
+        result = function()
+        self.times_ms.append(1e3 * (perf_counter() - start))
+        self.cpu_ms += 1e3 * (process_time() - cpu)
+        return result
+
+    @property
+    def share(self) -> float:
+        """How many processors the calls kept busy: less than 1 where others were in the way."""
+        return round(self.cpu_ms / max(sum(self.times_ms), 1e-6), 3)
 
 
 @dataclass(frozen=True)
@@ -88,10 +110,11 @@ def bench(
     many it did, and if that is fewer than ours, its cells and bytes cannot be compared.
 
     Returns `rows` of `library, voxel_size, threads, frames, integrate_ms_median, integrate_ms_p90, integrate_ms_p99,
-    occupied, free, map_bytes`; `variants`: rows like these of further ways to run stereovox; `ratio[str(voxel_size)]
-    [peer]` = peer's median / our median; and `source, image, frames, frames_refused, first_refusal, max_range,
-    budget_s, machine`. Cells count as each library defines them: occupied above p = 0.7 and free below 0.3 for
-    stereovox, above and below 0.5 for OctoMap.
+    occupied, free, map_bytes, cpu_share` (processors kept busy while timed; a single thread that got clearly less than
+    one had to wait for other programs); `variants`: rows like these of further ways to run stereovox;
+    `ratio[str(voxel_size)][peer]` = peer's median / our median; and `source, image, frames, frames_refused,
+    first_refusal, max_range, budget_s, machine`. Cells count as each library defines them: occupied above p = 0.7 and
+    free below 0.3 for stereovox, above and below 0.5 for the others.
     Raises ConfigError for an unknown peer or bad setting, MissingExtra for a peer that is not installed,
     StereovoxError when no frame can be used: one line each.
     """
@@ -184,25 +207,23 @@ class _Flights:
     def __init__(self, way: Variant, config: Config, frames: list[Frame], tell: Progress):
         self._way, self._config, self._frames, self._tell = way, config, frames, tell
         self._reports: list[UpdateReport] = []
-        self._add_ms: list[float] = []
+        self._watch = _Watch()
         self._map: dict[str, Any] = {}
 
     @property
     def seconds(self) -> float:
         """How long the timed frames took."""
-        return sum(self._add_ms) / 1e3
+        return sum(self._watch.times_ms) / 1e3
 
     def fly(self, text: str, timed: bool = False) -> None:
         """Add all frames to a new map, and remember the times if they are `timed`."""
         mapper, threads = Mapper(self._config), self._way.threads
         where = f"{self._way.library}{f', {threads} threads,' * (threads > 1)} at {self._config.voxel_size:g} m"
         for i, frame in enumerate(self._frames):
-            start = perf_counter()
-            report = mapper.add(frame)
-            took = 1e3 * (perf_counter() - start)
             if timed:
-                self._reports.append(report)
-                self._add_ms.append(took)
+                self._reports.append(self._watch.call(lambda frame=frame: mapper.add(frame)))
+            else:
+                mapper.add(frame)
             self._tell(i + 1, len(self._frames), f"{where}, {text}")
         counts = mapper.map.counts()
         self._map = {"occupied": counts["occupied"], "free": counts["free"], "map_bytes": mapper.map.memory_bytes}
@@ -215,7 +236,8 @@ class _Flights:
             "passes": len(self._reports) // len(self._frames),
             "integrator": self._way.integrator,
             "depth_ms_median": median([report.depth_ms for report in self._reports]),
-            "add_ms_median": median(self._add_ms),
+            "add_ms_median": median(self._watch.times_ms),
+            "cpu_share": self._watch.share,
         }
         return row | self._map | more
 
@@ -224,17 +246,15 @@ def _time_peer(
     name: str, kind: PeerClass, frames: list[Frame], config: Config, limits: _Limits, tell: Progress
 ) -> dict[str, Any]:
     _insertion(kind(config.voxel_size), frames[0], config)()
-    peer, times_ms = kind(config.voxel_size), []
-    for frame in frames:
-        insert = _insertion(peer, frame, config)
-        start = perf_counter()
-        insert()
-        times_ms.append(1e3 * (perf_counter() - start))
-        tell(len(times_ms), len(frames), f"{name} at {config.voxel_size:g} m")
-        if limits.reached(times_ms):
+    peer, watch = kind(config.voxel_size), _Watch()
+    for done, frame in enumerate(frames, start=1):
+        watch.call(_insertion(peer, frame, config))
+        tell(done, len(frames), f"{name} at {config.voxel_size:g} m")
+        if limits.reached(watch.times_ms):
             break
     occupied, free = peer.counts()
-    return _row(name, config, 1, times_ms) | {"occupied": occupied, "free": free, "map_bytes": peer.bytes()}
+    more = {"occupied": occupied, "free": free, "map_bytes": peer.bytes(), "cpu_share": watch.share}
+    return _row(name, config, 1, watch.times_ms) | more
 
 
 def _insertion(peer: Peer | ImagePeer, frame: Frame, config: Config) -> Callable[[], None]:

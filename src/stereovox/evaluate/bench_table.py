@@ -10,6 +10,8 @@ from typing import Any
 from stereovox.evaluate.bench_machine import machine_line
 
 LIBRARY = "stereovox"
+QUIET = 0.9
+"""Share of a processor that a thread gets at least on a quiet machine."""
 
 
 @dataclass(frozen=True)
@@ -110,10 +112,21 @@ def _notes(result: dict[str, Any]) -> list[str]:
             done = f"{row['frames']} of {result['frames']} frames"
             which = f"{row['library']} at {row['voxel_size']:g} m"
             notes.append(f"{which} stopped at its time limit after {done}: do not compare its cells and MB.")
+    notes += _busy(result["rows"])
     notes += [f"without {line}" for line in result.get("not_installed", ())]
     if "machine" in result:
         notes.append(f"On {machine_line(result['machine'])}.")
     return notes
+
+
+def _busy(rows: Sequence[dict[str, Any]]) -> list[str]:
+    """Return a line about other programs that were in the way, if they were."""
+    alone = [row for row in rows if row["threads"] == 1 and "cpu_share" in row]
+    least = min(alone, key=lambda row: row["cpu_share"], default=None)
+    if least is None or least["cpu_share"] >= QUIET:
+        return []
+    which = f"{least['library']} at {least['voxel_size']:g} m"
+    return [f"Other programs were in the way: {which} got {least['cpu_share']:.0%} of a processor. Measure again."]
 
 
 def _span(values: Sequence[float]) -> str:

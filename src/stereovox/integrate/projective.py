@@ -49,8 +49,8 @@ class Projective:
     def _of_pinhole(self, image: DepthImage, camera: PinholeCamera) -> Evidence:
         eye, depth_m = self._eye_of(camera), image.depth_m
         view = eye.views.at(image.T_world_sensor)
-        (windows, n_free, n_mixed), _ = together(
-            self._config.threads, lambda: eye.candidates(depth_m, view), lambda: eye.hits.find(depth_m, view)
+        _, (windows, n_free, n_mixed) = together(
+            self._config.threads, lambda: eye.hits.find(depth_m, view), lambda: eye.candidates(depth_m, view)
         )
         free, mixed, hit_of = eye.with_hits(n_free, n_mixed)
         values = np.empty((len(mixed), CELLS), np.int16)

@@ -156,11 +156,21 @@ class Views:
         self.block = np.zeros(3, np.int32)
         columns, rows = camera_rays(camera)
         self._view = View(
-            *(np.zeros((3, 3), np.float32) for _ in range(2)), np.zeros(3, np.float32), np.zeros((4, 5), np.float32),
-            columns, rows, intrinsics.astype(np.float32), np.int32(camera.width), np.int32(camera.height),
-            np.float32(size), np.float32(config.max_range), np.float32(WINDOW_SHARE * fx * size),
-            rim.astype(np.float32), np.zeros((3, SIDE**3), np.float32),
-        )  # fmt: skip
+            rotation=np.zeros((3, 3), np.float32),
+            forward=np.zeros((3, 3), np.float32),
+            position=np.zeros(3, np.float32),
+            sides=np.zeros((4, 5), np.float32),
+            columns=columns,
+            rows=rows,
+            intrinsics=intrinsics.astype(np.float32),
+            width=np.int32(camera.width),
+            height=np.int32(camera.height),
+            voxel_size=np.float32(size),
+            max_range=np.float32(config.max_range),
+            spread=np.float32(WINDOW_SHARE * fx * size),
+            rim=rim.astype(np.float32),
+            steps=np.zeros((3, SIDE**3), np.float32),
+        )
 
     def at(self, T_world_camera: Transform) -> View:
         """Return the view from this pose; `block` is then the block (3,) the camera stands in."""

@@ -28,6 +28,9 @@ from stereovox.shards import in_shards, shards, together
 
 ROOM = 4096
 """Blocks that a camera's lists have room for at first."""
+WORTH_A_THREAD = 128
+"""Blocks whose evaluation takes as long as it takes to wake a thread, and longer."""
+PIXELS_WORTH_A_THREAD = 100_000
 MOST_CAMERAS = 16
 """Cameras whose tables and memory are kept; where more come, all are forgotten."""
 
@@ -49,12 +52,15 @@ class Projective:
     def _of_pinhole(self, image: DepthImage, camera: PinholeCamera) -> Evidence:
         eye, depth_m = self._eye_of(camera), image.depth_m
         view = eye.views.at(image.T_world_sensor)
+        threads = self._config.threads
         _, (windows, n_free, n_mixed) = together(
-            self._config.threads, lambda: eye.hits.find(depth_m, view), lambda: eye.candidates(depth_m, view)
+            threads if depth_m.size >= PIXELS_WORTH_A_THREAD else 1,
+            lambda: eye.hits.find(depth_m, view),
+            lambda: eye.candidates(depth_m, view),
         )
         free, mixed, hit_of = eye.with_hits(n_free, n_mixed)
         values = np.empty((len(mixed), CELLS), np.int16)
-        hits, threads = eye.hits.blocks.values, self._config.threads
+        hits = eye.hits.blocks.values
 
         def one_shard(part: slice) -> None:
             scratch = np.empty((2, _evaluate.LAYER), np.float32)
@@ -62,7 +68,7 @@ class Projective:
                 depth_m, view, eye.table, windows, mixed[part], hit_of[part], hits, values[part], *scratch
             )  # fmt: skip
 
-        in_shards(one_shard, shards(len(mixed), threads))
+        in_shards(one_shard, shards(len(mixed), min(threads, len(mixed) // WORTH_A_THREAD or 1)))
         origin = eye.views.block
         return Evidence(mixed + origin, values, free + origin, int(eye.table.free))
 

@@ -36,10 +36,11 @@ def denoise(depth_m: NDArray[np.float32], camera: VirtualCamera, config: Config)
     they have in common stays in the mean. Two surfaces within some sigma of each other are blended over 3 pixels;
     sigma of a D435 is 3.5 cm at 3 m.
     """
-    noise = RangeNoise.of(config.noise, camera)
-    fine = FINE * config.voxel_size
-    if config.depth.denoise and noise.sigma(config.max_range) > WORTH * config.voxel_size:
-        _run(depth_m, noise, fine, config)
+    if not config.depth.denoise:
+        return
+    noise, farthest = RangeNoise.of(config.noise, camera), config.max_range
+    if noise.s0 + (noise.s1 + noise.s2 * farthest) * farthest > WORTH * config.voxel_size:
+        _run(depth_m, noise, FINE * config.voxel_size, config)
 
 
 def _run(depth_m: NDArray[np.float32], noise: RangeNoise, fine: float, config: Config) -> None:

@@ -25,10 +25,10 @@ import json
 import numpy as np
 from stereovox import VoxelMap, load_config
 from stereovox._jit import cache_folder
-from stereovox.maps import _cpu, _pool
+from stereovox.maps import _pool, _query
 
 voxel_map = VoxelMap.from_cells(load_config(voxel_size=1.0), [[0, 0, 0], [9, -9, 3]], [2.0, -1.0])
-stats = [kernel.stats for kernel in (_pool.put, _cpu.look_up)]
+stats = [kernel.stats for kernel in (_pool.put, _query.look_up)]
 print(json.dumps({
     "folder": str(cache_folder()),
     "log_odds": voxel_map.log_odds([[0.5, 0.5, 0.5], [9.5, -8.5, 3.5], [5, 5, 5]]).tolist(),

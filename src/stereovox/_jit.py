@@ -71,8 +71,17 @@ def allocating_kernel(function: Function) -> Function:
 
 
 def cell(function: Function) -> Function:
-    """Compile a small function that becomes part of every kernel that calls it; it makes no arrays."""
+    """Compile a small function that becomes part of every kernel that calls it.
+
+    It makes and returns no arrays: so none of those it is given is counted as in use, which inside a loop costs more
+    than the look into a hash.
+    """
     return _compile(function, forceinline=True, _nrt=False)
+
+
+def exact_cell(function: Function) -> Function:
+    """Compile a small function as `cell` does, but round each operation as NumPy does."""
+    return _compile(function, forceinline=True, _nrt=False, fastmath=False)
 
 
 @lru_cache
@@ -86,14 +95,14 @@ def cache_folder() -> Path | None:
     return None
 
 
-def _compile(function: Function, **options: Any) -> Function:
+def _compile(function: Function, fastmath: set[str] | bool = FAST_MATH, **options: Any) -> Function:
     folder = cache_folder()
     settings: Any = numba_config
     before = settings.CACHE_DIR
     settings.CACHE_DIR = str(folder or "")
     try:
         return numba.njit(
-            function, cache=folder is not None, error_model="numpy", fastmath=FAST_MATH, nogil=True,
+            function, cache=folder is not None, error_model="numpy", fastmath=fastmath, nogil=True,
             pipeline_class=_KernelCompiler, **options,
         )  # fmt: skip
     finally:

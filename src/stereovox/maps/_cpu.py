@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernels over blocks: rebuild the hash, enter blocks, look cells up."""
+"""Kernels over blocks: rebuild the hash, enter blocks."""
 
 from stereovox._jit import kernel
-from stereovox.maps._cells import EMPTY, find_or_insert, home_slot, number_in, row_of
+from stereovox.maps._cells import EMPTY, find_or_insert, home_slot
 
 
 @kernel
@@ -22,11 +22,3 @@ def insert_all(table, coords, count, wanted, indices):
     """Find or make every block of `wanted` (n, 3); write pool indices to `indices` (n,)."""
     for i in range(wanted.shape[0]):
         indices[i] = find_or_insert(table, coords, count, wanted[i, 0], wanted[i, 1], wanted[i, 2])
-
-
-@kernel
-def look_up(stored, indices, out):
-    """Write the stored number of each cell of `indices` (n, 3) int64 to `out` (n,)."""
-    for i in range(indices.shape[0]):
-        x, y, z = indices[i, 0], indices[i, 1], indices[i, 2]
-        out[i] = number_in(stored, row_of(stored, x >> 3, y >> 3, z >> 3), x, y, z)

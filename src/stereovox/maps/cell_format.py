@@ -6,7 +6,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property
-from math import log, sqrt
+from math import ceil, floor, log, sqrt
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -57,6 +58,13 @@ class CellFormat:
         return (0.5 + frame * self.drift) % 1.0
 
 
+class Thresholds(NamedTuple):
+    """The stored numbers, other than "unknown", that tell the states apart, as kernels read them."""
+
+    free_most: np.int32  # free up to it
+    occupied_least: np.int32  # occupied from it on
+
+
 @dataclass(frozen=True)
 class CellRules:
     """The `map` section of the settings in stored numbers.
@@ -97,12 +105,18 @@ class CellRules:
         """Stored numbers above it are occupied."""
         return self._exact(self.config.occupied_above)
 
+    @cached_property
+    def thresholds(self) -> Thresholds:
+        """The same in whole numbers."""
+        return Thresholds(np.int32(ceil(self.free_below) - 1), np.int32(floor(self.occupied_above) + 1))
+
     def states(self, stored: NDArray[np.integer]) -> NDArray[np.uint8]:
         """Return the `State` of stored numbers, uint8 of the same shape."""
+        free_most, occupied_least = map(int, self.thresholds)
         states = np.full(stored.shape, State.TENTATIVE, np.uint8)
-        states[stored < self.free_below] = State.FREE
-        states[stored > self.occupied_above] = State.OCCUPIED
-        states[stored == self.format.unknown] = State.UNKNOWN
+        states += stored >= occupied_least
+        states -= stored <= free_most
+        states *= stored != self.format.unknown  # State.UNKNOWN is 0
         return states
 
     def _exact(self, p: float) -> float:

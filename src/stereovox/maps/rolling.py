@@ -14,7 +14,7 @@ from stereovox.config import Config
 from stereovox.errors import ConfigError
 from stereovox.frame import Viewpoint
 from stereovox.maps import _window
-from stereovox.maps.blocks import CELLS, SIDE
+from stereovox.maps.blocks import CELLS, SIDE, StoredCells
 from stereovox.maps.cell_pool import CellPool
 from stereovox.maps.evidence import Evidence
 from stereovox.maps.tiles import BLOCKS, TILE, Tile, TileStore, blocks_of, slabs_of
@@ -62,6 +62,11 @@ class RollingMap(VoxelMap):
     def store(self) -> TileStore | None:
         """Where cells outside the window are kept, if they are."""
         return self._store
+
+    @property
+    def stored_cells(self) -> StoredCells:
+        """What kernels that only read need: the window, or the map made before until it is placed."""
+        return super().stored_cells if self._earlier is None else self._earlier.stored_cells
 
     def go_on_with(self, earlier: VoxelMap) -> None:
         """Start from the cells of a map made before; they enter when the window is placed, and are the map till then.

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from math import floor
 from pathlib import Path
 from typing import Any
@@ -14,15 +14,14 @@ from numpy.typing import ArrayLike, NDArray
 from stereovox.config import Config
 from stereovox.errors import ConfigError
 from stereovox.frame import Viewpoint
-from stereovox.maps import _add, _cpu
+from stereovox.maps import _add, queries
 from stereovox.maps.blocks import CELLS, SIDE, StoredCells
 from stereovox.maps.cell_format import CellFormat, CellRules
 from stereovox.maps.cell_format import State as State
 from stereovox.maps.cell_pool import CellPool
 from stereovox.maps.evidence import LOG_ODDS_SCALE, Evidence
-
-INDEX_LIMIT = 2**30
-"""Cell indices lie in [-INDEX_LIMIT, INDEX_LIMIT); beyond it everything is unknown."""
+from stereovox.maps.queries import INDEX_LIMIT as INDEX_LIMIT
+from stereovox.maps.queries import Asked, NearestCells, RayHits
 
 
 class VoxelMap:
@@ -121,6 +120,47 @@ class VoxelMap:
         """Return the `State` (N,) uint8 at points (N, 3) in metres, world frame."""
         return self._rules.states(self._stored_at(points))
 
+    def cast_rays(
+        self,
+        origins: ArrayLike,
+        directions: ArrayLike,
+        max_distance: float,
+        stop_at: Iterable[State] = (State.OCCUPIED,),
+    ) -> RayHits:
+        """Return where rays stop: at the first cell in one of the states `stop_at` (not FREE), entered by then.
+
+        origins: (N, 3), or (3,) for all rays; directions: (N, 3) of any length but zero; metres, world frame. A ray
+        begins in the cell that holds its origin and looks at every cell it crosses; one that it touches in an edge
+        only may count or not. max_distance: metres, may be infinite. Raises StereovoxError for bad input.
+        """
+        return queries.cast_rays(self._asked, origins, directions, max_distance, stop_at)
+
+    def check_boxes(self, low: ArrayLike, high: ArrayLike) -> NDArray[np.uint8]:
+        """Return the worst `State` (N,) uint8 in each box; worst is OCCUPIED, then TENTATIVE, UNKNOWN, FREE.
+
+        low, high: (N, 3) corners in metres, world frame. A cell counts that holds a point of the box, faces included:
+        what `state` would say of all points from low to high. Raises StereovoxError for bad input.
+        """
+        return queries.check_boxes(self._asked, low, high)
+
+    def check_capsules(self, start: ArrayLike, end: ArrayLike, radius: ArrayLike) -> NDArray[np.uint8]:
+        """Return the worst `State` (N,) uint8 that each capsule touches; worst is OCCUPIED, then TENTATIVE, UNKNOWN.
+
+        start, end: (N, 3) ends of the axis in metres, world frame, the same for a ball; radius: metres, (N,) or one for
+        all. A cell counts that is no farther from the axis than the radius. Raises StereovoxError for bad input.
+        """
+        return queries.check_capsules(self._asked, start, end, radius)
+
+    def nearest_obstacle(
+        self, points: ArrayLike, max_distance: float, obstacles: Iterable[State] = (State.OCCUPIED,)
+    ) -> NearestCells:
+        """Return how far the nearest cell is that is in one of the states `obstacles` (not FREE), and which it is.
+
+        points: (N, 3) in metres, world frame; max_distance: metres, may be infinite. Raises StereovoxError for bad
+        input.
+        """
+        return queries.nearest(self._asked, points, max_distance, obstacles)
+
     def cells(self) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
         """Return all known cells: indices (N, 3) int32 in ascending order, and their log-odds (N,)."""
         indices, stored = self._where(lambda values: values != self._format.unknown)
@@ -193,16 +233,12 @@ class VoxelMap:
         _add.rescale(evidence.values, np.float32(factor), np.float32(shift), values)
         return values, floor(evidence.uniform_value * factor + shift)
 
+    @property
+    def _asked(self) -> Asked:
+        return Asked(self.stored_cells, self._rules, self.config.cell)
+
     def _stored_at(self, points: ArrayLike) -> NDArray[np.integer]:
-        points = np.asarray(points, float).reshape(-1, 3)
-        with np.errstate(invalid="ignore"):
-            indices = np.floor(points / self.config.cell)
-        inside = (np.abs(indices) < INDEX_LIMIT).all(axis=1)
-        stored = np.full(len(points), self._format.unknown, self._format.dtype)
-        found = stored[inside]
-        _cpu.look_up(self.stored_cells, indices[inside].astype(np.int64), found)
-        stored[inside] = found
-        return stored
+        return queries.stored_at(self.stored_cells, self.config.cell, points)
 
     def _centers_of(self, state: State) -> NDArray[np.float64]:
         return self.centers(self._where(lambda values: self._rules.states(values) == state)[0])

@@ -77,6 +77,23 @@ def test_rays_of_wide_cameras_equal_their_references(integrator, camera, model, 
     assert share_that_differs(ours, theirs, tolerance=2) < 0.02
 
 
+@pytest.mark.parametrize("update", ["once", "every"])
+@pytest.mark.parametrize("integrator", ["ray", "line"])
+def test_rays_of_a_row_may_part_along_every_axis(integrator, update):
+    """A camera that looks along an axis: rays of one row go to both sides of it."""
+    config = load_config(voxel_size=0.1, max_range=2.5, integrator=integrator, **{"ray.update": update})
+    image = made_image(6, replace(CAMERA, cx=19.3))
+    pose = np.eye(4)
+    pose[:3, 3] = np.sqrt([2e-3, 3e-3, 5e-3])
+    image = replace(image, T_world_sensor=pose)
+    ours = cells_of(make_integrator(config).evidence(image))
+    reference = {"ray": _reference.cast_rays, "line": _reference.draw_lines}[integrator]
+    theirs = reference_of(reference, image, config)
+    assert len(theirs) > 1000
+    assert share_that_differs(ours, theirs, tolerance=25) < 0.002
+    assert share_that_differs(ours, theirs, tolerance=2) < 0.02
+
+
 @pytest.mark.parametrize("camera", WIDE)
 @pytest.mark.parametrize("integrator", ["ray", "line"])
 def test_wide_cameras_hit_where_their_definition_says(integrator, camera):

@@ -8,7 +8,7 @@ the compiler does for many lanes at once. Then gains are summed in runs: neighbo
 import numpy as np
 
 from stereovox._jit import cell, kernel
-from stereovox.integrate._cells import HALF, NO_RETURN, ONE, ZERO, stronger, table_row, usable
+from stereovox.integrate._cells import HALF, NO_RETURN, ONE, ZERO, bits_of, float_of, stronger, table_row, usable
 from stereovox.integrate._hits import _point_cell
 from stereovox.integrate._keys import bits, pack, unpack
 from stereovox.maps._cells import find_or_insert
@@ -21,6 +21,26 @@ HALF_DIAGONAL = np.float32(0.8661)
 
 
 @cell
+def in_step(columns, ray):
+    """Return how many of the columns' rays go the same way along each axis, and that way: 1 or -1 along x, y and z."""
+    signs = _signs(ray, columns[0])
+    n = columns.size
+    while _signs(ray, columns[n - 1]) != signs:  # directions change evenly from column to column
+        n -= 1
+    return n, signs
+
+
+@cell
+def _signs(ray, column):
+    return _sign(ray[0] * column + ray[1]), _sign(ray[2] * column + ray[3]), _sign(ray[4] * column + ray[5])
+
+
+@cell
+def _sign(direction):
+    return ONE if direction >= ZERO else -ONE
+
+
+@cell
 def aim(depths, columns, ray, position, view, table, lanes):
     """Fill depth, end, row, columns and hit of the lanes for a run of pixels.
 
@@ -29,23 +49,24 @@ def aim(depths, columns, ray, position, view, table, lanes):
     depths, columns: REP 117 depth and x/z of at most LANES pixels of one image row. ray: see `_row_rays`.
     """
     rows = table.hit.size
-    free_to = NO_RETURN
+    nearest = bits_of(NO_RETURN)  # whole numbers: those can be compared many at once
     half_cell = HALF_DIAGONAL * view.voxel_size  # the cell of the measured point is never "plainly free"
-    for i in range(lanes.depth.size):
-        d = usable(depths[i]) if i < depths.size else ZERO
+    for i in range(depths.size):
+        d = usable(depths[i])
         real = d < NO_RETURN
         row = table_row(min(d, view.max_range), table.rows_per_metre, rows)
-        reach = table.reach[row] if table.marks else ZERO
+        reach = table.reach[row]
+        end = (d + (reach if table.marks else ZERO)) if real else view.max_range
         lanes.depth[i] = d
         lanes.row[i] = row
         lanes.columns[i] = table.columns_per_metre[row]
-        lanes.end[i] = -ONE if d <= ZERO else (d + reach if real else view.max_range)
-        lanes.hit[i] = -1
-        if d > ZERO:
-            free_to = min(free_to, d - max(table.reach[row], half_cell) if real else view.max_range)
-            if real:
-                x, y, z = _point_cell(d, columns[i], ray, position)
-                lanes.hit[i] = pack(x, y, z, lanes.hit)
+        lanes.end[i] = end if d > ZERO else -ONE
+        plain = (d - max(reach, half_cell)) if real else view.max_range
+        nearest = min(nearest, bits_of(max(plain, ZERO) if d > ZERO else NO_RETURN))
+        x, y, z = _point_cell(d if real else ZERO, columns[i], ray, position)
+        key = pack(x, y, z, lanes.hit)
+        lanes.hit[i] = key if (d > ZERO) & real else lanes.hit.dtype.type(-1)
+    free_to = float_of(nearest)
     return free_to if free_to >= NO_RETURN else free_to - half_cell
 
 
@@ -63,58 +84,100 @@ def evidence(depth, measured, row, columns, look_up, width, weight):
 
 @cell
 def weighted(e, depth, weight):
-    """Return evidence times min(1, weight depth^2) (Chien 2020, Eq 3.21) in 1/1024; as it is where weight is zero."""
+    """Return evidence times min(1, weight depth^2) (Chien 2020, Eq 3.21) in 1/1024; as it is where weight is None."""
+    if weight is None:
+        return e
     share = min(ONE, weight * depth * depth) * FRACTION
-    return np.int32(np.floor(np.float32(e) * (share if weight > ZERO else ONE) + HALF))
+    return np.int32(np.floor(np.float32(e) * share + HALF))
 
 
 @cell
-def aim_at_hits(lanes, table, weight):
-    """Make the measured points' cells the ones that are given evidence."""
-    for i in range(lanes.depth.size):
-        lanes.key[i] = lanes.hit[i]
-        lanes.gain[i] = weighted(table.hit[lanes.row[i]], lanes.depth[i], weight) if lanes.hit[i] >= 0 else np.int32(0)
+def aim_at_hits(n, lanes, table, weight):
+    """Make the measured points' cells the ones that are given evidence; return what `give` wants to know."""
+    for i in range(n):
+        hit = lanes.hit[i]
+        lanes.key[i] = hit
+        lanes.gain[i] = weighted(table.hit[lanes.row[i]], lanes.depth[i], weight) if hit >= 0 else np.int32(0)
+    return mark_runs(n, lanes)
 
 
 @cell
-def give(lanes, weight, pool_table, coords, count, values):
-    """Give each lane's gain to its cell; return False when the block pool is full.
+def mark_runs(n, lanes):
+    """Mark the last of each run of lanes in one cell; return how many runs there are, and the sum of all gains."""
+    lanes.key[n] = -1
+    runs, total = np.int32(0), np.int32(0)
+    for i in range(n):
+        last = np.int32(lanes.key[i] != lanes.key[i + 1])
+        lanes.last[i] = last
+        runs, total = np.int32(runs + last), np.int32(total + lanes.gain[i])
+    return runs, total
 
-    weight > 0: gains of one cell add up; else the strongest counts.
+
+@cell
+def give(n, lanes, runs, total, plain, weight, memory, pool_table, coords, count, values):
+    """Give the gains of the first `n` lanes to their cells; return False when the block pool is full.
+
+    weight: gains of one cell add up; None: the strongest counts. runs, total: see `mark_runs`. plain: the only evidence
+    any lane may have, 0 for unlike ones.
     """
-    if weight > ZERO:  # two loops: a choice within the loop would take as long as the rest
-        return _give(lanes, True, pool_table, coords, count, values)
-    return _give(lanes, False, pool_table, coords, count, values)
-
-
-@cell
-def _give(lanes, adds, pool_table, coords, count, values):
     b = np.int64(bits(lanes.key))
-    run, total, room = lanes.key[0], np.int32(0), True
-    for i in range(lanes.key.size):
-        if lanes.key[i] != run:
-            room &= _enter(run, b, total, adds, pool_table, coords, count, values)  # leaving here would be slower
-            run, total = lanes.key[i], np.int32(0)
-        total = _joined(total, lanes.gain[i], adds)
-    return room & _enter(run, b, total, adds, pool_table, coords, count, values)
+    if weight is None:
+        if (plain == 0) | (total != np.int32(n * plain)):
+            runs = _mark_unlike(n, lanes)
+        total = lanes.gain[0]
+    if runs <= 1:
+        return _enter(lanes.key[0], b, total, weight, memory, pool_table, coords, count, values)
+    room, before = True, np.int32(0)
+    for r in range(_gather(n, lanes, weight)):
+        said = lanes.run_gain[r]
+        gain = np.int32(said - before)
+        room &= _enter(lanes.run_key[r], b, gain, weight, memory, pool_table, coords, count, values)
+        if weight is not None:
+            before = said
+    return room
 
 
 @cell
-def _joined(total, gain, adds):
-    return np.int32(total + gain) if adds else stronger(total, gain)
+def _mark_unlike(n, lanes):
+    """Mark the last of each run of lanes in one cell that say the same; return how many runs there are."""
+    lanes.key[n] = -1
+    runs = np.int32(0)
+    for i in range(n):
+        last = np.int32((lanes.key[i] != lanes.key[i + 1]) | (lanes.gain[i] != lanes.gain[i + 1]))
+        lanes.last[i] = last
+        runs = np.int32(runs + last)
+    return runs
 
 
 @cell
-def _enter(key, b, gain, adds, pool_table, coords, count, values):
+def _gather(n, lanes, weight):
+    """List what runs of lanes say; return how many there are. Sums run on from one to the next. Free of branches."""
+    runs, said = np.uint64(0), np.int32(0)  # unsigned: no check for indices that count from the end
+    for i in range(n):
+        said = lanes.gain[i] if weight is None else np.int32(said + lanes.gain[i])
+        lanes.run_key[runs] = lanes.key[i]
+        lanes.run_gain[runs] = said
+        runs += np.uint64(lanes.last[i])
+    return np.int64(runs)
+
+
+@cell
+def _enter(key, b, gain, weight, memory, pool_table, coords, count, values):
     """Give evidence to the cell with this key of `b` bits an axis; return False when the block pool is full."""
     if gain == 0:
         return True
     x, y, z = unpack(key, b)
-    place = find_or_insert(pool_table, coords, count, x >> 3, y >> 3, z >> 3)
+    block = np.int64(key) & ~np.int64((7 << (b + b)) | (7 << b) | 7)
+    slot = ((x & 56) << 3) | (y & 56) | ((z & 56) >> 3)
+    if memory.block[slot] != block:
+        memory.place[slot] = find_or_insert(pool_table, coords, count, x >> 3, y >> 3, z >> 3)
+        memory.block[slot] = block
+    place = memory.place[slot]
     if place < 0:
         return False
     c = ((x & 7) << 6) | ((y & 7) << 3) | (z & 7)
-    values[place, c] = _joined(values[place, c], gain, adds)
+    old = values[place, c]
+    values[place, c] = stronger(old, gain) if weight is None else np.int32(old + gain)
     return True
 
 

@@ -10,6 +10,8 @@ from numpy.typing import NDArray
 
 LANES = 32
 """Neighbouring pixels of a row that are walked in step."""
+MEMORY_BITS = 9
+"""The places of so many blocks (as a power of two: 8 along each axis) are remembered beside the pool's hash."""
 
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int32]
@@ -24,23 +26,36 @@ class Lanes(NamedTuple):
     entered: Floats  # depth at which the ray entered its present cell (or the depth of the sample)
     row: Ints  # row of the sensor table
     columns: Floats  # table columns a metre
-    x: Floats  # present cell: whole numbers, as floats because they meet floats only
+    x: Floats  # the face at which the ray leaves its cell along x: whole numbers, as floats because they meet floats
     y: Floats
     z: Floats
-    step_x: Floats  # -1 or 1
-    step_y: Floats
-    step_z: Floats
     per_x: Floats  # depth one cell takes along each axis; for line drawing, cells one metre of depth takes
     per_y: Floats
     per_z: Floats
     hit: Keys  # key of the cell that holds the measured point, -1 without one
+    cell: Keys  # key of the cell the ray goes into next
     key: Keys  # key of the cell that is given evidence in this step
     gain: Ints  # and the evidence
+    last: Ints  # whether the next lane says something else
+    run_key: Keys  # what neighbouring lanes say together, run by run
+    run_gain: Ints
+
+
+class Memory(NamedTuple):
+    """Blocks found lately, so that most need no search in the hash: (2^MEMORY_BITS,) each."""
+
+    block: NDArray[np.int64]  # key of its first cell, -1 for none
+    place: NDArray[np.int64]  # its place in the pool
 
 
 def make_lanes(wide: bool) -> Lanes:
     """Return scratch with keys of 64 bits (`wide`) or 32 bits, which serve cells within 2^9 of the camera."""
     types = {"Floats": np.float32, "Ints": np.int32, "Keys": np.int64 if wide else np.int32}
     kinds = {name: getattr(kind, "__forward_arg__", kind) for name, kind in Lanes.__annotations__.items()}
-    arrays: dict[str, Any] = {name: np.zeros(LANES, types[kind]) for name, kind in kinds.items()}
+    arrays: dict[str, Any] = {name: np.full(LANES + 1, -2, types[kind]) for name, kind in kinds.items()}
     return Lanes(**arrays)
+
+
+def make_memory() -> Memory:
+    """Return an empty memory of blocks."""
+    return Memory(*(np.full(1 << MEMORY_BITS, -1, np.int64) for _ in range(2)))

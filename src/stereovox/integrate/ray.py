@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from stereovox.config import Config
 from stereovox.frame import DepthImage
 from stereovox.integrate import _keys, _lanes, _line, _ray
-from stereovox.integrate.lanes import make_lanes
+from stereovox.integrate.lanes import make_lanes, make_memory
 from stereovox.integrate.views import KernelTable, Rays, farthest_cells, origin_block, rays_of, sensor_table
 from stereovox.maps.blocks import CELLS, BlockPool
 from stereovox.maps.evidence import Evidence
@@ -43,13 +43,13 @@ class Ray:
         self._prepare(camera)
         view = rays_of(image, config)
         cell_px = camera.focal_px / camera.binning * config.voxel_size  # at a depth of one metre
-        weight = np.float32(cell_px**-2 if config.ray.update == "every" else 0)
+        weight = np.float32(cell_px**-2) if config.ray.update == "every" else None
         parts = shards(camera.height, config.threads)
         number = {part.start: n for n, part in enumerate(parts)}
         in_shards(lambda part: self._follow(image.depth_m, view, weight, number[part.start], part), parts)
-        pool = self._merged(self._pools[: len(parts)], bool(weight > 0))
+        pool = self._merged(self._pools[: len(parts)], weight is not None)
         values = np.empty((len(pool), CELLS), np.int16)
-        _lanes.to_thousandths(pool.values[: len(pool)], _lanes.FRACTION_BITS if weight > 0 else 0, values)
+        _lanes.to_thousandths(pool.values[: len(pool)], 0 if weight is None else _lanes.FRACTION_BITS, values)
         origin = origin_block(image.T_world_sensor, config).astype(np.int32)
         return Evidence(pool.coords[: len(pool)] + origin, values, np.empty((0, 3), np.int32), 0)
 
@@ -62,13 +62,16 @@ class Ray:
         cells = farthest_cells(camera, reach, self._config)
         wide = bool(cells >= 1 << (_keys.NARROW - 1))
         self._lanes = [make_lanes(wide) for _ in self._pools]
+        self._memory = [make_memory() for _ in self._pools]
         self._camera = camera
 
-    def _follow(self, depth_m: NDArray[np.float32], view: Rays, weight: np.float32, worker: int, part: slice) -> None:
+    def _follow(
+        self, depth_m: NDArray[np.float32], view: Rays, weight: np.float32 | None, worker: int, part: slice
+    ) -> None:
         pool, lanes = self._pools[worker], self._lanes[worker]
         pool.clear()
         while not self._kernel(
-            depth_m, view, self._table, self._look_up, weight, lanes,
+            depth_m, view, self._table, self._look_up, weight, lanes, self._memory[worker],
             pool.table, pool.coords, pool.count, pool.values, part.start, part.stop,
         ):  # fmt: skip
             pool.clear()

@@ -3,7 +3,7 @@
 
 import numpy as np
 
-from stereovox._jit import cell, exact_cell, kernel
+from stereovox._jit import allocating_kernel, cell, exact_cell
 from stereovox.maps._cells import EMPTY, NO_ROW, number_in, row_of
 from stereovox.maps.cell_format import State
 
@@ -15,7 +15,7 @@ UNKNOWN_BIT = np.uint8(1 << State.UNKNOWN)
 BIT, ONE, NO_BITS = np.uint8(1), np.int32(1), np.uint64(0)
 
 
-@kernel
+@allocating_kernel
 def look_up(stored, side, limit, points, out):
     """Write the stored number of the cell at each of `points` (n, 3) to `out` (n,).
 

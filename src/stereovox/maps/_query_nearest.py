@@ -3,14 +3,14 @@
 
 import numpy as np
 
-from stereovox._jit import cell, kernel
+from stereovox._jit import allocating_kernel, cell
 from stereovox.maps._cells import EMPTY
 from stereovox.maps._query import LATELY, NOWHERE, UNKNOWN_BIT, level_of, row_again
 
 ZERO, ONE, BYTE = np.uint64(0), np.uint64(1), np.uint64(255)
 
 
-@kernel
+@allocating_kernel
 def nearest(stored, rules, wanted, side, points, farthest, distance, cells):
     """Write the distance from each of `points` (n, 3) to the nearest wanted cell, and which it is (n, 3).
 

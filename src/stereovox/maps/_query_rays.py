@@ -7,7 +7,7 @@ A ray's place is counted in cells: start + t * slope, t in metres; it meets a fa
 
 import numpy as np
 
-from stereovox._jit import cell, kernel
+from stereovox._jit import allocating_kernel, cell
 from stereovox.maps._cells import number_in
 from stereovox.maps._query import LATELY, NOWHERE, UNKNOWN_BIT, cells_from_zero, extent, level_of, row_again, state_of
 
@@ -15,7 +15,7 @@ LEVEL = 1e-300
 """A slope up to it is none."""
 
 
-@kernel
+@allocating_kernel
 def cast(stored, rules, wanted, side, origins, directions, farthest, distance, cells, states):
     """Write how far each ray goes, the cell (n, 3) it stops in and this cell's state; leave what meets nothing.
 

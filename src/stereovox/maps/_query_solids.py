@@ -7,7 +7,7 @@ for than the hash has slots, one that is not there was among them, and only bloc
 
 import numpy as np
 
-from stereovox._jit import cell, kernel
+from stereovox._jit import allocating_kernel, cell
 from stereovox.maps._cells import EMPTY
 from stereovox.maps._query import LATELY, NOWHERE, cells_from_zero, level_of, row_again
 
@@ -17,7 +17,7 @@ SLACK = 1e-9
 ZERO, ONE, EVERY_ROW = np.uint64(0), np.uint64(1), np.uint64(0x0101010101010101)
 
 
-@kernel
+@allocating_kernel
 def boxes(stored, rules, wanted, side, limit, low, high, out):
     """Write the level of the worst cell of each box to `out` (n,), -1 where all is free.
 
@@ -35,7 +35,7 @@ def boxes(stored, rules, wanted, side, limit, low, high, out):
         out[i] = _worst_in_box(stored, rules, wanted, box, worst, lately, marks, levels)
 
 
-@kernel
+@allocating_kernel
 def capsules(stored, rules, wanted, side, limit, begin, end, radius, out):
     """Write the level of the worst cell that each capsule touches to `out` (n,), -1 where all is free.
 

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stereovox.config import load_config
-from stereovox.maps import VoxelMap, _cpu, cell_pool, load_map
+from stereovox.maps import VoxelMap, cell_pool, load_map
 from stereovox.maps.cell_format import CellRules
 from stereovox.maps.cell_pool import CellPool
 from stereovox.maps.evidence import Evidence
@@ -60,8 +60,7 @@ def assert_same(pool, slow, rules):
     assert [tuple(block) for block in there.tolist()] == [b for b in map(tuple, around.tolist()) if b in slow.blocks]
     assert found.tolist() == [slow.blocks[tuple(block)].tolist() for block in there.tolist()]
     asked = np.random.default_rng(0).integers(-24, 24, (500, 3))
-    stored = np.empty(500, rules.format.dtype)
-    _cpu.look_up(pool.stored_cells, asked, stored)
+    stored = stored_at(pool.stored_cells, (1.0, 1.0, 1.0), asked + 0.5)
     empty = np.full(512, slow.unknown)
     low = asked & 7
     assert stored.tolist() == [

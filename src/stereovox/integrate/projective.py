@@ -19,6 +19,7 @@ from stereovox.integrate._cells import NEAR_PLANE, NO_RETURN
 from stereovox.integrate.faces import faces_of
 from stereovox.integrate.hits import HitFinder
 from stereovox.integrate.merging import strongest
+from stereovox.integrate.per_camera import PerCamera
 from stereovox.integrate.views import KernelTable, View, Views, sensor_table
 from stereovox.integrate.windows import WindowBuilder, Windows
 from stereovox.maps.blocks import CELLS
@@ -31,8 +32,6 @@ ROOM = 4096
 WORTH_A_THREAD = 128
 """Blocks whose evaluation takes as long as it takes to wake a thread, and longer."""
 PIXELS_WORTH_A_THREAD = 100_000
-MOST_CAMERAS = 16
-"""Cameras whose tables and memory are kept; where more come, all are forgotten."""
 
 
 class Projective:
@@ -41,7 +40,7 @@ class Projective:
     def __init__(self, config: Config):
         self._config = config
         self._sensor = make_sensor(config.sensor)
-        self._eyes: dict[PinholeCamera, _Eye] = {}
+        self._eyes = PerCamera(self._eye)
 
     def evidence(self, image: DepthImage) -> Evidence:
         """Return what `image` says about the cells it sees; that of a wide camera is cut into pinhole images."""
@@ -50,7 +49,7 @@ class Projective:
         return strongest([self._of_pinhole(face, face.camera) for face in faces_of(image)])  # pyright: ignore
 
     def _of_pinhole(self, image: DepthImage, camera: PinholeCamera) -> Evidence:
-        eye, depth_m = self._eye_of(camera), image.depth_m
+        eye, depth_m = self._eyes[camera], image.depth_m
         view = eye.views.at(image.T_world_sensor)
         threads = self._config.threads
         _, (windows, n_free, n_mixed) = together(
@@ -72,13 +71,8 @@ class Projective:
         origin = eye.views.block
         return Evidence(mixed + origin, values, free + origin, int(eye.table.free))
 
-    def _eye_of(self, camera: PinholeCamera) -> _Eye:
-        eye = self._eyes.get(camera)
-        if eye is None:
-            if len(self._eyes) >= MOST_CAMERAS:
-                self._eyes.clear()
-            eye = self._eyes[camera] = _Eye(camera, sensor_table(self._sensor, self._config, camera), self._config)
-        return eye
+    def _eye(self, camera: PinholeCamera) -> _Eye:
+        return _Eye(camera, sensor_table(self._sensor, self._config, camera), self._config)
 
 
 class _Eye:

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,13 +12,22 @@ from numpy.typing import NDArray
 from stereovox.config import Config
 from stereovox.frame import DepthImage
 from stereovox.integrate import _keys, _lanes, _line, _ray
-from stereovox.integrate.lanes import make_lanes, make_memory
+from stereovox.integrate.lanes import Lanes, Memory, make_lanes, make_memory
+from stereovox.integrate.per_camera import PerCamera
 from stereovox.integrate.views import KernelTable, Rays, farthest_cells, origin_block, rays_of, sensor_table
 from stereovox.maps.blocks import CELLS, BlockPool
 from stereovox.maps.evidence import Evidence
 from stereovox.rigs import VirtualCamera
 from stereovox.sensors import make_sensor
 from stereovox.shards import in_shards, shards
+
+
+class _Eye(NamedTuple):
+    """What one camera needs: its sensor table, that table with both signs together, and scratch for each thread."""
+
+    table: KernelTable
+    look_up: NDArray[np.int32]
+    scratch: list[tuple[Lanes, Memory]]
 
 
 class Ray:
@@ -35,43 +44,37 @@ class Ray:
         self._config = config
         self._sensor = make_sensor(config.sensor)
         self._pools = [BlockPool(np.int32, capacity=8192) for _ in range(config.threads)]
-        self._camera: VirtualCamera | None = None
+        self._eyes = PerCamera(self._eye)
 
     def evidence(self, image: DepthImage) -> Evidence:
         """Return what `image` says about the cells its rays cross."""
         config, camera = self._config, image.camera
-        self._prepare(camera)
-        view = rays_of(image, config)
+        eye, view = self._eyes[camera], rays_of(image, config)
         cell_px = camera.focal_px / camera.binning * config.voxel_size  # at a depth of one metre
         weight = np.float32(cell_px**-2) if config.ray.update == "every" else None
         parts = shards(camera.height, config.threads)
         number = {part.start: n for n, part in enumerate(parts)}
-        in_shards(lambda part: self._follow(image.depth_m, view, weight, number[part.start], part), parts)
+        in_shards(lambda part: self._follow(image.depth_m, view, weight, eye, number[part.start], part), parts)
         pool = self._merged(self._pools[: len(parts)], weight is not None)
         values = np.empty((len(pool), CELLS), np.int16)
         _lanes.to_thousandths(pool.values[: len(pool)], 0 if weight is None else _lanes.FRACTION_BITS, values)
         origin = origin_block(image.T_world_sensor, config).astype(np.int32)
         return Evidence(pool.coords[: len(pool)] + origin, values, np.empty((0, 3), np.int32), 0)
 
-    def _prepare(self, camera: VirtualCamera) -> None:
-        if camera == self._camera:
-            return
-        self._table: KernelTable = sensor_table(self._sensor, self._config, camera)
-        self._look_up = (self._table.clear + self._table.mark).ravel()
-        reach = self._config.max_range + float(self._table.reach[-1])
-        cells = farthest_cells(camera, reach, self._config)
-        wide = bool(cells >= 1 << (_keys.NARROW - 1))
-        self._lanes = [make_lanes(wide) for _ in self._pools]
-        self._memory = [make_memory() for _ in self._pools]
-        self._camera = camera
+    def _eye(self, camera: VirtualCamera) -> _Eye:
+        table = sensor_table(self._sensor, self._config, camera)
+        reach = self._config.max_range + float(table.reach[-1])
+        wide = farthest_cells(camera, reach, self._config) >= 1 << (_keys.NARROW - 1)
+        scratch = [(make_lanes(wide), make_memory()) for _ in self._pools]
+        return _Eye(table, (table.clear + table.mark).ravel(), scratch)
 
     def _follow(
-        self, depth_m: NDArray[np.float32], view: Rays, weight: np.float32 | None, worker: int, part: slice
+        self, depth_m: NDArray[np.float32], view: Rays, weight: np.float32 | None, eye: _Eye, worker: int, part: slice
     ) -> None:
-        pool, lanes = self._pools[worker], self._lanes[worker]
+        pool = self._pools[worker]
         pool.clear()
         while not self._kernel(
-            depth_m, view, self._table, self._look_up, weight, lanes, self._memory[worker],
+            depth_m, view, eye.table, eye.look_up, weight, *eye.scratch[worker],
             pool.table, pool.coords, pool.count, pool.values, part.start, part.stop,
         ):  # fmt: skip
             pool.clear()

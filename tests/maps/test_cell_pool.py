@@ -11,6 +11,7 @@ from stereovox.maps import VoxelMap, cell_pool, load_map
 from stereovox.maps.cell_format import CellRules
 from stereovox.maps.cell_pool import CellPool
 from stereovox.maps.evidence import Evidence
+from stereovox.maps.queries import stored_at
 
 FORMATS = ("int16", "int8", "uint8")
 NONE, NOTHING = np.empty((0, 3), np.int32), np.empty((0, 512), np.int16)

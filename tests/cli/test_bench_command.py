@@ -170,7 +170,7 @@ def test_the_toy_of_the_page_runs(recording, tmp_path):
         ("--frames-long 0: give a number above 0", ["--frames-long", 0]),
         ("--most-cells -5: give a number above 0", ["--most-cells=-5"]),
         ("peer 'nowhere:Toy': No module named 'nowhere'", ["--peers", "nowhere:Toy"]),
-        ("--out {tmp}/file: cannot make the folder", ["--out", "{tmp}/file"]),
+        ("{tmp}/file': cannot make this folder", ["--out", "{tmp}/file"]),
     ],
     ids=str,
 )

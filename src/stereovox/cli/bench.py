@@ -66,8 +66,9 @@ def add_arguments(parser: ArgumentParser) -> None:
 def run(arguments: Namespace) -> dict[str, Any]:
     """Run the comparison and what else was asked for; print the tables and write the files."""
     from stereovox.evaluate import bench_files
+    from stereovox.evaluate.out_folder import out_folder
 
-    folder = bench_files.make_folder(arguments.out) if arguments.out is not None else None
+    folder = out_folder(arguments.out) if arguments.out is not None else None
     result: dict[str, Any] = {}
 
     def so_far(found: dict[str, Any]) -> None:

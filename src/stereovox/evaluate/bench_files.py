@@ -7,7 +7,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-from stereovox.errors import StereovoxError
 from stereovox.evaluate.bench_machine import machine_line
 from stereovox.evaluate.bench_more import MEASUREMENTS
 from stereovox.evaluate.bench_table import Table, comparison_table
@@ -44,14 +43,3 @@ def write_picture(result: dict[str, Any], folder: Path) -> Path:
     with replacing(path) as file:
         file.write(speed_png(result))
     return path
-
-
-def make_folder(name: str) -> Path:
-    """Return the folder `name`, made if need be; raises StereovoxError, one line, where it cannot be written."""
-    folder = Path(name)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        why = error.strerror or error
-        raise StereovoxError(f"--out {name}: cannot make the folder ({why}); choose another") from None
-    return folder

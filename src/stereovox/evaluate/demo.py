@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox.errors import StereovoxError
 from stereovox.evaluate.metrics import by_part, compare_map, find_pieces
+from stereovox.evaluate.out_folder import out_folder
 from stereovox.evaluate.report import write_report
 from stereovox.evaluate.sightings import Sightings
 from stereovox.evaluate.summary import summarise
@@ -48,7 +48,7 @@ def demo(
     Raises StereovoxError when the folder cannot be written.
     """
     start = perf_counter()
-    folder = _folder(out)
+    folder = out_folder(out)
     source = source or Simulation()
     tell = progress or (lambda done, total, text: None)
     mapper = Mapper(voxel_size=voxel_size)
@@ -67,16 +67,6 @@ def demo(
     end = perf_counter()
     seconds = {"simulate_and_map": mapped - start, "check_and_draw": end - mapped, "total": end - start}
     return {**summary, "files": {name: str(path) for name, path in files.items()}, "seconds": _rounded(seconds)}
-
-
-def _folder(out: str | Path) -> Path:
-    folder = Path(out)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        why = error.strerror or error
-        raise StereovoxError(f"{folder}: cannot make this folder ({why}); choose another --out") from None
-    return folder
 
 
 def _map(mapper: Mapper, source: Simulation, sightings: Sightings, tell: Progress) -> list[UpdateReport]:

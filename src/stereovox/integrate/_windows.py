@@ -71,7 +71,7 @@ def build(
                 if v % 16 == 0 or v == rows:
                     offsets = tile_offset[level, 0] + ((v - 1) >> 4) * tile_width[level, 0]
                     big = tile_offset[level, 1] + ((v - 1) >> 6) * tile_width[level, 1]
-                    _put(_least_of_16(low_row, columns, other), tile_width[level, 0], lows, offsets, big, False)
+                    _put(_most_of_16(low_row, columns, other), tile_width[level, 0], lows, offsets, big, False)
                     _put(_most_of_16(high_row, columns, other), tile_width[level, 0], highs, offsets, big, True)
     farthest = ZERO
     for i in range(tile_offset[COARSEST, 0], tile_offset[COARSEST, 1]):
@@ -128,14 +128,6 @@ def _halved_row(row, width, out):
 
 
 @cell
-def _halved_row_least(row, width, out):
-    for u in range(width // 2):
-        out[u] = min(row[2 * u], row[2 * u + 1])
-    if width % 2:
-        out[width // 2] = row[width - 1]
-
-
-@cell
 def _window_row(above, here, below, width, row, out):
     for u in range(width):
         row[u] = max(max(above[u], below[u]), here[u])
@@ -147,15 +139,15 @@ def _window_row(above, here, below, width, row, out):
 
 @cell
 def _take_in(line, width, v, high_row, low_row):
-    """Take row v of window values into the highest and lowest values of up to 16 rows."""
+    """Take row v of window values into the highest, and the highest of their opposites, of up to 16 rows."""
     if v % 16 == 0:
         for u in range(width):
             high_row[u] = line[u]
-            low_row[u] = line[u]
+            low_row[u] = -line[u]
         return
     for u in range(width):
         high_row[u] = max(high_row[u], line[u])
-        low_row[u] = min(low_row[u], line[u])
+        low_row[u] = max(low_row[u], -line[u])
 
 
 @cell
@@ -169,22 +161,13 @@ def _most_of_16(row, width, other):
 
 
 @cell
-def _least_of_16(row, width, other):
-    """Return `row` with the lowest value of each 16 columns in its first ones."""
-    for _ in range(2):
-        _halved_row_least(row, width, other)
-        _halved_row_least(other, (width + 1) >> 1, row)
-        width = (width + 3) >> 2
-    return row
-
-
-@cell
 def _put(row, number, tiles, start, big, highest):
-    """Enter a row of tiles of 16, and take it into that of tiles of 64."""
+    """Enter a row of tiles of 16, and take it into that of tiles of 64; where not `highest`, `row` holds opposites."""
     for tu in range(number):
-        tiles[start + tu] = row[tu]
         k = big + (tu >> 2)
-        tiles[k] = max(tiles[k], row[tu]) if highest else min(tiles[k], row[tu])
+        value = row[tu] if highest else -row[tu]
+        tiles[start + tu] = value
+        tiles[k] = max(tiles[k], value) if highest else min(tiles[k], value)
 
 
 @cell

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from stereovox.errors import StereovoxError
+from stereovox.evaluate.out_folder import out_folder
 from stereovox.evaluate.reproduce.chapter import Chapter, Progress
 from stereovox.evaluate.reproduce.page import HEADS, report
 
@@ -33,11 +34,7 @@ class Steps:
 
 def output_files(out: Path) -> dict[str, Path]:
     """Return the files to be written; raises StereovoxError now, not after minutes, where they cannot be."""
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except (OSError, ValueError) as error:  # ValueError: a character 0
-        said = getattr(error, "strerror", None) or error
-        raise StereovoxError(f"{str(out)!r}: cannot make this folder ({said}); choose another --out") from None
+    out_folder(out)
     files = {"report": out / "report.html", "numbers": out / "numbers.json"}
     for path in files.values():
         if path.is_dir() or not os.access(path if path.exists() else out, os.W_OK):

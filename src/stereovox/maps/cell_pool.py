@@ -39,6 +39,7 @@ class CellPool:
         self._rules = rules
         self._limits = tuple(map(np.int16, (rules.format.unknown, rules.prior, rules.lowest, rules.highest)))
         self._least = rows, bare
+        self._has_settled = False
         self.count = np.zeros(2, np.int64)
         self.values = np.empty((0, CELLS), rules.format.dtype)
         self.coords = np.empty((0, 3), np.int32)
@@ -127,8 +128,10 @@ class CellPool:
             changed.append(_add.add(*evidence, *self._limits, floored))
 
         in_shards(one_shard, shards(len(rows), min(threads, len(rows) // WORTH_A_THREAD or 1)))
-        if sunk := int(np.count_nonzero(floored)):
+        sunk = int(np.count_nonzero(floored))
+        if sunk or not self._has_settled:  # the first time in any case: its kernel is compiled with the others
             self._settle(sunk, coords, uniform, floored)
+            self._has_settled = True
         return sum(changed)
 
     def _rows_for(

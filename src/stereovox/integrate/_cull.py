@@ -13,15 +13,17 @@ SLACK = np.float32(1e-3)
 """Pixels and parts of a depth by which boxes are taken too large: culling may err only to the safe side."""
 COARSE = 4
 """Blocks along each side of a coarse box; between it and a block stand boxes of two blocks."""
+STACK = 32
+"""Boxes that wait to be looked at, at most: eight of each of two sizes."""
 
 
 @kernel
-def candidates(view, table, windows, nearest, end, free, mixed):
+def candidates(view, table, windows, nearest, end, stack, free, mixed):
     """List the blocks that are wholly free and those that need a look at each cell; return both numbers.
 
     Both are -1 when a list is too short.
 
-    end: depth in metres beyond which the image says nothing.
+    end: depth in metres beyond which the image says nothing. stack: (STACK, 4) int32 scratch.
     free, mixed: (capacity, 3) int32 block coordinates from the camera's block.
     """
     n_free, n_mixed = 0, 0
@@ -31,26 +33,42 @@ def candidates(view, table, windows, nearest, end, free, mixed):
     for bx in range(low_x, high_x + 1, COARSE):
         for by in range(low_y, high_y + 1, COARSE):
             for bz in range(low_z, high_z + 1, COARSE):
-                coarse = _classify(view, table, windows, nearest, 1, COARSE, bx, by, bz)
-                if coarse == SKIP:
-                    continue
                 if max(n_free, n_mixed) + COARSE**3 > free.shape[0]:
                     return -1, -1
-                for i in range(8):
-                    hx, hy, hz = bx + 2 * (i >> 2), by + 2 * ((i >> 1) & 1), bz + 2 * (i & 1)
-                    half = coarse if coarse == FREE else _classify(view, table, windows, nearest, 1, 2, hx, hy, hz)
-                    if half == SKIP:
-                        continue
-                    for j in range(8):
-                        x, y, z = hx + (j >> 2), hy + ((j >> 1) & 1), hz + (j & 1)
-                        kind = half if half == FREE else _classify(view, table, windows, nearest, 0, 1, x, y, z)
-                        if kind == FREE:
-                            free[n_free, 0], free[n_free, 1], free[n_free, 2] = x, y, z
-                            n_free += 1
-                        elif kind == MIXED:
-                            mixed[n_mixed, 0], mixed[n_mixed, 1], mixed[n_mixed, 2] = x, y, z
-                            n_mixed += 1
+                waiting = _push(stack, 0, bx, by, bz, COARSE)
+                while waiting > 0:
+                    waiting -= 1
+                    x, y, z, size = stack[waiting, 0], stack[waiting, 1], stack[waiting, 2], stack[waiting, 3]
+                    kind = _classify(view, table, windows, nearest, 0 if size == 1 else 1, size, x, y, z)
+                    if kind == FREE:
+                        n_free = _enter(free, n_free, x, y, z, size)
+                    elif kind == MIXED and size == 1:
+                        n_mixed = _enter(mixed, n_mixed, x, y, z, size)
+                    elif kind == MIXED:
+                        half = size >> 1
+                        for i in range(8):
+                            waiting = _push(
+                                stack, waiting, x + half * (i >> 2), y + half * ((i >> 1) & 1), z + half * (i & 1), half
+                            )
     return n_free, n_mixed
+
+
+@cell
+def _push(stack, waiting, x, y, z, size):
+    """Put a box that is still to be looked at on the stack; return how many wait there now."""
+    stack[waiting, 0], stack[waiting, 1], stack[waiting, 2], stack[waiting, 3] = x, y, z, size
+    return waiting + 1
+
+
+@cell
+def _enter(blocks, n, x, y, z, size):
+    """List all blocks of a box `size` blocks wide; return how many are listed now."""
+    for i in range(size):
+        for j in range(size):
+            for k in range(size):
+                blocks[n, 0], blocks[n, 1], blocks[n, 2] = x + i, y + j, z + k
+                n += 1
+    return n
 
 
 @kernel
@@ -163,9 +181,9 @@ def _outside(view, half, px, py, pz):
 
 @cell
 def _behind(table, farthest, max_range):
-    """Return how far behind a measurement the sensor model still marks cells."""
+    """Return how far behind a measurement the sensor model still says anything."""
     if not table.marks:
-        return ZERO
+        return table.behind
     return table.reach[table_row(min(farthest, max_range), table.rows_per_metre, table.hit.size)]
 
 

@@ -59,7 +59,7 @@ def _clear(view, table, windows, cx, cy, cz, depths, measured, out):
         steps = view.steps[0, cells], view.steps[1, cells], view.steps[2, cells]
         _measure(view, windows, cx, cy, cz, steps, depths, measured)
         if _tell_apart(depths, measured, before, table.behind, np.int32(table.free), out[cells]):
-            _look_up(view, table, depths, measured, before, out[cells])
+            _look_up(view, table, depths, measured, out[cells])
 
 
 @cell
@@ -97,7 +97,7 @@ def _tell_apart(depths, measured, before, behind, free, out):
 
 
 @cell
-def _look_up(view, table, depths, measured, before, out):
+def _look_up(view, table, depths, measured, out):
     """Write what the sensor table says of cells that are not wholly before their measurement."""
     last_row = np.int32(table.hit.size - 1)
     columns, clear = np.int32(table.clear.shape[1]), table.clear.reshape(table.clear.size)

@@ -13,6 +13,10 @@ from stereovox.integrate._hits import _point_cell
 from stereovox.integrate._keys import bits, pack, unpack
 from stereovox.maps._cells import find_or_insert
 
+LANES = 32
+"""Neighbouring pixels of a row that are walked in step."""
+MEMORY_BITS = 9
+"""The places of so many blocks (as a power of two: 8 along each axis) are remembered beside the pool's hash."""
 FRACTION_BITS = 10
 """Weighted evidence is summed in thousandths times 2^10: whole numbers, so the order of rays does not matter."""
 FRACTION = np.float32(1 << FRACTION_BITS)

@@ -10,8 +10,7 @@ from stereovox._jit import cell, kernel
 from stereovox.integrate._cells import NO_RETURN, ONE, ZERO, bits_of, float_of
 from stereovox.integrate._hits import _row_rays
 from stereovox.integrate._keys import pack
-from stereovox.integrate._lanes import aim, aim_at_hits, evidence, give, mark_runs, weighted
-from stereovox.integrate.lanes import LANES
+from stereovox.integrate._lanes import LANES, aim, aim_at_hits, evidence, give, mark_runs, weighted
 
 OFF_FACE = np.float32(1e-3)
 """Cells by which samples are kept off the faces of cells: on them, rounding would choose the cell."""

@@ -7,8 +7,7 @@ from stereovox._jit import cell, kernel
 from stereovox.integrate._cells import HALF, NO_RETURN, ONE, ZERO, bits_of, float_of
 from stereovox.integrate._hits import _row_rays
 from stereovox.integrate._keys import pack, strides
-from stereovox.integrate._lanes import aim, aim_at_hits, evidence, give, in_step, weighted
-from stereovox.integrate.lanes import LANES
+from stereovox.integrate._lanes import LANES, aim, aim_at_hits, evidence, give, in_step, weighted
 
 BEYOND = np.float32(1e30)
 TINY = np.float32(1e-30)

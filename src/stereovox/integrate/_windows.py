@@ -71,8 +71,10 @@ def build(
                 if v % 16 == 0 or v == rows:
                     offsets = tile_offset[level, 0] + ((v - 1) >> 4) * tile_width[level, 0]
                     big = tile_offset[level, 1] + ((v - 1) >> 6) * tile_width[level, 1]
-                    _put(_most_of_16(low_row, columns, other), tile_width[level, 0], lows, offsets, big, False)
-                    _put(_most_of_16(high_row, columns, other), tile_width[level, 0], highs, offsets, big, True)
+                    _most_of_16(low_row, columns, other)
+                    _most_of_16(high_row, columns, other)
+                    _put(low_row, tile_width[level, 0], lows, offsets, big, False)
+                    _put(high_row, tile_width[level, 0], highs, offsets, big, True)
     farthest = ZERO
     for i in range(tile_offset[COARSEST, 0], tile_offset[COARSEST, 1]):
         farthest = max(farthest, highs[i])
@@ -152,12 +154,11 @@ def _take_in(line, width, v, high_row, low_row):
 
 @cell
 def _most_of_16(row, width, other):
-    """Return `row` with the highest value of each 16 columns in its first ones."""
+    """Put the highest value of each 16 columns into the first ones of `row`."""
     for _ in range(2):
         _halved_row(row, width, other)
         _halved_row(other, (width + 1) >> 1, row)
         width = (width + 3) >> 2
-    return row
 
 
 @cell

@@ -8,10 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-LANES = 32
-"""Neighbouring pixels of a row that are walked in step."""
-MEMORY_BITS = 9
-"""The places of so many blocks (as a power of two: 8 along each axis) are remembered beside the pool's hash."""
+from stereovox.integrate._lanes import LANES, MEMORY_BITS
 
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int32]

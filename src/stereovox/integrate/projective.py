@@ -85,6 +85,7 @@ class _Eye:
         self._windows = WindowBuilder(camera)
         self._max_range = config.max_range
         self._free, self._mixed = (np.empty((ROOM, 3), np.int32) for _ in range(2))
+        self._stack = np.empty((_cull.STACK, 4), np.int32)
 
     def candidates(self, depth_m: NDArray[np.float32], view: View) -> tuple[Windows, int, int]:
         """List free and mixed blocks; return the window images, and how many there are of each."""
@@ -93,7 +94,8 @@ class _Eye:
             self._windows.build_nearest(depth_m)
         end, nearest = np.float32(self._end_of_view(farthest)), self._windows.nearest
         while True:
-            n_free, n_mixed = _cull.candidates(view, self.table, windows, nearest, end, self._free, self._mixed)
+            lists = self._stack, self._free, self._mixed
+            n_free, n_mixed = _cull.candidates(view, self.table, windows, nearest, end, *lists)
             if n_free >= 0:
                 return windows, n_free, n_mixed
             self._free, self._mixed = (np.empty((4 * len(self._free), 3), np.int32) for _ in range(2))
@@ -114,5 +116,5 @@ class _Eye:
         """Return the depth in metres beyond which this image says nothing."""
         if farthest >= NO_RETURN:
             return self._max_range
-        behind = float(self.table.reach[-1]) if self.table.marks else 0.0
+        behind = float(self.table.reach[-1] if self.table.marks else self.table.behind)
         return min(self._max_range, max(float(farthest), 10 * float(NEAR_PLANE)) * 1.001 + behind)

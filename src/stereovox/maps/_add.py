@@ -16,6 +16,7 @@ SKIP, MAKE = np.int32(-1), np.int32(-2)
 """In place of a row: the evidence changes nothing in this block; it needs a row."""
 LOW, HIGH = np.int64(-32768), np.int64(32767)
 NIL, ONE = np.int16(0), np.int16(1)
+ZERO = np.float32(0)
 
 
 @kernel
@@ -89,7 +90,8 @@ def rescale(values, factor, shift, out):
     """Write `values` (n, 512) times `factor`, plus `shift`, rounded down to whole numbers, to `out` (n, 512) int16."""
     for i in range(values.shape[0]):
         for c in range(512):
-            out[i, c] = np.int16(np.floor(np.float32(values[i, c]) * factor + shift))
+            value = np.float32(values[i, c])
+            out[i, c] = np.int16(np.floor(value * factor + shift) if value != ZERO else ZERO)
 
 
 @cell

@@ -5,6 +5,8 @@ import numpy as np
 
 from stereovox._jit import cell
 
+UNKNOWN, FREE, TENTATIVE, OCCUPIED = 0, 1, 2, 3
+"""What a map says about a cell; see `State`."""
 EMPTY = np.int32(-1)
 NO_ROW, AT_FLOOR = np.int64(-1), np.int64(-2)
 """In place of a row of values: the block is not there; all its cells hold the lowest number there is."""

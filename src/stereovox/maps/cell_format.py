@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stereovox.config import MapConfig
+from stereovox.maps import _cells
 
 BYTE_THRESHOLD = 180
 """Byte above which Chien 2020 (3.5) shows a cell as occupied; it is taken to stand for a probability of 0.7."""
@@ -21,10 +22,10 @@ BYTE_THRESHOLD = 180
 class State(IntEnum):
     """What a map says about a cell."""
 
-    UNKNOWN = 0
-    FREE = 1
-    TENTATIVE = 2
-    OCCUPIED = 3
+    UNKNOWN = _cells.UNKNOWN
+    FREE = _cells.FREE
+    TENTATIVE = _cells.TENTATIVE
+    OCCUPIED = _cells.OCCUPIED
 
 
 @dataclass(frozen=True)

@@ -79,6 +79,7 @@ def tabulate(model: InverseSensorModel, noise: RangeNoise, max_range: float, vox
     z = z_measured[:, None] + offset_sigma() * sigma[:, None]
     _check_ends(model, z_measured, sigma)
     log_odds = _log_odds(model, model.probability(z, z_measured[:, None], sigma[:, None]))
+    log_odds[:, -1] = 0  # what lies farther behind is looked up there, and nothing is said about it
     at = model.probability(z_measured, z_measured, sigma)
     hit = _log_odds(model, model.hit(z_measured, sigma, voxel_size) if hasattr(model, "hit") else at)  # pyright: ignore
     return SensorTable(log_odds, hit, sigma, ROWS / max_range)

@@ -65,6 +65,11 @@ def imported(tree: ast.Module, package: list[str]) -> Iterator[tuple[int, str]]:
             yield node.lineno, text[1]
 
 
+def is_kernel_file(file: str) -> bool:
+    """Tell whether a file holds kernels: `_name.py`, but for slow twins."""
+    return bool(re.fullmatch(r"(.*/)?_(?!.*reference)[a-z]\w*\.py", file))
+
+
 def broken_rules(root: Path) -> list[str]:
     """Return one line for each rule that a file of the package at `root` breaks."""
     found = []
@@ -84,6 +89,8 @@ def broken_rules(root: Path) -> list[str]:
             if not re.fullmatch(HOMES.get(library, ".*"), file):
                 found.append(f"{file}:{line} {library} is not at home here")
             other = inner.partition(".")[0]
+            if library == "stereovox" and is_kernel_file(file) and "._" not in f".{inner}":
+                found.append(f"{file}:{line} machine code outlives a change of {inner}: only kernel files are hashed")
             upwards = library == "stereovox" and LEVEL.get(other, -1) > LEVEL.get(room, 99)
             if upwards or (room, library, other) == ("mapper", "stereovox", "sources"):
                 found.append(f"{file}:{line} {room} must not import {other}")
@@ -98,6 +105,11 @@ def test_the_rules_hold():
     ("file", "line", "complaint"),
     [
         ("maps/a.py", "from stereovox.view.picture import picture", "maps must not import view"),
+        (
+            "maps/_a.py",
+            "from stereovox.maps.cell_format import State",
+            "machine code outlives a change of maps.cell_format.State: only kernel files are hashed",
+        ),
         ("maps/a.py", "from stereovox import geometry, mapper", "maps must not import mapper"),
         ("maps/a.py", "def f():\n    import stereovox.cli.map", "maps must not import cli"),
         ("maps/a.py", "if TYPE_CHECKING:\n    from ..integrate import ray", "maps must not import integrate"),
@@ -118,7 +130,7 @@ def test_each_rule_can_fail(tmp_path, file, line, complaint):
         "__init__.py": "from stereovox.mapper import Mapper",
         "mapper.py": "from stereovox.integrate import ray",
         "view/a.py": "import matplotlib\nfrom stereovox import evaluate",
-        "integrate/_cpu.py": "import numba\nfrom ..maps import blocks\nfrom . import _cells",
+        "integrate/_cpu.py": "import numba\nfrom ..maps import _cpu\nfrom . import _cells",
     }
     for name, text in {**good, file: line}.items():
         (tmp_path / name).parent.mkdir(exist_ok=True)

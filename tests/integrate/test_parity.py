@@ -44,6 +44,46 @@ def test_projective_equals_its_reference(model, voxel_size):
         assert share_that_differs(ours, theirs) < 0.02
 
 
+class Late:
+    """Made up: clears up to two sigma behind what was measured, and marks behind that where `marks`."""
+
+    p_free, p_unknown = 0.3, 0.5
+
+    def __init__(self, marks):
+        self.marks = marks
+
+    def probability(self, z, z_measured, sigma):
+        t = (z - z_measured) / sigma
+        p = np.where(t < 2, 0.3, 0.5)
+        return np.where((t > 2.5) & (t < 3.9), 0.8, p) if self.marks else p
+
+    def hit(self, z_measured, sigma, voxel_size):
+        return np.full(np.shape(z_measured), 0.9)
+
+
+class Tail(Late):
+    """Made up: still says a little four sigma behind what was measured, where the table ends."""
+
+    def probability(self, z, z_measured, sigma):
+        t = (z - z_measured) / sigma
+        return 0.5 - 0.2 / (1 + np.exp(2 * (t - 2.5)))
+
+
+@pytest.mark.parametrize("model", [Late(False), Late(True), Tail(False)], ids=["late", "marks late", "tail"])
+@pytest.mark.parametrize("voxel_size", [0.1, 0.05])
+@pytest.mark.parametrize("far_share", [0.0, 0.1])
+def test_models_that_speak_of_what_lies_behind(model, voxel_size, far_share, monkeypatch):
+    from stereovox.integrate import projective
+
+    monkeypatch.setattr(projective, "make_sensor", lambda config: model)
+    config = load_config(voxel_size=voxel_size, max_range=4.0, **{"noise.s2": 0.03})
+    image = made_image(2, far_share=far_share)
+    ours = cells_of(make_integrator(config).evidence(image))
+    cells, log_odds = _reference.project(image, config, model)
+    theirs = dict(zip(map(tuple, cells.tolist()), np.rint(1000 * log_odds).astype(int).tolist(), strict=True))
+    assert share_that_differs(ours, theirs, tolerance=25) < 0.002
+
+
 @pytest.mark.parametrize("model", SENSORS)
 @pytest.mark.parametrize("voxel_size", SIZES)
 @pytest.mark.parametrize("update", ["once", "every"])
@@ -130,7 +170,11 @@ def test_threads_change_nothing_for_wide_cameras(integrator, camera, update):
 
 @pytest.mark.parametrize("integrator", ["projective", "ray", "line"])
 @pytest.mark.parametrize("model", ["stereo", "andert"])
-def test_threads_change_nothing(integrator, model):
+def test_threads_change_nothing(integrator, model, monkeypatch):
+    from stereovox.integrate import projective
+
+    monkeypatch.setattr(projective, "PIXELS_WORTH_A_THREAD", 1)
+    monkeypatch.setattr(projective, "WORTH_A_THREAD", 1)
     images = [made_image(seed) for seed in range(4)]
     outcomes = []
     for threads in (1, 2, 3):
@@ -200,6 +244,7 @@ def test_one_integrator_serves_many_cameras_by_turns(integrator):
     each = make_integrator(config)
     for n in (0, 1, 0, 1, *range(20), 0, 7):
         assert cells_of(each.evidence(images[n])) == cells_of(make_integrator(config).evidence(images[n]))
+    assert len(each._eyes._kept) <= 16  # a lens that zooms does not fill the memory
 
 
 def test_odd_image_sizes():

@@ -4,14 +4,14 @@
 import numpy as np
 
 from stereovox._jit import allocating_kernel, cell, exact_cell
+from stereovox.maps import _cells
 from stereovox.maps._cells import EMPTY, NO_ROW, number_in, row_of
-from stereovox.maps.cell_format import State
 
 LATELY = (4096, 4)
 NOWHERE = np.int32(2**30)
 """No block has such a coordinate."""
-UNKNOWN, TENTATIVE = np.int32(State.UNKNOWN), np.int32(State.TENTATIVE)
-UNKNOWN_BIT = np.uint8(1 << State.UNKNOWN)
+UNKNOWN, TENTATIVE = np.int32(_cells.UNKNOWN), np.int32(_cells.TENTATIVE)
+UNKNOWN_BIT = np.uint8(1 << _cells.UNKNOWN)
 BIT, ONE, NO_BITS = np.uint8(1), np.int32(1), np.uint64(0)
 
 

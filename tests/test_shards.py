@@ -1,0 +1,74 @@
+"""Work on several threads: all of it is done, slips come out when all is, and threads do not pile up."""
+
+import multiprocessing
+import sys
+import threading
+import time
+
+import pytest
+
+from stereovox.shards import in_shards, shards, together
+
+
+@pytest.mark.parametrize("threads", [1, 2, 3, 16])
+@pytest.mark.parametrize("length", [0, 1, 5, 100])
+def test_shards_cover_everything_once(length, threads):
+    done = []
+    in_shards(lambda part: done.extend(range(length)[part]), shards(length, threads))
+    assert sorted(done) == list(range(length))
+
+
+def test_parts_run_at_the_same_time():
+    meeting = threading.Barrier(3, timeout=20)
+    in_shards(lambda part: meeting.wait(), shards(9, 3))  # would break if one waited for another
+    assert together(2, lambda: 1, lambda: "two") == (1, "two")
+    both = threading.Barrier(2, timeout=20)
+    together(2, both.wait, both.wait)
+
+
+def test_one_thread_runs_one_after_the_other_in_the_caller():
+    here = threading.get_ident()
+    assert together(1, threading.get_ident, threading.get_ident) == (here, here)
+
+
+@pytest.mark.parametrize("culprit", [0, 1])
+def test_a_slip_comes_out_when_all_parts_are_done(culprit):
+    done = []
+
+    def work(part):
+        if part.start == 5 * culprit:
+            raise ValueError(f"part {culprit}")
+        time.sleep(0.2)
+        done.append(part.start)
+
+    with pytest.raises(ValueError, match=f"part {culprit}"):
+        in_shards(work, shards(10, 2))
+    assert done == [5 - 5 * culprit]
+
+    def slip():
+        raise ValueError("slip")
+
+    calls = (slip, lambda: work(slice(1, 2)))
+    with pytest.raises(ValueError, match="slip"):
+        together(2, *(calls if culprit == 0 else calls[::-1]))
+    assert done[1:] == [1]
+
+
+def test_threads_do_not_pile_up():
+    for threads in range(2, 9):
+        for _ in range(3):
+            in_shards(lambda part: time.sleep(0.001), shards(100, threads))
+    ours = [thread for thread in threading.enumerate() if thread.name.startswith("stereovox")]
+    assert len(ours) <= 16  # as many as were ever busy at once, and no more for each number of parts
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no fork there")
+def test_a_forked_child_has_threads_of_its_own():
+    in_shards(lambda part: None, shards(10, 2))  # the parent has some by now
+    child = multiprocessing.get_context("fork").Process(target=in_shards, args=(lambda part: None, shards(10, 2)))
+    child.start()
+    child.join(20)
+    hangs = child.is_alive()
+    child.kill()
+    assert not hangs
+    assert child.exitcode == 0

@@ -229,7 +229,8 @@ def made_result():
             rows.append(
                 {"library": library, "voxel_size": size, "threads": 1, "frames": frames, "integrate_ms_median": ms,
                  "integrate_ms_p90": 2 * ms, "integrate_ms_p99": 3 * ms,
-                 "occupied": 1234567, "free": 20, "map_bytes": 2_500_000}
+                 "occupied": 1234567, "free": 20, "map_bytes": 2_500_000,
+                 **({"integrator": "projective"} if library == "stereovox" else {})}
             )  # fmt: skip
     ratio = {"0.2": {"octomap": 42.0, "slow": 2.0}, "0.05": {"octomap": 10.5, "slow": 0.5}}
     return {"source": "kitchen", "image": "640x480", "frames": 50, "frames_refused": 0, "first_refusal": "",
@@ -275,6 +276,20 @@ def test_variants_are_rows_of_their_own_and_make_the_same_map():
     block = lines[lines.index(next(line for line in lines if line.startswith("0.1 m"))) :][:4]
     assert [line.split()[-8:-6] for line in block] == [["1", "3"], ["2", "3"], ["1", "3"], ["2", "3"]]
     assert "stereovox-ray" in block[2]
+
+
+def test_the_first_variant_is_what_peers_are_compared_with(recorder):
+    """Whatever its integrator: first in the table, the peer's ratio is to it."""
+    recording = read_frames([a_frame(i) for i in range(2)], Variant().config(0.2))
+    ways = [Variant("ray"), Variant("ray", 2), Variant(), Variant(threads=2)]
+    result = compare(recording, [0.2], {"recorder": Recorder}, ways)
+    names = ["stereovox-ray", "stereovox-ray", "stereovox", "stereovox", "recorder"]
+    (rows,) = comparison_table(result).groups
+    assert [row[1:3] for row in rows] == list(zip(names, "12121", strict=True))
+    assert rows[0][0] == "0.2 m"
+    ours, peer = result["rows"]
+    ratio = peer["integrate_ms_median"] / ours["integrate_ms_median"]
+    assert result["ratio"]["0.2"]["recorder"] == pytest.approx(ratio, abs=1e-3, rel=1e-2)
 
 
 def test_stereovox_is_timed_before_and_after_each_peer(recorder):
@@ -479,8 +494,10 @@ def test_a_busy_machine_is_told():
     for row in calm["rows"]:
         row["cpu_share"] = 0.97
     assert "in the way" not in format_table(calm)
-    calm["rows"][4]["cpu_share"] = 0.42
-    assert "Other programs were in the way: octomap at 0.05 m got 42% of a processor." in format_table(calm)
+    calm["rows"][4]["cpu_share"], calm["rows"][0]["cpu_share"] = 0.42, 0.8
+    calm["variants"] = [calm["rows"][0] | {"threads": 2, "cpu_share": 0.3}]
+    worst = "octomap at 0.05 m got 42% of a processor"
+    assert f"in the way of 2 of 6 rows of one thread; the worst: {worst}. Measure again." in format_table(calm)
 
 
 def test_waiting_takes_no_processor(monkeypatch):

@@ -54,7 +54,7 @@ def format_table(result: dict[str, Any]) -> str:
 
 
 def comparison_table(result: dict[str, Any]) -> Table:
-    """Return the result of `bench` as a table: a group for each voxel size, stereovox first."""
+    """Return the result of `bench` as a table: a group for each voxel size, first what peers are compared with."""
     head = ("voxel", "library", "threads", "frames", "ms/frame", "p90", "p99", "stereovox is", "occupied", "free")
     groups = [
         [_cells(row, i == 0, result["ratio"][size].get(row["library"])) for i, row in enumerate(rows)]
@@ -63,10 +63,17 @@ def comparison_table(result: dict[str, Any]) -> Table:
     return Table(_title(result), (*head, "map MB"), groups, _notes(result), words=2)
 
 
+def is_ours(row: dict[str, Any]) -> bool:
+    """Tell whether a row is one of stereovox, and not a peer's."""
+    return "integrator" in row
+
+
 def rows_by_size(result: dict[str, Any]) -> dict[str, list[dict[str, Any]]]:
-    """Return all rows of a result, ours first, by the voxel size as `ratio` names it."""
-    ours = [row for row in result["rows"] if row["library"] == LIBRARY]
-    peers = [row for row in result["rows"] if row["library"] != LIBRARY]
+    """Return all rows of a result by the voxel size as `ratio` names it: that which peers are compared with, then
+    our other ones, then peers.
+    """
+    ours = [row for row in result["rows"] if is_ours(row)]
+    peers = [row for row in result["rows"] if not is_ours(row)]
     rows = [*ours, *result.get("variants", ()), *peers]
     sizes = dict.fromkeys(row["voxel_size"] for row in rows)
     return {str(size): [row for row in rows if row["voxel_size"] == size] for size in sizes}
@@ -112,7 +119,7 @@ def _notes(result: dict[str, Any]) -> list[str]:
             done = f"{row['frames']} of {result['frames']} frames"
             which = f"{row['library']} at {row['voxel_size']:g} m"
             notes.append(f"{which} stopped at its time limit after {done}: do not compare its cells and MB.")
-    notes += _busy(result["rows"])
+    notes += _busy([*result["rows"], *result.get("variants", ())])
     notes += [f"without {line}" for line in result.get("not_installed", ())]
     if "machine" in result:
         notes.append(f"On {machine_line(result['machine'])}.")
@@ -122,11 +129,13 @@ def _notes(result: dict[str, Any]) -> list[str]:
 def _busy(rows: Sequence[dict[str, Any]]) -> list[str]:
     """Return a line about other programs that were in the way, if they were."""
     alone = [row for row in rows if row["threads"] == 1 and "cpu_share" in row]
-    least = min(alone, key=lambda row: row["cpu_share"], default=None)
-    if least is None or least["cpu_share"] >= QUIET:
+    short = [row for row in alone if row["cpu_share"] < QUIET]
+    if not short:
         return []
-    which = f"{least['library']} at {least['voxel_size']:g} m"
-    return [f"Other programs were in the way: {which} got {least['cpu_share']:.0%} of a processor. Measure again."]
+    worst = min(short, key=lambda row: row["cpu_share"])
+    which = f"{worst['library']} at {worst['voxel_size']:g} m got {worst['cpu_share']:.0%} of a processor"
+    rows_of = f"{len(short)} of {len(alone)} rows of one thread"
+    return [f"Other programs were in the way of {rows_of}; the worst: {which}. Measure again."]
 
 
 def _span(values: Sequence[float]) -> str:

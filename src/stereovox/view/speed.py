@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from stereovox.evaluate.bench_machine import machine_line
-from stereovox.evaluate.bench_table import LIBRARY, rows_by_size
+from stereovox.evaluate.bench_table import is_ours, rows_by_size
 from stereovox.view.charts import blank, labels, png_of
 from stereovox.view.panels import GREY, INK, LINE
 
@@ -52,23 +52,23 @@ def _lines(result: dict[str, Any]) -> dict[str, list[dict[str, Any]]]:
     found: dict[str, list[dict[str, Any]]] = {}
     for rows in rows_by_size(result).values():
         for row in rows:
-            threads = f", {row['threads']} thread{'s' * (row['threads'] != 1)}" if _ours(row) else ""
+            threads = f", {row['threads']} thread{'s' * (row['threads'] != 1)}" if is_ours(row) else ""
             found.setdefault(f"{_plain(row['library'])}{threads}", []).append(row)
     return {name: sorted(rows, key=lambda row: row["voxel_size"]) for name, rows in found.items()}
 
 
 def _again(row: dict[str, Any], result: dict[str, Any]) -> bool:
     """Tell whether a row is one of ours with more threads, which make the same map."""
-    return _ours(row) and row["threads"] != result["rows"][0]["threads"]
+    return is_ours(row) and row["threads"] != result["rows"][0]["threads"]
 
 
 def _panel(axis: Any, lines: Mapping[str, Sequence[dict[str, Any]]], key: str, factor: float) -> None:
-    ours = list(dict.fromkeys(rows[0]["library"] for rows in lines.values() if _ours(rows[0])))
-    threads = list(dict.fromkeys(rows[0]["threads"] for rows in lines.values() if _ours(rows[0])))
-    others = [name for name, rows in lines.items() if not _ours(rows[0])]
+    ours = list(dict.fromkeys(rows[0]["library"] for rows in lines.values() if is_ours(rows[0])))
+    threads = list(dict.fromkeys(rows[0]["threads"] for rows in lines.values() if is_ours(rows[0])))
+    others = [name for name, rows in lines.items() if not is_ours(rows[0])]
     first = next(iter(lines))
     for name, rows in lines.items():
-        if _ours(rows[0]):
+        if is_ours(rows[0]):
             colour = (OURS, *FURTHER)[ours.index(rows[0]["library"]) % 3]
             dash = DASHES[threads.index(rows[0]["threads"]) % len(DASHES)]
             look: dict[str, Any] = {
@@ -117,10 +117,6 @@ def _ticks(axis: Any, sizes: Sequence[float], values: Sequence[float]) -> None:
 def _words(axis: Any, title: str, unit: str) -> None:
     axis.set_title(title, loc="left", fontsize=12.5, color=INK)
     labels(axis, "size of a cell, metres", unit, 10.5)
-
-
-def _ours(row: dict[str, Any]) -> bool:
-    return row["library"].startswith(LIBRARY)
 
 
 def _plain(text: str) -> str:

@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -95,16 +96,16 @@ def test_more_is_measured_and_told(recording, tmp_path, capsys, monkeypatch):
     for name in bench_more.MEASUREMENTS:
         monkeypatch.setitem(bench_more.MEASUREMENTS, name, fake(name, calls))
     words = [recording, "--voxel-size", 0.2, "--peers", "", "--out", tmp_path / "b", "--json"]
-    assert run(*words, "--also", "path,threads", "--frames-long", 777, "--most-cells", 5000) == 0
+    assert run(*words, "--also", "path,map-size", "--frames-long", 777, "--most-cells", 50000) == 0
     captured = capsys.readouterr()
-    assert [name for name, _ in calls] == ["threads", "path"]
+    assert [name for name, _ in calls] == ["map-size", "path"]
     given = calls[0][1]
-    assert (given.path_frames, given.most_cells, given.voxel_sizes) == (777, 5000, [0.2])
+    assert (given.path_frames, given.most_cells, given.voxel_sizes) == (777, 50000, [0.2])
     assert len(given.recording.frames) == 3
     told = json.loads(captured.out)
-    assert told["more"] == {"threads": {"figure": 42}, "path": {"figure": 42}}
+    assert told["more"] == {"map-size": {"figure": 42}, "path": {"figure": 42}}
     assert "Table of path" in captured.err
-    assert "## Table of threads" in (tmp_path / "b" / "bench.md").read_text()
+    assert "## Table of map-size" in (tmp_path / "b" / "bench.md").read_text()
     calls.clear()
     assert run(*words, "--all") == 0
     assert [name for name, _ in calls] == list(bench_more.MEASUREMENTS)
@@ -161,16 +162,43 @@ def test_the_toy_of_the_page_runs(recording, tmp_path):
     assert ours["occupied"] / 2 < toy["occupied"] < 2 * ours["occupied"]
 
 
+def test_a_peer_that_fails_leaves_what_is_done(recording, tmp_path, capsys, monkeypatch):
+    class Toy:
+        def __init__(self, voxel_size):
+            self.voxel_size = voxel_size
+
+        def insert(self, points, origin):
+            assert self.voxel_size > 0.15, "too small for me"
+
+        def counts(self):
+            return 1, 2
+
+        def bytes(self):
+            return 3
+
+    monkeypatch.setitem(sys.modules, "toys", SimpleNamespace(Toy=Toy))
+    out = tmp_path / "bench"
+    assert run(recording, "--voxel-size", 0.2, "--voxel-size", 0.1, "--peers", "toys:Toy", "--out", out) == 2
+    said = capsys.readouterr().err
+    assert "stopped; this much is done" in said
+    assert said.splitlines()[-1].startswith("stereovox: peer 'toys:Toy' at 0.1 m: AssertionError: too small for me")
+    told = json.loads((out / "bench.json").read_text())
+    assert [(row["library"], row["voxel_size"]) for row in told["rows"]] == [("stereovox", 0.2), ("toys:Toy", 0.2)]
+
+
 @pytest.mark.parametrize(
     ("said", "words"),
     [
         ("unknown measurement 'thread' (did you mean 'threads'?)", ["--also", "thread"]),
         ("unknown integrator 'rays'", ["--integrators", "rays"]),
         ("--integrators: name at least one", ["--integrators", ""]),
-        ("--frames-long 0: give a number above 0", ["--frames-long", 0]),
-        ("--most-cells -5: give a number above 0", ["--most-cells=-5"]),
+        ("--frames-long 0: give at least 500", ["--also", "path", "--frames-long", 0]),
+        ("--frames-long 499: give at least 500", ["--all", "--frames-long", 499]),
+        ("--most-cells -5: give at least 10000", ["--also", "map-size", "--most-cells=-5"]),
+        ("--frames-long goes with --also path or --all", ["--frames-long", 900]),
+        ("--most-cells goes with --also map-size or --all", ["--also", "path", "--most-cells", 20000]),
         ("peer 'nowhere:Toy': No module named 'nowhere'", ["--peers", "nowhere:Toy"]),
-        ("{tmp}/file': cannot make this folder", ["--out", "{tmp}/file"]),
+        ("'{tmp}/file': cannot make this folder", ["--out", "{tmp}/file"]),
     ],
     ids=str,
 )

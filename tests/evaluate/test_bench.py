@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """The comparison with other libraries: same frames and pixels, a complete result, a table people understand."""
 
+import json
 import os
 import sys
 import time
 from dataclasses import replace
 from importlib.util import find_spec
+from itertools import groupby
 from types import SimpleNamespace
 
 import numpy as np
@@ -183,8 +185,10 @@ def test_frames_limit_and_progress(recorder):
     assert result["frames"] == 4
     assert next(frames).stamp_ns == 4
     texts = list(dict.fromkeys(text for _, _, text in told))
+    reading, warming = "reading frames", "stereovox at 0.2 m, warming up"
     assert texts == [
-        "reading frames", "stereovox at 0.2 m, warming up", "stereovox at 0.2 m, timing", "recorder at 0.2 m"
+        f"{reading}: compiling, if need be", reading, f"{warming}: compiling, if need be", warming,
+        "stereovox at 0.2 m, timing", "recorder at 0.2 m",
     ]  # fmt: skip
     assert told[-1][:2] == (4, 4)
 
@@ -305,10 +309,11 @@ def test_stereovox_is_timed_before_and_after_each_peer(recorder):
     finally:
         for name in ("second", "third", "fourth"):
             del PEERS[name]
-    order = told[2::2]
-    timing = "stereovox at 0.2 m, timing"
-    assert order[0] == "stereovox at 0.2 m, warming up"
-    assert order[1:] == [
+    timing, warming = "stereovox at 0.2 m, timing", "stereovox at 0.2 m, warming up"
+    assert told[:3] == ["reading frames: compiling, if need be", *2 * ["reading frames"]]
+    order = [text for text, _ in groupby(told[3:])]
+    assert order == [
+        f"{warming}: compiling, if need be", warming,
         timing, "recorder at 0.2 m", timing, "second at 0.2 m", timing, "third at 0.2 m", timing, "fourth at 0.2 m",
         timing,
     ]  # fmt: skip
@@ -396,6 +401,85 @@ def test_a_class_that_is_not_there_is_one_line(name, said):
     with pytest.raises(ConfigError, match=f"^peer '{name}': .*{said}.*; write module:Class") as error:
         find_peer(name)
     assert "\n" not in str(error.value)
+
+
+def a_peer(**changes):
+    """Return a class of a peer that works, but for what is changed; None takes a method away."""
+    methods = {
+        "__init__": lambda self, voxel_size: None,
+        "insert": lambda self, points, origin: None,
+        "counts": lambda self: (1, 2),
+        "bytes": lambda self: 3,
+    }
+    return type("Toy", (), {name: method for name, method in (methods | changes).items() if method})
+
+
+def fails(*_):
+    raise RuntimeError("no more\n  of this")
+
+
+@pytest.mark.parametrize(
+    ("toy", "said"),
+    [
+        (a_peer(insert=None), "peer 'toys:Toy' has no insert; it needs insert or insert_image, counts and bytes"),
+        (a_peer(counts=None, bytes=None), "peer 'toys:Toy' has no counts and no bytes; "),
+        (3, "peer 'toys:Toy' is no class but int; write module:Class"),
+        (a_peer(__init__=lambda self: None), "peer 'toys:Toy' cannot be made: TypeError: "),
+        (a_peer(__init__=fails), "peer 'toys:Toy' cannot be made: RuntimeError: no more of this"),
+    ],
+    ids=["no insert", "no counts", "no class", "no argument", "fails"],
+)
+def test_a_peer_that_cannot_be_used_is_one_line_before_the_work(toy, said, monkeypatch):
+    def unread():
+        raise AssertionError("a frame was asked for")
+        yield
+
+    monkeypatch.setitem(sys.modules, "toys", SimpleNamespace(Toy=toy))
+    with pytest.raises(ConfigError) as error:
+        bench(unread(), [0.1], ["toys:Toy"])
+    assert str(error.value).startswith(said)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("code", "said"),
+    [
+        ("class Toy\n", "SyntaxError: "),
+        ("import sys\nsys.exit(4)\n", "SystemExit: 4"),
+        ("1 / 0\n", "ZeroDivisionError: "),
+    ],
+)
+def test_a_module_that_cannot_be_imported_is_one_line(code, said, monkeypatch, tmp_path):
+    (tmp_path / "a_bad_toy.py").write_text(code)
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(ConfigError, match=f"^peer 'a_bad_toy:Toy': {said}") as error:
+        find_peer("a_bad_toy:Toy")
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("toy", "said"),
+    [
+        (a_peer(insert=fails), "RuntimeError: no more of this"),
+        (a_peer(insert=lambda self, points: None), "TypeError: "),
+        (a_peer(counts=lambda self: 7), "TypeError: "),
+        (a_peer(counts=lambda self: (1, None)), "TypeError: "),
+        (a_peer(bytes=fails), "RuntimeError: no more of this"),
+    ],
+    ids=["insert fails", "wrong arguments", "one count", "no count", "bytes fails"],
+)
+def test_a_peer_that_fails_is_one_line_with_its_name(toy, said, monkeypatch):
+    monkeypatch.setitem(sys.modules, "toys", SimpleNamespace(Toy=toy))
+    with pytest.raises(StereovoxError, match=f"^peer 'toys:Toy' at 0.1 m: {said}") as error:
+        bench([a_frame()], [0.1], ["toys:Toy"])
+    assert "\n" not in str(error.value)
+
+
+def test_numbers_of_numpy_become_plain_ones(monkeypatch):
+    toy = a_peer(counts=lambda self: np.array([5, 6]), bytes=lambda self: np.uint32(7))
+    monkeypatch.setitem(sys.modules, "toys", SimpleNamespace(Toy=toy))
+    row = json.loads(json.dumps(bench([a_frame()], [0.1], ["toys:Toy"])))["rows"][1]
+    assert (row["occupied"], row["free"], row["map_bytes"]) == (5, 6, 7)
 
 
 def test_another_package_adds_a_peer_by_an_entry_point(monkeypatch):

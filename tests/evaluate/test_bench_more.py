@@ -257,6 +257,11 @@ def test_a_path_is_flown_straight_on_into_new_space(monkeypatch):
     assert "unbounded" in path_table(result).text()
 
 
+def test_a_path_that_is_too_short_is_refused():
+    with pytest.raises(StereovoxError, match=r"^a flight of 499 frames is too short to compare; fly at least 500$"):
+        cost_along_path(499)
+
+
 def test_every_measurement_has_a_table(monkeypatch):
     """All by name, as `--all` calls them, the long ones made short."""
     monkeypatch.setattr(bench_size, "ROUNDS", 1)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import sys
 from argparse import ArgumentParser, Namespace
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -58,9 +58,11 @@ def add_arguments(parser: ArgumentParser) -> None:
     )
     parser.add_argument("--all", action="store_true", help="measure all of these")
     parser.add_argument(
-        "--frames-long", type=int, metavar="N", help="frames of the simulated flight of `path` (6000, a minute)"
+        "--frames-long", type=int, metavar="N", help="frames of the simulated flight of `path`, at least 500 (6000)"
     )
-    parser.add_argument("--most-cells", type=int, metavar="N", help="largest map of `map-size` (100000000)")
+    parser.add_argument(
+        "--most-cells", type=int, metavar="N", help="largest map of `map-size`, at least 10000 (100000000)"
+    )
 
 
 def run(arguments: Namespace) -> dict[str, Any]:
@@ -98,7 +100,7 @@ def _measure(arguments: Namespace, so_far: Callable[[dict[str, Any]], None]) -> 
     sizes = arguments.voxel_size or VOXEL_SIZES
     ways = _ways(arguments)
     configs = [way.config(size, arguments.max_range) for way in ways for size in sizes]  # slips show before the work
-    limits = _limits(arguments)
+    limits = _limits(arguments, wanted)
     peers, missing = _peers(arguments.peers)
     kinds = find_peers(peers, configs[0].voxel_size)
     source = open_source(arguments.source, arguments.frames)
@@ -137,13 +139,25 @@ def _ways(arguments: Namespace) -> list[Variant]:
     return [Variant(name, number) for name in integrators for number in threads]
 
 
-def _limits(arguments: Namespace) -> dict[str, int]:
+def _limits(arguments: Namespace, wanted: Sequence[str]) -> dict[str, int]:
     """Return the sizes of measurements that were asked for; raises StereovoxError for those that cannot be."""
-    given = {"path_frames": arguments.frames_long, "most_cells": arguments.most_cells}
-    for (name, number), option in zip(given.items(), ("--frames-long", "--most-cells"), strict=True):
-        if number is not None and number < 1:
-            raise StereovoxError(f"{option} {number}: give a number above 0 ({name.replace('_', ' ')})")
-    return {name: number for name, number in given.items() if number is not None}
+    from stereovox.evaluate.bench_path import LEAST_FRAMES
+    from stereovox.evaluate.bench_size import CELLS
+
+    options = (
+        ("--frames-long", "path_frames", arguments.frames_long, LEAST_FRAMES, "path"),
+        ("--most-cells", "most_cells", arguments.most_cells, CELLS[0], "map-size"),
+    )
+    limits = {}
+    for option, name, number, least, measurement in options:
+        if number is None:
+            continue
+        if measurement not in wanted:
+            raise StereovoxError(f"{option} goes with --also {measurement} or --all; add one of these")
+        if number < least:
+            raise StereovoxError(f"{option} {number}: give at least {least}")
+        limits[name] = number
+    return limits
 
 
 def _peers(text: str | None) -> tuple[list[str], list[str]]:

@@ -12,12 +12,12 @@ import numpy as np
 
 from stereovox.config import Config, load_config
 from stereovox.depth import prepare
-from stereovox.errors import StereovoxError
+from stereovox.errors import ConfigError, StereovoxError
 from stereovox.evaluate.bench_frames import Progress, Recording, points_of, read_frames, silent
 from stereovox.evaluate.bench_machine import machine
 from stereovox.evaluate.bench_table import LIBRARY
 from stereovox.evaluate.bench_table import format_table as format_table
-from stereovox.evaluate.peers import ImagePeer, Peer, PeerClass, find_peer
+from stereovox.evaluate.peers import ImagePeer, Peer, PeerClass, blamed, find_peer
 from stereovox.frame import AnyFrame, Frame, Reason
 from stereovox.mapper import Mapper, UpdateReport
 
@@ -115,8 +115,8 @@ def bench(
     `ratio[str(voxel_size)][peer]` = peer's median / our median; and `source, image, frames, frames_refused,
     first_refusal, max_range, budget_s, machine`. Cells count as each library defines them: occupied above p = 0.7 and
     free below 0.3 for stereovox, above and below 0.5 for the others.
-    Raises ConfigError for an unknown peer or bad setting, MissingExtra for a peer that is not installed,
-    StereovoxError when no frame can be used: one line each.
+    Raises ConfigError for an unknown or unusable peer or bad setting, MissingExtra for a peer that is not installed,
+    StereovoxError when no frame can be used or a peer fails: one line each.
     """
     ways = [Variant(threads=threads), *variants]
     configs = _configs(voxel_sizes, ways, max_range)
@@ -126,10 +126,11 @@ def bench(
 
 
 def find_peers(names: Sequence[str], voxel_size: float) -> dict[str, PeerClass]:
-    """Return peers by name; one that is missing shows here, before a long recording is read."""
+    """Return peers by name; one that is missing or cannot be made shows here, before a long recording is read."""
     kinds = {name: find_peer(name) for name in names}
-    for kind in kinds.values():
-        kind(voxel_size)
+    for name, kind in kinds.items():
+        with blamed(f"peer '{name}' cannot be made", ConfigError):
+            kind(voxel_size)
     return kinds
 
 
@@ -197,7 +198,8 @@ def _timed(
                 flight.fly("timing", timed=True)
         if waiting:
             name, kind = waiting.pop(0)
-            rows.append(_time_peer(name, kind, frames, config, limits, tell))
+            with blamed(f"peer '{name}' at {config.voxel_size:g} m"):
+                rows.append(_time_peer(name, kind, frames, config, limits, tell))
     return rows
 
 
@@ -219,6 +221,7 @@ class _Flights:
         """Add all frames to a new map, and remember the times if they are `timed`."""
         mapper, threads = Mapper(self._config), self._way.threads
         where = f"{self._way.library}{f', {threads} threads,' * (threads > 1)} at {self._config.voxel_size:g} m"
+        self._tell(0, len(self._frames), f"{where}, {text}{'' if timed else ': compiling, if need be'}")
         for i, frame in enumerate(self._frames):
             if timed:
                 self._reports.append(self._watch.call(lambda frame=frame: mapper.add(frame)))
@@ -253,7 +256,8 @@ def _time_peer(
         if limits.reached(watch.times_ms):
             break
     occupied, free = peer.counts()
-    more = {"occupied": occupied, "free": free, "map_bytes": peer.bytes(), "cpu_share": watch.share}
+    cells = {"occupied": int(occupied), "free": int(free)}
+    more = {**cells, "map_bytes": int(peer.bytes()), "cpu_share": watch.share}
     return _row(name, config, 1, watch.times_ms) | more
 
 

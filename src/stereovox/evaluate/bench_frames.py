@@ -53,6 +53,7 @@ def read_frames(
     frames: list[Frame] = []
     refusals: list[str] = []
     path = DepthPath(config)
+    tell(0, total, "reading frames: compiling, if need be")
     for done, frame in enumerate(islice(source, limit), start=1):
         try:
             frames.append(_only_valid_pixels(path.matched(frame), config))

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from stereovox.errors import StereovoxError
 from stereovox.evaluate.bench import median
 from stereovox.evaluate.bench_frames import Progress, silent
 from stereovox.evaluate.bench_table import Table
@@ -19,6 +20,8 @@ from stereovox.sources import open_source
 
 FRAMES = 6000
 """A minute."""
+LEAST_FRAMES = 500
+"""Shorter flights have no start and end to compare."""
 FRAMES_A_METRE = 6
 SETTINGS = {"voxel_size": 0.2, "max_range": 5.0}
 WINDOW = {"window.size": [20.0, 20.0, 16.0]}
@@ -60,15 +63,17 @@ def cost_along_path(frames: int = FRAMES, tell: Progress = silent) -> dict[str, 
     Returns `frames, metres, voxel_size` and `rows` of `map, start_ms` and `end_ms` (medians of the first and the last
     tenth, as flown; the first 100 frames do not count), `ratio` (old over new map; mean over pieces of 50 frames of the
     ratio of their medians), `ratio_error` (its standard error), `pieces, start_bytes, end_bytes`.
-    Raises SourceError for a flight that is too long.
+    Raises StereovoxError for a flight of less than 500 frames, SourceError for one that is too long.
     """
-    frames = max(frames, 500)
+    if frames < LEAST_FRAMES:
+        raise StereovoxError(f"a flight of {frames} frames is too short to compare; fly at least {LEAST_FRAMES}")
     metres = frames / FRAMES_A_METRE
     # half of the simulated flight is out, half back: only the way out is flown
     source = open_source(f"sim:flight?length={2 * metres + 10:g}&speed=5")
     last = max(frames // 10, 400)
     flights = {name: _Flight(settings) for name, settings in MAPS.items()}
     start_bytes = {}
+    tell(0, frames, "flying: compiling, if need be")
     for i, frame in enumerate(islice(source, frames)):
         for flight in flights.values():
             flight.add(frame, i >= frames - last, fresh_first=bool(i % 2))

@@ -37,10 +37,12 @@ def thread_scaling(
         times: dict[int, list[float]] = {config.threads: [] for config in configs}
         for number in range(PASSES):
             for config in configs:
+                text = f"{config.threads} thread{'s' * (config.threads != 1)} at {size:g} m"
+                tell(number, PASSES, text if number else f"{text}: compiling, if need be")
                 mapper = Mapper(config)
                 took = [mapper.add(frame).integrate_ms for frame in recording.frames]
                 times[config.threads] += took if number else []
-                tell(number + 1, PASSES, f"{config.threads} threads at {size:g} m")
+                tell(number + 1, PASSES, text)
         one = median(next(iter(times.values())))
         rows += [
             {"voxel_size": size, "threads": n, "integrate_ms_median": ms, "faster": round(one / max(ms, 1e-4), 3)}

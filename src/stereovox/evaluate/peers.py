@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from importlib import import_module
 from typing import Any, Protocol, runtime_checkable
 
@@ -85,14 +86,27 @@ PeerClass = type[Peer] | type[ImagePeer]
 def find_peer(name: str) -> PeerClass:
     """Return the class registered as `name`, or for `module:Class` that class of a module that Python finds.
 
-    Raises ConfigError, one line, that suggests a known name or tells what could not be imported.
+    Raises ConfigError, one line, that suggests a known name or tells what could not be imported or what a class lacks.
     """
-    if ":" in name:
-        return _class_in(name)
     known = registry.names("peers", PEERS)
-    if name not in known:
+    if ":" not in name and name not in known:
         raise ConfigError(f"unknown peer '{name}'{did_you_mean(name, known)}")
-    return registry.find("peers", PEERS, name)
+    with blamed(f"peer '{name}'", ConfigError):
+        kind = _class_in(name) if ":" in name else registry.find("peers", PEERS, name)
+    _check_class(name, kind)
+    return kind
+
+
+@contextmanager
+def blamed(who: str, kind: type[StereovoxError] = StereovoxError) -> Iterator[None]:
+    """Let what a peer raises inside be one line of this `kind` that names it; errors of stereovox are one already."""
+    try:
+        yield
+    except (StereovoxError, MemoryError):
+        raise
+    except (Exception, SystemExit) as error:
+        words = " ".join(str(error).split())
+        raise kind(f"{who}: {type(error).__name__}{': ' * bool(words)}{words}") from error
 
 
 def installed(names: Sequence[str] = USUAL) -> tuple[list[str], list[str]]:
@@ -113,6 +127,18 @@ def _class_in(name: str) -> PeerClass:
         return getattr(import_module(module), attribute)
     except (ImportError, AttributeError, ValueError) as error:
         raise ConfigError(f"peer '{name}': {error}; write module:Class, the module where Python finds it") from None
+
+
+def _check_class(name: str, kind: Any) -> None:
+    """Raise ConfigError for what is no class, or one that lacks a method."""
+    if not isinstance(kind, type):
+        raise ConfigError(f"peer '{name}' is no class but {type(kind).__name__}; write module:Class")
+    wanted = ("insert_image" if hasattr(kind, "insert_image") else "insert", "counts", "bytes")
+    lacking = [method for method in wanted if not callable(getattr(kind, method, None))]
+    if lacking:
+        raise ConfigError(
+            f"peer '{name}' has no {' and no '.join(lacking)}; it needs insert or insert_image, counts and bytes"
+        )
 
 
 class OctomapPython:

@@ -55,12 +55,13 @@ def format_table(result: dict[str, Any]) -> str:
 
 def comparison_table(result: dict[str, Any]) -> Table:
     """Return the result of `bench` as a table: a group for each voxel size, first what peers are compared with."""
-    head = ("voxel", "library", "threads", "frames", "ms/frame", "p90", "p99", "stereovox is", "occupied", "free")
+    compared = ("stereovox is",) if any(result["ratio"].values()) else ()
+    head = ("voxel", "library", "threads", "frames", "ms/frame", "p90", "p99", *compared, "occupied", "free", "map MB")
     groups = [
-        [_cells(row, i == 0, result["ratio"][size].get(row["library"])) for i, row in enumerate(rows)]
+        [_cells(row, i == 0, result["ratio"][size] if compared else None) for i, row in enumerate(rows)]
         for size, rows in rows_by_size(result).items()
     ]
-    return Table(_title(result), (*head, "map MB"), groups, _notes(result), words=2)
+    return Table(_title(result), head, groups, _notes(result), words=2)
 
 
 def is_ours(row: dict[str, Any]) -> bool:
@@ -83,22 +84,26 @@ def _title(result: dict[str, Any]) -> str:
     return f"{result['source']}: {result['frames']} frames of {result['image']}, depth up to {result['max_range']:g} m"
 
 
-def _cells(row: dict[str, Any], first: bool, times: float | None) -> tuple[str, ...]:
+def _cells(row: dict[str, Any], first: bool, ratio: dict[str, float] | None) -> tuple[str, ...]:
+    """Return the cells of a line; `ratio` is None where there are no peers, and so no column for it."""
+    faster = () if ratio is None else (_faster(ratio.get(row["library"])),)
     return (
         f"{row['voxel_size']:g} m" if first else "",
         row["library"],
         str(row["threads"]),
         str(row["frames"]),
         *(f"{row[f'integrate_ms_{name}']:.2f}" for name in ("median", "p90", "p99")),
-        "" if times is None else _faster(times),
+        *faster,
         f"{row['occupied']:,}",
         f"{row['free']:,}",
         f"{row['map_bytes'] / 1e6:.1f}",
     )
 
 
-def _faster(times: float) -> str:
-    """Return a ratio in words, from our side."""
+def _faster(times: float | None) -> str:
+    """Return a ratio in words, from our side; nothing for our own rows."""
+    if times is None:
+        return ""
     if times < 1:
         return f"{1 / max(times, 1e-3):.1f} x slower"
     return f"{times:.0f} x faster" if times >= 10 else f"{times:.1f} x faster"

@@ -100,8 +100,8 @@ def bench(
     `frames_limit`) are in memory before the clock starts.
 
     Timed: for stereovox the `integrate_ms` of each frame that `Mapper.add` reports, after all frames went once through
-    a map that is thrown away, so that kernels are compiled; several passes, one before each peer, and their frames
-    together give the figures. Its depth preparation stands apart as `depth_ms_median`, the whole call as
+    a map that is thrown away, so that kernels are compiled; several passes, one before each peer (only
+    one where that takes seconds), and their frames together give the figures. Its depth preparation stands apart as `depth_ms_median`, the whole call as
     `add_ms_median`. For a peer its insertion alone, in one thread, after one frame into a map that is thrown away; its
     points are made before. What a peer's Python binding does with the points is part of it: a Python user pays that, a
     C++ program would not.

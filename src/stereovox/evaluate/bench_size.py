@@ -20,7 +20,8 @@ from stereovox.maps.evidence import Evidence
 CELLS = (10**4, 10**5, 10**6, 10**7, 10**8)
 BLOCK_CELLS = 512
 BYTES_A_CELL = 7
-"""Needed while a map grows: it moves to a place twice as large, two bytes a cell, and holds both for a moment."""
+"""Needed while a map grows, at most: it moves to a place half as large again, two bytes a cell, and for a moment holds
+both, beside the evidence that is added."""
 ROUNDS = 3
 SEED = 0
 

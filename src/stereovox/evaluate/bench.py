@@ -100,11 +100,11 @@ def bench(
     `frames_limit`) are in memory before the clock starts.
 
     Timed: for stereovox the `integrate_ms` of each frame that `Mapper.add` reports, after all frames went once through
-    a map that is thrown away, so that kernels are compiled; several passes, one before each peer (only
-    one where that takes seconds), and their frames together give the figures. Its depth preparation stands apart as `depth_ms_median`, the whole call as
-    `add_ms_median`. For a peer its insertion alone, in one thread, after one frame into a map that is thrown away; its
-    points are made before. What a peer's Python binding does with the points is part of it: a Python user pays that, a
-    C++ program would not.
+    a map that is thrown away, so that kernels are compiled; several passes, one before each peer (only one where that
+    takes seconds), and their frames together give the figures. Its depth preparation stands apart as
+    `depth_ms_median`, the whole call as `add_ms_median`. For a peer its insertion alone, in one thread, after one frame
+    into a map that is thrown away; its points are made before. What a peer's Python binding does with the points is
+    part of it: a Python user pays that, a C++ program would not.
 
     A peer stops after `budget_s` seconds of inserting at one voxel size, with at least 5 frames: `frames` tells how
     many it did, and if that is fewer than ours, its cells and bytes cannot be compared.

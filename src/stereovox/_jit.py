@@ -74,14 +74,14 @@ def cell(function: Function) -> Function:
     """Compile a small function that becomes part of every kernel that calls it.
 
     It makes and returns no arrays: so none of those it is given is counted as in use, which inside a loop costs more
-    than the look into a hash.
+    than the look into a hash. Python cannot call it: what that needs takes as long to compile as the function.
     """
-    return _compile(function, forceinline=True, _nrt=False)
+    return _compile(function, forceinline=True, _nrt=False, no_cpython_wrapper=True)
 
 
 def exact_cell(function: Function) -> Function:
     """Compile a small function as `cell` does, but round each operation as NumPy does."""
-    return _compile(function, forceinline=True, _nrt=False, fastmath=False)
+    return _compile(function, forceinline=True, _nrt=False, no_cpython_wrapper=True, fastmath=False)
 
 
 @lru_cache
@@ -103,7 +103,7 @@ def _compile(function: Function, fastmath: set[str] | bool = FAST_MATH, **option
     try:
         return numba.njit(
             function, cache=folder is not None, error_model="numpy", fastmath=fastmath, nogil=True,
-            pipeline_class=_KernelCompiler, **options,
+            pipeline_class=_KernelCompiler, no_cfunc_wrapper=True, **options,
         )  # fmt: skip
     finally:
         settings.CACHE_DIR = before

@@ -2,6 +2,7 @@
 """Queries against slow twins on a dense array of states, and on cases that can be worked out by hand."""
 
 import itertools
+from typing import Any
 
 import numpy as np
 import pytest
@@ -429,22 +430,49 @@ def test_whole_thresholds_tell_states_as_exact_ones_do(cell):
     [
         ("cast_rays", ([0, 0, 0], [[1, 0, 0], [0, 0, 0]], 1), r"direction 1 is \(0, 0, 0\) and leads nowhere"),
         ("cast_rays", ([0, 0, 0], [[np.nan, 0, 0]], 1), "directions: number 0 is not finite"),
-        ("cast_rays", ([[0, 0, 0]] * 2, [[1, 0, 0]] * 3, 1), "origins: 2 for 3; give one, or as many"),
+        (
+            "cast_rays",
+            ([[0, 0, 0]] * 2, [[1, 0, 0]] * 3, 1),
+            "origins holds 2 places, directions 3; give one, or as many",
+        ),
         ("cast_rays", ([0, 0], [[1, 0, 0]], 1), r"origins: shape \(2,\) is not \(N, 3\)"),
         ("cast_rays", ([1e9, 0, 0], [[1, 0, 0]], 1), "origins: beyond the map, whose cells reach 107374 km"),
-        ("cast_rays", ("here", [[1, 0, 0]], 1), r"origins: not numbers of shape \(N, 3\)"),
-        ("cast_rays", ([0, 0, 0], [[1, 0, 0]], np.nan), "max_distance nan is not a length"),
+        ("cast_rays", ("here", [[1, 0, 0]], 1), r"origins: 'here' is not numbers of shape \(N, 3\)"),
+        ("cast_rays", ([0, 0, 0], [[1, 0, 0]], np.nan), "max_distance: nan is not a length of 0 m or more"),
         ("cast_rays", ([0, 0, 0], [[1, 0, 0]], 1, [FREE]), "stop_at: give one or more of State.UNKNOWN"),
         ("cast_rays", ([0, 0, 0], [[1, 0, 0]], 1, []), "stop_at: give one or more of"),
+        ("cast_rays", ([0, 0, 0], [[1, 0, 0]], 1, [3.0]), r"stop_at: give one or more of .*, not \[3.0\]$"),
+        ("cast_rays", ([0, 0, 0], [[1, 0, 0]], 1, 3.0), "stop_at: give one or more of .*, not 3.0$"),
+        ("cast_rays", ([0, 0, 0], [[1, 0, 0]], 1, None), "stop_at: give one or more of .*, not None$"),
+        ("cast_rays", ([0, 0, 0], [[1, 0, 0]], 1, "occupied"), "stop_at: give one or more of .*, not 'occupied'$"),
+        ("cast_rays", ([0, 0, 0], [[1, 0, 0]], np.array([1.0, 2.0])), "max_distance: 2 lengths; give one for all"),
+        ("cast_rays", ([0, 0, 0], [["1", "0", "0"]], 1), r"directions: \[\['1', '0', '0'\]\] is not numbers"),
+        ("cast_rays", ([0, 0, 0], [[1j, 0, 0]], 1), r"directions: \[\[1j, 0, 0\]\] is not numbers of shape"),
         ("check_boxes", ([[0, 0, 0]] * 2, [[1, 0, 0], [0, 0, -1]]), "box 1: low is above high; swap them"),
-        ("check_boxes", ([[0, 0, 0]], [[1, 0, 0]] * 2), "low: 1 for 2; give as many"),
+        ("check_boxes", ([[0, 0, 0]], [[1, 0, 0]] * 2), "low holds 1 place, high 2; give as many"),
         ("check_boxes", ([[0, 0, 0]], [[np.inf, 0, 0]]), "high: number 0 is not finite"),
-        ("check_capsules", ([[0, 0, 0]], [[1, 0, 0]], -1), "radius: not a finite length of 0 m or more"),
-        ("check_capsules", ([[0, 0, 0]], [[1, 0, 0]], np.nan), "radius: not a finite length"),
-        ("check_capsules", ([[0, 0, 0]] * 3, [[1, 0, 0]] * 3, [1, 2]), "radius: 2 for 3; give one, or as many"),
-        ("check_capsules", ([[0, 0, 0]], [[1, 0, 0]] * 2, 1), "start: 1 for 2; give as many"),
+        ("check_capsules", ([[0, 0, 0]], [[1, 0, 0]], -1), "radius: -1 is not a length of 0 m or more"),
+        ("check_capsules", ([[0, 0, 0]], [[1, 0, 0]], np.nan), "radius: nan is not a length"),
+        (
+            "check_capsules",
+            ([[0, 0, 0]] * 3, [[1, 0, 0]] * 3, [1, 2]),
+            "radius holds 2 lengths, start 3; give one, or as many",
+        ),
+        ("check_capsules", ([[0, 0, 0]], [[1, 0, 0]], np.inf), "radius: beyond the map"),
+        ("check_capsules", ([[0, 0, 0]], [[1, 0, 0]], "0.2"), "radius: '0.2' is not a length in metres"),
+        ("check_capsules", ([[0, 0, 0]], [[1, 0, 0]], None), "radius: None is not a length in metres"),
+        (
+            "check_capsules",
+            ([[0, 0, 0]] * 4, [[1, 0, 0]] * 4, np.ones((2, 2))),
+            r"radius: shape \(2, 2\) is not \(N,\)",
+        ),
+        ("check_capsules", ([[0, 0, 0]], [[1, 0, 0]] * 2, 1), "start holds 1 place, end 2; give as many"),
         ("nearest_obstacle", ([[0, 0, np.inf]], 1), "points: number 0 is not finite"),
-        ("nearest_obstacle", ([[0, 0, 0]], -1), "max_distance -1 is not a length"),
+        ("nearest_obstacle", ([[0, 0, 0]], -1), "max_distance: -1 is not a length"),
+        ("nearest_obstacle", ([[0, 0, 0]], "far"), "max_distance: 'far' is not a length in metres"),
+        ("nearest_obstacle", ([[0, 0, 0]], None), "max_distance: None is not a length in metres"),
+        ("nearest_obstacle", ([[0, 0, 0]], 1 + 0j), r"max_distance: \(1\+0j\) is not a length in metres"),
+        ("nearest_obstacle", ([[0, 0, 0], [0, 0]], 1), r"points: \[\[0, 0, 0\], \[0, 0\]\] is not numbers of shape"),
         ("nearest_obstacle", ([[0, 0, 0]], 1, [7]), "obstacles: give one or more of"),
     ],
 )
@@ -453,3 +481,53 @@ def test_bad_input_is_refused_in_one_line(query, arguments, message):
     with pytest.raises(StereovoxError, match=message) as error:
         getattr(voxel_map, query)(*arguments)
     assert "\n" not in str(error.value)
+
+
+NOT_POINTS = [
+    (np.zeros((3, 4)), r"shape \(3, 4\) is not \(N, 3\), or \(3,\) for one"),
+    (np.zeros((4, 2)), r"shape \(4, 2\) is not \(N, 3\)"),
+    (np.zeros((2, 2, 3)), r"shape \(2, 2, 3\) is not"),
+    (np.zeros((3, 0)), r"shape \(3, 0\) is not"),
+    (np.zeros(6), r"shape \(6,\) is not"),
+    ([1, 2], r"shape \(2,\) is not"),
+    (1.0, r"shape \(\) is not"),
+    ("abc", r"'abc' is not numbers of shape \(N, 3\)"),
+    ([["1", "2", "3"]], r"\[\['1', '2', '3'\]\] is not numbers"),
+    (None, "None is not numbers"),
+    ([[1, 2, None]], r"\[\[1, 2, None\]\] is not numbers"),
+    ([[1, 2, 3], [1, 2]], r"\[\[1, 2, 3\], \[1, 2\]\] is not numbers"),
+    ([[1 + 2j, 0, 0]], r"\[\[\(1\+2j\), 0, 0\]\] is not numbers"),
+    (np.zeros((9, 3), complex), r"array\(\[\[.*\) is not numbers"),
+]
+
+
+@pytest.mark.parametrize("method", ["state", "log_odds", "probability"])
+@pytest.mark.parametrize(
+    "settings", [{}, {"window": {"size": [3.2, 3.2, 3.2], "outside": "keep"}}], ids=["map", "window"]
+)
+@pytest.mark.parametrize(("points", "message"), NOT_POINTS, ids=[str(i) for i in range(len(NOT_POINTS))])
+def test_what_is_no_points_is_refused_in_one_line(method, settings, points, message):
+    voxel_map = make_map(load_config(voxel_size=0.1, **settings))
+    with pytest.raises(StereovoxError, match=f"^points: {message}") as error:
+        getattr(voxel_map, method)(points)
+    assert "\n" not in str(error.value)
+    voxel_map.close()
+
+
+def test_an_empty_list_is_a_batch_of_none():
+    voxel_map = VoxelMap(load_config(voxel_size=0.1))
+    answers = [
+        voxel_map.state([]),
+        voxel_map.cast_rays([0, 0, 0], [], 1.0).distance,
+        voxel_map.check_boxes([], []),
+        voxel_map.check_capsules([], [], 0.1),
+        voxel_map.nearest_obstacle([], 1.0).distance,
+    ]
+    assert [answer.shape for answer in answers] == [(0,)] * 5
+
+
+def test_states_may_be_whole_numbers():
+    wall = VoxelMap.from_cells(load_config(voxel_size=0.5), [[2, 0, 0]], [2.0])
+    anyhow: list[Any] = [OCCUPIED, 3, [3], np.array([3], np.uint8), {OCCUPIED}, iter([OCCUPIED])]
+    for stop_at in anyhow:
+        assert wall.cast_rays([0, 0, 0], [1, 0, 0], 9.0, stop_at).distance.tolist() == [1.0]

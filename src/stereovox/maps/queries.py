@@ -7,6 +7,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from operator import index
+from reprlib import repr as shortened
 from typing import NamedTuple
 
 import numpy as np
@@ -58,12 +60,24 @@ class NearestCells(NamedTuple):
     cell: NDArray[np.int32]
 
 
-def stored_at(cells: StoredCells, sides: tuple[float, float, float], points: ArrayLike) -> NDArray[np.integer]:
-    """Return the stored numbers (N,) of the cells at points (N, 3) in metres, "unknown" where not finite."""
-    points = np.asarray(points)
-    numbers = points if points.dtype == np.float32 else points.astype(float, copy=False)
-    found = np.empty(numbers.size // 3, cells.values.dtype)
-    _query.look_up(cells, sides, INDEX_LIMIT, np.require(numbers.reshape(-1, 3), None, ["C", "W"]), found)
+def points_of(values: ArrayLike, name: str = "points") -> NDArray[np.float32] | NDArray[np.float64]:
+    """Return places (N, 3), float32 if they are, else float64; one place (3,) is a batch of one, [] one of none.
+
+    Raises StereovoxError for any other shape and for what is no number; NaN and infinity are numbers.
+    """
+    numbers = _numbers(values, name, "numbers of shape (N, 3)")
+    if numbers.shape not in {(0,), (3,)} and (numbers.ndim != 2 or numbers.shape[1] != 3):
+        raise StereovoxError(f"{name}: shape {numbers.shape} is not (N, 3), or (3,) for one")
+    numbers = numbers.reshape(-1, 3)
+    return numbers if numbers.dtype == np.float32 else numbers.astype(float, copy=False)
+
+
+def stored_at(
+    cells: StoredCells, sides: tuple[float, float, float], points: NDArray[np.floating]
+) -> NDArray[np.integer]:
+    """Return the stored numbers (N,) of the cells at points, "unknown" where not finite; points as of `points_of`."""
+    found = np.empty(len(points), cells.values.dtype)
+    _query.look_up(cells, sides, INDEX_LIMIT, np.require(points, None, ["C", "W"]), found)
     return found
 
 
@@ -73,7 +87,7 @@ def cast_rays(
     """Return where rays stop; see `VoxelMap.cast_rays`."""
     directions = _vectors(directions, "directions")
     origins = _within_limits(asked, _vectors(origins, "origins"), "origins")
-    _check_length(origins, "origins", len(directions))
+    _check_number("origins", origins, "directions", directions)
     if not directions.any(axis=1).all():
         raise StereovoxError(f"direction {np.flatnonzero(~directions.any(axis=1))[0]} is (0, 0, 0) and leads nowhere")
     n, wanted = len(directions), _bits(stop_at, "stop_at")
@@ -85,7 +99,7 @@ def cast_rays(
 def check_boxes(asked: Asked, low: ArrayLike, high: ArrayLike) -> NDArray[np.uint8]:
     """Return the worst state in boxes; see `VoxelMap.check_boxes`."""
     low, high = _vectors(low, "low"), _vectors(high, "high")
-    _check_length(low, "low", len(high), least=len(high))
+    _check_number("low", low, "high", high, one_for_all=False)
     if (low > high).any():
         raise StereovoxError(f"box {np.flatnonzero((low > high).any(axis=1))[0]}: low is above high; swap them")
     levels = np.empty(len(low), np.int8)
@@ -97,11 +111,9 @@ def check_capsules(asked: Asked, start: ArrayLike, end: ArrayLike, radius: Array
     """Return the worst state that capsules touch; see `VoxelMap.check_capsules`."""
     start, end = _within_limits(asked, _vectors(start, "start"), "start"), _vectors(end, "end")
     end = _within_limits(asked, end, "end")
-    _check_length(start, "start", len(end), least=len(end))
-    reach = np.array(radius, float).ravel()
-    _check_length(reach, "radius", len(end))
-    if not ((reach >= 0) & (reach < INDEX_LIMIT * min(asked.sides))).all():
-        raise StereovoxError("radius: not a finite length of 0 m or more")
+    _check_number("start", start, "end", end, one_for_all=False)
+    reach = _within_limits(asked, _lengths(radius, "radius"), "radius")
+    _check_number("radius", reach, "start", start)
     levels = np.empty(len(start), np.int8)
     _query_solids.capsules(*_read(asked), _each(BADNESS[1:]), asked.sides, INDEX_LIMIT, start, end, reach, levels)
     return _states_of(levels)
@@ -124,44 +136,74 @@ def _states_of(levels: NDArray[np.int8]) -> NDArray[np.uint8]:
     return np.array(BADNESS, np.uint8)[levels + 1]
 
 
-def _each(states: Iterable[State]) -> NDArray[np.uint8]:
+def _each(states: Iterable[int]) -> NDArray[np.uint8]:
     return np.array([1 << state for state in states], np.uint8)
 
 
 def _bits(states: Iterable[State], name: str) -> NDArray[np.uint8]:
     """Return a set of states as the bits (1,) of one number."""
-    states = [states] if isinstance(states, State) else list(states)
-    if not states or not set(states) <= set(BADNESS[1:]):
-        raise StereovoxError(f"{name}: give one or more of State.UNKNOWN, State.TENTATIVE and State.OCCUPIED")
-    return np.bitwise_or.reduce(_each(states)).reshape(1)
+    try:
+        wanted = {index(state) for state in ([states] if isinstance(states, int) else states)}
+    except TypeError:
+        wanted = set()
+    if not wanted or not wanted <= set(BADNESS[1:]):
+        raise StereovoxError(
+            f"{name}: give one or more of State.UNKNOWN, State.TENTATIVE and State.OCCUPIED, not {_told(states)}"
+        )
+    return np.bitwise_or.reduce(_each(wanted)).reshape(1)
+
+
+def _numbers(values: ArrayLike, name: str, wanted: str) -> NDArray:
+    """Return whole or real numbers of any shape."""
+    try:
+        numbers = np.asarray(values)
+    except (TypeError, ValueError):  # lists of unequal lengths
+        numbers = None
+    if numbers is None or numbers.dtype.kind not in "biuf":
+        raise StereovoxError(f"{name}: {_told(values)} is not {wanted}")
+    return numbers
+
+
+def _told(values: object) -> str:
+    return " ".join(shortened(values).split())
 
 
 def _vectors(values: ArrayLike, name: str) -> NDArray[np.float64]:
-    """Return (N, 3) finite numbers of one's own; one vector (3,) is taken for a batch of one."""
-    try:
-        vectors = np.array(values, float, order="C", ndmin=2)
-    except (TypeError, ValueError):
-        raise StereovoxError(f"{name}: not numbers of shape (N, 3)") from None
-    if vectors.ndim != 2 or vectors.shape[1] != 3:
-        raise StereovoxError(f"{name}: shape {np.shape(values)} is not (N, 3)")
+    """Return (N, 3) finite numbers of one's own."""
+    vectors = np.array(points_of(values, name), float, order="C")
     if not np.isfinite(vectors).all():
         raise StereovoxError(f"{name}: number {np.flatnonzero(~np.isfinite(vectors).all(axis=1))[0]} is not finite")
     return vectors
 
 
-def _within_limits(asked: Asked, vectors: NDArray[np.float64], name: str) -> NDArray[np.float64]:
-    limit = INDEX_LIMIT * np.array(asked.sides)
-    if not (np.abs(vectors) < limit).all():
-        raise StereovoxError(f"{name}: beyond the map, whose cells reach {min(limit) / 1000:.0f} km from its origin")
-    return vectors
-
-
-def _check_length(values: NDArray, name: str, n: int, least: int = 1) -> None:
-    if len(values) not in {least, n}:
-        raise StereovoxError(f"{name}: {len(values)} for {n}; give {'as many' if least == n else 'one, or as many'}")
+def _lengths(values: ArrayLike, name: str) -> NDArray[np.float64]:
+    """Return (N,) lengths of 0 or more, infinity allowed; a single number is a batch of one."""
+    lengths = np.array(_numbers(values, name, "a length in metres"), float, ndmin=1)
+    if lengths.ndim != 1:
+        raise StereovoxError(f"{name}: shape {lengths.shape} is not (N,)")
+    if not (lengths >= 0).all():
+        raise StereovoxError(f"{name}: {lengths[~(lengths >= 0)][0]:g} is not a length of 0 m or more")
+    return lengths
 
 
 def _distance(metres: float) -> float:
-    if not metres >= 0:
-        raise StereovoxError(f"max_distance {metres} is not a length of 0 m or more")
-    return float(metres)
+    lengths = _lengths(metres, "max_distance")
+    if len(lengths) != 1:
+        raise StereovoxError(f"max_distance: {len(lengths)} lengths; give one for all")
+    return float(lengths[0])
+
+
+def _within_limits(asked: Asked, numbers: NDArray[np.float64], name: str) -> NDArray[np.float64]:
+    """Return metres (N, 3) or (N,) as they are."""
+    limit = INDEX_LIMIT * np.array(asked.sides)
+    if not (np.abs(numbers) < (limit if numbers.ndim > 1 else min(limit))).all():
+        raise StereovoxError(f"{name}: beyond the map, whose cells reach {min(limit) / 1000:.0f} km from its origin")
+    return numbers
+
+
+def _check_number(name: str, values: NDArray, other: str, others: NDArray, one_for_all: bool = True) -> None:
+    if len(values) == len(others) or (one_for_all and len(values) == 1):
+        return
+    what = f"{'place' if values.ndim > 1 else 'length'}{'' if len(values) == 1 else 's'}"
+    cure = "give one, or as many" if one_for_all else "give as many"
+    raise StereovoxError(f"{name} holds {len(values)} {what}, {other} {len(others)}; {cure}")

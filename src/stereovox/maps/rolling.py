@@ -8,7 +8,7 @@ from itertools import product
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from stereovox.config import Config
 from stereovox.errors import ConfigError
@@ -137,15 +137,15 @@ class RollingMap(VoxelMap):
         if self._store:
             self._store.close()
 
-    def _stored_at(self, points: ArrayLike) -> NDArray[np.integer]:
+    def _stored_at(self, points: NDArray[np.floating]) -> NDArray[np.integer]:
         if self._earlier is not None:
             return self._earlier._stored_at(points)
         stored = super()._stored_at(points)
         if self._store is not None:
-            self._look_into_tiles(np.asarray(points, float).reshape(-1, 3), stored)
+            self._look_into_tiles(points, stored)
         return stored
 
-    def _look_into_tiles(self, points: NDArray[np.float64], stored: NDArray[np.integer]) -> None:
+    def _look_into_tiles(self, points: NDArray[np.floating], stored: NDArray[np.integer]) -> None:
         """Set what the window does not know and a tile does, tile by tile."""
         assert self._store is not None
         within = (np.abs(points) < INDEX_LIMIT * np.array(self.config.cell)).all(axis=1)  # False for NaN

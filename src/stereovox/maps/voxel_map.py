@@ -109,16 +109,25 @@ class VoxelMap:
         return self._pool.add(evidence.coords, values, uniform, step, self.config.threads)
 
     def log_odds(self, points: ArrayLike) -> NDArray[np.float32]:
-        """Return the log-odds (N,) at points (N, 3) in metres, world frame; 0 where unknown or not finite."""
-        return self._format.log_odds(self._stored_at(points))
+        """Return the log-odds (N,) at points (N, 3) in metres, world frame; 0 where unknown or not finite.
+
+        Raises StereovoxError for what is not numbers (N, 3), or (3,) for one.
+        """
+        return self._format.log_odds(self._stored_at(queries.points_of(points)))
 
     def probability(self, points: ArrayLike) -> NDArray[np.float32]:
-        """Return the occupancy probability (N,) at points (N, 3) in metres, world frame; 0.5 where unknown."""
+        """Return the occupancy probability (N,) at points (N, 3) in metres, world frame; 0.5 where unknown.
+
+        Raises StereovoxError as `log_odds` does.
+        """
         return np.asarray(1 / (1 + np.exp(-self.log_odds(points))), np.float32)
 
     def state(self, points: ArrayLike) -> NDArray[np.uint8]:
-        """Return the `State` (N,) uint8 at points (N, 3) in metres, world frame."""
-        return self._rules.states(self._stored_at(points))
+        """Return the `State` (N,) uint8 at points (N, 3) in metres, world frame; UNKNOWN where not finite.
+
+        Raises StereovoxError as `log_odds` does.
+        """
+        return self._rules.states(self._stored_at(queries.points_of(points)))
 
     def cast_rays(
         self,
@@ -237,7 +246,7 @@ class VoxelMap:
     def _asked(self) -> Asked:
         return Asked(self.stored_cells, self._rules, self.config.cell)
 
-    def _stored_at(self, points: ArrayLike) -> NDArray[np.integer]:
+    def _stored_at(self, points: NDArray[np.floating]) -> NDArray[np.integer]:
         return queries.stored_at(self.stored_cells, self.config.cell, points)
 
     def _centers_of(self, state: State) -> NDArray[np.float64]:

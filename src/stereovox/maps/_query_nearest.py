@@ -34,9 +34,9 @@ def _nearest(stored, rules, wanted, side, p, farthest, lately, marks, levels):
     Where more blocks were asked for than the hash has slots, the shells stand in nothing, and the rows that there are
     are looked through instead. Not so where what is not there is wanted: then it was found long before.
     """
-    best = (np.inf, 0, 0, 0)
-    within = farthest * farthest
     hx, hy, hz = _home(p[0], side[0]), _home(p[1], side[1]), _home(p[2], side[2])
+    best = (np.inf, hx, hy, hz)
+    within = farthest * farthest
     asked, shell = 0, 0
     while _to_shell(p, side, hx, hy, hz, shell) <= np.sqrt(min(best[0], within)):
         for bx in range(hx - shell, hx + shell + 1):

@@ -96,14 +96,14 @@ def cache_folder() -> Path | None:
 
 
 def _compile(function: Function, fastmath: set[str] | bool = FAST_MATH, **options: Any) -> Function:
-    folder = cache_folder()
+    folder, options = cache_folder(), {"no_cfunc_wrapper": True, **options}
     settings: Any = numba_config
     before = settings.CACHE_DIR
     settings.CACHE_DIR = str(folder or "")
     try:
         return numba.njit(
             function, cache=folder is not None, error_model="numpy", fastmath=fastmath, nogil=True,
-            pipeline_class=_KernelCompiler, no_cfunc_wrapper=True, **options,
+            pipeline_class=_KernelCompiler, **options,
         )  # fmt: skip
     finally:
         settings.CACHE_DIR = before

@@ -107,10 +107,15 @@ def test_points_come_in_any_form(world):
     assert voxel_map.state(np.empty((0, 3))).shape == (0,)
 
 
-@pytest.mark.parametrize(("index", "state"), [(2**30 - 1, UNKNOWN), (2**30, UNKNOWN), (-(2**30), UNKNOWN), (7, FREE)])
-def test_points_at_the_limit_of_indices(index, state):
-    voxel_map = VoxelMap.from_cells(load_config(voxel_size=1.0), [[7, 0, 0]], [-3.0])
-    assert voxel_map.state([[index, 0, 0]]).tolist() == [state]
+def test_points_at_the_limit_of_indices():
+    last = 2**30 - 1
+    far = [[last, 0, 0], [-last, 0, 0], [7, 0, 0], [2**30, 0, 0], [-(2**30), 0, 0]]
+    voxel_map = VoxelMap.from_cells(load_config(voxel_size=1.0), far, [-3.0] * 5)
+    wrapped = 2**35 + 7  # cut down to 32 bits, that is cell 7
+    asked = [last, -last, wrapped, 7, -wrapped, 2**30, -(2**30), 1e300, -np.inf, np.nan]
+    expected = [State.FREE, State.FREE, State.UNKNOWN, State.FREE, *[State.UNKNOWN] * 6]
+    assert voxel_map.state([[x, 0, 0] for x in asked]).tolist() == expected
+    assert voxel_map.state([[x, 0, 0] for x in asked[::-1]]).tolist() == expected[::-1]
 
 
 # rays

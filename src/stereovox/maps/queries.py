@@ -20,7 +20,7 @@ from stereovox.maps.blocks import StoredCells
 from stereovox.maps.cell_format import CellRules, State, Thresholds
 
 INDEX_LIMIT = 2**30
-"""Cell indices lie in [-INDEX_LIMIT, INDEX_LIMIT); beyond it everything is unknown."""
+"""Cell indices lie in (-INDEX_LIMIT, INDEX_LIMIT); beyond it everything is unknown."""
 NO_CELL = -(2**31)
 """Stands on all three axes where no cell was found."""
 BADNESS = (State.FREE, State.UNKNOWN, State.TENTATIVE, State.OCCUPIED)

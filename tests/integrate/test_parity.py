@@ -173,7 +173,6 @@ def test_threads_change_nothing_for_wide_cameras(integrator, camera, update):
 def test_threads_change_nothing(integrator, model, monkeypatch):
     from stereovox.integrate import projective
 
-    monkeypatch.setattr(projective, "PIXELS_WORTH_A_THREAD", 1)
     monkeypatch.setattr(projective, "WORTH_A_THREAD", 1)
     images = [made_image(seed) for seed in range(4)]
     outcomes = []

@@ -29,9 +29,8 @@ from stereovox.shards import in_shards, shards, together
 
 ROOM = 4096
 """Blocks that a camera's lists have room for at first."""
-WORTH_A_THREAD = 128
-"""Blocks whose evaluation takes as long as it takes to wake a thread, and longer."""
-PIXELS_WORTH_A_THREAD = 100_000
+WORTH_A_THREAD = 256
+"""Blocks whose evaluation takes longer than it takes to wake a thread."""
 
 
 class Projective:
@@ -51,13 +50,14 @@ class Projective:
     def _of_pinhole(self, image: DepthImage, camera: PinholeCamera) -> Evidence:
         eye, depth_m = self._eyes[camera], image.depth_m
         view = eye.views.at(image.T_world_sensor)
-        threads = self._config.threads
+        threads = self._config.threads if eye.mixed_before >= 2 * WORTH_A_THREAD else 1
         _, (windows, n_free, n_mixed) = together(
-            threads if depth_m.size >= PIXELS_WORTH_A_THREAD else 1,
+            threads,
             lambda: eye.hits.find(depth_m, view),
             lambda: eye.candidates(depth_m, view),
         )
         free, mixed, hit_of = eye.with_hits(n_free, n_mixed)
+        eye.mixed_before = len(mixed)
         values = np.empty((len(mixed), CELLS), np.int16)
         hits = eye.hits.blocks.values
 
@@ -80,6 +80,7 @@ class _Eye:
 
     def __init__(self, camera: PinholeCamera, table: KernelTable, config: Config):
         self.table = table
+        self.mixed_before = 0  # blocks to be evaluated in the frame before: about as much is to be done in the next
         self.views = Views(camera, config)
         self.hits = HitFinder(camera, table, config)
         self._windows = WindowBuilder(camera)

@@ -18,7 +18,7 @@ GROWTH = 1.5
 SPARE = 4
 PIECE = 1024
 """Blocks that `pieces` yields at once."""
-WORTH_A_THREAD = 512
+WORTH_A_THREAD = 2048
 """Blocks of evidence that take as long as it takes to wake a thread."""
 
 

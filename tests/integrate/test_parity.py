@@ -19,14 +19,23 @@ WIDE = {
 }
 
 
-def reference_of(reference, image, config):
-    cells, log_odds = reference(image, config, make_sensor(config.sensor))
+def reference_of(reference, image, config, sensor=None):
+    cells, log_odds = reference(image, config, sensor or make_sensor(config.sensor))
     return dict(zip(map(tuple, cells.tolist()), np.rint(1000 * log_odds).astype(int).tolist(), strict=True))
 
 
 def share_that_differs(ours, theirs, tolerance=0):
     keys = ours.keys() | theirs.keys()
     return sum(abs(ours.get(k, 0) - theirs.get(k, 0)) > tolerance for k in keys) / len(keys)
+
+
+def assert_rays_equal_their_reference(image, config, at_least):
+    ours = cells_of(make_integrator(config).evidence(image))
+    reference = {"ray": _reference.cast_rays, "line": _reference.draw_lines}[config.integrator]
+    theirs = reference_of(reference, image, config)
+    assert len(theirs) > at_least
+    assert share_that_differs(ours, theirs, tolerance=25) < 0.002
+    assert share_that_differs(ours, theirs, tolerance=2) < 0.02
 
 
 @pytest.mark.parametrize("model", SENSORS)
@@ -79,8 +88,7 @@ def test_models_that_speak_of_what_lies_behind(model, voxel_size, far_share, mon
     config = load_config(voxel_size=voxel_size, max_range=4.0, **{"noise.s2": 0.03})
     image = made_image(2, far_share=far_share)
     ours = cells_of(make_integrator(config).evidence(image))
-    cells, log_odds = _reference.project(image, config, model)
-    theirs = dict(zip(map(tuple, cells.tolist()), np.rint(1000 * log_odds).astype(int).tolist(), strict=True))
+    theirs = reference_of(_reference.project, image, config, model)
     assert share_that_differs(ours, theirs, tolerance=25) < 0.002
 
 
@@ -93,12 +101,7 @@ def test_ray_and_line_equal_their_references(integrator, model, voxel_size, upda
         voxel_size=voxel_size, max_range=2.5, integrator=integrator, **{"sensor.model": model, "ray.update": update}
     )
     image = made_image(5)
-    ours = cells_of(make_integrator(config).evidence(image))
-    reference = {"ray": _reference.cast_rays, "line": _reference.draw_lines}[integrator]
-    theirs = reference_of(reference, image, config)
-    assert len(theirs) > 60
-    assert share_that_differs(ours, theirs, tolerance=25) < 0.002
-    assert share_that_differs(ours, theirs, tolerance=2) < 0.02
+    assert_rays_equal_their_reference(image, config, at_least=60)
 
 
 @pytest.mark.parametrize(("model", "update"), [("stereo", "once"), ("stereo", "every"), ("valenti", "every")])
@@ -109,12 +112,7 @@ def test_rays_of_wide_cameras_equal_their_references(integrator, camera, model, 
     settings = {"sensor.model": model, "ray.update": update, "noise.s2": 0.01}
     config = load_config(voxel_size=0.1, max_range=2.5, integrator=integrator, **settings)
     image = made_image(5, WIDE[camera])
-    ours = cells_of(make_integrator(config).evidence(image))
-    reference = {"ray": _reference.cast_rays, "line": _reference.draw_lines}[integrator]
-    theirs = reference_of(reference, image, config)
-    assert len(theirs) > 1000
-    assert share_that_differs(ours, theirs, tolerance=25) < 0.002
-    assert share_that_differs(ours, theirs, tolerance=2) < 0.02
+    assert_rays_equal_their_reference(image, config, at_least=1000)
 
 
 @pytest.mark.parametrize("update", ["once", "every"])
@@ -126,12 +124,7 @@ def test_rays_of_a_row_may_part_along_every_axis(integrator, update):
     pose = np.eye(4)
     pose[:3, 3] = np.sqrt([2e-3, 3e-3, 5e-3])
     image = replace(image, T_world_sensor=pose)
-    ours = cells_of(make_integrator(config).evidence(image))
-    reference = {"ray": _reference.cast_rays, "line": _reference.draw_lines}[integrator]
-    theirs = reference_of(reference, image, config)
-    assert len(theirs) > 1000
-    assert share_that_differs(ours, theirs, tolerance=25) < 0.002
-    assert share_that_differs(ours, theirs, tolerance=2) < 0.02
+    assert_rays_equal_their_reference(image, config, at_least=1000)
 
 
 @pytest.mark.parametrize("camera", WIDE)

@@ -79,6 +79,16 @@ def slot_of(table, coords, bx, by, bz):
 
 
 @cell
+def enter(table, coords, place):
+    """Enter the block at `place`, which the table does not know."""
+    mask = table.size - 1
+    slot = home_slot(coords[place, 0], coords[place, 1], coords[place, 2], mask)
+    while table[slot] != EMPTY:
+        slot = (slot + 1) & mask
+    table[slot] = place
+
+
+@cell
 def empty_slot(table, coords, slot):
     """Empty a slot of the hash table and close the gap: entries behind it move up if their search passes it."""
     mask = table.size - 1

@@ -2,19 +2,15 @@
 """Kernels over blocks: rebuild the hash, enter blocks."""
 
 from stereovox._jit import kernel
-from stereovox.maps._cells import EMPTY, find_or_insert, home_slot
+from stereovox.maps._cells import EMPTY, enter, find_or_insert
 
 
 @kernel
 def rebuild(table, coords, n):
     """Enter the first `n` blocks of the pool into an empty hash table."""
     table[:] = EMPTY
-    mask = table.size - 1
     for i in range(n):
-        slot = home_slot(coords[i, 0], coords[i, 1], coords[i, 2], mask)
-        while table[slot] != EMPTY:
-            slot = (slot + 1) & mask
-        table[slot] = i
+        enter(table, coords, i)
 
 
 @kernel

@@ -8,7 +8,7 @@ a row, a place from there on that of a bare block. The caller has made room.
 import numpy as np
 
 from stereovox._jit import cell, kernel
-from stereovox.maps._cells import EMPTY, copy_row, empty_slot, find, home_slot, slot_of
+from stereovox.maps._cells import EMPTY, copy_row, empty_slot, enter, find, slot_of
 
 NOTHING, BARE, ROW = np.uint8(0), np.uint8(1), np.uint8(2)
 """What a block of cells needs: no place at all, as none is known; a bare one, as all are at the floor; a row."""
@@ -19,9 +19,9 @@ def rebuild(table, coords, values, count):
     """Enter all blocks of the pool into the hash table anew."""
     table[:] = EMPTY
     for row in range(count[0]):
-        _enter(table, coords, row)
+        enter(table, coords, row)
     for n in range(count[1]):
-        _enter(table, coords, values.shape[0] + n)
+        enter(table, coords, values.shape[0] + n)
 
 
 @kernel
@@ -42,7 +42,7 @@ def put(table, coords, values, count, wanted, cells, kinds):
         elif kinds[i] == BARE:
             place = values.shape[0] + count[1]
             coords[place, 0], coords[place, 1], coords[place, 2] = x, y, z
-            _enter(table, coords, place)
+            enter(table, coords, place)
             count[1] += 1
 
 
@@ -78,7 +78,7 @@ def new_row(table, coords, count, x, y, z):
     """Make the row of a block that is not there, its numbers yet to be written; return it."""
     row = count[0]
     coords[row, 0], coords[row, 1], coords[row, 2] = x, y, z
-    _enter(table, coords, row)
+    enter(table, coords, row)
     count[0] = row + 1
     return row
 
@@ -115,16 +115,6 @@ def forget(table, coords, values, count, x, y, z):
             _close_row_gap(table, coords, values, count, place)
         else:
             _close_bare_gap(table, coords, values, count, place)
-
-
-@cell
-def _enter(table, coords, place):
-    """Enter the block at `place`, which the table does not know."""
-    mask = table.size - 1
-    slot = home_slot(coords[place, 0], coords[place, 1], coords[place, 2], mask)
-    while table[slot] != EMPTY:
-        slot = (slot + 1) & mask
-    table[slot] = place
 
 
 @cell

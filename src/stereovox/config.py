@@ -16,6 +16,7 @@ from typing import Any, Literal, get_args, get_origin
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from stereovox.config_robot import AmclConfig, GridConfig, ScanConfig, Section, SlamConfig
+from stereovox.config_safety import PaceConfig, TrustConfig
 from stereovox.errors import ConfigError, did_you_mean
 
 MOST_CELLS = 8192
@@ -73,10 +74,14 @@ class DepthConfig(Section):
 
     denoise: average depths that the camera's noise cannot tell apart, where it is large against the cells.
     downsample: n by n pixels become one that holds the smallest valid depth of its block (Chien 2020, 3.2); 1: none.
+    far: what is believed to be too far away, and so clears cells up to the maximum range. `measured`: only depths that
+        were measured beyond it; `told`: also pixels of which the source says so; `infinite`: also +inf (REP 117), for
+        cameras that never write it for what is too near or unmatched.
     """
 
     denoise: bool = True
     downsample: int = Field(1, ge=1, le=64)
+    far: Literal["measured", "told", "infinite"] = "told"
 
 
 class StereoConfig(Section):
@@ -205,6 +210,10 @@ class MapConfig(Section):
     prior: probability that a cell is occupied before the first evidence on it (l0 of Valenti 2018, Eq 6.2). Most cells
     a camera sees are free, so probabilities agree with what is really there when it is well below a half. `prior` of
     the sensor model `stereo` should be the same. A cell that evidence made likelier than that is never free.
+    confirm_hits: frames that must hit an unknown cell at least before it is occupied; one frame raises it by no more
+        than that part of the way.
+    keep_times: remember for each cell when it got its last evidence (4 bytes a cell on top).
+    forget_s: a cell without evidence for so many seconds of the recording becomes unknown; needs `keep_times`.
     """
 
     cell: Literal["int16", "int8", "uint8"] = "int16"
@@ -213,11 +222,16 @@ class MapConfig(Section):
     prior: float = Field(0.1, gt=0, lt=1)
     free_below: float = Field(0.3, gt=0, lt=1)
     occupied_above: float = Field(0.7, gt=0, lt=1)
+    confirm_hits: int = Field(1, ge=1, le=100)
+    keep_times: bool = False
+    forget_s: float | None = Field(None, gt=0)
 
     @model_validator(mode="after")
     def _ordered(self) -> MapConfig:
         if self.free_below >= self.occupied_above:
             raise ValueError("free_below must be smaller than occupied_above")
+        if self.forget_s is not None and not self.keep_times:
+            raise ValueError("forget_s needs keep_times = true")
         return self
 
 
@@ -227,6 +241,9 @@ class Config(Section):
     dimensions: 3 for a voxel map, 2 for the grid of a floor (IST 2019).
     steps: sides of a cell along x, y and z where they differ (Valenti 2018, 7.1); `voxel_size` is then the largest.
     up: which axis of the world points up (`z`, `-y`, ...): pictures and heights follow it.
+    deadline_ms: milliseconds a frame may take; where frames take longer, `pace` says what is left out. Not set: none.
+    max_memory: bytes that the cells may take. when_full: frames that need more are refused (`refuse`); or the map is a
+        window of that size round the camera, which drops what it leaves (`roll`) or keeps it on disk (`spill`).
     """
 
     profile: str = "default"
@@ -239,6 +256,11 @@ class Config(Section):
     integrator: str = "projective"
     threads: int = Field(1, ge=1, le=256)
     pose_rigidity_tolerance: float = Field(5e-3, gt=0, le=0.1)
+    deadline_ms: float | None = Field(None, gt=0)
+    max_memory: int | None = Field(None, gt=0)
+    when_full: Literal["refuse", "roll", "spill"] = "refuse"
+    trust: TrustConfig = Field(default_factory=lambda: TrustConfig.model_validate({}))
+    pace: PaceConfig = Field(default_factory=lambda: PaceConfig.model_validate({}))
     sensor: SensorConfig = Field(default_factory=SensorConfig)
     noise: NoiseConfig = Field(default_factory=lambda: NoiseConfig.model_validate({}))
     depth: DepthConfig = Field(default_factory=lambda: DepthConfig.model_validate({}))

@@ -17,13 +17,17 @@ from stereovox.rigs import StereoPair, VirtualCamera
 
 
 class Reason(IntEnum):
-    """Why a depth pixel has no value. Only TOO_FAR may clear cells, and only up to the maximum range."""
+    """Why a depth pixel has no value. Only TOO_FAR may clear cells, and only up to the maximum range.
+
+    UNKNOWN: the source does not say why, as cameras that write 0 for everything.
+    """
 
     VALID = 0
     UNMATCHED = 1
     TOO_NEAR = 2
     TOO_FAR = 3
     MASKED = 4
+    UNKNOWN = 5
 
 
 class Viewpoint(NamedTuple):
@@ -41,7 +45,7 @@ class StereoFrame:
     left, right: (height, width) uint8 grey or (height, width, 3) uint8 RGB; as the lenses made them where `pair` has
         `eyes`, else rectified, of the size of its camera.
     T_world_sensor: (4, 4) float64, maps the rectified left optical frame into the world.
-    stamp_ns, name, fault, fault_detail: as in `Frame`.
+    stamp_ns, name, fault, fault_detail, sensor, pose_off_ns: as in `Frame`.
     """
 
     left: NDArray[np.uint8]
@@ -52,6 +56,8 @@ class StereoFrame:
     name: str = ""
     fault: str | None = None
     fault_detail: str = ""
+    sensor: str = ""
+    pose_off_ns: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +74,8 @@ class Frame:
     name: where the frame came from, for messages.
     fault: why the source could not deliver this frame (`unreadable`, `no_pose`); such a frame is refused and counted.
     fault_detail: the same in one line that names file, value and cure.
+    sensor: which of several sensors took it (a topic, a name in a rig); their times are watched one by one.
+    pose_off_ns: how far from the nearest measured pose this one was extrapolated; 0: measured, or between two.
     """
 
     depth: NDArray[np.generic]
@@ -79,6 +87,8 @@ class Frame:
     name: str = ""
     fault: str | None = None
     fault_detail: str = ""
+    sensor: str = ""
+    pose_off_ns: int = 0
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +109,7 @@ class Scan:
         that beam is free up to 2 m (its range: NaN).
     clear_from: (N,) float32 metres from which on a beam is known to be free up to `clear`; None: from the sensor on. A
         camera does not see what stands on the floor right before it.
-    stamp_ns, name, fault, fault_detail: as in `Frame`.
+    stamp_ns, name, fault, fault_detail, sensor, pose_off_ns: as in `Frame`.
     """
 
     ranges: NDArray[np.float32]
@@ -115,6 +125,8 @@ class Scan:
     name: str = ""
     fault: str | None = None
     fault_detail: str = ""
+    sensor: str = ""
+    pose_off_ns: int = 0
 
     @property
     def angles(self) -> NDArray[np.float64]:

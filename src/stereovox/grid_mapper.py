@@ -16,9 +16,9 @@ from stereovox.errors import FrameRefused
 from stereovox.frame import AnyFrame, Scan
 from stereovox.integrate.beams import make_beams
 from stereovox.integrate.scan_check import trusted
-from stereovox.mapper import UpdateReport
 from stereovox.maps.grid_map import GridMap
 from stereovox.maps.occupancy import OccupancyGrid
+from stereovox.update_report import UpdateReport
 
 
 class GridMapper:

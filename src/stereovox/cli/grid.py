@@ -42,8 +42,8 @@ if TYPE_CHECKING:
     from stereovox.frame import Frame, Scan
     from stereovox.grid_mapper import GridMapper
     from stereovox.localize.track import Track
-    from stereovox.mapper import UpdateReport
     from stereovox.sources.robot import Robot
+    from stereovox.update_report import UpdateReport
 
 EXAMPLE = "stereovox grid floor.bag --poses reference.yaml --out kinect.yaml"
 MODES = ("trinary", "scale", "raw")

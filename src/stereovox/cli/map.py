@@ -28,8 +28,9 @@ from stereovox.errors import SourceError, StereovoxError
 
 if TYPE_CHECKING:
     from stereovox.config import WindowConfig
-    from stereovox.mapper import Mapper, UpdateReport
+    from stereovox.mapper import Mapper
     from stereovox.sources import Stream
+    from stereovox.update_report import UpdateReport
 
 PATIENCE = 100
 """Frames of a live camera that a run may refuse before the first that it does not."""

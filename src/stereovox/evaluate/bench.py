@@ -19,7 +19,8 @@ from stereovox.evaluate.bench_table import LIBRARY
 from stereovox.evaluate.bench_table import format_table as format_table
 from stereovox.evaluate.peers import ImagePeer, Peer, PeerClass, blamed, find_peer
 from stereovox.frame import AnyFrame, Frame, Reason
-from stereovox.mapper import Mapper, UpdateReport
+from stereovox.mapper import Mapper
+from stereovox.update_report import UpdateReport
 
 MIN_FRAMES = 5
 """A peer does so many frames however long they take."""

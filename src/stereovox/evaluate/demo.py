@@ -19,8 +19,9 @@ from stereovox.evaluate.sightings import Sightings
 from stereovox.evaluate.summary import summarise
 from stereovox.evaluate.truth import Truth, exact_occupancy
 from stereovox.frame import Frame
-from stereovox.mapper import Mapper, UpdateReport
+from stereovox.mapper import Mapper
 from stereovox.sources.simulation import Simulation
+from stereovox.update_report import UpdateReport
 from stereovox.view.picture import picture
 
 MIN_FRAMES = 20

@@ -100,6 +100,9 @@ class VoxelMap:
         cells = np.clip(cells, self._rules.lowest, self._rules.highest)
         self._pool.put(coords, cells.astype(self._format.dtype, copy=False))
 
+    def check_room(self, evidence: Evidence) -> None:
+        """Raise FrameRefused `memory_full` where `evidence` needs more memory than the map may take."""
+
     def add(self, evidence: Evidence) -> int:
         """Add what one frame says; return the number of cells whose value changed."""
         if not (len(evidence.coords) or len(evidence.uniform)):

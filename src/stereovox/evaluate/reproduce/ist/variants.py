@@ -14,9 +14,10 @@ from stereovox.evaluate.summary import summarise
 from stereovox.frame import Frame
 from stereovox.grid_mapper import GridMapper
 from stereovox.localize.track import Track
-from stereovox.mapper import Mapper, UpdateReport
+from stereovox.mapper import Mapper
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.products.projection import project
+from stereovox.update_report import UpdateReport
 
 REACH = 5.0
 """Metres (III-C)."""

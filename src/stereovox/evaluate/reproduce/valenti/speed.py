@@ -14,8 +14,9 @@ from stereovox.evaluate.reproduce.valenti.mappers import Setting, config_of
 from stereovox.evaluate.reproduce.valenti.recordings import Drive
 from stereovox.evaluate.summary import percentiles
 from stereovox.frame import StereoFrame
-from stereovox.mapper import Mapper, UpdateReport
+from stereovox.mapper import Mapper
 from stereovox.sources.base import prefetch
+from stereovox.update_report import UpdateReport
 
 THREADS = 2
 MOST = 100

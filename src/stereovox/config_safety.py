@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which frames may change a map, for how long it counts as current, and what is left out where time is short."""
+
+from __future__ import annotations
+
+from pydantic import Field, model_validator
+
+from stereovox.config_robot import Section
+
+
+class TrustConfig(Section):
+    """Which frames may change the map, and for how long it then counts as current (docs/safety.md).
+
+    ordered: the stamps of each sensor must not go back; `false` for runs that repeat or reverse a recording.
+    clock_reset_s: a stamp that steps by more than this many seconds backwards is a clock that was reset.
+    max_speed_mps, max_turn_dps: metres and degrees a second beyond which a pose has jumped.
+    max_pose_off_s: seconds that a pose may be extrapolated.
+    settle_s: after a jump or a reset, frames that agree with each other for so long are believed again.
+    stale_s, lost_s: seconds without a trusted frame until the map is `stale` and until it is `lost`.
+    """
+
+    ordered: bool = True
+    clock_reset_s: float = Field(1.0, gt=0)
+    max_speed_mps: float = Field(40.0, gt=0)
+    max_turn_dps: float = Field(1500.0, gt=0)
+    max_pose_off_s: float = Field(0.05, ge=0)
+    settle_s: float = Field(1.0, ge=0)
+    stale_s: float = Field(0.5, gt=0)
+    lost_s: float = Field(5.0, gt=0)
+
+    @model_validator(mode="after")
+    def _ordered(self) -> TrustConfig:
+        if self.stale_s >= self.lost_s:
+            raise ValueError(f"stale_s {self.stale_s:g} must be smaller than lost_s {self.lost_s:g}")
+        return self
+
+
+class PaceConfig(Section):
+    """What is left out, step by step, where frames take longer than `deadline_ms` (docs/safety.md).
+
+    near_share: share of the maximum range that is left in the first step. stride: pixels along each side that become
+    one in the second, on top of `depth.downsample`. The third step is to leave out the frame.
+    """
+
+    near_share: float = Field(0.5, gt=0, le=1)
+    stride: int = Field(2, ge=1, le=16)

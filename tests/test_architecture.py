@@ -24,6 +24,7 @@ LAYERS = (
         "config_robot",
         "config_safety",
         "gate",
+        "health",
         "history",
         "update_report",
         "_jit",

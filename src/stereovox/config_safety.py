@@ -13,18 +13,20 @@ class TrustConfig(Section):
 
     ordered: the stamps of each sensor must not go back; `false` for runs that repeat or reverse a recording.
     clock_reset_s: a stamp that steps by more than this many seconds backwards is a clock that was reset.
+    max_gap_s: so is one that is more than this many seconds ahead.
     max_speed_mps, max_turn_dps: metres and degrees a second beyond which a pose has jumped.
     max_pose_off_s: seconds that a pose may be extrapolated.
-    settle_s: after a jump or a reset, frames that agree with each other for so long are believed again.
+    settle_s: after a jump or a reset, frames that agree with each other for so long are believed again; 0: at once.
     stale_s, lost_s: seconds without a trusted frame until the map is `stale` and until it is `lost`.
     """
 
     ordered: bool = True
-    clock_reset_s: float = Field(1.0, gt=0)
+    clock_reset_s: float = Field(1.0, gt=0, le=1e9)
+    max_gap_s: float = Field(3600.0, gt=0, le=1e9)
     max_speed_mps: float = Field(40.0, gt=0)
     max_turn_dps: float = Field(1500.0, gt=0)
-    max_pose_off_s: float = Field(0.05, ge=0)
-    settle_s: float = Field(1.0, ge=0)
+    max_pose_off_s: float = Field(0.05, ge=0, le=1e9)
+    settle_s: float = Field(1.0, ge=0, le=1e9)
     stale_s: float = Field(0.5, gt=0)
     lost_s: float = Field(5.0, gt=0)
 

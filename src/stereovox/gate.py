@@ -3,20 +3,149 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from math import acos, dist, inf, radians
+from operator import index
+from typing import NamedTuple
 
 from stereovox.config import Config
-from stereovox.frame import AnyFrame, DepthImage
+from stereovox.errors import FrameRefused
+from stereovox.frame import AnyFrame, DepthImage, Scan
+from stereovox.history import EARLIEST, LATEST, LONGEST_NAME, MOST_SENSORS, History, Seen, Streak
+
+SLACK_M, SLACK_RAD = 0.05, radians(2)
+"""Poses are noisy: so much is no jump, however short the time."""
+BACKWARDS, RESET, JUMP = "stamp_backwards", "clock_reset", "pose_jump"
+
+
+class Passed(NamedTuple):
+    """A frame that fits: of which sensor, where it stood, and what it was believed again after (mostly: nothing)."""
+
+    sensor: str
+    seen: Seen
+    after: str = ""
+
+    @property
+    def told(self) -> str:
+        """What a report says about it."""
+        return f"frames of '{self.sensor}' are believed again after {self.after}" if self.after else ""
 
 
 class Gate:
-    """Watches stamps and poses of each sensor. clock: nanoseconds now, for the age of what came last."""
+    """Watches stamps and poses of each sensor. What it remembers is in `history`, which is saved with the map.
 
-    def __init__(self, config: Config, clock: Callable[[], int]):
-        self._config, self._clock = config.trust, clock
+    A frame that jumped, or whose clock was reset, is refused; so are those after it that belong to it. When they have
+    agreed with each other for `trust.settle_s` (by their stamps) they are believed again: a tracker that found itself
+    anew is not refused for ever. A frame belongs to the refused ones, and not to the trusted one, where it would have
+    to move slower from there. One that fits to the trusted one ends the waiting of the others.
+    """
 
-    def check(self, frame: AnyFrame, image: DepthImage) -> None:
-        """Raise FrameRefused where the frame does not fit; remembers nothing of it."""
+    def __init__(self, config: Config, history: History):
+        trust = config.trust
+        self._history, self._trust = history, trust
+        self._turn = radians(trust.max_turn_dps)
+        off, reset, ahead, settle = trust.max_pose_off_s, trust.clock_reset_s, trust.max_gap_s, trust.settle_s
+        self._off_ns, self._reset_ns, self._ahead_ns, self._settle_ns = (
+            round(1e9 * seconds) for seconds in (off, reset, ahead, settle)
+        )
 
-    def took(self, frame: AnyFrame, image: DepthImage) -> None:
+    def check(self, frame: AnyFrame | Scan, image: DepthImage | Scan) -> Passed:
+        """Return what `took` is to remember once the map has changed.
+
+        image: holds the frame's pose, exactly rigid. Raises FrameRefused: `bad_stamp`, `bad_sensor`,
+        `pose_extrapolated`, `stamp_backwards`, `clock_reset`, `pose_jump`. Of a refused frame nothing is remembered but
+        that it may agree with the next one.
+        """
+        sensor, stamp_ns = self._told(frame)
+        numbers = image.T_world_sensor.ravel().tolist()
+        now = Seen(stamp_ns, tuple(numbers[:12]))
+        trusted = self._history.trusted.get(sensor)
+        if trusted is None:
+            if len(self._history.trusted) >= MOST_SENSORS:
+                raise FrameRefused("bad_sensor", f"{_name(frame)}: more than {MOST_SENSORS} sensors; name fewer")
+            return Passed(sensor, now)
+        why, haste = self._against(trusted, now)
+        waiting = self._history.waiting.get(sensor)
+        if waiting is None and not why:
+            return Passed(sensor, now)
+        return self._settled(frame, Passed(sensor, now), trusted, (why, haste), waiting)
+
+    def took(self, passed: Passed) -> None:
         """Remember a frame that the map took in."""
+        self._history.trusted[passed.sensor] = passed.seen
+        self._history.waiting.pop(passed.sensor, None)
+        if passed.after:
+            self._history.settled[passed.after] += 1
+
+    def _told(self, frame: AnyFrame | Scan) -> tuple[str, int]:
+        """Return sensor and stamp; raise FrameRefused where they, or how old the pose is, cannot be used."""
+        try:
+            stamp_ns, off_ns = index(frame.stamp_ns), abs(index(frame.pose_off_ns))
+        except TypeError:
+            stamp_ns, off_ns = LATEST + 1, 0
+        if not EARLIEST <= stamp_ns <= LATEST:
+            raise FrameRefused("bad_stamp", f"{_name(frame)}: stamp_ns and pose_off_ns must be int64 nanoseconds")
+        if off_ns > self._off_ns:
+            limit = f"trust.max_pose_off_s {self._trust.max_pose_off_s:g}"
+            said = f"{_name(frame)}: its pose is extrapolated by {off_ns / 1e9:.3f} s ({limit}); give poses in time"
+            raise FrameRefused("pose_extrapolated", said)
+        if not isinstance(frame.sensor, str) or len(frame.sensor) > LONGEST_NAME:
+            raise FrameRefused("bad_sensor", f"{_name(frame)}: sensor is no text of at most {LONGEST_NAME} letters")
+        return frame.sensor or ("scan" if isinstance(frame, Scan) else "camera"), stamp_ns
+
+    def _against(self, before: Seen, now: Seen) -> tuple[str, float]:
+        """Return why `now` cannot follow `before` ("": it can), and its speed as a share of what is allowed."""
+        ahead_ns = now.stamp_ns - before.stamp_ns
+        if self._trust.ordered and (ahead_ns < 0 or ahead_ns > self._ahead_ns):
+            return (BACKWARDS if -self._reset_ns <= ahead_ns < 0 else RESET), inf
+        if ahead_ns <= 0:
+            return "", 0.0  # taken at one time, as far as is known: no speed can be said
+        metres, angle = _step(before.pose, now.pose)
+        allowed = 1e-9 * ahead_ns
+        moved, turned = (metres - SLACK_M) / self._trust.max_speed_mps, (angle - SLACK_RAD) / self._turn
+        haste = max(moved, turned) / allowed
+        return (JUMP if haste > 1 else ""), haste
+
+    def _settled(
+        self, frame: AnyFrame | Scan, passed: Passed, trusted: Seen, found: tuple[str, float], waiting: Streak | None
+    ) -> Passed:
+        """Return the frame where it may be believed, although it does not fit or others wait; else refuse it."""
+        (why, haste), now = found, passed.seen
+        follows, slower = False, False
+        if waiting is not None:
+            unfit, their_haste = self._against(waiting.last, now)
+            follows, slower = not unfit, their_haste < haste
+        if not why and not (follows and slower):
+            return passed
+        if waiting is not None and follows:
+            why, since_ns = waiting.why, waiting.since_ns
+        else:
+            since_ns = now.stamp_ns
+        detail = f"{_name(frame)}: {self._detail(why, trusted, now)}"
+        if why == BACKWARDS:
+            raise FrameRefused(why, detail)
+        if now.stamp_ns - since_ns >= self._settle_ns:
+            return passed._replace(after=why)
+        self._history.waiting[passed.sensor] = Streak(why, since_ns, now)
+        raise FrameRefused(why, detail)
+
+    def _detail(self, why: str, before: Seen, now: Seen) -> str:
+        seconds = (now.stamp_ns - before.stamp_ns) / 1e9
+        if why == BACKWARDS:
+            return f"taken {-seconds:.6g} s before the last trusted one; put frames in order or set trust.ordered=false"
+        until = f"believed again once frames agree for {self._trust.settle_s:g} s"
+        if why == RESET:
+            return f"its clock is {seconds:+.6g} s off the last trusted frame's, it was reset; {until}"
+        metres, angle = _step(before.pose, now.pose)
+        return f"the pose jumped by {metres:.3g} m and {angle * 57.29578:.3g} degrees in {seconds:.3g} s; {until}"
+
+
+def _step(before: tuple[float, ...], now: tuple[float, ...]) -> tuple[float, float]:
+    """Return how far apart two poses are, in metres and radians."""
+    a, b, c, x, d, e, f, y, g, h, i, z = before
+    p, q, r, u, s, t, k, v, m, n, o, w = now
+    cosine = (a * p + b * q + c * r + d * s + e * t + f * k + g * m + h * n + i * o - 1) / 2
+    return dist((x, y, z), (u, v, w)), acos(min(1.0, max(-1.0, cosine)))
+
+
+def _name(frame: AnyFrame | Scan) -> str:
+    return frame.name or f"frame at {frame.stamp_ns} ns"

@@ -6,14 +6,17 @@ A depth image becomes a scan first.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from time import perf_counter
+from time import monotonic_ns, perf_counter
 from typing import Any
 
 from stereovox.config import Config, load_config
 from stereovox.depth import DepthPath
 from stereovox.errors import FrameRefused
 from stereovox.frame import AnyFrame, Scan
+from stereovox.gate import Gate
+from stereovox.health import FULL, Health, Watch
 from stereovox.integrate.beams import make_beams
 from stereovox.integrate.scan_check import trusted
 from stereovox.maps.grid_map import GridMap
@@ -26,7 +29,7 @@ class GridMapper:
 
     Poses must be in the map's frame: `Track.corrected` turns those of the odometry into such. Give a profile name, a
     TOML file or a Config; settings by name on top (`voxel_size=0.02`, `**{"grid.update": "every"}`).
-    `resume` is a map to go on with, in its own frame. Raises ConfigError for bad settings.
+    `resume` is a map to go on with, in its own frame. `clock`: nanoseconds now. Raises ConfigError for bad settings.
     """
 
     def __init__(
@@ -34,27 +37,38 @@ class GridMapper:
         profile: str | Path | Config = "default",
         *,
         resume: GridMap | OccupancyGrid | None = None,
+        clock: Callable[[], int] = monotonic_ns,
         **overrides: Any,
     ):
         self.config = load_config(profile, **overrides)
         self._depth = DepthPath(self.config)
         self._beams = make_beams(self.config)
         self.map = self._made(resume)
+        self._gate = Gate(self.config, self.map.history)
+        self._clock, self._watch = clock, Watch(self.config, clock)
 
     def add(self, seen: Scan | AnyFrame) -> UpdateReport:
         """Take one scan or depth image into the map and tell what it did; `depth_ms` is what the scan took."""
-        start = perf_counter()
+        arrived, start = self._clock(), perf_counter()
         try:
             scan = trusted(seen if isinstance(seen, Scan) else self._scan_of(seen), self.config)
+            passed = self._gate.check(seen, scan)
             between = perf_counter()
             evidence = self._beams.evidence(scan, self.map.origin)
         except FrameRefused as refused:
-            self.map.frames_refused += 1
+            self.map.history.refuse(refused.reason)
+            self._watch.refused(arrived, refused.reason)
             return UpdateReport(refused=refused.reason, detail=str(refused))
         cells = self.map.add(evidence)
-        self.map.frames += 1
+        self.map.history.frames += 1
+        self._gate.took(passed)
+        self._watch.took(arrived, passed.sensor, passed.seen.stamp_ns, FULL)
         done = perf_counter()
-        return UpdateReport(1e3 * (between - start), 1e3 * (done - between), cells)
+        return UpdateReport(1e3 * (between - start), 1e3 * (done - between), cells, detail=passed.told)
+
+    def health(self, now_ns: int | None = None) -> Health:
+        """Return how current the map is; `now_ns`: by `clock`, None for now."""
+        return self._watch.health(now_ns)
 
     def occupancy(self) -> OccupancyGrid:
         """Return the map so far as plain numbers, as ROS publishes it."""

@@ -11,7 +11,8 @@ from typing import Any
 from stereovox.config import Config, load_config
 from stereovox.errors import FrameRefused
 from stereovox.frame import AnyFrame
-from stereovox.gate import Gate
+from stereovox.gate import Gate, Passed
+from stereovox.health import Health, Watch
 from stereovox.maps import VoxelMap, make_map
 from stereovox.pace import Pace
 from stereovox.update_report import UpdateReport as UpdateReport
@@ -37,29 +38,40 @@ class Mapper:
     ):
         self.config = load_config(profile, **overrides)
         self._pace = Pace(self.config)
-        self._gate = Gate(self.config, clock)
-        self.map = make_map(self.config, resume, tiles)  # last: it may leave tiles on the disk
+        self._clock, self._watch = clock, Watch(self.config, clock)
+        self.map = make_map(self.config, resume, tiles)  # it may leave tiles on the disk: what could fail comes before
+        self._gate = Gate(self.config, self.map.history)
 
     def add(self, frame: AnyFrame) -> UpdateReport:
         """Take one frame into the map and tell what it did."""
-        start = perf_counter()
+        arrived, start = self._clock(), perf_counter()
         try:
             way = self._pace.way()
             matched = way.depth.matched(frame)
             between = perf_counter()
             image = way.depth.image(matched)
-            self._gate.check(frame, image)
+            passed = self._gate.check(frame, image)
             prepared = perf_counter()
             evidence = way.integrator.evidence(image)
             self.map.check_room(evidence)
         except FrameRefused as refused:
-            self.map.frames_refused += 1
+            self.map.history.refuse(refused.reason)
+            self._watch.refused(arrived, refused.reason)
             return UpdateReport(refused=refused.reason, detail=str(refused))
         self.map.look_from(image.viewpoint)
         cells = self.map.add(evidence)
-        self.map.frames += 1
-        self._gate.took(frame, image)
+        self._remember(passed, way.name, arrived)
         done = perf_counter()
         match_ms, depth_ms, integrate_ms = 1e3 * (between - start), 1e3 * (prepared - between), 1e3 * (done - prepared)
         self._pace.took(way, match_ms + depth_ms + integrate_ms)
-        return UpdateReport(depth_ms, integrate_ms, cells, match_ms=match_ms, way=way.name)
+        return UpdateReport(depth_ms, integrate_ms, cells, detail=passed.told, match_ms=match_ms, way=way.name)
+
+    def health(self, now_ns: int | None = None) -> Health:
+        """Return how current the map is; `now_ns`: by `clock`, None for now."""
+        return self._watch.health(now_ns)
+
+    def _remember(self, passed: Passed, way: str, arrived_ns: int) -> None:
+        self.map.history.frames += 1
+        self.map.history.ways[way] += 1
+        self._gate.took(passed)
+        self._watch.took(arrived_ns, passed.sensor, passed.seen.stamp_ns, way)

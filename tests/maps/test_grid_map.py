@@ -188,7 +188,8 @@ def test_an_empty_map_says_so():
 def test_saved_and_loaded_it_is_the_same(tmp_path, cell):
     grid_map = GridMap(load_config(**{**EVEN, "map.cell": cell}), (1.0, 2.0, 3.0))
     grid_map.add(evidence_of({(i * 7, -i * 31): 10 * i + 100 for i in range(40)}))
-    grid_map.frames, grid_map.frames_refused, grid_map.recording = 5, 2, "floor"
+    grid_map.frames, grid_map.recording = 5, "floor"
+    grid_map.history.refused.update({"no_pose": 2})
     grid_map.save(tmp_path / "floor.npz")
     loaded = load_grid(tmp_path / "floor.npz")
     assert known(loaded) == known(grid_map)

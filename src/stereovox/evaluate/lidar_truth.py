@@ -19,6 +19,7 @@ from stereovox.evaluate.crossed import crossed_cells
 from stereovox.evaluate.in_view import blocks_in, project, view_volume
 from stereovox.frame import Viewpoint
 from stereovox.geometry import inverse, transform_points
+from stereovox.history import History
 from stereovox.maps import VoxelMap
 from stereovox.maps.blocks import SIDE, BlockPool
 from stereovox.sources import parse_slice
@@ -127,8 +128,7 @@ class _Truth:
         if not counts.frames:
             raise SourceError(f"{self.source.name}: not one lidar scan can be used ({counts.first_refusal})")
         voxel_map = VoxelMap(self.config)
-        voxel_map.frames, voxel_map.frames_refused = counts.frames, counts.refused.total()
-        voxel_map.recording = self.source.name
+        voxel_map.history = History(counts.frames, Counter(counts.refused), recording=self.source.name)
         if self._last is not None:
             voxel_map.look_from(self._last)
         coords, cells = self._cells()

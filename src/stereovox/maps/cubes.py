@@ -33,6 +33,5 @@ def in_cubes(voxel_map: VoxelMap) -> VoxelMap:
     config = load_config(voxel_map.config, steps=None, voxel_size=side)
     empty = np.empty((0, 3), np.int64)
     cubes = VoxelMap.from_cells(config, np.concatenate([empty, *indices]), np.concatenate([[], *values]))
-    cubes.frames, cubes.frames_refused = voxel_map.frames, voxel_map.frames_refused
-    cubes.recording, cubes.viewpoint = voxel_map.recording, voxel_map.viewpoint
+    cubes.history, cubes.viewpoint = voxel_map.history.copied(), voxel_map.viewpoint
     return cubes

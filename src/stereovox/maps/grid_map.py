@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from stereovox import planar
 from stereovox.config import Config
 from stereovox.errors import ConfigError, StereovoxError
+from stereovox.history import History, WithHistory
 from stereovox.maps import _grid
 from stereovox.maps.blocks import BlockPool
 from stereovox.maps.cell_format import CellFormat, CellRules
@@ -26,23 +27,20 @@ MOST_PICTURED = 2**29
 """Cells of the largest picture; the map itself holds only what was seen and may reach farther."""
 
 
-class GridMap:
+class GridMap(WithHistory):
     """A sparse 2-D occupancy map: tiles of 64x64 cells, made where a scan says something.
 
     Cell (i, j) covers `[i, i + 1) x [j, j + 1)` times `config.voxel_size` in the grid's own frame, which stands at
     `origin` (x, y, yaw) in the map's. Points and poses are in the map's frame. Cells, their states and the settings
     `config.map` mean what they do in a `VoxelMap`, but for the prior: that is `config.grid.prior`.
-    `frames` counts the scans and images that are in it, `frames_refused` those that were offered and refused;
-    `recording` is the name of what they came from, if known.
+    `history` is what it remembers of the scans and images that made it.
     """
 
     def __init__(self, config: Config, origin: ArrayLike = (0.0, 0.0, 0.0)):
         self.config = config
         self.voxel_size = config.voxel_size
         self.origin = np.array(origin, float).reshape(3)
-        self.frames = 0
-        self.frames_refused = 0
-        self.recording = ""
+        self.history = History()
         self._rules = CellRules(config.map.model_copy(update={"prior": config.grid.prior}))
         self._format = self._rules.format
         self._percent = Percent(self._rules)

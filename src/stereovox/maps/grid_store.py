@@ -14,6 +14,7 @@ import numpy as np
 
 from stereovox.config import load_config
 from stereovox.errors import MapFileError
+from stereovox.history import History
 from stereovox.maps.grid_evidence import CELLS
 
 if TYPE_CHECKING:
@@ -57,8 +58,7 @@ def load_grid(path: str | Path) -> GridMap:
         if about["format"] != FORMAT or about["version"] != VERSION:
             raise ValueError(f"format {about['format']} {about['version']}, not {FORMAT} {VERSION}")
         grid_map = GridMap(load_config(about["config"]), about["origin"])
-        grid_map.frames, grid_map.frames_refused = int(about["frames"]), int(about["frames_refused"])
-        grid_map.recording = str(about["recording"])
+        grid_map.history = History.loaded(about)
         coords, cells = parts["coords"], parts["cells"]
         wanted = ((len(coords), 3), np.int32), ((len(coords), CELLS), grid_map.cell_format.dtype)
         for array, (shape, dtype) in zip((coords, cells), wanted, strict=True):
@@ -84,9 +84,7 @@ def _about(grid_map: GridMap) -> dict[str, Any]:
         "format": FORMAT,
         "version": VERSION,
         "origin": grid_map.origin.tolist(),
-        "frames": grid_map.frames,
-        "frames_refused": grid_map.frames_refused,
-        "recording": grid_map.recording,
+        **grid_map.history.saved(),
         "config": grid_map.config.model_dump(),
     }
 

@@ -234,8 +234,7 @@ class RollingMap(VoxelMap):
 
 
 def _copy_history(earlier: VoxelMap, later: VoxelMap) -> None:
-    later.frames, later.frames_refused = earlier.frames, earlier.frames_refused
-    later.recording, later.viewpoint = earlier.recording, earlier.viewpoint
+    later.history, later.viewpoint = earlier.history.copied(), earlier.viewpoint
 
 
 def _check_memory(needed: int, config: Config) -> None:

@@ -25,6 +25,7 @@ from stereovox.cameras import DepthCorrection, PinholeCamera
 from stereovox.config import load_config
 from stereovox.errors import MapFileError
 from stereovox.frame import Viewpoint
+from stereovox.history import History
 from stereovox.maps.blocks import CELLS
 
 if TYPE_CHECKING:
@@ -88,8 +89,7 @@ def load_map(path: str | Path) -> VoxelMap:
         if isinstance(cells_of := manifest["config"].get("map"), dict):
             cells_of.setdefault("prior", 0.5)  # that of maps from before there was one
         voxel_map = VoxelMap(load_config(manifest["config"]))
-        voxel_map.frames, voxel_map.frames_refused = int(manifest["frames"]), int(manifest["frames_refused"])
-        voxel_map.recording = str(manifest["recording"])
+        voxel_map.history = History.loaded(manifest)
         voxel_map.viewpoint = _viewpoint_from(manifest.get("viewpoint"))
         voxel_map.window_state = manifest.get("window")
         coords, cells = _read_arrays(folder / str(manifest["data"]), int(manifest["blocks"]), voxel_map)
@@ -146,9 +146,7 @@ def _manifest(voxel_map: VoxelMap, data: str, blocks: int, checksum: list[int]) 
     return {
         "format": FORMAT,
         "version": VERSION,
-        "frames": voxel_map.frames,
-        "frames_refused": voxel_map.frames_refused,
-        "recording": voxel_map.recording,
+        **voxel_map.history.saved(),
         "blocks": blocks,
         "data": data,
         "checksum": checksum,

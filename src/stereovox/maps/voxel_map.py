@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from stereovox.config import Config
 from stereovox.errors import ConfigError
 from stereovox.frame import Viewpoint
+from stereovox.history import History, WithHistory
 from stereovox.maps import _add, queries
 from stereovox.maps.blocks import CELLS, SIDE, StoredCells
 from stereovox.maps.cell_format import CellFormat, CellRules
@@ -24,23 +25,20 @@ from stereovox.maps.queries import INDEX_LIMIT as INDEX_LIMIT
 from stereovox.maps.queries import Asked, NearestCells, RayHits
 
 
-class VoxelMap:
+class VoxelMap(WithHistory):
     """A sparse occupancy map in the world frame (z up unless the recording says otherwise).
 
     Cell i covers [i, i + 1) * voxel_size on each axis, or of `config.cell` where its sides differ. A cell without
     evidence is unknown: log-odds 0, probability 0.5. With evidence it is free (p < free_below), occupied
     (p > occupied_above) or tentative between them.
-    `config` holds the settings the map was made with, `frames` the number of frames that are in it, `frames_refused`
-    the number that were offered and refused, `recording` the name of what they came from, if known, `viewpoint` where
-    the camera stood last, `window_state` where its window was, if it had one.
+    `config` holds the settings the map was made with, `history` what it remembers of its frames, `viewpoint` where the
+    camera stood last, `window_state` where its window was, if it had one.
     """
 
     def __init__(self, config: Config):
         self.config = config
         self.voxel_size = config.voxel_size
-        self.frames = 0
-        self.frames_refused = 0
-        self.recording = ""
+        self.history = History()
         self.viewpoint: Viewpoint | None = None
         self.window_state: dict[str, Any] | None = None
         self._rules = CellRules(config.map)

@@ -1,0 +1,176 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a map remembers of the frames that made it: how many, which were refused and why, and whom it trusted last."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+MOST_SENSORS = 64
+"""Sensors that one map tells apart."""
+MOST_REASONS = 256
+"""Words that refusals are counted by; further ones count as OTHERS."""
+OTHERS = "others"
+NOT_TOLD = "not_told"
+"""How refusals are counted that a map from before reasons were saved only tells the number of."""
+LONGEST_NAME = 256
+EARLIEST, LATEST = -(2**63), 2**63 - 1
+"""Stamps in int64 nanoseconds."""
+FARTHEST = 1e7
+"""No number of a pose is larger; `depth.prepare` refuses positions beyond a tenth of it."""
+
+
+class Seen(NamedTuple):
+    """Where a sensor was and when: pose is the 12 numbers of the upper three rows of T_world_sensor, row by row."""
+
+    stamp_ns: int
+    pose: tuple[float, ...]
+
+
+class Streak(NamedTuple):
+    """Refused frames of one sensor that agree with each other: why the first one was, its stamp, and the last one."""
+
+    why: str
+    since_ns: int
+    last: Seen
+
+
+@dataclass
+class History:
+    """What a map remembers of its frames; saved and loaded with it, so that a run may stop and go on anywhere.
+
+    frames: how many are in the map. refused: how many were offered and refused, by reason. settled: how often frames
+    were believed again after a jump or a reset, by its reason. ways: how many frames were looked at how thoroughly, by
+    the name of the way. recording: the name of what the frames came from, if known.
+    trusted: the last trusted frame of each sensor. waiting: refused frames that may yet be believed, by sensor.
+    """
+
+    frames: int = 0
+    refused: Counter[str] = field(default_factory=Counter)
+    settled: Counter[str] = field(default_factory=Counter)
+    ways: Counter[str] = field(default_factory=Counter)
+    recording: str = ""
+    trusted: dict[str, Seen] = field(default_factory=dict)
+    waiting: dict[str, Streak] = field(default_factory=dict)
+
+    def refuse(self, reason: str) -> None:
+        """Count one refused frame."""
+        reason = str(reason)[:LONGEST_NAME]
+        self.refused[reason if reason in self.refused or len(self.refused) < MOST_REASONS else OTHERS] += 1
+
+    def copied(self) -> History:
+        """Return a history that goes on by itself."""
+        return copy.deepcopy(self)
+
+    def saved(self) -> dict[str, Any]:
+        """Return what `loaded` reads, as plain values for JSON."""
+        return {
+            "frames": self.frames,
+            "frames_refused": self.refused.total(),
+            "recording": self.recording,
+            "history": {
+                "refused": dict(self.refused),
+                "settled": dict(self.settled),
+                "ways": dict(self.ways),
+                "trusted": {name: _seen_to(seen) for name, seen in self.trusted.items()},
+                "waiting": {
+                    name: {"why": streak.why, "since_ns": streak.since_ns, **_seen_to(streak.last)}
+                    for name, streak in self.waiting.items()
+                },
+            },
+        }
+
+    @classmethod
+    def loaded(cls, saved: dict[str, Any]) -> History:
+        """Return the history that a manifest tells; maps from before there was one have counts only.
+
+        Raises KeyError, TypeError or ValueError for what cannot have been saved.
+        """
+        frames, refused = _whole(saved["frames"], "frames"), _whole(saved["frames_refused"], "frames_refused")
+        recording = str(saved["recording"])
+        told = saved.get("history")
+        if told is None:
+            return cls(frames, Counter({NOT_TOLD: refused} if refused else {}), recording=recording)
+        counts = (_counts(told[name], name) for name in ("refused", "settled", "ways"))
+        trusted = {name: _seen_from(seen) for name, seen in _sensors(told["trusted"]).items()}
+        waiting = {name: _streak_from(streak) for name, streak in _sensors(told["waiting"]).items()}
+        if not waiting.keys() <= trusted.keys():
+            raise ValueError("history.waiting names a sensor that was never trusted")
+        history = cls(frames, *counts, recording, trusted, waiting)
+        if history.refused.total() != refused:
+            raise ValueError(f"frames_refused is {refused}, its reasons add up to {history.refused.total()}")
+        return history
+
+
+class WithHistory:
+    """What every map tells of the frames that made it."""
+
+    history: History
+
+    @property
+    def frames(self) -> int:
+        """Frames that are in the map."""
+        return self.history.frames
+
+    @frames.setter
+    def frames(self, number: int) -> None:
+        self.history.frames = number
+
+    @property
+    def frames_refused(self) -> int:
+        """Frames that were offered and refused; `history.refused` tells why."""
+        return self.history.refused.total()
+
+    @property
+    def recording(self) -> str:
+        """Name of what the frames came from, if known."""
+        return self.history.recording
+
+    @recording.setter
+    def recording(self, name: str) -> None:
+        self.history.recording = name
+
+
+def _seen_to(seen: Seen) -> dict[str, Any]:
+    return {"stamp_ns": seen.stamp_ns, "pose": list(seen.pose)}
+
+
+def _seen_from(saved: Any) -> Seen:
+    pose = saved["pose"]
+    if not isinstance(pose, list) or len(pose) != 12 or not all(isinstance(x, float | int) for x in pose):
+        raise ValueError("history: a pose is not 12 numbers")
+    numbers = tuple(map(float, pose))
+    if not all(math.isfinite(x) and abs(x) <= FARTHEST for x in numbers):
+        raise ValueError("history: a pose holds NaN, infinity or absurdly large numbers")
+    return Seen(_whole(saved["stamp_ns"], "history: stamp_ns", EARLIEST), numbers)
+
+
+def _streak_from(saved: Any) -> Streak:
+    return Streak(_name(saved["why"]), _whole(saved["since_ns"], "history: since_ns", EARLIEST), _seen_from(saved))
+
+
+def _sensors(saved: Any) -> dict[str, Any]:
+    if not isinstance(saved, dict) or len(saved) > MOST_SENSORS:
+        raise ValueError(f"history: sensors are no table of at most {MOST_SENSORS}")
+    return {_name(name): value for name, value in saved.items()}
+
+
+def _counts(saved: Any, what: str) -> Counter[str]:
+    if not isinstance(saved, dict) or len(saved) > MOST_REASONS + 1:
+        raise ValueError(f"history.{what} is no table of at most {MOST_REASONS} counts")
+    return Counter({_name(name): _whole(number, f"history.{what}") for name, number in saved.items()})
+
+
+def _name(value: Any) -> str:
+    if not isinstance(value, str) or len(value) > LONGEST_NAME:
+        raise ValueError(f"history: a name is no text of at most {LONGEST_NAME} letters")
+    return value
+
+
+def _whole(value: Any, what: str, least: int = 0) -> int:
+    if type(value) is not int or not least <= value <= LATEST:
+        raise ValueError(f"{what} is no whole number from {least} on")
+    return value

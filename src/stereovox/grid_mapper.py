@@ -48,6 +48,7 @@ class GridMapper:
             scan = trusted(seen if isinstance(seen, Scan) else self._scan_of(seen), self.config)
             between = perf_counter()
             evidence = self._beams.evidence(scan, self.map.origin)
+            self.map.check_room(evidence)
         except FrameRefused as refused:
             self.map.frames_refused += 1
             return UpdateReport(refused=refused.reason, detail=str(refused))

@@ -13,7 +13,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ByteSize, ConfigDict, Field, ValidationError, model_validator
 
 from stereovox.config_robot import AmclConfig, GridConfig, ScanConfig, Section, SlamConfig
 from stereovox.config_safety import PaceConfig, TrustConfig
@@ -242,8 +242,9 @@ class Config(Section):
     steps: sides of a cell along x, y and z where they differ (Valenti 2018, 7.1); `voxel_size` is then the largest.
     up: which axis of the world points up (`z`, `-y`, ...): pictures and heights follow it.
     deadline_ms: milliseconds a frame may take; where frames take longer, `pace` says what is left out. Not set: none.
-    max_memory: bytes that the cells may take. when_full: frames that need more are refused (`refuse`); or the map is a
-        window of that size round the camera, which drops what it leaves (`roll`) or keeps it on disk (`spill`).
+    max_memory: bytes that the cells may take, as a number or like "500 MB". when_full: frames that need more are
+        refused (`refuse`); or the map is a window of that size round the camera, which drops what it leaves (`roll`) or
+        keeps it on disk (`spill`).
     """
 
     profile: str = "default"
@@ -257,7 +258,7 @@ class Config(Section):
     threads: int = Field(1, ge=1, le=256)
     pose_rigidity_tolerance: float = Field(5e-3, gt=0, le=0.1)
     deadline_ms: float | None = Field(None, gt=0)
-    max_memory: int | None = Field(None, gt=0)
+    max_memory: ByteSize | None = Field(None, gt=0, le=10**12)
     when_full: Literal["refuse", "roll", "spill"] = "refuse"
     trust: TrustConfig = Field(default_factory=lambda: TrustConfig.model_validate({}))
     pace: PaceConfig = Field(default_factory=lambda: PaceConfig.model_validate({}))
@@ -297,6 +298,8 @@ class Config(Section):
             )
         if self.min_range >= self.max_range:
             raise ValueError(f"min_range {self.min_range:g} must be smaller than max_range {self.max_range:g}")
+        if self.dimensions == 2 and (self.map.keep_times or (self.max_memory and self.when_full != "refuse")):
+            raise ValueError('a floor\'s grid has no map.keep_times, and when_full can only be "refuse"')
         if self.max_range / self.voxel_size > MOST_CELLS:
             raise ValueError(
                 f"max_range {self.max_range} spans more than {MOST_CELLS} cells of {self.voxel_size}; use larger cells"

@@ -55,6 +55,7 @@ class GridMapper:
             passed = self._gate.check(seen, scan)
             between = perf_counter()
             evidence = self._beams.evidence(scan, self.map.origin)
+            self.map.check_room(evidence)
         except FrameRefused as refused:
             self.map.history.refuse(refused.reason)
             self._watch.refused(arrived, refused.reason)

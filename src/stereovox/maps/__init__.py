@@ -14,10 +14,12 @@ __all__ = ["State", "VoxelMap", "load_map", "make_map"]
 
 
 def make_map(config: Config, resume: VoxelMap | None = None, tiles: Path | None = None) -> VoxelMap:
-    """Return the map that `config` asks for: unbounded, or in a window that moves with the camera.
+    """Return the map that `config` asks for: unbounded, or in a window that moves with the camera, or within
+    `max_memory`.
 
     resume: a map to go on with. tiles: folder for the cells that leave a window, a temporary one by default; it is not
-    there where this raises. Raises ConfigError when the settings would change what the cells of `resume` mean.
+    there where this raises. Raises ConfigError when the settings would change what the cells of `resume` mean, and when
+    something does not fit into `max_memory`.
     """
     if config.dimensions == 2:
         raise ConfigError(
@@ -25,8 +27,15 @@ def make_map(config: Config, resume: VoxelMap | None = None, tiles: Path | None 
         )
     if resume is not None:
         resume.check_cells(config)  # before anything lies on the disk
-    if config.window.size is None:
-        return VoxelMap(config) if resume is None else resume.with_config(config)
+    try:
+        return _made(config, resume, tiles)
+    except MemoryError:
+        raise ConfigError("this machine has no room for the map; set a smaller max_memory or window.size") from None
+
+
+def _made(config: Config, resume: VoxelMap | None, tiles: Path | None) -> VoxelMap:
+    if config.window.size is None and (config.max_memory is None or config.when_full == "refuse"):
+        return _without_window(config, resume)
     from stereovox.maps.rolling import RollingMap
 
     rolling = RollingMap(config, tiles)
@@ -37,3 +46,14 @@ def make_map(config: Config, resume: VoxelMap | None = None, tiles: Path | None 
             rolling.close()
             raise
     return rolling
+
+
+def _without_window(config: Config, resume: VoxelMap | None) -> VoxelMap:
+    if config.max_memory is None:
+        return VoxelMap(config) if resume is None else resume.with_config(config)
+    from stereovox.maps.capped import CappedMap
+
+    capped = CappedMap(config)
+    if resume is not None:
+        capped.go_on_with(resume)
+    return capped

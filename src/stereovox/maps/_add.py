@@ -86,12 +86,15 @@ def settle(table, coords, values, count, wanted, floored, unknown, lowest):
 
 
 @kernel
-def rescale(values, factor, shift, out):
-    """Write `values` (n, 512) times `factor`, plus `shift`, rounded down to whole numbers, to `out` (n, 512) int16."""
+def rescale(values, factor, shift, most, out):
+    """Write `values` (n, 512) times `factor`, plus `shift`, rounded down to whole numbers, to `out` (n, 512) int16.
+
+    None is more than `most`.
+    """
     for i in range(values.shape[0]):
         for c in range(512):
             value = np.float32(values[i, c])
-            out[i, c] = np.int16(np.floor(value * factor + shift) if value != ZERO else ZERO)
+            out[i, c] = np.int16(min(np.floor(value * factor + shift), most) if value != ZERO else ZERO)
 
 
 @cell

@@ -41,7 +41,7 @@ class BlockPool:
         self.fill = fill
         self.count = np.zeros(1, np.int64)
         self.coords = np.zeros((capacity, 3), np.int32)
-        self.values = np.full((capacity, cells), fill, dtype) if fill else np.zeros((capacity, cells), dtype)
+        self.values = _filled((capacity, cells), fill, dtype)
         self.table = np.full(table_size(capacity), -1, np.int32)
 
     def __len__(self) -> int:
@@ -83,6 +83,11 @@ def table_size(capacity: int) -> int:
 
 
 def _grown(array: NDArray, capacity: int, used: int, fill: int) -> NDArray:
-    grown = np.full((capacity, *array.shape[1:]), fill, array.dtype)
+    grown = _filled((capacity, *array.shape[1:]), fill, array.dtype)
     grown[:used] = array[:used]
     return grown
+
+
+def _filled(shape: tuple[int, ...], fill: int, dtype: DTypeLike) -> NDArray:
+    """Return an array of `fill`; the system gives the memory of zeros only when it is first used."""
+    return np.full(shape, fill, dtype) if fill else np.zeros(shape, dtype)

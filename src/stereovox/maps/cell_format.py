@@ -107,6 +107,19 @@ class CellRules:
         return self._exact(self.config.occupied_above)
 
     @cached_property
+    def most_rise(self) -> int | None:
+        """Most that one frame may add to a cell, so that `confirm_hits` frames must hit it; None: whatever they say.
+
+        Fewer frames never make an unknown cell occupied, which starts from the prior and skips "unknown" by one. Where
+        numbers are too coarse for exactly as many, it takes more.
+        """
+        frames = self.config.confirm_hits
+        if frames == 1:
+            return None
+        way = int(self.thresholds.occupied_least) - int(self.prior)
+        return max(1, min(ceil(way / frames), (way - 2) // (frames - 1)))
+
+    @cached_property
     def thresholds(self) -> Thresholds:
         """The same in whole numbers."""
         return Thresholds(np.int32(ceil(self.free_below) - 1), np.int32(floor(self.occupied_above) + 1))

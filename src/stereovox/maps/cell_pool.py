@@ -49,6 +49,11 @@ class CellPool:
         return int(self.count.sum())
 
     @property
+    def unknown(self) -> int:
+        """What a cell without evidence holds."""
+        return self._rules.format.unknown
+
+    @property
     def memory_bytes(self) -> int:
         """Bytes in use: rows, coordinates and the hash."""
         return (
@@ -134,6 +139,22 @@ class CellPool:
             self._has_settled = True
         return sum(changed)
 
+    def needed_for(
+        self, coords: NDArray[np.int32], values: NDArray[np.int16], uniform: NDArray[np.int32]
+    ) -> tuple[int, int]:
+        """Return the most rows and bare blocks that are in use while this evidence is added; it changes nothing."""
+        rows = np.empty(len(coords) + len(uniform), np.int32)
+        made = _add.places(self.table, self.coords, self.values, coords, values, uniform, rows)
+        has, bare = self.count.tolist()
+        return has + made, bare + int(np.count_nonzero(rows != _add.SKIP))
+
+    def needed_by(self, cells: NDArray[np.integer]) -> tuple[int, int]:
+        """Return how many rows and bare blocks are in use when blocks of `cells` (n, 512) have come on top."""
+        kinds = np.empty(len(cells), np.uint8)
+        _pool.needs(np.ascontiguousarray(cells), self._limits[0], self._limits[2], kinds)
+        has, bare = self.count.tolist()
+        return has + int((kinds == _pool.ROW).sum()), bare + int((kinds == _pool.BARE).sum())
+
     def _rows_for(
         self, coords: NDArray[np.int32], values: NDArray[np.int16], uniform: NDArray[np.int32]
     ) -> NDArray[np.int32]:
@@ -185,9 +206,10 @@ class CellPool:
 
     def _resize(self, rows: int, bare: int) -> None:
         (used, bare_used), before = self.count.tolist(), len(self.values)
-        values = np.empty((rows, CELLS), self.values.dtype)
+        values = self.values if rows == before else np.empty((rows, CELLS), self.values.dtype)
         coords = np.empty((rows + bare, 3), np.int32)
-        values[:used] = self.values[:used]
+        if rows != before:
+            values[:used] = self.values[:used]
         coords[:used], coords[rows : rows + bare_used] = self.coords[:used], self.coords[before : before + bare_used]
         self.values, self.coords = values, coords
         self.table = np.empty(table_size(rows + bare), np.int32)

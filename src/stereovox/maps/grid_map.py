@@ -12,13 +12,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from stereovox import planar
 from stereovox.config import Config
-from stereovox.errors import ConfigError, StereovoxError
+from stereovox.errors import ConfigError, FrameRefused, StereovoxError
 from stereovox.history import History, WithHistory
-from stereovox.maps import _grid
+from stereovox.maps import _grid, _pool
 from stereovox.maps.blocks import BlockPool
 from stereovox.maps.cell_format import CellFormat, CellRules
 from stereovox.maps.evidence import LOG_ODDS_SCALE
 from stereovox.maps.grid_evidence import CELLS, SIDE, GridEvidence
+from stereovox.maps.memory import told
 from stereovox.maps.occupancy import UNKNOWN, OccupancyGrid
 from stereovox.maps.percent import Percent
 from stereovox.maps.voxel_map import INDEX_LIMIT, State
@@ -91,12 +92,32 @@ class GridMap(WithHistory):
         known = np.clip(cells, self._rules.lowest, self._rules.highest)
         self._pool.values[places] = np.where(cells == self._format.unknown, self._format.unknown, known)
 
+    def check_room(self, evidence: GridEvidence) -> None:
+        """Raise FrameRefused `memory_full` where `evidence` needs more memory than `max_memory`.
+
+        A third of that may hold tiles: where their pool grows, the old one and one twice as large stand side by side.
+        """
+        if self.config.max_memory is None:
+            return
+        pool, wanted = self._pool, np.ascontiguousarray(evidence.coords[evidence.values.any(axis=1)], np.int32)
+        places = np.empty(len(wanted), np.int64)
+        _pool.find_all(pool.table, pool.coords, wanted, places)
+        needed = (len(pool) + int(np.count_nonzero(places < 0))) * pool.values[0].nbytes
+        if 3 * needed > self.config.max_memory:
+            raise FrameRefused(
+                "memory_full",
+                f"the grid would need {told(3 * needed)}, more than max_memory {told(self.config.max_memory)}; "
+                "allow more or use larger cells",
+            )
+
     def add(self, evidence: GridEvidence) -> int:
         """Add what one scan says (IST 2019, Eq 5); return the number of cells whose value changed."""
         values = evidence.values
         if self._format.per_log_odds != LOG_ODDS_SCALE:
             factor, shift = self._format.per_log_odds / LOG_ODDS_SCALE, self._format.shift(self.frames)
             values = np.floor(values * factor + shift).astype(np.int32)
+        if self._rules.most_rise is not None:
+            values = np.minimum(values, values.dtype.type(self._rules.most_rise))
         pool, rules = self._pool, self._rules
         pool.reserve(len(evidence.coords))
         return _grid.add_tiles(

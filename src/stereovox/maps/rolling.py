@@ -10,21 +10,22 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox.config import Config
+from stereovox.config import Config, WindowConfig
 from stereovox.errors import ConfigError
 from stereovox.frame import Viewpoint
 from stereovox.maps import _window
 from stereovox.maps.blocks import CELLS, SIDE, StoredCells
+from stereovox.maps.cell_format import CellFormat
 from stereovox.maps.cell_pool import CellPool
+from stereovox.maps.cell_times import NEVER, CellTimes
 from stereovox.maps.evidence import Evidence
+from stereovox.maps.memory import window_blocks, within_memory
 from stereovox.maps.tiles import BLOCKS, TILE, Tile, TileStore, blocks_of, slabs_of
 from stereovox.maps.voxel_map import INDEX_LIMIT, VoxelMap
-from stereovox.maps.window import Box, Window, coarser, most_touched, without
+from stereovox.maps.window import Box, Window, coarser, without
 
-MOST_BYTES = 8_000_000_000
-"""A window that would need more memory is taken for a mistake."""
-MOST_TOLD = 10**24
-"""More bytes than that are told as that many: a whole number may be larger than any float."""
+TIMES = CellFormat(np.dtype(np.uint32), NEVER, 1.0)
+"""How tiles hold the times of cells."""
 
 
 class RollingMap(VoxelMap):
@@ -39,14 +40,16 @@ class RollingMap(VoxelMap):
 
     def __init__(self, config: Config, tiles: Path | None = None):
         super().__init__(config)
-        self._window = Window(config)
-        keep = config.window.outside == "keep"
-        unit = TILE if keep else SIDE
-        capacity = most_touched(self._window.largest, unit) * (unit // SIDE) ** 3
-        _check_memory(capacity * CELLS * self._format.dtype.itemsize, config)
+        self._settings = within_memory(config)  # those of the window; `config` may leave it to the memory
+        self._window = Window(self._settings)
+        capacity = window_blocks(self._settings)
         self._pool = CellPool(self._rules, capacity, capacity)
+        self._times = CellTimes(config.map, capacity) if config.map.keep_times else None
         self._earlier: VoxelMap | None = None
-        self._store = TileStore(self._format, tiles) if keep else None  # last: it leaves a folder
+        self._store = self._times_store = None
+        if self._settings.window.outside == "keep":  # last: they leave folders
+            self._store = TileStore(self._format, tiles)
+            self._times_store = self._store_of_times(tiles)
 
     @property
     def window(self) -> NDArray[np.float64] | None:
@@ -76,9 +79,9 @@ class RollingMap(VoxelMap):
         understood.
         """
         earlier.check_cells(self.config)
-        _copy_history(earlier, self)
+        self.take_history(earlier)
         self._earlier = earlier
-        if earlier.window_state is not None and earlier.config.window == self.config.window:
+        if earlier.window_state is not None and _window_of(earlier.config) == self._settings.window:
             try:
                 self._window.restore(earlier.window_state)
             except (KeyError, TypeError, ValueError, OverflowError) as error:
@@ -91,11 +94,7 @@ class RollingMap(VoxelMap):
 
         Raises ConfigError when they would change what its cells mean.
         """
-        self.check_cells(config)
-        unbounded = VoxelMap(config)
-        unbounded.insert(*self.blocks())
-        _copy_history(self, unbounded)
-        return unbounded
+        return self.unbounded(config)
 
     def look_from(self, viewpoint: Viewpoint) -> None:
         """Remember where the camera stands and move the window after it."""
@@ -124,7 +123,10 @@ class RollingMap(VoxelMap):
         here = {tuple(tile) for tile in np.unique(self._pool.block_coords // BLOCKS, axis=0).tolist()}
         empty = True
         for slab in slabs_of(sorted(here | set(self._store.tiles()))):
-            parts = [self._pool.get(blocks_of(tile)) if tile in here else self._store.get(tile) for tile in slab]
+            parts = [
+                self._pool.get(blocks_of(tile)) if tile in here or self._in_window(tile) else self._kept(tile)[:2]
+                for tile in slab
+            ]
             coords, cells = (np.concatenate(part) for part in zip(*parts, strict=True))
             order = np.lexsort(coords.T[::-1])
             yield coords[order], cells[order]
@@ -132,10 +134,29 @@ class RollingMap(VoxelMap):
         if empty:
             yield from super().slabs()
 
+    def times_of(self, coords: NDArray[np.int32]) -> NDArray[np.uint32]:
+        """Return the times (n, 512) of the cells of blocks (n, 3), wherever they are kept."""
+        if self._earlier is not None:
+            return self._earlier.times_of(coords)
+        times = super().times_of(coords)
+        if self._times_store is not None:
+            tiles, of_block = np.unique(coords // BLOCKS, axis=0, return_inverse=True)
+            for n, tile in enumerate(map(tuple, tiles.tolist())):
+                if tile in self._times_store and not self._in_window(tile):
+                    mine = of_block.ravel() == n
+                    times[mine] = self._times_store.blocks_at(tile, coords[mine])
+        return times
+
+    @property
+    def times_start_ns(self) -> int | None:
+        """Stamp in nanoseconds from which times of cells are counted; None before the first and where none are kept."""
+        return super().times_start_ns if self._earlier is None else self._earlier.times_start_ns
+
     def close(self) -> None:
         """Remove the tiles on disk; save the map before."""
-        if self._store:
-            self._store.close()
+        for store in (self._store, self._times_store):
+            if store is not None:
+                store.close()
 
     def _stored_at(self, points: NDArray[np.floating]) -> NDArray[np.integer]:
         if self._earlier is not None:
@@ -157,7 +178,11 @@ class RollingMap(VoxelMap):
         groups = np.split(np.argsort(of_cell.ravel(), kind="stable"), np.cumsum(number)[:-1])
         for tile, group in zip(map(tuple, tiles.tolist()), groups, strict=True):
             if tile in self._store and not self._in_window(tile):
-                stored[asked[group]] = self._store.stored_at(tile, cells[group])
+                found = self._store.stored_at(tile, cells[group])
+                if self._times is not None and self._times_store is not None:
+                    times = self._times_store.stored_at(tile, cells[group])
+                    found = np.where(self._times.expired(times, self._now_ns), self._format.unknown, found)
+                stored[asked[group]] = found
 
     def _in_window(self, tile: Tile) -> bool:
         """Tell whether the window touches a tile; what the disk says of it is then out of date."""
@@ -190,40 +215,85 @@ class RollingMap(VoxelMap):
             self._bring_back(tile)
 
     def _drop(self, slab: Box, now: Box) -> None:
-        corners = (np.array(corner, np.int32) for corner in (*slab, *now))
-        _window.vacate(*self._pool.arrays, np.int16(self._format.unknown), self._rules.lowest, *corners)
+        low, high, *window = (np.array(corner, np.int32) for corner in (*slab, *now))
+        _window.vacate(*self._pool.arrays, np.int16(self._format.unknown), self._rules.lowest, low, high, *window)
+        if self._times is not None:
+            self._times.follow(self._pool, low, high)
 
     def _put_away(self, tile: Tile) -> None:
         coords, cells = self._pool.get(blocks_of(tile))
-        if len(coords) and self._store is not None:
-            self._store.put(tile, coords, cells)
+        if len(coords) or (self._store is not None and tile in self._store):
+            self._keep(tile, coords, cells, None if self._times is None else self._times.get(coords))
             self._pool.remove(coords)
+            if self._times is not None:
+                self._times.remove(coords)
 
     def _bring_back(self, tile: Tile) -> None:
         if self._store is not None and tile in self._store:
-            self.insert(*self._store.get(tile))
+            coords, cells, times = self._kept(tile)
+            self.insert(coords, cells)
+            if self._times is not None and times is not None:
+                self._times.put(coords, times)
+
+    def _keep(
+        self, tile: Tile, coords: NDArray[np.int32], cells: NDArray[np.integer], times: NDArray[np.uint32] | None
+    ) -> None:
+        """Put blocks of a tile to the disk, with the times of their cells."""
+        if self._store is not None:
+            self._store.put(tile, coords, cells)
+        if self._times_store is not None and times is not None:
+            self._times_store.put(tile, coords, times)
+
+    def _kept(self, tile: Tile) -> tuple[NDArray[np.int32], NDArray[np.integer], NDArray[np.uint32] | None]:
+        """Return the blocks of a tile on disk and the times of their cells; what is over by now is unknown."""
+        assert self._store is not None
+        coords, cells = self._store.get(tile)
+        if self._times is None or self._times_store is None:
+            return coords, cells, None
+        times = self._times_store.blocks_at(tile, coords)
+        over = self._times.expired(times, self._now_ns)
+        cells, times = np.where(over, cells.dtype.type(self._format.unknown), cells), np.where(over, NEVER, times)
+        left = (cells != self._format.unknown).any(axis=1)
+        return coords[left], cells[left], times[left]
+
+    def _store_of_times(self, tiles: Path | None) -> TileStore | None:
+        """Return the tiles beside those of the cells that keep when these were seen."""
+        if self._times is None:
+            return None
+        try:
+            return TileStore(TIMES, None if tiles is None else tiles.with_name(f"{tiles.name}-times"))
+        except BaseException:
+            self.close()
+            raise
 
     def _take_over(self) -> None:
         """Put the cells of an earlier map where they belong: into the window, or to the tiles, or nowhere."""
         if self._earlier is None or self._window.box is None:
             return
-        coords, cells = self._earlier.blocks()
-        self._earlier = None
+        earlier, self._earlier = self._earlier, None
+        coords, cells = earlier.blocks()
+        times = None
+        if self._times is not None:
+            times, self._times.start_ns = earlier.times_of(coords), earlier.times_start_ns
         unit = TILE if self._store else SIDE
         low, high = np.array(coarser(self._window.box, unit)) * (unit // SIDE)
         inside = ((coords >= low) & (coords < high)).all(axis=1)
         self.insert(coords[inside], cells[inside])
-        self._keep_others(coords[~inside], cells[~inside])
+        if self._times is not None and times is not None:
+            self._times.put(coords[inside], times[inside])
+        self._keep_others(coords[~inside], cells[~inside], None if times is None else times[~inside])
         if self._store is None:
             self._clear_borders()
 
-    def _keep_others(self, coords: NDArray[np.int32], cells: NDArray[np.integer]) -> None:
+    def _keep_others(
+        self, coords: NDArray[np.int32], cells: NDArray[np.integer], times: NDArray[np.uint32] | None
+    ) -> None:
         if self._store is None or not len(coords):
             return
         tiles, of_block = np.unique(coords // BLOCKS, axis=0, return_inverse=True)
         for n, tile in enumerate(tiles.tolist()):
             mine = of_block.ravel() == n
-            self._store.put(tuple(tile), coords[mine], cells[mine])
+            self._keep(tuple(tile), coords[mine], cells[mine], None if times is None else times[mine])
 
     def _clear_borders(self) -> None:
         assert self._window.box is not None
@@ -233,21 +303,12 @@ class RollingMap(VoxelMap):
             self._drop(slab, self._window.box)
 
 
-def _copy_history(earlier: VoxelMap, later: VoxelMap) -> None:
-    later.history, later.viewpoint = earlier.history.copied(), earlier.viewpoint
-
-
-def _check_memory(needed: int, config: Config) -> None:
-    if needed > MOST_BYTES:
-        size = " x ".join(f"{x:g}" for x in config.window.largest or config.window.size or ())
-        raise ConfigError(
-            f"window of {size} m in cells of {config.voxel_size:g} m needs {_read(min(needed, MOST_TOLD))} of memory, "
-            f"more than {_read(MOST_BYTES)}; choose a smaller window.size or larger cells"
-        )
-
-
-def _read(number_of_bytes: float) -> str:
-    return f"{number_of_bytes / 1e12:.0f} TB" if number_of_bytes >= 1e12 else f"{number_of_bytes / 1e9:.0f} GB"
+def _window_of(config: Config) -> WindowConfig:
+    """Return the window that a map was made in with these settings; as they stand where they no longer make one."""
+    try:
+        return within_memory(config).window
+    except ConfigError:
+        return config.window
 
 
 def _listed(box: Box, other: Box) -> Iterator[Tile]:

@@ -37,8 +37,9 @@ MANIFEST = "manifest.json"
 BLOCKS_PER_CHUNK = 4096
 UNFINISHED = re.compile(r"cells-[0-9a-f]{12}|\.manifest\.json\.new")
 """What a save that was killed leaves."""
-Slab = tuple[NDArray[np.int32], NDArray[np.integer]]
-"""Block coordinates (n, 3) and cells (n, 512)."""
+Slab = tuple[NDArray, ...]
+"""Block coordinates (n, 3), cells (n, 512), and times (n, 512) where they are kept."""
+ARRAYS = ("coords", "cells", "times")
 
 
 def save_map(voxel_map: VoxelMap, path: str | Path) -> None:
@@ -92,12 +93,17 @@ def load_map(path: str | Path) -> VoxelMap:
         voxel_map.history = History.loaded(manifest)
         voxel_map.viewpoint = _viewpoint_from(manifest.get("viewpoint"))
         voxel_map.window_state = manifest.get("window")
-        coords, cells = _read_arrays(folder / str(manifest["data"]), int(manifest["blocks"]), voxel_map)
-        if _checksums(coords, cells, manifest["checksum"]) != manifest["checksum"]:
+        start_ns = _start_ns(manifest.get("times_start_ns"))
+        coords, cells, *times = arrays = _read_arrays(
+            folder / str(manifest["data"]), int(manifest["blocks"]), voxel_map
+        )
+        if _checksums(arrays, manifest["checksum"]) != manifest["checksum"]:
             raise ValueError("the cells do not match their checksum")
     except (KeyError, TypeError, ValueError, OSError, RuntimeError, OverflowError, AttributeError) as error:
         raise MapFileError(f"{folder}: damaged map ({type(error).__name__}: {error}); make it anew") from None
     voxel_map.insert(coords, cells)
+    if times:
+        voxel_map.set_times(coords, times[0], start_ns)
     return voxel_map
 
 
@@ -152,16 +158,21 @@ def _manifest(voxel_map: VoxelMap, data: str, blocks: int, checksum: list[int]) 
         "checksum": checksum,
         "viewpoint": _viewpoint_to(voxel_map.viewpoint),
         "window": voxel_map.window_state,
+        "times_start_ns": voxel_map.times_start_ns,
         "config": voxel_map.config.model_dump(),
     }
 
 
-def _checksums(coords: NDArray, cells: NDArray, wanted: Any) -> int | list[int]:
+def _checksums(arrays: Slab, wanted: Any) -> int | list[int]:
     """Zarr reads a chunk whose file is gone as empty cells; these numbers tell. Version 1 had one for both arrays."""
-    of_coords = zlib.crc32(np.ascontiguousarray(coords).data)
     if isinstance(wanted, int):
-        return zlib.crc32(np.ascontiguousarray(cells).data, of_coords)
-    return [of_coords, zlib.crc32(np.ascontiguousarray(cells).data)]
+        coords, cells = (np.ascontiguousarray(array).data for array in arrays)
+        return zlib.crc32(cells, zlib.crc32(coords))
+    return [zlib.crc32(np.ascontiguousarray(array).data) for array in arrays]
+
+
+def _start_ns(saved: Any) -> int | None:
+    return None if saved is None else int(saved)
 
 
 def _viewpoint_to(viewpoint: Viewpoint | None) -> dict[str, Any] | None:
@@ -199,15 +210,17 @@ def _as_number(number: Any) -> Any:
 
 
 def _write_arrays(folder: Path, voxel_map: VoxelMap) -> tuple[int, list[int]]:
-    """Write all blocks, piece by piece; return their number and the checksums of coordinates and cells."""
+    """Write all blocks, piece by piece; return their number and the checksum of each array."""
     import zarr
 
     group = zarr.open_group(folder, mode="w", zarr_format=3)
-    arrays, checksums = None, [0, 0]
-    for slab in _whole_chunks(voxel_map.slabs()):
+    arrays, checksums = None, []
+    slabs = voxel_map.timed() if voxel_map.config.map.keep_times else voxel_map.slabs()
+    for slab in _whole_chunks(slabs):
         if arrays is None:
-            fills = (0, voxel_map.cell_format.unknown)
-            arrays = [_new_array(group, *what) for what in zip(("coords", "cells"), slab, fills, strict=True)]
+            fills = (0, voxel_map.cell_format.unknown, 0)
+            arrays = [_new_array(group, *what) for what in zip(ARRAYS, slab, fills, strict=False)]
+            checksums = [0] * len(arrays)
         for n, part in enumerate(slab):
             if len(part):
                 arrays[n].append(part)
@@ -223,17 +236,15 @@ def _whole_chunks(slabs: Iterable[Slab]) -> Iterator[Slab]:
         held.append(slab)
         rows += len(slab[0])
         if rows >= BLOCKS_PER_CHUNK:
-            coords, cells = _joined(held)
-            whole = rows // BLOCKS_PER_CHUNK * BLOCKS_PER_CHUNK
-            yield coords[:whole], cells[:whole]
-            held, rows = [(coords[whole:], cells[whole:])], rows - whole
+            slab, whole = _joined(held), rows // BLOCKS_PER_CHUNK * BLOCKS_PER_CHUNK
+            yield tuple(part[:whole] for part in slab)
+            held, rows = [tuple(part[whole:] for part in slab)], rows - whole
     if held:
         yield _joined(held)
 
 
 def _joined(slabs: list[Slab]) -> Slab:
-    coords, cells = zip(*slabs, strict=True)
-    return (coords[0], cells[0]) if len(slabs) == 1 else (np.concatenate(coords), np.concatenate(cells))
+    return slabs[0] if len(slabs) == 1 else tuple(np.concatenate(parts) for parts in zip(*slabs, strict=True))
 
 
 def _new_array(group: Any, name: str, like: NDArray, fill: int) -> Any:
@@ -246,12 +257,11 @@ def _read_arrays(folder: Path, blocks: int, voxel_map: VoxelMap) -> Slab:
     import zarr
 
     group = zarr.open_group(folder, mode="r")
-    coords: Any = group["coords"]
-    cells: Any = group["cells"]
-    for array, shape, dtype in (
-        (coords, (blocks, 3), np.int32),
-        (cells, (blocks, CELLS), voxel_map.cell_format.dtype),
-    ):
+    wanted = [((blocks, 3), np.int32), ((blocks, CELLS), voxel_map.cell_format.dtype)]
+    if voxel_map.config.map.keep_times:
+        wanted.append(((blocks, CELLS), np.uint32))
+    arrays: list[Any] = [group[name] for name, _ in zip(ARRAYS, wanted, strict=False)]
+    for array, (shape, dtype) in zip(arrays, wanted, strict=True):
         if array.shape != shape or array.dtype != dtype:
             raise ValueError(f"array of {array.shape} {array.dtype} where {shape} {np.dtype(dtype)} belongs")
-    return np.asarray(coords[:]), np.asarray(cells[:])
+    return tuple(np.asarray(array[:]) for array in arrays)

@@ -75,6 +75,10 @@ class TileStore:
         known = (dense != self._format.unknown).any(axis=3)
         return np.argwhere(known).astype(np.int32) + np.multiply(tile, BLOCKS).astype(np.int32), dense[known]
 
+    def blocks_at(self, tile: Tile, coords: NDArray[np.int32]) -> NDArray[np.integer]:
+        """Return the cells (n, 512) of blocks (n, 3) that lie in `tile`."""
+        return self._dense(tile)[tuple((coords - np.multiply(tile, BLOCKS)).T)]
+
     def stored_at(self, tile: Tile, cells: NDArray[np.int64]) -> NDArray[np.integer]:
         """Return the stored numbers (n,) of cells (n, 3) that lie in `tile`."""
         block, cell = np.divmod(cells - np.multiply(tile, TILE), SIDE)

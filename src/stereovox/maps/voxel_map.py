@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stereovox.config import Config
-from stereovox.errors import ConfigError
+from stereovox.errors import ConfigError, StereovoxError
 from stereovox.frame import Viewpoint
 from stereovox.history import History, WithHistory
 from stereovox.maps import _add, queries
@@ -20,7 +20,8 @@ from stereovox.maps.blocks import CELLS, SIDE, StoredCells
 from stereovox.maps.cell_format import CellFormat, CellRules
 from stereovox.maps.cell_format import State as State
 from stereovox.maps.cell_pool import CellPool
-from stereovox.maps.evidence import LOG_ODDS_SCALE, Evidence
+from stereovox.maps.cell_times import NEVER, CellTimes
+from stereovox.maps.evidence import LARGEST, LOG_ODDS_SCALE, Evidence
 from stereovox.maps.queries import INDEX_LIMIT as INDEX_LIMIT
 from stereovox.maps.queries import Asked, NearestCells, RayHits
 
@@ -44,6 +45,7 @@ class VoxelMap(WithHistory):
         self._rules = CellRules(config.map)
         self._format = self._rules.format
         self._pool = CellPool(self._rules)
+        self._times = CellTimes(config.map) if config.map.keep_times else None
 
     @classmethod
     def from_cells(cls, config: Config, indices: ArrayLike, log_odds: ArrayLike) -> VoxelMap:
@@ -72,6 +74,24 @@ class VoxelMap(WithHistory):
         self.config = config
         return self
 
+    def unbounded(self, config: Config) -> VoxelMap:
+        """Return a map without bounds of all cells and what is known of them, with the settings `config`.
+
+        Raises ConfigError when these would change what its cells mean.
+        """
+        self.check_cells(config)
+        unbounded = VoxelMap(config)
+        for coords, cells in self.slabs():
+            unbounded.insert(coords, cells)
+            if self._times is not None:
+                unbounded.set_times(coords, self.times_of(coords), self.times_start_ns)
+        unbounded.take_history(self)
+        return unbounded
+
+    def take_history(self, earlier: VoxelMap) -> None:
+        """Take over what `earlier` says of the frames that are in it."""
+        self.history, self.viewpoint = earlier.history.copied(), earlier.viewpoint
+
     def check_cells(self, config: Config) -> None:
         """Raise ConfigError when `config` gives cells another meaning: their size or the `map` section."""
         for name in ("voxel_size", "steps", "map"):
@@ -80,8 +100,10 @@ class VoxelMap(WithHistory):
                 raise ConfigError(f"cannot go on: the map was made with {name} {old}, now {new} is wanted")
 
     def look_from(self, viewpoint: Viewpoint) -> None:
-        """Remember where the camera stands; a bounded map moves with it."""
-        self.viewpoint = viewpoint
+        """Remember where the camera stands; a bounded map moves with it, cells without evidence for long go."""
+        before, self.viewpoint = self.viewpoint, viewpoint
+        if self._times is not None and before is not None:
+            self._times.forget(self._pool, before.stamp_ns, viewpoint.stamp_ns)
 
     @property
     def cell_format(self) -> CellFormat:
@@ -97,6 +119,8 @@ class VoxelMap(WithHistory):
         """Set whole blocks: coordinates (n, 3), cells (n, 512) as stored; what stood there before is lost."""
         cells = np.clip(cells, self._rules.lowest, self._rules.highest)
         self._pool.put(coords, cells.astype(self._format.dtype, copy=False))
+        if self._times is not None:
+            self._times.remove(coords)
 
     def check_room(self, evidence: Evidence) -> None:
         """Raise FrameRefused `memory_full` where `evidence` needs more memory than the map may take."""
@@ -105,9 +129,10 @@ class VoxelMap(WithHistory):
         """Add what one frame says; return the number of cells whose value changed."""
         if not (len(evidence.coords) or len(evidence.uniform)):
             return 0
-        values, step = self._in_my_units(evidence)
-        uniform = evidence.uniform if step else evidence.uniform[:0]
-        return self._pool.add(evidence.coords, values, uniform, step, self.config.threads)
+        mine = self._in_my_units(evidence)
+        if self._times is not None:
+            self._times.write(mine, self._now_ns)
+        return self._pool.add(mine.coords, mine.values, mine.uniform, mine.uniform_value, self.config.threads)
 
     def log_odds(self, points: ArrayLike) -> NDArray[np.float32]:
         """Return the log-odds (N,) at points (N, 3) in metres, world frame; 0 where unknown or not finite.
@@ -129,6 +154,23 @@ class VoxelMap(WithHistory):
         Raises StereovoxError as `log_odds` does.
         """
         return self._rules.states(self._stored_at(queries.points_of(points)))
+
+    def age(self, points: ArrayLike, now_ns: int | None = None) -> NDArray[np.float32]:
+        """Return how many seconds (N,) ago the cells at points (N, 3) got their last evidence, by frames' stamps.
+
+        points: metres, world frame. now_ns: time in nanoseconds, by default that of the last frame. NaN where the cell
+        is unknown or was put in without a time; negative where the evidence is stamped later than now.
+        Raises StereovoxError where the map keeps no times, and as `log_odds` does.
+        """
+        points = queries.points_of(points)
+        known = self._stored_at(points) != self._format.unknown
+        return self._seconds_ago(np.where(known, self._times_at(points), NEVER), now_ns)
+
+    def ages(self, now_ns: int | None = None) -> NDArray[np.float32]:
+        """Return the `age` (N,) of all known cells, in the order of `cells`."""
+        found = [_cells_where(coords, times, cells != self._format.unknown) for coords, cells, times in self.timed()]
+        indices, times = (np.concatenate(part) for part in zip(*found, strict=True))
+        return self._seconds_ago(times[np.lexsort(indices.T[::-1])], now_ns)
 
     def cast_rays(
         self,
@@ -185,6 +227,30 @@ class VoxelMap(WithHistory):
         """Yield all blocks as in `blocks`, piece by piece in ascending order; the map must not change meanwhile."""
         yield from self._pool.pieces()
 
+    def timed(self) -> Iterator[tuple[NDArray[np.int32], NDArray[np.integer], NDArray[np.uint32]]]:
+        """Yield all blocks as `slabs` does, with the times (n, 512) of their cells, 0 where there is none.
+
+        Raises StereovoxError where the map keeps no times. What they mean: `CellTimes`.
+        """
+        for coords, cells in self.slabs():
+            times = self.times_of(coords)
+            times[cells == self._format.unknown] = NEVER
+            yield coords, cells, times
+
+    def times_of(self, coords: NDArray[np.int32]) -> NDArray[np.uint32]:
+        """Return the times (n, 512) of the cells of blocks (n, 3); they mean something where the cell is known."""
+        return self._kept_times.get(coords)
+
+    def set_times(self, coords: NDArray[np.int32], times: NDArray[np.uint32], start_ns: int | None) -> None:
+        """Set the times (n, 512) of blocks (n, 3) that are in the map; they count from `start_ns`."""
+        self._kept_times.put(coords, times)
+        self._kept_times.start_ns = start_ns
+
+    @property
+    def times_start_ns(self) -> int | None:
+        """Stamp in nanoseconds from which times of cells are counted; None before the first and where none are kept."""
+        return None if self._times is None else self._times.start_ns
+
     def centers(self, indices: ArrayLike) -> NDArray[np.float64]:
         """Return the centres (N, 3) in metres of cells (N, 3)."""
         return (np.asarray(indices) + 0.5) * self.config.cell
@@ -216,13 +282,13 @@ class VoxelMap(WithHistory):
 
     @property
     def memory_bytes(self) -> int:
-        """Bytes the map uses: stored numbers, block coordinates and hash."""
-        return self._pool.memory_bytes
+        """Bytes the map uses: stored numbers, times, block coordinates and hash."""
+        return self._pool.memory_bytes + (0 if self._times is None else self._times.memory_bytes)
 
     @property
     def reserved_bytes(self) -> int:
         """Bytes the map has taken: those in use, and room to grow (which the system gives when it is first used)."""
-        return self._pool.reserved_bytes
+        return self._pool.reserved_bytes + (0 if self._times is None else self._times.reserved_bytes)
 
     def save(self, path: str | Path) -> None:
         """Save to the folder `path` (Zarr inside); an older map there stays whole until the new one is complete."""
@@ -233,15 +299,39 @@ class VoxelMap(WithHistory):
     def close(self) -> None:
         """Give back what the map holds outside memory (nothing, unless it keeps tiles on disk)."""
 
-    def _in_my_units(self, evidence: Evidence) -> tuple[NDArray[np.int16], int]:
-        """Return the values of `evidence` and its uniform value, both as differences of stored numbers."""
-        factor = self._format.per_log_odds / LOG_ODDS_SCALE
-        if factor == 1:
-            return evidence.values, evidence.uniform_value
+    def _in_my_units(self, evidence: Evidence) -> Evidence:
+        """Return the evidence as differences of stored numbers; blocks that would get a uniform 0 are left out."""
+        factor, most = self._format.per_log_odds / LOG_ODDS_SCALE, self._rules.most_rise
+        if factor == 1 and most is None and (evidence.uniform_value or not len(evidence.uniform)):
+            return evidence
         shift = self._format.shift(self.frames)
         values = np.empty_like(evidence.values)
-        _add.rescale(evidence.values, np.float32(factor), np.float32(shift), values)
-        return values, floor(evidence.uniform_value * factor + shift)
+        _add.rescale(evidence.values, np.float32(factor), np.float32(shift), np.float32(most or LARGEST), values)
+        step = floor(evidence.uniform_value * factor + shift)
+        return Evidence(evidence.coords, values, evidence.uniform if step else evidence.uniform[:0], step)
+
+    @property
+    def _now_ns(self) -> int:
+        return 0 if self.viewpoint is None else self.viewpoint.stamp_ns
+
+    @property
+    def _kept_times(self) -> CellTimes:
+        if self._times is None:
+            raise StereovoxError("the map does not keep when cells were seen; make it with map.keep_times = true")
+        return self._times
+
+    def _times_at(self, points: NDArray[np.floating]) -> NDArray[np.uint32]:
+        """Return the times (N,) of the cells at points, NEVER where no cell can be."""
+        times = np.zeros(len(points), np.uint32)
+        within = (np.abs(points) < INDEX_LIMIT * np.array(self.config.cell)).all(axis=1)  # False for NaN
+        cells = np.floor(points[within] / self.config.cell).astype(np.int64)
+        blocks, of_cell = np.unique(cells >> 3, axis=0, return_inverse=True)
+        x, y, z = (cells & (SIDE - 1)).T
+        times[within] = self.times_of(blocks.astype(np.int32))[of_cell.ravel(), (x << 6) | (y << 3) | z]
+        return times
+
+    def _seconds_ago(self, times: NDArray[np.uint32], now_ns: int | None) -> NDArray[np.float32]:
+        return self._kept_times.seconds_ago(times, self._now_ns if now_ns is None else now_ns)
 
     @property
     def _asked(self) -> Asked:

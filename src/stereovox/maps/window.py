@@ -36,8 +36,8 @@ class Window:
         self._trigger = max(window.trigger, max(self._cell) / 2)
         self._lead_s, self._grow_s = window.lead_s, window.grow_s
         self._fixed = window.centre
-        self._size = _cells(window.size, self._cell)
-        self.largest = _cells(window.largest or window.size, self._cell)
+        self._size = size_in_cells(window.size, self._cell)
+        self.largest = size_in_cells(window.largest or window.size, self._cell)
         self._extent = self._size
         self._velocity = (0.0, 0.0, 0.0)
         self._last: tuple[Sequence[float], int] | None = None
@@ -152,5 +152,6 @@ def _three(numbers: Any, kind: Any, most: float = 1e300) -> tuple[Any, Any, Any]
     return x, y, z
 
 
-def _cells(size: Sequence[float], cell: Sequence[float]) -> Cell:
+def size_in_cells(size: Sequence[float], cell: Sequence[float]) -> Cell:
+    """Return how many cells long a box of this size in metres is on each axis, one at least."""
     return tuple(max(1, floor(x / c + 0.5)) for x, c in zip(size, cell, strict=True))  # pyright: ignore

@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A map without bounds in space that takes no more memory than `max_memory`: what needs more is refused."""
+
+from __future__ import annotations
+
+from stereovox.config import Config
+from stereovox.errors import ConfigError, FrameRefused
+from stereovox.maps.cell_pool import CellPool
+from stereovox.maps.cell_times import CellTimes
+from stereovox.maps.evidence import Evidence
+from stereovox.maps.memory import most_blocks, told
+from stereovox.maps.voxel_map import VoxelMap
+
+
+class CappedMap(VoxelMap):
+    """A map whose frames are refused, as `memory_full`, where they need more blocks than fit into `max_memory`.
+
+    Room for all of these is set aside at the start, so nothing is ever copied to grow; the system gives the memory of a
+    block when it is first used. What is refused depends only on the cells and the frame. Raises ConfigError where not
+    even one block fits.
+    """
+
+    def __init__(self, config: Config):
+        super().__init__(config)
+        self._most = most_blocks(config)
+        self._pool = CellPool(self._rules, self._most, self._most)
+        self._times = CellTimes(config.map, self._most) if config.map.keep_times else None
+
+    def go_on_with(self, earlier: VoxelMap) -> None:
+        """Start from the cells of a map made before. Raises ConfigError where they do not fit."""
+        earlier.check_cells(self.config)
+        for coords, cells in earlier.slabs():
+            rows, bare = self._pool.needed_by(cells)
+            if max(rows, bare) > self._most or (self._times is not None and len(self._pool) + len(coords) > self._most):
+                raise ConfigError(
+                    f"cannot go on: the map needs more memory than max_memory {told(self.config.max_memory or 0)}; "
+                    'allow more, or set when_full to "spill"'
+                )
+            self.insert(coords, cells)
+            if self._times is not None:
+                self.set_times(coords, earlier.times_of(coords), earlier.times_start_ns)
+        self.take_history(earlier)
+
+    def check_room(self, evidence: Evidence) -> None:
+        """Raise FrameRefused `memory_full` where `evidence` needs more memory than the map may take."""
+        mine = self._in_my_units(evidence)
+        needed = max(self._pool.needed_for(mine.coords, mine.values, mine.uniform))
+        if self._times is not None:  # any block may come to need numbers again when cells are forgotten
+            needed = max(needed, len(self._pool) + self._times.missing(mine))
+        if needed > self._most:
+            raise FrameRefused(
+                "memory_full",
+                f"the map would need {needed} blocks of cells, max_memory {told(self.config.max_memory or 0)} holds "
+                f'{self._most}; allow more, use larger cells, or set when_full to "roll" or "spill"',
+            )
+
+    def with_config(self, config: Config) -> VoxelMap:
+        """Return a map without bounds of all cells, with the settings of a run that goes on with it.
+
+        Raises ConfigError when they would change what its cells mean.
+        """
+        return self.unbounded(config)

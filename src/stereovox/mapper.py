@@ -54,10 +54,12 @@ class Mapper:
             self.map.check_room(evidence)
         except FrameRefused as refused:
             self.map.frames_refused += 1
+            self.map.last_frame = frame.name, frame.stamp_ns
             return UpdateReport(refused=refused.reason, detail=str(refused))
         self.map.look_from(image.viewpoint)
         cells = self.map.add(evidence)
         self.map.frames += 1
+        self.map.last_frame = frame.name, frame.stamp_ns
         self._gate.took(frame, image)
         done = perf_counter()
         match_ms, depth_ms, integrate_ms = 1e3 * (between - start), 1e3 * (prepared - between), 1e3 * (done - prepared)

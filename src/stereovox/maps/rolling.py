@@ -236,6 +236,7 @@ class RollingMap(VoxelMap):
 def _copy_history(earlier: VoxelMap, later: VoxelMap) -> None:
     later.frames, later.frames_refused = earlier.frames, earlier.frames_refused
     later.recording, later.viewpoint = earlier.recording, earlier.viewpoint
+    later.last_frame = earlier.last_frame
 
 
 def _check_memory(needed: int, config: Config) -> None:

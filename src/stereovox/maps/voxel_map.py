@@ -32,7 +32,8 @@ class VoxelMap:
     (p > occupied_above) or tentative between them.
     `config` holds the settings the map was made with, `frames` the number of frames that are in it, `frames_refused`
     the number that were offered and refused, `recording` the name of what they came from, if known, `viewpoint` where
-    the camera stood last, `window_state` where its window was, if it had one.
+    the camera stood last, `window_state` where its window was, if it had one, `last_frame` name and stamp of the frame
+    that was offered last.
     """
 
     def __init__(self, config: Config):
@@ -43,6 +44,7 @@ class VoxelMap:
         self.recording = ""
         self.viewpoint: Viewpoint | None = None
         self.window_state: dict[str, Any] | None = None
+        self.last_frame: tuple[str, int] | None = None
         self._rules = CellRules(config.map)
         self._format = self._rules.format
         self._pool = CellPool(self._rules)

@@ -57,10 +57,12 @@ class GridMapper:
             evidence = self._beams.evidence(scan, self.map.origin)
             self.map.check_room(evidence)
         except FrameRefused as refused:
+            self.map.history.offered(seen)
             self.map.history.refuse(refused.reason)
             self._watch.refused(arrived, refused.reason)
             return UpdateReport(refused=refused.reason, detail=str(refused))
         cells = self.map.add(evidence)
+        self.map.history.offered(seen)
         self.map.history.frames += 1
         self._gate.took(passed)
         self._watch.took(arrived, passed.sensor, passed.seen.stamp_ns, FULL)

@@ -7,7 +7,8 @@ import copy
 import math
 from collections import Counter
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from operator import index
+from typing import Any, NamedTuple, SupportsIndex
 
 MOST_SENSORS = 64
 """Sensors that one map tells apart."""
@@ -44,7 +45,8 @@ class History:
 
     frames: how many are in the map. refused: how many were offered and refused, by reason. settled: how often frames
     were believed again after a jump or a reset, by its reason. ways: how many frames were looked at how thoroughly, by
-    the name of the way. recording: the name of what the frames came from, if known.
+    the name of the way. recording: the name of what the frames came from, if known. last_frame: name and stamp of the
+    one that was offered last.
     trusted: the last trusted frame of each sensor. waiting: refused frames that may yet be believed, by sensor.
     """
 
@@ -53,8 +55,15 @@ class History:
     settled: Counter[str] = field(default_factory=Counter)
     ways: Counter[str] = field(default_factory=Counter)
     recording: str = ""
+    last_frame: tuple[str, int] | None = None
     trusted: dict[str, Seen] = field(default_factory=dict)
     waiting: dict[str, Streak] = field(default_factory=dict)
+
+    def offered(self, frame: object) -> None:
+        """Remember which frame was the last."""
+        stamp_ns = getattr(frame, "stamp_ns", 0)
+        whole = stamp_ns if isinstance(stamp_ns, SupportsIndex) else 0
+        self.last_frame = str(getattr(frame, "name", ""))[:LONGEST_NAME], min(max(index(whole), EARLIEST), LATEST)
 
     def refuse(self, reason: str) -> None:
         """Count one refused frame."""
@@ -70,6 +79,7 @@ class History:
         return {
             "frames": self.frames,
             "frames_refused": self.refused.total(),
+            "last_frame": self._last_frame(),
             "recording": self.recording,
             "history": {
                 "refused": dict(self.refused),
@@ -90,19 +100,27 @@ class History:
         Raises KeyError, TypeError or ValueError for what cannot have been saved.
         """
         frames, refused = _whole(saved["frames"], "frames"), _whole(saved["frames_refused"], "frames_refused")
-        recording = str(saved["recording"])
+        recording, last = str(saved["recording"]), _last_frame_from(saved.get("last_frame"))
         told = saved.get("history")
         if told is None:
-            return cls(frames, Counter({NOT_TOLD: refused} if refused else {}), recording=recording)
+            return cls(frames, Counter({NOT_TOLD: refused} if refused else {}), recording=recording, last_frame=last)
         counts = (_counts(told[name], name) for name in ("refused", "settled", "ways"))
         trusted = {name: _seen_from(seen) for name, seen in _sensors(told["trusted"]).items()}
         waiting = {name: _streak_from(streak) for name, streak in _sensors(told["waiting"]).items()}
         if not waiting.keys() <= trusted.keys():
             raise ValueError("history.waiting names a sensor that was never trusted")
-        history = cls(frames, *counts, recording, trusted, waiting)
+        history = cls(frames, *counts, recording, last, trusted, waiting)
         if history.refused.total() != refused:
             raise ValueError(f"frames_refused is {refused}, its reasons add up to {history.refused.total()}")
         return history
+
+
+    def _last_frame(self) -> dict[str, Any] | None:
+        """Return which frame was the last: its number from 1 on, refused ones counted, its name and its stamp."""
+        if self.last_frame is None:
+            return None
+        name, stamp_ns = self.last_frame
+        return {"number": self.frames + self.refused.total(), "name": name, "stamp_ns": stamp_ns}
 
 
 class WithHistory:
@@ -146,6 +164,10 @@ def _seen_from(saved: Any) -> Seen:
     if not all(math.isfinite(x) and abs(x) <= FARTHEST for x in numbers):
         raise ValueError("history: a pose holds NaN, infinity or absurdly large numbers")
     return Seen(_whole(saved["stamp_ns"], "history: stamp_ns", EARLIEST), numbers)
+
+
+def _last_frame_from(saved: Any) -> tuple[str, int] | None:
+    return None if saved is None else (_name(saved["name"]), _whole(saved["stamp_ns"], "last_frame: stamp_ns", EARLIEST))
 
 
 def _streak_from(saved: Any) -> Streak:

@@ -55,11 +55,13 @@ class Mapper:
             evidence = way.integrator.evidence(image)
             self.map.check_room(evidence)
         except FrameRefused as refused:
+            self.map.history.offered(frame)
             self.map.history.refuse(refused.reason)
             self._watch.refused(arrived, refused.reason)
             return UpdateReport(refused=refused.reason, detail=str(refused))
         self.map.look_from(image.viewpoint)
         cells = self.map.add(evidence)
+        self.map.history.offered(frame)
         self._remember(passed, way.name, arrived)
         done = perf_counter()
         match_ms, depth_ms, integrate_ms = 1e3 * (between - start), 1e3 * (prepared - between), 1e3 * (done - prepared)

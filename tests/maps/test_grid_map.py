@@ -204,11 +204,11 @@ def test_a_failed_save_leaves_the_older_file_whole(tmp_path, monkeypatch):
     GridMap(load_config(**EVEN)).save(path)
     before = path.read_bytes()
     monkeypatch.setattr("os.fsync", lambda _: (_ for _ in ()).throw(OSError(28, "No space left on device")))
-    with pytest.raises(MapFileError, match=r"floor\.npz: cannot save the grid \(No space left"):
+    with pytest.raises(MapFileError, match=r"floor\.npz: cannot be written \(No space left"):
         GridMap(load_config(**EVEN)).save(path)
     assert path.read_bytes() == before
     assert [entry.name for entry in tmp_path.iterdir()] == ["floor.npz"]
-    with pytest.raises(MapFileError, match="cannot save"):
+    with pytest.raises(MapFileError, match="cannot be written"):
         GridMap(load_config(**EVEN)).save(tmp_path / "no" / "floor.npz")
 
 

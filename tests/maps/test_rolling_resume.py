@@ -2,6 +2,7 @@
 """A rolling map that goes on with another, is asked before its first frame, or asked about what lies in its tiles."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -169,10 +170,18 @@ def test_settings_that_are_refused_leave_no_tiles(tmp_path, changes):
     assert not (tmp_path / "tiles").exists()
 
 
-def test_what_a_killed_run_left_is_told_with_its_cure(tmp_path):
-    RollingMap(settings(outside="keep"), tmp_path / "tiles")  # never closed
-    with pytest.raises(MapFileError, match=r"tiles: tiles of a run that .* was killed; .* remove this folder"):
+def test_tiles_belong_to_one_map_and_what_a_dead_run_left_is_removed(tmp_path):
+    living = RollingMap(settings(outside="keep"), tmp_path / "tiles")
+    with pytest.raises(MapFileError, match=r"tiles: is being written by another run"):
         RollingMap(settings(outside="keep"), tmp_path / "tiles")
+    assert (tmp_path / "tiles" / "zarr.json").is_file()
+    shutil.copytree(tmp_path / "tiles", tmp_path / "dead")  # a copy of the lock that nobody holds
+    living.close()
+    assert not (tmp_path / "tiles").exists()
+    (tmp_path / "dead" / "c" / "33554432").mkdir(parents=True)
+    (tmp_path / "dead" / "c" / "33554432" / "0.partial").write_text("half a tile")
+    RollingMap(settings(outside="keep"), tmp_path / "dead").close()
+    assert not (tmp_path / "dead").exists()
 
 
 @pytest.mark.parametrize("trigger", [0.0, 0.04, 0.05])

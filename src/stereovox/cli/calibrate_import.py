@@ -42,7 +42,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Read, write the rig file and tell what is in it."""
-    from stereovox.products.files import replacing
+    from stereovox.files import replacing
     from stereovox.sources.calibration_files import import_rig
     from stereovox.sources.rig_file import Virtual
     from stereovox.sources.rig_tables import rig_text

@@ -78,7 +78,7 @@ def _terms(text: str) -> list[str]:
 
 
 def _write(out: str, found: NoiseCalibration) -> None:
-    from stereovox.products.files import replacing
+    from stereovox.files import replacing
 
     with replacing(out) as file:
         file.write(profile_text(found).encode())

@@ -127,7 +127,7 @@ def _three(numbers: Any, form: str) -> str:
 
 
 def _write(arguments: Namespace, folder: Path, settings: PairSettings, found: PairCalibration) -> None:
-    from stereovox.products.files import replacing
+    from stereovox.files import replacing
     from stereovox.sources.pair_file import FILE, pair_text
 
     if not arguments.out:

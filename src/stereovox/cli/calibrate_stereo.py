@@ -70,7 +70,7 @@ def _board(text: str, square: float) -> Any:
 
 
 def _write(arguments: Namespace, found: StereoCalibration) -> None:
-    from stereovox.products.files import replacing
+    from stereovox.files import replacing
     from stereovox.sources.rig_file import Rig, RigPair, Virtual
     from stereovox.sources.rig_tables import rig_text
 

@@ -64,7 +64,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
 
 
 def _write(out: str, found: WallCalibration) -> None:
-    from stereovox.products.files import replacing
+    from stereovox.files import replacing
     from stereovox.sources.camera_file import camera_text
 
     fitted = [wall.as_dict() for wall in found.walls if wall.fitted]

@@ -12,6 +12,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from stereovox.cli.checkpoints import Checkpoints, add_checkpoint
 from stereovox.cli.localize import add_start, check_start, localised, parse_start, say_fit
 from stereovox.cli.robots import (
     GRID_ENDINGS,
@@ -63,6 +64,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         "--resume", metavar="MAP", help="go on with this map; without --poses the robot is localised in it"
     )
     add_start(parser)
+    add_checkpoint(parser)
 
 
 def defaults() -> dict[str, Any]:
@@ -72,9 +74,14 @@ def defaults() -> dict[str, Any]:
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Find the way, map along it, save the map and tell what was done."""
-    from stereovox.products.map_server import write_map_server
+    from stereovox.maps.lock import only_writer_of
 
     out = check_file(arguments.out, GRID_ENDINGS)
+    with only_writer_of(out.with_suffix(".yaml")):
+        return _mapped(arguments, out)
+
+
+def _mapped(arguments: Namespace, out: Path) -> dict[str, Any]:
     if arguments.mode == "scale" and out.suffix.lower() == ".pgm":
         raise StereovoxError(f"--out {out}: mode scale has no grey for unknown cells; name a .yaml or .png")
     start, config = parse_start(arguments.start), settings_of(arguments)
@@ -87,14 +94,15 @@ def run(arguments: Namespace) -> dict[str, Any]:
     say_about_compiling()
     track = _track(robot, how, config, start)
     reports: list[UpdateReport] = []
+    checkpoints = Checkpoints(lambda: _save(mapper, out, arguments.mode), out, arguments.checkpoint)
     try:
-        _add_all(mapper, (track.corrected(one) if track else one for one in seen), count, reports)
+        _add_all(mapper, (track.corrected(one) if track else one for one in seen), count, reports, checkpoints)
     except KeyboardInterrupt:
         if mapper.map.frames:
-            write_map_server(mapper.occupancy(), out, mode=arguments.mode)
+            checkpoints.save(len(reports))
             say(f"stopped after {len(reports)} of {count} readings; they are saved in {out.with_suffix('.yaml')}")
         raise
-    return _finished(mapper, reports, out, arguments.mode)
+    return _finished(mapper, reports, out, checkpoints)
 
 
 def _chosen(robot: Robot, use: str | None, frames: str | None) -> tuple[Iterator[Scan | Frame], int]:
@@ -162,21 +170,34 @@ def _mapper(config: Config, resume: str | None, any_size: bool) -> GridMapper:
     return GridMapper(load_config(config, voxel_size=before.resolution) if any_size else config, resume=before)
 
 
-def _add_all(mapper: GridMapper, seen: Iterator[Scan | Frame], count: int, reports: list[UpdateReport]) -> None:
+def _add_all(
+    mapper: GridMapper,
+    seen: Iterator[Scan | Frame],
+    count: int,
+    reports: list[UpdateReport],
+    checkpoints: Checkpoints,
+) -> None:
     with interrupt_between_steps() as check:
         for one in tracked(seen, count, "mapping"):
             reports.append(mapper.add(one))
             check()
+            if not reports[-1].refused:  # a map of nothing must not take the place of an older one
+                checkpoints.after(len(reports))
 
 
-def _finished(mapper: GridMapper, reports: list[UpdateReport], out: Path, mode: str) -> dict[str, Any]:
-    from stereovox.evaluate.summary import summarise
+def _save(mapper: GridMapper, out: Path, mode: str) -> None:
     from stereovox.products.map_server import write_map_server
+
+    write_map_server(mapper.occupancy(), out, mode=mode)
+
+
+def _finished(mapper: GridMapper, reports: list[UpdateReport], out: Path, checkpoints: Checkpoints) -> dict[str, Any]:
+    from stereovox.evaluate.summary import summarise
 
     result = summarise(mapper.map, reports)
     if not result["frames"]:
         raise StereovoxError(f"not one reading could be used, no map is written ({reports[0].detail})")
-    write_map_server(mapper.occupancy(), out, mode=mode)
+    checkpoints.save(len(reports))
     say(f"{result['frames']} readings mapped, {result['frames_refused']} refused")
     for reason, number in result["refused"].items():
         say(f"  {number} x {reason}, first: {next(one.detail for one in reports if one.refused == reason)}")

@@ -9,9 +9,12 @@ recording of a ground robot, as for `stereovox grid`.
 from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from stereovox.cli.checkpoints import Checkpoints, add_checkpoint
 from stereovox.cli.robots import GRID_FILES
 from stereovox.cli.settings import add_settings, overrides
 from stereovox.cli.terminal import (
@@ -24,11 +27,13 @@ from stereovox.cli.terminal import (
     thousands,
     tracked,
 )
-from stereovox.errors import SourceError, StereovoxError
+from stereovox.errors import MapFileError, SourceError, StereovoxError
 
 if TYPE_CHECKING:
     from stereovox.config import WindowConfig
+    from stereovox.frame import AnyFrame
     from stereovox.mapper import Mapper
+    from stereovox.maps import VoxelMap
     from stereovox.sources import Stream
     from stereovox.update_report import UpdateReport
 
@@ -56,39 +61,70 @@ def add_arguments(parser: ArgumentParser) -> None:
         action="store_true",
         help="go on with the map at --out; as many frames of SOURCE are skipped as it has seen",
     )
+    add_checkpoint(parser)
 
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Map the source, save the map and tell what was done."""
     if _of_a_floor(arguments):
         return _grid(arguments)
-    from stereovox.evaluate.summary import summarise
-    from stereovox.sources import open_stream
+    from stereovox.maps.lock import only_writer_in
 
     out = Path(arguments.out)
     _check_target(out, arguments.resume)
-    source = open_stream(arguments.source, arguments.frames)
-    if arguments.camera is not None:
-        from stereovox.sources.with_camera import with_camera
+    with only_writer_in(out):
+        return _mapped(arguments, out)
 
-        source = with_camera(source, arguments.camera)
+
+def _mapped(arguments: Namespace, out: Path) -> dict[str, Any]:
+    from stereovox.evaluate.summary import summarise
+
+    source = _opened(arguments)
     mapper = _mapper(arguments, out)
     try:
+        checkpoints = Checkpoints(lambda: mapper.map.save(out), out, arguments.checkpoint)
         _check_recording(mapper, source, out)
         for note in source.notes:
             say(f"note: {note}")
         say_about_compiling()
-        reports = _add_all(mapper, source, out)
-        result = summarise(mapper.map, reports)
-        if not mapper.map.frames:
-            raise StereovoxError(
-                f"{arguments.source}: not one frame could be used, no map is written ({_first_refusal(reports)})"
-            )
-        mapper.map.save(out)
+        with _there_at_once(mapper.map, out):
+            reports = _add_all(mapper, source, out, checkpoints)
+            result = summarise(mapper.map, reports)
+            if not mapper.map.frames:
+                raise StereovoxError(
+                    f"{arguments.source}: not one frame could be used, no map is written ({_first_refusal(reports)})"
+                )
+            checkpoints.save(_seen(mapper))
     finally:
-        mapper.map.close()  # whatever went wrong: tiles that stay behind would be in the next run's way
+        mapper.map.close()
     _tell(result, reports, out, mapper.config.window)
     return result
+
+
+def _opened(arguments: Namespace) -> Stream:
+    from stereovox.sources import open_stream
+
+    source = open_stream(arguments.source, arguments.frames)
+    if arguments.camera is None:
+        return source
+    from stereovox.sources.with_camera import with_camera
+
+    return with_camera(source, arguments.camera)
+
+
+@contextmanager
+def _there_at_once(voxel_map: VoxelMap, out: Path) -> Iterator[None]:
+    """Save a map that is new before its first frame: one that is killed is there; remove it if it stays empty."""
+    from stereovox.maps.store import is_map, read_manifest, remove_map
+
+    new = not is_map(out)
+    if new:
+        voxel_map.save(out)
+    try:
+        yield
+    finally:
+        if new and is_map(out) and not read_manifest(out)["frames"]:
+            remove_map(out)
 
 
 def _of_a_floor(arguments: Namespace) -> bool:
@@ -146,10 +182,10 @@ def _check_recording(mapper: Mapper, source: Stream, out: Path) -> None:
     mapper.map.recording = source.name
 
 
-def _add_all(mapper: Mapper, source: Stream, out: Path) -> list[UpdateReport]:
+def _add_all(mapper: Mapper, source: Stream, out: Path, checkpoints: Checkpoints) -> list[UpdateReport]:
     """Add all frames that the map does not hold yet; on Ctrl-C save what there is."""
     reports: list[UpdateReport] = []
-    done = mapper.map.frames + mapper.map.frames_refused
+    done = _seen(mapper)
     if done:
         if source.length is not None and done >= source.length:
             raise StereovoxError(f"{out}: already holds all {source.length} frames of {source.name}")
@@ -158,8 +194,10 @@ def _add_all(mapper: Mapper, source: Stream, out: Path) -> list[UpdateReport]:
     try:
         with interrupt_between_steps() as check:
             for frame in tracked(source, source.length, "mapping"):
-                reports.append(mapper.add(frame))
+                reports.append(_added(mapper, frame, checkpoints))
                 check()
+                if mapper.map.frames:  # an empty map must not take the place of an older one
+                    checkpoints.after(_seen(mapper))
                 if source.length is None and len(reports) == PATIENCE and all(one.refused for one in reports):
                     left = f"{out} stays as it is" if done else "no map is written"  # it would be refused for ever
                     raise StereovoxError(
@@ -167,10 +205,23 @@ def _add_all(mapper: Mapper, source: Stream, out: Path) -> list[UpdateReport]:
                     )
     except (KeyboardInterrupt, SourceError):
         if mapper.map.frames:
-            mapper.map.save(out)
+            checkpoints.save(_seen(mapper))
             say(f"stopped after {len(reports)} frames; they are saved in {out}, go on with --resume")
         raise
     return reports
+
+
+def _added(mapper: Mapper, frame: AnyFrame, checkpoints: Checkpoints) -> UpdateReport:
+    try:
+        return mapper.add(frame)
+    except MapFileError as error:  # no room for a tile; up to this frame the map is whole in memory
+        checkpoints.save(_seen(mapper))
+        raise MapFileError(f"{error}; {checkpoints.left()}") from None
+
+
+def _seen(mapper: Mapper) -> int:
+    """Return how many frames the map was offered."""
+    return mapper.map.frames + mapper.map.frames_refused
 
 
 def _first_refusal(reports: list[UpdateReport]) -> str:

@@ -47,10 +47,18 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Map, save map and way, and tell how it went."""
+    from stereovox.maps.lock import only_writer_of
+
+    out = check_file(arguments.out, GRID_ENDINGS)
+    with only_writer_of(out.with_suffix(".yaml")):
+        return _mapped(arguments, out)
+
+
+def _mapped(arguments: Namespace, out: Path) -> dict[str, Any]:
     from stereovox.evaluate.relations import read_relations
     from stereovox.products.map_server import write_map_server
 
-    out, config = check_file(arguments.out, GRID_ENDINGS), settings_of(arguments)
+    config = settings_of(arguments)
     if arguments.relations is not None:
         read_relations(Path(arguments.relations))  # what is wrong with it shows before the work
     robot = opened(arguments.source)

@@ -10,7 +10,7 @@ from typing import Any
 from stereovox.evaluate.bench_machine import machine_line
 from stereovox.evaluate.bench_more import MEASUREMENTS
 from stereovox.evaluate.bench_table import Table, comparison_table
-from stereovox.products.files import replacing
+from stereovox.files import replacing
 
 
 def tables(result: dict[str, Any]) -> list[Table]:

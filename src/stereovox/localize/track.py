@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from stereovox import planar
 from stereovox.errors import StereovoxError
+from stereovox.files import replacing
 from stereovox.frame import Frame, Scan
-from stereovox.products.files import replacing
 from stereovox.sources.poses import seconds_from_ns
 
 Posed = TypeVar("Posed", bound=Frame | Scan)

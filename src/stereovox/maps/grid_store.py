@@ -4,8 +4,6 @@
 from __future__ import annotations
 
 import json
-import os
-import uuid
 import zipfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,8 +12,10 @@ import numpy as np
 
 from stereovox.config import load_config
 from stereovox.errors import MapFileError
+from stereovox.files import replacing
 from stereovox.history import History
 from stereovox.maps.grid_evidence import CELLS
+from stereovox.maps.lock import only_writer_of
 
 if TYPE_CHECKING:
     from stereovox.maps.grid_map import GridMap
@@ -27,25 +27,14 @@ MOST_BYTES = 1 << 32
 
 
 def save_grid(grid_map: GridMap, path: str | Path) -> None:
-    """Write `grid_map` to the file `path`, all or nothing. Raises MapFileError, one line, where that cannot be."""
-    target = Path(os.path.realpath(path))
-    temporary = target.with_name(f".{uuid.uuid4().hex[:12]}.new")
+    """Write `grid_map` to the file `path`, all or nothing.
+
+    Raises MapFileError, one line, where that cannot be or another run is writing it.
+    """
     coords, cells = grid_map.tiles()
     about = np.frombuffer(json.dumps(_about(grid_map)).encode(), np.uint8)
-    try:
-        if target.is_dir():
-            raise MapFileError(f"{path}: is a folder; name a file")
-        with temporary.open("xb") as file:
-            np.savez_compressed(file, about=about, coords=coords, cells=cells)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(target)
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or error
-        raise MapFileError(f"{path}: cannot save the grid ({reason}); choose a writable folder") from None
-    finally:
-        if temporary.exists():
-            temporary.unlink()
+    with only_writer_of(Path(path)), replacing(path) as file:
+        np.savez_compressed(file, about=about, coords=coords, cells=cells)
 
 
 def load_grid(path: str | Path) -> GridMap:

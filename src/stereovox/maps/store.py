@@ -2,7 +2,8 @@
 """A map on disk: a folder with a manifest (JSON) and the cells as Zarr v3 arrays.
 
 Zarr writes are not transactional, so each save goes to a folder of its own and becomes the map when the manifest
-that names it is renamed into place; only then is the older save removed. A killed save leaves the older map whole.
+that names it is renamed into place; only then is the older save removed. Each step waits until the disk has it: a save
+that is killed, or that a power cut ends, leaves the older map whole. What it leaves beside it, the next one removes.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import shutil
 import uuid
 import zlib
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,9 +26,11 @@ from numpy.typing import NDArray
 from stereovox.cameras import DepthCorrection, PinholeCamera
 from stereovox.config import load_config
 from stereovox.errors import MapFileError
+from stereovox.files import sync_folder, sync_tree
 from stereovox.frame import Viewpoint
 from stereovox.history import History
 from stereovox.maps.blocks import CELLS
+from stereovox.maps.lock import LOCK, only_writer_in
 
 if TYPE_CHECKING:
     from stereovox.maps.voxel_map import VoxelMap
@@ -35,7 +39,7 @@ FORMAT = "stereovox-map"
 VERSION, READABLE = 2, (1, 2)
 MANIFEST = "manifest.json"
 BLOCKS_PER_CHUNK = 4096
-UNFINISHED = re.compile(r"cells-[0-9a-f]{12}|\.manifest\.json\.new")
+UNFINISHED = re.compile(r"cells-[0-9a-f]{12}|\.manifest\.json\.new|\.lock")
 """What a save that was killed leaves."""
 Slab = tuple[NDArray, ...]
 """Block coordinates (n, 3), cells (n, 512), and times (n, 512) where they are kept."""
@@ -43,25 +47,37 @@ ARRAYS = ("coords", "cells", "times")
 
 
 def save_map(voxel_map: VoxelMap, path: str | Path) -> None:
-    """Write `voxel_map` to the folder `path`. Raises MapFileError when it cannot be written or is no map."""
+    """Write `voxel_map` to the folder `path`, so that the disk holds all of it when this returns.
+
+    Raises MapFileError when it cannot be written, is no map, or is being written by another run; an older map is then
+    as it was.
+    """
     folder = Path(path)
     check_target(folder)
     data = f"cells-{uuid.uuid4().hex[:12]}"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
+    with only_writer_in(folder):
+        _sweep(folder)
         try:
             blocks, checksum = _write_arrays(folder / data, voxel_map)
+            sync_tree(folder / data)
             _write_manifest(folder, _manifest(voxel_map, data, blocks, checksum))
-        except BaseException:
-            _clean_up(folder, data)
-            raise
-    except OSError as error:
-        raise MapFileError(
-            f"{folder}: cannot save the map ({error.strerror or error}); choose a writable folder"
-        ) from None
-    for old in folder.glob("cells-*"):
-        if old.name != data:
-            shutil.rmtree(old, ignore_errors=True)
+        except BaseException as error:
+            if _named(folder) != data:  # else it is the map already, whatever the disk says
+                _sweep(folder)
+            if not isinstance(error, OSError):
+                raise
+            raise MapFileError(
+                f"{folder}: cannot save the map ({error.strerror or error}); choose a writable folder that has room"
+            ) from None
+        _sweep(folder)
+
+
+def remove_map(folder: Path) -> None:
+    """Remove a saved map from its folder, which stays. Raises MapFileError where another run writes it."""
+    with only_writer_in(folder):
+        with suppress(OSError):
+            (folder / MANIFEST).unlink(missing_ok=True)
+        _sweep(folder)
 
 
 def check_target(folder: Path) -> None:
@@ -80,10 +96,20 @@ def load_map(path: str | Path) -> VoxelMap:
 
     Raises MapFileError: one line with the file and what is wrong.
     """
-    from stereovox.maps.voxel_map import VoxelMap
-
     folder = Path(path)
     manifest = read_manifest(folder)
+    while True:
+        try:
+            return _load(folder, manifest)
+        except MapFileError:
+            tried, manifest = manifest, read_manifest(folder)
+            if manifest.get("data") == tried.get("data"):  # else a newer save took its place meanwhile
+                raise
+
+
+def _load(folder: Path, manifest: dict[str, Any]) -> VoxelMap:
+    from stereovox.maps.voxel_map import VoxelMap
+
     try:
         if not isinstance(manifest["config"], dict):
             raise TypeError("config is no table of settings")
@@ -138,14 +164,18 @@ def _is_free(folder: Path) -> bool:
     return folder.is_dir() and all(UNFINISHED.fullmatch(entry.name) for entry in folder.iterdir())
 
 
-def _clean_up(folder: Path, data: str) -> None:
-    """Remove what a save that failed has written, and the folder if nothing else is in it."""
-    shutil.rmtree(folder / data, ignore_errors=True)
-    try:
-        (folder / f".{MANIFEST}.new").unlink(missing_ok=True)
-        folder.rmdir()
-    except OSError:
-        return  # an older map stands there
+def _sweep(folder: Path) -> None:
+    """Remove what saves left that were killed or failed: all that the manifest does not name."""
+    with suppress(OSError, MapFileError):  # what cannot be removed is in nobody's way; a damaged map stays as it is
+        named = _named(folder)
+        for entry in folder.iterdir():
+            if UNFINISHED.fullmatch(entry.name) and entry.name not in (named, LOCK):
+                shutil.rmtree(entry, ignore_errors=True) if entry.is_dir() else entry.unlink()
+
+
+def _named(folder: Path) -> Any:
+    """Return the name of the saved cells, None where there is no map. Raises MapFileError for a damaged one."""
+    return read_manifest(folder).get("data") if is_map(folder) else None
 
 
 def _manifest(voxel_map: VoxelMap, data: str, blocks: int, checksum: list[int]) -> dict[str, Any]:
@@ -199,7 +229,9 @@ def _write_manifest(folder: Path, manifest: dict[str, Any]) -> None:
         json.dump(manifest, file, indent=2, default=_as_number)
         file.flush()
         os.fsync(file.fileno())
+    sync_folder(folder)  # whatever the new manifest names is there before it
     temporary.replace(folder / MANIFEST)
+    sync_folder(folder)
 
 
 def _as_number(number: Any) -> Any:

@@ -6,11 +6,13 @@ A background thread writes, so that mapping does not wait for the disk; what is 
 
 from __future__ import annotations
 
+import re
 import shutil
 import tempfile
 import weakref
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +22,7 @@ from numpy.typing import NDArray
 from stereovox.errors import MapFileError
 from stereovox.maps.blocks import CELLS, SIDE
 from stereovox.maps.cell_format import CellFormat
+from stereovox.maps.lock import LOCK, only_store_in
 
 BLOCKS = 4
 """Blocks along each side of a tile."""
@@ -30,19 +33,23 @@ OFFSET = 1 << 30
 WAITING = 128
 """Tiles that may wait to be written; one more and mapping waits."""
 
+OURS = re.compile(rf"{re.escape(LOCK)}|zarr\.json|c|.*\.partial")
+"""What a store has in its folder."""
+
 Tile = tuple[int, int, int]
 
 
 class TileStore:
     """Tiles of 32x32x32 cells by their coordinates (cell index // 32).
 
-    folder: it must be empty or not exist, and is removed by `close`; by default a temporary one that goes with this
-    object. Raises MapFileError where the folder cannot be used.
+    folder: it must be empty or not exist or hold what a run left that was killed; `close` removes it. By default a
+    temporary one that goes with this object. Raises MapFileError where the folder cannot be used, or another run does.
     """
 
     def __init__(self, cell_format: CellFormat, folder: Path | None = None):
         self._format = cell_format
         self.folder = Path(tempfile.mkdtemp(prefix="stereovox-tiles-")) if folder is None else folder
+        self._writing = ExitStack()
         self._array = self._create()
         self._tiles: set[Tile] = set()
         self._waiting: dict[Tile, tuple[NDArray, Future[None]]] = {}
@@ -88,32 +95,50 @@ class TileStore:
     def close(self) -> None:
         """Remove the folder; what still waits to be written is not needed any more."""
         self._writer.shutdown(wait=True, cancel_futures=True)
-        shutil.rmtree(self.folder, ignore_errors=True)
+        self._remove()
 
     def _create(self) -> Any:
-        import zarr
-
+        """Return the empty array on disk; the folder is ours until `_remove`."""
+        self._check_unused()
+        self._writing.enter_context(only_store_in(self.folder))
         try:
-            self._check_empty()
-            try:
-                return zarr.create_array(
-                    self.folder, shape=(2 * OFFSET,) * 3, chunks=(TILE,) * 3,
-                    dtype=self._format.dtype, fill_value=self._format.unknown, zarr_format=3,
-                )  # fmt: skip
-            except BaseException:
-                shutil.rmtree(self.folder, ignore_errors=True)  # half a store would be in the next run's way
+            self._clear()
+            return self._new_array()
+        except BaseException as error:
+            self._remove()
+            if not isinstance(error, OSError):
                 raise
-        except OSError as error:
             raise MapFileError(f"{self.folder}: cannot keep tiles here ({error.strerror or error})") from None
 
-    def _check_empty(self) -> None:
-        if not self.folder.exists() or not any(self.folder.iterdir()):
-            return
-        if (self.folder / "zarr.json").is_file():
-            raise MapFileError(
-                f"{self.folder}: tiles of a run that still goes on or was killed; if it was killed, remove this folder"
-            )
-        raise MapFileError(f"{self.folder}: holds something that is no tile; move it away")
+    def _new_array(self) -> Any:
+        import zarr
+
+        return zarr.create_array(
+            self.folder, shape=(2 * OFFSET,) * 3, chunks=(TILE,) * 3,
+            dtype=self._format.dtype, fill_value=self._format.unknown, zarr_format=3,
+        )  # fmt: skip
+
+    def _check_unused(self) -> None:
+        """Refuse a folder that holds anything but what another store left, or still uses."""
+        try:
+            names = {entry.name for entry in self.folder.iterdir()} if self.folder.exists() else set()
+        except OSError as error:
+            raise MapFileError(f"{self.folder}: cannot keep tiles here ({error.strerror or error})") from None
+        if names and not (names & {LOCK, "zarr.json"} and all(map(OURS.fullmatch, names))):
+            raise MapFileError(f"{self.folder}: holds something that is no tile; move it away")
+
+    def _clear(self) -> None:
+        """Remove all but the lock: tiles of this store, or of one whose run was killed."""
+        for entry in self.folder.iterdir():
+            if entry.name != LOCK:
+                shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
+
+    def _remove(self) -> None:
+        with suppress(OSError):
+            self._clear()
+        self._writing.close()
+        with suppress(OSError):
+            self.folder.rmdir()
 
     def _dense(self, tile: Tile) -> NDArray:
         waiting = self._waiting.get(tile)
@@ -126,11 +151,11 @@ class TileStore:
         return _to_blocks(np.asarray(self._array[_place(tile)]))
 
     def _settle(self, tile: Tile) -> None:
-        _, written = self._waiting.pop(tile)
         try:
-            written.result()
-        except OSError as error:
+            self._waiting[tile][1].result()
+        except OSError as error:  # the tile stays where it is: the map can still be saved elsewhere
             raise MapFileError(f"{self.folder}: a tile cannot be written ({error.strerror or error})") from None
+        del self._waiting[tile]
 
     def _forget_written(self) -> None:
         for tile in [tile for tile, (_, written) in self._waiting.items() if written.done()]:

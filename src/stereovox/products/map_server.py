@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.errors import MapFileError, did_you_mean
+from stereovox.files import replacing
 from stereovox.maps.occupancy import UNKNOWN, OccupancyGrid
 from stereovox.maps.voxel_map import State
-from stereovox.products.files import replacing
 from stereovox.products.map_image import Picture, read_picture, write_pgm, write_png
 from stereovox.products.map_yaml import MODES, Meaning, read_meaning
 
@@ -42,7 +42,9 @@ def read_map_server(path: str | Path) -> OccupancyGrid:
 
 
 def write_map_server(grid: OccupancyGrid, path: str | Path, mode: str = "trinary", negate: bool = False) -> None:
-    """Write a picture and its .yaml, both or none; `path` names either (a .yaml's picture is a .pgm; scaled: a .png).
+    """Write a picture and its .yaml; `path` names either (a .yaml's picture is a .pgm; scaled: a .png).
+
+    Both or none: if the power goes, the .yaml names a picture that belongs to it, for a moment one of another name.
 
     trinary: free cells 254, occupied ones 0, all others 205, which are unknown. scale: per cent as greys, unknown cells
     are see-through and need a .png. raw: per cent as they are, unknown 255; the thresholds are the map's own. Scaled
@@ -55,13 +57,25 @@ def write_map_server(grid: OccupancyGrid, path: str | Path, mode: str = "trinary
     greys, occupied, free = _greys(grid, mode)
     shown = np.ascontiguousarray(grid.cells[::-1])
     pixels = _through(255 - greys if negate else greys, shown)
-    meaning = Meaning(image, grid.resolution, grid.origin, negate, occupied, free, mode)
-    with replacing(yaml) as text, replacing(image) as picture:  # the picture takes its place first
-        text.write(meaning.text().encode())
-        if png:
-            write_png(picture, pixels, shown >= 0 if mode == "scale" else None)
-        else:
-            write_pgm(picture, pixels, f"CREATOR: stereovox {grid.resolution:.3f} m/pix")
+    opaque = shown >= 0 if mode == "scale" else None
+    spare = image.with_name(f".{image.name}")
+    # They take their places from the last to the first: so whenever it ends, a .yaml names a picture of its own.
+    with (
+        replacing(yaml) as text,
+        replacing(image) as picture,
+        replacing(yaml) as text_between,
+        replacing(spare) as picture_between,
+    ):
+        for file, name in ((text, image), (text_between, spare)):
+            file.write(Meaning(name, grid.resolution, grid.origin, negate, occupied, free, mode).text().encode())
+        for file in (picture, picture_between):
+            if png:
+                write_png(file, pixels, opaque)
+            else:
+                write_pgm(file, pixels, f"CREATOR: stereovox {grid.resolution:.3f} m/pix")
+        for file in (text, picture, text_between):
+            file.flush()  # a full disk shows before the first of them is in its place
+    spare.unlink(missing_ok=True)
 
 
 def _cells(picture: Picture, meaning: Meaning) -> NDArray[np.int8]:

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from stereovox.files import replacing
 from stereovox.maps import State, VoxelMap
-from stereovox.products.files import replacing
 from stereovox.products.octree import Nodes, build_octree
 
 BINARY_TITLE = "# Octomap OcTree binary file"

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from stereovox.files import replacing
 from stereovox.maps import VoxelMap
-from stereovox.products.files import replacing
 
 PLY_POINT = np.dtype(
     [

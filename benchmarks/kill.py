@@ -1,0 +1,221 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Kill `stereovox map` at random moments (`kill -9`) and see what is left.
+
+    python benchmarks/kill.py --kills 200 [SOURCE] [--frames :100] [--voxel-size 0.1] [--json]
+
+After each kill the map must open and hold all frames of the last checkpoint, and `--resume` must end with the same
+cells, counts, window and settings as a run that nobody disturbed, and leave nothing else behind. Every second run keeps the cells that leave a window in tiles
+on disk; every seventh frame has a fault and is refused. Checkpoints are made far more often than by default, so that
+many kills fall into one. A moment is any from the first map on the disk to the end of the process.
+
+The runs are real processes, forked from this one, which has loaded the kernels for all of them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import random
+import signal
+import sys
+import tempfile
+import time
+from argparse import ArgumentParser, Namespace
+from dataclasses import replace
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+from stereovox.cli import checkpoints, main
+from stereovox.mapper import Mapper
+from stereovox.maps import load_map, make_map
+from stereovox.sources import open_stream
+
+CONTEXT = get_context("fork")
+PLAIN: list[str] = []
+KEEP = ["--set", "window.size=[4, 4, 3]", "--set", "window.trigger=0.3", "--set", "window.outside=keep"]
+REST = 1
+"""Instead of 25: half of the time goes into checkpoints."""
+
+
+def command(out: Path, given: Namespace, settings: list[str], *more: str) -> list[str]:
+    """Return the words of one run."""
+    words = ["map", given.source, "--out", str(out), "--frames", given.frames, "--voxel-size", str(given.voxel_size)]
+    return [*words, "--checkpoint", "0.001", *settings, *more]
+
+
+def perform(words: list[str], done: Any, saved: Any) -> None:
+    """Run a command in this process; `done` and `saved` tell others how many frames are in the map and on the disk."""
+    checkpoints.REST = REST
+    add, save = Mapper.add, checkpoints.Checkpoints.save
+
+    def add_or_refuse(mapper: Mapper, frame: Any) -> Any:
+        faulty = done.value % 7 == 3
+        report = add(mapper, replace(frame, fault="unreadable", fault_detail="made so") if faulty else frame)
+        done.value += 1
+        return report
+
+    def save_and_tell(self: checkpoints.Checkpoints, frames: int) -> None:
+        save(self, frames)
+        saved.value = frames
+
+    Mapper.add, checkpoints.Checkpoints.save = add_or_refuse, save_and_tell
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 2)
+    os._exit(main(words))
+
+
+def started(words: list[str], frames: int = 0) -> tuple[Any, Any, Any]:
+    """Return a process that runs a command on a map of so many frames, and its two counters."""
+    done, saved = CONTEXT.Value("q", frames, lock=False), CONTEXT.Value("q", frames, lock=False)
+    process = CONTEXT.Process(target=perform, args=(words, done, saved))
+    process.start()
+    return process, done, saved
+
+
+def contents(out: Path) -> dict[str, Any]:
+    """Return what a map holds, read by a process of its own; `digest` stands for all its cells."""
+    reader, writer = CONTEXT.Pipe(duplex=False)
+
+    def read() -> None:
+        try:
+            one = load_map(out)
+            cells = b"".join(part.tobytes() for part in one.blocks())
+            writer.send(
+                {
+                    "digest": hashlib.sha256(cells).hexdigest(),
+                    "frames": one.frames,
+                    "refused": one.frames_refused,
+                    "last_frame": one.last_frame,
+                    "window": one.window_state,
+                    "config": one.config.model_dump(),
+                }
+            )
+        except Exception as error:
+            writer.send({"error": f"{type(error).__name__}: {error}"})
+
+    process = CONTEXT.Process(target=read)
+    process.start()
+    found = reader.recv()
+    process.join()
+    return found
+
+
+def left_over(out: Path) -> list[str]:
+    """Return what lies in and beside a map and belongs to no whole one."""
+    data = json.loads((out / "manifest.json").read_text())["data"]
+    inside = [entry.name for entry in out.iterdir() if entry.name not in (data, "manifest.json")]
+    return inside + [entry.name for entry in out.parent.iterdir() if entry != out]
+
+
+def undisturbed(folder: Path, given: Namespace, settings: list[str]) -> tuple[dict[str, Any], float]:
+    """Return what a whole run leaves, and how long it takes from its first map on."""
+    out = folder / "whole" / "map.svox"
+    out.parent.mkdir()
+    process, _, _ = started(command(out, given, settings))
+    wait_for_map(process, out)
+    start = time.monotonic()
+    process.join()
+    seconds = time.monotonic() - start
+    found = contents(out)
+    if process.exitcode or "error" in found:
+        sys.exit(f"a run without any kill failed: status {process.exitcode}, {found}")
+    return found, seconds
+
+
+def wait_for_map(process: Any, out: Path) -> None:
+    """Wait until the first map lies on the disk."""
+    while process.is_alive() and not (out / "manifest.json").exists():
+        time.sleep(0.0005)
+
+
+def trial(out: Path, given: Namespace, settings: list[str], whole: dict[str, Any], seconds: float) -> dict[str, Any]:
+    """Kill one run, look at what is left, go on with it and look again."""
+    process, done, saved = started(command(out, given, settings))
+    wait_for_map(process, out)
+    time.sleep(random.uniform(0, seconds))
+    os.kill(process.pid, signal.SIGKILL)
+    process.join()
+    found = contents(out)
+    if process.exitcode != -signal.SIGKILL:
+        return {"killed": False}
+    told: dict[str, Any] = {"killed": True, "opened": "error" not in found, "error": found.get("error")}
+    if not told["opened"]:
+        return told
+    held = found["frames"] + found["refused"]
+    told |= {"frames": held, "missing": done.value - held, "lost": max(0, saved.value - held)}
+    told["in_a_save"] = any(name.startswith(("cells-", ".manifest")) for name in left_over(out))
+    start = time.monotonic()
+    again, _, _ = started(command(out, given, settings, "--resume"), held)
+    again.join()
+    told["resume_s"] = time.monotonic() - start
+    as_wanted = 2 if held == whole["frames"] + whole["refused"] else 0  # 2: the map holds all frames already
+    told["equal"] = again.exitcode == as_wanted and contents(out) == whole
+    told["left"] = left_over(out)
+    return told
+
+
+def summary(told: list[dict[str, Any]], seconds: float) -> dict[str, Any]:
+    """Return the figures of all trials."""
+    opened = [one for one in told if one["opened"]]
+    if not opened:
+        return {"kills": len(told), "opened": 0, "resumed_equal": 0, "failures": told[:5]}
+    return {
+        "kills": len(told),
+        "kills_in_a_save": sum(one["in_a_save"] for one in opened),
+        "opened": len(opened),
+        "frames_missing_most": max(one["missing"] for one in opened),
+        "frames_missing_median": sorted(one["missing"] for one in opened)[len(opened) // 2],
+        "checkpoints_lost": sum(one["lost"] > 0 for one in opened),
+        "resumed_equal": sum(one["equal"] for one in opened),
+        "with_things_left_after_resume": sum(bool(one["left"]) for one in opened),
+        "resume_s_median": round(sorted(one["resume_s"] for one in opened)[len(opened) // 2], 2),
+        "seconds": round(seconds, 1),
+        "failures": [one for one in told if not (one["opened"] and one["equal"] and not one["lost"])][:5],
+    }
+
+
+def parsed() -> Namespace:
+    """Return the options."""
+    parser = ArgumentParser(description=str(__doc__).splitlines()[0])
+    parser.add_argument("source", nargs="?", default="sim:room?image_width=160")
+    parser.add_argument("--kills", type=int, default=200)
+    parser.add_argument("--frames", default=":100")
+    parser.add_argument("--voxel-size", type=float, default=0.1)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--json", action="store_true")
+    return parser.parse_args()
+
+
+def run() -> int:
+    """Kill and tell; the status is 1 where a promise was broken."""
+    given = parsed()
+    random.seed(given.seed)
+    # Loads the kernels for all processes to come. Nothing is read or written with Zarr here: its thread would be lost.
+    for words in ({}, {"window": {"size": [4, 4, 3], "trigger": 0.3}}):
+        mapper = Mapper("default", voxel_size=given.voxel_size, **words)
+        for frame in open_stream(given.source, given.frames):
+            mapper.add(frame)
+        make_map(mapper.config, mapper.map).blocks()
+    start, told = time.monotonic(), []
+    with tempfile.TemporaryDirectory(prefix="stereovox-kill-") as name:
+        kinds = []
+        for n, settings in enumerate((PLAIN, KEEP)):
+            (Path(name) / str(n)).mkdir()
+            kinds.append((settings, *undisturbed(Path(name) / str(n), given, settings)))
+        while len(told) < given.kills:
+            with tempfile.TemporaryDirectory(dir=name) as place:
+                one = trial(Path(place) / "map.svox", given, *kinds[len(told) % 2])
+            if one["killed"]:  # else it had come to its end
+                told.append(one)
+                print(f"\r{len(told)} of {given.kills}", end="", file=sys.stderr, flush=True)
+    found = summary(told, time.monotonic() - start)
+    print(file=sys.stderr)
+    print(json.dumps(found) if given.json else "\n".join(f"{key:30} {value}" for key, value in found.items()))
+    kept = found["opened"] == found["resumed_equal"] == found["kills"]
+    return 0 if kept and told and not found["checkpoints_lost"] and not found["with_things_left_after_resume"] else 1
+
+
+if __name__ == "__main__":
+    sys.exit(run())

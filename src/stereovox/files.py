@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Write a file all or nothing, so that not even a power cut leaves half of one."""
+
+from __future__ import annotations
+
+import errno
+import os
+import uuid
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO
+
+from stereovox.errors import MapFileError, StereovoxError
+
+
+@contextmanager
+def replacing(path: str | Path, error: type[StereovoxError] = MapFileError) -> Iterator[IO[bytes]]:
+    """Yield a binary file that becomes `path` when the block ends well; otherwise an older `path` stays as it was.
+
+    Raises `error`: one line when the folder is missing or cannot be written, or the disk is full.
+    """
+    target = Path(os.path.realpath(path))  # a link keeps pointing to where it pointed
+    temporary = target.with_name(f".{uuid.uuid4().hex[:12]}.new")
+    try:
+        if target.is_dir():
+            raise error(f"{path}: is a folder; name a file")
+        if target.exists() and not target.is_file():
+            raise error(f"{path}: is no plain file, which could be replaced; name another")
+        with temporary.open("xb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(target)
+        sync_folder(target.parent)
+    except OSError as failed:
+        reason = f"cannot be written ({failed.strerror or failed})"
+        raise error(f"{path}: {reason}; choose a folder that exists and has room, and can be written") from None
+    finally:
+        _remove(temporary)
+
+
+def sync_folder(folder: Path) -> None:
+    """Wait until the disk holds the names in `folder`: what was made, renamed and removed there."""
+    try:
+        number = os.open(folder, os.O_RDONLY)
+    except PermissionError:
+        return  # a folder that may be written but not read; not on every system can it be asked
+    try:
+        os.fsync(number)
+    except OSError as error:
+        if error.errno != errno.EINVAL:  # the file system has no such thing for folders
+            raise
+    finally:
+        os.close(number)
+
+
+def sync_tree(folder: Path) -> None:
+    """Wait until the disk holds all files below `folder`, and their names."""
+    for place, _, names in os.walk(folder, topdown=False):
+        for name in names:
+            with (Path(place) / name).open("rb") as file:
+                os.fsync(file.fileno())
+        sync_folder(Path(place))
+
+
+def _remove(path: Path) -> None:
+    try:
+        path.unlink(missing_ok=True)
+    except OSError:
+        return  # the folder cannot be written, so the file was never made

@@ -12,6 +12,7 @@ SOURCE = Path(__file__).resolve().parents[1] / "src/stereovox"
 LAYERS = (
     {
         "errors",
+        "untrusted",
         "registry",
         "frame",
         "geometry",

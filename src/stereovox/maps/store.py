@@ -23,9 +23,10 @@ from numpy.typing import NDArray
 
 from stereovox.cameras import DepthCorrection, PinholeCamera
 from stereovox.config import load_config
-from stereovox.errors import MapFileError
+from stereovox.errors import MapFileError, one_line
 from stereovox.frame import Viewpoint
-from stereovox.maps.blocks import CELLS
+from stereovox.maps.store_read import read_blocks
+from stereovox.untrusted import json_value, read_bounded, shown
 
 if TYPE_CHECKING:
     from stereovox.maps.voxel_map import VoxelMap
@@ -33,6 +34,8 @@ if TYPE_CHECKING:
 FORMAT = "stereovox-map"
 VERSION, READABLE = 2, (1, 2)
 MANIFEST = "manifest.json"
+MOST_MANIFEST = 1 << 22
+"""Bytes of a manifest."""
 BLOCKS_PER_CHUNK = 4096
 UNFINISHED = re.compile(r"cells-[0-9a-f]{12}|\.manifest\.json\.new")
 """What a save that was killed leaves."""
@@ -88,17 +91,25 @@ def load_map(path: str | Path) -> VoxelMap:
         if isinstance(cells_of := manifest["config"].get("map"), dict):
             cells_of.setdefault("prior", 0.5)  # that of maps from before there was one
         voxel_map = VoxelMap(load_config(manifest["config"]))
-        voxel_map.frames, voxel_map.frames_refused = int(manifest["frames"]), int(manifest["frames_refused"])
-        voxel_map.recording = str(manifest["recording"])
+        voxel_map.frames, voxel_map.frames_refused = _count(manifest, "frames"), _count(manifest, "frames_refused")
+        voxel_map.recording = one_line(str(manifest["recording"]))
         voxel_map.viewpoint = _viewpoint_from(manifest.get("viewpoint"))
         voxel_map.window_state = manifest.get("window")
-        coords, cells = _read_arrays(folder / str(manifest["data"]), int(manifest["blocks"]), voxel_map)
+        data, blocks = folder / str(manifest["data"]), _count(manifest, "blocks")
+        coords, cells = read_blocks(data, blocks, voxel_map.cell_format.dtype)
         if _checksums(coords, cells, manifest["checksum"]) != manifest["checksum"]:
             raise ValueError("the cells do not match their checksum")
     except (KeyError, TypeError, ValueError, OSError, RuntimeError, OverflowError, AttributeError) as error:
         raise MapFileError(f"{folder}: damaged map ({type(error).__name__}: {error}); make it anew") from None
     voxel_map.insert(coords, cells)
     return voxel_map
+
+
+def _count(manifest: dict[str, Any], key: str) -> int:
+    count = manifest[key]
+    if type(count) is not int or not 0 <= count < 1 << 62:
+        raise ValueError(f"{key} {shown(count)} is no count")
+    return count
 
 
 def is_map(path: str | Path) -> bool:
@@ -113,8 +124,8 @@ def read_manifest(folder: Path) -> dict[str, Any]:
             f"{folder}: no stereovox map here (no {MANIFEST}); make one with: stereovox map SOURCE --out {folder}"
         )
     try:
-        manifest = json.loads((folder / MANIFEST).read_text())
-    except (OSError, ValueError, RecursionError) as error:
+        manifest = json_value(read_bounded(folder / MANIFEST, MOST_MANIFEST))
+    except (OSError, ValueError) as error:
         raise MapFileError(f"{folder / MANIFEST}: cannot be read ({error}); make the map anew") from None
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
         raise MapFileError(f"{folder / MANIFEST}: not a stereovox map")
@@ -242,18 +253,3 @@ def _new_array(group: Any, name: str, like: NDArray, fill: int) -> Any:
     rows = max(1, min(BLOCKS_PER_CHUNK, len(like)))
     shape, chunks = (0, like.shape[1]), (rows, like.shape[1])
     return group.create_array(name, shape=shape, dtype=like.dtype, chunks=chunks, fill_value=fill)
-
-
-def _read_arrays(folder: Path, blocks: int, voxel_map: VoxelMap) -> Slab:
-    import zarr
-
-    group = zarr.open_group(folder, mode="r")
-    coords: Any = group["coords"]
-    cells: Any = group["cells"]
-    for array, shape, dtype in (
-        (coords, (blocks, 3), np.int32),
-        (cells, (blocks, CELLS), voxel_map.cell_format.dtype),
-    ):
-        if array.shape != shape or array.dtype != dtype:
-            raise ValueError(f"array of {array.shape} {array.dtype} where {shape} {np.dtype(dtype)} belongs")
-    return np.asarray(coords[:]), np.asarray(cells[:])

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from stereovox.errors import SourceError
 from stereovox.sources.poses import Poses
 from stereovox.sources.poses import seconds_from_ns as seconds_from_ns
+from stereovox.untrusted import MOST_LIST, read_text
 
 LIMIT = 9_223_372_036
 """Seconds whose nanoseconds still fit into int64."""
@@ -82,7 +83,7 @@ def stamped_lines(path: Path) -> list[StampedLine]:
     Commas and tabs count as spaces. Raises SourceError naming file and line.
     """
     try:
-        text = path.read_text("utf-8-sig", errors="replace")
+        text = read_text(path, MOST_LIST, "replace")
     except OSError as error:
         raise SourceError(f"{path}: {error.strerror}; make it readable") from None
     return [_parse(line, f"{path}:{n}") for n, line in enumerate(map(_plain, text.splitlines()), 1) if line]

@@ -26,6 +26,7 @@ from made_robot_bags import START_NS, Messages, RobotBagMaker, planar_numbers
 
 from mutate import with_right_sums
 from stereovox.config import load_config
+from stereovox.errors import StereovoxError
 from stereovox.evaluate.camera_path import read_camera_path
 from stereovox.evaluate.relations import read_relations
 from stereovox.maps import VoxelMap, load_map
@@ -100,7 +101,7 @@ METADATA = """rosbag2_bagfile_information:
   topics_with_message_count: []
 """
 FLASER = b"PARAM robot_frontlaser_offset 0.1\nFLASER 3 1.0 2.0 81.9 0 0 0 0.1 0.2 0.3 976052857.3 nohost 0.1\n"
-ROBOTLASER = b"ROBOTLASER1 0 -1.57 3.14 1.57 30.0 0.01 0 3 1.0 2.0 31 0 0 0 0 0 0 0 0 0 0 0 0 976052857.3 nohost 0.1\n"
+ROBOTLASER = b"ROBOTLASER1 0 -1.57 3.14 0.5 30.0 0.01 0 3 1.0 2.0 31 0 0 0 0 0 0 0 0 0 0 0 0 976052857.3 nohost 0.1\n"
 IMAGE_KINDS = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/CameraInfo",
                "tf2_msgs/msg/TFMessage", "geometry_msgs/msg/PoseStamped", "nav_msgs/msg/Odometry")  # fmt: skip
 ROBOT_KINDS = ("sensor_msgs/msg/LaserScan", "sensor_msgs/msg/PointCloud2", "nav_msgs/msg/Odometry",
@@ -282,12 +283,15 @@ def pictures(folder: Path) -> list[bytes]:
 
 def read_bag(name: str, data: bytes, folder: Path) -> None:
     (folder / name).write_bytes(data)
-    try:
-        robot = RobotBag(folder / name)
-        frames_of(robot.scans)
-        frames_of(robot.frames)
-    finally:
-        frames_of(open_source(folder / name))
+    refused = []
+    for opened in (lambda: [open_source(folder / name)], lambda: [(bag := RobotBag(folder / name)).scans, bag.frames]):
+        try:
+            for frames in opened():
+                frames_of(frames)
+        except StereovoxError as error:
+            refused.append(error)
+    if len(refused) == 2:
+        raise refused[0]
 
 
 def ros1_bags(folder: Path) -> list[bytes]:
@@ -410,7 +414,7 @@ def read_raw(data: bytes, folder: Path) -> None:
         raw_calibration(folder)
     (folder / "calib_cam_to_cam.txt").write_bytes(data)
     read_raw_calibration(folder)
-    import_rig([folder / "calib_cam_to_cam.txt"], (1242, 375))
+    import_rig([folder / "calib_cam_to_cam.txt"], (64, 24))
 
 
 def read_matrix(path: Path) -> None:

@@ -123,6 +123,8 @@ def read_manifest(folder: Path) -> dict[str, Any]:
         raise MapFileError(
             f"{folder}: no stereovox map here (no {MANIFEST}); make one with: stereovox map SOURCE --out {folder}"
         )
+    if (folder / MANIFEST).is_symlink():
+        raise MapFileError(f"{folder / MANIFEST}: is a link; a map has all its files in one folder")
     try:
         manifest = json_value(read_bounded(folder / MANIFEST, MOST_MANIFEST))
     except (OSError, ValueError) as error:

@@ -126,7 +126,7 @@ def _virtual(table: dict[str, Any]) -> Virtual:
 
 def _rectangles(value: Any) -> tuple[Any, ...]:
     good = isinstance(value, list) and all(isinstance(one, list) and len(one) == 4 for one in value)
-    if not good or not all(type(number) is int for one in value for number in one):
+    if not good or not all(type(number) is int and abs(number) <= LARGEST for one in value for number in one):
         raise SourceError(f"mask_rectangles = {shown(value)} must be a list of [u0, v0, u1, v1] in whole pixels")
     return tuple(map(tuple, value))
 

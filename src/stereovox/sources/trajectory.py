@@ -4,9 +4,10 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Iterable, Sequence
 from decimal import Decimal, InvalidOperation
-from pathlib import Path
+from pathlib import Path, PurePath
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,6 +88,13 @@ def stamped_lines(path: Path) -> list[StampedLine]:
     except OSError as error:
         raise SourceError(f"{path}: {error.strerror}; make it readable") from None
     return [_parse(line, f"{path}:{n}") for n, line in enumerate(map(_plain, text.splitlines()), 1) if line]
+
+
+def inside(name: str, where: str) -> str:
+    """Return the name of a file that a line of a list gives; raises SourceError where it leads out of the folder."""
+    if os.path.isabs(name) or ".." in PurePath(name).parts or "\0" in name:
+        raise SourceError(f"{where}: '{name}' leads out of the recording's folder; put the file there and name it so")
+    return name
 
 
 def by_time(lines: Iterable[StampedLine]) -> list[StampedLine]:

@@ -13,6 +13,7 @@ LAYERS = (
     {
         "errors",
         "files",
+        "untrusted",
         "registry",
         "frame",
         "geometry",

@@ -7,7 +7,6 @@ A profile is a TOML file in `profiles/` or anywhere else; what it does not name 
 from __future__ import annotations
 
 import copy
-import tomllib
 from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
@@ -18,6 +17,7 @@ from pydantic import BaseModel, ByteSize, ConfigDict, Field, ValidationError, mo
 from stereovox.config_robot import AmclConfig, GridConfig, ScanConfig, Section, SlamConfig
 from stereovox.config_safety import PaceConfig, TrustConfig
 from stereovox.errors import ConfigError, did_you_mean
+from stereovox.untrusted import read_text, shown, toml_table
 
 MOST_CELLS = 8192
 """Cells that fit between the camera and the maximum range."""
@@ -148,7 +148,7 @@ class SphereConfig(Section):
         axis to its y axis (0: forward, 90: left, 270 or -90: right). They are widened to whole cells.
     """
 
-    step_deg: float | None = Field(None, gt=0, le=30)
+    step_deg: float | None = Field(None, ge=0.05, le=30)
     statistic: Literal["robust", "minimum"] = "robust"
     std_threshold: float = Field(0.1, gt=0)
     spread: float = Field(3.0, ge=0, le=10)
@@ -333,8 +333,8 @@ def profile_names() -> list[str]:
 def parse_value(text: str) -> Any:
     """Return a command line value as TOML reads it (`0.5`, `true`, `[1, 2]`); anything else is a plain string."""
     try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except (tomllib.TOMLDecodeError, RecursionError):
+        return toml_table(f"value = {text}")["value"]
+    except ValueError:
         return text
 
 
@@ -353,13 +353,13 @@ def _read_profile(profile: str | Path) -> dict[str, Any]:
     path = Path(profile)
     try:
         if path.suffix == ".toml":
-            return {"profile": path.stem, **tomllib.loads(path.read_text())}
+            return {"profile": path.stem, **toml_table(read_text(path))}
         if builtin.is_file():
-            return {"profile": str(profile), **tomllib.loads(builtin.read_text())}
+            return {"profile": str(profile), **toml_table(builtin.read_text())}
     except (OSError, UnicodeDecodeError) as error:
         why = getattr(error, "strerror", None) or "it is no text"
         raise ConfigError(f"{path}: cannot read the profile ({why}); give a readable TOML file") from None
-    except tomllib.TOMLDecodeError as error:
+    except ValueError as error:
         raise ConfigError(f"{path}: not valid TOML: {error}") from None
     raise ConfigError(f"unknown profile '{profile}'{did_you_mean(str(profile), profile_names())}; or name a .toml file")
 
@@ -393,8 +393,8 @@ def _one_line(error: ValidationError, where: str) -> str:
         letters = "xyz" if length == 3 else "abcdefgh"
         message = f"give a list of {length} numbers, [{', '.join(letters[:length])}]"
     name = ".".join(map(str, location)) or "settings"
-    shown = "" if isinstance(value, dict) or value == "" else f" {value!r}"
-    return f"{where}{name}{shown}: {message}"
+    given = "" if isinstance(value, dict) or value == "" else f" {shown(value)}"
+    return f"{where}{name}{given}: {message}"
 
 
 def _tuple_length(location: tuple[int | str, ...]) -> int:

@@ -6,9 +6,19 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 
+LONGEST_WORD = 100
+LONGEST_LINE = 10_000
+"""Characters of a word that is compared, and of a message; those of a file may be many more."""
+
 
 class StereovoxError(ValueError):
-    """Bad input or bad usage; commands print its one line and exit with status 2."""
+    """Bad input or bad usage; commands print its one line and exit with status 2.
+
+    Words out of a file stand in messages: whatever they hold, a message is one line that a terminal can show.
+    """
+
+    def __init__(self, message: object = ""):
+        super().__init__(one_line(str(message)))
 
 
 class ConfigError(StereovoxError):
@@ -27,7 +37,7 @@ class MissingExtra(StereovoxError, ImportError):  # noqa: N818 - reads as what h
     """An optional library is not installed."""
 
     def __init__(self, library: str, extra: str):
-        super().__init__(f"{library} is not installed; run: pip install 'stereovox[{extra}]'")
+        StereovoxError.__init__(self, f"{library} is not installed; run: pip install 'stereovox[{extra}]'")
 
 
 class FrameRefused(StereovoxError):  # noqa: N818 - reads as what happened
@@ -41,13 +51,20 @@ class FrameRefused(StereovoxError):  # noqa: N818 - reads as what happened
         self.reason = reason
 
 
+def one_line(text: str) -> str:
+    """Return `text` with what is not printable (line ends, colours of a terminal) written out, and its middle cut."""
+    if len(text) > LONGEST_LINE:
+        text = f"{text[: LONGEST_LINE // 2]} ... {text[-LONGEST_LINE // 2 :]}"
+    return text if text.isprintable() else "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+
+
 def did_you_mean(word: str, known: Iterable[str], prefix: str = "") -> str:
     """Return " (did you mean 'x'?)" for the closest known word, else the list of known words.
 
     prefix: what stands before each word where it is shown, but says nothing about which is near (`--`).
     """
     known = sorted(known)
-    close = difflib.get_close_matches(word, known, n=1)
+    close = difflib.get_close_matches(word[:LONGEST_WORD], known, n=1)
     if close:
         return f" (did you mean '{prefix}{close[0]}'?)"
     return f" (known: {', '.join(prefix + name for name in known)})" if known else ""

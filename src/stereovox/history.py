@@ -10,6 +10,8 @@ from dataclasses import dataclass, field
 from operator import index
 from typing import Any, NamedTuple, SupportsIndex
 
+from stereovox.errors import one_line
+
 MOST_SENSORS = 64
 """Sensors that one map tells apart."""
 MOST_REASONS = 256
@@ -100,7 +102,7 @@ class History:
         Raises KeyError, TypeError or ValueError for what cannot have been saved.
         """
         frames, refused = _whole(saved["frames"], "frames"), _whole(saved["frames_refused"], "frames_refused")
-        recording, last = str(saved["recording"]), _last_frame_from(saved.get("last_frame"))
+        recording, last = one_line(str(saved["recording"])), _last_frame_from(saved.get("last_frame"))
         told = saved.get("history")
         if told is None:
             return cls(frames, Counter({NOT_TOLD: refused} if refused else {}), recording=recording, last_frame=last)
@@ -113,7 +115,6 @@ class History:
         if history.refused.total() != refused:
             raise ValueError(f"frames_refused is {refused}, its reasons add up to {history.refused.total()}")
         return history
-
 
     def _last_frame(self) -> dict[str, Any] | None:
         """Return which frame was the last: its number from 1 on, refused ones counted, its name and its stamp."""
@@ -167,7 +168,9 @@ def _seen_from(saved: Any) -> Seen:
 
 
 def _last_frame_from(saved: Any) -> tuple[str, int] | None:
-    return None if saved is None else (_name(saved["name"]), _whole(saved["stamp_ns"], "last_frame: stamp_ns", EARLIEST))
+    if saved is None:
+        return None
+    return _name(saved["name"]), _whole(saved["stamp_ns"], "last_frame: stamp_ns", EARLIEST)
 
 
 def _streak_from(saved: Any) -> Streak:
@@ -189,7 +192,7 @@ def _counts(saved: Any, what: str) -> Counter[str]:
 def _name(value: Any) -> str:
     if not isinstance(value, str) or len(value) > LONGEST_NAME:
         raise ValueError(f"history: a name is no text of at most {LONGEST_NAME} letters")
-    return value
+    return one_line(value)
 
 
 def _whole(value: Any, what: str, least: int = 0) -> int:

@@ -23,8 +23,11 @@ CAMERA = "width=8\nheight=6\nfy=9\ncx=4\ncy=3\n"
         (read_camera, f"{CAMERA}fx=9\n[correction]\nmodel='scale'\ncoefficients=[{HUGE}]", "correction.coefficients"),
         (read_pair, f"depth_scale = {HUGE}", "depth_scale = 999"),
         (read_pair, f"T_tracker_camera = [[{HUGE}, 0, 0, 0]]", "T_tracker_camera must be"),
-        (read_camera, "a = " + "[" * 100_000, "nested too deeply"),
-        (read_pair, "a = " + "[" * 100_000, "nested too deeply"),
+        (read_camera, "a = " + "[" * 60_000, "nested too deeply"),
+        (read_pair, "a = " + "[" * 60_000, "nested too deeply"),
+        (read_camera, "#" * 100_000, "holds more than 65536 bytes"),
+        (read_pair, ".".join(["a"] * 20_000) + " = 1", "a line with more than 200 dots"),
+        (read_pair, f"baseline = 0x{'f' * 9000}", "baseline = 0xfff"),
     ],
 )
 def test_numbers_without_end_and_deep_nesting_are_one_line(tmp_path, read, text, said):

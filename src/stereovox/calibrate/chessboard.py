@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 import re
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +19,8 @@ SIDES = re.compile(r"left|right|(?<![a-z])[lr](?![a-z])|[LR](?=[^A-Za-z]*$)", re
 """What tells the eye in the name of a file without its ending: left01, cam_r_3, imageL0."""
 WIDEST_WINDOW = 11
 """Pixels on each side of a corner in which it is made precise; less where squares are small."""
+MOST_PIXELS = 100_000_000
+"""An image that tells of more is taken for a lie; nothing is allocated for it."""
 
 
 @dataclass(frozen=True)
@@ -69,11 +72,15 @@ def same_order(corners: NDArray[np.float64], other: NDArray[np.float64]) -> NDAr
 def read_grey(path: Path) -> NDArray[np.uint8] | None:
     """Return the (height, width) uint8 image in `path`, None where there is none that OpenCV reads."""
     import cv2
+    from PIL import Image
 
     try:
+        with warnings.catch_warnings(action="ignore"), Image.open(path) as picture:  # reads the header alone
+            if picture.width * picture.height > MOST_PIXELS:
+                return None
         data = np.fromfile(path, np.uint8)
         image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if data.size else None
-    except (OSError, cv2.error):
+    except Exception:  # Pillow's readers of headers raise anything
         return None
     return None if image is None else np.asarray(image, np.uint8)
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass
-from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 from stereovox import planar
 from stereovox.errors import SourceError
 from stereovox.localize.track import Track
+from stereovox.sources.trajectory import ns_from_seconds
+from stereovox.untrusted import MOST_LIST, read_text
 
 TOLERANCE_S = 0.05
 """A relation whose time is further than this from any pose is not scored."""
@@ -76,7 +77,7 @@ def read_relations(path: str | os.PathLike[str]) -> Relations:
     """
     path = Path(path)
     try:
-        lines = path.read_text("ascii", "replace").splitlines()
+        lines = read_text(path, MOST_LIST, "replace").splitlines()
     except OSError as error:
         raise SourceError(f"{path}: {os.strerror(error.errno or 0).lower()}; give a .relations file") from None
     rows = [_row(path, number, line) for number, line in enumerate(lines, 1) if line.strip() and line[0] != "#"]
@@ -88,11 +89,11 @@ def read_relations(path: str | os.PathLike[str]) -> Relations:
 def _row(path: Path, number: int, line: str) -> tuple[int, int, float, float, float]:
     words = line.split()
     try:
-        first, second = (int(Decimal(word).scaleb(9)) for word in words[:2])
+        first, second = (ns_from_seconds(word) for word in words[:2])
         x, y, _, _, _, yaw = (float(word) for word in words[2:])
-        if not (np.isfinite([x, y, yaw]).all() and max(abs(first), abs(second)) < 2**62):
+        if not np.isfinite([x, y, yaw]).all():
             raise ValueError
-    except (ValueError, InvalidOperation, OverflowError):
+    except ValueError:
         raise SourceError(f"{path}: line {number} is no relation (time1 time2 x y z roll pitch yaw)") from None
     return first, second, x, y, yaw
 

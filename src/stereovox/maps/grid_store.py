@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
+import io
 import json
+import math
 import zipfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,14 +18,15 @@ from stereovox.files import replacing
 from stereovox.history import History
 from stereovox.maps.grid_evidence import CELLS
 from stereovox.maps.lock import only_writer_of
+from stereovox.untrusted import json_value
 
 if TYPE_CHECKING:
     from stereovox.maps.grid_map import GridMap
 
 FORMAT, VERSION = "stereovox-grid", 1
 PARTS = ("about.npy", "coords.npy", "cells.npy")
-MOST_BYTES = 1 << 32
-"""Files that unpack to more are taken for lies."""
+SMALL, PACKED_BEST = 1 << 26, 200
+"""A file may unpack to so many bytes, or to so many for each of its own; more is taken for a lie."""
 
 
 def save_grid(grid_map: GridMap, path: str | Path) -> None:
@@ -43,7 +46,7 @@ def load_grid(path: str | Path) -> GridMap:
 
     try:
         parts = _read(Path(path))
-        about = json.loads(parts["about"].tobytes())
+        about = json_value(parts["about"].tobytes())
         if about["format"] != FORMAT or about["version"] != VERSION:
             raise ValueError(f"format {about['format']} {about['version']}, not {FORMAT} {VERSION}")
         grid_map = GridMap(load_config(about["config"]), about["origin"])
@@ -81,9 +84,23 @@ def _about(grid_map: GridMap) -> dict[str, Any]:
 def _read(path: Path) -> dict[str, np.ndarray]:
     with zipfile.ZipFile(path) as file:
         sizes = {entry.filename: entry.file_size for entry in file.infolist()}
-        if sorted(sizes) != sorted(PARTS):
+        kinds = {entry.compress_type for entry in file.infolist()}
+        if len(file.infolist()) != len(PARTS) or sorted(sizes) != sorted(PARTS):
             raise MapFileError(f"{path}: holds no grid; make one with GridMap.save")
-        if sum(sizes.values()) > MOST_BYTES:
+        if not kinds <= {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}:
+            raise ValueError("packed in a way that is not used here")
+        if sum(sizes.values()) > max(SMALL, PACKED_BEST * path.stat().st_size):
             raise ValueError(f"unpacks to {sum(sizes.values())} bytes")
-    with np.load(path, allow_pickle=False) as parts:
-        return {name: parts[name] for name in parts.files}
+        return {name.removesuffix(".npy"): _array(file, name, sizes[name]) for name in PARTS}
+
+
+def _array(file: zipfile.ZipFile, name: str, size: int) -> np.ndarray:
+    """Return an array of a file whose entry has `size` bytes unpacked; nothing is allocated for a shape that lies."""
+    with file.open(name) as entry:
+        data = entry.read(size)
+    stream = io.BytesIO(data)
+    version = np.lib.format.read_magic(stream)
+    shape, _, dtype = getattr(np.lib.format, f"read_array_header_{version[0]}_{version[1]}")(stream)
+    if dtype.hasobject or math.prod(shape) * dtype.itemsize != len(data) - stream.tell():
+        raise ValueError(f"{name} tells of {shape} {dtype} and holds {len(data) - stream.tell()} bytes")
+    return np.frombuffer(data, dtype, offset=stream.tell()).reshape(shape)

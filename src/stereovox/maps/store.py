@@ -29,8 +29,9 @@ from stereovox.errors import MapFileError
 from stereovox.files import sync_folder, sync_tree
 from stereovox.frame import Viewpoint
 from stereovox.history import History
-from stereovox.maps.blocks import CELLS
 from stereovox.maps.lock import LOCK, only_writer_in
+from stereovox.maps.store_read import ARRAYS, read_blocks
+from stereovox.untrusted import json_value, read_bounded, shown
 
 if TYPE_CHECKING:
     from stereovox.maps.voxel_map import VoxelMap
@@ -38,12 +39,13 @@ if TYPE_CHECKING:
 FORMAT = "stereovox-map"
 VERSION, READABLE = 2, (1, 2)
 MANIFEST = "manifest.json"
+MOST_MANIFEST = 1 << 22
+"""Bytes of a manifest."""
 BLOCKS_PER_CHUNK = 4096
 UNFINISHED = re.compile(r"cells-[0-9a-f]{12}|\.manifest\.json\.new|\.lock")
 """What a save that was killed leaves."""
 Slab = tuple[NDArray, ...]
 """Block coordinates (n, 3), cells (n, 512), and times (n, 512) where they are kept."""
-ARRAYS = ("coords", "cells", "times")
 
 
 def save_map(voxel_map: VoxelMap, path: str | Path) -> None:
@@ -120,9 +122,9 @@ def _load(folder: Path, manifest: dict[str, Any]) -> VoxelMap:
         voxel_map.viewpoint = _viewpoint_from(manifest.get("viewpoint"))
         voxel_map.window_state = manifest.get("window")
         start_ns = _start_ns(manifest.get("times_start_ns"))
-        coords, cells, *times = arrays = _read_arrays(
-            folder / str(manifest["data"]), int(manifest["blocks"]), voxel_map
-        )
+        data, blocks = folder / str(manifest["data"]), _count(manifest, "blocks")
+        dtypes = [voxel_map.cell_format.dtype, np.dtype(np.uint32)][: 2 if voxel_map.config.map.keep_times else 1]
+        coords, cells, *times = arrays = read_blocks(data, blocks, *dtypes)
         if _checksums(arrays, manifest["checksum"]) != manifest["checksum"]:
             raise ValueError("the cells do not match their checksum")
     except (KeyError, TypeError, ValueError, OSError, RuntimeError, OverflowError, AttributeError) as error:
@@ -131,6 +133,13 @@ def _load(folder: Path, manifest: dict[str, Any]) -> VoxelMap:
     if times:
         voxel_map.set_times(coords, times[0], start_ns)
     return voxel_map
+
+
+def _count(manifest: dict[str, Any], key: str) -> int:
+    count = manifest[key]
+    if type(count) is not int or not 0 <= count < 1 << 62:
+        raise ValueError(f"{key} {shown(count)} is no count")
+    return count
 
 
 def is_map(path: str | Path) -> bool:
@@ -144,9 +153,11 @@ def read_manifest(folder: Path) -> dict[str, Any]:
         raise MapFileError(
             f"{folder}: no stereovox map here (no {MANIFEST}); make one with: stereovox map SOURCE --out {folder}"
         )
+    if (folder / MANIFEST).is_symlink():
+        raise MapFileError(f"{folder / MANIFEST}: is a link; a map has all its files in one folder")
     try:
-        manifest = json.loads((folder / MANIFEST).read_text())
-    except (OSError, ValueError, RecursionError) as error:
+        manifest = json_value(read_bounded(folder / MANIFEST, MOST_MANIFEST))
+    except (OSError, ValueError) as error:
         raise MapFileError(f"{folder / MANIFEST}: cannot be read ({error}); make the map anew") from None
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
         raise MapFileError(f"{folder / MANIFEST}: not a stereovox map")
@@ -283,17 +294,3 @@ def _new_array(group: Any, name: str, like: NDArray, fill: int) -> Any:
     rows = max(1, min(BLOCKS_PER_CHUNK, len(like)))
     shape, chunks = (0, like.shape[1]), (rows, like.shape[1])
     return group.create_array(name, shape=shape, dtype=like.dtype, chunks=chunks, fill_value=fill)
-
-
-def _read_arrays(folder: Path, blocks: int, voxel_map: VoxelMap) -> Slab:
-    import zarr
-
-    group = zarr.open_group(folder, mode="r")
-    wanted = [((blocks, 3), np.int32), ((blocks, CELLS), voxel_map.cell_format.dtype)]
-    if voxel_map.config.map.keep_times:
-        wanted.append(((blocks, CELLS), np.uint32))
-    arrays: list[Any] = [group[name] for name, _ in zip(ARRAYS, wanted, strict=False)]
-    for array, (shape, dtype) in zip(arrays, wanted, strict=True):
-        if array.shape != shape or array.dtype != dtype:
-            raise ValueError(f"array of {array.shape} {array.dtype} where {shape} {np.dtype(dtype)} belongs")
-    return tuple(np.asarray(array[:]) for array in arrays)

@@ -13,12 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.errors import MapFileError
+from stereovox.untrusted import read_bounded
 
 MOST_PIXELS = 1 << 28
 MOST_BYTES = 1 << 31
 """Pictures of more pixels, and files of more bytes, are refused."""
 WHITE = 255.0
 FORMATS = ("PNG", "BMP", "PPM", "JPEG", "GIF")
+PIXELS_A_BYTE = 512
+PIXELS_OF_ANY = 1 << 24
+"""A packed picture holds at most so many pixels for each byte of its file; one of few pixels may hold fewer bytes."""
 _NUMBER = re.compile(rb"\s*(?:#[^\n\r]*[\n\r]\s*)*(\d{1,9})")
 
 
@@ -68,7 +72,7 @@ def write_png(file: IO[bytes], pixels: NDArray[np.uint8], opaque: NDArray[np.boo
 
 
 def _read_pgm(path: Path) -> NDArray[Any]:
-    data = path.read_bytes()
+    data = read_bounded(path, MOST_BYTES)
     numbers, at = [], 2
     for _ in range(3):
         found = _NUMBER.match(data, at)
@@ -112,7 +116,7 @@ def _read_other(path: Path) -> Picture:
 
     try:
         with warnings.catch_warnings(action="ignore"), Image.open(path, formats=FORMATS) as image:
-            _check_size(path, *image.size)
+            _check_size(path, *image.size, most=max(PIXELS_OF_ANY, PIXELS_A_BYTE * path.stat().st_size))
             pixels = _channels(image)
     except MapFileError:
         raise
@@ -135,9 +139,9 @@ def _channels(image: Any) -> NDArray[Any]:
     return np.asarray(image.convert("RGBA" if see_through else "RGB"))
 
 
-def _check_size(path: Path, width: int, height: int) -> None:
-    if not (width > 0 and height > 0 and width * height <= MOST_PIXELS):
-        raise MapFileError(f"{path}: {width} x {height} pixels; a map has 1 to {MOST_PIXELS}")
+def _check_size(path: Path, width: int, height: int, most: int = MOST_PIXELS) -> None:
+    if not (width > 0 and height > 0 and width * height <= min(most, MOST_PIXELS)):
+        raise MapFileError(f"{path}: {width} x {height} pixels; a map has 1 to {min(most, MOST_PIXELS)}")
 
 
 def _damaged(path: Path, why: str) -> MapFileError:

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from stereovox.errors import MapFileError, did_you_mean
+from stereovox.untrusted import MOST_YAML, read_bounded, shown, yaml_value
 
 MODES = ("trinary", "scale", "raw")
 NEEDED = ("image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh")
-MOST_BYTES = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -44,20 +44,16 @@ class Meaning:
 
 def read_meaning(path: Path) -> Meaning:
     """Return what the .yaml `path` says; `image` is relative to it. Raises MapFileError, one line, for all else."""
-    import yaml
-
     try:
         if not path.is_file():
             raise MapFileError(f"{path}: no such file; give the .yaml of a map_server map")
-        if path.stat().st_size > MOST_BYTES:
-            raise MapFileError(f"{path}: is too large for the .yaml of a map")
-        says: Any = yaml.safe_load(path.read_bytes())
+        says: Any = yaml_value(read_bounded(path, MOST_YAML))
     except OSError as error:
         raise MapFileError(f"{path}: cannot be read ({error.strerror or error})") from None
     except MapFileError:
         raise
-    except (yaml.YAMLError, RecursionError, ValueError) as error:
-        raise MapFileError(f"{path}: is no YAML ({' '.join(str(error).split())[:200]})") from None
+    except ValueError as error:
+        raise MapFileError(f"{path}: is no YAML ({str(error)[:200]})") from None
     if not isinstance(says, dict) or not any(name in says for name in NEEDED):
         raise MapFileError(f"{path}: is not the .yaml of a map_server map")
     return _checked(path, says)
@@ -71,9 +67,9 @@ def _checked(path: Path, says: dict[Any, Any]) -> Meaning:
     if mode not in MODES:
         raise MapFileError(f"{path}: mode '{mode}'{did_you_mean(str(mode), MODES)}")
     if not isinstance(origin, list) or len(origin) != 3:
-        raise MapFileError(f"{path}: origin {_short(origin)}; give [x, y, yaw]")
+        raise MapFileError(f"{path}: origin {shown(origin)}; give [x, y, yaw]")
     if not isinstance(image, str) or not image or "\0" in image:
-        raise MapFileError(f"{path}: image {_short(image)}; give the name of the picture")
+        raise MapFileError(f"{path}: image {shown(image)}; give the name of the picture")
     x, y, yaw = (_number(path, "origin", number) for number in origin)
     resolution, occupied, free, negate = (
         _number(path, name, says[name]) for name in ("resolution", "occupied_thresh", "free_thresh", "negate")
@@ -91,12 +87,8 @@ def _number(path: Path, name: str, value: Any) -> float:
     except (TypeError, ValueError, OverflowError):
         number = np.nan
     if not np.isfinite(number):
-        raise MapFileError(f"{path}: {name} {_short(value)} is no number")
+        raise MapFileError(f"{path}: {name} {shown(value)} is no number")
     return number
-
-
-def _short(value: Any) -> str:
-    return " ".join(repr(value)[:80].split())
 
 
 def _plain(number: float) -> str:

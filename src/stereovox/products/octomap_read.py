@@ -17,6 +17,7 @@ from stereovox.maps.evidence import Evidence, to_units
 from stereovox.products import _octree
 from stereovox.products.octomap_write import BINARY_TITLE, TREE_NODE, TREE_TITLE
 from stereovox.products.octree import BRANCH
+from stereovox.untrusted import read_bounded
 
 MOST_BLOCKS = 2**18
 """Blocks of 8x8x8 cells a file may unfold to (134 million cells); one node can claim 35 million million cells."""
@@ -24,6 +25,9 @@ LARGEST_LOG_ODDS = 30.0
 OCTOMAP: dict[str, Any] = {"map.prior": 0.5, "map.log_odds_min": -2.0, "map.log_odds_max": 3.5}
 """What OctoMap does when nothing else is said; the files do not tell."""
 LONGEST_HEADER = 1 << 16
+MOST_NODES = 2 * 512 * MOST_BLOCKS
+MOST_BYTES = 8 * MOST_NODES
+"""A tree of so many cells has fewer nodes and bytes."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +58,7 @@ def read_octomap(path: str | Path) -> VoxelMap:
 
 def _read(path: Path) -> bytes:
     try:
-        return path.read_bytes()
+        return read_bounded(path, MOST_BYTES)
     except OSError as error:
         raise MapFileError(f"{path}: cannot be read ({error.strerror or error}); name an OctoMap file") from None
 
@@ -102,7 +106,7 @@ def _binary_leaves(body: bytes, size: int, config: Config) -> _Leaves:
     _check_size(size, _nodes_in(body), len(body))
     corners, heights = _room_for(size)
     occupied = np.zeros(size, bool)
-    n = _octree.read_binary_leaves(records, corners, heights, occupied) if size else 0
+    n = _octree.read_binary_leaves(records, corners, heights, occupied)
     limits = config.map
     log_odds = np.where(occupied[:n], limits.log_odds_max, limits.log_odds_min).astype(np.float32)
     return _Leaves(corners[:n], heights[:n], log_odds)
@@ -122,7 +126,7 @@ def _tree_leaves(body: bytes, size: int) -> _Leaves:
     _check_size(size, len(nodes), len(body))
     corners, heights = _room_for(size)
     records = np.zeros(size, np.int64)
-    n = _octree.read_tree_leaves(nodes["children"].copy(), corners, heights, records) if size else 0
+    n = _octree.read_tree_leaves(nodes["children"].copy(), corners, heights, records)
     log_odds = nodes["log_odds"][records[:n]]
     if not np.isfinite(log_odds).all():
         raise ValueError("a cell's log-odds is not a number")
@@ -130,6 +134,10 @@ def _tree_leaves(body: bytes, size: int) -> _Leaves:
 
 
 def _check_size(size: int, found: int, length: int) -> None:
+    if not found:
+        raise ValueError("it holds no cell: the map was empty when it was saved, or the rest is lost")
+    if found > MOST_NODES:
+        raise ValueError(f"its {found} nodes are more than {MOST_NODES}")
     if size != found:
         raise ValueError(f"its header says {size} nodes, its {length} bytes of data hold {found}")
 

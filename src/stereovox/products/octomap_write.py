@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from stereovox.errors import MapFileError
 from stereovox.files import replacing
 from stereovox.maps import State, VoxelMap
 from stereovox.products.octree import Nodes, build_octree
@@ -53,6 +54,8 @@ def write_ot(voxel_map: VoxelMap, path: str | Path) -> None:
 
 
 def _write(path: str | Path, title: str, voxel_map: VoxelMap, nodes: Nodes, data: NDArray) -> None:
+    if not len(nodes):
+        raise MapFileError(f"{path}: the map holds no cell that such a file knows, there is nothing to write")
     lines = [
         title,
         "# (feel free to add / change comments, but leave the first line as it is!)",

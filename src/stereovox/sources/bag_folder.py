@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from pathlib import Path, PurePath
 from typing import Any
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from stereovox.errors import SourceError
 from stereovox.sources.bag_files import BagFile, one_line, open_bag
 from stereovox.sources.bag_messages import Wire
+from stereovox.untrusted import read_bounded, yaml_value
 
 METADATA, TITLE = "metadata.yaml", "rosbag2_bagfile_information"
 MAX_METADATA = 1024 * 1024
@@ -86,17 +88,11 @@ def _files(folder: Path) -> tuple[list[str], tuple[str, ...]]:
 
 
 def _metadata(path: Path) -> dict[str, Any]:
-    import yaml
-
     try:
-        with path.open("rb") as file:
-            data = file.read(MAX_METADATA + 1)
-        if len(data) > MAX_METADATA:
-            raise ValueError("absurdly large")
-        told = yaml.safe_load(data)[TITLE]  # the quicker CSafeLoader ends the process where lists nest too deep
+        told = yaml_value(read_bounded(path, MAX_METADATA))[TITLE]
         if not isinstance(told, dict):
             raise TypeError(f"{TITLE} holds nothing")
-    except (OSError, yaml.YAMLError, ValueError, TypeError, KeyError, RecursionError) as error:
+    except (OSError, ValueError, TypeError, KeyError) as error:
         cure = "write it anew with 'ros2 bag reindex'"
         raise SourceError(f"{path}: {one_line(error)[:200]}; {cure}") from None
     return told
@@ -117,12 +113,12 @@ def _whole(folder: Path, name: str) -> Path:
     """Return a file of the folder, unpacked if it was packed as a whole; raises SourceError where it is not there."""
     path = folder / name
     if path.suffix == ".zstd":
-        if not path.with_suffix("").is_file():
+        if not os.path.isfile(path.with_suffix("")):
             raise SourceError(
                 f"{path}: packed as a whole; unpack it with: zstd -d '{path}' -o '{path.with_suffix('')}'"
             )
         return path.with_suffix("")
-    if not path.is_file():
+    if not os.path.isfile(path):  # Path.is_file may raise
         raise SourceError(
             f"{path}: is missing; copy the whole folder, or write {METADATA} anew with 'ros2 bag reindex'"
         )

@@ -36,6 +36,7 @@ from stereovox.sources.bag_mcap_records import (
     record,
 )
 from stereovox.sources.bag_messages import Wire
+from stereovox.sources.bag_unpack import most_unpacked
 
 TAIL = HEAD + 20 + len(START)
 """Bytes of the last record and of what ends a file."""
@@ -117,7 +118,7 @@ class Scanned:
         self.whole, self.complete, self.damaged = len(START), False, 0
         self._schemas: dict[int, str] = {}
         self._found: dict[int, array[int]] = {}
-        self._file, self._count = file, 0
+        self._file, self._count, self._swollen = file, 0, 0
         self._go_through()
         self.channels = {key: known for key, known in self.channels.items() if key in self._found}
 
@@ -144,6 +145,9 @@ class Scanned:
         if found.kind == CHUNK:
             try:
                 inner = self._file.chunk(found)
+                self._swollen += len(inner)
+                if self._swollen > most_unpacked(self._file.size):
+                    raise SourceError(f"{self._file.path}: its chunks unpack to an absurd size; record it again")
                 for part in _records(inner):
                     self._note(part, inner[part.start : min(part.end, part.start + self._needed(part))], found)
             except (MissingExtra, SourceError):

@@ -10,13 +10,15 @@ from __future__ import annotations
 
 import struct
 from dataclasses import dataclass
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 STAMP_LIMIT = 2**63
+MOST_COEFFICIENTS = 64
+"""Of a lens; the longest model in use has 14."""
 STAMPED = ("PoseStamped", "PoseWithCovarianceStamped", "TransformStamped", "Odometry")
 WITH_CHILD = ("TransformStamped", "Odometry")
 POSE_TYPES = frozenset({"geometry_msgs/Transform", "nav_msgs/Odometry"} | {f"geometry_msgs/{n}" for n in STAMPED[:3]})
@@ -129,7 +131,10 @@ def read_camera_info(wire: Wire) -> CameraInfo:
     wire.header()
     height, width = wire.numbers("I", 2)
     wire.text()
-    D = wire.numbers("d", count) if (count := wire.number()) else ()  # aligned only where something follows
+    count = wire.number()
+    if count > MOST_COEFFICIENTS:
+        raise ValueError(f"a lens with {count} coefficients")
+    D = wire.numbers("d", count) if count else ()  # aligned only where something follows
     K, _, P = wire.numbers("d", 9), wire.numbers("d", 9), wire.numbers("d", 12)
     return CameraInfo(width, height, K, D, P)
 
@@ -168,6 +173,6 @@ def ns_from_ms(text: str) -> int | None:
     """Return the nanoseconds of a decimal number of milliseconds; None for what is none or too large for int64."""
     try:
         number = Decimal(text) * 1_000_000
-    except InvalidOperation:
+    except ArithmeticError:  # those of Decimal
         return None
     return round(number) if number.is_finite() and abs(number) < STAMP_LIMIT else None

@@ -9,18 +9,29 @@ from typing import Any
 from stereovox.errors import MissingExtra
 
 STEP = 4 * 1024 * 1024
+PACKED_BEST = 1000
+"""Bytes that one packed byte stands for at most: a recording of real things does not pack so well."""
+SMALL = 32 * 1024 * 1024
+"""Bytes that anything may unpack to: a picture of nothing packs to almost nothing."""
 ZSTD = b"\x28\xb5\x2f\xfd"
 """What a zstd frame starts with; no serialised ROS message does."""
+
+
+def most_unpacked(packed: int) -> int:
+    """Return how many bytes so many packed ones may become; more is taken for an attack."""
+    return max(SMALL, PACKED_BEST * packed)
 
 
 def unpacked(data: bytes | memoryview, packing: str, limit: int) -> bytes:
     """Return unpacked bytes; packing: `bz2`, `lz4`, `zstd`, or "" and `none` for what is not packed.
 
-    Raises ValueError for data that are damaged, cut off, of another packing, or swell beyond `limit` bytes, and
+    Raises ValueError for data that are damaged, cut off, of another packing, or swell beyond `limit` or what
+    `most_unpacked` grants, and
     MissingExtra where the library that unpacks them is not installed.
     """
     if packing in ("", "none"):
         return bytes(data)
+    limit = min(limit, most_unpacked(len(data)))
     if packing == "zstd" and _announced(data) > limit:
         raise ValueError("tells of an absurd size")
     parts, size, rest = [], 0, bytes(data)

@@ -10,6 +10,7 @@ from pathlib import Path
 from stereovox.errors import SourceError, StereovoxError
 from stereovox.geometry import inverse
 from stereovox.sources.rig_file import Rig, RigPair
+from stereovox.untrusted import read_text
 
 KINDS = "KITTI calib_cam_to_cam.txt or calib.txt, ROS camera_info yaml (two files), OpenCV yml, Kalibr camchain yaml"
 Size = tuple[int, int]
@@ -39,7 +40,7 @@ def import_rig(files: Sequence[Path], size: Size | None = None, lens: str = "", 
 
 def _is_kitti(path: Path) -> bool:
     try:
-        text = path.read_text("utf-8-sig", errors="replace")
+        text = read_text(path, errors="replace")
     except OSError as error:
         raise SourceError(f"{path}: {error.strerror}; give a calibration: {KINDS}") from None
     return any(line.startswith(("P_rect_0", "P0:", "P2:")) for line in text.splitlines())

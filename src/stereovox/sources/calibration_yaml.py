@@ -14,6 +14,7 @@ from stereovox.errors import SourceError
 from stereovox.geometry import Transform, inverse, orthonormalise, rigidity_error
 from stereovox.lenses import MODELS, Lens
 from stereovox.rigs import Eyes
+from stereovox.untrusted import MOST_YAML, read_text, yaml_value
 
 Table = dict[str, Any]
 Found = tuple[Eyes, Transform]
@@ -53,14 +54,13 @@ def read_yaml(path: Path) -> Table:
 
     Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", matrix)
     try:
-        lines = path.read_text("utf-8-sig").splitlines()
+        lines = read_text(path, MOST_YAML).splitlines()
         text = "\n".join(lines[1:] if lines and lines[0].startswith("%YAML") else lines)
-        table = yaml.load(text, Loader)
+        table = yaml_value(text, Loader)
     except OSError as error:
         raise SourceError(f"{path}: {error.strerror}; give a file you may read") from None
-    except (yaml.YAMLError, ValueError, RecursionError) as error:
-        why = " ".join(str(error).split())
-        raise SourceError(f"{path}: no YAML that can be read ({why}); correct it") from None
+    except ValueError as error:
+        raise SourceError(f"{path}: no YAML that can be read ({error}); correct it") from None
     if not isinstance(table, dict):
         raise SourceError(f"{path}: holds no table of a calibration; give the file that the calibration wrote")
     return table

@@ -10,6 +10,7 @@ from typing import Any
 from stereovox.cameras import DepthCorrection, PinholeCamera
 from stereovox.errors import SourceError, StereovoxError, did_you_mean
 from stereovox.sources.toml_file import is_number, read_table, toml_text
+from stereovox.untrusted import shown
 
 FILE = "camera.toml"
 SIZES = ("width", "height")
@@ -99,7 +100,7 @@ def _correction(table: Any) -> DepthCorrection:
     if not isinstance(model, str) or not isinstance(numbers, list):
         raise SourceError("[correction] needs model, a text, and coefficients, a list of numbers")
     if not all(is_number(number) for number in numbers):
-        raise SourceError(f"correction.coefficients {numbers} must be numbers")
+        raise SourceError(f"correction.coefficients {shown(numbers)} must be numbers")
     return DepthCorrection(model, tuple(map(float, numbers)))
 
 
@@ -112,5 +113,5 @@ def _check_keys(table: dict[str, Any], known: Sequence[str], prefix: str) -> Non
 def _number(table: dict[str, Any], key: str) -> float:
     value = table[key]
     if not is_number(value):
-        raise SourceError(f"{key} = {value!r} must be a number")
+        raise SourceError(f"{key} = {shown(value)} must be a number")
     return float(value)

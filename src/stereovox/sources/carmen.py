@@ -16,6 +16,7 @@ from stereovox.errors import SourceError
 from stereovox.frame import Frame, Scan
 from stereovox.planar import lifted
 from stereovox.sources import parameters
+from stereovox.sources.bag_unpack import most_unpacked
 from stereovox.sources.carmen_lines import LASERS, NO_ECHO, DamagedLine, Reading, read_laser
 from stereovox.sources.poses import Poses
 
@@ -126,9 +127,12 @@ def _offset(line: bytes, before: float) -> float:
 def _lines(path: Path, damaged: list[str]) -> Iterator[tuple[int, bytes]]:
     try:
         with _opened(path) as file:
-            number = 0
+            number, size, most = 0, 0, most_unpacked(path.stat().st_size)
             while line := file.readline(LONGEST):
-                number += 1
+                number, size = number + 1, size + len(line)
+                if size > most:
+                    damaged.append(f"the packed file swells to more than {most} bytes; the rest is left out")
+                    return
                 yield number, line
     except EOFError:
         damaged.append("the packed file ends too early")

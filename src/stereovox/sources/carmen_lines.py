@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,7 +50,7 @@ def read_laser(line: bytes, number: int, offset: float) -> Reading:
     words = line.split()
     try:
         return _flaser(words, number, offset) if words[0] == b"FLASER" else _robotlaser(words, number)
-    except (IndexError, ValueError, InvalidOperation, OverflowError) as error:
+    except (IndexError, ValueError, ArithmeticError) as error:  # ArithmeticError: those of Decimal
         if isinstance(error, DamagedLine):
             raise
         raise DamagedLine(f"{words[0].decode()} with words that are missing or no numbers") from None

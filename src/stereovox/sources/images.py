@@ -24,6 +24,8 @@ START = SIGNATURE + b"\0\0\0\rIHDR"
 HEADER_BYTES = 33  # signature, then IHDR: length, name, 13 bytes, check sum
 MAX_PIXELS = 100_000_000
 """A header that tells of more pixels than this is taken for a lie; nothing is allocated for it."""
+MOST_SWOLLEN = 1100
+"""Bytes that one byte of a PNG can stand for (deflate: 1032)."""
 GREY_16 = (16, 0)  # bit depth and colour type
 DEPTH = frozenset({GREY_16})
 PICTURE = frozenset({(8, 0), (8, 2)})
@@ -105,7 +107,7 @@ def _check(path: Path | str, data: bytes, size: tuple[int, int], kinds: Kinds) -
     found = _header_size(path, data, kinds)
     if found != size:
         raise FrameRefused("bad_shape", f"{path}: {_times(found)} pixels, the recording has {_times(size)}; remove it")
-    if not _is_whole(data):
+    if not _is_whole(data) or size[0] * size[1] > MOST_SWOLLEN * len(data):
         raise FrameRefused("unreadable", f"{path}: the PNG is cut off or damaged; copy it again or remove it")
 
 

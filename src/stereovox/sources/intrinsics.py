@@ -12,6 +12,7 @@ from pathlib import Path
 from stereovox.cameras import PinholeCamera
 from stereovox.errors import SourceError, StereovoxError
 from stereovox.sources.camera_file import FILE, pinhole, read_camera
+from stereovox.untrusted import read_text
 
 MATRIX, LIST = "camera-intrinsics.txt", "calibration.txt"
 VGA = (640, 480)
@@ -85,7 +86,7 @@ def _of_size(path: Path, size: tuple[int, int], baseline: float) -> PinholeCamer
 
 def _numbers(path: Path) -> list[float]:
     try:
-        lines = path.read_text("utf-8-sig").splitlines()
+        lines = read_text(path).splitlines()
         numbers = [float(word) for line in lines for word in line.partition("#")[0].replace(",", " ").split()]
     except OSError as error:
         raise SourceError(f"{path}: {error.strerror}; make it readable") from None

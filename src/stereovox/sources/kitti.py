@@ -22,6 +22,7 @@ from stereovox.sources.folder import file_names
 from stereovox.sources.images import PICTURE, common_size, read_picture_png
 from stereovox.sources.kitti_calibration import KittiCalibration
 from stereovox.sources.lidar import Box, LidarScan, read_velodyne
+from stereovox.untrusted import MOST_LIST, read_text
 
 PAIRS = {"grey": (0, 1), "colour": (2, 3)}
 """Camera numbers of the left and right eye."""
@@ -136,7 +137,7 @@ def location(where: str | os.PathLike[str], known: dict[str, str]) -> tuple[Path
 def time_lines(path: Path, whose: str) -> list[str]:
     """Return the lines of a file of times, stripped; raises SourceError, one line, where there is none."""
     try:
-        lines = path.read_text("utf-8-sig", errors="replace").rstrip().splitlines()
+        lines = read_text(path, MOST_LIST, "replace").rstrip().splitlines()
     except OSError as error:
         raise SourceError(f"{path}: {error.strerror}; put the {whose}'s own file there") from None
     if not lines:

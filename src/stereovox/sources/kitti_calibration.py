@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from stereovox.cameras import PinholeCamera
 from stereovox.errors import SourceError, StereovoxError
 from stereovox.geometry import Transform, orthonormalise, rigidity_error
+from stereovox.untrusted import read_text
 
 CAM_TO_CAM, VELO_TO_CAM, IMU_TO_VELO = "calib_cam_to_cam.txt", "calib_velo_to_cam.txt", "calib_imu_to_velo.txt"
 ROUNDING = 1e-3
@@ -101,7 +102,7 @@ def read_values(path: Path) -> dict[str, list[float]]:
     Raises SourceError, one line, where the file cannot be read or holds nothing of the kind.
     """
     try:
-        lines = path.read_text("utf-8-sig").splitlines()
+        lines = read_text(path).splitlines()
     except OSError as error:
         raise SourceError(f"{path}: {error.strerror}; put the data set's calibration there") from None
     except UnicodeDecodeError:

@@ -13,6 +13,7 @@ import numpy as np
 from stereovox.errors import SourceError
 from stereovox.geometry import Transform
 from stereovox.sources.lidar import Box
+from stereovox.untrusted import MOST_LIST, read_text
 
 FIELDS = 17
 """frame, track, kind, truncated, occluded, alpha, 4 of the 2-D box, h, w, l, x, y, z, rotation_y; perhaps a score."""
@@ -48,7 +49,7 @@ def box_pose(h: float, w: float, l: float, x: float, y: float, z: float, rotatio
 def read_labels(path: Path) -> Labels:
     """Return the annotated objects; raises SourceError, one line with file and line, for what cannot be read."""
     try:
-        lines = path.read_text("utf-8-sig", errors="replace").splitlines()
+        lines = read_text(path, MOST_LIST, "replace").splitlines()
     except OSError as error:
         raise SourceError(f"{path}: {error.strerror}; make it readable") from None
     found: dict[int, list[Label]] = defaultdict(list)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from stereovox.errors import FrameRefused, SourceError
 from stereovox.geometry import Transform, inverse, orthonormalise, rigidity_error
+from stereovox.untrusted import MOST_LIST, read_text
 
 EARTH_RADIUS = 6378137.0
 """Metres, as KITTI's own development kit has it."""
@@ -131,7 +132,7 @@ def _pose(line: str, where: str) -> Transform | str:
 
 def _packet_file(path: Path) -> NDArray[np.float64] | str:
     try:
-        return _packet(path.read_text("utf-8-sig", errors="replace"), str(path))
+        return _packet(read_text(path, errors="replace"), str(path))
     except OSError as error:
         return f"{path}: {error.strerror}; put it back or leave its frame out"
 
@@ -153,7 +154,7 @@ def _floats(line: str) -> NDArray[np.float64]:
 
 def _frame_lines(path: Path, frames: int) -> list[str]:
     try:
-        lines = path.read_text("utf-8-sig", errors="replace").splitlines()
+        lines = read_text(path, MOST_LIST, "replace").splitlines()
     except OSError as error:
         raise SourceError(f"{path}: {error.strerror}; put it there or choose other poses (?poses=)") from None
     while lines and not lines[-1].strip():

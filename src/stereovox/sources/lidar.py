@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from stereovox.errors import FrameRefused
 from stereovox.frame import Viewpoint
 from stereovox.geometry import Transform
+from stereovox.untrusted import MOST_LIST, read_bounded
 
 POINT_BYTES = 16
 """A point in a KITTI `.bin`: x, y, z in metres and the reflectance, float32 each."""
@@ -89,7 +90,7 @@ def read_velodyne(path: Path) -> NDArray[np.float32]:
     if not os.path.isfile(path):
         raise FrameRefused("missing_file", f"{path}: no such file; put the scan back or leave its frame out")
     try:
-        data = path.read_bytes()
+        data = read_bounded(path, MOST_LIST)
     except OSError as error:
         raise FrameRefused("unreadable", f"{path}: {error.strerror}; make it readable") from None
     if not data or len(data) % POINT_BYTES:

@@ -13,6 +13,7 @@ from stereovox.errors import SourceError, did_you_mean
 from stereovox.geometry import Transform, orthonormalise, rigidity_error
 from stereovox.sources.toml_file import is_number, read_table, toml_text
 from stereovox.sources.tracker import AXES, HIGHEST_CONFIDENCE, WORLDS
+from stereovox.untrusted import shown
 
 FILE = "pair.toml"
 TOLERANCE = 0.005
@@ -92,10 +93,10 @@ def _value(key: str, value: Any) -> Any:
     if key in LIMITS:
         low, high = LIMITS[key]
         if not (is_number(value) and low <= value <= high):
-            raise ValueError(f"{key} = {value!r} must be a number from {low:g} to {high:g}")
+            raise ValueError(f"{key} = {shown(value)} must be a number from {low:g} to {high:g}")
         return float(value)
     if not isinstance(value, str) or not value or "\0" in value:
-        raise ValueError(f"{key} = {value!r} must be a text")
+        raise ValueError(f"{key} = {shown(value)} must be a text")
     if value not in WORDS.get(key, (value,)):
         raise ValueError(f"{key} = '{value}' is unknown{did_you_mean(value, WORDS[key])}")
     return value

@@ -19,7 +19,7 @@ from stereovox.sources.base import Source
 from stereovox.sources.folder import file_names
 from stereovox.sources.images import PICTURE, png_size, read_picture_png
 from stereovox.sources.rig_file import FILE, RigPair, read_rig
-from stereovox.sources.trajectory import Trajectory, by_time, stamped_lines
+from stereovox.sources.trajectory import Trajectory, by_time, inside, stamped_lines
 
 SHORTEST_NS = 1_000_000
 """Names of a pair's images that span less are their numbers, not their times."""
@@ -137,6 +137,8 @@ def _listed(path: Path, number: int, left: Path, right: Path) -> list[_Shot]:
         names = rest.split()
         if len(names) not in (1, 2):
             raise SourceError(f"{where}: needs 'stamp left [right]'; correct or delete the line")
+        for name in names:
+            inside(name, where)
         shots.append(_Shot(stamp_ns, number, left / names[0], right / names[-1]))
     if not shots:
         raise SourceError(f"{path}: names no image; write lines 'stamp left [right]'")

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from stereovox.errors import FrameRefused, SourceError, StereovoxError
 from stereovox.geometry import Transform
 from stereovox.rigs import Eyes, StereoPair, VirtualCamera
+from stereovox.sources.images import MAX_PIXELS, read_picture_png
 
 FILE = "rig.toml"
 
@@ -65,6 +66,8 @@ class RigPair:
         """
         try:
             pair = self._bare()
+            if pair.camera.width * pair.camera.height > MAX_PIXELS:
+                raise SourceError(f"{pair.camera.width}x{pair.camera.height} pixels are too many; give smaller sizes")
         except StereovoxError as error:
             raise SourceError(f"pair '{self.name}': {error}") from None
         valid = self._valid(pair.camera, Path(folder))
@@ -92,8 +95,6 @@ class RigPair:
         return valid
 
     def _white(self, camera: VirtualCamera, path: Path) -> NDArray[np.bool_]:
-        from stereovox.sources.images import read_picture_png
-
         try:
             image = read_picture_png(path, (camera.width, camera.height))
         except FrameRefused as refused:

@@ -16,6 +16,7 @@ from stereovox.lenses import COUNTS, Lens
 from stereovox.rigs import Eyes, VirtualCamera
 from stereovox.sources.rig_file import Rig, RigPair, Virtual
 from stereovox.sources.toml_file import is_number, toml_text
+from stereovox.untrusted import shown
 from stereovox.wide import CylindricalCamera, SphericalCamera
 
 CAMERAS = {"pinhole": PinholeCamera, "spherical": SphericalCamera, "cylindrical": CylindricalCamera}
@@ -84,7 +85,7 @@ def _pair(name: str, table: dict[str, Any]) -> RigPair:
 def _camera(table: dict[str, Any]) -> VirtualCamera:
     model = table.get("model", "pinhole")
     if model not in CAMERAS:
-        raise SourceError(f"camera.model = {model!r} is unknown{did_you_mean(str(model), CAMERAS)}")
+        raise SourceError(f"camera.model = {shown(model)} is unknown{did_you_mean(str(model), CAMERAS)}")
     entries = {entry.name: entry for entry in fields(CAMERAS[model]) if entry.name not in UNWRITTEN}
     _check_keys(table, ("model", *entries), "camera.")
     needed = [name for name, entry in entries.items() if entry.default is MISSING or name == "baseline"]
@@ -99,7 +100,7 @@ def _lens(table: dict[str, Any], prefix: str) -> Lens:
         fx, fy, cx, cy = (_number(table, key) for key in LENS[3:7])
         distortion = table.get("distortion", [])
         if not isinstance(distortion, list) or not all(map(is_number, distortion)):
-            raise SourceError(f"distortion = {distortion!r} must be a list of numbers")
+            raise SourceError(f"distortion = {shown(distortion)} must be a list of numbers")
         lens = Lens(_word(table, "model"), width, height, fx, fy, cx, cy, tuple(map(float, distortion)))
         *counts, most = COUNTS[lens.model]
         if len(distortion) not in COUNTS[lens.model]:
@@ -118,15 +119,15 @@ def _virtual(table: dict[str, Any]) -> Virtual:
     if "size" in table:
         size = table["size"]
         if not isinstance(size, list) or len(size) != 2:
-            raise SourceError(f"virtual.size = {size!r} must be [width, height] in pixels")
+            raise SourceError(f"virtual.size = {shown(size)} must be [width, height] in pixels")
         given["size"] = tuple(_count({"virtual.size": side}, "virtual.size") for side in size)
     return Virtual(**given)
 
 
 def _rectangles(value: Any) -> tuple[Any, ...]:
     good = isinstance(value, list) and all(isinstance(one, list) and len(one) == 4 for one in value)
-    if not good or not all(type(number) is int for one in value for number in one):
-        raise SourceError(f"mask_rectangles = {value!r} must be a list of [u0, v0, u1, v1] in whole pixels")
+    if not good or not all(type(number) is int and abs(number) <= LARGEST for one in value for number in one):
+        raise SourceError(f"mask_rectangles = {shown(value)} must be a list of [u0, v0, u1, v1] in whole pixels")
     return tuple(map(tuple, value))
 
 
@@ -149,7 +150,8 @@ def _table(table: dict[str, Any], key: str) -> dict[str, Any]:
 def _word(table: dict[str, Any], key: str) -> str:
     value = table.get(key)
     if not isinstance(value, str) or not value or "\0" in value:
-        raise SourceError(f"{key} = {value!r} must be a text" if key in table else f"{key} is missing; give a text")
+        said = f"{key} = {shown(value)} must be a text" if key in table else f"{key} is missing; give a text"
+        raise SourceError(said)
     return value
 
 
@@ -157,7 +159,7 @@ def _number(table: dict[str, Any], key: str) -> float:
     if key not in table:
         raise SourceError(f"{key} is missing; write {key} = its number")
     if not is_number(table[key]):
-        raise SourceError(f"{key} = {table[key]!r} must be a number")
+        raise SourceError(f"{key} = {shown(table[key])} must be a number")
     return float(table[key])
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from stereovox.errors import FrameRefused, SourceError
 from stereovox.geometry import Transform
 from stereovox.sources.folder import DepthFolder, file_names
+from stereovox.untrusted import read_text
 
 FILE = re.compile(r"frame-(\d+)\.(depth\.png|pose\.txt)")
 FRAMES_PER_SECOND = 30
@@ -64,7 +65,7 @@ class SevenScenes(DepthFolder):
         """Return T_world_camera (4, 4) just as in the file; raises FrameRefused `no_pose` or `bad_pose_file`."""
         path = self.folder / f"frame-{self._numbers[i]}.pose.txt"
         try:
-            numbers = [float(word) for word in path.read_text("utf-8-sig").split()]
+            numbers = [float(word) for word in read_text(path).split()]
         except FileNotFoundError:
             raise FrameRefused("no_pose", f"{path}: no such file; put it back or remove the image") from None
         except OSError as error:

@@ -3,11 +3,11 @@
 
 from __future__ import annotations
 
-import tomllib
 from pathlib import Path
 from typing import Any
 
 from stereovox.errors import SourceError
+from stereovox.untrusted import read_text, toml_table
 
 LARGEST = 1e300
 """TOML's whole numbers have no end, but those of a float do."""
@@ -16,13 +16,11 @@ LARGEST = 1e300
 def read_table(path: Path) -> dict[str, Any]:
     """Return what stands in `path`; raises SourceError, one line, for a file that cannot be read or is no TOML."""
     try:
-        return tomllib.loads(path.read_text("utf-8-sig"))
+        return toml_table(read_text(path))
     except OSError as error:
         raise SourceError(f"{path}: {error.strerror}; give a TOML file you may read") from None
     except ValueError as error:  # bad TOML, bad UTF-8
         raise SourceError(f"{path}: {error}; correct it") from None
-    except RecursionError:
-        raise SourceError(f"{path}: nested too deeply; correct it") from None
 
 
 def is_number(value: Any) -> bool:

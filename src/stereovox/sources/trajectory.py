@@ -4,9 +4,10 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Iterable, Sequence
 from decimal import Decimal, InvalidOperation
-from pathlib import Path
+from pathlib import Path, PurePath
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 from stereovox.errors import SourceError
 from stereovox.sources.poses import Poses
 from stereovox.sources.poses import seconds_from_ns as seconds_from_ns
+from stereovox.untrusted import MOST_LIST, read_text
 
 LIMIT = 9_223_372_036
 """Seconds whose nanoseconds still fit into int64."""
@@ -82,10 +84,17 @@ def stamped_lines(path: Path) -> list[StampedLine]:
     Commas and tabs count as spaces. Raises SourceError naming file and line.
     """
     try:
-        text = path.read_text("utf-8-sig", errors="replace")
+        text = read_text(path, MOST_LIST, "replace")
     except OSError as error:
         raise SourceError(f"{path}: {error.strerror}; make it readable") from None
     return [_parse(line, f"{path}:{n}") for n, line in enumerate(map(_plain, text.splitlines()), 1) if line]
+
+
+def inside(name: str, where: str) -> str:
+    """Return the name of a file that a line of a list gives; raises SourceError where it leads out of the folder."""
+    if os.path.isabs(name) or ".." in PurePath(name).parts or "\0" in name:
+        raise SourceError(f"{where}: '{name}' leads out of the recording's folder; put the file there and name it so")
+    return name
 
 
 def by_time(lines: Iterable[StampedLine]) -> list[StampedLine]:

@@ -11,7 +11,7 @@ import numpy as np
 from stereovox.errors import SourceError
 from stereovox.geometry import Transform
 from stereovox.sources.folder import DepthFolder, file_names
-from stereovox.sources.trajectory import StampedLine, Trajectory, by_time, ns_from_seconds, stamped_lines
+from stereovox.sources.trajectory import StampedLine, Trajectory, by_time, inside, ns_from_seconds, stamped_lines
 
 LIST, IMAGES, POSES = "depth.txt", "depth", "groundtruth.txt"
 
@@ -88,6 +88,7 @@ def _listed(folder: Path) -> list[StampedLine]:
     for _, name, where in lines:
         if not name:
             raise SourceError(f"{where}: needs 'stamp file'; correct or delete the line")
+        inside(name, where)
     return lines
 
 

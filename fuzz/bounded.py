@@ -1,0 +1,42 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Run a target on bytes: what it may raise, how long it may take, how much memory."""
+
+from __future__ import annotations
+
+import resource
+import time
+from pathlib import Path
+
+from stereovox.errors import StereovoxError
+from targets import Target
+
+MOST_SECONDS = 1.0
+"""Of processor time, in all threads: a busy machine must not look like a hang."""
+MOST_GROWTH = 1 << 30
+"""Bytes by which the peak of the process may grow in one run."""
+
+
+class Unbounded(AssertionError):  # noqa: N818 - reads as what happened
+    """A reader took too long or too much."""
+
+
+def check(target: Target, data: bytes, folder: Path, most_seconds: float = MOST_SECONDS) -> str:
+    """Return `read` or `refused`; raises what the target raised, and Unbounded, where that is not allowed."""
+    memory, start = peak_bytes(), time.process_time()
+    try:
+        target.read(data, folder)
+        outcome = "read"
+    except StereovoxError as error:
+        outcome = "refused"
+        if not str(error).isprintable() or not str(error):
+            raise AssertionError(f"no single line: {error!r}") from error
+    if (took := time.process_time() - start) > most_seconds:
+        raise Unbounded(f"took {took:.1f} s")
+    if (grown := peak_bytes() - memory) > MOST_GROWTH:
+        raise Unbounded(f"took {grown >> 20} MiB")
+    return outcome
+
+
+def peak_bytes() -> int:
+    """Return the most memory this process has had so far."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024

@@ -1,0 +1,471 @@
+# SPDX-License-Identifier: Apache-2.0
+"""One target a parser, all of one shape: bytes go into a file, a reader reads it, and only StereovoxError may come out.
+
+Where plain bytes would not get past a check sum or an index, the bytes are what stands behind it (a message, the cells
+of a map) and the target writes a sound file round them.
+"""
+
+from __future__ import annotations
+
+import bz2
+import json
+import struct
+import zlib
+from collections.abc import Callable
+from functools import cache, partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from made_bags import ros_bag
+from made_kitti import label, packet, pose_lines, raw_calibration, single_calibration
+from made_mcap import Message, Style, mcap
+from made_recordings import depth_image, write_png
+from made_rigs import recorded
+from made_robot_bags import START_NS, Messages, RobotBagMaker, planar_numbers
+
+from mutate import with_right_sums
+from stereovox.config import load_config
+from stereovox.errors import StereovoxError
+from stereovox.evaluate.camera_path import read_camera_path
+from stereovox.evaluate.relations import read_relations
+from stereovox.maps import VoxelMap, load_map
+from stereovox.maps.grid_map import GridMap
+from stereovox.maps.grid_store import load_grid
+from stereovox.maps.occupancy import OccupancyGrid
+from stereovox.products import export, read_octomap
+from stereovox.products.map_server import read_map_server, write_map_server
+from stereovox.sources import images, open_source
+from stereovox.sources.calibration_files import import_rig
+from stereovox.sources.camera_file import read_camera
+from stereovox.sources.carmen import CarmenLog
+from stereovox.sources.intrinsics import find_camera
+from stereovox.sources.kitti_calibration import read_calibration, read_raw_calibration
+from stereovox.sources.kitti_labels import read_labels
+from stereovox.sources.kitti_poses import read_oxts_file, read_pose_file
+from stereovox.sources.lidar import read_velodyne
+from stereovox.sources.pair_file import PairSettings, pair_text, read_pair
+from stereovox.sources.rig_file import read_rig
+from stereovox.sources.robot_bag import RobotBag
+from stereovox.sources.tracker import read_tracker
+
+MOST_FRAMES = 20
+SIZE = (16, 12)
+POSES = "# stamp tx ty tz qx qy qz qw\n" + "".join(f"{k / 10:.9f} {k} 0 1 0 0 0.1 1\n" for k in range(4))
+KALIBR = """cam0: &left
+  camera_model: pinhole
+  distortion_model: radtan
+  distortion_coeffs: [-0.3, 0.1, 0.001, -0.0005]
+  intrinsics: [500.0, 501.0, 322.0, 238.0]
+  resolution: [640, 480]
+cam1:
+  <<: *left
+  T_cn_cnm1: [[1, 0, 0, -0.12], [0, 1, 0, 0.0], [0, 0, 1, 0], [0, 0, 0, 1.0]]
+"""
+OPENCV = """%YAML:1.0
+---
+M1: !!opencv-matrix {rows: 3, cols: 3, dt: d, data: [500., 0., 320., 0., 500., 240., 0., 0., 1.]}
+D1: !!opencv-matrix {rows: 1, cols: 5, dt: d, data: [-0.3, 0.1, 0., 0., 0.]}
+M2: !!opencv-matrix {rows: 3, cols: 3, dt: d, data: [500., 0., 320., 0., 500., 240., 0., 0., 1.]}
+D2: !!opencv-matrix {rows: 1, cols: 5, dt: d, data: [-0.3, 0.1, 0., 0., 0.]}
+R: !!opencv-matrix {rows: 3, cols: 3, dt: d, data: [1., 0., 0., 0., 1., 0., 0., 0., 1.]}
+T: !!opencv-matrix {rows: 3, cols: 1, dt: d, data: [-0.12, 0., 0.]}
+imageSize: [640, 480]
+"""
+PROFILE = """voxel_size = 0.1
+max_range = 8.0
+steps = [0.1, 0.1, 0.05]
+[sensor]
+model = "stereo"
+p_free = 0.4
+[window]
+size = [20, 20, 5]
+outside = "keep"
+[map]
+cell = "int8"
+[sphere]
+step_deg = 1.5
+"""
+MAP_YAML = """image: map.pgm
+mode: trinary
+resolution: 0.05
+origin: [-1.0, -2.0, 0.0]
+negate: 0
+occupied_thresh: 0.65
+free_thresh: 0.196
+"""
+METADATA = """rosbag2_bagfile_information:
+  version: 9
+  storage_identifier: mcap
+  relative_file_paths: [part_0.mcap]
+  topics_with_message_count: []
+"""
+FLASER = b"PARAM robot_frontlaser_offset 0.1\nFLASER 3 1.0 2.0 81.9 0 0 0 0.1 0.2 0.3 976052857.3 nohost 0.1\n"
+ROBOTLASER = b"ROBOTLASER1 0 -1.57 3.14 0.5 30.0 0.01 0 3 1.0 2.0 31 0 0 0 0 0 0 0 0 0 0 0 0 976052857.3 nohost 0.1\n"
+IMAGE_KINDS = ("sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/CameraInfo",
+               "tf2_msgs/msg/TFMessage", "geometry_msgs/msg/PoseStamped", "nav_msgs/msg/Odometry")  # fmt: skip
+ROBOT_KINDS = ("sensor_msgs/msg/LaserScan", "sensor_msgs/msg/PointCloud2", "nav_msgs/msg/Odometry",
+               "tf2_msgs/msg/TFMessage")  # fmt: skip
+
+
+class Target(NamedTuple):
+    """seeds: what is changed, made in an empty folder. read: what a file of such bytes is read by."""
+
+    seeds: Callable[[Path], list[bytes]]
+    read: Callable[[bytes, Path], Any]
+
+
+def file_target(name: str, reader: Callable[[Path], Any], *seeds: str | bytes) -> Target:
+    """Return a target whose bytes are the file `name` as it is."""
+
+    def read(data: bytes, folder: Path) -> Any:
+        (folder / name).write_bytes(data)
+        return reader(folder / name)
+
+    return Target(lambda _: [seed.encode() if isinstance(seed, str) else seed for seed in seeds], read)
+
+
+def frames_of(source: Any) -> None:
+    """Take the first frames; a fault is told in one line, and a frame without one has an image of its camera's size."""
+    for i in range(min(len(source), MOST_FRAMES)):
+        frame = source.frame(i) if hasattr(source, "frame") else source[i]
+        assert frame.fault_detail.isprintable(), "a fault of several lines"
+        if frame.fault is None and hasattr(frame, "depth"):
+            assert frame.depth.shape == (frame.camera.height, frame.camera.width)
+
+
+# maps ---------------------------------------------------------------------------------------------------------------
+
+
+@cache
+def small_map() -> VoxelMap:
+    cells = [(x, y, z) for x in range(-3, 9) for y in (0, 9) for z in (-1, 20)]
+    made = VoxelMap.from_cells(load_config(voxel_size=0.1), cells, np.linspace(-4, 3, len(cells)))
+    made.frames, made.recording = 3, "sim:room"
+    return made
+
+
+def saved(folder: Path) -> Path:
+    """Return the small map, saved once in `folder`."""
+    path = folder / "sound.svox"
+    if not path.exists():
+        small_map().save(path)
+    return path
+
+
+def read_manifest(data: bytes, folder: Path) -> None:
+    path = saved(folder)
+    whole = (path / "manifest.json").read_bytes()
+    try:
+        (path / "manifest.json").write_bytes(data.replace(b"DATA", json.loads(whole)["data"].encode()))
+        load_map(path)
+    finally:
+        (path / "manifest.json").write_bytes(whole)
+
+
+def manifests(folder: Path) -> list[bytes]:
+    text = (saved(folder) / "manifest.json").read_text()
+    return [text.replace(json.loads(text)["data"], "DATA").encode()]
+
+
+PIECES = ("coords/zarr.json", "coords/c/0/0", "cells/zarr.json", "cells/c/0/0", "zarr.json")
+
+
+def read_piece(data: bytes, folder: Path) -> None:
+    """The first byte says which file of the arrays gets the others."""
+    path = next(saved(folder).glob("cells-*")) / PIECES[data[0] % len(PIECES) if data else 0]
+    whole = path.read_bytes()
+    try:
+        path.write_bytes(data[1:])
+        load_map(saved(folder))
+    finally:
+        path.write_bytes(whole)
+
+
+def pieces(folder: Path) -> list[bytes]:
+    inner = next(saved(folder).glob("cells-*"))
+    return [bytes([k]) + (inner / piece).read_bytes() for k, piece in enumerate(PIECES)]
+
+
+def read_cells(data: bytes, folder: Path) -> None:
+    """The bytes are coordinates (12 each) and cells of two kinds, in a folder that is sound otherwise."""
+    import zarr
+
+    coords = np.frombuffer(data[: len(data) // 12 * 12], "<i4").reshape(-1, 3)
+    cells = np.resize(np.frombuffer(data or b"\0", np.uint8), (len(coords), 512)).astype(np.int16) * 131
+    path = saved(folder)
+    manifest = json.loads((path / "manifest.json").read_text())
+    whole = json.dumps(manifest)
+    manifest |= {"data": "cells-made", "blocks": len(coords), "checksum": [zlib.crc32(coords), zlib.crc32(cells)]}
+    group = zarr.open_group(path / "cells-made", mode="w", zarr_format=3)
+    rows = max(1, len(coords))
+    for name, array in (("coords", coords), ("cells", cells)):
+        group.create_array(name, shape=array.shape, dtype=array.dtype, chunks=(rows, array.shape[1]))[:] = array
+    try:
+        (path / "manifest.json").write_text(json.dumps(manifest))
+        loaded = load_map(path)
+        assert len(loaded.blocks()[0]) <= len(coords)
+    finally:
+        (path / "manifest.json").write_text(whole)
+
+
+def some_coords(_: Path) -> list[bytes]:
+    return [np.array([[0, 0, 0], [1, 2, 3], [-5, 7, 100]], "<i4").tobytes()]
+
+
+@cache
+def small_grid() -> GridMap:
+    cells = np.full((70, 65), -1, np.int8)
+    cells[3:9, 5:60], cells[10, 5:60] = 0, 100
+    return GridMap.from_occupancy(OccupancyGrid(cells, 0.05, (1.0, 2.0, 0.0)), load_config(dimensions=2))
+
+
+def grids(folder: Path) -> list[bytes]:
+    small_grid().save(folder / "a.npz")
+    return [(folder / "a.npz").read_bytes()]
+
+
+def read_about(data: bytes, folder: Path) -> None:
+    coords, cells = small_grid().tiles()
+    np.savez_compressed(folder / "b.npz", about=np.frombuffer(data, np.uint8), coords=coords, cells=cells)
+    load_grid(folder / "b.npz")
+
+
+def abouts(folder: Path) -> list[bytes]:
+    small_grid().save(folder / "a.npz")
+    with np.load(folder / "a.npz") as parts:
+        return [parts["about"].tobytes()]
+
+
+def trees(folder: Path) -> list[bytes]:
+    for name in ("a.bt", "a.ot"):
+        export(small_map(), folder / name)
+    return [(folder / name).read_bytes() for name in ("a.bt", "a.ot")]
+
+
+def read_tree(data: bytes, folder: Path) -> None:
+    """The bytes are the nodes of a tree; title and size are right. An odd first byte: `.ot`."""
+    ot, body = bool(data and data[0] % 2), data[1:]
+    nodes = len(body) // 5 if ot else 1 + sum(byte >> shift & 3 == 3 for byte in body for shift in (0, 2, 4, 6))
+    nodes += 0 if ot else sum(byte >> shift & 3 in (1, 2) for byte in body for shift in (0, 2, 4, 6))
+    title = "# Octomap OcTree file" if ot else "# Octomap OcTree binary file"
+    (folder / "tree").write_bytes(f"{title}\nid OcTree\nsize {nodes}\nres 0.1\ndata\n".encode() + body)
+    read_octomap(folder / "tree")
+
+
+def bodies(folder: Path) -> list[bytes]:
+    return [bytes([k]) + tree.partition(b"data\n")[2] for k, tree in enumerate(trees(folder))]
+
+
+def read_yaml(data: bytes, folder: Path) -> None:
+    (folder / "map.pgm").write_bytes(b"P5\n2 2\n255\n\0\xcd\xfe\xfe")
+    (folder / "map.yaml").write_bytes(data)
+    read_map_server(folder / "map.yaml")
+
+
+def read_picture(data: bytes, folder: Path) -> None:
+    (folder / "map.yaml").write_text(MAP_YAML.replace("trinary", "scale"))
+    for fixed in {data, with_right_sums(data)}:
+        (folder / "map.pgm").write_bytes(fixed)
+        read_map_server(folder / "map.yaml")
+
+
+def pictures(folder: Path) -> list[bytes]:
+    grid = OccupancyGrid(np.array([[0, 100, -1]] * 5, np.int8), 0.05, (0, 0, 0))
+    write_map_server(grid, folder / "a.pgm")
+    write_map_server(grid, folder / "a.png", "scale")
+    plain = b"P2\n# plain\n3 2\n255\n0 205 254 255 0 0\n"
+    return [(folder / "a.pgm").read_bytes(), (folder / "a.png").read_bytes(), plain]
+
+
+# bags ---------------------------------------------------------------------------------------------------------------
+
+
+def read_bag(name: str, data: bytes, folder: Path) -> None:
+    (folder / name).write_bytes(data)
+    refused = []
+    for opened in (lambda: [open_source(folder / name)], lambda: [(bag := RobotBag(folder / name)).scans, bag.frames]):
+        try:
+            for frames in opened():
+                frames_of(frames)
+        except StereovoxError as error:
+            refused.append(error)
+    if len(refused) == 2:
+        raise refused[0]
+
+
+def ros1_bags(folder: Path) -> list[bytes]:
+    made = [ros_bag(folder / f"{packed}.bag", 2, packed).read_bytes() for packed in ("", "lz4", "bz2")]
+    with RobotBagMaker(folder / "robot.bag") as bag:
+        bag.scans(2)
+        bag.tf(START_NS, "odom", "base_link", planar_numbers(1, 2, 0.1))
+    return [*made, (folder / "robot.bag").read_bytes()]
+
+
+def db3_bags(folder: Path) -> list[bytes]:
+    with RobotBagMaker(folder / "robot.db3") as bag:
+        bag.scans(2)
+        bag.depth(2)
+        bag.tf(START_NS, "odom", "base_link", planar_numbers(1, 2, 0.1))
+    return [bag.path.read_bytes()]
+
+
+@cache
+def messages() -> list[tuple[str, str, bytes]]:
+    """Topic, type and bytes of messages that fit together."""
+    ros = Messages(2)
+    edges = (
+        (START_NS, "odom", "base_link", planar_numbers(1, 2, 0.1)),
+        (START_NS, "base_link", "laser", [0.0] * 6 + [1.0]),
+    )
+    pixels = 1000 + np.arange(48, dtype=np.uint16).reshape(6, 8)
+    made = {
+        "/scan": ("sensor_msgs/LaserScan", ros.scan(START_NS, [1.0, 2.0, 3.0])),
+        "/points": ("sensor_msgs/PointCloud2", ros.cloud(START_NS, [[1, 2, 0.3], [2, 1, 0.2]])),
+        "/odom": ("nav_msgs/Odometry", ros.odometry(START_NS, planar_numbers(1, 2, 0.1))),
+        "/tf": ("tf2_msgs/TFMessage", ros.transforms(*edges)),
+        "/depth/image": ("sensor_msgs/Image", ros.image(START_NS, pixels, "optical")),
+        "/depth/camera_info": ("sensor_msgs/CameraInfo", ros.camera_info(START_NS, 8, 6)),
+    }
+    return [(topic, kind.replace("/", "/msg/"), ros.raw(kind, message)) for topic, (kind, message) in made.items()]
+
+
+def mcap_bags(folder: Path) -> list[bytes]:
+    types = {topic: kind for topic, kind, _ in messages()}
+    said = [Message(topic, START_NS + k, data) for k, (topic, _, data) in enumerate(messages())]
+    styles = (Style(), Style("zstd", crc=True), Style("lz4", summary=False), Style(chunk=0, summary=False))
+    return [mcap(folder / "a.mcap", types, said, style).read_bytes() for style in styles]
+
+
+def read_message(data: bytes, folder: Path) -> None:
+    """The first byte says which message gets the others; the file round them is sound."""
+    number = data[0] % len(messages()) if data else 0
+    types = {topic: kind for topic, kind, _ in messages()}
+    said = [
+        Message(topic, START_NS + k, data[1:] if k == number else sound)
+        for k, (topic, _, sound) in enumerate(messages())
+    ]
+    read_bag(
+        "message.mcap", mcap(folder / "made.mcap", types, said, Style(chunk=0, summary=False)).read_bytes(), folder
+    )
+
+
+def read_metadata(data: bytes, folder: Path) -> None:
+    bag = folder / "bag"
+    if not bag.exists():
+        bag.mkdir()
+        (bag / "part_0.mcap").write_bytes(mcap_bags(folder)[0])
+    (bag / "metadata.yaml").write_bytes(data)
+    frames_of(open_source(bag))
+
+
+# images and texts -----------------------------------------------------------------------------------------------------
+
+
+def read_png(reader: Callable[..., Any], data: bytes, folder: Path) -> None:
+    path = folder / "a.png"
+    for fixed in {data, with_right_sums(data)}:
+        path.write_bytes(fixed)
+        image = reader(path, SIZE)
+        assert image.shape[:2] == SIZE[::-1]
+
+
+def depth_pngs(folder: Path) -> list[bytes]:
+    write_png(folder / "s.png", depth_image(1))
+    return [(folder / "s.png").read_bytes()]
+
+
+def grey_pngs(folder: Path) -> list[bytes]:
+    made = []
+    for shape in ((12, 16), (12, 16, 3)):
+        write_png(folder / "s.png", np.arange(np.prod(shape), dtype=np.uint8).reshape(shape))
+        made.append((folder / "s.png").read_bytes())
+    return made
+
+
+def read_list(name: str, data: bytes, folder: Path) -> None:
+    """A TUM folder, one of whose lists is these bytes."""
+    if not (folder / "depth").exists():
+        write_png(folder / "depth/0.1.png", depth_image(1))
+        (folder / "camera-intrinsics.txt").write_text("20 0 7.5\n0 21 5.5\n0 0 1\n")
+        (folder / "groundtruth.txt").write_text(POSES)
+        (folder / "depth.txt").write_text("0.1 depth/0.1.png\n")
+    (folder / name).write_bytes(data)
+    frames_of(open_source(folder))
+
+
+def read_rig_folder(data: bytes, folder: Path) -> None:
+    (folder / "rig.toml").write_bytes(data)
+    for pair in read_rig(folder / "rig.toml").stereo_pairs(folder):
+        assert pair.camera.width > 0
+
+
+def rigs(folder: Path) -> list[bytes]:
+    return [(recorded(folder / "rig") / "rig.toml").read_bytes()]
+
+
+def raw_files(folder: Path) -> list[bytes]:
+    raw_calibration(folder)
+    return [(folder / "calib_cam_to_cam.txt").read_bytes()]
+
+
+def read_raw(data: bytes, folder: Path) -> None:
+    if not (folder / "calib_velo_to_cam.txt").exists():
+        raw_calibration(folder)
+    (folder / "calib_cam_to_cam.txt").write_bytes(data)
+    read_raw_calibration(folder)
+    import_rig([folder / "calib_cam_to_cam.txt"], (64, 24))
+
+
+def read_matrix(path: Path) -> None:
+    find_camera([path.parent], SIZE, 0.05, (1.0, 1.0, 1.0, 1.0))
+
+
+def read_log(path: Path) -> None:
+    frames_of(CarmenLog(str(path)).scans)
+
+
+CAMERA = 'width = 16\nheight = 12\nfx = 20.0\nfy = 21\ncx = 7.5\ncy = 5.5\nbaseline = 0.05\n[correction]\n' \
+    'model = "thesis"\ncoefficients = [0.1, 0.2, 0.3]\n[correction.provenance]\nmade = "by hand"\n'  # fmt: skip
+KITTI = single_calibration(("R_rect", "Tr_velo_cam", "Tr_imu_velo", True))
+SCAN = struct.pack("<8f", 1, 2, 3, 0.5, 4, 5, 6, 0.5)
+
+TARGETS: dict[str, Target] = {
+    "config": file_target("a.toml", load_config, PROFILE),
+    "camera": file_target("camera.toml", read_camera, CAMERA),
+    "pair": file_target("pair.toml", read_pair, pair_text(PairSettings(T_tracker_camera=np.eye(4), baseline=0.05))),
+    "rig": Target(rigs, read_rig_folder),
+    "calibration": file_target("calib.yaml", lambda path: import_rig([path]), KALIBR, OPENCV),
+    "intrinsics": file_target("camera-intrinsics.txt", read_matrix, "20 0 7.5\n0 21 5.5\n0 0 1\n"),
+    "images_list": Target(
+        lambda _: [b"# list\n0.1 depth/0.1.png\n0.2 depth/0.2.png\n"], partial(read_list, "depth.txt")
+    ),
+    "poses_list": Target(lambda _: [POSES.encode()], partial(read_list, "groundtruth.txt")),
+    "tracker": file_target("tracker.txt", read_tracker, POSES, "".join(f"{n} 3\n" for n in POSES.splitlines()[1:])),
+    "camera_path": file_target("path.txt", read_camera_path, POSES, "1 2 3\n4 5 6\n"),
+    "relations": file_target("a.relations", read_relations, "1.5 2.5 0.1 0.2 0 0 0 0.1\n"),
+    "kitti_poses": file_target("poses.txt", lambda path: read_pose_file(path, 5), pose_lines(3)),
+    "kitti_oxts": file_target("oxts.txt", lambda path: read_oxts_file(path, 5, np.eye(4)), packet(0) + packet(1)),
+    "kitti_labels": file_target("labels.txt", read_labels, label(0) + "\n" + label(1) + "\n"),
+    "kitti_calibration": file_target("calib.txt", read_calibration, KITTI),
+    "kitti_raw": Target(raw_files, read_raw),
+    "velodyne": file_target("0.bin", read_velodyne, SCAN),
+    "carmen": file_target("a.log", read_log, FLASER, ROBOTLASER, FLASER + ROBOTLASER),
+    "carmen_bz2": file_target("a.log.bz2", read_log, bz2.compress(FLASER * 3)),
+    "depth_png": Target(depth_pngs, partial(read_png, images.read_depth_png)),
+    "picture_png": Target(grey_pngs, partial(read_png, images.read_picture_png)),
+    "map_manifest": Target(manifests, read_manifest),
+    "map_arrays": Target(pieces, read_piece),
+    "map_cells": Target(some_coords, read_cells),
+    "grid_file": Target(grids, lambda data, folder: file_target("a.npz", load_grid).read(data, folder)),
+    "grid_about": Target(abouts, read_about),
+    "octomap": Target(trees, lambda data, folder: file_target("a.bt", read_octomap).read(data, folder)),
+    "octomap_nodes": Target(bodies, read_tree),
+    "map_yaml": file_target("map.yaml", lambda path: read_yaml(path.read_bytes(), path.parent), MAP_YAML),
+    "map_picture": Target(pictures, read_picture),
+    "bag_ros1": Target(ros1_bags, partial(read_bag, "a.bag")),
+    "bag_db3": Target(db3_bags, partial(read_bag, "a.db3")),
+    "bag_mcap": Target(mcap_bags, partial(read_bag, "a.mcap")),
+    "bag_message": Target(lambda _: [bytes([k]) + data for k, (_, _, data) in enumerate(messages())], read_message),
+    "bag_metadata": Target(lambda _: [METADATA.encode()], read_metadata),
+}

@@ -29,6 +29,8 @@ from stereovox.grid_mapper import GridMapper
 
 SEEN = Frame, Scan, StereoFrame
 SLOW_S = 1.0
+ON_DISK = 0.1
+"""Share of the frames that a map with tiles on the disk gets: looking at all of it is slow."""
 RENEWED = 200
 """Frames after which a map is begun anew, lest all of them be large."""
 UNFIT = "(settings do not fit the camera)"
@@ -155,8 +157,11 @@ def run(frames: int, seed: int, timed_from: int = WARM, told: Callable[[str], No
     maker, rng, tally = Maker(seed), np.random.default_rng(seed + 1), Tally()
     tried = [Tried(lambda s=s: sv.Mapper("default", **{**SMALL, **s})) for s in VOXELS.values()]
     grids = [Tried(lambda s=s: GridMapper("default", **{**SMALL, **s})) for s in GRIDS.values()]
+    all_tried = tried + grids
+    shares = np.array([ON_DISK if name == "projective, window on disk" else 1.0 for name in (*VOXELS, *GRIDS)])
+    shares /= shares.sum()
     for number in range(frames):
-        one = (tried + grids)[rng.integers(len(tried) + len(grids))]
+        one = all_tried[rng.choice(len(all_tried), p=shares)]
         thing = thing_for(one in grids, maker, rng.random())
         tally.frames[type(thing).__name__ if isinstance(thing, SEEN) else "nonsense"] += 1
         try:
@@ -170,7 +175,7 @@ def run(frames: int, seed: int, timed_from: int = WARM, told: Callable[[str], No
             one.renew()
         if number % 10_000 == 9_999:
             told(json.dumps({k: v for k, v in tally.as_dict().items() if k not in ("bad", "by_kind", "refused")}))
-    for one in tried + grids:
+    for one in all_tried:
         one.renew()
     return tally
 

@@ -29,6 +29,7 @@ ODD_THINGS = (
 ODD_DTYPES = (
     ">f4", ">u2", "<f8", ">f8", "f2", "i1", "u1", "i2", "i4", "i8", "u8", "?", "c8", "c16", "O", "S3", "g", "M8[s]",
 )  # fmt: skip
+CAMERAS = 40
 NAMES = ("", "a.png", "two\nlines", "\udc80", "x" * 300)
 STAMP_STEPS = (33_000_000, 33_000_000, 0, -33_000_000, -(10**10), 10**18, 2**63, 0.5)
 """Nanoseconds from one frame to the next."""
@@ -40,6 +41,7 @@ class Maker:
     def __init__(self, seed: int):
         self._rng = np.random.default_rng(seed)
         self._stamp: Any = 0
+        self._cameras = [self._any_camera() for _ in range(CAMERAS)]
         self._pairs = [self._pair(eyes) for eyes in (False, False, True)]
 
     def frame(self) -> AnyFrame:
@@ -127,6 +129,13 @@ class Maker:
         return T
 
     def _camera(self) -> Any:
+        """Return one of a few dozen cameras, for a robot has few; now and then one of them is replaced."""
+        number = int(self._rng.integers(CAMERAS))
+        if self._rarely():
+            self._cameras[number] = self._any_camera()
+        return self._cameras[number]
+
+    def _any_camera(self) -> Any:
         rng = self._rng
         width, height = int(rng.integers(1, 25)), int(rng.integers(1, 19))
         baseline = self._one_of((None, 0.05, 1e-6, 50.0))

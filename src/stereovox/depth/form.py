@@ -14,23 +14,29 @@ from stereovox.rigs import StereoPair, VirtualCamera
 
 
 class Field(NamedTuple):
-    """What a field may be, and how a message calls it."""
+    """What a field may be, how a message calls it, and what a frame is refused for where it is something else."""
 
     types: tuple[type, ...]
     wanted: str
+    reason: str = "bad_form"
 
 
 LONGEST = 2**63
 """Whole numbers from here on do not fit into 64 bits."""
-WHOLE = Field((int, np.integer), "a whole number of nanoseconds")
+WHOLE = Field((int, np.integer), "a whole number of nanoseconds", "bad_stamp")
 NUMBER = Field((int, float, np.integer, np.floating), "a number")
 TEXT = Field((str,), "text")
 TEXT_OR_NONE = Field((str, type(None)), "text or None")
 ARRAY = Field((np.ndarray,), "an array")
 ARRAY_OR_NONE = Field((np.ndarray, type(None)), "an array or None")
 SHARED = {
-    "stamp_ns": WHOLE, "pose_off_ns": WHOLE, "name": TEXT, "sensor": TEXT, "fault": TEXT_OR_NONE, "fault_detail": TEXT,
-}  # fmt: skip
+    "stamp_ns": WHOLE,
+    "pose_off_ns": WHOLE,
+    "sensor": TEXT._replace(reason="bad_sensor"),
+    "name": TEXT,
+    "fault": TEXT_OR_NONE,
+    "fault_detail": TEXT,
+}
 FIELDS = {
     Frame: {"camera": Field(get_args(VirtualCamera), "a camera"), "depth_scale": NUMBER, "reason": ARRAY_OR_NONE},
     StereoFrame: {"left": ARRAY, "right": ARRAY, "pair": Field((StereoPair,), "a StereoPair")},
@@ -40,8 +46,9 @@ FIELDS = {
 
 
 def check_form(seen: Any, *kinds: type) -> None:
-    """Raise FrameRefused `bad_form` for what is none of `kinds`, and where one of its fields is not what it should be.
+    """Raise FrameRefused for what is none of `kinds`, and where one of its fields is not what it should be.
 
+    The reason is `bad_form`, or `bad_stamp` for its times, or `bad_sensor`.
     kinds: out of Frame, StereoFrame and Scan. Looks into no array; a masked one is refused, for nobody asks it for its
     mask. The source's own `fault` is raised too.
     """
@@ -71,9 +78,9 @@ def _check_fields(seen: object, wanted: dict[str, Field]) -> None:
     for name, field in wanted.items():
         value = getattr(seen, name)
         if not isinstance(value, field.types):
-            raise FrameRefused("bad_form", f"{_called(seen)}: {name} is {type(value).__name__}; give {field.wanted}")
+            raise FrameRefused(field.reason, f"{_called(seen)}: {name} is {type(value).__name__}; give {field.wanted}")
         if isinstance(value, int) and abs(value) >= LONGEST:
-            raise FrameRefused("bad_form", f"{_called(seen)}: {name} does not fit into 64 bits; give {field.wanted}")
+            raise FrameRefused(field.reason, f"{_called(seen)}: {name} does not fit into 64 bits; give {field.wanted}")
 
 
 def _called(seen: object) -> str:

@@ -43,7 +43,8 @@ def sound(scan: Scan, rigidity: float) -> Scan:
     ranges = np.asarray(scan.ranges)
     if ranges.ndim != 1 or not ranges.size or not np.issubdtype(ranges.dtype, np.floating):
         raise FrameRefused("bad_shape", f"{name}: ranges are {ranges.shape} {ranges.dtype}; give (N,) float32 metres")
-    angles, limits = (scan.angle_min, scan.angle_step), (scan.range_min, scan.range_max)
+    angles = float(scan.angle_min), float(scan.angle_step)
+    limits = float(scan.range_min), float(scan.range_max)
     if (
         not np.isfinite([*angles, angles[0] + angles[1] * ranges.size]).all()
         or scan.angle_step == 0

@@ -6,6 +6,7 @@ import signal
 import socket
 import subprocess
 import sys
+import urllib.error
 import urllib.request
 
 import pytest
@@ -53,13 +54,36 @@ def test_up_is_taken_or_refused(saved, capsys, monkeypatch):
     assert "up 'w' is no axis" in capsys.readouterr().err
 
 
-def test_a_page_for_everybody_comes_with_a_warning(saved):
+def status_of(link):
+    try:
+        with urllib.request.urlopen(link, timeout=10) as page:
+            return page.status
+    except urllib.error.HTTPError as error:
+        return error.code
+
+
+def test_a_page_for_others_needs_the_link_that_is_printed(saved):
     running = start(saved, "--port", 0, "--host", "0.0.0.0")
-    assert running.stderr.readline().startswith("warning: anyone who can reach 0.0.0.0")
-    assert "http://localhost:" in running.stderr.readline()
+    assert "whoever has this link" in running.stderr.readline()
+    link = next(word for word in running.stderr.readline().split() if word.startswith("http://localhost:"))
+    place, token = link.split("/?token=")
+    assert (status_of(link), status_of(place), status_of(f"{place}/?token={token[:-1]}")) == (200, 403, 403)
     running.send_signal(signal.SIGINT)
     out, _ = running.communicate(timeout=20)
     assert (running.returncode, out) == (0, "")
+
+
+def test_a_token_may_come_from_the_environment(saved, capsys, monkeypatch):
+    from stereovox.view import viewer
+
+    seen = []
+    monkeypatch.setattr(viewer.Viewer, "wait", lambda self: seen.append(self.url))
+    monkeypatch.setenv("STEREOVOX_TOKEN", "known-to-all-of-us")
+    assert main(["view", str(saved), "--port", "0"]) == 0
+    assert main(["view", str(saved), "--port", "0", "--token", "only-known-to-me"]) == 0
+    assert [url.partition("/?token=")[2] for url in seen] == ["known-to-all-of-us", "only-known-to-me"]
+    assert main(["view", str(saved), "--port", "0", "--token", "short"]) == 2
+    assert "16 to 128 letters" in capsys.readouterr().err
 
 
 def test_a_taken_port_is_one_line(saved, capsys):

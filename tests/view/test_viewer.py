@@ -15,7 +15,7 @@ from stereovox.frame import Viewpoint
 from stereovox.maps import State
 from stereovox.view import viewer_cells
 from stereovox.view.scale import scale_of
-from stereovox.view.viewer import is_private, open_viewer, url_of
+from stereovox.view.viewer import open_viewer
 from stereovox.view.viewer_camera import first_look, up_vector
 from stereovox.view.viewer_cells import CORNERS, FACES
 from stereovox.view.viewer_layer import MOST_PX, layer_colours, sharp
@@ -249,13 +249,6 @@ def test_up_may_be_told():
 
 def test_names_from_a_map_are_no_program_text():
     assert plain("a{b}\n<img> |x\udc80") == r"a\{b\} \<img\> \|x\?"
-
-
-def test_addresses():
-    assert url_of("127.0.0.1", 8080) == "http://127.0.0.1:8080"
-    assert url_of("0.0.0.0", 1) == "http://localhost:1"
-    assert url_of("::1", 1) == "http://[::1]:1"
-    assert [is_private(host) for host in ("127.0.0.1", "localhost", "0.0.0.0")] == [True, True, False]
 
 
 def test_a_taken_port_is_named_with_its_cure():

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import logging
+import os
 from argparse import ArgumentParser, Namespace
 from contextlib import closing, suppress
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import Any
 from stereovox.cli.saved_map import open_cubes
 from stereovox.cli.terminal import say
 
+TOKEN = "STEREOVOX_TOKEN"
 EXAMPLE = "stereovox view kitchen.svox"
 
 
@@ -21,20 +23,31 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--up", metavar="AXIS", help="which way is up: z, -y, x ... (default: as the map's settings say)"
     )
-    parser.add_argument("--host", default="127.0.0.1", help="address to serve; 0.0.0.0 lets others look (default here)")
+    parser.add_argument(
+        "--host",
+        default="127.0.0.1",
+        help="address to serve; 0.0.0.0 lets others look who have the link (default here)",
+    )
     parser.add_argument("--port", type=int, default=8080, help="port of the page; 0 for any that is free (8080)")
+    parser.add_argument(
+        "--token",
+        metavar="WORD",
+        help=f"what the link must hold; better in {TOKEN}, for all users of a machine see its command lines",
+    )
 
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Serve the page until Ctrl-C."""
-    from stereovox.view.viewer import is_private, open_viewer
+    from stereovox.view.viewer import open_viewer
 
     logging.getLogger("websockets.server").setLevel(logging.CRITICAL)  # tells of every browser that hangs up early
     name = Path(arguments.map).stem
-    viewer = open_viewer(open_cubes(arguments.map), name, arguments.host, arguments.port, arguments.up)
+    place = arguments.host, arguments.port
+    token = arguments.token if arguments.token is not None else os.environ.get(TOKEN) or None
+    viewer = open_viewer(open_cubes(arguments.map), name, *place, arguments.up, token)
     with closing(viewer), suppress(KeyboardInterrupt):
-        if not is_private(arguments.host):
-            say(f"warning: anyone who can reach {arguments.host} over the network can look at this map")
+        if "?token=" in viewer.url:
+            say("whoever has this link can look at the map; from another machine put this one's name for localhost")
         say(f"open {viewer.url} in a browser; Ctrl-C ends")
         viewer.wait()
     return {"url": viewer.url}

@@ -6,6 +6,7 @@ from __future__ import annotations
 from functools import cached_property
 
 from stereovox.config import Config
+from stereovox.depth.form import check_form
 from stereovox.depth.prepare import prepare
 from stereovox.depth.sphere_image import through_sphere
 from stereovox.depth.stereo import StereoDepth
@@ -19,7 +20,11 @@ class DepthPath:
         self._config = config
 
     def matched(self, frame: AnyFrame) -> Frame:
-        """Return a stereo frame as one with depth, any other as it is. Raises FrameRefused as `StereoDepth`."""
+        """Return a stereo frame as one with depth, any other as it is.
+
+        Raises FrameRefused as `StereoDepth`, and `bad_form` for what is no frame at all.
+        """
+        check_form(frame, Frame, StereoFrame)
         return self._stereo(frame) if isinstance(frame, StereoFrame) else frame
 
     def image(self, frame: Frame) -> DepthImage:

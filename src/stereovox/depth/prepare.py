@@ -13,6 +13,7 @@ from stereovox.depth import _cpu
 from stereovox.depth.correct import corrected
 from stereovox.depth.denoise import denoise
 from stereovox.depth.downsample import downsample
+from stereovox.depth.form import matrix_of
 from stereovox.errors import FrameRefused
 from stereovox.frame import DepthImage, Frame, Reason, Scan
 
@@ -21,6 +22,8 @@ SATURATED = 65535
 """What many cameras write into uint16 images for "no value"."""
 EXACT = 1e-14
 """How far a rotation of doubles may be off and still be the nearest there is."""
+SMALLEST = 1e-30
+"""Metres per unit of a depth image that float32 can still multiply with."""
 FARTHEST = 1e6
 """Positions beyond this many metres are taken for errors."""
 
@@ -70,18 +73,18 @@ def _check_image(frame: Frame) -> None:
     if depth.shape != (camera.height, camera.width):
         wanted = f"({camera.height}, {camera.width})"
         raise FrameRefused("bad_shape", f"{name}: depth image is {depth.shape}, its camera says {wanted}")
-    if not (np.isfinite(frame.depth_scale) and frame.depth_scale > 0):
+    if not SMALLEST < frame.depth_scale < 1 / SMALLEST:  # NaN as well
         raise FrameRefused("bad_scale", f"{name}: depth_scale {frame.depth_scale} must be positive and finite")
-    if frame.reason is not None and (frame.reason.shape != depth.shape or frame.reason.max(initial=0) > max(Reason)):
+    given = frame.reason
+    if given is not None and (
+        given.dtype != np.uint8 or given.shape != depth.shape or given.max(initial=0) > max(Reason)
+    ):
         raise FrameRefused("bad_reason", f"{name}: reason must be {depth.shape} uint8 of values 0 to {max(Reason)}")
 
 
 def rigid_pose(frame: Frame | Scan, tolerance: float) -> geometry.Transform:
     """Return the rigid motion nearest to the pose; raises FrameRefused: `pose_not_finite`, `pose_not_rigid`."""
-    try:
-        T = np.asarray(frame.T_world_sensor, float)
-    except (TypeError, ValueError):
-        T = np.empty(0)
+    T = matrix_of(frame.T_world_sensor)
     if T.shape == (4, 4) and not all(-FARTHEST < x < FARTHEST for x in T.ravel().tolist()):
         raise FrameRefused("pose_not_finite", f"{_name(frame)}: the pose holds NaN, infinity or absurdly large numbers")
     error = geometry.rigidity_error(T)

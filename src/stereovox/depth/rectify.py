@@ -44,7 +44,7 @@ def rectified(frame: StereoFrame) -> StereoFrame:
 
     Unchanged where the pair has no eyes, and where the frame has a fault. `valid` and `valid_right` of the new pair are
     False also where the lens sees nothing; the pixels there are 0. All frames of one pair get one and the same new
-    pair. Raises FrameRefused `bad_shape` for images that are not of the lenses' sizes.
+    pair. Raises FrameRefused: `bad_shape` for images that are not of the lenses' sizes, `bad_dtype`.
     """
     if frame.pair.eyes is None or frame.fault:
         return frame
@@ -101,8 +101,10 @@ def _check(frame: StereoFrame) -> None:
         ("left", frame.left, frame.pair.eyes.left),
         ("right", frame.right, frame.pair.eyes.right),
     ):
-        if image.shape[:2] != (lens.height, lens.width):
-            name = frame.name or f"frame at {frame.stamp_ns} ns"
+        name = frame.name or f"frame at {frame.stamp_ns} ns"
+        if image.dtype != np.uint8:
+            raise FrameRefused("bad_dtype", f"{name}: the {side} image is {image.dtype}; give uint8")
+        if image.shape not in ((lens.height, lens.width), (lens.height, lens.width, 3)):
             wanted = f"the lens of pair '{frame.pair.name}' says {(lens.height, lens.width)}"
             raise FrameRefused(
                 "bad_shape", f"{name}: the {side} image is {image.shape}, {wanted}; calibrate at this size"

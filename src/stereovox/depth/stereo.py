@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from stereovox.config import StereoConfig
 from stereovox.depth.disparity import Disparity, doubled, explained, halved, match_aligned
+from stereovox.depth.form import matrix_of
 from stereovox.depth.stereo_matchers import make_matcher
 from stereovox.errors import FrameRefused, StereovoxError
 from stereovox.frame import Frame, StereoFrame
@@ -115,9 +116,9 @@ def _grey(image: NDArray[np.uint8], frame: StereoFrame, side: str) -> NDArray[np
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
 
 
-def _eye_pose(T_world_left: Transform, baseline: float, aligned: str) -> Transform:
+def _eye_pose(T_world_left: object, baseline: float, aligned: str) -> Transform:
     """Return T_world_eye (4, 4): the right eye stands the baseline along x from the left."""
-    T = np.array(T_world_left, float)
+    T = matrix_of(T_world_left)
     if aligned == "right" and T.shape == (4, 4):  # prepare tells a bad pose
         T[:3, 3] += T[:3, 0] * baseline
     return T

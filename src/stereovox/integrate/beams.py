@@ -111,7 +111,7 @@ class Beams:
 
     def _directions_of(self, scan: Scan) -> NDArray[np.float64]:
         """Return cosine and sine (N, 2) of each beam; those of the scan before, where it had the same angles."""
-        seen = scan.angle_min, scan.angle_step, len(scan.ranges)
+        seen = float(scan.angle_min), float(scan.angle_step), len(scan.ranges)
         if seen != self._seen:
             if not np.isfinite(scan.angle_min + scan.angle_step * len(scan.ranges)):
                 raise FrameRefused("bad_scan", f"{name_of(scan)}: its angles are not finite")
@@ -130,13 +130,15 @@ class Beams:
 
 def _beams_of(scan: Scan) -> tuple[NDArray[np.float32], ...]:
     """Return ranges, how far beams are known to be free (empty: ranges alone tell), and from where on (empty: 0)."""
-    ranges, clear, clear_from = (_floats(part) for part in (scan.ranges, scan.clear, scan.clear_from))
-    if len(ranges) > MOST_BEAMS:
-        raise FrameRefused("too_many_beams", f"{name_of(scan)}: {len(ranges)} beams; at most {MOST_BEAMS} are taken")
-    for what, part in (("clear", clear), ("clear_from", clear_from)):
-        if getattr(scan, what) is not None and part.shape != ranges.shape:
-            raise FrameRefused("bad_clear", f"{name_of(scan)}: {what} is {part.shape}, ranges are {ranges.shape}")
-    return ranges, clear, clear_from
+    shape = np.shape(scan.ranges)
+    if shape[0] > MOST_BEAMS:
+        raise FrameRefused("too_many_beams", f"{name_of(scan)}: {shape[0]} beams; at most {MOST_BEAMS} are taken")
+    for what in ("clear", "clear_from"):
+        given = getattr(scan, what)
+        if given is not None and (given.shape != shape or given.dtype.kind not in "fiu"):
+            said = f"{what} is {given.shape} {given.dtype}, ranges are {shape}"
+            raise FrameRefused("bad_clear", f"{name_of(scan)}: {said}")
+    return _floats(scan.ranges), _floats(scan.clear), _floats(scan.clear_from)
 
 
 def _floats(part: ArrayLike | None) -> NDArray[np.float32]:

@@ -9,6 +9,7 @@ import numpy as np
 
 from stereovox import geometry
 from stereovox.config import Config
+from stereovox.depth.form import check_form, matrix_of
 from stereovox.depth.prepare import EXACT, FARTHEST, rigid_pose
 from stereovox.errors import FrameRefused
 from stereovox.frame import Scan
@@ -32,16 +33,18 @@ def trusted(scan: Scan, config: Config) -> Scan:
 def sound(scan: Scan, rigidity: float) -> Scan:
     """Return the scan with an exactly rigid pose and mount; one off by more than `rigidity` is refused.
 
-    Raises FrameRefused with the reason: the source's `fault`, `bad_shape`, `bad_scan`, `pose_not_finite`,
+    Raises FrameRefused with the reason: `bad_form`, the source's `fault`, `bad_shape`, `bad_scan`, `pose_not_finite`,
     `pose_not_rigid`, `mount_not_rigid`, `no_valid_range`.
     """
+    check_form(scan, Scan)
     name = name_of(scan)
     if scan.fault:
         raise FrameRefused(scan.fault, scan.fault_detail or f"{name}: {scan.fault}")
     ranges = np.asarray(scan.ranges)
     if ranges.ndim != 1 or not ranges.size or not np.issubdtype(ranges.dtype, np.floating):
         raise FrameRefused("bad_shape", f"{name}: ranges are {ranges.shape} {ranges.dtype}; give (N,) float32 metres")
-    angles, limits = (scan.angle_min, scan.angle_step), (scan.range_min, scan.range_max)
+    angles = float(scan.angle_min), float(scan.angle_step)
+    limits = float(scan.range_min), float(scan.range_max)
     if (
         not np.isfinite([*angles, angles[0] + angles[1] * ranges.size]).all()
         or scan.angle_step == 0
@@ -56,10 +59,7 @@ def sound(scan: Scan, rigidity: float) -> Scan:
 
 
 def _mount(scan: Scan, rigidity: float) -> geometry.Transform:
-    try:
-        T = np.asarray(scan.T_base_sensor, float)
-    except (TypeError, ValueError):
-        T = np.empty(0)
+    T = matrix_of(scan.T_base_sensor)
     error = geometry.rigidity_error(T)
     if error > rigidity or (np.abs(T) >= FARTHEST).any():
         said = "T_base_sensor, where the lidar sits on the robot, is no rigid 4x4 motion"

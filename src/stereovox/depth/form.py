@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether a frame or scan is made of what its docstring says, before anything looks into it."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.errors import FrameRefused
+from stereovox.frame import Frame, Scan, StereoFrame
+from stereovox.rigs import StereoPair, VirtualCamera
+
+
+class Field(NamedTuple):
+    """What a field may be, how a message calls it, and what a frame is refused for where it is something else."""
+
+    types: tuple[type, ...]
+    wanted: str
+    reason: str = "bad_form"
+
+
+LONGEST = 2**63
+"""Whole numbers from here on do not fit into 64 bits."""
+WHOLE = Field((int, np.integer), "a whole number of nanoseconds", "bad_stamp")
+NUMBER = Field((int, float, np.integer, np.floating), "a number")
+TEXT = Field((str,), "text")
+TEXT_OR_NONE = Field((str, type(None)), "text or None")
+ARRAY = Field((np.ndarray,), "an array")
+ARRAY_OR_NONE = Field((np.ndarray, type(None)), "an array or None")
+SHARED = {
+    "stamp_ns": WHOLE,
+    "pose_off_ns": WHOLE,
+    "sensor": TEXT._replace(reason="bad_sensor"),
+    "name": TEXT,
+    "fault": TEXT_OR_NONE,
+    "fault_detail": TEXT,
+}
+FIELDS = {
+    Frame: {"camera": Field(get_args(VirtualCamera), "a camera"), "depth_scale": NUMBER, "reason": ARRAY_OR_NONE},
+    StereoFrame: {"left": ARRAY, "right": ARRAY, "pair": Field((StereoPair,), "a StereoPair")},
+    Scan: dict.fromkeys(("angle_min", "angle_step", "range_min", "range_max"), NUMBER)
+    | {"ranges": ARRAY, "clear": ARRAY_OR_NONE, "clear_from": ARRAY_OR_NONE},
+}
+
+
+def check_form(seen: Any, *kinds: type) -> None:
+    """Raise FrameRefused for what is none of `kinds`, and where one of its fields is not what it should be.
+
+    The reason is `bad_form`, or `bad_stamp` for its times, or `bad_sensor`.
+    kinds: out of Frame, StereoFrame and Scan. Looks into no array; a masked one is refused, for nobody asks it for its
+    mask. The source's own `fault` is raised too.
+    """
+    kind = next((kind for kind in kinds if isinstance(seen, kind)), None)
+    if kind is None:
+        names = " or a ".join(kind.__name__ for kind in kinds)
+        raise FrameRefused("bad_form", f"{type(seen).__name__} is not a {names}")
+    _check_fields(seen, SHARED)
+    if seen.fault:  # what the source could not deliver is not looked at
+        raise FrameRefused(seen.fault, seen.fault_detail or f"{_called(seen)}: {seen.fault}")
+    _check_fields(seen, FIELDS[kind])
+    for name in ("depth", "ranges", "left", "right"):
+        if isinstance(getattr(seen, name, None), np.ma.MaskedArray):
+            raise FrameRefused("bad_form", f"{_called(seen)}: {name} is a masked array; fill it, `{name}.filled(0)`")
+
+
+def matrix_of(given: object) -> NDArray[np.float64]:
+    """Return a pose as float64, of whatever shape; an empty array (0,) for what is no array of real numbers."""
+    try:
+        numbers = np.asarray(given)
+        return numbers.astype(float) if numbers.dtype.kind in "fiu" else np.empty(0)
+    except ValueError:  # a ragged list
+        return np.empty(0)
+
+
+def _check_fields(seen: object, wanted: dict[str, Field]) -> None:
+    for name, field in wanted.items():
+        value = getattr(seen, name)
+        if not isinstance(value, field.types):
+            raise FrameRefused(field.reason, f"{_called(seen)}: {name} is {type(value).__name__}; give {field.wanted}")
+        if isinstance(value, int) and abs(value) >= LONGEST:
+            raise FrameRefused(field.reason, f"{_called(seen)}: {name} does not fit into 64 bits; give {field.wanted}")
+
+
+def _called(seen: object) -> str:
+    name = getattr(seen, "name", "")
+    return name if isinstance(name, str) and name else f"a {type(seen).__name__}"

@@ -34,7 +34,7 @@ LAYERS = (
     },
     {"sources", "depth", "sensors", "maps"},
     {"integrate", "products", "localize", "calibrate"},
-    {"mapper", "grid_mapper", "pace", "evaluate", "view"},
+    {"mapper", "grid_mapper", "pace", "ways", "evaluate", "view"},
     {"batch", "cli", "ros", "__main__"},
 )
 LEVEL = {room: level for level, rooms in enumerate(LAYERS) for room in rooms}

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from stereovox.maps.occupancy import OccupancyGrid as OccupancyGrid
     from stereovox.rigs import StereoPair as StereoPair
     from stereovox.sources import open_source as open_source
+    from stereovox.sources.latest import Latest as Latest
     from stereovox.wide import CylindricalCamera as CylindricalCamera
     from stereovox.wide import SphericalCamera as SphericalCamera
 
@@ -53,6 +54,7 @@ _HOMES = {
     "GridMap": "maps.grid_map",
     "OccupancyGrid": "maps.occupancy",
     "open_source": "sources",
+    "Latest": "sources.latest",
 }
 __all__ = [*_HOMES, "__version__"]  # pyright: ignore[reportUnsupportedDunderAll]
 

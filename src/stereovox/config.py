@@ -300,6 +300,8 @@ class Config(Section):
             raise ValueError(f"min_range {self.min_range:g} must be smaller than max_range {self.max_range:g}")
         if self.dimensions == 2 and (self.map.keep_times or (self.max_memory and self.when_full != "refuse")):
             raise ValueError('a floor\'s grid has no map.keep_times, and when_full can only be "refuse"')
+        if self.dimensions == 2 and self.deadline_ms is not None:
+            raise ValueError("deadline_ms is for maps in space; leave it out for the map of a floor")
         if self.max_range / self.voxel_size > MOST_CELLS:
             raise ValueError(
                 f"max_range {self.max_range} spans more than {MOST_CELLS} cells of {self.voxel_size}; use larger cells"

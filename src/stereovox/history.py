@@ -111,7 +111,7 @@ class History:
         waiting = {name: _streak_from(streak) for name, streak in _sensors(told["waiting"]).items()}
         if not waiting.keys() <= trusted.keys():
             raise ValueError("history.waiting names a sensor that was never trusted")
-        history = cls(frames, *counts, recording, last, trusted, waiting)
+        history = cls(frames, *counts, recording=recording, last_frame=last, trusted=trusted, waiting=waiting)
         if history.refused.total() != refused:
             raise ValueError(f"frames_refused is {refused}, its reasons add up to {history.refused.total()}")
         return history

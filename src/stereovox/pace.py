@@ -4,28 +4,92 @@
 from __future__ import annotations
 
 from stereovox.config import Config
-from stereovox.depth import DepthPath
-from stereovox.integrate import make_integrator
+from stereovox.errors import FrameRefused
+from stereovox.ways import Way, full, ladder
+
+PATIENCE, LONGEST = 8, 128
+"""Frames in time before the next more thorough way is tried, at first and at most; a frame in 128 is less than 1 %."""
 
 
-class Way:
-    """One way from a frame to evidence: its settings, what makes depth images, what makes evidence of them."""
+class Ladder:
+    """Chooses one of some ways, 0 the most thorough, by the milliseconds that frames took on them.
 
-    def __init__(self, name: str, config: Config):
-        self.name = name
-        self.depth = DepthPath(config)
-        self.integrator = make_integrator(config)
+    - A frame that takes longer than the deadline: one step down, at once.
+    - So many frames in time, one after the other, as the patience with the next more thorough way: one step up. If that
+      way is too slow before as many frames have passed on it, it was tried too early: down again, and the patience with
+      it doubles, up to `LONGEST`. If it lasts, the patience with it is `PATIENCE` again.
+    - On the last way, time beyond the deadline is owed, and a frame is left out when that of a whole frame is; never
+      two in a row, and no more is owed than two frames.
+
+    So a way that is in time is kept; one that is too slow is tried in one of 128 frames; and when the load is gone the
+    first way is reached again, after 128 frames for each step at the latest.
+    The first frame on each way does not count: it may compile kernels, and takes memory.
+    """
+
+    def __init__(self, ways: int, deadline_ms: float):
+        self.step = 0
+        self._last, self._deadline = ways - 1, deadline_ms
+        self._patience = [PATIENCE] * ways
+        self._in_time, self._trying = 0, False
+        self._known: set[int] = set()
+        self._owed, self._left_out = 0.0, False
+
+    def leaves_out(self) -> bool:
+        """Tell whether the next frame is to be left out; asked once for each frame."""
+        self._left_out = not self._left_out and self._owed >= self._deadline
+        if self._left_out:
+            self._owed -= self._deadline
+        return self._left_out
+
+    def took(self, milliseconds: float) -> None:
+        """Learn from a frame that was taken on the present way."""
+        if self.step not in self._known:
+            self._known.add(self.step)
+            return
+        if self.step == self._last:
+            self._owed = min(max(self._owed + milliseconds - self._deadline, 0.0), 2 * self._deadline)
+        if milliseconds > self._deadline:
+            self._too_slow()
+        else:
+            self._was_in_time()
+
+    def _too_slow(self) -> None:
+        if self._trying:
+            self._patience[self.step] = min(2 * self._patience[self.step], LONGEST)
+        self._to(min(self.step + 1, self._last), trying=False)
+
+    def _was_in_time(self) -> None:
+        self._in_time += 1
+        if self._trying and self._in_time >= self._patience[self.step]:
+            self._patience[self.step], self._trying = PATIENCE, False
+        if self.step > 0 and self._in_time >= self._patience[self.step - 1]:
+            self._to(self.step - 1, trying=True)
+
+    def _to(self, step: int, trying: bool) -> None:
+        if step != self.step:
+            self._owed = 0.0
+        self.step, self._trying, self._in_time = step, trying, 0
 
 
 class Pace:
-    """Chooses the way of each frame so that frames take no longer than `deadline_ms`."""
+    """Chooses the way of each frame so that frames take no longer than `deadline_ms`; without one it is always `full`.
+
+    Raises ConfigError where `pace` leaves nothing to be seen.
+    """
 
     def __init__(self, config: Config):
-        self._full = Way("full", config)
+        self._ways = [full(config)] if config.deadline_ms is None else ladder(config)
+        self._ladder = Ladder(len(self._ways), config.deadline_ms) if config.deadline_ms else None
 
     def way(self) -> Way:
         """Return the way of the next frame. Raises FrameRefused `no_time` where it is to be left out."""
-        return self._full
+        if self._ladder is None:
+            return self._ways[0]
+        if self._ladder.leaves_out():
+            raise FrameRefused("no_time", "left out: frames take longer than deadline_ms even on the quickest way")
+        return self._ways[self._ladder.step]
 
     def took(self, way: Way, milliseconds: float) -> None:
-        """Learn from the time that a frame took."""
+        """Learn from the time that a frame took on `way`."""
+        if self._ladder is not None:
+            self._ladder.took(milliseconds)

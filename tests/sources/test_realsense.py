@@ -132,7 +132,7 @@ def test_a_camera_that_cannot_start_is_closed_again(camera, monkeypatch):
         def close(self):
             calls.append("close")
 
-    stream = open_stream(STILL)
+    stream = RealSense(STILL)
     stream._sensor = Sensor()
     with pytest.raises(SourceError, match="temporarily unavailable"):
         next(iter(stream))

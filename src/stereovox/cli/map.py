@@ -89,7 +89,7 @@ def _mapped(arguments: Namespace, out: Path) -> dict[str, Any]:
         say_about_compiling()
         with _there_at_once(mapper.map, out):
             reports = _add_all(mapper, source, out, checkpoints)
-            result = summarise(mapper.map, reports)
+            result = summarise(mapper.map, reports) | ({"dropped": source.dropped} if source.length is None else {})
             if not mapper.map.frames:
                 raise StereovoxError(
                     f"{arguments.source}: not one frame could be used, no map is written ({_first_refusal(reports)})"
@@ -233,6 +233,10 @@ def _tell(result: dict[str, Any], reports: list[UpdateReport], out: Path, window
     for reason, number in result["refused"].items():
         example = next(report.detail for report in reports if report.refused == reason)
         say(f"  {number} x {reason}, first: {example}")
+    if result.get("dropped"):
+        say(f"  {result['dropped']} more came while the map was busy and were dropped; see --set deadline_ms=")
+    if set(result["ways"]) - {"full"}:
+        say(f"for want of time: {', '.join(f'{number} {way}' for way, number in result['ways'].items())}")
     if result["match_ms"]["max"] > 1:  # stereo pairs
         say(f"a pair: matching {milliseconds(result['match_ms'])}")
     say(f"a frame: depth {milliseconds(result['depth_ms'])}; map {milliseconds(result['integrate_ms'])}")

@@ -187,7 +187,10 @@ def camera_rays(camera: VirtualCamera) -> tuple[NDArray[np.float32], NDArray[np.
 
 
 def farthest_cells(camera: VirtualCamera, reach: float, config: Config) -> float:
-    """Return how many cells from its block's corner a camera can see at most, at depths up to `reach` metres."""
+    """Return how many cells from its block's corner a camera can see at most, at depths up to `reach` metres.
+
+    And a cell beyond: points count as hits though they lie behind the middle of the farthest cells looked at.
+    """
     columns, rows = camera_rays(camera)
     corner = np.hypot(np.abs(columns).max(), np.hypot(*rows.T).max())
-    return float(corner * reach / min(config.cell) + SIDE)
+    return float(corner * (reach + float(np.linalg.norm(config.cell))) / min(config.cell) + SIDE)

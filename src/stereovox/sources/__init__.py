@@ -14,6 +14,7 @@ from stereovox.sources.base import Selection as Selection
 from stereovox.sources.base import Source as Source
 from stereovox.sources.base import Stream as Stream
 from stereovox.sources.base import parse_slice as parse_slice
+from stereovox.sources.latest import LatestStream
 
 SOURCES = {
     "pair": "stereovox.sources.pair:CameraPair",  # first: such a folder may hold groundtruth.txt as well
@@ -49,7 +50,8 @@ def open_source(path_or_name: str | os.PathLike[str], frames: str | None = None)
 def open_stream(path_or_name: str | os.PathLike[str], frames: str | None = None) -> Stream:
     """Return what `open_source` returns, or the frames that a live camera (`realsense:`) delivers from now on.
 
-    Of a live camera, `frames` can only count forwards: `:300` are its next 300. Raises SourceError as `open_source`.
+    A live camera is read by a thread of its own; frames that nobody takes in time are dropped, the oldest first, and
+    counted (`dropped`). Of it, `frames` can only count forwards: `:300` are the next 300 that are taken. Raises SourceError as `open_source`.
     """
     where = os.fspath(path_or_name)
     live = _live(where)
@@ -57,7 +59,8 @@ def open_stream(path_or_name: str | os.PathLike[str], frames: str | None = None)
         return open_source(where, frames)
     if frames is not None:
         parse_slice(frames)
-    return live(where) if frames is None else Excerpt(live(where), frames)
+    camera = LatestStream(live(where))
+    return camera if frames is None else Excerpt(camera, frames)
 
 
 def open_images(path_or_name: str | os.PathLike[str], frames: str | None = None) -> Stream:

@@ -41,6 +41,11 @@ class Stream(Protocol):
         """Number of frames; None where more come for as long as somebody asks for them."""
         return None
 
+    @property
+    def dropped(self) -> int:
+        """Frames that a live camera delivered and nobody took in time; of a recording none."""
+        return 0
+
     def after(self, count: int) -> Stream:
         """Return what is left after `count` frames; of a live camera that is itself, its past frames are gone."""
         return self
@@ -127,6 +132,11 @@ class Excerpt(Stream):
             raise SourceError(f"frames '{frames}' of a live camera: so many never come; give smaller numbers")
         self.name, self.camera = stream.name, stream.camera
         self.notes = getattr(stream, "notes", ())
+
+    @property
+    def dropped(self) -> int:
+        """Frames that the camera delivered and nobody took in time."""
+        return self._stream.dropped
 
     def __iter__(self) -> Iterator[AnyFrame]:
         frames = iter(self._stream)

@@ -28,6 +28,11 @@ class WithCamera(Stream):
         """Number of frames, as the stream tells."""
         return self._stream.length
 
+    @property
+    def dropped(self) -> int:
+        """Frames that nobody took in time, as the stream tells."""
+        return self._stream.dropped
+
     def after(self, count: int) -> Stream:
         """Return what is left after `count` frames, with the same camera."""
         return WithCamera(self._stream.after(count), self.camera, self._notes)

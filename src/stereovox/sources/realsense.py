@@ -116,12 +116,13 @@ class RealSense(Stream):
         name = f"{self.name} frame {image.get_frame_number()}"
         unit = float(image.as_depth_frame().get_units())
         if self.options.pose == "fixed":
-            return Frame(depth, self.camera, np.eye(4), stamp_ns, unit, name=name)
+            return Frame(depth, self.camera, np.eye(4), stamp_ns, unit, name=name, sensor=self.name)
         detail = f"{name}: the camera does not know where it is; add ?pose=fixed if it stands still, else record it"
         detail += " and put poses beside the recording in a camera pair (pair.toml)"
         return Frame(
-            depth, self.camera, np.full((4, 4), np.nan), stamp_ns, unit, name=name, fault="no_pose", fault_detail=detail
-        )
+            depth, self.camera, np.full((4, 4), np.nan), stamp_ns, unit, name=name, sensor=self.name,
+            fault="no_pose", fault_detail=detail,
+        )  # fmt: skip
 
 
 def _ns_from_ms(milliseconds: float) -> int:

@@ -75,7 +75,7 @@ class StereoRig(Source):
         shot = self._shots[range(len(self))[i]]
         pair = self.pairs[shot.pair]
         nothing, nowhere = np.empty((0, 0), np.uint8), np.full((4, 4), np.nan)
-        frame = StereoFrame(nothing, nothing, pair, nowhere, shot.stamp_ns, str(shot.left))
+        frame = StereoFrame(nothing, nothing, pair, nowhere, shot.stamp_ns, str(shot.left), sensor=pair.name)
         try:
             T_world_camera = self._pose(shot, pair)
             left, right = (_picture(path, size) for path, size in zip(shot[2:], _sizes(pair), strict=True))

@@ -54,6 +54,7 @@ class RealSense(Stream):
 
     location: `realsense:` or, where several are connected, `realsense:SERIAL`; see `Options` for what may follow.
     context: what lists the devices; pyrealsense2's own unless a test brings another.
+    Pixels without value are 0, whatever the reason: all are UNKNOWN, none clears.
     Time: the frame's, in the clock domain of the camera. Camera, unit and baseline are told by the device. Without
     `pose=fixed` every frame has the fault `no_pose`, but its depth all the same: a camera does not know where it is,
     and pyrealsense2 2.55 and later no longer supports the T265.

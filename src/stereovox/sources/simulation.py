@@ -80,6 +80,8 @@ class Simulation(DepthSource):
     The scene functions' docstrings tell their parameters, `Options` those of every scene. World: z up, x forward, y
     left, metres; with `axes=optical` x right, y down, z forward from the first camera. Every frame can be asked for by
     itself and is always the same for the same `seed`.
+    Reasons are the true ones: TOO_NEAR, TOO_FAR (beyond the device's `farthest`, and known to be free no farther),
+    UNMATCHED beside edges and where the right eye sees nothing.
     noise: False gives exact depth in metres (float32, inf where nothing is) without noise or holes.
     frames: how many frames are taken on the whole way; None leaves it to the scene. The way takes as long all the same.
     Raises SourceError, one line, for an unknown scene or parameter and for values out of range.

@@ -156,6 +156,7 @@ def test_too_near_too_far_and_nothing_to_see():
     assert (near.reason == Reason.TOO_NEAR).mean() > 0.5
     far = StereoDepth(stereo())(plane(0.0))
     assert (far.reason == Reason.TOO_FAR).mean() > 0.9
+    far.depth[0, 0], far.reason[0, 0] = 5.0, Reason.VALID  # else the second would be refused
     for max_range, wanted in ((79.0, Reason.TOO_FAR), (81.0, Reason.UNKNOWN)):  # half a pixel is at 80 m
         image = prepare(far, load_config(max_range=max_range, voxel_size=0.2))
         assert (image.reason[far.reason == Reason.TOO_FAR] == wanted).all()

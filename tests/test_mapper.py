@@ -49,6 +49,47 @@ def test_nothing_clears_through_pixels_without_a_value(integrator):
     assert all(tuple(np.round(p, 3)) in left for p in centre)
 
 
+def too_near_wall(nothing, far, source_reason=None, integrator="projective"):
+    """Return which cells of a wall at 1 m stay occupied where the camera, too near to it, then writes `nothing`.
+
+    A sliver of the image still has a value behind the wall, so that frames are not refused.
+    """
+    mapper = sv.Mapper("default", voxel_size=0.1, integrator=integrator, **{"depth.far": far})
+    for _ in range(8):
+        mapper.add(wall_frame(1.0))
+    before = mapper.map.occupied()
+    before = before[np.abs(before[:, 1]) < 0.3]
+    assert len(before) > 10
+    depth = np.full((60, 80), nothing, np.float32)
+    depth[:, :3] = 4.5
+    said = None if source_reason is None else np.where(depth == 4.5, 0, source_reason).astype(np.uint8)
+    blind = wall_frame()
+    blind = sv.Frame(depth, blind.camera, blind.T_world_sensor, reason=said)
+    for _ in range(30):
+        assert mapper.add(blind).refused is None
+    return mapper.map.state(before) == sv.State.OCCUPIED
+
+
+@pytest.mark.parametrize("integrator", ["projective", "ray"])
+@pytest.mark.parametrize("nothing", [np.inf, -np.inf, np.nan, 0.0])
+def test_infinite_depth_at_a_wall_that_is_too_near_leaves_it_standing(integrator, nothing):
+    """ROG-Map#18: cameras that write +inf (REP 117: too far) for what is too near or unmatched."""
+    assert too_near_wall(nothing, "told", integrator=integrator).all()
+    assert too_near_wall(nothing, "measured", integrator=integrator).all()
+
+
+def test_only_who_trusts_infinity_loses_the_wall_to_it():
+    assert not too_near_wall(np.inf, "infinite").any()
+    assert too_near_wall(-np.inf, "infinite").all()
+
+
+def test_the_sources_word_for_too_far_clears_unless_only_what_is_measured_counts():
+    assert not too_near_wall(0.0, "told", source_reason=sv.Reason.TOO_FAR).any()
+    assert too_near_wall(0.0, "measured", source_reason=sv.Reason.TOO_FAR).all()
+    for reason in set(sv.Reason) - {sv.Reason.VALID, sv.Reason.TOO_FAR}:
+        assert too_near_wall(0.0, "infinite", source_reason=reason).all()
+
+
 @pytest.mark.parametrize("integrator", ["projective", "ray"])
 def test_too_far_clears_up_to_the_maximum_range_and_no_further(integrator):
     mapper = sv.Mapper("default", voxel_size=0.1, integrator=integrator, max_range=3.0)

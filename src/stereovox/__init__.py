@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from stereovox.frame import Scan as Scan
     from stereovox.frame import StereoFrame as StereoFrame
     from stereovox.grid_mapper import GridMapper as GridMapper
+    from stereovox.health import Health as Health
     from stereovox.mapper import Mapper as Mapper
     from stereovox.mapper import UpdateReport as UpdateReport
     from stereovox.maps import State as State
@@ -46,6 +47,7 @@ _HOMES = {
     "CylindricalCamera": "wide",
     "Reason": "frame",
     "GridMapper": "grid_mapper",
+    "Health": "health",
     "Mapper": "mapper",
     "UpdateReport": "mapper",
     "State": "maps",

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import IntEnum
+from math import inf
 from typing import NamedTuple
 
 import numpy as np
@@ -19,6 +20,7 @@ from stereovox.rigs import StereoPair, VirtualCamera
 class Reason(IntEnum):
     """Why a depth pixel has no value. Only TOO_FAR may clear cells, and only up to the maximum range.
 
+    UNMATCHED: matching found nothing it could rely on. TOO_NEAR, TOO_FAR: out of range. MASKED: the pixel is not used.
     UNKNOWN: the source does not say why, as cameras that write 0 for everything.
     """
 
@@ -65,17 +67,20 @@ class Frame:
     """One depth image with its camera and pose, as a source delivers it.
 
     depth: (height, width) uint16 or float32/float64; times `depth_scale` it is the depth in metres, for a pinhole along
-        the optical axis. No value: 0, negative, NaN, infinite, and 65535 in uint16.
+        the optical axis. No value: 0, negative, NaN, +inf, and 65535 in uint16 (UNKNOWN), -inf (TOO_NEAR; REP 117).
     camera: the camera that took it; its size must be the image's.
     T_world_sensor: (4, 4) float64, maps the optical frame (x right, y down, z forward) into the world (z up).
     stamp_ns: time of the image in int64 nanoseconds.
     depth_scale: metres per unit of `depth` (0.001 for millimetres).
-    reason: (height, width) uint8 of `Reason`, where the source knows why a pixel has no value; else None.
+    reason: (height, width) uint8 of `Reason`, where the source knows why a pixel has no value; else None. VALID: as
+        the depth says.
     name: where the frame came from, for messages.
     fault: why the source could not deliver this frame (`unreadable`, `no_pose`); such a frame is refused and counted.
     fault_detail: the same in one line that names file, value and cure.
     sensor: which of several sensors took it (a topic, a name in a rig); their times are watched one by one.
     pose_off_ns: how far from the nearest measured pose this one was extrapolated; 0: measured, or between two.
+    farthest: metres that are free at least where `reason` is TOO_FAR; a positive depth beside it says so for a pixel.
+        Where that is less than the maximum range the pixel counts as UNKNOWN.
     """
 
     depth: NDArray[np.generic]
@@ -89,6 +94,7 @@ class Frame:
     fault_detail: str = ""
     sensor: str = ""
     pose_off_ns: int = 0
+    farthest: float = inf
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,7 +154,7 @@ class DepthImage:
     """A depth image that can be trusted, in metres, with the reason of every pixel that has no value.
 
     depth_m: (height, width) float32, for a pinhole along the optical axis (see `stereovox.cameras`). Without value
-        (REP 117): NaN unmatched or masked, -inf too near, +inf too far (nothing up to the maximum range).
+        (REP 117): NaN unmatched, masked or unknown, -inf too near, +inf too far (nothing up to the maximum range).
     reason: (height, width) uint8 of `Reason`.
     T_world_sensor: (4, 4) float64, exactly rigid.
     """

@@ -106,12 +106,12 @@ class History:
         told = saved.get("history")
         if told is None:
             return cls(frames, Counter({NOT_TOLD: refused} if refused else {}), recording=recording, last_frame=last)
-        counts = (_counts(told[name], name) for name in ("refused", "settled", "ways"))
+        reasons, settled, ways = (_counts(told[name], name) for name in ("refused", "settled", "ways"))
         trusted = {name: _seen_from(seen) for name, seen in _sensors(told["trusted"]).items()}
         waiting = {name: _streak_from(streak) for name, streak in _sensors(told["waiting"]).items()}
         if not waiting.keys() <= trusted.keys():
             raise ValueError("history.waiting names a sensor that was never trusted")
-        history = cls(frames, *counts, recording=recording, last_frame=last, trusted=trusted, waiting=waiting)
+        history = cls(frames, reasons, settled, ways, recording, last, trusted, waiting)
         if history.refused.total() != refused:
             raise ValueError(f"frames_refused is {refused}, its reasons add up to {history.refused.total()}")
         return history

@@ -15,7 +15,7 @@ from stereovox.frame import Frame, Reason
 
 CAMERA = PinholeCamera(40, 30, 30.0, 32.0, 18.7, 15.2, 0.05)
 ROW = PinholeCamera(6, 1, 50.0, 50.0, 2.5, 0.0)
-V, U, N, F = Reason.VALID, Reason.UNMATCHED, Reason.TOO_NEAR, Reason.TOO_FAR
+V, U, N, F = Reason.VALID, Reason.UNKNOWN, Reason.TOO_NEAR, Reason.TOO_FAR
 
 
 def slowly(correction, depth, camera):
@@ -46,13 +46,13 @@ def example(model, size):
 def test_kernels_say_what_the_formulas_say(model, size):
     correction = example(model, size)
     depth = np.random.default_rng(1).uniform(0.3, 6, (30, 40)).astype(np.float32)
-    depth[3, 5:9] = np.nan
+    depth[3, 5:9] = np.nan, np.nan, np.inf, -np.inf
     got = depth.copy()
     correct(got, replace(CAMERA, correction=correction))
-    wanted = slowly(correction, depth, CAMERA)
+    wanted = np.where(np.isinf(depth), depth, slowly(correction, np.where(np.isinf(depth), 1, depth), CAMERA))
     np.testing.assert_allclose(got, wanted, rtol=2e-5)
-    assert np.isnan(got[3, 5:9]).all()
-    assert np.nanmax(np.abs(got / depth - 1)) > 0.05, "the example must change something"
+    np.testing.assert_array_equal(got[3, 5:9], depth[3, 5:9])
+    assert np.nanmax(np.abs(got[4:] / depth[4:] - 1)) > 0.05, "the example must change something"
 
 
 def test_without_correction_nothing_changes():
@@ -90,10 +90,10 @@ def test_what_no_depth_comes_out_of_clears_nothing():
 
 
 def test_the_sources_reason_still_comes_first():
-    given = np.array([[F, Reason.MASKED, 0, N, 0, U]], np.uint8)
+    given = np.array([[F, Reason.MASKED, F, N, 0, U]], np.uint8)
     nothing_much = DepthCorrection("scale", (0.001, 0, 0, 0, 0, 0))
-    image = image_of(np.array([1.0, 1.0, 1.0, 1.0, 9.0, 1.0]), nothing_much, reason=given)
-    assert image.reason.tolist() == [[F, Reason.MASKED, V, N, F, U]]
+    image = image_of(np.array([0.0, 1.0, 1.0, 1.0, 9.0, 1.0]), nothing_much, reason=given)
+    assert image.reason.tolist() == [[F, Reason.MASKED, U, N, F, U]]
 
 
 def test_blocks_take_their_smallest_corrected_depth():

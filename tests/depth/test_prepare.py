@@ -18,31 +18,80 @@ def frame_of(depth, **changes):
     return Frame(**{"depth": depth, "camera": CAMERA, "T_world_sensor": POSE, "name": "f7", **changes})
 
 
-def test_every_pixel_gets_its_value_or_its_reason():
+@pytest.mark.parametrize("far", ["measured", "told", "infinite"])
+def test_every_pixel_gets_its_value_or_its_reason(far):
     millimetres = np.array([[0, 65535, 499, 500], [1234, 5000, 5001, 20000]], np.uint16)
-    image = prepare(frame_of(millimetres, depth_scale=0.001), CONFIG)
-    nan, near, far = np.nan, -np.inf, np.inf
-    expected = np.array([[nan, nan, near, 0.5], [1.234, 5.0, far, far]], np.float32)
+    image = prepare(frame_of(millimetres, depth_scale=0.001), load_config(CONFIG, **{"depth.far": far}))
+    nan, near, beyond = np.nan, -np.inf, np.inf
+    expected = np.array([[nan, nan, near, 0.5], [1.234, 5.0, beyond, beyond]], np.float32)
     np.testing.assert_allclose(image.depth_m, expected, rtol=1e-6)
-    U, N, F, V = Reason.UNMATCHED, Reason.TOO_NEAR, Reason.TOO_FAR, Reason.VALID
+    U, N, F, V = Reason.UNKNOWN, Reason.TOO_NEAR, Reason.TOO_FAR, Reason.VALID
     assert image.reason.tolist() == [[U, U, N, V], [V, V, F, F]]
     assert image.depth_m.dtype == np.float32
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_float_depth_that_is_no_depth_never_clears(dtype):
+@pytest.mark.parametrize(("far", "of_infinity"), [("measured", 5), ("told", 5), ("infinite", 3)])
+def test_float_depth_that_is_no_depth_clears_only_where_the_settings_say_so(dtype, far, of_infinity):
     depth = np.array([[np.nan, np.inf, -np.inf, -1.0], [0.0, 1e-30, 2.0, 65535.0]], dtype)
-    reason = prepare(frame_of(depth), CONFIG).reason
-    U = Reason.UNMATCHED
-    assert reason.tolist() == [[U, U, U, U], [U, Reason.TOO_NEAR, Reason.VALID, Reason.TOO_FAR]]
+    image = prepare(frame_of(depth), load_config(CONFIG, **{"depth.far": far}))
+    U = Reason.UNKNOWN
+    assert image.reason.tolist() == [
+        [U, of_infinity, Reason.TOO_NEAR, U],
+        [U, Reason.TOO_NEAR, Reason.VALID, Reason.TOO_FAR],
+    ]
+    assert (image.depth_m == np.inf).tolist() == (image.reason == Reason.TOO_FAR).tolist()
+    assert (image.depth_m == -np.inf).tolist() == (image.reason == Reason.TOO_NEAR).tolist()
 
 
 def test_the_sources_reason_comes_first():
-    given = np.array([[Reason.MASKED, Reason.TOO_FAR, Reason.TOO_NEAR, 0], [0, Reason.UNMATCHED, 0, 0]], np.uint8)
+    given = np.array([[Reason.MASKED, Reason.TOO_FAR, Reason.TOO_NEAR, 0], [5, Reason.UNMATCHED, 0, 0]], np.uint8)
     depth = np.array([[1, 0, 0, 0], [1, 1, 1, 9]], np.float32)
     image = prepare(frame_of(depth, reason=given), CONFIG)
-    assert image.reason.tolist() == [[4, 3, 2, 1], [0, 1, 0, 3]]
+    assert image.reason.tolist() == [[4, 3, 2, 5], [5, 1, 0, 3]]
     np.testing.assert_array_equal(image.depth_m[0], np.array([np.nan, np.inf, -np.inf, np.nan], np.float32))
+    assert np.isnan(image.depth_m[1, 0])
+
+
+VALUES = (0.0, np.nan, -1.0, -np.inf, np.inf, 0.2, 2.0, 50.0)
+
+
+def slowly_classified(value, said, far, farthest):
+    """What depth.far says in words, for one pixel of a camera that measures from 0.5 to 5 m."""
+    if value == -np.inf or 0 < value < 0.5:
+        own = Reason.TOO_NEAR
+    elif 0.5 <= value <= 5:
+        own = Reason.VALID
+    elif 5 < value < np.inf or (value == np.inf and far == "infinite"):
+        own = Reason.TOO_FAR
+    else:
+        own = Reason.UNKNOWN
+    if said == Reason.VALID:
+        return own
+    if said != Reason.TOO_FAR:
+        return said
+    if own == Reason.TOO_NEAR:
+        return Reason.TOO_NEAR
+    believed = far != "measured" and farthest >= 5 and own != Reason.VALID
+    return Reason.TOO_FAR if believed else Reason.UNKNOWN
+
+
+@pytest.mark.parametrize("far", ["measured", "told", "infinite"])
+@pytest.mark.parametrize("farthest", [np.inf, 5.0, 4.0, np.nan])
+def test_every_value_under_every_word_of_the_source(far, farthest):
+    """Whatever a source says: nothing but what is known to be too far becomes so, as it alone clears."""
+    depth = np.repeat(np.array(VALUES, np.float32), len(Reason)).reshape(len(VALUES), -1)
+    said = np.tile(np.array(Reason, np.uint8), (len(VALUES), 1))
+    camera = PinholeCamera(depth.shape[1], depth.shape[0], 50.0, 50.0, 1.5, 0.5)
+    frame = frame_of(depth, camera=camera, reason=said, farthest=farthest)
+    image = prepare(frame, load_config(CONFIG, **{"depth.far": far}))
+    wanted = [
+        [slowly_classified(v, w, far, farthest) for v, w in zip(*row, strict=True)]
+        for row in zip(depth, said, strict=True)
+    ]
+    assert image.reason.tolist() == wanted
+    special = {Reason.TOO_NEAR: -np.inf, Reason.TOO_FAR: np.inf, Reason.VALID: 2.0}
+    np.testing.assert_array_equal(image.depth_m, [[special.get(why, np.nan) for why in row] for row in wanted])
 
 
 def mirrored():
@@ -67,6 +116,11 @@ REFUSALS = [
     ("bad_scale", {"depth_scale": float("nan")}),
     ("bad_reason", {"reason": np.zeros((1, 1), np.uint8)}),
     ("bad_reason", {"reason": np.full((2, 4), 9, np.uint8)}),
+    ("bad_reason", {"reason": np.full((2, 4), -1, np.int64)}),
+    ("bad_reason", {"reason": np.zeros((2, 4))}),
+    ("bad_reason", {"reason": [[0] * 4] * 2}),
+    ("bad_scale", {"depth_scale": None}),
+    ("bad_scale", {"farthest": "far"}),
     ("pose_not_finite", {"T_world_sensor": with_entry(np.nan)}),
     ("pose_not_finite", {"T_world_sensor": with_entry(np.inf)}),
     ("pose_not_finite", {"T_world_sensor": with_entry(1e9)}),

@@ -15,7 +15,7 @@ from stereovox.frame import DepthImage, Reason
 from stereovox.geometry import look_at, rotation_matrix
 from stereovox.wide import CylindricalCamera, SphericalCamera
 
-NONE = np.array([0, np.nan, -np.inf, np.inf, np.nan], np.float32)
+NONE = np.array([0, np.nan, -np.inf, np.inf, np.nan, np.nan], np.float32)
 PINHOLE = PinholeCamera(64, 48, 60.0, 58.0, 30.7, 24.2)
 CAMERAS = {
     "pinhole": PINHOLE,
@@ -41,13 +41,13 @@ def pose(height=1.0, tilt=0.0, roll=0.0, yaw=0.4):
     return T
 
 
-def image_of(camera, T, seed=0, reasons=(0, 1, 2, 3, 4)):
+def image_of(camera, T, seed=0, reasons=(0, 1, 2, 3, 4, 5)):
     """A random image in patches of all kinds, depths from 0.4 to 7 m."""
     random = np.random.default_rng(seed)
     v, u = np.mgrid[: camera.height, : camera.width]
     depth = np.kron(random.uniform(0.5, 6.0, (13, 17)), np.ones((4, 4)))[: camera.height, : camera.width]
     depth = (depth * (1 + 0.05 * np.sin(u + v / 3))).clip(NEAR, FAR).astype(np.float32)
-    shares = np.array([0.9, 0.04, 0.01, 0.04, 0.01])[list(reasons)]
+    shares = np.array([0.9, 0.03, 0.01, 0.04, 0.01, 0.01])[list(reasons)]
     patches = random.choice(reasons, (16, 20), p=shares / shares.sum())
     reason = np.kron(patches, np.ones((4, 4), int))[: camera.height, : camera.width].astype(np.uint8)
     return DepthImage(np.where(reason == 0, depth, NONE[reason]), reason, camera, T, 77)
@@ -91,7 +91,8 @@ def what_it_says(why, d, ray, height, heights, floor):
     """One ray, step by step: (hit or None, whether too near, from, to), along the floor."""
     low, high = heights
     way = math.hypot(ray[0], ray[1])
-    if ray[0] <= 0 or abs(ray[2]) >= math.tan(math.radians(80)) * way or why in (Reason.UNMATCHED, Reason.MASKED):
+    nothing = why in (Reason.UNMATCHED, Reason.MASKED, Reason.UNKNOWN)
+    if ray[0] <= 0 or abs(ray[2]) >= math.tan(math.radians(80)) * way or nothing:
         return None, False, 0.0, 0.0
     enter, leave = 0.0, math.inf  # depths at which the ray is between the heights
     for limit, inwards in ((low, ray[2] > 0), (high, ray[2] < 0)):

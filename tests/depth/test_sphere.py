@@ -43,8 +43,8 @@ def image_of(camera, seed=0) -> DepthImage:
     v, u = np.mgrid[: camera.height, : camera.width]
     depth = (3 + 1.5 * np.sin(u / 9) + np.cos(v / 7) + random.normal(0, 0.02, u.shape)).astype(np.float32)
     blocks = np.kron(random.integers(0, 12, (10, 10)), np.ones((6, 6), int))[: camera.height, : camera.width]
-    reason = np.where(blocks < 5, blocks, 0).astype(np.uint8)
-    none = np.array([0, np.nan, -np.inf, np.inf, np.nan], np.float32)[reason]
+    reason = np.where(blocks < 6, blocks, 0).astype(np.uint8)
+    none = np.array([0, np.nan, -np.inf, np.inf, np.nan, np.nan], np.float32)[reason]
     return DepthImage(np.where(reason == 0, depth, none), reason, camera, np.eye(4), 1234)
 
 
@@ -55,7 +55,7 @@ def slow(image, T_body_sensor, config, layout):
     for v in range(image.camera.height):
         for u in range(image.camera.width):
             why = Reason(image.reason[v, u])
-            if why in (Reason.UNMATCHED, Reason.MASKED):
+            if why in (Reason.UNMATCHED, Reason.MASKED, Reason.UNKNOWN):
                 continue
             d = {Reason.VALID: image.depth_m[v, u], Reason.TOO_NEAR: config.min_range, Reason.TOO_FAR: config.max_range}
             x, y, z = T_body_sensor[:3, :3] @ (float(d[why]) * np.array([columns[u], *rows[v]])) + T_body_sensor[:3, 3]
@@ -109,7 +109,7 @@ def test_equals_the_slow_one(name, sphere):
             assert grid.stamp_ns[i, j] == 1234
             compared += 1
     assert compared > 20
-    assert set(map(int, grid.reason.ravel())) >= {0, 1}
+    assert set(map(int, grid.reason.ravel())) >= {0, 5}
     narrow = np.sin(layout.polar()) * layout.step < 0.2  # holes between pixels near the poles are filled
     for i, j in np.argwhere(grid.known):
         assert (i, j) in wanted or (i, j) in close or narrow[j]
@@ -153,8 +153,8 @@ def random_grid(seed, **bounds) -> SphereGrid:
     config = settings(10.0, **bounds)
     random = np.random.default_rng(seed)
     grid = empty(SphereLayout.configured(config.sphere))
-    grid.reason[:] = random.choice(list(map(int, Reason)), grid.reason.shape, p=[0.5, 0.2, 0.1, 0.2, 0])
-    known = grid.reason != Reason.UNMATCHED
+    grid.reason[:] = random.choice(list(map(int, Reason)), grid.reason.shape, p=[0.5, 0, 0.1, 0.2, 0, 0.2])
+    known = grid.reason != Reason.UNKNOWN
     grid.range_m[known] = random.integers(1, 6, known.sum())
     grid.range_m[grid.reason == Reason.TOO_NEAR] = 0
     grid.stamp_ns[known] = random.integers(0, 100, known.sum())
@@ -167,13 +167,13 @@ def test_stitching_takes_the_nearest_and_its_age():
     whole = stitch(grids)
     for place in np.ndindex(whole.layout.shape):
         here = [(g.reason[place], g.range_m[place], g.stamp_ns[place]) for g in grids]
-        order = [[Reason.TOO_NEAR, Reason.VALID, Reason.TOO_FAR].index(why) for why, _, _ in here if why != 1]
+        order = [[Reason.TOO_NEAR, Reason.VALID, Reason.TOO_FAR].index(why) for why, _, _ in here if why != 5]
         best = min(
-            ((o, rho, -stamp) for o, (_, rho, stamp) in zip(order, [h for h in here if h[0] != 1], strict=True)),
+            ((o, rho, -stamp) for o, (_, rho, stamp) in zip(order, [h for h in here if h[0] != 5], strict=True)),
             default=(None, math.nan, -NEVER),
         )
         assert (whole.reason[place], whole.stamp_ns[place]) == (
-            Reason.UNMATCHED if best[0] is None else [Reason.TOO_NEAR, Reason.VALID, Reason.TOO_FAR][best[0]],
+            Reason.UNKNOWN if best[0] is None else [Reason.TOO_NEAR, Reason.VALID, Reason.TOO_FAR][best[0]],
             -best[2] if best[0] is not None else NEVER,
         )
         np.testing.assert_equal(float(whole.range_m[place]), float(best[1]))
@@ -259,5 +259,5 @@ def test_what_is_old_is_unknown():
     young = grid.since(50)
     assert ((grid.stamp_ns >= 50) == young.known).all()
     assert np.isnan(young.range_m[~young.known]).all()
-    assert (young.reason[~young.known] == Reason.UNMATCHED).all()
+    assert (young.reason[~young.known] == Reason.UNKNOWN).all()
     np.testing.assert_array_equal(young.range_m[young.known], grid.range_m[young.known])

@@ -64,14 +64,14 @@ def test_reasons_of_the_frame():
     grid.range_m[:], grid.reason[:], grid.stamp_ns[:] = 3.0, Reason.VALID, 5
     grid.range_m[0], grid.reason[0] = 0, Reason.TOO_NEAR
     grid.range_m[1], grid.reason[1] = 8.5, Reason.TOO_FAR
-    grid.range_m[2], grid.reason[2], grid.stamp_ns[2] = np.nan, Reason.UNMATCHED, 0
+    grid.range_m[2], grid.reason[2], grid.stamp_ns[2] = np.nan, Reason.UNKNOWN, 0
     image = prepare(frame_of(grid, np.eye(4), 8.0), config)
     assert set(image.reason[0]) == {Reason.TOO_NEAR}
-    assert set(image.reason[2]) == {Reason.UNMATCHED}
+    assert set(image.reason[2]) == {Reason.UNKNOWN}
     assert set(image.reason[3]) == {Reason.VALID}
     # 8.5 m is beyond 8 m from the axis at 15 degrees of elevation, but not at 45: nothing may be cleared there
     assert [Reason(r).name for r in image.reason[1]] == [
-        "UNMATCHED", "UNMATCHED", "TOO_FAR", "TOO_FAR", "UNMATCHED", "UNMATCHED",
+        "UNKNOWN", "UNKNOWN", "TOO_FAR", "TOO_FAR", "UNKNOWN", "UNKNOWN",
     ]  # fmt: skip
 
 
@@ -127,7 +127,7 @@ def test_through_the_sphere_nothing_is_cleared_that_the_image_does_not_clear():
     pixel_v = camera.fy * ends[:, 1] / ends[:, 2] + camera.cy
     cell = 0.75 * np.radians(3) * camera.fx * 2.2  # what a cell covers, at the image's borders
     assert not ((pixel_u > 40 + cell) & (pixel_u < 90 - cell) & (pixel_v > 20 + cell) & (pixel_v < 60 - cell)).any()
-    assert set(np.unique(sphere.reason)) == {Reason.UNMATCHED, Reason.TOO_NEAR, Reason.TOO_FAR}
+    assert set(np.unique(sphere.reason)) == {Reason.UNKNOWN, Reason.TOO_NEAR, Reason.TOO_FAR}
     assert np.isposinf(sphere.depth_m[v, u]).all()
 
 

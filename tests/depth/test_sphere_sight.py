@@ -57,7 +57,7 @@ def test_a_cone_holds_every_cell_that_it_touches(half_angle):
 def test_unknown_is_never_free():
     grid = bubble()
     place = np.unravel_index(grid.layout.cells_of([[1, 0.02, 0.02]])[0], grid.layout.shape)
-    for values, nothing in ((grid.range_m, np.nan), (grid.reason, Reason.UNMATCHED)):
+    for values, nothing in ((grid.range_m, np.nan), (grid.reason, Reason.UNKNOWN)):
         values[place] = nothing
     grid.stamp_ns[place] = empty(grid.layout).stamp_ns[place]
     assert range_in(grid, (1, 0.02, 0.02)) is None

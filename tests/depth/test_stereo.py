@@ -10,6 +10,7 @@ import pytest
 
 from stereovox.cameras import PinholeCamera
 from stereovox.config import load_config
+from stereovox.depth import prepare
 from stereovox.depth.stereo import StereoDepth
 from stereovox.depth.stereo_matchers import MATCHERS, make_matcher
 from stereovox.errors import ConfigError, FrameRefused, StereovoxError
@@ -129,7 +130,7 @@ def test_rcrop_drops_columns_at_the_border(aligned):
     whole = StereoDepth(stereo(aligned=aligned)).disparity(plane(12.0))
     cropped = StereoDepth(stereo(aligned=aligned, rcrop=40)).disparity(plane(12.0))
     lost = slice(0, 40) if aligned == "left" else slice(WIDTH - 40, WIDTH)
-    assert (cropped.reason[:, lost] == Reason.UNMATCHED).all()
+    assert (cropped.reason[:, lost] == Reason.MASKED).all()
     assert np.isnan(cropped.disparity[:, lost]).all()
     rest = slice(40, None) if aligned == "left" else slice(0, WIDTH - 40)
     np.testing.assert_array_equal(cropped.disparity[:, rest], whole.disparity[:, rest])
@@ -155,6 +156,10 @@ def test_too_near_too_far_and_nothing_to_see():
     assert (near.reason == Reason.TOO_NEAR).mean() > 0.5
     far = StereoDepth(stereo())(plane(0.0))
     assert (far.reason == Reason.TOO_FAR).mean() > 0.9
+    far.depth[0, 0], far.reason[0, 0] = 5.0, Reason.VALID  # else the second would be refused
+    for max_range, wanted in ((79.0, Reason.TOO_FAR), (81.0, Reason.UNKNOWN)):  # half a pixel is at 80 m
+        image = prepare(far, load_config(max_range=max_range, voxel_size=0.2))
+        assert (image.reason[far.reason == Reason.TOO_FAR] == wanted).all()
     blank = np.full((HEIGHT, WIDTH), 200, np.uint8)
     sky = StereoDepth(stereo())(replace(plane(0.0), left=blank, right=blank))
     assert (sky.reason == Reason.UNMATCHED).all()  # clears nothing

@@ -72,7 +72,7 @@ def test_score_counts_what_it_says():
     grid = empty(layout)
     grid.range_m[:], grid.reason[:] = 2.0, Reason.VALID
     grid.range_m[0], grid.range_m[1] = 2.1, 1.8  # of 12 columns: one 5 % too far, one 10 % too near
-    grid.reason[2] = Reason.UNMATCHED
+    grid.reason[2] = Reason.UNKNOWN
     seen[3] = False
     score = sphere_score(grid, truth, seen, np.full(layout.shape, 0.04))
     assert score == {

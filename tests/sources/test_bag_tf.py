@@ -96,6 +96,7 @@ def test_a_gap_refuses_the_images_in_it_by_name(tmp_path):
         bag.depth(9)
     source = Bag(bag.path)
     assert [frame.fault for frame in source] == [None, *["no_pose"] * 6, None, None]
+    assert [frame.pose_off_ns for frame in source] == [0] * 8 + [100 * MS]
     assert "/tf: odom -> base_link has no transform for 0.650 s after" in source.frame(3).fault_detail
 
 

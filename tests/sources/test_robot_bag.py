@@ -194,6 +194,7 @@ def test_a_gap_in_tf_is_a_fault_of_the_scans_in_it(tmp_path):
     wide = RobotBag(f"{path}?max_gap=1&extrapolate=0.2")
     assert [scan.fault for scan in wide.scans] == [None] * 12
     np.testing.assert_allclose(wide.scans[4].pose_world_base, pose(4), atol=1e-9)
+    assert [scan.pose_off_ns for scan in wide.scans] == [0] * 10 + [50_000_000, 150_000_000]
 
 
 def test_a_scan_of_another_frame_has_that_frame_s_place(tmp_path):

@@ -2,6 +2,8 @@
 import numpy as np
 import pytest
 
+from stereovox.config import load_config
+from stereovox.depth import prepare
 from stereovox.errors import SourceError
 from stereovox.frame import Reason
 from stereovox.geometry import look_at, rigidity_error, transform_points
@@ -161,3 +163,19 @@ def test_measured_points_lie_on_the_scenes_surfaces(simulation):
     deep = np.any([solid.contains(world, margin=-0.06) for solid in simulation.scene.solids], axis=0)
     assert in_solid.mean() > 0.99
     assert deep.mean() < 0.01
+
+
+def test_what_is_too_far_is_free_as_far_as_the_camera_measures_and_no_farther():
+    frame = open_source("sim:room").frame(60)
+    assert (frame.reason == Reason.TOO_FAR).mean() > 0.01
+    for max_range, kept in ((9.9, True), (10.0, True), (10.1, False)):
+        reason = prepare(frame, load_config(max_range=max_range)).reason
+        told = reason[frame.reason == Reason.TOO_FAR]
+        assert (told == (Reason.TOO_FAR if kept else Reason.UNKNOWN)).all()
+
+
+def test_fewer_frames_are_as_long_apart_as_the_way_takes():
+    """Else a drone would seem to fly ten times as fast, and no gate would let it pass."""
+    all_of_them, few = Simulation(), Simulation(frames=20)
+    assert few.frame(19).stamp_ns == pytest.approx(all_of_them.frame(-1).stamp_ns, abs=1000)
+    np.testing.assert_allclose(few.upright_pose_at(few.frame(7).stamp_ns), few.pose(7), atol=1e-6)

@@ -114,6 +114,9 @@ def refused(tf: Tf, target: str = "odom", source: str = "base_link", millisecond
 def test_the_ends_hold_for_a_while_and_no_longer():
     tf = line((1000, 1.0), (1200, 3.0))
     assert (x_at(tf, 900), x_at(tf, 1300), x_at(tf, 1150)) == (1.0, 3.0, 2.5)
+    times = (900, 1000, 1150, 1200, 1300)
+    assert [tf.off_ns("odom", "base_link", ms * MS) for ms in times] == [100 * MS, 0, 0, 0, 100 * MS]
+    assert tf.off_ns("base_link", "odom", 900 * MS) == 100 * MS
     said = refused(tf, milliseconds=899)
     assert said.startswith("walk.bag /tf: odom -> base_link begins after 0.899000000 s, 0.101 s away (at most 0.1 s)")
     assert "odom -> base_link ends before 1.301000000 s, 0.101 s away" in refused(tf, milliseconds=1301)

@@ -42,6 +42,10 @@ def _about_cells(path: str) -> dict[str, Any]:
         "frames": voxel_map.frames,
         "frames_refused": voxel_map.frames_refused,
         "recording": voxel_map.recording,
+        "refused": dict(voxel_map.history.refused.most_common()),
+        "settled": dict(voxel_map.history.settled),
+        "ways": dict(voxel_map.history.ways),
+        "last_stamps_ns": {sensor: seen.stamp_ns for sensor, seen in voxel_map.history.trusted.items()},
         "profile": config.profile,
         "settings": config.model_dump(mode="json"),
         "changed": _changed(config),
@@ -60,6 +64,8 @@ ABOUT = {2: _about_grid, 3: _about_cells}
 
 
 def _tell(result: dict[str, Any]) -> None:
+    from stereovox.health import FULL
+
     settings = result["settings"]
     say(f"made of {result['recording'] or 'frames without a name'}, profile {result['profile']}")
     say(f"cells of {result['voxel_size']:g} m, {settings['integrator']}, depth up to {settings['max_range']:g} m")
@@ -71,6 +77,15 @@ def _tell(result: dict[str, Any]) -> None:
     say(", ".join(f"{thousands(result[state])} {state}" for state in ("occupied", "free", "tentative")))
     loaded = "in memory once loaded" + ("" if settings["window"]["size"] is None else ", whatever its window took")
     say(f"{result['frames']} frames ({result['frames_refused']} refused), {size(result['memory_bytes'])} {loaded}")
+    for reason, number in result["refused"].items():
+        say(f"  {number} x {reason}")
+    for reason, number in result["settled"].items():
+        say(f"  {number} x believed again after {reason}")
+    less = {way: number for way, number in result["ways"].items() if way != FULL}
+    if less:
+        say(f"looked at less thoroughly: {', '.join(f'{number} x {way}' for way, number in less.items())}")
+    for sensor, stamp_ns in result["last_stamps_ns"].items():
+        say(f"last trusted frame of '{sensor}' at {stamp_ns / 1e9:.3f} s")
 
 
 def _changed(config: Config) -> dict[str, Any]:

@@ -5,12 +5,12 @@ import numpy as np
 
 from stereovox._jit import kernel
 
-NAN, ZERO, ONE = np.float32(np.nan), np.float32(0), np.float32(1)
+NAN, ZERO, ONE, INF = np.float32(np.nan), np.float32(0), np.float32(1), np.float32(np.inf)
 
 
 @kernel
 def quadratics(s, q, x, y, depth_m):
-    """Divide `depth_m` (rows, columns) in place by 1 + s(x, y) + q(x, y) z; NaN where that is no depth.
+    """Divide `depth_m` (rows, columns) in place by 1 + s(x, y) + q(x, y) z; NaN: that is no depth; infinities stay.
 
     s, q: (6,) float32, coefficients of 1, x, y, x^2, x y, y^2. x, y: slopes of columns and rows.
     """
@@ -22,7 +22,8 @@ def quadratics(s, q, x, y, depth_m):
         for u in range(x.size):
             a, z = x[u], row[u]
             divisor = ONE + s0 + a * (s1 + a * s[3]) + (q0 + a * (q1 + a * q[3])) * z
-            row[u] = z / divisor if divisor > ZERO else NAN
+            d = z / divisor if divisor > ZERO else NAN
+            row[u] = z if abs(z) == INF else d
 
 
 @kernel
@@ -34,4 +35,5 @@ def thesis(p, x, depth_m):
             z = row[u]
             across = x[u] * z
             d = z - (across * (p[0] * across + p[1]) + p[2])
-            row[u] = d if d > ZERO else NAN
+            d = d if d > ZERO else NAN
+            row[u] = z if abs(z) == INF else d

@@ -125,13 +125,13 @@ def explain(disparity, sure, steps, valid, valid_other, side, settings, reason):
         for u in range(width):
             d, c = disparity[v, u], sure[v, u]
             x = np.float32(u) + np.float32(side) * d
-            outside = (x < -HALF) | (x > np.float32(width) - HALF) | (u < first) | (u >= end)
+            outside = (x < -HALF) | (x > np.float32(width) - HALF)
             why = VALID if (d == d) & (not outside) & (c >= least) else UNMATCHED
             why = UNMATCHED if (why == VALID) & (steps[v, u] < (seen if d < doubtful else textured)) else why
             far = d < farthest
             why = (TOO_FAR if c >= least_far else UNMATCHED) if (why == VALID) & far else why
             why = TOO_NEAR if (d >= nearest) & (not outside) else why
-            if own and not valid[v, u]:
+            if (u < first) | (u >= end) or (own and not valid[v, u]):
                 why = MASKED
             if other and d == d and not valid_other[v, _partner(u, d, side, width)]:
                 why = MASKED

@@ -5,7 +5,7 @@ import numpy as np
 
 from stereovox._jit import cell, kernel
 
-UNMATCHED, TOO_NEAR, TOO_FAR, MASKED = np.uint8(1), np.uint8(2), np.uint8(3), np.uint8(4)
+UNMATCHED, TOO_NEAR, TOO_FAR, MASKED, UNKNOWN = np.uint8(1), np.uint8(2), np.uint8(3), np.uint8(4), np.uint8(5)
 NAN, NEAR, FAR = np.float32(np.nan), np.float32(-np.inf), np.float32(np.inf)
 ZERO = np.float32(0)
 
@@ -38,7 +38,7 @@ def block_minimum(depth_m, reason, n, row, out_depth, out_reason):
 @cell
 def _why(reason, first, last, left, right):
     """Return the reason of a block without a valid pixel."""
-    far, masked = True, False
+    far, masked, unmatched = True, False, False
     for v in range(first, last):
         for u in range(left, right):
             why = reason[v, u]
@@ -46,4 +46,5 @@ def _why(reason, first, last, left, right):
                 return TOO_NEAR
             far = far and why == TOO_FAR
             masked = masked or why == MASKED
-    return TOO_FAR if far else (MASKED if masked else UNMATCHED)
+            unmatched = unmatched or why == UNMATCHED
+    return TOO_FAR if far else (MASKED if masked else (UNMATCHED if unmatched else UNKNOWN))

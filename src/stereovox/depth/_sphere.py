@@ -5,7 +5,7 @@ import numpy as np
 
 from stereovox._jit import cell, kernel
 
-VALID, UNMATCHED, TOO_NEAR, TOO_FAR, MASKED = np.uint8(0), np.uint8(1), np.uint8(2), np.uint8(3), np.uint8(4)
+VALID, TOO_NEAR, TOO_FAR = np.uint8(0), np.uint8(2), np.uint8(3)
 ZERO, ONE, HALF = np.float32(0), np.float32(1), np.float32(0.5)
 PI, HALF_PI = np.float32(np.pi), np.float32(np.pi / 2)
 TINY = np.float32(1e-30)
@@ -40,7 +40,7 @@ def gather_image(depth_m, reason, columns, rows, pose, near, far, layout, cells,
             places[u] = _place(x, y, z, layout)
         for u in range(width):
             why = reason[v, u]
-            if (places[u] >= 0) & (why != UNMATCHED) & (why != MASKED):
+            if (places[u] >= 0) & ((why == VALID) | (why == TOO_NEAR) | (why == TOO_FAR)):
                 _add(places[u], ranges[u], why, cells)
 
 
@@ -50,8 +50,9 @@ def gather_points(points, reason, layout, cells):
     for i in range(points.shape[0]):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
         place = _place(x, y, z, layout)
-        if (place >= 0) & (reason[i] != UNMATCHED) & (reason[i] != MASKED):
-            _add(place, np.sqrt(x * x + y * y + z * z), reason[i], cells)
+        why = reason[i]
+        if (place >= 0) & ((why == VALID) | (why == TOO_NEAR) | (why == TOO_FAR)):
+            _add(place, np.sqrt(x * x + y * y + z * z), why, cells)
 
 
 @cell

@@ -11,21 +11,21 @@ from stereovox.depth import _correct, _cpu
 
 
 def corrected(
-    raw: NDArray[np.generic], scale: np.float32, none: np.float32, camera: PinholeCamera
+    raw: NDArray[np.generic], scale: np.float32, none: np.float32, infinite: np.float32, camera: PinholeCamera
 ) -> NDArray[np.float32]:
     """Return the corrected depth (height * width,) in metres, float32, of a flat raw image; NaN: no value.
 
-    scale: metres per unit; none: raw value that means "no value" beside zero, negative and not finite ones. A pixel
-    whose correction leads to no positive depth has no value either: this clears nothing.
+    scale: metres per unit; none, infinite: as in `_cpu.classify`; infinities stay what they are. A pixel whose
+    correction leads to no positive depth has no value either: this clears nothing.
     """
     depth_m = np.empty(raw.size, np.float32)
-    _cpu.classify(raw, scale, np.float32(0), np.float32(np.inf), none, depth_m, np.empty(raw.size, np.uint8))
+    _cpu.classify(raw, scale, np.float32(0), np.float32(np.inf), none, infinite, depth_m, np.empty(raw.size, np.uint8))
     correct(depth_m.reshape(camera.height, camera.width), camera)
     return depth_m
 
 
 def correct(depth_m: NDArray[np.float32], camera: PinholeCamera) -> None:
-    """Correct (height, width) float32 metres in place by the camera's `correction`, if it has one; NaN stays NaN."""
+    """Correct (height, width) float32 metres in place by the camera's `correction`; NaN and infinities stay."""
     if camera.correction is None:
         return
     x, y = camera.ray_slopes()

@@ -15,7 +15,7 @@ def downsample(image: DepthImage, n: int) -> DepthImage:
     """Return the image of block minima and its camera; n = 1 returns the image itself.
 
     A block without any valid pixel is TOO_NEAR where one of its pixels is, TOO_FAR only where all of them are, else
-    MASKED where one is, else UNMATCHED. Blocks at the right and lower border may be cut.
+    MASKED where one is, else UNMATCHED where one is, else UNKNOWN. Blocks at the right and lower border may be cut.
     Raises ConfigError for a wide camera.
     """
     if n == 1:

@@ -24,6 +24,7 @@ EXACT = 1e-14
 """How far a rotation of doubles may be off and still be the nearest there is."""
 SMALLEST = 1e-30
 """Metres per unit of a depth image that float32 can still multiply with."""
+MOST = max(Reason)
 FARTHEST = 1e6
 """Positions beyond this many metres are taken for errors."""
 
@@ -31,8 +32,10 @@ FARTHEST = 1e6
 def prepare(frame: Frame, config: Config) -> DepthImage:
     """Return the frame's depth image in metres, corrected where its camera has a `correction`.
 
-    A pixel is UNMATCHED where the value is zero, negative, not finite or a saturated uint16; TOO_NEAR and TOO_FAR
-    outside [min_range, max_range]. The source's own reason, where it has one, comes first.
+    A pixel is UNKNOWN where the value is zero, negative, NaN, +inf or a saturated uint16; TOO_NEAR and TOO_FAR outside
+    [min_range, max_range], TOO_NEAR also where it is -inf. The source's own reason, where it has one, comes first; but
+    its TOO_FAR only where nothing contradicts it: a depth beside it, or the frame's `farthest`. `depth.far` says whose
+    word is taken for too far.
     Raises FrameRefused with the reason: the source's `fault`, `bad_dtype`, `bad_shape`, `bad_scale`, `bad_reason`,
     `pose_not_finite`, `pose_not_rigid`, `no_valid_depth`.
     """
@@ -53,13 +56,16 @@ def _classify(frame: Frame, config: Config, depth_m: NDArray, reason: NDArray) -
     raw, scale = np.ascontiguousarray(frame.depth).reshape(-1), np.float32(frame.depth_scale)
     none = np.float32(SATURATED if raw.dtype == np.uint16 else 0)
     camera = frame.camera
+    infinite = np.float32(np.inf if config.depth.far == "infinite" else np.nan)
     if isinstance(camera, PinholeCamera) and camera.correction:  # before the limits, which hold for true depths
-        raw, scale, none = corrected(raw, scale, none, camera), np.float32(1), np.float32(0)
+        raw, scale, none = corrected(raw, scale, none, infinite, camera), np.float32(1), np.float32(0)
     limits = (np.float32(config.min_range), np.float32(config.max_range))
     into = depth_m.reshape(-1), reason.reshape(-1)
-    usable = _cpu.classify(raw, scale, *limits, none, *into)
+    usable = _cpu.classify(raw, scale, *limits, none, infinite, *into)
     if frame.reason is not None:
-        usable = _cpu.take_given(np.ascontiguousarray(frame.reason, np.uint8).reshape(-1), *into)
+        told = config.depth.far != "measured" and frame.farthest >= config.max_range
+        far = np.uint8(Reason.TOO_FAR if told else Reason.UNKNOWN)
+        usable = _cpu.take_given(np.ascontiguousarray(frame.reason, np.uint8).reshape(-1), far, *into)
     return usable
 
 
@@ -75,11 +81,12 @@ def _check_image(frame: Frame) -> None:
         raise FrameRefused("bad_shape", f"{name}: depth image is {depth.shape}, its camera says {wanted}")
     if not SMALLEST < frame.depth_scale < 1 / SMALLEST:  # NaN as well
         raise FrameRefused("bad_scale", f"{name}: depth_scale {frame.depth_scale} must be positive and finite")
-    given = frame.reason
-    if given is not None and (
-        given.dtype != np.uint8 or given.shape != depth.shape or given.max(initial=0) > max(Reason)
-    ):
-        raise FrameRefused("bad_reason", f"{name}: reason must be {depth.shape} uint8 of values 0 to {max(Reason)}")
+    if frame.reason is not None and not _are_reasons(frame.reason, depth.shape):
+        raise FrameRefused("bad_reason", f"{name}: reason must be {depth.shape} uint8 of values 0 to {MOST}")
+
+
+def _are_reasons(given: NDArray, shape: tuple[int, ...]) -> bool:
+    return given.dtype == np.uint8 and given.shape == shape and given.max(initial=0) <= MOST
 
 
 def rigid_pose(frame: Frame | Scan, tolerance: float) -> geometry.Transform:

@@ -20,7 +20,7 @@ PIXEL = 1.5
 """Pixels that a pixel covers, with its diagonal and some for what a grid's origin is nearer than the eye."""
 NEVER = np.iinfo(np.int64).min
 """Stamp of a cell that nobody has looked into."""
-RANK = np.array([1, 3, 0, 2, 3], np.uint8)
+RANK = np.array([1, 3, 0, 2, 3, 3], np.uint8)
 """Which `Reason` wins where two meet: too near, a surface, free up to somewhere, unknown."""
 ARRAYS = ("range_m", "reason", "count", "stamp_ns")
 
@@ -42,7 +42,7 @@ class SphereGrid:
 
     layout: the directions. range_m: float32 metres to the nearest surface where `reason` is VALID; up to which the
         direction is free where it is TOO_FAR; 0 where it is TOO_NEAR; NaN where nobody has seen anything.
-    reason: uint8 of `Reason`, UNMATCHED for what is unknown. count: int32 points of a cell.
+    reason: uint8 of `Reason`, UNKNOWN where nobody has seen anything. count: int32 points of a cell.
     stamp_ns: int64 time of a cell's range, NEVER where it has none.
     camera: of all that took part the one whose ranges are the noisiest; None where none is known.
     """
@@ -76,7 +76,7 @@ def empty(layout: SphereLayout) -> SphereGrid:
     return SphereGrid(
         layout,
         np.full(shape, np.nan, np.float32),
-        np.full(shape, Reason.UNMATCHED, np.uint8),
+        np.full(shape, Reason.UNKNOWN, np.uint8),
         np.zeros(shape, np.int32),
         np.full(shape, NEVER, np.int64),
     )
@@ -126,7 +126,7 @@ def _grid(cells: Cells, layout: SphereLayout, config: SphereConfig, stamp_ns: in
     near, valid, free = cells.too_near > 0, cells.number > 0, np.isfinite(cells.free_to)
     ranges = np.select([near, valid, free], [np.float32(0), _nearest(cells, config), cells.free_to], np.float32(np.nan))
     codes = [np.uint8(code) for code in (Reason.TOO_NEAR, Reason.VALID, Reason.TOO_FAR)]
-    reason = np.select([near, valid, free], codes, np.uint8(Reason.UNMATCHED))
+    reason = np.select([near, valid, free], codes, np.uint8(Reason.UNKNOWN))
     stamps = np.where(near | valid | free, np.int64(stamp_ns), NEVER)
     shape = layout.shape
     return SphereGrid(

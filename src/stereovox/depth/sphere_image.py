@@ -29,7 +29,7 @@ def frame_of(grid: SphereGrid, T_world_body: Transform, max_range: float, name: 
 
     Rows of the image are azimuths, columns polar angles; one pixel looks through the middle of each cell. Depth is the
     distance from the body's z axis, float32 metres. Cells within two degrees of that axis are left out, since they
-    have no such depth; and a cell that is free up to less than `max_range` from the axis is UNMATCHED, since a frame
+    have no such depth; and a cell that is free up to less than `max_range` from the axis is UNKNOWN, since a frame
     can only say that all up to `max_range` (metres) is free.
     stamp_ns is the newest of the grid. Noise is that of the grid's `camera`.
     """
@@ -96,11 +96,11 @@ def _depth(
     reason = grid.reason[:, columns].copy()
     inner = np.cos(np.maximum(np.abs(camera.angles()) - camera.step_u / 2, 0)).astype(np.float32)
     farthest = grid.range_m[:, columns] * inner  # at the cell's edge nearest to the equator
-    reason[(reason == Reason.TOO_FAR) & (farthest < max_range * (1 - 1e-5))] = Reason.UNMATCHED
+    reason[(reason == Reason.TOO_FAR) & (farthest < max_range * (1 - 1e-5))] = Reason.UNKNOWN
     return np.where(reason == Reason.VALID, depth, np.float32(0)), reason
 
 
 def _special(depth: NDArray[np.float32], reason: NDArray[np.uint8]) -> NDArray[np.float32]:
     """Return depth with REP 117's values where there is none."""
-    none = np.array([0, np.nan, -np.inf, np.inf, np.nan], np.float32)[reason]
+    none = np.array([0, np.nan, -np.inf, np.inf, np.nan, np.nan], np.float32)[reason]
     return np.where(reason == Reason.VALID, depth, none)

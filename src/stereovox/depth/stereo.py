@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.config import StereoConfig
-from stereovox.depth.disparity import Disparity, doubled, explained, halved, match_aligned
+from stereovox.depth.disparity import FAR_PX, Disparity, doubled, explained, halved, match_aligned
 from stereovox.depth.form import matrix_of
 from stereovox.depth.stereo_matchers import make_matcher
 from stereovox.errors import FrameRefused, StereovoxError
-from stereovox.frame import Frame, StereoFrame
+from stereovox.frame import Frame, Reason, StereoFrame
 from stereovox.geometry import Transform
 
 __all__ = ["Disparity", "StereoDepth"]
@@ -33,17 +33,23 @@ class StereoDepth:
     def __call__(self, frame: StereoFrame) -> Frame:
         """Return the frame as a depth image: float32 metres, reasons, camera and pose of the aligned eye.
 
-        Where the source says the depth is what `camera.depth_of` makes of the disparity, NaN: none.
+        Depth is what `camera.depth_of` makes of the disparity, NaN: none. What is TOO_FAR has the depth beyond which
+        it is: a map that reaches farther does not take it for free. It is never UNKNOWN, but UNMATCHED where the
+        images do not agree, TOO_NEAR where the disparity is at the end of those searched, MASKED by rig and `rcrop`.
         Raises as `disparity`, and StereovoxError where the pair's camera has no baseline.
         """
         camera = frame.pair.camera
         if camera.baseline is None:
             raise StereovoxError(f"stereo pair '{frame.pair.name}': its camera has no baseline; give it in metres")
         found = self.disparity(frame)
-        depth_m = camera.depth_of(found.disparity, self.config.aligned).astype(np.float32)
+        least = np.where(found.reason == Reason.TOO_FAR, np.float32(FAR_PX), found.disparity)
+        depth_m = camera.depth_of(least, self.config.aligned).astype(np.float32)
         pose = _eye_pose(frame.T_world_sensor, camera.baseline, self.config.aligned)
         camera = replace(camera, subpixel=camera.subpixel or self.config.subpixel)
-        return Frame(depth_m, camera, pose, frame.stamp_ns, reason=found.reason, name=frame.name)
+        return Frame(
+            depth_m, camera, pose, frame.stamp_ns, reason=found.reason, name=frame.name, sensor=frame.sensor,
+            pose_off_ns=frame.pose_off_ns,
+        )  # fmt: skip
 
     def disparity(self, frame: StereoFrame) -> Disparity:
         """Return the disparity of the aligned image, rectified before where the pair has `eyes`.

@@ -78,10 +78,12 @@ class Bag(DepthSource):
     librealsense's `ros_writer.cpp` describes, which librealsense's own reader accepts; no bag of a real camera was at
     hand.
 
+    Pixels without value: 0 in 16UC1, and all are UNKNOWN, none clears; 32FC1 follows REP 117: -inf is TOO_NEAR, NaN
+    UNKNOWN, +inf what `depth.far` says.
     Time: the image's own; in RealSense files that of the frame in its own clock domain. Pose: interpolated at that
-    time; what /tf tells of the images' frame comes first. It is the pose of the depth camera's optical frame unless
-    `axes` says otherwise; where the poses are those of
-    another camera, or in another file, a camera pair (`pair.toml`) puts them together.
+    time; what /tf tells of the images' frame comes first, at its ends held for up to 0.1 s (`pose_off_ns`). It is the
+    pose of the depth camera's optical frame unless `axes` says otherwise; where the poses are those of another camera,
+    or in another file, a camera pair (`pair.toml`) puts them together.
     Faults: `unreadable`, `bad_dtype`, `bad_shape`; `no_pose` and `bad_pose_file` with the depth image all the same.
     Raises SourceError, one line, for files that are empty, damaged or without usable depth, and for bad options.
     """
@@ -119,7 +121,10 @@ class Bag(DepthSource):
     def frame(self, i: int) -> Frame:
         """Return frame `i`; depth is (0, 0) where the image has a `fault`, the pose NaN where there is none."""
         i = range(len(self))[i]
-        return depth_frame(self._depth, i, f"{self._file.path} frame {i}", self._pose, self.camera, self._scale)
+        frame = depth_frame(self._depth, i, f"{self._file.path} frame {i}", self._pose, self.camera, self._scale)
+        if frame.fault or not isinstance(self._poses, TurnedTf):
+            return frame
+        return replace(frame, pose_off_ns=self._poses.poses.off_ns(frame.stamp_ns))
 
     def _pose(self, stamp_ns: int) -> Transform:
         if self._standing:

@@ -62,6 +62,10 @@ class TfPoses:
         """Return T_world_body at a time; raises FrameRefused `no_pose` (see `Tf.lookup`)."""
         return self.tf.lookup(self.world, self.body, stamp_ns)
 
+    def off_ns(self, stamp_ns: int) -> int:
+        """Return how far the pose at a time is extrapolated."""
+        return self.tf.off_ns(self.world, self.body, stamp_ns)
+
 
 def tf_poses(tf: Tf, body: str, world: str = "") -> TfPoses | str:
     """Return the poses of frame `body` in `world`, or in one line why there are none.

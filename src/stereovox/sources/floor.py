@@ -184,7 +184,8 @@ class Floor:
             depth = np.where(reason == Reason.VALID, true, np.float32(0))
         scale = 0.001 if self.options.noise else 1.0
         pose = self.odometry.at(stamp) @ self.T_base_camera
-        return Frame(depth, self.camera, pose, stamp, scale, reason, f"{self.name} frame {i}")
+        name, farthest = f"{self.name} frame {i}", self.kinect.farthest
+        return Frame(depth, self.camera, pose, stamp, scale, reason, name, farthest=farthest)
 
     def _driven(self) -> planar.Pose:
         poses = drive(self.layout.stops, self.options.speed)

@@ -56,6 +56,7 @@ class Kinect:
     ) -> tuple[NDArray[np.uint16], NDArray[np.uint8]]:
         """Return depth in whole millimetres (0 = none) and the `Reason` of every pixel.
 
+        TOO_NEAR and TOO_FAR by what it measured, UNMATCHED in shadows and beside edges.
         true_depth_m: (height, width) along the optical axis, inf where there is nothing. Same seed, same image.
         """
         random = np.random.default_rng(seed)

@@ -23,6 +23,7 @@ class DepthFolder(DepthSource, ABC):
 
     A layout sets `depth_scale` (metres per unit), `baseline` (metres) and `intrinsics` (what 640x480 images have
     without a calibration file), calls `_set_camera` when it is made, and tells each frame's image and pose.
+    The PNGs hold 0 or 65535 for every pixel without value and do not say why: all are UNKNOWN, none clears.
     """
 
     depth_scale: float

@@ -42,6 +42,7 @@ class KittiSource(Source, ABC):
     A layout sets `name`, `calibration`, `poses`, `eyes` (camera numbers left and right) and `camera`, and says where
     the files of each frame lie. World: see `FramePoses`. Pose of a frame: that of the rectified left camera in use.
     A file that cannot be used becomes a frame with a `fault`: those of `read_picture_png`, `no_pose`, `bad_pose_file`.
+    Why a pixel has no value is found out by matching (see `depth.stereo`).
     """
 
     calibration: KittiCalibration

@@ -54,6 +54,7 @@ class RealSense(Stream):
 
     location: `realsense:` or, where several are connected, `realsense:SERIAL`; see `Options` for what may follow.
     context: what lists the devices; pyrealsense2's own unless a test brings another.
+    Pixels without value are 0, whatever the reason: all are UNKNOWN, none clears.
     Time: the frame's, in the clock domain of the camera. Camera, unit and baseline are told by the device. Without
     `pose=fixed` every frame has the fault `no_pose`, but its depth all the same: a camera does not know where it is,
     and pyrealsense2 2.55 and later no longer supports the T265.
@@ -116,12 +117,13 @@ class RealSense(Stream):
         name = f"{self.name} frame {image.get_frame_number()}"
         unit = float(image.as_depth_frame().get_units())
         if self.options.pose == "fixed":
-            return Frame(depth, self.camera, np.eye(4), stamp_ns, unit, name=name)
+            return Frame(depth, self.camera, np.eye(4), stamp_ns, unit, name=name, sensor=self.name)
         detail = f"{name}: the camera does not know where it is; add ?pose=fixed if it stands still, else record it"
         detail += " and put poses beside the recording in a camera pair (pair.toml)"
         return Frame(
-            depth, self.camera, np.full((4, 4), np.nan), stamp_ns, unit, name=name, fault="no_pose", fault_detail=detail
-        )
+            depth, self.camera, np.full((4, 4), np.nan), stamp_ns, unit, name=name, sensor=self.name,
+            fault="no_pose", fault_detail=detail,
+        )  # fmt: skip
 
 
 def _ns_from_ms(milliseconds: float) -> int:

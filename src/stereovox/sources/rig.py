@@ -41,6 +41,8 @@ class StereoRig(Source):
     Both images of a moment have the same name, their time in nanoseconds, or stand in a line of the pair's index.
     Pose: between the neighbours before and after the image's time, times T_body_camera; both must be less than 0.1 s
     away. World: that of the poses.
+    Each pair is a sensor of its own, by its name. Why a pixel has no value is found out by matching (`depth.stereo`);
+    the rig's masks make it MASKED.
     Faults: those of `read_picture_png` and of `Poses.at`. Raises SourceError, one line, for a bad rig file, masks or
     folders that cannot be read, names that are no times, and where there is no image or no file of poses.
     Names of several images that span less than a millisecond are no times.
@@ -75,7 +77,7 @@ class StereoRig(Source):
         shot = self._shots[range(len(self))[i]]
         pair = self.pairs[shot.pair]
         nothing, nowhere = np.empty((0, 0), np.uint8), np.full((4, 4), np.nan)
-        frame = StereoFrame(nothing, nothing, pair, nowhere, shot.stamp_ns, str(shot.left))
+        frame = StereoFrame(nothing, nothing, pair, nowhere, shot.stamp_ns, str(shot.left), sensor=pair.name)
         try:
             T_world_camera = self._pose(shot, pair)
             left, right = (_picture(path, size) for path, size in zip(shot[2:], _sizes(pair), strict=True))

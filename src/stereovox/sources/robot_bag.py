@@ -43,6 +43,7 @@ class RobotBag:
     interpolated; gaps longer than `max_gap` are not bridged. Sensors that tf does not mount are taken for mounted at
     the robot's own frame (`base_footprint`, else `base_link`). All that is assumed is told in `notes`.
 
+    Pixels without value are as in `Bag`. At the ends of tf a pose is held for `extrapolate` seconds (`pose_off_ns`).
     Order: as recorded, which is that of the stamps unless the clock was set back meanwhile.
     Faults: `unreadable`, `no_pose`, for images also `bad_dtype` and `bad_shape`.
     Raises SourceError, one line, for files that are empty, damaged or without scans and depth, and for bad options.
@@ -101,30 +102,35 @@ class RobotBag:
             blank = replace(blank, stamp_ns=told.stamp_ns)
             sensor = self._lidar if told.frame_id == topic.frame_id else told.frame_id
             T_base, T_odom = (look(sensor, told.stamp_ns) for look in (self.where.in_base, self.where.in_odom))
+            off_ns = self.where.off_ns(sensor, told.stamp_ns)
         except FrameRefused as refused:
             return replace(blank, fault=refused.reason, fault_detail=str(refused))
         if isinstance(told, LaserScan):
-            return _scan(told, T_odom, T_base, blank.name)
+            return _scan(told, T_odom, T_base, blank.name, off_ns)
         band = CloudBand(self._options.lowest, self._options.highest)
         band = replace(band, range_max=self._options.range_max or band.range_max)
         flat, T_base_scan = scan_of_cloud(told, T_base, band)
-        return _scan(flat, T_odom @ inverse(T_base) @ T_base_scan, T_base_scan, blank.name)
+        return _scan(flat, T_odom @ inverse(T_base) @ T_base_scan, T_base_scan, blank.name, off_ns)
 
     def _frame(self, i: int) -> Frame:
         images = self._depth
         assert images
         name = f"{self.where.path} {images.topic} message {i}"
-        return depth_frame(images, i, name, self._camera_pose, images.camera, self._options.scale)
+        frame = depth_frame(images, i, name, self._camera_pose, images.camera, self._options.scale)
+        return frame if frame.fault else replace(frame, pose_off_ns=self.where.off_ns(self._camera, frame.stamp_ns))
 
     def _camera_pose(self, stamp_ns: int) -> Transform:
         T = self.where.in_odom(self._camera, stamp_ns)
         return T if self._options.axes == "optical" else T @ T_BODY_OPTICAL
 
 
-def _scan(told: LaserScan, T_odom_sensor: Transform, T_base_sensor: Transform, name: str) -> Scan:
+def _scan(told: LaserScan, T_odom_sensor: Transform, T_base_sensor: Transform, name: str, off_ns: int) -> Scan:
     angles = told.angle_min, told.angle_step
     limits = told.range_min, told.range_max
-    return Scan(told.ranges, *angles, *limits, T_odom_sensor, T_base_sensor, stamp_ns=told.stamp_ns, name=name)
+    return Scan(
+        told.ranges, *angles, *limits, T_odom_sensor, T_base_sensor, stamp_ns=told.stamp_ns, name=name,
+        pose_off_ns=off_ns,
+    )  # fmt: skip
 
 
 def _find_depth(file: BagFile, options: RobotOptions) -> tuple[DepthTopic | None, tuple[str, ...]]:

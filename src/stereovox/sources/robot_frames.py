@@ -92,6 +92,11 @@ class RobotFrames:
             return T_odom_child @ self._between(self._edge.child, sensor, stamp_ns)
         return self._between(self.odom or self.base, sensor, stamp_ns)
 
+    def off_ns(self, sensor: str, stamp_ns: int) -> int:
+        """Return how far `in_odom` extrapolates; raises FrameRefused `no_pose` as it does."""
+        target, off = (self._edge.child, self._edge.off_ns(stamp_ns)) if self._edge else (self.odom or self.base, 0)
+        return off if target == sensor else max(off, self.tf.off_ns(target, sensor, stamp_ns))
+
     def _between(self, target: str, source: str, stamp_ns: int) -> Transform:
         return np.eye(4) if target == source else self.tf.lookup(target, source, stamp_ns)
 

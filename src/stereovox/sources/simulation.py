@@ -80,8 +80,10 @@ class Simulation(DepthSource):
     The scene functions' docstrings tell their parameters, `Options` those of every scene. World: z up, x forward, y
     left, metres; with `axes=optical` x right, y down, z forward from the first camera. Every frame can be asked for by
     itself and is always the same for the same `seed`.
+    Reasons are the true ones: TOO_NEAR, TOO_FAR (beyond the device's `farthest`, and known to be free no farther),
+    UNMATCHED beside edges and where the right eye sees nothing.
     noise: False gives exact depth in metres (float32, inf where nothing is) without noise or holes.
-    frames: how many frames are taken on the whole way; None leaves it to the scene.
+    frames: how many frames are taken on the whole way; None leaves it to the scene. The way takes as long all the same.
     Raises SourceError, one line, for an unknown scene or parameter and for values out of range.
     """
 
@@ -99,9 +101,9 @@ class Simulation(DepthSource):
         self.device = _device(stage.device, self.options)
         self.camera = self.device.camera
         self.noise, self.seed = self.options.noise, self.options.seed
-        self.period_ns = round(1e9 / stage.hz)
-        self._world = stage
         self._frames = self.options.frames or stage.frames
+        self.period_ns = round(1e9 / stage.hz * max(stage.frames - 1, 1) / max(self._frames - 1, 1))
+        self._world = stage
         self._seen: tuple[Transform, NDArray[np.float32]] | None = None
 
     @classmethod
@@ -150,7 +152,10 @@ class Simulation(DepthSource):
             depth, scale = self.device.distorted(true_depth_m), 1.0
             reason = classify(depth, self.device.nearest, self.device.farthest)
             depth = np.where(reason == Reason.VALID, depth, np.float32(0))
-        return Frame(depth, self.camera, self.pose(i), i * self.period_ns, scale, reason, f"{self.name} frame {i}")
+        return Frame(
+            depth, self.camera, self.pose(i), i * self.period_ns, scale, reason, f"{self.name} frame {i}",
+            farthest=self.device.farthest,
+        )  # fmt: skip
 
     def pose(self, i: int) -> Transform:
         """Return T_world_camera (4, 4) of frame `i`; raises IndexError beyond the last."""

@@ -91,7 +91,7 @@ class Surround(Source):
         left = photograph(self.scene, pair.eyes.left, T_world_left, self.options.noise, [*seed, 0])
         T_world_right = T_world_left @ pair.eyes.T_left_right
         right = photograph(self.scene, pair.eyes.right, T_world_right, self.options.noise, [*seed, 1])
-        return StereoFrame(left, right, pair, T_world_left, stamp_ns, name)
+        return StereoFrame(left, right, pair, T_world_left, stamp_ns, name, sensor=pair.name)
 
     def exact(self, i: int) -> Frame:
         """Return the true depth of what the pair of frame `i` sees, as its rectified left eye has it.
@@ -103,7 +103,7 @@ class Surround(Source):
         reason = np.where(np.isfinite(depth), Reason.VALID, Reason.TOO_FAR).astype(np.uint8)
         reason[~seen_by_both(pair)] = Reason.MASKED
         depth = np.where(reason == Reason.VALID, depth, np.float32(0))
-        return Frame(depth, pair.camera, T_world_left, stamp_ns, reason=reason, name=name)
+        return Frame(depth, pair.camera, T_world_left, stamp_ns, reason=reason, name=name, sensor=pair.name)
 
     def body_pose(self, i: int) -> Transform:
         """Return T_world_body (4, 4) of frame `i`: level, x forward, y left, z up."""

@@ -83,6 +83,11 @@ class Tf:
         up, down = self._way(frame_name(target), frame_name(source))
         return inverse(self._along(up, stamp_ns)) @ self._along(down, stamp_ns)
 
+    def off_ns(self, target: str, source: str, stamp_ns: int) -> int:
+        """Return how far `lookup` extrapolates; raises FrameRefused as it does for frames that nothing connects."""
+        up, down = self._way(frame_name(target), frame_name(source))
+        return max((edge.off_ns(int(stamp_ns)) for edge in (*up, *down)), default=0)
+
     def connected(self, target: str, source: str) -> bool:
         """Tell whether both frames are there and some way connects them."""
         try:

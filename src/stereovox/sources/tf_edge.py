@@ -91,6 +91,13 @@ class Edge:
             )
         return interpolate(_motion(rows[after - 1]), _motion(rows[after]), (stamp_ns - start) / (end - start))
 
+    def off_ns(self, stamp_ns: int) -> int:
+        """Return how far a time lies before the first transform or after the last; 0 where the frame is fixed."""
+        if self._fixed is not None:
+            return 0
+        stamps, _ = self._in_order()
+        return 0 if self._still else max(int(stamps[0]) - stamp_ns, stamp_ns - int(stamps[-1]), 0)
+
     def __str__(self) -> str:
         return self._name
 

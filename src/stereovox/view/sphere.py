@@ -54,11 +54,11 @@ def draw_sphere(grid: SphereGrid, title: str, now_ns: int | None = None) -> Any:
 def panorama(grid: SphereGrid) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
     """Return ranges in metres and reasons of all directions (polars, azimuths) as one sees them.
 
-    First row: straight up; first column: behind, then left, ahead in the middle, right. Outside of the grid: UNMATCHED.
+    First row: straight up; first column: behind, then left, ahead in the middle, right. Outside of the grid: UNKNOWN.
     """
     whole, layout = grid.layout.whole(), grid.layout
     ranges = np.full(whole.shape, np.nan, np.float32)
-    reason = np.full(whole.shape, Reason.UNMATCHED, np.uint8)
+    reason = np.full(whole.shape, Reason.UNKNOWN, np.uint8)
     place = np.ix_(*layout.places_in(whole))
     ranges[place], reason[place] = grid.range_m, grid.reason
     return ranges[::-1].T, reason[::-1].T

@@ -259,7 +259,9 @@ def test_no_room_for_a_tile_loses_no_cell(tmp_path):
             except MapFileError as error:
                 told.append(str(error))
             rolling.store._writer.submit(lambda: None).result()  # all that waited was tried
+    assert len(told) == 4  # all but the first, which put them there
     assert "a tile cannot be written (No space left" in told[0]
+    assert rolling.viewpoint.T_world_camera[0, 3] == 0.0
     rolling.save(tmp_path / "m")
     for got, expected in zip(load_map(tmp_path / "m").cells(), wanted, strict=True):
         np.testing.assert_array_equal(got, expected)

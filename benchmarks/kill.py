@@ -4,9 +4,10 @@
     python benchmarks/kill.py --kills 200 [SOURCE] [--frames :100] [--voxel-size 0.1] [--json]
 
 After each kill the map must open and hold all frames of the last checkpoint, and `--resume` must end with the same
-cells, counts, window and settings as a run that nobody disturbed, and leave nothing else behind. Every second run keeps the cells that leave a window in tiles
-on disk; every seventh frame has a fault and is refused. Checkpoints are made far more often than by default, so that
-many kills fall into one. A moment is any from the first map on the disk to the end of the process.
+cells, counts, window and settings as a run that nobody disturbed, and leave nothing else behind. Every second run keeps
+the cells that leave a window in tiles on disk; every seventh frame has a fault and is refused. Checkpoints are made far
+more often than by default, so that many kills fall into one. A moment is any from the first map on the disk to the end
+of the process. Ctrl-C ends the trials and tells what they found.
 
 The runs are real processes, forked from this one, which has loaded the kernels for all of them.
 """
@@ -22,6 +23,7 @@ import sys
 import tempfile
 import time
 from argparse import ArgumentParser, Namespace
+from contextlib import suppress
 from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
@@ -204,12 +206,13 @@ def run() -> int:
         for n, settings in enumerate((PLAIN, KEEP)):
             (Path(name) / str(n)).mkdir()
             kinds.append((settings, *undisturbed(Path(name) / str(n), given, settings)))
-        while len(told) < given.kills:
-            with tempfile.TemporaryDirectory(dir=name) as place:
-                one = trial(Path(place) / "map.svox", given, *kinds[len(told) % 2])
-            if one["killed"]:  # else it had come to its end
-                told.append(one)
-                print(f"\r{len(told)} of {given.kills}", end="", file=sys.stderr, flush=True)
+        with suppress(KeyboardInterrupt):
+            while len(told) < given.kills:
+                with tempfile.TemporaryDirectory(dir=name) as place:
+                    one = trial(Path(place) / "map.svox", given, *kinds[len(told) % 2])
+                if one["killed"]:  # else it had come to its end
+                    told.append(one)
+                    print(f"\r{len(told)} of {given.kills}", end="", file=sys.stderr, flush=True)
     found = summary(told, time.monotonic() - start)
     print(file=sys.stderr)
     print(json.dumps(found) if given.json else "\n".join(f"{key:30} {value}" for key, value in found.items()))

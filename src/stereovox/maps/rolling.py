@@ -97,7 +97,12 @@ class RollingMap(VoxelMap):
         return self.unbounded(config)
 
     def look_from(self, viewpoint: Viewpoint) -> None:
-        """Remember where the camera stands and move the window after it."""
+        """Remember where the camera stands and move the window after it.
+
+        Raises MapFileError, and changes nothing, where an earlier tile could not be written.
+        """
+        if self._store is not None:
+            self._store.check()
         super().look_from(viewpoint)
         before = self._window.box
         position = viewpoint.T_world_camera[:3, 3].tolist()

@@ -177,16 +177,20 @@ def _is_free(folder: Path) -> bool:
 
 def _sweep(folder: Path) -> None:
     """Remove what saves left that were killed or failed: all that the manifest does not name."""
-    with suppress(OSError, MapFileError):  # what cannot be removed is in nobody's way; a damaged map stays as it is
-        named = _named(folder)
+    named = _named(folder)
+    if named is None and is_map(folder):
+        return  # a damaged map stays as it is
+    with suppress(OSError):  # what cannot be removed is in nobody's way
         for entry in folder.iterdir():
             if UNFINISHED.fullmatch(entry.name) and entry.name not in (named, LOCK):
                 shutil.rmtree(entry, ignore_errors=True) if entry.is_dir() else entry.unlink()
 
 
 def _named(folder: Path) -> Any:
-    """Return the name of the saved cells, None where there is no map. Raises MapFileError for a damaged one."""
-    return read_manifest(folder).get("data") if is_map(folder) else None
+    """Return the name of the saved cells; None where there is no map, or a damaged one."""
+    with suppress(MapFileError):
+        return read_manifest(folder).get("data")
+    return None
 
 
 def _manifest(voxel_map: VoxelMap, data: str, blocks: int, checksum: list[int]) -> dict[str, Any]:

@@ -53,6 +53,7 @@ class TileStore:
         self._array = self._create()
         self._tiles: set[Tile] = set()
         self._waiting: dict[Tile, tuple[NDArray, Future[None]]] = {}
+        self._failed: OSError | None = None
         self._writer = ThreadPoolExecutor(1, thread_name_prefix="stereovox-tiles")
         if folder is None:
             weakref.finalize(self, shutil.rmtree, self.folder, ignore_errors=True)
@@ -65,8 +66,11 @@ class TileStore:
         return sorted(self._tiles)
 
     def put(self, tile: Tile, coords: NDArray[np.int32], cells: NDArray[np.integer]) -> None:
-        """Store the blocks of one tile: block coordinates (n, 3), cells (n, 512). They replace what stood there."""
-        while len(self._waiting) >= WAITING:
+        """Store the blocks of one tile: block coordinates (n, 3), cells (n, 512). They replace what stood there.
+
+        A tile that cannot be written stays in memory, so that no cell is lost; `check` tells.
+        """
+        while len(self._waiting) >= WAITING and self._failed is None:
             self._settle(next(iter(self._waiting)))
         if tile in self._waiting:
             self._settle(tile)
@@ -75,6 +79,13 @@ class TileStore:
         self._tiles.add(tile)
         self._waiting[tile] = dense, self._writer.submit(self._write, tile, dense)
         self._forget_written()
+
+    def check(self) -> None:
+        """Raise MapFileError where a tile could not be written."""
+        self._forget_written()
+        if self._failed is not None:
+            why = self._failed.strerror or self._failed
+            raise MapFileError(f"{self.folder}: a tile cannot be written ({why}); choose a disk that has room")
 
     def get(self, tile: Tile) -> tuple[NDArray[np.int32], NDArray[np.integer]]:
         """Return the blocks of one tile that hold any known cell: coordinates (n, 3), cells (n, 512)."""
@@ -153,9 +164,9 @@ class TileStore:
     def _settle(self, tile: Tile) -> None:
         try:
             self._waiting[tile][1].result()
-        except OSError as error:  # the tile stays where it is: the map can still be saved elsewhere
-            raise MapFileError(f"{self.folder}: a tile cannot be written ({error.strerror or error})") from None
-        del self._waiting[tile]
+            del self._waiting[tile]
+        except OSError as error:
+            self._failed = error
 
     def _forget_written(self) -> None:
         for tile in [tile for tile, (_, written) in self._waiting.items() if written.done()]:

@@ -1,0 +1,256 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Maps that are saved while they are made: when, what a disk without room leaves, and runs that are killed."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from stereovox.cli import main, map, terminal
+from stereovox.cli.checkpoints import REST, Checkpoints
+from stereovox.errors import MapFileError, StereovoxError
+from stereovox.mapper import Mapper
+from stereovox.maps import VoxelMap, load_map
+from stereovox.maps.lock import only_writer_in, only_writer_of
+
+ROOT = Path(__file__).resolve().parents[2]
+SOURCE = "sim:room?image_width=64&frames=30"
+COARSE = ["--voxel-size", "0.4", "--max-range", "4"]
+
+
+def mapped(out, *more, source=SOURCE):
+    return main(["map", source, "--out", str(out), *COARSE, *more])
+
+
+def names(folder):
+    return sorted(entry.name for entry in folder.iterdir())
+
+
+class Clock:
+    """Seconds that pass only where a test says so."""
+
+    def __init__(self):
+        self.now = 100.0
+
+    def __call__(self):
+        return self.now
+
+
+@pytest.mark.parametrize(("save_takes", "gap"), [(0.0, 10.0), (0.4, 10.0), (2.0, 2.0 * REST)])
+def test_saves_come_when_they_are_due_and_never_take_more_than_their_share(save_takes, gap):
+    clock, saved = Clock(), []
+
+    def save():
+        saved.append(clock.now)
+        clock.now += save_takes
+
+    checkpoints = Checkpoints(save, "m", 10.0, clock)
+    start = clock.now
+    for frame in range(1, 4001):
+        clock.now += 0.1
+        checkpoints.after(frame)
+    assert saved[0] - start == pytest.approx(10.0, abs=0.11)
+    np.testing.assert_allclose(np.diff(saved), gap + save_takes, atol=0.11)
+    assert save_takes * len(saved) <= 0.04 * (clock.now - start)
+
+
+def test_without_seconds_nothing_is_saved_before_the_end():
+    clock, saved = Clock(), []
+    checkpoints = Checkpoints(lambda: saved.append(1), "m", 0, clock)
+    clock.now += 1e9
+    checkpoints.after(5)
+    assert saved == []
+    checkpoints.save(5)
+    assert saved == [1]
+
+
+@pytest.mark.parametrize("seconds", ["-1", "nan", "inf"])
+def test_seconds_that_cannot_be_are_one_line(tmp_path, capsys, seconds):
+    assert mapped(tmp_path / "m", f"--checkpoint={seconds}") == 2
+    assert f"--checkpoint {seconds}: give seconds, or 0" in capsys.readouterr().err
+    assert names(tmp_path) == []
+
+
+def test_a_save_that_fails_tells_what_is_saved():
+    def save():
+        if broken:
+            raise MapFileError("m: no room")
+
+    broken = False
+    checkpoints = Checkpoints(save, "m", 1.0)
+    broken = True
+    with pytest.raises(StereovoxError, match=r"^m: no room; nothing of this run is saved$"):
+        checkpoints.save(3)
+    broken = False
+    checkpoints.save(4)
+    broken = True
+    with pytest.raises(StereovoxError, match=r"^m: no room; m holds this run up to frame 4$"):
+        checkpoints.save(5)
+
+
+def at_each_frame(monkeypatch, out, look):
+    """Call `look(number)` before each frame is added, with a checkpoint after every frame."""
+    add, number = Mapper.add, [0]
+
+    def looking(self, frame):
+        look(number[0])
+        number[0] += 1
+        return add(self, frame)
+
+    monkeypatch.setattr(Mapper, "add", looking)
+    monkeypatch.setattr("stereovox.cli.checkpoints.REST", 0)
+    return ["--checkpoint", "1e-9"]
+
+
+def test_the_map_is_there_from_the_start_and_holds_each_frame_that_was_saved(tmp_path, monkeypatch):
+    seen = []
+
+    def look(number):
+        found, manifest = load_map(tmp_path / "m"), json.loads((tmp_path / "m" / "manifest.json").read_text())
+        seen.append((found.frames, manifest["last_frame"] and manifest["last_frame"]["number"]))
+        assert found.last_frame is None if number == 0 else found.last_frame[0].endswith(f" frame {number - 1}")
+        assert len(names(tmp_path / "m")) == 3  # one set of cells, the manifest, the lock
+
+    assert mapped(tmp_path / "m", *at_each_frame(monkeypatch, tmp_path / "m", look)) == 0
+    assert seen == [(0, None), *((n, n) for n in range(1, 30))]
+    manifest = json.loads((tmp_path / "m" / "manifest.json").read_text())
+    assert manifest["last_frame"]["number"] == 30
+    assert manifest["last_frame"]["stamp_ns"] == load_map(tmp_path / "m").viewpoint.stamp_ns
+    assert names(tmp_path) == ["m"]
+
+
+def test_an_older_map_stays_until_the_first_frame_that_counts(tmp_path, monkeypatch, capsys):
+    assert mapped(tmp_path / "m", "--frames", ":5") == 0
+    held = []
+    options = at_each_frame(monkeypatch, tmp_path / "m", lambda number: held.append(load_map(tmp_path / "m").frames))
+    assert mapped(tmp_path / "m", *options, "--frames", ":3") == 0
+    assert held == [5, 1, 2]
+
+
+@pytest.mark.parametrize("seconds", ["0", "1e-9"])
+def test_saves_in_between_change_nothing(tmp_path, monkeypatch, seconds):
+    monkeypatch.setattr("stereovox.cli.checkpoints.REST", 0)
+    keep = ["--set", "window.size=[3, 3, 3]", "--set", "window.trigger=0.4", "--set", "window.outside=keep"]
+    assert mapped(tmp_path / "a", *keep) == 0
+    assert mapped(tmp_path / "b", *keep, "--checkpoint", seconds) == 0
+    for one, other in zip(load_map(tmp_path / "a").blocks(), load_map(tmp_path / "b").blocks(), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("older", [False, True])
+@pytest.mark.parametrize("full_at", [0, 1, 7, 31])
+def test_a_full_disk_ends_in_one_line_that_tells_what_is_left(tmp_path, monkeypatch, capsys, full_at, older):
+    if older:
+        assert mapped(tmp_path / "m", "--frames", ":2") == 0
+    save, done = VoxelMap.save, []
+    options = at_each_frame(monkeypatch, tmp_path / "m", lambda number: None)
+    capsys.readouterr()
+
+    def fill_up(self, path):
+        if len(done) >= full_at:
+            raise MapFileError(f"{path}: cannot save the map (No space left on device)")
+        done.append(1)
+        save(self, path)
+
+    monkeypatch.setattr(VoxelMap, "save", fill_up)
+    status = mapped(tmp_path / "m", *options)
+    said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("stereovox: ")]
+    if older and full_at == 31:  # 30 frames and the end: an older map needs no first one
+        assert (status, said) == (0, [])
+        return
+    assert status == 2
+    assert len(said) == 1
+    assert "No space left" in said[0]
+    held = full_at if older else full_at - 1
+    if held > 0:
+        assert f"holds this run up to frame {held}" in said[0]
+        assert load_map(tmp_path / "m").frames == held
+    else:
+        assert "holds this run" not in said[0]
+        assert names(tmp_path) == (["m"] if older else [])
+        assert not older or load_map(tmp_path / "m").frames == 2
+
+
+def test_a_tile_without_room_saves_what_there_is(tmp_path, monkeypatch, capsys):
+    add, done = Mapper.add, []
+
+    def no_room(self, frame):
+        if len(done) == 12:
+            raise MapFileError(".m-tiles: a tile cannot be written (No space left on device)")
+        done.append(1)
+        return add(self, frame)
+
+    monkeypatch.setattr(Mapper, "add", no_room)
+    assert mapped(tmp_path / "m") == 2
+    assert "a tile cannot be written (No space left on device); " in (said := capsys.readouterr().err)
+    assert "m holds this run up to frame 12" in said
+    assert load_map(tmp_path / "m").frames == 12
+
+
+@pytest.mark.parametrize("resume", [False, True])
+def test_a_second_writer_is_refused_before_any_work(tmp_path, monkeypatch, capsys, resume):
+    assert mapped(tmp_path / "m", "--frames", ":2") == 0
+    monkeypatch.setattr(map, "_opened", lambda _: pytest.fail("worked"))
+    refused = []
+
+    def second():
+        refused.append(mapped(tmp_path / "m", *(["--resume"] if resume else [])))
+
+    with only_writer_in(tmp_path / "m"):
+        run_in_thread(second)
+    assert refused == [2]
+    assert f"{tmp_path / 'm'}: is being written by another run" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", ["grid", "slam"])
+def test_a_second_writer_of_a_floor_is_refused_before_any_work(tmp_path, monkeypatch, capsys, command):
+    monkeypatch.setattr(f"stereovox.cli.{command}._mapped", lambda *_: pytest.fail("worked"))
+    refused = []
+    with only_writer_of(tmp_path / "floor.yaml"):
+        run_in_thread(lambda: refused.append(main([command, "sim:floor", "--out", str(tmp_path / "floor.yaml")])))
+    assert refused == [2]
+    assert "floor.yaml: is being written by another run" in capsys.readouterr().err
+
+
+def run_in_thread(action):
+    """Run where the lock of this thread is another's."""
+    import threading
+
+    thread = threading.Thread(target=action)
+    thread.start()
+    thread.join()
+
+
+def test_tiles_of_a_dead_run_are_in_nobodys_way(tmp_path):
+    keep = ["--set", "window.size=[3, 3, 3]", "--set", "window.trigger=0.4", "--set", "window.outside=keep"]
+    left = tmp_path / ".m-tiles"
+    (left / "c" / "1").mkdir(parents=True)
+    for name in (".lock", "zarr.json", "c/1/1.partial"):
+        (left / name).write_text("")
+    assert mapped(tmp_path / "m", *keep) == 0
+    assert names(tmp_path) == ["m"]
+
+
+def test_runs_that_are_killed_leave_maps_that_open_and_can_be_gone_on_with():
+    script, kills = ROOT / "benchmarks" / "kill.py", 4
+    words = [sys.executable, script, "--kills", str(kills), "--frames", ":60", "--json"]
+    done = subprocess.run(words, capture_output=True, text=True, check=False, timeout=400)
+    assert done.returncode == 0, done.stdout + done.stderr
+    found = json.loads(done.stdout)
+    assert found["kills"] == found["opened"] == found["resumed_equal"] == kills
+    assert found["checkpoints_lost"] == found["with_things_left_after_resume"] == 0
+
+
+def test_the_first_ctrl_c_waits_for_the_save_that_is_being_made():
+    with terminal.interrupt_between_steps() as check:
+        import signal
+
+        saved = []
+        signal.raise_signal(signal.SIGINT)
+        Checkpoints(lambda: saved.append(1), "m", 1.0).save(1)
+        assert saved == [1]
+        with pytest.raises(KeyboardInterrupt):
+            check()

@@ -17,7 +17,7 @@ import numpy as np
 from stereovox.config import load_config
 from stereovox.errors import MapFileError, one_line
 from stereovox.maps.grid_evidence import CELLS
-from stereovox.untrusted import json_value
+from stereovox.untrusted import count_in, json_value
 
 if TYPE_CHECKING:
     from stereovox.maps.grid_map import GridMap
@@ -60,7 +60,7 @@ def load_grid(path: str | Path) -> GridMap:
         if about["format"] != FORMAT or about["version"] != VERSION:
             raise ValueError(f"format {about['format']} {about['version']}, not {FORMAT} {VERSION}")
         grid_map = GridMap(load_config(about["config"]), about["origin"])
-        grid_map.frames, grid_map.frames_refused = int(about["frames"]), int(about["frames_refused"])
+        grid_map.frames, grid_map.frames_refused = (count_in(about, key) for key in ("frames", "frames_refused"))
         grid_map.recording = one_line(str(about["recording"]))
         coords, cells = parts["coords"], parts["cells"]
         wanted = ((len(coords), 3), np.int32), ((len(coords), CELLS), grid_map.cell_format.dtype)

@@ -26,7 +26,7 @@ from stereovox.config import load_config
 from stereovox.errors import MapFileError, one_line
 from stereovox.frame import Viewpoint
 from stereovox.maps.store_read import read_blocks
-from stereovox.untrusted import json_value, read_bounded, shown
+from stereovox.untrusted import count_in, json_value, read_bounded
 
 if TYPE_CHECKING:
     from stereovox.maps.voxel_map import VoxelMap
@@ -91,11 +91,11 @@ def load_map(path: str | Path) -> VoxelMap:
         if isinstance(cells_of := manifest["config"].get("map"), dict):
             cells_of.setdefault("prior", 0.5)  # that of maps from before there was one
         voxel_map = VoxelMap(load_config(manifest["config"]))
-        voxel_map.frames, voxel_map.frames_refused = _count(manifest, "frames"), _count(manifest, "frames_refused")
+        voxel_map.frames, voxel_map.frames_refused = count_in(manifest, "frames"), count_in(manifest, "frames_refused")
         voxel_map.recording = one_line(str(manifest["recording"]))
         voxel_map.viewpoint = _viewpoint_from(manifest.get("viewpoint"))
         voxel_map.window_state = manifest.get("window")
-        data, blocks = folder / str(manifest["data"]), _count(manifest, "blocks")
+        data, blocks = folder / str(manifest["data"]), count_in(manifest, "blocks")
         coords, cells = read_blocks(data, blocks, voxel_map.cell_format.dtype)
         if _checksums(coords, cells, manifest["checksum"]) != manifest["checksum"]:
             raise ValueError("the cells do not match their checksum")
@@ -103,13 +103,6 @@ def load_map(path: str | Path) -> VoxelMap:
         raise MapFileError(f"{folder}: damaged map ({type(error).__name__}: {error}); make it anew") from None
     voxel_map.insert(coords, cells)
     return voxel_map
-
-
-def _count(manifest: dict[str, Any], key: str) -> int:
-    count = manifest[key]
-    if type(count) is not int or not 0 <= count < 1 << 62:
-        raise ValueError(f"{key} {shown(count)} is no count")
-    return count
 
 
 def is_map(path: str | Path) -> bool:

@@ -116,7 +116,6 @@ def test_a_tree_whose_size_lies(tmp_path, size):
 def test_a_tree_that_claims_the_whole_world(tmp_path):
     said = refusal(read_octomap, tree(tmp_path / "a.bt", struct.pack("<H", 1), 2))
     assert "its nodes stand for up to 3.52e+13 cells" in said
-    assert len(said) < 500
     whole = b"# Octomap OcTree file\nid OcTree\nsize 1\nres 0.1\ndata\n" + struct.pack("<fB", 1.0, 0)
     (tmp_path / "a.ot").write_bytes(whole)
     assert "its nodes stand for up to" in refusal(read_octomap, tmp_path / "a.ot")

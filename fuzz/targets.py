@@ -23,6 +23,7 @@ from made_mcap import Message, Style, mcap
 from made_recordings import depth_image, write_png
 from made_rigs import recorded
 from made_robot_bags import START_NS, Messages, RobotBagMaker, planar_numbers
+from numcodecs import Zstd
 
 from mutate import with_right_sums
 from stereovox.config import load_config
@@ -173,7 +174,7 @@ PIECES = ("coords/zarr.json", "coords/c/0/0", "cells/zarr.json", "cells/c/0/0", 
 
 def read_piece(data: bytes, folder: Path) -> None:
     """The first byte says which file of the arrays gets the others."""
-    path = next(saved(folder).glob("cells-*")) / PIECES[data[0] % len(PIECES) if data else 0]
+    path = next(saved(folder).glob("cells-[0-9a-f]*")) / PIECES[data[0] % len(PIECES) if data else 0]
     whole = path.read_bytes()
     try:
         path.write_bytes(data[1:])
@@ -183,24 +184,24 @@ def read_piece(data: bytes, folder: Path) -> None:
 
 
 def pieces(folder: Path) -> list[bytes]:
-    inner = next(saved(folder).glob("cells-*"))
+    inner = next(saved(folder).glob("cells-[0-9a-f]*"))
     return [bytes([k]) + (inner / piece).read_bytes() for k, piece in enumerate(PIECES)]
 
 
 def read_cells(data: bytes, folder: Path) -> None:
     """The bytes are coordinates (12 each) and cells of two kinds, in a folder that is sound otherwise."""
-    import zarr
-
     coords = np.frombuffer(data[: len(data) // 12 * 12], "<i4").reshape(-1, 3)
     cells = np.resize(np.frombuffer(data or b"\0", np.uint8), (len(coords), 512)).astype(np.int16) * 131
     path = saved(folder)
     manifest = json.loads((path / "manifest.json").read_text())
     whole = json.dumps(manifest)
     manifest |= {"data": "cells-made", "blocks": len(coords), "checksum": [zlib.crc32(coords), zlib.crc32(cells)]}
-    group = zarr.open_group(path / "cells-made", mode="w", zarr_format=3)
-    rows = max(1, len(coords))
     for name, array in (("coords", coords), ("cells", cells)):
-        group.create_array(name, shape=array.shape, dtype=array.dtype, chunks=(rows, array.shape[1]))[:] = array
+        told = json.loads((next(path.glob("cells-[0-9a-f]*")) / name / "zarr.json").read_text())
+        told["chunk_grid"]["configuration"]["chunk_shape"] = [max(1, len(array)), array.shape[1]]
+        (path / "cells-made" / name / "c/0").mkdir(parents=True, exist_ok=True)
+        (path / "cells-made" / name / "zarr.json").write_text(json.dumps(told | {"shape": array.shape}))
+        (path / "cells-made" / name / "c/0/0").write_bytes(Zstd().encode(array.tobytes()))
     try:
         (path / "manifest.json").write_text(json.dumps(manifest))
         loaded = load_map(path)

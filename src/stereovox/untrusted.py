@@ -6,6 +6,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import re
 import reprlib
 import stat
 import tomllib
@@ -20,6 +21,10 @@ MOST_YAML = 1 << 14
 """Bytes of a small YAML file: reading takes 20 us for each."""
 MOST_DOTS = 200
 """Dots in one line of TOML; the time for a key `a.b.c` goes with their square."""
+DEEPEST = 64
+"""Brackets within brackets in YAML."""
+BRACKETS = re.compile(r"[\[\]{}]")
+LARGEST_COUNT = 1 << 62
 MOST_NODES = 100_000
 """Values in a YAML file, each counted as often as aliases repeat it."""
 
@@ -30,12 +35,12 @@ def read_bounded(path: Path, most: int = MOST_SETTINGS) -> bytes:
     A pipe would be waited for, and a device never ends.
     """
     with open(path, "rb", opener=_without_waiting) as file:
-        if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+        status = os.fstat(file.fileno())
+        if not stat.S_ISREG(status.st_mode):
             raise OSError(errno.EINVAL, "not a file")
-        data = file.read(most + 1)
-    if len(data) > most:
-        raise OSError(errno.EFBIG, f"holds more than {most} bytes, which is too many for such a file")
-    return data
+        if status.st_size > most:
+            raise OSError(errno.EFBIG, f"holds more than {most} bytes, which is too many for such a file")
+        return file.read(status.st_size)  # room is made for all that is asked for, there or not
 
 
 def read_text(path: Path, most: int = MOST_SETTINGS, errors: str = "strict") -> str:
@@ -69,6 +74,8 @@ def yaml_value(text: str | bytes, loader_class: Any = None) -> Any:
     import yaml
 
     loader = None
+    text = text.decode("utf-8-sig") if isinstance(text, bytes) else text  # UnicodeDecodeError is a ValueError
+    _check_brackets(text)
     try:
         loader = (loader_class or yaml.SafeLoader)(text)
         node = loader.get_single_node()
@@ -83,6 +90,14 @@ def yaml_value(text: str | bytes, loader_class: Any = None) -> Any:
     finally:
         if loader is not None:
             loader.dispose()
+
+
+def count_in(table: dict[str, Any], key: str) -> int:
+    """Return the count that stands under `key`; raises KeyError, and ValueError for what cannot be a count."""
+    count = table[key]
+    if type(count) is not int or not 0 <= count < LARGEST_COUNT:
+        raise ValueError(f"{key} {shown(count)} is no count")
+    return count
 
 
 def shown(value: Any) -> str:
@@ -103,6 +118,15 @@ _SHORT.maxlevel, _SHORT.maxlist, _SHORT.maxtuple, _SHORT.maxdict, _SHORT.maxstri
 
 def _without_waiting(path: str, flags: int) -> int:
     return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
+
+
+def _check_brackets(text: str) -> None:
+    """Raise ValueError where brackets nest deeper than `DEEPEST`: PyYAML's time goes with the square of that."""
+    depth = 0
+    for bracket in BRACKETS.findall(text):
+        depth = depth + 1 if bracket in "[{" else max(depth - 1, 0)
+        if depth > DEEPEST:
+            raise ValueError("nested too deeply")
 
 
 def _unfolded(node: Any, known: dict[int, int]) -> int:

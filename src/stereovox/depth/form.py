@@ -38,7 +38,12 @@ SHARED = {
     "fault_detail": TEXT,
 }
 FIELDS = {
-    Frame: {"camera": Field(get_args(VirtualCamera), "a camera"), "depth_scale": NUMBER, "farthest": NUMBER, "reason": ARRAY_OR_NONE},
+    Frame: {
+        "camera": Field(get_args(VirtualCamera), "a camera"),
+        "depth_scale": NUMBER,
+        "farthest": NUMBER,
+        "reason": ARRAY_OR_NONE,
+    },
     StereoFrame: {"left": ARRAY, "right": ARRAY, "pair": Field((StereoPair,), "a StereoPair")},
     Scan: dict.fromkeys(("angle_min", "angle_step", "range_min", "range_max"), NUMBER)
     | {"ranges": ARRAY, "clear": ARRAY_OR_NONE, "clear_from": ARRAY_OR_NONE},

@@ -31,7 +31,7 @@ from stereovox.frame import Viewpoint
 from stereovox.history import History
 from stereovox.maps.lock import LOCK, only_writer_in
 from stereovox.maps.store_read import ARRAYS, read_blocks
-from stereovox.untrusted import json_value, read_bounded, shown
+from stereovox.untrusted import count_in, json_value, read_bounded
 
 if TYPE_CHECKING:
     from stereovox.maps.voxel_map import VoxelMap
@@ -122,7 +122,7 @@ def _load(folder: Path, manifest: dict[str, Any]) -> VoxelMap:
         voxel_map.viewpoint = _viewpoint_from(manifest.get("viewpoint"))
         voxel_map.window_state = manifest.get("window")
         start_ns = _start_ns(manifest.get("times_start_ns"))
-        data, blocks = folder / str(manifest["data"]), _count(manifest, "blocks")
+        data, blocks = folder / str(manifest["data"]), count_in(manifest, "blocks")
         dtypes = [voxel_map.cell_format.dtype, np.dtype(np.uint32)][: 2 if voxel_map.config.map.keep_times else 1]
         coords, cells, *times = arrays = read_blocks(data, blocks, *dtypes)
         if _checksums(arrays, manifest["checksum"]) != manifest["checksum"]:
@@ -133,13 +133,6 @@ def _load(folder: Path, manifest: dict[str, Any]) -> VoxelMap:
     if times:
         voxel_map.set_times(coords, times[0], start_ns)
     return voxel_map
-
-
-def _count(manifest: dict[str, Any], key: str) -> int:
-    count = manifest[key]
-    if type(count) is not int or not 0 <= count < 1 << 62:
-        raise ValueError(f"{key} {shown(count)} is no count")
-    return count
 
 
 def is_map(path: str | Path) -> bool:

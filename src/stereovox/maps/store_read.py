@@ -102,7 +102,7 @@ def _check_chunk(path: Path, size: int, unpacked: int) -> None:
     """Raise ValueError for a chunk that does not say that it unpacks to just so many bytes."""
     with path.open("rb") as file:
         head = file.read(18)
-    if head[:4] != ZSTD or _announced(head) != unpacked or size > 2 * unpacked + 64:
+    if len(head) < 6 or head[:4] != ZSTD or _announced(head) != unpacked or size > 2 * unpacked + 64:
         raise ValueError(f"chunk {path.parent.name} of {path.parents[2].name} does not unpack to {unpacked} bytes")
 
 

@@ -21,6 +21,8 @@ from stereovox.untrusted import read_bounded
 
 MOST_BLOCKS = 2**18
 """Blocks of 8x8x8 cells a file may unfold to (134 million cells); one node can claim 35 million million cells."""
+BLOCKS_OF_ANY, BLOCKS_A_LEAF = 2**16, 256
+"""Few leaves may unfold to fewer: a file of 40 bytes is not to take a second."""
 LARGEST_LOG_ODDS = 30.0
 OCTOMAP: dict[str, Any] = {"map.prior": 0.5, "map.log_odds_min": -2.0, "map.log_odds_max": 3.5}
 """What OctoMap does when nothing else is said; the files do not tell."""
@@ -156,9 +158,9 @@ def _with_limits(config: Config, log_odds: NDArray[np.float32]) -> Config:
 
 
 def _map_of(leaves: _Leaves, config: Config) -> VoxelMap:
-    room = _blocks_of(leaves)
-    if room > MOST_BLOCKS:
-        raise ValueError(f"its nodes stand for up to {room * 512:.3g} cells, more than {MOST_BLOCKS * 512:.3g}")
+    room, most = _blocks_of(leaves), min(MOST_BLOCKS, max(BLOCKS_OF_ANY, BLOCKS_A_LEAF * len(leaves.heights)))
+    if room > most:
+        raise ValueError(f"its nodes stand for up to {room * 512:.3g} cells, more than {most * 512:.3g}")
     coords, values = np.zeros((room, 3), np.int32), np.zeros((room, 512), np.int16)
     limits = config.map
     units = to_units(np.clip(leaves.log_odds, limits.log_odds_min, limits.log_odds_max)).astype(np.int16)

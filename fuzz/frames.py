@@ -20,9 +20,9 @@ from typing import Any
 from zlib import crc32
 
 import numpy as np
-from made_frames import Maker
 
 import stereovox as sv
+from made_frames import Maker
 from stereovox.errors import ConfigError
 from stereovox.frame import Frame, Scan, StereoFrame
 from stereovox.grid_mapper import GridMapper

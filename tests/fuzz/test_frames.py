@@ -3,9 +3,9 @@
 
 import warnings
 
-import frames as fuzz
 import pytest
 
+import frames as fuzz
 import stereovox as sv
 
 

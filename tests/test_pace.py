@@ -1,5 +1,7 @@
 """How thoroughly there is time to look at a frame: no clock, the milliseconds are given."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -60,7 +62,7 @@ def test_a_way_that_stays_too_slow_is_tried_less_and_less_often():
 def test_on_the_last_way_frames_are_left_out_as_time_wants(cost):
     steps = run(2000, [100.0, 50.0, cost])[10:]
     left_out = [step < 0 for step in steps]
-    assert not any(a and b for a, b in zip(left_out, left_out[1:], strict=False))
+    assert not any(a and b for a, b in pairwise(left_out))
     spent = cost * (len(steps) - sum(left_out))
     assert spent <= DEADLINE * len(steps) + 2 * DEADLINE
     assert spent >= DEADLINE * len(steps) - 4 * DEADLINE  # and no more than that
@@ -69,7 +71,7 @@ def test_on_the_last_way_frames_are_left_out_as_time_wants(cost):
 def test_at_most_every_other_frame_is_left_out():
     left_out = [step < 0 for step in run(2000, [900.0, 900.0, 900.0])]
     assert 0.49 < np.mean(left_out) <= 0.5
-    assert not any(a and b for a, b in zip(left_out, left_out[1:], strict=False))
+    assert not any(a and b for a, b in pairwise(left_out))
 
 
 costs = st.lists(st.floats(0.1, 60), min_size=3, max_size=3).map(lambda found: sorted(found, reverse=True))

@@ -51,7 +51,8 @@ def open_stream(path_or_name: str | os.PathLike[str], frames: str | None = None)
     """Return what `open_source` returns, or the frames that a live camera (`realsense:`) delivers from now on.
 
     A live camera is read by a thread of its own; frames that nobody takes in time are dropped, the oldest first, and
-    counted (`dropped`). Of it, `frames` can only count forwards: `:300` are the next 300 that are taken. Raises SourceError as `open_source`.
+    counted (`dropped`). Of it, `frames` can only count forwards: `:300` are the next 300 that are taken.
+    Raises SourceError as `open_source`.
     """
     where = os.fspath(path_or_name)
     live = _live(where)

@@ -1,0 +1,158 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Does a map forget a person who passed, and keep a thin pole that is often missed?"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.evaluate.clearing import ClearTimes, time_to_clear
+from stereovox.evaluate.truth import touched_cells
+from stereovox.frame import Frame
+from stereovox.geometry import inverse, transform_points
+from stereovox.mapper import Mapper
+from stereovox.maps import State
+from stereovox.sources.passing import BEFORE, HZ, TALL, WALK_FROM, WALK_X, WIDE, Passing
+
+GONE = (State.FREE, State.TENTATIVE, State.UNKNOWN)
+"""States in which a cell is no obstacle any more."""
+NOISE = 0.3
+"""Metres about the person in which cells are followed: six standard deviations of the depth."""
+
+
+@dataclass(frozen=True, eq=False)
+class Ghosts:
+    """What became of the cells where a person had been, and of what stayed.
+
+    number: (F,) ghosts after each frame: cells that are occupied though the frame truly sees through them.
+    gone: frames until a cell that is seen free was no longer occupied; free: until it was free.
+    left: cells still occupied in the last frame; unseen: those of them that no frame ever saw free.
+    after_leaving: frames, from the first that does not show the person, until no cell that was seen is a ghost; inf:
+        never.
+    pole_lost: of the layers of cells in which the pole was found in the first second, the share in which, later, it has
+        no occupied cell; mean over all frames. 1 where it was not found at all.
+    pole_free: the same for single cells that had been occupied and are free; the pole may only have grazed them.
+    static_lost: share of the wall's and floor's cells, occupied before the person came, that were not so at the end.
+    """
+
+    number: NDArray[np.int64]
+    gone: ClearTimes
+    free: ClearTimes
+    left: int
+    unseen: int
+    after_leaving: float
+    pole_lost: float
+    pole_free: float
+    static_lost: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return all as plain numbers; times in seconds, None for never."""
+        gone, free = self.gone.as_dict(), self.free.as_dict()
+        seconds = {
+            "gone_median_s": gone["median"],
+            "gone_longest_s": gone["longest"],
+            "free_longest_s": free["longest"],
+            "after_leaving_s": self.after_leaving,
+        }
+        return {
+            "cells": gone["cells"],
+            "cleared": gone["cleared"],
+            **{name: _finite(frames) for name, frames in seconds.items()},
+            "left": self.left,
+            "unseen": self.unseen,
+            "pole_lost": self.pole_lost,
+            "pole_free": self.pole_free,
+            "static_lost": self.static_lost,
+        }
+
+
+def ghosts(source: Passing, frames: list[Frame] | None = None, **settings: Any) -> Ghosts:
+    """Map the frames of `source` and follow all cells where the person passes, and those of the pole.
+
+    frames: those of the source, where several maps are made of the same ones. settings: of the mapper.
+    """
+    frames = frames or [source.frame(i) for i in range(len(source))]
+    mapper = Mapper(**settings)
+    side = mapper.config.voxel_size
+    passed, pole = passed_cells(side), touched_cells(source.pole.triangles, side)
+    centers, pole_centers = mapper.map.centers(passed), mapper.map.centers(pole)
+    stay = np.empty((0, 3))
+    states, poles = [], []
+    for i, frame in enumerate(frames):
+        if i == BEFORE:
+            stay = mapper.map.occupied()
+        mapper.add(frame)
+        states.append(mapper.map.state(centers))
+        poles.append(mapper.map.state(pole_centers))
+    static_lost = float((mapper.map.state(stay) != State.OCCUPIED).mean()) if len(stay) else 0.0
+    return _judged(source, mapper, np.array(states), centers, _pole(np.array(poles), pole), static_lost)
+
+
+def passed_cells(side: float) -> NDArray[np.int32]:
+    """Return the indices (N, 3) of all cells with sides `side` where the person passes, or its noise may be."""
+    deep, half = WIDE / 2 + NOISE, WALK_FROM + WIDE
+    low, high = (WALK_X - deep, -half, 2 * side), (WALK_X + deep, half, TALL + NOISE)  # the floor stays
+    axes = [np.arange(np.floor(a / side), np.ceil(b / side)) for a, b in zip(low, high, strict=True)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3).astype(np.int32)
+
+
+def seen_free(
+    source: Passing, i: int, centers: NDArray[np.float64], side: float, max_range: float
+) -> NDArray[np.bool_]:
+    """Tell which cells (N,) with sides `side` frame `i` truly sees through; the person must be a cell away."""
+    camera = source.camera
+    points = transform_points(inverse(source.T_world_camera), centers)
+    z, half = points[:, 2], side * np.sqrt(3) / 2
+    ahead = np.maximum(z, 1e-3)
+    u = np.rint(points[:, 0] / ahead * camera.fx + camera.cx).astype(int)
+    v = np.rint(points[:, 1] / ahead * camera.fy + camera.cy).astype(int)
+    inside = (z > half) & (z + half < max_range) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
+    depth = source.true_depth(i)[np.where(inside, v, 0), np.where(inside, u, 0)]
+    person = source.person(i)
+    away = np.ones(len(centers), bool) if person is None else ~person.contains(centers, margin=side + half)
+    return inside & (depth > z + half) & away
+
+
+def _judged(
+    source: Passing,
+    mapper: Mapper,
+    states: NDArray[np.uint8],
+    centers: NDArray[np.float64],
+    pole: tuple[float, float],
+    static_lost: float,
+) -> Ghosts:
+    frames, side, reach = len(states), mapper.config.voxel_size, mapper.config.max_range
+    seen = np.array([seen_free(source, i, centers, side, reach) for i in range(frames)])
+    ever_seen = seen[BEFORE:].any(axis=0)
+    left = states[-1] == State.OCCUPIED
+    empty_from = next(i for i in range(frames - 1, 0, -1) if source.sees_person(i - 1))
+    ghost = ((states[empty_from:] == State.OCCUPIED) & ever_seen).any(axis=1)
+    return Ghosts(
+        ((states == State.OCCUPIED) & seen).sum(axis=1),
+        time_to_clear(states, seen, GONE),
+        time_to_clear(states, seen),
+        int(left.sum()),
+        int((left & ~ever_seen).sum()),
+        np.inf if ghost[-1] else float(len(ghost) - ghost[::-1].argmax() + 1 if ghost.any() else 0),
+        *pole,
+        static_lost,
+    )
+
+
+def _pole(states: NDArray[np.uint8], pole: NDArray[np.int32]) -> tuple[float, float]:
+    """Return what `Ghosts` tells of the pole for the states (F, N) of its cells (N, 3)."""
+    occupied, layers = states == State.OCCUPIED, pole[:, 2]
+    stands = np.stack([occupied[:, layers == layer].any(axis=1) for layer in np.unique(layers)], axis=1)
+    found, once = stands[:BEFORE].any(axis=0), occupied[:BEFORE].any(axis=0)
+    return _share(~stands[BEFORE:, found]), _share(states[BEFORE:, once] == State.FREE)
+
+
+def _share(flags: NDArray[np.bool_]) -> float:
+    return float(flags.mean()) if flags.size else 1.0
+
+
+def _finite(frames: float | None) -> float | None:
+    return None if frames is None or not np.isfinite(frames) else round(float(frames) / HZ, 3)

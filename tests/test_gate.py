@@ -14,6 +14,7 @@ from stereovox.gate import Gate
 from stereovox.geometry import rotation_matrix
 from stereovox.grid_mapper import GridMapper
 from stereovox.history import MOST_SENSORS, History
+from stereovox.maps.grid_store import load_grid
 
 CAMERA = sv.PinholeCamera(16, 12, 12.0, 12.0, 7.5, 5.5, 0.05)
 AHEAD = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])
@@ -264,12 +265,26 @@ def test_scans_go_through_the_same_gate_and_a_camera_beside_them_has_its_own_tim
     assert mapper.add(scan_at(133, pose_off_ns=10**9)).refused == "pose_extrapolated"
     assert mapper.map.occupancy().cells.tobytes() == before
     mapper.map.save(tmp_path / "grid.npz")
-    from stereovox.maps.grid_store import load_grid
-
     again = load_grid(tmp_path / "grid.npz")
     assert again.history == mapper.map.history
     assert again.frames_refused == 3
     assert GridMapper(mapper.config, resume=again).add(scan_at(166, 20.0)).refused == "pose_jump"
+
+
+def test_a_floors_run_may_be_split_anywhere(tmp_path):
+    ms = [0, 100, 50, 200, 300, 400, 800, 1200, 1500, -9000, -8900, -8000, -7800, 1600]
+    x = [0, 0.1, 0.2, 0.2, 9, 9, 9, 9, 9, 9, 9, 9, 9, 9]
+    whole, parts = GridMapper("ist2019"), GridMapper("ist2019")
+    refused = []
+    for scan in map(scan_at, ms, x):
+        parts.map.save(tmp_path / "grid.npz")
+        parts = GridMapper("ist2019", resume=load_grid(tmp_path / "grid.npz"))
+        refused.append(whole.add(scan).refused)
+        assert parts.add(scan).refused == refused[-1]
+    jump, reset = "pose_jump", "clock_reset"
+    assert refused == [None, None, "stamp_backwards", None, *[jump] * 4, None, *[reset] * 2, None, None, None]
+    assert parts.map.history == whole.map.history
+    assert all((a == b).all() for a, b in zip(parts.map.tiles(), whole.map.tiles(), strict=True))
 
 
 def test_a_report_tells_that_frames_are_believed_again():

@@ -22,7 +22,7 @@ from stereovox.sources.poses import Poses
 ENDINGS = (".clf", ".log", ".clf.bz2", ".log.bz2")
 LONGEST = 1 << 20
 """Bytes of a line; what is longer is no line of a log."""
-SMALL, PACKED_BEST = 1 << 20, 100
+SMALL, PACKED_BEST = 1 << 18, 100
 """A packed log may become so many bytes, or so many for each of its own; text packs to a tenth."""
 NO_ECHO_MEANS = {"unknown": np.nan, "free": np.inf}
 OFFSETS = {"robot_frontlaser_offset", "robot_front_laser_offset", "frontlaser_offset"}

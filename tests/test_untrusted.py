@@ -6,6 +6,7 @@ import time
 
 import pytest
 
+from stereovox.cli.terminal import say
 from stereovox.config import load_config
 from stereovox.errors import ConfigError, FrameRefused, MissingExtra, SourceError, StereovoxError
 from stereovox.sources.camera_file import read_camera
@@ -130,3 +131,8 @@ def test_times_beyond_all_bounds(tmp_path, stamp):
         return
     with pytest.raises(SourceError, match="is no time in seconds"):
         read_tracker(tmp_path / "a.txt")
+
+
+def test_notes_cannot_write_to_the_terminal(capsys):
+    say("note: a topic /a\x1b[2J\x07b\nsecond line é")
+    assert capsys.readouterr().err == "note: a topic /a\\x1b[2J\\x07b\nsecond line é\n"

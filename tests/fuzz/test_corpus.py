@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Every reader against what broke one before, and against some thousand changed files; always the same ones."""
 
+import json
 import random
 import subprocess
 import sys
@@ -75,8 +76,18 @@ def test_sums_of_a_png_are_put_right():
     assert with_right_sums(start + b"\0\0\0\0 end") == start + zlib.crc32(b"IDATx").to_bytes(4) + b" end"
 
 
-def test_the_long_run_counts(tmp_path):
-    command = [sys.executable, str(FUZZ / "run.py"), "--target", "camera", "--runs", "50", "--json"]
+@pytest.mark.parametrize("how", [[], ["--coverage"]], ids=["plain", "guided"])
+def test_the_long_run_counts(how):
+    if how:
+        pytest.importorskip("atheris")
+    command = [sys.executable, str(FUZZ / "run.py"), "--target", "camera", "--runs", "200", "--json", *how]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert '"runs": 50' in done.stdout
-    assert '"crashes": 0' in done.stdout
+    told = json.loads(done.stdout)["targets"]["camera"]
+    assert (told["runs"], told["crashes"], told["hangs"]) == (200, 0, 0)
+    assert told["refused"] > told["read"]
+
+
+def test_the_long_run_tells_of_a_target_that_is_gone():
+    done = subprocess.run([sys.executable, str(FUZZ / "run.py"), "--target", "none"], capture_output=True, text=True)
+    assert done.returncode == 1
+    assert "KeyError: 'none'" in done.stderr

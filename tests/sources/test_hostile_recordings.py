@@ -21,7 +21,7 @@ from stereovox.calibrate.chessboard import read_grey
 from stereovox.errors import FrameRefused, SourceError
 from stereovox.evaluate.camera_path import read_camera_path
 from stereovox.evaluate.relations import read_relations
-from stereovox.sources import bag_unpack, open_source
+from stereovox.sources import bag_unpack, carmen, open_source
 from stereovox.sources.bag_db3 import Db3File
 from stereovox.sources.bag_messages import Wire, ns_from_ms, read_camera_info
 from stereovox.sources.bag_robot_messages import read_laser_scan, read_point_cloud
@@ -68,7 +68,10 @@ def database(tmp_path, *statements):
         bag.depth(2)
     with sqlite3.connect(bag.path) as file:
         for statement in statements:
-            file.execute(statement)
+            try:
+                file.execute(statement)
+            except sqlite3.OperationalError as error:
+                pytest.skip(f"this SQLite has {error}")
     file.close()
     return bag.path
 
@@ -177,7 +180,7 @@ def test_a_png_with_too_much_or_too_little_in_it(tmp_path):
 
 
 def test_a_packed_log_that_swells(tmp_path, monkeypatch):
-    monkeypatch.setattr(bag_unpack, "SMALL", 1 << 16)
+    monkeypatch.setattr(carmen, "SMALL", 1 << 16)
     path = tmp_path / "a.log.bz2"
     path.write_bytes(bz2.compress(FLASER + b"#" * (1 << 22)))
     log = CarmenLog(str(path))

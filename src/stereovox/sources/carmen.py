@@ -16,13 +16,14 @@ from stereovox.errors import SourceError
 from stereovox.frame import Frame, Scan
 from stereovox.planar import lifted
 from stereovox.sources import parameters
-from stereovox.sources.bag_unpack import most_unpacked
 from stereovox.sources.carmen_lines import LASERS, NO_ECHO, DamagedLine, Reading, read_laser
 from stereovox.sources.poses import Poses
 
 ENDINGS = (".clf", ".log", ".clf.bz2", ".log.bz2")
 LONGEST = 1 << 20
 """Bytes of a line; what is longer is no line of a log."""
+SMALL, PACKED_BEST = 1 << 18, 100
+"""A packed log may become so many bytes, or so many for each of its own; text packs to a tenth."""
 NO_ECHO_MEANS = {"unknown": np.nan, "free": np.inf}
 OFFSETS = {"robot_frontlaser_offset", "robot_front_laser_offset", "frontlaser_offset"}
 
@@ -127,7 +128,7 @@ def _offset(line: bytes, before: float) -> float:
 def _lines(path: Path, damaged: list[str]) -> Iterator[tuple[int, bytes]]:
     try:
         with _opened(path) as file:
-            number, size, most = 0, 0, most_unpacked(path.stat().st_size)
+            number, size, most = 0, 0, max(SMALL, PACKED_BEST * path.stat().st_size)
             while line := file.readline(LONGEST):
                 number, size = number + 1, size + len(line)
                 if size > most:

@@ -38,7 +38,11 @@ SHARED = {
     "fault_detail": TEXT,
 }
 FIELDS = {
-    Frame: {"camera": Field(get_args(VirtualCamera), "a camera"), "depth_scale": NUMBER, "reason": ARRAY_OR_NONE},
+    Frame: {
+        "camera": Field(get_args(VirtualCamera), "a camera"),
+        "depth_scale": NUMBER._replace(reason="bad_scale"),
+        "reason": ARRAY_OR_NONE._replace(reason="bad_reason"),
+    },
     StereoFrame: {"left": ARRAY, "right": ARRAY, "pair": Field((StereoPair,), "a StereoPair")},
     Scan: dict.fromkeys(("angle_min", "angle_step", "range_min", "range_max"), NUMBER)
     | {"ranges": ARRAY, "clear": ARRAY_OR_NONE, "clear_from": ARRAY_OR_NONE},
@@ -49,7 +53,7 @@ MEASURED = {Frame: ("depth",), StereoFrame: ("left", "right"), Scan: ("ranges",)
 def check_form(seen: Any, *kinds: type) -> None:
     """Raise FrameRefused for what is none of `kinds`, and where one of its fields is not what it should be.
 
-    The reason is `bad_form`, or `bad_stamp` for its times, or `bad_sensor`.
+    The reason is `bad_form`, or `bad_stamp` for its times, `bad_sensor`, `bad_scale`, `bad_reason`.
     kinds: out of Frame, StereoFrame and Scan. Looks into no array; a masked one is refused, for nobody asks it for its
     mask. The source's own `fault` is raised too.
     """

@@ -143,7 +143,7 @@ def test_a_window_and_threads_change_no_cell_within(seed, integrator):
 @given(
     seed=st.integers(0, 2**31),
     traversal=st.sampled_from(["exact", "bresenham"]),
-    method=st.sampled_from(["once", "every"]),
+    way=st.sampled_from(["once", "every"]),
 )
 def test_beams_change_only_what_they_passed(seed, traversal, way):
     """NaN and -inf say nothing, +inf clears to the maximum range, a hit clears up to itself."""

@@ -40,33 +40,36 @@ SHARED = {
 FIELDS = {
     Frame: {
         "camera": Field(get_args(VirtualCamera), "a camera"),
-        "depth_scale": NUMBER,
-        "farthest": NUMBER,
-        "reason": ARRAY_OR_NONE,
+        "depth_scale": NUMBER._replace(reason="bad_scale"),
+        "farthest": NUMBER._replace(reason="bad_scale"),
+        "reason": ARRAY_OR_NONE._replace(reason="bad_reason"),
     },
     StereoFrame: {"left": ARRAY, "right": ARRAY, "pair": Field((StereoPair,), "a StereoPair")},
     Scan: dict.fromkeys(("angle_min", "angle_step", "range_min", "range_max"), NUMBER)
     | {"ranges": ARRAY, "clear": ARRAY_OR_NONE, "clear_from": ARRAY_OR_NONE},
 }
+MEASURED = {Frame: ("depth",), StereoFrame: ("left", "right"), Scan: ("ranges",)}
 
 
 def check_form(seen: Any, *kinds: type) -> None:
     """Raise FrameRefused for what is none of `kinds`, and where one of its fields is not what it should be.
 
-    The reason is `bad_form`, or `bad_stamp` for its times, or `bad_sensor`.
+    The reason is `bad_form`, or `bad_stamp` for its times, `bad_sensor`, `bad_scale`, `bad_reason`.
     kinds: out of Frame, StereoFrame and Scan. Looks into no array; a masked one is refused, for nobody asks it for its
     mask. The source's own `fault` is raised too.
     """
-    kind = next((kind for kind in kinds if isinstance(seen, kind)), None)
-    if kind is None:
+    for kind in kinds:
+        if isinstance(seen, kind):
+            break
+    else:
         names = " or a ".join(kind.__name__ for kind in kinds)
         raise FrameRefused("bad_form", f"{type(seen).__name__} is not a {names}")
     _check_fields(seen, SHARED)
     if seen.fault:  # what the source could not deliver is not looked at
         raise FrameRefused(seen.fault, seen.fault_detail or f"{_called(seen)}: {seen.fault}")
     _check_fields(seen, FIELDS[kind])
-    for name in ("depth", "ranges", "left", "right"):
-        if isinstance(getattr(seen, name, None), np.ma.MaskedArray):
+    for name in MEASURED[kind]:
+        if isinstance(getattr(seen, name), np.ma.MaskedArray):
             raise FrameRefused("bad_form", f"{_called(seen)}: {name} is a masked array; fill it, `{name}.filled(0)`")
 
 

@@ -113,7 +113,7 @@ class Beams:
         """Return cosine and sine (N, 2) of each beam; those of the scan before, where it had the same angles."""
         seen = float(scan.angle_min), float(scan.angle_step), len(scan.ranges)
         if seen != self._seen:
-            if not np.isfinite(scan.angle_min + scan.angle_step * len(scan.ranges)):
+            if not np.isfinite(seen[0] + seen[1] * seen[2]):
                 raise FrameRefused("bad_scan", f"{name_of(scan)}: its angles are not finite")
             self._directions, self._seen = np.column_stack([np.cos(scan.angles), np.sin(scan.angles)]), seen
         return self._directions

@@ -34,17 +34,31 @@ class Face(NamedTuple):
     scale: NDArray[np.float32]
 
 
-def faces_of(image: DepthImage) -> list[DepthImage]:
-    """Return the depth image of a wide camera as pinhole images that do not overlap; each takes the nearest pixels."""
+class FaceImage(NamedTuple):
+    """What one face sees. image: a pinhole's depth image. ends: (size, size) float32, the same, but for pixels that
+    see nothing up to the maximum range: the depth along the face's axis up to which that is so.
+    """
+
+    image: DepthImage
+    ends: NDArray[np.float32]
+
+
+def faces_of(image: DepthImage, max_range: float) -> list[FaceImage]:
+    """Return the depth image of a wide camera as pinhole images that do not overlap; each takes the nearest pixels.
+
+    max_range: metres, a depth of the wide camera.
+    """
     assert not isinstance(image.camera, PinholeCamera)
-    return [_cut(image, face) for face in _faces(image.camera)]
+    return [_cut(image, face, np.float32(max_range)) for face in _faces(image.camera)]
 
 
-def _cut(image: DepthImage, face: Face) -> DepthImage:
+def _cut(image: DepthImage, face: Face, max_range: np.float32) -> FaceImage:
     seen = face.pixel >= 0
     depth_m = np.where(seen, image.depth_m.ravel()[face.pixel] * face.scale, np.float32(np.nan))
     reason = np.where(seen, image.reason.ravel()[face.pixel], np.uint8(Reason.MASKED))
-    return DepthImage(depth_m, reason, face.camera, image.T_world_sensor @ face.T_wide_face, image.stamp_ns)
+    ends = np.where(depth_m == np.inf, max_range * face.scale, depth_m)
+    pose = image.T_world_sensor @ face.T_wide_face
+    return FaceImage(DepthImage(depth_m, reason, face.camera, pose, image.stamp_ns), ends)
 
 
 @lru_cache(maxsize=16)

@@ -44,17 +44,18 @@ class Projective:
     def evidence(self, image: DepthImage) -> Evidence:
         """Return what `image` says about the cells it sees; that of a wide camera is cut into pinhole images."""
         if isinstance(image.camera, PinholeCamera):
-            return self._of_pinhole(image, image.camera)
-        return strongest([self._of_pinhole(face, face.camera) for face in faces_of(image)])  # pyright: ignore
+            return self._of_pinhole(image, image.camera, image.depth_m)
+        faces = faces_of(image, self._config.max_range)
+        return strongest([self._of_pinhole(face, face.camera, ends) for face, ends in faces])  # pyright: ignore
 
-    def _of_pinhole(self, image: DepthImage, camera: PinholeCamera) -> Evidence:
+    def _of_pinhole(self, image: DepthImage, camera: PinholeCamera, ends: NDArray[np.float32]) -> Evidence:
         eye, depth_m = self._eyes[camera], image.depth_m
         view = eye.views.at(image.T_world_sensor)
         threads = self._config.threads if eye.mixed_before >= 2 * WORTH_A_THREAD else 1
         _, (windows, n_free, n_mixed) = together(
             threads,
             lambda: eye.hits.find(depth_m, view),
-            lambda: eye.candidates(depth_m, view),
+            lambda: eye.candidates(depth_m, ends, view),
         )
         free, mixed, hit_of = eye.with_hits(n_free, n_mixed)
         eye.mixed_before = len(mixed)
@@ -88,9 +89,14 @@ class _Eye:
         self._free, self._mixed = (np.empty((ROOM, 3), np.int32) for _ in range(2))
         self._stack = np.empty((_cull.STACK, 4), np.int32)
 
-    def candidates(self, depth_m: NDArray[np.float32], view: View) -> tuple[Windows, int, int]:
-        """List free and mixed blocks; return the window images, and how many there are of each."""
-        windows, farthest = self._windows.build(depth_m, float(view.spread) / self._max_range)
+    def candidates(
+        self, depth_m: NDArray[np.float32], ends: NDArray[np.float32], view: View
+    ) -> tuple[Windows, int, int]:
+        """List free and mixed blocks; return the window images, and how many there are of each.
+
+        ends: `depth_m`, but for pixels that see nothing: how far that is.
+        """
+        windows, farthest = self._windows.build(ends, float(view.spread) / self._max_range)
         if self.table.marks:
             self._windows.build_nearest(depth_m)
         end, nearest = np.float32(self._end_of_view(farthest)), self._windows.nearest

@@ -1,0 +1,43 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The law: a map is the same bit for bit for any number of threads and any split of the run by save and load."""
+
+import tempfile
+
+import made_flights as made
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from stereovox.config import load_config
+from stereovox.maps import cell_pool, load_map, make_map
+
+WINDOWS = {
+    "unbounded": {},
+    "drop": {"window.size": [3.2, 3.3, 2.5], "window.trigger": 0.3},
+    "keep": {"window.size": [3.2, 3.3, 2.5], "window.trigger": 0.3, "window.outside": "keep"},
+}
+
+
+@pytest.mark.parametrize("window", WINDOWS)
+@pytest.mark.parametrize("cell", ["int16", "int8", "uint8"])
+@settings(max_examples=3, deadline=None)
+@given(seed=st.integers(0, 999), threads=st.sampled_from([2, 3]), cuts=st.sets(st.integers(0, 13), max_size=2))
+def test_threads_and_splits_change_nothing(window, cell, seed, threads, cuts):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cell_pool, "WORTH_A_THREAD", 2)
+        map_rules = {"map.cell": cell, "map.keep_times": True, "map.forget_s": 2.0, "map.confirm_hits": 2}
+        config = load_config("default", voxel_size=0.1, **map_rules, **WINDOWS[window])
+        moments = list(made.flight(seed, 14))
+        whole = made.fly(make_map(config), moments)
+        parallel = load_config(config, threads=threads)
+        split, done = make_map(parallel), 0
+        for cut in sorted(cuts):
+            made.fly(split, moments[done:cut])
+            with tempfile.TemporaryDirectory() as folder:
+                split.save(f"{folder}/m")
+                split.close()
+                split, done = make_map(parallel, load_map(f"{folder}/m")), cut
+        made.fly(split, moments[done:])
+        made.assert_same(split, whole)
+        split.close()
+        whole.close()

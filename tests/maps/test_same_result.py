@@ -4,12 +4,16 @@
 import tempfile
 
 import made_flights as made
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stereovox.config import load_config
 from stereovox.maps import cell_pool, load_map, make_map
+from stereovox.maps.grid_evidence import GridEvidence
+from stereovox.maps.grid_map import GridMap
+from stereovox.maps.grid_store import load_grid
 
 WINDOWS = {
     "unbounded": {},
@@ -41,3 +45,21 @@ def test_threads_and_splits_change_nothing(window, cell, seed, threads, cuts):
         made.assert_same(split, whole)
         split.close()
         whole.close()
+
+
+@pytest.mark.parametrize("cell", ["int16", "int8", "uint8"])
+def test_a_grid_is_the_same_for_any_split(cell, tmp_path):
+    config = load_config("ist2019", **{"map.cell": cell, "map.confirm_hits": 2})
+    random, whole, split = np.random.default_rng(0), GridMap(config), GridMap(config)
+    for frame in range(9):
+        if frame in (3, 7):
+            split.save(tmp_path / "grid.npz")
+            split = load_grid(tmp_path / "grid.npz").with_config(config)
+        coords = np.array([[frame // 3, 0, 0], [9, frame % 2, 0]], np.int32)
+        evidence = GridEvidence(coords, random.integers(-900, 900, (2, 4096)).astype(np.int16))
+        for one in (whole, split):
+            one.check_room(evidence)
+            one.add(evidence)
+            one.frames += 1
+    for a, b in zip(whole.tiles(), split.tiles(), strict=True):
+        np.testing.assert_array_equal(a, b)

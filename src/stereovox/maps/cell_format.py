@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stereovox.config import MapConfig
+from stereovox.errors import ConfigError
 from stereovox.maps import _cells
 
 BYTE_THRESHOLD = 180
@@ -111,13 +112,19 @@ class CellRules:
         """Most that one frame may add to a cell, so that `confirm_hits` frames must hit it; None: whatever they say.
 
         Fewer frames never make an unknown cell occupied, which starts from the prior and skips "unknown" by one. Where
-        numbers are too coarse for exactly as many, it takes more.
+        numbers are too coarse for exactly as many, it takes more. Raises ConfigError where they are far too coarse.
         """
         frames = self.config.confirm_hits
         if frames == 1:
             return None
         way = int(self.thresholds.occupied_least) - int(self.prior)
-        return max(1, min(ceil(way / frames), (way - 2) // (frames - 1)))
+        most = min(ceil(way / frames), (way - 2) // (frames - 1))
+        if most < 1:
+            raise ConfigError(
+                f"map.confirm_hits {frames}: cells of {self.config.cell} count at most {max(1, way - 1)} hits from "
+                "map.prior to map.occupied_above; ask for fewer"
+            )
+        return most
 
     @cached_property
     def thresholds(self) -> Thresholds:

@@ -44,6 +44,7 @@ class GridMap(WithHistory):
         self.history = History()
         self._rules = CellRules(config.map.model_copy(update={"prior": config.grid.prior}))
         self._format = self._rules.format
+        self._most_rise = self._rules.most_rise
         self._percent = Percent(self._rules)
         self._pool = BlockPool(self._format.dtype, capacity=64, fill=self._format.unknown, cells=CELLS)
 
@@ -116,8 +117,8 @@ class GridMap(WithHistory):
         if self._format.per_log_odds != LOG_ODDS_SCALE:
             factor, shift = self._format.per_log_odds / LOG_ODDS_SCALE, self._format.shift(self.frames)
             values = np.floor(values * factor + shift).astype(np.int32)
-        if self._rules.most_rise is not None:
-            values = np.minimum(values, values.dtype.type(self._rules.most_rise))
+        if self._most_rise is not None:
+            values = np.minimum(values, values.dtype.type(self._most_rise))
         pool, rules = self._pool, self._rules
         pool.reserve(len(evidence.coords))
         return _grid.add_tiles(

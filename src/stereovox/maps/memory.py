@@ -32,10 +32,10 @@ def pool_bytes(config: Config, blocks: int) -> int:
 
 def most_blocks(config: Config) -> int:
     """Return how many blocks fit into `max_memory`. Raises ConfigError where none does."""
-    assert config.max_memory is not None
-    most = _largest(lambda blocks: pool_bytes(config, blocks) <= int(config.max_memory or 0), MOST_BLOCKS)
+    allowed = int(config.max_memory or 0)
+    most = _largest(lambda blocks: pool_bytes(config, blocks) <= allowed, MOST_BLOCKS)
     if not most:
-        raise ConfigError(f"max_memory {int(config.max_memory)}: not one block of cells fits; allow more")
+        raise ConfigError(f"max_memory {allowed}: not one block of cells fits; allow more")
     return most
 
 
@@ -56,14 +56,15 @@ def within_memory(config: Config) -> Config:
     with the cure, for one that does not fit, and where not even the view does: that of a camera at the border of the
     trigger box, `max_range` to all sides and half as far up and down.
     """
-    if config.max_memory is None or (config.window.size is None and config.when_full == "refuse"):
+    allowed = int(config.max_memory or 0)
+    if not allowed or (config.window.size is None and config.when_full == "refuse"):
         _check(config, MOST_BYTES, "choose a smaller window.size or larger cells")
         return config
     if config.when_full != "refuse":
         config = _with_window(config, outside="keep" if config.when_full == "spill" else "drop")
     if config.window.size is None:
         config = _as_wide(config, _widest(config))
-    _check(config, int(config.max_memory), "allow more max_memory, or choose a smaller window.size or larger cells")
+    _check(config, allowed, "allow more max_memory, or choose a smaller window.size or larger cells")
     return config
 
 

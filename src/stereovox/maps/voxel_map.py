@@ -44,6 +44,7 @@ class VoxelMap(WithHistory):
         self.window_state: dict[str, Any] | None = None
         self._rules = CellRules(config.map)
         self._format = self._rules.format
+        self._most_rise = self._rules.most_rise
         self._pool = CellPool(self._rules)
         self._times = CellTimes(config.map) if config.map.keep_times else None
 
@@ -301,7 +302,7 @@ class VoxelMap(WithHistory):
 
     def _in_my_units(self, evidence: Evidence) -> Evidence:
         """Return the evidence as differences of stored numbers; blocks that would get a uniform 0 are left out."""
-        factor, most = self._format.per_log_odds / LOG_ODDS_SCALE, self._rules.most_rise
+        factor, most = self._format.per_log_odds / LOG_ODDS_SCALE, self._most_rise
         if factor == 1 and most is None and (evidence.uniform_value or not len(evidence.uniform)):
             return evidence
         shift = self._format.shift(self.frames)

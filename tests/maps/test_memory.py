@@ -1,0 +1,194 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A map keeps within the memory it was given: it refuses what does not fit, or is a window that always does."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import made_flights as made
+import numpy as np
+import pytest
+
+from stereovox.config import load_config
+from stereovox.errors import ConfigError, FrameRefused
+from stereovox.maps import VoxelMap, load_map, make_map
+from stereovox.maps.grid_evidence import GridEvidence
+from stereovox.maps.grid_map import GridMap
+
+TIMES = {"map.keep_times": True}
+
+
+def settings(max_memory="200 kB", **more):
+    return load_config("default", voxel_size=0.1, max_memory=max_memory, **more)
+
+
+def refusal(one, evidence):
+    try:
+        one.check_room(evidence)
+    except FrameRefused as why:
+        return why
+    return None
+
+
+def refused(one, moments):
+    """Fly as a mapper does; return the frames that were refused."""
+    names = []
+    for i, moment in enumerate(moments):
+        before = [part.tobytes() for part in made.blocks_and_times(one)]
+        why = refusal(one, moment.evidence)
+        if why is None:
+            made.fly(one, [moment])
+        else:
+            assert why.reason == "memory_full"
+            assert "\n" not in str(why)
+            assert [part.tobytes() for part in made.blocks_and_times(one)] == before
+            names.append(i)
+        assert one.memory_bytes <= one.reserved_bytes <= one.config.max_memory
+    return names
+
+
+@pytest.mark.parametrize(
+    ("rules", "max_memory"),
+    [
+        ({}, "200 kB"),
+        ({"map.cell": "int8"}, "100 kB"),
+        (TIMES, "600 kB"),
+        ({**TIMES, "map.cell": "int8"}, "500 kB"),
+    ],
+)
+def test_what_does_not_fit_is_refused_and_what_fits_is_right(rules, max_memory):
+    one = make_map(settings(max_memory, **rules))
+    free = load_config(voxel_size=0.1, **rules)
+    moments = list(made.flight(1, 40))
+    out = refused(one, moments)
+    assert 0 < len(out) < 36, "it comes back to where it was"
+    assert one.reserved_bytes > 0.9 * one.config.max_memory
+    whole = made.fly(VoxelMap(free), [m for i, m in enumerate(moments) if i not in out])
+    made.assert_same(one, whole)
+    assert whole.memory_bytes > 0.4 * one.config.max_memory
+
+
+@pytest.mark.parametrize("max_memory", ["500 MB", 500_000_000])
+def test_memory_is_a_number_or_text(max_memory):
+    assert load_config(max_memory=max_memory).max_memory == 500_000_000
+
+
+@pytest.mark.parametrize("max_memory", ["much", 0, -1, "1 XB", 10**13])
+def test_what_is_no_memory_is_one_line(max_memory):
+    with pytest.raises(ConfigError, match=r"^max_memory"):
+        load_config(max_memory=max_memory)
+    with pytest.raises(ConfigError, match="not one block"):
+        make_map(load_config(max_memory=500))
+
+
+@pytest.mark.parametrize(("when_full", "outside"), [("roll", "drop"), ("spill", "keep")])
+@pytest.mark.parametrize("times", [{}, TIMES], ids=["cells", "times"])
+def test_a_window_takes_what_there_is_and_no_more(when_full, outside, times):
+    one = make_map(settings("200 MB", when_full=when_full, **times))
+    assert 0.6 * 200e6 < one.reserved_bytes <= 200e6
+    assert one._settings.window.outside == outside
+    one.look_from(made.at((3, 3, 3)))
+    wide, deep, high = np.diff(one.window, axis=0)[0]
+    assert wide == deep >= 2 * (5.0 + 1.0)
+    assert high >= 5.0 + 2 * 1.0
+    larger = make_map(settings("250 MB", when_full=when_full, **times))
+    assert larger.reserved_bytes > one.reserved_bytes
+    one.close()
+    larger.close()
+
+
+def test_a_window_that_cannot_be_is_one_line_with_its_cure():
+    with pytest.raises(ConfigError, match=r"holds the view needs .* allow more, or set a smaller max_range"):
+        make_map(settings("1 MB", when_full="roll"))
+    with pytest.raises(ConfigError, match=r"window of 20 x 20 x 20 m .* more than 1 MB; allow more max_memory"):
+        make_map(settings("1 MB", **{"window.size": [20, 20, 20]}))
+    with pytest.raises(ConfigError, match='only be "refuse"'):
+        load_config("ist2019", max_memory="1 MB", when_full="roll")
+
+
+@pytest.mark.parametrize("when_full", ["refuse", "roll", "spill"])
+def test_a_run_goes_on_where_it_was(tmp_path, when_full):
+    config = settings("600 kB" if when_full == "refuse" else "60 MB", max_range=1.0, when_full=when_full, **TIMES)
+    moments = list(made.flight(2, 30))
+    whole, half = make_map(config), make_map(config)
+    out = refused(whole, moments), [*refused(half, moments[:15])]
+    half.save(tmp_path / "m")
+    again = make_map(config, load_map(tmp_path / "m"))
+    assert [*out[1], *(15 + i for i in refused(again, moments[15:]))] == out[0]
+    made.assert_same(again, whole)
+    for one in (whole, half, again):
+        one.close()
+
+
+def test_a_map_that_is_larger_does_not_go_on_but_one_without_bounds_takes_it():
+    earlier = made.fly(VoxelMap(load_config(voxel_size=0.1)), made.flight(3, 30))
+    with pytest.raises(ConfigError, match="more memory than max_memory 50 kB; allow more"):
+        make_map(settings("50 kB"), earlier)
+    capped = make_map(settings("20 MB"), earlier)
+    made.assert_same(capped, earlier)
+    made.assert_same(make_map(load_config(voxel_size=0.1), capped), earlier)
+
+
+def test_a_grid_refuses_what_does_not_fit():
+    one = GridMap(load_config("ist2019", max_memory="1 MB"))
+    for n in range(200):
+        evidence = GridEvidence(np.array([[n, 0, 0]], np.int32), np.full((1, 4096), 300, np.int16))
+        if why := refusal(one, evidence):
+            assert why.reason == "memory_full"
+            break
+        one.add(evidence)
+    assert 20 < n < 199
+    pool = one._pool
+    assert pool.values.nbytes + pool.coords.nbytes + pool.table.nbytes < 1e6
+    one.check_room(GridEvidence(np.array([[0, 0, 0], [999, 0, 0]], np.int32), np.full((2, 4096), [[9], [0]], np.int16)))
+
+
+LONG_FLIGHT = """
+import resource, sys
+import made_flights as made
+import numpy as np
+from stereovox.config import load_config
+from stereovox.errors import FrameRefused
+from stereovox.maps import VoxelMap, make_map
+from stereovox.maps.evidence import Evidence
+
+def moments(frames):
+    random = np.random.default_rng(0)
+    around = np.argwhere(np.ones((8, 8, 8), bool)).astype(np.int32)
+    values = random.integers(-900, 900, (512, 512)).astype(np.int16)
+    for i in range(frames):
+        yield made.at((0.32 * i, 0, 0), i * 10**8), Evidence(around + np.array([4 * i, 0, 0], np.int32), values,
+                                                             np.empty((0, 3), np.int32), 0)
+
+config = load_config(voxel_size=0.01, max_range=0.5, max_memory="40 MB", when_full=sys.argv[1],
+                     **{"map.keep_times": True, "window.trigger": 0.1})
+made.fly(VoxelMap(load_config(config, max_memory=None)), moments(2))  # kernels are loaded
+peak = lambda: 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+address_space = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
+resource.setrlimit(resource.RLIMIT_AS, (address_space + 150_000_000,) * 2)
+before, one, refused = peak(), make_map(config), 0
+for moment in moments(400):
+    try:
+        made.fly(one, [moment])
+    except FrameRefused:
+        refused += 1
+assert peak() - before < 60e6, peak() - before
+if sys.argv[1] == "refuse":
+    assert refused > 300, refused
+    assert len(one._pool) > 10_000
+    whole = made.fly(VoxelMap(load_config(config, max_memory=None, **{"map.keep_times": False})), moments(one.frames))
+    for a, b in zip(one.slabs(), whole.slabs()):
+        assert all((x == y).all() for x, y in zip(a, b))
+else:
+    assert refused == 0
+one.close()
+print("survived", refused)
+"""
+
+
+@pytest.mark.parametrize("when_full", ["refuse", "roll"])
+def test_a_long_flight_survives_under_a_limit_of_the_system(when_full):
+    """Without `max_memory` it would need 3 KB for each of 100,000 blocks."""
+    command = [sys.executable, "-c", LONG_FLIGHT, when_full]
+    done = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, check=False)
+    assert done.stdout.startswith("survived"), done.stderr

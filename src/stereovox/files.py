@@ -40,6 +40,12 @@ def replacing(path: str | Path, error: type[StereovoxError] = MapFileError) -> I
         _remove(temporary)
 
 
+def sync_file(path: Path) -> None:
+    """Wait until the disk holds what is in a file."""
+    with path.open("rb") as file:
+        os.fsync(file.fileno())
+
+
 def sync_folder(folder: Path) -> None:
     """Wait until the disk holds the names in `folder`: what was made, renamed and removed there."""
     try:
@@ -59,8 +65,7 @@ def sync_tree(folder: Path) -> None:
     """Wait until the disk holds all files below `folder`, and their names."""
     for place, _, names in os.walk(folder, topdown=False):
         for name in names:
-            with (Path(place) / name).open("rb") as file:
-                os.fsync(file.fileno())
+            sync_file(Path(place) / name)
         sync_folder(Path(place))
 
 

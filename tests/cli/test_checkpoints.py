@@ -234,6 +234,15 @@ def test_tiles_of_a_dead_run_are_in_nobodys_way(tmp_path):
     assert names(tmp_path) == ["m"]
 
 
+def test_cells_of_a_dead_run_go_even_where_there_is_nothing_left_to_do(tmp_path, capsys):
+    assert mapped(tmp_path / "m", "--frames", ":3") == 0
+    whole = names(tmp_path / "m")
+    (tmp_path / "m" / "cells-0123456789ab" / "coords").mkdir(parents=True)
+    assert mapped(tmp_path / "m", "--frames", ":3", "--resume") == 2
+    assert "already holds all 3 frames" in capsys.readouterr().err
+    assert names(tmp_path / "m") == whole
+
+
 def test_runs_that_are_killed_leave_maps_that_open_and_can_be_gone_on_with():
     script, kills = ROOT / "benchmarks" / "kill.py", 4
     words = [sys.executable, script, "--kills", str(kills), "--frames", ":60", "--json"]

@@ -179,7 +179,10 @@ MISTAKES = [
     ("not a stereovox map", ["map", "{rec}", "--out", "{rec}"]),
     ("no map to go on with", ["map", "{rec}", "--out", "{tmp}/m", "--resume"]),
     ("did you mean '--threads'", ["map", "{rec}", "--out", "{tmp}/m", "--thread", "2"]),
-    ("unknown option '--zebra' (known: --camera, --frames", ["map", "{rec}", "--out", "{tmp}/m", "--zebra"]),
+    (
+        "unknown option '--zebra' (known: --camera, --checkpoint, --frames",
+        ["map", "{rec}", "--out", "{tmp}/m", "--zebra"],
+    ),
     ("'extra' is one argument too many", ["map", "{rec}", "extra", "--out", "{tmp}/m"]),
     ("expected one argument", ["map", "{rec}", "--out"]),
     ("'--jsn' stands before the command; write it after: stereovox info ... --jsn", ["--jsn", "info", "m"]),

@@ -64,5 +64,5 @@ def test_the_page_holds_the_figures_and_needs_no_other_file():
 def test_a_report_that_cannot_be_written_is_one_line(tmp_path):
     picture = tmp_path / "a.png"
     picture.write_bytes(b"png")
-    with pytest.raises(StereovoxError, match=r"nowhere.*cannot write"):
+    with pytest.raises(StereovoxError, match=r"nowhere.*cannot be written"):
         write_report(tmp_path / "nowhere" / "report.html", SUMMARY, picture)

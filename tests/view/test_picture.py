@@ -60,7 +60,7 @@ def test_one_single_cell_can_be_drawn(tmp_path):
 def test_user_mistakes_are_one_line(tmp_path):
     with pytest.raises(StereovoxError, match=r"map\.jpg.*\.png"):
         picture(a_room(), tmp_path / "map.jpg")
-    with pytest.raises(StereovoxError, match="cannot write"):
+    with pytest.raises(StereovoxError, match="cannot be written"):
         picture(VoxelMap.from_cells(CONFIG, np.zeros((0, 3)), []), tmp_path / "no" / "map.png")
     with pytest.raises(StereovoxError, match="up 'w'"):
         picture(a_room(), tmp_path / "map.png", up="w")

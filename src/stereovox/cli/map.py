@@ -69,10 +69,12 @@ def run(arguments: Namespace) -> dict[str, Any]:
     if _of_a_floor(arguments):
         return _grid(arguments)
     from stereovox.maps.lock import only_writer_in
+    from stereovox.maps.store import sweep
 
     out = Path(arguments.out)
     _check_target(out, arguments.resume)
     with only_writer_in(out):
+        sweep(out)
         return _mapped(arguments, out)
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from stereovox.errors import StereovoxError
+from stereovox.files import replacing
 
 EXPLANATIONS = {
     "precision": "Of the cells the map calls occupied, the share that a surface really touches.",
@@ -33,11 +34,9 @@ def write_report(path: str | Path, summary: dict[str, Any], picture: str | Path)
 
     Raises StereovoxError when the file cannot be written.
     """
-    try:
-        Path(path).write_text(report(summary, Path(picture).read_bytes()), encoding="utf-8")
-    except OSError as error:
-        why = error.strerror or error
-        raise StereovoxError(f"{path}: cannot write the report ({why}); name a writable file") from None
+    text = report(summary, Path(picture).read_bytes())
+    with replacing(path, StereovoxError) as file:
+        file.write(text.encode())
 
 
 def report(summary: dict[str, Any], png: bytes) -> str:

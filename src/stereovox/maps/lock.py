@@ -67,9 +67,9 @@ def _held(what: Path, where: Path, again: bool) -> Iterator[None]:
     where = Path(os.path.realpath(where.parent)) / where.name  # by any name it is the same lock
     with _told(what):
         os.stat(where.parent)  # filelock would make the folder
-        lock = FileLock(where, PATIENCE_S, is_singleton=again, thread_local=again, poll_interval=PATIENCE_S / 5)
+        lock = FileLock(where, is_singleton=again, thread_local=again)
         try:
-            lock.acquire()
+            lock.acquire(PATIENCE_S, PATIENCE_S / 5)
         except Timeout:
             raise MapFileError(f"{what}: is being written by another run; wait for its end or name another") from None
     try:

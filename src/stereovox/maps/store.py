@@ -58,20 +58,20 @@ def save_map(voxel_map: VoxelMap, path: str | Path) -> None:
     check_target(folder)
     data = f"cells-{uuid.uuid4().hex[:12]}"
     with only_writer_in(folder):
-        _sweep(folder)
+        sweep(folder)
         try:
             blocks, checksum = _write_arrays(folder / data, voxel_map)
             sync_tree(folder / data)
             _write_manifest(folder, _manifest(voxel_map, data, blocks, checksum))
         except BaseException as error:
             if _named(folder) != data:  # else it is the map already, whatever the disk says
-                _sweep(folder)
+                sweep(folder)
             if not isinstance(error, OSError):
                 raise
             raise MapFileError(
                 f"{folder}: cannot save the map ({error.strerror or error}); choose a writable folder that has room"
             ) from None
-        _sweep(folder)
+        sweep(folder)
 
 
 def remove_map(folder: Path) -> None:
@@ -79,7 +79,7 @@ def remove_map(folder: Path) -> None:
     with only_writer_in(folder):
         with suppress(OSError):
             (folder / MANIFEST).unlink(missing_ok=True)
-        _sweep(folder)
+        sweep(folder)
 
 
 def check_target(folder: Path) -> None:
@@ -168,8 +168,8 @@ def _is_free(folder: Path) -> bool:
     return folder.is_dir() and all(UNFINISHED.fullmatch(entry.name) for entry in folder.iterdir())
 
 
-def _sweep(folder: Path) -> None:
-    """Remove what saves left that were killed or failed: all that the manifest does not name."""
+def sweep(folder: Path) -> None:
+    """Remove what saves left that were killed or failed: all that the manifest does not name. The lock must be held."""
     named = _named(folder)
     if named is None and is_map(folder):
         return  # a damaged map stays as it is

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from stereovox.errors import MissingExtra, SourceError
+from stereovox.files import sync_file, sync_folder, sync_tree
 from stereovox.sources.bag_files import one_line
 
 SECONDS = {1: 2**32, 2: 2**31}
@@ -130,10 +131,12 @@ class BagFileWriter:
         made: Path = self._writer.path
         if self._ending in (".db3", ".mcap"):
             made = made / f"{made.name}{self._ending}"
-        for path in made.iterdir() if made.is_dir() else [made]:
-            with path.open("rb") as file:
-                os.fsync(file.fileno())
+        if made.is_dir():
+            sync_tree(made)
+        else:
+            sync_file(made)
         made.replace(self._target)
+        sync_folder(self._target.parent)
 
     @contextmanager
     def _told(self) -> Iterator[None]:

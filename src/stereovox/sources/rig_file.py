@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.errors import FrameRefused, SourceError, StereovoxError
+from stereovox.files import replacing
 from stereovox.geometry import Transform
 from stereovox.rigs import Eyes, StereoPair, VirtualCamera
 from stereovox.sources.images import MAX_PIXELS, read_picture_png
@@ -131,7 +132,5 @@ def write_rig(path: Path | str, rig: Rig, remarks: Sequence[str] = ()) -> None:
     """Write `rig` so that `read_rig` gives it back; `remarks` are comments at its top. Raises SourceError."""
     from stereovox.sources.rig_tables import rig_text
 
-    try:
-        Path(path).write_text(rig_text(rig, remarks), "utf-8")
-    except OSError as error:
-        raise SourceError(f"{path}: cannot be written ({error.strerror}); choose a folder that can") from None
+    with replacing(path, SourceError) as file:
+        file.write(rig_text(rig, remarks).encode())

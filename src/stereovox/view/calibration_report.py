@@ -8,7 +8,6 @@ from typing import Any
 
 from stereovox.calibrate.noise import NoiseCalibration
 from stereovox.calibrate.wall import WallCalibration
-from stereovox.errors import StereovoxError
 from stereovox.view import page
 from stereovox.view.calibration import noise_png, wall_png
 
@@ -157,10 +156,4 @@ def _noise_table(found: NoiseCalibration) -> tuple[list[str], list[list[str]]]:
 
 def write_page(folder: Path, name: str, text: str, png: bytes) -> Path:
     """Write NAME.html and NAME.png into `folder`, made where it is missing, and return the page's path."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / f"{name}.png").write_bytes(png)
-        (folder / f"{name}.html").write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise StereovoxError(f"{folder}: cannot write the report ({error.strerror or error}); name a folder") from None
-    return folder / f"{name}.html"
+    return page.write_files(folder, {f"{name}.html": text.encode(), f"{name}.png": png})

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from stereovox.errors import StereovoxError
+from stereovox.files import replacing
 from stereovox.maps import VoxelMap
 from stereovox.view.panels import GREY, INK
 
@@ -47,8 +48,5 @@ def save(figure: Any, path: str | Path) -> None:
     """Save a figure as PNG. Raises StereovoxError for another ending or a file that cannot be written."""
     if Path(path).suffix.lower() != ".png":
         raise StereovoxError(f"{path}: pictures are PNG files; give a name that ends in .png")
-    try:
-        figure.savefig(path, dpi=DPI)
-    except OSError as error:
-        why = error.strerror or error
-        raise StereovoxError(f"{path}: cannot write the picture ({why}); name a writable file") from None
+    with replacing(path, StereovoxError) as file:
+        figure.savefig(file, dpi=DPI, format="png")

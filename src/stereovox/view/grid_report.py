@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 
-from stereovox.errors import StereovoxError
 from stereovox.evaluate.grid_lattice import Laid
 from stereovox.evaluate.grid_scores import GridScores
 from stereovox.view import page
@@ -42,12 +41,8 @@ def write_grid_report(
 
     name, reference: what the maps are called. Raises StereovoxError where they cannot be written.
     """
-    file = page.write_page(folder, "evaluation.html", grid_page(scores, laid, name, reference))
-    try:
-        file.with_name("difference.png").write_bytes(binary_png(laid))
-    except OSError as error:
-        raise StereovoxError(f"{folder}: cannot write the picture ({error.strerror or error}); name a folder") from None
-    return file
+    text = grid_page(scores, laid, name, reference)
+    return page.write_files(folder, {"evaluation.html": text.encode(), "difference.png": binary_png(laid)})
 
 
 def grid_page(scores: GridScores, laid: Laid, name: str, reference: str) -> str:

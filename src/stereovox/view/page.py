@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from stereovox.errors import StereovoxError
+from stereovox.files import replacing
 
 MANY = 7
 """Columns of a table up to which a page has room for large letters."""
@@ -30,13 +31,22 @@ def write_page(folder: str | Path, name: str, text: str) -> Path:
 
     Raises StereovoxError, one line, where it cannot be written.
     """
-    file = Path(folder) / name
+    return write_files(folder, {name: text.encode()})
+
+
+def write_files(folder: str | Path, contents: dict[str, bytes]) -> Path:
+    """Write files into `folder`, made where it is missing, each all or nothing; return the path of the first.
+
+    Raises StereovoxError, one line, where one cannot be written.
+    """
     try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_text(text, encoding="utf-8")
+        Path(folder).mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise StereovoxError(f"{folder}: cannot write the report ({error.strerror or error}); name a folder") from None
-    return file
+    for name, content in contents.items():
+        with replacing(Path(folder) / name, StereovoxError) as file:
+            file.write(content)
+    return Path(folder) / next(iter(contents))
 
 
 def section(heading: str, text: str, *parts: str) -> str:

@@ -13,6 +13,7 @@ from stereovox.errors import StereovoxError
 from stereovox.evaluate.out_folder import out_folder
 from stereovox.evaluate.reproduce.chapter import Chapter, Progress
 from stereovox.evaluate.reproduce.page import HEADS, report
+from stereovox.files import replacing
 
 
 class Steps:
@@ -85,7 +86,5 @@ def _facts(found: Sequence[Chapter], seconds: float) -> list[tuple[str, str]]:
 
 
 def _write(path: Path, text: str) -> None:
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise StereovoxError(f"{path}: cannot write ({error.strerror or error}); choose another --out") from None
+    with replacing(path, StereovoxError) as file:
+        file.write(text.encode())

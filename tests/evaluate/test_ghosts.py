@@ -10,7 +10,7 @@ from stereovox.evaluate.ghosts import ghosts, seen_free
 from stereovox.frame import Reason
 from stereovox.sources.passing import BEFORE, POLE, WALK_X, Passing
 
-SMALL = {"image_width": 128, "pole_m": 0.04}
+SMALL = {"image_width": 160, "pole_m": 0.04}
 
 
 @lru_cache
@@ -66,13 +66,13 @@ def test_the_scene_is_what_it_says():
     assert near.person(len(near) - 1) is None
     assert near.sees_person(middle)
     assert not near.sees_person(0)
-    assert near.true_depth(middle)[36, 64] == pytest.approx(WALK_X - 0.2, abs=0.05)
-    assert near.true_depth(0)[16, 64] == pytest.approx(4.0)
-    assert np.isinf(far.true_depth(0)[16, 64])
+    assert near.true_depth(middle)[45, 80] == pytest.approx(WALK_X - 0.2, abs=0.05)
+    assert near.true_depth(0)[20, 80] == pytest.approx(4.0)
+    assert np.isinf(far.true_depth(0)[20, 80])
     seen, unsure = far.frame(0), silent.frame(0)
-    assert (seen.reason[:16, 16:112] == Reason.TOO_FAR).mean() > 0.9
+    assert (seen.reason[:20, 20:140] == Reason.TOO_FAR).mean() > 0.9
     assert not (unsure.reason == Reason.TOO_FAR).any()
-    assert (unsure.reason[:16, 16:112] == Reason.UNKNOWN).mean() > 0.9
+    assert (unsure.reason[:20, 20:140] == Reason.UNKNOWN).mean() > 0.9
     for a, b in zip((seen.depth, seen.reason), (far.frame(0).depth, far.frame(0).reason), strict=True):
         np.testing.assert_array_equal(a, b)
     with pytest.raises(SourceError, match="background=fog is unknown; use near or far or silent"):
@@ -86,10 +86,10 @@ def test_the_pole_is_missed_in_two_frames_of_three(missed):
     u = round(-POLE[1] / POLE[0] * camera.fx + camera.cx)
     images = [source.frame(i) for i in range(6)]
     near = [
-        ((image.depth[10:30, u - 3 : u + 4] > 0) & (image.depth[10:30, u - 3 : u + 4] < 2000)).any() for image in images
+        ((image.depth[10:40, u - 3 : u + 4] > 0) & (image.depth[10:30, u - 3 : u + 4] < 2000)).any() for image in images
     ]
     assert near == [True, False, False] * 2
-    missing = [(image.reason[10:30, u - 3 : u + 4] == Reason.UNMATCHED).mean() for image in images]
+    missing = [(image.reason[10:40, u - 3 : u + 4] == Reason.UNMATCHED).mean() for image in images]
     assert (missing[1] > 0.2) == (missed == "unmatched")
 
 

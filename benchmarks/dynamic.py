@@ -23,7 +23,7 @@ from stereovox.sources.passing import BACKGROUNDS, HZ, MISSES, Passing
 
 MODELS: dict[str, dict[str, Any]] = {
     "default": {},
-    "Chien 2020": {"profile": "chien2020", "up": "z", "window.size": [20.0, 20.0, 20.0], "depth.downsample": 1},
+    "Chien 2020": {"profile": "chien2020", "up": "z", "window.size": None, "depth.downsample": 1},
     "Valenti 2018": {"profile": "valenti2018", "min_range": 0.2},
     "OctoMap": {
         "integrator": "ray",

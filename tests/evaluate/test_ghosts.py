@@ -25,12 +25,12 @@ def test_ghosts_are_gone_within_half_a_second(background):
     told = found.as_dict()
     assert told["cells"] > 500
     assert told["cleared"] == 1
-    assert told["gone_longest_s"] <= 0.2  # promised: 0.5 s
+    assert told["gone_longest_s"] <= 0.3  # promised: 0.5 s
     assert told["free_longest_s"] <= 0.5
     assert told["after_leaving_s"] <= 0.2
     assert found.left == found.unseen < 60  # only what stands at the border of the image, where no frame sees through
     assert found.number.max() > 20
-    assert not found.number[-60:].any()
+    assert not found.number[-30:].any()
     assert told["static_lost"] < 0.01
 
 
@@ -85,9 +85,8 @@ def test_the_pole_is_missed_in_two_frames_of_three(missed):
     camera = source.camera
     u = round(-POLE[1] / POLE[0] * camera.fx + camera.cx)
     images = [source.frame(i) for i in range(6)]
-    near = [
-        ((image.depth[10:40, u - 3 : u + 4] > 0) & (image.depth[10:40, u - 3 : u + 4] < 2000)).any() for image in images
-    ]
+    shown = [image.depth[10:40, u - 3 : u + 4] for image in images]
+    near = [((depth > 0) & (depth < 2000)).any() for depth in shown]
     assert near == [True, False, False] * 2
     missing = [(image.reason[10:40, u - 3 : u + 4] == Reason.UNMATCHED).mean() for image in images]
     assert (missing[1] > 0.2) == (missed == "unmatched")

@@ -27,7 +27,7 @@ WIDE, TALL = 0.45, 1.75
 """Of the person."""
 WALL = 4.0
 POLE = (1.5, -0.47)
-BEFORE, AFTER = 30, 90
+BEFORE, AFTER = 30, 45
 """Frames in which nobody is there, at the beginning and at the end."""
 
 

@@ -4,13 +4,12 @@
 from __future__ import annotations
 
 from math import acos, dist, inf, radians
-from operator import index
 from typing import NamedTuple
 
 from stereovox.config import Config
 from stereovox.errors import FrameRefused
 from stereovox.frame import AnyFrame, DepthImage, Scan
-from stereovox.history import EARLIEST, LATEST, LONGEST_NAME, MOST_SENSORS, History, Seen, Streak
+from stereovox.history import LONGEST_NAME, MOST_SENSORS, History, Seen, Streak
 
 SLACK_M, SLACK_RAD = 0.05, radians(2)
 """Poses are noisy: so much is no jump, however short the time."""
@@ -51,9 +50,9 @@ class Gate:
     def check(self, frame: AnyFrame | Scan, image: DepthImage | Scan) -> Passed:
         """Return what `took` is to remember once the map has changed.
 
-        image: holds the frame's pose, exactly rigid. Raises FrameRefused: `bad_stamp`, `bad_sensor`,
-        `pose_extrapolated`, `stamp_backwards`, `clock_reset`, `pose_jump`. Of a refused frame nothing is remembered but
-        that it may agree with the next one.
+        image: holds the frame's pose, exactly rigid. Raises FrameRefused: `bad_sensor`, `pose_extrapolated`,
+        `stamp_backwards`, `clock_reset`, `pose_jump`. Of a refused frame nothing is remembered but that it may agree
+        with the next one.
         """
         sensor, stamp_ns = self._told(frame)
         numbers = image.T_world_sensor.ravel().tolist()
@@ -77,20 +76,15 @@ class Gate:
             self._history.settled[passed.after] += 1
 
     def _told(self, frame: AnyFrame | Scan) -> tuple[str, int]:
-        """Return sensor and stamp; raise FrameRefused where they, or how old the pose is, cannot be used."""
-        try:
-            stamp_ns, off_ns = index(frame.stamp_ns), abs(index(frame.pose_off_ns))
-        except TypeError:
-            stamp_ns, off_ns = LATEST + 1, 0
-        if not EARLIEST <= stamp_ns <= LATEST:
-            raise FrameRefused("bad_stamp", f"{_name(frame)}: stamp_ns and pose_off_ns must be int64 nanoseconds")
+        """Return sensor and stamp of a frame whose form was checked (`depth.form`); refuse poses that are too old."""
+        off_ns = abs(int(frame.pose_off_ns))
         if off_ns > self._off_ns:
             limit = f"trust.max_pose_off_s {self._trust.max_pose_off_s:g}"
             said = f"{_name(frame)}: its pose is extrapolated by {off_ns / 1e9:.3f} s ({limit}); give poses in time"
             raise FrameRefused("pose_extrapolated", said)
-        if not isinstance(frame.sensor, str) or len(frame.sensor) > LONGEST_NAME:
-            raise FrameRefused("bad_sensor", f"{_name(frame)}: sensor is no text of at most {LONGEST_NAME} letters")
-        return frame.sensor or ("scan" if isinstance(frame, Scan) else "camera"), stamp_ns
+        if len(frame.sensor) > LONGEST_NAME:
+            raise FrameRefused("bad_sensor", f"{_name(frame)}: sensor has more than {LONGEST_NAME} letters")
+        return frame.sensor or ("scan" if isinstance(frame, Scan) else "camera"), int(frame.stamp_ns)
 
     def _against(self, before: Seen, now: Seen) -> tuple[str, float]:
         """Return why `now` cannot follow `before` ("": it can), and its speed as a share of what is allowed."""

@@ -18,6 +18,7 @@ FULL = History(
     Counter({"clock_reset": 1}),
     Counter({"full": 6, "near": 1}),
     "kitchen",
+    ("frame 9", 2**62),
     {"left": Seen(2**62, POSE), "right": Seen(-5, POSE)},
     {"left": Streak("pose_jump", 2**62 + 1, Seen(2**62 + 9, POSE))},
 )

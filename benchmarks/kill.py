@@ -89,7 +89,7 @@ def contents(out: Path) -> dict[str, Any]:
                     "digest": hashlib.sha256(cells).hexdigest(),
                     "frames": one.frames,
                     "refused": one.frames_refused,
-                    "last_frame": one.last_frame,
+                    "last_frame": one.history.last_frame,
                     "window": one.window_state,
                     "config": one.config.model_dump(),
                 }

@@ -36,6 +36,15 @@ def test_a_copy_goes_on_by_itself():
     assert (FULL.refused.total(), len(FULL.trusted)) == (3, 2)
 
 
+@pytest.mark.parametrize("stamp_ns", [np.zeros(2, int), np.array(5), None, "5", 1.5])
+def test_a_refused_frame_may_hold_anything_as_stamp_and_name(stamp_ns):
+    mapper = sv.Mapper(voxel_size=0.5)
+    camera = sv.PinholeCamera(2, 2, 1, 1, 1, 1)
+    frame = sv.Frame(np.ones((2, 2), np.float32), camera, np.eye(4), stamp_ns=stamp_ns, name=stamp_ns)
+    assert mapper.add(frame).refused == "bad_stamp"
+    assert mapper.map.history.last_frame == (stamp_ns if isinstance(stamp_ns, str) else "", 0)
+
+
 def test_a_map_from_before_there_was_a_history_loads():
     old = {"frames": 4, "frames_refused": 2, "recording": "hall"}
     assert History.loaded(old) == History(4, Counter({NOT_TOLD: 2}), recording="hall")

@@ -38,6 +38,7 @@ def made_frame(seed, camera, share=0.6, patches=True):
     shape = (4, 4) if patches else depth.shape
     what = rng.choice([0, Reason.TOO_FAR, *NO_VALUE], shape, p=[0.8 - share, 0.2, *[share / 4] * 4])
     reason = what[v % 4, u % 4] if not patches else what[4 * v // camera.height, 4 * u // camera.width]
+    depth[reason == Reason.TOO_FAR] = 0  # a depth would contradict it
     turn = rng.normal(size=4)
     T = from_quaternion(rng.uniform(-0.4, 0.4, 3), turn)
     return sv.Frame(depth.astype(np.float32), camera, T, reason=reason.astype(np.uint8), stamp_ns=seed)
@@ -105,7 +106,8 @@ def test_a_wall_stays_whatever_hides_it(integrator, camera, why):
     before = log_odds_of(mapper.map)
     reason = np.full(frame.depth.shape, why, np.uint8)
     reason[:2, :2] = Reason.TOO_FAR
-    blind = replace(frame, depth=np.full_like(frame.depth, 3.9), reason=reason)
+    depth = np.where(reason == Reason.TOO_FAR, 0, np.float32(3.9))
+    blind = replace(frame, depth=depth.astype(np.float32), reason=reason)
     for _ in range(5):
         assert mapper.add(blind).refused is None
     after = log_odds_of(mapper.map)

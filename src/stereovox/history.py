@@ -7,8 +7,9 @@ import copy
 import math
 from collections import Counter
 from dataclasses import dataclass, field
-from operator import index
-from typing import Any, NamedTuple, SupportsIndex
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from stereovox.errors import one_line
 
@@ -63,9 +64,10 @@ class History:
 
     def offered(self, frame: object) -> None:
         """Remember which frame was the last."""
-        stamp_ns = getattr(frame, "stamp_ns", 0)
-        whole = stamp_ns if isinstance(stamp_ns, SupportsIndex) else 0
-        self.last_frame = str(getattr(frame, "name", ""))[:LONGEST_NAME], min(max(index(whole), EARLIEST), LATEST)
+        name, stamp_ns = getattr(frame, "name", ""), getattr(frame, "stamp_ns", 0)
+        whole = int(stamp_ns) if isinstance(stamp_ns, int | np.integer) else 0  # a refused frame may hold anything
+        told = name[:LONGEST_NAME] if isinstance(name, str) else ""
+        self.last_frame = told, min(max(whole, EARLIEST), LATEST)
 
     def refuse(self, reason: str) -> None:
         """Count one refused frame."""

@@ -2,6 +2,7 @@
 """Maps that are saved while they are made: when, what a disk without room leaves, and runs that are killed."""
 
 import json
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -12,6 +13,7 @@ import pytest
 from stereovox.cli import main, map, terminal
 from stereovox.cli.checkpoints import REST, Checkpoints
 from stereovox.errors import MapFileError, StereovoxError
+from stereovox.grid_mapper import GridMapper
 from stereovox.mapper import Mapper
 from stereovox.maps import VoxelMap, load_map
 from stereovox.maps.lock import only_writer_in, only_writer_of
@@ -91,6 +93,16 @@ def test_a_save_that_fails_tells_what_is_saved():
         checkpoints.save(5)
 
 
+@pytest.fixture
+def obeys_signals():
+    """A process that was started in the background or by nohup ignores some, and so would its tests."""
+    usual = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL, signal.SIGHUP: signal.SIG_DFL}
+    before = {number: signal.signal(number, handler) for number, handler in usual.items()}
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
 def at_each_frame(monkeypatch, out, look):
     """Call `look(number)` before each frame is added, with a checkpoint after every frame."""
     add, number = Mapper.add, [0]
@@ -109,7 +121,7 @@ def test_the_map_is_there_from_the_start_and_holds_each_frame_that_was_saved(tmp
     seen = []
 
     def look(number):
-        found, manifest = load_map(tmp_path / "m"), json.loads((tmp_path / "m" / "manifest.json").read_text())
+        found, manifest = load_map(tmp_path / "m").history, json.loads((tmp_path / "m" / "manifest.json").read_text())
         seen.append((found.frames, manifest["last_frame"] and manifest["last_frame"]["number"]))
         assert found.last_frame is None if number == 0 else found.last_frame[0].endswith(f" frame {number - 1}")
         assert len(names(tmp_path / "m")) == 3  # one set of cells, the manifest, the lock
@@ -253,13 +265,65 @@ def test_runs_that_are_killed_leave_maps_that_open_and_can_be_gone_on_with():
     assert found["checkpoints_lost"] == found["with_things_left_after_resume"] == 0
 
 
+@pytest.mark.usefixtures("obeys_signals")
+@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_run_that_is_told_to_stop_saves_what_there_is(tmp_path, monkeypatch, capsys, stop):
+    def look(number):
+        if number == 12:
+            signal.raise_signal(stop)
+
+    at_each_frame(monkeypatch, tmp_path / "m", look)
+    before = signal.getsignal(stop)
+    assert mapped(tmp_path / "m", "--checkpoint", "0") == 128 + stop
+    assert signal.getsignal(stop) == before
+    assert capsys.readouterr().err.endswith(
+        f"stopped after 13 frames; they are saved in {tmp_path / 'm'}, go on with --resume\nstereovox: stopped\n"
+    )
+    assert load_map(tmp_path / "m").frames == 13
+
+
+@pytest.mark.usefixtures("obeys_signals")
+@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("save", [0, 1])
+def test_a_save_is_not_cut_off_by_a_signal(tmp_path, monkeypatch, save, stop):
+    """Neither the first nor the last one; `timeout` sends SIGTERM twice."""
+    real, saves = VoxelMap.save, []
+
+    def told_to_stop(self, path):
+        if len(saves) == save:
+            for _ in range(1 if stop == signal.SIGINT else 2):
+                signal.raise_signal(stop)
+        saves.append(path)
+        real(self, path)
+
+    monkeypatch.setattr(VoxelMap, "save", told_to_stop)
+    status = mapped(tmp_path / "m", "--checkpoint", "0")
+    assert (status, load_map(tmp_path / "m").frames) == ((128 + stop, 1) if save == 0 else (0, 30))
+
+
+@pytest.mark.usefixtures("obeys_signals")
+def test_a_floor_that_is_told_to_stop_is_saved(tmp_path, monkeypatch, capsys):
+    add = GridMapper.add
+
+    def told_to_stop(self, seen):
+        signal.raise_signal(signal.SIGTERM)
+        return add(self, seen)
+
+    monkeypatch.setattr(GridMapper, "add", told_to_stop)
+    words = ["grid", "sim:floor?plan=testbed&seconds=2&scan_hz=2&depth_hz=2&image_width=80", "--poses", "odometry", "--out", str(tmp_path / "floor.yaml")]
+    assert main(words) == 143
+    assert "stopped after 1 of" in capsys.readouterr().err
+    assert names(tmp_path) == ["floor.pgm", "floor.yaml"]
+
+
+@pytest.mark.usefixtures("obeys_signals")
 def test_the_first_ctrl_c_waits_for_the_save_that_is_being_made():
     with terminal.interrupt_between_steps() as check:
-        import signal
-
         saved = []
         signal.raise_signal(signal.SIGINT)
         Checkpoints(lambda: saved.append(1), "m", 1.0).save(1)
         assert saved == [1]
         with pytest.raises(KeyboardInterrupt):
             check()
+        with pytest.raises(KeyboardInterrupt):  # a second one is obeyed at once
+            signal.raise_signal(signal.SIGINT)

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command line. Human text goes to stderr; with --json the last line of stdout is one JSON object.
 
-Exit status: 0 ok, 2 bad usage or bad input (one line says what and how to cure it), 130 stopped by Ctrl-C.
+Exit status: 0 ok, 2 bad usage or bad input (one line says what and how to cure it), 130 stopped by Ctrl-C,
+143 by SIGTERM.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import signal
 import sys
 from collections.abc import Sequence
 from importlib import import_module
@@ -57,8 +59,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _fail(f"{where}{error.strerror or error}; check that it exists and that you may use it", 2)
     except MemoryError:
         return _fail("not enough memory; use larger cells (--voxel-size) or a shorter --max-range", 2)
-    except KeyboardInterrupt:
-        return _fail("stopped", 130)
+    except KeyboardInterrupt as stopped:
+        return _fail("stopped", 128 + (stopped.args[0] if stopped.args else signal.SIGINT))
 
 
 def _print_json(result: dict[str, Any]) -> int:

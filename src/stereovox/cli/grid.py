@@ -34,7 +34,7 @@ from stereovox.cli.terminal import (
     say_about_compiling,
     tracked,
 )
-from stereovox.errors import StereovoxError
+from stereovox.errors import SourceError, StereovoxError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -95,14 +95,19 @@ def _mapped(arguments: Namespace, out: Path) -> dict[str, Any]:
     track = _track(robot, how, config, start)
     reports: list[UpdateReport] = []
     checkpoints = Checkpoints(lambda: _save(mapper, out, arguments.mode), out, arguments.checkpoint)
-    try:
-        _add_all(mapper, (track.corrected(one) if track else one for one in seen), count, reports, checkpoints)
-    except KeyboardInterrupt:
-        if mapper.map.frames:
-            checkpoints.save(len(reports))
-            say(f"stopped after {len(reports)} of {count} readings; they are saved in {out.with_suffix('.yaml')}")
-        raise
-    return _finished(mapper, reports, out, checkpoints)
+    with interrupt_between_steps() as check:
+        try:
+            for one in tracked((track.corrected(one) if track else one for one in seen), count, "mapping"):
+                reports.append(mapper.add(one))
+                check()
+                if not reports[-1].refused:  # a map of nothing must not take the place of an older one
+                    checkpoints.after(len(reports))
+        except (KeyboardInterrupt, SourceError):
+            if mapper.map.frames:
+                checkpoints.save(len(reports))
+                say(f"stopped after {len(reports)} of {count} readings; they are saved in {out.with_suffix('.yaml')}")
+            raise
+        return _finished(mapper, reports, out, checkpoints)
 
 
 def _chosen(robot: Robot, use: str | None, frames: str | None) -> tuple[Iterator[Scan | Frame], int]:
@@ -168,21 +173,6 @@ def _mapper(config: Config, resume: str | None, any_size: bool) -> GridMapper:
         return GridMapper(config)
     before = read_map_server(resume)
     return GridMapper(load_config(config, voxel_size=before.resolution) if any_size else config, resume=before)
-
-
-def _add_all(
-    mapper: GridMapper,
-    seen: Iterator[Scan | Frame],
-    count: int,
-    reports: list[UpdateReport],
-    checkpoints: Checkpoints,
-) -> None:
-    with interrupt_between_steps() as check:
-        for one in tracked(seen, count, "mapping"):
-            reports.append(mapper.add(one))
-            check()
-            if not reports[-1].refused:  # a map of nothing must not take the place of an older one
-                checkpoints.after(len(reports))
 
 
 def _save(mapper: GridMapper, out: Path, mode: str) -> None:

@@ -9,7 +9,7 @@ recording of a ground robot, as for `stereovox grid`.
 from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -89,8 +89,8 @@ def _mapped(arguments: Namespace, out: Path) -> dict[str, Any]:
         for note in source.notes:
             say(f"note: {note}")
         say_about_compiling()
-        with _there_at_once(mapper.map, out):
-            reports = _add_all(mapper, source, out, checkpoints)
+        with interrupt_between_steps() as check, _there_at_once(mapper.map, out):
+            reports = _add_all(mapper, source, out, checkpoints, check)
             result = summarise(mapper.map, reports) | ({"dropped": source.dropped} if source.length is None else {})
             if not mapper.map.frames:
                 raise StereovoxError(
@@ -184,8 +184,10 @@ def _check_recording(mapper: Mapper, source: Stream, out: Path) -> None:
     mapper.map.recording = source.name
 
 
-def _add_all(mapper: Mapper, source: Stream, out: Path, checkpoints: Checkpoints) -> list[UpdateReport]:
-    """Add all frames that the map does not hold yet; on Ctrl-C save what there is."""
+def _add_all(
+    mapper: Mapper, source: Stream, out: Path, checkpoints: Checkpoints, check: Callable[[], None]
+) -> list[UpdateReport]:
+    """Add all frames that the map does not hold yet; where `check` says that it is enough, save what there is."""
     reports: list[UpdateReport] = []
     done = _seen(mapper)
     if done:
@@ -194,17 +196,16 @@ def _add_all(mapper: Mapper, source: Stream, out: Path, checkpoints: Checkpoints
         source = source.after(done)
         say(f"going on after frame {done}")
     try:
-        with interrupt_between_steps() as check:
-            for frame in tracked(source, source.length, "mapping"):
-                reports.append(_added(mapper, frame, checkpoints))
-                check()
-                if mapper.map.frames:  # an empty map must not take the place of an older one
-                    checkpoints.after(_seen(mapper))
-                if source.length is None and len(reports) == PATIENCE and all(one.refused for one in reports):
-                    left = f"{out} stays as it is" if done else "no map is written"  # it would be refused for ever
-                    raise StereovoxError(
-                        f"{source.name}: not one of {PATIENCE} frames could be used, {left} ({_first_refusal(reports)})"
-                    )
+        for frame in tracked(source, source.length, "mapping"):
+            reports.append(_added(mapper, frame, checkpoints))
+            check()
+            if mapper.map.frames:  # an empty map must not take the place of an older one
+                checkpoints.after(_seen(mapper))
+            if source.length is None and len(reports) == PATIENCE and all(one.refused for one in reports):
+                left = f"{out} stays as it is" if done else "no map is written"  # it would be refused for ever
+                raise StereovoxError(
+                    f"{source.name}: not one of {PATIENCE} frames could be used, {left} ({_first_refusal(reports)})"
+                )
     except (KeyboardInterrupt, SourceError):
         if mapper.map.frames:
             checkpoints.save(_seen(mapper))

@@ -8,7 +8,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from stereovox.errors import one_line
@@ -65,29 +65,34 @@ def tracked(items: Iterable[T], total: int | None, text: str) -> Iterator[T]:
 
 @contextmanager
 def interrupt_between_steps() -> Iterator[Callable[[], None]]:
-    """Give a function that raises KeyboardInterrupt if Ctrl-C was pressed: a step is never cut in half by it.
+    """Give a function that raises KeyboardInterrupt if the run was told to stop: a step is never cut in half by it.
 
-    A second Ctrl-C is obeyed at once.
+    By Ctrl-C, of which a second one is obeyed at once, by SIGTERM (`kill`, systemd, docker stop) or by SIGHUP (the
+    terminal is gone), which may come several times: `timeout` sends two. The exception holds the signal's number.
     """
-    pressed: list[int] = []
+    told: list[int] = []
 
     def remember(number: int, _: object) -> None:
-        pressed.append(number)
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+        told.append(number)
+        if number == signal.SIGINT:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
 
     def check() -> None:
-        if pressed:
-            raise KeyboardInterrupt
+        if told:
+            raise KeyboardInterrupt(told[0])
 
-    before = signal.getsignal(signal.SIGINT)
-    ours = before is signal.default_int_handler and threading.current_thread() is threading.main_thread()
-    if ours:  # not where the caller handles or ignores Ctrl-C: notebooks, servers, jobs in the background
-        signal.signal(signal.SIGINT, remember)
-    try:
+    with ExitStack() as stack:
+        for number in _stops() if threading.current_thread() is threading.main_thread() else ():
+            stack.callback(signal.signal, number, signal.signal(number, remember))
         yield check
-    finally:
-        if ours:
-            signal.signal(signal.SIGINT, before)
+
+
+def _stops() -> list[int]:
+    """Return the signals that nobody handles or ignores: notebooks, servers, nohup, jobs in the background do."""
+    usual = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
+    if hasattr(signal, "SIGHUP"):
+        usual[signal.SIGHUP] = signal.SIG_DFL
+    return [number for number, handler in usual.items() if signal.getsignal(number) == handler]
 
 
 def command_line(*words: object) -> str:

@@ -7,8 +7,9 @@ import copy
 import math
 from collections import Counter
 from dataclasses import dataclass, field
-from operator import index
-from typing import Any, NamedTuple, SupportsIndex
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from stereovox.errors import one_line
 
@@ -64,12 +65,12 @@ class History:
     def offered(self, frame: object) -> None:
         """Remember which frame was the last."""
         stamp_ns = getattr(frame, "stamp_ns", 0)
-        whole = stamp_ns if isinstance(stamp_ns, SupportsIndex) else 0
-        self.last_frame = str(getattr(frame, "name", ""))[:LONGEST_NAME], min(max(index(whole), EARLIEST), LATEST)
+        whole = int(stamp_ns) if isinstance(stamp_ns, int | np.integer) else 0
+        self.last_frame = str(getattr(frame, "name", ""))[:LONGEST_NAME], min(max(whole, EARLIEST), LATEST)
 
     def refuse(self, reason: str) -> None:
         """Count one refused frame."""
-        reason = str(reason)[:LONGEST_NAME]
+        reason = one_line(str(reason))[:LONGEST_NAME]  # as `loaded` reads it
         self.refused[reason if reason in self.refused or len(self.refused) < MOST_REASONS else OTHERS] += 1
 
     def copied(self) -> History:
@@ -159,7 +160,7 @@ def _seen_to(seen: Seen) -> dict[str, Any]:
 
 def _seen_from(saved: Any) -> Seen:
     pose = saved["pose"]
-    if not isinstance(pose, list) or len(pose) != 12 or not all(isinstance(x, float | int) for x in pose):
+    if not isinstance(pose, list) or len(pose) != 12 or not all(type(x) in (float, int) for x in pose):
         raise ValueError("history: a pose is not 12 numbers")
     numbers = tuple(map(float, pose))
     if not all(math.isfinite(x) and abs(x) <= FARTHEST for x in numbers):

@@ -22,7 +22,7 @@ from zlib import crc32
 import numpy as np
 
 import stereovox as sv
-from made_frames import Maker
+from random_frames import Maker
 from stereovox.errors import ConfigError
 from stereovox.frame import Frame, Scan, StereoFrame
 from stereovox.grid_mapper import GridMapper

@@ -85,6 +85,7 @@ def test_each_sensor_has_its_own_time_and_place():
         (frame_at(133, pose_off_ns=-51 * MS), "pose_extrapolated"),
         (frame_at(0, stamp_ns=np.int64(133 * MS)), ""),
         (frame_at(133, sensor="x" * 300), "bad_sensor"),
+        (frame_at(133, sensor="two\nlines"), "bad_sensor"),
     ],
 )
 def test_each_reason_at_its_limit(later, why):

@@ -59,6 +59,15 @@ def test_words_without_end_do_not_fill_the_memory():
     assert History.loaded(history.saved()) == history
 
 
+def test_words_that_no_terminal_shows_are_counted_the_same_after_a_save():
+    history, other = History(), History()
+    for reason in ("a\nb", "a\\nb", "\x1b[1m", 300 * "\n"):
+        history.refuse(reason)
+        other.refuse(reason)
+        other = History.loaded(other.saved())
+    assert other == history
+
+
 def damaged(change):
     saved = json.loads(json.dumps(FULL.saved()))
     change(saved)
@@ -81,6 +90,7 @@ LIES = {
     "a sensor that is a number": lambda s: s["history"]["trusted"].update(left=5),
     "eleven numbers": lambda s: s["history"]["trusted"]["left"].update(pose=[0.0] * 11),
     "a pose with NaN": lambda s: s["history"]["trusted"]["left"].update(pose=[float("nan")] * 12),
+    "a pose that is true": lambda s: s["history"]["trusted"]["left"].update(pose=[True] * 12),
     "a pose of text": lambda s: s["history"]["trusted"]["left"].update(pose=["0"] * 12),
     "a pose far away": lambda s: s["history"]["trusted"]["left"].update(pose=[1e300] * 12),
     "a pose of huge numbers": lambda s: s["history"]["trusted"]["left"].update(pose=[10**400] * 12),

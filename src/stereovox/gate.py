@@ -82,8 +82,9 @@ class Gate:
             limit = f"trust.max_pose_off_s {self._trust.max_pose_off_s:g}"
             said = f"{_name(frame)}: its pose is extrapolated by {off_ns / 1e9:.3f} s ({limit}); give poses in time"
             raise FrameRefused("pose_extrapolated", said)
-        if len(frame.sensor) > LONGEST_NAME:
-            raise FrameRefused("bad_sensor", f"{_name(frame)}: sensor has more than {LONGEST_NAME} letters")
+        if len(frame.sensor) > LONGEST_NAME or not frame.sensor.isprintable():
+            said = f"sensor is no word of at most {LONGEST_NAME} letters that can be shown; name it otherwise"
+            raise FrameRefused("bad_sensor", f"{_name(frame)}: {said}")
         return frame.sensor or ("scan" if isinstance(frame, Scan) else "camera"), int(frame.stamp_ns)
 
     def _against(self, before: Seen, now: Seen) -> tuple[str, float]:

@@ -71,7 +71,7 @@ class History:
 
     def refuse(self, reason: str) -> None:
         """Count one refused frame."""
-        reason = str(reason)[:LONGEST_NAME]
+        reason = one_line(str(reason))[:LONGEST_NAME]  # as `loaded` reads it
         self.refused[reason if reason in self.refused or len(self.refused) < MOST_REASONS else OTHERS] += 1
 
     def copied(self) -> History:
@@ -161,7 +161,7 @@ def _seen_to(seen: Seen) -> dict[str, Any]:
 
 def _seen_from(saved: Any) -> Seen:
     pose = saved["pose"]
-    if not isinstance(pose, list) or len(pose) != 12 or not all(isinstance(x, float | int) for x in pose):
+    if not isinstance(pose, list) or len(pose) != 12 or not all(type(x) in (float, int) for x in pose):
         raise ValueError("history: a pose is not 12 numbers")
     numbers = tuple(map(float, pose))
     if not all(math.isfinite(x) and abs(x) <= FARTHEST for x in numbers):

@@ -84,6 +84,7 @@ def grid():
         ({"stamp_ns": 10**30}, "bad_stamp"),
         ({"stamp_ns": -(10**5000)}, "bad_stamp"),
         ({"stamp_ns": np.array([1, 2])}, "bad_stamp"),
+        ({"stamp_ns": np.uint64(2**63)}, "bad_stamp"),
         ({"pose_off_ns": 0.1}, "bad_stamp"),
         ({"sensor": None}, "bad_sensor"),
         ({"sensor": 1}, "bad_sensor"),
@@ -124,6 +125,15 @@ def test_what_means_the_same_does_the_same(same):
         assert mapper.add(frame).refused is None
         maps.append(mapper.map.blocks())
     assert all((a == b).all() for a, b in zip(*maps, strict=True))
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.int32, np.uint64])
+def test_times_are_told_whatever_holds_the_stamps(kind):
+    mapper = sv.Mapper(voxel_size=0.25, max_range=4.0, **{"map.keep_times": True})
+    for stamp, sensor in ((200, "left"), (5, "right")):  # each has its own clock
+        assert mapper.add(replace(FRAME, stamp_ns=kind(stamp), sensor=sensor)).refused is None
+    assert set(mapper.map.ages(0).tolist()) == {0.0}
+    assert type(mapper.map.viewpoint.stamp_ns) is int
 
 
 @pytest.mark.parametrize(

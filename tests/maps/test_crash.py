@@ -269,6 +269,22 @@ def test_no_room_for_a_tile_loses_no_cell(tmp_path):
     assert names(tmp_path) == ["m"]
 
 
+@pytest.mark.parametrize("stopped", ["_store", "_times_store"])
+def test_what_cannot_be_written_of_a_tile_ends_the_run(tmp_path, monkeypatch, stopped):
+    config = load_config(voxel_size=0.1, window={"size": [3.2, 3.2, 3.2], "outside": "keep"}, map={"keep_times": True})
+    rolling = make_map(config, tiles=tmp_path / "tiles")
+    rolling.look_from(at(0.0))
+    rolling.insert(*small_map(9).blocks())
+    monkeypatch.setattr(getattr(rolling, stopped), "_write", lambda *_: no_room())
+    rolling.look_from(at(10.0))
+    for tiles in (rolling._store, rolling._times_store):
+        tiles._writer.submit(lambda: None).result()
+    with pytest.raises(MapFileError, match="a tile cannot be written"):
+        rolling.look_from(at(20.0))
+    rolling.close()
+    assert names(tmp_path) == []
+
+
 def at(x):
     from stereovox.cameras import PinholeCamera
     from stereovox.frame import Viewpoint

@@ -12,6 +12,7 @@ import pytest
 from stereovox.config import load_config
 from stereovox.errors import ConfigError, FrameRefused
 from stereovox.maps import VoxelMap, load_map, make_map
+from stereovox.maps.evidence import Evidence
 from stereovox.maps.grid_evidence import GridEvidence
 from stereovox.maps.grid_map import GridMap
 
@@ -66,6 +67,23 @@ def test_what_does_not_fit_is_refused_and_what_fits_is_right(rules, max_memory):
     whole = made.fly(VoxelMap(free), [m for i, m in enumerate(moments) if i not in out])
     made.assert_same(one, whole)
     assert whole.memory_bytes > 0.4 * one.config.max_memory
+
+
+@pytest.mark.parametrize(
+    "window", [{}, {"window.size": [25.6, 3.2, 3.2], "when_full": "roll"}], ids=["capped", "rolling"]
+)
+def test_cells_that_are_forgotten_in_a_full_map_take_no_more(window):
+    one = make_map(settings("3 MB", **TIMES, **{"map.forget_s": 8.0}, **window))
+    coords = np.array([(x, y, z) for x in range(-16, 16) for y in range(-2, 2) for z in range(-2, 2)], np.int32)
+    if not window:
+        coords = np.repeat(np.arange(one._most, dtype=np.int32), 3).reshape(-1, 3)
+    taken, random = one.reserved_bytes, np.random.default_rng(0)
+    for second in range(40):
+        values = random.integers(-300, 300, (len(coords), 512)).astype(np.int16)
+        values[:, : 256 * (second > 3)] = 0  # half of each block is not seen any more
+        made.fly(one, [made.Moment(made.at((0, 0, 0), second * 10**9), Evidence(coords, values, coords[:0], 0))])
+        assert one.reserved_bytes == taken
+    assert 0 < sum(one.counts().values()) <= 256 * len(coords)
 
 
 @pytest.mark.parametrize("max_memory", ["500 MB", 500_000_000])

@@ -87,7 +87,7 @@ def _check_fields(seen: object, wanted: dict[str, Field]) -> None:
         value = getattr(seen, name)
         if not isinstance(value, field.types):
             raise FrameRefused(field.reason, f"{_called(seen)}: {name} is {type(value).__name__}; give {field.wanted}")
-        if isinstance(value, int) and abs(value) >= LONGEST:
+        if isinstance(value, int | np.integer) and abs(int(value)) >= LONGEST:
             raise FrameRefused(field.reason, f"{_called(seen)}: {name} does not fit into 64 bits; give {field.wanted}")
 
 

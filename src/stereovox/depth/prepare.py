@@ -48,7 +48,7 @@ def prepare(frame: Frame, config: Config) -> DepthImage:
         cure = "check its depth correction" if getattr(frame.camera, "correction", None) else "is the lens covered?"
         raise FrameRefused("no_valid_depth", f"{_name(frame)}: not one pixel has a valid depth; {cure}")
     denoise(depth_m, frame.camera, config)
-    image = DepthImage(depth_m, reason, frame.camera, T_world_sensor, frame.stamp_ns)
+    image = DepthImage(depth_m, reason, frame.camera, T_world_sensor, int(frame.stamp_ns))
     return downsample(image, config.depth.downsample)
 
 

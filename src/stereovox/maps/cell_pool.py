@@ -83,10 +83,12 @@ class CellPool:
 
     def put(self, coords: NDArray[np.int32], cells: NDArray[np.integer]) -> None:
         """Set whole blocks: coordinates (n, 3), cells (n, 512) as stored; what stood there before is lost."""
-        kinds = np.empty(len(coords), np.uint8)
+        kinds, places = np.empty(len(coords), np.uint8), np.empty(len(coords), np.int64)
         coords, cells = np.ascontiguousarray(coords, np.int32), np.ascontiguousarray(cells)
         _pool.needs(cells, self._limits[0], self._limits[2], kinds)
-        self._reserve(int((kinds == _pool.ROW).sum()), int((kinds == _pool.BARE).sum()))
+        _pool.find_all(self.table, self.coords, coords, places)  # a block that is there keeps its room
+        new_row, new_bare = (places < 0) | (places >= len(self.values)), places < len(self.values)
+        self._reserve(int(((kinds == _pool.ROW) & new_row).sum()), int(((kinds == _pool.BARE) & new_bare).sum()))
         _pool.put(*self.arrays, coords, cells, kinds)
         self._shrink()
 

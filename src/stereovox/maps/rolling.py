@@ -101,8 +101,9 @@ class RollingMap(VoxelMap):
 
         Raises MapFileError, and changes nothing, where an earlier tile could not be written.
         """
-        if self._store is not None:
-            self._store.check()
+        for store in (self._store, self._times_store):
+            if store is not None:
+                store.check()
         super().look_from(viewpoint)
         before = self._window.box
         position = viewpoint.T_world_camera[:3, 3].tolist()

@@ -47,7 +47,7 @@ class FrameRefused(StereovoxError):  # noqa: N818 - reads as what happened
     """
 
     def __init__(self, reason: str, message: str):
-        super().__init__(" ".join(message.splitlines()))  # names come from anywhere
+        super().__init__(message)
         self.reason = reason
 
 

@@ -24,8 +24,10 @@ class DepthPath:
 
         Raises FrameRefused as `StereoDepth`, and `bad_form` for what is no frame at all.
         """
-        check_form(frame, Frame, StereoFrame)
-        return self._stereo(frame) if isinstance(frame, StereoFrame) else frame
+        if isinstance(frame, Frame):
+            return frame  # `prepare` looks at its form
+        check_form(frame, StereoFrame, Frame)
+        return self._stereo(frame)
 
     def image(self, frame: Frame) -> DepthImage:
         """Return the frame's depth image. Raises FrameRefused as `prepare`."""

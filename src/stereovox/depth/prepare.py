@@ -13,7 +13,7 @@ from stereovox.depth import _cpu
 from stereovox.depth.correct import corrected
 from stereovox.depth.denoise import denoise
 from stereovox.depth.downsample import downsample
-from stereovox.depth.form import matrix_of
+from stereovox.depth.form import check_form, matrix_of
 from stereovox.errors import FrameRefused
 from stereovox.frame import DepthImage, Frame, Reason, Scan
 
@@ -36,8 +36,8 @@ def prepare(frame: Frame, config: Config) -> DepthImage:
     [min_range, max_range], TOO_NEAR also where it is -inf. The source's own reason, where it has one, comes first; but
     its TOO_FAR only where nothing contradicts it: a depth beside it, or the frame's `farthest`. `depth.far` says whose
     word is taken for too far.
-    Raises FrameRefused with the reason: the source's `fault`, `bad_dtype`, `bad_shape`, `bad_scale`, `bad_reason`,
-    `pose_not_finite`, `pose_not_rigid`, `no_valid_depth`.
+    Raises FrameRefused with the reason: the source's `fault`, `bad_form` and others of `check_form`, `bad_dtype`,
+    `bad_shape`, `bad_scale`, `bad_reason`, `pose_not_finite`, `pose_not_rigid`, `no_valid_depth`.
     """
     _check_image(frame)
     T_world_sensor = rigid_pose(frame, config.pose_rigidity_tolerance)
@@ -70,9 +70,8 @@ def _classify(frame: Frame, config: Config, depth_m: NDArray, reason: NDArray) -
 
 
 def _check_image(frame: Frame) -> None:
+    check_form(frame, Frame)
     name, depth, camera = _name(frame), frame.depth, frame.camera
-    if frame.fault:
-        raise FrameRefused(frame.fault, frame.fault_detail or f"{name}: {frame.fault}")
     if not isinstance(depth, np.ndarray) or depth.dtype not in DTYPES:
         kind = getattr(depth, "dtype", type(depth).__name__)
         raise FrameRefused("bad_dtype", f"{name}: depth is {kind}; give a uint16, float32 or float64 array")

@@ -41,7 +41,7 @@ def made_frame(seed, camera, share=0.6, patches=True):
     depth[reason == Reason.TOO_FAR] = 0  # a depth would contradict it
     turn = rng.normal(size=4)
     T = from_quaternion(rng.uniform(-0.4, 0.4, 3), turn)
-    return sv.Frame(depth.astype(np.float32), camera, T, reason=reason.astype(np.uint8), stamp_ns=seed)
+    return sv.Frame(depth.astype(np.float32), camera, T, reason=reason.astype(np.uint8))
 
 
 def seen_by(frame, centres, slack):

@@ -310,15 +310,8 @@ def test_a_floor_that_is_told_to_stop_is_saved(tmp_path, monkeypatch, capsys):
         return add(self, seen)
 
     monkeypatch.setattr(GridMapper, "add", told_to_stop)
-    words = [
-        "grid",
-        "sim:floor?plan=testbed&seconds=2&scan_hz=2&depth_hz=2&image_width=80",
-        "--poses",
-        "odometry",
-        "--out",
-        str(tmp_path / "floor.yaml"),
-    ]
-    assert main(words) == 143
+    drive = "sim:floor?plan=testbed&seconds=2&scan_hz=2&depth_hz=2&image_width=80"
+    assert main(["grid", drive, "--poses", "odometry", "--out", str(tmp_path / "floor.yaml")]) == 143
     assert "stopped after 1 of" in capsys.readouterr().err
     assert names(tmp_path) == ["floor.pgm", "floor.yaml"]
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 class UpdateReport:
     """What one frame did: milliseconds spent, cells whose value changed, and why it was refused, if it was.
 
+    detail: why in a line, or that frames of its sensor are believed again.
     match_ms: rectify and match a stereo pair; depth_ms: prepare the depth image; integrate_ms: put it into the map.
     way: how thoroughly the frame was looked at: `full`, or what `pace` left of it.
     """

@@ -5,6 +5,7 @@ import json
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -202,6 +203,38 @@ def test_a_tile_without_room_saves_what_there_is(tmp_path, monkeypatch, capsys):
     assert load_map(tmp_path / "m").frames == 12
 
 
+def test_going_on_with_other_frames_is_refused(tmp_path, capsys):
+    assert mapped(tmp_path / "m", "--frames", ":20:2") == 0
+    before = load_map(tmp_path / "m").blocks()
+    assert mapped(tmp_path / "m", "--resume") == 2
+    assert "frame 18', here it is" in (said := capsys.readouterr().err)
+    assert "give --frames as before" in said
+    for one, other in zip(load_map(tmp_path / "m").blocks(), before, strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert mapped(tmp_path / "m", "--resume", "--frames", "::2") == 0
+    assert load_map(tmp_path / "m").frames == 15
+
+
+def test_the_end_tells_what_was_refused_and_when_frames_were_believed_again(tmp_path, monkeypatch, capsys):
+    add, done = Mapper.add, []
+
+    def far_away_from_the_tenth_on(self, frame):
+        done.append(frame)
+        pose = frame.T_world_sensor.copy()
+        pose[0, 3] += 100 * (len(done) > 10)
+        return add(self, replace(frame, T_world_sensor=pose))
+
+    monkeypatch.setattr(Mapper, "add", far_away_from_the_tenth_on)
+    assert mapped(tmp_path / "m", "--json", "--set", "trust.settle_s=0.2") == 0
+    out, said = capsys.readouterr()
+    told = json.loads(out)
+    refused = told["refused"]["pose_jump"]
+    assert f"{30 - refused} frames mapped, {refused} refused" in said
+    assert f"  {refused} x pose_jump, first: " in said
+    assert "  1 x frames of 'camera' are believed again after pose_jump\n" in said
+    assert told["settled"] == {"frames of 'camera' are believed again after pose_jump": 1}
+
+
 @pytest.mark.parametrize("resume", [False, True])
 def test_a_second_writer_is_refused_before_any_work(tmp_path, monkeypatch, capsys, resume):
     assert mapped(tmp_path / "m", "--frames", ":2") == 0
@@ -310,15 +343,8 @@ def test_a_floor_that_is_told_to_stop_is_saved(tmp_path, monkeypatch, capsys):
         return add(self, seen)
 
     monkeypatch.setattr(GridMapper, "add", told_to_stop)
-    words = [
-        "grid",
-        "sim:floor?plan=testbed&seconds=2&scan_hz=2&depth_hz=2&image_width=80",
-        "--poses",
-        "odometry",
-        "--out",
-        str(tmp_path / "floor.yaml"),
-    ]
-    assert main(words) == 143
+    drive = "sim:floor?plan=testbed&seconds=2&scan_hz=2&depth_hz=2&image_width=80"
+    assert main(["grid", drive, "--poses", "odometry", "--out", str(tmp_path / "floor.yaml")]) == 143
     assert "stopped after 1 of" in capsys.readouterr().err
     assert names(tmp_path) == ["floor.pgm", "floor.yaml"]
 

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import os
+
 import cv2
 import numpy as np
 import pytest
@@ -50,6 +52,12 @@ def test_any_flipped_byte_is_refused_and_the_terminal_stays_clean(good, capfd):
 def test_bytes_after_the_end_mark_do_no_harm(good):
     good.write_bytes(good.read_bytes() + b"rest")
     np.testing.assert_array_equal(read_depth_png(good, SIZE), depth_image(3))
+
+
+def test_a_file_of_more_bytes_than_an_image_needs_is_not_read(good):
+    os.truncate(good, 300 << 20)  # a hole in the disk, and else 300 MB of memory
+    assert refusal(good) == "unreadable"
+    assert png_size(good) == SIZE
 
 
 def test_a_missing_file_and_a_folder_are_missing(tmp_path):

@@ -32,6 +32,7 @@ from stereovox.cli.terminal import (
     milliseconds,
     say,
     say_about_compiling,
+    say_refusals,
     tracked,
 )
 from stereovox.errors import SourceError, StereovoxError
@@ -188,9 +189,7 @@ def _finished(mapper: GridMapper, reports: list[UpdateReport], out: Path, checkp
     if not result["frames"]:
         raise StereovoxError(f"not one reading could be used, no map is written ({reports[0].detail})")
     checkpoints.save(len(reports))
-    say(f"{result['frames']} readings mapped, {result['frames_refused']} refused")
-    for reason, number in result["refused"].items():
-        say(f"  {number} x {reason}, first: {next(one.detail for one in reports if one.refused == reason)}")
+    say_refusals(result, reports, "readings")
     say(f"a reading: scan {milliseconds(result['depth_ms'])}; map {milliseconds(result['integrate_ms'])}")
     say(cells_line(result))
     say(f"saved in {out.with_suffix('.yaml')}; look at it with: {picture_line(out)}")

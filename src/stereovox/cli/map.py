@@ -24,10 +24,11 @@ from stereovox.cli.terminal import (
     milliseconds,
     say,
     say_about_compiling,
+    say_refusals,
     thousands,
     tracked,
 )
-from stereovox.errors import MapFileError, SourceError, StereovoxError
+from stereovox.errors import MapFileError, SourceError, StereovoxError, one_line
 
 if TYPE_CHECKING:
     from stereovox.config import WindowConfig
@@ -193,6 +194,7 @@ def _add_all(
     if done:
         if source.length is not None and done >= source.length:
             raise StereovoxError(f"{out}: already holds all {source.length} frames of {source.name}")
+        _check_last(mapper, source, done, out)
         source = source.after(done)
         say(f"going on after frame {done}")
     try:
@@ -214,6 +216,21 @@ def _add_all(
     return reports
 
 
+def _check_last(mapper: Mapper, source: Stream, done: int, out: Path) -> None:
+    """Frames are skipped by their number: under another --frames some would be missed, and others counted twice."""
+    from stereovox.history import LONGEST_NAME
+
+    last = mapper.map.history.last_frame
+    if source.length is None or last is None:  # a live camera; a map from before this was saved
+        return
+    there = next(iter(source.after(done - 1)))
+    if (one_line(there.name[:LONGEST_NAME]), there.stamp_ns) != last:
+        raise StereovoxError(
+            f"{out}: its frame {done} was '{last[0]}', here it is '{there.name}'; give --frames as before, or leave "
+            "--resume out"
+        )
+
+
 def _added(mapper: Mapper, frame: AnyFrame, checkpoints: Checkpoints) -> UpdateReport:
     try:
         return mapper.add(frame)
@@ -232,10 +249,7 @@ def _first_refusal(reports: list[UpdateReport]) -> str:
 
 
 def _tell(result: dict[str, Any], reports: list[UpdateReport], out: Path, window: WindowConfig) -> None:
-    say(f"{result['frames']} frames mapped, {result['frames_refused']} refused")
-    for reason, number in result["refused"].items():
-        example = next(report.detail for report in reports if report.refused == reason)
-        say(f"  {number} x {reason}, first: {example}")
+    say_refusals(result, reports, "frames")
     if result.get("dropped"):
         say(f"  {result['dropped']} more came while the map was busy and were dropped; see --set deadline_ms=")
     if set(result["ways"]) - {"full"}:

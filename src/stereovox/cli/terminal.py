@@ -7,7 +7,7 @@ import shlex
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -15,6 +15,8 @@ from stereovox.errors import one_line
 
 if TYPE_CHECKING:
     from rich.progress import Progress
+
+    from stereovox.update_report import UpdateReport
 
 T = TypeVar("T")
 
@@ -117,6 +119,16 @@ def size(number_of_bytes: float) -> str:
 def thousands(number: Any) -> str:
     """Return a whole number with commas: 1,234,567."""
     return f"{number:,}"
+
+
+def say_refusals(result: dict[str, Any], reports: Sequence[UpdateReport], what: str) -> None:
+    """Say how many `what` (frames) were mapped, which were refused and why, and when they were believed again."""
+    say(f"{result['frames']} {what} mapped, {result['frames_refused']} refused")
+    for reason, number in result["refused"].items():
+        example = next(report.detail for report in reports if report.refused == reason)
+        say(f"  {number} x {reason}, first: {example}")
+    for told, number in result["settled"].items():
+        say(f"  {number} x {told}")
 
 
 def cells_line(result: dict[str, Any]) -> str:

@@ -111,9 +111,10 @@ def seen_free(
     v = np.rint(points[:, 1] / ahead * camera.fy + camera.cy).astype(int)
     inside = (z > half) & (z + half < max_range) & (u >= 0) & (v >= 0) & (u < camera.width) & (v < camera.height)
     depth = source.true_depth(i)[np.where(inside, v, 0), np.where(inside, u, 0)]
-    person = source.person(i)
-    away = np.ones(len(centers), bool) if person is None else ~person.contains(centers, margin=side + half)
-    return inside & (depth > z + half) & away
+    seen, person = inside & (depth > z + half), source.person(i)
+    if person is not None:
+        seen[seen] = ~person.contains(centers[seen], margin=side + half)
+    return seen
 
 
 def _judged(

@@ -17,7 +17,8 @@ from stereovox.update_report import UpdateReport
 def summarise(voxel_map: VoxelMap | GridMap, reports: Sequence[UpdateReport]) -> dict[str, Any]:
     """Return frames, refusals by reason, the ways they were looked at, milliseconds, cells and memory of a run.
 
-    `ways`: how many frames were looked at in full, how many less thoroughly for want of time (docs/safety.md).
+    `settled`: how often frames were believed again after a jump or a reset, by what a report says about it. `ways`: how
+    many frames were looked at in full, how many less thoroughly for want of time (docs/safety.md).
     `frame_ms` is the whole of a frame, `match_ms` (stereo pairs), `depth_ms` and `integrate_ms` are its parts. Times
     leave out the first frame that was taken in, which may compile kernels. `memory_reserved`: the memory is that of a
     window, taken at the start.
@@ -28,6 +29,7 @@ def summarise(voxel_map: VoxelMap | GridMap, reports: Sequence[UpdateReport]) ->
         "frames": len(taken),
         "frames_refused": refused.total(),
         "refused": dict(refused.most_common()),
+        "settled": dict(Counter(report.detail for report in taken if report.detail).most_common()),
         "ways": dict(Counter(report.way for report in taken).most_common()),
         "match_ms": percentiles([report.match_ms for report in taken]),
         "depth_ms": percentiles([report.depth_ms for report in taken]),

@@ -18,12 +18,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.errors import FrameRefused
+from stereovox.untrusted import read_bounded
 
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
 START = SIGNATURE + b"\0\0\0\rIHDR"
 HEADER_BYTES = 33  # signature, then IHDR: length, name, 13 bytes, check sum
 MAX_PIXELS = 100_000_000
 """A header that tells of more pixels than this is taken for a lie; nothing is allocated for it."""
+MOST_BYTES = 1 << 28
+"""Bytes of a file: more than so many pixels can need."""
 MOST_SWOLLEN = 1100
 """Bytes that one byte of a PNG can stand for (deflate: 1032)."""
 GREY_16 = (16, 0)  # bit depth and colour type
@@ -70,7 +73,7 @@ def read_picture_png(path: Path, size: tuple[int, int]) -> NDArray[np.uint8]:
 
 def png_size(path: Path, kinds: Kinds = DEPTH) -> tuple[int, int]:
     """Return (width, height) as the header of a PNG of these kinds tells; raises FrameRefused as `read_depth_png`."""
-    return _header_size(path, _read(path, HEADER_BYTES), kinds)
+    return _header_size(path, _read(path, header_only=True), kinds)
 
 
 def common_size(paths: Sequence[Path], looks: int = 5, kinds: Kinds = DEPTH) -> tuple[int, int] | None:
@@ -92,12 +95,14 @@ def _spread(paths: Sequence[Path], looks: int) -> list[Path]:
     return [path for start in range(step) for path in paths[start::step]]
 
 
-def _read(path: Path, count: int = -1) -> bytes:
+def _read(path: Path, header_only: bool = False) -> bytes:
     if not os.path.isfile(path):  # Path.is_file may raise
         raise FrameRefused("missing_file", f"{path}: no such file; put it back or remove its entry")
     try:
+        if not header_only:
+            return read_bounded(path, MOST_BYTES)
         with path.open("rb") as file:
-            return file.read(count)
+            return file.read(HEADER_BYTES)
     except OSError as error:
         raise FrameRefused("unreadable", f"{path}: {error.strerror}; make it readable or remove it") from None
 

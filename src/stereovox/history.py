@@ -65,7 +65,7 @@ class History:
     def offered(self, frame: object) -> None:
         """Remember which frame was the last."""
         stamp_ns = getattr(frame, "stamp_ns", 0)
-        whole = int(stamp_ns) if isinstance(stamp_ns, int | np.integer) else 0
+        whole = int(stamp_ns) if isinstance(stamp_ns, (int, np.integer)) else 0
         self.last_frame = str(getattr(frame, "name", ""))[:LONGEST_NAME], min(max(whole, EARLIEST), LATEST)
 
     def refuse(self, reason: str) -> None:

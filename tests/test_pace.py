@@ -58,6 +58,14 @@ def test_a_way_that_stays_too_slow_is_tried_less_and_less_often():
     assert 2 not in steps
 
 
+def test_a_way_that_lasts_again_is_tried_soon_after_the_next_overrun():
+    on = Ladder(3, DEADLINE)
+    run(5000, [25.0, 15.0, 5.0], on)
+    run(3 * LONGEST, [15.0, 12.0, 5.0], on)
+    on.took(50.0)
+    assert run(20, [15.0, 12.0, 5.0], on) == [1] * PATIENCE + [0] * (20 - PATIENCE)
+
+
 @pytest.mark.parametrize("cost", [20.5, 24.0, 30.0, 33.0, 40.0])
 def test_on_the_last_way_frames_are_left_out_as_time_wants(cost):
     steps = run(2000, [100.0, 50.0, cost])[10:]
@@ -213,6 +221,8 @@ def test_without_a_deadline_all_is_looked_at_in_full(monkeypatch):
 def test_a_near_range_before_all_that_is_seen_is_refused():
     with pytest.raises(sv.StereovoxError, match=r"near_share 0\.1: leaves nothing between min_range 0\.5 and 0\.5 m"):
         sv.Mapper(deadline_ms=20, min_range=0.5, **{"pace.near_share": 0.1})
+    with pytest.raises(sv.StereovoxError, match=r"between min_range 0\.5 and 0\.51 m"):  # less than half a cell
+        sv.Mapper(deadline_ms=20, min_range=0.5, **{"pace.near_share": 0.102})
     sv.Mapper(min_range=0.5, **{"pace.near_share": 0.1})  # nobody asked for it
     with pytest.raises(sv.StereovoxError, match="map of a floor"):
         load_config("ist2019", deadline_ms=20)

@@ -179,6 +179,22 @@ def test_cells_on_disk_are_forgotten_wherever_they_are_asked_for(tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["early", "late"]
 
 
+@pytest.mark.parametrize("saved", [False, True])
+@pytest.mark.parametrize("clock", [(11, 30, 12, 12.5), (11, 3, 11, 11.5)], ids=["back", "back and on"])
+def test_what_was_over_on_disk_stays_so_when_the_clock_is_set_back(tmp_path, clock, saved):
+    config = settings(**WINDOW, **{"window.outside": "keep", "map.forget_s": 5.0})
+    one = made.fly(make_map(config), [made.Moment(made.at((0, 0, 0), 10 * SECOND), one_cell(3000))])
+    for n, place in enumerate((20, 20, 20, 0)):
+        one.look_from(made.at((place, 0, 0), round(clock[n] * SECOND)))
+        assert (one.state([[0.05, 0.05, 0.05]]) == State.UNKNOWN) == (n > 0), n
+        if saved:
+            one.save(tmp_path / "m")
+            one.close()
+            one = make_map(config, load_map(tmp_path / "m"))
+    assert not len(one.cells()[0])
+    one.close()
+
+
 def test_times_are_saved_and_checked(tmp_path):
     one = made.fly(VoxelMap(settings()), made.flight(3, 6))
     one.save(tmp_path / "m")

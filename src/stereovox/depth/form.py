@@ -83,12 +83,12 @@ def matrix_of(given: object) -> NDArray[np.float64]:
 
 
 def _check_fields(seen: object, wanted: dict[str, Field]) -> None:
-    for name, field in wanted.items():
+    for name, (types, what, reason) in wanted.items():
         value = getattr(seen, name)
-        if not isinstance(value, field.types):
-            raise FrameRefused(field.reason, f"{_called(seen)}: {name} is {type(value).__name__}; give {field.wanted}")
-        if isinstance(value, int | np.integer) and abs(int(value)) >= LONGEST:
-            raise FrameRefused(field.reason, f"{_called(seen)}: {name} does not fit into 64 bits; give {field.wanted}")
+        if not isinstance(value, types):
+            raise FrameRefused(reason, f"{_called(seen)}: {name} is {type(value).__name__}; give {what}")
+        if types[0] is int and isinstance(value, WHOLE.types) and abs(int(value)) >= LONGEST:
+            raise FrameRefused(reason, f"{_called(seen)}: {name} does not fit into 64 bits; give {what}")
 
 
 def _called(seen: object) -> str:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from math import ceil
+from math import ceil, inf
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,6 +48,11 @@ class CellTimes:
         """Bytes of all arrays, in use or not."""
         blocks = self._blocks
         return blocks.values.nbytes + blocks.coords.nbytes + blocks.table.nbytes
+
+    @property
+    def late_ns(self) -> float:
+        """How much longer than `forget_s` a cell may stay; infinite where none is forgotten."""
+        return inf if self._forget_ns is None else self._forget_ns / LATE
 
     def steps(self, stamp_ns: int) -> np.uint32:
         """Return the number that is kept for a time in nanoseconds."""

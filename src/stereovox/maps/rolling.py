@@ -47,6 +47,8 @@ class RollingMap(VoxelMap):
         self._times = CellTimes(config.map, capacity) if config.map.keep_times else None
         self._earlier: VoxelMap | None = None
         self._store = self._times_store = None
+        self._turned: list[int] = []  # stamps between which the clock was set back
+        self._since: dict[Tile, int] = {}  # how many of them there were when a tile was put to the disk
         if self._settings.window.outside == "keep":  # last: they leave folders
             self._store = TileStore(self._format, tiles)
             self._times_store = self._store_of_times(tiles)
@@ -104,6 +106,8 @@ class RollingMap(VoxelMap):
         for store in (self._store, self._times_store):
             if store is not None:
                 store.check()
+        if self._times_store is not None and self.viewpoint is not None:
+            self._note_time(self.viewpoint.stamp_ns, viewpoint.stamp_ns)
         super().look_from(viewpoint)
         before = self._window.box
         position = viewpoint.T_world_camera[:3, 3].tolist()
@@ -185,9 +189,9 @@ class RollingMap(VoxelMap):
         for tile, group in zip(map(tuple, tiles.tolist()), groups, strict=True):
             if tile in self._store and not self._in_window(tile):
                 found = self._store.stored_at(tile, cells[group])
-                if self._times is not None and self._times_store is not None:
-                    times = self._times_store.stored_at(tile, cells[group])
-                    found = np.where(self._times.expired(times, self._now_ns), self._format.unknown, found)
+                if self._times_store is not None:
+                    over = self._over(tile, self._times_store.stored_at(tile, cells[group]))
+                    found = np.where(over, self._format.unknown, found)
                 stored[asked[group]] = found
 
     def _in_window(self, tile: Tile) -> bool:
@@ -249,18 +253,30 @@ class RollingMap(VoxelMap):
             self._store.put(tile, coords, cells)
         if self._times_store is not None and times is not None:
             self._times_store.put(tile, coords, times)
+            self._since[tile] = len(self._turned)
 
     def _kept(self, tile: Tile) -> tuple[NDArray[np.int32], NDArray[np.integer], NDArray[np.uint32] | None]:
         """Return the blocks of a tile on disk and the times of their cells; what is over by now is unknown."""
         assert self._store is not None
         coords, cells = self._store.get(tile)
-        if self._times is None or self._times_store is None:
+        if self._times_store is None:
             return coords, cells, None
         times = self._times_store.blocks_at(tile, coords)
-        over = self._times.expired(times, self._now_ns)
+        over = self._over(tile, times)
         cells, times = np.where(over, cells.dtype.type(self._format.unknown), cells), np.where(over, NEVER, times)
         left = (cells != self._format.unknown).any(axis=1)
         return coords[left], cells[left], times[left]
+
+    def _note_time(self, before_ns: int, now_ns: int) -> None:
+        assert self._times is not None
+        if before_ns - now_ns > self._times.late_ns:
+            self._turned += before_ns, now_ns
+
+    def _over(self, tile: Tile, times: NDArray[np.integer]) -> NDArray[np.bool_]:
+        """Tell which times of cells in a tile are over, or were since it left: a clock that is set back brings none."""
+        assert self._times is not None
+        moments = self._now_ns, *self._turned[self._since[tile] :]
+        return self._times.expired(times, min(moments)) | self._times.expired(times, max(moments))
 
     def _store_of_times(self, tiles: Path | None) -> TileStore | None:
         """Return the tiles beside those of the cells that keep when these were seen."""

@@ -8,6 +8,7 @@ that is killed, or that a power cut ends, leaves the older map whole. What it le
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
 import re
@@ -64,6 +65,7 @@ def save_map(voxel_map: VoxelMap, path: str | Path) -> None:
             sync_tree(folder / data)
             _write_manifest(folder, _manifest(voxel_map, data, blocks, checksum))
         except BaseException as error:
+            _let_writes_end()
             if _named(folder) != data:  # else it is the map already, whatever the disk says
                 sweep(folder)
             if not isinstance(error, OSError):
@@ -177,6 +179,16 @@ def sweep(folder: Path) -> None:
         for entry in folder.iterdir():
             if UNFINISHED.fullmatch(entry.name) and entry.name not in (named, LOCK):
                 shutil.rmtree(entry, ignore_errors=True) if entry.is_dir() else entry.unlink()
+
+
+def _let_writes_end() -> None:
+    """Wait for what Zarr still writes: of several files at once, one that fails does not stop the others."""
+    from zarr.core.sync import sync
+
+    async def the_others() -> None:
+        await asyncio.gather(*(asyncio.all_tasks() - {asyncio.current_task()}), return_exceptions=True)
+
+    sync(the_others())
 
 
 def _named(folder: Path) -> Any:

@@ -70,8 +70,7 @@ def log_odds_of(voxel_map):
 
 
 def mapper_of(**more):
-    quiet = {"trust.ordered": False, "trust.max_speed_mps": 1e9, "trust.max_turn_dps": 1e9, "depth.denoise": False}
-    return sv.Mapper(voxel_size=SIZE, max_range=REACH, **{**quiet, **more})
+    return sv.Mapper(voxel_size=SIZE, max_range=REACH, **{"depth.denoise": False, **more})
 
 
 @pytest.mark.parametrize("camera", CAMERAS)
@@ -88,6 +87,7 @@ def test_only_what_was_seen_changes(integrator, camera, seed, cell, window):
         report = mapper.add(frame)
         after = log_odds_of(mapper.map)
         changed = np.array([cell for cell in after if after[cell] != before.get(cell)]).reshape(-1, 3)
+        assert report.refused in (None, "no_valid_depth")  # frames without stamps may be anywhere
         assert report.cells >= len(changed) * (report.refused is None)
         assert (not len(changed)) if report.refused else seen_by(frame, mapper.map.centers(changed), 1.3 * SIZE).all()
         assert window or before.keys() <= after.keys()
@@ -126,7 +126,7 @@ def test_the_order_of_frames_does_not_matter_before_the_clamp(integrator, seed, 
     for order in ((0, 1, 2), (2, 0, 1)):
         mapper = mapper_of(**INTEGRATORS[integrator], **wide)
         for number in order:
-            mapper.add(frames[number])
+            assert mapper.add(frames[number]).refused in (None, "no_valid_depth")
         maps.append(mapper.map.blocks())
     assert all((a == b).all() for a, b in zip(*maps, strict=True))
 
@@ -137,7 +137,7 @@ def test_a_window_and_threads_change_no_cell_within(seed, integrator):
     plain, rolling = mapper_of(**INTEGRATORS[integrator]), mapper_of(threads=2, **INTEGRATORS[integrator], **FOLLOWING)
     for number in range(3):
         for mapper in (plain, rolling):
-            mapper.add(made_frame(seed + number, CAMERAS["pinhole"]))
+            assert mapper.add(made_frame(seed + number, CAMERAS["pinhole"])).refused in (None, "no_valid_depth")
     assert log_odds_of(plain.map) == log_odds_of(rolling.map)
 
 

@@ -34,10 +34,10 @@ def test_it_serves_until_ctrl_c(saved):
     with socket.create_connection(("127.0.0.1", int(url.rpartition(":")[2]))):
         pass  # a browser that hangs up at once
     for _ in range(2):
-        with urllib.request.urlopen(url, timeout=10) as page:
+        with urllib.request.urlopen(url, timeout=60) as page:
             assert page.status == 200
     running.send_signal(signal.SIGINT)
-    out, err = running.communicate(timeout=20)
+    out, err = running.communicate(timeout=120)
     assert (running.returncode, err) == (0, "")
     assert json.loads(out) == {"url": url}
 
@@ -56,7 +56,7 @@ def test_up_is_taken_or_refused(saved, capsys, monkeypatch):
 
 def status_of(link):
     try:
-        with urllib.request.urlopen(link, timeout=10) as page:
+        with urllib.request.urlopen(link, timeout=60) as page:
             return page.status
     except urllib.error.HTTPError as error:
         return error.code
@@ -69,7 +69,7 @@ def test_a_page_for_others_needs_the_link_that_is_printed(saved):
     place, token = link.split("/?token=")
     assert (status_of(link), status_of(place), status_of(f"{place}/?token={token[:-1]}")) == (200, 403, 403)
     running.send_signal(signal.SIGINT)
-    out, _ = running.communicate(timeout=20)
+    out, _ = running.communicate(timeout=120)
     assert (running.returncode, out) == (0, "")
 
 

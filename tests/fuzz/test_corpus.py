@@ -6,6 +6,7 @@ import random
 import subprocess
 import sys
 import zlib
+from math import inf
 from pathlib import Path
 
 import pytest
@@ -28,7 +29,7 @@ def test_a_reader_raises_stereovox_errors_alone(tmp_path, name):
     (tmp_path / "place").mkdir()
     seeds = target.seeds(tmp_path / "seeds")
     assert seeds
-    assert {check(target, seed, tmp_path / "place", PATIENCE) for seed in seeds} == {"read"}
+    assert {check(target, seed, tmp_path / "place", inf) for seed in seeds} == {"read"}  # kernels may be compiled
     for path in sorted((FUZZ / "corpus" / name).glob("*")):
         check(target, path.read_bytes(), tmp_path / "place", PATIENCE)
     for _ in range(CHANGES):

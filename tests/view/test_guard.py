@@ -41,7 +41,7 @@ def here():
 def asked(port, path="/", *headers, host=None):
     """Return status, headers and body of what a plain request gets."""
     lines = [f"GET {path} HTTP/1.1", f"Host: {host or f'127.0.0.1:{port}'}", *headers, "", ""]
-    with socket.create_connection(("127.0.0.1", port), timeout=10) as client:
+    with socket.create_connection(("127.0.0.1", port), timeout=60) as client:
         client.sendall("\r\n".join(lines).encode())
         with client.makefile("rb") as reply:
             head, _, body = reply.read().partition(b"\r\n\r\n")
@@ -54,7 +54,7 @@ def first_message(port, path="/", host="127.0.0.1", **headers):
     extra = {name.replace("_", "-"): value for name, value in headers.items()}
     protocol = f"viser-v{viser.__version__}"
     with connect(f"ws://{host}:{port}{path}", additional_headers=extra, subprotocols=[protocol]) as page:
-        return page.recv(timeout=10)
+        return page.recv(timeout=60)
 
 
 def refused(port, *args, **headers):
@@ -126,13 +126,13 @@ def test_by_default_only_this_machine_is_served_and_by_its_own_name(here):
 
 
 def test_who_says_nothing_or_too_much_is_hung_up_on(monkeypatch):
-    monkeypatch.setattr(serve, "PATIENCE_S", 0.3)
+    monkeypatch.setattr(serve, "PATIENCE_S", 2.0)
     with closing(open_viewer(small_map(), port=0)) as viewer:
         place = "127.0.0.1", viewer.server.get_port()
-        with socket.create_connection(place, timeout=20) as slow:
+        with socket.create_connection(place, timeout=60) as slow:
             slow.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\nX-Slow")
             assert b"<html" not in slow.makefile("rb").read()
-        with socket.create_connection(place, timeout=20) as long:
+        with socket.create_connection(place, timeout=60) as long:
             long.sendall(b"GET / HTTP/1.1\r\nX-Long: " + b"a" * 20_000)
             assert b"200" not in long.makefile("rb").read().partition(b"\r\n")[0]
 

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 PATIENCE_S = 5.0
 """Seconds in which a browser must have said what it wants."""
+ANSWER_S = 60.0
+"""Seconds in which the server must have refused a stranger, however busy the machine is."""
 STRANGER = "stranger.invalid"
 _STARTING = Lock()
 
@@ -89,7 +91,7 @@ def _asking(guard: Guard, answer: Callable[..., Any] | None) -> Callable[..., An
 def _is_guarded(number: str, port: int) -> bool:
     """Ask as a stranger, whom a guard never lets in."""
     here = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(number, number)
-    connection = HTTPConnection(here, port, timeout=PATIENCE_S)
+    connection = HTTPConnection(here, port, timeout=ANSWER_S)
     try:
         connection.request("GET", "/", headers={"Host": STRANGER})
         return connection.getresponse().status == HTTPStatus.FORBIDDEN

@@ -99,6 +99,7 @@ def contents(out: Path) -> dict[str, Any]:
 
     process = CONTEXT.Process(target=read)
     process.start()
+    writer.close()  # or a reader that dies would be waited for without end
     found = reader.recv()
     process.join()
     return found

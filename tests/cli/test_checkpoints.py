@@ -143,6 +143,20 @@ def test_an_older_map_stays_until_the_first_frame_that_counts(tmp_path, monkeypa
     assert held == [5, 1, 2]
 
 
+def test_refused_frames_do_not_take_the_place_of_an_older_map(tmp_path, monkeypatch):
+    assert mapped(tmp_path / "m", "--frames", ":5") == 0
+    held = []
+    options = at_each_frame(monkeypatch, tmp_path / "m", lambda number: held.append(load_map(tmp_path / "m").frames))
+    add = Mapper.add
+
+    def first_three_refused(self, frame):
+        return add(self, replace(frame, fault="no_pose") if self.map.frames_refused < 3 else frame)
+
+    monkeypatch.setattr(Mapper, "add", first_three_refused)
+    assert mapped(tmp_path / "m", *options, "--frames", ":6") == 0
+    assert held == [5, 5, 5, 5, 1, 2]
+
+
 @pytest.mark.parametrize("seconds", ["0", "1e-9"])
 def test_saves_in_between_change_nothing(tmp_path, monkeypatch, seconds):
     monkeypatch.setattr("stereovox.cli.checkpoints.REST", 0)

@@ -33,7 +33,9 @@ OFFSET = 1 << 30
 WAITING = 128
 """Tiles that may wait to be written; one more and mapping waits."""
 
-OURS = re.compile(rf"{re.escape(LOCK)}|zarr\.json|c|.*\.partial")
+INNER = "times"
+"""Folder for another store of the same tiles; whoever removes this one's folder removes it as well."""
+OURS = re.compile(rf"{re.escape(LOCK)}|zarr\.json|c|{INNER}|.*\.partial")
 """What a store has in its folder."""
 
 Tile = tuple[int, int, int]

@@ -73,6 +73,8 @@ def test_a_save_that_fails_at_any_step_leaves_a_whole_map(tmp_path, ever):
             assert found.frames == 1 or step > steps - 10, step
             assert "No space left" in failed
             assert "\n" not in failed
+        if failed and found.frames == 2:  # until the disk has the new manifest, the old one may come back
+            assert len(names(folder)) >= 3, step
         if failed and not ever and found.frames == 1:
             assert len(names(folder)) == 2, step  # what the save had written is gone
 
@@ -302,8 +304,10 @@ def test_what_cannot_be_written_of_a_tile_ends_the_run(tmp_path, monkeypatch, st
     config = load_config(voxel_size=0.1, window={"size": [3.2, 3.2, 3.2], "outside": "keep"}, map={"keep_times": True})
     rolling = make_map(config, tiles=tmp_path / "tiles")
     rolling.look_from(at(0.0))
-    rolling.insert(*small_map(9).blocks())
+    coords, cells = small_map(3).blocks()
+    rolling.insert(coords - np.array([2, 0, 0], np.int32), cells)  # in two tiles
     monkeypatch.setattr(getattr(rolling, stopped), "_write", lambda *_: no_room())
+    monkeypatch.setattr("stereovox.maps.tiles.WAITING", 1)  # nobody waits for what cannot be written
     rolling.look_from(at(10.0))
     for tiles in (rolling._store, rolling._times_store):
         tiles._writer.submit(lambda: None).result()

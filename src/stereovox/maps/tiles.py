@@ -74,8 +74,6 @@ class TileStore:
         """
         while len(self._waiting) >= WAITING and self._failed is None:
             self._settle(next(iter(self._waiting)))
-        if tile in self._waiting:
-            self._settle(tile)
         dense = np.full((BLOCKS,) * 3 + (CELLS,), self._format.unknown, self._format.dtype)
         dense[tuple((coords - np.multiply(tile, BLOCKS)).T)] = cells
         self._tiles.add(tile)

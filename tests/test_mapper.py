@@ -1,5 +1,7 @@
 """The whole flow by its Python API."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from made_images import made_image
@@ -190,3 +192,15 @@ def test_cameras_may_change_between_frames():
     for camera_frame in (wall, sv.Frame(np.full((6, 8), 2.0, np.float32), small, wall.T_world_sensor), wall):
         same.add(camera_frame)
     assert all((a == b).all() for a, b in zip(mapper.map.blocks(), same.map.blocks(), strict=True))
+
+
+def test_a_frame_that_does_not_fit_into_the_memory_is_refused_and_changes_nothing():
+    mapper, frame = sv.Mapper(max_memory="40 kB", voxel_size=0.1), wall_frame()
+    assert mapper.add(frame).refused is None
+    before, viewpoint = mapper.map.blocks(), mapper.map.viewpoint
+    behind = replace(frame, T_world_sensor=np.diag([-1.0, -1, 1, 1]) @ frame.T_world_sensor, sensor="behind")
+    report = mapper.add(behind)
+    assert report.refused == "memory_full"
+    assert "max_memory 40 kB holds" in report.detail
+    assert mapper.map.viewpoint is viewpoint
+    assert all((a == b).all() for a, b in zip(mapper.map.blocks(), before, strict=True))

@@ -20,7 +20,7 @@ from stereovox.maps.cell_pool import CellPool
 from stereovox.maps.cell_times import NEVER, CellTimes
 from stereovox.maps.evidence import Evidence
 from stereovox.maps.memory import window_blocks, within_memory
-from stereovox.maps.tiles import BLOCKS, TILE, Tile, TileStore, blocks_of, slabs_of
+from stereovox.maps.tiles import BLOCKS, INNER, TILE, Tile, TileStore, blocks_of, slabs_of
 from stereovox.maps.voxel_map import INDEX_LIMIT, VoxelMap
 from stereovox.maps.window import Box, Window, coarser, without
 
@@ -51,7 +51,7 @@ class RollingMap(VoxelMap):
         self._since: dict[Tile, int] = {}  # how many of them there were when a tile was put to the disk
         if self._settings.window.outside == "keep":  # last: they leave folders
             self._store = TileStore(self._format, tiles)
-            self._times_store = self._store_of_times(tiles)
+            self._times_store = self._store_of_times(self._store.folder / INNER)
 
     @property
     def window(self) -> NDArray[np.float64] | None:
@@ -164,7 +164,7 @@ class RollingMap(VoxelMap):
 
     def close(self) -> None:
         """Remove the tiles on disk; save the map before."""
-        for store in (self._store, self._times_store):
+        for store in (self._times_store, self._store):
             if store is not None:
                 store.close()
 
@@ -278,12 +278,12 @@ class RollingMap(VoxelMap):
         moments = self._now_ns, *self._turned[self._since[tile] :]
         return self._times.expired(times, min(moments)) | self._times.expired(times, max(moments))
 
-    def _store_of_times(self, tiles: Path | None) -> TileStore | None:
-        """Return the tiles beside those of the cells that keep when these were seen."""
+    def _store_of_times(self, folder: Path) -> TileStore | None:
+        """Return the tiles that keep when cells were seen."""
         if self._times is None:
             return None
         try:
-            return TileStore(TIMES, None if tiles is None else tiles.with_name(f"{tiles.name}-times"))
+            return TileStore(TIMES, folder)
         except BaseException:
             self.close()
             raise

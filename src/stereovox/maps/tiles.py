@@ -33,7 +33,9 @@ OFFSET = 1 << 30
 WAITING = 128
 """Tiles that may wait to be written; one more and mapping waits."""
 
-OURS = re.compile(rf"{re.escape(LOCK)}|zarr\.json|c|.*\.partial")
+INNER = "times"
+"""Folder for another store of the same tiles; whoever removes this one's folder removes it as well."""
+OURS = re.compile(rf"{re.escape(LOCK)}|zarr\.json|c|{INNER}|.*\.partial")
 """What a store has in its folder."""
 
 Tile = tuple[int, int, int]
@@ -72,8 +74,6 @@ class TileStore:
         """
         while len(self._waiting) >= WAITING and self._failed is None:
             self._settle(next(iter(self._waiting)))
-        if tile in self._waiting:
-            self._settle(tile)
         dense = np.full((BLOCKS,) * 3 + (CELLS,), self._format.unknown, self._format.dtype)
         dense[tuple((coords - np.multiply(tile, BLOCKS)).T)] = cells
         self._tiles.add(tile)

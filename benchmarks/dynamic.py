@@ -86,7 +86,7 @@ def draw(found: dict[str, dict[str, Ghosts]], path: Path) -> None:
         for name, one in models.items():
             chart.plot(np.arange(len(one.number)) / HZ, one.number, label=name)
         chart.set_title(f"background: {background}", loc="left", fontsize=9)
-        labels(chart, "seconds" if chart is charts[-1] else "", "ghosts")
+        labels(chart, "seconds" if chart is charts[-1] else "", "cells that are ghosts")
     charts[0].legend(frameon=False, fontsize=8)
     path.write_bytes(png_of(figure, 120))
 

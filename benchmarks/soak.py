@@ -186,12 +186,13 @@ def draw(found: dict, path: Path) -> None:
     memory, times = figure.subplots(2, 1, sharex=True)
     memory.plot(at, [minute["rss_bytes"] / 1e6 for minute in minutes], color="C0")
     memory.set_ylim(0, 1.2 * max(minute["rss_bytes"] for minute in minutes) / 1e6)
-    for name, colour in (("wall_ms", "C1"), ("cpu_ms", "C2")):
-        times.plot(at, [minute[name]["p99"] for minute in minutes], color=colour, label=name.removesuffix("_ms"))
+    for name, colour, label in (("wall_ms", "C1", "on the clock"), ("cpu_ms", "C2", "of the processor")):
+        times.plot(at, [minute[name]["p99"] for minute in minutes], color=colour, label=label)
     times.set_ylim(bottom=0)
     times.legend(frameon=False)
-    labels(memory, "", "RSS in MB")
-    labels(times, "minutes of flight", "99 % of frames, ms")
+    memory.set_title(f"{found['frames']:,} frames, one after the other, into one map", fontsize=10)
+    labels(memory, "", "memory of the process, MB")
+    labels(times, "minutes of flight", "ms that 99 % of frames keep")
     path.write_bytes(png_of(figure, 120))
 
 

@@ -191,3 +191,8 @@ def test_did_you_mean_lists_all_where_nothing_is_near():
 def test_a_fixed_box_needs_a_size():
     refused("window.centre needs window.size", **{"window.centre": [1, 2, 3]})
     assert load_config(**{"window.centre": [1, 2, 3], "window.size": [4, 4, 4]}).window.centre == (1, 2, 3)
+
+
+@pytest.mark.parametrize("memory", ["5 XB", "abc", -5, float("nan"), "1e3 kB"])
+def test_a_size_that_is_none_is_told_how_to_write_one(memory):
+    refused("max_memory", 'give bytes, or a size like "500 MB"', max_memory=memory)

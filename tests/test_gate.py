@@ -287,6 +287,7 @@ def test_a_report_tells_that_frames_are_believed_again():
     mapper = sv.Mapper(**SETTINGS)
     reports = [mapper.add(frame_at(200 * i, 30.0 * (i > 2))) for i in range(10)]
     assert [report.refused for report in reports] == [None] * 3 + ["pose_jump"] * 5 + [None] * 2
+    assert "jumped by 30 m and 0 degrees in 0.2 s" in reports[3].detail
     assert "pose_jump" in reports[8].detail
     assert reports[9].detail == ""
     assert mapper.map.history.settled == {"pose_jump": 1}

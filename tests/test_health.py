@@ -158,3 +158,10 @@ def test_a_floors_map_has_the_same_states():
     assert mapper.health().refused == {"no_valid_range": 1}
     clock.wait(4.5)
     assert mapper.health().state == "lost"
+
+
+def test_the_reasons_told_add_up():
+    mapper, _ = mapper_and_clock()
+    for fault in ("a", "a", "b", "b", "c", "c", "d", "e"):
+        mapper.add(frame(fault=fault))
+    assert "8 of 8 frames refused (2 x a, 2 x b, 2 x c, 2 x other)" in mapper.health().text

@@ -125,7 +125,9 @@ def test_a_refused_frame_changes_nothing(integrator):
     after = mapper.map.blocks()
     assert all((a == b).all() for a, b in zip(before, after, strict=True))
     assert mapper.map.frames == 1
-    assert mapper.add(frame_of(image)).refused is None
+    report = mapper.add(frame_of(image))
+    assert report.refused is None
+    assert report.match_ms == 0  # only pairs are matched
 
 
 @pytest.mark.parametrize("integrator", ["projective", "ray"])

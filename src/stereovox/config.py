@@ -394,6 +394,8 @@ def _one_line(error: ValidationError, where: str) -> str:
         length, location = _tuple_length(location[:at]), location[:at]
         letters = "xyz" if length == 3 else "abcdefgh"
         message = f"give a list of {length} numbers, [{', '.join(letters[:length])}]"
+    if first["type"].startswith("byte_size"):
+        message = 'give bytes, or a size like "500 MB"'
     name = ".".join(map(str, location)) or "settings"
     given = "" if isinstance(value, dict) or value == "" else f" {shown(value)}"
     return f"{where}{name}{given}: {message}"

@@ -131,7 +131,9 @@ class Gate:
         if why == RESET:
             return f"its clock is {seconds:+.6g} s off the last trusted frame's, it was reset; {until}"
         metres, angle = _step(before.pose, now.pose)
-        return f"the pose jumped by {metres:.3g} m and {angle * 57.29578:.3g} degrees in {seconds:.3g} s; {until}"
+        return (
+            f"the pose jumped by {metres:.3g} m and {round(angle * 57.29578, 1):g} degrees in {seconds:.3g} s; {until}"
+        )
 
 
 def _step(before: tuple[float, ...], now: tuple[float, ...]) -> tuple[float, float]:

@@ -103,6 +103,8 @@ def _text(
     for word, counts in (("refused", refused), ("looked at less thoroughly", reduced)):
         if counts:
             told = ", ".join(f"{number} x {name}" for name, number in counts.most_common(3))
+            others = counts.total() - sum(number for _, number in counts.most_common(3))
+            told += f", {others} x other" if others else ""
             parts.append(f"{counts.total()} of {frames} frames {word} ({told})")
     if state == "degraded":
         parts += [f"sensor '{sensor}' silent for {ns / 1e9:.2f} s" for sensor, ns in list(silent.items())[:3]]

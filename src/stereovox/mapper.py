@@ -48,7 +48,7 @@ class Mapper:
         try:
             way = self._pace.way()
             matched = way.depth.matched(frame)
-            between = perf_counter()
+            between = start if matched is frame else perf_counter()
             image = way.depth.image(matched)
             passed = self._gate.check(frame, image)
             prepared = perf_counter()

@@ -93,3 +93,11 @@ def test_a_taken_port_is_one_line(saved, capsys):
     assert captured.out == ""
     assert captured.err.count("\n") == 1
     assert "this port is in use; give another one (--port" in captured.err
+
+
+def test_a_link_for_this_machine_alone_promises_nothing_to_others(saved, capsys, monkeypatch):
+    from stereovox.view import viewer
+
+    monkeypatch.setattr(viewer.Viewer, "wait", lambda self: None)
+    assert main(["view", str(saved), "--port", "0", "--token", "a" * 16]) == 0
+    assert "whoever has this link can look at the map\n" in capsys.readouterr().err

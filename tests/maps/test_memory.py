@@ -15,6 +15,7 @@ from stereovox.maps import VoxelMap, load_map, make_map
 from stereovox.maps.evidence import Evidence
 from stereovox.maps.grid_evidence import GridEvidence
 from stereovox.maps.grid_map import GridMap
+from stereovox.maps.memory import within_memory
 
 TIMES = {"map.keep_times": True}
 
@@ -210,3 +211,11 @@ def test_a_long_flight_survives_under_a_limit_of_the_system(when_full):
     command = [sys.executable, "-c", LONG_FLIGHT, when_full]
     done = subprocess.run(command, cwd=Path(__file__).parent, capture_output=True, text=True, check=False)
     assert done.stdout.startswith("survived"), done.stderr
+
+
+def test_the_memory_that_is_told_is_enough():
+    for max_range in np.arange(0.5, 8, 0.3):
+        with pytest.raises(ConfigError) as refused:
+            within_memory(settings("100 kB", when_full="roll", max_range=max_range))
+        enough = str(refused.value).split("needs ")[1].split(";")[0]
+        assert within_memory(settings(enough, when_full="roll", max_range=max_range)).window.size

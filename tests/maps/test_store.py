@@ -112,3 +112,20 @@ def test_a_damaged_manifest_is_one_line(tmp_path, damage):
     with pytest.raises(MapFileError, match=r"make .* anew") as caught:
         load_map(tmp_path / "m")
     assert "\n" not in str(caught.value)
+
+
+def test_what_may_not_be_read_or_written_is_named_once_with_its_cure(tmp_path, monkeypatch):
+    small_map().save(tmp_path / "m")
+    monkeypatch.setattr(store.os, "access", lambda *_: False)
+    with pytest.raises(MapFileError) as refused:
+        store.check_target(tmp_path / "m")
+    assert str(refused.value) == f"{tmp_path / 'm'}: cannot be written to; choose a writable folder"
+    monkeypatch.setattr(store, "read_bounded", forbidden)
+    with pytest.raises(MapFileError) as refused:
+        load_map(tmp_path / "m")
+    manifest = tmp_path / "m" / "manifest.json"
+    assert str(refused.value) == f"{manifest}: cannot be read (Permission denied); check that you may read it"
+
+
+def forbidden(path, most):
+    raise PermissionError(13, "Permission denied", str(path))

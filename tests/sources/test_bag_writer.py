@@ -14,6 +14,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from rosbags import rosbag1, rosbag2
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import QosDurability
 from scipy.spatial.transform import Rotation
@@ -422,3 +423,16 @@ def test_memory_does_not_grow_with_the_recording(tmp_path, name):
 
     peak(1)
     assert peak(40) < peak(4) + 2_000_000  # the 36 images more are 22 MB
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_bag_that_cannot_even_be_begun_leaves_nothing(tmp_path, monkeypatch, name):
+    writer = rosbag1.Writer if name.endswith(".bag") else rosbag2.Writer
+    monkeypatch.setattr(writer, "open", no_room)
+    with pytest.raises(SourceError, match="No space left"), BagWriter(tmp_path / name):
+        pass
+    assert not list(tmp_path.iterdir())
+
+
+def no_room(self):
+    raise OSError(errno.ENOSPC, "No space left on device")

@@ -254,7 +254,7 @@ def _tell(result: dict[str, Any], reports: list[UpdateReport], out: Path, window
         say(f"  {result['dropped']} more came while the map was busy and were dropped; see --set deadline_ms=")
     if set(result["ways"]) - {"full"}:
         say(f"for want of time: {', '.join(f'{number} {way}' for way, number in result['ways'].items())}")
-    if result["match_ms"]["max"] > 1:  # stereo pairs
+    if result["match_ms"]["max"]:  # stereo pairs
         say(f"a pair: matching {milliseconds(result['match_ms'])}")
     say(f"a frame: depth {milliseconds(result['depth_ms'])}; map {milliseconds(result['integrate_ms'])}")
     say(cells_line(result))

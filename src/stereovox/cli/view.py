@@ -47,7 +47,8 @@ def run(arguments: Namespace) -> dict[str, Any]:
     viewer = open_viewer(open_cubes(arguments.map), name, *place, arguments.up, token)
     with closing(viewer), suppress(KeyboardInterrupt):
         if "?token=" in viewer.url:
-            say("whoever has this link can look at the map; from another machine put this one's name for localhost")
+            others = "; from another machine put this one's name for localhost" if "//localhost:" in viewer.url else ""
+            say(f"whoever has this link can look at the map{others}")
         say(f"open {viewer.url} in a browser; Ctrl-C ends")
         viewer.wait()
     return {"url": viewer.url}

@@ -75,6 +75,14 @@ def told(number_of_bytes: float) -> str:
     return f"{number / size:.0f} {unit}" if number >= 10 * size else f"{number / size:.2g} {unit}"
 
 
+def _enough(number_of_bytes: int) -> str:
+    """Return at least this number of bytes as text, so that who sets just what it says has enough."""
+    number = min(number_of_bytes, int(MOST_TOLD))
+    size, unit = next(((int(size), unit) for size, unit in UNITS if number >= size), (1, "bytes"))
+    part = 1 if number >= 10 * size or size == 1 else 10
+    return f"{-(-number * part // size) / part:g} {unit}"
+
+
 def _widest(config: Config) -> float:
     """Return the width in metres of the largest window that fits."""
     least = 2 * (config.max_range + config.window.trigger) + config.voxel_size
@@ -82,9 +90,9 @@ def _widest(config: Config) -> float:
     fits = lambda n: _window_bytes(_as_wide(config, n * step)) <= (config.max_memory or 0)  # noqa: E731
     width = step * _largest(fits, int(LARGEST_WINDOW / step))
     if width < least:
-        needed = _window_bytes(_as_wide(config, least))
+        needed = _window_bytes(_as_wide(config, step * -(-least // step)))
         raise ConfigError(
-            f"max_memory {told(config.max_memory or 0)}: a window that holds the view needs {told(needed)}; "
+            f"max_memory {told(config.max_memory or 0)}: a window that holds the view needs {_enough(needed)}; "
             "allow more, or set a smaller max_range or larger cells"
         )
     return width

@@ -92,7 +92,8 @@ def check_target(folder: Path) -> None:
         raise MapFileError(f"{folder}: exists and is not a stereovox map; choose another name or remove it")
     there = next(parent for parent in (folder, *folder.absolute().parents) if parent.exists())
     if not there.is_dir() or not os.access(there, os.W_OK | os.X_OK):
-        raise MapFileError(f"{folder}: {there} cannot be written to; choose a writable folder")
+        where = "" if there == folder else f"{there} "
+        raise MapFileError(f"{folder}: {where}cannot be written to; choose a writable folder")
 
 
 def load_map(path: str | Path) -> VoxelMap:
@@ -152,7 +153,10 @@ def read_manifest(folder: Path) -> dict[str, Any]:
         raise MapFileError(f"{folder / MANIFEST}: is a link; a map has all its files in one folder")
     try:
         manifest = json_value(read_bounded(folder / MANIFEST, MOST_MANIFEST))
-    except (OSError, ValueError) as error:
+    except OSError as error:
+        reason = error.strerror or error
+        raise MapFileError(f"{folder / MANIFEST}: cannot be read ({reason}); check that you may read it") from None
+    except ValueError as error:
         raise MapFileError(f"{folder / MANIFEST}: cannot be read ({error}); make the map anew") from None
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
         raise MapFileError(f"{folder / MANIFEST}: not a stereovox map")

@@ -44,10 +44,14 @@ class BagFileWriter:
 
     def open(self) -> None:
         """Begin; nothing is at `path` yet."""
-        with self._told():
-            self._folder.mkdir()
-            self._writer = self._ros1() if self.ros == 1 else self._ros2()
-            self._writer.open()
+        try:
+            with self._told():
+                self._folder.mkdir()
+                self._writer = self._ros1() if self.ros == 1 else self._ros2()
+                self._writer.open()
+        except SourceError:
+            self.abort()
+            raise
 
     def write(self, topic: str, kind: str, stamp_ns: int, message: Any, latched: bool = False) -> None:
         """Write one message of the store's type `kind` (`nav_msgs/msg/Odometry`), recorded at `stamp_ns`.

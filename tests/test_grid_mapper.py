@@ -87,7 +87,7 @@ def test_a_report_tells_what_a_scan_did():
         ({"T_world_sensor": np.diag([1.0, -1, 1, 1])}, "pose_not_rigid"),
         ({"T_world_sensor": 2 * np.eye(4)}, "pose_not_rigid"),
         ({"T_world_sensor": np.eye(3)}, "pose_not_rigid"),
-        ({"T_world_sensor": None}, "pose_not_rigid"),
+        ({"T_world_sensor": None}, "no_pose"),
         ({"T_world_sensor": leaning(6)}, "tilted"),
     ],
 )

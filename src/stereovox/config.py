@@ -300,6 +300,8 @@ class Config(Section):
             raise ValueError(f"min_range {self.min_range:g} must be smaller than max_range {self.max_range:g}")
         if self.dimensions == 2 and (self.map.keep_times or (self.max_memory and self.when_full != "refuse")):
             raise ValueError('a floor\'s grid has no map.keep_times, and when_full can only be "refuse"')
+        if self.when_full != "refuse" and self.max_memory is None:
+            raise ValueError(f'when_full "{self.when_full}" needs max_memory, for example max_memory="500 MB"')
         if self.dimensions == 2 and self.deadline_ms is not None:
             raise ValueError("deadline_ms is for maps in space; leave it out for the map of a floor")
         if self.max_range / self.voxel_size > MOST_CELLS:

@@ -297,9 +297,10 @@ def test_cells_of_a_dead_run_go_even_where_there_is_nothing_left_to_do(tmp_path,
     assert mapped(tmp_path / "m", "--frames", ":3") == 0
     whole = names(tmp_path / "m")
     (tmp_path / "m" / "cells-0123456789ab" / "coords").mkdir(parents=True)
-    assert mapped(tmp_path / "m", "--frames", ":3", "--resume") == 2
+    assert mapped(tmp_path / "m", "--frames", ":3", "--resume") == 0
     assert "already holds all 3 frames" in capsys.readouterr().err
-    assert names(tmp_path / "m") == whole
+    assert len(names(tmp_path / "m")) == len(whole)
+    assert not (tmp_path / "m" / "cells-0123456789ab").exists()
 
 
 def test_runs_that_are_killed_leave_maps_that_open_and_can_be_gone_on_with():

@@ -110,9 +110,11 @@ def test_resume_equals_one_run(recording, tmp_path, capsys):
     whole, parts = sv.load_map(tmp_path / "whole"), sv.load_map(tmp_path / "parts")
     assert all((a == b).all() for a, b in zip(whole.blocks(), parts.blocks(), strict=True))
     assert (parts.frames, parts.frames_refused) == (whole.frames, whole.frames_refused) == (5, 1)
-    fails_with_one_line(
-        capsys, "already holds all", "map", recording, "--out", tmp_path / "parts", "--voxel-size", 0.1, "--resume"
-    )
+    assert run("map", recording, "--out", tmp_path / "parts", "--resume") == 0
+    assert "already holds all 6 frames" in capsys.readouterr().err
+    assert (sv.load_map(tmp_path / "parts").blocks()[1] == whole.blocks()[1]).all()
+    fewer = ["map", recording, "--out", tmp_path / "parts", "--resume", "--frames", ":4"]
+    fails_with_one_line(capsys, "holds 6 frames, more than the 4", *fewer)
     other_size = ["--resume", "--voxel-size", 0.2]
     fails_with_one_line(capsys, "voxel_size 0.1", "map", recording, "--out", tmp_path / "parts", *other_size)
 

@@ -93,7 +93,7 @@ def grid():
         ({"fault": 1}, "bad_form"),
         ({"fault": "no_pose", "depth": None, "camera": None}, "no_pose"),
         ({"name": "two\nlines\r", "depth": None}, "bad_dtype"),
-        ({"T_world_sensor": None}, "pose_not_rigid"),
+        ({"T_world_sensor": None}, "no_pose"),
         ({"T_world_sensor": [[1, 2], [3]]}, "pose_not_rigid"),
         ({"T_world_sensor": np.eye(4)[:3]}, "pose_not_rigid"),
         ({"T_world_sensor": np.eye(4).astype(complex)}, "pose_not_rigid"),

@@ -128,7 +128,7 @@ REFUSALS = [
     ("pose_not_rigid", {"T_world_sensor": np.diag([1.1, 1, 1, 1])}),
     ("pose_not_rigid", {"T_world_sensor": np.zeros((4, 4))}),
     ("pose_not_rigid", {"T_world_sensor": np.eye(3)}),
-    ("pose_not_rigid", {"T_world_sensor": None}),
+    ("no_pose", {"T_world_sensor": None}),
     ("no_valid_depth", {"depth": GOOD * np.nan}),
     ("no_valid_depth", {"depth": GOOD * 0}),
     ("unreadable", {"fault": "unreadable", "fault_detail": "f7: cut short"}),

@@ -192,9 +192,14 @@ def _add_all(
     reports: list[UpdateReport] = []
     done = _seen(mapper)
     if done:
-        if source.length is not None and done >= source.length:
-            raise StereovoxError(f"{out}: already holds all {source.length} frames of {source.name}")
+        if source.length is not None and done > source.length:
+            raise StereovoxError(
+                f"{out}: holds {done} frames, more than the {source.length} of {source.name}; give the same --frames"
+            )
         _check_last(mapper, source, done, out)
+        if done == source.length:  # whoever starts a run again after a kill need not know that it was complete
+            say(f"{out} already holds all {done} frames of {source.name}")
+            return reports
         source = source.after(done)
         say(f"going on after frame {done}")
     try:
@@ -252,8 +257,8 @@ def _tell(result: dict[str, Any], reports: list[UpdateReport], out: Path, window
     say_refusals(result, reports, "frames")
     if result.get("dropped"):
         say(f"  {result['dropped']} more came while the map was busy and were dropped; see --set deadline_ms=")
-    if set(result["ways"]) - {"full"}:
-        say(f"for want of time: {', '.join(f'{number} {way}' for way, number in result['ways'].items())}")
+    if reduced := [f"{number} {way}" for way, number in result["ways"].items() if way != "full"]:
+        say(f"for want of time: {', '.join(reduced)}")
     if result["match_ms"]["max"]:  # stereo pairs
         say(f"a pair: matching {milliseconds(result['match_ms'])}")
     say(f"a frame: depth {milliseconds(result['depth_ms'])}; map {milliseconds(result['integrate_ms'])}")

@@ -37,7 +37,7 @@ def prepare(frame: Frame, config: Config) -> DepthImage:
     its TOO_FAR only where nothing contradicts it: a depth beside it, or the frame's `farthest`. `depth.far` says whose
     word is taken for too far.
     Raises FrameRefused with the reason: the source's `fault`, `bad_form` and others of `check_form`, `bad_dtype`,
-    `bad_shape`, `bad_scale`, `bad_reason`, `pose_not_finite`, `pose_not_rigid`, `no_valid_depth`.
+    `bad_shape`, `bad_scale`, `bad_reason`, `no_pose`, `pose_not_finite`, `pose_not_rigid`, `no_valid_depth`.
     """
     _check_image(frame)
     T_world_sensor = rigid_pose(frame, config.pose_rigidity_tolerance)
@@ -89,7 +89,12 @@ def _are_reasons(given: NDArray, shape: tuple[int, ...]) -> bool:
 
 
 def rigid_pose(frame: Frame | Scan, tolerance: float) -> geometry.Transform:
-    """Return the rigid motion nearest to the pose; raises FrameRefused: `pose_not_finite`, `pose_not_rigid`."""
+    """Return the rigid motion nearest to the pose.
+
+    Raises FrameRefused: `no_pose` for None, `pose_not_finite`, `pose_not_rigid`.
+    """
+    if frame.T_world_sensor is None:
+        raise FrameRefused("no_pose", f"{_name(frame)}: there is no pose; give a (4, 4) matrix, or wait for one")
     T = matrix_of(frame.T_world_sensor)
     if T.shape == (4, 4) and not all(-FARTHEST < x < FARTHEST for x in T.ravel().tolist()):
         raise FrameRefused("pose_not_finite", f"{_name(frame)}: the pose holds NaN, infinity or absurdly large numbers")

@@ -38,8 +38,6 @@ def sound(scan: Scan, rigidity: float) -> Scan:
     """
     check_form(scan, Scan)
     name = name_of(scan)
-    if scan.fault:
-        raise FrameRefused(scan.fault, scan.fault_detail or f"{name}: {scan.fault}")
     ranges = np.asarray(scan.ranges)
     if ranges.ndim != 1 or not ranges.size or not np.issubdtype(ranges.dtype, np.floating):
         raise FrameRefused("bad_shape", f"{name}: ranges are {ranges.shape} {ranges.dtype}; give (N,) float32 metres")

@@ -181,14 +181,14 @@ def test_pairs_are_matched_at_half_the_resolution_on_the_coarse_way():
 
 
 class Clock:
-    """Stands for the clock of a mapper; each look at it takes a quarter of a frame."""
+    """Stands for the clock of a mapper; each look at it takes half of a frame."""
 
     def __init__(self, monkeypatch):
         self.now, self.frame_ms = 0.0, 0.0
         monkeypatch.setattr(mapper_module, "perf_counter", self)
 
     def __call__(self):
-        self.now += self.frame_ms / 3 / 1e3
+        self.now += self.frame_ms / 2 / 1e3
         return self.now
 
 

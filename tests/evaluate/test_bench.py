@@ -12,8 +12,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-
 from made_frames import CAMERA, a_frame
+
 from stereovox.errors import ConfigError, MissingExtra, StereovoxError
 from stereovox.evaluate import bench as bench_module
 from stereovox.evaluate import peers as peers_module

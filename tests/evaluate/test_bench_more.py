@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
 from made_frames import a_recording
+
 from stereovox import load_config
 from stereovox.errors import ConfigError, StereovoxError
 from stereovox.evaluate import bench_path, bench_size, bench_start

@@ -181,7 +181,7 @@ def moments(frames):
 
 config = load_config(voxel_size=0.01, max_range=0.5, max_memory="40 MB", when_full=sys.argv[1],
                      **{"map.keep_times": True, "window.trigger": 0.1})
-made.fly(VoxelMap(load_config(config, max_memory=None)), moments(2))  # kernels are loaded
+made.fly(VoxelMap(load_config(config, max_memory=None, when_full="refuse")), moments(2))  # kernels are loaded
 peak = lambda: 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 address_space = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
 resource.setrlimit(resource.RLIMIT_AS, (address_space + 150_000_000,) * 2)
@@ -195,7 +195,8 @@ assert peak() - before < 60e6, peak() - before
 if sys.argv[1] == "refuse":
     assert refused > 300, refused
     assert len(one._pool) > 10_000
-    whole = made.fly(VoxelMap(load_config(config, max_memory=None, **{"map.keep_times": False})), moments(one.frames))
+    plain = load_config(config, max_memory=None, when_full="refuse", **{"map.keep_times": False})
+    whole = made.fly(VoxelMap(plain), moments(one.frames))
     for a, b in zip(one.slabs(), whole.slabs()):
         assert all((x == y).all() for x, y in zip(a, b))
 else:
@@ -219,3 +220,9 @@ def test_the_memory_that_is_told_is_enough():
             within_memory(settings("100 kB", when_full="roll", max_range=max_range))
         enough = str(refused.value).split("needs ")[1].split(";")[0]
         assert within_memory(settings(enough, when_full="roll", max_range=max_range)).window.size
+
+
+@pytest.mark.parametrize("when_full", ["roll", "spill"])
+def test_what_happens_when_full_needs_a_size(when_full):
+    with pytest.raises(ConfigError, match=f'when_full "{when_full}" needs max_memory'):
+        load_config(when_full=when_full)

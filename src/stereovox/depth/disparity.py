@@ -103,10 +103,9 @@ def explained(
     """Return the disparity with confidence and reasons; `raw` (height, width), in full pixels, is changed.
 
     image: (height, width) uint8 that `raw` is aligned with. valid, valid_other: (height, width) bool of that image and
-    of the other, None: all may be used. A pixel is MASKED where it or its match is, and where
-    it lies in the cropped columns. TOO_NEAR: the best match is the
-    last one searched, a nearer one may be missing. TOO_FAR: surely less than half a pixel, with texture. All else
-    without a value is UNMATCHED.
+    of the other, None: all may be used. A pixel is MASKED where it or its match is, and where it lies in the cropped
+    columns. TOO_NEAR: the best match is the last one searched, a nearer one may be missing. TOO_FAR: surely less than
+    half a pixel, with texture. All else without a value is UNMATCHED.
     """
     right = config.aligned == "right"
     side = 1 if right else -1

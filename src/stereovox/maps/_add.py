@@ -9,7 +9,7 @@ any number of threads, and `settle` takes the rows from blocks that have sunk to
 import numpy as np
 
 from stereovox._jit import cell, kernel
-from stereovox.maps._cells import find
+from stereovox.maps._cells import find, says_something
 from stereovox.maps._pool import BARE, make_bare, need, new_row, with_row
 
 SKIP, MAKE = np.int32(-1), np.int32(-2)
@@ -29,7 +29,7 @@ def places(table, coords, values, wanted, steps, uniform, out):
     for i in range(n):
         place = _find(table, coords, wanted, i)
         if place < 0:
-            place = MAKE if _says_something(steps[i]) else SKIP
+            place = MAKE if says_something(steps[i]) else SKIP
         elif place >= rows:
             place = MAKE if _raises(steps[i]) else SKIP
         made += place == MAKE
@@ -124,14 +124,6 @@ def _added(old, step, unknown, prior, lowest, highest):
 @cell
 def _find(table, coords, wanted, i):
     return find(table, coords, wanted[i, 0], wanted[i, 1], wanted[i, 2])
-
-
-@cell
-def _says_something(steps):
-    anything = NIL
-    for c in range(512):
-        anything = np.int16(anything | steps[c])
-    return anything != NIL
 
 
 @cell

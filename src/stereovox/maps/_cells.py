@@ -7,7 +7,7 @@ from stereovox._jit import cell
 
 UNKNOWN, FREE, TENTATIVE, OCCUPIED = 0, 1, 2, 3
 """What a map says about a cell; see `State`."""
-EMPTY = np.int32(-1)
+EMPTY, NIL = np.int32(-1), np.int16(0)
 NO_ROW, AT_FLOOR = np.int64(-1), np.int64(-2)
 """In place of a row of values: the block is not there; all its cells hold the lowest number there is."""
 
@@ -22,6 +22,15 @@ def added(old, step, unknown, prior, lowest, highest):
     new = min(max(np.int32(start + step), lowest), highest)
     new = np.int32(new + (np.int32(1) if new == unknown else np.int32(0)))
     return new if step != 0 else old
+
+
+@cell
+def says_something(steps):
+    """Tell whether evidence (512,) int16 on a block is anything but zeros."""
+    anything = NIL
+    for c in range(512):
+        anything = np.int16(anything | steps[c])
+    return anything != NIL
 
 
 @cell

@@ -8,7 +8,7 @@ Every kernel takes the times as three arrays and a number: `table`, `coords`, `t
 import numpy as np
 
 from stereovox._jit import cell, kernel
-from stereovox.maps._cells import find, find_or_insert, home_slot
+from stereovox.maps._cells import find, find_or_insert, home_slot, says_something
 from stereovox.maps._pool import forget
 
 NEVER = np.uint32(0)
@@ -22,7 +22,7 @@ def missing(table, coords, wanted, values, uniform):
     """Return how many blocks of evidence have no times so far: `wanted` (n, 3) with any `values`, `uniform` (m, 3)."""
     number = 0
     for i in range(wanted.shape[0]):
-        number += _says_something(values[i]) and find(table, coords, wanted[i, 0], wanted[i, 1], wanted[i, 2]) < 0
+        number += says_something(values[i]) and find(table, coords, wanted[i, 0], wanted[i, 1], wanted[i, 2]) < 0
     for i in range(uniform.shape[0]):
         number += find(table, coords, uniform[i, 0], uniform[i, 1], uniform[i, 2]) < 0
     return number
@@ -32,7 +32,7 @@ def missing(table, coords, wanted, values, uniform):
 def write(table, coords, times, count, wanted, values, uniform, now):
     """Set the cells that get evidence to `now`: those of `values` (n, 512) that are not zero, all of `uniform`."""
     for i in range(wanted.shape[0]):
-        if _says_something(values[i]):
+        if says_something(values[i]):
             row = find_or_insert(table, coords, count, wanted[i, 0], wanted[i, 1], wanted[i, 2])
             given, mine = values[i], times[row]
             for c in range(512):
@@ -94,11 +94,3 @@ def _any_past(times, now, most):
         away = np.uint32(max(times[c], now) - min(times[c], now))
         past |= np.uint32((times[c] != NEVER) & (away > most))
     return past != 0
-
-
-@cell
-def _says_something(steps):
-    anything = NIL
-    for c in range(512):
-        anything = np.int16(anything | steps[c])
-    return anything != NIL

@@ -89,7 +89,7 @@ class Pace:
             raise FrameRefused("no_time", "left out: frames take longer than deadline_ms even on the quickest way")
         return self._ways[self._ladder.step]
 
-    def took(self, way: Way, milliseconds: float) -> None:
-        """Learn from the time that a frame took on `way`."""
+    def took(self, milliseconds: float) -> None:
+        """Learn from the time that a frame took on the way that `way` returned."""
         if self._ladder is not None:
             self._ladder.took(milliseconds)

@@ -19,6 +19,7 @@ from stereovox.depth.downsample import downsample
 from stereovox.depth.shorten import shortened
 from stereovox.errors import ConfigError
 from stereovox.frame import AnyFrame, DepthImage, Frame
+from stereovox.health import FULL
 from stereovox.integrate import make_integrator
 from stereovox.sensors.model import REACH_SIGMA
 from stereovox.sensors.noise import RangeNoise
@@ -49,7 +50,7 @@ class Way:
 
 def full(config: Config) -> Way:
     """Return the way that leaves nothing out."""
-    return Way("full", DepthPath(config), config)
+    return Way(FULL, DepthPath(config), config)
 
 
 def ladder(config: Config) -> list[Way]:

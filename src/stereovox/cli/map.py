@@ -254,10 +254,12 @@ def _first_refusal(reports: list[UpdateReport]) -> str:
 
 
 def _tell(result: dict[str, Any], reports: list[UpdateReport], out: Path, window: WindowConfig) -> None:
+    from stereovox.health import FULL
+
     say_refusals(result, reports, "frames")
     if result.get("dropped"):
         say(f"  {result['dropped']} more came while the map was busy and were dropped; see --set deadline_ms=")
-    if reduced := [f"{number} {way}" for way, number in result["ways"].items() if way != "full"]:
+    if reduced := [f"{number} {way}" for way, number in result["ways"].items() if way != FULL]:
         say(f"for want of time: {', '.join(reduced)}")
     if result["match_ms"]["max"]:  # stereo pairs
         say(f"a pair: matching {milliseconds(result['match_ms'])}")

@@ -149,6 +149,11 @@ AnyFrame = Frame | StereoFrame
 """What a source delivers and a mapper takes."""
 
 
+def name_of(seen: AnyFrame | Scan) -> str:
+    """Return what to call a frame or scan in a message."""
+    return seen.name or f"{'scan' if isinstance(seen, Scan) else 'frame'} at {seen.stamp_ns} ns"
+
+
 @dataclass(frozen=True, eq=False)
 class DepthImage:
     """A depth image that can be trusted, in metres, with the reason of every pixel that has no value.

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from stereovox.config import Config
 from stereovox.errors import FrameRefused
-from stereovox.frame import AnyFrame, DepthImage, Scan
+from stereovox.frame import AnyFrame, DepthImage, Scan, name_of
 from stereovox.history import LONGEST_NAME, MOST_SENSORS, History, Seen, Streak
 
 SLACK_M, SLACK_RAD = 0.05, radians(2)
@@ -60,7 +60,7 @@ class Gate:
         trusted = self._history.trusted.get(sensor)
         if trusted is None:
             if len(self._history.trusted) >= MOST_SENSORS:
-                raise FrameRefused("bad_sensor", f"{_name(frame)}: more than {MOST_SENSORS} sensors; name fewer")
+                raise FrameRefused("bad_sensor", f"{name_of(frame)}: more than {MOST_SENSORS} sensors; name fewer")
             return Passed(sensor, now)
         why, haste = self._against(trusted, now)
         waiting = self._history.waiting.get(sensor)
@@ -80,11 +80,11 @@ class Gate:
         off_ns = abs(int(frame.pose_off_ns))
         if off_ns > self._off_ns:
             limit = f"trust.max_pose_off_s {self._trust.max_pose_off_s:g}"
-            said = f"{_name(frame)}: its pose is extrapolated by {off_ns / 1e9:.3f} s ({limit}); give poses in time"
+            said = f"{name_of(frame)}: its pose is extrapolated by {off_ns / 1e9:.3f} s ({limit}); give poses in time"
             raise FrameRefused("pose_extrapolated", said)
         if len(frame.sensor) > LONGEST_NAME or not frame.sensor.isprintable():
             said = f"sensor is no word of at most {LONGEST_NAME} letters that can be shown; name it otherwise"
-            raise FrameRefused("bad_sensor", f"{_name(frame)}: {said}")
+            raise FrameRefused("bad_sensor", f"{name_of(frame)}: {said}")
         return frame.sensor or ("scan" if isinstance(frame, Scan) else "camera"), int(frame.stamp_ns)
 
     def _against(self, before: Seen, now: Seen) -> tuple[str, float]:
@@ -115,7 +115,7 @@ class Gate:
             why, since_ns = waiting.why, waiting.since_ns
         else:
             since_ns = now.stamp_ns
-        detail = f"{_name(frame)}: {self._detail(why, trusted, now)}"
+        detail = f"{name_of(frame)}: {self._detail(why, trusted, now)}"
         if why == BACKWARDS:
             raise FrameRefused(why, detail)
         if now.stamp_ns - since_ns >= self._settle_ns:
@@ -142,7 +142,3 @@ def _step(before: tuple[float, ...], now: tuple[float, ...]) -> tuple[float, flo
     p, q, r, u, s, t, k, v, m, n, o, w = now
     cosine = (a * p + b * q + c * r + d * s + e * t + f * k + g * m + h * n + i * o - 1) / 2
     return dist((x, y, z), (u, v, w)), acos(min(1.0, max(-1.0, cosine)))
-
-
-def _name(frame: AnyFrame | Scan) -> str:
-    return frame.name or f"frame at {frame.stamp_ns} ns"

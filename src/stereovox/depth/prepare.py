@@ -15,7 +15,7 @@ from stereovox.depth.denoise import denoise
 from stereovox.depth.downsample import downsample
 from stereovox.depth.form import check_form, matrix_of
 from stereovox.errors import FrameRefused
-from stereovox.frame import DepthImage, Frame, Reason, Scan
+from stereovox.frame import DepthImage, Frame, Reason, Scan, name_of
 
 DTYPES = (np.dtype(np.uint16), np.dtype(np.float32), np.dtype(np.float64))
 SATURATED = 65535
@@ -46,7 +46,7 @@ def prepare(frame: Frame, config: Config) -> DepthImage:
     usable = _classify(frame, config, depth_m, reason)
     if not usable and not (reason == Reason.TOO_FAR).any():
         cure = "check its depth correction" if getattr(frame.camera, "correction", None) else "is the lens covered?"
-        raise FrameRefused("no_valid_depth", f"{_name(frame)}: not one pixel has a valid depth; {cure}")
+        raise FrameRefused("no_valid_depth", f"{name_of(frame)}: not one pixel has a valid depth; {cure}")
     denoise(depth_m, frame.camera, config)
     image = DepthImage(depth_m, reason, frame.camera, T_world_sensor, int(frame.stamp_ns))
     return downsample(image, config.depth.downsample)
@@ -71,7 +71,7 @@ def _classify(frame: Frame, config: Config, depth_m: NDArray, reason: NDArray) -
 
 def _check_image(frame: Frame) -> None:
     check_form(frame, Frame)
-    name, depth, camera = _name(frame), frame.depth, frame.camera
+    name, depth, camera = name_of(frame), frame.depth, frame.camera
     if not isinstance(depth, np.ndarray) or depth.dtype not in DTYPES:
         kind = getattr(depth, "dtype", type(depth).__name__)
         raise FrameRefused("bad_dtype", f"{name}: depth is {kind}; give a uint16, float32 or float64 array")
@@ -94,15 +94,13 @@ def rigid_pose(frame: Frame | Scan, tolerance: float) -> geometry.Transform:
     Raises FrameRefused: `no_pose` for None, `pose_not_finite`, `pose_not_rigid`.
     """
     if frame.T_world_sensor is None:
-        raise FrameRefused("no_pose", f"{_name(frame)}: there is no pose; give a (4, 4) matrix, or wait for one")
+        raise FrameRefused("no_pose", f"{name_of(frame)}: there is no pose; give a (4, 4) matrix, or wait for one")
     T = matrix_of(frame.T_world_sensor)
     if T.shape == (4, 4) and not all(-FARTHEST < x < FARTHEST for x in T.ravel().tolist()):
-        raise FrameRefused("pose_not_finite", f"{_name(frame)}: the pose holds NaN, infinity or absurdly large numbers")
+        raise FrameRefused(
+            "pose_not_finite", f"{name_of(frame)}: the pose holds NaN, infinity or absurdly large numbers"
+        )
     error = geometry.rigidity_error(T)
     if error > tolerance:
-        raise FrameRefused("pose_not_rigid", f"{_name(frame)}: the pose is no rigid 4x4 motion (off by {error:.2g})")
+        raise FrameRefused("pose_not_rigid", f"{name_of(frame)}: the pose is no rigid 4x4 motion (off by {error:.2g})")
     return geometry.orthonormalise(T) if error > EXACT else T
-
-
-def _name(frame: Frame | Scan) -> str:
-    return frame.name or f"frame at {frame.stamp_ns} ns"

@@ -15,9 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 from stereovox import planar, registry
 from stereovox.config import Config
 from stereovox.errors import ConfigError, FrameRefused
-from stereovox.frame import Scan
+from stereovox.frame import Scan, name_of
 from stereovox.integrate import _beams
-from stereovox.integrate.scan_check import name_of
 from stereovox.maps.evidence import to_units
 from stereovox.maps.grid_evidence import CELLS, SIDE, GridEvidence
 from stereovox.maps.voxel_map import INDEX_LIMIT

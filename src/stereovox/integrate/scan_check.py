@@ -12,7 +12,7 @@ from stereovox.config import Config
 from stereovox.depth.form import check_form, matrix_of
 from stereovox.depth.prepare import EXACT, FARTHEST, rigid_pose
 from stereovox.errors import FrameRefused
-from stereovox.frame import Scan
+from stereovox.frame import Scan, name_of
 
 
 def trusted(scan: Scan, config: Config) -> Scan:
@@ -63,8 +63,3 @@ def _mount(scan: Scan, rigidity: float) -> geometry.Transform:
         said = "T_base_sensor, where the lidar sits on the robot, is no rigid 4x4 motion"
         raise FrameRefused("mount_not_rigid", f"{name_of(scan)}: {said} (off by {error:.2g})")
     return geometry.orthonormalise(T) if error > EXACT else T
-
-
-def name_of(scan: Scan) -> str:
-    """Return what to call a scan in a message."""
-    return scan.name or f"scan at {scan.stamp_ns} ns"

@@ -7,8 +7,7 @@ from array import array
 from bisect import bisect_left
 
 from stereovox.errors import FrameRefused
-from stereovox.frame import Scan
-from stereovox.integrate.scan_check import name_of
+from stereovox.frame import Scan, name_of
 
 LATE = 3
 """Scans in a row that are too late, and in order among themselves, before it is asked who is right."""

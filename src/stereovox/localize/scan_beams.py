@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.errors import FrameRefused
-from stereovox.frame import Scan
-from stereovox.integrate.scan_check import name_of
+from stereovox.frame import Scan, name_of
 
 
 @dataclass(frozen=True, eq=False)

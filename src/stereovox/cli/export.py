@@ -11,9 +11,9 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import Any
 
+from stereovox.cli.numbers import heights_of
 from stereovox.cli.saved_map import open_cubes, open_map
 from stereovox.cli.terminal import say, size
-from stereovox.errors import StereovoxError
 
 EXAMPLE = "stereovox export kitchen.svox kitchen.bt"
 
@@ -34,7 +34,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
     """Load the map and write it in the other format."""
     from stereovox.products import FLAT, export
 
-    file, heights = Path(arguments.file), _heights(arguments.heights)
+    file, heights = Path(arguments.file), heights_of(arguments.heights)
     flat = file.suffix.lower() in FLAT
     voxel_map = open_map(arguments.map) if flat else open_cubes(arguments.map)  # seen from above, most need no cubes
     export(voxel_map, file, heights)
@@ -47,17 +47,3 @@ def run(arguments: Namespace) -> dict[str, Any]:
     else:
         say(f"saved {file} ({size(file.stat().st_size)})")
     return result
-
-
-def _heights(text: str | None) -> tuple[float, float] | None:
-    """Return what --heights says; raises StereovoxError where that is not LO:HI."""
-    if text is None:
-        return None
-    low, _, high = text.partition(":")
-    try:
-        heights = float(low), float(high)
-    except ValueError:
-        raise StereovoxError(f"--heights {text}: write LO:HI in metres, for example --heights 0.1:1.8") from None
-    if not heights[0] < heights[1]:
-        raise StereovoxError(f"--heights {text}: the second must be higher than the first")
-    return heights

@@ -17,6 +17,7 @@ from stereovox.maps.cubes import in_cubes
 from stereovox.maps.occupancy import UNKNOWN, OccupancyGrid
 from stereovox.maps.percent import Percent
 from stereovox.products import _projection
+from stereovox.products.floor_axes import Heights, floor_axes
 from stereovox.products.map_server import write_map_server
 
 NOTHING = np.iinfo(np.int16).min
@@ -24,7 +25,6 @@ NOTHING = np.iinfo(np.int16).min
 MOST_CELLS = 2**30
 """Cells of the largest grid."""
 TIE = 1e-9
-Heights = tuple[float, float]
 
 
 class _Patch(NamedTuple):
@@ -48,12 +48,9 @@ def project(voxel_map: VoxelMap, heights: Heights | None = None) -> OccupancyGri
     for x, z and x for y, and with a minus the same two swapped. Uneven cells become cubes where the floor needs it.
     Raises StereovoxError, one line, where no cell between the heights is known, or the grid were too large.
     """
-    axis = "xyz".index(voxel_map.config.up[-1])
-    order = [(axis + 1) % 3, (axis + 2) % 3]
+    *order, axis, _ = floor_axes(voxel_map.config.up)
     if voxel_map.config.cell[order[0]] != voxel_map.config.cell[order[1]]:
         voxel_map = in_cubes(voxel_map)
-    if voxel_map.config.up.startswith("-"):
-        order.reverse()
     heights = heights or voxel_map.config.scan.heights
     layers = _layers(voxel_map, axis, heights)
     patches = [_patch(voxel_map, *slab, [*order, axis], layers) for slab in voxel_map.slabs() if len(slab[0])]

@@ -21,7 +21,7 @@ def random_map(seed=0, kind="int16", number=1500, low=-11, high=13, **more):
     config = load_config(**{"voxel_size": 0.1, **KINDS[kind], **more})
     indices = np.unique(random.integers(low, high, (number, 3)), axis=0)
     log_odds = random.choice([-4, -2.5, -1.2, -0.2, 0.3, 1.2, 3.5], len(indices))
-    free = np.argwhere(np.ones((8, 8, 8))) + [8, 0, 0]
+    free = np.argwhere(np.ones((8, 8, 8))) + np.array([8, 0, 0])
     return VoxelMap.from_cells(config, np.concatenate([indices, free]), np.append(log_odds, np.full(len(free), -30)))
 
 

@@ -221,7 +221,7 @@ def test_changes_are_those_of_each_cell(kind):
     np.testing.assert_array_equal(back.appeared, changes.vanished)
     np.testing.assert_array_equal(back.became_unknown, changes.became_known)
     same = sv.difference(a, a)
-    assert not (len(same.appeared) or len(same.vanished) or len(same.became_known) or len(same.became_unknown))
+    assert not any(len(kind) for kind in (same.appeared, same.vanished, same.became_known, same.became_unknown))
 
 
 def test_a_difference_in_another_frame():

@@ -161,8 +161,9 @@ def _frontier(voxel_map: VoxelMap, cells: NDArray[np.int32], reached: KDTree) ->
 
 def _look_at(voxel_map: VoxelMap, point: NDArray[np.float64], reached: KDTree) -> NDArray[np.float64] | None:
     """Return the nearest place that sees a point past free cells alone, of LOOKS that are nearest."""
-    away, nearest = reached.query(point, k=min(LOOKS, reached.n)) if reached.n else ([], [])
-    for distance, place in zip(np.atleast_1d(away), reached.data[np.atleast_1d(nearest)], strict=True):
+    away, nearest = reached.query(point, k=[*range(1, min(LOOKS, reached.n) + 1)]) if reached.n else ([], [])
+    for distance, n in zip(away, nearest, strict=True):
+        place = reached.data[n]
         if distance == 0 or np.isinf(
             voxel_map.cast_rays(place, (point - place)[None], float(distance), stop_at=NOT_FREE).distance[0]
         ):

@@ -44,7 +44,8 @@ def components(cells: NDArray[np.integer], steps: Iterable[tuple[int, int, int]]
 
     if not len(cells):
         return np.zeros(0, np.int32)
-    number, extent = _places(cells)
+    steps = list(steps)
+    number, extent = _places(cells, int(np.abs(steps).max()))
     order = np.argsort(number)
     ascending = number[order]
     pairs = [_apart(ascending, int(np.dot(step, (extent[1] * extent[2], extent[2], 1)))) for step in steps]
@@ -53,13 +54,16 @@ def components(cells: NDArray[np.integer], steps: Iterable[tuple[int, int, int]]
     return connected_components(graph, directed=False)[1]
 
 
-def _places(cells: NDArray[np.integer]) -> tuple[NDArray[np.int64], list[int]]:
-    """Return one number (N,) for each cell, and the sides of the box they count in, a cell wider than needed."""
+def _places(cells: NDArray[np.integer], longest: int) -> tuple[NDArray[np.int64], list[int]]:
+    """Return one number (N,) for each cell, and the sides of the box they count in.
+
+    The box is so much wider that no step, at most `longest` on each axis, leads out of it and in again elsewhere.
+    """
     low = cells.min(axis=0).astype(np.int64)
-    extent = [int(n) + 3 for n in cells.max(axis=0) - low]
+    extent = [int(n) + 1 + longest for n in cells.max(axis=0) - low]
     if extent[0] * extent[1] * extent[2] > MOST_PLACES:
         raise StereovoxError("the map reaches too far to tell what hangs together; take a part of it: stereovox crop")
-    x, y, z = (cells - low + 1).T.astype(np.int64)
+    x, y, z = (cells - low).T
     return (x * extent[1] + y) * extent[2] + z, extent
 
 

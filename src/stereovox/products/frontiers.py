@@ -161,11 +161,10 @@ def _frontier(voxel_map: VoxelMap, cells: NDArray[np.int32], reached: KDTree) ->
 
 def _look_at(voxel_map: VoxelMap, point: NDArray[np.float64], reached: KDTree) -> NDArray[np.float64] | None:
     """Return the nearest place that sees a point past free cells alone, of LOOKS that are nearest."""
-    away, nearest = reached.query(point, k=[*range(1, min(LOOKS, reached.n) + 1)]) if reached.n else ([], [])
-    for distance, n in zip(away, nearest, strict=True):
-        place = reached.data[n]
-        if distance == 0 or np.isinf(
-            voxel_map.cast_rays(place, (point - place)[None], float(distance), stop_at=NOT_FREE).distance[0]
-        ):
+    if not reached.n:
+        return None
+    away, nearest = map(np.ravel, reached.query(point, k=min(LOOKS, reached.n)))
+    for distance, place in zip(away.tolist(), reached.data[nearest], strict=True):
+        if distance == 0 or np.isinf(voxel_map.cast_rays(place, point - place, distance, NOT_FREE).distance[0]):
             return place
     return None

@@ -30,7 +30,7 @@ def draw_changes(a: VoxelMap, b: VoxelMap, heading: str) -> Any:
     a, b = in_cubes(a), in_cubes(b)
     changes, both = difference(a, b), merge(a, b)
     floor = floor_of(both)
-    figure, (axis,) = page_of(floor)
+    figure, (axis,) = page_of(floor.shape)
     draw_columns(axis, floor)
     for kind, (_, colour) in KINDS.items():
         mark(axis, floor, both.centers(getattr(changes, kind)), colour)

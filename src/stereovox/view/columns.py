@@ -18,9 +18,9 @@ DARKEST = 0.75
 """How much of the ink a column gets that is as full as most walls."""
 
 
-def page_of(floor: Floor, panels: int = 1) -> tuple[Any, list[Any]]:
-    """Return a figure that fits panels of a floor, side by side, and these."""
-    rows, columns = floor.shape
+def page_of(shape: tuple[int, int], panels: int = 1) -> tuple[Any, list[Any]]:
+    """Return a figure that fits panels of so many rows and columns, side by side, and these."""
+    rows, columns = shape
     figure = figure_of(float(np.clip(0.9 * WIDTH / panels * rows / columns, 3, 13)) + 2.0)
     return figure, list(figure.subplots(1, panels, squeeze=False)[0])
 
@@ -44,7 +44,6 @@ def show(axis: Any, floor: Floor, image: NDArray, **how: Any) -> Any:
     (rows, columns), side, (x, y, _) = floor.shape, floor.resolution, floor.origin
     extent = (x, x + columns * side, y, y + rows * side)
     drawn = axis.imshow(image, origin="lower", extent=extent, interpolation="nearest", **how)
-    axis.set_facecolor(STATE_COLOURS[State.UNKNOWN])
     measured(axis, ("xyz"[floor.axes[0]], "xyz"[floor.axes[1]], ""))
     return drawn
 
@@ -60,6 +59,7 @@ def mark(axis: Any, floor: Floor, points: ArrayLike, colour: str) -> None:
 
 def finish(axis: Any) -> None:
     """Put a scale bar in a strip below a panel."""
+    axis.set_facecolor(STATE_COLOURS[State.UNKNOWN])
     bottom, top = axis.get_ylim()
     axis.set_ylim(bottom - 0.06 * (top - bottom), top)
     scale_bar(axis)

@@ -23,7 +23,7 @@ LABELLED = 12
 def draw_frontiers(voxel_map: VoxelMap, frontiers: Sequence[Frontier], heading: str) -> Any:
     """Return the matplotlib figure of the frontiers of a map, the largest on top."""
     floor = floor_of(voxel_map)
-    figure, (axis,) = page_of(floor)
+    figure, (axis,) = page_of(floor.shape)
     draw_columns(axis, floor)
     for n in reversed(range(len(frontiers))):
         mark(axis, floor, voxel_map.centers(frontiers[n].cells), COLOURS[n % len(COLOURS)])

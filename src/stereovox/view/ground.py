@@ -30,9 +30,16 @@ def draw_ground(voxel_map: VoxelMap, ground: Ground, heading: str) -> Any:
     from matplotlib.patches import Patch
 
     floor = floor_of(voxel_map)
-    figure, (heights, footing) = page_of(floor, panels=2)
-    _draw_heights(figure, heights, floor, ground)
-    _draw_footing(footing, floor, ground)
+    rows, columns = ground.grid.known_span
+    shape = rows.stop - rows.start, columns.stop - columns.start
+    figure, panels = page_of(shape, panels=2)
+    _draw_heights(figure, panels[0], floor, ground)
+    _draw_footing(panels[1], floor, ground)
+    x, y, side = *ground.origin[:2], ground.resolution
+    for panel in panels:
+        panel.set_xlim(x + columns.start * side, x + columns.stop * side)
+        panel.set_ylim(y + rows.start * side, y + rows.stop * side)
+        finish(panel)
     patches = [Patch(fc=colour, ec="#888", label=name) for name, colour in KINDS.values()]
     figure.legend(handles=patches, loc="outside lower center", ncols=7, frameon=False, fontsize=11, labelcolor=INK)
     area = np.count_nonzero(ground.footing == Footing.DRIVABLE) * ground.resolution**2
@@ -47,7 +54,6 @@ def _draw_heights(figure: Any, axis: Any, floor: Floor, ground: Ground) -> None:
     bar.ax.tick_params(colors=GREY)
     bar.outline.set_visible(False)
     title(axis, "Height of the ground")
-    finish(axis)
 
 
 def _draw_footing(axis: Any, floor: Floor, ground: Ground) -> None:
@@ -56,4 +62,3 @@ def _draw_footing(axis: Any, floor: Floor, ground: Ground) -> None:
     colours = np.array([to_rgb(KINDS[footing][1]) for footing in Footing])
     show(axis, floor, colours[ground.footing])
     title(axis, "What each place is to the robot")
-    finish(axis)

@@ -39,7 +39,7 @@ def flooded(cells, half):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_equals_the_flood_fill(kind):
-    voxel_map = random_map(5, kind, 4000)
+    voxel_map = random_map(5, kind, 2500)
     what = states(voxel_map)
     rim = [cell for cell, state in what.items() if state == State.FREE
            and any(moved(cell, step) not in what for step in steps_of(FACES))]  # fmt: skip

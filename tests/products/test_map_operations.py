@@ -232,7 +232,7 @@ def test_a_difference_in_another_frame():
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("factor", [2, 3, 10])
 def test_a_larger_cell_is_as_bad_as_the_worst_in_it(kind, factor):
-    voxel_map = random_map(kind=kind, number=9000)
+    voxel_map = random_map(kind=kind, number=4000)
     values, what = table(voxel_map), states(voxel_map)
     children = {}
     for cell in values:

@@ -89,6 +89,16 @@ class VoxelMap(WithHistory):
         unbounded.take_history(self)
         return unbounded
 
+    def snapshot(self) -> VoxelMap:
+        """Return a copy to look at while this map goes on: of all cells, or of those in the window."""
+        copy = VoxelMap(self.config)
+        for coords, cells in self._pool.pieces():
+            copy.insert(coords, cells)
+            if self._times is not None:
+                copy.set_times(coords, self._times.get(coords), self._times.start_ns)
+        copy.take_history(self)
+        return copy
+
     def take_history(self, earlier: VoxelMap) -> None:
         """Take over what `earlier` says of the frames that are in it."""
         self.history, self.viewpoint = earlier.history.copied(), earlier.viewpoint

@@ -6,6 +6,8 @@ from __future__ import annotations
 import threading
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from stereovox.maps import VoxelMap
 from stereovox.view.address import HERE, PORT, find_address, url_of
 from stereovox.view.drawn import checked_up
@@ -20,6 +22,9 @@ from stereovox.view.viewer_panel import axis_chart, colour_bar, plain, statistic
 if TYPE_CHECKING:
     from viser import ViserServer
 
+GROWN, MOVED = 1.2, 0.01
+"""The page steps back from a map that grew by so much, if a looker moved by less than that share of the distance."""
+
 
 class Viewer:
     """A running page; url leads to it.
@@ -32,9 +37,9 @@ class Viewer:
         self._name, self._map, self._up = name, voxel_map, up
         _dress(server)
         server.scene.set_up_direction(as_tuple(up_vector(up)))
-        look_from, look_at = first_look(voxel_map, up)
-        server.initial_camera.position, server.initial_camera.look_at = as_tuple(look_from), as_tuple(look_at)
-        self.cells = Cells(server, voxel_map, up, look_from)
+        self._eye, self._away = np.zeros(3), 0.0
+        self._look()
+        self.cells = Cells(server, voxel_map, up)
         self._legend = _Legend(server)
         self.layer = LayerPlane(server, voxel_map, up)
         self.cameras = Cameras(server, voxel_map)
@@ -53,6 +58,7 @@ class Viewer:
     def take(self, voxel_map: VoxelMap) -> None:
         """Show another map with the same settings, which nobody changes from now on: a copy of one that grows."""
         self._map = voxel_map
+        self._look()
         for part in (self.cells, self.layer, self.cameras):
             part.take(voxel_map)
         self._tell()
@@ -64,6 +70,19 @@ class Viewer:
     def close(self) -> None:
         """Take the page down."""
         stop(self.server)
+
+    def _look(self) -> None:
+        """Let those who look see the whole map when it has grown, unless they went to look from elsewhere."""
+        look_from, look_at = first_look(self._map, self._up)
+        away = float(np.linalg.norm(look_from - look_at))
+        if away < GROWN * self._away:
+            return
+        cameras = [client.camera for client in self.server.get_clients().values()]
+        if self._away:
+            cameras = [one for one in cameras if np.linalg.norm(one.position - self._eye) < MOVED * self._away]
+        self._eye, self._away = look_from, away
+        for camera in (self.server.initial_camera, *cameras):
+            camera.position, camera.look_at = as_tuple(look_from), as_tuple(look_at)
 
     def _tell(self) -> None:
         self._told.content = f"**{plain(self._name)}**\n\n{statistics(self._map)}"
@@ -77,25 +96,21 @@ class _Legend:
     """Colour bars for what is in the scene."""
 
     def __init__(self, server: ViserServer):
-        self._server, self._said = server, ()
-        self._folder = server.gui.add_folder("Legend")
-        self._bars: list[Any] = []
+        blank = np.full((1, 1, 3), 255, np.uint8)
+        with server.gui.add_folder("Legend"):
+            self._cells, self._slice = (server.gui.add_image(blank, format="png", visible=False) for _ in range(2))
+        self._said: Any = None
 
     def explain(self, cells: Cells, plane: LayerPlane) -> None:
         """Put up the bars of the cells' colours, and of the layer where it is shown."""
         limits = None if cells.scale is None else (cells.scale.norm.vmin, cells.scale.norm.vmax)
-        said = cells.label, limits, plane.show.value
-        if said == self._said:
-            return
-        for bar in self._bars:
-            bar.remove()
-        images = [] if limits is None else [colour_bar(cells.scale, cells.label)]
-        if plane.show.value:
+        self._slice.visible = plane.show.value
+        if self._said is None:
             ends = plane.scale.lowest, plane.scale.highest
-            images.append(colour_bar(plane.colours, f"in the slice: {plane.scale.label}", ends))
-        with self._folder:
-            self._bars = [self._server.gui.add_image(image, format="png") for image in images]
-        self._said = said
+            self._slice.image = colour_bar(plane.colours, f"in the slice: {plane.scale.label}", ends)
+        if limits is not None and self._said != (cells.label, limits):
+            self._cells.image, self._cells.visible = colour_bar(cells.scale, cells.label), True
+        self._said = cells.label, limits
 
 
 def open_viewer(

@@ -48,8 +48,8 @@ class Cells:
     (N, 3) that are shown now. scale: what a colour bar needs, None where no cell is occupied.
     """
 
-    def __init__(self, server: ViserServer, voxel_map: VoxelMap, up: str, first_eye: NDArray[np.floating]):
-        self._server, self._up, self._map, self._first_eye = server, up, voxel_map, first_eye
+    def __init__(self, server: ViserServer, voxel_map: VoxelMap, up: str):
+        self._server, self._up, self._map = server, up, voxel_map
         self._found: dict[State, NDArray[np.int32]] = {}
         self.solid = np.empty((0, 3), np.int32)
         self.scale: Any = None
@@ -134,7 +134,7 @@ class Cells:
     def _eyes(self) -> NDArray[np.float64]:
         """Return where those who look stand, (n, 3) in metres; the first look, if nobody does."""
         eyes = [client.camera.position for client in self._server.get_clients().values()]
-        return np.array(eyes or [self._first_eye], float).reshape(-1, 3)
+        return np.array(eyes or [self._server.initial_camera.position], float).reshape(-1, 3)
 
     def _watch_lookers(self) -> None:
         @self._server.on_client_connect

@@ -42,7 +42,7 @@ class FramePanel:
 
 def frame_words(frame: AnyFrame, report: UpdateReport | None) -> str:
     """Return name and fate of a frame, as Markdown."""
-    name = plain(name_of(frame))
+    name = plain(name_of(frame).rpartition("/")[2])
     if report is None:
         return name
     return f"{name}: {plain(report.detail)}" if report.refused else f"{name}: {report.cells:,} cells changed"

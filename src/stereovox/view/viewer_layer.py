@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox.maps import VoxelMap
+from stereovox.maps import State, VoxelMap
 from stereovox.products.slices import Layer, layer
-from stereovox.view.drawn import upright
+from stereovox.view.drawn import stood_up
 from stereovox.view.newest import Newest
 from stereovox.view.scale import Scale, scale_of
+from stereovox.view.shown import cells_in
 
 if TYPE_CHECKING:
     from viser import ImageHandle, ViserServer
@@ -126,8 +127,10 @@ def _first_place(voxel_map: VoxelMap, up: str) -> NDArray[np.float64]:
     """Return where the sliders begin, (3,) in metres: at the camera, or at the layer that tells most."""
     if voxel_map.viewpoint is not None:
         return voxel_map.viewpoint.T_world_camera[:3, 3]
-    drawn = upright(voxel_map, None, up)
-    place = voxel_map.centers(voxel_map.cells()[0]).mean(axis=0)
+    cells = cells_in(voxel_map, State.OCCUPIED)
+    cells = cells if len(cells) else voxel_map.cells()[0]
+    drawn = stood_up(cells, np.full(len(cells), State.OCCUPIED, np.uint8), voxel_map.voxel_size, up)
+    place = voxel_map.centers(cells.mean(axis=0)[None] - 0.5)[0]
     height = (drawn.layer + 0.5) * drawn.voxel_size
     place["xyz".index(up[-1])] = -height if up.startswith("-") else height
     return place

@@ -41,8 +41,8 @@ class LiveView:
         with gui.add_folder("Now", order=0.5):
             self.frame = FramePanel(self.viewer.server, mapper.config)
         self._arrivals: deque[float] = deque(maxlen=200)
-        self._due, self._waiting, self._free = 0.0, None, threading.Event()
-        self._ask, self._stopped = threading.Event(), False
+        self._due, self._last, self._waiting = 0.0, None, None
+        self._ask, self._free, self._stopped = threading.Event(), threading.Event(), False
         self._free.set()
         self._thread = threading.Thread(target=self._run, name="stereovox-live-view", daemon=True)
         self._thread.start()
@@ -62,15 +62,17 @@ class LiveView:
         """Show the map if it is time; to be called between frames, from the thread that maps."""
         start = monotonic()
         self._arrivals.append(start)
+        self._last = frame, report
         if start >= self._due and self._free.is_set():
-            self._hand_over(frame, report)
+            self._hand_over()
             done = monotonic()
             self._due = done + max(LEAST_S, COPY_REST * (done - start))
 
     def finish(self) -> None:
         """Show the map as it is now, whole; to be called when the last frame is in it."""
         self._free.wait(PATIENCE_S)
-        self.viewer.take(_copy(self._mapper))
+        if self._last is not None:
+            self._hand_over()
 
     def close(self) -> None:
         """Take the page down."""
@@ -87,7 +89,8 @@ class LiveView:
         """Take the page down."""
         self.close()
 
-    def _hand_over(self, frame: AnyFrame, report: UpdateReport) -> None:
+    def _hand_over(self) -> None:
+        frame, report = self._last
         self._free.clear()
         self._waiting = _copy(self._mapper), frame, f"{frame_words(frame, report)}\n\n{self._pace()}"
         self._ask.set()
@@ -114,7 +117,7 @@ class LiveView:
             ("frames a second", f"{rate:.1f}"),
             ("frames in the map", f"{history.frames:,}"),
             ("refused", ", ".join(f"{n:,} {plain(why)}" for why, n in history.refused.most_common(5)) or "none"),
-            ("health", f"{health.state}: {plain(health.text)}"),
+            ("health", plain(health.text)),
         ]
         return "\n".join(["| now | |", "|:--|:--|", *(f"| {name} | {value} |" for name, value in rows)])
 

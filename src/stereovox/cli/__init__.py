@@ -32,6 +32,7 @@ COMMANDS = (
     "slam",
     "localize",
     "simulate",
+    "ros2",
     "bench",
     "calibrate",
     "truth",

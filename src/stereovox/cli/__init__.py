@@ -34,6 +34,7 @@ COMMANDS = (
     "slam",
     "localize",
     "simulate",
+    "ros2",
     "bench",
     "calibrate",
     "truth",

@@ -27,7 +27,7 @@ TIE = 1e-9
 Heights = tuple[float, float]
 
 
-class _Patch(NamedTuple):
+class Patch(NamedTuple):
     """Some blocks seen from above: lowest column and row, and (rows, columns) int16 as `look_down` fills them."""
 
     corner: NDArray[np.int64]
@@ -48,15 +48,12 @@ def project(voxel_map: VoxelMap, heights: Heights | None = None) -> OccupancyGri
     for x, z and x for y, and with a minus the same two swapped. Uneven cells become cubes where the floor needs it.
     Raises StereovoxError, one line, where no cell between the heights is known, or the grid were too large.
     """
-    axis = "xyz".index(voxel_map.config.up[-1])
-    order = [(axis + 1) % 3, (axis + 2) % 3]
+    order = axes_of(voxel_map.config.up)
     if voxel_map.config.cell[order[0]] != voxel_map.config.cell[order[1]]:
         voxel_map = in_cubes(voxel_map)
-    if voxel_map.config.up.startswith("-"):
-        order.reverse()
-    heights = heights or voxel_map.config.scan.heights
-    layers = _layers(voxel_map, axis, heights)
-    patches = [_patch(voxel_map, *slab, [*order, axis], layers) for slab in voxel_map.slabs() if len(slab[0])]
+    axis, heights = order[2], heights or voxel_map.config.scan.heights
+    layers = layers_of(voxel_map, axis, heights)
+    patches = [patch_of(voxel_map, *slab, order, layers) for slab in voxel_map.slabs() if len(slab[0])]
     patch = _joined(patches)
     if patch is None or not (patch.marked != NOTHING).any():
         raise StereovoxError(_nothing_there(voxel_map, axis, heights))
@@ -75,7 +72,14 @@ def write_grid(voxel_map: VoxelMap, path: str | Path, heights: Heights | None = 
     write_map_server(grid, path)
 
 
-def _layers(voxel_map: VoxelMap, axis: int, heights: Heights) -> NDArray[np.int64]:
+def axes_of(up: str) -> list[int]:
+    """Return which axes of a map go along columns, along rows and up; up: as in the settings."""
+    axis = "xyz".index(up[-1])
+    floor = [(axis + 1) % 3, (axis + 2) % 3]
+    return [*(reversed(floor) if up.startswith("-") else floor), axis]
+
+
+def layers_of(voxel_map: VoxelMap, axis: int, heights: Heights) -> NDArray[np.int64]:
     """Return the first and the last layer of cells whose middle is above the lower height, and not above the upper."""
     low, high = heights
     if not (np.isfinite(heights).all() and low < high):
@@ -88,13 +92,17 @@ def _layers(voxel_map: VoxelMap, axis: int, heights: Heights) -> NDArray[np.int6
     return -1 - layers[::-1] if voxel_map.config.up.startswith("-") else layers
 
 
-def _patch(
+def patch_of(
     voxel_map: VoxelMap,
     coords: NDArray[np.int32],
     values: NDArray[np.integer],
     order: list[int],
     layers: NDArray[np.int64],
-) -> _Patch:
+) -> Patch:
+    """Return what blocks (n, 3), n > 0, with their cells (n, 512) as stored, show from above.
+
+    order, layers: as `axes_of` and `layers_of` return them.
+    """
     floor = coords[:, order[:2]].astype(np.int64)
     low, high = floor.min(axis=0) * SIDE, (floor.max(axis=0) + 1) * SIDE
     patch = _empty(low, high)
@@ -106,16 +114,16 @@ def _patch(
     return patch
 
 
-def _empty(low: NDArray[np.int64], high: NDArray[np.int64]) -> _Patch:
+def _empty(low: NDArray[np.int64], high: NDArray[np.int64]) -> Patch:
     columns, rows = (high - low).tolist()
     if columns * rows > MOST_CELLS:
         raise StereovoxError(
             f"a grid of {columns} x {rows} cells is too large; map a smaller place, with --set window.size=[X,Y,Z]"
         )
-    return _Patch(low, np.full((rows, columns), NOTHING, np.int16), np.full((rows, columns), NOTHING, np.int16))
+    return Patch(low, np.full((rows, columns), NOTHING, np.int16), np.full((rows, columns), NOTHING, np.int16))
 
 
-def _joined(patches: list[_Patch]) -> _Patch | None:
+def _joined(patches: list[Patch]) -> Patch | None:
     if len(patches) < 2:
         return patches[0] if patches else None
     ends = [patch.corner + patch.marked.shape[::-1] for patch in patches]
@@ -128,7 +136,7 @@ def _joined(patches: list[_Patch]) -> _Patch | None:
     return joined
 
 
-def _grid(voxel_map: VoxelMap, patch: _Patch, side: float) -> OccupancyGrid:
+def _grid(voxel_map: VoxelMap, patch: Patch, side: float) -> OccupancyGrid:
     number = np.where(patch.marked != NOTHING, patch.marked, patch.cleared)
     rows, columns = (np.flatnonzero((number != NOTHING).any(axis=across)) for across in (1, 0))
     number = number[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]

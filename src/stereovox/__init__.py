@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from stereovox.maps import load_map as load_map
     from stereovox.maps.grid_map import GridMap as GridMap
     from stereovox.maps.occupancy import OccupancyGrid as OccupancyGrid
+    from stereovox.products.distance import DistanceField as DistanceField
+    from stereovox.products.path_check import check_path as check_path
     from stereovox.rigs import StereoPair as StereoPair
     from stereovox.sources import open_source as open_source
     from stereovox.sources.latest import Latest as Latest
@@ -55,6 +57,8 @@ _HOMES = {
     "load_map": "maps",
     "GridMap": "maps.grid_map",
     "OccupancyGrid": "maps.occupancy",
+    "DistanceField": "products.distance",
+    "check_path": "products.path_check",
     "open_source": "sources",
     "Latest": "sources.latest",
 }

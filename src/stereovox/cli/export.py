@@ -28,6 +28,9 @@ def add_arguments(parser: ArgumentParser) -> None:
         help="2-D maps: heights in metres between which obstacles count (the map's scan.heights); what is free at any"
         " height is cleared. Below zero: --heights=-0.5:1",
     )
+    parser.add_argument(
+        "--inflate", type=float, metavar="R", help="2-D maps: grow obstacles by a robot's radius in metres and one cell"
+    )
 
 
 def run(arguments: Namespace) -> dict[str, Any]:
@@ -37,11 +40,14 @@ def run(arguments: Namespace) -> dict[str, Any]:
     file, heights = Path(arguments.file), _heights(arguments.heights)
     flat = file.suffix.lower() in FLAT
     voxel_map = open_map(arguments.map) if flat else open_cubes(arguments.map)  # seen from above, most need no cubes
-    export(voxel_map, file, heights)
+    export(voxel_map, file, heights, arguments.inflate)
     result: dict[str, Any] = {"file": str(file), "bytes": file.stat().st_size}
     if flat:
         low, high = result["heights"] = heights or voxel_map.config.scan.heights
         say(f"seen from above: what is {low:g} to {high:g} m high marks a cell; others: --heights=LO:HI")
+        if arguments.inflate is not None:
+            result["inflated_m"] = arguments.inflate
+            say(f"obstacles grown by {arguments.inflate:g} m and one cell")
         beside = file.with_suffix(".pgm" if file.suffix.lower() == ".yaml" else ".yaml")
         say(f"saved {file} and {beside}")
     else:

@@ -28,6 +28,8 @@ COMMANDS = (
     "view",
     "sphere",
     "export",
+    "distance",
+    "path",
     "grid",
     "slam",
     "localize",

@@ -87,6 +87,11 @@ class DistanceField:
         return np.asarray(self._low * self._cell, float)
 
     @property
+    def cell(self) -> NDArray[np.float64]:
+        """Sides (3,) of a cell in metres."""
+        return self._cell.copy()
+
+    @property
     def metres(self) -> NDArray[np.float32]:
         """Distances of all cells (x, y, z) in metres, infinite where no obstacle is near enough.
 

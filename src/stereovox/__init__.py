@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from stereovox.maps.occupancy import OccupancyGrid as OccupancyGrid
     from stereovox.products import export as export
     from stereovox.products.imports import import_map as import_map
+    from stereovox.products.distance import DistanceField as DistanceField
+    from stereovox.products.path_check import check_path as check_path
     from stereovox.rigs import StereoPair as StereoPair
     from stereovox.sources import open_source as open_source
     from stereovox.sources.latest import Latest as Latest
@@ -59,6 +61,8 @@ _HOMES = {
     "OccupancyGrid": "maps.occupancy",
     "export": "products",
     "import_map": "products.imports",
+    "DistanceField": "products.distance",
+    "check_path": "products.path_check",
     "open_source": "sources",
     "Latest": "sources.latest",
 }

@@ -32,7 +32,7 @@ def one_by_one(mask, sides, nearer):
 @pytest.mark.parametrize("cells", [np.inf, 4])
 def test_after_any_change_it_is_what_it_would_be_anew_and_what_scipy_says(shape, sides, cells):
     reach = cells * min(sides)
-    transform, mask = Transform(shape, sides, reach, "centres"), np.zeros(shape, bool)
+    transform, mask = Transform(shape, sides, reach), np.zeros(shape, bool)
     for step in range(40):
         share = RANDOM.choice([0.0005, 0.005, 0.2])
         changed = mask ^ (RANDOM.random(shape) < share) if step % 4 else RANDOM.random(shape) < share / 4
@@ -46,10 +46,10 @@ def test_after_any_change_it_is_what_it_would_be_anew_and_what_scipy_says(shape,
         np.testing.assert_allclose(transform.metres, by_scipy(mask, sides, reach), rtol=1e-6)
 
 
-@pytest.mark.parametrize(("measure", "nearer"), [("centres", 0), ("faces", 0.5), ("gap", 1)])
-def test_what_is_measured(measure, nearer):
+@pytest.mark.parametrize("nearer", [0, 0.5, 1, 2])
+def test_what_is_measured(nearer):
     mask, sides = RANDOM.random((11, 6, 9)) < 0.02, np.array([0.1, 0.3, 0.2])
-    found = transformed(mask, sides, measure=measure)
+    found = transformed(mask, sides, nearer=nearer)
     np.testing.assert_allclose(found, one_by_one(mask, sides, nearer), rtol=1e-6)
 
 
@@ -137,6 +137,10 @@ def test_distances_and_gradients_at_points():
     np.testing.assert_allclose(gradient[2], [0.6, 0.8, 0], atol=0.02)
     assert np.isnan(gradient[3:]).all()
     np.testing.assert_allclose(field.gradient([-0.95, 0.05, 0.05]), [[np.nan] * 3])
+    for measure, metres in {"centres": 0.3, "faces": 0.25, "gap": 0.2}.items():
+        assert DistanceField(voxel_map, (-1, -1, -1), (1, 1, 1), measure=measure).distance(points[1]) == pytest.approx(
+            metres
+        )
     unlimited = DistanceField(voxel_map, (-1, -1, -1), (1, 1, 1))
     np.testing.assert_allclose(unlimited.gradient([-0.95, 0.05, 0.05]), [[-1, 0, 0]], atol=1e-5)
     assert unlimited.distance([0.95, 0.05, 0.05]) == pytest.approx(0.9)

@@ -30,6 +30,8 @@ COMMANDS = (
     "sphere",
     "export",
     "import",
+    "distance",
+    "path",
     "grid",
     "slam",
     "localize",

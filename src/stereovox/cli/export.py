@@ -29,6 +29,9 @@ def add_arguments(parser: ArgumentParser) -> None:
         help="2-D maps and bags: heights in metres between which obstacles count (the map's scan.heights); what is free"
         " at any height is cleared. Below zero: --heights=-0.5:1",
     )
+    parser.add_argument(
+        "--inflate", type=float, metavar="R", help="2-D maps: grow obstacles by a robot's radius in metres and one cell"
+    )
 
 
 def run(arguments: Namespace) -> dict[str, Any]:
@@ -40,12 +43,15 @@ def run(arguments: Namespace) -> dict[str, Any]:
     if dimensions(arguments.map) == 2 and ending in BAGS:
         return _floor(arguments)
     voxel_map = open_map(arguments.map)
-    export(voxel_map, file, heights)
+    export(voxel_map, file, heights, arguments.inflate)
     result: dict[str, Any] = {"file": str(file), "bytes": file.stat().st_size}
     beside = ""
     if ending in (*FLAT, *BAGS):
         low, high = result["heights"] = heights or voxel_map.config.scan.heights
         say(f"seen from above: what is {low:g} to {high:g} m high marks a cell; others: --heights=LO:HI")
+    if arguments.inflate is not None:
+        result["inflated_m"] = arguments.inflate
+        say(f"obstacles grown by {arguments.inflate:g} m and one cell")
     if ending in FLAT:
         beside = f" and {file.with_suffix('.pgm' if ending == '.yaml' else '.yaml')}"
     say(f"saved {file}{beside} ({size(result['bytes'])})")
@@ -57,7 +63,7 @@ def _floor(arguments: Namespace) -> dict[str, Any]:
     from stereovox.products.bag_maps import write_grid_bag
     from stereovox.products.map_server import read_map_server
 
-    refuse_options(arguments, ["heights"], "a floor's map has no height")
+    refuse_options(arguments, ["heights", "inflate"], "a floor's map goes into a bag as it is")
     write_grid_bag(read_map_server(arguments.map), arguments.file)
     say(f"saved {arguments.file}")
     return {"file": arguments.file, "bytes": Path(arguments.file).stat().st_size}

@@ -20,6 +20,8 @@ TRIGGER = 1 / 8
 """A window follows when the camera is farther from its middle than this share of the window."""
 TIE = 1e-6
 """A face of the box that is so near to a face of cells, in cells, stands on it."""
+MEASURES = {"centres": 0.0, "faces": 0.5, "gap": 1.0}
+"""How many cells nearer an obstacle counts along each axis."""
 
 
 class DistanceField:
@@ -48,11 +50,13 @@ class DistanceField:
         to: Iterable[State] = (State.OCCUPIED,),
         measure: str = "centres",
     ):
+        if measure not in MEASURES:
+            raise StereovoxError(f"measure '{measure}': name one of {', '.join(MEASURES)}")
         self._map, self._wanted = voxel_map, state_bits(to, "to")
         self._cell = np.array(voxel_map.config.cell)
         self._follows = size is not None
         self._low, shape = self._about_zero(size) if self._follows else self._between(low, high)
-        self._transform = Transform(tuple(shape.tolist()), self._cell, max_distance, measure)
+        self._transform = Transform(tuple(shape.tolist()), self._cell, max_distance, MEASURES[measure])
         blocks = ((self._low + shape - 1) >> 3) - (self._low >> 3) + 1
         self._seen = np.zeros((int(blocks.prod()), CELLS), np.uint8)
         self._shape, self._made = shape, False
@@ -81,6 +85,11 @@ class DistanceField:
     def origin(self) -> NDArray[np.float64]:
         """Lowest corner (3,) of the box in metres, world frame: that of cell [0, 0, 0] of `metres`."""
         return np.asarray(self._low * self._cell, float)
+
+    @property
+    def cell(self) -> NDArray[np.float64]:
+        """Sides (3,) of a cell in metres."""
+        return self._cell.copy()
 
     @property
     def metres(self) -> NDArray[np.float32]:

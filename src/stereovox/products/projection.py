@@ -17,6 +17,7 @@ from stereovox.maps.cubes import in_cubes
 from stereovox.maps.occupancy import UNKNOWN, OccupancyGrid
 from stereovox.maps.percent import Percent
 from stereovox.products import _projection
+from stereovox.products.inflate import inflated_grid
 from stereovox.products.map_server import write_map_server
 
 NOTHING = np.iinfo(np.int16).min
@@ -60,13 +61,17 @@ def project(voxel_map: VoxelMap, heights: Heights | None = None) -> OccupancyGri
     return _grid(voxel_map, patch, voxel_map.config.cell[order[0]])
 
 
-def write_grid(voxel_map: VoxelMap, path: str | Path, heights: Heights | None = None) -> None:
+def write_grid(
+    voxel_map: VoxelMap, path: str | Path, heights: Heights | None = None, inflate: float | None = None
+) -> None:
     """Write the map seen from above as map_server's two files, a picture and its .yaml; `path` names either.
 
-    heights: see `project`. Raises StereovoxError as `project` and `write_map_server` do.
+    heights: see `project`. inflate: radius of a robot in metres by which obstacles grow, with a margin of one cell.
+    Raises StereovoxError as `project`, `inflated_grid` and `write_map_server` do.
     """
     try:
         grid = project(voxel_map, heights)
+        grid = grid if inflate is None else inflated_grid(grid, inflate)
     except StereovoxError as error:
         raise StereovoxError(f"{path}: {error}") from None
     write_map_server(grid, path)

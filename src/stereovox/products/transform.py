@@ -20,8 +20,6 @@ LANES = 32
 MOST_CELLS, LONGEST = 2**28, 2**14
 """The largest box, in cells; it needs 20 bytes a cell, with padding more. Its longest side."""
 UNLIMITED = np.float32(3e38)
-MEASURES = {"centres": 0.0, "faces": 0.5, "gap": 1.0}
-"""From the middle of a cell to the middle of the obstacle's, or to its nearest face; from any point of it to that."""
 
 
 class Field(NamedTuple):
@@ -63,16 +61,18 @@ class Costs(NamedTuple):
 class Transform:
     """Distances in a box of `shape` (3,) cells with `sides` (3,) in metres; at first it has no obstacle.
 
-    max_distance: metres, to one part in a million; obstacles farther off count as none. measure: one of MEASURES.
+    max_distance: metres, to one part in a million; obstacles farther off count as none.
+    nearer: how many cells nearer they count along each axis: 0 from middle to middle of a cell, 0.5 from the middle to
+    the nearest face, 1 from the nearest of all points of a cell; more as if all obstacles were larger by the rest.
     order: the axes from the longest to the shortest. field: the arrays, whose axes are in that order.
     """
 
-    def __init__(self, shape: tuple[int, ...], sides: ArrayLike, max_distance: float, measure: str):
-        _check(shape, max_distance, measure)
+    def __init__(self, shape: tuple[int, ...], sides: ArrayLike, max_distance: float, nearer: float = 0.0):
+        _check(shape, max_distance)
         self.order = tuple(np.argsort([-n for n in shape], kind="stable").tolist())
         self._sides = np.array(sides, float)[list(self.order)]
         slabs, rows, self.lanes = (shape[axis] for axis in self.order)
-        self.costs = self._costs((slabs, rows, -(-self.lanes // LANES) * LANES), max_distance, MEASURES[measure])
+        self.costs = self._costs((slabs, rows, -(-self.lanes // LANES) * LANES), max_distance, nearer)
         self.field = self._empty(slabs, rows)
 
     def update(self, dirty: NDArray[np.uint8], threads: int = 1) -> None:
@@ -121,21 +121,19 @@ class Transform:
 
 
 def transformed(
-    mask: NDArray[np.bool_], sides: ArrayLike, max_distance: float = np.inf, measure: str = "centres"
+    mask: NDArray[np.bool_], sides: ArrayLike, max_distance: float = np.inf, nearer: float = 0.0
 ) -> NDArray[np.float32]:
     """Return the distance (x, y, z) float32 in metres of each cell to the nearest one in `mask` (x, y, z) bool.
 
-    sides: of a cell, (3,) metres. Infinite where none is near enough. max_distance, measure: see `Transform`.
+    sides: of a cell, (3,) metres. Infinite where none is near enough. max_distance, nearer: see `Transform`.
     """
-    transform = Transform(mask.shape, sides, max_distance, measure)
+    transform = Transform(mask.shape, sides, max_distance, nearer)
     transform.field.mask[:, :, : transform.lanes] = mask.transpose(transform.order)
     transform.update(np.ones(len(transform.field.mask), np.uint8))
     return transform.metres
 
 
-def _check(shape: tuple[int, ...], max_distance: float, measure: str) -> None:
-    if measure not in MEASURES:
-        raise StereovoxError(f"measure '{measure}': name one of {', '.join(MEASURES)}")
+def _check(shape: tuple[int, ...], max_distance: float) -> None:
     if not max_distance > 0:
         raise StereovoxError(f"max_distance {max_distance:g}: give a length of more than 0 m")
     if np.prod(np.array(shape, float)) > MOST_CELLS or max(shape) > LONGEST:

@@ -51,6 +51,7 @@ HOMES = {
     "pyrealsense2": r"sources/.*",
     "rich": r"cli/.*",
     "rosbags": r"sources/.*",
+    "skimage": r"products/.*",
     "small_gicp": r"calibrate/.*",
     "trimesh": r"sources/.*",
     "typer": r"cli/.*",

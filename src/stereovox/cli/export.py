@@ -12,9 +12,9 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import Any
 
+from stereovox.cli.numbers import heights_of
 from stereovox.cli.saved_map import dimensions, open_map, refuse_options
 from stereovox.cli.terminal import say, size
-from stereovox.errors import StereovoxError
 
 EXAMPLE = "stereovox export kitchen.svox kitchen.bt"
 
@@ -38,7 +38,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
     """Load the map and write it in the other format."""
     from stereovox.products import BAGS, FLAT, export
 
-    file, heights = Path(arguments.file), _heights(arguments.heights)
+    file, heights = Path(arguments.file), heights_of(arguments.heights)
     ending = file.suffix.lower()
     if dimensions(arguments.map) == 2 and ending in BAGS:
         return _floor(arguments)
@@ -67,17 +67,3 @@ def _floor(arguments: Namespace) -> dict[str, Any]:
     write_grid_bag(read_map_server(arguments.map), arguments.file)
     say(f"saved {arguments.file}")
     return {"file": arguments.file, "bytes": Path(arguments.file).stat().st_size}
-
-
-def _heights(text: str | None) -> tuple[float, float] | None:
-    """Return what --heights says; raises StereovoxError where that is not LO:HI."""
-    if text is None:
-        return None
-    low, _, high = text.partition(":")
-    try:
-        heights = float(low), float(high)
-    except ValueError:
-        raise StereovoxError(f"--heights {text}: write LO:HI in metres, for example --heights 0.1:1.8") from None
-    if not heights[0] < heights[1]:
-        raise StereovoxError(f"--heights {text}: the second must be higher than the first")
-    return heights

@@ -13,10 +13,10 @@ from stereovox.errors import ConfigError, FrameRefused, MapFileError, SourceErro
 from stereovox.maps import VoxelMap
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.products.cloud_cells import cells_of_points
+from stereovox.products.floor_axes import upright_axes
 from stereovox.products.octomap_read import map_of_nodes
 from stereovox.products.octomap_write import BINARY_TITLE, TREE_TITLE, full_tree
 from stereovox.products.projection import Heights, project
-from stereovox.products.upright import upright_axes
 from stereovox.sources.bag_files import open_bag
 from stereovox.sources.bag_map_messages import OCCUPANCY_GRID, OCTOMAP, read_occupancy_grid, read_octomap_message
 from stereovox.sources.bag_messages import Wire

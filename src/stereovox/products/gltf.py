@@ -15,8 +15,8 @@ from stereovox.errors import MapFileError
 from stereovox.files import replacing
 from stereovox.maps import VoxelMap
 from stereovox.products.cube_faces import Faces, cube_faces
+from stereovox.products.floor_axes import upright_axes
 from stereovox.products.points import height_colours
-from stereovox.products.upright import upright_axes
 
 FLOAT, UINT32, UINT8 = 5126, 5125, 5121
 VERTICES, INDICES = 34962, 34963

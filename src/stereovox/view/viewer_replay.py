@@ -58,8 +58,9 @@ class Replay:
         self._viewer.take(in_cubes(self._mapper.map.snapshot()))
 
     def _go_to(self, number: int) -> None:
-        if number < self._done or self._nearest(number) > self._done:
-            self._start_from(self._nearest(number))
+        before = self._nearest(number - 1)  # the frame itself is added last: the page tells what it did
+        if number < self._done or before > self._done:
+            self._start_from(before)
         due = monotonic() + TOLD_S
         while self._done < number:
             self._report = self._mapper.add(self._source.frame(self._done))

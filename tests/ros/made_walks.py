@@ -42,7 +42,7 @@ def depth_at(k: int) -> Frame:
 
 
 def write_walk(path: Path, frames: int = 12) -> Path:
-    """Write depth, camera_info, /tf and /tf_static in order of time; the last transform is later than the last image."""
+    """Write depth, camera_info, /tf and /tf_static in order of time; transforms go on after the last image."""
     told = [(START_NS - FRAME_NS // 4 + k * TF_NS, k) for k in range(2 + frames * FRAME_NS // TF_NS)]
     with BagWriter(path) as bag:
         bag.fixed("base_link", OPTICAL, T_BASE_CAMERA)

@@ -68,13 +68,7 @@ class MapNode:
 
     def spin_once(self, executor: Any) -> None:
         """Take in what has come, map one frame, publish what is due."""
-        wait_s = SOON_S if len(self.waiting) else IDLE_S
-        for _ in range(MOST_AT_ONCE):
-            before = self._heard.messages
-            executor.spin_once(timeout_sec=wait_s)
-            if self._heard.messages == before:
-                break
-            wait_s = 0.0
+        self._take_in(executor, SOON_S if len(self.waiting) else IDLE_S)
         arrival = self.waiting.take(self._ready)
         if arrival is not None:
             self._map(arrival)
@@ -85,6 +79,17 @@ class MapNode:
         while (arrival := self.waiting.take(lambda one: True)) is not None:
             self._map(arrival)
         self._outputs.close()
+
+    def _take_in(self, executor: Any, wait_s: float) -> None:
+        """Wait for messages, and take in all that are there."""
+        idle = 0  # rclpy returns empty-handed once after each round of what was ready, whether or not more came
+        for _ in range(MOST_AT_ONCE):
+            before = self._heard.messages
+            executor.spin_once(timeout_sec=wait_s)
+            idle = idle + 1 if self._heard.messages == before else 0
+            if idle == 2:
+                break
+            wait_s = 0.0
 
     def _arrived(self, topic: str, data: bytes) -> None:
         self.received[topic] += 1

@@ -145,6 +145,9 @@ def _pixels(picture: Picture, name: str) -> NDArray[np.generic]:
     try:
         if picture.step < picture.width * dtype.itemsize:
             raise ValueError(f"a row of {picture.width} pixels does not fit into {picture.step} bytes")
+        needed = (picture.height - 1) * picture.step + picture.width * dtype.itemsize
+        if needed > len(picture.data):  # of an empty buffer NumPy makes an array of whatever lies in the memory
+            raise ValueError(f"an image of {needed} bytes has {len(picture.data)}")
         strided = np.ndarray(shape, dtype, picture.data, strides=(picture.step, dtype.itemsize))
     except (TypeError, ValueError) as error:
         raise FrameRefused("unreadable", f"{name}: {error}; the message is damaged, leave the frame out") from None

@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from stereovox.maps import load_map as load_map
     from stereovox.maps.grid_map import GridMap as GridMap
     from stereovox.maps.occupancy import OccupancyGrid as OccupancyGrid
+    from stereovox.products import export as export
+    from stereovox.products.imports import import_map as import_map
     from stereovox.rigs import StereoPair as StereoPair
     from stereovox.sources import open_source as open_source
     from stereovox.sources.latest import Latest as Latest
@@ -55,6 +57,8 @@ _HOMES = {
     "load_map": "maps",
     "GridMap": "maps.grid_map",
     "OccupancyGrid": "maps.occupancy",
+    "export": "products",
+    "import_map": "products.imports",
     "open_source": "sources",
     "Latest": "sources.latest",
 }

@@ -8,28 +8,39 @@ from pathlib import Path
 from stereovox import registry
 from stereovox.errors import StereovoxError
 from stereovox.maps import VoxelMap
+from stereovox.maps.cubes import in_cubes
 from stereovox.products.octomap_read import read_octomap
 
 EXPORTS = {
     ".bt": "stereovox.products.octomap_write:write_bt",
     ".ot": "stereovox.products.octomap_write:write_ot",
     ".ply": "stereovox.products.points:write_ply",
+    ".pcd": "stereovox.products.points:write_pcd",
     ".npz": "stereovox.products.points:write_npz",
+    ".glb": "stereovox.products.gltf:write_glb",
+    ".obj": "stereovox.products.mesh_files:write_obj",
+    ".stl": "stereovox.products.mesh_files:write_stl",
+    ".bag": "stereovox.products.bag_maps:write_bag",
+    ".mcap": "stereovox.products.bag_maps:write_bag",
+    ".db3": "stereovox.products.bag_maps:write_bag",
     ".pgm": "stereovox.products.projection:write_grid",
     ".png": "stereovox.products.projection:write_grid",
     ".yaml": "stereovox.products.projection:write_grid",
 }
 """File ending -> writer `(voxel_map, path) -> None`; other packages add theirs as entry points `stereovox.export`."""
 FLAT = (".pgm", ".png", ".yaml")
-"""Endings of 2-D maps, whose writer takes `heights` too."""
+"""Endings of 2-D maps."""
+BAGS = (".bag", ".mcap", ".db3")
+"""Endings of recordings of ROS, with a 2-D map in them; their writer takes `heights` too, as that of `FLAT` does."""
 
-__all__ = ["EXPORTS", "FLAT", "export", "read_octomap"]
+__all__ = ["BAGS", "EXPORTS", "FLAT", "export", "read_octomap"]
 
 
 def export(voxel_map: VoxelMap, path: str | Path, heights: tuple[float, float] | None = None) -> None:
     """Write `voxel_map` to the file `path` in the format its ending names; a failed export leaves an older file whole.
 
-    heights: for 2-D maps, the lowest and highest metres that mark cells (see `projection.project`).
+    Uneven cells become cubes where the format knows only those.
+    heights: for 2-D maps and bags, the lowest and highest metres that mark cells (see `projection.project`).
     Raises StereovoxError: one line about an unknown ending, a place that cannot be written, cells the format cannot
     hold, or heights where they have no meaning.
     """
@@ -37,6 +48,8 @@ def export(voxel_map: VoxelMap, path: str | Path, heights: tuple[float, float] |
     known = registry.names("export", EXPORTS)
     if ending not in known:
         raise StereovoxError(f"{path}: cannot export to '{ending}'; end the file's name with one of {', '.join(known)}")
-    if heights is not None and ending not in FLAT:
-        raise StereovoxError(f"{path}: heights are for 2-D maps alone; end the file's name with {' or '.join(FLAT)}")
-    registry.find("export", EXPORTS, ending)(voxel_map, path, *([] if heights is None else [heights]))
+    if heights is not None and ending not in (*FLAT, *BAGS):
+        known = " or ".join((*FLAT, *BAGS))
+        raise StereovoxError(f"{path}: heights are for 2-D maps alone; end the file's name with {known}")
+    write = registry.find("export", EXPORTS, ending)
+    write(voxel_map if ending in FLAT else in_cubes(voxel_map), path, *([] if heights is None else [heights]))

@@ -264,12 +264,24 @@ def test_bags_without_such_a_map(tmp_path, voxel_map):
 
 def test_options_and_endings_that_say_nothing(tmp_path):
     for path, more, what in (
-        ("a.bt", {"voxel_size": 0.1}, "leave --voxel-size out"),
-        ("a.ply", {"topic": "/a"}, "leave --topic out"),
+        ("a.bt", {"voxel_size": 0.1}, "--voxel-size says nothing"),
+        ("a.ply", {"topic": "/a"}, "--topic says nothing"),
         ("a.xyz", {}, r"\.bt, \.ot, \.npz"),
-        ("none.ply", {}, "cannot be read"),
+        ("none.ply", {"voxel_size": 0.0}, "cannot be read"),
         ("none.npz", {}, "cannot be read"),
         ("none.mcap", {}, "none.mcap"),
     ):
         with pytest.raises(StereovoxError, match=what):
             import_map(tmp_path / path, **more)
+
+
+def test_other_packages_read_their_own(tmp_path, voxel_map, monkeypatch):
+    class Entry:
+        name = ".cells"
+
+        @staticmethod
+        def load():
+            return lambda path: voxel_map
+
+    monkeypatch.setattr("stereovox.registry.entry_points", lambda group: [Entry] if group == "stereovox.import" else [])
+    assert import_map(tmp_path / "map.cells") is voxel_map

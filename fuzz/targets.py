@@ -308,7 +308,10 @@ def text_points(_: Path) -> list[bytes]:
         b"ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty double z\nend_header\n"
     )
     pcd = b"# .PCD v0.7\nFIELDS x y z\nSIZE 4 4 8\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 2\nHEIGHT 1\nPOINTS 2\nDATA ascii\n"
-    return [ply + rows, pcd + rows]
+    columns = np.array([1, 2, 3, 4], "<f4").tobytes() + np.array([5.0, 6.0]).tobytes()
+    packed = b"\x1f" + columns  # a run of 32 bytes
+    compressed = pcd.replace(b"ascii", b"binary_compressed") + struct.pack("<II", len(packed), len(columns)) + packed
+    return [ply + rows, pcd + rows, compressed]
 
 
 # bags ---------------------------------------------------------------------------------------------------------------

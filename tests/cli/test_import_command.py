@@ -53,7 +53,7 @@ def test_a_floor_there_and_back(capsys):
         (["import", "floor.yaml", "m"], "floor.yaml: cannot import '.yaml'"),
         (["import", "room.ply", "m", "--voxel-size", "0"], "voxel_size"),
         (["import", "room.ply", "room.ply"], "room.ply"),
-        (["import", "room.ply", "m", "--topic", "/a"], "leave --topic out"),
+        (["import", "room.ply", "m", "--topic", "/a"], "--topic says nothing"),
         (["import", "room.ply", "m.yaml"], "room.ply: neither a ROS 1 bag"),
         (["import", "room.bag", "m.yaml", "--voxel-size", "1"], "--voxel-size: a floor's map tells"),
         (["import", "room.svox", "m"], "room.svox"),

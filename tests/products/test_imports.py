@@ -13,6 +13,7 @@ from stereovox.errors import MapFileError, StereovoxError
 from stereovox.maps import State, VoxelMap
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.products import export
+from stereovox.products._lzf import unpack
 from stereovox.products.bag_maps import read_bag_grid, write_grid_bag
 from stereovox.products.imports import import_map
 from stereovox.products.point_files import read_points
@@ -90,11 +91,57 @@ def packed(form):
 PLY = "ply\nformat {} 1.0\nelement vertex 3\n{}end_header\n"
 XYZ = "property float x\nproperty float y\nproperty float z\nproperty double w\n"
 PCD = "VERSION 0.7\nFIELDS x y z w\nSIZE 4 4 4 8\nTYPE F F F F\nCOUNT 1 1 1 1\nPOINTS 3\nDATA {}\n"
+
+
+def lzf(data):
+    """Pack as LZF does: runs of equal bytes as a piece of what was written before, all else as it is."""
+    packed, k = bytearray(), 0
+    while k < len(data):
+        run = next((n for n in range(k, len(data)) if data[n] != data[k - 1]), len(data)) - k if k else 0
+        if run >= 3:
+            run = min(run, 200)
+            packed += bytes([(run - 2) << 5, 0] if run < 9 else [7 << 5, run - 9, 0])
+            k += run
+        else:
+            packed += bytes([0, data[k]])
+            k += 1
+    return bytes(packed)
+
+
+def test_lzf_of_every_kind_of_piece():
+    dice, packed, expected = np.random.default_rng(5), bytearray(), bytearray(b"x")
+    packed += b"\0x"
+    for _ in range(400):
+        if dice.random() < 0.5:
+            new = dice.bytes(dice.integers(1, 33))
+            packed += bytes([len(new) - 1]) + new
+            expected += new
+        else:
+            length, back = int(dice.integers(3, 265)), int(dice.integers(1, min(len(expected), 8192) + 1))
+            high, low = divmod(back - 1, 256)
+            packed += bytes([(length - 2) << 5 | high, low] if length < 9 else [7 << 5 | high, length - 9, low])
+            for _ in range(length):
+                expected.append(expected[-back])
+    unpacked = np.zeros(len(expected), np.uint8)
+    assert unpack(np.frombuffer(packed, np.uint8), unpacked) == len(expected) > 9000
+    assert unpacked.tobytes() == expected
+    assert unpack(np.frombuffer(packed, np.uint8), unpacked[:-1]) == -1
+    for data in ([5, 1], [32, 0], [224], [0, 1, 32], [0, 1, 32, 1]):
+        assert unpack(np.array(data, np.uint8), unpacked) == -1
+
+
+def packed_columns():
+    columns = b"".join(np.ascontiguousarray(POINTS[:, axis], "<f4").tobytes() for axis in range(3))
+    columns += np.ones(3).tobytes()
+    return struct.pack("<II", len(lzf(columns)), len(columns)) + lzf(columns)
+
+
 SOUND = {
     "text.ply": PLY.format("ascii", XYZ).encode() + ROWS.encode(),
     "little.ply": PLY.format("binary_little_endian", XYZ).encode() + packed("<3fd"),
     "big.ply": PLY.format("binary_big_endian", XYZ).encode() + packed(">3fd"),
     "text.pcd": PCD.format("ascii").encode() + ROWS.encode(),
+    "packed.pcd": PCD.format("binary_compressed").encode() + packed_columns(),
     "binary.pcd": PCD.format("binary").encode() + packed("<3fd"),
 }
 
@@ -136,7 +183,9 @@ def test_points_that_are_none_count_for_nothing(tmp_path):
         ("text.pcd", b"TYPE F F F F", b"TYPE F F F", "number of fields"),
         ("text.pcd", b"SIZE 4", b"SIZE 3", "SIZE '3'"),
         ("text.pcd", b"COUNT 1 1 1 1", b"COUNT 1 1 1 -1", "no number"),
-        ("binary.pcd", b"DATA binary", b"DATA binary_compressed", "convert it"),
+        ("binary.pcd", b"DATA binary", b"DATA binary_zipped", "only ascii, binary, binary_compressed"),
+        ("binary.pcd", b"DATA binary", b"DATA binary_compressed", "cannot be"),
+        ("packed.pcd", b"POINTS 3", b"POINTS 9", "cannot be"),
         ("binary.pcd", b"POINTS 3", b"POINTS 4", "are left"),
     ],
 )
@@ -215,12 +264,24 @@ def test_bags_without_such_a_map(tmp_path, voxel_map):
 
 def test_options_and_endings_that_say_nothing(tmp_path):
     for path, more, what in (
-        ("a.bt", {"voxel_size": 0.1}, "leave --voxel-size out"),
-        ("a.ply", {"topic": "/a"}, "leave --topic out"),
+        ("a.bt", {"voxel_size": 0.1}, "--voxel-size says nothing"),
+        ("a.ply", {"topic": "/a"}, "--topic says nothing"),
         ("a.xyz", {}, r"\.bt, \.ot, \.npz"),
-        ("none.ply", {}, "cannot be read"),
+        ("none.ply", {"voxel_size": 0.0}, "cannot be read"),
         ("none.npz", {}, "cannot be read"),
         ("none.mcap", {}, "none.mcap"),
     ):
         with pytest.raises(StereovoxError, match=what):
             import_map(tmp_path / path, **more)
+
+
+def test_other_packages_read_their_own(tmp_path, voxel_map, monkeypatch):
+    class Entry:
+        name = ".cells"
+
+        @staticmethod
+        def load():
+            return lambda path: voxel_map
+
+    monkeypatch.setattr("stereovox.registry.entry_points", lambda group: [Entry] if group == "stereovox.import" else [])
+    assert import_map(tmp_path / "map.cells") is voxel_map

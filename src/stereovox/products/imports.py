@@ -5,18 +5,26 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from stereovox import registry
 from stereovox.errors import StereovoxError
 from stereovox.maps import VoxelMap
-from stereovox.products.bag_maps import read_bag_map
-from stereovox.products.npz_read import read_npz
-from stereovox.products.octomap_read import read_octomap
-from stereovox.products.point_files import read_point_map
 
-WHOLE = {".bt": read_octomap, ".ot": read_octomap, ".npz": read_npz}
-"""Files that tell all by themselves."""
-POINTS = (".ply", ".pcd")
-BAGS = (".bag", ".mcap", ".db3")
-ENDINGS = (*WHOLE, *POINTS, *BAGS)
+IMPORTS = {
+    ".bt": "stereovox.products.octomap_read:read_octomap",
+    ".ot": "stereovox.products.octomap_read:read_octomap",
+    ".npz": "stereovox.products.npz_read:read_npz",
+    ".ply": "stereovox.products.point_files:read_point_map",
+    ".pcd": "stereovox.products.point_files:read_point_map",
+    ".bag": "stereovox.products.bag_maps:read_bag_map",
+    ".mcap": "stereovox.products.bag_maps:read_bag_map",
+    ".db3": "stereovox.products.bag_maps:read_bag_map",
+}
+"""File ending -> reader `(path) -> VoxelMap`; other packages add theirs as entry points `stereovox.import`."""
+TAKES = {
+    "voxel_size": (".ply", ".pcd", ".bag", ".mcap", ".db3"),
+    "topic": (".bag", ".mcap", ".db3"),
+}
+"""Which files' readers want to know more, by keyword."""
 
 
 def import_map(path: str | Path, voxel_size: float | None = None, topic: str | None = None) -> VoxelMap:
@@ -27,14 +35,14 @@ def import_map(path: str | Path, voxel_size: float | None = None, topic: str | N
     voxel_size: metres, for points of other programs; ours tell it. topic: see `bag_maps.read_bag_map`.
     Raises StereovoxError: one line with the file and what is wrong, or an option that says nothing for such a file.
     """
-    ending = Path(path).suffix.lower()
-    bag = ending in BAGS or Path(path).is_dir()
-    if not bag and ending not in ENDINGS:
-        raise StereovoxError(f"{path}: cannot import '{ending}'; the file's name ends in one of {', '.join(ENDINGS)}")
-    if voxel_size is not None and ending in WHOLE:
-        raise StereovoxError(f"{path}: tells itself how large its cells are; leave --voxel-size out")
-    if topic is not None and not bag:
-        raise StereovoxError(f"{path}: has no topics; leave --topic out")
-    if bag:
-        return read_bag_map(path, voxel_size, topic)
-    return read_point_map(path, voxel_size) if ending in POINTS else WHOLE[ending](path)
+    ending = ".mcap" if Path(path).is_dir() else Path(path).suffix.lower()
+    known = registry.names("import", IMPORTS)
+    if ending not in known:
+        raise StereovoxError(f"{path}: cannot import '{ending}'; the file's name ends in one of {', '.join(known)}")
+    told = {"voxel_size": voxel_size, "topic": topic}
+    given = {name: value for name, value in told.items() if value is not None}
+    for name in given:
+        if ending not in TAKES[name]:
+            option = f"--{name.replace('_', '-')}"
+            raise StereovoxError(f"{path}: {option} says nothing about a '{ending}'; leave it out")
+    return registry.find("import", IMPORTS, ending)(path, **given)

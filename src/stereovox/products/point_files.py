@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from stereovox.errors import ConfigError, MapFileError, StereovoxError
 from stereovox.maps import VoxelMap
+from stereovox.products._lzf import unpack
 from stereovox.products.cloud_cells import cells_of_points
 from stereovox.untrusted import read_bounded, shown
 
@@ -26,6 +27,11 @@ PLY_TYPES = {
     "float": "f4", "double": "f8", "float32": "f4", "float64": "f8",
 }  # fmt: skip
 PLY_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+COLUMNS = "columns"
+"""The order of packed points: all numbers of one field, little-endian, then all of the next."""
+PCD_ORDERS = {"ascii": "", "binary": "<", "binary_compressed": COLUMNS}
+PACKED_BEST = 100
+"""LZF makes at best 264 bytes of 3."""
 PCD_KINDS = {"I": "i", "U": "u", "F": "f"}
 PCD_SIZES = {"i": (1, 2, 4, 8), "u": (1, 2, 4, 8), "f": (4, 8)}
 
@@ -38,7 +44,7 @@ class Points(NamedTuple):
 
 
 class _Head(NamedTuple):
-    """record: one point, fields of the same name as in the file. order: "" for text. start: where points begin."""
+    """record: one point, name, kind and count of its fields. order: "" for text. start: where points begin."""
 
     record: list[tuple[str, str, int]]
     number: int
@@ -114,11 +120,10 @@ def _pcd_head(content: bytes) -> _Head:
     counts = told.get("COUNT", ["1"] * len(names))
     if not names or not len(names) == len(sizes) == len(kinds) == len(counts) <= MOST_FIELDS:
         raise ValueError("FIELDS, SIZE, TYPE and COUNT do not tell the same number of fields")
-    if data not in ("ascii", "binary"):
-        cure = "convert it: pcl_convert_pcd_ascii_binary IN.pcd OUT.pcd 1"
-        raise ValueError(f"DATA is {shown(data)}, only ascii and binary can be read; {cure}")
+    if data not in PCD_ORDERS:
+        raise ValueError(f"DATA is {shown(data)}, only {', '.join(PCD_ORDERS)} can be read")
     record = [(name, *one) for name, one in zip(names, map(_pcd_type, kinds, sizes, counts), strict=True)]
-    return _Head(record, _count(" ".join(told.get("POINTS", []))), "" if data == "ascii" else "<", start)
+    return _Head(record, _count(" ".join(told.get("POINTS", []))), PCD_ORDERS[data], start)
 
 
 def _pcd_type(kind: str, size: str, count: str) -> tuple[str, int]:
@@ -141,7 +146,21 @@ def _xyz(body: bytes, head: _Head) -> NDArray[np.float64]:
     names = [name for name, _, _ in head.record]
     if any(names.count(axis) != 1 for axis in "xyz") or any(n > 1 for name, _, n in head.record if name in "xyz"):
         raise ValueError(f"its points have no x, y and z of one number each (they have {shown(' '.join(names))})")
-    return _text_xyz(body, head, names) if not head.order else _binary_xyz(body, head, names)
+    read = {"": _text_xyz, COLUMNS: _packed_xyz}.get(head.order, _binary_xyz)
+    return read(body, head, names)
+
+
+def _packed_xyz(body: bytes, head: _Head, names: list[str]) -> NDArray[np.float64]:
+    types = [np.dtype((f"<{kind}", (n,))) for _, kind, n in head.record]
+    starts = np.cumsum([0, *(head.number * kind.itemsize for kind in types)]).tolist()
+    size, whole = np.frombuffer(body[:8], "<u4").tolist() if len(body) >= 8 else (0, -1)
+    if whole != starts[-1] or size > len(body) - 8 or whole > PACKED_BEST * size:
+        raise ValueError(f"{head.number} points in {starts[-1]} bytes, packed in {len(body) - 8} bytes, cannot be")
+    columns = np.empty(whole, np.uint8)
+    if unpack(np.frombuffer(body, np.uint8, size, 8), columns) != whole:
+        raise ValueError("its packed points are damaged")
+    at = [names.index(axis) for axis in "xyz"]
+    return np.stack([columns[starts[k] : starts[k + 1]].view(types[k].base).astype(np.float64) for k in at], axis=1)
 
 
 def _binary_xyz(body: bytes, head: _Head, names: list[str]) -> NDArray[np.float64]:

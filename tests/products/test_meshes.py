@@ -12,7 +12,7 @@ from stereovox.errors import MapFileError, StereovoxError
 from stereovox.maps import VoxelMap
 from stereovox.products import export
 from stereovox.products.cube_faces import cube_faces
-from stereovox.products.upright import upright_axes
+from stereovox.products.floor_axes import upright_axes
 
 ENDINGS = (".glb", ".obj", ".stl")
 

@@ -27,6 +27,7 @@ LAYERS = (
         "config_safety",
         "gate",
         "health",
+        "camera_path",
         "history",
         "update_report",
         "_jit",

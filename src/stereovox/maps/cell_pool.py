@@ -98,6 +98,15 @@ class CellPool:
         _pool.find_all(self.table, self.coords, coords, places)
         return coords[places >= 0], self._cells_at(places[places >= 0], self.values)
 
+    def within(
+        self, low: NDArray[np.integer], high: NDArray[np.integer]
+    ) -> tuple[NDArray[np.int32], NDArray[np.integer]]:
+        """Return the blocks from `low` (3,) to below `high` (3,), and their cells (n, 512) as stored, in no order."""
+        places = self._places()
+        coords = self.coords[places]
+        inside = ((coords >= low) & (coords < high)).all(axis=1)
+        return coords[inside], self._cells_at(places[inside], self.values)
+
     def remove(self, coords: NDArray[np.int32]) -> None:
         """Forget blocks (n, 3), each there or not."""
         _pool.remove(*self.arrays, coords)

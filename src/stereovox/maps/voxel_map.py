@@ -25,6 +25,9 @@ from stereovox.maps.evidence import LARGEST, LOG_ODDS_SCALE, Evidence
 from stereovox.maps.queries import INDEX_LIMIT as INDEX_LIMIT
 from stereovox.maps.queries import Asked, NearestCells, RayHits
 
+EVERYWHERE = np.array([[-(2**30)] * 3, [2**30] * 3])
+"""Lowest block that `VoxelMap.blocks_within` may be asked for, and the first beyond the highest."""
+
 
 class VoxelMap(WithHistory):
     """A sparse occupancy map in the world frame (z up unless the recording says otherwise).
@@ -33,7 +36,8 @@ class VoxelMap(WithHistory):
     evidence is unknown: log-odds 0, probability 0.5. With evidence it is free (p < free_below), occupied
     (p > occupied_above) or tentative between them.
     `config` holds the settings the map was made with, `history` what it remembers of its frames, `viewpoint` where the
-    camera stood last, `window_state` where its window was, if it had one.
+    camera stood last, `window_state` where its window was, if it had one. `listeners` are called after every `add`
+    with the evidence: no other block has changed, but for those that a window or time took away.
     """
 
     def __init__(self, config: Config):
@@ -42,6 +46,7 @@ class VoxelMap(WithHistory):
         self.history = History()
         self.viewpoint: Viewpoint | None = None
         self.window_state: dict[str, Any] | None = None
+        self.listeners: list[Callable[[Evidence], None]] = []
         self._rules = CellRules(config.map)
         self._format = self._rules.format
         self._most_rise = self._rules.most_rise
@@ -89,6 +94,16 @@ class VoxelMap(WithHistory):
         unbounded.take_history(self)
         return unbounded
 
+    def snapshot(self) -> VoxelMap:
+        """Return a copy to look at while this map goes on: of all cells, or of those in the window."""
+        copy = VoxelMap(self.config)
+        for coords, cells in self._pool.pieces():
+            copy.insert(coords, cells)
+            if self._times is not None:
+                copy.set_times(coords, self._times.get(coords), self._times.start_ns)
+        copy.take_history(self)
+        return copy
+
     def take_history(self, earlier: VoxelMap) -> None:
         """Take over what `earlier` says of the frames that are in it."""
         self.history, self.viewpoint = earlier.history.copied(), earlier.viewpoint
@@ -133,7 +148,10 @@ class VoxelMap(WithHistory):
         mine = self._in_my_units(evidence)
         if self._times is not None:
             self._times.write(mine, self._now_ns)
-        return self._pool.add(mine.coords, mine.values, mine.uniform, mine.uniform_value, self.config.threads)
+        changed = self._pool.add(mine.coords, mine.values, mine.uniform, mine.uniform_value, self.config.threads)
+        for listener in self.listeners:
+            listener(mine)
+        return changed
 
     def log_odds(self, points: ArrayLike) -> NDArray[np.float32]:
         """Return the log-odds (N,) at points (N, 3) in metres, world frame; 0 where unknown or not finite.
@@ -223,6 +241,13 @@ class VoxelMap(WithHistory):
         """Return block coordinates (n, 3) in ascending order and their cells (n, 512) as they are stored."""
         coords, values = zip(*self.slabs(), strict=True)
         return np.concatenate(coords), np.concatenate(values)
+
+    def blocks_within(self, low: ArrayLike, high: ArrayLike) -> tuple[NDArray[np.int32], NDArray[np.integer]]:
+        """Return the blocks in memory with coordinates (3,) from `low` to below `high`, in no order.
+
+        Coordinates (n, 3), cells (n, 512) as they are stored; both are copies.
+        """
+        return self._pool.within(np.asarray(low), np.asarray(high))
 
     def slabs(self) -> Iterator[tuple[NDArray[np.int32], NDArray[np.integer]]]:
         """Yield all blocks as in `blocks`, piece by piece in ascending order; the map must not change meanwhile."""

@@ -23,6 +23,16 @@ def floor_axes(up: str) -> tuple[int, int, int, int]:
     return (y, x, upright, -1) if up.startswith("-") else (x, y, upright, 1)
 
 
+def upright_axes(up: str) -> NDArray[np.float64]:
+    """Return rows (3, 3) x, y and z of a right-handed frame whose z is a map's `up`, as directions in the map's frame.
+
+    They are the axes of the grid that `projection.project` makes.
+    """
+    x, y, upright, sign = floor_axes(up)
+    unit = np.eye(3)
+    return np.stack([unit[x], unit[y], sign * unit[upright]])
+
+
 def heights_of(points: ArrayLike, up: str) -> NDArray[np.float64]:
     """Return the heights (N,) in metres of points (N, 3)."""
     _, _, upright, sign = floor_axes(up)

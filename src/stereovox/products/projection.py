@@ -18,6 +18,7 @@ from stereovox.maps.occupancy import UNKNOWN, OccupancyGrid
 from stereovox.maps.percent import Percent
 from stereovox.products import _projection
 from stereovox.products.floor_axes import Heights, floor_axes
+from stereovox.products.inflate import inflated_grid
 from stereovox.products.map_server import write_map_server
 
 NOTHING = np.iinfo(np.int16).min
@@ -27,7 +28,7 @@ MOST_CELLS = 2**30
 TIE = 1e-9
 
 
-class _Patch(NamedTuple):
+class Patch(NamedTuple):
     """Some blocks seen from above: lowest column and row, and (rows, columns) int16 as `look_down` fills them."""
 
     corner: NDArray[np.int64]
@@ -48,31 +49,35 @@ def project(voxel_map: VoxelMap, heights: Heights | None = None) -> OccupancyGri
     for x, z and x for y, and with a minus the same two swapped. Uneven cells become cubes where the floor needs it.
     Raises StereovoxError, one line, where no cell between the heights is known, or the grid were too large.
     """
-    *order, axis, _ = floor_axes(voxel_map.config.up)
+    order = list(floor_axes(voxel_map.config.up)[:3])
     if voxel_map.config.cell[order[0]] != voxel_map.config.cell[order[1]]:
         voxel_map = in_cubes(voxel_map)
     heights = heights or voxel_map.config.scan.heights
-    layers = _layers(voxel_map, axis, heights)
-    patches = [_patch(voxel_map, *slab, [*order, axis], layers) for slab in voxel_map.slabs() if len(slab[0])]
+    layers = layers_of(voxel_map, order[2], heights)
+    patches = [patch_of(voxel_map, *slab, order, layers) for slab in voxel_map.slabs() if len(slab[0])]
     patch = _joined(patches)
     if patch is None or not (patch.marked != NOTHING).any():
-        raise StereovoxError(_nothing_there(voxel_map, axis, heights))
+        raise StereovoxError(_nothing_there(voxel_map, order[2], heights))
     return _grid(voxel_map, patch, voxel_map.config.cell[order[0]])
 
 
-def write_grid(voxel_map: VoxelMap, path: str | Path, heights: Heights | None = None) -> None:
+def write_grid(
+    voxel_map: VoxelMap, path: str | Path, heights: Heights | None = None, inflate: float | None = None
+) -> None:
     """Write the map seen from above as map_server's two files, a picture and its .yaml; `path` names either.
 
-    heights: see `project`. Raises StereovoxError as `project` and `write_map_server` do.
+    heights: see `project`. inflate: radius of a robot in metres by which obstacles grow, with a margin of one cell.
+    Raises StereovoxError as `project`, `inflated_grid` and `write_map_server` do.
     """
     try:
         grid = project(voxel_map, heights)
+        grid = grid if inflate is None else inflated_grid(grid, inflate)
     except StereovoxError as error:
         raise StereovoxError(f"{path}: {error}") from None
     write_map_server(grid, path)
 
 
-def _layers(voxel_map: VoxelMap, axis: int, heights: Heights) -> NDArray[np.int64]:
+def layers_of(voxel_map: VoxelMap, axis: int, heights: Heights) -> NDArray[np.int64]:
     """Return the first and the last layer of cells whose middle is above the lower height, and not above the upper."""
     low, high = heights
     if not (np.isfinite(heights).all() and low < high):
@@ -85,13 +90,17 @@ def _layers(voxel_map: VoxelMap, axis: int, heights: Heights) -> NDArray[np.int6
     return -1 - layers[::-1] if voxel_map.config.up.startswith("-") else layers
 
 
-def _patch(
+def patch_of(
     voxel_map: VoxelMap,
     coords: NDArray[np.int32],
     values: NDArray[np.integer],
     order: list[int],
     layers: NDArray[np.int64],
-) -> _Patch:
+) -> Patch:
+    """Return what blocks (n, 3), n > 0, with their cells (n, 512) as stored, show from above.
+
+    order: axes along columns, along rows and up, see `floor_axes`; layers: as `layers_of` returns them.
+    """
     floor = coords[:, order[:2]].astype(np.int64)
     low, high = floor.min(axis=0) * SIDE, (floor.max(axis=0) + 1) * SIDE
     patch = _empty(low, high)
@@ -103,16 +112,16 @@ def _patch(
     return patch
 
 
-def _empty(low: NDArray[np.int64], high: NDArray[np.int64]) -> _Patch:
+def _empty(low: NDArray[np.int64], high: NDArray[np.int64]) -> Patch:
     columns, rows = (high - low).tolist()
     if columns * rows > MOST_CELLS:
         raise StereovoxError(
             f"a grid of {columns} x {rows} cells is too large; map a smaller place, with --set window.size=[X,Y,Z]"
         )
-    return _Patch(low, np.full((rows, columns), NOTHING, np.int16), np.full((rows, columns), NOTHING, np.int16))
+    return Patch(low, np.full((rows, columns), NOTHING, np.int16), np.full((rows, columns), NOTHING, np.int16))
 
 
-def _joined(patches: list[_Patch]) -> _Patch | None:
+def _joined(patches: list[Patch]) -> Patch | None:
     if len(patches) < 2:
         return patches[0] if patches else None
     ends = [patch.corner + patch.marked.shape[::-1] for patch in patches]
@@ -125,7 +134,7 @@ def _joined(patches: list[_Patch]) -> _Patch | None:
     return joined
 
 
-def _grid(voxel_map: VoxelMap, patch: _Patch, side: float) -> OccupancyGrid:
+def _grid(voxel_map: VoxelMap, patch: Patch, side: float) -> OccupancyGrid:
     number = np.where(patch.marked != NOTHING, patch.marked, patch.cleared)
     rows, columns = (np.flatnonzero((number != NOTHING).any(axis=across)) for across in (1, 0))
     number = number[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]

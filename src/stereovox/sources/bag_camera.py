@@ -36,7 +36,7 @@ def find_camera(
     try:
         told = _read(file, found)
         millimetres = option(file, sensor, "Stereo Baseline") if sensor else None
-        camera = _camera(told, rectified, millimetres and millimetres / 1000)
+        camera = camera_of(told, rectified, millimetres and millimetres / 1000)
     except (FrameRefused, StereovoxError, ValueError) as error:
         raise SourceError(f"{file.path}: {found}: {error}") from None
     if any(told.D) and not rectified:
@@ -63,7 +63,11 @@ def _read(file: BagFile, topic: str) -> CameraInfo:
     return CameraInfo(width, height, (fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0), D)
 
 
-def _camera(told: CameraInfo, rectified: bool, baseline: float | None) -> PinholeCamera:
+def camera_of(told: CameraInfo, rectified: bool, baseline: float | None = None) -> PinholeCamera:
+    """Return the camera that a message tells; rectified: its images are, so that P counts and not K.
+
+    Raises StereovoxError for one that cannot be.
+    """
     fx, _, cx, _, fy, cy = told.K[:6]
     if rectified and told.P[0] > 0:
         fx, cx, fy, cy = told.P[0], told.P[2], told.P[5], told.P[6]

@@ -58,7 +58,8 @@ class DepthTopic:
         Raises FrameRefused `unreadable`, `bad_dtype` or `bad_shape`; `name` stands in its message.
         """
         picture = read_picture(self._file, self.topic, i, name)
-        depth, encoding = self._decoded(picture, name)
+        packed = self._file.types[self.topic] == COMPRESSED
+        depth, encoding = decoded(picture, packed, (self.camera.width, self.camera.height), name)
         stamp_ns, unit = picture.stamp_ns, picture.depth_units
         told = self._metadata.at(self.stamp_ns(i)) if self._metadata else {}
         if "timestamp" in told:  # only .db3 has it: there the header counts from the start of the recording
@@ -66,19 +67,24 @@ class DepthTopic:
         unit = unit or _positive(told.get("depth_units", "")) or self._unit
         return depth, stamp_ns, unit or UNITS[encoding]
 
-    def _decoded(self, picture: Picture, name: str) -> tuple[NDArray[np.generic], str]:
-        size = self.camera.width, self.camera.height
-        if self._file.types[self.topic] == COMPRESSED:
-            encoding = picture.encoding.partition(";")[0].strip()
-            if PACKED not in picture.encoding or encoding not in ("16UC1", "mono16"):
-                raise FrameRefused("bad_dtype", f"{name}: '{picture.encoding}' is not read; record it as 16UC1")
-            return decode_depth_png(name, bytes(picture.data[PNG_AT:]), size), encoding
-        if picture.encoding not in DTYPES:
-            raise FrameRefused("bad_dtype", f"{name}: '{picture.encoding}' is no depth; it must be 16UC1 or 32FC1")
-        if (picture.width, picture.height) != size:
-            found, wanted = f"{picture.width}x{picture.height}", f"{size[0]}x{size[1]}"
-            raise FrameRefused("bad_shape", f"{name}: {found} pixels, its camera has {wanted}; give ?info=/topic")
-        return _pixels(picture, name), picture.encoding
+
+def decoded(picture: Picture, packed: bool, size: tuple[int, int], name: str) -> tuple[NDArray[np.generic], str]:
+    """Return depth (height, width) uint16 or float32, and its encoding, one of `UNITS`.
+
+    packed: the picture is a `CompressedImage`. size: width and height of its camera. `name` stands in messages.
+    Raises FrameRefused `unreadable`, `bad_dtype` or `bad_shape`.
+    """
+    if packed:
+        encoding = picture.encoding.partition(";")[0].strip()
+        if PACKED not in picture.encoding or encoding not in ("16UC1", "mono16"):
+            raise FrameRefused("bad_dtype", f"{name}: '{picture.encoding}' is not read; record it as 16UC1")
+        return decode_depth_png(name, bytes(picture.data[PNG_AT:]), size), encoding
+    if picture.encoding not in DTYPES:
+        raise FrameRefused("bad_dtype", f"{name}: '{picture.encoding}' is no depth; it must be 16UC1 or 32FC1")
+    if (picture.width, picture.height) != size:
+        found, wanted = f"{picture.width}x{picture.height}", f"{size[0]}x{size[1]}"
+        raise FrameRefused("bad_shape", f"{name}: {found} pixels, its camera has {wanted}; give ?info=/topic")
+    return _pixels(picture, name), picture.encoding
 
 
 def find_depth(file: BagFile, topic: str = "", info: str = "") -> DepthTopic:
@@ -139,6 +145,9 @@ def _pixels(picture: Picture, name: str) -> NDArray[np.generic]:
     try:
         if picture.step < picture.width * dtype.itemsize:
             raise ValueError(f"a row of {picture.width} pixels does not fit into {picture.step} bytes")
+        needed = (picture.height - 1) * picture.step + picture.width * dtype.itemsize
+        if needed > len(picture.data):  # of an empty buffer NumPy makes an array of whatever lies in the memory
+            raise ValueError(f"an image of {needed} bytes has {len(picture.data)}")
         strided = np.ndarray(shape, dtype, picture.data, strides=(picture.step, dtype.itemsize))
     except (TypeError, ValueError) as error:
         raise FrameRefused("unreadable", f"{name}: {error}; the message is damaged, leave the frame out") from None

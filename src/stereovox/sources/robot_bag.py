@@ -106,11 +106,11 @@ class RobotBag:
         except FrameRefused as refused:
             return replace(blank, fault=refused.reason, fault_detail=str(refused))
         if isinstance(told, LaserScan):
-            return _scan(told, T_odom, T_base, blank.name, off_ns)
+            return posed_scan(told, T_odom, T_base, blank.name, off_ns)
         band = CloudBand(self._options.lowest, self._options.highest)
         band = replace(band, range_max=self._options.range_max or band.range_max)
         flat, T_base_scan = scan_of_cloud(told, T_base, band)
-        return _scan(flat, T_odom @ inverse(T_base) @ T_base_scan, T_base_scan, blank.name, off_ns)
+        return posed_scan(flat, T_odom @ inverse(T_base) @ T_base_scan, T_base_scan, blank.name, off_ns)
 
     def _frame(self, i: int) -> Frame:
         images = self._depth
@@ -124,7 +124,8 @@ class RobotBag:
         return T if self._options.axes == "optical" else T @ T_BODY_OPTICAL
 
 
-def _scan(told: LaserScan, T_odom_sensor: Transform, T_base_sensor: Transform, name: str, off_ns: int) -> Scan:
+def posed_scan(told: LaserScan, T_odom_sensor: Transform, T_base_sensor: Transform, name: str, off_ns: int) -> Scan:
+    """Return a message as a scan. off_ns: as `Scan.pose_off_ns`."""
     angles = told.angle_min, told.angle_step
     limits = told.range_min, told.range_max
     return Scan(

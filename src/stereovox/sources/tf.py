@@ -8,6 +8,7 @@ way up to their common ancestor and down again.
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import ClassVar
 
 import numpy as np
 
@@ -30,6 +31,9 @@ class Tf:
     often, else the first; `notes` tells. Transforms that are none (see `is_motion`), or that put a frame into itself,
     are left out, as tf2 does it.
     """
+
+    edge: ClassVar[type[Edge]] = Edge
+    """What a frame's places in its parent are kept in."""
 
     def __init__(self, where: str = "tf", limits: Limits | None = None):
         self.where, self.limits, self.unreadable = where, limits or Limits(), 0
@@ -110,7 +114,7 @@ class Tf:
         parent, child = frame_name(parent), frame_name(child)
         edges = self._parents.setdefault(child, {})
         if parent not in edges:
-            edges[parent] = Edge(parent, child)
+            edges[parent] = self.edge(parent, child)
         return edges[parent]
 
     def _up(self, frame: str) -> Edge | None:

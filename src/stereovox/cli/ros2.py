@@ -1,0 +1,185 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Map what comes on topics of ROS 2, live.
+
+Depth images with camera_info, point clouds and laser scans in, poses from /tf or odometry; a 2-D map, a cloud, an
+OctoMap and diagnostics out. All options and settings may be given as parameters too: docs/ros2.md.
+"""
+
+from __future__ import annotations
+
+from argparse import REMAINDER, ArgumentParser, Namespace
+from collections import deque
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from stereovox.cli.checkpoints import Checkpoints
+from stereovox.cli.robots import GRID_ENDINGS, check_file
+from stereovox.cli.settings import add_settings, overrides
+from stereovox.cli.terminal import interrupt_between_steps, milliseconds, say, say_about_compiling
+from stereovox.errors import StereovoxError
+
+if TYPE_CHECKING:
+    from stereovox.config import Config
+    from stereovox.ros.mapping import Mapping
+    from stereovox.ros.node import MapNode
+    from stereovox.ros.options import Options
+    from stereovox.update_report import UpdateReport
+
+EXAMPLE = "stereovox ros2 --depth /camera/depth/image_rect_raw --out room.svox"
+LATELY = 10_000
+"""Frames whose times are told at the end."""
+
+
+def add_arguments(parser: ArgumentParser) -> None:
+    """Declare the options."""
+    topics = (
+        ("depth", "TOPIC[=INFO]", "depth images (16UC1, 32FC1, .../compressedDepth), and their camera_info"),
+        ("cloud", "TOPIC", "point clouds"),
+        ("scan", "TOPIC", "laser scans, for the map of a floor (--set dimensions=2)"),
+        ("odometry", "TOPIC", "poses of nav_msgs/Odometry, beside /tf"),
+        ("pose", "TOPIC=FRAME", "poses of geometry_msgs/PoseStamped of a frame"),
+        ("fixed", "TEXT", "where a frame is mounted: 'PARENT CHILD x y z yaw pitch roll'"),
+    )
+    for name, value, about in topics:
+        parser.add_argument(f"--{name}", action="append", metavar=value, help=f"{about}; repeatable")
+    parser.add_argument("--world-frame", metavar="FRAME", help="frame of the map (map, else odom)")
+    parser.add_argument("--base-frame", metavar="FRAME", help="frame of the robot (base_footprint, else base_link)")
+    parser.add_argument("--out", metavar="MAP", help="save the map there at the end, and when the service asks for it")
+    parser.add_argument("--load", metavar="MAP", help="go on with this map")
+    parser.add_argument("--profile", metavar="P", help="profile name or TOML file (default)")
+    parser.add_argument("--voxel-size", type=float, metavar="M", help="cell size in metres")
+    parser.add_argument("--max-range", type=float, metavar="M", help="depth in metres up to which pixels count")
+    add_settings(parser, "sensor.model=andert")
+    parser.add_argument(
+        "--checkpoint", type=float, default=0.0, metavar="SECONDS",
+        help="save the map as often while it is made; frames wait meanwhile (0: only at the end)",
+    )  # fmt: skip
+    parser.add_argument("--ros-args", nargs=REMAINDER, default=[], help="all that follows is for ROS 2")
+
+
+def run(arguments: Namespace) -> dict[str, Any]:
+    """Map until Ctrl-C or SIGTERM, save the map and tell what was done."""
+    from stereovox.ros.library import check_installed
+
+    check_installed()
+    with _running_node(arguments.ros_args) as node, ExitStack() as stack:
+        from stereovox.ros.mapping import make_mapping
+        from stereovox.ros.parameters import freeze
+        from stereovox.ros.warm_up import warm_up
+
+        config, options = _settings(arguments, node)
+        options.check_sources(config.dimensions)
+        _reserve(options.out, config.dimensions, stack)
+        say_about_compiling()
+        warm_up(config)
+        tiles = Path(options.out).parent / f".{Path(options.out).name}-tiles" if options.out else None
+        mapping = make_mapping(config, options.heights, tiles)
+        stack.callback(mapping.close)
+        if arguments.load:
+            mapping.load(arguments.load)
+        freeze(node, options.out)
+        return _map(arguments, node, mapping, options)
+
+
+def _map(arguments: Namespace, node: Any, mapping: Mapping, options: Options) -> dict[str, Any]:
+    from rclpy.executors import SingleThreadedExecutor
+
+    from stereovox.ros.node import MapNode
+    from stereovox.ros.parameters import FREE
+
+    reports: deque[UpdateReport] = deque(maxlen=LATELY)
+
+    def out() -> str:
+        return str(node.get_parameter(FREE).value)
+
+    maker = MapNode(node, mapping, options, out, reports.append)
+    checkpoints = Checkpoints(lambda: mapping.save(out()), options.out, arguments.checkpoint if options.out else 0.0)
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    say("listening; Ctrl-C ends")
+    with interrupt_between_steps() as check:
+        with suppress(KeyboardInterrupt):
+            while True:
+                maker.spin_once(executor)
+                check()
+                if mapping.history.frames:
+                    checkpoints.after(mapping.history.frames)
+        maker.close()  # a second signal, as `timeout` sends it, is to spoil nothing here
+        return _finished(maker, mapping, out(), reports)
+
+
+def _finished(maker: MapNode, mapping: Mapping, out: str, reports: deque[UpdateReport]) -> dict[str, Any]:
+    from stereovox.evaluate.summary import percentiles
+
+    taken = [one for one in reports if not one.refused]
+    result = {
+        "frames": mapping.history.frames,
+        "frames_refused": mapping.history.refused.total(),
+        "refused": dict(mapping.history.refused.most_common()),
+        "received": dict(maker.received),
+        "dropped": dict(maker.waiting.dropped),
+        "frame_ms": percentiles([one.match_ms + one.depth_ms + one.integrate_ms for one in taken]),
+        "out": "",
+    }
+    say(f"{result['frames']} frames mapped, {result['frames_refused']} refused, {sum(result['dropped'].values())} late")
+    for reason, number in result["refused"].items():
+        example = next((f", last: {one.detail}" for one in reversed(reports) if one.refused == reason), "")
+        say(f"  {number} x {reason}{example}")
+    say(f"a frame: {milliseconds(result['frame_ms'])}")
+    if out and result["frames"]:
+        mapping.save(out)
+        result["out"] = out
+        say(f"saved in {out}")
+    elif out:
+        say("no frame could be used: no map is written")
+    return result
+
+
+@contextmanager
+def _running_node(words: list[str]) -> Iterator[Any]:
+    """Give a node of rclpy with the parameters that the command line names."""
+    import rclpy
+    from rclpy.signals import SignalHandlerOptions
+
+    try:
+        rclpy.init(args=["--ros-args", *words], signal_handler_options=SignalHandlerOptions.NO)
+        node = rclpy.create_node("stereovox", automatically_declare_parameters_from_overrides=True)
+    except Exception as error:  # of rclpy's C library, which has many
+        raise StereovoxError(f"--ros-args {' '.join(words)}: {error}") from None
+    try:
+        yield node
+    finally:
+        node.destroy_node()
+        rclpy.try_shutdown()
+
+
+def _settings(arguments: Namespace, node: Any) -> tuple[Config, Options]:
+    """Return the settings of the map and the options of the node; the command line counts before parameters."""
+    from stereovox.config import load_config
+    from stereovox.ros.options import LISTS, Options, with_parameters
+    from stereovox.ros.parameters import given_parameters
+
+    given = given_parameters(node)
+    profile = arguments.profile or given.settings.pop("profile", "default")
+    given.settings.pop("profile", None)
+    config = load_config(profile, **{**given.settings, **overrides(arguments)})
+    named = {name: getattr(arguments, name) for name in (*LISTS, "world_frame", "base_frame", "out")}
+    said = {name: value for name, value in named.items() if value}
+    return config, with_parameters(Options(), {**given.options, **said})
+
+
+def _reserve(out: str, dimensions: int, stack: ExitStack) -> None:
+    """Find out now, not at the end, that the map could not be saved, and keep others from writing there."""
+    from stereovox.maps.lock import only_writer_in, only_writer_of
+    from stereovox.maps.store import check_target, sweep
+
+    if out and dimensions == 2:
+        stack.enter_context(only_writer_of(check_file(out, GRID_ENDINGS).with_suffix(".yaml")))
+    elif out:
+        if Path(out).suffix.lower() in GRID_ENDINGS:
+            raise StereovoxError(f"--out {out}: names a floor's map; end the name of a map in space in .svox")
+        check_target(Path(out))
+        stack.enter_context(only_writer_in(Path(out)))
+        sweep(Path(out))

@@ -1,0 +1,105 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A 3-D map seen from above while it is made: only what changed is looked at again."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.errors import StereovoxError
+from stereovox.maps import VoxelMap
+from stereovox.maps.blocks import SIDE
+from stereovox.maps.cell_format import CellRules
+from stereovox.maps.evidence import Evidence
+from stereovox.maps.occupancy import UNKNOWN, OccupancyGrid
+from stereovox.maps.percent import Percent
+from stereovox.maps.rolling import RollingMap
+from stereovox.maps.voxel_map import EVERYWHERE
+from stereovox.products.floor_axes import Heights, floor_axes
+from stereovox.products.projection import NOTHING, Patch, layers_of, patch_of
+
+STEP = 8 * SIDE
+"""The grid grows by so many cells: programs that plan in it need not make room anew with each frame."""
+
+
+class LiveProjection:
+    """Keeps a map seen from above, as `projection.project` makes it, at the price of what changed.
+
+    heights: as for `project`. The grid is as large as what is known, in steps of 64 cells. Of a map in a window only
+    the cells in memory count; that and a map that forgets are looked at as a whole.
+    Raises StereovoxError where the heights hold no cell, and where cells are not as long as wide.
+    """
+
+    def __init__(self, voxel_map: VoxelMap, heights: Heights | None = None):
+        self._map, config = voxel_map, voxel_map.config
+        self._order = list(floor_axes(config.up)[:3])
+        across, along, up = self._order
+        if config.cell[across] != config.cell[along]:
+            raise StereovoxError(f"steps {list(config.cell)}: a grid of the floor needs cells as long as wide")
+        self._layers = layers_of(voxel_map, up, heights or config.scan.heights)
+        self._percent = Percent(CellRules(config.map))
+        self._whole = isinstance(voxel_map, RollingMap) or config.map.forget_s is not None
+        self._changed = EVERYWHERE.copy()
+        self._canvas = _Canvas()
+        voxel_map.listeners.append(self._note)
+
+    def grid(self) -> OccupancyGrid | None:
+        """Return the map from above as it is now; None where nothing is known. Its cells are a copy."""
+        if self._whole:
+            self._changed, self._canvas = EVERYWHERE.copy(), _Canvas()
+        coords, cells = self._map.blocks_within(*self._changed)
+        if len(coords):
+            patch = patch_of(self._map, coords, cells, self._order, self._layers)
+            self._canvas.paint(self._in_percent(patch), patch.corner)
+        self._changed = EVERYWHERE[::-1].copy()
+        return self._shown()
+
+    def _note(self, evidence: Evidence) -> None:
+        """Widen the columns that changed by those of a frame."""
+        for coords in (evidence.coords, evidence.uniform):
+            if len(coords):
+                floor = coords[:, self._order[:2]]
+                low, high = self._changed
+                low[self._order[:2]] = np.minimum(low[self._order[:2]], floor.min(axis=0))
+                high[self._order[:2]] = np.maximum(high[self._order[:2]], floor.max(axis=0) + 1)
+                low[self._order[2]], high[self._order[2]] = EVERYWHERE[:, 0]
+
+    def _in_percent(self, patch: Patch) -> NDArray[np.int8]:
+        number = np.where(patch.marked != NOTHING, patch.marked, patch.cleared).astype(np.int32)
+        known = self._percent.shown[np.maximum(number, self._percent.lowest) - self._percent.lowest]
+        return np.where(number == NOTHING, np.int8(UNKNOWN), known)
+
+    def _shown(self) -> OccupancyGrid | None:
+        if not self._canvas.cells.size:
+            return None
+        side = self._map.config.cell[self._order[0]]
+        left, bottom = (self._canvas.corner * side).round(9).tolist()
+        limits = self._percent.free_below, self._percent.occupied_above
+        return OccupancyGrid(self._canvas.cells.copy(), side, (left, bottom, 0.0), *limits)
+
+
+class _Canvas:
+    """A picture that grows. corner: column and row of its first cell; cells: (rows, columns) int8 per cent."""
+
+    def __init__(self) -> None:
+        self.corner = np.zeros(2, np.int64)
+        self.cells = np.empty((0, 0), np.int8)
+
+    def paint(self, patch: NDArray[np.int8], corner: NDArray[np.int64]) -> None:
+        """Put a patch over what stood there."""
+        end = corner + patch.shape[::-1]
+        self._reach(corner // STEP * STEP, -(-end // STEP) * STEP)
+        (left, bottom), (right, top) = (corner - self.corner).tolist(), (end - self.corner).tolist()
+        self.cells[bottom:top, left:right] = patch
+
+    def _reach(self, low: NDArray[np.int64], high: NDArray[np.int64]) -> None:
+        if self.cells.size:
+            before = self.corner + self.cells.shape[::-1]
+            low, high = np.minimum(low, self.corner), np.maximum(high, before)
+            if (low == self.corner).all() and (high == before).all():
+                return
+        columns, rows = (high - low).tolist()
+        larger, (left, bottom) = np.full((rows, columns), UNKNOWN, np.int8), (self.corner - low).tolist()
+        if self.cells.size:
+            larger[bottom : bottom + self.cells.shape[0], left : left + self.cells.shape[1]] = self.cells
+        self.corner, self.cells = low, larger

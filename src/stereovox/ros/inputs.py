@@ -1,0 +1,178 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From messages, as bytes of CDR, to frames and scans, by the readers that read bags: a bag and its replay are one.
+
+A frame waits until its pose is there, so an input reads a message twice: `header` says when and where it was taken,
+`frame` makes the frame of it. Whatever a message holds, `frame` returns one: with a `fault` where it cannot be used.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Protocol
+
+import numpy as np
+
+from stereovox.cameras import PinholeCamera
+from stereovox.errors import FrameRefused, StereovoxError
+from stereovox.frame import Frame, Scan
+from stereovox.geometry import inverse
+from stereovox.ros.clouds import frame_of_cloud
+from stereovox.ros.poses import Pose
+from stereovox.sources.bag_camera import RECTIFIED, camera_of
+from stereovox.sources.bag_depth import UNITS, decoded
+from stereovox.sources.bag_messages import Wire, read_camera_info, read_compressed, read_image
+from stereovox.sources.bag_metadata import sibling
+from stereovox.sources.bag_robot_messages import frame_name, read_laser_scan, read_point_cloud
+from stereovox.sources.cloud_scan import CloudBand, scan_of_cloud
+from stereovox.sources.poses import seconds_from_ns
+from stereovox.sources.robot_bag import posed_scan
+
+NOWHERE = np.full((4, 4), np.nan)
+NO_CAMERA = PinholeCamera(1, 1, 1.0, 1.0, 0.0, 0.0)
+COMPRESSED = "/compressedDepth"
+Place = Callable[[str, int], Pose]
+"""Tells where a frame (by its name) stood at a time; raises FrameRefused."""
+
+
+class Input(Protocol):
+    """One topic with something to map. kind: its message type as `package/Name`."""
+
+    topic: str
+    kind: str
+
+    @property
+    def ready(self) -> bool:
+        """Whether all is there, but for the pose, that its messages need."""
+        return True
+
+    def frame(self, data: bytes, where: Place) -> Frame | Scan:
+        """Return what a message shows; its `fault` says why it cannot be used."""
+        ...
+
+
+def header(data: bytes) -> tuple[int, str]:
+    """Return time in nanoseconds and frame of a message that begins with a header; raises ValueError."""
+    stamp_ns, frame_id = Wire(data, cdr=True).header()
+    return stamp_ns, frame_name(frame_id)
+
+
+class DepthInput(Input):
+    """Depth images (16UC1, 32FC1, or compressedDepth by the topic's name) and the camera_info that belongs to them."""
+
+    def __init__(self, topic: str, info: str = ""):
+        self.topic, self._packed = topic, topic.endswith(COMPRESSED)
+        self.kind = "sensor_msgs/CompressedImage" if self._packed else "sensor_msgs/Image"
+        self.info = info or sibling(topic.removesuffix(COMPRESSED), "camera_info")
+        self._camera: PinholeCamera | None = None
+        self._trouble = f"{topic}: no camera_info came on {self.info}; name its topic: --depth {topic}=INFO"
+
+    @property
+    def ready(self) -> bool:
+        """Whether the camera is known."""
+        return self._camera is not None
+
+    def take_info(self, data: bytes) -> None:
+        """Take in a `sensor_msgs/CameraInfo`; the newest one that can be counts."""
+        try:
+            camera = camera_of(read_camera_info(Wire(data, cdr=True)), RECTIFIED.search(self.topic) is not None)
+        except (StereovoxError, ValueError) as error:
+            self._trouble = f"{self.info}: {error}"
+            return
+        if camera != self._camera:  # the same object lets tables that were made for it be found quickly
+            self._camera = camera
+
+    def frame(self, data: bytes, where: Place) -> Frame:
+        """Return a depth image."""
+        blank = Frame(np.empty((0, 0), np.uint16), NO_CAMERA, NOWHERE, name=self.topic, sensor=self.topic)
+        try:
+            stamp_ns, frame_id = header(data)
+            blank = replace(blank, stamp_ns=stamp_ns, name=_named(self.topic, stamp_ns))
+            if self._camera is None:
+                raise FrameRefused("no_camera", self._trouble)
+            wire, size = Wire(data, cdr=True), (self._camera.width, self._camera.height)
+            picture = read_compressed(wire) if self._packed else read_image(wire)
+            depth, encoding = decoded(picture, self._packed, size, blank.name)
+            T_world_sensor, _, off_ns = where(frame_id, stamp_ns)
+        except (FrameRefused, ValueError) as error:
+            return replace(blank, **_fault(error, blank.name))
+        return replace(
+            blank, depth=depth, camera=self._camera, T_world_sensor=T_world_sensor, depth_scale=UNITS[encoding],
+            pose_off_ns=off_ns,
+        )  # fmt: skip
+
+
+class CloudInput(Input):
+    """Point clouds for a map in space; see `frame_of_cloud`."""
+
+    kind = "sensor_msgs/PointCloud2"
+
+    def __init__(self, topic: str, step_deg: float):
+        self.topic, self._step_deg = topic, step_deg
+
+    def frame(self, data: bytes, where: Place) -> Frame:
+        """Return a cloud as a depth image all round."""
+        try:
+            cloud = read_point_cloud(Wire(data, cdr=True))
+            name = _named(self.topic, cloud.stamp_ns)
+            T_world_sensor, _, off_ns = where(frame_name(cloud.frame_id), cloud.stamp_ns)
+            frame = frame_of_cloud(cloud, T_world_sensor, self._step_deg, name, self.topic)
+        except (FrameRefused, ValueError) as error:
+            blank = Frame(np.empty((0, 0), np.uint16), NO_CAMERA, NOWHERE, name=self.topic, sensor=self.topic)
+            return replace(blank, **_fault(error, self.topic))
+        return replace(frame, pose_off_ns=off_ns)
+
+
+class FloorCloudInput(Input):
+    """Point clouds for the map of a floor: what a 2-D lidar would see of them (`sources.cloud_scan`)."""
+
+    kind = "sensor_msgs/PointCloud2"
+
+    def __init__(self, topic: str):
+        self.topic = topic
+
+    def frame(self, data: bytes, where: Place) -> Scan:
+        """Return a cloud as a scan."""
+        try:
+            cloud = read_point_cloud(Wire(data, cdr=True))
+            T_world, T_base, off_ns = where(frame_name(cloud.frame_id), cloud.stamp_ns)
+            told, T_base_scan = scan_of_cloud(cloud, T_base, CloudBand())
+        except (FrameRefused, ValueError) as error:
+            return _no_scan(self.topic, error)
+        T_world_scan = T_world @ inverse(T_base) @ T_base_scan
+        scan = posed_scan(told, T_world_scan, T_base_scan, _named(self.topic, cloud.stamp_ns), off_ns)
+        return replace(scan, sensor=self.topic)
+
+
+class ScanInput(Input):
+    """Scans of a 2-D lidar, for the map of a floor."""
+
+    kind = "sensor_msgs/LaserScan"
+
+    def __init__(self, topic: str):
+        self.topic = topic
+
+    def frame(self, data: bytes, where: Place) -> Scan:
+        """Return a scan."""
+        try:
+            told = read_laser_scan(Wire(data, cdr=True))
+            T_world, T_base, off_ns = where(frame_name(told.frame_id), told.stamp_ns)
+        except (FrameRefused, ValueError) as error:
+            return _no_scan(self.topic, error)
+        scan = posed_scan(told, T_world, T_base, _named(self.topic, told.stamp_ns), off_ns)
+        return replace(scan, sensor=self.topic)
+
+
+def _no_scan(topic: str, error: Exception) -> Scan:
+    blank = Scan(np.empty(0, np.float32), 0.0, 0.0, 0.0, 0.0, NOWHERE, name=topic, sensor=topic)
+    return replace(blank, **_fault(error, topic))
+
+
+def _fault(error: Exception, name: str) -> dict[str, str]:
+    if isinstance(error, FrameRefused):
+        return {"fault": error.reason, "fault_detail": str(error)}
+    return {"fault": "unreadable", "fault_detail": f"{name}: {error}; the message is damaged"}
+
+
+def _named(topic: str, stamp_ns: int) -> str:
+    return f"{topic} {seconds_from_ns(stamp_ns)}"

@@ -1,0 +1,29 @@
+# SPDX-License-Identifier: Apache-2.0
+"""ROS 2's own packages, of the wheels on PyPI or of a sourced distribution; imported when they are needed."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import Any
+
+from stereovox.errors import MissingExtra
+
+ALWAYS = ("rclpy", "sensor_msgs", "nav_msgs", "geometry_msgs", "diagnostic_msgs", "std_srvs")
+"""Packages that the node needs in any case."""
+
+
+def check_installed() -> None:
+    """Raise MissingExtra, one line, where a package that the node cannot do without is not there."""
+    for package in ALWAYS:
+        try:
+            import_module(package)
+        except ImportError:
+            raise MissingExtra(f"{package} of ROS 2 (source a distribution, or take the wheels)", "ros2") from None
+
+
+def optional_message(package: str, name: str) -> Any | None:
+    """Return a message class of a package that need not be there, else None."""
+    try:
+        return getattr(import_module(f"{package}.msg"), name)
+    except ImportError:
+        return None

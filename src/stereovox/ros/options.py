@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the node itself is told, beside the settings of the map: topics, frames, times."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+from stereovox.errors import StereovoxError, did_you_mean
+
+PREFIX = "ros."
+"""What the names of parameters begin with that are the node's own."""
+LISTS = ("depth", "cloud", "scan", "odometry", "pose", "fixed")
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of the command, and parameters of the node under the same name with `ros.` before it.
+
+    depth: topics of depth images; `TOPIC=INFO` where the camera_info is not beside it. cloud, scan: topics.
+    odometry: topics of nav_msgs/Odometry; pose: `TOPIC=FRAME`, a topic of PoseStamped and the frame whose pose it is.
+    fixed: `PARENT CHILD x y z yaw pitch roll`, where a frame stands in another for good, metres and radians.
+    world_frame: the frame of the map; "": `map`, else `odom`, whichever is connected with the sensors first.
+    base_frame: frame of the robot, on the floor, for maps of a floor; "": `base_footprint`, else `base_link`.
+    wait_s: seconds that a frame waits for its pose. extrapolate_s: seconds by which a pose may be extrapolated then.
+    late_s: a frame that waited so long for a busy map gives way to newer ones. queue: frames of one topic that wait.
+    map_rate, cloud_rate: messages a second at most: of the 2-D map, and of the cloud and the OctoMap.
+    low, high: heights in metres between which obstacles mark the 2-D map; NaN: those of the settings.
+    full_octomap: send log-odds, not only what is occupied and free. cloud_step_deg: see `clouds.frame_of_cloud`.
+    reliable: ask for images that are sent again when they get lost. out: where the map is saved; "": nowhere.
+    """
+
+    depth: tuple[str, ...] = ()
+    cloud: tuple[str, ...] = ()
+    scan: tuple[str, ...] = ()
+    odometry: tuple[str, ...] = ()
+    pose: tuple[str, ...] = ()
+    fixed: tuple[str, ...] = ()
+    world_frame: str = ""
+    base_frame: str = ""
+    wait_s: float = 0.5
+    extrapolate_s: float = 0.1
+    late_s: float = 0.1
+    queue: int = 10
+    map_rate: float = 30.0
+    cloud_rate: float = 1.0
+    low: float = math.nan
+    high: float = math.nan
+    full_octomap: bool = False
+    cloud_step_deg: float = 1.0
+    reliable: bool = False
+    out: str = ""
+
+    def __post_init__(self) -> None:
+        for name in ("wait_s", "extrapolate_s", "late_s"):
+            if not 0 <= getattr(self, name) <= 60:
+                raise StereovoxError(f"{PREFIX}{name} {getattr(self, name):g}: give seconds, 0 to 60")
+        for name in ("map_rate", "cloud_rate"):
+            if not 0 < getattr(self, name) <= 1000:
+                raise StereovoxError(f"{PREFIX}{name} {getattr(self, name):g}: give messages a second, above 0")
+        if not 1 <= self.queue <= 1000:
+            raise StereovoxError(f"{PREFIX}queue {self.queue}: give 1 to 1000 frames")
+        if not 0.05 <= self.cloud_step_deg <= 10:
+            raise StereovoxError(f"{PREFIX}cloud_step_deg {self.cloud_step_deg:g}: give 0.05 to 10 degrees")
+        if math.isnan(self.low) != math.isnan(self.high) or self.low >= self.high:
+            raise StereovoxError(f"{PREFIX}low {self.low:g}, {PREFIX}high {self.high:g}: give both, the second higher")
+
+    @property
+    def heights(self) -> tuple[float, float] | None:
+        """Heights in metres between which obstacles mark the 2-D map, None for those of the settings."""
+        return None if math.isnan(self.low) else (self.low, self.high)
+
+    def check_sources(self, dimensions: int) -> Options:
+        """Return these options; raises StereovoxError where nothing is to be mapped, or what such a map cannot take."""
+        if not (self.depth or self.cloud or self.scan):
+            raise StereovoxError("no topic to map; give --depth /camera/depth/image_rect_raw, --cloud or --scan")
+        if self.scan and dimensions == 3:
+            raise StereovoxError(
+                f"--scan {self.scan[0]}: a 2-D lidar maps a floor; add --set dimensions=2 or --profile ist2019"
+            )
+        return self
+
+
+def with_parameters(options: Options, given: Mapping[str, Any]) -> Options:
+    """Return options with parameters of the node on top, by their names without `ros.`.
+
+    Raises StereovoxError, one line, for an unknown one and for a value of another kind.
+    """
+    kinds = {field.name: field for field in fields(Options)}
+    changed = {}
+    for name, value in given.items():
+        if name not in kinds:
+            raise StereovoxError(f"unknown parameter '{PREFIX}{name}'{did_you_mean(name, kinds, PREFIX)}")
+        changed[name] = _as_kind(name, value, kinds[name].default)
+    return replace(options, **changed)
+
+
+def _as_kind(name: str, value: Any, default: Any) -> Any:
+    if name in LISTS:
+        return tuple(map(str, [value] if isinstance(value, str) or not isinstance(value, Iterable) else value))
+    if isinstance(default, float) and isinstance(value, int) and not isinstance(value, bool):
+        return float(value)
+    if type(value) is not type(default):
+        raise StereovoxError(f"{PREFIX}{name} {value!r}: give a {type(default).__name__}")
+    return value
+
+
+def pair_of(text: str) -> tuple[str, str]:
+    """Return both sides of `TOPIC=OTHER`, the second "" where there is none."""
+    first, _, second = text.partition("=")
+    return first.strip(), second.strip()

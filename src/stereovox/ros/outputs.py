@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the node publishes, and when: the 2-D map with each frame, what is large seldom and in a thread of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from collections.abc import Mapping as Table
+from concurrent.futures import Future, ThreadPoolExecutor
+from time import monotonic
+from typing import Any
+
+from stereovox.errors import StereovoxError
+from stereovox.maps import VoxelMap
+from stereovox.ros.library import optional_message
+from stereovox.ros.mapping import Mapping
+from stereovox.ros.messages import cloud_message, diagnostics_message, occupancy_message, octomap_message
+from stereovox.ros.options import Options
+
+UNHEARD_S = 1.0
+"""Seconds between 2-D maps while nobody listens: who comes later finds one that is no older."""
+DIAGNOSED_S = 1.0
+MAP, CLOUD, BINARY, FULL = "map_mapping", "occupied_cells", "octomap_binary", "octomap_full"
+"""Topics; those of the OctoMap are named as octomap_server does."""
+
+
+class Outputs:
+    """Publishes a map. counts: what diagnostics tell beside health. clock: seconds that never step."""
+
+    def __init__(
+        self,
+        node: Any,
+        mapping: Mapping,
+        options: Options,
+        counts: Callable[[], Table[str, object]],
+        clock: Callable[[], float] = monotonic,
+    ):
+        self._node, self._mapping, self._options = node, mapping, options
+        self._counts, self._clock = counts, clock
+        self._made = _Makers(node, mapping.config.dimensions, options)
+        self._stamp_ns, self._frame_id = 0, ""
+        self._new_map = self._new_cloud = False
+        self._next_map = self._next_cloud = self._next_told = 0.0
+        self._worker = ThreadPoolExecutor(1, "stereovox-messages")
+        self._busy: Future[None] | None = None
+
+    def changed(self, stamp_ns: int, frame_id: str) -> None:
+        """Note that the map has taken in a frame of that time, and the name of the map's own frame."""
+        self._stamp_ns, self._frame_id = stamp_ns, frame_id
+        self._new_map = self._new_cloud = True
+
+    def update(self) -> None:
+        """Publish what is due."""
+        now = self._clock()
+        if self._new_map and now >= self._next_map:
+            self._publish_map(now)
+        if self._new_cloud and now >= self._next_cloud and self._made.wanted() and self._idle():
+            self._publish_cells(now)
+        if now >= self._next_told:
+            self._next_told = now + DIAGNOSED_S
+            stamp_ns = self._node.get_clock().now().nanoseconds
+            name = f"{self._node.get_fully_qualified_name()}: map"
+            self._made.status.publish(diagnostics_message(name, self._mapping.health(), self._counts(), stamp_ns))
+
+    def close(self) -> None:
+        """Publish the last map, and wait for what is being published."""
+        if self._new_map:
+            self._publish_map(self._clock())
+        self._worker.shutdown()
+
+    def _publish_map(self, now: float) -> None:
+        self._new_map = False
+        heard = self._made.map.get_subscription_count() > 0
+        self._next_map = now + (1 / self._options.map_rate if heard else UNHEARD_S)
+        grid = self._mapping.grid()
+        if grid is not None:
+            self._made.map.publish(occupancy_message(grid, self._stamp_ns, self._frame_id))
+
+    def _publish_cells(self, now: float) -> None:
+        self._new_cloud, self._next_cloud = False, now + 1 / self._options.cloud_rate
+        copy = self._mapping.snapshot()
+        if copy is not None:
+            self._busy = self._worker.submit(self._send_cells, copy, self._stamp_ns, self._frame_id)
+
+    def _send_cells(self, copy: Callable[[], VoxelMap], stamp_ns: int, frame_id: str) -> None:
+        try:
+            self._made.send(copy(), stamp_ns, frame_id)
+        except StereovoxError as error:
+            self._node.get_logger().error(f"cannot be published: {error}", throttle_duration_sec=10.0)
+
+    def _idle(self) -> bool:
+        if self._busy is None:
+            return True
+        if self._busy.done():
+            self._busy.result()  # what nobody foresaw is raised here
+            return True
+        return False
+
+
+class _Makers:
+    """The publishers, and the messages of what is large."""
+
+    def __init__(self, node: Any, dimensions: int, options: Options):
+        from diagnostic_msgs.msg import DiagnosticArray
+        from nav_msgs.msg import OccupancyGrid
+        from sensor_msgs.msg import PointCloud2
+
+        self._full = options.full_octomap
+        self.map = node.create_publisher(OccupancyGrid, MAP, _kept())
+        self.status = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self._cloud = self._octomap = None
+        if dimensions == 3:
+            self._cloud = node.create_publisher(PointCloud2, CLOUD, _kept())
+            octomap = optional_message("octomap_msgs", "Octomap")
+            if octomap is None:
+                node.get_logger().info("octomap_msgs is not installed: no OctoMap is published")
+            else:
+                self._octomap = node.create_publisher(octomap, FULL if self._full else BINARY, _kept())
+
+    def wanted(self) -> bool:
+        """Tell whether anybody listens to what is large."""
+        return any(one is not None and one.get_subscription_count() > 0 for one in (self._cloud, self._octomap))
+
+    def send(self, voxel_map: VoxelMap, stamp_ns: int, frame_id: str) -> None:
+        """Publish what somebody listens to."""
+        if self._cloud is not None and self._cloud.get_subscription_count():
+            self._cloud.publish(cloud_message(voxel_map, stamp_ns, frame_id))
+        if self._octomap is not None and self._octomap.get_subscription_count():
+            self._octomap.publish(octomap_message(voxel_map, self._full, stamp_ns, frame_id))
+
+
+def _kept() -> Any:
+    """Return the quality of service of maps: reliable, and the last one is kept for who comes later."""
+    from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+    return QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)

@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where the sensors stand in the map's frame: from /tf, odometry, poses, and what is fixed."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from stereovox.errors import FrameRefused, StereovoxError
+from stereovox.geometry import Transform
+from stereovox.ros.live_tf import LiveTf
+from stereovox.sources.bag_messages import Wire
+from stereovox.sources.bag_robot_messages import frame_name, read_odometry, read_transforms
+from stereovox.sources.bag_tf import tf_poses
+from stereovox.sources.robot_frames import BASES
+from stereovox.sources.tf_edge import Limits
+
+
+class Pose(NamedTuple):
+    """T_world_sensor (4, 4), where the sensor sits on the robot, and nanoseconds by which the pose is extrapolated."""
+
+    T_world_sensor: Transform
+    T_base_sensor: Transform
+    off_ns: int
+
+
+class Whereabouts:
+    """Takes messages in as they come, as bytes of CDR, and tells poses.
+
+    world, base: frames of the map and of the robot, "" to take the usual one that is there first; it is kept then.
+    extrapolate_s: seconds by which a pose may be extrapolated.
+    """
+
+    def __init__(self, world: str, base: str, extrapolate_s: float):
+        self.world, self._base = frame_name(world), frame_name(base)
+        self.tf = LiveTf("/tf", Limits(extrapolate_s=extrapolate_s))
+
+    def take_tf(self, data: bytes, fixed: bool) -> None:
+        """Take in a `tf2_msgs/TFMessage`; fixed: of /tf_static."""
+        try:
+            told = read_transforms(Wire(data, cdr=True))
+        except ValueError:
+            self.tf.unreadable += 1
+            return
+        for one in told:
+            self.tf.add(one.parent, one.child, one.stamp_ns, one.numbers, fixed)
+
+    def take_odometry(self, data: bytes) -> None:
+        """Take in a `nav_msgs/Odometry`: where its child_frame_id stands in its frame_id."""
+        try:
+            one = read_odometry(Wire(data, cdr=True))
+        except ValueError:
+            self.tf.unreadable += 1
+            return
+        self.tf.add(one.parent, one.child, one.stamp_ns, one.numbers)
+
+    def take_pose(self, data: bytes, child: str) -> None:
+        """Take in a `geometry_msgs/PoseStamped`: where frame `child` stands in its frame_id."""
+        try:
+            wire = Wire(data, cdr=True)
+            (stamp_ns, parent), numbers = wire.header(), wire.numbers("d", 7)
+        except ValueError:
+            self.tf.unreadable += 1
+            return
+        self.tf.add(parent, child, stamp_ns, numbers)
+
+    def settled(self, frame_id: str, stamp_ns: int) -> bool:
+        """Tell whether later messages change nothing about a pose: all it needs was told for that time or later."""
+        try:
+            return self.tf.off_ns(self._world_of(frame_id), frame_id, stamp_ns) == 0
+        except FrameRefused:
+            return False
+
+    def pose(self, frame_id: str, stamp_ns: int) -> Pose:
+        """Return where frame `frame_id` stood in the world at a time; raises FrameRefused `no_pose`."""
+        world, base = self._world_of(frame_id), self._base_of(frame_id)
+        T_base_sensor = np.eye(4) if base == frame_id else self.tf.lookup(base, frame_id, stamp_ns)
+        T_world_sensor = self.tf.lookup(world, frame_id, stamp_ns)
+        self.world, self._base = world, base
+        return Pose(T_world_sensor, T_base_sensor, self.tf.off_ns(world, frame_id, stamp_ns))
+
+    def _world_of(self, frame_id: str) -> str:
+        if self.world:
+            return self.world
+        found = tf_poses(self.tf, frame_id)
+        if isinstance(found, str):
+            raise FrameRefused("no_pose", f"{found}; is the odometry running? ros.world_frame names another frame")
+        return found.world
+
+    def _base_of(self, frame_id: str) -> str:
+        return self._base or next((name for name in BASES if self.tf.connected(name, frame_id)), frame_id)
+
+
+def fixed_transform(text: str) -> tuple[str, str, tuple[float, ...]]:
+    """Return parent, child and tx ty tz qx qy qz qw of `PARENT CHILD x y z yaw pitch roll` (metres, radians).
+
+    Raises StereovoxError, one line, for what is none.
+    """
+    words = text.split()
+    try:
+        x, y, z, *turn = map(float, words[2:])
+        yaw, pitch, roll = np.array(turn) / 2
+    except ValueError:
+        raise StereovoxError(f"ros.fixed '{text}': write PARENT CHILD x y z yaw pitch roll") from None
+    (cy, sy), (cp, sp), (cr, sr) = ((float(np.cos(half)), float(np.sin(half))) for half in (yaw, pitch, roll))
+    quaternion = (
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+        cr * cp * cy + sr * sp * sy,
+    )
+    return words[0], words[1], (x, y, z, *quaternion)

@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the node listens to. Messages come as bytes: nothing is unpacked twice, and readers of bags take them as such.
+
+Where a publisher offers what does not fit, rclpy says so in the log ("offering incompatible QoS").
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from importlib import import_module
+from typing import Any
+
+from stereovox.ros.inputs import DepthInput, Input
+from stereovox.ros.library import optional_message
+from stereovox.ros.options import Options, pair_of
+from stereovox.ros.poses import Whereabouts
+
+TRANSFORMS = 100
+"""Messages of poses that wait in the middleware."""
+
+
+class Subscriptions:
+    """Subscribes to all that options name, and to /tf and /tf_static.
+
+    arrived: called with topic and bytes of what is to be mapped. messages: how many came, of all kinds.
+    """
+
+    def __init__(
+        self,
+        node: Any,
+        options: Options,
+        where: Whereabouts,
+        inputs: Mapping[str, Input],
+        arrived: Callable[[str, bytes], None],
+    ):
+        self._node, self.messages = node, 0
+        images = _quality(options.queue, options.reliable)
+        for topic, one in inputs.items():
+            self._listen(one.kind, topic, partial(arrived, topic), images)
+            if isinstance(one, DepthInput):
+                self._listen("sensor_msgs/CameraInfo", one.info, one.take_info, images)
+        poses = _quality(TRANSFORMS, reliable=False)
+        for topic in options.odometry:
+            self._listen("nav_msgs/Odometry", topic, where.take_odometry, poses)
+        for topic, child in map(pair_of, options.pose):
+            self._listen("geometry_msgs/PoseStamped", topic, partial(where.take_pose, child=child), poses)
+        self._listen_to_tf(where)
+
+    def _listen_to_tf(self, where: Whereabouts) -> None:
+        kind = optional_message("tf2_msgs", "TFMessage")
+        if kind is None:
+            self._node.get_logger().warning(
+                "tf2_msgs is not installed: /tf is not heard, poses come from ros.odometry, ros.pose and ros.fixed "
+                "alone; source a ROS 2 distribution, or see docs/ros2.md for how to build it"
+            )
+            return
+        moving, fixed = partial(where.take_tf, fixed=False), partial(where.take_tf, fixed=True)
+        self._subscribe(kind, "/tf", moving, _quality(TRANSFORMS, reliable=True))
+        self._subscribe(kind, "/tf_static", fixed, _quality(TRANSFORMS, reliable=True, kept=True))
+
+    def _listen(self, kind: str, topic: str, callback: Callable[[bytes], None], quality: Any) -> None:
+        package, _, name = kind.partition("/")
+        self._subscribe(getattr(import_module(f"{package}.msg"), name), topic, callback, quality)
+
+    def _subscribe(self, kind: Any, topic: str, callback: Callable[[bytes], None], quality: Any) -> None:
+        def take(data: bytes) -> None:
+            self.messages += 1
+            callback(data)
+
+        self._node.create_subscription(kind, topic, take, quality, raw=True)
+
+
+def _quality(depth: int, reliable: bool, kept: bool = False) -> Any:
+    """Return a quality of service. kept: what was sent before is wanted too."""
+    from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+    return QoSProfile(
+        depth=depth,
+        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if kept else DurabilityPolicy.VOLATILE,
+    )

@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A map kept from above block by block is the map seen from above as a whole, after every frame."""
+
+import numpy as np
+import pytest
+
+from stereovox.cameras import PinholeCamera
+from stereovox.config import load_config
+from stereovox.errors import StereovoxError
+from stereovox.frame import Frame
+from stereovox.mapper import Mapper
+from stereovox.maps.voxel_map import VoxelMap
+from stereovox.products.live_projection import STEP, LiveProjection
+from stereovox.products.projection import project
+
+CAMERA = PinholeCamera.from_field_of_view(24, 18, 80.0)
+
+
+def frames(number: int, seed: int):
+    """A camera that turns and moves; boxes come and go before it."""
+    random = np.random.default_rng(seed)
+    for k in range(number):
+        yaw = 0.9 * k
+        forward, left = np.array([np.cos(yaw), np.sin(yaw), 0]), np.array([-np.sin(yaw), np.cos(yaw), 0])
+        T = np.eye(4)
+        T[:3, :3] = np.stack([-left, [0, 0, -1.0], forward], axis=1)
+        T[:3, 3] = 0.7 * k * np.array([1, -0.5, 0]) + [0, 0, 0.8]
+        depth = np.full((18, 24), random.uniform(1.5, 3.5), np.float32)
+        depth[:, random.integers(0, 20) :][:, :4] = random.uniform(0.8, 1.4)
+        yield Frame(depth, CAMERA, T, k * 10**9)
+
+
+def assert_same(shown, expected):
+    rows, columns = shown.known_span
+    np.testing.assert_array_equal(shown.cells[rows, columns], expected.cells)
+    left, bottom = shown.origin[0] + columns.start * shown.resolution, shown.origin[1] + rows.start * shown.resolution
+    assert (left, bottom) == pytest.approx(expected.origin[:2], abs=1e-6)
+    assert (shown.free_below, shown.occupied_above) == (expected.free_below, expected.occupied_above)
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {},
+        {"map.cell": "uint8"},
+        {"map.cell": "int8", "up": "-z", "scan.heights": (-1.8, -0.1)},
+        {"window.size": (6.0, 6.0, 4.0), "window.trigger": 0.2},
+        {"map.keep_times": True, "map.forget_s": 2.5},
+        {"steps": (0.2, 0.2, 0.1)},
+    ],
+)
+def test_after_every_frame_it_is_the_map_from_above(settings):
+    mapper = Mapper("default", **{"voxel_size": 0.2, "max_range": 3.0, **settings})
+    live = LiveProjection(mapper.map)
+    assert live.grid() is None
+    for k, frame in enumerate(frames(7, seed=1)):
+        assert mapper.add(frame).refused is None
+        if k % 3 != 1:  # some frames are looked at together
+            assert_same(live.grid(), project(mapper.map))
+    assert (np.array(live.grid().cells.shape) % STEP == 0).all()
+
+
+def test_it_looks_at_what_changed_alone(monkeypatch):
+    mapper = Mapper("default", voxel_size=0.2, max_range=3.0)
+    live, looked = LiveProjection(mapper.map), []
+    within = VoxelMap.blocks_within
+    monkeypatch.setattr(VoxelMap, "blocks_within", lambda *a: looked.append(within(*a)) or looked[-1])
+    for frame in frames(6, seed=2):
+        mapper.add(frame)
+        live.grid()
+    assert len(looked[-1][0]) < 0.6 * len(mapper.map.blocks()[0])
+    assert live.grid().cells.size
+    assert len(looked[-1][0]) == 0  # nothing changed since
+
+
+def test_cells_that_were_handed_out_do_not_change():
+    mapper = Mapper("default", voxel_size=0.2)
+    live = LiveProjection(mapper.map)
+    first, second, *_ = frames(3, seed=3)
+    mapper.add(first)
+    before = live.grid()
+    copy = before.cells.copy()
+    mapper.add(second)
+    live.grid()
+    np.testing.assert_array_equal(before.cells, copy)
+
+
+def test_heights_and_steps_that_cannot_be_are_told():
+    with pytest.raises(StereovoxError, match="heights"):
+        LiveProjection(VoxelMap(load_config(voxel_size=0.2)), (1.0, 0.0))
+    with pytest.raises(StereovoxError, match="as long as wide"):
+        LiveProjection(VoxelMap(load_config(steps=(0.1, 0.2, 0.1))))

@@ -1,0 +1,181 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Messages become frames; whatever else they hold, they become a counted refusal and change nothing."""
+
+import cv2
+import numpy as np
+import pytest
+import wire
+
+from stereovox.cameras import PinholeCamera
+from stereovox.errors import FrameRefused
+from stereovox.frame import Scan
+from stereovox.grid_mapper import GridMapper
+from stereovox.mapper import Mapper
+from stereovox.ros.inputs import CloudInput, DepthInput, FloorCloudInput, ScanInput
+from stereovox.ros.poses import Pose
+from stereovox.sources.bag_writer_messages import packed_png
+
+CAMERA = PinholeCamera(8, 6, 10.0, 10.5, 3.5, 2.5)
+DEPTH = np.arange(48, dtype=np.uint16).reshape(6, 8) + 1000
+T = np.eye(4)
+T[:3, 3] = 1, 2, 3
+
+
+def there(frame_id: str, stamp_ns: int) -> Pose:
+    return Pose(T, np.eye(4), 7)
+
+
+def nowhere(frame_id: str, stamp_ns: int) -> Pose:
+    raise FrameRefused("no_pose", "nobody knows")
+
+
+def info(**changes) -> bytes:
+    message = wire.messages().camera_info(CAMERA, 1, "eye")
+    for name, value in changes.items():
+        setattr(message, name, value)
+    return wire.packed(message)
+
+
+def depth_input(topic: str = "/cam/depth/image") -> DepthInput:
+    one = DepthInput(topic)
+    one.take_info(info())
+    return one
+
+
+def test_a_depth_image_becomes_a_frame():
+    one = depth_input()
+    frame = one.frame(wire.image(DEPTH, stamp_ns=5_000_000_007), there)
+    assert frame.fault is None
+    assert (frame.depth == DEPTH).all()
+    assert (frame.stamp_ns, frame.depth_scale, frame.pose_off_ns) == (5_000_000_007, 0.001, 7)
+    assert (frame.camera, frame.sensor) == (CAMERA, "/cam/depth/image")
+    assert (frame.T_world_sensor == T).all()
+    assert "5.000000007" in frame.name
+
+
+def test_floats_and_packed_images_are_read():
+    metres = (DEPTH / 1000).astype(np.float32)
+    metres[0, :3] = np.nan, np.inf, -np.inf
+    frame = depth_input().frame(wire.image(metres), there)
+    np.testing.assert_array_equal(frame.depth, metres)
+    assert frame.depth_scale == 1.0
+    packed = wire.packed(wire.messages().compressed(packed_png(DEPTH), 5, "eye"))
+    one = depth_input("/cam/depth/image/compressedDepth")
+    assert one.info == "/cam/depth/camera_info"
+    assert one.kind == "sensor_msgs/CompressedImage"
+    assert (one.frame(packed, there).depth == DEPTH).all()
+
+
+@pytest.mark.parametrize(
+    ("changes", "why"),
+    [
+        ({"width": 7}, "bad_shape"),
+        ({"width": 2**31, "height": 2**31 + 1}, "bad_shape"),
+        ({"data": np.zeros(95, np.uint8)}, "unreadable"),
+        ({"data": np.zeros(0, np.uint8)}, "unreadable"),
+        ({"step": 3}, "unreadable"),
+        ({"step": 2**32 - 1}, "unreadable"),
+        ({"encoding": "rgb8"}, "bad_dtype"),
+        ({"encoding": ""}, "bad_dtype"),
+    ],
+)
+def test_hostile_images_are_refused(changes, why):
+    mapper = Mapper("default")
+    report = mapper.add(depth_input().frame(wire.image(DEPTH, **changes), there))
+    assert report.refused == why
+    assert mapper.map.history.refused == {why: 1}
+    assert sum(mapper.map.counts().values()) == 0
+
+
+def test_cut_off_messages_are_refused_at_any_length():
+    whole, one, mapper = wire.image(DEPTH), depth_input(), Mapper("default")
+    lengths = [*range(0, 80), len(whole) - 1]
+    for length in lengths:
+        assert mapper.add(one.frame(whole[:length], there)).refused == "unreadable"
+    assert mapper.map.history.refused["unreadable"] == len(lengths)
+
+
+def test_without_camera_or_pose_nothing_is_mapped():
+    report = Mapper("default").add(DepthInput("/d/image").frame(wire.image(DEPTH), there))
+    assert report.refused == "no_camera"
+    assert "/d/camera_info" in report.detail
+    assert Mapper("default").add(depth_input().frame(wire.image(DEPTH), nowhere)).refused == "no_pose"
+
+
+def test_camera_info_that_cannot_be_is_told_and_a_good_one_stays():
+    one = DepthInput("/d/image")
+    for bad in (info(k=np.zeros(9)), info(width=0), info(k=np.full(9, np.nan)), info(width=2**31, height=2**31), b""):
+        one.take_info(bad)
+        assert not one.ready
+    assert "camera" in one.frame(wire.image(DEPTH), there).fault_detail
+    one.take_info(info())
+    one.take_info(info(k=np.zeros(9)))
+    assert one.ready
+
+
+def test_rectified_images_have_the_camera_of_p():
+    one = DepthInput("/d/image_rect", "/other/info")
+    p = np.array([20.0, 0, 3, 0, 0, 21.0, 2, 0, 0, 0, 1, 0])
+    one.take_info(info(p=p))
+    camera = one.frame(wire.image(DEPTH), there).camera
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (20, 21, 3, 2)
+    assert one.info == "/other/info"
+
+
+def test_a_cloud_marks_its_points_and_clears_up_to_them():
+    points = np.array([[2.0, 0, 0], [np.nan, 0, 0], [0, 3.0, 0.5]])
+    mapper = Mapper("default", voxel_size=0.1, **{"noise.s0": 0.02})
+    one = CloudInput("/points", 1.0)
+    for stamp in (1, 2):
+        report = mapper.add(one.frame(wire.cloud(points, stamp), lambda *_: Pose(np.eye(4), np.eye(4), 0)))
+        assert report.refused is None
+    occupied = {tuple(np.floor(p / 0.1).astype(int)) for p in mapper.map.occupied()}
+    assert any(abs(x - 20) <= 1 and abs(y) <= 1 and abs(z) <= 1 for x, y, z in occupied)
+    assert any(abs(x) <= 1 and abs(y - 30) <= 1 and abs(z - 5) <= 1 for x, y, z in occupied)
+    assert all(np.min(np.linalg.norm(p - np.array([[2.0, 0, 0], [0, 3, 0.5]]), axis=1)) < 0.3
+               for p in mapper.map.occupied())  # fmt: skip
+    assert mapper.map.state([[1.0, 0.0, 0.0]])[0] == 1
+    assert mapper.map.state([[-1.0, 0.0, 0.0], [2.6, 0.0, 0.0]]).tolist() == [0, 0]  # no point tells of them
+
+
+@pytest.mark.parametrize("make", [lambda: CloudInput("/p", 1.0), lambda: FloorCloudInput("/p")])
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"names": "abc"},
+        {"width": 2**20},
+        {"height": 2**16, "width": 2**16},
+        {"point_step": 4},
+        {"row_step": 2**31, "height": 2},
+    ],
+)
+def test_hostile_clouds_are_refused(make, changes):
+    mapper = GridMapper("ist2019") if isinstance(make(), FloorCloudInput) else Mapper("default")
+    report = mapper.add(make().frame(wire.cloud(np.ones((4, 3)), **changes), there))
+    assert report.refused == "unreadable"
+
+
+def test_empty_clouds_and_clouds_of_nan_are_refused():
+    for points in (np.empty((0, 3)), np.full((5, 3), np.nan)):
+        assert Mapper("default").add(CloudInput("/p", 1.0).frame(wire.cloud(points), there)).refused == "no_valid_depth"
+
+
+def test_a_scan_comes_with_where_it_sits():
+    mount = np.eye(4)
+    mount[0, 3] = 0.2
+    told = wire.messages().scan(Scan(np.full(9, 2.0, np.float32), -1.0, 0.25, 0.1, 5.0, T), "laser")
+    scan = ScanInput("/scan").frame(wire.packed(told), lambda *_: Pose(T, mount, 3))
+    assert (scan.ranges == 2).all()
+    assert (scan.T_base_sensor == mount).all()
+    assert (scan.pose_off_ns, scan.sensor) == (3, "/scan")
+    assert GridMapper("ist2019").add(scan).refused is None
+    told.angle_increment = float("nan")
+    assert GridMapper("ist2019").add(ScanInput("/scan").frame(wire.packed(told), there)).refused == "unreadable"
+
+
+def test_pictures_that_are_no_depth_are_refused():
+    png = cv2.imencode(".png", np.zeros((6, 8, 3), np.uint8))[1].ravel()
+    data = np.concatenate([np.zeros(12, np.uint8), png])
+    packed = wire.packed(wire.messages().compressed(data, 5, "eye"))
+    frame = depth_input("/cam/image/compressedDepth").frame(packed, there)
+    assert Mapper("default").add(frame).refused in ("bad_dtype", "unreadable")

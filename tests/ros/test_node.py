@@ -1,0 +1,190 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The node in one process: what it hears, publishes, and is asked to do."""
+
+from __future__ import annotations
+
+import os
+import time
+
+import numpy as np
+import pytest
+import wire
+from made_walks import CAMERA, DEPTH, OPTICAL, START_NS, T_BASE_CAMERA, base_at, depth_at
+
+rclpy = pytest.importorskip("rclpy", reason="rclpy is not installed: pip install 'stereovox[ros2]'")
+
+from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
+from nav_msgs.msg import OccupancyGrid  # noqa: E402
+from nav_msgs.srv import LoadMap  # noqa: E402
+from rclpy.executors import SingleThreadedExecutor  # noqa: E402
+from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
+from sensor_msgs.msg import CameraInfo, Image, PointCloud2  # noqa: E402
+from std_srvs.srv import Trigger  # noqa: E402
+
+from stereovox.config import load_config  # noqa: E402
+from stereovox.maps import load_map  # noqa: E402
+from stereovox.products.projection import project  # noqa: E402
+from stereovox.ros.mapping import make_mapping  # noqa: E402
+from stereovox.ros.node import MapNode  # noqa: E402
+from stereovox.ros.options import Options  # noqa: E402
+from stereovox.ros.parameters import freeze  # noqa: E402
+
+TFMessage = pytest.importorskip("tf2_msgs.msg", reason="tf2_msgs is not installed (docs/ros2.md)").TFMessage
+KEPT = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+PATIENCE_S = 15.0
+
+
+class Robot:
+    """A node, and beside it one that sends and listens."""
+
+    def __init__(self, out: str):
+        self.options = Options(depth=(DEPTH,), wait_s=0.3, cloud_rate=20.0, late_s=10.0, out=out)
+        self.reports = []
+        self.mapping = make_mapping(load_config(voxel_size=0.1), None, None)
+        given = [rclpy.Parameter("voxel_size", value=0.1)]
+        node = rclpy.create_node(
+            "stereovox", parameter_overrides=given, automatically_declare_parameters_from_overrides=True
+        )
+        self.other = rclpy.create_node("robot")
+        freeze(node, out)
+        self.node = node
+        self.maker = MapNode(
+            node, self.mapping, self.options, lambda: str(node.get_parameter("ros.out").value), self.reports.append
+        )
+        self.executor, self.listening = SingleThreadedExecutor(), SingleThreadedExecutor()
+        self.executor.add_node(node)
+        self.listening.add_node(self.other)
+        kinds = {DEPTH: Image, "/camera/depth/camera_info": CameraInfo, "/tf": TFMessage}
+        self.send = {topic: self.other.create_publisher(kind, topic, 20) for topic, kind in kinds.items()}
+        self.send["/tf_static"] = self.other.create_publisher(TFMessage, "/tf_static", KEPT)
+        self.came: dict[str, list] = {}
+
+    def listen(self, kind, topic, qos=KEPT):
+        self.came[topic] = []
+        self.other.create_subscription(kind, topic, self.came[topic].append, qos)
+
+    def until(self, condition):
+        end = time.monotonic() + PATIENCE_S
+        while not condition():
+            assert time.monotonic() < end, "nothing came"
+            self.maker.spin_once(self.executor)
+            self.listening.spin_once(timeout_sec=0.01)
+
+    def drive(self, frames: int):
+        self.until(lambda: all(one.get_subscription_count() for one in self.send.values()))
+        made = wire.messages()
+        self.publish("/tf_static", made.transforms(0, [("base_link", OPTICAL, T_BASE_CAMERA)]))
+        for k in range(frames):
+            frame = depth_at(k)
+            self.publish("/camera/depth/camera_info", made.camera_info(CAMERA, frame.stamp_ns, OPTICAL))
+            self.publish(DEPTH, made.image(frame.depth, frame.stamp_ns, OPTICAL))
+            self.publish("/tf", made.transforms(frame.stamp_ns, [("odom", "base_link", base_at(frame.stamp_ns))]))
+        self.until(lambda: len(self.reports) == frames)
+
+    def publish(self, topic, message):
+        self.send[topic].publish(wire.packed(message))
+
+    def call(self, kind, name, request=None):
+        client = self.other.create_client(kind, name)
+        self.until(client.service_is_ready)
+        future = client.call_async(request or kind.Request())
+        self.until(future.done)
+        return future.result()
+
+
+@pytest.fixture
+def robot(tmp_path, monkeypatch):
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(101 + os.getpid() % 80))
+    rclpy.init(args=[])
+    robot = Robot(str(tmp_path / "live.svox"))
+    yield robot
+    robot.maker.close()
+    rclpy.shutdown()
+
+
+def test_what_is_published_is_what_the_map_says(robot):
+    octomap_msgs = pytest.importorskip("octomap_msgs.msg", reason="octomap_msgs is not installed (docs/ros2.md)")
+    topics = {"/map_mapping": OccupancyGrid, "/occupied_cells": PointCloud2, "/octomap_binary": octomap_msgs.Octomap}
+    for topic, kind in topics.items():
+        robot.listen(kind, topic)
+    robot.listen(DiagnosticArray, "/diagnostics", 10)
+    robot.drive(4)
+    last_ns = depth_at(3).stamp_ns
+
+    def all_came():
+        stamps = [robot.came[topic][-1].header.stamp if robot.came[topic] else None for topic in topics]
+        return all(stamp and stamp.sec * 10**9 + stamp.nanosec == last_ns for stamp in stamps)
+
+    robot.until(lambda: all_came() and len(robot.came["/diagnostics"]) > 1)
+    voxel_map = robot.mapping.snapshot()()
+    grid, cloud, octomap = (robot.came[topic][-1] for topic in topics)
+    assert {grid.header.frame_id, cloud.header.frame_id, octomap.header.frame_id} == {"odom"}
+    check_grid(grid, project(voxel_map))
+    points = np.frombuffer(cloud.data, "<f4").reshape(-1, 4)
+    np.testing.assert_allclose(points[:, :3], voxel_map.occupied(), atol=1e-6)
+    np.testing.assert_allclose(points[:, 3], voxel_map.probability(voxel_map.occupied()), atol=1e-6)
+    assert [(field.name, field.offset) for field in cloud.fields][-1] == ("probability", 12)
+    check_octomap(octomap, voxel_map)
+    values = {pair.key: pair.value for pair in robot.came["/diagnostics"][-1].status[0].values}
+    assert values["frames_in_map"] == "4"
+    assert values["received"] == "4"
+    assert robot.came["/diagnostics"][-1].status[0].level == b"\0"
+
+
+def check_grid(message, expected):
+    cells = np.array(message.data, np.int8).reshape(message.info.height, message.info.width)
+    known = np.argwhere(cells >= 0)
+    (bottom, left), (top, right) = known.min(axis=0), known.max(axis=0) + 1
+    np.testing.assert_array_equal(cells[bottom:top, left:right], expected.cells)
+    side, place = message.info.resolution, message.info.origin.position
+    assert side == pytest.approx(0.1)
+    assert (place.x + left * side, place.y + bottom * side) == pytest.approx(expected.origin[:2], abs=1e-5)
+
+
+def check_octomap(message, voxel_map):
+    """Read the message with OctoMap itself."""
+    octomap = pytest.importorskip("octomap", reason="octomap-python is not installed")
+    assert (message.id, message.binary) == ("OcTree", True)
+    data = bytes(np.array(message.data, np.int8).tobytes())
+    size = sum(1 for _ in voxel_map.occupied())
+    text = f"# Octomap OcTree binary file\nid OcTree\nsize {max(size, 1)}\nres {message.resolution!r}\ndata\n"
+    tree = octomap.OcTree(message.resolution)
+    assert tree.readBinary(text.encode() + data)
+    occupied = [tree.isNodeOccupied(tree.search(point)) for point in voxel_map.occupied()]
+    free = [tree.isNodeOccupied(tree.search(point)) for point in voxel_map.free()]
+    assert all(occupied)
+    assert not any(free)
+
+
+def test_a_frame_whose_pose_never_comes_is_refused_and_counted(robot):
+    robot.drive(1)
+    late = depth_at(30)
+    robot.publish(DEPTH, wire.messages().image(late.depth, late.stamp_ns, OPTICAL))
+    robot.publish(DEPTH, wire.messages().image(late.depth[:, :9], START_NS, OPTICAL))
+    robot.until(lambda: len(robot.reports) == 3)
+    assert robot.mapping.history.frames == 1
+    assert dict(robot.mapping.history.refused) == {"no_pose": 1, "bad_shape": 1}
+
+
+def test_save_reset_and_load(robot, tmp_path):
+    robot.drive(3)
+    before = robot.mapping.snapshot()().blocks()
+    saved = robot.call(Trigger, "/stereovox/save")
+    assert (saved.success, "3 frames" in saved.message) == (True, True)
+    assert robot.call(Trigger, "/stereovox/reset").success
+    assert robot.mapping.history.frames == 0
+    assert len(robot.mapping.snapshot()().occupied()) == 0
+    missing = robot.call(LoadMap, "/stereovox/load", LoadMap.Request(map_url=str(tmp_path / "nothing")))
+    assert missing.result == LoadMap.Response.RESULT_MAP_DOES_NOT_EXIST
+    loaded = robot.call(LoadMap, "/stereovox/load", LoadMap.Request(map_url=f"file://{tmp_path / 'live.svox'}"))
+    assert loaded.result == LoadMap.Response.RESULT_SUCCESS
+    for mine, theirs in zip(robot.mapping.snapshot()().blocks(), before, strict=True):
+        np.testing.assert_array_equal(mine, theirs)
+    assert load_map(tmp_path / "live.svox").frames == 3
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other/file").touch()
+    robot.node.set_parameters([rclpy.Parameter("ros.out", value=str(tmp_path / "other"))])
+    refused = robot.call(Trigger, "/stereovox/save")
+    assert (refused.success, "not a stereovox map" in refused.message) == (False, True)
+    assert not robot.node.set_parameters([rclpy.Parameter("voxel_size", value=0.2)])[0].successful

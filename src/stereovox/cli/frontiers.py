@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stereovox.cli.endings import check_ending
-from stereovox.cli.numbers import heights_of, numbers_of
+from stereovox.cli.numbers import heights_of
+from stereovox.cli.points import point
 from stereovox.cli.saved_map import open_map
 from stereovox.cli.terminal import say, thousands
 
@@ -26,7 +27,9 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--smallest", type=int, default=10, metavar="CELLS", help="cells of the least that counts (10)")
     parser.add_argument("--longest", type=float, default=2.0, metavar="M", help="longer ones are halved (2 metres)")
     parser.add_argument("--heights", metavar="LO:HI", help="heights in metres between which cells count (all)")
-    parser.add_argument("--start", metavar="X,Y,Z", help="where the robot is, in metres (the camera of the last frame)")
+    parser.add_argument(
+        "--start", type=point, metavar="X,Y,Z", help="where the robot is, in metres (the camera of the last frame)"
+    )
     parser.add_argument("--radius", type=float, default=0.25, metavar="M", help="what must be free about it (0.25)")
     parser.add_argument("--out", metavar="FILE.npz", help="file for the cells, centroids and places to look from")
     parser.add_argument("--picture", metavar="FILE.png", help="picture from above")
@@ -38,10 +41,9 @@ def run(arguments: Namespace) -> dict[str, Any]:
 
     check_ending("--out", arguments.out, ".npz")
     check_ending("--picture", arguments.picture, ".png")
-    start = None if arguments.start is None else numbers_of("--start", arguments.start, "X,Y,Z")
     heights = heights_of(arguments.heights)
     voxel_map = open_map(arguments.map)
-    found = frontiers(voxel_map, arguments.smallest, arguments.longest, heights, start, arguments.radius)
+    found = frontiers(voxel_map, arguments.smallest, arguments.longest, heights, arguments.start, arguments.radius)
     _tell(found)
     if arguments.out:
         write_frontiers(found, arguments.out)

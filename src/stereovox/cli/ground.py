@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stereovox.cli.endings import check_ending
-from stereovox.cli.numbers import numbers_of
+from stereovox.cli.points import point
 from stereovox.cli.saved_map import open_map
 from stereovox.cli.terminal import say, thousands
 
@@ -34,7 +34,10 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--max-step", type=float, default=0.1, metavar="M", help="highest step it climbs (0.1)")
     parser.add_argument("--max-slope", type=float, default=20.0, metavar="DEG", help="steepest ground in degrees (20)")
     parser.add_argument(
-        "--start", metavar="X,Y,Z", help="a place on the ground in metres, or near (the lowest large surface)"
+        "--start",
+        type=point,
+        metavar="X,Y,Z",
+        help="a place on the ground in metres, or near (the lowest large surface)",
     )
 
 
@@ -44,9 +47,8 @@ def run(arguments: Namespace) -> dict[str, Any]:
 
     check_ending("FILE", arguments.file, ".npz", ".yaml", ".pgm", ".png")
     robot = Robot(arguments.height, arguments.radius, arguments.max_step, arguments.max_slope)
-    start = None if arguments.start is None else numbers_of("--start", arguments.start, "X,Y,Z")
     voxel_map = open_map(arguments.map)
-    found = ground(voxel_map, robot, start)
+    found = ground(voxel_map, robot, arguments.start)
     _write(voxel_map, found, arguments)
     return _tell(found, arguments.file)
 

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from itertools import product
 
@@ -15,7 +14,7 @@ from stereovox.geometry import Transform, inverse, orthonormalise, rigidity_erro
 from stereovox.maps import State, VoxelMap
 from stereovox.maps.blocks import CELLS, SIDE
 from stereovox.maps.cell_format import CellRules
-from stereovox.maps.voxel_map import cells_where
+from stereovox.maps.voxel_map import INDEX_LIMIT, cells_where
 from stereovox.products.side_by_side import cells_at, put_times
 
 PIECE = 512
@@ -32,11 +31,13 @@ def moved(voxel_map: VoxelMap, T_a_b: ArrayLike) -> VoxelMap:
     A cell gets the log-odds and the time of the cell that its middle lies in. Where the motion maps cells onto cells
     (whole cells, quarter turns) that is exact. Where it does not, middles may miss a thin thing: so a cell also gets
     the log-odds of any cell that is occupied or tentative and whose middle lies in it, if they are higher. Nothing
-    occupied is lost; things may become one cell thicker. Raises StereovoxError where T_a_b is no rigid motion.
+    occupied is lost; things may become one cell thicker. Raises StereovoxError where T_a_b is no rigid motion, or leads
+    too far away.
     """
     T = rigid(T_a_b)
-    solid, there = _pushed(voxel_map, T), VoxelMap(voxel_map.config)
-    for coords in _reached(voxel_map, T):
+    there, blocks = VoxelMap(voxel_map.config), _reached(voxel_map, T)
+    for start in range(0, len(blocks), PIECE):
+        coords = blocks[start : start + PIECE]
         points = transform_points(inverse(T), there.centers(_cells_of(coords)))
         cells = _stored_at(voxel_map, points).reshape(-1, CELLS)
         known = (cells != there.cell_format.unknown).any(axis=1)
@@ -44,7 +45,7 @@ def moved(voxel_map: VoxelMap, T_a_b: ArrayLike) -> VoxelMap:
         if there.config.map.keep_times:
             times = voxel_map.times_at(points).reshape(-1, CELLS)
             there.set_times(coords[known], times[known], voxel_map.times_start_ns)
-    _raise_to(there, solid)
+    _raise_to(there, _pushed(voxel_map, T))
     there.history = replace(voxel_map.history.copied(), trusted={}, waiting={})  # their poses are those of frame b
     if voxel_map.viewpoint is not None:
         there.viewpoint = voxel_map.viewpoint._replace(T_world_camera=T @ voxel_map.viewpoint.T_world_camera)
@@ -92,18 +93,18 @@ def _pushed(voxel_map: VoxelMap, T: Transform) -> VoxelMap:
     return pushed
 
 
-def _reached(voxel_map: VoxelMap, T: Transform) -> Iterator[NDArray[np.int32]]:
-    """Yield the blocks (n, 3) that the map's blocks may lie in after the motion, each once, piece by piece."""
+def _reached(voxel_map: VoxelMap, T: Transform) -> NDArray[np.int32]:
+    """Return the blocks (n, 3) that the map's blocks may lie in after the motion, each once."""
     block = SIDE * np.array(voxel_map.config.cell)
     coords = np.concatenate([coords for coords, _ in voxel_map.slabs()])
     corners = np.array(list(product((0, 1), repeat=3)))
     places = transform_points(T, ((coords[:, None] + corners) * block).reshape(-1, 3)).reshape(-1, 8, 3) / block
+    if np.abs(places).max(initial=0) * SIDE >= INDEX_LIMIT:
+        raise StereovoxError("the transform takes the map farther away than cells can be counted; give it in metres")
     low, high = np.floor(places.min(axis=1) - NEAR).astype(np.int64), np.floor(places.max(axis=1) + NEAR).astype(int)
     most = (high - low).max(axis=0, initial=-1) + 1
     found = [(low + offset)[(low + offset <= high).all(axis=1)] for offset in np.ndindex(*most)]
-    blocks = np.unique(np.concatenate([np.empty((0, 3), np.int64), *found]), axis=0).astype(np.int32)
-    for start in range(0, len(blocks), PIECE):
-        yield blocks[start : start + PIECE]
+    return np.unique(np.concatenate([np.empty((0, 3), np.int64), *found]), axis=0).astype(np.int32)
 
 
 def _cells_of(coords: NDArray[np.int32]) -> NDArray[np.int64]:

@@ -136,8 +136,14 @@ def test_merged_halves_are_the_map_of_all_frames(halves):
 
 
 def test_a_merged_map_is_saved_with_what_it_says(halves, tmp_path):
-    merged = sv.merge(*halves[:2], motion([0, 0, 0.3], [1.0, 2.0, 0.0]))
+    T = motion([0, 0, 0.3], [1.0, 2.0, 0.0])
+    merged = sv.merge(*halves[:2], T)
     assert merged.frames == 10
+    (first,), (second,) = (one.history.path.stops for one in halves[:2])
+    path = merged.history.path
+    assert sorted(path.stops) == [first, first + "+"]
+    np.testing.assert_array_equal(path.poses(first), halves[0].history.path.poses(first))
+    np.testing.assert_allclose(path.poses(first + "+"), T @ halves[1].history.path.poses(second), atol=1e-6)
     merged.save(tmp_path / "both.svox")
     again = sv.load_map(tmp_path / "both.svox")
     assert (table(again), again.history) == (table(merged), merged.history)

@@ -4,10 +4,13 @@
 from __future__ import annotations
 
 from collections import Counter
+from copy import deepcopy
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from stereovox.camera_path import CameraPath
 from stereovox.history import MOST_REASONS, OTHERS, History
 from stereovox.maps import VoxelMap
 from stereovox.maps.blocks import CELLS
@@ -77,7 +80,19 @@ def _together(a: History, b: History) -> History:
         ways=_counts(a.ways + b.ways),
         recording=" + ".join(names),
         last_frame=max(lasts, key=lambda last: last[1], default=None),
+        path=_both_paths(a.path, b.path),
     )
+
+
+def _both_paths(a: CameraPath, b: CameraPath) -> CameraPath:
+    """Return the ways of all cameras; one of `b` that is called like one of `a` gets a plus behind its name."""
+    path = replace(deepcopy(a), spacing=max(a.spacing, b.spacing))
+    for sensor, stops in b.stops.items():
+        while sensor in path.stops:
+            sensor += "+"
+        for seen in stops:
+            path.walk(sensor, seen)
+    return path
 
 
 def _counts(counts: Counter[str]) -> Counter[str]:

@@ -9,6 +9,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from stereovox.camera_path import CameraPath, Seen
 from stereovox.errors import StereovoxError
 from stereovox.geometry import Transform, inverse, orthonormalise, rigidity_error, transform_points
 from stereovox.maps import State, VoxelMap
@@ -46,7 +47,8 @@ def moved(voxel_map: VoxelMap, T_a_b: ArrayLike) -> VoxelMap:
             times = voxel_map.times_at(points).reshape(-1, CELLS)
             there.set_times(coords[known], times[known], voxel_map.times_start_ns)
     _raise_to(there, _pushed(voxel_map, T))
-    there.history = replace(voxel_map.history.copied(), trusted={}, waiting={})  # their poses are those of frame b
+    path = _moved_path(voxel_map.history.path, T)
+    there.history = replace(voxel_map.history.copied(), trusted={}, waiting={}, path=path)  # no pose of frame b is left
     if voxel_map.viewpoint is not None:
         there.viewpoint = voxel_map.viewpoint._replace(T_world_camera=T @ voxel_map.viewpoint.T_world_camera)
     return there
@@ -59,6 +61,14 @@ def rigid(T: ArrayLike) -> Transform:
     if not error <= RIGID:
         raise StereovoxError("the transform is no rigid motion: give a 4x4 matrix, without scale or mirror")
     return orthonormalise(T)
+
+
+def _moved_path(path: CameraPath, T: Transform) -> CameraPath:
+    there = CameraPath(path.spacing)
+    for sensor, stops in path.stops.items():
+        poses = (T @ path.poses(sensor))[:, :3].reshape(-1, 12).astype(np.float32).tolist()
+        there.stops[sensor] = [Seen(seen.stamp_ns, tuple(pose)) for seen, pose in zip(stops, poses, strict=True)]
+    return there
 
 
 def higher(mine: NDArray[np.integer], cells: NDArray[np.integer], unknown: int) -> NDArray[np.integer]:

@@ -33,7 +33,7 @@ def main() -> None:
             found = again.state(centers)
             lost = [np.count_nonzero((state == kind) & (found != kind)) for kind in (State.OCCUPIED, State.FREE)]
             change = np.abs(again.log_odds(centers) - log_odds).max()
-            print(f"| {ending} | {path.stat().st_size / 1e6:.1f} | {lost[0]} | {lost[1]} | {change:.4f} |", flush=True)
+            print(f"| {ending} | {path.stat().st_size / 1e6:.2f} | {lost[0]} | {lost[1]} | {change:.4f} |", flush=True)
 
 
 if __name__ == "__main__":

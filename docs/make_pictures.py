@@ -151,7 +151,7 @@ def cells_and_pixels() -> plt.Figure:
     left.annotate("", (1.58, 0.5), (3.08, 0.5), arrowprops={"arrowstyle": "->", "color": INK})
     left.set_xlim(-2.2, 4.9)
     left.set_ylim(-3.3, 3.7)
-    blank(right, "Depth is along the optical axis, not along the ray")
+    blank(right, "Depth: along the axis, not along the ray")
     arrow(right, zero, np.array([6.2, 0]), Z, "z", (0.22, 0))
     arrow(right, zero, np.array([0, -1.1]), X, "x", (0, -0.22))
     right.plot([1.3, 1.3], [-1.15, 1.15], color=INK, lw=2)

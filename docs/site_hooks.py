@@ -18,7 +18,8 @@ INTO_DOCS = re.compile(r"\]\(docs/")
 
 def on_files(files: Files, config: Any) -> Files:
     """Add pages and examples, as if they lay in docs/."""
-    for name in (*PAGES, *(f"examples/{path.name}" for path in sorted((ROOT / "examples").glob("*.py")))):
+    examples = (path for path in sorted((ROOT / "examples").rglob("*.*")) if path.suffix != ".pyc" and path.is_file())
+    for name in (*PAGES, *(path.relative_to(ROOT).as_posix() for path in examples)):
         if files.get_file_from_path(name) is None:
             files.append(File.generated(config, name, abs_src_path=str(ROOT / name)))
     return files

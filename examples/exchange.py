@@ -4,7 +4,7 @@
 import stereovox as sv
 
 mapper = sv.Mapper(voxel_size=0.1)
-for frame in sv.open_source("sim:room", frames=":10"):
+for frame in sv.open_source("sim:room", frames=":4"):
     mapper.add(frame)
 
 for file in ("room.ot", "room.bt", "room.npz", "room.ply", "room.glb"):

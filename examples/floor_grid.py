@@ -1,20 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
 """A floor's map for a ground robot: from a lidar's scans, and from a 3-D map seen from above."""
 
+import numpy as np
+
 import stereovox as sv
 from stereovox.products.map_server import write_map_server
 from stereovox.products.projection import project
-from stereovox.sources.robot import open_robot
 
-robot = open_robot("sim:floor?plan=testbed&seconds=6")  # or a bag
-mapper = sv.GridMapper(voxel_size=0.1)
-for scan in robot.scans[:20]:
-    mapper.add(scan)  # at the pose that odometry tells; SLAM and localisation: docs/robots.md
-write_map_server(mapper.occupancy(), "lidar.yaml")
+mapper = sv.GridMapper(voxel_size=0.05)
+for number in range(10):  # a lidar that drives forward in a corridor 2 m wide; replace this by yours
+    angles = np.radians(np.arange(-120.0, 120.0))
+    ranges = np.minimum(1 / np.maximum(np.abs(np.sin(angles)), 0.01), 8.0)  # 8 m and more: no echo
+    ranges[ranges >= 5.6] = np.inf
+    T_world_lidar = np.eye(4)
+    T_world_lidar[0, 3] = 0.1 * number
+    mapper.add(sv.Scan(ranges, angles[0], np.radians(1.0), 0.05, 5.6, T_world_lidar, stamp_ns=number * 100_000_000))
+write_map_server(mapper.occupancy(), "corridor.yaml")
+print(mapper.occupancy().cells.shape, "cells of the corridor")
 
 space = sv.Mapper(voxel_size=0.1)
-for frame in sv.open_source("sim:room", frames=":5"):
+for frame in sv.open_source("sim:room", frames=":4"):
     space.add(frame)
 grid = project(space.map, heights=(0.1, 1.8))  # what is 0.1 to 1.8 m high marks; what is free at any height clears
 write_map_server(grid, "room.yaml")
-print(grid.cells.shape, "cells, states", sorted(set(grid.states.ravel().tolist())))
+print(grid.cells.shape, "cells of the room, states", sorted(set(grid.states.ravel().tolist())))

@@ -13,8 +13,9 @@ from stereovox.maps import VoxelMap
 from stereovox.products import export
 from stereovox.products.cube_faces import cube_faces
 from stereovox.products.floor_axes import upright_axes
+from stereovox.products.mesh import surface
 
-ENDINGS = (".glb", ".obj", ".stl")
+SURFACES = (".obj", ".stl")
 
 
 def map_of(cells, **settings):
@@ -43,20 +44,15 @@ def buffers(path):
     return np.frombuffer(views[0], "<f4").reshape(-1, 3), np.frombuffer(views[1], np.uint8).reshape(-1, 4)
 
 
-@pytest.mark.parametrize("ending", ENDINGS)
 @pytest.mark.parametrize("up", ["z", "-y", "x"])
-def test_another_program_sees_the_cells(tmp_path, ending, up):
+def test_another_program_sees_the_cells(tmp_path, up):
     cells = np.unique(np.random.default_rng(3).integers(-4, 4, (90, 3)), axis=0)
-    export(map_of(cells, up=up), tmp_path / f"map{ending}")
-    scene = trimesh.load(tmp_path / f"map{ending}", force="scene")
-    mesh = scene.to_mesh()
-    middles = mesh.triangles.mean(axis=1)
-    turn = np.eye(3)
-    if ending == ".glb":  # y is up there
-        x, y, z = upright_axes(up)
-        turn = np.stack([x, z, -y])
-        axis = np.eye(3)["xyz".index(up[-1])]
-        np.testing.assert_array_equal(turn @ (-axis if up.startswith("-") else axis), [0, 1, 0])
+    export(map_of(cells, up=up), tmp_path / "map.glb")
+    mesh = trimesh.load(tmp_path / "map.glb", force="scene").to_mesh()
+    x, y, z = upright_axes(up)
+    turn = np.stack([x, z, -y])  # y is up there
+    axis = np.eye(3)["xyz".index(up[-1])]
+    np.testing.assert_array_equal(turn @ (-axis if up.startswith("-") else axis), [0, 1, 0])
     triangles, normals = mesh.triangles @ turn, mesh.face_normals @ turn
     pairs = {}
     for triangle, normal in zip(triangles / 0.5, np.rint(normals), strict=True):
@@ -64,7 +60,19 @@ def test_another_program_sees_the_cells(tmp_path, ending, up):
         pairs.setdefault((*((low + high) / 2).round(4), *normal), []).append(triangle)
     assert set(pairs) == faces_of(cells)
     assert all(len(pair) == 2 for pair in pairs.values())
-    assert middles.shape == (2 * len(pairs), 3)
+
+
+@pytest.mark.parametrize("ending", SURFACES)
+def test_another_program_sees_the_surface(tmp_path, ending):
+    made = map_of([[0, 0, 0], [1, 0, 0], [5, -3, 2]])
+    export(made, tmp_path / f"map{ending}")
+    mesh, expected = trimesh.load(tmp_path / f"map{ending}"), surface(made)
+    triangles = expected.vertices[expected.faces]
+    order = [np.lexsort(part.reshape(-1, 9).round(4).T) for part in (mesh.triangles, triangles)]
+    np.testing.assert_allclose(mesh.triangles[order[0]], triangles[order[1]], atol=1e-5)
+    assert mesh.is_watertight
+    assert mesh.volume > 0  # it faces outward
+    assert len(mesh.split()) == 2
 
 
 def test_equal_corners_are_one_vertex_and_height_is_colour(tmp_path):
@@ -78,12 +86,15 @@ def test_equal_corners_are_one_vertex_and_height_is_colour(tmp_path):
     assert (colours[high][:, 0] > colours[high][:, 2]).all()  # to red
 
 
-@pytest.mark.parametrize("ending", ENDINGS)
+@pytest.mark.parametrize("ending", [".glb", *SURFACES])
 def test_maps_without_a_surface(tmp_path, ending):
     free = VoxelMap.from_cells(load_config(), [[0, 0, 0]], [-3.0])
     for empty in (VoxelMap(load_config()), free):
-        with pytest.raises(MapFileError, match="holds no occupied cell"):
+        with pytest.raises(MapFileError, match="occupied"):
             export(empty, tmp_path / f"map{ending}")
-    with pytest.raises(StereovoxError, match="crop it"):
-        export(map_of([[0, 0, 0], [0, 1 << 22, 0]]), tmp_path / f"map{ending}")
     assert not list(tmp_path.iterdir())
+
+
+def test_a_map_that_is_too_wide_to_draw(tmp_path):
+    with pytest.raises(StereovoxError, match="crop it"):
+        export(map_of([[0, 0, 0], [0, 1 << 22, 0]]), tmp_path / "map.glb")

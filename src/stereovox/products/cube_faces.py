@@ -3,27 +3,19 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.errors import StereovoxError
 from stereovox.maps import State, VoxelMap
+from stereovox.products.mesh import Mesh
 
 SPAN = 1 << 21
 """Corners of cells on each axis that three of them fit into one int64."""
 TRIANGLES = ((0, 1, 2), (0, 2, 3))
 
 
-class Faces(NamedTuple):
-    """vertices: (N, 3) float32 metres, world frame. faces: (M, 3) int32, counter-clockwise as seen from outside."""
-
-    vertices: NDArray[np.float32]
-    faces: NDArray[np.int32]
-
-
-def cube_faces(voxel_map: VoxelMap) -> Faces:
+def cube_faces(voxel_map: VoxelMap) -> Mesh:
     """Return each face between an occupied cell and one that is not, as two triangles; equal corners are one vertex.
 
     Raises StereovoxError for a map that is too wide.
@@ -39,7 +31,7 @@ def cube_faces(voxel_map: VoxelMap) -> Faces:
     codes, of_corner = np.unique(_codes(corners.reshape(-1, 3)), return_inverse=True)
     faces = of_corner.reshape(-1, 4)[:, TRIANGLES].reshape(-1, 3)
     vertices = (_places(codes) + lowest) * np.array(voxel_map.config.cell)
-    return Faces(vertices.astype(np.float32), faces.astype(np.int32))
+    return Mesh(vertices.astype(np.float32), faces.astype(np.int32))
 
 
 def _occupied(voxel_map: VoxelMap) -> NDArray[np.int64]:

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from stereovox.errors import MapFileError
 from stereovox.files import replacing
 from stereovox.maps import VoxelMap
-from stereovox.products.cube_faces import Faces, cube_faces
+from stereovox.products.cube_faces import cube_faces
 from stereovox.products.floor_axes import upright_axes
+from stereovox.products.mesh import Mesh
 from stereovox.products.points import height_colours
 
 FLOAT, UINT32, UINT8 = 5126, 5125, 5121
@@ -49,7 +50,7 @@ def write_glb(voxel_map: VoxelMap, path: str | Path) -> None:
         file.write(struct.pack("<I4s", len(body), b"BIN\0") + body)
 
 
-def _scene(mesh: Faces, sizes: list[int], turn: NDArray[np.float64]) -> dict[str, Any]:
+def _scene(mesh: Mesh, sizes: list[int], turn: NDArray[np.float64]) -> dict[str, Any]:
     starts = np.cumsum([0, *sizes]).tolist()
     count, corners = len(mesh.vertices), mesh.faces.size
     targets = (VERTICES, VERTICES, INDICES)

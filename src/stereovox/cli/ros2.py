@@ -17,7 +17,7 @@ from stereovox.cli.checkpoints import Checkpoints
 from stereovox.cli.robots import GRID_ENDINGS, check_file
 from stereovox.cli.settings import add_settings, overrides
 from stereovox.cli.terminal import interrupt_between_steps, milliseconds, say, say_about_compiling
-from stereovox.errors import StereovoxError
+from stereovox.errors import MapFileError, StereovoxError
 
 if TYPE_CHECKING:
     from stereovox.config import Config
@@ -101,10 +101,18 @@ def _map(arguments: Namespace, node: Any, mapping: Mapping, options: Options) ->
             while True:
                 maker.spin_once()
                 check()
-                if mapping.history.frames:
-                    checkpoints.after(mapping.history.frames)
+                _checkpoint(checkpoints, mapping.history.frames, node)
         maker.close()  # a second signal, as `timeout` sends it, is to spoil nothing here
         return _finished(maker, mapping, out(), reports)
+
+
+def _checkpoint(checkpoints: Checkpoints, frames: int, node: Any) -> None:
+    """Save the map if it is time; a robot goes on although its disk is full."""
+    try:
+        if frames:
+            checkpoints.after(frames)
+    except MapFileError as error:
+        node.get_logger().error(str(error), throttle_duration_sec=10.0)
 
 
 def _finished(maker: MapNode, mapping: Mapping, out: str, reports: deque[UpdateReport]) -> dict[str, Any]:

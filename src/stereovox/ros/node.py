@@ -116,7 +116,7 @@ class MapNode:
 
     def _renewed(self) -> None:
         self.waiting.clear()
-        self._outputs.changed(self._node.get_clock().now().nanoseconds, self._where.world)
+        self._outputs.changed(self._node.get_clock().now().nanoseconds, self._where.world or "map")
 
 
 def _inputs(options: Options, dimensions: int) -> list[Input]:

@@ -70,7 +70,8 @@ class Outputs:
     def _publish_map(self, now: float) -> None:
         self._new_map = False
         heard = self._made.map.get_subscription_count() > 0
-        self._next_map = now + (1 / self._options.map_rate if heard else UNHEARD_S)
+        period = 1 / self._options.map_rate if heard else UNHEARD_S
+        self._next_map = max(self._next_map, now - period) + period  # one may come early: cameras are not exact
         try:
             grid = self._mapping.grid()
         except StereovoxError as error:

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A map kept from above block by block is the map seen from above as a whole, after every frame."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -90,3 +92,17 @@ def test_heights_and_steps_that_cannot_be_are_told():
         LiveProjection(VoxelMap(load_config(voxel_size=0.2)), (1.0, 0.0))
     with pytest.raises(StereovoxError, match="as long as wide"):
         LiveProjection(VoxelMap(load_config(steps=(0.1, 0.2, 0.1))))
+
+
+def test_a_grid_that_were_too_large_is_told_and_the_map_goes_on():
+    mapper = Mapper("default", voxel_size=0.2, **{"trust.ordered": False})
+    live = LiveProjection(mapper.map)
+    near = next(frames(1, seed=4))
+    mapper.add(near)
+    shown = live.grid()
+    T = near.T_world_sensor.copy()
+    T[:2, 3] += 50_000.0
+    assert mapper.add(replace(near, T_world_sensor=T, sensor="far")).refused is None
+    with pytest.raises(StereovoxError, match=r"window\.size"):
+        live.grid()
+    assert shown.cells.size

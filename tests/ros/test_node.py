@@ -14,7 +14,7 @@ from made_walks import CAMERA, DEPTH, OPTICAL, START_NS, T_BASE_CAMERA, base_at,
 rclpy = pytest.importorskip("rclpy", reason="rclpy is not installed: pip install 'stereovox[ros2]'")
 
 from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
-from nav_msgs.msg import OccupancyGrid  # noqa: E402
+from nav_msgs.msg import OccupancyGrid, Odometry  # noqa: E402
 from nav_msgs.srv import LoadMap  # noqa: E402
 from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
@@ -51,8 +51,7 @@ class Robot:
         self.maker = MapNode(
             node, self.mapping, self.options, lambda: str(node.get_parameter("ros.out").value), self.reports.append
         )
-        self.executor, self.listening = SingleThreadedExecutor(), SingleThreadedExecutor()
-        self.executor.add_node(node)
+        self.listening = SingleThreadedExecutor()
         self.listening.add_node(self.other)
         kinds = {DEPTH: Image, "/camera/depth/camera_info": CameraInfo, "/tf": TFMessage}
         self.send = {topic: self.other.create_publisher(kind, topic, 20) for topic, kind in kinds.items()}
@@ -67,7 +66,7 @@ class Robot:
         end = time.monotonic() + PATIENCE_S
         while not condition():
             assert time.monotonic() < end, "nothing came"
-            self.maker.spin_once(self.executor)
+            self.maker.spin_once()
             self.listening.spin_once(timeout_sec=0.01)
 
     def drive(self, frames: int):
@@ -129,7 +128,8 @@ def test_what_is_published_is_what_the_map_says(robot):
     values = {pair.key: pair.value for pair in robot.came["/diagnostics"][-1].status[0].values}
     assert values["frames_in_map"] == "4"
     assert values["received"] == "4"
-    assert robot.came["/diagnostics"][-1].status[0].level == b"\0"
+    levels = {one.status[0].message.partition(":")[0]: one.status[0].level for one in robot.came["/diagnostics"]}
+    assert levels.items() <= {"waiting": b"\1", "current": b"\0", "stale": b"\3"}.items()
 
 
 def check_grid(message, expected):
@@ -147,8 +147,9 @@ def check_octomap(message, voxel_map):
     octomap = pytest.importorskip("octomap", reason="octomap-python is not installed")
     assert (message.id, message.binary) == ("OcTree", True)
     data = bytes(np.array(message.data, np.int8).tobytes())
-    size = sum(1 for _ in voxel_map.occupied())
-    text = f"# Octomap OcTree binary file\nid OcTree\nsize {max(size, 1)}\nres {message.resolution!r}\ndata\n"
+    children = np.frombuffer(data, "<u2")[:, None] >> 2 * np.arange(8) & 3
+    size = len(children) + np.isin(children, (1, 2)).sum()  # inner nodes and leaves
+    text = f"# Octomap OcTree binary file\nid OcTree\nsize {size}\nres {message.resolution!r}\ndata\n"
     tree = octomap.OcTree(message.resolution)
     assert tree.readBinary(text.encode() + data)
     occupied = [tree.isNodeOccupied(tree.search(point)) for point in voxel_map.occupied()]
@@ -165,6 +166,27 @@ def test_a_frame_whose_pose_never_comes_is_refused_and_counted(robot):
     robot.until(lambda: len(robot.reports) == 3)
     assert robot.mapping.history.frames == 1
     assert dict(robot.mapping.history.refused) == {"no_pose": 1, "bad_shape": 1}
+
+
+def test_without_tf2_msgs_odometry_and_mounts_do(robot, monkeypatch, capfd):
+    monkeypatch.setattr("stereovox.ros.subscriptions.optional_message", lambda *_: None)
+    other = rclpy.create_node("no_tf")
+    options = Options(depth=(DEPTH,), odometry=("/odom",), fixed=(f"base_link {OPTICAL} 0.1 0 0.4 -1.5708 0 -1.5708",))
+    mapping, reports = make_mapping(load_config(voxel_size=0.1), None, None), []
+    maker = MapNode(other, mapping, options, str, reports.append)
+    odometry = robot.other.create_publisher(Odometry, "/odom", 10)
+    robot.maker = maker
+    robot.until(lambda: odometry.get_subscription_count() and robot.send[DEPTH].get_subscription_count() == 2)
+    made, frame = wire.messages(), depth_at(0)
+    robot.publish("/camera/depth/camera_info", made.camera_info(CAMERA, frame.stamp_ns, OPTICAL))
+    robot.publish(DEPTH, made.image(frame.depth, frame.stamp_ns, OPTICAL))
+    odometry.publish(wire.packed(made.odometry(np.zeros(3), frame.stamp_ns, "odom", "base_link")))
+    robot.until(lambda: reports)
+    assert [report.refused for report in reports] == [None]
+    assert "/tf is not heard" in capfd.readouterr().err
+    T_world_camera = mapping._mapper.map.viewpoint.T_world_camera
+    np.testing.assert_allclose(T_world_camera[:3, 3], [0.1, 0, 0.4], atol=1e-6)
+    np.testing.assert_allclose(T_world_camera[:3, 2], [1, 0, 0], atol=1e-4)  # it looks ahead
 
 
 def test_save_reset_and_load(robot, tmp_path):

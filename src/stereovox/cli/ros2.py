@@ -9,8 +9,7 @@ from __future__ import annotations
 
 from argparse import REMAINDER, ArgumentParser, Namespace
 from collections import deque
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +17,7 @@ from stereovox.cli.checkpoints import Checkpoints
 from stereovox.cli.robots import GRID_ENDINGS, check_file
 from stereovox.cli.settings import add_settings, overrides
 from stereovox.cli.terminal import interrupt_between_steps, milliseconds, say, say_about_compiling
-from stereovox.errors import StereovoxError
+from stereovox.errors import MapFileError, StereovoxError
 
 if TYPE_CHECKING:
     from stereovox.config import Config
@@ -64,7 +63,9 @@ def run(arguments: Namespace) -> dict[str, Any]:
     from stereovox.ros.library import check_installed
 
     check_installed()
-    with _running_node(arguments.ros_args) as node, ExitStack() as stack:
+    from stereovox.ros.running import running_node
+
+    with running_node(arguments.ros_args) as node, ExitStack() as stack:
         from stereovox.ros.mapping import make_mapping
         from stereovox.ros.parameters import freeze
         from stereovox.ros.warm_up import warm_up
@@ -84,8 +85,6 @@ def run(arguments: Namespace) -> dict[str, Any]:
 
 
 def _map(arguments: Namespace, node: Any, mapping: Mapping, options: Options) -> dict[str, Any]:
-    from rclpy.executors import SingleThreadedExecutor
-
     from stereovox.ros.node import MapNode
     from stereovox.ros.parameters import FREE
 
@@ -96,18 +95,24 @@ def _map(arguments: Namespace, node: Any, mapping: Mapping, options: Options) ->
 
     maker = MapNode(node, mapping, options, out, reports.append)
     checkpoints = Checkpoints(lambda: mapping.save(out()), options.out, arguments.checkpoint if options.out else 0.0)
-    executor = SingleThreadedExecutor()
-    executor.add_node(node)
     say("listening; Ctrl-C ends")
     with interrupt_between_steps() as check:
         with suppress(KeyboardInterrupt):
             while True:
-                maker.spin_once(executor)
+                maker.spin_once()
                 check()
-                if mapping.history.frames:
-                    checkpoints.after(mapping.history.frames)
+                _checkpoint(checkpoints, mapping.history.frames, node)
         maker.close()  # a second signal, as `timeout` sends it, is to spoil nothing here
         return _finished(maker, mapping, out(), reports)
+
+
+def _checkpoint(checkpoints: Checkpoints, frames: int, node: Any) -> None:
+    """Save the map if it is time; a robot goes on although its disk is full."""
+    try:
+        if frames:
+            checkpoints.after(frames)
+    except MapFileError as error:
+        node.get_logger().error(str(error), throttle_duration_sec=10.0)
 
 
 def _finished(maker: MapNode, mapping: Mapping, out: str, reports: deque[UpdateReport]) -> dict[str, Any]:
@@ -135,24 +140,6 @@ def _finished(maker: MapNode, mapping: Mapping, out: str, reports: deque[UpdateR
     elif out:
         say("no frame could be used: no map is written")
     return result
-
-
-@contextmanager
-def _running_node(words: list[str]) -> Iterator[Any]:
-    """Give a node of rclpy with the parameters that the command line names."""
-    import rclpy
-    from rclpy.signals import SignalHandlerOptions
-
-    try:
-        rclpy.init(args=["--ros-args", *words], signal_handler_options=SignalHandlerOptions.NO)
-        node = rclpy.create_node("stereovox", automatically_declare_parameters_from_overrides=True)
-    except Exception as error:  # of rclpy's C library, which has many
-        raise StereovoxError(f"--ros-args {' '.join(words)}: {error}") from None
-    try:
-        yield node
-    finally:
-        node.destroy_node()
-        rclpy.try_shutdown()
 
 
 def _settings(arguments: Namespace, node: Any) -> tuple[Config, Options]:

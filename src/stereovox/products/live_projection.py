@@ -20,6 +20,8 @@ from stereovox.products.projection import NOTHING, Patch, layers_of, patch_of
 
 STEP = 8 * SIDE
 """The grid grows by so many cells: programs that plan in it need not make room anew with each frame."""
+MOST_CELLS = 2**26
+"""Cells of the largest grid; nobody wants to be sent more with each frame."""
 
 
 class LiveProjection:
@@ -44,11 +46,16 @@ class LiveProjection:
         voxel_map.listeners.append(self._note)
 
     def grid(self) -> OccupancyGrid | None:
-        """Return the map from above as it is now; None where nothing is known. Its cells are a copy."""
+        """Return the map from above as it is now; None where nothing is known. Its cells are a copy.
+
+        Raises StereovoxError where it were too large.
+        """
         if self._whole:
             self._changed, self._canvas = EVERYWHERE.copy(), _Canvas()
         coords, cells = self._map.blocks_within(*self._changed)
         if len(coords):
+            floor = SIDE * coords[:, self._order[:2]].astype(np.int64)
+            self._canvas.reach(floor.min(axis=0), floor.max(axis=0) + SIDE)
             patch = patch_of(self._map, coords, cells, self._order, self._layers)
             self._canvas.paint(self._in_percent(patch), patch.corner)
         self._changed = EVERYWHERE[::-1].copy()
@@ -86,19 +93,21 @@ class _Canvas:
         self.cells = np.empty((0, 0), np.int8)
 
     def paint(self, patch: NDArray[np.int8], corner: NDArray[np.int64]) -> None:
-        """Put a patch over what stood there."""
-        end = corner + patch.shape[::-1]
-        self._reach(corner // STEP * STEP, -(-end // STEP) * STEP)
-        (left, bottom), (right, top) = (corner - self.corner).tolist(), (end - self.corner).tolist()
-        self.cells[bottom:top, left:right] = patch
+        """Put a patch over what stood there; it is within reach."""
+        left, bottom = (corner - self.corner).tolist()
+        self.cells[bottom : bottom + patch.shape[0], left : left + patch.shape[1]] = patch
 
-    def _reach(self, low: NDArray[np.int64], high: NDArray[np.int64]) -> None:
+    def reach(self, low: NDArray[np.int64], high: NDArray[np.int64]) -> None:
+        """Grow by whole steps, so that columns and rows from `low` to below `high` are in it; raises StereovoxError."""
+        low, high = low // STEP * STEP, -(-high // STEP) * STEP
         if self.cells.size:
             before = self.corner + self.cells.shape[::-1]
             low, high = np.minimum(low, self.corner), np.maximum(high, before)
             if (low == self.corner).all() and (high == before).all():
                 return
         columns, rows = (high - low).tolist()
+        if columns * rows > MOST_CELLS:
+            raise StereovoxError(f"a grid of {columns} x {rows} cells is too large; set window.size=[X,Y,Z]")
         larger, (left, bottom) = np.full((rows, columns), UNKNOWN, np.int8), (self.corner - low).tolist()
         if self.cells.size:
             larger[bottom : bottom + self.cells.shape[0], left : left + self.cells.shape[1]] = self.cells

@@ -41,7 +41,11 @@ class MapNode:
         out: Callable[[], str],
         told: Callable[[UpdateReport], None] = lambda report: None,
     ):
+        from rclpy.executors import SingleThreadedExecutor
+
         self._node, self._mapping, self._told = node, mapping, told
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(node)
         self._where = Whereabouts(options.world_frame, options.base_frame, options.extrapolate_s)
         for text in options.fixed:
             parent, child, numbers = fixed_transform(text)
@@ -66,9 +70,9 @@ class MapNode:
             "transforms_unreadable": self._where.tf.unreadable,
         }
 
-    def spin_once(self, executor: Any) -> None:
+    def spin_once(self) -> None:
         """Take in what has come, map one frame, publish what is due."""
-        self._take_in(executor, SOON_S if len(self.waiting) else IDLE_S)
+        self._take_in(SOON_S if len(self.waiting) else IDLE_S)
         arrival = self.waiting.take(self._ready)
         if arrival is not None:
             self._map(arrival)
@@ -80,12 +84,12 @@ class MapNode:
             self._map(arrival)
         self._outputs.close()
 
-    def _take_in(self, executor: Any, wait_s: float) -> None:
+    def _take_in(self, wait_s: float) -> None:
         """Wait for messages, and take in all that are there."""
         idle = 0  # rclpy returns empty-handed once after each round of what was ready, whether or not more came
         for _ in range(MOST_AT_ONCE):
             before = self._heard.messages
-            executor.spin_once(timeout_sec=wait_s)
+            self._executor.spin_once(timeout_sec=wait_s)
             idle = idle + 1 if self._heard.messages == before else 0
             if idle == 2:
                 break
@@ -112,7 +116,7 @@ class MapNode:
 
     def _renewed(self) -> None:
         self.waiting.clear()
-        self._outputs.changed(self._node.get_clock().now().nanoseconds, self._where.world)
+        self._outputs.changed(self._node.get_clock().now().nanoseconds, self._where.world or "map")
 
 
 def _inputs(options: Options, dimensions: int) -> list[Input]:

@@ -70,8 +70,13 @@ class Outputs:
     def _publish_map(self, now: float) -> None:
         self._new_map = False
         heard = self._made.map.get_subscription_count() > 0
-        self._next_map = now + (1 / self._options.map_rate if heard else UNHEARD_S)
-        grid = self._mapping.grid()
+        period = 1 / self._options.map_rate if heard else UNHEARD_S
+        self._next_map = max(self._next_map, now - period) + period  # one may come early: cameras are not exact
+        try:
+            grid = self._mapping.grid()
+        except StereovoxError as error:
+            self._complain(error)
+            return
         if grid is not None:
             self._made.map.publish(occupancy_message(grid, self._stamp_ns, self._frame_id))
 
@@ -85,7 +90,10 @@ class Outputs:
         try:
             self._made.send(copy(), stamp_ns, frame_id)
         except StereovoxError as error:
-            self._node.get_logger().error(f"cannot be published: {error}", throttle_duration_sec=10.0)
+            self._complain(error)
+
+    def _complain(self, error: StereovoxError) -> None:
+        self._node.get_logger().error(f"cannot be published: {error}", throttle_duration_sec=10.0)
 
     def _idle(self) -> bool:
         if self._busy is None:

@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the node is told: by options, by parameters, wrongly."""
+
+import builtins
+import subprocess
+import sys
+
+import pytest
+
+from stereovox.cli import main
+from stereovox.errors import StereovoxError
+from stereovox.ros.options import Options, pair_of, with_parameters
+
+DEPTH = "/camera/depth/image_rect_raw"
+
+
+def test_parameters_come_as_ros_has_them():
+    given = {
+        "depth": ["/a", "/b=/b/info"],
+        "cloud": "/c",
+        "wait_s": 1,
+        "queue": 3,
+        "reliable": True,
+        "low": 0.1,
+        "high": 2,
+    }
+    options = with_parameters(Options(), given)
+    assert (options.depth, options.cloud, options.wait_s, options.queue) == (("/a", "/b=/b/info"), ("/c",), 1.0, 3)
+    assert options.heights == (0.1, 2.0)
+    assert Options().heights is None
+    assert [pair_of(text) for text in options.depth] == [("/a", ""), ("/b", "/b/info")]
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"dept": "/a"}, r"'ros\.dept' \(did you mean 'ros\.depth'"),
+        ({"queue": "many"}, r"ros\.queue 'many': give a int"),
+        ({"queue": 0}, r"ros\.queue 0"),
+        ({"wait_s": -1.0}, r"ros\.wait_s"),
+        ({"map_rate": 0.0}, r"ros\.map_rate"),
+        ({"low": 1.0}, r"ros\.high"),
+        ({"cloud_step_deg": 0.0}, r"ros\.cloud_step_deg"),
+    ],
+)
+def test_parameters_that_cannot_be_are_told(given, said):
+    with pytest.raises(StereovoxError, match=said):
+        with_parameters(Options(), given)
+
+
+def test_something_must_be_mapped_and_a_scan_only_on_a_floor():
+    with pytest.raises(StereovoxError, match="--depth"):
+        Options().check_sources(3)
+    with pytest.raises(StereovoxError, match="dimensions=2"):
+        Options(scan=("/scan",)).check_sources(3)
+    Options(scan=("/scan",)).check_sources(2)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--depth", DEPTH, "--ros-args", "-p", "voxle_size:=0.1"], "did you mean 'voxel_size'"),
+        (["--depth", DEPTH, "--ros-args", "-p", "voxel_size:=-1.0"], "voxel_size -1"),
+        (["--depth", DEPTH, "--ros-args", "-p", "sensor.model:=nothing"], "unknown sensor"),
+        (["--depth", DEPTH, "--ros-args", "-p", "profile:=nothing"], "unknown profile"),
+        (["--ros-args", "-p", "ros.dept:=/a"], "ros.depth"),
+        (["--depth", DEPTH, "--ros-args", "--nonsense"], "--ros-args"),
+        (["--depth", DEPTH, "--out", "/proc/x/y"], "/proc"),
+        (["--scan", "/scan"], "dimensions=2"),
+        ([], "--depth"),
+    ],
+)
+def test_mistakes_end_in_one_line(capsys, words, said):
+    pytest.importorskip("rclpy", reason="rclpy is not installed: pip install 'stereovox[ros2]'")
+    assert main(["ros2", *words]) == 2
+    err = capsys.readouterr().err
+    assert said in err.splitlines()[-1]
+    assert "Traceback" not in err
+
+
+def test_without_ros_the_cure_is_told(monkeypatch, capsys):
+    real = builtins.__import__
+
+    def no_ros(name, *args, **kwargs):
+        if name.partition(".")[0] == "rclpy":
+            raise ImportError(name)
+        return real(name, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, "__import__", no_ros)
+    monkeypatch.setattr("stereovox.ros.library.import_module", lambda name: no_ros(name))
+    assert main(["ros2", "--depth", DEPTH]) == 2
+    assert "stereovox[ros2]" in capsys.readouterr().err
+
+
+def test_help_needs_no_ros():
+    code = "import sys; sys.modules['rclpy'] = None; from stereovox.cli import main; main(['ros2', '--help'])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "--depth TOPIC[=INFO]" in done.stdout

@@ -69,6 +69,9 @@ def test_the_oldest_evidence_is_that_of_the_cells_it_touches():
         low, high = known * 0.1, (known + 1) * 0.1
         away = np.array([np.linalg.norm(place - np.clip(place, low, high), axis=1) for place in steps]).min(axis=0)
         assert found.oldest_s[segment] == pytest.approx(ages[away <= 0.17].max(), abs=1e-4)
+    far = check_path(voxel_map, [(-1e6, 0, 0), (1e6, 0, 0), (1e6, 5, 0)], 1e3, now_ns=now_ns)
+    assert far.oldest_s[0] == pytest.approx(ages.max())
+    assert np.isnan(far.oldest_s[1])
     outside = check_path(voxel_map, [(50, 0, 0), (51, 0, 0)], 0.1)
     assert np.isnan(outside.oldest_s).all()
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from argparse import ArgumentParser, Namespace
 from math import isfinite
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -16,6 +17,7 @@ import numpy as np
 from stereovox.cli.points import point
 from stereovox.cli.saved_map import open_map
 from stereovox.cli.terminal import say
+from stereovox.errors import StereovoxError
 
 if TYPE_CHECKING:
     from stereovox.products.path_check import PathCheck
@@ -30,6 +32,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("point", type=point, metavar="X,Y,Z", nargs="+", help="two places or more, in metres")
     parser.add_argument("--radius", type=float, required=True, metavar="R", help="of the body, in metres")
     parser.add_argument("--through-unknown", action="store_true", help="what is not known is not in its way")
+    parser.add_argument("--picture", metavar="FILE.png", help="draw the path: from above, from the side, room along it")
 
 
 def run(arguments: Namespace) -> dict[str, Any]:
@@ -37,6 +40,8 @@ def run(arguments: Namespace) -> dict[str, Any]:
     from stereovox.maps import State
     from stereovox.products.path_check import check_path, point_along
 
+    if arguments.picture and Path(arguments.picture).suffix.lower() != ".png":
+        raise StereovoxError(f"{arguments.picture}: pictures are written as .png; name the file so")
     voxel_map = open_map(arguments.map)
     points = np.array(arguments.point)
     found = check_path(voxel_map, points, arguments.radius, arguments.through_unknown)
@@ -54,6 +59,13 @@ def run(arguments: Namespace) -> dict[str, Any]:
         )
         say(f"{n + 1}. {_named(points[n])} to {_named(points[n + 1])}, {lengths[n]:.2f} m: {word}{age}")
     say(_verdict(found, float(lengths.sum()), stopped))
+    if arguments.picture:
+        from stereovox.view.path import picture_path
+
+        picture_path(
+            voxel_map, points, arguments.radius, arguments.picture, f"A path through {Path(arguments.map).stem}"
+        )
+        say(f"saved {arguments.picture}")
     return {
         "free": found.free,
         "length_m": float(lengths.sum()),

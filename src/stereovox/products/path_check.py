@@ -64,8 +64,7 @@ def check_path(
         lengths, first = np.linalg.norm(np.diff(points, axis=0), axis=1), stopped[0]
         share = _free_share(voxel_map, points[first], points[first + 1], radius, in_the_way)
         blocked_at = float(lengths[:first].sum() + share * lengths[first])
-    ages = [_oldest(voxel_map, *ends, radius, now_ns) for ends in pairwise(points)]
-    return PathCheck(worst, blocked_at, np.array(ages, np.float32) if voxel_map.config.map.keep_times else None)
+    return PathCheck(worst, blocked_at, _oldest(voxel_map, points, radius, now_ns))
 
 
 def point_along(waypoints: ArrayLike, metres: float) -> NDArray[np.float64]:
@@ -92,27 +91,48 @@ def _free_share(
 
 
 def _oldest(
-    voxel_map: VoxelMap, start: NDArray[np.float64], end: NDArray[np.float64], radius: float, now_ns: int | None
-) -> float:
-    """Return the age in seconds of the oldest evidence that a capsule touches, NaN where there is none."""
+    voxel_map: VoxelMap, points: NDArray[np.float64], radius: float, now_ns: int | None
+) -> NDArray[np.float32] | None:
+    """Return the age (N,) in seconds of the oldest evidence that each segment touches, None where no times are kept."""
     if not voxel_map.config.map.keep_times:
-        return np.nan
-    cell = np.array(voxel_map.config.cell)
-    ages = [voxel_map.age((cells + 0.5) * cell, now_ns) for cells in _touched(cell, start, end, radius)]
-    return float(np.fmax.reduce(np.concatenate(ages), initial=np.nan))
+        return None
+    cell, bounds = np.array(voxel_map.config.cell), voxel_map.bounds()
+    oldest = np.full(len(points) - 1, np.nan, np.float32)
+    for n, (start, end) in enumerate(pairwise(points) if bounds is not None else ()):
+        for cells in _touched(cell, np.asarray(bounds), start, end, radius):
+            ages = voxel_map.age((cells + 0.5) * cell, now_ns)
+            oldest[n] = np.fmax.reduce(ages, initial=oldest[n])
+    return oldest
 
 
 def _touched(
-    cell: NDArray[np.float64], start: NDArray[np.float64], end: NDArray[np.float64], radius: float
+    cell: NDArray[np.float64],
+    bounds: NDArray[np.float64],
+    start: NDArray[np.float64],
+    end: NDArray[np.float64],
+    radius: float,
 ) -> Iterator[NDArray[np.int64]]:
-    """Yield the cells (n, 3) that a capsule touches, piece by piece along its axis; some of them twice."""
-    length = float(np.linalg.norm(end - start))
-    joints = np.linspace(start, end, 1 + max(1, int(np.ceil(length / max(PIECE * cell.max(), radius)))))
-    for a, b in pairwise(joints):
-        first = np.floor((np.minimum(a, b) - radius) / cell).astype(np.int64)
-        last = np.floor((np.maximum(a, b) + radius) / cell).astype(np.int64)
-        cells = first + np.indices(last - first + 1).reshape(3, -1).T
+    """Yield the cells (n, 3) within `bounds` (2, 3) that a capsule touches, piece by piece; some of them twice."""
+    first, last = _within(bounds + np.array([[-radius], [radius]]), start, end)
+    if first > last:
+        return
+    start, end = start + first * (end - start), start + last * (end - start)
+    pieces = 1 + int(np.linalg.norm(end - start) / max(PIECE * cell.max(), radius))
+    lowest, highest = np.rint(bounds / cell).astype(np.int64)
+    for a, b in pairwise(np.linspace(start, end, 1 + pieces)):
+        low = np.maximum(np.floor((np.minimum(a, b) - radius) / cell).astype(np.int64), lowest)
+        high = np.minimum(np.floor((np.maximum(a, b) + radius) / cell).astype(np.int64) + 1, highest)
+        cells = low + np.indices(np.maximum(high - low, 0)).reshape(3, -1).T
         yield cells[_away(a, b, cells * cell, (cells + 1) * cell) <= radius]
+
+
+def _within(box: NDArray[np.float64], start: NDArray[np.float64], end: NDArray[np.float64]) -> tuple[float, float]:
+    """Return from where to where, 0 to 1, a segment is in a box (2, 3); the first is larger where it never is."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        crossings = np.sort((box - start) / (end - start), axis=0)
+    level = start == end
+    crossings[:, level] = np.where(((box[0] <= start) & (start <= box[1]))[level], [[0.0], [1.0]], [[1.0], [0.0]])
+    return max(0.0, float(crossings[0].max())), min(1.0, float(crossings[1].min()))
 
 
 def _away(

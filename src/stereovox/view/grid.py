@@ -48,7 +48,7 @@ def draw_grid(grid: OccupancyGrid, heading: str, track: ArrayLike | None = None)
         axis = figure.add_subplot()
         plan(axis, trimmed(grid), track)
         framed(axis, box)
-        _legend(figure, grid.states, track is not None)
+        legend(figure, grid.states, track is not None)
     words_above(figure, heading, facts(grid))
     return figure
 
@@ -145,7 +145,8 @@ def known_bounds(grid: OccupancyGrid) -> NDArray[np.float64] | None:
     return np.stack([corners.min(axis=0), corners.max(axis=0)]) if len(corners) else None
 
 
-def _legend(figure: Any, shown: NDArray[np.uint8], with_track: bool) -> None:
+def legend(figure: Any, shown: NDArray[np.uint8], with_track: bool) -> None:
+    """Write below a figure what the colours of `plan` mean, of the states that are `shown`."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 

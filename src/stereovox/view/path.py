@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A picture of a path through a map: from above, unrolled from the side, and how much room there is along it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stereovox.maps import State, VoxelMap
+from stereovox.products.path_check import point_along
+from stereovox.products.projection import project
+from stereovox.view.drawn import UPS, turned
+from stereovox.view.figures import WIDTH, figure_of, save, words_above
+from stereovox.view.grid import bounds, framed, legend, plan, trimmed
+from stereovox.view.panels import INK, PATH_COLOUR, STATE_COLOURS, measured
+
+STEPS = 400
+"""Places along the path at which the room is measured."""
+MORE_RADII = 3.0
+"""The section reaches so many radii above and below the path."""
+DRAWN_EVERY = 2.0
+"""The body is drawn along the path this many radii apart."""
+NEAREST = {"obstacle": ([State.OCCUPIED, State.TENTATIVE], INK), "unknown cell": ([State.UNKNOWN], "tab:blue")}
+
+
+def picture_path(voxel_map: VoxelMap, waypoints: ArrayLike, radius: float, path: str | Path, title: str) -> None:
+    """Write a PNG of a path (N, 3) in metres, world frame, of a ball of `radius` metres.
+
+    First the map from above, of the heights that the ball passes through; then the upright section along the path, so
+    that one sees what it passes over and under; then how far obstacles and unknown cells are from it.
+    Raises StereovoxError where nothing is known at these heights, and as `figures.save` does.
+    """
+    save(draw_path(voxel_map, np.asarray(waypoints, float), radius, title), path)
+
+
+def draw_path(voxel_map: VoxelMap, way: NDArray[np.float64], radius: float, title: str) -> Any:
+    """Return the matplotlib figure that `picture_path` saves."""
+    up = voxel_map.config.up
+    heights = turned(way, up)[:, 2]
+    band = float(heights.min()) - radius, float(heights.max()) + radius
+    seen, flat = project(voxel_map, band), way[:, UPS[up][:2]]
+    box = bounds(seen, flat)
+    assert box is not None  # `project` found something
+    (x0, y0), (x1, y1) = box
+    tall = float(np.clip(0.92 * WIDTH * (y1 - y0) / (x1 - x0), 3, 12))
+    figure = figure_of(tall + 7.6)
+    above, aside, along = figure.subplots(3, 1, height_ratios=[tall, 3, 3])
+    plan(above, trimmed(seen), flat)
+    names = "".join("xyz"[axis] for axis in UPS[up])
+    measured(above, (names[0], names[1], names[2]))
+    framed(above, box)
+    length = float(np.linalg.norm(np.diff(way, axis=0), axis=1).sum())
+    places = np.array([point_along(way, at) for at in np.linspace(0, length, STEPS)])
+    _bodies(above, places[:, UPS[up][:2]], radius, length)
+    _section(aside, voxel_map, places, radius, length)
+    _room(along, voxel_map, places, radius, length)
+    told = f"from above: what is {band[0]:.2f} to {band[1]:.2f} m high ({up}); the way may pass over or under it"
+    above.set_title(told, fontsize=11, color=INK)
+    legend(figure, seen.states, with_track=True)
+    facts = [f"{length:.2f} m long", f"radius {radius:g} m", f"cells of {voxel_map.voxel_size:g} m"]
+    words_above(figure, title, facts)
+    return figure
+
+
+def _bodies(axis: Any, places: NDArray[np.float64], radius: float, length: float) -> None:
+    from matplotlib.patches import Circle
+
+    number = max(2, int(length / (DRAWN_EVERY * radius)) + 1)
+    for n in np.linspace(0, len(places) - 1, number).round().astype(int):
+        axis.add_patch(Circle(tuple(places[n]), radius, fill=False, color=PATH_COLOUR, alpha=0.6))
+    for place, word in ((places[0], "start"), (places[-1], "goal")):
+        axis.annotate(word, tuple(place), textcoords="offset points", xytext=(-12, -20), fontsize=13, color=PATH_COLOUR)
+
+
+def _section(axis: Any, voxel_map: VoxelMap, places: NDArray[np.float64], radius: float, length: float) -> None:
+    """Draw the states of the cells above and below the path, unrolled, and the room that the body takes."""
+    from matplotlib.colors import ListedColormap
+
+    up = voxel_map.config.up
+    sign, side = -1 if up.startswith("-") else 1, voxel_map.config.cell[UPS[up][2]]
+    height = turned(places, up)[:, 2]
+    low, high = height.min() - MORE_RADII * radius, height.max() + MORE_RADII * radius
+    rows = np.arange(low, high, side / 2)
+    points = np.repeat(places[None], len(rows), axis=0)
+    points[:, :, UPS[up][2]] = sign * rows[:, None]
+    states = voxel_map.state(points.reshape(-1, 3)).reshape(points.shape[:2])
+    colours, extent = ListedColormap([STATE_COLOURS[state] for state in State]), (0, length, low, high)
+    axis.imshow(states, cmap=colours, vmin=0, vmax=3, origin="lower", extent=extent, interpolation="nearest")
+    at = np.linspace(0, length, len(places))
+    axis.plot(at, height, color=PATH_COLOUR, linewidth=1.6)
+    for edge in (height - radius, height + radius):
+        axis.plot(at, edge, color=PATH_COLOUR, linestyle="--", linewidth=1)
+    axis.set(ylabel=f"height ({up}) [m]", aspect="auto")
+    axis.set_title("straight above and below the path; dashed: how far the body reaches", fontsize=11, color=INK)
+
+
+def _room(axis: Any, voxel_map: VoxelMap, places: NDArray[np.float64], radius: float, length: float) -> None:
+    at = np.linspace(0, length, len(places))
+    for what, (states, colour) in NEAREST.items():
+        away = voxel_map.nearest_obstacle(places, np.inf, states).distance
+        axis.plot(at, away, color=colour, label=f"nearest {what}")
+    axis.axhline(radius, color=PATH_COLOUR, linestyle="--", label="radius")
+    axis.set(xlabel="metres along the path", ylabel="metres away", xlim=(0, max(length, 1e-6)), ylim=(0, None))
+    axis.legend(loc="lower right")
+    axis.grid(alpha=0.3)

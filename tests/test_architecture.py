@@ -49,6 +49,7 @@ HOMES = {
     "pydantic": r"config(_robot|_safety)?\.py",
     "pyoctomap": r"evaluate/.*",
     "pyrealsense2": r"sources/.*",
+    "rerun": r"products/.*",
     "rich": r"cli/.*",
     "rosbags": r"sources/.*",
     "small_gicp": r"calibrate/.*",

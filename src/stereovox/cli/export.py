@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Write a map for other programs; the ending of FILE chooses the format.
 
-.bt and .ot for OctoMap, .ply for point cloud viewers, .npz for NumPy; .pgm, .png or .yaml for map_server: the map seen
-from above, as a picture and its .yaml.
+.bt and .ot for OctoMap, .ply for point cloud viewers, .npz for NumPy, .rrd for the Rerun viewer; .pgm, .png or .yaml
+for map_server: the map seen from above, as a picture and its .yaml.
 """
 
 from __future__ import annotations

@@ -15,6 +15,7 @@ EXPORTS = {
     ".ot": "stereovox.products.octomap_write:write_ot",
     ".ply": "stereovox.products.points:write_ply",
     ".npz": "stereovox.products.points:write_npz",
+    ".rrd": "stereovox.products.rerun_write:write_rrd",
     ".pgm": "stereovox.products.projection:write_grid",
     ".png": "stereovox.products.projection:write_grid",
     ".yaml": "stereovox.products.projection:write_grid",

@@ -28,7 +28,7 @@ DPI = 600
 LETTERS_PT, LINE_PT, PATH_PT = 7.0, 0.5, 0.9
 BAR_SHARE = 0.12
 """Share of the width beside cells that the colour bar takes."""
-STYLE = {
+STYLE: dict[Any, Any] = {
     "font.size": LETTERS_PT,
     "axes.linewidth": LINE_PT,
     "xtick.major.width": LINE_PT,
@@ -125,7 +125,7 @@ def _layer(voxel_map: VoxelMap, one: Layer, width_mm: float) -> Any:
     for state in (State.FREE, State.TENTATIVE, State.OCCUPIED):
         corners = runs(one.state == state) * size + [left, bottom]
         axis.add_collection(
-            PolyCollection(corners, facecolor=STATE_COLOURS[state], edgecolor=STATE_COLOURS[state], linewidth=0.1)
+            PolyCollection(list(corners), facecolor=STATE_COLOURS[state], edgecolor=STATE_COLOURS[state], linewidth=0.1)
         )
     path = turned(_path(voxel_map), one.across)
     if len(path):
@@ -152,11 +152,11 @@ def _figure(width_mm: float, shape: float) -> tuple[Any, Any]:
     """Return an empty figure for a panel that is `shape` times as high as wide, and the panel."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
 
     width = width_mm * MM
     height = float(np.clip(width * shape + 0.35, 0.4 * width, 2.5 * width))
-    figure = Figure((width, height), dpi=DPI, facecolor="white", layout="constrained")
-    figure.get_layout_engine().set(w_pad=0.01, h_pad=0.01)
+    figure = Figure((width, height), dpi=DPI, facecolor="white", layout=ConstrainedLayoutEngine(w_pad=0.01, h_pad=0.01))
     FigureCanvasAgg(figure)
     return figure, figure.add_subplot()
 

@@ -56,6 +56,7 @@ HOMES = {
     "pyrealsense2": r"sources/.*",
     "rcl_interfaces": r"ros/.*",
     "rclpy": r"ros/.*",
+    "rerun": r"products/.*",
     "rich": r"cli/.*",
     "rosbags": r"sources/.*",
     "skimage": r"products/.*",

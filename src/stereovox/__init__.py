@@ -39,6 +39,8 @@ if TYPE_CHECKING:
     from stereovox.rigs import StereoPair as StereoPair
     from stereovox.sources import open_source as open_source
     from stereovox.sources.latest import Latest as Latest
+    from stereovox.view.viewer import open_viewer as open_viewer
+    from stereovox.view.viewer_live import LiveView as LiveView
     from stereovox.wide import CylindricalCamera as CylindricalCamera
     from stereovox.wide import SphericalCamera as SphericalCamera
 
@@ -79,6 +81,8 @@ _HOMES = {
     "surface": "products.mesh",
     "open_source": "sources",
     "Latest": "sources.latest",
+    "open_viewer": "view.viewer",
+    "LiveView": "view.viewer_live",
 }
 __all__ = [*_HOMES, "__version__"]  # pyright: ignore[reportUnsupportedDunderAll]
 

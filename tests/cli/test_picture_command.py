@@ -32,9 +32,55 @@ def test_each_view_is_written(saved, tmp_path, capsys, words):
     assert file.read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.parametrize("view", ["overview", "space", "layer"])
+def test_a_figure_for_a_paper_is_as_wide_as_its_column(saved, tmp_path, view):
+    from PIL import Image
+
+    words = ["picture", str(saved), "--view", view, "--width-mm", "80"]
+    for ending in ("png", "pdf", "svg"):
+        assert main([*words[:2], str(tmp_path / f"map.{ending}"), *words[2:], "--dpi", "254"]) == 0
+    picture = np.asarray(Image.open(tmp_path / "map.png").convert("RGB"))
+    assert picture.shape[1] == 800
+    assert (picture[0, 0] == 255).all()
+    text = (tmp_path / "map.svg").read_text()
+    assert 'width="226.77' in text  # 80 mm in points
+    assert "<text" in text
+    assert (" m</text>" if view == "space" else " [m]</text>") in text
+    assert ("<image" in text) == (view != "layer")  # rectangles stay sharp
+    assert b"/Type3" not in (tmp_path / "map.pdf").read_bytes()  # publishers refuse such fonts
+
+
+def test_a_page_may_be_vectors_and_have_more_dots(saved, tmp_path):
+    from PIL import Image
+
+    widths = []
+    for dpi in ("60", "120"):
+        words = ["--view", "axis", *CAMERA, "--dpi", dpi]
+        assert main(["picture", str(saved), str(tmp_path / "map.png"), *words]) == 0
+        widths.append(Image.open(tmp_path / "map.png").width)
+    assert 2 * widths[0] == widths[1]
+    assert main(["picture", str(saved), str(tmp_path / "map.pdf"), "--view", "axis", *CAMERA]) == 0
+    assert (tmp_path / "map.pdf").read_bytes().startswith(b"%PDF")
+
+
+def test_rectangles_cover_just_the_chosen_cells():
+    from stereovox.view.paper import runs
+
+    chosen = np.random.default_rng(0).random((7, 9)) < 0.6
+    covered = np.zeros_like(chosen)
+    for corners in runs(chosen).astype(int):
+        (x0, y0), (x1, y1) = corners.min(0), corners.max(0)
+        assert not covered[y0:y1, x0:x1].any()
+        covered[y0:y1, x0:x1] = True
+    assert (covered == chosen).all()
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
+        (["--view", "axis", "--width-mm", "80", *CAMERA], "goes with the views overview, space, layer"),
+        (["--width-mm", "5"], "--width-mm 5: give 30 to 400"),
+        (["--dpi", "1"], "--dpi 1: give 20 to 2400"),
         (["--view", "axis"], "--eye=X,Y,Z --toward=X,Y,Z"),
         (["--view", "axis", "--eye=1,2"], "'1,2' is no point"),
         (["--view", "axis", "--eye=1,2,nan", "--toward=1,2,3"], "'1,2,nan' is no point"),

@@ -2,8 +2,8 @@
 """Write a map for other programs; the ending of FILE chooses the format.
 
 .bt and .ot for OctoMap, .ply and .pcd for point cloud viewers, .npz for NumPy, .glb for browsers and Blender, .obj and
-.stl for modellers; .bag, .mcap and .db3 for ROS; .pgm, .png or .yaml for map_server: the map seen from above, as a
-picture and its .yaml. The map of a floor (.yaml) goes into a bag as well.
+.stl for modellers, .rrd for the Rerun viewer; .bag, .mcap and .db3 for ROS; .pgm, .png or .yaml for map_server: the map
+seen from above, as a picture and its .yaml. The map of a floor (.yaml) goes into a bag as well.
 """
 
 from __future__ import annotations

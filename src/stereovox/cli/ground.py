@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stereovox.cli.endings import check_ending
-from stereovox.cli.points import point
+from stereovox.cli.numbers import point
 from stereovox.cli.saved_map import open_map
 from stereovox.cli.terminal import say, thousands
 

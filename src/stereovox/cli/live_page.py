@@ -12,6 +12,7 @@ from stereovox.cli.terminal import say
 if TYPE_CHECKING:
     from stereovox.frame import AnyFrame
     from stereovox.mapper import Mapper
+    from stereovox.products.rerun_write import RerunLog
     from stereovox.update_report import UpdateReport
     from stereovox.view.viewer_live import LiveView
 
@@ -63,3 +64,38 @@ def page_of(mapper: Mapper, name: str, port: int | None) -> Iterator[NoPage]:
     with closing(LiveView(mapper, name, port=port)) as live:
         say(f"open {live.url} in a browser to see the map grow")
         yield Page(live)
+
+
+@contextmanager
+def rerun_of(mapper: Mapper, file: str | None) -> Iterator[NoPage]:
+    """Write a Rerun recording of the mapper's frames and map while this is open; None: none."""
+    if file is None:
+        yield NoPage()
+        return
+    from stereovox.depth import DepthPath
+    from stereovox.products.rerun_write import RerunLog, rerun_file
+
+    with rerun_file(file, mapper.config.up) as opened:
+        stopped = None
+        try:
+            yield Recorded(mapper, RerunLog(opened, DepthPath(mapper.config)))
+        except KeyboardInterrupt as told:  # what was mapped is saved, and so is this
+            stopped = told
+    say(f"saved {file}; look at it with: rerun {file}")
+    if stopped is not None:
+        raise stopped
+
+
+class Recorded(NoPage):
+    """A Rerun recording for a command."""
+
+    def __init__(self, mapper: Mapper, log: RerunLog):
+        self._mapper, self._log = mapper, log
+
+    def after(self, frame: AnyFrame, report: UpdateReport) -> None:
+        """Write the frame, and the map, if it is time."""
+        self._log.after(self._mapper.map, frame)
+
+    def finish(self) -> None:
+        """Write the map whole."""
+        self._log.finish(self._mapper.map)

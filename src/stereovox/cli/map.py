@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stereovox.cli.checkpoints import Checkpoints, add_checkpoint
-from stereovox.cli.live_page import page_of
+from stereovox.cli.live_page import NoPage, page_of, rerun_of
 from stereovox.cli.robots import GRID_FILES
 from stereovox.cli.settings import add_settings, overrides
 from stereovox.cli.terminal import (
@@ -73,6 +73,9 @@ def add_arguments(parser: ArgumentParser) -> None:
         metavar="PORT",
         help=f"show the map in a browser while it grows, and then until Ctrl-C ({PORT}; 0: any port that is free)",
     )
+    parser.add_argument(
+        "--rerun", metavar="FILE.rrd", help="write depth images, camera and the growing map for the Rerun viewer"
+    )
 
 
 def run(arguments: Namespace) -> dict[str, Any]:
@@ -101,21 +104,30 @@ def _mapped(arguments: Namespace, out: Path) -> dict[str, Any]:
             say(f"note: {note}")
         with page_of(mapper, out.stem, arguments.view) as page:
             say_about_compiling()
-            with interrupt_between_steps() as check, _there_at_once(mapper.map, out):
-                reports = _add_all(mapper, source, out, checkpoints, check, page.after)
-                result = summarise(mapper.map, reports) | ({"dropped": source.dropped} if source.length is None else {})
-                if not mapper.map.frames:
-                    raise StereovoxError(
-                        f"{arguments.source}: not one frame could be used, no map is written "
-                        f"({_first_refusal(reports)})"
-                    )
-                checkpoints.save(_seen(mapper))
+            with rerun_of(mapper, arguments.rerun) as recorded:
+                reports = _made(mapper, source, out, checkpoints, (page, recorded))
+                recorded.finish()
+            result = summarise(mapper.map, reports) | ({"dropped": source.dropped} if source.length is None else {})
             page.finish()
             _tell(result, reports, out, mapper.config.window)
             page.stay()
     finally:
         mapper.map.close()
     return result
+
+
+def _made(
+    mapper: Mapper, source: Stream, out: Path, checkpoints: Checkpoints, watching: tuple[NoPage, ...]
+) -> list[UpdateReport]:
+    """Add all frames and save the map; raises StereovoxError where not one could be used."""
+    with interrupt_between_steps() as check, _there_at_once(mapper.map, out):
+        reports = _add_all(mapper, source, out, checkpoints, check, watching)
+        if not mapper.map.frames:
+            raise StereovoxError(
+                f"{source.name}: not one frame could be used, no map is written ({_first_refusal(reports)})"
+            )
+        checkpoints.save(_seen(mapper))
+    return reports
 
 
 def _opened(arguments: Namespace) -> Stream:
@@ -155,7 +167,7 @@ def _grid(arguments: Namespace) -> dict[str, Any]:
     """Do what `stereovox grid` does; it has more options."""
     from stereovox.cli import grid
 
-    for option in ("camera", "integrator", "threads", "view"):
+    for option in ("camera", "integrator", "threads", "view", "rerun"):
         if getattr(arguments, option) is not None:
             raise StereovoxError(f"--{option}: has no meaning for the map of a floor; leave it out")
     if arguments.resume and not Path(arguments.out).exists():
@@ -205,11 +217,11 @@ def _add_all(
     out: Path,
     checkpoints: Checkpoints,
     check: Callable[[], None],
-    after: Callable[[AnyFrame, UpdateReport], None],
+    watching: tuple[NoPage, ...],
 ) -> list[UpdateReport]:
     """Add all frames that the map does not hold yet; where `check` says that it is enough, save what there is.
 
-    after: is told of each frame.
+    watching: who is told of each frame.
     """
     reports: list[UpdateReport] = []
     done = _seen(mapper)
@@ -227,7 +239,8 @@ def _add_all(
     try:
         for frame in tracked(source, source.length, "mapping"):
             reports.append(_added(mapper, frame, checkpoints))
-            after(frame, reports[-1])
+            for one in watching:
+                one.after(frame, reports[-1])
             check()
             if mapper.map.frames:  # an empty map must not take the place of an older one
                 checkpoints.after(_seen(mapper))

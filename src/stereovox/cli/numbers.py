@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+from argparse import ArgumentTypeError
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -25,6 +26,17 @@ def numbers_of(option: str, text: str, names: str) -> list[float]:
     if len(numbers) != len(names.split(",")) or any(map(math.isnan, numbers)):
         raise StereovoxError(f"{option} {text}: write {names}, numbers in metres with commas and no blanks")
     return numbers
+
+
+def point(text: str) -> tuple[float, float, float]:
+    """Return three numbers in metres from X,Y,Z; raises ArgumentTypeError for anything else."""
+    try:
+        x, y, z = map(float, text.split(","))
+    except ValueError:
+        x = y = z = math.nan
+    if not math.isfinite(x + y + z):
+        raise ArgumentTypeError(f"'{text}' is no point; give X,Y,Z in metres")
+    return x, y, z
 
 
 def transform_of(text: str) -> Transform:

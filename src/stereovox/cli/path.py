@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from stereovox.cli.points import point
+from stereovox.cli.numbers import point
 from stereovox.cli.saved_map import open_map
 from stereovox.cli.terminal import say
 from stereovox.errors import StereovoxError

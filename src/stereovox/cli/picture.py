@@ -10,7 +10,7 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stereovox.cli.points import point
+from stereovox.cli.numbers import point
 from stereovox.cli.saved_map import dimensions, open_cubes, refuse_options
 from stereovox.cli.terminal import say
 from stereovox.errors import StereovoxError
@@ -27,7 +27,7 @@ USED = {"overview": (), "layer": ("at", "eye", "toward"), "axis": ("eye", "towar
 def add_arguments(parser: ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("map", metavar="MAP", help="folder of a map, or the .yaml of a floor's map")
-    parser.add_argument("file", metavar="FILE.png", help="picture to write")
+    parser.add_argument("file", metavar="FILE.png", help="picture to write; .pdf and .svg hold letters and lines")
     parser.add_argument("--view", metavar="NAME", help="overview (default), layer, axis or space")
     parser.add_argument("--at", type=float, metavar="M", help="height of the layer along --up (default: the camera's)")
     parser.add_argument(
@@ -36,17 +36,25 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--eye", type=point, metavar="X,Y,Z", help="where the camera is (default: the last frame's)")
     parser.add_argument("--toward", type=point, metavar="X,Y,Z", help="a point on its optical axis; goes with --eye")
     parser.add_argument("--title", metavar="TEXT", help="title instead of the map's name")
+    parser.add_argument("--dpi", type=float, metavar="N", help="dots an inch (120; with --width-mm 600)")
+    parser.add_argument(
+        "--width-mm",
+        type=float,
+        metavar="W",
+        help="one panel for a paper, as wide as its column, with small letters and no headline: overview is from above",
+    )
 
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Load the map and write its picture."""
-    from stereovox.view.figures import save
+    from stereovox.view.figures import ENDINGS, save
 
     file = Path(arguments.file)
-    if file.suffix.lower() != ".png":
-        raise StereovoxError(f"{file}: pictures are written as .png; name the file so")
+    if file.suffix.lower() not in ENDINGS:
+        raise StereovoxError(f"{file}: pictures are written as {', '.join(ENDINGS)}; name the file so")
     heading = _plain(arguments.title or Path(arguments.map).stem)
-    save(DRAWN[dimensions(arguments.map)](arguments, heading), file)
+    drawn = DRAWN[dimensions(arguments.map)](arguments, heading)
+    save(drawn, file, arguments.dpi)
     say(f"saved {file}")
     return {"picture": str(file)}
 
@@ -54,6 +62,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
 def _draw_cells(arguments: Namespace, heading: str) -> Any:
     """Return the figure of a map in space."""
     from stereovox.view.drawn import checked_up
+    from stereovox.view.paper import draw_paper
     from stereovox.view.views import draw_view
     from stereovox.view.whereabouts import viewpoint_at
 
@@ -62,7 +71,10 @@ def _draw_cells(arguments: Namespace, heading: str) -> Any:
     voxel_map = open_cubes(arguments.map)
     up = checked_up(arguments.up or voxel_map.config.up)
     viewpoint = viewpoint_at(voxel_map, arguments.eye, arguments.toward, up)
-    drawn = draw_view(voxel_map, arguments.view, heading, up, arguments.at, viewpoint)
+    if arguments.width_mm is None:
+        drawn = draw_view(voxel_map, arguments.view, heading, up, arguments.at, viewpoint)
+    else:
+        drawn = draw_paper(voxel_map, arguments.view, up, arguments.width_mm, arguments.at, viewpoint)
     if arguments.at is not None:
         _tell_if_outside(voxel_map, up, arguments.at)
     return drawn
@@ -73,7 +85,9 @@ def _draw_grid(arguments: Namespace, heading: str) -> Any:
     from stereovox.cli.floor_map import check_not_its_own, open_grid
     from stereovox.view.grid import draw_grid
 
-    refuse_options(arguments, ("view", "at", "up", "eye", "toward"), f"{arguments.map} is a floor's map, always a plan")
+    refuse_options(
+        arguments, ("view", "at", "up", "eye", "toward", "width_mm"), f"{arguments.map} is a floor's map, always a plan"
+    )
     check_not_its_own(arguments.file, arguments.map)
     return draw_grid(open_grid(arguments.map), heading)
 

@@ -23,6 +23,7 @@ EXPORTS = {
     ".bag": "stereovox.products.bag_maps:write_bag",
     ".mcap": "stereovox.products.bag_maps:write_bag",
     ".db3": "stereovox.products.bag_maps:write_bag",
+    ".rrd": "stereovox.products.rerun_write:write_rrd",
     ".pgm": "stereovox.products.projection:write_grid",
     ".png": "stereovox.products.projection:write_grid",
     ".yaml": "stereovox.products.projection:write_grid",

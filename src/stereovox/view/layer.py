@@ -35,7 +35,7 @@ def draw_layer(
     """
     viewpoint = viewpoint or voxel_map.viewpoint
     up = checked_up(up)
-    one = upright_layer(voxel_map, up, _height(voxel_map, up, viewpoint) if at_m is None else at_m)
+    one = upright_layer(voxel_map, up, shown_height(voxel_map, up, viewpoint) if at_m is None else at_m)
     rows, columns = one.state.shape
     plan_height = float(np.clip(0.44 * WIDTH * rows / columns, 2.5, 8.0)) + 0.9
     figure = figure_of(plan_height + 6.3)
@@ -100,7 +100,8 @@ def draw_values(figure: Any, axis: Any, one: Layer, voxel_map: VoxelMap, viewpoi
     measured(axis, (*one.axes, one.across))
 
 
-def _height(voxel_map: VoxelMap, up: str, viewpoint: Viewpoint | None) -> float:
+def shown_height(voxel_map: VoxelMap, up: str, viewpoint: Viewpoint | None) -> float:
+    """Return the height in metres along `up` of the layer to show: the camera's, or of the one that tells most."""
     if viewpoint is None:
         drawn = upright(voxel_map, None, up)
         return (drawn.layer + 0.5) * voxel_map.voxel_size if len(drawn.cells) else 0.0

@@ -54,7 +54,7 @@ def values_of(voxel_map: VoxelMap, cells: NDArray[np.int32], colour: str, up: st
 
 def heights(voxel_map: VoxelMap, cells: NDArray[np.int32], up: str) -> NDArray[np.float64]:
     """Return the height (N,) in metres along `up` of the middle of cells (N, 3)."""
-    along = (cells[:, "xyz".index(up[-1])] + 0.5) * voxel_map.voxel_size
+    along = (cells[:, "xyz".index(up[-1])].astype(np.float64) + 0.5) * voxel_map.voxel_size
     return -along if up.startswith("-") else along
 
 

@@ -41,7 +41,9 @@ class LiveView:
         with gui.add_folder("Now", order=0.5):
             self.frame = FramePanel(self.viewer.server, mapper.config)
         self._arrivals: deque[float] = deque(maxlen=200)
-        self._due, self._last, self._waiting = 0.0, None, None
+        self._due = 0.0
+        self._last: tuple[AnyFrame, UpdateReport] | None = None
+        self._waiting: tuple[VoxelMap, AnyFrame, str] | None = None
         self._ask, self._free, self._stopped = threading.Event(), threading.Event(), False
         self._free.set()
         self._thread = threading.Thread(target=self._run, name="stereovox-live-view", daemon=True)
@@ -64,7 +66,7 @@ class LiveView:
         self._arrivals.append(start)
         self._last = frame, report
         if start >= self._due and self._free.is_set():
-            self._hand_over()
+            self._hand_over(frame, report)
             done = monotonic()
             self._due = done + max(LEAST_S, COPY_REST * (done - start))
 
@@ -72,7 +74,7 @@ class LiveView:
         """Show the map as it is now, whole; to be called when the last frame is in it."""
         self._free.wait(PATIENCE_S)
         if self._last is not None:
-            self._hand_over()
+            self._hand_over(*self._last)
 
     def close(self) -> None:
         """Take the page down."""
@@ -89,8 +91,7 @@ class LiveView:
         """Take the page down."""
         self.close()
 
-    def _hand_over(self) -> None:
-        frame, report = self._last
+    def _hand_over(self, frame: AnyFrame, report: UpdateReport) -> None:
         self._free.clear()
         self._waiting = _copy(self._mapper), frame, f"{frame_words(frame, report)}\n\n{self._pace()}"
         self._ask.set()
@@ -100,7 +101,7 @@ class LiveView:
         while True:
             self._ask.wait()
             self._ask.clear()
-            if self._stopped:
+            if self._stopped or self._waiting is None:
                 return
             start = monotonic()
             voxel_map, frame, words = self._waiting

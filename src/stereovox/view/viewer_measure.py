@@ -26,7 +26,7 @@ class Measure:
 
     def __init__(self, server: ViserServer, cells: Cells, size: float):
         self._server, self._cells, self._size = server, cells, size
-        self.picked: list[NDArray[np.float64]] = []
+        self.picked: list[NDArray[np.floating]] = []
         with server.gui.add_folder("Measure"):
             self.on = server.gui.add_checkbox("measure", False)
             self.told = server.gui.add_markdown(HOW)
@@ -37,7 +37,7 @@ class Measure:
         cell = first_hit(self._cells.solid, self._size, origin, direction)
         if cell is None:
             return
-        self.picked = [*self.picked, (cell + 0.5) * self._size] if len(self.picked) < 2 else [(cell + 0.5) * self._size]
+        self.picked = [*(self.picked if len(self.picked) < 2 else []), (cell + 0.5) * self._size]
         self._draw()
 
     def _switch(self) -> None:
@@ -65,7 +65,7 @@ class Measure:
             self.told.content = told(points)
 
 
-def told(points: list[NDArray[np.float64]]) -> str:
+def told(points: list[NDArray[np.floating]]) -> str:
     """Return how far apart two points (3,) in metres are, as Markdown."""
     step = points[1] - points[0]
     along = ", ".join(f"{name} {value:+.2f}" for name, value in zip("xyz", step, strict=True))

@@ -46,7 +46,7 @@ class Replay:
             self.play = gui.add_checkbox("play", False)
             self.frame = FramePanel(viewer.server, self._config)
         self.at.on_update(lambda _: self.draw())
-        self.play.on_update(lambda _: self.play.value and threading.Thread(target=self._play, daemon=True).start())
+        self.play.on_update(lambda _: self._start())
         self.frame.show(source.frame(len(source) - 1), "the last frame; move the timeline or tick play")
 
     def _draw(self) -> None:
@@ -84,6 +84,10 @@ class Replay:
         if self._done % apart == 0 and self._done not in self._kept:
             self._kept[self._done] = self._mapper.map.snapshot()
 
+    def _start(self) -> None:
+        if self.play.value:
+            threading.Thread(target=self._play, daemon=True).start()
+
     def _play(self) -> None:
         """Move the timeline as time goes by, over frames that could not be drawn meanwhile."""
         seconds = self._seconds_a_frame()
@@ -105,4 +109,4 @@ class Replay:
 
 def _as_shown(config: Config) -> Config:
     """Return settings that leave no cell and no frame out: what a picture of the recording needs."""
-    return config.model_copy(update={"window": WindowConfig(), "deadline_ms": None})
+    return config.model_copy(update={"window": WindowConfig.model_validate({}), "deadline_ms": None})

@@ -50,7 +50,7 @@ def test_distances_are_written_as_scipy_measures_them(saved, tmp_path, capsys):
     assert away.max() > 0.35
     np.testing.assert_allclose(arrays["distance"], np.where(away > 0.351, np.inf, away), rtol=1e-6)
     assert matplotlib.image.imread(picture).std() > 0.05
-    unknown = told(capsys, "distance", saved, file, "--to", "unknown", "--box=-1,-1,0:3.5,3,1")
+    unknown = told(capsys, "distance", saved, file, "--to", "unknown", "--box=-1,-1,0,3.5,3,1")
     assert (unknown["shape"], unknown["origin"]) == ([45, 40, 10], [-1, -1, 0])
     assert np.load(file)["distance"].max() < 1
 
@@ -75,8 +75,8 @@ def test_paths_are_checked(saved, tmp_path, capsys):
     ("words", "complaint"),
     [
         (["distance", "MAP", "d.txt"], "d.txt: distances are written as .npz"),
-        (["distance", "MAP", "d.npz", "--box", "1,2:3"], "--box 1,2:3: write two corners"),
-        (["distance", "MAP", "d.npz", "--box", "3,3,3:1,1,1"], "lower one first"),
+        (["distance", "MAP", "d.npz", "--box", "1,2,3"], "--box 1,2,3: write X0,Y0,Z0,X1,Y1,Z1"),
+        (["distance", "MAP", "d.npz", "--box", "3,3,3,1,1,1"], "lower one first"),
         (["distance", "MAP", "d.npz", "--max", "-1"], "more than 0 m"),
         (["distance", "MAP", "d.npz", "--measure", "feet"], "centres, faces, gap"),
         (["distance", "MAP", "d.npz", "--at", "1"], "--picture"),

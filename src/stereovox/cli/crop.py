@@ -7,7 +7,7 @@ from argparse import ArgumentParser, Namespace
 from typing import Any
 
 from stereovox.cli.new_map import check_new, save_new
-from stereovox.cli.numbers import numbers_of
+from stereovox.cli.numbers import CORNERS, numbers_of
 from stereovox.cli.saved_map import open_map
 from stereovox.errors import StereovoxError
 
@@ -20,7 +20,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("out", metavar="OUT", help="folder of the new map")
     parser.add_argument(
         "--box",
-        metavar="X0,Y0,Z0,X1,Y1,Z1",
+        metavar=CORNERS,
         required=True,
         help="lowest and highest corner in metres; inf and -inf where it has no end. --box=... where it begins with -",
     )
@@ -30,7 +30,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
     """Load the map and save the part."""
     from stereovox.products.crop import crop
 
-    box = numbers_of("--box", arguments.box, "X0,Y0,Z0,X1,Y1,Z1")
+    box = numbers_of("--box", arguments.box, CORNERS)
     check_new(arguments.out, arguments.map)
     whole = open_map(arguments.map)
     part = crop(whole, box[:3], box[3:])

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from stereovox.cli.numbers import CORNERS, numbers_of
 from stereovox.cli.saved_map import open_map
 from stereovox.cli.terminal import say, size, thousands
 from stereovox.errors import StereovoxError
@@ -38,7 +39,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         help="besides occupied cells, count these as obstacles too; may be given twice",
     )
     parser.add_argument(
-        "--box", metavar="X,Y,Z:X,Y,Z", help="lowest and highest corner in metres (default: all that is known)"
+        "--box", metavar=CORNERS, help="lowest and highest corner in metres (default: all that is known)"
     )
     parser.add_argument("--max", type=float, metavar="M", default=np.inf, help="obstacles farther off count as none")
     parser.add_argument(
@@ -87,13 +88,7 @@ def _box(text: str | None, voxel_map: VoxelMap) -> NDArray[np.float64]:
         raise StereovoxError("the map is empty: there is nothing to be far from")
     if text is None:
         return bounds
-    try:
-        box = np.array([[float(x) for x in corner.split(",")] for corner in text.split(":")])
-    except ValueError:
-        box = np.empty(0)
-    if box.shape != (2, 3):
-        raise StereovoxError(f"--box {text}: write two corners in metres, for example --box=-1,-1,0:3,3,2")
-    return box
+    return np.reshape(numbers_of("--box", text, CORNERS), (2, 3))
 
 
 def _told(field: DistanceField, arguments: Namespace) -> dict[str, Any]:

@@ -13,6 +13,8 @@ from stereovox.errors import StereovoxError
 if TYPE_CHECKING:
     from stereovox.geometry import Transform
 
+CORNERS = "X0,Y0,Z0,X1,Y1,Z1"
+"""How a box is written: its lowest and its highest corner."""
 LARGEST_FILE = 10_000
 """Bytes of a file that holds a transform."""
 

@@ -9,9 +9,12 @@ from __future__ import annotations
 
 import bz2
 import json
+import sqlite3
 import struct
+import tempfile
 import zlib
 from collections.abc import Callable
+from contextlib import closing
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -35,7 +38,10 @@ from stereovox.maps.grid_map import GridMap
 from stereovox.maps.grid_store import load_grid
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.products import export, read_octomap
+from stereovox.products.bag_maps import read_bag_grid, read_bag_map
 from stereovox.products.map_server import read_map_server, write_map_server
+from stereovox.products.npz_read import read_npz
+from stereovox.products.point_files import read_point_map
 from stereovox.sources import images, open_source
 from stereovox.sources.calibration_files import import_rig
 from stereovox.sources.camera_file import read_camera
@@ -279,6 +285,35 @@ def pictures(folder: Path) -> list[bytes]:
     return [(folder / "a.pgm").read_bytes(), (folder / "a.png").read_bytes(), plain]
 
 
+def exported(ending: str, folder: Path) -> list[bytes]:
+    export(small_map(), folder / f"a{ending}")
+    return [(folder / f"a{ending}").read_bytes()]
+
+
+def read_settings(data: bytes, folder: Path) -> None:
+    """The settings in a file of cells that is sound otherwise."""
+    export(small_map(), folder / "s.npz")
+    with np.load(folder / "s.npz") as parts:
+        np.savez(folder / "s.npz", **(dict(parts) | {"settings": np.frombuffer(data, np.uint8)}))
+    read_npz(folder / "s.npz")
+
+
+def settings(_: Path) -> list[bytes]:
+    return [json.dumps(small_map().config.model_dump()).encode()]
+
+
+def text_points(_: Path) -> list[bytes]:
+    rows = b"1 2 3\n-4 5.5 nan\n"
+    ply = (
+        b"ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\nproperty double z\nend_header\n"
+    )
+    pcd = b"# .PCD v0.7\nFIELDS x y z\nSIZE 4 4 8\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 2\nHEIGHT 1\nPOINTS 2\nDATA ascii\n"
+    columns = np.array([1, 2, 3, 4], "<f4").tobytes() + np.array([5.0, 6.0]).tobytes()
+    packed = b"\x1f" + columns  # a run of 32 bytes
+    compressed = pcd.replace(b"ascii", b"binary_compressed") + struct.pack("<II", len(packed), len(columns)) + packed
+    return [ply + rows, pcd + rows, compressed]
+
+
 # bags ---------------------------------------------------------------------------------------------------------------
 
 
@@ -349,6 +384,26 @@ def read_message(data: bytes, folder: Path) -> None:
     read_bag(
         "message.mcap", mcap(folder / "made.mcap", types, said, Style(chunk=0, summary=False)).read_bytes(), folder
     )
+
+
+@cache
+def map_messages() -> list[tuple[str, bytes]]:
+    """Type and bytes of messages of finished maps."""
+    with tempfile.TemporaryDirectory() as folder:
+        export(small_map(), Path(folder) / "a.db3", (-1, 3))
+        with closing(sqlite3.connect(Path(folder) / "a.db3")) as file:
+            query = "SELECT type, data FROM topics JOIN messages ON topics.id = topic_id ORDER BY type"
+            return file.execute(query).fetchall()
+
+
+def read_map_message(data: bytes, folder: Path) -> None:
+    """The first byte says which message the others are; the file round it is sound."""
+    kind, _ = map_messages()[data[0] % len(map_messages()) if data else 0]
+    path = mcap(folder / "map.mcap", {"/a": kind}, [Message("/a", START_NS, data[1:])], Style(chunk=0, summary=False))
+    if kind.endswith("OccupancyGrid"):
+        read_bag_grid(path)
+    else:
+        read_bag_map(path, 0.1, "/a")
 
 
 def read_metadata(data: bytes, folder: Path) -> None:
@@ -462,11 +517,27 @@ TARGETS: dict[str, Target] = {
     "grid_about": Target(abouts, read_about),
     "octomap": Target(trees, lambda data, folder: file_target("a.bt", read_octomap).read(data, folder)),
     "octomap_nodes": Target(bodies, read_tree),
+    "cells_npz": Target(
+        partial(exported, ".npz"), lambda data, folder: file_target("a.npz", read_npz).read(data, folder)
+    ),
+    "cells_settings": Target(settings, read_settings),
+    "points_text": Target(
+        text_points, lambda data, folder: file_target("a", lambda path: read_point_map(path, 0.1)).read(data, folder)
+    ),
+    "points_ply": Target(
+        partial(exported, ".ply"), lambda data, folder: file_target("a", read_point_map).read(data, folder)
+    ),
+    "points_pcd": Target(
+        partial(exported, ".pcd"), lambda data, folder: file_target("a", read_point_map).read(data, folder)
+    ),
     "map_yaml": file_target("map.yaml", lambda path: read_yaml(path.read_bytes(), path.parent), MAP_YAML),
     "map_picture": Target(pictures, read_picture),
     "bag_ros1": Target(ros1_bags, partial(read_bag, "a.bag")),
     "bag_db3": Target(db3_bags, partial(read_bag, "a.db3")),
     "bag_mcap": Target(mcap_bags, partial(read_bag, "a.mcap")),
     "bag_message": Target(lambda _: [bytes([k]) + data for k, (_, _, data) in enumerate(messages())], read_message),
+    "bag_map_message": Target(
+        lambda _: [bytes([k]) + data for k, (_, data) in enumerate(map_messages())], read_map_message
+    ),
     "bag_metadata": Target(lambda _: [METADATA.encode()], read_metadata),
 }

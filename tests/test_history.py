@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import stereovox as sv
+from stereovox.camera_path import CameraPath
 from stereovox.errors import MapFileError
 from stereovox.history import MOST_REASONS, NOT_TOLD, OTHERS, History, Seen, Streak
 
@@ -21,6 +22,7 @@ FULL = History(
     ("frame 9", 2**62),
     {"left": Seen(2**62, POSE), "right": Seen(-5, POSE)},
     {"left": Streak("pose_jump", 2**62 + 1, Seen(2**62 + 9, POSE))},
+    CameraPath(0.1, {"left": [Seen(2**62, (0.5,) * 12)], "right": []}),
 )
 
 
@@ -98,6 +100,12 @@ LIES = {
     "a stamp with a fraction": lambda s: s["history"]["trusted"]["left"].update(stamp_ns=1.5),
     "somebody waits who was never there": lambda s: s["history"]["trusted"].pop("left"),
     "waiting for a number": lambda s: s["history"]["waiting"]["left"].update(why=5),
+    "a path of text": lambda s: s.update(camera_path="home"),
+    "a path with half a pose": lambda s: s["camera_path"]["stops"]["left"].update(poses="AAAA"),
+    "a path of no base64": lambda s: s["camera_path"]["stops"]["left"].update(poses="?"),
+    "a path with NaN": lambda s: s["camera_path"]["stops"]["left"].update(poses="AADAfwAAwH8AAMB/" * 4),
+    "a path without end": lambda s: s["camera_path"]["stops"]["left"].update(stamps_ns="AAAA" * 999_999),
+    "a path without spacing": lambda s: s["camera_path"].update(spacing=0),
     "no beginning": lambda s: s["history"]["waiting"]["left"].pop("since_ns"),
 }
 

@@ -25,6 +25,17 @@ if TYPE_CHECKING:
     from stereovox.maps import load_map as load_map
     from stereovox.maps.grid_map import GridMap as GridMap
     from stereovox.maps.occupancy import OccupancyGrid as OccupancyGrid
+    from stereovox.products import export as export
+    from stereovox.products.coarsen import coarsen as coarsen
+    from stereovox.products.crop import crop as crop
+    from stereovox.products.difference import difference as difference
+    from stereovox.products.distance import DistanceField as DistanceField
+    from stereovox.products.frontiers import frontiers as frontiers
+    from stereovox.products.ground import ground as ground
+    from stereovox.products.imports import import_map as import_map
+    from stereovox.products.merge import merge as merge
+    from stereovox.products.mesh import surface as surface
+    from stereovox.products.path_check import check_path as check_path
     from stereovox.rigs import StereoPair as StereoPair
     from stereovox.sources import open_source as open_source
     from stereovox.sources.latest import Latest as Latest
@@ -55,6 +66,17 @@ _HOMES = {
     "load_map": "maps",
     "GridMap": "maps.grid_map",
     "OccupancyGrid": "maps.occupancy",
+    "export": "products",
+    "import_map": "products.imports",
+    "DistanceField": "products.distance",
+    "check_path": "products.path_check",
+    "coarsen": "products.coarsen",
+    "crop": "products.crop",
+    "difference": "products.difference",
+    "frontiers": "products.frontiers",
+    "ground": "products.ground",
+    "merge": "products.merge",
+    "surface": "products.mesh",
     "open_source": "sources",
     "Latest": "sources.latest",
 }

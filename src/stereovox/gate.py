@@ -3,9 +3,10 @@
 
 from __future__ import annotations
 
-from math import acos, dist, inf, radians
+from math import inf, radians
 from typing import NamedTuple
 
+from stereovox.camera_path import apart
 from stereovox.config import Config
 from stereovox.errors import FrameRefused
 from stereovox.frame import AnyFrame, DepthImage, Scan, name_of
@@ -94,7 +95,7 @@ class Gate:
             return (BACKWARDS if -self._reset_ns <= ahead_ns < 0 else RESET), inf
         if ahead_ns <= 0:
             return "", 0.0  # taken at one time, as far as is known: no speed can be said
-        metres, angle = _step(before.pose, now.pose)
+        metres, angle = apart(before.pose, now.pose)
         allowed = 1e-9 * ahead_ns
         moved, turned = (metres - SLACK_M) / self._trust.max_speed_mps, (angle - SLACK_RAD) / self._turn
         haste = max(moved, turned) / allowed
@@ -130,15 +131,7 @@ class Gate:
         until = f"believed again once frames agree for {self._trust.settle_s:g} s"
         if why == RESET:
             return f"its clock is {seconds:+.6g} s off the last trusted frame's, it was reset; {until}"
-        metres, angle = _step(before.pose, now.pose)
+        metres, angle = apart(before.pose, now.pose)
         return (
             f"the pose jumped by {metres:.3g} m and {round(angle * 57.29578, 1):g} degrees in {seconds:.3g} s; {until}"
         )
-
-
-def _step(before: tuple[float, ...], now: tuple[float, ...]) -> tuple[float, float]:
-    """Return how far apart two poses are, in metres and radians."""
-    a, b, c, x, d, e, f, y, g, h, i, z = before
-    p, q, r, u, s, t, k, v, m, n, o, w = now
-    cosine = (a * p + b * q + c * r + d * s + e * t + f * k + g * m + h * n + i * o - 1) / 2
-    return dist((x, y, z), (u, v, w)), acos(min(1.0, max(-1.0, cosine)))

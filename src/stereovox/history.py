@@ -11,6 +11,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from stereovox.camera_path import FARTHEST, CameraPath
+from stereovox.camera_path import Seen as Seen
 from stereovox.errors import one_line
 
 MOST_SENSORS = 64
@@ -23,15 +25,6 @@ NOT_TOLD = "not_told"
 LONGEST_NAME = 256
 EARLIEST, LATEST = -(2**63), 2**63 - 1
 """Stamps in int64 nanoseconds."""
-FARTHEST = 1e7
-"""No number of a pose is larger; `depth.prepare` refuses positions beyond a tenth of it."""
-
-
-class Seen(NamedTuple):
-    """Where a sensor was and when: pose is the 12 numbers of the upper three rows of T_world_sensor, row by row."""
-
-    stamp_ns: int
-    pose: tuple[float, ...]
 
 
 class Streak(NamedTuple):
@@ -51,6 +44,7 @@ class History:
     the name of the way. recording: the name of what the frames came from, if known. last_frame: name and stamp of the
     one that was offered last.
     trusted: the last trusted frame of each sensor. waiting: refused frames that may yet be believed, by sensor.
+    path: the way that the sensors of the frames in the map went.
     """
 
     frames: int = 0
@@ -61,6 +55,7 @@ class History:
     last_frame: tuple[str, int] | None = None
     trusted: dict[str, Seen] = field(default_factory=dict)
     waiting: dict[str, Streak] = field(default_factory=dict)
+    path: CameraPath = field(default_factory=CameraPath)
 
     def offered(self, frame: object) -> None:
         """Remember which frame was the last."""
@@ -95,6 +90,7 @@ class History:
                     for name, streak in self.waiting.items()
                 },
             },
+            "camera_path": self.path.saved(),
         }
 
     @classmethod
@@ -105,15 +101,17 @@ class History:
         """
         frames, refused = _whole(saved["frames"], "frames"), _whole(saved["frames_refused"], "frames_refused")
         recording, last = one_line(str(saved["recording"])), _last_frame_from(saved.get("last_frame"))
-        told = saved.get("history")
+        told, path = saved.get("history"), _path_from(saved.get("camera_path"))
         if told is None:
-            return cls(frames, Counter({NOT_TOLD: refused} if refused else {}), recording=recording, last_frame=last)
+            return cls(
+                frames, Counter({NOT_TOLD: refused} if refused else {}), recording=recording, last_frame=last, path=path
+            )
         reasons, settled, ways = (_counts(told[name], name) for name in ("refused", "settled", "ways"))
         trusted = {name: _seen_from(seen) for name, seen in _sensors(told["trusted"]).items()}
         waiting = {name: _streak_from(streak) for name, streak in _sensors(told["waiting"]).items()}
         if not waiting.keys() <= trusted.keys():
             raise ValueError("history.waiting names a sensor that was never trusted")
-        history = cls(frames, reasons, settled, ways, recording, last, trusted, waiting)
+        history = cls(frames, reasons, settled, ways, recording, last, trusted, waiting, path)
         if history.refused.total() != refused:
             raise ValueError(f"frames_refused is {refused}, its reasons add up to {history.refused.total()}")
         return history
@@ -173,6 +171,13 @@ def _last_frame_from(saved: Any) -> tuple[str, int] | None:
     if saved is None:
         return None
     return _name(saved["name"]), _whole(saved["stamp_ns"], "last_frame: stamp_ns", EARLIEST)
+
+
+def _path_from(saved: Any) -> CameraPath:
+    """Return where the sensors went; maps from before it was kept do not know."""
+    if saved is None:
+        return CameraPath()
+    return CameraPath.loaded({**saved, "stops": _sensors(saved["stops"])})
 
 
 def _streak_from(saved: Any) -> Streak:

@@ -75,5 +75,6 @@ class Mapper:
     def _remember(self, passed: Passed, way: str, arrived_ns: int) -> None:
         self.map.history.frames += 1
         self.map.history.ways[way] += 1
+        self.map.history.path.walk(passed.sensor, passed.seen)
         self._gate.took(passed)
         self._watch.took(arrived_ns, passed.sensor, passed.seen.stamp_ns, way)

@@ -101,3 +101,47 @@ def test_a_link_for_this_machine_alone_promises_nothing_to_others(saved, capsys,
     monkeypatch.setattr(viewer.Viewer, "wait", lambda self: None)
     assert main(["view", str(saved), "--port", "0", "--token", "a" * 16]) == 0
     assert "whoever has this link can look at the map\n" in capsys.readouterr().err
+
+
+def test_a_recording_adds_a_timeline(saved, tmp_path, capsys, monkeypatch):
+    from stereovox.view import viewer
+
+    said = []
+
+    def look(page):
+        labels = [
+            handle.label for handle in page.server.gui._container_handle_from_uuid.values() if hasattr(handle, "label")
+        ]
+        said.append(labels)
+
+    monkeypatch.setattr(viewer.Viewer, "wait", look)
+    assert main(["view", str(saved), "--port", "0", "--recording", "sim:room", "--frames", ":3"]) == 0
+    assert main(["view", str(saved), "--port", "0"]) == 0
+    assert ["Recording" in labels for labels in said] == [True, False]
+    assert main(["view", str(saved), "--port", "0", "--recording", str(tmp_path / "nothing")]) == 2
+    assert main(["view", str(saved), "--port", "0", "--frames", ":3"]) == 2
+    assert "--frames: picks frames of --recording" in capsys.readouterr().err
+
+
+def test_map_shows_the_map_while_it_grows(tmp_path):
+    words = ["map", "sim:room", "--out", tmp_path / "room.svox", "--frames", ":4", "--voxel-size", "0.2", "--view", "0"]
+    command = [sys.executable, "-m", "stereovox", *map(str, words)]
+    running = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    line = running.stderr.readline()
+    url = next(word for word in line.split() if word.startswith("http://127.0.0.1:"))
+    while "Ctrl-C ends" not in line:
+        line = running.stderr.readline()
+        assert line
+    assert sv.load_map(tmp_path / "room.svox").frames == 4
+    with urllib.request.urlopen(url, timeout=60) as page:
+        assert page.status == 200
+    running.send_signal(signal.SIGINT)
+    assert running.wait(timeout=60) == 0
+
+
+def test_a_taken_port_is_told_before_a_map_is_made(tmp_path, capsys):
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        port = str(other.getsockname()[1])
+        assert main(["map", "sim:room", "--out", str(tmp_path / "room.svox"), "--frames", ":2", "--view", port]) == 2
+    assert "this port is in use" in capsys.readouterr().err
+    assert not (tmp_path / "room.svox").exists()

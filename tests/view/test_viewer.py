@@ -13,7 +13,6 @@ from stereovox import PinholeCamera, VoxelMap, load_config
 from stereovox.errors import MissingExtra, StereovoxError
 from stereovox.frame import Viewpoint
 from stereovox.maps import State
-from stereovox.view import viewer_cells
 from stereovox.view.scale import scale_of
 from stereovox.view.viewer import open_viewer
 from stereovox.view.viewer_camera import first_look, up_vector
@@ -75,15 +74,24 @@ def test_only_this_machine_can_look_and_nobody_can_publish(shown):
     assert shown.server.request_share_url() is None
 
 
+def positions(viewer, state=State.OCCUPIED):
+    """Centres of the cells in a state that the scene holds, in ascending order."""
+    nodes = viewer.cells.kinds[state].sent
+    parts = [node.batched_positions if state is State.OCCUPIED else node.points for node in nodes]
+    found = np.concatenate([np.empty((0, 3)), *parts])
+    return found[np.lexsort(found.T[::-1])]
+
+
 def test_occupied_cells_are_cubes_coloured_by_height(shown):
-    node = shown.cells.nodes[State.OCCUPIED]
+    (node,) = shown.cells.kinds[State.OCCUPIED].sent
     want = box_map().occupied()
-    assert np.allclose(node.batched_positions, want)
-    for height in np.unique(want[:, 2]):
-        assert len(np.unique(node.batched_colors[want[:, 2] == height], axis=0)) == 1
+    assert np.allclose(positions(shown), want)
+    heights = node.batched_positions[:, 2]
+    for height in np.unique(heights):
+        assert len(np.unique(node.batched_colors[heights == height], axis=0)) == 1
     assert len(np.unique(node.batched_colors, axis=0)) == 5
     assert np.allclose(np.ptp(node.vertices, axis=0), SIZE)
-    assert set(shown.cells.nodes) == {State.OCCUPIED}
+    assert not any(shown.cells.kinds[state].sent for state in (State.FREE, State.TENTATIVE, State.UNKNOWN))
 
 
 def test_a_cube_is_closed_and_faces_outwards():
@@ -96,40 +104,74 @@ def test_a_cube_is_closed_and_faces_outwards():
 def test_the_slider_leaves_out_what_is_above(shown):
     assert shown.cells.below.value == shown.cells.below.max == 1.0
     shown.cells.below.value = 0.6
-    positions = shown.cells.nodes[State.OCCUPIED].batched_positions
-    assert len(positions) == 2 * 3 * 3
-    assert positions[:, 2].max() < 0.6
+    assert len(positions(shown)) == len(shown.cells.solid) == 2 * 3 * 3
+    assert positions(shown)[:, 2].max() < 0.6
     shown.cells.show[State.OCCUPIED].value = False
-    assert not shown.cells.nodes[State.OCCUPIED].visible
+    assert not shown.cells.kinds[State.OCCUPIED].root.visible
     shown.cells.show[State.OCCUPIED].value = True
-    assert len(shown.cells.nodes[State.OCCUPIED].batched_positions) == 2 * 3 * 3
+    assert shown.cells.kinds[State.OCCUPIED].root.visible
+    shown.take(box_map())
+    assert shown.cells.below.value == 0.6
 
 
 def test_heights_follow_up():
     with closing(open_viewer(box_map(up="-y"), port=0)) as viewer:
         assert viewer.cells.below.label == "below -y [m]"
         viewer.cells.below.value = -0.4
-        assert np.allclose(viewer.cells.nodes[State.OCCUPIED].batched_positions[:, 1], 0.5)
+        assert np.allclose(positions(viewer)[:, 1], 0.5)
         assert viewer.layer.across.value == "y"
 
 
 def test_other_cells_come_when_asked_for(shown):
     for state, number in ((State.FREE, 29), (State.TENTATIVE, 1)):
         shown.cells.show[state].value = True
-        assert shown.cells.nodes[state].points.shape == (number, 3)
-        assert shown.cells.nodes[state].points.dtype == np.float32
+        assert len(positions(shown, state)) == number
         shown.cells.show[state].value = False
-        assert not shown.cells.nodes[state].visible
-    assert np.allclose(shown.cells.nodes[State.FREE].points, box_map().free())
+        assert not shown.cells.kinds[state].root.visible
+    assert np.allclose(positions(shown, State.FREE), box_map().free())
 
 
-def test_very_many_cells_become_points(monkeypatch):
-    monkeypatch.setattr(viewer_cells, "MOST_CUBES", 29)
-    with closing(open_viewer(box_map(), port=0)) as viewer:
-        node = viewer.cells.nodes[State.OCCUPIED]
-        assert np.allclose(node.points, box_map().occupied())
-        assert node.point_size == pytest.approx(SIZE)
-        assert node.point_shape == "square"
+def test_unknown_cells_are_those_beside_free_ones(shown):
+    shown.cells.below.max = shown.cells.below.value = 1.2
+    shown.cells.show[State.UNKNOWN].value = True
+    free, known = {tuple(c) for c in np.rint(box_map().free() / SIZE - 0.5)}, set()
+    known = {tuple(c) for c in box_map().cells()[0]}
+    steps = [tuple(s) for s in np.concatenate([np.eye(3), -np.eye(3)])]
+    want = {tuple(np.add(cell, step)) for cell in free for step in steps} - known
+    assert {tuple(c) for c in np.rint(positions(shown, State.UNKNOWN) / SIZE - 0.5)} == want
+
+
+def test_colours_may_tell_the_probability_or_the_age():
+    config = load_config(voxel_size=SIZE, **{"map.keep_times": True})
+    indices, log_odds = [[0, 0, 0], [1, 0, 0], [2, 0, 0]], [1.0, 3.0, 3.0]
+    voxel_map = VoxelMap.from_cells(config, indices, log_odds)
+    times = np.zeros((1, 512), np.uint32)
+    times[0, [0, 64, 128]] = 1, 200, 0
+    voxel_map.set_times(np.zeros((1, 3), np.int32), times, 0)
+    voxel_map.viewpoint = Viewpoint(CAMERA, LOOKS_ALONG_X, 10**9)
+    with closing(open_viewer(voxel_map, port=0)) as viewer:
+
+        def colours():
+            (node,) = viewer.cells.kinds[State.OCCUPIED].sent
+            return node.batched_colors[np.argsort(node.batched_positions[:, 0])].astype(int)
+
+        assert viewer.cells.colour.options == ("height", "probability", "age")
+        assert len(np.unique(colours(), axis=0)) == 1
+        viewer.cells.colour.value = "probability"
+        assert (colours()[1] == colours()[2]).all()
+        assert colours()[0].sum() > colours()[1].sum() + 50
+        viewer.cells.colour.value = "age"
+        assert viewer.cells.label.startswith("seconds")
+        assert len(np.unique(colours(), axis=0)) == 3
+        assert colours()[2].tolist() == [0x8A, 0x8F, 0x98]
+
+
+def test_another_map_takes_the_place_of_the_first(shown):
+    other = VoxelMap.from_cells(box_map().config, [[9, 9, 9]], [2.0])
+    shown.layer.show.value = True
+    shown.take(other)
+    assert np.allclose(positions(shown), other.occupied())
+    assert (shown.layer.at["x"].min, shown.layer.node.position[0]) == pytest.approx((1.9, 1.9))
 
 
 def test_the_layer_begins_at_the_camera_and_is_hidden(shown):
@@ -202,16 +244,20 @@ def test_a_map_without_camera_has_none():
 def test_an_empty_map_says_so():
     empty = VoxelMap(load_config())
     with closing(open_viewer(empty, port=0)) as viewer:
-        assert (viewer.layer, viewer.cells.nodes, viewer.cells.show) == (None, {}, {})
+        for state in State:
+            viewer.cells.show[state].value = True
+        viewer.layer.show.value = True
+        assert (viewer.layer.node, len(positions(viewer))) == (None, 0)
+        viewer.take(box_map())
+        assert len(positions(viewer)) == 30
+        assert viewer.layer.node is not None
     assert statistics(empty).startswith("This map is empty")
 
 
 @pytest.mark.parametrize("up", ["x", "y", "z", "-x", "-y", "-z"])
 def test_the_first_look_is_from_behind_and_above(up):
-    from stereovox.view.drawn import upright
-
     voxel_map = box_map(up)
-    look_from, look_at = first_look(voxel_map, upright(voxel_map, None, up))
+    look_from, look_at = first_look(voxel_map, up)
     away = look_from - look_at
     assert away @ up_vector(up) > 0.3
     if up[-1] != "x":  # there the camera looks straight up or down

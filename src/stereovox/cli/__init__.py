@@ -15,6 +15,7 @@ import sys
 from collections.abc import Sequence
 from importlib import import_module
 from itertools import pairwise
+from keyword import iskeyword
 from typing import Any, NoReturn
 
 import stereovox
@@ -28,6 +29,15 @@ COMMANDS = (
     "view",
     "sphere",
     "export",
+    "import",
+    "distance",
+    "path",
+    "crop",
+    "merge",
+    "diff",
+    "coarsen",
+    "frontiers",
+    "ground",
     "grid",
     "slam",
     "localize",
@@ -39,7 +49,10 @@ COMMANDS = (
     "eval",
     "reproduce",
 )
-"""Each is a module here with a docstring, `EXAMPLE`, `add_arguments(parser)` and `run(arguments) -> dict`."""
+"""Each is a module here with a docstring, `EXAMPLE`, `add_arguments(parser)` and `run(arguments) -> dict`.
+
+A module whose name Python keeps for itself has an underscore behind it.
+"""
 
 ALONE = ("-h", "--help", "--version")
 """Options that stand before a command, or without one."""
@@ -145,4 +158,4 @@ def _check_command(words: Sequence[str]) -> None:
 
 
 def _module(name: str) -> Any:
-    return import_module(f"stereovox.cli.{name}")
+    return import_module(f"stereovox.cli.{name}{'_' * iskeyword(name)}")

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Write a map for other programs; the ending of FILE chooses the format.
 
-.bt and .ot for OctoMap, .ply for point cloud viewers, .npz for NumPy; .pgm, .png or .yaml for map_server: the map seen
-from above, as a picture and its .yaml.
+.bt and .ot for OctoMap, .ply and .pcd for point cloud viewers, .npz for NumPy, .glb for browsers and Blender, .obj and
+.stl for modellers; .bag, .mcap and .db3 for ROS; .pgm, .png or .yaml for map_server: the map seen from above, as a
+picture and its .yaml. The map of a floor (.yaml) goes into a bag as well.
 """
 
 from __future__ import annotations
@@ -11,53 +12,58 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import Any
 
-from stereovox.cli.saved_map import open_cubes, open_map
+from stereovox.cli.numbers import heights_of
+from stereovox.cli.saved_map import dimensions, open_map, refuse_options
 from stereovox.cli.terminal import say, size
-from stereovox.errors import StereovoxError
 
 EXAMPLE = "stereovox export kitchen.svox kitchen.bt"
 
 
 def add_arguments(parser: ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("map", metavar="MAP", help="folder of a map")
+    parser.add_argument("map", metavar="MAP", help="folder of a map; for a bag also the .yaml of a floor's map")
     parser.add_argument("file", metavar="FILE", help="file to write")
     parser.add_argument(
         "--heights",
         metavar="LO:HI",
-        help="2-D maps: heights in metres between which obstacles count (the map's scan.heights); what is free at any"
-        " height is cleared. Below zero: --heights=-0.5:1",
+        help="2-D maps and bags: heights in metres between which obstacles count (the map's scan.heights); what is free"
+        " at any height is cleared. Below zero: --heights=-0.5:1",
+    )
+    parser.add_argument(
+        "--inflate", type=float, metavar="R", help="2-D maps: grow obstacles by a robot's radius in metres and one cell"
     )
 
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Load the map and write it in the other format."""
-    from stereovox.products import FLAT, export
+    from stereovox.products import BAGS, FLAT, export
 
-    file, heights = Path(arguments.file), _heights(arguments.heights)
-    flat = file.suffix.lower() in FLAT
-    voxel_map = open_map(arguments.map) if flat else open_cubes(arguments.map)  # seen from above, most need no cubes
-    export(voxel_map, file, heights)
+    file, heights = Path(arguments.file), heights_of(arguments.heights)
+    ending = file.suffix.lower()
+    if dimensions(arguments.map) == 2 and ending in BAGS:
+        return _floor(arguments)
+    voxel_map = open_map(arguments.map)
+    export(voxel_map, file, heights, arguments.inflate)
     result: dict[str, Any] = {"file": str(file), "bytes": file.stat().st_size}
-    if flat:
+    beside = ""
+    if ending in (*FLAT, *BAGS):
         low, high = result["heights"] = heights or voxel_map.config.scan.heights
         say(f"seen from above: what is {low:g} to {high:g} m high marks a cell; others: --heights=LO:HI")
-        beside = file.with_suffix(".pgm" if file.suffix.lower() == ".yaml" else ".yaml")
-        say(f"saved {file} and {beside}")
-    else:
-        say(f"saved {file} ({size(file.stat().st_size)})")
+    if arguments.inflate is not None:
+        result["inflated_m"] = arguments.inflate
+        say(f"obstacles grown by {arguments.inflate:g} m and one cell")
+    if ending in FLAT:
+        beside = f" and {file.with_suffix('.pgm' if ending == '.yaml' else '.yaml')}"
+    say(f"saved {file}{beside} ({size(result['bytes'])})")
     return result
 
 
-def _heights(text: str | None) -> tuple[float, float] | None:
-    """Return what --heights says; raises StereovoxError where that is not LO:HI."""
-    if text is None:
-        return None
-    low, _, high = text.partition(":")
-    try:
-        heights = float(low), float(high)
-    except ValueError:
-        raise StereovoxError(f"--heights {text}: write LO:HI in metres, for example --heights 0.1:1.8") from None
-    if not heights[0] < heights[1]:
-        raise StereovoxError(f"--heights {text}: the second must be higher than the first")
-    return heights
+def _floor(arguments: Namespace) -> dict[str, Any]:
+    """Write the map of a floor into a bag."""
+    from stereovox.products.bag_maps import write_grid_bag
+    from stereovox.products.map_server import read_map_server
+
+    refuse_options(arguments, ["heights", "inflate"], "a floor's map goes into a bag as it is")
+    write_grid_bag(read_map_server(arguments.map), arguments.file)
+    say(f"saved {arguments.file}")
+    return {"file": arguments.file, "bytes": Path(arguments.file).stat().st_size}

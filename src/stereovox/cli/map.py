@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stereovox.cli.checkpoints import Checkpoints, add_checkpoint
+from stereovox.cli.live_page import page_of
 from stereovox.cli.robots import GRID_FILES
 from stereovox.cli.settings import add_settings, overrides
 from stereovox.cli.terminal import (
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
     from stereovox.sources import Stream
     from stereovox.update_report import UpdateReport
 
+PORT = 8080
 PATIENCE = 100
 """Frames of a live camera that a run may refuse before the first that it does not."""
 EXAMPLE = "stereovox map recordings/kitchen --out kitchen.svox --voxel-size 0.05"
@@ -63,6 +65,14 @@ def add_arguments(parser: ArgumentParser) -> None:
         help="go on with the map at --out; as many frames of SOURCE are skipped as it has seen",
     )
     add_checkpoint(parser)
+    parser.add_argument(
+        "--view",
+        type=int,
+        nargs="?",
+        const=PORT,
+        metavar="PORT",
+        help=f"show the map in a browser while it grows, and then until Ctrl-C ({PORT}; 0: any port that is free)",
+    )
 
 
 def run(arguments: Namespace) -> dict[str, Any]:
@@ -89,18 +99,22 @@ def _mapped(arguments: Namespace, out: Path) -> dict[str, Any]:
         _check_recording(mapper, source, out)
         for note in source.notes:
             say(f"note: {note}")
-        say_about_compiling()
-        with interrupt_between_steps() as check, _there_at_once(mapper.map, out):
-            reports = _add_all(mapper, source, out, checkpoints, check)
-            result = summarise(mapper.map, reports) | ({"dropped": source.dropped} if source.length is None else {})
-            if not mapper.map.frames:
-                raise StereovoxError(
-                    f"{arguments.source}: not one frame could be used, no map is written ({_first_refusal(reports)})"
-                )
-            checkpoints.save(_seen(mapper))
+        with page_of(mapper, out.stem, arguments.view) as page:
+            say_about_compiling()
+            with interrupt_between_steps() as check, _there_at_once(mapper.map, out):
+                reports = _add_all(mapper, source, out, checkpoints, check, page.after)
+                result = summarise(mapper.map, reports) | ({"dropped": source.dropped} if source.length is None else {})
+                if not mapper.map.frames:
+                    raise StereovoxError(
+                        f"{arguments.source}: not one frame could be used, no map is written "
+                        f"({_first_refusal(reports)})"
+                    )
+                checkpoints.save(_seen(mapper))
+            page.finish()
+            _tell(result, reports, out, mapper.config.window)
+            page.stay()
     finally:
         mapper.map.close()
-    _tell(result, reports, out, mapper.config.window)
     return result
 
 
@@ -141,7 +155,7 @@ def _grid(arguments: Namespace) -> dict[str, Any]:
     """Do what `stereovox grid` does; it has more options."""
     from stereovox.cli import grid
 
-    for option in ("camera", "integrator", "threads"):
+    for option in ("camera", "integrator", "threads", "view"):
         if getattr(arguments, option) is not None:
             raise StereovoxError(f"--{option}: has no meaning for the map of a floor; leave it out")
     if arguments.resume and not Path(arguments.out).exists():
@@ -186,9 +200,17 @@ def _check_recording(mapper: Mapper, source: Stream, out: Path) -> None:
 
 
 def _add_all(
-    mapper: Mapper, source: Stream, out: Path, checkpoints: Checkpoints, check: Callable[[], None]
+    mapper: Mapper,
+    source: Stream,
+    out: Path,
+    checkpoints: Checkpoints,
+    check: Callable[[], None],
+    after: Callable[[AnyFrame, UpdateReport], None],
 ) -> list[UpdateReport]:
-    """Add all frames that the map does not hold yet; where `check` says that it is enough, save what there is."""
+    """Add all frames that the map does not hold yet; where `check` says that it is enough, save what there is.
+
+    after: is told of each frame.
+    """
     reports: list[UpdateReport] = []
     done = _seen(mapper)
     if done:
@@ -205,6 +227,7 @@ def _add_all(
     try:
         for frame in tracked(source, source.length, "mapping"):
             reports.append(_added(mapper, frame, checkpoints))
+            after(frame, reports[-1])
             check()
             if mapper.map.frames:  # an empty map must not take the place of an older one
                 checkpoints.after(_seen(mapper))

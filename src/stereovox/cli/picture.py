@@ -6,11 +6,11 @@ A floor's map in map_server files (.yaml) is drawn as a plan; --view and what go
 
 from __future__ import annotations
 
-import math
-from argparse import ArgumentParser, ArgumentTypeError, Namespace
+from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from stereovox.cli.points import point
 from stereovox.cli.saved_map import dimensions, open_cubes, refuse_options
 from stereovox.cli.terminal import say
 from stereovox.errors import StereovoxError
@@ -33,8 +33,8 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--up", metavar="AXIS", help="which way is up: z, -y, x ... (default: as the map's settings say)"
     )
-    parser.add_argument("--eye", type=_point, metavar="X,Y,Z", help="where the camera is (default: the last frame's)")
-    parser.add_argument("--toward", type=_point, metavar="X,Y,Z", help="a point on its optical axis; goes with --eye")
+    parser.add_argument("--eye", type=point, metavar="X,Y,Z", help="where the camera is (default: the last frame's)")
+    parser.add_argument("--toward", type=point, metavar="X,Y,Z", help="a point on its optical axis; goes with --eye")
     parser.add_argument("--title", metavar="TEXT", help="title instead of the map's name")
 
 
@@ -96,17 +96,6 @@ def _tell_if_outside(voxel_map: VoxelMap, up: str, at_m: float) -> None:
     low, high = sorted(bounds[:, "xyz".index(up[-1])] * (-1 if up.startswith("-") else 1) + 0.0)  # no "-0"
     if not low <= at_m < high:
         say(f"note: --at {at_m:g} is outside the map ({up} = {low:g} to {high:g} m): all cells there are unknown")
-
-
-def _point(text: str) -> tuple[float, float, float]:
-    """Return three numbers in metres."""
-    try:
-        x, y, z = map(float, text.split(","))
-    except ValueError:
-        x = y = z = math.nan
-    if not math.isfinite(x + y + z):
-        raise ArgumentTypeError(f"'{text}' is no point; give X,Y,Z in metres")
-    return x, y, z
 
 
 def _plain(text: str) -> str:

@@ -3,10 +3,7 @@
 
 from __future__ import annotations
 
-import io
 import json
-import math
-import zipfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +13,7 @@ from stereovox.config import load_config
 from stereovox.errors import MapFileError
 from stereovox.files import replacing
 from stereovox.history import History
+from stereovox.maps.arrays_file import read_arrays
 from stereovox.maps.grid_evidence import CELLS
 from stereovox.maps.lock import only_writer_of
 from stereovox.untrusted import json_value
@@ -24,9 +22,7 @@ if TYPE_CHECKING:
     from stereovox.maps.grid_map import GridMap
 
 FORMAT, VERSION = "stereovox-grid", 1
-PARTS = ("about.npy", "coords.npy", "cells.npy")
-SMALL, PACKED_BEST = 1 << 26, 200
-"""A file may unpack to so many bytes, or to so many for each of its own; more is taken for a lie."""
+PARTS = ("about", "coords", "cells")
 
 
 def save_grid(grid_map: GridMap, path: str | Path) -> None:
@@ -45,7 +41,7 @@ def load_grid(path: str | Path) -> GridMap:
     from stereovox.maps.grid_map import GridMap
 
     try:
-        parts = _read(Path(path))
+        parts = read_arrays(path, PARTS, "grid; make one with GridMap.save")
         about = json_value(parts["about"].tobytes())
         if about["format"] != FORMAT or about["version"] != VERSION:
             raise ValueError(f"format {about['format']} {about['version']}, not {FORMAT} {VERSION}")
@@ -79,28 +75,3 @@ def _about(grid_map: GridMap) -> dict[str, Any]:
         **grid_map.history.saved(),
         "config": grid_map.config.model_dump(),
     }
-
-
-def _read(path: Path) -> dict[str, np.ndarray]:
-    with zipfile.ZipFile(path) as file:
-        sizes = {entry.filename: entry.file_size for entry in file.infolist()}
-        kinds = {entry.compress_type for entry in file.infolist()}
-        if len(file.infolist()) != len(PARTS) or sorted(sizes) != sorted(PARTS):
-            raise MapFileError(f"{path}: holds no grid; make one with GridMap.save")
-        if not kinds <= {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}:
-            raise ValueError("packed in a way that is not used here")
-        if sum(sizes.values()) > max(SMALL, PACKED_BEST * path.stat().st_size):
-            raise ValueError(f"unpacks to {sum(sizes.values())} bytes")
-        return {name.removesuffix(".npy"): _array(file, name, sizes[name]) for name in PARTS}
-
-
-def _array(file: zipfile.ZipFile, name: str, size: int) -> np.ndarray:
-    """Return an array of a file whose entry has `size` bytes unpacked; nothing is allocated for a shape that lies."""
-    with file.open(name) as entry:
-        data = entry.read(size)
-    stream = io.BytesIO(data)
-    version = np.lib.format.read_magic(stream)
-    shape, _, dtype = getattr(np.lib.format, f"read_array_header_{version[0]}_{version[1]}")(stream)
-    if dtype.hasobject or math.prod(shape) * dtype.itemsize != len(data) - stream.tell():
-        raise ValueError(f"{name} tells of {shape} {dtype} and holds {len(data) - stream.tell()} bytes")
-    return np.frombuffer(data, dtype, offset=stream.tell()).reshape(shape)

@@ -90,7 +90,7 @@ def cast_rays(
     _check_number("origins", origins, "directions", directions)
     if not directions.any(axis=1).all():
         raise StereovoxError(f"direction {np.flatnonzero(~directions.any(axis=1))[0]} is (0, 0, 0) and leads nowhere")
-    n, wanted = len(directions), _bits(stop_at, "stop_at")
+    n, wanted = len(directions), state_bits(stop_at, "stop_at")
     hits = RayHits(np.full(n, np.inf, np.float32), np.full((n, 3), NO_CELL, np.int32), np.zeros(n, np.uint8))
     _query_rays.cast(*_read(asked), wanted, asked.sides, origins, directions, _distance(max_distance), *hits)
     return hits
@@ -121,11 +121,24 @@ def check_capsules(asked: Asked, start: ArrayLike, end: ArrayLike, radius: Array
 
 def nearest(asked: Asked, points: ArrayLike, max_distance: float, obstacles: Iterable[State]) -> NearestCells:
     """Return what is nearest to points; see `VoxelMap.nearest_obstacle`."""
-    points, wanted = _within_limits(asked, _vectors(points, "points"), "points"), _bits(obstacles, "obstacles")
+    points, wanted = _within_limits(asked, _vectors(points, "points"), "points"), state_bits(obstacles, "obstacles")
     n = len(points)
     found = NearestCells(np.full(n, np.inf, np.float32), np.full((n, 3), NO_CELL, np.int32))
     _query_nearest.nearest(*_read(asked), wanted, asked.sides, points, _distance(max_distance), *found)
     return found
+
+
+def state_bits(states: Iterable[State], name: str) -> NDArray[np.uint8]:
+    """Return a set of states (not FREE) as the bits (1,) of one number; raises StereovoxError for anything else."""
+    try:
+        wanted = {index(state) for state in ([states] if isinstance(states, int) else states)}
+    except TypeError:
+        wanted = set()
+    if not wanted or not wanted <= set(BADNESS[1:]):
+        raise StereovoxError(
+            f"{name}: give one or more of State.UNKNOWN, State.TENTATIVE and State.OCCUPIED, not {_told(states)}"
+        )
+    return np.bitwise_or.reduce(_each(wanted)).reshape(1)
 
 
 def _read(asked: Asked) -> tuple[StoredCells, Thresholds]:
@@ -138,19 +151,6 @@ def _states_of(levels: NDArray[np.int8]) -> NDArray[np.uint8]:
 
 def _each(states: Iterable[int]) -> NDArray[np.uint8]:
     return np.array([1 << state for state in states], np.uint8)
-
-
-def _bits(states: Iterable[State], name: str) -> NDArray[np.uint8]:
-    """Return a set of states as the bits (1,) of one number."""
-    try:
-        wanted = {index(state) for state in ([states] if isinstance(states, int) else states)}
-    except TypeError:
-        wanted = set()
-    if not wanted or not wanted <= set(BADNESS[1:]):
-        raise StereovoxError(
-            f"{name}: give one or more of State.UNKNOWN, State.TENTATIVE and State.OCCUPIED, not {_told(states)}"
-        )
-    return np.bitwise_or.reduce(_each(wanted)).reshape(1)
 
 
 def _numbers(values: ArrayLike, name: str, wanted: str) -> NDArray:

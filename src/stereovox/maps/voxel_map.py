@@ -94,6 +94,16 @@ class VoxelMap(WithHistory):
         unbounded.take_history(self)
         return unbounded
 
+    def snapshot(self) -> VoxelMap:
+        """Return a copy to look at while this map goes on: of all cells, or of those in the window."""
+        copy = VoxelMap(self.config)
+        for coords, cells in self._pool.pieces():
+            copy.insert(coords, cells)
+            if self._times is not None:
+                copy.set_times(coords, self._times.get(coords), self._times.start_ns)
+        copy.take_history(self)
+        return copy
+
     def take_history(self, earlier: VoxelMap) -> None:
         """Take over what `earlier` says of the frames that are in it."""
         self.history, self.viewpoint = earlier.history.copied(), earlier.viewpoint
@@ -173,11 +183,11 @@ class VoxelMap(WithHistory):
         """
         points = queries.points_of(points)
         known = self._stored_at(points) != self._format.unknown
-        return self._seconds_ago(np.where(known, self._times_at(points), NEVER), now_ns)
+        return self._seconds_ago(np.where(known, self.times_at(points), NEVER), now_ns)
 
     def ages(self, now_ns: int | None = None) -> NDArray[np.float32]:
         """Return the `age` (N,) of all known cells, in the order of `cells`."""
-        found = [_cells_where(coords, times, cells != self._format.unknown) for coords, cells, times in self.timed()]
+        found = [cells_where(coords, times, cells != self._format.unknown) for coords, cells, times in self.timed()]
         indices, times = (np.concatenate(part) for part in zip(*found, strict=True))
         return self._seconds_ago(times[np.lexsort(indices.T[::-1])], now_ns)
 
@@ -336,7 +346,7 @@ class VoxelMap(WithHistory):
             raise StereovoxError("the map does not keep when cells were seen; make it with map.keep_times = true")
         return self._times
 
-    def _times_at(self, points: NDArray[np.floating]) -> NDArray[np.uint32]:
+    def times_at(self, points: NDArray[np.floating]) -> NDArray[np.uint32]:
         """Return the times (N,) of the cells at points, NEVER where no cell can be."""
         times = np.zeros(len(points), np.uint32)
         within = (np.abs(points) < INDEX_LIMIT * np.array(self.config.cell)).all(axis=1)  # False for NaN
@@ -363,13 +373,13 @@ class VoxelMap(WithHistory):
         self, chosen: Callable[[NDArray[np.integer]], NDArray[np.bool_]]
     ) -> tuple[NDArray[np.int32], NDArray[np.integer]]:
         """Return indices (N, 3) of the cells whose stored numbers are `chosen`, in ascending order, and these (N,)."""
-        found = [_cells_where(coords, values, chosen(values)) for coords, values in self.slabs()]
+        found = [cells_where(coords, values, chosen(values)) for coords, values in self.slabs()]
         indices, stored = (np.concatenate(part) for part in zip(*found, strict=True))
         order = np.lexsort(indices.T[::-1])
         return indices[order], stored[order]
 
 
-def _cells_where(
+def cells_where(
     coords: NDArray[np.int32], values: NDArray[np.integer], chosen: NDArray[np.bool_]
 ) -> tuple[NDArray[np.int32], NDArray[np.integer]]:
     """Return indices (N, 3) and stored numbers (N,) of the `chosen` cells (n, 512) of blocks (n, 3)."""

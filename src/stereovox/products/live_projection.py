@@ -15,7 +15,8 @@ from stereovox.maps.occupancy import UNKNOWN, OccupancyGrid
 from stereovox.maps.percent import Percent
 from stereovox.maps.rolling import RollingMap
 from stereovox.maps.voxel_map import EVERYWHERE
-from stereovox.products.projection import NOTHING, Heights, Patch, axes_of, layers_of, patch_of
+from stereovox.products.floor_axes import Heights, floor_axes
+from stereovox.products.projection import NOTHING, Patch, layers_of, patch_of
 
 STEP = 8 * SIDE
 """The grid grows by so many cells: programs that plan in it need not make room anew with each frame."""
@@ -33,7 +34,7 @@ class LiveProjection:
 
     def __init__(self, voxel_map: VoxelMap, heights: Heights | None = None):
         self._map, config = voxel_map, voxel_map.config
-        self._order = axes_of(config.up)
+        self._order = list(floor_axes(config.up)[:3])
         across, along, up = self._order
         if config.cell[across] != config.cell[along]:
             raise StereovoxError(f"steps {list(config.cell)}: a grid of the floor needs cells as long as wide")

@@ -50,12 +50,20 @@ def read_octomap(path: str | Path) -> VoxelMap:
     content = _read(Path(path))
     try:
         title, header, body = _split(content)
-        size, voxel_size = _size(header), _voxel_size(header)
-        config = load_config(voxel_size=voxel_size, **OCTOMAP)
-        leaves = _binary_leaves(body, size, config) if title == BINARY_TITLE else _tree_leaves(body, size)
-        return _map_of(leaves, _with_limits(config, leaves.log_odds))
+        return map_of_nodes(title, body, _voxel_size(header), _size(header))
     except (ValueError, ConfigError) as error:
         raise MapFileError(f"{path}: not a whole OctoMap file: {error}; export it again") from None
+
+
+def map_of_nodes(title: str, body: bytes, voxel_size: float, size: int | None = None) -> VoxelMap:
+    """Return the map in the nodes `body` of a tree, those of BINARY_TITLE or of TREE_TITLE.
+
+    voxel_size: metres. size: how many nodes there should be, if that is known.
+    Raises ValueError for damaged nodes, ConfigError for a size that no cell can have.
+    """
+    config = load_config(voxel_size=voxel_size, **OCTOMAP)
+    leaves = _binary_leaves(body, size, config) if title == BINARY_TITLE else _tree_leaves(body, size)
+    return _map_of(leaves, _with_limits(config, leaves.log_odds))
 
 
 def _read(path: Path) -> bytes:
@@ -101,11 +109,11 @@ def _voxel_size(header: dict[str, str]) -> float:
         raise ValueError(f"its res '{text}' is not a number of metres") from None
 
 
-def _binary_leaves(body: bytes, size: int, config: Config) -> _Leaves:
+def _binary_leaves(body: bytes, size: int | None, config: Config) -> _Leaves:
     if len(body) % 2:
         raise ValueError("it ends inside a node")
     records = np.frombuffer(body, "<u2")
-    _check_size(size, _nodes_in(body), len(body))
+    size = _checked_size(size, _nodes_in(body), len(body))
     corners, heights = _room_for(size)
     occupied = np.zeros(size, bool)
     n = _octree.read_binary_leaves(records, corners, heights, occupied)
@@ -121,11 +129,11 @@ def _nodes_in(body: bytes) -> int:
     return int(numbers @ pairs) + 1 if body else 0
 
 
-def _tree_leaves(body: bytes, size: int) -> _Leaves:
+def _tree_leaves(body: bytes, size: int | None) -> _Leaves:
     if len(body) % TREE_NODE.itemsize:
         raise ValueError("it ends inside a node")
     nodes = np.frombuffer(body, TREE_NODE)
-    _check_size(size, len(nodes), len(body))
+    size = _checked_size(size, len(nodes), len(body))
     corners, heights = _room_for(size)
     records = np.zeros(size, np.int64)
     n = _octree.read_tree_leaves(nodes["children"].copy(), corners, heights, records)
@@ -135,13 +143,14 @@ def _tree_leaves(body: bytes, size: int) -> _Leaves:
     return _Leaves(corners[:n], heights[:n], log_odds)
 
 
-def _check_size(size: int, found: int, length: int) -> None:
+def _checked_size(size: int | None, found: int, length: int) -> int:
     if not found:
         raise ValueError("it holds no cell: the map was empty when it was saved, or the rest is lost")
     if found > MOST_NODES:
         raise ValueError(f"its {found} nodes are more than {MOST_NODES}")
-    if size != found:
+    if size not in (None, found):
         raise ValueError(f"its header says {size} nodes, its {length} bytes of data hold {found}")
+    return found
 
 
 def _room_for(size: int) -> tuple[NDArray[np.int32], NDArray[np.uint8]]:

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A map as plain points: `.ply` for point cloud viewers, `.npz` for NumPy."""
+"""A map as plain points: `.ply` and `.pcd` for point cloud programs, `.npz` for NumPy."""
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ PLY_POINT = np.dtype(
     ]
 )  # fmt: skip
 PLY_TYPES = {"f": "float", "u": "uchar"}
+PCD_POINT = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<u4"), ("probability", "<f4")])
 HEIGHT_RAMP = ((40, 60, 180), (30, 160, 210), (70, 190, 90), (240, 200, 50), (200, 40, 30))
 """Red, green and blue at equal steps from the lowest to the highest point."""
 
@@ -41,11 +43,28 @@ def write_ply(voxel_map: VoxelMap, path: str | Path) -> None:
         file.write(points.tobytes())
 
 
+def write_pcd(voxel_map: VoxelMap, path: str | Path) -> None:
+    """Write the occupied cells as PCL's binary point cloud, with what `write_ply` tells of them.
+
+    Raises MapFileError when the place cannot be written.
+    """
+    centers = voxel_map.occupied()
+    points = np.empty(len(centers), PCD_POINT)
+    for axis, name in enumerate("xyz"):
+        points[name] = centers[:, axis]
+    points["rgb"] = height_colours(centers[:, 2]).astype(np.uint32) @ np.array([1 << 16, 1 << 8, 1], np.uint32)
+    points["probability"] = voxel_map.probability(centers)
+    with replacing(path) as file:
+        file.write(_pcd_header(len(points), voxel_map.voxel_size).encode("ascii"))
+        file.write(points.tobytes())
+
+
 def write_npz(voxel_map: VoxelMap, path: str | Path) -> None:
-    """Write every known cell for `numpy.load`.
+    """Write every known cell for `numpy.load`, and the settings, so that `npz_read.read_npz` gives the same cells.
 
     Arrays: `indices` (N, 3) int32, cell i covers [i, i + 1) * voxel_size; `log_odds` (N,) float32; and the numbers
     `voxel_size` in metres, `free_below` and `occupied_above` (probabilities). What is not named is unknown.
+    `settings` (M,) uint8 is JSON.
     Raises MapFileError when the place cannot be written.
     """
     indices, log_odds = voxel_map.cells()
@@ -58,6 +77,7 @@ def write_npz(voxel_map: VoxelMap, path: str | Path) -> None:
             voxel_size=np.float64(voxel_map.voxel_size),
             free_below=np.float64(min(limits.free_below, limits.prior)),
             occupied_above=np.float64(limits.occupied_above),
+            settings=np.frombuffer(json.dumps(voxel_map.config.model_dump()).encode(), np.uint8),
         )
 
 
@@ -75,9 +95,32 @@ def _ply_header(number: int, voxel_size: float) -> str:
     lines = [
         "ply",
         "format binary_little_endian 1.0",
-        f"comment centres of occupied cells of {voxel_size!r} m",
+        f"comment {_told(voxel_size)}",
         f"element vertex {number}",
         *properties,
         "end_header",
     ]
     return "\n".join([*lines, ""])
+
+
+def _pcd_header(number: int, voxel_size: float) -> str:
+    names = PCD_POINT.names or ()
+    lines = [
+        f"# {_told(voxel_size)}",
+        "VERSION 0.7",
+        f"FIELDS {' '.join(names)}",
+        f"SIZE {' '.join(str(PCD_POINT[name].itemsize) for name in names)}",
+        f"TYPE {' '.join(PCD_POINT[name].kind.upper() for name in names)}",
+        f"COUNT {' '.join('1' * len(names))}",
+        f"WIDTH {number}",
+        "HEIGHT 1",
+        "VIEWPOINT 0 0 0 1 0 0 0",
+        f"POINTS {number}",
+        "DATA binary",
+    ]
+    return "\n".join([*lines, ""])
+
+
+def _told(voxel_size: float) -> str:
+    """Return what a file says of its points; `point_files` reads the size of a cell from it."""
+    return f"centres of occupied cells of {voxel_size!r} m"

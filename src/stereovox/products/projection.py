@@ -17,6 +17,8 @@ from stereovox.maps.cubes import in_cubes
 from stereovox.maps.occupancy import UNKNOWN, OccupancyGrid
 from stereovox.maps.percent import Percent
 from stereovox.products import _projection
+from stereovox.products.floor_axes import Heights, floor_axes
+from stereovox.products.inflate import inflated_grid
 from stereovox.products.map_server import write_map_server
 
 NOTHING = np.iinfo(np.int16).min
@@ -24,7 +26,6 @@ NOTHING = np.iinfo(np.int16).min
 MOST_CELLS = 2**30
 """Cells of the largest grid."""
 TIE = 1e-9
-Heights = tuple[float, float]
 
 
 class Patch(NamedTuple):
@@ -48,35 +49,32 @@ def project(voxel_map: VoxelMap, heights: Heights | None = None) -> OccupancyGri
     for x, z and x for y, and with a minus the same two swapped. Uneven cells become cubes where the floor needs it.
     Raises StereovoxError, one line, where no cell between the heights is known, or the grid were too large.
     """
-    order = axes_of(voxel_map.config.up)
+    order = list(floor_axes(voxel_map.config.up)[:3])
     if voxel_map.config.cell[order[0]] != voxel_map.config.cell[order[1]]:
         voxel_map = in_cubes(voxel_map)
-    axis, heights = order[2], heights or voxel_map.config.scan.heights
-    layers = layers_of(voxel_map, axis, heights)
+    heights = heights or voxel_map.config.scan.heights
+    layers = layers_of(voxel_map, order[2], heights)
     patches = [patch_of(voxel_map, *slab, order, layers) for slab in voxel_map.slabs() if len(slab[0])]
     patch = _joined(patches)
     if patch is None or not (patch.marked != NOTHING).any():
-        raise StereovoxError(_nothing_there(voxel_map, axis, heights))
+        raise StereovoxError(_nothing_there(voxel_map, order[2], heights))
     return _grid(voxel_map, patch, voxel_map.config.cell[order[0]])
 
 
-def write_grid(voxel_map: VoxelMap, path: str | Path, heights: Heights | None = None) -> None:
+def write_grid(
+    voxel_map: VoxelMap, path: str | Path, heights: Heights | None = None, inflate: float | None = None
+) -> None:
     """Write the map seen from above as map_server's two files, a picture and its .yaml; `path` names either.
 
-    heights: see `project`. Raises StereovoxError as `project` and `write_map_server` do.
+    heights: see `project`. inflate: radius of a robot in metres by which obstacles grow, with a margin of one cell.
+    Raises StereovoxError as `project`, `inflated_grid` and `write_map_server` do.
     """
     try:
         grid = project(voxel_map, heights)
+        grid = grid if inflate is None else inflated_grid(grid, inflate)
     except StereovoxError as error:
         raise StereovoxError(f"{path}: {error}") from None
     write_map_server(grid, path)
-
-
-def axes_of(up: str) -> list[int]:
-    """Return which axes of a map go along columns, along rows and up; up: as in the settings."""
-    axis = "xyz".index(up[-1])
-    floor = [(axis + 1) % 3, (axis + 2) % 3]
-    return [*(reversed(floor) if up.startswith("-") else floor), axis]
 
 
 def layers_of(voxel_map: VoxelMap, axis: int, heights: Heights) -> NDArray[np.int64]:
@@ -101,7 +99,7 @@ def patch_of(
 ) -> Patch:
     """Return what blocks (n, 3), n > 0, with their cells (n, 512) as stored, show from above.
 
-    order, layers: as `axes_of` and `layers_of` return them.
+    order: axes along columns, along rows and up, see `floor_axes`; layers: as `layers_of` returns them.
     """
     floor = coords[:, order[:2]].astype(np.int64)
     low, high = floor.min(axis=0) * SIDE, (floor.max(axis=0) + 1) * SIDE

@@ -18,7 +18,7 @@ from stereovox.geometry import Transform, rigidity_error
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.planar import lifted
 from stereovox.sources.bag_metadata import sibling
-from stereovox.sources.bag_writer_file import TF_MESSAGE, BagFileWriter
+from stereovox.sources.bag_writer_file import OCTOMAP, TF_MESSAGE, BagFileWriter
 from stereovox.sources.bag_writer_messages import Messages, metres, millimetres, packed_png
 
 IMAGE, PACKED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
@@ -146,6 +146,28 @@ class BagWriter:
         """Write a `nav_msgs/OccupancyGrid`, kept for who comes later (latched)."""
         message = self._messages.occupancy(grid, stamp_ns, frame_id)
         self._write(topic, "nav_msgs/msg/OccupancyGrid", stamp_ns, message, latched=True)
+
+    def octomap(
+        self,
+        stamp_ns: int,
+        tree: bytes,
+        resolution: float,
+        topic: str = "/octomap_full",
+        frame_id: str = "map",
+        *,
+        binary: bool = False,
+    ) -> None:
+        """Write an `octomap_msgs/Octomap`, latched: the nodes of an OcTree as in an `.ot` file, binary: in a `.bt`.
+
+        resolution: side of a cell in metres.
+        """
+        message = self._messages.octomap(tree, binary, resolution, stamp_ns, frame_id)
+        self._write(topic, OCTOMAP, stamp_ns, message, latched=True)
+
+    def cloud(self, stamp_ns: int, points: ArrayLike, topic: str = "/occupied_cells", frame_id: str = "map") -> None:
+        """Write a `sensor_msgs/PointCloud2` of (N, 3) metres, latched."""
+        message = self._messages.cloud(np.asarray(points, np.float32).reshape(-1, 3), stamp_ns, frame_id)
+        self._write(topic, "sensor_msgs/msg/PointCloud2", stamp_ns, message, latched=True)
 
     def _write(self, topic: str, kind: str, stamp_ns: int, message: Any, latched: bool = False) -> None:
         self._last_ns = stamp_ns

@@ -17,7 +17,12 @@ from stereovox.sources.bag_files import one_line
 
 SECONDS = {1: 2**32, 2: 2**31}
 """Seconds that a time of ROS 1 (uint32) and of ROS 2 (int32) can count."""
-TF_MESSAGE = "tf2_msgs/msg/TFMessage"
+TF_MESSAGE, OCTOMAP = "tf2_msgs/msg/TFMessage", "octomap_msgs/msg/Octomap"
+NOT_IN_ROSBAGS = {
+    TF_MESSAGE: "geometry_msgs/TransformStamped[] transforms\n",
+    OCTOMAP: "std_msgs/Header header\nbool binary\nstring id\nfloat64 resolution\nint8[] data\n",
+}
+"""Definitions of messages that rosbags' types of a ROS may lack."""
 VERSION = 8
 """Of rosbag2's metadata: the newest that every distribution since Humble reads."""
 
@@ -164,8 +169,9 @@ def typestore(ros: int) -> Any:
     except ImportError:
         raise MissingExtra("rosbags", "bags") from None
     store = get_typestore(Stores.ROS1_NOETIC if ros == 1 else Stores.ROS2_HUMBLE)
-    if TF_MESSAGE not in store.types:
-        store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms\n", TF_MESSAGE))
+    for kind, definition in NOT_IN_ROSBAGS.items():
+        if kind not in store.types:
+            store.register(get_types_from_msg(definition, kind))
     return store
 
 

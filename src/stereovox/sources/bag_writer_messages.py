@@ -18,6 +18,9 @@ from stereovox.planar import lifted
 PLANAR = np.ix_((0, 1, 5), (0, 1, 5))
 """Rows and columns of x, y and yaw in a covariance of x, y, z, roll, pitch, yaw."""
 
+FLOAT32 = 7
+"""What `sensor_msgs/PointField` calls such numbers."""
+
 
 class Messages:
     """Makes messages of one ROS: `store` has rosbags' types of it, `ros` is 1 or 2."""
@@ -129,6 +132,37 @@ class Messages:
         )
         data = np.ascontiguousarray(grid.cells, np.int8).ravel()
         return self._make("nav_msgs/msg/OccupancyGrid", header=self._header(stamp_ns, frame_id), info=info, data=data)
+
+    def octomap(self, data: bytes, binary: bool, resolution: float, stamp_ns: int, frame_id: str) -> Any:
+        """Return an `octomap_msgs/Octomap` of a tree of type OcTree with cells of `resolution` metres."""
+        return self._make(
+            "octomap_msgs/msg/Octomap",
+            header=self._header(stamp_ns, frame_id),
+            binary=binary,
+            id="OcTree",
+            resolution=resolution,
+            data=np.frombuffer(data, np.int8),
+        )
+
+    def cloud(self, points: NDArray[np.floating], stamp_ns: int, frame_id: str) -> Any:
+        """Return a `sensor_msgs/PointCloud2` of (N, 3) metres, as float32."""
+        little = np.ascontiguousarray(points, "<f4")
+        fields = [
+            self._make("sensor_msgs/msg/PointField", name=name, offset=4 * k, datatype=FLOAT32, count=1)
+            for k, name in enumerate("xyz")
+        ]
+        return self._make(
+            "sensor_msgs/msg/PointCloud2",
+            header=self._header(stamp_ns, frame_id),
+            height=1,
+            width=len(little),
+            fields=fields,
+            is_bigendian=False,
+            point_step=12,
+            row_step=little.nbytes,
+            data=little.view(np.uint8).ravel(),
+            is_dense=True,
+        )
 
     def _make(self, kind: str, **fields: Any) -> Any:
         return self._types[kind](**fields)

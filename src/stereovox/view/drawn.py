@@ -75,14 +75,25 @@ def turned(points: ArrayLike, up: str) -> NDArray[np.float64]:
 def upright(voxel_map: VoxelMap, trajectory: ArrayLike | None, up: str) -> Drawn:
     """Turn a map so that its axis `up` (`z`, `-y`, ...) becomes the third. Raises StereovoxError for another word."""
     up = checked_up(up)
-    order = list(UPS[up])
     cells, _ = voxel_map.cells()
     state = voxel_map.state(voxel_map.centers(cells))
-    cells = cells[:, order]
     path = None if trajectory is None else turned(np.reshape(np.asarray(trajectory, float), (-1, 3)), up)
+    return stood_up(cells, state, voxel_map.voxel_size, up, path)
+
+
+def stood_up(
+    cells: NDArray[np.int32],
+    state: NDArray[np.uint8],
+    voxel_size: float,
+    up: str,
+    path: NDArray[np.float64] | None = None,
+) -> Drawn:
+    """Return cells (N, 3) of a map whose axis `up`, a key of `UPS`, becomes the third. path: turned already."""
+    order = list(UPS[up])
+    cells = cells[:, order]
     if up.startswith("-"):
         cells[:, 2] = -1 - cells[:, 2]
-    return Drawn(cells, state, voxel_map.voxel_size, path, ("xyz"[order[0]], "xyz"[order[1]], up))
+    return Drawn(cells, state, voxel_size, path, ("xyz"[order[0]], "xyz"[order[1]], up))
 
 
 def ceiling(occupied: NDArray[np.int32]) -> int:

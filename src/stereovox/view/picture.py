@@ -129,13 +129,17 @@ def _row_height(solid: NDArray[np.int32], panels: list[tuple[float, Direction]])
 
 def height_colours(drawn: Drawn) -> tuple[NDArray[np.float64], Any]:
     """Return the colour (N, 3) of every drawn cell, pale enough for shading to show, and what a colour bar needs."""
+    height = (drawn.below_ceiling[:, 2] + 0.5) * drawn.voxel_size
+    mappable = height_scale(height, drawn.voxel_size)
+    return mappable.to_rgba(height)[:, :3], mappable
+
+
+def height_scale(height: NDArray[np.floating], voxel_size: float) -> Any:
+    """Return matplotlib's colours for heights (N,) in metres of cells' middles, a few outliers left out."""
     from matplotlib import colormaps
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import ListedColormap, Normalize
 
-    height = (drawn.below_ceiling[:, 2] + 0.5) * drawn.voxel_size
-    low, high = np.percentile(height, [0.5, 99.5])
-    scale = Normalize(low - drawn.voxel_size / 2, high + drawn.voxel_size / 2)
+    low, high = np.percentile(height, [0.5, 99.5]) if len(height) else (0.0, 0.0)
     table = colormaps[HEIGHT_COLOURS](np.linspace(0, 1, 256))[:, :3] * 0.84 + 0.16
-    colours = ListedColormap(table)
-    return colours(scale(height))[:, :3], ScalarMappable(scale, colours)
+    return ScalarMappable(Normalize(low - voxel_size / 2, high + voxel_size / 2), ListedColormap(table))

@@ -1,27 +1,33 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The cells of a map in the viewer: occupied ones by height and cut off at a height, the others on demand."""
+"""The cells of a map in the viewer: occupied ones in colours and cut off at a height, the others on demand."""
 
 from __future__ import annotations
 
-import threading
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.maps import State, VoxelMap
-from stereovox.view.drawn import Drawn
+from stereovox.view.drawn import stood_up
+from stereovox.view.newest import Newest
 from stereovox.view.panels import STATE_COLOURS
-from stereovox.view.picture import height_colours
+from stereovox.view.shown import AGE, HEIGHT, PROBABILITY, cells_in, colours_of, heights, unknown_shell, values_of
+from stereovox.view.viewer_chunks import Chunks
 
 if TYPE_CHECKING:
     from viser import SceneNodeHandle, ViserServer
 
-MOST_CUBES = 300_000
-"""More cells than this are drawn as flat squares that face the viewer: a browser stays fluent with millions of them."""
-FREE_COLOUR = "#6fa8dc"
+FREE_COLOUR, UNKNOWN_COLOUR = "#6fa8dc", "#9b7fc4"
 DOT = 0.12
-"""Side of the squares that stand for free and tentative cells, in cells: one can look through between them."""
+"""Side of the squares that stand for cells that are not occupied, in cells: one can look through between them."""
+LABELS = {
+    State.OCCUPIED: "occupied",
+    State.TENTATIVE: "tentative",
+    State.FREE: "free",
+    State.UNKNOWN: "unknown beside free",
+}
+COLOUR_LABELS = {HEIGHT: "height of occupied cells {} [m]", PROBABILITY: "probability", AGE: "seconds since last seen"}
 CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], np.float32) - 0.5
 FACES = np.array(
     [
@@ -37,81 +43,120 @@ FACES = np.array(
 class Cells:
     """What the scene shows of the cells, and the controls for it.
 
-    nodes: the scene's nodes by state, the ones not yet asked for left out. show: a check box for each state that the
-    map holds. below: slider in metres along `up`; occupied cells above it are left out. scale: what a colour bar of
-    the heights needs, None where no cell is occupied.
+    kinds: the cells in the scene by state. show: a check box for each state. colour: drop-down with what occupied cells
+    are coloured by. below: slider in metres along `up`; cells above it are left out. solid: occupied cells
+    (N, 3) that are shown now. scale: what a colour bar needs, None where no cell is occupied.
     """
 
-    def __init__(self, server: ViserServer, voxel_map: VoxelMap, drawn: Drawn):
-        self.nodes: dict[State, SceneNodeHandle] = {}
-        self.show: dict[State, Any] = {}
-        self.below: Any = None
+    def __init__(self, server: ViserServer, voxel_map: VoxelMap, up: str):
+        self._server, self._up, self._map = server, up, voxel_map
+        self._found: dict[State, NDArray[np.int32]] = {}
+        self.solid = np.empty((0, 3), np.int32)
         self.scale: Any = None
-        self._server, self._map, self._drawn = server, voxel_map, drawn
-        self._lock = threading.Lock()
-        if len(drawn.occupied):
-            _, self.scale = height_colours(drawn)
-            self._centres = voxel_map.occupied()
-            self._heights = (drawn.occupied[:, 2] + 0.5) * drawn.voxel_size
+        size = voxel_map.voxel_size
+        self.kinds = {state: Chunks(server, f"/cells/{state.name.lower()}", size, _dots) for state in LABELS}
+        self.kinds[State.OCCUPIED] = Chunks(server, "/cells/occupied", size, add_cubes)
+        self.draw, self._look = Newest(self._draw), Newest(self._come_closer)
         self._controls()
-        self.draw(State.OCCUPIED)
+        self.take(voxel_map)
+        self._watch_lookers()
 
-    def draw(self, state: State) -> None:
-        """Show the cells of one state, or hide them, as the controls say; they are sent when first asked for."""
-        with self._lock:  # viser calls back from many threads; the last one sees the controls' last values
-            wanted = state in self.show and self.show[state].value
-            if state is State.OCCUPIED and wanted:
-                self.nodes[state] = self._draw_occupied()
-            elif wanted and state not in self.nodes:
-                self.nodes[state] = self._draw_dots(state)
-            if state in self.nodes:
-                self.nodes[state].visible = wanted
+    @property
+    def label(self) -> str:
+        """What the colours of occupied cells mean."""
+        return COLOUR_LABELS[self.colour.value].format(self._up)
+
+    def take(self, voxel_map: VoxelMap) -> None:
+        """Show another map of the same cells, which nobody changes from now on."""
+        self._map, self._found = voxel_map, {State.OCCUPIED: cells_in(voxel_map, State.OCCUPIED)}
+        self._fit_slider()
+        self.draw()
 
     def _controls(self) -> None:
-        gui, number = self._server.gui, self._map.counts()
+        gui = self._server.gui
         with gui.add_folder("Cells"):
-            for state in (State.OCCUPIED, State.TENTATIVE, State.FREE):
-                if number[name := state.name.lower()]:
-                    box = self.show[state] = gui.add_checkbox(name, state is State.OCCUPIED)
-                    box.on_update(lambda _, state=state: self.draw(state))
-            if self.scale is not None:
-                self.below = self._height_slider()
-                self.below.on_update(lambda _: self.draw(State.OCCUPIED))
+            self.show = {state: gui.add_checkbox(label, state is State.OCCUPIED) for state, label in LABELS.items()}
+            colours = (HEIGHT, PROBABILITY, *([AGE] if self._map.config.map.keep_times else []))
+            self.colour = gui.add_dropdown("colour", colours)
+            self.below = gui.add_slider(f"below {self._up} [m]", 0.0, 1.0, self._map.voxel_size, 1.0)
+        self._touched = self._fitting = False
+        for control in (*self.show.values(), self.colour):
+            control.on_update(lambda _: self.draw())
+        self.below.on_update(self._cut)
 
-    def _height_slider(self) -> Any:
-        """Return a slider from the lowest to the highest layer; at first it leaves out a ceiling."""
-        size = self._drawn.voxel_size
-        low, high = (round(float(height + size / 2), 6) for height in (self._heights.min(), self._heights.max()))
-        first = high if self._drawn.cut is None else round(self._drawn.cut, 6)
-        return self._server.gui.add_slider(f"below {self._drawn.names[2]} [m]", low, high, size, first)
+    def _cut(self, _: Any) -> None:
+        if not self._fitting:
+            self._touched = True  # the cut stays when the map grows
+            self.draw()
 
-    def _draw_occupied(self) -> SceneNodeHandle:
-        drawn = self._heights < self.below.value
-        centres = self._centres[drawn]
-        colours = self.scale.to_rgba(self._heights[drawn], bytes=True)[:, :3]
-        return add_cells(self._server, "/cells/occupied", centres, colours, self._map.voxel_size)
+    def _fit_slider(self) -> None:
+        """Let the slider reach from the lowest to the highest layer; at first it leaves out a ceiling."""
+        cells, size = self._found[State.OCCUPIED], self._map.voxel_size
+        if not len(cells):
+            return
+        drawn = stood_up(cells, np.full(len(cells), State.OCCUPIED, np.uint8), size, self._up)
+        layers = drawn.cells[:, 2]
+        low, high = (round(float(layer + 1) * size, 6) for layer in (layers.min(), layers.max()))
+        first = high if drawn.cut is None else round(drawn.cut, 6)
+        self.below.max = max(high, low + size)  # before the lowest: a slider refuses ends that cross
+        self.below.min = low
+        if not self._touched:
+            self._fitting = True
+            self.below.value = first
+            self._fitting = False
 
-    def _draw_dots(self, state: State) -> SceneNodeHandle:
-        colour = FREE_COLOUR if state is State.FREE else STATE_COLOURS[state]
-        indices, _ = self._map.cells()
-        centres = self._map.centers(indices[self._drawn.state == state])
-        return add_points(
-            self._server, f"/cells/{state.name.lower()}", centres, rgb(colour), DOT * self._map.voxel_size
-        )
+    def _draw(self) -> None:
+        for state, box in self.show.items():
+            self.kinds[state].root.visible = box.value
+            if box.value:
+                self._show_occupied() if state is State.OCCUPIED else self._show_dots(state)
+
+    def _show_occupied(self) -> None:
+        cells, voxel_map = self._found[State.OCCUPIED], self._map
+        values = values_of(voxel_map, cells, self.colour.value, self._up)
+        self.scale = colours_of(values, self.colour.value, voxel_map.voxel_size) if len(cells) else None
+        shown = heights(voxel_map, cells, self._up) < self.below.value
+        self.solid = cells[shown]
+        colours = np.empty((0, 3), np.uint8)
+        if self.scale is not None:
+            colours = self.scale.to_rgba(np.ma.masked_invalid(values[shown]), bytes=True)[:, :3]
+        self.kinds[State.OCCUPIED].show(self.solid, colours, self._eyes())
+
+    def _show_dots(self, state: State) -> None:
+        if state not in self._found:
+            find = unknown_shell if state is State.UNKNOWN else lambda one: cells_in(one, state)
+            self._found[state] = find(self._map)
+        cells = self._found[state]
+        cells = cells[heights(self._map, cells, self._up) < self.below.value]
+        colour = {State.FREE: FREE_COLOUR, State.UNKNOWN: UNKNOWN_COLOUR}.get(state, STATE_COLOURS[state])
+        self.kinds[state].show(cells, np.tile(rgb(colour), (len(cells), 1)), self._eyes())
+
+    def _eyes(self) -> NDArray[np.float64]:
+        """Return where those who look stand, (n, 3) in metres; the first look, if nobody does."""
+        eyes = [client.camera.position for client in self._server.get_clients().values()]
+        return np.array(eyes or [self._server.initial_camera.position], float).reshape(-1, 3)
+
+    def _watch_lookers(self) -> None:
+        @self._server.on_client_connect
+        def _(client: Any) -> None:
+            client.camera.on_update(lambda _: self._look())
+            self._look()
+
+    def _come_closer(self) -> None:
+        for state, kind in self.kinds.items():
+            if self.show[state].value:
+                kind.look_from(self._eyes())
 
 
-def add_cells(
+def add_cubes(
     server: ViserServer, name: str, centres: NDArray[np.floating], colours: NDArray[np.uint8], size: float
 ) -> SceneNodeHandle:
-    """Add cells (N, 3) in metres in colours (N, 3) with sides of `size` metres: as cubes, or as squares where many."""
-    if len(centres) > MOST_CUBES:
-        return add_points(server, name, centres, colours, size)
-    upright = np.tile(np.array([1, 0, 0, 0], np.float32), (len(centres), 1))
+    """Add cells (N, 3) in metres in colours (N, 3) as cubes with sides of `size` metres."""
     return server.scene.add_batched_meshes_simple(
         name,
         CORNERS * size,
         FACES,
-        batched_wxyzs=upright,
+        batched_wxyzs=np.tile(np.array([1, 0, 0, 0], np.float32), (len(centres), 1)),
         batched_positions=centres.astype(np.float32),
         batched_colors=colours,
         lod="off",  # a cube with fewer triangles is no cube
@@ -128,6 +173,12 @@ def add_points(
     return server.scene.add_point_cloud(
         name, centres, colours, point_size=size, point_shape="square", point_shading="flat", precision="float32"
     )
+
+
+def _dots(
+    server: ViserServer, name: str, centres: NDArray[np.floating], colours: NDArray[np.uint8], size: float
+) -> SceneNodeHandle:
+    return add_points(server, name, centres, colours, DOT * size)
 
 
 def rgb(colour: str) -> NDArray[np.uint8]:

@@ -3,16 +3,17 @@
 
 from __future__ import annotations
 
-import threading
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox.maps import VoxelMap
+from stereovox.maps import State, VoxelMap
 from stereovox.products.slices import Layer, layer
-from stereovox.view.drawn import Drawn
+from stereovox.view.drawn import stood_up
+from stereovox.view.newest import Newest
 from stereovox.view.scale import Scale, scale_of
+from stereovox.view.shown import cells_in
 
 if TYPE_CHECKING:
     from viser import ImageHandle, ViserServer
@@ -31,44 +32,56 @@ class LayerPlane:
     the numbers that it shows, and what a colour bar of them needs.
     """
 
-    def __init__(self, server: ViserServer, voxel_map: VoxelMap, drawn: Drawn):
+    def __init__(self, server: ViserServer, voxel_map: VoxelMap, up: str):
         self.node: ImageHandle | None = None
         self.scale = scale_of(voxel_map)
         self.colours = layer_colours(self.scale)
-        self._server, self._map = server, voxel_map
-        self._lock = threading.Lock()
-        first = _first_place(voxel_map, drawn)
-        bounds = voxel_map.bounds()
-        if bounds is None:
-            raise ValueError("an empty map has no layer")
-        gui = server.gui
-        with gui.add_folder("Layer"):
+        self._server, self._map, self._up, self._placed = server, voxel_map, up, False
+        self.draw = Newest(self._draw)
+        gui, size = server.gui, voxel_map.voxel_size
+        with gui.add_folder("Slice plane"):
             self.show = gui.add_checkbox("show", False)
-            self.across = gui.add_dropdown("across", ("x", "y", "z"), initial_value=drawn.names[2][-1])
-            self.at = {name: self._slider(name, bounds[:, axis], first[axis]) for axis, name in enumerate("xyz")}
+            self.across = gui.add_dropdown("across", ("x", "y", "z"), initial_value=up[-1])
+            self.at = {name: gui.add_slider(f"{name} [m]", 0.0, 1.0, size, 0.0) for name in "xyz"}
+        self.take(voxel_map)
         for control in (self.show, self.across, *self.at.values()):
             control.on_update(lambda _: self.draw())
+
+    def take(self, voxel_map: VoxelMap) -> None:
+        """Cut another map of the same cells, which nobody changes from now on."""
+        self._map, bounds = voxel_map, voxel_map.bounds()
+        if bounds is not None:
+            for axis, slider in enumerate(self.at.values()):
+                self._fit(slider, bounds[:, axis])
+            if not self._placed:
+                self._place(_first_place(voxel_map, self._up))
         self.draw()
 
-    def draw(self) -> None:
+    def _draw(self) -> None:
         """Put the plane where the controls say."""
-        with self._lock:  # viser calls back from many threads; the last one sees the controls' last values
-            across = self.across.value
-            for name, slider in self.at.items():
-                slider.visible = name == across
-            if self.show.value:
-                one = layer(self._map, across, self.at[across].value)
-                image = self.colours.to_rgba(self.scale.shown(one.log_odds), bytes=True)
-                self.node = add_plane(self._server, one, image)
-            elif self.node is not None:
-                self.node.visible = False
+        across = self.across.value
+        for name, slider in self.at.items():
+            slider.visible = name == across
+        if self.show.value and self._placed:
+            one = layer(self._map, across, self.at[across].value)
+            image = self.colours.to_rgba(self.scale.shown(one.log_odds), bytes=True)
+            self.node = add_plane(self._server, one, image)
+        elif self.node is not None:
+            self.node.visible = False
 
-    def _slider(self, name: str, bounds: NDArray[np.float64], first: float) -> Any:
-        """Return a slider with one step a layer: the middle of each layer between two faces of the map."""
+    def _fit(self, slider: Any, bounds: NDArray[np.float64]) -> None:
+        """Let a slider reach from the middle of the lowest layer to that of the highest, one step a layer."""
         size = self._map.voxel_size
         low, high = (round(float(face), 6) for face in (bounds[0] + size / 2, bounds[1] - size / 2))
-        steps = round((np.clip(first, low, high) - low) / size)
-        return self._server.gui.add_slider(f"{name} [m]", low, high, size, round(low + steps * size, 6))
+        slider.max = max(high, low + size)
+        slider.min = low
+
+    def _place(self, first: NDArray[np.float64]) -> None:
+        size = self._map.voxel_size
+        for slider, place in zip(self.at.values(), first, strict=True):
+            steps = round((np.clip(place, slider.min, slider.max) - slider.min) / size)
+            slider.value = round(slider.min + steps * size, 6)
+        self._placed = True
 
 
 def layer_colours(scale: Scale) -> Any:
@@ -110,12 +123,14 @@ def sharp(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return image.repeat(times, axis=0).repeat(times, axis=1)
 
 
-def _first_place(voxel_map: VoxelMap, drawn: Drawn) -> NDArray[np.float64]:
+def _first_place(voxel_map: VoxelMap, up: str) -> NDArray[np.float64]:
     """Return where the sliders begin, (3,) in metres: at the camera, or at the layer that tells most."""
     if voxel_map.viewpoint is not None:
         return voxel_map.viewpoint.T_world_camera[:3, 3]
-    up = drawn.names[2]
-    place = voxel_map.centers(voxel_map.cells()[0]).mean(axis=0)
+    cells = cells_in(voxel_map, State.OCCUPIED)
+    cells = cells if len(cells) else voxel_map.cells()[0]
+    drawn = stood_up(cells, np.full(len(cells), State.OCCUPIED, np.uint8), voxel_map.voxel_size, up)
+    place = voxel_map.centers(cells.mean(axis=0)[None] - 0.5)[0]
     height = (drawn.layer + 0.5) * drawn.voxel_size
     place["xyz".index(up[-1])] = -height if up.startswith("-") else height
     return place

@@ -1,0 +1,29 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What mkdocs.yml adds to the pages in docs/: files of the repository that they link to, so that links work in both."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+from mkdocs.structure.files import File, Files
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = ("CONTRIBUTING.md", "CHANGELOG.md")
+"""Files beside docs/ that become pages."""
+UP = re.compile(r"\]\(\.\./")
+INTO_DOCS = re.compile(r"\]\(docs/")
+
+
+def on_files(files: Files, config: Any) -> Files:
+    """Add pages and examples, as if they lay in docs/."""
+    for name in (*PAGES, *(f"examples/{path.name}" for path in sorted((ROOT / "examples").glob("*.py")))):
+        if files.get_file_from_path(name) is None:
+            files.append(File.generated(config, name, abs_src_path=str(ROOT / name)))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
+    """Turn links between docs/ and its parent into links within docs/."""
+    return (INTO_DOCS if page.file.src_uri in PAGES else UP).sub("](", markdown)

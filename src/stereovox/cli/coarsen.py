@@ -1,0 +1,27 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Make a map of larger cells, each as bad as the worst it is made of: occupied, then tentative, unknown, free."""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser, Namespace
+from typing import Any
+
+from stereovox.cli.new_map import check_new, save_new
+from stereovox.cli.saved_map import open_map
+
+EXAMPLE = "stereovox coarsen kitchen.svox kitchen10.svox --factor 2"
+
+
+def add_arguments(parser: ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("map", metavar="MAP", help="folder of a map")
+    parser.add_argument("out", metavar="OUT", help="folder of the new map")
+    parser.add_argument("--factor", type=int, metavar="N", required=True, help="cells that become one, along each side")
+
+
+def run(arguments: Namespace) -> dict[str, Any]:
+    """Load the map and save it in larger cells."""
+    from stereovox.products.coarsen import coarsen
+
+    check_new(arguments.out, arguments.map)
+    return save_new(coarsen(open_map(arguments.map), arguments.factor), arguments.out)

@@ -1,0 +1,41 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Take the part of a map that lies in a box, as a map of its own: whole cells, those whose middle is inside."""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser, Namespace
+from typing import Any
+
+from stereovox.cli.new_map import check_new, save_new
+from stereovox.cli.numbers import numbers_of
+from stereovox.cli.saved_map import open_map
+from stereovox.errors import StereovoxError
+
+EXAMPLE = "stereovox crop kitchen.svox table.svox --box=-1,-1,0,1,1,2"
+
+
+def add_arguments(parser: ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("map", metavar="MAP", help="folder of a map")
+    parser.add_argument("out", metavar="OUT", help="folder of the new map")
+    parser.add_argument(
+        "--box",
+        metavar="X0,Y0,Z0,X1,Y1,Z1",
+        required=True,
+        help="lowest and highest corner in metres; inf and -inf where it has no end. --box=... where it begins with -",
+    )
+
+
+def run(arguments: Namespace) -> dict[str, Any]:
+    """Load the map and save the part."""
+    from stereovox.products.crop import crop
+
+    box = numbers_of("--box", arguments.box, "X0,Y0,Z0,X1,Y1,Z1")
+    check_new(arguments.out, arguments.map)
+    whole = open_map(arguments.map)
+    part = crop(whole, box[:3], box[3:])
+    bounds = whole.bounds()
+    if part.bounds() is None and bounds is not None:
+        low, high = bounds.round(3).tolist()
+        raise StereovoxError(f"--box {arguments.box}: no known cell there; the map reaches from {low} to {high} m")
+    return save_new(part, arguments.out)

@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Write how far the nearest obstacle is from each cell of a box of the map (an ESDF without signs), for planners.
+
+FILE.npz holds the arrays distance (x, y, z) in metres, origin and cell.
+"""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser, Namespace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from stereovox.cli.saved_map import open_map
+from stereovox.cli.terminal import say, size, thousands
+from stereovox.errors import StereovoxError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from stereovox.maps import VoxelMap
+    from stereovox.products.distance import DistanceField
+
+EXAMPLE = "stereovox distance kitchen.svox kitchen.npz --to unknown --max 2 --picture distance.png"
+STATES = ("occupied", "tentative", "unknown")
+
+
+def add_arguments(parser: ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("map", metavar="MAP", help="folder of a map")
+    parser.add_argument("file", metavar="FILE.npz", help="file to write")
+    parser.add_argument(
+        "--to",
+        action="append",
+        choices=STATES[1:],
+        default=[],
+        help="besides occupied cells, count these as obstacles too; may be given twice",
+    )
+    parser.add_argument(
+        "--box", metavar="X,Y,Z:X,Y,Z", help="lowest and highest corner in metres (default: all that is known)"
+    )
+    parser.add_argument("--max", type=float, metavar="M", default=np.inf, help="obstacles farther off count as none")
+    parser.add_argument(
+        "--measure",
+        metavar="HOW",
+        default="centres",
+        help="from the cell's middle to the obstacle's (centres, default), to its nearest face (faces), or from"
+        " whatever point of the cell is nearest (gap)",
+    )
+    parser.add_argument("--picture", metavar="FILE.png", help="draw one layer as well")
+    parser.add_argument("--at", type=float, metavar="M", help="height of that layer (default: the camera's)")
+
+
+def run(arguments: Namespace) -> dict[str, Any]:
+    """Measure the distances, write them and tell about them."""
+    from stereovox.maps import State
+    from stereovox.products.distance import DistanceField
+    from stereovox.products.distance_file import write_distance
+
+    _check_files(arguments)
+    voxel_map = open_map(arguments.map)
+    low, high = _box(arguments.box, voxel_map)
+    to = [State[name.upper()] for name in ("occupied", *arguments.to)]
+    field = DistanceField(voxel_map, low, high, to=to, max_distance=arguments.max, measure=arguments.measure)
+    write_distance(field, arguments.file)
+    result = _told(field, arguments)
+    if arguments.picture:
+        _draw(field, voxel_map, arguments)
+        result["picture"] = arguments.picture
+    return result
+
+
+def _check_files(arguments: Namespace) -> None:
+    if Path(arguments.file).suffix.lower() != ".npz":
+        raise StereovoxError(f"{arguments.file}: distances are written as .npz; name the file so")
+    if arguments.picture and Path(arguments.picture).suffix.lower() != ".png":
+        raise StereovoxError(f"{arguments.picture}: pictures are written as .png; name the file so")
+    if arguments.at is not None and not arguments.picture:
+        raise StereovoxError("--at: the height of the layer to draw; it goes with --picture FILE.png")
+
+
+def _box(text: str | None, voxel_map: VoxelMap) -> NDArray[np.float64]:
+    """Return lowest and highest corner (2, 3) in metres."""
+    bounds = voxel_map.bounds()
+    if bounds is None:
+        raise StereovoxError("the map is empty: there is nothing to be far from")
+    if text is None:
+        return bounds
+    try:
+        box = np.array([[float(x) for x in corner.split(",")] for corner in text.split(":")])
+    except ValueError:
+        box = np.empty(0)
+    if box.shape != (2, 3):
+        raise StereovoxError(f"--box {text}: write two corners in metres, for example --box=-1,-1,0:3,3,2")
+    return box
+
+
+def _told(field: DistanceField, arguments: Namespace) -> dict[str, Any]:
+    metres, file = field.metres, Path(arguments.file)
+    near = metres[np.isfinite(metres)]
+    shape, largest = list(metres.shape), float(near.max()) if len(near) else None
+    x, y, z = shape
+    say(f"{x} x {y} x {z} cells from ({', '.join(f'{place:g}' for place in field.origin)}) m")
+    far = "no obstacle is near enough" if largest is None else f"up to {largest:.2f} m"
+    say(f"{thousands(int(field.obstacles.sum()))} obstacles ({', '.join(('occupied', *arguments.to))}); {far}")
+    say(f"saved {file} ({size(file.stat().st_size)})")
+    return {
+        "file": str(file),
+        "shape": shape,
+        "origin": field.origin.round(9).tolist(),
+        "cell": field.cell.tolist(),
+        "obstacles": int(field.obstacles.sum()),
+        "largest_m": largest,
+    }
+
+
+def _draw(field: DistanceField, voxel_map: VoxelMap, arguments: Namespace) -> None:
+    from stereovox.view.distance import picture_distance
+    from stereovox.view.drawn import turned
+
+    at_m, up = arguments.at, voxel_map.config.up
+    if at_m is None and voxel_map.viewpoint is not None:
+        camera = voxel_map.viewpoint.T_world_camera[:3, 3]
+        at_m = float(turned(camera, up)[2]) if np.isfinite(field.distance(camera))[0] else None
+    to = " or ".join(("occupied", *arguments.to))
+    picture_distance(field, arguments.picture, up, at_m, f"{Path(arguments.map).stem}: distance to what is {to}")
+    say(f"saved {arguments.picture}")

@@ -1,0 +1,55 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Make a map of another program's file; the ending of FILE tells what it is.
+
+.bt and .ot of OctoMap, .npz of stereovox, .ply and .pcd (each cell that holds a point becomes occupied), and .bag,
+.mcap, .db3 and rosbag2 folders with an octomap_msgs/Octomap. Where MAP ends in .yaml, .pgm or .png, the bag's
+nav_msgs/OccupancyGrid becomes map_server files.
+"""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser, Namespace
+from pathlib import Path
+from typing import Any
+
+from stereovox.cli.robots import GRID_ENDINGS
+from stereovox.cli.saved_map import refuse_options
+from stereovox.cli.terminal import say, thousands
+
+EXAMPLE = "stereovox import building.bt building.svox"
+
+
+def add_arguments(parser: ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("file", metavar="FILE", help="file to read")
+    parser.add_argument("map", metavar="MAP", help="folder of the new map, or the .yaml of a floor's map")
+    parser.add_argument("--voxel-size", type=float, metavar="M", help="side of a cell in metres, for points")
+    parser.add_argument("--topic", metavar="T", help="topic in the bag, where it is not plain which")
+
+
+def run(arguments: Namespace) -> dict[str, Any]:
+    """Read the file and save the map."""
+    return (_grid if Path(arguments.map).suffix.lower() in GRID_ENDINGS else _cells)(arguments)
+
+
+def _cells(arguments: Namespace) -> dict[str, Any]:
+    from stereovox.products.imports import import_map
+
+    voxel_map = import_map(arguments.file, arguments.voxel_size, arguments.topic)
+    voxel_map.save(arguments.map)
+    counts = voxel_map.counts()
+    say(", ".join(f"{thousands(counts[state])} {state}" for state in ("occupied", "free", "tentative")))
+    say(f"saved {arguments.map}")
+    return {"map": arguments.map, "voxel_size": voxel_map.voxel_size, **counts}
+
+
+def _grid(arguments: Namespace) -> dict[str, Any]:
+    from stereovox.products.bag_maps import read_bag_grid
+    from stereovox.products.map_server import write_map_server
+
+    refuse_options(arguments, ["voxel_size"], "a floor's map tells how large its cells are")
+    grid = read_bag_grid(arguments.file, arguments.topic)
+    write_map_server(grid, arguments.map)
+    rows, columns = grid.cells.shape
+    say(f"{columns} x {rows} cells of {grid.resolution:g} m; saved {arguments.map}")
+    return {"map": arguments.map, "voxel_size": grid.resolution, "columns": columns, "rows": rows}

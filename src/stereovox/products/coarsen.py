@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A map in larger cells."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.config import Config, load_config
+from stereovox.errors import StereovoxError
+from stereovox.maps import State, VoxelMap
+from stereovox.maps.cell_format import CellRules
+from stereovox.maps.voxel_map import cells_where
+from stereovox.products.side_by_side import put_times
+
+Parents = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.uint32]]
+"""Cells (N, 3); and (N,) of how many known cells they are made, the largest number these store, their latest time."""
+
+
+def coarsen(voxel_map: VoxelMap, factor: int) -> VoxelMap:
+    """Return an unbounded map in cells that are `factor` times as long on each side, with the history of the map.
+
+    A cell gets the worst state of those it is made of: occupied, then tentative, unknown, free; it is free only where
+    all of them are, and nothing occupied is lost. Its log-odds are the largest of theirs, its time the latest.
+    Raises StereovoxError for a factor that is no whole number from 1 on, or makes cells too large.
+    """
+    if factor != int(factor) or factor < 1:
+        raise StereovoxError(f"factor {factor}: give a whole number of cells, 2 or more")
+    parts = [_parents(voxel_map, coords, cells, int(factor)) for coords, cells in voxel_map.slabs()]
+    indices, number, stored, times = _grouped(*map(np.concatenate, zip(*parts, strict=True)))
+    sure = (number == int(factor) ** 3) | (CellRules(voxel_map.config.map).states(stored) != State.FREE)
+    settings = _coarser(voxel_map.config, int(factor))
+    coarse = VoxelMap.from_cells(settings, indices[sure], voxel_map.cell_format.log_odds(stored[sure]))
+    if settings.map.keep_times:
+        put_times(coarse, indices[sure], times[sure], voxel_map.times_start_ns)
+    coarse.take_history(voxel_map)
+    return coarse
+
+
+def _coarser(config: Config, factor: int) -> Config:
+    steps = config.steps and [float(f"{side * factor:.12g}") for side in config.steps]
+    return load_config(config, steps=steps, voxel_size=float(f"{config.voxel_size * factor:.12g}"))
+
+
+def _parents(voxel_map: VoxelMap, coords: NDArray[np.int32], cells: NDArray[np.integer], factor: int) -> Parents:
+    known = cells != voxel_map.cell_format.unknown
+    indices, stored = cells_where(coords, cells, known)
+    times = np.zeros(len(stored), np.uint32)
+    if voxel_map.config.map.keep_times:
+        times = voxel_map.times_of(coords)[known]
+    return _grouped(indices.astype(np.int64) // factor, np.ones(len(stored), np.int64), stored.astype(np.int64), times)
+
+
+def _grouped(
+    indices: NDArray[np.int64], number: NDArray[np.int64], stored: NDArray[np.int64], times: NDArray[np.uint32]
+) -> Parents:
+    """Return each cell once, with the sum of the numbers of cells and the largest of the rest."""
+    if not len(indices):
+        return indices, number, stored, times
+    order = np.lexsort(indices.T)
+    indices = indices[order]
+    starts = np.flatnonzero(np.append(True, (indices[1:] != indices[:-1]).any(axis=1)))
+    highest, latest = (np.maximum.reduceat(values[order], starts) for values in (stored, times))
+    return indices[starts], np.add.reduceat(number[order], starts), highest, latest

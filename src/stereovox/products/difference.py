@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What changed from one map to another."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stereovox.files import replacing
+from stereovox.maps import State, VoxelMap
+from stereovox.maps.cell_format import CellRules
+from stereovox.maps.voxel_map import cells_where
+from stereovox.products.moved import moved
+from stereovox.products.side_by_side import check_same_cells, in_memory, side_by_side
+
+
+@dataclass(frozen=True, eq=False)
+class Difference:
+    """How an earlier map `a` became `b`: cells (N, 3) int32 in ascending order, in the frame of `a`.
+
+    appeared: free before, occupied now. vanished: occupied before, free now. became_known, became_unknown: no matter as
+    what. counts: (4, 4) int64 cells by their `State` in `a` (row) and in `b` (column); 0 where unknown to both.
+    """
+
+    appeared: NDArray[np.int32]
+    vanished: NDArray[np.int32]
+    became_known: NDArray[np.int32]
+    became_unknown: NDArray[np.int32]
+    counts: NDArray[np.int64]
+
+
+def difference(a: VoxelMap, b: VoxelMap, T_a_b: ArrayLike | None = None) -> Difference:
+    """Return what changed from map `a` to map `b`; each map's own settings tell its states.
+
+    T_a_b: (4, 4) maps the world frame of `b` into that of `a`, see `moved`; none where both are the same. Cells that
+    are tentative in one of the maps count as neither appeared nor vanished. Raises StereovoxError where the cells
+    differ in size or T_a_b is no rigid motion.
+    """
+    check_same_cells(a, b)
+    a, b = in_memory(a), in_memory(b) if T_a_b is None else moved(in_memory(b), T_a_b)
+    before, after = CellRules(a.config.map), CellRules(b.config.map)
+    found = []
+    counts = np.zeros(len(State) ** 2, np.int64)
+    for coords, cells_a, cells_b in side_by_side(a, b):
+        pairs = before.states(cells_a) * len(State) + after.states(cells_b)
+        counts += np.bincount(pairs.ravel(), minlength=len(counts))
+        found.append([cells_where(coords, pairs, chosen)[0] for chosen in _kinds(pairs)])
+    counts[0] = 0  # of blocks that hold other cells
+    kinds = [_ascending(np.concatenate(kind)) for kind in zip(*found, strict=True)]
+    return Difference(*kinds, counts=counts.reshape(4, 4))
+
+
+def write_difference(changes: Difference, cell: tuple[float, float, float], path: str | Path) -> None:
+    """Write the arrays of a `Difference` for `numpy.load`, and `cell`, the sides of a cell in metres.
+
+    Raises MapFileError when the place cannot be written.
+    """
+    with replacing(path) as file:
+        np.savez_compressed(file, cell=np.array(cell), **asdict(changes))
+
+
+def _kinds(pairs: NDArray[np.uint8]) -> list[NDArray[np.bool_]]:
+    """Tell which cells, by the number of their state before and that after, are of the four kinds."""
+    before, after = np.divmod(pairs, len(State))
+    return [
+        (before == State.FREE) & (after == State.OCCUPIED),
+        (before == State.OCCUPIED) & (after == State.FREE),
+        (before == State.UNKNOWN) & (after != State.UNKNOWN),
+        (before != State.UNKNOWN) & (after == State.UNKNOWN),
+    ]
+
+
+def _ascending(indices: NDArray[np.int32]) -> NDArray[np.int32]:
+    return indices[np.lexsort(indices.T[::-1])]

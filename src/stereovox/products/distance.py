@@ -1,0 +1,184 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How far the nearest obstacle is from every cell of a box (an unsigned ESDF), brought up to date frame by frame."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stereovox.errors import StereovoxError
+from stereovox.maps import State, VoxelMap
+from stereovox.maps.blocks import CELLS, SIDE
+from stereovox.maps.cell_format import CellRules
+from stereovox.maps.queries import INDEX_LIMIT, points_of, state_bits
+from stereovox.products import _distance
+from stereovox.products.transform import Transform
+
+TRIGGER = 1 / 8
+"""A window follows when the camera is farther from its middle than this share of the window."""
+TIE = 1e-6
+"""A face of the box that is so near to a face of cells, in cells, stands on it."""
+MEASURES = {"centres": 0.0, "faces": 0.5, "gap": 1.0}
+"""How many cells nearer an obstacle counts along each axis."""
+
+
+class DistanceField:
+    """Distances of all cells of a box to the nearest obstacle in the box, exact, in metres.
+
+    The box is `low` to `high` (3,) in metres, widened to whole cells, or a window of `size` (3,) metres about the
+    camera, which it follows by whole blocks of 8 cells as soon as the map knows a camera.
+    to: states that are obstacles (not FREE); with UNKNOWN, what was never seen keeps a robot off, too.
+    max_distance: metres; obstacles farther off count as none.
+    measure: `centres` from the middle of a cell to the middle of the obstacle's cell, 0 in an obstacle, as
+    `scipy.ndimage.distance_transform_edt` measures; `faces` to the nearest face of the obstacle's cell; `gap` from
+    whatever point of the cell is nearest: a ball about any point of the cell meets nothing if its radius is less.
+    What is outside the box counts for nothing: a cell nearer to the box's border than to an obstacle may be nearer to
+    one beyond it. After `update` the field is what it would be if it were made anew.
+    Raises StereovoxError, one line, for a box that is none or too large, and for other bad input.
+    """
+
+    def __init__(
+        self,
+        voxel_map: VoxelMap,
+        low: ArrayLike | None = None,
+        high: ArrayLike | None = None,
+        *,
+        size: ArrayLike | None = None,
+        max_distance: float = np.inf,
+        to: Iterable[State] = (State.OCCUPIED,),
+        measure: str = "centres",
+    ):
+        if measure not in MEASURES:
+            raise StereovoxError(f"measure '{measure}': name one of {', '.join(MEASURES)}")
+        self._map, self._wanted = voxel_map, state_bits(to, "to")
+        self._cell = np.array(voxel_map.config.cell)
+        self._follows = size is not None
+        self._low, shape = self._about_zero(size) if self._follows else self._between(low, high)
+        self._transform = Transform(tuple(shape.tolist()), self._cell, max_distance, MEASURES[measure])
+        blocks = ((self._low + shape - 1) >> 3) - (self._low >> 3) + 1
+        self._seen = np.zeros((int(blocks.prod()), CELLS), np.uint8)
+        self._shape, self._made = shape, False
+        if not self._follows or voxel_map.viewpoint is not None:
+            self.update()
+
+    def update(self) -> int:
+        """Bring the field up to date with the map; return how many cells became obstacles or ceased to be.
+
+        Raises StereovoxError where a window has no camera to stand about: the map has no frame yet.
+        """
+        if self._follows:
+            self._follow()
+        field, config = self._transform.field, self._map.config
+        dirty = np.zeros(len(field.mask), np.uint8)
+        order = np.array(self._transform.order)
+        changed = _distance.refresh(
+            self._map.stored_cells, CellRules(config.map).thresholds, self._wanted, self._low, order,
+            self._shape[order], self._seen, field.mask, dirty,
+        )  # fmt: skip
+        self._transform.update(dirty, config.threads)
+        self._made = True
+        return int(changed)
+
+    @property
+    def origin(self) -> NDArray[np.float64]:
+        """Lowest corner (3,) of the box in metres, world frame: that of cell [0, 0, 0] of `metres`."""
+        return np.asarray(self._low * self._cell, float)
+
+    @property
+    def cell(self) -> NDArray[np.float64]:
+        """Sides (3,) of a cell in metres."""
+        return self._cell.copy()
+
+    @property
+    def metres(self) -> NDArray[np.float32]:
+        """Distances of all cells (x, y, z) in metres, infinite where no obstacle is near enough.
+
+        A view, not to be written to; `update` changes it.
+        """
+        self._check_place()
+        return self._transform.metres
+
+    @property
+    def obstacles(self) -> NDArray[np.bool_]:
+        """Which cells (x, y, z) are obstacles; a view, not to be written to."""
+        self._check_place()
+        return self._transform.as_box(self._transform.field.mask).view(bool)
+
+    def distance(self, points: ArrayLike) -> NDArray[np.float32]:
+        """Return the distances (N,) in metres of the cells that hold points (N, 3) in metres, world frame.
+
+        Infinite where no obstacle is near enough, NaN outside the box and where a point is not finite.
+        """
+        return self._at(*self._cells_of(points))
+
+    def gradient(self, points: ArrayLike) -> NDArray[np.float32]:
+        """Return how the distance grows (N, 3) at points (N, 3): metres a metre along each axis, world frame.
+
+        It points away from the nearest obstacle, is about 1 long, and shorter midway between obstacles. Taken between
+        the cells on both sides, on one side at the border of the box and beside cells without a distance. NaN where
+        the point's own cell has none.
+        """
+        cells, inside = self._cells_of(points)
+        here = self._at(cells, inside)
+        slopes = [self._slope(cells, inside, here, axis) for axis in range(3)]
+        return np.where(np.isfinite(here)[:, None], np.stack(slopes, axis=1), np.float32(np.nan))
+
+    def _check_place(self) -> None:
+        if self._follows and self._map.viewpoint is None:
+            raise StereovoxError("the window of the distance field has no place yet: add a frame to the map and update")
+
+    def _slope(
+        self, cells: NDArray[np.int64], inside: NDArray[np.bool_], here: NDArray[np.float32], axis: int
+    ) -> NDArray[np.float32]:
+        """Return the difference quotient (N,) along one axis; 0 where no neighbour has a distance."""
+        ends, offs = [], []
+        for step in (-1, 1):
+            beside = cells.copy()
+            beside[:, axis] += step
+            there = self._at(beside, inside & (beside[:, axis] >= 0) & (beside[:, axis] < self._shape[axis]))
+            ends.append(np.where(np.isfinite(there), there, here))
+            offs.append(np.isfinite(there))
+        with np.errstate(invalid="ignore"):
+            rise = (ends[1] - ends[0]) / np.float32(self._cell[axis])
+        return rise / np.maximum(offs[0].astype(np.float32) + offs[1], 1)
+
+    def _cells_of(self, points: ArrayLike) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+        """Return places (N, 3) in the box, and which points (N,) are in it."""
+        with np.errstate(invalid="ignore"):
+            cells = np.floor(points_of(points) / self._cell) - self._low
+            inside = np.all((cells >= 0) & (cells < self._shape), axis=1)  # False for NaN
+        return np.where(inside[:, None], cells, 0).astype(np.int64), inside
+
+    def _at(self, cells: NDArray[np.int64], inside: NDArray[np.bool_]) -> NDArray[np.float32]:
+        x, y, z = np.where(inside[:, None], cells, 0).T
+        return np.where(inside, self.metres[x, y, z], np.float32(np.nan))
+
+    def _between(self, low: ArrayLike | None, high: ArrayLike | None) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return the first cell (3,) and the number of cells (3,) of a box in metres."""
+        if low is None or high is None:
+            raise StereovoxError(
+                "a distance field needs low and high of a box, or the size of a window about the camera"
+            )
+        corners = np.concatenate([points_of(low, "low"), points_of(high, "high")]) / self._cell
+        if corners.shape != (2, 3) or not (np.abs(corners) < INDEX_LIMIT).all() or not (corners[0] < corners[1]).all():
+            raise StereovoxError(f"box {low} to {high}: give two corners x, y, z in metres, the lower one first")
+        first = np.floor(corners[0] + TIE).astype(np.int64)
+        return first, np.ceil(corners[1] - TIE).astype(np.int64) - first
+
+    def _about_zero(self, size: ArrayLike | None) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return the window where it stands until the camera is known, on faces of blocks."""
+        wanted = points_of([] if size is None else size, "size") / self._cell
+        if wanted.shape != (1, 3) or not ((wanted > 0) & (wanted < INDEX_LIMIT)).all():
+            raise StereovoxError(f"size {size}: give three lengths in metres")
+        return np.zeros(3, np.int64), np.ceil(wanted[0] - TIE).astype(np.int64)
+
+    def _follow(self) -> None:
+        """Move the window where the camera is too far from its middle, by whole blocks: `_seen` goes by blocks."""
+        self._check_place()
+        assert self._map.viewpoint is not None
+        camera = self._map.viewpoint.T_world_camera[:3, 3] / self._cell
+        away = np.abs(camera - (self._low + self._shape / 2))
+        if not self._made or (away > np.maximum(TRIGGER * self._shape, SIDE)).any():
+            self._low = SIDE * np.rint((camera - self._shape / 2) / SIDE).astype(np.int64)

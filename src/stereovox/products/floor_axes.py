@@ -1,0 +1,47 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Heights and floors of maps whose `up` is any axis."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stereovox.errors import StereovoxError
+
+Heights = tuple[float, float]
+"""Lowest and highest metres along the map's `up`, from the world's origin."""
+
+
+def floor_axes(up: str) -> tuple[int, int, int, int]:
+    """Return the axes of the map that are x and y of its floor, the one that stands across it, and its sign along `up`.
+
+    x and y are the map's where z is up; else the two axes that make a right-handed frame with `up`: y and z for x, z
+    and x for y, and with a minus the same two swapped.
+    """
+    upright = "xyz".index(up[-1])
+    x, y = (upright + 1) % 3, (upright + 2) % 3
+    return (y, x, upright, -1) if up.startswith("-") else (x, y, upright, 1)
+
+
+def upright_axes(up: str) -> NDArray[np.float64]:
+    """Return rows (3, 3) x, y and z of a right-handed frame whose z is a map's `up`, as directions in the map's frame.
+
+    They are the axes of the grid that `projection.project` makes.
+    """
+    x, y, upright, sign = floor_axes(up)
+    unit = np.eye(3)
+    return np.stack([unit[x], unit[y], sign * unit[upright]])
+
+
+def heights_of(points: ArrayLike, up: str) -> NDArray[np.float64]:
+    """Return the heights (N,) in metres of points (N, 3)."""
+    _, _, upright, sign = floor_axes(up)
+    return np.asarray(points, float)[:, upright] * sign
+
+
+def checked_heights(heights: Heights) -> Heights:
+    """Return two heights; raises StereovoxError where they do not rise."""
+    low, high = heights
+    if not low < high:
+        raise StereovoxError(f"heights {low:g}:{high:g} must be two numbers that rise, LO:HI in metres")
+    return low, high

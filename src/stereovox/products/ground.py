@@ -1,0 +1,151 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The ground under a robot: how high it is in each place, and where the robot can drive."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from enum import IntEnum
+from math import isfinite, radians, tan
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stereovox.errors import StereovoxError
+from stereovox.files import replacing
+from stereovox.maps import State, VoxelMap
+from stereovox.maps.occupancy import UNKNOWN, OccupancyGrid
+from stereovox.products.ground_slope import beside, slopes
+from stereovox.products.ground_surfaces import Floor, floor_of, ground_levels
+
+MARGIN = 1e-3
+"""Part of a cell by which boxes keep away from the cells beside them."""
+
+
+class Footing(IntEnum):
+    """What a place is to the robot."""
+
+    UNKNOWN = 0
+    DRIVABLE = 1
+    TENTATIVE = 2  # something above the ground is not decided
+    OBSTACLE = 3  # something stands or hangs there
+    STEP = 4  # the ground beside is higher or lower by more than a step
+    STEEP = 5
+    DROP = 6  # what is there lies lower by more than a step, and no way leads down
+
+
+PERCENT = np.array([UNKNOWN, 0, 50, 100, 100, 100, 100], np.int8)
+"""What each `Footing` is in an occupancy grid."""
+
+
+@dataclass(frozen=True, eq=False)
+class Robot:
+    """What a robot needs: metres, and degrees.
+
+    height: how much room above the ground. radius: about its middle, over which the slope is taken. max_step: the
+    highest step it climbs, up or down; lower things are no obstacles. max_slope_deg: the steepest ground.
+    """
+
+    height: float = 1.0
+    radius: float = 0.25
+    max_step: float = 0.1
+    max_slope_deg: float = 20.0
+
+    def __post_init__(self) -> None:
+        if not (0 <= self.max_step < self.height and isfinite(self.height)):
+            raise StereovoxError(f"max_step {self.max_step:g} must be 0 or more and less than height {self.height:g}")
+        if not (0 < self.radius < np.inf and 0 < self.max_slope_deg < 90):
+            raise StereovoxError(
+                f"radius {self.radius:g} must be above 0, max_slope_deg {self.max_slope_deg:g} between 0 and 90"
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class Ground:
+    """A floor seen from above; row 0 and column 0 are the lowest.
+
+    height: (rows, columns) float32, metres along the map's `up`, of the upper face of the ground; NaN where none was
+    seen. footing: (rows, columns) uint8 `Footing`. resolution: side of a cell in metres. origin: x, y, yaw of the
+    corner of cell (0, 0), in the axes of `project`.
+    """
+
+    height: NDArray[np.float32]
+    footing: NDArray[np.uint8]
+    resolution: float
+    origin: tuple[float, float, float]
+
+    @property
+    def grid(self) -> OccupancyGrid:
+        """Where the robot can drive: 0 per cent there, 50 where that is tentative, 100 where it cannot, -1 unknown."""
+        return OccupancyGrid(PERCENT[self.footing], self.resolution, self.origin)
+
+
+def ground(voxel_map: VoxelMap, robot: Robot | None = None, start: ArrayLike | None = None) -> Ground:
+    """Return the height of the ground and where a robot can drive on it.
+
+    Ground is occupied, has a free cell above it within a step, and nothing occupied in the robot's height. It grows
+    from the surface nearest to `start` ((3,) metres; without it from the lowest of the large ones) to all that is no
+    higher or lower by more than a step from one cell to the next; so a table top is no ground, a ramp is. Ground beyond
+    a gap that was not seen counts where it begins no more than a step higher or lower. Of two floors above one another
+    the one nearest in height to `start` counts, or else the lower one.
+    A place is drivable where the whole room above the step is free over ground that is not too steep (by the plane that
+    fits best within the robot's radius) and has no step beside it. Where no ground was seen, something occupied in the
+    robot's height above the nearest ground is an obstacle, a surface lower than a step below it a drop; all else is
+    unknown. The footprint of the robot is not added: inflate the grid for that.
+    robot: by default a `Robot` of 1 m. Raises StereovoxError where the map has no ground or is too large.
+    """
+    robot = robot or Robot()
+    floor = floor_of(voxel_map)
+    levels, lower = ground_levels(floor, robot.height, robot.max_step, start)
+    height = np.where(levels.mask, np.nan, levels.filled(0) * floor.side)
+    footing = _on_ground(floor, height, robot)
+    missing = np.isnan(height)
+    footing[missing] = _off_ground(floor, height, lower, robot)[missing]
+    return Ground(height.astype(np.float32), footing, floor.resolution, floor.origin)
+
+
+def write_ground(found: Ground, path: str | Path) -> None:
+    """Write a `Ground` for `numpy.load`: its arrays, `resolution` in metres, and `origin` x, y, yaw.
+
+    Raises MapFileError when the place cannot be written.
+    """
+    with replacing(path) as file:
+        np.savez_compressed(file, **asdict(found))
+
+
+def _on_ground(floor: Floor, height: NDArray[np.float64], robot: Robot) -> NDArray[np.uint8]:
+    """Return the `Footing` (rows, columns) where there is ground."""
+    footing = np.array([Footing.UNKNOWN, Footing.DRIVABLE, Footing.TENTATIVE, Footing.OBSTACLE], np.uint8)[
+        _room_above(floor, height, robot)
+    ]
+    footing[slopes(height, floor.resolution, robot.radius) > tan(radians(robot.max_slope_deg))] = Footing.STEEP
+    footing[beside(height) > robot.max_step + MARGIN * floor.side] = Footing.STEP
+    return footing
+
+
+def _off_ground(floor: Floor, height: NDArray[np.float64], lower: NDArray[np.int64], robot: Robot) -> NDArray[np.uint8]:
+    """Return the `Footing` (rows, columns) where there is none, seen from the nearest ground.
+
+    lower: (rows, columns) the lowest surface there, in cells, as high as can be where there is none.
+    """
+    from scipy.ndimage import distance_transform_edt
+
+    rows, columns = np.asarray(distance_transform_edt(np.isnan(height), return_distances=False, return_indices=True))
+    near = height[rows, columns]
+    above = _room_above(floor, near, robot)
+    footing = np.where(above == State.OCCUPIED, Footing.OBSTACLE, Footing.UNKNOWN)
+    footing[above == State.TENTATIVE] = Footing.TENTATIVE
+    drop = (lower * floor.side < near - robot.max_step - MARGIN * floor.side) & (above != State.OCCUPIED)
+    footing[drop] = Footing.DROP
+    return footing.astype(np.uint8)
+
+
+def _room_above(floor: Floor, height: NDArray[np.float64], robot: Robot) -> NDArray[np.uint8]:
+    """Return the worst `State` (rows, columns) of the cells between a step and the robot's height above the ground."""
+    worst = np.zeros(height.shape, np.uint8)
+    rows, columns = np.nonzero(~np.isnan(height))
+    over = height[rows, columns]
+    low = floor.points(rows + MARGIN, columns + MARGIN, over + robot.max_step + MARGIN * floor.side)
+    high = floor.points(rows + 1 - MARGIN, columns + 1 - MARGIN, over + robot.height - MARGIN * floor.side)
+    worst[rows, columns] = floor.voxel_map.check_boxes(np.minimum(low, high), np.maximum(low, high))
+    return worst

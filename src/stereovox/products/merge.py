@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Two maps as one: what both have seen adds up."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stereovox.history import MOST_REASONS, OTHERS, History
+from stereovox.maps import VoxelMap
+from stereovox.maps.blocks import CELLS
+from stereovox.maps.cell_format import CellRules
+from stereovox.maps.cell_times import LAST, NEVER, UNIT_NS
+from stereovox.products.moved import moved
+from stereovox.products.side_by_side import cells_at, check_same_cells, in_memory
+
+
+def merge(a: VoxelMap, b: VoxelMap, T_a_b: ArrayLike | None = None) -> VoxelMap:
+    """Return an unbounded map of all that two maps know, with the settings of `a`.
+
+    T_a_b: (4, 4) maps the world frame of `b` into that of `a`, see `moved`; none where both are the same.
+    The evidence of both adds up: log-odds a + b - prior, for each started from its prior, then clamped (Thrun et al.
+    2005, Probabilistic Robotics, 9.2). Where nothing was clamped before, that is the map of all frames together, but
+    for one step of a stored number where a sum passed just through "unknown". A cell that one map does not know is the
+    other's. Times are the later ones, frames and refusals are counted together, the viewpoint is the later one.
+    Raises StereovoxError where the cells differ in size or T_a_b is no rigid motion.
+    """
+    check_same_cells(a, b)
+    b = in_memory(b)
+    if T_a_b is not None:
+        b = moved(b, T_a_b)
+    merged = a.unbounded(a.config)
+    start_ns = b.times_start_ns if a.times_start_ns is None else a.times_start_ns
+    for coords, cells in b.slabs():
+        times = _later(merged, b, coords, start_ns) if a.config.map.keep_times else None
+        merged.insert(coords, _summed(a, cells_at(merged, coords), b, cells))
+        if times is not None:
+            merged.set_times(coords, times, start_ns)
+    merged.history = _together(a.history, b.history)
+    viewpoints = [one.viewpoint for one in (a, b) if one.viewpoint]
+    merged.viewpoint = max(viewpoints, key=lambda viewpoint: viewpoint.stamp_ns, default=None)
+    return merged
+
+
+def _summed(a: VoxelMap, mine: NDArray[np.integer], b: VoxelMap, theirs: NDArray[np.integer]) -> NDArray[np.integer]:
+    """Return what cells as `a` stores them hold with the evidence of cells as `b` stores them."""
+    rules, other = CellRules(a.config.map), CellRules(b.config.map)
+    scale = rules.format.per_log_odds / other.format.per_log_odds
+    evidence = np.rint((theirs.astype(np.int32) - other.prior) * scale).astype(np.int32)
+    number = np.where(mine == rules.format.unknown, rules.prior, mine) + evidence
+    number = np.clip(number, rules.lowest, rules.highest)
+    number += number == rules.format.unknown
+    return np.where(theirs == other.format.unknown, mine, number).astype(mine.dtype)
+
+
+def _later(a: VoxelMap, b: VoxelMap, coords: NDArray[np.int32], start_ns: int | None) -> NDArray[np.uint32]:
+    """Return the later time (n, 512) of each cell of blocks (n, 3), from `start_ns` on; NEVER where none is kept."""
+    times = np.full((len(coords), CELLS), NEVER, np.int64)
+    for one in (a, b):
+        if one.config.map.keep_times and one.times_start_ns is not None and start_ns is not None:
+            kept = np.where(cells_at(one, coords) == one.cell_format.unknown, NEVER, one.times_of(coords))
+            shifted = kept.astype(np.int64) + (one.times_start_ns - start_ns) // UNIT_NS
+            times = np.maximum(times, np.where(kept == NEVER, NEVER, np.clip(shifted, NEVER + 1, LAST)))
+    return times.astype(np.uint32)
+
+
+def _together(a: History, b: History) -> History:
+    """Return the counts of both; whom each trusted last says nothing about the next frame of the two together."""
+    names = dict.fromkeys(name for name in (a.recording, b.recording) if name)
+    lasts = [one for one in (a.last_frame, b.last_frame) if one]
+    return History(
+        frames=a.frames + b.frames,
+        refused=_counts(a.refused + b.refused),
+        settled=_counts(a.settled + b.settled),
+        ways=_counts(a.ways + b.ways),
+        recording=" + ".join(names),
+        last_frame=max(lasts, key=lambda last: last[1], default=None),
+    )
+
+
+def _counts(counts: Counter[str]) -> Counter[str]:
+    """Return counts of no more words than a saved map may have."""
+    kept = Counter(dict(counts.most_common(MOST_REASONS)))
+    if rest := counts.total() - kept.total():
+        kept[OTHERS] += rest
+    return kept

@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A map in another frame."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import product
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stereovox.errors import StereovoxError
+from stereovox.geometry import Transform, inverse, orthonormalise, rigidity_error, transform_points
+from stereovox.maps import State, VoxelMap
+from stereovox.maps.blocks import CELLS, SIDE
+from stereovox.maps.cell_format import CellRules
+from stereovox.maps.voxel_map import cells_where
+from stereovox.products.side_by_side import cells_at, put_times
+
+PIECE = 512
+"""Blocks looked at together."""
+RIGID = 1e-3
+"""Largest entry of |R^T R - I| that still passes for rounding."""
+NEAR = 1e-6
+"""Cells by which a place may miss the face it stands on for all its digits."""
+
+
+def moved(voxel_map: VoxelMap, T_a_b: ArrayLike) -> VoxelMap:
+    """Return what a map in frame b says in frame a, in cells of the same size; T_a_b (4, 4) maps b into a.
+
+    A cell gets the log-odds and the time of the cell that its middle lies in. Where the motion maps cells onto cells
+    (whole cells, quarter turns) that is exact. Where it does not, middles may miss a thin thing: so a cell also gets
+    the log-odds of any cell that is occupied or tentative and whose middle lies in it, if they are higher. Nothing
+    occupied is lost; things may become one cell thicker. Raises StereovoxError where T_a_b is no rigid motion.
+    """
+    T = rigid(T_a_b)
+    solid, there = _pushed(voxel_map, T), VoxelMap(voxel_map.config)
+    for coords in _reached(voxel_map, T):
+        points = transform_points(inverse(T), there.centers(_cells_of(coords)))
+        cells = _stored_at(voxel_map, points).reshape(-1, CELLS)
+        known = (cells != there.cell_format.unknown).any(axis=1)
+        there.insert(coords[known], cells[known])
+        if there.config.map.keep_times:
+            times = voxel_map.times_at(points).reshape(-1, CELLS)
+            there.set_times(coords[known], times[known], voxel_map.times_start_ns)
+    _raise_to(there, solid)
+    there.history = replace(voxel_map.history.copied(), trusted={}, waiting={})  # their poses are those of frame b
+    if voxel_map.viewpoint is not None:
+        there.viewpoint = voxel_map.viewpoint._replace(T_world_camera=T @ voxel_map.viewpoint.T_world_camera)
+    return there
+
+
+def rigid(T: ArrayLike) -> Transform:
+    """Return a (4, 4) rigid motion without what rounding did to it; raises StereovoxError where it is none."""
+    T = np.asarray(T, float)
+    error = rigidity_error(T)
+    if not error <= RIGID:
+        raise StereovoxError("the transform is no rigid motion: give a 4x4 matrix, without scale or mirror")
+    return orthonormalise(T)
+
+
+def higher(mine: NDArray[np.integer], cells: NDArray[np.integer], unknown: int) -> NDArray[np.integer]:
+    """Return the larger of two maps' cells as stored, where one is unknown the other."""
+    known = np.where(mine == unknown, cells, np.maximum(mine, cells))
+    return np.where(cells == unknown, mine, known)
+
+
+def _raise_to(there: VoxelMap, solid: VoxelMap) -> None:
+    for coords, cells in solid.slabs():
+        times = there.times_of(coords) if there.config.map.keep_times else None
+        there.insert(coords, higher(cells_at(there, coords), cells, there.cell_format.unknown))
+        if times is not None:
+            there.set_times(coords, np.maximum(times, solid.times_of(coords)), solid.times_start_ns)
+
+
+def _pushed(voxel_map: VoxelMap, T: Transform) -> VoxelMap:
+    """Return a map of the occupied and tentative cells alone, each moved into the one cell that holds its middle."""
+    rules, parts = CellRules(voxel_map.config.map), []
+    for coords, cells in voxel_map.slabs():
+        solid = rules.states(cells) >= State.TENTATIVE
+        indices, stored = cells_where(coords, cells, solid)
+        times = voxel_map.times_of(coords)[solid] if voxel_map.config.map.keep_times else np.zeros(len(stored))
+        parts.append((indices, stored, times))
+    indices, stored, times = (np.concatenate(part) for part in zip(*parts, strict=True))
+    order = np.argsort(stored, kind="stable")  # of several in one cell the last counts, the highest
+    places = transform_points(T, voxel_map.centers(indices[order])) / voxel_map.config.cell
+    indices = np.floor(places + NEAR).astype(np.int64)
+    pushed = VoxelMap.from_cells(voxel_map.config, indices, voxel_map.cell_format.log_odds(stored[order]))
+    if voxel_map.config.map.keep_times:
+        put_times(pushed, indices, times[order].astype(np.uint32), voxel_map.times_start_ns)
+    return pushed
+
+
+def _reached(voxel_map: VoxelMap, T: Transform) -> Iterator[NDArray[np.int32]]:
+    """Yield the blocks (n, 3) that the map's blocks may lie in after the motion, each once, piece by piece."""
+    block = SIDE * np.array(voxel_map.config.cell)
+    coords = np.concatenate([coords for coords, _ in voxel_map.slabs()])
+    corners = np.array(list(product((0, 1), repeat=3)))
+    places = transform_points(T, ((coords[:, None] + corners) * block).reshape(-1, 3)).reshape(-1, 8, 3) / block
+    low, high = np.floor(places.min(axis=1) - NEAR).astype(np.int64), np.floor(places.max(axis=1) + NEAR).astype(int)
+    most = (high - low).max(axis=0, initial=-1) + 1
+    found = [(low + offset)[(low + offset <= high).all(axis=1)] for offset in np.ndindex(*most)]
+    blocks = np.unique(np.concatenate([np.empty((0, 3), np.int64), *found]), axis=0).astype(np.int32)
+    for start in range(0, len(blocks), PIECE):
+        yield blocks[start : start + PIECE]
+
+
+def _cells_of(coords: NDArray[np.int32]) -> NDArray[np.int64]:
+    """Return the indices (n * 512, 3) of all cells of blocks (n, 3), as they are stored."""
+    return (
+        coords[:, None].astype(np.int64) * SIDE + np.stack(np.unravel_index(np.arange(CELLS), (SIDE,) * 3), 1)
+    ).reshape(-1, 3)
+
+
+def _stored_at(voxel_map: VoxelMap, points: NDArray[np.float64]) -> NDArray[np.integer]:
+    """Return what the cells at points (N, 3) store; no known cell has a log-odds of just zero."""
+    log_odds, cell_format = voxel_map.log_odds(points), voxel_map.cell_format
+    stored = np.where(log_odds == 0, cell_format.unknown, cell_format.stored(log_odds))
+    return stored.astype(cell_format.dtype)

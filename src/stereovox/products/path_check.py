@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether a ball may go along a path, where it would be stopped, and how old the evidence for that is."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stereovox.errors import StereovoxError
+from stereovox.maps import State, VoxelMap
+from stereovox.maps.queries import points_of
+
+HALVINGS = 48
+"""How often a part of a segment is halved in search of a place on it."""
+PIECE = 8
+"""Cells of ages are looked for about pieces of a segment of so many cells, or of its radius if that is more."""
+
+
+class PathCheck(NamedTuple):
+    """What a map says of a path of N segments.
+
+    worst: (N,) uint8, the worst `State` of the cells that the ball touches on each segment (`check_capsules`).
+    blocked_at: metres along the path that the ball can go until it touches a cell that is in its way; None where it
+        can go to the end.
+    oldest_s: (N,) float32 seconds since the last evidence for that known cell a segment touches which has been without
+        any the longest; NaN where it touches none. None where the map keeps no times.
+    """
+
+    worst: NDArray[np.uint8]
+    blocked_at: float | None
+    oldest_s: NDArray[np.float32] | None
+
+    @property
+    def free(self) -> bool:
+        """Whether nothing is in the way."""
+        return self.blocked_at is None
+
+
+def check_path(
+    voxel_map: VoxelMap,
+    waypoints: ArrayLike,
+    radius: float,
+    through_unknown: bool = False,
+    now_ns: int | None = None,
+) -> PathCheck:
+    """Tell whether a ball of `radius` metres may go from waypoint to waypoint, (N + 1, 3) in metres, world frame.
+
+    Cells that are occupied, tentative or unknown are in its way; with `through_unknown` unknown ones are not.
+    now_ns: the time from which ages count, by default that of the map's last frame.
+    Raises StereovoxError, one line, for fewer than two waypoints and other bad input.
+    """
+    points = points_of(waypoints, "waypoints").astype(float)
+    if len(points) < 2:
+        raise StereovoxError(f"waypoints: {len(points)} of them make no path; give two or more")
+    worst = voxel_map.check_capsules(points[:-1], points[1:], radius)
+    in_the_way = [State.OCCUPIED, State.TENTATIVE] + ([] if through_unknown else [State.UNKNOWN])
+    stopped = np.flatnonzero(np.isin(worst, in_the_way))
+    blocked_at = None
+    if len(stopped):
+        lengths, first = np.linalg.norm(np.diff(points, axis=0), axis=1), stopped[0]
+        share = _free_share(voxel_map, points[first], points[first + 1], radius, in_the_way)
+        blocked_at = float(lengths[:first].sum() + share * lengths[first])
+    ages = [_oldest(voxel_map, *ends, radius, now_ns) for ends in pairwise(points)]
+    return PathCheck(worst, blocked_at, np.array(ages, np.float32) if voxel_map.config.map.keep_times else None)
+
+
+def point_along(waypoints: ArrayLike, metres: float) -> NDArray[np.float64]:
+    """Return the place (3,) that is so many metres along a path (N, 3); its end where the path is shorter."""
+    points = points_of(waypoints, "waypoints").astype(float)
+    at = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+    return np.array([np.interp(metres, at, points[:, axis]) for axis in range(3)])
+
+
+def _free_share(
+    voxel_map: VoxelMap, start: NDArray[np.float64], end: NDArray[np.float64], radius: float, in_the_way: list[State]
+) -> float:
+    """Return how much of a blocked segment, 0 to 1, the ball can go: what it touched once stays touched."""
+    if voxel_map.check_capsules(start, start, radius)[0] in in_the_way:
+        return 0.0
+    low, high = 0.0, 1.0
+    for _ in range(HALVINGS):
+        middle = (low + high) / 2
+        if voxel_map.check_capsules(start, start + middle * (end - start), radius)[0] in in_the_way:
+            high = middle
+        else:
+            low = middle
+    return low
+
+
+def _oldest(
+    voxel_map: VoxelMap, start: NDArray[np.float64], end: NDArray[np.float64], radius: float, now_ns: int | None
+) -> float:
+    """Return the age in seconds of the oldest evidence that a capsule touches, NaN where there is none."""
+    if not voxel_map.config.map.keep_times:
+        return np.nan
+    cell = np.array(voxel_map.config.cell)
+    ages = [voxel_map.age((cells + 0.5) * cell, now_ns) for cells in _touched(cell, start, end, radius)]
+    return float(np.fmax.reduce(np.concatenate(ages), initial=np.nan))
+
+
+def _touched(
+    cell: NDArray[np.float64], start: NDArray[np.float64], end: NDArray[np.float64], radius: float
+) -> Iterator[NDArray[np.int64]]:
+    """Yield the cells (n, 3) that a capsule touches, piece by piece along its axis; some of them twice."""
+    length = float(np.linalg.norm(end - start))
+    joints = np.linspace(start, end, 1 + max(1, int(np.ceil(length / max(PIECE * cell.max(), radius)))))
+    for a, b in pairwise(joints):
+        first = np.floor((np.minimum(a, b) - radius) / cell).astype(np.int64)
+        last = np.floor((np.maximum(a, b) + radius) / cell).astype(np.int64)
+        cells = first + np.indices(last - first + 1).reshape(3, -1).T
+        yield cells[_away(a, b, cells * cell, (cells + 1) * cell) <= radius]
+
+
+def _away(
+    a: NDArray[np.float64], b: NDArray[np.float64], low: NDArray[np.float64], high: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return how far boxes low..high (n, 3) are from a segment (n,): where the distance's slope changes its sign."""
+    before, after = np.zeros((len(low), 1)), np.ones((len(low), 1))
+    for _ in range(HALVINGS):
+        middle = (before + after) / 2
+        place = a + middle * (b - a)
+        falls = ((place - np.clip(place, low, high)) @ (b - a) < 0)[:, None]
+        before, after = np.where(falls, middle, before), np.where(falls, after, middle)
+    place = a + after * (b - a)
+    return np.linalg.norm(place - np.clip(place, low, high), axis=1)

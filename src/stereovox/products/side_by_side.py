@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Maps block by block: the cells of any block of a map, and two maps side by side."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.errors import StereovoxError
+from stereovox.maps import VoxelMap, _pool
+from stereovox.maps.blocks import CELLS, SIDE
+from stereovox.maps.rolling import RollingMap
+
+Blocks = tuple[NDArray[np.int32], NDArray[np.integer], NDArray[np.integer]]
+"""Coordinates (n, 3), and the cells (n, 512) of two maps as each stores them."""
+
+
+def in_memory(voxel_map: VoxelMap) -> VoxelMap:
+    """Return the map with all its cells in memory; one that is there already is returned as it is."""
+    return voxel_map.unbounded(voxel_map.config) if isinstance(voxel_map, RollingMap) else voxel_map
+
+
+def cells_at(voxel_map: VoxelMap, coords: NDArray[np.int32]) -> NDArray[np.integer]:
+    """Return the cells (n, 512) as stored of blocks (n, 3) of a map in memory; all unknown where it has no block."""
+    stored, places = voxel_map.stored_cells, np.empty(len(coords), np.int64)
+    _pool.find_all(stored.table, stored.coords, np.ascontiguousarray(coords, np.int32), places)
+    cells = np.full((len(coords), CELLS), stored.unknown, stored.values.dtype)
+    has_row = (places >= 0) & (places < len(stored.values))
+    cells[has_row] = stored.values[places[has_row]]
+    cells[places >= len(stored.values)] = stored.lowest
+    return cells
+
+
+def side_by_side(a: VoxelMap, b: VoxelMap) -> Iterator[Blocks]:
+    """Yield every block that one of two maps in memory has, with the cells of both, piece by piece."""
+    for coords, cells in a.slabs():
+        yield coords, cells, cells_at(b, coords)
+    for coords, cells in b.slabs():
+        theirs = cells_at(a, coords)
+        new = (theirs == a.cell_format.unknown).all(axis=1)
+        yield coords[new], theirs[new], cells[new]
+
+
+def check_same_cells(a: VoxelMap, b: VoxelMap) -> None:
+    """Raise StereovoxError where cells of two maps differ in size."""
+    if not np.allclose(a.config.cell, b.config.cell, rtol=1e-9, atol=0):
+        sizes = " and ".join(" x ".join(f"{side:g}" for side in _short(one)) for one in (a, b))
+        raise StereovoxError(
+            f"the maps have cells of {sizes} m; bring the finer one to the size of the other with: stereovox coarsen"
+        )
+
+
+def take(target: VoxelMap, source: VoxelMap, coords: NDArray[np.int32], cells: NDArray[np.integer]) -> None:
+    """Put blocks (n, 3) with cells (n, 512) into `target`, with the times that `source` keeps of them."""
+    known = (cells != target.cell_format.unknown).any(axis=1)
+    target.insert(coords[known], cells[known])
+    if source.config.map.keep_times:
+        target.set_times(coords[known], source.times_of(coords[known]), source.times_start_ns)
+
+
+def put_times(target: VoxelMap, indices: NDArray[np.integer], times: NDArray[np.uint32], start_ns: int | None) -> None:
+    """Set the times (N,) of cells (N, 3) of a map, each named once; they count from `start_ns`."""
+    blocks, of_cell = np.unique(indices >> 3, axis=0, return_inverse=True)
+    low = indices & (SIDE - 1)
+    kept = np.zeros((len(blocks), CELLS), np.uint32)
+    kept[of_cell.ravel(), (low[:, 0] << 6) | (low[:, 1] << 3) | low[:, 2]] = times
+    target.set_times(blocks.astype(np.int32), kept, start_ns)
+
+
+def _short(voxel_map: VoxelMap) -> tuple[float, ...]:
+    cell = voxel_map.config.cell
+    return cell if len(set(cell)) > 1 else cell[:1]

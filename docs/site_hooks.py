@@ -12,13 +12,15 @@ from mkdocs.structure.files import File, Files
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = ("CONTRIBUTING.md", "CHANGELOG.md")
 """Files beside docs/ that become pages."""
+EXAMPLES = (".py", ".xml", ".yaml")
 UP = re.compile(r"\]\(\.\./")
 INTO_DOCS = re.compile(r"\]\(docs/")
 
 
 def on_files(files: Files, config: Any) -> Files:
     """Add pages and examples, as if they lay in docs/."""
-    for name in (*PAGES, *(f"examples/{path.name}" for path in sorted((ROOT / "examples").glob("*.py")))):
+    examples = (path for path in sorted((ROOT / "examples").rglob("*")) if path.suffix in EXAMPLES)
+    for name in (*PAGES, *(path.relative_to(ROOT).as_posix() for path in examples)):
         if files.get_file_from_path(name) is None:
             files.append(File.generated(config, name, abs_src_path=str(ROOT / name)))
     return files

@@ -94,7 +94,7 @@ class Robot:
 @pytest.fixture
 def robot(tmp_path, monkeypatch):
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    monkeypatch.setenv("ROS_DOMAIN_ID", str(101 + os.getpid() % 80))
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(50 + os.getpid() % 48))
     rclpy.init(args=[])
     robot = Robot(str(tmp_path / "live.svox"))
     yield robot

@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Maps are published as often as they are wanted."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="rclpy is not installed: pip install 'stereovox[ros2]'")
+
+from stereovox.config import load_config
+from stereovox.maps.occupancy import OccupancyGrid
+from stereovox.ros.options import Options
+from stereovox.ros.outputs import MAP, Outputs
+
+
+class Publisher:
+    def __init__(self):
+        self.sent, self.heard = [], 0
+
+    def get_subscription_count(self) -> int:
+        return self.heard
+
+    def publish(self, message):
+        self.sent.append(message)
+
+
+@pytest.mark.parametrize(("heard", "expected"), [(1, (58, 61)), (0, (2, 4))])
+def test_every_frame_has_its_map_while_somebody_listens(heard, expected):
+    publishers: dict[str, Publisher] = {}
+    node = SimpleNamespace(
+        create_publisher=lambda kind, topic, qos: publishers.setdefault(topic, Publisher()),
+        get_clock=lambda: SimpleNamespace(now=lambda: SimpleNamespace(nanoseconds=0)),
+        get_fully_qualified_name=lambda: "/stereovox",
+        get_logger=lambda: SimpleNamespace(info=print),
+    )
+    grid = OccupancyGrid(np.zeros((3, 4), np.int8), 0.1)
+    health = SimpleNamespace(state="current", text="current", as_dict=dict)
+    mapping = SimpleNamespace(config=load_config(), grid=lambda: grid, health=lambda: health, snapshot=lambda: None)
+    times = [100.0]
+    outputs = Outputs(node, mapping, Options(map_rate=30.0), dict, lambda: times[0])
+    publishers[MAP].heard = heard
+    random = np.random.default_rng(0)
+    for k in range(60):  # two seconds of a camera that is up to 3 ms late
+        times[0] = 100.0 + k / 30 + random.uniform(0, 0.003)
+        outputs.changed(k, "map")
+        outputs.update()
+    low, high = expected
+    assert low <= len(publishers[MAP].sent) <= high
+    assert len(publishers["/diagnostics"].sent) in (2, 3)
+    outputs.close()
+    assert publishers[MAP].sent[-1].header.stamp.nanosec == 59

@@ -59,7 +59,7 @@ def test_a_floor_there_and_back(capsys):
         (["import", "room.svox", "m"], "room.svox"),
         (["export", "room.svox", "m.bag", "--heights", "90:99"], "m.bag: nothing is known at heights 90 to 99 m"),
         (["export", "room.svox", "room.ply", "--heights", "0:1"], "heights are for 2-D maps"),
-        (["export", "floor.yaml", "m.bag", "--heights", "0:1"], "--heights: a floor's map has no height"),
+        (["export", "floor.yaml", "m.bag", "--heights", "0:1"], "--heights: a floor's map goes into a bag as it is"),
         (["export", "floor.yaml", "m.ply"], "is the map of a floor"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",

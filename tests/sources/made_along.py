@@ -13,7 +13,7 @@ FRAMES = 12
 
 
 class Along(Source):
-    """Frame 5 has no pose; the depth grows from frame to frame, and a corner of the image tells each reason."""
+    """Frame 5 has no pose; a post moves from frame to frame, and a corner of the image tells each reason."""
 
     name, camera = "along", CAMERA
 
@@ -22,7 +22,8 @@ class Along(Source):
 
     def frame(self, i):
         """Return frame `i`."""
-        depth = np.full((24, 32), 1.5 + 0.05 * i, np.float32)
+        depth = np.full((24, 32), 1.55, np.float32)
+        depth[10:, 2 * i : 2 * i + 2] = 1.25
         reason = np.zeros((24, 32), np.uint8)
         for n, why in enumerate((Reason.UNMATCHED, Reason.TOO_NEAR, Reason.TOO_FAR, Reason.MASKED)):
             depth[:4, 4 * n : 4 * n + 4], reason[:4, 4 * n : 4 * n + 4] = np.nan, why

@@ -22,8 +22,9 @@ from stereovox.view.viewer_panel import axis_chart, colour_bar, plain, statistic
 if TYPE_CHECKING:
     from viser import ViserServer
 
-GROWN, MOVED = 1.2, 0.01
-"""The page steps back from a map that grew by so much, if a looker moved by less than that share of the distance."""
+GROWN, ASIDE, MOVED = 1.2, 0.1, 0.01
+"""The page looks anew at a map that grew by so much, or whose middle went aside by such a share of the distance, if a
+looker moved by less than the last."""
 
 
 class Viewer:
@@ -37,8 +38,8 @@ class Viewer:
         self._name, self._map, self._up = name, voxel_map, up
         _dress(server)
         server.scene.set_up_direction(as_tuple(up_vector(up)))
-        self._eye, self._away = np.zeros(3), 0.0
-        self._look()
+        self._eye, self._middle, self._away = np.zeros(3), np.zeros(3), 0.0
+        self.follow()
         self.cells = Cells(server, voxel_map, up)
         self._legend = _Legend(server)
         self.layer = LayerPlane(server, voxel_map, up)
@@ -58,7 +59,6 @@ class Viewer:
     def take(self, voxel_map: VoxelMap) -> None:
         """Show another map with the same settings, which nobody changes from now on: a copy of one that grows."""
         self._map = voxel_map
-        self._look()
         for part in (self.cells, self.layer, self.cameras):
             part.take(voxel_map)
         self._tell()
@@ -71,16 +71,17 @@ class Viewer:
         """Take the page down."""
         stop(self.server)
 
-    def _look(self) -> None:
+    def follow(self) -> None:
         """Let those who look see the whole map when it has grown, unless they went to look from elsewhere."""
         look_from, look_at = first_look(self._map, self._up)
         away = float(np.linalg.norm(look_from - look_at))
-        if away < GROWN * self._away:
+        moved = float(np.linalg.norm(look_at - self._middle))
+        if away < GROWN * self._away and moved < ASIDE * self._away:
             return
         cameras = [client.camera for client in self.server.get_clients().values()]
         if self._away:
             cameras = [one for one in cameras if np.linalg.norm(one.position - self._eye) < MOVED * self._away]
-        self._eye, self._away = look_from, away
+        self._eye, self._middle, self._away = look_from, look_at, away
         for camera in (self.server.initial_camera, *cameras):
             camera.position, camera.look_at = as_tuple(look_from), as_tuple(look_at)
 

@@ -107,6 +107,7 @@ class LiveView:
             voxel_map, frame, words = self._waiting
             self.frame.show(frame, words)
             self.viewer.take(voxel_map)
+            self.viewer.follow()
             sleep(min(DRAW_REST * (monotonic() - start), PATIENCE_S / 2))
             self._free.set()
 

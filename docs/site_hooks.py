@@ -12,7 +12,6 @@ from mkdocs.structure.files import File, Files
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = ("CONTRIBUTING.md", "CHANGELOG.md")
 """Files beside docs/ that become pages."""
-EXAMPLES = (".py", ".xml", ".yaml")
 UP = re.compile(r"\]\(\.\./")
 INTO_DOCS = re.compile(r"\]\(docs/")
 

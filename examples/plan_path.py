@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Plan a way through a map for a robot that fits into a ball: A* over the cells where it touches nothing.
 
-    python examples/plan_path.py MAP START GOAL [RADIUS] [PICTURE.png] [--through-unknown]
+    python examples/plan_path.py MAP START GOAL [--through-unknown]
 
-Places are X,Y,Z in metres; the radius is 0.3 m and the picture plan.png unless named.
+Places are X,Y,Z in metres; the picture is plan.png.
 """
 
 import heapq
@@ -15,6 +15,7 @@ import numpy as np
 import stereovox as sv
 from stereovox.view.path import picture_path
 
+RADIUS = 0.3
 STEPS = [np.array(step) for step in product((-1, 0, 1), repeat=3) if any(step)]
 
 
@@ -38,8 +39,7 @@ def plan(m, start, goal, radius, through_unknown=False):
             inside = min(beside) >= 0 and np.less(beside, fits.shape).all()
             if inside and fits[beside] and length < lengths.get(beside, np.inf):
                 lengths[beside] = length
-                to_go = np.linalg.norm(np.subtract(last, beside) * field.cell)
-                heapq.heappush(ahead, (length + to_go, beside, cell))
+                heapq.heappush(ahead, (length + np.linalg.norm(np.subtract(last, beside) * field.cell), beside, cell))
     if last not in came:
         return None
     cells = [last]
@@ -49,15 +49,10 @@ def plan(m, start, goal, radius, through_unknown=False):
 
 
 if __name__ == "__main__":
-    through_unknown = "--through-unknown" in sys.argv
-    given = [word for word in sys.argv[1:] if word != "--through-unknown"]
-    path, *places, radius, picture = given + ["0.3", "plan.png"][len(given) - 3 :]
-    start, goal = (np.array(place.split(","), float) for place in places)
-    m = sv.load_map(path)
-    way = plan(m, start, goal, float(radius), through_unknown)
+    m = sv.load_map(sys.argv[1])
+    start, goal = (np.array(place.split(","), float) for place in sys.argv[2:4])
+    way = plan(m, start, goal, RADIUS, through_unknown="--through-unknown" in sys.argv)
     if way is None:
-        sys.exit(f"there is no way for a ball of {radius} m that is known to be free; or try --through-unknown")
-    checked = sv.check_path(m, way, float(radius), through_unknown)
-    picture_path(m, way, float(radius), picture, "A way through the map")
-    length = np.linalg.norm(np.diff(way, axis=0), axis=1).sum()
-    print(f"{length:.2f} m through {len(way)} places, {'free' if checked.free else 'BLOCKED'}; saved {picture}")
+        sys.exit(f"there is no way for a ball of {RADIUS} m that is known to be free; or try --through-unknown")
+    picture_path(m, way, RADIUS, "plan.png", "A way through the map")
+    print(f"{np.linalg.norm(np.diff(way, axis=0), axis=1).sum():.2f} m through {len(way)} places; saved plan.png")

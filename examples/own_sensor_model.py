@@ -29,6 +29,6 @@ class Careful:
 SENSORS["careful"] = f"{__name__}:Careful"
 
 mapper = sv.Mapper(voxel_size=0.1, **{"sensor.model": "careful", "sensor.p_hit": 0.7})
-for frame in sv.open_source("sim:room", frames=":10"):
+for frame in sv.open_source("sim:room", frames=":4"):
     mapper.add(frame)
 print(mapper.map.counts())

@@ -4,7 +4,7 @@
 import stereovox as sv
 
 mapper = sv.Mapper("default", voxel_size=0.1)  # profile name, TOML file or Config; settings on top
-for frame in sv.open_source("sim:room", frames=":30"):  # or a folder
+for frame in sv.open_source("sim:room", frames=":10"):  # or a folder
     report = mapper.add(frame)  # UpdateReport: milliseconds, cells changed, why it was refused (None if it was not)
 
 m = mapper.map

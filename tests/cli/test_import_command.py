@@ -56,6 +56,7 @@ def test_a_floor_there_and_back(capsys):
         (["import", "room.ply", "m", "--topic", "/a"], "--topic says nothing"),
         (["import", "room.ply", "m.yaml"], "room.ply: neither a ROS 1 bag"),
         (["import", "room.bag", "m.yaml", "--voxel-size", "1"], "--voxel-size: a floor's map tells"),
+        (["import", "room.bag", "m", "--voxel-size", "1"], "room.bag: an Octomap tells how large its cells are"),
         (["import", "room.svox", "m"], "room.svox"),
         (["export", "room.svox", "m.bag", "--heights", "90:99"], "m.bag: nothing is known at heights 90 to 99 m"),
         (["export", "room.svox", "room.ply", "--heights", "0:1"], "heights are for 2-D maps"),

@@ -74,7 +74,7 @@ def test_paths_are_checked(saved, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("words", "complaint"),
     [
-        (["distance", "MAP", "d.txt"], "d.txt: distances are written as .npz"),
+        (["distance", "MAP", "d.txt"], "FILE d.txt: end the file's name with .npz"),
         (["distance", "MAP", "d.npz", "--box", "1,2,3"], "--box 1,2,3: write X0,Y0,Z0,X1,Y1,Z1"),
         (["distance", "MAP", "d.npz", "--box", "3,3,3,1,1,1"], "lower one first"),
         (["distance", "MAP", "d.npz", "--max", "-1"], "more than 0 m"),
@@ -82,6 +82,7 @@ def test_paths_are_checked(saved, tmp_path, capsys):
         (["distance", "MAP", "d.npz", "--at", "1"], "--picture"),
         (["distance", "MAP", "d.npz", "--picture", "d.png", "--at", "9"], "outside the box"),
         (["path", "MAP", "1,1,1", "--radius", "0.3"], "two or more"),
+        (["path", "MAP", "1,1,1", "2,2,2", "--radius", "0.3", "--picture", "p.jpg"], "--picture p.jpg: end the file's"),
         (["path", "MAP", "1,1", "2,2,2", "--radius", "0.3"], "'1,1' is no point"),
         (["path", "MAP", "1,1,1", "2,2,2", "--radius", "-1"], "0 m or more"),
         (["path", "MAP", "1,1,1", "2,2,2"], "--radius"),

@@ -8,6 +8,7 @@ from stereovox.config import load_config
 from stereovox.errors import MapFileError, StereovoxError
 from stereovox.maps import VoxelMap
 from stereovox.products import EXPORTS, FLAT, export
+from stereovox.products.points import PCD_POINT, PLY_POINT
 
 CONFIG = load_config(voxel_size=0.25, **{"map.prior": 0.5})
 
@@ -96,6 +97,19 @@ def test_ply_holds_the_occupied_cells(tmp_path, voxel_map):
         assert len(np.unique(cloud.colors[level], axis=0)) == 1
     assert cloud.colors[low][0, 2] > cloud.colors[low][0, 0]  # from blue
     assert cloud.colors[high][0, 0] > cloud.colors[high][0, 2]  # to red
+
+
+@pytest.mark.parametrize("ending", [".ply", ".pcd"])
+def test_points_are_coloured_by_height_whichever_way_is_up(tmp_path, ending):
+    voxel_map = VoxelMap.from_cells(load_config(CONFIG, up="-y"), [[0, 0, 0], [0, -1, 0], [0, 0, 1]], [3.0] * 3)
+    export(voxel_map, tmp_path / f"map{ending}")
+    data = (tmp_path / f"map{ending}").read_bytes()
+    kind = PLY_POINT if ending == ".ply" else PCD_POINT
+    points = np.frombuffer(data, kind, offset=len(data) - 3 * kind.itemsize)
+    top = points["y"] < 0
+    assert top.tolist().count(True) == 1
+    colours = points["red" if ending == ".ply" else "rgb"]
+    assert colours[top] > colours[~top][0] == colours[~top][1]
 
 
 def test_npz_holds_every_known_cell(tmp_path, voxel_map):

@@ -180,6 +180,7 @@ def test_slopes_are_those_of_the_plane_that_fits_best():
         wanted = 0.0 if np.isnan(height[row, column]) else np.hypot(*plane[:2])
         assert found[row, column] == pytest.approx(wanted)
     assert slopes(np.array([[0.0, 1.0, 2.0]]), 1.0, 1.0).tolist() == [[0, 0, 0]]
+    np.testing.assert_allclose(slopes(np.array([[0.0, 1.0, 2.0]] * 2), 1.0, 1e9), 1)  # no wider than all there is
 
 
 def test_steps_beside():

@@ -161,6 +161,13 @@ def test_points_of_other_programs(tmp_path, name):
         assert str(error.value).startswith(str(tmp_path / name))
 
 
+@pytest.mark.parametrize("piece", [1, 5, 33])
+def test_text_in_pieces(tmp_path, monkeypatch, piece):
+    monkeypatch.setattr("stereovox.products.point_files.TEXT_PIECE", piece)
+    (tmp_path / "a.ply").write_bytes(SOUND["text.ply"] + b"3 0 1 2\nnot read any more")
+    np.testing.assert_allclose(read_points(tmp_path / "a.ply").xyz, POINTS, rtol=1e-6)
+
+
 def test_points_that_are_none_count_for_nothing(tmp_path):
     (tmp_path / "a.pcd").write_bytes(SOUND["text.pcd"].replace(b"-9.25", b"nan"))
     assert import_map(tmp_path / "a.pcd", 1.0).counts()["occupied"] == 2
@@ -249,14 +256,14 @@ def test_the_cells_stand_in_the_bag_s_map_frame_as_its_grid_does(tmp_path):
 
 def test_bags_without_such_a_map(tmp_path, voxel_map):
     write_grid_bag(OccupancyGrid(np.zeros((2, 2), np.int8), 0.1), tmp_path / "floor.bag")
-    with pytest.raises(MapFileError, match="has no octomap_msgs/Octomap; name a topic"):
+    with pytest.raises(MapFileError, match=r"has no octomap_msgs/Octomap; name a topic .* /map_mapping "):
         import_map(tmp_path / "floor.bag")
     with pytest.raises(MapFileError, match="holds no octomap_msgs/Octomap or sensor_msgs/PointCloud2"):
         import_map(tmp_path / "floor.bag", topic="/map_mapping")
     with BagWriter(tmp_path / "two.mcap") as bag:
         for topic in ("/a", "/b"):
             bag.octomap(0, b"\0", 0.1, topic)
-    with pytest.raises(MapFileError, match=r"2 topics .*\(/a, /b\)"):
+    with pytest.raises(MapFileError, match=r"2 topics .*/a .*, /b "):
         import_map(tmp_path / "two.mcap")
     with pytest.raises(MapFileError, match="node"):
         import_map(tmp_path / "two.mcap", topic="/a")

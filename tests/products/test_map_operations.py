@@ -269,7 +269,7 @@ def test_cells_that_stay_as_they_are(halves):
         newest[parent] = min(newest.get(parent, 1e9), age)
     assert coarse.ages().tolist() == [newest[tuple(cell)] for cell in coarse.cells()[0].tolist()]
     assert sv.coarsen(random_map(), 3).config.voxel_size == 0.3
-    for factor in (0, 1.5, 10**6):
+    for factor in (0, 1.5, np.nan, np.inf, 10**6, 10**30):
         with pytest.raises(StereovoxError):
             sv.coarsen(random_map(), factor)
 

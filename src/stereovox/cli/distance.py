@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from stereovox.cli.endings import check_ending
 from stereovox.cli.numbers import CORNERS, numbers_of
 from stereovox.cli.saved_map import open_map
 from stereovox.cli.terminal import say, size, thousands
@@ -73,10 +74,8 @@ def run(arguments: Namespace) -> dict[str, Any]:
 
 
 def _check_files(arguments: Namespace) -> None:
-    if Path(arguments.file).suffix.lower() != ".npz":
-        raise StereovoxError(f"{arguments.file}: distances are written as .npz; name the file so")
-    if arguments.picture and Path(arguments.picture).suffix.lower() != ".png":
-        raise StereovoxError(f"{arguments.picture}: pictures are written as .png; name the file so")
+    check_ending("FILE", arguments.file, ".npz")
+    check_ending("--picture", arguments.picture, ".png")
     if arguments.at is not None and not arguments.picture:
         raise StereovoxError("--at: the height of the layer to draw; it goes with --picture FILE.png")
 

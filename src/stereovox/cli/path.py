@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from stereovox.cli.endings import check_ending
 from stereovox.cli.numbers import point
 from stereovox.cli.saved_map import open_map
 from stereovox.cli.terminal import say
-from stereovox.errors import StereovoxError
 
 if TYPE_CHECKING:
     from stereovox.products.path_check import PathCheck
@@ -40,8 +40,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
     from stereovox.maps import State
     from stereovox.products.path_check import check_path, point_along
 
-    if arguments.picture and Path(arguments.picture).suffix.lower() != ".png":
-        raise StereovoxError(f"{arguments.picture}: pictures are written as .png; name the file so")
+    check_ending("--picture", arguments.picture, ".png")
     voxel_map = open_map(arguments.map)
     points = np.array(arguments.point)
     found = check_path(voxel_map, points, arguments.radius, arguments.through_unknown)

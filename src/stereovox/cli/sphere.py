@@ -8,9 +8,9 @@ the end. sim:surround is a drone with four stereo cameras.
 from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from stereovox.cli.endings import check_ending
 from stereovox.cli.terminal import say, say_about_compiling, tracked
 from stereovox.errors import StereovoxError
 
@@ -38,7 +38,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
     from stereovox.evaluate.look_round import look_round
     from stereovox.sources import open_stream
 
-    _check_picture(arguments.out)
+    check_ending("--out", arguments.out, ".png")
     config = _config(arguments)
     stream = open_stream(arguments.source, arguments.frames)
     if stream.length is None and arguments.frames is None:
@@ -66,11 +66,6 @@ def run(arguments: Namespace) -> dict[str, Any]:
 
 def _note(line: str) -> None:
     say(f"note: {line}")
-
-
-def _check_picture(out: str | None) -> None:
-    if out is not None and Path(out).suffix.lower() != ".png":
-        raise StereovoxError(f"{out}: pictures are written as .png; name the file so")
 
 
 def _config(arguments: Namespace) -> Any:

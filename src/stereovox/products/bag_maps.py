@@ -75,12 +75,17 @@ def read_bag_map(path: str | Path, voxel_size: float | None = None, topic: str |
     voxel_size: metres, for a PointCloud2 alone. Raises MapFileError, one line.
     """
 
+    def octomap_cells(wire: Wire) -> VoxelMap:
+        if voxel_size is not None:
+            raise ValueError("an Octomap tells how large its cells are; leave --voxel-size out")
+        return _octomap_cells(wire)
+
     def cloud_cells(wire: Wire) -> VoxelMap:
         if voxel_size is None:
             raise ValueError("points do not tell how large cells should be; give --voxel-size in metres")
         return cells_of_points(read_point_cloud(wire).points, voxel_size)
 
-    return _last(Path(path), topic, {OCTOMAP: _octomap_cells, POINT_CLOUD: cloud_cells})
+    return _last(Path(path), topic, {OCTOMAP: octomap_cells, POINT_CLOUD: cloud_cells})
 
 
 def read_bag_grid(path: str | Path, topic: str | None = None) -> OccupancyGrid:
@@ -101,8 +106,7 @@ def _last(path: Path, topic: str | None, readers: dict[str, Callable[[Wire], Mad
         bag = open_bag(path)
         topic = topic or _only(bag.types, next(iter(readers)))
         if bag.types.get(topic) not in readers:
-            held = ", ".join(f"{name} ({kind})" for name, kind in sorted(bag.types.items())) or "nothing"
-            raise ValueError(f"{topic} holds no {' or '.join(readers)}; the bag has {held}")
+            raise ValueError(f"{topic} holds no {' or '.join(readers)}; {_held(bag.types)}")
         return readers[bag.types[topic]](bag.read(topic, len(bag.stamps(topic)) - 1))
     except (SourceError, FrameRefused) as error:
         raise MapFileError(str(error)) from None
@@ -113,6 +117,10 @@ def _last(path: Path, topic: str | None, readers: dict[str, Callable[[Wire], Mad
 def _only(types: dict[str, str], kind: str) -> str:
     found: Sequence[str] = sorted(topic for topic, held in types.items() if held == kind)
     if len(found) != 1:
-        told = f"has {len(found)} topics of {kind} ({', '.join(found)})" if found else f"has no {kind}"
-        raise ValueError(f"{told}; name a topic with --topic")
+        told = f"has {len(found)} topics of {kind}" if found else f"has no {kind}"
+        raise ValueError(f"{told}; name a topic with --topic; {_held(types)}")
     return found[0]
+
+
+def _held(types: dict[str, str]) -> str:
+    return f"the bag has {', '.join(f'{name} ({kind})' for name, kind in sorted(types.items())) or 'nothing'}"

@@ -24,12 +24,12 @@ def coarsen(voxel_map: VoxelMap, factor: int) -> VoxelMap:
     all of them are, and nothing occupied is lost. Its log-odds are the largest of theirs, its time the latest.
     Raises StereovoxError for a factor that is no whole number from 1 on, or makes cells too large.
     """
-    if factor != int(factor) or factor < 1:
-        raise StereovoxError(f"factor {factor}: give a whole number of cells, 2 or more")
+    if not 1 <= factor < 2**31 or factor != int(factor):
+        raise StereovoxError(f"factor {factor}: give a whole number of cells, 1 or more")
+    settings = _coarser(voxel_map.config, int(factor))
     parts = [_parents(voxel_map, coords, cells, int(factor)) for coords, cells in voxel_map.slabs()]
     indices, number, stored, times = _grouped(*map(np.concatenate, zip(*parts, strict=True)))
     sure = (number == int(factor) ** 3) | (CellRules(voxel_map.config.map).states(stored) != State.FREE)
-    settings = _coarser(voxel_map.config, int(factor))
     coarse = VoxelMap.from_cells(settings, indices[sure], voxel_map.cell_format.log_odds(stored[sure]))
     if settings.map.keep_times:
         put_times(coarse, indices[sure], times[sure], voxel_map.times_start_ns)

@@ -18,7 +18,7 @@ def slopes(height: NDArray[np.float64], side: float, radius: float) -> NDArray[n
     """
     from scipy.ndimage import correlate1d
 
-    reach = max(int(np.ceil(radius / side - 1e-9)), LEAST)
+    reach = max(int(np.ceil(min(radius / side, max(height.shape)) - 1e-9)), LEAST)  # farther off there is nothing
     known = ~np.isnan(height)
     z = np.where(known, height - (height[known].mean() if known.any() else 0), 0.0)
     run = np.arange(-reach, reach + 1) * side

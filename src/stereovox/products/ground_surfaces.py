@@ -89,7 +89,7 @@ def floor_of(voxel_map: VoxelMap) -> Floor:
         voxel_map = in_cubes(voxel_map)
     bounds, cell = voxel_map.bounds(), voxel_map.config.cell
     if bounds is None:
-        raise StereovoxError("the map is empty: it has no ground")
+        raise StereovoxError("the map is empty: there is no floor to look at")
     low, high = np.rint(bounds[:, [x, y]] / cell[x]).astype(np.int64)
     columns, rows = (high - low).tolist()
     if rows * columns > MOST_CELLS:

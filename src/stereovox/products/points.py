@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from stereovox.files import replacing
 from stereovox.maps import VoxelMap
+from stereovox.products.floor_axes import heights_of
 
 PLY_POINT = np.dtype(
     [
@@ -34,7 +35,7 @@ def write_ply(voxel_map: VoxelMap, path: str | Path) -> None:
     points = np.empty(len(centers), PLY_POINT)
     for axis, name in enumerate("xyz"):
         points[name] = centers[:, axis]
-    colours = height_colours(centers[:, 2])
+    colours = cell_colours(voxel_map, centers)
     for channel, name in enumerate(("red", "green", "blue")):
         points[name] = colours[:, channel]
     points["probability"] = voxel_map.probability(centers)
@@ -52,7 +53,8 @@ def write_pcd(voxel_map: VoxelMap, path: str | Path) -> None:
     points = np.empty(len(centers), PCD_POINT)
     for axis, name in enumerate("xyz"):
         points[name] = centers[:, axis]
-    points["rgb"] = height_colours(centers[:, 2]).astype(np.uint32) @ np.array([1 << 16, 1 << 8, 1], np.uint32)
+    colours = cell_colours(voxel_map, centers)
+    points["rgb"] = colours.astype(np.uint32) @ np.array([1 << 16, 1 << 8, 1], np.uint32)
     points["probability"] = voxel_map.probability(centers)
     with replacing(path) as file:
         file.write(_pcd_header(len(points), voxel_map.voxel_size).encode("ascii"))
@@ -79,6 +81,11 @@ def write_npz(voxel_map: VoxelMap, path: str | Path) -> None:
             occupied_above=np.float64(limits.occupied_above),
             settings=np.frombuffer(json.dumps(voxel_map.config.model_dump()).encode(), np.uint8),
         )
+
+
+def cell_colours(voxel_map: VoxelMap, centers: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """Return the `height_colours` (N, 3) of places (N, 3) in metres, whichever axis of the map is up."""
+    return height_colours(heights_of(centers, voxel_map.config.up))
 
 
 def height_colours(z: NDArray[np.floating]) -> NDArray[np.uint8]:

@@ -22,7 +22,7 @@ from stereovox.frame import AnyFrame, DepthImage
 from stereovox.geometry import Transform
 from stereovox.maps import VoxelMap
 from stereovox.maps.cubes import in_cubes
-from stereovox.products.points import height_colours
+from stereovox.products.points import cell_colours
 
 CAMERA, CELLS, WAY = "world/camera", "world/occupied", "world/path"
 TIME = "stamp"
@@ -79,7 +79,7 @@ class RerunFile:
         self._at(stamp_ns)
         cubes = in_cubes(voxel_map)
         centres, size = cubes.occupied(), cubes.voxel_size
-        self._stream.log(CELLS, self._cells(centres, _colours(cubes, centres), size), static=stamp_ns is None)
+        self._stream.log(CELLS, self._cells(centres, cell_colours(cubes, centres), size), static=stamp_ns is None)
         lines = [poses[:, :3, 3] for poses in map(voxel_map.history.path.poses, voxel_map.history.path.stops)]
         way = self._rerun.LineStrips3D(lines, colors=[PATH_COLOUR] * len(lines))
         self._stream.log(WAY, way, static=stamp_ns is None)
@@ -142,12 +142,6 @@ class RerunLog:
         """Write the map as it is when the last frame is in it."""
         stamp_ns = 0 if voxel_map.viewpoint is None else voxel_map.viewpoint.stamp_ns
         self._file.add_map(voxel_map.snapshot(), stamp_ns)
-
-
-def _colours(voxel_map: VoxelMap, centres: NDArray[np.float64]) -> NDArray[np.uint8]:
-    up = voxel_map.config.up
-    heights = centres[:, "xyz".index(up[-1])]
-    return height_colours(-heights if up.startswith("-") else heights)
 
 
 def _rerun() -> ModuleType:

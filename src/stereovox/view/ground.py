@@ -31,6 +31,8 @@ def draw_ground(voxel_map: VoxelMap, ground: Ground, heading: str) -> Any:
 
     floor = floor_of(voxel_map)
     rows, columns = ground.grid.known_span
+    if rows.stop == rows.start:  # nothing is decided: all of it
+        rows, columns = (slice(0, number) for number in ground.footing.shape)
     shape = rows.stop - rows.start, columns.stop - columns.start
     figure, panels = page_of(shape, panels=2)
     _draw_heights(figure, panels[0], floor, ground)

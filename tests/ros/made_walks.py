@@ -6,6 +6,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import wire
 
 from stereovox.cameras import PinholeCamera
 from stereovox.frame import Frame
@@ -41,14 +42,22 @@ def depth_at(k: int) -> Frame:
     return Frame(depth, CAMERA, base_at(stamp_ns) @ T_BASE_CAMERA, stamp_ns, 0.001)
 
 
-def write_walk(path: Path, frames: int = 12) -> Path:
-    """Write depth, camera_info, /tf and /tf_static in order of time; transforms go on after the last image."""
+def write_walk(path: Path, frames: int = 12, odometry: bool = False) -> Path:
+    """Write depth, camera_info, /tf and /tf_static in order of time; transforms go on after the last image.
+
+    odometry: poses of the camera itself on /odom take the place of transforms.
+    """
     told = [(START_NS - FRAME_NS // 4 + k * TF_NS, k) for k in range(2 + frames * FRAME_NS // TF_NS)]
     with BagWriter(path) as bag:
-        bag.fixed("base_link", OPTICAL, T_BASE_CAMERA)
+        if not odometry:
+            bag.fixed("base_link", OPTICAL, T_BASE_CAMERA)
         for stamp_ns, k in sorted([*told, *((START_NS + k * FRAME_NS, -k) for k in range(frames))]):
             if (stamp_ns - START_NS) % FRAME_NS == 0 and k <= 0:
                 bag.depth(depth_at(-k), DEPTH, OPTICAL)
+            elif odometry:
+                message = wire.messages().odometry(np.zeros(3), stamp_ns, "odom", OPTICAL)
+                message.pose.pose = wire.messages()._pose(base_at(stamp_ns) @ T_BASE_CAMERA)
+                bag._write("/odom", "nav_msgs/msg/Odometry", stamp_ns, message)
             else:
                 bag.transform(stamp_ns, "odom", "base_link", base_at(stamp_ns))
     return path

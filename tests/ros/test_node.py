@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 
 import numpy as np
@@ -22,23 +21,29 @@ from sensor_msgs.msg import CameraInfo, Image, PointCloud2  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 
 from stereovox.config import load_config  # noqa: E402
+from stereovox.errors import StereovoxError  # noqa: E402
 from stereovox.maps import load_map  # noqa: E402
 from stereovox.products.projection import project  # noqa: E402
+from stereovox.ros.library import optional_message  # noqa: E402
 from stereovox.ros.mapping import make_mapping  # noqa: E402
 from stereovox.ros.node import MapNode  # noqa: E402
 from stereovox.ros.options import Options  # noqa: E402
 from stereovox.ros.parameters import freeze  # noqa: E402
 
-TFMessage = pytest.importorskip("tf2_msgs.msg", reason="tf2_msgs is not installed (docs/ros2.md)").TFMessage
+TFMessage = optional_message("tf2_msgs", "TFMessage")
+Octomap = optional_message("octomap_msgs", "Octomap")
+MOUNT = f"base_link {OPTICAL} 0.1 0 0.4 -1.5708 0 -1.5708"
+BY_TF = {"odometry": (), "fixed": ()} if TFMessage else {"odometry": ("/odom",), "fixed": (MOUNT,)}
+"""tf2_msgs is not on PyPI: without it poses come by odometry."""
 KEPT = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-PATIENCE_S = 15.0
+PATIENCE_S = 60.0
 
 
 class Robot:
     """A node, and beside it one that sends and listens."""
 
     def __init__(self, out: str):
-        self.options = Options(depth=(DEPTH,), wait_s=0.3, cloud_rate=20.0, late_s=10.0, out=out)
+        self.options = Options(depth=(DEPTH,), wait_s=0.3, cloud_rate=20.0, late_s=60.0, out=out, **BY_TF)
         self.reports = []
         self.mapping = make_mapping(load_config(voxel_size=0.1), None, None)
         given = [rclpy.Parameter("voxel_size", value=0.1)]
@@ -53,9 +58,11 @@ class Robot:
         )
         self.listening = SingleThreadedExecutor()
         self.listening.add_node(self.other)
-        kinds = {DEPTH: Image, "/camera/depth/camera_info": CameraInfo, "/tf": TFMessage}
+        kinds = {DEPTH: Image, "/camera/depth/camera_info": CameraInfo}
+        kinds |= {"/tf": TFMessage} if TFMessage else {"/odom": Odometry}
         self.send = {topic: self.other.create_publisher(kind, topic, 20) for topic, kind in kinds.items()}
-        self.send["/tf_static"] = self.other.create_publisher(TFMessage, "/tf_static", KEPT)
+        if TFMessage:
+            self.send["/tf_static"] = self.other.create_publisher(TFMessage, "/tf_static", KEPT)
         self.came: dict[str, list] = {}
 
     def listen(self, kind, topic, qos=KEPT):
@@ -72,13 +79,21 @@ class Robot:
     def drive(self, frames: int):
         self.until(lambda: all(one.get_subscription_count() for one in self.send.values()))
         made = wire.messages()
-        self.publish("/tf_static", made.transforms(0, [("base_link", OPTICAL, T_BASE_CAMERA)]))
+        if TFMessage:
+            self.publish("/tf_static", made.transforms(0, [("base_link", OPTICAL, T_BASE_CAMERA)]))
         for k in range(frames):
             frame = depth_at(k)
             self.publish("/camera/depth/camera_info", made.camera_info(CAMERA, frame.stamp_ns, OPTICAL))
             self.publish(DEPTH, made.image(frame.depth, frame.stamp_ns, OPTICAL))
-            self.publish("/tf", made.transforms(frame.stamp_ns, [("odom", "base_link", base_at(frame.stamp_ns))]))
+            self.stand(base_at(frame.stamp_ns), frame.stamp_ns)
         self.until(lambda: len(self.reports) == frames)
+
+    def stand(self, T, stamp_ns):
+        if TFMessage:
+            self.publish("/tf", wire.messages().transforms(stamp_ns, [("odom", "base_link", T)]))
+        else:
+            pose = np.array([T[0, 3], T[1, 3], np.arctan2(T[1, 0], T[0, 0])])
+            self.publish("/odom", wire.messages().odometry(pose, stamp_ns, "odom", "base_link"))
 
     def publish(self, topic, message):
         self.send[topic].publish(wire.packed(message))
@@ -92,19 +107,22 @@ class Robot:
 
 
 @pytest.fixture
-def robot(tmp_path, monkeypatch):
+def robot(tmp_path, monkeypatch, domains):
     monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-    monkeypatch.setenv("ROS_DOMAIN_ID", str(50 + os.getpid() % 48))
+    monkeypatch.setenv("ROS_DOMAIN_ID", str(domains[1]))
     rclpy.init(args=[])
     robot = Robot(str(tmp_path / "live.svox"))
     yield robot
     robot.maker.close()
+    robot.node.destroy_node()
+    robot.other.destroy_node()
     rclpy.shutdown()
 
 
 def test_what_is_published_is_what_the_map_says(robot):
-    octomap_msgs = pytest.importorskip("octomap_msgs.msg", reason="octomap_msgs is not installed (docs/ros2.md)")
-    topics = {"/map_mapping": OccupancyGrid, "/occupied_cells": PointCloud2, "/octomap_binary": octomap_msgs.Octomap}
+    topics = {"/map_mapping": OccupancyGrid, "/occupied_cells": PointCloud2}
+    if Octomap is not None:
+        topics["/octomap_binary"] = Octomap
     for topic, kind in topics.items():
         robot.listen(kind, topic)
     robot.listen(DiagnosticArray, "/diagnostics", 10)
@@ -117,14 +135,15 @@ def test_what_is_published_is_what_the_map_says(robot):
 
     robot.until(lambda: all_came() and len(robot.came["/diagnostics"]) > 1)
     voxel_map = robot.mapping.snapshot()()
-    grid, cloud, octomap = (robot.came[topic][-1] for topic in topics)
-    assert {grid.header.frame_id, cloud.header.frame_id, octomap.header.frame_id} == {"odom"}
+    grid, cloud, *octomap = (robot.came[topic][-1] for topic in topics)
+    assert {one.header.frame_id for one in (grid, cloud, *octomap)} == {"odom"}
     check_grid(grid, project(voxel_map))
     points = np.frombuffer(cloud.data, "<f4").reshape(-1, 4)
     np.testing.assert_allclose(points[:, :3], voxel_map.occupied(), atol=1e-6)
     np.testing.assert_allclose(points[:, 3], voxel_map.probability(voxel_map.occupied()), atol=1e-6)
     assert [(field.name, field.offset) for field in cloud.fields][-1] == ("probability", 12)
-    check_octomap(octomap, voxel_map)
+    for message in octomap:
+        check_octomap(message, voxel_map)
     values = {pair.key: pair.value for pair in robot.came["/diagnostics"][-1].status[0].values}
     assert values["frames_in_map"] == "4"
     assert values["received"] == "4"
@@ -171,10 +190,10 @@ def test_a_frame_whose_pose_never_comes_is_refused_and_counted(robot):
 def test_without_tf2_msgs_odometry_and_mounts_do(robot, monkeypatch, capfd):
     monkeypatch.setattr("stereovox.ros.subscriptions.optional_message", lambda *_: None)
     other = rclpy.create_node("no_tf")
-    options = Options(depth=(DEPTH,), odometry=("/odom",), fixed=(f"base_link {OPTICAL} 0.1 0 0.4 -1.5708 0 -1.5708",))
+    options = Options(depth=(DEPTH,), odometry=("/odom",), fixed=(MOUNT,))
     mapping, reports = make_mapping(load_config(voxel_size=0.1), None, None), []
     maker = MapNode(other, mapping, options, str, reports.append)
-    odometry = robot.other.create_publisher(Odometry, "/odom", 10)
+    odometry = robot.send.get("/odom") or robot.other.create_publisher(Odometry, "/odom", 10)
     robot.maker = maker
     robot.until(lambda: odometry.get_subscription_count() and robot.send[DEPTH].get_subscription_count() == 2)
     made, frame = wire.messages(), depth_at(0)
@@ -189,6 +208,12 @@ def test_without_tf2_msgs_odometry_and_mounts_do(robot, monkeypatch, capfd):
     np.testing.assert_allclose(T_world_camera[:3, 2], [1, 0, 0], atol=1e-4)  # it looks ahead
 
 
+def test_names_that_no_topic_has_end_in_one_line(robot):
+    for options in (Options(depth=("a b",)), Options(depth=("",)), Options(depth=(DEPTH,), odometry=("1x",))):
+        with pytest.raises(StereovoxError, match=r"^topic '.*': Invalid topic name.*[^:]$"):
+            MapNode(robot.node, robot.mapping, options, str)
+
+
 def test_save_reset_and_load(robot, tmp_path):
     robot.drive(3)
     before = robot.mapping.snapshot()().blocks()
@@ -199,6 +224,8 @@ def test_save_reset_and_load(robot, tmp_path):
     assert len(robot.mapping.snapshot()().occupied()) == 0
     missing = robot.call(LoadMap, "/stereovox/load", LoadMap.Request(map_url=str(tmp_path / "nothing")))
     assert missing.result == LoadMap.Response.RESULT_MAP_DOES_NOT_EXIST
+    no_name = robot.call(LoadMap, "/stereovox/load", LoadMap.Request(map_url="x" * 5000))
+    assert no_name.result == LoadMap.Response.RESULT_MAP_DOES_NOT_EXIST
     loaded = robot.call(LoadMap, "/stereovox/load", LoadMap.Request(map_url=f"file://{tmp_path / 'live.svox'}"))
     assert loaded.result == LoadMap.Response.RESULT_SUCCESS
     for mine, theirs in zip(robot.mapping.snapshot()().blocks(), before, strict=True):

@@ -6,9 +6,11 @@ import subprocess
 import sys
 
 import pytest
+from made_walks import depth_at
 
 from stereovox.cli import main
 from stereovox.errors import StereovoxError
+from stereovox.maps import load_map
 from stereovox.ros.options import Options, pair_of, with_parameters
 
 DEPTH = "/camera/depth/image_rect_raw"
@@ -41,6 +43,7 @@ def test_parameters_come_as_ros_has_them():
         ({"map_rate": 0.0}, r"ros\.map_rate"),
         ({"low": 1.0}, r"ros\.high"),
         ({"cloud_step_deg": 0.0}, r"ros\.cloud_step_deg"),
+        ({"pose": "/vicon/camera"}, r"ros\.pose '/vicon/camera': write TOPIC=FRAME"),
     ],
 )
 def test_parameters_that_cannot_be_are_told(given, said):
@@ -76,6 +79,21 @@ def test_mistakes_end_in_one_line(capsys, words, said):
     err = capsys.readouterr().err
     assert said in err.splitlines()[-1]
     assert "Traceback" not in err
+
+
+def test_whatever_breaks_the_map_is_saved(monkeypatch, tmp_path, alone):
+    from stereovox.ros.node import MapNode
+
+    def breaks(node):
+        node._mapping.add(depth_at(0))
+        raise RuntimeError("nobody foresaw this")
+
+    monkeypatch.setenv("ROS_DOMAIN_ID", alone["ROS_DOMAIN_ID"])
+    monkeypatch.setattr(MapNode, "spin_once", breaks)
+    monkeypatch.setattr("stereovox.ros.warm_up.warm_up", lambda config: None)
+    with pytest.raises(RuntimeError, match="foresaw"):
+        main(["ros2", "--depth", DEPTH, "--out", str(tmp_path / "live.svox")])
+    assert load_map(tmp_path / "live.svox").frames == 1
 
 
 def test_without_ros_the_cure_is_told(monkeypatch, capsys):

@@ -139,6 +139,6 @@ def test_fixed_transforms_are_read_as_static_transform_publisher_does():
 
     expected = about(2, 0.3) @ about(1, -0.2) @ about(0, 0.1)
     np.testing.assert_allclose(from_quaternion(numbers[:3], numbers[3:])[:3, :3], expected, atol=1e-12)
-    for bad in ("", "a b 1 2 3", "a b 1 2 3 4 5 x", "a b 1 2 3 4 5 6 7"):
+    for bad in ("", "a b 1 2 3", "a b 1 2 3 4 5 x", "a b 1 2 3 4 5 6 7", "a b 1 2 nan 4 5 6", "a a 1 2 3 4 5 6"):
         with pytest.raises(StereovoxError, match=r"ros\.fixed"):
             fixed_transform(bad)

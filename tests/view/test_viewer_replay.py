@@ -4,6 +4,7 @@
 import threading
 import time
 from contextlib import closing
+from dataclasses import replace
 
 import made_along as made
 import numpy as np
@@ -100,6 +101,21 @@ def test_a_growing_map_is_copied_between_frames_and_shown():
         middle = mapper.map.occupied().mean(axis=0)  # whoever opens the page now looks at the map
         assert np.linalg.norm(live.viewer.server.initial_camera.look_at - middle) < 1
     assert "stereovox-live-view" not in {thread.name for thread in threading.enumerate()}
+
+
+def test_what_is_no_frame_is_told_and_the_page_goes_on():
+    mapper = sv.Mapper(**SETTINGS)
+    with LiveView(mapper, port=0) as live:
+        for offered in (None, replace(SOURCE.frame(0), name=5), SOURCE.frame(0)):
+            live.finish()
+            live._due = 0.0
+            live.add(offered)
+        live.finish()
+        until = time.monotonic() + 30
+        while solid(live.viewer) != occupied(mapper.map) and time.monotonic() < until:
+            time.sleep(0.02)
+        assert solid(live.viewer) == occupied(mapper.map)
+        assert "2 bad" in live.frame.told.content
 
 
 def test_a_snapshot_stays_as_it_was():

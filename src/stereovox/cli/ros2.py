@@ -97,11 +97,15 @@ def _map(arguments: Namespace, node: Any, mapping: Mapping, options: Options) ->
     checkpoints = Checkpoints(lambda: mapping.save(out()), options.out, arguments.checkpoint if options.out else 0.0)
     say("listening; Ctrl-C ends")
     with interrupt_between_steps() as check:
-        with suppress(KeyboardInterrupt):
-            while True:
-                maker.spin_once()
-                check()
-                _checkpoint(checkpoints, mapping.history.frames, node)
+        try:
+            with suppress(KeyboardInterrupt):
+                while True:
+                    maker.spin_once()
+                    check()
+                    _checkpoint(checkpoints, mapping.history.frames, node)
+        except Exception:  # whatever broke: what was mapped so far is not lost with it
+            _save(mapping, out())
+            raise
         maker.close()  # a second signal, as `timeout` sends it, is to spoil nothing here
         return _finished(maker, mapping, out(), reports)
 
@@ -133,13 +137,20 @@ def _finished(maker: MapNode, mapping: Mapping, out: str, reports: deque[UpdateR
         example = next((f", last: {one.detail}" for one in reversed(reports) if one.refused == reason), "")
         say(f"  {number} x {reason}{example}")
     say(f"a frame: {milliseconds(result['frame_ms'])}")
-    if out and result["frames"]:
-        mapping.save(out)
+    if _save(mapping, out):
         result["out"] = out
-        say(f"saved in {out}")
     elif out:
         say("no frame could be used: no map is written")
     return result
+
+
+def _save(mapping: Mapping, out: str) -> bool:
+    """Save the map if there is one and it is wanted; tell whether."""
+    if not (out and mapping.history.frames):
+        return False
+    mapping.save(out)
+    say(f"saved in {out}")
+    return True
 
 
 def _settings(arguments: Namespace, node: Any) -> tuple[Config, Options]:

@@ -64,6 +64,8 @@ class Options:
             raise StereovoxError(f"{PREFIX}queue {self.queue}: give 1 to 1000 frames")
         if not 0.05 <= self.cloud_step_deg <= 10:
             raise StereovoxError(f"{PREFIX}cloud_step_deg {self.cloud_step_deg:g}: give 0.05 to 10 degrees")
+        if lacking := [text for text in self.pose if not all(pair_of(text))]:
+            raise StereovoxError(f"{PREFIX}pose '{lacking[0]}': write TOPIC=FRAME, the frame whose pose it is")
         if math.isnan(self.low) != math.isnan(self.high) or self.low >= self.high:
             raise StereovoxError(f"{PREFIX}low {self.low:g}, {PREFIX}high {self.high:g}: give both, the second higher")
 

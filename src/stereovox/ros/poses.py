@@ -101,6 +101,8 @@ def fixed_transform(text: str) -> tuple[str, str, tuple[float, ...]]:
     try:
         x, y, z, *turn = map(float, words[2:])
         yaw, pitch, roll = np.array(turn) / 2
+        if words[0] == words[1] or not np.isfinite((x, y, z, yaw, pitch, roll)).all():
+            raise ValueError
     except ValueError:
         raise StereovoxError(f"ros.fixed '{text}': write PARENT CHILD x y z yaw pitch roll") from None
     (cy, sy), (cp, sp), (cr, sr) = ((float(np.cos(half)), float(np.sin(half))) for half in (yaw, pitch, roll))

@@ -3,8 +3,8 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 from stereovox.errors import StereovoxError
@@ -47,7 +47,7 @@ class Services:
 
     def _load(self, request: Any, response: Any) -> Any:
         path = request.map_url.removeprefix("file://")
-        if not Path(path).exists():
+        if not os.path.exists(path):  # false, where Path raises, for names that no file can have
             self._log.error(f"{path}: no such map; check the name")
             response.result = response.RESULT_MAP_DOES_NOT_EXIST
             return response

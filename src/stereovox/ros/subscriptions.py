@@ -11,6 +11,7 @@ from functools import partial
 from importlib import import_module
 from typing import Any
 
+from stereovox.errors import StereovoxError, one_line
 from stereovox.ros.inputs import DepthInput, Input
 from stereovox.ros.library import optional_message
 from stereovox.ros.options import Options, pair_of
@@ -24,6 +25,7 @@ class Subscriptions:
     """Subscribes to all that options name, and to /tf and /tf_static.
 
     arrived: called with topic and bytes of what is to be mapped. messages: how many came, of all kinds.
+    Raises StereovoxError, one line, for what cannot be the name of a topic.
     """
 
     def __init__(
@@ -68,7 +70,12 @@ class Subscriptions:
             self.messages += 1
             callback(data)
 
-        self._node.create_subscription(kind, topic, take, quality, raw=True)
+        from rclpy.exceptions import InvalidTopicNameException
+
+        try:
+            self._node.create_subscription(kind, topic, take, quality, raw=True)
+        except InvalidTopicNameException as error:
+            raise StereovoxError(f"topic '{topic}': {one_line(str(error).splitlines()[0].rstrip(':'))}") from None
 
 
 def _quality(depth: int, reliable: bool, kept: bool = False) -> Any:

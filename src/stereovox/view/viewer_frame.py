@@ -10,7 +10,7 @@ import numpy as np
 from stereovox.config import Config
 from stereovox.depth import DepthPath
 from stereovox.errors import FrameRefused
-from stereovox.frame import AnyFrame, name_of
+from stereovox.frame import AnyFrame, Frame, StereoFrame, name_of
 from stereovox.update_report import UpdateReport
 from stereovox.view.depth_colours import depth_picture, reasons_key
 from stereovox.view.viewer_panel import plain
@@ -41,8 +41,9 @@ class FramePanel:
 
 
 def frame_words(frame: AnyFrame, report: UpdateReport | None) -> str:
-    """Return name and fate of a frame, as Markdown."""
-    name = plain(name_of(frame).rpartition("/")[2])
+    """Return name and fate of a frame, or of what was offered as one, as Markdown."""
+    called = name_of(frame) if isinstance(frame, Frame | StereoFrame) else type(frame).__name__
+    name = plain(str(called).rpartition("/")[2])
     if report is None:
         return name
     return f"{name}: {plain(report.detail)}" if report.refused else f"{name}: {report.cells:,} cells changed"

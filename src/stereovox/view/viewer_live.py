@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from time import monotonic, sleep
+from time import monotonic
 from typing import Any
 
 from stereovox.frame import AnyFrame
@@ -44,7 +44,7 @@ class LiveView:
         self._due = 0.0
         self._last: tuple[AnyFrame, UpdateReport] | None = None
         self._waiting: tuple[VoxelMap, AnyFrame, str] | None = None
-        self._ask, self._free, self._stopped = threading.Event(), threading.Event(), False
+        self._ask, self._free, self._stopped = (threading.Event() for _ in range(3))
         self._free.set()
         self._thread = threading.Thread(target=self._run, name="stereovox-live-view", daemon=True)
         self._thread.start()
@@ -78,7 +78,7 @@ class LiveView:
 
     def close(self) -> None:
         """Take the page down."""
-        self._stopped = True
+        self._stopped.set()
         self._ask.set()
         self._thread.join()
         self.viewer.close()
@@ -92,8 +92,9 @@ class LiveView:
         self.close()
 
     def _hand_over(self, frame: AnyFrame, report: UpdateReport) -> None:
+        waiting = _copy(self._mapper), frame, f"{frame_words(frame, report)}\n\n{self._pace()}"
         self._free.clear()
-        self._waiting = _copy(self._mapper), frame, f"{frame_words(frame, report)}\n\n{self._pace()}"
+        self._waiting = waiting
         self._ask.set()
 
     def _run(self) -> None:
@@ -101,14 +102,14 @@ class LiveView:
         while True:
             self._ask.wait()
             self._ask.clear()
-            if self._stopped or self._waiting is None:
+            if self._stopped.is_set() or self._waiting is None:
                 return
             start = monotonic()
             voxel_map, frame, words = self._waiting
             self.frame.show(frame, words)
             self.viewer.take(voxel_map)
             self.viewer.follow()
-            sleep(min(DRAW_REST * (monotonic() - start), PATIENCE_S / 2))
+            self._stopped.wait(min(DRAW_REST * (monotonic() - start), PATIENCE_S / 2))
             self._free.set()
 
     def _pace(self) -> str:

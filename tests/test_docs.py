@@ -68,6 +68,11 @@ def test_links_lead_somewhere(page):
             assert (page.parent / target).exists(), target
 
 
+def test_the_menu_of_the_site_names_every_page_once():
+    pages = re.findall(r"\S+\.md$", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE)
+    assert len(pages) == len(set(pages)), pages
+
+
 def test_the_site_builds_without_a_warning_and_asks_no_other_host(tmp_path):
     pytest.importorskip("material", reason="needs pip install '.[docs]'")
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path / "site")]

@@ -136,7 +136,8 @@ def _finished(maker: MapNode, mapping: Mapping, out: str, reports: deque[UpdateR
     for reason, number in result["refused"].items():
         example = next((f", last: {one.detail}" for one in reversed(reports) if one.refused == reason), "")
         say(f"  {number} x {reason}{example}")
-    say(f"a frame: {milliseconds(result['frame_ms'])}")
+    if taken:
+        say(f"a frame: {milliseconds(result['frame_ms'])}")
     if _save(mapping, out):
         result["out"] = out
     elif out:

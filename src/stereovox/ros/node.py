@@ -17,6 +17,7 @@ from stereovox.ros.options import Options, pair_of
 from stereovox.ros.outputs import Outputs
 from stereovox.ros.poses import Whereabouts, fixed_transform
 from stereovox.ros.services import Services
+from stereovox.ros.silence import Silence
 from stereovox.ros.subscriptions import Subscriptions
 from stereovox.ros.waiting import Arrival, Waiting
 from stereovox.update_report import UpdateReport
@@ -57,6 +58,7 @@ class MapNode:
         self._outputs = Outputs(node, mapping, options, self.counts)
         Services(node, mapping, out, self._renewed)
         self._heard = Subscriptions(node, options, self._where, self._inputs, self._arrived)
+        self._silence = Silence(node, self._inputs, self.received)
 
     def counts(self) -> dict[str, Any]:
         """Return how many messages came, were dropped and wait, and what was refused why."""
@@ -77,6 +79,7 @@ class MapNode:
         if arrival is not None:
             self._map(arrival)
         self._outputs.update()
+        self._silence.update()
 
     def close(self) -> None:
         """Map what still waits, and publish the last map."""

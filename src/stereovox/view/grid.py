@@ -21,7 +21,7 @@ MOST_PIXELS = 1500
 """Cells along the longer side up to which each has a pixel of its own; beyond, one of several is shown."""
 Box = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Lowest and highest (2,) x, y in metres."""
-NAMES = {State.UNKNOWN: "unknown", State.FREE: "free", State.TENTATIVE: "between", State.OCCUPIED: "occupied"}
+NAMES = {State.UNKNOWN: "unknown", State.FREE: "free", State.TENTATIVE: "tentative", State.OCCUPIED: "occupied"}
 
 
 def picture_grid(

@@ -104,6 +104,9 @@ def test_the_planner_keeps_its_distance(saved, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", [str(EXAMPLE), saved, *places, "0.25", str(picture)])
     plan = runpy.run_path(str(EXAMPLE), run_name="__main__")["plan"]
     assert ", free;" in capsys.readouterr().out
+    monkeypatch.setattr(sys, "argv", [str(EXAMPLE), saved, places[0]])
+    with pytest.raises(SystemExit, match="MAP START GOAL"):
+        runpy.run_path(str(EXAMPLE), run_name="__main__")
     assert matplotlib.image.imread(picture).std() > 0.05
     voxel_map, start, goal = load_map(saved), np.array([0.55, 1.45, 0.65]), np.array([2.45, 1.45, 0.65])
     way = plan(voxel_map, start, goal, 0.25)

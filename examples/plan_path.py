@@ -49,6 +49,8 @@ def plan(m, start, goal, radius, through_unknown=False):
 
 
 if __name__ == "__main__":
+    if len(sys.argv) < 4 or not all(place.count(",") == 2 for place in sys.argv[2:4]):
+        sys.exit(__doc__)
     m = sv.load_map(sys.argv[1])
     start, goal = (np.array(place.split(","), float) for place in sys.argv[2:4])
     way = plan(m, start, goal, RADIUS, through_unknown="--through-unknown" in sys.argv)

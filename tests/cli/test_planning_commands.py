@@ -104,6 +104,9 @@ def test_the_planner_keeps_its_distance(saved, tmp_path, monkeypatch, capsys):
     plan = runpy.run_path(str(EXAMPLE), run_name="__main__")["plan"]
     assert "saved plan.png" in capsys.readouterr().out
     assert matplotlib.image.imread("plan.png").std() > 0.05
+    monkeypatch.setattr(sys, "argv", [str(EXAMPLE), saved, "0.55,0.55,0.65"])
+    with pytest.raises(SystemExit, match="MAP START GOAL"):
+        runpy.run_path(str(EXAMPLE), run_name="__main__")
     voxel_map, start, goal = load_map(saved), np.array([0.55, 1.45, 0.65]), np.array([2.45, 1.45, 0.65])
     way = plan(voxel_map, start, goal, 0.25)
     np.testing.assert_array_equal(way[[0, -1]], [start, goal])

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from stereovox.config import load_config
 from stereovox.errors import MapFileError
 from stereovox.maps import State, VoxelMap, load_map
+from stereovox.maps.blocks import blocks_of_cells
 from stereovox.maps.evidence import Evidence
 
 CONFIG = load_config(voxel_size=0.1)
@@ -235,3 +236,13 @@ def test_a_map_from_before_there_was_a_prior_keeps_its_meaning(tmp_path):
     del manifest["config"]["map"]["prior"]
     file.write_text(json.dumps(manifest))
     assert load_map(tmp_path / "old.svox").config.map.prior == 0.5
+
+
+@pytest.mark.parametrize("reach", [0, 20, 2**30, 2**62])
+def test_the_blocks_of_cells_are_those_of_plain_rows(reach):
+    cells = np.random.default_rng(0).integers(-reach - 1, reach, (300, 3))
+    blocks, of_cell = blocks_of_cells(cells)
+    wanted, of_row = np.unique(cells // 8, axis=0, return_inverse=True)
+    np.testing.assert_array_equal(blocks, wanted)
+    np.testing.assert_array_equal(of_cell, of_row.ravel())
+    assert [part.shape for part in blocks_of_cells(cells[:0])] == [(0, 3), (0,)]

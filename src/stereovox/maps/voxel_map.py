@@ -16,7 +16,7 @@ from stereovox.errors import ConfigError, StereovoxError
 from stereovox.frame import Viewpoint
 from stereovox.history import History, WithHistory
 from stereovox.maps import _add, queries
-from stereovox.maps.blocks import CELLS, SIDE, StoredCells
+from stereovox.maps.blocks import CELLS, SIDE, StoredCells, blocks_of_cells
 from stereovox.maps.cell_format import CellFormat, CellRules
 from stereovox.maps.cell_format import State as State
 from stereovox.maps.cell_pool import CellPool
@@ -61,13 +61,13 @@ class VoxelMap(WithHistory):
         """
         voxel_map = cls(config)
         indices = np.asarray(indices, np.int64).reshape(-1, 3)
-        blocks, of_cell = np.unique(indices >> 3, axis=0, return_inverse=True)
+        blocks, of_cell = blocks_of_cells(indices)
         rules, unknown = voxel_map._rules, voxel_map._format.unknown
         stored = np.clip(voxel_map._format.stored(log_odds), rules.lowest, rules.highest)
         low = indices & (SIDE - 1)
         column = (low[:, 0] << 6) | (low[:, 1] << 3) | low[:, 2]
         cells = np.full((len(blocks), CELLS), unknown, voxel_map._format.dtype)
-        cells[of_cell.ravel(), column] = np.where(stored == unknown, unknown + 1, stored)
+        cells[of_cell, column] = np.where(stored == unknown, unknown + 1, stored)
         voxel_map._pool.put(blocks.astype(np.int32), cells)
         return voxel_map
 
@@ -351,9 +351,9 @@ class VoxelMap(WithHistory):
         times = np.zeros(len(points), np.uint32)
         within = (np.abs(points) < INDEX_LIMIT * np.array(self.config.cell)).all(axis=1)  # False for NaN
         cells = np.floor(points[within] / self.config.cell).astype(np.int64)
-        blocks, of_cell = np.unique(cells >> 3, axis=0, return_inverse=True)
+        blocks, of_cell = blocks_of_cells(cells)
         x, y, z = (cells & (SIDE - 1)).T
-        times[within] = self.times_of(blocks.astype(np.int32))[of_cell.ravel(), (x << 6) | (y << 3) | z]
+        times[within] = self.times_of(blocks.astype(np.int32))[of_cell, (x << 6) | (y << 3) | z]
         return times
 
     def _seconds_ago(self, times: NDArray[np.uint32], now_ns: int | None) -> NDArray[np.float32]:

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from stereovox.config import load_config
 from stereovox.errors import StereovoxError
 from stereovox.maps import VoxelMap
+from stereovox.maps.blocks import blocks_of_cells
 from stereovox.maps.queries import INDEX_LIMIT
 
 MOST_BLOCKS = 2**19
@@ -35,6 +36,6 @@ def cells_of_points(points: ArrayLike, voxel_size: float) -> VoxelMap:
 
 def check_room(indices: NDArray[np.integer]) -> None:
     """Raise StereovoxError where cells (N, 3) lie in more than `MOST_BLOCKS` blocks."""
-    blocks = len(np.unique(indices >> 3, axis=0)) if len(indices) > MOST_BLOCKS else len(indices)
+    blocks = len(blocks_of_cells(indices)[0]) if len(indices) > MOST_BLOCKS else len(indices)
     if blocks > MOST_BLOCKS:
         raise StereovoxError(f"its cells lie in {blocks} blocks, more than {MOST_BLOCKS}; use larger cells or crop it")

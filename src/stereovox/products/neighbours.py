@@ -10,13 +10,12 @@ from numpy.typing import NDArray
 
 from stereovox.errors import StereovoxError
 from stereovox.maps import VoxelMap
-from stereovox.maps.blocks import SIDE
+from stereovox.maps.blocks import MOST_PLACES, SIDE
 from stereovox.products import _margin
 
 FACES = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
 CORNERS = tuple((x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if (x, y, z) > (0, 0, 0))
 """Steps to half of the cells that share a face with a cell, and to half of those that share a corner with it."""
-MOST_PLACES = 2**62
 
 
 def with_margins(voxel_map: VoxelMap) -> Iterator[tuple[NDArray[np.int32], NDArray[np.integer]]]:

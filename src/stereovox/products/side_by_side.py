@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from stereovox.errors import StereovoxError
 from stereovox.maps import VoxelMap, _pool
-from stereovox.maps.blocks import CELLS, SIDE
+from stereovox.maps.blocks import CELLS, SIDE, blocks_of_cells
 from stereovox.maps.rolling import RollingMap
 
 Blocks = tuple[NDArray[np.int32], NDArray[np.integer], NDArray[np.integer]]
@@ -62,10 +62,10 @@ def take(target: VoxelMap, source: VoxelMap, coords: NDArray[np.int32], cells: N
 
 def put_times(target: VoxelMap, indices: NDArray[np.integer], times: NDArray[np.uint32], start_ns: int | None) -> None:
     """Set the times (N,) of cells (N, 3) of a map, each named once; they count from `start_ns`."""
-    blocks, of_cell = np.unique(indices >> 3, axis=0, return_inverse=True)
+    blocks, of_cell = blocks_of_cells(indices)
     low = indices & (SIDE - 1)
     kept = np.zeros((len(blocks), CELLS), np.uint32)
-    kept[of_cell.ravel(), (low[:, 0] << 6) | (low[:, 1] << 3) | low[:, 2]] = times
+    kept[of_cell, (low[:, 0] << 6) | (low[:, 1] << 3) | low[:, 2]] = times
     target.set_times(blocks.astype(np.int32), kept, start_ns)
 
 

@@ -9,10 +9,12 @@ import sys
 import urllib.error
 import urllib.request
 
+import numpy as np
 import pytest
 
 import stereovox as sv
 from stereovox.cli import main
+from stereovox.maps import State
 
 
 @pytest.fixture
@@ -52,6 +54,25 @@ def test_up_is_taken_or_refused(saved, capsys, monkeypatch):
     assert told == ["y", "z"]
     assert main(["view", str(saved), "--port", "0", "--up=w"]) == 2
     assert "up 'w' is no axis" in capsys.readouterr().err
+
+
+def test_fewer_cells_are_drawn_where_fewer_are_wanted(tmp_path, capsys, monkeypatch):
+    from stereovox.view import viewer
+
+    cells = np.argwhere(np.ones((250, 60, 1)))
+    sv.VoxelMap.from_cells(sv.load_config(), cells, np.full(len(cells), 2.0)).save(tmp_path / "floor.svox")
+    drawn = []
+
+    def count(page):
+        drawn.append(sum(len(node.batched_positions) for node in page.cells.kinds[State.OCCUPIED].sent))
+
+    monkeypatch.setattr(viewer.Viewer, "wait", count)
+    for most in (250_000, 5000):
+        assert main(["view", str(tmp_path / "floor.svox"), "--port", "0", "--most-cells", str(most)]) == 0
+    assert drawn[0] == len(cells)
+    assert drawn[1] < 6000
+    assert main(["view", str(tmp_path / "floor.svox"), "--port", "0", "--most-cells", "0"]) == 2
+    assert "0 cells at once" in capsys.readouterr().err
 
 
 def status_of(link):

@@ -13,7 +13,7 @@ from stereovox.view.drawn import stood_up
 from stereovox.view.newest import Newest
 from stereovox.view.panels import STATE_COLOURS
 from stereovox.view.shown import AGE, HEIGHT, PROBABILITY, cells_in, colours_of, heights, unknown_shell, values_of
-from stereovox.view.viewer_chunks import Chunks
+from stereovox.view.viewer_chunks import MOST_CELLS, Chunks, Draws
 
 if TYPE_CHECKING:
     from viser import SceneNodeHandle, ViserServer
@@ -45,17 +45,19 @@ class Cells:
 
     kinds: the cells in the scene by state. show: a check box for each state. colour: drop-down with what occupied cells
     are coloured by. below: slider in metres along `up`; cells above it are left out. solid: occupied cells
-    (N, 3) that are shown now. scale: what a colour bar needs, None where no cell is occupied.
+    (N, 3) that are shown now. scale: what a colour bar needs, None where no cell is occupied. most: cells of one kind
+    that are in the scene at once, about.
     """
 
-    def __init__(self, server: ViserServer, voxel_map: VoxelMap, up: str):
+    def __init__(self, server: ViserServer, voxel_map: VoxelMap, up: str, most: int = MOST_CELLS):
         self._server, self._up, self._map = server, up, voxel_map
         self._found: dict[State, NDArray[np.int32]] = {}
         self.solid = np.empty((0, 3), np.int32)
         self.scale: Any = None
         size = voxel_map.voxel_size
-        self.kinds = {state: Chunks(server, f"/cells/{state.name.lower()}", size, _dots) for state in LABELS}
-        self.kinds[State.OCCUPIED] = Chunks(server, "/cells/occupied", size, add_cubes)
+        self.kinds = {
+            state: Chunks(server, f"/cells/{state.name.lower()}", size, _draws_of(state), most) for state in LABELS
+        }
         self.draw, self._look = Newest(self._draw), Newest(self._come_closer)
         self._controls()
         self.take(voxel_map)
@@ -179,6 +181,10 @@ def _dots(
     server: ViserServer, name: str, centres: NDArray[np.floating], colours: NDArray[np.uint8], size: float
 ) -> SceneNodeHandle:
     return add_points(server, name, centres, colours, DOT * size)
+
+
+def _draws_of(state: State) -> Draws:
+    return add_cubes if state is State.OCCUPIED else _dots
 
 
 def rgb(colour: str) -> NDArray[np.uint8]:

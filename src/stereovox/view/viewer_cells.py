@@ -70,7 +70,9 @@ class Cells:
 
     def take(self, voxel_map: VoxelMap) -> None:
         """Show another map of the same cells, which nobody changes from now on."""
-        self._map, self._found = voxel_map, {State.OCCUPIED: cells_in(voxel_map, State.OCCUPIED)}
+        found = {State.OCCUPIED: cells_in(voxel_map, State.OCCUPIED)}
+        self._map = voxel_map
+        self._found = found
         self._fit_slider()
         self.draw()
 
@@ -125,10 +127,11 @@ class Cells:
         self.kinds[State.OCCUPIED].show(self.solid, colours, self._eyes())
 
     def _show_dots(self, state: State) -> None:
-        if state not in self._found:
+        found = self._found  # read before the map, which `take` sets first: no dots of an older map are kept
+        if state not in found:
             find = unknown_shell if state is State.UNKNOWN else lambda one: cells_in(one, state)
-            self._found[state] = find(self._map)
-        cells = self._found[state]
+            found[state] = find(self._map)
+        cells = found[state]
         cells = cells[heights(self._map, cells, self._up) < self.below.value]
         colour = {State.FREE: FREE_COLOUR, State.UNKNOWN: UNKNOWN_COLOUR}.get(state, STATE_COLOURS[state])
         self.kinds[state].show(cells, np.tile(rgb(colour), (len(cells), 1)), self._eyes())

@@ -9,10 +9,12 @@ import sys
 import urllib.error
 import urllib.request
 
+import numpy as np
 import pytest
 
 import stereovox as sv
 from stereovox.cli import main
+from stereovox.maps import State
 
 
 @pytest.fixture
@@ -22,13 +24,24 @@ def saved(tmp_path):
     return tmp_path / "two cells.svox"
 
 
-def start(*words):
-    command = [sys.executable, "-m", "stereovox", "view", *map(str, words)]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+@pytest.fixture
+def start():
+    """Starts commands, of which none outlives the test."""
+    started = []
+
+    def run(*words):
+        command = [sys.executable, "-m", "stereovox", *map(str, words)]
+        started.append(subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True))
+        return started[-1]
+
+    yield run
+    for one in started:
+        one.kill()
+        one.communicate()
 
 
-def test_it_serves_until_ctrl_c(saved):
-    running = start(saved, "--port", 0, "--json")
+def test_it_serves_until_ctrl_c(saved, start):
+    running = start("view", saved, "--port", 0, "--json")
     line = running.stderr.readline()
     url = next(word for word in line.split() if word.startswith("http://127.0.0.1:"))
     with socket.create_connection(("127.0.0.1", int(url.rpartition(":")[2]))):
@@ -54,6 +67,25 @@ def test_up_is_taken_or_refused(saved, capsys, monkeypatch):
     assert "up 'w' is no axis" in capsys.readouterr().err
 
 
+def test_fewer_cells_are_drawn_where_fewer_are_wanted(tmp_path, capsys, monkeypatch):
+    from stereovox.view import viewer
+
+    cells = np.argwhere(np.ones((250, 60, 1)))
+    sv.VoxelMap.from_cells(sv.load_config(), cells, np.full(len(cells), 2.0)).save(tmp_path / "floor.svox")
+    drawn = []
+
+    def count(page):
+        drawn.append(sum(len(node.batched_positions) for node in page.cells.kinds[State.OCCUPIED].sent))
+
+    monkeypatch.setattr(viewer.Viewer, "wait", count)
+    for most in (250_000, 5000):
+        assert main(["view", str(tmp_path / "floor.svox"), "--port", "0", "--most-cells", str(most)]) == 0
+    assert drawn[0] == len(cells)
+    assert drawn[1] < 6000
+    assert main(["view", str(tmp_path / "floor.svox"), "--port", "0", "--most-cells", "0"]) == 2
+    assert "0 cells at once" in capsys.readouterr().err
+
+
 def status_of(link):
     try:
         with urllib.request.urlopen(link, timeout=60) as page:
@@ -62,8 +94,8 @@ def status_of(link):
         return error.code
 
 
-def test_a_page_for_others_needs_the_link_that_is_printed(saved):
-    running = start(saved, "--port", 0, "--host", "0.0.0.0")
+def test_a_page_for_others_needs_the_link_that_is_printed(saved, start):
+    running = start("view", saved, "--port", 0, "--host", "0.0.0.0")
     assert "whoever has this link" in running.stderr.readline()
     link = next(word for word in running.stderr.readline().split() if word.startswith("http://localhost:"))
     place, token = link.split("/?token=")
@@ -123,16 +155,15 @@ def test_a_recording_adds_a_timeline(saved, tmp_path, capsys, monkeypatch):
     assert "--frames: picks frames of --recording" in capsys.readouterr().err
 
 
-def test_map_shows_the_map_while_it_grows(tmp_path):
-    words = ["map", "sim:room", "--out", tmp_path / "room.svox", "--frames", ":4", "--voxel-size", "0.2", "--view", "0"]
-    command = [sys.executable, "-m", "stereovox", *map(str, words)]
-    running = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+def test_map_shows_the_map_while_it_grows(tmp_path, start):
+    room = tmp_path / "room.svox"
+    running = start("map", "sim:room", "--out", room, "--frames", ":4", "--voxel-size", "0.2", "--view", 0)
     line = running.stderr.readline()
     url = next(word for word in line.split() if word.startswith("http://127.0.0.1:"))
     while "Ctrl-C ends" not in line:
         line = running.stderr.readline()
         assert line
-    assert sv.load_map(tmp_path / "room.svox").frames == 4
+    assert sv.load_map(room).frames == 4
     with urllib.request.urlopen(url, timeout=60) as page:
         assert page.status == 200
     running.send_signal(signal.SIGINT)

@@ -6,8 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from stereovox.view import viewer_chunks
-from stereovox.view.viewer_chunks import SIDE, Chunks, coarser, levels, split
+from stereovox.view.viewer_chunks import MOST_CELLS, SIDE, Chunks, coarser, levels, split
 
 SIZE = 0.1
 random = np.random.default_rng(1)
@@ -29,9 +28,9 @@ class Scene:
         return node
 
 
-def shown(cells, eyes):
+def shown(cells, eyes, most=MOST_CELLS):
     scene = Scene()
-    chunks = Chunks(scene, "/cells", SIZE, scene.draw)
+    chunks = Chunks(scene, "/cells", SIZE, scene.draw, most)
     chunks.show(cells, COLOURS[: len(cells)], np.array(eyes, float))
     return scene, chunks
 
@@ -57,7 +56,7 @@ def test_coarse_cells_cover_the_fine_ones_in_their_mean_colour(doublings):
             assert np.abs(colour - np.mean(members[tuple(cell)], axis=0)).max() <= 1
 
 
-def test_near_chunks_are_finer_than_far_ones(monkeypatch):
+def test_near_chunks_are_finer_than_far_ones():
     places, numbers = np.array([[n, 0, 0] for n in range(40)]), np.full(40, 1000)
     doublings = levels(places, numbers, np.array([[0.0, 0, 0]]), SIZE)
     assert doublings[0] == 0
@@ -65,15 +64,13 @@ def test_near_chunks_are_finer_than_far_ones(monkeypatch):
     assert doublings[-1] > 0
     both = levels(places, numbers, np.array([[0.0, 0, 0], [40 * SIDE * SIZE, 0, 0]]), SIZE)
     assert both[-1] == 0
-    monkeypatch.setattr(viewer_chunks, "MOST_CELLS", 5000)
-    scarce = levels(places, numbers, np.array([[0.0, 0, 0]]), SIZE)
+    scarce = levels(places, numbers, np.array([[0.0, 0, 0]]), SIZE, 5000)
     assert scarce[0] == 0
     assert (numbers / 4.0**scarce).sum() <= 5000
 
 
-def test_only_what_changes_is_sent(monkeypatch):
-    monkeypatch.setattr(viewer_chunks, "MOST_CELLS", 1500)
-    scene, chunks = shown(CELLS, [[-10, -10, -10]])
+def test_only_what_changes_is_sent():
+    scene, chunks = shown(CELLS, [[-10, -10, -10]], 1500)
     assert max(node.size for node in scene.nodes.values()) > SIZE
     before = scene.sent
     chunks.show(CELLS[::-1], COLOURS[::-1], np.array([[-10.0, -10, -10]]))

@@ -31,6 +31,13 @@ def add_arguments(parser: ArgumentParser) -> None:
         "--up", metavar="AXIS", help="which way is up: z, -y, x ... (default: as the map's settings say)"
     )
     parser.add_argument(
+        "--most-cells",
+        type=int,
+        default=250_000,
+        metavar="N",
+        help="cells drawn at once, about; far ones are drawn coarser (250000; 20000 without a graphics card)",
+    )
+    parser.add_argument(
         "--host",
         default="127.0.0.1",
         help="address to serve; 0.0.0.0 lets others look who have the link (default here)",
@@ -52,7 +59,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
     voxel_map, source = open_map(arguments.map), _recording(arguments)
     name, place = Path(arguments.map).stem, (arguments.host, arguments.port)
     token = arguments.token if arguments.token is not None else os.environ.get(TOKEN) or None
-    viewer = open_viewer(in_cubes(voxel_map), name, *place, arguments.up, token)
+    viewer = open_viewer(in_cubes(voxel_map), name, *place, arguments.up, token, arguments.most_cells)
     with closing(viewer), suppress(KeyboardInterrupt):
         if source is not None:
             from stereovox.view.viewer_replay import Replay

@@ -88,11 +88,15 @@ def check_target(folder: Path) -> None:
     """Raise MapFileError when a map cannot be saved to `folder`: it holds something else or cannot be written."""
     if "\0" in str(folder):
         raise MapFileError(f"{str(folder)!r}: no file name holds the character 0; choose another name")
-    if folder.exists() and not is_map(folder) and not _is_free(folder):
+    try:
+        there = folder.exists()
+    except OSError as error:  # a name that is too long, a folder that may not be entered
+        raise MapFileError(f"{folder}: cannot be written ({error.strerror}); choose another name") from None
+    if there and not is_map(folder) and not _is_free(folder):
         raise MapFileError(f"{folder}: exists and is not a stereovox map; choose another name or remove it")
-    there = next(parent for parent in (folder, *folder.absolute().parents) if parent.exists())
-    if not there.is_dir() or not os.access(there, os.W_OK | os.X_OK):
-        where = "" if there == folder else f"{there} "
+    nearest = next(parent for parent in (folder, *folder.absolute().parents) if parent.exists())
+    if not nearest.is_dir() or not os.access(nearest, os.W_OK | os.X_OK):
+        where = "" if nearest == folder else f"{nearest} "
         raise MapFileError(f"{folder}: {where}cannot be written to; choose a writable folder")
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from stereovox.errors import StereovoxError
 from stereovox.maps import VoxelMap
 from stereovox.view.address import HERE, PORT, find_address, url_of
 from stereovox.view.drawn import checked_up
@@ -15,6 +16,7 @@ from stereovox.view.guard import Guard, checked_token, new_token
 from stereovox.view.serve import serve, stop
 from stereovox.view.viewer_camera import Cameras, as_tuple, first_look, up_vector
 from stereovox.view.viewer_cells import Cells
+from stereovox.view.viewer_chunks import MOST_CELLS
 from stereovox.view.viewer_layer import LayerPlane
 from stereovox.view.viewer_measure import Measure
 from stereovox.view.viewer_panel import axis_chart, colour_bar, plain, statistics
@@ -33,14 +35,14 @@ class Viewer:
     cells, layer, cameras and measure hold what is in the scene and its controls; dark: the check box of the theme.
     """
 
-    def __init__(self, url: str, server: ViserServer, voxel_map: VoxelMap, name: str, up: str):
+    def __init__(self, url: str, server: ViserServer, voxel_map: VoxelMap, name: str, up: str, most_cells: int):
         self.url, self.server = url, server
         self._name, self._map, self._up = name, voxel_map, up
         _dress(server)
         server.scene.set_up_direction(as_tuple(up_vector(up)))
         self._eye, self._middle, self._away = np.zeros(3), np.zeros(3), 0.0
         self.follow()
-        self.cells = Cells(server, voxel_map, up)
+        self.cells = Cells(server, voxel_map, up, most_cells)
         self._legend = _Legend(server)
         self.layer = LayerPlane(server, voxel_map, up)
         self.cameras = Cameras(server, voxel_map)
@@ -121,20 +123,25 @@ def open_viewer(
     port: int = PORT,
     up: str | None = None,
     token: str | None = None,
+    most_cells: int = MOST_CELLS,
 ) -> Viewer:
     """Serve a page of a map, under the heading `name`, until it is closed; port 0 takes any free one.
 
     up: the map's axis that points up (`z`, `-y`, ...); by default as its settings say.
     token: what a browser must show once, 16 to 128 letters, digits, - or _; `url` holds it. Where others reach `host`
     one is made if none is given; else whoever sits at this machine can look. Nobody can change or share the map.
-    Raises MissingExtra without viser, and StereovoxError for an `up` that is no axis, for a short token, and where the
-    address cannot be used.
+    most_cells: of each kind, about, that are drawn at once; where a map has more, far ones are drawn coarser. Fewer are
+    for browsers without a graphics card.
+    Raises MissingExtra without viser, and StereovoxError for an `up` that is no axis, for a short token, for no cells
+    at all, and where the address cannot be used.
     """
+    if most_cells < 1:
+        raise StereovoxError(f"{most_cells} cells at once: give a number above 0, 250000 for most browsers")
     up = checked_up(up or voxel_map.config.up)
     address = find_address(host, port)
     token = checked_token(token) if token is not None else None if address.is_private else new_token()
     server = serve(name.encode("utf-8", "replace").decode(), address, Guard(host, token))
-    return Viewer(url_of(host, server.get_port(), token), server, voxel_map, name, up)
+    return Viewer(url_of(host, server.get_port(), token), server, voxel_map, name, up, most_cells)
 
 
 def _dress(server: Any) -> None:

@@ -13,7 +13,7 @@ from stereovox.view.drawn import stood_up
 from stereovox.view.newest import Newest
 from stereovox.view.panels import STATE_COLOURS
 from stereovox.view.shown import AGE, HEIGHT, PROBABILITY, cells_in, colours_of, heights, unknown_shell, values_of
-from stereovox.view.viewer_chunks import Chunks
+from stereovox.view.viewer_chunks import MOST_CELLS, Chunks, Draws
 
 if TYPE_CHECKING:
     from viser import SceneNodeHandle, ViserServer
@@ -45,17 +45,19 @@ class Cells:
 
     kinds: the cells in the scene by state. show: a check box for each state. colour: drop-down with what occupied cells
     are coloured by. below: slider in metres along `up`; cells above it are left out. solid: occupied cells
-    (N, 3) that are shown now. scale: what a colour bar needs, None where no cell is occupied.
+    (N, 3) that are shown now. scale: what a colour bar needs, None where no cell is occupied. most: cells of one kind
+    that are in the scene at once, about.
     """
 
-    def __init__(self, server: ViserServer, voxel_map: VoxelMap, up: str):
+    def __init__(self, server: ViserServer, voxel_map: VoxelMap, up: str, most: int = MOST_CELLS):
         self._server, self._up, self._map = server, up, voxel_map
         self._found: dict[State, NDArray[np.int32]] = {}
         self.solid = np.empty((0, 3), np.int32)
         self.scale: Any = None
         size = voxel_map.voxel_size
-        self.kinds = {state: Chunks(server, f"/cells/{state.name.lower()}", size, _dots) for state in LABELS}
-        self.kinds[State.OCCUPIED] = Chunks(server, "/cells/occupied", size, add_cubes)
+        self.kinds = {
+            state: Chunks(server, f"/cells/{state.name.lower()}", size, _draws_of(state), most) for state in LABELS
+        }
         self.draw, self._look = Newest(self._draw), Newest(self._come_closer)
         self._controls()
         self.take(voxel_map)
@@ -68,7 +70,9 @@ class Cells:
 
     def take(self, voxel_map: VoxelMap) -> None:
         """Show another map of the same cells, which nobody changes from now on."""
-        self._map, self._found = voxel_map, {State.OCCUPIED: cells_in(voxel_map, State.OCCUPIED)}
+        found = {State.OCCUPIED: cells_in(voxel_map, State.OCCUPIED)}
+        self._map = voxel_map
+        self._found = found
         self._fit_slider()
         self.draw()
 
@@ -123,10 +127,11 @@ class Cells:
         self.kinds[State.OCCUPIED].show(self.solid, colours, self._eyes())
 
     def _show_dots(self, state: State) -> None:
-        if state not in self._found:
+        found = self._found  # read before the map, which `take` sets first: no dots of an older map are kept
+        if state not in found:
             find = unknown_shell if state is State.UNKNOWN else lambda one: cells_in(one, state)
-            self._found[state] = find(self._map)
-        cells = self._found[state]
+            found[state] = find(self._map)
+        cells = found[state]
         cells = cells[heights(self._map, cells, self._up) < self.below.value]
         colour = {State.FREE: FREE_COLOUR, State.UNKNOWN: UNKNOWN_COLOUR}.get(state, STATE_COLOURS[state])
         self.kinds[state].show(cells, np.tile(rgb(colour), (len(cells), 1)), self._eyes())
@@ -179,6 +184,10 @@ def _dots(
     server: ViserServer, name: str, centres: NDArray[np.floating], colours: NDArray[np.uint8], size: float
 ) -> SceneNodeHandle:
     return add_points(server, name, centres, colours, DOT * size)
+
+
+def _draws_of(state: State) -> Draws:
+    return add_cubes if state is State.OCCUPIED else _dots
 
 
 def rgb(colour: str) -> NDArray[np.uint8]:

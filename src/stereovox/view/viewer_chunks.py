@@ -23,7 +23,7 @@ SIDE = 1 << CHUNK_BITS
 COARSEST = 4
 """Times that the side of a cell is doubled, at most."""
 MOST_CELLS = 250_000
-"""Cells of one kind that are sent at once, about."""
+"""Cells of one kind that are sent at once, about, if nobody asks for another number."""
 ANGLE = 0.002
 """A cell that looks smaller than so many radians, about two pixels, may be drawn coarser."""
 WIDER = 1.25
@@ -58,12 +58,13 @@ class Chunk:
 class Chunks:
     """All cells of one kind. name: of the node in the scene, below which each chunk has one of its own.
 
-    size: side of a cell in metres. chunks: by place, in chunks from the origin on.
+    size: side of a cell in metres. most: cells that are sent at once, about. chunks: by place, in chunks from the
+    origin on.
     """
 
-    def __init__(self, server: ViserServer, name: str, size: float, draws: Draws):
+    def __init__(self, server: ViserServer, name: str, size: float, draws: Draws, most: int = MOST_CELLS):
         self.chunks: dict[Key, Chunk] = {}
-        self._server, self._name, self._size, self._draws = server, name, size, draws
+        self._server, self._name, self._size, self._draws, self._most = server, name, size, draws, most
         self.root = server.scene.add_frame(name, show_axes=False)
 
     @property
@@ -88,7 +89,8 @@ class Chunks:
         """Send what lookers at `eyes` (n, 3) need that they have not got."""
         keys = list(self.chunks)
         numbers = np.array([len(self.chunks[key].cells) for key in keys])
-        for key, doublings in zip(keys, levels(np.array(keys), numbers, eyes, self._size).tolist(), strict=True):
+        found = levels(np.array(keys), numbers, eyes, self._size, self._most)
+        for key, doublings in zip(keys, found.tolist(), strict=True):
             chunk = self.chunks[key]
             if chunk.sent != doublings:
                 self._send(key, chunk, doublings)
@@ -136,12 +138,16 @@ def coarser(
 
 
 def levels(
-    places: NDArray[np.integer], numbers: NDArray[np.integer], eyes: NDArray[np.floating], size: float
+    places: NDArray[np.integer],
+    numbers: NDArray[np.integer],
+    eyes: NDArray[np.floating],
+    size: float,
+    most: int = MOST_CELLS,
 ) -> NDArray[np.int64]:
     """Return how often the side of cells is doubled in chunks at `places` (n, 3) with `numbers` (n,) cells: (n,).
 
     eyes: (m, 3) in metres; each chunk is as fine as the nearest needs. Cells of surfaces become a quarter with each
-    doubling, about; the least coarse levels are taken that leave `MOST_CELLS`.
+    doubling, about; the least coarse levels are taken that leave `most`.
     """
     if not len(places):
         return np.zeros(0, np.int64)
@@ -151,7 +157,7 @@ def levels(
     angle = ANGLE
     while True:
         doublings = np.log2(np.maximum(nearest * angle / size, 1)).astype(np.int64).clip(0, COARSEST)
-        if (numbers / 4.0**doublings).sum() <= MOST_CELLS or (doublings == COARSEST)[nearest > 0].all():
+        if (numbers / 4.0**doublings).sum() <= most or (doublings == COARSEST)[nearest > 0].all():
             return doublings
         angle *= WIDER
 

@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The 2-D map of a node follows its map: through a reset, a load, and a load that is refused."""
+
+import numpy as np
+import pytest
+from made_walks import depth_at
+
+from stereovox import VoxelMap
+from stereovox.config import load_config
+from stereovox.errors import StereovoxError
+from stereovox.products.projection import project
+from stereovox.ros.mapping import Mapping, make_mapping
+
+WINDOW = {"window.size": [2.4, 2.4, 2.4], "window.trigger": 0.3, "window.outside": "keep"}
+
+
+def check_grid(mapping: Mapping) -> None:
+    expected, cells = project(mapping.snapshot()()).cells, mapping.grid().cells
+    (bottom, left), (top, right) = (corner(np.argwhere(cells >= 0), axis=0) for corner in (np.min, np.max))
+    np.testing.assert_array_equal(cells[bottom : top + 1, left : right + 1], expected)
+
+
+@pytest.mark.parametrize("settings", [{}, WINDOW, {"map.keep_times": True, "map.forget_s": 0.35}])
+def test_the_grid_is_that_of_the_map(tmp_path, settings):
+    mapping = make_mapping(load_config(voxel_size=0.1, **settings), None, None)
+    for k in range(5):
+        assert mapping.add(depth_at(k)).refused is None
+        check_grid(mapping)
+    mapping.save(str(tmp_path / "five.svox"))
+    mapping.reset()
+    assert mapping.grid() is None
+    mapping.add(depth_at(12))
+    check_grid(mapping)
+    mapping.load(str(tmp_path / "five.svox"))
+    check_grid(mapping)
+    VoxelMap.from_cells(load_config(voxel_size=0.2), [[0, 0, 0]], [2.0]).save(tmp_path / "other.svox")
+    with pytest.raises(StereovoxError, match="voxel_size"):
+        mapping.load(str(tmp_path / "other.svox"))
+    assert mapping.add(depth_at(6)).refused is None
+    assert mapping.history.frames == 6
+    check_grid(mapping)
+    mapping.close()
+
+
+def test_what_cannot_be_saved_is_one_line(tmp_path):
+    mapping = make_mapping(load_config(voxel_size=0.1), None, None)
+    mapping.add(depth_at(0))
+    (tmp_path / "file").touch()
+    for name in ("/proc/no/map", str(tmp_path / "file/map"), str(tmp_path / ("x" * 300)), str(tmp_path / "a\0b")):
+        with pytest.raises(StereovoxError):
+            mapping.save(name)
+    mapping.close()

@@ -51,6 +51,8 @@ def plan(m, start, goal, radius, through_unknown=False):
 if __name__ == "__main__":
     through_unknown = "--through-unknown" in sys.argv
     given = [word for word in sys.argv[1:] if word != "--through-unknown"]
+    if not 3 <= len(given) <= 5 or not all(place.count(",") == 2 for place in given[1:3]):
+        sys.exit(__doc__)
     path, *places, radius, picture = given + ["0.3", "plan.png"][len(given) - 3 :]
     start, goal = (np.array(place.split(","), float) for place in places)
     m = sv.load_map(path)

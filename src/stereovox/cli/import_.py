@@ -52,7 +52,7 @@ def _grid(arguments: Namespace) -> dict[str, Any]:
 
     if Path(arguments.file).suffix.lower() in IN_SPACE:
         raise StereovoxError(
-            f"{arguments.file}: holds a map in space; import it as MAP.svox, and then: stereovox export MAP.svox floor.yaml"
+            f"{arguments.file}: holds a map in space; import it as M.svox, then: stereovox export M.svox floor.yaml"
         )
     refuse_options(arguments, ["voxel_size"], "a floor's map tells how large its cells are")
     grid = read_bag_grid(arguments.file, arguments.topic)

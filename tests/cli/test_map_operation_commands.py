@@ -73,6 +73,8 @@ def test_coarsen(maps, tmp_path, told, refused):
     assert table(sv.load_map(tmp_path / "coarse.svox")) == table(sv.coarsen(random_map(1), 2))
     assert "whole number" in refused("coarsen", maps / "a.svox", tmp_path / "no.svox", "--factor", 0)
     assert "another name" in refused("coarsen", maps / "a.svox", maps / "a.svox", "--factor", 2)
+    assert "floor's map" in refused("coarsen", maps / "a.svox", tmp_path / "no.yaml", "--factor", 2)
+    assert "stereovox info" in refused("map", maps / "a.svox", "--out", tmp_path / "no.svox")
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "letter.txt").write_text("dear")
     assert "not a stereovox map" in refused("coarsen", maps / "a.svox", tmp_path / "other", "--factor", 2)

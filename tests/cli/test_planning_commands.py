@@ -13,6 +13,7 @@ from scipy.ndimage import distance_transform_edt
 from stereovox.cli import main
 from stereovox.config import load_config
 from stereovox.maps import State, VoxelMap, load_map
+from stereovox.view.path import draw_path
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples/plan_path.py"
 SHAPE = 30, 20, 12
@@ -66,6 +67,9 @@ def test_paths_are_checked(saved, tmp_path, capsys):
     through = told(capsys, "path", saved, "0.5,1.5,0.6", "2.5,1.5,0.6", "--radius", "0.3")
     assert not through["free"]
     assert through["blocked_at"] == pytest.approx([1.2, 1.5, 0.6])
+    line = np.array([[0.5, 1.5, 0.6], [2.5, 1.5, 0.6]])
+    above = [draw_path(load_map(saved), line, radius, "", at).axes[0] for radius, at in ((0.0, None), (1e-12, 0.7))]
+    assert len(above[1].lines) == len(above[0].lines) + 1, "the cross where it is blocked"
     outside = told(capsys, "path", saved, "-2,0,0", "-1,0,0", "--radius", "0.3")
     assert outside["segments"] == ["unknown"]
     assert told(capsys, "path", saved, "-2,0,0", "-1,0,0", "--radius", "0.3", "--through-unknown")["free"]
@@ -86,6 +90,7 @@ def test_paths_are_checked(saved, tmp_path, capsys):
         (["path", "MAP", "1,1", "2,2,2", "--radius", "0.3"], "'1,1' is no point"),
         (["path", "MAP", "1,1,1", "2,2,2", "--radius", "-1"], "0 m or more"),
         (["path", "MAP", "1,1,1", "2,2,2"], "--radius"),
+        (["path", "MAP", "1,1,9", "2,2,9", "--radius", "0.1", "--picture", "p.png"], "own are 0.00 to 1.20 m\n"),
         (["path", "no.svox", "1,1,1", "2,2,2", "--radius", "1"], "no.svox"),
     ],
 )

@@ -15,8 +15,11 @@ from typing import Any
 from stereovox.cli.robots import GRID_ENDINGS
 from stereovox.cli.saved_map import refuse_options
 from stereovox.cli.terminal import say, thousands
+from stereovox.errors import StereovoxError
 
 EXAMPLE = "stereovox import building.bt building.svox"
+IN_SPACE = (".bt", ".ot", ".npz", ".ply", ".pcd")
+"""Files that hold no floor's map."""
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -47,6 +50,10 @@ def _grid(arguments: Namespace) -> dict[str, Any]:
     from stereovox.products.bag_maps import read_bag_grid
     from stereovox.products.map_server import write_map_server
 
+    if Path(arguments.file).suffix.lower() in IN_SPACE:
+        raise StereovoxError(
+            f"{arguments.file}: holds a map in space; import it as M.svox, then: stereovox export M.svox floor.yaml"
+        )
     refuse_options(arguments, ["voxel_size"], "a floor's map tells how large its cells are")
     grid = read_bag_grid(arguments.file, arguments.topic)
     write_map_server(grid, arguments.map)

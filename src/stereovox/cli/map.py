@@ -15,8 +15,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stereovox.cli.checkpoints import Checkpoints, add_checkpoint
+from stereovox.cli.endings import check_ending
 from stereovox.cli.live_page import NoPage, page_of, rerun_of
-from stereovox.cli.robots import GRID_FILES
+from stereovox.cli.robots import check_in_space
 from stereovox.cli.settings import add_settings, overrides
 from stereovox.cli.terminal import (
     cells_line,
@@ -86,6 +87,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
     from stereovox.maps.store import sweep
 
     out = Path(arguments.out)
+    check_ending("--rerun", arguments.rerun, ".rrd")
     _check_target(out, arguments.resume)
     with only_writer_in(out):
         sweep(out)
@@ -180,10 +182,7 @@ def _check_target(out: Path, resume: bool) -> None:
     """Find out before the work, not after it, that the map could not be saved."""
     from stereovox.maps.store import check_target, is_map
 
-    if out.suffix.lower() in GRID_FILES:
-        raise StereovoxError(
-            f"--out {out}: names a floor's map; end the name of a map in space in .svox, or leave it bare"
-        )
+    check_in_space(out)
     check_target(out)
     if resume and not is_map(out):
         raise StereovoxError(f"{out}: no map to go on with; leave --resume out")

@@ -7,6 +7,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from stereovox.cli.robots import check_in_space
 from stereovox.cli.terminal import cells_line, command_line, say
 from stereovox.errors import StereovoxError
 
@@ -20,6 +21,7 @@ def check_new(out: str, *made_of: str) -> None:
 
     if os.path.realpath(out) in map(os.path.realpath, made_of):
         raise StereovoxError(f"{out}: is what the new map is made of; give the new one another name")
+    check_in_space(out)
     check_target(Path(out))
 
 

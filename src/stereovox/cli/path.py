@@ -61,9 +61,8 @@ def run(arguments: Namespace) -> dict[str, Any]:
     if arguments.picture:
         from stereovox.view.path import picture_path
 
-        picture_path(
-            voxel_map, points, arguments.radius, arguments.picture, f"A path through {Path(arguments.map).stem}"
-        )
+        title = f"A path through {Path(arguments.map).stem}"
+        picture_path(voxel_map, points, arguments.radius, arguments.picture, title, found.blocked_at)
         say(f"saved {arguments.picture}")
     return {
         "free": found.free,

@@ -76,6 +76,12 @@ def picture_line(out: Path) -> str:
     return command_line("picture", out.with_suffix(".yaml"), name)
 
 
+def check_in_space(out: str | Path) -> None:
+    """Raise StereovoxError where a map in space would get the name of a floor's map."""
+    if Path(out).suffix.lower() in GRID_FILES:
+        raise StereovoxError(f"{out}: names a floor's map; end the name of a map in space in .svox, or leave it bare")
+
+
 def check_file(out: str, endings: Iterable[str], option: str = "--out") -> Path:
     """Return `out` as a path; raises StereovoxError before the work where it could not be written after it."""
     path = Path(out)

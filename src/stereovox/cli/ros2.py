@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stereovox.cli.checkpoints import Checkpoints
-from stereovox.cli.robots import GRID_ENDINGS, check_file
+from stereovox.cli.robots import GRID_ENDINGS, check_file, check_in_space
 from stereovox.cli.settings import add_settings, overrides
 from stereovox.cli.terminal import interrupt_between_steps, milliseconds, say, say_about_compiling
-from stereovox.errors import MapFileError, StereovoxError
+from stereovox.errors import MapFileError
 
 if TYPE_CHECKING:
     from stereovox.config import Config
@@ -177,8 +177,7 @@ def _reserve(out: str, dimensions: int, stack: ExitStack) -> None:
     if out and dimensions == 2:
         stack.enter_context(only_writer_of(check_file(out, GRID_ENDINGS).with_suffix(".yaml")))
     elif out:
-        if Path(out).suffix.lower() in GRID_ENDINGS:
-            raise StereovoxError(f"--out {out}: names a floor's map; end the name of a map in space in .svox")
+        check_in_space(out)
         check_target(Path(out))
         stack.enter_context(only_writer_in(Path(out)))
         sweep(Path(out))

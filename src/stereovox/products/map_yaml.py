@@ -45,6 +45,10 @@ class Meaning:
 def read_meaning(path: Path) -> Meaning:
     """Return what the .yaml `path` says; `image` is relative to it. Raises MapFileError, one line, for all else."""
     try:
+        if path.is_dir():
+            raise MapFileError(
+                f"{path}: no map of a floor; make one of a map in space: stereovox export {path} floor.yaml"
+            )
         if not path.is_file():
             raise MapFileError(f"{path}: no such file; give the .yaml of a map_server map")
         says: Any = yaml_value(read_bounded(path, MOST_YAML))

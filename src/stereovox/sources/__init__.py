@@ -101,6 +101,8 @@ def _recognise(where: str) -> Any:
             return kinds[-1]
     if not os.path.exists(where) and not _live(where):
         raise SourceError(f"{where}: no such folder or file")
+    if os.path.isfile(os.path.join(where, "manifest.json")):
+        raise SourceError(f"{where}: is a map, not a recording; what it was made of: stereovox info {where}")
     known = ", ".join(getattr(kind, "layout", "") or kind.__name__ for kind in kinds)
     raise SourceError(f"{where}: {_problem(where, kinds)}; known: {known}")
 

@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from stereovox.errors import StereovoxError
 from stereovox.maps import State, VoxelMap
+from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.products.path_check import point_along
 from stereovox.products.projection import project
 from stereovox.view.drawn import UPS, turned
@@ -23,25 +25,37 @@ MORE_RADII = 3.0
 """The section reaches so many radii above and below the path."""
 DRAWN_EVERY = 2.0
 """The body is drawn along the path this many radii apart."""
+MOST_BODIES = 100
 NEAREST = {"obstacle": ([State.OCCUPIED, State.TENTATIVE], INK), "unknown cell": ([State.UNKNOWN], "tab:blue")}
 
 
-def picture_path(voxel_map: VoxelMap, waypoints: ArrayLike, radius: float, path: str | Path, title: str) -> None:
+def picture_path(
+    voxel_map: VoxelMap,
+    waypoints: ArrayLike,
+    radius: float,
+    path: str | Path,
+    title: str,
+    blocked_at: float | None = None,
+) -> None:
     """Write a PNG of a path (N, 3) in metres, world frame, of a ball of `radius` metres.
 
     First the map from above, of the heights that the ball passes through; then the upright section along the path, so
     that one sees what it passes over and under; then how far obstacles and unknown cells are from it.
+    blocked_at: metres along the path where it is blocked, which is marked.
     Raises StereovoxError where nothing is known at these heights, and as `figures.save` does.
     """
-    save(draw_path(voxel_map, np.asarray(waypoints, float), radius, title), path)
+    save(draw_path(voxel_map, np.asarray(waypoints, float), radius, title, blocked_at), path)
 
 
-def draw_path(voxel_map: VoxelMap, way: NDArray[np.float64], radius: float, title: str) -> Any:
+def draw_path(
+    voxel_map: VoxelMap, way: NDArray[np.float64], radius: float, title: str, blocked_at: float | None = None
+) -> Any:
     """Return the matplotlib figure that `picture_path` saves."""
     up = voxel_map.config.up
     heights = turned(way, up)[:, 2]
-    band = float(heights.min()) - radius, float(heights.max()) + radius
-    seen, flat = project(voxel_map, band), way[:, UPS[up][:2]]
+    room = max(radius, voxel_map.config.cell[UPS[up][2]])
+    band = float(heights.min()) - room, float(heights.max()) + room
+    seen, flat = _seen(voxel_map, band), way[:, UPS[up][:2]]
     box = bounds(seen, flat)
     assert box is not None  # `project` found something
     (x0, y0), (x1, y1) = box
@@ -57,18 +71,36 @@ def draw_path(voxel_map: VoxelMap, way: NDArray[np.float64], radius: float, titl
     _bodies(above, places[:, UPS[up][:2]], radius, length)
     _section(aside, voxel_map, places, radius, length)
     _room(along, voxel_map, places, radius, length)
+    if blocked_at is not None:
+        _mark(above, (aside, along), point_along(way, blocked_at)[[*UPS[up][:2]]], blocked_at)
     told = f"from above: what is {band[0]:.2f} to {band[1]:.2f} m high ({up}); the way may pass over or under it"
     above.set_title(told, fontsize=11, color=INK)
     legend(figure, seen.states, with_track=True)
     facts = [f"{length:.2f} m long", f"radius {radius:g} m", f"cells of {voxel_map.voxel_size:g} m"]
+    if blocked_at is not None:
+        facts.append(f"blocked after {blocked_at:.2f} m, at the cross")
     words_above(figure, title, facts)
     return figure
+
+
+def _seen(voxel_map: VoxelMap, band: tuple[float, float]) -> OccupancyGrid:
+    try:
+        return project(voxel_map, band)
+    except StereovoxError as error:  # its cure is to give other heights, which are the path's own here
+        raise StereovoxError(f"no picture of this path: {str(error).partition(';')[0]}") from None
+
+
+def _mark(above: Any, others: tuple[Any, ...], place: NDArray[np.float64], at: float) -> None:
+    """Mark the place from which on the path is blocked."""
+    above.plot(*place, marker="X", color=PATH_COLOUR, markeredgecolor="white", markersize=16, zorder=5)
+    for axis in others:
+        axis.axvline(at, color=PATH_COLOUR, linestyle=":")
 
 
 def _bodies(axis: Any, places: NDArray[np.float64], radius: float, length: float) -> None:
     from matplotlib.patches import Circle
 
-    number = max(2, int(length / (DRAWN_EVERY * radius)) + 1)
+    number = int(np.clip(length / max(DRAWN_EVERY * radius, length / MOST_BODIES, 1e-9) + 1, 2, MOST_BODIES))
     for n in np.linspace(0, len(places) - 1, number).round().astype(int):
         axis.add_patch(Circle(tuple(places[n]), radius, fill=False, color=PATH_COLOUR, alpha=0.6))
     for place, word in ((places[0], "start"), (places[-1], "goal")):
@@ -82,12 +114,13 @@ def _section(axis: Any, voxel_map: VoxelMap, places: NDArray[np.float64], radius
     up = voxel_map.config.up
     sign, side = -1 if up.startswith("-") else 1, voxel_map.config.cell[UPS[up][2]]
     height = turned(places, up)[:, 2]
-    low, high = height.min() - MORE_RADII * radius, height.max() + MORE_RADII * radius
+    more = MORE_RADII * max(radius, side)
+    low, high = height.min() - more, height.max() + more
     rows = np.arange(low, high, side / 2)
     points = np.repeat(places[None], len(rows), axis=0)
     points[:, :, UPS[up][2]] = sign * rows[:, None]
     states = voxel_map.state(points.reshape(-1, 3)).reshape(points.shape[:2])
-    colours, extent = ListedColormap([STATE_COLOURS[state] for state in State]), (0, length, low, high)
+    colours, extent = ListedColormap([STATE_COLOURS[state] for state in State]), (0, max(length, 1e-6), low, high)
     axis.imshow(states, cmap=colours, vmin=0, vmax=3, origin="lower", extent=extent, interpolation="nearest")
     at = np.linspace(0, length, len(places))
     axis.plot(at, height, color=PATH_COLOUR, linewidth=1.6)

@@ -30,7 +30,7 @@ def statistics(voxel_map: VoxelMap) -> str:
     rows["profile"] = plain(voxel_map.config.profile)
     if voxel_map.recording:
         rows["recording"] = plain(voxel_map.recording)
-    lines = ["| map | |", "|:--|:--|", *(f"| {name} | {value} |" for name, value in rows.items())]
+    lines = ["| | |", "|:--|:--|", *(f"| {name} | {value} |" for name, value in rows.items())]
     return "\n".join(lines if bounds is not None else ["This map is empty: no cell is known yet.", "", *lines])
 
 

@@ -102,7 +102,9 @@ def test_merge(maps, tmp_path, told, refused):
         assert "--transform" in refused("merge", a, b, "--out", tmp_path / "no.svox", f"--transform={transform}")
     told("coarsen", b, tmp_path / "coarse.svox", "--factor", 2)
     assert "coarsen" in refused("merge", a, tmp_path / "coarse.svox", "--out", tmp_path / "no.svox")
-    assert "another name" in refused("merge", a, b, "--out", b)
+    same = f"{maps}/../{maps.name}/b.svox"
+    for one, out in ((b, b), (b, same), (same, b)):
+        assert "another name" in refused("merge", a, one, "--out", out)
 
 
 def test_diff(maps, tmp_path, told, refused):

@@ -221,6 +221,14 @@ def test_damaged_npz(tmp_path, voxel_map):
         assert str(error.value).startswith(str(path))
 
 
+@pytest.mark.parametrize("ending", [".npz", ".ply", ".pcd"])
+def test_cells_in_too_many_blocks_are_refused(tmp_path, voxel_map, ending, monkeypatch):
+    export(voxel_map, tmp_path / f"map{ending}")
+    monkeypatch.setattr("stereovox.products.cloud_cells.MOST_BLOCKS", 1)
+    with pytest.raises(MapFileError, match=r"blocks, more than 1;"):
+        import_map(tmp_path / f"map{ending}")
+
+
 @pytest.mark.parametrize("ending", BAGS)
 def test_an_occupancy_grid_through_a_bag(tmp_path, ending):
     cells = np.random.default_rng(2).integers(-1, 101, (7, 11)).astype(np.int8)
@@ -252,6 +260,13 @@ def test_the_cells_stand_in_the_bag_s_map_frame_as_its_grid_does(tmp_path):
     [[row, column]] = grid.indices(place[None, :2])
     assert (told.parent, told.child, place[2]) == ("map", "map_cells", pytest.approx(0.75))
     assert grid.cells[row, column] > 90
+
+
+def test_the_last_map_of_a_topic_counts_and_no_per_cent_is_unknown(tmp_path):
+    with BagWriter(tmp_path / "two.mcap") as bag:
+        for n, cells in enumerate(([[1, 2]], [[101, -2]], [[100, 127]])):
+            bag.occupancy(n, OccupancyGrid(np.array(cells, np.int8), 0.1))
+    assert read_bag_grid(tmp_path / "two.mcap").cells.tolist() == [[100, -1]]
 
 
 def test_bags_without_such_a_map(tmp_path, voxel_map):

@@ -196,3 +196,7 @@ def test_a_fixed_box_needs_a_size():
 @pytest.mark.parametrize("memory", ["5 XB", "abc", -5, float("nan"), "1e3 kB"])
 def test_a_size_that_is_none_is_told_how_to_write_one(memory):
     refused("max_memory", 'give bytes, or a size like "500 MB"', max_memory=memory)
+
+
+def test_up_that_is_no_axis_is_refused_with_the_axes_there_are():
+    refused("up", "give x, y, z, -x, -y or -z", up="q")

@@ -398,6 +398,8 @@ def _one_line(error: ValidationError, where: str) -> str:
         message = f"give a list of {length} numbers, [{', '.join(letters[:length])}]"
     if first["type"].startswith("byte_size"):
         message = 'give bytes, or a size like "500 MB"'
+    if first["type"] == "string_pattern_mismatch":  # `up` alone has one
+        message = "give x, y, z, -x, -y or -z"
     name = ".".join(map(str, location)) or "settings"
     given = "" if isinstance(value, dict) or value == "" else f" {shown(value)}"
     return f"{where}{name}{given}: {message}"

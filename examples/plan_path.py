@@ -55,6 +55,6 @@ if __name__ == "__main__":
     start, goal = (np.array(place.split(","), float) for place in sys.argv[2:4])
     way = plan(m, start, goal, RADIUS, through_unknown="--through-unknown" in sys.argv)
     if way is None:
-        sys.exit(f"no way is known to be free for a ball of {RADIUS} m, or it does not fit at an end; or try --through-unknown")
+        sys.exit(f"no way is known to be free for a ball of {RADIUS} m, or it does not fit where it starts or ends")
     picture_path(m, way, RADIUS, "plan.png", "A way through the map")
     print(f"{np.linalg.norm(np.diff(way, axis=0), axis=1).sum():.2f} m through {len(way)} places; saved plan.png")

@@ -294,6 +294,9 @@ def test_what_does_not_go_together():
     for together in (sv.merge, sv.difference):
         with pytest.raises(StereovoxError, match=r"0\.1 and 0\.2 m.*coarsen"):
             together(a, other)
+        with pytest.raises(StereovoxError, match="up is z in one map and -y in the other"):
+            together(a, random_map(up="-y"))
+        together(a, random_map(up="-y"), motion([np.pi / 2, 0, 0], [0, 0, 0]))
         with pytest.raises(StereovoxError, match="rigid"):
             together(a, a, np.diag([2.0, 1, 1, 1]))
         with pytest.raises(StereovoxError, match="farther"):

@@ -14,7 +14,7 @@ from stereovox.maps import State, VoxelMap
 from stereovox.maps.cell_format import CellRules
 from stereovox.maps.voxel_map import cells_where
 from stereovox.products.moved import moved
-from stereovox.products.side_by_side import check_same_cells, in_memory, side_by_side
+from stereovox.products.side_by_side import check_alike, in_memory, side_by_side
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,9 +37,9 @@ def difference(a: VoxelMap, b: VoxelMap, T_a_b: ArrayLike | None = None) -> Diff
 
     T_a_b: (4, 4) maps the world frame of `b` into that of `a`, see `moved`; none where both are the same. Cells that
     are tentative in one of the maps count as neither appeared nor vanished. Raises StereovoxError where the cells
-    differ in size or T_a_b is no rigid motion.
+    differ in size, T_a_b is no rigid motion, or there is none and the maps' `up` differs.
     """
-    check_same_cells(a, b)
+    check_alike(a, b, T_a_b)
     a, b = in_memory(a), in_memory(b) if T_a_b is None else moved(in_memory(b), T_a_b)
     before, after = CellRules(a.config.map), CellRules(b.config.map)
     found = []

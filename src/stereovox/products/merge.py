@@ -17,7 +17,7 @@ from stereovox.maps.blocks import CELLS
 from stereovox.maps.cell_format import CellRules
 from stereovox.maps.cell_times import LAST, NEVER, UNIT_NS
 from stereovox.products.moved import moved
-from stereovox.products.side_by_side import cells_at, check_same_cells, in_memory
+from stereovox.products.side_by_side import cells_at, check_alike, in_memory
 
 
 def merge(a: VoxelMap, b: VoxelMap, T_a_b: ArrayLike | None = None) -> VoxelMap:
@@ -28,9 +28,10 @@ def merge(a: VoxelMap, b: VoxelMap, T_a_b: ArrayLike | None = None) -> VoxelMap:
     2005, Probabilistic Robotics, 9.2). Where nothing was clamped before, that is the map of all frames together, but
     for one step of a stored number where a sum passed just through "unknown". A cell that one map does not know is the
     other's. Times are the later ones, frames and refusals are counted together, the viewpoint is the later one.
-    Raises StereovoxError where the cells differ in size or T_a_b is no rigid motion.
+    Raises StereovoxError where the cells differ in size, T_a_b is no rigid motion, or there is none and the maps' `up`
+    differs.
     """
-    check_same_cells(a, b)
+    check_alike(a, b, T_a_b)
     b = in_memory(b)
     if T_a_b is not None:
         b = moved(b, T_a_b)

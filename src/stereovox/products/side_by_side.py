@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from stereovox.errors import StereovoxError
 from stereovox.maps import VoxelMap, _pool
@@ -43,8 +43,12 @@ def side_by_side(a: VoxelMap, b: VoxelMap) -> Iterator[Blocks]:
         yield coords[new], theirs[new], cells[new]
 
 
-def check_same_cells(a: VoxelMap, b: VoxelMap) -> None:
-    """Raise StereovoxError where cells of two maps differ in size."""
+def check_alike(a: VoxelMap, b: VoxelMap, T_a_b: ArrayLike | None) -> None:
+    """Raise StereovoxError where cells of two maps differ in size, or, without a transform, in which way is up."""
+    if T_a_b is None and a.config.up != b.config.up:
+        raise StereovoxError(
+            f"up is {a.config.up} in one map and {b.config.up} in the other; give the transform between them"
+        )
     if not np.allclose(a.config.cell, b.config.cell, rtol=1e-9, atol=0):
         sizes = " and ".join(" x ".join(f"{side:g}" for side in _short(one)) for one in (a, b))
         raise StereovoxError(

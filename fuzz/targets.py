@@ -403,7 +403,7 @@ def read_map_message(data: bytes, folder: Path) -> None:
     if kind.endswith("OccupancyGrid"):
         read_bag_grid(path)
     else:
-        read_bag_map(path, 0.1, "/a")
+        read_bag_map(path, 0.1 if kind.endswith("PointCloud2") else None, "/a")
 
 
 def read_metadata(data: bytes, folder: Path) -> None:

@@ -148,7 +148,7 @@ def _rerun() -> ModuleType:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            import rerun
+            import rerun  # pyright: ignore[reportMissingImports]
     except ImportError:
         raise MissingExtra("rerun-sdk", "rerun") from None
     return rerun

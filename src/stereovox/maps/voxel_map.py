@@ -86,23 +86,11 @@ class VoxelMap(WithHistory):
         Raises ConfigError when these would change what its cells mean.
         """
         self.check_cells(config)
-        unbounded = VoxelMap(config)
-        for coords, cells in self.slabs():
-            unbounded.insert(coords, cells)
-            if self._times is not None:
-                unbounded.set_times(coords, self.times_of(coords), self.times_start_ns)
-        unbounded.take_history(self)
-        return unbounded
+        return self._copied(config, self.slabs())
 
     def snapshot(self) -> VoxelMap:
         """Return a copy to look at while this map goes on: of all cells, or of those in the window."""
-        copy = VoxelMap(self.config)
-        for coords, cells in self._pool.pieces():
-            copy.insert(coords, cells)
-            if self._times is not None:
-                copy.set_times(coords, self._times.get(coords), self._times.start_ns)
-        copy.take_history(self)
-        return copy
+        return self._copied(self.config, self._pool.pieces())
 
     def take_history(self, earlier: VoxelMap) -> None:
         """Take over what `earlier` says of the frames that are in it."""
@@ -277,6 +265,11 @@ class VoxelMap(WithHistory):
         """Stamp in nanoseconds from which times of cells are counted; None before the first and where none are kept."""
         return None if self._times is None else self._times.start_ns
 
+    def cells_in(self, state: State) -> NDArray[np.int32]:
+        """Return the indices (N, 3) of the cells in a known state, block by block."""
+        found = [cells_where(coords, stored, self._rules.states(stored) == state)[0] for coords, stored in self.slabs()]
+        return np.concatenate(found)
+
     def centers(self, indices: ArrayLike) -> NDArray[np.float64]:
         """Return the centres (N, 3) in metres of cells (N, 3)."""
         return (np.asarray(indices) + 0.5) * self.config.cell
@@ -339,6 +332,16 @@ class VoxelMap(WithHistory):
     @property
     def _now_ns(self) -> int:
         return 0 if self.viewpoint is None else self.viewpoint.stamp_ns
+
+    def _copied(self, config: Config, blocks: Iterable[tuple[NDArray[np.int32], NDArray[np.integer]]]) -> VoxelMap:
+        """Return a map without bounds of these of the map's blocks, and of what is known of them."""
+        copy = VoxelMap(config)
+        for coords, cells in blocks:
+            copy.insert(coords, cells)
+            if self._times is not None:
+                copy.set_times(coords, self.times_of(coords), self.times_start_ns)
+        copy.take_history(self)
+        return copy
 
     @property
     def _kept_times(self) -> CellTimes:

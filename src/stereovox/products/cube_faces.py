@@ -20,7 +20,7 @@ def cube_faces(voxel_map: VoxelMap) -> Mesh:
 
     Raises StereovoxError for a map that is too wide.
     """
-    cells = _occupied(voxel_map)
+    cells = voxel_map.cells_in(State.OCCUPIED).astype(np.int64)
     lowest = cells.min(axis=0) - 1 if len(cells) else np.zeros(3, np.int64)
     cells = cells - lowest
     if len(cells) and cells.max() + 1 >= SPAN:
@@ -32,11 +32,6 @@ def cube_faces(voxel_map: VoxelMap) -> Mesh:
     faces = of_corner.reshape(-1, 4)[:, TRIANGLES].reshape(-1, 3)
     vertices = (_places(codes) + lowest) * np.array(voxel_map.config.cell)
     return Mesh(vertices.astype(np.float32), faces.astype(np.int32))
-
-
-def _occupied(voxel_map: VoxelMap) -> NDArray[np.int64]:
-    indices, _ = voxel_map.cells()
-    return indices[voxel_map.state(voxel_map.centers(indices)) == State.OCCUPIED].astype(np.int64)
 
 
 def _quads(cells: NDArray[np.int64], present: NDArray[np.int64], axis: int, side: int) -> NDArray[np.int64]:

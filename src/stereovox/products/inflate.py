@@ -15,7 +15,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from stereovox.errors import StereovoxError
 from stereovox.maps import State, VoxelMap
-from stereovox.maps.cell_format import CellRules
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.products.transform import transformed
 
@@ -58,9 +57,8 @@ def inflated(voxel_map: VoxelMap, radius: float, margin: int = MARGIN) -> VoxelM
     """
     _check(radius, margin)
     known, log_odds = voxel_map.cells()
-    rules = CellRules(voxel_map.config.map)
-    occupied = known[rules.states(rules.format.stored(log_odds)) == State.OCCUPIED]
-    grown = np.concatenate([known[:0], *(_grown(voxel_map, tile, radius, margin) for tile in _tiles(occupied))])
+    tiles = _tiles(voxel_map.cells_in(State.OCCUPIED))
+    grown = np.concatenate([known[:0], *(_grown(voxel_map, tile, radius, margin) for tile in tiles)])
     surest = np.full(len(grown), voxel_map.config.map.log_odds_max)
     made = VoxelMap.from_cells(voxel_map.config, np.concatenate([known, grown]), np.concatenate([log_odds, surest]))
     made.take_history(voxel_map)

@@ -10,6 +10,7 @@ import numpy as np
 
 from stereovox.errors import StereovoxError
 from stereovox.products.distance import DistanceField
+from stereovox.products.floor_axes import floor_axes
 from stereovox.view.drawn import UPS, checked_up
 from stereovox.view.figures import WIDTH, figure_of, save, words_above
 
@@ -32,8 +33,8 @@ def picture_distance(
 
 def draw_distance(field: DistanceField, up: str, at_m: float | None, title: str) -> Any:
     """Return the matplotlib figure that `picture_distance` saves."""
-    right, away, height = UPS[checked_up(up)]
-    sign = -1 if up.startswith("-") else 1
+    right, away, _ = UPS[checked_up(up)]
+    _, _, height, sign = floor_axes(up)
     layer, at_m = _layer(field, height, sign, at_m)
     order = (right, away) if right < away else (away, right)
     metres, obstacles = (

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from stereovox.errors import StereovoxError
 from stereovox.maps import State, VoxelMap
 from stereovox.maps.occupancy import OccupancyGrid
+from stereovox.products.floor_axes import floor_axes
 from stereovox.products.path_check import point_along
 from stereovox.products.projection import project
 from stereovox.view.drawn import UPS, turned
@@ -112,13 +113,14 @@ def _section(axis: Any, voxel_map: VoxelMap, places: NDArray[np.float64], radius
     from matplotlib.colors import ListedColormap
 
     up = voxel_map.config.up
-    sign, side = -1 if up.startswith("-") else 1, voxel_map.config.cell[UPS[up][2]]
+    _, _, upright, sign = floor_axes(up)
+    side = voxel_map.config.cell[upright]
     height = turned(places, up)[:, 2]
     more = MORE_RADII * max(radius, side)
     low, high = height.min() - more, height.max() + more
     rows = np.arange(low, high, side / 2)
     points = np.repeat(places[None], len(rows), axis=0)
-    points[:, :, UPS[up][2]] = sign * rows[:, None]
+    points[:, :, upright] = sign * rows[:, None]
     states = voxel_map.state(points.reshape(-1, 3)).reshape(points.shape[:2])
     colours, extent = ListedColormap([STATE_COLOURS[state] for state in State]), (0, max(length, 1e-6), low, high)
     axis.imshow(states, cmap=colours, vmin=0, vmax=3, origin="lower", extent=extent, interpolation="nearest")

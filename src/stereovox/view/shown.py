@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from stereovox.evaluate.cells import keys, position
 from stereovox.maps import State, VoxelMap
-from stereovox.maps.cell_format import CellRules
+from stereovox.products.floor_axes import floor_axes
 from stereovox.view.picture import height_scale
 from stereovox.view.scale import COLOURS
 
@@ -21,20 +21,10 @@ TIMELESS = "#8a8f98"
 BESIDE = np.concatenate([np.eye(3, dtype=np.int32), -np.eye(3, dtype=np.int32)])
 
 
-def cells_in(voxel_map: VoxelMap, state: State) -> NDArray[np.int32]:
-    """Return indices (N, 3) of the cells in a known state, block by block; for UNKNOWN see `unknown_shell`."""
-    rules, found = CellRules(voxel_map.config.map), []
-    for coords, stored in voxel_map.slabs():
-        block, column = np.nonzero(rules.states(stored) == state)
-        low = np.stack([column >> 6, (column >> 3) & 7, column & 7], axis=1)
-        found.append((coords[block] * 8 + low).astype(np.int32))
-    return np.concatenate([np.empty((0, 3), np.int32), *found])
-
-
 def unknown_shell(voxel_map: VoxelMap) -> NDArray[np.int32]:
     """Return indices (N, 3) of the cells without evidence that share a face with a free cell: where knowledge ends."""
-    free = cells_in(voxel_map, State.FREE)
-    known = np.sort(keys(np.concatenate([free, *(cells_in(voxel_map, s) for s in (State.TENTATIVE, State.OCCUPIED))])))
+    free = voxel_map.cells_in(State.FREE)
+    known = np.sort(keys(np.concatenate([free, *map(voxel_map.cells_in, (State.TENTATIVE, State.OCCUPIED))])))
     shell = [np.empty((0, 3), np.int32)]
     for step in BESIDE:
         beside = free + step
@@ -54,8 +44,8 @@ def values_of(voxel_map: VoxelMap, cells: NDArray[np.int32], colour: str, up: st
 
 def heights(voxel_map: VoxelMap, cells: NDArray[np.int32], up: str) -> NDArray[np.float64]:
     """Return the height (N,) in metres along `up` of the middle of cells (N, 3)."""
-    along = (cells[:, "xyz".index(up[-1])].astype(np.float64) + 0.5) * voxel_map.voxel_size
-    return -along if up.startswith("-") else along
+    _, _, axis, sign = floor_axes(up)
+    return sign * (cells[:, axis].astype(np.float64) + 0.5) * voxel_map.voxel_size
 
 
 def colours_of(values: NDArray[np.floating], colour: str, voxel_size: float) -> Any:

@@ -10,9 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from stereovox.frame import Viewpoint
 from stereovox.maps import State, VoxelMap
+from stereovox.products.floor_axes import upright_axes
 from stereovox.view.drawn import UPS
 from stereovox.view.panels import PATH_COLOUR
-from stereovox.view.shown import cells_in
 from stereovox.view.space import ABOVE_DEG, BEHIND_DEG
 from stereovox.view.viewer_cells import rgb
 from stereovox.view.whereabouts import field_of_view
@@ -112,7 +112,7 @@ def first_look(voxel_map: VoxelMap, up: str) -> tuple[NDArray[np.float64], NDArr
     It looks from behind the depth camera and above at the middle of the camera and the occupied cells, or of all
     cells if none is occupied; a few far outliers do not count.
     """
-    cells = cells_in(voxel_map, State.OCCUPIED)
+    cells = voxel_map.cells_in(State.OCCUPIED)
     centres = voxel_map.centers(cells if len(cells) else voxel_map.cells()[0])
     if not len(centres):
         return np.array([3.0, 3.0, 3.0]), np.zeros(3)
@@ -133,7 +133,7 @@ def first_look(voxel_map: VoxelMap, up: str) -> tuple[NDArray[np.float64], NDArr
 
 def up_vector(up: str) -> NDArray[np.float64]:
     """Return the unit vector (3,) of an axis name such as `z` or `-y`."""
-    return np.eye(3)["xyz".index(up[-1])] * (-1 if up.startswith("-") else 1)
+    return upright_axes(up)[2]
 
 
 def as_tuple(vector: ArrayLike) -> tuple[float, float, float]:

@@ -12,7 +12,7 @@ from stereovox.maps import State, VoxelMap
 from stereovox.view.drawn import stood_up
 from stereovox.view.newest import Newest
 from stereovox.view.panels import STATE_COLOURS
-from stereovox.view.shown import AGE, HEIGHT, PROBABILITY, cells_in, colours_of, heights, unknown_shell, values_of
+from stereovox.view.shown import AGE, HEIGHT, PROBABILITY, colours_of, heights, unknown_shell, values_of
 from stereovox.view.viewer_chunks import MOST_CELLS, Chunks, Draws
 
 if TYPE_CHECKING:
@@ -70,7 +70,7 @@ class Cells:
 
     def take(self, voxel_map: VoxelMap) -> None:
         """Show another map of the same cells, which nobody changes from now on."""
-        found = {State.OCCUPIED: cells_in(voxel_map, State.OCCUPIED)}
+        found = {State.OCCUPIED: voxel_map.cells_in(State.OCCUPIED)}
         self._map = voxel_map
         self._found = found
         self._fit_slider()
@@ -129,7 +129,7 @@ class Cells:
     def _show_dots(self, state: State) -> None:
         found = self._found  # read before the map, which `take` sets first: no dots of an older map are kept
         if state not in found:
-            find = unknown_shell if state is State.UNKNOWN else lambda one: cells_in(one, state)
+            find = unknown_shell if state is State.UNKNOWN else lambda one: one.cells_in(state)
             found[state] = find(self._map)
         cells = found[state]
         cells = cells[heights(self._map, cells, self._up) < self.below.value]

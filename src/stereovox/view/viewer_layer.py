@@ -13,7 +13,6 @@ from stereovox.products.slices import Layer, layer
 from stereovox.view.drawn import stood_up
 from stereovox.view.newest import Newest
 from stereovox.view.scale import Scale, scale_of
-from stereovox.view.shown import cells_in
 
 if TYPE_CHECKING:
     from viser import ImageHandle, ViserServer
@@ -127,7 +126,7 @@ def _first_place(voxel_map: VoxelMap, up: str) -> NDArray[np.float64]:
     """Return where the sliders begin, (3,) in metres: at the camera, or at the layer that tells most."""
     if voxel_map.viewpoint is not None:
         return voxel_map.viewpoint.T_world_camera[:3, 3]
-    cells = cells_in(voxel_map, State.OCCUPIED)
+    cells = voxel_map.cells_in(State.OCCUPIED)
     cells = cells if len(cells) else voxel_map.cells()[0]
     drawn = stood_up(cells, np.full(len(cells), State.OCCUPIED, np.uint8), voxel_map.voxel_size, up)
     place = voxel_map.centers(cells.mean(axis=0)[None] - 0.5)[0]

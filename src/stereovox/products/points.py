@@ -31,17 +31,10 @@ def write_ply(voxel_map: VoxelMap, path: str | Path) -> None:
 
     Raises MapFileError when the place cannot be written.
     """
-    centers = voxel_map.occupied()
-    points = np.empty(len(centers), PLY_POINT)
-    for axis, name in enumerate("xyz"):
-        points[name] = centers[:, axis]
-    colours = cell_colours(voxel_map, centers)
+    points, colours = _occupied(voxel_map, PLY_POINT)
     for channel, name in enumerate(("red", "green", "blue")):
         points[name] = colours[:, channel]
-    points["probability"] = voxel_map.probability(centers)
-    with replacing(path) as file:
-        file.write(_ply_header(len(points), voxel_map.voxel_size).encode("ascii"))
-        file.write(points.tobytes())
+    _write(path, _ply_header(len(points), voxel_map.voxel_size), points)
 
 
 def write_pcd(voxel_map: VoxelMap, path: str | Path) -> None:
@@ -49,16 +42,9 @@ def write_pcd(voxel_map: VoxelMap, path: str | Path) -> None:
 
     Raises MapFileError when the place cannot be written.
     """
-    centers = voxel_map.occupied()
-    points = np.empty(len(centers), PCD_POINT)
-    for axis, name in enumerate("xyz"):
-        points[name] = centers[:, axis]
-    colours = cell_colours(voxel_map, centers)
+    points, colours = _occupied(voxel_map, PCD_POINT)
     points["rgb"] = colours.astype(np.uint32) @ np.array([1 << 16, 1 << 8, 1], np.uint32)
-    points["probability"] = voxel_map.probability(centers)
-    with replacing(path) as file:
-        file.write(_pcd_header(len(points), voxel_map.voxel_size).encode("ascii"))
-        file.write(points.tobytes())
+    _write(path, _pcd_header(len(points), voxel_map.voxel_size), points)
 
 
 def write_npz(voxel_map: VoxelMap, path: str | Path) -> None:
@@ -95,6 +81,21 @@ def height_colours(z: NDArray[np.floating]) -> NDArray[np.uint8]:
     share = (z - z.min()) / max(float(np.ptp(z)), 1e-9)
     at = np.linspace(0, 1, len(HEIGHT_RAMP))
     return np.stack([np.interp(share, at, channel) for channel in np.transpose(HEIGHT_RAMP)], axis=1).astype(np.uint8)
+
+
+def _occupied(voxel_map: VoxelMap, kind: np.dtype) -> tuple[NDArray[np.void], NDArray[np.uint8]]:
+    """Return the occupied cells as records (N,) with their centres and probabilities, and their colours (N, 3)."""
+    centers = voxel_map.occupied()
+    points = np.empty(len(centers), kind)
+    points["x"], points["y"], points["z"] = centers.T
+    points["probability"] = voxel_map.probability(centers)
+    return points, cell_colours(voxel_map, centers)
+
+
+def _write(path: str | Path, header: str, points: NDArray[np.void]) -> None:
+    with replacing(path) as file:
+        file.write(header.encode("ascii"))
+        file.write(points.tobytes())
 
 
 def _ply_header(number: int, voxel_size: float) -> str:

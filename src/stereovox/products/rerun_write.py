@@ -43,9 +43,9 @@ def write_rrd(voxel_map: VoxelMap, path: str | Path) -> None:
     with rerun_file(path, voxel_map.config.up) as file:
         file.add_map(voxel_map)
         camera = None if voxel_map.viewpoint is None else voxel_map.viewpoint.camera
-        for stops in voxel_map.history.path.stops.values():
-            for seen in stops:
-                pose = np.vstack([np.reshape(seen.pose, (3, 4)), [0, 0, 0, 1]])
+        way = voxel_map.history.path
+        for sensor, stops in way.stops.items():
+            for seen, pose in zip(stops, way.poses(sensor), strict=True):
                 file.add_camera(camera, pose, seen.stamp_ns)
 
 

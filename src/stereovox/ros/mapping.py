@@ -17,11 +17,10 @@ from stereovox.mapper import Mapper
 from stereovox.maps import VoxelMap, load_map
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.maps.voxel_map import EVERYWHERE
+from stereovox.products.floor_axes import Heights
 from stereovox.products.live_projection import LiveProjection
 from stereovox.products.map_server import read_map_server, write_map_server
 from stereovox.update_report import UpdateReport
-
-Heights = tuple[float, float]
 
 
 class Mapping(Protocol):

@@ -19,18 +19,19 @@ def slow_denoise(depth_m, s0, s1, s2, voxel_size, low, high):
     """The same in plain words and float64: two passes, pixel by pixel, neighbour by neighbour."""
     inverse = {vu: 1.0 / d for vu, d in np.ndenumerate(depth_m.astype(float)) if 0 < d < np.inf}
     untouched = set()
-    for (down, right), k in (((0, 1), 5.0), ((1, 0), 3.0)):
+    for k, neighbours in ((5.0, 3), (6.0, 2)):
         averaged = {}
         for (v, u), centre in inverse.items():
             z = 1 / centre
             noise = s0 + s1 * z + s2 * z**2
-            steps = sum(noise > (2 * s - 1) * 0.15 * voxel_size for s in (1, 2, 3))
-            if steps == 0:
+            reach = min(k * noise, 6 * voxel_size) / z**2
+            steps = [s for s in range(1, neighbours + 1) if noise > (2 * s - 1) * 0.15 * voxel_size]
+            if not steps:
                 untouched.add((v, u))
-            near = [inverse.get((v + s * down, u + s * right)) for s in range(-steps, steps + 1)]
-            near = [w for w in near if w is not None and abs(w - centre) < k * noise / z**2]
-            weights = [1 - ((w - centre) / (k * noise / z**2)) ** 2 for w in near]
-            averaged[v, u] = sum(w * g for w, g in zip(near, weights, strict=True)) / sum(weights)
+            beside = [(v + i, u + j) for s in steps for i, j in ((0, -s), (0, s), (-s, 0), (s, 0))]
+            values = [centre, *(inverse[vu] for vu in beside if vu in inverse)]
+            weights = [max(1 - ((w - centre) / reach) ** 2, 0) ** 4 for w in values]
+            averaged[v, u] = sum(w * g for w, g in zip(values, weights, strict=True)) / sum(weights)
         inverse = averaged
     result = depth_m.astype(float).copy()
     for vu, value in inverse.items():

@@ -33,6 +33,7 @@ class NoiseConfig(Section):
     Where `s2` is not set it follows from the camera: `subpixel / (focal_px * baseline)` (Chien 2020, Eq 3.5 with the
     square that is missing in print). Where `subpixel` is not set it is the camera's own (`stereo.subpixel` for images
     that are matched here), else 0.08. `default_baseline` serves cameras whose file does not tell theirs.
+    pose_m, pose_deg: standard deviation of the tracker's poses along and about each axis; hits count as less sure.
     """
 
     s0: float = Field(0.0, ge=0)
@@ -40,6 +41,8 @@ class NoiseConfig(Section):
     s2: float | None = Field(None, ge=0)
     subpixel: float | None = Field(None, gt=0)
     default_baseline: float = Field(0.05, gt=0)
+    pose_m: float = Field(0.0, ge=0, le=10)
+    pose_deg: float = Field(0.0, ge=0, le=90)
 
 
 class SensorConfig(BaseModel):

@@ -19,13 +19,13 @@ def slow_denoise(depth_m, s0, s1, s2, voxel_size, low, high):
     """The same in plain words and float64: two passes, pixel by pixel, neighbour by neighbour."""
     inverse = {vu: 1.0 / d for vu, d in np.ndenumerate(depth_m.astype(float)) if 0 < d < np.inf}
     untouched = set()
-    for k, neighbours in ((5.0, 3), (6.0, 2)):
+    for k in (5.0, 6.0):
         averaged = {}
         for (v, u), centre in inverse.items():
             z = 1 / centre
             noise = s0 + s1 * z + s2 * z**2
             reach = min(k * noise, 6 * voxel_size) / z**2
-            steps = [s for s in range(1, neighbours + 1) if noise > (2 * s - 1) * 0.15 * voxel_size]
+            steps = [s for s in (1, 2, 3) if noise > (2 * s - 1) * 0.15 * voxel_size]
             if not steps:
                 untouched.add((v, u))
             beside = [(v + i, u + j) for s in steps for i, j in ((0, -s), (0, s), (-s, 0), (s, 0))]

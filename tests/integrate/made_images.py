@@ -28,7 +28,7 @@ def made_image(seed: int, camera: VirtualCamera = CAMERA, far_share: float = 0.1
 def cells_of(evidence):
     """Evidence as a dict from cell to thousandths."""
     coords = np.concatenate([evidence.coords, evidence.uniform])
-    uniform = np.full((len(evidence.uniform), 512), evidence.uniform_value)
+    uniform = np.repeat(evidence.uniform_values[:, None], 512, axis=1)
     values = np.concatenate([evidence.values, uniform])
     assert len(np.unique(coords, axis=0)) == len(coords), "a block stands in the evidence twice"
     block, column = np.nonzero(values)

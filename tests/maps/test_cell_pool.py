@@ -110,10 +110,11 @@ def test_equals_a_dict(cell, threads, monkeypatch):
                 slow.put(blocks.tolist(), cells)
             case _:
                 half = len(blocks) // 2
-                values, step = some_steps(random, half, span // 3), -int(random.integers(1, span))
+                values = some_steps(random, half, span // 3)
+                steps = -random.integers(1, span, len(blocks) - half).astype(np.int16)
                 changed = slow.add(blocks[:half], values)
-                changed += slow.add(blocks[half:], np.full((len(blocks) - half, 512), step))
-                assert pool.add(blocks[:half], values, blocks[half:], step, threads) == changed
+                changed += slow.add(blocks[half:], np.repeat(steps[:, None], 512, axis=1))
+                assert pool.add(blocks[:half], values, blocks[half:], steps, threads) == changed
         sunk, risen = sunk + (pool.count[1] > bare), risen + (pool.count[1] < bare)
         assert_same(pool, slow, rules)
     assert min(sunk, risen) > 10
@@ -131,8 +132,12 @@ def test_sums_never_overflow(cell, limits, prior, steps):
     pool, slow, here = CellPool(rules), Slow(rules), np.zeros((1, 3), np.int32)
     for step in steps:
         values = np.resize(np.array([step, -step // 2, 0, step]), (1, 512)).astype(np.int16)
-        assert pool.add(here, values, NONE, 0, 1) == slow.add(here, values)
+        assert pool.add(here, values, NONE, same(0, NONE), 1) == slow.add(here, values)
     assert_same(pool, slow, rules)
+
+
+def same(step, blocks):
+    return np.full(len(blocks), step, np.int16)
 
 
 def many(n):
@@ -143,15 +148,15 @@ def test_memory_is_given_back():
     rules = rules_of("int16")
     pool, blocks = CellPool(rules), many(5000)
     start = pool.reserved_bytes
-    pool.add(NONE, NOTHING, blocks, -100, 1)
+    pool.add(NONE, NOTHING, blocks, same(-100, blocks), 1)
     assert pool.memory_bytes > 5000 * 1024
     assert pool.memory_bytes <= pool.reserved_bytes < 1.6 * pool.memory_bytes
-    pool.add(NONE, NOTHING, blocks, -30000, 1)
+    pool.add(NONE, NOTHING, blocks, same(-30000, blocks), 1)
     assert pool.count.tolist() == [0, 5000]
     assert pool.memory_bytes <= pool.reserved_bytes < start + 5000 * 60
     hit = np.zeros((1, 512), np.int16)
     hit[0, 5] = 1
-    pool.add(blocks[:1], hit, NONE, 0, 1)
+    pool.add(blocks[:1], hit, NONE, same(0, NONE), 1)
     assert pool.count.tolist() == [1, 4999]
     pool.remove(blocks)
     assert len(pool) == 0
@@ -162,7 +167,7 @@ def test_a_pool_never_shrinks_below_its_first_size():
     pool = CellPool(rules_of("int16"), rows=600, bare=600)
     before = pool.reserved_bytes
     for step in (-100, -30000):
-        pool.add(NONE, NOTHING, many(600), step, 1)
+        pool.add(NONE, NOTHING, many(600), same(step, many(600)), 1)
         assert pool.reserved_bytes == before
     pool.remove(many(600))
     assert pool.reserved_bytes == before
@@ -170,10 +175,10 @@ def test_a_pool_never_shrinks_below_its_first_size():
 
 def test_what_is_free_already_needs_no_rows():
     pool = CellPool(rules_of("int16"), rows=1)
-    pool.add(NONE, NOTHING, many(200), -30000, 1)
+    pool.add(NONE, NOTHING, many(200), same(-30000, many(200)), 1)
     before = pool.values
     steps = np.where(np.random.default_rng(0).random((100, 512)) < 0.5, 0, -300).astype(np.int16)
-    assert pool.add(many(200)[:100], steps, many(200)[100:], -300, 1) == 0
+    assert pool.add(many(200)[:100], steps, many(200)[100:], same(-300, many(100)), 1) == 0
     assert pool.values is before, "no row was made and taken back"
 
 
@@ -184,7 +189,7 @@ def test_evidence_that_names_a_block_twice_does_no_harm():
     twice = np.zeros((2, 3), np.int32)
     for values in ([[-30000], [50]], [[1], [1]], [[-30000], [-30000]]):
         steps = np.repeat(np.array(values, np.int16), 512, axis=1)
-        pool.add(twice, steps, NONE, 0, 1)
+        pool.add(twice, steps, NONE, same(0, NONE), 1)
         slow.add(twice, steps)
         assert_same(pool, slow, rules)
 

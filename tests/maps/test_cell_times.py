@@ -31,7 +31,7 @@ class Slow:
 
     def add(self, moment):
         evidence = moment.evidence
-        values = [*evidence.values, *([np.full(512, evidence.uniform_value)] * len(evidence.uniform))]
+        values = [*evidence.values, *(np.full(512, value) for value in evidence.uniform_values)]
         for block, row in zip([*evidence.coords, *evidence.uniform], values, strict=True):
             for c in np.flatnonzero(row).tolist():
                 cell = tuple((block * 8 + [c >> 6, (c >> 3) & 7, c & 7]).tolist())

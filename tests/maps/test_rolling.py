@@ -62,7 +62,7 @@ class Slow:
 
     def add(self, evidence):
         blocks = [(b, v) for b, v in zip(evidence.coords, evidence.values, strict=True)]
-        blocks += [(b, np.full(512, evidence.uniform_value)) for b in evidence.uniform]
+        blocks += [(b, np.full(512, v)) for b, v in zip(evidence.uniform, evidence.uniform_values, strict=True)]
         for block, values in blocks:
             for c, value in enumerate(values):
                 cell = tuple(int(x) for x in block * 8 + [c >> 6, (c >> 3) & 7, c & 7])

@@ -22,7 +22,7 @@ def evidence_of(coords, values, uniform=(), uniform_value=-405):
         np.array(coords, np.int32).reshape(-1, 3),
         np.array(values, np.int16).reshape(-1, 512),
         np.array(uniform, np.int32).reshape(-1, 3),
-        uniform_value,
+        np.full(len(uniform), uniform_value, np.int16),
     )
 
 

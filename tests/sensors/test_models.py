@@ -8,7 +8,7 @@ from stereovox.config import NoiseConfig, SensorConfig
 from stereovox.errors import ConfigError
 from stereovox.sensors import SENSORS, make_sensor
 from stereovox.sensors.model import COLUMNS, REACH_SIGMA, ROWS, offset_sigma, tabulate
-from stereovox.sensors.noise import RangeNoise
+from stereovox.sensors.noise import PoseNoise, RangeNoise
 
 CASES = [(0.5, 0.002), (2.0, 0.01), (4.0, 0.08), (8.0, 0.3)]
 HALF = np.sqrt(2 * np.log(2))
@@ -91,7 +91,7 @@ def test_point_models_mark_nothing_beside_the_hit(name):
 
 
 def test_stereo_clears_half_as_much_where_the_gaussian_is_half():
-    p = model_of("stereo").probability(2.0 - 0.05 * HALF, 2.0, 0.05)
+    p = model_of("stereo", fade=1.5).probability(2.0 - 0.05 * (HALF + 1.5), 2.0, 0.05)
     assert p == pytest.approx(0.35 + 0.15 * 0.5)
     assert model_of("constant").probability(2.0, 2.0, 0.05) == 0.7
 
@@ -103,8 +103,8 @@ def test_a_hit_counts_as_its_noise_leaves_it_in_its_cell(ratio):
     stays = np.mean(np.floor(rng.random(1_000_000) + ratio * rng.normal(size=1_000_000)) == 0)
     p = 0.9 * stays
     evidence = 0.5 * (np.log(p / (1 - p)) - np.log(0.2 / 0.8))
-    model = model_of("stereo", p_right=0.9, prior=0.2, trust=0.5)
-    expected = 1 / (1 + np.exp(-max(evidence, 0.05)))  # a measured point is never evidence for free space
+    model = model_of("stereo", p_right=0.9, prior=0.2, trust=0.5, p_least=0.6)
+    expected = max(1 / (1 + np.exp(-evidence)), 0.6)  # a measured point is never evidence for free space
     assert said_of_the_hit(model, 3.0, ratio * 0.08, 0.08) == pytest.approx(expected, abs=2e-3)
 
 
@@ -115,7 +115,37 @@ def test_a_hit_counts_less_with_more_noise_and_more_in_larger_cells_but_always_s
     assert (np.diff(p, axis=1) <= 1e-12).all()
     assert (np.diff(p, axis=0) >= -1e-12).all()
     assert p[:, 0] == pytest.approx(1 / (1 + np.exp(-0.8 * (np.log(0.95 / 0.05) - np.log(0.1 / 0.9)))), abs=1e-4)
-    assert p[:, -1] == pytest.approx(1 / (1 + np.exp(-0.05)))
+    assert p[:, -1] == pytest.approx(0.7)
+
+
+def test_stereo_says_nothing_right_before_what_was_measured():
+    z = np.linspace(1.0, 3.0, 400)
+    p = model_of("stereo", fade=2.0).probability(z, 2.0, 0.1)
+    assert (p[z > 1.8] == 0.5).all()
+    assert (p[z < 1.79] < 0.5).all()
+
+
+@pytest.mark.parametrize("voxel_size", [0.02, 0.1])
+def test_a_cell_that_is_looked_through_loses_at_most_a_share_of_a_hit(voxel_size):
+    """So frames that miss a pole thinner than a pixel do not outvote those that see it."""
+    z = np.linspace(0.1, 5.0, 50)
+    sigma, model = 0.004 * z * z, model_of("stereo", passes=0.25)
+    hit, passed = (np.log(p / (1 - p)) for p in (model.hit(z, sigma, voxel_size), model.passed(z, sigma, voxel_size)))
+    assert passed == pytest.approx(-0.25 * hit)
+    table = tabulate(model, RangeNoise(0, 0, 0.004), 5.0, voxel_size)
+    assert (table.passed >= np.maximum(-0.25 * table.hit, np.log(0.35 / 0.65)) - 1e-9).all()
+    assert tabulate(model_of("constant"), RangeNoise(0, 0, 0.004), 5.0).passed == pytest.approx(np.log(0.4 / 0.6))
+
+
+def test_hits_count_less_where_poses_are_noisy():
+    noise, model = RangeNoise(0, 0, 0.001), model_of("stereo")
+    sure, shaken = (tabulate(model, noise, 5.0, 0.05, pose) for pose in (None, PoseNoise(0.02, 0.01)))
+    z = (np.arange(ROWS) + 0.5) * 5 / ROWS
+    width = np.sqrt(noise.sigma(z) ** 2 + 0.02**2 + (0.01 * z) ** 2)
+    p = model.hit(z, width, 0.05)
+    assert shaken.hit == pytest.approx(np.log(p / (1 - p)))
+    assert (shaken.hit[10:60] < sure.hit[10:60]).all()
+    assert (shaken.passed >= sure.passed).all()
 
 
 def test_table_asks_a_model_that_knows_cells_for_its_hits():

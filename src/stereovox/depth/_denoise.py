@@ -5,8 +5,8 @@ import numpy as np
 
 from stereovox._jit import cell, kernel
 
-RADIUS, AGAIN = 3, 2
-"""Neighbours on each side, in the first and in the second pass; a third one changes little there."""
+RADIUS = 3
+"""Neighbours on each side. Written out below, so that a whole row of pixels is worked on at once."""
 RING = 2 * RADIUS + 1
 SEGMENT = 64
 """Pixels of a row that share the number of neighbours looked at: that of the farthest of them."""
@@ -35,12 +35,12 @@ def denoise(depth_m, noise, fine, widths, limit, low, high, raw, once):
         else:
             raw[v % RING, :] = NONE
         if RADIUS <= v < height + RADIUS:
-            _average(raw, v, noise, fine, widths[0], limit, RADIUS, once[(v - RADIUS) % RING])
+            _average(raw, v, noise, fine, widths[0], limit, once[(v - RADIUS) % RING])
         elif v >= height + RADIUS:
             once[(v - RADIUS) % RING, :] = NONE
         if v >= 2 * RADIUS:
             row = raw[(v - 2 * RADIUS) % RING]  # measured depths of this row are needed no more
-            _average(once, v - RADIUS, noise, fine, widths[1], limit, AGAIN, row)
+            _average(once, v - RADIUS, noise, fine, widths[1], limit, row)
             _write(row, once[(v - 2 * RADIUS) % RING], noise, fine, low, high, depth_m[v - 2 * RADIUS])
 
 
@@ -61,7 +61,7 @@ def _write(inverse, before, noise, fine, low, high, depths):
 
 
 @cell
-def _average(ring, last, noise, fine, wide, limit, most, out):
+def _average(ring, last, noise, fine, wide, limit, out):
     """Average the middle row of the ring, whose last row is `last`, with the rows about it; margins stay NONE."""
     rows = (
         ring[(last + 1) % RING], ring[(last + 2) % RING], ring[(last + 3) % RING], ring[(last + 4) % RING],
@@ -72,7 +72,7 @@ def _average(ring, last, noise, fine, wide, limit, most, out):
         stop = min(start + SEGMENT, width)
         c = _farthest(rows[3][start + RADIUS : stop + RADIUS])
         sigma, step = _sigma(c, noise), fine * c * c
-        if (most > 2) & (sigma > FIVE * step):
+        if sigma > FIVE * step:
             _segment(rows, start, stop, noise, fine, wide, limit, 3, out)
         elif sigma > THREE * step:
             _segment(rows, start, stop, noise, fine, wide, limit, 2, out)

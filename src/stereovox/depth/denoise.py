@@ -30,7 +30,7 @@ def denoise(depth_m: NDArray[np.float32], camera: VirtualCamera, config: Config)
     A sigma filter (Lee 1983) whose weights (1 - (difference / (k sigma))^2)^4 fall smoothly. It works on inverse depth,
     in which stereo noise is the same everywhere and a plane is linear, so a mean over symmetric neighbours is true to
     it. sigma is the noise model's: the configured one, or the camera's. A pixel is averaged with up to 3 neighbours on
-    each side in its row and in its column, and the result once more, with up to 2. A pixel asks for no more neighbours than it takes
+    each side in its row and in its column, and the result once more. A pixel asks for no more neighbours than it takes
     to bring its noise down to FINE cells: the s-th on each side only where sigma(depth) > (2 s - 1) FINE voxel_size. So
     what is near keeps every detail. Nothing is done where even the farthest noise is less than WORTH cells.
 

@@ -69,7 +69,7 @@ def _large_map(recording: Recording, config: Config, cells: int) -> Mapper:
     for piece in np.array_split(blocks, -(-len(blocks) // 8192)):
         values = random.integers(1, 1500, (len(piece), BLOCK_CELLS), np.int16)
         values *= np.where(random.random(values.shape) < 0.8, -1, 1).astype(np.int16)  # free, mostly
-        mapper.map.add(Evidence(piece, values, np.empty((0, 3), np.int32), -1))
+        mapper.map.add(Evidence(piece, values, np.empty((0, 3), np.int32), np.empty(0, np.int16)))
     return mapper
 
 

@@ -35,7 +35,7 @@ def evaluate(depth_m, view, table, windows, blocks, hit_of, hit_values, values, 
         cy = (R[1, 0] * px + R[1, 1] * py + R[1, 2] * pz) * view.intrinsics[1]
         cz = R[2, 0] * px + R[2, 1] * py + R[2, 2] * pz
         out = values[i]
-        _clear(view, table, windows, cx, cy, cz, depths, measured, out)
+        _clear(view, table, windows, cx, cy, cz, _passed(view, table, cz), depths, measured, out)
         if table.marks:
             _mark(depth_m, view, table, cx, cy, cz, out)
         if hit_of[i] >= 0:
@@ -44,9 +44,32 @@ def evaluate(depth_m, view, table, windows, blocks, hit_of, hit_values, values, 
                 out[c] = max(out[c], hits[c]) if hits[c] > 0 else out[c]
 
 
+@kernel
+def passed(view, table, blocks, out):
+    """Fill `out` (n,) int16 with the evidence on all cells of each of `blocks` (n, 3), which are wholly free."""
+    side = np.float32(8) * view.voxel_size
+    R = view.rotation
+    for i in range(blocks.shape[0]):
+        px = np.float32(blocks[i, 0]) * side - view.position[0]
+        py = np.float32(blocks[i, 1]) * side - view.position[1]
+        pz = np.float32(blocks[i, 2]) * side - view.position[2]
+        out[i] = np.int16(_passed(view, table, R[2, 0] * px + R[2, 1] * py + R[2, 2] * pz))
+
+
 @cell
-def _clear(view, table, windows, cx, cy, cz, depths, measured, out):
-    """Write the negative evidence: what the farthest pixel in a window about the cell's size says.
+def _passed(view, table, cz):
+    """Return the most that the cells of a block lose when they are looked through, by the depth of its centre.
+
+    cz: depth of the block's corner.
+    """
+    R = view.rotation
+    z = cz + np.float32(4) * view.voxel_size * (R[2, 0] + R[2, 1] + R[2, 2])
+    return table.passed[table_row(min(max(z, ZERO), view.max_range), table.rows_per_metre, table.passed.size)]
+
+
+@cell
+def _clear(view, table, windows, cx, cy, cz, most, depths, measured, out):
+    """Write the negative evidence: what the farthest pixel in a window about the cell's size says, `most` at most.
 
     depths, measured: (LAYER,) scratch.
     """
@@ -58,8 +81,8 @@ def _clear(view, table, windows, cx, cy, cz, depths, measured, out):
         cells = slice(layer, layer + LAYER)
         steps = view.steps[0, cells], view.steps[1, cells], view.steps[2, cells]
         _measure(view, windows, cx, cy, cz, steps, depths, measured)
-        if _tell_apart(depths, measured, before, table.behind, np.int32(table.free), out[cells]):
-            _look_up(view, table, depths, measured, out[cells])
+        if _tell_apart(depths, measured, before, table.behind, most, out[cells]):
+            _look_up(view, table, depths, measured, most, out[cells])
 
 
 @cell
@@ -97,8 +120,8 @@ def _tell_apart(depths, measured, before, behind, free, out):
 
 
 @cell
-def _look_up(view, table, depths, measured, out):
-    """Write what the sensor table says of cells that are not wholly before their measurement."""
+def _look_up(view, table, depths, measured, most, out):
+    """Write what the sensor table says of cells that are not wholly before their measurement, `most` at most."""
     last_row = np.int32(table.hit.size - 1)
     columns, clear = np.int32(table.clear.shape[1]), table.clear.reshape(table.clear.size)
     last_column, middle_column = np.float32(columns - 1), np.float32(columns) * HALF
@@ -107,7 +130,7 @@ def _look_up(view, table, depths, measured, out):
         row = min(np.int32(min(max(d, ZERO), view.max_range) * table.rows_per_metre), last_row)
         t = (depths[c] - d) * table.columns_per_metre[index(row)] + middle_column
         k = np.int32(min(max(t, ZERO), last_column))
-        e = clear[index(np.int32(np.int32(row * columns) + k))]
+        e = max(clear[index(np.int32(np.int32(row * columns) + k))], most)
         out[c] = np.int16(e if d > ZERO else np.int32(0))
 
 

@@ -75,15 +75,22 @@ def aim(depths, columns, ray, position, view, table, lanes):
 
 
 @cell
-def evidence(depth, measured, row, columns, look_up, width, weight):
+def evidence(depth, measured, row, columns, look_up, width, table, weight):
     """Return the evidence at `depth` on a ray that measured `measured`, weighted if `weight` is above zero.
 
     look_up: the sensor table (rows * width,), negative and positive evidence together.
     """
     t = (depth - measured) * columns + np.float32(width) * HALF
     k = np.int32(min(max(t, ZERO), np.float32(width) - ONE))
-    e = look_up[np.uint32(row * np.int32(width) + k)]
+    e = max(look_up[np.uint32(row * np.int32(width) + k)], passed(table, depth))
     return weighted(e, depth, weight)
+
+
+@cell
+def passed(table, depth):
+    """Return the most that a cell at `depth` loses when it is looked through: `table.free` or less."""
+    last = np.float32(np.int32(table.passed.size - 1))
+    return table.passed[np.uint32(np.int32(min(max(depth * table.rows_per_metre, ZERO), last)))]
 
 
 @cell
@@ -121,8 +128,8 @@ def mark_runs(n, lanes):
 def give(n, lanes, runs, total, plain, weight, memory, pool_table, coords, count, values):
     """Give the gains of the first `n` lanes to their cells; return False when the block pool is full.
 
-    weight: gains of one cell add up; None: the strongest counts. runs, total: see `mark_runs`. plain: the only evidence
-    any lane may have, 0 for unlike ones.
+    weight: gains of one cell add up; None: the strongest counts. runs, total: see `mark_runs`. plain: the most that any
+    lane may take away, where none gives anything; 0 for unlike ones.
     """
     b = np.int64(bits(lanes.key))
     if weight is None:

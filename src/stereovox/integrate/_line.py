@@ -10,7 +10,7 @@ from stereovox._jit import cell, kernel
 from stereovox.integrate._cells import NO_RETURN, ONE, ZERO, bits_of, float_of
 from stereovox.integrate._hits import _row_rays
 from stereovox.integrate._keys import pack
-from stereovox.integrate._lanes import LANES, aim, aim_at_hits, evidence, give, mark_runs, weighted
+from stereovox.integrate._lanes import LANES, aim, aim_at_hits, evidence, give, mark_runs, passed, weighted
 
 OFF_FACE = np.float32(1e-3)
 """Cells by which samples are kept off the faces of cells: on them, rounding would choose the cell."""
@@ -79,10 +79,10 @@ def _step(n, lanes, number, start, near, table, look_up, weight):
         z = np.int32(np.floor(depth * lanes.per_z[i] + pz))
         key = pack(x, y, z, lanes.key)
         if near:
-            e = evidence(depth, lanes.depth[i], lanes.row[i], lanes.columns[i], look_up, width, weight)
+            e = evidence(depth, lanes.depth[i], lanes.row[i], lanes.columns[i], look_up, width, table, weight)
             counts = (depth <= end) & (key != lanes.hit[i])
         else:
-            e = weighted(table.free, depth, weight)
+            e = weighted(passed(table, depth), depth, weight)
             counts = depth <= end
         lanes.key[i] = key
         lanes.gain[i] = e if counts else np.int32(0)

@@ -7,7 +7,7 @@ from stereovox._jit import cell, kernel
 from stereovox.integrate._cells import HALF, NO_RETURN, ONE, ZERO, bits_of, float_of
 from stereovox.integrate._hits import _row_rays
 from stereovox.integrate._keys import pack, strides
-from stereovox.integrate._lanes import LANES, aim, aim_at_hits, evidence, give, in_step, weighted
+from stereovox.integrate._lanes import LANES, aim, aim_at_hits, evidence, give, in_step, passed, weighted
 
 BEYOND = np.float32(1e30)
 TINY = np.float32(1e-30)
@@ -87,10 +87,10 @@ def _step(n, lanes, position, signs, near, table, look_up, weight):
         key = lanes.cell[i]
         middle = HALF * (entered + min(left, end))
         if near:
-            e = evidence(middle, lanes.depth[i], lanes.row[i], lanes.columns[i], look_up, width, weight)
+            e = evidence(middle, lanes.depth[i], lanes.row[i], lanes.columns[i], look_up, width, table, weight)
             counts = (entered <= end) & (key != lanes.hit[i])
         else:
-            e = weighted(table.free, middle, weight)
+            e = weighted(passed(table, middle), middle, weight)
             counts = entered <= end
         gain, last = e if counts else np.int32(0), np.int32(key != lanes.cell[i + 1])
         lanes.key[i], lanes.gain[i], lanes.last[i] = key, gain, last

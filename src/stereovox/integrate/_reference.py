@@ -18,7 +18,7 @@ from stereovox.config import Config
 from stereovox.frame import DepthImage
 from stereovox.rigs import VirtualCamera
 from stereovox.sensors.model import COLUMNS, REACH_SIGMA, ROWS, InverseSensorModel, SensorTable, tabulate
-from stereovox.sensors.noise import RangeNoise
+from stereovox.sensors.noise import PoseNoise, RangeNoise
 
 WINDOW_SHARE, RIM_SHARE, NEAR_PLANE, LARGEST_LEVEL = 0.27, 0.35, 1e-3, 8
 
@@ -61,14 +61,17 @@ def project(image: DepthImage, config: Config, sensor: InverseSensorModel) -> Ce
     pixels, z, size_px, seen = _projected(cells, image, config)
     cells, pixels, z, size_px = cells[seen], pixels[seen], z[seen], size_px[seen]
     clear = np.minimum(_look_up(table, z, _farthest_in_window(image, pixels, size_px), config), 0)
+    clear = np.maximum(clear, table.passed[_row(table, _depth_of_block(cells, image, config))])
     mark = np.maximum(_look_up(table, z, _at_centre(image, pixels), config), 0)
     beside = np.where(mark > 0, mark, clear)
     return _strongest(np.concatenate([hits, cells]), np.concatenate([hit_evidence, beside]))
 
 
 def _table(image: DepthImage, config: Config, sensor: InverseSensorModel) -> SensorTable:
-    table = tabulate(sensor, RangeNoise.of(config.noise, image.camera), config.max_range, config.voxel_size)
-    return replace(table, log_odds=np.round(table.log_odds, 3), hit=np.round(table.hit, 3))  # as a map keeps them
+    noise, pose_noise = RangeNoise.of(config.noise, image.camera), PoseNoise.of(config.noise)
+    table = tabulate(sensor, noise, config.max_range, config.voxel_size, pose_noise)
+    numbers = {name: np.round(getattr(table, name), 3) for name in ("log_odds", "hit", "passed")}  # as a map keeps them
+    return replace(table, **numbers)
 
 
 def _rays(
@@ -88,6 +91,7 @@ def _rays(
         middle = depths_of(start, direction / config.voxel_size, end)
         cells = np.floor(start + middle[:, None] * direction / config.voxel_size).astype(np.int64)
         evidence = _look_up(table, middle, np.full(len(middle), d), config)
+        evidence = np.maximum(evidence, table.passed[_row(table, np.minimum(middle, config.max_range))])
         if np.isfinite(d):
             hit = np.floor((T[:3, 3] + d * direction) / config.voxel_size).astype(np.int64)
             others = (cells != hit).any(axis=1)
@@ -193,6 +197,12 @@ def _centres_in_camera(cells: NDArray, image: DepthImage, config: Config) -> NDA
     """Return x, y and z (3, N) of the cells' centres along the camera's axes, in metres."""
     T = image.T_world_sensor
     return (((cells + 0.5) * config.voxel_size - T[:3, 3]) @ T[:3, :3]).T
+
+
+def _depth_of_block(cells: NDArray, image: DepthImage, config: Config) -> NDArray[np.float64]:
+    """Return the depth (N,) of the middle of each cell's block of 8 x 8 x 8, within 0 and the maximum range."""
+    middle = 8 * (cells // 8) + 3.5
+    return np.clip(_centres_in_camera(middle, image, config)[2], 0, config.max_range)
 
 
 def _pixels_at(x: NDArray, y: NDArray, z: NDArray, image: DepthImage, config: Config) -> tuple[NDArray, NDArray]:

@@ -69,8 +69,10 @@ class Projective:
             )  # fmt: skip
 
         in_shards(one_shard, shards(len(mixed), min(threads, len(mixed) // WORTH_A_THREAD or 1)))
+        free_values = np.empty(len(free), np.int16)
+        _evaluate.passed(view, eye.table, free, free_values)
         origin = eye.views.block
-        return Evidence(mixed + origin, values, free + origin, int(eye.table.free))
+        return Evidence(mixed + origin, values, free + origin, free_values)
 
     def _eye(self, camera: PinholeCamera) -> _Eye:
         return _Eye(camera, sensor_table(self._sensor, self._config, camera), self._config)

@@ -59,7 +59,7 @@ class Ray:
         values = np.empty((len(pool), CELLS), np.int16)
         _lanes.to_thousandths(pool.values[: len(pool)], 0 if weight is None else _lanes.FRACTION_BITS, values)
         origin = origin_block(image.T_world_sensor, config).astype(np.int32)
-        return Evidence(pool.coords[: len(pool)] + origin, values, np.empty((0, 3), np.int32), 0)
+        return Evidence(pool.coords[: len(pool)] + origin, values, np.empty((0, 3), np.int32), np.empty(0, np.int16))
 
     def _eye(self, camera: VirtualCamera) -> _Eye:
         table = sensor_table(self._sensor, self._config, camera)

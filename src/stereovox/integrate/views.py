@@ -18,7 +18,7 @@ from stereovox.maps.blocks import SIDE
 from stereovox.maps.evidence import to_units
 from stereovox.rigs import VirtualCamera
 from stereovox.sensors.model import COLUMNS, REACH_SIGMA, InverseSensorModel, SensorTable, tabulate
-from stereovox.sensors.noise import RangeNoise
+from stereovox.sensors.noise import PoseNoise, RangeNoise
 
 WINDOW_SHARE = 0.27
 """Tile size of a cell's window image over the cell's size in the image; a window is three tiles wide.
@@ -39,13 +39,14 @@ class KernelTable(NamedTuple):
     clear: NDArray[np.int32]  # (rows, columns) negative evidence, 0 elsewhere; column 0 exactly the free value
     mark: NDArray[np.int32]  # (rows, columns) positive evidence beside the hit, 0 elsewhere
     hit: NDArray[np.int32]  # (rows,) evidence of the cell that holds the measured point
+    passed: NDArray[np.int32]  # (rows,) most that a cell at the row's depth loses when it is looked through; negative
     columns_per_metre: NDArray[np.float32]  # (rows,) table columns one metre spans
     reach: NDArray[np.float32]  # (rows,) half width of the table in metres
     safe: NDArray[np.float32]  # (rows + 1,) nearest z that any later row does not call wholly free
     before: NDArray[np.float32]  # (rows,) cells at z up to the row's end are wholly free so far before a measurement
     behind: np.float32  # metres behind a measurement from which on there is no negative evidence
     rows_per_metre: np.float32
-    free: np.int32  # evidence far before a measurement
+    free: np.int32  # evidence far before a measurement, where `passed` allows it
     marks: bool  # whether there is any positive evidence beside the hit
 
 
@@ -85,7 +86,8 @@ class View(NamedTuple):
 def sensor_table(sensor: InverseSensorModel, config: Config, camera: VirtualCamera) -> KernelTable:
     """Return the kernel table of a sensor model for a camera with the configured noise."""
     noise = RangeNoise.of(config.noise, camera)
-    return kernel_table(tabulate(sensor, noise, config.max_range, config.voxel_size), config.max_range)
+    table = tabulate(sensor, noise, config.max_range, config.voxel_size, PoseNoise.of(config.noise))
+    return kernel_table(table, config.max_range)
 
 
 def kernel_table(table: SensorTable, max_range: float) -> KernelTable:
@@ -101,6 +103,7 @@ def kernel_table(table: SensorTable, max_range: float) -> KernelTable:
         clear,
         mark,
         to_units(table.hit),
+        np.maximum(to_units(table.passed), free),
         (COLUMNS / (2 * reach)).astype(np.float32),
         reach.astype(np.float32),
         safe.astype(np.float32),

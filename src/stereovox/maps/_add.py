@@ -3,7 +3,7 @@
 
 `places` looks where the blocks of the evidence are, `make_rows` makes the rows that are missing, `add` fills them, on
 any number of threads, and `settle` takes the rows from blocks that have sunk to the floor. The evidence is `coords`
-(n, 3) with `values` (n, 512) int16, then `uniform` (m, 3), all of whose cells get one negative `step`.
+(n, 3) with `values` (n, 512) int16, then `uniform` (m, 3), all of whose cells get one negative step each.
 """
 
 import numpy as np
@@ -59,16 +59,18 @@ def make_rows(table, coords, values, count, wanted, unknown, lowest, rows):
 
 
 @kernel
-def add(values, rows, start, stop, steps, step, unknown, prior, lowest, highest, floored):
+def add(values, rows, start, stop, steps, uniform_steps, same, unknown, prior, lowest, highest, floored):
     """Add the evidence of blocks `start` to `stop`; return how many cells changed.
 
-    All numbers are int16, and `step` is (512,), the same for all cells. `floored` (n + m,) is set to 1 for blocks whose
-    cells are all at the floor now.
+    All numbers are int16: steps (n, 512), uniform_steps (m,), and `same` (512,), scratch. `floored` (n + m,) is set to 1
+    for blocks whose cells are all at the floor now.
     """
-    changed = 0
+    changed, n = 0, steps.shape[0]
     for i in range(start, stop):
         if rows[i] >= 0:
-            given = steps[i] if i < steps.shape[0] else step
+            if i >= n:
+                same[:] = uniform_steps[i - n]
+            given = steps[i] if i < n else same
             moved, above = _add_to_row(values[rows[i]], given, unknown, prior, lowest, highest)
             changed += np.int64(moved)
             floored[i] = above == 0

@@ -26,7 +26,7 @@ def vacate(table, coords, values, count, unknown, lowest, slab_low, slab_high, l
 
 
 @kernel
-def clip(coords, values, uniform, uniform_value, low, high, out_coords, out_values, out_uniform):
+def clip(coords, values, uniform, uniform_values, low, high, out_coords, out_values, out_uniform, out_uniform_values):
     """Copy the evidence on cells of the window [low, high); return the number of blocks, and of uniform blocks.
 
     Uniform blocks on the border become ordinary ones.
@@ -45,10 +45,11 @@ def clip(coords, values, uniform, uniform_value, low, high, out_coords, out_valu
         x, y, z = uniform[i, 0], uniform[i, 1], uniform[i, 2]
         if _contained(x, y, z, low, high):
             copy_row(out_uniform[whole], uniform[i])
+            out_uniform_values[whole] = uniform_values[i]
             whole += 1
         elif not _disjoint(x, y, z, low, high):
             copy_row(out_coords[n], uniform[i])
-            out_values[n] = uniform_value
+            out_values[n] = uniform_values[i]
             _keep_inside(x, y, z, low, high, out_values[n], 0)
             n += 1
     return n, whole

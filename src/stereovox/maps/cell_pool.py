@@ -128,19 +128,18 @@ class CellPool:
         coords: NDArray[np.int32],
         values: NDArray[np.int16],
         uniform: NDArray[np.int32],
-        step: int,
+        steps: NDArray[np.int16],
         threads: int,
     ) -> int:
-        """Add `values` (n, 512) to blocks `coords` (n, 3), and `step`, not positive, to all cells of `uniform` (m, 3).
+        """Add `values` (n, 512) to blocks `coords` (n, 3), and `steps` (m,), negative, to all cells of `uniform` (m, 3).
 
         In differences of stored numbers; no block is named twice. Returns the number of cells that changed.
         """
         rows = self._rows_for(coords, values, uniform)
         floored, changed = np.zeros(len(rows), np.uint8), []
-        everywhere = np.full(CELLS, step, np.int16)
 
         def one_shard(part: slice) -> None:
-            evidence = self.values, rows, part.start, part.stop, values, everywhere
+            evidence = self.values, rows, part.start, part.stop, values, steps, np.empty(CELLS, np.int16)
             changed.append(_add.add(*evidence, *self._limits, floored))
 
         in_shards(one_shard, shards(len(rows), min(threads, len(rows) // WORTH_A_THREAD or 1)))

@@ -23,10 +23,15 @@ class Evidence:
     """Log-odds of one frame in thousandths, block by block; no block stands in it twice.
 
     coords: (n, 3) int32 block coordinates; values: (n, 512) int16, zero where the frame says nothing.
-    uniform: (m, 3) int32 blocks all of whose cells get `uniform_value`, a negative number (wholly free blocks).
+    uniform: (m, 3) int32 wholly free blocks; uniform_values: (m,) int16, negative, what all cells of each get; one
+        number serves all.
     """
 
     coords: NDArray[np.int32]
     values: NDArray[np.int16]
     uniform: NDArray[np.int32]
-    uniform_value: int
+    uniform_values: NDArray[np.int16]
+
+    def __post_init__(self) -> None:
+        if np.ndim(self.uniform_values) == 0:
+            object.__setattr__(self, "uniform_values", np.full(len(self.uniform), self.uniform_values, np.int16))

@@ -206,12 +206,12 @@ class RollingMap(VoxelMap):
         low, high = (np.array(corner, np.int32) for corner in self._window.box)
         n, m = len(evidence.coords), len(evidence.uniform)
         coords, values = np.empty((n + m, 3), np.int32), np.empty((n + m, CELLS), np.int16)
-        uniform = np.empty((m, 3), np.int32)
+        uniform, uniform_values = np.empty((m, 3), np.int32), np.empty(m, np.int16)
         kept, whole = _window.clip(
-            evidence.coords, evidence.values, evidence.uniform, np.int16(evidence.uniform_value),
-            low, high, coords, values, uniform,
+            evidence.coords, evidence.values, evidence.uniform, evidence.uniform_values,
+            low, high, coords, values, uniform, uniform_values,
         )  # fmt: skip
-        return Evidence(coords[:kept], values[:kept], uniform[:whole], evidence.uniform_value)
+        return Evidence(coords[:kept], values[:kept], uniform[:whole], uniform_values[:whole])
 
     def _move(self, before: Box, now: Box) -> None:
         if self._store is None:

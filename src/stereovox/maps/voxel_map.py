@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from math import floor
 from pathlib import Path
 from typing import Any
 
@@ -136,7 +135,7 @@ class VoxelMap(WithHistory):
         mine = self._in_my_units(evidence)
         if self._times is not None:
             self._times.write(mine, self._now_ns)
-        changed = self._pool.add(mine.coords, mine.values, mine.uniform, mine.uniform_value, self.config.threads)
+        changed = self._pool.add(mine.coords, mine.values, mine.uniform, mine.uniform_values, self.config.threads)
         for listener in self.listeners:
             listener(mine)
         return changed
@@ -321,13 +320,14 @@ class VoxelMap(WithHistory):
     def _in_my_units(self, evidence: Evidence) -> Evidence:
         """Return the evidence as differences of stored numbers; blocks that would get a uniform 0 are left out."""
         factor, most = self._format.per_log_odds / LOG_ODDS_SCALE, self._most_rise
-        if factor == 1 and most is None and (evidence.uniform_value or not len(evidence.uniform)):
+        if factor == 1 and most is None and evidence.uniform_values.all():
             return evidence
         shift = self._format.shift(self.frames)
         values = np.empty_like(evidence.values)
         _add.rescale(evidence.values, np.float32(factor), np.float32(shift), np.float32(most or LARGEST), values)
-        step = floor(evidence.uniform_value * factor + shift)
-        return Evidence(evidence.coords, values, evidence.uniform if step else evidence.uniform[:0], step)
+        steps = np.floor(evidence.uniform_values * factor + shift).astype(np.int16)
+        some = steps != 0
+        return Evidence(evidence.coords, values, evidence.uniform[some], steps[some])
 
     @property
     def _now_ns(self) -> int:

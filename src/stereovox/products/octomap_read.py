@@ -176,7 +176,7 @@ def _map_of(leaves: _Leaves, config: Config) -> VoxelMap:
     units[units == 0] = 1
     _octree.fill_blocks(leaves.corners, leaves.heights, units, coords, values)
     voxel_map = VoxelMap(config)
-    voxel_map.add(Evidence(coords, values, np.zeros((0, 3), np.int32), 0))
+    voxel_map.add(Evidence(coords, values, np.zeros((0, 3), np.int32), np.zeros(0, np.int16)))
     return voxel_map
 
 

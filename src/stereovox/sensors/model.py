@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.errors import ConfigError
-from stereovox.sensors.noise import RangeNoise
+from stereovox.sensors.noise import PoseNoise, RangeNoise
 
 Array = NDArray[np.float64]
 
@@ -32,7 +32,9 @@ class InverseSensorModel(Protocol):
 
     `p_free` is what the model says far before a measurement, `p_unknown` what it says far behind one. What it says of
     the cell that holds the measured point is `probability` at that point; a model that knows better, since a cell has
-    a size, has another function `hit(z_measured, sigma, voxel_size)`.
+    a size, has another function `hit(z_measured, sigma, voxel_size)`. And where a cell that is looked through must not
+    lose as much as p_free says, since what stands in it may be thinner than a pixel, a function `passed(z, sigma,
+    voxel_size)` returns the least probability for it, by the depth of the cell.
     """
 
     @property
@@ -59,19 +61,28 @@ class SensorTable:
 
     log_odds: (ROWS, COLUMNS) of a point at `z = z_measured + offset_sigma[column] * sigma[row]`; p_unknown is 0.
     hit: (ROWS,) log-odds of the cell that holds the measured point.
+    passed: (ROWS,) least log-odds, not positive, of a cell at the row's depth that is looked through.
     sigma: (ROWS,) noise in metres; row r stands for measured depths around `(r + 0.5) / rows_per_metre`.
     """
 
     log_odds: Array
     hit: Array
+    passed: Array
     sigma: Array
     rows_per_metre: float
 
 
-def tabulate(model: InverseSensorModel, noise: RangeNoise, max_range: float, voxel_size: float = 0.05) -> SensorTable:
+def tabulate(
+    model: InverseSensorModel,
+    noise: RangeNoise,
+    max_range: float,
+    voxel_size: float = 0.05,
+    pose_noise: PoseNoise | None = None,
+) -> SensorTable:
     """Return `model` as a table for measured depths up to `max_range` metres and cells of `voxel_size` metres.
 
     Evidence is log(p / (1 - p)) less that of p_unknown (Valenti 2018, Eq 6.2: the prior is not counted twice).
+    Where poses are noisy a hit is as wide as they and the range noise make it together.
     Raises ConfigError when the model leaves (0, 1), or does not come to p_free and p_unknown far off.
     """
     z_measured: Array = (np.arange(ROWS, dtype=float) + 0.5) * (max_range / ROWS)
@@ -81,8 +92,13 @@ def tabulate(model: InverseSensorModel, noise: RangeNoise, max_range: float, vox
     log_odds = _log_odds(model, model.probability(z, z_measured[:, None], sigma[:, None]))
     log_odds[:, -1] = 0  # what lies farther behind is looked up there, and nothing is said about it
     at = model.probability(z_measured, z_measured, sigma)
-    hit = _log_odds(model, model.hit(z_measured, sigma, voxel_size) if hasattr(model, "hit") else at)  # pyright: ignore
-    return SensorTable(log_odds, hit, sigma, ROWS / max_range)
+    width = sigma if pose_noise is None else np.hypot(sigma, pose_noise.sigma(z_measured))
+    hit = _log_odds(model, model.hit(z_measured, width, voxel_size) if hasattr(model, "hit") else at)  # pyright: ignore
+    passed = np.full(ROWS, log_odds[:, 0].mean())
+    if hasattr(model, "passed"):
+        least = _log_odds(model, model.passed(z_measured, width, voxel_size))  # pyright: ignore
+        passed = np.clip(least, passed, 0)
+    return SensorTable(log_odds, hit, passed, sigma, ROWS / max_range)
 
 
 def offset_sigma() -> Array:

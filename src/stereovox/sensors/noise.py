@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import radians
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -45,3 +46,20 @@ class RangeNoise:
         noise_rad = subpixel / camera.focal_px  # disparity is measured in the sensor's own pixels
         always = baseline * noise_rad if isinstance(camera, SphericalCamera) else 0.0
         return cls(config.s0 + always, config.s1, noise_rad / baseline)
+
+
+@dataclass(frozen=True)
+class PoseNoise:
+    """Standard deviation of a camera's poses: `position` in metres along each axis, `angle` in radians about each."""
+
+    position: float
+    angle: float
+
+    def sigma(self, z: ArrayLike) -> NDArray[np.float64]:
+        """Return by how many metres a point at depth `z` is moved along each axis."""
+        return np.hypot(self.position, self.angle * np.asarray(z, float))
+
+    @classmethod
+    def of(cls, config: NoiseConfig) -> PoseNoise:
+        """Return the configured noise."""
+        return cls(config.pose_m, radians(config.pose_deg))

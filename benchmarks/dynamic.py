@@ -28,6 +28,7 @@ MODELS: dict[str, dict[str, Any]] = {
     "OctoMap": {
         "integrator": "ray",
         "ray.update": "once",
+        "blind_range": 0.0,
         "sensor.model": "constant",
         "depth.denoise": False,
         "map.prior": 0.5,

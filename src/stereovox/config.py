@@ -21,6 +21,8 @@ from stereovox.untrusted import read_text, shown, toml_table
 
 MOST_CELLS = 8192
 """Cells that fit between the camera and the maximum range."""
+BLIND_RANGE = 0.3
+"""Metres within which depth cameras see nothing, most of them."""
 MOST_UNEQUAL = 16
 """Largest over smallest side of a cell."""
 LARGEST_WINDOW = 1e6
@@ -57,9 +59,13 @@ class SensorConfig(BaseModel):
 
 
 class RayConfig(Section):
-    """How rays of one frame share a cell: `every` ray adds its weighted part, or the cell changes `once` a frame."""
+    """How rays of one frame share a cell: it changes `once`, hits first, or `every` ray adds its weighted part.
 
-    update: Literal["every", "once"] = "every"
+    `every` is Chien 2020, Eq 3.21. It counts pixels, so a pole that fills less than about a quarter of its cell's width
+    is outvoted by the rays beside it and called free.
+    """
+
+    update: Literal["every", "once"] = "once"
 
 
 class ProjectiveConfig(Section):
@@ -244,6 +250,8 @@ class Config(Section):
     dimensions: 3 for a voxel map, 2 for the grid of a floor (IST 2019).
     steps: sides of a cell along x, y and z where they differ (Valenti 2018, 7.1); `voxel_size` is then the largest.
     up: which axis of the world points up (`z`, `-y`, ...): pictures and heights follow it.
+    blind_range: depth in metres up to which a camera clears nothing, for it does not see what stands so near, only what
+        is beside it. Not set: 0.3, or min_range where that is more, but no more than a tenth of max_range.
     deadline_ms: milliseconds a frame may take; where frames take longer, `pace` says what is left out. Not set: none.
     max_memory: bytes that the cells may take, as a number or like "500 MB". when_full: frames that need more are
         refused (`refuse`); or the map is a window of that size round the camera, which drops what it leaves (`roll`) or
@@ -256,6 +264,7 @@ class Config(Section):
     steps: tuple[float, float, float] | None = None
     min_range: float = Field(0.1, ge=0)
     max_range: float = Field(5.0, gt=0, le=1000)
+    blind_range: float | None = Field(None, ge=0, le=1000)
     up: str = Field("z", pattern="^[+-]?[xyz]$")
     integrator: str = "projective"
     threads: int = Field(1, ge=1, le=256)
@@ -292,6 +301,13 @@ class Config(Section):
         """Sides of a cell along x, y and z in metres."""
         side = self.voxel_size
         return self.steps or (side, side, side)
+
+    @property
+    def blind(self) -> float:
+        """Depth in metres up to which nothing is cleared."""
+        if self.blind_range is not None:
+            return self.blind_range
+        return min(max(self.min_range, BLIND_RANGE), max(self.min_range, 0.1 * self.max_range))
 
     @model_validator(mode="after")
     def _ordered(self) -> Config:

@@ -25,6 +25,7 @@ def settings(voxel_size, **more):
         **{
             "sensor.model": "constant",
             "ray.update": "once",
+            "blind_range": 0.0,
             "noise.s2": 0,
             "map.prior": 0.5,  # OctoMap's tree starts from even odds and clamps at these
             "map.log_odds_min": -2.0,

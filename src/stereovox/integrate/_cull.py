@@ -133,9 +133,10 @@ def _classify(view, table, windows, nearest, tile, blocks, bx, by, bz):
     z = R[2, 0] * px + R[2, 1] * py + R[2, 2] * pz
     ez = half * _extent(R, 2)
     z_low, z_high = z - ez, z + ez
-    if z_high <= NEAR_PLANE or z_low > view.max_range or _outside(view, half, px, py, pz):
+    blind = NEAR_PLANE if table.marks else max(NEAR_PLANE, table.blind)  # marks may stand nearer
+    if z_high <= blind or z_low > view.max_range or _outside(view, half, px, py, pz):
         return SKIP
-    if z_low <= NEAR_PLANE:
+    if z_low <= max(NEAR_PLANE, table.blind):
         return MIXED
     x = R[0, 0] * px + R[0, 1] * py + R[0, 2] * pz
     y = R[1, 0] * px + R[1, 1] * py + R[1, 2] * pz

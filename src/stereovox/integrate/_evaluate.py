@@ -80,14 +80,17 @@ def _clear(view, table, windows, cx, cy, cz, most, depths, measured, out):
     for layer in range(0, 512, LAYER):
         cells = slice(layer, layer + LAYER)
         steps = view.steps[0, cells], view.steps[1, cells], view.steps[2, cells]
-        _measure(view, windows, cx, cy, cz, steps, depths, measured)
+        _measure(view, windows, max(NEAR_PLANE, table.blind), cx, cy, cz, steps, depths, measured)
         if _tell_apart(depths, measured, before, table.behind, most, out[cells]):
             _look_up(view, table, depths, measured, most, out[cells])
 
 
 @cell
-def _measure(view, windows, cx, cy, cz, steps, depths, measured):
-    """Fill `depths` with the depth of each cell's centre and `measured` with what was measured there."""
+def _measure(view, windows, nearest, cx, cy, cz, steps, depths, measured):
+    """Fill `depths` with the depth of each cell's centre and `measured` with what was measured there.
+
+    nearest: depth up to which cells are not looked at.
+    """
     fx_steps, fy_steps, z_steps = steps
     u_centre, v_centre = view.intrinsics[2] + HALF, view.intrinsics[3] + HALF
     right, bottom = np.float32(view.width - 1), np.float32(view.height - 1)
@@ -95,7 +98,7 @@ def _measure(view, windows, cx, cy, cz, steps, depths, measured):
     first, last = np.int32(windows.first), np.int32(COARSEST)
     for c in range(LAYER):
         z = cz + z_steps[c]
-        ahead = (z > NEAR_PLANE) & (z <= view.max_range)
+        ahead = (z > nearest) & (z <= view.max_range)
         inverse = ONE / (z if ahead else ONE)
         u = (cx + fx_steps[c]) * inverse + u_centre
         v = (cy + fy_steps[c]) * inverse + v_centre

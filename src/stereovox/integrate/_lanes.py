@@ -88,9 +88,10 @@ def evidence(depth, measured, row, columns, look_up, width, table, weight):
 
 @cell
 def passed(table, depth):
-    """Return the most that a cell at `depth` loses when it is looked through: `table.free` or less."""
+    """Return the most that a cell at `depth` loses when it is looked through: `table.free` or less, 0 for too near."""
     last = np.float32(np.int32(table.passed.size - 1))
-    return table.passed[np.uint32(np.int32(min(max(depth * table.rows_per_metre, ZERO), last)))]
+    most = table.passed[np.uint32(np.int32(min(max(depth * table.rows_per_metre, ZERO), last)))]
+    return most if depth > table.blind else np.int32(0)
 
 
 @cell

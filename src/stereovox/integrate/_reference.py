@@ -63,7 +63,7 @@ def project(image: DepthImage, config: Config, sensor: InverseSensorModel) -> Ce
     clear = np.minimum(_look_up(table, z, _farthest_in_window(image, pixels, size_px), config), 0)
     clear = np.maximum(clear, table.passed[_row(table, _depth_of_block(cells, image, config))])
     mark = np.maximum(_look_up(table, z, _at_centre(image, pixels), config), 0)
-    beside = np.where(mark > 0, mark, clear)
+    beside = np.where(mark > 0, mark, np.where(z > config.blind, clear, 0))
     return _strongest(np.concatenate([hits, cells]), np.concatenate([hit_evidence, beside]))
 
 
@@ -91,7 +91,8 @@ def _rays(
         middle = depths_of(start, direction / config.voxel_size, end)
         cells = np.floor(start + middle[:, None] * direction / config.voxel_size).astype(np.int64)
         evidence = _look_up(table, middle, np.full(len(middle), d), config)
-        evidence = np.maximum(evidence, table.passed[_row(table, np.minimum(middle, config.max_range))])
+        most = np.where(middle > config.blind, table.passed[_row(table, np.minimum(middle, config.max_range))], 0)
+        evidence = np.maximum(evidence, most)
         if np.isfinite(d):
             hit = np.floor((T[:3, 3] + d * direction) / config.voxel_size).astype(np.int64)
             others = (cells != hit).any(axis=1)

@@ -46,6 +46,7 @@ class KernelTable(NamedTuple):
     before: NDArray[np.float32]  # (rows,) cells at z up to the row's end are wholly free so far before a measurement
     behind: np.float32  # metres behind a measurement from which on there is no negative evidence
     rows_per_metre: np.float32
+    blind: np.float32  # depth in metres up to which nothing is cleared
     free: np.int32  # evidence far before a measurement, where `passed` allows it
     marks: bool  # whether there is any positive evidence beside the hit
 
@@ -87,11 +88,11 @@ def sensor_table(sensor: InverseSensorModel, config: Config, camera: VirtualCame
     """Return the kernel table of a sensor model for a camera with the configured noise."""
     noise = RangeNoise.of(config.noise, camera)
     table = tabulate(sensor, noise, config.max_range, config.voxel_size, PoseNoise.of(config.noise))
-    return kernel_table(table, config.max_range)
+    return kernel_table(table, config.max_range, config.blind)
 
 
-def kernel_table(table: SensorTable, max_range: float) -> KernelTable:
-    """Return `table` as kernels read it."""
+def kernel_table(table: SensorTable, max_range: float, blind: float = 0.0) -> KernelTable:
+    """Return `table` as kernels read it; up to depth `blind` in metres nothing is cleared."""
     units = to_units(table.log_odds)
     clear, mark = np.minimum(units, 0), np.maximum(units, 0)
     free = int(to_units(table.log_odds[:, 0].mean()))
@@ -110,6 +111,7 @@ def kernel_table(table: SensorTable, max_range: float) -> KernelTable:
         _before(edges, reach),
         _behind(clear, reach),
         np.float32(table.rows_per_metre),
+        np.float32(blind),
         np.int32(free),
         bool((mark > 0).any()),
     )

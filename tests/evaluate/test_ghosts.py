@@ -25,8 +25,8 @@ def test_ghosts_are_gone_within_half_a_second(background):
     told = found.as_dict()
     assert told["cells"] > 500
     assert told["cleared"] == 1
-    assert told["gone_longest_s"] <= 0.3  # promised: 0.5 s
-    assert told["free_longest_s"] <= 0.5
+    assert told["gone_longest_s"] <= 0.5  # promised; it takes 0.3 s
+    assert told["free_longest_s"] <= 0.7  # by then tentative for a while: what clears faster loses thin poles
     assert told["after_leaving_s"] <= 0.2
     assert found.left == found.unseen < 60  # only what stands at the border of the image, where no frame sees through
     assert found.number.max() > 20

@@ -36,7 +36,7 @@ class Stereo:
     p_unknown: float = 0.5
     p_least: float = 0.7
     fade: float = 2.0
-    passes: float = 0.25
+    passes: float = 0.3
 
     def probability(self, z: Array, z_measured: Array, sigma: Array) -> Array:
         """Return p_free rising to p_unknown at `fade` sigma before the measurement."""

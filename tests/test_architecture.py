@@ -31,6 +31,7 @@ LAYERS = (
         "history",
         "update_report",
         "_jit",
+        "guarded",
         "shards",
     },
     {"sources", "depth", "sensors", "maps"},

@@ -72,8 +72,8 @@ class Watch:
     def health(self, now_ns: int | None = None) -> Health:
         """Return how things stand at `now_ns` by the clock; None: now."""
         now = self._clock() if now_ns is None else now_ns
-        ages = {sensor: now - arrived for sensor, arrived in self._arrivals.items()}
-        lately = [(why, way) for arrived, why, way in self._lately if now - arrived <= self._lost_ns]
+        ages = {sensor: now - arrived for sensor, arrived in self._arrivals.copy().items()}  # another thread may add
+        lately = [(why, way) for arrived, why, way in self._lately.copy() if now - arrived <= self._lost_ns]
         refused = Counter(why for why, _ in lately if why)
         reduced = Counter(way for _, way in lately if way != FULL)
         age = min(ages.values(), default=None)

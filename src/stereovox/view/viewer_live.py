@@ -9,6 +9,7 @@ from time import monotonic
 from typing import Any
 
 from stereovox.frame import AnyFrame
+from stereovox.history import History
 from stereovox.mapper import Mapper
 from stereovox.maps import VoxelMap
 from stereovox.maps.cubes import in_cubes
@@ -92,7 +93,8 @@ class LiveView:
         self.close()
 
     def _hand_over(self, frame: AnyFrame, report: UpdateReport) -> None:
-        waiting = _copy(self._mapper), frame, f"{frame_words(frame, report)}\n\n{self._pace()}"
+        copy = _copy(self._mapper)
+        waiting = copy, frame, f"{frame_words(frame, report)}\n\n{self._pace(copy.history)}"
         self._free.clear()
         self._waiting = waiting
         self._ask.set()
@@ -112,9 +114,9 @@ class LiveView:
             self._stopped.wait(min(DRAW_REST * (monotonic() - start), PATIENCE_S / 2))
             self._free.set()
 
-    def _pace(self) -> str:
+    def _pace(self, history: History) -> str:
         """Return how mapping fares, as Markdown."""
-        times, history, health = self._arrivals, self._mapper.map.history, self._mapper.health()
+        times, health = self._arrivals, self._mapper.health()
         rate = (len(times) - 1) / max(times[-1] - times[0], 1e-9)
         rows = [
             ("frames a second", f"{rate:.1f}"),

@@ -46,7 +46,7 @@ class GridMapper:
         self._beams = make_beams(self.config)
         self.map = self._made(resume)
         self._gate = Gate(self.config, self.map.history)
-        self._clock, self._watch = clock, Watch(self.config, clock)
+        self._watch = Watch(self.config, clock)
         self._adding = MapLock()
 
     def add(self, seen: Scan | AnyFrame) -> UpdateReport:
@@ -54,7 +54,7 @@ class GridMapper:
 
         Several threads may call: scans go in one by one. Raises StereovoxError for one that holds the map's `lock`.
         """
-        arrived = self._clock()
+        arrived = self._watch.now()
         self.map.lock.refuse_holder()
         with self._adding:
             return self._add(seen, arrived)

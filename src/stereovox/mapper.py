@@ -39,7 +39,7 @@ class Mapper:
     ):
         self.config = load_config(profile, **overrides)
         self._pace = Pace(self.config)
-        self._clock, self._watch = clock, Watch(self.config, clock)
+        self._watch = Watch(self.config, clock)
         self.map = make_map(self.config, resume, tiles)  # it may leave tiles on the disk: what could fail comes before
         self._gate = Gate(self.config, self.map.history)
         self._adding = MapLock()
@@ -49,7 +49,7 @@ class Mapper:
 
         Raises StereovoxError for a thread that holds the map's `lock`.
         """
-        arrived = self._clock()
+        arrived = self._watch.now()
         self.map.lock.refuse_holder()
         with self._adding:
             return self._add(frame, arrived)

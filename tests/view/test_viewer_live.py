@@ -96,7 +96,10 @@ def test_a_page_that_was_taken_down_keeps_no_frame_waiting(end, monkeypatch):
         if i == 2:
             end(live)
         live.add(SOURCE.frame(i))
-    live.finish()
+    finishing = threading.Thread(target=live.finish, daemon=True)
+    finishing.start()
+    finishing.join(PATIENCE_S)
+    assert not finishing.is_alive()
     live.close()
     assert same_as_alone(mapper, 6)
 

@@ -12,7 +12,7 @@ SCRIPT = Path(__file__).parents[1] / "maps" / "made_kills.py"
 
 @pytest.mark.parametrize(
     ("kind", "kills", "least"),
-    [("merge", 8, 40), ("slam", 10, 25), ("grid", 6, 40), ("node, floor", 8, 60), ("node, space", 8, 90)],
+    [("merge", 6, 40), ("slam", 7, 25), ("grid", 4, 40), ("node, floor", 6, 60), ("node, space", 6, 90)],
 )
 def test_a_writer_that_is_killed_leaves_a_map_that_opens_and_nothing_that_stays(tmp_path, kind, kills, least):
     """One of the maps that it saved, or the one from before; the run after it leaves just its own files."""

@@ -4,9 +4,15 @@
 import ast
 import re
 from collections.abc import Iterator
+from inspect import signature
 from pathlib import Path
+from time import monotonic, monotonic_ns
 
 import pytest
+
+from stereovox.cli.checkpoints import Checkpoints
+from stereovox.grid_mapper import GridMapper
+from stereovox.mapper import Mapper
 
 SOURCE = Path(__file__).resolve().parents[1] / "src/stereovox"
 LAYERS = (
@@ -31,6 +37,7 @@ LAYERS = (
         "history",
         "update_report",
         "_jit",
+        "guarded",
         "shards",
     },
     {"sources", "depth", "sensors", "maps"},
@@ -162,3 +169,13 @@ def test_each_rule_can_fail(tmp_path, file, line, complaint):
 def test_bare_files_are_found(tmp_path):
     (tmp_path / "frame.py").write_text("import math\n")
     assert broken_rules(tmp_path) == ["frame.py:1 has no SPDX line", "frame.py:1 has no docstring"]
+
+
+def test_nothing_goes_by_a_clock_that_is_set():
+    """Checkpoints, ages and deadlines would come early, late or never when somebody sets the system's time."""
+    for path in sorted(SOURCE.rglob("*.py")):
+        names = {name for _, name in imported(ast.parse(path.read_text()), [])}
+        assert not names & {"time", "time.time", "time.time_ns", "datetime", "datetime.datetime"}, path
+    assert signature(Checkpoints).parameters["clock"].default is monotonic
+    assert signature(Mapper).parameters["clock"].default is signature(GridMapper).parameters["clock"].default
+    assert signature(Mapper).parameters["clock"].default is monotonic_ns

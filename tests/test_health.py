@@ -145,12 +145,19 @@ def test_as_plain_values_for_json():
     }
 
 
-def test_a_floors_map_has_the_same_states():
+def scan():
+    return Scan(np.full(40, 2.0, np.float32), -0.5, 0.025, 0.1, 5.0, np.eye(4), stamp_ns=11)
+
+
+def grid_and_clock():
     clock = Clock()
-    mapper = GridMapper("ist2019", clock=clock)
-    scan = Scan(np.full(40, 2.0, np.float32), -0.5, 0.025, 0.1, 5.0, np.eye(4), stamp_ns=11)
+    return GridMapper("ist2019", clock=clock), clock
+
+
+def test_a_floors_map_has_the_same_states():
+    mapper, clock = grid_and_clock()
     assert mapper.health().state == "waiting"
-    mapper.add(scan)
+    mapper.add(scan())
     assert (mapper.health().state, mapper.health().ages_s) == ("current", {"scan": 0.0})
     clock.wait(0.6)
     assert mapper.health().state == "stale"
@@ -165,3 +172,37 @@ def test_the_reasons_told_add_up():
     for fault in ("a", "a", "b", "b", "c", "c", "d", "e"):
         mapper.add(frame(fault=fault))
     assert "8 of 8 frames refused (2 x a, 2 x b, 2 x c, 2 x other)" in mapper.health().text
+
+
+@pytest.mark.parametrize("make", [mapper_and_clock, grid_and_clock], ids=["space", "floor"])
+@pytest.mark.parametrize("back_s", [0.4, 30.0, 3600.0])
+def test_a_clock_that_is_set_back_makes_no_map_current(make, back_s):
+    mapper, clock = make()
+    seen = frame() if isinstance(mapper, sv.Mapper) else scan()
+    mapper.add(seen)
+    clock.wait(0.3)
+    assert mapper.health().state == "current"
+    clock.wait(-back_s)
+    assert mapper.health().age_s == pytest.approx(0.3)
+    assert mapper.health(clock.ns + round(0.1 * S)).age_s == pytest.approx(0.4)
+    ages = []
+    for _ in range(4):
+        clock.wait(1.7)
+        ages.append(mapper.health())
+    assert [one.state for one in ages] == ["stale", "stale", "lost", "lost"]
+    assert [one.age_s for one in ages] == pytest.approx([2.0, 3.7, 5.4, 7.1])
+    clock.wait(-back_s)  # and once more, between two frames that nobody asked about
+    assert mapper.add(seen).refused is None
+    assert (mapper.health().state, mapper.health().age_s) == ("current", 0.0)
+    clock.wait(5.5)
+    assert mapper.health().state == "lost"
+
+
+def test_a_clock_that_is_put_forward_makes_a_map_old_until_the_next_frame():
+    mapper, clock = mapper_and_clock()
+    mapper.add(frame())
+    clock.wait(3600)
+    assert mapper.health().state == "lost"
+    mapper.add(frame())
+    assert mapper.health().state == "current"
+    assert mapper.health().frames == 1

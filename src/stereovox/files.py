@@ -5,9 +5,10 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import uuid
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO
 
@@ -21,7 +22,7 @@ def replacing(path: str | Path, error: type[StereovoxError] = MapFileError) -> I
     Raises `error`: one line when the folder is missing or cannot be written, or the disk is full.
     """
     target = Path(os.path.realpath(path))  # a link keeps pointing to where it pointed
-    temporary = target.with_name(f".{uuid.uuid4().hex[:12]}.new")
+    temporary = target.with_name(f".{_short(target)}.{uuid.uuid4().hex[:12]}.new")
     try:
         if target.is_dir():
             raise error(f"{path}: is a folder; name a file")
@@ -38,6 +39,16 @@ def replacing(path: str | Path, error: type[StereovoxError] = MapFileError) -> I
         raise error(f"{path}: {reason}; choose a folder that exists and has room, and can be written") from None
     finally:
         _remove(temporary)
+
+
+def sweep_unfinished(*paths: Path) -> None:
+    """Remove what `replacing` left of these files where it was killed; nobody else may be writing them."""
+    for target in map(Path, map(os.path.realpath, paths)):
+        left = re.compile(rf"\.{re.escape(_short(target))}\.[0-9a-f]{{12}}\.new")
+        with suppress(OSError):  # what cannot be removed is in nobody's way
+            for entry in target.parent.iterdir():
+                if left.fullmatch(entry.name):
+                    entry.unlink()
 
 
 def sync_file(path: Path) -> None:
@@ -67,6 +78,11 @@ def sync_tree(folder: Path) -> None:
         for name in names:
             sync_file(Path(place) / name)
         sync_folder(Path(place))
+
+
+def _short(target: Path) -> str:
+    """Return so much of a file's name that a longer one is still a name."""
+    return os.fsdecode(os.fsencode(target.name)[:200])
 
 
 def _remove(path: Path) -> None:

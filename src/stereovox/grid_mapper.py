@@ -16,6 +16,7 @@ from stereovox.depth import DepthPath
 from stereovox.errors import FrameRefused
 from stereovox.frame import AnyFrame, Scan
 from stereovox.gate import Gate
+from stereovox.guarded import MapLock
 from stereovox.health import FULL, Health, Watch
 from stereovox.integrate.beams import make_beams
 from stereovox.integrate.scan_check import trusted
@@ -45,26 +46,39 @@ class GridMapper:
         self._beams = make_beams(self.config)
         self.map = self._made(resume)
         self._gate = Gate(self.config, self.map.history)
-        self._clock, self._watch = clock, Watch(self.config, clock)
+        self._watch = Watch(self.config, clock)
+        self._adding = MapLock()
 
     def add(self, seen: Scan | AnyFrame) -> UpdateReport:
-        """Take one scan or depth image into the map and tell what it did; `depth_ms` is what the scan took."""
-        arrived, start = self._clock(), perf_counter()
+        """Take one scan or depth image into the map and tell what it did; `depth_ms` is what the scan took.
+
+        Several threads may call: scans go in one by one. Raises StereovoxError for one that holds the map's `lock`.
+        """
+        arrived = self._watch.now()
+        self.map.lock.refuse_holder()
+        with self._adding:
+            return self._add(seen, arrived)
+
+    def _add(self, seen: Scan | AnyFrame, arrived: int) -> UpdateReport:
+        start = perf_counter()
         try:
             scan = trusted(seen if isinstance(seen, Scan) else self._scan_of(seen), self.config)
-            passed = self._gate.check(seen, scan)
+            with self.map.lock:
+                passed = self._gate.check(seen, scan)
             between = perf_counter()
             evidence = self._beams.evidence(scan, self.map.origin)
-            self.map.check_room(evidence)
+            with self.map.lock:
+                self.map.check_room(evidence)
+                cells = self.map.add(evidence)
+                self.map.history.offered(seen)
+                self.map.history.frames += 1
+                self._gate.took(passed)
         except FrameRefused as refused:
-            self.map.history.offered(seen)
-            self.map.history.refuse(refused.reason)
+            with self.map.lock:
+                self.map.history.offered(seen)
+                self.map.history.refuse(refused.reason)
             self._watch.refused(arrived, refused.reason)
             return UpdateReport(refused=refused.reason, detail=str(refused))
-        cells = self.map.add(evidence)
-        self.map.history.offered(seen)
-        self.map.history.frames += 1
-        self._gate.took(passed)
         self._watch.took(arrived, passed.sensor, passed.seen.stamp_ns, FULL)
         done = perf_counter()
         return UpdateReport(1e3 * (between - start), 1e3 * (done - between), cells, detail=passed.told)

@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 from stereovox.config import Config
+from stereovox.guarded import MapLock
 
 MOST = 1000
 """Frames that are looked back at."""
@@ -49,18 +50,37 @@ class Health:
         return {**asdict(self), "refused_share": self.refused_share}
 
 
+class Onward:
+    """A clock that goes on where the one that it reads was set back; after a step forward it is ahead as well."""
+
+    def __init__(self, clock: Callable[[], int]):
+        self._clock, self._lock = clock, MapLock()
+        self._last_ns: int | None = None
+        self._ahead_ns = 0
+
+    def __call__(self, reading_ns: int | None = None) -> int:
+        """Return nanoseconds now, or at a reading of the clock as it goes now."""
+        if reading_ns is not None:
+            return reading_ns + self._ahead_ns
+        with self._lock:
+            now, last = self._clock(), self._last_ns
+            self._ahead_ns += 0 if last is None else max(last - now, 0)
+            self._last_ns = now
+            return now + self._ahead_ns
+
+
 class Watch:
-    """Sees every frame arrive. clock: nanoseconds now, of a clock that never steps."""
+    """Sees every frame arrive. clock: nanoseconds now; one that is set back makes no frame younger than it was."""
 
     def __init__(self, config: Config, clock: Callable[[], int]):
-        self._clock = clock
+        self.now = Onward(clock)
         self._stale_ns, self._lost_ns = round(1e9 * config.trust.stale_s), round(1e9 * config.trust.lost_s)
         self._arrivals: dict[str, int] = {}
         self._stamp_ns: int | None = None
         self._lately: deque[tuple[int, str, str]] = deque(maxlen=MOST)  # arrival, why it was refused, way
 
     def took(self, arrived_ns: int, sensor: str, stamp_ns: int, way: str) -> None:
-        """Note a frame that the map took in; arrived_ns: by the clock."""
+        """Note a frame that the map took in; arrived_ns: by `now`."""
         self._arrivals[sensor] = arrived_ns
         self._stamp_ns = stamp_ns
         self._lately.append((arrived_ns, "", way))
@@ -71,9 +91,9 @@ class Watch:
 
     def health(self, now_ns: int | None = None) -> Health:
         """Return how things stand at `now_ns` by the clock; None: now."""
-        now = self._clock() if now_ns is None else now_ns
-        ages = {sensor: now - arrived for sensor, arrived in self._arrivals.items()}
-        lately = [(why, way) for arrived, why, way in self._lately if now - arrived <= self._lost_ns]
+        now = self.now(now_ns)
+        ages = {sensor: now - arrived for sensor, arrived in self._arrivals.copy().items()}  # another thread may add
+        lately = [(why, way) for arrived, why, way in self._lately.copy() if now - arrived <= self._lost_ns]
         refused = Counter(why for why, _ in lately if why)
         reduced = Counter(way for _, way in lately if way != FULL)
         age = min(ages.values(), default=None)

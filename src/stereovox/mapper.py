@@ -12,6 +12,7 @@ from stereovox.config import Config, load_config
 from stereovox.errors import FrameRefused
 from stereovox.frame import AnyFrame
 from stereovox.gate import Gate, Passed
+from stereovox.guarded import MapLock
 from stereovox.health import Health, Watch
 from stereovox.maps import VoxelMap, make_map
 from stereovox.pace import Pace
@@ -38,31 +39,44 @@ class Mapper:
     ):
         self.config = load_config(profile, **overrides)
         self._pace = Pace(self.config)
-        self._clock, self._watch = clock, Watch(self.config, clock)
+        self._watch = Watch(self.config, clock)
         self.map = make_map(self.config, resume, tiles)  # it may leave tiles on the disk: what could fail comes before
         self._gate = Gate(self.config, self.map.history)
+        self._adding = MapLock()
 
     def add(self, frame: AnyFrame) -> UpdateReport:
-        """Take one frame into the map and tell what it did."""
-        arrived, start = self._clock(), perf_counter()
+        """Take one frame into the map and tell what it did. Several threads may call: frames go in one by one.
+
+        Raises StereovoxError for a thread that holds the map's `lock`.
+        """
+        arrived = self._watch.now()
+        self.map.lock.refuse_holder()
+        with self._adding:
+            return self._add(frame, arrived)
+
+    def _add(self, frame: AnyFrame, arrived: int) -> UpdateReport:
+        start = perf_counter()
         try:
             way = self._pace.way()
             matched = way.depth.matched(frame)
             between = start if matched is frame else perf_counter()
             image = way.depth.image(matched)
-            passed = self._gate.check(frame, image)
+            with self.map.lock:
+                passed = self._gate.check(frame, image)
             prepared = perf_counter()
             evidence = way.integrator.evidence(image)
-            self.map.check_room(evidence)
+            with self.map.lock:
+                self.map.check_room(evidence)
+                self.map.look_from(image.viewpoint)
+                cells = self.map.add(evidence)
+                self.map.history.offered(frame)
+                self._remember(passed, way.name, arrived)
         except FrameRefused as refused:
-            self.map.history.offered(frame)
-            self.map.history.refuse(refused.reason)
+            with self.map.lock:
+                self.map.history.offered(frame)
+                self.map.history.refuse(refused.reason)
             self._watch.refused(arrived, refused.reason)
             return UpdateReport(refused=refused.reason, detail=str(refused))
-        self.map.look_from(image.viewpoint)
-        cells = self.map.add(evidence)
-        self.map.history.offered(frame)
-        self._remember(passed, way.name, arrived)
         done = perf_counter()
         match_ms, depth_ms, integrate_ms = 1e3 * (between - start), 1e3 * (prepared - between), 1e3 * (done - prepared)
         self._pace.took(match_ms + depth_ms + integrate_ms)

@@ -73,6 +73,33 @@ def off(found, poses):
     return np.hypot(*(np.asarray(found) - poses)[:, :2].T)
 
 
+def by_likelihood(log_likelihoods, trust):
+    """The weights that products of likelihoods to the power of `trust` give, one by one in plain numbers."""
+    powers = [float(value) * trust for value in log_likelihoods]
+    weights = [np.exp(value - max(powers)) for value in powers]
+    return [weight / sum(weights) for weight in weights]
+
+
+@pytest.mark.parametrize("model", ["field", "beam"])
+@pytest.mark.parametrize("trust", [0.1, 0.03])
+def test_weights_are_the_product_of_all_scans_since_particles_were_drawn(driven, model, trust):
+    poses, _, scans = driven
+    settings = {"model": model, "trust": trust, "resample_interval": 3, "particles_max": 300, "update_min_d": 0}
+    settings = {f"amcl.{name}": value for name, value in settings.items()}
+    localiser = Localiser(GRID, load_config(**{**SMALL, **settings}), poses[0])
+    log_likelihoods = np.zeros(300)
+    for number, scan in enumerate(scans[:9:4]):
+        localiser.add(scan)
+        beams = beams_of(scan).some(localiser.config.max_beams, localiser._sensor.hits_only)
+        if number < 2:
+            log_likelihoods += localiser._sensor.log_likelihood(localiser._particles, beams)
+            assert localiser._weights == pytest.approx(by_likelihood(log_likelihoods, trust), rel=1e-3)
+    assert np.ptp(localiser._weights) == 0  # drawn anew
+    strangers, weights = localiser._strangers(0.05, beams)
+    alone = localiser._sensor.log_likelihood(strangers, beams)
+    assert weights == pytest.approx(by_likelihood(alone, trust), rel=1e-3)
+
+
 @pytest.mark.parametrize("model", ["field", "beam"])
 def test_tracking_follows_where_odometry_drifts(driven, model):
     poses, odom, scans = driven

@@ -390,3 +390,14 @@ def test_a_grid_is_saved_whole_or_not_at_all(tmp_path):
             after.save(path)
         assert load_grid(path).frames in (0, 2)
         assert [name for name in names(tmp_path) if not name.endswith(".lock")] == ["floor.npz"]
+
+
+def test_what_a_dead_writer_left_of_a_file_goes_and_nothing_else(tmp_path):
+    long = tmp_path / ("x" * 245 + ".yaml")
+    mine = [".floor.yaml.0123456789ab.new", ".floor.pgm.ba9876543210.new", f".{'x' * 200}.0123456789ab.new"]
+    others = [".floor.yaml.0123456789ab.new.bag", ".floor2.yaml.0123456789ab.new", ".0123456789ab.new", "floor.new"]
+    for name in mine + others:
+        (tmp_path / name).touch()
+    with only_writer_of(tmp_path / "floor.yaml", tmp_path / "floor.pgm", long), replacing(long) as file:
+        file.write(b"whole")
+    assert names(tmp_path) == sorted([*others, long.name])

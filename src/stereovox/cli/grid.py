@@ -19,6 +19,7 @@ from stereovox.cli.robots import (
     GRID_FILES,
     add_robot,
     check_file,
+    only_writer_of_floor,
     opened,
     picture_line,
     say_refused,
@@ -75,10 +76,8 @@ def defaults() -> dict[str, Any]:
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Find the way, map along it, save the map and tell what was done."""
-    from stereovox.maps.lock import only_writer_of
-
     out = check_file(arguments.out, GRID_ENDINGS)
-    with only_writer_of(out.with_suffix(".yaml")):
+    with only_writer_of_floor(out):
         return _mapped(arguments, out)
 
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 import os
 from argparse import ArgumentParser, Namespace
 from collections.abc import Iterable, Mapping
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -80,6 +81,15 @@ def check_in_space(out: str | Path) -> None:
     """Raise StereovoxError where a map in space would get the name of a floor's map."""
     if Path(out).suffix.lower() in GRID_FILES:
         raise StereovoxError(f"{out}: names a floor's map; end the name of a map in space in .svox, or leave it bare")
+
+
+def only_writer_of_floor(out: Path) -> AbstractContextManager[None]:
+    """Be the only one who writes a floor's map, its pictures and its way, whichever of them `out` names."""
+    from stereovox.maps.lock import only_writer_of
+
+    yaml, *pictures, way = (out.with_suffix(ending) for ending in (*GRID_ENDINGS, ".tum"))
+    between = [picture.with_name(f".{picture.name}") for picture in pictures]
+    return only_writer_of(yaml, *pictures, *between, way)
 
 
 def check_file(out: str, endings: Iterable[str], option: str = "--out") -> Path:

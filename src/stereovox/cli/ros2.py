@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stereovox.cli.checkpoints import Checkpoints
-from stereovox.cli.robots import GRID_ENDINGS, check_file, check_in_space
+from stereovox.cli.robots import GRID_ENDINGS, check_file, check_in_space, only_writer_of_floor
 from stereovox.cli.settings import add_settings, overrides
 from stereovox.cli.terminal import interrupt_between_steps, milliseconds, say, say_about_compiling
 from stereovox.errors import MapFileError
@@ -171,11 +171,11 @@ def _settings(arguments: Namespace, node: Any) -> tuple[Config, Options]:
 
 def _reserve(out: str, dimensions: int, stack: ExitStack) -> None:
     """Find out now, not at the end, that the map could not be saved, and keep others from writing there."""
-    from stereovox.maps.lock import only_writer_in, only_writer_of
+    from stereovox.maps.lock import only_writer_in
     from stereovox.maps.store import check_target, sweep
 
     if out and dimensions == 2:
-        stack.enter_context(only_writer_of(check_file(out, GRID_ENDINGS).with_suffix(".yaml")))
+        stack.enter_context(only_writer_of_floor(check_file(out, GRID_ENDINGS)))
     elif out:
         check_in_space(out)
         check_target(Path(out))

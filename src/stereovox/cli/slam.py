@@ -16,6 +16,7 @@ from stereovox.cli.robots import (
     GRID_ENDINGS,
     add_robot,
     check_file,
+    only_writer_of_floor,
     opened,
     picture_line,
     say_refused,
@@ -47,10 +48,8 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Map, save map and way, and tell how it went."""
-    from stereovox.maps.lock import only_writer_of
-
     out = check_file(arguments.out, GRID_ENDINGS)
-    with only_writer_of(out.with_suffix(".yaml")):
+    with only_writer_of_floor(out):
         return _mapped(arguments, out)
 
 

@@ -4,12 +4,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from math import ceil
 from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from stereovox.cameras import PinholeCamera
 from stereovox.config import Config
+from stereovox.depth.downsample import downsample
+from stereovox.errors import FrameRefused
 from stereovox.frame import DepthImage
 from stereovox.integrate import _keys, _lanes, _line, _ray
 from stereovox.integrate.lanes import Lanes, Memory, make_lanes, make_memory
@@ -20,6 +24,9 @@ from stereovox.maps.evidence import Evidence
 from stereovox.rigs import VirtualCamera
 from stereovox.sensors import make_sensor
 from stereovox.shards import in_shards, shards
+
+MAX_CELL_PX = 512
+"""Pixels along a cell at a depth of one metre; of more, each would say so little that `_lanes` rounds it to nothing."""
 
 
 class _Eye(NamedTuple):
@@ -48,10 +55,10 @@ class Ray:
 
     def evidence(self, image: DepthImage) -> Evidence:
         """Return what `image` says about the cells its rays cross."""
-        config, camera = self._config, image.camera
+        config, image = self._config, self._of_countable_rays(image)
+        camera = image.camera
         eye, view = self._eyes[camera], rays_of(image, config)
-        cell_px = camera.focal_px / camera.binning * config.voxel_size  # at a depth of one metre
-        weight = np.float32(cell_px**-2) if config.ray.update == "every" else None
+        weight = np.float32(self._cell_px(camera) ** -2) if config.ray.update == "every" else None
         parts = shards(camera.height, config.threads)
         number = {part.start: n for n, part in enumerate(parts)}
         in_shards(lambda part: self._follow(image.depth_m, view, weight, eye, number[part.start], part), parts)
@@ -60,6 +67,23 @@ class Ray:
         _lanes.to_thousandths(pool.values[: len(pool)], 0 if weight is None else _lanes.FRACTION_BITS, values)
         origin = origin_block(image.T_world_sensor, config).astype(np.int32)
         return Evidence(pool.coords[: len(pool)] + origin, values, np.empty((0, 3), np.int32), np.empty(0, np.int16))
+
+    def _cell_px(self, camera: VirtualCamera) -> float:
+        """Return how many pixels a cell is long at a depth of one metre."""
+        return camera.focal_px / camera.binning * self._config.voxel_size
+
+    def _of_countable_rays(self, image: DepthImage) -> DepthImage:
+        """Return the image, or its block minima where the weight of one ray were too small to be counted."""
+        cell_px = self._cell_px(image.camera)
+        if self._config.ray.update != "every" or cell_px <= MAX_CELL_PX:
+            return image
+        if isinstance(image.camera, PinholeCamera):
+            return downsample(image, ceil(cell_px / MAX_CELL_PX))
+        raise FrameRefused(
+            "bad_camera",
+            f"its image has {cell_px:.0f} pixels for a cell at one metre, of which ray.update every counts "
+            f"{MAX_CELL_PX}; use integrator projective or ray.update once",
+        )
 
     def _eye(self, camera: VirtualCamera) -> _Eye:
         table = sensor_table(self._sensor, self._config, camera)

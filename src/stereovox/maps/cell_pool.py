@@ -115,13 +115,12 @@ class CellPool:
     def pieces(self) -> Iterator[tuple[NDArray[np.int32], NDArray[np.integer]]]:
         """Yield coordinates (n, 3) and cells (n, 512) of all blocks in ascending order, at least once.
 
-        The pool must not change meanwhile.
+        Of blocks that are made meanwhile nothing is yielded, others are as they are at their time.
         """
-        places, coords, values = self._places(), self.coords, self.values
-        places = places[np.lexsort(coords[places].T[::-1])]
-        for start in range(0, max(len(places), 1), PIECE):
-            some = places[start : start + PIECE]
-            yield coords[some], self._cells_at(some, values)
+        coords = self.block_coords
+        coords = coords[np.lexsort(coords.T[::-1])]
+        for start in range(0, max(len(coords), 1), PIECE):
+            yield self.get(coords[start : start + PIECE])
 
     def add(
         self,

@@ -8,12 +8,14 @@ from itertools import product
 import numpy as np
 
 from stereovox.config import load_config
+from stereovox.guarded import one_state
 from stereovox.maps.voxel_map import VoxelMap
 
 TIE = 1e-6
 """Cubes: a centre so near to a face stands on it, and belongs to the cell above."""
 
 
+@one_state
 def in_cubes(voxel_map: VoxelMap) -> VoxelMap:
     """Return the map in cubes of the smallest side of its cells; a map of cubes is returned as it is.
 

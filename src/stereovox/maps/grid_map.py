@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from stereovox import planar
 from stereovox.config import Config
 from stereovox.errors import ConfigError, FrameRefused, StereovoxError
+from stereovox.guarded import Guarded, MapLock
 from stereovox.history import History, WithHistory
 from stereovox.maps import _grid, _pool
 from stereovox.maps.blocks import BlockPool
@@ -28,16 +29,18 @@ MOST_PICTURED = 2**29
 """Cells of the largest picture; the map itself holds only what was seen and may reach farther."""
 
 
-class GridMap(WithHistory):
+class GridMap(Guarded, WithHistory):
     """A sparse 2-D occupancy map: tiles of 64x64 cells, made where a scan says something.
 
     Cell (i, j) covers `[i, i + 1) x [j, j + 1)` times `config.voxel_size` in the grid's own frame, which stands at
     `origin` (x, y, yaw) in the map's. Points and poses are in the map's frame. Cells, their states and the settings
     `config.map` mean what they do in a `VoxelMap`, but for the prior: that is `config.grid.prior`.
     `history` is what it remembers of the scans and images that made it.
+    Several threads may use a map: each call holds its `lock`.
     """
 
     def __init__(self, config: Config, origin: ArrayLike = (0.0, 0.0, 0.0)):
+        self.lock = MapLock()
         self.config = config
         self.voxel_size = config.voxel_size
         self.origin = np.array(origin, float).reshape(3)

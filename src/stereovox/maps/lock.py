@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from stereovox.errors import MapFileError
-from stereovox.files import sync_folder
+from stereovox.files import sweep_unfinished, sync_folder
 
 LOCK = ".lock"
 """The file in a folder that tells of its writer."""
@@ -39,9 +39,13 @@ def only_store_in(folder: Path) -> Iterator[None]:
 
 
 @contextmanager
-def only_writer_of(file: Path) -> Iterator[None]:
-    """Be the only process that writes `file`: as `only_writer_in`; the lock stands beside it."""
+def only_writer_of(file: Path, *others: Path) -> Iterator[None]:
+    """Be the only process that writes `file`, and `others` with it: as `only_writer_in`; the lock stands beside it.
+
+    What a writer left of them that was killed is removed.
+    """
     with _held(file, file.with_name(f".{file.name}{LOCK}"), again=True):
+        sweep_unfinished(file, *others)
         yield
 
 

@@ -122,28 +122,6 @@ class RollingMap(VoxelMap):
         """Add what one frame says about the cells of the window; return the number of cells whose value changed."""
         return super().add(self._within(evidence))
 
-    def slabs(self) -> Iterator[tuple[NDArray[np.int32], NDArray[np.integer]]]:
-        """Yield all blocks, those on disk with them, piece by piece in ascending order."""
-        if self._earlier is not None:  # no frame has placed the window so far
-            yield from self._earlier.slabs()
-            return
-        if self._store is None:
-            yield from super().slabs()
-            return
-        here = {tuple(tile) for tile in np.unique(self._pool.block_coords // BLOCKS, axis=0).tolist()}
-        empty = True
-        for slab in slabs_of(sorted(here | set(self._store.tiles()))):
-            parts = [
-                self._pool.get(blocks_of(tile)) if tile in here or self._in_window(tile) else self._kept(tile)[:2]
-                for tile in slab
-            ]
-            coords, cells = (np.concatenate(part) for part in zip(*parts, strict=True))
-            order = np.lexsort(coords.T[::-1])
-            yield coords[order], cells[order]
-            empty = False
-        if empty:
-            yield from super().slabs()
-
     def times_of(self, coords: NDArray[np.int32]) -> NDArray[np.uint32]:
         """Return the times (n, 512) of the cells of blocks (n, 3), wherever they are kept."""
         if self._earlier is not None:
@@ -167,6 +145,31 @@ class RollingMap(VoxelMap):
         for store in (self._times_store, self._store):
             if store is not None:
                 store.close()
+
+    def _slabs(self) -> Iterator[tuple[NDArray[np.int32], NDArray[np.integer]]]:
+        """Yield all blocks, those on disk with them, piece by piece in ascending order."""
+        if self._earlier is not None:  # no frame has placed the window so far
+            yield from self._earlier.slabs()
+            return
+        if self._store is None:
+            yield from super()._slabs()
+            return
+        here = {tuple(tile) for tile in np.unique(self._pool.block_coords // BLOCKS, axis=0).tolist()}
+        empty = True
+        for slab in slabs_of(sorted(here | set(self._store.tiles()))):
+            coords, cells = (np.concatenate(part) for part in zip(*map(self._tile, slab), strict=True))
+            order = np.lexsort(coords.T[::-1])
+            yield coords[order], cells[order]
+            empty = False
+        if empty:
+            yield from super()._slabs()
+
+    def _tile(self, tile: Tile) -> tuple[NDArray[np.int32], NDArray[np.integer]]:
+        """Return the blocks of a tile, wherever it is now."""
+        coords, cells = self._pool.get(blocks_of(tile))
+        if len(coords) or self._store is None or tile not in self._store or self._in_window(tile):
+            return coords, cells
+        return self._kept(tile)[:2]
 
     def _stored_at(self, points: NDArray[np.floating]) -> NDArray[np.integer]:
         if self._earlier is not None:

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from stereovox.config import Config
 from stereovox.errors import ConfigError, StereovoxError
 from stereovox.frame import Viewpoint
+from stereovox.guarded import Guarded, MapLock, in_steps
 from stereovox.history import History, WithHistory
 from stereovox.maps import _add, queries
 from stereovox.maps.blocks import CELLS, SIDE, StoredCells, blocks_of_cells
@@ -28,7 +29,7 @@ EVERYWHERE = np.array([[-(2**30)] * 3, [2**30] * 3])
 """Lowest block that `VoxelMap.blocks_within` may be asked for, and the first beyond the highest."""
 
 
-class VoxelMap(WithHistory):
+class VoxelMap(Guarded, WithHistory):
     """A sparse occupancy map in the world frame (z up unless the recording says otherwise).
 
     Cell i covers [i, i + 1) * voxel_size on each axis, or of `config.cell` where its sides differ. A cell without
@@ -37,9 +38,11 @@ class VoxelMap(WithHistory):
     `config` holds the settings the map was made with, `history` what it remembers of its frames, `viewpoint` where the
     camera stood last, `window_state` where its window was, if it had one. `listeners` are called after every `add`
     with the evidence: no other block has changed, but for those that a window or time took away.
+    Several threads may use a map: each call holds its `lock`. Listeners are called with it held.
     """
 
     def __init__(self, config: Config):
+        self.lock = MapLock()
         self.config = config
         self.voxel_size = config.voxel_size
         self.history = History()
@@ -237,18 +240,18 @@ class VoxelMap(WithHistory):
         return self._pool.within(np.asarray(low), np.asarray(high))
 
     def slabs(self) -> Iterator[tuple[NDArray[np.int32], NDArray[np.integer]]]:
-        """Yield all blocks as in `blocks`, piece by piece in ascending order; the map must not change meanwhile."""
-        yield from self._pool.pieces()
+        """Yield all blocks as in `blocks`, piece by piece in ascending order.
+
+        Where the map changes meanwhile, each piece is as it is at its time; hold `lock` to read one state.
+        """
+        yield from in_steps(self.lock, self._slabs())
 
     def timed(self) -> Iterator[tuple[NDArray[np.int32], NDArray[np.integer], NDArray[np.uint32]]]:
         """Yield all blocks as `slabs` does, with the times (n, 512) of their cells, 0 where there is none.
 
         Raises StereovoxError where the map keeps no times. What they mean: `CellTimes`.
         """
-        for coords, cells in self.slabs():
-            times = self.times_of(coords)
-            times[cells == self._format.unknown] = NEVER
-            yield coords, cells, times
+        yield from in_steps(self.lock, self._timed())
 
     def times_of(self, coords: NDArray[np.int32]) -> NDArray[np.uint32]:
         """Return the times (n, 512) of the cells of blocks (n, 3); they mean something where the cell is known."""
@@ -316,6 +319,16 @@ class VoxelMap(WithHistory):
 
     def close(self) -> None:
         """Give back what the map holds outside memory (nothing, unless it keeps tiles on disk)."""
+
+    def _slabs(self) -> Iterator[tuple[NDArray[np.int32], NDArray[np.integer]]]:
+        """Yield what `slabs` does; the lock is held while an item is made."""
+        yield from self._pool.pieces()
+
+    def _timed(self) -> Iterator[tuple[NDArray[np.int32], NDArray[np.integer], NDArray[np.uint32]]]:
+        for coords, cells in self._slabs():
+            times = self.times_of(coords)
+            times[cells == self._format.unknown] = NEVER
+            yield coords, cells, times
 
     def _in_my_units(self, evidence: Evidence) -> Evidence:
         """Return the evidence as differences of stored numbers; blocks that would get a uniform 0 are left out."""

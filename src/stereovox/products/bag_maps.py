@@ -10,6 +10,7 @@ from typing import TypeVar
 import numpy as np
 
 from stereovox.errors import ConfigError, FrameRefused, MapFileError, SourceError, StereovoxError
+from stereovox.guarded import one_state
 from stereovox.maps import VoxelMap
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.products.cloud_cells import cells_of_points
@@ -28,6 +29,7 @@ MAP_FRAME, CELLS_FRAME = "map", "map_cells"
 Made = TypeVar("Made")
 
 
+@one_state
 def write_bag(voxel_map: VoxelMap, path: str | Path, heights: Heights | None = None) -> None:
     """Write the map into a bag of its own, `.bag` (ROS 1), `.mcap` or `.db3` (ROS 2), all latched.
 

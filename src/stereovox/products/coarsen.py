@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from stereovox.config import Config, load_config
 from stereovox.errors import StereovoxError
+from stereovox.guarded import one_state
 from stereovox.maps import State, VoxelMap
 from stereovox.maps.cell_format import CellRules
 from stereovox.maps.voxel_map import cells_where
@@ -17,6 +18,7 @@ Parents = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray
 """Cells (N, 3); and (N,) of how many known cells they are made, the largest number these store, their latest time."""
 
 
+@one_state
 def coarsen(voxel_map: VoxelMap, factor: int) -> VoxelMap:
     """Return an unbounded map in cells that are `factor` times as long on each side, with the history of the map.
 

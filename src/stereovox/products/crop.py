@@ -7,11 +7,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stereovox.errors import StereovoxError
+from stereovox.guarded import one_state
 from stereovox.maps import VoxelMap
 from stereovox.maps.blocks import CELLS, SIDE
 from stereovox.products.side_by_side import take
 
 
+@one_state
 def crop(voxel_map: VoxelMap, low: ArrayLike, high: ArrayLike) -> VoxelMap:
     """Return an unbounded map of the cells whose middle is in a box, with the settings and the history of the map.
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stereovox.files import replacing
+from stereovox.guarded import one_state
 from stereovox.maps import State, VoxelMap
 from stereovox.maps.cell_format import CellRules
 from stereovox.maps.voxel_map import cells_where
@@ -32,6 +33,7 @@ class Difference:
     counts: NDArray[np.int64]
 
 
+@one_state
 def difference(a: VoxelMap, b: VoxelMap, T_a_b: ArrayLike | None = None) -> Difference:
     """Return what changed from map `a` to map `b`; each map's own settings tell its states.
 

@@ -4,11 +4,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from contextlib import ExitStack
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stereovox.errors import StereovoxError
+from stereovox.guarded import MapLock
 from stereovox.maps import State, VoxelMap
 from stereovox.maps.blocks import CELLS, SIDE
 from stereovox.maps.cell_format import CellRules
@@ -36,6 +38,8 @@ class DistanceField:
     whatever point of the cell is nearest: a ball about any point of the cell meets nothing if its radius is less.
     What is outside the box counts for nothing: a cell nearer to the box's border than to an obstacle may be nearer to
     one beyond it. After `update` the field is what it would be if it were made anew.
+    One thread may update, others ask for `distance` and `gradient`: each answer is that of one update. What the
+    properties return is for the thread that updates.
     Raises StereovoxError, one line, for a box that is none or too large, and for other bad input.
     """
 
@@ -53,6 +57,7 @@ class DistanceField:
         if measure not in MEASURES:
             raise StereovoxError(f"measure '{measure}': name one of {', '.join(MEASURES)}")
         self._map, self._wanted = voxel_map, state_bits(to, "to")
+        self._lock = MapLock()
         self._cell = np.array(voxel_map.config.cell)
         self._follows = size is not None
         self._low, shape = self._about_zero(size) if self._follows else self._between(low, high)
@@ -68,18 +73,15 @@ class DistanceField:
 
         Raises StereovoxError where a window has no camera to stand about: the map has no frame yet.
         """
-        if self._follows:
-            self._follow()
-        field, config = self._transform.field, self._map.config
-        dirty = np.zeros(len(field.mask), np.uint8)
-        order = np.array(self._transform.order)
-        changed = _distance.refresh(
-            self._map.stored_cells, CellRules(config.map).thresholds, self._wanted, self._low, order,
-            self._shape[order], self._seen, field.mask, dirty,
-        )  # fmt: skip
-        self._transform.update(dirty, config.threads)
-        self._made = True
-        return int(changed)
+        with ExitStack() as mine:
+            with self._map.lock:  # always before this field's own, and only as long as the map is read
+                mine.enter_context(self._lock)
+                if self._follows:
+                    self._follow()
+                changed, dirty = self._refresh()
+            self._transform.update(dirty, self._map.config.threads)
+            self._made = True
+            return changed
 
     @property
     def origin(self) -> NDArray[np.float64]:
@@ -111,7 +113,8 @@ class DistanceField:
 
         Infinite where no obstacle is near enough, NaN outside the box and where a point is not finite.
         """
-        return self._at(*self._cells_of(points))
+        with self._lock:
+            return self._at(*self._cells_of(points))
 
     def gradient(self, points: ArrayLike) -> NDArray[np.float32]:
         """Return how the distance grows (N, 3) at points (N, 3): metres a metre along each axis, world frame.
@@ -120,10 +123,21 @@ class DistanceField:
         the cells on both sides, on one side at the border of the box and beside cells without a distance. NaN where
         the point's own cell has none.
         """
-        cells, inside = self._cells_of(points)
-        here = self._at(cells, inside)
-        slopes = [self._slope(cells, inside, here, axis) for axis in range(3)]
+        with self._lock:
+            cells, inside = self._cells_of(points)
+            here = self._at(cells, inside)
+            slopes = [self._slope(cells, inside, here, axis) for axis in range(3)]
         return np.where(np.isfinite(here)[:, None], np.stack(slopes, axis=1), np.float32(np.nan))
+
+    def _refresh(self) -> tuple[int, NDArray[np.uint8]]:
+        """Look at the map; return how many cells are obstacles or free of them anew, and which slabs have such."""
+        field, order = self._transform.field, np.array(self._transform.order)
+        dirty = np.zeros(len(field.mask), np.uint8)
+        changed = _distance.refresh(
+            self._map.stored_cells, CellRules(self._map.config.map).thresholds, self._wanted, self._low, order,
+            self._shape[order], self._seen, field.mask, dirty,
+        )  # fmt: skip
+        return int(changed), dirty
 
     def _check_place(self) -> None:
         if self._follows and self._map.viewpoint is None:

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from stereovox.errors import StereovoxError
 from stereovox.files import replacing
+from stereovox.guarded import one_state
 from stereovox.maps import State, VoxelMap
 from stereovox.maps.blocks import CELLS
 from stereovox.maps.cell_format import CellRules
@@ -43,6 +44,7 @@ class Frontier:
     look_from: NDArray[np.float64] | None
 
 
+@one_state
 def frontiers(
     voxel_map: VoxelMap,
     smallest: int = 10,

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from stereovox.errors import StereovoxError
 from stereovox.files import replacing
+from stereovox.guarded import one_state
 from stereovox.maps import State, VoxelMap
 from stereovox.maps.occupancy import UNKNOWN, OccupancyGrid
 from stereovox.products.ground_slope import beside, slopes
@@ -80,6 +81,7 @@ class Ground:
         return OccupancyGrid(PERCENT[self.footing], self.resolution, self.origin)
 
 
+@one_state
 def ground(voxel_map: VoxelMap, robot: Robot | None = None, start: ArrayLike | None = None) -> Ground:
     """Return the height of the ground and where a robot can drive on it.
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stereovox.errors import StereovoxError
+from stereovox.guarded import one_state
 from stereovox.maps import State, VoxelMap
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.products.transform import transformed
@@ -50,6 +51,7 @@ def inflated_grid(grid: OccupancyGrid, radius: float, margin: int = MARGIN) -> O
     return replace(grid, cells=np.where(near, np.int8(100), grid.cells))
 
 
+@one_state
 def inflated(voxel_map: VoxelMap, radius: float, margin: int = MARGIN) -> VoxelMap:
     """Return a map without bounds in which all cells are occupied in which a robot of `radius` metres may not be.
 

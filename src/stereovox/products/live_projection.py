@@ -50,16 +50,8 @@ class LiveProjection:
 
         Raises StereovoxError where it were too large.
         """
-        if self._whole:
-            self._changed, self._canvas = EVERYWHERE.copy(), _Canvas()
-        coords, cells = self._map.blocks_within(*self._changed)
-        if len(coords):
-            floor = SIDE * coords[:, self._order[:2]].astype(np.int64)
-            self._canvas.reach(floor.min(axis=0), floor.max(axis=0) + SIDE)
-            patch = patch_of(self._map, coords, cells, self._order, self._layers)
-            self._canvas.paint(self._in_percent(patch), patch.corner)
-        self._changed = EVERYWHERE[::-1].copy()
-        return self._shown()
+        with self._map.lock:  # `_note` is called with it held
+            return self._grid()
 
     def _note(self, evidence: Evidence) -> None:
         """Widen the columns that changed by those of a frame."""
@@ -70,6 +62,18 @@ class LiveProjection:
                 low[self._order[:2]] = np.minimum(low[self._order[:2]], floor.min(axis=0))
                 high[self._order[:2]] = np.maximum(high[self._order[:2]], floor.max(axis=0) + 1)
                 low[self._order[2]], high[self._order[2]] = EVERYWHERE[:, 0]
+
+    def _grid(self) -> OccupancyGrid | None:
+        if self._whole:
+            self._changed, self._canvas = EVERYWHERE.copy(), _Canvas()
+        coords, cells = self._map.blocks_within(*self._changed)
+        if len(coords):
+            floor = SIDE * coords[:, self._order[:2]].astype(np.int64)
+            self._canvas.reach(floor.min(axis=0), floor.max(axis=0) + SIDE)
+            patch = patch_of(self._map, coords, cells, self._order, self._layers)
+            self._canvas.paint(self._in_percent(patch), patch.corner)
+        self._changed = EVERYWHERE[::-1].copy()
+        return self._shown()
 
     def _in_percent(self, patch: Patch) -> NDArray[np.int8]:
         number = np.where(patch.marked != NOTHING, patch.marked, patch.cleared).astype(np.int32)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stereovox.camera_path import CameraPath
+from stereovox.guarded import one_state
 from stereovox.history import MOST_REASONS, OTHERS, History
 from stereovox.maps import VoxelMap
 from stereovox.maps.blocks import CELLS
@@ -20,6 +21,7 @@ from stereovox.products.moved import moved
 from stereovox.products.side_by_side import cells_at, check_alike, in_memory
 
 
+@one_state
 def merge(a: VoxelMap, b: VoxelMap, T_a_b: ArrayLike | None = None) -> VoxelMap:
     """Return an unbounded map of all that two maps know, with the settings of `a`.
 

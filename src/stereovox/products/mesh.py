@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.errors import MissingExtra, StereovoxError
+from stereovox.guarded import one_state
 from stereovox.maps import State, VoxelMap
 from stereovox.maps.blocks import SIDE
 from stereovox.maps.cell_format import CellRules
@@ -29,6 +30,7 @@ class Mesh:
     faces: NDArray[np.int32]
 
 
+@one_state
 def surface(voxel_map: VoxelMap) -> Mesh:
     """Return the closed surface about what is occupied: every occupied cell's middle is inside, every other's outside.
 

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from stereovox.camera_path import CameraPath, Seen
 from stereovox.errors import StereovoxError
 from stereovox.geometry import Transform, inverse, orthonormalise, rigidity_error, transform_points
+from stereovox.guarded import one_state
 from stereovox.maps import State, VoxelMap
 from stereovox.maps.blocks import CELLS, SIDE
 from stereovox.maps.cell_format import CellRules
@@ -26,6 +27,7 @@ NEAR = 1e-6
 """Cells by which a place may miss the face it stands on for all its digits."""
 
 
+@one_state
 def moved(voxel_map: VoxelMap, T_a_b: ArrayLike) -> VoxelMap:
     """Return what a map in frame b says in frame a, in cells of the same size; T_a_b (4, 4) maps b into a.
 

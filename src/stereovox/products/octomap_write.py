@@ -14,6 +14,7 @@ import numpy as np
 
 from stereovox.errors import MapFileError
 from stereovox.files import replacing
+from stereovox.guarded import one_state
 from stereovox.maps import State, VoxelMap
 from stereovox.products.octree import build_octree
 
@@ -46,6 +47,7 @@ def write_ot(voxel_map: VoxelMap, path: str | Path) -> None:
     _write(path, TREE_TITLE, voxel_map, full_tree(voxel_map))
 
 
+@one_state
 def binary_tree(voxel_map: VoxelMap) -> Tree:
     """Return the map as OctoMap's binary tree: each cell free, occupied or unknown; eight equal cells become one.
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stereovox.errors import StereovoxError
+from stereovox.guarded import one_state
 from stereovox.maps import State, VoxelMap
 from stereovox.maps.queries import points_of
 
@@ -40,6 +41,7 @@ class PathCheck(NamedTuple):
         return self.blocked_at is None
 
 
+@one_state
 def check_path(
     voxel_map: VoxelMap,
     waypoints: ArrayLike,

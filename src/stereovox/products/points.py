@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.files import replacing
+from stereovox.guarded import one_state
 from stereovox.maps import VoxelMap
 from stereovox.products.floor_axes import heights_of
 
@@ -26,6 +27,7 @@ HEIGHT_RAMP = ((40, 60, 180), (30, 160, 210), (70, 190, 90), (240, 200, 50), (20
 """Red, green and blue at equal steps from the lowest to the highest point."""
 
 
+@one_state
 def write_ply(voxel_map: VoxelMap, path: str | Path) -> None:
     """Write the occupied cells as a binary point cloud: centre in metres (world frame), colour by height, probability.
 
@@ -37,6 +39,7 @@ def write_ply(voxel_map: VoxelMap, path: str | Path) -> None:
     _write(path, _ply_header(len(points), voxel_map.voxel_size), points)
 
 
+@one_state
 def write_pcd(voxel_map: VoxelMap, path: str | Path) -> None:
     """Write the occupied cells as PCL's binary point cloud, with what `write_ply` tells of them.
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.errors import StereovoxError
+from stereovox.guarded import one_state
 from stereovox.maps import VoxelMap
 from stereovox.maps.blocks import SIDE
 from stereovox.maps.cell_format import CellRules
@@ -36,6 +37,7 @@ class Patch(NamedTuple):
     cleared: NDArray[np.int16]
 
 
+@one_state
 def project(voxel_map: VoxelMap, heights: Heights | None = None) -> OccupancyGrid:
     """Return the map seen from above, just large enough for what is known.
 

@@ -20,6 +20,7 @@ from stereovox.errors import FrameRefused, MissingExtra
 from stereovox.files import replacing
 from stereovox.frame import AnyFrame, DepthImage
 from stereovox.geometry import Transform
+from stereovox.guarded import one_state
 from stereovox.maps import VoxelMap
 from stereovox.maps.cubes import in_cubes
 from stereovox.products.points import cell_colours
@@ -35,6 +36,7 @@ REST = 25
 PATH_COLOUR = (224, 69, 47)
 
 
+@one_state
 def write_rrd(voxel_map: VoxelMap, path: str | Path) -> None:
     """Write the occupied cells, the cameras' path, and the camera along it over time, for the Rerun viewer.
 

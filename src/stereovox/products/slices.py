@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stereovox.errors import StereovoxError
+from stereovox.guarded import one_state
 from stereovox.maps import VoxelMap
 from stereovox.maps.blocks import SIDE
 from stereovox.maps.cell_format import CellRules
@@ -34,6 +35,7 @@ class Layer:
     at_m: float
 
 
+@one_state
 def layer(voxel_map: VoxelMap, across: str, at_m: float, bounds: NDArray[np.float64] | None = None) -> Layer:
     """Return the layer that holds the plane `across` = `at_m` metres, as large as the map's known cells.
 

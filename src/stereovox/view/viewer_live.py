@@ -4,11 +4,13 @@
 from __future__ import annotations
 
 import threading
+import warnings
 from collections import deque
 from time import monotonic
 from typing import Any
 
 from stereovox.frame import AnyFrame
+from stereovox.history import History
 from stereovox.mapper import Mapper
 from stereovox.maps import VoxelMap
 from stereovox.maps.cubes import in_cubes
@@ -65,13 +67,15 @@ class LiveView:
         start = monotonic()
         self._arrivals.append(start)
         self._last = frame, report
-        if start >= self._due and self._free.is_set():
+        if start >= self._due and self._free.is_set() and not self._stopped.is_set():
             self._hand_over(frame, report)
             done = monotonic()
             self._due = done + max(LEAST_S, COPY_REST * (done - start))
 
     def finish(self) -> None:
         """Show the map as it is now, whole; to be called when the last frame is in it."""
+        if self._stopped.is_set():
+            return
         self._free.wait(PATIENCE_S)
         if self._last is not None:
             self._hand_over(*self._last)
@@ -92,7 +96,8 @@ class LiveView:
         self.close()
 
     def _hand_over(self, frame: AnyFrame, report: UpdateReport) -> None:
-        waiting = _copy(self._mapper), frame, f"{frame_words(frame, report)}\n\n{self._pace()}"
+        copy = _copy(self._mapper)
+        waiting = copy, frame, f"{frame_words(frame, report)}\n\n{self._pace(copy.history)}"
         self._free.clear()
         self._waiting = waiting
         self._ask.set()
@@ -105,16 +110,21 @@ class LiveView:
             if self._stopped.is_set() or self._waiting is None:
                 return
             start = monotonic()
-            voxel_map, frame, words = self._waiting
-            self.frame.show(frame, words)
-            self.viewer.take(voxel_map)
-            self.viewer.follow()
+            try:
+                self._draw(*self._waiting)
+            except Exception as error:  # whatever breaks a picture, the next one may be drawn, and mapping goes on
+                warnings.warn(f"the live view could not be drawn ({type(error).__name__}: {error})", stacklevel=1)
             self._stopped.wait(min(DRAW_REST * (monotonic() - start), PATIENCE_S / 2))
             self._free.set()
 
-    def _pace(self) -> str:
+    def _draw(self, voxel_map: VoxelMap, frame: AnyFrame, words: str) -> None:
+        self.frame.show(frame, words)
+        self.viewer.take(voxel_map)
+        self.viewer.follow()
+
+    def _pace(self, history: History) -> str:
         """Return how mapping fares, as Markdown."""
-        times, history, health = self._arrivals, self._mapper.map.history, self._mapper.health()
+        times, health = self._arrivals, self._mapper.health()
         rate = (len(times) - 1) / max(times[-1] - times[0], 1e-9)
         rows = [
             ("frames a second", f"{rate:.1f}"),

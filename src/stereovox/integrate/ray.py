@@ -11,10 +11,18 @@ from numpy.typing import NDArray
 
 from stereovox.config import Config
 from stereovox.frame import DepthImage
-from stereovox.integrate import _keys, _lanes, _line, _ray
+from stereovox.integrate import _lanes, _line, _ray
 from stereovox.integrate.lanes import Lanes, Memory, make_lanes, make_memory
 from stereovox.integrate.per_camera import PerCamera
-from stereovox.integrate.views import KernelTable, Rays, farthest_cells, origin_block, rays_of, sensor_table
+from stereovox.integrate.views import (
+    KernelTable,
+    Rays,
+    check_blocks,
+    origin_block,
+    rays_of,
+    sensor_table,
+    uses_wide_keys,
+)
 from stereovox.maps.blocks import CELLS, BlockPool
 from stereovox.maps.evidence import Evidence
 from stereovox.rigs import VirtualCamera
@@ -30,6 +38,12 @@ class _Eye(NamedTuple):
     scratch: list[tuple[Lanes, Memory]]
 
 
+def _eye(camera: VirtualCamera, table: KernelTable, config: Config) -> _Eye:
+    wide = uses_wide_keys(camera, config.max_range + (float(table.reach[-1]) if table.marks else 0), config)
+    scratch = [(make_lanes(wide), make_memory()) for _ in range(config.threads)]
+    return _Eye(table, (table.clear + table.mark).ravel(), scratch)
+
+
 class Ray:
     """Evidence by ray casting: every cell that a ray crosses (Chien 2020, Alg 2).
 
@@ -41,10 +55,10 @@ class Ray:
     _kernel: ClassVar[Callable[..., bool]] = staticmethod(_ray.cast)
 
     def __init__(self, config: Config):
+        sensor = make_sensor(config.sensor)
         self._config = config
-        self._sensor = make_sensor(config.sensor)
         self._pools = [BlockPool(np.int32, capacity=8192) for _ in range(config.threads)]
-        self._eyes = PerCamera(self._eye)
+        self._eyes = PerCamera(lambda camera: _eye(camera, sensor_table(sensor, config, camera), config))
 
     def evidence(self, image: DepthImage) -> Evidence:
         """Return what `image` says about the cells its rays cross."""
@@ -61,13 +75,6 @@ class Ray:
         origin = origin_block(image.T_world_sensor, config).astype(np.int32)
         return Evidence(pool.coords[: len(pool)] + origin, values, np.empty((0, 3), np.int32), 0)
 
-    def _eye(self, camera: VirtualCamera) -> _Eye:
-        table = sensor_table(self._sensor, self._config, camera)
-        reach = self._config.max_range + float(table.reach[-1])
-        wide = farthest_cells(camera, reach, self._config) >= 1 << (_keys.NARROW - 1)
-        scratch = [(make_lanes(wide), make_memory()) for _ in self._pools]
-        return _Eye(table, (table.clear + table.mark).ravel(), scratch)
-
     def _follow(
         self, depth_m: NDArray[np.float32], view: Rays, weight: np.float32 | None, eye: _Eye, worker: int, part: slice
     ) -> None:
@@ -77,6 +84,7 @@ class Ray:
             depth_m, view, eye.table, eye.look_up, weight, *eye.scratch[worker],
             pool.table, pool.coords, pool.count, pool.values, part.start, part.stop,
         ):  # fmt: skip
+            check_blocks(2 * len(pool.coords))
             pool.clear()
             pool.reserve(2 * len(pool.coords))
 

@@ -22,6 +22,8 @@ SATURATED = 65535
 """What many cameras write into uint16 images for "no value"."""
 EXACT = 1e-14
 """How far a rotation of doubles may be off and still be the nearest there is."""
+NO_REASONS = np.empty(0, np.uint8)
+"""What is taken where a frame gives none: so the kernel is there when the first one does."""
 SMALLEST = 1e-30
 """Metres per unit of a depth image that float32 can still multiply with."""
 MOST = max(Reason)
@@ -62,11 +64,11 @@ def _classify(frame: Frame, config: Config, depth_m: NDArray, reason: NDArray) -
     limits = (np.float32(config.min_range), np.float32(config.max_range))
     into = depth_m.reshape(-1), reason.reshape(-1)
     usable = _cpu.classify(raw, scale, *limits, none, infinite, *into)
-    if frame.reason is not None:
-        told = config.depth.far != "measured" and float(frame.farthest) >= config.max_range
-        far = np.uint8(Reason.TOO_FAR if told else Reason.UNKNOWN)
-        usable = _cpu.take_given(for_kernels(frame.reason).reshape(-1), far, *into)
-    return usable
+    told = config.depth.far != "measured" and float(frame.farthest) >= config.max_range
+    far = np.uint8(Reason.TOO_FAR if told else Reason.UNKNOWN)
+    given = frame.reason is not None
+    taken = _cpu.take_given(for_kernels(frame.reason if given else NO_REASONS).reshape(-1), far, *into)
+    return taken if given else usable
 
 
 def _check_image(frame: Frame) -> None:

@@ -26,9 +26,9 @@ LIMITS = {
     "focal": (0.025, 1e6),
     "centre": (-1e9, 1e9),
     "step": (1e-6, 2 * math.pi),
-    "baseline": (1e-12, 1e6),
-    "subpixel": (1e-12, 1e6),
-    "binning": (1, 1e6),
+    "baseline": (1e-9, 1e6),
+    "subpixel": (1e-9, 1e6),
+    "binning": (1, 1e12),
 }
 """What numbers of a camera can be: focal length and centre in pixels, step in radians a pixel, baseline in metres."""
 STEREO = {"baseline": "baseline", "binning": "binning", "subpixel": "subpixel"}

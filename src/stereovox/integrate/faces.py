@@ -91,7 +91,7 @@ def _pinhole(camera: WideCamera, forward: tuple[int, int, int]) -> PinholeCamera
     if window is None:
         return None
     focal = camera.focal_px / camera.binning
-    whole = max(2, ceil(2 * max(focal, 1 / camera.step_v) - 1e-6))
+    whole = max(2, round(2 * max(focal, 1 / camera.step_v)))
     first_u, first_v = (min(max(floor((slope + 1) / 2 * whole), 0), whole - 1) for slope in window[:2])
     last_u, last_v = (min(max(floor((slope + 1) / 2 * whole), 0), whole - 1) for slope in window[2:])
     baseline = None if camera.baseline is None else camera.baseline * focal / (whole / 2)  # focal length times baseline

@@ -22,7 +22,8 @@ class HitFinder:
 
     def __init__(self, camera: PinholeCamera, table: KernelTable, config: Config):
         self.blocks = BlockPool(np.int16, capacity=1024)
-        self._table, self._full_share = table, np.float32(config.projective.full_share)
+        self._camera, self._table = camera, table
+        self._full_share = np.float32(config.projective.full_share)
         pixels = _hits.GROUP * -(-camera.width // _hits.GROUP)
         kind = np.int64 if uses_wide_keys(camera, config.max_range, config) else np.int32
         self._keys, self._seen = np.zeros((2, camera.width + 1), kind), np.zeros(_hits.SEEN, kind)
@@ -35,7 +36,7 @@ class HitFinder:
         blocks = self.blocks
         blocks.clear()
         while (n := self._scatter(depth_m, view)) < 0:
-            check_blocks(2 * len(blocks.coords))
+            check_blocks(2 * len(blocks.coords), self._camera)
             blocks.clear()
             blocks.reserve(2 * len(blocks.coords))
         _hits.weigh(

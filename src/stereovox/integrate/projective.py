@@ -20,7 +20,7 @@ from stereovox.integrate.faces import cut, faces_of
 from stereovox.integrate.hits import HitFinder
 from stereovox.integrate.merging import strongest
 from stereovox.integrate.per_camera import PerCamera
-from stereovox.integrate.views import KernelTable, View, Views, check_blocks, check_view, sensor_table
+from stereovox.integrate.views import RIM_SHARE, KernelTable, View, Views, check_blocks, check_view, sensor_table
 from stereovox.integrate.windows import WindowBuilder, Windows
 from stereovox.maps.blocks import CELLS
 from stereovox.maps.evidence import Evidence
@@ -40,11 +40,11 @@ class Projective:
         self._config = config
         sensor = make_sensor(config.sensor)
 
-        def eye(camera: PinholeCamera) -> _Eye:  # knows no `self`, which would keep itself alive
-            return _Eye(camera, sensor_table(sensor, config, camera), config)
+        def eye(camera: PinholeCamera, rim_share: float) -> _Eye:  # knows no `self`, which would keep itself alive
+            return _Eye(camera, sensor_table(sensor, config, camera), config, rim_share)
 
-        self._eyes = PerCamera(eye)
-        self._faces = PerCamera(lambda camera: [(face, eye(face.camera)) for face in faces_of(camera, config)])
+        self._eyes = PerCamera(lambda camera: eye(camera, RIM_SHARE))
+        self._faces = PerCamera(lambda camera: [(face, eye(face.camera, 0.0)) for face in faces_of(camera, config)])
 
     def evidence(self, image: DepthImage) -> Evidence:
         """Return what `image` says about the cells it sees; that of a wide camera is cut into pinhole images."""
@@ -81,11 +81,11 @@ class Projective:
 class _Eye:
     """What one camera needs: its sensor table, and memory for what its images say."""
 
-    def __init__(self, camera: PinholeCamera, table: KernelTable, config: Config):
+    def __init__(self, camera: PinholeCamera, table: KernelTable, config: Config, rim_share: float):
         check_view(camera, config)
-        self.table = table
+        self._camera, self.table = camera, table
         self.mixed_before = 0  # blocks to be evaluated in the frame before: about as much is to be done in the next
-        self.views = Views(camera, config)
+        self.views = Views(camera, config, rim_share)
         self.hits = HitFinder(camera, table, config)
         self._windows = WindowBuilder(camera)
         self._max_range = config.max_range
@@ -108,7 +108,7 @@ class _Eye:
             n_free, n_mixed = _cull.candidates(view, self.table, windows, nearest, end, *lists)
             if n_free >= 0:
                 return windows, n_free, n_mixed
-            check_blocks(4 * len(self._free))
+            check_blocks(4 * len(self._free), self._camera)
             self._free, self._mixed = (np.empty((4 * len(self._free), 3), np.int32) for _ in range(2))
 
     def with_hits(self, n_free: int, n_mixed: int) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:

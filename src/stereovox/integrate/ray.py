@@ -68,7 +68,7 @@ class Ray:
         weight = np.float32(cell_px**-2) if config.ray.update == "every" else None
         parts = shards(camera.height, config.threads)
         number = {part.start: n for n, part in enumerate(parts)}
-        in_shards(lambda part: self._follow(image.depth_m, view, weight, eye, number[part.start], part), parts)
+        in_shards(lambda part: self._follow(image, view, weight, eye, number[part.start], part), parts)
         pool = self._merged(self._pools[: len(parts)], weight is not None)
         values = np.empty((len(pool), CELLS), np.int16)
         _lanes.to_thousandths(pool.values[: len(pool)], 0 if weight is None else _lanes.FRACTION_BITS, values)
@@ -76,15 +76,15 @@ class Ray:
         return Evidence(pool.coords[: len(pool)] + origin, values, np.empty((0, 3), np.int32), 0)
 
     def _follow(
-        self, depth_m: NDArray[np.float32], view: Rays, weight: np.float32 | None, eye: _Eye, worker: int, part: slice
+        self, image: DepthImage, view: Rays, weight: np.float32 | None, eye: _Eye, worker: int, part: slice
     ) -> None:
         pool = self._pools[worker]
         pool.clear()
         while not self._kernel(
-            depth_m, view, eye.table, eye.look_up, weight, *eye.scratch[worker],
+            image.depth_m, view, eye.table, eye.look_up, weight, *eye.scratch[worker],
             pool.table, pool.coords, pool.count, pool.values, part.start, part.stop,
         ):  # fmt: skip
-            check_blocks(2 * len(pool.coords))
+            check_blocks(2 * len(pool.coords), image.camera)
             pool.clear()
             pool.reserve(2 * len(pool.coords))
 

@@ -27,12 +27,13 @@ WINDOW_SHARE = 0.27
 Chosen so that a cell is cleared when any ray through it goes on, as exact ray casting does (see docs/integrators.md).
 """
 RIM_SHARE = 0.35
-"""A cell still counts as inside the image when its centre lies this share of its size outside."""
+"""`rim_share` of the image of a pinhole camera."""
 
 FEWEST_BLOCKS, BLOCKS_PER_PIXEL = 1 << 18, 32
 """Blocks that a camera may see however small its image, and for each pixel: an image of a few can tell of no more."""
 MAX_BLOCKS = 1 << 21
 """Blocks that one frame may tell of: a thousand million cells. Their places fit into 22 bits (`_hits.scatter`)."""
+CURE = "check the camera's size and focal length, lower max_range, or use larger cells"
 
 CELL_CENTRES = (np.stack([axis.ravel() for axis in np.mgrid[:SIDE, :SIDE, :SIDE]]) + 0.5).astype(np.float32)
 """(3, 512) centres of a block's cells from its corner, in cells."""
@@ -150,11 +151,14 @@ def _stretch(config: Config) -> NDArray[np.float64]:
 
 
 class Views:
-    """Makes the kernel views of one pinhole camera; a view holds until the next is made."""
+    """Makes the kernel views of one pinhole camera; a view holds until the next is made.
 
-    def __init__(self, camera: PinholeCamera, config: Config):
+    rim_share: a cell still counts as inside the image when its centre lies this share of its size outside.
+    """
+
+    def __init__(self, camera: PinholeCamera, config: Config, rim_share: float = RIM_SHARE):
         size, fx, fy = config.voxel_size, camera.fx, camera.fy
-        rim = RIM_SHARE * size * np.array([fx, fy])
+        rim = rim_share * size * np.array([fx, fy])
         intrinsics = np.array([fx, fy, camera.cx, camera.cy])
         shape = np.array([camera.width, camera.height], float)
         self._given = np.array(config.cell, float), size, intrinsics, shape, rim, CELL_CENTRES
@@ -188,10 +192,20 @@ class Views:
 def check_view(camera: VirtualCamera, config: Config) -> None:
     """Raise FrameRefused `bad_camera` where the view up to the maximum range is out of proportion to the image."""
     blocks = camera.volume(config.max_range) / (CELLS * float(np.prod(config.cell)))
-    if blocks > FEWEST_BLOCKS + BLOCKS_PER_PIXEL * camera.width * camera.height:
+    if blocks > _fitting_blocks(camera):
         seen = f"{camera.width}x{camera.height} pixels see {CELLS * blocks:.2g} cells up to {config.max_range:g} m"
-        cure = "check the camera's size and focal length, lower max_range, or use larger cells"
-        raise FrameRefused("bad_camera", f"{seen}: {cure}")
+        raise FrameRefused("bad_camera", f"{seen}: {CURE}")
+
+
+def check_blocks(blocks: int, camera: VirtualCamera) -> None:
+    """Raise FrameRefused `view_too_large` where one frame tells of more blocks than can be kept, or befit its image."""
+    most = min(MAX_BLOCKS, _fitting_blocks(camera))
+    if blocks > most:
+        raise FrameRefused("view_too_large", f"the frame tells of more than {CELLS * most:.2g} cells: {CURE}")
+
+
+def _fitting_blocks(camera: VirtualCamera) -> int:
+    return FEWEST_BLOCKS + BLOCKS_PER_PIXEL * camera.width * camera.height
 
 
 def uses_wide_keys(camera: VirtualCamera, reach: float, config: Config) -> bool:
@@ -204,13 +218,6 @@ def uses_wide_keys(camera: VirtualCamera, reach: float, config: Config) -> bool:
         said = f"the camera's view and noise reach {cells:.2g} cells far, more than can be counted"
         raise FrameRefused("bad_camera", f"{said}: check focal length and baseline, or use larger cells")
     return cells >= 1 << (_keys.NARROW - 1)
-
-
-def check_blocks(blocks: int) -> None:
-    """Raise FrameRefused `view_too_large` where one frame tells of more blocks than can be kept."""
-    if blocks > MAX_BLOCKS:
-        more = f"the frame tells of more than {MAX_BLOCKS * CELLS:.1g} cells"
-        raise FrameRefused("view_too_large", f"{more}; lower max_range or use larger cells")
 
 
 @lru_cache

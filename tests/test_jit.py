@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from llvmlite.binding import get_host_cpu_features as host_features
 
+import stereovox as sv
 from stereovox import _jit
 
 PACKAGE = Path(_jit.__file__).parent
@@ -43,10 +44,23 @@ from stereovox.depth import _cpu as depth
 from stereovox.integrate import _cull, _evaluate, _hits, _windows
 from stereovox.maps import _cpu as maps
 
-sv.Mapper(voxel_size=0.1).add(next(iter(sv.open_source("sim:room", "0:1"))))
+mapper = sv.Mapper(voxel_size=0.1)
+mapper.add(next(iter(sv.open_source("sim:room", "0:1"))))
 kernels = [value for room in (depth, _cull, _evaluate, _hits, _windows, maps) for value in vars(room).values()]
 compiled = [kernel for kernel in kernels if getattr(kernel, "signatures", None)]
-print(json.dumps({kernel.py_func.__name__: "".join(kernel.inspect_asm().values()) for kernel in compiled}))
+assembly = {kernel.py_func.__name__: "".join(kernel.inspect_asm().values()) for kernel in compiled}
+print(json.dumps({"assembly": assembly, "cells": [array.tolist() for array in mapper.map.cells()]}))
+"""
+HASWELL = {"NUMBA_CPU_NAME": "haswell", "NUMBA_CPU_FEATURES": ""}
+"""Without the second, numba takes a name alone together with all that this processor can do."""
+ARITHMETIC = re.compile(
+    r"^\s+(v?(?:add|sub|mul|div|sqrt|min|max|round|rndscale|hadd|hsub|addsub|cmp\w*|cvt\w+2|fn?m\w+)pd|vcvtt?pd2\w+)"
+    r"\s.*%[yz]mm",
+    re.MULTILINE,
+)
+"""Instructions that compute with wide vectors of doubles, or convert them; others just move 64 bits of anything.
+
+In an xmm register they are no loop: without AVX-512 a single whole number of 64 bits is made a double in this way.
 """
 ASK_THE_PROBE = "from stereovox._probe import f; print(f(1))"
 
@@ -172,7 +186,13 @@ def assembly(kernel):
     return "\n".join(kernel.inspect_asm().values())
 
 
-@pytest.mark.skipif(not host_features().get("avx512f"), reason="this processor has no vectors of 512 bits")
+def needs(*features):
+    missing = [name for name in features if not host_features().get(name)]
+    return pytest.mark.skipif(bool(missing), reason=f"this processor has no {', '.join(missing)}")
+
+
+@needs("avx512f")
+@pytest.mark.skipif("NUMBA_CPU_NAME" in os.environ, reason="compiles for another processor")
 def test_rows_of_numbers_use_the_widest_vectors(monkeypatch):
     monkeypatch.setattr(_jit, "cache_folder", lambda: None)  # of machine code from the cache the assembly is not known
 
@@ -187,14 +207,57 @@ def test_rows_of_numbers_use_the_widest_vectors(monkeypatch):
     assert "zmm" in assembly(double)
 
 
-def test_the_kernels_of_the_default_integrator_compute_no_vectors_of_doubles(tmp_path):
+@pytest.fixture(scope="module")
+def cells_here():
+    mapper = sv.Mapper(voxel_size=0.1)
+    mapper.add(next(iter(sv.open_source("sim:room", "0:1"))))
+    return mapper.map.cells()
+
+
+@pytest.mark.parametrize(
+    "target", [{}, pytest.param(HASWELL, marks=needs("avx2", "fma", "bmi2"))], ids=["host", "haswell"]
+)
+def test_kernels_for_any_processor_compute_in_float32_and_make_the_same_map(tmp_path, cells_here, target):
     """An int32 times a float32 is a float64 in numba: easily written, never seen, and twice as slow."""
-    compiled = run(MAP_A_FRAME, STEREOVOX_CACHE=str(tmp_path))
+    made = run(MAP_A_FRAME, STEREOVOX_CACHE=str(tmp_path), **target)
+    compiled = made["assembly"]
     assert {"scatter", "weigh", "candidates", "evaluate", "build", "classify"} <= compiled.keys()
     for name, text in compiled.items():
         assert "\tret" in text, name
-        doubles = {word for word in re.findall(r"^\s+(v\w+pd)\b", text, re.MULTILINE) if "mov" not in word}
+        doubles = set(ARITHMETIC.findall(text))
         assert not doubles, (name, doubles)
+        assert not (target and "zmm" in text), name
+    (indices, log_odds), (their_indices, theirs) = cells_here, made["cells"]
+    assert (indices == their_indices).all()
+    assert np.abs(log_odds - theirs).max() <= 0.05
+    assert (log_odds != theirs).mean() <= 1e-3  # where a sum is rounded is the compiler's choice: docs/integrators.md
+
+
+@pytest.mark.parametrize(
+    "line", ["vfmadd213pd", "vcvtps2pd", "vcvtpd2ps", "vcvttpd2dqy", "vcmpltpd", "mulpd", "vrndscalepd"]
+)
+def test_arithmetic_on_doubles_is_known(line):
+    assert ARITHMETIC.findall(f"\t{line}\t%ymm1, %ymm2, %ymm3\n") == [line]
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["vpermpd", "vunpcklpd", "vmovupd", "vbroadcastpd", "vshufpd", "vblendvpd", "vandpd", "vgatherqpd", "vmulps"],
+)
+def test_instructions_that_move_doubles_are_no_arithmetic(line):
+    assert not ARITHMETIC.findall(f"\t{line}\t%ymm1, %ymm2, %ymm3\n")
+
+
+def test_a_kernel_that_falls_into_doubles_is_found(monkeypatch):
+    monkeypatch.setattr(_jit, "cache_folder", lambda: None)
+
+    @_jit.kernel
+    def half(numbers, out):
+        for i in range(numbers.size):
+            out[i] = 0.1 * numbers[i]
+
+    half(np.ones(100, np.float32), np.zeros(100, np.float32))
+    assert ARITHMETIC.search(assembly(half)) or not host_features().get("avx")
 
 
 def test_kernels_make_no_arrays():

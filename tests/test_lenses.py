@@ -114,10 +114,14 @@ def test_nobody_finds_two_pixels_of_a_lens_in_one_direction():
     ("change", "said"),
     [
         ({"model": "fishye"}, "did you mean 'fisheye'"),
-        ({"fx": 0.0}, "must be positive"),
-        ({"cx": np.nan}, "must be positive"),
+        ({"fx": 0.0}, "fx must be a number from"),
+        ({"fx": 1e300}, "fx must be a number from"),
+        ({"fy": 1e-3}, "fy must be a number from"),
+        ({"width": 10**6, "height": 10**6}, "pixels; check width and height"),
+        ({"cx": np.nan}, "cx must be a number from"),
         ({"model": "fisheye", "distortion": (1, 2, 3, 4, 5)}, "at most 4"),
         ({"distortion": (np.inf,)}, "finite"),
+        ({"distortion": (1e300, 1e300)}, "up to 1e"),
     ],
 )
 def test_what_is_no_lens(change, said):

@@ -20,6 +20,22 @@ from numpy.typing import NDArray
 
 from stereovox.errors import StereovoxError, did_you_mean
 
+MAX_PIXELS = 100_000_000
+"""Pixels of an image, at most."""
+LIMITS = {
+    "focal": (0.025, 1e6),
+    "centre": (-1e9, 1e9),
+    "step": (1e-6, 2 * math.pi),
+    "baseline": (1e-9, 1e6),
+    "subpixel": (1e-9, 1e6),
+    "binning": (1, 1e12),
+}
+"""What numbers of a camera can be: focal length and centre in pixels, step in radians a pixel, baseline in metres."""
+STEREO = {"baseline": "baseline", "binning": "binning", "subpixel": "subpixel"}
+"""Fields of all cameras with a depth, and which limits they have."""
+LARGEST_COEFFICIENT = 1e36
+"""Beyond it a correction leaves the range of float32."""
+
 CORRECTIONS = {"scale": 6, "disparity": 6, "scale+disparity": 12, "thesis": 3}
 """Models of a depth correction and the number of their coefficients; see `DepthCorrection`."""
 
@@ -46,14 +62,40 @@ class DepthCorrection:
         if self.model not in CORRECTIONS:
             raise StereovoxError(f"correction: unknown model '{self.model}'{did_you_mean(self.model, CORRECTIONS)}")
         numbers = tuple(float(number) for number in self.coefficients)  # a list from a file cannot be hashed
-        if len(numbers) != CORRECTIONS[self.model] or not all(map(math.isfinite, numbers)):
+        if len(numbers) != CORRECTIONS[self.model] or not all(abs(n) <= LARGEST_COEFFICIENT for n in numbers):
             needed = f"{CORRECTIONS[self.model]} finite coefficients"
             raise StereovoxError(f"correction: model '{self.model}' needs {needed}, not {list(numbers)}")
         object.__setattr__(self, "coefficients", numbers)
 
 
+def check_numbers(camera: object, **kinds: str) -> None:
+    """Make the named fields of a frozen camera plain numbers, `width` and `height` too, and check what they can be.
+
+    kinds: for each field a key of LIMITS. A field that is None by default may be None. Raises StereovoxError for what
+    is no number within its limits, for sizes that are no whole numbers, and for images of more than MAX_PIXELS.
+    """
+    for name, kind in kinds.items():
+        value, (low, high) = _plain(getattr(camera, name)), LIMITS[kind]
+        if value is None and getattr(type(camera), name, 0) is None:
+            continue
+        if not isinstance(value, int | float) or not low <= value <= high:
+            raise StereovoxError(f"camera {camera}: {name} must be a number from {low:g} to {high:g}")
+        object.__setattr__(camera, name, int(value) if kind == "binning" else float(value))
+    sizes = [_plain(getattr(camera, name)) for name in ("width", "height")]
+    if not all(isinstance(n, int | float) and 1 <= n <= MAX_PIXELS and n == int(n) for n in sizes):
+        raise StereovoxError(f"camera {camera}: width and height must be whole numbers of pixels")
+    if sizes[0] * sizes[1] > MAX_PIXELS:
+        raise StereovoxError(f"camera {camera}: more than {MAX_PIXELS:,} pixels; check width and height")
+    object.__setattr__(camera, "width", int(sizes[0]))
+    object.__setattr__(camera, "height", int(sizes[1]))
+
+
+def _plain(value: object) -> object:
+    return value.item() if isinstance(value, np.generic) else value
+
+
 STEEPEST = 20.0
-"""Largest x/z or y/z of a pinhole camera's rays: 87 degrees off the axis."""
+"""Largest x/z or y/z at the borders of a pinhole camera's image: 87 degrees off the axis."""
 
 
 @dataclass(frozen=True)
@@ -64,8 +106,8 @@ class PinholeCamera:
     between the two eyes (or projector and eye) of a stereo depth camera, None when not known. `binning` sensor pixels
     along each side make one pixel (see `binned`); `correction` is what its depth is to be corrected by; `subpixel` the
     noise of its disparity in pixels, None when not known.
-    Raises StereovoxError for sizes or focal lengths that are not positive and finite, and for rays that leave the axis
-    by more than 87 degrees.
+    Raises StereovoxError for numbers that cannot be (see `LIMITS`), and where the image's borders are more than 87
+    degrees off the axis.
     """
 
     width: int
@@ -80,11 +122,9 @@ class PinholeCamera:
     subpixel: float | None = None
 
     def __post_init__(self) -> None:
-        numbers = (self.width, self.height, self.fx, self.fy, 1.0 if self.baseline is None else self.baseline)
-        if not (all(math.isfinite(n) and n > 0 for n in numbers) and math.isfinite(self.cx) and math.isfinite(self.cy)):
-            raise StereovoxError(f"camera {self}: sizes, focal lengths and baseline must be positive and finite")
-        across = max(abs(self.cx), abs(self.width - 1 - self.cx)) / self.fx
-        steepest = max(across, abs(self.cy) / self.fy, abs(self.height - 1 - self.cy) / self.fy)
+        check_numbers(self, fx="focal", fy="focal", cx="centre", cy="centre", **STEREO)
+        across, down = ((n - 0.5 - c, c + 0.5) for n, c in ((self.width, self.cx), (self.height, self.cy)))
+        steepest = max(max(across) / self.fx, max(down) / self.fy)
         if steepest > STEEPEST:
             angle = math.degrees(math.atan(steepest))
             raise StereovoxError(
@@ -127,6 +167,10 @@ class PinholeCamera:
     def focal_px(self) -> float:
         """Pixels of the sensor per radian along a row, at its centre: what disparity is counted in."""
         return self.fx * self.binning
+
+    def volume(self, depth: float) -> float:
+        """Return how many cubic metres the image's borders enclose up to `depth` metres."""
+        return self.width / self.fx * (self.height / self.fy) * depth**3 / 3
 
     def rays(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Return the columns (width,) and rows (height, 2) of the rays, float32, as the module says."""

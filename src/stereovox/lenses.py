@@ -14,6 +14,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from stereovox.cameras import check_numbers
 from stereovox.errors import StereovoxError, did_you_mean
 
 MODELS = {"pinhole": 8, "fisheye": 4}
@@ -22,6 +23,8 @@ COUNTS = {"pinhole": (0, 4, 5, 8), "fisheye": (0, 4)}
 """How many coefficients a calibration has; another number in a file is a slip."""
 FARTHEST = {"pinhole": math.radians(89.9), "fisheye": math.pi}
 """Angle off the axis in radians at which the model ends by its nature."""
+LARGEST = 1e9
+"""No coefficient of a lens comes near it; polynomials of larger ones leave the range of doubles."""
 STEPS = 2000
 """Angles of the table from which the inverse starts."""
 ROUNDS = 12
@@ -35,8 +38,7 @@ class Lens:
 
     model: `pinhole` with up to 8 coefficients of Brown and Conrady (k1 k2 p1 p2 k3 k4 k5 k6, OpenCV's order), or
     `fisheye` with the four of Kannala and Brandt; missing ones are zero. fx, fy, cx, cy in pixels.
-    Raises StereovoxError for another model, sizes or focal lengths that are not positive and finite, too many
-    coefficients, or one that is not finite.
+    Raises StereovoxError for another model, numbers that cannot be (see `cameras.LIMITS`), and too many coefficients.
     """
 
     model: str
@@ -51,12 +53,10 @@ class Lens:
     def __post_init__(self) -> None:
         if self.model not in MODELS:
             raise StereovoxError(f"lens: unknown model '{self.model}'{did_you_mean(self.model, MODELS)}")
-        numbers = (self.width, self.height, self.fx, self.fy)
-        if not (all(math.isfinite(n) and n > 0 for n in numbers) and math.isfinite(self.cx) and math.isfinite(self.cy)):
-            raise StereovoxError(f"lens {numbers}, {self.cx}, {self.cy}: sizes and focal lengths must be positive")
+        check_numbers(self, fx="focal", fy="focal", cx="centre", cy="centre")
         coefficients = tuple(float(number) for number in self.distortion)  # a list from a file cannot be hashed
-        if len(coefficients) > MODELS[self.model] or not all(map(math.isfinite, coefficients)):
-            wanted = f"at most {MODELS[self.model]} finite coefficients"
+        if len(coefficients) > MODELS[self.model] or not all(abs(n) <= LARGEST for n in coefficients):
+            wanted = f"at most {MODELS[self.model]} finite coefficients up to {LARGEST:g}"
             raise StereovoxError(f"lens: model '{self.model}' takes {wanted}, not {list(coefficients)}")
         object.__setattr__(self, "distortion", coefficients)
 

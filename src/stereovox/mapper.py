@@ -80,6 +80,7 @@ class Mapper:
         done = perf_counter()
         match_ms, depth_ms, integrate_ms = 1e3 * (between - start), 1e3 * (prepared - between), 1e3 * (done - prepared)
         self._pace.took(match_ms + depth_ms + integrate_ms)
+        self._pace.rehearse(frame, matched.camera)
         return UpdateReport(depth_ms, integrate_ms, cells, detail=passed.told, match_ms=match_ms, way=way.name)
 
     def health(self, now_ns: int | None = None) -> Health:

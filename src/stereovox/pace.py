@@ -3,8 +3,13 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+
 from stereovox.config import Config
 from stereovox.errors import FrameRefused
+from stereovox.frame import AnyFrame
+from stereovox.integrate.per_camera import MAX_CAMERAS
+from stereovox.rigs import VirtualCamera
 from stereovox.ways import Way, full, ladder
 
 PATIENCE, LONGEST = 8, 128
@@ -80,6 +85,7 @@ class Pace:
     def __init__(self, config: Config):
         self._ways = [full(config)] if config.deadline_ms is None else ladder(config)
         self._ladder = Ladder(len(self._ways), config.deadline_ms) if config.deadline_ms else None
+        self._rehearsed: set[VirtualCamera] = set()
 
     def way(self) -> Way:
         """Return the way of the next frame. Raises FrameRefused `no_time` where it is to be left out."""
@@ -88,6 +94,17 @@ class Pace:
         if self._ladder.leaves_out():
             raise FrameRefused("no_time", "left out: frames take longer than deadline_ms even on the quickest way")
         return self._ways[self._ladder.step]
+
+    def rehearse(self, frame: AnyFrame, camera: VirtualCamera) -> None:
+        """Let all other ways see the first frame of a camera: kernels are compiled then, and not when time is short."""
+        if self._ladder is None or camera in self._rehearsed:
+            return
+        if len(self._rehearsed) >= MAX_CAMERAS:
+            self._rehearsed.clear()
+        self._rehearsed.add(camera)
+        for way in self._ways[1:]:
+            with suppress(FrameRefused):
+                way.integrator.evidence(way.depth.image(way.depth.matched(frame)))
 
     def took(self, milliseconds: float) -> None:
         """Learn from the time that a frame took on the way that `way` returned."""

@@ -13,11 +13,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox.cameras import PinholeCamera
+from stereovox.cameras import STEREO, PinholeCamera, check_numbers
 from stereovox.errors import StereovoxError
 
 WIDEST_DEG = 88.0
 """Rays along the x axis, within two degrees, have no depth: both eyes see the same there."""
+WIDEST_BORDER_DEG = 93.0
+"""A pixel's outer border may lie so far off, though its middle may not."""
+SEEN_DEG = 89.0
+"""Borders farther off than this count as this: depths from the x axis reach to infinity there."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +30,7 @@ class SphericalCamera:
 
     cu, cv: column and row of the z axis. step_u, step_v: radians a pixel. baseline: metres between both eyes, None when
     not known. binning, subpixel: as in `PinholeCamera`.
-    Raises StereovoxError for sizes or steps that are not positive and finite, and for columns more than 88 degrees off.
+    Raises StereovoxError for numbers that cannot be (see `cameras.LIMITS`), and for columns more than 88 degrees off.
     """
 
     width: int
@@ -40,7 +44,8 @@ class SphericalCamera:
     subpixel: float | None = None
 
     def __post_init__(self) -> None:
-        _check(self, self.step_u, max(abs(self.cu), abs(self.width - 1 - self.cu)) * self.step_u)
+        check_numbers(self, step_u="step", step_v="step", cu="centre", cv="centre", **STEREO)
+        _check(self, max(abs(self.cu), abs(self.width - 1 - self.cu)) * self.step_u)
 
     @classmethod
     def from_field_of_view(
@@ -54,6 +59,16 @@ class SphericalCamera:
     def middle(self) -> PinholeCamera:
         """The pinhole camera that sees the middle of what this one sees."""
         return _middle(self)
+
+    @property
+    def borders(self) -> tuple[float, float, float, float]:
+        """Angles of the image's borders, radians: left, right from the y-z plane, top, bottom from the z axis."""
+        left, right = ((u - self.cu) * self.step_u for u in (-0.5, self.width - 0.5))
+        return left, right, (-0.5 - self.cv) * self.step_v, (self.height - 0.5 - self.cv) * self.step_v
+
+    def volume(self, depth: float) -> float:
+        """Return how many cubic metres the image shows up to `depth` metres from the x axis, and as far along it."""
+        return _volume(self.borders, depth)
 
     @property
     def focal_px(self) -> float:
@@ -101,7 +116,8 @@ class CylindricalCamera:
     subpixel: float | None = None
 
     def __post_init__(self) -> None:
-        _check(self, self.fx, math.atan(max(abs(self.cx), abs(self.width - 1 - self.cx)) / self.fx))
+        check_numbers(self, fx="focal", step_v="step", cx="centre", cv="centre", **STEREO)
+        _check(self, math.atan(max(abs(self.cx), abs(self.width - 1 - self.cx)) / self.fx))
 
     @classmethod
     def from_field_of_view(
@@ -115,6 +131,16 @@ class CylindricalCamera:
     def middle(self) -> PinholeCamera:
         """The pinhole camera that sees the middle of what this one sees."""
         return _middle(self)
+
+    @property
+    def borders(self) -> tuple[float, float, float, float]:
+        """Angles of the image's borders, radians: left, right from the y-z plane, top, bottom from the z axis."""
+        left, right = (math.atan((u - self.cx) / self.fx) for u in (-0.5, self.width - 0.5))
+        return left, right, (-0.5 - self.cv) * self.step_v, (self.height - 0.5 - self.cv) * self.step_v
+
+    def volume(self, depth: float) -> float:
+        """Return how many cubic metres the image shows up to `depth` metres from the x axis, and as far along it."""
+        return _volume(self.borders, depth)
 
     @property
     def focal_px(self) -> float:
@@ -132,6 +158,8 @@ class CylindricalCamera:
 
 MIDDLE_DEG = 40.0
 """The middle pinhole of a wide camera sees so far to each side, or as far as the camera."""
+FINEST_MIDDLE = 2400.0
+"""Its focal length in pixels, at most: it stands for where the camera looked, no image is made of it."""
 
 
 def _middle(camera: SphericalCamera | CylindricalCamera) -> PinholeCamera:
@@ -139,7 +167,7 @@ def _middle(camera: SphericalCamera | CylindricalCamera) -> PinholeCamera:
     limit = math.tan(math.radians(MIDDLE_DEG))
     across = min(limit, float(np.abs(columns).max()))
     down = min(limit, math.tan(min(camera.height * camera.step_v / 2, math.radians(MIDDLE_DEG))))
-    focal = camera.focal_px / camera.binning
+    focal = min(camera.focal_px / camera.binning, FINEST_MIDDLE)
     width, height = max(1, round(2 * across * focal)), max(1, round(2 * down * focal))
     return PinholeCamera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2, camera.baseline)
 
@@ -149,13 +177,18 @@ def _row_rays(camera: SphericalCamera | CylindricalCamera) -> NDArray[np.float32
     return np.stack([np.sin(down), np.cos(down)], axis=1).astype(np.float32)
 
 
-def _check(camera: SphericalCamera | CylindricalCamera, scale: float, widest: float) -> None:
-    numbers = (camera.width, camera.height, scale, camera.step_v, 1.0 if camera.baseline is None else camera.baseline)
-    if not (all(math.isfinite(n) and n > 0 for n in numbers) and math.isfinite(widest) and math.isfinite(camera.cv)):
-        raise StereovoxError(f"camera {camera}: sizes, steps and baseline must be positive and finite")
+def _volume(borders: tuple[float, float, float, float], depth: float) -> float:
+    left, right = (math.tan(angle) for angle in np.clip(borders[:2], -math.radians(SEEN_DEG), math.radians(SEEN_DEG)))
+    return min(right - left, 3.0) * (borders[3] - borders[2]) * depth**3 / 3
+
+
+def _check(camera: SphericalCamera | CylindricalCamera, widest: float) -> None:
     if math.degrees(widest) > WIDEST_DEG:
         raise StereovoxError(
             f"camera {camera}: columns reach {math.degrees(widest):.1f} deg off the axis, more than {WIDEST_DEG}"
         )
-    if camera.height * camera.step_v > 2 * math.pi + 1e-9:
+    left, right, top, bottom = camera.borders
+    if math.degrees(max(-left, right)) > WIDEST_BORDER_DEG:
+        raise StereovoxError(f"camera {camera}: columns end more than {WIDEST_BORDER_DEG} deg off the axis")
+    if bottom - top > 2 * math.pi + 1e-9:
         raise StereovoxError(f"camera {camera}: rows span more than a full turn")

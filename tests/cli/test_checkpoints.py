@@ -94,16 +94,6 @@ def test_a_save_that_fails_tells_what_is_saved():
         checkpoints.save(5)
 
 
-@pytest.fixture
-def obeys_signals():
-    """A process that was started in the background or by nohup ignores some, and so would its tests."""
-    usual = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL, signal.SIGHUP: signal.SIG_DFL}
-    before = {number: signal.signal(number, handler) for number, handler in usual.items()}
-    yield
-    for number, handler in before.items():
-        signal.signal(number, handler)
-
-
 def at_each_frame(monkeypatch, out, look):
     """Call `look(number)` before each frame is added, with a checkpoint after every frame."""
     add, number = Mapper.add, [0]

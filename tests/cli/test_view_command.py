@@ -25,7 +25,7 @@ def saved(tmp_path):
 
 
 @pytest.fixture
-def start():
+def start(obeys_signals):
     """Starts commands, of which none outlives the test."""
     started = []
 

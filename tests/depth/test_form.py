@@ -66,7 +66,7 @@ def grid():
         ({"depth": np.array(2.0, np.float32)}, "bad_shape"),
         ({"camera": None}, "bad_form"),
         ({"camera": CAMERA.__dict__}, "bad_form"),
-        ({"camera": sv.PinholeCamera(10**9, 10**9, 1e9, 1e9, 1e8, 1e8)}, "bad_shape"),
+        ({"camera": sv.PinholeCamera(10**4, 10**4, 1e4, 1e4, 5e3, 5e3)}, "bad_shape"),
         ({"camera": SCAN}, "bad_form"),
         ({"depth_scale": None}, "bad_scale"),
         ({"depth_scale": "0.001"}, "bad_scale"),

@@ -87,6 +87,7 @@ def test_the_process_of_a_first_frame_maps_five(tmp_path):
     assert run["all_s"] >= run["s"] > run["add_s"] > 0
 
 
+@pytest.mark.usefixtures("obeys_signals")
 @pytest.mark.parametrize("send", [os.kill, os.killpg])
 def test_ctrl_c_leaves_no_process_and_no_folder(send, tmp_path):
     """As a terminal sends it, to all of a group, and as `kill` does, to one."""

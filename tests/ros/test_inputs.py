@@ -104,7 +104,9 @@ def test_without_camera_or_pose_nothing_is_mapped():
 
 def test_camera_info_that_cannot_be_is_told_and_a_good_one_stays():
     one = DepthInput("/d/image")
-    for bad in (info(k=np.zeros(9)), info(width=0), info(k=np.full(9, np.nan)), info(width=2**31, height=2**31), b""):
+    wide, huge = (np.array([f, 0, 0, 0, f, 0, 0, 0, 1]) for f in (0.006, 1e300))
+    odd = [info(k=k, width=1, height=1) for k in (np.zeros(9), np.full(9, np.nan), wide, huge)]
+    for bad in (*odd, info(width=0), info(width=2**31, height=2**31), b""):
         one.take_info(bad)
         assert not one.ready
     assert "camera" in one.frame(wire.image(DEPTH), there).fault_detail

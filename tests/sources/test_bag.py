@@ -214,6 +214,18 @@ def test_without_camera_info_the_cure_is_named(tmp_path):
     assert len(BagSource(f"{bag.path}?info=/elsewhere/camera_info")) == 1
 
 
+@pytest.mark.parametrize(("focal", "size"), [(0.006, (1, 1)), (1e300, (8, 6)), (10.0, (2**31, 2**31))])
+def test_a_camera_that_cannot_be_is_one_line(tmp_path, focal, size):
+    told = camera_info(*size)
+    told.K[[0, 4]] = focal
+    with Bag(tmp_path / "a.bag") as bag:
+        bag.add("/depth/image", "sensor_msgs/Image", stamp(0), image(depth(0), "16UC1", stamp(0)))
+        bag.add("/depth/camera_info", "sensor_msgs/CameraInfo", stamp(0), told)
+    with pytest.raises(SourceError, match=r"a\.bag: /depth/camera_info: ") as refused:
+        BagSource(bag.path)
+    assert "\n" not in str(refused.value)
+
+
 def test_a_bag_without_depth_tells_what_it_holds(tmp_path):
     with Bag(tmp_path / "a.bag") as bag:
         bag.add("/chatter", "std_msgs/String", START_NS, text("hello"))

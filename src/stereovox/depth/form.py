@@ -6,7 +6,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple, get_args
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from stereovox.errors import FrameRefused
 from stereovox.frame import Frame, Scan, StereoFrame
@@ -80,6 +80,18 @@ def matrix_of(given: object) -> NDArray[np.float64]:
         return numbers.astype(float) if numbers.dtype.kind in "fiu" else np.empty(0)
     except ValueError:  # a ragged list
         return np.empty(0)
+
+
+def for_kernels(given: ArrayLike) -> NDArray:
+    """Return what a source measured as a plain array of one layout, whatever it lay in; floats as float32.
+
+    Read-only, aligned and without gaps: for arrays of other kinds kernels would be compiled anew, amid a run.
+    """
+    array = np.asarray(given)
+    with np.errstate(over="ignore", invalid="ignore"):
+        plain = np.require(array, np.float32 if array.dtype.kind == "f" else None, ["C", "A"]).view()
+    plain.flags.writeable = False
+    return plain
 
 
 def _check_fields(seen: object, wanted: dict[str, Field]) -> None:

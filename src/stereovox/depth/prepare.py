@@ -13,7 +13,7 @@ from stereovox.depth import _cpu
 from stereovox.depth.correct import corrected
 from stereovox.depth.denoise import denoise
 from stereovox.depth.downsample import downsample
-from stereovox.depth.form import check_form, matrix_of
+from stereovox.depth.form import check_form, for_kernels, matrix_of
 from stereovox.errors import FrameRefused
 from stereovox.frame import DepthImage, Frame, Reason, Scan, name_of
 
@@ -22,6 +22,8 @@ SATURATED = 65535
 """What many cameras write into uint16 images for "no value"."""
 EXACT = 1e-14
 """How far a rotation of doubles may be off and still be the nearest there is."""
+NO_REASONS = np.empty(0, np.uint8)
+"""What is taken where a frame gives none: so the kernel is there when the first one does."""
 SMALLEST = 1e-30
 """Metres per unit of a depth image that float32 can still multiply with."""
 MOST = max(Reason)
@@ -53,7 +55,7 @@ def prepare(frame: Frame, config: Config) -> DepthImage:
 
 
 def _classify(frame: Frame, config: Config, depth_m: NDArray, reason: NDArray) -> int:
-    raw, scale = np.ascontiguousarray(frame.depth).reshape(-1), np.float32(frame.depth_scale)
+    raw, scale = for_kernels(frame.depth).reshape(-1), np.float32(frame.depth_scale)
     none = np.float32(SATURATED if raw.dtype == np.uint16 else 0)
     camera = frame.camera
     infinite = np.float32(np.inf if config.depth.far == "infinite" else np.nan)
@@ -62,11 +64,11 @@ def _classify(frame: Frame, config: Config, depth_m: NDArray, reason: NDArray) -
     limits = (np.float32(config.min_range), np.float32(config.max_range))
     into = depth_m.reshape(-1), reason.reshape(-1)
     usable = _cpu.classify(raw, scale, *limits, none, infinite, *into)
-    if frame.reason is not None:
-        told = config.depth.far != "measured" and frame.farthest >= config.max_range
-        far = np.uint8(Reason.TOO_FAR if told else Reason.UNKNOWN)
-        usable = _cpu.take_given(np.ascontiguousarray(frame.reason, np.uint8).reshape(-1), far, *into)
-    return usable
+    told = config.depth.far != "measured" and float(frame.farthest) >= config.max_range
+    far = np.uint8(Reason.TOO_FAR if told else Reason.UNKNOWN)
+    given = frame.reason is not None
+    taken = _cpu.take_given(for_kernels(frame.reason if given else NO_REASONS).reshape(-1), far, *into)
+    return taken if given else usable
 
 
 def _check_image(frame: Frame) -> None:
@@ -78,14 +80,14 @@ def _check_image(frame: Frame) -> None:
     if depth.shape != (camera.height, camera.width):
         wanted = f"({camera.height}, {camera.width})"
         raise FrameRefused("bad_shape", f"{name}: depth image is {depth.shape}, its camera says {wanted}")
-    if not SMALLEST < frame.depth_scale < 1 / SMALLEST:  # NaN as well
+    if not SMALLEST < float(frame.depth_scale) < 1 / SMALLEST:  # NaN as well
         raise FrameRefused("bad_scale", f"{name}: depth_scale {frame.depth_scale} must be positive and finite")
     if frame.reason is not None and not _are_reasons(frame.reason, depth.shape):
         raise FrameRefused("bad_reason", f"{name}: reason must be {depth.shape} uint8 of values 0 to {MOST}")
 
 
 def _are_reasons(given: NDArray, shape: tuple[int, ...]) -> bool:
-    return given.dtype == np.uint8 and given.shape == shape and given.max(initial=0) <= MOST
+    return given.dtype == np.uint8 and given.shape == shape and np.max(given.view(np.ndarray), initial=0) <= MOST
 
 
 def rigid_pose(frame: Frame | Scan, tolerance: float) -> geometry.Transform:

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from stereovox import planar, registry
 from stereovox.config import Config
+from stereovox.depth.form import for_kernels
 from stereovox.errors import ConfigError, FrameRefused
 from stereovox.frame import Scan, name_of
 from stereovox.integrate import _beams
@@ -142,4 +143,4 @@ def _beams_of(scan: Scan) -> tuple[NDArray[np.float32], ...]:
 
 def _floats(part: ArrayLike | None) -> NDArray[np.float32]:
     with np.errstate(over="ignore", invalid="ignore"):
-        return np.ascontiguousarray(() if part is None else part, np.float32)
+        return for_kernels(np.asarray(() if part is None else part, np.float32))

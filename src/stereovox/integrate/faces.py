@@ -3,29 +3,36 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
+from math import atan, atan2, ceil, cos, floor, hypot, pi, radians, sin, sqrt, tan
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.cameras import PinholeCamera
+from stereovox.config import Config
+from stereovox.errors import FrameRefused, StereovoxError
 from stereovox.frame import DepthImage, Reason
 from stereovox.geometry import Transform
-from stereovox.wide import CylindricalCamera, SphericalCamera
+from stereovox.integrate.views import check_view
+from stereovox.wide import SEEN_DEG, CylindricalCamera, SphericalCamera
 
 WideCamera = SphericalCamera | CylindricalCamera
 FORWARD = ((0, 0, 1), (0, 1, 0), (0, 0, -1), (0, -1, 0), (1, 0, 0), (-1, 0, 0))
 """Directions of the six faces in the optical frame of the wide camera."""
-LARGEST = 4096
-"""Pixels along a side of a face."""
+FEWEST_PIXELS, MAX_SHARE = 1 << 18, 16
+"""Pixels that all faces may have however small the image, and for each pixel of it. A sphere needs less than two."""
+
+
+Window = tuple[float, float, float, float]
+"""Slopes of a face between which it sees something: left, top, right, bottom."""
 
 
 class Face(NamedTuple):
-    """One side of the cube.
+    """The part of one side of the cube that the wide camera sees.
 
-    T_wide_face: (4, 4) maps its optical frame into the wide camera's. pixel: (size, size) index of the wide image's
-    pixel, -1 where it sees none. scale: (size, size) depth along the face's axis over depth of the wide camera.
+    T_wide_face: (4, 4) maps its optical frame into the wide camera's. pixel: (height, width) index of the wide image's
+    pixel, -1 where it sees none. scale: (height, width) depth along the face's axis over depth of the wide camera.
     """
 
     camera: PinholeCamera
@@ -35,7 +42,7 @@ class Face(NamedTuple):
 
 
 class FaceImage(NamedTuple):
-    """What one face sees. image: a pinhole's depth image. ends: (size, size) float32, the same, but for pixels that
+    """What one face sees. image: a pinhole's depth image. ends: (height, width) float32, the same, but for pixels that
     see nothing up to the maximum range: the depth along the face's axis up to which that is so.
     """
 
@@ -43,41 +50,102 @@ class FaceImage(NamedTuple):
     ends: NDArray[np.float32]
 
 
-def faces_of(image: DepthImage, max_range: float) -> list[FaceImage]:
-    """Return the depth image of a wide camera as pinhole images that do not overlap; each takes the nearest pixels.
+def faces_of(camera: WideCamera, config: Config) -> list[Face]:
+    """Return the faces that a wide camera sees. They do not overlap, and no row and no column is passed over, but for
+    rows that crowd near the x axis.
+
+    Raises FrameRefused `bad_camera` where the view or the faces were out of proportion to the image.
+    """
+    check_view(camera, config)
+    try:
+        places = [(np.array(forward, float), pinhole) for forward in FORWARD if (pinhole := _pinhole(camera, forward))]
+    except StereovoxError as error:
+        raise FrameRefused("bad_camera", str(error)) from None
+    pixels = sum(pinhole.width * pinhole.height for _, pinhole in places)
+    if pixels > FEWEST_PIXELS + MAX_SHARE * camera.width * camera.height:
+        said = f"{camera.width}x{camera.height} wide pixels need {pixels} of pinhole cameras"
+        raise FrameRefused("bad_camera", f"{said}: their sides differ too much; check the camera's steps")
+    faces = [_face(camera, pinhole, forward) for forward, pinhole in places]
+    return [face for face in faces if (face.pixel >= 0).any()]
+
+
+def cut(image: DepthImage, face: Face, max_range: float) -> FaceImage:
+    """Return what a face sees of a wide camera's depth image; each of its pixels takes the nearest of the image's.
 
     max_range: metres, a depth of the wide camera.
     """
-    assert not isinstance(image.camera, PinholeCamera)
-    return [_cut(image, face, np.float32(max_range)) for face in _faces(image.camera)]
-
-
-def _cut(image: DepthImage, face: Face, max_range: np.float32) -> FaceImage:
     seen = face.pixel >= 0
     depth_m = np.where(seen, image.depth_m.ravel()[face.pixel] * face.scale, np.float32(np.nan))
     reason = np.where(seen, image.reason.ravel()[face.pixel], np.uint8(Reason.MASKED))
-    ends = np.where(depth_m == np.inf, max_range * face.scale, depth_m)
+    ends = np.where(depth_m == np.inf, np.float32(max_range) * face.scale, depth_m)
     pose = image.T_world_sensor @ face.T_wide_face
     return FaceImage(DepthImage(depth_m, reason, face.camera, pose, image.stamp_ns), ends)
 
 
-@lru_cache(maxsize=16)
-def _faces(camera: WideCamera) -> list[Face]:
-    faces = [_face(camera, np.array(forward, float)) for forward in FORWARD]
-    return [face for face in faces if (face.pixel >= 0).any()]
+def _pinhole(camera: WideCamera, forward: tuple[int, int, int]) -> PinholeCamera | None:
+    """Return the pinhole camera of a face: pixels as fine as the wide camera's, as far as that sees; None: it does not.
 
-
-def _face(camera: WideCamera, forward: NDArray[np.float64]) -> Face:
+    A whole face spans slopes from -1 to 1 in whole pixels, so that neighbours meet at their borders.
+    """
+    window = _beside(camera, forward[0]) if forward[0] else _around(camera, atan2(forward[1], forward[2]))
+    if window is None:
+        return None
     focal = camera.focal_px / camera.binning
-    size = int(min(max(2, round(2 * max(focal, 1 / camera.step_v))), LARGEST))  # no row and no column is passed over
-    middle = (size - 1) / 2
-    baseline = None if camera.baseline is None else camera.baseline * focal / (size / 2)  # focal length times baseline
-    pinhole = PinholeCamera(
-        size, size, size / 2, size / 2, middle, middle, baseline, binning=camera.binning, subpixel=camera.subpixel
-    )
+    whole = max(2, round(2 * max(focal, 1 / camera.step_v)))
+    first_u, first_v = (min(max(floor((slope + 1) / 2 * whole), 0), whole - 1) for slope in window[:2])
+    last_u, last_v = (min(max(floor((slope + 1) / 2 * whole), 0), whole - 1) for slope in window[2:])
+    baseline = None if camera.baseline is None else camera.baseline * focal / (whole / 2)  # focal length times baseline
+    return PinholeCamera(
+        last_u - first_u + 1, last_v - first_v + 1, whole / 2, whole / 2,
+        (whole - 1) / 2 - first_u, (whole - 1) / 2 - first_v,
+        baseline, binning=camera.binning, subpixel=camera.subpixel,
+    )  # fmt: skip
+
+
+def _around(camera: WideCamera, middle: float) -> Window | None:
+    """Return where a face that looks in the direction of rows, `middle` radians down from the z axis, sees the image.
+
+    A ray `a` beside the y-z plane has the slopes x = tan(a) |1, y| and y.
+    """
+    left, right, top, bottom = camera.borders
+    first = middle + 2 * pi * floor((top - middle) / (2 * pi))
+    parts = [(max(top - m, -pi / 4), min(bottom - m, pi / 4)) for m in (first, first + 2 * pi, first + 4 * pi)]
+    seen = [tan(angle) for part in parts if part[0] < part[1] for angle in part]
+    if not seen:
+        return None
+    low, high = min(seen), max(seen)
+    farthest, nearest = hypot(1, max(-low, high)), hypot(1, max(low, -high, 0))
+    left, right = _slope(left), _slope(right)
+    left, right = left * (farthest if left < 0 else nearest), right * (farthest if right > 0 else nearest)
+    return (left, low, right, high) if left < 1 and right > -1 else None
+
+
+def _beside(camera: WideCamera, side: int) -> Window | None:
+    """Return where the face that looks along the x axis (side 1) or back along it (-1) sees the image.
+
+    A ray `a` beside the y-z plane stands 1 / tan(a) from its middle, in the direction of its row.
+    """
+    left, right, top, bottom = camera.borders
+    near, far = (left, right) if side > 0 else (-right, -left)
+    near = max(near, atan(sqrt(0.5)))  # the corners of the face
+    if near >= far:
+        return None
+    quarters = range(ceil(top / (pi / 2)), floor(bottom / (pi / 2)) + 1)
+    turns = [top, bottom, *(quarter * pi / 2 for quarter in quarters)]
+    points = [(-side * cos(turn) / _slope(a), sin(turn) / _slope(a)) for turn in turns for a in (near, far)]
+    across, down = zip(*points, strict=True)
+    window = min(across), min(down), max(across), max(down)
+    return window if max(window[:2]) < 1 and min(window[2:]) > -1 else None
+
+
+def _slope(angle: float) -> float:
+    return tan(min(max(angle, -radians(SEEN_DEG)), radians(SEEN_DEG)))
+
+
+def _face(camera: WideCamera, pinhole: PinholeCamera, forward: NDArray[np.float64]) -> Face:
     T = np.eye(4)
     T[:3, :3] = _rotation(forward)
-    directions = pinhole.back_project(np.ones((size, size))) @ T[:3, :3].T
+    directions = pinhole.back_project(np.ones((pinhole.height, pinhole.width))) @ T[:3, :3].T
     across = np.hypot(directions[..., 1], directions[..., 2])  # distance from the x axis at depth 1 of the face
     with np.errstate(divide="ignore"):
         return Face(pinhole, T, _pixels(camera, directions, across), np.float32(1) / across.astype(np.float32))

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from stereovox.cameras import PinholeCamera
 from stereovox.config import Config
-from stereovox.integrate import _hits, _keys
-from stereovox.integrate.views import KernelTable, View, farthest_cells
+from stereovox.integrate import _hits
+from stereovox.integrate.views import KernelTable, View, check_blocks, uses_wide_keys
 from stereovox.maps.blocks import BlockPool
 
 
@@ -22,10 +22,10 @@ class HitFinder:
 
     def __init__(self, camera: PinholeCamera, table: KernelTable, config: Config):
         self.blocks = BlockPool(np.int16, capacity=1024)
-        self._table, self._full_share = table, np.float32(config.projective.full_share)
+        self._camera, self._table = camera, table
+        self._full_share = np.float32(config.projective.full_share)
         pixels = _hits.GROUP * -(-camera.width // _hits.GROUP)
-        narrow = farthest_cells(camera, config.max_range, config) < 1 << (_keys.NARROW - 1)
-        kind = np.int32 if narrow else np.int64
+        kind = np.int64 if uses_wide_keys(camera, config.max_range, config) else np.int32
         self._keys, self._seen = np.zeros((2, camera.width + 1), kind), np.zeros(_hits.SEEN, kind)
         self._news, self._fresh = np.zeros(pixels, np.uint8), np.zeros(pixels + 1, np.int32)
         self._listed = np.zeros(camera.height * camera.width, np.int32)
@@ -36,6 +36,7 @@ class HitFinder:
         blocks = self.blocks
         blocks.clear()
         while (n := self._scatter(depth_m, view)) < 0:
+            check_blocks(2 * len(blocks.coords), self._camera)
             blocks.clear()
             blocks.reserve(2 * len(blocks.coords))
         _hits.weigh(

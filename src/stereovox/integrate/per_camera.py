@@ -6,11 +6,13 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Generic, TypeVar
 
-Camera = TypeVar("Camera")
-Tools = TypeVar("Tools")
+from stereovox.rigs import VirtualCamera
 
-MOST = 16
-"""Cameras whose tools are kept; where more come, as from a lens that zooms, all are forgotten."""
+MAX_CAMERAS, MAX_PIXELS = 16, 1 << 26
+"""Cameras whose tools are kept, and pixels of all of them; where more come, as from a lens that zooms, all go."""
+
+Camera = TypeVar("Camera", bound=VirtualCamera)
+Tools = TypeVar("Tools")
 
 
 class PerCamera(Generic[Camera, Tools]):
@@ -23,7 +25,9 @@ class PerCamera(Generic[Camera, Tools]):
     def __getitem__(self, camera: Camera) -> Tools:
         tools = self._kept.get(camera)
         if tools is None:
-            if len(self._kept) >= MOST:
+            tools = self._make(camera)
+            pixels = sum(kept.width * kept.height for kept in (*self._kept, camera))
+            if len(self._kept) >= MAX_CAMERAS or pixels > MAX_PIXELS:
                 self._kept.clear()
-            tools = self._kept[camera] = self._make(camera)
+            self._kept[camera] = tools
         return tools

@@ -16,11 +16,11 @@ from stereovox.config import Config
 from stereovox.frame import DepthImage
 from stereovox.integrate import _cull, _evaluate
 from stereovox.integrate._cells import NEAR_PLANE, NO_RETURN
-from stereovox.integrate.faces import faces_of
+from stereovox.integrate.faces import cut, faces_of
 from stereovox.integrate.hits import HitFinder
 from stereovox.integrate.merging import strongest
 from stereovox.integrate.per_camera import PerCamera
-from stereovox.integrate.views import KernelTable, View, Views, sensor_table
+from stereovox.integrate.views import RIM_SHARE, KernelTable, View, Views, check_blocks, check_view, sensor_table
 from stereovox.integrate.windows import WindowBuilder, Windows
 from stereovox.maps.blocks import CELLS
 from stereovox.maps.evidence import Evidence
@@ -38,18 +38,23 @@ class Projective:
 
     def __init__(self, config: Config):
         self._config = config
-        self._sensor = make_sensor(config.sensor)
-        self._eyes = PerCamera(self._eye)
+        sensor = make_sensor(config.sensor)
+
+        def eye(camera: PinholeCamera, rim_share: float) -> _Eye:  # knows no `self`, which would keep itself alive
+            return _Eye(camera, sensor_table(sensor, config, camera), config, rim_share)
+
+        self._eyes = PerCamera(lambda camera: eye(camera, RIM_SHARE))
+        self._faces = PerCamera(lambda camera: [(face, eye(face.camera, 0.0)) for face in faces_of(camera, config)])
 
     def evidence(self, image: DepthImage) -> Evidence:
         """Return what `image` says about the cells it sees; that of a wide camera is cut into pinhole images."""
         if isinstance(image.camera, PinholeCamera):
-            return self._of_pinhole(image, image.camera, image.depth_m)
-        faces = faces_of(image, self._config.max_range)
-        return strongest([self._of_pinhole(face, face.camera, ends) for face, ends in faces])  # pyright: ignore
+            return self._of_pinhole(self._eyes[image.camera], image, image.depth_m)
+        faces = [(eye, *cut(image, face, self._config.max_range)) for face, eye in self._faces[image.camera]]
+        return strongest([self._of_pinhole(*face) for face in faces])
 
-    def _of_pinhole(self, image: DepthImage, camera: PinholeCamera, ends: NDArray[np.float32]) -> Evidence:
-        eye, depth_m = self._eyes[camera], image.depth_m
+    def _of_pinhole(self, eye: _Eye, image: DepthImage, ends: NDArray[np.float32]) -> Evidence:
+        depth_m = image.depth_m
         view = eye.views.at(image.T_world_sensor)
         threads = self._config.threads if eye.mixed_before >= 2 * WORTH_A_THREAD else 1
         _, (windows, n_free, n_mixed) = together(
@@ -74,17 +79,15 @@ class Projective:
         origin = eye.views.block
         return Evidence(mixed + origin, values, free + origin, free_values)
 
-    def _eye(self, camera: PinholeCamera) -> _Eye:
-        return _Eye(camera, sensor_table(self._sensor, self._config, camera), self._config)
-
 
 class _Eye:
     """What one camera needs: its sensor table, and memory for what its images say."""
 
-    def __init__(self, camera: PinholeCamera, table: KernelTable, config: Config):
-        self.table = table
+    def __init__(self, camera: PinholeCamera, table: KernelTable, config: Config, rim_share: float):
+        check_view(camera, config)
+        self._camera, self.table = camera, table
         self.mixed_before = 0  # blocks to be evaluated in the frame before: about as much is to be done in the next
-        self.views = Views(camera, config)
+        self.views = Views(camera, config, rim_share)
         self.hits = HitFinder(camera, table, config)
         self._windows = WindowBuilder(camera)
         self._max_range = config.max_range
@@ -107,6 +110,7 @@ class _Eye:
             n_free, n_mixed = _cull.candidates(view, self.table, windows, nearest, end, *lists)
             if n_free >= 0:
                 return windows, n_free, n_mixed
+            check_blocks(4 * len(self._free), self._camera)
             self._free, self._mixed = (np.empty((4 * len(self._free), 3), np.int32) for _ in range(2))
 
     def with_hits(self, n_free: int, n_mixed: int) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:

@@ -15,10 +15,18 @@ from stereovox.config import Config
 from stereovox.depth.downsample import downsample
 from stereovox.errors import FrameRefused
 from stereovox.frame import DepthImage
-from stereovox.integrate import _keys, _lanes, _line, _ray
+from stereovox.integrate import _lanes, _line, _ray
 from stereovox.integrate.lanes import Lanes, Memory, make_lanes, make_memory
 from stereovox.integrate.per_camera import PerCamera
-from stereovox.integrate.views import KernelTable, Rays, farthest_cells, origin_block, rays_of, sensor_table
+from stereovox.integrate.views import (
+    KernelTable,
+    Rays,
+    check_blocks,
+    origin_block,
+    rays_of,
+    sensor_table,
+    uses_wide_keys,
+)
 from stereovox.maps.blocks import CELLS, BlockPool
 from stereovox.maps.evidence import Evidence
 from stereovox.rigs import VirtualCamera
@@ -37,6 +45,12 @@ class _Eye(NamedTuple):
     scratch: list[tuple[Lanes, Memory]]
 
 
+def _eye(camera: VirtualCamera, table: KernelTable, config: Config) -> _Eye:
+    wide = uses_wide_keys(camera, config.max_range + (float(table.reach[-1]) if table.marks else 0), config)
+    scratch = [(make_lanes(wide), make_memory()) for _ in range(config.threads)]
+    return _Eye(table, (table.clear + table.mark).ravel(), scratch)
+
+
 class Ray:
     """Evidence by ray casting: every cell that a ray crosses (Chien 2020, Alg 2).
 
@@ -48,10 +62,10 @@ class Ray:
     _kernel: ClassVar[Callable[..., bool]] = staticmethod(_ray.cast)
 
     def __init__(self, config: Config):
+        sensor = make_sensor(config.sensor)
         self._config = config
-        self._sensor = make_sensor(config.sensor)
         self._pools = [BlockPool(np.int32, capacity=8192) for _ in range(config.threads)]
-        self._eyes = PerCamera(self._eye)
+        self._eyes = PerCamera(lambda camera: _eye(camera, sensor_table(sensor, config, camera), config))
 
     def evidence(self, image: DepthImage) -> Evidence:
         """Return what `image` says about the cells its rays cross."""
@@ -61,7 +75,7 @@ class Ray:
         weight = np.float32(self._cell_px(camera) ** -2) if config.ray.update == "every" else None
         parts = shards(camera.height, config.threads)
         number = {part.start: n for n, part in enumerate(parts)}
-        in_shards(lambda part: self._follow(image.depth_m, view, weight, eye, number[part.start], part), parts)
+        in_shards(lambda part: self._follow(image, view, weight, eye, number[part.start], part), parts)
         pool = self._merged(self._pools[: len(parts)], weight is not None)
         values = np.empty((len(pool), CELLS), np.int16)
         _lanes.to_thousandths(pool.values[: len(pool)], 0 if weight is None else _lanes.FRACTION_BITS, values)
@@ -85,22 +99,16 @@ class Ray:
             f"{MAX_CELL_PX}; use integrator projective or ray.update once",
         )
 
-    def _eye(self, camera: VirtualCamera) -> _Eye:
-        table = sensor_table(self._sensor, self._config, camera)
-        reach = self._config.max_range + float(table.reach[-1])
-        wide = farthest_cells(camera, reach, self._config) >= 1 << (_keys.NARROW - 1)
-        scratch = [(make_lanes(wide), make_memory()) for _ in self._pools]
-        return _Eye(table, (table.clear + table.mark).ravel(), scratch)
-
     def _follow(
-        self, depth_m: NDArray[np.float32], view: Rays, weight: np.float32 | None, eye: _Eye, worker: int, part: slice
+        self, image: DepthImage, view: Rays, weight: np.float32 | None, eye: _Eye, worker: int, part: slice
     ) -> None:
         pool = self._pools[worker]
         pool.clear()
         while not self._kernel(
-            depth_m, view, eye.table, eye.look_up, weight, *eye.scratch[worker],
+            image.depth_m, view, eye.table, eye.look_up, weight, *eye.scratch[worker],
             pool.table, pool.coords, pool.count, pool.values, part.start, part.stop,
         ):  # fmt: skip
+            check_blocks(2 * len(pool.coords), image.camera)
             pool.clear()
             pool.reserve(2 * len(pool.coords))
 

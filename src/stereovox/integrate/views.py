@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from stereovox.cameras import PinholeCamera
 from stereovox.config import Config
+from stereovox.errors import FrameRefused
 from stereovox.frame import DepthImage
 from stereovox.geometry import Transform
-from stereovox.integrate import _views
-from stereovox.maps.blocks import SIDE
+from stereovox.integrate import _keys, _views
+from stereovox.maps.blocks import CELLS, SIDE
 from stereovox.maps.evidence import to_units
 from stereovox.rigs import VirtualCamera
 from stereovox.sensors.model import COLUMNS, REACH_SIGMA, InverseSensorModel, SensorTable, tabulate
@@ -26,8 +27,13 @@ WINDOW_SHARE = 0.27
 Chosen so that a cell is cleared when any ray through it goes on, as exact ray casting does (see docs/integrators.md).
 """
 RIM_SHARE = 0.35
-"""A cell still counts as inside the image when its centre lies this share of its size outside."""
+"""`rim_share` of the image of a pinhole camera."""
 
+FEWEST_BLOCKS, BLOCKS_PER_PIXEL = 1 << 18, 32
+"""Blocks that a camera may see however small its image, and for each pixel: an image of a few can tell of no more."""
+MAX_BLOCKS = 1 << 21
+"""Blocks that one frame may tell of: a thousand million cells. Their places fit into 22 bits (`_hits.scatter`)."""
+CURE = "check the camera's size and focal length, lower max_range, or use larger cells"
 
 CELL_CENTRES = (np.stack([axis.ravel() for axis in np.mgrid[:SIDE, :SIDE, :SIDE]]) + 0.5).astype(np.float32)
 """(3, 512) centres of a block's cells from its corner, in cells."""
@@ -150,11 +156,14 @@ def _stretch(config: Config) -> NDArray[np.float64]:
 
 
 class Views:
-    """Makes the kernel views of one pinhole camera; a view holds until the next is made."""
+    """Makes the kernel views of one pinhole camera; a view holds until the next is made.
 
-    def __init__(self, camera: PinholeCamera, config: Config):
+    rim_share: a cell still counts as inside the image when its centre lies this share of its size outside.
+    """
+
+    def __init__(self, camera: PinholeCamera, config: Config, rim_share: float = RIM_SHARE):
         size, fx, fy = config.voxel_size, camera.fx, camera.fy
-        rim = RIM_SHARE * size * np.array([fx, fy])
+        rim = rim_share * size * np.array([fx, fy])
         intrinsics = np.array([fx, fy, camera.cx, camera.cy])
         shape = np.array([camera.width, camera.height], float)
         self._given = np.array(config.cell, float), size, intrinsics, shape, rim, CELL_CENTRES
@@ -183,6 +192,37 @@ class Views:
         written = view.rotation, view.forward, view.position, view.sides, view.steps
         _views.aim(np.ascontiguousarray(T_world_camera, float), *self._given, self.block, *written)
         return view
+
+
+def check_view(camera: VirtualCamera, config: Config) -> None:
+    """Raise FrameRefused `bad_camera` where the view up to the maximum range is out of proportion to the image."""
+    blocks = camera.volume(config.max_range) / (CELLS * float(np.prod(config.cell)))
+    if blocks > _fitting_blocks(camera):
+        seen = f"{camera.width}x{camera.height} pixels see {CELLS * blocks:.2g} cells up to {config.max_range:g} m"
+        raise FrameRefused("bad_camera", f"{seen}: {CURE}")
+
+
+def check_blocks(blocks: int, camera: VirtualCamera) -> None:
+    """Raise FrameRefused `view_too_large` where one frame tells of more blocks than can be kept, or befit its image."""
+    most = min(MAX_BLOCKS, _fitting_blocks(camera))
+    if blocks > most:
+        raise FrameRefused("view_too_large", f"the frame tells of more than {CELLS * most:.2g} cells: {CURE}")
+
+
+def _fitting_blocks(camera: VirtualCamera) -> int:
+    return FEWEST_BLOCKS + BLOCKS_PER_PIXEL * camera.width * camera.height
+
+
+def uses_wide_keys(camera: VirtualCamera, reach: float, config: Config) -> bool:
+    """Tell whether cells that a camera sees at depths up to `reach` metres need keys of 64 bits.
+
+    Raises FrameRefused `bad_camera` where these would not do either.
+    """
+    cells = farthest_cells(camera, reach, config)
+    if cells >= 1 << (_keys.WIDE - 1):
+        said = f"the camera's view and noise reach {cells:.2g} cells far, more than can be counted"
+        raise FrameRefused("bad_camera", f"{said}: check focal length and baseline, or use larger cells")
+    return cells >= 1 << (_keys.NARROW - 1)
 
 
 @lru_cache

@@ -64,7 +64,8 @@ class BlockPool:
         self.count = np.zeros(1, np.int64)
         self.coords = np.zeros((capacity, 3), np.int32)
         self.values = _filled((capacity, cells), fill, dtype)
-        self.table = np.full(table_size(capacity), -1, np.int32)
+        self.table = np.empty(table_size(capacity), np.int32)
+        _cpu.rebuild(self.table, self.coords, 0)
 
     def __len__(self) -> int:
         return int(self.count[0])

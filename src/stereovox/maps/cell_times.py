@@ -34,6 +34,7 @@ class CellTimes:
         self.start_ns: int | None = None
         self._forget_ns = None if config.forget_s is None else max(ceil(config.forget_s * 1e9), LATE * _times.SLOTS)
         self._blocks = BlockPool(np.uint32, capacity)
+        self._has_written = self._has_forgotten = False  # at first all kernels are called, lest they compile later
 
     def __len__(self) -> int:
         return len(self._blocks)
@@ -68,8 +69,8 @@ class CellTimes:
         """Remember when cells got evidence; that of the first frame is where times count from."""
         if self.start_ns is None:
             self.start_ns = stamp_ns
-        blocks = self._blocks
-        if len(blocks) + len(evidence.coords) + len(evidence.uniform) > len(blocks.coords):
+        blocks, first, self._has_written = self._blocks, not self._has_written, True
+        if first or len(blocks) + len(evidence.coords) + len(evidence.uniform) > len(blocks.coords):
             blocks.reserve(self.missing(evidence))
         _times.write(*self._arrays, evidence.coords, evidence.values, evidence.uniform, self.steps(stamp_ns))
 
@@ -84,12 +85,11 @@ class CellTimes:
         """Set the times (n, 512) of blocks (n, 3); those without any are not kept."""
         timed = times.any(axis=1)
         self.remove(coords[~timed])
-        if timed.any():
-            blocks, coords = self._blocks, np.ascontiguousarray(coords[timed], np.int32)
-            blocks.reserve(int((self._places(coords) < 0).sum()))
-            places = np.empty(len(coords), np.int64)
-            _cpu.insert_all(blocks.table, blocks.coords, blocks.count, coords, places)
-            blocks.values[places] = times[timed]
+        blocks, coords = self._blocks, np.ascontiguousarray(coords[timed], np.int32)
+        blocks.reserve(int((self._places(coords) < 0).sum()))
+        places = np.empty(len(coords), np.int64)
+        _cpu.insert_all(blocks.table, blocks.coords, blocks.count, coords, places)
+        blocks.values[places] = times[timed]
 
     def remove(self, coords: NDArray[np.int32]) -> None:
         """Forget the times of blocks (n, 3), each there or not."""
@@ -113,8 +113,9 @@ class CellTimes:
             return
         turn_ns = self._forget_ns // (LATE * _times.SLOTS)
         before, now = before_ns // turn_ns, now_ns // turn_ns
-        if now > before:
-            self._forget_in_turns((before + 1) % _times.SLOTS, min(now - before, _times.SLOTS), cells, now_ns)
+        if now > before or not self._has_forgotten:
+            self._has_forgotten = True
+            self._forget_in_turns((before + 1) % _times.SLOTS, max(0, min(now - before, _times.SLOTS)), cells, now_ns)
 
     def expired(self, times: NDArray[np.integer], now_ns: int) -> NDArray[np.bool_]:
         """Tell which times are over: more than `forget_s` before now, or after it, as where a clock was reset."""
@@ -130,7 +131,7 @@ class CellTimes:
             blocks.coords, blocks.values, blocks.count, first, turns, self.steps(now_ns), self._most, places
         )
         coords = blocks.coords[places[:number]]
-        for start in range(0, number, PIECE):
+        for start in range(0, max(number, 1), PIECE):
             some, left = cells.get(coords[start : start + PIECE])
             times = self.get(some)
             left[self.expired(times, now_ns)] = cells.unknown

@@ -90,6 +90,7 @@ class RollingMap(VoxelMap):
                 raise ConfigError(f"cannot go on: the map's window is damaged ({error}); make the map anew") from None
             self.window_state = earlier.window_state
             self._take_over()
+            self._rehearse()
 
     def with_config(self, config: Config) -> VoxelMap:
         """Return an unbounded map of all cells, with the settings of a run that goes on with it.
@@ -115,6 +116,7 @@ class RollingMap(VoxelMap):
         self.window_state = self._window.state
         if before is None:
             self._take_over()
+            self._rehearse()
         elif now != before:
             self._move(before, now)
 
@@ -226,6 +228,20 @@ class RollingMap(VoxelMap):
             self._put_away(tile)
         for tile in _listed(tiles_now, tiles_before):
             self._bring_back(tile)
+
+    def _rehearse(self) -> None:
+        """Do all that a move does, with nothing: so its kernels are compiled before the first one."""
+        assert self._window.box is not None
+        if self._store is None:
+            low = self._window.box[0]
+            self._drop((low, low), self._window.box)
+            return
+        nowhere, nothing = np.empty((0, 3), np.int32), np.empty((0, CELLS), self._format.dtype)
+        self._pool.get(nowhere)
+        self._pool.remove(nowhere)
+        self.insert(nowhere, nothing)
+        if self._times is not None:
+            self._times.put(nowhere, self._times.get(nowhere))
 
     def _drop(self, slab: Box, now: Box) -> None:
         low, high, *window = (np.array(corner, np.int32) for corner in (*slab, *now))

@@ -108,8 +108,8 @@ class VoxelMap(Guarded, WithHistory):
     def look_from(self, viewpoint: Viewpoint) -> None:
         """Remember where the camera stands; a bounded map moves with it, cells without evidence for long go."""
         before, self.viewpoint = self.viewpoint, viewpoint
-        if self._times is not None and before is not None:
-            self._times.forget(self._pool, before.stamp_ns, viewpoint.stamp_ns)
+        if self._times is not None:
+            self._times.forget(self._pool, (before or viewpoint).stamp_ns, viewpoint.stamp_ns)
 
     @property
     def cell_format(self) -> CellFormat:

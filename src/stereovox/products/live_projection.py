@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from weakref import WeakMethod
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -43,7 +45,8 @@ class LiveProjection:
         self._whole = isinstance(voxel_map, RollingMap) or config.map.forget_s is not None
         self._changed = EVERYWHERE.copy()
         self._canvas = _Canvas()
-        voxel_map.listeners.append(self._note)
+        note = WeakMethod(self._note)  # the map does not keep alive what only looks at it
+        voxel_map.listeners.append(lambda evidence: (method := note()) and method(evidence))
 
     def grid(self) -> OccupancyGrid | None:
         """Return the map from above as it is now; None where nothing is known. Its cells are a copy.

@@ -196,7 +196,9 @@ def digest(voxel_map: Any) -> tuple[Any, ...]:
 def described(thing: Any) -> str:
     """Return in a few words what was offered."""
     with suppress(AttributeError):
-        image = thing.depth if isinstance(thing, Frame) else thing.left if isinstance(thing, StereoFrame) else thing.ranges
+        image = (
+            thing.depth if isinstance(thing, Frame) else thing.left if isinstance(thing, StereoFrame) else thing.ranges
+        )
         by = thing.camera if isinstance(thing, Frame) else thing.pair.camera if isinstance(thing, StereoFrame) else ""
         return f"{type(thing).__name__} {image.dtype}{list(image.shape)} {by}"[:400]
     return type(thing).__name__

@@ -6,6 +6,7 @@ from __future__ import annotations
 import ctypes
 import gc
 import resource
+import signal
 from collections.abc import Callable, Sequence
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
@@ -20,6 +21,7 @@ HUNG_S = 60.0
 MEMORY = 4 << 30
 """Bytes that a batch may take."""
 LOOKS_S = 1.0
+PR_SET_PDEATHSIG = 1
 
 
 class Watched:
@@ -31,6 +33,7 @@ class Watched:
 
     def __init__(self, seed: int, words: Sequence[str], told: Callable[[str], None]):
         self.memory: dict[str, Any] = {}
+        self._known: set[str] = set()
         self._seed, self._words, self._told = seed, list(words), told
         self._context = get_context("spawn")  # forked threads of the kernels would hang
         self._number, self._since = self._context.Value("q", 0), self._context.Value("d", 0.0)
@@ -46,7 +49,7 @@ class Watched:
         """Run batches in a new process for as long as it lives; return the number of the next one."""
         mine, theirs = self._context.Pipe()
         task = self._seed, self._words, batch, frames, until
-        self._since.value = float("inf")  # nothing is timed before the kernels are compiled
+        self._since.value = float("inf")  # until the first call
         process = self._context.Process(target=_work, args=(theirs, self._number, self._since, *task), daemon=True)
         process.start()
         theirs.close()
@@ -56,7 +59,7 @@ class Watched:
                     seen, megabytes = mine.recv()
                     tally.join(seen)
                     self.memory = {"memory_mb": [*self.memory.get("memory_mb", [megabytes])[:1], megabytes]}
-                    self._tell(batch, tally, megabytes)
+                    self._tell(batch, seen, tally, megabytes)
                     batch += 1
                 elif monotonic() - self._since.value > HUNG_S:
                     return self._lost(tally.hung, batch, f"no answer for {HUNG_S:.0f} s")
@@ -74,9 +77,12 @@ class Watched:
         self._told(lines[-1])
         return batch + 1
 
-    def _tell(self, batch: int, tally: Tally, megabytes: float) -> None:
-        for line in tally.bad + tally.hung:
-            if line.startswith(f"[{self._seed}, {batch}]"):
+    def _tell(self, batch: int, seen: Tally, tally: Tally, megabytes: float) -> None:
+        """Say how it goes, and each thing that went wrong once."""
+        for line in seen.bad:
+            what = line.partition(": ")[2]
+            if what not in self._known:
+                self._known.add(what)
                 self._told(line)
         longest = tally.slowest[0][0] if tally.slowest else 0.0
         self._told(
@@ -88,6 +94,7 @@ class Watched:
 def _work(
     tell: Connection, number: Any, since: Any, seed: int, words: Sequence[str], batch: int, frames: int, until: float
 ) -> None:
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)  # else one that hangs would outlive its parent
     resource.setrlimit(resource.RLIMIT_DATA, (MEMORY, MEMORY))
     kinds, odd = without(words)
 
@@ -95,7 +102,7 @@ def _work(
         number.value, since.value = now, monotonic()
         return now % 100 > 0 or monotonic() < until
 
-    run(WARM, [seed, batch, 0], WARM, kinds, odd)
+    run(WARM, [seed, batch, 0], WARM, kinds, odd, alive)
     while batch * BATCH < frames and monotonic() < until:
         seen = run(min(BATCH, frames - batch * BATCH), [seed, batch], 0, kinds, odd, alive)
         since.value = float("inf")

@@ -20,6 +20,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field
 from heapq import nlargest
+from itertools import product
 from time import perf_counter, process_time
 from typing import Any
 from zlib import crc32
@@ -27,7 +28,8 @@ from zlib import crc32
 import numpy as np
 
 from mapper_kinds import KINDS, Kind
-from random_frames import Maker
+from random_cameras import RARE
+from random_frames import DTYPES, Maker
 from stereovox.errors import ConfigError
 from stereovox.frame import Frame, Scan, StereoFrame
 
@@ -41,7 +43,7 @@ RENEWED = 200
 UNFIT = "(settings do not fit the camera)"
 """What a ConfigError counts as: it is raised, for it would come with every frame."""
 WARM = 5000
-"""Frames that are made and not timed: kernels are compiled meanwhile."""
+"""Frames that are made and not timed: kernels are compiled meanwhile. One that is compiled later is a slow call."""
 Told = Callable[[str], None]
 
 
@@ -244,6 +246,18 @@ def run(
     return tally
 
 
+def warm_up(seed: Any, kinds: Sequence[Kind], odd_cameras: bool, alive: Callable[[int], bool]) -> None:
+    """Compile the kernels: of ordinary frames, and of some of every kind that need rare ones."""
+    for kind in kinds:
+        mapper = kind.make()
+        for camera, dtype in product(RARE, DTYPES if odd_cameras else ()):
+            alive(0)
+            depth = np.full((camera.height, camera.width), 2000 if dtype == "u2" else 2.0, dtype)
+            with suppress(ConfigError):
+                mapper.add(Frame(depth, camera, np.eye(4), depth_scale=0.001 if dtype == "u2" else 1.0))
+    run(WARM, seed, WARM, kinds, odd_cameras, alive)
+
+
 def what_happened(error: Exception) -> str:
     """Return an exception and its place in one line."""
     place = traceback.extract_tb(error.__traceback__)[-1]
@@ -265,8 +279,8 @@ def main() -> int:
     parser.add_argument("--seconds", type=float)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--batch", type=int, help="only this one, in this process")
-    parser.add_argument("--without", action="append", default=[], metavar="WORD",
-                        help="leave out kinds of mappers whose names hold it, or 'odd cameras'; repeatable")  # fmt: skip
+    left_out = "leave out kinds of mappers whose names hold it, or 'odd cameras'; repeatable"
+    parser.add_argument("--without", action="append", default=[], metavar="WORD", help=left_out)
     parser.add_argument("--json", action="store_true", help="print one JSON object on stdout")
     arguments = parser.parse_args()
     start = perf_counter()

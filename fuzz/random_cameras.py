@@ -20,6 +20,12 @@ ODD_SIZES = (1, 1, 2, 3, 7, 16, 40, 97, 400)
 """Pixels; width and height are drawn one by one."""
 ODD_FOCALS = (1e-300, 1e-30, 1e30, 1e300, -20.0, 0.0, np.nan, np.inf)
 LARGE = ((640, 480, 580.0), (848, 480, 420.0), (1280, 720, 640.0), (320, 240, 150.0))
+RARE = (
+    sv.PinholeCamera(16, 12, 0.9, 0.9, 0.0, 0.0), SphericalCamera(9, 7, 0.33, 0.8, 4.0, 3.0, 1e-6),
+    CylindricalCamera(12, 9, 0.5, 0.6, 5.5, 4.0, 1e-6),
+    sv.PinholeCamera(9, 7, 9.0, 9.0, 4.0, 3.0, correction=DepthCorrection("scale", (0.0,) * 6)),
+)  # fmt: skip
+"""Cameras that need what most do not: cells so far to the side that their numbers take 64 bits, and a correction."""
 TRIES = 50
 """Odd cameras that are drawn until one of them passes."""
 

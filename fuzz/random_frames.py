@@ -27,8 +27,8 @@ ODD_THINGS = (
 ODD_DTYPES = (
     ">f4", ">u2", "<f8", ">f8", "f2", "i1", "u1", "i2", "i4", "i8", "u8", "?", "c8", "c16", "O", "S3", "g", "M8[s]",
 )  # fmt: skip
-DTYPES = ("f4", "f4", "f4", "f4", "f8", "f8", "u2", "u2", "u2", "u2", "f2", ">f4")
-"""Kinds of number that depth comes in, the last two in vain; whole ones are millimetres."""
+DTYPES, NO_DTYPES = ("f4", "f4", "f8", "u2", "u2"), ("f2", ">f4", ">u2", "i4", "u1")
+"""Kinds of number that depth comes in, and that it must not; whole ones are millimetres."""
 ROOM_M = np.array([4.0, 3.0, 2.5])
 """From the origin to the walls of the room that plausible images show."""
 CAMERAS = 60
@@ -79,8 +79,8 @@ class Maker:
         depth = depth + rng.normal(size=shape) * self._one_of((0.0, 0.02, 0.02 if plausible else 1.0))
         strange = rng.random(depth.shape) < self._one_of((0.0, 0.0, 0.0, 0.1, 0.1 if plausible else 1.0))
         depth[strange] = rng.choice(STRANGE, strange.sum())
-        dtype = np.dtype(self._one_of(DTYPES))
-        scale = 0.001 if dtype.kind == "u" else 1.0
+        dtype = np.dtype(self._one_of(NO_DTYPES if self._chance(0.02) else DTYPES))
+        scale = 0.001 if dtype.kind in "iu" else 1.0
         with np.errstate(all="ignore"):
             depth = (depth / scale).astype(dtype)
         reason = rng.integers(0, 6, depth.shape, np.uint8) if self._chance(0.2) else None
@@ -206,7 +206,7 @@ class Maker:
 
 
 def room_depth(camera: VirtualCamera, T_world_camera: np.ndarray) -> np.ndarray:
-    """Return the depth (height, width) in metres of the walls of a room about the origin, as a camera in it sees them."""
+    """Return the depth (height, width) in metres of the walls of a room about the origin, seen by a camera in it."""
     columns, rows = camera.rays()
     shape = len(rows), len(columns)
     across, down, ahead = np.broadcast_to(columns, shape), *(np.broadcast_to(row[:, None], shape) for row in rows.T)

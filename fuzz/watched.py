@@ -14,7 +14,7 @@ from pathlib import Path
 from time import monotonic
 from typing import Any
 
-from frames import BATCH, WARM, Tally, run, without
+from frames import BATCH, Tally, run, warm_up, without
 
 HUNG_S = 60.0
 """Seconds after which a call that has not come back never will."""
@@ -102,7 +102,7 @@ def _work(
         number.value, since.value = now, monotonic()
         return now % 100 > 0 or monotonic() < until
 
-    run(WARM, [seed, batch, 0], WARM, kinds, odd, alive)
+    warm_up([seed, batch, 0], kinds, odd, alive)
     while batch * BATCH < frames and monotonic() < until:
         seen = run(min(BATCH, frames - batch * BATCH), [seed, batch], 0, kinds, odd, alive)
         since.value = float("inf")

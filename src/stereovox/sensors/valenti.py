@@ -9,9 +9,6 @@ import numpy as np
 
 from stereovox.sensors.model import Array
 
-THINNEST = 1e-9
-"""Metres that the tail is at least: where sigma is far larger than the range, Eq 6.6 rounds to none."""
-
 
 @dataclass(frozen=True)
 class Valenti:
@@ -43,5 +40,6 @@ class Valenti:
         offset = np.asarray(z) - z_measured
         a = self.peak(sigma)
         before = self.p_free + (a + self.p_unknown - self.p_free) * np.exp(-0.5 * (offset / sigma) ** 2)
-        behind = self.p_unknown + a * np.exp(-0.5 * (offset / np.maximum(self.tail(sigma), THINNEST)) ** 2)
+        with np.errstate(divide="ignore", invalid="ignore"):  # of a very large sigma no tail is left
+            behind = self.p_unknown + a * np.exp(-0.5 * (offset / self.tail(sigma)) ** 2)
         return np.where(offset <= 0, before, behind)

@@ -316,13 +316,20 @@ def main() -> None:
         ours, theirs = [], []
         for seed in range(wanted.first_seed, wanted.first_seed + wanted.seeds):
             frames = frames_of(scene, seed)
-            ours.append(judged(with_stereovox(scene, frames, voxel_size, **settings, **overrides), scene, seed, voxel_size))
+            ours.append(
+                judged(with_stereovox(scene, frames, voxel_size, **settings, **overrides), scene, seed, voxel_size)
+            )
             theirs.append(judged(with_octomap(scene, frames, voxel_size), scene, seed, voxel_size))
-        rows[name] = {who: {key: float(np.mean([getattr(one, key) for one in found])) for key in ("lost", "free", "wall")}
-                      for who, found in (("stereovox", ours), ("octomap", theirs))}
+        rows[name] = {
+            who: {key: float(np.mean([getattr(one, key) for one in found])) for key in ("lost", "free", "wall")}
+            for who, found in (("stereovox", ours), ("octomap", theirs))
+        }
         if not wanted.json:
             a, b = rows[name]["stereovox"], rows[name]["octomap"]
-            print(f"{name:30} {scene.pixels:5.2f} px  lost {a['lost']:6.1%} ({b['lost']:6.1%})  free {a['free']:6.1%} ({b['free']:6.1%})  wall {a['wall']:.2f} ({b['wall']:.2f})", flush=True)
+            print(
+                f"{name:30} {scene.pixels:5.2f} px  lost {a['lost']:6.1%} ({b['lost']:6.1%})  free {a['free']:6.1%} ({b['free']:6.1%})  wall {a['wall']:.2f} ({b['wall']:.2f})",
+                flush=True,
+            )
     if wanted.json:
         print(json.dumps(rows))
 

@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Random frames, scans and stereo pairs into mappers of all kinds: `python fuzz/frames.py --frames 1000000`.
+"""Random frames, scans and stereo pairs into mappers of all kinds: `python fuzz/frames.py --seconds 3600 --seed 1`.
 
-What must hold: no exception; a refused frame leaves every bit of the map as it was and says why in one line; no call
-takes longer than a second; no cell leaves its range. What does not is printed, and the exit status is then 1.
+What must hold: no exception, not even a warning; a refused frame leaves every bit of the map as it was and says why in
+one line; no call takes longer than a second; no cell leaves its range. What does not is printed, and the exit status is
+then 1. Frames come in batches, each with new mappers and dice of its own: `--seed S --batch B --frames N` makes the
+first N frames of one again. Batches run in a process of their own, which is ended when a call does not come back.
 """
 
 from __future__ import annotations
@@ -13,129 +15,162 @@ import sys
 import traceback
 import warnings
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, field
+from heapq import nlargest
+from itertools import product
 from time import perf_counter, process_time
 from typing import Any
 from zlib import crc32
 
 import numpy as np
 
-import stereovox as sv
-from random_frames import Maker
+from mapper_kinds import KINDS, Kind
+from random_cameras import RARE
+from random_frames import DTYPES, Maker
 from stereovox.errors import ConfigError
 from stereovox.frame import Frame, Scan, StereoFrame
-from stereovox.grid_mapper import GridMapper
 
 SEEN = Frame, Scan, StereoFrame
 SLOW_S = 1.0
-SELDOM = 0.1
-"""Share of the frames that a map with tiles on the disk gets: looking at all of it is slow."""
+SLOWEST = 5
+"""Calls that are kept as the slowest."""
+BATCH = 20_000
 RENEWED = 200
-"""Frames after which a map is begun anew, lest all of them be large."""
+"""Calls after which a map is begun anew, lest all of them be large."""
 UNFIT = "(settings do not fit the camera)"
 """What a ConfigError counts as: it is raised, for it would come with every frame."""
-WARM = 3000
-"""Frames that are made and not timed: kernels are compiled meanwhile."""
-ANYWHERE = {"trust.ordered": False, "trust.max_speed_mps": 1e12, "trust.max_turn_dps": 1e12, "trust.settle_s": 0}
-"""Else nearly all frames were refused for jumps."""
-SMALL = {"voxel_size": 0.25, "max_range": 4.0, "stereo.disparities": 16, **ANYWHERE}
-WINDOW = {"window.size": (12, 12, 6), "window.trigger": 1}
-VOXELS: dict[str, dict[str, Any]] = {
-    "projective": {},
-    "projective, two threads, as a sensor tells": {"threads": 2, "depth.far": "infinite", "map.cell": "int8"},
-    "projective, window, downsampled": {**WINDOW, "depth.downsample": 2},
-    "projective, window on disk": {**WINDOW, "window.outside": "keep"},
-    "projective, fixed window, sphere": {**WINDOW, "window.centre": (0, 0, 0), "sphere.step_deg": 5},
-    "projective, flat cells, stamps in order": {"steps": (0.25, 0.25, 0.1), "trust.ordered": True, "trust.settle_s": 1},
-    "ray, every": {"integrator": "ray", "map.cell": "uint8"},
-    "ray, once, valenti": {"integrator": "ray", "ray.update": "once", "depth.far": "measured"},
-    "line": {"integrator": "line", "map.cell": "int8"},
-}
-GRIDS: dict[str, dict[str, Any]] = {
-    "grid, exact, once": {"grid.thickness": 0.3},
-    "grid, bresenham, every": {"grid.traversal": "bresenham", "grid.update": "every", "scan.method": "rows"},
-}
+WARM = 5000
+"""Frames that are made and not timed: kernels are compiled meanwhile. One that is compiled later is a slow call."""
+Told = Callable[[str], None]
 
 
 @dataclass
 class Tally:
     """What was seen.
 
-    longest_ms, busiest_ms: of one call, by the clock and by the processor, which other programs use too. A call is
-    slow where both are over SLOW_S. bad: one line for each frame after which something did not hold.
+    slowest: (milliseconds, frame, what) of calls, the lesser of the time by the clock and by the processor, which other
+    programs use too. A call is slow where it is over SLOW_S. bad: one line for each frame after which something did not
+    hold. hung: one for each call that did not come back.
     """
 
     frames: Counter[str] = field(default_factory=Counter)
+    taken: Counter[str] = field(default_factory=Counter)
     refused: Counter[str] = field(default_factory=Counter)
-    longest_ms: float = 0.0
-    busiest_ms: float = 0.0
+    slowest: list[tuple[float, str, str]] = field(default_factory=list)
     slow: int = 0
     changed_by_refused: int = 0
     bad: list[str] = field(default_factory=list)
+    hung: list[str] = field(default_factory=list)
+
+    def took(self, seconds: float, place: str, what: str) -> None:
+        """Note how long a call took."""
+        self.slow += seconds > SLOW_S
+        if len(self.slowest) < SLOWEST or 1e3 * seconds > self.slowest[-1][0]:
+            self.slowest = nlargest(SLOWEST, [*self.slowest, (round(1e3 * seconds, 1), place, what)])
+
+    def join(self, other: Tally) -> None:
+        """Take over what another one saw."""
+        for mine, theirs in ((self.frames, other.frames), (self.taken, other.taken), (self.refused, other.refused)):
+            mine.update(theirs)
+        self.slowest = nlargest(SLOWEST, self.slowest + other.slowest)
+        self.slow += other.slow
+        self.changed_by_refused += other.changed_by_refused
+        self.bad += other.bad
+        self.hung += other.hung
+
+    @property
+    def failed(self) -> bool:
+        """Whether something did not hold."""
+        return bool(self.bad or self.hung or self.slow or self.changed_by_refused)
 
     def as_dict(self) -> dict[str, Any]:
         """Return it for JSON."""
-        refused = sum(self.refused.values())
         return {
             "frames": sum(self.frames.values()),
-            "taken": sum(self.frames.values()) - refused - len(self.bad),
-            "refused": refused,
+            "taken": sum(self.taken.values()),
+            "refused": sum(self.refused.values()),
             "crashes": len(self.bad),
+            "hangs": len(self.hung),
             "over_1_s": self.slow,
             "changed_by_a_refused_frame": self.changed_by_refused,
-            "longest_ms": round(self.longest_ms, 1),
-            "busiest_ms": round(self.busiest_ms, 1),
+            "slowest": [{"ms": ms, "place": place, "call": what} for ms, place, what in self.slowest],
             "by_kind": dict(self.frames.most_common()),
+            "taken_by": dict(self.taken.most_common()),
             "by_reason": dict(self.refused.most_common()),
-            "bad": self.bad[:20],
+            "bad": self.bad[:1000],
+            "hung": self.hung[:1000],
         }
 
 
 class Tried:
-    """A mapper with the state of its map after the last frame."""
+    """A mapper with the state of its map after the last call."""
 
-    def __init__(self, make: Callable[[], Any]):
-        self._make = make
+    def __init__(self, kind: Kind):
+        self.kind = kind
+        self._callers = ThreadPoolExecutor(kind.callers)
         self._begin()
 
-    def add(self, thing: Any, tally: Tally, timed: bool) -> None:
-        """Offer one thing and note in `tally` what it did; raises AssertionError where something does not hold."""
-        before, told = self._digest, self.mapper.map.frames + self.mapper.map.frames_refused
+    def add(self, things: Sequence[Any], tally: Tally, place: str, timed: bool = True) -> None:
+        """Offer one thing from each caller and note in `tally` what they did.
+
+        Raises AssertionError where something does not hold.
+        """
+        before, known = self._digest, self._offered_so_far
         start, busy_start = perf_counter(), process_time()
-        reason, detail = self._offered(thing)
-        took, busy = perf_counter() - start, process_time() - busy_start
+        answers = self._answers(things)
+        seconds = min(perf_counter() - start, process_time() - busy_start) / len(things)
         if timed:
-            tally.longest_ms = max(tally.longest_ms, 1e3 * took)
-            tally.busiest_ms = max(tally.busiest_ms, 1e3 * busy)
-            tally.slow += min(took, busy) > SLOW_S
+            tally.took(seconds, place, f"{self.kind.name}: {' | '.join(map(described, things))}")
         self._digest = digest(self.mapper.map)
-        if reason:
-            tally.refused[reason] += 1
-            check(bool(detail) and "\n" not in detail, f"what is said is not one line: {detail!r}")
+        for reason, detail in answers:
+            if reason:
+                tally.refused[reason] += 1
+                check(bool(detail) and "\n" not in detail, f"what is said is not one line: {detail!r}")
+            else:
+                tally.taken[self.kind.name] += 1
+        if all(reason for reason, _ in answers):
             tally.changed_by_refused += self._digest != before
-            check(self._digest == before, f"a refused frame ({reason}) changed the map")
-        counted = self.mapper.map.frames + self.mapper.map.frames_refused - told
-        check(counted == (reason != UNFIT), f"a frame was counted {counted} times")
+            check(self._digest == before, f"a refused frame ({answers[0][0]}) changed the map")
+        counted, expected = self._offered_so_far - known, sum(reason != UNFIT for reason, _ in answers)
+        check(counted == expected, f"{counted} frames were counted, not {expected}")
         self._left -= 1
         if not self._left:
             self.renew()
 
-    def _offered(self, thing: Any) -> tuple[str | None, str]:
+    def renew(self) -> None:
+        """Begin with an empty map."""
+        self.close()
+        self._begin()
+
+    def close(self) -> None:
+        """Give back what the map holds on the disk."""
+        if hasattr(self.mapper.map, "close"):
+            self.mapper.map.close()
+
+    @property
+    def _offered_so_far(self) -> int:
+        return self.mapper.map.frames + self.mapper.map.frames_refused
+
+    def _answers(self, things: Sequence[Any]) -> list[tuple[str | None, str]]:
+        if len(things) == 1:
+            return [self._answer(things[0])]
+        running = [self._callers.submit(self._answer, thing) for thing in things]
+        self.mapper.map.state(np.zeros((4, 3))) if not self.kind.grid else None
+        self.mapper.health()
+        return [future.result() for future in running]
+
+    def _answer(self, thing: Any) -> tuple[str | None, str]:
         try:
             report = self.mapper.add(thing)
         except ConfigError as error:
             return UNFIT, str(error)
         return report.refused, report.detail
 
-    def renew(self) -> None:
-        """Begin with an empty map."""
-        if hasattr(self.mapper.map, "close"):
-            self.mapper.map.close()
-        self._begin()
-
     def _begin(self) -> None:
-        self.mapper, self._left = self._make(), RENEWED
+        self.mapper, self._left = self.kind.make(), RENEWED
         self._digest = digest(self.mapper.map)
 
 
@@ -160,6 +195,17 @@ def digest(voxel_map: Any) -> tuple[Any, ...]:
     return *cells_there, voxel_map.frames, seen, None if window is None else window.tobytes()
 
 
+def described(thing: Any) -> str:
+    """Return in a few words what was offered."""
+    with suppress(AttributeError):
+        image = (
+            thing.depth if isinstance(thing, Frame) else thing.left if isinstance(thing, StereoFrame) else thing.ranges
+        )
+        by = thing.camera if isinstance(thing, Frame) else thing.pair.camera if isinstance(thing, StereoFrame) else ""
+        return f"{type(thing).__name__} {image.dtype}{list(image.shape)} {by}"[:400]
+    return type(thing).__name__
+
+
 def thing_for(grid: bool, maker: Maker, chance: float) -> Any:
     """Return a frame or a scan, whatever suits the mapper, and now and then what does not."""
     if chance < 0.02:
@@ -167,35 +213,49 @@ def thing_for(grid: bool, maker: Maker, chance: float) -> Any:
     return maker.scan() if grid and chance < 0.7 else maker.frame()
 
 
-def all_mappers() -> tuple[list[Tried], list[float]]:
-    """Return one mapper of each kind, and which share of the frames each gets."""
-    tried = [Tried(lambda s=s: sv.Mapper("default", **{**SMALL, **s})) for s in VOXELS.values()]
-    tried += [Tried(lambda s=s: GridMapper("default", **{**SMALL, **s})) for s in GRIDS.values()]
-    weights = np.array([SELDOM if "window.outside" in s else 1.0 for s in (*VOXELS.values(), *GRIDS.values())])
-    return tried, (weights / weights.sum()).tolist()
+def run(
+    frames: int,
+    seed: int | Sequence[int],
+    timed_from: int = WARM,
+    kinds: Sequence[Kind] = KINDS,
+    odd_cameras: bool = True,
+    alive: Callable[[int], bool] = lambda number: True,
+) -> Tally:
+    """Offer so many things to mappers in turn and return what was seen; a warning counts as an exception.
 
-
-def run(frames: int, seed: int, timed_from: int = WARM, told: Callable[[str], None] = lambda line: None) -> Tally:
-    """Offer so many things to mappers in turn and return what was seen; a warning counts as an exception."""
-    maker, rng, tally = Maker(seed), np.random.default_rng(seed + 1), Tally()
-    tried, shares = all_mappers()
+    seed: one number, or one of a run and one of a batch. alive: called before each call with the number of frames so
+    far; tells whether to go on.
+    """
+    maker, rng, tally, number = Maker(seed, odd_cameras), np.random.default_rng(seed), Tally(), 0
+    tried, shares = [Tried(kind) for kind in kinds], np.array([kind.share for kind in kinds])
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        for number in range(frames):
-            one = tried[rng.choice(len(tried), p=shares)]
-            thing = thing_for(isinstance(one.mapper, GridMapper), maker, rng.random())
-            tally.frames[type(thing).__name__ if isinstance(thing, SEEN) else "nonsense"] += 1
+        warnings.simplefilter("ignore", PendingDeprecationWarning)  # NumPy's, for each matrix
+        while number < frames and alive(number):
+            one, place = tried[rng.choice(len(tried), p=shares / shares.sum())], f"{seed}, frame {number}"
             try:
-                one.add(thing, tally, number >= timed_from)
+                things = [thing_for(one.kind.grid, maker, rng.random()) for _ in range(one.kind.callers)]
+                number += len(things)
+                tally.frames.update(type(thing).__name__ if isinstance(thing, SEEN) else "nonsense" for thing in things)
+                one.add(things, tally, place, number >= timed_from)
             except Exception as error:
-                tally.bad.append(f"frame {number}: {what_happened(error)}")
-                told(tally.bad[-1])
+                tally.bad.append(f"{place}, {one.kind.name}: {what_happened(error)}")
                 one.renew()
-            if number % 10_000 == 9_999:
-                told(f"{number + 1} frames, {len(tally.bad)} crashes, {tally.slow} slow, {tally.longest_ms:.0f} ms")
     for one in tried:
-        one.renew()
+        one.close()
     return tally
+
+
+def warm_up(seed: Any, kinds: Sequence[Kind], odd_cameras: bool, alive: Callable[[int], bool]) -> None:
+    """Compile the kernels: of ordinary frames, and of some of every kind that need rare ones."""
+    for kind in kinds:
+        mapper = kind.make()
+        for camera, dtype in product(RARE, DTYPES if odd_cameras else ()):
+            alive(0)
+            depth = np.full((camera.height, camera.width), 2000 if dtype == "u2" else 2.0, dtype)
+            with suppress(ConfigError):
+                mapper.add(Frame(depth, camera, np.eye(4), depth_scale=0.001 if dtype == "u2" else 1.0))
+    run(WARM, seed, WARM, kinds, odd_cameras, alive)
 
 
 def what_happened(error: Exception) -> str:
@@ -204,18 +264,38 @@ def what_happened(error: Exception) -> str:
     return f"{type(error).__name__} {str(error)[:200]!r} ({place.filename}:{place.lineno})"
 
 
+def without(words: Iterable[str]) -> tuple[list[Kind], bool]:
+    """Return the kinds whose names hold none of the words, and whether odd cameras are drawn."""
+    kinds = [kind for kind in KINDS if not any(word in kind.name for word in words)]
+    return kinds, "odd cameras" not in set(words)
+
+
 def main() -> int:
     """Run as the command line says; return the exit status."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--frames", type=int, default=100_000)
+    from watched import Watched
+
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--frames", type=int, help="100,000 where no --seconds are given")
+    parser.add_argument("--seconds", type=float)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--batch", type=int, help="only this one, in this process")
+    left_out = "leave out kinds of mappers whose names hold it, or 'odd cameras'; repeatable"
+    parser.add_argument("--without", action="append", default=[], metavar="WORD", help=left_out)
     parser.add_argument("--json", action="store_true", help="print one JSON object on stdout")
     arguments = parser.parse_args()
     start = perf_counter()
-    tally = run(arguments.frames, arguments.seed, told=lambda line: print(line, file=sys.stderr, flush=True))
-    result = {**tally.as_dict(), "seconds": round(perf_counter() - start), "seed": arguments.seed}
+    most = arguments.frames or (100_000 if arguments.seconds is None else sys.maxsize)
+    if arguments.batch is not None:
+        kinds, odd = without(arguments.without)
+        tally, memory = run(most, [arguments.seed, arguments.batch], 0, kinds, odd), {}
+    else:
+        watched = Watched(arguments.seed, arguments.without, lambda line: print(line, file=sys.stderr, flush=True))
+        tally, memory = watched.run(most, arguments.seconds or float("inf")), watched.memory
+    seconds = perf_counter() - start
+    result = {**tally.as_dict(), **memory, "seconds": round(seconds), "seed": arguments.seed}
+    result["frames_per_s"] = round(result["frames"] / seconds)
     print(json.dumps(result) if arguments.json else "\n".join(f"{name}: {value}" for name, value in result.items()))
-    return int(bool(tally.bad or tally.slow or tally.changed_by_refused))
+    return int(tally.failed)
 
 
 if __name__ == "__main__":

@@ -9,12 +9,10 @@ from typing import Any
 import numpy as np
 
 import stereovox as sv
-from stereovox.cameras import DepthCorrection
+from random_cameras import RandomCameras
 from stereovox.frame import AnyFrame, Scan, StereoFrame
-from stereovox.geometry import from_quaternion
-from stereovox.lenses import Lens
-from stereovox.rigs import Eyes, StereoPair
-from stereovox.wide import CylindricalCamera, SphericalCamera
+from stereovox.geometry import from_quaternion, inverse
+from stereovox.rigs import VirtualCamera
 
 STRANGE = (0.0, -0.0, -1.0, np.nan, np.inf, -np.inf, 1e-30, 1e30, 1e-45, 3e38, 65535.0, 65536.0, 0.05, 2.0)
 """Numbers that are not what a sensor says, or just are."""
@@ -29,30 +27,38 @@ ODD_THINGS = (
 ODD_DTYPES = (
     ">f4", ">u2", "<f8", ">f8", "f2", "i1", "u1", "i2", "i4", "i8", "u8", "?", "c8", "c16", "O", "S3", "g", "M8[s]",
 )  # fmt: skip
-CAMERAS = 40
+DTYPES, NO_DTYPES = ("f4", "f4", "f8", "u2", "u2"), ("f2", ">f4", ">u2", "i4", "u1")
+"""Kinds of number that depth comes in, and that it must not; whole ones are millimetres."""
+ROOM_M = np.array([4.0, 3.0, 2.5])
+"""From the origin to the walls of the room that plausible images show."""
+CAMERAS = 60
+LARGE = 0.003
+"""Share of the depth images that have the size of a real camera."""
+SENSORS = ("", "", "", "left", "right", "lidar 1")
 NAMES = ("", "a.png", "two\nlines", "\udc80", "x" * 300)
 STAMP_STEPS = (33_000_000, 33_000_000, 0, -33_000_000, -(10**10), 10**18, 2**63, 0.5)
 """Nanoseconds from one frame to the next."""
 
 
 class Maker:
-    """Makes one thing after another; the same ones for the same seed."""
+    """Makes one thing after another; the same ones for the same seed. odd_cameras: see `RandomCameras`."""
 
-    def __init__(self, seed: int):
+    def __init__(self, seed: Any, odd_cameras: bool = True):
         self._rng = np.random.default_rng(seed)
         self._stamp: Any = 0
-        self._cameras = [self._any_camera() for _ in range(CAMERAS)]
-        self._pairs = [self._pair(eyes) for eyes in (False, False, True)]
+        self._shapes = RandomCameras(self._rng, odd_cameras)
+        self._cameras = [self._shapes.camera() for _ in range(CAMERAS)]
+        self._pairs = [self._shapes.pair(model) for model in (None, None, "spherical", "cylindrical")]
 
     def frame(self) -> AnyFrame:
         """Return a depth image or a stereo pair."""
-        made = self._stereo() if self._rng.random() < 0.15 else self._depth()
-        return self._spoilt(made) if self._rng.random() < 0.35 else made
+        made = self._stereo() if self._chance(0.1) else self._depth()
+        return self._spoilt(made) if self._chance(0.25) else self._same(made)
 
     def scan(self) -> Scan:
         """Return a turn of a lidar."""
         made = self._scan()
-        return self._spoilt(made) if self._rng.random() < 0.35 else made
+        return self._spoilt(made) if self._chance(0.25) else self._same(made)
 
     def nonsense(self) -> Any:
         """Return what is no frame at all."""
@@ -61,20 +67,26 @@ class Maker:
     def _one_of(self, choices: Any) -> Any:
         return choices[self._rng.integers(len(choices))]
 
-    def _rarely(self, share: float = 0.05) -> bool:
+    def _chance(self, share: float = 0.05) -> bool:
         return self._rng.random() < share
 
     def _depth(self) -> sv.Frame:
         rng, camera = self._rng, self._camera()
-        depth = rng.uniform(0.05, 6) + rng.normal(size=(camera.height, camera.width)) * self._one_of((0.0, 0.02, 1.0))
-        strange = rng.random(depth.shape) < self._one_of((0.0, 0.0, 0.1, 0.5, 1.0))
+        plausible = self._chance(0.6)
+        T = from_quaternion(rng.uniform(-1, 1, 3), rng.normal(size=4)) if plausible else self._pose()
+        depth = room_depth(camera, T) if plausible else rng.uniform(0.05, 6)
+        shape = int(camera.height), int(camera.width)
+        depth = depth + rng.normal(size=shape) * self._one_of((0.0, 0.02, 0.02 if plausible else 1.0))
+        strange = rng.random(depth.shape) < self._one_of((0.0, 0.0, 0.0, 0.1, 0.1 if plausible else 1.0))
         depth[strange] = rng.choice(STRANGE, strange.sum())
-        dtype = np.dtype(self._one_of(("f4", "f4", "f8", "u2")))
-        scale = 0.001 if dtype.kind == "u" else 1.0
+        dtype = np.dtype(self._one_of(NO_DTYPES if self._chance(0.02) else DTYPES))
+        scale = 0.001 if dtype.kind in "iu" else 1.0
         with np.errstate(all="ignore"):
             depth = (depth / scale).astype(dtype)
-        reason = rng.integers(0, 6, depth.shape, np.uint8) if self._rarely(0.2) else None
-        return sv.Frame(depth, camera, self._pose(), depth_scale=scale, reason=reason, **self._shared())
+        reason = rng.integers(0, 6, depth.shape, np.uint8) if self._chance(0.2) else None
+        farthest = self._one_of((3.0, 0.0, 1e-3, 4, np.float32(2))) if self._chance() else np.inf
+        scale = self._one_of((1, scale, np.float32(scale), np.float16(scale))) if self._chance() else scale
+        return sv.Frame(depth, camera, T, depth_scale=scale, reason=reason, farthest=farthest, **self._shared())
 
     def _stereo(self) -> StereoFrame:
         pair = self._one_of(self._pairs)
@@ -84,7 +96,7 @@ class Maker:
         ]
         colour = (3,) * int(self._rng.integers(2))
         left, right = (self._rng.integers(0, 256, size + colour, np.uint8) for size in sizes)
-        if self._rarely(0.5) and left.shape == right.shape:
+        if self._chance(0.5) and left.shape == right.shape:
             right = np.roll(left, -int(self._rng.integers(1, 9)), axis=1)
         return StereoFrame(left, right, pair, self._pose(), **self._shared())
 
@@ -101,7 +113,7 @@ class Maker:
         given = {
             name: rng.choice([*STRANGE, 2.0], beams).astype(np.float32)
             for name in ("clear", "clear_from")
-            if self._rarely(0.3)
+            if self._chance(0.3)
         }
         first = self._one_of((-2.0, -2.0, 1e9, np.nan, -1e300))
         pose, mount = (self._pose(level=True) for _ in range(2))
@@ -110,65 +122,65 @@ class Maker:
         return Scan(ranges, first, step, *limits, pose, mount, **given, **self._shared())
 
     def _shared(self) -> dict[str, Any]:
-        step = STAMP_STEPS[0] if not self._rarely(0.1) else self._one_of(STAMP_STEPS)
+        step = STAMP_STEPS[0] if not self._chance() else self._one_of(STAMP_STEPS)
         stamp = self._stamp + step
         self._stamp = stamp if isinstance(stamp, int) and 0 <= stamp < 2**62 else 0
-        fault = self._one_of(("no_pose", "unreadable", "a new one\n")) if self._rarely(0.03) else None
-        off = self._one_of((0, 0, 0, 10**7, 10**12, -1))
-        return {"stamp_ns": stamp, "name": self._one_of(NAMES), "fault": fault, "pose_off_ns": off}
+        fault = self._one_of(("no_pose", "unreadable", "a new one\n")) if self._chance(0.02) else None
+        off = self._one_of((10**7, 10**12, -1)) if self._chance() else 0
+        if self._chance() and stamp < 2**63:
+            stamp = np.int64(stamp)
+        return {
+            "stamp_ns": stamp,
+            "name": self._one_of(NAMES),
+            "fault": fault,
+            "pose_off_ns": off,
+            "sensor": self._one_of(SENSORS),
+        }
 
     def _pose(self, level: bool = False) -> Any:
         rng = self._rng
         turn = rng.normal(size=4) * ([0, 0, 1, 1] if level else [1, 1, 1, 1])
         T = from_quaternion(rng.normal(size=3) * self._one_of(PLACES), turn)
-        if self._rarely():
+        if self._chance():
             T[tuple(rng.integers(0, 4, 2))] = self._one_of(STRANGE)
-        if self._rarely():
+        if self._chance():
             with np.errstate(all="ignore"):
                 T[:3, :3] *= self._one_of((1 + 1e-4, 0.99, 2.0, 0.0, -1.0, 1e200))
         return T
 
-    def _camera(self) -> Any:
+    def _camera(self) -> VirtualCamera:
         """Return one of a few dozen cameras, for a robot has few; now and then one of them is replaced."""
+        if self._chance(LARGE):
+            return self._shapes.large()
         number = int(self._rng.integers(CAMERAS))
-        if self._rarely():
-            self._cameras[number] = self._any_camera()
+        if self._chance():
+            self._cameras[number] = self._shapes.camera()
         return self._cameras[number]
 
-    def _any_camera(self) -> Any:
-        rng = self._rng
-        width, height = int(rng.integers(1, 25)), int(rng.integers(1, 19))
-        baseline = self._one_of((None, 0.05, 1e-6, 50.0))
-        if self._rarely(0.15):
-            kind = self._one_of((SphericalCamera, CylindricalCamera))
-            return kind.from_field_of_view(width, height, rng.uniform(5, 170), rng.uniform(5, 359), baseline)
-        focal = self._one_of((20.0, 20.0, 60.0, 600.0, 1e5))
-        u, v = self._one_of((0.5, 0.5, 0.0, -3.0)) * width, self._one_of((0.5, 0.5, 0.0, 9.0)) * height
-        correction = None
-        if self._rarely(0.1):
-            correction = DepthCorrection(
-                "scale+disparity", tuple(rng.normal(size=12) * self._one_of((1e-3, 1.0, 1e30)))
-            )
-        return sv.PinholeCamera(width, height, focal, focal, u, v, baseline, correction=correction)
+    def _same(self, made: Any) -> Any:
+        """Return the frame, now and then with arrays that hold the same in another layout."""
+        if not self._chance(0.2):
+            return made
+        arrays = [field.name for field in fields(made) if isinstance(getattr(made, field.name), np.ndarray)]
+        name = self._one_of(arrays)
+        return replace(made, **{name: self._laid_out(getattr(made, name))})
 
-    def _pair(self, eyes: bool) -> StereoPair:
-        rng = self._rng
-        width, height = int(rng.integers(20, 70)), int(rng.integers(8, 40))
-        if not eyes:
-            return StereoPair(sv.PinholeCamera(width, height, 40.0, 40.0, width / 2, height / 2, 0.1))
-        lens = Lens.from_field_of_view("fisheye", width, height, 160.0)
-        T_left_right = np.eye(4)
-        T_left_right[0, 3] = 0.1
-        return StereoPair.from_eyes(Eyes(lens, lens, T_left_right), "spherical", size=(40, 30))
+    def _laid_out(self, array: np.ndarray) -> np.ndarray:
+        ways = (
+            lambda: np.asfortranarray(array), lambda: np.repeat(array, 2, axis=-1)[..., ::2],
+            lambda: self._read_only(array), lambda: array[..., ::-1].copy()[..., ::-1],
+            lambda: np.asmatrix(array) if array.ndim == 2 else array, lambda: array.view(np.recarray),
+        )  # fmt: skip
+        return self._one_of(ways)()
 
     def _spoilt(self, made: Any) -> Any:
         """Return the frame with one field replaced by what does not belong there."""
         name = self._one_of([field.name for field in fields(made)])
         old = getattr(made, name)
         new = self._one_of(ODD_THINGS)
-        if isinstance(old, np.ndarray) and not self._rarely(0.3):
+        if isinstance(old, np.ndarray) and not self._chance(0.3):
             new = self._odd_array(old)
-        elif isinstance(old, int | float) and not self._rarely(0.3):
+        elif isinstance(old, int | float) and not self._chance(0.3):
             new = self._one_of(ODD_NUMBERS)
         return replace(made, **{name: new})
 
@@ -176,10 +188,10 @@ class Maker:
         """Return an array of another kind, shape or layout; some of them mean the same."""
         ways = (
             lambda: self._of_dtype(array), lambda: self._of_dtype(array), lambda: array[:-1], lambda: array[..., None],
-            lambda: array[..., ::-1], lambda: np.asfortranarray(array), lambda: array.tolist(), lambda: array.T,
-            lambda: np.repeat(array, 2, axis=-1)[..., ::2], lambda: np.ma.masked_invalid(array.astype(float)),
-            lambda: np.broadcast_to(np.float32(2), array.shape), lambda: array.ravel(), lambda: array[:0],
-            lambda: np.zeros((1, *array.shape), array.dtype), lambda: self._read_only(array), lambda: array[:3],
+            lambda: array[..., ::-1], lambda: self._laid_out(array), lambda: array.tolist(), lambda: array.T,
+            lambda: np.ma.masked_invalid(array.astype(float)), lambda: np.broadcast_to(np.float32(2), array.shape),
+            lambda: array.ravel(), lambda: array[:0], lambda: np.zeros((1, *array.shape), array.dtype),
+            lambda: array[:3],
         )  # fmt: skip
         return self._one_of(ways)()
 
@@ -191,3 +203,14 @@ class Maker:
         array = array.copy()
         array.flags.writeable = False
         return array
+
+
+def room_depth(camera: VirtualCamera, T_world_camera: np.ndarray) -> np.ndarray:
+    """Return the depth (height, width) in metres of the walls of a room about the origin, seen by a camera in it."""
+    columns, rows = camera.rays()
+    shape = len(rows), len(columns)
+    across, down, ahead = np.broadcast_to(columns, shape), *(np.broadcast_to(row[:, None], shape) for row in rows.T)
+    directions = np.stack([across, down, ahead], axis=-1) @ inverse(T_world_camera)[:3, :3]
+    with np.errstate(all="ignore"):
+        walls = (np.sign(directions) * ROOM_M - T_world_camera[:3, 3]) / directions
+    return np.nanmin(np.where(directions == 0, np.inf, walls), axis=-1)

@@ -141,7 +141,10 @@ def said(way, frame):
     """Return {block: (512,) evidence} of a frame on one way."""
     evidence = way.integrator.evidence(way.depth.image(way.depth.matched(frame)))
     found = {tuple(c): v.astype(int) for c, v in zip(evidence.coords.tolist(), evidence.values.copy(), strict=True)}
-    return {**found, **{tuple(c): np.full(512, v) for c, v in zip(evidence.uniform.tolist(), evidence.uniform_values, strict=True)}}
+    return {
+        **found,
+        **{tuple(c): np.full(512, v) for c, v in zip(evidence.uniform.tolist(), evidence.uniform_values, strict=True)},
+    }
 
 
 @pytest.mark.parametrize("integrator", ["projective", "ray"])

@@ -107,6 +107,15 @@ def test_through_the_sphere_a_wall_stays_where_it_is(camera):
     assert (sphere.camera.height, sphere.camera.width) == sphere.depth_m.shape
 
 
+def test_the_narrowest_pixels_make_a_camera_that_can_be():
+    """A pixel of a millionth of a radian, of 1000 sensor pixels, goes 3e7 times into a step of 2 degrees."""
+    eye = SphericalCamera(4, 3, 1e-6, 1e-6, 1.5, 1.0, baseline=0.05, binning=1000)
+    image = DepthImage(np.full((3, 4), 2.0, np.float32), np.zeros((3, 4), np.uint8), eye, np.eye(4))
+    camera = through_sphere(image, load_config(**{"sphere.step_deg": 2.0})).camera
+    assert camera.binning == 1_000_000
+    assert camera.focal_px * camera.baseline == pytest.approx(eye.focal_px * eye.baseline)
+
+
 def test_through_the_sphere_nothing_is_cleared_that_the_image_does_not_clear():
     """All pixels TOO_FAR but a block of unmatched ones: free cells end within the image's own."""
     config, camera = settings(3.0), PinholeCamera.from_field_of_view(160, 90, 91, 0.15)

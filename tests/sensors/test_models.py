@@ -62,6 +62,12 @@ def test_valenti_half_height_widths_agree(z_measured, sigma, p_unknown):
     assert model.probability(z_measured, z_measured, sigma) == pytest.approx(p_unknown + a)
 
 
+@pytest.mark.filterwarnings("error")
+def test_valenti_knows_nothing_where_noise_is_larger_than_the_range():
+    z = np.array([-1.0, 0.0, 1e-3, 1.0])
+    assert model_of("valenti").probability(z, 0.0, 800.0) == pytest.approx(0.5, abs=1e-6)
+
+
 def test_valenti_as_printed_for_one_half():
     sigma, a = 0.1, 0.75 * 0.5 * np.exp(-0.1)
     printed = sigma * np.sqrt(np.log(1 + a / (a + 1 - 2 * 0.3)) / np.log(2))
@@ -189,6 +195,14 @@ def test_table_holds_the_model():
     assert table.log_odds[row, column] == pytest.approx(np.log(p / (1 - p)))
     assert np.abs(offset_sigma()).max() < REACH_SIGMA
     assert (np.abs(offset_sigma()) > 0).all()
+
+
+@pytest.mark.parametrize("name", ["stereo", "valenti"])
+def test_noise_beyond_the_range_makes_no_longer_rays(name):
+    found, most = (tabulate(model_of(name), RangeNoise(s0, 0, 0), 5.0) for s0 in (1e9, 5.0))
+    np.testing.assert_array_equal(found.sigma, most.sigma)
+    np.testing.assert_array_equal(found.log_odds, most.log_odds)
+    assert found.sigma.max() == 5.0
 
 
 def test_prior_is_not_counted_twice():

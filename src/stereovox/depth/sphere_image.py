@@ -22,6 +22,8 @@ T_BODY_GRID: Transform = np.array([[0.0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 0], 
 T_BODY_OPTICAL: Transform = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """From the optical frame of a camera that looks ahead (x right, y down, z forward) to the body's."""
 T_OPTICAL_GRID: Transform = inverse(T_BODY_OPTICAL) @ T_BODY_GRID
+MAX_BINNING, MAX_BASELINE_M = 1_000_000, 1e6
+"""What a grid's camera counts up to: that of an eye with the narrowest of pixels is beyond what a camera can be."""
 
 
 def frame_of(grid: SphereGrid, T_world_body: Transform, max_range: float, name: str = "sphere") -> Frame:
@@ -80,8 +82,9 @@ def _image_of(layout: SphereLayout, eye: VirtualCamera | None) -> tuple[slice, S
     cv = -float(layout.azimuth()[0]) / step
     binning, baseline = 1, None
     if eye is not None:
-        binning = max(1, round(eye.focal_px * step))
-        baseline = eye.baseline and eye.baseline * eye.focal_px * step / binning  # focal length times baseline is kept
+        binning = min(max(1, round(eye.focal_px * step)), MAX_BINNING)
+        kept = eye.focal_px * step / binning  # focal length times baseline is
+        baseline = eye.baseline and min(eye.baseline * kept, MAX_BASELINE_M)
     camera = SphericalCamera(
         last - first, layout.azimuths, step, step, cu, cv, baseline, binning, subpixel=eye.subpixel if eye else None
     )

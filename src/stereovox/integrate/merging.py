@@ -21,7 +21,12 @@ def strongest(parts: Sequence[Evidence]) -> Evidence:
     if len(parts) == 1:
         return parts[0]
     if not parts:
-        return Evidence(np.empty((0, 3), np.int32), np.empty((0, CELLS), np.int16), np.empty((0, 3), np.int32), np.empty(0, np.int16))
+        return Evidence(
+            np.empty((0, 3), np.int32),
+            np.empty((0, CELLS), np.int16),
+            np.empty((0, 3), np.int32),
+            np.empty(0, np.int16),
+        )
     pool = BlockPool(np.int16, capacity=max(1, sum(len(part.coords) + len(part.uniform) for part in parts)))
     free, free_values, shared = _alone(parts)
     for part, both in zip(parts, shared, strict=True):

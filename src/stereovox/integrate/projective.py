@@ -8,6 +8,8 @@ stay, small holes do not matter, and the outcome is what exact ray casting gives
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,7 +18,7 @@ from stereovox.config import Config
 from stereovox.frame import DepthImage
 from stereovox.integrate import _cull, _evaluate
 from stereovox.integrate._cells import NEAR_PLANE, NO_RETURN
-from stereovox.integrate.faces import cut, faces_of
+from stereovox.integrate.faces import Face, cut, faces_of
 from stereovox.integrate.hits import HitFinder
 from stereovox.integrate.merging import strongest
 from stereovox.integrate.per_camera import PerCamera
@@ -25,6 +27,7 @@ from stereovox.integrate.windows import WindowBuilder, Windows
 from stereovox.maps.blocks import CELLS
 from stereovox.maps.evidence import Evidence
 from stereovox.sensors import make_sensor
+from stereovox.sensors.model import InverseSensorModel
 from stereovox.shards import in_shards, shards, together
 
 ROOM = 4096
@@ -39,12 +42,8 @@ class Projective:
     def __init__(self, config: Config):
         self._config = config
         sensor = make_sensor(config.sensor)
-
-        def eye(camera: PinholeCamera, rim_share: float) -> _Eye:  # knows no `self`, which would keep itself alive
-            return _Eye(camera, sensor_table(sensor, config, camera), config, rim_share)
-
-        self._eyes = PerCamera(lambda camera: eye(camera, RIM_SHARE))
-        self._faces = PerCamera(lambda camera: [(face, eye(face.camera, 0.0)) for face in faces_of(camera, config)])
+        self._eyes = PerCamera(partial(_eye, sensor, config))  # knows no `self`, which would keep itself alive
+        self._faces = PerCamera(partial(_eyes_of_faces, sensor, config))
 
     def evidence(self, image: DepthImage) -> Evidence:
         """Return what `image` says about the cells it sees; that of a wide camera is cut into pinhole images."""
@@ -78,6 +77,14 @@ class Projective:
         _evaluate.passed(view, eye.table, free, free_values)
         origin = eye.views.block
         return Evidence(mixed + origin, values, free + origin, free_values)
+
+
+def _eye(sensor: InverseSensorModel, config: Config, camera: PinholeCamera, rim_share: float = RIM_SHARE) -> _Eye:
+    return _Eye(camera, sensor_table(sensor, config, camera), config, rim_share)
+
+
+def _eyes_of_faces(sensor: InverseSensorModel, config: Config, camera: WideCamera) -> list[tuple[Face, _Eye]]:
+    return [(face, _eye(sensor, config, face.camera, 0.0)) for face in faces_of(camera, config)]
 
 
 class _Eye:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from math import ceil
 from typing import ClassVar, NamedTuple
 
@@ -31,6 +32,7 @@ from stereovox.maps.blocks import CELLS, BlockPool
 from stereovox.maps.evidence import Evidence
 from stereovox.rigs import VirtualCamera
 from stereovox.sensors import make_sensor
+from stereovox.sensors.model import InverseSensorModel
 from stereovox.shards import in_shards, shards
 
 MAX_CELL_PX = 512
@@ -45,7 +47,8 @@ class _Eye(NamedTuple):
     scratch: list[tuple[Lanes, Memory]]
 
 
-def _eye(camera: VirtualCamera, table: KernelTable, config: Config) -> _Eye:
+def _eye(sensor: InverseSensorModel, config: Config, camera: VirtualCamera) -> _Eye:
+    table = sensor_table(sensor, config, camera)
     wide = uses_wide_keys(camera, config.max_range + (float(table.reach[-1]) if table.marks else 0), config)
     scratch = [(make_lanes(wide), make_memory()) for _ in range(config.threads)]
     return _Eye(table, (table.clear + table.mark).ravel(), scratch)
@@ -65,7 +68,7 @@ class Ray:
         sensor = make_sensor(config.sensor)
         self._config = config
         self._pools = [BlockPool(np.int32, capacity=8192) for _ in range(config.threads)]
-        self._eyes = PerCamera(lambda camera: _eye(camera, sensor_table(sensor, config, camera), config))
+        self._eyes = PerCamera(partial(_eye, sensor, config))
 
     def evidence(self, image: DepthImage) -> Evidence:
         """Return what `image` says about the cells its rays cross."""

@@ -17,7 +17,8 @@ from stereovox.maps import State, VoxelMap
 from stereovox.maps.blocks import CELLS, SIDE
 from stereovox.maps.cell_format import CellRules
 from stereovox.maps.voxel_map import INDEX_LIMIT, cells_where
-from stereovox.products.side_by_side import cells_at, put_times
+from stereovox.products import _moved
+from stereovox.products.side_by_side import cells_at, in_memory, put_times
 
 PIECE = 512
 """Blocks looked at together."""
@@ -25,6 +26,10 @@ RIGID = 1e-3
 """Largest entry of |R^T R - I| that still passes for rounding."""
 NEAR = 1e-6
 """Cells by which a place may miss the face it stands on for all its digits."""
+TOUCHING = 2e-5
+"""Share of a cell by which two may overlap for all their digits and yet only touch."""
+PARALLEL = 1e-6
+"""Sine of the angle between edges so parallel that they have no direction in common that tells boxes apart."""
 
 
 @one_state
@@ -32,23 +37,29 @@ def moved(voxel_map: VoxelMap, T_a_b: ArrayLike) -> VoxelMap:
     """Return what a map in frame b says in frame a, in cells of the same size; T_a_b (4, 4) maps b into a.
 
     A cell gets the log-odds and the time of the cell that its middle lies in. Where the motion maps cells onto cells
-    (whole cells, quarter turns) that is exact. Where it does not, middles may miss a thin thing: so a cell also gets
-    the log-odds of any cell that is occupied or tentative and whose middle lies in it, if they are higher. Nothing
-    occupied is lost; things may become one cell thicker. Raises StereovoxError where T_a_b is no rigid motion, or leads
-    too far away.
+    (whole cells, quarter turns) that is exact. Where it does not, nothing occupied, tentative or unknown becomes free:
+
+    - a cell also gets the log-odds of any cell that is occupied or tentative and whose middle lies in it, if they are
+      higher: so whatever is occupied stays so, in at least one cell;
+    - one that would be free after that, but overlaps an occupied or tentative cell, is tentative. What speaks for an
+      obstacle in the cells it overlaps counts by its share of the cell;
+    - one that would be free, but overlaps an unknown cell, is unknown.
+
+    Raises StereovoxError where T_a_b is no rigid motion, or leads too far away.
     """
-    T = rigid(T_a_b)
-    there, blocks = VoxelMap(voxel_map.config), _reached(voxel_map, T)
+    T, voxel_map = rigid(T_a_b), in_memory(voxel_map)
+    there, blocks, pushed = VoxelMap(voxel_map.config), _reached(voxel_map, T), _pushed(voxel_map, T)
     for start in range(0, len(blocks), PIECE):
         coords = blocks[start : start + PIECE]
         points = transform_points(inverse(T), there.centers(_cells_of(coords)))
         cells = _stored_at(voxel_map, points).reshape(-1, CELLS)
+        cells = higher(cells, cells_at(pushed, coords), there.cell_format.unknown)
+        _doubt(voxel_map, T, coords, cells)
         known = (cells != there.cell_format.unknown).any(axis=1)
         there.insert(coords[known], cells[known])
         if there.config.map.keep_times:
-            times = voxel_map.times_at(points).reshape(-1, CELLS)
+            times = np.maximum(voxel_map.times_at(points).reshape(-1, CELLS), pushed.times_of(coords))
             there.set_times(coords[known], times[known], voxel_map.times_start_ns)
-    _raise_to(there, _pushed(voxel_map, T))
     path = _moved_path(voxel_map.history.path, T)
     there.history = replace(voxel_map.history.copied(), trusted={}, waiting={}, path=path)  # no pose of frame b is left
     if voxel_map.viewpoint is not None:
@@ -79,12 +90,30 @@ def higher(mine: NDArray[np.integer], cells: NDArray[np.integer], unknown: int) 
     return np.where(cells == unknown, mine, known)
 
 
-def _raise_to(there: VoxelMap, solid: VoxelMap) -> None:
-    for coords, cells in solid.slabs():
-        times = there.times_of(coords) if there.config.map.keep_times else None
-        there.insert(coords, higher(cells_at(there, coords), cells, there.cell_format.unknown))
-        if times is not None:
-            there.set_times(coords, np.maximum(times, solid.times_of(coords)), solid.times_start_ns)
+def _doubt(voxel_map: VoxelMap, T: Transform, coords: NDArray[np.int32], cells: NDArray[np.integer]) -> None:
+    """Change those of `cells` (n, 512) of blocks (n, 3) in frame a that are free but overlap what is not in frame b."""
+    rules, sides, R_b_a = CellRules(voxel_map.config.map), np.array(voxel_map.config.cell), inverse(T)[:3, :3]
+    corners = transform_points(inverse(T), coords * (SIDE * sides)) / sides
+    low = np.floor(corners).astype(np.int32)
+    axes, reach = _separating_axes(R_b_a, sides)
+    arrays = R_b_a * sides / sides[:, None], axes, reach, corners - low
+    turn, axes, reach, rest = (array.astype(np.float32) for array in arrays)
+    _moved.doubt(voxel_map.stored_cells, rules.thresholds, rules.prior, turn, axes, reach, low, rest, cells)
+
+
+def _separating_axes(
+    R_b_a: NDArray[np.float64], sides: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the directions (n, 3) that tell cells of both frames apart, and from how far apart their middles are (n,).
+
+    Both in cells of frame b, whose cells are 1 wide along each direction: those of the edges in both frames and what is
+    normal to an edge of each, but for edges that are parallel.
+    """
+    normals = np.cross(np.eye(3)[:, None], R_b_a.T).reshape(9, 3)
+    axes = np.concatenate([np.eye(3), R_b_a.T, normals[np.linalg.norm(normals, axis=1) > PARALLEL]]) * sides
+    axes /= np.abs(axes).sum(axis=1, keepdims=True)
+    widths = np.abs(axes / sides @ (R_b_a * sides)).sum(axis=1)
+    return axes, (1 + widths) / 2 - TOUCHING
 
 
 def _pushed(voxel_map: VoxelMap, T: Transform) -> VoxelMap:

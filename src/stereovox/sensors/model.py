@@ -81,12 +81,13 @@ def tabulate(
 ) -> SensorTable:
     """Return `model` as a table for measured depths up to `max_range` metres and cells of `voxel_size` metres.
 
-    Evidence is log(p / (1 - p)) less that of p_unknown (Valenti 2018, Eq 6.2: the prior is not counted twice).
-    Where poses are noisy a hit is as wide as they and the range noise make it together.
+    Evidence is log(p / (1 - p)) less that of p_unknown (Valenti 2018, Eq 6.2: the prior is not counted twice). Noise
+    counts up to `max_range`, so that no ray is followed farther than 1 + REACH_SIGMA times as far. Where poses are
+    noisy a hit is as wide as they and the range noise make it together.
     Raises ConfigError when the model leaves (0, 1), or does not come to p_free and p_unknown far off.
     """
     z_measured: Array = (np.arange(ROWS, dtype=float) + 0.5) * (max_range / ROWS)
-    sigma = np.maximum(noise.sigma(z_measured), 1e-6)
+    sigma = np.clip(noise.sigma(z_measured), 1e-6, max_range)  # one that is noisier could be anywhere, too
     z = z_measured[:, None] + offset_sigma() * sigma[:, None]
     _check_ends(model, z_measured, sigma)
     log_odds = _log_odds(model, model.probability(z, z_measured[:, None], sigma[:, None]))

@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Batches of random frames in a process of their own: one that dies or hangs is noted and replaced by another."""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import resource
+import signal
+from collections.abc import Callable, Sequence
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+from pathlib import Path
+from time import monotonic
+from typing import Any
+
+from frames import BATCH, Tally, run, warm_up, without
+
+HUNG_S = 60.0
+"""Seconds after which a call that has not come back never will."""
+MEMORY = 4 << 30
+"""Bytes that a batch may take."""
+LOOKS_S = 1.0
+PR_SET_PDEATHSIG = 1
+
+
+class Watched:
+    """Runs batches, one after the other, until there were enough frames or the time is over.
+
+    memory: MB after the first batch and after the last, without what the allocator keeps for later: glibc gives arrays
+    of up to 32 MB out of its heap once some of that size were freed, and holes in it stay with the process.
+    """
+
+    def __init__(self, seed: int, words: Sequence[str], told: Callable[[str], None]):
+        self.memory: dict[str, Any] = {}
+        self._known: set[str] = set()
+        self._seed, self._words, self._told = seed, list(words), told
+        self._context = get_context("spawn")  # forked threads of the kernels would hang
+        self._number, self._since = self._context.Value("q", 0), self._context.Value("d", 0.0)
+
+    def run(self, frames: int, seconds: float) -> Tally:
+        """Return what was seen."""
+        tally, batch, until = Tally(), 0, monotonic() + seconds
+        while batch * BATCH < frames and monotonic() < until:
+            batch = self._batches(tally, batch, frames, until)
+        return tally
+
+    def _batches(self, tally: Tally, batch: int, frames: int, until: float) -> int:
+        """Run batches in a new process for as long as it lives; return the number of the next one."""
+        mine, theirs = self._context.Pipe()
+        task = self._seed, self._words, batch, frames, until
+        self._since.value = float("inf")  # until the first call
+        process = self._context.Process(target=_work, args=(theirs, self._number, self._since, *task), daemon=True)
+        process.start()
+        theirs.close()
+        try:
+            while True:
+                if mine.poll(LOOKS_S):
+                    seen, megabytes = mine.recv()
+                    tally.join(seen)
+                    self.memory = {"memory_mb": [*self.memory.get("memory_mb", [megabytes])[:1], megabytes]}
+                    self._tell(batch, seen, tally, megabytes)
+                    batch += 1
+                elif monotonic() - self._since.value > HUNG_S:
+                    return self._lost(tally.hung, batch, f"no answer for {HUNG_S:.0f} s")
+        except EOFError:  # it is over, or it died
+            process.join()
+            if process.exitcode:
+                return self._lost(tally.bad, batch, f"the process ended with {process.exitcode}")
+            return batch
+        finally:
+            process.kill()
+            process.join()
+
+    def _lost(self, lines: list[str], batch: int, what: str) -> int:
+        lines.append(f"[{self._seed}, {batch}], frame {self._number.value}: {what}")
+        self._told(lines[-1])
+        return batch + 1
+
+    def _tell(self, batch: int, seen: Tally, tally: Tally, megabytes: float) -> None:
+        """Say how it goes, and each thing that went wrong once."""
+        for line in seen.bad:
+            what = line.partition(": ")[2]
+            if what not in self._known:
+                self._known.add(what)
+                self._told(line)
+        longest = tally.slowest[0][0] if tally.slowest else 0.0
+        self._told(
+            f"batch {batch}: {sum(tally.frames.values())} frames, {len(tally.bad)} crashes, {len(tally.hung)} hangs, "
+            f"{tally.slow} slow, {longest:.0f} ms, {megabytes:.0f} MB"
+        )
+
+
+def _work(
+    tell: Connection, number: Any, since: Any, seed: int, words: Sequence[str], batch: int, frames: int, until: float
+) -> None:
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)  # else one that hangs would outlive its parent
+    resource.setrlimit(resource.RLIMIT_DATA, (MEMORY, MEMORY))
+    kinds, odd = without(words)
+
+    def alive(now: int) -> bool:
+        number.value, since.value = now, monotonic()
+        return now % 100 > 0 or monotonic() < until
+
+    warm_up([seed, batch, 0], kinds, odd, alive)
+    while batch * BATCH < frames and monotonic() < until:
+        seen = run(min(BATCH, frames - batch * BATCH), [seed, batch], 0, kinds, odd, alive)
+        since.value = float("inf")
+        tell.send((seen, _megabytes()))
+        batch += 1
+
+
+def _megabytes() -> float:
+    gc.collect()
+    ctypes.CDLL(None).malloc_trim(0)
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * resource.getpagesize() / 1e6

@@ -26,7 +26,7 @@ def denoise(depth_m, noise, fine, widths, limit, low, high, raw, once):
     limit: the same in metres, where that is less. low, high: results are kept within these depths. raw, once: scratch,
     (RING, w + 2 RADIUS), inverse depths of the rows that are needed: measured, and after the first pass.
     """
-    height, width = depth_m.shape
+    height = depth_m.shape[0]
     raw[:, :] = NONE
     once[:, :] = NONE
     for v in range(height + 2 * RADIUS):

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """What becomes of poles and wires of 0.3 to 4 pixels: stereovox and OctoMap on the same frames.
 
-    python benchmarks/thin.py [--sweep | --cases] [--seeds 3] [--voxel-size 0.1] [--set key=value ...] [--json]
+    python benchmarks/thin.py [--sweep] [--seeds 3] [--only WORDS] [--alone] [--set key=value ...] [--json]
                               [--picture thin.png]
 
 A pole stands before a wall, or before nothing, and a simulated camera looks at it while it stands, flies or turns.
 `lost`: share of the layers of cells along the pole, as far as it was seen, without one occupied cell that the pole
-touches. `free`: share of the cells that the pole touches and the map calls free. Truth is exact: the pole is a cylinder.
+touches. `free`: share of the cells that the pole touches and the map calls free. Truth is exact, a cylinder.
 """
 
 from __future__ import annotations
@@ -15,12 +15,14 @@ import argparse
 import json
 from dataclasses import dataclass, replace
 from math import cos, radians, sin
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stereovox import Frame, Mapper, PinholeCamera
+from stereovox.config import parse_value
 from stereovox.frame import Reason
 
 HZ = 30
@@ -79,7 +81,6 @@ class Scene:
 
 def pose(scene: Scene, i: int, random: np.random.Generator) -> NDArray[np.float64]:
     """Return T_world_camera (4, 4) of frame `i`: the world's x is forward, y left, z up; the pole's foot at (0, 0)."""
-    t = i / HZ
     phase = 2 * i / max(scene.frames - 1, 1) - 1  # -1 to 1 over the run
     place, yaw, pitch = np.array([-scene.distance, 0.0123, 0.0077]), 0.0, 0.0
     if scene.motion == "sideways":
@@ -99,7 +100,6 @@ def pose(scene: Scene, i: int, random: np.random.Generator) -> NDArray[np.float6
         place[1] = 0.0
     elif scene.motion != "still":
         raise ValueError(f"motion '{scene.motion}' is none of {MOTIONS}")
-    del t
     level = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
     T = np.eye(4)
     T[:3, :3] = rotation(yaw, pitch) @ level
@@ -298,40 +298,85 @@ CASES: dict[str, tuple[Scene, float, dict[str, Any]]] = {
 }
 
 
+def compared(
+    scene: Scene, voxel_size: float, seeds: range, peer: bool = True, **settings: Any
+) -> dict[str, dict[str, float]]:
+    """Return the mean scores of both libraries, by name, on the same frames of a scene."""
+    found: dict[str, list[Found]] = {"stereovox": [], "octomap": []}
+    for seed in seeds:
+        frames = frames_of(scene, seed)
+        found["stereovox"].append(
+            judged(with_stereovox(scene, frames, voxel_size, **settings), scene, seed, voxel_size)
+        )
+        if peer:
+            found["octomap"].append(judged(with_octomap(scene, frames, voxel_size), scene, seed, voxel_size))
+    return {
+        who: {key: float(np.mean([getattr(one, key) for one in some])) for key in ("lost", "free", "wall")}
+        for who, some in found.items()
+        if some
+    }
+
+
+def sweep() -> dict[str, tuple[Scene, float, dict[str, Any]]]:
+    """Return poles of 0.3 to 4 pixels under all noises, motions and backgrounds, by both integrators."""
+    scenes = {
+        f"{pixels} px, {noise}, {motion}, {background}": (
+            px(pixels, width=424, noise=noise, motion=motion, gap=gap), 0.1, {},
+        )
+        for pixels in (0.3, 0.5, 1, 2, 4)
+        for noise in NOISES
+        for motion in MOTIONS
+        for background, gap in BACKGROUNDS.items()
+    }  # fmt: skip
+    rays = {f"{name}, ray": (scene, size, {"integrator": "ray"}) for name, (scene, size, _) in scenes.items()}
+    return {**scenes, **rays}
+
+
+def draw(rows: dict[str, dict[str, dict[str, float]]], path: Path) -> None:
+    """Draw lost and free shares of both libraries, a line a case."""
+    from stereovox.view.charts import blank, labels, png_of
+
+    figure = blank(9, 1.5 + 0.28 * len(rows))
+    charts = figure.subplots(1, 2, sharey=True)
+    at = np.arange(len(rows))
+    for chart, key in zip(charts, ("lost", "free"), strict=True):
+        for shift, who in ((-0.2, "stereovox"), (0.2, "octomap")):
+            shares = [100 * row.get(who, {}).get(key, np.nan) for row in rows.values()]
+            chart.barh(at + shift, shares, 0.38, label=who)
+        chart.set_yticks(at, list(rows), fontsize=7)
+        chart.set_xlim(0, 100)
+        labels(chart, f"{key}, per cent", "")
+    charts[0].invert_yaxis()
+    charts[1].legend(frameon=False, fontsize=8)
+    figure.tight_layout()
+    path.write_bytes(png_of(figure, 120))
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--sweep", action="store_true", help="all sizes, noises, motions, backgrounds: takes hours")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--only", default="", help="cases whose name holds this")
+    parser.add_argument("--alone", action="store_true", help="without OctoMap")
     parser.add_argument("--set", action="append", default=[], metavar="key=value")
     parser.add_argument("--json", action="store_true")
+    parser.add_argument("--picture", type=Path)
     wanted = parser.parse_args()
-    from stereovox.config import parse_value
-
     overrides = {key: parse_value(value) for key, _, value in (one.partition("=") for one in wanted.set)}
+    seeds = range(wanted.first_seed, wanted.first_seed + wanted.seeds)
     rows = {}
-    for name, (scene, voxel_size, settings) in CASES.items():
+    for name, (scene, voxel_size, settings) in (sweep() if wanted.sweep else CASES).items():
         if wanted.only not in name:
             continue
-        ours, theirs = [], []
-        for seed in range(wanted.first_seed, wanted.first_seed + wanted.seeds):
-            frames = frames_of(scene, seed)
-            ours.append(
-                judged(with_stereovox(scene, frames, voxel_size, **settings, **overrides), scene, seed, voxel_size)
-            )
-            theirs.append(judged(with_octomap(scene, frames, voxel_size), scene, seed, voxel_size))
-        rows[name] = {
-            who: {key: float(np.mean([getattr(one, key) for one in found])) for key in ("lost", "free", "wall")}
-            for who, found in (("stereovox", ours), ("octomap", theirs))
-        }
+        rows[name] = compared(scene, voxel_size, seeds, not wanted.alone, **{**settings, **overrides})
         if not wanted.json:
-            a, b = rows[name]["stereovox"], rows[name]["octomap"]
-            print(
-                f"{name:30} {scene.pixels:5.2f} px  lost {a['lost']:6.1%} ({b['lost']:6.1%})  free {a['free']:6.1%} ({b['free']:6.1%})  wall {a['wall']:.2f} ({b['wall']:.2f})",
-                flush=True,
-            )
+            shown = (f"{who}: lost {row['lost']:6.1%} free {row['free']:6.1%}" for who, row in rows[name].items())
+            print(f"{name:32} {scene.pixels:5.2f} px ", *shown, sep="  ", flush=True)
     if wanted.json:
         print(json.dumps(rows))
+    if wanted.picture:
+        draw(rows, wanted.picture)
 
 
 if __name__ == "__main__":

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,7 +82,7 @@ def check_numbers(camera: object, **kinds: str) -> None:
         if not isinstance(value, int | float) or not low <= value <= high:
             raise StereovoxError(f"camera {camera}: {name} must be a number from {low:g} to {high:g}")
         object.__setattr__(camera, name, int(value) if kind == "binning" else float(value))
-    sizes = [_plain(getattr(camera, name)) for name in ("width", "height")]
+    sizes: list[Any] = [_plain(getattr(camera, name)) for name in ("width", "height")]
     if not all(isinstance(n, int | float) and 1 <= n <= MAX_PIXELS and n == int(n) for n in sizes):
         raise StereovoxError(f"camera {camera}: width and height must be whole numbers of pixels")
     if sizes[0] * sizes[1] > MAX_PIXELS:

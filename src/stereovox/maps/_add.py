@@ -62,8 +62,8 @@ def make_rows(table, coords, values, count, wanted, unknown, lowest, rows):
 def add(values, rows, start, stop, steps, uniform_steps, same, unknown, prior, lowest, highest, floored):
     """Add the evidence of blocks `start` to `stop`; return how many cells changed.
 
-    All numbers are int16: steps (n, 512), uniform_steps (m,), and `same` (512,), scratch. `floored` (n + m,) is set to 1
-    for blocks whose cells are all at the floor now.
+    All numbers are int16: steps (n, 512), uniform_steps (m,), and `same` (512,), scratch. `floored` (n + m,) is set to
+    1 for blocks whose cells are all at the floor now.
     """
     changed, n = 0, steps.shape[0]
     for i in range(start, stop):

@@ -130,7 +130,7 @@ class CellPool:
         steps: NDArray[np.int16],
         threads: int,
     ) -> int:
-        """Add `values` (n, 512) to blocks `coords` (n, 3), and `steps` (m,), negative, to all cells of `uniform` (m, 3).
+        """Add `values` (n, 512) to blocks `coords` (n, 3), and `steps` (m,) to the cells of `uniform` (m, 3).
 
         In differences of stored numbers; no block is named twice. Returns the number of cells that changed.
         """

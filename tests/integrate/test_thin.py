@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Poles of half a pixel to three pixels stay: a short form of `benchmarks/thin.py`, without OctoMap."""
+
+import pytest
+from thin import Scene, compared, px
+
+CASES = {
+    "half a pixel, exact": (px(0.5, width=640), 0.05, {}),
+    "half a pixel, tilted": (px(0.5, width=424, tilt_deg=20.0), 0.05, {}),
+    "shaken poses": (px(1.0, width=640, pose_noise=(0.010, 0.3)), 0.05, {}),
+    "noise": (px(1.0, width=848, noise="d435"), 0.05, {}),
+    "two sigma before a wall": (Scene(0.030, 4.6, 0.2, 848, "d435"), 0.1, {}),
+    "one sigma before a wall": (Scene(0.013, 4.6, 0.2, 320, "d435"), 0.1, {}),
+    "rays": (px(1.0, width=320, frames=24), 0.1, {"integrator": "ray"}),
+    "nearer than the camera sees": (Scene(0.020, 1.5, 2.0, 424, "d435", "approach", nearest=0.3), 0.05, {}),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_thin_pole_stays(name):
+    scene, voxel_size, settings = CASES[name]
+    found = compared(scene, voxel_size, range(11, 13), peer=False, **settings)["stereovox"]
+    assert found["lost"] <= 0.01
+
+
+@pytest.mark.parametrize(
+    ("name", "broken"),
+    [
+        ("half a pixel, exact", {"sensor.passes": 1.0}),
+        ("rays", {"ray.update": "every"}),
+        ("nearer than the camera sees", {"blind_range": 0.0}),
+    ],
+)
+def test_and_is_lost_or_called_free_without_what_keeps_it(name, broken):
+    scene, voxel_size, settings = CASES[name]
+    kept, lost = (
+        compared(scene, voxel_size, range(11, 13), peer=False, **{**settings, **more})["stereovox"]
+        for more in ({}, broken)
+    )
+    assert lost["lost"] + lost["free"] > kept["lost"] + kept["free"] + 0.2

@@ -62,7 +62,7 @@ def ladder(config: Config) -> list[Way]:
             f"pace.near_share {config.pace.near_share:g}: leaves nothing between min_range {config.min_range:g} and "
             f"{near:g} m; raise it"
         )
-    short = config.model_copy(update={"max_range": cleared})
+    short = config.model_copy(update={"max_range": cleared, "blind_range": config.blind})
     halved = config.model_copy(update={"stereo": config.stereo.model_copy(update={"halve": True})})
     return [
         full(config),

@@ -44,7 +44,7 @@ def test_tells_what_is_near_and_draws_it(tmp_path, capsys):
 
 
 def test_a_depth_camera_looks_ahead(capsys):
-    status, said = run(capsys, "sim:wall?distance=2&image_width=106", "--frames", ":2", "--json", "--step", "5")
+    status, said = run(capsys, "sim:wall?distance=2&image_width=212", "--frames", ":2", "--json", "--step", "5")
     assert status == 0
     sights = json.loads(said.out.splitlines()[-1])["directions"]
     assert sights["front"]["range_m"] == pytest.approx(2, abs=0.15)

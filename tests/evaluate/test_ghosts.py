@@ -27,7 +27,7 @@ def test_ghosts_are_gone_within_half_a_second(background):
     assert told["cleared"] == 1
     assert told["gone_longest_s"] <= 0.5  # promised; it takes 0.3 s
     assert told["free_longest_s"] <= 0.7  # by then tentative for a while: what clears faster loses thin poles
-    assert told["after_leaving_s"] <= 0.2
+    assert told["after_leaving_s"] <= 0.5
     assert found.left == found.unseen < 60  # only what stands at the border of the image, where no frame sees through
     assert found.number.max() > 20
     assert not found.number[-30:].any()
@@ -55,7 +55,7 @@ def test_figures_fail_where_clearing_or_keeping_breaks():
     frames = [source.frame(i) for i in range(len(source))]
     slow = ghosts(source, frames, voxel_size=0.1, **{"sensor.p_free": 0.48})
     assert slow.as_dict()["gone_longest_s"] > 0.5
-    eager = ghosts(source, frames, voxel_size=0.1, **{"sensor.p_free": 0.05})
+    eager = ghosts(source, frames, voxel_size=0.1, **{"sensor.p_free": 0.05, "sensor.passes": 1.0})
     assert eager.pole_lost > 0.2
 
 

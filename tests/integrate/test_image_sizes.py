@@ -78,7 +78,7 @@ def test_a_wide_image_that_is_too_fine_for_cells_is_refused_by_rays_in_one_line(
     depth = np.full((64, 64), 2.0, np.float32)
     image = DepthImage(depth, np.full(depth.shape, Reason.VALID, np.uint8), camera, LOOKS_ALONG_X)
     with pytest.raises(FrameRefused, match="use integrator projective or ray") as caught:
-        make_integrator(sv.load_config(integrator="ray", voxel_size=0.5)).evidence(image)
+        make_integrator(sv.load_config(integrator="ray", voxel_size=0.5, **{"ray.update": "every"})).evidence(image)
     assert caught.value.reason == "bad_camera"
 
 

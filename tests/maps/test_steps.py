@@ -19,7 +19,14 @@ def settings(integrator="ray", **more):
     return load_config(
         max_range=2.5,
         integrator=integrator,
-        **{"steps": STEPS, "sensor.model": "constant", "ray.update": "once", "projective.full_share": 0, **more},
+        **{
+            "steps": STEPS,
+            "sensor.model": "constant",
+            "ray.update": "once",
+            "projective.full_share": 0,
+            "blind_range": 0,
+            **more,
+        },
     )
 
 

@@ -66,9 +66,8 @@ def _classify(frame: Frame, config: Config, depth_m: NDArray, reason: NDArray) -
     usable = _cpu.classify(raw, scale, *limits, none, infinite, *into)
     told = config.depth.far != "measured" and float(frame.farthest) >= config.max_range
     far = np.uint8(Reason.TOO_FAR if told else Reason.UNKNOWN)
-    given = frame.reason is not None
-    taken = _cpu.take_given(for_kernels(frame.reason if given else NO_REASONS).reshape(-1), far, *into)
-    return taken if given else usable
+    taken = _cpu.take_given(for_kernels(NO_REASONS if frame.reason is None else frame.reason).reshape(-1), far, *into)
+    return usable if frame.reason is None else taken
 
 
 def _check_image(frame: Frame) -> None:

@@ -16,7 +16,7 @@ from stereovox.config import Config
 from stereovox.frame import DepthImage
 from stereovox.integrate import _cull, _evaluate
 from stereovox.integrate._cells import NEAR_PLANE, NO_RETURN
-from stereovox.integrate.faces import cut, faces_of
+from stereovox.integrate.faces import Face, WideCamera, cut, faces_of
 from stereovox.integrate.hits import HitFinder
 from stereovox.integrate.merging import strongest
 from stereovox.integrate.per_camera import PerCamera
@@ -43,15 +43,17 @@ class Projective:
         def eye(camera: PinholeCamera, rim_share: float) -> _Eye:  # knows no `self`, which would keep itself alive
             return _Eye(camera, sensor_table(sensor, config, camera), config, rim_share)
 
-        self._eyes = PerCamera(lambda camera: eye(camera, RIM_SHARE))
-        self._faces = PerCamera(lambda camera: [(face, eye(face.camera, 0.0)) for face in faces_of(camera, config)])
+        self._eyes: PerCamera[PinholeCamera, _Eye] = PerCamera(lambda camera: eye(camera, RIM_SHARE))
+        self._faces: PerCamera[WideCamera, list[tuple[Face, _Eye]]] = PerCamera(
+            lambda camera: [(face, eye(face.camera, 0.0)) for face in faces_of(camera, config)]
+        )
 
     def evidence(self, image: DepthImage) -> Evidence:
         """Return what `image` says about the cells it sees; that of a wide camera is cut into pinhole images."""
         if isinstance(image.camera, PinholeCamera):
             return self._of_pinhole(self._eyes[image.camera], image, image.depth_m)
-        faces = [(eye, *cut(image, face, self._config.max_range)) for face, eye in self._faces[image.camera]]
-        return strongest([self._of_pinhole(*face) for face in faces])
+        seen = [(eye, cut(image, face, self._config.max_range)) for face, eye in self._faces[image.camera]]
+        return strongest([self._of_pinhole(eye, face.image, face.ends) for eye, face in seen])
 
     def _of_pinhole(self, eye: _Eye, image: DepthImage, ends: NDArray[np.float32]) -> Evidence:
         depth_m = image.depth_m

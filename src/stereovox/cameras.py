@@ -24,6 +24,7 @@ from stereovox.errors import StereovoxError, did_you_mean
 MAX_PIXELS = 100_000_000
 """Pixels of an image, at most."""
 LIMITS = {
+    "pixels": (1, MAX_PIXELS),
     "focal": (0.025, 1e6),
     "centre": (-1e9, 1e9),
     "step": (1e-6, 2 * math.pi),
@@ -32,6 +33,8 @@ LIMITS = {
     "binning": (1, 1e12),
 }
 """What numbers of a camera can be: focal length and centre in pixels, step in radians a pixel, baseline in metres."""
+WHOLE = "pixels", "binning"
+"""Which of them are whole numbers."""
 STEREO = {"baseline": "baseline", "binning": "binning", "subpixel": "subpixel"}
 """Fields of all cameras with a depth, and which limits they have."""
 LARGEST_COEFFICIENT = 1e36
@@ -73,10 +76,10 @@ def check_numbers(camera: object, **kinds: str) -> None:
     """Make the named fields of a frozen camera plain numbers, `width` and `height` too, and check what they can be.
 
     kinds: for each field a key of LIMITS. A field that is None by default may be None. Raises StereovoxError for what
-    is no number within its limits, for sizes that are no whole numbers, and for images of more than MAX_PIXELS.
+    is no number within its limits, and for images of more than MAX_PIXELS.
     """
-    for name, kind in kinds.items():
-        value, (low, high) = _plain(getattr(camera, name)), LIMITS[kind]
+    for name, kind in {"width": "pixels", "height": "pixels", **kinds}.items():
+        value, (low, high), whole = getattr(camera, name), LIMITS[kind], kind in WHOLE
         if value is None and getattr(type(camera), name, 0) is None:
             continue
         if not isinstance(value, int | float) or not low <= value <= high:
@@ -87,12 +90,6 @@ def check_numbers(camera: object, **kinds: str) -> None:
         raise StereovoxError(f"camera {camera}: width and height must be whole numbers of pixels")
     if sizes[0] * sizes[1] > MAX_PIXELS:
         raise StereovoxError(f"camera {camera}: more than {MAX_PIXELS:,} pixels; check width and height")
-    object.__setattr__(camera, "width", int(sizes[0]))
-    object.__setattr__(camera, "height", int(sizes[1]))
-
-
-def _plain(value: object) -> object:
-    return value.item() if isinstance(value, np.generic) else value
 
 
 STEEPEST = 20.0

@@ -5,12 +5,11 @@ from __future__ import annotations
 
 import re
 
-from stereovox.cameras import PinholeCamera
+from stereovox.cameras import MAX_PIXELS, PinholeCamera
 from stereovox.errors import FrameRefused, SourceError, StereovoxError
 from stereovox.sources.bag_files import BagFile
 from stereovox.sources.bag_messages import CameraInfo, read_camera_info, read_pairs
 from stereovox.sources.bag_metadata import option, sibling
-from stereovox.sources.images import MAX_PIXELS
 
 CAMERA_INFO = "sensor_msgs/CameraInfo"
 RECTIFIED = re.compile(r"(?<![a-z])rect")

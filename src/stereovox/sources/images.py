@@ -17,14 +17,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from stereovox.cameras import MAX_PIXELS
 from stereovox.errors import FrameRefused
 from stereovox.untrusted import read_bounded
 
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
 START = SIGNATURE + b"\0\0\0\rIHDR"
 HEADER_BYTES = 33  # signature, then IHDR: length, name, 13 bytes, check sum
-MAX_PIXELS = 100_000_000
-"""A header that tells of more pixels than this is taken for a lie; nothing is allocated for it."""
 MOST_BYTES = 1 << 28
 """Bytes of a file: more than so many pixels can need."""
 MOST_SWOLLEN = 1100

@@ -15,7 +15,7 @@ from stereovox.errors import FrameRefused, SourceError, StereovoxError
 from stereovox.files import replacing
 from stereovox.geometry import Transform
 from stereovox.rigs import Eyes, StereoPair, VirtualCamera
-from stereovox.sources.images import MAX_PIXELS, read_picture_png
+from stereovox.sources.images import read_picture_png
 
 FILE = "rig.toml"
 
@@ -67,8 +67,6 @@ class RigPair:
         """
         try:
             pair = self._bare()
-            if pair.camera.width * pair.camera.height > MAX_PIXELS:
-                raise SourceError(f"{pair.camera.width}x{pair.camera.height} pixels are too many; give smaller sizes")
         except StereovoxError as error:
             raise SourceError(f"pair '{self.name}': {error}") from None
         valid = self._valid(pair.camera, Path(folder))

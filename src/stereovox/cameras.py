@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,13 +81,12 @@ def check_numbers(camera: object, **kinds: str) -> None:
         value, (low, high), whole = getattr(camera, name), LIMITS[kind], kind in WHOLE
         if value is None and getattr(type(camera), name, 0) is None:
             continue
-        if not isinstance(value, int | float) or not low <= value <= high:
-            raise StereovoxError(f"camera {camera}: {name} must be a number from {low:g} to {high:g}")
-        object.__setattr__(camera, name, int(value) if kind == "binning" else float(value))
-    sizes: list[Any] = [_plain(getattr(camera, name)) for name in ("width", "height")]
-    if not all(isinstance(n, int | float) and 1 <= n <= MAX_PIXELS and n == int(n) for n in sizes):
-        raise StereovoxError(f"camera {camera}: width and height must be whole numbers of pixels")
-    if sizes[0] * sizes[1] > MAX_PIXELS:
+        value = value.item() if isinstance(value, np.generic) else value
+        if not isinstance(value, int | float) or not low <= value <= high or (whole and value % 1):
+            wanted = f"a {'whole ' if whole else ''}number from {low:g} to {high:g}"
+            raise StereovoxError(f"camera {camera}: {name} must be {wanted}")
+        object.__setattr__(camera, name, int(value) if whole else float(value))
+    if getattr(camera, "width", 0) * getattr(camera, "height", 0) > MAX_PIXELS:
         raise StereovoxError(f"camera {camera}: more than {MAX_PIXELS:,} pixels; check width and height")
 
 

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """A short run of `fuzz/frames.py`, and that it would see what it looks for."""
 
-import os
 import time
 import warnings
 from collections import Counter
@@ -11,6 +10,7 @@ import numpy as np
 import pytest
 
 import frames as fuzz
+import lost_batches
 import stereovox as sv
 import watched
 from mapper_kinds import KINDS, Kind
@@ -112,7 +112,7 @@ def test_a_process_that_hangs_or_dies_is_seen_and_replaced(monkeypatch):
     """Batch 0 is well, 1 hangs, 2 dies, 3 is well."""
     monkeypatch.setattr(watched, "HUNG_S", 1.0)
     monkeypatch.setattr(watched, "LOOKS_S", 0.1)
-    monkeypatch.setattr(watched, "_work", _work)
+    monkeypatch.setattr(watched, "_work", lost_batches.work)
     lines = []
     found = watched.Watched(6, [], lines.append)
     tally = found.run(4 * fuzz.BATCH, 60.0)
@@ -121,17 +121,6 @@ def test_a_process_that_hangs_or_dies_is_seen_and_replaced(monkeypatch):
     assert tally.bad == ["[6, 2], frame 17: the process ended with 5"]
     assert found.memory == {"memory_mb": [1.0, 1.0]}
     assert tally.failed
-
-
-def _work(tell, number, since, seed, words, batch, frames, until):
-    while batch < frames // fuzz.BATCH:
-        number.value, since.value = 17, time.monotonic()
-        if batch == 1:
-            time.sleep(60)
-        if batch == 2:
-            os._exit(5)
-        tell.send((fuzz.Tally(frames=Counter(Frame=1)), 1.0))
-        batch += 1
 
 
 def test_without_leaves_out():

@@ -8,6 +8,7 @@ from pathlib import Path
 from time import monotonic_ns, perf_counter
 from typing import Any
 
+from stereovox.comparing import compared
 from stereovox.config import Config, load_config
 from stereovox.errors import FrameRefused
 from stereovox.frame import AnyFrame
@@ -50,9 +51,8 @@ class Mapper:
             matched = way.depth.matched(frame)
             between = start if matched is frame else perf_counter()
             image = way.depth.image(matched)
-            passed = self._gate.check(frame, image)
             prepared = perf_counter()
-            evidence = way.integrator.evidence(image)
+            evidence, passed = compared(frame, image, self._gate, way.integrator, self.map)
             self.map.check_room(evidence)
         except FrameRefused as refused:
             self.map.history.offered(frame)

@@ -1,0 +1,95 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether a frame that disagrees with the map is to be believed: not one alone, nor a camera that was knocked."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import inf
+from typing import NamedTuple
+
+from stereovox.config import Config
+from stereovox.errors import FrameRefused
+from stereovox.frame import AnyFrame, name_of
+from stereovox.history import MOST_SENSORS, Doubt, History
+
+CHANGED, MOVED = "disagrees_with_map", "camera_moved"
+USUAL_AT_FIRST, USUAL_GAIN = 0.25, 0.2
+"""Disagreement that a sensor is taken for at first, and how quickly it follows its frames (exponential mean)."""
+USUAL_TIMES, MAX_LIMIT = 2.0, 0.8
+"""A frame may disagree so many times as much as usual, for noise and large cells make much of it and change slowly; but
+never more than that."""
+UNTIMED_HZ = 30
+"""Frames a second where stamps stand still."""
+
+
+class Judged(NamedTuple):
+    """A frame that is believed: how far it disagrees with the map (None: that cannot be told), and the doubt that
+    remains. `after`: what it is believed again after ("": it was never doubted)."""
+
+    against: float | None
+    doubt: Doubt | None = None
+    after: str = ""
+
+
+class Belief:
+    """Compares the disagreement of each frame with that of its sensor of late; what it remembers is in `history`.
+
+    A frame that disagrees more is refused. Where all frames of its sensor have done so for `trust.changed_s`, the world
+    has changed: they are believed until they agree again. But where they would agree if the camera stood elsewhere, it
+    is the camera that was moved, or its tracker that is wrong: it is not believed until it agrees again, or for
+    `trust.moved_s`.
+    """
+
+    def __init__(self, config: Config, history: History):
+        self._history, self._trust = history, config.trust
+        self._changed_ns = round(1e9 * config.trust.changed_s)
+        self._moved_ns = inf if config.trust.moved_s is None else round(1e9 * config.trust.moved_s)
+
+    def limit(self, sensor: str) -> float:
+        """Return how far a frame may disagree with the map, 0 to 1."""
+        usual = self._history.usual.get(sensor, USUAL_AT_FIRST)
+        return max(self._trust.max_disagreement, min(USUAL_TIMES * usual, MAX_LIMIT))
+
+    def check(
+        self, frame: AnyFrame, sensor: str, stamp_ns: int, against: float | None, moved: Callable[[float], bool]
+    ) -> Judged:
+        """Return what `took` is to remember once the map has changed.
+
+        against: share of what the frame says that is against the map; None: too little is known. moved: asked, with
+        the limit, whether the frame would agree from elsewhere. Raises FrameRefused: `disagrees_with_map`,
+        `camera_moved`.
+        """
+        doubt, limit = self._history.doubts.get(sensor), self.limit(sensor)
+        if doubt is None if against is None else against <= limit:
+            return Judged(against)
+        doubt = Doubt(stamp_ns, stamp_ns) if doubt is None else doubt.going_on(stamp_ns)
+        lasted_ns = doubt.lasted_ns(UNTIMED_HZ)
+        if against is not None and lasted_ns >= self._changed_ns and not doubt.believed:
+            doubt = doubt._replace(moved=moved(limit))
+        if lasted_ns >= (self._moved_ns if doubt.moved else self._changed_ns):
+            why = "" if doubt.believed else MOVED if doubt.moved else CHANGED
+            return Judged(against, None if against is None else doubt._replace(believed=True), why)
+        self._remember(sensor, doubt)
+        raise self._refused(frame, against, limit, doubt.moved)
+
+    def took(self, sensor: str, judged: Judged) -> None:
+        """Remember a frame that the map took in."""
+        if judged.doubt is None:
+            self._history.doubts.pop(sensor, None)
+            if judged.against is not None:
+                usual = self._history.usual.get(sensor, USUAL_AT_FIRST)
+                self._history.usual[sensor] = usual + USUAL_GAIN * (judged.against - usual)
+        else:
+            self._remember(sensor, judged.doubt)
+
+    def _remember(self, sensor: str, doubt: Doubt) -> None:
+        if sensor in self._history.doubts or len(self._history.doubts) < MOST_SENSORS:
+            self._history.doubts[sensor] = doubt
+
+    def _refused(self, frame: AnyFrame, against: float | None, limit: float, moved: bool) -> FrameRefused:
+        if moved:
+            said = "it would agree with the map if the camera stood elsewhere; calibrate where it is, or reset its tracker"
+            return FrameRefused(MOVED, f"{name_of(frame)}: {said}")
+        shown = "so do those before it" if against is None else f"{against:.0%} of what it says, {limit:.0%} may"
+        until = f"believed once frames do for {self._trust.changed_s:g} s"
+        return FrameRefused(CHANGED, f"{name_of(frame)}: disagrees with the map ({shown}); {until}")

@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Kernel that weighs what one frame says of cells the map is sure of."""
+
+import numpy as np
+
+from stereovox._jit import cell, kernel
+from stereovox.maps._cells import AT_FLOOR, row_of
+
+NONE, MIX_X, MIX_Y, MIX_Z = np.int32(0), np.uint32(0x9E3779B1), np.uint32(0x85EBCA77), np.uint32(0xC2B2AE3D)
+SHIFT = np.uint32(16)
+"""Low bits of a product depend on low bits alone; those from here on on all."""
+
+
+@kernel
+def weigh(stored, sure, coords, values, uniform, step, mask, out):
+    """Write the weights (in the units of `values`) of what is said of sure cells to `out` (3,) float64.
+
+    out: for and against cells that are surely occupied (hits; looked through), and against cells that are surely free
+    (hits). sure: (surely free up to, occupied from, surely occupied from). coords (n, 3) with values (n, 512) int16,
+    then uniform (m, 3), all of whose cells get `step`. Looks only at blocks whose hash ends in zeros where `mask` has
+    ones: which these are does not depend on the order of the blocks.
+    """
+    hits, passes, into = np.int64(0), np.int64(0), np.int64(0)
+    for i in range(coords.shape[0]):
+        if _chosen(coords, i, mask):
+            row = row_of(stored, coords[i, 0], coords[i, 1], coords[i, 2])
+            if row >= 0:
+                one = _of_row(values[i], stored.values[row], stored.unknown, sure)
+                hits, passes, into = hits + one[0], passes + one[1], into + one[2]
+            elif row == AT_FLOOR and stored.lowest <= sure[0]:
+                into += _hits(values[i])
+    for i in range(uniform.shape[0]):
+        if _chosen(uniform, i, mask):
+            row = row_of(stored, uniform[i, 0], uniform[i, 1], uniform[i, 2])
+            if row >= 0:
+                passes -= np.int64(step) * _occupied(stored.values[row], stored.unknown, sure)
+    out[0], out[1], out[2] = hits, passes, into
+
+
+@cell
+def _chosen(coords, i, mask):
+    mixed = np.uint32(coords[i, 0]) * MIX_X ^ np.uint32(coords[i, 1]) * MIX_Y ^ np.uint32(coords[i, 2]) * MIX_Z
+    return (np.uint32(mixed >> SHIFT) & mask) == 0
+
+
+@cell
+def _of_row(said, cells, unknown, sure):
+    """Return what (512,) evidence weighs for and against occupied cells, and against free ones."""
+    hits, passes, into = NONE, NONE, NONE
+    for c in range(512):
+        value, number = np.int32(said[c]), np.int32(cells[c])
+        hit = max(value, NONE)
+        known = number != unknown
+        hits = np.int32(hits + (hit if known & (number >= sure[1]) else NONE))
+        passes = np.int32(passes + (np.int32(hit - value) if known & (number >= sure[2]) else NONE))
+        into = np.int32(into + (hit if known & (number <= sure[0]) else NONE))
+    return np.int64(hits), np.int64(passes), np.int64(into)
+
+
+@cell
+def _hits(said):
+    hits = NONE
+    for c in range(512):
+        hits = np.int32(hits + max(np.int32(said[c]), NONE))
+    return np.int64(hits)
+
+
+@cell
+def _occupied(cells, unknown, sure):
+    """Return how many cells (512,) are surely occupied."""
+    number = NONE
+    for c in range(512):
+        value = np.int32(cells[c])
+        number = np.int32(number + (np.int32(1) if (value != unknown) & (value >= sure[2]) else NONE))
+    return np.int64(number)

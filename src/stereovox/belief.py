@@ -18,6 +18,8 @@ USUAL_AT_FIRST, USUAL_GAIN = 0.25, 0.2
 USUAL_TIMES, MAX_LIMIT = 2.0, 0.8
 """A frame may disagree so many times as much as usual, for noise and large cells make much of it and change slowly; but
 never more than that."""
+LEAST_LIMIT, MOST_OF_ERROR = 0.07, 0.4
+"""Share of what a frame says that may be against the map in any case, and that `trust.pose_error_m` explains at most."""
 UNTIMED_HZ = 30
 """Frames a second where stamps stand still."""
 
@@ -42,13 +44,15 @@ class Belief:
 
     def __init__(self, config: Config, history: History):
         self._history, self._trust = history, config.trust
+        explained = config.trust.pose_error_m / config.voxel_size  # a surface off by a cell disagrees altogether
+        self._least = max(LEAST_LIMIT, min(explained, MOST_OF_ERROR))
         self._changed_ns = round(1e9 * config.trust.changed_s)
         self._moved_ns = inf if config.trust.moved_s is None else round(1e9 * config.trust.moved_s)
 
     def limit(self, sensor: str) -> float:
         """Return how far a frame may disagree with the map, 0 to 1."""
         usual = self._history.usual.get(sensor, USUAL_AT_FIRST)
-        return max(self._trust.max_disagreement, min(USUAL_TIMES * usual, MAX_LIMIT))
+        return max(self._least, min(USUAL_TIMES * usual, MAX_LIMIT))
 
     def check(
         self, frame: AnyFrame, sensor: str, stamp_ns: int, against: float | None, moved: Callable[[float], bool]

@@ -17,7 +17,7 @@ def surfaces(depth_m, step, noise, slack, counts):
     noise, times what a second difference may be in sigma. slack: share of the inverse depth that it may be on top.
     """
     compared, even = np.int64(0), np.int64(0)
-    for v in range(step // 2, depth_m.shape[0], step):
+    for v in range(0, depth_m.shape[0], step):
         for u in range(1, depth_m.shape[1] - 1):
             a, b, c = depth_m[v, u - 1], depth_m[v, u], depth_m[v, u + 1]
             if (a > ZERO) & (b > ZERO) & (c > ZERO) & (a < FAR) & (b < FAR) & (c < FAR):

@@ -37,13 +37,14 @@ SPARSE = 0.05
 
 def check_depth(image: DepthImage, frame: Frame, config: Config) -> None:
     """Raise FrameRefused where `image`, made of `frame`, is none of surfaces: `too_few_values`, `no_surfaces`."""
-    pixels = image.reason.size - np.count_nonzero(image.reason == Reason.MASKED)
-    says = np.count_nonzero(image.reason == Reason.VALID) + np.count_nonzero(image.reason == Reason.TOO_FAR)
-    if says < config.trust.min_valid_share * pixels:
-        limit = f"trust.min_valid_share {config.trust.min_valid_share:g}"
-        raise FrameRefused(
-            "too_few_values", f"{name_of(frame)}: {says} of {pixels} pixels say something ({limit}); is the view blocked?"
-        )
+    least = config.trust.min_valid_share
+    for rows in (image.reason[:: _step(image.reason)], image.reason):  # all of them only where some say too little
+        says, pixels = _saying(rows)
+        if says >= least * pixels:
+            break
+    else:
+        said = f"{says} of {pixels} pixels say something (trust.min_valid_share {least:g}); is the view blocked?"
+        raise FrameRefused("too_few_values", f"{name_of(frame)}: {said}")
     share = surface_share(image, config)
     if share < config.trust.min_surface_share:
         limit = f"trust.min_surface_share {config.trust.min_surface_share:g}"
@@ -56,8 +57,7 @@ def surface_share(image: DepthImage, config: Config) -> float:
     """Return which share of depths lies on surfaces, as far as the range noise can tell; 1 where there are too few."""
     noise, counts = RangeNoise.of(config.noise, image.camera), np.zeros(2, np.int64)
     allowed = (BEND_SIGMA * np.array([noise.s0, noise.s1, noise.s2])).astype(np.float32)
-    step = max(1, image.depth_m.shape[0] // ROWS)
-    _quality.surfaces(image.depth_m, step, allowed, np.float32(BEND_SLACK), counts)
+    _quality.surfaces(image.depth_m, _step(image.depth_m), allowed, np.float32(BEND_SLACK), counts)
     compared, even = counts.tolist()
     return even / compared if compared >= FEW else 1.0
 
@@ -86,10 +86,20 @@ def check_light(frame: StereoFrame, limit: float) -> None:
     for side, image in (("left", frame.left), ("right", frame.right)):
         if not isinstance(image, np.ndarray) or image.dtype != np.uint8 or image.ndim < 2 or not image.size:
             continue  # matching refuses it
-        step = max(1, image.shape[0] // ROWS)
-        rows = image[step // 2 :: step]
+        rows = image[:: _step(image)]
         dark, bright = float((rows <= BLACK).mean()), float((rows >= WHITE).mean())
         for share, reason, word in ((dark, "too_dark", "black"), (bright, "overexposed", "saturated")):
             if share > limit:
                 told = f"{share:.0%} of its {side} image is {word} (trust.max_unexposed_share {limit:g})"
                 raise FrameRefused(reason, f"{name_of(frame)}: {told}; set the exposure, or clear the lens")
+
+
+def _step(image: NDArray) -> int:
+    """Return the distance of the rows that are looked at."""
+    return max(1, len(image) // ROWS)
+
+
+def _saying(reason: NDArray[np.uint8]) -> tuple[int, int]:
+    """Return how many pixels have a depth or are too far, and how many may be used at all."""
+    number = np.bincount(reason.ravel(), minlength=len(Reason))
+    return int(number[Reason.VALID] + number[Reason.TOO_FAR]), int(number.sum() - number[Reason.MASKED])

@@ -15,11 +15,8 @@ from stereovox.history import MOST_SENSORS, Doubt, History
 CHANGED, MOVED = "disagrees_with_map", "camera_moved"
 USUAL_AT_FIRST, USUAL_GAIN = 0.25, 0.2
 """Disagreement that a sensor is taken for at first, and how quickly it follows its frames (exponential mean)."""
-USUAL_TIMES, MAX_LIMIT = 2.0, 0.8
-"""A frame may disagree so many times as much as usual, for noise and large cells make much of it and change slowly; but
-never more than that."""
-LEAST_LIMIT, MOST_OF_ERROR = 0.07, 0.4
-"""Share of what a frame says that may be against the map in any case, and that `trust.pose_error_m` explains at most."""
+MAX_LIMIT = 0.8
+"""Disagreement that is too much whatever is usual."""
 UNTIMED_HZ = 30
 """Frames a second where stamps stand still."""
 
@@ -44,15 +41,14 @@ class Belief:
 
     def __init__(self, config: Config, history: History):
         self._history, self._trust = history, config.trust
-        explained = config.trust.pose_error_m / config.voxel_size  # a surface off by a cell disagrees altogether
-        self._least = max(LEAST_LIMIT, min(explained, MOST_OF_ERROR))
+        self._excess = max(config.trust.max_disagreement, config.trust.pose_error_m / config.voxel_size)
         self._changed_ns = round(1e9 * config.trust.changed_s)
         self._moved_ns = inf if config.trust.moved_s is None else round(1e9 * config.trust.moved_s)
 
     def limit(self, sensor: str) -> float:
         """Return how far a frame may disagree with the map, 0 to 1."""
         usual = self._history.usual.get(sensor, USUAL_AT_FIRST)
-        return max(self._least, min(USUAL_TIMES * usual, MAX_LIMIT))
+        return min(usual + max(self._excess, usual), MAX_LIMIT)
 
     def check(
         self, frame: AnyFrame, sensor: str, stamp_ns: int, against: float | None, moved: Callable[[float], bool]
@@ -64,7 +60,9 @@ class Belief:
         `camera_moved`.
         """
         doubt, limit = self._history.doubts.get(sensor), self.limit(sensor)
-        if doubt is None if against is None else against <= limit:
+        if against is None and not (doubt and doubt.moved):
+            return Judged(None, doubt)
+        if against is not None and against <= limit:
             return Judged(against)
         doubt = Doubt(stamp_ns, stamp_ns) if doubt is None else doubt.going_on(stamp_ns)
         lasted_ns = doubt.lasted_ns(UNTIMED_HZ)
@@ -72,28 +70,29 @@ class Belief:
             doubt = doubt._replace(moved=moved(limit))
         if lasted_ns >= (self._moved_ns if doubt.moved else self._changed_ns):
             why = "" if doubt.believed else MOVED if doubt.moved else CHANGED
-            return Judged(against, None if against is None else doubt._replace(believed=True), why)
+            return Judged(against, doubt._replace(believed=True), why)
         self._remember(sensor, doubt)
-        raise self._refused(frame, against, limit, doubt.moved)
+        raise self._refused(frame, against or 0.0, limit, doubt.moved)
 
     def took(self, sensor: str, judged: Judged) -> None:
         """Remember a frame that the map took in."""
-        if judged.doubt is None:
-            self._history.doubts.pop(sensor, None)
-            if judged.against is not None:
-                usual = self._history.usual.get(sensor, USUAL_AT_FIRST)
-                self._history.usual[sensor] = usual + USUAL_GAIN * (judged.against - usual)
-        else:
+        if judged.doubt is not None:
             self._remember(sensor, judged.doubt)
+        elif judged.against is not None:
+            self._history.doubts.pop(sensor, None)
+            usual = self._history.usual.get(sensor, USUAL_AT_FIRST)
+            self._history.usual[sensor] = usual + USUAL_GAIN * (judged.against - usual)
 
     def _remember(self, sensor: str, doubt: Doubt) -> None:
         if sensor in self._history.doubts or len(self._history.doubts) < MOST_SENSORS:
             self._history.doubts[sensor] = doubt
 
-    def _refused(self, frame: AnyFrame, against: float | None, limit: float, moved: bool) -> FrameRefused:
+    def _refused(self, frame: AnyFrame, against: float, limit: float, moved: bool) -> FrameRefused:
         if moved:
-            said = "it would agree with the map if the camera stood elsewhere; calibrate where it is, or reset its tracker"
+            said = (
+                "it would agree with the map if the camera stood elsewhere; calibrate where it is, or reset its tracker"
+            )
             return FrameRefused(MOVED, f"{name_of(frame)}: {said}")
-        shown = "so do those before it" if against is None else f"{against:.0%} of what it says, {limit:.0%} may"
+        shown = f"{against:.0%} of what it says, {limit:.0%} may"
         until = f"believed once frames do for {self._trust.changed_s:g} s"
         return FrameRefused(CHANGED, f"{name_of(frame)}: disagrees with the map ({shown}); {until}")

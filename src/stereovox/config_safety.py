@@ -22,8 +22,9 @@ class TrustConfig(Section):
     min_surface_share: share of the depths that must lie on surfaces; 0: not asked for.
     max_unexposed_share: share of the pixels of a stereo pair's image that may be black, or saturated; 1: all.
     frozen: refuse an image that is exactly the one before although the camera has moved.
-    compare: refuse frames that disagree with what the map is sure of, far more than their sensor does usually.
-    pose_error_m: metres that poses are usually off; a frame that disagrees no more than that explains is taken.
+    max_disagreement: share of what a frame says of what the map is sure of that may be against the map, on top of what
+        is usual for its sensor; 1: not asked for.
+    pose_error_m: metres that poses are off now and then; a frame may disagree by that over the size of a cell.
     changed_s: a world that has changed is believed after so many seconds of frames that disagree with the map.
     moved_s: seconds after which frames are believed that would agree if the camera stood elsewhere; not set: never.
     """
@@ -41,8 +42,8 @@ class TrustConfig(Section):
     min_surface_share: float = Field(0.5, ge=0, le=1)
     max_unexposed_share: float = Field(0.9, gt=0, le=1)
     frozen: bool = True
-    compare: bool = True
-    pose_error_m: float = Field(0.01, ge=0)
+    max_disagreement: float = Field(0.12, gt=0, le=1)
+    pose_error_m: float = Field(0.0075, ge=0)
     changed_s: float = Field(1.0, ge=0, le=1e9)
     moved_s: float | None = Field(None, ge=0, le=1e9)
 

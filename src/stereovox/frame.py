@@ -16,7 +16,6 @@ from stereovox.geometry import Transform, inverse
 from stereovox.planar import flattened
 from stereovox.rigs import StereoPair, VirtualCamera
 
-
 NOT_GIVEN: float = nan
 """Depth scale of a frame whose maker did not name one."""
 

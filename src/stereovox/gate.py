@@ -77,14 +77,12 @@ class Gate:
         now = Seen(stamp_ns, tuple(numbers[:12]))
         return self._fitting(frame, sensor, now)._replace(look=self._look(frame, sensor, now))
 
-    def believe(
-        self, frame: AnyFrame, passed: Passed, against: float | None, moved: Callable[[float], bool]
-    ) -> Passed:
+    def believe(self, frame: AnyFrame, passed: Passed, against: float | None, moved: Callable[[float], bool]) -> Passed:
         """Return what `took` is to remember of a frame that was compared with the map.
 
         Arguments, and what it raises: as of `Belief.check`.
         """
-        if not self._trust.compare:
+        if self._trust.max_disagreement == 1:
             return passed
         judged = self._belief.check(frame, passed.sensor, passed.seen.stamp_ns, against, moved)
         return passed._replace(judged=judged, after=passed.after or judged.after)

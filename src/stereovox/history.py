@@ -123,9 +123,7 @@ class History:
                     name: {"why": streak.why, "since_ns": streak.since_ns, **_seen_to(streak.last)}
                     for name, streak in self.waiting.items()
                 },
-                "looks": {
-                    name: {"digest": look.digest, "pose": list(look.pose)} for name, look in self.looks.items()
-                },
+                "looks": {name: {"digest": look.digest, "pose": list(look.pose)} for name, look in self.looks.items()},
                 "usual": dict(self.usual),
                 "doubts": {name: doubt._asdict() for name, doubt in self.doubts.items()},
             },

@@ -8,11 +8,11 @@ from pathlib import Path
 from time import monotonic_ns, perf_counter
 from typing import Any
 
-from stereovox.comparing import compared
+from stereovox.comparing import Comparison
 from stereovox.config import Config, load_config
 from stereovox.errors import FrameRefused
 from stereovox.frame import AnyFrame
-from stereovox.gate import Gate, Passed
+from stereovox.gate import Passed
 from stereovox.health import Health, Watch
 from stereovox.maps import VoxelMap, make_map
 from stereovox.pace import Pace
@@ -41,7 +41,7 @@ class Mapper:
         self._pace = Pace(self.config)
         self._clock, self._watch = clock, Watch(self.config, clock)
         self.map = make_map(self.config, resume, tiles)  # it may leave tiles on the disk: what could fail comes before
-        self._gate = Gate(self.config, self.map.history)
+        self._comparison = Comparison(self.config, self.map.history)
 
     def add(self, frame: AnyFrame) -> UpdateReport:
         """Take one frame into the map and tell what it did."""
@@ -52,7 +52,7 @@ class Mapper:
             between = start if matched is frame else perf_counter()
             image = way.depth.image(matched)
             prepared = perf_counter()
-            evidence, passed = compared(frame, image, self._gate, way.integrator, self.map)
+            evidence, passed = self._comparison.evidence(frame, image, way.integrator, self.map)
             self.map.check_room(evidence)
         except FrameRefused as refused:
             self.map.history.offered(frame)
@@ -76,5 +76,5 @@ class Mapper:
         self.map.history.frames += 1
         self.map.history.ways[way] += 1
         self.map.history.path.walk(passed.sensor, passed.seen)
-        self._gate.took(passed)
+        self._comparison.took(passed)
         self._watch.took(arrived_ns, passed.sensor, passed.seen.stamp_ns, way)

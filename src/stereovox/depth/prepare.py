@@ -38,7 +38,8 @@ def prepare(frame: Frame, config: Config) -> DepthImage:
     its TOO_FAR only where nothing contradicts it: a depth beside it, or the frame's `farthest`. `depth.far` says whose
     word is taken for too far.
     Raises FrameRefused with the reason: the source's `fault`, `bad_form` and others of `check_form`, `bad_dtype`,
-    `bad_shape`, `bad_scale`, `bad_units`, `bad_reason`, `no_pose`, `pose_not_finite`, `pose_not_rigid`, `no_valid_depth`.
+    `bad_shape`, `bad_scale`, `bad_units`, `bad_reason`, `no_pose`, `pose_not_finite`, `pose_not_rigid`,
+    `no_valid_depth`.
     """
     _check_image(frame)
     T_world_sensor = rigid_pose(frame, config.pose_rigidity_tolerance)
@@ -73,7 +74,7 @@ def _classify(frame: Frame, config: Config, depth_m: NDArray, reason: NDArray) -
 
 
 def _said(frame: Frame) -> NDArray[np.float64]:
-    """Return some of the depths (N,) that a frame holds, in metres, where its source does not say that there is none."""
+    """Return some of a frame's depths (N,) in metres, but those that its source says are none."""
     rows, columns = (slice(n // 128, None, max(1, n // 64)) for n in frame.depth.shape)
     raw = frame.depth[rows, columns]
     none = raw == SATURATED if raw.dtype == np.uint16 else np.zeros(raw.shape, bool)

@@ -27,7 +27,7 @@ FEW = 100
 """Fewer pixels than these, with a depth on both sides, show no surface, nor that there is none."""
 BLACK, WHITE = 5, 250
 """Grey up to which a pixel is black, and from which it is saturated."""
-FAR_RANGES, FAR_M = 30, 150.0
+FAR_RANGES, FAR_M = 60, 300.0
 """Median depth beyond as many maximum ranges, and as many metres, that no camera means."""
 NEAR_RANGE, NEAR_M = 0.1, 0.01
 """Median depth below this share of the minimum range, and below as many metres, that no camera means."""

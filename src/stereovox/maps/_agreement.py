@@ -12,29 +12,34 @@ SHIFT = np.uint32(16)
 
 
 @kernel
-def weigh(stored, sure, coords, values, uniform, step, mask, out):
-    """Write the weights (in the units of `values`) of what is said of sure cells to `out` (3,) float64.
+def weigh(stored, sure, least, coords, values, uniform, step, mask, out):
+    """Write the weights (in the units of `values`) of what is said of sure cells to `out` (5,) float64.
 
-    out: for and against cells that are surely occupied (hits; looked through), and against cells that are surely free
-    (hits). sure: (surely free up to, occupied from, surely occupied from). coords (n, 3) with values (n, 512) int16,
-    then uniform (m, 3), all of whose cells get `step`. Looks only at blocks whose hash ends in zeros where `mask` has
-    ones: which these are does not depend on the order of the blocks.
+    out: for cells that are occupied (hits), against such that are surely so (looked through), against cells that are
+    surely free (hits), those of them that are next to an unknown cell of their block, and of all hits, whatever the map
+    says. Hits below `least` are for cells, but not against them. sure: (surely free up to, occupied from, surely
+    occupied from). coords (n, 3) with values (n, 512) int16, then uniform (m, 3), all of whose cells get `step`. Looks
+    only at blocks whose hash ends in zeros where `mask` has ones: which these are does not depend on their order.
     """
-    hits, passes, into = np.int64(0), np.int64(0), np.int64(0)
+    hits, passes, into, edge, every = np.int64(0), np.int64(0), np.int64(0), np.int64(0), np.int64(0)
     for i in range(coords.shape[0]):
         if _chosen(coords, i, mask):
+            found = _hits(values[i], least)
+            every += found
             row = row_of(stored, coords[i, 0], coords[i, 1], coords[i, 2])
             if row >= 0:
-                one = _of_row(values[i], stored.values[row], stored.unknown, sure)
+                one = _of_row(values[i], least, stored.values[row], stored.unknown, sure)
                 hits, passes, into = hits + one[0], passes + one[1], into + one[2]
+                if one[2]:
+                    edge += _at_edge(values[i], least, stored.values[row], stored.unknown, sure)
             elif row == AT_FLOOR and stored.lowest <= sure[0]:
-                into += _hits(values[i])
+                into += found
     for i in range(uniform.shape[0]):
         if _chosen(uniform, i, mask):
             row = row_of(stored, uniform[i, 0], uniform[i, 1], uniform[i, 2])
             if row >= 0:
                 passes -= np.int64(step) * _occupied(stored.values[row], stored.unknown, sure)
-    out[0], out[1], out[2] = hits, passes, into
+    out[0], out[1], out[2], out[3], out[4] = hits, passes, into, edge, every
 
 
 @cell
@@ -44,24 +49,43 @@ def _chosen(coords, i, mask):
 
 
 @cell
-def _of_row(said, cells, unknown, sure):
+def _of_row(said, least, cells, unknown, sure):
     """Return what (512,) evidence weighs for and against occupied cells, and against free ones."""
     hits, passes, into = NONE, NONE, NONE
     for c in range(512):
         value, number = np.int32(said[c]), np.int32(cells[c])
-        hit = max(value, NONE)
+        firm = value if value >= least else NONE
         known = number != unknown
-        hits = np.int32(hits + (hit if known & (number >= sure[1]) else NONE))
-        passes = np.int32(passes + (np.int32(hit - value) if known & (number >= sure[2]) else NONE))
-        into = np.int32(into + (hit if known & (number <= sure[0]) else NONE))
+        hits = np.int32(hits + (max(value, NONE) if known & (number >= sure[1]) else NONE))
+        passes = np.int32(passes + (max(np.int32(-value), NONE) if known & (number >= sure[2]) else NONE))
+        into = np.int32(into + (firm if known & (number <= sure[0]) else NONE))
     return np.int64(hits), np.int64(passes), np.int64(into)
 
 
 @cell
-def _hits(said):
+def _at_edge(said, least, cells, unknown, sure):
+    """Return what (512,) evidence weighs against free cells that are next to an unknown one of the same block."""
+    weight = NONE
+    for c in range(512):
+        number = np.int32(cells[c])
+        if (np.int32(said[c]) >= least) & (number != unknown) & (number <= sure[0]):
+            x, y, z = c >> 6, (c >> 3) & 7, c & 7
+            edge = (x > 0) & (np.int32(cells[max(c - 64, 0)]) == unknown)
+            edge |= (x < 7) & (np.int32(cells[min(c + 64, 511)]) == unknown)
+            edge |= (y > 0) & (np.int32(cells[max(c - 8, 0)]) == unknown)
+            edge |= (y < 7) & (np.int32(cells[min(c + 8, 511)]) == unknown)
+            edge |= (z > 0) & (np.int32(cells[max(c - 1, 0)]) == unknown)
+            edge |= (z < 7) & (np.int32(cells[min(c + 1, 511)]) == unknown)
+            weight = np.int32(weight + (np.int32(said[c]) if edge else NONE))
+    return np.int64(weight)
+
+
+@cell
+def _hits(said, least):
     hits = NONE
     for c in range(512):
-        hits = np.int32(hits + max(np.int32(said[c]), NONE))
+        value = np.int32(said[c])
+        hits = np.int32(hits + (value if value >= least else NONE))
     return np.int64(hits)
 
 

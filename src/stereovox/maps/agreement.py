@@ -12,8 +12,10 @@ from stereovox.maps.blocks import StoredCells
 from stereovox.maps.cell_format import CellRules
 from stereovox.maps.evidence import LOG_ODDS_SCALE, Evidence
 
-FEW = 50.0
-"""Log-odds on surfaces the map is sure of that are too few to judge a frame by: some 15 hits."""
+FEW = 200.0
+"""Log-odds on surfaces the map is sure of that are too few to judge a frame by: some 50 hits."""
+KNOWN = 0.3
+"""Share of what a frame sees that the map must be sure of."""
 SAMPLE = 512
 """Blocks that are enough to judge a frame by."""
 
@@ -21,16 +23,22 @@ SAMPLE = 512
 class Agreement(NamedTuple):
     """Log-odds that a frame gives to cells the map is sure of.
 
+    Hits that are not firm count for cells, but not against them.
+
     A cell is surely free or occupied where it is past the middle between its threshold and its limit; where the frame
     confirms an occupied cell, it need not be sure.
 
     hits: for cells that are occupied. passes: against cells that are surely occupied: the frame looks through them.
-    into_free: against cells that are surely free: the frame sees something there.
+    into_free: against cells that are surely free: the frame sees something there. at_edge: those of them that are next
+        to an unknown cell, where surfaces come to light that the camera saw edge on before.
+    every: all firm hits, whatever the map says of their cells.
     """
 
     hits: float
     passes: float
     into_free: float
+    at_edge: float
+    every: float
 
     @property
     def weight(self) -> float:
@@ -39,25 +47,33 @@ class Agreement(NamedTuple):
 
     @property
     def against(self) -> float | None:
-        """Share of them that is against the map, 0 to 1; None where there are too few to tell."""
-        return (self.passes + self.into_free) / self.weight if self.weight >= FEW else None
+        """Share of them that is against the map, 0 to 1; None where there are too few to tell.
+
+        What is new is often seen first where noise at the end of the range has cleared some cells before; so a frame
+        is judged only where a good part of what it sees is known, and what is at the edge of the known counts no more
+        than all else that is against the map.
+        """
+        if self.weight < max(FEW, KNOWN * self.every):
+            return None
+        within = self.passes + self.into_free - self.at_edge
+        against = within + min(self.at_edge, within)
+        return against / (self.hits + against) if against else 0.0
 
 
-def agreement(stored: StoredCells, rules: CellRules, evidence: Evidence) -> Agreement:
-    """Weigh `evidence` against the cells of a map.
+def agreement(stored: StoredCells, rules: CellRules, evidence: Evidence, firm: int) -> Agreement:
+    """Weigh `evidence` against the cells of a map; see `VoxelMap.agreement`.
 
     Of a frame with more than SAMPLE blocks every second, fourth ... is looked at, by a hash of its coordinates: the
     same ones whatever their order.
     """
     blocks = len(evidence.coords) + len(evidence.uniform)
     mask = (1 << max(blocks // SAMPLE, 1).bit_length() - 1) - 1
-    weights = np.zeros(3)
+    weights = np.zeros(5)
     _agreement.weigh(
-        stored, _sure(rules), evidence.coords, evidence.values, evidence.uniform, np.int32(evidence.uniform_value),
-        np.uint32(mask), weights,
+        stored, _sure(rules), np.int32(firm), evidence.coords, evidence.values, evidence.uniform,
+        np.int32(evidence.uniform_value), np.uint32(mask), weights,
     )  # fmt: skip
-    hits, passes, into_free = ((mask + 1) / LOG_ODDS_SCALE * weights).tolist()
-    return Agreement(hits, passes, into_free)
+    return Agreement(*((mask + 1) / LOG_ODDS_SCALE * weights).tolist())
 
 
 def _sure(rules: CellRules) -> tuple[np.int32, np.int32, np.int32]:

@@ -130,9 +130,12 @@ class VoxelMap(WithHistory):
     def check_room(self, evidence: Evidence) -> None:
         """Raise FrameRefused `memory_full` where `evidence` needs more memory than the map may take."""
 
-    def agreement(self, evidence: Evidence) -> Agreement:
-        """Return how far `evidence` agrees with what the map is sure of."""
-        return agreement(self.stored_cells, self._rules, evidence)
+    def agreement(self, evidence: Evidence, firm: int) -> Agreement:
+        """Return how far `evidence` agrees with what the map is sure of.
+
+        firm: evidence of a hit, in thousandths, below which noise may have put it there.
+        """
+        return agreement(self.stored_cells, self._rules, evidence, firm)
 
     def add(self, evidence: Evidence) -> int:
         """Add what one frame says; return the number of cells whose value changed."""

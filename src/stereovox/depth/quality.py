@@ -18,7 +18,7 @@ from stereovox.errors import FrameRefused
 from stereovox.frame import DepthImage, Frame, Reason, StereoFrame, name_of
 from stereovox.sensors.noise import RangeNoise
 
-ROWS = 24
+ROWS = 16
 """Rows of an image that are looked at."""
 BEND_SIGMA, BEND_SLACK = 3 * sqrt(6), 0.02
 """On a surface the second difference of inverse depth along a row is at most three of its standard deviations (that of
@@ -37,29 +37,32 @@ SPARSE = 0.05
 
 def check_depth(image: DepthImage, frame: Frame, config: Config) -> None:
     """Raise FrameRefused where `image`, made of `frame`, is none of surfaces: `too_few_values`, `no_surfaces`."""
-    least = config.trust.min_valid_share
-    for rows in (image.reason[:: _step(image.reason)], image.reason):  # all of them only where some say too little
-        says, pixels = _saying(rows)
-        if says >= least * pixels:
-            break
-    else:
+    looked, saying, compared, even = counted(image, config)
+    if saying < config.trust.min_valid_share * looked:  # of some rows; then all of them are looked at
+        _check_share(image, frame, config.trust.min_valid_share)
+    if even < config.trust.min_surface_share * compared and compared >= FEW:
+        said = f"{even / compared:.0%} of the depths lie on surfaces"
+        limit = f"trust.min_surface_share {config.trust.min_surface_share:g}"
+        raise FrameRefused("no_surfaces", f"{name_of(frame)}: {said} ({limit}); check camera and driver")
+
+
+def counted(image: DepthImage, config: Config) -> tuple[int, int, int, int]:
+    """Return of some rows how many pixels there are, and how many have a depth or are too far; how many have a depth
+    between two others, and how many of these lie on a surface with them, as far as the range noise can tell.
+    """
+    noise, counts = RangeNoise.of(config.noise, image.camera), np.empty(4, np.int64)
+    allowed = np.array([BEND_SIGMA * noise.s0, BEND_SIGMA * noise.s1, BEND_SIGMA * noise.s2], np.float32)
+    _quality.count(image.depth_m, _step(image.depth_m), allowed, np.float32(BEND_SLACK), counts)
+    looked, saying, compared, even = counts.tolist()
+    return looked, saying, compared, even
+
+
+def _check_share(image: DepthImage, frame: Frame, least: float) -> None:
+    number = np.bincount(image.reason.ravel(), minlength=len(Reason))
+    says, pixels = number[Reason.VALID] + number[Reason.TOO_FAR], number.sum() - number[Reason.MASKED]
+    if says < least * pixels:
         said = f"{says} of {pixels} pixels say something (trust.min_valid_share {least:g}); is the view blocked?"
         raise FrameRefused("too_few_values", f"{name_of(frame)}: {said}")
-    share = surface_share(image, config)
-    if share < config.trust.min_surface_share:
-        limit = f"trust.min_surface_share {config.trust.min_surface_share:g}"
-        raise FrameRefused(
-            "no_surfaces", f"{name_of(frame)}: {share:.0%} of the depths lie on surfaces ({limit}); check the driver"
-        )
-
-
-def surface_share(image: DepthImage, config: Config) -> float:
-    """Return which share of depths lies on surfaces, as far as the range noise can tell; 1 where there are too few."""
-    noise, counts = RangeNoise.of(config.noise, image.camera), np.zeros(2, np.int64)
-    allowed = (BEND_SIGMA * np.array([noise.s0, noise.s1, noise.s2])).astype(np.float32)
-    _quality.surfaces(image.depth_m, _step(image.depth_m), allowed, np.float32(BEND_SLACK), counts)
-    compared, even = counts.tolist()
-    return even / compared if compared >= FEW else 1.0
 
 
 def check_unit(frame: Frame, depth_m: NDArray[np.floating], config: Config) -> None:
@@ -97,9 +100,3 @@ def check_light(frame: StereoFrame, limit: float) -> None:
 def _step(image: NDArray) -> int:
     """Return the distance of the rows that are looked at."""
     return max(1, len(image) // ROWS)
-
-
-def _saying(reason: NDArray[np.uint8]) -> tuple[int, int]:
-    """Return how many pixels have a depth or are too far, and how many may be used at all."""
-    number = np.bincount(reason.ravel(), minlength=len(Reason))
-    return int(number[Reason.VALID] + number[Reason.TOO_FAR]), int(number.sum() - number[Reason.MASKED])

@@ -6,7 +6,8 @@ import numpy as np
 from stereovox._jit import cell, kernel
 from stereovox.maps._cells import AT_FLOOR, row_of
 
-NONE, MIX_X, MIX_Y, MIX_Z = np.int32(0), np.uint32(0x9E3779B1), np.uint32(0x85EBCA77), np.uint32(0xC2B2AE3D)
+NONE, NIL = np.int32(0), np.int16(0)
+MIX_X, MIX_Y, MIX_Z = np.uint32(0x9E3779B1), np.uint32(0x85EBCA77), np.uint32(0xC2B2AE3D)
 SHIFT = np.uint32(16)
 """Low bits of a product depend on low bits alone; those from here on on all."""
 
@@ -24,21 +25,21 @@ def weigh(stored, sure, least, coords, values, uniform, step, mask, out):
     hits, passes, into, edge, every = np.int64(0), np.int64(0), np.int64(0), np.int64(0), np.int64(0)
     for i in range(coords.shape[0]):
         if _chosen(coords, i, mask):
-            found = _hits(values[i], least)
-            every += found
             row = row_of(stored, coords[i, 0], coords[i, 1], coords[i, 2])
             if row >= 0:
-                one = _of_row(values[i], least, stored.values[row], stored.unknown, sure)
-                hits, passes, into = hits + one[0], passes + one[1], into + one[2]
+                one = _of_row(values[i], least, stored.values[row], sure)
+                hits, passes, into, every = hits + one[0], passes + one[1], into + one[2], every + one[3]
                 if one[2]:
                     edge += _at_edge(values[i], least, stored.values[row], stored.unknown, sure)
-            elif row == AT_FLOOR and stored.lowest <= sure[0]:
-                into += found
+            else:
+                found = _hits(values[i], least)
+                every += found
+                into += found if (row == AT_FLOOR) & (np.int16(stored.lowest) <= sure[0]) else np.int64(0)
     for i in range(uniform.shape[0]):
         if _chosen(uniform, i, mask):
             row = row_of(stored, uniform[i, 0], uniform[i, 1], uniform[i, 2])
             if row >= 0:
-                passes -= np.int64(step) * _occupied(stored.values[row], stored.unknown, sure)
+                passes -= np.int64(step) * _occupied(stored.values[row], sure)
     out[0], out[1], out[2], out[3], out[4] = hits, passes, into, edge, every
 
 
@@ -49,17 +50,21 @@ def _chosen(coords, i, mask):
 
 
 @cell
-def _of_row(said, least, cells, unknown, sure):
-    """Return what (512,) evidence weighs for and against occupied cells, and against free ones."""
-    hits, passes, into = NONE, NONE, NONE
+def _of_row(said, least, cells, sure):
+    """Return what (512,) evidence weighs for and against occupied cells, against free ones, and all its firm hits.
+
+    All numbers but the sums are int16: twice as many cells in one instruction.
+    """
+    hits, passes, into, every = NONE, NONE, NONE, NONE
     for c in range(512):
-        value, number = np.int32(said[c]), np.int32(cells[c])
-        firm = value if value >= least else NONE
-        known = number != unknown
-        hits = np.int32(hits + (max(value, NONE) if known & (number >= sure[1]) else NONE))
-        passes = np.int32(passes + (max(np.int32(-value), NONE) if known & (number >= sure[2]) else NONE))
-        into = np.int32(into + (firm if known & (number <= sure[0]) else NONE))
-    return np.int64(hits), np.int64(passes), np.int64(into)
+        value, number = said[c], np.int16(cells[c])
+        hit, miss = max(value, NIL), max(np.int16(-value), NIL)
+        firm = value if value >= least else NIL
+        hits = np.int32(hits + np.int32(hit if number >= sure[1] else NIL))
+        passes = np.int32(passes + np.int32(miss if number >= sure[2] else NIL))
+        into = np.int32(into + np.int32(firm if number <= sure[0] else NIL))
+        every = np.int32(every + np.int32(firm))
+    return np.int64(hits), np.int64(passes), np.int64(into), np.int64(every)
 
 
 @cell
@@ -67,8 +72,7 @@ def _at_edge(said, least, cells, unknown, sure):
     """Return what (512,) evidence weighs against free cells that are next to an unknown one of the same block."""
     weight = NONE
     for c in range(512):
-        number = np.int32(cells[c])
-        if (np.int32(said[c]) >= least) & (number != unknown) & (number <= sure[0]):
+        if (said[c] >= least) & (np.int16(cells[c]) <= sure[0]):
             x, y, z = c >> 6, (c >> 3) & 7, c & 7
             edge = (x > 0) & (np.int32(cells[max(c - 64, 0)]) == unknown)
             edge |= (x < 7) & (np.int32(cells[min(c + 64, 511)]) == unknown)
@@ -84,16 +88,14 @@ def _at_edge(said, least, cells, unknown, sure):
 def _hits(said, least):
     hits = NONE
     for c in range(512):
-        value = np.int32(said[c])
-        hits = np.int32(hits + (value if value >= least else NONE))
+        hits = np.int32(hits + np.int32(said[c] if said[c] >= least else NIL))
     return np.int64(hits)
 
 
 @cell
-def _occupied(cells, unknown, sure):
+def _occupied(cells, sure):
     """Return how many cells (512,) are surely occupied."""
     number = NONE
     for c in range(512):
-        value = np.int32(cells[c])
-        number = np.int32(number + (np.int32(1) if (value != unknown) & (value >= sure[2]) else NONE))
+        number = np.int32(number + (np.int32(1) if np.int16(cells[c]) >= sure[2] else NONE))
     return np.int64(number)

@@ -10,7 +10,7 @@ import numpy as np
 from stereovox.maps import _agreement
 from stereovox.maps.blocks import StoredCells
 from stereovox.maps.cell_format import CellRules
-from stereovox.maps.evidence import LOG_ODDS_SCALE, Evidence
+from stereovox.maps.evidence import LARGEST, LOG_ODDS_SCALE, Evidence
 
 FEW = 200.0
 """Log-odds on surfaces the map is sure of that are too few to judge a frame by: some 50 hits."""
@@ -70,15 +70,19 @@ def agreement(stored: StoredCells, rules: CellRules, evidence: Evidence, firm: i
     mask = (1 << max(blocks // SAMPLE, 1).bit_length() - 1) - 1
     weights = np.zeros(5)
     _agreement.weigh(
-        stored, _sure(rules), np.int32(firm), evidence.coords, evidence.values, evidence.uniform,
+        stored, _sure(rules), np.int16(min(firm, LARGEST)), evidence.coords, evidence.values, evidence.uniform,
         np.int32(evidence.uniform_value), np.uint32(mask), weights,
     )  # fmt: skip
     return Agreement(*((mask + 1) / LOG_ODDS_SCALE * weights).tolist())
 
 
-def _sure(rules: CellRules) -> tuple[np.int32, np.int32, np.int32]:
-    """Return the highest stored number that is surely free, the lowest occupied one, and the lowest surely so."""
-    free_most, occupied_least = map(int, rules.thresholds)
-    surely_free = (free_most + int(rules.lowest)) // 2
-    surely_occupied = -(-(occupied_least + int(rules.highest)) // 2)
-    return np.int32(surely_free), np.int32(occupied_least), np.int32(surely_occupied)
+def _sure(rules: CellRules) -> tuple[np.int16, np.int16, np.int16]:
+    """Return the highest stored number that is surely free, the lowest occupied one, and the lowest surely so.
+
+    None of them is "unknown", nor beyond it.
+    """
+    unknown, (free_most, occupied_least) = rules.format.unknown, map(int, rules.thresholds)
+    surely_free = min((free_most + int(rules.lowest)) // 2, unknown - 1)
+    occupied = max(occupied_least, unknown + 1)
+    surely_occupied = max(-(-(occupied_least + int(rules.highest)) // 2), occupied)
+    return np.int16(surely_free), np.int16(occupied), np.int16(surely_occupied)

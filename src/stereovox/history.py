@@ -42,18 +42,22 @@ class Look(NamedTuple):
     pose: tuple[float, ...]
 
 
+CHANGED, MOVED = "changed", "moved"
+"""Why frames disagree with the map: the world has changed, or the camera was moved."""
+
+
 class Doubt(NamedTuple):
     """Frames of one sensor that disagree with the map: stamps of the first and the last one, and how many came after
     the first.
 
-    moved: they would agree if the camera stood elsewhere. believed: they disagreed for long enough to be believed.
+    fits: how many of them would agree if the camera stood elsewhere. verdict: CHANGED or MOVED; "" while they wait.
     """
 
     since_ns: int
     last_ns: int
     frames: int = 0
-    moved: bool = False
-    believed: bool = False
+    fits: int = 0
+    verdict: str = ""
 
     def going_on(self, stamp_ns: int) -> Doubt:
         """Return the doubt after one more frame."""
@@ -207,10 +211,10 @@ def _look_from(saved: Any) -> Look:
 
 def _doubt_from(saved: Any) -> Doubt:
     since_ns, last_ns = (_whole(saved[name], f"history: {name}", EARLIEST) for name in ("since_ns", "last_ns"))
-    moved, believed = saved["moved"], saved["believed"]
-    if type(moved) is not bool or type(believed) is not bool:
-        raise ValueError("history: moved and believed must be true or false")
-    return Doubt(since_ns, last_ns, _whole(saved["frames"], "history: frames"), moved, believed)
+    frames, fits = (_whole(saved[name], f"history: {name}") for name in ("frames", "fits"))
+    if saved["verdict"] not in ("", CHANGED, MOVED):
+        raise ValueError("history: a doubt has no such verdict")
+    return Doubt(since_ns, last_ns, frames, fits, saved["verdict"])
 
 
 def _share(saved: Any) -> float:

@@ -50,10 +50,10 @@ class Agreement(NamedTuple):
         """Share of them that is against the map, 0 to 1; None where there are too few to tell.
 
         What is new is often seen first where noise at the end of the range has cleared some cells before; so a frame
-        is judged only where a good part of what it sees is known, and what is at the edge of the known counts no more
-        than all else that is against the map.
+        is judged only where a good part of what it sees is known, or where it looks through much; and what is at the
+        edge of the known counts no more than all else that is against the map.
         """
-        if self.weight < max(FEW, KNOWN * self.every):
+        if self.weight < FEW or (self.weight < KNOWN * self.every and self.passes < FEW):
             return None
         within = self.passes + self.into_free - self.at_edge
         against = within + min(self.at_edge, within)

@@ -32,6 +32,7 @@ LAYERS = (
         "config_robot",
         "config_safety",
         "gate",
+        "belief",
         "health",
         "camera_path",
         "history",
@@ -42,7 +43,7 @@ LAYERS = (
     },
     {"sources", "depth", "sensors", "maps"},
     {"integrate", "products", "localize", "calibrate"},
-    {"mapper", "grid_mapper", "pace", "ways", "evaluate", "view"},
+    {"mapper", "grid_mapper", "pace", "ways", "comparing", "evaluate", "view"},
     {"batch", "cli", "ros", "__main__"},
 )
 LEVEL = {room: level for level, rooms in enumerate(LAYERS) for room in rooms}

@@ -54,9 +54,11 @@ def test_nothing_clears_through_pixels_without_a_value(integrator):
 def too_near_wall(nothing, far, source_reason=None, integrator="projective"):
     """Return which cells of a wall at 1 m stay occupied where the camera, too near to it, then writes `nothing`.
 
-    A sliver of the image still has a value behind the wall, so that frames are not refused.
+    A sliver of the image still has a value behind the wall, so that frames are not refused; nor does the gate ask
+    whether they agree with the map.
     """
-    mapper = sv.Mapper("default", voxel_size=0.1, integrator=integrator, **{"depth.far": far})
+    settings = {"depth.far": far, "trust.max_disagreement": 1}
+    mapper = sv.Mapper("default", voxel_size=0.1, integrator=integrator, **settings)
     for _ in range(8):
         mapper.add(wall_frame(1.0))
     before = mapper.map.occupied()

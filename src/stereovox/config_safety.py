@@ -18,6 +18,15 @@ class TrustConfig(Section):
     max_pose_off_s: seconds that a pose may be extrapolated.
     settle_s: after a jump or a reset, frames that agree with each other for so long are believed again; 0: at once.
     stale_s, lost_s: seconds without a trusted frame until the map is `stale` and until it is `lost`.
+    min_valid_share: share of the pixels that must say something (a depth, or too far); 0: one pixel is enough.
+    min_surface_share: share of the depths that must lie on surfaces; 0: not asked for.
+    max_unexposed_share: share of the pixels of a stereo pair's image that may be black, or saturated; 1: all.
+    frozen: refuse an image that is exactly the one before although the camera has moved.
+    max_disagreement: share of what a frame says of what the map is sure of that may be against the map, on top of what
+        is usual for its sensor; 1: not asked for.
+    pose_error_m: metres that poses are off now and then; a frame may disagree by that over the size of a cell.
+    changed_s: a world that has changed is believed after so many seconds of frames that disagree with the map.
+    moved_s: seconds after which frames are believed that would agree if the camera stood elsewhere; not set: never.
     """
 
     ordered: bool = True
@@ -29,6 +38,14 @@ class TrustConfig(Section):
     settle_s: float = Field(1.0, ge=0, le=1e9)
     stale_s: float = Field(0.5, gt=0)
     lost_s: float = Field(5.0, gt=0)
+    min_valid_share: float = Field(0.005, ge=0, le=1)
+    min_surface_share: float = Field(0.5, ge=0, le=1)
+    max_unexposed_share: float = Field(0.9, gt=0, le=1)
+    frozen: bool = True
+    max_disagreement: float = Field(0.12, gt=0, le=1)
+    pose_error_m: float = Field(0.0075, ge=0)
+    changed_s: float = Field(1.0, ge=0, le=1e9)
+    moved_s: float | None = Field(None, ge=0, le=1e9)
 
     @model_validator(mode="after")
     def _ordered(self) -> TrustConfig:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import IntEnum
-from math import inf
+from math import inf, nan
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +15,9 @@ from stereovox.cameras import PinholeCamera
 from stereovox.geometry import Transform, inverse
 from stereovox.planar import flattened
 from stereovox.rigs import StereoPair, VirtualCamera
+
+NOT_GIVEN: float = nan
+"""Depth scale of a frame whose maker did not name one."""
 
 
 class Reason(IntEnum):
@@ -71,7 +74,8 @@ class Frame:
     camera: the camera that took it; its size must be the image's.
     T_world_sensor: (4, 4) float64, maps the optical frame (x right, y down, z forward) into the world (z up).
     stamp_ns: time of the image in int64 nanoseconds.
-    depth_scale: metres per unit of `depth` (0.001 for millimetres).
+    depth_scale: metres per unit of `depth` (0.001 for millimetres). Not given: 1 for floats; an image of whole numbers
+        without it is refused, for nobody can say what it means.
     reason: (height, width) uint8 of `Reason`, where the source knows why a pixel has no value; else None. VALID: as
         the depth says.
     name: where the frame came from, for messages.
@@ -87,7 +91,7 @@ class Frame:
     camera: VirtualCamera
     T_world_sensor: Transform
     stamp_ns: int = 0
-    depth_scale: float = 1.0
+    depth_scale: float = NOT_GIVEN
     reason: NDArray[np.uint8] | None = None
     name: str = ""
     fault: str | None = None
@@ -95,6 +99,10 @@ class Frame:
     sensor: str = ""
     pose_off_ns: int = 0
     farthest: float = inf
+
+    def __post_init__(self) -> None:
+        if self.depth_scale is NOT_GIVEN and getattr(getattr(self.depth, "dtype", None), "kind", "") == "f":
+            object.__setattr__(self, "depth_scale", 1.0)
 
 
 @dataclass(frozen=True, eq=False)

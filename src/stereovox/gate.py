@@ -1,28 +1,45 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The last check before a frame may change the map: does it fit to the frames before it?"""
+"""The last check before a frame may change the map: does it fit to the frames before it, and to the map?"""
 
 from __future__ import annotations
 
+import zlib
+from collections.abc import Callable
 from math import inf, radians
 from typing import NamedTuple
 
+import numpy as np
+
+from stereovox.belief import Belief, Judged
 from stereovox.camera_path import apart
 from stereovox.config import Config
 from stereovox.errors import FrameRefused
-from stereovox.frame import AnyFrame, DepthImage, Scan, name_of
-from stereovox.history import LONGEST_NAME, MOST_SENSORS, History, Seen, Streak
+from stereovox.frame import AnyFrame, DepthImage, Scan, StereoFrame, name_of
+from stereovox.history import LONGEST_NAME, MOST_SENSORS, History, Look, Seen, Streak
 
 SLACK_M, SLACK_RAD = 0.05, radians(2)
 """Poses are noisy: so much is no jump, however short the time."""
 BACKWARDS, RESET, JUMP = "stamp_backwards", "clock_reset", "pose_jump"
+STILL_M, STILL_RAD = 0.01, radians(0.5)
+"""So far a camera that stands seems to move where its tracker trembles."""
+LOOK_ROWS = 16
+"""Rows of an image by which it is known again."""
+ROUGH, ROUGH_SHARE = 1e-3, 0.2
+"""Measured depths bend by so much of themselves at least, at so many pixels; walls without noise do not, and look the
+same from many places."""
 
 
 class Passed(NamedTuple):
-    """A frame that fits: of which sensor, where it stood, and what it was believed again after (mostly: nothing)."""
+    """A frame that fits: of which sensor, where it stood, and what it was believed again after (mostly: nothing).
+
+    look: which image it is; None for scans. judged: how it fits to the map; None where it was not compared.
+    """
 
     sensor: str
     seen: Seen
     after: str = ""
+    look: Look | None = None
+    judged: Judged | None = None
 
     @property
     def told(self) -> str:
@@ -41,7 +58,7 @@ class Gate:
 
     def __init__(self, config: Config, history: History):
         trust = config.trust
-        self._history, self._trust = history, trust
+        self._history, self._trust, self._belief = history, trust, Belief(config, history)
         self._turn = radians(trust.max_turn_dps)
         off, reset, ahead, settle = trust.max_pose_off_s, trust.clock_reset_s, trust.max_gap_s, trust.settle_s
         self._off_ns, self._reset_ns, self._ahead_ns, self._settle_ns = (
@@ -52,12 +69,50 @@ class Gate:
         """Return what `took` is to remember once the map has changed.
 
         image: holds the frame's pose, exactly rigid. Raises FrameRefused: `bad_sensor`, `pose_extrapolated`,
-        `stamp_backwards`, `clock_reset`, `pose_jump`. Of a refused frame nothing is remembered but that it may agree
-        with the next one.
+        `stamp_backwards`, `clock_reset`, `pose_jump`, `frozen_image`. Of a refused frame nothing is remembered but that
+        it may agree with the next one.
         """
         sensor, stamp_ns = self._told(frame)
         numbers = image.T_world_sensor.ravel().tolist()
         now = Seen(stamp_ns, tuple(numbers[:12]))
+        return self._fitting(frame, sensor, now)._replace(look=self._look(frame, sensor, now))
+
+    def believe(self, frame: AnyFrame, passed: Passed, against: float | None, moved: Callable[[float], bool]) -> Passed:
+        """Return what `took` is to remember of a frame that was compared with the map.
+
+        Arguments, and what it raises: as of `Belief.check`.
+        """
+        if self._trust.max_disagreement == 1:
+            return passed
+        judged = self._belief.check(frame, passed.sensor, passed.seen.stamp_ns, against, moved)
+        return passed._replace(judged=judged, after=passed.after or judged.after)
+
+    def took(self, passed: Passed) -> None:
+        """Remember a frame that the map took in."""
+        self._history.trusted[passed.sensor] = passed.seen
+        self._history.waiting.pop(passed.sensor, None)
+        if passed.look is not None:
+            self._history.looks[passed.sensor] = passed.look
+        if passed.judged is not None:
+            self._belief.took(passed.sensor, passed.judged)
+        if passed.after:
+            self._history.settled[passed.after] += 1
+
+    def _look(self, frame: AnyFrame | Scan, sensor: str, now: Seen) -> Look | None:
+        """Return which image a frame is. Raises FrameRefused where it is the last one although the camera has moved."""
+        if isinstance(frame, Scan) or not self._trust.frozen:
+            return None
+        look, before = Look(_digest(frame), now.pose), self._history.looks.get(sensor)
+        if before is None or before.digest != look.digest:
+            return look
+        metres, angle = apart(before.pose, now.pose)
+        if (metres > STILL_M or angle > STILL_RAD) and (isinstance(frame, StereoFrame) or _is_measured(frame.depth)):
+            said = f"the image is the one before, from {metres:.3g} m and {np.degrees(angle):.1f} degrees away"
+            raise FrameRefused("frozen_image", f"{name_of(frame)}: {said}; restart the camera")
+        return before
+
+    def _fitting(self, frame: AnyFrame | Scan, sensor: str, now: Seen) -> Passed:
+        """Return a frame that fits to the trusted one before, or is believed again."""
         trusted = self._history.trusted.get(sensor)
         if trusted is None:
             if len(self._history.trusted) >= MOST_SENSORS:
@@ -68,13 +123,6 @@ class Gate:
         if waiting is None and not why:
             return Passed(sensor, now)
         return self._settled(frame, Passed(sensor, now), trusted, (why, haste), waiting)
-
-    def took(self, passed: Passed) -> None:
-        """Remember a frame that the map took in."""
-        self._history.trusted[passed.sensor] = passed.seen
-        self._history.waiting.pop(passed.sensor, None)
-        if passed.after:
-            self._history.settled[passed.after] += 1
 
     def _told(self, frame: AnyFrame | Scan) -> tuple[str, int]:
         """Return sensor and stamp of a frame whose form was checked (`depth.form`); refuse poses that are too old."""
@@ -135,3 +183,26 @@ class Gate:
         return (
             f"the pose jumped by {metres:.3g} m and {round(angle * 57.29578, 1):g} degrees in {seconds:.3g} s; {until}"
         )
+
+
+def _rows(image: np.ndarray) -> np.ndarray:
+    return image[LOOK_ROWS // 2 if len(image) > LOOK_ROWS else 0 :: max(1, len(image) // LOOK_ROWS)]
+
+
+def _digest(frame: AnyFrame) -> int:
+    """Return a number that is another one for another image, as far as LOOK_ROWS of its rows tell."""
+    images = (frame.left, frame.right) if isinstance(frame, StereoFrame) else (frame.depth,)
+    number = 0
+    for image in images:
+        number = zlib.crc32(np.ascontiguousarray(_rows(image)).tobytes(), number)
+    return number
+
+
+def _is_measured(depth: np.ndarray) -> bool:
+    """Tell whether depths (height, width) have noise: whether inverse depth bends between neighbours."""
+    rows = _rows(depth).astype(float)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        inverse = np.where(np.isfinite(rows) & (rows > 0), 1 / rows, np.nan)
+        bend = np.abs(np.diff(inverse, 2, axis=1)) / inverse[:, 1:-1]
+    bend = bend[np.isfinite(bend)]
+    return bool(bend.size and (bend > ROUGH).mean() > ROUGH_SHARE)

@@ -35,6 +35,39 @@ class Streak(NamedTuple):
     last: Seen
 
 
+class Look(NamedTuple):
+    """The last image of a sensor: a checksum, and the pose that it was first seen at, as in `Seen`."""
+
+    digest: int
+    pose: tuple[float, ...]
+
+
+CHANGED, MOVED = "changed", "moved"
+"""Why frames disagree with the map: the world has changed, or the camera was moved."""
+
+
+class Doubt(NamedTuple):
+    """Frames of one sensor that disagree with the map: stamps of the first and the last one, and how many came after
+    the first.
+
+    fits: how many of them would agree if the camera stood elsewhere. verdict: CHANGED or MOVED; "" while they wait.
+    """
+
+    since_ns: int
+    last_ns: int
+    frames: int = 0
+    fits: int = 0
+    verdict: str = ""
+
+    def going_on(self, stamp_ns: int) -> Doubt:
+        """Return the doubt after one more frame."""
+        return self._replace(last_ns=stamp_ns, frames=self.frames + 1)
+
+    def lasted_ns(self, untimed_hz: float) -> int:
+        """Return how long it has lasted; where stamps stand still, or went back, at so many frames a second."""
+        return self.last_ns - self.since_ns if self.last_ns > self.since_ns else round(1e9 * self.frames / untimed_hz)
+
+
 @dataclass
 class History:
     """What a map remembers of its frames; saved and loaded with it, so that a run may stop and go on anywhere.
@@ -45,6 +78,8 @@ class History:
     one that was offered last.
     trusted: the last trusted frame of each sensor. waiting: refused frames that may yet be believed, by sensor.
     path: the way that the sensors of the frames in the map went.
+    looks: the last image of each camera. usual: how far the frames of each camera disagree with the map, 0 to 1.
+    doubts: cameras whose last frames disagree with it more than that.
     """
 
     frames: int = 0
@@ -56,6 +91,9 @@ class History:
     trusted: dict[str, Seen] = field(default_factory=dict)
     waiting: dict[str, Streak] = field(default_factory=dict)
     path: CameraPath = field(default_factory=CameraPath)
+    looks: dict[str, Look] = field(default_factory=dict)
+    usual: dict[str, float] = field(default_factory=dict)
+    doubts: dict[str, Doubt] = field(default_factory=dict)
 
     def offered(self, frame: object) -> None:
         """Remember which frame was the last."""
@@ -89,6 +127,9 @@ class History:
                     name: {"why": streak.why, "since_ns": streak.since_ns, **_seen_to(streak.last)}
                     for name, streak in self.waiting.items()
                 },
+                "looks": {name: {"digest": look.digest, "pose": list(look.pose)} for name, look in self.looks.items()},
+                "usual": dict(self.usual),
+                "doubts": {name: doubt._asdict() for name, doubt in self.doubts.items()},
             },
             "camera_path": self.path.saved(),
         }
@@ -111,7 +152,10 @@ class History:
         waiting = {name: _streak_from(streak) for name, streak in _sensors(told["waiting"]).items()}
         if not waiting.keys() <= trusted.keys():
             raise ValueError("history.waiting names a sensor that was never trusted")
-        history = cls(frames, reasons, settled, ways, recording, last, trusted, waiting, path)
+        looks = {name: _look_from(look) for name, look in _sensors(told.get("looks", {})).items()}
+        usual = {name: _share(share) for name, share in _sensors(told.get("usual", {})).items()}
+        doubts = {name: _doubt_from(doubt) for name, doubt in _sensors(told.get("doubts", {})).items()}
+        history = cls(frames, reasons, settled, ways, recording, last, trusted, waiting, path, looks, usual, doubts)
         if history.refused.total() != refused:
             raise ValueError(f"frames_refused is {refused}, its reasons add up to {history.refused.total()}")
         return history
@@ -158,13 +202,34 @@ def _seen_to(seen: Seen) -> dict[str, Any]:
 
 
 def _seen_from(saved: Any) -> Seen:
-    pose = saved["pose"]
+    return Seen(_whole(saved["stamp_ns"], "history: stamp_ns", EARLIEST), _pose_from(saved["pose"]))
+
+
+def _look_from(saved: Any) -> Look:
+    return Look(_whole(saved["digest"], "history: digest"), _pose_from(saved["pose"]))
+
+
+def _doubt_from(saved: Any) -> Doubt:
+    since_ns, last_ns = (_whole(saved[name], f"history: {name}", EARLIEST) for name in ("since_ns", "last_ns"))
+    frames, fits = (_whole(saved[name], f"history: {name}") for name in ("frames", "fits"))
+    if saved["verdict"] not in ("", CHANGED, MOVED):
+        raise ValueError("history: a doubt has no such verdict")
+    return Doubt(since_ns, last_ns, frames, fits, saved["verdict"])
+
+
+def _share(saved: Any) -> float:
+    if type(saved) not in (float, int) or not 0 <= saved <= 1:
+        raise ValueError("history: a share is no number from 0 to 1")
+    return float(saved)
+
+
+def _pose_from(pose: Any) -> tuple[float, ...]:
     if not isinstance(pose, list) or len(pose) != 12 or not all(type(x) in (float, int) for x in pose):
         raise ValueError("history: a pose is not 12 numbers")
     numbers = tuple(map(float, pose))
     if not all(math.isfinite(x) and abs(x) <= FARTHEST for x in numbers):
         raise ValueError("history: a pose holds NaN, infinity or absurdly large numbers")
-    return Seen(_whole(saved["stamp_ns"], "history: stamp_ns", EARLIEST), numbers)
+    return numbers
 
 
 def _last_frame_from(saved: Any) -> tuple[str, int] | None:

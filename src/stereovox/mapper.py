@@ -8,10 +8,11 @@ from pathlib import Path
 from time import monotonic_ns, perf_counter
 from typing import Any
 
+from stereovox.comparing import Comparison
 from stereovox.config import Config, load_config
 from stereovox.errors import FrameRefused
 from stereovox.frame import AnyFrame
-from stereovox.gate import Gate, Passed
+from stereovox.gate import Passed
 from stereovox.guarded import MapLock
 from stereovox.health import Health, Watch
 from stereovox.maps import VoxelMap, make_map
@@ -41,7 +42,7 @@ class Mapper:
         self._pace = Pace(self.config)
         self._watch = Watch(self.config, clock)
         self.map = make_map(self.config, resume, tiles)  # it may leave tiles on the disk: what could fail comes before
-        self._gate = Gate(self.config, self.map.history)
+        self._comparison = Comparison(self.config, self.map.history)
         self._adding = MapLock()
 
     def add(self, frame: AnyFrame) -> UpdateReport:
@@ -61,10 +62,8 @@ class Mapper:
             matched = way.depth.matched(frame)
             between = start if matched is frame else perf_counter()
             image = way.depth.image(matched)
-            with self.map.lock:
-                passed = self._gate.check(frame, image)
             prepared = perf_counter()
-            evidence = way.integrator.evidence(image)
+            evidence, passed = self._comparison.evidence(frame, image, way.integrator, self.map)
             with self.map.lock:
                 self.map.check_room(evidence)
                 self.map.look_from(image.viewpoint)
@@ -91,5 +90,5 @@ class Mapper:
         self.map.history.frames += 1
         self.map.history.ways[way] += 1
         self.map.history.path.walk(passed.sensor, passed.seen)
-        self._gate.took(passed)
+        self._comparison.took(passed)
         self._watch.took(arrived_ns, passed.sensor, passed.seen.stamp_ns, way)

@@ -13,7 +13,7 @@ from stereovox.rigs import StereoPair
 CAMERA = sv.PinholeCamera(8, 6, 8.0, 8.0, 3.5, 2.5, 0.05)
 DEPTH = np.full((6, 8), 2.0, np.float32)
 FRAME = sv.Frame(DEPTH, CAMERA, np.eye(4))
-GREY = np.zeros((6, 8), np.uint8)
+GREY = np.full((6, 8), 100, np.uint8)
 PAIR = sv.StereoFrame(GREY, GREY, StereoPair(CAMERA), np.eye(4))
 SCAN = sv.Scan(np.full(9, 2.0, np.float32), -1.0, 0.25, 0.1, 5.0, np.eye(4))
 MASKED = np.ma.masked_array(DEPTH, DEPTH > 1)
@@ -143,7 +143,7 @@ def test_times_are_told_whatever_holds_the_stamps(kind):
         ({"left": GREY.tolist()}, "bad_form"),
         ({"right": GREY.astype(float)}, "bad_dtype"),
         ({"right": GREY[:0]}, "bad_shape"),
-        ({"left": np.zeros((6, 8, 4), np.uint8)}, "bad_shape"),
+        ({"left": np.full((6, 8, 4), 100, np.uint8)}, "bad_shape"),
         ({"left": np.ma.masked_array(GREY, GREY)}, "bad_form"),
         ({"pair": None}, "bad_form"),
         ({"pair": CAMERA}, "bad_form"),

@@ -6,11 +6,11 @@ import warnings
 from collections import Counter
 from dataclasses import replace
 
+import lost_batches
 import numpy as np
 import pytest
 
 import frames as fuzz
-import lost_batches
 import stereovox as sv
 import watched
 from mapper_kinds import KINDS, Kind

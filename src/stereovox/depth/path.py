@@ -8,6 +8,7 @@ from functools import cached_property
 from stereovox.config import Config
 from stereovox.depth.form import check_form
 from stereovox.depth.prepare import prepare
+from stereovox.depth.quality import check_depth, check_light
 from stereovox.depth.sphere_image import through_sphere
 from stereovox.depth.stereo import StereoDepth
 from stereovox.frame import AnyFrame, DepthImage, Frame, StereoFrame
@@ -22,16 +23,19 @@ class DepthPath:
     def matched(self, frame: AnyFrame) -> Frame:
         """Return a stereo frame as one with depth, any other as it is.
 
-        Raises FrameRefused as `StereoDepth`, and `bad_form` for what is no frame at all.
+        Raises FrameRefused as `StereoDepth` and `check_light`, and `bad_form` for what is no frame at all.
         """
         if isinstance(frame, Frame):
             return frame  # `prepare` looks at its form
         check_form(frame, StereoFrame, Frame)
+        check_light(frame, self._config.trust.max_unexposed_share)
         return self._stereo(frame)
 
     def image(self, frame: Frame) -> DepthImage:
-        """Return the frame's depth image. Raises FrameRefused as `prepare`."""
-        return through_sphere(prepare(frame, self._config), self._config)
+        """Return the frame's depth image. Raises FrameRefused as `prepare` and `check_depth`."""
+        image = prepare(frame, self._config)
+        check_depth(image, frame, self._config)
+        return through_sphere(image, self._config)
 
     @cached_property
     def _stereo(self) -> StereoDepth:

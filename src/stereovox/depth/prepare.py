@@ -14,8 +14,9 @@ from stereovox.depth.correct import corrected
 from stereovox.depth.denoise import denoise
 from stereovox.depth.downsample import downsample
 from stereovox.depth.form import check_form, for_kernels, matrix_of
+from stereovox.depth.quality import SPARSE, check_unit
 from stereovox.errors import FrameRefused
-from stereovox.frame import DepthImage, Frame, Reason, Scan, name_of
+from stereovox.frame import NOT_GIVEN, DepthImage, Frame, Reason, Scan, name_of
 
 DTYPES = (np.dtype(np.uint16), np.dtype(np.float32), np.dtype(np.float64))
 SATURATED = 65535
@@ -39,13 +40,16 @@ def prepare(frame: Frame, config: Config) -> DepthImage:
     its TOO_FAR only where nothing contradicts it: a depth beside it, or the frame's `farthest`. `depth.far` says whose
     word is taken for too far.
     Raises FrameRefused with the reason: the source's `fault`, `bad_form` and others of `check_form`, `bad_dtype`,
-    `bad_shape`, `bad_scale`, `bad_reason`, `no_pose`, `pose_not_finite`, `pose_not_rigid`, `no_valid_depth`.
+    `bad_shape`, `bad_scale`, `bad_units`, `bad_reason`, `no_pose`, `pose_not_finite`, `pose_not_rigid`,
+    `no_valid_depth`.
     """
     _check_image(frame)
     T_world_sensor = rigid_pose(frame, config.pose_rigidity_tolerance)
     depth_m = np.empty(frame.depth.shape, np.float32)
     reason = np.empty(frame.depth.shape, np.uint8)
     usable = _classify(frame, config, depth_m, reason)
+    if usable < SPARSE * depth_m.size:
+        check_unit(frame, _said(frame), config)
     if not usable and not (reason == Reason.TOO_FAR).any():
         cure = "check its depth correction" if getattr(frame.camera, "correction", None) else "is the lens covered?"
         raise FrameRefused("no_valid_depth", f"{name_of(frame)}: not one pixel has a valid depth; {cure}")
@@ -71,6 +75,16 @@ def _classify(frame: Frame, config: Config, depth_m: NDArray, reason: NDArray) -
     return usable if frame.reason is None else taken
 
 
+def _said(frame: Frame) -> NDArray[np.float64]:
+    """Return some of a frame's depths (N,) in metres, but those that its source says are none."""
+    rows, columns = (slice(n // 128, None, max(1, n // 64)) for n in frame.depth.shape)
+    raw = np.asarray(frame.depth)[rows, columns]
+    none = raw == SATURATED if raw.dtype == np.uint16 else np.zeros(raw.shape, bool)
+    if frame.reason is not None:
+        none |= np.asarray(frame.reason)[rows, columns] != Reason.VALID
+    return raw[~none].astype(float) * float(frame.depth_scale)
+
+
 def _check_image(frame: Frame) -> None:
     check_form(frame, Frame)
     name, depth, camera = name_of(frame), frame.depth, frame.camera
@@ -80,6 +94,9 @@ def _check_image(frame: Frame) -> None:
     if depth.shape != (camera.height, camera.width):
         wanted = f"({camera.height}, {camera.width})"
         raise FrameRefused("bad_shape", f"{name}: depth image is {depth.shape}, its camera says {wanted}")
+    if frame.depth_scale is NOT_GIVEN:
+        cure = "give metres per unit, depth_scale=0.001 for millimetres"
+        raise FrameRefused("bad_scale", f"{name}: depth is {depth.dtype} and has no depth_scale; {cure}")
     if not SMALLEST < float(frame.depth_scale) < 1 / SMALLEST:  # NaN as well
         raise FrameRefused("bad_scale", f"{name}: depth_scale {frame.depth_scale} must be positive and finite")
     if frame.reason is not None and not _are_reasons(frame.reason, depth.shape):

@@ -16,6 +16,7 @@ from stereovox.frame import Viewpoint
 from stereovox.guarded import Guarded, MapLock, in_steps
 from stereovox.history import History, WithHistory
 from stereovox.maps import _add, queries
+from stereovox.maps.agreement import Agreement, agreement
 from stereovox.maps.blocks import CELLS, SIDE, StoredCells, blocks_of_cells
 from stereovox.maps.cell_format import CellFormat, CellRules
 from stereovox.maps.cell_format import State as State
@@ -130,6 +131,13 @@ class VoxelMap(Guarded, WithHistory):
 
     def check_room(self, evidence: Evidence) -> None:
         """Raise FrameRefused `memory_full` where `evidence` needs more memory than the map may take."""
+
+    def agreement(self, evidence: Evidence, firm: int) -> Agreement:
+        """Return how far `evidence` agrees with what the map is sure of.
+
+        firm: evidence of a hit, in thousandths, below which noise may have put it there.
+        """
+        return agreement(self.stored_cells, self._rules, evidence, firm)
 
     def add(self, evidence: Evidence) -> int:
         """Add what one frame says; return the number of cells whose value changed."""

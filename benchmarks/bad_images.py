@@ -1,0 +1,47 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which bad images are refused, and how many good ones?
+
+    python benchmarks/bad_images.py [SOURCE] [--voxel-size 0.05] [--max-range 5] [--frames A:B:S] [--every 5] [--seed 0]
+                                    [--set key=value ...] [--json]
+
+All frames of SOURCE are mapped one by one. Before every N-th of them each kind of bad frame is offered in its place, to
+the map as it is then, and taken back. One that is not refused is harmless where it changes the state of less than 0.1 %
+of the sure cells it says something of, and frees no occupied one; what the true frame would do as well does not count.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+
+import stereovox as sv
+from stereovox.config import parse_value
+from stereovox.evaluate.bad_images import trial
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("source", nargs="?", default="sim:room")
+    parser.add_argument("--voxel-size", type=float, default=0.05)
+    parser.add_argument("--max-range", type=float, default=5.0)
+    parser.add_argument("--frames", default=":", help="a Python slice")
+    parser.add_argument("--every", type=int, default=5, help="bad frames before every so many; 0: none")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
+    parser.add_argument("--json", action="store_true")
+    wanted = parser.parse_args()
+    more = {key: parse_value(value) for key, _, value in (pair.partition("=") for pair in wanted.set)}
+    settings = {"voxel_size": wanted.voxel_size, "max_range": wanted.max_range, **more}
+    found = trial(sv.open_source(wanted.source, frames=wanted.frames), wanted.every, wanted.seed, **settings)
+    if wanted.json:
+        print(json.dumps(found))
+        return
+    print(f"{found['frames']} good frames, refused: {found['refused'] or 'none'}")
+    print(f"{'instead':24}{'frames':>7}{'refused':>9}{'harmless':>9}{'neither':>9}  reasons")
+    for kind, row in found["bad"].items():
+        shares = "".join(f"{row[name]:9.3f}" for name in ("refused", "harmless", "left"))
+        print(f"{kind:24}{row['frames']:7}{shares}  {row['reasons'] or ''}")
+
+
+if __name__ == "__main__":
+    main()

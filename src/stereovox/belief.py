@@ -1,0 +1,110 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether a frame that disagrees with the map is to be believed: not one alone, nor a camera that was knocked."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from math import inf
+from typing import NamedTuple
+
+from stereovox.config import Config
+from stereovox.errors import FrameRefused
+from stereovox.frame import AnyFrame, name_of
+from stereovox.history import CHANGED, MOST_SENSORS, MOVED, Doubt, History
+
+WHY = {"": "disagrees_with_map", CHANGED: "disagrees_with_map", MOVED: "camera_moved"}
+"""Reasons by the verdict on a doubt."""
+USUAL_AT_FIRST, USUAL_GAIN = 0.25, 0.2
+"""Disagreement that a sensor is taken for at first, and how quickly it follows its frames (exponential mean)."""
+MAX_LIMIT = 0.8
+"""Disagreement that is too much whatever is usual."""
+AGAIN = 1 / 2
+"""Share of what a frame may disagree beyond the usual up to which one ends a doubt: it must really agree."""
+FITS = 1 / 3
+"""Share of the frames that agree from elsewhere where it is the camera that was moved: some find no such place."""
+UNTIMED_HZ = 30
+"""Frames a second where stamps stand still."""
+
+
+class Judged(NamedTuple):
+    """A frame that is believed: how far it disagrees with the map (None: that cannot be told), and the doubt that
+    remains. `after`: what it is believed again after ("": it was never doubted)."""
+
+    against: float | None
+    doubt: Doubt | None = None
+    after: str = ""
+
+
+class Belief:
+    """Compares the disagreement of each frame with that of its sensor of late; what it remembers is in `history`.
+
+    A frame that disagrees more is refused. Where all frames of its sensor have done so for `trust.changed_s`, the world
+    has changed: they are believed until they agree again. But where they would agree if the camera stood elsewhere, it
+    is the camera that was moved, or its tracker that is wrong: it is not believed until it agrees again, or for
+    `trust.moved_s`.
+    """
+
+    def __init__(self, config: Config, history: History):
+        self._history, self._trust = history, config.trust
+        self._excess = max(config.trust.max_disagreement, config.trust.pose_error_m / config.voxel_size)
+        self._changed_ns = round(1e9 * config.trust.changed_s)
+        self._moved_ns = inf if config.trust.moved_s is None else round(1e9 * config.trust.moved_s)
+
+    def limit(self, sensor: str, share: float = 1.0) -> float:
+        """Return how far a frame may disagree with the map, 0 to 1; `share`: of what it may beyond the usual."""
+        usual = self._history.usual.get(sensor, USUAL_AT_FIRST)
+        return min(usual + share * max(self._excess, usual), MAX_LIMIT)
+
+    def check(
+        self, frame: AnyFrame, sensor: str, stamp_ns: int, against: float | None, moved: Callable[[float], bool]
+    ) -> Judged:
+        """Return what `took` is to remember once the map has changed.
+
+        against: share of what the frame says that is against the map; None: too little is known. moved: asked, with
+        the limit, whether the frame would agree from elsewhere. Raises FrameRefused: `disagrees_with_map`,
+        `camera_moved`.
+        """
+        doubt, limit = self._history.doubts.get(sensor), self.limit(sensor)
+        if against is None and not (doubt and doubt.verdict == MOVED):
+            return Judged(None, doubt)
+        if against is not None and against <= (limit if doubt is None else self.limit(sensor, AGAIN)):
+            return Judged(against)
+        waited = doubt is not None and doubt.verdict == CHANGED
+        doubt = self._judged(Doubt(stamp_ns, stamp_ns) if doubt is None else doubt.going_on(stamp_ns), limit, moved)
+        enough_ns = self._moved_ns if doubt.verdict == MOVED else self._changed_ns
+        if doubt.lasted_ns(UNTIMED_HZ) >= enough_ns:
+            return Judged(against, doubt._replace(verdict=CHANGED), "" if waited else WHY[doubt.verdict])
+        self._remember(sensor, doubt)
+        raise self._refused(frame, against, limit, doubt)
+
+    def _judged(self, doubt: Doubt, limit: float, moved: Callable[[float], bool]) -> Doubt:
+        """Return a doubt with its verdict, where it has lasted long enough for one."""
+        if doubt.verdict:
+            return doubt
+        doubt = doubt._replace(fits=doubt.fits + moved(limit))
+        if doubt.lasted_ns(UNTIMED_HZ) < self._changed_ns:
+            return doubt
+        return doubt._replace(verdict=MOVED if doubt.fits >= FITS * (doubt.frames + 1) else CHANGED)
+
+    def took(self, sensor: str, judged: Judged) -> None:
+        """Remember a frame that the map took in."""
+        if judged.doubt is not None:
+            self._remember(sensor, judged.doubt)
+        elif judged.against is not None:
+            self._history.doubts.pop(sensor, None)
+            usual = self._history.usual.get(sensor, USUAL_AT_FIRST)
+            self._history.usual[sensor] = usual + USUAL_GAIN * (judged.against - usual)
+
+    def _remember(self, sensor: str, doubt: Doubt) -> None:
+        if sensor in self._history.doubts or len(self._history.doubts) < MOST_SENSORS:
+            self._history.doubts[sensor] = doubt
+
+    def _refused(self, frame: AnyFrame, against: float | None, limit: float, doubt: Doubt) -> FrameRefused:
+        if doubt.verdict == MOVED:
+            said = (
+                "it would agree with the map if the camera stood elsewhere; calibrate where it is, or reset the tracker"
+            )
+        else:
+            share = f"{against or 0:.0%} of what it says, {limit:.0%} may"
+            said = f"it disagrees with the map ({share}); believed once frames do for {self._trust.changed_s:g} s"
+        return FrameRefused(WHY[doubt.verdict], f"{name_of(frame)}: {said}")

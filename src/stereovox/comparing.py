@@ -1,0 +1,68 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Evidence that was compared with the map before the map takes it in."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+
+from stereovox.config import Config
+from stereovox.frame import AnyFrame, DepthImage
+from stereovox.gate import Gate, Passed
+from stereovox.history import History
+from stereovox.integrate import Integrator
+from stereovox.integrate.per_camera import PerCamera
+from stereovox.integrate.views import sensor_table
+from stereovox.maps import VoxelMap
+from stereovox.maps.evidence import Evidence
+from stereovox.rigs import VirtualCamera
+from stereovox.sensors import make_sensor
+from stereovox.sensors.model import InverseSensorModel
+
+FIRM = 0.4
+"""Share of the most that a hit says which a hit must say to be firm: what is far says less, for its noise is wider than
+a cell."""
+
+
+class Comparison:
+    """Makes evidence and lets a gate, which knows `history`, decide whether it is to be believed."""
+
+    def __init__(self, config: Config, history: History):
+        self._gate = Gate(config, history)
+        self._firm = PerCamera(partial(_firm, make_sensor(config.sensor), config))
+
+    def evidence(
+        self, frame: AnyFrame, image: DepthImage, integrator: Integrator, voxel_map: VoxelMap
+    ) -> tuple[Evidence, Passed]:
+        """Return the evidence of an image, and what the gate is to remember of it.
+
+        Raises FrameRefused as `Gate.check` and `Gate.believe`.
+        """
+        firm, asked = self._firm[image.camera], False
+        with voxel_map.lock:
+            passed = self._gate.check(frame, image)
+
+        def moved(limit: float) -> bool:
+            nonlocal asked
+            from stereovox.localize.elsewhere import pose_on_surfaces
+
+            asked, pose = True, pose_on_surfaces(voxel_map, image)
+            if pose is None:
+                return False
+            other = integrator.evidence(replace(image, T_world_sensor=pose))
+            against = voxel_map.agreement(other, firm).against
+            return against is not None and against <= limit
+
+        evidence = integrator.evidence(image)
+        with voxel_map.lock:
+            passed = self._gate.believe(frame, passed, voxel_map.agreement(evidence, firm).against, moved)
+        return (integrator.evidence(image) if asked else evidence), passed  # each takes the memory of the one before
+
+    def took(self, passed: Passed) -> None:
+        """Remember a frame that the map took in."""
+        self._gate.took(passed)
+
+
+def _firm(sensor: InverseSensorModel, config: Config, camera: VirtualCamera) -> int:
+    """Return the evidence in thousandths from which on a hit is firm."""
+    return round(FIRM * int(sensor_table(sensor, config, camera).hit.max()))

@@ -20,7 +20,8 @@ def weigh(stored, sure, least, coords, values, uniform, steps, mask, out):
     surely free (hits), those of them that are next to an unknown cell of their block, and of all hits, whatever the map
     says. Hits below `least` are for cells, but not against them. sure: (surely free up to, occupied from, surely
     occupied from). coords (n, 3) with values (n, 512) int16, then uniform (m, 3), all of whose cells get one of
-    `steps` (m,) each. Looks only at blocks whose hash ends in zeros where `mask` has ones: which these are does not depend on their order.
+    `steps` (m,) each. Looks only at blocks whose hash ends in zeros where `mask` has ones: which these are does not
+    depend on their order.
     """
     hits, passes, into, edge, every = np.int64(0), np.int64(0), np.int64(0), np.int64(0), np.int64(0)
     for i in range(coords.shape[0]):

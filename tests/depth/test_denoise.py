@@ -16,19 +16,18 @@ CONFIG = load_config(voxel_size=0.05, min_range=0.2, max_range=6.0)
 
 
 def slow_denoise(depth_m, s0, s1, s2, voxel_size, low, high):
-    """The same in plain words and float64: two passes, pixel by pixel, neighbour by neighbour."""
+    """The same in plain words and float64: three passes, pixel by pixel, neighbour by neighbour."""
     inverse = {vu: 1.0 / d for vu, d in np.ndenumerate(depth_m.astype(float)) if 0 < d < np.inf}
-    untouched = set()
-    for k in (5.0, 6.0):
+    untouched = {vu for vu, c in inverse.items() if s0 + s1 / c + s2 / c**2 <= 0.15 * voxel_size}
+    for far, least, k in ((1, 1, 4.5), (2, 1, 4.5), (4, 3, 4.0)):
         averaged = {}
         for (v, u), centre in inverse.items():
             z = 1 / centre
             noise = s0 + s1 * z + s2 * z**2
-            reach = min(k * noise, 6 * voxel_size) / z**2
-            steps = [s for s in (1, 2, 3) if noise > (2 * s - 1) * 0.15 * voxel_size]
-            if not steps:
-                untouched.add((v, u))
-            beside = [(v + i, u + j) for s in steps for i, j in ((0, -s), (0, s), (-s, 0), (s, 0))]
+            reach = k * min(noise, 1.3 * voxel_size) / z**2
+            beside = [(v, u - far), (v, u + far), (v - far, u), (v + far, u)]
+            if noise <= least * 0.15 * voxel_size:
+                beside = []
             values = [centre, *(inverse[vu] for vu in beside if vu in inverse)]
             weights = [max(1 - ((w - centre) / reach) ** 2, 0) ** 4 for w in values]
             averaged[v, u] = sum(w * g for w, g in zip(values, weights, strict=True)) / sum(weights)

@@ -1,116 +1,95 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernel that averages each pixel with the like neighbours in its row and its column, twice."""
+"""Kernel that averages each pixel with like pixels in its row and its column, near ones first, then farther ones."""
 
 import numpy as np
 
 from stereovox._jit import cell, kernel
 
-RADIUS = 3
-"""Neighbours on each side. Written out below, so that a whole row of pixels is worked on at once."""
-RING = 2 * RADIUS + 1
 SEGMENT = 64
-"""Pixels of a row that share the number of neighbours looked at: that of the farthest of them."""
+"""Pixels of a row that are left out together where none of them is noisy."""
 NONE = np.float32(-1e6)
 """Inverse depth of a pixel without value: far from every other."""
 COARSEST = np.float32(1e4)
 """Bound for the noise of inverse depth, so that NONE stays far from everything."""
-ZERO, ONE, THREE, FIVE, FAR = np.float32(0), np.float32(1), np.float32(3), np.float32(5), np.float32(np.inf)
+ZERO, ONE, FAR = np.float32(0), np.float32(1), np.float32(np.inf)
 
 
 @kernel
-def denoise(depth_m, noise, fine, widths, limit, low, high, raw, once):
+def denoise(depth_m, noise, steps, fine, widths, limit, low, high, rings):
     """Replace every depth by a weighted mean over neighbours, in place; pixels without value stay as they are.
 
-    depth_m: (h, w) REP 117 depth image. noise: (3,) s0, s1, s2 of the depth noise in metres. fine: the noise in metres
-    that does no harm. widths: (2,) how many sigma away a neighbour no longer counts, in the first and the second pass;
-    limit: the same in metres, where that is less. low, high: results are kept within these depths. raw, once: scratch,
-    (RING, w + 2 RADIUS), inverse depths of the rows that are needed: measured, and after the first pass.
+    depth_m: (h, w) REP 117 depth image. noise: (3,) s0, s1, s2 of the depth noise in metres. One pass after another:
+    steps: (passes,) int64, how many pixels away its four neighbours are; fine: the noise in metres, up to which it
+    leaves a pixel; widths: how many sigma off a neighbour no longer counts; `limit`: metres, sigma counts for no more.
+    low, high: results are kept within these depths. rings: scratch (passes + 1, 2 m + 1, w + 2 m), m the largest
+    step: inverse depths of the rows that are needed, measured and after each pass.
     """
-    height = depth_m.shape[0]
-    raw[:, :] = NONE
-    once[:, :] = NONE
-    for v in range(height + 2 * RADIUS):
+    height, passes, rows = depth_m.shape[0], steps.size, rings.shape[1]
+    margin = rows // 2
+    rings[:, :, :] = NONE
+    for v in range(height + passes * margin):
         if v < height:
-            _invert(depth_m[v], raw[v % RING])
+            _invert(depth_m[v], rings[0, v % rows], margin)
         else:
-            raw[v % RING, :] = NONE
-        if RADIUS <= v < height + RADIUS:
-            _average(raw, v, noise, fine, widths[0], limit, once[(v - RADIUS) % RING])
-        elif v >= height + RADIUS:
-            once[(v - RADIUS) % RING, :] = NONE
-        if v >= 2 * RADIUS:
-            row = raw[(v - 2 * RADIUS) % RING]  # measured depths of this row are needed no more
-            _average(once, v - RADIUS, noise, fine, widths[1], limit, row)
-            _write(row, once[(v - 2 * RADIUS) % RING], noise, fine, low, high, depth_m[v - 2 * RADIUS])
+            rings[0, v % rows, :] = NONE
+        for i in range(passes):
+            middle = v - (i + 1) * margin
+            if 0 <= middle < height:
+                ring, step = rings[i], steps[i]
+                _average(
+                    ring[(middle - step) % rows], ring[middle % rows], ring[(middle + step) % rows], np.uintp(step),
+                    np.uintp(margin), noise, fine[i], widths[i], limit, rings[i + 1, middle % rows],
+                )  # fmt: skip
+            elif middle >= height:
+                rings[i + 1, middle % rows, :] = NONE
+        last = v - passes * margin
+        if last >= 0:
+            _write(rings[passes, last % rows], np.uintp(margin), noise, fine[0], low, high, depth_m[last])
 
 
 @cell
-def _invert(depths, inverse):
-    for u in range(depths.size):
+def _invert(depths, inverse, margin):
+    for u in range(np.uintp(depths.size)):  # unsigned, here and below: else each index is first compared with 0
         d = depths[u]
-        inverse[u + RADIUS] = ONE / d if (d > ZERO) & (d < FAR) else NONE
+        inverse[u + np.uintp(margin)] = ONE / d if (d > ZERO) & (d < FAR) else NONE
 
 
 @cell
-def _write(inverse, before, noise, fine, low, high, depths):
+def _write(inverse, margin, noise, fine, low, high, depths):
     """Write depths where they were to change."""
-    for u in range(depths.size):
-        c = before[u + RADIUS]
-        d = min(max(ONE / inverse[u + RADIUS], low), high)
-        depths[u] = d if (_sigma(c, noise) > fine * c * c) & (c > ZERO) else depths[u]
+    for u in range(np.uintp(depths.size)):
+        d = depths[u]
+        c = ONE / d
+        counts = (_sigma(c, noise) > fine * c * c) & (d > ZERO) & (d < FAR)
+        depths[u] = min(max(ONE / inverse[u + margin], low), high) if counts else d
 
 
 @cell
-def _average(ring, last, noise, fine, wide, limit, out):
-    """Average the middle row of the ring, whose last row is `last`, with the rows about it; margins stay NONE."""
-    rows = (
-        ring[(last + 1) % RING], ring[(last + 2) % RING], ring[(last + 3) % RING], ring[(last + 4) % RING],
-        ring[(last + 5) % RING], ring[(last + 6) % RING], ring[last % RING],
-    )  # fmt: skip
-    width = out.size - 2 * RADIUS
-    for start in range(0, width, SEGMENT):
-        stop = min(start + SEGMENT, width)
-        c = _farthest(rows[3][start + RADIUS : stop + RADIUS])
-        sigma, step = _sigma(c, noise), fine * c * c
-        if sigma > FIVE * step:
-            _segment(rows, start, stop, noise, fine, wide, limit, 3, out)
-        elif sigma > THREE * step:
-            _segment(rows, start, stop, noise, fine, wide, limit, 2, out)
-        elif sigma > step:
-            _segment(rows, start, stop, noise, fine, wide, limit, 1, out)
+def _average(above, row, below, step, margin, noise, fine, wide, limit, out):
+    """Average the pixels of a row with those `step` beside them, and in the rows above and below; margins stay."""
+    end = np.uintp(row.size) - margin
+    for start in range(margin, end, np.uintp(SEGMENT)):
+        stop = min(start + np.uintp(SEGMENT), end)
+        if _any_noisy(row, start, stop, noise, fine):
+            for u in range(start, stop):
+                c = row[u]
+                sigma, square = _sigma(c, noise), c * c
+                reach = wide * min(sigma, limit * square)
+                total, weight = _four(c, row[u - step], row[u + step], above[u], below[u], ONE / (reach * reach))
+                out[u] = c + total / (ONE + weight) if (sigma > fine * square) & (c > ZERO) else c
         else:
-            for u in range(start + RADIUS, stop + RADIUS):
-                out[u] = rows[3][u]
+            for u in range(start, stop):
+                out[u] = row[u]
 
 
 @cell
-def _farthest(inverse):
-    """Return the smallest inverse depth of a segment, the largest of all where it has no value."""
-    least = -NONE
-    for u in range(inverse.size):
-        least = min(least, inverse[u] if inverse[u] > ZERO else -NONE)
-    return least
-
-
-@cell
-def _segment(rows, start, stop, noise, fine, wide, limit, radius, out):
-    """Average pixels start..stop with up to `radius` neighbours on each side."""
-    a3, a2, a1, middle, b1, b2, b3 = rows
-    for u in range(start + RADIUS, stop + RADIUS):
-        c = middle[u]
-        sigma, step = _sigma(c, noise), fine * c * c
-        reach = min(wide * sigma, limit * c * c)
-        scale = ONE / (reach * reach)
-        total, weight = _four(c, middle[u - 1], middle[u + 1], a1[u], b1[u], scale)
-        if radius > 1:
-            t, w = _four(c, middle[u - 2], middle[u + 2], a2[u], b2[u], scale)
-            counts = sigma > THREE * step
-            total, weight = total + (t if counts else ZERO), weight + (w if counts else ZERO)
-        if radius > 2:
-            t, w = _four(c, middle[u - 3], middle[u + 3], a3[u], b3[u], scale)
-            counts = sigma > FIVE * step
-            total, weight = total + (t if counts else ZERO), weight + (w if counts else ZERO)
-        out[u] = c + total / (ONE + weight) if (sigma > step) & (c > ZERO) else c
+def _any_noisy(inverse, start, stop, noise, fine):
+    """Tell whether a pixel has more noise than `fine`."""
+    number = np.int32(0)
+    for u in range(start, stop):
+        c = inverse[u]
+        number += np.int32((_sigma(c, noise) > fine * c * c) & (c > ZERO))
+    return number > 0
 
 
 @cell

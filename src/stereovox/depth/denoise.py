@@ -15,10 +15,14 @@ FINE = 0.15
 """Noise of this share of a cell does not thicken a surface noticeably."""
 WORTH = 0.5
 """Where no noise exceeds this share of a cell, raw depth maps as well: in the demo at 0.2 m even a little better."""
-WIDTHS = (5.0, 6.0)
-"""A neighbour counts less the more it differs, and not at all from so many sigma on: in the first and second pass."""
-LIMIT = 6.0
-"""Nor from so many cells on: what the map can tell apart is not mixed, however noisy the camera is."""
+STEPS = np.array([1, 2, 4])
+"""How many pixels away the neighbours are, pass by pass."""
+FROM = np.array([1, 1, 3])
+"""In which pass a pixel takes part: where its noise is more than so many times FINE cells."""
+WIDTHS = np.array([4.5, 4.5, 4.0], np.float32)
+"""A neighbour counts less the more it differs, and not at all from so many sigma on."""
+LIMIT = 1.3
+"""Sigma counts for no more than so many cells: what the map can tell apart is not mixed, however noisy the camera."""
 
 
 def denoise(depth_m: NDArray[np.float32], camera: VirtualCamera, config: Config) -> None:
@@ -27,19 +31,20 @@ def denoise(depth_m: NDArray[np.float32], camera: VirtualCamera, config: Config)
     depth_m: (height, width) float32 metres with REP 117's special values, contiguous. Pixels without value stay as they
     are and count nowhere; values stay within min_range and max_range.
 
-    A sigma filter (Lee 1983) whose weights (1 - (difference / (k sigma))^2)^4 fall smoothly. It works on inverse depth,
-    in which stereo noise is the same everywhere and a plane is linear, so a mean over symmetric neighbours is true to
-    it. sigma is the noise model's: the configured one, or the camera's. A pixel is averaged with up to 3 neighbours on
-    each side in its row and in its column, and the result once more. A pixel asks for no more neighbours than it takes
-    to bring its noise down to FINE cells: the s-th on each side only where sigma(depth) > (2 s - 1) FINE voxel_size. So
-    what is near keeps every detail. Nothing is done where even the farthest noise is less than WORTH cells.
+    A sigma filter (Lee 1983) whose weights (1 - (difference / (k sigma))^2)^4 fall smoothly, in passes with holes
+    ("a trous", Dammertz 2010): with the next neighbours to the left and right, above and below, then with those 2
+    pixels away, then 4. So few neighbours go far, and the noise of stereo, which is alike over about its matching
+    window, is taken out as well. It works on inverse depth, in which stereo noise is the same everywhere and a plane is
+    linear, so a mean over symmetric neighbours is true to it. sigma is the noise model's: the configured one, or the
+    camera's. A pixel asks for no more passes than it takes: it is left alone where sigma(depth) is at most FINE cells,
+    and by the last pass up to three times that. So what is near keeps every detail. Nothing is done where even the
+    farthest noise is less than WORTH cells.
 
     Row and column together keep what is thin: a pole finds its like along the column while its row shows the wall
-    behind, and a wire the other way round; in the second pass what noise is left no longer hides the step. Were the
-    row averaged alone first, a pole two sigma before its wall would be gone.
+    behind, and a wire the other way round; in later passes what noise is left no longer hides the step. Were the row
+    averaged alone first, a pole two sigma before its wall would be gone.
 
-    What it cannot do: neighbouring errors of real stereo matching are alike over about the matching window, and what
-    they have in common stays in the mean. A step of less than about two sigma is smoothed over some pixels.
+    What it cannot do: a step of less than about two sigma is smoothed over some pixels.
     """
     if not config.depth.denoise:
         return
@@ -49,9 +54,8 @@ def denoise(depth_m: NDArray[np.float32], camera: VirtualCamera, config: Config)
 
 
 def _run(depth_m: NDArray[np.float32], noise: RangeNoise, fine: float, config: Config) -> None:
-    raw, once = np.empty((2, _denoise.RING, depth_m.shape[1] + 2 * _denoise.RADIUS), np.float32)
-    coefficients = np.array([noise.s0, noise.s1, noise.s2], np.float32)
-    low, high, limit = np.float32(config.min_range), np.float32(config.max_range), np.float32(LIMIT * config.voxel_size)
-    _denoise.denoise(
-        depth_m, coefficients, np.float32(fine), np.array(WIDTHS, np.float32), limit, low, high, raw, once
-    )  # fmt: skip
+    margin = int(STEPS.max())
+    rings = np.empty((len(STEPS) + 1, 2 * margin + 1, depth_m.shape[1] + 2 * margin), np.float32)
+    coefficients, least = np.array([noise.s0, noise.s1, noise.s2], np.float32), (fine * FROM).astype(np.float32)
+    low, high, limit = (np.float32(x) for x in (config.min_range, config.max_range, LIMIT * config.voxel_size))
+    _denoise.denoise(depth_m, coefficients, STEPS, least, WIDTHS, limit, low, high, rings)

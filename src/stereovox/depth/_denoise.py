@@ -59,8 +59,7 @@ def _write(inverse, margin, noise, fine, low, high, depths):
     """Write depths where they were to change."""
     for u in range(np.uintp(depths.size)):
         d = depths[u]
-        c = ONE / d
-        counts = (_sigma(c, noise) > fine * c * c) & (d > ZERO) & (d < FAR)
+        counts = (noise[0] + d * (noise[1] + d * noise[2]) > fine) & (d > ZERO) & (d < FAR)
         depths[u] = min(max(ONE / inverse[u + margin], low), high) if counts else d
 
 

@@ -88,8 +88,10 @@ def for_kernels(given: ArrayLike) -> NDArray:
     Read-only, aligned and without gaps: for arrays of other kinds kernels would be compiled anew, amid a run.
     """
     array = np.asarray(given)
-    with np.errstate(over="ignore", invalid="ignore"):
-        plain = np.require(array, np.float32 if array.dtype.kind == "f" else None, ["C", "A"]).view()
+    if array.dtype.kind == "f" and array.dtype != np.float32:
+        with np.errstate(over="ignore", invalid="ignore"):
+            array = array.astype(np.float32)
+    plain = (array if array.flags.carray else np.require(array, None, ["C", "A"])).view()
     plain.flags.writeable = False
     return plain
 

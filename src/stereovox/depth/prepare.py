@@ -23,7 +23,7 @@ SATURATED = 65535
 """What many cameras write into uint16 images for "no value"."""
 EXACT = 1e-14
 """How far a rotation of doubles may be off and still be the nearest there is."""
-NO_REASONS = np.empty(0, np.uint8)
+NO_REASONS = for_kernels(np.empty(0, np.uint8))
 """What is taken where a frame gives none: so the kernel is there when the first one does."""
 SMALLEST = 1e-30
 """Metres per unit of a depth image that float32 can still multiply with."""
@@ -70,8 +70,8 @@ def _classify(frame: Frame, config: Config, depth_m: NDArray, reason: NDArray) -
     usable = _cpu.classify(raw, scale, *limits, none, infinite, *into)
     told = config.depth.far != "measured" and float(frame.farthest) >= config.max_range
     far = np.uint8(Reason.TOO_FAR if told else Reason.UNKNOWN)
-    given = NO_REASONS if frame.reason is None else frame.reason
-    taken = _cpu.take_given(for_kernels(given).reshape(-1), far, *into)
+    given = NO_REASONS if frame.reason is None else for_kernels(frame.reason).reshape(-1)
+    taken = _cpu.take_given(given, far, *into)
     return usable if frame.reason is None else taken
 
 

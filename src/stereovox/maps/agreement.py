@@ -70,19 +70,7 @@ def agreement(stored: StoredCells, rules: CellRules, evidence: Evidence, firm: i
     mask = (1 << max(blocks // SAMPLE, 1).bit_length() - 1) - 1
     weights = np.zeros(5)
     _agreement.weigh(
-        stored, _sure(rules), np.int16(min(firm, LARGEST)), evidence.coords, evidence.values, evidence.uniform,
+        stored, rules.sure, np.int16(min(firm, LARGEST)), evidence.coords, evidence.values, evidence.uniform,
         evidence.uniform_values, np.uint32(mask), weights,
     )  # fmt: skip
     return Agreement(*((mask + 1) / LOG_ODDS_SCALE * weights).tolist())
-
-
-def _sure(rules: CellRules) -> tuple[np.int16, np.int16, np.int16]:
-    """Return the highest stored number that is surely free, the lowest occupied one, and the lowest surely so.
-
-    None of them is "unknown", nor beyond it.
-    """
-    unknown, (free_most, occupied_least) = rules.format.unknown, map(int, rules.thresholds)
-    surely_free = min((free_most + int(rules.lowest)) // 2, unknown - 1)
-    occupied = max(occupied_least, unknown + 1)
-    surely_occupied = max(-(-(occupied_least + int(rules.highest)) // 2), occupied)
-    return np.int16(surely_free), np.int16(occupied), np.int16(surely_occupied)

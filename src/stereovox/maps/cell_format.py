@@ -131,6 +131,18 @@ class CellRules:
         """The same in whole numbers."""
         return Thresholds(np.int32(ceil(self.free_below) - 1), np.int32(floor(self.occupied_above) + 1))
 
+    @cached_property
+    def sure(self) -> tuple[np.int16, np.int16, np.int16]:
+        """The highest stored number that is surely free, the lowest occupied one, and the lowest surely occupied one.
+
+        Sure is what lies past the middle between its threshold and its limit. None is "unknown", nor beyond it.
+        """
+        unknown, (free_most, occupied_least) = self.format.unknown, map(int, self.thresholds)
+        surely_free = min((free_most + int(self.lowest)) // 2, unknown - 1)
+        occupied = max(occupied_least, unknown + 1)
+        surely_occupied = max(-(-(occupied_least + int(self.highest)) // 2), occupied)
+        return np.int16(surely_free), np.int16(occupied), np.int16(surely_occupied)
+
     def states(self, stored: NDArray[np.integer]) -> NDArray[np.uint8]:
         """Return the `State` of stored numbers, uint8 of the same shape."""
         free_most, occupied_least = map(int, self.thresholds)

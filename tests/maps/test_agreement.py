@@ -38,7 +38,7 @@ def slow(voxel_map, evidence):
     rules = voxel_map._rules
     free_most, occupied_least = map(int, rules.thresholds)
     spoken = [*zip(evidence.coords, evidence.values, strict=True)]
-    spoken += [(c, np.full(512, evidence.uniform_value)) for c in evidence.uniform]
+    spoken += [(c, np.full(512, step)) for c, step in zip(evidence.uniform, evidence.uniform_values, strict=True)]
     for coords, values in spoken:
         cells = stored.get(tuple(coords), np.full(512, rules.format.unknown)).astype(int).reshape(8, 8, 8)
         known = cells != rules.format.unknown
@@ -87,11 +87,11 @@ def test_a_frame_is_judged_by_what_is_known_alone():
     assert Agreement(FEW, 0.0, 0.0, 0.0, FEW).against == 0
     assert Agreement(FEW - 1, 0.0, 0.0, 0.0, FEW).against is None
     assert Agreement(FEW, 0.0, 0.0, 0.0, 1.01 * FEW / KNOWN).against is None
-    assert Agreement(300.0, 100.0, 0.0, 0.0, 300.0).against == 0.25
+    assert Agreement(300.0, 40.0, 0.0, 0.0, 300.0).against == 0.25
     assert Agreement(300.0, 0.0, 100.0, 0.0, 300.0).against == 0.25
 
 
 def test_what_comes_to_light_at_the_edge_counts_no_more_than_the_rest():
     assert Agreement(300.0, 0.0, 200.0, 200.0, 300.0).against == 0
-    assert Agreement(300.0, 50.0, 200.0, 200.0, 300.0).against == 0.25
-    assert Agreement(300.0, 50.0, 100.0, 50.0, 300.0).against == 1 / 3
+    assert Agreement(300.0, 20.0, 200.0, 200.0, 300.0).against == 0.25
+    assert Agreement(300.0, 20.0, 100.0, 50.0, 300.0).against == 1 / 3

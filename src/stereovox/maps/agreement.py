@@ -18,6 +18,8 @@ KNOWN = 0.3
 """Share of what a frame sees that the map must be sure of."""
 SAMPLE = 512
 """Blocks that are enough to judge a frame by."""
+LOOKED_THROUGH = 2.5
+"""What is looked through tells as much as what is hit, although a sensor model gives it less evidence."""
 
 
 class Agreement(NamedTuple):
@@ -55,7 +57,7 @@ class Agreement(NamedTuple):
         """
         if self.weight < FEW or (self.weight < KNOWN * self.every and self.passes < FEW):
             return None
-        within = self.passes + self.into_free - self.at_edge
+        within = LOOKED_THROUGH * self.passes + self.into_free - self.at_edge
         against = within + min(self.at_edge, within)
         return against / (self.hits + against) if against else 0.0
 

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 import stereovox as sv
-from stereovox.belief import MAX_LIMIT, USUAL_AT_FIRST, Belief
+from stereovox.belief import LEAST_FRAMES, MAX_LIMIT, SPREADS, USUAL_AT_FIRST, Belief
 from stereovox.config import load_config
 from stereovox.errors import FrameRefused
-from stereovox.history import MOST_SENSORS, History
+from stereovox.history import MOST_SENSORS, Doubt, History, Seen, Usual
 
 FRAME = sv.Frame(np.ones((2, 2), np.float32), sv.PinholeCamera(2, 2, 1, 1, 0.5, 0.5), np.eye(4))
 
@@ -48,31 +48,40 @@ CHANGED, MOVED = "disagrees_with_map", "camera_moved"
 def test_a_frame_may_disagree_as_much_as_usual_and_some_more():
     told = Told()
     assert told(*[0.03] * 40) == [""] * 40
-    assert told.history.usual["camera"] == pytest.approx(0.03, abs=1e-3)
-    limit = Belief(told.config, told.history).limit("camera")
+    assert told.history.usual["camera"] == pytest.approx((0.03, 0), abs=1e-3)
+    limit = Belief(told.config, told.history).limit("camera", 0)
     assert limit == pytest.approx(0.03 + told.config.trust.max_disagreement, abs=1e-3)
     assert told(limit - 0.001) == [""]
     assert told(0.2, 0.03, 0.03) == [CHANGED, "", ""]
 
 
 def test_at_first_nothing_is_known_of_what_is_usual():
-    assert Told()(2 * USUAL_AT_FIRST - 0.01) == [""]
-    assert Told()(2 * USUAL_AT_FIRST + 0.01) == [CHANGED]
+    assert Told()(2 * USUAL_AT_FIRST.mean - 0.01) == [""]
+    assert Told()(2 * USUAL_AT_FIRST.mean + 0.01) == [CHANGED]
+
+
+def test_where_frames_disagree_now_more_and_now_less_a_frame_may_as_well():
+    told = Told()
+    assert told(*[0.1, 0.3] * 20) == [""] * 40
+    mean, spread = told.history.usual["camera"]
+    assert (mean, spread) == (pytest.approx(0.2, abs=0.03), pytest.approx(0.1, abs=0.03))
+    assert told(mean + SPREADS * spread - 0.01) == [""]
+    assert Told()(*[0.2] * 40, mean + SPREADS * spread - 0.01)[-1] == CHANGED
 
 
 def test_small_cells_disagree_by_small_errors_of_the_pose():
     fine = load_config(voxel_size=0.02, **{"trust.pose_error_m": 0.006})
-    history = History(usual={"camera": 0.05})
-    assert Belief(fine, history).limit("camera") == pytest.approx(0.35)
-    noisy = History(usual={"camera": 0.7})
-    assert Belief(fine, noisy).limit("camera") == MAX_LIMIT
+    history = History(usual={"camera": Usual(0.05, 0.0)})
+    assert Belief(fine, history).limit("camera", 0) == pytest.approx(0.35)
+    noisy = History(usual={"camera": Usual(0.7, 0.0)})
+    assert Belief(fine, noisy).limit("camera", 0) == MAX_LIMIT
 
 
 def test_a_world_that_has_changed_is_believed_after_a_second():
     told = Told()
     assert told(*[0.03] * 30, *[0.6] * 12) == [""] * 30 + [CHANGED] * 10 + [f"after {CHANGED}", ""]
     assert told.asked == 11
-    assert told.history.usual["camera"] < 0.05  # what had to be believed is not usual
+    assert told.history.usual["camera"].mean < 0.05  # what had to be believed is not usual
     assert told(0.03, 0.6) == ["", CHANGED]  # it agreed again: from here on the second starts anew
 
 
@@ -82,8 +91,27 @@ def test_a_frame_that_agrees_ends_the_waiting():
 
 
 def test_how_long_is_a_setting():
-    assert Told(changed_s=0.3)(*[0.03] * 30, *[0.6] * 4)[30:] == [CHANGED] * 3 + [f"after {CHANGED}"]
+    assert Told(changed_s=0.6)(*[0.03] * 30, *[0.6] * 7)[30:] == [CHANGED] * 6 + [f"after {CHANGED}"]
     assert Told(changed_s=0)(*[0.03] * 30, 0.6)[30:] == [f"after {CHANGED}"]
+
+
+def test_a_frame_that_comes_late_may_disagree_more():
+    told = Told()
+    told(*[0.03] * 40)
+    told.history.trusted["camera"] = Seen(told.now, (0.0,) * 12)
+    early, late = (Belief(told.config, told.history).limit("camera", told.now + ms * 1_000_000) for ms in (200, 1200))
+    assert late - 0.03 == pytest.approx(2 * (early - 0.03), rel=1e-2)
+    told.history.doubts["camera"] = Doubt(told.now, told.now + 10**9)
+    assert Belief(told.config, told.history).limit("camera", told.now + 1_200_000_000) == early
+
+
+@pytest.mark.parametrize("moved", [False, True])
+def test_a_few_frames_are_not_enough_however_long_they_take(moved):
+    told = Told(moved=moved)
+    found = told(*[0.03] * 30, *[0.6] * LEAST_FRAMES, 0.03, ms=2000)[30:]
+    assert found == [CHANGED] * LEAST_FRAMES + [""]
+    told(*[0.6] * (LEAST_FRAMES + 1), ms=2000)
+    assert told.history.doubts["camera"].verdict == ("moved" if moved else "changed")
 
 
 def test_frames_without_times_count_thirty_a_second():

@@ -10,16 +10,23 @@ from typing import NamedTuple
 from stereovox.config import Config
 from stereovox.errors import FrameRefused
 from stereovox.frame import AnyFrame, name_of
-from stereovox.history import CHANGED, MOST_SENSORS, MOVED, Doubt, History
+from stereovox.history import CHANGED, MOST_SENSORS, MOVED, Doubt, History, Usual
 
 WHY = {"": "disagrees_with_map", CHANGED: "disagrees_with_map", MOVED: "camera_moved"}
 """Reasons by the verdict on a doubt."""
-USUAL_AT_FIRST, USUAL_GAIN = 0.25, 0.2
+USUAL_AT_FIRST, USUAL_GAIN = Usual(0.25, 0.06), 0.2
 """Disagreement that a sensor is taken for at first, and how quickly it follows its frames (exponential mean)."""
+SPREADS = 4
+"""Spreads beyond the mean that are usual."""
 MAX_LIMIT = 0.8
 """Disagreement that is too much whatever is usual."""
 AGAIN = 1 / 2
 """Share of what a frame may disagree beyond the usual up to which one ends a doubt: it must really agree."""
+SOON_S = 0.2
+"""What comes later than so many seconds after the frame before may disagree more, in proportion: it sees much that is
+new, and the world had time to change."""
+LEAST_FRAMES = 5
+"""Frames that must disagree before anything is made of it, however far apart they were taken."""
 FITS = 1 / 3
 """Share of the frames that agree from elsewhere where it is the camera that was moved: some find no such place."""
 UNTIMED_HZ = 30
@@ -38,7 +45,7 @@ class Judged(NamedTuple):
 class Belief:
     """Compares the disagreement of each frame with that of its sensor of late; what it remembers is in `history`.
 
-    A frame that disagrees more is refused. Where all frames of its sensor have done so for `trust.changed_s`, the world
+    A frame that disagrees more is refused. Where at least LEAST_FRAMES have done so for `trust.changed_s`, the world
     has changed: they are believed until they agree again. But where they would agree if the camera stood elsewhere, it
     is the camera that was moved, or its tracker that is wrong: it is not believed until it agrees again, or for
     `trust.moved_s`.
@@ -50,10 +57,17 @@ class Belief:
         self._changed_ns = round(1e9 * config.trust.changed_s)
         self._moved_ns = inf if config.trust.moved_s is None else round(1e9 * config.trust.moved_s)
 
-    def limit(self, sensor: str, share: float = 1.0) -> float:
+    def limit(self, sensor: str, stamp_ns: int, share: float = 1.0) -> float:
         """Return how far a frame may disagree with the map, 0 to 1; `share`: of what it may beyond the usual."""
-        usual = self._history.usual.get(sensor, USUAL_AT_FIRST)
-        return min(usual + share * max(self._excess, usual), MAX_LIMIT)
+        mean, spread = self._history.usual.get(sensor, USUAL_AT_FIRST)
+        late_s = max(1e-9 * (stamp_ns - self._last_ns(sensor, stamp_ns)) - SOON_S, 0.0)
+        return min(mean + share * (1 + late_s) * max(self._excess, mean, SPREADS * spread), MAX_LIMIT)
+
+    def _last_ns(self, sensor: str, now_ns: int) -> int:
+        """Return the stamp of the frame before, believed or in doubt; that of now where there is none."""
+        if sensor in self._history.doubts:
+            return self._history.doubts[sensor].last_ns
+        return self._history.trusted[sensor].stamp_ns if sensor in self._history.trusted else now_ns
 
     def check(
         self, frame: AnyFrame, sensor: str, stamp_ns: int, against: float | None, moved: Callable[[float], bool]
@@ -64,15 +78,15 @@ class Belief:
         the limit, whether the frame would agree from elsewhere. Raises FrameRefused: `disagrees_with_map`,
         `camera_moved`.
         """
-        doubt, limit = self._history.doubts.get(sensor), self.limit(sensor)
+        doubt, limit = self._history.doubts.get(sensor), self.limit(sensor, stamp_ns)
         if against is None and not (doubt and doubt.verdict == MOVED):
             return Judged(None, doubt)
-        if against is not None and against <= (limit if doubt is None else self.limit(sensor, AGAIN)):
+        if against is not None and against <= (self.limit(sensor, stamp_ns, AGAIN) if doubt else limit):
             return Judged(against)
         waited = doubt is not None and doubt.verdict == CHANGED
         doubt = self._judged(Doubt(stamp_ns, stamp_ns) if doubt is None else doubt.going_on(stamp_ns), limit, moved)
         enough_ns = self._moved_ns if doubt.verdict == MOVED else self._changed_ns
-        if doubt.lasted_ns(UNTIMED_HZ) >= enough_ns:
+        if self._lasted(doubt, enough_ns):
             return Judged(against, doubt._replace(verdict=CHANGED), "" if waited else WHY[doubt.verdict])
         self._remember(sensor, doubt)
         raise self._refused(frame, against, limit, doubt)
@@ -82,9 +96,12 @@ class Belief:
         if doubt.verdict:
             return doubt
         doubt = doubt._replace(fits=doubt.fits + moved(limit))
-        if doubt.lasted_ns(UNTIMED_HZ) < self._changed_ns:
+        if not self._lasted(doubt, self._changed_ns):
             return doubt
         return doubt._replace(verdict=MOVED if doubt.fits >= FITS * (doubt.frames + 1) else CHANGED)
+
+    def _lasted(self, doubt: Doubt, enough_ns: float) -> bool:
+        return doubt.lasted_ns(UNTIMED_HZ) >= enough_ns and (doubt.frames >= LEAST_FRAMES or enough_ns == 0)
 
     def took(self, sensor: str, judged: Judged) -> None:
         """Remember a frame that the map took in."""
@@ -92,8 +109,9 @@ class Belief:
             self._remember(sensor, judged.doubt)
         elif judged.against is not None:
             self._history.doubts.pop(sensor, None)
-            usual = self._history.usual.get(sensor, USUAL_AT_FIRST)
-            self._history.usual[sensor] = usual + USUAL_GAIN * (judged.against - usual)
+            self._history.usual[sensor] = self._history.usual.get(sensor, USUAL_AT_FIRST).after(
+                judged.against, USUAL_GAIN
+            )
 
     def _remember(self, sensor: str, doubt: Doubt) -> None:
         if sensor in self._history.doubts or len(self._history.doubts) < MOST_SENSORS:

@@ -42,6 +42,18 @@ class Look(NamedTuple):
     pose: tuple[float, ...]
 
 
+class Usual(NamedTuple):
+    """How far the frames of a sensor disagree with the map, 0 to 1: their mean, and how far they are from it."""
+
+    mean: float
+    spread: float
+
+    def after(self, share: float, gain: float) -> Usual:
+        """Return both after one more frame; gain: its part."""
+        off = share - self.mean
+        return Usual(self.mean + gain * off, self.spread + gain * (abs(off) - self.spread))
+
+
 CHANGED, MOVED = "changed", "moved"
 """Why frames disagree with the map: the world has changed, or the camera was moved."""
 
@@ -92,7 +104,7 @@ class History:
     waiting: dict[str, Streak] = field(default_factory=dict)
     path: CameraPath = field(default_factory=CameraPath)
     looks: dict[str, Look] = field(default_factory=dict)
-    usual: dict[str, float] = field(default_factory=dict)
+    usual: dict[str, Usual] = field(default_factory=dict)
     doubts: dict[str, Doubt] = field(default_factory=dict)
 
     def offered(self, frame: object) -> None:
@@ -128,7 +140,7 @@ class History:
                     for name, streak in self.waiting.items()
                 },
                 "looks": {name: {"digest": look.digest, "pose": list(look.pose)} for name, look in self.looks.items()},
-                "usual": dict(self.usual),
+                "usual": {name: list(usual) for name, usual in self.usual.items()},
                 "doubts": {name: doubt._asdict() for name, doubt in self.doubts.items()},
             },
             "camera_path": self.path.saved(),
@@ -153,7 +165,7 @@ class History:
         if not waiting.keys() <= trusted.keys():
             raise ValueError("history.waiting names a sensor that was never trusted")
         looks = {name: _look_from(look) for name, look in _sensors(told.get("looks", {})).items()}
-        usual = {name: _share(share) for name, share in _sensors(told.get("usual", {})).items()}
+        usual = {name: _usual_from(shares) for name, shares in _sensors(told.get("usual", {})).items()}
         doubts = {name: _doubt_from(doubt) for name, doubt in _sensors(told.get("doubts", {})).items()}
         history = cls(frames, reasons, settled, ways, recording, last, trusted, waiting, path, looks, usual, doubts)
         if history.refused.total() != refused:
@@ -217,10 +229,11 @@ def _doubt_from(saved: Any) -> Doubt:
     return Doubt(since_ns, last_ns, frames, fits, saved["verdict"])
 
 
-def _share(saved: Any) -> float:
-    if type(saved) not in (float, int) or not 0 <= saved <= 1:
+def _usual_from(saved: Any) -> Usual:
+    shares = Usual(*saved)
+    if any(type(share) not in (float, int) or not 0 <= share <= 1 for share in shares):
         raise ValueError("history: a share is no number from 0 to 1")
-    return float(saved)
+    return shares
 
 
 def _pose_from(pose: Any) -> tuple[float, ...]:

@@ -25,7 +25,7 @@ def frames():
 
 @pytest.fixture(scope="module")
 def found(frames):
-    return trial(frames, every=13, voxel_size=0.1)
+    return trial(frames, every=16, voxel_size=0.1)
 
 
 def test_no_good_frame_is_refused(found):

@@ -29,6 +29,9 @@ def test_a_displaced_camera_is_found(room, shift_m, turn_deg):
     voxel_map, frame = room
     image = DepthPath(load_config(voxel_size=0.1)).image(displaced(frame, np.array(shift_m), np.radians(turn_deg)))
     found = pose_on_surfaces(voxel_map, image)
+    if not any(shift_m) and not any(turn_deg):
+        assert found is None  # it is there already
+        return
     off = inverse(np.asarray(frame.T_world_sensor, float)) @ found
     assert np.linalg.norm(off[:3, 3]) < 0.1  # a cell
     assert np.degrees(np.arccos((np.trace(off[:3, :3]) - 1) / 2)) < 2.0

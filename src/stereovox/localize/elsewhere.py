@@ -26,7 +26,9 @@ DAMPING = 1e-3
 
 
 def pose_on_surfaces(voxel_map: VoxelMap, image: DepthImage) -> Transform | None:
-    """Return T_world_sensor (4, 4) near the image's own that brings its points onto the map's surfaces; None: none.
+    """Return T_world_sensor (4, 4) near the image's own that brings its points onto the map's surfaces.
+
+    None: there is no such pose, or the image is there already, within a cell.
 
     Iterative closest points, from points and their planes to the centres of cells (Chen and Medioni 1992); the distance
     up to which a point finds a cell shrinks from step to step.
@@ -41,7 +43,9 @@ def pose_on_surfaces(voxel_map: VoxelMap, image: DepthImage) -> Transform | None
             return None
         T = _motion(there[near], planes[near], voxel_map.centers(found.cell[near])) @ T
     shift_m, turn = apart(tuple(image.T_world_sensor[:3].ravel().tolist()), tuple(T[:3].ravel().tolist()))
-    return T if shift_m <= MAX_SHIFT_M and turn <= MAX_TURN else None
+    moved_m = np.linalg.norm(points @ (T - image.T_world_sensor)[:3, :3].T + (T - image.T_world_sensor)[:3, 3], axis=1)
+    elsewhere = moved_m.mean() > voxel_map.voxel_size and shift_m <= MAX_SHIFT_M and turn <= MAX_TURN
+    return T if elsewhere else None
 
 
 def _surfaces(image: DepthImage) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -105,6 +105,7 @@ SPACE = {
     "check_boxes": (PLACE, PLACE),
     "check_capsules": (PLACE, PLACE, 0.1),
     "check_cells": "config",
+    "agreement": (NO_EVIDENCE, 1),
     "check_room": (NO_EVIDENCE,),
     "go_on_with": "map",
     "insert": (NO_BLOCKS, np.empty((0, 512), np.int16)),

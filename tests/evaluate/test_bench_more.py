@@ -142,7 +142,7 @@ def test_start_up_runs_each_in_a_process_of_its_own():
 def test_overhead_is_that_of_images_with_one_valid_pixel():
     frame = empty_frame(64, 48)
     assert np.count_nonzero(frame.depth) == 1
-    assert Mapper(COARSE).add(frame).refused is None
+    assert Mapper(COARSE, **{"trust.min_valid_share": 0}).add(frame).refused is None
     result = overhead(COARSE, repeats=3, sizes=[(8, 6), (64, 48)])
     assert [(row["width"], row["height"]) for row in result["rows"]] == [(8, 6), (64, 48)]
     for row in result["rows"]:

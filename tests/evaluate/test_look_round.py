@@ -76,7 +76,7 @@ def test_a_last_frame_that_cannot_be_used_is_counted_and_named():
     a, b = mounted(UPRIGHT, "a"), mounted(UPRIGHT, "b")
     early = replace(wall(a, 1), fault="no_pose")
     late = replace(wall(a, 3), fault="no_pose", fault_detail="a at 3: no pose")
-    wrong = replace(wall(b, 4), left=np.zeros((3, 3), np.uint8))
+    wrong = replace(wall(b, 4), left=np.full((3, 3), 99, np.uint8))
     told = []
     grid, now_ns, refused = look_round([early, wall(a, 2), late, wrong], CONFIG, told.append)
     assert refused == {"no_pose": 2, "bad_shape": 1}

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from stereovox.depth.sphere_image import T_BODY_GRID
 from stereovox.depth.sphere_layout import SphereLayout
-from stereovox.frame import Frame
+from stereovox.frame import Frame, Reason
 from stereovox.geometry import Transform
 from stereovox.sources.bag_robot_messages import PointCloud
 from stereovox.wide import WIDEST_DEG, SphericalCamera
@@ -23,8 +23,8 @@ def frame_of_cloud(cloud: PointCloud, T_world_sensor: Transform, step_deg: float
     """Return a cloud as the frame of a spherical camera where its sensor stands (x forward, y left, z up).
 
     A pixel is `step_deg` wide in azimuth and elevation and has the distance of the nearest of its points from the
-    sensor's z axis. One without points has no value, and clears nothing: a cloud does not tell why. Points within two
-    degrees of the z axis have no such depth and are left out.
+    sensor's z axis. One without points is masked, and clears nothing: a cloud does not tell where it looked. Points
+    within two degrees of the z axis have no such depth and are left out.
     """
     camera, columns, layout = _eye(step_deg)
     points = cloud.points[np.isfinite(cloud.points).all(axis=1)].astype(float)
@@ -35,7 +35,8 @@ def frame_of_cloud(cloud: PointCloud, T_world_sensor: Transform, step_deg: float
     np.minimum.at(depth, cells[seen], level[seen])
     depth[np.isinf(depth)] = np.nan
     image = depth.reshape(layout.shape)[:, columns].astype(np.float32)
-    return Frame(image, camera, T_world_sensor @ T_BODY_GRID, cloud.stamp_ns, name=name, sensor=sensor)
+    reason = np.where(np.isnan(image), np.uint8(Reason.MASKED), np.uint8(Reason.VALID))
+    return Frame(image, camera, T_world_sensor @ T_BODY_GRID, cloud.stamp_ns, reason=reason, name=name, sensor=sensor)
 
 
 @lru_cache(maxsize=4)

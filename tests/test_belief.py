@@ -52,7 +52,7 @@ def test_a_frame_may_disagree_as_much_as_usual_and_some_more():
     limit = Belief(told.config, told.history).limit("camera", 0)
     assert limit == pytest.approx(0.03 + told.config.trust.max_disagreement, abs=1e-3)
     assert told(limit - 0.001) == [""]
-    assert told(0.2, 0.03, 0.03) == [CHANGED, "", ""]
+    assert told(0.3, 0.03, 0.03) == [CHANGED, "", ""]
 
 
 def test_at_first_nothing_is_known_of_what_is_usual():

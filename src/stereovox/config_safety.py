@@ -42,7 +42,7 @@ class TrustConfig(Section):
     min_surface_share: float = Field(0.5, ge=0, le=1)
     max_unexposed_share: float = Field(0.9, gt=0, le=1)
     frozen: bool = True
-    max_disagreement: float = Field(0.12, gt=0, le=1)
+    max_disagreement: float = Field(0.15, gt=0, le=1)
     pose_error_m: float = Field(0.0075, ge=0)
     changed_s: float = Field(1.0, ge=0, le=1e9)
     moved_s: float | None = Field(None, ge=0, le=1e9)

@@ -30,14 +30,15 @@ class Told:
         self.now = getattr(self, "now", 0) + ms * 1_000_000
         self.history = History.loaded(json.loads(json.dumps(self.history.saved())))
         belief = Belief(self.config, self.history)
+        fits = belief.limit_elsewhere(sensor, self.now, against) is not None and self.ask()
         try:
-            judged = belief.check(FRAME, sensor, self.now, against, self.ask)
+            judged = belief.check(FRAME, sensor, self.now, against, fits)
         except FrameRefused as refused:
             return refused.reason
         belief.took(sensor, judged)
         return f"after {judged.after}" if judged.after else ""
 
-    def ask(self, limit):
+    def ask(self):
         self.asked += 1
         return self.moved
 
@@ -103,6 +104,8 @@ def test_a_frame_that_comes_late_may_disagree_more():
     assert late - 0.03 == pytest.approx(2 * (early - 0.03), rel=1e-2)
     told.history.doubts["camera"] = Doubt(told.now, told.now + 10**9)
     assert Belief(told.config, told.history).limit("camera", told.now + 1_200_000_000) == early
+    told.history.trusted["camera"] = Seen(told.now + 3 * 10**9, (0.0,) * 12)  # nothing is known of what it saw
+    assert Belief(told.config, told.history).limit("camera", told.now + 3_200_000_000) == early
 
 
 @pytest.mark.parametrize("moved", [False, True])

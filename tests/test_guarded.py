@@ -277,7 +277,23 @@ def test_who_holds_the_lock_cannot_add_a_frame():
     assert mapper.map.frames == 5
 
 
-@pytest.mark.parametrize("way", [copy.deepcopy, lambda one: pickle.loads(pickle.dumps(one))], ids=["copy", "pickle"])
+COPIES = [copy.deepcopy, lambda one: pickle.loads(pickle.dumps(one))]
+
+
+@pytest.mark.parametrize("way", [copy.copy, *COPIES], ids=["shallow", "copy", "pickle"])
+def test_who_listens_to_a_map_does_not_listen_to_its_copy(way):
+    mapper = mapped()
+    seen = LiveProjection(mapper.map, (0.0, 2.0))
+    twin = way(mapper.map)
+    assert len(mapper.map.listeners) == 1
+    assert twin.listeners == []
+    assert twin.lock is not mapper.map.lock
+    twin.add(Evidence(np.zeros((1, 3), np.int32), np.full((1, 512), 999, np.int16), np.empty((0, 3), np.int32), 0))
+    assert twin.counts() != mapper.map.counts()
+    assert seen.grid() is not None
+
+
+@pytest.mark.parametrize("way", COPIES, ids=["copy", "pickle"])
 def test_copies_have_locks_of_their_own_and_go_on(way):
     for mapper, rest in ((mapped(), list(frames_of(0, 7))[4:]), (GridMapper(voxel_size=0.1), list(scans_of(0, 3)))):
         with mapper.map.lock:
@@ -291,7 +307,7 @@ def test_copies_have_locks_of_their_own_and_go_on(way):
         assert twin.map.frames == mapper.map.frames > 0
 
 
-@pytest.mark.parametrize("way", [copy.deepcopy, lambda one: pickle.loads(pickle.dumps(one))], ids=["copy", "pickle"])
+@pytest.mark.parametrize("way", COPIES, ids=["copy", "pickle"])
 def test_a_copy_is_made_with_the_lock_held(way, monkeypatch):
     one, held = mapped().map, []
 
@@ -305,3 +321,6 @@ def test_a_copy_is_made_with_the_lock_held(way, monkeypatch):
     assert np.array_equal(twin.blocks()[1], one.blocks()[1])
     twin._pool.values[:] = 0
     assert one.counts() != twin.counts()
+    kept = one.__getstate__()["history"]
+    one.history.refused["later"] += 1
+    assert kept.refused["later"] == 0

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from math import inf
 from typing import NamedTuple
 
@@ -65,37 +64,48 @@ class Belief:
 
     def _last_ns(self, sensor: str, now_ns: int) -> int:
         """Return the stamp of the frame before, believed or in doubt; that of now where there is none."""
-        if sensor in self._history.doubts:
-            return self._history.doubts[sensor].last_ns
-        return self._history.trusted[sensor].stamp_ns if sensor in self._history.trusted else now_ns
+        stamps_ns = [self._history.doubts[sensor].last_ns] if sensor in self._history.doubts else []
+        stamps_ns += [self._history.trusted[sensor].stamp_ns] if sensor in self._history.trusted else []
+        return max(stamps_ns, default=now_ns)
 
-    def check(
-        self, frame: AnyFrame, sensor: str, stamp_ns: int, against: float | None, moved: Callable[[float], bool]
-    ) -> Judged:
+    def limit_elsewhere(self, sensor: str, stamp_ns: int, against: float | None) -> float | None:
+        """Return how far a frame may disagree that is to be looked at from elsewhere; None for one that is not.
+
+        Those are to be that disagree while it is open whether the world has changed or the camera was moved.
+        """
+        doubt, limit = self._history.doubts.get(sensor), self.limit(sensor, stamp_ns)
+        settled = (
+            (doubt is not None and doubt.verdict) or against is None or self._agrees(doubt, sensor, stamp_ns, against)
+        )
+        return None if settled else limit
+
+    def check(self, frame: AnyFrame, sensor: str, stamp_ns: int, against: float | None, fits: bool) -> Judged:
         """Return what `took` is to remember once the map has changed.
 
-        against: share of what the frame says that is against the map; None: too little is known. moved: asked, with
-        the limit, whether the frame would agree from elsewhere. Raises FrameRefused: `disagrees_with_map`,
-        `camera_moved`.
+        against: share of what the frame says that is against the map; None: too little is known. fits: whether it
+        would agree from elsewhere (`limit_elsewhere`). Raises FrameRefused: `disagrees_with_map`, `camera_moved`.
         """
         doubt, limit = self._history.doubts.get(sensor), self.limit(sensor, stamp_ns)
         if against is None and not (doubt and doubt.verdict == MOVED):
             return Judged(None, doubt)
-        if against is not None and against <= (self.limit(sensor, stamp_ns, AGAIN) if doubt else limit):
+        if against is not None and self._agrees(doubt, sensor, stamp_ns, against):
             return Judged(against)
         waited = doubt is not None and doubt.verdict == CHANGED
-        doubt = self._judged(Doubt(stamp_ns, stamp_ns) if doubt is None else doubt.going_on(stamp_ns), limit, moved)
+        doubt = self._judged(Doubt(stamp_ns, stamp_ns) if doubt is None else doubt.going_on(stamp_ns), fits)
         enough_ns = self._moved_ns if doubt.verdict == MOVED else self._changed_ns
         if self._lasted(doubt, enough_ns):
             return Judged(against, doubt._replace(verdict=CHANGED), "" if waited else WHY[doubt.verdict])
         self._remember(sensor, doubt)
         raise self._refused(frame, against, limit, doubt)
 
-    def _judged(self, doubt: Doubt, limit: float, moved: Callable[[float], bool]) -> Doubt:
+    def _agrees(self, doubt: Doubt | None, sensor: str, stamp_ns: int, against: float) -> bool:
+        return against <= self.limit(sensor, stamp_ns, AGAIN if doubt else 1.0)
+
+    def _judged(self, doubt: Doubt, fits: bool) -> Doubt:
         """Return a doubt with its verdict, where it has lasted long enough for one."""
         if doubt.verdict:
             return doubt
-        doubt = doubt._replace(fits=doubt.fits + moved(limit))
+        doubt = doubt._replace(fits=doubt.fits + fits)
         if not self._lasted(doubt, self._changed_ns):
             return doubt
         return doubt._replace(verdict=MOVED if doubt.fits >= FITS * (doubt.frames + 1) else CHANGED)

@@ -13,6 +13,7 @@ from stereovox.history import History
 from stereovox.integrate import Integrator
 from stereovox.integrate.per_camera import PerCamera
 from stereovox.integrate.views import sensor_table
+from stereovox.localize.elsewhere import pose_on_surfaces
 from stereovox.maps import VoxelMap
 from stereovox.maps.evidence import Evidence
 from stereovox.rigs import VirtualCamera
@@ -28,8 +29,9 @@ class Comparison:
     """Makes evidence and lets a gate, which knows `history`, decide whether it is to be believed."""
 
     def __init__(self, config: Config, history: History):
-        self._gate = Gate(config, history)
+        self._gate, self._compares = Gate(config, history), config.trust.max_disagreement < 1
         self._firm = PerCamera(partial(_firm, make_sensor(config.sensor), config))
+        self._prepared = False
 
     def evidence(
         self, frame: AnyFrame, image: DepthImage, integrator: Integrator, voxel_map: VoxelMap
@@ -38,29 +40,40 @@ class Comparison:
 
         Raises FrameRefused as `Gate.check` and `Gate.believe`.
         """
-        firm, asked = self._firm[image.camera], False
         with voxel_map.lock:
             passed = self._gate.check(frame, image)
-
-        def moved(limit: float) -> bool:
-            nonlocal asked
-            from stereovox.localize.elsewhere import pose_on_surfaces
-
-            asked, pose = True, pose_on_surfaces(voxel_map, image)
-            if pose is None:
-                return False
-            other = integrator.evidence(replace(image, T_world_sensor=pose))
-            against = voxel_map.agreement(other, firm).against
-            return against is not None and against <= limit
-
         evidence = integrator.evidence(image)
+        if not self._compares:
+            return evidence, passed
+        self._prepare(voxel_map, image)
+        firm, fits = self._firm[image.camera], False
+        against = voxel_map.agreement(evidence, firm).against
+        limit = self._gate.limit_elsewhere(passed, against)
+        if limit is not None:
+            fits = _fits_elsewhere(image, integrator, voxel_map, firm, limit)
+            evidence = integrator.evidence(image)  # each takes the memory of the one before
         with voxel_map.lock:
-            passed = self._gate.believe(frame, passed, voxel_map.agreement(evidence, firm).against, moved)
-        return (integrator.evidence(image) if asked else evidence), passed  # each takes the memory of the one before
+            passed = self._gate.believe(frame, passed, against, fits)
+        return evidence, passed
+
+    def _prepare(self, voxel_map: VoxelMap, image: DepthImage) -> None:
+        """Let the first image be looked for elsewhere: kernels are compiled then, and not when one is doubted."""
+        if not self._prepared:
+            self._prepared = True
+            pose_on_surfaces(voxel_map, image)
 
     def took(self, passed: Passed) -> None:
         """Remember a frame that the map took in."""
         self._gate.took(passed)
+
+
+def _fits_elsewhere(image: DepthImage, integrator: Integrator, voxel_map: VoxelMap, firm: int, limit: float) -> bool:
+    """Tell whether an image disagrees with the map by no more than `limit` where it lies on its surfaces."""
+    pose = pose_on_surfaces(voxel_map, image)
+    if pose is None:
+        return False
+    against = voxel_map.agreement(integrator.evidence(replace(image, T_world_sensor=pose)), firm).against
+    return against is not None and against <= limit
 
 
 def _firm(sensor: InverseSensorModel, config: Config, camera: VirtualCamera) -> int:

@@ -35,7 +35,8 @@ class NoiseConfig(Section):
     Where `s2` is not set it follows from the camera: `subpixel / (focal_px * baseline)` (Chien 2020, Eq 3.5 with the
     square that is missing in print). Where `subpixel` is not set it is the camera's own (`stereo.subpixel` for images
     that are matched here), else 0.08. `default_baseline` serves cameras whose file does not tell theirs.
-    pose_m, pose_deg: standard deviation of the tracker's poses along and about each axis; hits count as less sure.
+    pose_m, pose_deg: standard deviation of the tracker's poses along and about each axis; hits and passes count as less
+        sure, with models that know how wide noise is.
     """
 
     s0: float = Field(0.0, ge=0)
@@ -251,7 +252,7 @@ class Config(Section):
     steps: sides of a cell along x, y and z where they differ (Valenti 2018, 7.1); `voxel_size` is then the largest.
     up: which axis of the world points up (`z`, `-y`, ...): pictures and heights follow it.
     blind_range: depth in metres up to which a camera clears nothing, for it does not see what stands so near, only what
-        is beside it. Not set: 0.3, or min_range where that is more, but no more than a tenth of max_range.
+        is beside it. Not set: 0.3, but no more than a tenth of max_range, and no less than min_range.
     deadline_ms: milliseconds a frame may take; where frames take longer, `pace` says what is left out. Not set: none.
     max_memory: bytes that the cells may take, as a number or like "500 MB". when_full: frames that need more are
         refused (`refuse`); or the map is a window of that size round the camera, which drops what it leaves (`roll`) or
@@ -315,8 +316,9 @@ class Config(Section):
             raise ValueError(
                 f"steps {list(self.cell)} must be above 0 and differ by a factor of at most {MOST_UNEQUAL}"
             )
-        if self.min_range >= self.max_range:
-            raise ValueError(f"min_range {self.min_range:g} must be smaller than max_range {self.max_range:g}")
+        for name, value in (("min_range", self.min_range), ("blind_range", self.blind)):
+            if value >= self.max_range:
+                raise ValueError(f"{name} {value:g} must be smaller than max_range {self.max_range:g}")
         if self.dimensions == 2 and (self.map.keep_times or (self.max_memory and self.when_full != "refuse")):
             raise ValueError('a floor\'s grid has no map.keep_times, and when_full can only be "refuse"')
         if self.when_full != "refuse" and self.max_memory is None:

@@ -25,7 +25,8 @@ class TrustConfig(Section):
     max_disagreement: share of what a frame says of what the map is sure of that may be against the map, on top of what
         is usual for its sensor; 1: not asked for.
     pose_error_m: metres that poses are off now and then; a frame may disagree by that over the size of a cell.
-    changed_s: a world that has changed is believed after so many seconds of frames that disagree with the map.
+    changed_s: a world that has changed is believed after so many seconds of frames that disagree with the map, and at
+        least five of them; 0: at once.
     moved_s: seconds after which frames are believed that would agree if the camera stood elsewhere; not set: never.
     """
 

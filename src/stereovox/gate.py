@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable
 from math import inf, radians
 from typing import NamedTuple
 
@@ -77,14 +76,16 @@ class Gate:
         now = Seen(stamp_ns, tuple(numbers[:12]))
         return self._fitting(frame, sensor, now)._replace(look=self._look(frame, sensor, now))
 
-    def believe(self, frame: AnyFrame, passed: Passed, against: float | None, moved: Callable[[float], bool]) -> Passed:
+    def limit_elsewhere(self, passed: Passed, against: float | None) -> float | None:
+        """Return as `Belief.limit_elsewhere`."""
+        return self._belief.limit_elsewhere(passed.sensor, passed.seen.stamp_ns, against)
+
+    def believe(self, frame: AnyFrame, passed: Passed, against: float | None, fits: bool) -> Passed:
         """Return what `took` is to remember of a frame that was compared with the map.
 
         Arguments, and what it raises: as of `Belief.check`.
         """
-        if self._trust.max_disagreement == 1:
-            return passed
-        judged = self._belief.check(frame, passed.sensor, passed.seen.stamp_ns, against, moved)
+        judged = self._belief.check(frame, passed.sensor, passed.seen.stamp_ns, against, fits)
         return passed._replace(judged=judged, after=passed.after or judged.after)
 
     def took(self, passed: Passed) -> None:

@@ -18,6 +18,10 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 
+CHANGING = ("_pool", "_times", "history")
+"""What `add` changes in place."""
+
+
 class MapLock(RLock):  # pyright: ignore[reportGeneralTypeIssues] - only its stub calls it final
     """A re-entrant lock that can be copied and pickled: the copy is a lock of its own, which nobody holds."""
 
@@ -51,16 +55,23 @@ class Guarded:
             elif isinstance(value, FunctionType) and not isgeneratorfunction(value):
                 setattr(cls, name, _locked(value))
 
+    def __copy__(self) -> Any:
+        return deepcopy(self)  # two maps must not share cells, each with a lock of its own
+
     def __deepcopy__(self, memo: dict[int, Any]) -> Any:
+        twin = memo[id(self)] = type(self).__new__(type(self))
         with self.lock:
-            twin = memo[id(self)] = type(self).__new__(type(self))
-            vars(twin).update({name: deepcopy(value, memo) for name, value in vars(self).items()})
+            vars(twin).update({name: deepcopy(value, memo) for name, value in self._without_listeners().items()})
         return twin
 
     def __getstate__(self) -> dict[str, Any]:
-        with self.lock:  # cells are pickled when it is given back
-            copied = {name: deepcopy(cells) for name, cells in vars(self).items() if name in ("_pool", "_times")}
-            return {**vars(self), **copied}
+        with self.lock:  # what it returns is pickled when the lock is given back
+            changing = {name: deepcopy(value) for name, value in vars(self).items() if name in CHANGING}
+            return {**self._without_listeners(), **changing}
+
+    def _without_listeners(self) -> dict[str, Any]:
+        """Return what a copy has: all but who listens to this map."""
+        return {name: [] if name == "listeners" else value for name, value in vars(self).items()}
 
 
 def in_steps(lock: MapLock, items: Iterator[T]) -> Iterator[T]:

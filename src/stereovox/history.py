@@ -85,9 +85,9 @@ class History:
     """What a map remembers of its frames; saved and loaded with it, so that a run may stop and go on anywhere.
 
     frames: how many are in the map. refused: how many were offered and refused, by reason. settled: how often frames
-    were believed again after a jump or a reset, by its reason. ways: how many frames were looked at how thoroughly, by
-    the name of the way. recording: the name of what the frames came from, if known. last_frame: name and stamp of the
-    one that was offered last.
+    were believed again after a jump, a reset or a disagreement, by its reason. ways: how many frames were looked at how
+    thoroughly, by the name of the way. recording: the name of what the frames came from, if known. last_frame: name and
+    stamp of the one that was offered last.
     trusted: the last trusted frame of each sensor. waiting: refused frames that may yet be believed, by sensor.
     path: the way that the sensors of the frames in the map went.
     looks: the last image of each camera. usual: how far the frames of each camera disagree with the map, 0 to 1.

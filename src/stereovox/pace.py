@@ -97,10 +97,8 @@ class Pace:
 
     def rehearse(self, frame: AnyFrame, camera: VirtualCamera) -> None:
         """Let all other ways see the first frame of a camera: kernels are compiled then, and not when time is short."""
-        if self._ladder is None or camera in self._rehearsed:
-            return
-        if len(self._rehearsed) >= MAX_CAMERAS:
-            self._rehearsed.clear()
+        if self._ladder is None or camera in self._rehearsed or len(self._rehearsed) >= MAX_CAMERAS:
+            return  # whose camera is another one in each frame would rehearse for ever
         self._rehearsed.add(camera)
         for way in self._ways[1:]:
             with suppress(FrameRefused):

@@ -44,3 +44,11 @@ def test_nothing_is_found_where_nothing_is_near(room):
     image = DepthPath(load_config(voxel_size=0.1)).image(frame)
     assert pose_on_surfaces(voxel_map, replace(image, T_world_sensor=T)) is None
     assert pose_on_surfaces(voxel_map, replace(image, depth_m=np.full_like(image.depth_m, np.inf))) is None
+
+
+@pytest.mark.parametrize("height", [1, 4, 7])
+def test_images_of_few_rows_are_looked_for_as_well(room, height):
+    camera = sv.PinholeCamera(640, height, 300, 300, 319.5, (height - 1) / 2)
+    voxel_map, frame = room
+    image = DepthPath(load_config()).image(sv.Frame(np.full((height, 640), 2.0), camera, frame.T_world_sensor))
+    assert pose_on_surfaces(voxel_map, image) is None or height == 7

@@ -32,7 +32,6 @@ def made(cell, seed=0, blocks=12):
 
 def slow(voxel_map, evidence):
     """The same cell by cell, of what the map itself says of them."""
-    config = voxel_map.config.map
     out = dict.fromkeys(("hits", "passes", "into_free", "at_edge", "every"), 0.0)
     stored = {tuple(c): cells for c, cells in zip(*voxel_map.blocks(), strict=True)}
     rules = voxel_map._rules
@@ -58,7 +57,6 @@ def slow(voxel_map, evidence):
                 around = [(x - 1, y, z), (x + 1, y, z), (x, y - 1, z), (x, y + 1, z), (x, y, z - 1), (x, y, z + 1)]
                 if any(min(at) >= 0 and max(at) < 8 and not known[at] for at in around):
                     out["at_edge"] += value
-    assert config.cell
     return Agreement(**{name: weight / 1000 for name, weight in out.items()})
 
 

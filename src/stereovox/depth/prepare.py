@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from math import isnan
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -16,7 +18,7 @@ from stereovox.depth.downsample import downsample
 from stereovox.depth.form import check_form, for_kernels, matrix_of
 from stereovox.depth.quality import SPARSE, check_unit
 from stereovox.errors import FrameRefused
-from stereovox.frame import NOT_GIVEN, DepthImage, Frame, Reason, Scan, name_of
+from stereovox.frame import DepthImage, Frame, Reason, Scan, name_of
 
 DTYPES = (np.dtype(np.uint16), np.dtype(np.float32), np.dtype(np.float64))
 SATURATED = 65535
@@ -94,7 +96,7 @@ def _check_image(frame: Frame) -> None:
     if depth.shape != (camera.height, camera.width):
         wanted = f"({camera.height}, {camera.width})"
         raise FrameRefused("bad_shape", f"{name}: depth image is {depth.shape}, its camera says {wanted}")
-    if frame.depth_scale is NOT_GIVEN:
+    if depth.dtype.kind == "u" and isnan(frame.depth_scale):
         cure = "give metres per unit, depth_scale=0.001 for millimetres"
         raise FrameRefused("bad_scale", f"{name}: depth is {depth.dtype} and has no depth_scale; {cure}")
     if not SMALLEST < float(frame.depth_scale) < 1 / SMALLEST:  # NaN as well

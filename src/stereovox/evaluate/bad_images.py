@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -120,9 +121,10 @@ def trial(source: Iterable[AnyFrame], every: int, seed: int = 0, **settings: Any
     for frame in source:
         frames += 1
         if every and frames > WARM and frames % every == 0 and before is not None and not frame.fault:
-            matched = tried.way.depth.matched(frame)
-            for kind, bad in bad_frames(frame, matched, before, random):
-                verdicts.setdefault(kind, []).append(tried.judge(bad, frame))
+            with suppress(FrameRefused):  # the good frame is refused itself
+                matched = tried.way.depth.matched(frame)
+                for kind, bad in bad_frames(frame, matched, before, random):
+                    verdicts.setdefault(kind, []).append(tried.judge(bad, frame))
         why = tried.add(frame)
         refused.update([why] if why else [])
         before = before if why else frame

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.cameras import PinholeCamera
-from stereovox.config import Config
+from stereovox.config import Config, load_config
 from stereovox.evaluate.bench_frames import Progress, silent
 from stereovox.evaluate.bench_table import Table
 from stereovox.frame import Frame
@@ -38,7 +38,7 @@ def overhead(
     pixels (None with a single size).
     """
     frames = [empty_frame(width, height) for width, height in sizes]
-    mappers = [Mapper(config, **{"trust.min_valid_share": 0}) for _ in frames]
+    mappers = [Mapper(load_config(config, **{"trust.min_valid_share": 0})) for _ in frames]
     times: list[list[tuple[float, float, float]]] = [[] for _ in frames]
     for number in range(repeats + WARM):
         for frame, mapper, took in zip(frames, mappers, times, strict=True):

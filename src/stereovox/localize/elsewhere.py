@@ -52,7 +52,8 @@ def _surfaces(image: DepthImage) -> tuple[NDArray[np.float64], NDArray[np.float6
     """Return some of the image's points (N, 3) and the normals of their surfaces (N, 3), in the camera's frame."""
     height, width = image.depth_m.shape
     step = max(1, round((image.depth_m.size / POINTS) ** 0.5))
-    v, u = np.mgrid[BESIDE : height - BESIDE : step, BESIDE : width - BESIDE : step]
+    rows, columns = (np.arange(BESIDE, size - BESIDE, step) for size in (height, width))
+    v, u = np.meshgrid(rows, columns, indexing="ij")
     here = _points(image, v, u)
     across = _points(image, v, u + BESIDE) - _points(image, v, u - BESIDE)
     down = _points(image, v + BESIDE, u) - _points(image, v - BESIDE, u)

@@ -61,7 +61,9 @@ def moved(voxel_map: VoxelMap, T_a_b: ArrayLike) -> VoxelMap:
             times = np.maximum(voxel_map.times_at(points).reshape(-1, CELLS), pushed.times_of(coords))
             there.set_times(coords[known], times[known], voxel_map.times_start_ns)
     path = _moved_path(voxel_map.history.path, T)
-    there.history = replace(voxel_map.history.copied(), trusted={}, waiting={}, path=path)  # no pose of frame b is left
+    there.history = replace(
+        voxel_map.history.copied(), trusted={}, waiting={}, looks={}, doubts={}, path=path
+    )  # no pose of frame b is left
     if voxel_map.viewpoint is not None:
         there.viewpoint = voxel_map.viewpoint._replace(T_world_camera=T @ voxel_map.viewpoint.T_world_camera)
     return there

@@ -3,6 +3,7 @@
 
 import itertools
 import math
+from dataclasses import replace
 
 import made_flights as made
 import numpy as np
@@ -414,3 +415,15 @@ def test_what_does_not_go_together():
     assert not len(
         sv.merge(VoxelMap(a.config), VoxelMap(a.config), from_quaternion([1, 0, 0], [0, 0, 0, 1])).cells()[0]
     )
+
+
+def test_a_moved_map_remembers_no_pose_of_its_old_frame():
+    mapper = sv.Mapper(voxel_size=0.2)
+    frames = list(sv.open_source("sim:room?image_width=160", frames=":12"))
+    for frame in [*frames, replace(frames[-1], depth=2 * frames[-1].depth, reason=None)]:
+        mapper.add(frame)
+    assert mapper.map.history.doubts
+    assert mapper.map.history.looks
+    history = moved(mapper.map, motion([0, 0, 0.3], [1, 0, 0])).history
+    assert (history.trusted, history.waiting, history.looks, history.doubts) == ({}, {}, {}, {})
+    assert history.usual == mapper.map.history.usual

@@ -346,9 +346,10 @@ def draw(rows: dict[str, dict[str, dict[str, float]]], path: Path) -> None:
     for chart, key in zip(charts, ("lost", "free"), strict=True):
         for shift, who in ((-0.2, "stereovox"), (0.2, "octomap")):
             shares = [100 * row.get(who, {}).get(key, np.nan) for row in rows.values()]
-            chart.barh(at + shift, shares, 0.38, label=who)
+            bars = chart.barh(at + shift, shares, 0.38, label=who)
+            chart.bar_label(bars, fmt="%.0f", fontsize=6, padding=2)
         chart.set_yticks(at, list(rows), fontsize=7)
-        chart.set_xlim(0, 100)
+        chart.set_xlim(0, 110)
         labels(chart, f"{key}, per cent", "")
     charts[0].invert_yaxis()
     charts[1].legend(frameon=False, fontsize=8)

@@ -2,6 +2,7 @@
 """Frames that disagree with the map: refused at first, believed when the world has changed, not when the camera has."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -102,6 +103,7 @@ def test_a_frame_that_comes_late_may_disagree_more():
     told.history.trusted["camera"] = Seen(told.now, (0.0,) * 12)
     early, late = (Belief(told.config, told.history).limit("camera", told.now + ms * 1_000_000) for ms in (200, 1200))
     assert late - 0.03 == pytest.approx(2 * (early - 0.03), rel=1e-2)
+    assert Belief(told.config, told.history).limit("camera", told.now + 10**12) == late
     told.history.doubts["camera"] = Doubt(told.now, told.now + 10**9)
     assert Belief(told.config, told.history).limit("camera", told.now + 1_200_000_000) == early
     told.history.trusted["camera"] = Seen(told.now + 3 * 10**9, (0.0,) * 12)  # nothing is known of what it saw
@@ -110,7 +112,7 @@ def test_a_frame_that_comes_late_may_disagree_more():
 
 @pytest.mark.parametrize("moved", [False, True])
 def test_a_few_frames_are_not_enough_however_long_they_take(moved):
-    told = Told(moved=moved)
+    told = Told(moved=moved, moved_s=1e9)
     found = told(*[0.03] * 30, *[0.6] * LEAST_FRAMES, 0.03, ms=2000)[30:]
     assert found == [CHANGED] * LEAST_FRAMES + [""]
     told(*[0.6] * (LEAST_FRAMES + 1), ms=2000)
@@ -167,3 +169,29 @@ def test_each_sensor_is_for_itself_and_there_are_so_many():
     for i in range(2 * MOST_SENSORS):
         told(0.9, sensor=str(i))
     assert len(told.history.doubts) == MOST_SENSORS
+
+
+def test_a_doubt_ends_where_the_gate_lets_a_sensor_begin_anew():
+    """A map that is gone on with elsewhere, or later, must not refuse what it has never seen."""
+    mapper = sv.Mapper(voxel_size=0.1, **{"trust.settle_s": 0.5})
+    frames = list(sv.open_source("sim:room?image_width=160", frames=":30"))
+    for frame in frames:
+        mapper.add(frame)
+    mapper.map.history.doubts["camera"] = Doubt(0, frames[-1].stamp_ns, 40, 40, "moved")
+    far = np.eye(4)
+    far[0, 3] = 300.0
+    found = [
+        mapper.add(replace(frame, T_world_sensor=far @ frame.T_world_sensor, stamp_ns=frame.stamp_ns + 10**9)).refused
+        for frame in frames
+    ]
+    assert found[0] == "pose_jump"
+    assert found[-1] is None
+    assert mapper.map.history.doubts == {}
+
+
+def test_a_camera_is_not_taken_for_moved_for_ever():
+    told = Told(moved=True)
+    found = told(*[0.03] * 30, *[0.6, None] * 60)[30:]
+    assert set(found[12:48]) == {MOVED}
+    assert f"after {MOVED}" in found
+    assert set(found[-5:]) == {""}

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from math import inf
 from typing import NamedTuple
 
 from stereovox.config import Config
@@ -19,11 +18,11 @@ SPREADS = 4
 """Spreads beyond the mean that are usual."""
 MAX_LIMIT = 0.8
 """Disagreement that is too much whatever is usual."""
-AGAIN = 1 / 2
+AGAIN = 0.6
 """Share of what a frame may disagree beyond the usual up to which one ends a doubt: it must really agree."""
-SOON_S = 0.2
-"""What comes later than so many seconds after the frame before may disagree more, in proportion: it sees much that is
-new, and the world had time to change."""
+SOON_S, LATE_S = 0.2, 1.0
+"""What comes later than so many seconds after the frame before may disagree more, in proportion, up to twice as much
+after one second more: it sees much that is new, and the world had time to change."""
 LEAST_FRAMES = 5
 """Frames that must disagree before anything is made of it, however far apart they were taken."""
 FITS = 1 / 3
@@ -46,21 +45,23 @@ class Belief:
 
     A frame that disagrees more is refused. Where at least LEAST_FRAMES have done so for `trust.changed_s`, the world
     has changed: they are believed until they agree again. But where they would agree if the camera stood elsewhere, it
-    is the camera that was moved, or its tracker that is wrong: it is not believed until it agrees again, or for
-    `trust.moved_s`.
+    is the camera that was moved, or its tracker that is wrong: it is not believed until it agrees again, or has
+    disagreed for `trust.moved_s`; nor is what sees nothing known, for the next frames would agree with that.
+    Other frames that see nothing known cannot be judged, and are believed.
     """
 
     def __init__(self, config: Config, history: History):
         self._history, self._trust = history, config.trust
         self._excess = max(config.trust.max_disagreement, config.trust.pose_error_m / config.voxel_size)
         self._changed_ns = round(1e9 * config.trust.changed_s)
-        self._moved_ns = inf if config.trust.moved_s is None else round(1e9 * config.trust.moved_s)
+        self._moved_ns = round(1e9 * config.trust.moved_s)
 
     def limit(self, sensor: str, stamp_ns: int, share: float = 1.0) -> float:
         """Return how far a frame may disagree with the map, 0 to 1; `share`: of what it may beyond the usual."""
         mean, spread = self._history.usual.get(sensor, USUAL_AT_FIRST)
-        late_s = max(1e-9 * (stamp_ns - self._last_ns(sensor, stamp_ns)) - SOON_S, 0.0)
-        return min(mean + share * (1 + late_s) * max(self._excess, mean, SPREADS * spread), MAX_LIMIT)
+        late_s = 1e-9 * (stamp_ns - self._last_ns(sensor, stamp_ns)) - SOON_S
+        share *= 1 + min(max(late_s / LATE_S, 0.0), 1.0)
+        return min(mean + share * max(self._excess, mean, SPREADS * spread), MAX_LIMIT)
 
     def _last_ns(self, sensor: str, now_ns: int) -> int:
         """Return the stamp of the frame before, believed or in doubt; that of now where there is none."""
@@ -129,10 +130,9 @@ class Belief:
 
     def _refused(self, frame: AnyFrame, against: float | None, limit: float, doubt: Doubt) -> FrameRefused:
         if doubt.verdict == MOVED:
-            said = (
-                "it would agree with the map if the camera stood elsewhere; calibrate where it is, or reset the tracker"
-            )
+            said = "it would agree with the map from elsewhere; calibrate where the camera is, or reset the tracker"
         else:
-            share = f"{against or 0:.0%} of what it says, {limit:.0%} may"
-            said = f"it disagrees with the map ({share}); believed once frames do for {self._trust.changed_s:g} s"
+            said = f"it disagrees with the map ({against or 0:.0%} of what it says, {limit:.0%} may)"
+        seconds = self._trust.moved_s if doubt.verdict == MOVED else self._trust.changed_s
+        said += f"; believed once frames do for {seconds:g} s"
         return FrameRefused(WHY[doubt.verdict], f"{name_of(frame)}: {said}")

@@ -27,7 +27,7 @@ class TrustConfig(Section):
     pose_error_m: metres that poses are off now and then; a frame may disagree by that over the size of a cell.
     changed_s: a world that has changed is believed after so many seconds of frames that disagree with the map, and at
         least five of them; 0: at once.
-    moved_s: seconds after which frames are believed that would agree if the camera stood elsewhere; not set: never.
+    moved_s: seconds after which frames are believed that would agree if the camera stood elsewhere.
     """
 
     ordered: bool = True
@@ -46,7 +46,7 @@ class TrustConfig(Section):
     max_disagreement: float = Field(0.15, gt=0, le=1)
     pose_error_m: float = Field(0.0075, ge=0)
     changed_s: float = Field(1.0, ge=0, le=1e9)
-    moved_s: float | None = Field(None, ge=0, le=1e9)
+    moved_s: float = Field(5.0, ge=0, le=1e9)
 
     @model_validator(mode="after")
     def _ordered(self) -> TrustConfig:

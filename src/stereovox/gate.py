@@ -74,7 +74,10 @@ class Gate:
         sensor, stamp_ns = self._told(frame)
         numbers = image.T_world_sensor.ravel().tolist()
         now = Seen(stamp_ns, tuple(numbers[:12]))
-        return self._fitting(frame, sensor, now)._replace(look=self._look(frame, sensor, now))
+        passed = self._fitting(frame, sensor, now)._replace(look=self._look(frame, sensor, now))
+        if passed.after:
+            self._history.doubts.pop(sensor, None)  # they were of another place, or another time
+        return passed
 
     def limit_elsewhere(self, passed: Passed, against: float | None) -> float | None:
         """Return as `Belief.limit_elsewhere`."""

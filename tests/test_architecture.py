@@ -10,9 +10,9 @@ from time import monotonic, monotonic_ns
 
 import pytest
 
-from stereovox.cli.checkpoints import Checkpoints
 from stereovox.grid_mapper import GridMapper
 from stereovox.mapper import Mapper
+from stereovox.run import Checkpoints
 
 SOURCE = Path(__file__).resolve().parents[1] / "src/stereovox"
 LAYERS = (
@@ -44,7 +44,8 @@ LAYERS = (
     {"sources", "depth", "sensors", "maps"},
     {"integrate", "products", "localize", "calibrate"},
     {"mapper", "grid_mapper", "pace", "ways", "comparing", "evaluate", "view"},
-    {"batch", "cli", "ros", "__main__"},
+    {"run"},
+    {"cli", "ros", "__main__"},
 )
 LEVEL = {room: level for level, rooms in enumerate(LAYERS) for room in rooms}
 HOMES = {

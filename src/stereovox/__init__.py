@@ -37,6 +37,9 @@ if TYPE_CHECKING:
     from stereovox.products.mesh import surface as surface
     from stereovox.products.path_check import check_path as check_path
     from stereovox.rigs import StereoPair as StereoPair
+    from stereovox.run import MapResult as MapResult
+    from stereovox.run import MapRun as MapRun
+    from stereovox.run import map_recording as map_recording
     from stereovox.sources import open_source as open_source
     from stereovox.sources.latest import Latest as Latest
     from stereovox.view.viewer import open_viewer as open_viewer
@@ -79,6 +82,9 @@ _HOMES = {
     "ground": "products.ground",
     "merge": "products.merge",
     "surface": "products.mesh",
+    "MapResult": "run",
+    "MapRun": "run",
+    "map_recording": "run",
     "open_source": "sources",
     "Latest": "sources.latest",
     "open_viewer": "view.viewer",

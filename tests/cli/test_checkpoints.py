@@ -11,13 +11,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from stereovox.cli import main, map, terminal
-from stereovox.cli.checkpoints import REST, Checkpoints
+from stereovox import run
+from stereovox.cli import main, map
 from stereovox.errors import MapFileError, StereovoxError
 from stereovox.grid_mapper import GridMapper
 from stereovox.mapper import Mapper
 from stereovox.maps import VoxelMap, load_map
 from stereovox.maps.lock import only_writer_in, only_writer_of
+from stereovox.run import REST, Checkpoints
 
 ROOT = Path(__file__).resolve().parents[2]
 SOURCE = "sim:room?image_width=64&frames=30"
@@ -104,7 +105,7 @@ def at_each_frame(monkeypatch, out, look):
         return add(self, frame)
 
     monkeypatch.setattr(Mapper, "add", looking)
-    monkeypatch.setattr("stereovox.cli.checkpoints.REST", 0)
+    monkeypatch.setattr("stereovox.run.REST", 0)
     return ["--checkpoint", "1e-9"]
 
 
@@ -149,7 +150,7 @@ def test_refused_frames_do_not_take_the_place_of_an_older_map(tmp_path, monkeypa
 
 @pytest.mark.parametrize("seconds", ["0", "1e-9"])
 def test_saves_in_between_change_nothing(tmp_path, monkeypatch, seconds):
-    monkeypatch.setattr("stereovox.cli.checkpoints.REST", 0)
+    monkeypatch.setattr("stereovox.run.REST", 0)
     keep = ["--set", "window.size=[3, 3, 3]", "--set", "window.trigger=0.4", "--set", "window.outside=keep"]
     assert mapped(tmp_path / "a", *keep) == 0
     assert mapped(tmp_path / "b", *keep, "--checkpoint", seconds) == 0
@@ -356,7 +357,7 @@ def test_a_floor_that_is_told_to_stop_is_saved(tmp_path, monkeypatch, capsys):
 
 @pytest.mark.usefixtures("obeys_signals")
 def test_the_first_ctrl_c_waits_for_the_save_that_is_being_made():
-    with terminal.interrupt_between_steps() as check:
+    with run.interrupt_between_steps() as check:
         saved = []
         signal.raise_signal(signal.SIGINT)
         Checkpoints(lambda: saved.append(1), "m", 1.0).save(1)

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stereovox.cli.checkpoints import Checkpoints, add_checkpoint
+from stereovox.cli.checkpoints import add_checkpoint
 from stereovox.cli.localize import add_start, check_start, localised, parse_start, say_fit
 from stereovox.cli.robots import (
     GRID_ENDINGS,
@@ -29,14 +29,13 @@ from stereovox.cli.settings import overrides
 from stereovox.cli.slam import mapped
 from stereovox.cli.terminal import (
     cells_line,
-    interrupt_between_steps,
     milliseconds,
+    progress_of,
     say,
     say_about_compiling,
     say_refusals,
-    tracked,
 )
-from stereovox.errors import SourceError, StereovoxError
+from stereovox.errors import StereovoxError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -45,6 +44,7 @@ if TYPE_CHECKING:
     from stereovox.frame import Frame, Scan
     from stereovox.grid_mapper import GridMapper
     from stereovox.localize.track import Track
+    from stereovox.run import Checkpoints
     from stereovox.sources.robot import Robot
     from stereovox.update_report import UpdateReport
 
@@ -82,6 +82,8 @@ def run(arguments: Namespace) -> dict[str, Any]:
 
 
 def _mapped(arguments: Namespace, out: Path) -> dict[str, Any]:
+    from stereovox.run import Checkpoints, add_all, interrupt_between_steps
+
     if arguments.mode == "scale" and out.suffix.lower() == ".pgm":
         raise StereovoxError(f"--out {out}: mode scale has no grey for unknown cells; name a .yaml or .png")
     start, config = parse_start(arguments.start), settings_of(arguments)
@@ -93,20 +95,15 @@ def _mapped(arguments: Namespace, out: Path) -> dict[str, Any]:
     mapper = _mapper(config, arguments.resume, any_size="voxel_size" not in overrides(arguments))
     say_about_compiling()
     track = _track(robot, how, config, start)
-    reports: list[UpdateReport] = []
     checkpoints = Checkpoints(lambda: _save(mapper, out, arguments.mode), out, arguments.checkpoint)
+    readings = (track.corrected(one) if track else one for one in seen)
+
+    def stopped(done: int) -> None:
+        say(f"stopped after {done} of {count} readings; they are saved in {out.with_suffix('.yaml')}")
+
     with interrupt_between_steps() as check:
-        try:
-            for one in tracked((track.corrected(one) if track else one for one in seen), count, "mapping"):
-                reports.append(mapper.add(one))
-                check()
-                if not reports[-1].refused:  # a map of nothing must not take the place of an older one
-                    checkpoints.after(len(reports))
-        except (KeyboardInterrupt, SourceError):
-            if mapper.map.frames:
-                checkpoints.save(len(reports))
-                say(f"stopped after {len(reports)} of {count} readings; they are saved in {out.with_suffix('.yaml')}")
-            raise
+        with progress_of(count, "mapping") as bar:
+            reports = add_all(mapper, readings, checkpoints, check, [bar], stopped)
         return _finished(mapper, reports, out, checkpoints)
 
 

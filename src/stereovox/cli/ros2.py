@@ -13,10 +13,9 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stereovox.cli.checkpoints import Checkpoints
 from stereovox.cli.robots import GRID_ENDINGS, check_file, check_in_space, only_writer_of_floor
 from stereovox.cli.settings import add_settings, overrides
-from stereovox.cli.terminal import interrupt_between_steps, milliseconds, say, say_about_compiling
+from stereovox.cli.terminal import milliseconds, say, say_about_compiling
 from stereovox.errors import MapFileError
 
 if TYPE_CHECKING:
@@ -24,6 +23,7 @@ if TYPE_CHECKING:
     from stereovox.ros.mapping import Mapping
     from stereovox.ros.node import MapNode
     from stereovox.ros.options import Options
+    from stereovox.run import Checkpoints
     from stereovox.update_report import UpdateReport
 
 EXAMPLE = "stereovox ros2 --depth /camera/depth/image_rect_raw --out room.svox"
@@ -87,6 +87,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
 def _map(arguments: Namespace, node: Any, mapping: Mapping, options: Options) -> dict[str, Any]:
     from stereovox.ros.node import MapNode
     from stereovox.ros.parameters import FREE
+    from stereovox.run import Checkpoints, interrupt_between_steps
 
     reports: deque[UpdateReport] = deque(maxlen=LATELY)
 

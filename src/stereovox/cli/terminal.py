@@ -4,17 +4,15 @@
 from __future__ import annotations
 
 import shlex
-import signal
 import sys
-import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from stereovox.errors import one_line
 
 if TYPE_CHECKING:
-    from rich.progress import Progress
+    from rich.progress import Progress, TaskID
 
     from stereovox.update_report import UpdateReport
 
@@ -66,35 +64,22 @@ def tracked(items: Iterable[T], total: int | None, text: str) -> Iterator[T]:
 
 
 @contextmanager
-def interrupt_between_steps() -> Iterator[Callable[[], None]]:
-    """Give a function that raises KeyboardInterrupt if the run was told to stop: a step is never cut in half by it.
-
-    By Ctrl-C, of which a second one is obeyed at once, by SIGTERM (`kill`, systemd, docker stop) or by SIGHUP (the
-    terminal is gone), which may come several times: `timeout` sends two. The exception holds the signal's number.
-    """
-    told: list[int] = []
-
-    def remember(number: int, _: object) -> None:
-        told.append(number)
-        if number == signal.SIGINT:
-            signal.signal(signal.SIGINT, signal.default_int_handler)
-
-    def check() -> None:
-        if told:
-            raise KeyboardInterrupt(told[0])
-
-    with ExitStack() as stack:
-        for number in _stops() if threading.current_thread() is threading.main_thread() else ():
-            stack.callback(signal.signal, number, signal.signal(number, remember))
-        yield check
+def progress_of(total: int | None, text: str) -> Iterator[ProgressOfFrames]:
+    """Give an observer that draws a progress bar; `total` is None where nobody knows how many frames there are."""
+    with progress_bar() as bar:
+        yield ProgressOfFrames(bar, bar.add_task(text, total=total, note=""))
 
 
-def _stops() -> list[int]:
-    """Return the signals that nobody handles or ignores: notebooks, servers, nohup, jobs in the background do."""
-    usual = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
-    if hasattr(signal, "SIGHUP"):
-        usual[signal.SIGHUP] = signal.SIG_DFL
-    return [number for number, handler in usual.items() if signal.getsignal(number) == handler]
+class ProgressOfFrames:
+    """Moves a progress bar on by each frame."""
+
+    def __init__(self, bar: Progress, task: TaskID):
+        self._bar, self._task = bar, task
+
+    def after(self, frame: object, report: object) -> None:
+        """Note a frame that was offered to the map."""
+        speed = self._bar.tasks[0].finished_speed or self._bar.tasks[0].speed
+        self._bar.update(self._task, advance=1, note=f"{speed:.0f} a second" if speed else "")
 
 
 def command_line(*words: object) -> str:

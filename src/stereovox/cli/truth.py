@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stereovox.cli.terminal import cells_line, command_line, interrupt_between_steps, say, thousands, tracked
+from stereovox.cli.terminal import cells_line, command_line, say, thousands, tracked
 
 if TYPE_CHECKING:
     from stereovox.evaluate.lidar_truth import TruthCounts
@@ -70,6 +70,8 @@ def run(arguments: Namespace) -> dict[str, Any]:
 
 def _watched(numbers: Iterable[int], count: int) -> Iterator[int]:
     """Yield the frames with a progress bar; Ctrl-C stops between two."""
+    from stereovox.run import interrupt_between_steps
+
     with interrupt_between_steps() as check:
         for i in tracked(numbers, count, "scans"):
             yield i

@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A recording becomes a map by one call from Python, with all that `stereovox map` promises (tests/cli)."""
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import stereovox as sv
+from stereovox import run
+from stereovox.cli import checkpoints
+from stereovox.cli import main as command
+from stereovox.sources import open_stream
+
+SOURCE = "sim:room?image_width=160"
+SETTINGS = {"voxel_size": 0.1, "frames": ":12"}
+
+
+def same_cells(a, b):
+    for mine, theirs in zip(sv.load_map(a).cells(), sv.load_map(b).cells(), strict=True):
+        np.testing.assert_array_equal(mine, theirs)
+
+
+class Seen:
+    """Counts frames; ends the run after some."""
+
+    def __init__(self, stop=None):
+        self.reports, self._stop = [], stop
+
+    def after(self, frame, report):
+        self.reports.append((frame.stamp_ns, report))
+        if len(self.reports) == self._stop:
+            raise KeyboardInterrupt
+
+
+class Live:
+    """A camera that never ends, whose frames have a fault from one of them on."""
+
+    name, notes, layout, length, dropped = "live", (), "", None, 3
+
+    def __init__(self, good):
+        self._frames = list(open_stream(SOURCE, ":3"))
+        self.camera, self._good = self._frames[0].camera, good
+
+    def after(self, count):
+        return self
+
+    def __iter__(self):
+        for i in range(10_000):
+            frame = self._frames[min(i, 2)]
+            yield replace(frame, stamp_ns=i * 33_000_000, fault=None if i < self._good else "no_pose")
+
+
+def test_it_makes_the_map_of_the_command(tmp_path):
+    seen = Seen()
+    result = sv.map_recording(SOURCE, tmp_path / "a.svox", **SETTINGS, observers=[seen])
+    assert command(["map", SOURCE, "--out", str(tmp_path / "b.svox"), "--voxel-size", "0.1", "--frames", ":12"]) == 0
+    same_cells(tmp_path / "a.svox", tmp_path / "b.svox")
+    assert result.out == tmp_path / "a.svox"
+    assert [report for _, report in seen.reports] == result.reports
+    assert result.summary()["frames"] == result.map.frames == 12
+    assert checkpoints.SECONDS == run.CHECKPOINT_S
+
+
+def test_a_run_that_was_stopped_goes_on_where_it_was(tmp_path):
+    told = []
+    with pytest.raises(KeyboardInterrupt):
+        sv.map_recording(SOURCE, tmp_path / "a.svox", **SETTINGS, observers=[Seen(stop=5)], tell=told.append)
+    assert told[-1].startswith("stopped after 5 frames")
+    assert sv.load_map(tmp_path / "a.svox").frames == 5
+    with sv.MapRun(SOURCE, tmp_path / "a.svox", resume=True, frames=":12", tell=told.append) as going:
+        assert going.left == 7
+        assert going.mapper.config.voxel_size == 0.1  # the map's own settings
+        assert len(going.finish().reports) == 7
+    assert told[-1] == "going on after frame 5"
+    sv.map_recording(SOURCE, tmp_path / "whole.svox", **SETTINGS)
+    same_cells(tmp_path / "a.svox", tmp_path / "whole.svox")
+    again = sv.map_recording(SOURCE, tmp_path / "a.svox", resume=True, frames=":12", tell=told.append)
+    assert again.reports == []
+    assert "already holds all 12 frames" in told[-1]
+
+
+def test_what_is_wrong_is_said_in_one_line_and_leaves_the_map(tmp_path):
+    out = tmp_path / "a.svox"
+    with pytest.raises(sv.StereovoxError, match="no map to go on with"):
+        sv.map_recording(SOURCE, out, resume=True)
+    sv.map_recording(SOURCE, out, **SETTINGS)
+    for source, more, words in (
+        ("sim:wall?image_width=160", {"resume": True}, "was made of"),
+        (SOURCE, {"resume": True, "frames": ":5"}, "more than the 5"),
+        (SOURCE, {"resume": True, "frames": "::2"}, "its frame 12 was"),
+        (SOURCE, {"checkpoint_s": -1.0}, "give seconds"),
+        (SOURCE, {"nonsense": 1}, "nonsense"),
+        (tmp_path / "nothing", {}, "nothing"),
+    ):
+        with pytest.raises(sv.StereovoxError, match=words) as caught:
+            sv.map_recording(source, out, **more)
+        assert "\n" not in str(caught.value)
+        assert sv.load_map(out).frames == 12
+    with sv.MapRun(SOURCE, out, resume=True), ThreadPoolExecutor() as pool:
+        other = pool.submit(sv.map_recording, SOURCE, out, **SETTINGS)
+        assert "another run" in str(other.exception())
+
+
+def test_a_live_camera_that_delivers_nothing_ends(tmp_path):
+    with pytest.raises(sv.StereovoxError, match="not one of 100 frames could be used, no map is written"):
+        sv.map_recording(Live(0), tmp_path / "a.svox", voxel_size=0.2)
+    assert not (tmp_path / "a.svox").exists()
+    with pytest.raises(KeyboardInterrupt):
+        sv.map_recording(Live(2), tmp_path / "a.svox", voxel_size=0.2, observers=[Seen(stop=150)])
+    assert sv.load_map(tmp_path / "a.svox").frames == 2

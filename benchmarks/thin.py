@@ -298,7 +298,11 @@ CASES: dict[str, tuple[Scene, float, dict[str, Any]]] = {
     "1 px, exact, ray": (px(1.0), 0.05, {"integrator": "ray"}),
     "10 mm, approached": (Scene(0.010, 1.5, 2.0, 320, "d435", "approach", nearest=0.3), 0.05, {}),
     "20 mm, approached": (Scene(0.020, 1.5, 2.0, 320, "d435", "approach", nearest=0.3), 0.05, {}),
-    "20 mm, approached, reported": (Scene(0.020, 1.5, 2.0, 320, "d435", "approach", nearest=0.3, reported=True), 0.05, {}),
+    "20 mm, approached, reported": (
+        Scene(0.020, 1.5, 2.0, 320, "d435", "approach", nearest=0.3, reported=True),
+        0.05,
+        {},
+    ),
 }
 
 

@@ -19,6 +19,7 @@ from time import monotonic
 from types import TracebackType
 from typing import Any, Protocol
 
+from stereovox import sources
 from stereovox.config import Config
 from stereovox.errors import MapFileError, SourceError, StereovoxError, one_line
 from stereovox.evaluate.summary import summarise
@@ -29,7 +30,7 @@ from stereovox.mapper import Mapper
 from stereovox.maps import VoxelMap, load_map
 from stereovox.maps.lock import only_writer_in
 from stereovox.maps.store import check_target, is_map, read_manifest, remove_map, sweep
-from stereovox.sources import Stream, open_stream
+from stereovox.sources import Stream
 from stereovox.update_report import UpdateReport
 
 CHECKPOINT_S = 10.0
@@ -175,7 +176,7 @@ class MapRun:
     def _opened(self) -> Stream:
         source = self._where
         if isinstance(source, str | Path):
-            source = open_stream(str(source), self._frames)
+            source = sources.open_stream(str(source), self._frames)
         if self._camera is None:
             return source
         from stereovox.sources.with_camera import with_camera

@@ -29,7 +29,8 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-from stereovox.cli import checkpoints, main
+from stereovox import run
+from stereovox.cli import main
 from stereovox.mapper import Mapper
 from stereovox.maps import load_map, make_map
 from stereovox.sources import open_stream
@@ -49,8 +50,8 @@ def command(out: Path, given: Namespace, settings: list[str], *more: str) -> lis
 
 def perform(words: list[str], done: Any, saved: Any) -> None:
     """Run a command in this process; `done` and `saved` tell others how many frames are in the map and on the disk."""
-    checkpoints.REST = REST
-    add, save = Mapper.add, checkpoints.Checkpoints.save
+    run.REST = REST
+    add, save = Mapper.add, run.Checkpoints.save
 
     def add_or_refuse(mapper: Mapper, frame: Any) -> Any:
         faulty = done.value % 7 == 3
@@ -58,11 +59,11 @@ def perform(words: list[str], done: Any, saved: Any) -> None:
         done.value += 1
         return report
 
-    def save_and_tell(self: checkpoints.Checkpoints, frames: int) -> None:
+    def save_and_tell(self: run.Checkpoints, frames: int) -> None:
         save(self, frames)
         saved.value = frames
 
-    Mapper.add, checkpoints.Checkpoints.save = add_or_refuse, save_and_tell
+    Mapper.add, run.Checkpoints.save = add_or_refuse, save_and_tell
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 2)
     os._exit(main(words))
@@ -191,7 +192,7 @@ def parsed() -> Namespace:
     return parser.parse_args()
 
 
-def run() -> int:
+def judged() -> int:
     """Kill and tell; the status is 1 where a promise was broken."""
     given = parsed()
     random.seed(given.seed)
@@ -222,4 +223,4 @@ def run() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(run())
+    sys.exit(judged())

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from stereovox import run
-from stereovox.cli import main, map
+from stereovox.cli import main
 from stereovox.errors import MapFileError, StereovoxError
 from stereovox.grid_mapper import GridMapper
 from stereovox.mapper import Mapper
@@ -243,7 +243,7 @@ def test_the_end_tells_what_was_refused_and_when_frames_were_believed_again(tmp_
 @pytest.mark.parametrize("resume", [False, True])
 def test_a_second_writer_is_refused_before_any_work(tmp_path, monkeypatch, capsys, resume):
     assert mapped(tmp_path / "m", "--frames", ":2") == 0
-    monkeypatch.setattr(map, "_opened", lambda _: pytest.fail("worked"))
+    monkeypatch.setattr(run.MapRun, "_opened", lambda _: pytest.fail("worked"))
     refused = []
 
     def second():

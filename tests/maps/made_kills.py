@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 from made_faults import disk, in_child, small_map
 
-from stereovox.cli import checkpoints, main, ros2, slam
-from stereovox.cli.checkpoints import Checkpoints
+from stereovox import run
+from stereovox.cli import main, ros2, slam
 from stereovox.config import load_config
 from stereovox.frame import Scan
 from stereovox.localize.slam import SlamResult
@@ -21,6 +21,7 @@ from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.planar import lifted
 from stereovox.products.map_server import read_map_server
 from stereovox.ros.mapping import FloorMapping
+from stereovox.run import Checkpoints
 from stereovox.sources.trajectory import Trajectory
 
 DRIVE = "sim:floor?plan=testbed&seconds=2&scan_hz=4&depth_hz=1&image_width=16"
@@ -184,5 +185,5 @@ def kill_at_steps(kind, folder, kills):
 
 
 if __name__ == "__main__":
-    checkpoints.REST = 0
+    run.REST = 0
     print(kill_at_steps(KINDS[sys.argv[1]], Path(sys.argv[2]), int(sys.argv[3])))

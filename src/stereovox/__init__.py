@@ -98,3 +98,8 @@ def __getattr__(name: str) -> Any:
     if name in _HOMES:
         return getattr(import_module(f"stereovox.{_HOMES[name]}"), name)
     raise AttributeError(f"module 'stereovox' has no attribute '{name}'")
+
+
+def __dir__() -> list[str]:
+    """Return the public names and the modules that are imported: for tab completion."""
+    return sorted({*globals(), *__all__})

@@ -83,6 +83,9 @@ class GridMapper:
         done = perf_counter()
         return UpdateReport(1e3 * (between - start), 1e3 * (done - between), cells, detail=passed.told)
 
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__}: profile '{self.config.profile}'; {self.map!r}>"
+
     def health(self, now_ns: int | None = None) -> Health:
         """Return how current the map is; `now_ns`: by `clock`, None for now."""
         return self._watch.health(now_ns)

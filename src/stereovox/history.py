@@ -6,6 +6,7 @@ from __future__ import annotations
 import copy
 import math
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -184,6 +185,13 @@ class WithHistory:
     """What every map tells of the frames that made it."""
 
     history: History
+
+    def _described(self, sides: Sequence[float], counts: dict[str, int], memory_bytes: int) -> str:
+        """Return what `repr` says of a map whose cells have `sides` in metres."""
+        cells = ", ".join(f"{number:,} {state}" for state, number in counts.items())
+        side = " x ".join(f"{x:g}" for x in sides)
+        made_of = f"{self.history.frames:,} frames, {self.history.refused.total():,} refused"
+        return f"<{type(self).__name__} of {side} m cells: {cells}; {made_of}; {memory_bytes / 1e6:.1f} MB>"
 
     @property
     def frames(self) -> int:

@@ -82,6 +82,9 @@ class Mapper:
         self._pace.rehearse(frame, matched.camera)
         return UpdateReport(depth_ms, integrate_ms, cells, detail=passed.told, match_ms=match_ms, way=way.name)
 
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__}: profile '{self.config.profile}'; {self.map!r}>"
+
     def health(self, now_ns: int | None = None) -> Health:
         """Return how current the map is; `now_ns`: by `clock`, None for now."""
         return self._watch.health(now_ns)

@@ -163,6 +163,9 @@ class GridMap(Guarded, WithHistory):
         """Return the centres (N, 2) in metres of all free cells."""
         return self._centres_of(State.FREE)
 
+    def __repr__(self) -> str:
+        return self._described((self.config.voxel_size,), self.counts(), self.memory_bytes)
+
     def counts(self) -> dict[str, int]:
         """Return the number of cells in each known state: `free`, `tentative`, `occupied`."""
         number = np.bincount(self._rules.states(self._pool.values[: len(self._pool)]).ravel(), minlength=4)

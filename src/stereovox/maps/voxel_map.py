@@ -292,6 +292,11 @@ class VoxelMap(Guarded, WithHistory):
         """Return the centres (N, 3) in metres of all free cells."""
         return self._centers_of(State.FREE)
 
+    def __repr__(self) -> str:
+        return self._described(
+            self.config.cell if self.config.steps else self.config.cell[:1], self.counts(), self.memory_bytes
+        )
+
     def counts(self) -> dict[str, int]:
         """Return the number of cells in each known state: `free`, `tentative`, `occupied`."""
         number = np.zeros(4, np.int64)

@@ -68,6 +68,10 @@ class DistanceField:
         if not self._follows or voxel_map.viewpoint is not None:
             self.update()
 
+    def __repr__(self) -> str:
+        shape, cell = (" x ".join(f"{x:g}" for x in of) for of in (self._shape.tolist(), self._cell.tolist()))
+        return f"<DistanceField of {shape} cells of {cell} m>"
+
     def update(self) -> int:
         """Bring the field up to date with the map; return how many cells became obstacles or ceased to be.
 

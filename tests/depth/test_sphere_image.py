@@ -10,8 +10,9 @@ from stereovox.cameras import PinholeCamera
 from stereovox.config import load_config
 from stereovox.depth import prepare
 from stereovox.depth.sphere import SphereLayout, accumulate, empty, frame_of, gather, through_sphere
-from stereovox.frame import DepthImage, Reason
+from stereovox.frame import DepthImage, Frame, Reason
 from stereovox.geometry import rotation_matrix, transform_points
+from stereovox.mapper import Mapper
 from stereovox.sensors.noise import SUBPIXEL, RangeNoise
 from stereovox.wide import SphericalCamera
 
@@ -179,3 +180,12 @@ def test_an_empty_view_straight_ahead_stays_free(camera):
     sphere = through_sphere(image, load_config("default", max_range=20.0, **{"sphere.step_deg": 2.0}))
     ahead = sphere.reason[np.abs(np.arange(len(sphere.reason)) - len(sphere.reason) / 2) < 3]
     assert (ahead == Reason.TOO_FAR).mean() > 0.9
+
+
+def test_a_camera_that_sees_nothing_but_the_pole_is_refused():
+    camera = SphericalCamera(16, 1, 0.002, 3.1, 8.0, 0.5)  # it looks round the whole of a thin ring, up and down
+    mapper = Mapper(voxel_size=0.2, **{"sphere.step_deg": 1.0})
+    frame = Frame(np.full((1, 16), 2.0, np.float32), camera, np.eye(4))
+    report = mapper.add(frame)
+    assert report.refused == "bad_camera"
+    assert "sphere.step_deg" in report.detail

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from stereovox.config import Config
 from stereovox.depth.sphere_grid import SphereGrid, accumulate
 from stereovox.depth.sphere_layout import SphereLayout
+from stereovox.errors import FrameRefused
 from stereovox.frame import DepthImage, Frame, Reason
 from stereovox.geometry import Transform, inverse
 from stereovox.rigs import VirtualCamera
@@ -46,6 +47,7 @@ def through_sphere(image: DepthImage, config: Config) -> DepthImage:
 
     The grid's origin is the camera's eye, its pole the camera's y axis, its step `sphere.step_deg`; it reaches as far
     as the image, whatever bounds the settings name, so no pixel but those within two degrees of the pole is lost.
+    Raises FrameRefused `bad_camera` where it sees nothing else.
     """
     if config.sphere.step_deg is None:
         return image
@@ -76,6 +78,9 @@ def _image_of(layout: SphereLayout, eye: VirtualCamera | None) -> tuple[slice, S
     """Return the polar cells that have a depth, and the camera whose columns they are, as noisy as `eye`."""
     elevation = np.degrees(layout.polar()) - 90
     inside = np.flatnonzero(np.abs(elevation) <= WIDEST_DEG)
+    if not len(inside):
+        blind = f"the camera sees only what is within {90 - WIDEST_DEG:g} degrees of the axis of the spherical grid"
+        raise FrameRefused("bad_camera", f"{blind}; leave sphere.step_deg out")
     first, last = int(inside[0]), int(inside[-1]) + 1
     step = layout.step
     cu = -math.radians(elevation[first]) / step

@@ -15,7 +15,7 @@ import argparse
 import json
 
 import stereovox as sv
-from stereovox.config import parse_value
+from stereovox.cli.settings import add_settings, overrides
 from stereovox.evaluate.bad_images import trial
 
 
@@ -27,12 +27,10 @@ def main() -> None:
     parser.add_argument("--frames", default=":", help="a Python slice")
     parser.add_argument("--every", type=int, default=5, help="bad frames before every so many; 0: none")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
+    add_settings(parser, "trust.max_disagreement=1")
     parser.add_argument("--json", action="store_true")
     wanted = parser.parse_args()
-    more = {key: parse_value(value) for key, _, value in (pair.partition("=") for pair in wanted.set)}
-    settings = {"voxel_size": wanted.voxel_size, "max_range": wanted.max_range, **more}
-    found = trial(sv.open_source(wanted.source, frames=wanted.frames), wanted.every, wanted.seed, **settings)
+    found = trial(sv.open_source(wanted.source, frames=wanted.frames), wanted.every, wanted.seed, **overrides(wanted))
     if wanted.json:
         print(json.dumps(found))
         return

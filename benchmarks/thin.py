@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox import Frame, Mapper, PinholeCamera
-from stereovox.config import parse_value
+from stereovox.cli.settings import add_settings, overrides
 from stereovox.frame import Reason
 
 HZ = 30
@@ -368,17 +368,17 @@ def main() -> None:
     parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--only", default="", help="cases whose name holds this")
     parser.add_argument("--alone", action="store_true", help="without OctoMap")
-    parser.add_argument("--set", action="append", default=[], metavar="key=value")
+    add_settings(parser, "sensor.passes=0.25")
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--picture", type=Path)
     wanted = parser.parse_args()
-    overrides = {key: parse_value(value) for key, _, value in (one.partition("=") for one in wanted.set)}
+    given = overrides(wanted)
     seeds = range(wanted.first_seed, wanted.first_seed + wanted.seeds)
     rows = {}
     for name, (scene, voxel_size, settings) in (sweep() if wanted.sweep else CASES).items():
         if wanted.only not in name:
             continue
-        rows[name] = compared(scene, voxel_size, seeds, not wanted.alone, **{**settings, **overrides})
+        rows[name] = compared(scene, voxel_size, seeds, not wanted.alone, **{**settings, **given})
         if not wanted.json:
             shown = (f"{who}: lost {row['lost']:6.1%} free {row['free']:6.1%}" for who, row in rows[name].items())
             print(f"{name:32} {scene.pixels:5.2f} px ", *shown, sep="  ", flush=True)

@@ -164,14 +164,14 @@ class MapRun:
                 raise StereovoxError(
                     f"{self.source.name}: not one frame could be used, no map is written ({_first_refusal(reports)})"
                 )
-            self._checkpoints.save(self._seen())
+            self._checkpoints.save(seen_by(self.mapper))
         return MapResult(self.mapper.map, self.out, reports, self.source.dropped)
 
     @property
     def left(self) -> int | None:
         """How many frames are not in the map yet; None for a live camera."""
         length = self.source.length
-        return None if length is None else max(length - self._seen(), 0)
+        return None if length is None else max(length - seen_by(self.mapper), 0)
 
     def _opened(self) -> Stream:
         source = self._where
@@ -202,7 +202,7 @@ class MapRun:
         self.mapper.map.recording = self.source.name
 
     def _add_all(self, check: Callable[[], None], observers: Sequence[Observer]) -> list[UpdateReport]:
-        done, length = self._seen(), self.source.length
+        done, length = seen_by(self.mapper), self.source.length
         if done:
             if length is not None and done > length:
                 raise StereovoxError(
@@ -230,9 +230,6 @@ class MapRun:
                 f"{self.out}: its frame {done} was '{last[0]}', here it is '{there.name}'; give --frames as before, or "
                 "leave --resume out"
             )
-
-    def _seen(self) -> int:
-        return seen_by(self.mapper)
 
 
 def add_all(

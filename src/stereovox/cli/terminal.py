@@ -55,12 +55,10 @@ def progress_bar() -> Iterator[Progress]:
 
 def tracked(items: Iterable[T], total: int | None, text: str) -> Iterator[T]:
     """Yield `items` with a progress bar; `total` is None where nobody knows how many there are."""
-    with progress_bar() as bar:
-        task = bar.add_task(text, total=total, note="")
+    with progress_of(total, text) as bar:
         for item in items:
             yield item
-            speed = bar.tasks[0].finished_speed or bar.tasks[0].speed
-            bar.update(task, advance=1, note=f"{speed:.0f} a second" if speed else "")
+            bar.advance()
 
 
 @contextmanager
@@ -78,6 +76,10 @@ class ProgressOfFrames:
 
     def after(self, frame: object, report: object) -> None:
         """Note a frame that was offered to the map."""
+        self.advance()
+
+    def advance(self) -> None:
+        """Move on by one step."""
         speed = self._bar.tasks[0].finished_speed or self._bar.tasks[0].speed
         self._bar.update(self._task, advance=1, note=f"{speed:.0f} a second" if speed else "")
 

@@ -16,7 +16,7 @@ from stereovox.localize.slam import Slam, SlamResult, map_scans
 from stereovox.localize.slam_closure import ClosureSearch
 from stereovox.localize.track import Track
 from stereovox.products.map_server import write_map_server
-from stereovox.sources.robot import open_robot
+from stereovox.sources import open_robot
 
 
 def main() -> None:

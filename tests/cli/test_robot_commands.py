@@ -8,9 +8,9 @@ import pytest
 
 from stereovox.cli import main
 from stereovox.products.map_server import read_map_server
-from stereovox.sources.bag_files import open_bag
+from stereovox.sources import open_robot
+from stereovox.sources.bag_kinds import open_bag
 from stereovox.sources.bag_messages import read_pose
-from stereovox.sources.robot import open_robot
 from stereovox.sources.trajectory import Trajectory
 
 DRIVE = "sim:floor?plan=testbed&seconds=24&scan_hz=4&depth_hz=2&image_width=160"

@@ -18,7 +18,7 @@ from stereovox.products.bag_maps import read_bag_grid, write_grid_bag
 from stereovox.products.imports import import_map
 from stereovox.products.point_files import read_points
 from stereovox.products.projection import project
-from stereovox.sources.bag_files import open_bag
+from stereovox.sources.bag_kinds import open_bag
 from stereovox.sources.bag_robot_messages import read_transforms
 from stereovox.sources.bag_writer import BagWriter
 

@@ -18,8 +18,8 @@ from stereovox.cameras import PinholeCamera
 from stereovox.errors import SourceError
 from stereovox.frame import Frame
 from stereovox.sources import open_source
-from stereovox.sources.bag_files import FOLDER, open_bag, suffix_of
 from stereovox.sources.bag_folder import FolderFile
+from stereovox.sources.bag_kinds import FOLDER, open_bag, suffix_of
 from stereovox.sources.bag_writer import BagWriter
 
 CAMERA = PinholeCamera(8, 6, 10.0, 10.5, 3.4, 2.6)

@@ -21,7 +21,7 @@ from stereovox.cameras import PinholeCamera
 from stereovox.errors import FrameRefused, MissingExtra, SourceError
 from stereovox.frame import Frame
 from stereovox.sources import bag_mcap_index, bag_mcap_records, open_source
-from stereovox.sources.bag_files import open_bag, suffix_of
+from stereovox.sources.bag_kinds import open_bag, suffix_of
 from stereovox.sources.bag_mcap import McapFile
 from stereovox.sources.bag_mcap_records import message_at
 from stereovox.sources.bag_writer import BagWriter

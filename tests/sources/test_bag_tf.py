@@ -11,7 +11,7 @@ from made_robot_bags import MS, START_NS, TF, RobotBagMaker, planar_motion, plan
 
 from stereovox.errors import SourceError
 from stereovox.sources.bag import Bag, tracker_poses
-from stereovox.sources.bag_files import open_bag
+from stereovox.sources.bag_kinds import open_bag
 from stereovox.sources.bag_tf import read_tf, tf_topics
 from stereovox.sources.tracker import turned
 

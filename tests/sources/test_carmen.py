@@ -9,8 +9,8 @@ import pytest
 
 from stereovox import planar
 from stereovox.errors import SourceError
+from stereovox.sources import open_robot
 from stereovox.sources.carmen import CarmenLog
-from stereovox.sources.robot import open_robot
 
 DATA = Path(__file__).resolve().parents[3] / "shared/data/carmen"
 HEAD = "# message_name [message contents] ipc_timestamp\nPARAM robot_frontlaser_offset 0.2 nohost 0\nSYNC x nohost 0\n"

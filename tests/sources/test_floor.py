@@ -13,10 +13,10 @@ from stereovox.errors import SourceError
 from stereovox.frame import Reason
 from stereovox.geometry import inverse, rigidity_error, transform_points
 from stereovox.sensors.noise import RangeNoise
+from stereovox.sources import open_robot
 from stereovox.sources.floor import PLANS, Floor
 from stereovox.sources.floor_drive import STEP_NS, Odometry, Stop, drive, metres, zigzag
 from stereovox.sources.floor_kinect import Kinect, kinect_camera
-from stereovox.sources.robot import open_robot
 
 SMALL = "image_width=80"
 DRIVES = ("sim:floor", "sim:floor?shut=1", "sim:floor?plan=testbed")

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from stereovox.errors import SourceError
+from stereovox.sources import open_robot
 from stereovox.sources.floor import Floor
 from stereovox.sources.floor_bag import write_bag
-from stereovox.sources.robot import open_robot
 
 pytest.importorskip("rosbags", reason="needs the extra 'bags'")
 

@@ -7,6 +7,7 @@ import pytest
 
 from stereovox.errors import SourceError
 from stereovox.geometry import inverse, rotation_vector
+from stereovox.sources import open_depth
 from stereovox.sources.drift import Drift
 from stereovox.sources.pair import CameraPair
 from stereovox.sources.pair_file import read_pair
@@ -30,7 +31,7 @@ def recorded(simulation, tmp_path_factory):
 
 
 def test_a_pair_read_back_has_the_true_poses(simulation, recorded):
-    pair = CameraPair(recorded.folder)
+    pair = CameraPair(recorded.folder, open_depth)
     assert len(pair) == len(simulation)
     truth = simulation.stage.moved(recorded.T_map_world)
     for i in range(0, len(pair), 23):
@@ -49,7 +50,7 @@ def test_the_map_begins_at_the_tracker_and_is_level(simulation, recorded):
 
 
 def test_images_are_the_cameras_in_millimetres(simulation, recorded):
-    pair = CameraPair(recorded.folder)
+    pair = CameraPair(recorded.folder, open_depth)
     frame, true = pair.frame(11), simulation.frame(11)
     np.testing.assert_array_equal(frame.depth, true.depth)
     assert frame.depth_scale == true.depth_scale == 0.001

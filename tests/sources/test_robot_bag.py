@@ -13,7 +13,8 @@ from made_robot_bags import MS, START_NS, RobotBagMaker, planar_motion, planar_n
 from stereovox.errors import SourceError
 from stereovox.frame import Frame, Scan
 from stereovox.geometry import inverse
-from stereovox.sources.robot import in_time_order, open_robot
+from stereovox.sources import open_robot
+from stereovox.sources.robot import in_time_order
 from stereovox.sources.robot_bag import RobotBag
 from stereovox.sources.robot_options import mounted
 

@@ -42,8 +42,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Calibrate, print the result and write it."""
-    from stereovox.sources import Selection
-    from stereovox.sources.pair import open_depth
+    from stereovox.sources import Selection, open_depth
 
     folder = Path(arguments.recording)
     settings = _settings(folder)

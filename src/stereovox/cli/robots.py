@@ -44,7 +44,7 @@ def settings_of(arguments: Namespace) -> Config:
 
 def opened(where: str) -> Robot:
     """Open the recording and say what had to be assumed about it."""
-    from stereovox.sources.robot import open_robot
+    from stereovox.sources import open_robot
 
     robot = open_robot(where)
     for note in robot.notes:

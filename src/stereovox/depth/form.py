@@ -8,9 +8,15 @@ from typing import Any, NamedTuple, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from stereovox import geometry
 from stereovox.errors import FrameRefused
-from stereovox.frame import Frame, Scan, StereoFrame
+from stereovox.frame import Frame, Scan, StereoFrame, name_of
 from stereovox.rigs import StereoPair, VirtualCamera
+
+EXACT = 1e-14
+"""How far a rotation of doubles may be off and still be the nearest there is."""
+FARTHEST = 1e6
+"""Positions beyond this many metres are taken for errors."""
 
 
 class Field(NamedTuple):
@@ -108,3 +114,21 @@ def _check_fields(seen: object, wanted: dict[str, Field]) -> None:
 def _called(seen: object) -> str:
     name = getattr(seen, "name", "")
     return name if isinstance(name, str) and name else f"a {type(seen).__name__}"
+
+
+def rigid_pose(frame: Frame | Scan, tolerance: float) -> geometry.Transform:
+    """Return the rigid motion nearest to the pose.
+
+    Raises FrameRefused: `no_pose` for None, `pose_not_finite`, `pose_not_rigid`.
+    """
+    if frame.T_world_sensor is None:
+        raise FrameRefused("no_pose", f"{name_of(frame)}: there is no pose; give a (4, 4) matrix, or wait for one")
+    T = matrix_of(frame.T_world_sensor)
+    if T.shape == (4, 4) and not all(-FARTHEST < x < FARTHEST for x in T.ravel().tolist()):
+        raise FrameRefused(
+            "pose_not_finite", f"{name_of(frame)}: the pose holds NaN, infinity or absurdly large numbers"
+        )
+    error = geometry.rigidity_error(T)
+    if error > tolerance:
+        raise FrameRefused("pose_not_rigid", f"{name_of(frame)}: the pose is no rigid 4x4 motion (off by {error:.2g})")
+    return geometry.orthonormalise(T) if error > EXACT else T

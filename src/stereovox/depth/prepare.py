@@ -8,30 +8,25 @@ from math import isnan
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox import geometry
 from stereovox.cameras import PinholeCamera
 from stereovox.config import Config
 from stereovox.depth import _cpu
 from stereovox.depth.correct import corrected
 from stereovox.depth.denoise import denoise
 from stereovox.depth.downsample import downsample
-from stereovox.depth.form import check_form, for_kernels, matrix_of
+from stereovox.depth.form import check_form, for_kernels, rigid_pose
 from stereovox.depth.quality import SPARSE, check_unit
 from stereovox.errors import FrameRefused
-from stereovox.frame import DepthImage, Frame, Reason, Scan, name_of
+from stereovox.frame import DepthImage, Frame, Reason, name_of
 
 DTYPES = (np.dtype(np.uint16), np.dtype(np.float32), np.dtype(np.float64))
 SATURATED = 65535
 """What many cameras write into uint16 images for "no value"."""
-EXACT = 1e-14
-"""How far a rotation of doubles may be off and still be the nearest there is."""
 NO_REASONS = for_kernels(np.empty(0, np.uint8))
 """What is taken where a frame gives none: so the kernel is there when the first one does."""
 SMALLEST = 1e-30
 """Metres per unit of a depth image that float32 can still multiply with."""
 MOST = max(Reason)
-FARTHEST = 1e6
-"""Positions beyond this many metres are taken for errors."""
 
 
 def prepare(frame: Frame, config: Config) -> DepthImage:
@@ -107,21 +102,3 @@ def _check_image(frame: Frame) -> None:
 
 def _are_reasons(given: NDArray, shape: tuple[int, ...]) -> bool:
     return given.dtype == np.uint8 and given.shape == shape and np.max(given.view(np.ndarray), initial=0) <= MOST
-
-
-def rigid_pose(frame: Frame | Scan, tolerance: float) -> geometry.Transform:
-    """Return the rigid motion nearest to the pose.
-
-    Raises FrameRefused: `no_pose` for None, `pose_not_finite`, `pose_not_rigid`.
-    """
-    if frame.T_world_sensor is None:
-        raise FrameRefused("no_pose", f"{name_of(frame)}: there is no pose; give a (4, 4) matrix, or wait for one")
-    T = matrix_of(frame.T_world_sensor)
-    if T.shape == (4, 4) and not all(-FARTHEST < x < FARTHEST for x in T.ravel().tolist()):
-        raise FrameRefused(
-            "pose_not_finite", f"{name_of(frame)}: the pose holds NaN, infinity or absurdly large numbers"
-        )
-    error = geometry.rigidity_error(T)
-    if error > tolerance:
-        raise FrameRefused("pose_not_rigid", f"{name_of(frame)}: the pose is no rigid 4x4 motion (off by {error:.2g})")
-    return geometry.orthonormalise(T) if error > EXACT else T

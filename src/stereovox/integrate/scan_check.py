@@ -9,8 +9,7 @@ import numpy as np
 
 from stereovox import geometry
 from stereovox.config import Config
-from stereovox.depth.form import check_form, matrix_of
-from stereovox.depth.prepare import EXACT, FARTHEST, rigid_pose
+from stereovox.depth.form import EXACT, FARTHEST, check_form, matrix_of, rigid_pose
 from stereovox.errors import FrameRefused
 from stereovox.frame import Scan, name_of
 

@@ -7,8 +7,7 @@ from pathlib import Path
 
 from stereovox.config import Config
 from stereovox.errors import ConfigError
-from stereovox.maps.store import load_map
-from stereovox.maps.voxel_map import State, VoxelMap
+from stereovox.maps.voxel_map import State, VoxelMap, load_map
 
 __all__ = ["State", "VoxelMap", "load_map", "make_map"]
 

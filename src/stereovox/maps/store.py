@@ -19,23 +19,21 @@ from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.cameras import DepthCorrection, PinholeCamera
-from stereovox.config import load_config
+from stereovox.config import Config, load_config
 from stereovox.errors import MapFileError
 from stereovox.files import sync_folder, sync_tree
 from stereovox.frame import Viewpoint
 from stereovox.history import History
+from stereovox.maps.cell_format import FORMATS, CellFormat
 from stereovox.maps.lock import LOCK, only_writer_in
 from stereovox.maps.store_read import ARRAYS, read_blocks
 from stereovox.untrusted import count_in, json_value, read_bounded
-
-if TYPE_CHECKING:
-    from stereovox.maps.voxel_map import VoxelMap
 
 FORMAT = "stereovox-map"
 VERSION, READABLE = 2, (1, 2)
@@ -49,7 +47,47 @@ Slab = tuple[NDArray, ...]
 """Block coordinates (n, 3), cells (n, 512), and times (n, 512) where they are kept."""
 
 
-def save_map(voxel_map: VoxelMap, path: str | Path) -> None:
+class Saveable(Protocol):
+    """What a map must offer to be saved; see `VoxelMap` for what each is."""
+
+    config: Config
+    history: History
+    viewpoint: Viewpoint | None
+    window_state: dict[str, Any] | None
+
+    @property
+    def cell_format(self) -> CellFormat:
+        """How cells are stored."""
+        ...
+
+    @property
+    def times_start_ns(self) -> int | None:
+        """The stamp that times of cells count from."""
+        ...
+
+    def slabs(self) -> Iterator[Slab]:
+        """Yield block coordinates and cells, in ascending order."""
+        ...
+
+    def timed(self) -> Iterator[Slab]:
+        """Yield block coordinates, cells and their times."""
+        ...
+
+
+class SavedMap(NamedTuple):
+    """What a saved map holds; `times` is None where none were kept."""
+
+    config: Config
+    history: History
+    viewpoint: Viewpoint | None
+    window_state: dict[str, Any] | None
+    coords: NDArray[np.int32]
+    cells: NDArray[np.integer]
+    times: NDArray[np.uint32] | None
+    times_start_ns: int | None
+
+
+def save_map(voxel_map: Saveable, path: str | Path) -> None:
     """Write `voxel_map` to the folder `path`, so that the disk holds all of it when this returns.
 
     Raises MapFileError when it cannot be written, is no map, or is being written by another run; an older map is then
@@ -100,46 +138,36 @@ def check_target(folder: Path) -> None:
         raise MapFileError(f"{folder}: {where}cannot be written to; choose a writable folder")
 
 
-def load_map(path: str | Path) -> VoxelMap:
-    """Read a map saved by `VoxelMap.save`, all of it, whatever window it was made in.
-
-    Raises MapFileError: one line with the file and what is wrong.
-    """
+def read_map(path: str | Path) -> SavedMap:
+    """Read what `save_map` wrote, all of it. Raises MapFileError: one line with the file and what is wrong."""
     folder = Path(path)
     manifest = read_manifest(folder)
     while True:
         try:
-            return _load(folder, manifest)
+            return _read(folder, manifest)
         except MapFileError:
             tried, manifest = manifest, read_manifest(folder)
             if manifest.get("data") == tried.get("data"):  # else a newer save took its place meanwhile
                 raise
 
 
-def _load(folder: Path, manifest: dict[str, Any]) -> VoxelMap:
-    from stereovox.maps.voxel_map import VoxelMap
-
+def _read(folder: Path, manifest: dict[str, Any]) -> SavedMap:
     try:
         if not isinstance(manifest["config"], dict):
             raise TypeError("config is no table of settings")
         if isinstance(cells_of := manifest["config"].get("map"), dict):
             cells_of.setdefault("prior", 0.5)  # that of maps from before there was one
-        voxel_map = VoxelMap(load_config(manifest["config"]))
-        voxel_map.history = History.loaded(manifest)
-        voxel_map.viewpoint = _viewpoint_from(manifest.get("viewpoint"))
-        voxel_map.window_state = manifest.get("window")
+        config, history = load_config(manifest["config"]), History.loaded(manifest)
+        viewpoint, window = _viewpoint_from(manifest.get("viewpoint")), manifest.get("window")
         start_ns = _start_ns(manifest.get("times_start_ns"))
         data, blocks = folder / str(manifest["data"]), count_in(manifest, "blocks")
-        dtypes = [voxel_map.cell_format.dtype, np.dtype(np.uint32)][: 2 if voxel_map.config.map.keep_times else 1]
+        dtypes = [FORMATS[config.map.cell].dtype, np.dtype(np.uint32)][: 2 if config.map.keep_times else 1]
         coords, cells, *times = arrays = read_blocks(data, blocks, *dtypes)
         if _checksums(arrays, manifest["checksum"]) != manifest["checksum"]:
             raise ValueError("the cells do not match their checksum")
     except (KeyError, TypeError, ValueError, OSError, RuntimeError, OverflowError, AttributeError) as error:
         raise MapFileError(f"{folder}: damaged map ({type(error).__name__}: {error}); make it anew") from None
-    voxel_map.insert(coords, cells)
-    if times:
-        voxel_map.set_times(coords, times[0], start_ns)
-    return voxel_map
+    return SavedMap(config, history, viewpoint, window, coords, cells, times[0] if times else None, start_ns)
 
 
 def is_map(path: str | Path) -> bool:
@@ -206,7 +234,7 @@ def _named(folder: Path) -> Any:
     return None
 
 
-def _manifest(voxel_map: VoxelMap, data: str, blocks: int, checksum: list[int]) -> dict[str, Any]:
+def _manifest(voxel_map: Saveable, data: str, blocks: int, checksum: list[int]) -> dict[str, Any]:
     return {
         "format": FORMAT,
         "version": VERSION,
@@ -269,7 +297,7 @@ def _as_number(number: Any) -> Any:
     return number.item()
 
 
-def _write_arrays(folder: Path, voxel_map: VoxelMap) -> tuple[int, list[int]]:
+def _write_arrays(folder: Path, voxel_map: Saveable) -> tuple[int, list[int]]:
     """Write all blocks, piece by piece; return their number and the checksum of each array."""
     import zarr
 

@@ -25,6 +25,7 @@ from stereovox.maps.cell_times import NEVER, CellTimes
 from stereovox.maps.evidence import LARGEST, LOG_ODDS_SCALE, Evidence
 from stereovox.maps.queries import INDEX_LIMIT as INDEX_LIMIT
 from stereovox.maps.queries import Asked, NearestCells, RayHits
+from stereovox.maps.store import read_map, save_map
 
 EVERYWHERE = np.array([[-(2**30)] * 3, [2**30] * 3])
 """Lowest block that `VoxelMap.blocks_within` may be asked for, and the first beyond the highest."""
@@ -326,8 +327,6 @@ class VoxelMap(Guarded, WithHistory):
 
     def save(self, path: str | Path) -> None:
         """Save to the folder `path` (Zarr inside); an older map there stays whole until the new one is complete."""
-        from stereovox.maps.store import save_map
-
         save_map(self, path)
 
     def close(self) -> None:
@@ -428,3 +427,17 @@ def _span(coords: NDArray[np.int32], known: NDArray[np.bool_]) -> tuple[list[int
         ends.append((int(layers.min()), int(layers.max()) + 1))
     lowest, beyond = zip(*ends, strict=True)
     return list(lowest), list(beyond)
+
+
+def load_map(path: str | Path) -> VoxelMap:
+    """Read a map saved by `VoxelMap.save`, all of it, whatever window it was made in.
+
+    Raises MapFileError: one line with the file and what is wrong.
+    """
+    saved = read_map(path)
+    voxel_map = VoxelMap(saved.config)
+    voxel_map.history, voxel_map.viewpoint, voxel_map.window_state = saved.history, saved.viewpoint, saved.window_state
+    voxel_map.insert(saved.coords, saved.cells)
+    if saved.times is not None:
+        voxel_map.set_times(saved.coords, saved.times, saved.times_start_ns)
+    return voxel_map

@@ -24,9 +24,9 @@ EXPORTS = {
     ".mcap": "stereovox.products.bag_maps:write_bag",
     ".db3": "stereovox.products.bag_maps:write_bag",
     ".rrd": "stereovox.products.rerun_write:write_rrd",
-    ".pgm": "stereovox.products.projection:write_grid",
-    ".png": "stereovox.products.projection:write_grid",
-    ".yaml": "stereovox.products.projection:write_grid",
+    ".pgm": "stereovox.products.map_server:write_grid",
+    ".png": "stereovox.products.map_server:write_grid",
+    ".yaml": "stereovox.products.map_server:write_grid",
 }
 """File ending -> writer `(voxel_map, path) -> None`; other packages add theirs as entry points `stereovox.export`."""
 FLAT = (".pgm", ".png", ".yaml")

@@ -18,7 +18,7 @@ from stereovox.products.floor_axes import upright_axes
 from stereovox.products.octomap_read import map_of_nodes
 from stereovox.products.octomap_write import BINARY_TITLE, TREE_TITLE, full_tree
 from stereovox.products.projection import Heights, project
-from stereovox.sources.bag_files import open_bag
+from stereovox.sources.bag_kinds import open_bag
 from stereovox.sources.bag_map_messages import OCCUPANCY_GRID, OCTOMAP, read_occupancy_grid, read_octomap_message
 from stereovox.sources.bag_messages import Wire
 from stereovox.sources.bag_robot_messages import POINT_CLOUD, read_point_cloud

@@ -9,12 +9,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox.errors import MapFileError, did_you_mean
+from stereovox.errors import MapFileError, StereovoxError, did_you_mean
 from stereovox.files import replacing
+from stereovox.maps import VoxelMap
 from stereovox.maps.occupancy import UNKNOWN, OccupancyGrid
 from stereovox.maps.voxel_map import State
+from stereovox.products.floor_axes import Heights
+from stereovox.products.inflate import inflated_grid
 from stereovox.products.map_image import Picture, read_picture, write_pgm, write_png
 from stereovox.products.map_yaml import MODES, Meaning, read_meaning
+from stereovox.products.projection import project
 
 OCCUPIED_THRESH, FREE_THRESH = 0.65, 0.196
 """What map_saver writes. With a free_thresh of 0.25, as nav2 has it, its own grey 205, unknown, is read as free."""
@@ -150,3 +154,19 @@ def _yaml_of(path: Path) -> Path:
     if not there:
         raise MapFileError(f"{path}: no {path.stem}.yaml beside it, which tells what its greys mean")
     return there[0]
+
+
+def write_grid(
+    voxel_map: VoxelMap, path: str | Path, heights: Heights | None = None, inflate: float | None = None
+) -> None:
+    """Write the map seen from above as map_server's two files, a picture and its .yaml; `path` names either.
+
+    heights: see `project`. inflate: radius of a robot in metres by which obstacles grow, with a margin of one cell.
+    Raises StereovoxError as `project`, `inflated_grid` and `write_map_server` do.
+    """
+    try:
+        grid = project(voxel_map, heights)
+        grid = grid if inflate is None else inflated_grid(grid, inflate)
+    except StereovoxError as error:
+        raise StereovoxError(f"{path}: {error}") from None
+    write_map_server(grid, path)

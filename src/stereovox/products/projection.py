@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -19,8 +18,6 @@ from stereovox.maps.occupancy import UNKNOWN, OccupancyGrid
 from stereovox.maps.percent import Percent
 from stereovox.products import _projection
 from stereovox.products.floor_axes import Heights, floor_axes
-from stereovox.products.inflate import inflated_grid
-from stereovox.products.map_server import write_map_server
 
 NOTHING = np.iinfo(np.int16).min
 """What a column is stored as of which nothing is known; no cell is stored so."""
@@ -61,22 +58,6 @@ def project(voxel_map: VoxelMap, heights: Heights | None = None) -> OccupancyGri
     if patch is None or not (patch.marked != NOTHING).any():
         raise StereovoxError(_nothing_there(voxel_map, order[2], heights))
     return _grid(voxel_map, patch, voxel_map.config.cell[order[0]])
-
-
-def write_grid(
-    voxel_map: VoxelMap, path: str | Path, heights: Heights | None = None, inflate: float | None = None
-) -> None:
-    """Write the map seen from above as map_server's two files, a picture and its .yaml; `path` names either.
-
-    heights: see `project`. inflate: radius of a robot in metres by which obstacles grow, with a margin of one cell.
-    Raises StereovoxError as `project`, `inflated_grid` and `write_map_server` do.
-    """
-    try:
-        grid = project(voxel_map, heights)
-        grid = grid if inflate is None else inflated_grid(grid, inflate)
-    except StereovoxError as error:
-        raise StereovoxError(f"{path}: {error}") from None
-    write_map_server(grid, path)
 
 
 def layers_of(voxel_map: VoxelMap, axis: int, heights: Heights) -> NDArray[np.int64]:

@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 from stereovox import registry
@@ -15,6 +17,8 @@ from stereovox.sources.base import Source as Source
 from stereovox.sources.base import Stream as Stream
 from stereovox.sources.base import parse_slice as parse_slice
 from stereovox.sources.latest import LatestStream
+from stereovox.sources.pair_file import FILE, PairSettings
+from stereovox.sources.robot import Robot
 
 SOURCES = {
     "pair": "stereovox.sources.pair:CameraPair",  # first: such a folder may hold groundtruth.txt as well
@@ -32,6 +36,12 @@ SOURCES = {
 """Asked in this order, then those of other packages (entry points in the group `stereovox.sources`)."""
 STREAMS = {"realsense": "stereovox.sources.realsense:RealSense"}
 """Live cameras, which can only be followed; entry points in the group `stereovox.streams`."""
+ROBOTS = {
+    "floor": "stereovox.sources.floor:Floor",
+    "carmen": "stereovox.sources.carmen:CarmenLog",
+    "bag": "stereovox.sources.robot_bag:RobotBag",
+}
+"""Kinds of recordings, asked in this order, then those of other packages (entry points `stereovox.robots`)."""
 
 
 def open_source(path_or_name: str | os.PathLike[str], frames: str | None = None) -> Source:
@@ -43,7 +53,7 @@ def open_source(path_or_name: str | os.PathLike[str], frames: str | None = None)
     where = os.fspath(path_or_name)
     if frames is not None:
         parse_slice(frames)  # a slip of the pen shows before a long recording is opened
-    source = _recognise(where)(where)
+    source = _opened(where)
     return source if frames is None else Selection(source, frames)
 
 
@@ -69,7 +79,6 @@ def open_images(path_or_name: str | os.PathLike[str], frames: str | None = None)
 
     So a folder of stamped images needs no groundtruth.txt. Raises SourceError as `open_stream`.
     """
-    from stereovox.sources.pair_file import FILE
     from stereovox.sources.tum import StampedImages
 
     where = os.fspath(path_or_name)
@@ -81,10 +90,56 @@ def open_images(path_or_name: str | os.PathLike[str], frames: str | None = None)
     return source if frames is None else Selection(source, frames)
 
 
+def open_depth(folder: Path, settings: PairSettings) -> DepthSource:
+    """Return the depth images of a pair; their own poses, if there are any, do not count.
+
+    A folder with `depth.txt` or `depth/` holds stamped images (see `StampedImages`); anything else is opened by the
+    source that recognises it, by its `depth_only(where)`.
+    Raises SourceError where there are no depth images.
+    """
+    from stereovox.sources.pair import CorrectedDepth
+    from stereovox.sources.tum import StampedImages
+
+    where = os.path.join(folder, settings.depth)
+    source = StampedImages(where) if StampedImages.recognises(where) else _depth_of(where)
+    if settings.depth_scale is None and settings.baseline is None:
+        return source
+    return CorrectedDepth(source, settings)
+
+
+def open_robot(where: str | os.PathLike[str]) -> Robot:
+    """Return the recording of a ground robot: a bag, a CARMEN log (`.clf`, `.clf.bz2`) or `sim:floor`.
+
+    Raises SourceError, one line, where there is nothing, nothing known or nothing usable.
+    """
+    place = os.fspath(where)
+    for name in registry.names("robots", ROBOTS):
+        kind = registry.find("robots", ROBOTS, name)
+        if kind.recognises(place):
+            return kind(place)
+    if place.startswith("sim:"):
+        raise SourceError(f"{place}: no simulation of a ground robot; there is sim:floor")
+    if not os.path.exists(place):
+        raise SourceError(f"{place}: no such file or folder")
+    raise SourceError(f"{place}: no recording of a ground robot; give a bag with scans, a CARMEN log or sim:floor")
+
+
 def is_recording(path: str | os.PathLike[str]) -> bool:
     """Tell whether `path` is a folder or file that `open_source` knows."""
-    kinds = (registry.find("sources", SOURCES, name) for name in registry.names("sources", SOURCES))
-    return any(kind.recognises(os.fspath(path)) for kind in kinds)
+    return any(kind.recognises(os.fspath(path)) for kind in _kinds())
+
+
+def _depth_of(where: str) -> DepthSource:
+    """Return the depth images of a recording that is made of no others."""
+    for kind in _kinds():
+        if not getattr(kind, "opens_others", False) and kind.recognises(where):
+            return kind.depth_only(where)
+    raise SourceError(f"{where}: no depth images; name a folder with depth.txt or depth/, or a recording, as 'depth'")
+
+
+def _kinds() -> Iterator[Any]:
+    """Yield the classes of recordings, one by one: what is not needed is not imported."""
+    return (registry.find("sources", SOURCES, name) for name in registry.names("sources", SOURCES))
 
 
 def _live(where: str) -> Any:
@@ -93,12 +148,17 @@ def _live(where: str) -> Any:
     return next((kind for kind in kinds if kind.recognises(where)), None)
 
 
+def _opened(where: str) -> Any:
+    kind = _recognise(where)
+    return kind(where, open_depth) if getattr(kind, "opens_others", False) else kind(where)
+
+
 def _recognise(where: str) -> Any:
     kinds = []
-    for name in registry.names("sources", SOURCES):  # one by one: what is not needed is not imported
-        kinds.append(registry.find("sources", SOURCES, name))
-        if kinds[-1].recognises(where):
-            return kinds[-1]
+    for kind in _kinds():
+        kinds.append(kind)
+        if kind.recognises(where):
+            return kind
     if not os.path.exists(where) and not _live(where):
         raise SourceError(f"{where}: no such folder or file")
     if os.path.isfile(os.path.join(where, "manifest.json")):

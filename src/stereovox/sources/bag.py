@@ -16,7 +16,7 @@ from stereovox.frame import Frame
 from stereovox.geometry import Transform
 from stereovox.sources import parameters
 from stereovox.sources.bag_depth import DepthTopic, find_depth
-from stereovox.sources.bag_files import open_bag, suffix_of
+from stereovox.sources.bag_kinds import open_bag, suffix_of
 from stereovox.sources.bag_poses import find_poses
 from stereovox.sources.bag_tf import TfPoses
 from stereovox.sources.base import DepthSource

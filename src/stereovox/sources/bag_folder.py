@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 import re
+from collections.abc import Callable
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -12,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.errors import SourceError
-from stereovox.sources.bag_files import BagFile, one_line, open_bag
+from stereovox.sources.bag_files import BagFile, one_line
 from stereovox.sources.bag_messages import Wire
 from stereovox.untrusted import read_bounded, yaml_value
 
@@ -26,13 +27,14 @@ class FolderFile(BagFile):
     """A folder that rosbag2 recorded; a recording that was split is one, whatever its files are called.
 
     Without `metadata.yaml`, which rosbag2 writes at the end, the numbered files of the folder count, and `notes` say
-    so. Raises SourceError, one line, for files that are missing, damaged, or packed as a whole.
+    so. open_part: opens one of the files. Raises SourceError, one line, for files that are missing, damaged, or packed
+    as a whole.
     """
 
-    def __init__(self, path: Path):
+    def __init__(self, path: Path, open_part: Callable[[Path], BagFile]):
         self.path = path
         names, notes = _files(path)
-        self._parts: list[BagFile] = [open_bag(_whole(path, name)) for name in names]
+        self._parts: list[BagFile] = [open_part(_whole(path, name)) for name in names]
         self.types = {topic: kind for part in self._parts for topic, kind in part.types.items()}
         self.notes = (*notes, *(note for part in self._parts for note in part.notes))
         self._places: dict[str, NDArray[np.int64]] = {}

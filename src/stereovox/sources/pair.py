@@ -4,25 +4,22 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox import registry
 from stereovox.cameras import PinholeCamera
 from stereovox.errors import FrameRefused, SourceError
 from stereovox.frame import Frame
 from stereovox.geometry import Transform
-from stereovox.sources.bag_files import suffix_of
+from stereovox.sources.bag_kinds import suffix_of
 from stereovox.sources.base import DepthSource
 from stereovox.sources.pair_file import FILE, PairSettings, read_pair
 from stereovox.sources.poses import Poses, seconds_from_ns
 from stereovox.sources.tracker import jumps, on_clock, read_tracker
-from stereovox.sources.tum import StampedImages
 
 NEAR_JUMP_NS = 100_000_000
 """Frames this near (0.1 s) to a jump, on either side, are refused: a tracker is rarely right just before one."""
@@ -45,7 +42,10 @@ class CameraPair(DepthSource):
 
     layout = f"a camera pair ({FILE} that names depth images and a tracker's poses)"
 
-    def __init__(self, where: str | os.PathLike[str]):
+    opens_others = True
+
+    def __init__(self, where: str | os.PathLike[str], open_depth: Callable[[Path, PairSettings], DepthSource]):
+        """`open_depth`: opens the depth images that the settings of a folder name; see `sources.open_depth`."""
         self.folder = Path(where)
         self.name = self.folder.resolve().name
         file = self.folder / FILE
@@ -118,20 +118,6 @@ class CameraPair(DepthSource):
         return (f"{self._poses.where}: {many} of up to {largest:.2f} m; {left_out}",)
 
 
-def open_depth(folder: Path, settings: PairSettings) -> DepthSource:
-    """Return the depth images of a pair; their own poses, if there are any, do not count.
-
-    A folder with `depth.txt` or `depth/` holds stamped images (see `StampedImages`); anything else is opened by the
-    source that recognises it, by its `depth_only(where)`.
-    Raises SourceError where there are no depth images.
-    """
-    where = os.path.join(folder, settings.depth)
-    source = StampedImages(where) if StampedImages.recognises(where) else _recognised(where)
-    if settings.depth_scale is None and settings.baseline is None:
-        return source
-    return _Corrected(source, settings)
-
-
 def open_poses(folder: Path, settings: PairSettings) -> Poses:
     """Return the poses of a pair's tracker on the depth camera's clock, in the world and axes of the map."""
     where = os.path.join(folder, settings.poses)
@@ -173,21 +159,7 @@ def check_clocks(image_ns: tuple[int, int], poses: Poses, file: Path) -> None:
         )
 
 
-def _recognised(where: str) -> DepthSource:
-    from stereovox.sources import SOURCES
-
-    for kind in _others(SOURCES):
-        if kind.recognises(where):
-            return kind.depth_only(where)
-    raise SourceError(f"{where}: no depth images; name a folder with depth.txt or depth/, or a recording, as 'depth'")
-
-
-def _others(sources: dict[str, str]) -> Iterable[Any]:
-    kinds = (registry.find("sources", sources, name) for name in registry.names("sources", sources))
-    return (kind for kind in kinds if kind is not CameraPair)
-
-
-class _Corrected(DepthSource):
+class CorrectedDepth(DepthSource):
     """A depth source whose unit or baseline `pair.toml` knows better."""
 
     def __init__(self, source: DepthSource, settings: PairSettings):
@@ -201,6 +173,7 @@ class _Corrected(DepthSource):
         return len(self._source)
 
     def frame(self, i: int) -> Frame:
+        """Return frame `i` with the unit and baseline of `pair.toml`."""
         frame = self._source.frame(i)
         scale = frame.depth_scale if self._scale is None else self._scale
         return replace(frame, camera=self.camera, depth_scale=scale)

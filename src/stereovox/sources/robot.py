@@ -3,22 +3,12 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Iterator, Sequence
 from heapq import merge
 from typing import Protocol
 
-from stereovox import registry
-from stereovox.errors import SourceError
 from stereovox.frame import Frame, Scan
 from stereovox.sources.poses import Poses
-
-ROBOTS = {
-    "floor": "stereovox.sources.floor:Floor",
-    "carmen": "stereovox.sources.carmen:CarmenLog",
-    "bag": "stereovox.sources.robot_bag:RobotBag",
-}
-"""Kinds of recordings, asked in this order, then those of other packages (entry points `stereovox.robots`)."""
 
 
 class Robot(Protocol):
@@ -40,23 +30,6 @@ class Robot(Protocol):
     def recognises(cls, where: str) -> bool:
         """Tell whether `where` is, or by its name should be, such a recording. Never raises."""
         ...
-
-
-def open_robot(where: str | os.PathLike[str]) -> Robot:
-    """Return the recording of a ground robot: a bag, a CARMEN log (`.clf`, `.clf.bz2`) or `sim:floor`.
-
-    Raises SourceError, one line, where there is nothing, nothing known or nothing usable.
-    """
-    place = os.fspath(where)
-    for name in registry.names("robots", ROBOTS):
-        kind = registry.find("robots", ROBOTS, name)
-        if kind.recognises(place):
-            return kind(place)
-    if place.startswith("sim:"):
-        raise SourceError(f"{place}: no simulation of a ground robot; there is sim:floor")
-    if not os.path.exists(place):
-        raise SourceError(f"{place}: no such file or folder")
-    raise SourceError(f"{place}: no recording of a ground robot; give a bag with scans, a CARMEN log or sim:floor")
 
 
 def in_time_order(*streams: Iterable[Scan | Frame]) -> Iterator[Scan | Frame]:

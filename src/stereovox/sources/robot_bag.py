@@ -14,7 +14,8 @@ from stereovox.frame import Frame, Scan
 from stereovox.geometry import Transform, inverse
 from stereovox.sources.bag import depth_frame, file_part, parse_as
 from stereovox.sources.bag_depth import DepthTopic, depth_topics, find_depth
-from stereovox.sources.bag_files import BagFile, open_bag, suffix_of
+from stereovox.sources.bag_files import BagFile
+from stereovox.sources.bag_kinds import open_bag, suffix_of
 from stereovox.sources.bag_poses import topic_poses
 from stereovox.sources.bag_robot_messages import LaserScan, frame_name
 from stereovox.sources.bag_scans import find_scans, most

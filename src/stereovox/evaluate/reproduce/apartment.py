@@ -22,6 +22,7 @@ from stereovox.evaluate.sightings import Sightings
 from stereovox.evaluate.truth import touched_cells
 from stereovox.frame import Frame
 from stereovox.mapper import Mapper
+from stereovox.sources import open_depth
 from stereovox.sources.pair import CameraPair
 from stereovox.sources.recorder import MOUNT, Recording, record
 from stereovox.sources.simulation import Simulation
@@ -119,7 +120,7 @@ def _recorded(simulation: Simulation, tracker: T265, folder: Path) -> tuple[Reco
     """Record the tracker beside tiny images: the pair tells where the large ones were taken."""
     tiny = Simulation(f"{simulation.name}{'&' if '?' in simulation.name else '?'}image_width=16", noise=False)
     recording = record(tiny, folder, tracker, MOUNT)
-    return recording, CameraPair(folder)
+    return recording, CameraPair(folder, open_depth)
 
 
 def _tracked(pair: CameraPair, i: int, exact: Frame) -> Frame:

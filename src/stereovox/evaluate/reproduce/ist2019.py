@@ -19,7 +19,8 @@ from stereovox.evaluate.reproduce.ist.publish import SIDE, TIMES, time_publishin
 from stereovox.evaluate.reproduce.ist.survey import Survey, survey
 from stereovox.evaluate.reproduce.ist.variants import VARIANTS, Variant
 from stereovox.evaluate.reproduce.output import Steps, output_files, write_result
-from stereovox.sources.robot import Robot, open_robot
+from stereovox.sources import open_robot
+from stereovox.sources.robot import Robot
 
 TITLE = "IST 2019, made again"
 LEAD = (

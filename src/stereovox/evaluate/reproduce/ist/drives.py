@@ -11,9 +11,10 @@ import numpy as np
 
 from stereovox import planar
 from stereovox.evaluate.grid_lattice import Rectangle
+from stereovox.sources import open_robot
 from stereovox.sources.floor import Floor
 from stereovox.sources.floor_bag import TRUTH, write_bag
-from stereovox.sources.robot import Robot, open_robot
+from stereovox.sources.robot import Robot
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,7 @@ def main() -> None:
 
 
 def demo() -> None:
-    """Shrink the picture that `stereovox demo` makes; a palette fitted to it keeps the gradients at a third of the size."""
+    """Shrink the picture that `stereovox demo` makes; a palette fitted to it keeps the gradients in a small file."""
     with TemporaryDirectory() as folder:
         if stereovox(["demo", "--out", folder]):
             raise SystemExit("stereovox demo failed")

@@ -27,11 +27,7 @@ COMMANDS = """# Commands
 
 {source}
 
-```bash
-stereovox --help            # all commands
-stereovox map --help        # one of them
-```
-
+- `stereovox --help` lists all commands, `stereovox map --help` the options of one.
 - Options come after the command, and are written in full. A value that begins with a minus needs `=`: `--up=-y`.
 - Text and progress go to stderr. With `--json`, which every command has, the last line of stdout is one JSON object.
 - Exit status: 0 for success; 2 for bad usage or bad input, with one line that names the file or value and the remedy;

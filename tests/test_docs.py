@@ -81,6 +81,17 @@ def test_the_api_page_names_everything_public():
     assert sorted([*named, "__version__"]) == sorted(stereovox.__all__)
 
 
+def test_lines_that_describe_fields_become_lists():
+    pytest.importorskip("griffe", reason="needs pip install '.[docs]'")
+    titled = runpy.run_path(str(ROOT / "docs/docstring_fields.py"))["titled"]
+    house = "A box: small.\n\nlow, high: corners. side: metres,\n    along x.\n\nMore."
+    google = (
+        "A box: small.\n\nAttributes:\n    low: corners.\n    high: See `low`.\n    side: metres, along x.\n\nMore."
+    )
+    assert titled(house, ["low", "high", "side"], "Attributes") == google
+    assert titled(google, ["low", "high", "side"], "Attributes") == google
+
+
 def test_the_menu_of_the_site_names_every_page_once():
     pages = re.findall(r"\S+\.md$", (ROOT / "mkdocs.yml").read_text(), re.MULTILINE)
     assert len(pages) == len(set(pages)), pages

@@ -1,15 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Draw the pictures of docs/conventions.md: python docs/make_pictures.py."""
+"""Draw the pictures of docs/conventions.md and the one of the demo: python docs/make_pictures.py (about a minute)."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import matplotlib as mpl
 
 mpl.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
+from PIL import Image
+
+from stereovox.cli import main as stereovox
 
 HERE = Path(__file__).resolve().parent
 ALONG = np.array([[1.0, 0.36], [-0.62, 0.34], [0.0, 1.0]])
@@ -21,10 +25,21 @@ OPTICAL = np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]], float)
 
 
 def main() -> None:
-    """Draw both."""
+    """Draw all three."""
+    demo()
     plt.rcParams.update({"font.size": 11, "text.color": INK, "svg.fonttype": "path", "svg.hashsalt": "stereovox"})
     save(frames(), "frames.svg")
     save(cells_and_pixels(), "cells.svg")
+
+
+def demo() -> None:
+    """Shrink the picture that `stereovox demo` makes; a palette fitted to it keeps the gradients in a small file."""
+    with TemporaryDirectory() as folder:
+        if stereovox(["demo", "--out", folder]):
+            raise SystemExit("stereovox demo failed")
+        picture = Image.open(Path(folder, "room.png")).convert("RGB")
+    small = picture.resize((1280, round(1280 * picture.height / picture.width)), Image.Resampling.LANCZOS)
+    small.quantize(256, Image.Quantize.MEDIANCUT, kmeans=2).save(HERE / "demo.png", optimize=True)
 
 
 def save(figure: plt.Figure, name: str) -> None:

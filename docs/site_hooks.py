@@ -12,7 +12,6 @@ from mkdocs.structure.files import File, Files
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = ("CONTRIBUTING.md", "CHANGELOG.md")
 """Files beside docs/ that become pages."""
-UP = re.compile(r"\]\(\.\./")
 INTO_DOCS = re.compile(r"\]\(docs/")
 
 
@@ -27,4 +26,7 @@ def on_files(files: Files, config: Any) -> Files:
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     """Turn links between docs/ and its parent into links within docs/."""
-    return (INTO_DOCS if page.file.src_uri in PAGES else UP).sub("](", markdown)
+    if page.file.src_uri in PAGES:
+        return INTO_DOCS.sub("](", markdown)
+    up = "../" * page.file.src_uri.count("/")
+    return markdown.replace(f"](../{up}", f"]({up}")

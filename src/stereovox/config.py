@@ -32,9 +32,12 @@ LARGEST_WINDOW = 1e6
 class NoiseConfig(Section):
     """Range noise sigma(z) = s0 + s1 z + s2 z^2 in metres.
 
-    Where `s2` is not set it follows from the camera: `subpixel / (focal_px * baseline)` (Chien 2020, Eq 3.5 with the
-    square that is missing in print). Where `subpixel` is not set it is the camera's own (`stereo.subpixel` for images
-    that are matched here), else 0.08. `default_baseline` serves cameras whose file does not tell theirs.
+    s0, s1: constant and linear part.
+    s2: quadratic part. Not set: from the camera, `subpixel / (focal_px * baseline)` (Chien 2020, Eq 3.5 with the square
+        that is missing in print).
+    subpixel: standard deviation of the disparity in pixels. Not set: the camera's own (`stereo.subpixel` for images
+        that are matched here), else 0.08.
+    default_baseline: metres between the two eyes, for cameras whose file does not give it.
     pose_m, pose_deg: standard deviation of the tracker's poses along and about each axis; hits and passes count as less
         sure, with models that know how wide noise is.
     """
@@ -49,7 +52,10 @@ class NoiseConfig(Section):
 
 
 class SensorConfig(BaseModel):
-    """The inverse sensor model by name, and its own parameters beside it (`p_free`, ...)."""
+    """The inverse sensor model by name, and its own parameters beside it (`p_free`, ...).
+
+    model: `stereo`, `constant`, `andert`, `valenti`, or one that another package registers.
+    """
 
     model_config = ConfigDict(frozen=True, extra="allow")
     model: str = "stereo"
@@ -60,10 +66,11 @@ class SensorConfig(BaseModel):
 
 
 class RayConfig(Section):
-    """How rays of one frame share a cell: it changes `once`, hits first, or `every` ray adds its weighted part.
+    """How the integrators `ray` and `line` combine the rays of one frame.
 
-    `every` is Chien 2020, Eq 3.21. It counts pixels, so a pole that fills less than about a quarter of its cell's width
-    is outvoted by the rays beside it and called free.
+    update: a cell changes `once` a frame, hits first, or `every` ray adds its weighted part (Chien 2020, Eq 3.21). That
+        counts pixels: a pole that fills less than about a quarter of its cell's width is outvoted by the rays beside it
+        and becomes free.
     """
 
     update: Literal["every", "once"] = "once"
@@ -154,6 +161,7 @@ class SphereConfig(Section):
     step_deg: width of a cell in both angles; must go into 180 degrees a whole number of times.
     statistic: what a cell keeps of the ranges in it: `robust` is their mean less `spread` standard deviations where
         the standard deviation is below `std_threshold` metres, else the smallest (Eq 5.4); `minimum` the smallest.
+    std_threshold: metres. spread: standard deviations; both for `robust`.
     polar_deg, azimuth_deg: from and to; polar from the body's z axis (0: up, 90: level, 180: down), azimuth from its x
         axis to its y axis (0: forward, 90: left, 270 or -90: right). They are widened to whole cells.
     """
@@ -185,7 +193,8 @@ class WindowConfig(Section):
     trigger: half width in metres of the box round the window's centre in which the camera moves freely; half a cell at
         least.
     lead_s: the centre runs ahead of the camera by so many seconds of its flight.
-    grow_s: the window is longer by so many seconds of flight along each axis, up to `largest`.
+    grow_s: the window is longer by so many seconds of flight along each axis.
+    largest: extents that it may grow to; not set: `size`.
     outside: cells that leave are lost (`drop`), or kept in tiles on disk and restored when they return (`keep`).
     """
 
@@ -223,6 +232,8 @@ class MapConfig(Section):
     confirm_hits: frames that must hit an unknown cell at least before it is occupied; one frame raises it by no more
         than that part of the way.
     keep_times: remember for each cell when it got its last evidence (4 bytes a cell on top).
+    log_odds_min, log_odds_max: limits of a cell's log-odds.
+    free_below, occupied_above: probabilities below which a cell is free, and above which it is occupied.
     forget_s: a cell without evidence for so many seconds of the recording becomes unknown; needs `keep_times`.
     """
 
@@ -248,11 +259,18 @@ class MapConfig(Section):
 class Config(Section):
     """Every setting of a run; the resolved one is saved inside the map.
 
+    profile: name of the profile that the settings come from.
     dimensions: 3 for a voxel map, 2 for the grid of a floor (IST 2019).
-    steps: sides of a cell along x, y and z where they differ (Valenti 2018, 7.1); `voxel_size` is then the largest.
+    voxel_size: side of a cell.
+    steps: sides of a cell along x, y and z where they differ, at most 16-fold (Valenti 2018, 7.1); `voxel_size` is then
+        the largest. Pictures and exports are made in cubes of the smallest.
+    min_range, max_range: depths along the optical axis that count.
     up: which axis of the world points up (`z`, `-y`, ...): pictures and heights follow it.
     blind_range: depth in metres up to which a camera clears nothing, for it does not see what stands so near, only what
         is beside it. Not set: 0.3, but no more than a tenth of max_range, and no less than min_range.
+    integrator: `projective`, `ray`, `line`, or one that another package registers.
+    threads: threads of the integrator; the map does not depend on it.
+    pose_rigidity_tolerance: largest entry of abs(R^T R - I) of a pose that is still taken for rounding.
     deadline_ms: milliseconds a frame may take; where frames take longer, `pace` says what is left out. Not set: none.
     max_memory: bytes that the cells may take, as a number or like "500 MB". when_full: frames that need more are
         refused (`refuse`); or the map is a window of that size round the camera, which drops what it leaves (`roll`) or

@@ -44,7 +44,8 @@ class GridConfig(Section):
     update: a cell changes `once` a scan (a hit beats a pass), or by `every` beam that crosses it (IST 2019).
     thickness: metres behind the measured point that are occupied too (alpha of IST 2019, II-B); 0: its cell alone.
     p_occupied, p_free: what one beam says of a cell it ends in, and of one it passes, where as many cells are occupied
-        as free (OctoMap's numbers); `map.prior` tells how many are.
+        as free (OctoMap's numbers); `prior` tells how many are.
+    prior: probability that a cell is occupied before the first evidence on it.
     max_tilt_deg: scans of a sensor that leans more than this are refused: its beams meet the floor.
     """
 
@@ -78,8 +79,10 @@ class AmclConfig(Section):
         `field` knows z_hit and z_rand only. sigma_hit: metres; lambda_short: 1 / metres.
     field_distance: metres from an obstacle beyond which all places are equal.
     beam_skip: leave out beams that most particles find in the open, once they agree with each other: people, and what
-        was moved. A beam fits a particle that it ends within beam_skip_distance metres of an obstacle for; it is left
-        out where it fits less than beam_skip_share of them; all are used where more than beam_skip_most would be lost.
+        was moved.
+    beam_skip_distance: a beam fits a particle for which it ends within so many metres of an obstacle.
+    beam_skip_share: a beam is left out where it fits a smaller share of the particles.
+    beam_skip_most: all beams are used where a larger share of them would be left out.
     alpha_slow, alpha_fast: how quickly the long and the short memory of the likelihood fade (table 8.3); where the
         short one falls below the long one, random particles help to find the robot again. 0: never.
     recovery_least: a smaller share of random particles is taken for chance, and none are drawn; 0: as printed.

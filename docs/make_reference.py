@@ -1,0 +1,249 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Write docs/reference/commands.md and settings.md from argparse and the settings: python docs/make_reference.py.
+
+A test compares the files with what is written here.
+"""
+
+from __future__ import annotations
+
+import re
+from argparse import SUPPRESS, Action, ArgumentParser
+from dataclasses import fields
+from pathlib import Path
+from types import UnionType
+from typing import Any, Literal, Union, get_args, get_origin
+
+from pydantic import BaseModel, ByteSize
+from pydantic.fields import FieldInfo
+
+from stereovox import Config, cli, load_config, registry
+from stereovox.config import profile_names
+from stereovox.sensors import SENSORS
+
+FOLDER = Path(__file__).resolve().parent / "reference"
+SOURCE = "<!-- Written by docs/make_reference.py from {}: change it there. -->"
+
+COMMANDS = """# Commands
+
+{source}
+
+- `stereovox --help` lists all commands, `stereovox map --help` the options of one.
+- Options come after the command, and are written in full. A value that begins with a minus needs `=`: `--up=-y`.
+- Text and progress go to stderr. With `--json`, which every command has, the last line of stdout is one JSON object.
+- Exit status: 0 for success; 2 for bad usage or bad input, with one line that names the file or value and the remedy;
+  130 after Ctrl-C and 143 after SIGTERM. `map` and `grid` then save the map as far as it got.
+- Recordings are recognised by their contents, wherever they lie: [Recordings](../recordings.md).
+
+| command | |
+|---|---|
+{overview}
+"""
+
+SETTINGS = """# Settings
+
+{source}
+
+Every setting has a default, so a profile names only what differs. It is a TOML file:
+
+```toml
+# garage.toml, used as: stereovox map SOURCE --out MAP --profile garage.toml
+voxel_size = 0.1
+max_range = 8.0
+
+[sensor]
+model = "valenti"
+p_free = 0.3
+```
+
+On the command line: `--set max_range=8 --set sensor.model=valenti`. In Python: `sv.Mapper(max_range=8.0,
+**{{"sensor.model": "valenti"}})`. An unknown name is an error that suggests the right one. The settings that a map was
+made with are saved in it. Lengths are metres unless the description says otherwise. Which settings matter:
+[How to choose](../choosing.md).
+"""
+
+
+def main() -> None:
+    """Write both pages."""
+    FOLDER.mkdir(exist_ok=True)
+    for name, text in pages().items():
+        (FOLDER / name).write_text(text)
+
+
+def pages() -> dict[str, str]:
+    """Return the text of each page by its file's name."""
+    return {"commands.md": _commands(), "settings.md": _settings()}
+
+
+def _commands() -> str:
+    modules = {name: cli._module(name) for name in cli.COMMANDS}
+    overview = [f"| [`{name}`](#{name}) | {_cell(_first(module.__doc__))} |" for name, module in modules.items()]
+    parts = [COMMANDS.format(source=SOURCE.format("src/stereovox/cli"), overview="\n".join(overview))]
+    for name, module in modules.items():
+        parser = cli._Parser(prog=f"stereovox {name}", description=module.__doc__, epilog=f"example: {module.EXAMPLE}")
+        module.add_arguments(parser)
+        parts.append(_command(name, parser, "##"))
+    return "\n".join(parts)
+
+
+def _command(name: str, parser: ArgumentParser, heading: str) -> str:
+    actions = [action for action in parser._actions if {"--help", "--json"}.isdisjoint(action.option_strings)]
+    kinds = [action for action in actions if isinstance(action.choices, dict)]
+    options = [action for action in actions if action not in kinds]
+    lines = [f"{heading} {name}", "", str(parser.description).strip(), ""]
+    if options:
+        lines += ["```text", _usage(parser.prog, options), "```", "", "| argument | default | |", "|---|---|---|"]
+        lines += [f"| `{_name(action)}` | {_default(action)} | {_help(parser, action)} |" for action in options]
+        lines += ["", "```bash", str(parser.epilog).removeprefix("example: "), "```", ""]
+    for action in kinds:
+        lines += [_command(f"{name} {kind}", sub, heading + "#") for kind, sub in action.choices.items()]
+    return "\n".join(lines)
+
+
+def _usage(program: str, actions: list[Action]) -> str:
+    """Return what must be given, and whether there is more."""
+    needed = [_name(action) for action in actions if action.required]
+    needed += ["[options]"] if any(action.option_strings and not action.required for action in actions) else []
+    return " ".join([program, *needed])
+
+
+def _name(action: Action) -> str:
+    """Return an option with its value, or the name of a positional argument, as the usage shows it."""
+    names = action.metavar or ("" if action.nargs == 0 else _alternatives(action))
+    value = " ".join(names) if isinstance(names, tuple) else names
+    if action.nargs == "?":
+        value = f"[{value}]"
+    elif action.nargs in ("*", "+"):
+        value += " ..."
+    return " ".join([*action.option_strings[-1:], value]).strip().replace("|", "\\|")
+
+
+def _alternatives(action: Action) -> str:
+    return "|".join(map(str, action.choices)) if action.choices else action.dest.upper()
+
+
+def _default(action: Action) -> str:
+    if action.required:
+        return "required"
+    return "" if action.default in (None, False, SUPPRESS) or action.default == [] else f"`{action.default}`"
+
+
+def _help(parser: ArgumentParser, action: Action) -> str:
+    return _cell(parser._get_formatter()._expand_help(action)) if action.help else ""
+
+
+def _settings() -> str:
+    parts = [SETTINGS.format(source=SOURCE.format("stereovox.Config")), _section("General", "", Config)]
+    for name, field in Config.model_fields.items():
+        if _is_section(field.annotation):
+            parts.append(_section(name, f"{name}.", field.annotation))
+            if name == "sensor":
+                parts.append(_sensors())
+    return "\n".join([*parts, _profiles()])
+
+
+def _is_section(kind: Any) -> bool:
+    return isinstance(kind, type) and issubclass(kind, BaseModel)
+
+
+def _section(title: str, prefix: str, model: type[BaseModel]) -> str:
+    about, described = _described(model)
+    first = {text: name for name, text in reversed(described.items())}  # of settings that are described together
+    lines = [f"## {title}", "", about, "", "| setting | type | default | |", "|---|---|---|---|"]
+    for name, field in model.model_fields.items():
+        if not _is_section(field.annotation):
+            default = "not set" if field.default is None else f"`{_value(field.default)}`"
+            same = first[described[name]]
+            text = described[name] if same == name else f"see `{prefix}{same}`"
+            lines.append(f"| `{prefix}{name}` | {_type(field)} | {default} | {_cell(text)} |")
+    return "\n".join([*lines, ""])
+
+
+def _described(model: type[BaseModel]) -> tuple[str, dict[str, str]]:
+    """Return what a section's docstring says of the whole, and of each setting: `name: text` or `name, name: text`."""
+    text = " ".join(str(model.__doc__).replace("Attributes:\n", "").split())
+    text = re.sub(r"docs/(\w+)\.md", r"[\g<0>](../\1.md)", text)
+    text = re.sub(r"(\w+?)1 \.\.\. \w+4:", r"\g<1>1, \g<1>2, \g<1>3, \g<1>4:", text)
+    names = "|".join(sorted(model.model_fields, key=len, reverse=True))
+    about, *entries = re.split(rf"(?<=\s)((?:{names})(?:, (?:{names}))*): ", text)
+    said: dict[str, str] = {}
+    for group, entry in zip(entries[::2], entries[1::2], strict=True):
+        said |= dict.fromkeys(group.split(", "), entry.strip().rstrip(".;"))
+    missing = [
+        name for name, field in model.model_fields.items() if name not in said and not _is_section(field.annotation)
+    ]
+    if missing:
+        raise ValueError(f"{model.__name__}: its docstring does not describe {', '.join(missing)}")
+    return about.strip(), said
+
+
+def _type(field: FieldInfo) -> str:
+    limits = [
+        f"{sign} {getattr(limit, name):g}" for limit in field.metadata for name, sign in LIMITS if hasattr(limit, name)
+    ]
+    return _cell(", ".join([_kind(field.annotation), *limits]))
+
+
+LIMITS = (("gt", ">"), ("ge", "≥"), ("lt", "<"), ("le", "≤"), ("multiple_of", "multiple of"))
+KINDS = {bool: "true or false", int: "whole number", float: "number", str: "text", ByteSize: "bytes"}
+
+
+def _kind(kind: Any) -> str:
+    if get_origin(kind) in (Union, UnionType):
+        return _kind(next(part for part in get_args(kind) if part is not type(None)))
+    if get_origin(kind) is Literal:
+        return " or ".join(f"`{value}`" for value in get_args(kind))
+    return f"{len(get_args(kind))} numbers" if get_origin(kind) is tuple else KINDS[kind]
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    return str(list(value)) if isinstance(value, tuple) else str(value)
+
+
+def _sensors() -> str:
+    lines = ["The parameters of a model stand beside its name, for example `sensor.p_free`:", ""]
+    lines += ["| `sensor.model` | parameters and defaults | |", "|---|---|---|"]
+    for name in SENSORS:
+        model = registry.find("sensors", SENSORS, name)
+        numbers = ", ".join(f"`{field.name}` {field.default}" for field in fields(model))
+        lines.append(f"| `{name}` | {numbers} | {_cell(_first(model.__doc__))} |")
+    return "\n".join([*lines, ""])
+
+
+def _profiles() -> str:
+    """Return a table of what the built-in profiles change."""
+    usual, *changed = ["default", *(name for name in profile_names() if name != "default")]
+    flat = {name: _flat(load_config(name).model_dump()) for name in (usual, *changed)}
+    names = [name for name in dict.fromkeys(key for values in flat.values() for key in values) if name != "profile"]
+    lines = ["## Profiles", "", "What the built-in profiles change. An empty field is the default.", ""]
+    lines += [f"| setting | {' | '.join(f'`{name}`' for name in flat)} |", f"|---|{'---|' * len(flat)}"]
+    for name in names:
+        row = [values.get(name) for values in flat.values()]
+        if any(value != row[0] for value in row):
+            shown = [_shown(row[0]), *("" if value == row[0] else _shown(value) for value in row[1:])]
+            lines.append(f"| `{name}` | {' | '.join(shown)} |")
+    return "\n".join([*lines, ""])
+
+
+def _flat(settings: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for name, value in settings.items():
+        found |= _flat(value, f"{prefix}{name}.") if isinstance(value, dict) else {prefix + name: value}
+    return found
+
+
+def _shown(value: Any) -> str:
+    return "" if value is None else f"`{_value(value)}`"
+
+
+def _first(doc: str | None) -> str:
+    return " ".join(str(doc).strip().split("\n\n")[0].split())
+
+
+def _cell(text: str) -> str:
+    return " ".join(text.split()).replace("|", "\\|").replace("<", "&lt;")
+
+
+if __name__ == "__main__":
+    main()

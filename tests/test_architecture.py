@@ -10,8 +10,7 @@ from time import monotonic, monotonic_ns
 
 import pytest
 
-from stereovox.grid_mapper import GridMapper
-from stereovox.mapper import Mapper
+from stereovox.mapper import GridMapper, Mapper
 from stereovox.run import Checkpoints
 
 SOURCE = Path(__file__).resolve().parents[1] / "src/stereovox"
@@ -43,7 +42,7 @@ LAYERS = (
     },
     {"sources", "depth", "sensors", "maps"},
     {"integrate", "products", "localize", "calibrate"},
-    {"mapper", "grid_mapper", "pace", "ways", "comparing", "evaluate", "view"},
+    {"mapper", "intake", "pace", "ways", "comparing", "evaluate", "view"},
     {"run"},
     {"cli", "ros", "__main__"},
 )

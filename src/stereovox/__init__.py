@@ -16,8 +16,9 @@ if TYPE_CHECKING:
     from stereovox.frame import Reason as Reason
     from stereovox.frame import Scan as Scan
     from stereovox.frame import StereoFrame as StereoFrame
-    from stereovox.grid_mapper import GridMapper as GridMapper
     from stereovox.health import Health as Health
+    from stereovox.mapper import AnyMapper as AnyMapper
+    from stereovox.mapper import GridMapper as GridMapper
     from stereovox.mapper import Mapper as Mapper
     from stereovox.mapper import UpdateReport as UpdateReport
     from stereovox.maps import State as State
@@ -62,8 +63,9 @@ _HOMES = {
     "SphericalCamera": "wide",
     "CylindricalCamera": "wide",
     "Reason": "frame",
-    "GridMapper": "grid_mapper",
     "Health": "health",
+    "AnyMapper": "mapper",
+    "GridMapper": "mapper",
     "Mapper": "mapper",
     "UpdateReport": "mapper",
     "State": "maps",

@@ -17,21 +17,21 @@ from math import inf, isfinite
 from pathlib import Path
 from time import monotonic
 from types import TracebackType
-from typing import Any, Protocol
+from typing import Any, Protocol, TypeVar
 
 from stereovox import sources
 from stereovox.config import Config
 from stereovox.errors import MapFileError, SourceError, StereovoxError, one_line
 from stereovox.evaluate.summary import summarise
-from stereovox.frame import AnyFrame, Scan
-from stereovox.grid_mapper import GridMapper
 from stereovox.history import LONGEST_NAME
-from stereovox.mapper import Mapper
+from stereovox.mapper import AnyMapper, Mapper
 from stereovox.maps import VoxelMap, load_map
 from stereovox.maps.lock import only_writer_in
 from stereovox.maps.store import check_target, is_map, read_manifest, remove_map, sweep
 from stereovox.sources import Stream
 from stereovox.update_report import UpdateReport
+
+SeenT = TypeVar("SeenT")
 
 CHECKPOINT_S = 10.0
 REST = 25
@@ -233,8 +233,8 @@ class MapRun:
 
 
 def add_all(
-    mapper: Mapper | GridMapper,
-    frames: Iterable[AnyFrame | Scan],
+    mapper: AnyMapper[SeenT],
+    frames: Iterable[SeenT],
     checkpoints: Checkpoints,
     check: Callable[[], None],
     observers: Sequence[Observer],
@@ -262,12 +262,12 @@ def add_all(
     return reports
 
 
-def seen_by(mapper: Mapper | GridMapper) -> int:
+def seen_by(mapper: AnyMapper[Any]) -> int:
     """Return how many frames a mapper's map was offered."""
     return mapper.map.frames + mapper.map.frames_refused
 
 
-def _added(mapper: Any, frame: AnyFrame | Scan, checkpoints: Checkpoints) -> UpdateReport:
+def _added(mapper: AnyMapper[SeenT], frame: SeenT, checkpoints: Checkpoints) -> UpdateReport:
     try:
         return mapper.add(frame)
     except MapFileError as error:  # no room for a tile; up to this frame the map is whole in memory

@@ -14,8 +14,7 @@ import pytest
 from stereovox import run
 from stereovox.cli import main
 from stereovox.errors import MapFileError, StereovoxError
-from stereovox.grid_mapper import GridMapper
-from stereovox.mapper import Mapper
+from stereovox.mapper import GridMapper, Mapper
 from stereovox.maps import VoxelMap, load_map
 from stereovox.maps.lock import only_writer_in, only_writer_of
 from stereovox.run import REST, Checkpoints

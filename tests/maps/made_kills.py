@@ -20,7 +20,7 @@ from stereovox.maps import load_map
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.planar import lifted
 from stereovox.products.map_server import read_map_server
-from stereovox.ros.mapping import FloorMapping
+from stereovox.ros.mapping import Mapping
 from stereovox.run import Checkpoints
 from stereovox.sources.trajectory import Trajectory
 
@@ -107,7 +107,7 @@ class FloorByNode(Floor):
     def write(self, n):
         with ExitStack() as stack:
             ros2._reserve(str(self.out), 2, stack)
-            mapping = FloorMapping(load_config(dimensions=2, voxel_size=0.1))
+            mapping = Mapping(load_config(dimensions=2, voxel_size=0.1))
             saves = Checkpoints(lambda: mapping.save(str(self.out)), self.out, 1e-9)
             for k in range(2 * n):
                 scan = Scan(
@@ -122,11 +122,9 @@ class SpaceByNode(Merge):
     """What the node does with its disk, for a map in space; its frames are those of two small maps."""
 
     def newer(self):
-        from stereovox.ros.mapping import SpaceMapping
-
         with ExitStack() as stack:
             ros2._reserve(str(self.out), 3, stack)
-            mapping = SpaceMapping(load_config(voxel_size=0.1))
+            mapping = Mapping(load_config(voxel_size=0.1))
             saves = Checkpoints(lambda: mapping.save(str(self.out)), self.out, 1e-9)
             for n, part in enumerate(self.parts, 1):
                 mapping.load(str(part))

@@ -42,8 +42,8 @@ if TYPE_CHECKING:
 
     from stereovox.config import Config
     from stereovox.frame import Frame, Scan
-    from stereovox.grid_mapper import GridMapper
     from stereovox.localize.track import Track
+    from stereovox.mapper import GridMapper
     from stereovox.run import Checkpoints
     from stereovox.sources.robot import Robot
     from stereovox.update_report import UpdateReport
@@ -163,7 +163,7 @@ def _track(robot: Robot, how: str, config: Config, start: np.ndarray | None) -> 
 
 def _mapper(config: Config, resume: str | None, any_size: bool) -> GridMapper:
     from stereovox.config import load_config
-    from stereovox.grid_mapper import GridMapper
+    from stereovox.mapper import GridMapper
     from stereovox.products.map_server import read_map_server
 
     if resume is None:

@@ -66,7 +66,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
     from stereovox.ros.running import running_node
 
     with running_node(arguments.ros_args) as node, ExitStack() as stack:
-        from stereovox.ros.mapping import make_mapping
+        from stereovox.ros.mapping import Mapping
         from stereovox.ros.parameters import freeze
         from stereovox.ros.warm_up import warm_up
 
@@ -76,7 +76,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
         say_about_compiling()
         warm_up(config)
         tiles = Path(options.out).parent / f".{Path(options.out).name}-tiles" if options.out else None
-        mapping = make_mapping(config, options.heights, tiles)
+        mapping = Mapping(config, options.heights, tiles)
         stack.callback(mapping.close)
         if arguments.load:
             mapping.load(arguments.load)

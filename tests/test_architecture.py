@@ -42,8 +42,8 @@ LAYERS = (
     },
     {"sources", "depth", "sensors", "maps"},
     {"integrate", "products", "localize", "calibrate"},
-    {"mapper", "intake", "pace", "ways", "comparing", "evaluate", "view"},
-    {"run"},
+    {"mapper", "intake", "pace", "ways", "comparing", "evaluate", "view", "run"},
+    {"floor_run"},
     {"cli", "ros", "__main__"},
 )
 LEVEL = {room: level for level, rooms in enumerate(LAYERS) for room in rooms}

@@ -11,6 +11,8 @@ if TYPE_CHECKING:
     from stereovox.config import Config as Config
     from stereovox.config import load_config as load_config
     from stereovox.errors import StereovoxError as StereovoxError
+    from stereovox.floor_run import FloorRun as FloorRun
+    from stereovox.floor_run import map_floor as map_floor
     from stereovox.frame import DepthImage as DepthImage
     from stereovox.frame import Frame as Frame
     from stereovox.frame import Reason as Reason
@@ -84,6 +86,8 @@ _HOMES = {
     "ground": "products.ground",
     "merge": "products.merge",
     "surface": "products.mesh",
+    "FloorRun": "floor_run",
+    "map_floor": "floor_run",
     "MapResult": "run",
     "MapRun": "run",
     "map_recording": "run",

@@ -11,9 +11,10 @@ import numpy as np
 from made_faults import disk, in_child, small_map
 
 from stereovox import run
-from stereovox.cli import main, ros2, slam
+from stereovox.cli import main, ros2
 from stereovox.config import load_config
 from stereovox.frame import Scan
+from stereovox.localize import robot_way
 from stereovox.localize.slam import SlamResult
 from stereovox.localize.track import Track
 from stereovox.maps import load_map
@@ -80,11 +81,11 @@ class FloorBySlam(Floor):
     def write(self, n):
         grid = OccupancyGrid(np.full((2 + n, 3), 100 * (n - 1), np.int8), 0.05, (1.0, 2.0, 0.0))
 
-        def found(robot, config):
+        def found(robot, config, progress):
             stamps_ns = np.array([robot.scans[i].stamp_ns for i in range(n + 2)])
             return SlamResult(Track(stamps_ns, np.full((n + 2, 3), float(n)), np.zeros((n + 2, 3))), grid, [], [], {})
 
-        slam.mapped = found
+        robot_way.slam_robot = found
         done("slam", DRIVE, "--out", self.out)
 
     def seen(self):

@@ -18,7 +18,7 @@ from time import perf_counter
 import numpy as np
 
 from stereovox import Scan, planar
-from stereovox.grid_mapper import GridMapper
+from stereovox.mapper import GridMapper
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.products.map_server import read_map_server, write_map_server
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import stereovox as sv
-from stereovox.grid_mapper import GridMapper
+from stereovox.mapper import GridMapper
 
 SELDOM = 0.1
 """Share of what has tiles on the disk: looking at all of it is slow."""

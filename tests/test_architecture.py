@@ -10,8 +10,7 @@ from time import monotonic, monotonic_ns
 
 import pytest
 
-from stereovox.grid_mapper import GridMapper
-from stereovox.mapper import Mapper
+from stereovox.mapper import GridMapper, Mapper
 from stereovox.run import Checkpoints
 
 SOURCE = Path(__file__).resolve().parents[1] / "src/stereovox"
@@ -43,8 +42,8 @@ LAYERS = (
     },
     {"sources", "depth", "sensors", "maps"},
     {"integrate", "products", "localize", "calibrate"},
-    {"mapper", "grid_mapper", "pace", "ways", "comparing", "evaluate", "view"},
-    {"run"},
+    {"mapper", "intake", "pace", "ways", "comparing", "evaluate", "view", "run"},
+    {"floor_run"},
     {"cli", "ros", "__main__"},
 )
 LEVEL = {room: level for level, rooms in enumerate(LAYERS) for room in rooms}

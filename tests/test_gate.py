@@ -12,8 +12,8 @@ from stereovox.errors import FrameRefused
 from stereovox.frame import Scan
 from stereovox.gate import Gate
 from stereovox.geometry import rotation_matrix
-from stereovox.grid_mapper import GridMapper
 from stereovox.history import MOST_SENSORS, History
+from stereovox.mapper import GridMapper
 from stereovox.maps.grid_store import load_grid
 
 CAMERA = sv.PinholeCamera(16, 12, 12.0, 12.0, 7.5, 5.5, 0.05)

@@ -11,7 +11,7 @@ import stereovox as sv
 from stereovox import planar
 from stereovox.errors import ConfigError
 from stereovox.geometry import from_quaternion
-from stereovox.grid_mapper import GridMapper
+from stereovox.mapper import GridMapper
 from stereovox.maps import State
 from stereovox.maps.occupancy import OccupancyGrid
 

@@ -17,9 +17,9 @@ from made_threads import CAMERA, frames_of, scans_of
 import stereovox as sv
 from stereovox.errors import StereovoxError
 from stereovox.frame import Viewpoint
-from stereovox.grid_mapper import GridMapper
 from stereovox.guarded import MapLock, one_state
 from stereovox.history import WithHistory
+from stereovox.mapper import GridMapper
 from stereovox.maps import cell_pool, cubes
 from stereovox.maps.evidence import Evidence
 from stereovox.maps.grid_evidence import GridEvidence

@@ -8,8 +8,8 @@ import pytest
 
 import stereovox as sv
 from stereovox.frame import Scan
-from stereovox.grid_mapper import GridMapper
 from stereovox.health import Health
+from stereovox.mapper import GridMapper
 
 CAMERA = sv.PinholeCamera(16, 12, 12.0, 12.0, 7.5, 5.5, 0.05)
 POSE = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])

@@ -24,7 +24,7 @@ from numba.core.dispatcher import Dispatcher
 
 import stereovox as sv
 from stereovox.frame import Scan
-from stereovox.grid_mapper import GridMapper
+from stereovox.mapper import GridMapper
 
 
 def compiled():

@@ -103,6 +103,15 @@ def test_what_is_wrong_is_said_in_one_line_and_leaves_the_map(tmp_path):
         assert "another run" in str(other.exception())
 
 
+def test_names_of_a_floors_map_are_refused_in_space(tmp_path):
+    for name in ("a.yaml", "a.yml", "a.pgm", "a.PNG"):
+        with pytest.raises(sv.StereovoxError, match=r"names a floor's map; end the name of a map in space in \.svox"):
+            sv.map_recording(SOURCE, tmp_path / name, **SETTINGS)
+    with pytest.raises(sv.StereovoxError, match="map_floor"):
+        sv.map_recording(SOURCE, tmp_path / "a.svox", dimensions=2)
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_live_camera_that_delivers_nothing_ends(tmp_path):
     with pytest.raises(sv.StereovoxError, match="not one of 100 frames could be used, no map is written"):
         sv.map_recording(Live(0), tmp_path / "a.svox", voxel_size=0.2)

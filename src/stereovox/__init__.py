@@ -11,13 +11,16 @@ if TYPE_CHECKING:
     from stereovox.config import Config as Config
     from stereovox.config import load_config as load_config
     from stereovox.errors import StereovoxError as StereovoxError
+    from stereovox.floor_run import FloorRun as FloorRun
+    from stereovox.floor_run import map_floor as map_floor
     from stereovox.frame import DepthImage as DepthImage
     from stereovox.frame import Frame as Frame
     from stereovox.frame import Reason as Reason
     from stereovox.frame import Scan as Scan
     from stereovox.frame import StereoFrame as StereoFrame
-    from stereovox.grid_mapper import GridMapper as GridMapper
     from stereovox.health import Health as Health
+    from stereovox.mapper import AnyMapper as AnyMapper
+    from stereovox.mapper import GridMapper as GridMapper
     from stereovox.mapper import Mapper as Mapper
     from stereovox.mapper import UpdateReport as UpdateReport
     from stereovox.maps import State as State
@@ -62,8 +65,9 @@ _HOMES = {
     "SphericalCamera": "wide",
     "CylindricalCamera": "wide",
     "Reason": "frame",
-    "GridMapper": "grid_mapper",
     "Health": "health",
+    "AnyMapper": "mapper",
+    "GridMapper": "mapper",
     "Mapper": "mapper",
     "UpdateReport": "mapper",
     "State": "maps",
@@ -82,6 +86,8 @@ _HOMES = {
     "ground": "products.ground",
     "merge": "products.merge",
     "surface": "products.mesh",
+    "FloorRun": "floor_run",
+    "map_floor": "floor_run",
     "MapResult": "run",
     "MapRun": "run",
     "map_recording": "run",

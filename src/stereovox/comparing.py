@@ -9,7 +9,6 @@ from functools import partial
 from stereovox.config import Config
 from stereovox.frame import AnyFrame, DepthImage
 from stereovox.gate import Gate, Passed
-from stereovox.history import History
 from stereovox.integrate import Integrator
 from stereovox.integrate.per_camera import PerCamera
 from stereovox.integrate.views import sensor_table
@@ -26,22 +25,20 @@ a cell."""
 
 
 class Comparison:
-    """Makes evidence and lets a gate, which knows `history`, decide whether it is to be believed."""
+    """Makes evidence and lets a gate decide whether it is to be believed."""
 
-    def __init__(self, config: Config, history: History):
-        self._gate, self._compares = Gate(config, history), config.trust.max_disagreement < 1
+    def __init__(self, config: Config, gate: Gate):
+        self._gate, self._compares = gate, config.trust.max_disagreement < 1
         self._firm = PerCamera(partial(_firm, make_sensor(config.sensor), config))
         self._prepared = False
 
     def evidence(
-        self, frame: AnyFrame, image: DepthImage, integrator: Integrator, voxel_map: VoxelMap
+        self, frame: AnyFrame, image: DepthImage, passed: Passed, integrator: Integrator, voxel_map: VoxelMap
     ) -> tuple[Evidence, Passed]:
         """Return the evidence of an image, and what the gate is to remember of it.
 
-        Raises FrameRefused as `Gate.check` and `Gate.believe`.
+        passed: what `Gate.check` returned. Raises FrameRefused as `Gate.believe`.
         """
-        with voxel_map.lock:
-            passed = self._gate.check(frame, image)
         evidence = integrator.evidence(image)
         if not self._compares:
             return evidence, passed
@@ -61,10 +58,6 @@ class Comparison:
         if not self._prepared:
             self._prepared = True
             pose_on_surfaces(voxel_map, image)
-
-    def took(self, passed: Passed) -> None:
-        """Remember a frame that the map took in."""
-        self._gate.took(passed)
 
 
 def _fits_elsewhere(image: DepthImage, integrator: Integrator, voxel_map: VoxelMap, firm: int, limit: float) -> bool:

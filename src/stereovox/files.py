@@ -7,12 +7,42 @@ import errno
 import os
 import re
 import uuid
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO
 
 from stereovox.errors import MapFileError, StereovoxError
+
+FLOOR_ENDINGS = (".yaml", ".pgm", ".png")
+"""Files of a floor's map: the picture and its .yaml are written together, whichever is named."""
+FLOOR_READABLE = (*FLOOR_ENDINGS, ".yml")
+"""Those that can be read."""
+
+
+def check_in_space(out: str | Path) -> None:
+    """Raise StereovoxError where a map in space would get the name of a floor's map."""
+    if Path(out).suffix.lower() in FLOOR_READABLE:
+        raise StereovoxError(f"{out}: names a floor's map; end the name of a map in space in .svox, or leave it bare")
+
+
+def check_file(out: str | Path, endings: Iterable[str]) -> Path:
+    """Return `out` as a path; raises StereovoxError before the work where it could not be written after it."""
+    path = Path(out)
+    if path.suffix.lower() not in endings:
+        raise StereovoxError(f"{out}: give a name that ends in {' or '.join(endings)}")
+    if os.path.isdir(out):
+        raise StereovoxError(f"{out}: is a folder; name a file")
+    check_folder(path.absolute().parent, str(out))
+    return path
+
+
+def check_folder(folder: Path, name: str) -> None:
+    """Raise StereovoxError unless files can be made in `folder`, where `name` shall be."""
+    if not folder.is_dir():
+        raise StereovoxError(f"{name}: there is no folder {folder}; make it or choose another")
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise StereovoxError(f"{name}: {folder} cannot be written to; choose another folder")
 
 
 @contextmanager

@@ -17,21 +17,25 @@ from math import inf, isfinite
 from pathlib import Path
 from time import monotonic
 from types import TracebackType
-from typing import Any, Protocol
+from typing import Any, Generic, Protocol, TypeVar
 
 from stereovox import sources
 from stereovox.config import Config
 from stereovox.errors import MapFileError, SourceError, StereovoxError, one_line
 from stereovox.evaluate.summary import summarise
-from stereovox.frame import AnyFrame, Scan
-from stereovox.grid_mapper import GridMapper
+from stereovox.files import check_in_space
 from stereovox.history import LONGEST_NAME
-from stereovox.mapper import Mapper
+from stereovox.localize.track import Track
+from stereovox.mapper import AnyMapper, Mapper
 from stereovox.maps import VoxelMap, load_map
+from stereovox.maps.grid_map import GridMap
 from stereovox.maps.lock import only_writer_in
 from stereovox.maps.store import check_target, is_map, read_manifest, remove_map, sweep
 from stereovox.sources import Stream
 from stereovox.update_report import UpdateReport
+
+SeenT = TypeVar("SeenT")
+MapT = TypeVar("MapT", VoxelMap, GridMap)
 
 CHECKPOINT_S = 10.0
 REST = 25
@@ -49,17 +53,22 @@ class Observer(Protocol):
 
 
 @dataclass(frozen=True)
-class MapResult:
+class MapResult(Generic[MapT]):
     """What a run made.
 
-    map: the map, as saved. out: where. reports: one for each frame of this run, in order. dropped: frames that a live
-    camera delivered and nobody took in time.
+    Attributes:
+        map: The map, as saved.
+        out: Where.
+        reports: One for each frame of this run, in order.
+        dropped: Frames that a live camera delivered and nobody took in time.
+        track: Of a floor's run the robot's way in the map; None where its odometry was believed.
     """
 
-    map: VoxelMap
+    map: MapT
     out: Path
     reports: list[UpdateReport]
     dropped: int = 0
+    track: Track | None = None
 
     def summary(self) -> dict[str, Any]:
         """Return the numbers of `stereovox map --json`: frames, refusals by reason, milliseconds, cells, memory."""
@@ -78,7 +87,7 @@ def map_recording(
     observers: Sequence[Observer] = (),
     tell: Callable[[str], None] = lambda line: None,
     **overrides: Any,
-) -> MapResult:
+) -> MapResult[VoxelMap]:
     """Make the map of a recording, a simulation or a live camera, and save it while it is made.
 
     Args:
@@ -138,9 +147,10 @@ class MapRun:
 
     def __enter__(self) -> MapRun:
         with ExitStack() as stack:
+            check_in_space(self.out)
             check_target(self.out)
             if self._resume and not is_map(self.out):
-                raise StereovoxError(f"{self.out}: no map to go on with; leave --resume out")
+                raise StereovoxError(f"{self.out}: no map to go on with; start it without resume")
             stack.enter_context(only_writer_in(self.out))
             sweep(self.out)
             self.source = self._opened()
@@ -156,7 +166,7 @@ class MapRun:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         self._open.close()
 
-    def finish(self, observers: Sequence[Observer] = ()) -> MapResult:
+    def finish(self, observers: Sequence[Observer] = ()) -> MapResult[VoxelMap]:
         """Add all frames that the map does not hold yet, and save it. Raises as `map_recording`."""
         with interrupt_between_steps() as check, _there_at_once(self.mapper.map, self.out):
             reports = self._add_all(check, observers)
@@ -196,8 +206,8 @@ class MapRun:
         made_of = self.mapper.map.recording
         if made_of and made_of != self.source.name:
             raise StereovoxError(
-                f"{self.out}: was made of '{made_of}', not of '{self.source.name}'; go on with that or leave --resume "
-                "out"
+                f"{self.out}: was made of '{made_of}', not of '{self.source.name}'; go on with that, or start "
+                "anew without resume"
             )
         self.mapper.map.recording = self.source.name
 
@@ -206,8 +216,8 @@ class MapRun:
         if done:
             if length is not None and done > length:
                 raise StereovoxError(
-                    f"{self.out}: holds {done} frames, more than the {length} of {self.source.name}; give the same "
-                    "--frames"
+                    f"{self.out}: holds {done} frames, more than the {length} of {self.source.name}; choose "
+                    "the same frames as before"
                 )
             self._check_last(done)
             if done == length:  # whoever starts a run again after a kill need not know that it was complete
@@ -215,26 +225,26 @@ class MapRun:
                 return []
             self._tell(f"going on after frame {done}")
         watching = (*observers, *([] if length is not None else [_Patience(self, done)]))
-        stopped = "stopped after {} frames; they are saved in " + f"{self.out}, go on with --resume"
+        stopped = "stopped after {} frames; they are saved in " + f"{self.out}, resume goes on there"
         frames = self.source.after(done) if done else self.source
         return add_all(self.mapper, frames, self._checkpoints, check, watching, lambda n: self._tell(stopped.format(n)))
 
     def _check_last(self, done: int) -> None:
-        """Frames are skipped by their number: under another --frames some would be missed, and others counted twice."""
+        """Frames are skipped by their number: under other frames some would be missed, and others counted twice."""
         last = self.mapper.map.history.last_frame
         if self.source.length is None or last is None:  # a live camera; a map from before this was saved
             return
         there = next(iter(self.source.after(done - 1)))
         if (one_line(there.name[:LONGEST_NAME]), there.stamp_ns) != last:
             raise StereovoxError(
-                f"{self.out}: its frame {done} was '{last[0]}', here it is '{there.name}'; give --frames as before, or "
-                "leave --resume out"
+                f"{self.out}: its frame {done} was '{last[0]}', here it is '{there.name}'; choose frames as "
+                "before, or start anew without resume"
             )
 
 
 def add_all(
-    mapper: Mapper | GridMapper,
-    frames: Iterable[AnyFrame | Scan],
+    mapper: AnyMapper[SeenT],
+    frames: Iterable[SeenT],
     checkpoints: Checkpoints,
     check: Callable[[], None],
     observers: Sequence[Observer],
@@ -262,12 +272,12 @@ def add_all(
     return reports
 
 
-def seen_by(mapper: Mapper | GridMapper) -> int:
+def seen_by(mapper: AnyMapper[Any]) -> int:
     """Return how many frames a mapper's map was offered."""
     return mapper.map.frames + mapper.map.frames_refused
 
 
-def _added(mapper: Any, frame: AnyFrame | Scan, checkpoints: Checkpoints) -> UpdateReport:
+def _added(mapper: AnyMapper[SeenT], frame: SeenT, checkpoints: Checkpoints) -> UpdateReport:
     try:
         return mapper.add(frame)
     except MapFileError as error:  # no room for a tile; up to this frame the map is whole in memory
@@ -319,7 +329,7 @@ class Checkpoints:
 
     def __init__(self, save: Callable[[], None], out: object, seconds: float, clock: Callable[[], float] = monotonic):
         if not (isfinite(seconds) and seconds >= 0):
-            raise StereovoxError(f"--checkpoint {seconds:g}: give seconds, or 0 for none")
+            raise StereovoxError(f"a checkpoint every {seconds:g} s cannot be; give seconds, or 0 for none")
         self._save, self._out, self._clock = save, out, clock
         self._seconds = seconds or inf
         self._due = clock() + self._seconds

@@ -14,8 +14,7 @@ import pytest
 from stereovox import run
 from stereovox.cli import main
 from stereovox.errors import MapFileError, StereovoxError
-from stereovox.grid_mapper import GridMapper
-from stereovox.mapper import Mapper
+from stereovox.mapper import GridMapper, Mapper
 from stereovox.maps import VoxelMap, load_map
 from stereovox.maps.lock import only_writer_in, only_writer_of
 from stereovox.run import REST, Checkpoints
@@ -74,7 +73,7 @@ def test_without_seconds_nothing_is_saved_before_the_end():
 @pytest.mark.parametrize("seconds", ["-1", "nan", "inf"])
 def test_seconds_that_cannot_be_are_one_line(tmp_path, capsys, seconds):
     assert mapped(tmp_path / "m", f"--checkpoint={seconds}") == 2
-    assert f"--checkpoint {seconds}: give seconds, or 0" in capsys.readouterr().err
+    assert f"a checkpoint every {seconds} s cannot be; give seconds, or 0" in capsys.readouterr().err
     assert names(tmp_path) == []
 
 
@@ -213,7 +212,7 @@ def test_going_on_with_other_frames_is_refused(tmp_path, capsys):
     before = load_map(tmp_path / "m").blocks()
     assert mapped(tmp_path / "m", "--resume") == 2
     assert "frame 18', here it is" in (said := capsys.readouterr().err)
-    assert "give --frames as before" in said
+    assert "choose frames as before" in said
     for one, other in zip(load_map(tmp_path / "m").blocks(), before, strict=True):
         np.testing.assert_array_equal(one, other)
     assert mapped(tmp_path / "m", "--resume", "--frames", "::2") == 0
@@ -257,7 +256,8 @@ def test_a_second_writer_is_refused_before_any_work(tmp_path, monkeypatch, capsy
 
 @pytest.mark.parametrize("command", ["grid", "slam"])
 def test_a_second_writer_of_a_floor_is_refused_before_any_work(tmp_path, monkeypatch, capsys, command):
-    monkeypatch.setattr(f"stereovox.cli.{command}._mapped", lambda *_: pytest.fail("worked"))
+    monkeypatch.setattr("stereovox.floor_run.open_robot", lambda _: pytest.fail("worked"))
+    monkeypatch.setattr("stereovox.sources.robot.open_robot", lambda _: pytest.fail("worked"))
     refused = []
     with only_writer_of(tmp_path / "floor.yaml"):
         run_in_thread(lambda: refused.append(main([command, "sim:floor", "--out", str(tmp_path / "floor.yaml")])))
@@ -316,7 +316,7 @@ def test_a_run_that_is_told_to_stop_saves_what_there_is(tmp_path, monkeypatch, c
     assert mapped(tmp_path / "m", "--checkpoint", "0") == 128 + stop
     assert signal.getsignal(stop) == before
     assert capsys.readouterr().err.endswith(
-        f"stopped after 13 frames; they are saved in {tmp_path / 'm'}, go on with --resume\nstereovox: stopped\n"
+        f"stopped after 13 frames; they are saved in {tmp_path / 'm'}, resume goes on there\nstereovox: stopped\n"
     )
     assert load_map(tmp_path / "m").frames == 13
 

@@ -159,7 +159,7 @@ def test_map_under_profile_ist2019_is_a_grid(bag, tmp_path, capsys):
         (("slam", "nowhere.bag", "--out", "a.yaml"), "nowhere.bag: no such file"),
         (("slam", DRIVE, "--out", "a.yaml", "--relations", "nope"), "nope"),
         (("slam", DRIVE, "--out", "a.svox"), "give a name that ends in .yaml"),
-        (("grid", DRIVE, "--out", "a.yaml", "--poses", "gps"), "--poses gps: give slam, odometry, or the .yaml"),
+        (("grid", DRIVE, "--out", "a.yaml", "--poses", "gps"), "poses gps: give slam, odometry, or the .yaml"),
         (("grid", DRIVE, "--out", "a.yaml", "--frames", "9999:"), "picks none"),
         (("grid", DRIVE, "--out", "a.yaml", "--set", "grid.thick=1"), "did you mean 'grid.thickness'"),
         (("localize", DRIVE, "nowhere.yaml", "--out", "a.tum"), "nowhere.yaml"),

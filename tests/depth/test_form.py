@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import stereovox as sv
-from stereovox.grid_mapper import GridMapper
+from stereovox.mapper import GridMapper
 from stereovox.rigs import StereoPair
 
 CAMERA = sv.PinholeCamera(8, 6, 8.0, 8.0, 3.5, 2.5, 0.05)

@@ -12,9 +12,9 @@ import pytest
 import stereovox as sv
 from stereovox.errors import StereovoxError
 from stereovox.frame import Reason
-from stereovox.grid_mapper import GridMapper
 from stereovox.integrate import views
 from stereovox.integrate.per_camera import MAX_CAMERAS, PerCamera
+from stereovox.mapper import GridMapper
 from stereovox.maps.blocks import CELLS
 from stereovox.wide import CylindricalCamera, SphericalCamera
 

@@ -9,8 +9,8 @@ import pytest
 import stereovox as sv
 from stereovox.errors import FrameRefused
 from stereovox.frame import DepthImage, Reason
-from stereovox.grid_mapper import GridMapper
 from stereovox.integrate import make_integrator
+from stereovox.mapper import GridMapper
 from stereovox.wide import SphericalCamera
 
 LOOKS_ALONG_X = np.array([[0.0, 0, 1, 0.02], [-1, 0, 0, 0.03], [0, -1, 0, 0.01], [0, 0, 0, 1]])

@@ -10,10 +10,10 @@ from stereovox import geometry, planar
 from stereovox.config import load_config
 from stereovox.errors import FrameRefused
 from stereovox.frame import Scan
-from stereovox.grid_mapper import GridMapper
 from stereovox.integrate.scan_check import sound, trusted
 from stereovox.localize.amcl import Localiser
 from stereovox.localize.slam import Slam
+from stereovox.mapper import GridMapper
 from stereovox.maps.occupancy import OccupancyGrid
 
 MOUNT = planar.lifted([0.2, -0.1, 0.3])

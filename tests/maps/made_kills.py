@@ -11,16 +11,17 @@ import numpy as np
 from made_faults import disk, in_child, small_map
 
 from stereovox import run
-from stereovox.cli import main, ros2, slam
+from stereovox.cli import main, ros2
 from stereovox.config import load_config
 from stereovox.frame import Scan
+from stereovox.localize import robot_way
 from stereovox.localize.slam import SlamResult
 from stereovox.localize.track import Track
 from stereovox.maps import load_map
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.planar import lifted
 from stereovox.products.map_server import read_map_server
-from stereovox.ros.mapping import FloorMapping
+from stereovox.ros.mapping import Mapping
 from stereovox.run import Checkpoints
 from stereovox.sources.trajectory import Trajectory
 
@@ -80,11 +81,11 @@ class FloorBySlam(Floor):
     def write(self, n):
         grid = OccupancyGrid(np.full((2 + n, 3), 100 * (n - 1), np.int8), 0.05, (1.0, 2.0, 0.0))
 
-        def found(robot, config):
+        def found(robot, config, progress):
             stamps_ns = np.array([robot.scans[i].stamp_ns for i in range(n + 2)])
             return SlamResult(Track(stamps_ns, np.full((n + 2, 3), float(n)), np.zeros((n + 2, 3))), grid, [], [], {})
 
-        slam.mapped = found
+        robot_way.slam_robot = found
         done("slam", DRIVE, "--out", self.out)
 
     def seen(self):
@@ -107,7 +108,7 @@ class FloorByNode(Floor):
     def write(self, n):
         with ExitStack() as stack:
             ros2._reserve(str(self.out), 2, stack)
-            mapping = FloorMapping(load_config(dimensions=2, voxel_size=0.1))
+            mapping = Mapping(load_config(dimensions=2, voxel_size=0.1))
             saves = Checkpoints(lambda: mapping.save(str(self.out)), self.out, 1e-9)
             for k in range(2 * n):
                 scan = Scan(
@@ -122,11 +123,9 @@ class SpaceByNode(Merge):
     """What the node does with its disk, for a map in space; its frames are those of two small maps."""
 
     def newer(self):
-        from stereovox.ros.mapping import SpaceMapping
-
         with ExitStack() as stack:
             ros2._reserve(str(self.out), 3, stack)
-            mapping = SpaceMapping(load_config(voxel_size=0.1))
+            mapping = Mapping(load_config(voxel_size=0.1))
             saves = Checkpoints(lambda: mapping.save(str(self.out)), self.out, 1e-9)
             for n, part in enumerate(self.parts, 1):
                 mapping.load(str(part))

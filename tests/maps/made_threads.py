@@ -11,7 +11,7 @@ import numpy as np
 
 import stereovox as sv
 from stereovox import planar
-from stereovox.grid_mapper import GridMapper
+from stereovox.mapper import GridMapper
 from stereovox.maps.grid_store import load_grid
 from stereovox.products.distance import DistanceField
 from stereovox.products.live_projection import LiveProjection

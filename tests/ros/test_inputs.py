@@ -9,8 +9,7 @@ import wire
 from stereovox.cameras import PinholeCamera
 from stereovox.errors import FrameRefused
 from stereovox.frame import Scan
-from stereovox.grid_mapper import GridMapper
-from stereovox.mapper import Mapper
+from stereovox.mapper import GridMapper, Mapper
 from stereovox.ros.inputs import CloudInput, DepthInput, FloorCloudInput, ScanInput
 from stereovox.ros.poses import Pose
 from stereovox.sources.bag_writer_messages import packed_png

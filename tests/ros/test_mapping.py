@@ -9,7 +9,7 @@ from stereovox import VoxelMap
 from stereovox.config import load_config
 from stereovox.errors import StereovoxError
 from stereovox.products.projection import project
-from stereovox.ros.mapping import Mapping, make_mapping
+from stereovox.ros.mapping import Mapping
 
 WINDOW = {"window.size": [2.4, 2.4, 2.4], "window.trigger": 0.3, "window.outside": "keep"}
 
@@ -22,7 +22,7 @@ def check_grid(mapping: Mapping) -> None:
 
 @pytest.mark.parametrize("settings", [{}, WINDOW, {"map.keep_times": True, "map.forget_s": 0.35}])
 def test_the_grid_is_that_of_the_map(tmp_path, settings):
-    mapping = make_mapping(load_config(voxel_size=0.1, **settings), None, None)
+    mapping = Mapping(load_config(voxel_size=0.1, **settings))
     for k in range(5):
         assert mapping.add(depth_at(k)).refused is None
         check_grid(mapping)
@@ -43,7 +43,7 @@ def test_the_grid_is_that_of_the_map(tmp_path, settings):
 
 
 def test_what_cannot_be_saved_is_one_line(tmp_path):
-    mapping = make_mapping(load_config(voxel_size=0.1), None, None)
+    mapping = Mapping(load_config(voxel_size=0.1))
     mapping.add(depth_at(0))
     (tmp_path / "file").touch()
     for name in ("/proc/no/map", str(tmp_path / "file/map"), str(tmp_path / ("x" * 300)), str(tmp_path / "a\0b")):

@@ -25,7 +25,7 @@ from stereovox.errors import StereovoxError  # noqa: E402
 from stereovox.maps import load_map  # noqa: E402
 from stereovox.products.projection import project  # noqa: E402
 from stereovox.ros.library import optional_message  # noqa: E402
-from stereovox.ros.mapping import make_mapping  # noqa: E402
+from stereovox.ros.mapping import Mapping  # noqa: E402
 from stereovox.ros.node import MapNode  # noqa: E402
 from stereovox.ros.options import Options  # noqa: E402
 from stereovox.ros.parameters import freeze  # noqa: E402
@@ -45,7 +45,7 @@ class Robot:
     def __init__(self, out: str):
         self.options = Options(depth=(DEPTH,), wait_s=0.3, cloud_rate=20.0, late_s=60.0, out=out, **BY_TF)
         self.reports = []
-        self.mapping = make_mapping(load_config(voxel_size=0.1), None, None)
+        self.mapping = Mapping(load_config(voxel_size=0.1))
         given = [rclpy.Parameter("voxel_size", value=0.1)]
         node = rclpy.create_node(
             "stereovox", parameter_overrides=given, automatically_declare_parameters_from_overrides=True
@@ -191,7 +191,7 @@ def test_without_tf2_msgs_odometry_and_mounts_do(robot, monkeypatch, capfd):
     monkeypatch.setattr("stereovox.ros.subscriptions.optional_message", lambda *_: None)
     other = rclpy.create_node("no_tf")
     options = Options(depth=(DEPTH,), odometry=("/odom",), fixed=(MOUNT,))
-    mapping, reports = make_mapping(load_config(voxel_size=0.1), None, None), []
+    mapping, reports = Mapping(load_config(voxel_size=0.1)), []
     maker = MapNode(other, mapping, options, str, reports.append)
     odometry = robot.send.get("/odom") or robot.other.create_publisher(Odometry, "/odom", 10)
     robot.maker = maker
@@ -203,7 +203,7 @@ def test_without_tf2_msgs_odometry_and_mounts_do(robot, monkeypatch, capfd):
     robot.until(lambda: reports)
     assert [report.refused for report in reports] == [None]
     assert "/tf is not heard" in capfd.readouterr().err
-    T_world_camera = mapping._mapper.map.viewpoint.T_world_camera
+    T_world_camera = mapping.mapper.map.viewpoint.T_world_camera
     np.testing.assert_allclose(T_world_camera[:3, 3], [0.1, 0, 0.4], atol=1e-6)
     np.testing.assert_allclose(T_world_camera[:3, 2], [1, 0, 0], atol=1e-4)  # it looks ahead
 

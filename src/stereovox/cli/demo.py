@@ -9,7 +9,7 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 from typing import Any
 
-from stereovox.cli.terminal import cells_line, milliseconds, progress_bar, say, say_about_compiling
+from stereovox.cli.terminal import cells_line, milliseconds, progress_of_steps, say, say_about_compiling
 
 EXAMPLE = "stereovox demo --out my-first-map"
 
@@ -25,13 +25,8 @@ def run(arguments: Namespace) -> dict[str, Any]:
     from stereovox.evaluate.demo import demo
 
     say_about_compiling()
-    with progress_bar() as bar:
-        task = bar.add_task("starting", note="")
-        result = demo(
-            arguments.out,
-            voxel_size=arguments.voxel_size,
-            progress=lambda done, total, text: bar.update(task, completed=done, total=total, description=text),
-        )
+    with progress_of_steps("starting") as progress:
+        result = demo(arguments.out, voxel_size=arguments.voxel_size, progress=progress)
     _tell(result)
     return result
 

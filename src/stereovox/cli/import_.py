@@ -12,10 +12,10 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import Any
 
-from stereovox.cli.robots import GRID_ENDINGS
 from stereovox.cli.saved_map import refuse_options
 from stereovox.cli.terminal import say, thousands
 from stereovox.errors import StereovoxError
+from stereovox.files import FLOOR_ENDINGS
 
 EXAMPLE = "stereovox import building.bt building.svox"
 IN_SPACE = (".bt", ".ot", ".npz", ".ply", ".pcd")
@@ -32,7 +32,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Read the file and save the map."""
-    return (_grid if Path(arguments.map).suffix.lower() in GRID_ENDINGS else _cells)(arguments)
+    return (_grid if Path(arguments.map).suffix.lower() in FLOOR_ENDINGS else _cells)(arguments)
 
 
 def _cells(arguments: Namespace) -> dict[str, Any]:

@@ -13,19 +13,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from stereovox.cli.robots import add_robot, check_file, opened, say_refused, settings_of, way_error
-from stereovox.cli.terminal import progress_bar, say, say_about_compiling
+from stereovox.cli.robots import add_robot, opened, settings_of, way_error
+from stereovox.cli.terminal import progress_of_steps, say, say_about_compiling
 from stereovox.errors import StereovoxError
+from stereovox.files import check_file
 
 if TYPE_CHECKING:
-    from stereovox.config import Config
     from stereovox.localize.track import Track
-    from stereovox.maps.occupancy import OccupancyGrid
-    from stereovox.sources.robot import Robot
 
 TEXT, BAGS = (".tum", ".txt"), (".bag", ".mcap", ".db3")
-DOUBTFUL = 0.6
-"""Share of beams that fit the map below which the way may be wrong."""
 EXAMPLE = "stereovox localize floor.bag reference.yaml --out way.tum"
 
 
@@ -49,6 +45,7 @@ def add_start(parser: ArgumentParser) -> None:
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Localise, save the way and tell where it ended."""
+    from stereovox.localize.robot_way import check_start, fit_of, localise_robot, refused_line
     from stereovox.products.map_server import read_map_server
 
     out, config = check_file(arguments.out, (*TEXT, *BAGS)), settings_of(arguments)
@@ -56,11 +53,13 @@ def run(arguments: Namespace) -> dict[str, Any]:
     check_start(start, grid)
     robot = opened(arguments.source)
     say_about_compiling()
-    track = localised(robot, grid, config, start)
+    with progress_of_steps("localising") as progress:
+        track = localise_robot(robot, grid, config, start, progress)
     _save(track, out)
-    say_refused(track.refused, track.first_refusal)
+    fit, fits = fit_of(robot, grid, track)
+    for line in filter(None, (refused_line(track.refused, track.first_refusal), fits)):
+        say(line)
     x, y, yaw = track.pose_map_base[-1]
-    fit = say_fit(robot, grid, track)
     say(f"{len(track.stamps_ns)} poses saved in {out}")
     say(f"the robot ended at x {x:.2f} m, y {y:.2f} m, {np.degrees(yaw):.0f} degrees")
     refused = {"scans_refused": sum(track.refused.values()), "refused": dict(track.refused)}
@@ -94,37 +93,3 @@ def parse_start(text: str | None) -> np.ndarray | None:
     if not np.isfinite([x, y, degrees]).all():
         raise StereovoxError(f"--start {text}: give finite numbers")
     return np.array([x, y, radians(degrees)])
-
-
-def check_start(start: np.ndarray | None, grid: OccupancyGrid) -> None:
-    """Raise StereovoxError for a start outside of the map."""
-    if start is None:
-        return
-    row, column = grid.indices(start[None, :2])[0]
-    rows, columns = grid.cells.shape
-    if not (0 <= row < rows and 0 <= column < columns):
-        (x0, y0), (x1, y1) = grid.centres([0, rows - 1], [0, columns - 1])
-        given = f"--start {start[0]:g},{start[1]:g},{np.degrees(start[2]):g}"
-        raise StereovoxError(f"{given}: lies outside of the map, from ({x0:.1f}, {y0:.1f}) to ({x1:.1f}, {y1:.1f}) m")
-
-
-def say_fit(robot: Robot, grid: OccupancyGrid, track: Track) -> float | None:
-    """Say how well the scans fit the map along the way, and doubt it where they do not; return the share of beams."""
-    from stereovox.localize.fit import NEAR, fit_share
-
-    fit = fit_share(grid, robot.scans, track)
-    if fit is not None:
-        doubt = "; is it the right map, and the right start?" if fit < DOUBTFUL else ""
-        say(f"{100 * fit:.0f} % of the beams end within {NEAR:g} m of an obstacle of the map{doubt}")
-    return fit
-
-
-def localised(robot: Robot, grid: OccupancyGrid, config: Config, start: np.ndarray | None) -> Track:
-    """Return the robot's way through the map, with a progress bar."""
-    from stereovox.localize.amcl import localise
-
-    if not len(robot.scans):
-        raise StereovoxError(f"{robot.name}: holds no lidar scans to localise with; give a bag with a LaserScan topic")
-    with progress_bar() as bar:
-        task = bar.add_task("localising", total=len(robot.scans), note="")
-        return localise(grid, robot.scans, config, start, progress=lambda done: bar.update(task, completed=done))

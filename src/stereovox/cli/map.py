@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 from stereovox.cli.checkpoints import add_checkpoint
 from stereovox.cli.endings import check_ending
 from stereovox.cli.live_page import page_of, rerun_of
-from stereovox.cli.robots import check_in_space
 from stereovox.cli.settings import add_settings, overrides
 from stereovox.cli.terminal import (
     cells_line,
@@ -74,10 +73,8 @@ def run(arguments: Namespace) -> dict[str, Any]:
     """Map the source, save the map and tell what was done."""
     if _of_a_floor(arguments):
         return _grid(arguments)
-    out = Path(arguments.out)
     check_ending("--rerun", arguments.rerun, ".rrd")
-    check_in_space(out)
-    return _mapped(arguments, out)
+    return _mapped(arguments, Path(arguments.out))
 
 
 def _mapped(arguments: Namespace, out: Path) -> dict[str, Any]:
@@ -108,15 +105,15 @@ def _of_a_floor(arguments: Namespace) -> bool:
 
 def _grid(arguments: Namespace) -> dict[str, Any]:
     """Do what `stereovox grid` does; it has more options."""
-    from stereovox.cli import grid
+    from stereovox.cli.grid import mapped
 
     for option in ("camera", "integrator", "threads", "view", "rerun"):
         if getattr(arguments, option) is not None:
             raise StereovoxError(f"--{option}: has no meaning for the map of a floor; leave it out")
-    if arguments.resume and not Path(arguments.out).exists():
-        raise StereovoxError(f"{arguments.out}: no map to go on with; leave --resume out")
-    given = {**vars(arguments), "profile": arguments.profile or "default"}
-    return grid.run(Namespace(**{**grid.defaults(), **given, "resume": arguments.out if arguments.resume else None}))
+    return mapped(
+        arguments.source, arguments.out, profile=arguments.profile, frames=arguments.frames, resume=arguments.resume,
+        checkpoint_s=arguments.checkpoint, **overrides(arguments),
+    )  # fmt: skip
 
 
 def _tell(result: dict[str, Any], reports: list[UpdateReport], out: Path, window: WindowConfig) -> None:

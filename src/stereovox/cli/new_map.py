@@ -7,9 +7,9 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stereovox.cli.robots import check_in_space
 from stereovox.cli.terminal import cells_line, command_line, say
 from stereovox.errors import StereovoxError
+from stereovox.files import check_in_space
 
 if TYPE_CHECKING:
     from stereovox.maps import VoxelMap

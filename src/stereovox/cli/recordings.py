@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 from stereovox.cli.terminal import say, tracked
 from stereovox.errors import StereovoxError
+from stereovox.files import check_folder
 
 if TYPE_CHECKING:
     from stereovox.calibrate.recording import WallRecording
@@ -48,12 +49,12 @@ def check_outputs(out: str, report: str | None = None) -> None:
         raise StereovoxError(f"--out {out}: give a name that ends in .toml")
     if os.path.isdir(out):
         raise StereovoxError(f"--out {out}: is a folder; name a file")
-    check_folder(Path(out).absolute().parent, "--out", out)
+    check_folder(Path(out).absolute().parent, f"--out {out}")
     if report is not None:
         if os.path.exists(report) and not os.path.isdir(report):
             raise StereovoxError(f"--report {report}: is a file; name a folder")
         there = next(path for path in (Path(report).absolute(), *Path(report).absolute().parents) if path.exists())
-        check_folder(there, "--report", report)
+        check_folder(there, f"--report {report}")
 
 
 def read_walls(
@@ -99,11 +100,3 @@ def check_distances(names: Sequence[str], distances: Sequence[float], option: st
     for distance in distances:
         if not 0 < distance < 1000:
             raise StereovoxError(f"{option} {distance:g}: give metres, above 0")
-
-
-def check_folder(folder: Path, option: str, name: str) -> None:
-    """Raise StereovoxError unless files can be made in `folder`, which `option` asks for by `name`."""
-    if not folder.is_dir():
-        raise StereovoxError(f"{option} {name}: there is no folder {folder}; make it or choose another")
-    if not os.access(folder, os.W_OK | os.X_OK):
-        raise StereovoxError(f"{option} {name}: {folder} cannot be written to; choose another folder")

@@ -13,10 +13,10 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stereovox.cli.robots import GRID_ENDINGS, check_file, check_in_space, only_writer_of_floor
 from stereovox.cli.settings import add_settings, overrides
 from stereovox.cli.terminal import milliseconds, say, say_about_compiling
 from stereovox.errors import MapFileError
+from stereovox.files import FLOOR_ENDINGS, check_file, check_in_space
 
 if TYPE_CHECKING:
     from stereovox.config import Config
@@ -66,7 +66,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
     from stereovox.ros.running import running_node
 
     with running_node(arguments.ros_args) as node, ExitStack() as stack:
-        from stereovox.ros.mapping import make_mapping
+        from stereovox.ros.mapping import Mapping
         from stereovox.ros.parameters import freeze
         from stereovox.ros.warm_up import warm_up
 
@@ -76,7 +76,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
         say_about_compiling()
         warm_up(config)
         tiles = Path(options.out).parent / f".{Path(options.out).name}-tiles" if options.out else None
-        mapping = make_mapping(config, options.heights, tiles)
+        mapping = Mapping(config, options.heights, tiles)
         stack.callback(mapping.close)
         if arguments.load:
             mapping.load(arguments.load)
@@ -172,11 +172,11 @@ def _settings(arguments: Namespace, node: Any) -> tuple[Config, Options]:
 
 def _reserve(out: str, dimensions: int, stack: ExitStack) -> None:
     """Find out now, not at the end, that the map could not be saved, and keep others from writing there."""
-    from stereovox.maps.lock import only_writer_in
+    from stereovox.maps.lock import only_writer_in, only_writer_of_floor
     from stereovox.maps.store import check_target, sweep
 
     if out and dimensions == 2:
-        stack.enter_context(only_writer_of_floor(check_file(out, GRID_ENDINGS)))
+        stack.enter_context(only_writer_of_floor(check_file(out, FLOOR_ENDINGS)))
     elif out:
         check_in_space(out)
         check_target(Path(out))

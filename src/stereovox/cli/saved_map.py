@@ -9,9 +9,9 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from stereovox.cli.robots import GRID_FILES
 from stereovox.cli.terminal import command_line
 from stereovox.errors import MapFileError, StereovoxError
+from stereovox.files import FLOOR_READABLE
 
 if TYPE_CHECKING:
     from stereovox.maps import VoxelMap
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 def dimensions(path: str) -> int:
     """Return 2 for the name of a map_server file, and 3 for all else."""
-    return 2 if Path(path).suffix.lower() in GRID_FILES and not os.path.isdir(path) else 3
+    return 2 if Path(path).suffix.lower() in FLOOR_READABLE and not os.path.isdir(path) else 3
 
 
 def refuse_options(arguments: Namespace, names: Iterable[str], why: str) -> None:

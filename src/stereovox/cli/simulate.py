@@ -9,8 +9,9 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 from typing import Any
 
-from stereovox.cli.robots import check_file, opened
+from stereovox.cli.robots import opened
 from stereovox.cli.terminal import command_line, progress_bar, say, size
+from stereovox.files import check_file
 
 EXAMPLE = "stereovox simulate sim:floor --out floor.bag"
 

@@ -7,27 +7,15 @@ Scans are matched, loops closed, and the way and the map made to agree. The way 
 from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
-from importlib.util import find_spec
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
-from stereovox.cli.robots import (
-    GRID_ENDINGS,
-    add_robot,
-    check_file,
-    only_writer_of_floor,
-    opened,
-    picture_line,
-    say_refused,
-    settings_of,
-    way_error,
-)
-from stereovox.cli.terminal import progress_bar, say, say_about_compiling
-from stereovox.errors import MissingExtra, StereovoxError
+from stereovox.cli.robots import add_robot, opened, picture_line, settings_of, way_error
+from stereovox.cli.terminal import progress_of_steps, say, say_about_compiling
+from stereovox.files import FLOOR_ENDINGS, check_file
 
 if TYPE_CHECKING:
-    from stereovox.config import Config
     from stereovox.localize.slam import SlamResult
     from stereovox.sources.robot import Robot
 
@@ -48,13 +36,16 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Map, save map and way, and tell how it went."""
-    out = check_file(arguments.out, GRID_ENDINGS)
+    from stereovox.maps.lock import only_writer_of_floor
+
+    out = check_file(arguments.out, FLOOR_ENDINGS)
     with only_writer_of_floor(out):
         return _mapped(arguments, out)
 
 
 def _mapped(arguments: Namespace, out: Path) -> dict[str, Any]:
     from stereovox.evaluate.relations import read_relations
+    from stereovox.localize.robot_way import slam_robot
     from stereovox.products.map_server import write_map_server
 
     config = settings_of(arguments)
@@ -63,7 +54,8 @@ def _mapped(arguments: Namespace, out: Path) -> dict[str, Any]:
     robot = opened(arguments.source)
     say_about_compiling()
     start = perf_counter()
-    found = mapped(robot, config)
+    with progress_of_steps("matching scans") as progress:
+        found = slam_robot(robot, config, progress)
     seconds = perf_counter() - start
     write_map_server(found.grid, out)
     found.track.save(out.with_suffix(".tum"))
@@ -72,29 +64,15 @@ def _mapped(arguments: Namespace, out: Path) -> dict[str, Any]:
     return result
 
 
-def mapped(robot: Robot, config: Config) -> SlamResult:
-    """Return what SLAM makes of the robot's scans, with a progress bar."""
-    from stereovox.localize.slam import map_scans
-
-    if find_spec("gtsam") is None:
-        raise MissingExtra("gtsam", "slam")  # not after an hour, when the first loop is found
-    if not len(robot.scans):
-        raise StereovoxError(f"{robot.name}: holds no lidar scans to make a map of; give a bag with a LaserScan topic")
-    with progress_bar() as bar:
-        task = bar.add_task("matching scans", note="")
-        return map_scans(
-            robot.scans,
-            config,
-            lambda done, total, text: bar.update(task, completed=done, total=total, description=text),
-        )
-
-
 def _told(robot: Robot, found: SlamResult, seconds: float) -> dict[str, Any]:
+    from stereovox.localize.robot_way import refused_line
+
     track = found.track
     recorded = 1e-9 * float(track.stamps_ns[-1] - track.stamps_ns[0])
     say(f"{len(track.stamps_ns)} scans, {found.closures} loops closed, in {seconds:.1f} s "
         f"({recorded / seconds:.0f} times as fast as recorded)")  # fmt: skip
-    say_refused(found.refused)
+    if found.refused:
+        say(refused_line(found.refused))
     told = {"scans": len(track.stamps_ns), "scans_refused": sum(found.refused.values()), "refused": found.refused}
     times = {"closures": found.closures, "seconds": seconds, "recorded_s": recorded}
     return {**told, **times, **way_error(track, robot)}

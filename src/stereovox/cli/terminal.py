@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import shlex
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -59,6 +59,14 @@ def tracked(items: Iterable[T], total: int | None, text: str) -> Iterator[T]:
         for item in items:
             yield item
             bar.advance()
+
+
+@contextmanager
+def progress_of_steps(text: str) -> Iterator[Callable[[int, int, str], None]]:
+    """Give what draws a progress bar when it is called with steps done, steps in all, and what is being done."""
+    with progress_bar() as bar:
+        task = bar.add_task(text, note="")
+        yield lambda done, total, doing: bar.update(task, completed=done, total=total, description=doing)
 
 
 @contextmanager

@@ -16,7 +16,7 @@ from stereovox.comparing import Comparison
 from stereovox.config import load_config
 from stereovox.errors import FrameRefused
 from stereovox.frame import AnyFrame, DepthImage, Frame, Reason, StereoFrame
-from stereovox.gate import Passed
+from stereovox.gate import Gate, Passed
 from stereovox.geometry import rotation_matrix
 from stereovox.maps import State, VoxelMap, make_map
 from stereovox.maps.blocks import CELLS, SIDE
@@ -57,7 +57,8 @@ class Trial:
     def __init__(self, **settings: Any):
         self.config = load_config(**settings)
         self.way, self.map = full(self.config), make_map(self.config)
-        self._comparison = Comparison(self.config, self.map.history)
+        self._gate = Gate(self.config, self.map.history)
+        self._comparison = Comparison(self.config, self._gate)
 
     def add(self, frame: AnyFrame) -> str:
         """Take a frame into the map; return why it was refused, or ""."""
@@ -68,7 +69,7 @@ class Trial:
         self.map.look_from(image.viewpoint)
         self.map.add(evidence)
         self.map.history.frames += 1
-        self._comparison.took(passed)
+        self._gate.took(passed)
         return ""
 
     def judge(self, bad: AnyFrame, true: AnyFrame) -> Verdict:
@@ -85,7 +86,8 @@ class Trial:
 
     def _offer(self, frame: AnyFrame) -> tuple[DepthImage, Evidence, Passed]:
         image = self._image(frame)
-        return image, *self._comparison.evidence(frame, image, self.way.integrator, self.map)
+        passed = self._gate.check(frame, image)
+        return image, *self._comparison.evidence(frame, image, passed, self.way.integrator, self.map)
 
     def _image(self, frame: AnyFrame) -> DepthImage:
         return self.way.depth.image(self.way.depth.matched(frame))

@@ -16,10 +16,11 @@ from stereovox.evaluate.metrics import by_part, compare_map, find_pieces
 from stereovox.evaluate.out_folder import out_folder
 from stereovox.evaluate.report import write_report
 from stereovox.evaluate.sightings import Sightings
-from stereovox.evaluate.summary import summarise
 from stereovox.evaluate.truth import Truth, exact_occupancy
 from stereovox.frame import Frame
-from stereovox.mapper import Mapper
+from stereovox.maps import VoxelMap
+from stereovox.run import MapResult, MapRun
+from stereovox.sources.base import Stream
 from stereovox.sources.simulation import Simulation
 from stereovox.update_report import UpdateReport
 from stereovox.view.picture import picture
@@ -52,53 +53,72 @@ def demo(
     folder = out_folder(out)
     source = source or Simulation()
     tell = progress or (lambda done, total, text: None)
-    mapper = Mapper(voxel_size=voxel_size)
-    mapper.map.recording = source.name
     truth = exact_occupancy(source.scene, voxel_size)
-    sightings = Sightings(truth.surface, voxel_size)
-    reports = _map(mapper, source, sightings, tell)
+    files = {"map": folder / "room.svox", "picture": folder / "room.png", "report": folder / "report.html"}
+    flight = _Flight(source)
+    with MapRun(flight, files["map"], voxel_size=voxel_size) as run:
+        watch = _Watch(flight, Sightings(truth.surface, voxel_size), run.mapper.config.max_range, tell)
+        made = run.finish([watch])
     mapped = perf_counter()
     tell(len(source), len(source), "checking the map and drawing it")
-    files = {"map": folder / "room.svox", "picture": folder / "room.png", "report": folder / "report.html"}
-    mapper.map.save(files["map"])
-    summary = {**_facts(source, mapper, reports), **_quality(mapper, truth, sightings.frames, min_frames)}
+    summary = {**_facts(source, made), **_quality(made.map, truth, watch.sightings.frames, min_frames)}
     trajectory = [source.pose(i)[:3, 3] for i in range(len(source))]
-    picture(mapper.map, files["picture"], title=f"stereovox demo: {source.name}", trajectory=trajectory)
+    picture(made.map, files["picture"], title=f"stereovox demo: {source.name}", trajectory=trajectory)
     write_report(files["report"], summary, files["picture"])
     end = perf_counter()
     seconds = {"simulate_and_map": mapped - start, "check_and_draw": end - mapped, "total": end - start}
     return {**summary, "files": {name: str(path) for name, path in files.items()}, "seconds": _rounded(seconds)}
 
 
-def _map(mapper: Mapper, source: Simulation, sightings: Sightings, tell: Progress) -> list[UpdateReport]:
-    reports = []
-    for i, (depth, frame) in enumerate(_simulated(source)):
-        reports.append(mapper.add(frame))
-        sightings.add(depth, source.camera, frame.T_world_sensor, mapper.config.max_range)
-        tell(i + 1, len(source), "flying and mapping")
-    return reports
+class _Flight(Stream):
+    """A simulated recording. depth: the exact depth of the last frame that it gave."""
+
+    depth: NDArray[np.float32]
+
+    def __init__(self, source: Simulation):
+        self._source, self.name, self.camera = source, source.name, source.camera
+
+    @property
+    def length(self) -> int:
+        """Number of frames."""
+        return len(self._source)
+
+    def __iter__(self) -> Iterator[Frame]:
+        """Two threads simulate a batch, then rest, so that mapping is timed alone."""
+
+        def simulate(i: int) -> tuple[NDArray[np.float32], Frame]:
+            depth = self._source.true_depth(i)
+            return depth, self._source.observe(i, depth)
+
+        with ThreadPoolExecutor(2) as threads:
+            for start in range(0, self.length, BATCH):
+                for depth, frame in list(threads.map(simulate, range(start, min(start + BATCH, self.length)))):
+                    self.depth = depth
+                    yield frame
 
 
-def _simulated(source: Simulation) -> Iterator[tuple[NDArray[np.float32], Frame]]:
-    """Yield exact depth and frame in order. Two threads simulate a batch, then rest, so that mapping is timed alone."""
+class _Watch:
+    """Notes which cells each frame of a flight saw, and tells of the progress."""
 
-    def simulate(i: int) -> tuple[NDArray[np.float32], Frame]:
-        depth = source.true_depth(i)
-        return depth, source.observe(i, depth)
+    def __init__(self, flight: _Flight, sightings: Sightings, max_range: float, tell: Progress):
+        self.sightings = sightings
+        self._flight, self._max_range, self._tell, self._done = flight, max_range, tell, 0
 
-    with ThreadPoolExecutor(2) as threads:
-        for start in range(0, len(source), BATCH):
-            yield from list(threads.map(simulate, range(start, min(start + BATCH, len(source)))))
+    def after(self, frame: Frame, report: UpdateReport) -> None:
+        """Note a frame that was offered to the map."""
+        self.sightings.add(self._flight.depth, self._flight.camera, frame.T_world_sensor, self._max_range)
+        self._done += 1
+        self._tell(self._done, self._flight.length, "flying and mapping")
 
 
-def _facts(source: Simulation, mapper: Mapper, reports: list[UpdateReport]) -> dict[str, Any]:
+def _facts(source: Simulation, made: MapResult[VoxelMap]) -> dict[str, Any]:
     camera = source.camera
     return {
         "source": source.name,
         "camera": f"RealSense D435 ({camera.width}x{camera.height})",
-        "voxel_size": mapper.map.voxel_size,
-        "settings": mapper.config.model_dump(mode="json"),
-        **summarise(mapper.map, reports),
+        "voxel_size": made.map.voxel_size,
+        "settings": made.map.config.model_dump(mode="json"),
+        **made.summary(),
     }
 
 
@@ -106,10 +126,10 @@ def _rounded(numbers: dict[str, float]) -> dict[str, float]:
     return {name: round(float(number), 3) for name, number in numbers.items()}
 
 
-def _quality(mapper: Mapper, truth: Truth, frames_seen: NDArray[np.int32], min_frames: int) -> dict[str, Any]:
-    pieces = find_pieces(mapper.map, truth, frames_seen, min_frames)
+def _quality(voxel_map: VoxelMap, truth: Truth, frames_seen: NDArray[np.int32], min_frames: int) -> dict[str, Any]:
+    pieces = find_pieces(voxel_map, truth, frames_seen, min_frames)
     return {
-        "accuracy": compare_map(mapper.map, truth),
+        "accuracy": compare_map(voxel_map, truth),
         "min_frames": min_frames,
         "parts": by_part(pieces),
         "missing": [piece.name for piece in pieces if piece.missing],

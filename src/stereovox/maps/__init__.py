@@ -22,7 +22,7 @@ def make_map(config: Config, resume: VoxelMap | None = None, tiles: Path | None 
     """
     if config.dimensions == 2:
         raise ConfigError(
-            f"profile {config.profile}: dimensions 2 is a floor's grid; use GridMapper or `stereovox grid`"
+            f"profile {config.profile}: dimensions 2 is a floor's grid; use GridMapper, map_floor or `stereovox grid`"
         )
     if resume is not None:
         resume.check_cells(config)  # before anything lies on the disk

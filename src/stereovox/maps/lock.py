@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 
 from stereovox.errors import MapFileError
-from stereovox.files import sweep_unfinished, sync_folder
+from stereovox.files import FLOOR_ENDINGS, sweep_unfinished, sync_folder
 
 LOCK = ".lock"
 """The file in a folder that tells of its writer."""
@@ -47,6 +47,13 @@ def only_writer_of(file: Path, *others: Path) -> Iterator[None]:
     with _held(file, file.with_name(f".{file.name}{LOCK}"), again=True):
         sweep_unfinished(file, *others)
         yield
+
+
+def only_writer_of_floor(out: Path) -> AbstractContextManager[None]:
+    """Be the only one who writes a floor's map, its pictures and its way, whichever of them `out` names."""
+    yaml, *pictures, way = (out.with_suffix(ending) for ending in (*FLOOR_ENDINGS, ".tum"))
+    between = [picture.with_name(f".{picture.name}") for picture in pictures]
+    return only_writer_of(yaml, *pictures, *between, way)
 
 
 @contextmanager

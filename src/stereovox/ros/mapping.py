@@ -1,180 +1,112 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The map that a node makes, in space or of a floor: what of them the node needs, under the same names."""
+"""The map that a node makes: its mapper, which another one replaces when a map is loaded or reset."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Protocol
+from typing import Any
 
 from stereovox.config import Config, load_config
-from stereovox.errors import MapFileError
 from stereovox.frame import Frame, Scan
-from stereovox.grid_mapper import GridMapper
 from stereovox.health import Health
 from stereovox.history import History
-from stereovox.mapper import Mapper
+from stereovox.mapper import AnyMapper, GridMapper, Mapper
 from stereovox.maps import VoxelMap, load_map
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.maps.voxel_map import EVERYWHERE
 from stereovox.products.floor_axes import Heights
 from stereovox.products.live_projection import LiveProjection
-from stereovox.products.map_server import read_map_server, write_map_server
+from stereovox.products.map_server import read_map_server
 from stereovox.update_report import UpdateReport
 
 
-class Mapping(Protocol):
-    """A map in the making. config: its settings."""
+class Mapping:
+    """A map in space or of a floor, as the settings say, seen from above.
 
-    config: Config
+    heights: between which obstacles mark the 2-D map of one in space. tiles: folder for cells that leave a window.
 
-    @property
-    def history(self) -> History:
-        """What the map remembers of its frames."""
-        ...
+    Attributes:
+        mapper: Makes the map; after `load` and `reset` another one.
+    """
 
-    def add(self, seen: Frame | Scan) -> UpdateReport:
-        """Take in a frame or scan."""
-        ...
-
-    def health(self) -> Health:
-        """Return how current the map is."""
-        ...
-
-    def grid(self) -> OccupancyGrid | None:
-        """Return the map from above; None where nothing is known."""
-        ...
-
-    def snapshot(self) -> Callable[[], VoxelMap] | None:
-        """Return what makes a copy of the map as it is now, in whatever thread; None for what is not in space."""
-        ...
-
-    def save(self, path: str) -> None:
-        """Save the map, all or nothing; raises MapFileError."""
-        ...
-
-    def load(self, path: str) -> None:
-        """Go on with a saved map; raises StereovoxError, and changes nothing, where that cannot be."""
-        ...
-
-    def reset(self) -> None:
-        """Begin anew with an empty map."""
-        ...
-
-    def close(self) -> None:
-        """Give back what the map holds on disk."""
-        ...
-
-
-class SpaceMapping(Mapping):
-    """A voxel map. heights: between which obstacles mark its 2-D map. tiles: folder for cells that leave a window."""
+    mapper: AnyMapper[Any]  # the node offers it only what its options allow
 
     def __init__(self, config: Config, heights: Heights | None = None, tiles: Path | None = None):
         self._heights, self._tiles = heights, tiles
-        self.config = config
-        self._begin(None)
+        self._begin(config)
+
+    @property
+    def config(self) -> Config:
+        """The settings of the map."""
+        return self.mapper.config
 
     @property
     def history(self) -> History:
         """What the map remembers of its frames."""
-        return self._mapper.map.history
+        return self.mapper.map.history
 
     def add(self, seen: Frame | Scan) -> UpdateReport:
-        """Take in a frame."""
-        assert isinstance(seen, Frame)
-        return self._mapper.add(seen)
+        """Take in a frame or scan."""
+        return self.mapper.add(seen)
 
     def health(self) -> Health:
         """Return how current the map is."""
-        return self._mapper.health()
+        return self.mapper.health()
 
     def grid(self) -> OccupancyGrid | None:
-        """Return the map from above."""
-        return self._above.grid()
+        """Return the map from above; None where nothing is known."""
+        return self._above()
 
-    def snapshot(self) -> Callable[[], VoxelMap]:
-        """Return what makes a copy of the cells in memory."""
-        coords, cells = self._mapper.map.blocks_within(*EVERYWHERE)
+    def snapshot(self) -> Callable[[], VoxelMap] | None:
+        """Return what makes a copy of the cells in memory, in whatever thread; None for what is not in space."""
+        voxel_map = self.mapper.map
+        if not isinstance(voxel_map, VoxelMap):
+            return None
+        coords, cells = voxel_map.blocks_within(*EVERYWHERE)
 
         def copy() -> VoxelMap:
-            voxel_map = VoxelMap(self.config)
-            voxel_map.insert(coords, cells)
-            return voxel_map
+            copied = VoxelMap(voxel_map.config)
+            copied.insert(coords, cells)
+            return copied
 
         return copy
 
     def save(self, path: str) -> None:
-        """Save the map to a folder."""
-        self._mapper.map.save(path)
+        """Save the map, all or nothing; raises MapFileError."""
+        self.mapper.save(path)
 
     def load(self, path: str) -> None:
-        """Go on with a map in a folder."""
-        self._begin(load_map(path))
-
-    def reset(self) -> None:
-        """Begin anew."""
-        self._begin(None)
-
-    def close(self) -> None:
-        """Remove tiles on disk."""
-        self._mapper.map.close()
-
-    def _begin(self, saved: VoxelMap | None) -> None:
-        if saved is not None:
+        """Go on with a saved map; raises StereovoxError, and changes nothing, where that cannot be."""
+        if self.config.dimensions == 2:
+            floor = read_map_server(path)
+            self._begin_floor(load_config(self.config, voxel_size=floor.resolution), floor)
+        else:
+            saved = load_map(path)
             saved.check_cells(self.config)  # before the map in use is given up
-        if hasattr(self, "_mapper"):
             self.close()
-        self._mapper = Mapper(self.config, resume=saved, tiles=self._tiles)
-        self._above = LiveProjection(self._mapper.map, self._heights)
-
-
-class FloorMapping(Mapping):
-    """The grid of a floor."""
-
-    def __init__(self, config: Config):
-        self.config = config
-        self._mapper = GridMapper(config)
-
-    @property
-    def history(self) -> History:
-        """What the map remembers of its scans."""
-        return self._mapper.map.history
-
-    def add(self, seen: Frame | Scan) -> UpdateReport:
-        """Take in a scan or depth image."""
-        return self._mapper.add(seen)
-
-    def health(self) -> Health:
-        """Return how current the map is."""
-        return self._mapper.health()
-
-    def grid(self) -> OccupancyGrid | None:
-        """Return the map."""
-        return self._mapper.occupancy() if self._mapper.map.frames else None
-
-    def snapshot(self) -> None:
-        """Return None: there is nothing in space."""
-
-    def save(self, path: str) -> None:
-        """Save the map as map_server's two files."""
-        if not self._mapper.map.frames:
-            raise MapFileError(f"{path}: nothing is mapped so far; save it later")
-        write_map_server(self._mapper.occupancy(), path)
-
-    def load(self, path: str) -> None:
-        """Go on with map_server's files."""
-        before = read_map_server(path)
-        self._mapper = GridMapper(load_config(self.config, voxel_size=before.resolution), resume=before)
-        self.config = self._mapper.config
+            self._begin_space(self.config, saved)
 
     def reset(self) -> None:
-        """Begin anew."""
-        self._mapper = GridMapper(self.config)
+        """Begin anew with an empty map."""
+        self.close()
+        self._begin(self.config)
 
     def close(self) -> None:
-        """Nothing lies on disk."""
+        """Give back what the map holds on disk."""
+        self.mapper.close()
+
+    def _begin(self, config: Config) -> None:
+        (self._begin_floor if config.dimensions == 2 else self._begin_space)(config)
+
+    def _begin_space(self, config: Config, saved: VoxelMap | None = None) -> None:
+        mapper = Mapper(config, resume=saved, tiles=self._tiles)
+        self.mapper, self._above = mapper, LiveProjection(mapper.map, self._heights).grid
+
+    def _begin_floor(self, config: Config, saved: OccupancyGrid | None = None) -> None:
+        mapper = GridMapper(config, resume=saved)
+        self.mapper, self._above = mapper, lambda: _unless_empty(mapper.occupancy())
 
 
-def make_mapping(config: Config, heights: Heights | None, tiles: Path | None) -> Mapping:
-    """Return the map that the settings ask for, of two or three dimensions."""
-    return FloorMapping(config) if config.dimensions == 2 else SpaceMapping(config, heights, tiles)
+def _unless_empty(grid: OccupancyGrid) -> OccupancyGrid | None:
+    return grid if grid.cells.size else None

@@ -8,13 +8,13 @@ import numpy as np
 from stereovox.cameras import PinholeCamera
 from stereovox.config import Config, load_config
 from stereovox.frame import Frame
-from stereovox.ros.mapping import make_mapping
+from stereovox.ros.mapping import Mapping
 from stereovox.sources.tracker import AXES
 
 
 def warm_up(config: Config) -> None:
     """Load or compile all kernels that depth images need under these settings; the map is thrown away."""
-    mapping = make_mapping(load_config(config, **{"window.outside": "drop"}), None, None)
+    mapping = Mapping(load_config(config, **{"window.outside": "drop"}))
     camera = PinholeCamera.from_field_of_view(64, 48, 60.0)
     T_world_camera = np.eye(4)
     T_world_camera[:3, :3] = AXES["ros"].T

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from stereovox.config import Config, load_config
 from stereovox.evaluate.summary import percentiles
 from stereovox.frame import Scan
-from stereovox.grid_mapper import GridMapper
+from stereovox.mapper import GridMapper
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.maps.voxel_map import State
 

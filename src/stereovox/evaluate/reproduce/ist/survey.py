@@ -18,10 +18,10 @@ from stereovox.evaluate.grid_scores import GridScores, laid_on, score_laid
 from stereovox.evaluate.reproduce.ist.drives import Recording
 from stereovox.evaluate.reproduce.ist.variants import Made, Makes, Variant, make
 from stereovox.evaluate.trajectory_error import TrajectoryError, trajectory_error
-from stereovox.grid_mapper import GridMapper
 from stereovox.localize.amcl import localise
 from stereovox.localize.slam import SlamResult, map_scans
 from stereovox.localize.track import Track
+from stereovox.mapper import GridMapper
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.products.map_server import read_map_server, write_map_server
 from stereovox.sources.robot import Robot

@@ -12,9 +12,8 @@ from stereovox.config import Config, load_config
 from stereovox.evaluate.reproduce.ist.drives import Recording
 from stereovox.evaluate.summary import summarise
 from stereovox.frame import Frame
-from stereovox.grid_mapper import GridMapper
 from stereovox.localize.track import Track
-from stereovox.mapper import Mapper
+from stereovox.mapper import GridMapper, Mapper
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.products.projection import project
 from stereovox.update_report import UpdateReport

@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where a ground robot was along its recording: found by SLAM, or by localising it in a map."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from importlib.util import find_spec
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.config import Config
+from stereovox.errors import MissingExtra, StereovoxError
+from stereovox.localize.amcl import localise
+from stereovox.localize.fit import NEAR, fit_share
+from stereovox.localize.slam import SlamResult, map_scans
+from stereovox.localize.track import Track
+from stereovox.maps.occupancy import OccupancyGrid
+from stereovox.sources.robot import Robot
+
+Progress = Callable[[int, int, str], object]
+"""Called with scans done, scans in all, and what is being done."""
+DOUBTFUL = 0.6
+"""Share of beams that fit the map below which the way may be wrong."""
+
+
+def no_progress(done: int, total: int, text: str) -> None:
+    """Tell nobody."""
+
+
+def slam_robot(robot: Robot, config: Config, progress: Progress = no_progress) -> SlamResult:
+    """Return the way and the map that SLAM makes of the robot's scans.
+
+    Raises MissingExtra without gtsam, StereovoxError where there are no scans, and as `map_scans`.
+    """
+    if find_spec("gtsam") is None:
+        raise MissingExtra("gtsam", "slam")  # not after an hour, when the first loop is found
+    if not len(robot.scans):
+        raise StereovoxError(f"{robot.name}: holds no lidar scans to make a map of; give a bag with a LaserScan topic")
+    return map_scans(robot.scans, config, progress)
+
+
+def localise_robot(
+    robot: Robot,
+    floor: OccupancyGrid,
+    config: Config,
+    start: NDArray[np.floating] | None,
+    progress: Progress = no_progress,
+) -> Track:
+    """Return the robot's way through a map; `start`: x, y, yaw in metres and radians, None: anywhere.
+
+    Raises StereovoxError where there are no scans, and as `localise`.
+    """
+    total = len(robot.scans)
+    if not total:
+        raise StereovoxError(f"{robot.name}: holds no lidar scans to localise with; give a bag with a LaserScan topic")
+    return localise(floor, robot.scans, config, start, progress=lambda done: progress(done, total, "localising"))
+
+
+def check_start(start: NDArray[np.floating] | None, floor: OccupancyGrid) -> None:
+    """Raise StereovoxError for a start (x, y, yaw in radians) that is no three numbers or outside of the map."""
+    if start is None:
+        return
+    if start.shape != (3,) or not np.isfinite(start).all():
+        raise StereovoxError(f"start {start.tolist()}: give x, y in metres and the yaw, three finite numbers")
+    row, column = floor.indices(start[None, :2])[0]
+    rows, columns = floor.cells.shape
+    if not (0 <= row < rows and 0 <= column < columns):
+        (x0, y0), (x1, y1) = floor.centres([0, rows - 1], [0, columns - 1])
+        given = f"start {start[0]:g}, {start[1]:g} m, {np.degrees(start[2]):g} degrees"
+        raise StereovoxError(f"{given}: lies outside of the map, from ({x0:.1f}, {y0:.1f}) to ({x1:.1f}, {y1:.1f}) m")
+
+
+def refused_line(refused: Mapping[str, int], first: str = "") -> str:
+    """Return one line about the scans that could not be used, by reason; "" where all could."""
+    if not refused:
+        return ""
+    reasons = ", ".join(f"{number} x {reason}" for reason, number in refused.items())
+    return f"{sum(refused.values())} scans refused: {reasons}" + (f", first: {first}" if first else "")
+
+
+def fit_of(robot: Robot, floor: OccupancyGrid, track: Track) -> tuple[float | None, str]:
+    """Return the share of beams that fit the map along the way, and a line that says so, and doubts it where few do.
+
+    None and "" where no beam met anything.
+    """
+    fit = fit_share(floor, robot.scans, track)
+    if fit is None:
+        return None, ""
+    doubt = "; is it the right map, and the right start?" if fit < DOUBTFUL else ""
+    return fit, f"{100 * fit:.0f} % of the beams end within {NEAR:g} m of an obstacle of the map{doubt}"

@@ -17,7 +17,7 @@ from stereovox.errors import MapFileError
 from stereovox.mapper import GridMapper
 from stereovox.maps.grid_store import load_grid
 from stereovox.products.map_server import read_map_server
-from stereovox.sources.robot import open_robot
+from stereovox.sources import open_robot
 
 DRIVE = "sim:floor?plan=testbed&seconds=4&scan_hz=4&depth_hz=2&image_width=64"
 LIDAR = {"use": "lidar", "poses": "odometry"}

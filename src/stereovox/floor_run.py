@@ -38,8 +38,8 @@ from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.products.map_server import read_map_server
 from stereovox.products.map_yaml import MODES
 from stereovox.run import CHECKPOINT_S, Checkpoints, MapResult, Observer, add_all, interrupt_between_steps
-from stereovox.sources import parse_slice
-from stereovox.sources.robot import Robot, in_time_order, open_robot
+from stereovox.sources import open_robot, parse_slice
+from stereovox.sources.robot import Robot, in_time_order
 
 SLAM, ODOMETRY = "slam", "odometry"
 

@@ -2,8 +2,8 @@
 """The kinds of files that hold recorded ROS messages: `.bag` (ROS 1), `.db3` and `.mcap` (ROS 2), and rosbag2 folders.
 
 All give any message of any topic by its number. Whatever is wrong with a file ends in one line, and nothing is
-allocated because a damaged file says so: reads are bounded by the size of the file, unpacking by `MAX_BYTES`. That is why they
-are read by hand: in the usual readers a hostile file sizes the buffers.
+allocated because a damaged file says so: reads are bounded by the size of the file, unpacking by `MAX_BYTES`.
+By hand, because in the usual readers a hostile file sizes the buffers.
 """
 
 from __future__ import annotations

@@ -73,7 +73,7 @@ HOMES = {
     "std_msgs": r"ros/.*",
     "std_srvs": r"ros/.*",
     "tf2_msgs": r"ros/.*",
-    "trimesh": r"sources/.*",
+    "trimesh": r"(products|sources)/.*",
     "typer": r"cli/.*",
     "viser": r"view/.*",
     "zarr": r"maps/.*",

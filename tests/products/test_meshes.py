@@ -11,9 +11,9 @@ from stereovox.config import load_config
 from stereovox.errors import MapFileError, StereovoxError
 from stereovox.maps import VoxelMap
 from stereovox.products import export
-from stereovox.products.cube_faces import cube_faces
 from stereovox.products.floor_axes import upright_axes
 from stereovox.products.mesh import surface
+from stereovox.products.meshes import cube_faces
 
 SURFACES = (".obj", ".stl")
 
@@ -35,20 +35,56 @@ def faces_of(cells):
     return found
 
 
-def buffers(path):
-    """Places and colours of the vertices in a .glb (trimesh leaves colours out where there is a material)."""
+class Glb:
+    """A .glb by the words of its standard, not by the library that wrote it."""
+
+    def __init__(self, path):
+        content = path.read_bytes()
+        assert (content[:8], int.from_bytes(content[8:12], "little")) == (b"glTF\2\0\0\0", len(content))
+        size = int.from_bytes(content[12:16], "little")
+        self.scene, self.body = json.loads(content[20 : 20 + size]), content[28 + size :]
+        (self.primitive,) = self.scene["meshes"][0]["primitives"]
+        self.vertices = self.values(self.primitive["attributes"]["POSITION"], "<f4", 3)
+        self.colours = self.values(self.primitive["attributes"]["COLOR_0"], np.uint8, 4)
+        self.faces = self.values(self.primitive["indices"], "<u4", 1).reshape(-1, 3)
+
+    def values(self, number, kind, columns):
+        accessor = self.scene["accessors"][number]
+        view = self.scene["bufferViews"][accessor["bufferView"]]
+        return np.frombuffer(self.body[view["byteOffset"] :][: view["byteLength"]], kind).reshape(-1, columns)
+
+    @property
+    def triangles(self):
+        """In the frame of the file: y up."""
+        (node,) = [node for node in self.scene["nodes"] if "mesh" in node]
+        turn = np.reshape(node["matrix"], (4, 4)).T
+        assert (turn[3] == [0, 0, 0, 1]).all()
+        return (self.vertices @ turn[:3, :3].T + turn[:3, 3])[self.faces]
+
+
+def surface_triangles(path):
+    """Read .obj or .stl by the words of their descriptions."""
+    if path.suffix == ".obj":
+        lines = [line.split() for line in path.read_text().splitlines() if line]
+        assert {line[0] for line in lines} == {"#", "v", "f"}
+        vertices = np.array([line[1:] for line in lines if line[0] == "v"], float)
+        return vertices[np.array([line[1:] for line in lines if line[0] == "f"], int) - 1]
     content = path.read_bytes()
-    size = int.from_bytes(content[12:16], "little")
-    scene, body = json.loads(content[20 : 20 + size]), content[28 + size :]
-    views = [body[view["byteOffset"] :][: view["byteLength"]] for view in scene["bufferViews"]]
-    return np.frombuffer(views[0], "<f4").reshape(-1, 3), np.frombuffer(views[1], np.uint8).reshape(-1, 4)
+    faces = np.frombuffer(content[84:], [("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("colour", "<u2")])
+    assert len(faces) == int.from_bytes(content[80:84], "little")
+    a, b, c = np.moveaxis(faces["corners"], 1, 0)
+    across = np.cross(b - a, c - a)
+    np.testing.assert_allclose(faces["normal"], across / np.linalg.norm(across, axis=1, keepdims=True), atol=1e-4)
+    return faces["corners"]
 
 
 @pytest.mark.parametrize("up", ["z", "-y", "x"])
 def test_another_program_sees_the_cells(tmp_path, up):
     cells = np.unique(np.random.default_rng(3).integers(-4, 4, (90, 3)), axis=0)
     export(map_of(cells, up=up), tmp_path / "map.glb")
+    file = Glb(tmp_path / "map.glb")
     mesh = trimesh.load(tmp_path / "map.glb", force="scene").to_mesh()
+    np.testing.assert_array_equal(mesh.triangles, file.triangles)
     x, y, z = upright_axes(up)
     turn = np.stack([x, z, -y])  # y is up there
     axis = np.eye(3)["xyz".index(up[-1])]
@@ -66,10 +102,13 @@ def test_another_program_sees_the_cells(tmp_path, up):
 def test_another_program_sees_the_surface(tmp_path, ending):
     made = map_of([[0, 0, 0], [1, 0, 0], [5, -3, 2]])
     export(made, tmp_path / f"map{ending}")
-    mesh, expected = trimesh.load(tmp_path / f"map{ending}"), surface(made)
+    path, expected = tmp_path / f"map{ending}", surface(made)
+    assert b"metres" in path.read_bytes()[:80]
+    mesh = trimesh.load(path)
     triangles = expected.vertices[expected.faces]
     order = [np.lexsort(part.reshape(-1, 9).round(4).T) for part in (mesh.triangles, triangles)]
     np.testing.assert_allclose(mesh.triangles[order[0]], triangles[order[1]], atol=1e-5)
+    np.testing.assert_allclose(surface_triangles(path), triangles, atol=1e-6)
     assert mesh.is_watertight
     assert mesh.volume > 0  # it faces outward
     assert len(mesh.split()) == 2
@@ -79,11 +118,16 @@ def test_equal_corners_are_one_vertex_and_height_is_colour(tmp_path):
     made = map_of([[0, 0, 0], [0, 0, 1]])
     assert len(cube_faces(made).vertices) == 12
     export(made, tmp_path / "map.glb")
-    vertices, colours = buffers(tmp_path / "map.glb")
+    file = Glb(tmp_path / "map.glb")
+    vertices, colours = file.vertices, file.colours
     low, high = vertices[:, 2] == 0, vertices[:, 2] == 1
     assert low.sum() == high.sum() == 4
     assert (colours[low][:, 2] > colours[low][:, 0]).all()  # from blue
     assert (colours[high][:, 0] > colours[high][:, 2]).all()  # to red
+    (matt,) = file.scene["materials"]  # metal, which is the standard's default, is black without surroundings to mirror
+    assert matt["pbrMetallicRoughness"] == {"metallicFactor": 0, "roughnessFactor": 1}
+    assert matt["doubleSided"]
+    assert file.primitive["material"] == 0
 
 
 @pytest.mark.parametrize("ending", [".glb", *SURFACES])

@@ -3,6 +3,10 @@
 
 Rotation after Park & Martin 1994 (rotation vectors of A are those of B, turned by X); translation by linear least
 squares of (R_A - I) t_X = R_X t_B - t_A (Tsai & Lenz 1989).
+
+Not cv2.calibrateHandEye: OpenCV 5 has none, and that of version 4 wants poses, not motions, and knows no outliers
+(`benchmarks/hand_eye.py`: errors of 0.1 deg and 3 mm here, of 0.4 deg and 13 mm or more there; with 5 % of the motions
+wrong 0.1 deg and 3 mm here, 3 deg and 9 cm there).
 """
 
 from __future__ import annotations

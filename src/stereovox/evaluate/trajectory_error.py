@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far an estimated way of a ground robot is from the true one: ATE and RPE on a floor (Sturm et al. 2012)."""
+"""How far an estimated way of a ground robot is from the true one: ATE and RPE on a floor (Sturm et al. 2012).
+
+By hand, because evo is GPL-3 and this is Apache-2.0.
+"""
 
 from __future__ import annotations
 

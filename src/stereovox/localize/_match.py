@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Kernels that lay a scan onto a map of lines: a search over a window, then Gauss-Newton.
 
+By hand, because libraries match clouds of points in 3-D (small_gicp); a floor's scans need lines and three unknowns.
 Poses are float64 here, sums too: a normal matrix of three unknowns loses half of its digits when it is solved.
 """
 

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Adaptive Monte Carlo localisation: where a robot is in a known map (Fox 2003; Thrun, Burgard and Fox 2005, ch. 8)."""
+"""Adaptive Monte Carlo localisation: where a robot is in a known map (Fox 2003; Thrun, Burgard and Fox 2005, ch. 8).
+
+By hand, because nav2's AMCL is a node of ROS 2, not a library.
+"""
 
 from __future__ import annotations
 

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernel that unpacks LZF, in which PCL packs its point clouds (format: LibLZF 3.6, lzf_d.c)."""
+"""Kernel that unpacks LZF, in which PCL packs its point clouds (format: LibLZF 3.6, lzf_d.c).
+
+By hand, because no dependency unpacks LZF, and this one cannot write past the size it was given.
+"""
 
 from stereovox._jit import kernel
 

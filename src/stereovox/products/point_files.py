@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Read the points of `.ply` and `.pcd` files, of ours and of other programs (formats: Turk 1994; PCL's PCD 0.7)."""
+"""Read the points of `.ply` and `.pcd` files, of ours and of other programs (formats: Turk 1994; PCL's PCD 0.7).
+
+By hand, because trimesh reads no PCD and no dependency unpacks its LZF.
+"""
 
 from __future__ import annotations
 

@@ -3,6 +3,7 @@
 
 All give any message of any topic by its number. Whatever is wrong with a file ends in one line, and nothing is
 allocated because a damaged file says so: reads are bounded by the size of the file, unpacking by `MAX_BYTES`.
+By hand, because in the usual readers a hostile file sizes the buffers.
 """
 
 from __future__ import annotations

@@ -149,6 +149,8 @@ SIMULATED: dict[str, Callable[[], Cells]] = {
     "floor lidar": partial(floor, FLOOR, "scans", 1, 40),
     "floor depth": partial(floor, FLOOR, "frames", 1, 20, profile="ist2019"),
 }
+MATCHED = {"drive", "pairs"}
+"""Stereo pairs, which OpenCV matches: not the same in each version of it (4.14 and 5.0: 15 % of the cells of `pairs`)."""
 MAPS = {**{name: make for name, (_, make) in RECORDED.items()}, **SIMULATED}
 
 
@@ -176,7 +178,10 @@ def problem(now: Digest, before: Digest, exact: bool) -> str | None:
 
 def check(name: str) -> None:
     written = json.loads(TABLE.read_text())
-    found = problem(Digest.of(MAPS[name]()), Digest(**written["maps"][name]), toolchain() == written["toolchain"])
+    here, there = toolchain(), written["toolchain"]
+    if name in MATCHED and here["cv2"] != there["cv2"]:
+        pytest.skip(f"pairs were matched by OpenCV {there['cv2']}, here it is {here['cv2']}")
+    found = problem(Digest.of(MAPS[name]()), Digest(**written["maps"][name]), here == there)
     assert found is None, f"{name}: {found}; if that is meant: python tests/{Path(__file__).name}"
 
 

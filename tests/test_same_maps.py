@@ -150,7 +150,7 @@ SIMULATED: dict[str, Callable[[], Cells]] = {
     "floor depth": partial(floor, FLOOR, "frames", 1, 20, profile="ist2019"),
 }
 MATCHED = {"drive", "pairs"}
-"""Stereo pairs, which OpenCV matches: not the same in each version of it (4.14 and 5.0: 15 % of the cells of `pairs`)."""
+"""Stereo pairs, which OpenCV matches, not alike in each version: with 4.14 15 % of the cells of `pairs` were others."""
 MAPS = {**{name: make for name, (_, make) in RECORDED.items()}, **SIMULATED}
 
 

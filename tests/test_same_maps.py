@@ -32,10 +32,7 @@ import numba
 import numpy as np
 import pytest
 
-from stereovox.grid_mapper import GridMapper
-from stereovox.mapper import Mapper
-from stereovox.maps import load_map
-from stereovox.sources import open_source
+import stereovox as sv
 from stereovox.sources.robot import open_robot
 
 TABLE = Path(__file__).with_name("same_maps.json")
@@ -113,19 +110,19 @@ def cells_of(grown: Any) -> Cells:
 def mapped(source: str | Path, frames: str, **settings: Any) -> Cells:
     """Return the cells of a map of `frames`; of one with a window what was saved."""
     with TemporaryDirectory() as folder:
-        mapper = Mapper(**settings, tiles=Path(folder) / "tiles" if "window.outside" in settings else None)
-        for frame in open_source(source, frames):
+        mapper = sv.Mapper(**settings, tiles=Path(folder) / "tiles" if "window.outside" in settings else None)
+        for frame in sv.open_source(source, frames):
             mapper.add(frame)
         if "window.size" not in settings:
             return cells_of(mapper.map)
         mapper.map.save(Path(folder) / "map")
         mapper.map.close()
-        return cells_of(load_map(Path(folder) / "map"))
+        return cells_of(sv.load_map(Path(folder) / "map"))
 
 
 def floor(robot: str | Path, what: str, step: int, most: int, **settings: Any) -> Cells:
     """Return the cells of a floor by the robot's `scans` or `frames`, along its odometry."""
-    mapper = GridMapper(**settings)
+    mapper = sv.GridMapper(**settings)
     for seen in islice(getattr(open_robot(robot), what), 0, most * step, step):
         mapper.add(seen)
     return cells_of(mapper.map)

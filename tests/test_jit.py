@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The kernels' decorator and where it keeps machine code."""
 
+import importlib
 import json
 import os
 import re
@@ -8,12 +9,15 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import tomllib
+from operator import attrgetter
 from pathlib import Path
 
 import numba
 import numpy as np
 import pytest
 from llvmlite.binding import get_host_cpu_features as host_features
+from packaging.requirements import Requirement
 
 import stereovox as sv
 from stereovox import _jit
@@ -184,6 +188,67 @@ def test_a_division_by_zero_in_a_kernel_is_no_error():
 
 def assembly(kernel):
     return "\n".join(kernel.inspect_asm().values())
+
+
+PRIVATE = {
+    "numba.core.config": ("CACHE_DIR",),
+    "numba.core.compiler": ("CompilerBase.define_pipelines", "DefaultPassBuilder.define_nopython_pipeline"),
+    "numba.core.compiler_machinery": ("register_pass", "PassManager.finalize"),
+    "numba.core.lowering": ("Lower.setup_function",),
+    "numba.core.typed_passes": ("NativeLowering.lowering_class",),
+    "numba.core.compiler:Flags": ("noalias", "nrt", "forceinline", "no_cpython_wrapper", "no_cfunc_wrapper"),
+}
+"""What `_jit.py` takes from inside of numba, which may change in any version of it."""
+
+
+def missing_names(private):
+    """Those of `private` that this numba does not have, in full."""
+    for place, names in private.items():
+        module, _, holder = place.partition(":")
+        found = importlib.import_module(module)
+        for name in names:
+            try:
+                attrgetter(f"{holder}.{name}" if holder else name)(found)
+            except AttributeError:
+                yield f"{place}.{name}".replace(":", ".")
+
+
+def test_this_numba_has_all_that_is_private_in_it_and_taken():
+    missing = [*missing_names(PRIVATE)]
+    assert not missing, (
+        f"numba {numba.__version__} has no {', '.join(missing)} any more; change _jit.py, "
+        "or pin numba in pyproject.toml to the last version that has it"
+    )
+
+
+def test_a_name_that_is_gone_is_named():
+    gone = {"numba.core.lowering": ("Lower.lower", "Lower.prepare"), "numba.core.compiler:Flags": ("no_such_flag",)}
+    assert [*missing_names(gone)] == ["numba.core.lowering.Lower.prepare", "numba.core.compiler.Flags.no_such_flag"]
+
+
+def test_promises_and_wide_vectors_reach_the_compiler(monkeypatch):
+    """A numba that goes another way through its pipeline could leave them out without a word; code would be slower."""
+    monkeypatch.setattr(_jit, "cache_folder", lambda: None)
+
+    @_jit.kernel
+    def double(numbers, out):
+        for i in range(numbers.size):
+            out[i] = numbers[i] + numbers[i]
+
+    double(np.ones(4, np.float32), np.zeros(4, np.float32))
+    [code] = double.inspect_llvm().values()
+    lost = f"with numba {numba.__version__} _jit.py has lost"
+    assert re.search(r"\bnoalias\b[^,]*%arg\.out\.4", code), (
+        f"{lost} the promise that arrays do not overlap (flags.noalias)"
+    )
+    assert '"prefer-vector-width"="512"' in code, f"{lost} the width of vectors (Lower.setup_function, NativeLowering)"
+
+
+def test_the_numba_installed_is_one_that_was_tried():
+    project = tomllib.loads((PACKAGE.parents[1] / "pyproject.toml").read_text())["project"]
+    [pin] = [Requirement(line) for line in project["dependencies"] if line.startswith("numba")]
+    assert numba.__version__ in pin.specifier
+    assert "999" not in pin.specifier, "any numba to come is allowed, though _jit.py rests on its inside"
 
 
 def needs(*features):

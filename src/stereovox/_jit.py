@@ -22,6 +22,10 @@ from numba.core.compiler_machinery import register_pass
 from numba.core.lowering import Lower
 from numba.core.typed_passes import NativeLowering
 
+# Two things that make kernels fast cannot be had through numba's public options: the promise that arrays do not
+# overlap, and vectors of 512 bits. Both need its private pipeline (numba.core), which any version may change without a
+# word. So pyproject.toml allows just the versions this was tried with; tests/test_jit.py names what a new one breaks.
+
 FAST_MATH = {"nsz", "arcp", "contract", "afn", "reassoc"}
 """Without `nnan` and `ninf`: depth images hold NaN and infinity."""
 

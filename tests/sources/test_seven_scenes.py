@@ -73,6 +73,7 @@ def test_without_intrinsics_other_sizes_cannot_be_opened(tmp_path):
         ("frame-000001.depth.png", lambda p: write_png(p, depth_image(0, (8, 8))), "bad_shape"),
         ("frame-000001.pose.txt", lambda p: p.unlink(), "no_pose"),
         ("frame-000001.pose.txt", lambda p: p.write_text("1 0 0"), "bad_pose_file"),
+        ("frame-000001.pose.txt", lambda p: p.write_text("1 " * 17), "bad_pose_file"),
         ("frame-000001.pose.txt", lambda p: p.write_text("one " * 16), "bad_pose_file"),
         ("frame-000001.pose.txt", lambda p: p.write_bytes(b"\xff\xfe\x00"), "bad_pose_file"),
     ],

@@ -1,0 +1,178 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The house from outside: modules, lines, folders, and where imports go in circles or upwards.
+
+    python benchmarks/house.py [ROOT] [--json]
+
+ROOT: the folder of a checkout; without it this one. Imports count wherever they stand in a file, also those by name in
+a registry (`"stereovox.x:Name"`); those for type checkers alone (`if TYPE_CHECKING`) are counted apart. The package's
+own `__init__.py` is left out of circles: it hands names out when they are asked for.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import importlib.util
+import json
+import re
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+HERE = Path(__file__).resolve().parents[1]
+NAMED = re.compile(r"(stereovox(?:\.\w+)+):\w+")
+PACKAGE = "stereovox"
+SMALL = 60
+"""Lines below which a module that one other imports is a fragment."""
+
+Graph = Mapping[str, set[str]]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("root", nargs="?", type=Path, default=HERE)
+    parser.add_argument("--json", action="store_true")
+    arguments = parser.parse_args()
+    found = house(arguments.root)
+    print(json.dumps(found) if arguments.json else "\n".join(f"{name:34} {_shown(found[name])}" for name in found))
+
+
+def house(root: Path) -> dict[str, Any]:
+    """Return the figures of the checkout at `root`."""
+    modules = modules_of(root / "src" / PACKAGE)
+    lines = {name: path.read_text().count("\n") for name, path in modules.items()}
+    real, typed = import_graphs(modules)
+    together = {name: real[name] | typed[name] for name in modules}
+    users = Counter(other for name in modules if name != PACKAGE for other in together[name])
+    alone = [name for name, count in users.items() if count == 1]
+    flat = Counter(str(path.parent.relative_to(root / "src")) for path in modules.values())
+    rooms = Counter()
+    for name, path in modules.items():
+        rooms[path.relative_to(root / "src" / PACKAGE).parts[0].removesuffix(".py")] += lines[name]
+    (folder, files), (room, most) = flat.most_common(1)[0], rooms.most_common(1)[0]
+    circles, typed_circles = (circles_of(graph) for graph in (real, together))
+    return {
+        "modules": len(modules),
+        "lines": sum(lines.values()),
+        "lines of code": sum(code_lines(path.read_text()) for path in modules.values()),
+        "folders": len(flat),
+        "loose modules at the root": flat[PACKAGE],
+        "biggest folder, files in it": f"{folder}: {files}",
+        "biggest room, share of the lines": f"{room}: {most / sum(lines.values()):.1%}",
+        "circles": circles,
+        "circles with TYPE_CHECKING": typed_circles,
+        "circles between rooms": circles_of(between_rooms(real)),
+        "imports upwards": upwards(root),
+        "modules with one importer": len(alone),
+        f"of these under {SMALL} lines": sum(lines[name] < SMALL for name in alone),
+    }
+
+
+def modules_of(package: Path) -> dict[str, Path]:
+    """Return all modules by their full names."""
+    named = {
+        ".".join([PACKAGE, *path.relative_to(package).with_suffix("").parts]): path for path in package.rglob("*.py")
+    }
+    return {name.removesuffix(".__init__"): named[name] for name in sorted(named)}
+
+
+def import_graphs(modules: Mapping[str, Path]) -> tuple[dict[str, set[str]], dict[str, set[str]]]:
+    """Return what each module imports of the others: when it runs, and for type checkers alone."""
+    real, typed = ({name: set() for name in modules} for _ in range(2))
+    for name, path in modules.items():
+        tree = ast.parse(path.read_text())
+        for_types = {id(inner) for node in ast.walk(tree) if _is_for_types(node) for inner in ast.walk(node)}
+        for node in ast.walk(tree):
+            for other in _imported(node, name if path.name == "__init__.py" else name.rpartition(".")[0], modules):
+                if other != name:
+                    (typed if id(node) in for_types else real)[name].add(other)
+    return real, typed
+
+
+def _is_for_types(node: ast.AST) -> bool:
+    return isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test)
+
+
+def _imported(node: ast.AST, package: str, modules: Mapping[str, Path]) -> Iterator[str]:
+    """Yield the modules that one node imports, but for the package's own `__init__.py`."""
+    names: list[str] = []
+    if isinstance(node, ast.Import):
+        names = [name.name for name in node.names]
+    elif isinstance(node, ast.ImportFrom):
+        base = package.split(".")[: len(package.split(".")) + 1 - node.level] if node.level else []
+        origin = ".".join([*base, *filter(None, [node.module])])
+        inner = [f"{origin}.{name.name}" for name in node.names]
+        names = [name if name in modules else origin for name in inner]
+    elif isinstance(node, ast.Constant) and (text := NAMED.fullmatch(str(node.value))):
+        names = [text[1]]
+    yield from (name for name in names if name in modules and name != PACKAGE)
+
+
+def circles_of(graph: Graph) -> list[list[str]]:
+    """Return the strongly connected components of more than one node (Tarjan 1972, here by reachability)."""
+    nodes = [name for name in graph if name != PACKAGE]
+    reached = {name: _reached(name, graph) for name in nodes}
+    found, done = [], set()
+    for name in nodes:
+        if name in reached[name] and name not in done:
+            circle = sorted(other for other in reached[name] if name in reached.get(other, ()))
+            done.update(circle)
+            found.append([other.removeprefix(f"{PACKAGE}.") for other in circle])
+    return found
+
+
+def _reached(start: str, graph: Graph) -> set[str]:
+    found, ahead = set[str](), [start]
+    while ahead:
+        for other in graph[ahead.pop()] - found:
+            found.add(other)
+            ahead.append(other)
+    return found
+
+
+def between_rooms(graph: Graph) -> dict[str, set[str]]:
+    """Return what rooms, which are folders and loose modules at the root, import of each other."""
+    rooms = defaultdict[str, set[str]](set)
+    for name, others in graph.items():
+        if name != PACKAGE:
+            rooms[_room(name)] |= {_room(other) for other in others} - {_room(name)}
+    return {room: rooms[room] for room in sorted({*rooms, *(other for others in rooms.values() for other in others)})}
+
+
+def _room(name: str) -> str:
+    return name.split(".")[1]
+
+
+def upwards(root: Path) -> list[str]:
+    """Return the imports that break the layers of `tests/test_architecture.py`, one line each."""
+    spec = importlib.util.spec_from_file_location("architecture", root / "tests/test_architecture.py")
+    assert spec is not None
+    assert spec.loader is not None
+    rules = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(rules)
+    return [line for line in rules.broken_rules(root / "src" / PACKAGE) if "must not import" in line]
+
+
+def code_lines(text: str) -> int:
+    """Return the number of lines that are neither empty, comment nor docstring."""
+    texts = set[int]()
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
+            texts.update(range(node.lineno, (node.end_lineno or node.lineno) + 1))
+    bare = (line.strip() for number, line in enumerate(text.splitlines(), 1) if number not in texts)
+    return sum(bool(line) and not line.startswith("#") for line in bare)
+
+
+def _shown(value: Any) -> str:
+    if not isinstance(value, list):
+        return str(value)
+    return "\n".join([str(len(value)), *("    " + _row(row) for row in value)])
+
+
+def _row(row: str | Iterable[str]) -> str:
+    return row if isinstance(row, str) else " ".join(row)
+
+
+if __name__ == "__main__":
+    main()

@@ -20,14 +20,14 @@ from time import thread_time
 
 import numpy as np
 
-from stereovox import planar
+from stereovox import se2
 from stereovox.config import Config, load_config
 from stereovox.frame import Scan
-from stereovox.localize.amcl import Localiser
+from stereovox.localize.amcl.localise import Localiser
 from stereovox.maps.occupancy import OccupancyGrid
-from stereovox.sources.floor import Floor
-from stereovox.sources.floor_plan import FloorPlan, block
-from stereovox.sources.floor_rays import cast
+from stereovox.simulate.floors.floor import Floor
+from stereovox.simulate.floors.plan import FloorPlan, block
+from stereovox.simulate.floors.view import cast
 
 REACH, WAY, STEP, TURN = 5.6, 40.0, 0.1, 0.25
 ANGLES = np.radians(np.arange(-120, 120.1, 1.44))
@@ -81,7 +81,7 @@ def drive(start: tuple[float, int], length: float, rng: np.random.Generator) -> 
             way, towards = np.hypot(b[0] - a[0], b[1] - a[1]), np.arctan2(b[1] - a[1], b[0] - a[0])
             if way < 1e-6:
                 continue
-            turn = float(planar.wrapped(towards - heading))
+            turn = float(se2.wrapped(towards - heading))
             poses += [(*a, heading + turn * share) for share in np.linspace(0, 1, int(abs(turn) / TURN) + 2)[:-1]]
             shares = np.linspace(0, 1, int(way / STEP) + 1)[:, None]
             poses += [(*place, towards) for place in np.asarray(a) + shares * np.subtract(b, a)]
@@ -99,28 +99,28 @@ def way_of(poses: np.ndarray) -> np.ndarray:
 def odometry(poses: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Return what an odometer makes of true poses: scales off by 2 % (way) and 3 % (turn), noise, drift."""
     wheel, gyro, drift = rng.normal(0, (0.02, 0.03, np.radians(0.3)))
-    steps = planar.relative(poses[:-1], poses[1:])
+    steps = se2.relative(poses[:-1], poses[1:])
     way = np.hypot(steps[:, 0], steps[:, 1])[:, None]
     noise = rng.standard_normal(steps.shape) * np.hypot([0.01, 0.01, 0.015] * np.sqrt(way), 0.03 * np.abs(steps))
     steps = steps * [1 + wheel, 1 + wheel, 1 + gyro] + noise
     steps[:, 2:] += drift * way
     found = [np.array([3.0, -2.0, 1.0])]
     for step in steps:
-        found.append(planar.compose(found[-1], step))
+        found.append(se2.compose(found[-1], step))
     return np.array(found)
 
 
 def scan(walls: np.ndarray, pose: np.ndarray, odom: np.ndarray, stamp_ns: int, rng: np.random.Generator) -> Scan:
     """Return what the lidar sees from a true pose, and where the odometer says that it was."""
-    x, y, yaw = planar.compose(pose, MOUNT)
+    x, y, yaw = se2.compose(pose, MOUNT)
     ranges = cast(walls, (x, y), ANGLES + yaw, REACH)
     ranges = ranges + rng.normal(0, 0.01, len(ranges))
     blocked = rng.random(len(ranges)) < 0.05
     ranges[blocked] *= rng.uniform(0.2, 1, blocked.sum())
     ranges[rng.random(len(ranges)) < 0.02] = np.nan
-    T = planar.lifted(MOUNT)
+    T = se2.lifted(MOUNT)
     step = ANGLES[1] - ANGLES[0]
-    return Scan(ranges.astype(np.float32), ANGLES[0], step, 0.02, REACH, planar.lifted(odom) @ T, T, stamp_ns=stamp_ns)
+    return Scan(ranges.astype(np.float32), ANGLES[0], step, 0.02, REACH, se2.lifted(odom) @ T, T, stamp_ns=stamp_ns)
 
 
 def run(seed: int, plan: FloorPlan, grid: OccupancyGrid, config: Config, kidnap: bool) -> dict:
@@ -134,7 +134,7 @@ def run(seed: int, plan: FloorPlan, grid: OccupancyGrid, config: Config, kidnap:
         half = int(np.searchsorted(way_of(poses), WAY / 2))
         elsewhere = drive(OFFICES[rng.integers(len(OFFICES))], WAY, rng)
         poses = np.concatenate([poses[:half], elsewhere])
-        odom = np.concatenate([odom[:half], planar.compose(odom[half], planar.relative(elsewhere[0], elsewhere))])
+        odom = np.concatenate([odom[:half], se2.compose(odom[half], se2.relative(elsewhere[0], elsewhere))])
     localiser = Localiser(grid, config, poses[0] if kidnap else None, seed)
     scans = [scan(walls, pose, at, n * 10**8, rng) for n, (pose, at) in enumerate(zip(poses, odom, strict=True))]
     return followed(localiser, scans, poses, len(poses) - half if kidnap else None)
@@ -157,7 +157,7 @@ def on_floor(runs: int, config: Config) -> None:
     """Localise on the simulated floor after IST 2019: from its start, and from anywhere on its way on."""
     floor = Floor("sim:floor?plan=corridors")
     scans = list(floor.scans[::2])
-    poses = np.array([planar.flattened(floor.truth.at(scan.stamp_ns)) for scan in scans])
+    poses = np.array([se2.flattened(floor.truth.at(scan.stamp_ns)) for scan in scans])
     grid = floor.true_grid(0.05)
     report("from its start", [followed(Localiser(grid, config, poses[0]), scans, poses, len(poses))])
     first = [int(len(scans) * 0.7 * n / runs) for n in range(runs)]

@@ -15,8 +15,8 @@ import argparse
 import json
 
 import stereovox as sv
-from stereovox.cli.settings import add_settings, overrides
-from stereovox.evaluate.bad_images import trial
+from stereovox.cli.options import add_settings, overrides
+from stereovox.lab.checks.bad_images import trial
 
 
 def main() -> None:

@@ -24,10 +24,10 @@ from stereovox.calibrate import stereo
 from stereovox.calibrate.chessboard import Board
 from stereovox.calibrate.stereo import BoardPair, calibrate_stereo, epipolar_errors
 from stereovox.calibrate.stereo_fit import GUESSES, MANY, Corners, Fit, fit_stereo
+from stereovox.cameras.lenses import Lens
+from stereovox.cameras.rigs import Eyes
 from stereovox.errors import StereovoxError
-from stereovox.geometry import Transform, inverse, rotation_matrix, rotation_vector, transform_points
-from stereovox.lenses import Lens
-from stereovox.rigs import Eyes
+from stereovox.se3 import Transform, inverse, rotation_matrix, rotation_vector, transform_points
 
 BOARD = Board(9, 6, 0.03)
 SIZE = (640, 480)

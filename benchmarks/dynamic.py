@@ -18,8 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from stereovox.evaluate.ghosts import Ghosts, ghosts
-from stereovox.sources.passing import BACKGROUNDS, HZ, MISSES, Passing
+from stereovox.lab.checks.ghosts import Ghosts, ghosts
+from stereovox.simulate.passer_by import BACKGROUNDS, HZ, MISSES, Passing
 
 MODELS: dict[str, dict[str, Any]] = {
     "default": {},
@@ -79,7 +79,7 @@ def shown(value: float | None) -> str:
 
 def draw(found: dict[str, dict[str, Ghosts]], path: Path) -> None:
     """Draw how many ghosts there are against time, one chart for each background."""
-    from stereovox.view.charts import blank, labels, png_of
+    from stereovox.view.figures import blank, labels, png_of
 
     figure = blank(7, 6)
     charts = figure.subplots(len(found), 1, sharex=True)

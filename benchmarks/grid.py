@@ -17,10 +17,10 @@ from time import perf_counter
 
 import numpy as np
 
-from stereovox import Scan, planar
+from stereovox import Scan, se2
+from stereovox.formats.map_server import read_map_server, write_map_server
 from stereovox.mapper import GridMapper
 from stereovox.maps.occupancy import OccupancyGrid
-from stereovox.products.map_server import read_map_server, write_map_server
 
 BEAMS = 700
 SCENES = {
@@ -54,7 +54,7 @@ def update_ms(
     rng, fov, times = np.random.default_rng(0), np.radians(fov_deg), []
     for i in range(repeats + 5):
         ranges = (distance + rng.uniform(-0.05, 0.05, BEAMS)).astype(np.float32)
-        pose = planar.lifted([0.011 * i, 0.007 * i, 0.05 * i])
+        pose = se2.lifted([0.011 * i, 0.007 * i, 0.05 * i])
         report = mapper.add(Scan(ranges, -fov / 2, fov / BEAMS, 0.05, 2 * max_range, pose))
         assert report.refused is None, report.detail
         times.append(report.depth_ms + report.integrate_ms)

@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox.calibrate.hand_eye import hand_eye
-from stereovox.geometry import inverse, rotation_matrix, rotation_vector
+from stereovox.calibrate.pair import hand_eye
+from stereovox.se3 import inverse, rotation_matrix, rotation_vector
 
 METHODS = ("TSAI", "PARK", "HORAUD", "ANDREFF", "DANIILIDIS")
 IMAGES = 60

@@ -33,7 +33,7 @@ from stereovox import run
 from stereovox.cli import main
 from stereovox.mapper import Mapper
 from stereovox.maps import load_map, make_map
-from stereovox.sources import open_stream
+from stereovox.opening import open_stream
 
 CONTEXT = get_context("fork")
 PLAIN: list[str] = []

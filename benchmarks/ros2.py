@@ -34,9 +34,9 @@ from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from tf2_msgs.msg import TFMessage
 
 import stereovox as sv
-from stereovox.geometry import rotation_vector
-from stereovox.ros.messages import header
-from stereovox.sources.bag_messages import Wire
+from stereovox.ros.outputs import header
+from stereovox.se3 import rotation_vector
+from stereovox.sources.bags.messages import Wire
 
 KEPT = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 SENSOR = QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT)

@@ -10,13 +10,13 @@ import time
 import numpy as np
 
 from stereovox.config import load_config, parse_value
-from stereovox.evaluate.relations import score_relations
-from stereovox.localize.line_map import cloud_of
-from stereovox.localize.slam import Slam, SlamResult, map_scans
-from stereovox.localize.slam_closure import ClosureSearch
+from stereovox.evaluate.trajectory import score_relations
+from stereovox.formats.map_server import write_map_server
+from stereovox.localize.slam.line_map import cloud_of
+from stereovox.localize.slam.loops import ClosureSearch
+from stereovox.localize.slam.pipeline import Slam, SlamResult, map_scans
 from stereovox.localize.track import Track
-from stereovox.products.map_server import write_map_server
-from stereovox.sources import open_robot
+from stereovox.opening import open_robot
 
 
 def main() -> None:

@@ -24,12 +24,12 @@ import numpy as np
 import psutil
 
 import stereovox as sv
-from stereovox.cameras import PinholeCamera
+from stereovox.cameras.lenses import Lens
+from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.config import parse_value
 from stereovox.frame import AnyFrame
-from stereovox.lenses import Lens
-from stereovox.sources.rendering import photograph
-from stereovox.sources.simulation import Simulation
+from stereovox.simulate.rendering import photograph
+from stereovox.simulate.simulation import Simulation
 
 HZ = 30
 MINUTE = 60 * HZ
@@ -178,7 +178,7 @@ def say(text: str) -> None:
 
 def draw(found: dict, path: Path) -> None:
     """Draw memory and the slowest hundredth of the frames against the minutes of flight."""
-    from stereovox.view.charts import blank, labels, png_of
+    from stereovox.view.figures import blank, labels, png_of
 
     minutes = found["minutes"]
     at = [minute["minute"] for minute in minutes]

@@ -13,11 +13,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from stereovox.cameras import PinholeCamera
+from stereovox.cameras.pinhole import PinholeCamera
+from stereovox.cameras.rigs import StereoPair
 from stereovox.config import load_config, parse_value
-from stereovox.depth.stereo import StereoDepth
+from stereovox.depth.stereo.pipeline import StereoDepth
 from stereovox.frame import Reason, StereoFrame
-from stereovox.rigs import StereoPair
 
 SHARES = (1.0, 0.9, 0.75, 0.5, 0.25)
 

@@ -12,12 +12,12 @@ import numpy as np
 from stereovox.config import Config, load_config, parse_value
 from stereovox.depth import prepare
 from stereovox.depth.sphere import SphereGrid, accumulate, stitch
-from stereovox.depth.stereo import StereoDepth
-from stereovox.evaluate.surround import nearest_surfaces, range_sigma, seen_cells, sphere_score
+from stereovox.depth.stereo.pipeline import StereoDepth
 from stereovox.frame import Frame, Reason
-from stereovox.geometry import inverse
+from stereovox.lab.checks.surround import nearest_surfaces, range_sigma, seen_cells, sphere_score
+from stereovox.se3 import inverse
 from stereovox.sensors.noise import SUBPIXEL
-from stereovox.sources.surround import Surround
+from stereovox.simulate.surround import Surround
 
 STATISTICS = {"minimum": {"sphere.statistic": "minimum"}, "mean - 3 std": {}, "mean - 2 std": {"sphere.spread": 2.0}}
 

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox import Frame, Mapper, PinholeCamera
-from stereovox.cli.settings import add_settings, overrides
+from stereovox.cli.options import add_settings, overrides
 from stereovox.frame import Reason
 
 HZ = 30
@@ -342,7 +342,7 @@ def sweep() -> dict[str, tuple[Scene, float, dict[str, Any]]]:
 
 def draw(rows: dict[str, dict[str, dict[str, float]]], path: Path) -> None:
     """Draw lost and free shares of both libraries, a line a case."""
-    from stereovox.view.charts import blank, labels, png_of
+    from stereovox.view.figures import blank, labels, png_of
 
     figure = blank(9, 1.5 + 0.28 * len(rows))
     charts = figure.subplots(1, 2, sharey=True)

@@ -4,7 +4,7 @@
 import numpy as np
 
 import stereovox as sv
-from stereovox.products.map_server import write_map_server
+from stereovox.formats.map_server import write_map_server
 from stereovox.products.projection import project
 
 mapper = sv.GridMapper(voxel_size=0.05)

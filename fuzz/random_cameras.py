@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 import stereovox as sv
-from stereovox.cameras import CORRECTIONS, DepthCorrection
+from stereovox.cameras.lenses import Lens
+from stereovox.cameras.pinhole import CORRECTIONS, DepthCorrection
+from stereovox.cameras.rigs import Eyes, StereoPair, VirtualCamera
+from stereovox.cameras.wide import CylindricalCamera, SphericalCamera
 from stereovox.errors import StereovoxError
-from stereovox.lenses import Lens
-from stereovox.rigs import Eyes, StereoPair, VirtualCamera
-from stereovox.wide import CylindricalCamera, SphericalCamera
 
 BASELINES = (None, None, 0.05, 1e-6, 50.0)
 ODD_SIZES = (1, 1, 2, 3, 7, 16, 40, 97, 400)

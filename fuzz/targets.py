@@ -31,29 +31,27 @@ from numcodecs import Zstd
 from mutate import with_right_sums
 from stereovox.config import load_config
 from stereovox.errors import StereovoxError
-from stereovox.evaluate.camera_path import read_camera_path
-from stereovox.evaluate.relations import read_relations
+from stereovox.evaluate.inputs import read_camera_path
+from stereovox.evaluate.trajectory import read_relations
+from stereovox.formats import export, read_octomap
+from stereovox.formats.bags import read_bag_grid, read_bag_map
+from stereovox.formats.map_server import read_map_server, write_map_server
+from stereovox.formats.read_points import read_npz, read_point_map
 from stereovox.maps import VoxelMap, load_map
-from stereovox.maps.grid_map import GridMap
-from stereovox.maps.grid_store import load_grid
+from stereovox.maps.grid_map import GridMap, load_grid
 from stereovox.maps.occupancy import OccupancyGrid
-from stereovox.products import export, read_octomap
-from stereovox.products.bag_maps import read_bag_grid, read_bag_map
-from stereovox.products.map_server import read_map_server, write_map_server
-from stereovox.products.npz_read import read_npz
-from stereovox.products.point_files import read_point_map
-from stereovox.sources import images, open_source
+from stereovox.opening import open_source
+from stereovox.sources import images
 from stereovox.sources.calibration_files import import_rig
-from stereovox.sources.camera_file import read_camera
-from stereovox.sources.carmen import CarmenLog
-from stereovox.sources.intrinsics import find_camera
-from stereovox.sources.kitti_calibration import read_calibration, read_raw_calibration
-from stereovox.sources.kitti_labels import read_labels
-from stereovox.sources.kitti_poses import read_oxts_file, read_pose_file
+from stereovox.sources.camera_file import find_camera, read_camera
+from stereovox.sources.kitti.calibration import read_calibration, read_raw_calibration
+from stereovox.sources.kitti.poses import read_oxts_file, read_pose_file
+from stereovox.sources.kitti.tracking import read_labels
 from stereovox.sources.lidar import read_velodyne
 from stereovox.sources.pair_file import PairSettings, pair_text, read_pair
 from stereovox.sources.rig_file import read_rig
-from stereovox.sources.robot_bag import RobotBag
+from stereovox.sources.robots.bag import RobotBag
+from stereovox.sources.robots.carmen import CarmenLog
 from stereovox.sources.tracker import read_tracker
 
 MOST_FRAMES = 20

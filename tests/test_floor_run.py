@@ -14,10 +14,10 @@ import stereovox as sv
 from stereovox import floor_run, run
 from stereovox.cli import main as command
 from stereovox.errors import MapFileError
+from stereovox.formats.map_server import read_map_server
 from stereovox.mapper import GridMapper
-from stereovox.maps.grid_store import load_grid
-from stereovox.products.map_server import read_map_server
-from stereovox.sources import open_robot
+from stereovox.maps.grid_map import load_grid
+from stereovox.opening import open_robot
 
 DRIVE = "sim:floor?plan=testbed&seconds=4&scan_hz=4&depth_hz=2&image_width=64"
 LIDAR = {"use": "lidar", "poses": "odometry"}

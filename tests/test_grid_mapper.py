@@ -8,12 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import stereovox as sv
-from stereovox import planar
+from stereovox import se2
 from stereovox.errors import ConfigError
-from stereovox.geometry import from_quaternion
 from stereovox.mapper import GridMapper
 from stereovox.maps import State
 from stereovox.maps.occupancy import OccupancyGrid
+from stereovox.se3 import from_quaternion
 
 ROOM = 2.0
 STRANGE = [0.0, -1.0, np.nan, np.inf, -np.inf, 1e-30, 1e30, 0.05, 7.0]
@@ -21,11 +21,11 @@ STRANGE = [0.0, -1.0, np.nan, np.inf, -np.inf, 1e-30, 1e30, 0.05, 7.0]
 
 def made_scan(pose=(0.0, 0.0, 0.0), **changes):
     """A full turn in the middle of a square room of 4 m, sensor 0.2 m above and ahead of the robot's middle."""
-    T_base_sensor = planar.lifted([0.2, 0, 0])
+    T_base_sensor = se2.lifted([0.2, 0, 0])
     T_base_sensor[2, 3] = 0.2
-    T = planar.lifted(pose) @ T_base_sensor
+    T = se2.lifted(pose) @ T_base_sensor
     angles = -np.pi + np.arange(720) * np.pi / 360
-    yaw = planar.flattened(T)[2]
+    yaw = se2.flattened(T)[2]
     directions = np.column_stack([np.cos(angles + yaw), np.sin(angles + yaw)])
     with np.errstate(divide="ignore"):
         ranges = np.where(directions > 0, (ROOM - T[:2, 3]) / directions, (-ROOM - T[:2, 3]) / directions).min(axis=1)
@@ -83,7 +83,7 @@ def test_a_report_tells_what_a_scan_did():
         ({"ranges": np.ones(65537, np.float32)}, "too_many_beams"),
         ({"ranges": np.full(9, np.nan, np.float32)}, "no_valid_range"),
         ({"T_world_sensor": np.full((4, 4), np.nan)}, "pose_not_finite"),
-        ({"T_world_sensor": planar.lifted([1e7, 0, 0])}, "pose_not_finite"),
+        ({"T_world_sensor": se2.lifted([1e7, 0, 0])}, "pose_not_finite"),
         ({"T_world_sensor": np.diag([1.0, -1, 1, 1])}, "pose_not_rigid"),
         ({"T_world_sensor": 2 * np.eye(4)}, "pose_not_rigid"),
         ({"T_world_sensor": np.eye(3)}, "pose_not_rigid"),
@@ -135,11 +135,11 @@ def test_going_on_with_a_map_keeps_its_frame(as_picture):
     for _ in range(6):
         first.add(made_scan())
     grid = first.occupancy()
-    turned = OccupancyGrid(grid.cells, grid.resolution, tuple(planar.compose([0.4, 0.2, 0.5], grid.origin)))
+    turned = OccupancyGrid(grid.cells, grid.resolution, tuple(se2.compose([0.4, 0.2, 0.5], grid.origin)))
     second = GridMapper(**settings, resume=turned if as_picture else first.map)
-    pose = planar.compose([0.4, 0.2, 0.5], [0, 0, 0]) if as_picture else (0, 0, 0)
+    pose = se2.compose([0.4, 0.2, 0.5], [0, 0, 0]) if as_picture else (0, 0, 0)
     moved = made_scan()
-    report = second.add(replace(moved, T_world_sensor=planar.lifted(pose) @ moved.T_world_sensor))
+    report = second.add(replace(moved, T_world_sensor=se2.lifted(pose) @ moved.T_world_sensor))
     assert report.refused is None
     known = (grid.cells >= 0).sum()
     assert abs(len(second.map.cells()[0]) - known) < 0.02 * known

@@ -10,9 +10,8 @@ from hypothesis import strategies as st
 import stereovox as sv
 from stereovox import mapper as mapper_module
 from stereovox.config import load_config
-from stereovox.pace import LONGEST, PATIENCE, Ladder
-from stereovox.sources.scene import Scene, box
-from stereovox.ways import ladder
+from stereovox.deadline import LONGEST, PATIENCE, Ladder, ladder
+from stereovox.simulate.scene import Scene, box
 
 DEADLINE = 20.0
 

@@ -14,9 +14,9 @@ from made_robot_bags import MS, START_NS, RobotBagMaker, planar_numbers
 import stereovox as sv
 from stereovox.cli import main
 from stereovox.errors import MapFileError
-from stereovox.geometry import look_at
+from stereovox.formats import export, read_octomap
 from stereovox.maps import State
-from stereovox.products import export, read_octomap
+from stereovox.se3 import look_at
 
 CAMERA = sv.PinholeCamera(80, 60, 60.0, 60.0, 39.5, 29.5, 0.05)
 FORWARD = look_at([0.03, 0.02, 0.51], [1.03, 0.02, 0.51])

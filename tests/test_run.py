@@ -9,9 +9,9 @@ import pytest
 
 import stereovox as sv
 from stereovox import run
-from stereovox.cli import checkpoints
 from stereovox.cli import main as command
-from stereovox.sources import open_stream
+from stereovox.cli import options
+from stereovox.opening import open_stream
 
 SOURCE = "sim:room?image_width=160"
 SETTINGS = {"voxel_size": 0.1, "frames": ":12"}
@@ -60,7 +60,7 @@ def test_it_makes_the_map_of_the_command(tmp_path):
     assert result.out == tmp_path / "a.svox"
     assert [report for _, report in seen.reports] == result.reports
     assert result.summary()["frames"] == result.map.frames == 12
-    assert checkpoints.SECONDS == run.CHECKPOINT_S
+    assert options.SECONDS == run.CHECKPOINT_S
 
 
 def test_a_run_that_was_stopped_goes_on_where_it_was(tmp_path):

@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from stereovox.shards import in_shards, shards, together
+from stereovox.threads import in_shards, shards, together
 
 
 @pytest.mark.parametrize("threads", [1, 2, 3, 16])

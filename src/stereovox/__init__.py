@@ -7,18 +7,23 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from stereovox.cameras import PinholeCamera as PinholeCamera
+    from stereovox.cameras.pinhole import PinholeCamera as PinholeCamera
+    from stereovox.cameras.rigs import StereoPair as StereoPair
+    from stereovox.cameras.wide import CylindricalCamera as CylindricalCamera
+    from stereovox.cameras.wide import SphericalCamera as SphericalCamera
     from stereovox.config import Config as Config
     from stereovox.config import load_config as load_config
     from stereovox.errors import StereovoxError as StereovoxError
     from stereovox.floor_run import FloorRun as FloorRun
     from stereovox.floor_run import map_floor as map_floor
+    from stereovox.formats import export as export
+    from stereovox.formats import import_map as import_map
+    from stereovox.formats.meshes import surface as surface
     from stereovox.frame import DepthImage as DepthImage
     from stereovox.frame import Frame as Frame
     from stereovox.frame import Reason as Reason
     from stereovox.frame import Scan as Scan
     from stereovox.frame import StereoFrame as StereoFrame
-    from stereovox.health import Health as Health
     from stereovox.mapper import AnyMapper as AnyMapper
     from stereovox.mapper import GridMapper as GridMapper
     from stereovox.mapper import Mapper as Mapper
@@ -28,32 +33,27 @@ if TYPE_CHECKING:
     from stereovox.maps import load_map as load_map
     from stereovox.maps.grid_map import GridMap as GridMap
     from stereovox.maps.occupancy import OccupancyGrid as OccupancyGrid
-    from stereovox.products import export as export
+    from stereovox.opening import open_source as open_source
     from stereovox.products.coarsen import coarsen as coarsen
     from stereovox.products.crop import crop as crop
     from stereovox.products.difference import difference as difference
     from stereovox.products.distance import DistanceField as DistanceField
     from stereovox.products.frontiers import frontiers as frontiers
     from stereovox.products.ground import ground as ground
-    from stereovox.products.imports import import_map as import_map
     from stereovox.products.merge import merge as merge
-    from stereovox.products.mesh import surface as surface
     from stereovox.products.path_check import check_path as check_path
-    from stereovox.rigs import StereoPair as StereoPair
     from stereovox.run import MapResult as MapResult
     from stereovox.run import MapRun as MapRun
     from stereovox.run import map_recording as map_recording
-    from stereovox.sources import open_source as open_source
     from stereovox.sources.latest import Latest as Latest
-    from stereovox.view.viewer import open_viewer as open_viewer
-    from stereovox.view.viewer_live import LiveView as LiveView
-    from stereovox.wide import CylindricalCamera as CylindricalCamera
-    from stereovox.wide import SphericalCamera as SphericalCamera
+    from stereovox.trust.health import Health as Health
+    from stereovox.viewer.live import LiveView as LiveView
+    from stereovox.viewer.viewer import open_viewer as open_viewer
 
 __version__ = "0.1.0"
 
 _HOMES = {
-    "PinholeCamera": "cameras",
+    "PinholeCamera": "cameras.pinhole",
     "Config": "config",
     "load_config": "config",
     "StereovoxError": "errors",
@@ -61,11 +61,11 @@ _HOMES = {
     "Frame": "frame",
     "Scan": "frame",
     "StereoFrame": "frame",
-    "StereoPair": "rigs",
-    "SphericalCamera": "wide",
-    "CylindricalCamera": "wide",
+    "StereoPair": "cameras.rigs",
+    "SphericalCamera": "cameras.wide",
+    "CylindricalCamera": "cameras.wide",
     "Reason": "frame",
-    "Health": "health",
+    "Health": "trust.health",
     "AnyMapper": "mapper",
     "GridMapper": "mapper",
     "Mapper": "mapper",
@@ -75,8 +75,8 @@ _HOMES = {
     "load_map": "maps",
     "GridMap": "maps.grid_map",
     "OccupancyGrid": "maps.occupancy",
-    "export": "products",
-    "import_map": "products.imports",
+    "export": "formats",
+    "import_map": "formats",
     "DistanceField": "products.distance",
     "check_path": "products.path_check",
     "coarsen": "products.coarsen",
@@ -85,16 +85,16 @@ _HOMES = {
     "frontiers": "products.frontiers",
     "ground": "products.ground",
     "merge": "products.merge",
-    "surface": "products.mesh",
+    "surface": "formats.meshes",
     "FloorRun": "floor_run",
     "map_floor": "floor_run",
     "MapResult": "run",
     "MapRun": "run",
     "map_recording": "run",
-    "open_source": "sources",
+    "open_source": "opening",
     "Latest": "sources.latest",
-    "open_viewer": "view.viewer",
-    "LiveView": "view.viewer_live",
+    "open_viewer": "viewer.viewer",
+    "LiveView": "viewer.live",
 }
 __all__ = [*_HOMES, "__version__"]  # pyright: ignore[reportUnsupportedDunderAll]
 

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 
 from stereovox.config import Config, load_config
 from stereovox.errors import StereovoxError, did_you_mean
-from stereovox.files import FLOOR_ENDINGS, FLOOR_READABLE, check_file
+from stereovox.formats.map_server import MODES, read_map_server
 from stereovox.frame import Frame, Scan
 from stereovox.localize.robot_way import (
     Progress,
@@ -35,11 +35,10 @@ from stereovox.mapper import GridMapper
 from stereovox.maps.grid_map import GridMap
 from stereovox.maps.lock import only_writer_of_floor
 from stereovox.maps.occupancy import OccupancyGrid
-from stereovox.products.map_server import read_map_server
-from stereovox.products.map_yaml import MODES
+from stereovox.opening import open_robot, parse_slice
 from stereovox.run import CHECKPOINT_S, Checkpoints, MapResult, Observer, add_all, interrupt_between_steps
-from stereovox.sources import open_robot, parse_slice
-from stereovox.sources.robot import Robot, in_time_order
+from stereovox.safe_io import FLOOR_ENDINGS, FLOOR_READABLE, check_file
+from stereovox.sources.robots.robot import Robot, in_time_order
 
 SLAM, ODOMETRY = "slam", "odometry"
 

@@ -11,10 +11,29 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox.cameras import PinholeCamera
-from stereovox.geometry import Transform, inverse
-from stereovox.planar import flattened
-from stereovox.rigs import StereoPair, VirtualCamera
+from stereovox.cameras.pinhole import PinholeCamera
+from stereovox.cameras.rigs import StereoPair, VirtualCamera
+from stereovox.se2 import flattened
+from stereovox.se3 import Transform, inverse
+
+
+@dataclass(frozen=True)
+class UpdateReport:
+    """What one frame did: milliseconds spent, cells whose value changed, and why it was refused, if it was.
+
+    detail: why in a line, or that frames of its sensor are believed again.
+    match_ms: rectify and match a stereo pair; depth_ms: prepare the depth image; integrate_ms: put it into the map.
+    way: how thoroughly the frame was looked at: `full`, or what `pace` left of it.
+    """
+
+    depth_ms: float = 0.0
+    integrate_ms: float = 0.0
+    cells: int = 0
+    refused: str | None = None
+    detail: str = ""
+    match_ms: float = 0.0
+    way: str = "full"
+
 
 NOT_GIVEN: float = nan
 """Depth scale of a frame whose maker did not name one."""
@@ -166,8 +185,8 @@ def name_of(seen: AnyFrame | Scan) -> str:
 class DepthImage:
     """A depth image that can be trusted, in metres, with the reason of every pixel that has no value.
 
-    depth_m: (height, width) float32, for a pinhole along the optical axis (see `stereovox.cameras`). Without value
-        (REP 117): NaN unmatched, masked or unknown, -inf too near, +inf too far (nothing up to the maximum range).
+    depth_m: (height, width) float32, for a pinhole along the optical axis (see `PinholeCamera`). Without value (REP
+        117): NaN unmatched, masked or unknown, -inf too near, +inf too far (nothing up to the maximum range).
     reason: (height, width) uint8 of `Reason`.
     T_world_sensor: (4, 4) float64, exactly rigid.
     """

@@ -8,13 +8,12 @@ from types import TracebackType
 
 from stereovox.config import Config
 from stereovox.errors import FrameRefused
-from stereovox.frame import AnyFrame, DepthImage, Scan
-from stereovox.gate import Gate, Passed
-from stereovox.guarded import MapLock
-from stereovox.health import FULL, Watch
+from stereovox.frame import AnyFrame, DepthImage, Scan, UpdateReport
 from stereovox.maps import VoxelMap
 from stereovox.maps.grid_map import GridMap
-from stereovox.update_report import UpdateReport
+from stereovox.threads import MapLock
+from stereovox.trust.gate import Gate, Passed
+from stereovox.trust.health import FULL, Watch
 
 
 class Intake:

@@ -8,19 +8,19 @@ from pathlib import Path
 from time import monotonic_ns, perf_counter
 from typing import Any, Protocol, TypeVar
 
-from stereovox.comparing import Comparison
+from stereovox.comparison import Comparison
 from stereovox.config import Config, load_config
+from stereovox.deadline import Pace
 from stereovox.depth import DepthPath
 from stereovox.frame import AnyFrame, Scan
-from stereovox.health import Health
+from stereovox.frame import UpdateReport as UpdateReport
 from stereovox.intake import Intake
 from stereovox.integrate.beams import make_beams
-from stereovox.integrate.scan_check import trusted
 from stereovox.maps import VoxelMap, make_map
 from stereovox.maps.grid_map import GridMap
 from stereovox.maps.occupancy import OccupancyGrid
-from stereovox.pace import Pace
-from stereovox.update_report import UpdateReport as UpdateReport
+from stereovox.trust.health import Health
+from stereovox.trust.validate import trusted
 
 SeenT = TypeVar("SeenT", contravariant=True)
 
@@ -194,7 +194,7 @@ class GridMapper:
         """Save the map: exactly to a `.npz`, as `GridMap.save`, or as files of map_server, as `write_map_server`."""
         if Path(path).suffix.lower() == ".npz":
             return self.map.save(path)
-        from stereovox.products.map_server import write_map_server
+        from stereovox.formats.map_server import write_map_server
 
         write_map_server(self.map.occupancy(), path, mode=mode)
 

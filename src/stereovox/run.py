@@ -19,20 +19,20 @@ from time import monotonic
 from types import TracebackType
 from typing import Any, Generic, Protocol, TypeVar
 
-from stereovox import sources
+from stereovox import opening
 from stereovox.config import Config
 from stereovox.errors import MapFileError, SourceError, StereovoxError, one_line
 from stereovox.evaluate.summary import summarise
-from stereovox.files import check_in_space
-from stereovox.history import LONGEST_NAME
+from stereovox.frame import UpdateReport
 from stereovox.localize.track import Track
 from stereovox.mapper import AnyMapper, Mapper
 from stereovox.maps import VoxelMap, load_map
 from stereovox.maps.grid_map import GridMap
 from stereovox.maps.lock import only_writer_in
 from stereovox.maps.store import check_target, is_map, read_manifest, remove_map, sweep
-from stereovox.sources import Stream
-from stereovox.update_report import UpdateReport
+from stereovox.opening import Stream
+from stereovox.safe_io import check_in_space
+from stereovox.trust.history import LONGEST_NAME
 
 SeenT = TypeVar("SeenT")
 MapT = TypeVar("MapT", VoxelMap, GridMap)
@@ -186,10 +186,10 @@ class MapRun:
     def _opened(self) -> Stream:
         source = self._where
         if isinstance(source, str | Path):
-            source = sources.open_stream(str(source), self._frames)
+            source = opening.open_stream(str(source), self._frames)
         if self._camera is None:
             return source
-        from stereovox.sources.with_camera import with_camera
+        from stereovox.sources.camera_file import with_camera
 
         return with_camera(source, str(self._camera))
 

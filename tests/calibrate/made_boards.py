@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 
 from stereovox.calibrate.chessboard import Board
-from stereovox.geometry import Transform, inverse, rotation_matrix
-from stereovox.lenses import Lens
-from stereovox.rigs import Eyes
+from stereovox.cameras.lenses import Lens
+from stereovox.cameras.rigs import Eyes
+from stereovox.se3 import Transform, inverse, rotation_matrix
 
 BOARD = Board(7, 5, 0.04)
 SUB = 2

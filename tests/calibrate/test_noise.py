@@ -8,10 +8,10 @@ import pytest
 
 from stereovox.calibrate.noise import calibrate_noise, fit_noise, noise_at
 from stereovox.calibrate.recording import read_wall
-from stereovox.cameras import PinholeCamera
+from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.errors import StereovoxError
 from stereovox.frame import Frame
-from stereovox.sources import open_source
+from stereovox.opening import open_source
 
 CAMERA = PinholeCamera(160, 100, 120.0, 120.0, 79.5, 49.5, 0.05)
 

@@ -14,9 +14,9 @@ from stereovox.calibrate.pair import calibrate_pair
 from stereovox.cli import calibrate_pair as command
 from stereovox.errors import StereovoxError
 from stereovox.frame import Frame
-from stereovox.sources import Selection, open_source
+from stereovox.opening import Selection, open_source
+from stereovox.simulate.d435 import depth_camera
 from stereovox.sources.base import Source
-from stereovox.sources.d435 import depth_camera
 from stereovox.sources.poses import Poses
 from stereovox.sources.tracker import on_clock
 

@@ -10,15 +10,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from stereovox.calibrate.clock import find_offsets
-from stereovox.calibrate.hand_eye import check_turning, hand_eye
 from stereovox.calibrate.odometry import CameraMotion, camera_motion
-from stereovox.calibrate.points import reduced_points
-from stereovox.calibrate.pose_track import PoseTrack
-from stereovox.cameras import PinholeCamera
+from stereovox.calibrate.pair import check_turning, hand_eye, reduced_points
+from stereovox.calibrate.tracker import PoseTrack, find_offsets
+from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.errors import MissingExtra, StereovoxError
 from stereovox.frame import DepthImage, Reason
-from stereovox.geometry import inverse
+from stereovox.se3 import inverse
 from stereovox.sources.poses import Poses
 
 RANDOM = np.random.default_rng(5)

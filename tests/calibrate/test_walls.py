@@ -7,16 +7,24 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stereovox.calibrate.models import Points, corrected_inverse, fit, plane_of, residual, rms
 from stereovox.calibrate.recording import metres, read_wall
 from stereovox.calibrate.surface import find_wall, fit_plane, tilt_deg
-from stereovox.calibrate.wall import calibrate_wall, distance_groups
-from stereovox.cameras import DepthCorrection, PinholeCamera
+from stereovox.calibrate.wall import (
+    Points,
+    calibrate_wall,
+    corrected_inverse,
+    distance_groups,
+    fit,
+    plane_of,
+    residual,
+    rms,
+)
+from stereovox.cameras.pinhole import DepthCorrection, PinholeCamera
 from stereovox.config import load_config
 from stereovox.depth import prepare
 from stereovox.errors import StereovoxError
 from stereovox.frame import Frame, Reason
-from stereovox.sources import open_source
+from stereovox.opening import open_source
 
 CAMERA = PinholeCamera(120, 80, 60.0, 60.0, 59.5, 39.5, 0.05)
 X, Y = np.meshgrid((np.arange(120) - 59.5) / 60, (np.arange(80) - 39.5) / 60)

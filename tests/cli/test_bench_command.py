@@ -15,8 +15,8 @@ from made_recordings import write_png
 from stereovox.cli import bench as command
 from stereovox.cli import main
 from stereovox.errors import StereovoxError
-from stereovox.evaluate import bench_more
-from stereovox.evaluate.bench_table import Table
+from stereovox.lab.bench import more
+from stereovox.lab.bench.results import Table
 
 SPEED = Path(__file__).parents[2] / "docs/speed.md"
 
@@ -48,7 +48,7 @@ def test_without_a_source_the_built_in_room_is_used(monkeypatch, capsys):
 
 
 def test_files_hold_what_is_printed(recording, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("stereovox.evaluate.bench_machine.cores", lambda: 3)
+    monkeypatch.setattr("stereovox.lab.bench.machine.cores", lambda: 3)
     out = tmp_path / "a" / "bench"
     sizes = ["--voxel-size", 0.2, "--voxel-size", 0.1]
     assert run(recording, *sizes, "--peers", "", "--integrators", "projective,ray", "--out", out, "--json") == 0
@@ -88,13 +88,13 @@ def fake(name, calls, stop=False):
     def table(result):
         return Table(f"Table of {name}", ("what", "figure"), [[(name, str(result["figure"]))]])
 
-    return bench_more.Measurement("a fake", measure, table)
+    return more.Measurement("a fake", measure, table)
 
 
 def test_more_is_measured_and_told(recording, tmp_path, capsys, monkeypatch):
     calls = []
-    for name in bench_more.MEASUREMENTS:
-        monkeypatch.setitem(bench_more.MEASUREMENTS, name, fake(name, calls))
+    for name in more.MEASUREMENTS:
+        monkeypatch.setitem(more.MEASUREMENTS, name, fake(name, calls))
     words = [recording, "--voxel-size", 0.2, "--peers", "", "--out", tmp_path / "b", "--json"]
     assert run(*words, "--also", "path,map-size", "--frames-long", 777, "--most-cells", 50000) == 0
     captured = capsys.readouterr()
@@ -108,22 +108,22 @@ def test_more_is_measured_and_told(recording, tmp_path, capsys, monkeypatch):
     assert "## Table of map-size" in (tmp_path / "b" / "bench.md").read_text()
     calls.clear()
     assert run(*words, "--all") == 0
-    assert [name for name, _ in calls] == list(bench_more.MEASUREMENTS)
+    assert [name for name, _ in calls] == list(more.MEASUREMENTS)
 
 
 def test_help_names_every_measurement(capsys):
     with pytest.raises(SystemExit):
         run("--help")
     said = " ".join(capsys.readouterr().out.split()).replace("- ", "-")
-    assert all(name in said for name in bench_more.MEASUREMENTS)
+    assert all(name in said for name in more.MEASUREMENTS)
     page = SPEED.read_text()
-    assert all(f"| `{name}` |" in page for name in bench_more.MEASUREMENTS)
+    assert all(f"| `{name}` |" in page for name in more.MEASUREMENTS)
 
 
 def test_ctrl_c_leaves_what_is_done(recording, tmp_path, capsys, monkeypatch):
     calls = []
-    monkeypatch.setitem(bench_more.MEASUREMENTS, "threads", fake("threads", calls))
-    monkeypatch.setitem(bench_more.MEASUREMENTS, "overhead", fake("overhead", calls, stop=True))
+    monkeypatch.setitem(more.MEASUREMENTS, "threads", fake("threads", calls))
+    monkeypatch.setitem(more.MEASUREMENTS, "overhead", fake("overhead", calls, stop=True))
     out = tmp_path / "bench"
     words = [recording, "--voxel-size", 0.2, "--peers", "", "--also", "threads,overhead", "--out", out]
     assert run(*words) == 130
@@ -141,7 +141,7 @@ def test_ctrl_c_before_anything_is_done_leaves_nothing(recording, tmp_path, caps
     def stop(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("stereovox.evaluate.bench_frames.read_frames", stop)
+    monkeypatch.setattr("stereovox.lab.bench.frames.read_frames", stop)
     assert run(recording, "--peers", "", "--out", tmp_path / "bench") == 130
     assert capsys.readouterr().err.splitlines()[-1] == "stereovox: stopped"
     assert list((tmp_path / "bench").iterdir()) == []
@@ -206,7 +206,7 @@ def test_slips_are_one_line_before_the_work(said, words, recording, tmp_path, ca
     def unread(*_, **__):
         raise AssertionError("a frame was asked for")
 
-    monkeypatch.setattr("stereovox.evaluate.bench_frames.read_frames", unread)
+    monkeypatch.setattr("stereovox.lab.bench.frames.read_frames", unread)
     (tmp_path / "file").write_text("not a folder")
     assert run(recording, "--voxel-size", 0.2, *(str(word).format(tmp=tmp_path) for word in words)) == 2
     lines = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("compiling")]
@@ -218,8 +218,8 @@ def test_a_measurement_that_fails_leaves_what_is_done(recording, tmp_path, capsy
     def fail(given):
         raise StereovoxError("no process could be started")
 
-    broken = bench_more.Measurement("a fake", fail, bench_more.MEASUREMENTS["start-up"].table)
-    monkeypatch.setitem(bench_more.MEASUREMENTS, "start-up", broken)
+    broken = more.Measurement("a fake", fail, more.MEASUREMENTS["start-up"].table)
+    monkeypatch.setitem(more.MEASUREMENTS, "start-up", broken)
     out = tmp_path / "bench"
     assert run(recording, "--voxel-size", 0.2, "--peers", "", "--also", "start-up", "--out", out) == 2
     said = capsys.readouterr().err

@@ -315,7 +315,7 @@ def test_what_no_command_foresaw_is_one_line_too(error, said, recording, tmp_pat
     def fail(*_):
         raise error
 
-    monkeypatch.setattr("stereovox.sources.open_source", fail)
+    monkeypatch.setattr("stereovox.opening.open_source", fail)
     fails_with_one_line(capsys, said, "map", recording, "--out", tmp_path / "m")
 
 

@@ -8,7 +8,7 @@ import pytest
 
 import stereovox as sv
 from stereovox.cli import main
-from stereovox.products import export
+from stereovox.formats import export
 
 CONFIG = sv.load_config(voxel_size=0.5, **{"map.prior": 0.5})
 CELLS = [[x, y, 0] for x in range(6) for y in range(6)]

@@ -8,11 +8,11 @@ import pytest
 from made_floors import FREE, WALL, changed, looked_up, room
 
 import stereovox as sv
-from stereovox import planar
+from stereovox import se2
 from stereovox.cli import main
 from stereovox.evaluate.grid_scores import score_grids
+from stereovox.formats.map_server import read_map_server, write_map_server
 from stereovox.maps.occupancy import OccupancyGrid
-from stereovox.products.map_server import read_map_server, write_map_server
 
 CONTRACT = ("tp", "fp", "tn", "fn", "accuracy", "precision", "recall", "specificity", "npv", "error", "correlation")
 
@@ -23,7 +23,7 @@ def folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     reference = room()
     write_map_server(reference, "reference.yaml")
-    moved = OccupancyGrid(reference.cells, 0.05, tuple(planar.inverse((0.4, -0.1, 0.1))))
+    moved = OccupancyGrid(reference.cells, 0.05, tuple(se2.inverse((0.4, -0.1, 0.1))))
     write_map_server(looked_up(moved, 0.05, (-1.0, -1.0, 0.0), (130, 170)), "moved.yaml")
     cells = reference.cells.copy()
     cells[:, :44] = -1

@@ -8,8 +8,8 @@ import pytest
 
 import stereovox as sv
 from stereovox.cli import main
+from stereovox.formats.map_server import read_map_server, write_map_server
 from stereovox.maps.occupancy import OccupancyGrid
-from stereovox.products.map_server import read_map_server, write_map_server
 
 
 @pytest.fixture

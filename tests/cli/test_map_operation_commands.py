@@ -9,7 +9,7 @@ from made_maps import random_map, table
 
 import stereovox as sv
 from stereovox.cli import main
-from stereovox.products.map_server import read_map_server
+from stereovox.formats.map_server import read_map_server
 from stereovox.products.moved import moved
 
 FLOOR = [(x, y, z, 3.0 if z == 0 else -3.0) for x in range(30) for y in range(20) for z in range(14)]

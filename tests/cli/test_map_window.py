@@ -11,7 +11,7 @@ from stereovox.cli import main
 from stereovox.config import load_config
 from stereovox.mapper import Mapper, UpdateReport
 from stereovox.maps import VoxelMap, load_map
-from stereovox.sources import Stream, open_source
+from stereovox.opening import Stream, open_source
 
 SOURCE = "sim:flight?length=120&speed=10&frames=60"
 COARSE = ["--voxel-size", "0.4", "--max-range", "4"]
@@ -148,7 +148,7 @@ def test_a_live_camera_that_is_always_refused_is_given_up(tmp_path, capsys, monk
         earlier = VoxelMap.from_cells(load_config(voxel_size=0.4), [[0, 0, 0]], [1.0])
         earlier.frames, earlier.recording = done, "realsense:1"
         earlier.save(out)
-    monkeypatch.setattr("stereovox.sources.open_stream", lambda *_: Live())
+    monkeypatch.setattr("stereovox.opening.open_stream", lambda *_: Live())
     assert main(["map", "realsense:", "--out", str(out), *(["--resume"] if done else [])]) == 2
     said = capsys.readouterr().err.splitlines()[-1]
     assert "not one of 100 frames could be used" in said

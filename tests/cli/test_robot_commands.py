@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from stereovox.cli import main
-from stereovox.products.map_server import read_map_server
-from stereovox.sources import open_robot
-from stereovox.sources.bag_kinds import open_bag
-from stereovox.sources.bag_messages import read_pose
+from stereovox.formats.map_server import read_map_server
+from stereovox.opening import open_robot
+from stereovox.sources.bags import open_bag
+from stereovox.sources.bags.messages import read_pose
 from stereovox.sources.trajectory import Trajectory
 
 DRIVE = "sim:floor?plan=testbed&seconds=24&scan_hz=4&depth_hz=2&image_width=160"
@@ -64,9 +64,9 @@ def test_slam_saves_map_and_way(bag, reference, tmp_path, capsys):
 def test_slam_scores_relations(tmp_path, capsys):
     scans = open_robot(DRIVE).scans
     first, second = scans[8], scans[40]
-    from stereovox import planar
+    from stereovox import se2
 
-    x, y, yaw = planar.relative(*(one.pose_world_base for one in (first, second)))
+    x, y, yaw = se2.relative(*(one.pose_world_base for one in (first, second)))
     line = f"{first.stamp_ns / 1e9:.6f} {second.stamp_ns / 1e9:.6f} {x} {y} 0 0 0 {yaw}\n"
     (tmp_path / "floor.relations").write_text(line)
     result, said = run(capsys, "slam", DRIVE, "--out", tmp_path / "a.yaml", "--relations", tmp_path / "floor.relations")

@@ -56,7 +56,7 @@ def test_it_serves_until_ctrl_c(saved, start):
 
 
 def test_up_is_taken_or_refused(saved, capsys, monkeypatch):
-    from stereovox.view import viewer
+    from stereovox.viewer import viewer
 
     told = []
     monkeypatch.setattr(viewer.Viewer, "wait", lambda self: told.append(self.layer.across.value))
@@ -68,7 +68,7 @@ def test_up_is_taken_or_refused(saved, capsys, monkeypatch):
 
 
 def test_fewer_cells_are_drawn_where_fewer_are_wanted(tmp_path, capsys, monkeypatch):
-    from stereovox.view import viewer
+    from stereovox.viewer import viewer
 
     cells = np.argwhere(np.ones((250, 60, 1)))
     sv.VoxelMap.from_cells(sv.load_config(), cells, np.full(len(cells), 2.0)).save(tmp_path / "floor.svox")
@@ -106,7 +106,7 @@ def test_a_page_for_others_needs_the_link_that_is_printed(saved, start):
 
 
 def test_a_token_may_come_from_the_environment(saved, capsys, monkeypatch):
-    from stereovox.view import viewer
+    from stereovox.viewer import viewer
 
     seen = []
     monkeypatch.setattr(viewer.Viewer, "wait", lambda self: seen.append(self.url))
@@ -128,7 +128,7 @@ def test_a_taken_port_is_one_line(saved, capsys):
 
 
 def test_a_link_for_this_machine_alone_promises_nothing_to_others(saved, capsys, monkeypatch):
-    from stereovox.view import viewer
+    from stereovox.viewer import viewer
 
     monkeypatch.setattr(viewer.Viewer, "wait", lambda self: None)
     assert main(["view", str(saved), "--port", "0", "--token", "a" * 16]) == 0
@@ -136,7 +136,7 @@ def test_a_link_for_this_machine_alone_promises_nothing_to_others(saved, capsys,
 
 
 def test_a_recording_adds_a_timeline(saved, tmp_path, capsys, monkeypatch):
-    from stereovox.view import viewer
+    from stereovox.viewer import viewer
 
     said = []
 

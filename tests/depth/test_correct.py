@@ -6,10 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stereovox.cameras import DepthCorrection, PinholeCamera
+from stereovox.cameras.pinhole import DepthCorrection, PinholeCamera
 from stereovox.config import load_config
 from stereovox.depth import prepare
-from stereovox.depth.correct import correct
+from stereovox.depth.prepare import correct
 from stereovox.errors import StereovoxError
 from stereovox.frame import Frame, Reason
 

@@ -4,10 +4,10 @@
 import numpy as np
 import pytest
 
-from stereovox.cameras import PinholeCamera
+from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.config import load_config
 from stereovox.depth import prepare
-from stereovox.depth.denoise import denoise
+from stereovox.depth.prepare import denoise
 from stereovox.frame import Frame, Reason
 
 CAMERA = PinholeCamera(64, 48, 415.0, 415.0, 31.5, 23.5, baseline=0.05)

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from stereovox.cameras import PinholeCamera
+from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.config import load_config
 from stereovox.depth import prepare
 from stereovox.frame import Frame, Reason

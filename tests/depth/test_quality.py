@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 import stereovox as sv
+from stereovox.cameras.rigs import StereoPair
 from stereovox.config import load_config
 from stereovox.depth import DepthPath
 from stereovox.depth.prepare import prepare
 from stereovox.depth.quality import BEND_SIGMA, BEND_SLACK, ROWS, counted
 from stereovox.errors import FrameRefused
 from stereovox.frame import Reason
-from stereovox.rigs import StereoPair
 from stereovox.sensors.noise import RangeNoise
 
 CAMERA = sv.PinholeCamera(160, 120, 120.0, 120.0, 79.5, 59.5, 0.05)

@@ -4,12 +4,12 @@
 import numpy as np
 import pytest
 
-from stereovox.cameras import PinholeCamera
+from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.config import load_config
 from stereovox.depth.scan import scan_of
 from stereovox.frame import DepthImage, Reason
-from stereovox.geometry import look_at
-from stereovox.sources.scene import Scene, box, cylinder
+from stereovox.se3 import look_at
+from stereovox.simulate.scene import Scene, box, cylinder
 
 CAMERA = PinholeCamera.from_field_of_view(320, 240, 57)
 LOW, HIGH = 0.1, 1.8

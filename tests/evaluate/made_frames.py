@@ -3,9 +3,9 @@
 
 import numpy as np
 
-from stereovox.cameras import PinholeCamera
-from stereovox.evaluate.bench_frames import Recording
+from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.frame import Frame
+from stereovox.lab.bench.frames import Recording
 
 CAMERA = PinholeCamera(64, 48, 40.0, 40.0, 31.5, 23.5, 0.05)
 

@@ -6,11 +6,11 @@ import pytest
 
 import stereovox as sv
 from stereovox.errors import StereovoxError
-from stereovox.evaluate.clearing import time_to_clear
 from stereovox.evaluate.curves import roc
 from stereovox.evaluate.distance import round_edges
 from stereovox.evaluate.reliability import brier, correlation, reliability
 from stereovox.evaluate.scores import score
+from stereovox.lab.checks.ghosts import time_to_clear
 from stereovox.maps import State
 
 

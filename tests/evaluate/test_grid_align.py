@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 from made_floors import FREE, WALL, changed, looked_up, room
 
-from stereovox import planar
-from stereovox.evaluate.grid_align import align_grids
-from stereovox.evaluate.grid_fit import Fit
+from stereovox import se2
+from stereovox.evaluate.grid_align import Fit, align_grids
 from stereovox.evaluate.grid_scores import score_grids
 from stereovox.maps.occupancy import OccupancyGrid
 
@@ -18,7 +17,7 @@ MOTIONS = [(0.0, 0.0, 0.0), (0.13, -0.21, 0.06), (-7.0, 5.0, 2.9)]
 
 def in_its_own_frame(reference, motion, side=0.05):
     """The map of a robot whose frame stands at `motion` in the reference's frame."""
-    there = replace(reference, origin=tuple(planar.compose(planar.inverse(motion), reference.origin)))
+    there = replace(reference, origin=tuple(se2.compose(se2.inverse(motion), reference.origin)))
     corners = there.centres([0, 0, 79, 79], [0, 119, 0, 119])
     low, high = corners.min(axis=0) - 0.3, corners.max(axis=0) + 0.3
     shape = tuple(int(n) for n in np.ceil((high - low)[::-1] / side))
@@ -27,7 +26,7 @@ def in_its_own_frame(reference, motion, side=0.05):
 
 def gap(found, motion, middle=(3.0, 2.0, 0.0)):
     """Metres at the room's middle, and radians."""
-    x, y, yaw = planar.relative(planar.compose(motion, middle), planar.compose(found, middle))
+    x, y, yaw = se2.relative(se2.compose(motion, middle), se2.compose(found, middle))
     return float(np.hypot(x, y)), abs(float(yaw))
 
 
@@ -100,7 +99,7 @@ def test_a_likelihood_is_the_mean_over_nearest_walls():
     ours, theirs = (np.unique(np.floor(random.uniform(0, 60, (50, 2))), axis=0) * 0.1 + 0.05 for _ in range(2))
     fit = Fit(ours, theirs, ours[:0], theirs[:0], 0.1, 1.0)
     pose = (0.31, -0.17, 0.05)
-    there, back = planar.transform(pose, ours), planar.transform(planar.inverse(pose), theirs)
+    there, back = se2.transform(pose, ours), se2.transform(se2.inverse(pose), theirs)
 
     def mean(points, others):
         nearest = np.linalg.norm(points[:, None] - others[None], axis=2).min(axis=1)
@@ -120,7 +119,7 @@ def test_a_small_map_finds_its_place_in_one_five_times_as_large():
         cells[row : row + along, column] = WALL
         cells[row, column : column + across] = WALL
     building, motion = OccupancyGrid(cells, 0.1), (22.0, 15.0, 2.0)
-    there = replace(building, origin=tuple(planar.inverse(motion)))
+    there = replace(building, origin=tuple(se2.inverse(motion)))
     ours = looked_up(there, 0.1, (-4.0, -4.0, 0.0), (80, 80))
     assert (ours.cells == WALL).sum() > 200
     metres, radians = gap(align_grids(ours, building), motion, (0.0, 0.0, 0.0))

@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 from made_floors import FREE, WALL, changed, random_floor, room
 
-from stereovox import planar
+from stereovox import se2
 from stereovox.errors import StereovoxError
-from stereovox.evaluate.grid_errors import Difference, differences, wrong
 from stereovox.evaluate.grid_lattice import lay
-from stereovox.evaluate.grid_scores import score_grids
+from stereovox.evaluate.grid_scores import Difference, differences, score_grids, wrong
 from stereovox.maps import State
 from stereovox.maps.occupancy import OccupancyGrid
 
@@ -168,7 +167,7 @@ def test_maps_of_other_frames_and_quarter_turns_lie_on_each_other_exactly(turns)
     reference = random_floor(5, shape=(8, 11), side=0.25, origin=(2.0, -1.0, 0.3))
     high, wide = 8 * 0.25, 11 * 0.25
     corner = [(0, 0, 0), (wide, 0, np.pi / 2), (wide, high, np.pi), (0, high, -np.pi / 2)][turns]
-    pose = planar.compose(reference.origin, corner)
+    pose = se2.compose(reference.origin, corner)
     ours = OccupancyGrid(np.ascontiguousarray(np.rot90(reference.cells, turns)), 0.25, tuple(pose))
     laid = lay(ours, reference)
     assert (differences(laid) == Difference.SAME).all()
@@ -199,7 +198,7 @@ def test_no_obstacle_is_lost_in_a_turn_and_walls_do_not_grow(yaw):
     reference = OccupancyGrid(np.full((10, 10), FREE, np.int8), 0.1)
     laid = lay(ours, reference, (0.5, -0.2, yaw))
     walls = np.argwhere(cells == WALL)
-    where = laid.map.indices(planar.transform((0.5, -0.2, yaw), ours.centres(*walls.T)))
+    where = laid.map.indices(se2.transform((0.5, -0.2, yaw), ours.centres(*walls.T)))
     near = [laid.map.states[max(r - 1, 0) : r + 2, max(c - 1, 0) : c + 2] for r, c in where]
     assert all((patch == State.OCCUPIED).any() for patch in near)
     count = int((laid.map.states == State.OCCUPIED).sum())

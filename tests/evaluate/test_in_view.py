@@ -8,12 +8,11 @@ import itertools
 import numpy as np
 import pytest
 
-from stereovox.cameras import PinholeCamera
+from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.evaluate.cells import indices
-from stereovox.evaluate.crossed import crossed_cells
-from stereovox.evaluate.in_view import blocks_in, project, view_volume
+from stereovox.evaluate.lidar_truth import blocks_in, crossed_cells, project, view_volume
 from stereovox.frame import Viewpoint
-from stereovox.geometry import look_at
+from stereovox.se3 import look_at
 
 CAMERA = PinholeCamera(40, 24, 30.0, 33.0, 17.0, 13.5)
 

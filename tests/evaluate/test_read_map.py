@@ -9,10 +9,9 @@ from made_kitti import raw
 
 import stereovox as sv
 from stereovox.errors import MapFileError, SourceError
-from stereovox.evaluate.camera_path import read_camera_path
-from stereovox.evaluate.read_map import read_map
+from stereovox.evaluate.inputs import read_camera_path, read_map
 from stereovox.evaluate.scores import score
-from stereovox.products import export
+from stereovox.formats import export
 
 CELLS = [[x, y, -3] for x in range(-5, 5) for y in range(9)]
 VALUES, OURS = np.random.default_rng(3).choice([3.0, -3.0], (2, len(CELLS)), p=[0.3, 0.7])

@@ -6,9 +6,9 @@ from math import pi, sqrt
 import numpy as np
 import pytest
 
-from stereovox import planar
+from stereovox import se2
 from stereovox.errors import SourceError
-from stereovox.evaluate.relations import read_relations, relation_errors, score_relations
+from stereovox.evaluate.trajectory import read_relations, relation_errors, score_relations
 from stereovox.localize.track import Track
 
 STAMPS = np.array([0, 1, 2, 3], np.int64) * 10**9
@@ -50,7 +50,7 @@ def test_errors_are_those_worked_out_by_hand(tmp_path):
 def test_the_frame_of_the_map_does_not_matter(tmp_path):
     relations = read_relations(written(tmp_path, "0 1 1.3 0.4 0 0 0 1", "1 3 2 1 0 0 0 1", "2 0 1 1 0 0 0 2"))
     here = relation_errors(relations, STAMPS, POSES)
-    there = relation_errors(relations, STAMPS, planar.compose([100.0, -40.0, 2.5], POSES))
+    there = relation_errors(relations, STAMPS, se2.compose([100.0, -40.0, 2.5], POSES))
     assert np.allclose(here.metres, there.metres)
     assert np.allclose(here.radians, there.radians)
 

@@ -11,13 +11,12 @@ from hypothesis import strategies as st
 
 import stereovox as sv
 from stereovox.errors import StereovoxError
-from stereovox.evaluate.cell_reader import CellReader, Neighbourhood
 from stereovox.evaluate.cells import indices, keys
 from stereovox.evaluate.outcomes import Outcome, outcomes
-from stereovox.evaluate.score_series import ScoreSeries
 from stereovox.evaluate.scores import score
-from stereovox.evaluate.truth_cells import TruthCells
+from stereovox.evaluate.truth_cells import CellReader, Neighbourhood, TruthCells
 from stereovox.frame import Viewpoint
+from stereovox.lab.papers.valenti.judge import ScoreSeries
 from stereovox.maps import make_map
 from stereovox.maps.evidence import Evidence
 from stereovox.maps.rolling import RollingMap

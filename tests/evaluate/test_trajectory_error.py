@@ -6,9 +6,9 @@ import json
 import numpy as np
 import pytest
 
-from stereovox import planar
+from stereovox import se2
 from stereovox.errors import StereovoxError
-from stereovox.evaluate.trajectory_error import best_motion, trajectory_error
+from stereovox.evaluate.trajectory import best_motion, trajectory_error
 from stereovox.localize.track import Track
 from stereovox.sources.poses import Poses
 
@@ -18,7 +18,7 @@ TRUE = np.column_stack([ALONG, np.sin(ALONG), np.arctan(np.cos(ALONG))])
 
 
 def truth(stamps=STAMPS, poses=TRUE):
-    return Poses(stamps, [planar.lifted(pose) for pose in poses])
+    return Poses(stamps, [se2.lifted(pose) for pose in poses])
 
 
 def track(poses, stamps=STAMPS):
@@ -26,11 +26,11 @@ def track(poses, stamps=STAMPS):
 
 
 def test_the_true_way_has_no_error_in_any_frame():
-    moved = planar.compose((3.0, -8.0, 2.1), TRUE)
+    moved = se2.compose((3.0, -8.0, 2.1), TRUE)
     found = trajectory_error(track(moved), truth())
     assert [found.position_rms_m, found.position_max_m, found.yaw_rms_deg] == pytest.approx([0] * 3, abs=1e-5)
     assert found.step_rms_m == pytest.approx(0, abs=1e-9)
-    assert found.motion == pytest.approx(planar.inverse((3.0, -8.0, 2.1)))
+    assert found.motion == pytest.approx(se2.inverse((3.0, -8.0, 2.1)))
     assert json.dumps(found.as_dict(), allow_nan=False)
 
 
@@ -55,7 +55,7 @@ def test_position_and_steps_against_plain_loops():
             way += np.hypot(*(TRUE[j + 1] - TRUE[j])[:2])
             j += 1
         if way >= 2.0 - 1e-9:
-            T = [np.linalg.inv(planar.lifted(p[i])) @ planar.lifted(p[j]) for p in (TRUE, ours)]
+            T = [np.linalg.inv(se2.lifted(p[i])) @ se2.lifted(p[j]) for p in (TRUE, ours)]
             errors.append(np.linalg.norm((np.linalg.inv(T[0]) @ T[1])[:2, 3]))
     assert found.step_rms_m == pytest.approx(np.sqrt(np.mean(np.square(errors))))
 
@@ -63,11 +63,11 @@ def test_position_and_steps_against_plain_loops():
 def test_the_best_motion_beats_all_near_it():
     random = np.random.default_rng(2)
     here = random.normal(0, [3, 3, 1], (40, 3))
-    there = planar.compose((1.0, 2.0, -0.7), here) + random.normal(0, [0.3, 0.3, 0.01], here.shape)
+    there = se2.compose((1.0, 2.0, -0.7), here) + random.normal(0, [0.3, 0.3, 0.01], here.shape)
     best = best_motion(here, there)
 
     def cost(pose):  # positions, and points 0.3 m ahead of them
-        moved = planar.compose(pose, here)
+        moved = se2.compose(pose, here)
         ahead = [np.column_stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])]) for poses in (moved, there)]
         return ((moved - there)[:, :2] ** 2).sum() + 0.3**2 * ((ahead[0] - ahead[1]) ** 2).sum()
 
@@ -79,7 +79,7 @@ def test_on_a_long_way_headings_hardly_matter():
     random = np.random.default_rng(3)
     wrong = TRUE + random.normal(0, [0.05, 0.05, 0.01], TRUE.shape)
     wrong[:, 2] = 0  # the truth of a tracker without a heading
-    assert planar.wrapped(best_motion(wrong, TRUE)[2]) == pytest.approx(0, abs=0.005)
+    assert se2.wrapped(best_motion(wrong, TRUE)[2]) == pytest.approx(0, abs=0.005)
     turned = TRUE + random.normal(0, [0.05, 0.05, 0.01], TRUE.shape) + [0, 0, 0.1]  # mounted askew
     assert best_motion(turned, TRUE)[2] == pytest.approx(0, abs=0.005)
 
@@ -88,7 +88,7 @@ def test_on_a_long_way_headings_hardly_matter():
 def test_a_robot_that_only_turns_is_laid_on_the_truth_by_its_headings(shaken):
     random = np.random.default_rng(4)
     turning = np.column_stack([np.zeros((101, 2)), np.linspace(-9, 9, 101)])
-    ours = planar.compose((4.0, 1.0, 2.0), turning) + random.normal(0, [shaken, shaken, 0.01], turning.shape)
+    ours = se2.compose((4.0, 1.0, 2.0), turning) + random.normal(0, [shaken, shaken, 0.01], turning.shape)
     found = trajectory_error(track(ours), truth(poses=turning))
     assert found.motion[2] == pytest.approx(-2.0, abs=0.01)
     assert found.yaw_rms_deg == pytest.approx(np.degrees(0.01), rel=0.3)
@@ -97,7 +97,7 @@ def test_a_robot_that_only_turns_is_laid_on_the_truth_by_its_headings(shaken):
 
 def test_one_pose_is_laid_on_another():
     assert best_motion([[1.0, 2.0, 0.5]], [[0.0, 0.0, -0.5]]) == pytest.approx(
-        planar.compose((0, 0, -0.5), planar.inverse((1.0, 2.0, 0.5)))
+        se2.compose((0, 0, -0.5), se2.inverse((1.0, 2.0, 0.5)))
     )
 
 

@@ -2,12 +2,12 @@
 import numpy as np
 import pytest
 
-from stereovox.cameras import PinholeCamera
+from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.evaluate.cells import indices, keys, position, within
 from stereovox.evaluate.sightings import Sightings
 from stereovox.evaluate.truth import exact_occupancy, interior_cells, longest_axis, touched_cells
-from stereovox.geometry import look_at
-from stereovox.sources.scene import Scene, box, cylinder
+from stereovox.se3 import look_at
+from stereovox.simulate.scene import Scene, box, cylinder
 
 
 def touches(triangle, low, high):

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from stereovox.cameras import PinholeCamera
+from stereovox.cameras.pinhole import PinholeCamera
+from stereovox.cameras.rigs import VirtualCamera
 from stereovox.frame import DepthImage, Reason
-from stereovox.geometry import from_quaternion
-from stereovox.rigs import VirtualCamera
+from stereovox.se3 import from_quaternion
 
 CAMERA = PinholeCamera(64, 48, 40.0, 40.0, 31.3, 23.8, 0.05)
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import stereovox as sv
-from stereovox.evaluate.agreement import agreement
-from stereovox.sources.simulation import Simulation
+from stereovox.lab.checks.agreement import agreement
+from stereovox.simulate.simulation import Simulation
 
 KITCHEN = Path(__file__).resolve().parents[2] / "../shared/data/sevenscenes_redkitchen"
 

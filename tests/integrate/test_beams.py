@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from naive_beams import scan_cells
 
-from stereovox import planar
+from stereovox import se2
 from stereovox.config import load_config
 from stereovox.errors import ConfigError, FrameRefused
 from stereovox.frame import Scan
-from stereovox.integrate._beams_reference import scan_cells
 from stereovox.integrate.beams import make_beams
 
 KINDS = [(traversal, update) for traversal in ("exact", "bresenham") for update in ("once", "every")]
@@ -30,12 +30,12 @@ def made_scan(seed=0, pose=(0.013, -0.021, 0.3), beams=60, **changes):
     ranges = rng.uniform(0.05, 3.5, beams).astype(np.float32)
     strange = rng.random(beams) < 0.3
     ranges[strange] = rng.choice(NOTHING, strange.sum())
-    return replace(Scan(ranges, -2.1, 4.2 / beams, 0.1, 3.3, planar.lifted(pose)), **changes)
+    return replace(Scan(ranges, -2.1, 4.2 / beams, 0.1, 3.3, se2.lifted(pose)), **changes)
 
 
 def along_x(*ranges, **changes):
     """Beams that all go along x, in the middle of cells of 0.1."""
-    pose = planar.lifted([0.05, 0.05, 0.0])
+    pose = se2.lifted([0.05, 0.05, 0.0])
     return replace(Scan(np.array(ranges, np.float32), 0.0, 1e-9, 0.01, 20.0, pose), **changes)
 
 
@@ -68,7 +68,7 @@ def test_lines_through_corners_of_cells_equal_the_reference(traversal, update, s
         for y in (0.0, 0.5):
             step = np.arctan(slope)
             length = np.float32(6 / np.cos(step))
-            scan = Scan(np.full(16, length), -8 * step, step, 0.1, 30.0, planar.lifted([x, y, 0.0]))
+            scan = Scan(np.full(16, length), -8 * step, step, 0.1, 30.0, se2.lifted([x, y, 0.0]))
             assert cells_of(config, scan) == scan_cells(scan, config)
 
 
@@ -80,7 +80,7 @@ def test_lines_through_corners_of_cells_equal_the_reference(traversal, update, s
 )
 def test_any_scan_equals_the_reference(traversal, update, numbers, pose):
     config = config_of(traversal, update, thickness=0.2)
-    scan = Scan(np.array(numbers, np.float32), -1.0, 0.61, 0.0, 3.3, planar.lifted(pose))
+    scan = Scan(np.array(numbers, np.float32), -1.0, 0.61, 0.0, 3.3, se2.lifted(pose))
     assert cells_of(config, scan) == scan_cells(scan, config)
 
 
@@ -90,11 +90,11 @@ def test_evidence_moves_with_the_world(traversal, name):
     """Mirrored, by a quarter turn, and by whole cells, so that edges of tiles lie elsewhere."""
     config = config_of(traversal, "every", voxel_size=0.125)
     rng = np.random.default_rng(3)
-    scan = Scan(rng.uniform(0.3, 2.9, 90).astype(np.float32), -2.0, 0.045, 0.1, 5.0, planar.lifted([0.037, 0.061, 0]))
+    scan = Scan(rng.uniform(0.3, 2.9, 90).astype(np.float32), -2.0, 0.045, 0.1, 5.0, se2.lifted([0.037, 0.061, 0]))
     T, moved = {
         "mirrored": (np.diag([-1.0, 1, 1, 1]), lambda i, j: (-1 - i, j)),
-        "turned": (planar.lifted([0, 0, np.pi / 2]), lambda i, j: (-1 - j, i)),
-        "moved": (planar.lifted([4.625, -6.5, 0]), lambda i, j: (i + 37, j - 52)),
+        "turned": (se2.lifted([0, 0, np.pi / 2]), lambda i, j: (-1 - j, i)),
+        "moved": (se2.lifted([4.625, -6.5, 0]), lambda i, j: (i + 37, j - 52)),
     }[name]
     there = cells_of(config, replace(scan, T_world_sensor=T @ scan.T_world_sensor))
     assert there == {moved(*cell): value for cell, value in cells_of(config, scan).items()}
@@ -140,7 +140,7 @@ def test_the_order_of_beams_does_not_matter(traversal, update):
 
 
 def test_gaps_between_far_beams_stay_unknown():
-    scan = Scan(np.full(10, 2.5, np.float32), -0.5, 0.1, 0.1, 5.0, planar.lifted([0.01, 0.01, 0]))
+    scan = Scan(np.full(10, 2.5, np.float32), -0.5, 0.1, 0.1, 5.0, se2.lifted([0.01, 0.01, 0]))
     cells = cells_of(config_of(voxel_size=0.02), scan)
     ring = [(i, j) for i in range(130) for j in range(-70, 70) if 110 < np.hypot(i, j) < 118 and abs(j) < 0.4 * i]
     known = np.mean([cell in cells for cell in ring])
@@ -149,7 +149,7 @@ def test_gaps_between_far_beams_stay_unknown():
 
 
 def test_a_sensor_that_hangs_upside_down_sees_the_mirrored_scan():
-    flipped = planar.lifted([0.013, 0.021, 0.3]) @ np.diag([1.0, -1, -1, 1])
+    flipped = se2.lifted([0.013, 0.021, 0.3]) @ np.diag([1.0, -1, -1, 1])
     scan = made_scan(pose=(0.013, 0.021, 0.3))
     turned = replace(scan, ranges=scan.ranges[::-1].copy(), angle_min=-scan.angle_min - 59 * scan.angle_step)
     assert cells_of(config_of(), replace(turned, T_world_sensor=flipped)) == cells_of(config_of(), scan)

@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 import stereovox as sv
+from stereovox.cameras.wide import CylindricalCamera, SphericalCamera
 from stereovox.errors import StereovoxError
 from stereovox.frame import Reason
 from stereovox.integrate import views
-from stereovox.integrate.per_camera import MAX_CAMERAS, PerCamera
+from stereovox.integrate.views import MAX_CAMERAS, PerCamera
 from stereovox.mapper import GridMapper
 from stereovox.maps.blocks import CELLS
-from stereovox.wide import CylindricalCamera, SphericalCamera
 
 PIXEL = {"width": 1, "height": 1, "cx": 0.0, "cy": 0.0}
 

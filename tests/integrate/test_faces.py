@@ -6,11 +6,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stereovox.cameras import PinholeCamera
+from stereovox.cameras.pinhole import PinholeCamera
+from stereovox.cameras.wide import CylindricalCamera, SphericalCamera
 from stereovox.config import load_config
 from stereovox.errors import FrameRefused
 from stereovox.integrate import faces
-from stereovox.wide import CylindricalCamera, SphericalCamera
 
 CONFIG = load_config()
 KINDS = st.sampled_from([SphericalCamera, CylindricalCamera])

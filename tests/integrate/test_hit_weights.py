@@ -1,15 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """What a hit counts: in full where much of a cell's footprint says so, less where only a few pixels do."""
 
+import naive_integrators
 import numpy as np
 import pytest
 from made_images import cells_of, made_image
 
-from stereovox.cameras import PinholeCamera
+from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.config import load_config
 from stereovox.depth import prepare
 from stereovox.frame import DepthImage, Frame
-from stereovox.integrate import _reference, make_integrator
+from stereovox.integrate import make_integrator
 from stereovox.sensors import make_sensor
 
 DEFAULT = load_config(voxel_size=0.4)
@@ -21,9 +22,9 @@ def hits_of(image, integrator):
 
 
 def reference_hits(image, config):
-    table = _reference._table(image, config, make_sensor(config.sensor))
-    cells = np.unique(_reference._hit_cells(image, config), axis=0)
-    cells, evidence = _reference._weighed(cells, image, config, table)
+    table = naive_integrators._table(image, config, make_sensor(config.sensor))
+    cells = np.unique(naive_integrators._hit_cells(image, config), axis=0)
+    cells, evidence = naive_integrators._weighed(cells, image, config, table)
     thousandths = np.rint(1000 * evidence).astype(int).tolist()
     return dict(zip(map(tuple, cells.tolist()), thousandths, strict=True))
 
@@ -105,7 +106,7 @@ def test_a_single_pixel_is_all_that_a_small_cell_has():
 def test_the_depth_of_the_centre_decides_and_not_that_of_the_pixels():
     """Points all over a cell give it the one evidence that a hit at its centre's depth has."""
     config = load_config(voxel_size=0.4, max_range=5.0, **{"projective.full_share": 0.0, "noise.s2": 0.05})
-    table = _reference._table(straight(np.ones((48, 64))), config, make_sensor(config.sensor))
+    table = naive_integrators._table(straight(np.ones((48, 64))), config, make_sensor(config.sensor))
     for distance in (2.01, 2.2, 2.39):
         image = straight(np.full((48, 64), distance))
         row = int(2.2 * table.rows_per_metre)
@@ -134,7 +135,7 @@ def test_a_point_a_hair_before_a_face_does_not_hide_the_cell_behind_it():
 
 
 def test_nothing_seen_is_no_evidence():
-    from stereovox.integrate.merging import strongest
+    from stereovox.integrate.projective import strongest
 
     nothing = strongest([])
     assert len(nothing.coords) == len(nothing.uniform) == 0

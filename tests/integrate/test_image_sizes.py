@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 import stereovox as sv
+from stereovox.cameras.wide import SphericalCamera
 from stereovox.errors import FrameRefused
 from stereovox.frame import DepthImage, Reason
 from stereovox.integrate import make_integrator
 from stereovox.mapper import GridMapper
-from stereovox.wide import SphericalCamera
 
 LOOKS_ALONG_X = np.array([[0.0, 0, 1, 0.02], [-1, 0, 0, 0.03], [0, -1, 0, 0.01], [0, 0, 0, 1]])
 SMALL = (960, 540)

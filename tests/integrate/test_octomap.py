@@ -3,16 +3,17 @@
 from collections import Counter
 from pathlib import Path
 
+import naive_integrators
 import numpy as np
 import pytest
 from made_images import made_image
 
 from stereovox.config import load_config
 from stereovox.depth import prepare
-from stereovox.integrate import _reference, make_integrator
+from stereovox.integrate import make_integrator
 from stereovox.maps import VoxelMap
+from stereovox.opening import open_source
 from stereovox.sensors import make_sensor
-from stereovox.sources import open_source
 
 octomap = pytest.importorskip("octomap", reason="pip install 'stereovox[bench]'")
 KITCHEN = Path(__file__).resolve().parents[2] / "../shared/data/sevenscenes_redkitchen"
@@ -118,7 +119,7 @@ def test_made_images(voxel_size):
 def test_the_numpy_reference_itself_equals_octomap():
     config = settings(0.1, max_range=4.0)
     image = without_far(made_image(7))
-    cells, log_odds = _reference.cast_rays(image, config, make_sensor(config.sensor))
+    cells, log_odds = naive_integrators.cast_rays(image, config, make_sensor(config.sensor))
     ours = dict(zip(map(tuple, cells.tolist()), log_odds.tolist(), strict=True))
     theirs = cells_of_octree(octree_of([image], config))
     assert differences(ours, theirs).total() <= 0.005 * len(theirs)

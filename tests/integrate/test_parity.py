@@ -2,15 +2,16 @@
 
 from dataclasses import replace
 
+import naive_integrators
 import numpy as np
 import pytest
 from made_images import CAMERA, cells_of, made_image
 
-from stereovox.cameras import PinholeCamera
+from stereovox.cameras.pinhole import PinholeCamera
+from stereovox.cameras.wide import CylindricalCamera, SphericalCamera
 from stereovox.config import load_config
-from stereovox.integrate import _reference, make_integrator
+from stereovox.integrate import make_integrator
 from stereovox.sensors import SENSORS, make_sensor
-from stereovox.wide import CylindricalCamera, SphericalCamera
 
 SIZES = [0.4, 0.1, 0.05]
 WIDE = {
@@ -31,7 +32,7 @@ def share_that_differs(ours, theirs, tolerance=0):
 
 def assert_rays_equal_their_reference(image, config, at_least):
     ours = cells_of(make_integrator(config).evidence(image))
-    reference = {"ray": _reference.cast_rays, "line": _reference.draw_lines}[config.integrator]
+    reference = {"ray": naive_integrators.cast_rays, "line": naive_integrators.draw_lines}[config.integrator]
     theirs = reference_of(reference, image, config)
     assert len(theirs) > at_least
     assert share_that_differs(ours, theirs, tolerance=25) < 0.002
@@ -46,7 +47,7 @@ def test_projective_equals_its_reference(model, voxel_size):
     for seed in range(3):
         image = made_image(seed)
         ours = cells_of(integrator.evidence(image))
-        theirs = reference_of(_reference.project, image, config)
+        theirs = reference_of(naive_integrators.project, image, config)
         assert len(theirs) > 60
         # float32 against float64: a few cells project on a pixel's edge or lie on a table column's edge
         assert share_that_differs(ours, theirs, tolerance=25) < 0.002
@@ -88,7 +89,7 @@ def test_models_that_speak_of_what_lies_behind(model, voxel_size, far_share, mon
     config = load_config(voxel_size=voxel_size, max_range=4.0, **{"noise.s2": 0.03})
     image = made_image(2, far_share=far_share)
     ours = cells_of(make_integrator(config).evidence(image))
-    theirs = reference_of(_reference.project, image, config, model)
+    theirs = reference_of(naive_integrators.project, image, config, model)
     assert share_that_differs(ours, theirs, tolerance=25) < 0.002
 
 
@@ -216,7 +217,8 @@ def test_a_ray_pool_that_is_too_small_grows_and_starts_over(monkeypatch):
 
 
 def test_projective_lists_that_are_too_small_grow_and_start_over(monkeypatch):
-    from stereovox.integrate import hits, projective
+    from stereovox.integrate import projective
+    from stereovox.integrate import projective as hits
 
     images = [made_image(seed) for seed in range(2)]
     config = load_config(voxel_size=0.02, max_range=2.5)
@@ -247,7 +249,7 @@ def test_odd_image_sizes():
         image = type(image)(depth, np.zeros_like(image.reason), camera, image.T_world_sensor)
         config = load_config(voxel_size=0.1, max_range=2.5)
         ours = cells_of(make_integrator(config).evidence(image))
-        assert share_that_differs(ours, reference_of(_reference.project, image, config), tolerance=25) < 0.01
+        assert share_that_differs(ours, reference_of(naive_integrators.project, image, config), tolerance=25) < 0.01
     assert CAMERA.width == 64
 
 
@@ -255,7 +257,7 @@ def test_odd_image_sizes():
 def test_a_camera_where_cells_meet_sees_all_it_should(integrator):
     """At a corner of cells a ray that goes towards smaller indices leaves its first cell at depth zero."""
     config = load_config(voxel_size=0.2, max_range=2.5, integrator=integrator, **{"sensor.model": "constant"})
-    slow = {"ray": _reference.cast_rays, "projective": _reference.project}[integrator]
+    slow = {"ray": naive_integrators.cast_rays, "projective": naive_integrators.project}[integrator]
     for seed in range(3):
         image = made_image(seed)
         pose = image.T_world_sensor.copy()

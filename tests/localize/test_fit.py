@@ -4,7 +4,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from stereovox import planar
+from stereovox import se2
 from stereovox.frame import Scan
 from stereovox.localize.fit import fit_share
 from stereovox.localize.track import Track
@@ -28,7 +28,7 @@ def track(*correction):
 def scans():
     angles = np.linspace(-np.pi, np.pi, 90, endpoint=False)
     ranges = 1.97 / np.maximum(np.abs(np.cos(angles)), np.abs(np.sin(angles)))
-    one = Scan(ranges.astype(np.float32), -np.pi, 2 * np.pi / 90, 0.1, 5.0, planar.lifted([0, 0, 0]))
+    one = Scan(ranges.astype(np.float32), -np.pi, 2 * np.pi / 90, 0.1, 5.0, se2.lifted([0, 0, 0]))
     return [replace(one, stamp_ns=int(stamp)) for stamp in STAMPS]
 
 

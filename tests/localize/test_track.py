@@ -2,7 +2,7 @@
 import numpy as np
 import pytest
 
-from stereovox import planar
+from stereovox import se2
 from stereovox.errors import StereovoxError
 from stereovox.frame import Scan
 from stereovox.localize.track import Track
@@ -44,7 +44,7 @@ def test_after_the_last_pose_it_is_held(ns):
 def test_a_turn_over_half_a_turn_goes_the_short_way(sign):
     ends = np.array([[0, 0, sign * (np.pi - 0.1)], [0, 0, sign * (0.3 - np.pi)]])
     found = track(ends, STAMPS[:2])
-    yaws = [planar.wrapped(at(found, ns)[2] - sign * np.pi) for ns in (1_250, 1_500, 1_750)]
+    yaws = [se2.wrapped(at(found, ns)[2] - sign * np.pi) for ns in (1_250, 1_500, 1_750)]
     assert yaws == pytest.approx(np.array([0, 0.1, 0.2]) * sign, abs=1e-9)
 
 
@@ -56,13 +56,13 @@ def test_asking_changes_nothing():
 
 
 def test_a_scan_is_put_where_the_robot_was_in_the_map():
-    mount = planar.lifted((0.2, 0.1, 0.4))
+    mount = se2.lifted((0.2, 0.1, 0.4))
     mount[2, 3] = 0.3
     odom = (5.0, 1.0, -0.7)
     stamp_ns = int(STAMPS[0]) + 500
-    scan = Scan(np.ones(3, np.float32), 0, 0.1, 0.1, 5.0, planar.lifted(odom) @ mount, mount, stamp_ns=stamp_ns)
+    scan = Scan(np.ones(3, np.float32), 0, 0.1, 0.1, 5.0, se2.lifted(odom) @ mount, mount, stamp_ns=stamp_ns)
     found = track().corrected(scan)
-    assert found.pose_world_base == pytest.approx(planar.compose((2, 0, 0.4), odom))
+    assert found.pose_world_base == pytest.approx(se2.compose((2, 0, 0.4), odom))
     assert found.T_world_sensor[2, 3] == pytest.approx(0.3)
     assert found.stamp_ns == stamp_ns
 

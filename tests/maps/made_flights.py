@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stereovox.cameras import PinholeCamera
+from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.frame import Viewpoint
 from stereovox.maps.evidence import Evidence
 

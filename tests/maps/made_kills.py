@@ -13,16 +13,16 @@ from made_faults import disk, in_child, small_map
 from stereovox import run
 from stereovox.cli import main, ros2
 from stereovox.config import load_config
+from stereovox.formats.map_server import read_map_server
 from stereovox.frame import Scan
 from stereovox.localize import robot_way
-from stereovox.localize.slam import SlamResult
+from stereovox.localize.slam.pipeline import SlamResult
 from stereovox.localize.track import Track
 from stereovox.maps import load_map
 from stereovox.maps.occupancy import OccupancyGrid
-from stereovox.planar import lifted
-from stereovox.products.map_server import read_map_server
 from stereovox.ros.mapping import Mapping
 from stereovox.run import Checkpoints
+from stereovox.se2 import lifted
 from stereovox.sources.trajectory import Trajectory
 
 DRIVE = "sim:floor?plan=testbed&seconds=2&scan_hz=4&depth_hz=1&image_width=16"

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 import stereovox as sv
-from stereovox import planar
+from stereovox import se2
 from stereovox.mapper import GridMapper
-from stereovox.maps.grid_store import load_grid
+from stereovox.maps.grid_map import load_grid
 from stereovox.products.distance import DistanceField
 from stereovox.products.live_projection import LiveProjection
 from stereovox.products.projection import project
@@ -35,7 +35,7 @@ def frames_of(sensor, number):
         row, column = chance.integers(0, 40, 2)
         depth[row : row + 20, column : column + 20] = chance.uniform(0.8, 2.5)
         yaw = 0.05 * k + sensor * np.pi / 2
-        T = planar.lifted([0.05 * k - 1, 0.3 * sensor, yaw]) @ np.array(
+        T = se2.lifted([0.05 * k - 1, 0.3 * sensor, yaw]) @ np.array(
             [[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]]
         )
         fault = "unreadable" if k % 7 == 5 else None
@@ -46,7 +46,7 @@ def scans_of(sensor, number):
     chance = np.random.default_rng(sensor)
     for k in range(number):
         ranges = chance.uniform(0.5, 4, 90).astype(np.float32)
-        pose = planar.lifted([0.05 * k, sensor, 0.1 * k])
+        pose = se2.lifted([0.05 * k, sensor, 0.1 * k])
         fault = "unreadable" if k % 7 == 5 else None
         yield sv.Scan(
             ranges, -np.pi, np.pi / 45, 0.1, 5.6, pose, stamp_ns=100_000_000 * k + sensor,

@@ -10,8 +10,7 @@ from stereovox.config import load_config
 from stereovox.errors import ConfigError
 from stereovox.maps import State, VoxelMap
 from stereovox.maps.cell_format import CellRules
-from stereovox.maps.evidence import Evidence
-from stereovox.maps.grid_evidence import GridEvidence
+from stereovox.maps.evidence import Evidence, GridEvidence
 from stereovox.maps.grid_map import GridMap
 
 NONE = np.empty((0, 3), np.int32)

@@ -17,13 +17,12 @@ from made_faults import disk, in_child, small_map
 
 from stereovox.config import load_config
 from stereovox.errors import MapFileError
-from stereovox.files import replacing
+from stereovox.formats.map_server import read_map_server, write_map_server
 from stereovox.maps import load_map, make_map, store
-from stereovox.maps.grid_map import GridMap
-from stereovox.maps.grid_store import load_grid
+from stereovox.maps.grid_map import GridMap, load_grid
 from stereovox.maps.lock import only_store_in, only_writer_in, only_writer_of
 from stereovox.maps.occupancy import OccupancyGrid
-from stereovox.products.map_server import read_map_server, write_map_server
+from stereovox.safe_io import replacing
 
 HOLDER = """
 import sys
@@ -318,7 +317,7 @@ def test_what_cannot_be_written_of_a_tile_ends_the_run(tmp_path, monkeypatch, st
 
 
 def at(x):
-    from stereovox.cameras import PinholeCamera
+    from stereovox.cameras.pinhole import PinholeCamera
     from stereovox.frame import Viewpoint
 
     T = np.eye(4)

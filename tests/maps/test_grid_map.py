@@ -5,13 +5,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from stereovox import planar
+from stereovox import se2
 from stereovox.config import load_config
 from stereovox.errors import ConfigError, MapFileError, StereovoxError
 from stereovox.maps import State
-from stereovox.maps.grid_evidence import CELLS, GridEvidence
-from stereovox.maps.grid_map import GridMap
-from stereovox.maps.grid_store import load_grid
+from stereovox.maps.evidence import CELLS, GridEvidence
+from stereovox.maps.grid_map import GridMap, load_grid
 from stereovox.maps.occupancy import OccupancyGrid
 
 EVEN = {"grid.prior": 0.5, "map.log_odds_min": -4.0, "map.log_odds_max": 4.0, "voxel_size": 0.1}
@@ -110,7 +109,7 @@ def test_the_picture_is_just_large_enough_and_stands_where_the_cells_are():
     assert np.argwhere(grid.cells >= 0).tolist() == [[0, 0], [61, 70], [127, 75]]
     assert grid.cells[[0, 61, 127], [0, 70, 75]].tolist() == [12, 57, 88]
     np.testing.assert_allclose(grid.centres([127], [75]), grid_map.occupied())
-    np.testing.assert_allclose(planar.transform(grid_map.origin, [[0.55, 13.05]]), grid_map.occupied())
+    np.testing.assert_allclose(se2.transform(grid_map.origin, [[0.55, 13.05]]), grid_map.occupied())
     assert grid_map.state(grid.centres([0, 127, 61], [0, 75, 70])).tolist() == [1, 3, 2]
 
 

@@ -11,8 +11,7 @@ import pytest
 
 from stereovox.config import load_config
 from stereovox.errors import MapFileError
-from stereovox.maps.grid_map import GridMap
-from stereovox.maps.grid_store import load_grid
+from stereovox.maps.grid_map import GridMap, load_grid
 from stereovox.maps.occupancy import OccupancyGrid
 
 

@@ -12,8 +12,7 @@ import pytest
 from stereovox.config import load_config
 from stereovox.errors import ConfigError, FrameRefused
 from stereovox.maps import VoxelMap, load_map, make_map
-from stereovox.maps.evidence import Evidence
-from stereovox.maps.grid_evidence import GridEvidence
+from stereovox.maps.evidence import Evidence, GridEvidence
 from stereovox.maps.grid_map import GridMap
 from stereovox.maps.memory import within_memory
 

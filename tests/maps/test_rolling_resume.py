@@ -7,7 +7,7 @@ import shutil
 import numpy as np
 import pytest
 
-from stereovox.cameras import PinholeCamera
+from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.config import load_config
 from stereovox.errors import ConfigError, MapFileError
 from stereovox.frame import Viewpoint

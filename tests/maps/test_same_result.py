@@ -11,9 +11,8 @@ from hypothesis import strategies as st
 
 from stereovox.config import load_config
 from stereovox.maps import cell_pool, load_map, make_map
-from stereovox.maps.grid_evidence import GridEvidence
-from stereovox.maps.grid_map import GridMap
-from stereovox.maps.grid_store import load_grid
+from stereovox.maps.evidence import GridEvidence
+from stereovox.maps.grid_map import GridMap, load_grid
 
 WINDOWS = {
     "unbounded": {},

@@ -13,7 +13,7 @@ from numcodecs import Zstd
 from stereovox.config import load_config
 from stereovox.errors import MapFileError
 from stereovox.maps import VoxelMap, load_map
-from stereovox.maps.store_read import _announced
+from stereovox.maps.store import _announced
 
 CONFIG = load_config(voxel_size=0.1)
 

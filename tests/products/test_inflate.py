@@ -5,10 +5,10 @@ import pytest
 from stereovox.cli import main
 from stereovox.config import load_config
 from stereovox.errors import StereovoxError
+from stereovox.formats.map_server import read_map_server
 from stereovox.maps import State, VoxelMap
 from stereovox.maps.occupancy import OccupancyGrid
-from stereovox.products.inflate import inflated, inflated_grid, inflated_mask
-from stereovox.products.map_server import read_map_server
+from stereovox.products.projection import inflated, inflated_grid, inflated_mask
 
 RANDOM = np.random.default_rng(3)
 

@@ -10,13 +10,13 @@ from stereovox.cli import main
 from stereovox.config import load_config
 from stereovox.errors import StereovoxError
 from stereovox.evaluate.grid_scores import score_grids
+from stereovox.formats import export
+from stereovox.formats.map_server import read_map_server
 from stereovox.mapper import Mapper
 from stereovox.maps import State, VoxelMap
 from stereovox.maps.cubes import in_cubes
-from stereovox.products import export
-from stereovox.products.map_server import read_map_server
 from stereovox.products.projection import project
-from stereovox.sources.floor import Floor
+from stereovox.simulate.floors.floor import Floor
 
 SIZE = 0.1
 FREE, PERHAPS, WALL = -3.0, 0.2, 3.0

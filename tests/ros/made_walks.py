@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import wire
 
-from stereovox.cameras import PinholeCamera
+from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.frame import Frame
-from stereovox.geometry import Transform
-from stereovox.sources.bag_writer import BagWriter
+from stereovox.se3 import Transform
+from stereovox.sources.bags.writer import BagWriter
 from stereovox.sources.tracker import AXES
 
 CAMERA = PinholeCamera.from_field_of_view(48, 36, 70.0)

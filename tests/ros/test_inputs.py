@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import wire
 
-from stereovox.cameras import PinholeCamera
+from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.errors import FrameRefused
 from stereovox.frame import Scan
 from stereovox.mapper import GridMapper, Mapper
 from stereovox.ros.inputs import CloudInput, DepthInput, FloorCloudInput, ScanInput
 from stereovox.ros.poses import Pose
-from stereovox.sources.bag_writer_messages import packed_png
+from stereovox.sources.bags.writer_messages import packed_png
 
 CAMERA = PinholeCamera(8, 6, 10.0, 10.5, 3.5, 2.5)
 DEPTH = np.arange(48, dtype=np.uint16).reshape(6, 8) + 1000

@@ -27,8 +27,7 @@ from stereovox.products.projection import project  # noqa: E402
 from stereovox.ros.library import optional_message  # noqa: E402
 from stereovox.ros.mapping import Mapping  # noqa: E402
 from stereovox.ros.node import MapNode  # noqa: E402
-from stereovox.ros.options import Options  # noqa: E402
-from stereovox.ros.parameters import freeze  # noqa: E402
+from stereovox.ros.options import Options, freeze  # noqa: E402
 
 TFMessage = optional_message("tf2_msgs", "TFMessage")
 Octomap = optional_message("octomap_msgs", "Octomap")

@@ -6,9 +6,8 @@ import pytest
 import wire
 
 from stereovox.errors import FrameRefused, StereovoxError
-from stereovox.geometry import from_quaternion
-from stereovox.ros.live_tf import MOST, LiveTf
-from stereovox.ros.poses import Whereabouts, fixed_transform
+from stereovox.ros.poses import MOST, LiveTf, Whereabouts, fixed_transform
+from stereovox.se3 import from_quaternion
 
 MS = 1_000_000
 START = 10**12

@@ -15,7 +15,7 @@ from made_walks import DEPTH, write_walk
 
 from stereovox.mapper import Mapper
 from stereovox.maps import VoxelMap, load_map
-from stereovox.sources import open_source
+from stereovox.opening import open_source
 
 PLAYER = Path(__file__).with_name("play.py")
 PATIENCE_S = 150

@@ -4,7 +4,7 @@ from collections import Counter
 import pytest
 
 from stereovox.ros.inputs import DepthInput
-from stereovox.ros.silence import AGAIN_S, FIRST_S, Silence
+from stereovox.ros.subscriptions import AGAIN_S, FIRST_S, Silence
 
 IMAGE, OTHER = "sensor_msgs/msg/Image", "sensor_msgs/msg/CameraInfo"
 

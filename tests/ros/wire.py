@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from rosbags.typesys import Stores, get_typestore
 
-from stereovox.sources.bag_writer_messages import Messages
+from stereovox.sources.bags.writer_messages import Messages
 
 
 @cache

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from stereovox.cameras import PinholeCamera
+from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.config import NoiseConfig, SensorConfig
 from stereovox.errors import ConfigError
 from stereovox.sensors import SENSORS, make_sensor

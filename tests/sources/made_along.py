@@ -5,7 +5,7 @@ import numpy as np
 
 from stereovox import Frame, PinholeCamera
 from stereovox.frame import Reason
-from stereovox.geometry import look_at
+from stereovox.se3 import look_at
 from stereovox.sources.base import Source
 
 CAMERA = PinholeCamera(32, 24, 24.0, 24.0, 15.5, 11.5, 0.05)

@@ -5,7 +5,7 @@ import itertools
 
 import numpy as np
 
-from stereovox import planar
+from stereovox import se2
 from stereovox.frame import Scan
 
 
@@ -47,7 +47,7 @@ def along(corners, step=0.1, turn=0.1):
     for (x0, y0), (x1, y1) in itertools.pairwise(corners):
         way, yaw = np.hypot(x1 - x0, y1 - y0), np.arctan2(y1 - y0, x1 - x0)
         if poses:
-            swing = float(planar.wrapped(yaw - poses[-1][2]))
+            swing = float(se2.wrapped(yaw - poses[-1][2]))
             poses += [(x0, y0, poses[-1][2] + t) for t in np.linspace(0, swing, int(abs(swing) / turn) + 1)[1:]]
         poses += [(x0 + t * (x1 - x0), y0 + t * (y1 - y0), yaw) for t in np.linspace(0, 1, int(way / step) + 1)]
     return np.array(poses)
@@ -63,12 +63,12 @@ def drive(walls, poses, drift=(1.0, 0.0), noise=0.01, limit=8.0, beams=181, seed
     odometry, scans = poses[0], []
     for i, pose in enumerate(poses):
         if i:
-            step = planar.relative(poses[i - 1], pose)
+            step = se2.relative(poses[i - 1], pose)
             way = np.hypot(step[0], step[1])
-            odometry = planar.compose(odometry, [*(drift[0] * step[:2]), step[2] + drift[1] * way])
+            odometry = se2.compose(odometry, [*(drift[0] * step[:2]), step[2] + drift[1] * way])
         seen = ranges(walls, pose, angles, limit)
         seen = (seen + noise * rng.standard_normal(beams)).astype(np.float32)
         stamp = (i + 1) * 100_000_000
         step = float(angles[1] - angles[0])
-        scans.append(Scan(seen, float(angles[0]), step, 0.02, limit, planar.lifted(odometry), stamp_ns=stamp))
+        scans.append(Scan(seen, float(angles[0]), step, 0.02, limit, se2.lifted(odometry), stamp_ns=stamp))
     return scans

@@ -9,7 +9,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from stereovox.geometry import inverse, rotation_matrix, transform_points
+from stereovox.se3 import inverse, rotation_matrix, transform_points
 
 SIZE = (64, 24)
 """Width, height."""

@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from stereovox.geometry import Transform, inverse, look_at
-from stereovox.sources.d435 import D435, depth_camera
+from stereovox.se3 import Transform, inverse, look_at
+from stereovox.simulate.d435 import D435, depth_camera
+from stereovox.simulate.room import room
+from stereovox.simulate.scene import Scene
 from stereovox.sources.pair_file import PairSettings, pair_text
 from stereovox.sources.poses import Poses, seconds_from_ns
-from stereovox.sources.room import room
-from stereovox.sources.scene import Scene
 
 START_NS = 1_700_000_000_000_000_000
 """Time of the first image."""

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 from made_recordings import write_png
 
-from stereovox.cameras import PinholeCamera
-from stereovox.geometry import rotation_matrix
-from stereovox.lenses import Lens
-from stereovox.rigs import Eyes
+from stereovox.cameras.lenses import Lens
+from stereovox.cameras.pinhole import PinholeCamera
+from stereovox.cameras.rigs import Eyes
+from stereovox.cameras.wide import CylindricalCamera
+from stereovox.se3 import rotation_matrix
 from stereovox.sources.rig_file import Rig, RigPair, Virtual, write_rig
-from stereovox.wide import CylindricalCamera
 
 FORWARD = np.array([[0.0, 0, 1, 0.2], [-1, 0, 0, 0.05], [0, -1, 0, -0.1], [0, 0, 0, 1]])
 """T_body_left of an eye that looks ahead: body x forward, y left, z up."""

@@ -14,8 +14,8 @@ from rosbags.rosbag2 import Writer as Writer2
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from stereovox.geometry import Transform
-from stereovox.sources.bag_messages import Wire
+from stereovox.se3 import Transform
+from stereovox.sources.bags.messages import Wire
 
 START_NS = 1_600_000_000_000_000_000
 MS = 1_000_000

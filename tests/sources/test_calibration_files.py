@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 import pytest
 
+from stereovox.cameras.lenses import Lens
+from stereovox.cameras.rigs import Eyes, StereoPair
 from stereovox.errors import SourceError
-from stereovox.geometry import inverse, rotation_matrix
-from stereovox.lenses import Lens
-from stereovox.rigs import Eyes, StereoPair
+from stereovox.se3 import inverse, rotation_matrix
 from stereovox.sources.calibration_files import import_rig
 
 T = np.eye(4)

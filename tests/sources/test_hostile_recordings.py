@@ -19,15 +19,17 @@ from made_robot_bags import START_NS, Messages, RobotBagMaker
 
 from stereovox.calibrate.chessboard import read_grey
 from stereovox.errors import FrameRefused, SourceError
-from stereovox.evaluate.camera_path import read_camera_path
-from stereovox.evaluate.relations import read_relations
-from stereovox.sources import bag_unpack, carmen, open_source
-from stereovox.sources.bag_db3 import Db3File
-from stereovox.sources.bag_messages import Wire, ns_from_ms, read_camera_info
-from stereovox.sources.bag_robot_messages import read_laser_scan, read_point_cloud
-from stereovox.sources.bag_unpack import SMALL, most_unpacked, unpacked
-from stereovox.sources.carmen import CarmenLog
+from stereovox.evaluate.inputs import read_camera_path
+from stereovox.evaluate.trajectory import read_relations
+from stereovox.opening import open_source
+from stereovox.sources.bags import unpack
+from stereovox.sources.bags.db3 import Db3File
+from stereovox.sources.bags.messages import Wire, ns_from_ms, read_camera_info
+from stereovox.sources.bags.robot_messages import read_laser_scan, read_point_cloud
+from stereovox.sources.bags.unpack import SMALL, most_unpacked, unpacked
 from stereovox.sources.images import SIGNATURE, read_depth_png, read_picture_png
+from stereovox.sources.robots import carmen
+from stereovox.sources.robots.carmen import CarmenLog
 
 FLASER = b"FLASER 3 1.0 2.0 81.9 0 0 0 0.1 0.2 0.3 976052857.3 nohost 0.1\n"
 PACK = {"bz2": bz2.compress, "lz4": lz4.frame.compress, "zstd": zstd.compress}
@@ -35,8 +37,8 @@ PACK = {"bz2": bz2.compress, "lz4": lz4.frame.compress, "zstd": zstd.compress}
 
 @pytest.mark.parametrize("packing", PACK)
 def test_a_small_piece_that_swells_is_refused_early(packing, monkeypatch):
-    monkeypatch.setattr(bag_unpack, "SMALL", 1 << 20)
-    monkeypatch.setattr(bag_unpack, "PACKED_BEST", 20)
+    monkeypatch.setattr(unpack, "SMALL", 1 << 20)
+    monkeypatch.setattr(unpack, "PACKED_BEST", 20)
     bomb = PACK[packing](bytes(60 << 20))
     assert most_unpacked(len(bomb)) < 20 << 20
     tracemalloc.start()
@@ -54,7 +56,7 @@ def test_what_may_swell_how_far():
 
 def test_many_chunks_that_swell_a_little(tmp_path, monkeypatch):
     """Each alone is small enough; without an index the whole file is gone through."""
-    monkeypatch.setattr(bag_unpack, "SMALL", 1 << 20)
+    monkeypatch.setattr(unpack, "SMALL", 1 << 20)
     inner = record(200, bytes((1 << 20) - 9))
     bomb = chunk_record(inner, 0, 1, Style("zstd"))
     (tmp_path / "a.mcap").write_bytes(MAGIC + record(1, text("") + text("")) + bomb * 30)

@@ -4,7 +4,7 @@ from __future__ import annotations
 import pytest
 
 from stereovox.errors import SourceError
-from stereovox.sources.intrinsics import find_camera, read_intrinsics
+from stereovox.sources.camera_file import find_camera, read_intrinsics
 
 DEFAULT = (525.0, 525.0, 319.5, 239.5)
 

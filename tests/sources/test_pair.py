@@ -12,8 +12,8 @@ from stereovox.errors import SourceError
 from stereovox.frame import Frame
 from stereovox.mapper import Mapper
 from stereovox.maps import State
-from stereovox.sources import open_source
-from stereovox.sources.d435 import depth_camera
+from stereovox.opening import open_source
+from stereovox.simulate.d435 import depth_camera
 from stereovox.sources.pair import CameraPair
 from stereovox.sources.pair_file import PairSettings, pair_text, read_pair
 from stereovox.sources.poses import Poses

@@ -5,8 +5,8 @@ import pytest
 
 from stereovox import registry
 from stereovox.errors import SourceError
+from stereovox.simulate.simulation import SCENES, Options
 from stereovox.sources.parameters import defaults, split, typed
-from stereovox.sources.simulation import SCENES, Options
 
 KNOWN = {"size": "large", "distance": 2.0, "frames": 120, "noise": True}
 

@@ -16,7 +16,8 @@ from made_realsense import FPS, HEIGHT, UNIT, WIDTH, SoftwareCamera, depth, stam
 from stereovox.cli import main, recordings  # noqa: E402
 from stereovox.errors import MissingExtra, SourceError  # noqa: E402
 from stereovox.maps import load_map  # noqa: E402
-from stereovox.sources import Excerpt, open_source, open_stream, realsense  # noqa: E402
+from stereovox.opening import Excerpt, open_source, open_stream  # noqa: E402
+from stereovox.sources import realsense  # noqa: E402
 from stereovox.sources.realsense import RealSense  # noqa: E402
 
 STILL = "realsense:?pose=fixed"

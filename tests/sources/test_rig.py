@@ -6,10 +6,10 @@ import pytest
 from made_recordings import write_png
 from made_rigs import CAMERA, FORWARD, picture, poses_text, recorded, rig
 
-from stereovox.depth.rectify import rectified
+from stereovox.depth.stereo.rectify import rectified
 from stereovox.errors import SourceError
 from stereovox.frame import StereoFrame
-from stereovox.sources import open_source
+from stereovox.opening import open_source
 from stereovox.sources.rig_file import Rig, RigPair, write_rig
 
 

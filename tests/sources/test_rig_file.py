@@ -9,8 +9,8 @@ import pytest
 from made_recordings import write_png
 from made_rigs import CAMERA, FORWARD, cylinder, eyes, rig
 
+from stereovox.cameras.rigs import Eyes, StereoPair
 from stereovox.errors import SourceError
-from stereovox.rigs import Eyes, StereoPair
 from stereovox.sources.rig_file import Rig, RigPair, Virtual, read_rig, write_rig
 
 MINIMAL = """

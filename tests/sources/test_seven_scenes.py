@@ -8,7 +8,7 @@ import pytest
 from made_recordings import depth_image, pose, seven_scenes, write_png
 
 from stereovox.errors import SourceError
-from stereovox.sources import open_source
+from stereovox.opening import open_source
 from stereovox.sources.seven_scenes import SevenScenes
 
 KITCHEN = Path(__file__).resolve().parents[2] / "../shared/data/sevenscenes_redkitchen"

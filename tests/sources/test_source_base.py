@@ -6,10 +6,10 @@ import threading
 import numpy as np
 import pytest
 
-from stereovox.cameras import PinholeCamera
+from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.errors import SourceError
 from stereovox.frame import Frame
-from stereovox.sources import Selection, Source, parse_slice
+from stereovox.opening import Selection, Source, parse_slice
 from stereovox.sources.base import AHEAD, prefetch
 
 

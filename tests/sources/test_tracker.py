@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from stereovox.errors import FrameRefused, SourceError
-from stereovox.geometry import rigidity_error, rotation_matrix
+from stereovox.se3 import rigidity_error, rotation_matrix
 from stereovox.sources.poses import Poses
 from stereovox.sources.tracker import angles, jumps, on_clock, read_tracker
 

@@ -11,13 +11,13 @@ from made_pages import Balanced
 from matplotlib.colors import to_rgb
 from matplotlib.image import imread
 
-from stereovox import planar
+from stereovox import se2
 from stereovox.errors import StereovoxError
-from stereovox.evaluate.grid_errors import Difference, differences, wrong
 from stereovox.evaluate.grid_lattice import lay
-from stereovox.evaluate.grid_scores import laid_on, score_laid
+from stereovox.evaluate.grid_scores import Difference, differences, laid_on, score_laid, wrong
 from stereovox.maps import State
 from stereovox.maps.occupancy import OccupancyGrid
+from stereovox.report.grid import write_grid_report
 from stereovox.view.grid import draw_grid, picture_grid, pooled, trimmed
 from stereovox.view.grid_difference import (
     BOTH_FREE,
@@ -29,7 +29,6 @@ from stereovox.view.grid_difference import (
     difference_png,
     side_by_side_png,
 )
-from stereovox.view.grid_report import write_grid_report
 from stereovox.view.panels import PATH_COLOUR, STATE_COLOURS
 
 
@@ -135,7 +134,7 @@ def test_pictures_of_nothing_and_of_little(tmp_path):
     empty = changed(room(), np.full((80, 120), -1))
     picture_grid(empty, tmp_path / "empty.png")
     assert "empty" in draw_grid(empty, "x").texts[0].get_text()
-    one = OccupancyGrid(np.array([[WALL]], np.int8), 0.05, tuple(planar.inverse((1, 2, 3))))
+    one = OccupancyGrid(np.array([[WALL]], np.int8), 0.05, tuple(se2.inverse((1, 2, 3))))
     picture_grid(one, tmp_path / "one.png", title="one cell", track=np.zeros((0, 3)))
     long = replace(room(), cells=np.zeros((3, 3000), np.int8))
     picture_grid(long, tmp_path / "long.png", track=[[0, 0]])

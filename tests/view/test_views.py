@@ -4,22 +4,22 @@
 import numpy as np
 import pytest
 
-from stereovox.cameras import PinholeCamera
+from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.config import load_config
 from stereovox.errors import StereovoxError
 from stereovox.frame import Viewpoint
-from stereovox.geometry import rigidity_error
 from stereovox.maps import VoxelMap, load_map
+from stereovox.se3 import rigidity_error
 from stereovox.view.drawn import UPS, upright
 from stereovox.view.figures import save
-from stereovox.view.frame3d import numbers
 from stereovox.view.landscape import FROM, columns, thinned
 from stereovox.view.layer import upright_layer
 from stereovox.view.panels import PATH_COLOUR
 from stereovox.view.render import render
 from stereovox.view.scale import scale_of
+from stereovox.view.space import numbers
+from stereovox.view.viewpoint import field_of_view, viewpoint_at
 from stereovox.view.views import VIEWS, draw_view
-from stereovox.view.whereabouts import field_of_view, viewpoint_at
 
 CAMERA = PinholeCamera.from_field_of_view(100, 60, 90, 0.05)
 

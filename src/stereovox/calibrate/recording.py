@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.calibrate.surface import find_wall
-from stereovox.cameras import PinholeCamera
-from stereovox.depth.correct import correct
+from stereovox.cameras.pinhole import PinholeCamera
+from stereovox.depth.prepare import correct
 from stereovox.errors import StereovoxError
 from stereovox.frame import Frame, Reason
 

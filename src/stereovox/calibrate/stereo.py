@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from stereovox.calibrate.chessboard import Board, find_corners, image_pairs, read_grey, same_order
 from stereovox.calibrate.stereo_fit import Fit, fit_stereo, missed_pixels, refined
+from stereovox.cameras.lenses import MODELS, Lens
+from stereovox.cameras.rigs import Eyes
 from stereovox.errors import StereovoxError
-from stereovox.geometry import inverse
-from stereovox.lenses import MODELS, Lens
-from stereovox.rigs import Eyes
+from stereovox.se3 import inverse
 
 FEWEST = 3
 """Pairs of images that say enough."""

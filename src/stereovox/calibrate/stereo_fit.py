@@ -18,10 +18,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from stereovox.cameras.lenses import Lens
+from stereovox.cameras.rigs import Eyes
 from stereovox.errors import StereovoxError
-from stereovox.geometry import Transform, inverse, rotation_matrix, rotation_vector, transform_points
-from stereovox.lenses import Lens
-from stereovox.rigs import Eyes
+from stereovox.se3 import Transform, inverse, rotation_matrix, rotation_vector, transform_points
 
 MANY = 10
 """Views from which on a fifth coefficient of Brown and Conrady's is found as well; with fewer it only follows noise."""

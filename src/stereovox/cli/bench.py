@@ -18,7 +18,7 @@ from stereovox.cli.terminal import progress_bar, say, say_about_compiling
 from stereovox.errors import StereovoxError
 
 if TYPE_CHECKING:
-    from stereovox.evaluate.bench import Variant
+    from stereovox.lab.bench.rows import Variant
 
 EXAMPLE = "stereovox bench recordings/kitchen --voxel-size 0.1 --voxel-size 0.05 --peers octomap,pyoctomap"
 VOXEL_SIZES = (0.2, 0.1, 0.05, 0.02)
@@ -67,8 +67,8 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Run the comparison and what else was asked for; print the tables and write the files."""
-    from stereovox.evaluate import bench_files
-    from stereovox.evaluate.out_folder import out_folder
+    from stereovox.lab.bench import files
+    from stereovox.report.folder import out_folder
 
     folder = out_folder(arguments.out) if arguments.out is not None else None
     result: dict[str, Any] = {}
@@ -76,7 +76,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
     def so_far(found: dict[str, Any]) -> None:
         result.update(found)
         if folder is not None:
-            bench_files.write(result, folder)
+            files.write(result, folder)
 
     try:
         _measure(arguments, so_far)
@@ -91,10 +91,10 @@ def run(arguments: Namespace) -> dict[str, Any]:
 
 def _measure(arguments: Namespace, so_far: Callable[[dict[str, Any]], None]) -> None:
     """Measure all that was asked for, and hand over what is done whenever something is."""
-    from stereovox.evaluate.bench import compare, find_peers
-    from stereovox.evaluate.bench_frames import read_frames
-    from stereovox.evaluate.bench_more import MEASUREMENTS, Given, check_names
-    from stereovox.sources import open_source
+    from stereovox.lab.bench.frames import read_frames
+    from stereovox.lab.bench.more import MEASUREMENTS, Given, check_names
+    from stereovox.lab.bench.rows import compare, find_peers
+    from stereovox.opening import open_source
 
     wanted = check_names(list(MEASUREMENTS) if arguments.all else _named(arguments.also))
     sizes = arguments.voxel_size or VOXEL_SIZES
@@ -126,9 +126,9 @@ def _measure(arguments: Namespace, so_far: Callable[[dict[str, Any]], None]) -> 
 def _ways(arguments: Namespace) -> list[Variant]:
     """Return how stereovox is run: each integrator on one thread and on all cores, or on as many as asked for."""
     from stereovox import registry
-    from stereovox.evaluate.bench import Variant
-    from stereovox.evaluate.bench_machine import cores
     from stereovox.integrate import INTEGRATORS
+    from stereovox.lab.bench.machine import cores
+    from stereovox.lab.bench.rows import Variant
 
     threads = dict.fromkeys((1, cores())) if arguments.threads is None else (arguments.threads,)
     integrators = _named(arguments.integrators)
@@ -141,8 +141,7 @@ def _ways(arguments: Namespace) -> list[Variant]:
 
 def _limits(arguments: Namespace, wanted: Sequence[str]) -> dict[str, int]:
     """Return the sizes of measurements that were asked for; raises StereovoxError for those that cannot be."""
-    from stereovox.evaluate.bench_path import LEAST_FRAMES
-    from stereovox.evaluate.bench_size import CELLS
+    from stereovox.lab.bench.growth import CELLS, LEAST_FRAMES
 
     options = (
         ("--frames-long", "path_frames", arguments.frames_long, LEAST_FRAMES, "path"),
@@ -162,7 +161,7 @@ def _limits(arguments: Namespace, wanted: Sequence[str]) -> dict[str, int]:
 
 def _peers(text: str | None) -> tuple[list[str], list[str]]:
     """Return the peers to compare with, and a line for each usual one that is not installed."""
-    from stereovox.evaluate.peers import installed
+    from stereovox.lab.bench.peers import installed
 
     if text is None:
         return installed()
@@ -177,9 +176,9 @@ def _named(text: str) -> list[str]:
 
 def _tell(result: dict[str, Any], folder: Path | None) -> None:
     """Print the tables, draw the picture and say where the files are."""
-    from stereovox.evaluate import bench_files
+    from stereovox.lab.bench import files
 
-    say(bench_files.text(result))
+    say(files.text(result))
     if folder is not None:
-        bench_files.write_picture(result, folder)
+        files.write_picture(result, folder)
         say(f"written into {folder}: bench.json, bench.md, bench.png")

@@ -42,10 +42,9 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Read, write the rig file and tell what is in it."""
-    from stereovox.files import replacing
+    from stereovox.safe_io import replacing
     from stereovox.sources.calibration_files import import_rig
-    from stereovox.sources.rig_file import Virtual
-    from stereovox.sources.rig_tables import rig_text
+    from stereovox.sources.rig_file import Virtual, rig_text
 
     check_outputs(arguments.out)
     files = [Path(name) for name in arguments.files]

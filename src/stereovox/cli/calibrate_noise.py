@@ -51,7 +51,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
     _tell(found, arguments.out)
     result = {**found.as_dict(), "out": arguments.out}
     if arguments.report:
-        from stereovox.view.calibration_report import write_noise_report
+        from stereovox.report.calibration import write_noise_report
 
         result["report"] = str(write_noise_report(arguments.report, found, arguments.out))
         say(f"report: {result['report']}")
@@ -78,7 +78,7 @@ def _terms(text: str) -> list[str]:
 
 
 def _write(out: str, found: NoiseCalibration) -> None:
-    from stereovox.files import replacing
+    from stereovox.safe_io import replacing
 
     with replacing(out) as file:
         file.write(profile_text(found).encode())

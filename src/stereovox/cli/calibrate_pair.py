@@ -19,7 +19,7 @@ from stereovox.errors import StereovoxError
 
 if TYPE_CHECKING:
     from stereovox.calibrate.pair import PairCalibration
-    from stereovox.sources import DepthSource
+    from stereovox.opening import DepthSource
     from stereovox.sources.pair_file import PairSettings
 
 EXAMPLE = "stereovox calibrate pair recordings/flight --out recordings/flight/pair.toml"
@@ -42,7 +42,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Calibrate, print the result and write it."""
-    from stereovox.sources import Selection, open_depth
+    from stereovox.opening import Selection, open_depth
 
     folder = Path(arguments.recording)
     settings = _settings(folder)
@@ -106,7 +106,7 @@ def _settings(folder: Path) -> PairSettings:
 def _tell(found: PairCalibration) -> None:
     import numpy as np
 
-    from stereovox.geometry import rotation_vector
+    from stereovox.se3 import rotation_vector
 
     turn = np.degrees(rotation_vector(found.T_tracker_camera[:3, :3]))
     place = 1000 * found.T_tracker_camera[:3, 3]
@@ -126,7 +126,7 @@ def _three(numbers: Any, form: str) -> str:
 
 
 def _write(arguments: Namespace, folder: Path, settings: PairSettings, found: PairCalibration) -> None:
-    from stereovox.files import replacing
+    from stereovox.safe_io import replacing
     from stereovox.sources.pair_file import FILE, pair_text
 
     if not arguments.out:

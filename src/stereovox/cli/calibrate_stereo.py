@@ -52,7 +52,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
     _tell(found, arguments, alone)
     result = {**found.as_dict(), "unmatched": alone, "out": arguments.out}
     if arguments.report:
-        from stereovox.view.calibration_stereo import write_stereo_report
+        from stereovox.report.stereo import write_stereo_report
 
         result["report"] = str(write_stereo_report(arguments.report, found, arguments.out))
         say(f"report: {result['report']}")
@@ -70,9 +70,8 @@ def _board(text: str, square: float) -> Any:
 
 
 def _write(arguments: Namespace, found: StereoCalibration) -> None:
-    from stereovox.files import replacing
-    from stereovox.sources.rig_file import Rig, RigPair, Virtual
-    from stereovox.sources.rig_tables import rig_text
+    from stereovox.safe_io import replacing
+    from stereovox.sources.rig_file import Rig, RigPair, Virtual, rig_text
 
     model = arguments.rectify or ("spherical" if found.eyes.left.model == "fisheye" else "pinhole")
     pair = RigPair(arguments.name, eyes=found.eyes, virtual=Virtual(model))

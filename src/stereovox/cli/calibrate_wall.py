@@ -56,7 +56,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
     _tell(found, arguments.out)
     result = {**found.as_dict(), "out": arguments.out}
     if arguments.report:
-        from stereovox.view.calibration_report import write_wall_report
+        from stereovox.report.calibration import write_wall_report
 
         result["report"] = str(write_wall_report(arguments.report, found, arguments.out))
         say(f"report: {result['report']}")
@@ -64,7 +64,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
 
 
 def _write(out: str, found: WallCalibration) -> None:
-    from stereovox.files import replacing
+    from stereovox.safe_io import replacing
     from stereovox.sources.camera_file import camera_text
 
     fitted = [wall.as_dict() for wall in found.walls if wall.fitted]

@@ -6,8 +6,7 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 from typing import Any
 
-from stereovox.cli.new_map import check_new, save_new
-from stereovox.cli.saved_map import open_map
+from stereovox.cli.maps import check_new, open_map, save_new
 
 EXAMPLE = "stereovox coarsen kitchen.svox kitchen10.svox --factor 2"
 

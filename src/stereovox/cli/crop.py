@@ -6,9 +6,8 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 from typing import Any
 
-from stereovox.cli.new_map import check_new, save_new
-from stereovox.cli.numbers import CORNERS, numbers_of
-from stereovox.cli.saved_map import open_map
+from stereovox.cli.maps import check_new, open_map, save_new
+from stereovox.cli.options import CORNERS, numbers_of
 from stereovox.errors import StereovoxError
 
 EXAMPLE = "stereovox crop kitchen.svox table.svox --box=-1,-1,0,1,1,2"

@@ -22,7 +22,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Run the demo and tell where its results are."""
-    from stereovox.evaluate.demo import demo
+    from stereovox.lab.demo import demo
 
     say_about_compiling()
     with progress_of_steps("starting") as progress:

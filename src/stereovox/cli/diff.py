@@ -7,10 +7,9 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stereovox.cli.endings import check_ending
+from stereovox.cli.maps import open_map
 from stereovox.cli.merge import add_transform
-from stereovox.cli.numbers import transform_of
-from stereovox.cli.saved_map import open_map
+from stereovox.cli.options import check_ending, transform_of
 from stereovox.cli.terminal import say, thousands
 
 if TYPE_CHECKING:
@@ -57,7 +56,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
         write_difference(changes, a.config.cell, arguments.out)
         say(f"saved {arguments.out}")
     if arguments.picture:
-        from stereovox.view.changes import draw_changes
+        from stereovox.view.above import draw_changes
         from stereovox.view.figures import save
 
         save(draw_changes(a, b, f"{Path(arguments.a).stem} to {Path(arguments.b).stem}"), arguments.picture)

@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from stereovox.cli.endings import check_ending
-from stereovox.cli.numbers import CORNERS, numbers_of
-from stereovox.cli.saved_map import open_map
+from stereovox.cli.maps import open_map
+from stereovox.cli.options import CORNERS, check_ending, numbers_of
 from stereovox.cli.terminal import say, size, thousands
 from stereovox.errors import StereovoxError
 
@@ -57,8 +56,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 def run(arguments: Namespace) -> dict[str, Any]:
     """Measure the distances, write them and tell about them."""
     from stereovox.maps import State
-    from stereovox.products.distance import DistanceField
-    from stereovox.products.distance_file import write_distance
+    from stereovox.products.distance import DistanceField, write_distance
 
     _check_files(arguments)
     voxel_map = open_map(arguments.map)

@@ -12,8 +12,8 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import Any
 
-from stereovox.cli.numbers import heights_of
-from stereovox.cli.saved_map import dimensions, open_map, refuse_options
+from stereovox.cli.maps import dimensions, open_map, refuse_options
+from stereovox.cli.options import heights_of
 from stereovox.cli.terminal import say, size
 
 EXAMPLE = "stereovox export kitchen.svox kitchen.bt"
@@ -36,7 +36,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Load the map and write it in the other format."""
-    from stereovox.products import BAGS, FLAT, export
+    from stereovox.formats import BAGS, FLAT, export
 
     file, heights = Path(arguments.file), heights_of(arguments.heights)
     ending = file.suffix.lower()
@@ -60,8 +60,8 @@ def run(arguments: Namespace) -> dict[str, Any]:
 
 def _floor(arguments: Namespace) -> dict[str, Any]:
     """Write the map of a floor into a bag."""
-    from stereovox.products.bag_maps import write_grid_bag
-    from stereovox.products.map_server import read_map_server
+    from stereovox.formats.bags import write_grid_bag
+    from stereovox.formats.map_server import read_map_server
 
     refuse_options(arguments, ["heights", "inflate"], "a floor's map goes into a bag as it is")
     write_grid_bag(read_map_server(arguments.map), arguments.file)

@@ -7,9 +7,8 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stereovox.cli.endings import check_ending
-from stereovox.cli.numbers import heights_of, point
-from stereovox.cli.saved_map import open_map
+from stereovox.cli.maps import open_map
+from stereovox.cli.options import check_ending, heights_of, point
 from stereovox.cli.terminal import say, thousands
 
 if TYPE_CHECKING:
@@ -48,8 +47,8 @@ def run(arguments: Namespace) -> dict[str, Any]:
         write_frontiers(found, arguments.out)
         say(f"saved {arguments.out}")
     if arguments.picture:
+        from stereovox.view.above import draw_frontiers
         from stereovox.view.figures import save
-        from stereovox.view.frontier import draw_frontiers
 
         save(draw_frontiers(voxel_map, found, f"{Path(arguments.map).stem}: frontiers"), arguments.picture)
         say(f"saved {arguments.picture}")

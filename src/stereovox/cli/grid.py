@@ -11,10 +11,9 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stereovox.cli.checkpoints import add_checkpoint
 from stereovox.cli.localize import add_start, parse_start
+from stereovox.cli.options import add_checkpoint, overrides
 from stereovox.cli.robots import add_robot, picture_line
-from stereovox.cli.settings import overrides
 from stereovox.cli.terminal import (
     cells_line,
     milliseconds,
@@ -26,7 +25,7 @@ from stereovox.cli.terminal import (
 )
 
 if TYPE_CHECKING:
-    from stereovox.update_report import UpdateReport
+    from stereovox.frame import UpdateReport
 
 EXAMPLE = "stereovox grid floor.bag --poses reference.yaml --out kinect.yaml"
 MODES = ("trinary", "scale", "raw")

@@ -11,9 +11,8 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stereovox.cli.endings import check_ending
-from stereovox.cli.numbers import point
-from stereovox.cli.saved_map import open_map
+from stereovox.cli.maps import open_map
+from stereovox.cli.options import check_ending, point
 from stereovox.cli.terminal import say, thousands
 
 if TYPE_CHECKING:
@@ -56,8 +55,8 @@ def run(arguments: Namespace) -> dict[str, Any]:
 def _write(voxel_map: VoxelMap, found: Ground, arguments: Namespace) -> None:
     ending = Path(arguments.file).suffix.lower()
     if ending == ".png":
+        from stereovox.view.above import draw_ground
         from stereovox.view.figures import save
-        from stereovox.view.ground import draw_ground
 
         save(draw_ground(voxel_map, found, f"{Path(arguments.map).stem}: ground"), arguments.file)
     elif ending == ".npz":
@@ -65,7 +64,7 @@ def _write(voxel_map: VoxelMap, found: Ground, arguments: Namespace) -> None:
 
         write_ground(found, arguments.file)
     else:
-        from stereovox.products.map_server import write_map_server
+        from stereovox.formats.map_server import write_map_server
 
         write_map_server(found.grid, arguments.file)
 

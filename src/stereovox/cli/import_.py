@@ -12,10 +12,10 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import Any
 
-from stereovox.cli.saved_map import refuse_options
+from stereovox.cli.maps import refuse_options
 from stereovox.cli.terminal import say, thousands
 from stereovox.errors import StereovoxError
-from stereovox.files import FLOOR_ENDINGS
+from stereovox.safe_io import FLOOR_ENDINGS
 
 EXAMPLE = "stereovox import building.bt building.svox"
 IN_SPACE = (".bt", ".ot", ".npz", ".ply", ".pcd")
@@ -36,7 +36,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
 
 
 def _cells(arguments: Namespace) -> dict[str, Any]:
-    from stereovox.products.imports import import_map
+    from stereovox.formats import import_map
 
     voxel_map = import_map(arguments.file, arguments.voxel_size, arguments.topic)
     voxel_map.save(arguments.map)
@@ -47,8 +47,8 @@ def _cells(arguments: Namespace) -> dict[str, Any]:
 
 
 def _grid(arguments: Namespace) -> dict[str, Any]:
-    from stereovox.products.bag_maps import read_bag_grid
-    from stereovox.products.map_server import write_map_server
+    from stereovox.formats.bags import read_bag_grid
+    from stereovox.formats.map_server import write_map_server
 
     if Path(arguments.file).suffix.lower() in IN_SPACE:
         raise StereovoxError(

@@ -10,7 +10,7 @@ from argparse import ArgumentParser, Namespace
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
-from stereovox.cli.saved_map import dimensions, open_map
+from stereovox.cli.maps import dimensions, open_map
 from stereovox.cli.terminal import say, size, thousands
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ def _about_cells(path: str) -> dict[str, Any]:
 
 
 def _about_grid(path: str) -> dict[str, Any]:
-    from stereovox.cli.floor_map import about
+    from stereovox.cli.maps import about
 
     return about(path)
 
@@ -64,7 +64,7 @@ ABOUT = {2: _about_grid, 3: _about_cells}
 
 
 def _tell(result: dict[str, Any]) -> None:
-    from stereovox.health import FULL
+    from stereovox.trust.health import FULL
 
     settings = result["settings"]
     say(f"made of {result['recording'] or 'frames without a name'}, profile {result['profile']}")

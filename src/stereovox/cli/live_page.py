@@ -10,11 +10,10 @@ from typing import TYPE_CHECKING
 from stereovox.cli.terminal import say
 
 if TYPE_CHECKING:
-    from stereovox.frame import AnyFrame
+    from stereovox.formats.rerun import RerunLog
+    from stereovox.frame import AnyFrame, UpdateReport
     from stereovox.mapper import Mapper
-    from stereovox.products.rerun_write import RerunLog
-    from stereovox.update_report import UpdateReport
-    from stereovox.view.viewer_live import LiveView
+    from stereovox.viewer.live import LiveView
 
 
 class NoPage:
@@ -58,7 +57,7 @@ def page_of(mapper: Mapper, name: str, port: int | None) -> Iterator[NoPage]:
         yield NoPage()
         return
     from stereovox.cli.view import quiet
-    from stereovox.view.viewer_live import LiveView
+    from stereovox.viewer.live import LiveView
 
     quiet()
     with closing(LiveView(mapper, name, port=port)) as live:
@@ -73,7 +72,7 @@ def rerun_of(mapper: Mapper, file: str | None) -> Iterator[NoPage]:
         yield NoPage()
         return
     from stereovox.depth import DepthPath
-    from stereovox.products.rerun_write import RerunLog, rerun_file
+    from stereovox.formats.rerun import RerunLog, rerun_file
 
     with rerun_file(file, mapper.config.up) as opened:
         stopped = None

@@ -16,7 +16,7 @@ import numpy as np
 from stereovox.cli.robots import add_robot, opened, settings_of, way_error
 from stereovox.cli.terminal import progress_of_steps, say, say_about_compiling
 from stereovox.errors import StereovoxError
-from stereovox.files import check_file
+from stereovox.safe_io import check_file
 
 if TYPE_CHECKING:
     from stereovox.localize.track import Track
@@ -45,8 +45,8 @@ def add_start(parser: ArgumentParser) -> None:
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Localise, save the way and tell where it ended."""
+    from stereovox.formats.map_server import read_map_server
     from stereovox.localize.robot_way import check_start, fit_of, localise_robot, refused_line
-    from stereovox.products.map_server import read_map_server
 
     out, config = check_file(arguments.out, (*TEXT, *BAGS)), settings_of(arguments)
     start, grid = parse_start(arguments.start), read_map_server(arguments.map)
@@ -71,15 +71,15 @@ def _save(track: Track, out: Path) -> None:
     """Write the way as text, or as ROS's amcl tells it: /amcl_pose, and map -> odom on /tf."""
     if out.suffix.lower() in TEXT:
         return track.save(out)
-    from stereovox import planar
-    from stereovox.sources.bag_writer import BagWriter
+    from stereovox import se2
+    from stereovox.sources.bags.writer import BagWriter
 
     with BagWriter(out) as bag:
         for stamp_ns, base, odom in zip(
             track.stamps_ns.tolist(), track.pose_map_base, track.pose_map_odom, strict=True
         ):
             bag.pose(stamp_ns, base)
-            bag.transform(stamp_ns, "map", "odom", planar.lifted(odom))
+            bag.transform(stamp_ns, "map", "odom", se2.lifted(odom))
 
 
 def parse_start(text: str | None) -> np.ndarray | None:

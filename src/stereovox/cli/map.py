@@ -12,10 +12,8 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stereovox.cli.checkpoints import add_checkpoint
-from stereovox.cli.endings import check_ending
 from stereovox.cli.live_page import page_of, rerun_of
-from stereovox.cli.settings import add_settings, overrides
+from stereovox.cli.options import add_checkpoint, add_settings, check_ending, overrides
 from stereovox.cli.terminal import (
     cells_line,
     command_line,
@@ -30,7 +28,7 @@ from stereovox.errors import StereovoxError
 
 if TYPE_CHECKING:
     from stereovox.config import WindowConfig
-    from stereovox.update_report import UpdateReport
+    from stereovox.frame import UpdateReport
 
 PORT = 8080
 EXAMPLE = "stereovox map recordings/kitchen --out kitchen.svox --voxel-size 0.05"
@@ -117,7 +115,7 @@ def _grid(arguments: Namespace) -> dict[str, Any]:
 
 
 def _tell(result: dict[str, Any], reports: list[UpdateReport], out: Path, window: WindowConfig) -> None:
-    from stereovox.health import FULL
+    from stereovox.trust.health import FULL
 
     say_refusals(result, reports, "frames")
     if result.get("dropped"):

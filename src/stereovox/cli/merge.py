@@ -6,9 +6,8 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 from typing import Any
 
-from stereovox.cli.new_map import check_new, save_new
-from stereovox.cli.numbers import transform_of
-from stereovox.cli.saved_map import open_map
+from stereovox.cli.maps import check_new, open_map, save_new
+from stereovox.cli.options import transform_of
 
 EXAMPLE = "stereovox merge kitchen.svox hall.svox --out both.svox --transform 4.2,0,0,0,0,0.7071,0.7071"
 

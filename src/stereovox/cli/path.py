@@ -14,9 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from stereovox.cli.endings import check_ending
-from stereovox.cli.numbers import point
-from stereovox.cli.saved_map import open_map
+from stereovox.cli.maps import open_map
+from stereovox.cli.options import check_ending, point
 from stereovox.cli.terminal import say
 
 if TYPE_CHECKING:

@@ -10,8 +10,8 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stereovox.cli.numbers import point
-from stereovox.cli.saved_map import dimensions, open_cubes, refuse_options
+from stereovox.cli.maps import dimensions, open_cubes, refuse_options
+from stereovox.cli.options import point
 from stereovox.cli.terminal import say
 from stereovox.errors import StereovoxError
 
@@ -63,8 +63,8 @@ def _draw_cells(arguments: Namespace, heading: str) -> Any:
     """Return the figure of a map in space."""
     from stereovox.view.drawn import checked_up
     from stereovox.view.paper import draw_paper
+    from stereovox.view.viewpoint import viewpoint_at
     from stereovox.view.views import draw_view
-    from stereovox.view.whereabouts import viewpoint_at
 
     arguments.view = arguments.view or "overview"
     _check_use(arguments)
@@ -82,7 +82,7 @@ def _draw_cells(arguments: Namespace, heading: str) -> Any:
 
 def _draw_grid(arguments: Namespace, heading: str) -> Any:
     """Return the figure of a floor's map."""
-    from stereovox.cli.floor_map import check_not_its_own, open_grid
+    from stereovox.cli.maps import check_not_its_own, open_grid
     from stereovox.view.grid import draw_grid
 
     refuse_options(

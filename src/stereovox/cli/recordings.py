@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING
 
 from stereovox.cli.terminal import say, tracked
 from stereovox.errors import StereovoxError
-from stereovox.files import check_folder
+from stereovox.safe_io import check_folder
 
 if TYPE_CHECKING:
     from stereovox.calibrate.recording import WallRecording
-    from stereovox.sources import Stream
+    from stereovox.opening import Stream
 
 LIVE_FRAMES = 60
 """Frames taken of a live camera where --frames names no last one."""
@@ -72,8 +72,8 @@ def _read(name: str, distance: float | None, frames: str | None, camera: str | N
     from stereovox.calibrate.recording import read_wall
     from stereovox.config import load_config
     from stereovox.depth import DepthPath
-    from stereovox.sources import open_images, parse_slice
-    from stereovox.sources.with_camera import with_camera
+    from stereovox.opening import open_images, parse_slice
+    from stereovox.sources.camera_file import with_camera
 
     stream: Stream = open_images(name, frames)
     if camera is not None:

@@ -26,7 +26,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Run the experiments and tell what holds."""
-    from stereovox.evaluate.reproduce import reproduce
+    from stereovox.lab.papers import reproduce
 
     say_about_compiling()
     with progress_bar() as bar:

@@ -7,13 +7,13 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stereovox.cli.settings import add_settings, overrides
+from stereovox.cli.options import add_settings, overrides
 from stereovox.cli.terminal import command_line, say
 
 if TYPE_CHECKING:
     from stereovox.config import Config
     from stereovox.localize.track import Track
-    from stereovox.sources.robot import Robot
+    from stereovox.sources.robots.robot import Robot
 
 
 def add_robot(parser: ArgumentParser) -> None:
@@ -34,7 +34,7 @@ def settings_of(arguments: Namespace) -> Config:
 
 def opened(where: str) -> Robot:
     """Open the recording and say what had to be assumed about it."""
-    from stereovox.sources import open_robot
+    from stereovox.opening import open_robot
 
     robot = open_robot(where)
     for note in robot.notes:
@@ -46,7 +46,7 @@ def way_error(track: Track, robot: Robot) -> dict[str, Any]:
     """Say how far the way found is from the true one, where that is known, and return it."""
     if robot.truth is None:
         return {}
-    from stereovox.evaluate.trajectory_error import trajectory_error
+    from stereovox.evaluate.trajectory import trajectory_error
 
     error = trajectory_error(track, robot.truth)
     off = f"{100 * error.position_rms_m:.1f} cm (RMS) and {error.yaw_rms_deg:.2f} degrees"

@@ -13,18 +13,18 @@ from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stereovox.cli.settings import add_settings, overrides
+from stereovox.cli.options import add_settings, overrides
 from stereovox.cli.terminal import milliseconds, say, say_about_compiling
 from stereovox.errors import MapFileError
-from stereovox.files import FLOOR_ENDINGS, check_file, check_in_space
+from stereovox.safe_io import FLOOR_ENDINGS, check_file, check_in_space
 
 if TYPE_CHECKING:
     from stereovox.config import Config
+    from stereovox.frame import UpdateReport
     from stereovox.ros.mapping import Mapping
     from stereovox.ros.node import MapNode
     from stereovox.ros.options import Options
     from stereovox.run import Checkpoints
-    from stereovox.update_report import UpdateReport
 
 EXAMPLE = "stereovox ros2 --depth /camera/depth/image_rect_raw --out room.svox"
 LATELY = 10_000
@@ -63,11 +63,11 @@ def run(arguments: Namespace) -> dict[str, Any]:
     from stereovox.ros.library import check_installed
 
     check_installed()
-    from stereovox.ros.running import running_node
+    from stereovox.ros.library import running_node
 
     with running_node(arguments.ros_args) as node, ExitStack() as stack:
         from stereovox.ros.mapping import Mapping
-        from stereovox.ros.parameters import freeze
+        from stereovox.ros.options import freeze
         from stereovox.ros.warm_up import warm_up
 
         config, options = _settings(arguments, node)
@@ -86,7 +86,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
 
 def _map(arguments: Namespace, node: Any, mapping: Mapping, options: Options) -> dict[str, Any]:
     from stereovox.ros.node import MapNode
-    from stereovox.ros.parameters import FREE
+    from stereovox.ros.options import FREE
     from stereovox.run import Checkpoints, interrupt_between_steps
 
     reports: deque[UpdateReport] = deque(maxlen=LATELY)
@@ -158,8 +158,7 @@ def _save(mapping: Mapping, out: str) -> bool:
 def _settings(arguments: Namespace, node: Any) -> tuple[Config, Options]:
     """Return the settings of the map and the options of the node; the command line counts before parameters."""
     from stereovox.config import load_config
-    from stereovox.ros.options import LISTS, Options, with_parameters
-    from stereovox.ros.parameters import given_parameters
+    from stereovox.ros.options import LISTS, Options, given_parameters, with_parameters
 
     given = given_parameters(node)
     profile = arguments.profile or given.settings.pop("profile", "default")

@@ -11,7 +11,7 @@ from typing import Any
 
 from stereovox.cli.robots import opened
 from stereovox.cli.terminal import command_line, progress_bar, say, size
-from stereovox.files import check_file
+from stereovox.safe_io import check_file
 
 EXAMPLE = "stereovox simulate sim:floor --out floor.bag"
 
@@ -24,7 +24,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Write the bag and tell what is in it."""
-    from stereovox.sources.floor_bag import write_bag
+    from stereovox.simulate.floors.bag import write_bag
 
     out = check_file(arguments.out, (".bag", ".mcap", ".db3"))
     robot = opened(arguments.source)

@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Any
 
 from stereovox.cli.robots import add_robot, opened, picture_line, settings_of, way_error
 from stereovox.cli.terminal import progress_of_steps, say, say_about_compiling
-from stereovox.files import FLOOR_ENDINGS, check_file
+from stereovox.safe_io import FLOOR_ENDINGS, check_file
 
 if TYPE_CHECKING:
-    from stereovox.localize.slam import SlamResult
-    from stereovox.sources.robot import Robot
+    from stereovox.localize.slam.pipeline import SlamResult
+    from stereovox.sources.robots.robot import Robot
 
 EXAMPLE = "stereovox slam floor.bag --out reference.yaml"
 
@@ -44,9 +44,9 @@ def run(arguments: Namespace) -> dict[str, Any]:
 
 
 def _mapped(arguments: Namespace, out: Path) -> dict[str, Any]:
-    from stereovox.evaluate.relations import read_relations
+    from stereovox.evaluate.trajectory import read_relations
+    from stereovox.formats.map_server import write_map_server
     from stereovox.localize.robot_way import slam_robot
-    from stereovox.products.map_server import write_map_server
 
     config = settings_of(arguments)
     if arguments.relations is not None:
@@ -81,7 +81,7 @@ def _told(robot: Robot, found: SlamResult, seconds: float) -> dict[str, Any]:
 def _scored(found: SlamResult, relations: str | None) -> dict[str, Any]:
     if relations is None:
         return {}
-    from stereovox.evaluate.relations import score_relations
+    from stereovox.evaluate.trajectory import score_relations
 
     score = score_relations(found.track, Path(relations))
     say(score.line())

@@ -10,7 +10,7 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 from typing import TYPE_CHECKING, Any
 
-from stereovox.cli.endings import check_ending
+from stereovox.cli.options import check_ending
 from stereovox.cli.terminal import say, say_about_compiling, tracked
 from stereovox.errors import StereovoxError
 
@@ -35,8 +35,8 @@ def add_arguments(parser: ArgumentParser) -> None:
 def run(arguments: Namespace) -> dict[str, Any]:
     """Look round, tell what is near, and draw it."""
     from stereovox.depth.sphere import surroundings
-    from stereovox.evaluate.look_round import look_round
-    from stereovox.sources import open_stream
+    from stereovox.depth.sphere.vehicle import vehicle_grid
+    from stereovox.opening import open_stream
 
     check_ending("--out", arguments.out, ".png")
     config = _config(arguments)
@@ -46,7 +46,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
     for note in stream.notes:
         _note(note)
     say_about_compiling()
-    grid, now_ns, refused = look_round(tracked(stream, stream.length, "looking"), config, _note)
+    grid, now_ns, refused = vehicle_grid(tracked(stream, stream.length, "looking"), config, _note)
     sights = surroundings(grid)
     result = {
         "step_deg": config.sphere.step_deg,

@@ -14,7 +14,7 @@ from stereovox.errors import one_line
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
-    from stereovox.update_report import UpdateReport
+    from stereovox.frame import UpdateReport
 
 T = TypeVar("T")
 

@@ -47,7 +47,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
     """Make the map, save it and tell about it."""
     from stereovox.evaluate.lidar_truth import lidar_truth
     from stereovox.maps.store import check_target
-    from stereovox.sources import open_source
+    from stereovox.opening import open_source
 
     out = Path(arguments.out)
     check_target(out)

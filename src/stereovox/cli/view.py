@@ -10,11 +10,11 @@ from contextlib import closing, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from stereovox.cli.saved_map import open_map, refuse_options
+from stereovox.cli.maps import open_map, refuse_options
 from stereovox.cli.terminal import say
 
 if TYPE_CHECKING:
-    from stereovox.sources import Source
+    from stereovox.opening import Source
 
 TOKEN = "STEREOVOX_TOKEN"
 EXAMPLE = "stereovox view kitchen.svox"
@@ -53,7 +53,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 def run(arguments: Namespace) -> dict[str, Any]:
     """Serve the page until Ctrl-C."""
     from stereovox.maps.cubes import in_cubes
-    from stereovox.view.viewer import open_viewer
+    from stereovox.viewer.viewer import open_viewer
 
     quiet()
     voxel_map, source = open_map(arguments.map), _recording(arguments)
@@ -62,7 +62,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
     viewer = open_viewer(in_cubes(voxel_map), name, *place, arguments.up, token, arguments.most_cells)
     with closing(viewer), suppress(KeyboardInterrupt):
         if source is not None:
-            from stereovox.view.viewer_replay import Replay
+            from stereovox.viewer.replay import Replay
 
             Replay(viewer, source, voxel_map.config)
         if "?token=" in viewer.url:
@@ -83,6 +83,6 @@ def _recording(arguments: Namespace) -> Source | None:
     if arguments.recording is None:
         refuse_options(arguments, ("frames",), "picks frames of --recording, which is not given")
         return None
-    from stereovox.sources import open_source
+    from stereovox.opening import open_source
 
     return open_source(arguments.recording, arguments.frames)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.config import Config
-from stereovox.depth import _quality
+from stereovox.depth import _images
 from stereovox.errors import FrameRefused
 from stereovox.frame import DepthImage, Frame, Reason, StereoFrame, name_of
 from stereovox.sensors.noise import RangeNoise
@@ -52,7 +52,7 @@ def counted(image: DepthImage, config: Config) -> tuple[int, int, int, int]:
     """
     noise, counts = RangeNoise.of(config.noise, image.camera), np.empty(4, np.int64)
     allowed = np.array([BEND_SIGMA * noise.s0, BEND_SIGMA * noise.s1, BEND_SIGMA * noise.s2], np.float32)
-    _quality.count(image.depth_m, _step(image.depth_m), allowed, np.float32(BEND_SLACK), counts)
+    _images.count(image.depth_m, _step(image.depth_m), allowed, np.float32(BEND_SLACK), counts)
     looked, saying, compared, even = counts.tolist()
     return looked, saying, compared, even
 

@@ -8,14 +8,118 @@ of these, and the start, are moved until walls lie on walls (`grid_fit`). Nothin
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stereovox import planar
-from stereovox.evaluate.grid_fit import FEW, Fit, evenly
+from stereovox import se2
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.maps.voxel_map import State
+
+FEW, MANY = 600, 4000
+"""Walls and floor cells of each map that are looked at, evenly taken: to sort out motions, and to find the best."""
+MOST_ACROSS = 3000
+"""Pixels along the longer side of a picture of distances; larger maps get larger pixels."""
+STEPS = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
+Points = NDArray[np.float64]
+"""(N, 2) x, y in metres."""
+
+
+class Fit:
+    """Two maps as points: middles of their occupied and free cells, in metres from the lower left corner of each.
+
+    walls, their_walls: at least one each. resolution: side of a cell in metres. reach: metres up to which distances
+    matter.
+    """
+
+    def __init__(
+        self, walls: Points, their_walls: Points, floor: Points, their_floor: Points, resolution: float, reach: float
+    ):
+        self.resolution = resolution
+        self._walls, self._their_walls, self._floor = walls, their_walls, floor
+        self._ours, self._theirs = (_Field(one, resolution, 4 * reach) for one in (walls, their_walls))
+        self._their_floor = _Field(their_floor, resolution, reach) if len(their_floor) else None
+        self._middle = (walls.min(axis=0) + walls.max(axis=0)) / 2
+        self._radius = max(float(np.hypot(*np.ptp(walls, axis=0))) / 2, resolution)
+
+    def likelihood(self, pose: ArrayLike, width: float, most: int = MANY) -> float:
+        """Return how well walls lie on walls, 0 to 1: mean of exp(-d^2 / (2 width^2)) both ways.
+
+        pose: (3,), our corner seen from theirs; width in metres; most: points of each map to look at.
+        """
+        there = se2.transform(pose, evenly(self._walls, most))
+        back = se2.transform(se2.inverse(pose), evenly(self._their_walls, most))
+        pairs = ((self._theirs, there), (self._ours, back))
+        return float(np.mean([np.exp(-0.5 * (field.metres(at) / width) ** 2).mean() for field, at in pairs]))
+
+    def agreement(self, pose: ArrayLike) -> float:
+        """Return the likelihood for walls two cells wide, and the share of our floor that lies on theirs; 0 to 2."""
+        walls = self.likelihood(pose, 2 * self.resolution)
+        if not len(self._floor) or self._their_floor is None:
+            return walls
+        metres = self._their_floor.metres(se2.transform(pose, evenly(self._floor, MANY)))
+        return walls + float((metres < self.resolution).mean())
+
+    def refined(self, pose: ArrayLike, width: float, stop: float, most: int = MANY) -> se2.Pose:
+        """Return the pose near `pose` of the highest likelihood: steps along x, y and yaw, halved where none helps.
+
+        The likelihood's width is `width` at first and half as much at the end; `stop` is the smallest step in metres.
+        """
+        best = np.asarray(pose, float)
+        for reach in (width, width / 2):
+            score, step = self.likelihood(best, reach, most), reach
+            while step > stop:
+                tried = [self._stepped(best, step * np.array(one)) for one in STEPS]
+                scores = [self.likelihood(one, reach, most) for one in tried]
+                if max(scores) > score + 1e-9:
+                    score, best = max(scores), tried[int(np.argmax(scores))]
+                else:
+                    step /= 2
+        return best
+
+    def way(self, start: ArrayLike, end: ArrayLike) -> float:
+        """Return the metres by which two poses differ: of the map's middle, and of its rim by the turn."""
+        x, y, yaw = se2.relative(self._at_middle(start), self._at_middle(end))
+        return float(np.hypot(x, y) + self._radius * abs(yaw))
+
+    def _at_middle(self, pose: ArrayLike) -> se2.Pose:
+        return se2.compose(pose, [*self._middle, 0.0])
+
+    def _stepped(self, pose: se2.Pose, step: NDArray[np.float64]) -> se2.Pose:
+        """Return the pose moved by step[:2] and turned about the walls' middle so that their rim moves step[2]."""
+        x, y, yaw = self._at_middle(pose) + step * [1, 1, 1 / self._radius]
+        return se2.compose([x, y, yaw], [-self._middle[0], -self._middle[1], 0.0])
+
+
+class _Field:
+    """Distances to the nearest of some points, as a picture."""
+
+    def __init__(self, points: Points, resolution: float, margin: float):
+        from scipy.ndimage import distance_transform_edt
+
+        across = float(np.ptp(points, axis=0).max()) + 2 * margin
+        self._side = max(resolution, across / MOST_ACROSS)
+        self._low = points.min(axis=0) - (np.ceil(margin / self._side)) * self._side
+        cells = np.rint((points - self._low) / self._side).astype(np.int64)
+        empty = np.ones(cells.max(axis=0)[::-1] + 1 + int(np.ceil(margin / self._side)), bool)
+        empty[cells[:, 1], cells[:, 0]] = False
+        self._metres = np.asarray(distance_transform_edt(empty, sampling=self._side), np.float32)
+
+    def metres(self, points: Points) -> NDArray[np.float32]:
+        """Return the distance of (N, 2) points, between pixels in proportion; beyond the picture that of its rim."""
+        from scipy.ndimage import map_coordinates
+
+        places = (points - self._low).T[::-1] / self._side
+        return np.asarray(map_coordinates(self._metres, places, order=1, mode="nearest"), np.float32)
+
+
+def evenly(points: NDArray[Any], most: int) -> NDArray[Any]:
+    """Return at most `most` rows of an array, evenly taken."""
+    if len(points) <= most:
+        return points
+    return points[np.linspace(0, len(points) - 1, most).astype(int)]
+
 
 COARSE, MOST_COARSE = 128, 512
 """Pixels along the longer side of the smaller map's small picture, as far as the larger map's then has no more."""
@@ -27,7 +131,7 @@ ALIKE = 0.98
 """Among motions so near to the best one the smallest is taken: a building may look alike from both ends."""
 
 
-def align_grids(grid: OccupancyGrid, reference: OccupancyGrid, start: ArrayLike = (0, 0, 0)) -> planar.Pose:
+def align_grids(grid: OccupancyGrid, reference: OccupancyGrid, start: ArrayLike = (0, 0, 0)) -> se2.Pose:
     """Return (3,) pose_reference_map: the motion of `grid`'s map frame that lays it on `reference`.
 
     All turns and shifts are searched; of those that fit about as well as the best the one nearest to `start`, (3,), is
@@ -37,9 +141,9 @@ def align_grids(grid: OccupancyGrid, reference: OccupancyGrid, start: ArrayLike 
     ours, theirs = _seen(grid), _seen(reference)
     if not len(ours.walls) or not len(theirs.walls):
         return start
-    from_corner = planar.compose(planar.inverse(reference.origin), planar.compose(start, grid.origin))
+    from_corner = se2.compose(se2.inverse(reference.origin), se2.compose(start, grid.origin))
     pose = _best(ours, theirs, max(grid.resolution, reference.resolution), from_corner)
-    return planar.compose(planar.compose(reference.origin, pose), planar.inverse(grid.origin))
+    return se2.compose(se2.compose(reference.origin, pose), se2.inverse(grid.origin))
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +161,7 @@ def _seen(grid: OccupancyGrid) -> _Seen:
     return _Seen(walls, floor)
 
 
-def _best(ours: _Seen, theirs: _Seen, resolution: float, start: planar.Pose) -> planar.Pose:
+def _best(ours: _Seen, theirs: _Seen, resolution: float, start: se2.Pose) -> se2.Pose:
     """Return the pose of our corner seen from theirs."""
     small, large = sorted(float(np.ptp(one.walls, axis=0).max()) for one in (ours, theirs))
     side = max(small / COARSE, large / MOST_COARSE, 2 * resolution)
@@ -70,7 +174,7 @@ def _best(ours: _Seen, theirs: _Seen, resolution: float, start: planar.Pose) -> 
     return min(alike, key=lambda pose: fit.way(start, pose))
 
 
-def _candidates(ours: _Seen, theirs: _Seen, side: float) -> list[planar.Pose]:
+def _candidates(ours: _Seen, theirs: _Seen, side: float) -> list[se2.Pose]:
     """Return the best shifts of the best turns, each well apart from the others."""
     points, weights = _thinned(ours, side)
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
@@ -79,7 +183,7 @@ def _candidates(ours: _Seen, theirs: _Seen, side: float) -> list[planar.Pose]:
     correlator = _Correlator(*_picture(*_thinned(theirs, side), side), side, reach)
     tried = []
     for yaw in np.arange(0, 2 * np.pi, 2 / (reach + 1)):
-        score, where = correlator.best(planar.transform((0, 0, yaw), points), weights)
+        score, where = correlator.best(se2.transform((0, 0, yaw), points), weights)
         tried.append((score, np.array([*where, yaw])))
     tried.sort(key=lambda one: -one[0])
     return [_from_origin(pose, middle) for pose in _apart([pose for _, pose in tried], side, reach)]
@@ -108,16 +212,16 @@ class _Correlator:
         return float(fits.max()), self._corner + (at[::-1] + self._reach) * self._side
 
 
-def _from_origin(pose_reference_middle: planar.Pose, middle: NDArray[np.float64]) -> planar.Pose:
+def _from_origin(pose_reference_middle: se2.Pose, middle: NDArray[np.float64]) -> se2.Pose:
     """Return pose_reference_map of a pose of the map's middle, where the map was turned about that."""
-    return planar.compose(pose_reference_middle, [-middle[0], -middle[1], 0.0])
+    return se2.compose(pose_reference_middle, [-middle[0], -middle[1], 0.0])
 
 
-def _apart(poses: list[planar.Pose], side: float, reach: int) -> list[planar.Pose]:
-    kept: list[planar.Pose] = []
+def _apart(poses: list[se2.Pose], side: float, reach: int) -> list[se2.Pose]:
+    kept: list[se2.Pose] = []
     for pose in poses:
         gaps = (np.abs(pose - one) for one in kept)
-        if all(max(*gap[:2] / side, reach * abs(float(planar.wrapped(gap[2])))) > 6 for gap in gaps):
+        if all(max(*gap[:2] / side, reach * abs(float(se2.wrapped(gap[2])))) > 6 for gap in gaps):
             kept.append(pose)
         if len(kept) == CANDIDATES:
             break

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stereovox import planar
+from stereovox import se2
 from stereovox.errors import StereovoxError
 from stereovox.maps.occupancy import UNKNOWN, OccupancyGrid
 from stereovox.maps.voxel_map import State
@@ -36,7 +36,7 @@ class Laid:
     map: OccupancyGrid
     reference: OccupancyGrid
     excluded: NDArray[np.bool_]
-    motion: planar.Pose
+    motion: se2.Pose
 
 
 def lay(
@@ -49,8 +49,8 @@ def lay(
     no rectangle, a reference that knows nothing, and maps so far apart that no picture holds both.
     """
     motion = np.asarray(motion, float)
-    pose = planar.compose(planar.inverse(reference.origin), planar.compose(motion, grid.origin))
-    corners = planar.transform(pose, grid.known_corners * grid.resolution)[:, ::-1] / reference.resolution
+    pose = se2.compose(se2.inverse(reference.origin), se2.compose(motion, grid.origin))
+    corners = se2.transform(pose, grid.known_corners * grid.resolution)[:, ::-1] / reference.resolution
     known = np.concatenate([reference.known_corners[:, ::-1], corners])
     if not (reference.cells != UNKNOWN).any():
         raise StereovoxError(NOTHING)
@@ -58,9 +58,9 @@ def lay(
     rows, columns = (max(1, int(n)) for n in np.ceil(known.max(axis=0) - TIE) - first)
     _check_size(rows, columns, reference.resolution)
     offset = (first[1] * reference.resolution, first[0] * reference.resolution, 0.0)
-    x, y, yaw = planar.compose(reference.origin, offset).tolist()
+    x, y, yaw = se2.compose(reference.origin, offset).tolist()
     there = replace(reference, cells=_window(reference.cells, first, (rows, columns)), origin=(x, y, yaw))
-    pose_there_map = planar.compose(planar.inverse(offset), pose)
+    pose_there_map = se2.compose(se2.inverse(offset), pose)
     here = replace(there, cells=resampled(grid, pose_there_map, there))
     here = replace(here, free_below=grid.free_below, occupied_above=grid.occupied_above)
     return Laid(here, there, excluded_cells(there, exclude), motion)
@@ -80,7 +80,7 @@ def resampled(grid: OccupancyGrid, pose_there_here: ArrayLike, there: OccupancyG
     """
     shape = there.cells.shape
     cells, found = np.full(shape, UNKNOWN, np.int8), np.zeros(grid.cells.shape, bool)
-    back = planar.inverse(pose_there_here)
+    back = se2.inverse(pose_there_here)
     for start in range(0, shape[0], ROWS_AT_ONCE):
         rows = np.arange(start, min(start + ROWS_AT_ONCE, shape[0]))
         row, column = _landed(back, rows[:, None], np.arange(shape[1]), there.resolution, grid.resolution)

@@ -6,9 +6,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox.cameras import PinholeCamera
+from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.evaluate.cells import Keys, keys, position
-from stereovox.geometry import Transform
+from stereovox.se3 import Transform
 
 
 class Sightings:

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from stereovox.frame import UpdateReport
 from stereovox.maps import VoxelMap
 from stereovox.maps.grid_map import GridMap
-from stereovox.update_report import UpdateReport
 
 
 def summarise(voxel_map: VoxelMap | GridMap, reports: Sequence[UpdateReport]) -> dict[str, Any]:

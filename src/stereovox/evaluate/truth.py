@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.evaluate.cells import Keys, indices, keys
-from stereovox.sources.scene import Scene, Solid
+from stereovox.simulate.scene import Scene, Solid
 
 _COARSE = 16
 """The search starts with cells this many times larger and halves them."""

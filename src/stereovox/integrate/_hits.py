@@ -8,8 +8,19 @@ pixels whose number differs from their neighbours' are looked at further; groups
 import numpy as np
 
 from stereovox._jit import cell, kernel
-from stereovox.integrate._cells import HALF, NEAR_PLANE, NO_RETURN, ONE, ZERO, index, table_row
-from stereovox.integrate._keys import NARROW, WIDE, bits, unpack
+from stereovox.integrate._cells import (
+    HALF,
+    NARROW,
+    NEAR_PLANE,
+    NO_RETURN,
+    ONE,
+    WIDE,
+    ZERO,
+    bits,
+    index,
+    table_row,
+    unpack,
+)
 from stereovox.maps._cells import find_or_insert
 
 SEEN_BITS = 11
@@ -162,7 +173,7 @@ def _slot(key):
 def _row_rays(forward, row, size):
     """Return, in cells, how the world point of a pixel of this row at depth 1 depends on its column: slope, offset.
 
-    row: (2,) y and z of the row's rays at depth 1; see `stereovox.cameras`.
+    row: (2,) y and z of the row's rays at depth 1; see `stereovox.cameras.pinhole`.
     """
     y, z = row[0], row[1]
     return (

@@ -8,9 +8,21 @@ the compiler does for many lanes at once. Then gains are summed in runs: neighbo
 import numpy as np
 
 from stereovox._jit import cell, kernel
-from stereovox.integrate._cells import HALF, NO_RETURN, ONE, ZERO, bits_of, float_of, stronger, table_row, usable
+from stereovox.integrate._cells import (
+    HALF,
+    NO_RETURN,
+    ONE,
+    ZERO,
+    bits,
+    bits_of,
+    float_of,
+    pack,
+    stronger,
+    table_row,
+    unpack,
+    usable,
+)
 from stereovox.integrate._hits import _point_cell
-from stereovox.integrate._keys import bits, pack, unpack
 from stereovox.maps._cells import find_or_insert
 
 LANES = 32

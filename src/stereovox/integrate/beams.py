@@ -12,15 +12,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stereovox import planar, registry
+from stereovox import registry, se2
 from stereovox.config import Config
-from stereovox.depth.form import for_kernels
 from stereovox.errors import ConfigError, FrameRefused
 from stereovox.frame import Scan, name_of
 from stereovox.integrate import _beams
-from stereovox.maps.evidence import to_units
-from stereovox.maps.grid_evidence import CELLS, SIDE, GridEvidence
+from stereovox.maps.evidence import CELLS, SIDE, GridEvidence, to_units
 from stereovox.maps.voxel_map import INDEX_LIMIT
+from stereovox.trust.validate import for_kernels
 
 TRAVERSALS = {
     "bresenham": "stereovox.integrate._beams:bresenham",
@@ -91,7 +90,7 @@ class Beams:
         """Return the lines to clear, to occupy, and those that a hit takes back, in cells, and the box they lie in."""
         size, config = self._config.voxel_size, self._config
         ranges, clear, clear_from = _beams_of(scan)
-        T = planar.lifted(planar.inverse(origin)) @ scan.T_world_sensor
+        T = se2.lifted(se2.inverse(origin)) @ scan.T_world_sensor
         position = T[:2, 3] / size
         if not ((np.abs(position) < INDEX_LIMIT - 2 * MOST_CELLS).all() and (np.abs(T[:2, :2]) < 1.01).all()):
             raise FrameRefused(

@@ -9,13 +9,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox.cameras import PinholeCamera
+from stereovox.cameras.pinhole import PinholeCamera
+from stereovox.cameras.wide import SEEN_DEG, CylindricalCamera, SphericalCamera
 from stereovox.config import Config
 from stereovox.errors import FrameRefused, StereovoxError
 from stereovox.frame import DepthImage, Reason
-from stereovox.geometry import Transform
 from stereovox.integrate.views import check_view
-from stereovox.wide import SEEN_DEG, CylindricalCamera, SphericalCamera
+from stereovox.se3 import Transform
 
 WideCamera = SphericalCamera | CylindricalCamera
 FORWARD = ((0, 0, 1), (0, 1, 0), (0, 0, -1), (0, -1, 0), (1, 0, 0), (-1, 0, 0))

@@ -8,27 +8,173 @@ stay, small holes do not matter, and the outcome is what exact ray casting gives
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
+from math import floor, log2
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox.cameras import PinholeCamera
+from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.config import Config
 from stereovox.frame import DepthImage
-from stereovox.integrate import _cull, _evaluate
+from stereovox.integrate import _hits, _lanes, _projective, _windows
 from stereovox.integrate._cells import NEAR_PLANE, NO_RETURN
 from stereovox.integrate.faces import Face, WideCamera, cut, faces_of
-from stereovox.integrate.hits import HitFinder
-from stereovox.integrate.merging import strongest
-from stereovox.integrate.per_camera import PerCamera
-from stereovox.integrate.views import RIM_SHARE, KernelTable, View, Views, check_blocks, check_view, sensor_table
-from stereovox.integrate.windows import WindowBuilder, Windows
-from stereovox.maps.blocks import CELLS
+from stereovox.integrate.views import (
+    RIM_SHARE,
+    KernelTable,
+    PerCamera,
+    View,
+    Views,
+    check_blocks,
+    check_view,
+    sensor_table,
+    uses_wide_keys,
+)
+from stereovox.maps.blocks import CELLS, BlockPool
 from stereovox.maps.evidence import Evidence
 from stereovox.sensors import make_sensor
 from stereovox.sensors.model import InverseSensorModel
-from stereovox.shards import in_shards, shards, together
+from stereovox.threads import in_shards, shards, together
+
+
+class HitFinder:
+    """Keeps the memory for one camera's hits.
+
+    blocks: what `find` found: evidence in thousandths on each cell that holds a point, 0 elsewhere; blocks count from
+    the one the camera stands in.
+    """
+
+    def __init__(self, camera: PinholeCamera, table: KernelTable, config: Config):
+        self.blocks = BlockPool(np.int16, capacity=1024)
+        self._camera, self._table = camera, table
+        self._full_share = np.float32(config.projective.full_share)
+        pixels = _hits.GROUP * -(-camera.width // _hits.GROUP)
+        kind = np.int64 if uses_wide_keys(camera, config.max_range, config) else np.int32
+        self._keys, self._seen = np.zeros((2, camera.width + 1), kind), np.zeros(_hits.SEEN, kind)
+        self._news, self._fresh = np.zeros(pixels, np.uint8), np.zeros(pixels + 1, np.int32)
+        self._listed = np.zeros(camera.height * camera.width, np.int32)
+        self._lanes = np.zeros((9, _hits.LANES), np.float32)
+
+    def find(self, depth_m: NDArray[np.float32], view: View) -> None:
+        """Fill `blocks` from a REP 117 depth image."""
+        blocks = self.blocks
+        blocks.clear()
+        while (n := self._scatter(depth_m, view)) < 0:
+            check_blocks(2 * len(blocks.coords), self._camera)
+            blocks.clear()
+            blocks.reserve(2 * len(blocks.coords))
+        _hits.weigh(
+            depth_m, view, self._table, self._full_share, self._listed, n, blocks.coords, blocks.values, self._lanes
+        )
+
+    def _scatter(self, depth_m: NDArray[np.float32], view: View) -> int:
+        scratch = self._keys, self._news, self._fresh, self._seen, self._listed
+        blocks = self.blocks
+        return _hits.scatter(depth_m, view, *scratch, blocks.table, blocks.coords, blocks.count, blocks.values)
+
+
+LEVELS = _windows.COARSEST + 1
+"""Windows of one pixel, and of three tiles of 1 to 128 pixels."""
+
+
+class Windows(NamedTuple):
+    """All window images in one; see `_windows.py`."""
+
+    image: NDArray[np.float32]  # flat; `_windows.place` says where a pixel stands
+    pitch: np.int32
+    height: np.int32
+    lows: NDArray[np.float32]
+    highs: NDArray[np.float32]
+    tile_offset: NDArray[np.int32]  # (levels, 2) where tiles of 16 and of 64 start
+    tile_width: NDArray[np.int32]  # (levels, 2) tiles in a row
+    first: np.int32  # lowest level that is filled
+
+
+class WindowBuilder:
+    """Keeps the memory for one camera's window images and fills it for each depth image."""
+
+    def __init__(self, camera: PinholeCamera):
+        h, w = camera.height, camera.width
+        coarsest = 1 << (LEVELS - 2)
+        strides = np.array([1] + [1 << level for level in range(LEVELS - 1)])
+        self._shape = np.stack([-(-h // strides), -(-w // strides)], axis=1).astype(np.int32)
+        tiles = np.stack([-(-self._shape // 16), -(-self._shape // 64)], axis=1)
+        tile_offset = _starts(tiles.prod(axis=2).ravel()).reshape(LEVELS, 2)
+        pitch = coarsest * -(-w // coarsest)
+        size = pitch * (2 * h + -(-h // 2))
+        self._scratch = np.zeros(size, np.float32), np.zeros((4, pitch), np.float32), *np.zeros((4, pitch), np.float32)
+        lows, highs = np.zeros((2, tiles.prod(axis=2).sum()), np.float32)
+        self._windows = Windows(
+            np.zeros(size, np.float32), np.int32(pitch), np.int32(h), lows, highs,
+            tile_offset, np.ascontiguousarray(tiles[:, :, 1], np.int32), np.int32(0),
+        )  # fmt: skip
+        self.nearest = tuple(np.zeros((-(-h // size), -(-w // size)), np.float32) for size in (16, 64))
+
+    def build(self, depth_m: NDArray[np.float32], smallest_tile: float) -> tuple[Windows, float]:
+        """Return the window images of a REP 117 depth image, from tiles of about `smallest_tile` pixels on.
+
+        With them the image's farthest depth in metres, `NO_RETURN` where a pixel saw nothing.
+        """
+        first = min(max(floor(log2(max(smallest_tile, 1e-9))) + 2, 0), LEVELS - 1)
+        windows = self._windows._replace(first=np.int32(first))
+        base, *rows = self._scratch
+        farthest = _windows.build(
+            depth_m.reshape(-1), base, windows.image, *rows, windows.lows, windows.highs,
+            self._shape, windows.tile_offset, windows.tile_width, first,
+        )  # fmt: skip
+        return windows, farthest
+
+    def build_nearest(self, depth_m: NDArray[np.float32]) -> None:
+        """Fill `nearest`, for sensor models that mark cells beside the hit."""
+        low16, low64 = (tiles.reshape(-1) for tiles in self.nearest)
+        _windows.nearest_tiles(depth_m.reshape(-1), *depth_m.shape, low16, low64)
+
+
+def _starts(sizes: NDArray[np.int64]) -> NDArray[np.int32]:
+    return np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.int32)
+
+
+def strongest(parts: Sequence[Evidence]) -> Evidence:
+    """Return one frame's evidence: a cell keeps the strongest, positive before negative, of all `parts`.
+
+    Blocks that are wholly free in one part alone stay so; they are spelt out where another part has the block as well.
+    """
+    if len(parts) == 1:
+        return parts[0]
+    if not parts:
+        return Evidence(
+            np.empty((0, 3), np.int32),
+            np.empty((0, CELLS), np.int16),
+            np.empty((0, 3), np.int32),
+            np.empty(0, np.int16),
+        )
+    pool = BlockPool(np.int16, capacity=max(1, sum(len(part.coords) + len(part.uniform) for part in parts)))
+    free, free_values, shared = _alone(parts)
+    for part, both in zip(parts, shared, strict=True):
+        _lanes.merge(pool.values, part.values, pool.insert(part.coords), False)
+        spelt = np.repeat(part.uniform_values[both, None], CELLS, axis=1)
+        _lanes.merge(pool.values, spelt, pool.insert(part.uniform[both]), False)
+    n = len(pool)
+    return Evidence(pool.coords[:n].copy(), pool.values[:n].copy(), free, free_values)
+
+
+def _alone(parts: Sequence[Evidence]) -> tuple[NDArray[np.int32], NDArray[np.int16], list[NDArray[np.bool_]]]:
+    """Return the uniform blocks that no part spells out, each once with its strongest value, and for each part which of
+    its own others do."""
+    spelt = np.unique(np.concatenate([part.coords for part in parts]), axis=0)
+    known = {tuple(block) for block in spelt.tolist()}
+    shared = [np.array([tuple(b) in known for b in part.uniform.tolist()], bool) for part in parts]
+    pairs = list(zip(parts, shared, strict=True))
+    alone, of_block = np.unique(
+        np.concatenate([part.uniform[~both] for part, both in pairs]), axis=0, return_inverse=True
+    )
+    values = np.zeros(len(alone), np.int16)
+    np.minimum.at(values, of_block.ravel(), np.concatenate([part.uniform_values[~both] for part, both in pairs]))
+    return alone.astype(np.int32).reshape(-1, 3), values, shared
+
 
 ROOM = 4096
 """Blocks that a camera's lists have room for at first."""
@@ -67,14 +213,14 @@ class Projective:
         hits = eye.hits.blocks.values
 
         def one_shard(part: slice) -> None:
-            scratch = np.empty((2, _evaluate.LAYER), np.float32)
-            _evaluate.evaluate(
+            scratch = np.empty((2, _projective.LAYER), np.float32)
+            _projective.evaluate(
                 depth_m, view, eye.table, windows, mixed[part], hit_of[part], hits, values[part], *scratch
             )  # fmt: skip
 
         in_shards(one_shard, shards(len(mixed), min(threads, len(mixed) // WORTH_A_THREAD or 1)))
         free_values = np.empty(len(free), np.int16)
-        _evaluate.passed(view, eye.table, free, free_values)
+        _projective.passed(view, eye.table, free, free_values)
         origin = eye.views.block
         return Evidence(mixed + origin, values, free + origin, free_values)
 
@@ -99,7 +245,7 @@ class _Eye:
         self._windows = WindowBuilder(camera)
         self._max_range = config.max_range
         self._free, self._mixed = (np.empty((ROOM, 3), np.int32) for _ in range(2))
-        self._stack = np.empty((_cull.STACK, 4), np.int32)
+        self._stack = np.empty((_projective.STACK, 4), np.int32)
 
     def candidates(
         self, depth_m: NDArray[np.float32], ends: NDArray[np.float32], view: View
@@ -114,7 +260,7 @@ class _Eye:
         end, nearest = np.float32(self._end_of_view(farthest)), self._windows.nearest
         while True:
             lists = self._stack, self._free, self._mixed
-            n_free, n_mixed = _cull.candidates(view, self.table, windows, nearest, end, *lists)
+            n_free, n_mixed = _projective.candidates(view, self.table, windows, nearest, end, *lists)
             if n_free >= 0:
                 return windows, n_free, n_mixed
             check_blocks(4 * len(self._free), self._camera)
@@ -127,7 +273,7 @@ class _Eye:
         if most > len(self._mixed):
             self._mixed = np.concatenate([self._mixed, np.empty((most, 3), np.int32)])
         hit_of, listed = np.empty(most, np.int32), np.zeros(len(hits), np.uint8)
-        n_free, n_mixed = _cull.with_hits(
+        n_free, n_mixed = _projective.with_hits(
             hits.table, hits.coords, len(hits), self._free, n_free, self._mixed, n_mixed, hit_of, listed
         )
         return self._free[:n_free], self._mixed[:n_mixed], hit_of[:n_mixed]

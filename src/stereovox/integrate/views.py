@@ -3,23 +3,49 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox.cameras import PinholeCamera
+from stereovox.cameras.pinhole import PinholeCamera
+from stereovox.cameras.rigs import VirtualCamera
 from stereovox.config import Config
 from stereovox.errors import FrameRefused
 from stereovox.frame import DepthImage
-from stereovox.geometry import Transform
-from stereovox.integrate import _keys, _views
+from stereovox.integrate import _cells, _views
 from stereovox.maps.blocks import CELLS, SIDE
 from stereovox.maps.evidence import to_units
-from stereovox.rigs import VirtualCamera
+from stereovox.se3 import Transform
 from stereovox.sensors.model import COLUMNS, REACH_SIGMA, InverseSensorModel, SensorTable, tabulate
 from stereovox.sensors.noise import PoseNoise, RangeNoise
+
+MAX_CAMERAS, MAX_PIXELS = 16, 1 << 26
+"""Cameras whose tools are kept, and pixels of all of them; where more come, as from a lens that zooms, all go."""
+
+Camera = TypeVar("Camera", bound=VirtualCamera)
+Tools = TypeVar("Tools")
+
+
+class PerCamera(Generic[Camera, Tools]):
+    """Makes the tools for a camera when it is first seen, and keeps them."""
+
+    def __init__(self, make: Callable[[Camera], Tools]):
+        self._make = make
+        self._kept: dict[Camera, Tools] = {}
+
+    def __getitem__(self, camera: Camera) -> Tools:
+        tools = self._kept.get(camera)
+        if tools is None:
+            tools = self._make(camera)
+            pixels = sum(kept.width * kept.height for kept in (*self._kept, camera))
+            if len(self._kept) >= MAX_CAMERAS or pixels > MAX_PIXELS:
+                self._kept.clear()
+            self._kept[camera] = tools
+        return tools
+
 
 WINDOW_SHARE = 0.27
 """Tile size of a cell's window image over the cell's size in the image; a window is three tiles wide.
@@ -219,10 +245,10 @@ def uses_wide_keys(camera: VirtualCamera, reach: float, config: Config) -> bool:
     Raises FrameRefused `bad_camera` where these would not do either.
     """
     cells = farthest_cells(camera, reach, config)
-    if cells >= 1 << (_keys.WIDE - 1):
+    if cells >= 1 << (_cells.WIDE - 1):
         said = f"the camera's view and noise reach {cells:.2g} cells far, more than can be counted"
         raise FrameRefused("bad_camera", f"{said}: check focal length and baseline, or use larger cells")
-    return cells >= 1 << (_keys.NARROW - 1)
+    return cells >= 1 << (_cells.NARROW - 1)
 
 
 @lru_cache

@@ -9,14 +9,14 @@ from math import ceil
 
 import numpy as np
 
-from stereovox import planar
+from stereovox import se2
 from stereovox.errors import FrameRefused
 from stereovox.frame import Scan
-from stereovox.integrate.scan_check import sound
-from stereovox.localize.field import DistanceField, distance_field
+from stereovox.localize.amcl.models import DistanceField, distance_field
 from stereovox.localize.scan_beams import beams_of
 from stereovox.localize.track import Track
 from stereovox.maps.occupancy import UNKNOWN, OccupancyGrid
+from stereovox.trust.validate import sound
 
 NEAR = 0.25
 """Metres from an obstacle of the map within which a beam fits."""
@@ -37,7 +37,7 @@ def fit_share(grid: OccupancyGrid, scans: Sequence[Scan], track: Track) -> float
 def _with_rim(grid: OccupancyGrid) -> OccupancyGrid:
     """Return the map with unknown cells around it: walls at its border have a far side, too."""
     rim = ceil(NEAR / grid.resolution)
-    x, y, yaw = planar.compose(grid.origin, [-rim * grid.resolution, -rim * grid.resolution, 0.0]).tolist()
+    x, y, yaw = se2.compose(grid.origin, [-rim * grid.resolution, -rim * grid.resolution, 0.0]).tolist()
     return replace(grid, cells=np.pad(grid.cells, rim, constant_values=UNKNOWN), origin=(x, y, yaw))
 
 
@@ -50,5 +50,5 @@ def _distances(field: DistanceField, scan: Scan, track: Track) -> np.ndarray:
         beams = beams_of(sound(scan, RIGID)).some(BEAMS, hits_only=True)
     except FrameRefused:
         return np.empty(0)
-    pose = planar.compose(track.correction(scan.stamp_ns), scan.pose_world_base)
-    return np.asarray(field.at(planar.transform(pose, beams.ends)), float)
+    pose = se2.compose(track.correction(scan.stamp_ns), scan.pose_world_base)
+    return np.asarray(field.at(se2.transform(pose, beams.ends)), float)

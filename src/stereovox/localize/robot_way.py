@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 
 from stereovox.config import Config
 from stereovox.errors import MissingExtra, StereovoxError
-from stereovox.localize.amcl import localise
+from stereovox.localize.amcl.localise import localise
 from stereovox.localize.fit import NEAR, fit_share
-from stereovox.localize.slam import SlamResult, map_scans
+from stereovox.localize.slam.pipeline import SlamResult, map_scans
 from stereovox.localize.track import Track
 from stereovox.maps.occupancy import OccupancyGrid
-from stereovox.sources.robot import Robot
+from stereovox.sources.robots.robot import Robot
 
 Progress = Callable[[int, int, str], object]
 """Called with scans done, scans in all, and what is being done."""

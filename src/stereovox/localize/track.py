@@ -10,10 +10,10 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox import planar
+from stereovox import se2
 from stereovox.errors import StereovoxError
-from stereovox.files import replacing
 from stereovox.frame import Frame, Scan
+from stereovox.safe_io import replacing
 from stereovox.sources.poses import seconds_from_ns
 
 Posed = TypeVar("Posed", bound=Frame | Scan)
@@ -31,8 +31,8 @@ class Track:
     """
 
     stamps_ns: NDArray[np.int64]
-    pose_map_base: planar.Pose
-    pose_map_odom: planar.Pose
+    pose_map_base: se2.Pose
+    pose_map_odom: se2.Pose
     refused: dict[str, int] = field(default_factory=dict)
     first_refusal: str = ""
 
@@ -44,7 +44,7 @@ class Track:
             said = f"pose {late[0] + 1} at {after} ns comes after one at {before} ns"
             raise StereovoxError(f"the times of a track must rise: {said}; leave out scans that are not in order")
 
-    def correction(self, stamp_ns: int) -> planar.Pose:
+    def correction(self, stamp_ns: int) -> se2.Pose:
         """Return pose_map_odom (3,) at a time: interpolated, and held before the first and after the last."""
         after = int(np.searchsorted(self.stamps_ns, stamp_ns, side="right"))
         if after in (0, len(self.stamps_ns)):
@@ -52,12 +52,12 @@ class Track:
         before, start, end = after - 1, self.stamps_ns[after - 1], self.stamps_ns[after]
         share = float(stamp_ns - start) / float(end - start)
         step = self.pose_map_odom[after] - self.pose_map_odom[before]
-        step[2] = float(planar.wrapped(step[2]))
+        step[2] = float(se2.wrapped(step[2]))
         return np.asarray(self.pose_map_odom[before] + share * step, float)
 
     def corrected(self, seen: Posed) -> Posed:
         """Return a frame or scan whose pose is in the odometry's world with its pose in the map."""
-        T_map_odom = planar.lifted(self.correction(seen.stamp_ns))
+        T_map_odom = se2.lifted(self.correction(seen.stamp_ns))
         return replace(seen, T_world_sensor=T_map_odom @ seen.T_world_sensor)
 
     def save(self, path: str | Path) -> None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernels that add a frame's evidence to the blocks of a map, in four steps.
+"""Kernels that weigh a frame's evidence against the blocks of a map, and add it to them.
 
 `places` looks where the blocks of the evidence are, `make_rows` makes the rows that are missing, `add` fills them, on
 any number of threads, and `settle` takes the rows from blocks that have sunk to the floor. The evidence is `coords`
@@ -9,8 +9,104 @@ any number of threads, and `settle` takes the rows from blocks that have sunk to
 import numpy as np
 
 from stereovox._jit import cell, kernel
-from stereovox.maps._cells import find, says_something
+from stereovox.maps._cells import AT_FLOOR, find, row_of, says_something
 from stereovox.maps._pool import BARE, make_bare, need, new_row, with_row
+
+NONE, NIL = np.int32(0), np.int16(0)
+MIX_X, MIX_Y, MIX_Z = np.uint32(0x9E3779B1), np.uint32(0x85EBCA77), np.uint32(0xC2B2AE3D)
+SHIFT = np.uint32(16)
+"""Low bits of a product depend on low bits alone; those from here on on all."""
+
+
+@kernel
+def weigh(stored, sure, least, coords, values, uniform, steps, mask, out):
+    """Write the weights (in the units of `values`) of what is said of sure cells to `out` (5,) float64.
+
+    out: for cells that are occupied (hits), against such that are surely so (looked through), against cells that are
+    surely free (hits), those of them that are next to an unknown cell of their block, and of all hits, whatever the map
+    says. Hits below `least` are for cells, but not against them. sure: (surely free up to, occupied from, surely
+    occupied from). coords (n, 3) with values (n, 512) int16, then uniform (m, 3), all of whose cells get one of
+    `steps` (m,) each. Looks only at blocks whose hash ends in zeros where `mask` has ones: which these are does not
+    depend on their order.
+    """
+    hits, passes, into, edge, every = np.int64(0), np.int64(0), np.int64(0), np.int64(0), np.int64(0)
+    for i in range(coords.shape[0]):
+        if _chosen(coords, i, mask):
+            row = row_of(stored, coords[i, 0], coords[i, 1], coords[i, 2])
+            if row >= 0:
+                one = _of_row(values[i], least, stored.values[row], sure)
+                hits, passes, into, every = hits + one[0], passes + one[1], into + one[2], every + one[3]
+                if one[2]:
+                    edge += _at_edge(values[i], least, stored.values[row], stored.unknown, sure)
+            else:
+                found = _hits(values[i], least)
+                every += found
+                into += found if (row == AT_FLOOR) & (np.int16(stored.lowest) <= sure[0]) else np.int64(0)
+    for i in range(uniform.shape[0]):
+        if _chosen(uniform, i, mask):
+            row = row_of(stored, uniform[i, 0], uniform[i, 1], uniform[i, 2])
+            if row >= 0:
+                passes -= np.int64(steps[i]) * _occupied(stored.values[row], sure)
+    out[0], out[1], out[2], out[3], out[4] = hits, passes, into, edge, every
+
+
+@cell
+def _chosen(coords, i, mask):
+    mixed = np.uint32(coords[i, 0]) * MIX_X ^ np.uint32(coords[i, 1]) * MIX_Y ^ np.uint32(coords[i, 2]) * MIX_Z
+    return (np.uint32(mixed >> SHIFT) & mask) == 0
+
+
+@cell
+def _of_row(said, least, cells, sure):
+    """Return what (512,) evidence weighs for and against occupied cells, against free ones, and all its firm hits.
+
+    All numbers but the sums are int16: twice as many cells in one instruction.
+    """
+    hits, passes, into, every = NONE, NONE, NONE, NONE
+    for c in range(512):
+        value, number = said[c], np.int16(cells[c])
+        hit, miss = max(value, NIL), max(np.int16(-value), NIL)
+        firm = value if value >= least else NIL
+        hits = np.int32(hits + np.int32(hit if number >= sure[1] else NIL))
+        passes = np.int32(passes + np.int32(miss if number >= sure[2] else NIL))
+        into = np.int32(into + np.int32(firm if number <= sure[0] else NIL))
+        every = np.int32(every + np.int32(firm))
+    return np.int64(hits), np.int64(passes), np.int64(into), np.int64(every)
+
+
+@cell
+def _at_edge(said, least, cells, unknown, sure):
+    """Return what (512,) evidence weighs against free cells that are next to an unknown one of the same block."""
+    weight = NONE
+    for c in range(512):
+        if (said[c] >= least) & (np.int16(cells[c]) <= sure[0]):
+            x, y, z = c >> 6, (c >> 3) & 7, c & 7
+            edge = (x > 0) & (np.int32(cells[max(c - 64, 0)]) == unknown)
+            edge |= (x < 7) & (np.int32(cells[min(c + 64, 511)]) == unknown)
+            edge |= (y > 0) & (np.int32(cells[max(c - 8, 0)]) == unknown)
+            edge |= (y < 7) & (np.int32(cells[min(c + 8, 511)]) == unknown)
+            edge |= (z > 0) & (np.int32(cells[max(c - 1, 0)]) == unknown)
+            edge |= (z < 7) & (np.int32(cells[min(c + 1, 511)]) == unknown)
+            weight = np.int32(weight + (np.int32(said[c]) if edge else NONE))
+    return np.int64(weight)
+
+
+@cell
+def _hits(said, least):
+    hits = NONE
+    for c in range(512):
+        hits = np.int32(hits + np.int32(said[c] if said[c] >= least else NIL))
+    return np.int64(hits)
+
+
+@cell
+def _occupied(cells, sure):
+    """Return how many cells (512,) are surely occupied."""
+    number = NONE
+    for c in range(512):
+        number = np.int32(number + (np.int32(1) if np.int16(cells[c]) >= sure[2] else NONE))
+    return np.int64(number)
+
 
 SKIP, MAKE = np.int32(-1), np.int32(-2)
 """In place of a row: the evidence changes nothing in this block; it needs a row."""

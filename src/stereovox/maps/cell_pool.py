@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from stereovox.maps import _add, _pool
 from stereovox.maps.blocks import CELLS, StoredCells, table_size
 from stereovox.maps.cell_format import CellRules
-from stereovox.shards import in_shards, shards
+from stereovox.threads import in_shards, shards
 
 GROWTH = 1.5
 """A pool that is full becomes so many times as large; one that is SPARE times too large shrinks to as much."""

@@ -8,8 +8,8 @@ from itertools import product
 import numpy as np
 
 from stereovox.config import load_config
-from stereovox.guarded import one_state
 from stereovox.maps.voxel_map import VoxelMap
+from stereovox.threads import one_state
 
 TIE = 1e-6
 """Cubes: a centre so near to a face stands on it, and belongs to the cell above."""

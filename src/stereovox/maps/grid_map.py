@@ -3,27 +3,85 @@
 
 from __future__ import annotations
 
+import json
 from math import isclose
 from operator import attrgetter
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stereovox import planar
-from stereovox.config import Config
-from stereovox.errors import ConfigError, FrameRefused, StereovoxError
-from stereovox.guarded import Guarded, MapLock
-from stereovox.history import History, WithHistory
+from stereovox import se2
+from stereovox.config import Config, load_config
+from stereovox.errors import ConfigError, FrameRefused, MapFileError, StereovoxError
 from stereovox.maps import _grid, _pool
 from stereovox.maps.blocks import BlockPool
 from stereovox.maps.cell_format import CellFormat, CellRules
-from stereovox.maps.evidence import LOG_ODDS_SCALE
-from stereovox.maps.grid_evidence import CELLS, SIDE, GridEvidence
+from stereovox.maps.evidence import CELLS, LOG_ODDS_SCALE, SIDE, GridEvidence
+from stereovox.maps.lock import only_writer_of
 from stereovox.maps.memory import told
-from stereovox.maps.occupancy import UNKNOWN, OccupancyGrid
-from stereovox.maps.percent import Percent
+from stereovox.maps.occupancy import UNKNOWN, OccupancyGrid, Percent
 from stereovox.maps.voxel_map import INDEX_LIMIT, State
+from stereovox.safe_io import json_value, read_arrays, replacing
+from stereovox.threads import Guarded, MapLock
+from stereovox.trust.history import History, WithHistory
+
+FORMAT, VERSION = "stereovox-grid", 1
+PARTS = ("about", "coords", "cells")
+
+
+def save_grid(grid_map: GridMap, path: str | Path) -> None:
+    """Write `grid_map` to the file `path`, all or nothing.
+
+    Raises MapFileError, one line, where that cannot be or another run is writing it.
+    """
+    coords, cells = grid_map.tiles()
+    about = np.frombuffer(json.dumps(_about(grid_map)).encode(), np.uint8)
+    with only_writer_of(Path(path)), replacing(path) as file:
+        np.savez_compressed(file, about=about, coords=coords, cells=cells)
+
+
+def load_grid(path: str | Path) -> GridMap:
+    """Read a grid saved by `GridMap.save`. Raises MapFileError: one line with the file and what is wrong."""
+    pass  # REHOUSED
+
+    try:
+        parts = read_arrays(path, PARTS, "grid; make one with GridMap.save")
+        about = json_value(parts["about"].tobytes())
+        if about["format"] != FORMAT or about["version"] != VERSION:
+            raise ValueError(f"format {about['format']} {about['version']}, not {FORMAT} {VERSION}")
+        grid_map = GridMap(load_config(about["config"]), about["origin"])
+        grid_map.history = History.loaded(about)
+        coords, cells = parts["coords"], parts["cells"]
+        wanted = ((len(coords), 3), np.int32), ((len(coords), CELLS), grid_map.cell_format.dtype)
+        for array, (shape, dtype) in zip((coords, cells), wanted, strict=True):
+            if array.shape != shape or array.dtype != dtype:
+                raise ValueError(f"array of {array.shape} {array.dtype} where {shape} {np.dtype(dtype)} belongs")
+        if not np.isfinite(grid_map.origin).all() or coords[:, 2].any() or (np.abs(coords) > 1 << 24).any():
+            raise ValueError("tiles or origin out of range")
+        if not (cells != grid_map.cell_format.unknown).any(axis=1).all():
+            raise ValueError("a tile without a known cell")
+        grid_map.insert(coords, cells)
+    except MapFileError:
+        raise
+    except OSError as error:
+        raise MapFileError(f"{path}: cannot be read ({error.strerror or error})") from None
+    except Exception as error:  # what a damaged file can raise in zipfile, zlib, NumPy and JSON is not bounded
+        why = " ".join(str(error).split()) or type(error).__name__
+        raise MapFileError(f"{path}: no grid that can be read ({why}); save it anew") from None
+    return grid_map
+
+
+def _about(grid_map: GridMap) -> dict[str, Any]:
+    return {
+        "format": FORMAT,
+        "version": VERSION,
+        "origin": grid_map.origin.tolist(),
+        **grid_map.history.saved(),
+        "config": grid_map.config.model_dump(),
+    }
+
 
 MOST_PICTURED = 2**29
 """Cells of the largest picture; the map itself holds only what was seen and may reach farther."""
@@ -195,7 +253,7 @@ class GridMap(Guarded, WithHistory):
         picture = np.full((top - bottom, right - left), UNKNOWN, np.int8)
         n, percent = len(self._pool), self._percent
         _grid.show(self._pool.coords[:n], self._pool.values[:n], left, bottom, percent.shown, percent.lowest, picture)
-        x, y, yaw = planar.compose(self.origin, [left * self.voxel_size, bottom * self.voxel_size, 0.0]).tolist()
+        x, y, yaw = se2.compose(self.origin, [left * self.voxel_size, bottom * self.voxel_size, 0.0]).tolist()
         return OccupancyGrid(picture, self.voxel_size, (x, y, yaw), percent.free_below, percent.occupied_above)
 
     @property
@@ -208,7 +266,7 @@ class GridMap(Guarded, WithHistory):
 
         `load_grid` reads it. For other programs write `occupancy()` as map_server files.
         """
-        from stereovox.maps.grid_store import save_grid
+        pass  # REHOUSED
 
         save_grid(self, path)
 
@@ -229,7 +287,7 @@ class GridMap(Guarded, WithHistory):
     def _stored_at(self, points: ArrayLike) -> NDArray[np.integer]:
         points = np.asarray(points, float).reshape(-1, 2)
         with np.errstate(invalid="ignore"):
-            indices = np.floor(planar.transform(planar.inverse(self.origin), points) / self.voxel_size)
+            indices = np.floor(se2.transform(se2.inverse(self.origin), points) / self.voxel_size)
         inside = (np.abs(indices) < INDEX_LIMIT).all(axis=1)
         stored = np.full(len(points), self._format.unknown, self._format.dtype)
         found = stored[inside]
@@ -241,4 +299,4 @@ class GridMap(Guarded, WithHistory):
     def _centres_of(self, state: State) -> NDArray[np.float64]:
         indices, log_odds = self.cells()
         chosen = indices[self._rules.states(self._format.stored(log_odds)) == state]
-        return planar.transform(self.origin, (chosen + 0.5) * self.voxel_size)
+        return se2.transform(self.origin, (chosen + 0.5) * self.voxel_size)

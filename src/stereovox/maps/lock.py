@@ -12,7 +12,7 @@ from contextlib import AbstractContextManager, contextmanager, suppress
 from pathlib import Path
 
 from stereovox.errors import MapFileError
-from stereovox.files import FLOOR_ENDINGS, sweep_unfinished, sync_folder
+from stereovox.safe_io import FLOOR_ENDINGS, sweep_unfinished, sync_folder
 
 LOCK = ".lock"
 """The file in a folder that tells of its writer."""

@@ -13,19 +13,19 @@ from numpy.typing import ArrayLike, NDArray
 from stereovox.config import Config
 from stereovox.errors import ConfigError, StereovoxError
 from stereovox.frame import Viewpoint
-from stereovox.guarded import Guarded, MapLock, in_steps
-from stereovox.history import History, WithHistory
 from stereovox.maps import _add, queries
-from stereovox.maps.agreement import Agreement, agreement
 from stereovox.maps.blocks import CELLS, SIDE, StoredCells, blocks_of_cells
 from stereovox.maps.cell_format import CellFormat, CellRules
 from stereovox.maps.cell_format import State as State
 from stereovox.maps.cell_pool import CellPool
 from stereovox.maps.cell_times import NEVER, CellTimes
 from stereovox.maps.evidence import LARGEST, LOG_ODDS_SCALE, Evidence
+from stereovox.maps.frame_agreement import Agreement, agreement
 from stereovox.maps.queries import INDEX_LIMIT as INDEX_LIMIT
 from stereovox.maps.queries import Asked, NearestCells, RayHits
 from stereovox.maps.store import read_map, save_map
+from stereovox.threads import Guarded, MapLock, in_steps
+from stereovox.trust.history import History, WithHistory
 
 EVERYWHERE = np.array([[-(2**30)] * 3, [2**30] * 3])
 """Lowest block that `VoxelMap.blocks_within` may be asked for, and the first beyond the highest."""

@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 
 from stereovox.config import Config, load_config
 from stereovox.errors import StereovoxError
-from stereovox.guarded import one_state
 from stereovox.maps import State, VoxelMap
 from stereovox.maps.cell_format import CellRules
 from stereovox.maps.voxel_map import cells_where
 from stereovox.products.side_by_side import put_times
+from stereovox.threads import one_state
 
 Parents = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.uint32]]
 """Cells (N, 3); and (N,) of how many known cells they are made, the largest number these store, their latest time."""

@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stereovox.errors import StereovoxError
-from stereovox.guarded import one_state
 from stereovox.maps import VoxelMap
 from stereovox.maps.blocks import CELLS, SIDE
 from stereovox.products.side_by_side import take
+from stereovox.threads import one_state
 
 
 @one_state

@@ -5,18 +5,20 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from contextlib import ExitStack
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stereovox.errors import StereovoxError
-from stereovox.guarded import MapLock
 from stereovox.maps import State, VoxelMap
 from stereovox.maps.blocks import CELLS, SIDE
 from stereovox.maps.cell_format import CellRules
 from stereovox.maps.queries import INDEX_LIMIT, points_of, state_bits
 from stereovox.products import _distance
 from stereovox.products.transform import Transform
+from stereovox.safe_io import replacing
+from stereovox.threads import MapLock
 
 TRIGGER = 1 / 8
 """A window follows when the camera is farther from its middle than this share of the window."""
@@ -200,3 +202,16 @@ class DistanceField:
         away = np.abs(camera - (self._low + self._shape / 2))
         if not self._made or (away > np.maximum(TRIGGER * self._shape, SIDE)).any():
             self._low = SIDE * np.rint((camera - self._shape / 2) / SIDE).astype(np.int64)
+
+
+def write_distance(field: DistanceField, path: str | Path) -> None:
+    """Write a field for `numpy.load`.
+
+    Arrays: `distance` (x, y, z) float32 metres, infinite where no obstacle is near enough; `origin` (3,) metres, lowest
+    corner of cell [0, 0, 0]; `cell` (3,) metres, its sides. Cell (i, j, k) has its middle at origin + (i + 0.5, ...)
+    times cell. Raises StereovoxError for another ending than .npz, MapFileError where it cannot be written.
+    """
+    if Path(path).suffix.lower() != ".npz":
+        raise StereovoxError(f"{path}: distances are written as .npz; name the file so")
+    with replacing(path) as file:
+        np.savez_compressed(file, distance=field.metres, origin=field.origin, cell=field.cell)

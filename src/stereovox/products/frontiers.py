@@ -12,8 +12,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stereovox.errors import StereovoxError
-from stereovox.files import replacing
-from stereovox.guarded import one_state
 from stereovox.maps import State, VoxelMap
 from stereovox.maps.blocks import CELLS
 from stereovox.maps.cell_format import CellRules
@@ -21,6 +19,8 @@ from stereovox.maps.voxel_map import cells_where
 from stereovox.products.floor_axes import Heights, checked_heights, heights_of
 from stereovox.products.neighbours import CORNERS, FACES, components, shifted, with_margins
 from stereovox.products.side_by_side import in_memory
+from stereovox.safe_io import replacing
+from stereovox.threads import one_state
 
 if TYPE_CHECKING:
     from scipy.spatial import KDTree

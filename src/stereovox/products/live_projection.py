@@ -13,8 +13,7 @@ from stereovox.maps import VoxelMap
 from stereovox.maps.blocks import SIDE
 from stereovox.maps.cell_format import CellRules
 from stereovox.maps.evidence import Evidence
-from stereovox.maps.occupancy import UNKNOWN, OccupancyGrid
-from stereovox.maps.percent import Percent
+from stereovox.maps.occupancy import UNKNOWN, OccupancyGrid, Percent
 from stereovox.maps.rolling import RollingMap
 from stereovox.maps.voxel_map import EVERYWHERE
 from stereovox.products.floor_axes import Heights, floor_axes

@@ -10,15 +10,15 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stereovox.camera_path import CameraPath
-from stereovox.guarded import one_state
-from stereovox.history import MOST_REASONS, OTHERS, History
 from stereovox.maps import VoxelMap
 from stereovox.maps.blocks import CELLS
 from stereovox.maps.cell_format import CellRules
 from stereovox.maps.cell_times import LAST, NEVER, UNIT_NS
 from stereovox.products.moved import moved
 from stereovox.products.side_by_side import cells_at, check_alike, in_memory
+from stereovox.threads import one_state
+from stereovox.trust.camera_path import CameraPath
+from stereovox.trust.history import MOST_REASONS, OTHERS, History
 
 
 @one_state

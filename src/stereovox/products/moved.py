@@ -9,16 +9,16 @@ from itertools import product
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stereovox.camera_path import CameraPath, Seen
 from stereovox.errors import StereovoxError
-from stereovox.geometry import Transform, inverse, orthonormalise, rigidity_error, transform_points
-from stereovox.guarded import one_state
 from stereovox.maps import State, VoxelMap
 from stereovox.maps.blocks import CELLS, SIDE
 from stereovox.maps.cell_format import CellRules
 from stereovox.maps.voxel_map import INDEX_LIMIT, cells_where
 from stereovox.products import _moved
 from stereovox.products.side_by_side import cells_at, in_memory, put_times
+from stereovox.se3 import Transform, inverse, orthonormalise, rigidity_error, transform_points
+from stereovox.threads import one_state
+from stereovox.trust.camera_path import CameraPath, Seen
 
 PIECE = 512
 """Blocks looked at together."""

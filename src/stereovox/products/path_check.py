@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stereovox.errors import StereovoxError
-from stereovox.guarded import one_state
 from stereovox.maps import State, VoxelMap
 from stereovox.maps.queries import points_of
+from stereovox.threads import one_state
 
 HALVINGS = 48
 """How often a part of a segment is halved in search of a place on it."""

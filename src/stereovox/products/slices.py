@@ -9,10 +9,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stereovox.errors import StereovoxError
-from stereovox.guarded import one_state
 from stereovox.maps import VoxelMap
 from stereovox.maps.blocks import SIDE
 from stereovox.maps.cell_format import CellRules
+from stereovox.threads import one_state
 
 ACROSS = {"x": ("y", "z"), "y": ("x", "z"), "z": ("x", "y")}
 """For the axis a layer stands across: the axes of its columns and of its rows."""

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from stereovox.errors import StereovoxError
 from stereovox.products import _transform
-from stereovox.shards import in_shards
+from stereovox.threads import in_shards
 
 LANES = 32
 """Rows are padded to a multiple of it: whole vectors."""

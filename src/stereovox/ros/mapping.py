@@ -8,17 +8,16 @@ from pathlib import Path
 from typing import Any
 
 from stereovox.config import Config, load_config
-from stereovox.frame import Frame, Scan
-from stereovox.health import Health
-from stereovox.history import History
+from stereovox.formats.map_server import read_map_server
+from stereovox.frame import Frame, Scan, UpdateReport
 from stereovox.mapper import AnyMapper, GridMapper, Mapper
 from stereovox.maps import VoxelMap, load_map
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.maps.voxel_map import EVERYWHERE
 from stereovox.products.floor_axes import Heights
 from stereovox.products.live_projection import LiveProjection
-from stereovox.products.map_server import read_map_server
-from stereovox.update_report import UpdateReport
+from stereovox.trust.health import Health
+from stereovox.trust.history import History
 
 
 class Mapping:

@@ -11,16 +11,15 @@ from collections.abc import Callable
 from time import monotonic_ns
 from typing import Any
 
+from stereovox.frame import UpdateReport
 from stereovox.ros.inputs import CloudInput, DepthInput, FloorCloudInput, Input, ScanInput, header
 from stereovox.ros.mapping import Mapping
 from stereovox.ros.options import Options, pair_of
 from stereovox.ros.outputs import Outputs
 from stereovox.ros.poses import Whereabouts, fixed_transform
 from stereovox.ros.services import Services
-from stereovox.ros.silence import Silence
-from stereovox.ros.subscriptions import Subscriptions
+from stereovox.ros.subscriptions import Silence, Subscriptions
 from stereovox.ros.waiting import Arrival, Waiting
-from stereovox.update_report import UpdateReport
 
 IDLE_S, SOON_S = 0.05, 0.005
 """Seconds to wait for messages: when nothing is to be done, and when something will be due soon."""

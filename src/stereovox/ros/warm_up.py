@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from stereovox.cameras import PinholeCamera
+from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.config import Config, load_config
 from stereovox.frame import Frame
 from stereovox.ros.mapping import Mapping

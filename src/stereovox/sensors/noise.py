@@ -9,9 +9,9 @@ from math import radians
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from stereovox.cameras.rigs import VirtualCamera
+from stereovox.cameras.wide import SphericalCamera
 from stereovox.config import NoiseConfig
-from stereovox.rigs import VirtualCamera
-from stereovox.wide import SphericalCamera
 
 SUBPIXEL = 0.08
 """Noise in pixels of a camera nothing is known of: that of a RealSense D435 (Chien 2020, 2.2.4)."""
@@ -37,7 +37,7 @@ class RangeNoise:
         s2 = subpixel / (focal_px * baseline): Chien 2020, Eq 3.5 with the square that print lacks (Alg 3 has it), which
         is also Valenti 2018, Eq 6.9. A spherical camera has subpixel * baseline / focal_px more at every depth: Eq 6.11
         in 6.10, with 1 / focal_px for the angle of a pixel. That holds at the middle of its rows; towards the sides
-        the noise grows (`stereovox.depth.reproject`), which the thesis leaves out as well.
+        the noise grows (`stereovox.depth.stereo.reproject`), which the thesis leaves out as well.
         """
         if config.s2 is not None:
             return cls(config.s0, config.s1, config.s2)

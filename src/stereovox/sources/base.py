@@ -5,16 +5,37 @@ from __future__ import annotations
 
 import sys
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import islice
-from typing import Protocol, TypeVar
+from typing import Protocol, TypeVar, overload
 
-from stereovox.cameras import PinholeCamera
+from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.errors import SourceError
 from stereovox.frame import AnyFrame, Frame
 
 T = TypeVar("T")
+
+
+class Lazy(Sequence[T]):
+    """The items `read(k)` of the numbers `k`, each read anew whenever it is asked for; a slice is as lazy."""
+
+    def __init__(self, read: Callable[[int], T], numbers: range):
+        self._read, self._numbers = read, numbers
+
+    def __len__(self) -> int:
+        return len(self._numbers)
+
+    @overload
+    def __getitem__(self, i: int) -> T: ...
+    @overload
+    def __getitem__(self, i: slice) -> Lazy[T]: ...
+    def __getitem__(self, i: int | slice) -> T | Lazy[T]:
+        if isinstance(i, slice):
+            return Lazy(self._read, self._numbers[i])
+        return self._read(self._numbers[i])
+
+
 AHEAD = 4
 """Frames read before they are asked for: enough to even out slow ones, at 0.6 MB each for 640x480."""
 

@@ -1,16 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`camera.toml`: the numbers of a depth camera, and what a calibration found that it measures wrongly."""
+"""The camera of a recording: from `camera.toml`, or from the small text files that lie beside the images."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from stereovox.cameras import DepthCorrection, PinholeCamera
+from stereovox.cameras.pinhole import DepthCorrection, PinholeCamera
 from stereovox.errors import SourceError, StereovoxError, did_you_mean
-from stereovox.sources.toml_file import is_number, read_table, toml_text
-from stereovox.untrusted import shown
+from stereovox.frame import Frame, StereoFrame
+from stereovox.safe_io import is_number, read_table, read_text, shown, toml_text
+from stereovox.sources.base import Stream
 
 FILE = "camera.toml"
 SIZES = ("width", "height")
@@ -115,3 +119,143 @@ def _number(table: dict[str, Any], key: str) -> float:
     if not is_number(value):
         raise SourceError(f"{key} = {shown(value)} must be a number")
     return float(value)
+
+
+MATRIX, LIST = "camera-intrinsics.txt", "calibration.txt"
+VGA = (640, 480)
+Intrinsics = tuple[float, float, float, float]
+"""fx, fy, cx, cy in pixels."""
+
+
+def find_camera(
+    folders: Sequence[Path], size: tuple[int, int], baseline: float, default: Intrinsics
+) -> tuple[PinholeCamera, tuple[str, ...]]:
+    """Return the camera of images of (width, height) = `size`, and notes: what was assumed, used, or passed over.
+
+    The first file found counts: `camera.toml` (see `camera_file`) in the first of `folders`, the recording's own; then
+    `camera-intrinsics.txt` (3x3 matrix) and `calibration.txt` (fx fy cx cy), in the order of `folders`. Without one,
+    640x480 images get `default`. `baseline` in metres, where the file tells none.
+    Raises SourceError for a bad file, or where there is none and the images have another size.
+    """
+    places = [folders[0] / FILE, *(folder / name for folder in folders for name in (MATRIX, LIST))]
+    found = [path for path in places if os.path.isfile(path)]  # Path.is_file may raise
+    far = [folder / FILE for folder in folders[1:] if os.path.isfile(folder / FILE)]
+    cure = "it counts only in the recording's own folder; give it with --camera"
+    passed_over = [f"{path} is not used: {cure}" for path in far]
+    passed_over += [f"{path} is not used: {found[0]} comes first" for path in found[1:]]
+    if found:
+        camera = _read(found[0], size, baseline)
+        used = (f"{found[0]} is used ({correction_words(camera)})",) if found[0].name == FILE else ()
+        return camera, (*used, *passed_over)
+    if size != VGA:
+        raise SourceError(
+            f"{folders[0] / MATRIX}: no such file, and {size[0]}x{size[1]} images have no standard calibration; "
+            "write the 3x3 camera matrix into it"
+        )
+    numbers = " ".join(f"{n:g}" for n in default)
+    note = f"{folders[0]} has no {MATRIX}: assuming the data set's standard fx fy cx cy = {numbers}"
+    return PinholeCamera(*size, *default, baseline), (note, *passed_over)
+
+
+def correction_words(camera: PinholeCamera) -> str:
+    """Return in words what the depth of a camera will be corrected by."""
+    return f"depth correction '{camera.correction.model}'" if camera.correction else "no depth correction"
+
+
+def read_intrinsics(path: Path) -> Intrinsics:
+    """Return fx, fy, cx, cy in pixels from a 3x3 matrix or from these four numbers; `#` starts a comment.
+
+    Raises SourceError naming the file for anything else, also for skew: such a camera is no plain pinhole.
+    """
+    numbers = _numbers(path)
+    if len(numbers) == 4:
+        fx, fy, cx, cy = numbers
+    elif len(numbers) == 9 and numbers[6:] == [0, 0, 1] and numbers[1] == numbers[3] == 0:
+        fx, _, cx, _, fy, cy, *_ = numbers
+    else:
+        raise SourceError(f"{path}: needs the matrix 'fx 0 cx / 0 fy cy / 0 0 1' or the four numbers fx fy cx cy")
+    return fx, fy, cx, cy
+
+
+def _read(path: Path, size: tuple[int, int], baseline: float) -> PinholeCamera:
+    return _of_size(path, size, baseline) if path.name == FILE else _plain(path, size, baseline)
+
+
+def _of_size(path: Path, size: tuple[int, int], baseline: float) -> PinholeCamera:
+    camera = read_camera(path)
+    if (camera.width, camera.height) != size:
+        raise SourceError(
+            f"{path}: is of a camera with {camera.width}x{camera.height} pixels, the images have {size[0]}x{size[1]}; "
+            "replace or remove it"
+        )
+    return camera if camera.baseline else replace(camera, baseline=baseline)
+
+
+def _numbers(path: Path) -> list[float]:
+    try:
+        lines = read_text(path).splitlines()
+        numbers = [float(word) for line in lines for word in line.partition("#")[0].replace(",", " ").split()]
+    except OSError as error:
+        raise SourceError(f"{path}: {error.strerror}; make it readable") from None
+    except ValueError as error:
+        raise SourceError(f"{path}: {error}; write plain numbers") from None
+    if not all(map(math.isfinite, numbers)):
+        raise SourceError(f"{path}: holds NaN or infinity; write plain numbers")
+    return numbers
+
+
+def _plain(path: Path, size: tuple[int, int], baseline: float) -> PinholeCamera:
+    intrinsics = read_intrinsics(path)
+    try:
+        return pinhole(size, intrinsics, baseline)
+    except StereovoxError as error:
+        raise SourceError(f"{path}: {error}") from None
+
+
+class WithCamera(Stream):
+    """The frames of `stream`, all with `camera`, which has as many pixels; `notes` follow its own."""
+
+    def __init__(self, stream: Stream, camera: PinholeCamera, notes: tuple[str, ...] = ()):
+        self._stream, self.camera, self._notes = stream, camera, notes
+        self.name, self.notes = stream.name, (*getattr(stream, "notes", ()), *notes)
+
+    @property
+    def length(self) -> int | None:
+        """Number of frames, as the stream tells."""
+        return self._stream.length
+
+    @property
+    def dropped(self) -> int:
+        """Frames that nobody took in time, as the stream tells."""
+        return self._stream.dropped
+
+    def after(self, count: int) -> Stream:
+        """Return what is left after `count` frames, with the same camera."""
+        return WithCamera(self._stream.after(count), self.camera, self._notes)
+
+    def __iter__(self) -> Iterator[Frame]:
+        frames = iter(self._stream)
+        try:
+            for frame in frames:
+                if isinstance(frame, StereoFrame):
+                    raise SourceError(f"{self.name}: has stereo pairs, which no camera file fits; correct its rig file")
+                yield replace(frame, camera=self.camera)
+        finally:
+            close = getattr(frames, "close", None)
+            if close:  # a generator: a live camera is to stop now
+                close()
+
+
+def with_camera(stream: Stream, file: str | os.PathLike[str]) -> Stream:
+    """Return `stream` with the camera in `file`; without a baseline there, the stream's own counts.
+
+    Raises SourceError, one line, for a bad file and for a camera with another number of pixels.
+    """
+    camera, own = read_camera(Path(file)), stream.camera
+    if (camera.width, camera.height) != (own.width, own.height):
+        raise SourceError(
+            f"{file}: is of a camera with {camera.width}x{camera.height} pixels, {stream.name} has "
+            f"{own.width}x{own.height}; give the file of its own camera"
+        )
+    note = f"{file} is used in place of the recording's own camera ({correction_words(camera)})"
+    return WithCamera(stream, camera if camera.baseline else replace(camera, baseline=own.baseline), (note,))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Images in PNG files, trusted only when they are whole: depth in 16 bits, pictures in 8.
+"""Images in PNG files, trusted only when they are whole, and folders of them.
 
 Decoders differ in what they do with a damaged file: a half image, noise, or lines on the terminal from the C library.
 So the file's own check sums are verified first (0.02 ms for 90 kB) and only a whole file is decoded.
@@ -10,16 +10,22 @@ from __future__ import annotations
 import os
 import struct
 import zlib
+from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox.cameras import MAX_PIXELS
-from stereovox.errors import FrameRefused
-from stereovox.untrusted import read_bounded
+from stereovox.cameras.pinhole import MAX_PIXELS
+from stereovox.errors import FrameRefused, SourceError
+from stereovox.frame import Frame
+from stereovox.safe_io import read_bounded
+from stereovox.se3 import Transform
+from stereovox.sources.base import DepthSource
+from stereovox.sources.camera_file import Intrinsics, find_camera
 
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
 START = SIGNATURE + b"\0\0\0\rIHDR"
@@ -160,3 +166,57 @@ def _undecodable(path: Path | str) -> FrameRefused:
 
 def _times(size: tuple[int, int]) -> str:
     return f"{size[0]}x{size[1]}"
+
+
+class DepthFolder(DepthSource, ABC):
+    """Frames from depth PNGs, one file each; a file that cannot be used becomes a frame with a `fault`.
+
+    A layout sets `depth_scale` (metres per unit), `baseline` (metres) and `intrinsics` (what 640x480 images have
+    without a calibration file), calls `_set_camera` when it is made, and tells each frame's image and pose.
+    The PNGs hold 0 or 65535 for every pixel without value and do not say why: all are UNKNOWN, none clears.
+    """
+
+    depth_scale: float
+    baseline: float
+    intrinsics: Intrinsics
+
+    def __init__(self, where: str | os.PathLike[str]):
+        self.folder = Path(where)
+        self.name = self.folder.resolve().name
+
+    @abstractmethod
+    def image(self, i: int) -> tuple[Path, int]:
+        """Return the image file of frame `i` (0 to len - 1) and its time in nanoseconds."""
+
+    @abstractmethod
+    def pose(self, i: int) -> Transform:
+        """Return T_world_camera (4, 4) of frame `i` (0 to len - 1); raises FrameRefused where there is none."""
+
+    def frame(self, i: int) -> Frame:
+        """Return frame `i`; depth is (0, 0) and the pose NaN where the frame has a `fault`."""
+        i = range(len(self))[i]
+        path, stamp_ns = self.image(i)
+        try:
+            T_world_camera = self.pose(i)
+            depth = read_depth_png(path, (self.camera.width, self.camera.height))
+        except FrameRefused as refused:
+            nothing, nowhere = np.empty((0, 0), np.uint16), np.full((4, 4), np.nan)
+            blank = Frame(nothing, self.camera, nowhere, stamp_ns, self.depth_scale, name=str(path))
+            return replace(blank, fault=refused.reason, fault_detail=str(refused))
+        return Frame(depth, self.camera, T_world_camera, stamp_ns, self.depth_scale, name=str(path))
+
+    def _set_camera(self, *calibration_folders: Path) -> None:
+        paths = [self.image(i)[0] for i in range(len(self))]
+        size = common_size(paths)
+        if size is None:
+            raise SourceError(f"{self.folder}: none of its {len(paths)} depth images is a readable 16-bit grey PNG")
+        self.camera, notes = find_camera(calibration_folders, size, self.baseline, self.intrinsics)
+        self.notes = (*self.notes, *notes)
+
+
+def file_names(folder: Path) -> list[str]:
+    """Return the names of what lies in `folder`; raises SourceError where it cannot be listed."""
+    try:
+        return os.listdir(folder)
+    except OSError as error:
+        raise SourceError(f"{folder}: {error.strerror}; give a folder you may read") from None

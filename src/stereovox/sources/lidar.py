@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from stereovox.errors import FrameRefused
 from stereovox.frame import Viewpoint
-from stereovox.geometry import Transform
-from stereovox.untrusted import MOST_LIST, read_bounded
+from stereovox.safe_io import MOST_LIST, read_bounded
+from stereovox.se3 import Transform
 
 POINT_BYTES = 16
 """A point in a KITTI `.bin`: x, y, z in metres and the reflectance, float32 each."""

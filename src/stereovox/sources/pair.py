@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox.cameras import PinholeCamera
+from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.errors import FrameRefused, SourceError
 from stereovox.frame import Frame
-from stereovox.geometry import Transform
-from stereovox.sources.bag_kinds import suffix_of
+from stereovox.se3 import Transform
+from stereovox.sources.bags import suffix_of
 from stereovox.sources.base import DepthSource
 from stereovox.sources.pair_file import FILE, PairSettings, read_pair
 from stereovox.sources.poses import Poses, seconds_from_ns
@@ -122,7 +122,7 @@ def open_poses(folder: Path, settings: PairSettings) -> Poses:
     """Return the poses of a pair's tracker on the depth camera's clock, in the world and axes of the map."""
     where = os.path.join(folder, settings.poses)
     if suffix_of(where.partition("?")[0]):  # a recorded file, perhaps with a topic behind its name
-        from stereovox.sources.bag import tracker_poses
+        from stereovox.sources.bags.recording import tracker_poses
 
         poses = tracker_poses(where, settings.axes, settings.world)
     else:

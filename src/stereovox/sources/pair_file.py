@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 
 from stereovox.errors import SourceError, did_you_mean
-from stereovox.geometry import Transform, orthonormalise, rigidity_error
-from stereovox.sources.toml_file import is_number, read_table, toml_text
+from stereovox.safe_io import is_number, read_table, shown, toml_text
+from stereovox.se3 import Transform, orthonormalise, rigidity_error
 from stereovox.sources.tracker import AXES, HIGHEST_CONFIDENCE, WORLDS
-from stereovox.untrusted import shown
 
 FILE = "pair.toml"
 TOLERANCE = 0.005

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stereovox.errors import FrameRefused, SourceError
-from stereovox.geometry import Transform, interpolate
+from stereovox.se3 import Transform, interpolate
 
 MAX_GAP_NS = 100_000_000
 """A pose this far (0.1 s) or further from an image, on either side, says too little about the image's own."""

@@ -9,7 +9,7 @@ from typing import Any, NoReturn
 
 import numpy as np
 
-from stereovox.cameras import PinholeCamera
+from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.errors import MissingExtra, SourceError, StereovoxError
 from stereovox.frame import Frame
 from stereovox.sources import parameters

@@ -11,13 +11,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from stereovox.cameras.rigs import StereoPair
 from stereovox.errors import FrameRefused, SourceError
 from stereovox.frame import StereoFrame
-from stereovox.geometry import Transform
-from stereovox.rigs import StereoPair
+from stereovox.se3 import Transform
 from stereovox.sources.base import Source
-from stereovox.sources.folder import file_names
-from stereovox.sources.images import PICTURE, png_size, read_picture_png
+from stereovox.sources.images import PICTURE, file_names, png_size, read_picture_png
 from stereovox.sources.rig_file import FILE, RigPair, read_rig
 from stereovox.sources.trajectory import Trajectory, by_time, inside, stamped_lines
 

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from stereovox.errors import FrameRefused, SourceError
-from stereovox.geometry import Transform
-from stereovox.sources.folder import DepthFolder, file_names
-from stereovox.untrusted import read_text
+from stereovox.safe_io import read_text
+from stereovox.se3 import Transform
+from stereovox.sources.images import DepthFolder, file_names
 
 FILE = re.compile(r"frame-(\d+)\.(depth\.png|pose\.txt)")
 FRAMES_PER_SECOND = 30

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.errors import SourceError, did_you_mean
-from stereovox.geometry import Transform
+from stereovox.se3 import Transform
 from stereovox.sources.poses import Poses
 from stereovox.sources.trajectory import FORMAT, pose_lines, pose_numbers, transforms
 

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.errors import SourceError
+from stereovox.safe_io import MOST_LIST, read_text
 from stereovox.sources.poses import Poses
 from stereovox.sources.poses import seconds_from_ns as seconds_from_ns
-from stereovox.untrusted import MOST_LIST, read_text
 
 LIMIT = 9_223_372_036
 """Seconds whose nanoseconds still fit into int64."""

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from stereovox.errors import SourceError
-from stereovox.geometry import Transform
-from stereovox.sources.folder import DepthFolder, file_names
+from stereovox.se3 import Transform
+from stereovox.sources.images import DepthFolder, file_names
 from stereovox.sources.trajectory import StampedLine, Trajectory, by_time, inside, ns_from_seconds, stamped_lines
 
 LIST, IMAGES, POSES = "depth.txt", "depth", "groundtruth.txt"

@@ -14,7 +14,7 @@ from stereovox.products.slices import along_ray
 from stereovox.view.figures import figure_of, headline
 from stereovox.view.panels import GREY, INK, LINE, STATE_COLOURS, title
 from stereovox.view.scale import Scale, scale_of
-from stereovox.view.whereabouts import known_viewpoint
+from stereovox.view.viewpoint import known_viewpoint
 
 BEYOND = 6
 """Cells that are drawn after the last known one."""

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from stereovox.calibrate.noise import NoiseCalibration
 from stereovox.calibrate.wall import WallCalibration, WallResult
-from stereovox.view.charts import blank, labels, png_of
+from stereovox.view.figures import blank, labels, png_of
 from stereovox.view.panels import GREY, title
 
 DPI = 150

@@ -14,7 +14,7 @@ from stereovox.evaluate.curves import PrecisionRecall, Roc
 from stereovox.evaluate.distance import ByDistance
 from stereovox.evaluate.reliability import Reliability
 from stereovox.evaluate.scores import Scores
-from stereovox.view.charts import blank, labels, png_of
+from stereovox.view.figures import blank, labels, png_of
 from stereovox.view.panels import GREY, INK
 
 DPI = 140

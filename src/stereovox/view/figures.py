@@ -1,16 +1,74 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What all pictures share: a figure with a headline, saved as dots or as vectors."""
+"""What all pictures share: figures with a headline, legends, charts."""
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from stereovox.errors import StereovoxError
-from stereovox.files import replacing
 from stereovox.maps import VoxelMap
-from stereovox.view.panels import GREY, INK
+from stereovox.safe_io import replacing
+from stereovox.view.panels import GREY, INK, LINE
+
+
+def keep_clear(axis: Any) -> None:
+    """Put the legend above a panel into a column at its right, where it would cover the panel's title.
+
+    To be called when all panels of the figure are there: how wide this one is, only the finished layout tells.
+    """
+    axis.figure.draw_without_rendering()
+    legend = axis.get_legend()
+    if not covered(axis):
+        return
+    axis.legend(
+        handles=legend.legend_handles,
+        labels=[text.get_text() for text in legend.get_texts()],
+        loc="upper left",
+        bbox_to_anchor=(1.0, 1.0),
+        frameon=False,
+        handlelength=1.2,
+        fontsize=legend.get_texts()[0].get_fontsize(),
+    )
+
+
+def covered(axis: Any) -> bool:
+    """Return whether the legend of a drawn panel touches its title."""
+    from matplotlib.text import Text
+
+    words = axis.get_title(loc="left")
+    title = next(one for one in axis.get_children() if isinstance(one, Text) and one.get_text() == words)
+    return bool(axis.get_legend().get_window_extent().overlaps(title.get_window_extent()))
+
+
+def blank(width: float, height: float) -> Any:
+    """Return an empty figure of this size in inches."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    made = Figure((width, height), facecolor="white", layout="constrained")
+    FigureCanvasAgg(made)
+    return made
+
+
+def labels(axis: Any, x: str, y: str, letters: float = 9) -> None:
+    """Label both axes of a chart in grey, ticks with `letters` points; an empty `x` leaves that axis as it is."""
+    if x:
+        axis.set_xlabel(x, color=GREY)
+    axis.set_ylabel(y, color=GREY)
+    axis.tick_params(colors=GREY, labelsize=letters)
+    for spine in axis.spines.values():
+        spine.set_color(LINE)
+
+
+def png_of(figure: Any, dpi: int) -> bytes:
+    """Return a figure as the bytes of a PNG."""
+    out = io.BytesIO()
+    figure.savefig(out, dpi=dpi, format="png")
+    return out.getvalue()
+
 
 DPI = 120
 ENDINGS = (".png", ".pdf", ".svg")

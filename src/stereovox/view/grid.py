@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stereovox import planar
+from stereovox import se2
 from stereovox.maps import State
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.view.figures import WIDTH, figure_of, save, words_above
@@ -72,7 +72,7 @@ def facts(grid: OccupancyGrid) -> list[str]:
 
 def bounds(grid: OccupancyGrid, track: ArrayLike | None = None) -> Box | None:
     """Return lowest and highest (2,) x, y of what is known and of the track, with a margin; None where nothing is."""
-    corners = planar.transform(grid.origin, grid.known_corners * grid.resolution)
+    corners = se2.transform(grid.origin, grid.known_corners * grid.resolution)
     if track is not None and np.size(track):
         corners = np.concatenate([corners, np.asarray(track, float)[:, :2]])
     if not len(corners):
@@ -135,13 +135,13 @@ def pooled(classes: NDArray[np.uint8], rising: Sequence[int], step: int) -> NDAr
 def trimmed(grid: OccupancyGrid) -> OccupancyGrid:
     """Return a map without the rows and columns at its rim of which nothing is known."""
     rows, columns = grid.known_span
-    x, y, yaw = planar.compose(grid.origin, [columns.start * grid.resolution, rows.start * grid.resolution, 0]).tolist()
+    x, y, yaw = se2.compose(grid.origin, [columns.start * grid.resolution, rows.start * grid.resolution, 0]).tolist()
     return replace(grid, cells=grid.cells[rows, columns], origin=(x, y, yaw))
 
 
 def known_bounds(grid: OccupancyGrid) -> NDArray[np.float64] | None:
     """Return lowest and highest (2, 2) x, y in metres of what is known, in the map's frame; None where nothing is."""
-    corners = planar.transform(grid.origin, grid.known_corners * grid.resolution)
+    corners = se2.transform(grid.origin, grid.known_corners * grid.resolution)
     return np.stack([corners.min(axis=0), corners.max(axis=0)]) if len(corners) else None
 
 

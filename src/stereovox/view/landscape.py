@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from stereovox.maps import State, VoxelMap
 from stereovox.products.slices import Layer
 from stereovox.view.figures import DPI
-from stereovox.view.frame3d import draw_frame, fit, numbers
 from stereovox.view.panels import STATE_COLOURS, round_length, title
 from stereovox.view.render import Direction, render
 from stereovox.view.scale import Scale, scale_of
+from stereovox.view.space import draw_frame, fit, numbers
 
 MOST_COLUMNS = 160
 """Cells along a side; larger layers are thinned, and the value furthest from unknown stays."""

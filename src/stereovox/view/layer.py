@@ -14,12 +14,11 @@ from stereovox.maps import State, VoxelMap
 from stereovox.products.slices import Layer, layer
 from stereovox.view.axis import draw_profile
 from stereovox.view.drawn import UPS, checked_up, upright
-from stereovox.view.figures import WIDTH, figure_of, headline
+from stereovox.view.figures import WIDTH, figure_of, headline, keep_clear
 from stereovox.view.landscape import draw_landscape
-from stereovox.view.legends import keep_clear
 from stereovox.view.panels import GREY, LINE, PATH_COLOUR, STATE_COLOURS, measured, title
 from stereovox.view.scale import scale_of
-from stereovox.view.whereabouts import FIELD_M
+from stereovox.view.viewpoint import FIELD_M
 
 MOST_SQUARES = 90
 """Columns of cells up to which each is drawn as a square with an outline."""

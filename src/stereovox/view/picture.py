@@ -11,8 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from stereovox.maps import VoxelMap
 from stereovox.view.drawn import Drawn, upright
-from stereovox.view.figures import DPI, WIDTH, figure_of, headline, save
-from stereovox.view.legends import keep_clear
+from stereovox.view.figures import DPI, WIDTH, figure_of, headline, keep_clear, save
 from stereovox.view.panels import GREY, measured, oblique, slice_, title, view
 from stereovox.view.render import Direction, extent
 

@@ -1,0 +1,195 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Poses of a tracker at many times at once, where they may be trusted, and how far its clock is off."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.calibrate.odometry import CameraMotion
+from stereovox.errors import StereovoxError
+from stereovox.sources.poses import MAX_GAP_NS, Poses
+from stereovox.sources.tracker import angles, jumps
+
+SMOOTH = 0.03
+"""Seconds; a hand that swings twice a second loses 0.6 % of its turns by that."""
+
+
+class PoseTrack:
+    """Poses interpolated as `Poses.at` does, vectorised; times in seconds since `start_ns`.
+
+    Poses below `min_confidence` and those that cannot be used are left out; a jump divides the track. A tracker's poses
+    tremble from one to the next, by which no offset finer than their distance could be found, so each is the mean of
+    those within `SMOOTH` around it.
+    """
+
+    def __init__(self, poses: Poses, min_confidence: float, max_speed_mps: float, max_turn_dps: float):
+        from scipy.spatial.transform import Rotation, Slerp
+
+        usable = np.isfinite(poses.T_world_body).all((1, 2))
+        if poses.confidence is not None:
+            usable &= poses.confidence >= min_confidence
+        if usable.sum() < 2:
+            raise StereovoxError(f"{poses.where}: fewer than two poses of confidence {min_confidence:g} or more")
+        kept = Poses(poses.stamps_ns[usable], poses.T_world_body[usable], where=poses.where)
+        self.start_ns = int(kept.stamps_ns[0])
+        times = (kept.stamps_ns - self.start_ns) / 1e9
+        breaks = np.zeros(len(times), np.intp)
+        breaks[jumps(kept, max_speed_mps, max_turn_dps)[:, 1]] = 1
+        count = _poses_to_average(times)
+        middle = slice(count // 2, len(times) - count // 2)
+        self._breaks = np.cumsum(breaks)[middle]
+        self.times = _averages(times[:, None], count)[:, 0]
+        self._positions = _averages(kept.T_world_body[:, :3, 3], count)
+        self._rotations = Slerp(self.times, Rotation.from_quat(_averages(_quaternions(kept), count)))
+
+    def at(self, times: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return (N, 4, 4) T_world_body at (N,) times; those beyond either end get the pose at that end."""
+        times = np.clip(times, self.times[0], self.times[-1])
+        T = np.zeros((len(times), 4, 4))
+        T[:, 3, 3] = 1
+        T[:, :3, :3] = self._rotations(times).as_matrix()
+        T[:, :3, 3] = np.stack([np.interp(times, self.times, axis) for axis in self._positions.T], axis=1)
+        return T
+
+    def parts(self, times: NDArray[np.float64]) -> NDArray[np.intp]:
+        """Return for (N,) times which part of the track between two jumps they lie in; -1 where no pose is near."""
+        after = np.clip(np.searchsorted(self.times, times), 1, len(self.times) - 1)
+        before = after - 1
+        gap = np.maximum(times - self.times[before], self.times[after] - times)
+        within = (times >= self.times[0]) & (times <= self.times[-1]) & (gap < MAX_GAP_NS / 1e9)
+        return np.where(within & (self._breaks[before] == self._breaks[after]), self._breaks[after], -1)
+
+
+def _poses_to_average(times: NDArray[np.float64]) -> int:
+    """Return the odd number of poses that SMOOTH holds; one where they come too slowly or there are too few."""
+    count = int(SMOOTH / np.median(np.diff(times))) // 2 * 2 + 1
+    return count if len(times) > 2 * count else 1
+
+
+def _quaternions(poses: Poses) -> NDArray[np.float64]:
+    """Return (N, 4) unit quaternions, neighbours on the same side of the sphere."""
+    from scipy.spatial.transform import Rotation
+
+    quaternions = Rotation.from_matrix(poses.T_world_body[:, :3, :3]).as_quat()
+    sides = np.where(np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0, -1.0, 1.0)
+    return quaternions * np.cumprod(np.concatenate([[1.0], sides]))[:, None]
+
+
+def _averages(values: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+    """Return the running means (N - count + 1, K) over `count` rows of (N, K)."""
+    return np.lib.stride_tricks.sliding_window_view(values, count, axis=0).mean(axis=-1)
+
+
+STEP = 0.01
+"""Seconds between the samples that are compared."""
+OVERLAP = 0.5
+"""Share of the shorter recording that must lie within the other."""
+CLEAR = 0.6
+"""Least correlation of a match."""
+APART, ALMOST, MOST = 0.3, 0.85, 5
+"""Other matches that are looked at: so far beside better ones (seconds), so well correlated (share of the best)."""
+LONGEST = 86_400.0
+"""Seconds; what seems to last longer holds a wrong time, and its samples would fill the memory."""
+
+
+@dataclass(frozen=True)
+class Offset:
+    """Seconds to add to times of the track to get times of the camera (both since their starts); its correlation."""
+
+    seconds: float
+    correlation: float
+
+
+def find_offsets(motion: CameraMotion, track: PoseTrack, between: tuple[float, float] | None = None) -> list[Offset]:
+    """Return the offsets at which the two angular speeds fit, the best first; one, unless the motion repeats itself.
+
+    Times of the camera count from its first image, those of the track from its first pose. `between`: only offsets in
+    this range, in seconds. Raises StereovoxError, one line, where no offset fits.
+    """
+    _check_span("images", (motion.stamps_ns[-1] - motion.stamps_ns[0]) / 1e9)
+    _check_span("poses", track.times[-1])
+    lags, correlation = _correlate(_camera_speed(motion), _track_speed(track, _frame_time(motion)))
+    offsets = lags * STEP
+    allowed = np.isfinite(correlation)
+    if between is not None:
+        allowed &= (offsets >= between[0]) & (offsets <= between[1])
+    if not allowed.any():
+        raise StereovoxError("clocks: at no allowed offset do images and poses overlap enough; record both together")
+    correlation = np.where(allowed, correlation, -1.0)
+    best = float(correlation.max())
+    if best < CLEAR:
+        found = f"the best correlation of the angular speeds is {best:.2f}, below {CLEAR:g}"
+        cure = "the recordings do not overlap, or turn too little; record both together and turn irregularly"
+        raise StereovoxError(f"clocks: {found}; {cure}")
+    chosen: list[int] = []
+    left = correlation.copy()
+    while len(chosen) < MOST and left.max() >= max(CLEAR, ALMOST * best):
+        chosen.append(int(np.argmax(left)))
+        left[np.abs(offsets - offsets[chosen[-1]]) < APART] = -1.0
+    return [Offset(float(offsets[k] + STEP * _peak(correlation, k)), float(correlation[k])) for k in chosen]
+
+
+def _check_span(what: str, seconds: float) -> None:
+    if not STEP < seconds < LONGEST:
+        cure = "record for some seconds, and remove what has a wrong time (longest: a day)"
+        raise StereovoxError(f"clocks: the {what} span {seconds:.9g} s from first to last; {cure}")
+
+
+def _frame_time(motion: CameraMotion) -> float:
+    return float(np.median(np.diff(motion.stamps_ns))) / 1e9
+
+
+def _camera_speed(motion: CameraMotion) -> NDArray[np.float64]:
+    """Return the angular speed in rad/s each STEP from the first image on, NaN where it is not known."""
+    times = (motion.stamps_ns - motion.stamps_ns[0]) / 1e9
+    spans = np.diff(times)
+    usual = (spans > 0) & (spans <= max(0.25, 3 * np.median(spans)))
+    speeds = np.where(usual, angles(motion.steps[:, :3, :3]) / np.where(usual, spans, 1), np.nan)
+    samples = np.arange(0, times[-1], STEP)
+    return speeds[np.clip(np.searchsorted(times, samples, side="right") - 1, 0, len(speeds) - 1)]
+
+
+def _track_speed(track: PoseTrack, window: float) -> NDArray[np.float64]:
+    """Return the angular speed in rad/s each STEP from the first pose on, as a camera of this frame time sees it."""
+    samples = np.arange(0, track.times[-1], STEP)
+    before, after = samples - window / 2, samples + window / 2
+    turned = np.swapaxes(track.at(before)[:, :3, :3], 1, 2) @ track.at(after)[:, :3, :3]
+    parts = track.parts(before)
+    known = (parts >= 0) & (parts == track.parts(after))
+    return np.where(known, angles(turned) / window, np.nan)
+
+
+def _correlate(a: NDArray[np.float64], b: NDArray[np.float64]) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
+    """Return lags and Pearson's correlation between a[i + lag] and b[i] over the samples both know.
+
+    NaN where fewer samples than OVERLAP of the shorter one are common, or where one of them does not change.
+    """
+    from scipy.signal import correlate, correlation_lags
+
+    known_a, known_b = np.isfinite(a).astype(float), np.isfinite(b).astype(float)
+    a, b = (np.nan_to_num(x - np.nanmean(x)) if np.isfinite(x).any() else np.zeros(len(x)) for x in (a, b))
+
+    def cross(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+        return correlate(x, y, "full", "fft")
+
+    count = np.rint(cross(known_a, known_b))
+    fewest = max(OVERLAP * min(known_a.sum(), known_b.sum()), 50)
+    n = np.where(count >= fewest, count, np.nan)
+    sum_a, sum_b = cross(a, known_b), cross(known_a, b)
+    spread_a = cross(a * a, known_b) - sum_a**2 / n
+    spread_b = cross(known_a, b * b) - sum_b**2 / n
+    least = 1e-6 * n
+    spread = np.where((spread_a > least) & (spread_b > least), spread_a * spread_b, np.nan)
+    return correlation_lags(len(a), len(b), "full"), (cross(a, b) - sum_a * sum_b / n) / np.sqrt(spread)
+
+
+def _peak(values: NDArray[np.float64], k: int) -> float:
+    """Return how far beside sample `k` the top of the parabola through it and its neighbours lies, in samples."""
+    if not 0 < k < len(values) - 1:
+        return 0.0
+    left, middle, right = values[k - 1 : k + 2]
+    bend = left - 2 * middle + right
+    return float(np.clip((left - right) / (2 * bend), -0.5, 0.5)) if bend < 0 else 0.0

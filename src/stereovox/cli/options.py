@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Options that several commands share: settings, numbers, how often a map is saved, endings of files."""
+
+from __future__ import annotations
+
+import math
+from argparse import ArgumentParser, ArgumentTypeError, Namespace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from stereovox.errors import StereovoxError
+
+if TYPE_CHECKING:
+    from stereovox.se3 import Transform
+
+CORNERS = "X0,Y0,Z0,X1,Y1,Z1"
+"""How a box is written: its lowest and its highest corner."""
+LARGEST_FILE = 10_000
+"""Bytes of a file that holds a transform."""
+
+
+def numbers_of(option: str, text: str, names: str) -> list[float]:
+    """Return as many numbers as there are `names` ("X,Y,Z"); raises StereovoxError that names the option."""
+    try:
+        numbers = [float(word) for word in text.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) != len(names.split(",")) or any(map(math.isnan, numbers)):
+        raise StereovoxError(f"{option} {text}: write {names}, numbers in metres with commas and no blanks")
+    return numbers
+
+
+def point(text: str) -> tuple[float, float, float]:
+    """Return three numbers in metres from X,Y,Z; raises ArgumentTypeError for anything else."""
+    try:
+        x, y, z = map(float, text.split(","))
+    except ValueError:
+        x = y = z = math.nan
+    if not math.isfinite(x + y + z):
+        raise ArgumentTypeError(f"'{text}' is no point; give X,Y,Z in metres")
+    return x, y, z
+
+
+def transform_of(text: str) -> Transform:
+    """Return the transform that `--transform` names: seven numbers, or a file with them or with a 4x4 matrix.
+
+    Raises StereovoxError: one line that names the value or file and the cure.
+    """
+    import numpy as np
+
+    from stereovox.products.moved import rigid
+    from stereovox.safe_io import read_text
+    from stereovox.se3 import from_quaternion
+
+    where = f"--transform {text}"
+    try:
+        words = text if "," in text else read_text(Path(text), LARGEST_FILE)
+        numbers = np.array([float(word) for word in words.replace(",", " ").split()])
+    except (OSError, UnicodeError, ValueError):
+        numbers = np.array([])
+    if numbers.size == 7 and np.isfinite(numbers).all() and numbers[3:].any():
+        return from_quaternion(numbers[:3], numbers[3:])
+    if numbers.size != 16 or not np.isfinite(numbers).all():
+        raise StereovoxError(f"{where}: write tx,ty,tz,qx,qy,qz,qw, or name a file with these or with a 4x4 matrix")
+    try:
+        return rigid(numbers.reshape(4, 4))
+    except StereovoxError as error:
+        raise StereovoxError(f"{where}: {error}") from None
+
+
+def heights_of(text: str | None) -> tuple[float, float] | None:
+    """Return what --heights says; raises StereovoxError where that is not LO:HI."""
+    if text is None:
+        return None
+    low, _, high = text.partition(":")
+    try:
+        heights = float(low), float(high)
+    except ValueError:
+        raise StereovoxError(f"--heights {text}: write LO:HI in metres, for example --heights 0.1:1.8") from None
+    if not heights[0] < heights[1]:
+        raise StereovoxError(f"--heights {text}: the second must be higher than the first")
+    return heights
+
+
+SECONDS = 10.0
+"""As `run.CHECKPOINT_S`, whose import `--help` need not wait for."""
+
+
+def add_checkpoint(parser: ArgumentParser) -> None:
+    """Declare the option."""
+    parser.add_argument(
+        "--checkpoint",
+        type=float,
+        default=SECONDS,
+        metavar="SECONDS",
+        help=f"save the map as often while it is made ({SECONDS:g}; 0: only at the end), in 4 %% of the time at most",
+    )
+
+
+def check_ending(option: str, file: str | None, *endings: str) -> None:
+    """Raise StereovoxError where the file of an option does not end as it must."""
+    if file is not None and Path(file).suffix.lower() not in endings:
+        raise StereovoxError(f"{option} {file}: end the file's name with {' or '.join(endings)}")
+
+
+NAMED = ("voxel_size", "integrator", "max_range", "threads")
+"""Settings that may have an option of their own."""
+
+
+def add_settings(parser: ArgumentParser, example: str) -> None:
+    """Declare --set; `example` is one setting that the command knows."""
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        dest="settings",
+        help=f"any other setting, for example {example}; repeatable",
+    )
+
+
+def overrides(arguments: Namespace) -> dict[str, Any]:
+    """Return what stands on top of the profile; raises StereovoxError for a --set that is none."""
+    from stereovox.config import parse_value
+
+    found = {}
+    for setting in arguments.settings:
+        key, equals, value = setting.partition("=")
+        if not equals or not key:
+            raise StereovoxError(f"--set {setting}: write KEY=VALUE, for example --set sensor.p_free=0.3")
+        if key.strip() in ("profile", "resume"):
+            raise StereovoxError(f"--set {setting}: this is no setting; use --{key.strip()}")
+        if key.strip() in ("tiles", "self"):  # other names that `Mapper` knows
+            raise StereovoxError(f"--set {setting}: this is no setting; leave it out")
+        found[key.strip()] = parse_value(value.strip())
+    named = {name: getattr(arguments, name, None) for name in NAMED}
+    return {**found, **{name: value for name, value in named.items() if value is not None}}

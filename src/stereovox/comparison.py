@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Evidence that is compared with the map before the map takes it in, and where else its image would fit."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.cameras.rigs import VirtualCamera
+from stereovox.config import Config
+from stereovox.frame import AnyFrame, DepthImage
+from stereovox.integrate import Integrator
+from stereovox.integrate.views import PerCamera, sensor_table
+from stereovox.maps import State, VoxelMap
+from stereovox.maps.evidence import Evidence
+from stereovox.se3 import Transform, rotation_matrix
+from stereovox.sensors import make_sensor
+from stereovox.sensors.model import InverseSensorModel
+from stereovox.trust.camera_path import apart
+from stereovox.trust.gate import Gate, Passed
+
+SURFACES = (State.OCCUPIED, State.TENTATIVE)
+POINTS, BESIDE = 600, 3
+"""Pixels that are laid onto the map, at most, and how many pixels beside them their neighbours are."""
+STEPS = 30
+REACH_M, REACH_CELLS = 0.6, 2.0
+"""How far a point looks for its surface in the first step, and in the last."""
+FEWEST = 30
+"""Points that must find a surface."""
+MAX_SHIFT_M, MAX_TURN = 0.5, np.radians(15)
+"""How far a knocked camera may stand from where its pose says."""
+DAMPING = 1e-3
+"""Of the least squares, for motions that no surface is against."""
+
+
+def pose_on_surfaces(voxel_map: VoxelMap, image: DepthImage) -> Transform | None:
+    """Return T_world_sensor (4, 4) near the image's own that brings its points onto the map's surfaces.
+
+    None: there is no such pose, or the image is there already, within a cell.
+
+    Iterative closest points, from points and their planes to the centres of cells (Chen and Medioni 1992); the distance
+    up to which a point finds a cell shrinks from step to step.
+    """
+    points, normals = _surfaces(image)
+    T, last = image.T_world_sensor, min(REACH_M, REACH_CELLS * voxel_map.voxel_size)
+    for reach in np.geomspace(REACH_M, last, STEPS):
+        there, planes = points @ T[:3, :3].T + T[:3, 3], normals @ T[:3, :3].T
+        found = voxel_map.nearest_obstacle(there, float(reach), SURFACES) if len(there) else None
+        near = np.isfinite(found.distance) if found else np.zeros(0, bool)
+        if found is None or near.sum() < FEWEST:
+            return None
+        T = _motion(there[near], planes[near], voxel_map.centers(found.cell[near])) @ T
+    shift_m, turn = apart(tuple(image.T_world_sensor[:3].ravel().tolist()), tuple(T[:3].ravel().tolist()))
+    moved_m = np.linalg.norm(points @ (T - image.T_world_sensor)[:3, :3].T + (T - image.T_world_sensor)[:3, 3], axis=1)
+    elsewhere = moved_m.mean() > voxel_map.voxel_size and shift_m <= MAX_SHIFT_M and turn <= MAX_TURN
+    return T if elsewhere else None
+
+
+def _surfaces(image: DepthImage) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return some of the image's points (N, 3) and the normals of their surfaces (N, 3), in the camera's frame."""
+    height, width = image.depth_m.shape
+    step = max(1, round((image.depth_m.size / POINTS) ** 0.5))
+    rows, columns = (np.arange(BESIDE, size - BESIDE, step) for size in (height, width))
+    v, u = np.meshgrid(rows, columns, indexing="ij")
+    here = _points(image, v, u)
+    across = _points(image, v, u + BESIDE) - _points(image, v, u - BESIDE)
+    down = _points(image, v + BESIDE, u) - _points(image, v - BESIDE, u)
+    normals = np.cross(across, down)
+    length = np.linalg.norm(normals, axis=-1)
+    seen = np.isfinite(here).all(axis=-1) & np.isfinite(length) & (length > 0)
+    return here[seen], normals[seen] / length[seen][:, None]
+
+
+def _points(image: DepthImage, v: NDArray[np.integer], u: NDArray[np.integer]) -> NDArray[np.float64]:
+    """Return the points (..., 3) of pixels, NaN where they have no depth."""
+    columns, rows = (rays.astype(float) for rays in image.camera.rays())
+    depth = np.where(np.isfinite(image.depth_m[v, u]), image.depth_m[v, u], np.nan)
+    return np.stack([columns[u], rows[v, 0], rows[v, 1]], axis=-1) * depth[..., None]
+
+
+def _motion(points: NDArray[np.float64], normals: NDArray[np.float64], onto: NDArray[np.float64]) -> Transform:
+    """Return the small rigid motion (4, 4) that brings points (N, 3), along their normals, nearest to others."""
+    middle = points.mean(axis=0)
+    arms = points - middle
+    jacobian = np.hstack([np.cross(arms, normals), normals])
+    gap = ((onto - points) * normals).sum(axis=1)
+    square = jacobian.T @ jacobian + DAMPING * len(points) * np.eye(6)
+    turn, shift = np.split(np.linalg.solve(square, jacobian.T @ gap), 2)
+    T = np.eye(4)
+    T[:3, :3] = rotation_matrix(turn)
+    T[:3, 3] = middle + shift - T[:3, :3] @ middle
+    return T
+
+
+FIRM = 0.4
+"""Share of the most that a hit says which a hit must say to be firm: what is far says less, for its noise is wider than
+a cell."""
+
+
+class Comparison:
+    """Makes evidence and lets a gate decide whether it is to be believed."""
+
+    def __init__(self, config: Config, gate: Gate):
+        self._gate, self._compares = gate, config.trust.max_disagreement < 1
+        self._firm = PerCamera(partial(_firm, make_sensor(config.sensor), config))
+        self._prepared = False
+
+    def evidence(
+        self, frame: AnyFrame, image: DepthImage, passed: Passed, integrator: Integrator, voxel_map: VoxelMap
+    ) -> tuple[Evidence, Passed]:
+        """Return the evidence of an image, and what the gate is to remember of it.
+
+        passed: what `Gate.check` returned. Raises FrameRefused as `Gate.believe`.
+        """
+        evidence = integrator.evidence(image)
+        if not self._compares:
+            return evidence, passed
+        self._prepare(voxel_map, image)
+        firm, fits = self._firm[image.camera], False
+        against = voxel_map.agreement(evidence, firm).against
+        limit = self._gate.limit_elsewhere(passed, against)
+        if limit is not None:
+            fits = _fits_elsewhere(image, integrator, voxel_map, firm, limit)
+            evidence = integrator.evidence(image)  # each takes the memory of the one before
+        with voxel_map.lock:
+            passed = self._gate.believe(frame, passed, against, fits)
+        return evidence, passed
+
+    def _prepare(self, voxel_map: VoxelMap, image: DepthImage) -> None:
+        """Let the first image be looked for elsewhere: kernels are compiled then, and not when one is doubted."""
+        if not self._prepared:
+            self._prepared = True
+            pose_on_surfaces(voxel_map, image)
+
+
+def _fits_elsewhere(image: DepthImage, integrator: Integrator, voxel_map: VoxelMap, firm: int, limit: float) -> bool:
+    """Tell whether an image disagrees with the map by no more than `limit` where it lies on its surfaces."""
+    pose = pose_on_surfaces(voxel_map, image)
+    if pose is None:
+        return False
+    against = voxel_map.agreement(integrator.evidence(replace(image, T_world_sensor=pose)), firm).against
+    return against is not None and against <= limit
+
+
+def _firm(sensor: InverseSensorModel, config: Config, camera: VirtualCamera) -> int:
+    """Return the evidence in thousandths from which on a hit is firm."""
+    return round(FIRM * int(sensor_table(sensor, config, camera).hit.max()))

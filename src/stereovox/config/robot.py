@@ -1,0 +1,192 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Settings of a ground robot: scans out of depth images, 2-D grids, localisation, SLAM. Part of `config.Config`."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+
+class Section(BaseModel):
+    """A part of the settings: unknown names are errors, numbers are finite, values do not change."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+class ScanConfig(Section):
+    """How a depth image becomes a scan (IST 2019, III-C).
+
+    method: `rows` takes the nearest of `rows` rows round the row that looks level, for a camera that is level; `cloud`
+        the nearest point between `heights`, for one that is tilted.
+    rows: 1 is the middle row alone (IST 2019). off_level_deg: most by which that row may leave the level.
+    heights: lowest and highest metres over the floor (z of the world) that count as an obstacle.
+    angle_step_deg: width of a beam; not set: that of a pixel in the middle of the image.
+    """
+
+    method: Literal["rows", "cloud"] = "cloud"
+    rows: int = Field(1, ge=1, le=4096)
+    heights: tuple[float, float] = (0.1, 1.8)
+    off_level_deg: float = Field(2.0, gt=0, le=20)
+    angle_step_deg: float | None = Field(None, ge=0.01, le=10)
+
+    @model_validator(mode="after")
+    def _ordered(self) -> ScanConfig:
+        if self.heights[0] >= self.heights[1]:
+            raise ValueError(f"heights {list(self.heights)} must rise: [lowest, highest]")
+        return self
+
+
+class GridConfig(Section):
+    """How scans become a 2-D occupancy grid (IST 2019, II).
+
+    traversal: cells of a beam by `bresenham`'s line, or `exact`: every cell that it touches; other packages add theirs.
+    update: a cell changes `once` a scan (a hit beats a pass), or by `every` beam that crosses it (IST 2019).
+    thickness: metres behind the measured point that are occupied too (alpha of IST 2019, II-B); 0: its cell alone.
+    p_occupied, p_free: what one beam says of a cell it ends in, and of one it passes, where as many cells are occupied
+        as free (OctoMap's numbers); `prior` tells how many are.
+    prior: probability that a cell is occupied before the first evidence on it.
+    max_tilt_deg: scans of a sensor that leans more than this are refused: its beams meet the floor.
+    """
+
+    traversal: str = "exact"
+    update: Literal["once", "every"] = "once"
+    thickness: float = Field(0.0, ge=0, le=5)
+    p_occupied: float = Field(0.7, gt=0.5, lt=1)
+    p_free: float = Field(0.4, gt=0, lt=0.5)
+    prior: float = Field(0.5, gt=0, lt=1)
+    max_tilt_deg: float = Field(5.0, ge=0, le=45)
+
+
+class AmclConfig(Section):
+    """Adaptive Monte Carlo localisation (Thrun, Burgard and Fox 2005, chapters 5, 6 and 8).
+
+    particles_min, particles_max: how many there are at least and at most.
+    kld_error, kld_z: there are so many particles that, up to the normal quantile `kld_z` (2.33: in 99 of 100 cases),
+        they differ from the true distribution by `kld_error` at most (Fox 2003); kld_bin, kld_bin_deg: its bins, in
+        metres and degrees, which also part the clusters the pose is taken from.
+    alpha1 ... alpha4: noise of the odometry (table 5.6): variance of a turn by a turn, of a turn by a way, of a way by
+        a way, of a way by a turn. 0.01 is a standard deviation of 10 %.
+    update_min_d, update_min_a: the map is asked after moving so many metres or turning so many radians.
+    resample_interval: particles are drawn anew after so many updates.
+    model: `field` compares where beams end with the nearest obstacle (table 6.3); `beam` compares their lengths with
+        what the map lets them be (table 6.1), which takes longer and suits maps of all that the lidar sees.
+    max_beams: how many of a scan's beams are used. max_range: metres beyond which a beam has seen nothing; not set: the
+        scan's own.
+    trust: power of a scan's likelihood: 1 takes the beams for independent (as printed), 1 / max_beams for a single one.
+    z_hit, z_short, z_max, z_rand: shares of beams that end at what the map holds, before it, nowhere, and anywhere;
+        only their proportions matter: `beam` divides them by their sum, which need not be 1 (it is not in ROS's amcl);
+        `field` knows z_hit and z_rand only. sigma_hit: metres; lambda_short: 1 / metres.
+    field_distance: metres from an obstacle beyond which all places are equal.
+    beam_skip: leave out beams that most particles find in the open, once they agree with each other: people, and what
+        was moved.
+    beam_skip_distance: a beam fits a particle for which it ends within so many metres of an obstacle.
+    beam_skip_share: a beam is left out where it fits a smaller share of the particles.
+    beam_skip_most: all beams are used where a larger share of them would be left out.
+    alpha_slow, alpha_fast: how quickly the long and the short memory of the likelihood fade (table 8.3); where the
+        short one falls below the long one, random particles help to find the robot again. 0: never.
+    recovery_least: a smaller share of random particles is taken for chance, and none are drawn; 0: as printed.
+    candidates: random poses that are tried for each random particle, of which the scan chooses; 1: any, as printed.
+    start_std: standard deviation of the first pose where it is given: metres, metres, radians.
+    """
+
+    particles_min: int = Field(500, ge=10)
+    particles_max: int = Field(30000, ge=10, le=1_000_000)
+    kld_error: float = Field(0.01, gt=0, lt=1)
+    kld_z: float = Field(2.33, gt=0, le=6)
+    kld_bin: float = Field(0.5, gt=0)
+    kld_bin_deg: float = Field(10.0, gt=0, le=360)
+    alpha1: float = Field(0.02, ge=0)
+    alpha2: float = Field(0.02, ge=0)
+    alpha3: float = Field(0.02, ge=0)
+    alpha4: float = Field(0.02, ge=0)
+    update_min_d: float = Field(0.2, ge=0)
+    update_min_a: float = Field(0.5, ge=0)
+    resample_interval: int = Field(1, ge=1)
+    model: Literal["field", "beam"] = "field"
+    max_beams: int = Field(60, ge=2)
+    max_range: float | None = Field(None, gt=0)
+    trust: float = Field(0.1, gt=0, le=1)
+    z_hit: float = Field(0.75, gt=0, le=1)
+    z_short: float = Field(0.05, ge=0, le=1)
+    z_max: float = Field(0.05, ge=0, le=1)
+    z_rand: float = Field(0.15, gt=0, le=1)
+    sigma_hit: float = Field(0.1, gt=0)
+    lambda_short: float = Field(0.1, gt=0)
+    field_distance: float = Field(2.0, gt=0)
+    beam_skip: bool = True
+    beam_skip_distance: float = Field(0.5, gt=0)
+    beam_skip_share: float = Field(0.3, ge=0, le=1)
+    beam_skip_most: float = Field(0.9, ge=0, le=1)
+    alpha_slow: float = Field(0.01, ge=0, le=1)
+    alpha_fast: float = Field(0.3, ge=0, le=1)
+    recovery_least: float = Field(0.1, ge=0, lt=1)
+    candidates: int = Field(20, ge=1, le=1000)
+    start_std: tuple[float, float, float] = (0.5, 0.5, 0.26)
+
+    @model_validator(mode="after")
+    def _ordered(self) -> AmclConfig:
+        if self.particles_min > self.particles_max:
+            raise ValueError(f"particles_min {self.particles_min} must be at most particles_max {self.particles_max}")
+        if self.alpha_slow > self.alpha_fast:
+            raise ValueError(f"alpha_slow {self.alpha_slow:g} must be at most alpha_fast {self.alpha_fast:g}")
+        if min(self.start_std) < 0:
+            raise ValueError(f"start_std {list(self.start_std)} must not be negative")
+        return self
+
+
+class SlamConfig(Section):
+    """Simultaneous localisation and mapping from a 2-D lidar (`localize/slam/pipeline.py`).
+
+    voxel_size: side in metres of a cell of the map, and of the grid that scans are matched in.
+    max_range: metres up to which hits are matched; what is further is too sparse to lie on a line.
+    sigma: metres that a hit may stand off a wall; beyond, it counts less and less (Geman and McClure).
+    odometry: how far the odometry's step between two scans may be off: metres (above 0), metres per metre, radians
+        (above 0), radians per radian. Turns are wide on purpose: odometry and lidar seldom have one clock, and matching
+        knows better.
+    keyframe_distance, keyframe_turn: metres and radians between the scans that the map is made of.
+    local_keyframes: a scan is matched with the map of this many last keyframes.
+    submap_keyframes: keyframes of a submap, the unit that loops are closed with.
+    closure_path: metres of way between two visits, from which on they are a loop.
+    drift, drift_turn: what the search for loops allows the way between: metres per metre, radians per metre.
+    closure_window, closure_window_turn: largest metres and radians that are searched.
+    closure_score: mean likelihood of the points (0 to 1) from which on a place may be one seen before.
+    closure_rival: no loop is closed where another place scores this share of the best one's score.
+    closure_share: share of the points that must then lie on the earlier map's lines.
+    refine_rounds: how often all keyframes are matched with all that saw the same walls, at the end; 0 is quickest.
+    refine_distance: metres between keyframes that are matched with each other.
+    clear_far: whether a beam that saw nothing clears the map up to `max_range`. Off, as many lidars tell black and
+        dazzling things in the same way.
+    """
+
+    voxel_size: float = Field(0.05, ge=0.01, le=0.5)
+    max_range: float = Field(30.0, gt=0, le=1000)
+    sigma: float = Field(0.04, gt=0, le=1)
+    odometry: tuple[float, float, float, float] = (0.02, 0.2, 0.07, 0.5)
+    keyframe_distance: float = Field(0.25, gt=0, le=10)
+    keyframe_turn: float = Field(0.2, gt=0, le=3.2)
+    local_keyframes: int = Field(50, ge=1, le=1000)
+    submap_keyframes: int = Field(24, ge=2, le=1000)
+    closure_path: float = Field(12.0, gt=0)
+    drift: float = Field(0.03, ge=0, le=1)
+    drift_turn: float = Field(0.004, ge=0, le=1)
+    closure_window: float = Field(6.0, gt=0, le=50)
+    closure_window_turn: float = Field(0.5, gt=0, le=3.2)
+    closure_score: float = Field(0.45, gt=0, lt=1)
+    closure_rival: float = Field(0.9, gt=0, le=1)
+    closure_share: float = Field(0.5, gt=0, lt=1)
+    refine_rounds: int = Field(1, ge=0, le=20)
+    refine_distance: float = Field(5.0, gt=0, le=100)
+    clear_far: bool = False
+
+    @model_validator(mode="after")
+    def _possible(self) -> SlamConfig:
+        if self.max_range > 2000 * self.voxel_size:
+            raise ValueError(f"max_range {self.max_range:g} spans more than 2000 cells of {self.voxel_size:g}")
+        base, per_metre, base_turn, per_radian = self.odometry
+        if min(base, base_turn) <= 0 or min(per_metre, per_radian) < 0:
+            raise ValueError(
+                f"odometry {list(self.odometry)} must be [metres, metres per metre, radians, radians per radian]: "
+                "the first and the third above 0, the others at least 0"
+            )
+        return self

@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which frames may change a map, for how long it counts as current, and what is left out where time is short."""
+
+from __future__ import annotations
+
+from pydantic import Field, model_validator
+
+from stereovox.config.robot import Section
+
+
+class TrustConfig(Section):
+    """Which frames may change the map, and for how long it then counts as current (docs/safety.md).
+
+    ordered: the stamps of each sensor must not go back; `false` for runs that repeat or reverse a recording.
+    clock_reset_s: a stamp that steps by more than this many seconds backwards is a clock that was reset.
+    max_gap_s: so is one that is more than this many seconds ahead.
+    max_speed_mps, max_turn_dps: metres and degrees a second beyond which a pose has jumped.
+    max_pose_off_s: seconds that a pose may be extrapolated.
+    settle_s: after a jump or a reset, frames that agree with each other for so long are believed again; 0: at once.
+    stale_s, lost_s: seconds without a trusted frame until the map is `stale` and until it is `lost`.
+    min_valid_share: share of the pixels that must say something (a depth, or too far); 0: one pixel is enough.
+    min_surface_share: share of the depths that must lie on surfaces; 0: not asked for.
+    max_unexposed_share: share of the pixels of a stereo pair's image that may be black, or saturated; 1: all.
+    frozen: refuse an image that is exactly the one before although the camera has moved.
+    max_disagreement: share of what a frame says of what the map is sure of that may be against the map, on top of what
+        is usual for its sensor; 1: not asked for.
+    pose_error_m: metres that poses are off now and then; a frame may disagree by that over the size of a cell.
+    changed_s: a world that has changed is believed after so many seconds of frames that disagree with the map, and at
+        least five of them; 0: at once.
+    moved_s: seconds after which frames are believed that would agree if the camera stood elsewhere.
+    """
+
+    ordered: bool = True
+    clock_reset_s: float = Field(1.0, gt=0, le=1e9)
+    max_gap_s: float = Field(3600.0, gt=0, le=1e9)
+    max_speed_mps: float = Field(40.0, gt=0)
+    max_turn_dps: float = Field(1500.0, gt=0)
+    max_pose_off_s: float = Field(0.05, ge=0, le=1e9)
+    settle_s: float = Field(1.0, ge=0, le=1e9)
+    stale_s: float = Field(0.5, gt=0)
+    lost_s: float = Field(5.0, gt=0)
+    min_valid_share: float = Field(0.005, ge=0, le=1)
+    min_surface_share: float = Field(0.5, ge=0, le=1)
+    max_unexposed_share: float = Field(0.9, gt=0, le=1)
+    frozen: bool = True
+    max_disagreement: float = Field(0.15, gt=0, le=1)
+    pose_error_m: float = Field(0.0075, ge=0)
+    changed_s: float = Field(1.0, ge=0, le=1e9)
+    moved_s: float = Field(5.0, ge=0, le=1e9)
+
+    @model_validator(mode="after")
+    def _ordered(self) -> TrustConfig:
+        if self.stale_s >= self.lost_s:
+            raise ValueError(f"stale_s {self.stale_s:g} must be smaller than lost_s {self.lost_s:g}")
+        return self
+
+
+class PaceConfig(Section):
+    """What is left out, step by step, where frames take longer than `deadline_ms` (docs/safety.md).
+
+    near_share: share of the maximum range that is left in the first step. stride: pixels along each side that become
+    one in the second, on top of `depth.downsample`. The third step is to leave out the frame.
+    """
+
+    near_share: float = Field(0.5, gt=0, le=1)
+    stride: int = Field(2, ge=1, le=16)

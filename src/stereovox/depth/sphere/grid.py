@@ -1,0 +1,225 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The spherical grid: how far the nearest surface is in each direction from the vehicle (Valenti 2018, 5.3)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import reduce
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stereovox.cameras.rigs import VirtualCamera
+from stereovox.config import Config, SphereConfig
+from stereovox.depth.sphere import _sphere
+from stereovox.depth.sphere.layout import SphereLayout, union
+from stereovox.frame import DepthImage, Reason
+from stereovox.se3 import Transform, transform_points
+from stereovox.sensors.noise import SUBPIXEL
+
+PIXEL = 1.5
+"""Pixels that a pixel covers, with its diagonal and some for what a grid's origin is nearer than the eye."""
+NEVER = np.iinfo(np.int64).min
+"""Stamp of a cell that nobody has looked into."""
+RANK = np.array([1, 3, 0, 2, 3, 3], np.uint8)
+"""Which `Reason` wins where two meet: too near, a surface, free up to somewhere, unknown."""
+ARRAYS = ("range_m", "reason", "count", "stamp_ns")
+
+
+class Cells(NamedTuple):
+    """What is known of the ranges of each cell, flat arrays as kernels write them."""
+
+    number: NDArray[np.int32]
+    mean: NDArray[np.float32]
+    squares: NDArray[np.float32]  # sum of squared differences from the mean
+    nearest: NDArray[np.float32]
+    free_to: NDArray[np.float32]  # range up to which rays without an obstacle are free
+    too_near: NDArray[np.uint8]  # whether anything was nearer than the camera can tell
+
+
+@dataclass(frozen=True, eq=False)
+class SphereGrid:
+    """One range for each direction from the origin of the body, and how old it is. Arrays are (azimuths, polars).
+
+    layout: the directions. range_m: float32 metres to the nearest surface where `reason` is VALID; up to which the
+        direction is free where it is TOO_FAR; 0 where it is TOO_NEAR; NaN where nobody has seen anything.
+    reason: uint8 of `Reason`, UNKNOWN where nobody has seen anything. count: int32 points of a cell.
+    stamp_ns: int64 time of a cell's range, NEVER where it has none.
+    camera: of all that took part the one whose ranges are the noisiest; None where none is known.
+    """
+
+    layout: SphereLayout
+    range_m: NDArray[np.float32]
+    reason: NDArray[np.uint8]
+    count: NDArray[np.int32]
+    stamp_ns: NDArray[np.int64]
+    camera: VirtualCamera | None = None
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """Whether somebody has seen something (azimuths, polars)."""
+        return self.stamp_ns != NEVER
+
+    def points(self) -> NDArray[np.float64]:
+        """Return the surfaces (N, 3) in metres, frame of the body: each at the middle of its cell."""
+        surface = self.reason == Reason.VALID
+        return self.layout.directions()[surface] * self.range_m[surface, None]
+
+    def since(self, stamp_ns: int) -> SphereGrid:
+        """Return the grid without what is older than `stamp_ns`: that is unknown again."""
+        old, nothing = self.stamp_ns < stamp_ns, empty(self.layout)
+        return replace(self, **{name: np.where(old, getattr(nothing, name), getattr(self, name)) for name in ARRAYS})
+
+
+def empty(layout: SphereLayout) -> SphereGrid:
+    """Return a grid in which nothing is known."""
+    shape = layout.shape
+    return SphereGrid(
+        layout,
+        np.full(shape, np.nan, np.float32),
+        np.full(shape, Reason.UNKNOWN, np.uint8),
+        np.zeros(shape, np.int32),
+        np.full(shape, NEVER, np.int64),
+    )
+
+
+def accumulate(
+    image: DepthImage, T_body_sensor: Transform, config: Config, layout: SphereLayout | None = None
+) -> SphereGrid:
+    """Return the grid of one depth image (Valenti 2018, Eq 5.2 to 5.4).
+
+    T_body_sensor: (4, 4) maps the image's optical frame into the body's (x forward, y left, z up), the grid's origin.
+    layout: the directions; without it those of `config.sphere`. A cell is TOO_NEAR where any of its pixels is, else
+    VALID where any pixel has a depth, else TOO_FAR where any pixel is. Near the poles, where cells are narrower than
+    pixels, what lies between two pixels takes the nearest beside it.
+    """
+    layout = layout or SphereLayout.configured(config.sphere)
+    cells, camera = _new_cells(layout), image.camera
+    columns, rows = camera.rays()
+    _sphere.gather_image(
+        image.depth_m, image.reason, columns, rows, np.ascontiguousarray(T_body_sensor[:3], np.float32),
+        np.float32(config.min_range), np.float32(config.max_range), layout.for_kernels(), cells,
+        np.empty((2, camera.width), np.float32),
+    )  # fmt: skip
+    grid = replace(_grid(cells, layout, config.sphere, image.stamp_ns), camera=camera)
+    _fill_between_pixels(grid, PIXEL * camera.binning / camera.focal_px)
+    return grid
+
+
+def gather(points: ArrayLike, stamp_ns: int, config: SphereConfig, layout: SphereLayout | None = None) -> SphereGrid:
+    """Return the grid of points (N, 3) in metres, frame of the body, seen at one time; NaN points count nowhere."""
+    layout = layout or SphereLayout.configured(config)
+    finite = np.asarray(points, np.float32).reshape(-1, 3)
+    finite = np.ascontiguousarray(finite[np.isfinite(finite).all(axis=1)])
+    cells = _new_cells(layout)
+    _sphere.gather_points(finite, np.zeros(len(finite), np.uint8), layout.for_kernels(), cells)
+    return _grid(cells, layout, config, stamp_ns)
+
+
+def _new_cells(layout: SphereLayout) -> Cells:
+    n = layout.azimuths * layout.polars
+    far = np.full((2, n), np.inf, np.float32)
+    none = np.zeros((2, n), np.float32)
+    return Cells(np.zeros(n, np.int32), none[0], none[1], far[0], far[1], np.zeros(n, np.uint8))
+
+
+def _grid(cells: Cells, layout: SphereLayout, config: SphereConfig, stamp_ns: int) -> SphereGrid:
+    near, valid, free = cells.too_near > 0, cells.number > 0, np.isfinite(cells.free_to)
+    ranges = np.select([near, valid, free], [np.float32(0), _nearest(cells, config), cells.free_to], np.float32(np.nan))
+    codes = [np.uint8(code) for code in (Reason.TOO_NEAR, Reason.VALID, Reason.TOO_FAR)]
+    reason = np.select([near, valid, free], codes, np.uint8(Reason.UNKNOWN))
+    stamps = np.where(near | valid | free, np.int64(stamp_ns), NEVER)
+    shape = layout.shape
+    return SphereGrid(
+        layout, ranges.reshape(shape), reason.reshape(shape), cells.number.reshape(shape), stamps.reshape(shape)
+    )
+
+
+def _nearest(cells: Cells, config: SphereConfig) -> NDArray[np.float32]:
+    """Return the distance of the most dangerous obstacle of each cell (Valenti 2018, Eq 5.4)."""
+    if config.statistic == "minimum":
+        return cells.nearest
+    std = np.sqrt(cells.squares / np.maximum(cells.number, 1).astype(np.float32))
+    robust = cells.mean - np.float32(config.spread) * std
+    return np.where((std < config.std_threshold) & (robust > 0), robust, cells.nearest)
+
+
+def _fill_between_pixels(grid: SphereGrid, pixel: float) -> None:
+    """Close the holes near the poles, in place: a pixel is so many radians wide and covers several cells there."""
+    width = np.sin(grid.layout.polar()) * grid.layout.step
+    known = grid.known
+    for j in np.flatnonzero((width < pixel) & known.any(axis=0) & ~known.all(axis=0)).tolist():
+        beside = _winner_beside(grid, j, min(int(np.ceil(pixel / width[j])), grid.layout.per_half_turn))
+        taken = ~known[:, j] & (beside >= 0)
+        for name in ARRAYS:
+            values = getattr(grid, name)
+            values[taken, j] = values[beside[taken], j]
+
+
+def _winner_beside(grid: SphereGrid, j: int, reach: int) -> NDArray[np.int64]:
+    """Return the azimuth cell (azimuths,) that wins among those at most `reach` aside in one ring, -1: none known."""
+    n, turn = grid.layout.azimuths, 2 * grid.layout.per_half_turn
+    rank = RANK[grid.reason[:, j]] * 1e6 + np.nan_to_num(grid.range_m[:, j].astype(float))
+    rank[~grid.known[:, j]] = np.inf
+    i = np.arange(n)[:, None] + np.arange(-reach, reach + 1)
+    i = i % turn if n == turn else i
+    ranks = np.where((i >= 0) & (i < n), rank[np.clip(i, 0, n - 1)], np.inf)
+    best = np.argmin(ranks, axis=1)
+    return np.where(np.isfinite(ranks[np.arange(n), best]), i[np.arange(n), best], -1)
+
+
+def stitch(grids: Sequence[SphereGrid]) -> SphereGrid:
+    """Return one grid of several: in each direction the nearest wins and keeps its age (Valenti 2018, 5.4).
+
+    A surface wins against what is only known to be free up to somewhere; at equal ranges the newest wins. Bounds may
+    differ. Raises ConfigError where steps differ.
+    """
+    layout = union([grid.layout for grid in grids])
+    return reduce(_nearer, (_widened(grid, layout) for grid in grids), empty(layout))
+
+
+def moved(grid: SphereGrid, T_new_old: Transform) -> SphereGrid:
+    """Return the grid as the body sees it after it has moved; T_new_old (4, 4) maps its old frame into the new one.
+
+    Each range is taken to where it stands now and keeps its age; what fell between two cells is unknown. For moves that
+    are small against the ranges: what the vehicle could not see round from its old place is not known either.
+    """
+    seen = grid.known & (grid.reason != Reason.TOO_NEAR)
+    points = transform_points(T_new_old, grid.layout.directions()[seen] * grid.range_m[seen, None])
+    ranges = np.linalg.norm(points, axis=1)
+    values = {"range_m": ranges, **{name: getattr(grid, name)[seen] for name in ARRAYS[1:]}}
+    order = np.lexsort((-ranges, -RANK[values["reason"]].astype(int)))  # what wins is written last
+    place = grid.layout.cells_of(points)
+    order = order[place[order] >= 0]
+    into = empty(grid.layout)
+    for name in ARRAYS:
+        getattr(into, name).reshape(-1)[place[order]] = values[name][order]
+    return replace(into, camera=grid.camera)
+
+
+def _widened(grid: SphereGrid, layout: SphereLayout) -> SphereGrid:
+    """Return the grid with other bounds, which hold its own."""
+    if grid.layout == layout:
+        return grid
+    into = empty(layout)
+    place = np.ix_(*grid.layout.places_in(layout))
+    for name in ARRAYS:
+        getattr(into, name)[place] = getattr(grid, name)
+    return replace(into, camera=grid.camera)
+
+
+def _nearer(a: SphereGrid, b: SphereGrid) -> SphereGrid:
+    rank_a, rank_b = (RANK[grid.reason] for grid in (a, b))
+    nearer = (rank_b < rank_a) | ((rank_b == rank_a) & (b.range_m < a.range_m))  # false for NaN, which is unknown
+    take = nearer | ((rank_b == rank_a) & (b.range_m == a.range_m) & (b.stamp_ns > a.stamp_ns))
+    arrays = {name: np.where(take, getattr(b, name), getattr(a, name)) for name in ARRAYS}
+    return replace(a, **arrays, camera=max(a.camera, b.camera, key=_noise))
+
+
+def _noise(camera: VirtualCamera | None) -> float:
+    """Return how fast the noise of a camera's depths grows with the square of the depth; -1 where nobody knows."""
+    if camera is None or camera.baseline is None:
+        return -1.0 if camera is None else 0.0
+    return (camera.subpixel or SUBPIXEL) / (camera.focal_px * camera.baseline)

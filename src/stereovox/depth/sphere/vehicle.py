@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What all cameras of a vehicle see together: the last grid of each, moved to where the vehicle is now."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+
+import numpy as np
+
+from stereovox.cameras.rigs import StereoPair
+from stereovox.config import Config
+from stereovox.depth import DepthPath, prepare
+from stereovox.depth.sphere import T_BODY_OPTICAL, SphereGrid, SphereLayout, accumulate, empty, moved, stitch
+from stereovox.errors import FrameRefused, StereovoxError
+from stereovox.frame import AnyFrame, StereoFrame
+from stereovox.se3 import Transform, inverse, orthonormalise
+
+
+def vehicle_grid(
+    frames: Iterable[AnyFrame], config: Config, tell: Callable[[str], object] = lambda line: None
+) -> tuple[SphereGrid, int, dict[str, int]]:
+    """Return the grid of all pairs' last frames, the time of the newest in ns, and how many were refused and why.
+
+    A pair is known by its name; its last frame without a `fault` counts, and only that one is matched. `tell` is given
+    one line for each pair whose newest frame cannot be used. A depth camera has no name and counts as one that stands
+    at the body's origin and looks ahead. So does a pair whose T_body_left is the identity: poses are then those of its
+    optical frame, and the body has its axes turned to x forward, y left, z up, for all pairs.
+    Raises StereovoxError where no frame at all could be used.
+    """
+    newest, why, refused = _newest(frames)
+    path, T_ahead_body = DepthPath(config), _axes(newest.values())
+    last: dict[str, tuple[SphereGrid, Transform]] = {}
+    for name, frame in newest.items():
+        try:
+            last[name] = _grid_of(frame, T_ahead_body, path, config)
+        except FrameRefused as error:
+            refused[error.reason] = refused.get(error.reason, 0) + 1
+            why[name] = str(error)
+    if not last:
+        raise StereovoxError(f"not one frame could be used ({next(iter(why.values()), 'the source is empty')})")
+    for name, text in why.items():
+        tell(f"{name or 'the camera'}: its last frame cannot be used ({text})")
+    grid, now_ns = _together(last)
+    return grid, now_ns, refused
+
+
+def _newest(
+    frames: Iterable[AnyFrame],
+) -> tuple[dict[str, AnyFrame], dict[str, str], dict[str, int]]:
+    """Return each pair's last frame without a fault, why there is a later one with a fault, and how many have which."""
+    newest: dict[str, AnyFrame] = {}
+    why: dict[str, str] = {}
+    refused: dict[str, int] = {}
+    for frame in frames:
+        name = frame.pair.name if isinstance(frame, StereoFrame) else ""
+        if frame.fault:
+            refused[frame.fault] = refused.get(frame.fault, 0) + 1
+            why[name] = frame.fault_detail or f"{frame.name}: {frame.fault}"
+        else:
+            newest[name] = frame
+            why.pop(name, None)
+    return newest, why, refused
+
+
+def _axes(frames: Iterable[AnyFrame]) -> Transform:
+    """Return T_ahead_body: what turns the axes of the poses' frame to x forward, y left, z up."""
+    optical = any(isinstance(frame, StereoFrame) and _is_body(frame.pair) for frame in frames)
+    return T_BODY_OPTICAL if optical else np.eye(4)
+
+
+def _is_body(pair: StereoPair) -> bool:
+    """Tell whether the poses are those of the left eye's optical frame: its T_body_left is the identity."""
+    T_left_camera = np.eye(4)
+    if pair.eyes is not None:
+        T_left_camera[:3, :3] = pair.eyes.rectifying_rotations()[0]
+    return np.allclose(pair.T_body_camera, T_left_camera, atol=1e-6)
+
+
+def _grid_of(frame: AnyFrame, T_ahead_body: Transform, path: DepthPath, config: Config) -> tuple[SphereGrid, Transform]:
+    """Return the grid of one frame in the frame of the body that looks ahead, and T_world_ahead."""
+    mounted = T_ahead_body @ frame.pair.T_body_camera if isinstance(frame, StereoFrame) else T_BODY_OPTICAL
+    image = prepare(path.matched(frame), config)
+    T_world_body = orthonormalise(np.asarray(frame.T_world_sensor, float)) @ inverse(mounted)
+    T_body_eye = inverse(T_world_body) @ image.T_world_sensor  # the right eye's, where that is the one with depth
+    return accumulate(image, T_body_eye, config, SphereLayout.configured(config.sphere)), T_world_body
+
+
+def _together(last: dict[str, tuple[SphereGrid, Transform]]) -> tuple[SphereGrid, int]:
+    newest, T_world_now = max(last.values(), key=lambda item: _stamp(item[0]))
+    grids = [_carried(grid, inverse(T_world_now) @ T_world_then) for grid, T_world_then in last.values()]
+    return stitch(grids or [empty(newest.layout)]), _stamp(newest)
+
+
+def _carried(grid: SphereGrid, T_now_then: Transform) -> SphereGrid:
+    return grid if np.allclose(T_now_then, np.eye(4), atol=1e-6) else moved(grid, T_now_then)
+
+
+def _stamp(grid: SphereGrid) -> int:
+    return int(grid.stamp_ns.max())

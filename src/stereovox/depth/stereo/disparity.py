@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is done with a raw disparity: views of a pair, checks, confidence, reasons."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.config import StereoConfig
+from stereovox.depth.stereo import _disparity
+from stereovox.depth.stereo.matchers import Matcher
+
+Image = NDArray[np.uint8]
+Mask = NDArray[np.bool_] | None
+RADIUS = 10
+"""Confidence looks at a window of 21 by 21 pixels."""
+FAR_PX = 0.5
+"""Less disparity than that is none: the pixel is too far to have a depth."""
+SURE = 0.5
+"""Confidence a pixel needs to be called too far, because that clears what lies before it."""
+DOUBTFUL_PX, SEEN = 3.0, 4.0
+"""Where there is nothing to see matchers tend to find no disparity: less than 3 px takes at least this texture."""
+DOWN, ACROSS = 3, 7
+"""Texture is looked for in a window of 7 rows and 15 columns."""
+
+
+@dataclass(frozen=True, eq=False)
+class Disparity:
+    """What matching found out about each pixel of the image it is aligned with.
+
+    disparity: (height, width) float32, pixels of the full image; NaN: none.
+    confidence: (height, width) float32 from 0 (a guess) to 1 (sure); 0 without a value.
+    reason: (height, width) uint8 of `Reason`, VALID where there is a disparity.
+    """
+
+    disparity: NDArray[np.float32]
+    confidence: NDArray[np.float32]
+    reason: NDArray[np.uint8]
+
+
+def match_aligned(match: Matcher, left: Image, right: Image, aligned: str) -> NDArray[np.float32]:
+    """Return the raw disparity (height, width) of the left or the right image, both seen from its own eye.
+
+    Matchers know the left image only; a mirrored pair has its right image there.
+    """
+    if aligned == "left":
+        return match(left, right)
+    mirrored = match(np.ascontiguousarray(right[:, ::-1]), np.ascontiguousarray(left[:, ::-1]))
+    return np.ascontiguousarray(mirrored[:, ::-1])
+
+
+def halved(image: Image) -> Image:
+    """Return the image whose pixels are means of 2 by 2; an odd last row or column is doubled before."""
+    import cv2
+
+    height, width = image.shape
+    even = cv2.copyMakeBorder(image, 0, height % 2, 0, width % 2, cv2.BORDER_REPLICATE)
+    return np.asarray(cv2.resize(even, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def doubled(disparity: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.float32]:
+    """Return a disparity of halved images in full pixels, cut to `shape`: linear where smooth, else each four times.
+
+    Smooth is where the two differ by less than a pixel; edges stay where they are.
+    """
+    import cv2
+
+    full = disparity * np.float32(2)
+    nearest, linear = (
+        cv2.resize(full, None, fx=2, fy=2, interpolation=how) for how in (cv2.INTER_NEAREST, cv2.INTER_LINEAR)
+    )
+    smooth = np.abs(linear - nearest) < 1
+    return np.where(smooth, linear, nearest)[: shape[0], : shape[1]].astype(np.float32)
+
+
+def confidence(disparity: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return how sure each disparity (height, width) is, 0 to 1: share / (1 + off / (1 + 0.1 disparity)).
+
+    share: of the pixels in the window of 21 by 21 round it that have a disparity: where matching failed nearby, what is
+    left is mostly chance. off: pixels between the disparity and the mean of the window. Both were chosen, out of
+    texture, matching error, its curvature and others, for how well they rank errors (docs/stereo.md).
+    """
+    width = disparity.shape[1]
+    sums = [np.empty(size, np.int32) for size in (width, width, width + 1, width + 1)]
+    sure = np.empty_like(disparity)
+    _disparity.confidence(disparity, RADIUS, *sums, sure)
+    return sure
+
+
+def texture(image: Image) -> NDArray[np.float32]:
+    """Return the mean step of grey over two columns (height, width) float32 in a window of 7 rows and 15 columns."""
+    width = image.shape[1]
+    steps = np.empty(image.shape, np.float32)
+    _disparity.texture(image, DOWN, ACROSS, np.empty(width, np.int32), np.empty(width + 1, np.int32), steps)
+    return steps
+
+
+def explained(
+    raw: NDArray[np.float32], image: Image, valid: Mask, valid_other: Mask, config: StereoConfig
+) -> Disparity:
+    """Return the disparity with confidence and reasons; `raw` (height, width), in full pixels, is changed.
+
+    image: (height, width) uint8 that `raw` is aligned with. valid, valid_other: (height, width) bool of that image and
+    of the other, None: all may be used. A pixel is MASKED where it or its match is, and where it lies in the cropped
+    columns. TOO_NEAR: the best match is the last one searched, a nearer one may be missing. TOO_FAR: surely less than
+    half a pixel, with texture. All else without a value is UNMATCHED.
+    """
+    right = config.aligned == "right"
+    side = 1 if right else -1
+    if config.left_right:
+        _disparity.cross_check(raw, side, np.float32(config.left_right), np.empty(raw.shape[1], np.float32))
+    sure = confidence(raw)
+    reason = np.empty(raw.shape, np.uint8)
+    last = config.disparities - (2 if config.halve else 1)
+    crop = (0, config.rcrop) if right else (config.rcrop, 0)
+    sures = config.min_confidence, max(SURE, config.min_confidence)
+    seen = config.texture, DOUBTFUL_PX, max(SEEN, config.texture)
+    limits = np.array([last - 0.1, FAR_PX, *sures, *crop, *seen], np.float32)
+    none = np.empty((0, 0), np.bool_)
+    masks = (none if mask is None else np.ascontiguousarray(mask, np.bool_) for mask in (valid, valid_other))
+    _disparity.explain(raw, sure, texture(image), *masks, side, limits, reason)
+    return Disparity(raw, sure, reason)

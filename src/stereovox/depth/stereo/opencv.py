@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: Apache-2.0
+"""OpenCV's matchers: semi-global matching (Hirschmueller 2008) along three, four or eight paths, and plain blocks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.config import StereoConfig
+from stereovox.depth.stereo import _disparity
+from stereovox.errors import ConfigError, FrameRefused
+
+COUNTS = 16
+"""OpenCV counts disparities in sixteenths of a pixel."""
+ROUNDED = -1 / 32
+"""It rounds up: on planes all its matchers are 0.03 px too near."""
+LOCKING = 0.62
+"""Its semi-global matching pulls fractions to whole pixels: 0.5 (2 f)^0.62 makes them as frequent as they should be."""
+PREFILTER = 63
+MOST_COST = 32767
+"""OpenCV's semi-global matching adds costs up in 16 bits."""
+"""Gradients along a row count up to this."""
+
+
+class _OpenCv:
+    lag_rows = 0.0
+    locking = 1.0
+
+    def __init__(self, config: StereoConfig) -> None:
+        self._config = config
+        self._matcher = self._make(config)
+        self._fractions = _fractions(self.locking if config.unlock else 1.0)
+
+    def __call__(self, left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """Return the disparity of the left image, see `Matcher`."""
+        margin = self._config.disparities  # OpenCV leaves so many columns at the left without a value
+        wider = [np.pad(image, ((0, 0), (margin, 0)), mode="edge") for image in (left, right)]
+        with _threads(self._config.threads):
+            raw = self._compute(*wider)[:, margin:]
+        out = np.empty(raw.shape, np.float32)
+        _disparity.pixels(raw, self._fractions, np.float32(self.lag_rows), out)
+        return out
+
+    def _compute(self, left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray[np.int16]:
+        return self._matcher.compute(left, right)
+
+    def _make(self, config: StereoConfig) -> Any:
+        raise NotImplementedError
+
+
+class _SemiGlobal(_OpenCv):
+    mode = ""
+    locking = LOCKING
+
+    def _make(self, config: StereoConfig) -> Any:
+        import cv2
+
+        window = config.block_size**2
+        if (config.p2 + PREFILTER) * window > MOST_COST:
+            raise ConfigError(
+                f"stereo.block_size {config.block_size} with p2 {config.p2:g}: too large, OpenCV's costs overflow; use "
+                "less, or stereo.method=block"
+            )
+        return cv2.StereoSGBM.create(
+            numDisparities=config.disparities, blockSize=config.block_size,
+            P1=round(config.p1 * window), P2=round(config.p2 * window),
+            disp12MaxDiff=_left_right(config), preFilterCap=PREFILTER, uniquenessRatio=config.uniqueness,
+            speckleWindowSize=config.speckle_size, speckleRange=max(1, round(config.speckle_range)),
+            mode=getattr(cv2, f"STEREO_SGBM_MODE_{self.mode}"),
+        )  # fmt: skip
+
+
+class ThreeWay(_SemiGlobal):
+    """Three paths: from the left, from the right, and from above, or from below.
+
+    Its one vertical path drags disparities along: a slanted plane comes out `lag_rows` rows late. That is taken back.
+    """
+
+    mode = "SGBM_3WAY"
+    lag_rows = 0.35
+
+    def _compute(self, left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray[np.int16]:
+        if not self._config.from_below:
+            return super()._compute(left, right)
+        turned = [np.ascontiguousarray(image[::-1]) for image in (left, right)]
+        return super()._compute(*turned)[::-1]
+
+    def __init__(self, config: StereoConfig) -> None:
+        super().__init__(config)
+        self.lag_rows = -self.lag_rows if config.from_below else self.lag_rows
+
+
+class EightWay(_SemiGlobal):
+    """Eight paths: slow, and memory for all costs."""
+
+    mode = "HH"
+
+
+class FourWay(_SemiGlobal):
+    """Four paths."""
+
+    mode = "HH4"
+
+
+class Block(_OpenCv):
+    """Each window by itself: quick, and empty where there is no texture. Windows are at least 5 pixels wide."""
+
+    def _make(self, config: StereoConfig) -> Any:
+        import cv2
+
+        matcher = cv2.StereoBM.create(config.disparities, max(5, config.block_size))
+        matcher.setUniquenessRatio(config.uniqueness)
+        matcher.setDisp12MaxDiff(_left_right(config))
+        matcher.setSpeckleWindowSize(config.speckle_size)
+        matcher.setSpeckleRange(max(1, round(config.speckle_range * COUNTS)))  # in its raw counts, other than SGBM
+        return matcher
+
+    def _compute(self, left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray[np.int16]:
+        if min(left.shape) <= max(5, self._config.block_size):
+            raise FrameRefused("bad_shape", f"images of {left.shape}: smaller than stereo.block_size; use less")
+        return super()._compute(left, right)
+
+
+def _fractions(locking: float) -> NDArray[np.float32]:
+    """Return what the 16 fractions of a pixel stand for; those from a half on are seen from the next whole pixel."""
+    counts = np.arange(COUNTS) / COUNTS
+    nearest = np.round(counts)
+    off = counts - nearest
+    return (nearest + np.sign(off) * 0.5 * (2 * np.abs(off)) ** locking + ROUNDED).astype(np.float32)
+
+
+def _left_right(config: StereoConfig) -> int:
+    return max(1, round(config.left_right)) if config.left_right else config.disparities  # SGBM makes 1 of less
+
+
+@contextmanager
+def _threads(wanted: int) -> Iterator[None]:
+    """Let OpenCV have so many threads; what it had before comes back."""
+    import cv2
+
+    before = cv2.getNumThreads()
+    if wanted == before:
+        yield
+        return
+    cv2.setNumThreads(wanted)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(before)

@@ -1,0 +1,130 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From a stereo frame to a depth image: match, throw out what cannot be right, turn disparity into metres."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.config import StereoConfig
+from stereovox.depth.stereo.disparity import FAR_PX, Disparity, doubled, explained, halved, match_aligned
+from stereovox.depth.stereo.matchers import make_matcher
+from stereovox.errors import FrameRefused, StereovoxError
+from stereovox.frame import Frame, Reason, StereoFrame
+from stereovox.se3 import Transform
+from stereovox.trust.validate import matrix_of
+
+__all__ = ["Disparity", "StereoDepth"]
+
+LARGE = 450_000
+"""Images of more pixels are halved where the settings leave it open: those of street cameras, not 848x480 ones."""
+
+
+class StereoDepth:
+    """Makes depth images of stereo frames, as `config` says. One object serves one thread at a time."""
+
+    def __init__(self, config: StereoConfig) -> None:
+        """Raises ConfigError for an unknown method, MissingExtra where its library is missing."""
+        self.config = config
+        self._matchers = {bool(config.halve): make_matcher(_of_half(config) if config.halve else config)}
+
+    def __call__(self, frame: StereoFrame) -> Frame:
+        """Return the frame as a depth image: float32 metres, reasons, camera and pose of the aligned eye.
+
+        Depth is what `camera.depth_of` makes of the disparity, NaN: none. What is TOO_FAR has the depth beyond which
+        it is: a map that reaches farther does not take it for free. It is never UNKNOWN, but UNMATCHED where the
+        images do not agree, TOO_NEAR where the disparity is at the end of those searched, MASKED by rig and `rcrop`.
+        Raises as `disparity`, and StereovoxError where the pair's camera has no baseline.
+        """
+        camera = frame.pair.camera
+        if camera.baseline is None:
+            raise StereovoxError(f"stereo pair '{frame.pair.name}': its camera has no baseline; give it in metres")
+        found = self.disparity(frame)
+        least = np.where(found.reason == Reason.TOO_FAR, np.float32(FAR_PX), found.disparity)
+        depth_m = camera.depth_of(least, self.config.aligned).astype(np.float32)
+        pose = _eye_pose(frame.T_world_sensor, camera.baseline, self.config.aligned)
+        camera = replace(camera, subpixel=camera.subpixel or self.config.subpixel)
+        return Frame(
+            depth_m, camera, pose, frame.stamp_ns, reason=found.reason, name=frame.name, sensor=frame.sensor,
+            pose_off_ns=frame.pose_off_ns,
+        )  # fmt: skip
+
+    def disparity(self, frame: StereoFrame) -> Disparity:
+        """Return the disparity of the aligned image, rectified before where the pair has `eyes`.
+
+        Raises FrameRefused: the source's `fault`, `bad_dtype`, `bad_shape`.
+        """
+        if frame.fault:
+            raise FrameRefused(frame.fault, frame.fault_detail or f"{frame.name}: {frame.fault}")
+        frame = _rectified(frame)
+        left, right = (_grey(image, frame, side) for image, side in ((frame.left, "left"), (frame.right, "right")))
+        config = self._decided(left.shape)
+        raw = self._raw(left, right, config)
+        sides = (left, _checked(frame.pair.valid, frame)), (right, _checked(frame.pair.valid_right, frame))
+        (image, valid), (_, valid_other) = sides if self.config.aligned == "left" else sides[::-1]
+        return explained(raw, image, valid, valid_other, config)
+
+    def _decided(self, shape: tuple[int, ...]) -> StereoConfig:
+        """Return the settings with `halve` decided for images of this shape."""
+        if self.config.halve is not None:
+            return self.config
+        return self.config.model_copy(update={"halve": shape[0] * shape[1] > LARGE})
+
+    def _raw(self, left: NDArray[np.uint8], right: NDArray[np.uint8], config: StereoConfig) -> NDArray[np.float32]:
+        halve = bool(config.halve)
+        if halve not in self._matchers:
+            self._matchers[halve] = make_matcher(_of_half(config) if halve else config)
+        if not halve:
+            return match_aligned(self._matchers[halve], left, right, config.aligned)
+        return doubled(match_aligned(self._matchers[halve], halved(left), halved(right), config.aligned), left.shape)
+
+
+def _of_half(config: StereoConfig) -> StereoConfig:
+    """Return the settings in pixels of halved images."""
+    return config.model_copy(
+        update={
+            "block_size": max(3, config.block_size // 2 | 1),
+            "disparities": max(16, -(-config.disparities // 32) * 16),
+            "speckle_size": config.speckle_size // 4,
+            "speckle_range": config.speckle_range / 2,
+            "left_right": config.left_right / 2,
+        }
+    )
+
+
+def _checked(mask: NDArray[np.bool_] | None, frame: StereoFrame) -> NDArray[np.bool_] | None:
+    size = frame.pair.camera.height, frame.pair.camera.width
+    if mask is not None and mask.shape != size:
+        raise StereovoxError(f"stereo pair '{frame.pair.name}': mask is {mask.shape}, its camera says {size}")
+    return mask
+
+
+def _rectified(frame: StereoFrame) -> StereoFrame:
+    if frame.pair.eyes is None:
+        return frame
+    from stereovox.depth.stereo.rectify import rectified
+
+    return rectified(frame)
+
+
+def _grey(image: NDArray[np.uint8], frame: StereoFrame, side: str) -> NDArray[np.uint8]:
+    camera, name = frame.pair.camera, f"{frame.name or f'frame at {frame.stamp_ns} ns'}: {side} image"
+    if not isinstance(image, np.ndarray) or image.dtype != np.uint8:
+        raise FrameRefused("bad_dtype", f"{name} is {getattr(image, 'dtype', type(image).__name__)}; give uint8")
+    if image.shape not in ((camera.height, camera.width), (camera.height, camera.width, 3)):
+        raise FrameRefused("bad_shape", f"{name} is {image.shape}, its camera says ({camera.height}, {camera.width})")
+    if image.ndim == 2:
+        return np.ascontiguousarray(image)
+    import cv2
+
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), np.uint8)
+
+
+def _eye_pose(T_world_left: object, baseline: float, aligned: str) -> Transform:
+    """Return T_world_eye (4, 4): the right eye stands the baseline along x from the left."""
+    T = matrix_of(T_world_left)
+    if aligned == "right" and T.shape == (4, 4):  # prepare tells a bad pose
+        T[:3, 3] += T[:3, 0] * baseline
+    return T

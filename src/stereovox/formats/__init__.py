@@ -1,0 +1,102 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Maps for other programs and from them: one writer and one reader a file type, chosen by the file's ending."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from stereovox import registry
+from stereovox.errors import StereovoxError
+from stereovox.formats.octomap import read_octomap
+from stereovox.maps import VoxelMap
+from stereovox.maps.cubes import in_cubes
+
+IMPORTS = {
+    ".bt": "stereovox.formats.octomap:read_octomap",
+    ".ot": "stereovox.formats.octomap:read_octomap",
+    ".npz": "stereovox.formats.read_points:read_npz",
+    ".ply": "stereovox.formats.read_points:read_point_map",
+    ".pcd": "stereovox.formats.read_points:read_point_map",
+    ".bag": "stereovox.formats.bags:read_bag_map",
+    ".mcap": "stereovox.formats.bags:read_bag_map",
+    ".db3": "stereovox.formats.bags:read_bag_map",
+}
+"""File ending -> reader `(path) -> VoxelMap`; other packages add theirs as entry points `stereovox.import`."""
+TAKES = {
+    "voxel_size": (".ply", ".pcd", ".bag", ".mcap", ".db3"),
+    "topic": (".bag", ".mcap", ".db3"),
+}
+"""Which files' readers want to know more, by keyword."""
+
+
+def import_map(path: str | Path, voxel_size: float | None = None, topic: str | None = None) -> VoxelMap:
+    """Return the map in a file of another program, or in one that `export` wrote.
+
+    `.bt`, `.ot`: OctoMap's cells. `.npz`: ours, exactly. `.ply`, `.pcd`: each cell that holds a point is occupied, all
+    others are unknown. `.bag`, `.mcap`, `.db3` or a rosbag2 folder: the last Octomap, or PointCloud2, of a topic.
+    voxel_size: metres, for points of other programs; ours tell it. topic: see `bag_maps.read_bag_map`.
+    Raises StereovoxError: one line with the file and what is wrong, or an option that says nothing for such a file.
+    """
+    ending = ".mcap" if Path(path).is_dir() else Path(path).suffix.lower()
+    known = registry.names("import", IMPORTS)
+    if ending not in known:
+        raise StereovoxError(f"{path}: cannot import '{ending}'; the file's name ends in one of {', '.join(known)}")
+    told = {"voxel_size": voxel_size, "topic": topic}
+    given = {name: value for name, value in told.items() if value is not None}
+    for name in given:
+        if ending not in TAKES[name]:
+            option = f"--{name.replace('_', '-')}"
+            raise StereovoxError(f"{path}: {option} says nothing about a '{ending}'; leave it out")
+    return registry.find("import", IMPORTS, ending)(path, **given)
+
+
+EXPORTS = {
+    ".bt": "stereovox.formats.octomap:write_bt",
+    ".ot": "stereovox.formats.octomap:write_ot",
+    ".ply": "stereovox.formats.points:write_ply",
+    ".pcd": "stereovox.formats.points:write_pcd",
+    ".npz": "stereovox.formats.points:write_npz",
+    ".glb": "stereovox.formats.meshes:write_glb",
+    ".obj": "stereovox.formats.meshes:write_obj",
+    ".stl": "stereovox.formats.meshes:write_stl",
+    ".bag": "stereovox.formats.bags:write_bag",
+    ".mcap": "stereovox.formats.bags:write_bag",
+    ".db3": "stereovox.formats.bags:write_bag",
+    ".rrd": "stereovox.formats.rerun:write_rrd",
+    ".pgm": "stereovox.formats.map_server:write_grid",
+    ".png": "stereovox.formats.map_server:write_grid",
+    ".yaml": "stereovox.formats.map_server:write_grid",
+}
+"""File ending -> writer `(voxel_map, path) -> None`; other packages add theirs as entry points `stereovox.export`."""
+FLAT = (".pgm", ".png", ".yaml")
+"""Endings of 2-D maps, whose writer takes `heights` and `inflate` too."""
+BAGS = (".bag", ".mcap", ".db3")
+"""Endings of recordings of ROS, with a 2-D map in them, whose writer takes `heights` too."""
+
+__all__ = ["BAGS", "EXPORTS", "FLAT", "export", "read_octomap"]
+
+
+def export(
+    voxel_map: VoxelMap, path: str | Path, heights: tuple[float, float] | None = None, inflate: float | None = None
+) -> None:
+    """Write `voxel_map` to the file `path` in the format its ending names; a failed export leaves an older file whole.
+
+    Uneven cells become cubes where the format knows only those.
+    heights: for 2-D maps and bags, the lowest and highest metres that mark cells (see `projection.project`).
+    inflate: for 2-D maps, a robot's radius in metres by which obstacles grow (see `inflate.inflated_grid`).
+    Raises StereovoxError: one line about an unknown ending, a place that cannot be written, cells the format cannot
+    hold, or heights or inflation where they have no meaning.
+    """
+    ending = Path(path).suffix.lower()
+    known = registry.names("export", EXPORTS)
+    if ending not in known:
+        raise StereovoxError(f"{path}: cannot export to '{ending}'; end the file's name with one of {', '.join(known)}")
+    if heights is not None and ending not in (*FLAT, *BAGS):
+        known = " or ".join((*FLAT, *BAGS))
+        raise StereovoxError(f"{path}: heights are for 2-D maps alone; end the file's name with {known}")
+    if inflate is not None and ending not in FLAT:
+        raise StereovoxError(f"{path}: only 2-D maps are inflated; end the file's name with {' or '.join(FLAT)}")
+    options = {"heights": heights, "inflate": inflate}
+    given = {name: value for name, value in options.items() if value is not None}
+    write = registry.find("export", EXPORTS, ending)
+    write(voxel_map if ending in FLAT else in_cubes(voxel_map), path, **given)

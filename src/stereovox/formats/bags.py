@@ -1,0 +1,133 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Finished maps in bags: `nav_msgs/OccupancyGrid`, `octomap_msgs/Octomap` and `sensor_msgs/PointCloud2`, both ways."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from stereovox.errors import ConfigError, FrameRefused, MapFileError, SourceError, StereovoxError
+from stereovox.formats.octomap import BINARY_TITLE, TREE_TITLE, full_tree, map_of_nodes
+from stereovox.formats.read_points import cells_of_points
+from stereovox.maps import VoxelMap
+from stereovox.maps.occupancy import OccupancyGrid
+from stereovox.products.floor_axes import upright_axes
+from stereovox.products.projection import Heights, project
+from stereovox.sources.bags import open_bag
+from stereovox.sources.bags.messages import Wire
+from stereovox.sources.bags.robot_messages import (
+    OCCUPANCY_GRID,
+    OCTOMAP,
+    POINT_CLOUD,
+    read_occupancy_grid,
+    read_octomap_message,
+    read_point_cloud,
+)
+from stereovox.sources.bags.writer import BagWriter
+from stereovox.threads import one_state
+
+MAP_FRAME, CELLS_FRAME = "map", "map_cells"
+"""Names of the frame whose z is up, and of that of the cells where another axis is up in it."""
+Made = TypeVar("Made")
+
+
+@one_state
+def write_bag(voxel_map: VoxelMap, path: str | Path, heights: Heights | None = None) -> None:
+    """Write the map into a bag of its own, `.bag` (ROS 1), `.mcap` or `.db3` (ROS 2), all latched.
+
+    `/octomap_full`: an Octomap of every known cell with its log-odds. `/occupied_cells`: a PointCloud2 of the centres
+    of the occupied cells. `/map_mapping`: an OccupancyGrid, the map seen from above; heights: see `projection.project`.
+    All are in frame `map`; where the map's `up` is not z, the first two are in `map_cells`, which `/tf_static` turns.
+    Stamps are the last frame's, or zero. Raises MapFileError, one line, for what cannot be written, MissingExtra
+    without rosbags.
+    """
+    axes = upright_axes(voxel_map.config.up)
+    turned = not np.array_equal(axes, np.eye(3))
+    stamp_ns = 0 if voxel_map.viewpoint is None else voxel_map.viewpoint.stamp_ns
+    frame = CELLS_FRAME if turned else MAP_FRAME
+    try:
+        grid, tree = project(voxel_map, heights), full_tree(voxel_map).data
+        with BagWriter(path) as bag:
+            if turned:
+                T_map_cells = np.eye(4)
+                T_map_cells[:3, :3] = axes
+                bag.fixed(MAP_FRAME, CELLS_FRAME, T_map_cells)
+            bag.octomap(stamp_ns, tree, voxel_map.voxel_size, frame_id=frame)
+            bag.cloud(stamp_ns, voxel_map.occupied(), frame_id=frame)
+            bag.occupancy(stamp_ns, grid, frame_id=MAP_FRAME)
+    except SourceError as error:
+        raise MapFileError(str(error)) from None
+    except ImportError:
+        raise
+    except StereovoxError as error:
+        raise MapFileError(f"{path}: {error}") from None
+
+
+def write_grid_bag(grid: OccupancyGrid, path: str | Path) -> None:
+    """Write a floor's map as an OccupancyGrid on `/map_mapping`, latched; raises as `write_bag` does."""
+    try:
+        with BagWriter(path) as bag:
+            bag.occupancy(0, grid, frame_id=MAP_FRAME)
+    except SourceError as error:
+        raise MapFileError(str(error)) from None
+
+
+def read_bag_map(path: str | Path, voxel_size: float | None = None, topic: str | None = None) -> VoxelMap:
+    """Return the map in the last Octomap of a bag's topic, cell for cell; or the cells that a PointCloud2 marks.
+
+    topic: where the bag has several Octomaps, or for a PointCloud2, whose points are taken for places in the world.
+    voxel_size: metres, for a PointCloud2 alone. Raises MapFileError, one line.
+    """
+
+    def octomap_cells(wire: Wire) -> VoxelMap:
+        if voxel_size is not None:
+            raise ValueError("an Octomap tells how large its cells are; leave --voxel-size out")
+        return _octomap_cells(wire)
+
+    def cloud_cells(wire: Wire) -> VoxelMap:
+        if voxel_size is None:
+            raise ValueError("points do not tell how large cells should be; give --voxel-size in metres")
+        return cells_of_points(read_point_cloud(wire).points, voxel_size)
+
+    return _last(Path(path), topic, {OCTOMAP: octomap_cells, POINT_CLOUD: cloud_cells})
+
+
+def read_bag_grid(path: str | Path, topic: str | None = None) -> OccupancyGrid:
+    """Return the last OccupancyGrid of a bag's topic; topic: where there are several. Raises MapFileError, one line."""
+    return _last(Path(path), topic, {OCCUPANCY_GRID: read_occupancy_grid})
+
+
+def _octomap_cells(wire: Wire) -> VoxelMap:
+    message = read_octomap_message(wire)
+    if message.tree != "OcTree":
+        raise ValueError(f"its tree type is '{message.tree}', only OcTree can be read")
+    return map_of_nodes(BINARY_TITLE if message.binary else TREE_TITLE, message.data, message.resolution)
+
+
+def _last(path: Path, topic: str | None, readers: dict[str, Callable[[Wire], Made]]) -> Made:
+    """Return what its type's reader makes of a topic's last message; None: the only topic of the first type."""
+    try:
+        bag = open_bag(path)
+        topic = topic or _only(bag.types, next(iter(readers)))
+        if bag.types.get(topic) not in readers:
+            raise ValueError(f"{topic} holds no {' or '.join(readers)}; {_held(bag.types)}")
+        return readers[bag.types[topic]](bag.read(topic, len(bag.stamps(topic)) - 1))
+    except (SourceError, FrameRefused) as error:
+        raise MapFileError(str(error)) from None
+    except (ValueError, ConfigError) as error:
+        raise MapFileError(f"{path}: {error}") from None
+
+
+def _only(types: dict[str, str], kind: str) -> str:
+    found: Sequence[str] = sorted(topic for topic, held in types.items() if held == kind)
+    if len(found) != 1:
+        told = f"has {len(found)} topics of {kind}" if found else f"has no {kind}"
+        raise ValueError(f"{told}; name a topic with --topic; {_held(types)}")
+    return found[0]
+
+
+def _held(types: dict[str, str]) -> str:
+    return f"the bag has {', '.join(f'{name} ({kind})' for name, kind in sorted(types.items())) or 'nothing'}"

@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A map as plain points: `.ply` and `.pcd` for point cloud programs, `.npz` for NumPy."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.maps import VoxelMap
+from stereovox.products.floor_axes import heights_of
+from stereovox.safe_io import replacing
+from stereovox.threads import one_state
+
+PLY_POINT = np.dtype(
+    [
+        ("x", "<f4"), ("y", "<f4"), ("z", "<f4"),
+        ("red", "u1"), ("green", "u1"), ("blue", "u1"),
+        ("probability", "<f4"),
+    ]
+)  # fmt: skip
+PLY_TYPES = {"f": "float", "u": "uchar"}
+PCD_POINT = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<u4"), ("probability", "<f4")])
+HEIGHT_RAMP = ((40, 60, 180), (30, 160, 210), (70, 190, 90), (240, 200, 50), (200, 40, 30))
+"""Red, green and blue at equal steps from the lowest to the highest point."""
+
+
+@one_state
+def write_ply(voxel_map: VoxelMap, path: str | Path) -> None:
+    """Write the occupied cells as a binary point cloud: centre in metres (world frame), colour by height, probability.
+
+    Raises MapFileError when the place cannot be written.
+    """
+    points, colours = _occupied(voxel_map, PLY_POINT)
+    for channel, name in enumerate(("red", "green", "blue")):
+        points[name] = colours[:, channel]
+    _write(path, _ply_header(len(points), voxel_map.voxel_size), points)
+
+
+@one_state
+def write_pcd(voxel_map: VoxelMap, path: str | Path) -> None:
+    """Write the occupied cells as PCL's binary point cloud, with what `write_ply` tells of them.
+
+    Raises MapFileError when the place cannot be written.
+    """
+    points, colours = _occupied(voxel_map, PCD_POINT)
+    points["rgb"] = colours.astype(np.uint32) @ np.array([1 << 16, 1 << 8, 1], np.uint32)
+    _write(path, _pcd_header(len(points), voxel_map.voxel_size), points)
+
+
+def write_npz(voxel_map: VoxelMap, path: str | Path) -> None:
+    """Write every known cell for `numpy.load`, and the settings, so that `npz_read.read_npz` gives the same cells.
+
+    Arrays: `indices` (N, 3) int32, cell i covers [i, i + 1) * voxel_size; `log_odds` (N,) float32; and the numbers
+    `voxel_size` in metres, `free_below` and `occupied_above` (probabilities). What is not named is unknown.
+    `settings` (M,) uint8 is JSON.
+    Raises MapFileError when the place cannot be written.
+    """
+    indices, log_odds = voxel_map.cells()
+    limits = voxel_map.config.map
+    with replacing(path) as file:
+        np.savez_compressed(
+            file,
+            indices=indices,
+            log_odds=log_odds,
+            voxel_size=np.float64(voxel_map.voxel_size),
+            free_below=np.float64(min(limits.free_below, limits.prior)),
+            occupied_above=np.float64(limits.occupied_above),
+            settings=np.frombuffer(json.dumps(voxel_map.config.model_dump()).encode(), np.uint8),
+        )
+
+
+def cell_colours(voxel_map: VoxelMap, centers: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """Return the `height_colours` (N, 3) of places (N, 3) in metres, whichever axis of the map is up."""
+    return height_colours(heights_of(centers, voxel_map.config.up))
+
+
+def height_colours(z: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """Return colours (N, 3) from blue at the lowest through green to red at the highest of the heights (N,)."""
+    if not len(z):
+        return np.zeros((0, 3), np.uint8)
+    share = (z - z.min()) / max(float(np.ptp(z)), 1e-9)
+    at = np.linspace(0, 1, len(HEIGHT_RAMP))
+    return np.stack([np.interp(share, at, channel) for channel in np.transpose(HEIGHT_RAMP)], axis=1).astype(np.uint8)
+
+
+def _occupied(voxel_map: VoxelMap, kind: np.dtype) -> tuple[NDArray[np.void], NDArray[np.uint8]]:
+    """Return the occupied cells as records (N,) with their centres and probabilities, and their colours (N, 3)."""
+    centers = voxel_map.occupied()
+    points = np.empty(len(centers), kind)
+    points["x"], points["y"], points["z"] = centers.T
+    points["probability"] = voxel_map.probability(centers)
+    return points, cell_colours(voxel_map, centers)
+
+
+def _write(path: str | Path, header: str, points: NDArray[np.void]) -> None:
+    with replacing(path) as file:
+        file.write(header.encode("ascii"))
+        file.write(points.tobytes())
+
+
+def _ply_header(number: int, voxel_size: float) -> str:
+    properties = [f"property {PLY_TYPES[PLY_POINT[name].kind]} {name}" for name in PLY_POINT.names or ()]
+    lines = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"comment {_told(voxel_size)}",
+        f"element vertex {number}",
+        *properties,
+        "end_header",
+    ]
+    return "\n".join([*lines, ""])
+
+
+def _pcd_header(number: int, voxel_size: float) -> str:
+    names = PCD_POINT.names or ()
+    lines = [
+        f"# {_told(voxel_size)}",
+        "VERSION 0.7",
+        f"FIELDS {' '.join(names)}",
+        f"SIZE {' '.join(str(PCD_POINT[name].itemsize) for name in names)}",
+        f"TYPE {' '.join(PCD_POINT[name].kind.upper() for name in names)}",
+        f"COUNT {' '.join('1' * len(names))}",
+        f"WIDTH {number}",
+        "HEIGHT 1",
+        "VIEWPOINT 0 0 0 1 0 0 0",
+        f"POINTS {number}",
+        "DATA binary",
+    ]
+    return "\n".join([*lines, ""])
+
+
+def _told(voxel_size: float) -> str:
+    """Return what a file says of its points; `point_files` reads the size of a cell from it."""
+    return f"centres of occupied cells of {voxel_size!r} m"

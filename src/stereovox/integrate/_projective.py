@@ -1,0 +1,385 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Kernels of the projective integrator: cull blocks from coarse to fine, and evaluate each cell of those that are left.
+
+Nearly all cells are plain: free, for they lie well before what was measured, or behind it. So a layer of cells is first
+told apart by two comparisons, and only a layer with cells near a measurement is looked up in the sensor table.
+"""
+
+import numpy as np
+
+from stereovox._jit import cell, kernel
+from stereovox.integrate._cells import HALF, NEAR_PLANE, NO_RETURN, ONE, ZERO, index, table_row, window_level
+from stereovox.integrate._windows import COARSEST, place
+from stereovox.maps._cells import find
+
+SKIP, FREE, MIXED = 0, 1, 2
+SLACK = np.float32(1e-3)
+"""Pixels and parts of a depth by which boxes are taken too large: culling may err only to the safe side."""
+COARSE = 4
+"""Blocks along each side of a coarse box; between it and a block stand boxes of two blocks."""
+STACK = 32
+"""Boxes that wait to be looked at, at most: eight of each of two sizes."""
+
+
+@kernel
+def candidates(view, table, windows, nearest, end, stack, free, mixed):
+    """List the blocks that are wholly free and those that need a look at each cell; return both numbers.
+
+    Both are -1 when a list is too short.
+
+    end: depth in metres beyond which the image says nothing. stack: (STACK, 4) int32 scratch.
+    free, mixed: (capacity, 3) int32 block coordinates from the camera's block.
+    """
+    n_free, n_mixed = 0, 0
+    low_x, high_x = _touched(view, end, 0)
+    low_y, high_y = _touched(view, end, 1)
+    low_z, high_z = _touched(view, end, 2)
+    for bx in range(low_x, high_x + 1, COARSE):
+        for by in range(low_y, high_y + 1, COARSE):
+            for bz in range(low_z, high_z + 1, COARSE):
+                if max(n_free, n_mixed) + COARSE**3 > free.shape[0]:
+                    return -1, -1
+                waiting = _push(stack, 0, bx, by, bz, COARSE)
+                while waiting > 0:
+                    waiting -= 1
+                    x, y, z, size = stack[waiting, 0], stack[waiting, 1], stack[waiting, 2], stack[waiting, 3]
+                    kind = _classify(view, table, windows, nearest, 0 if size == 1 else 1, size, x, y, z)
+                    if kind == FREE:
+                        n_free = _enter(free, n_free, x, y, z, size)
+                    elif kind == MIXED and size == 1:
+                        n_mixed = _enter(mixed, n_mixed, x, y, z, size)
+                    elif kind == MIXED:
+                        half = size >> 1
+                        for i in range(8):
+                            waiting = _push(
+                                stack, waiting, x + half * (i >> 2), y + half * ((i >> 1) & 1), z + half * (i & 1), half
+                            )
+    return n_free, n_mixed
+
+
+@cell
+def _push(stack, waiting, x, y, z, size):
+    """Put a box that is still to be looked at on the stack; return how many wait there now."""
+    stack[waiting, 0], stack[waiting, 1], stack[waiting, 2], stack[waiting, 3] = x, y, z, size
+    return waiting + 1
+
+
+@cell
+def _enter(blocks, n, x, y, z, size):
+    """List all blocks of a box `size` blocks wide; return how many are listed now."""
+    for i in range(size):
+        for j in range(size):
+            for k in range(size):
+                blocks[n, 0], blocks[n, 1], blocks[n, 2] = x + i, y + j, z + k
+                n += 1
+    return n
+
+
+@kernel
+def with_hits(hit_table, hit_coords, n_hits, free, n_free, mixed, n_mixed, hit_of, listed):
+    """Put all blocks that hold hits among the mixed ones; return the numbers of free and of mixed blocks.
+
+    `mixed` must have room for `n_hits` more. hit_of: as long as `mixed`, written: the place of each mixed block among
+    the hits, -1 for none. listed: (n_hits,) uint8 zeros, scratch.
+    """
+    for i in range(n_mixed):
+        h = find(hit_table, hit_coords, mixed[i, 0], mixed[i, 1], mixed[i, 2])
+        hit_of[i] = h
+        if h >= 0:
+            listed[h] = 1
+    kept = 0
+    for i in range(n_free):
+        x, y, z = free[i, 0], free[i, 1], free[i, 2]
+        if find(hit_table, hit_coords, x, y, z) < 0:
+            free[kept, 0], free[kept, 1], free[kept, 2] = x, y, z
+            kept += 1
+    for h in range(n_hits):  # in blocks called free, and in those on the very border of the view
+        if not listed[h]:
+            for axis in range(3):
+                mixed[n_mixed, axis] = hit_coords[h, axis]
+            hit_of[n_mixed] = h
+            n_mixed += 1
+    return kept, n_mixed
+
+
+@cell
+def _touched(view, end, axis):
+    """Return the first blocks of the first and the last coarse box along an axis that the view up to `end` touches."""
+    last_u, last_v = view.columns.size - 1, view.rows.shape[0] - 1
+    rim_x = (view.rim[0] / end + ONE) / view.intrinsics[0]
+    rim_y = (view.rim[1] / end + ONE) / view.intrinsics[1]
+    low = high = ZERO
+    for corner in range(4):
+        x = view.columns[last_u] + rim_x if corner & 1 else view.columns[0] - rim_x
+        y = view.rows[last_v, 0] + rim_y if corner & 2 else view.rows[0, 0] - rim_y
+        reached = end * (x * view.forward[0, axis] + y * view.forward[1, axis] + view.forward[2, axis])
+        low, high = min(low, reached), max(high, reached)
+    side = np.float32(8 * COARSE) * view.voxel_size
+    first = np.int64(np.floor((view.position[axis] + low - view.voxel_size) / side))
+    last = np.int64(np.floor((view.position[axis] + high + view.voxel_size) / side))
+    return first * COARSE, last * COARSE
+
+
+@cell
+def _classify(view, table, windows, nearest, tile, blocks, bx, by, bz):
+    """Tell whether all cells of a box are free (FREE), untouched (SKIP) or neither (MIXED).
+
+    The box is `blocks` blocks wide and starts at block (bx, by, bz); only the centres of its cells count.
+    tile: 0 to look at tiles of 16 pixels (blocks), 1 for 64 (larger boxes).
+    """
+    side = np.float32(8) * view.voxel_size
+    half = (np.float32(4 * blocks) - HALF) * view.voxel_size
+    middle = np.float32(blocks) * HALF
+    px = (np.float32(bx) + middle) * side - view.position[0]
+    py = (np.float32(by) + middle) * side - view.position[1]
+    pz = (np.float32(bz) + middle) * side - view.position[2]
+    R = view.rotation
+    z = R[2, 0] * px + R[2, 1] * py + R[2, 2] * pz
+    ez = half * _extent(R, 2)
+    z_low, z_high = z - ez, z + ez
+    blind = NEAR_PLANE if table.marks else max(NEAR_PLANE, table.blind)  # marks may stand nearer
+    if z_high <= blind or z_low > view.max_range or _outside(view, half, px, py, pz):
+        return SKIP
+    if z_low <= max(NEAR_PLANE, table.blind):
+        return MIXED
+    x = R[0, 0] * px + R[0, 1] * py + R[0, 2] * pz
+    y = R[1, 0] * px + R[1, 1] * py + R[1, 2] * pz
+    ex, ey = half * _extent(R, 0), half * _extent(R, 1)
+    near, far = ONE / z_low, ONE / z_high
+    u_low = view.intrinsics[0] * (x - ex) * (near if x < ex else far) + view.intrinsics[2] - SLACK
+    u_high = view.intrinsics[0] * (x + ex) * (near if x > -ex else far) + view.intrinsics[2] + SLACK
+    v_low = view.intrinsics[1] * (y - ey) * (near if y < ey else far) + view.intrinsics[3] - SLACK
+    v_high = view.intrinsics[1] * (y + ey) * (near if y > -ey else far) + view.intrinsics[3] + SLACK
+    right, bottom = np.float32(view.width - 1), np.float32(view.height - 1)
+    u0, u1 = _pixel(u_low, right), _pixel(u_high, right)
+    v0, v1 = _pixel(v_low, bottom), _pixel(v_high, bottom)
+    level = min(max(window_level(view.spread * near), windows.first), np.int32(COARSEST))
+    farthest = _extreme(windows, windows.highs, level, tile, u0, u1, v0, v1, True)
+    if z_low > (farthest + _behind(table, farthest, view.max_range)) * (ONE + SLACK):
+        return SKIP
+    whole = u_low >= -HALF and v_low >= -HALF and u_high <= right + HALF and v_high <= bottom + HALF
+    if not whole or z_high > view.max_range:
+        return MIXED
+    level = min(max(window_level(view.spread * far), windows.first), np.int32(COARSEST))
+    closest = _extreme(windows, windows.lows, level, tile, u0, u1, v0, v1, False)
+    if table.marks:
+        closest = min(closest, _nearest(nearest, tile, u0, u1, v0, v1))
+    return FREE if z_high < _clear_to(table, closest) * (ONE - SLACK) else MIXED
+
+
+@cell
+def _extent(rotation, axis):
+    """Return the half width along one axis of the camera of a box of half width 1."""
+    return abs(rotation[axis, 0]) + abs(rotation[axis, 1]) + abs(rotation[axis, 2])
+
+
+@cell
+def _outside(view, half, px, py, pz):
+    """Tell whether a box of half width `half` about (px, py, pz) lies wholly beyond one side of the image."""
+    for side in range(4):
+        plane = view.sides[side]
+        height = plane[0] * px + plane[1] * py + plane[2] * pz + half * plane[3] + plane[4]
+        if height < ZERO:
+            return True
+    return False
+
+
+@cell
+def _behind(table, farthest, max_range):
+    """Return how far behind a measurement the sensor model still says anything."""
+    if not table.marks:
+        return table.behind
+    return table.reach[table_row(min(farthest, max_range), table.rows_per_metre, table.hit.size)]
+
+
+@cell
+def _pixel(x, last):
+    return np.int32(min(max(x + HALF, ZERO), last))
+
+
+@cell
+def _clear_to(table, depth):
+    """Return the z up to which every measurement of at least `depth` says "free" and nothing else."""
+    if depth <= ZERO:
+        return ZERO
+    if depth >= NO_RETURN:
+        return NO_RETURN
+    row = table_row(depth, table.rows_per_metre, table.hit.size)
+    return min(depth - table.reach[row], table.safe[row + 1])
+
+
+@cell
+def _extreme(windows, image, level, tile, u0, u1, v0, v1, highest):
+    """Return the highest (or lowest) window value over the tiles that pixels u0..u1, v0..v1 touch."""
+    shift = max(level - 1, 0) + (4 if tile == 0 else 6)
+    width = windows.tile_width[level, tile]
+    start = windows.tile_offset[level, tile]
+    best = ZERO if highest else NO_RETURN
+    for v in range(v0 >> shift, (v1 >> shift) + 1):
+        for u in range(u0 >> shift, (u1 >> shift) + 1):
+            value = image[start + v * width + u]
+            best = max(best, value) if highest else min(best, value)
+    return best
+
+
+@cell
+def _nearest(nearest, tile, u0, u1, v0, v1):
+    image = nearest[tile]
+    shift = 4 if tile == 0 else 6
+    best = NO_RETURN
+    for v in range(v0 >> shift, (v1 >> shift) + 1):
+        for u in range(u0 >> shift, (u1 >> shift) + 1):
+            best = min(best, image[v, u])
+    return best
+
+
+LAYER = 64
+"""Cells told apart together: one layer of a block."""
+UNSEEN = np.float32(-1e9)
+"""Depth that stands for "nothing was measured where this cell is": every cell lies behind it."""
+
+
+@kernel
+def evaluate(depth_m, view, table, windows, blocks, hit_of, hit_values, values, depths, measured):
+    """Fill `values` (n, 512) int16 with the evidence on the cells of `blocks` (n, 3), hits included.
+
+    depth_m: (h, w) REP 117 depth image, from which `windows` was made. hit_of: (n,) place of each block among the hits,
+    -1 for none. depths, measured: (LAYER,) float32 scratch.
+    """
+    side = np.float32(8) * view.voxel_size
+    for i in range(blocks.shape[0]):
+        x, y, z = blocks[i, 0], blocks[i, 1], blocks[i, 2]
+        px = np.float32(x) * side - view.position[0]
+        py = np.float32(y) * side - view.position[1]
+        pz = np.float32(z) * side - view.position[2]
+        R = view.rotation
+        cx = (R[0, 0] * px + R[0, 1] * py + R[0, 2] * pz) * view.intrinsics[0]
+        cy = (R[1, 0] * px + R[1, 1] * py + R[1, 2] * pz) * view.intrinsics[1]
+        cz = R[2, 0] * px + R[2, 1] * py + R[2, 2] * pz
+        out = values[i]
+        _clear(view, table, windows, cx, cy, cz, _passed(view, table, cz), depths, measured, out)
+        if table.marks:
+            _mark(depth_m, view, table, cx, cy, cz, out)
+        if hit_of[i] >= 0:
+            hits = hit_values[hit_of[i]]
+            for c in range(512):
+                out[c] = max(out[c], hits[c]) if hits[c] > 0 else out[c]
+
+
+@kernel
+def passed(view, table, blocks, out):
+    """Fill `out` (n,) int16 with the evidence on all cells of each of `blocks` (n, 3), which are wholly free."""
+    side = np.float32(8) * view.voxel_size
+    R = view.rotation
+    for i in range(blocks.shape[0]):
+        px = np.float32(blocks[i, 0]) * side - view.position[0]
+        py = np.float32(blocks[i, 1]) * side - view.position[1]
+        pz = np.float32(blocks[i, 2]) * side - view.position[2]
+        out[i] = np.int16(_passed(view, table, R[2, 0] * px + R[2, 1] * py + R[2, 2] * pz))
+
+
+@cell
+def _passed(view, table, cz):
+    """Return the most that the cells of a block lose when they are looked through, by the depth of its centre.
+
+    cz: depth of the block's corner.
+    """
+    R = view.rotation
+    z = cz + np.float32(4) * view.voxel_size * (R[2, 0] + R[2, 1] + R[2, 2])
+    return table.passed[table_row(min(max(z, ZERO), view.max_range), table.rows_per_metre, table.passed.size)]
+
+
+@cell
+def _clear(view, table, windows, cx, cy, cz, most, depths, measured, out):
+    """Write the negative evidence: what the farthest pixel in a window about the cell's size says, `most` at most.
+
+    depths, measured: (LAYER,) scratch.
+    """
+    R = view.rotation
+    farther = max(R[2, 0], ZERO) + max(R[2, 1], ZERO) + max(R[2, 2], ZERO)
+    z_most = max(cz + np.float32(8) * view.voxel_size * farther, ZERO)
+    before = table.before[table_row(min(z_most, view.max_range), table.rows_per_metre, table.before.size)]
+    for layer in range(0, 512, LAYER):
+        cells = slice(layer, layer + LAYER)
+        steps = view.steps[0, cells], view.steps[1, cells], view.steps[2, cells]
+        _measure(view, windows, max(NEAR_PLANE, table.blind), cx, cy, cz, steps, depths, measured)
+        if _tell_apart(depths, measured, before, table.behind, most, out[cells]):
+            _look_up(view, table, depths, measured, most, out[cells])
+
+
+@cell
+def _measure(view, windows, nearest, cx, cy, cz, steps, depths, measured):
+    """Fill `depths` with the depth of each cell's centre and `measured` with what was measured there.
+
+    nearest: depth up to which cells are not looked at.
+    """
+    fx_steps, fy_steps, z_steps = steps
+    u_centre, v_centre = view.intrinsics[2] + HALF, view.intrinsics[3] + HALF
+    right, bottom = np.float32(view.width - 1), np.float32(view.height - 1)
+    u_end, v_end = np.float32(view.width), np.float32(view.height)
+    first, last = np.int32(windows.first), np.int32(COARSEST)
+    for c in range(LAYER):
+        z = cz + z_steps[c]
+        ahead = (z > nearest) & (z <= view.max_range)
+        inverse = ONE / (z if ahead else ONE)
+        u = (cx + fx_steps[c]) * inverse + u_centre
+        v = (cy + fy_steps[c]) * inverse + v_centre
+        u_rim, v_rim = view.rim[0] * inverse, view.rim[1] * inverse
+        seen = ahead & (u >= -u_rim) & (v >= -v_rim) & (u < u_end + u_rim) & (v < v_end + v_rim)
+        level = min(max(window_level(view.spread * inverse), first), last)
+        i = place(level, min(max(v, ZERO), bottom), min(max(u, ZERO), right), windows.pitch, windows.height)
+        d = windows.image[index(i)]
+        depths[c] = z
+        measured[c] = d if seen else UNSEEN
+
+
+@cell
+def _tell_apart(depths, measured, before, behind, free, out):
+    """Write `free` for cells wholly before their measurement, else 0; return whether any lies near it."""
+    near = np.int32(0)
+    for c in range(LAYER):
+        ahead = measured[c] - depths[c]
+        out[c] = np.int16(free if ahead > before else np.int32(0))
+        near |= np.int32((ahead <= before) & (ahead >= -behind) & (measured[c] > ZERO))
+    return near != 0
+
+
+@cell
+def _look_up(view, table, depths, measured, most, out):
+    """Write what the sensor table says of cells that are not wholly before their measurement, `most` at most."""
+    last_row = np.int32(table.hit.size - 1)
+    columns, clear = np.int32(table.clear.shape[1]), table.clear.reshape(table.clear.size)
+    last_column, middle_column = np.float32(columns - 1), np.float32(columns) * HALF
+    for c in range(LAYER):
+        d = measured[c]
+        row = min(np.int32(min(max(d, ZERO), view.max_range) * table.rows_per_metre), last_row)
+        t = (depths[c] - d) * table.columns_per_metre[index(row)] + middle_column
+        k = np.int32(min(max(t, ZERO), last_column))
+        e = max(clear[index(np.int32(np.int32(row * columns) + k))], most)
+        out[c] = np.int16(e if d > ZERO else np.int32(0))
+
+
+@cell
+def _mark(depth_m, view, table, cx, cy, cz, out):
+    """Overwrite with the positive evidence, where there is any, of the pixel at the cell's centre."""
+    u_centre, v_centre = view.intrinsics[2] + HALF, view.intrinsics[3] + HALF
+    rows = table.hit.size
+    last_column, middle_column = np.float32(table.mark.shape[1] - 1), np.float32(table.mark.shape[1]) * HALF
+    for c in range(512):
+        z = cz + view.steps[2, c]
+        if z <= NEAR_PLANE or z > view.max_range:
+            continue
+        u = (cx + view.steps[0, c]) / z + u_centre
+        v = (cy + view.steps[1, c]) / z + v_centre
+        if not (u >= ZERO and v >= ZERO and u < np.float32(view.width) and v < np.float32(view.height)):
+            continue
+        d = depth_m[np.int32(v), np.int32(u)]
+        if not (d > ZERO and d < NO_RETURN):
+            continue
+        row = table_row(d, table.rows_per_metre, rows)
+        t = (z - d) * table.columns_per_metre[row] + middle_column
+        if t < ZERO or t > last_column:
+            continue
+        e = table.mark[row, np.int32(t)]
+        if e > 0:
+            out[c] = np.int16(e)

@@ -1,0 +1,292 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How fast is stereovox beside other libraries? The same frames through all of them, in one process."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from time import perf_counter, process_time
+from typing import Any, TypeVar
+
+import numpy as np
+
+from stereovox.config import Config, load_config
+from stereovox.depth import prepare
+from stereovox.errors import ConfigError, StereovoxError
+from stereovox.frame import AnyFrame, Frame, Reason, UpdateReport
+from stereovox.lab.bench.frames import Progress, Recording, points_of, read_frames, silent
+from stereovox.lab.bench.machine import machine
+from stereovox.lab.bench.peers import ImagePeer, Peer, PeerClass, blamed, find_peer
+from stereovox.lab.bench.results import LIBRARY
+from stereovox.lab.bench.results import format_table as format_table
+from stereovox.mapper import Mapper
+
+MIN_FRAMES = 5
+"""A peer does so many frames however long they take."""
+PASSES = 3
+"""stereovox flies all frames so many times, and once more after each peer, so that a machine's moods meet all."""
+ENOUGH_S = 5.0
+"""A variant of stereovox whose timed frames took so many seconds flies no further pass."""
+
+T = TypeVar("T")
+SoFar = Callable[[dict[str, Any]], None]
+"""Called with the result so far."""
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One way to run stereovox: an integrator by name, on so many threads."""
+
+    integrator: str = "projective"
+    threads: int = 1
+
+    @property
+    def library(self) -> str:
+        """What its rows are called: `stereovox`, or `stereovox-ray`."""
+        return LIBRARY if self.integrator == "projective" else f"{LIBRARY}-{self.integrator}"
+
+    def config(self, voxel_size: float, max_range: float | None = None) -> Config:
+        """Return the default profile's settings with those of this variant; raises ConfigError."""
+        more: dict[str, Any] = {} if max_range is None else {"max_range": max_range}
+        return load_config(voxel_size=float(voxel_size), threads=self.threads, integrator=self.integrator, **more)
+
+
+@dataclass
+class _Watch:
+    """Times of calls in milliseconds, and the processor's time they got in all."""
+
+    times_ms: list[float] = field(default_factory=list)
+    cpu_ms: float = 0.0
+
+    def call(self, function: Callable[[], T]) -> T:
+        """Time a call and return its result."""
+        cpu, start = process_time(), perf_counter()
+        result = function()
+        self.times_ms.append(1e3 * (perf_counter() - start))
+        self.cpu_ms += 1e3 * (process_time() - cpu)
+        return result
+
+    @property
+    def share(self) -> float:
+        """How many processors the calls kept busy: less than 1 where others were in the way."""
+        return round(self.cpu_ms / max(sum(self.times_ms), 1e-6), 3)
+
+
+@dataclass(frozen=True)
+class _Limits:
+    """When a peer may stop: after `seconds` of inserting, but not before `MIN_FRAMES` frames."""
+
+    seconds: float
+
+    def reached(self, times_ms: Sequence[float]) -> bool:
+        return len(times_ms) >= MIN_FRAMES and sum(times_ms) >= 1e3 * self.seconds
+
+
+def bench(
+    source: Iterable[AnyFrame],
+    voxel_sizes: Sequence[float],
+    peers: Sequence[str],
+    threads: int = 1,
+    max_range: float | None = None,
+    frames_limit: int | None = None,
+    progress: Progress | None = None,
+    budget_s: float = 60.0,
+    variants: Sequence[Variant] = (),
+) -> dict[str, Any]:
+    """Time stereovox and `peers` (names in `PEERS`, or `module:Class`) on the same frames at each voxel size in metres.
+
+    Same pixels: those without a value and those beyond `max_range` (None: the default profile's) are left out for all,
+    ours included, so nobody clears space through them. Same poses: made exactly rigid once. All frames (at most
+    `frames_limit`) are in memory before the clock starts.
+
+    Timed: for stereovox the `integrate_ms` of each frame that `Mapper.add` reports, after all frames went once through
+    a map that is thrown away, so that kernels are compiled; several passes, one before each peer (only one where that
+    takes seconds), and their frames together give the figures. Its depth preparation stands apart as
+    `depth_ms_median`, the whole call as `add_ms_median`. For a peer its insertion alone, in one thread, after one frame
+    into a map that is thrown away; its points are made before. What a peer's Python binding does with the points is
+    part of it: a Python user pays that, a C++ program would not.
+
+    A peer stops after `budget_s` seconds of inserting at one voxel size, with at least 5 frames: `frames` tells how
+    many it did, and if that is fewer than ours, its cells and bytes cannot be compared.
+
+    Returns `rows` of `library, voxel_size, threads, frames, integrate_ms_median, integrate_ms_p90, integrate_ms_p99,
+    occupied, free, map_bytes, cpu_share` (processors kept busy while timed; a single thread that got clearly less than
+    one had to wait for other programs); `variants`: rows like these of further ways to run stereovox;
+    `ratio[str(voxel_size)][peer]` = peer's median / our median; and `source, image, frames, frames_refused,
+    first_refusal, max_range, budget_s, machine`. Cells count as each library defines them: occupied above p = 0.7 and
+    free below 0.3 for stereovox, above and below 0.5 for the others.
+    Raises ConfigError for an unknown or unusable peer or bad setting, MissingExtra for a peer that is not installed,
+    StereovoxError when no frame can be used or a peer fails: one line each.
+    """
+    ways = [Variant(threads=threads), *variants]
+    configs = _configs(voxel_sizes, ways, max_range)
+    kinds = find_peers(peers, configs[0][0].voxel_size)
+    recording = read_frames(source, configs[0][0], frames_limit, progress or silent)
+    return compare(recording, voxel_sizes, kinds, ways, max_range, progress or silent, budget_s)
+
+
+def find_peers(names: Sequence[str], voxel_size: float) -> dict[str, PeerClass]:
+    """Return peers by name; one that is missing or cannot be made shows here, before a long recording is read."""
+    kinds = {name: find_peer(name) for name in names}
+    for name, kind in kinds.items():
+        with blamed(f"peer '{name}' cannot be made", ConfigError):
+            kind(voxel_size)
+    return kinds
+
+
+def compare(
+    recording: Recording,
+    voxel_sizes: Sequence[float],
+    peers: dict[str, PeerClass],
+    ways: Sequence[Variant],
+    max_range: float | None = None,
+    tell: Progress = silent,
+    budget_s: float = 60.0,
+    so_far: SoFar = lambda result: None,
+) -> dict[str, Any]:
+    """Do what `bench` does with frames in memory; the first of `ways` is what peers are compared with.
+
+    so_far: called with the result after each voxel size, so that a long run can be stopped.
+    """
+    sizes = _configs(voxel_sizes, ways, max_range)
+    result: dict[str, Any] = {
+        "source": recording.name,
+        "image": recording.size,
+        "frames": len(recording.frames),
+        "frames_refused": len(recording.refusals),
+        "first_refusal": next(iter(recording.refusals), ""),
+        "max_range": sizes[0][0].max_range,
+        "budget_s": budget_s,
+        "machine": machine(),
+        "rows": [],
+        "variants": [],
+        "ratio": {},
+    }
+    for configs in sizes:
+        flights = [_Flights(way, config, recording.frames, tell) for way, config in zip(ways, configs, strict=True)]
+        theirs = _timed(flights, peers, recording.frames, configs[0], _Limits(budget_s), tell)
+        ours, *others = [flight.row() for flight in flights]
+        result["rows"] += [ours, *theirs]
+        result["variants"] += others
+        result["ratio"][str(configs[0].voxel_size)] = {row["library"]: _ratio(row, ours) for row in theirs}
+        so_far(result)
+    return result
+
+
+def _configs(voxel_sizes: Sequence[float], ways: Sequence[Variant], max_range: float | None) -> list[list[Config]]:
+    configs = [[way.config(size, max_range) for way in ways] for size in dict.fromkeys(voxel_sizes)]
+    if not configs:
+        raise StereovoxError("no voxel size to time; give at least one in metres, for example 0.05")
+    return configs
+
+
+def _timed(
+    flights: Sequence[_Flights],
+    peers: dict[str, PeerClass],
+    frames: list[Frame],
+    config: Config,
+    limits: _Limits,
+    tell: Progress,
+) -> list[dict[str, Any]]:
+    """Fly stereovox and let each peer do the frames, by turns; return the peers' rows."""
+    for flight in flights:
+        flight.fly("warming up")
+    waiting, rows = list(peers.items()), []
+    for _ in range(max(PASSES, len(waiting) + 1)):
+        for flight in flights:
+            if flight.seconds < ENOUGH_S:
+                flight.fly("timing", timed=True)
+        if waiting:
+            name, kind = waiting.pop(0)
+            with blamed(f"peer '{name}' at {config.voxel_size:g} m"):
+                rows.append(_time_peer(name, kind, frames, config, limits, tell))
+    return rows
+
+
+class _Flights:
+    """The frames through stereovox, as often as it is flown: each time into a new map."""
+
+    def __init__(self, way: Variant, config: Config, frames: list[Frame], tell: Progress):
+        self._way, self._config, self._frames, self._tell = way, config, frames, tell
+        self._reports: list[UpdateReport] = []
+        self._watch = _Watch()
+        self._map: dict[str, Any] = {}
+
+    @property
+    def seconds(self) -> float:
+        """How long the timed frames took."""
+        return sum(self._watch.times_ms) / 1e3
+
+    def fly(self, text: str, timed: bool = False) -> None:
+        """Add all frames to a new map, and remember the times if they are `timed`."""
+        mapper, threads = Mapper(self._config), self._way.threads
+        where = f"{self._way.library}{f', {threads} threads,' * (threads > 1)} at {self._config.voxel_size:g} m"
+        self._tell(0, len(self._frames), f"{where}, {text}{'' if timed else ': compiling, if need be'}")
+        for i, frame in enumerate(self._frames):
+            if timed:
+                self._reports.append(self._watch.call(lambda frame=frame: mapper.add(frame)))
+            else:
+                mapper.add(frame)
+            self._tell(i + 1, len(self._frames), f"{where}, {text}")
+        counts = mapper.map.counts()
+        self._map = {"occupied": counts["occupied"], "free": counts["free"], "map_bytes": mapper.map.memory_bytes}
+
+    def row(self) -> dict[str, Any]:
+        """Return the row of this way to run stereovox."""
+        row = _row(self._way.library, self._config, self._way.threads, [r.integrate_ms for r in self._reports])
+        more = {
+            "frames": len(self._frames),
+            "passes": len(self._reports) // len(self._frames),
+            "integrator": self._way.integrator,
+            "depth_ms_median": median([report.depth_ms for report in self._reports]),
+            "add_ms_median": median(self._watch.times_ms),
+            "cpu_share": self._watch.share,
+        }
+        return row | self._map | more
+
+
+def _time_peer(
+    name: str, kind: PeerClass, frames: list[Frame], config: Config, limits: _Limits, tell: Progress
+) -> dict[str, Any]:
+    _insertion(kind(config.voxel_size), frames[0], config)()
+    peer, watch = kind(config.voxel_size), _Watch()
+    for done, frame in enumerate(frames, start=1):
+        watch.call(_insertion(peer, frame, config))
+        tell(done, len(frames), f"{name} at {config.voxel_size:g} m")
+        if limits.reached(watch.times_ms):
+            break
+    occupied, free = peer.counts()
+    cells = {"occupied": int(occupied), "free": int(free)}
+    more = {**cells, "map_bytes": int(peer.bytes()), "cpu_share": watch.share}
+    return _row(name, config, 1, watch.times_ms) | more
+
+
+def _insertion(peer: Peer | ImagePeer, frame: Frame, config: Config) -> Callable[[], None]:
+    """Return the call that is timed; all that it needs is made here."""
+    image = prepare(frame, config)
+    if isinstance(peer, ImagePeer):
+        depth_m = np.where(image.reason == Reason.VALID, image.depth_m, np.float32(0))
+        return lambda: peer.insert_image(depth_m, image.camera, image.T_world_sensor)
+    points, origin = points_of(image)
+    return lambda: peer.insert(points, origin)
+
+
+def _row(library: str, config: Config, threads: int, times_ms: Sequence[float]) -> dict[str, Any]:
+    return {
+        "library": library,
+        "voxel_size": config.voxel_size,
+        "threads": threads,
+        "frames": len(times_ms),
+        "integrate_ms_median": median(times_ms),
+        "integrate_ms_p90": round(float(np.percentile(times_ms, 90)), 4),
+        "integrate_ms_p99": round(float(np.percentile(times_ms, 99)), 4),
+    }
+
+
+def median(times: Sequence[float]) -> float:
+    """Return the median to four places."""
+    return round(float(np.median(times)), 4)
+
+
+def _ratio(peer: dict[str, Any], ours: dict[str, Any]) -> float:
+    return round(peer["integrate_ms_median"] / max(ours["integrate_ms_median"], 1e-4), 3)

@@ -1,0 +1,42 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Experiments of papers, made again on simulated recordings, with the paper's figures beside ours."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from stereovox.errors import StereovoxError, did_you_mean
+from stereovox.lab.papers.chapter import Progress
+
+PAPERS = {
+    "chien2020": "stereovox.lab.papers.chien2020:reproduce",
+    "valenti2018": "stereovox.lab.papers.valenti2018:reproduce",
+    "ist2019": "stereovox.lab.papers.ist2019:reproduce",
+}
+"""Function `(out, data, quick, progress) -> dict` of each paper."""
+
+
+def reproduce(
+    paper: str,
+    out: str | Path,
+    *,
+    data: str | Path | None = None,
+    quick: bool = False,
+    progress: Progress | None = None,
+) -> dict[str, Any]:
+    """Make the experiments of a paper again and write `report.html` and `numbers.json` into folder `out`.
+
+    data: what the paper's experiments need besides simulation (chien2020: a recording of your own, mapped as well;
+    valenti2018: a folder with KITTI tracking sequences, or a drive of KITTI raw data; ist2019: a bag of your own, in
+    place of the simulated ones).
+    quick: fewer frames; enough to see that all works, not to quote. Returns the numbers, fit for JSON.
+    Raises StereovoxError, one line, for an unknown paper.
+    """
+    if paper not in PAPERS:
+        raise StereovoxError(f"unknown paper '{paper}'{did_you_mean(paper, PAPERS)}")
+    module, _, name = PAPERS[paper].partition(":")
+    run: Callable[..., dict[str, Any]] = getattr(import_module(module), name)
+    return run(Path(out), data, quick, progress or (lambda done, total, text: None))

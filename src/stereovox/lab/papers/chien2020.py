@@ -1,0 +1,96 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Chien 2020 made again: which experiments, how large, in which order, and the two files they end in."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+from stereovox.config import load_config
+from stereovox.lab.papers.chapter import Chapter, Progress
+from stereovox.lab.papers.chien import aisle, apartment, boxes, shifting, timing, tracers
+from stereovox.lab.papers.chien.aisle import compare_aisles
+from stereovox.lab.papers.chien.apartment import scan_apartment
+from stereovox.lab.papers.chien.boxes import Placement, find_boxes, random_placements
+from stereovox.lab.papers.chien.own import map_own
+from stereovox.lab.papers.chien.shifting import OUTSIDE, fly
+from stereovox.lab.papers.chien.timing import FIRST, time_tables
+from stereovox.lab.papers.chien.tracers import compare_tracers
+from stereovox.lab.papers.output import Steps, output_files, write_result
+from stereovox.opening import open_source
+
+TITLE = "Chien 2020, made again"
+LEAD = (
+    "A 3-D occupancy grid from a RealSense D435 and T265 on a drone (MSc thesis, Penn State 2020): its "
+    "experiments with simulated cameras in simulated scenes, whose truth is known. The thesis's recordings were "
+    "not published and its pictures are not at hand; its numbers and words stand beside ours. "
+    "Two claims are expected not to hold: cells of 0.05 m through a drifting tracker, see chapter 2."
+)
+APARTMENT_FRAMES = 902
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """How much of each experiment is done."""
+
+    box_updates: int = 100
+    placements: int = 50
+    placement_updates: int = 100
+    apartment_every: int = 2
+    aisle_frames: int = 100
+    timed_frames: int = 250
+    tracer_frames: int = 40
+    flight_m: float = 80.0
+
+
+QUICK = Sizes(100, 6, 20, 12, 40, 25, 10, 40.0)
+
+
+def reproduce(out: Path, data: str | Path | None, quick: bool, progress: Progress) -> dict[str, Any]:
+    """Run all experiments; see `stereovox.lab.papers.reproduce`."""
+    start = perf_counter()
+    source = None if data is None else open_source(str(data))
+    files = output_files(out)
+    sizes = QUICK if quick else Sizes()
+    steps = Steps(progress, _total(sizes) + (0 if source is None else len(source)))
+    own = [] if source is None else [map_own(source, steps.of("your own recording"))]  # first: it may be of no use
+    found = [*experiments(sizes, steps), *own]
+    return write_result(files, found, perf_counter() - start, paper="chien2020", title=TITLE, lead=LEAD, quick=quick)
+
+
+def experiments(sizes: Sizes, steps: Steps) -> list[Chapter]:
+    """Return all chapters of the thesis."""
+    at_2_m = [Placement("large", 2.0), Placement("small", 2.0)]
+    two = find_boxes(at_2_m, updates=sizes.box_updates, step=steps.of("two boxes"))
+    placed = list(random_placements(sizes.placements))
+    many = find_boxes(placed, updates=sizes.placement_updates, step=steps.of("boxes at random places"))
+    scanned = scan_apartment(every=sizes.apartment_every, step=steps.of("apartment"))
+    aisles, simulation = compare_aisles(frames=sizes.aisle_frames, step=steps.of("aisle"))
+    compared = [compare_tracers(n, frames=sizes.tracer_frames, step=steps.of("ray tracers")) for n in (8, 1)]
+    flights = [fly(outside, length_m=sizes.flight_m, step=steps.of("map shifting")) for outside in OUTSIDE]
+    times = time_tables(frames=sizes.timed_frames, step=steps.of("time tables"))  # last: all kernels are compiled
+    found = [
+        boxes.chapter(two, many, sizes.box_updates),
+        apartment.chapter(scanned),
+        aisle.chapter(aisles, simulation.scene),
+        timing.chapter(*times),
+        tracers.chapter(compared, load_config("chien2020").voxel_size),
+        shifting.chapter(flights),
+    ]
+    for flight in flights:
+        flight.voxel_map.close()
+    return found
+
+
+def _total(sizes: Sizes) -> int:
+    flight_frames = 2 * (round(sizes.flight_m / 5 * 30) + 1)
+    images = (
+        -(-APARTMENT_FRAMES // sizes.apartment_every)
+        + sizes.aisle_frames
+        + FIRST
+        + sizes.timed_frames
+        + 2 * sizes.tracer_frames
+    )
+    return 2 + sizes.placements + images + flight_frames

@@ -1,0 +1,161 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What must hold of simulated beams and of a floor's maps, and whether it does."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from stereovox.lab.papers.chapter import Claim
+from stereovox.lab.papers.ist.drives import Place
+from stereovox.lab.papers.ist.fans import Fan
+from stereovox.lab.papers.ist.survey import Judged, Survey
+from stereovox.lab.papers.ist.variants import MIDDLE, OURS, THEIRS
+
+
+def numbers_of(found: Survey) -> dict[str, Any]:
+    """Return maps, scores, ways and times."""
+    slam = found.reference.slam
+    return {
+        "scans": len(found.recording.robot.scans),
+        "frames": len(found.recording.robot.frames),
+        "first_scans": len(found.recording.first.scans),
+        "megabytes": found.recording.megabytes,
+        "closures": slam.closures,
+        "slam_s": found.reference.seconds,
+        "amcl_s": found.localised_s,
+        "excluded": [list(one) for one in found.excluded],
+        "slam_way": found.reference.way_error.as_dict() if found.reference.way_error else None,
+        "amcl_way": found.way_error.as_dict() if found.way_error else None,
+        "reference_of_building": found.of_building.as_dict() if found.of_building else None,
+        "maps": {
+            name: {
+                "what": one.made.variant.what,
+                "figures": one.made.figures,
+                "scores": one.scores.as_dict(),
+                "nothing_excluded": one.with_door.as_dict(),
+                "of_building": {heights: scores.as_dict() for heights, scores in one.of_building.items()},
+            }
+            for name, one in found.judged.items()
+        },
+    }
+
+
+RIGHT, AREA = 0.98, 0.03
+"""Least share of places on the beams with the right state; most by which counted cells differ from the areas."""
+TARGET_PERCENT = 10.0
+WALL_M, WAY_M = 0.04, 0.10
+"""Most metres, median, from a wall of the map to the reference's; most metres (RMS) that a way is off."""
+DRAWN_ODOMETRY = "ist2019, odometry"
+
+
+def fan_claims(many: Fan, few: Fan) -> list[Claim]:
+    """Return the claims on Fig 3."""
+    assert many.expected_free is not None
+    assert many.expected_occupied is not None
+    free = abs(many.free / many.expected_free - 1)
+    occupied = abs(many.occupied / many.expected_occupied - 1)
+    return [
+        Claim(
+            "700 beams: free are the cells nearer than the measurement, occupied those within the thickness behind",
+            f"areas of sector and ring: {many.expected_free:,.0f} and {many.expected_occupied:,.0f} cells",
+            f"{many.free:,} and {many.occupied:,} cells",
+            free <= AREA and occupied <= 2 * AREA,
+        ),
+        Claim("700 beams: the rest is unknown", "0 known cells beyond", f"{many.beyond}", many.beyond == 0),
+        Claim(
+            "10 beams: free up to the object found, occupied there",
+            f"at least {100 * RIGHT:.0f} % of places on the beams",
+            f"{100 * few.right:.1f} %",
+            few.right >= RIGHT,
+        ),
+    ]
+
+
+def claims_of(found: Survey, place: Place | None) -> list[Claim]:
+    """Return the claims on one floor; on somebody's own recording nothing is claimed."""
+    theirs, ours, middle = (found.judged[name] for name in (THEIRS, OURS, MIDDLE))
+    told = place.error_percent if place else None
+    claims = [
+        Claim(
+            "profile ist2019: error (Eq 7) below the report's",
+            "-" if told is None else f"{told:g} %",
+            _percent(theirs),
+            None if told is None else theirs.scores.eq7_percent < told,
+        )
+    ]
+    if place is None:
+        return [*claims, *(_beside(one) for one in (middle, ours))]
+    claims += [_target(middle), _beside(ours), *_band(ours, theirs), _walls(middle), *_ways(found)]
+    odometry = found.judged.get(DRAWN_ODOMETRY)
+    if odometry is not None:
+        less = theirs.scores.eq7_percent < odometry.scores.eq7_percent
+        claims.append(
+            Claim(
+                "localisation makes the map better than odometry alone",
+                "less error",
+                f"{_percent(theirs)} against {_percent(odometry)}",
+                less,
+            )
+        )
+    if found.excluded:
+        changed = theirs.with_door.eq7_percent - theirs.scores.eq7_percent
+        claims.append(
+            Claim(
+                "a door shut since then can be excluded",
+                "the white rectangle is made black",
+                f"{_percent(theirs)}; not excluded {theirs.with_door.eq7_percent:.1f}\u00a0%",
+                changed > 0,
+            )
+        )
+    return claims
+
+
+def update_ms(found: Survey, name: str) -> float:
+    """Return median milliseconds from depth image to updated map."""
+    return float(found.judged[name].made.figures["frame_ms"]["median"])
+
+
+def _target(one: Judged) -> Claim:
+    text = f"{one.made.variant.name} ({one.made.variant.what}): error (Eq 7)"
+    return Claim(
+        text, f"at most {TARGET_PERCENT:g} % (our target)", _percent(one), one.scores.eq7_percent <= TARGET_PERCENT
+    )
+
+
+def _beside(one: Judged) -> Claim:
+    text = f"{one.made.variant.name} ({one.made.variant.what}): error (Eq 7)"
+    return Claim(text, "-", _percent(one), None)
+
+
+def _band(ours: Judged, theirs: Judged) -> list[Claim]:
+    """Return what a robot needs to know: all that stands in its way, which the lidar's reference does not."""
+    if not (ours.of_building and theirs.of_building):
+        return []
+    mine, printed = (one.of_building["band"].eq7_percent for one in (ours, theirs))
+    text = f"{ours.made.variant.name}: error (Eq 7) against all that stands 0.1 to 1.8 m over the building's floor"
+    less = f"{ours.made.variant.name}: less of it than {theirs.made.variant.name}, which sees one height only"
+    return [
+        Claim(text, f"at most {TARGET_PERCENT:g} % (our target)", f"{mine:.1f}\u00a0%", mine <= TARGET_PERCENT),
+        Claim(less, "less", f"{mine:.1f}\u00a0% against {printed:.1f}\u00a0%", mine < printed),
+    ]
+
+
+def _walls(one: Judged) -> Claim:
+    there, back = one.scores.to_reference.median, one.scores.from_reference.median
+    holds = there is not None and back is not None and max(there, back) <= WALL_M
+    ours = "no walls" if there is None or back is None else f"{100 * there:.1f} and {100 * back:.1f} cm"
+    text = f"{one.made.variant.name}: walls to the reference's walls and back, median"
+    return Claim(text, f"at most {100 * WALL_M:g} cm", ours, holds)
+
+
+def _ways(found: Survey) -> list[Claim]:
+    ways = {"SLAM's way": found.reference.way_error, "AMCL's way": found.way_error}
+    return [
+        Claim(f"{name}, off the true one (RMS, laid on it as a whole)", f"at most {100 * WAY_M:g} cm",
+              f"{100 * error.position_rms_m:.1f} cm, {error.yaw_rms_deg:.2f} degrees", error.position_rms_m <= WAY_M)
+        for name, error in ways.items() if error is not None
+    ]  # fmt: skip
+
+
+def _percent(one: Judged) -> str:
+    return f"{one.scores.eq7_percent:.1f}\u00a0%"

@@ -1,0 +1,315 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Adaptive Monte Carlo localisation: where a robot is in a known map (Fox 2003; Thrun, Burgard and Fox 2005, ch. 8).
+
+By hand, because nav2's AMCL is a node of ROS 2, not a library.
+"""
+
+from __future__ import annotations
+
+from array import array
+from bisect import bisect_left
+from collections import Counter
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from time import perf_counter
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stereovox import se2
+from stereovox.config import Config
+from stereovox.errors import ConfigError, FrameRefused, MapFileError, SourceError
+from stereovox.frame import Scan, name_of
+from stereovox.localize.amcl.models import MODELS, moved, turn_go_turn
+from stereovox.localize.amcl.particles import Clusters, Recovery, draw, mean_pose, spread
+from stereovox.localize.scan_beams import Beams, beams_of
+from stereovox.localize.track import Track
+from stereovox.maps.occupancy import OccupancyGrid
+from stereovox.maps.voxel_map import State
+from stereovox.trust.validate import sound
+
+LATE = 3
+"""Scans in a row that are too late, and in order among themselves, before it is asked who is right."""
+
+
+class Clock:
+    """The stamps of the scans so far, rising.
+
+    A lone stamp in the future would make all later scans too late. So once more scans in a row are late than there are
+    scans that they would have to come before, it is those before that had the wrong stamps (as `slam_way.Way`).
+    """
+
+    def __init__(self):
+        self._stamps_ns = array("q")
+        self._late, self._late_ns = 0, 0
+
+    def take(self, scan: Scan) -> int:
+        """Go on to the time of a scan; return how many of the last scans turn out to have had a wrong stamp.
+
+        Raises FrameRefused with the reason `not_in_order` where the scan is not later than the one before.
+        """
+        ahead = len(self._stamps_ns) - bisect_left(self._stamps_ns, scan.stamp_ns)
+        if ahead:
+            self._count_late(scan, ahead)
+            del self._stamps_ns[-ahead:]
+        self._stamps_ns.append(scan.stamp_ns)
+        self._late = 0
+        return ahead
+
+    def _count_late(self, scan: Scan, ahead: int) -> None:
+        self._late = self._late + 1 if self._late and scan.stamp_ns > self._late_ns else 1
+        self._late_ns = scan.stamp_ns
+        if self._late <= max(ahead, LATE):
+            said = f"at {scan.stamp_ns} ns, is not later than the scan before it at {self._stamps_ns[-1]} ns"
+            raise FrameRefused("not_in_order", f"{name_of(scan)}: {said}; give scans in order of time")
+
+
+class FreeFloor:
+    """The free cells of a map. Raises MapFileError where there is none, or nothing occupied to go by."""
+
+    def __init__(self, grid: OccupancyGrid):
+        states = grid.states
+        self.grid = grid
+        self._free = np.flatnonzero(states == State.FREE).astype(np.uint32)
+        for state, count in (("free", len(self._free)), ("occupied", int((states == State.OCCUPIED).sum()))):
+            if not count:
+                raise MapFileError(f"the map has no {state} cell: nobody can be localised in it; give a finished map")
+
+    def anywhere(self, count: int, rng: np.random.Generator) -> se2.Pose:
+        """Return (count, 3) poses evenly spread over all free cells and directions."""
+        chosen = self._free[rng.integers(len(self._free), size=count)]
+        rows, columns = np.divmod(chosen, np.uint32(self.grid.cells.shape[1]))
+        local = (np.column_stack([columns, rows]) + rng.random((count, 2))) * self.grid.resolution
+        turns = rng.uniform(-np.pi, np.pi, count)
+        return np.column_stack([se2.transform(self.grid.origin, local), turns])
+
+
+def near(start: se2.Pose, std: ArrayLike, count: int, rng: np.random.Generator) -> se2.Pose:
+    """Return (count, 3) poses normally distributed round a (3,) pose; std: (3,) metres, metres, radians."""
+    poses = start + rng.standard_normal((count, 3)) * np.asarray(std)
+    poses[:, 2] = se2.wrapped(poses[:, 2])
+    return poses
+
+
+def checked_start(start: ArrayLike) -> NDArray[np.float64]:
+    """Return a start pose as (3,) float64. Raises ConfigError, one line, where it is none."""
+    try:
+        pose = np.asarray(start, float)
+    except (TypeError, ValueError):
+        pose = np.empty(0)
+    if pose.shape != (3,) or not np.isfinite(pose).all():
+        raise ConfigError(f"start {start!r}: give three finite numbers x, y, yaw (metres, metres, radians), or none")
+    return pose
+
+
+MOST_AT_START = 1_000_000
+"""Poses that are tried at once where the robot may be anywhere."""
+SETTLED_SHARE, SETTLED_M = 0.95, 0.3
+"""The robot knows where it is when so much weight is in one cluster, which is so wide (standard deviation)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """Where the robot is after a scan, as ROS's amcl gives it.
+
+    pose_map_base: (3,) float64, the mean of the heaviest cluster of particles, moved by the odometry since.
+    covariance: (3, 3) float64, mean square of how far the particles of all clusters are from it (metres, radians).
+    pose_map_odom: (3,) float64, what turns the odometry's poses into those of the map.
+    particles: (N, 3) float64, equally likely poses in the map, as of the last update.
+    moved: tells whether the scan was compared with the map: at first, and then after moving far enough.
+    settled: tells whether nearly all particles agree; False while the robot may be in several places.
+    ms: milliseconds the scan took.
+    """
+
+    pose_map_base: se2.Pose
+    covariance: NDArray[np.float64]
+    pose_map_odom: se2.Pose
+    particles: se2.Pose
+    moved: bool
+    settled: bool
+    ms: float
+
+
+class Localiser:
+    """Follows a robot through a map by its scans and odometry.
+
+    start: (3,) x, y, yaw where the robot is at the first scan, good to `amcl.start_std`; None: it may be anywhere.
+    seed: of all random numbers; the same scans then give the same estimates.
+    refused: how many scans were refused, by reason; `not_in_order` are also those that later ones show to be.
+    Raises MapFileError for a map without free or occupied cells, ConfigError for a start that is no pose.
+    """
+
+    def __init__(self, grid: OccupancyGrid, config: Config, start: ArrayLike | None = None, seed: int = 0):
+        self.config, self._rigidity = config.amcl, config.pose_rigidity_tolerance
+        self.refused: Counter[str] = Counter()
+        self._clock = Clock()
+        self._rng = np.random.default_rng(seed)
+        self._floor = FreeFloor(grid)
+        self._sensor = MODELS[self.config.model](grid, self.config)
+        self._recovery = Recovery(self.config)
+        self._particles = self._first(None if start is None else checked_start(start))
+        self._weights = np.full(len(self._particles), 1 / len(self._particles))
+        self._pose_odom_base: se2.Pose | None = None
+        self._updates = 0
+        self._pose_map_odom, self._covariance, self._settled = np.zeros(3), np.zeros((3, 3)), False
+
+    def add(self, scan: Scan) -> Estimate:
+        """Return where the robot is after one more scan.
+
+        Raises FrameRefused, and changes nothing but what is counted, where the scan cannot be trusted (`sound`,
+        `beams_of`) or is not later than the one before (`Clock`).
+        """
+        start = perf_counter()
+        try:
+            scan = sound(scan, self._rigidity)
+            beams = beams_of(scan, self.config.max_range)
+            wrong = self._clock.take(scan)
+        except FrameRefused as refusal:
+            self.refused[refusal.reason] += 1
+            raise
+        if wrong:
+            self.refused["not_in_order"] += wrong
+        pose_odom_base = scan.pose_world_base
+        if due := self._far_enough(pose_odom_base):
+            self._update(pose_odom_base, beams)
+        pose = se2.compose(self._pose_map_odom, pose_odom_base)
+        ms = 1e3 * (perf_counter() - start)
+        return Estimate(pose, self._covariance, self._pose_map_odom, self._particles, due, self._settled, ms)
+
+    def _first(self, start: se2.Pose | None) -> se2.Pose:
+        most = self.config.particles_max
+        if start is None:
+            return self._floor.anywhere(max(min(most * self.config.candidates, MOST_AT_START), most), self._rng)
+        return near(start, self.config.start_std, most, self._rng)
+
+    def _far_enough(self, pose_odom_base: se2.Pose) -> bool:
+        if self._pose_odom_base is None:
+            return True
+        step = se2.relative(self._pose_odom_base, pose_odom_base)
+        return bool(np.hypot(*step[:2]) >= self.config.update_min_d or abs(step[2]) >= self.config.update_min_a)
+
+    def _update(self, pose_odom_base: se2.Pose, beams: Beams) -> None:
+        if self._pose_odom_base is not None:
+            motion = turn_go_turn(self._pose_odom_base, pose_odom_base)
+            self._particles = moved(self._particles, motion, self.config, self._rng)
+        self._pose_odom_base = pose_odom_base
+        self._updates += 1
+        chosen = beams.some(self.config.max_beams, self._sensor.hits_only)
+        self._weigh(chosen)
+        clusters = Clusters(self._particles, self.config)
+        self._estimate(clusters, pose_odom_base)
+        if self._updates % self.config.resample_interval == 0 or len(self._particles) > self.config.particles_max:
+            self._resample(clusters, chosen)
+
+    def _weigh(self, beams: Beams) -> None:
+        if not len(beams.ranges):
+            return
+        log_likelihood = self._sensor.log_likelihood(self._particles, beams).astype(float)
+        self._recovery.see(log_likelihood, self._weights, len(beams.ranges))  # all: skipping would hide that it is lost
+        fitting = self._fitting(beams)
+        if fitting is not beams:
+            log_likelihood = self._sensor.log_likelihood(self._particles, fitting).astype(float)
+        self._weights = _times(self._weights, log_likelihood * self.config.trust)
+
+    def _fitting(self, beams: Beams) -> Beams:
+        """Return the beams that enough particles agree with, or all of them (`amcl.beam_skip`)."""
+        if not (self.config.beam_skip and self._settled):
+            return beams
+        lost = self._sensor.agreeing(self._particles, beams) < self.config.beam_skip_share
+        return beams.only(~lost) if 0 < lost.mean() <= self.config.beam_skip_most else beams
+
+    def _estimate(self, clusters: Clusters, pose_odom_base: se2.Pose) -> None:
+        inside, share = clusters.heaviest(self._weights)
+        particles, weights = self._particles[inside], self._weights[inside]
+        pose = mean_pose(particles, weights)
+        wide = np.sqrt(np.trace(spread(particles, weights, pose)[:2, :2]))
+        self._settled = bool(share >= SETTLED_SHARE and wide <= SETTLED_M)
+        self._covariance = spread(self._particles, self._weights, pose)
+        self._pose_map_odom = se2.compose(pose, se2.inverse(pose_odom_base))
+
+    def _resample(self, clusters: Clusters, beams: Beams) -> None:
+        share, bins = self._recovery.strangers, clusters.bins
+        strangers, likely = np.empty((0, 3)), None
+        if share > 0:
+            strangers, likely = self._strangers(share, beams)
+            bins = Clusters(np.concatenate([self._particles, strangers]), self.config).bins
+        kept, taken = draw(self._weights, bins, self.config, self._rng.random(), share, likely)
+        self._particles = np.concatenate([self._particles[kept], strangers[taken]])
+        self._weights = np.full(len(self._particles), 1 / len(self._particles))
+
+    def _strangers(self, share: float, beams: Beams) -> tuple[se2.Pose, NDArray[np.float64]]:
+        """Return poses from anywhere, and how likely each is by the scan alone (Lenser and Veloso 2000)."""
+        tried = self.config.candidates
+        count = int(np.clip(np.ceil(share * len(self._particles)), 50, 5000)) * tried
+        poses = self._floor.anywhere(count, self._rng)
+        weights = np.full(count, 1 / count)
+        if tried > 1 and len(beams.ranges):
+            log_likelihood = self._sensor.log_likelihood(poses, beams).astype(float)
+            weights = _times(weights, log_likelihood * self.config.trust)
+        return poses, weights
+
+
+def localise(
+    grid: OccupancyGrid,
+    scans: Iterable[Scan],
+    config: Config,
+    start: ArrayLike | None = None,
+    seed: int = 0,
+    progress: Callable[[int], object] | None = None,
+) -> Track:
+    """Return a robot's way through a map; scans that cannot be trusted are left out, and counted in `Track.refused`.
+
+    start, seed: as in `Localiser`; progress: called with the number of scans done.
+    Where the particles disagree, the way is that of the odometry, with a drift in between those of the sure poses
+    before and after; before the first sure pose it has that one's.
+    Scans that later ones show to have a wrong stamp (`Clock`) are taken out of the way again, and counted too.
+    Raises what `Localiser` raises, and SourceError where not one scan can be trusted.
+    """
+    localiser, way, first_refusal = Localiser(grid, config, start, seed), _Way(), ""
+    for done, scan in enumerate(scans, 1):
+        try:
+            way.add(scan.stamp_ns, localiser.add(scan))
+        except FrameRefused as refusal:
+            first_refusal = first_refusal or str(refusal)
+        if progress:
+            progress(done)
+    if not way.stamps_ns:
+        said = f"every one was refused, the first: {first_refusal}" if first_refusal else "there are none"
+        raise SourceError(f"no scan to localise by: {said}")
+    return way.track(dict(localiser.refused), first_refusal)
+
+
+class _Way:
+    """What is kept of the estimates: all but the particles, of which hours would not fit into memory."""
+
+    def __init__(self):
+        self.stamps_ns: list[int] = []
+        self._base: list[se2.Pose] = []
+        self._odom: list[se2.Pose] = []
+        self._sure: list[bool] = []
+
+    def add(self, stamp_ns: int, estimate: Estimate) -> None:
+        """Take in the next estimate; earlier ones of the same time or later go (`Clock`)."""
+        while self.stamps_ns and self.stamps_ns[-1] >= stamp_ns:
+            for kept in (self.stamps_ns, self._base, self._odom, self._sure):
+                kept.pop()
+        self.stamps_ns.append(stamp_ns)
+        self._base.append(estimate.pose_map_base)
+        self._odom.append(estimate.pose_map_odom)
+        self._sure.append(estimate.settled)
+
+    def track(self, refused: dict[str, int], first_refusal: str) -> Track:
+        """Return the way by what was sure alone: between, the odometry's drift is taken to be in between."""
+        stamps_ns, base, odom = np.array(self.stamps_ns, np.int64), np.array(self._base), np.array(self._odom)
+        sure = np.array(self._sure)
+        if sure.any() and not sure.all():
+            known = Track(stamps_ns[sure], base[sure], odom[sure])
+            drift = np.array([known.correction(stamp_ns) for stamp_ns in self.stamps_ns])
+            base, odom = se2.compose(drift, se2.compose(se2.inverse(odom), base)), drift
+        return Track(stamps_ns, base, odom, refused, first_refusal)
+
+
+def _times(weights: NDArray[np.float64], log_factors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return weights of sum 1 times the exponentials of log factors."""
+    weights = weights * np.exp(log_factors - log_factors.max())
+    return weights / weights.sum()

@@ -1,0 +1,190 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The pose graph of SLAM: keyframes, what is known of where two of them stand, and the last refinement."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox import se2
+from stereovox.config.robot import SlamConfig
+from stereovox.errors import MissingExtra
+from stereovox.frame import Scan
+from stereovox.localize.slam.line_map import Cloud, LineMap, joined
+
+STEP_SIGMA = (0.01, 0.03, 0.003, 0.02)
+"""Standard deviation of a matched step between keyframes: metres, per metre, radians, per radian."""
+
+
+@dataclass(eq=False)
+class Keyframe:
+    """A scan that the map is made of.
+
+    pose: (3,) pose_map_base as now believed. step: (3,) where it stood as seen from the keyframe before, as matched.
+    cloud: its points in the robot's frame. travelled: metres of the robot's way until here.
+    """
+
+    pose: se2.Pose
+    step: se2.Pose
+    cloud: Cloud
+    scan: Scan
+    travelled: float
+
+
+@dataclass(frozen=True, eq=False)
+class Edge:
+    """How two keyframes stand to each other: motion (3,) is pose_first_second.
+
+    information: (3, 3) of x, y, yaw in the second's frame. share: of the points that lay on lines, 1 for a step.
+    """
+
+    first: int
+    second: int
+    motion: se2.Pose
+    information: NDArray[np.float64]
+    share: float = 1.0
+
+
+def step_edges(keyframes: list[Keyframe]) -> list[Edge]:
+    """Return what matching scan after scan says: one edge between each keyframe and the next."""
+    edges = []
+    for i, keyframe in enumerate(keyframes[1:]):
+        way, turn = float(np.hypot(*keyframe.step[:2])), abs(float(keyframe.step[2]))
+        metres = STEP_SIGMA[0] + STEP_SIGMA[1] * way
+        radians = STEP_SIGMA[2] + STEP_SIGMA[3] * turn
+        edges.append(Edge(i, i + 1, keyframe.step, np.diag([metres**-2, metres**-2, radians**-2])))
+    return edges
+
+
+def in_map(keyframe: Keyframe) -> Scan:
+    """Return a keyframe's scan with its pose in the map, whatever its stamp says."""
+    T_map_odom = se2.lifted(se2.compose(keyframe.pose, se2.inverse(keyframe.scan.pose_world_base)))
+    return replace(keyframe.scan, T_world_sensor=T_map_odom @ keyframe.scan.T_world_sensor)
+
+
+def in_second_frame(information: NDArray[np.float64], yaw: float) -> NDArray[np.float64]:
+    """Return information (3, 3) about x, y, yaw of a frame's place as that about its own x, y, yaw."""
+    turn = np.array([[np.cos(yaw), -np.sin(yaw), 0.0], [np.sin(yaw), np.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
+    return turn.T @ information @ turn
+
+
+def without_weak(information: NDArray[np.float64], floor: float) -> NDArray[np.float64]:
+    """Return information (3, 3) without what it says of the direction in which it says little.
+
+    Along a corridor nothing but noise tells where one is, and its pull is towards "has not moved".
+    floor: share of the strongest direction's information below which a direction is dropped.
+    """
+    values, vectors = np.linalg.eigh(information[:2, :2])
+    if values[0] >= floor * values[1]:
+        return information
+    keep = np.eye(3)
+    keep[:2, :2] -= np.outer(vectors[:, 0], vectors[:, 0])
+    return keep @ information @ keep
+
+
+PATCH = 4
+"""Keyframes before and after a patch's middle that belong to it: few enough to be rigid."""
+STRIDE = 3
+"""Keyframes from one patch's middle to the next."""
+WEAK = 0.1
+"""Share of information below which a direction is a corridor's."""
+MOST_OTHERS = 120
+"""Keyframes that are laid onto a patch: a robot may pass the same place all day."""
+LEAST_SHARE = 0.4
+"""Share of a keyframe's points that must lie on a patch's lines."""
+
+
+def patch_edges(keyframes: list[Keyframe], config: SlamConfig) -> Iterator[Edge]:
+    """Yield what each keyframe says of where it stands to each patch of other keyframes nearby.
+
+    A patch is a short run of keyframes, taken as rigid; edges go from its middle to the keyframe. They start from the
+    keyframes' present poses, so these must be right to a decimetre or two.
+    """
+    places = np.array([keyframe.pose for keyframe in keyframes])
+    patch = LineMap(config.voxel_size)
+    for middle in range(0, len(keyframes), STRIDE):
+        first, last = max(middle - PATCH, 0), min(middle + PATCH + 1, len(keyframes))
+        others = _others(places, middle, first, last, config)
+        if not len(others):
+            continue
+        pose = places[middle]
+        patch.build(joined([k.cloud.moved(se2.relative(pose, k.pose)) for k in keyframes[first:last]]))
+        guesses = se2.relative(pose, places[others])
+        for other, guess in zip(others.tolist(), guesses, strict=True):
+            edge = _edge(patch, keyframes, (middle, other), guess, config)
+            if edge is not None:
+                yield edge
+
+
+def _others(places: se2.Pose, middle: int, first: int, last: int, config: SlamConfig) -> NDArray[np.int64]:
+    far = np.hypot(*(places[:, :2] - places[middle, :2]).T)
+    near = np.nonzero(far < config.refine_distance)[0]
+    near = near[(near < first) | (near >= last)]
+    return near[:: len(near) // MOST_OTHERS + 1]
+
+
+def _edge(
+    patch: LineMap, keyframes: list[Keyframe], pair: tuple[int, int], guess: se2.Pose, config: SlamConfig
+) -> Edge | None:
+    cloud = keyframes[pair[1]].cloud
+    match = patch.refine(cloud, guess, 2 * config.sigma, iterations=6)
+    match = patch.refine(cloud, match.pose, config.sigma, iterations=8)
+    moved = match.pose - guess
+    if match.share < LEAST_SHARE or moved[0] ** 2 + moved[1] ** 2 > 0.1 or abs(moved[2]) > 0.1:
+        return None
+    information = without_weak(in_second_frame(match.information, float(match.pose[2])), WEAK)
+    return Edge(*pair, match.pose, information, match.share)
+
+
+OUTLIER = 3.0
+"""Standard deviations from which on a robust edge pulls less and less (Cauchy)."""
+
+
+def optimised(
+    poses: se2.Pose, steps: Iterable[Edge], edges: Iterable[Edge], scale: float = 1.0, outlier: float = OUTLIER
+) -> se2.Pose:
+    """Return the poses (N, 3) that explain all edges best; the first one stays.
+
+    steps: edges that are surely right. edges: edges any of which may be wrong, as their information times `scale`; they
+    are weighted by Cauchy's function.
+    Raises MissingExtra where gtsam is not installed.
+    """
+    gtsam = _gtsam()
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    for i, (x, y, yaw) in enumerate(poses):
+        values.insert(i, gtsam.Pose2(x, y, yaw))
+    graph.add(gtsam.PriorFactorPose2(0, values.atPose2(0), gtsam.noiseModel.Isotropic.Sigma(3, 1e-4)))
+    robust = gtsam.noiseModel.mEstimator.Cauchy.Create(outlier)
+    for edge in steps:
+        graph.add(_factor(gtsam, edge, _noise(gtsam, edge.information)))
+    for edge in edges:
+        noise = gtsam.noiseModel.Robust.Create(robust, _noise(gtsam, edge.information * scale))
+        graph.add(_factor(gtsam, edge, noise))
+    parameters = gtsam.LevenbergMarquardtParams()
+    parameters.setMaxIterations(50)
+    found = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
+    return np.array([_numbers(found.atPose2(i)) for i in range(len(poses))])
+
+
+def _gtsam() -> Any:
+    try:
+        import gtsam
+    except ImportError:
+        raise MissingExtra("gtsam", "slam") from None
+    return gtsam
+
+
+def _noise(gtsam: Any, information: NDArray[np.float64]) -> Any:
+    return gtsam.noiseModel.Gaussian.Information(information + 1e-3 * np.eye(3))
+
+
+def _factor(gtsam: Any, edge: Edge, noise: Any) -> Any:
+    return gtsam.BetweenFactorPose2(edge.first, edge.second, gtsam.Pose2(*edge.motion), noise)
+
+
+def _numbers(pose: Any) -> tuple[float, float, float]:
+    return pose.x(), pose.y(), pose.theta()

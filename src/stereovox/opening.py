@@ -1,0 +1,181 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where frames come from: recordings and simulations, recognised by what they hold, and live cameras."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from stereovox import registry
+from stereovox.errors import SourceError
+from stereovox.sources.base import DepthSource as DepthSource
+from stereovox.sources.base import Excerpt as Excerpt
+from stereovox.sources.base import Selection as Selection
+from stereovox.sources.base import Source as Source
+from stereovox.sources.base import Stream as Stream
+from stereovox.sources.base import parse_slice as parse_slice
+from stereovox.sources.latest import LatestStream
+from stereovox.sources.pair_file import FILE, PairSettings
+from stereovox.sources.robots.robot import Robot
+
+SOURCES = {
+    "pair": "stereovox.sources.pair:CameraPair",  # first: such a folder may hold groundtruth.txt as well
+    "seven_scenes": "stereovox.sources.seven_scenes:SevenScenes",
+    "tum": "stereovox.sources.tum:TumRgbd",
+    "rig": "stereovox.sources.rig:StereoRig",
+    "kitti_raw": "stereovox.sources.kitti.raw:KittiRaw",
+    "kitti_tracking": "stereovox.sources.kitti.tracking:KittiTracking",
+    "kitti_odometry": "stereovox.sources.kitti.odometry:KittiOdometry",
+    "kitti_stereo2015": "stereovox.sources.kitti.stereo2015:KittiStereo2015",
+    "surround": "stereovox.simulate.surround:Surround",  # before all others of sim:
+    "simulation": "stereovox.simulate.simulation:Simulation",
+    "bag": "stereovox.sources.bags.recording:Bag",
+}
+"""Asked in this order, then those of other packages (entry points in the group `stereovox.opening`)."""
+STREAMS = {"realsense": "stereovox.sources.realsense:RealSense"}
+"""Live cameras, which can only be followed; entry points in the group `stereovox.streams`."""
+ROBOTS = {
+    "floor": "stereovox.simulate.floors.floor:Floor",
+    "carmen": "stereovox.sources.robots.carmen:CarmenLog",
+    "bag": "stereovox.sources.robots.bag:RobotBag",
+}
+"""Kinds of recordings, asked in this order, then those of other packages (entry points `stereovox.robots`)."""
+
+
+def open_source(path_or_name: str | os.PathLike[str], frames: str | None = None) -> Source:
+    """Return the frames of a recorded folder or file or of a simulation (`sim:room`).
+
+    The layout is recognised by content. `frames` picks some of them as a Python slice does (`A:B:S`).
+    Raises SourceError, one line, where there is nothing, nothing known or nothing usable, or `frames` picks nothing.
+    """
+    where = os.fspath(path_or_name)
+    if frames is not None:
+        parse_slice(frames)  # a slip of the pen shows before a long recording is opened
+    source = _opened(where)
+    return source if frames is None else Selection(source, frames)
+
+
+def open_stream(path_or_name: str | os.PathLike[str], frames: str | None = None) -> Stream:
+    """Return what `open_source` returns, or the frames that a live camera (`realsense:`) delivers from now on.
+
+    A live camera is read by a thread of its own; frames that nobody takes in time are dropped, the oldest first, and
+    counted (`dropped`). Of it, `frames` can only count forwards: `:300` are the next 300 that are taken.
+    Raises SourceError as `open_source`.
+    """
+    where = os.fspath(path_or_name)
+    live = _live(where)
+    if live is None:
+        return open_source(where, frames)
+    if frames is not None:
+        parse_slice(frames)
+    camera = LatestStream(live(where))
+    return camera if frames is None else Excerpt(camera, frames)
+
+
+def open_images(path_or_name: str | os.PathLike[str], frames: str | None = None) -> Stream:
+    """Return what `open_stream` returns, but without poses where the recording can do without them.
+
+    So a folder of stamped images needs no groundtruth.txt. Raises SourceError as `open_stream`.
+    """
+    from stereovox.sources.tum import StampedImages
+
+    where = os.fspath(path_or_name)
+    if _live(where):
+        return open_stream(where, frames)
+    stamped = StampedImages.recognises(where) and not os.path.isfile(os.path.join(where, FILE))
+    kind: Any = StampedImages if stamped else _recognise(where)
+    source = kind.depth_only(where)
+    return source if frames is None else Selection(source, frames)
+
+
+def open_depth(folder: Path, settings: PairSettings) -> DepthSource:
+    """Return the depth images of a pair; their own poses, if there are any, do not count.
+
+    A folder with `depth.txt` or `depth/` holds stamped images (see `StampedImages`); anything else is opened by the
+    source that recognises it, by its `depth_only(where)`.
+    Raises SourceError where there are no depth images.
+    """
+    from stereovox.sources.pair import CorrectedDepth
+    from stereovox.sources.tum import StampedImages
+
+    where = os.path.join(folder, settings.depth)
+    source = StampedImages(where) if StampedImages.recognises(where) else _depth_of(where)
+    if settings.depth_scale is None and settings.baseline is None:
+        return source
+    return CorrectedDepth(source, settings)
+
+
+def open_robot(where: str | os.PathLike[str]) -> Robot:
+    """Return the recording of a ground robot: a bag, a CARMEN log (`.clf`, `.clf.bz2`) or `sim:floor`.
+
+    Raises SourceError, one line, where there is nothing, nothing known or nothing usable.
+    """
+    place = os.fspath(where)
+    for name in registry.names("robots", ROBOTS):
+        kind = registry.find("robots", ROBOTS, name)
+        if kind.recognises(place):
+            return kind(place)
+    if place.startswith("sim:"):
+        raise SourceError(f"{place}: no simulation of a ground robot; there is sim:floor")
+    if not os.path.exists(place):
+        raise SourceError(f"{place}: no such file or folder")
+    raise SourceError(f"{place}: no recording of a ground robot; give a bag with scans, a CARMEN log or sim:floor")
+
+
+def is_recording(path: str | os.PathLike[str]) -> bool:
+    """Tell whether `path` is a folder or file that `open_source` knows."""
+    return any(kind.recognises(os.fspath(path)) for kind in _kinds())
+
+
+def _depth_of(where: str) -> DepthSource:
+    """Return the depth images of a recording that is made of no others."""
+    for kind in _kinds():
+        if not getattr(kind, "opens_others", False) and kind.recognises(where):
+            return kind.depth_only(where)
+    raise SourceError(f"{where}: no depth images; name a folder with depth.txt or depth/, or a recording, as 'depth'")
+
+
+def _kinds() -> Iterator[Any]:
+    """Yield the classes of recordings, one by one: what is not needed is not imported."""
+    return (registry.find("sources", SOURCES, name) for name in registry.names("sources", SOURCES))
+
+
+def _live(where: str) -> Any:
+    """Return the class of the live camera that `where` names, if it does."""
+    kinds = (registry.find("streams", STREAMS, name) for name in registry.names("streams", STREAMS))
+    return next((kind for kind in kinds if kind.recognises(where)), None)
+
+
+def _opened(where: str) -> Any:
+    kind = _recognise(where)
+    return kind(where, open_depth) if getattr(kind, "opens_others", False) else kind(where)
+
+
+def _recognise(where: str) -> Any:
+    kinds = []
+    for kind in _kinds():
+        kinds.append(kind)
+        if kind.recognises(where):
+            return kind
+    if not os.path.exists(where) and not _live(where):
+        raise SourceError(f"{where}: no such folder or file")
+    if os.path.isfile(os.path.join(where, "manifest.json")):
+        raise SourceError(f"{where}: is a map, not a recording; what it was made of: stereovox info {where}")
+    known = ", ".join(getattr(kind, "layout", "") or kind.__name__ for kind in kinds)
+    raise SourceError(f"{where}: {_problem(where, kinds)}; known: {known}")
+
+
+def _problem(where: str, kinds: list[Any]) -> str:
+    """Return why nothing can be made of `where`, and the folder below it that was perhaps meant."""
+    if _live(where):
+        return "a live camera can be mapped, but has no frames to go back to: record it into a file first"
+    if not os.path.isdir(where):
+        return "is a file, but no recording of a known kind"
+    try:
+        below = sorted(entry.path for entry in os.scandir(where) if entry.is_dir())
+    except OSError as error:
+        return f"{error.strerror}, so it cannot be listed"
+    meant = next((folder for folder in below for kind in kinds if kind.recognises(folder)), None)
+    return "not a recording of a known layout" + (f" (did you mean {meant}?)" if meant else "")

@@ -1,0 +1,324 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Safe files: parsed within bounds whoever wrote them, and written all or nothing."""
+
+from __future__ import annotations
+
+import errno
+import io
+import json
+import math
+import os
+import re
+import reprlib
+import stat
+import tomllib
+import uuid
+import zipfile
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.errors import MapFileError, SourceError, StereovoxError
+
+FLOOR_ENDINGS = (".yaml", ".pgm", ".png")
+"""Files of a floor's map: the picture and its .yaml are written together, whichever is named."""
+FLOOR_READABLE = (*FLOOR_ENDINGS, ".yml")
+"""Those that can be read."""
+
+
+def check_in_space(out: str | Path) -> None:
+    """Raise StereovoxError where a map in space would get the name of a floor's map."""
+    if Path(out).suffix.lower() in FLOOR_READABLE:
+        raise StereovoxError(f"{out}: names a floor's map; end the name of a map in space in .svox, or leave it bare")
+
+
+def check_file(out: str | Path, endings: Iterable[str]) -> Path:
+    """Return `out` as a path; raises StereovoxError before the work where it could not be written after it."""
+    path = Path(out)
+    if path.suffix.lower() not in endings:
+        raise StereovoxError(f"{out}: give a name that ends in {' or '.join(endings)}")
+    if os.path.isdir(out):
+        raise StereovoxError(f"{out}: is a folder; name a file")
+    check_folder(path.absolute().parent, str(out))
+    return path
+
+
+def check_folder(folder: Path, name: str) -> None:
+    """Raise StereovoxError unless files can be made in `folder`, where `name` shall be."""
+    if not folder.is_dir():
+        raise StereovoxError(f"{name}: there is no folder {folder}; make it or choose another")
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise StereovoxError(f"{name}: {folder} cannot be written to; choose another folder")
+
+
+@contextmanager
+def replacing(path: str | Path, error: type[StereovoxError] = MapFileError) -> Iterator[IO[bytes]]:
+    """Yield a binary file that becomes `path` when the block ends well; otherwise an older `path` stays as it was.
+
+    Raises `error`: one line when the folder is missing or cannot be written, or the disk is full.
+    """
+    target = Path(os.path.realpath(path))  # a link keeps pointing to where it pointed
+    temporary = target.with_name(f".{_short(target)}.{uuid.uuid4().hex[:12]}.new")
+    try:
+        if target.is_dir():
+            raise error(f"{path}: is a folder; name a file")
+        if target.exists() and not target.is_file():
+            raise error(f"{path}: is no plain file, which could be replaced; name another")
+        with temporary.open("xb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(target)
+        sync_folder(target.parent)
+    except OSError as failed:
+        reason = f"cannot be written ({failed.strerror or failed})"
+        raise error(f"{path}: {reason}; choose a folder that exists and has room, and can be written") from None
+    finally:
+        _remove(temporary)
+
+
+def sweep_unfinished(*paths: Path) -> None:
+    """Remove what `replacing` left of these files where it was killed; nobody else may be writing them."""
+    for target in map(Path, map(os.path.realpath, paths)):
+        left = re.compile(rf"\.{re.escape(_short(target))}\.[0-9a-f]{{12}}\.new")
+        with suppress(OSError):  # what cannot be removed is in nobody's way
+            for entry in target.parent.iterdir():
+                if left.fullmatch(entry.name):
+                    entry.unlink()
+
+
+def sync_file(path: Path) -> None:
+    """Wait until the disk holds what is in a file."""
+    with path.open("rb") as file:
+        os.fsync(file.fileno())
+
+
+def sync_folder(folder: Path) -> None:
+    """Wait until the disk holds the names in `folder`: what was made, renamed and removed there."""
+    try:
+        number = os.open(folder, os.O_RDONLY)
+    except PermissionError:
+        return  # a folder that may be written but not read; not on every system can it be asked
+    try:
+        os.fsync(number)
+    except OSError as error:
+        if error.errno != errno.EINVAL:  # the file system has no such thing for folders
+            raise
+    finally:
+        os.close(number)
+
+
+def sync_tree(folder: Path) -> None:
+    """Wait until the disk holds all files below `folder`, and their names."""
+    for place, _, names in os.walk(folder, topdown=False):
+        for name in names:
+            sync_file(Path(place) / name)
+        sync_folder(Path(place))
+
+
+def _short(target: Path) -> str:
+    """Return so much of a file's name that a longer one is still a name."""
+    return os.fsdecode(os.fsencode(target.name)[:200])
+
+
+def _remove(path: Path) -> None:
+    try:
+        path.unlink(missing_ok=True)
+    except OSError:
+        return  # the folder cannot be written, so the file was never made
+
+
+SMALL, PACKED_BEST = 1 << 26, 200
+"""A file may unpack to so many bytes, or to so many for each of its own; more is taken for a lie."""
+
+
+def read_arrays(path: str | Path, names: Sequence[str], what: str) -> dict[str, NDArray[Any]]:
+    """Return the arrays of a file that holds those called `names` and no others.
+
+    what: what the file should be, for messages. Raises MapFileError where it holds other arrays; what a damaged file
+    can raise in zipfile, zlib and NumPy is not bounded: catch Exception.
+    """
+    with zipfile.ZipFile(path) as file:
+        sizes = {entry.filename: entry.file_size for entry in file.infolist()}
+        kinds = {entry.compress_type for entry in file.infolist()}
+        if len(file.infolist()) != len(names) or set(sizes) != {f"{name}.npy" for name in names}:
+            raise MapFileError(f"{path}: holds no {what}")
+        if not kinds <= {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}:
+            raise ValueError("packed in a way that is not used here")
+        if sum(sizes.values()) > max(SMALL, PACKED_BEST * Path(path).stat().st_size):
+            raise ValueError(f"unpacks to {sum(sizes.values())} bytes")
+        return {name: _array(file, f"{name}.npy", sizes[f"{name}.npy"]) for name in names}
+
+
+def _array(file: zipfile.ZipFile, name: str, size: int) -> NDArray[Any]:
+    """Return an array of a file whose entry has `size` bytes unpacked; nothing is allocated for a shape that lies."""
+    with file.open(name) as entry:
+        data = entry.read(size)
+    stream = io.BytesIO(data)
+    version = np.lib.format.read_magic(stream)
+    shape, _, dtype = getattr(np.lib.format, f"read_array_header_{version[0]}_{version[1]}")(stream)
+    if dtype.hasobject or math.prod(shape) * dtype.itemsize != len(data) - stream.tell():
+        raise ValueError(f"{name} tells of {shape} {dtype} and holds {len(data) - stream.tell()} bytes")
+    return np.frombuffer(data, dtype, offset=stream.tell()).reshape(shape)
+
+
+MOST_LIST = 1 << 28
+"""Bytes of a list with a line for each image or pose."""
+MOST_SETTINGS = 1 << 16
+"""Bytes of a file of settings, or of one calibration."""
+MOST_YAML = 1 << 14
+"""Bytes of a small YAML file: reading takes 20 us for each."""
+MOST_DOTS = 200
+"""Dots in one line of TOML; the time for a key `a.b.c` goes with their square."""
+DEEPEST = 64
+"""Brackets within brackets in YAML."""
+BRACKETS = re.compile(r"[\[\]{}]")
+LARGEST_COUNT = 1 << 62
+MOST_NODES = 100_000
+"""Values in a YAML file, each counted as often as aliases repeat it."""
+
+
+def read_bounded(path: Path, most: int = MOST_SETTINGS) -> bytes:
+    """Return the bytes of a file. Raises OSError where it cannot be read, holds more than `most`, or is no file.
+
+    A pipe would be waited for, and a device never ends.
+    """
+    with open(path, "rb", opener=_without_waiting) as file:
+        status = os.fstat(file.fileno())
+        if not stat.S_ISREG(status.st_mode):
+            raise OSError(errno.EINVAL, "not a file")
+        if status.st_size > most:
+            raise OSError(errno.EFBIG, f"holds more than {most} bytes, which is too many for such a file")
+        return file.read(status.st_size)  # room is made for all that is asked for, there or not
+
+
+def read_text(path: Path, most: int = MOST_SETTINGS, errors: str = "strict") -> str:
+    """Return the text (UTF-8) of a file; raises OSError as `read_bounded`, UnicodeDecodeError where it is no text."""
+    return read_bounded(path, most).decode("utf-8-sig", errors)
+
+
+def toml_table(text: str) -> dict[str, Any]:
+    """Return what stands in TOML; raises ValueError, one line."""
+    if any(line.count(".") > MOST_DOTS for line in text.splitlines()):
+        raise ValueError(f"a line with more than {MOST_DOTS} dots")
+    try:
+        return tomllib.loads(text)
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
+
+
+def json_value(text: str | bytes) -> Any:
+    """Return what stands in JSON; raises ValueError, one line."""
+    try:
+        return json.loads(text)
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
+
+
+def yaml_value(text: str | bytes, loader_class: Any = None) -> Any:
+    """Return what stands in YAML, by a SafeLoader: plain values only. Raises ValueError, one line.
+
+    Aliases may repeat a value, but neither nest without end nor unfold to more than `MOST_NODES`.
+    """
+    import yaml
+
+    loader = None
+    text = text.decode("utf-8-sig") if isinstance(text, bytes) else text  # UnicodeDecodeError is a ValueError
+    _check_brackets(text)
+    try:
+        loader = (loader_class or yaml.SafeLoader)(text)
+        node = loader.get_single_node()
+        if node is None:
+            return None
+        _unfolded(node, {})
+        return loader.construct_document(node)
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
+    except (yaml.YAMLError, ValueError, TypeError, AttributeError, LookupError) as error:  # PyYAML's own slips too
+        raise ValueError(" ".join(str(error).split()) or type(error).__name__) from None
+    finally:
+        if loader is not None:
+            loader.dispose()
+
+
+def count_in(table: dict[str, Any], key: str) -> int:
+    """Return the count that stands under `key`; raises KeyError, and ValueError for what cannot be a count."""
+    count = table[key]
+    if type(count) is not int or not 0 <= count < LARGEST_COUNT:
+        raise ValueError(f"{key} {shown(count)} is no count")
+    return count
+
+
+def shown(value: Any) -> str:
+    """Return a value as messages show it: short, whatever it is."""
+    return _SHORT.repr(value)
+
+
+class _Short(reprlib.Repr):
+    """Python's own short texts, also of whole numbers that Python refuses to write out."""
+
+    def repr_int(self, x: int, level: int) -> str:
+        return repr(x) if x.bit_length() < 256 else f"{x if x.bit_length() < 13_000 else hex(x)}"[:60] + "..."
+
+
+_SHORT = _Short()
+_SHORT.maxlevel, _SHORT.maxlist, _SHORT.maxtuple, _SHORT.maxdict, _SHORT.maxstring = 4, 16, 16, 4, 80
+
+
+def _without_waiting(path: str, flags: int) -> int:
+    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
+
+
+def _check_brackets(text: str) -> None:
+    """Raise ValueError where brackets nest deeper than `DEEPEST`: PyYAML's time goes with the square of that."""
+    depth = 0
+    for bracket in BRACKETS.findall(text):
+        depth = depth + 1 if bracket in "[{" else max(depth - 1, 0)
+        if depth > DEEPEST:
+            raise ValueError("nested too deeply")
+
+
+def _unfolded(node: Any, known: dict[int, int]) -> int:
+    """Return how many values a node stands for; raises ValueError for too many, and for one that holds itself."""
+    if isinstance(node.value, str):
+        return 1
+    if id(node) not in known:
+        known[id(node)] = 0  # while it is being counted
+        parts = [part for item in node.value for part in (item if isinstance(item, tuple) else (item,))]
+        known[id(node)] = 1 + sum(_unfolded(part, known) for part in parts)
+    if not 0 < known[id(node)] <= MOST_NODES:
+        raise ValueError("aliases that hold themselves or unfold to too many values")
+    return known[id(node)]
+
+
+LARGEST = 1e300
+"""TOML's whole numbers have no end, but those of a float do."""
+
+
+def read_table(path: Path) -> dict[str, Any]:
+    """Return what stands in `path`; raises SourceError, one line, for a file that cannot be read or is no TOML."""
+    try:
+        return toml_table(read_text(path))
+    except OSError as error:
+        raise SourceError(f"{path}: {error.strerror}; give a TOML file you may read") from None
+    except ValueError as error:  # bad TOML, bad UTF-8
+        raise SourceError(f"{path}: {error}; correct it") from None
+
+
+def is_number(value: Any) -> bool:
+    """Tell whether a value is a finite number that a float can hold."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and -LARGEST < value < LARGEST
+
+
+def toml_text(value: Any) -> str:
+    """Return a text, a number or a list of them as TOML; floats keep all their digits."""
+    if isinstance(value, str):
+        escaped = "".join(f"\\u{ord(c):04x}" if ord(c) < 32 or c in '"\\\x7f' else c for c in value)
+        return f'"{escaped}"'
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(toml_text, value))}]"
+    return repr(value if isinstance(value, int) else float(value))

@@ -1,0 +1,140 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a RealSense D435 makes of a true depth image: disparity noise, holes beside edges, near and far limits."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.cameras.pinhole import PinholeCamera
+from stereovox.frame import Reason
+
+HFOV_DEG = 91.2
+CAMERA = PinholeCamera.from_field_of_view(848, 480, HFOV_DEG, baseline=0.05)
+"""The D435's depth camera: the image is the left eye's, the right eye stands one baseline along +x."""
+SHAPE = 480 / 848
+"""Height over width of its images."""
+JUMP_PX = 1.0
+"""Disparities that differ by more belong to two surfaces."""
+
+
+@dataclass(frozen=True)
+class D435:
+    """A stereo depth camera whose matching error is Gaussian in disparity and independent from pixel to pixel.
+
+    subpixel: standard deviation of the disparity in pixels (Chien 2020: 0.08).
+    nearest, farthest: depths in metres the camera delivers.
+    edge_px: half width of the matching window; background pixels that close to a nearer surface find no match.
+    edge_loss: share of the nearer surface's own border pixels that find none.
+    barrel: how much too far the left and right borders of the image are seen, as a share of the depth; it grows with
+        the square of the distance from the optical axis (Chien 2020, App. A: 0.1).
+    toe_in: angle in radians by which the right eye is turned without the camera knowing: a barrel as well, whose share
+        grows with the depth, as Chien 2020, App. A, says of his.
+    """
+
+    camera: PinholeCamera = CAMERA
+    subpixel: float = 0.08
+    nearest: float = 0.195
+    farthest: float = 10.0
+    edge_px: int = 2
+    edge_loss: float = 0.25
+    barrel: float = 0.0
+    toe_in: float = 0.0
+
+    def measure(
+        self, true_depth_m: NDArray[np.floating], seed: int | list[int]
+    ) -> tuple[NDArray[np.uint16], NDArray[np.uint8]]:
+        """Return depth in whole millimetres (0 = none) and the `Reason` of every pixel.
+
+        true_depth_m: (height, width) along the optical axis, inf where there is nothing. Same seed, same image.
+        """
+        random = np.random.default_rng(seed)
+        scale = self._disparity_at_one_metre
+        disparity = scale / np.asarray(true_depth_m, np.float32)
+        noisy = self._misaligned(disparity) + np.float32(self.subpixel) * random.standard_normal(
+            disparity.shape, np.float32
+        )
+        depth = scale / np.maximum(noisy, np.float32(1e-6))
+        lost = hidden_from_right_eye(disparity) | beside_nearer_surface(disparity, self.edge_px)
+        lost |= on_border(disparity) & (random.random(disparity.shape, np.float32) < self.edge_loss)
+        reason = classify(depth, self.nearest, self.farthest)
+        reason[lost & (reason != Reason.TOO_NEAR)] = Reason.UNMATCHED
+        return np.where(reason == Reason.VALID, np.rint(depth * 1000), 0).astype(np.uint16), reason
+
+    def distorted(self, true_depth_m: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return what `barrel` and `toe_in` alone make of depth (height, width) in metres; inf stays far away."""
+        if not (self.barrel or self.toe_in):
+            return true_depth_m
+        scale = self._disparity_at_one_metre
+        seen = self._misaligned(scale / np.asarray(true_depth_m, np.float32))
+        return np.where(seen > 0, scale / np.where(seen > 0, seen, 1), np.float32(np.inf))
+
+    @property
+    def _disparity_at_one_metre(self) -> np.float32:
+        return np.float32(self.camera.fx * (self.camera.baseline or 0.0))
+
+    def _misaligned(self, disparity: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Return the disparity that eyes out of line see.
+
+        An eye turned by a small angle a sees a point at slope x moved by f a (1 + x^2); calibration takes out f a.
+        """
+        if not (self.barrel or self.toe_in):
+            return disparity
+        x, _ = self.camera.ray_slopes()
+        too_far = 1 + np.float32(self.barrel) * (x / np.abs(x).max()) ** 2
+        return disparity / too_far - np.float32(self.camera.fx * self.toe_in) * x**2
+
+
+def depth_camera(width: int) -> PinholeCamera:
+    """Return a camera with the D435's field of view, baseline and image format, `width` pixels wide (848: its own)."""
+    return PinholeCamera.from_field_of_view(width, round(width * SHAPE), HFOV_DEG, CAMERA.baseline)
+
+
+def classify(depth_m: NDArray[np.floating], nearest: float, farthest: float) -> NDArray[np.uint8]:
+    """Return VALID, TOO_NEAR or TOO_FAR for every depth (metres, inf allowed)."""
+    reason = np.full(depth_m.shape, Reason.VALID, np.uint8)
+    reason[depth_m < nearest] = Reason.TOO_NEAR
+    reason[depth_m > farthest] = Reason.TOO_FAR
+    return reason
+
+
+def hidden_from_right_eye(disparity: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Tell which pixels of the left image (height, width) the right eye cannot see.
+
+    Each pixel moves left by its disparity; where a nearer surface lands on the same pixel of the right image, or
+    where it leaves that image, there is nothing to match.
+    """
+    height, width = disparity.shape
+    column = np.arange(width, dtype=np.float32) - disparity
+    left = np.floor(column).astype(np.int32)
+    row = (np.arange(height, dtype=np.int32) * (width + 2))[:, None] + 1
+    nearest = np.zeros(height * (width + 2), np.float32)
+    target = row + np.clip(left, -1, width - 1)
+    for step in (0, 1):
+        np.maximum.at(nearest, (target + step).ravel(), disparity.ravel())
+    seen = nearest[row + np.clip(np.rint(column).astype(np.int32), -1, width - 1)]
+    return (seen > disparity + JUMP_PX) | (column < 0)
+
+
+def beside_nearer_surface(disparity: NDArray[np.float32], radius: int) -> NDArray[np.bool_]:
+    """Tell which pixels have a nearer surface within `radius` pixels."""
+    return _extreme(np.maximum, disparity, radius) > disparity + JUMP_PX
+
+
+def on_border(disparity: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Tell which pixels have a farther surface right beside them."""
+    return _extreme(np.minimum, disparity, 1) < disparity - JUMP_PX
+
+
+def _extreme(choose: np.ufunc, image: NDArray[np.float32], radius: int) -> NDArray[np.float32]:
+    """Return the largest (smallest) value in the square of `radius` pixels around every pixel."""
+    for axis in (0, 1):
+        image = np.moveaxis(image, axis, 0)
+        result = image.copy()
+        for step in range(1, radius + 1):
+            choose(result[:-step], image[step:], out=result[:-step])
+            choose(result[step:], image[:-step], out=result[step:])
+        image = np.moveaxis(result, 0, axis)
+    return image

@@ -1,0 +1,213 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a level camera and a lidar see of a simulated floor, exactly.
+
+So each column needs one ray on the plan, and each thing the two places where that ray enters and leaves its outline.
+
+Tops and undersides of things as a camera sees them: what a 3-D map has inside of the rims of a floor's things.
+A camera that is lower than a table looks at its underside, so a map in three dimensions has the whole table, and so has
+its projection. Beams in one plane find nothing but the rim.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stereovox import se2
+from stereovox.cameras.pinhole import PinholeCamera
+from stereovox.maps.occupancy import OccupancyGrid
+from stereovox.simulate.floors.plan import CEILING, FloorPlan, Thing
+
+
+def cast(
+    segments: NDArray[np.float64], origin: ArrayLike, angles: ArrayLike, longest: float = np.inf
+) -> NDArray[np.float64]:
+    """Return how far rays from `origin` (2,) run until they meet a segment, (N,) metres, inf where they meet none.
+
+    segments: (M, 4) x, y from and to. angles: (N,) radians, 0 along x, to the left. longest: what is farther is inf.
+    """
+    directions = np.column_stack([np.cos(angles), np.sin(angles)])
+    t = cast_along(within_reach(segments, origin, longest), origin, directions)
+    return np.where(t <= longest, t, np.inf)
+
+
+def cast_along(
+    segments: NDArray[np.float64], origin: ArrayLike, directions: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return how often `directions` (N, 2) fit between `origin` (2,) and the first segment, (N,), inf where none is."""
+    start = segments[:, :2] - np.asarray(origin, float)
+    along = segments[:, 2:] - segments[:, :2]
+    x, y = directions[:, :1], directions[:, 1:]
+    # start + s along = t (x, y): Cramer's rule
+    across = x * along[:, 1] - y * along[:, 0]
+    t = np.full(across.shape, np.inf)
+    met = across != 0
+    np.divide(start[:, 0] * along[:, 1] - start[:, 1] * along[:, 0], across, out=t, where=met)
+    s = y * start[:, 0] - x * start[:, 1]
+    # 0 <= s / across <= 1 without dividing
+    on = met & (s * across >= 0) & (np.abs(s) <= np.abs(across)) & (t >= 0)
+    return np.where(on, t, np.inf).min(axis=1, initial=np.inf)
+
+
+def within_reach(segments: NDArray[np.float64], origin: ArrayLike, reach: float) -> NDArray[np.float64]:
+    """Return the segments that touch the square of half width `reach` round `origin`, or nearly so."""
+    x, y = np.asarray(origin, float)
+    near = (np.minimum(segments[:, 0], segments[:, 2]) <= x + reach) & (
+        np.maximum(segments[:, 0], segments[:, 2]) >= x - reach
+    )
+    near &= np.minimum(segments[:, 1], segments[:, 3]) <= y + reach
+    near &= np.maximum(segments[:, 1], segments[:, 3]) >= y - reach
+    return segments[near]
+
+
+OCCUPIED, FREE = 100, 0
+
+
+def with_lids(grid: OccupancyGrid, things: Sequence[Thing], heights: tuple[float, float], eye: float) -> OccupancyGrid:
+    """Return a perfect map of a floor with all lids occupied that lie between `heights` and can be seen.
+
+    grid: what `FloorPlan.truth` returns, in the plan's frame. eye: height of the camera over the floor. A lid is an
+    underside above the eye or a top below it. Not seen: what stands on another thing or carries one there, and what
+    stands nowhere beside a free cell. Nothing that is free in `grid` changes.
+    """
+    from scipy import ndimage
+
+    beside = np.asarray(ndimage.binary_dilation(grid.cells == FREE, np.ones((5, 5))), bool)
+    inside = [_inside(thing, grid) for thing in things]
+    seen = np.zeros(grid.cells.shape, bool)
+    for thing, here in zip(things, inside, strict=True):
+        height = lid(thing, eye)
+        if height is None or not heights[0] <= height <= heights[1] or not (here & beside).any():
+            continue
+        open_ = here.copy()
+        for other, there in zip(things, inside, strict=True):
+            if other is not thing and other.low <= height <= other.high:
+                open_ &= ~there
+        seen |= open_
+    return replace(grid, cells=np.where(seen & (grid.cells != FREE), np.int8(OCCUPIED), grid.cells))
+
+
+def lid(thing: Thing, eye: float) -> float | None:
+    """Return the height of the underside or top that a camera at the height `eye` looks at; None beside the thing."""
+    if thing.low > eye:
+        return thing.low
+    return thing.high if thing.high < eye else None
+
+
+def _inside(thing: Thing, grid: OccupancyGrid) -> NDArray[np.bool_]:
+    """Tell which cells' middles lie within a thing's outline, (rows, columns)."""
+    rows, columns = grid.cells.shape
+    x = grid.origin[0] + (np.arange(columns) + 0.5) * grid.resolution
+    y = grid.origin[1] + (np.arange(rows)[:, None] + 0.5) * grid.resolution
+    inside = np.ones(grid.cells.shape, bool)
+    for x0, y0, x1, y1 in thing.outline:  # the body is on the left of each side
+        inside &= (x1 - x0) * (y - y0) - (y1 - y0) * (x - x0) >= 0
+    return inside
+
+
+NONE = np.float32(np.inf)
+
+
+class LevelView:
+    """Depth images of one floor by one camera. height: of the camera over the floor in metres, below the ceiling."""
+
+    def __init__(self, plan: FloorPlan, camera: PinholeCamera, height: float):
+        self._plan, self._height = plan, height
+        across, down = camera.ray_slopes()
+        self._across, self._down = across.astype(float), down.astype(np.float32)
+        with np.errstate(divide="ignore"):
+            level = np.where(self._down > 0, height, height - CEILING) / self._down  # floor or ceiling
+        self._level = np.abs(level).astype(np.float32)
+
+    def depth(self, pose_world_camera: ArrayLike) -> NDArray[np.float32]:
+        """Return the depth (height, width) in metres; pose: (3,) x, y and where the optical axis points on the plan."""
+        x, y, yaw = np.asarray(pose_world_camera, float)
+        ahead, left = np.array([np.cos(yaw), np.sin(yaw)]), np.array([-np.sin(yaw), np.cos(yaw)])
+        directions = ahead - self._across[:, None] * left  # columns go to the right
+        walls = cast_along(self._plan.walls, (x, y), directions).astype(np.float32)
+        image = np.minimum(self._level[:, None], walls)
+        seen = se2.inverse((x, y, yaw))
+        for thing in self._plan.things:
+            columns = self._columns(se2.transform(seen, thing.corners))
+            if len(columns):
+                self._draw(image, thing, columns, (x, y), directions, walls)
+        return image
+
+    def _columns(self, corners: NDArray[np.float64]) -> range:
+        """Return the columns that a body may be in, whose corners (K, 2) are given as ahead and left."""
+        ahead, left = corners.T
+        if ahead.max() <= 0:
+            return range(0)
+        if ahead.min() <= 1e-3:  # beside the camera: its slopes turn over
+            return range(len(self._across))
+        slopes = -left / ahead
+        first, last = np.searchsorted(self._across, [slopes.min(), slopes.max()])
+        return range(int(first), int(last))
+
+    def _draw(
+        self,
+        image: NDArray[np.float32],
+        thing: Thing,
+        columns: range,
+        origin: tuple[float, float],
+        directions: NDArray[np.float64],
+        walls: NDArray[np.float32],
+    ) -> None:
+        """Draw one body where it is nearer than what is there."""
+        part = slice(columns.start, columns.stop)
+        enter, leave = _through(thing.corners, np.asarray(origin), directions[part])
+        met = np.flatnonzero((enter < leave) & (enter > 0) & (enter < walls[part]))
+        if not len(met):
+            return
+        start, end = columns.start + int(met[0]), columns.start + int(met[-1]) + 1
+        enter, leave = (
+            np.where(enter < leave, one, np.inf)[met[0] : met[-1] + 1].astype(np.float32) for one in (enter, leave)
+        )
+        self._side(image[:, start:end], thing, enter)
+        self._lid(image[:, start:end], thing, enter, leave)
+
+    def _side(self, image: NDArray[np.float32], thing: Thing, enter: NDArray[np.float32]) -> None:
+        near, far = enter.min(), enter[np.isfinite(enter)].max()
+        slopes = [(self._height - z) / s for z in (thing.low, thing.high) for s in (near, far)]
+        rows = self._rows(slopes)
+        z = np.float32(self._height) - self._down[rows, None] * np.where(np.isfinite(enter), enter, 0)
+        there = (z >= thing.low) & (z <= thing.high) & np.isfinite(enter)
+        np.minimum(image[rows], np.where(there, enter, NONE), out=image[rows])
+
+    def _lid(
+        self, image: NDArray[np.float32], thing: Thing, enter: NDArray[np.float32], leave: NDArray[np.float32]
+    ) -> None:
+        """Draw the top of a body that is lower than the camera, or the bottom of one that is higher."""
+        if thing.low <= self._height <= thing.high:
+            return
+        drop = self._height - (thing.high if thing.high < self._height else thing.low)
+        rows = self._rows([drop / float(enter.min()), drop / float(leave[np.isfinite(leave)].max())])
+        flat = np.float32(drop) / self._down[rows, None]
+        there = (flat >= enter) & (flat <= leave) & np.isfinite(enter)
+        np.minimum(image[rows], np.where(there, flat, NONE), out=image[rows])
+
+    def _rows(self, slopes: list[float]) -> slice:
+        """Return the rows that look down at slopes between the least and the largest of these."""
+        return slice(*np.searchsorted(self._down, [min(slopes) - 1e-6, max(slopes) + 1e-6]).tolist())
+
+
+def _through(
+    corners: NDArray[np.float64], origin: NDArray[np.float64], directions: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return how often directions (N, 2) fit before they enter, and leave, a convex outline (K, 2).
+
+    A ray that never does leaves before it enters.
+    """
+    along = np.roll(corners, -1, axis=0) - corners
+    inward = np.column_stack([-along[:, 1], along[:, 0]])
+    distance = np.einsum("kj,kj->k", inward, corners - origin)  # inside where inward . (t direction) >= distance
+    speed = directions @ inward.T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        t = distance / speed
+    enter = np.where(speed > 0, t, -np.inf).max(axis=1)
+    leave = np.where(speed < 0, t, np.inf).min(axis=1)
+    never = ((speed == 0) & (distance > 0)).any(axis=1)
+    return np.where(never, np.inf, enter), np.where(never, -np.inf, leave)

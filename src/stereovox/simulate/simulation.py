@@ -1,0 +1,205 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Recordings that need no files: a simulated D435 in a built-in scene."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox import registry
+from stereovox.errors import ConfigError, SourceError
+from stereovox.frame import Frame, Reason
+from stereovox.se3 import Transform, inverse
+from stereovox.simulate.d435 import D435, classify, depth_camera
+from stereovox.simulate.scene import Scene
+from stereovox.simulate.stage import Face, Stage, one_of, within
+from stereovox.sources import parameters
+from stereovox.sources.base import DepthSource
+
+SCENES = {
+    "room": "stereovox.simulate.room:stage",
+    "box": "stereovox.simulate.plain_scenes:box_stage",
+    "aisle": "stereovox.simulate.plain_scenes:aisle_stage",
+    "apartment": "stereovox.simulate.apartment:stage",
+    "wall": "stereovox.simulate.plain_scenes:wall_stage",
+    "flight": "stereovox.simulate.flight:stage",
+}
+"""Functions that return a `Stage`; their keyword arguments and defaults are the scene's parameters."""
+AXES = ("world", "optical")
+
+
+@dataclass(frozen=True)
+class Options:
+    """Parameters of every simulation. Where 0 stands for "the scene's own", the scene chooses.
+
+    axes: `world` (z up) or `optical` (Chien 2020: x right, y down, z forward, origin at the first camera).
+    frames: number of frames on the same way (0: the scene's own); noise: see `Simulation`; seed: of the noise.
+    image_width: pixels (0: the scene's own, mostly 848), the height follows; the field of view stays.
+    barrel, toe_in (degrees), subpixel, farthest (metres, 0: the scene's own): see `D435`.
+    """
+
+    axes: str = "world"
+    frames: int = 0
+    noise: bool = True
+    seed: int = 0
+    image_width: int = 0
+    barrel: float = 0.0
+    toe_in: float = 0.0
+    subpixel: float = D435.subpixel
+    farthest: float = 0.0
+
+    def __post_init__(self) -> None:
+        one_of("axes", self.axes, AXES)
+        within("frames", self.frames, 0, 10_000_000)
+        within("seed", self.seed, 0, 2**63)
+        if self.image_width:
+            within("image_width", self.image_width, 16, 1920)
+        within("barrel", self.barrel, -0.5, 1)
+        within("toe_in", self.toe_in, -1, 1)
+        within("subpixel", self.subpixel, 0, 5)
+        within("farthest", self.farthest, 0, 65)
+
+
+class Simulation(DepthSource):
+    """Frames of a simulated D435 in a built-in scene.
+
+    location: `sim:SCENE`, or with parameters `sim:SCENE?key=value&key=value`:
+
+        sim:room                                    furnished room and corridor (the demo)
+        sim:box?size=large|small&distance=2&x=0&y=0&wall=4.1        a box before a wall; the camera stands
+        sim:aisle?length=12&width=1.27&speed=0       a narrow aisle; the camera stands, or walks at `speed`
+        sim:apartment?speed=0.8                     six rooms, scanned by hand
+        sim:wall?distance=1.4&tilt=0&turn=0         a flat wall that fills the view
+        sim:flight?length=2000&speed=5              out and back along the same hall
+
+    The scene functions' docstrings tell their parameters, `Options` those of every scene. World: z up, x forward, y
+    left, metres; with `axes=optical` x right, y down, z forward from the first camera. Every frame can be asked for by
+    itself and is always the same for the same `seed`.
+    Reasons are the true ones: TOO_NEAR, TOO_FAR (beyond the device's `farthest`, and known to be free no farther),
+    UNMATCHED beside edges and where the right eye sees nothing.
+    noise: False gives exact depth in metres (float32, inf where nothing is) without noise or holes.
+    frames: how many frames are taken on the whole way; None leaves it to the scene. The way takes as long all the same.
+    Raises SourceError, one line, for an unknown scene or parameter and for values out of range.
+    """
+
+    layout = f"simulation ({', '.join(f'sim:{name}' for name in SCENES)})"
+
+    def __init__(
+        self, location: str | Path = "sim:room", *, noise: bool = True, frames: int | None = None, seed: int = 0
+    ):
+        self.name = str(location)
+        given = {"noise": noise, "frames": frames or 0, "seed": seed}
+        try:
+            self.options, stage = _read(self.name.removeprefix("sim:"), given)
+        except (SourceError, ConfigError) as error:
+            raise SourceError(f"{location}: {error}") from None
+        self.device = _device(stage.device, self.options)
+        self.camera = self.device.camera
+        self.noise, self.seed = self.options.noise, self.options.seed
+        self._frames = self.options.frames or stage.frames
+        self.period_ns = round(1e9 / stage.hz * max(stage.frames - 1, 1) / max(self._frames - 1, 1))
+        self._world = stage
+        self._seen: tuple[Transform, NDArray[np.float32]] | None = None
+
+    @classmethod
+    def recognises(cls, location: str | Path) -> bool:
+        """Tell whether `location` names a simulation."""
+        return str(location).startswith("sim:")
+
+    @cached_property
+    def stage(self) -> Stage:
+        """The scene and the way through it, in the frame of the poses."""
+        first = self._world.path(0.0)
+        return self._world if self.options.axes == "world" else self._world.moved(inverse(first))
+
+    @property
+    def scene(self) -> Scene:
+        """What the camera flies through, in the frame of the poses."""
+        return self.stage.scene
+
+    @property
+    def faces(self) -> tuple[Face, ...]:
+        """Flat surfaces by which a map can be judged, in the frame of the poses; empty for `sim:room`."""
+        return self.stage.faces
+
+    def __len__(self) -> int:
+        return self._frames
+
+    def frame(self, i: int) -> Frame:
+        """Return frame `i` (negative: from the end); raises IndexError for a frame that does not exist."""
+        i = range(len(self))[i]
+        return self.observe(i, self.true_depth(i))
+
+    def true_depth(self, i: int) -> NDArray[np.float32]:
+        """Return the exact depth (height, width) in metres along the optical axis, inf where nothing is; read only."""
+        T = self._world.path(self._share(i))  # the frame of the poses must not change the image
+        seen = self._seen
+        if seen is None or not np.array_equal(seen[0], T):
+            seen = self._seen = (T, self._cast(T))  # a camera that stands looks once
+        return seen[1]
+
+    def observe(self, i: int, true_depth_m: NDArray[np.float32]) -> Frame:
+        """Return what the camera delivers as frame `i` where `true_depth_m` is the exact depth (height, width)."""
+        if self.noise:
+            depth, reason = self.device.measure(true_depth_m, [self.seed, i])
+            scale = 0.001
+        else:
+            depth, scale = self.device.distorted(true_depth_m), 1.0
+            reason = classify(depth, self.device.nearest, self.device.farthest)
+            depth = np.where(reason == Reason.VALID, depth, np.float32(0))
+        return Frame(
+            depth, self.camera, self.pose(i), i * self.period_ns, scale, reason, f"{self.name} frame {i}",
+            farthest=self.device.farthest,
+        )  # fmt: skip
+
+    def pose(self, i: int) -> Transform:
+        """Return T_world_camera (4, 4) of frame `i`; raises IndexError beyond the last."""
+        if not 0 <= i < len(self):
+            raise IndexError(f"{self.name} has frames 0 to {len(self) - 1}, not {i}")
+        return self.stage.path(self._share(i))
+
+    def upright_pose_at(self, stamp_ns: float) -> Transform:
+        """Return T_world_camera (4, 4) at any time, world z up whatever `axes` says; it stands before and after."""
+        last = max(len(self) - 1, 1) * self.period_ns
+        return self._world.path(min(max(stamp_ns / last, 0.0), 1.0))
+
+    def _share(self, i: int) -> float:
+        return i / max(len(self) - 1, 1)
+
+    def _cast(self, T_world_camera: Transform) -> NDArray[np.float32]:
+        directions = self._directions @ T_world_camera[:3, :3].T.astype(np.float32)
+        depth = self._world.scene.cast(T_world_camera[:3, 3], directions)
+        depth.setflags(write=False)
+        return depth.reshape(self.camera.height, self.camera.width)
+
+    @cached_property
+    def _directions(self) -> NDArray[np.float32]:
+        x, y = self.camera.ray_slopes()
+        grid = np.stack(np.broadcast_arrays(x[None, :], y[:, None], np.float32(1)), axis=-1)
+        return np.ascontiguousarray(grid.reshape(-1, 3))
+
+
+def _read(text: str, given: dict[str, Any]) -> tuple[Options, Stage]:
+    """Return what a location without its `sim:` asks for; `given` counts where it says nothing."""
+    name, written = parameters.split(text)
+    build = registry.find("scenes", SCENES, name)
+    own, common = parameters.defaults(build), parameters.defaults(Options)
+    values = parameters.typed(written, {**common, **own})
+    options = Options(**{**given, **{key: value for key, value in values.items() if key in common}})
+    return options, build(**{key: value for key, value in values.items() if key in own})
+
+
+def _device(own: D435, options: Options) -> D435:
+    return replace(
+        own,
+        camera=depth_camera(options.image_width) if options.image_width else own.camera,
+        farthest=options.farthest or own.farthest,
+        subpixel=options.subpixel,
+        barrel=options.barrel,
+        toe_in=float(np.radians(options.toe_in)),
+    )

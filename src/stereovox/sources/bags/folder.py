@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Recordings of ROS 2 as rosbag2 makes them: a folder with one or several `.mcap` or `.db3` files."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable
+from pathlib import Path, PurePath
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.errors import SourceError
+from stereovox.safe_io import read_bounded, yaml_value
+from stereovox.sources.bags.files import BagFile, one_line
+from stereovox.sources.bags.messages import Wire
+
+METADATA, TITLE = "metadata.yaml", "rosbag2_bagfile_information"
+MAX_METADATA = 1024 * 1024
+"""Bytes of a metadata file; more is taken for damaged."""
+NUMBERED = re.compile(r".*_(\d+)\.(mcap|db3)", re.DOTALL)
+
+
+class FolderFile(BagFile):
+    """A folder that rosbag2 recorded; a recording that was split is one, whatever its files are called.
+
+    Without `metadata.yaml`, which rosbag2 writes at the end, the numbered files of the folder count, and `notes` say
+    so. open_part: opens one of the files. Raises SourceError, one line, for files that are missing, damaged, or packed
+    as a whole.
+    """
+
+    def __init__(self, path: Path, open_part: Callable[[Path], BagFile]):
+        self.path = path
+        names, notes = _files(path)
+        self._parts: list[BagFile] = [open_part(_whole(path, name)) for name in names]
+        self.types = {topic: kind for part in self._parts for topic, kind in part.types.items()}
+        self.notes = (*notes, *(note for part in self._parts for note in part.notes))
+        self._places: dict[str, NDArray[np.int64]] = {}
+
+    def stamps(self, topic: str) -> NDArray[np.int64]:
+        """Return the times at which the messages of `topic` were recorded; raises SourceError for a damaged file."""
+        return self._of(topic)[:, 0]
+
+    def read(self, topic: str, i: int) -> Wire:
+        """Return message `i`; raises FrameRefused `unreadable` where its file is damaged."""
+        _, part, k = self._of(topic)[i].tolist()
+        return self._parts[part].read(topic, k)
+
+    def _of(self, topic: str) -> NDArray[np.int64]:
+        """Return time, file and number there of a topic's messages, (N, 3), in order of time."""
+        if topic not in self._places:
+            rows = []
+            for number, part in enumerate(self._parts):
+                if topic in part.types:
+                    stamps = part.stamps(topic)
+                    rows.append(np.stack([stamps, np.full_like(stamps, number), np.arange(len(stamps))], axis=1))
+            places = np.concatenate(rows)
+            self._places[topic] = places[np.argsort(places[:, 0], kind="stable")]
+        return self._places[topic]
+
+
+def is_bag_folder(path: str) -> bool:
+    """Tell whether a folder is such a recording. Never raises."""
+    folder = Path(path)
+    try:
+        if not folder.is_dir():
+            return False
+        if (folder / METADATA).is_file():
+            with (folder / METADATA).open("rb") as file:
+                return TITLE.encode() in file.read(4096)
+        return bool(_numbered(folder))
+    except (OSError, ValueError):
+        return False
+
+
+def _files(folder: Path) -> tuple[list[str], tuple[str, ...]]:
+    """Return the names of a folder's files in order, and notes."""
+    if not (folder / METADATA).is_file():
+        names = _numbered(folder)
+        if not names:
+            raise SourceError(f"{folder}: no {METADATA} in it; give the folder that rosbag2 made, or a file of it")
+        return names, (f"{folder}: no {METADATA}, as after a recording that was cut off: {_few(names)} taken",)
+    told = _metadata(folder / METADATA)
+    names = told.get("relative_file_paths")
+    if not isinstance(names, list) or not names or not all(isinstance(name, str) and name for name in names):
+        raise SourceError(f"{folder / METADATA}: names no files; write it anew with 'ros2 bag reindex'")
+    return list(dict.fromkeys(PurePath(name).name for name in names)), ()  # older ones tell the folder as well
+
+
+def _metadata(path: Path) -> dict[str, Any]:
+    try:
+        told = yaml_value(read_bounded(path, MAX_METADATA))[TITLE]
+        if not isinstance(told, dict):
+            raise TypeError(f"{TITLE} holds nothing")
+    except (OSError, ValueError, TypeError, KeyError) as error:
+        cure = "write it anew with 'ros2 bag reindex'"
+        raise SourceError(f"{path}: {one_line(error)[:200]}; {cure}") from None
+    return told
+
+
+def _numbered(folder: Path) -> list[str]:
+    """Return the files called `<anything>_<number>.mcap` or `.db3`, in order of the number, if all are of one name."""
+    found = {}
+    for path in folder.iterdir():
+        match = NUMBERED.fullmatch(path.name)
+        if match and path.is_file():
+            found[path.name] = int(match[1]) if len(match[1]) < 10 else 0
+    same = len({name.rpartition("_")[0] for name in found}) == 1
+    return sorted(found, key=lambda name: found[name]) if same else []
+
+
+def _whole(folder: Path, name: str) -> Path:
+    """Return a file of the folder, unpacked if it was packed as a whole; raises SourceError where it is not there."""
+    path = folder / name
+    if path.suffix == ".zstd":
+        if not os.path.isfile(path.with_suffix("")):
+            raise SourceError(
+                f"{path}: packed as a whole; unpack it with: zstd -d '{path}' -o '{path.with_suffix('')}'"
+            )
+        return path.with_suffix("")
+    if not os.path.isfile(path):  # Path.is_file may raise
+        raise SourceError(
+            f"{path}: is missing; copy the whole folder, or write {METADATA} anew with 'ros2 bag reindex'"
+        )
+    return path
+
+
+def _few(names: list[str]) -> str:
+    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")

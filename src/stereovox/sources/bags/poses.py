@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What tells poses in a recording: a T265's own topic, /tf, or a topic of ordinary ROS messages."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+
+import numpy as np
+
+from stereovox.errors import FrameRefused, SourceError, did_you_mean
+from stereovox.sources.bags.depth_topic import Metadata
+from stereovox.sources.bags.files import BagFile
+from stereovox.sources.bags.messages import POSE_TYPES, StampedPose, ns_from_ms, read_pose
+from stereovox.sources.bags.tf import TfPoses, read_tf, tf_poses
+from stereovox.sources.poses import Poses
+from stereovox.sources.trajectory import transforms
+
+T265 = re.compile(r"(/device_\d+/sensor_\d+/Pose_\d+/pose)/transform/data")
+"""Its geometry_msgs/Transform has no time: that stands in the metadata, with the confidence."""
+CURE = "put poses beside it in a camera pair (pair.toml), or add ?pose=fixed for a camera that stood still"
+
+
+@dataclass(frozen=True)
+class FoundPoses:
+    """Poses as the file has them, in its axes; None, and why in one line, where there are none.
+
+    tracker: they are a T265's, in OpenGL axes; of_camera: the messages say that they are those of the depth camera;
+    assumed: else, what is assumed about them.
+    """
+
+    poses: Poses | TfPoses | None
+    missing: str = ""
+    tracker: bool = False
+    of_camera: bool = False
+    assumed: str = ""
+
+
+def find_poses(file: BagFile, topic: str = "", frame_id: str = "", world_frame: str = "") -> FoundPoses:
+    """Return the poses of `topic`, else what /tf tells of the camera, else those of the only topic that has some.
+
+    frame_id: frame of the depth images, "" to leave /tf alone. world_frame: see `bag_tf.tf_poses`.
+    Raises SourceError where the named topic does not exist or has no poses, and where /tf does not know `world_frame`.
+    """
+    if topic:
+        return topic_poses(file, topic, frame_id)
+    found, by_tf, why = pose_topics(file), None, ""
+    if frame_id or world_frame:
+        by_tf, why = _from_tf(file, frame_id, world_frame)
+    if by_tf:
+        others = f"; ?poses={' or ?poses='.join(found)} for others" if found else ""
+        return FoundPoses(by_tf, assumed=f"{by_tf.where}: these poses count{others}")
+    if len(found) > 1:
+        say = f"several topics with poses, say which: ?poses={' or ?poses='.join(found)}"
+        return FoundPoses(None, f"{file.path}: {say}")
+    if not found:
+        return FoundPoses(None, f"{why or f'{file.path}: holds no poses'}; {CURE}")
+    return _read(file, found[0], frame_id)
+
+
+def topic_poses(file: BagFile, topic: str, frame_id: str = "") -> FoundPoses:
+    """Return the poses of `topic`; raises SourceError where there is no such topic or it has no poses."""
+    if topic not in file.types:
+        raise SourceError(f"{file.path}: no topic {topic} with messages{did_you_mean(topic, file.types)}")
+    if file.types[topic] not in POSE_TYPES:
+        raise SourceError(f"{file.path}: {topic} holds {file.types[topic]}, no poses; name one of {_known()}")
+    return _read(file, topic, frame_id)
+
+
+def _from_tf(file: BagFile, frame_id: str, world_frame: str) -> tuple[TfPoses | None, str]:
+    """Return what /tf tells of the camera; without it, why it does not."""
+    tf = read_tf(file)
+    if tf is None or not frame_id:
+        if world_frame:
+            lacks = "no /tf" if tf is None else "no frame_id with its depth images"
+            raise SourceError(f"{file.path}: has {lacks}; leave ?world_frame={world_frame} out")
+        return None, ""
+    found = tf_poses(tf, frame_id, world_frame)
+    return (None, found) if isinstance(found, str) else (found, "")
+
+
+def pose_topics(file: BagFile) -> list[str]:
+    """Return the topics with poses; a RealSense file also tells how its own sensors are mounted, which is none."""
+    loose = "geometry_msgs/Transform"
+    return sorted(t for t, kind in file.types.items() if kind in POSE_TYPES and (kind != loose or T265.fullmatch(t)))
+
+
+def _read(file: BagFile, topic: str, frame_id: str) -> FoundPoses:
+    kind, recorded, match = file.types[topic], file.stamps(topic), T265.fullmatch(topic)
+    metadata = Metadata(file, f"{match[1]}/metadata") if match else None
+    stamps, numbers, confidence, child = [], [], [], ""
+    for i in range(len(recorded)):
+        try:
+            pose = read_pose(file.read(topic, i), kind)
+        except (FrameRefused, ValueError):
+            continue  # images near it find no pose near enough
+        told = metadata.at(int(recorded[i])) if metadata else {}
+        stamps.append(_stamp(pose, told, int(recorded[i])))
+        numbers.append(pose.numbers)
+        confidence.append(_confidence(told.get("Tracker Confidence", "")))
+        child = child or pose.child
+    where = f"{file.path} {topic}"
+    if not stamps:
+        return FoundPoses(None, f"{where}: not one pose can be read; {CURE}")
+    rows = np.array(numbers)
+    faults = _spoil(rows, stamps, where)
+    trusted = np.array(confidence) if np.isfinite(confidence).any() else None
+    with np.errstate(invalid="ignore"):
+        poses = Poses(stamps, transforms(rows), trusted, where=where, faults=faults)
+    what = "T265 body, as if it were the depth camera" if match else "depth camera's optical frame"
+    assumed = f"{where}: taken for poses of the {what}; set ?axes=, or make a camera pair (pair.toml), if they are not"
+    return FoundPoses(poses, "", bool(match), bool(child) and child.strip("/") == frame_id.strip("/"), assumed)
+
+
+def _stamp(pose: StampedPose, told: dict[str, str], recorded_ns: int) -> int:
+    if pose.stamp_ns is not None:
+        return pose.stamp_ns
+    stamp_ns = ns_from_ms(told.get("frame_timestamp", ""))
+    return recorded_ns if stamp_ns is None else stamp_ns
+
+
+def _confidence(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
+
+
+def _spoil(rows: np.ndarray, stamps: list[int], where: str) -> dict[int, str]:
+    """Turn poses that are none into NaN, and return by stamp what is wrong with them."""
+    bad = ~np.isfinite(rows).all(axis=1) | (np.linalg.norm(rows[:, 3:], axis=1) < 1e-6)
+    rows[bad] = np.nan
+    return {stamps[k]: f"{where}: message {k} holds no pose; leave the images near it out" for k in np.flatnonzero(bad)}
+
+
+def _known() -> str:
+    return ", ".join(sorted(POSE_TYPES))

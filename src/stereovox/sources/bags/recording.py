@@ -1,0 +1,224 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Depth images in a recording: `.db3` and `.bag` of a RealSense camera, and ordinary bags of ROS 1 and ROS 2."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from stereovox.cameras.pinhole import PinholeCamera
+from stereovox.errors import FrameRefused, SourceError
+from stereovox.frame import Frame
+from stereovox.se3 import Transform
+from stereovox.sources import parameters
+from stereovox.sources.bags import open_bag, suffix_of
+from stereovox.sources.bags.depth_topic import DepthTopic, find_depth
+from stereovox.sources.bags.poses import find_poses
+from stereovox.sources.bags.tf import TfPoses
+from stereovox.sources.base import DepthSource
+from stereovox.sources.poses import Poses
+from stereovox.sources.tracker import AXES, WORLDS, turned
+
+STANDING = ("", "fixed")
+Given = TypeVar("Given")
+
+
+@dataclass(frozen=True)
+class Options:
+    """What may stand behind the file's name, as in `walk.bag?depth=/camera/depth/image_rect&poses=/vicon`.
+
+    depth, info, poses: topics of the depth images, of their `sensor_msgs/CameraInfo`, and of the camera's poses, where
+        they are not found or not the right ones.
+    axes: axes of the posed body, `optical`, `ros` (x forward, z up) or `opengl` (T265); world: axes of the map, `file`,
+        `up` or `optical` (see `tracker.py`). T265 poses are `opengl` and `up` if nothing else is said, others `optical`
+        and `file`.
+    world_frame: the frame of /tf that is the world: `map`, else `odom`, else the root of the tree if nothing is said.
+    pose: `fixed` for a camera that stood still: every pose is the identity, poses in the file do not count.
+    scale: metres per unit (0: as the file says, else millimetres); baseline: metres (0: as the file says).
+    """
+
+    depth: str = ""
+    info: str = ""
+    poses: str = ""
+    axes: str = ""
+    world: str = ""
+    world_frame: str = ""
+    pose: str = ""
+    scale: float = 0.0
+    baseline: float = 0.0
+
+    def __post_init__(self) -> None:
+        for key, known in {"axes": tuple(AXES), "world": WORLDS, "pose": STANDING}.items():
+            word = getattr(self, key)
+            if word and word not in known:
+                raise SourceError(f"{key}={word} must be {' or '.join(filter(None, known))}")
+        for one, others in {"pose": ("poses", "axes", "world", "world_frame"), "poses": ("world_frame",)}.items():
+            for key in filter(lambda key, one=one: getattr(self, one) and getattr(self, key), others):
+                told = f"{one}={getattr(self, one)} and {key}={getattr(self, key)}"
+                raise SourceError(f"{told} contradict each other; give one")
+        for key in ("scale", "baseline"):
+            if getattr(self, key) < 0:
+                raise SourceError(f"{key}={getattr(self, key):g} must be a positive number")
+
+
+class Bag(DepthSource):
+    """Depth images of one topic of a recorded file, with the poses that /tf or another topic tells.
+
+    Realsense-viewer writes `.db3` since librealsense 2.57 and `.bag` before; both are recognised by their topics and
+    tell camera, unit and baseline. In ordinary bags the depth topic has 16UC1 (millimetres), 32FC1 (metres) or
+    compressedDepth images, and `camera_info` beside it. Where there are several, `?depth=/topic` says which.
+
+    The files are read message by message, not played back by pyrealsense2: that plays at its own pace, cannot go to
+    frame number i, and a damaged file may end it together with the program. Checked: `.db3` against files that
+    pyrealsense2 2.59 recorded and against its own playback; RealSense `.bag` only against files made for the tests as
+    librealsense's `ros_writer.cpp` describes, which librealsense's own reader accepts; no bag of a real camera was at
+    hand.
+
+    Pixels without value: 0 in 16UC1, and all are UNKNOWN, none clears; 32FC1 follows REP 117: -inf is TOO_NEAR, NaN
+    UNKNOWN, +inf what `depth.far` says.
+    Time: the image's own; in RealSense files that of the frame in its own clock domain. Pose: interpolated at that
+    time; what /tf tells of the images' frame comes first, at its ends held for up to 0.1 s (`pose_off_ns`). It is the
+    pose of the depth camera's optical frame unless `axes` says otherwise; where the poses are those of another camera,
+    or in another file, a camera pair (`pair.toml`) puts them together.
+    Faults: `unreadable`, `bad_dtype`, `bad_shape`; `no_pose` and `bad_pose_file` with the depth image all the same.
+    Raises SourceError, one line, for files that are empty, damaged or without usable depth, and for bad options.
+    """
+
+    layout = "a RealSense .db3 or .bag, or a .bag, .db3, .mcap or rosbag2 folder with depth images"
+
+    def __init__(self, where: str | Path, *, posed: bool = True):
+        path, options = parse(str(where))
+        self.name = path.name or path.resolve().name
+        self._file = open_bag(path)
+        self._depth: DepthTopic = find_depth(self._file, options.depth, options.info)
+        self.camera = self._depth.camera
+        if options.baseline:
+            self.camera = replace(self.camera, baseline=options.baseline)
+        self._scale = options.scale
+        self._standing = options.pose == "fixed" or not posed
+        self._poses, self._missing, notes = None, "", ()
+        if not self._standing:
+            self._poses, self._missing, notes = read_poses(self._file, options, self._depth.frame_id)
+        self.notes = (*self._file.notes, *self._depth.notes, *notes)
+
+    @classmethod
+    def recognises(cls, where: str) -> bool:
+        """Tell whether `where` is, or by its name should be, such a file or folder; options may follow."""
+        return bool(suffix_of(file_part(where)))
+
+    @classmethod
+    def depth_only(cls, where: str) -> Bag:
+        """Return the depth images without looking for poses: every pose is the identity."""
+        return cls(where, posed=False)
+
+    def __len__(self) -> int:
+        return len(self._depth)
+
+    def frame(self, i: int) -> Frame:
+        """Return frame `i`; depth is (0, 0) where the image has a `fault`, the pose NaN where there is none."""
+        i = range(len(self))[i]
+        frame = depth_frame(self._depth, i, f"{self._file.path} frame {i}", self._pose, self.camera, self._scale)
+        if frame.fault or not isinstance(self._poses, TurnedTf):
+            return frame
+        return replace(frame, pose_off_ns=self._poses.poses.off_ns(frame.stamp_ns))
+
+    def _pose(self, stamp_ns: int) -> Transform:
+        if self._standing:
+            return np.eye(4)
+        if self._poses is None:
+            raise FrameRefused("no_pose", self._missing)
+        return self._poses.at(stamp_ns)
+
+
+def depth_frame(
+    images: DepthTopic,
+    i: int,
+    name: str,
+    pose: Callable[[int], Transform],
+    camera: PinholeCamera,
+    scale: float = 0.0,
+) -> Frame:
+    """Return image `i` of a topic as a frame with the pose at its time, T_world_sensor; see `Bag.frame`.
+
+    name: for messages. scale: metres per unit, 0 for what the recording says. pose: may raise FrameRefused.
+    """
+    blank = Frame(np.empty((0, 0), np.uint16), camera, np.full((4, 4), np.nan), images.stamp_ns(i), name=name)
+    try:
+        depth, stamp_ns, told = images.image(i, name)
+    except FrameRefused as refused:
+        return replace(blank, fault=refused.reason, fault_detail=str(refused))
+    frame = replace(blank, depth=depth, stamp_ns=stamp_ns, depth_scale=scale or told)
+    try:
+        return replace(frame, T_world_sensor=pose(stamp_ns))
+    except FrameRefused as refused:
+        return replace(frame, fault=refused.reason, fault_detail=str(refused))
+
+
+def file_part(where: str) -> str:
+    """Return `where` without options; a file or folder whose name holds a `?` comes first. Never raises."""
+    try:
+        whole = Path(where).exists()
+    except (OSError, ValueError):
+        whole = False
+    return where if whole else where.partition("?")[0]
+
+
+def parse(where: str) -> tuple[Path, Options]:
+    """Return file and options; raises SourceError, one line, for bad options."""
+    return parse_as(where, Options)
+
+
+def parse_as(where: str, kind: type[Given]) -> tuple[Path, Given]:
+    """Return file and options of a kind; raises SourceError, one line, for bad options."""
+    file = file_part(where)
+    try:
+        _, given = parameters.split(where[len(file) :])
+        return Path(file), kind(**parameters.typed(given, parameters.defaults(kind)))
+    except SourceError as error:
+        raise SourceError(f"{where}: {error}") from None
+
+
+@dataclass(frozen=True)
+class TurnedTf:
+    """Poses out of /tf of a body in optical axes; see `tracker.turned`."""
+
+    poses: TfPoses
+    axes: str
+    world: str
+
+    def at(self, stamp_ns: int) -> Transform:
+        """Return T_world_body at a time; raises FrameRefused `no_pose`."""
+        return turned(self.poses.at(stamp_ns), self.axes, self.world)
+
+
+def read_poses(file: Any, options: Options, frame_id: str) -> tuple[Poses | TurnedTf | None, str, tuple[str, ...]]:
+    """Return the poses in a bag, if there are any, why there are none, and notes about what had to be assumed."""
+    found = find_poses(file, options.poses, frame_id, options.world_frame)
+    if found.poses is None:
+        return None, found.missing, ()
+    axes = options.axes or ("opengl" if found.tracker else "optical")
+    world = options.world or ("up" if found.tracker else "file")
+    poses = found.poses
+    notes = () if found.of_camera or options.axes else (found.assumed,)
+    if isinstance(poses, TfPoses):
+        return TurnedTf(poses, axes, world), "", (*notes, *poses.tf.notes)
+    T = turned(poses.T_world_body, axes, world)
+    return Poses(poses.stamps_ns, T, poses.confidence, where=poses.where, faults=poses.faults), "", notes
+
+
+def tracker_poses(where: str | Path, axes: str = "", world: str = "") -> Poses:
+    """Return the poses in a `.bag` or `.db3`, for a camera pair; `where` may name the topic: `t265.bag?poses=/topic`.
+
+    `axes` and `world` as in `read_tracker`; T_world_body of a T265 has its confidence.
+    Raises SourceError where there is none.
+    """
+    path, options = parse(str(where))
+    options = replace(options, pose="", world_frame="", axes=axes or options.axes, world=world or options.world)
+    poses, missing, _ = read_poses(open_bag(path), options, "")
+    if not isinstance(poses, Poses):
+        raise SourceError(missing)
+    return poses

@@ -1,0 +1,229 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The messages of ground robots and of finished maps, read from their serialised bytes.
+
+ROS 1 and ROS 2 (CDR) alike, as in `bag_messages`. All raise ValueError, one line, for bytes that do not suffice or say
+what cannot be; nothing is allocated for a length that lies.
+
+The messages of finished maps, read from their serialised bytes: `nav_msgs/OccupancyGrid`, `octomap_msgs/Octomap`.
+ROS 1 and ROS 2 (CDR) alike, as in `bag_messages`. Both raise ValueError, one line, for bytes that do not suffice or say
+what cannot be; nothing is allocated for a length that lies.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from math import atan2, hypot, isfinite
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.maps.occupancy import UNKNOWN, OccupancyGrid
+from stereovox.sources.bags.messages import Wire
+
+OCCUPANCY_GRID, OCTOMAP = "nav_msgs/OccupancyGrid", "octomap_msgs/Octomap"
+
+
+@dataclass(frozen=True)
+class OctomapMessage:
+    """An `octomap_msgs/Octomap`: nodes as in a `.bt` (binary) or `.ot` file; resolution: side of a cell in metres."""
+
+    frame_id: str
+    binary: bool
+    tree: str
+    resolution: float
+    data: bytes
+
+
+def read_octomap_message(wire: Wire) -> OctomapMessage:
+    """Return an `octomap_msgs/Octomap`."""
+    _, frame_id = wire.header()
+    binary, tree, resolution = bool(wire.number("B")), wire.text(), wire.number("d")
+    return OctomapMessage(frame_id, binary, tree, resolution, bytes(wire.data()))
+
+
+def read_occupancy_grid(wire: Wire) -> OccupancyGrid:
+    """Return a `nav_msgs/OccupancyGrid`; numbers that are no per cent are unknown, as navigation programs take them.
+
+    The message's resolution is a float32: the shortest number that means it is taken, 0.05 for 0.0500000007.
+    """
+    wire.header()
+    wire.numbers("I", 2)  # when the map was loaded
+    resolution = float(str(np.float32(wire.number("f"))))
+    width, height = wire.numbers("I", 2)
+    x, y, _, qx, qy, qz, qw = wire.numbers("d", 7)
+    count = wire.number()
+    if count != width * height or not count:
+        raise ValueError(f"a grid of {width} x {height} with {count} cells")
+    yaw = atan2(2 * (qw * qz + qx * qy), qw * qw + qx * qx - qy * qy - qz * qz)
+    if not (0 < resolution < np.inf and all(map(isfinite, (x, y, yaw)))):
+        raise ValueError(f"a grid with cells of {resolution:g} m at {x:g}, {y:g}")
+    cells = np.frombuffer(wire.block(count), np.int8)
+    known = (cells >= 0) & (cells <= 100)
+    return OccupancyGrid(np.where(known, cells, np.int8(UNKNOWN)).reshape(height, width), resolution, (x, y, yaw))
+
+
+LASER_SCAN, POINT_CLOUD, ODOMETRY = "sensor_msgs/LaserScan", "sensor_msgs/PointCloud2", "nav_msgs/Odometry"
+TF_TYPES = ("tf2_msgs/TFMessage", "tf/tfMessage")
+FLOATS = {7: "f4", 8: "f8"}
+"""`sensor_msgs/PointField` types that can hold a coordinate."""
+MAX_FIELDS = 256
+MOST_BEAMS = 100_000
+LARGEST = 1e9
+"""Metres: no robot goes there, and the products of such numbers are finite."""
+
+
+@dataclass(frozen=True, eq=False)
+class LaserScan:
+    """A `sensor_msgs/LaserScan`.
+
+    ranges: (N,) float32 metres as in `frame.Scan`: NaN no reading, -inf too near, +inf nothing up to `range_max`.
+    angle_min, angle_step: radians; range_min, range_max: metres.
+    """
+
+    stamp_ns: int
+    frame_id: str
+    angle_min: float
+    angle_step: float
+    range_min: float
+    range_max: float
+    ranges: NDArray[np.float32]
+
+
+def read_laser_scan(wire: Wire, range_max: float = 0.0) -> LaserScan:
+    """Return a `sensor_msgs/LaserScan`; `range_max`, where given, stands in place of the message's own.
+
+    What the driver wrote becomes (REP 117): NaN stays NaN; below range_min, -inf and 0.0 (what many drivers write for
+    "no reading") -inf, which clears nothing; range_max itself, all beyond it (drivers of Hokuyo write range_max + 1 for
+    "no echo") and +inf become +inf, which clears up to range_max. Raises ValueError also for angles and limits that
+    make no sense.
+    """
+    stamp_ns, frame_id = wire.header()
+    angle_min, _, angle_step, _, _, range_min, told_max = wire.numbers("f", 7)
+    range_max = range_max or told_max
+    count = wire.number()
+    if count > MOST_BEAMS:
+        raise ValueError(f"a scan of {count} ranges; no lidar has so many beams")
+    ranges = wire.array("f4", count).astype(np.float32, copy=False)
+    if not len(ranges):
+        raise ValueError("a scan with no ranges")
+    if not (np.isfinite([angle_min, angle_step]).all() and 0 < abs(angle_step) <= 2 * np.pi):
+        raise ValueError(f"a scan that begins at angle {angle_min:g} with steps of {angle_step:g} is none")
+    if not (np.isfinite([range_min, range_max]).all() and 0 <= range_min < range_max):
+        raise ValueError(
+            f"a scan between range_min {range_min:g} and range_max {range_max:g} is none; give ?range_max="
+        )
+    marked = marked_ranges(ranges, range_min, range_max)
+    return LaserScan(stamp_ns, frame_id, angle_min, angle_step, range_min, range_max, marked)
+
+
+def marked_ranges(ranges: NDArray[np.float32], range_min: float, range_max: float) -> NDArray[np.float32]:
+    """Return (N,) float32 ranges in which only what lies in [range_min, range_max) is a number (see `LaserScan`)."""
+    with np.errstate(invalid="ignore"):
+        near = (ranges < np.float32(range_min)) | (ranges <= 0)
+        return np.where(near, -np.inf, np.where(ranges >= np.float32(range_max), np.inf, ranges)).astype(np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class PointCloud:
+    """The points of a `sensor_msgs/PointCloud2`: (N, 3) float32 metres in frame `frame_id`; NaN: no point there."""
+
+    stamp_ns: int
+    frame_id: str
+    points: NDArray[np.float32]
+
+
+def read_point_cloud(wire: Wire) -> PointCloud:
+    """Return a `sensor_msgs/PointCloud2`: its fields x, y and z, wherever they stand, as 4 or 8 byte floats.
+
+    Raises ValueError for a cloud without them, of a size that its data does not have, or of points that overlap.
+    """
+    stamp_ns, frame_id = wire.header()
+    height, width = wire.numbers("I", 2)
+    fields = _fields(wire)
+    order, point_step, row_step = ">" if wire.number("B") else "<", wire.number(), wire.number()
+    data = wire.data()
+    types, offsets = [], []
+    for axis in "xyz":
+        if axis not in fields:
+            raise ValueError(f"a cloud without {axis} (it has {', '.join(fields)[:80] or 'no fields'})")
+        offset, kind = fields[axis]
+        if kind not in FLOATS:
+            raise ValueError(f"{axis} is of type {kind}, no float; convert the cloud to FLOAT32")
+        types.append(np.dtype(f"{order}{FLOATS[kind]}"))
+        offsets.append(offset)
+    end = max(offset + dtype.itemsize for offset, dtype in zip(offsets, types, strict=True))
+    row_step = row_step if height > 1 else width * point_step  # a single row needs none, and some drivers write 0
+    if end > point_step or row_step < width * point_step:
+        raise ValueError(
+            f"points of {end} bytes do not fit: point_step {point_step}, row_step {row_step}, {width} wide"
+        )
+    _check_size(height, width, point_step, row_step, len(data))
+    columns = (
+        [
+            np.ndarray((height, width), dtype, data, offset, (row_step, point_step)).ravel()
+            for dtype, offset in zip(types, offsets, strict=True)
+        ]
+        if height * width
+        else [np.empty(0)] * 3
+    )
+    with np.errstate(over="ignore", invalid="ignore"):
+        return PointCloud(stamp_ns, frame_id, np.stack(columns, axis=1).astype(np.float32))
+
+
+def _fields(wire: Wire) -> dict[str, tuple[int, int]]:
+    """Return offset and type of each field by its name."""
+    count = wire.number()
+    if count > MAX_FIELDS:
+        raise ValueError(f"a cloud with {count} fields")
+    found = {}
+    for _ in range(count):
+        name, offset, kind, _ = wire.text(), wire.number(), wire.number("B"), wire.number()
+        found.setdefault(name, (offset, kind))
+    return found
+
+
+def _check_size(height: int, width: int, point_step: int, row_step: int, size: int) -> None:
+    needed = (height - 1) * row_step + width * point_step if height and width else 0
+    if needed > size:
+        raise ValueError(f"a cloud of {width}x{height} points needs {needed} bytes and has {size}")
+
+
+@dataclass(frozen=True)
+class StampedTransform:
+    """Where frame `child` stands in frame `parent`: tx ty tz in metres, quaternion qx qy qz qw of any length.
+
+    Names are as in tf2: without the slash that tf1 puts in front of them.
+    """
+
+    stamp_ns: int
+    parent: str
+    child: str
+    numbers: tuple[float, ...]
+
+
+def read_odometry(wire: Wire) -> StampedTransform:
+    """Return the pose in a `nav_msgs/Odometry`; covariance and speed are left."""
+    return _transform(wire)
+
+
+def read_transforms(wire: Wire) -> list[StampedTransform]:
+    """Return the transforms in a `tf2_msgs/TFMessage`, or in a `tf/tfMessage`, which is written alike."""
+    return [_transform(wire) for _ in range(wire.number())]
+
+
+def is_motion(numbers: Sequence[float]) -> bool:
+    """Tell whether tx ty tz qx qy qz qw are seven numbers below `LARGEST` with a quaternion longer than zero."""
+    return len(numbers) == 7 and all(abs(x) < LARGEST for x in numbers) and hypot(*numbers[3:]) > 1e-6
+
+
+@lru_cache(maxsize=1024)
+def frame_name(frame_id: str) -> str:
+    """Return the name of a frame as tf2 writes it: tf1 puts a slash in front."""
+    return frame_id.strip().lstrip("/")
+
+
+def _transform(wire: Wire) -> StampedTransform:
+    stamp_ns, parent = wire.header()
+    return StampedTransform(stamp_ns, frame_name(parent), frame_name(wire.text()), wire.numbers("d", 7))

@@ -1,0 +1,156 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The topics of a ground robot in a recording: scans, or point clouds in their place, and odometry."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+from stereovox.errors import FrameRefused, SourceError, did_you_mean
+from stereovox.sources.bags.files import BagFile
+from stereovox.sources.bags.robot_messages import (
+    LASER_SCAN,
+    ODOMETRY,
+    POINT_CLOUD,
+    LaserScan,
+    PointCloud,
+    StampedTransform,
+    frame_name,
+    is_motion,
+    read_laser_scan,
+    read_odometry,
+    read_point_cloud,
+)
+from stereovox.sources.bags.tf import Edge
+
+LOOKS = 5
+
+
+class ScanTopic:
+    """Scans, or clouds, of one topic in the order in which they were recorded.
+
+    frame_id: frame of the first that can be read, "" where none says.
+    """
+
+    def __init__(self, file: BagFile, topic: str, range_max: float = 0.0):
+        self.path, self.topic, self.is_cloud = file.path, topic, file.types[topic] == POINT_CLOUD
+        self._file, self._range_max = file, range_max
+        self._stamps = file.stamps(topic)
+        self.frame_id = frame_id_of(file, topic)
+
+    def __len__(self) -> int:
+        return len(self._stamps)
+
+    def name(self, i: int) -> str:
+        """Return what to call scan `i` in messages."""
+        return f"{self.path} {self.topic} message {i}"
+
+    def recorded_ns(self, i: int) -> int:
+        """Return the time at which scan `i` was recorded."""
+        return int(self._stamps[i])
+
+    def read(self, i: int) -> LaserScan | PointCloud:
+        """Return scan `i`, with the time of recording where it has none; raises FrameRefused `unreadable`."""
+        wire = self._file.read(self.topic, i)
+        try:
+            told = read_point_cloud(wire) if self.is_cloud else read_laser_scan(wire, self._range_max)
+        except ValueError as error:
+            raise FrameRefused("unreadable", f"{self.name(i)}: {error}; leave it out") from None
+        return replace(told, stamp_ns=told.stamp_ns or self.recorded_ns(i), frame_id=frame_name(told.frame_id))
+
+
+def find_scans(
+    file: BagFile, topic: str = "", range_max: float = 0.0, depth_frame: str = ""
+) -> tuple[ScanTopic | None, tuple[str, ...]]:
+    """Return the scans of `topic`, else of the topic with most scans, else with most clouds, and notes.
+
+    depth_frame: frame of the depth images; clouds in it are made of them, and are left alone. None: no scans.
+    Raises SourceError where the named topic does not exist or has no scans.
+    """
+    if topic:
+        check_topic(file, topic, (LASER_SCAN, POINT_CLOUD), "scan")
+        return ScanTopic(file, topic, range_max), ()
+    found = _of_kind(file, LASER_SCAN)
+    if not found:
+        clouds = _of_kind(file, POINT_CLOUD)
+        found = [name for name in clouds if not depth_frame or frame_id_of(file, name) != frame_name(depth_frame)]
+    if not found:
+        return None, ()
+    best, said = most(file, found), ()
+    if len(found) > 1:
+        others = ", ".join(name for name in found if name != best)
+        said = (f"{file.path}: scans of {best}, which has most; there are {others} too: say ?scan=/topic for those",)
+    return ScanTopic(file, best, range_max), said
+
+
+def check_topic(file: BagFile, topic: str, kinds: Iterable[str], option: str) -> None:
+    """Raise SourceError where there is no such topic, or it holds none of these kinds of messages."""
+    if topic not in file.types:
+        raise SourceError(f"{file.path}: no topic {topic} with messages{did_you_mean(topic, file.types)}")
+    if file.types[topic] not in (kinds := tuple(kinds)):
+        raise SourceError(f"{file.path}: {topic} holds {file.types[topic]}; ?{option}= needs {' or '.join(kinds)}")
+
+
+def most(file: BagFile, topics: list[str]) -> str:
+    """Return the topic with most messages, of several the first."""
+    return max(topics, key=lambda topic: len(file.stamps(topic)))
+
+
+def frame_id_of(file: BagFile, topic: str) -> str:
+    """Return the frame that the header of the first readable message of a topic names, "" where none does."""
+    for i in range(min(LOOKS, len(file.stamps(topic)))):
+        try:
+            return frame_name(file.read(topic, i).header()[1])
+        except (FrameRefused, ValueError):
+            continue
+    return ""
+
+
+def _of_kind(file: BagFile, kind: str) -> list[str]:
+    return sorted(topic for topic, known in file.types.items() if known == kind)
+
+
+def odometry_topic(file: BagFile, given: str = "", other: str = "") -> tuple[str, tuple[str, ...]]:
+    """Return the topic with the robot's odometry, "" where there is none, and notes.
+
+    given: counts, where it is not ""; other: a topic that is not meant. Of several the one with most messages counts.
+    Raises SourceError where the given one does not exist or is none.
+    """
+    if given:
+        check_topic(file, given, (ODOMETRY,), "odom")
+        return given, ()
+    found = sorted(topic for topic, kind in file.types.items() if kind == ODOMETRY and topic != other)
+    if not found:
+        return "", ()
+    best = most(file, found)
+    others = ", ".join(topic for topic in found if topic != best)
+    said = f"odometry of {best}, which has most; there is {others} too: say ?odom=/topic or ?truth=/topic for it"
+    return best, (f"{file.path}: {said}",) if others else ()
+
+
+def first_odometry(file: BagFile, topic: str) -> StampedTransform | None:
+    """Return the first readable message, None where none of the first few is."""
+    for i in range(min(LOOKS, len(file.stamps(topic)))):
+        try:
+            return read_odometry(file.read(topic, i))
+        except (FrameRefused, ValueError):
+            continue
+    return None
+
+
+def odometry_edge(file: BagFile, topic: str, parent: str, child: str) -> Edge:
+    """Return the poses of a topic as transforms of `child` in `parent`; what cannot be read or is no pose is a gap.
+
+    Raises SourceError where not one pose can be read.
+    """
+    edge, recorded = Edge(parent, child, topic), file.stamps(topic)
+    for i in range(len(recorded)):
+        try:
+            told = read_odometry(file.read(topic, i))
+        except (FrameRefused, ValueError):
+            continue
+        if is_motion(told.numbers):
+            edge.add(told.stamp_ns or int(recorded[i]), told.numbers)
+    if not edge.count:
+        raise SourceError(f"{file.path}: {topic}: not one pose can be read; name another with ?odom=/topic")
+    return edge

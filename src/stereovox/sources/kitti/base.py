@@ -1,0 +1,175 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the KITTI layouts have in common: a rectified pair, a lidar, and poses of rectified camera 0."""
+
+from __future__ import annotations
+
+import os
+import re
+from abc import ABC, abstractmethod
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.cameras.rigs import StereoPair
+from stereovox.errors import FrameRefused, SourceError, did_you_mean
+from stereovox.frame import StereoFrame, Viewpoint
+from stereovox.safe_io import MOST_LIST, read_text
+from stereovox.se3 import Transform, inverse
+from stereovox.sources import parameters
+from stereovox.sources.base import Source
+from stereovox.sources.images import PICTURE, common_size, file_names, read_picture_png
+from stereovox.sources.kitti.calibration import KittiCalibration
+from stereovox.sources.lidar import Box, LidarScan, read_velodyne
+
+PAIRS = {"grey": (0, 1), "colour": (2, 3)}
+"""Camera numbers of the left and right eye."""
+
+
+class CameraPoses(Protocol):
+    """Whatever tells the pose of camera 0 for each frame; see `kitti_poses`."""
+
+    def at(self, i: int) -> Transform:
+        """Return T_world_cam0 (4, 4); raises FrameRefused where there is none."""
+        ...
+
+
+class KittiSource(Source, ABC):
+    """Frames of a stereo pair with a lidar scan each, in one of KITTI's layouts.
+
+    A layout sets `name`, `calibration`, `poses`, `eyes` (camera numbers left and right) and `camera`, and says where
+    the files of each frame lie. World: see `FramePoses`. Pose of a frame: that of the rectified left camera in use.
+    A file that cannot be used becomes a frame with a `fault`: those of `read_picture_png`, `no_pose`, `bad_pose_file`.
+    Why a pixel has no value is found out by matching (see `depth.stereo`).
+    """
+
+    calibration: KittiCalibration
+    poses: CameraPoses
+    eyes: tuple[int, int]
+
+    @abstractmethod
+    def images(self, i: int) -> tuple[Path, Path]:
+        """Return the left and right image files of frame `i` (0 to len - 1)."""
+
+    @abstractmethod
+    def stamp_ns(self, i: int) -> int:
+        """Return the time of frame `i` in nanoseconds."""
+
+    @abstractmethod
+    def velodyne(self, i: int) -> Path:
+        """Return the scan's file of frame `i`."""
+
+    def pair(self, i: int) -> StereoPair:
+        """Return the stereo pair of frame `i`."""
+        return StereoPair(self.camera, name=self.name)
+
+    def calibration_of(self, i: int) -> KittiCalibration:
+        """Return the calibration of frame `i`."""
+        return self.calibration
+
+    def frame(self, i: int) -> StereoFrame:
+        """Return frame `i`; images are (0, 0) and the pose NaN where the frame has a `fault`."""
+        i = range(len(self))[i]
+        paths, stamp_ns, pair = self.images(i), self.stamp_ns(i), self.pair(i)
+        try:
+            T_world_left = self.viewpoint(i).T_world_camera
+            size = (pair.camera.width, pair.camera.height)
+            left, right = (read_picture_png(path, size) for path in paths)
+        except FrameRefused as refused:
+            nothing, nowhere = np.empty((0, 0), np.uint8), np.full((4, 4), np.nan)
+            return StereoFrame(
+                nothing, nothing, pair, nowhere, stamp_ns, str(paths[0]), refused.reason, fault_detail=str(refused)
+            )
+        return StereoFrame(left, right, pair, T_world_left, stamp_ns, str(paths[0]))
+
+    def viewpoint(self, i: int) -> Viewpoint:
+        """Return the rectified left camera of frame `i`, its pose and time; FrameRefused where there is no pose."""
+        i = range(len(self))[i]
+        T_cam0_left = inverse(self.calibration_of(i).offset_of(self.eyes[0]))
+        return Viewpoint(self.pair(i).camera.middle, self.poses.at(i) @ T_cam0_left, self.stamp_ns(i))
+
+    @property
+    def has_lidar(self) -> bool:
+        """Whether there are lidar scans, and a calibration that tells where the lidar sits."""
+        return self.calibration.T_cam0_velo is not None and os.path.isdir(self.velodyne(0).parent)
+
+    def scan(self, i: int) -> LidarScan | None:
+        """Return the scan of frame `i`; None, and FrameRefused, as `LidarSource` says."""
+        i = range(len(self))[i]
+        T_cam0_velo = self.calibration_of(i).T_cam0_velo
+        if not self.has_lidar or T_cam0_velo is None:
+            return None
+        return LidarScan(read_velodyne(self.velodyne(i)), self.poses.at(i) @ T_cam0_velo, self.stamp_ns(i))
+
+    def boxes(self, i: int) -> tuple[Box, ...]:
+        """Return the annotated objects of frame `i`: none, where the layout has no annotations."""
+        range(len(self))[i]
+        return ()
+
+    def moving(self, i: int) -> NDArray[np.bool_] | None:
+        """Return the pixels that moved, None where the recording does not tell."""
+        range(len(self))[i]
+        return None
+
+    def _size(self) -> tuple[int, int]:
+        """Return (width, height) of the left images; raises SourceError where none can be read."""
+        paths = [self.images(i)[0] for i in range(len(self))]
+        size = common_size(paths, kinds=PICTURE)
+        if size is None:
+            folder = paths[0].parent if paths else self.name
+            raise SourceError(f"{folder}: none of its {len(paths)} images is a readable 8-bit PNG; copy them again")
+        return size
+
+
+def location(where: str | os.PathLike[str], known: dict[str, str]) -> tuple[Path, dict[str, str]]:
+    """Return the folder in `FOLDER?key=value` and its parameters on top of `known`, the defaults.
+
+    Raises SourceError, one line, for a parameter that is not known or not complete.
+    """
+    try:
+        folder, given = parameters.split(os.fspath(where))
+        return Path(folder), {**known, **parameters.typed(given, known)}
+    except SourceError as error:
+        raise SourceError(f"{where}: {error}") from None
+
+
+def time_lines(path: Path, whose: str) -> list[str]:
+    """Return the lines of a file of times, stripped; raises SourceError, one line, where there is none."""
+    try:
+        lines = read_text(path, MOST_LIST, "replace").rstrip().splitlines()
+    except OSError as error:
+        raise SourceError(f"{path}: {error.strerror}; put the {whose}'s own file there") from None
+    if not lines:
+        raise SourceError(f"{path}: holds no time; put the {whose}'s own file there")
+    return [line.strip() for line in lines]
+
+
+def folder_of(where: str) -> str:
+    """Return what stands before the parameters; never raises."""
+    return where.partition("?")[0]
+
+
+def choose_pair(where: Path, camera: str, present: dict[str, bool]) -> tuple[int, int]:
+    """Return the camera numbers of the pair that `camera` names, or of the first present one (grey) for ''.
+
+    Raises SourceError, one line, for an unknown name or a pair that is not there.
+    """
+    if camera and camera not in PAIRS:
+        raise SourceError(f"{where}: camera={camera}{did_you_mean(camera, PAIRS)}")
+    found = [name for name in PAIRS if present.get(name)]
+    if not found or (camera and camera not in found):
+        has = f"only {found[0]} images" if found else "no image pair (left and right folder)"
+        raise SourceError(f"{where}: has {has}; " + ("leave camera= out" if found else "copy both image folders"))
+    return PAIRS[camera or found[0]]
+
+
+def numbers_in(folder: Path, pattern: re.Pattern[str]) -> list[str]:
+    """Return the numbers (first group of `pattern`) of the files in `folder`, in ascending order, as written."""
+    names = file_names(folder) if os.path.isdir(folder) else []
+    return sorted({match[1] for name in names if (match := pattern.fullmatch(name))}, key=int)
+
+
+def named_file(text: str, folder: Path) -> Path:
+    """Return the file that a parameter names: as a path of its own, else inside `folder`."""
+    return Path(text) if os.path.isfile(text) else folder / text

@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Drives of KITTI raw data, synced and rectified."""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+
+import numpy as np
+
+from stereovox.errors import SourceError
+from stereovox.sources.kitti.base import (
+    PAIRS,
+    KittiSource,
+    choose_pair,
+    folder_of,
+    location,
+    named_file,
+    numbers_in,
+    time_lines,
+)
+from stereovox.sources.kitti.calibration import CAM_TO_CAM, KittiCalibration, read_raw_calibration
+from stereovox.sources.kitti.poses import FramePoses, read_oxts_files, read_pose_file
+
+IMAGE = re.compile(r"(\d{10})\.png")
+REFINED, INS, OXTS = "poses_refined.txt", "poses_ins.txt", "oxts"
+POSE_FILES = {"refined": REFINED, "ins": INS}
+
+
+class KittiRaw(KittiSource):
+    """A drive folder `2011_09_26_drive_0001_sync`, with the three `calib_*.txt` in the date folder above it.
+
+    where: the folder, or with parameters `DRIVE?camera=colour&poses=oxts`:
+        camera: `grey` (image_00 and 01) or `colour` (02 and 03); without it grey where there are such images.
+        poses: `refined` (`poses_refined.txt`), `ins` (`poses_ins.txt`), `oxts` (computed from the GPS and inertial
+            packets), or a file of 3x4 matrices T_world_cam0 line by line; without it the first of these there is.
+    Time: image_0X/timestamps.txt of the left camera, exact to the nanosecond. Every line of it is a frame.
+    World and faults: see `KittiSource`. Raises SourceError, one line, for what is missing as a whole.
+    """
+
+    layout = "a KITTI raw drive (image_00 and image_01 with data/*.png; calib_*.txt beside the drive)"
+
+    def __init__(self, where: str | os.PathLike[str]):
+        self.folder, options = location(where, {"camera": "", "poses": ""})
+        self.name = self.folder.resolve().name
+        self.calibration = _calibration(self.folder)
+        self.eyes = choose_pair(self.folder, options["camera"], {name: _has(self.folder, name) for name in PAIRS})
+        self._stamps = _stamps(self._eye(0) / "timestamps.txt")
+        self._check_numbers()
+        self.camera = self.calibration.camera(*self.eyes, self._size())
+        self.poses = self._poses(options["poses"])
+
+    @classmethod
+    def recognises(cls, where: str) -> bool:
+        """Tell whether `where` is a folder with the images of a grey or a colour pair as in KITTI raw."""
+        return any(_has(Path(folder_of(where)), name) for name in PAIRS)
+
+    def __len__(self) -> int:
+        return len(self._stamps)
+
+    def images(self, i: int) -> tuple[Path, Path]:
+        """Return the left and right image files of frame `i`."""
+        return self._eye(0) / "data" / f"{i:010d}.png", self._eye(1) / "data" / f"{i:010d}.png"
+
+    def stamp_ns(self, i: int) -> int:
+        """Return the time of frame `i` in nanoseconds since 1970, in the recording's own clock."""
+        return self._stamps[i]
+
+    def velodyne(self, i: int) -> Path:
+        """Return the scan's file of frame `i`."""
+        return self.folder / "velodyne_points" / "data" / f"{i:010d}.bin"
+
+    def _eye(self, side: int) -> Path:
+        return self.folder / f"image_{self.eyes[side]:02d}"
+
+    def _check_numbers(self) -> None:
+        numbers = numbers_in(self._eye(0) / "data", IMAGE)
+        if numbers and int(numbers[-1]) >= len(self._stamps):
+            path, lines = self._eye(0) / "timestamps.txt", len(self._stamps)
+            raise SourceError(f"{path}: has {lines} lines, but there is an image {numbers[-1]}.png; copy it again")
+
+    def _poses(self, wanted: str) -> FramePoses:
+        if not wanted:
+            there = [kind for kind, name in POSE_FILES.items() if os.path.isfile(self.folder / name)]
+            wanted = there[0] if there else OXTS
+        if wanted == OXTS:
+            return self._oxts()
+        path = self.folder / POSE_FILES[wanted] if wanted in POSE_FILES else named_file(wanted, self.folder)
+        return read_pose_file(path, len(self))
+
+    def _oxts(self) -> FramePoses:
+        c = self.calibration
+        if c.T_cam0_velo is None or c.T_velo_imu is None:
+            missing = "calib_velo_to_cam.txt" if c.T_cam0_velo is None else "calib_imu_to_velo.txt"
+            raise SourceError(f"{Path(c.where).parent / missing}: no such file, poses from oxts need it; put it there")
+        data = self.folder / OXTS / "data"
+        if not os.path.isdir(data):
+            raise SourceError(f"{data}: no such folder, and no {REFINED}; put one of them there or name ?poses=FILE")
+        return read_oxts_files([data / f"{i:010d}.txt" for i in range(len(self))], c.T_cam0_velo @ c.T_velo_imu)
+
+
+def _has(folder: Path, pair: str) -> bool:
+    return all(os.path.isdir(folder / f"image_{number:02d}" / "data") for number in PAIRS[pair])
+
+
+def _calibration(drive: Path) -> KittiCalibration:
+    above = drive.resolve().parent
+    return read_raw_calibration(drive if os.path.isfile(drive / CAM_TO_CAM) else above)
+
+
+def _stamps(path: Path) -> list[int]:
+    """Return the times `2011-09-26 14:05:35.913420800` in nanoseconds; raises SourceError with the line."""
+    return [_stamp(line, f"{path}:{n}") for n, line in enumerate(time_lines(path, "drive"), 1)]
+
+
+def _stamp(text: str, where: str) -> int:
+    try:
+        stamp = np.datetime64(text, "ns")
+    except ValueError:
+        stamp = np.datetime64("NaT", "ns")
+    if np.isnat(stamp):
+        raise SourceError(f"{where}: '{text}' is no time like 2011-09-26 14:05:35.913420800; correct the line")
+    return int(stamp.astype(np.int64))

@@ -1,0 +1,227 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Recordings of ground robots in bags of ROS 1 and ROS 2: scans, depth images, odometry, tf."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from stereovox.errors import FrameRefused, SourceError
+from stereovox.frame import Frame, Scan
+from stereovox.se3 import Transform, inverse, rotation_matrix
+from stereovox.sources.bags import open_bag, suffix_of
+from stereovox.sources.bags.depth_topic import DepthTopic, depth_topics, find_depth
+from stereovox.sources.bags.files import BagFile
+from stereovox.sources.bags.poses import topic_poses
+from stereovox.sources.bags.recording import depth_frame, file_part, parse_as
+from stereovox.sources.bags.robot_messages import LaserScan, frame_name
+from stereovox.sources.bags.scans import find_scans, most
+from stereovox.sources.bags.tf import Limits
+from stereovox.sources.base import Lazy
+from stereovox.sources.poses import Poses
+from stereovox.sources.robots.cloud_scan import CloudBand, scan_of_cloud
+from stereovox.sources.robots.frames import FrameOptions, RobotFrames
+from stereovox.sources.tracker import AXES
+
+
+@dataclass(frozen=True)
+class RobotOptions:
+    """What may stand behind the file's name, as in `walk.bag?scan=/front_scan&mount=0.04,0,0.225,0`.
+
+    scan, depth, info, odom, truth: topics of scans (or point clouds), depth images, their CameraInfo, odometry
+        (nav_msgs/Odometry, in place of tf) and true poses of the robot, where they are not found or not the right ones.
+    base_frame, odom_frame: frames of the robot and of its odometry.
+    mount, camera_mount: where lidar and camera sit on the robot, in place of tf: x,y,z in metres, then yaw, pitch and
+        roll in radians, of which the last may be left out. A camera without turn looks forward.
+    axes: `ros` where depth images name the camera's body (x forward) as their frame, not its optical frame.
+    scale: metres per unit of depth (0: as the file says). range_max: metres, in place of what the scans say.
+    max_gap, extrapolate: seconds, see `tf_edge.Limits`.
+    lowest, highest: metres over the floor between which points of a cloud count.
+    """
+
+    scan: str = ""
+    depth: str = ""
+    info: str = ""
+    odom: str = ""
+    truth: str = ""
+    base_frame: str = ""
+    odom_frame: str = ""
+    mount: str = ""
+    camera_mount: str = ""
+    axes: str = "optical"
+    scale: float = 0.0
+    range_max: float = 0.0
+    max_gap: float = Limits().max_gap_s
+    extrapolate: float = Limits().extrapolate_s
+    lowest: float = CloudBand().lowest
+    highest: float = CloudBand().highest
+
+    def __post_init__(self) -> None:
+        for key in ("scale", "range_max", "max_gap", "extrapolate"):
+            if getattr(self, key) < 0:
+                raise SourceError(f"{key}={getattr(self, key):g} must be a positive number")
+        if self.axes not in ("optical", "ros"):
+            raise SourceError(f"axes={self.axes} must be optical or ros")
+        if self.lowest >= self.highest:
+            raise SourceError(f"lowest={self.lowest:g} must be below highest={self.highest:g}")
+        for key in ("mount", "camera_mount"):
+            mounted(key, getattr(self, key))
+
+
+def mounted(key: str, text: str) -> Transform | None:
+    """Return T_base_body of `x,y,z,yaw,pitch,roll`, None for ""; raises SourceError for anything else."""
+    if not text:
+        return None
+    try:
+        numbers = [float(word) for word in text.split(",")]
+    except ValueError:
+        numbers = []
+    if not (3 <= len(numbers) <= 6 and np.isfinite(numbers).all()):
+        raise SourceError(f"{key}={text} must be x,y,z,yaw in metres and radians; pitch and roll may follow")
+    yaw, pitch, roll = (*numbers[3:], 0.0, 0.0, 0.0)[:3]
+    T = np.eye(4)
+    T[:3, :3] = rotation_matrix([0, 0, yaw]) @ rotation_matrix([0, pitch, 0]) @ rotation_matrix([roll, 0, 0])
+    T[:3, 3] = numbers[:3]
+    return T
+
+
+NOWHERE = np.full((4, 4), np.nan)
+T_BODY_OPTICAL = np.eye(4)
+"""An optical frame (z forward) in a body that looks the same way (x forward, z up)."""
+T_BODY_OPTICAL[:3, :3] = AXES["ros"].T
+
+
+class RobotBag:
+    """A ground robot's scans, depth images and odometry in a bag of ROS 1 (`.bag`) or ROS 2.
+
+    Topics are found by their types; where there are several the one with most messages counts, and a note names the
+    others. Scans are those of a lidar (LaserScan), without one what a lidar would see of point clouds.
+
+    World: the frame of the odometry (`odom` in tf); without it poses of a nav_msgs/Odometry topic; without that the
+    robot is taken to stand still, which SLAM can put right. A pose is looked up in tf at the time of the scan or image,
+    interpolated; gaps longer than `max_gap` are not bridged. Sensors that tf does not mount are taken for mounted at
+    the robot's own frame (`base_footprint`, else `base_link`). All that is assumed is told in `notes`.
+
+    Pixels without value are as in `Bag`. At the ends of tf a pose is held for `extrapolate` seconds (`pose_off_ns`).
+    Order: as recorded, which is that of the stamps unless the clock was set back meanwhile.
+    Faults: `unreadable`, `no_pose`, for images also `bad_dtype` and `bad_shape`.
+    Raises SourceError, one line, for files that are empty, damaged or without scans and depth, and for bad options.
+    """
+
+    layout = "a bag with scans or depth images of a robot"
+
+    def __init__(self, where: str | Path):
+        path, options = parse_as(str(where), RobotOptions)
+        file = open_bag(path)
+        self.name, self._options = path.name, options
+        self._depth, depth_notes = _find_depth(file, options)
+        depth_frame_id = frame_name(self._depth.frame_id) if self._depth else ""
+        self._scans, scan_notes = find_scans(file, options.scan, options.range_max, depth_frame_id)
+        if not (self._scans or self._depth):
+            seen = ", ".join(f"{name} ({kind})" for name, kind in sorted(file.types.items())[:5]) or "nothing at all"
+            why = f"{depth_notes[0]}; else" if depth_notes else f"{path}:"
+            raise SourceError(f"{why} no scans, point clouds or depth images in it; it holds {seen}")
+        limits = Limits(options.max_gap, options.extrapolate)
+        chosen = FrameOptions(options.odom, options.base_frame, options.odom_frame, options.truth, limits)
+        scan_frame_id = self._scans.frame_id if self._scans else ""
+        self.where = RobotFrames(file, chosen, (scan_frame_id, depth_frame_id))
+        self._lidar, lidar_notes = self._mount_lidar(scan_frame_id)
+        self._camera, camera_notes = self._mount_camera(depth_frame_id)
+        self.truth: Poses | None = _truth(file, options.truth)
+        self.notes = (*file.notes, *scan_notes, *depth_notes, *self.where.notes, *lidar_notes, *camera_notes)
+        self.scans: Sequence[Scan] = Lazy(self._scan, range(len(self._scans or ())))
+        self.frames: Sequence[Frame] = Lazy(self._frame, range(len(self._depth or ())))
+
+    @classmethod
+    def recognises(cls, where: str) -> bool:
+        """Tell whether `where` is, or by its name should be, a bag; options may follow. Never raises."""
+        return bool(suffix_of(file_part(where)))
+
+    def _mount_lidar(self, frame_id: str) -> tuple[str, tuple[str, ...]]:
+        if not self._scans:
+            return "", ()
+        return self.where.mount(frame_id, "lidar", mounted("mount", self._options.mount), np.eye(4))
+
+    def _mount_camera(self, frame_id: str) -> tuple[str, tuple[str, ...]]:
+        if not self._depth:
+            return "", ()
+        T_frame = T_BODY_OPTICAL if self._options.axes == "optical" else np.eye(4)
+        given = mounted("camera_mount", self._options.camera_mount)
+        camera, notes = self.where.mount(frame_id, "camera", given, T_frame)
+        return camera, (*self._depth.notes, *notes)
+
+    def _scan(self, i: int) -> Scan:
+        topic = self._scans
+        assert topic
+        blank = Scan(
+            np.empty(0, np.float32), 0.0, 0.0, 0.0, 0.0, NOWHERE, stamp_ns=topic.recorded_ns(i), name=topic.name(i)
+        )
+        try:
+            told = topic.read(i)
+            blank = replace(blank, stamp_ns=told.stamp_ns)
+            sensor = self._lidar if told.frame_id == topic.frame_id else told.frame_id
+            T_base, T_odom = (look(sensor, told.stamp_ns) for look in (self.where.in_base, self.where.in_odom))
+            off_ns = self.where.off_ns(sensor, told.stamp_ns)
+        except FrameRefused as refused:
+            return replace(blank, fault=refused.reason, fault_detail=str(refused))
+        if isinstance(told, LaserScan):
+            return posed_scan(told, T_odom, T_base, blank.name, off_ns)
+        band = CloudBand(self._options.lowest, self._options.highest)
+        band = replace(band, range_max=self._options.range_max or band.range_max)
+        flat, T_base_scan = scan_of_cloud(told, T_base, band)
+        return posed_scan(flat, T_odom @ inverse(T_base) @ T_base_scan, T_base_scan, blank.name, off_ns)
+
+    def _frame(self, i: int) -> Frame:
+        images = self._depth
+        assert images
+        name = f"{self.where.path} {images.topic} message {i}"
+        frame = depth_frame(images, i, name, self._camera_pose, images.camera, self._options.scale)
+        return frame if frame.fault else replace(frame, pose_off_ns=self.where.off_ns(self._camera, frame.stamp_ns))
+
+    def _camera_pose(self, stamp_ns: int) -> Transform:
+        T = self.where.in_odom(self._camera, stamp_ns)
+        return T if self._options.axes == "optical" else T @ T_BODY_OPTICAL
+
+
+def posed_scan(told: LaserScan, T_odom_sensor: Transform, T_base_sensor: Transform, name: str, off_ns: int) -> Scan:
+    """Return a message as a scan. off_ns: as `Scan.pose_off_ns`."""
+    angles = told.angle_min, told.angle_step
+    limits = told.range_min, told.range_max
+    return Scan(
+        told.ranges, *angles, *limits, T_odom_sensor, T_base_sensor, stamp_ns=told.stamp_ns, name=name,
+        pose_off_ns=off_ns,
+    )  # fmt: skip
+
+
+def _find_depth(file: BagFile, options: RobotOptions) -> tuple[DepthTopic | None, tuple[str, ...]]:
+    """Return the depth images that are named, or else the topic with most, and notes; None where there are none.
+
+    Without being asked for, images that cannot be used (without CameraInfo) only make a note.
+    """
+    if options.depth:
+        return find_depth(file, options.depth, options.info), ()
+    found, notes = depth_topics(file), ()
+    if not found:
+        return None, ()
+    best = most(file, found)
+    if len(found) > 1:
+        others = ", ".join(name for name in found if name != best)
+        notes = (f"{file.path}: depth images of {best}; there are {others} too: say ?depth=/topic for those",)
+    try:
+        return find_depth(file, best, options.info), notes
+    except SourceError as error:
+        if options.info:
+            raise
+        return None, (f"{error}; depth images are left out",)
+
+
+def _truth(file: BagFile, topic: str) -> Poses | None:
+    if not topic:
+        return None
+    found = topic_poses(file, topic)
+    if not isinstance(found.poses, Poses):
+        raise SourceError(f"{file.path}: {topic}: not one pose can be read; name another with ?truth=/topic")
+    return found.poses

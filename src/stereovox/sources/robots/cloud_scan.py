@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a 2-D lidar would see of a point cloud."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.se2 import flattened, lifted
+from stereovox.se3 import Transform, inverse, transform_points
+from stereovox.sources.bags.robot_messages import LaserScan, PointCloud
+
+
+@dataclass(frozen=True)
+class CloudBand:
+    """Which points of a cloud count, in the robot's frame.
+
+    lowest, highest: metres over the floor. range_min, range_max: metres from the sensor, seen from above; nearer points
+    are the robot's own and do not count. step: width of a beam in radians, about.
+    """
+
+    lowest: float = 0.1
+    highest: float = 1.8
+    range_min: float = 0.1
+    range_max: float = 20.0
+    step: float = math.radians(0.5)
+
+
+def scan_of_cloud(cloud: PointCloud, T_base_sensor: Transform, band: CloudBand) -> tuple[LaserScan, Transform]:
+    """Return the scan all round, and T_base_scan: its frame is upright and stands where the sensor does.
+
+    A beam has the distance of its nearest point in the band; +inf where that is `range_max` or more; NaN where there is
+    no point, since a cloud does not tell why.
+    """
+    points = transform_points(T_base_sensor, cloud.points[np.isfinite(cloud.points).all(axis=1)])
+    T_base_scan = lifted(flattened(T_base_sensor))
+    T_base_scan[2, 3] = T_base_sensor[2, 3]
+    points = points[(points[:, 2] >= band.lowest) & (points[:, 2] <= band.highest)]
+    x, y, _ = transform_points(inverse(T_base_scan), points).T
+    count = max(round(2 * np.pi / band.step), 1)
+    step = 2 * np.pi / count
+    ranges = nearest(np.hypot(x, y), np.arctan2(y, x), count, band)
+    scan = LaserScan(cloud.stamp_ns, cloud.frame_id, -np.pi, step, band.range_min, band.range_max, ranges)
+    return scan, T_base_scan
+
+
+def nearest(
+    distance: NDArray[np.float64], angle: NDArray[np.float64], count: int, band: CloudBand
+) -> NDArray[np.float32]:
+    """Return (count,) float32 ranges of beams that begin backwards (-pi), the nearest point of each."""
+    beams = np.rint((angle + np.pi) * count / (2 * np.pi)).astype(np.int64) % count
+    ranges = np.full(count, np.inf)
+    far_enough = distance >= band.range_min
+    np.minimum.at(ranges, beams[far_enough], distance[far_enough])
+    seen = np.bincount(beams[far_enough], minlength=count) > 0
+    return np.where(seen, np.where(ranges < band.range_max, ranges, np.inf), np.nan).astype(np.float32)

@@ -1,0 +1,158 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where a recorded robot stood and where its sensors sit: from tf, an odometry topic, options, or assumed."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from stereovox.errors import FrameRefused, SourceError, did_you_mean
+from stereovox.se3 import Transform
+from stereovox.sources.bags.files import BagFile
+from stereovox.sources.bags.robot_messages import frame_name
+from stereovox.sources.bags.scans import first_odometry, odometry_edge, odometry_topic
+from stereovox.sources.bags.tf import Edge, Limits, Tf, read_tf
+
+BASES = ("base_footprint", "base_link")
+"""Frames taken for the robot, the first that is connected with its sensors: REP 120 and REP 105."""
+ODOMS = ("odom", "odom_combined")
+Notes = tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class FrameOptions:
+    """Names that were given; "" to look for them. odom: topic of nav_msgs/Odometry; truth: one that is not odometry."""
+
+    odom: str = ""
+    base_frame: str = ""
+    odom_frame: str = ""
+    truth: str = ""
+    limits: Limits = field(default_factory=Limits)
+
+
+class RobotFrames:
+    """Poses of a robot's sensors in the world of its odometry.
+
+    sensors: frames that the sensors name, "" where they name none; they help to choose the robot's own.
+    tf: all transforms; empty without /tf. `mount` adds what is assumed.
+    base, odom: frames of the robot and of its odometry; odom is "" where the robot is taken to stand still. notes: what
+    had to be assumed.
+    Raises SourceError, one line, for topics and frames that were given and are not there.
+    """
+
+    def __init__(self, file: BagFile, options: FrameOptions, sensors: tuple[str, ...]):
+        self.path = file.path
+        self.tf = read_tf(file, options.limits) or Tf(f"{file.path}", options.limits)
+        self._sensors = [sensor for sensor in sensors if sensor in self.tf.frames]
+        topic, noted = odometry_topic(file, options.odom, options.truth)
+        first = first_odometry(file, topic) if topic else None
+        self.base, based = self._find_base(frame_name(options.base_frame), first.child if first else "")
+        self._edge: Edge | None = None
+        self.odom, how = "" if options.odom else self._odom_in_tf(frame_name(options.odom_frame), bool(first)), ()
+        if not self.odom and first and topic:
+            child, said = self._body(first.child, topic)
+            self._edge = odometry_edge(file, topic, first.parent or ODOMS[0], child)
+            self.odom, how = self._edge.parent, (*noted, *said)
+        if not self.odom:
+            self.odom, how = self._anything_moving()
+        self.notes = (*based, *how, *self.tf.notes)
+
+    def mount(self, sensor: str, alias: str, given: Transform | None, T_frame: Transform) -> tuple[str, Notes]:
+        """Return the frame in which a sensor's poses can be looked up, and notes.
+
+        given: T_base_body of the options, which counts before tf. T_frame: T_body_sensor of a frame that tf does not
+        know (for a camera its optical frame). alias: what to call the sensor.
+        """
+        if given is not None:
+            self.tf.add_fixed(self.base, f"{alias}?", given @ T_frame)
+            return f"{alias}?", ()
+        if sensor and (sensor == self.base or self.tf.connected(self.base, sensor)):
+            return sensor, ()
+        known = sensor in self.tf.frames
+        try:
+            top = self.tf.root(sensor) if known else sensor or alias
+        except FrameRefused:  # a loop: what needs it is refused
+            return sensor, ()
+        self.tf.add_fixed(self.base, top, np.eye(4) if known else T_frame)
+        option = "mount" if alias == "lidar" else f"{alias}_mount"
+        said = f"nothing tells where the {alias} ({top}) sits on the robot: taken for {self.base} itself"
+        return sensor or alias, (f"{self.path}: {said}; give ?{option}=x,y,z,yaw",)
+
+    def in_base(self, sensor: str, stamp_ns: int) -> Transform:
+        """Return T_base_sensor at a time; raises FrameRefused `no_pose`."""
+        return self._between(self.base, sensor, stamp_ns)
+
+    def in_odom(self, sensor: str, stamp_ns: int) -> Transform:
+        """Return T_odom_sensor at a time; raises FrameRefused `no_pose`."""
+        if self._edge:
+            T_odom_child = self._edge.at(int(stamp_ns), self.tf.limits, f"{self.path}")
+            return T_odom_child @ self._between(self._edge.child, sensor, stamp_ns)
+        return self._between(self.odom or self.base, sensor, stamp_ns)
+
+    def off_ns(self, sensor: str, stamp_ns: int) -> int:
+        """Return how far `in_odom` extrapolates; raises FrameRefused `no_pose` as it does."""
+        target, off = (self._edge.child, self._edge.off_ns(stamp_ns)) if self._edge else (self.odom or self.base, 0)
+        return off if target == sensor else max(off, self.tf.off_ns(target, sensor, stamp_ns))
+
+    def _between(self, target: str, source: str, stamp_ns: int) -> Transform:
+        return np.eye(4) if target == source else self.tf.lookup(target, source, stamp_ns)
+
+    def _find_base(self, given: str, child: str) -> tuple[str, Notes]:
+        """Return the robot's frame; child: the frame whose pose the odometry topic tells."""
+        if given:
+            if self.tf.frames and given not in {*self.tf.frames, child}:
+                known = did_you_mean(given, self.tf.frames)
+                raise SourceError(f"{self.path}: base_frame={given} is in no transform{known}")
+            return given, ()
+        for name in BASES:
+            if found := self._named(name, "base_frame"):
+                return found, ()
+        if child or not self._sensors or not self._moved(self._sensors[0]):
+            return child or "base_link", ()
+        said = f"no {' or '.join(BASES)} in /tf: {self._sensors[0]} is taken for the robot; else give ?base_frame="
+        return self._sensors[0], (f"{self.path}: {said}",)
+
+    def _body(self, child: str, topic: str) -> tuple[str, Notes]:
+        """Return the frame whose pose an odometry topic tells: what it says, where that has to do with the robot."""
+        if child in ("", self.base) or self.tf.connected(child, self.base):
+            return child or self.base, ()
+        return self.base, (f"{self.path}: {topic} tells where {child} is: taken for {self.base}",)
+
+    def _named(self, name: str, option: str) -> str:
+        """Return the frame of that name, or the only one of a namespace (`robot/base_link`), "" where there is none."""
+        near = [frame for frame in self.tf.frames if frame.rpartition("/")[2] == name]
+        near = [frame for frame in near if any(self.tf.connected(frame, other) for other in self._sensors)] or near
+        if len(near) > 1 and name not in near:
+            raise SourceError(f"{self.path}: several robots, say which: ?{option}={f' or ?{option}='.join(near)}")
+        return name if name in near else "".join(near)
+
+    def _odom_in_tf(self, given: str, has_topic: bool) -> str:
+        """Return the odometry's frame where tf connects it with the robot's, else ""."""
+        if not given:
+            names = filter(None, (self._named(name, "odom_frame") for name in ODOMS))
+            return next((name for name in names if self.tf.connected(name, self.base)), "")
+        if self.tf.connected(given, self.base):
+            return given
+        if has_topic and not self.tf.frames:
+            return ""
+        try:
+            self.tf.moving(given, self.base)  # says what is wrong
+        except FrameRefused as refused:
+            raise SourceError(f"{refused}; correct ?odom_frame={given}") from None
+        return given
+
+    def _anything_moving(self) -> tuple[str, Notes]:
+        """Return the root above the robot, where it moves there; else "": it is taken to stand still."""
+        if self.base in self.tf.frames and self._moved(self.base):
+            root = self.tf.root(self.base)
+            said = f"no {ODOMS[0]} in /tf: poses are those of {self.base} in {root}; else give ?odom_frame="
+            return root, (f"{self.path}: {said}",)
+        said = "tells no odometry: the robot is taken to stand still until its way is found (stereovox slam)"
+        return "", (f"{self.path}: {said}",)
+
+    def _moved(self, frame: str) -> bool:
+        try:
+            return self.tf.moving(self.tf.root(frame), frame)
+        except FrameRefused:
+            return False

@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The way that cameras went while they made a map: as many of their poses as are worth to be drawn."""
+
+from __future__ import annotations
+
+import base64
+from array import array
+from dataclasses import dataclass, field
+from math import acos, dist, inf
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.se3 import Transform
+
+SPACING_M = 0.05
+"""A pose is kept when the camera moved so far, or turned by twice as many radians, since the last one."""
+MOST_STOPS = 2048
+"""Poses that are kept of all sensors; where there are more, the spacing doubles."""
+FARTHEST = 1e7
+"""No number of a pose is larger; `depth.prepare` refuses positions beyond a tenth of it."""
+POSE = 12
+
+
+class Seen(NamedTuple):
+    """Where a sensor was and when: pose is the 12 numbers of the upper three rows of T_world_sensor, row by row."""
+
+    stamp_ns: int
+    pose: tuple[float, ...]
+
+
+@dataclass
+class CameraPath:
+    """Poses along the way of each sensor, in the order in which the map took their frames in.
+
+    spacing: metres between two poses, at least, and half of the radians. stops: by sensor; numbers are rounded to
+    float32, as they are saved.
+    """
+
+    spacing: float = SPACING_M
+    stops: dict[str, list[Seen]] = field(default_factory=dict)
+
+    def walk(self, sensor: str, seen: Seen) -> None:
+        """Keep a pose, if it is far enough from the last one of its sensor."""
+        stops = self.stops.setdefault(sensor, [])
+        if stops and not self._is_far(stops[-1], seen):
+            return
+        stops.append(Seen(seen.stamp_ns, tuple(array("f", seen.pose))))
+        while sum(map(len, self.stops.values())) > MOST_STOPS:
+            self.spacing *= 2
+            self.stops = {name: self._thinned(kept) for name, kept in self.stops.items()}
+
+    def poses(self, sensor: str) -> NDArray[np.float64]:
+        """Return T_world_sensor (N, 4, 4) of the kept poses of a sensor."""
+        matrices = np.tile(np.eye(4), (len(self.stops[sensor]), 1, 1))
+        matrices[:, :3] = np.reshape([seen.pose for seen in self.stops[sensor]], (-1, 3, 4))
+        return matrices
+
+    def until(self, stamp_ns: float = inf) -> list[tuple[str, Transform]]:
+        """Return sensor and pose (4, 4) of each stop up to a time in nanoseconds, one sensor after the other."""
+        return [
+            (sensor, pose)
+            for sensor, stops in self.stops.items()
+            for seen, pose in zip(stops, self.poses(sensor), strict=True)
+            if seen.stamp_ns <= stamp_ns
+        ]
+
+    def saved(self) -> dict[str, Any]:
+        """Return what `loaded` reads, as plain values for JSON; numbers are packed, little-endian, in base64."""
+        return {
+            "spacing": self.spacing,
+            "stops": {
+                sensor: {
+                    "stamps_ns": _packed([seen.stamp_ns for seen in stops], "<i8"),
+                    "poses": _packed([seen.pose for seen in stops], "<f4"),
+                }
+                for sensor, stops in self.stops.items()
+            },
+        }
+
+    @classmethod
+    def loaded(cls, saved: Any) -> CameraPath:
+        """Return a path that was saved. Raises KeyError, TypeError or ValueError for what cannot have been saved."""
+        spacing = float(saved["spacing"])
+        if not SPACING_M <= spacing < FARTHEST:
+            raise ValueError(f"camera_path: spacing {spacing:g}")
+        stops = {sensor: _stops_from(one) for sensor, one in saved["stops"].items()}
+        if sum(map(len, stops.values())) > MOST_STOPS:
+            raise ValueError(f"camera_path: more than {MOST_STOPS} poses")
+        return cls(spacing, stops)
+
+    def _is_far(self, before: Seen, now: Seen) -> bool:
+        metres, radians = apart(before.pose, now.pose)
+        return metres >= self.spacing or radians >= 2 * self.spacing
+
+    def _thinned(self, stops: list[Seen]) -> list[Seen]:
+        kept = stops[:1]
+        for seen in stops[1:]:
+            if self._is_far(kept[-1], seen):
+                kept.append(seen)
+        return kept
+
+    def __deepcopy__(self, memo: Any) -> CameraPath:
+        """Return a path that goes on by itself; its poses never change."""
+        return CameraPath(self.spacing, {sensor: stops.copy() for sensor, stops in self.stops.items()})
+
+
+def apart(before: tuple[float, ...], now: tuple[float, ...]) -> tuple[float, float]:
+    """Return how far apart two poses are, in metres and radians."""
+    a, b, c, x, d, e, f, y, g, h, i, z = before
+    p, q, r, u, s, t, k, v, m, n, o, w = now
+    cosine = (a * p + b * q + c * r + d * s + e * t + f * k + g * m + h * n + i * o - 1) / 2
+    return dist((x, y, z), (u, v, w)), acos(min(1.0, max(-1.0, cosine)))
+
+
+def _packed(numbers: Any, dtype: str) -> str:
+    return base64.b64encode(np.asarray(numbers, dtype).tobytes()).decode("ascii")
+
+
+def _unpacked(text: Any, dtype: str) -> NDArray[Any]:
+    if not isinstance(text, str) or len(text) > 8 * POSE * MOST_STOPS:
+        raise ValueError("camera_path: no packed numbers")
+    return np.frombuffer(base64.b64decode(text, validate=True), dtype)
+
+
+def _stops_from(saved: Any) -> list[Seen]:
+    stamps, numbers = _unpacked(saved["stamps_ns"], "<i8"), _unpacked(saved["poses"], "<f4")
+    if len(numbers) != POSE * len(stamps) or not (np.abs(numbers) <= FARTHEST).all():  # False for NaN
+        raise ValueError("camera_path: poses that cannot be")
+    poses = map(tuple, numbers.reshape(-1, POSE).tolist())
+    return [Seen(stamp_ns, pose) for stamp_ns, pose in zip(stamps.tolist(), poses, strict=True)]

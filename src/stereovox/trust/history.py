@@ -1,0 +1,294 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a map remembers of the frames that made it: how many, which were refused and why, and whom it trusted last."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from stereovox.errors import one_line
+from stereovox.trust.camera_path import FARTHEST, CameraPath
+from stereovox.trust.camera_path import Seen as Seen
+
+MOST_SENSORS = 64
+"""Sensors that one map tells apart."""
+MOST_REASONS = 256
+"""Words that refusals are counted by; further ones count as OTHERS."""
+OTHERS = "others"
+NOT_TOLD = "not_told"
+"""How refusals are counted that a map from before reasons were saved only tells the number of."""
+LONGEST_NAME = 256
+EARLIEST, LATEST = -(2**63), 2**63 - 1
+"""Stamps in int64 nanoseconds."""
+
+
+class Streak(NamedTuple):
+    """Refused frames of one sensor that agree with each other: why the first one was, its stamp, and the last one."""
+
+    why: str
+    since_ns: int
+    last: Seen
+
+
+class Look(NamedTuple):
+    """The last image of a sensor: a checksum, and the pose that it was first seen at, as in `Seen`."""
+
+    digest: int
+    pose: tuple[float, ...]
+
+
+class Usual(NamedTuple):
+    """How far the frames of a sensor disagree with the map, 0 to 1: their mean, and how far they are from it."""
+
+    mean: float
+    spread: float
+
+    def after(self, share: float, gain: float) -> Usual:
+        """Return both after one more frame; gain: its part."""
+        off = share - self.mean
+        return Usual(self.mean + gain * off, self.spread + gain * (abs(off) - self.spread))
+
+
+CHANGED, MOVED = "changed", "moved"
+"""Why frames disagree with the map: the world has changed, or the camera was moved."""
+
+
+class Doubt(NamedTuple):
+    """Frames of one sensor that disagree with the map: stamps of the first and the last one, and how many came after
+    the first.
+
+    fits: how many of them would agree if the camera stood elsewhere. verdict: CHANGED or MOVED; "" while they wait.
+    """
+
+    since_ns: int
+    last_ns: int
+    frames: int = 0
+    fits: int = 0
+    verdict: str = ""
+
+    def going_on(self, stamp_ns: int) -> Doubt:
+        """Return the doubt after one more frame."""
+        return self._replace(last_ns=stamp_ns, frames=self.frames + 1)
+
+    def lasted_ns(self, untimed_hz: float) -> int:
+        """Return how long it has lasted; where stamps stand still, or went back, at so many frames a second."""
+        return self.last_ns - self.since_ns if self.last_ns > self.since_ns else round(1e9 * self.frames / untimed_hz)
+
+
+@dataclass
+class History:
+    """What a map remembers of its frames; saved and loaded with it, so that a run may stop and go on anywhere.
+
+    frames: how many are in the map. refused: how many were offered and refused, by reason. settled: how often frames
+    were believed again after a jump, a reset or a disagreement, by its reason. ways: how many frames were looked at how
+    thoroughly, by the name of the way. recording: the name of what the frames came from, if known. last_frame: name and
+    stamp of the one that was offered last.
+    trusted: the last trusted frame of each sensor. waiting: refused frames that may yet be believed, by sensor.
+    path: the way that the sensors of the frames in the map went.
+    looks: the last image of each camera. usual: how far the frames of each camera disagree with the map, 0 to 1.
+    doubts: cameras whose last frames disagree with it more than that.
+    """
+
+    frames: int = 0
+    refused: Counter[str] = field(default_factory=Counter)
+    settled: Counter[str] = field(default_factory=Counter)
+    ways: Counter[str] = field(default_factory=Counter)
+    recording: str = ""
+    last_frame: tuple[str, int] | None = None
+    trusted: dict[str, Seen] = field(default_factory=dict)
+    waiting: dict[str, Streak] = field(default_factory=dict)
+    path: CameraPath = field(default_factory=CameraPath)
+    looks: dict[str, Look] = field(default_factory=dict)
+    usual: dict[str, Usual] = field(default_factory=dict)
+    doubts: dict[str, Doubt] = field(default_factory=dict)
+
+    def offered(self, frame: object) -> None:
+        """Remember which frame was the last."""
+        name, stamp_ns = getattr(frame, "name", ""), getattr(frame, "stamp_ns", 0)
+        whole = int(stamp_ns) if isinstance(stamp_ns, int | np.integer) else 0  # a refused frame may hold anything
+        told = name[:LONGEST_NAME] if isinstance(name, str) else ""
+        self.last_frame = told, min(max(whole, EARLIEST), LATEST)
+
+    def refuse(self, reason: str) -> None:
+        """Count one refused frame."""
+        reason = one_line(str(reason))[:LONGEST_NAME]  # as `loaded` reads it
+        self.refused[reason if reason in self.refused or len(self.refused) < MOST_REASONS else OTHERS] += 1
+
+    def copied(self) -> History:
+        """Return a history that goes on by itself."""
+        return copy.deepcopy(self)
+
+    def saved(self) -> dict[str, Any]:
+        """Return what `loaded` reads, as plain values for JSON."""
+        return {
+            "frames": self.frames,
+            "frames_refused": self.refused.total(),
+            "last_frame": self._last_frame(),
+            "recording": self.recording,
+            "history": {
+                "refused": dict(self.refused),
+                "settled": dict(self.settled),
+                "ways": dict(self.ways),
+                "trusted": {name: _seen_to(seen) for name, seen in self.trusted.items()},
+                "waiting": {
+                    name: {"why": streak.why, "since_ns": streak.since_ns, **_seen_to(streak.last)}
+                    for name, streak in self.waiting.items()
+                },
+                "looks": {name: {"digest": look.digest, "pose": list(look.pose)} for name, look in self.looks.items()},
+                "usual": {name: list(usual) for name, usual in self.usual.items()},
+                "doubts": {name: doubt._asdict() for name, doubt in self.doubts.items()},
+            },
+            "camera_path": self.path.saved(),
+        }
+
+    @classmethod
+    def loaded(cls, saved: dict[str, Any]) -> History:
+        """Return the history that a manifest tells; maps from before there was one have counts only.
+
+        Raises KeyError, TypeError or ValueError for what cannot have been saved.
+        """
+        frames, refused = _whole(saved["frames"], "frames"), _whole(saved["frames_refused"], "frames_refused")
+        recording, last = one_line(str(saved["recording"])), _last_frame_from(saved.get("last_frame"))
+        told, path = saved.get("history"), _path_from(saved.get("camera_path"))
+        if told is None:
+            return cls(
+                frames, Counter({NOT_TOLD: refused} if refused else {}), recording=recording, last_frame=last, path=path
+            )
+        reasons, settled, ways = (_counts(told[name], name) for name in ("refused", "settled", "ways"))
+        trusted = {name: _seen_from(seen) for name, seen in _sensors(told["trusted"]).items()}
+        waiting = {name: _streak_from(streak) for name, streak in _sensors(told["waiting"]).items()}
+        if not waiting.keys() <= trusted.keys():
+            raise ValueError("history.waiting names a sensor that was never trusted")
+        looks = {name: _look_from(look) for name, look in _sensors(told.get("looks", {})).items()}
+        usual = {name: _usual_from(shares) for name, shares in _sensors(told.get("usual", {})).items()}
+        doubts = {name: _doubt_from(doubt) for name, doubt in _sensors(told.get("doubts", {})).items()}
+        history = cls(frames, reasons, settled, ways, recording, last, trusted, waiting, path, looks, usual, doubts)
+        if history.refused.total() != refused:
+            raise ValueError(f"frames_refused is {refused}, its reasons add up to {history.refused.total()}")
+        return history
+
+    def _last_frame(self) -> dict[str, Any] | None:
+        """Return which frame was the last: its number from 1 on, refused ones counted, its name and its stamp."""
+        if self.last_frame is None:
+            return None
+        name, stamp_ns = self.last_frame
+        return {"number": self.frames + self.refused.total(), "name": name, "stamp_ns": stamp_ns}
+
+
+class WithHistory:
+    """What every map tells of the frames that made it."""
+
+    history: History
+
+    def _described(self, sides: Sequence[float], counts: dict[str, int], memory_bytes: int) -> str:
+        """Return what `repr` says of a map whose cells have `sides` in metres."""
+        cells = ", ".join(f"{number:,} {state}" for state, number in counts.items())
+        side = " x ".join(f"{x:g}" for x in sides)
+        made_of = f"{self.history.frames:,} frames, {self.history.refused.total():,} refused"
+        return f"<{type(self).__name__} of {side} m cells: {cells}; {made_of}; {memory_bytes / 1e6:.1f} MB>"
+
+    @property
+    def frames(self) -> int:
+        """Frames that are in the map."""
+        return self.history.frames
+
+    @frames.setter
+    def frames(self, number: int) -> None:
+        self.history.frames = number
+
+    @property
+    def frames_refused(self) -> int:
+        """Frames that were offered and refused; `history.refused` tells why."""
+        return self.history.refused.total()
+
+    @property
+    def recording(self) -> str:
+        """Name of what the frames came from, if known."""
+        return self.history.recording
+
+    @recording.setter
+    def recording(self, name: str) -> None:
+        self.history.recording = name
+
+
+def _seen_to(seen: Seen) -> dict[str, Any]:
+    return {"stamp_ns": seen.stamp_ns, "pose": list(seen.pose)}
+
+
+def _seen_from(saved: Any) -> Seen:
+    return Seen(_whole(saved["stamp_ns"], "history: stamp_ns", EARLIEST), _pose_from(saved["pose"]))
+
+
+def _look_from(saved: Any) -> Look:
+    return Look(_whole(saved["digest"], "history: digest"), _pose_from(saved["pose"]))
+
+
+def _doubt_from(saved: Any) -> Doubt:
+    since_ns, last_ns = (_whole(saved[name], f"history: {name}", EARLIEST) for name in ("since_ns", "last_ns"))
+    frames, fits = (_whole(saved[name], f"history: {name}") for name in ("frames", "fits"))
+    if saved["verdict"] not in ("", CHANGED, MOVED):
+        raise ValueError("history: a doubt has no such verdict")
+    return Doubt(since_ns, last_ns, frames, fits, saved["verdict"])
+
+
+def _usual_from(saved: Any) -> Usual:
+    shares = Usual(*saved)
+    if any(type(share) not in (float, int) or not 0 <= share <= 1 for share in shares):
+        raise ValueError("history: a share is no number from 0 to 1")
+    return shares
+
+
+def _pose_from(pose: Any) -> tuple[float, ...]:
+    if not isinstance(pose, list) or len(pose) != 12 or not all(type(x) in (float, int) for x in pose):
+        raise ValueError("history: a pose is not 12 numbers")
+    numbers = tuple(map(float, pose))
+    if not all(math.isfinite(x) and abs(x) <= FARTHEST for x in numbers):
+        raise ValueError("history: a pose holds NaN, infinity or absurdly large numbers")
+    return numbers
+
+
+def _last_frame_from(saved: Any) -> tuple[str, int] | None:
+    if saved is None:
+        return None
+    return _name(saved["name"]), _whole(saved["stamp_ns"], "last_frame: stamp_ns", EARLIEST)
+
+
+def _path_from(saved: Any) -> CameraPath:
+    """Return where the sensors went; maps from before it was kept do not know."""
+    if saved is None:
+        return CameraPath()
+    return CameraPath.loaded({**saved, "stops": _sensors(saved["stops"])})
+
+
+def _streak_from(saved: Any) -> Streak:
+    return Streak(_name(saved["why"]), _whole(saved["since_ns"], "history: since_ns", EARLIEST), _seen_from(saved))
+
+
+def _sensors(saved: Any) -> dict[str, Any]:
+    if not isinstance(saved, dict) or len(saved) > MOST_SENSORS:
+        raise ValueError(f"history: sensors are no table of at most {MOST_SENSORS}")
+    return {_name(name): value for name, value in saved.items()}
+
+
+def _counts(saved: Any, what: str) -> Counter[str]:
+    if not isinstance(saved, dict) or len(saved) > MOST_REASONS + 1:
+        raise ValueError(f"history.{what} is no table of at most {MOST_REASONS} counts")
+    return Counter({_name(name): _whole(number, f"history.{what}") for name, number in saved.items()})
+
+
+def _name(value: Any) -> str:
+    if not isinstance(value, str) or len(value) > LONGEST_NAME:
+        raise ValueError(f"history: a name is no text of at most {LONGEST_NAME} letters")
+    return one_line(value)
+
+
+def _whole(value: Any, what: str, least: int = 0) -> int:
+    if type(value) is not int or not least <= value <= LATEST:
+        raise ValueError(f"{what} is no whole number from {least} on")
+    return value

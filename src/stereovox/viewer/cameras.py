@@ -1,0 +1,142 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The cameras in the viewer: the last one, the way they went, and from where the page looks at first."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from stereovox.frame import Viewpoint
+from stereovox.maps import State, VoxelMap
+from stereovox.products.floor_axes import upright_axes
+from stereovox.view.drawn import UPS
+from stereovox.view.panels import PATH_COLOUR
+from stereovox.view.space import ABOVE_DEG, BEHIND_DEG
+from stereovox.view.viewpoint import field_of_view
+from stereovox.viewer.cells import rgb
+
+if TYPE_CHECKING:
+    from viser import FrameHandle, ViserServer
+
+AXES_M = 0.3
+FAR = 0.8
+"""How far the page stands from the middle of the map, in diagonals of the map."""
+FRUSTUM_M = 0.15
+"""Depth of the small fields of view along the path."""
+MOST_FRUSTA = 60
+FRUSTA_COLOUR = "#2a78c2"
+
+
+class Cameras:
+    """The last camera, the path of all of them, fields of view along it, and the check boxes for these."""
+
+    def __init__(self, server: ViserServer, voxel_map: VoxelMap):
+        self._server, self._map = server, voxel_map
+        self._roots = {name: server.scene.add_frame(f"/{name}", show_axes=False) for name in ("path", "frusta")}
+        with server.gui.add_folder("Camera"):
+            self.last = server.gui.add_checkbox("last view", True)
+            self.path = server.gui.add_checkbox("path", True)
+            self.frusta = server.gui.add_checkbox("views along the path", False)
+        for box in (self.last, self.path, self.frusta):
+            box.on_update(lambda _: self._draw())
+        self._drawn: FrameHandle | None = None
+        self.take(voxel_map)
+
+    def take(self, voxel_map: VoxelMap) -> None:
+        """Show where the cameras of another map were, which nobody changes from now on."""
+        self._map = voxel_map
+        viewpoint = voxel_map.viewpoint
+        if viewpoint is not None:
+            self._drawn = add_camera(self._server, viewpoint, voxel_map.config.max_range)
+        add_path(self._server, voxel_map)
+        self._draw()
+
+    def _draw(self) -> None:
+        if self._drawn is not None:
+            self._drawn.visible = self.last.value
+        self._roots["path"].visible, self._roots["frusta"].visible = self.path.value, self.frusta.value
+        if self.frusta.value:
+            add_frusta(self._server, self._map)
+
+
+def add_camera(server: ViserServer, viewpoint: Viewpoint, reach_m: float) -> FrameHandle:
+    """Add the camera's axes, its field of view (Chien 2020, Fig 4.7) and its optical axis up to `reach_m` metres."""
+    from viser.transforms import SO3
+
+    T = viewpoint.T_world_camera
+    axes = server.scene.add_frame(
+        "/camera", axes_length=AXES_M, axes_radius=AXES_M / 30, wxyz=SO3.from_matrix(T[:3, :3]).wxyz, position=T[:3, 3]
+    )
+    local = field_of_view(viewpoint._replace(T_world_camera=np.eye(4)))
+    red = rgb(PATH_COLOUR)
+    server.scene.add_line_segments("/camera/field_of_view", local, red, thickness=3, thickness_units="screen")
+    axis = np.array([[[0, 0, 0], [0, 0, reach_m]]], float)
+    server.scene.add_line_segments("/camera/optical_axis", axis, red, thickness=1, thickness_units="screen")
+    return axes
+
+
+def add_path(server: ViserServer, voxel_map: VoxelMap) -> None:
+    """Add a line along the way of each sensor; one that a map no longer has goes."""
+    path = voxel_map.history.path
+    lines = [np.stack([p[:-1, :3, 3], p[1:, :3, 3]], axis=1) for p in map(path.poses, path.stops)]
+    segments = np.concatenate([np.empty((0, 2, 3)), *lines])
+    if len(segments):
+        server.scene.add_line_segments("/path/line", segments, rgb(PATH_COLOUR), thickness=3, thickness_units="screen")
+    else:
+        _remove(server, "/path/line")
+
+
+def add_frusta(server: ViserServer, voxel_map: VoxelMap) -> None:
+    """Add small fields of view at places along the path, all like that of the last camera."""
+    stops, viewpoint = voxel_map.history.path.until(), voxel_map.viewpoint
+    if viewpoint is None or not stops:
+        return _remove(server, "/frusta/views")
+    some = stops[:: -(-len(stops) // MOST_FRUSTA)]
+    lines = [field_of_view(viewpoint._replace(T_world_camera=pose), FRUSTUM_M) for _, pose in some]
+    server.scene.add_line_segments(
+        "/frusta/views", np.concatenate(lines), rgb(FRUSTA_COLOUR), thickness=1.5, thickness_units="screen"
+    )
+
+
+def _remove(server: ViserServer, name: str) -> None:
+    node = server.scene.get_handle_by_name(name)
+    if node is not None:
+        node.remove()
+
+
+def first_look(voxel_map: VoxelMap, up: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return from where the page looks at first, and at what: (3,) each in metres.
+
+    It looks from behind the depth camera and above at the middle of the camera and the occupied cells, or of all
+    cells if none is occupied; a few far outliers do not count.
+    """
+    cells = voxel_map.cells_in(State.OCCUPIED)
+    centres = voxel_map.centers(cells if len(cells) else voxel_map.cells()[0])
+    if not len(centres):
+        return np.array([3.0, 3.0, 3.0]), np.zeros(3)
+    low, high = np.percentile(centres, [0.5, 99.5], axis=0)
+    upwards = up_vector(up)
+    back = -np.eye(3)[UPS[up][1]]
+    if voxel_map.viewpoint is not None:
+        T = voxel_map.viewpoint.T_world_camera
+        low, high, behind = np.minimum(low, T[:3, 3]), np.maximum(high, T[:3, 3]), -T[:3, 2]
+        level = behind - (behind @ upwards) * upwards
+        back = level / np.linalg.norm(level) if np.linalg.norm(level) > 0.1 else back  # it may look straight down
+    aside, above = np.radians(BEHIND_DEG), np.radians(ABOVE_DEG)
+    level = np.cos(aside) * back + np.sin(aside) * np.cross(upwards, back)
+    look_at = (low + high) / 2
+    distance = max(FAR * float(np.linalg.norm(high - low)), 1.0)
+    return look_at + distance * (np.cos(above) * level + np.sin(above) * upwards), look_at
+
+
+def up_vector(up: str) -> NDArray[np.float64]:
+    """Return the unit vector (3,) of an axis name such as `z` or `-y`."""
+    return upright_axes(up)[2]
+
+
+def as_tuple(vector: ArrayLike) -> tuple[float, float, float]:
+    """Return a vector (3,) as three floats."""
+    x, y, z = (float(value) for value in np.asarray(vector))
+    return x, y, z

@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The depth image of one frame in the viewer's panel, and a line about it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.config import Config
+from stereovox.depth import DepthPath
+from stereovox.errors import FrameRefused
+from stereovox.frame import AnyFrame, DepthImage, Frame, Reason, StereoFrame, UpdateReport, name_of
+from stereovox.view.plain import colour_depth
+from stereovox.viewer.panel import plain
+
+if TYPE_CHECKING:
+    from viser import ViserServer
+
+REASON_COLOURS = {
+    Reason.UNMATCHED: "#1a1a1a",
+    Reason.TOO_NEAR: "#e6399b",
+    Reason.TOO_FAR: "#cfe3f7",
+    Reason.MASKED: "#b9a16b",
+    Reason.UNKNOWN: "#7d7d7d",
+}
+SHARED = "near red, far blue"
+WIDEST_PX = 480
+
+
+def depth_picture(image: DepthImage, max_range: float) -> NDArray[np.uint8]:
+    """Return a depth image as RGB (rows, columns, 3), at most `WIDEST_PX` wide: near red, far blue, else the reason.
+
+    max_range: metres; what is farther has the colour of that distance.
+    """
+    step = -(-image.depth_m.shape[1] // WIDEST_PX)
+    depth_m, reason = image.depth_m[::step, ::step], image.reason[::step, ::step]
+    picture = colour_depth(np.where(reason == Reason.VALID, depth_m, np.nan), max_range)
+    for why, colour in REASON_COLOURS.items():
+        picture[reason == why] = tuple(bytes.fromhex(colour[1:]))
+    return picture
+
+
+def reasons_key() -> str:
+    """Return a line of HTML that tells what the colours mean."""
+    swatch = '<span style="display:inline-block;width:.8em;height:.8em;border:1px solid #888;background:{}"></span> {}'
+    words = [swatch.format(colour, why.name.lower().replace("_", " ")) for why, colour in REASON_COLOURS.items()]
+    body = " &nbsp; ".join([SHARED, *words])
+    return f'<div style="font-size:.75em;line-height:1.7;padding:0 1em .6em">{body}</div>'
+
+
+EMPTY = np.full((180, 240, 3), 128, np.uint8)
+
+
+class FramePanel:
+    """The depth image as the map saw it; image and told: what the page shows."""
+
+    def __init__(self, server: ViserServer, config: Config):
+        self._config, self._path = config, DepthPath(config)
+        self.image = server.gui.add_image(EMPTY, format="jpeg", jpeg_quality=85)
+        server.gui.add_html(reasons_key())
+        self.told = server.gui.add_markdown("")
+
+    def show(self, frame: AnyFrame, words: str) -> None:
+        """Show the depth image of a frame, which may be one that is refused, with `words` below."""
+        try:
+            image = self._path.image(self._path.matched(frame))
+            self.image.image = depth_picture(image, self._config.max_range)
+        except FrameRefused:
+            self.image.image = EMPTY
+        self.told.content = words
+
+
+def frame_words(frame: AnyFrame, report: UpdateReport | None) -> str:
+    """Return name and fate of a frame, or of what was offered as one, as Markdown."""
+    called = name_of(frame) if isinstance(frame, Frame | StereoFrame) else type(frame).__name__
+    name = plain(str(called).rpartition("/")[2])
+    if report is None:
+        return name
+    return f"{name}: {plain(report.detail)}" if report.refused else f"{name}: {report.cells:,} cells changed"

@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A map that grows, on a page: shown as often as mapping can spare the time."""
+
+from __future__ import annotations
+
+import threading
+import warnings
+from collections import deque
+from time import monotonic
+from typing import Any
+
+from stereovox.frame import AnyFrame, UpdateReport
+from stereovox.mapper import Mapper
+from stereovox.maps import VoxelMap
+from stereovox.maps.cubes import in_cubes
+from stereovox.trust.history import History
+from stereovox.viewer.frame import FramePanel, frame_words
+from stereovox.viewer.panel import plain
+from stereovox.viewer.serve import HERE, PORT
+from stereovox.viewer.viewer import open_viewer
+
+LEAST_S = 0.5
+"""Seconds from one picture to the next, at least."""
+COPY_REST, DRAW_REST = 25, 4
+"""Times as long as a copy, and as a drawing, took must pass before the next: at most 4 % of mapping, 20 % of a core."""
+PATIENCE_S = 10.0
+
+
+class LiveView:
+    """A page that shows the map of a `Mapper` while it grows. Give each frame to `add` instead of the mapper's.
+
+    Between two frames the map is copied, and the page is drawn from the copy in a thread of its own: nothing reads
+    the map while a kernel writes it. viewer: the page, as `open_viewer` makes it with these arguments.
+    """
+
+    def __init__(
+        self, mapper: Mapper, name: str = "live map", host: str = HERE, port: int = PORT, token: str | None = None
+    ):
+        self._mapper = mapper
+        self.viewer = open_viewer(_copy(mapper), name, host, port, token=token)
+        gui = self.viewer.server.gui
+        with gui.add_folder("Now", order=0.5):
+            self.frame = FramePanel(self.viewer.server, mapper.config)
+        self._arrivals: deque[float] = deque(maxlen=200)
+        self._due = 0.0
+        self._last: tuple[AnyFrame, UpdateReport] | None = None
+        self._waiting: tuple[VoxelMap, AnyFrame, str] | None = None
+        self._ask, self._free, self._stopped = (threading.Event() for _ in range(3))
+        self._free.set()
+        self._thread = threading.Thread(target=self._run, name="stereovox-live-view", daemon=True)
+        self._thread.start()
+
+    @property
+    def url(self) -> str:
+        """Where the page is."""
+        return self.viewer.url
+
+    def add(self, frame: AnyFrame) -> UpdateReport:
+        """Take a frame into the map, as `Mapper.add`, and show it when it is time."""
+        report = self._mapper.add(frame)
+        self.after(frame, report)
+        return report
+
+    def after(self, frame: AnyFrame, report: UpdateReport) -> None:
+        """Show the map if it is time; to be called between frames, from the thread that maps."""
+        start = monotonic()
+        self._arrivals.append(start)
+        self._last = frame, report
+        if start >= self._due and self._free.is_set() and not self._stopped.is_set():
+            self._hand_over(frame, report)
+            done = monotonic()
+            self._due = done + max(LEAST_S, COPY_REST * (done - start))
+
+    def finish(self) -> None:
+        """Show the map as it is now, whole; to be called when the last frame is in it."""
+        if self._stopped.is_set():
+            return
+        self._free.wait(PATIENCE_S)
+        if self._last is not None:
+            self._hand_over(*self._last)
+
+    def close(self) -> None:
+        """Take the page down."""
+        self._stopped.set()
+        self._ask.set()
+        self._thread.join()
+        self.viewer.close()
+
+    def __enter__(self) -> LiveView:
+        """Return itself."""
+        return self
+
+    def __exit__(self, *_: Any) -> None:
+        """Take the page down."""
+        self.close()
+
+    def _hand_over(self, frame: AnyFrame, report: UpdateReport) -> None:
+        copy = _copy(self._mapper)
+        waiting = copy, frame, f"{frame_words(frame, report)}\n\n{self._pace(copy.history)}"
+        self._free.clear()
+        self._waiting = waiting
+        self._ask.set()
+
+    def _run(self) -> None:
+        """Draw what is handed over; then leave the machine to the mapping for a while."""
+        while True:
+            self._ask.wait()
+            self._ask.clear()
+            if self._stopped.is_set() or self._waiting is None:
+                return
+            start = monotonic()
+            try:
+                self._draw(*self._waiting)
+            except Exception as error:  # whatever breaks a picture, the next one may be drawn, and mapping goes on
+                warnings.warn(f"the live view could not be drawn ({type(error).__name__}: {error})", stacklevel=1)
+            self._stopped.wait(min(DRAW_REST * (monotonic() - start), PATIENCE_S / 2))
+            self._free.set()
+
+    def _draw(self, voxel_map: VoxelMap, frame: AnyFrame, words: str) -> None:
+        self.frame.show(frame, words)
+        self.viewer.take(voxel_map)
+        self.viewer.follow()
+
+    def _pace(self, history: History) -> str:
+        """Return how mapping fares, as Markdown."""
+        times, health = self._arrivals, self._mapper.health()
+        rate = (len(times) - 1) / max(times[-1] - times[0], 1e-9)
+        rows = [
+            ("frames a second", f"{rate:.1f}"),
+            ("frames in the map", f"{history.frames:,}"),
+            ("refused", ", ".join(f"{n:,} {plain(why)}" for why, n in history.refused.most_common(5)) or "none"),
+            ("health", plain(health.text)),
+        ]
+        return "\n".join(["| now | |", "|:--|:--|", *(f"| {name} | {value} |" for name, value in rows)])
+
+
+def _copy(mapper: Mapper) -> VoxelMap:
+    return in_cubes(mapper.map.snapshot())

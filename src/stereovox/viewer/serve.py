@@ -1,0 +1,269 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Serving a page: its addresses, who may look at it, and the server that asks before it answers."""
+
+from __future__ import annotations
+
+import errno
+import io
+import re
+import secrets
+import socket
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, redirect_stdout
+from http import HTTPStatus
+from http.client import HTTPConnection, HTTPException
+from http.cookies import CookieError, SimpleCookie
+from ipaddress import ip_address
+from threading import Lock
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from unittest.mock import patch
+from urllib.parse import parse_qs, urlsplit
+
+from stereovox.errors import MissingExtra, StereovoxError
+
+if TYPE_CHECKING:
+    from viser import ViserServer
+
+HERE, PORT = "127.0.0.1", 8080
+
+
+class Address(NamedTuple):
+    """Where to listen. host: as the user named it; number: the one address of it that is used."""
+
+    host: str
+    number: str
+    port: int
+
+    @property
+    def is_private(self) -> bool:
+        """Whether only this machine can reach it."""
+        return is_loopback(self.number)
+
+
+def is_loopback(number: str) -> bool:
+    """Tell whether an address is one of those that never leave the machine; False for names."""
+    try:
+        return ip_address(number).is_loopback
+    except ValueError:
+        return False
+
+
+def find_address(host: str, port: int) -> Address:
+    """Return where to listen: the first address of `host`, which is asked for once lest the answer change.
+
+    Raises StereovoxError where no page can be served there; viser would take another or wait for ever.
+    """
+    if not 0 <= port <= 65535:
+        raise StereovoxError(f"port {port} does not exist; give one from 0 to 65535")
+    place = f"{host}:{port}"
+    try:
+        if not host:
+            raise OSError("it has no name")
+        family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind, protocol) as probe:
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as the server will
+            probe.bind(address)
+    except (OSError, UnicodeError) as error:
+        cures = {
+            errno.EADDRINUSE: "in use; give another one (--port 8081), or --port 0 for any that is free",
+            errno.EACCES: "reserved; give one above 1023",
+        }
+        if (number := getattr(error, "errno", None)) in cures:
+            raise StereovoxError(f"{place}: this port is {cures[number]}") from None
+        why = getattr(error, "strerror", None) or error
+        raise StereovoxError(f"{place}: no address of this machine ({why}); leave --host out to serve {HERE}") from None
+    return Address(host, str(address[0]), port)
+
+
+def url_of(host: str, port: int, token: str | None = None) -> str:
+    """Return the link to a page; one that is served to everybody is found at localhost."""
+    host = "localhost" if host in ("0.0.0.0", "::") else host
+    place = f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
+    return place if token is None else f"{place}/?token={token}"
+
+
+TOKEN = re.compile(r"[A-Za-z0-9_-]{16,128}")
+"""What fits into a link and a cookie as it is, and cannot be guessed."""
+
+
+class Headers(Protocol):
+    """Headers of a request."""
+
+    def get_all(self, key: str) -> list[str]:
+        """Return all headers of a name, whatever its case."""
+        ...
+
+
+def new_token() -> str:
+    """Return a token that nobody can guess."""
+    return secrets.token_urlsafe(24)
+
+
+def checked_token(token: str) -> str:
+    """Return a token that a user chose; raises StereovoxError for one that is short or does not fit into a link."""
+    if not TOKEN.fullmatch(token):
+        raise StereovoxError(
+            f"a token of {len(token)} characters: give 16 to 128 letters, digits, - or _, or none and one is made"
+        )
+    return token
+
+
+class Guard:
+    """Lets in who knows the token; without one, whoever sits at this machine.
+
+    host: the name or address that is served. A browser is believed only when the page that asks came from here: else
+    any page on the web could read the map through the browser that shows it, or by a name of its own that leads to
+    this machine (DNS rebinding).
+    """
+
+    def __init__(self, host: str, token: str | None):
+        self._host, self._token = host.lower(), token
+
+    def refusal(self, path: str, headers: Headers, port: int) -> str | None:
+        """Return in a line why a request is refused, None where it may pass. path: with its query."""
+        named, origins = headers.get_all("Host"), headers.get_all("Origin")
+        if len(named) != 1:
+            return "one Host header is needed"
+        if any(_place(origin) != named[0].lower() for origin in origins):
+            return "the page that asks came from elsewhere"
+        if self._token is None:
+            return None if self._is_here(named[0]) else "this machine has no such name"
+        offered = [*_in_link(path), *_in_cookies(headers.get_all("Cookie"), _cookie_name(port))]
+        if any(self._is_token(one) for one in offered):
+            return None
+        return "open the link that stereovox printed: it holds the token"
+
+    def cookie(self, path: str, port: int) -> str | None:
+        """Return the header that lets a browser in from now on, for requests whose link holds the token.
+
+        Neither scripts nor other sites ever see it.
+        """
+        if not any(self._is_token(one) for one in _in_link(path)):
+            return None
+        return f"{_cookie_name(port)}={self._token}; Path=/; HttpOnly; SameSite=Strict"
+
+    def _is_token(self, offered: str) -> bool:
+        return self._token is not None and secrets.compare_digest(
+            offered.encode(errors="replace"), self._token.encode()
+        )
+
+    def _is_here(self, named: str) -> bool:
+        name = _name(named)
+        return name in ("localhost", self._host) or is_loopback(name)
+
+
+def _place(origin: str) -> str:
+    """Return name and port of an origin; nothing for what is none."""
+    try:
+        return urlsplit(origin).netloc.lower()
+    except ValueError:
+        return ""
+
+
+def _name(host: str) -> str:
+    """Return the name in a Host header, without its port; nothing for what is none."""
+    try:
+        return urlsplit(f"//{host}").hostname or ""
+    except ValueError:
+        return ""
+
+
+def _in_link(path: str) -> list[str]:
+    return parse_qs(path.partition("?")[2]).get("token", [])
+
+
+def _in_cookies(headers: Iterable[str], name: str) -> Iterator[str]:
+    for header in headers:
+        try:
+            found = SimpleCookie(header).get(name)
+        except CookieError:
+            continue
+        if found is not None:
+            yield found.value
+
+
+def _cookie_name(port: int) -> str:
+    """Return a name of its own for each port: browsers show cookies to all ports of a machine."""
+    return f"stereovox_{port}"
+
+
+PATIENCE_S = 5.0
+"""Seconds in which a browser must have said what it wants."""
+ANSWER_S = 60.0
+"""Seconds in which the server must have refused a stranger, however busy the machine is."""
+STRANGER = "stranger.invalid"
+_STARTING = Lock()
+
+
+def serve(name: str, address: Address, guard: Guard) -> ViserServer:
+    """Start a server whose every page, file and websocket is behind `guard`.
+
+    Raises MissingExtra without viser, StereovoxError where the port was taken meanwhile and where this viser does not
+    ask the guard.
+    """
+    try:
+        import viser
+    except ImportError:
+        raise MissingExtra("viser", "viewer") from None
+    with redirect_stdout(io.StringIO()), _guarded(guard):  # viser introduces itself there
+        server = viser.ViserServer(host=address.number, port=address.port, label=name, verbose=False)
+    port = server.get_port()
+    if address.port and port != address.port:
+        stop(server)
+        raise StereovoxError(f"{address.host}:{address.port}: this port is in use; give another one (--port {port})")
+    if not _is_guarded(address.number, port):
+        stop(server)
+        raise StereovoxError(f"viser {viser.__version__} would show the map to anyone; install viser 1.1")
+    return server
+
+
+def stop(server: ViserServer) -> None:
+    """Take the server down."""
+    with redirect_stdout(io.StringIO()):  # viser says goodbye there
+        server.stop()
+
+
+@contextmanager
+def _guarded(guard: Guard) -> Iterator[None]:
+    """While this is open, servers that viser starts ask `guard` first: viser has no way to tell it so."""
+    import websockets.asyncio.server as websockets
+
+    plain = websockets.serve
+
+    def serve_guarded(handler: Callable[..., Any], *place: Any, **options: Any) -> Any:
+        if handler.__module__.partition(".")[0] == "viser":
+            options["process_request"] = _asking(guard, options.get("process_request"))
+            options["open_timeout"] = PATIENCE_S
+        return plain(handler, *place, **options)
+
+    with _STARTING, patch.object(websockets, "serve", serve_guarded):
+        yield
+
+
+def _asking(guard: Guard, answer: Callable[..., Any] | None) -> Callable[..., Any]:
+    def ask(connection: Any, request: Any) -> Any:
+        port = connection.local_address[1]
+        refusal = guard.refusal(request.path, request.headers, port)
+        if refusal is not None:
+            return connection.respond(HTTPStatus.FORBIDDEN, f"stereovox: {refusal}\n")
+        response = None if answer is None else answer(connection, request)
+        if response is not None:
+            response.headers["Referrer-Policy"] = "no-referrer"  # the link holds the token
+            if (cookie := guard.cookie(request.path, port)) is not None:
+                response.headers["Set-Cookie"] = cookie
+        return response
+
+    return ask
+
+
+def _is_guarded(number: str, port: int) -> bool:
+    """Ask as a stranger, whom a guard never lets in."""
+    here = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(number, number)
+    connection = HTTPConnection(here, port, timeout=ANSWER_S)
+    try:
+        connection.request("GET", "/", headers={"Host": STRANGER})
+        return connection.getresponse().status == HTTPStatus.FORBIDDEN
+    except (OSError, HTTPException):
+        return False
+    finally:
+        connection.close()

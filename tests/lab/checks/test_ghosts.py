@@ -1,0 +1,102 @@
+"""A person who passes is forgotten within half a second, and a thin pole that is seen in one frame of three stays."""
+
+from functools import lru_cache
+
+import numpy as np
+import pytest
+
+from stereovox.errors import SourceError
+from stereovox.frame import Reason
+from stereovox.lab.checks.ghosts import ghosts, seen_free
+from stereovox.simulate.passer_by import BEFORE, POLE, WALK_X, Passing
+
+SMALL = {"image_width": 160, "pole_m": 0.04}
+
+
+@lru_cache
+def passed(background, **changes):
+    source = Passing(background, **SMALL)
+    return ghosts(source, voxel_size=0.1, **changes)
+
+
+@pytest.mark.parametrize("background", ["near", "far"])
+def test_ghosts_are_gone_within_half_a_second(background):
+    found = passed(background)
+    told = found.as_dict()
+    assert told["cells"] > 500
+    assert told["cleared"] == 1
+    assert told["gone_longest_s"] <= 0.5  # promised; it takes 0.3 s
+    assert told["free_longest_s"] <= 0.7  # by then tentative for a while: what clears faster loses thin poles
+    assert told["after_leaving_s"] <= 0.5
+    assert found.left == found.unseen < 60  # only what stands at the border of the image, where no frame sees through
+    assert found.number.max() > 20
+    assert not found.number[-30:].any()
+    assert told["static_lost"] < 0.01
+
+
+def test_nothing_is_cleared_where_the_camera_does_not_say_why_it_has_no_value():
+    found = passed("silent")
+    assert found.after_leaving == np.inf
+    assert found.as_dict()["after_leaving_s"] is None
+    assert found.left > 300
+    assert found.number[-1] > 300
+
+
+@pytest.mark.parametrize("background", ["near", "far", "silent"])
+def test_a_pole_seen_in_one_frame_of_three_stays(background):
+    found = passed(background)
+    assert found.pole_lost < 0.01
+    assert found.pole_free < 0.2
+
+
+def test_figures_fail_where_clearing_or_keeping_breaks():
+    """The same scene under models that clear hardly, and too much: the figures tell both."""
+    source = Passing("near", **SMALL)
+    frames = [source.frame(i) for i in range(len(source))]
+    slow = ghosts(source, frames, voxel_size=0.1, **{"sensor.p_free": 0.48})
+    assert slow.as_dict()["gone_longest_s"] > 0.5
+    eager = ghosts(source, frames, voxel_size=0.1, **{"sensor.p_free": 0.05, "sensor.passes": 1.0})
+    assert eager.pole_lost > 0.2
+
+
+def test_the_scene_is_what_it_says():
+    near, far, silent = (Passing(background, **SMALL) for background in ("near", "far", "silent"))
+    middle = BEFORE + 64
+    assert near.person(BEFORE - 1) is None
+    assert near.person(len(near) - 1) is None
+    assert near.sees_person(middle)
+    assert not near.sees_person(0)
+    assert near.true_depth(middle)[45, 80] == pytest.approx(WALK_X - 0.2, abs=0.05)
+    assert near.true_depth(0)[20, 80] == pytest.approx(4.0)
+    assert np.isinf(far.true_depth(0)[20, 80])
+    seen, unsure = far.frame(0), silent.frame(0)
+    assert (seen.reason[:20, 20:140] == Reason.TOO_FAR).mean() > 0.9
+    assert not (unsure.reason == Reason.TOO_FAR).any()
+    assert (unsure.reason[:20, 20:140] == Reason.UNKNOWN).mean() > 0.9
+    for a, b in zip((seen.depth, seen.reason), (far.frame(0).depth, far.frame(0).reason), strict=True):
+        np.testing.assert_array_equal(a, b)
+    with pytest.raises(SourceError, match="background=fog is unknown; use near or far or silent"):
+        Passing("fog")
+
+
+@pytest.mark.parametrize("missed", ["background", "unmatched"])
+def test_the_pole_is_missed_in_two_frames_of_three(missed):
+    source = Passing("near", missed=missed, **SMALL)
+    camera = source.camera
+    u = round(-POLE[1] / POLE[0] * camera.fx + camera.cx)
+    images = [source.frame(i) for i in range(6)]
+    shown = [image.depth[10:40, u - 3 : u + 4] for image in images]
+    near = [((depth > 0) & (depth < 2000)).any() for depth in shown]
+    assert near == [True, False, False] * 2
+    missing = [(image.reason[10:40, u - 3 : u + 4] == Reason.UNMATCHED).mean() for image in images]
+    assert (missing[1] > 0.2) == (missed == "unmatched")
+
+
+def test_what_a_frame_sees_through():
+    source = Passing("near", **SMALL)
+    points = np.array(
+        [[1.5, 1.0, 1.2], [3.5, 0.05, 1.2], [4.1, 0.05, 1.2], [-1.0, 0.0, 1.2], [*POLE, 1.2], [2.6, 0.0, 1.2]]
+    )
+    assert seen_free(source, 0, points, 0.1, 5.0).tolist() == [True, True, False, False, False, True]
+    assert seen_free(source, BEFORE + 64, points, 0.1, 5.0).tolist() == [True, False, False, False, False, False]
+    assert not seen_free(source, 0, points, 0.1, 3.0)[1]

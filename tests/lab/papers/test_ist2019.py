@@ -1,0 +1,157 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`stereovox reproduce ist2019` on short drives."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from made_pages import Balanced
+
+from stereovox.cli import main
+from stereovox.formats.map_server import read_map_server
+from stereovox.lab.papers import ist2019, reproduce
+from stereovox.lab.papers.ist.claims import fan_claims
+from stereovox.lab.papers.ist.drives import PLACES, Drive, Extent, record
+from stereovox.lab.papers.ist.fans import DISTANCE, FEW, MANY, simulate
+from stereovox.lab.papers.ist.publish import time_publishing
+from stereovox.lab.papers.ist.survey import survey
+from stereovox.lab.papers.ist.variants import MIDDLE, OURS, THEIRS, VARIANTS
+from stereovox.lab.papers.ist2019 import QUICK, Sizes
+from stereovox.simulate.floors.bag import write_bag
+from stereovox.simulate.floors.floor import Floor
+
+pytest.importorskip("rosbags", reason="needs the extra 'bags'")
+pytest.importorskip("gtsam", reason="needs the extra 'slam'")
+SHORT = "image_width=128&scan_hz=5"
+TINY = Sizes(Extent(f"depth_hz=5&seconds=9&{SHORT}", f"seconds=20&{SHORT}"), VARIANTS[:3], 64)
+
+
+@pytest.fixture(autouse=True)
+def _tiny(monkeypatch):
+    monkeypatch.setattr(ist2019, "QUICK", TINY)
+
+
+def no_outside_link(page: str) -> bool:
+    return not re.search(r"""(src|href)\s*=\s*["'](?!data:)|url\(|@import""", page)
+
+
+def test_both_floors_give_a_page_maps_and_all_numbers(tmp_path):
+    done = []
+    result = reproduce("ist2019", tmp_path, quick=True, progress=lambda *step: done.append(step[:2]))
+    assert done[-1][0] == done[-1][1] == max(counted for counted, _ in done)
+    numbers = json.loads((tmp_path / "numbers.json").read_text())["experiments"]
+    assert list(numbers) == ["simulation", "corridors", "testbed", "table1"]
+    for name in ("corridors", "testbed"):
+        told = numbers[name]["numbers"]
+        assert (told["scans"], told["frames"]) == (45, 45)
+        assert list(told["maps"]) == [THEIRS, OURS, MIDDLE]
+        assert told["slam_way"]["position_rms_m"] < 0.1
+        assert told["amcl_way"]["position_median_m"] < 0.2
+        ours, theirs = told["maps"][MIDDLE], told["maps"][THEIRS]
+        assert ours["figures"]["frames"] > 35  # an image whose middle row shows nothing is refused
+        assert theirs["scores"]["occupied_iou_tolerant"] > 0.3
+        assert theirs["scores"]["distance_m"]["to_reference"]["median"] < 0.1
+        assert set(theirs["of_building"]) == {"lidar", "band", "above"}
+        saved = [read_map_server(tmp_path / f"{name}_{kind}.yaml") for kind in ("reference", "ist2019", "default")]
+        assert {grid.resolution for grid in saved} == {0.02}
+        assert all((grid.cells == 100).sum() > 50 for grid in saved)
+    assert numbers["corridors"]["numbers"]["excluded"]
+    assert not numbers["testbed"]["numbers"]["excluded"]
+    assert numbers["corridors"]["numbers"]["first_scans"] == 100
+    claims = [claim for chapter in numbers.values() for claim in chapter["claims"]]
+    assert result["holds"] == sum(claim["holds"] is True for claim in claims)
+    page = (tmp_path / "report.html").read_text()
+    for text in ("Fig 3", "Fig 4", "Fig 6", "Fig 9", "26.2 %", "30.42 %", "Table I", "0.320", "do not quote it"):
+        assert text in page, text
+    assert page.count("data:image/png") == 1 + 2 * 6
+    assert no_outside_link(page)
+    checker = Balanced()
+    checker.feed(page)
+    assert checker.open == []
+    assert sorted(path.suffix for path in tmp_path.iterdir()) == [".html", ".json"] + [".pgm"] * 8 + [".yaml"] * 8
+
+
+def test_a_bag_of_ones_own_needs_no_truth(tmp_path, capsys):
+    write_bag(Floor(f"sim:floor?plan=testbed&seconds=9&{SHORT}"), tmp_path / "mine.bag")
+    words = ["reproduce", "ist2019", "--data", str(tmp_path / "mine.bag"), "--out", str(tmp_path / "out"), "--quick"]
+    assert main(words) == 0
+    numbers = json.loads((tmp_path / "out/numbers.json").read_text())["experiments"]
+    assert list(numbers) == ["simulation", "own", "table1"]
+    told = numbers["own"]["numbers"]
+    assert told["slam_way"] is None
+    assert told["reference_of_building"] is None
+    assert told["maps"][THEIRS]["scores"]["eq7_percent"] > 0
+    assert {claim["holds"] for claim in numbers["own"]["claims"]} == {None}
+    page = (tmp_path / "out/report.html").read_text()
+    assert "Your recording: mine" in page
+    assert "2 claims do not" not in page
+    own = page.partition("<h2>2. Your recording: mine")[2]
+    assert own
+    assert "as published" not in own
+    assert capsys.readouterr().err
+
+
+@pytest.mark.parametrize("given", ["nowhere.bag", "no_depth.bag", "no_scans.bag"])
+def test_a_bag_that_will_not_do_ends_in_one_line(given, tmp_path, capsys):
+    hz = {"no_depth.bag": "depth_hz=0", "no_scans.bag": "scan_hz=0&image_width=32"}.get(given)
+    if hz:
+        write_bag(Floor(f"sim:floor?seconds=1&{hz}"), tmp_path / given)
+    assert main(["reproduce", "ist2019", "--data", str(tmp_path / given), "--out", str(tmp_path / "out")]) == 2
+    error = capsys.readouterr().err
+    said = {"nowhere.bag": "no such file", "no_depth.bag": "no depth images", "no_scans.bag": "no lidar scans"}[given]
+    assert said in error
+    assert error.count("\n") <= 2  # a word about compiling may stand before
+
+
+def test_the_whole_chain_reaches_its_target(tmp_path):
+    drive = Drive.through(PLACES[1], Extent("speed=1.5&scan_hz=3&depth_hz=2&image_width=160"))
+    found = survey(record(drive, tmp_path), (VARIANTS[0], VARIANTS[2]), tmp_path, lambda: None)
+    theirs, ours = (found.judged[name].scores for name in (THEIRS, MIDDLE))
+    assert max(theirs.eq7_percent, ours.eq7_percent) < 10
+    assert found.reference.way_error.position_rms_m < 0.1
+    assert found.way_error.position_rms_m < 0.1
+    assert theirs.free_iou > 0.9
+    assert theirs.occupied.tolerance_recall > 0.9
+    assert ours.occupied.tolerance_precision > 0.7
+
+
+def test_synthetic_beams_mark_what_the_report_says():
+    steps = []
+    many, few = simulate([DISTANCE] * MANY, lambda: steps.append(1)), simulate(FEW, lambda: steps.append(1))
+    assert len(steps) == 2
+    assert (len(many.scan.ranges), len(few.scan.ranges)) == (700, 10)
+    assert [claim.holds for claim in fan_claims(many, few)] == [True] * 3
+    # counted once more: middles of cells inside the sector
+    y, x = np.mgrid[-200:200, 0:200] * 0.02 + 0.01
+    inside = (np.hypot(x, y) < DISTANCE) & (np.abs(np.degrees(np.arctan2(y, x))) < 57 / 2)
+    assert many.free == pytest.approx(inside.sum(), rel=0.03)
+    assert few.expected_free is None
+    assert few.free == pytest.approx(sum(FEW) / 0.02, rel=0.15)
+    wrong = (replace(many, free=many.free * 2), replace(few, right=0.5))
+    assert [claim.holds for claim in fan_claims(*wrong)] == [False, True, False]
+    assert not fan_claims(replace(many, beyond=1), few)[1].holds
+
+
+def test_what_a_shut_door_closes_off_is_seen_from_the_start_of_the_first_drive():
+    corridors, testbed = (Drive.through(place, Extent("seconds=2", "seconds=2")) for place in PLACES)
+    (x0, y0, x1, y1), start = corridors.floor.behind_door, corridors.first.start
+    assert start[2] == 0
+    (seen,) = corridors.closed_off
+    assert seen == pytest.approx([x0 - start[0], y0 - start[1], x1 - start[0], y1 - start[1]])
+    assert (corridors.floor.options.shut, corridors.first.options.shut) == (True, False)
+    assert testbed.closed_off == []
+    assert testbed.first is testbed.floor
+
+
+def test_publishing_is_timed_and_the_quick_run_is_smaller():
+    published = time_publishing(40)
+    assert published.side == 40
+    assert published.picture > 0
+    assert published.message > 0
+    names = [{one.name for one in sizes.variants} for sizes in (QUICK, Sizes())]
+    assert {THEIRS, OURS, MIDDLE} < names[0] < names[1]
+    assert [(place.error_percent, place.update_s) for place in PLACES] == [(26.2, 0.21), (30.42, 0.32)]

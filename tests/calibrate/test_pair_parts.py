@@ -211,3 +211,14 @@ def test_trembling_is_smoothed_without_delay():
     assert np.std(found[:, :3, 3]) < 0.0012
     angles = Rotation.from_matrix(np.swapaxes(T[50:-50, :3, :3], 1, 2) @ found[:, :3, :3]).magnitude()
     assert angles.max() < 1e-3
+
+
+def test_the_step_between_two_images_of_one_reference_is_seen_from_the_first_of_them():
+    T = np.tile(np.eye(4), (4, 1, 1))
+    T[:, :3, :3] = Rotation.from_euler("zyx", np.arange(12).reshape(4, 3) / 9).as_matrix()
+    T[:, :3, 3] = np.arange(12).reshape(4, 3) ** 2 / 50
+    motion = CameraMotion(np.arange(4), np.array([-1, 0, 0, -1]), T, np.zeros((4, 6, 6)))
+    first, between, lost = motion.steps
+    np.testing.assert_array_equal(first, T[1])
+    np.testing.assert_allclose(T[1] @ between, T[2], atol=1e-12)
+    assert np.isnan(lost).all()

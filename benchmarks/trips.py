@@ -31,7 +31,7 @@ import numpy as np
 from house import house
 
 import stereovox as sv
-from stereovox.sources.robots.robot import open_robot
+from stereovox.opening import open_robot
 
 SOURCE = Path(sv.__file__).parent
 WARM = 8

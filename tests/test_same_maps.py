@@ -33,7 +33,7 @@ import numpy as np
 import pytest
 
 import stereovox as sv
-from stereovox.sources.robots.robot import open_robot
+from stereovox.opening import open_robot
 
 TABLE = Path(__file__).with_name("same_maps.json")
 DATA = Path(__file__).resolve().parents[2] / "shared/data"

@@ -150,7 +150,7 @@ def test_only_kernel_files_change_the_hash(monkeypatch, copied_package):
     here = _jit._source_hash()
     monkeypatch.setattr(_jit, "__file__", str(copied_package / "_jit.py"))
     assert _jit._source_hash() == here
-    for file, renews in (("mapper.py", False), ("integrate/_cells.py", True), ("maps/_blocks.py", True)):
+    for file, renews in (("mapper.py", False), ("integrate/_cells.py", True), ("maps/_pool.py", True)):
         before = _jit._source_hash()
         with (copied_package / file).open("a") as opened:
             opened.write("# a change\n")

@@ -16,10 +16,9 @@ from stereovox.integrate import Integrator
 from stereovox.integrate.views import PerCamera, sensor_table
 from stereovox.maps import State, VoxelMap
 from stereovox.maps.evidence import Evidence
-from stereovox.se3 import Transform, rotation_matrix
+from stereovox.se3 import Transform, apart, rotation_matrix
 from stereovox.sensors import make_sensor
 from stereovox.sensors.model import InverseSensorModel
-from stereovox.trust.camera_path import apart
 from stereovox.trust.gate import Gate, Passed
 
 SURFACES = (State.OCCUPIED, State.TENTATIVE)

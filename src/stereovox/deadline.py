@@ -18,7 +18,7 @@ from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.cameras.rigs import VirtualCamera
 from stereovox.config import Config
 from stereovox.depth import DepthPath
-from stereovox.depth.downsample import downsample, shortened
+from stereovox.depth.prepare import downsample, shortened
 from stereovox.errors import ConfigError, FrameRefused
 from stereovox.frame import AnyFrame, DepthImage, Frame
 from stereovox.integrate import make_integrator

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from math import isfinite
+from math import acos, dist, isfinite
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -108,3 +108,11 @@ def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0, 0, 1)) -> Tra
     T[:3, :3] = np.column_stack([right, np.cross(forward, right), forward])
     T[:3, 3] = eye
     return T
+
+
+def apart(before: tuple[float, ...], now: tuple[float, ...]) -> tuple[float, float]:
+    """Return how far apart two poses are, in metres and radians."""
+    a, b, c, x, d, e, f, y, g, h, i, z = before
+    p, q, r, u, s, t, k, v, m, n, o, w = now
+    cosine = (a * p + b * q + c * r + d * s + e * t + f * k + g * m + h * n + i * o - 1) / 2
+    return dist((x, y, z), (u, v, w)), acos(min(1.0, max(-1.0, cosine)))

@@ -11,13 +11,45 @@ from numpy.typing import NDArray
 from stereovox.cameras.pinhole import DepthCorrection, PinholeCamera
 from stereovox.cameras.rigs import VirtualCamera
 from stereovox.config import Config
-from stereovox.depth import _denoise, _images
-from stereovox.depth.downsample import downsample
+from stereovox.depth import _images
 from stereovox.depth.quality import SPARSE, check_unit
-from stereovox.errors import FrameRefused
+from stereovox.errors import ConfigError, FrameRefused, StereovoxError
 from stereovox.frame import DepthImage, Frame, Reason, name_of
 from stereovox.sensors.noise import RangeNoise
 from stereovox.trust.validate import check_form, for_kernels, rigid_pose
+
+
+def shortened(image: DepthImage, valid_to: float, far_from: float) -> DepthImage:
+    """Return the image with depths up to `valid_to` metres; what is farther than `far_from` is TOO_FAR.
+
+    What lies between the two is UNMATCHED: near enough for its noise to matter, so nothing may be cleared through it.
+    """
+    depth_m, reason = np.empty_like(image.depth_m), np.empty_like(image.reason)
+    given, made = (image.depth_m, image.reason), (depth_m, reason)
+    limits = np.float32(valid_to), np.float32(far_from)
+    _images.shorten(*(array.reshape(-1) for array in given), *limits, *(array.reshape(-1) for array in made))
+    return DepthImage(depth_m, reason, image.camera, image.T_world_sensor, image.stamp_ns)
+
+
+def downsample(image: DepthImage, n: int) -> DepthImage:
+    """Return the image of block minima and its camera; n = 1 returns the image itself.
+
+    A block without any valid pixel is TOO_NEAR where one of its pixels is, TOO_FAR only where all of them are, else
+    MASKED where one is, else UNMATCHED where one is, else UNKNOWN. Blocks at the right and lower border may be cut.
+    Raises ConfigError for a wide camera, FrameRefused `bad_camera` where larger pixels are no pinhole's any more.
+    """
+    if n == 1:
+        return image
+    if not isinstance(image.camera, PinholeCamera):
+        raise ConfigError(f"depth.downsample {n}: a wide camera's image cannot be downsampled; use sphere.step_deg")
+    try:
+        camera = image.camera.binned(n)
+    except StereovoxError as error:
+        raise FrameRefused("bad_camera", f"blocks of {n} by {n} pixels: {error}") from None
+    depth_m = np.empty((camera.height, camera.width), np.float32)
+    reason = np.empty(depth_m.shape, np.uint8)
+    _images.block_minimum(image.depth_m, image.reason, n, np.empty(image.camera.width, np.float32), depth_m, reason)
+    return DepthImage(depth_m, reason, camera, image.T_world_sensor, image.stamp_ns)
 
 
 def corrected(
@@ -103,7 +135,7 @@ def _run(depth_m: NDArray[np.float32], noise: RangeNoise, fine: float, config: C
     rings = np.empty((len(STEPS) + 1, 2 * margin + 1, depth_m.shape[1] + 2 * margin), np.float32)
     coefficients, least = np.array([noise.s0, noise.s1, noise.s2], np.float32), (fine * FROM).astype(np.float32)
     low, high, limit = (np.float32(x) for x in (config.min_range, config.max_range, LIMIT * config.voxel_size))
-    _denoise.denoise(depth_m, coefficients, STEPS, least, WIDTHS, limit, low, high, rings)
+    _images.denoise(depth_m, coefficients, STEPS, least, WIDTHS, limit, low, high, rings)
 
 
 DTYPES = (np.dtype(np.uint16), np.dtype(np.float32), np.dtype(np.float64))

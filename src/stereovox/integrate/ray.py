@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.cameras.rigs import VirtualCamera
 from stereovox.config import Config
-from stereovox.depth.downsample import downsample
+from stereovox.depth.prepare import downsample
 from stereovox.errors import FrameRefused
 from stereovox.frame import DepthImage
 from stereovox.integrate import _lanes, _ray

@@ -15,7 +15,7 @@ from stereovox.cameras.rigs import VirtualCamera
 from stereovox.config import Config
 from stereovox.errors import FrameRefused
 from stereovox.frame import DepthImage
-from stereovox.integrate import _cells, _views
+from stereovox.integrate import _cells
 from stereovox.maps.blocks import CELLS, SIDE
 from stereovox.maps.evidence import to_units
 from stereovox.se3 import Transform
@@ -216,7 +216,7 @@ class Views:
         """Return the view from this pose; `block` is then the block (3,) the camera stands in."""
         view = self._view
         written = view.rotation, view.forward, view.position, view.sides, view.steps
-        _views.aim(np.ascontiguousarray(T_world_camera, float), *self._given, self.block, *written)
+        _cells.aim(np.ascontiguousarray(T_world_camera, float), *self._given, self.block, *written)
         return view
 
 

@@ -8,7 +8,23 @@ a row, a place from there on that of a bare block. The caller has made room.
 import numpy as np
 
 from stereovox._jit import cell, kernel
-from stereovox.maps._cells import EMPTY, copy_row, empty_slot, enter, find, slot_of
+from stereovox.maps._cells import EMPTY, copy_row, empty_slot, enter, find, find_or_insert, slot_of
+
+
+@kernel
+def rebuild_all(table, coords, n):
+    """Enter the first `n` blocks of the pool into an empty hash table."""
+    table[:] = EMPTY
+    for i in range(n):
+        enter(table, coords, i)
+
+
+@kernel
+def insert_all(table, coords, count, wanted, indices):
+    """Find or make every block of `wanted` (n, 3); write pool indices to `indices` (n,)."""
+    for i in range(wanted.shape[0]):
+        indices[i] = find_or_insert(table, coords, count, wanted[i, 0], wanted[i, 1], wanted[i, 2])
+
 
 NOTHING, BARE, ROW = np.uint8(0), np.uint8(1), np.uint8(2)
 """What a block of cells needs: no place at all, as none is known; a bare one, as all are at the floor; a row."""

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from stereovox.maps import _blocks
+from stereovox.maps import _pool
 
 SIDE = 8
 """Cells along each side of a block."""
@@ -65,7 +65,7 @@ class BlockPool:
         self.coords = np.zeros((capacity, 3), np.int32)
         self.values = _filled((capacity, cells), fill, dtype)
         self.table = np.empty(table_size(capacity), np.int32)
-        _blocks.rebuild(self.table, self.coords, 0)
+        _pool.rebuild_all(self.table, self.coords, 0)
 
     def __len__(self) -> int:
         return int(self.count[0])
@@ -84,13 +84,13 @@ class BlockPool:
         self.coords = _grown(self.coords, capacity, len(self), 0)
         self.values = _grown(self.values, capacity, len(self), self.fill)
         self.table = np.empty(table_size(capacity), np.int32)
-        _blocks.rebuild(self.table, self.coords, len(self))
+        _pool.rebuild_all(self.table, self.coords, len(self))
 
     def insert(self, coords: NDArray[np.int32]) -> NDArray[np.int64]:
         """Find or make blocks (n, 3); return their places in the pool (n,)."""
         self.reserve(len(coords))
         places = np.empty(len(coords), np.int64)
-        _blocks.insert_all(self.table, self.coords, self.count, np.ascontiguousarray(coords, np.int32), places)
+        _pool.insert_all(self.table, self.coords, self.count, np.ascontiguousarray(coords, np.int32), places)
         return places
 
     def clear(self) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.config import MapConfig
-from stereovox.maps import _blocks, _pool, _times
+from stereovox.maps import _pool, _times
 from stereovox.maps.blocks import CELLS, BlockPool
 from stereovox.maps.cell_pool import PIECE, CellPool
 from stereovox.maps.evidence import Evidence
@@ -88,7 +88,7 @@ class CellTimes:
         blocks, coords = self._blocks, np.ascontiguousarray(coords[timed], np.int32)
         blocks.reserve(int((self._places(coords) < 0).sum()))
         places = np.empty(len(coords), np.int64)
-        _blocks.insert_all(blocks.table, blocks.coords, blocks.count, coords, places)
+        _pool.insert_all(blocks.table, blocks.coords, blocks.count, coords, places)
         blocks.values[places] = times[timed]
 
     def remove(self, coords: NDArray[np.int32]) -> None:

@@ -6,13 +6,13 @@ from __future__ import annotations
 import base64
 from array import array
 from dataclasses import dataclass, field
-from math import acos, dist, inf
+from math import inf
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox.se3 import Transform
+from stereovox.se3 import Transform, apart
 
 SPACING_M = 0.05
 """A pose is kept when the camera moved so far, or turned by twice as many radians, since the last one."""
@@ -104,14 +104,6 @@ class CameraPath:
     def __deepcopy__(self, memo: Any) -> CameraPath:
         """Return a path that goes on by itself; its poses never change."""
         return CameraPath(self.spacing, {sensor: stops.copy() for sensor, stops in self.stops.items()})
-
-
-def apart(before: tuple[float, ...], now: tuple[float, ...]) -> tuple[float, float]:
-    """Return how far apart two poses are, in metres and radians."""
-    a, b, c, x, d, e, f, y, g, h, i, z = before
-    p, q, r, u, s, t, k, v, m, n, o, w = now
-    cosine = (a * p + b * q + c * r + d * s + e * t + f * k + g * m + h * n + i * o - 1) / 2
-    return dist((x, y, z), (u, v, w)), acos(min(1.0, max(-1.0, cosine)))
 
 
 def _packed(numbers: Any, dtype: str) -> str:

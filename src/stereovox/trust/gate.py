@@ -12,7 +12,7 @@ import numpy as np
 from stereovox.config import Config
 from stereovox.errors import FrameRefused
 from stereovox.frame import AnyFrame, DepthImage, Scan, StereoFrame, name_of
-from stereovox.trust.camera_path import apart
+from stereovox.se3 import apart
 from stereovox.trust.history import (
     CHANGED,
     LONGEST_NAME,

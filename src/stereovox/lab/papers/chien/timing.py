@@ -16,7 +16,7 @@ import numpy as np
 
 from stereovox.config import load_config
 from stereovox.depth import prepare
-from stereovox.depth.downsample import downsample
+from stereovox.depth.prepare import downsample
 from stereovox.evaluate.summary import percentiles
 from stereovox.frame import DepthImage, Frame
 from stereovox.integrate import make_integrator

@@ -10,9 +10,9 @@ from pathlib import Path
 from stereovox.errors import StereovoxError
 from targets import Target
 
-MOST_SECONDS = 1.0
+MAX_SECONDS = 1.0
 """Of processor time, in all threads: a busy machine must not look like a hang."""
-MOST_GROWTH = 1 << 30
+MAX_GROWTH = 1 << 30
 """Bytes by which the peak of the process may grow in one run."""
 
 
@@ -20,7 +20,7 @@ class Unbounded(AssertionError):  # noqa: N818 - reads as what happened
     """A reader took too long or too much."""
 
 
-def check(target: Target, data: bytes, folder: Path, most_seconds: float = MOST_SECONDS) -> str:
+def check(target: Target, data: bytes, folder: Path, most_seconds: float = MAX_SECONDS) -> str:
     """Return `read` or `refused`; raises what the target raised, and Unbounded, where that is not allowed."""
     memory, start = peak_bytes(), time.process_time()
     try:
@@ -32,7 +32,7 @@ def check(target: Target, data: bytes, folder: Path, most_seconds: float = MOST_
             raise AssertionError(f"no single line: {error!r}") from error
     if (took := time.process_time() - start) > most_seconds:
         raise Unbounded(f"took {took:.1f} s")
-    if (grown := peak_bytes() - memory) > MOST_GROWTH:
+    if (grown := peak_bytes() - memory) > MAX_GROWTH:
         raise Unbounded(f"took {grown >> 20} MiB")
     return outcome
 

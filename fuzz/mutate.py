@@ -8,7 +8,7 @@ import re
 import struct
 import zlib
 
-MOST_BYTES = 1 << 16
+MAX_BYTES = 1 << 16
 NUMBER = re.compile(rb"-?\d+(?:\.\d+)?(?:[eE][+-]?\d+)?")
 WORDS = (
     b"nan", b"inf", b"-inf", b"-1", b"0", b"1e308", b"1e-320", b"1e999999999", b"9" * 400, b"0x" + b"f" * 5000,
@@ -27,7 +27,7 @@ def mutated(data: bytes, dice: random.Random) -> bytes:
     changed = bytearray(data)
     for _ in range(dice.choice((1, 1, 1, 2, 3, 5))):
         dice.choice(CHANGES)(changed, dice)
-    return bytes(changed[:MOST_BYTES])
+    return bytes(changed[:MAX_BYTES])
 
 
 def with_right_sums(png: bytes) -> bytes:

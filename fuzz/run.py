@@ -27,7 +27,7 @@ CORPUS = HERE / "corpus"
 PLACES = (HERE, HERE.parent / "tests/sources")
 OWN_SHARE = 20
 """Times that a seed is changed for each time that a file of the corpus is."""
-MOST_KEPT = 10
+MAX_KEPT = 10
 """New crashers of one target after which it is given up."""
 
 
@@ -149,7 +149,7 @@ class Session:
     def is_over(self) -> bool:
         """Tell whether it was enough."""
         late = time.monotonic() - self.start > self.arguments.seconds
-        return late or self.counts["runs"] >= self.arguments.runs or len(self.said) >= MOST_KEPT
+        return late or self.counts["runs"] >= self.arguments.runs or len(self.said) >= MAX_KEPT
 
     def one(self, data: bytes) -> None:
         """Run once, and keep what must not happen."""

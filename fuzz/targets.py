@@ -54,7 +54,7 @@ from stereovox.sources.robots.bag import RobotBag
 from stereovox.sources.robots.carmen import CarmenLog
 from stereovox.sources.tracker import read_tracker
 
-MOST_FRAMES = 20
+MAX_FRAMES = 20
 SIZE = (16, 12)
 POSES = "# stamp tx ty tz qx qy qz qw\n" + "".join(f"{k / 10:.9f} {k} 0 1 0 0 0.1 1\n" for k in range(4))
 KALIBR = """cam0: &left
@@ -132,7 +132,7 @@ def file_target(name: str, reader: Callable[[Path], Any], *seeds: str | bytes) -
 
 def frames_of(source: Any) -> None:
     """Take the first frames; a fault is told in one line, and a frame without one has an image of its camera's size."""
-    for i in range(min(len(source), MOST_FRAMES)):
+    for i in range(min(len(source), MAX_FRAMES)):
         frame = source.frame(i) if hasattr(source, "frame") else source[i]
         assert frame.fault_detail.isprintable(), "a fault of several lines"
         if frame.fault is None and hasattr(frame, "depth"):

@@ -6,8 +6,8 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 
-LONGEST_WORD = 100
-LONGEST_LINE = 10_000
+MAX_WORD_LENGTH = 100
+MAX_LINE_LENGTH = 10_000
 """Characters of a word that is compared, and of a message; those of a file may be many more."""
 
 
@@ -53,8 +53,8 @@ class FrameRefused(StereovoxError):  # noqa: N818 - reads as what happened
 
 def one_line(text: str) -> str:
     """Return `text` with what is not printable (line ends, colours of a terminal) written out, and its middle cut."""
-    if len(text) > LONGEST_LINE:
-        text = f"{text[: LONGEST_LINE // 2]} ... {text[-LONGEST_LINE // 2 :]}"
+    if len(text) > MAX_LINE_LENGTH:
+        text = f"{text[: MAX_LINE_LENGTH // 2]} ... {text[-MAX_LINE_LENGTH // 2 :]}"
     return text if text.isprintable() else "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 
@@ -64,7 +64,7 @@ def did_you_mean(word: str, known: Iterable[str], prefix: str = "") -> str:
     prefix: what stands before each word where it is shown, but says nothing about which is near (`--`).
     """
     known = sorted(known)
-    close = difflib.get_close_matches(word[:LONGEST_WORD], known, n=1)
+    close = difflib.get_close_matches(word[:MAX_WORD_LENGTH], known, n=1)
     if close:
         return f" (did you mean '{prefix}{close[0]}'?)"
     return f" (known: {', '.join(prefix + name for name in known)})" if known else ""

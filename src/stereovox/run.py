@@ -32,7 +32,7 @@ from stereovox.maps.lock import only_writer_in
 from stereovox.maps.store import check_target, is_map, read_manifest, remove_map, sweep
 from stereovox.opening import Stream
 from stereovox.safe_io import check_in_space
-from stereovox.trust.history import LONGEST_NAME
+from stereovox.trust.history import MAX_NAME_LENGTH
 
 SeenT = TypeVar("SeenT")
 MapT = TypeVar("MapT", VoxelMap, GridMap)
@@ -235,7 +235,7 @@ class MapRun:
         if self.source.length is None or last is None:  # a live camera; a map from before this was saved
             return
         there = next(iter(self.source.after(done - 1)))
-        if (one_line(there.name[:LONGEST_NAME]), there.stamp_ns) != last:
+        if (one_line(there.name[:MAX_NAME_LENGTH]), there.stamp_ns) != last:
             raise StereovoxError(
                 f"{self.out}: its frame {done} was '{last[0]}', here it is '{there.name}'; choose frames as "
                 "before, or start anew without resume"

@@ -166,23 +166,23 @@ def _array(file: zipfile.ZipFile, name: str, size: int) -> NDArray[Any]:
     return np.frombuffer(data, dtype, offset=stream.tell()).reshape(shape)
 
 
-MOST_LIST = 1 << 28
+MAX_LIST = 1 << 28
 """Bytes of a list with a line for each image or pose."""
-MOST_SETTINGS = 1 << 16
+MAX_SETTINGS = 1 << 16
 """Bytes of a file of settings, or of one calibration."""
-MOST_YAML = 1 << 14
+MAX_YAML = 1 << 14
 """Bytes of a small YAML file: reading takes 20 us for each."""
-MOST_DOTS = 200
+MAX_DOTS = 200
 """Dots in one line of TOML; the time for a key `a.b.c` goes with their square."""
 DEEPEST = 64
 """Brackets within brackets in YAML."""
 BRACKETS = re.compile(r"[\[\]{}]")
-LARGEST_COUNT = 1 << 62
-MOST_NODES = 100_000
+MAX_COUNT = 1 << 62
+MAX_NODES = 100_000
 """Values in a YAML file, each counted as often as aliases repeat it."""
 
 
-def read_bounded(path: Path, most: int = MOST_SETTINGS) -> bytes:
+def read_bounded(path: Path, most: int = MAX_SETTINGS) -> bytes:
     """Return the bytes of a file. Raises OSError where it cannot be read, holds more than `most`, or is no file.
 
     A pipe would be waited for, and a device never ends.
@@ -196,15 +196,15 @@ def read_bounded(path: Path, most: int = MOST_SETTINGS) -> bytes:
         return file.read(status.st_size)  # room is made for all that is asked for, there or not
 
 
-def read_text(path: Path, most: int = MOST_SETTINGS, errors: str = "strict") -> str:
+def read_text(path: Path, most: int = MAX_SETTINGS, errors: str = "strict") -> str:
     """Return the text (UTF-8) of a file; raises OSError as `read_bounded`, UnicodeDecodeError where it is no text."""
     return read_bounded(path, most).decode("utf-8-sig", errors)
 
 
 def toml_table(text: str) -> dict[str, Any]:
     """Return what stands in TOML; raises ValueError, one line."""
-    if any(line.count(".") > MOST_DOTS for line in text.splitlines()):
-        raise ValueError(f"a line with more than {MOST_DOTS} dots")
+    if any(line.count(".") > MAX_DOTS for line in text.splitlines()):
+        raise ValueError(f"a line with more than {MAX_DOTS} dots")
     try:
         return tomllib.loads(text)
     except RecursionError:
@@ -222,7 +222,7 @@ def json_value(text: str | bytes) -> Any:
 def yaml_value(text: str | bytes, loader_class: Any = None) -> Any:
     """Return what stands in YAML, by a SafeLoader: plain values only. Raises ValueError, one line.
 
-    Aliases may repeat a value, but neither nest without end nor unfold to more than `MOST_NODES`.
+    Aliases may repeat a value, but neither nest without end nor unfold to more than `MAX_NODES`.
     """
     import yaml
 
@@ -248,7 +248,7 @@ def yaml_value(text: str | bytes, loader_class: Any = None) -> Any:
 def count_in(table: dict[str, Any], key: str) -> int:
     """Return the count that stands under `key`; raises KeyError, and ValueError for what cannot be a count."""
     count = table[key]
-    if type(count) is not int or not 0 <= count < LARGEST_COUNT:
+    if type(count) is not int or not 0 <= count < MAX_COUNT:
         raise ValueError(f"{key} {shown(count)} is no count")
     return count
 
@@ -290,7 +290,7 @@ def _unfolded(node: Any, known: dict[int, int]) -> int:
         known[id(node)] = 0  # while it is being counted
         parts = [part for item in node.value for part in (item if isinstance(item, tuple) else (item,))]
         known[id(node)] = 1 + sum(_unfolded(part, known) for part in parts)
-    if not 0 < known[id(node)] <= MOST_NODES:
+    if not 0 < known[id(node)] <= MAX_NODES:
         raise ValueError("aliases that hold themselves or unfold to too many values")
     return known[id(node)]
 

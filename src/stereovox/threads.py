@@ -20,7 +20,7 @@ from stereovox.errors import StereovoxError
 First = TypeVar("First")
 Second = TypeVar("Second")
 
-MOST_THREADS = 256
+MAX_THREADS = 256
 
 
 def in_shards(work: Callable[[slice], None], parts: list[slice]) -> None:
@@ -63,7 +63,7 @@ def shards(length: int, threads: int) -> list[slice]:
 @lru_cache
 def _pool() -> ThreadPoolExecutor:
     """Return the threads of this process; only as many are started as are busy at once."""
-    return ThreadPoolExecutor(MOST_THREADS, thread_name_prefix="stereovox")
+    return ThreadPoolExecutor(MAX_THREADS, thread_name_prefix="stereovox")
 
 
 if hasattr(os, "register_at_fork"):

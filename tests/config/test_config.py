@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from stereovox.config import MOST_CELLS, Config, load_config, parse_value, profile_names
+from stereovox.config import MAX_CELLS, Config, load_config, parse_value, profile_names
 from stereovox.errors import ConfigError, did_you_mean
 
 
@@ -121,7 +121,7 @@ def test_values_out_of_range_are_refused(name, value):
 
 
 def test_a_range_of_too_many_cells_is_refused():
-    refused("use larger cells", voxel_size=0.001, max_range=0.002 * MOST_CELLS)
+    refused("use larger cells", voxel_size=0.001, max_range=0.002 * MAX_CELLS)
 
 
 def test_a_section_is_not_a_value_and_a_value_not_a_section():

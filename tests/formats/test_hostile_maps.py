@@ -126,9 +126,9 @@ def test_a_tree_deeper_than_sixteen_levels(tmp_path):
 
 
 def test_trees_of_too_many_nodes_are_not_unfolded(tmp_path, monkeypatch):
-    monkeypatch.setattr(octomap, "MOST_NODES", 10)
+    monkeypatch.setattr(octomap, "MAX_NODES", 10)
     assert "nodes are more than 10" in refusal(read_octomap, tree(tmp_path / "a.bt", struct.pack("<H", 3) * 11, 12))
-    monkeypatch.setattr(octomap, "MOST_BYTES", 50)
+    monkeypatch.setattr(octomap, "MAX_BYTES", 50)
     assert "holds more than 50 bytes" in refusal(read_octomap, tree(tmp_path / "a.bt", struct.pack("<H", 3) * 11, 12))
 
 

@@ -82,7 +82,7 @@ def test_a_small_image_tells_of_few_cells_or_nothing(integrator, camera):
     report = mapper.add(frame_of(camera))
     blocks, _ = mapper.map.blocks()
     assert report.refused in (None, "bad_camera", "view_too_large")
-    assert len(blocks) <= 2 * views.FEWEST_BLOCKS
+    assert len(blocks) <= 2 * views.MIN_BLOCKS
     assert not (report.refused and len(blocks))
     assert report.refused is None or ("\n" not in report.detail and "check" in report.detail)
 

@@ -20,7 +20,7 @@ from stereovox.frame import DepthImage
 from stereovox.sensors.model import COLUMNS, REACH_SIGMA, ROWS, InverseSensorModel, SensorTable, tabulate
 from stereovox.sensors.noise import PoseNoise, RangeNoise
 
-WINDOW_SHARE, RIM_SHARE, NEAR_PLANE, LARGEST_LEVEL = 0.27, 0.35, 1e-3, 8
+WINDOW_SHARE, RIM_SHARE, NEAR_PLANE, MAX_LEVEL = 0.27, 0.35, 1e-3, 8
 
 Cells = tuple[NDArray[np.int64], NDArray[np.float64]]
 
@@ -220,7 +220,7 @@ def _farthest_in_window(image: DepthImage, uv: NDArray, size_px: NDArray) -> NDA
     """
     depth = np.where(image.depth_m > 0, image.depth_m, 0).astype(float)
     height, width = depth.shape
-    level = np.clip(np.floor(np.log2(WINDOW_SHARE * size_px)) + 2, 0, LARGEST_LEVEL).astype(int)
+    level = np.clip(np.floor(np.log2(WINDOW_SHARE * size_px)) + 2, 0, MAX_LEVEL).astype(int)
     u, v = np.clip(uv[:, 0], 0, width - 1).astype(int), np.clip(uv[:, 1], 0, height - 1).astype(int)
     farthest = depth[v, u]
     for i in np.flatnonzero(level > 0):

@@ -10,8 +10,8 @@ import pytest
 import stereovox as sv
 from stereovox.config import load_config
 from stereovox.errors import FrameRefused
-from stereovox.trust.gate import LEAST_FRAMES, MAX_LIMIT, SPREADS, USUAL_AT_FIRST, Belief
-from stereovox.trust.history import MOST_SENSORS, Doubt, History, Seen, Usual
+from stereovox.trust.gate import MAX_LIMIT, MIN_FRAMES, SPREADS, USUAL_AT_FIRST, Belief
+from stereovox.trust.history import MAX_SENSORS, Doubt, History, Seen, Usual
 
 FRAME = sv.Frame(np.ones((2, 2), np.float32), sv.PinholeCamera(2, 2, 1, 1, 0.5, 0.5), np.eye(4))
 
@@ -113,9 +113,9 @@ def test_a_frame_that_comes_late_may_disagree_more():
 @pytest.mark.parametrize("moved", [False, True])
 def test_a_few_frames_are_not_enough_however_long_they_take(moved):
     told = Told(moved=moved, moved_s=1e9)
-    found = told(*[0.03] * 30, *[0.6] * LEAST_FRAMES, 0.03, ms=2000)[30:]
-    assert found == [CHANGED] * LEAST_FRAMES + [""]
-    told(*[0.6] * (LEAST_FRAMES + 1), ms=2000)
+    found = told(*[0.03] * 30, *[0.6] * MIN_FRAMES, 0.03, ms=2000)[30:]
+    assert found == [CHANGED] * MIN_FRAMES + [""]
+    told(*[0.6] * (MIN_FRAMES + 1), ms=2000)
     assert told.history.doubts["camera"].verdict == ("moved" if moved else "changed")
 
 
@@ -166,9 +166,9 @@ def test_each_sensor_is_for_itself_and_there_are_so_many():
     told(*[0.03] * 30, sensor="left")
     assert told(0.3, sensor="right") == [""]
     assert told(0.3, sensor="left") == [CHANGED]
-    for i in range(2 * MOST_SENSORS):
+    for i in range(2 * MAX_SENSORS):
         told(0.9, sensor=str(i))
-    assert len(told.history.doubts) == MOST_SENSORS
+    assert len(told.history.doubts) == MAX_SENSORS
 
 
 def test_a_doubt_ends_where_the_gate_lets_a_sensor_begin_anew():

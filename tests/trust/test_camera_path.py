@@ -7,7 +7,7 @@ import numpy as np
 
 import stereovox as sv
 from stereovox.se3 import look_at
-from stereovox.trust.camera_path import MOST_STOPS, SPACING_M, CameraPath, Seen
+from stereovox.trust.camera_path import MAX_STOPS, SPACING_M, CameraPath, Seen
 
 
 def seen(n, x, turn=0.0):
@@ -31,21 +31,21 @@ def test_what_stands_still_is_kept_once_and_what_moves_or_turns_again():
 
 def test_a_long_way_is_thinned_evenly_and_never_outgrows_its_bound():
     path = CameraPath()
-    for n in range(3 * MOST_STOPS):
+    for n in range(3 * MAX_STOPS):
         path.walk("left" if n % 2 else "right", seen(n, 0.1 * n))
-        assert sum(map(len, path.stops.values())) <= MOST_STOPS
+        assert sum(map(len, path.stops.values())) <= MAX_STOPS
     for sensor in ("left", "right"):
         steps = np.diff(xs(path, sensor))
         assert steps.min() >= path.spacing - 1e-3
         assert steps.max() <= 2 * path.spacing
         assert xs(path, sensor)[0] < 0.2
-        assert xs(path, sensor)[-1] > 0.1 * 3 * MOST_STOPS - 2 * path.spacing
+        assert xs(path, sensor)[-1] > 0.1 * 3 * MAX_STOPS - 2 * path.spacing
 
 
 def test_a_way_that_is_saved_midway_goes_on_the_same():
     whole, split = CameraPath(), CameraPath()
     random = np.random.default_rng(3)
-    x = np.cumsum(random.uniform(0, 0.1, 3 * MOST_STOPS))
+    x = np.cumsum(random.uniform(0, 0.1, 3 * MAX_STOPS))
     for n in range(len(x)):
         whole.walk("camera", seen(n, x[n]))
         split.walk("camera", seen(n, x[n]))

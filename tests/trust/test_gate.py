@@ -14,7 +14,7 @@ from stereovox.mapper import GridMapper
 from stereovox.maps.grid_map import load_grid
 from stereovox.se3 import rotation_matrix
 from stereovox.trust.gate import Gate
-from stereovox.trust.history import MOST_SENSORS, History
+from stereovox.trust.history import MAX_SENSORS, History
 
 CAMERA = sv.PinholeCamera(16, 12, 12.0, 12.0, 7.5, 5.5, 0.05)
 AHEAD = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])
@@ -134,9 +134,9 @@ def test_settling_may_be_switched_off():
 
 
 def test_one_map_knows_so_many_sensors():
-    frames = [frame_at(0, sensor=str(i)) for i in range(MOST_SENSORS + 1)]
-    assert verdicts(frames) == [""] * MOST_SENSORS + ["bad_sensor"]
-    assert verdicts([*frames[:MOST_SENSORS], frame_at(33, sensor="3")])[-1] == ""
+    frames = [frame_at(0, sensor=str(i)) for i in range(MAX_SENSORS + 1)]
+    assert verdicts(frames) == [""] * MAX_SENSORS + ["bad_sensor"]
+    assert verdicts([*frames[:MAX_SENSORS], frame_at(33, sensor="3")])[-1] == ""
 
 
 # The law: what is refused leaves the map as it is, and a run may stop and go on anywhere.

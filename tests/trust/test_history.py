@@ -10,7 +10,7 @@ import pytest
 import stereovox as sv
 from stereovox.errors import MapFileError
 from stereovox.trust.camera_path import CameraPath
-from stereovox.trust.history import MOST_REASONS, NOT_TOLD, OTHERS, History, Seen, Streak
+from stereovox.trust.history import MAX_REASONS, NOT_TOLD, OTHERS, History, Seen, Streak
 
 POSE = tuple(float(x) / 3 for x in range(12))
 FULL = History(
@@ -54,10 +54,10 @@ def test_a_map_from_before_there_was_a_history_loads():
 
 def test_words_without_end_do_not_fill_the_memory():
     history = History()
-    for i in range(2 * MOST_REASONS):
+    for i in range(2 * MAX_REASONS):
         history.refuse(f"{i} {500 * 'x'}")
-    assert len(history.refused) == MOST_REASONS + 1
-    assert history.refused[OTHERS] == MOST_REASONS
+    assert len(history.refused) == MAX_REASONS + 1
+    assert history.refused[OTHERS] == MAX_REASONS
     assert History.loaded(history.saved()) == history
 
 

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from stereovox.viewer.chunks import MOST_CELLS, SIDE, Chunks, coarser, levels, split
+from stereovox.viewer.chunks import MAX_CELLS, SIDE, Chunks, coarser, levels, split
 
 SIZE = 0.1
 random = np.random.default_rng(1)
@@ -28,7 +28,7 @@ class Scene:
         return node
 
 
-def shown(cells, eyes, most=MOST_CELLS):
+def shown(cells, eyes, most=MAX_CELLS):
     scene = Scene()
     chunks = Chunks(scene, "/cells", SIZE, scene.draw, most)
     chunks.show(cells, COLOURS[: len(cells)], np.array(eyes, float))

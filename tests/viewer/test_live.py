@@ -25,7 +25,7 @@ PATIENCE_S = 30
 @pytest.fixture(autouse=True)
 def no_rest(monkeypatch):
     """Show every frame that can be shown."""
-    for name in ("LEAST_S", "COPY_REST", "DRAW_REST"):
+    for name in ("MIN_S", "COPY_REST", "DRAW_REST"):
         monkeypatch.setattr(viewer_live, name, 0)
 
 

@@ -16,7 +16,7 @@ from stereovox.maps import State
 from stereovox.view.scale import scale_of
 from stereovox.viewer.cameras import first_look, up_vector
 from stereovox.viewer.cells import CORNERS, FACES
-from stereovox.viewer.layer import MOST_PX, layer_colours, sharp
+from stereovox.viewer.layer import MAX_PX, layer_colours, sharp
 from stereovox.viewer.panel import colour_bar, plain, statistics
 from stereovox.viewer.viewer import open_viewer
 
@@ -221,7 +221,7 @@ def test_small_layers_are_enlarged_and_large_ones_thinned():
     large = sharp(image)
     assert 512 < max(large.shape) <= 1024
     assert (large[::341, ::341] == image).all()
-    assert max(sharp(np.zeros((2, MOST_PX + 1, 4), np.uint8)).shape) <= MOST_PX
+    assert max(sharp(np.zeros((2, MAX_PX + 1, 4), np.uint8)).shape) <= MAX_PX
 
 
 def test_the_camera_stands_where_the_map_says(shown):

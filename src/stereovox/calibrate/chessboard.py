@@ -19,7 +19,7 @@ SIDES = re.compile(r"left|right|(?<![a-z])[lr](?![a-z])|[LR](?=[^A-Za-z]*$)", re
 """What tells the eye in the name of a file without its ending: left01, cam_r_3, imageL0."""
 WIDEST_WINDOW = 11
 """Pixels on each side of a corner in which it is made precise; less where squares are small."""
-MOST_PIXELS = 100_000_000
+MAX_PIXELS = 100_000_000
 """An image that tells of more is taken for a lie; nothing is allocated for it."""
 
 
@@ -76,7 +76,7 @@ def read_grey(path: Path) -> NDArray[np.uint8] | None:
 
     try:
         with warnings.catch_warnings(action="ignore"), Image.open(path) as picture:  # reads the header alone
-            if picture.width * picture.height > MOST_PIXELS:
+            if picture.width * picture.height > MAX_PIXELS:
                 return None
         data = np.fromfile(path, np.uint8)
         image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if data.size else None

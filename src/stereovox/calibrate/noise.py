@@ -17,8 +17,8 @@ from stereovox.errors import StereovoxError
 
 REGION = (0.6, 0.4)
 """Width and height in metres of the part of the wall round the optical axis that counts (Chien 2020, 3.3)."""
-FEWEST_PIXELS = 30
-LEAST_RMSE = 1e-6
+MIN_PIXELS = 30
+MIN_RMSE = 1e-6
 """Error, as a share of the depth, below which there is nothing but rounding."""
 TERMS = ("s0", "s1", "s2")
 
@@ -122,7 +122,7 @@ def noise_at(recording: WallRecording, region: tuple[float, float] = REGION) -> 
     x, y = slopes(camera)
     inside = (np.abs(x) <= region[0] / 2 / wall.distance) & (np.abs(y) <= region[1] / 2 / wall.distance)
     used = inside & wall.on_wall
-    if used.sum() < FEWEST_PIXELS:
+    if used.sum() < MIN_PIXELS:
         raise StereovoxError(
             f"{recording.name}: only {used.sum()} pixels of the middle {region[0]:g} x {region[1]:g} m show the wall; "
             "clear what stands before it, give it more texture, or use a larger --region"
@@ -181,7 +181,7 @@ def _errors(sums: NDArray[np.float64], wall_z: Array) -> tuple[float, float | No
 
 def _check_noisy(points: Sequence[NoiseAt]) -> None:
     for point in points:
-        if point.rmse_m <= LEAST_RMSE * point.distance_m:
+        if point.rmse_m <= MIN_RMSE * point.distance_m:
             raise StereovoxError(f"{point.name}: shows no noise at all; record a real camera, with its noise")
 
 

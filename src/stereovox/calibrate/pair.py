@@ -34,9 +34,9 @@ from stereovox.opening import DepthSource
 from stereovox.se3 import Transform
 from stereovox.sources.poses import Poses
 
-LEAST_TURN = np.radians(3.0)
+MIN_TURN = np.radians(3.0)
 """Root mean square turn between registered images that tells anything."""
-LEAST_SECOND_TURN = np.radians(1.2)
+MIN_SECOND_TURN = np.radians(1.2)
 """The same about the second axis: about one axis only, where the camera sits along it remains open."""
 
 
@@ -44,11 +44,11 @@ def check_turning(vectors: NDArray[np.float64]) -> None:
     """Raise StereovoxError, one line, where (N, 3) rotation vectors are too small or all about one axis."""
     weights, axes = np.linalg.eigh(vectors.T @ vectors / max(len(vectors), 1))
     first, second = np.sqrt(np.maximum(weights[::-1][:2], 0))
-    if first < LEAST_TURN:
+    if first < MIN_TURN:
         raise StereovoxError(
             f"motion: too small, images are turned by {np.degrees(first):.1f} deg (rms); turn by 30 deg about two axes"
         )
-    if second < LEAST_SECOND_TURN:
+    if second < MIN_SECOND_TURN:
         axis = " ".join(f"{number:+.2f}" for number in axes[:, -1])
         raise StereovoxError(
             f"motion: turns about one axis only ({axis} in the camera's frame); pitch, yaw and roll while recording"

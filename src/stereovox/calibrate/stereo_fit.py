@@ -30,7 +30,7 @@ GUESSES = {"pinhole": np.geomspace(0.4, 4.0, 14), "fisheye": np.geomspace(0.25, 
 FAR_OFF = 1e3
 """Pixels that a corner counts for which the lens cannot see at all; it leads away from such lenses."""
 STEP = 1e-6
-MOST_STEPS, ENOUGH = 60, 1e-6
+MAX_STEPS, ENOUGH = 60, 1e-6
 """The search ends after so many steps, or when one makes things better by so small a share."""
 Vector = NDArray[np.float64]
 Missed = Callable[[Vector, Vector], Vector]
@@ -148,7 +148,7 @@ def _least_squares(missed: Missed, shared: Vector, places: Vector) -> tuple[Vect
     that does not belong here does not bend the others.
     """
     damping, residuals = 1e-3, missed(shared, places)
-    for _ in range(MOST_STEPS):
+    for _ in range(MAX_STEPS):
         J, r = _rates(missed, shared, places, residuals), residuals.ravel()
         weighted = J * (1 / np.sqrt(1 + r * r))[:, None]
         A, g = weighted.T @ J, weighted.T @ r

@@ -17,9 +17,9 @@ from stereovox.errors import StereovoxError
 
 Array = NDArray[np.float64]
 TERMS = 6
-LEAST_VALID = 0.3
+MIN_VALID = 0.3
 """Share of the pixels that must have depth."""
-LEAST_WALL = 0.6
+MIN_WALL = 0.6
 """Share of the pixels with depth that must lie on the wall."""
 TOLERANCE = 0.03
 """Share of the depth by which a pixel of the wall may lie off the quadratic; four times the noise if that is more."""
@@ -27,7 +27,7 @@ NOISIEST = 0.15
 """Noise, as a share of the depth, above which nothing can be told from an image."""
 STEEPEST_DEG = 20.0
 """A wall that leans more is refused."""
-MOST_CURVED = 0.4
+MAX_CURVED = 0.4
 """Largest distortion, as a share of the depth, that is believed."""
 BLOCKS = 40
 GUESSES = 400
@@ -83,7 +83,7 @@ def find_wall(inverse: Array, camera: PinholeCamera, name: str) -> Wall:
     that is nearly flat, too tilted, too curved.
     """
     valid = np.isfinite(inverse)
-    if valid.mean() < LEAST_VALID:
+    if valid.mean() < MIN_VALID:
         raise StereovoxError(
             f"{name}: only {valid.mean():.0%} of the pixels have depth; take a textured wall, nearer, in more light"
         )
@@ -171,15 +171,15 @@ def _refined(x: Array, y: Array, inverse: Array, coefficients: Array, tolerance:
 
 
 def _check(wall: Wall, surface: Array, plane: Array, share: float, name: str) -> None:
-    if share < LEAST_WALL or wall.coefficients[0] <= 0:
+    if share < MIN_WALL or wall.coefficients[0] <= 0:
         raise StereovoxError(
             f"{name}: no flat wall in view: the best surface explains {share:.0%} of the pixels, "
-            f"{LEAST_WALL:.0%} are needed; let a wall fill the image"
+            f"{MIN_WALL:.0%} are needed; let a wall fill the image"
         )
     if wall.tilt_deg > STEEPEST_DEG:
         raise StereovoxError(
             f"{name}: the wall leans by {wall.tilt_deg:.0f} deg, more than {STEEPEST_DEG:.0f}; look at it squarely"
         )
     curved = np.abs(surface / plane - 1)[wall.on_wall].max()
-    if curved > MOST_CURVED:
+    if curved > MAX_CURVED:
         raise StereovoxError(f"{name}: the surface bends by {curved:.0%} of its depth: that is no flat wall")

@@ -36,7 +36,7 @@ WHOLE = "pixels", "binning"
 """Which of them are whole numbers."""
 STEREO = {"baseline": "baseline", "binning": "binning", "subpixel": "subpixel"}
 """Fields of all cameras with a depth, and which limits they have."""
-LARGEST_COEFFICIENT = 1e36
+MAX_COEFFICIENT = 1e36
 """Beyond it a correction leaves the range of float32."""
 
 CORRECTIONS = {"scale": 6, "disparity": 6, "scale+disparity": 12, "thesis": 3}
@@ -65,7 +65,7 @@ class DepthCorrection:
         if self.model not in CORRECTIONS:
             raise StereovoxError(f"correction: unknown model '{self.model}'{did_you_mean(self.model, CORRECTIONS)}")
         numbers = tuple(float(number) for number in self.coefficients)  # a list from a file cannot be hashed
-        if len(numbers) != CORRECTIONS[self.model] or not all(abs(n) <= LARGEST_COEFFICIENT for n in numbers):
+        if len(numbers) != CORRECTIONS[self.model] or not all(abs(n) <= MAX_COEFFICIENT for n in numbers):
             needed = f"{CORRECTIONS[self.model]} finite coefficients"
             raise StereovoxError(f"correction: model '{self.model}' needs {needed}, not {list(numbers)}")
         object.__setattr__(self, "coefficients", numbers)

@@ -141,10 +141,10 @@ def _ways(arguments: Namespace) -> list[Variant]:
 
 def _limits(arguments: Namespace, wanted: Sequence[str]) -> dict[str, int]:
     """Return the sizes of measurements that were asked for; raises StereovoxError for those that cannot be."""
-    from stereovox.lab.bench.growth import CELLS, LEAST_FRAMES
+    from stereovox.lab.bench.growth import CELLS, MIN_FRAMES
 
     options = (
-        ("--frames-long", "path_frames", arguments.frames_long, LEAST_FRAMES, "path"),
+        ("--frames-long", "path_frames", arguments.frames_long, MIN_FRAMES, "path"),
         ("--most-cells", "most_cells", arguments.most_cells, CELLS[0], "map-size"),
     )
     limits = {}

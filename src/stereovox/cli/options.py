@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 CORNERS = "X0,Y0,Z0,X1,Y1,Z1"
 """How a box is written: its lowest and its highest corner."""
-LARGEST_FILE = 10_000
+MAX_FILE = 10_000
 """Bytes of a file that holds a transform."""
 
 
@@ -54,7 +54,7 @@ def transform_of(text: str) -> Transform:
 
     where = f"--transform {text}"
     try:
-        words = text if "," in text else read_text(Path(text), LARGEST_FILE)
+        words = text if "," in text else read_text(Path(text), MAX_FILE)
         numbers = np.array([float(word) for word in words.replace(",", " ").split()])
     except (OSError, UnicodeError, ValueError):
         numbers = np.array([])

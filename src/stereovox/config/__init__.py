@@ -19,13 +19,13 @@ from stereovox.config.safety import PaceConfig, TrustConfig
 from stereovox.errors import ConfigError, did_you_mean
 from stereovox.safe_io import read_text, shown, toml_table
 
-MOST_CELLS = 8192
+MAX_CELLS = 8192
 """Cells that fit between the camera and the maximum range."""
 BLIND_RANGE = 0.3
 """Metres within which depth cameras see nothing, most of them."""
-MOST_UNEQUAL = 16
+MAX_UNEQUAL = 16
 """Largest over smallest side of a cell."""
-LARGEST_WINDOW = 1e6
+MAX_WINDOW = 1e6
 """Metres along each side of a window."""
 
 
@@ -214,8 +214,8 @@ class WindowConfig(Section):
             return self
         if min(self.size) <= 0 or any(b < a for a, b in zip(self.size, self.largest or self.size, strict=True)):
             raise ValueError("size must be positive, and largest no smaller than size")
-        if max(self.largest or self.size) > LARGEST_WINDOW:
-            raise ValueError(f"size and largest must be at most {LARGEST_WINDOW:g} m")
+        if max(self.largest or self.size) > MAX_WINDOW:
+            raise ValueError(f"size and largest must be at most {MAX_WINDOW:g} m")
         if self.centre is None and 2 * self.trigger >= min(self.size):
             raise ValueError(f"trigger {self.trigger} must be less than half of the smallest size")
         return self
@@ -330,10 +330,8 @@ class Config(Section):
 
     @model_validator(mode="after")
     def _ordered(self) -> Config:
-        if min(self.cell) < self.voxel_size / MOST_UNEQUAL or min(self.cell) <= 0:
-            raise ValueError(
-                f"steps {list(self.cell)} must be above 0 and differ by a factor of at most {MOST_UNEQUAL}"
-            )
+        if min(self.cell) < self.voxel_size / MAX_UNEQUAL or min(self.cell) <= 0:
+            raise ValueError(f"steps {list(self.cell)} must be above 0 and differ by a factor of at most {MAX_UNEQUAL}")
         for name, value in (("min_range", self.min_range), ("blind_range", self.blind)):
             if value >= self.max_range:
                 raise ValueError(f"{name} {value:g} must be smaller than max_range {self.max_range:g}")
@@ -343,9 +341,9 @@ class Config(Section):
             raise ValueError(f'when_full "{self.when_full}" needs max_memory, for example max_memory="500 MB"')
         if self.dimensions == 2 and self.deadline_ms is not None:
             raise ValueError("deadline_ms is for maps in space; leave it out for the map of a floor")
-        if self.max_range / self.voxel_size > MOST_CELLS:
+        if self.max_range / self.voxel_size > MAX_CELLS:
             raise ValueError(
-                f"max_range {self.max_range} spans more than {MOST_CELLS} cells of {self.voxel_size}; use larger cells"
+                f"max_range {self.max_range} spans more than {MAX_CELLS} cells of {self.voxel_size}; use larger cells"
             )
         return self
 

@@ -19,7 +19,7 @@ from stereovox.maps.voxel_map import State
 
 FEW, MANY = 600, 4000
 """Walls and floor cells of each map that are looked at, evenly taken: to sort out motions, and to find the best."""
-MOST_ACROSS = 3000
+MAX_ACROSS = 3000
 """Pixels along the longer side of a picture of distances; larger maps get larger pixels."""
 STEPS = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
 Points = NDArray[np.float64]
@@ -99,7 +99,7 @@ class _Field:
         from scipy.ndimage import distance_transform_edt
 
         across = float(np.ptp(points, axis=0).max()) + 2 * margin
-        self._side = max(resolution, across / MOST_ACROSS)
+        self._side = max(resolution, across / MAX_ACROSS)
         self._low = points.min(axis=0) - (np.ceil(margin / self._side)) * self._side
         cells = np.rint((points - self._low) / self._side).astype(np.int64)
         empty = np.ones(cells.max(axis=0)[::-1] + 1 + int(np.ceil(margin / self._side)), bool)
@@ -121,11 +121,11 @@ def evenly(points: NDArray[Any], most: int) -> NDArray[Any]:
     return points[np.linspace(0, len(points) - 1, most).astype(int)]
 
 
-COARSE, MOST_COARSE = 128, 512
+COARSE, MAX_COARSE = 128, 512
 """Pixels along the longer side of the smaller map's small picture, as far as the larger map's then has no more."""
 CANDIDATES, BEST = 12, 4
 """Motions that are looked at closely, and very closely."""
-MOST_POINTS = 500_000
+MAX_POINTS = 500_000
 """Walls and floor cells of each map that are looked at."""
 ALIKE = 0.98
 """Among motions so near to the best one the smallest is taken: a building may look alike from both ends."""
@@ -156,7 +156,7 @@ class _Seen:
 
 def _seen(grid: OccupancyGrid) -> _Seen:
     states, cornered = grid.states, replace(grid, origin=(0.0, 0.0, 0.0))
-    places = (evenly(np.argwhere(states == state), MOST_POINTS) for state in (State.OCCUPIED, State.FREE))
+    places = (evenly(np.argwhere(states == state), MAX_POINTS) for state in (State.OCCUPIED, State.FREE))
     walls, floor = (cornered.centres(*place.T) for place in places)
     return _Seen(walls, floor)
 
@@ -164,7 +164,7 @@ def _seen(grid: OccupancyGrid) -> _Seen:
 def _best(ours: _Seen, theirs: _Seen, resolution: float, start: se2.Pose) -> se2.Pose:
     """Return the pose of our corner seen from theirs."""
     small, large = sorted(float(np.ptp(one.walls, axis=0).max()) for one in (ours, theirs))
-    side = max(small / COARSE, large / MOST_COARSE, 2 * resolution)
+    side = max(small / COARSE, large / MAX_COARSE, 2 * resolution)
     fit = Fit(ours.walls, theirs.walls, ours.floor, theirs.floor, resolution, side)
     poses = [fit.refined(pose, side, side / 8, FEW) for pose in (start, *_candidates(ours, theirs, side))]
     poses = sorted(poses, key=fit.agreement, reverse=True)[:BEST]

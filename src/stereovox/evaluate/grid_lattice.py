@@ -14,7 +14,7 @@ from stereovox.errors import StereovoxError
 from stereovox.maps.occupancy import UNKNOWN, OccupancyGrid
 from stereovox.maps.voxel_map import State
 
-MOST_CELLS = 40_000_000
+MAX_CELLS = 40_000_000
 """Cells of the rectangle that holds both maps: 126 m x 126 m in cells of 2 cm. Distances take 40 bytes a cell."""
 NOTHING = "the reference has no free and no occupied cell: there is nothing to compare with; give another"
 ROWS_AT_ONCE = 256
@@ -117,7 +117,7 @@ def _checked(region: Rectangle) -> Rectangle:
 
 
 def _check_size(rows: int, columns: int, resolution: float) -> None:
-    if rows * columns > MOST_CELLS:
+    if rows * columns > MAX_CELLS:
         size = f"{columns * resolution:.0f} m x {rows * resolution:.0f} m in cells of {resolution:g} m"
         raise StereovoxError(f"both maps together cover {size}: too far apart; are they in one frame? align them")
 

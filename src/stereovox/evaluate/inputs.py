@@ -14,7 +14,7 @@ from stereovox.evaluate.distance import distances
 from stereovox.evaluate.truth_cells import TruthCells
 from stereovox.maps import VoxelMap, load_map
 from stereovox.maps.store import is_map
-from stereovox.safe_io import MOST_LIST, read_text
+from stereovox.safe_io import MAX_LIST, read_text
 
 COLUMNS = {3: (0, 1, 2), 8: (1, 2, 3), 9: (1, 2, 3), 12: (3, 7, 11), 16: (3, 7, 11)}
 """Where x, y, z stand, by the numbers in a line: x y z; TUM's, with or without a confidence; 3x4 and 4x4 matrices."""
@@ -32,7 +32,7 @@ def read_camera_path(path: str | Path) -> NDArray[np.float64]:
     """
     try:
         with warnings.catch_warnings(action="ignore"):  # an empty file is refused below
-            table = np.loadtxt(read_text(Path(path), MOST_LIST).splitlines(), ndmin=2)
+            table = np.loadtxt(read_text(Path(path), MAX_LIST).splitlines(), ndmin=2)
     except (OSError, ValueError) as error:
         raise SourceError(f"{path}: cannot be read as poses ({error}); give one pose a line") from None
     if table.shape[1] not in COLUMNS or not np.isfinite(table).all() or not len(table):

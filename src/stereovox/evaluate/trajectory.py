@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from stereovox import se2
 from stereovox.errors import FrameRefused, SourceError, StereovoxError
 from stereovox.localize.track import Track
-from stereovox.safe_io import MOST_LIST, read_text
+from stereovox.safe_io import MAX_LIST, read_text
 from stereovox.sources.poses import Poses
 from stereovox.sources.trajectory import ns_from_seconds
 
@@ -81,7 +81,7 @@ def read_relations(path: str | os.PathLike[str]) -> Relations:
     """
     path = Path(path)
     try:
-        lines = read_text(path, MOST_LIST, "replace").splitlines()
+        lines = read_text(path, MAX_LIST, "replace").splitlines()
     except OSError as error:
         raise SourceError(f"{path}: {os.strerror(error.errno or 0).lower()}; give a .relations file") from None
     rows = [_row(path, number, line) for number, line in enumerate(lines, 1) if line.strip() and line[0] != "#"]
@@ -133,7 +133,7 @@ def _nearest(stamps: NDArray[np.int64], wanted: NDArray[np.int64]) -> NDArray[np
     return np.where(wanted - stamps[before] <= stamps[after] - wanted, before, after)
 
 
-LEVER_M, LEAST_LEVER_M = 0.3, 0.001
+LEVER_M, MIN_LEVER_M = 0.3, 0.001
 """What headings weigh in an alignment at most and at least: that of a point so far ahead of the robot."""
 
 
@@ -223,7 +223,7 @@ def best_motion(poses_here: ArrayLike, poses_there: ArrayLike) -> se2.Pose:
     turn = complex(np.cos(turns).sum(), np.sin(turns).sum())
     off = np.sqrt(max((a**2).sum() + (b**2).sum() - 2 * abs(fit), 0.0))
     off_turn = np.sqrt((se2.wrapped(turns - np.angle(turn)) ** 2).sum())
-    lever = np.clip(off / max(off_turn, 1e-12), LEAST_LEVER_M, LEVER_M)
+    lever = np.clip(off / max(off_turn, 1e-12), MIN_LEVER_M, LEVER_M)
     yaw = float(np.angle(fit + lever**2 * turn))
     shift = there[:, :2].mean(axis=0) - se2.transform((0, 0, yaw), here[:, :2].mean(axis=0)[None])[0]
     return np.array([*shift, yaw])

@@ -67,7 +67,7 @@ class Neighbourhood:
         return values
 
 
-MOST_TOLERANCE = 20
+MAX_TOLERANCE = 20
 _ROUNDING = 1e-6
 """Log-odds are kept in steps of about a thousandth: what is nearer to a threshold than this is equal to it."""
 
@@ -113,8 +113,8 @@ class TruthCells:
 
     def __init__(self, truth_map: VoxelMap, tolerance: int = 1):
         truth_map = in_cubes(truth_map)
-        if not 0 <= tolerance <= MOST_TOLERANCE:
-            raise StereovoxError(f"tolerance {tolerance} is out of range; give 0 to {MOST_TOLERANCE} cells")
+        if not 0 <= tolerance <= MAX_TOLERANCE:
+            raise StereovoxError(f"tolerance {tolerance} is out of range; give 0 to {MAX_TOLERANCE} cells")
         known, state = known_cells(truth_map)
         counts = (state == State.OCCUPIED) | (state == State.FREE)
         if not counts.any():

@@ -18,7 +18,7 @@ from stereovox.maps.occupancy import UNKNOWN, OccupancyGrid
 from stereovox.maps.voxel_map import State
 from stereovox.products.floor_axes import Heights
 from stereovox.products.projection import inflated_grid, project
-from stereovox.safe_io import MOST_YAML, read_bounded, replacing, shown, yaml_value
+from stereovox.safe_io import MAX_YAML, read_bounded, replacing, shown, yaml_value
 
 MODES = ("trinary", "scale", "raw")
 NEEDED = ("image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh")
@@ -59,7 +59,7 @@ def read_meaning(path: Path) -> Meaning:
             )
         if not path.is_file():
             raise MapFileError(f"{path}: no such file; give the .yaml of a map_server map")
-        says: Any = yaml_value(read_bounded(path, MOST_YAML))
+        says: Any = yaml_value(read_bounded(path, MAX_YAML))
     except OSError as error:
         raise MapFileError(f"{path}: cannot be read ({error.strerror or error})") from None
     except MapFileError:
@@ -115,8 +115,8 @@ def _quoted(name: str) -> str:
     return yaml.safe_dump(name, allow_unicode=True, width=10**6).removesuffix("\n").removesuffix("\n...")
 
 
-MOST_PIXELS = 1 << 28
-MOST_BYTES = 1 << 31
+MAX_PIXELS = 1 << 28
+MAX_BYTES = 1 << 31
 """Pictures of more pixels, and files of more bytes, are refused."""
 WHITE = 255.0
 FORMATS = ("PNG", "BMP", "PPM", "JPEG", "GIF")
@@ -145,8 +145,8 @@ def read_picture(path: Path) -> Picture:
     try:
         if not path.is_file():
             raise MapFileError(f"{path}: no such picture; the map's .yaml names it as its image")
-        if path.stat().st_size > MOST_BYTES:
-            raise MapFileError(f"{path}: larger than {MOST_BYTES} bytes; no map is")
+        if path.stat().st_size > MAX_BYTES:
+            raise MapFileError(f"{path}: larger than {MAX_BYTES} bytes; no map is")
         with path.open("rb") as file:
             kind = file.read(2)
         return Picture(_read_pgm(path)) if kind in (b"P5", b"P2") else _read_other(path)
@@ -172,7 +172,7 @@ def write_png(file: IO[bytes], pixels: NDArray[np.uint8], opaque: NDArray[np.boo
 
 
 def _read_pgm(path: Path) -> NDArray[Any]:
-    data = read_bounded(path, MOST_BYTES)
+    data = read_bounded(path, MAX_BYTES)
     numbers, at = [], 2
     for _ in range(3):
         found = _NUMBER.match(data, at)
@@ -247,9 +247,9 @@ def _channels(image: Any) -> NDArray[Any]:
     return np.asarray(image.convert("RGBA" if see_through else "RGB"))
 
 
-def _check_size(path: Path, width: int, height: int, most: int = MOST_PIXELS) -> None:
-    if not (width > 0 and height > 0 and width * height <= min(most, MOST_PIXELS)):
-        raise MapFileError(f"{path}: {width} x {height} pixels; a map has 1 to {min(most, MOST_PIXELS)}")
+def _check_size(path: Path, width: int, height: int, most: int = MAX_PIXELS) -> None:
+    if not (width > 0 and height > 0 and width * height <= min(most, MAX_PIXELS)):
+        raise MapFileError(f"{path}: {width} x {height} pixels; a map has 1 to {min(most, MAX_PIXELS)}")
 
 
 def _damaged(path: Path, why: str) -> MapFileError:

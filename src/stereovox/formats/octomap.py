@@ -198,16 +198,16 @@ def _write(path: str | Path, title: str, voxel_map: VoxelMap, tree: Tree) -> Non
         file.write(tree.data)
 
 
-MOST_BLOCKS = 2**18
+MAX_BLOCKS = 2**18
 """Blocks of 8x8x8 cells a file may unfold to (134 million cells); one node can claim 35 million million cells."""
 BLOCKS_OF_ANY, BLOCKS_A_LEAF = 2**16, 256
 """Few leaves may unfold to fewer: a file of 40 bytes is not to take a second."""
-LARGEST_LOG_ODDS = 30.0
+MAX_LOG_ODDS = 30.0
 OCTOMAP: dict[str, Any] = {"map.prior": 0.5, "map.log_odds_min": -2.0, "map.log_odds_max": 3.5}
 """What OctoMap does when nothing else is said; the files do not tell."""
-LONGEST_HEADER = 1 << 16
-MOST_NODES = 2 * 512 * MOST_BLOCKS
-MOST_BYTES = 8 * MOST_NODES
+MAX_HEADER_LENGTH = 1 << 16
+MAX_NODES = 2 * 512 * MAX_BLOCKS
+MAX_BYTES = 8 * MAX_NODES
 """A tree of so many cells has fewer nodes and bytes."""
 
 
@@ -247,14 +247,14 @@ def map_of_nodes(title: str, body: bytes, voxel_size: float, size: int | None = 
 
 def _read(path: Path) -> bytes:
     try:
-        return read_bounded(path, MOST_BYTES)
+        return read_bounded(path, MAX_BYTES)
     except OSError as error:
         raise MapFileError(f"{path}: cannot be read ({error.strerror or error}); name an OctoMap file") from None
 
 
 def _split(content: bytes) -> tuple[str, dict[str, str], bytes]:
     """Return the title, the words of the header by their name, and the bytes of the tree."""
-    title, _, rest = content[:LONGEST_HEADER].partition(b"\n")
+    title, _, rest = content[:MAX_HEADER_LENGTH].partition(b"\n")
     known = next((t for t in (BINARY_TITLE, TREE_TITLE) if title.startswith(t.encode())), None)
     if known is None:
         raise ValueError(f"its first line is not '{BINARY_TITLE}' or '{TREE_TITLE}'")
@@ -325,8 +325,8 @@ def _tree_leaves(body: bytes, size: int | None) -> _Leaves:
 def _checked_size(size: int | None, found: int, length: int) -> int:
     if not found:
         raise ValueError("it holds no cell: the map was empty when it was saved, or the rest is lost")
-    if found > MOST_NODES:
-        raise ValueError(f"its {found} nodes are more than {MOST_NODES}")
+    if found > MAX_NODES:
+        raise ValueError(f"its {found} nodes are more than {MAX_NODES}")
     if size not in (None, found):
         raise ValueError(f"its header says {size} nodes, its {length} bytes of data hold {found}")
     return found
@@ -340,13 +340,13 @@ def _with_limits(config: Config, log_odds: NDArray[np.float32]) -> Config:
     """Widen the clamping limits where the file's values lie beyond them."""
     if not len(log_odds):
         return config
-    lowest = max(min(config.map.log_odds_min, float(log_odds.min())), -LARGEST_LOG_ODDS)
-    highest = min(max(config.map.log_odds_max, float(log_odds.max())), LARGEST_LOG_ODDS)
+    lowest = max(min(config.map.log_odds_min, float(log_odds.min())), -MAX_LOG_ODDS)
+    highest = min(max(config.map.log_odds_max, float(log_odds.max())), MAX_LOG_ODDS)
     return load_config(config, **{"map.log_odds_min": lowest, "map.log_odds_max": highest})
 
 
 def _map_of(leaves: _Leaves, config: Config) -> VoxelMap:
-    room, most = _blocks_of(leaves), min(MOST_BLOCKS, max(BLOCKS_OF_ANY, BLOCKS_A_LEAF * len(leaves.heights)))
+    room, most = _blocks_of(leaves), min(MAX_BLOCKS, max(BLOCKS_OF_ANY, BLOCKS_A_LEAF * len(leaves.heights)))
     if room > most:
         raise ValueError(f"its nodes stand for up to {room * 512:.3g} cells, more than {most * 512:.3g}")
     coords, values = np.zeros((room, 3), np.int32), np.zeros((room, 512), np.int16)

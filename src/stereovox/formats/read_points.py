@@ -22,7 +22,7 @@ from stereovox.maps.blocks import blocks_of_cells
 from stereovox.maps.queries import INDEX_LIMIT
 from stereovox.safe_io import json_value, read_arrays, read_bounded, shown
 
-MOST_BLOCKS = 2**19
+MAX_BLOCKS = 2**19
 """Blocks of 8x8x8 cells, 1 KB each, that cells of a file may lie in: a file of far points is not to fill the memory."""
 
 
@@ -45,10 +45,10 @@ def cells_of_points(points: ArrayLike, voxel_size: float) -> VoxelMap:
 
 
 def check_room(indices: NDArray[np.integer]) -> None:
-    """Raise StereovoxError where cells (N, 3) lie in more than `MOST_BLOCKS` blocks."""
-    blocks = len(blocks_of_cells(indices)[0]) if len(indices) > MOST_BLOCKS else len(indices)
-    if blocks > MOST_BLOCKS:
-        raise StereovoxError(f"its cells lie in {blocks} blocks, more than {MOST_BLOCKS}; use larger cells or crop it")
+    """Raise StereovoxError where cells (N, 3) lie in more than `MAX_BLOCKS` blocks."""
+    blocks = len(blocks_of_cells(indices)[0]) if len(indices) > MAX_BLOCKS else len(indices)
+    if blocks > MAX_BLOCKS:
+        raise StereovoxError(f"its cells lie in {blocks} blocks, more than {MAX_BLOCKS}; use larger cells or crop it")
 
 
 ARRAYS = ("indices", "log_odds", "voxel_size", "free_below", "occupied_above", "settings")
@@ -86,8 +86,8 @@ def _checked(indices: NDArray[np.integer], log_odds: NDArray[np.floating]) -> tu
     return indices, log_odds
 
 
-MOST_BYTES = 1 << 32
-LONGEST_HEADER, MOST_FIELDS = 1 << 16, 256
+MAX_BYTES = 1 << 32
+MAX_HEADER_LENGTH, MAX_FIELDS = 1 << 16, 256
 TEXT_PIECE, BLANK = 1 << 20, re.compile(rb"\s")
 """Bytes of text that are read at once, and what parts its numbers."""
 OURS = re.compile(r"centres of occupied cells of (\S+) m")
@@ -142,7 +142,7 @@ def read_point_map(path: str | Path, voxel_size: float | None = None) -> VoxelMa
 def read_points(path: str | Path) -> Points:
     """Return the points of a `.ply` or `.pcd` file; raises MapFileError: one line with the file and what is wrong."""
     try:
-        content = read_bounded(Path(path), MOST_BYTES)
+        content = read_bounded(Path(path), MAX_BYTES)
         head = (_ply_head if content.startswith(b"ply") else _pcd_head)(content)
         return Points(_xyz(content[head.start :], head), _told_size(content[: head.start]))
     except OSError as error:
@@ -154,7 +154,7 @@ def read_points(path: str | Path) -> Points:
 def _lines(content: bytes, last: Callable[[list[str]], bool]) -> tuple[list[list[str]], int]:
     """Return the words of the header's lines, up to and with the one that is `last`, and where the rest begins."""
     found, start = [], 0
-    for line in content[:LONGEST_HEADER].splitlines(keepends=True):
+    for line in content[:MAX_HEADER_LENGTH].splitlines(keepends=True):
         start += len(line)
         words = line.decode("ascii", "replace").split()
         found.append(words)
@@ -189,7 +189,7 @@ def _pcd_head(content: bytes) -> _Head:
     names, data = told.get("FIELDS", []), " ".join(told["DATA"])
     sizes, kinds = told.get("SIZE", []), told.get("TYPE", [])
     counts = told.get("COUNT", ["1"] * len(names))
-    if not names or not len(names) == len(sizes) == len(kinds) == len(counts) <= MOST_FIELDS:
+    if not names or not len(names) == len(sizes) == len(kinds) == len(counts) <= MAX_FIELDS:
         raise ValueError("FIELDS, SIZE, TYPE and COUNT do not tell the same number of fields")
     if data not in PCD_ORDERS:
         raise ValueError(f"DATA is {shown(data)}, only {', '.join(PCD_ORDERS)} can be read")
@@ -201,7 +201,7 @@ def _pcd_type(kind: str, size: str, count: str) -> tuple[str, int]:
     letter = PCD_KINDS.get(kind, "")
     if size not in map(str, PCD_SIZES.get(letter, ())):
         raise ValueError(f"no field of TYPE {shown(kind)} has SIZE {shown(size)}")
-    if not 0 < _count(count) <= LONGEST_HEADER:
+    if not 0 < _count(count) <= MAX_HEADER_LENGTH:
         raise ValueError(f"a field of COUNT {shown(count)}")
     return f"{letter}{size}", int(count)
 

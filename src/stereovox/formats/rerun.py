@@ -27,7 +27,7 @@ from stereovox.threads import one_state
 
 CAMERA, CELLS, WAY = "world/camera", "world/occupied", "world/path"
 TIME = "stamp"
-MOST_BOXES = 300_000
+MAX_BOXES = 300_000
 """More cells than this are written as points."""
 WIDEST_PX = 320
 """Depth images are thinned to so many columns."""
@@ -115,7 +115,7 @@ class RerunFile:
         return self._rerun.Pinhole(focal_length=focal, principal_point=principal, resolution=resolution)
 
     def _cells(self, centres: NDArray[np.float64], colours: NDArray[np.uint8], size: float) -> Any:
-        if len(centres) > MOST_BOXES:
+        if len(centres) > MAX_BOXES:
             return self._rerun.Points3D(centres, colors=colours, radii=size / 2)
         halves = np.full((len(centres), 3), size / 2)
         return self._rerun.Boxes3D(centers=centres, half_sizes=halves, colors=colours, fill_mode="solid")

@@ -26,9 +26,9 @@ TRAVERSALS = {
     "exact": "stereovox.integrate._beams:exact",
 }
 """Name -> kernel `(lines, first, columns, rows, gain, adding, values)`, see `_beams.exact`; others as entry points."""
-MOST_CELLS = 4096
+MAX_CELLS = 4096
 """Cells a beam may be long: a scan's patch is at most four times the square of it."""
-MOST_BEAMS = 65536
+MAX_BEAMS = 65536
 """Beams of a scan: so many times the largest evidence fit into 32 bits."""
 UPDATES = {"once": (None, np.int16), "every": (1, np.int32)}
 """Whether what beams say of a cell is added up (None: the last one counts), and what the sum is kept in."""
@@ -44,9 +44,9 @@ class Beams:
 
     def __init__(self, config: Config):
         grid = config.grid
-        if config.max_range + grid.thickness > MOST_CELLS * config.voxel_size:
+        if config.max_range + grid.thickness > MAX_CELLS * config.voxel_size:
             raise ConfigError(
-                f"max_range {config.max_range:g} spans more than {MOST_CELLS} cells of {config.voxel_size:g} in a "
+                f"max_range {config.max_range:g} spans more than {MAX_CELLS} cells of {config.voxel_size:g} in a "
                 "grid; use larger cells"
             )
         self._config = config
@@ -92,7 +92,7 @@ class Beams:
         ranges, clear, clear_from = _beams_of(scan)
         T = se2.lifted(se2.inverse(origin)) @ scan.T_world_sensor
         position = T[:2, 3] / size
-        if not ((np.abs(position) < INDEX_LIMIT - 2 * MOST_CELLS).all() and (np.abs(T[:2, :2]) < 1.01).all()):
+        if not ((np.abs(position) < INDEX_LIMIT - 2 * MAX_CELLS).all() and (np.abs(T[:2, :2]) < 1.01).all()):
             raise FrameRefused(
                 "pose_too_far", f"{name_of(scan)}: is more than {INDEX_LIMIT} cells from the map's origin"
             )
@@ -130,8 +130,8 @@ class Beams:
 def _beams_of(scan: Scan) -> tuple[NDArray[np.float32], ...]:
     """Return ranges, how far beams are known to be free (empty: ranges alone tell), and from where on (empty: 0)."""
     shape = np.shape(scan.ranges)
-    if shape[0] > MOST_BEAMS:
-        raise FrameRefused("too_many_beams", f"{name_of(scan)}: {shape[0]} beams; at most {MOST_BEAMS} are taken")
+    if shape[0] > MAX_BEAMS:
+        raise FrameRefused("too_many_beams", f"{name_of(scan)}: {shape[0]} beams; at most {MAX_BEAMS} are taken")
     for what in ("clear", "clear_from"):
         given = getattr(scan, what)
         if given is not None and (given.shape != shape or given.dtype.kind not in "fiu"):

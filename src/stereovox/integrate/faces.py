@@ -20,7 +20,7 @@ from stereovox.se3 import Transform
 WideCamera = SphericalCamera | CylindricalCamera
 FORWARD = ((0, 0, 1), (0, 1, 0), (0, 0, -1), (0, -1, 0), (1, 0, 0), (-1, 0, 0))
 """Directions of the six faces in the optical frame of the wide camera."""
-FEWEST_PIXELS, MAX_SHARE = 1 << 18, 16
+MIN_PIXELS, MAX_SHARE = 1 << 18, 16
 """Pixels that all faces may have however small the image, and for each pixel of it. A sphere needs less than two."""
 
 
@@ -62,7 +62,7 @@ def faces_of(camera: WideCamera, config: Config) -> list[Face]:
     except StereovoxError as error:
         raise FrameRefused("bad_camera", str(error)) from None
     pixels = sum(pinhole.width * pinhole.height for _, pinhole in places)
-    if pixels > FEWEST_PIXELS + MAX_SHARE * camera.width * camera.height:
+    if pixels > MIN_PIXELS + MAX_SHARE * camera.width * camera.height:
         said = f"{camera.width}x{camera.height} wide pixels need {pixels} of pinhole cameras"
         raise FrameRefused("bad_camera", f"{said}: their sides differ too much; check the camera's steps")
     faces = [_face(camera, pinhole, forward) for forward, pinhole in places]

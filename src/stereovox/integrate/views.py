@@ -55,7 +55,7 @@ Chosen so that a cell is cleared when any ray through it goes on, as exact ray c
 RIM_SHARE = 0.35
 """`rim_share` of the image of a pinhole camera."""
 
-FEWEST_BLOCKS, BLOCKS_PER_PIXEL = 1 << 18, 32
+MIN_BLOCKS, BLOCKS_PER_PIXEL = 1 << 18, 32
 """Blocks that a camera may see however small its image, and for each pixel: an image of a few can tell of no more."""
 MAX_BLOCKS = 1 << 21
 """Blocks that one frame may tell of: a thousand million cells. Their places fit into 22 bits (`_hits.scatter`)."""
@@ -236,7 +236,7 @@ def check_blocks(blocks: int, camera: VirtualCamera) -> None:
 
 
 def _fitting_blocks(camera: VirtualCamera) -> int:
-    return FEWEST_BLOCKS + BLOCKS_PER_PIXEL * camera.width * camera.height
+    return MIN_BLOCKS + BLOCKS_PER_PIXEL * camera.width * camera.height
 
 
 def uses_wide_keys(camera: VirtualCamera, reach: float, config: Config) -> bool:

@@ -18,7 +18,7 @@ from stereovox.maps import _pool
 SIDE = 8
 """Cells along each side of a block."""
 CELLS = SIDE**3
-MOST_PLACES = 2**62
+MAX_PLACES = 2**62
 """Places in a box that one int64 can count."""
 
 
@@ -32,7 +32,7 @@ def blocks_of_cells(cells: NDArray[np.integer]) -> tuple[NDArray[np.int64], NDAr
         return coords, np.zeros(0, np.int64)
     low = coords.min(axis=0)
     _, y_side, z_side = sides = [int(n) + 1 for n in coords.max(axis=0) - low]
-    if prod(sides) > MOST_PLACES:
+    if prod(sides) > MAX_PLACES:
         blocks, of_cell = np.unique(coords, axis=0, return_inverse=True)
         return blocks, of_cell.ravel()
     x, y, z = (coords - low).T

@@ -83,7 +83,7 @@ def _about(grid_map: GridMap) -> dict[str, Any]:
     }
 
 
-MOST_PICTURED = 2**29
+MAX_PICTURED = 2**29
 """Cells of the largest picture; the map itself holds only what was seen and may reach farther."""
 
 
@@ -240,11 +240,11 @@ class GridMap(Guarded, WithHistory):
     def occupancy(self) -> OccupancyGrid:
         """Return all known cells as per cent, in a picture just large enough; no cells at all for an empty map.
 
-        Cells are of the same state here and there (see `Percent`). Raises StereovoxError for more than MOST_PICTURED.
+        Cells are of the same state here and there (see `Percent`). Raises StereovoxError for more than MAX_PICTURED.
         """
         box = self._box()
         (left, bottom), (right, top) = np.zeros((2, 2), int).tolist() if box is None else box.tolist()
-        if (top - bottom) * (right - left) > MOST_PICTURED:
+        if (top - bottom) * (right - left) > MAX_PICTURED:
             across, up = ((b - a) * self.voxel_size for a, b in ((left, right), (bottom, top)))
             raise StereovoxError(
                 f"a map of {across:.0f} x {up:.0f} m has too many cells of {self.voxel_size:g} m for a picture; "

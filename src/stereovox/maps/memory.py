@@ -6,19 +6,19 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from stereovox.config import LARGEST_WINDOW, Config
+from stereovox.config import MAX_WINDOW, Config
 from stereovox.errors import ConfigError
 from stereovox.maps.blocks import CELLS, SIDE, table_size
 from stereovox.maps.cell_format import FORMATS
 from stereovox.maps.tiles import TILE, WAITING
 from stereovox.maps.window import most_touched, size_in_cells
 
-MOST_BYTES = 8_000_000_000
+MAX_BYTES = 8_000_000_000
 """A window that would need more memory is taken for a mistake, unless `max_memory` allows it."""
-MOST_TOLD = 10**24
+MAX_TOLD = 10**24
 """More bytes than that are told as that many: a whole number may be larger than any float."""
 UNITS = (1e12, "TB"), (1e9, "GB"), (1e6, "MB"), (1e3, "kB")
-MOST_BLOCKS = 1 << 29
+MAX_BLOCKS = 1 << 29
 """Places of blocks are kept in 32 bits, those with numbers and those without one after the other."""
 COORDS = 3 * 4
 """Bytes of a block's coordinates."""
@@ -33,7 +33,7 @@ def pool_bytes(config: Config, blocks: int) -> int:
 def most_blocks(config: Config) -> int:
     """Return how many blocks fit into `max_memory`. Raises ConfigError where none does."""
     allowed = int(config.max_memory or 0)
-    most = _largest(lambda blocks: pool_bytes(config, blocks) <= allowed, MOST_BLOCKS)
+    most = _largest(lambda blocks: pool_bytes(config, blocks) <= allowed, MAX_BLOCKS)
     if not most:
         raise ConfigError(f"max_memory {allowed}: not one block of cells fits; allow more")
     return most
@@ -58,7 +58,7 @@ def within_memory(config: Config) -> Config:
     """
     allowed = int(config.max_memory or 0)
     if not allowed or (config.window.size is None and config.when_full == "refuse"):
-        _check(config, MOST_BYTES, "choose a smaller window.size or larger cells")
+        _check(config, MAX_BYTES, "choose a smaller window.size or larger cells")
         return config
     if config.when_full != "refuse":
         config = _with_window(config, outside="keep" if config.when_full == "spill" else "drop")
@@ -70,14 +70,14 @@ def within_memory(config: Config) -> Config:
 
 def told(number_of_bytes: float) -> str:
     """Return a number of bytes as text."""
-    number = float(min(number_of_bytes, MOST_TOLD))
+    number = float(min(number_of_bytes, MAX_TOLD))
     size, unit = next(((size, unit) for size, unit in UNITS if number >= size), (1.0, "bytes"))
     return f"{number / size:.0f} {unit}" if number >= 10 * size else f"{number / size:.2g} {unit}"
 
 
 def _enough(number_of_bytes: int) -> str:
     """Return at least this number of bytes as text, so that who sets just what it says has enough."""
-    number = min(number_of_bytes, int(MOST_TOLD))
+    number = min(number_of_bytes, int(MAX_TOLD))
     size, unit = next(((int(size), unit) for size, unit in UNITS if number >= size), (1, "bytes"))
     part = 1 if number >= 10 * size or size == 1 else 10
     return f"{-(-number * part // size) / part:g} {unit}"
@@ -88,7 +88,7 @@ def _widest(config: Config) -> float:
     least = 2 * (config.max_range + config.window.trigger) + config.voxel_size
     step = SIDE * config.voxel_size
     fits = lambda n: _window_bytes(_as_wide(config, n * step)) <= (config.max_memory or 0)  # noqa: E731
-    width = step * _largest(fits, int(LARGEST_WINDOW / step))
+    width = step * _largest(fits, int(MAX_WINDOW / step))
     if width < least:
         needed = _window_bytes(_as_wide(config, step * -(-least // step)))
         raise ConfigError(

@@ -42,7 +42,7 @@ from stereovox.trust.history import History
 
 ARRAYS = ("coords", "cells", "times")
 """Names of the arrays of a map, the last only where times are kept."""
-LARGEST_CHUNK = 1 << 26
+MAX_CHUNK = 1 << 26
 """Bytes of an unpacked chunk; `store` writes 4 MiB."""
 SMALL, PACKED_BEST = 1 << 24, 100
 """Coordinates may unpack to so many bytes, or to so many for each of theirs on disk."""
@@ -98,7 +98,7 @@ def _rows_a_chunk(told: Any, name: str, shape: tuple[int, int], dtype: np.dtype[
     rows, width = told["chunk_grid"]["configuration"]["chunk_shape"]
     if told["shape"] != list(shape) or told["data_type"] != dtype.name:
         raise ValueError(f"array of {told['shape']} {told['data_type']} where {list(shape)} {dtype} belongs")
-    if type(rows) is not int or not 0 < rows * width * dtype.itemsize <= LARGEST_CHUNK or width != shape[1]:
+    if type(rows) is not int or not 0 < rows * width * dtype.itemsize <= MAX_CHUNK or width != shape[1]:
         raise ValueError(f"{name}: chunks of {rows} x {width}")
     order = BYTES if dtype.itemsize == 1 else LITTLE
     _, packing = told["codecs"]
@@ -155,7 +155,7 @@ def _ascend(coords: NDArray[np.int32]) -> bool:
 FORMAT = "stereovox-map"
 VERSION, READABLE = 2, (1, 2)
 MANIFEST = "manifest.json"
-MOST_MANIFEST = 1 << 22
+MAX_MANIFEST = 1 << 22
 """Bytes of a manifest."""
 BLOCKS_PER_CHUNK = 4096
 UNFINISHED = re.compile(r"cells-[0-9a-f]{12}|\.manifest\.json\.new|\.lock")
@@ -301,7 +301,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     if (folder / MANIFEST).is_symlink():
         raise MapFileError(f"{folder / MANIFEST}: is a link; a map has all its files in one folder")
     try:
-        manifest = json_value(read_bounded(folder / MANIFEST, MOST_MANIFEST))
+        manifest = json_value(read_bounded(folder / MANIFEST, MAX_MANIFEST))
     except OSError as error:
         reason = error.strerror or error
         raise MapFileError(f"{folder / MANIFEST}: cannot be read ({reason}); check that you may read it") from None

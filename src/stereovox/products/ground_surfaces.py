@@ -14,7 +14,7 @@ from stereovox.maps import State, VoxelMap
 from stereovox.maps.cubes import in_cubes
 from stereovox.products.floor_axes import floor_axes
 from stereovox.products.neighbours import components
-from stereovox.products.projection import MOST_CELLS
+from stereovox.products.projection import MAX_CELLS
 from stereovox.products.side_by_side import in_memory
 
 TIE = 1e-6
@@ -92,7 +92,7 @@ def floor_of(voxel_map: VoxelMap) -> Floor:
         raise StereovoxError("the map is empty: there is no floor to look at")
     low, high = np.rint(bounds[:, [x, y]] / cell[x]).astype(np.int64)
     columns, rows = (high - low).tolist()
-    if rows * columns > MOST_CELLS:
+    if rows * columns > MAX_CELLS:
         raise StereovoxError(f"a floor of {columns} x {rows} cells is too large; take a part of it: stereovox crop")
     return Floor(voxel_map, (x, y, up), sign, low, (rows, columns), cell[x], cell[up])
 

@@ -21,7 +21,7 @@ from stereovox.products.projection import NOTHING, Patch, layers_of, patch_of
 
 STEP = 8 * SIDE
 """The grid grows by so many cells: programs that plan in it need not make room anew with each frame."""
-MOST_CELLS = 2**26
+MAX_CELLS = 2**26
 """Cells of the largest grid; nobody wants to be sent more with each frame."""
 
 
@@ -112,7 +112,7 @@ class _Canvas:
             if (low == self.corner).all() and (high == before).all():
                 return
         columns, rows = (high - low).tolist()
-        if columns * rows > MOST_CELLS:
+        if columns * rows > MAX_CELLS:
             raise StereovoxError(f"a grid of {columns} x {rows} cells is too large; set window.size=[X,Y,Z]")
         larger, (left, bottom) = np.full((rows, columns), UNKNOWN, np.int8), (self.corner - low).tolist()
         if self.cells.size:

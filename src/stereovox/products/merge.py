@@ -18,7 +18,7 @@ from stereovox.products.moved import moved
 from stereovox.products.side_by_side import cells_at, check_alike, in_memory
 from stereovox.threads import one_state
 from stereovox.trust.camera_path import CameraPath
-from stereovox.trust.history import MOST_REASONS, OTHERS, History
+from stereovox.trust.history import MAX_REASONS, OTHERS, History
 
 
 @one_state
@@ -100,7 +100,7 @@ def _both_paths(a: CameraPath, b: CameraPath) -> CameraPath:
 
 def _counts(counts: Counter[str]) -> Counter[str]:
     """Return counts of no more words than a saved map may have."""
-    kept = Counter(dict(counts.most_common(MOST_REASONS)))
+    kept = Counter(dict(counts.most_common(MAX_REASONS)))
     if rest := counts.total() - kept.total():
         kept[OTHERS] += rest
     return kept

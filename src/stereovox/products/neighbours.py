@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from stereovox.errors import StereovoxError
 from stereovox.maps import VoxelMap
-from stereovox.maps.blocks import MOST_PLACES, SIDE
+from stereovox.maps.blocks import MAX_PLACES, SIDE
 from stereovox.products import _margin
 
 FACES = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
@@ -60,7 +60,7 @@ def _places(cells: NDArray[np.integer], longest: int) -> tuple[NDArray[np.int64]
     """
     low = cells.min(axis=0).astype(np.int64)
     extent = [int(n) + 1 + longest for n in cells.max(axis=0) - low]
-    if extent[0] * extent[1] * extent[2] > MOST_PLACES:
+    if extent[0] * extent[1] * extent[2] > MAX_PLACES:
         raise StereovoxError("the map reaches too far to tell what hangs together; take a part of it: stereovox crop")
     x, y, z = (cells - low).T
     return (x * extent[1] + y) * extent[2] + z, extent

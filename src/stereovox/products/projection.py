@@ -100,7 +100,7 @@ def _check(radius: float, margin: int) -> None:
 
 NOTHING = np.iinfo(np.int16).min
 """What a column is stored as of which nothing is known; no cell is stored so."""
-MOST_CELLS = 2**30
+MAX_CELLS = 2**30
 """Cells of the largest grid."""
 TIE = 1e-9
 
@@ -176,7 +176,7 @@ def patch_of(
 
 def _empty(low: NDArray[np.int64], high: NDArray[np.int64]) -> Patch:
     columns, rows = (high - low).tolist()
-    if columns * rows > MOST_CELLS:
+    if columns * rows > MAX_CELLS:
         raise StereovoxError(
             f"a grid of {columns} x {rows} cells is too large; map a smaller place, with --set window.size=[X,Y,Z]"
         )

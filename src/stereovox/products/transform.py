@@ -19,7 +19,7 @@ from stereovox.threads import in_shards
 
 LANES = 32
 """Rows are padded to a multiple of it: whole vectors."""
-MOST_CELLS, LONGEST = 2**28, 2**14
+MAX_CELLS, LONGEST = 2**28, 2**14
 """The largest box, in cells; it needs 20 bytes a cell, with padding more. Its longest side."""
 UNLIMITED = np.float32(3e38)
 
@@ -138,6 +138,6 @@ def transformed(
 def _check(shape: tuple[int, ...], max_distance: float) -> None:
     if not max_distance > 0:
         raise StereovoxError(f"max_distance {max_distance:g}: give a length of more than 0 m")
-    if np.prod(np.array(shape, float)) > MOST_CELLS or max(shape) > LONGEST:
+    if np.prod(np.array(shape, float)) > MAX_CELLS or max(shape) > LONGEST:
         told = " x ".join(map(str, shape))
         raise StereovoxError(f"a box of {told} cells is too large for a distance field; choose a smaller one")

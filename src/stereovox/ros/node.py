@@ -23,7 +23,7 @@ from stereovox.ros.waiting import Arrival, Waiting
 
 IDLE_S, SOON_S = 0.05, 0.005
 """Seconds to wait for messages: when nothing is to be done, and when something will be due soon."""
-MOST_AT_ONCE = 256
+MAX_AT_ONCE = 256
 """Messages that are taken in before the map has its turn."""
 
 
@@ -89,7 +89,7 @@ class MapNode:
     def _take_in(self, wait_s: float) -> None:
         """Wait for messages, and take in all that are there."""
         idle = 0  # rclpy returns empty-handed once after each round of what was ready, whether or not more came
-        for _ in range(MOST_AT_ONCE):
+        for _ in range(MAX_AT_ONCE):
             before = self._heard.messages
             self._executor.spin_once(timeout_sec=wait_s)
             idle = idle + 1 if self._heard.messages == before else 0

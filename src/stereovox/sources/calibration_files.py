@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from stereovox.cameras.lenses import MODELS, Lens
 from stereovox.cameras.rigs import Eyes
 from stereovox.errors import SourceError, StereovoxError
-from stereovox.safe_io import MOST_YAML, read_text, yaml_value
+from stereovox.safe_io import MAX_YAML, read_text, yaml_value
 from stereovox.se3 import Transform, inverse, orthonormalise, rigidity_error
 from stereovox.sources.rig_file import Rig, RigPair
 
@@ -56,7 +56,7 @@ def read_yaml(path: Path) -> Table:
 
     Loader.add_constructor("tag:yaml.org,2002:opencv-matrix", matrix)
     try:
-        lines = read_text(path, MOST_YAML).splitlines()
+        lines = read_text(path, MAX_YAML).splitlines()
         text = "\n".join(lines[1:] if lines and lines[0].startswith("%YAML") else lines)
         table = yaml_value(text, Loader)
     except OSError as error:

@@ -30,9 +30,9 @@ from stereovox.sources.camera_file import Intrinsics, find_camera
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
 START = SIGNATURE + b"\0\0\0\rIHDR"
 HEADER_BYTES = 33  # signature, then IHDR: length, name, 13 bytes, check sum
-MOST_BYTES = 1 << 28
+MAX_BYTES = 1 << 28
 """Bytes of a file: more than so many pixels can need."""
-MOST_SWOLLEN = 1100
+MAX_SWOLLEN = 1100
 """Bytes that one byte of a PNG can stand for (deflate: 1032)."""
 GREY_16 = (16, 0)  # bit depth and colour type
 DEPTH = frozenset({GREY_16})
@@ -105,7 +105,7 @@ def _read(path: Path, header_only: bool = False) -> bytes:
         raise FrameRefused("missing_file", f"{path}: no such file; put it back or remove its entry")
     try:
         if not header_only:
-            return read_bounded(path, MOST_BYTES)
+            return read_bounded(path, MAX_BYTES)
         with path.open("rb") as file:
             return file.read(HEADER_BYTES)
     except OSError as error:
@@ -117,7 +117,7 @@ def _check(path: Path | str, data: bytes, size: tuple[int, int], kinds: Kinds) -
     found = _header_size(path, data, kinds)
     if found != size:
         raise FrameRefused("bad_shape", f"{path}: {_times(found)} pixels, the recording has {_times(size)}; remove it")
-    if not _is_whole(data) or size[0] * size[1] > MOST_SWOLLEN * len(data):
+    if not _is_whole(data) or size[0] * size[1] > MAX_SWOLLEN * len(data):
         raise FrameRefused("unreadable", f"{path}: the PNG is cut off or damaged; copy it again or remove it")
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from stereovox.errors import FrameRefused
 from stereovox.frame import Viewpoint
-from stereovox.safe_io import MOST_LIST, read_bounded
+from stereovox.safe_io import MAX_LIST, read_bounded
 from stereovox.se3 import Transform
 
 POINT_BYTES = 16
@@ -90,7 +90,7 @@ def read_velodyne(path: Path) -> NDArray[np.float32]:
     if not os.path.isfile(path):
         raise FrameRefused("missing_file", f"{path}: no such file; put the scan back or leave its frame out")
     try:
-        data = read_bounded(path, MOST_LIST)
+        data = read_bounded(path, MAX_LIST)
     except OSError as error:
         raise FrameRefused("unreadable", f"{path}: {error.strerror}; make it readable") from None
     if not data or len(data) % POINT_BYTES:

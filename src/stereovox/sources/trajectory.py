@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.errors import SourceError
-from stereovox.safe_io import MOST_LIST, read_text
+from stereovox.safe_io import MAX_LIST, read_text
 from stereovox.sources.poses import Poses
 from stereovox.sources.poses import seconds_from_ns as seconds_from_ns
 
@@ -84,7 +84,7 @@ def stamped_lines(path: Path) -> list[StampedLine]:
     Commas and tabs count as spaces. Raises SourceError naming file and line.
     """
     try:
-        text = read_text(path, MOST_LIST, "replace")
+        text = read_text(path, MAX_LIST, "replace")
     except OSError as error:
         raise SourceError(f"{path}: {error.strerror}; make it readable") from None
     return [_parse(line, f"{path}:{n}") for n, line in enumerate(map(_plain, text.splitlines()), 1) if line]

@@ -16,7 +16,7 @@ from stereovox.se3 import Transform, apart
 
 SPACING_M = 0.05
 """A pose is kept when the camera moved so far, or turned by twice as many radians, since the last one."""
-MOST_STOPS = 2048
+MAX_STOPS = 2048
 """Poses that are kept of all sensors; where there are more, the spacing doubles."""
 FARTHEST = 1e7
 """No number of a pose is larger; `depth.prepare` refuses positions beyond a tenth of it."""
@@ -47,7 +47,7 @@ class CameraPath:
         if stops and not self._is_far(stops[-1], seen):
             return
         stops.append(Seen(seen.stamp_ns, tuple(array("f", seen.pose))))
-        while sum(map(len, self.stops.values())) > MOST_STOPS:
+        while sum(map(len, self.stops.values())) > MAX_STOPS:
             self.spacing *= 2
             self.stops = {name: self._thinned(kept) for name, kept in self.stops.items()}
 
@@ -86,8 +86,8 @@ class CameraPath:
         if not SPACING_M <= spacing < FARTHEST:
             raise ValueError(f"camera_path: spacing {spacing:g}")
         stops = {sensor: _stops_from(one) for sensor, one in saved["stops"].items()}
-        if sum(map(len, stops.values())) > MOST_STOPS:
-            raise ValueError(f"camera_path: more than {MOST_STOPS} poses")
+        if sum(map(len, stops.values())) > MAX_STOPS:
+            raise ValueError(f"camera_path: more than {MAX_STOPS} poses")
         return cls(spacing, stops)
 
     def _is_far(self, before: Seen, now: Seen) -> bool:
@@ -111,7 +111,7 @@ def _packed(numbers: Any, dtype: str) -> str:
 
 
 def _unpacked(text: Any, dtype: str) -> NDArray[Any]:
-    if not isinstance(text, str) or len(text) > 8 * POSE * MOST_STOPS:
+    if not isinstance(text, str) or len(text) > 8 * POSE * MAX_STOPS:
         raise ValueError("camera_path: no packed numbers")
     return np.frombuffer(base64.b64decode(text, validate=True), dtype)
 

@@ -15,8 +15,8 @@ from stereovox.frame import AnyFrame, DepthImage, Scan, StereoFrame, name_of
 from stereovox.se3 import apart
 from stereovox.trust.history import (
     CHANGED,
-    LONGEST_NAME,
-    MOST_SENSORS,
+    MAX_NAME_LENGTH,
+    MAX_SENSORS,
     MOVED,
     Doubt,
     History,
@@ -39,7 +39,7 @@ AGAIN = 0.6
 SOON_S, LATE_S = 0.2, 1.0
 """What comes later than so many seconds after the frame before may disagree more, in proportion, up to twice as much
 after one second more: it sees much that is new, and the world had time to change."""
-LEAST_FRAMES = 5
+MIN_FRAMES = 5
 """Frames that must disagree before anything is made of it, however far apart they were taken."""
 FITS = 1 / 3
 """Share of the frames that agree from elsewhere where it is the camera that was moved: some find no such place."""
@@ -59,7 +59,7 @@ class Judged(NamedTuple):
 class Belief:
     """Compares the disagreement of each frame with that of its sensor of late; what it remembers is in `history`.
 
-    A frame that disagrees more is refused. Where at least LEAST_FRAMES have done so for `trust.changed_s`, the world
+    A frame that disagrees more is refused. Where at least MIN_FRAMES have done so for `trust.changed_s`, the world
     has changed: they are believed until they agree again. But where they would agree if the camera stood elsewhere, it
     is the camera that was moved, or its tracker that is wrong: it is not believed until it agrees again, or has
     disagreed for `trust.moved_s`; nor is what sees nothing known, for the next frames would agree with that.
@@ -128,7 +128,7 @@ class Belief:
         return doubt._replace(verdict=MOVED if doubt.fits >= FITS * (doubt.frames + 1) else CHANGED)
 
     def _lasted(self, doubt: Doubt, enough_ns: float) -> bool:
-        return doubt.lasted_ns(UNTIMED_HZ) >= enough_ns and (doubt.frames >= LEAST_FRAMES or enough_ns == 0)
+        return doubt.lasted_ns(UNTIMED_HZ) >= enough_ns and (doubt.frames >= MIN_FRAMES or enough_ns == 0)
 
     def took(self, sensor: str, judged: Judged) -> None:
         """Remember a frame that the map took in."""
@@ -141,7 +141,7 @@ class Belief:
             )
 
     def _remember(self, sensor: str, doubt: Doubt) -> None:
-        if sensor in self._history.doubts or len(self._history.doubts) < MOST_SENSORS:
+        if sensor in self._history.doubts or len(self._history.doubts) < MAX_SENSORS:
             self._history.doubts[sensor] = doubt
 
     def _refused(self, frame: AnyFrame, against: float | None, limit: float, doubt: Doubt) -> FrameRefused:
@@ -257,8 +257,8 @@ class Gate:
         """Return a frame that fits to the trusted one before, or is believed again."""
         trusted = self._history.trusted.get(sensor)
         if trusted is None:
-            if len(self._history.trusted) >= MOST_SENSORS:
-                raise FrameRefused("bad_sensor", f"{name_of(frame)}: more than {MOST_SENSORS} sensors; name fewer")
+            if len(self._history.trusted) >= MAX_SENSORS:
+                raise FrameRefused("bad_sensor", f"{name_of(frame)}: more than {MAX_SENSORS} sensors; name fewer")
             return Passed(sensor, now)
         why, haste = self._against(trusted, now)
         waiting = self._history.waiting.get(sensor)
@@ -273,8 +273,8 @@ class Gate:
             limit = f"trust.max_pose_off_s {self._trust.max_pose_off_s:g}"
             said = f"{name_of(frame)}: its pose is extrapolated by {off_ns / 1e9:.3f} s ({limit}); give poses in time"
             raise FrameRefused("pose_extrapolated", said)
-        if len(frame.sensor) > LONGEST_NAME or not frame.sensor.isprintable():
-            said = f"sensor is no word of at most {LONGEST_NAME} letters that can be shown; name it otherwise"
+        if len(frame.sensor) > MAX_NAME_LENGTH or not frame.sensor.isprintable():
+            said = f"sensor is no word of at most {MAX_NAME_LENGTH} letters that can be shown; name it otherwise"
             raise FrameRefused("bad_sensor", f"{name_of(frame)}: {said}")
         return frame.sensor or ("scan" if isinstance(frame, Scan) else "camera"), int(frame.stamp_ns)
 

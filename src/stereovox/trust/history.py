@@ -16,14 +16,14 @@ from stereovox.errors import one_line
 from stereovox.trust.camera_path import FARTHEST, CameraPath
 from stereovox.trust.camera_path import Seen as Seen
 
-MOST_SENSORS = 64
+MAX_SENSORS = 64
 """Sensors that one map tells apart."""
-MOST_REASONS = 256
+MAX_REASONS = 256
 """Words that refusals are counted by; further ones count as OTHERS."""
 OTHERS = "others"
 NOT_TOLD = "not_told"
 """How refusals are counted that a map from before reasons were saved only tells the number of."""
-LONGEST_NAME = 256
+MAX_NAME_LENGTH = 256
 EARLIEST, LATEST = -(2**63), 2**63 - 1
 """Stamps in int64 nanoseconds."""
 
@@ -112,13 +112,13 @@ class History:
         """Remember which frame was the last."""
         name, stamp_ns = getattr(frame, "name", ""), getattr(frame, "stamp_ns", 0)
         whole = int(stamp_ns) if isinstance(stamp_ns, int | np.integer) else 0  # a refused frame may hold anything
-        told = name[:LONGEST_NAME] if isinstance(name, str) else ""
+        told = name[:MAX_NAME_LENGTH] if isinstance(name, str) else ""
         self.last_frame = told, min(max(whole, EARLIEST), LATEST)
 
     def refuse(self, reason: str) -> None:
         """Count one refused frame."""
-        reason = one_line(str(reason))[:LONGEST_NAME]  # as `loaded` reads it
-        self.refused[reason if reason in self.refused or len(self.refused) < MOST_REASONS else OTHERS] += 1
+        reason = one_line(str(reason))[:MAX_NAME_LENGTH]  # as `loaded` reads it
+        self.refused[reason if reason in self.refused or len(self.refused) < MAX_REASONS else OTHERS] += 1
 
     def copied(self) -> History:
         """Return a history that goes on by itself."""
@@ -271,20 +271,20 @@ def _streak_from(saved: Any) -> Streak:
 
 
 def _sensors(saved: Any) -> dict[str, Any]:
-    if not isinstance(saved, dict) or len(saved) > MOST_SENSORS:
-        raise ValueError(f"history: sensors are no table of at most {MOST_SENSORS}")
+    if not isinstance(saved, dict) or len(saved) > MAX_SENSORS:
+        raise ValueError(f"history: sensors are no table of at most {MAX_SENSORS}")
     return {_name(name): value for name, value in saved.items()}
 
 
 def _counts(saved: Any, what: str) -> Counter[str]:
-    if not isinstance(saved, dict) or len(saved) > MOST_REASONS + 1:
-        raise ValueError(f"history.{what} is no table of at most {MOST_REASONS} counts")
+    if not isinstance(saved, dict) or len(saved) > MAX_REASONS + 1:
+        raise ValueError(f"history.{what} is no table of at most {MAX_REASONS} counts")
     return Counter({_name(name): _whole(number, f"history.{what}") for name, number in saved.items()})
 
 
 def _name(value: Any) -> str:
-    if not isinstance(value, str) or len(value) > LONGEST_NAME:
-        raise ValueError(f"history: a name is no text of at most {LONGEST_NAME} letters")
+    if not isinstance(value, str) or len(value) > MAX_NAME_LENGTH:
+        raise ValueError(f"history: a name is no text of at most {MAX_NAME_LENGTH} letters")
     return one_line(value)
 
 

@@ -16,8 +16,8 @@ from stereovox.view.figures import WIDTH, figure_of, save, words_above
 
 COLOURS = "viridis"
 LINES = (0.1, 0.25, 0.5, 1.0, 2.0, 5.0, 10.0)
-"""Distances between lines, in metres; there are at most MOST_LINES."""
-MOST_LINES = 10
+"""Distances between lines, in metres; there are at most MAX_LINES."""
+MAX_LINES = 10
 
 
 def picture_distance(
@@ -70,7 +70,7 @@ def _lines(axis: Any, metres: np.ma.MaskedArray, extent: tuple[float, float, flo
     if metres.mask.all() or min(metres.shape) < 2:
         return
     most = float(metres.max())
-    step = next((step for step in LINES if most / step <= MOST_LINES), most / MOST_LINES)
+    step = next((step for step in LINES if most / step <= MAX_LINES), most / MAX_LINES)
     levels = np.arange(step, most, step)
     if len(levels):
         lines = axis.contour(metres, levels, origin="lower", extent=extent, colors="white", linewidths=0.8)

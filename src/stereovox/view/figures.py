@@ -72,7 +72,7 @@ def png_of(figure: Any, dpi: int) -> bytes:
 
 DPI = 120
 ENDINGS = (".png", ".pdf", ".svg")
-LEAST_DPI, MOST_DPI = 20, 2400
+MIN_DPI, MAX_DPI = 20, 2400
 WIDTH = 16.0
 """Width of a page in inches."""
 
@@ -115,8 +115,8 @@ def save(figure: Any, path: str | Path, dpi: float | None = None) -> None:
     ending = Path(path).suffix.lower()
     if ending not in ENDINGS:
         raise StereovoxError(f"{path}: pictures are .png, .pdf or .svg; give a name that ends so")
-    if dpi is not None and not LEAST_DPI <= dpi <= MOST_DPI:
-        raise StereovoxError(f"--dpi {dpi:g}: give {LEAST_DPI} to {MOST_DPI} dots an inch")
+    if dpi is not None and not MIN_DPI <= dpi <= MAX_DPI:
+        raise StereovoxError(f"--dpi {dpi:g}: give {MIN_DPI} to {MAX_DPI} dots an inch")
     undated = {".png": None, ".pdf": {"CreationDate": None}, ".svg": {"Date": None}}[ending]
     with replacing(path, StereovoxError) as file, rc_context({"pdf.fonttype": 42, "svg.fonttype": "none"}):
         figure.savefig(file, dpi=dpi or figure.dpi, format=ending[1:], metadata=undated)

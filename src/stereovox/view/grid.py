@@ -17,7 +17,7 @@ from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.view.figures import WIDTH, figure_of, save, words_above
 from stereovox.view.panels import GREY, INK, PATH_COLOUR, STATE_COLOURS, measured, scale_bar
 
-MOST_PIXELS = 1500
+MAX_PIXELS = 1500
 """Cells along the longer side up to which each has a pixel of its own; beyond, one of several is shown."""
 Box = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Lowest and highest (2,) x, y in metres."""
@@ -82,7 +82,7 @@ def bounds(grid: OccupancyGrid, track: ArrayLike | None = None) -> Box | None:
     return low - margin, high + margin
 
 
-def plan(axis: Any, grid: OccupancyGrid, track: ArrayLike | None = None, most: int = MOST_PIXELS) -> None:
+def plan(axis: Any, grid: OccupancyGrid, track: ArrayLike | None = None, most: int = MAX_PIXELS) -> None:
     """Draw the states of a map's cells into a panel in metres of the map's frame, and a robot's way if there is one."""
     paint(axis, grid, grid.states, {int(state): STATE_COLOURS[state] for state in State}, most)
     axis.set_facecolor(STATE_COLOURS[State.UNKNOWN])
@@ -94,7 +94,7 @@ def plan(axis: Any, grid: OccupancyGrid, track: ArrayLike | None = None, most: i
 
 
 def paint(
-    axis: Any, grid: OccupancyGrid, classes: NDArray[np.uint8], colours: Mapping[int, str], most: int = MOST_PIXELS
+    axis: Any, grid: OccupancyGrid, classes: NDArray[np.uint8], colours: Mapping[int, str], most: int = MAX_PIXELS
 ) -> None:
     """Draw classes (rows, columns) uint8 of the cells of `grid` into a panel.
 

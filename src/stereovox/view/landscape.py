@@ -16,7 +16,7 @@ from stereovox.view.render import Direction, render
 from stereovox.view.scale import Scale, scale_of
 from stereovox.view.space import draw_frame, fit, numbers
 
-MOST_COLUMNS = 160
+MAX_COLUMNS = 160
 """Cells along a side; larger layers are thinned, and the value furthest from unknown stays."""
 TALL = 0.3
 """Height of the landscape as a share of its longer side."""
@@ -45,7 +45,7 @@ def draw_landscape(axis: Any, one: Layer, voxel_map: VoxelMap) -> None:
 
 def thinned(values: NDArray[np.float64], unknown: float) -> tuple[NDArray[np.float64], int]:
     """Return values (rows, columns), NaN unknown, of which each stands for step by step cells, and the step."""
-    step = max(1, -(-max(values.shape) // MOST_COLUMNS))
+    step = max(1, -(-max(values.shape) // MAX_COLUMNS))
     if step == 1:
         return values, 1
     rows, across = (-(-size // step) for size in values.shape)

@@ -20,7 +20,7 @@ from stereovox.view.panels import GREY, LINE, PATH_COLOUR, STATE_COLOURS, measur
 from stereovox.view.scale import scale_of
 from stereovox.view.viewpoint import FIELD_M
 
-MOST_SQUARES = 90
+MAX_SQUARES = 90
 """Columns of cells up to which each is drawn as a square with an outline."""
 
 
@@ -117,7 +117,7 @@ def _where(one: Layer) -> str:
 def _squares(axis: Any, one: Layer) -> None:
     """Outline the cells where they are large enough to be told apart."""
     rows, columns = one.state.shape
-    if max(rows, columns) > MOST_SQUARES:
+    if max(rows, columns) > MAX_SQUARES:
         return
     left, right, bottom, top = one.extent
     axis.vlines(np.linspace(left, right, columns + 1), bottom, top, color=LINE, linewidth=0.5)

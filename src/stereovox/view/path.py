@@ -26,7 +26,7 @@ MORE_RADII = 3.0
 """The section reaches so many radii above and below the path."""
 DRAWN_EVERY = 2.0
 """The body is drawn along the path this many radii apart."""
-MOST_BODIES = 100
+MAX_BODIES = 100
 NEAREST = {"obstacle": ([State.OCCUPIED, State.TENTATIVE], INK), "unknown cell": ([State.UNKNOWN], "tab:blue")}
 
 
@@ -101,7 +101,7 @@ def _mark(above: Any, others: tuple[Any, ...], place: NDArray[np.float64], at: f
 def _bodies(axis: Any, places: NDArray[np.float64], radius: float, length: float) -> None:
     from matplotlib.patches import Circle
 
-    number = int(np.clip(length / max(DRAWN_EVERY * radius, length / MOST_BODIES, 1e-9) + 1, 2, MOST_BODIES))
+    number = int(np.clip(length / max(DRAWN_EVERY * radius, length / MAX_BODIES, 1e-9) + 1, 2, MAX_BODIES))
     for n in np.linspace(0, len(places) - 1, number).round().astype(int):
         axis.add_patch(Circle(tuple(places[n]), radius, fill=False, color=PATH_COLOUR, alpha=0.6))
     for place, word in ((places[0], "start"), (places[-1], "goal")):

@@ -14,7 +14,7 @@ from stereovox.view.render import Direction
 
 SIZE_PX = 640
 """Width or height of a picture of a map, whichever is longer."""
-LARGEST_PX = 24.0
+MAX_PX = 24.0
 """A cube's side is no longer."""
 FROM = Direction.of(-60, 38)
 
@@ -38,7 +38,7 @@ def space_pixels(voxel_map: VoxelMap) -> NDArray[np.uint8]:
     cells = cells[np.argsort(cells @ FROM.toward)]  # far ones first: nearer ones overwrite them
     flat = FROM.flat(cells)
     low, high = flat.min(0) - 1, flat.max(0) + 1
-    scale = min(SIZE_PX / float((high - low).max()), LARGEST_PX)
+    scale = min(SIZE_PX / float((high - low).max()), MAX_PX)
     width, height = np.ceil((high - low) * scale).astype(int) + 2
     column, row = (np.rint((flat - low) * scale) * [1, -1] + [0, height - 2]).astype(np.int64).T
     front = _painted(row * width + column, *_cube(scale), width, np.zeros(height * width, np.int32))

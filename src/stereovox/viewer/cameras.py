@@ -25,7 +25,7 @@ FAR = 0.8
 """How far the page stands from the middle of the map, in diagonals of the map."""
 FRUSTUM_M = 0.15
 """Depth of the small fields of view along the path."""
-MOST_FRUSTA = 60
+MAX_FRUSTA = 60
 FRUSTA_COLOUR = "#2a78c2"
 
 
@@ -93,7 +93,7 @@ def add_frusta(server: ViserServer, voxel_map: VoxelMap) -> None:
     stops, viewpoint = voxel_map.history.path.until(), voxel_map.viewpoint
     if viewpoint is None or not stops:
         return _remove(server, "/frusta/views")
-    some = stops[:: -(-len(stops) // MOST_FRUSTA)]
+    some = stops[:: -(-len(stops) // MAX_FRUSTA)]
     lines = [field_of_view(viewpoint._replace(T_world_camera=pose), FRUSTUM_M) for _, pose in some]
     server.scene.add_line_segments(
         "/frusta/views", np.concatenate(lines), rgb(FRUSTA_COLOUR), thickness=1.5, thickness_units="screen"

@@ -16,7 +16,7 @@ from stereovox.view.drawn import stood_up
 from stereovox.view.panels import STATE_COLOURS
 from stereovox.view.picture import height_scale
 from stereovox.view.scale import COLOURS
-from stereovox.viewer.chunks import MOST_CELLS, Chunks, Draws
+from stereovox.viewer.chunks import MAX_CELLS, Chunks, Draws
 
 if TYPE_CHECKING:
     from viser import SceneNodeHandle, ViserServer
@@ -101,7 +101,7 @@ class Cells:
     that are in the scene at once, about.
     """
 
-    def __init__(self, server: ViserServer, voxel_map: VoxelMap, up: str, most: int = MOST_CELLS):
+    def __init__(self, server: ViserServer, voxel_map: VoxelMap, up: str, most: int = MAX_CELLS):
         self._server, self._up, self._map = server, up, voxel_map
         self._found: dict[State, NDArray[np.int32]] = {}
         self.solid = np.empty((0, 3), np.int32)

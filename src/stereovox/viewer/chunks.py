@@ -22,7 +22,7 @@ SIDE = 1 << CHUNK_BITS
 """Cells along a side of a chunk."""
 COARSEST = 4
 """Times that the side of a cell is doubled, at most."""
-MOST_CELLS = 250_000
+MAX_CELLS = 250_000
 """Cells of one kind that are sent at once, about, if nobody asks for another number."""
 ANGLE = 0.002
 """A cell that looks smaller than so many radians, about two pixels, may be drawn coarser."""
@@ -62,7 +62,7 @@ class Chunks:
     origin on.
     """
 
-    def __init__(self, server: ViserServer, name: str, size: float, draws: Draws, most: int = MOST_CELLS):
+    def __init__(self, server: ViserServer, name: str, size: float, draws: Draws, most: int = MAX_CELLS):
         self.chunks: dict[Key, Chunk] = {}
         self._server, self._name, self._size, self._draws, self._most = server, name, size, draws, most
         self.root = server.scene.add_frame(name, show_axes=False)
@@ -142,7 +142,7 @@ def levels(
     numbers: NDArray[np.integer],
     eyes: NDArray[np.floating],
     size: float,
-    most: int = MOST_CELLS,
+    most: int = MAX_CELLS,
 ) -> NDArray[np.int64]:
     """Return how often the side of cells is doubled in chunks at `places` (n, 3) with `numbers` (n,) cells: (n,).
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 SHARP_PX = 1024
 """Browsers blur enlarged images: a layer's longer side is sent with at least about half so many pixels."""
-MOST_PX = 4096
+MAX_PX = 4096
 """Largest side of an image that every browser can draw; longer layers are thinned."""
 
 
@@ -115,8 +115,8 @@ def add_plane(server: ViserServer, one: Layer, image: NDArray[np.uint8]) -> Imag
 def sharp(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Return an image (H, W, 4) with its pixels repeated, so that cells keep their edges; a too large one thinned."""
     longer = max(image.shape[:2])
-    if longer > MOST_PX:
-        step = -(-longer // MOST_PX)
+    if longer > MAX_PX:
+        step = -(-longer // MAX_PX)
         return image[::step, ::step]
     times = max(1, SHARP_PX // longer)
     return image.repeat(times, axis=0).repeat(times, axis=1)

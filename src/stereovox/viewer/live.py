@@ -19,7 +19,7 @@ from stereovox.viewer.panel import plain
 from stereovox.viewer.serve import HERE, PORT
 from stereovox.viewer.viewer import open_viewer
 
-LEAST_S = 0.5
+MIN_S = 0.5
 """Seconds from one picture to the next, at least."""
 COPY_REST, DRAW_REST = 25, 4
 """Times as long as a copy, and as a drawing, took must pass before the next: at most 4 % of mapping, 20 % of a core."""
@@ -69,7 +69,7 @@ class LiveView:
         if start >= self._due and self._free.is_set() and not self._stopped.is_set():
             self._hand_over(frame, report)
             done = monotonic()
-            self._due = done + max(LEAST_S, COPY_REST * (done - start))
+            self._due = done + max(MIN_S, COPY_REST * (done - start))
 
     def finish(self) -> None:
         """Show the map as it is now, whole; to be called when the last frame is in it."""

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 KEPT = 16
 """Maps along the recording that are kept, so that going back need not begin at the first frame."""
-MOST_KEPT_BYTES = 1 << 30
+MAX_KEPT_BYTES = 1 << 30
 SLOWEST_S = 0.1
 """A recording without times plays with so many seconds a frame."""
 TOLD_S = 0.5
@@ -79,7 +79,7 @@ class Replay:
 
     def _keep(self) -> None:
         """Keep a copy now and then, as far as memory goes."""
-        room = MOST_KEPT_BYTES // max(self._mapper.map.memory_bytes, 1)
+        room = MAX_KEPT_BYTES // max(self._mapper.map.memory_bytes, 1)
         apart = max(1, len(self._source) // max(1, min(KEPT, room)))
         if self._done % apart == 0 and self._done not in self._kept:
             self._kept[self._done] = self._mapper.map.snapshot()

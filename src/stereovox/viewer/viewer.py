@@ -13,7 +13,7 @@ from stereovox.maps import VoxelMap
 from stereovox.view.drawn import checked_up
 from stereovox.viewer.cameras import Cameras, as_tuple, first_look, up_vector
 from stereovox.viewer.cells import Cells
-from stereovox.viewer.chunks import MOST_CELLS
+from stereovox.viewer.chunks import MAX_CELLS
 from stereovox.viewer.layer import LayerPlane
 from stereovox.viewer.measure import Measure
 from stereovox.viewer.panel import axis_chart, colour_bar, plain, statistics
@@ -121,7 +121,7 @@ def open_viewer(
     port: int = PORT,
     up: str | None = None,
     token: str | None = None,
-    most_cells: int = MOST_CELLS,
+    most_cells: int = MAX_CELLS,
 ) -> Viewer:
     """Serve a page of a map, under the heading `name`, until it is closed; port 0 takes any free one.
 

@@ -95,7 +95,7 @@ def test_along_a_corridor_nothing_is_found(weak, taken, axis):
 
 
 def test_the_nearest_places_are_tried_first_and_not_all(monkeypatch):
-    monkeypatch.setattr("stereovox.localize.slam.loops.MOST_TRIED", 2)
+    monkeypatch.setattr("stereovox.localize.slam.loops.MAX_TRIED", 2)
     finder, windows = found(lambda _: {})
     later = [edge.second for edge in finder.edges]
     assert max(later.count(i) for i in later) == 2

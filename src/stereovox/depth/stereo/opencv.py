@@ -21,7 +21,7 @@ ROUNDED = -1 / 32
 LOCKING = 0.62
 """Its semi-global matching pulls fractions to whole pixels: 0.5 (2 f)^0.62 makes them as frequent as they should be."""
 PREFILTER = 63
-MOST_COST = 32767
+MAX_COST = 32767
 """OpenCV's semi-global matching adds costs up in 16 bits."""
 """Gradients along a row count up to this."""
 
@@ -60,7 +60,7 @@ class _SemiGlobal(_OpenCv):
         import cv2
 
         window = config.block_size**2
-        if (config.p2 + PREFILTER) * window > MOST_COST:
+        if (config.p2 + PREFILTER) * window > MAX_COST:
             raise ConfigError(
                 f"stereo.block_size {config.block_size} with p2 {config.p2:g}: too large, OpenCV's costs overflow; use "
                 "less, or stereo.method=block"

@@ -139,7 +139,7 @@ def size_table(result: dict[str, Any]) -> Table:
 
 FRAMES = 6000
 """A minute."""
-LEAST_FRAMES = 500
+MIN_FRAMES = 500
 """Shorter flights have no start and end to compare."""
 FRAMES_A_METRE = 6
 SETTINGS = {"voxel_size": 0.2, "max_range": 5.0}
@@ -184,8 +184,8 @@ def cost_along_path(frames: int = FRAMES, tell: Progress = silent) -> dict[str, 
     ratio of their medians), `ratio_error` (its standard error), `pieces, start_bytes, end_bytes`.
     Raises StereovoxError for a flight of less than 500 frames, SourceError for one that is too long.
     """
-    if frames < LEAST_FRAMES:
-        raise StereovoxError(f"a flight of {frames} frames is too short to compare; fly at least {LEAST_FRAMES}")
+    if frames < MIN_FRAMES:
+        raise StereovoxError(f"a flight of {frames} frames is too short to compare; fly at least {MIN_FRAMES}")
     metres = frames / FRAMES_A_METRE
     # half of the simulated flight is out, half back: only the way out is flown
     source = open_source(f"sim:flight?length={2 * metres + 10:g}&speed=5")

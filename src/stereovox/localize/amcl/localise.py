@@ -102,7 +102,7 @@ def checked_start(start: ArrayLike) -> NDArray[np.float64]:
     return pose
 
 
-MOST_AT_START = 1_000_000
+MAX_AT_START = 1_000_000
 """Poses that are tried at once where the robot may be anywhere."""
 SETTLED_SHARE, SETTLED_M = 0.95, 0.3
 """The robot knows where it is when so much weight is in one cluster, which is so wide (standard deviation)."""
@@ -179,7 +179,7 @@ class Localiser:
     def _first(self, start: se2.Pose | None) -> se2.Pose:
         most = self.config.particles_max
         if start is None:
-            return self._floor.anywhere(max(min(most * self.config.candidates, MOST_AT_START), most), self._rng)
+            return self._floor.anywhere(max(min(most * self.config.candidates, MAX_AT_START), most), self._rng)
         return near(start, self.config.start_std, most, self._rng)
 
     def _far_enough(self, pose_odom_base: se2.Pose) -> bool:

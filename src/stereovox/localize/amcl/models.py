@@ -15,7 +15,7 @@ from stereovox.localize.scan_beams import Beams
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.maps.voxel_map import State
 
-LEAST_WAY = 0.01
+MIN_WAY = 0.01
 """Metres below which the direction of a way says nothing: the robot turned on the spot."""
 
 
@@ -23,7 +23,7 @@ def turn_go_turn(pose_odom_before: se2.Pose, pose_odom_after: se2.Pose) -> NDArr
     """Return the (3,) first turn, way and second turn (radians, metres) that lead from one (3,) pose to the other."""
     step = se2.relative(pose_odom_before, pose_odom_after)
     way = float(np.hypot(step[0], step[1]))
-    first = float(np.arctan2(step[1], step[0])) if way >= LEAST_WAY else 0.0
+    first = float(np.arctan2(step[1], step[0])) if way >= MIN_WAY else 0.0
     return np.array([first, way, float(se2.wrapped(step[2] - first))])
 
 
@@ -95,7 +95,7 @@ def distance_field(grid: OccupancyGrid, farthest: float = np.inf) -> DistanceFie
 
 LENGTHS = 1024
 """So many lengths of beams are told apart by the beam model, from 0 to the longest."""
-LEAST_LEVEL = 1e-6
+MIN_LEVEL = 1e-6
 """Metres on the map for one of a beam's length, below which it points straight up or down."""
 WITNESSES = 500
 """So many particles are asked whether a beam fits the map."""
@@ -147,7 +147,7 @@ class BeamModel:
         table, cell = self._table(beams.range_max), self.field.resolution
         bins = table.shape[1] - 1
         row = np.where(beams.at_max, bins + 1, np.rint(beams.ranges * (bins / beams.range_max))).astype(np.int64)
-        level = np.maximum(np.hypot(*beams.directions.T), LEAST_LEVEL)
+        level = np.maximum(np.hypot(*beams.directions.T), MIN_LEVEL)
         across = (beams.directions / level[:, None]).astype(np.float32)
         farthest, out = beams.range_max * level / cell, np.empty(len(particles), np.float32)
         poses, origin = _poses(particles, self.field, 0), _in_cells(beams.origin, self.field)

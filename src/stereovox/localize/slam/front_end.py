@@ -15,7 +15,7 @@ STEP_YAW = 0.01
 """Radians between the turns that the search tries."""
 WINDOW, WINDOW_TURN = 1.0, 1.5
 """Metres and radians that are searched at most, whatever the odometry says."""
-LEAST_WINDOW = 0.1
+MIN_WINDOW = 0.1
 SLOPE = 0.02
 """Likelihood that the search takes off at one standard deviation of the odometry: so much a scan that moves on along a
 corridor loses against one that stays where it was, as its far points fall between those of before."""
@@ -76,7 +76,7 @@ class Follower:
         information = np.diag([metres**-2, metres**-2, radians**-2]) / LOOSER**2
         seeds = cloud.points[:: max(len(cloud.points) // SEARCHED, 1)]
         slopes = SLOPE / metres**2, SLOPE / radians**2
-        window = min(max(3 * metres, LEAST_WINDOW), WINDOW), min(2 * radians, WINDOW_TURN)
+        window = min(max(3 * metres, MIN_WINDOW), WINDOW), min(2 * radians, WINDOW_TURN)
         start, _ = self._map.search(seeds, guess, *window, STEP_YAW, *slopes)
         start = self._map.refine(cloud, start, 2 * config.sigma, guess, information).pose
         return self._map.refine(cloud, start, config.sigma, guess, information).pose

@@ -92,9 +92,9 @@ STRIDE = 3
 """Keyframes from one patch's middle to the next."""
 WEAK = 0.1
 """Share of information below which a direction is a corridor's."""
-MOST_OTHERS = 120
+MAX_OTHERS = 120
 """Keyframes that are laid onto a patch: a robot may pass the same place all day."""
-LEAST_SHARE = 0.4
+MIN_SHARE = 0.4
 """Share of a keyframe's points that must lie on a patch's lines."""
 
 
@@ -124,7 +124,7 @@ def _others(places: se2.Pose, middle: int, first: int, last: int, config: SlamCo
     far = np.hypot(*(places[:, :2] - places[middle, :2]).T)
     near = np.nonzero(far < config.refine_distance)[0]
     near = near[(near < first) | (near >= last)]
-    return near[:: len(near) // MOST_OTHERS + 1]
+    return near[:: len(near) // MAX_OTHERS + 1]
 
 
 def _edge(
@@ -134,7 +134,7 @@ def _edge(
     match = patch.refine(cloud, guess, 2 * config.sigma, iterations=6)
     match = patch.refine(cloud, match.pose, config.sigma, iterations=8)
     moved = match.pose - guess
-    if match.share < LEAST_SHARE or moved[0] ** 2 + moved[1] ** 2 > 0.1 or abs(moved[2]) > 0.1:
+    if match.share < MIN_SHARE or moved[0] ** 2 + moved[1] ** 2 > 0.1 or abs(moved[2]) > 0.1:
         return None
     information = without_weak(in_second_frame(match.information, float(match.pose[2])), WEAK)
     return Edge(*pair, match.pose, information, match.share)

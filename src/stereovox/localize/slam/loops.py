@@ -124,7 +124,7 @@ BASE_WINDOW, BASE_WINDOW_TURN = 0.5, 0.1
 """Metres and radians that are searched even where no drift is to be feared."""
 CORRIDOR = 0.03
 """Share of the strongest direction's information below which the weakest is a corridor's: no closure there."""
-MOST_TRIED = 16
+MAX_TRIED = 16
 """Earlier submaps that a new one is laid onto, the nearest: a robot may pass the same place all day."""
 WITNESS_PATH = 15.0
 """Metres of way within which two findings can bear each other out."""
@@ -169,7 +169,7 @@ class LoopFinder:
                 windows[earlier] = window
         there = self._keyframes[later.anchor].pose
         near = sorted(windows, key=lambda e: float(np.hypot(*(self._keyframes[e.anchor].pose - there)[:2])))
-        for earlier in near[:MOST_TRIED]:
+        for earlier in near[:MAX_TRIED]:
             self._search.onto(submap_cloud(self._keyframes, earlier, FAR_RANGE))
             self._lay(earlier, later, cloud, windows[earlier])
 

@@ -94,7 +94,7 @@ CLOSURE_TRUST, PATCH_TRUST = 0.02, 0.1
 """What a match's information is worth: its points are not independent, nor is what they lie on exact."""
 LOOKS = 2.25
 """A keyframe counts in the map as so many scans: it stands for those around it, and one is enough to know a cell."""
-MOST_CELLS = 40_000
+MAX_CELLS = 40_000
 """Cells on a side of the finished map."""
 JUMP, JUMP_TURN = 0.05, 0.01
 """Metres and radians that a closure must be off, before the graph is solved anew on the way."""
@@ -234,9 +234,9 @@ def map_scans(scans: Iterable[Scan], config: Config, progress: Progress | None =
 
 def _check_extent(poses: se2.Pose, cell: float) -> None:
     span = float(np.ptp(poses[:, :2], axis=0).max())
-    if span > MOST_CELLS * cell:
+    if span > MAX_CELLS * cell:
         raise StereovoxError(
-            f"the robot's way spans {span:.0f} m, more than {MOST_CELLS} cells of {cell:g} m; does its odometry jump? "
+            f"the robot's way spans {span:.0f} m, more than {MAX_CELLS} cells of {cell:g} m; does its odometry jump? "
             "Else set slam.voxel_size larger"
         )
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 STAMP_LIMIT = 2**63
-MOST_COEFFICIENTS = 64
+MAX_COEFFICIENTS = 64
 """Of a lens; the longest model in use has 14."""
 STAMPED = ("PoseStamped", "PoseWithCovarianceStamped", "TransformStamped", "Odometry")
 WITH_CHILD = ("TransformStamped", "Odometry")
@@ -132,7 +132,7 @@ def read_camera_info(wire: Wire) -> CameraInfo:
     height, width = wire.numbers("I", 2)
     wire.text()
     count = wire.number()
-    if count > MOST_COEFFICIENTS:
+    if count > MAX_COEFFICIENTS:
         raise ValueError(f"a lens with {count} coefficients")
     D = wire.numbers("d", count) if count else ()  # aligned only where something follows
     K, _, P = wire.numbers("d", 9), wire.numbers("d", 9), wire.numbers("d", 12)

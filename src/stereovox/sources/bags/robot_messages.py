@@ -69,7 +69,7 @@ TF_TYPES = ("tf2_msgs/TFMessage", "tf/tfMessage")
 FLOATS = {7: "f4", 8: "f8"}
 """`sensor_msgs/PointField` types that can hold a coordinate."""
 MAX_FIELDS = 256
-MOST_BEAMS = 100_000
+MAX_BEAMS = 100_000
 LARGEST = 1e9
 """Metres: no robot goes there, and the products of such numbers are finite."""
 
@@ -103,7 +103,7 @@ def read_laser_scan(wire: Wire, range_max: float = 0.0) -> LaserScan:
     angle_min, _, angle_step, _, _, range_min, told_max = wire.numbers("f", 7)
     range_max = range_max or told_max
     count = wire.number()
-    if count > MOST_BEAMS:
+    if count > MAX_BEAMS:
         raise ValueError(f"a scan of {count} ranges; no lidar has so many beams")
     ranges = wire.array("f4", count).astype(np.float32, copy=False)
     if not len(ranges):

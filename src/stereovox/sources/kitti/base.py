@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from stereovox.cameras.rigs import StereoPair
 from stereovox.errors import FrameRefused, SourceError, did_you_mean
 from stereovox.frame import StereoFrame, Viewpoint
-from stereovox.safe_io import MOST_LIST, read_text
+from stereovox.safe_io import MAX_LIST, read_text
 from stereovox.se3 import Transform, inverse
 from stereovox.sources import parameters
 from stereovox.sources.base import Source
@@ -137,7 +137,7 @@ def location(where: str | os.PathLike[str], known: dict[str, str]) -> tuple[Path
 def time_lines(path: Path, whose: str) -> list[str]:
     """Return the lines of a file of times, stripped; raises SourceError, one line, where there is none."""
     try:
-        lines = read_text(path, MOST_LIST, "replace").rstrip().splitlines()
+        lines = read_text(path, MAX_LIST, "replace").rstrip().splitlines()
     except OSError as error:
         raise SourceError(f"{path}: {error.strerror}; put the {whose}'s own file there") from None
     if not lines:

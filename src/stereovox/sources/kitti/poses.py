@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.errors import FrameRefused, SourceError
-from stereovox.safe_io import MOST_LIST, read_text
+from stereovox.safe_io import MAX_LIST, read_text
 from stereovox.se3 import Transform, inverse, orthonormalise, rigidity_error
 
 EARTH_RADIUS = 6378137.0
@@ -154,7 +154,7 @@ def _floats(line: str) -> NDArray[np.float64]:
 
 def _frame_lines(path: Path, frames: int) -> list[str]:
     try:
-        lines = read_text(path, MOST_LIST, "replace").splitlines()
+        lines = read_text(path, MAX_LIST, "replace").splitlines()
     except OSError as error:
         raise SourceError(f"{path}: {error.strerror}; put it there or choose other poses (?poses=)") from None
     while lines and not lines[-1].strip():

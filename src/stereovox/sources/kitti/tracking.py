@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from stereovox.errors import SourceError
-from stereovox.safe_io import MOST_LIST, read_text
+from stereovox.safe_io import MAX_LIST, read_text
 from stereovox.se3 import Transform
 from stereovox.sources.kitti.base import KittiSource, folder_of, location, named_file, numbers_in
 from stereovox.sources.kitti.calibration import KittiCalibration, read_calibration
@@ -54,7 +54,7 @@ def box_pose(h: float, w: float, l: float, x: float, y: float, z: float, rotatio
 def read_labels(path: Path) -> Labels:
     """Return the annotated objects; raises SourceError, one line with file and line, for what cannot be read."""
     try:
-        lines = read_text(path, MOST_LIST, "replace").splitlines()
+        lines = read_text(path, MAX_LIST, "replace").splitlines()
     except OSError as error:
         raise SourceError(f"{path}: {error.strerror}; make it readable") from None
     found: dict[int, list[Label]] = defaultdict(list)

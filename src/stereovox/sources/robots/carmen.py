@@ -27,7 +27,7 @@ LASERS = {b"FLASER": 100.0, b"ROBOTLASER1": 100.0}
 NO_ECHO = (50.0, 81.9)
 FARTHEST = 1e6
 """Metres from the world's origin within which a robot can be."""
-MOST_BEAMS = 100_000
+MAX_BEAMS = 100_000
 
 
 class DamagedLine(ValueError):  # noqa: N818 - reads as what happened
@@ -91,7 +91,7 @@ def _numbers(words: list[bytes], at: int) -> tuple[NDArray[np.float32], list[byt
     """Return the ranges whose number stands at `at`, and the words behind them."""
     count = int(words[at])
     values, tail = words[at + 1 : at + 1 + count], words[at + 1 + count :]
-    if not 0 <= count <= MOST_BEAMS or len(values) < count:
+    if not 0 <= count <= MAX_BEAMS or len(values) < count:
         raise DamagedLine(f"{words[0].decode()} that tells {count} ranges and holds {len(words) - at - 1} words")
     return np.array(values, dtype="S").astype(np.float64).astype(np.float32) if count else np.empty(0, np.float32), tail
 

@@ -78,7 +78,7 @@ def too_near_wall(nothing, far, source_reason=None, integrator="projective"):
 @pytest.mark.parametrize("nothing", [np.inf, -np.inf, np.nan, 0.0])
 def test_infinite_depth_at_a_wall_that_is_too_near_leaves_it_standing(integrator, nothing):
     """ROG-Map#18: cameras that write +inf (REP 117: too far) for what is too near or unmatched."""
-    assert too_near_wall(nothing, "told", integrator=integrator).all()
+    assert too_near_wall(nothing, "reported", integrator=integrator).all()
     assert too_near_wall(nothing, "measured", integrator=integrator).all()
 
 
@@ -88,7 +88,7 @@ def test_only_who_trusts_infinity_loses_the_wall_to_it():
 
 
 def test_the_sources_word_for_too_far_clears_unless_only_what_is_measured_counts():
-    assert not too_near_wall(0.0, "told", source_reason=sv.Reason.TOO_FAR).any()
+    assert not too_near_wall(0.0, "reported", source_reason=sv.Reason.TOO_FAR).any()
     assert too_near_wall(0.0, "measured", source_reason=sv.Reason.TOO_FAR).all()
     for reason in set(sv.Reason) - {sv.Reason.VALID, sv.Reason.TOO_FAR}:
         assert too_near_wall(0.0, "infinite", source_reason=reason).all()

@@ -200,3 +200,9 @@ def test_a_size_that_is_none_is_told_how_to_write_one(memory):
 
 def test_up_that_is_no_axis_is_refused_with_the_axes_there_are():
     refused("up", "give x, y, z, -x, -y or -z", up="q")
+
+
+def test_older_names_of_values_still_count():
+    assert load_config("default", **{"depth.far": "told"}).depth.far == "reported"
+    with pytest.raises(ConfigError, match="depth.far"):
+        load_config("default", **{"depth.far": "said"})

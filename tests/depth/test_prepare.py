@@ -18,7 +18,7 @@ def frame_of(depth, **changes):
     return Frame(**{"depth": depth, "camera": CAMERA, "T_world_sensor": POSE, "name": "f7", **changes})
 
 
-@pytest.mark.parametrize("far", ["measured", "told", "infinite"])
+@pytest.mark.parametrize("far", ["measured", "reported", "infinite"])
 def test_every_pixel_gets_its_value_or_its_reason(far):
     millimetres = np.array([[0, 65535, 499, 500], [1234, 5000, 5001, 20000]], np.uint16)
     image = prepare(frame_of(millimetres, depth_scale=0.001), load_config(CONFIG, **{"depth.far": far}))
@@ -31,7 +31,7 @@ def test_every_pixel_gets_its_value_or_its_reason(far):
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-@pytest.mark.parametrize(("far", "of_infinity"), [("measured", 5), ("told", 5), ("infinite", 3)])
+@pytest.mark.parametrize(("far", "of_infinity"), [("measured", 5), ("reported", 5), ("infinite", 3)])
 def test_float_depth_that_is_no_depth_clears_only_where_the_settings_say_so(dtype, far, of_infinity):
     depth = np.array([[np.nan, np.inf, -np.inf, -1.0], [0.0, 1e-30, 2.0, 65535.0]], dtype)
     image = prepare(frame_of(depth), load_config(CONFIG, **{"depth.far": far}))
@@ -76,7 +76,7 @@ def slowly_classified(value, said, far, farthest):
     return Reason.TOO_FAR if believed else Reason.UNKNOWN
 
 
-@pytest.mark.parametrize("far", ["measured", "told", "infinite"])
+@pytest.mark.parametrize("far", ["measured", "reported", "infinite"])
 @pytest.mark.parametrize("farthest", [np.inf, 5.0, 4.0, np.nan])
 def test_every_value_under_every_word_of_the_source(far, farthest):
     """Whatever a source says: nothing but what is known to be too far becomes so, as it alone clears."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from pydantic import Field, model_validator
 
-from stereovox.config.robot import Section
+from stereovox.config.base import Section
 
 
 class TrustConfig(Section):

@@ -6,7 +6,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from stereovox.config import MAX_WINDOW, Config
+from stereovox.config import Config
+from stereovox.config.map import MAX_WINDOW
 from stereovox.errors import ConfigError
 from stereovox.maps.blocks import CELLS, SIDE, table_size
 from stereovox.maps.cell_format import FORMATS

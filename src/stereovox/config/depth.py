@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Settings of depth images: their noise, stereo matching, the spherical grid."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from pydantic import Field, field_validator, model_validator
+
+from stereovox.config.base import Section
+
+
+class NoiseConfig(Section):
+    """Range noise sigma(z) = s0 + s1 z + s2 z^2 in metres.
+
+    s0, s1: constant and linear part.
+    s2: quadratic part. Not set: from the camera, `subpixel / (focal_px * baseline)` (Chien 2020, Eq 3.5 with the square
+        that is missing in print).
+    subpixel: standard deviation of the disparity in pixels. Not set: the camera's own (`stereo.subpixel` for images
+        that are matched here), else 0.08.
+    default_baseline: metres between the two eyes, for cameras whose file does not give it.
+    pose_m, pose_deg: standard deviation of the tracker's poses along and about each axis; hits and passes count as less
+        sure, with models that know how wide noise is.
+    """
+
+    s0: float = Field(0.0, ge=0)
+    s1: float = Field(0.0, ge=0)
+    s2: float | None = Field(None, ge=0)
+    subpixel: float | None = Field(None, gt=0)
+    default_baseline: float = Field(0.05, gt=0)
+    pose_m: float = Field(0.0, ge=0, le=10)
+    pose_deg: float = Field(0.0, ge=0, le=90)
+
+
+class DepthConfig(Section):
+    """What happens to a depth image before it becomes evidence.
+
+    denoise: average depths that the camera's noise cannot tell apart, where it is large against the cells.
+    downsample: n by n pixels become one that holds the smallest valid depth of its block (Chien 2020, 3.2); 1: none.
+    far: what is believed to be too far away, and so clears cells up to the maximum range. `measured`: only depths that
+        were measured beyond it; `reported`: also pixels that the source reports as too far (older name: `told`);
+        `infinite`: also +inf (REP 117), for cameras that never write it for what is too near or unmatched.
+    """
+
+    denoise: bool = True
+    downsample: int = Field(1, ge=1, le=64)
+    far: Literal["measured", "reported", "infinite"] = "reported"
+
+    @field_validator("far", mode="before")
+    @classmethod
+    def _older_name(cls, far: Any) -> Any:
+        return "reported" if far == "told" else far
+
+
+class StereoConfig(Section):
+    """How the disparity of a stereo pair is found (Valenti 2018, 5.1 and 5.2); lengths are pixels of the full image.
+
+    method: `sgm` (OpenCV's semi-global matching along three paths), `sgm8` (eight), `hh4` (four), `block`, `onnx`.
+    model: the file of a network for `onnx`: two images in, a disparity out.
+    disparities: how many are searched, from 0 on.
+    block_size: side of the window by which two pixels are compared; odd. p1, p2: what a step of one disparity and of
+        more costs, for each pixel of the window. uniqueness: per cent by which the best match must beat the second.
+    from_below: the vertical path of `sgm` comes from below: better where a road fills the lower half of the view.
+    unlock: spread fractions of a pixel evenly, which semi-global matching pulls towards whole ones.
+    speckle_size, speckle_range: smaller patches are dropped; a step of more disparity ends a patch. 0: none dropped.
+    left_right: most by which the disparities of both images may differ; 0: not checked.
+    aligned: the image whose pixels get a depth (Valenti 2018: right).
+    halve: match at half the resolution: four to five times as quick and smoother (Valenti 2018, 5.1); maps of streets
+        come out the same. The result is of full size, and the numbers above stand for full pixels all the same. Not
+        set: images of more than 450,000 pixels are halved.
+    rcrop: columns dropped at the border that the other eye cannot see: the right one for the right image (Valenti
+        2018, Eq 5.1). Pixels whose match lies outside of the other image are dropped in any case.
+    min_confidence: pixels that are less sure have no value (0 to 1, see docs/stereo.md).
+    texture: mean step of grey over two columns below which pixels have no value. 1 drops what is quite flat, 2 to 3
+        also clear skies, and smooth roads with them; 0: not asked for.
+    subpixel: standard deviation of the disparities that are left, in pixels; what the map takes for their noise.
+    threads: threads of the matcher; the disparity does not depend on it.
+    """
+
+    method: str = "sgm"
+    model: str | None = None
+    disparities: int = Field(128, ge=16, le=1024, multiple_of=16)
+    block_size: int = Field(5, ge=1, le=51)
+    p1: float = Field(16.0, ge=0, le=100)
+    p2: float = Field(64.0, gt=0, le=400)
+    uniqueness: int = Field(15, ge=0, le=99)
+    from_below: bool = False
+    unlock: bool = True
+    speckle_size: int = Field(400, ge=0)
+    speckle_range: float = Field(2.0, gt=0)
+    left_right: float = Field(1.0, ge=0)
+    aligned: Literal["left", "right"] = "left"
+    halve: bool | None = None
+    rcrop: int = Field(0, ge=0)
+    min_confidence: float = Field(0.5, ge=0, le=1)
+    texture: float = Field(1.0, ge=0)
+    subpixel: float = Field(0.4, gt=0)
+    threads: int = Field(2, ge=1, le=256)
+
+    @model_validator(mode="after")
+    def _fitting(self) -> StereoConfig:
+        if self.block_size % 2 == 0:
+            raise ValueError(f"block_size {self.block_size} must be odd")
+        if self.p1 >= self.p2:
+            raise ValueError(f"p1 {self.p1} must be smaller than p2 {self.p2}")
+        return self
+
+
+class SphereConfig(Section):
+    """The spherical grid round the vehicle between depth and map (Valenti 2018, 5.3): none without `step_deg`.
+
+    step_deg: width of a cell in both angles; must go into 180 degrees a whole number of times.
+    statistic: what a cell keeps of the ranges in it: `robust` is their mean less `spread` standard deviations where
+        the standard deviation is below `std_threshold` metres, else the smallest (Eq 5.4); `minimum` the smallest.
+    std_threshold: metres. spread: standard deviations; both for `robust`.
+    polar_deg, azimuth_deg: from and to; polar from the body's z axis (0: up, 90: level, 180: down), azimuth from its x
+        axis to its y axis (0: forward, 90: left, 270 or -90: right). They are widened to whole cells.
+    """
+
+    step_deg: float | None = Field(None, ge=0.05, le=30)
+    statistic: Literal["robust", "minimum"] = "robust"
+    std_threshold: float = Field(0.1, gt=0)
+    spread: float = Field(3.0, ge=0, le=10)
+    polar_deg: tuple[float, float] = (0.0, 180.0)
+    azimuth_deg: tuple[float, float] = (-180.0, 180.0)
+
+    @model_validator(mode="after")
+    def _fitting(self) -> SphereConfig:
+        if self.step_deg is not None and abs(180 / self.step_deg - round(180 / self.step_deg)) > 1e-6:
+            raise ValueError("step_deg must go into 180 a whole number of times, as 0.5, 1, 1.5, 2, 3, 5 do")
+        if not 0 <= self.polar_deg[0] < self.polar_deg[1] <= 180:
+            raise ValueError("polar_deg must rise, from 0 (up) to 180 (down)")
+        if not (-180 <= self.azimuth_deg[0] < self.azimuth_deg[1] <= self.azimuth_deg[0] + 360):
+            raise ValueError("azimuth_deg must rise from -180 or more, and span 360 at most")
+        return self

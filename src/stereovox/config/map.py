@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Settings of maps: sensor model, integrators, cells, the window."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from stereovox.config.base import Section
+
+MAX_WINDOW = 1e6
+"""Metres along each side of a window."""
+
+
+class SensorConfig(BaseModel):
+    """The inverse sensor model by name, and its own parameters beside it (`p_free`, ...).
+
+    model: `stereo`, `constant`, `andert`, `valenti`, or one that another package registers.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="allow")
+    model: str = "stereo"
+
+    def parameters(self) -> dict[str, Any]:
+        """Return what the model itself is to be made with."""
+        return dict(self.model_extra or {})
+
+
+class RayConfig(Section):
+    """How the integrators `ray` and `line` combine the rays of one frame.
+
+    update: a cell changes `once` a frame, hits first, or `every` ray adds its weighted part (Chien 2020, Eq 3.21). That
+        counts pixels: a pole that fills less than about a quarter of its cell's width is outvoted by the rays beside it
+        and becomes free.
+    """
+
+    update: Literal["every", "once"] = "once"
+
+
+class ProjectiveConfig(Section):
+    """How the projective integrator counts hits.
+
+    full_share: a cell's hit counts in full when so much of the cell's footprint in the image falls into it, with less
+    by the square root of the part, since a few pixels may be wrong; 0: every hit counts in full.
+    """
+
+    full_share: float = Field(0.1, ge=0, le=1)
+
+
+class MapConfig(Section):
+    """What a cell is kept in, the range of its log-odds, and the probabilities that tell the states apart.
+
+    cell: `int16` holds thousandths of log-odds, `int8` steps of 1/32 from -4 to 3.97; `uint8` is Chien's byte (2020,
+    3.5): 127 unknown, 0 free, 255 occupied.
+    prior: probability that a cell is occupied before the first evidence on it (l0 of Valenti 2018, Eq 6.2). Most cells
+    a camera sees are free, so probabilities agree with what is really there when it is well below a half. `prior` of
+    the sensor model `stereo` should be the same. A cell that evidence made likelier than that is never free.
+    confirm_hits: frames that must hit an unknown cell at least before it is occupied; one frame raises it by no more
+        than that part of the way.
+    keep_times: remember for each cell when it got its last evidence (4 bytes a cell on top).
+    log_odds_min, log_odds_max: limits of a cell's log-odds.
+    free_below, occupied_above: probabilities below which a cell is free, and above which it is occupied.
+    forget_s: a cell without evidence for so many seconds of the recording becomes unknown; needs `keep_times`.
+    """
+
+    cell: Literal["int16", "int8", "uint8"] = "int16"
+    log_odds_min: float = Field(-4.0, lt=0, ge=-30)
+    log_odds_max: float = Field(3.5, gt=0, le=30)
+    prior: float = Field(0.1, gt=0, lt=1)
+    free_below: float = Field(0.3, gt=0, lt=1)
+    occupied_above: float = Field(0.7, gt=0, lt=1)
+    confirm_hits: int = Field(1, ge=1, le=100)
+    keep_times: bool = False
+    forget_s: float | None = Field(None, gt=0)
+
+    @model_validator(mode="after")
+    def _ordered(self) -> MapConfig:
+        if self.free_below >= self.occupied_above:
+            raise ValueError("free_below must be smaller than occupied_above")
+        if self.forget_s is not None and not self.keep_times:
+            raise ValueError("forget_s needs keep_times = true")
+        return self
+
+
+class WindowConfig(Section):
+    """A box that moves with the camera by whole cells and bounds the map's memory (Chien 2020, 3.6).
+
+    size: extents along the world's axes in metres; without them the map is unbounded and the rest has no meaning.
+    centre: the middle of a window that stays where it is, a fixed box (Valenti 2018, 7.1: the global map); without it
+        the window follows the camera (7.2: the local map), and only then the rest but `outside` has a meaning.
+    trigger: half width in metres of the box round the window's centre in which the camera moves freely; half a cell at
+        least.
+    lead_s: the centre runs ahead of the camera by so many seconds of its flight.
+    grow_s: the window is longer by so many seconds of flight along each axis.
+    largest: extents that it may grow to; not set: `size`.
+    outside: cells that leave are lost (`drop`), or kept in tiles on disk and restored when they return (`keep`).
+    """
+
+    size: tuple[float, float, float] | None = None
+    largest: tuple[float, float, float] | None = None
+    centre: tuple[float, float, float] | None = None
+    trigger: float = Field(1.0, ge=0)
+    lead_s: float = Field(0.0, ge=0, le=10)
+    grow_s: float = Field(0.0, ge=0, le=10)
+    outside: Literal["drop", "keep"] = "drop"
+
+    @model_validator(mode="after")
+    def _fitting(self) -> WindowConfig:
+        if self.size is None:
+            if self.centre is not None:
+                raise ValueError("window.centre needs window.size, for example window.size=[20,20,5]")
+            return self
+        if min(self.size) <= 0 or any(b < a for a, b in zip(self.size, self.largest or self.size, strict=True)):
+            raise ValueError("size must be positive, and largest no smaller than size")
+        if max(self.largest or self.size) > MAX_WINDOW:
+            raise ValueError(f"size and largest must be at most {MAX_WINDOW:g} m")
+        if self.centre is None and 2 * self.trigger >= min(self.size):
+            raise ValueError(f"trigger {self.trigger} must be less than half of the smallest size")
+        return self

@@ -204,5 +204,5 @@ def test_up_that_is_no_axis_is_refused_with_the_axes_there_are():
 
 def test_older_names_of_values_still_count():
     assert load_config("default", **{"depth.far": "told"}).depth.far == "reported"
-    with pytest.raises(ConfigError, match="depth.far"):
+    with pytest.raises(ConfigError, match=r"depth\.far"):
         load_config("default", **{"depth.far": "said"})

@@ -16,7 +16,7 @@ from pydantic import BaseModel, ByteSize, Field, ValidationError, model_validato
 
 from stereovox.config.base import Section
 from stereovox.config.depth import DepthConfig, NoiseConfig, SphereConfig, StereoConfig
-from stereovox.config.map import MapConfig, ProjectiveConfig, RayConfig, SensorConfig, WindowConfig
+from stereovox.config.maps import MapConfig, ProjectiveConfig, RayConfig, SensorConfig, WindowConfig
 from stereovox.config.robot import AmclConfig, GridConfig, ScanConfig, SlamConfig
 from stereovox.config.safety import PaceConfig, TrustConfig
 from stereovox.errors import ConfigError, did_you_mean

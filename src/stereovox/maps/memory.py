@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 from stereovox.config import Config
-from stereovox.config.map import MAX_WINDOW
+from stereovox.config.maps import MAX_WINDOW
 from stereovox.errors import ConfigError
 from stereovox.maps.blocks import CELLS, SIDE, table_size
 from stereovox.maps.cell_format import FORMATS

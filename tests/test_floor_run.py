@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """A robot's recording becomes a floor's map by one call from Python, with all that `stereovox grid` promises."""
 
-import os
 import signal
+import subprocess
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from multiprocessing import get_context
 
 import numpy as np
 import pytest
@@ -91,17 +91,27 @@ def test_a_run_that_is_told_to_stop_is_saved(tmp_path, then):
     same_cells(tmp_path / "a.yaml", tmp_path / "five.yaml")
 
 
-def killed(out):
-    run.REST = 0
-    kill = Seen(6, lambda: os.kill(os.getpid(), signal.SIGKILL))
-    sv.map_floor(DRIVE, out, **LIDAR, observers=[kill], checkpoint_s=1e-9)
+KILLED = f"""
+import os, signal, sys
+import stereovox as sv
+from stereovox import run
+
+class Kill:
+    seen = 0
+
+    def after(self, frame, report):
+        self.seen += 1
+        if self.seen == 6:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+run.REST = 0
+sv.map_floor({DRIVE!r}, sys.argv[1], **{LIDAR!r}, observers=[Kill()], checkpoint_s=1e-9)
+"""
 
 
 def test_a_run_that_is_killed_leaves_its_last_checkpoint(tmp_path):
-    child = get_context("spawn").Process(target=killed, args=(tmp_path / "a.yaml",))
-    child.start()
-    child.join()
-    assert child.exitcode == -signal.SIGKILL
+    done = subprocess.run([sys.executable, "-c", KILLED, str(tmp_path / "a.yaml")], check=False)
+    assert done.returncode == -signal.SIGKILL
     sv.map_floor(DRIVE, tmp_path / "five.yaml", **LIDAR, frames=":5")
     same_cells(tmp_path / "a.yaml", tmp_path / "five.yaml")
     sv.map_floor(DRIVE, tmp_path / "a.yaml", **LIDAR, frames=":1")

@@ -44,13 +44,13 @@ print(json.dumps({
 MAP_A_FRAME = """
 import json
 import stereovox as sv
-from stereovox.depth import _cpu as depth
-from stereovox.integrate import _cull, _evaluate, _hits, _windows
-from stereovox.maps import _cpu as maps
+from stereovox.depth import _images as depth
+from stereovox.integrate import _hits, _projective, _windows
+from stereovox.maps import _pool as maps
 
 mapper = sv.Mapper(voxel_size=0.1)
 mapper.add(next(iter(sv.open_source("sim:room", "0:1"))))
-kernels = [value for room in (depth, _cull, _evaluate, _hits, _windows, maps) for value in vars(room).values()]
+kernels = [value for room in (depth, _projective, _hits, _windows, maps) for value in vars(room).values()]
 compiled = [kernel for kernel in kernels if getattr(kernel, "signatures", None)]
 assembly = {kernel.py_func.__name__: "".join(kernel.inspect_asm().values()) for kernel in compiled}
 print(json.dumps({"assembly": assembly, "cells": [array.tolist() for array in mapper.map.cells()]}))

@@ -15,6 +15,7 @@ import stereovox as sv
 from stereovox.cli import main
 from stereovox.errors import MapFileError
 from stereovox.formats import export, read_octomap
+from stereovox.formats.map_server import read_map_server
 from stereovox.maps import State
 from stereovox.se3 import look_at
 
@@ -71,7 +72,7 @@ def wall_of_points():
 def mapped(capsys, bag, out, *more):
     """Map a bag by its odometry; return the result, what was told, and the floor's map."""
     result, said = run(capsys, "grid", bag, "--out", out, "--poses", "odometry", "--use", "lidar", *more)
-    return result, said, sv.products.map_server.read_map_server(out)
+    return result, said, read_map_server(out)
 
 
 BROKEN_CLOUDS = {

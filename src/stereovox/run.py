@@ -225,7 +225,7 @@ class MapRun:
                 return []
             self._tell(f"going on after frame {done}")
         watching = (*observers, *([] if length is not None else [_Patience(self, done)]))
-        stopped = "stopped after {} frames; they are saved in " + f"{self.out}, resume goes on there"
+        stopped = "stopped after {} frames; they are saved in " + f"{self.out}, go on there with resume (--resume)"
         frames = self.source.after(done) if done else self.source
         return add_all(self.mapper, frames, self._checkpoints, check, watching, lambda n: self._tell(stopped.format(n)))
 

@@ -257,7 +257,7 @@ def test_a_second_writer_is_refused_before_any_work(tmp_path, monkeypatch, capsy
 @pytest.mark.parametrize("command", ["grid", "slam"])
 def test_a_second_writer_of_a_floor_is_refused_before_any_work(tmp_path, monkeypatch, capsys, command):
     monkeypatch.setattr("stereovox.floor_run.open_robot", lambda _: pytest.fail("worked"))
-    monkeypatch.setattr("stereovox.sources.robots.robot.open_robot", lambda _: pytest.fail("worked"))
+    monkeypatch.setattr("stereovox.opening.open_robot", lambda _: pytest.fail("worked"))
     refused = []
     with only_writer_of(tmp_path / "floor.yaml"):
         run_in_thread(lambda: refused.append(main([command, "sim:floor", "--out", str(tmp_path / "floor.yaml")])))
@@ -316,7 +316,8 @@ def test_a_run_that_is_told_to_stop_saves_what_there_is(tmp_path, monkeypatch, c
     assert mapped(tmp_path / "m", "--checkpoint", "0") == 128 + stop
     assert signal.getsignal(stop) == before
     assert capsys.readouterr().err.endswith(
-        f"stopped after 13 frames; they are saved in {tmp_path / 'm'}, resume goes on there\nstereovox: stopped\n"
+        f"stopped after 13 frames; they are saved in {tmp_path / 'm'}, go on there with resume (--resume)\n"
+        "stereovox: stopped\n"
     )
     assert load_map(tmp_path / "m").frames == 13
 

@@ -92,15 +92,15 @@ def test_ctrl_c_leaves_no_process_and_no_folder(send, tmp_path):
     code = """
 from made_frames import a_recording
 from stereovox import load_config
-from stereovox.evaluate import bench_start
-bench_start.FIRST_FRAME = "import os, time; print(os.getpid(), flush=True); time.sleep(600)"
-Popen = bench_start.subprocess.Popen
+from stereovox.lab.bench import start
+start.FIRST_FRAME = "import os, time; print(os.getpid(), flush=True); time.sleep(600)"
+Popen = start.subprocess.Popen
 def told(*words, **more):
     child = Popen(*words, **more)
     print(child.pid, flush=True)
     return child
-bench_start.subprocess.Popen = told
-bench_start.first_frame(a_recording().frames, load_config(voxel_size=0.2))
+start.subprocess.Popen = told
+start.first_frame(a_recording().frames, load_config(voxel_size=0.2))
 """
     environment = {**os.environ, "TMPDIR": str(tmp_path), "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     with subprocess.Popen(

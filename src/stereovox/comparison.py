@@ -125,7 +125,7 @@ class Comparison:
             fits = _fits_elsewhere(image, integrator, voxel_map, firm, limit)
             evidence = integrator.evidence(image)  # each takes the memory of the one before
         with voxel_map.lock:
-            passed = self._gate.believe(frame, passed, against, fits)
+            passed = self._gate.check_agreement(frame, passed, against, fits)
         return evidence, passed
 
     def _prepare(self, voxel_map: VoxelMap, image: DepthImage) -> None:

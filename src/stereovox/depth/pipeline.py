@@ -11,10 +11,10 @@ from stereovox.depth.quality import check_depth, check_light
 from stereovox.depth.sphere.image import through_sphere
 from stereovox.depth.stereo.pipeline import StereoDepth
 from stereovox.frame import AnyFrame, DepthImage, Frame, StereoFrame
-from stereovox.trust.validate import check_form
+from stereovox.trust.validate import validate_fields
 
 
-class DepthPath:
+class DepthPipeline:
     """Makes depth images of frames as `config` says."""
 
     def __init__(self, config: Config):
@@ -27,7 +27,7 @@ class DepthPath:
         """
         if isinstance(frame, Frame):
             return frame  # `prepare` looks at its form
-        check_form(frame, StereoFrame, Frame)
+        validate_fields(frame, StereoFrame, Frame)
         check_light(frame, self._config.trust.max_unexposed_share)
         return self._stereo(frame)
 

@@ -16,7 +16,7 @@ from stereovox.depth.quality import SPARSE, check_unit
 from stereovox.errors import ConfigError, FrameRefused, StereovoxError
 from stereovox.frame import DepthImage, Frame, Reason, name_of
 from stereovox.sensors.noise import RangeNoise
-from stereovox.trust.validate import check_form, for_kernels, rigid_pose
+from stereovox.trust.validate import for_kernels, rigid_pose, validate_fields
 
 
 def shortened(image: DepthImage, valid_to: float, far_from: float) -> DepthImage:
@@ -155,7 +155,7 @@ def prepare(frame: Frame, config: Config) -> DepthImage:
     [min_range, max_range], TOO_NEAR also where it is -inf. The source's own reason, where it has one, comes first; but
     its TOO_FAR only where nothing contradicts it: a depth beside it, or the frame's `farthest`. `depth.far` says whose
     word is taken for too far.
-    Raises FrameRefused with the reason: the source's `fault`, `bad_form` and others of `check_form`, `bad_dtype`,
+    Raises FrameRefused with the reason: the source's `fault`, `bad_form` and others of `validate_fields`, `bad_dtype`,
     `bad_shape`, `bad_scale`, `bad_units`, `bad_reason`, `no_pose`, `pose_not_finite`, `pose_not_rigid`,
     `no_valid_depth`.
     """
@@ -202,7 +202,7 @@ def _said(frame: Frame) -> NDArray[np.float64]:
 
 
 def _check_image(frame: Frame) -> None:
-    check_form(frame, Frame)
+    validate_fields(frame, Frame)
     name, depth, camera = name_of(frame), frame.depth, frame.camera
     if not isinstance(depth, np.ndarray) or depth.dtype not in DTYPES:
         kind = getattr(depth, "dtype", type(depth).__name__)

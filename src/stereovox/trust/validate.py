@@ -59,7 +59,7 @@ FIELDS = {
 MEASURED = {Frame: ("depth",), StereoFrame: ("left", "right"), Scan: ("ranges",)}
 
 
-def check_form(seen: Any, *kinds: type) -> None:
+def validate_fields(seen: Any, *kinds: type) -> None:
     """Raise FrameRefused for what is none of `kinds`, and where one of its fields is not what it should be.
 
     The reason is `bad_form`, or `bad_stamp` for its times, `bad_sensor`, `bad_scale`, `bad_reason`.
@@ -136,12 +136,12 @@ def rigid_pose(frame: Frame | Scan, tolerance: float) -> se3.Transform:
     return se3.orthonormalise(T) if error > EXACT else T
 
 
-def trusted(scan: Scan, config: Config) -> Scan:
+def validate_upright_scan(scan: Scan, config: Config) -> Scan:
     """Return the scan with an exactly rigid pose.
 
     Raises FrameRefused as `sound` does, or `tilted` where the sensor leans by more than `grid.max_tilt_deg`.
     """
-    scan = sound(scan, config.pose_rigidity_tolerance)
+    scan = validate_scan(scan, config.pose_rigidity_tolerance)
     upright = abs(scan.T_world_sensor[2, 2])  # a sensor may hang upside down
     tilt_deg = np.degrees(np.arccos(min(upright, 1.0)))
     if tilt_deg > config.grid.max_tilt_deg:
@@ -151,13 +151,13 @@ def trusted(scan: Scan, config: Config) -> Scan:
     return scan
 
 
-def sound(scan: Scan, rigidity: float) -> Scan:
+def validate_scan(scan: Scan, rigidity: float) -> Scan:
     """Return the scan with an exactly rigid pose and mount; one off by more than `rigidity` is refused.
 
     Raises FrameRefused with the reason: `bad_form`, the source's `fault`, `bad_shape`, `bad_scan`, `pose_not_finite`,
     `pose_not_rigid`, `mount_not_rigid`, `no_valid_range`.
     """
-    check_form(scan, Scan)
+    validate_fields(scan, Scan)
     name = name_of(scan)
     ranges = np.asarray(scan.ranges)
     if ranges.ndim != 1 or not ranges.size or not np.issubdtype(ranges.dtype, np.floating):

@@ -9,7 +9,7 @@ import numpy as np
 
 from stereovox.cameras.rigs import StereoPair
 from stereovox.config import Config
-from stereovox.depth import DepthPath, prepare
+from stereovox.depth import DepthPipeline, prepare
 from stereovox.depth.sphere import T_BODY_OPTICAL, SphereGrid, SphereLayout, accumulate, empty, moved, stitch
 from stereovox.errors import FrameRefused, StereovoxError
 from stereovox.frame import AnyFrame, StereoFrame
@@ -28,7 +28,7 @@ def vehicle_grid(
     Raises StereovoxError where no frame at all could be used.
     """
     newest, why, refused = _newest(frames)
-    path, T_ahead_body = DepthPath(config), _axes(newest.values())
+    path, T_ahead_body = DepthPipeline(config), _axes(newest.values())
     last: dict[str, tuple[SphereGrid, Transform]] = {}
     for name, frame in newest.items():
         try:
@@ -76,7 +76,9 @@ def _is_body(pair: StereoPair) -> bool:
     return np.allclose(pair.T_body_camera, T_left_camera, atol=1e-6)
 
 
-def _grid_of(frame: AnyFrame, T_ahead_body: Transform, path: DepthPath, config: Config) -> tuple[SphereGrid, Transform]:
+def _grid_of(
+    frame: AnyFrame, T_ahead_body: Transform, path: DepthPipeline, config: Config
+) -> tuple[SphereGrid, Transform]:
     """Return the grid of one frame in the frame of the body that looks ahead, and T_world_ahead."""
     mounted = T_ahead_body @ frame.pair.T_body_camera if isinstance(frame, StereoFrame) else T_BODY_OPTICAL
     image = prepare(path.matched(frame), config)

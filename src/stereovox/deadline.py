@@ -58,7 +58,7 @@ class Deadline:
             self._scheduler.record(milliseconds)
 
     def warm_up(self, frame: AnyFrame, camera: VirtualCamera) -> None:
-        """Run the first frame of each camera through all other levels, so that no kernel compiles when time is short."""
+        """Run each camera's first frame through all other levels: no kernel then compiles when time is short."""
         if self._scheduler is None or camera in self._warm or len(self._warm) >= MAX_CAMERAS:
             return  # a source with another camera in each frame would warm up for ever
         self._warm.add(camera)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The whole flow in one file: a frame becomes a depth image, is checked, becomes evidence and enters the map.
 
-Read `Mapper.add` (voxel maps) or `GridMapper.add` (2-D grids) first: each step is one call into the module that does it.
+Read `Mapper.add` (voxel maps) or `GridMapper.add` (2-D grids) first: each step is a call into the module that does it.
 """
 
 from __future__ import annotations

@@ -37,7 +37,7 @@ from stereovox.maps.blocks import CELLS, BlockPool
 from stereovox.maps.evidence import Evidence
 from stereovox.sensors import make_sensor
 from stereovox.sensors.model import InverseSensorModel
-from stereovox.threads import in_shards, shards, together
+from stereovox.threads import in_shards, run_both, shards
 
 
 class HitFinder:
@@ -202,7 +202,7 @@ class Projective:
         depth_m = image.depth_m
         view = eye.views.at(image.T_world_sensor)
         threads = self._config.threads if eye.mixed_before >= 2 * WORTH_A_THREAD else 1
-        _, (windows, n_free, n_mixed) = together(
+        _, (windows, n_free, n_mixed) = run_both(
             threads,
             lambda: eye.hits.find(depth_m, view),
             lambda: eye.candidates(depth_m, ends, view),

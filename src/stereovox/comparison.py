@@ -35,7 +35,7 @@ MAX_SHIFT_M, MAX_TURN = 0.5, np.radians(15)
 DAMPING = 1e-3
 """Damping of the least squares, for motions that no surface constrains."""
 FIRM = 0.4
-"""Share of the largest hit evidence that a hit needs to be firm: far hits say less, their noise is wider than a cell."""
+"""Share of the largest hit evidence that makes a hit firm: far hits say less, their noise is wider than a cell."""
 
 
 class Comparison:

@@ -108,7 +108,7 @@ class PinholeCamera:
         subpixel: Standard deviation of its disparity in pixels; None if unknown.
 
     Raises:
-        StereovoxError: A number is out of its limits (`LIMITS`), or the image reaches more than 87 degrees off the axis.
+        StereovoxError: A number is out of its limits (`LIMITS`), or a border is more than 87 degrees off the axis.
     """
 
     width: int

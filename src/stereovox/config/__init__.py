@@ -154,9 +154,7 @@ def load_config(profile: str | Path | Config | Mapping[str, Any] = "default", **
         ConfigError: A profile cannot be read, or a setting is unknown, of the wrong type or out of range.
     """
     where = str(profile) if isinstance(profile, str | Path) else "config"
-    where = (
-        "" if where in profile_names() else f"{where}: "
-    )  # built-in profiles are right, so the override must be wrong
+    where = "" if where in profile_names() else f"{where}: "  # built-in ones are right: the override is wrong
     settings = _as_settings(profile)
     for key, value in overrides.items():
         _put(settings, key, value)

@@ -67,8 +67,8 @@ class AmclConfig(Section):
     resample_interval: updates between two resamplings.
     model: `field` compares where beams end with the nearest obstacle (table 6.3); `beam` compares their lengths with
         what the map lets them be (table 6.1), which takes longer and suits maps of all that the lidar sees.
-    max_beams: number of a scan's beams that are used. max_range: metres beyond which a beam has seen nothing; not set: the
-        scan's own.
+    max_beams: number of a scan's beams that are used. max_range: metres beyond which a beam has seen nothing; not set:
+        the scan's own.
     trust: power of a scan's likelihood: 1 treats the beams as independent (as printed), 1 / max_beams as a single one.
     z_hit, z_short, z_max, z_rand: shares of beams that end at what the map holds, before it, nowhere, and anywhere;
         only their proportions matter: `beam` divides them by their sum, which need not be 1 (it is not in ROS's amcl);

@@ -21,8 +21,8 @@ class Stereo:
     walls do not grow thick (the weakness of Valenti 2018, section 8.4).
 
     The cell that holds the measured point is occupied with the probability that the point is right (`p_right`) and that
-    its noise leaves it in this cell, but at least with `p_least`. This probability becomes evidence relative to `prior`,
-    of which the share `trust` is taken, since the errors of one frame recur in the next.
+    its noise leaves it in this cell, but at least with `p_least`. It becomes evidence relative to `prior`, of which
+    the share `trust` is taken, since the errors of one frame recur in the next.
 
     A cell that is looked through loses at most the share `passes` of what a hit at its depth would give: most frames
     see only what is behind a pole thinner than a pixel, and must not outvote the frames that do see it.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What all cameras of a vehicle see together: the last grid of each, moved to where the vehicle is now."""
+"""The combined view of a vehicle's cameras: the last grid of each, moved to the vehicle's present pose."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def _axes(frames: Iterable[AnyFrame]) -> Transform:
 
 
 def _is_body(pair: StereoPair) -> bool:
-    """Tell whether the poses are those of the left eye's optical frame: its T_body_left is the identity."""
+    """Return whether the poses are those of the left eye's optical frame: its T_body_left is the identity."""
     T_left_camera = np.eye(4)
     if pair.eyes is not None:
         T_left_camera[:3, :3] = pair.eyes.rectifying_rotations()[0]

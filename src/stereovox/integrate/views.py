@@ -224,7 +224,7 @@ def check_view(camera: VirtualCamera, config: Config) -> None:
 
 
 def check_blocks(blocks: int, camera: VirtualCamera) -> None:
-    """Raise FrameRefused `view_too_large` where a frame has evidence on more blocks than can be kept or fit its image."""
+    """Raise FrameRefused `view_too_large` for evidence on more blocks than can be kept, or than fit the image."""
     most = min(MAX_BLOCKS, _fitting_blocks(camera))
     if blocks > most:
         raise FrameRefused("view_too_large", f"the frame tells of more than {CELLS * most:.2g} cells: {CURE}")

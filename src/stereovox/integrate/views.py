@@ -227,7 +227,7 @@ def check_blocks(blocks: int, camera: VirtualCamera) -> None:
     """Raise FrameRefused `view_too_large` for evidence on more blocks than can be kept, or than fit the image."""
     most = min(MAX_BLOCKS, _fitting_blocks(camera))
     if blocks > most:
-        raise FrameRefused("view_too_large", f"the frame tells of more than {CELLS * most:.2g} cells: {CURE}")
+        raise FrameRefused("view_too_large", f"the frame has evidence on more than {CELLS * most:.2g} cells: {CURE}")
 
 
 def _fitting_blocks(camera: VirtualCamera) -> int:

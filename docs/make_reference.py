@@ -167,7 +167,8 @@ def _described(model: type[BaseModel]) -> tuple[str, dict[str, str]]:
     about, *entries = re.split(rf"(?<=\s)((?:{names})(?:, (?:{names}))*): ", text)
     said: dict[str, str] = {}
     for group, entry in zip(entries[::2], entries[1::2], strict=True):
-        said |= dict.fromkeys(group.split(", "), entry.strip().rstrip(".;"))
+        entry = entry.strip().rstrip(".;")
+        said |= dict.fromkeys(group.split(", "), entry[:1].lower() + entry[1:])
     missing = [
         name for name, field in model.model_fields.items() if name not in said and not _is_section(field.annotation)
     ]

@@ -134,7 +134,7 @@ def test_a_dropped_mapper_is_gone_at_once(frames, without_collector, settings):
     mapper = sv.Mapper(**settings)
     for n, frame in enumerate(frames):
         assert mapper.add(replace(frame, stamp_ns=n)).refused is None
-    parts = [mapper, mapper.map, *(way.integrator for way in mapper._pace._ways)]
+    parts = [mapper, mapper.map, *(level.integrator for level in mapper._deadline._levels)]
     left = [weakref.ref(part) for part in parts]
     del mapper, parts
     assert [ref() for ref in left] == [None] * len(left)

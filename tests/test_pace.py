@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 import stereovox as sv
 from stereovox import mapper as mapper_module
 from stereovox.config import load_config
-from stereovox.deadline import LONGEST, PATIENCE, Ladder, ladder
+from stereovox.deadline import MAX_PATIENCE, PATIENCE, Scheduler, quality_levels
 from stereovox.simulate.scene import Scene, box
 
 DEADLINE = 20.0
@@ -18,12 +18,12 @@ DEADLINE = 20.0
 
 def run(frames, costs, on=None):
     """Return the step of each of so many frames, -1 for those left out, where way k takes `costs[k]` milliseconds."""
-    on, steps = on or Ladder(len(costs), DEADLINE), []
+    on, steps = on or Scheduler(len(costs), DEADLINE), []
     for _ in range(frames):
-        out = on.leaves_out()
-        steps.append(-1 if out else on.step)
+        out = on.skips()
+        steps.append(-1 if out else on.level)
         if not out:
-            on.took(costs[on.step])
+            on.record(costs[on.level])
     return steps
 
 
@@ -40,9 +40,9 @@ def test_an_overrun_goes_down_at_once_and_the_first_frame_of_each_way_does_not_c
 
 
 def test_a_single_slow_frame_costs_eight_frames():
-    on = Ladder(3, DEADLINE)
+    on = Scheduler(3, DEADLINE)
     run(100, [5.0, 3.0, 2.0], on)
-    on.took(50.0)
+    on.record(50.0)
     steps = run(100, [5.0, 3.0, 2.0], on)
     assert steps == [1] * (PATIENCE + 1) + [0] * (99 - PATIENCE)  # one more: the first on that way does not count
 
@@ -52,16 +52,16 @@ def test_a_way_that_stays_too_slow_is_tried_less_and_less_often():
     tries = np.flatnonzero(steps == 0)
     gaps = np.diff(tries[tries > 2])
     assert gaps[:6].tolist() == [n + 1 for n in (16, 32, 64, 128, 128, 128)]
-    assert set(gaps[5:]) == {LONGEST + 1}
+    assert set(gaps[5:]) == {MAX_PATIENCE + 1}
     assert (steps == 0).mean() < 0.01
     assert 2 not in steps
 
 
 def test_a_way_that_lasts_again_is_tried_soon_after_the_next_overrun():
-    on = Ladder(3, DEADLINE)
+    on = Scheduler(3, DEADLINE)
     run(5000, [25.0, 15.0, 5.0], on)
-    run(3 * LONGEST, [15.0, 12.0, 5.0], on)
-    on.took(50.0)
+    run(3 * MAX_PATIENCE, [15.0, 12.0, 5.0], on)
+    on.record(50.0)
     assert run(20, [15.0, 12.0, 5.0], on) == [1] * PATIENCE + [0] * (20 - PATIENCE)
 
 
@@ -87,13 +87,13 @@ costs = st.lists(st.floats(0.1, 60), min_size=3, max_size=3).map(lambda found: s
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.tuples(costs, st.integers(1, 400)), max_size=5), costs)
 def test_in_the_long_run_no_more_time_is_taken_than_there_is(before, now):
-    on = Ladder(3, DEADLINE)
+    on = Scheduler(3, DEADLINE)
     for load, frames in before:
         run(frames, load, on)
-    run(2 * LONGEST, now, on)  # it finds its way
+    run(2 * MAX_PATIENCE, now, on)  # it finds its way
     steps = run(2000, now, on)
     if now[-1] <= DEADLINE:
-        assert too_slow(steps, now) <= 2 + 2 * 2000 / LONGEST
+        assert too_slow(steps, now) <= 2 + 2 * 2000 / MAX_PATIENCE
         assert -1 not in steps
         best = next(k for k, cost in enumerate(now) if cost <= DEADLINE)
         assert np.mean(np.array(steps) == best) > 0.95
@@ -104,10 +104,10 @@ def test_in_the_long_run_no_more_time_is_taken_than_there_is(before, now):
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.tuples(costs, st.integers(1, 400)), max_size=5))
 def test_when_the_load_is_gone_all_is_looked_at_in_full_again(before):
-    on = Ladder(3, DEADLINE)
+    on = Scheduler(3, DEADLINE)
     for load, frames in before:
         run(frames, load, on)
-    steps = run(2 * LONGEST + 10, [19.0, 12.0, 5.0], on)
+    steps = run(2 * MAX_PATIENCE + 10, [19.0, 12.0, 5.0], on)
     assert steps[-1] == 0
     assert set(run(500, [19.0, 12.0, 5.0], on)) == {0}
 
@@ -115,11 +115,11 @@ def test_when_the_load_is_gone_all_is_looked_at_in_full_again(before):
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.floats(0.1, 60), min_size=50, max_size=500))
 def test_whatever_frames_take_it_never_goes_to_and_fro(times):
-    on, steps = Ladder(3, DEADLINE), []
+    on, steps = Scheduler(3, DEADLINE), []
     for milliseconds in times:
-        if not on.leaves_out():
-            steps.append(on.step)
-            on.took(milliseconds)
+        if not on.skips():
+            steps.append(on.level)
+            on.record(milliseconds)
     ups = np.flatnonzero(np.diff(steps) < 0)
     assert (np.diff(steps) >= -1).all()
     assert (np.diff(ups) >= PATIENCE).all()
@@ -152,7 +152,7 @@ def test_near_says_of_what_is_near_what_full_says_and_of_the_rest_nothing(integr
     things = [box("post", f"post {x}", (x, y, -1), (x + 0.03, y + 0.03, 1)) for x, y in ((1.5, 0.5), (2.48, 0.0))]
     things += [box("wall", "at the limit", (2.52, -1.2, -1), (2.7, -0.6, 1))]
     frame = stage(*things)
-    full, near, _ = ladder(load_config(voxel_size=0.1, integrator=integrator, **{"ray.update": "once"}))
+    full, near, _ = quality_levels(load_config(voxel_size=0.1, integrator=integrator, **{"ray.update": "once"}))
     in_full, in_short = said(full, frame), said(near, frame)
     marks = clears = 0
     for block, values in in_short.items():
@@ -166,7 +166,7 @@ def test_near_says_of_what_is_near_what_full_says_and_of_the_rest_nothing(integr
 
 def test_coarse_keeps_a_thin_post_that_stands_near():
     frame = stage(box("post", "post", (1.45, 0.11, -2), (1.46, 0.12, 2)))  # a pixel wide
-    coarse = ladder(load_config(voxel_size=0.1))[2]
+    coarse = quality_levels(load_config(voxel_size=0.1))[2]
     depth = coarse.depth.image(frame).depth_m
     assert depth.shape == (45, 60)
     assert (depth < 2).any(axis=1).all()
@@ -177,9 +177,9 @@ def test_coarse_keeps_a_thin_post_that_stands_near():
 
 
 def test_pairs_are_matched_at_half_the_resolution_on_the_coarse_way():
-    _, near, coarse = ladder(load_config())
-    assert near.depth._path._stereo.config.halve is None
-    assert coarse.depth._path._stereo.config.halve is True
+    _, near, coarse = quality_levels(load_config())
+    assert near.depth._pipeline._stereo.config.halve is None
+    assert coarse.depth._pipeline._stereo.config.halve is True
 
 
 class Clock:

@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from stereovox.threads import in_shards, shards, together
+from stereovox.threads import in_shards, run_both, shards
 
 
 @pytest.mark.parametrize("threads", [1, 2, 3, 16])
@@ -21,14 +21,14 @@ def test_shards_cover_everything_once(length, threads):
 def test_parts_run_at_the_same_time():
     meeting = threading.Barrier(3, timeout=20)
     in_shards(lambda part: meeting.wait(), shards(9, 3))  # would break if one waited for another
-    assert together(2, lambda: 1, lambda: "two") == (1, "two")
+    assert run_both(2, lambda: 1, lambda: "two") == (1, "two")
     both = threading.Barrier(2, timeout=20)
-    together(2, both.wait, both.wait)
+    run_both(2, both.wait, both.wait)
 
 
 def test_one_thread_runs_one_after_the_other_in_the_caller():
     here = threading.get_ident()
-    assert together(1, threading.get_ident, threading.get_ident) == (here, here)
+    assert run_both(1, threading.get_ident, threading.get_ident) == (here, here)
 
 
 @pytest.mark.parametrize("culprit", [0, 1])
@@ -50,7 +50,7 @@ def test_a_slip_comes_out_when_all_parts_are_done(culprit):
 
     calls = (slip, lambda: work(slice(1, 2)))
     with pytest.raises(ValueError, match="slip"):
-        together(2, *(calls if culprit == 0 else calls[::-1]))
+        run_both(2, *(calls if culprit == 0 else calls[::-1]))
     assert done[1:] == [1]
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The one decorator for kernels: compile flags, and a disk cache that a change of any kernel file renews.
+"""Decorators for kernels: compile flags, and a disk cache that any change in a kernel file renews.
 
 Numba renews a cached kernel when its own file changes but not when a file it calls does; so the cache folder's name
 holds the hash of all kernel files (and of numba's version).
@@ -33,7 +33,7 @@ Function = Callable[..., Any]
 
 
 class _WideLower(Lower):
-    """Allows vectors of 512 bits where the processor has them; LLVM takes half of that by itself."""
+    """Allows 512-bit vectors where the processor has them; by default LLVM uses half of that."""
 
     def setup_function(self, fndesc: Any) -> None:
         super().setup_function(fndesc)
@@ -63,22 +63,22 @@ class _KernelCompiler(CompilerBase):
 def kernel(function: Function) -> Function:
     """Compile `function` to machine code that releases the GIL and is cached on disk.
 
-    An array that a kernel writes to must not overlap another array it is given. It cannot make arrays: so none has to
-    be counted, which takes longer than the work where kernel cells are small.
+    An array that a kernel writes must not overlap any other argument. Kernels cannot allocate arrays: then references
+    need not be counted, which in small loops takes longer than the work.
     """
     return _compile(function, _nrt=False)
 
 
 def allocating_kernel(function: Function) -> Function:
-    """Compile `function` as `kernel` does, but let it make arrays."""
+    """Compile `function` as `kernel` does, but allow it to allocate arrays."""
     return _compile(function)
 
 
 def cell(function: Function) -> Function:
-    """Compile a small function that becomes part of every kernel that calls it.
+    """Compile a small function that is inlined into every kernel that calls it.
 
-    It makes and returns no arrays: so none of those it is given is counted as in use, which inside a loop costs more
-    than the look into a hash. Python cannot call it: what that needs takes as long to compile as the function.
+    It must not make or return arrays: then references are not counted, which inside a loop costs more than a hash
+    look-up. Python cannot call it: compiling a wrapper takes as long as compiling the function.
     """
     return _compile(function, forceinline=True, _nrt=False, no_cpython_wrapper=True)
 
@@ -90,7 +90,7 @@ def exact_cell(function: Function) -> Function:
 
 @lru_cache
 def cache_folder() -> Path | None:
-    """Return the folder compiled kernels are kept in, None where nothing can be written."""
+    """Return the folder of compiled kernels, None where none can be written."""
     name = f"stereovox-kernels-{_source_hash()}"
     for base in (os.environ.get("STEREOVOX_CACHE"), _user_cache(), tempfile.gettempdir()):
         folder = Path(base) / "stereovox" / name if base else None

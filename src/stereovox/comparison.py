@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Evidence that is compared with the map before the map takes it in, and where else its image would fit."""
+"""Compare the evidence of a frame with the map before the map takes it in, also from nearby poses."""
 
 from __future__ import annotations
 
@@ -23,25 +23,64 @@ from stereovox.trust.gate import Gate, Passed
 
 SURFACES = (State.OCCUPIED, State.TENTATIVE)
 POINTS, BESIDE = 600, 3
-"""Pixels that are laid onto the map, at most, and how many pixels beside them their neighbours are."""
+"""Most pixels that are registered with the map, and the distance in pixels of the neighbours for their normals."""
 STEPS = 30
+"""Iterations of the registration."""
 REACH_M, REACH_CELLS = 0.6, 2.0
-"""How far a point looks for its surface in the first step, and in the last."""
-FEWEST = 30
+"""Search radius of a point for its surface in the first iteration (metres) and in the last (cells)."""
+MIN_POINTS = 30
 """Points that must find a surface."""
 MAX_SHIFT_M, MAX_TURN = 0.5, np.radians(15)
-"""How far a knocked camera may stand from where its pose says."""
+"""How far a knocked camera may stand from its pose."""
 DAMPING = 1e-3
-"""Of the least squares, for motions that no surface is against."""
+"""Damping of the least squares, for motions that no surface constrains."""
+FIRM = 0.4
+"""Share of the largest hit evidence that makes a hit firm: far hits say less, their noise is wider than a cell."""
+
+
+class Comparison:
+    """Makes the evidence of a frame and lets the gate decide whether to accept it."""
+
+    def __init__(self, config: Config, gate: Gate):
+        self._gate, self._compares = gate, config.trust.max_disagreement < 1
+        self._firm = PerCamera(partial(_firm, make_sensor(config.sensor), config))
+        self._prepared = False
+
+    def evidence(
+        self, frame: AnyFrame, image: DepthImage, passed: Passed, integrator: Integrator, voxel_map: VoxelMap
+    ) -> tuple[Evidence, Passed]:
+        """Return the evidence of an image, and what the gate needs to accept the frame.
+
+        passed: what `Gate.check` returned. Raises FrameRefused as `Gate.check_agreement`.
+        """
+        evidence = integrator.evidence(image)
+        if not self._compares:
+            return evidence, passed
+        self._prepare(voxel_map, image)
+        firm, fits = self._firm[image.camera], False
+        against = voxel_map.agreement(evidence, firm).against
+        limit = self._gate.limit_elsewhere(passed, against)
+        if limit is not None:
+            fits = _fits_elsewhere(image, integrator, voxel_map, firm, limit)
+            evidence = integrator.evidence(image)  # again: each call reuses the memory of the one before
+        with voxel_map.lock:
+            passed = self._gate.check_agreement(frame, passed, against, fits)
+        return evidence, passed
+
+    def _prepare(self, voxel_map: VoxelMap, image: DepthImage) -> None:
+        """Register the first image, so that kernels compile then and not when a frame is in doubt."""
+        if not self._prepared:
+            self._prepared = True
+            pose_on_surfaces(voxel_map, image)
 
 
 def pose_on_surfaces(voxel_map: VoxelMap, image: DepthImage) -> Transform | None:
-    """Return T_world_sensor (4, 4) near the image's own that brings its points onto the map's surfaces.
+    """Return a T_world_sensor (4, 4) near the image's own that brings its points onto the map's surfaces.
 
-    None: there is no such pose, or the image is there already, within a cell.
+    None where there is no such pose, or the image already lies there within a cell.
 
-    Iterative closest points, from points and their planes to the centres of cells (Chen and Medioni 1992); the distance
-    up to which a point finds a cell shrinks from step to step.
+    Iterative closest points, from points and their planes to the centres of cells (Chen and Medioni 1992); the search
+    radius shrinks from iteration to iteration.
     """
     points, normals = _surfaces(image)
     T, last = image.T_world_sensor, min(REACH_M, REACH_CELLS * voxel_map.voxel_size)
@@ -49,7 +88,7 @@ def pose_on_surfaces(voxel_map: VoxelMap, image: DepthImage) -> Transform | None
         there, planes = points @ T[:3, :3].T + T[:3, 3], normals @ T[:3, :3].T
         found = voxel_map.nearest_obstacle(there, float(reach), SURFACES) if len(there) else None
         near = np.isfinite(found.distance) if found else np.zeros(0, bool)
-        if found is None or near.sum() < FEWEST:
+        if found is None or near.sum() < MIN_POINTS:
             return None
         T = _motion(there[near], planes[near], voxel_map.centers(found.cell[near])) @ T
     shift_m, turn = apart(tuple(image.T_world_sensor[:3].ravel().tolist()), tuple(T[:3].ravel().tolist()))
@@ -94,49 +133,8 @@ def _motion(points: NDArray[np.float64], normals: NDArray[np.float64], onto: NDA
     return T
 
 
-FIRM = 0.4
-"""Share of the most that a hit says which a hit must say to be firm: what is far says less, for its noise is wider than
-a cell."""
-
-
-class Comparison:
-    """Makes evidence and lets a gate decide whether it is to be believed."""
-
-    def __init__(self, config: Config, gate: Gate):
-        self._gate, self._compares = gate, config.trust.max_disagreement < 1
-        self._firm = PerCamera(partial(_firm, make_sensor(config.sensor), config))
-        self._prepared = False
-
-    def evidence(
-        self, frame: AnyFrame, image: DepthImage, passed: Passed, integrator: Integrator, voxel_map: VoxelMap
-    ) -> tuple[Evidence, Passed]:
-        """Return the evidence of an image, and what the gate is to remember of it.
-
-        passed: what `Gate.check` returned. Raises FrameRefused as `Gate.believe`.
-        """
-        evidence = integrator.evidence(image)
-        if not self._compares:
-            return evidence, passed
-        self._prepare(voxel_map, image)
-        firm, fits = self._firm[image.camera], False
-        against = voxel_map.agreement(evidence, firm).against
-        limit = self._gate.limit_elsewhere(passed, against)
-        if limit is not None:
-            fits = _fits_elsewhere(image, integrator, voxel_map, firm, limit)
-            evidence = integrator.evidence(image)  # each takes the memory of the one before
-        with voxel_map.lock:
-            passed = self._gate.believe(frame, passed, against, fits)
-        return evidence, passed
-
-    def _prepare(self, voxel_map: VoxelMap, image: DepthImage) -> None:
-        """Let the first image be looked for elsewhere: kernels are compiled then, and not when one is doubted."""
-        if not self._prepared:
-            self._prepared = True
-            pose_on_surfaces(voxel_map, image)
-
-
 def _fits_elsewhere(image: DepthImage, integrator: Integrator, voxel_map: VoxelMap, firm: int, limit: float) -> bool:
-    """Tell whether an image disagrees with the map by no more than `limit` where it lies on its surfaces."""
+    """Return whether an image, registered with the map's surfaces, disagrees with the map by at most `limit`."""
     pose = pose_on_surfaces(voxel_map, image)
     if pose is None:
         return False
@@ -145,5 +143,5 @@ def _fits_elsewhere(image: DepthImage, integrator: Integrator, voxel_map: VoxelM
 
 
 def _firm(sensor: InverseSensorModel, config: Config, camera: VirtualCamera) -> int:
-    """Return the evidence in thousandths from which on a hit is firm."""
+    """Return the evidence in thousandths above which a hit is firm."""
     return round(FIRM * int(sensor_table(sensor, config, camera).hit.max()))

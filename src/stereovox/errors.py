@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Errors a user can cause. Each message is one line that names the file or value and the cure."""
+"""Errors that a user can cause. Each message is one line that names the file or value and the cure."""
 
 from __future__ import annotations
 
@@ -7,14 +7,18 @@ import difflib
 from collections.abc import Iterable
 
 MAX_WORD_LENGTH = 100
+"""Characters of a word that are compared; words from a file may be longer."""
 MAX_LINE_LENGTH = 10_000
-"""Characters of a word that is compared, and of a message; those of a file may be many more."""
+"""Characters of a message."""
 
 
 class StereovoxError(ValueError):
-    """Bad input or bad usage; commands print its one line and exit with status 2.
+    """Bad input or bad usage. Commands print the message and exit with status 2.
 
-    Words out of a file stand in messages: whatever they hold, a message is one line that a terminal can show.
+    The message is always one printable line, whatever text from a file it quotes.
+
+    Args:
+        message: What is wrong, with the value and the cure.
     """
 
     def __init__(self, message: object = ""):
@@ -43,7 +47,8 @@ class MissingExtra(StereovoxError, ImportError):  # noqa: N818 - reads as what h
 class FrameRefused(StereovoxError):  # noqa: N818 - reads as what happened
     """A frame cannot be trusted and must not change the map.
 
-    `reason` is a short fixed word that is counted (`pose_not_rigid`); the message says more.
+    Attributes:
+        reason: Short fixed word that refusals are counted by (`pose_not_rigid`); the message has the details.
     """
 
     def __init__(self, reason: str, message: str):
@@ -52,16 +57,16 @@ class FrameRefused(StereovoxError):  # noqa: N818 - reads as what happened
 
 
 def one_line(text: str) -> str:
-    """Return `text` with what is not printable (line ends, colours of a terminal) written out, and its middle cut."""
+    """Return `text` as one printable line: line ends and terminal colours are escaped, a long middle is cut."""
     if len(text) > MAX_LINE_LENGTH:
         text = f"{text[: MAX_LINE_LENGTH // 2]} ... {text[-MAX_LINE_LENGTH // 2 :]}"
     return text if text.isprintable() else "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 
 def did_you_mean(word: str, known: Iterable[str], prefix: str = "") -> str:
-    """Return " (did you mean 'x'?)" for the closest known word, else the list of known words.
+    """Return " (did you mean 'x'?)" with the closest known word, or the list of known words.
 
-    prefix: what stands before each word where it is shown, but says nothing about which is near (`--`).
+    prefix: shown before each word but not compared (`--`).
     """
     known = sorted(known)
     close = difflib.get_close_matches(word[:MAX_WORD_LENGTH], known, n=1)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What flows through the house: a `Frame` as a source delivers it, a `DepthImage` as an integrator needs it."""
+"""The data that flows through the pipeline: frames and scans from a source, depth images for integrators, reports."""
 
 from __future__ import annotations
 
@@ -16,14 +16,22 @@ from stereovox.cameras.rigs import StereoPair, VirtualCamera
 from stereovox.se2 import flattened
 from stereovox.se3 import Transform, inverse
 
+NOT_GIVEN: float = nan
+"""Depth scale of a frame that was made without one."""
+
 
 @dataclass(frozen=True)
 class UpdateReport:
-    """What one frame did: milliseconds spent, cells whose value changed, and why it was refused, if it was.
+    """What one frame did to the map.
 
-    detail: why in a line, or that frames of its sensor are believed again.
-    match_ms: rectify and match a stereo pair; depth_ms: prepare the depth image; integrate_ms: put it into the map.
-    way: how thoroughly the frame was looked at: `full`, or what `pace` left of it.
+    Attributes:
+        depth_ms: Milliseconds to prepare the depth image or scan.
+        integrate_ms: Milliseconds to turn it into evidence and put that into the map.
+        cells: Number of cells whose value changed.
+        refused: Reason the frame was refused; None where it was taken.
+        detail: The refusal in one line, or a note that frames of this sensor are accepted again.
+        match_ms: Milliseconds to rectify and match a stereo pair; 0 for other frames.
+        quality: Quality level of the frame: `full`, or `near` or `coarse` where `deadline_ms` left less time.
     """
 
     depth_ms: float = 0.0
@@ -32,18 +40,24 @@ class UpdateReport:
     refused: str | None = None
     detail: str = ""
     match_ms: float = 0.0
-    way: str = "full"
+    quality: str = "full"
 
-
-NOT_GIVEN: float = nan
-"""Depth scale of a frame whose maker did not name one."""
+    @property
+    def way(self) -> str:
+        """Older name of `quality`."""
+        return self.quality
 
 
 class Reason(IntEnum):
     """Why a depth pixel has no value. Only TOO_FAR may clear cells, and only up to the maximum range.
 
-    UNMATCHED: matching found nothing it could rely on. TOO_NEAR, TOO_FAR: out of range. MASKED: the pixel is not used.
-    UNKNOWN: the source does not say why, as cameras that write 0 for everything.
+    Attributes:
+        VALID: The pixel has a depth.
+        UNMATCHED: Stereo matching found nothing reliable.
+        TOO_NEAR: Nearer than the minimum range.
+        TOO_FAR: Farther than the maximum range.
+        MASKED: The pixel is not used.
+        UNKNOWN: The source does not say why, like cameras that write 0 for everything.
     """
 
     VALID = 0
@@ -55,7 +69,7 @@ class Reason(IntEnum):
 
 
 class Viewpoint(NamedTuple):
-    """Where a camera stood: T_world_camera (4, 4) maps its optical frame into the world; time in nanoseconds."""
+    """Camera pose at a time: T_world_camera (4, 4) maps the optical frame into the world; stamp_ns in nanoseconds."""
 
     camera: PinholeCamera
     T_world_camera: Transform
@@ -64,12 +78,20 @@ class Viewpoint(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class StereoFrame:
-    """Two images taken at one moment by a stereo pair, as a source delivers them.
+    """Two images taken at the same time by a stereo pair, as a source delivers them.
 
-    left, right: (height, width) uint8 grey or (height, width, 3) uint8 RGB; as the lenses made them where `pair` has
-        `eyes`, else rectified, of the size of its camera.
-    T_world_sensor: (4, 4) float64, maps the rectified left optical frame into the world.
-    stamp_ns, name, fault, fault_detail, sensor, pose_off_ns: as in `Frame`.
+    Attributes:
+        left: (height, width) uint8 grey or (height, width, 3) uint8 RGB: raw where `pair` has `eyes`, otherwise
+            rectified and of the size of the pair's camera.
+        right: The same for the right eye.
+        pair: The stereo pair that took them.
+        T_world_sensor: (4, 4) float64, maps the rectified left optical frame into the world.
+        stamp_ns: As in `Frame`.
+        name: As in `Frame`.
+        fault: As in `Frame`.
+        fault_detail: As in `Frame`.
+        sensor: As in `Frame`.
+        pose_off_ns: As in `Frame`.
     """
 
     left: NDArray[np.uint8]
@@ -88,22 +110,25 @@ class StereoFrame:
 class Frame:
     """One depth image with its camera and pose, as a source delivers it.
 
-    depth: (height, width) uint16 or float32/float64; times `depth_scale` it is the depth in metres, for a pinhole along
-        the optical axis. No value: 0, negative, NaN, +inf, and 65535 in uint16 (UNKNOWN), -inf (TOO_NEAR; REP 117).
-    camera: the camera that took it; its size must be the image's.
-    T_world_sensor: (4, 4) float64, maps the optical frame (x right, y down, z forward) into the world (z up).
-    stamp_ns: time of the image in int64 nanoseconds.
-    depth_scale: metres per unit of `depth` (0.001 for millimetres). Not given: 1 for floats; an image of whole numbers
-        without it is refused, for nobody can say what it means.
-    reason: (height, width) uint8 of `Reason`, where the source knows why a pixel has no value; else None. VALID: as
-        the depth says.
-    name: where the frame came from, for messages.
-    fault: why the source could not deliver this frame (`unreadable`, `no_pose`); such a frame is refused and counted.
-    fault_detail: the same in one line that names file, value and cure.
-    sensor: which of several sensors took it (a topic, a name in a rig); their times are watched one by one.
-    pose_off_ns: how far from the nearest measured pose this one was extrapolated; 0: measured, or between two.
-    farthest: metres that are free at least where `reason` is TOO_FAR; a positive depth beside it says so for a pixel.
-        Where that is less than the maximum range the pixel counts as UNKNOWN.
+    Attributes:
+        depth: (height, width) uint16, float32 or float64; times `depth_scale` it is the depth in metres, for a pinhole
+            along the optical axis. No value: 0, negative, NaN, +inf, and 65535 in uint16 (UNKNOWN); -inf (TOO_NEAR;
+            REP 117).
+        camera: The camera that took it; its size must be the image's.
+        T_world_sensor: (4, 4) float64, maps the optical frame (x right, y down, z forward) into the world (z up).
+        stamp_ns: Time of the image in int64 nanoseconds.
+        depth_scale: Metres per unit of `depth` (0.001 for millimetres). Not given: 1 for floats; integer images
+            without it are refused, since their unit is unknown.
+        reason: (height, width) uint8 of `Reason`, where the source knows why a pixel has no value; else None. VALID:
+            as the depth says.
+        name: Where the frame came from, for messages.
+        fault: Why the source could not deliver this frame (`unreadable`, `no_pose`); it is refused and counted.
+        fault_detail: The same in one line that names file, value and cure.
+        sensor: Which of several sensors took it (a topic, a name in a rig); each sensor's stamps are checked by
+            themselves.
+        pose_off_ns: How far the pose was extrapolated from the nearest measured one; 0: measured or interpolated.
+        farthest: Metres that are free at least where `reason` is TOO_FAR; a positive depth there says so for that
+            pixel. Where this is less than the maximum range, the pixel counts as UNKNOWN.
     """
 
     depth: NDArray[np.generic]
@@ -126,23 +151,30 @@ class Frame:
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """One turn of a 2-D lidar, or what a depth image would look like to one.
+    """One sweep of a 2-D lidar, or a depth image reduced to one.
 
-    ranges: (N,) float32 metres from the sensor. No value (REP 117): NaN no reading, -inf too near, +inf nothing up to
-        `range_max`.
-    angle_min, angle_step: radians; beam i points `angle_min + i * angle_step` from the sensor's x axis (forward)
-        towards its y axis (left).
-    range_min, range_max: metres between which the sensor measures.
-    T_world_sensor: (4, 4) float64, maps the sensor's frame (x forward, y left, z up) into the world (z up). As a source
-        delivers it the world is that of the odometry.
-    T_base_sensor: (4, 4) float64, where the sensor sits on the robot, whose frame stands on the floor.
-    clear: (N,) float32 metres up to which each beam is known to be free, 0 for not at all; never more than the beam's
-        hit. None: as `ranges` alone tell it: a hit clears up to itself, +inf up to `range_max`, NaN and -inf nothing.
-        Scans out of depth images have it: a camera that looks down sees a beam's floor at 2 m and nothing beyond, so
-        that beam is free up to 2 m (its range: NaN).
-    clear_from: (N,) float32 metres from which on a beam is known to be free up to `clear`; None: from the sensor on. A
-        camera does not see what stands on the floor right before it.
-    stamp_ns, name, fault, fault_detail, sensor, pose_off_ns: as in `Frame`.
+    Attributes:
+        ranges: (N,) float32 metres from the sensor. No value (REP 117): NaN no reading, -inf too near, +inf nothing up
+            to `range_max`.
+        angle_min: Direction of beam 0 in radians, from the sensor's x axis (forward) towards its y axis (left).
+        angle_step: Radians from one beam to the next.
+        range_min: Shortest range in metres that the sensor measures.
+        range_max: Longest range in metres that it measures.
+        T_world_sensor: (4, 4) float64, maps the sensor's frame (x forward, y left, z up) into the world (z up). In
+            scans from a source, the world is that of the odometry.
+        T_base_sensor: (4, 4) float64, maps the sensor's frame into the robot's, which stands on the floor.
+        clear: (N,) float32 metres up to which each beam is known to be free, 0 for not at all; never more than the
+            beam's hit. None: derived from `ranges`: a hit clears up to itself, +inf up to `range_max`, NaN and -inf
+            nothing. Scans made from depth images have it: a camera that looks down sees the floor of a beam at 2 m
+            and nothing beyond, so that beam is free up to 2 m (its range: NaN).
+        clear_from: (N,) float32 metres from which a beam is known to be free up to `clear`; None: from the sensor. A
+            camera does not see what stands on the floor right in front of it.
+        stamp_ns: As in `Frame`.
+        name: As in `Frame`.
+        fault: As in `Frame`.
+        fault_detail: As in `Frame`.
+        sensor: As in `Frame`.
+        pose_off_ns: As in `Frame`.
     """
 
     ranges: NDArray[np.float32]
@@ -168,27 +200,30 @@ class Scan:
 
     @property
     def pose_world_base(self) -> NDArray[np.float64]:
-        """Where the robot stood, seen from above: (3,) x, y, yaw."""
+        """Pose of the robot on the floor, (3,) x, y in metres and yaw in radians."""
         return flattened(self.T_world_sensor @ inverse(self.T_base_sensor))
 
 
 AnyFrame = Frame | StereoFrame
-"""What a source delivers and a mapper takes."""
+"""What a camera source delivers and a mapper takes."""
 
 
 def name_of(seen: AnyFrame | Scan) -> str:
-    """Return what to call a frame or scan in a message."""
+    """Return the name of a frame or scan for messages."""
     return seen.name or f"{'scan' if isinstance(seen, Scan) else 'frame'} at {seen.stamp_ns} ns"
 
 
 @dataclass(frozen=True, eq=False)
 class DepthImage:
-    """A depth image that can be trusted, in metres, with the reason of every pixel that has no value.
+    """A checked depth image in metres, with the reason for every pixel that has no value.
 
-    depth_m: (height, width) float32, for a pinhole along the optical axis (see `PinholeCamera`). Without value (REP
-        117): NaN unmatched, masked or unknown, -inf too near, +inf too far (nothing up to the maximum range).
-    reason: (height, width) uint8 of `Reason`.
-    T_world_sensor: (4, 4) float64, exactly rigid.
+    Attributes:
+        depth_m: (height, width) float32, for a pinhole along the optical axis (see `PinholeCamera`). No value (REP
+            117): NaN unmatched, masked or unknown; -inf too near; +inf too far (nothing up to the maximum range).
+        reason: (height, width) uint8 of `Reason`.
+        camera: The camera that took it; its size is the image's.
+        T_world_sensor: (4, 4) float64, exactly rigid, maps the optical frame into the world.
+        stamp_ns: Time of the image in int64 nanoseconds.
     """
 
     depth_m: NDArray[np.float32]
@@ -199,5 +234,5 @@ class DepthImage:
 
     @property
     def viewpoint(self) -> Viewpoint:
-        """Where the camera stood, and what it saw at least (a wide camera: its middle)."""
+        """Pose of the camera, and a pinhole for what it saw (of a wide camera, its middle)."""
         return Viewpoint(self.camera.middle, self.T_world_sensor, self.stamp_ns)

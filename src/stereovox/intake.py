@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every mapper does around its map: frames one at a time, the gate, refusals, health."""
+"""What every mapper does around its map: take frames one at a time, gate them, count refusals, monitor health."""
 
 from __future__ import annotations
 
@@ -13,39 +13,39 @@ from stereovox.maps import VoxelMap
 from stereovox.maps.grid_map import GridMap
 from stereovox.threads import MapLock
 from stereovox.trust.gate import Gate, Passed
-from stereovox.trust.health import FULL, Watch
+from stereovox.trust.health import FULL, HealthMonitor
 
 
 class Intake:
-    """The way of frames into one map, one frame at a time.
+    """Entrance for frames of one map: one frame at a time.
 
-    A frame that is refused (FrameRefused) is counted in the map's history and changes nothing else.
+    A refused frame (FrameRefused) is counted in the map's history and changes nothing else.
 
     Attributes:
-        gate: Compares each frame with those before it; what it remembers is in the map's history.
-        watch: Notes what became of each frame, and when it arrived.
+        gate: Compares each frame with those before it; its memory is the map's history.
+        monitor: Records when each frame arrived and what became of it.
     """
 
-    def __init__(self, config: Config, its_map: VoxelMap | GridMap, clock: Callable[[], int]):
-        self.gate, self.watch = Gate(config, its_map.history), Watch(config, clock)
-        self._map, self._adding = its_map, MapLock()
+    def __init__(self, config: Config, target: VoxelMap | GridMap, clock: Callable[[], int]):
+        self.gate, self.monitor = Gate(config, target.history), HealthMonitor(config, clock)
+        self._map, self._adding = target, MapLock()
 
     def offer(self, frame: AnyFrame | Scan) -> Offer:
-        """Return a frame that arrives now, to be entered by `with` while the map takes it in.
+        """Return a frame that arrives now; enter it with `with` while the map takes it in.
 
         Raises:
             StereovoxError: This thread holds the map's lock.
         """
-        arrived_ns = self.watch.now()
+        arrived_ns = self.monitor.now()
         self._map.lock.refuse_holder()
         return Offer(self, frame, arrived_ns)
 
 
 class Offer:
-    """One frame on its way into the map; while it is entered, others wait. A FrameRefused ends with it.
+    """A frame on its way into the map. While it is entered, others wait; a FrameRefused inside the block ends there.
 
     Attributes:
-        report: What became of the frame: set by the mapper, or here where the frame was refused.
+        report: What became of the frame: set by the mapper, or on exit where the frame was refused.
     """
 
     __slots__ = ("_arrived_ns", "_frame", "_intake", "report")
@@ -68,23 +68,23 @@ class Offer:
             self._intake._adding.release()
 
     def check(self, image: DepthImage | Scan) -> Passed:
-        """Return what `took` is to remember of the frame, of which `image` was made. Raises as `Gate.check`."""
+        """Check the frame, of which `image` was made, and return what `accept` needs. Raises as `Gate.check`."""
         intake = self._intake
         with intake._map.lock:
             return intake.gate.check(self._frame, image)
 
-    def took(self, passed: Passed, way: str = FULL) -> None:
-        """Note that the map took the frame in; called while the map's lock is still held for that."""
+    def accept(self, passed: Passed, quality: str = FULL) -> None:
+        """Record that the map took the frame in; call it under the same hold of the map's lock."""
         intake, history = self._intake, self._intake._map.history
         history.offered(self._frame)
         history.frames += 1
-        intake.gate.took(passed)
-        intake.watch.took(self._arrived_ns, passed.sensor, passed.seen.stamp_ns, way)
+        intake.gate.accept(passed)
+        intake.monitor.accept(self._arrived_ns, passed.sensor, passed.seen.stamp_ns, quality)
 
     def _refuse(self, refused: FrameRefused) -> None:
         intake = self._intake
         with intake._map.lock:
             intake._map.history.offered(self._frame)
             intake._map.history.refuse(refused.reason)
-        intake.watch.refused(self._arrived_ns, refused.reason)
+        intake.monitor.refuse(self._arrived_ns, refused.reason)
         self.report = UpdateReport(refused=refused.reason, detail=str(refused))

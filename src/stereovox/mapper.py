@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The whole flow: a frame is made a depth image or a scan, is checked, becomes evidence, and the map takes it in."""
+"""The whole flow in one file: a frame becomes a depth image, is checked, becomes evidence and enters the map.
+
+Read `Mapper.add` (voxel maps) or `GridMapper.add` (2-D grids) first: each step is a call into the module that does it.
+"""
 
 from __future__ import annotations
 
@@ -10,8 +13,8 @@ from typing import Any, Protocol, TypeVar
 
 from stereovox.comparison import Comparison
 from stereovox.config import Config, load_config
-from stereovox.deadline import Pace
-from stereovox.depth import DepthPath
+from stereovox.deadline import Deadline
+from stereovox.depth import DepthPipeline
 from stereovox.frame import AnyFrame, Scan
 from stereovox.frame import UpdateReport as UpdateReport
 from stereovox.intake import Intake
@@ -20,13 +23,13 @@ from stereovox.maps import VoxelMap, make_map
 from stereovox.maps.grid_map import GridMap
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.trust.health import Health
-from stereovox.trust.validate import trusted
+from stereovox.trust.validate import validate_upright_scan
 
 SeenT = TypeVar("SeenT", contravariant=True)
 
 
 class AnyMapper(Protocol[SeenT]):
-    """What builds a map from frames or scans: `Mapper`, `GridMapper`.
+    """A mapper: builds a map from frames or scans. Implemented by `Mapper` and `GridMapper`.
 
     Attributes:
         config: The settings.
@@ -36,17 +39,17 @@ class AnyMapper(Protocol[SeenT]):
 
     @property
     def map(self) -> VoxelMap | GridMap:
-        """The map so far; `map.history` is what it remembers of its frames."""
+        """The map so far; `map.history` records the frames that made it."""
         ...
 
     def add(self, frame: SeenT, /) -> UpdateReport:
-        """Take one frame into the map, or refuse it, which changes nothing.
+        """Add one frame to the map, or refuse it, which changes nothing.
 
         Args:
-            frame: Where it was taken is in it.
+            frame: The frame, with the pose it was taken at.
 
         Returns:
-            What the frame did, or why it was refused.
+            What the frame changed, or why it was refused.
 
         Raises:
             StereovoxError: This thread holds the map's `lock`.
@@ -54,11 +57,21 @@ class AnyMapper(Protocol[SeenT]):
         ...
 
     def health(self, now_ns: int | None = None) -> Health:
-        """Return how current the map is; `now_ns`: by the mapper's clock, None for now."""
+        """Return how current the map is.
+
+        Args:
+            now_ns: Nanoseconds by the mapper's clock; None for now.
+
+        Returns:
+            State, age and recent refusals of the map.
+        """
         ...
 
     def save(self, path: str | Path) -> None:
-        """Save the map, all or nothing; an older one there stays whole until then.
+        """Save the map, all or nothing: an older map at `path` stays whole until the new one is complete.
+
+        Args:
+            path: Where to save it.
 
         Raises:
             MapFileError: It cannot be written, or there is nothing to write.
@@ -66,17 +79,28 @@ class AnyMapper(Protocol[SeenT]):
         ...
 
     def close(self) -> None:
-        """Give back what the map holds outside memory."""
+        """Release what the map holds outside memory."""
         ...
 
 
 class Mapper:
-    """Builds a map from frames. A frame that cannot be trusted is refused and changes nothing.
+    """Builds a voxel map from depth images or stereo pairs.
 
-    Give a profile name, a TOML file or a Config; settings by name on top (`voxel_size=0.1`,
-    `**{"sensor.p_free": 0.3}`).
-    `resume` is a map to go on with; what its cells mean must not change. `tiles` is the folder for cells that leave a
-    window (`window.outside = "keep"`). `clock`: nanoseconds now. Raises ConfigError for bad settings.
+    A frame that cannot be trusted is refused and changes nothing but the count of refusals.
+
+    Args:
+        profile: Profile name, TOML file or `Config`.
+        resume: Map to continue; the settings that give its cells their meaning must not change.
+        tiles: Folder for cells that leave a window (`window.outside = "keep"`).
+        clock: Returns the time in nanoseconds; used for `health`.
+        **overrides: Settings that replace those of the profile (`voxel_size=0.1`, `**{"sensor.p_free": 0.3}`).
+
+    Attributes:
+        config: The resolved settings.
+        map: The map so far.
+
+    Raises:
+        ConfigError: A setting is unknown, of the wrong type or out of range.
     """
 
     def __init__(
@@ -89,61 +113,96 @@ class Mapper:
         **overrides: Any,
     ):
         self.config = load_config(profile, **overrides)
-        self._pace = Pace(self.config)
-        self.map = make_map(self.config, resume, tiles)  # it may leave tiles on the disk: what could fail comes before
+        self._deadline = Deadline(self.config)
+        self.map = make_map(self.config, resume, tiles)  # may leave tiles on disk, so whatever can fail comes first
         self._intake = Intake(self.config, self.map, clock)
         self._comparison = Comparison(self.config, self._intake.gate)
 
     def add(self, frame: AnyFrame) -> UpdateReport:
-        """Take one frame into the map and tell what it did. Several threads may call: frames go in one by one.
+        """Add one frame to the map, or refuse it. Threads may call this concurrently; frames enter one at a time.
 
-        Raises StereovoxError for a thread that holds the map's `lock`.
+        Args:
+            frame: Depth image or stereo pair, with the pose it was taken at.
+
+        Returns:
+            What the frame changed and how long each step took, or why it was refused.
+
+        Raises:
+            StereovoxError: This thread holds the map's `lock`.
         """
-        with self._intake.offer(frame) as offer:
-            start = perf_counter()
-            way = self._pace.way()
-            matched = way.depth.matched(frame)
-            between = start if matched is frame else perf_counter()
-            image = way.depth.image(matched)
+        with self._intake.offer(frame) as offer:  # a FrameRefused ends here and becomes the report
+            started = perf_counter()
+            quality = self._deadline.quality()
+            depth_frame = quality.depth.matched(frame)
+            matched = started if depth_frame is frame else perf_counter()
+            image = quality.depth.image(depth_frame)
             prepared = perf_counter()
             passed = offer.check(image)
-            evidence, passed = self._comparison.evidence(frame, image, passed, way.integrator, self.map)
+            evidence, passed = self._comparison.evidence(frame, image, passed, quality.integrator, self.map)
             with self.map.lock:
                 self.map.check_room(evidence)
                 self.map.look_from(image.viewpoint)
                 cells = self.map.add(evidence)
-                offer.took(passed, way.name)
-                self.map.history.ways[way.name] += 1
+                offer.accept(passed, quality.name)
+                self.map.history.ways[quality.name] += 1
                 self.map.history.path.walk(passed.sensor, passed.seen)
             done = perf_counter()
-            match_ms, depth_ms, map_ms = 1e3 * (between - start), 1e3 * (prepared - between), 1e3 * (done - prepared)
-            offer.report = UpdateReport(depth_ms, map_ms, cells, detail=passed.told, match_ms=match_ms, way=way.name)
-            self._pace.took(match_ms + depth_ms + map_ms)
-            self._pace.rehearse(frame, matched.camera)
+            match_ms, depth_ms, map_ms = 1e3 * (matched - started), 1e3 * (prepared - matched), 1e3 * (done - prepared)
+            offer.report = UpdateReport(
+                depth_ms, map_ms, cells, detail=passed.note, match_ms=match_ms, quality=quality.name
+            )
+            self._deadline.record(match_ms + depth_ms + map_ms)
+            self._deadline.warm_up(frame, depth_frame.camera)
         return offer.report
 
     def __repr__(self) -> str:
-        return _described(self)
+        return _summary(self)
 
     def health(self, now_ns: int | None = None) -> Health:
-        """Return how current the map is; `now_ns`: by `clock`, None for now."""
-        return self._intake.watch.health(now_ns)
+        """Return how current the map is.
+
+        Args:
+            now_ns: Nanoseconds by `clock`; None for now.
+
+        Returns:
+            State, age and recent refusals of the map.
+        """
+        return self._intake.monitor.health(now_ns)
 
     def save(self, path: str | Path) -> None:
-        """Save the map to the folder `path`, as `VoxelMap.save`."""
+        """Save the map to a folder, all or nothing, as `VoxelMap.save` does.
+
+        Args:
+            path: The folder.
+
+        Raises:
+            MapFileError: It cannot be written.
+        """
         self.map.save(path)
 
     def close(self) -> None:
-        """Give back what the map holds outside memory (nothing, unless it keeps tiles on disk)."""
+        """Release what the map holds outside memory: nothing, unless it keeps tiles on disk."""
         self.map.close()
 
 
 class GridMapper:
-    """Builds a floor's map from lidar scans and depth images. What cannot be trusted is refused and changes nothing.
+    """Builds a 2-D occupancy grid of a floor from lidar scans and depth images.
 
-    Poses must be in the map's frame: `Track.corrected` turns those of the odometry into such. Give a profile name, a
-    TOML file or a Config; settings by name on top (`voxel_size=0.02`, `**{"grid.update": "every"}`).
-    `resume` is a map to go on with, in its own frame. `clock`: nanoseconds now. Raises ConfigError for bad settings.
+    A scan that cannot be trusted is refused and changes nothing but the count of refusals. Poses must be in the map's
+    frame; `Track.corrected` brings odometry poses into it.
+
+    Args:
+        profile: Profile name, TOML file or `Config`.
+        resume: Map to continue, in its own frame.
+        clock: Returns the time in nanoseconds; used for `health`.
+        **overrides: Settings that replace those of the profile (`voxel_size=0.02`, `**{"grid.update": "every"}`).
+
+    Attributes:
+        config: The resolved settings.
+        map: The map so far.
+
+    Raises:
+        ConfigError: A setting is unknown, of the wrong type or out of range.
     """
 
     def __init__(
@@ -155,43 +214,69 @@ class GridMapper:
         **overrides: Any,
     ):
         self.config = load_config(profile, **overrides)
-        self._depth = DepthPath(self.config)
+        self._depth = DepthPipeline(self.config)
         self._beams = make_beams(self.config)
         self.map = _grid_map(self.config, resume)
         self._intake = Intake(self.config, self.map, clock)
 
-    def add(self, seen: Scan | AnyFrame) -> UpdateReport:
-        """Take one scan or depth image into the map and tell what it did; `depth_ms` is what the scan took.
+    def add(self, frame: Scan | AnyFrame) -> UpdateReport:
+        """Add one scan to the map, or refuse it. Threads may call this concurrently; scans enter one at a time.
 
-        Several threads may call: scans go in one by one. Raises StereovoxError for one that holds the map's `lock`.
+        Args:
+            frame: Lidar scan, or a depth image or stereo pair that is turned into one.
+
+        Returns:
+            What the scan changed, or why it was refused. `depth_ms` is the time to prepare the scan.
+
+        Raises:
+            StereovoxError: This thread holds the map's `lock`.
         """
-        with self._intake.offer(seen) as offer:
-            start = perf_counter()
-            scan = trusted(seen if isinstance(seen, Scan) else self._scan_of(seen), self.config)
+        with self._intake.offer(frame) as offer:  # a FrameRefused ends here and becomes the report
+            started = perf_counter()
+            scan = validate_upright_scan(frame if isinstance(frame, Scan) else self._to_scan(frame), self.config)
             passed = offer.check(scan)
             prepared = perf_counter()
             evidence = self._beams.evidence(scan, self.map.origin)
             with self.map.lock:
                 self.map.check_room(evidence)
                 cells = self.map.add(evidence)
-                offer.took(passed)
+                offer.accept(passed)
             done = perf_counter()
-            offer.report = UpdateReport(1e3 * (prepared - start), 1e3 * (done - prepared), cells, detail=passed.told)
+            offer.report = UpdateReport(1e3 * (prepared - started), 1e3 * (done - prepared), cells, detail=passed.note)
         return offer.report
 
     def __repr__(self) -> str:
-        return _described(self)
+        return _summary(self)
 
     def health(self, now_ns: int | None = None) -> Health:
-        """Return how current the map is; `now_ns`: by `clock`, None for now."""
-        return self._intake.watch.health(now_ns)
+        """Return how current the map is.
+
+        Args:
+            now_ns: Nanoseconds by `clock`; None for now.
+
+        Returns:
+            State, age and recent refusals of the map.
+        """
+        return self._intake.monitor.health(now_ns)
 
     def occupancy(self) -> OccupancyGrid:
-        """Return the map so far as plain numbers, as ROS publishes it."""
+        """Return the map so far as an occupancy grid, in the form that ROS publishes.
+
+        Returns:
+            Cells from 0 (free) to 100 (occupied), -1 for unknown.
+        """
         return self.map.occupancy()
 
     def save(self, path: str | Path, mode: str = "trinary") -> None:
-        """Save the map: exactly to a `.npz`, as `GridMap.save`, or as files of map_server, as `write_map_server`."""
+        """Save the map: without loss to a `.npz` (`GridMap.save`), else as map_server files (`write_map_server`).
+
+        Args:
+            path: The file; its ending chooses the format.
+            mode: Mode of the map_server files; has no meaning for `.npz`.
+
+        Raises:
+            MapFileError: It cannot be written, or there is nothing to write.
+        """
         if Path(path).suffix.lower() == ".npz":
             return self.map.save(path)
         from stereovox.formats.map_server import write_map_server
@@ -199,9 +284,9 @@ class GridMapper:
         write_map_server(self.map.occupancy(), path, mode=mode)
 
     def close(self) -> None:
-        """Do nothing: all of the map is in memory."""
+        """Do nothing: the whole map is in memory."""
 
-    def _scan_of(self, frame: AnyFrame) -> Scan:
+    def _to_scan(self, frame: AnyFrame) -> Scan:
         from stereovox.depth.scan import scan_of
 
         return scan_of(self._depth.image(self._depth.matched(frame)), self.config)
@@ -215,6 +300,6 @@ def _grid_map(config: Config, resume: GridMap | OccupancyGrid | None) -> GridMap
     return resume.with_config(config)
 
 
-def _described(mapper: AnyMapper[Any]) -> str:
-    """Return what `repr` says of a mapper."""
+def _summary(mapper: AnyMapper[Any]) -> str:
+    """Return the `repr` of a mapper."""
     return f"<{type(mapper).__name__}: profile '{mapper.config.profile}'; {mapper.map!r}>"

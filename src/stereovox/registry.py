@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Look up a class by name in a room's `name -> "module:Class"` dict, importing it only when asked for."""
+"""Plug-in registry: look up a class in a `name -> "module:Class"` dict, and import it only when it is used."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from stereovox.errors import ConfigError, did_you_mean
 
 
 def find(room: str, builtin: Mapping[str, str], name: str) -> Any:
-    """Return the object registered as `name` in `room`.
+    """Return the object registered as `name` in `room` (`sensors`, `integrators`, ...).
 
-    Other packages add to a room with an entry point in the group `stereovox.<room>`.
-    Raises ConfigError that lists or suggests the known names.
+    Other packages register theirs as entry points in the group `stereovox.<room>`.
+    Raises ConfigError that suggests or lists the known names.
     """
     if name in builtin:
         module, _, attribute = builtin[name].partition(":")
@@ -27,5 +27,5 @@ def find(room: str, builtin: Mapping[str, str], name: str) -> Any:
 
 
 def names(room: str, builtin: Mapping[str, str]) -> list[str]:
-    """Return all names in `room`, built-in ones first."""
+    """Return all names registered in `room`, built-in ones first."""
     return [*builtin, *(entry.name for entry in entry_points(group=f"stereovox.{room}"))]

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Safe files: parsed within bounds whoever wrote them, and written all or nothing."""
+"""Safe files: written all or nothing, and read within bounds, whoever wrote them.
+
+First the writing (`check_file`, `replacing`, `sync_*`), then the reading of text, TOML, JSON, YAML and arrays.
+"""
 
 from __future__ import annotations
 
@@ -25,19 +28,38 @@ from numpy.typing import NDArray
 from stereovox.errors import MapFileError, SourceError, StereovoxError
 
 FLOOR_ENDINGS = (".yaml", ".pgm", ".png")
-"""Files of a floor's map: the picture and its .yaml are written together, whichever is named."""
+"""Endings of 2-D maps; the picture and its .yaml are written together, whichever is named."""
 FLOOR_READABLE = (*FLOOR_ENDINGS, ".yml")
-"""Those that can be read."""
+"""Endings of 2-D maps that can be read."""
+SMALL, MAX_PACKING = 1 << 26, 200
+"""Files that claim to unpack to more bytes, and to more for each of their own, are rejected."""
+MAX_LIST = 1 << 28
+"""Most bytes of a list with a line for each image or pose."""
+MAX_SETTINGS = 1 << 16
+"""Most bytes of a file of settings, or of one calibration."""
+MAX_YAML = 1 << 14
+"""Most bytes of a small YAML file; parsing takes 20 us for each."""
+MAX_DOTS = 200
+"""Most dots in one line of TOML; the time for a key `a.b.c` grows with their square."""
+MAX_DEPTH = 64
+"""Deepest nesting of brackets in YAML."""
+BRACKETS = re.compile(r"[\[\]{}]")
+MAX_COUNT = 1 << 62
+"""Counts in files are smaller."""
+MAX_NODES = 100_000
+"""Most values in a YAML file, each counted as often as aliases repeat it."""
+MAX_NUMBER = 1e300
+"""Bound of numbers in settings: TOML's integers are unbounded, floats are not."""
 
 
 def check_in_space(out: str | Path) -> None:
-    """Raise StereovoxError where a map in space would get the name of a floor's map."""
+    """Raise StereovoxError where a 3-D map would be given the file name of a 2-D map."""
     if Path(out).suffix.lower() in FLOOR_READABLE:
         raise StereovoxError(f"{out}: names a floor's map; end the name of a map in space in .svox, or leave it bare")
 
 
 def check_file(out: str | Path, endings: Iterable[str]) -> Path:
-    """Return `out` as a path; raises StereovoxError before the work where it could not be written after it."""
+    """Return `out` as a path. Raises StereovoxError, before any work, where it cannot be written."""
     path = Path(out)
     if path.suffix.lower() not in endings:
         raise StereovoxError(f"{out}: give a name that ends in {' or '.join(endings)}")
@@ -48,7 +70,7 @@ def check_file(out: str | Path, endings: Iterable[str]) -> Path:
 
 
 def check_folder(folder: Path, name: str) -> None:
-    """Raise StereovoxError unless files can be made in `folder`, where `name` shall be."""
+    """Raise StereovoxError unless files can be created in `folder`; `name` is the file, for messages."""
     if not folder.is_dir():
         raise StereovoxError(f"{name}: there is no folder {folder}; make it or choose another")
     if not os.access(folder, os.W_OK | os.X_OK):
@@ -57,11 +79,11 @@ def check_folder(folder: Path, name: str) -> None:
 
 @contextmanager
 def replacing(path: str | Path, error: type[StereovoxError] = MapFileError) -> Iterator[IO[bytes]]:
-    """Yield a binary file that becomes `path` when the block ends well; otherwise an older `path` stays as it was.
+    """Yield a binary file that replaces `path` when the block ends without error; otherwise `path` is unchanged.
 
-    Raises `error`: one line when the folder is missing or cannot be written, or the disk is full.
+    Raises `error` where the folder is missing or cannot be written, or the disk is full.
     """
-    target = Path(os.path.realpath(path))  # a link keeps pointing to where it pointed
+    target = Path(os.path.realpath(path))  # a symbolic link stays one
     temporary = target.with_name(f".{_short(target)}.{uuid.uuid4().hex[:12]}.new")
     try:
         if target.is_dir():
@@ -82,110 +104,48 @@ def replacing(path: str | Path, error: type[StereovoxError] = MapFileError) -> I
 
 
 def sweep_unfinished(*paths: Path) -> None:
-    """Remove what `replacing` left of these files where it was killed; nobody else may be writing them."""
+    """Remove temporary files of `replacing` for these files after a kill; no one else may be writing them."""
     for target in map(Path, map(os.path.realpath, paths)):
         left = re.compile(rf"\.{re.escape(_short(target))}\.[0-9a-f]{{12}}\.new")
-        with suppress(OSError):  # what cannot be removed is in nobody's way
+        with suppress(OSError):  # what cannot be removed does no harm
             for entry in target.parent.iterdir():
                 if left.fullmatch(entry.name):
                     entry.unlink()
 
 
 def sync_file(path: Path) -> None:
-    """Wait until the disk holds what is in a file."""
+    """Flush the contents of a file to the disk."""
     with path.open("rb") as file:
         os.fsync(file.fileno())
 
 
 def sync_folder(folder: Path) -> None:
-    """Wait until the disk holds the names in `folder`: what was made, renamed and removed there."""
+    """Flush the entries of `folder` to the disk: what was created, renamed and removed there."""
     try:
         number = os.open(folder, os.O_RDONLY)
     except PermissionError:
-        return  # a folder that may be written but not read; not on every system can it be asked
+        return  # a folder that may be written but not read; some systems cannot flush it
     try:
         os.fsync(number)
     except OSError as error:
-        if error.errno != errno.EINVAL:  # the file system has no such thing for folders
+        if error.errno != errno.EINVAL:  # the file system cannot flush folders
             raise
     finally:
         os.close(number)
 
 
 def sync_tree(folder: Path) -> None:
-    """Wait until the disk holds all files below `folder`, and their names."""
+    """Flush all files below `folder`, and their names, to the disk."""
     for place, _, names in os.walk(folder, topdown=False):
         for name in names:
             sync_file(Path(place) / name)
         sync_folder(Path(place))
 
 
-def _short(target: Path) -> str:
-    """Return so much of a file's name that a longer one is still a name."""
-    return os.fsdecode(os.fsencode(target.name)[:200])
-
-
-def _remove(path: Path) -> None:
-    try:
-        path.unlink(missing_ok=True)
-    except OSError:
-        return  # the folder cannot be written, so the file was never made
-
-
-SMALL, PACKED_BEST = 1 << 26, 200
-"""A file may unpack to so many bytes, or to so many for each of its own; more is taken for a lie."""
-
-
-def read_arrays(path: str | Path, names: Sequence[str], what: str) -> dict[str, NDArray[Any]]:
-    """Return the arrays of a file that holds those called `names` and no others.
-
-    what: what the file should be, for messages. Raises MapFileError where it holds other arrays; what a damaged file
-    can raise in zipfile, zlib and NumPy is not bounded: catch Exception.
-    """
-    with zipfile.ZipFile(path) as file:
-        sizes = {entry.filename: entry.file_size for entry in file.infolist()}
-        kinds = {entry.compress_type for entry in file.infolist()}
-        if len(file.infolist()) != len(names) or set(sizes) != {f"{name}.npy" for name in names}:
-            raise MapFileError(f"{path}: holds no {what}")
-        if not kinds <= {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}:
-            raise ValueError("packed in a way that is not used here")
-        if sum(sizes.values()) > max(SMALL, PACKED_BEST * Path(path).stat().st_size):
-            raise ValueError(f"unpacks to {sum(sizes.values())} bytes")
-        return {name: _array(file, f"{name}.npy", sizes[f"{name}.npy"]) for name in names}
-
-
-def _array(file: zipfile.ZipFile, name: str, size: int) -> NDArray[Any]:
-    """Return an array of a file whose entry has `size` bytes unpacked; nothing is allocated for a shape that lies."""
-    with file.open(name) as entry:
-        data = entry.read(size)
-    stream = io.BytesIO(data)
-    version = np.lib.format.read_magic(stream)
-    shape, _, dtype = getattr(np.lib.format, f"read_array_header_{version[0]}_{version[1]}")(stream)
-    if dtype.hasobject or math.prod(shape) * dtype.itemsize != len(data) - stream.tell():
-        raise ValueError(f"{name} tells of {shape} {dtype} and holds {len(data) - stream.tell()} bytes")
-    return np.frombuffer(data, dtype, offset=stream.tell()).reshape(shape)
-
-
-MAX_LIST = 1 << 28
-"""Bytes of a list with a line for each image or pose."""
-MAX_SETTINGS = 1 << 16
-"""Bytes of a file of settings, or of one calibration."""
-MAX_YAML = 1 << 14
-"""Bytes of a small YAML file: reading takes 20 us for each."""
-MAX_DOTS = 200
-"""Dots in one line of TOML; the time for a key `a.b.c` goes with their square."""
-DEEPEST = 64
-"""Brackets within brackets in YAML."""
-BRACKETS = re.compile(r"[\[\]{}]")
-MAX_COUNT = 1 << 62
-MAX_NODES = 100_000
-"""Values in a YAML file, each counted as often as aliases repeat it."""
-
-
 def read_bounded(path: Path, most: int = MAX_SETTINGS) -> bytes:
-    """Return the bytes of a file. Raises OSError where it cannot be read, holds more than `most`, or is no file.
+    """Return the bytes of a file. Raises OSError where it cannot be read, holds more than `most`, or is no plain file.
 
-    A pipe would be waited for, and a device never ends.
+    Pipes would block, and devices never end.
     """
     with open(path, "rb", opener=_without_waiting) as file:
         status = os.fstat(file.fileno())
@@ -193,16 +153,16 @@ def read_bounded(path: Path, most: int = MAX_SETTINGS) -> bytes:
             raise OSError(errno.EINVAL, "not a file")
         if status.st_size > most:
             raise OSError(errno.EFBIG, f"holds more than {most} bytes, which is too many for such a file")
-        return file.read(status.st_size)  # room is made for all that is asked for, there or not
+        return file.read(status.st_size)  # read() would allocate whatever size it is given
 
 
 def read_text(path: Path, most: int = MAX_SETTINGS, errors: str = "strict") -> str:
-    """Return the text (UTF-8) of a file; raises OSError as `read_bounded`, UnicodeDecodeError where it is no text."""
+    """Return the text (UTF-8) of a file. Raises OSError as `read_bounded`, UnicodeDecodeError where it is no text."""
     return read_bounded(path, most).decode("utf-8-sig", errors)
 
 
 def toml_table(text: str) -> dict[str, Any]:
-    """Return what stands in TOML; raises ValueError, one line."""
+    """Parse TOML. Raises ValueError, one line."""
     if any(line.count(".") > MAX_DOTS for line in text.splitlines()):
         raise ValueError(f"a line with more than {MAX_DOTS} dots")
     try:
@@ -212,7 +172,7 @@ def toml_table(text: str) -> dict[str, Any]:
 
 
 def json_value(text: str | bytes) -> Any:
-    """Return what stands in JSON; raises ValueError, one line."""
+    """Parse JSON. Raises ValueError, one line."""
     try:
         return json.loads(text)
     except RecursionError:
@@ -220,9 +180,9 @@ def json_value(text: str | bytes) -> Any:
 
 
 def yaml_value(text: str | bytes, loader_class: Any = None) -> Any:
-    """Return what stands in YAML, by a SafeLoader: plain values only. Raises ValueError, one line.
+    """Parse YAML with a SafeLoader: plain values only. Raises ValueError, one line.
 
-    Aliases may repeat a value, but neither nest without end nor unfold to more than `MAX_NODES`.
+    Aliases may repeat values, but not hold themselves nor unfold to more than `MAX_NODES` values.
     """
     import yaml
 
@@ -246,7 +206,7 @@ def yaml_value(text: str | bytes, loader_class: Any = None) -> Any:
 
 
 def count_in(table: dict[str, Any], key: str) -> int:
-    """Return the count that stands under `key`; raises KeyError, and ValueError for what cannot be a count."""
+    """Return the count under `key`. Raises KeyError, and ValueError for anything but a count."""
     count = table[key]
     if type(count) is not int or not 0 <= count < MAX_COUNT:
         raise ValueError(f"{key} {shown(count)} is no count")
@@ -254,19 +214,63 @@ def count_in(table: dict[str, Any], key: str) -> int:
 
 
 def shown(value: Any) -> str:
-    """Return a value as messages show it: short, whatever it is."""
+    """Return a short text of any value, for messages."""
     return _SHORT.repr(value)
 
 
-class _Short(reprlib.Repr):
-    """Python's own short texts, also of whole numbers that Python refuses to write out."""
+def read_table(path: Path) -> dict[str, Any]:
+    """Return the table in a TOML file. Raises SourceError for a file that cannot be read or is no TOML."""
+    try:
+        return toml_table(read_text(path))
+    except OSError as error:
+        raise SourceError(f"{path}: {error.strerror}; give a TOML file you may read") from None
+    except ValueError as error:  # bad TOML, bad UTF-8
+        raise SourceError(f"{path}: {error}; correct it") from None
 
-    def repr_int(self, x: int, level: int) -> str:
-        return repr(x) if x.bit_length() < 256 else f"{x if x.bit_length() < 13_000 else hex(x)}"[:60] + "..."
+
+def is_number(value: Any) -> bool:
+    """Return whether a value is a finite number that a float can hold."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and -MAX_NUMBER < value < MAX_NUMBER
 
 
-_SHORT = _Short()
-_SHORT.maxlevel, _SHORT.maxlist, _SHORT.maxtuple, _SHORT.maxdict, _SHORT.maxstring = 4, 16, 16, 4, 80
+def toml_text(value: Any) -> str:
+    """Return a text, a number or a list of them as TOML; floats keep all digits."""
+    if isinstance(value, str):
+        escaped = "".join(f"\\u{ord(c):04x}" if ord(c) < 32 or c in '"\\\x7f' else c for c in value)
+        return f'"{escaped}"'
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(toml_text, value))}]"
+    return repr(value if isinstance(value, int) else float(value))
+
+
+def read_arrays(path: str | Path, names: Sequence[str], what: str) -> dict[str, NDArray[Any]]:
+    """Return the arrays of a `.npz` file that holds exactly those in `names`.
+
+    what: the kind of file, for messages. Raises MapFileError where it holds other arrays; a damaged file may raise any
+    exception in zipfile, zlib and NumPy: catch Exception.
+    """
+    with zipfile.ZipFile(path) as file:
+        sizes = {entry.filename: entry.file_size for entry in file.infolist()}
+        kinds = {entry.compress_type for entry in file.infolist()}
+        if len(file.infolist()) != len(names) or set(sizes) != {f"{name}.npy" for name in names}:
+            raise MapFileError(f"{path}: holds no {what}")
+        if not kinds <= {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}:
+            raise ValueError("packed in a way that is not used here")
+        if sum(sizes.values()) > max(SMALL, MAX_PACKING * Path(path).stat().st_size):
+            raise ValueError(f"unpacks to {sum(sizes.values())} bytes")
+        return {name: _array(file, f"{name}.npy", sizes[f"{name}.npy"]) for name in names}
+
+
+def _short(target: Path) -> str:
+    """Return a file's name, cut so that a longer name made of it is still valid."""
+    return os.fsdecode(os.fsencode(target.name)[:200])
+
+
+def _remove(path: Path) -> None:
+    try:
+        path.unlink(missing_ok=True)
+    except OSError:
+        return  # the folder cannot be written, so the file was never created
 
 
 def _without_waiting(path: str, flags: int) -> int:
@@ -274,16 +278,16 @@ def _without_waiting(path: str, flags: int) -> int:
 
 
 def _check_brackets(text: str) -> None:
-    """Raise ValueError where brackets nest deeper than `DEEPEST`: PyYAML's time goes with the square of that."""
+    """Raise ValueError where brackets nest deeper than `MAX_DEPTH`; PyYAML's time grows with the square of that."""
     depth = 0
     for bracket in BRACKETS.findall(text):
         depth = depth + 1 if bracket in "[{" else max(depth - 1, 0)
-        if depth > DEEPEST:
+        if depth > MAX_DEPTH:
             raise ValueError("nested too deeply")
 
 
 def _unfolded(node: Any, known: dict[int, int]) -> int:
-    """Return how many values a node stands for; raises ValueError for too many, and for one that holds itself."""
+    """Return the number of values in a node. Raises ValueError for too many, and for a node that holds itself."""
     if isinstance(node.value, str):
         return 1
     if id(node) not in known:
@@ -295,30 +299,24 @@ def _unfolded(node: Any, known: dict[int, int]) -> int:
     return known[id(node)]
 
 
-LARGEST = 1e300
-"""TOML's whole numbers have no end, but those of a float do."""
+def _array(file: zipfile.ZipFile, name: str, size: int) -> NDArray[Any]:
+    """Return an array from an entry of `size` unpacked bytes; nothing is allocated for a false shape."""
+    with file.open(name) as entry:
+        data = entry.read(size)
+    stream = io.BytesIO(data)
+    version = np.lib.format.read_magic(stream)
+    shape, _, dtype = getattr(np.lib.format, f"read_array_header_{version[0]}_{version[1]}")(stream)
+    if dtype.hasobject or math.prod(shape) * dtype.itemsize != len(data) - stream.tell():
+        raise ValueError(f"{name} claims {shape} {dtype} and holds {len(data) - stream.tell()} bytes")
+    return np.frombuffer(data, dtype, offset=stream.tell()).reshape(shape)
 
 
-def read_table(path: Path) -> dict[str, Any]:
-    """Return what stands in `path`; raises SourceError, one line, for a file that cannot be read or is no TOML."""
-    try:
-        return toml_table(read_text(path))
-    except OSError as error:
-        raise SourceError(f"{path}: {error.strerror}; give a TOML file you may read") from None
-    except ValueError as error:  # bad TOML, bad UTF-8
-        raise SourceError(f"{path}: {error}; correct it") from None
+class _Short(reprlib.Repr):
+    """Python's own short texts, also for integers that Python refuses to convert."""
+
+    def repr_int(self, x: int, level: int) -> str:
+        return repr(x) if x.bit_length() < 256 else f"{x if x.bit_length() < 13_000 else hex(x)}"[:60] + "..."
 
 
-def is_number(value: Any) -> bool:
-    """Tell whether a value is a finite number that a float can hold."""
-    return isinstance(value, int | float) and not isinstance(value, bool) and -LARGEST < value < LARGEST
-
-
-def toml_text(value: Any) -> str:
-    """Return a text, a number or a list of them as TOML; floats keep all their digits."""
-    if isinstance(value, str):
-        escaped = "".join(f"\\u{ord(c):04x}" if ord(c) < 32 or c in '"\\\x7f' else c for c in value)
-        return f'"{escaped}"'
-    if isinstance(value, list | tuple):
-        return f"[{', '.join(map(toml_text, value))}]"
-    return repr(value if isinstance(value, int) else float(value))
+_SHORT = _Short()
+_SHORT.maxlevel, _SHORT.maxlist, _SHORT.maxtuple, _SHORT.maxdict, _SHORT.maxstring = 4, 16, 16, 4, 80

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Poses on a floor: x, y in metres and the turn to the left (yaw) in radians, as (..., 3) float64 arrays.
+"""Poses on a floor: x, y in metres and yaw (to the left) in radians, as (..., 3) float64 arrays.
 
-Named like transforms: `pose_a_b` says where frame b stands in frame a.
+Named like transforms: `pose_a_b` is the pose of frame b in frame a.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ Pose = NDArray[np.float64]
 
 
 def wrapped(angle: ArrayLike) -> NDArray[np.float64]:
-    """Return angles in radians brought into [-pi, pi)."""
+    """Return angles in radians wrapped into [-pi, pi)."""
     turned = (np.asarray(angle, float) + np.pi) % (2 * np.pi) - np.pi
     return turned - 2 * np.pi * (turned >= np.pi)  # a hair below -pi is rounded up to pi
 
@@ -40,7 +40,7 @@ def inverse(pose_a_b: ArrayLike) -> Pose:
 
 
 def relative(pose_a_b: ArrayLike, pose_a_c: ArrayLike) -> Pose:
-    """Return pose_b_c: where c stands as seen from b."""
+    """Return pose_b_c: the pose of c as seen from b."""
     return compose(inverse(pose_a_b), pose_a_c)
 
 
@@ -55,12 +55,12 @@ def transform(pose_a_b: ArrayLike, points_b: ArrayLike) -> NDArray[np.float64]:
 
 
 def flattened(T_a_b: Transform) -> Pose:
-    """Return the (3,) pose of a (4, 4) motion seen from above: yaw is where its x axis points."""
+    """Return the (3,) pose of a (4, 4) motion seen from above; yaw is the direction of its x axis."""
     return np.array([T_a_b[0, 3], T_a_b[1, 3], np.arctan2(T_a_b[1, 0], T_a_b[0, 0])])
 
 
 def lifted(pose_a_b: ArrayLike) -> Transform:
-    """Return the (..., 4, 4) motions of (..., 3) poses: upright, at height 0."""
+    """Return the (..., 4, 4) motions of (..., 3) poses, upright and at height 0."""
     pose = np.asarray(pose_a_b, float)
     cosine, sine = np.cos(pose[..., 2]), np.sin(pose[..., 2])
     T = np.zeros((*pose.shape[:-1], 4, 4))

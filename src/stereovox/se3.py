@@ -26,11 +26,11 @@ def transform_points(T_a_b: Transform, points_b: ArrayLike) -> NDArray[np.float6
 
 
 def rigidity_error(T: ArrayLike) -> float:
-    """Return how far `T` is from a rigid motion: the largest entry of |R^T R - I|; inf for mirrors, NaN, bad shape."""
+    """Return the largest entry of |R^T R - I|; inf for reflections, NaN and wrong shapes."""
     T = np.asarray(T)
     if T.shape != (4, 4):
         return np.inf
-    # Plain numbers, for it is asked of each frame: five times as quick.
+    # plain numbers: five times as fast, and every frame is checked
     (a, b, c, x), (d, e, f, y), (g, h, i, z), (j, k, m, n) = T.tolist()
     if not (isfinite(x + y + z) and abs(j) + abs(k) + abs(m) + abs(n - 1) <= 1e-6):
         return np.inf
@@ -42,7 +42,7 @@ def rigidity_error(T: ArrayLike) -> float:
 
 
 def orthonormalise(T: Transform) -> Transform:
-    """Return the rigid motion nearest to `T` (polar decomposition); files often hold rotations of few digits."""
+    """Return the rigid motion nearest to `T` (polar decomposition), for rotations read from files with few digits."""
     u, _, vt = np.linalg.svd(T[:3, :3])
     rigid = np.array(T, float)
     rigid[:3, :3] = u @ vt
@@ -51,7 +51,7 @@ def orthonormalise(T: Transform) -> Transform:
 
 
 def from_quaternion(translation: ArrayLike, quaternion_xyzw: ArrayLike) -> Transform:
-    """Return the motion with this (3,) translation in metres and (4,) quaternion x, y, z, w (any length but zero)."""
+    """Return the motion of a (3,) translation in metres and a (4,) quaternion x, y, z, w (of any length but zero)."""
     x, y, z, w = np.asarray(quaternion_xyzw, float) / np.linalg.norm(quaternion_xyzw)
     T = np.eye(4)
     T[:3, :3] = [
@@ -89,7 +89,7 @@ def rotation_matrix(vector: ArrayLike) -> NDArray[np.float64]:
 
 
 def interpolate(T_a_b0: Transform, T_a_b1: Transform, share: float) -> Transform:
-    """Return the motion at `share` (0 to 1) of the way: straight line in position, constant turn rate in rotation."""
+    """Return the motion at `share` (0 to 1) between two: linear in position, constant turn rate in rotation."""
     T = np.eye(4)
     R0 = T_a_b0[:3, :3]
     T[:3, :3] = R0 @ rotation_matrix(share * rotation_vector(R0.T @ T_a_b1[:3, :3]))
@@ -111,7 +111,7 @@ def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0, 0, 1)) -> Tra
 
 
 def apart(before: tuple[float, ...], now: tuple[float, ...]) -> tuple[float, float]:
-    """Return how far apart two poses are, in metres and radians."""
+    """Return the distance between two poses (12 numbers each, row by row), in metres and radians."""
     a, b, c, x, d, e, f, y, g, h, i, z = before
     p, q, r, u, s, t, k, v, m, n, o, w = now
     cosine = (a * p + b * q + c * r + d * s + e * t + f * k + g * m + h * n + i * o - 1) / 2

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Threads: locks of maps, kernels in shards, and work of which only the newest request counts."""
+"""Threads: sharded kernels, locks of maps, and jobs of which only the newest request counts."""
 
 from __future__ import annotations
 
@@ -19,14 +19,18 @@ from stereovox.errors import StereovoxError
 
 First = TypeVar("First")
 Second = TypeVar("Second")
+P = ParamSpec("P")
+T = TypeVar("T")
 
 MAX_THREADS = 256
+CHANGING = ("_pool", "_times", "history")
+"""Attributes of a map that `add` changes in place."""
 
 
 def in_shards(work: Callable[[slice], None], parts: list[slice]) -> None:
-    """Call `work(part)` for all parts at the same time; the outcome must not depend on the cut.
+    """Call `work(part)` for all parts in parallel; the result must not depend on the partition.
 
-    Returns, or raises what one of them raised, when all are done.
+    When all are done it returns, or raises what one of them raised.
     """
     mine, *others = parts
     if not others:
@@ -41,8 +45,8 @@ def in_shards(work: Callable[[slice], None], parts: list[slice]) -> None:
         future.result()
 
 
-def together(threads: int, first: Callable[[], First], second: Callable[[], Second]) -> tuple[First, Second]:
-    """Return what two calls return that have nothing to do with each other, made at the same time if threads allow."""
+def run_both(threads: int, first: Callable[[], First], second: Callable[[], Second]) -> tuple[First, Second]:
+    """Return the results of two independent calls, made in parallel if `threads` is not 1."""
     if threads == 1:
         return first(), second()
     running = _pool().submit(second)
@@ -54,7 +58,7 @@ def together(threads: int, first: Callable[[], First], second: Callable[[], Seco
 
 
 def shards(length: int, threads: int) -> list[slice]:
-    """Return slices of nearly equal size that cover range(length): one a thread, or just one where little is to do."""
+    """Return slices of nearly equal size that cover range(length): one per thread, or a single one for little work."""
     if threads == 1 or length < 2 * threads:
         return [slice(0, length)]
     return [slice(length * i // threads, length * (i + 1) // threads) for i in range(threads)]
@@ -62,18 +66,18 @@ def shards(length: int, threads: int) -> list[slice]:
 
 @lru_cache
 def _pool() -> ThreadPoolExecutor:
-    """Return the threads of this process; only as many are started as are busy at once."""
+    """Return the thread pool of this process; it starts only as many threads as are busy at once."""
     return ThreadPoolExecutor(MAX_THREADS, thread_name_prefix="stereovox")
 
 
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_pool.cache_clear)  # a child has none of its parent's threads
+    os.register_at_fork(after_in_child=_pool.cache_clear)  # a forked child has none of its parent's threads
 
 
 class Newest:
-    """Runs `job` for whoever calls, one at a time; of calls that wait for one that runs, one run serves all.
+    """Runs `job` one at a time; calls that arrive while it runs share the next run.
 
-    A page's controls call from many threads, and a slider that is dragged faster than it is drawn.
+    For controls of a page, which call from many threads, and sliders that are dragged faster than they are drawn.
     """
 
     def __init__(self, job: Callable[[], None]):
@@ -82,7 +86,7 @@ class Newest:
         self._asked = self._done = 0
 
     def __call__(self) -> None:
-        """Return when the job was begun and ended after this call."""
+        """Return once a run of the job that started after this call has ended."""
         with self._counting:
             self._asked += 1
             mine = self._asked
@@ -93,20 +97,12 @@ class Newest:
                 self._job()
 
 
-P = ParamSpec("P")
-T = TypeVar("T")
-
-
-CHANGING = ("_pool", "_times", "history")
-"""What `add` changes in place."""
-
-
 class MapLock(RLock):  # pyright: ignore[reportGeneralTypeIssues] - only its stub calls it final
-    """A re-entrant lock that can be copied and pickled: the copy is a lock of its own, which nobody holds."""
+    """A re-entrant lock that can be copied and pickled; the copy is a new lock, not held by any thread."""
 
     def refuse_holder(self) -> None:
-        """Raise StereovoxError where this thread holds the lock: who waits for another with it might wait for ever."""
-        if self._is_owned():  # pyright: ignore[reportAttributeAccessIssue] - what threading.Condition asks
+        """Raise StereovoxError where this thread holds the lock: waiting for another lock now could deadlock."""
+        if self._is_owned():  # pyright: ignore[reportAttributeAccessIssue] - threading.Condition uses it too
             raise StereovoxError(
                 "a frame cannot be added by a thread that holds the map's lock, as a listener does; add it afterwards"
             )
@@ -116,10 +112,10 @@ class MapLock(RLock):  # pyright: ignore[reportGeneralTypeIssues] - only its stu
 
 
 class Guarded:
-    """A map whose public methods and properties each hold `lock`, so that each meets the state between two changes.
+    """A map whose public methods and properties hold `lock`, so that none sees a change half done.
 
-    Generators do not: what they yield is made with the lock held (`in_steps`), and their reader works without it.
-    lock: re-entrant; hold it over several calls that must meet the same state.
+    Generators hold it only while they make an item (`in_steps`), not while their reader works.
+    lock: re-entrant; hold it over several calls that must see the same state.
     """
 
     lock: MapLock
@@ -144,17 +140,17 @@ class Guarded:
         return twin
 
     def __getstate__(self) -> dict[str, Any]:
-        with self.lock:  # what it returns is pickled when the lock is given back
+        with self.lock:  # the result is pickled after the lock is released
             changing = {name: deepcopy(value) for name, value in vars(self).items() if name in CHANGING}
             return {**self._without_listeners(), **changing}
 
     def _without_listeners(self) -> dict[str, Any]:
-        """Return what a copy has: all but who listens to this map."""
+        """Return the attributes of a copy: all but the listeners."""
         return {name: [] if name == "listeners" else value for name, value in vars(self).items()}
 
 
 def in_steps(lock: MapLock, items: Iterator[T]) -> Iterator[T]:
-    """Yield what an iterator yields; it holds the lock while it makes an item, its reader does not."""
+    """Yield the items of an iterator, holding the lock only while each is made."""
     while True:
         with lock:
             item = next(items, None)
@@ -164,7 +160,7 @@ def in_steps(lock: MapLock, items: Iterator[T]) -> Iterator[T]:
 
 
 def one_state(function: Callable[P, T]) -> Callable[P, T]:
-    """Let none of the maps that `function` is given change while it runs: for what asks a map several times."""
+    """Hold the locks of all maps among the arguments while `function` runs, so that it sees one state of each."""
 
     @wraps(function)
     def still(*args: P.args, **kwargs: P.kwargs) -> T:
@@ -178,7 +174,7 @@ def one_state(function: Callable[P, T]) -> Callable[P, T]:
 def _held(values: list[Any]) -> Iterator[None]:
     locks = {id(value.lock): value.lock for value in values if isinstance(value, Guarded)}
     with ExitStack() as stack:
-        for _, lock in sorted(locks.items()):  # in the same order in all threads, or two might wait for each other
+        for _, lock in sorted(locks.items()):  # the same order in all threads, or two could deadlock
             stack.enter_context(lock)
         yield
 

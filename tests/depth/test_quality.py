@@ -9,7 +9,7 @@ import pytest
 import stereovox as sv
 from stereovox.cameras.rigs import StereoPair
 from stereovox.config import load_config
-from stereovox.depth import DepthPath
+from stereovox.depth import DepthPipeline
 from stereovox.depth.prepare import prepare
 from stereovox.depth.quality import BEND_SIGMA, BEND_SLACK, ROWS, counted
 from stereovox.errors import FrameRefused
@@ -28,7 +28,7 @@ def frame_of(depth, camera=CAMERA, **changes):
 
 def why(frame, **settings):
     try:
-        DepthPath(load_config(CONFIG, **settings)).image(frame)
+        DepthPipeline(load_config(CONFIG, **settings)).image(frame)
     except FrameRefused as refused:
         return refused.reason
     return ""
@@ -161,7 +161,7 @@ def test_pairs_without_light_or_with_too_much_are_refused(image, reason):
 
 def dark(frame, **settings):
     try:
-        DepthPath(load_config(CONFIG, **settings)).matched(frame)
+        DepthPipeline(load_config(CONFIG, **settings)).matched(frame)
     except FrameRefused as refused:
         return refused.reason
     return ""

@@ -8,7 +8,7 @@ from stereovox.errors import FrameRefused
 from stereovox.frame import Scan
 from stereovox.localize.scan_beams import beams_of
 from stereovox.se3 import rotation_matrix
-from stereovox.trust.validate import sound
+from stereovox.trust.validate import validate_scan
 
 MANY = np.array([np.nan, -np.inf, 0.01, 0.0, -1.0, 1.0, 2.0, 4.0, 5.0, np.inf], np.float32)
 
@@ -73,7 +73,7 @@ NOWHERE = np.full((4, 4), np.nan)
 )
 def test_what_cannot_be_trusted_is_refused(reason, changes):
     with pytest.raises(FrameRefused) as caught:
-        beams_of(sound(replace(scan(name="scan 7"), **changes), 5e-3))
+        beams_of(validate_scan(replace(scan(name="scan 7"), **changes), 5e-3))
     assert caught.value.reason == reason
     assert "\n" not in str(caught.value)
     assert "scan 7" in str(caught.value)

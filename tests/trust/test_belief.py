@@ -10,14 +10,14 @@ import pytest
 import stereovox as sv
 from stereovox.config import load_config
 from stereovox.errors import FrameRefused
-from stereovox.trust.gate import MAX_LIMIT, MIN_FRAMES, SPREADS, USUAL_AT_FIRST, Belief
-from stereovox.trust.history import MAX_SENSORS, Doubt, History, Seen, Usual
+from stereovox.trust.gate import MAX_LIMIT, MIN_FRAMES, SPREADS, USUAL_AT_FIRST, DisagreementMonitor
+from stereovox.trust.history import MAX_SENSORS, Doubt, History, RunningMean, Seen
 
 FRAME = sv.Frame(np.ones((2, 2), np.float32), sv.PinholeCamera(2, 2, 1, 1, 0.5, 0.5), np.eye(4))
 
 
 class Told:
-    """A belief that is asked frame by frame; its history goes through a file before each of them."""
+    """A monitor that is asked frame by frame; its history goes through a file before each of them."""
 
     def __init__(self, moved=False, **trust):
         self.config = load_config(voxel_size=0.1, **{f"trust.{name}": value for name, value in trust.items()})
@@ -30,14 +30,14 @@ class Told:
     def one(self, against, ms, sensor):
         self.now = getattr(self, "now", 0) + ms * 1_000_000
         self.history = History.loaded(json.loads(json.dumps(self.history.saved())))
-        belief = Belief(self.config, self.history)
-        fits = belief.limit_elsewhere(sensor, self.now, against) is not None and self.ask()
+        monitor = DisagreementMonitor(self.config, self.history)
+        fits = monitor.limit_elsewhere(sensor, self.now, against) is not None and self.ask()
         try:
-            judged = belief.check(FRAME, sensor, self.now, against, fits)
+            agreement = monitor.check(FRAME, sensor, self.now, against, fits)
         except FrameRefused as refused:
             return refused.reason
-        belief.took(sensor, judged)
-        return f"after {judged.after}" if judged.after else ""
+        monitor.accept(sensor, agreement)
+        return f"after {agreement.after}" if agreement.after else ""
 
     def ask(self):
         self.asked += 1
@@ -51,7 +51,7 @@ def test_a_frame_may_disagree_as_much_as_usual_and_some_more():
     told = Told()
     assert told(*[0.03] * 40) == [""] * 40
     assert told.history.usual["camera"] == pytest.approx((0.03, 0), abs=1e-3)
-    limit = Belief(told.config, told.history).limit("camera", 0)
+    limit = DisagreementMonitor(told.config, told.history).limit("camera", 0)
     assert limit == pytest.approx(0.03 + told.config.trust.max_disagreement, abs=1e-3)
     assert told(limit - 0.001) == [""]
     assert told(0.3, 0.03, 0.03) == [CHANGED, "", ""]
@@ -73,10 +73,10 @@ def test_where_frames_disagree_now_more_and_now_less_a_frame_may_as_well():
 
 def test_small_cells_disagree_by_small_errors_of_the_pose():
     fine = load_config(voxel_size=0.02, **{"trust.pose_error_m": 0.006})
-    history = History(usual={"camera": Usual(0.05, 0.0)})
-    assert Belief(fine, history).limit("camera", 0) == pytest.approx(0.35)
-    noisy = History(usual={"camera": Usual(0.7, 0.0)})
-    assert Belief(fine, noisy).limit("camera", 0) == MAX_LIMIT
+    history = History(usual={"camera": RunningMean(0.05, 0.0)})
+    assert DisagreementMonitor(fine, history).limit("camera", 0) == pytest.approx(0.35)
+    noisy = History(usual={"camera": RunningMean(0.7, 0.0)})
+    assert DisagreementMonitor(fine, noisy).limit("camera", 0) == MAX_LIMIT
 
 
 def test_a_world_that_has_changed_is_believed_after_a_second():
@@ -101,13 +101,15 @@ def test_a_frame_that_comes_late_may_disagree_more():
     told = Told()
     told(*[0.03] * 40)
     told.history.trusted["camera"] = Seen(told.now, (0.0,) * 12)
-    early, late = (Belief(told.config, told.history).limit("camera", told.now + ms * 1_000_000) for ms in (200, 1200))
+    early, late = (
+        DisagreementMonitor(told.config, told.history).limit("camera", told.now + ms * 1_000_000) for ms in (200, 1200)
+    )
     assert late - 0.03 == pytest.approx(2 * (early - 0.03), rel=1e-2)
-    assert Belief(told.config, told.history).limit("camera", told.now + 10**12) == late
+    assert DisagreementMonitor(told.config, told.history).limit("camera", told.now + 10**12) == late
     told.history.doubts["camera"] = Doubt(told.now, told.now + 10**9)
-    assert Belief(told.config, told.history).limit("camera", told.now + 1_200_000_000) == early
+    assert DisagreementMonitor(told.config, told.history).limit("camera", told.now + 1_200_000_000) == early
     told.history.trusted["camera"] = Seen(told.now + 3 * 10**9, (0.0,) * 12)  # nothing is known of what it saw
-    assert Belief(told.config, told.history).limit("camera", told.now + 3_200_000_000) == early
+    assert DisagreementMonitor(told.config, told.history).limit("camera", told.now + 3_200_000_000) == early
 
 
 @pytest.mark.parametrize("moved", [False, True])

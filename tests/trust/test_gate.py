@@ -40,7 +40,7 @@ def verdicts(frames, **trust):
         except FrameRefused as refused:
             told.append(refused.reason)
             continue
-        gate.took(passed)
+        gate.accept(passed)
         told.append(f"after {passed.after}" if passed.after else "")
     return told
 

@@ -108,9 +108,9 @@ def test_a_sensor_that_falls_silent_degrades_the_map():
 def test_frames_looked_at_less_thoroughly_degrade_the_map(monkeypatch):
     mapper, clock = mapper_and_clock()
     mapper.add(frame())
-    way = mapper._pace.way()
-    monkeypatch.setattr(way, "name", "near")
-    monkeypatch.setattr(mapper._pace, "way", lambda: way)
+    level = mapper._deadline.quality()
+    monkeypatch.setattr(level, "name", "near")
+    monkeypatch.setattr(mapper._deadline, "quality", lambda: level)
     clock.wait(0.1)
     assert mapper.add(frame()).way == "near"
     health = mapper.health()

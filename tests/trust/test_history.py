@@ -10,7 +10,7 @@ import pytest
 import stereovox as sv
 from stereovox.errors import MapFileError
 from stereovox.trust.camera_path import CameraPath
-from stereovox.trust.history import MAX_REASONS, NOT_TOLD, OTHERS, History, Seen, Streak
+from stereovox.trust.history import MAX_REASONS, NOT_RECORDED, OTHERS, History, Seen, Streak
 
 POSE = tuple(float(x) / 3 for x in range(12))
 FULL = History(
@@ -49,7 +49,7 @@ def test_a_refused_frame_may_hold_anything_as_stamp_and_name(stamp_ns):
 
 def test_a_map_from_before_there_was_a_history_loads():
     old = {"frames": 4, "frames_refused": 2, "recording": "hall"}
-    assert History.loaded(old) == History(4, Counter({NOT_TOLD: 2}), recording="hall")
+    assert History.loaded(old) == History(4, Counter({NOT_RECORDED: 2}), recording="hall")
 
 
 def test_words_without_end_do_not_fill_the_memory():

@@ -14,7 +14,7 @@ from stereovox.localize.amcl.localise import Localiser
 from stereovox.localize.slam.pipeline import Slam
 from stereovox.mapper import GridMapper
 from stereovox.maps.occupancy import OccupancyGrid
-from stereovox.trust.validate import sound, trusted
+from stereovox.trust.validate import validate_scan, validate_upright_scan
 
 MOUNT = se2.lifted([0.2, -0.1, 0.3])
 SCAN = Scan(np.full(40, 3.0, np.float32), -1.0, 0.05, 0.02, 8.0, np.eye(4), MOUNT, name="scan 7")
@@ -31,7 +31,9 @@ BAD = {
 }
 
 
-@pytest.mark.parametrize("check", [lambda scan: sound(scan, 5e-3), lambda scan: trusted(scan, load_config())])
+@pytest.mark.parametrize(
+    "check", [lambda scan: validate_scan(scan, 5e-3), lambda scan: validate_upright_scan(scan, load_config())]
+)
 @pytest.mark.parametrize("what", BAD)
 def test_a_bad_mount_is_one_line(check, what):
     with pytest.raises(FrameRefused) as caught:
@@ -45,10 +47,10 @@ def test_a_mount_of_few_digits_is_made_rigid():
     off = MOUNT.copy()
     off[:3, :3] = np.round(off[:3, :3], 4)
     assert 1e-6 < se3.rigidity_error(off) < 5e-3
-    assert se3.rigidity_error(sound(replace(SCAN, T_base_sensor=off), 5e-3).T_base_sensor) < 1e-14
-    assert np.array_equal(sound(SCAN, 5e-3).T_base_sensor, MOUNT)
+    assert se3.rigidity_error(validate_scan(replace(SCAN, T_base_sensor=off), 5e-3).T_base_sensor) < 1e-14
+    assert np.array_equal(validate_scan(SCAN, 5e-3).T_base_sensor, MOUNT)
     with pytest.raises(FrameRefused):
-        sound(replace(SCAN, T_base_sensor=off), 1e-7)
+        validate_scan(replace(SCAN, T_base_sensor=off), 1e-7)
 
 
 @pytest.mark.parametrize("what", BAD)

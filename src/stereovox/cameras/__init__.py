@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Camera models: how a pixel becomes a ray, and how cameras stand to each other."""
+"""Camera models, from pixel to ray, and the geometry of stereo pairs."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Lenses as they are, with their distortion: where a direction falls in the image, and what a pixel looks along.
+"""Lenses with distortion: projection of directions into the image, and back.
 
 Two models, both as in OpenCV: Brown and Conrady's for narrow lenses, Kannala and Brandt's for fisheyes. Optical frame:
 x right, y down, z forward; pixel (u, v) has its centre at (u, v).
@@ -18,18 +18,19 @@ from stereovox.cameras.pinhole import check_numbers
 from stereovox.errors import StereovoxError, did_you_mean
 
 MODELS = {"pinhole": 8, "fisheye": 4}
-"""Models of a lens and the largest number of their coefficients."""
+"""Lens models and the largest number of their coefficients."""
 COUNTS = {"pinhole": (0, 4, 5, 8), "fisheye": (0, 4)}
-"""How many coefficients a calibration has; another number in a file is a slip."""
+"""Numbers of coefficients that a calibration may have; any other number in a file is an error."""
 FARTHEST = {"pinhole": math.radians(89.9), "fisheye": math.pi}
-"""Angle off the axis in radians at which the model ends by its nature."""
+"""Angle off the axis in radians where the model ends."""
 LARGEST = 1e9
-"""No coefficient of a lens comes near it; polynomials of larger ones leave the range of doubles."""
+"""Bound of the coefficients; polynomials with larger ones leave the range of float64."""
 STEPS = 2000
-"""Angles of the table from which the inverse starts."""
+"""Angles in the table from which the inverse starts."""
 ROUNDS = 12
+"""Newton steps of the inverse."""
 GOOD = 1e-10
-"""The inverse has converged when it misses by less than this, in focal lengths."""
+"""Residual of a converged inverse, in focal lengths."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +39,7 @@ class Lens:
 
     model: `pinhole` with up to 8 coefficients of Brown and Conrady (k1 k2 p1 p2 k3 k4 k5 k6, OpenCV's order), or
     `fisheye` with the four of Kannala and Brandt; missing ones are zero. fx, fy, cx, cy in pixels.
-    Raises StereovoxError for another model, numbers that cannot be (see `cameras.LIMITS`), and too many coefficients.
+    Raises StereovoxError for an unknown model, numbers out of their limits (`pinhole.LIMITS`), too many coefficients.
     """
 
     model: str
@@ -71,7 +72,7 @@ class Lens:
 
     @cached_property
     def widest(self) -> float:
-        """Angle off the axis in radians up to which the lens sees: beyond it the model would fold the image back."""
+        """Largest angle off the axis in radians that the lens sees; beyond it the model would fold the image back."""
         k = self._k
         if self.model == "fisheye":
             return min(math.sqrt(_first_root(np.array([1.0, *k]) * (1, 3, 5, 7, 9))), FARTHEST["fisheye"])
@@ -84,7 +85,7 @@ class Lens:
         return min(math.atan(steepest), FARTHEST["pinhole"])
 
     def project(self, points: ArrayLike) -> NDArray[np.float64]:
-        """Return the (N, 2) pixels at which (N, 3) points of the optical frame are seen; also outside the image.
+        """Return the (N, 2) pixels, inside the image or not, at which (N, 3) points of the optical frame are seen.
 
         NaN where the lens does not see: behind a pinhole, beyond `widest`, at the lens itself.
         """
@@ -101,7 +102,7 @@ class Lens:
         return np.where(seen[:, None], plane * (self.fx, self.fy) + (self.cx, self.cy), np.nan)
 
     def directions(self, pixels: ArrayLike) -> NDArray[np.float64]:
-        """Return the (N, 3) unit rays along which (N, 2) pixels look; NaN where none falls there (see `widest`)."""
+        """Return the (N, 3) unit rays of (N, 2) pixels; NaN where the lens sees nothing (see `widest`)."""
         plane = (np.asarray(pixels, float) - (self.cx, self.cy)) / (self.fx, self.fy)
         radius = np.hypot(*plane.T)
         angle = self._angles(radius)
@@ -152,7 +153,7 @@ class Lens:
         return np.where(np.abs(self._bent(angle) - radius) < 1e-9, angle, np.nan)
 
     def _undistorted(self, slopes: NDArray[np.float64], plane: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the slopes x/z, y/z that are shown at `plane`, by Newton's steps; NaN where there are none."""
+        """Return the slopes x/z, y/z that appear at `plane`, by Newton's method; NaN where there are none."""
         with np.errstate(all="ignore"):
             for _ in range(ROUNDS):
                 missing = plane - self._distorted(slopes)

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Camera models: how a pixel becomes a ray.
+"""The pinhole camera, the ray convention of all camera models, and depth corrections.
 
-Optical frame: x right, y down, z forward. Pixel centres stand at whole numbers. In all cameras here the point that
+Optical frame: x right, y down, z forward. Pixel centres lie at whole numbers. For all cameras here the point that
 pixel (u, v) sees at depth d is
 
     d * (columns[u], rows[v, 0], rows[v, 1])        with `columns, rows = camera.rays()`
 
-so rows are straight lines of an image pair whose eyes stand side by side along x. What depth is: the distance along z
-for a pinhole camera; the distance from the x axis, on which both eyes stand, for a spherical and a cylindrical one.
+so the rows of a pair whose eyes are side by side along x are straight lines. Depth is the distance along z for a
+pinhole camera, and the distance from the x axis, on which both eyes lie, for a spherical or cylindrical one.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from stereovox.errors import StereovoxError, did_you_mean
 
 MAX_PIXELS = 100_000_000
-"""Pixels of an image, at most."""
+"""Most pixels of an image."""
 LIMITS = {
     "pixels": (1, MAX_PIXELS),
     "focal": (0.025, 1e6),
@@ -31,28 +31,29 @@ LIMITS = {
     "subpixel": (1e-9, 1e6),
     "binning": (1, 1e12),
 }
-"""What numbers of a camera can be: focal length and centre in pixels, step in radians a pixel, baseline in metres."""
+"""Limits of a camera's numbers: focal length and centre in pixels, step in radians a pixel, baseline in metres."""
 WHOLE = "pixels", "binning"
-"""Which of them are whole numbers."""
+"""Those that must be whole numbers."""
 STEREO = {"baseline": "baseline", "binning": "binning", "subpixel": "subpixel"}
-"""Fields of all cameras with a depth, and which limits they have."""
+"""Fields of all depth cameras, with the key of their limits."""
 MAX_COEFFICIENT = 1e36
-"""Beyond it a correction leaves the range of float32."""
-
+"""Larger coefficients of a correction leave the range of float32."""
+STEEPEST = 20.0
+"""Largest x/z or y/z at the borders of a pinhole camera's image: 87 degrees off the axis."""
 CORRECTIONS = {"scale": 6, "disparity": 6, "scale+disparity": 12, "thesis": 3}
 """Models of a depth correction and the number of their coefficients; see `DepthCorrection`."""
 
 
 @dataclass(frozen=True)
 class DepthCorrection:
-    """What a depth camera measures wrongly, as found on flat walls (`stereovox calibrate wall`; Chien 2020, App. A).
+    """Systematic depth error of a camera, as measured on flat walls (`stereovox calibrate wall`; Chien 2020, App. A).
 
     x = (u - cx) / fx and y = (v - cy) / fy are a pixel's slopes, z its measured depth in metres. With the quadratics
     s and q, each of six coefficients in the order 1, x, y, x^2, x y, y^2, the true depth is
 
-        scale             z / (1 + s)          an error that is a share of the depth
-        disparity         z / (1 + q z)        one of the disparity, q times focal length and baseline: eyes out of line
-        scale+disparity   z / (1 + s + q z)    both; first the six of s, then those of q
+        scale             z / (1 + s)          error proportional to depth
+        disparity         z / (1 + q z)        disparity error, q times focal length and baseline: misaligned eyes
+        scale+disparity   z / (1 + s + q z)    both; first the six coefficients of s, then those of q
         thesis            z - (p1 X^2 + p2 X + p3) with X = x z: Chien 2020, Eq A.3
 
     Raises StereovoxError for an unknown model, a wrong number of coefficients, or one that is not finite.
@@ -72,10 +73,10 @@ class DepthCorrection:
 
 
 def check_numbers(camera: object, **kinds: str) -> None:
-    """Make the named fields of a frozen camera plain numbers, `width` and `height` too, and check what they can be.
+    """Convert the named fields of a frozen camera, and `width` and `height`, to plain numbers and check their limits.
 
-    kinds: for each field a key of LIMITS. A field that is None by default may be None. Raises StereovoxError for what
-    is no number within its limits, and for images of more than MAX_PIXELS.
+    kinds: for each field a key of LIMITS. A field that is None by default may be None. Raises StereovoxError
+    for values that are not numbers within their limits, and for images of more than MAX_PIXELS.
     """
     for name, kind in {"width": "pixels", "height": "pixels", **kinds}.items():
         value, (low, high), whole = getattr(camera, name), LIMITS[kind], kind in WHOLE
@@ -90,20 +91,24 @@ def check_numbers(camera: object, **kinds: str) -> None:
         raise StereovoxError(f"camera {camera}: more than {MAX_PIXELS:,} pixels; check width and height")
 
 
-STEEPEST = 20.0
-"""Largest x/z or y/z at the borders of a pinhole camera's image: 87 degrees off the axis."""
-
-
 @dataclass(frozen=True)
 class PinholeCamera:
-    """An undistorted pinhole camera.
+    """An undistorted pinhole camera. The centre of pixel (u, v) lies at (u, v).
 
-    `fx, fy, cx, cy` are in pixels; pixel (u, v) has its centre at (u, v). `baseline` is the distance in metres
-    between the two eyes (or projector and eye) of a stereo depth camera, None when not known. `binning` sensor pixels
-    along each side make one pixel (see `binned`); `correction` is what its depth is to be corrected by; `subpixel` the
-    noise of its disparity in pixels, None when not known.
-    Raises StereovoxError for numbers that cannot be (see `LIMITS`), and where the image's borders are more than 87
-    degrees off the axis.
+    Attributes:
+        width: Columns of the image.
+        height: Rows of the image.
+        fx: Focal length along rows, in pixels.
+        fy: Focal length along columns, in pixels.
+        cx: Column of the optical axis.
+        cy: Row of the optical axis.
+        baseline: Metres between the two eyes (or projector and eye) of a stereo depth camera; None if unknown.
+        binning: Sensor pixels along each side of one pixel; see `binned`.
+        correction: Correction of its depth; None for none.
+        subpixel: Standard deviation of its disparity in pixels; None if unknown.
+
+    Raises:
+        StereovoxError: A number is out of its limits (`LIMITS`), or a border is more than 87 degrees off the axis.
     """
 
     width: int
@@ -133,7 +138,17 @@ class PinholeCamera:
     ) -> PinholeCamera:
         """Return a camera with square pixels and a centred axis (Chien 2020, Eq 3.6).
 
-        Raises StereovoxError for angles outside (0, 180) degrees.
+        Args:
+            width: Columns of the image.
+            height: Rows of the image.
+            hfov_deg: Angle between the left and the right border in degrees.
+            baseline: Metres between the two eyes; None if unknown.
+
+        Returns:
+            The camera.
+
+        Raises:
+            StereovoxError: The angle is not between 0 and 180 degrees.
         """
         if not 0 < hfov_deg < 180:
             raise StereovoxError(f"camera: field of view {hfov_deg} deg must lie between 0 and 180")
@@ -141,7 +156,14 @@ class PinholeCamera:
         return cls(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2, baseline)
 
     def binned(self, n: int) -> PinholeCamera:
-        """Return the camera whose pixels are blocks of n by n of this one's; blocks at the far borders may be cut."""
+        """Return the camera whose pixels are blocks of n by n pixels of this one; blocks at the far borders may be cut.
+
+        Args:
+            n: Pixels along each side of a block.
+
+        Returns:
+            The camera with 1/n of the resolution, rounded up.
+        """
         middle = (n - 1) / 2
         return replace(
             self,
@@ -156,35 +178,65 @@ class PinholeCamera:
 
     @property
     def middle(self) -> PinholeCamera:
-        """The camera itself; of a wide one, the pinhole camera that sees its middle."""
+        """The camera itself; for wide cameras, a pinhole camera of their middle."""
         return self
 
     @property
     def focal_px(self) -> float:
-        """Pixels of the sensor per radian along a row, at its centre: what disparity is counted in."""
+        """Sensor pixels per radian along a row, at its centre: the unit of disparity."""
         return self.fx * self.binning
 
     def volume(self, depth: float) -> float:
-        """Return how many cubic metres the image's borders enclose up to `depth` metres."""
+        """Return the volume of the view.
+
+        Args:
+            depth: Depth in metres where the view ends.
+
+        Returns:
+            Cubic metres.
+        """
         return self.width / self.fx * (self.height / self.fy) * depth**3 / 3
 
     def rays(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Return the columns (width,) and rows (height, 2) of the rays, float32, as the module says."""
+        """Return the rays of the pixels, in the convention of `stereovox.cameras.pinhole`.
+
+        Returns:
+            Columns (width,) and rows (height, 2), float32.
+        """
         columns, slopes = self.ray_slopes()
         return columns, np.stack([slopes, np.ones_like(slopes)], axis=1)
 
     def depth_of(self, disparity: NDArray[np.floating], aligned: str = "left") -> NDArray[np.float64]:
-        """Return the depth in metres for disparities (height, width) in pixels > 0 (Valenti 2018, Eq 4.1)."""
+        """Return the depth of disparities (Valenti 2018, Eq 4.1).
+
+        Args:
+            disparity: (height, width) in pixels, above 0.
+            aligned: Eye that the disparities belong to, `left` or `right`; has no influence here.
+
+        Returns:
+            (height, width) float64 metres; NaN without a baseline.
+        """
         return self.fx * (self.baseline or np.nan) / np.asarray(disparity, float)
 
     def ray_slopes(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Return x/z of every column (width,) and y/z of every row (height,), float32."""
+        """Return the slopes of the pixels' rays.
+
+        Returns:
+            x/z of every column (width,) and y/z of every row (height,), float32.
+        """
         x = (np.arange(self.width) - self.cx) / self.fx
         y = (np.arange(self.height) - self.cy) / self.fy
         return x.astype(np.float32), y.astype(np.float32)
 
     def back_project(self, depth_m: NDArray[np.floating]) -> NDArray[np.float64]:
-        """Return (height, width, 3) points in the optical frame for a depth image in metres (NaN stays NaN)."""
+        """Return the points of a depth image.
+
+        Args:
+            depth_m: (height, width) metres along the optical axis; NaN: no value.
+
+        Returns:
+            (height, width, 3) float64 metres in the optical frame; NaN where the depth is NaN.
+        """
         depth = np.asarray(depth_m, float)
         v, u = np.mgrid[: self.height, : self.width]
         return np.stack([(u - self.cx) / self.fx * depth, (v - self.cy) / self.fy * depth, depth], axis=-1)

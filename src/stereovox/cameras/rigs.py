@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stereo pairs: two eyes side by side, where they sit on the vehicle, and the camera they are rectified to."""
+"""Stereo pairs: two eyes side by side, their mount on the vehicle, and the virtual camera they are rectified to."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from stereovox.errors import StereovoxError, did_you_mean
 from stereovox.se3 import Transform, orthonormalise, rigidity_error
 
 VirtualCamera = PinholeCamera | SphericalCamera | CylindricalCamera
-"""What a rectified image was taken with."""
+"""The camera of a rectified image."""
 MODELS = ("pinhole", "spherical", "cylindrical")
 USUAL_DEG = {"spherical": (170.0, 180.0), "cylindrical": (120.0, 180.0)}
-"""Most degrees across and down of a wide camera that nobody gave a field of view."""
+"""Largest default field of view, across and down, of a wide camera."""
 SIDEWAYS_DEG = 45.0
-"""The baseline may lean so far against the x axis of the left eye."""
+"""Largest angle of the baseline to the x axis of the left eye."""
 
 
 @dataclass(frozen=True, eq=False)
 class Eyes:
-    """Both cameras as they are: lenses, and T_left_right (4, 4), which maps the right optical frame into the left.
+    """The raw cameras of a pair: lenses, and T_left_right (4, 4), which maps the right optical frame into the left.
 
-    Images come as the lenses made them and must be rectified. Raises StereovoxError for a T_left_right that is no rigid
-    motion, or that does not put the right eye to the right of the left one.
+    Their images are distorted and must be rectified. Raises StereovoxError for a T_left_right that is no rigid motion,
+    or that does not place the right eye to the right of the left one.
     """
 
     left: Lens
@@ -56,9 +56,9 @@ class Eyes:
         return float(np.linalg.norm(self.T_left_right[:3, 3]))
 
     def rectifying_rotations(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the (3, 3) rotations that turn rectified coordinates into those of the left and of the right eye.
+        """Return the (3, 3) rotations from rectified coordinates into those of the left and of the right eye.
 
-        The rectified x axis runs along the baseline, z is the mean of both optical axes made square to it.
+        The rectified x axis runs along the baseline; z is the mean of both optical axes, made orthogonal to it.
         """
         R_left_right = self.T_left_right[:3, :3]
         x = self.T_left_right[:3, 3] / self.baseline
@@ -73,12 +73,15 @@ class Eyes:
 class StereoPair:
     """A stereo camera.
 
-    camera: the rectified left eye, with the baseline; the rectified right eye is the same camera, moved by the baseline
-        along x. eyes: what the images come from, None where they are rectified already.
-    T_body_camera: (4, 4) maps the rectified left optical frame into the vehicle's (x forward, y left, z up).
-    valid: (height, width) bool of the rectified left image: False where parts of the vehicle stand in the view, or the
-        lens sees nothing; None: all may be used. valid_right: the same of the rectified right image.
-    name: for messages.
+    Attributes:
+        camera: The rectified left eye, with the baseline; the rectified right eye is the same camera, moved by the
+            baseline along x.
+        eyes: The raw cameras that the images come from; None where images are rectified already.
+        T_body_camera: (4, 4) maps the rectified left optical frame into the vehicle's (x forward, y left, z up).
+        valid: (height, width) bool of the rectified left image: False where parts of the vehicle block the view or the
+            lens sees nothing; None: all pixels may be used.
+        name: For messages.
+        valid_right: As `valid`, for the rectified right image.
     """
 
     camera: VirtualCamera
@@ -101,9 +104,23 @@ class StereoPair:
         valid: NDArray[np.bool_] | None = None,
         name: str = "stereo",
     ) -> StereoPair:
-        """Return the pair with the virtual camera that `virtual_camera` makes.
+        """Return a pair that is rectified to a virtual camera, made by `virtual_camera`.
 
-        T_body_left: (4, 4) maps the optical frame of the left eye as it is, not rectified, into the vehicle's.
+        Args:
+            eyes: The raw cameras.
+            model: `pinhole`, `spherical` or `cylindrical`.
+            size: Width and height in pixels; None: the resolution of the lenses.
+            hfov_deg: Angle between the left and the right border in degrees; None: what the lenses see.
+            vfov_deg: Angle between the upper and the lower border in degrees; None: what the lenses see.
+            T_body_left: (4, 4) maps the raw left optical frame, not rectified, into the vehicle's; None: identity.
+            valid: As the attribute `valid`.
+            name: For messages.
+
+        Returns:
+            The pair.
+
+        Raises:
+            StereovoxError: The model is unknown, or an angle or size is impossible.
         """
         T_left_camera = np.eye(4)
         T_left_camera[:3, :3] = eyes.rectifying_rotations()[0]
@@ -160,7 +177,7 @@ def _pinhole(
 
 
 def _centre(eyes: Eyes) -> tuple[float, float]:
-    """Return the slopes x/z, y/z of the middle of what both eyes see; 0, 0 where they see too far to the side."""
+    """Return the slopes x/z, y/z of the middle of both views; 0, 0 where the eyes see too far to the side."""
     slopes = []
     for lens, R in zip((eyes.left, eyes.right), eyes.rectifying_rotations(), strict=True):
         right, bottom = lens.width - 1, lens.height - 1

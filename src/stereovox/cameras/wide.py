@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Virtual cameras for wide lenses: what fisheye images are warped to, so that both eyes' rows are the same planes.
+"""Virtual cameras for wide lenses: fisheye images are warped to them, so that rows of both eyes are the same planes.
 
-Both eyes stand on the x axis and every row of pixels is a plane through it, `(v - cv) * step_v` radians down from the
-z axis. Depth is the distance from the x axis; see `stereovox.cameras.pinhole` for how a pixel and a depth make a point.
+Both eyes lie on the x axis and every row of pixels is a plane through it, `(v - cv) * step_v` radians down from the
+z axis. Depth is the distance from the x axis; see `stereovox.cameras.pinhole` for the ray convention.
 """
 
 from __future__ import annotations
@@ -17,20 +17,35 @@ from stereovox.cameras.pinhole import STEREO, PinholeCamera, check_numbers
 from stereovox.errors import StereovoxError
 
 WIDEST_DEG = 88.0
-"""Rays along the x axis, within two degrees, have no depth: both eyes see the same there."""
+"""Rays within two degrees of the x axis have no depth: both eyes see the same there."""
 WIDEST_BORDER_DEG = 93.0
-"""A pixel's outer border may lie so far off, though its middle may not."""
+"""Limit for the outer border of a pixel, whose middle may not be that far off."""
+MIDDLE_DEG = 40.0
+"""Half the field of view of a wide camera's `middle`, at most."""
+FINEST_MIDDLE = 2400.0
+"""Its largest focal length in pixels: it only represents the view, no image is made with it."""
 SEEN_DEG = 89.0
-"""Borders farther off than this count as this: depths from the x axis reach to infinity there."""
+"""Borders farther off count as this: depths from the x axis reach to infinity there."""
 
 
 @dataclass(frozen=True)
 class SphericalCamera:
     """An equirectangular camera: columns are even in the angle from the y-z plane (Valenti 2018, 4.2).
 
-    cu, cv: column and row of the z axis. step_u, step_v: radians a pixel. baseline: metres between both eyes, None when
-    not known. binning, subpixel: as in `PinholeCamera`.
-    Raises StereovoxError for numbers that cannot be (see `cameras.LIMITS`), and for columns more than 88 degrees off.
+    Attributes:
+        width: Columns of the image.
+        height: Rows of the image.
+        step_u: Radians from one column to the next.
+        step_v: Radians from one row to the next.
+        cu: Column of the z axis.
+        cv: Row of the z axis.
+        baseline: Metres between both eyes; None if unknown.
+        binning: As in `PinholeCamera`.
+        subpixel: As in `PinholeCamera`.
+
+    Raises:
+        StereovoxError: A number is out of its limits (`LIMITS` of `cameras.pinhole`), or a column is more than 88
+            degrees off the axis.
     """
 
     width: int
@@ -51,13 +66,24 @@ class SphericalCamera:
     def from_field_of_view(
         cls, width: int, height: int, hfov_deg: float, vfov_deg: float, baseline: float | None = None
     ) -> SphericalCamera:
-        """Return a camera whose pixel borders span these angles round the z axis."""
+        """Return a camera whose pixel borders span the given angles, centred on the z axis.
+
+        Args:
+            width: Columns of the image.
+            height: Rows of the image.
+            hfov_deg: Angle between the left and the right border in degrees.
+            vfov_deg: Angle between the upper and the lower border in degrees.
+            baseline: Metres between both eyes; None if unknown.
+
+        Returns:
+            The camera.
+        """
         step_u, step_v = math.radians(hfov_deg) / width, math.radians(vfov_deg) / height
         return cls(width, height, step_u, step_v, (width - 1) / 2, (height - 1) / 2, baseline)
 
     @property
     def middle(self) -> PinholeCamera:
-        """The pinhole camera that sees the middle of what this one sees."""
+        """A pinhole camera of the middle of the view."""
         return _middle(self)
 
     @property
@@ -67,27 +93,48 @@ class SphericalCamera:
         return left, right, (-0.5 - self.cv) * self.step_v, (self.height - 0.5 - self.cv) * self.step_v
 
     def volume(self, depth: float) -> float:
-        """Return how many cubic metres the image shows up to `depth` metres from the x axis, and as far along it."""
+        """Return the volume of the view.
+
+        Args:
+            depth: Metres from the x axis, and along it, where the view ends.
+
+        Returns:
+            Cubic metres.
+        """
         return _volume(self.borders, depth)
 
     @property
     def focal_px(self) -> float:
-        """Pixels of the sensor per radian along a row."""
+        """Sensor pixels per radian along a row."""
         return self.binning / self.step_u
 
     def angles(self) -> NDArray[np.float64]:
-        """Return the angle (width,) of each column from the y-z plane in radians, positive towards x."""
+        """Return the angle of each column from the y-z plane.
+
+        Returns:
+            (width,) radians, positive towards x.
+        """
         return (np.arange(self.width, dtype=float) - self.cu) * self.step_u
 
     def rays(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Return the columns (width,) and rows (height, 2) of the rays, float32."""
+        """Return the rays of the pixels, in the convention of `stereovox.cameras.pinhole`.
+
+        Returns:
+            Columns (width,) and rows (height, 2), float32.
+        """
         return np.tan(self.angles()).astype(np.float32), _row_rays(self)
 
     def depth_of(self, disparity: NDArray[np.floating], aligned: str = "left") -> NDArray[np.float64]:
-        """Return the depth (height, width) in metres for disparities in pixels > 0 of the left or the right image.
+        """Return the depth of disparities: rho cos(theta) of Valenti 2018, Eq 4.3 and 4.4.
 
-        rho cos(theta) of Valenti 2018, Eq 4.3 and 4.4: B / (tan(left angle) - tan(right angle)). Where the other eye
-        would have to look back (90 degrees and more) there is none: NaN.
+        It is B / (tan(left angle) - tan(right angle)).
+
+        Args:
+            disparity: (height, width) in pixels, above 0.
+            aligned: Eye that the disparities belong to, `left` or `right`.
+
+        Returns:
+            (height, width) float64 metres; NaN where the other eye would have to look back (90 degrees and more).
         """
         here = self.angles()
         shift = np.asarray(disparity, float) * self.step_u
@@ -100,9 +147,21 @@ class SphericalCamera:
 class CylindricalCamera:
     """A camera with columns like a pinhole's and rows even in angle, so that depth is `fx baseline / disparity`.
 
-    fx, cx: focal length and centre of the columns in pixels. step_v, cv: radians a row, and the row of the z axis. The
-    noise of its depth is the same function of depth in all directions, which a spherical camera's is not.
-    Raises StereovoxError as `SphericalCamera`.
+    The noise of its depth is the same function of depth in all directions, unlike a spherical camera's.
+
+    Attributes:
+        width: Columns of the image.
+        height: Rows of the image.
+        fx: Focal length along rows, in pixels.
+        step_v: Radians from one row to the next.
+        cx: Column of the z axis.
+        cv: Row of the z axis.
+        baseline: Metres between both eyes; None if unknown.
+        binning: As in `PinholeCamera`.
+        subpixel: As in `PinholeCamera`.
+
+    Raises:
+        StereovoxError: As for `SphericalCamera`.
     """
 
     width: int
@@ -123,13 +182,24 @@ class CylindricalCamera:
     def from_field_of_view(
         cls, width: int, height: int, hfov_deg: float, vfov_deg: float, baseline: float | None = None
     ) -> CylindricalCamera:
-        """Return a camera whose pixel borders span these angles round the z axis."""
+        """Return a camera whose pixel borders span the given angles, centred on the z axis.
+
+        Args:
+            width: Columns of the image.
+            height: Rows of the image.
+            hfov_deg: Angle between the left and the right border in degrees.
+            vfov_deg: Angle between the upper and the lower border in degrees.
+            baseline: Metres between both eyes; None if unknown.
+
+        Returns:
+            The camera.
+        """
         fx = 0.5 * width / math.tan(math.radians(hfov_deg) / 2)
         return cls(width, height, fx, math.radians(vfov_deg) / height, (width - 1) / 2, (height - 1) / 2, baseline)
 
     @property
     def middle(self) -> PinholeCamera:
-        """The pinhole camera that sees the middle of what this one sees."""
+        """A pinhole camera of the middle of the view."""
         return _middle(self)
 
     @property
@@ -139,27 +209,40 @@ class CylindricalCamera:
         return left, right, (-0.5 - self.cv) * self.step_v, (self.height - 0.5 - self.cv) * self.step_v
 
     def volume(self, depth: float) -> float:
-        """Return how many cubic metres the image shows up to `depth` metres from the x axis, and as far along it."""
+        """Return the volume of the view.
+
+        Args:
+            depth: Metres from the x axis, and along it, where the view ends.
+
+        Returns:
+            Cubic metres.
+        """
         return _volume(self.borders, depth)
 
     @property
     def focal_px(self) -> float:
-        """Pixels of the sensor per radian along a row, at its centre."""
+        """Sensor pixels per radian along a row, at its centre."""
         return self.fx * self.binning
 
     def rays(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Return the columns (width,) and rows (height, 2) of the rays, float32."""
+        """Return the rays of the pixels, in the convention of `stereovox.cameras.pinhole`.
+
+        Returns:
+            Columns (width,) and rows (height, 2), float32.
+        """
         return ((np.arange(self.width) - self.cx) / self.fx).astype(np.float32), _row_rays(self)
 
     def depth_of(self, disparity: NDArray[np.floating], aligned: str = "left") -> NDArray[np.float64]:
-        """Return the depth (height, width) in metres for disparities in pixels > 0, of either image."""
+        """Return the depth of disparities.
+
+        Args:
+            disparity: (height, width) in pixels, above 0.
+            aligned: Eye that the disparities belong to, `left` or `right`; has no influence here.
+
+        Returns:
+            (height, width) float64 metres; NaN without a baseline.
+        """
         return self.fx * (self.baseline or np.nan) / np.asarray(disparity, float)
-
-
-MIDDLE_DEG = 40.0
-"""The middle pinhole of a wide camera sees so far to each side, or as far as the camera."""
-FINEST_MIDDLE = 2400.0
-"""Its focal length in pixels, at most: it stands for where the camera looked, no image is made of it."""
 
 
 def _middle(camera: SphericalCamera | CylindricalCamera) -> PinholeCamera:

@@ -71,13 +71,13 @@ def rerun_of(mapper: Mapper, file: str | None) -> Iterator[NoPage]:
     if file is None:
         yield NoPage()
         return
-    from stereovox.depth import DepthPath
+    from stereovox.depth import DepthPipeline
     from stereovox.formats.rerun import RerunLog, rerun_file
 
     with rerun_file(file, mapper.config.up) as opened:
         stopped = None
         try:
-            yield Recorded(mapper, RerunLog(opened, DepthPath(mapper.config)))
+            yield Recorded(mapper, RerunLog(opened, DepthPipeline(mapper.config)))
         except KeyboardInterrupt as told:  # what was mapped is saved, and so is this
             stopped = told
     say(f"saved {file}; look at it with: rerun {file}")

@@ -71,7 +71,7 @@ def read_walls(
 def _read(name: str, distance: float | None, frames: str | None, camera: str | None, raw: bool) -> WallRecording:
     from stereovox.calibrate.recording import read_wall
     from stereovox.config import load_config
-    from stereovox.depth import DepthPath
+    from stereovox.depth import DepthPipeline
     from stereovox.opening import open_images, parse_slice
     from stereovox.sources.camera_file import with_camera
 
@@ -85,7 +85,7 @@ def _read(name: str, distance: float | None, frames: str | None, camera: str | N
     count = stream.length
     if count is None and (frames is None or parse_slice(frames).stop is None):
         count = LIVE_FRAMES
-    path = DepthPath(load_config())
+    path = DepthPipeline(load_config())
     shown = tracked(islice(stream, count), count, name)
     return read_wall(
         map(path.matched, shown), name, replace(stream.camera, correction=None) if raw else stream.camera, distance

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""All settings of a run, typed and checked. Lengths in metres unless the name says otherwise.
+"""All settings of a run, typed and checked. Lengths are in metres unless the name says otherwise.
 
-A profile is a TOML file in `profiles/` or anywhere else; what it does not name keeps the default below.
+A profile is a TOML file in `profiles/` or elsewhere; settings that it does not name keep their defaults.
 """
 
 from __future__ import annotations
@@ -23,32 +23,50 @@ from stereovox.errors import ConfigError, did_you_mean
 from stereovox.safe_io import read_text, shown, toml_table
 
 MAX_CELLS = 8192
-"""Cells that fit between the camera and the maximum range."""
+"""Most cells between the camera and the maximum range."""
 BLIND_RANGE = 0.3
-"""Metres within which depth cameras see nothing, most of them."""
+"""Metres within which most depth cameras see nothing."""
 MAX_UNEQUAL = 16
-"""Largest over smallest side of a cell."""
+"""Largest ratio of two sides of a cell."""
 
 
 class Config(Section):
     """Every setting of a run; the resolved one is saved inside the map.
 
-    profile: name of the profile that the settings come from.
-    dimensions: 3 for a voxel map, 2 for the grid of a floor (IST 2019).
-    voxel_size: side of a cell.
-    steps: sides of a cell along x, y and z where they differ, at most 16-fold (Valenti 2018, 7.1); `voxel_size` is then
-        the largest. Pictures and exports are made in cubes of the smallest.
-    min_range, max_range: depths along the optical axis that count.
-    up: which axis of the world points up (`z`, `-y`, ...): pictures and heights follow it.
-    blind_range: depth in metres up to which a camera clears nothing, for it does not see what stands so near, only what
-        is beside it. Not set: 0.3, but no more than a tenth of max_range, and no less than min_range.
-    integrator: `projective`, `ray`, `line`, or one that another package registers.
-    threads: threads of the integrator; the map does not depend on it.
-    pose_rigidity_tolerance: largest entry of abs(R^T R - I) of a pose that is still taken for rounding.
-    deadline_ms: milliseconds a frame may take; where frames take longer, `pace` says what is left out. Not set: none.
-    max_memory: bytes that the cells may take, as a number or like "500 MB". when_full: frames that need more are
-        refused (`refuse`); or the map is a window of that size round the camera, which drops what it leaves (`roll`) or
-        keeps it on disk (`spill`).
+    Attributes:
+        profile: Name of the profile that the settings come from.
+        dimensions: 3 for a voxel map, 2 for the grid of a floor (IST 2019).
+        voxel_size: Side of a cell.
+        steps: Sides of a cell along x, y and z where they differ, at most 16-fold (Valenti 2018, 7.1); `voxel_size` is
+            then the largest. Pictures and exports are made in cubes of the smallest.
+        min_range: Least depth along the optical axis that counts.
+        max_range: Largest depth along the optical axis that counts.
+        up: The axis of the world that points up (`z`, `-y`, ...); pictures and heights follow it.
+        blind_range: Depth in metres up to which a camera clears nothing, since it sees nothing that near. Not set:
+            0.3, but at most a tenth of max_range and at least min_range.
+        integrator: `projective`, `ray`, `line`, or one that another package registers.
+        threads: Threads of the integrator; the map does not depend on their number.
+        pose_rigidity_tolerance: Largest entry of abs(R^T R - I) that counts as rounding of a pose.
+        deadline_ms: Milliseconds a frame may take; `pace` sets what is left out where frames take longer. Not set:
+            no limit.
+        max_memory: Bytes that the cells may take, as a number or like "500 MB".
+        when_full: Frames that need more memory are refused (`refuse`); or the map is a window of that size round the
+            camera, which drops what leaves it (`roll`) or keeps it on disk (`spill`).
+        trust: Which frames may change the map; see TrustConfig.
+        pace: What is left out under `deadline_ms`; see PaceConfig.
+        sensor: Inverse sensor model; see SensorConfig.
+        noise: Range and pose noise; see NoiseConfig.
+        depth: Depth images; see DepthConfig.
+        stereo: Stereo matching; see StereoConfig.
+        sphere: Spherical grid; see SphereConfig.
+        map: Cells; see MapConfig.
+        window: Moving window; see WindowConfig.
+        ray: Ray integrators; see RayConfig.
+        projective: Projective integrator; see ProjectiveConfig.
+        scan: Depth images as scans; see ScanConfig.
+        grid: 2-D grids; see GridConfig.
+        amcl: Localisation; see AmclConfig.
+        slam: SLAM; see SlamConfig.
     """
 
     profile: str = "default"
@@ -123,13 +141,20 @@ class Config(Section):
 
 
 def load_config(profile: str | Path | Config | Mapping[str, Any] = "default", **overrides: Any) -> Config:
-    """Return the settings of a profile (built-in name, TOML file, Config or plain dict) with `overrides` on top.
+    """Return the settings of a profile with overrides.
 
-    Overrides name settings as in the file; a dot reaches into a section (`{"sensor.p_free": 0.3}`).
-    Raises ConfigError: one line with the setting, its value and the cure.
+    Args:
+        profile: Built-in name, TOML file, `Config` or plain dict.
+        **overrides: Settings by their names in the file; a dot reaches into a section (`**{"sensor.p_free": 0.3}`).
+
+    Returns:
+        The checked settings.
+
+    Raises:
+        ConfigError: A profile cannot be read, or a setting is unknown, of the wrong type or out of range.
     """
     where = str(profile) if isinstance(profile, str | Path) else "config"
-    where = "" if where in profile_names() else f"{where}: "  # what is built in is right: a setting on top is not
+    where = "" if where in profile_names() else f"{where}: "  # built-in ones are right: the override is wrong
     settings = _as_settings(profile)
     for key, value in overrides.items():
         _put(settings, key, value)
@@ -146,7 +171,7 @@ def profile_names() -> list[str]:
 
 
 def parse_value(text: str) -> Any:
-    """Return a command line value as TOML reads it (`0.5`, `true`, `[1, 2]`); anything else is a plain string."""
+    """Return a command line value parsed as TOML (`0.5`, `true`, `[1, 2]`); anything else is a string."""
     try:
         return toml_table(f"value = {text}")["value"]
     except ValueError:
@@ -217,7 +242,7 @@ def _one_line(error: ValidationError, where: str) -> str:
 
 
 def _tuple_length(location: tuple[int | str, ...]) -> int:
-    """Return how many numbers belong into the setting at `location`; 0 where it is no list."""
+    """Return the length of the list that the setting at `location` takes; 0 where it takes none."""
     model: Any = Config
     for name in location:
         field = getattr(model, "model_fields", {}).get(name)

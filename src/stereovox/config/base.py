@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What all sections of the settings have in common."""
+"""The base class of all settings sections."""
 
 from __future__ import annotations
 
@@ -7,6 +7,6 @@ from pydantic import BaseModel, ConfigDict
 
 
 class Section(BaseModel):
-    """A part of the settings: unknown names are errors, numbers are finite, values do not change."""
+    """A section of the settings: immutable, unknown names are errors, numbers must be finite."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)

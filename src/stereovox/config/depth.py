@@ -33,13 +33,13 @@ class NoiseConfig(Section):
 
 
 class DepthConfig(Section):
-    """What happens to a depth image before it becomes evidence.
+    """Preparation of a depth image before it becomes evidence.
 
-    denoise: average depths that the camera's noise cannot tell apart, where it is large against the cells.
+    denoise: average depths that differ by no more than the camera's noise, where that is large against the cells.
     downsample: n by n pixels become one that holds the smallest valid depth of its block (Chien 2020, 3.2); 1: none.
-    far: what is believed to be too far away, and so clears cells up to the maximum range. `measured`: only depths that
-        were measured beyond it; `reported`: also pixels that the source reports as too far (older name: `told`);
-        `infinite`: also +inf (REP 117), for cameras that never write it for what is too near or unmatched.
+    far: which pixels count as too far, and so clear cells up to the maximum range. `measured`: only depths measured
+        beyond it; `reported`: also pixels that the source reports as too far (older name: `told`);
+        `infinite`: also +inf (REP 117), for cameras that never write it for pixels that are too near or unmatched.
     """
 
     denoise: bool = True
@@ -57,23 +57,23 @@ class StereoConfig(Section):
 
     method: `sgm` (OpenCV's semi-global matching along three paths), `sgm8` (eight), `hh4` (four), `block`, `onnx`.
     model: the file of a network for `onnx`: two images in, a disparity out.
-    disparities: how many are searched, from 0 on.
-    block_size: side of the window by which two pixels are compared; odd. p1, p2: what a step of one disparity and of
-        more costs, for each pixel of the window. uniqueness: per cent by which the best match must beat the second.
+    disparities: number of disparities searched, from 0.
+    block_size: side of the window by which two pixels are compared; odd. p1, p2: cost of a step of one disparity and of
+        more, per pixel of the window. uniqueness: per cent by which the best match must beat the second.
     from_below: the vertical path of `sgm` comes from below: better where a road fills the lower half of the view.
-    unlock: spread fractions of a pixel evenly, which semi-global matching pulls towards whole ones.
+    unlock: spread fractions of a pixel evenly; semi-global matching pulls them towards whole pixels.
     speckle_size, speckle_range: smaller patches are dropped; a step of more disparity ends a patch. 0: none dropped.
     left_right: most by which the disparities of both images may differ; 0: not checked.
-    aligned: the image whose pixels get a depth (Valenti 2018: right).
-    halve: match at half the resolution: four to five times as quick and smoother (Valenti 2018, 5.1); maps of streets
-        come out the same. The result is of full size, and the numbers above stand for full pixels all the same. Not
-        set: images of more than 450,000 pixels are halved.
+    aligned: the image that the depth belongs to (Valenti 2018: right).
+    halve: match at half the resolution: four to five times as fast and smoother (Valenti 2018, 5.1); maps of streets
+        come out the same. The result has full size, and the settings above still count full pixels. Not set: images
+        of more than 450,000 pixels are halved.
     rcrop: columns dropped at the border that the other eye cannot see: the right one for the right image (Valenti
         2018, Eq 5.1). Pixels whose match lies outside of the other image are dropped in any case.
-    min_confidence: pixels that are less sure have no value (0 to 1, see docs/stereo.md).
+    min_confidence: pixels with less confidence have no value (0 to 1, see docs/stereo.md).
     texture: mean step of grey over two columns below which pixels have no value. 1 drops what is quite flat, 2 to 3
         also clear skies, and smooth roads with them; 0: not asked for.
-    subpixel: standard deviation of the disparities that are left, in pixels; what the map takes for their noise.
+    subpixel: standard deviation of the remaining disparities in pixels, which the map assumes as their noise.
     threads: threads of the matcher; the disparity does not depend on it.
     """
 

@@ -23,12 +23,12 @@ class SensorConfig(BaseModel):
     model: str = "stereo"
 
     def parameters(self) -> dict[str, Any]:
-        """Return what the model itself is to be made with."""
+        """Return the parameters of the model itself."""
         return dict(self.model_extra or {})
 
 
 class RayConfig(Section):
-    """How the integrators `ray` and `line` combine the rays of one frame.
+    """How the integrators `ray` and `line` combine the rays of a frame.
 
     update: a cell changes `once` a frame, hits first, or `every` ray adds its weighted part (Chien 2020, Eq 3.21). That
         counts pixels: a pole that fills less than about a quarter of its cell's width is outvoted by the rays beside it
@@ -41,24 +41,24 @@ class RayConfig(Section):
 class ProjectiveConfig(Section):
     """How the projective integrator counts hits.
 
-    full_share: a cell's hit counts in full when so much of the cell's footprint in the image falls into it, with less
-    by the square root of the part, since a few pixels may be wrong; 0: every hit counts in full.
+    full_share: a hit counts in full where at least this share of the cell's footprint in the image measures the cell,
+        below that by the square root of the part, since a few pixels may be wrong; 0: every hit counts in full.
     """
 
     full_share: float = Field(0.1, ge=0, le=1)
 
 
 class MapConfig(Section):
-    """What a cell is kept in, the range of its log-odds, and the probabilities that tell the states apart.
+    """Storage of a cell, the range of its log-odds, and the probabilities that separate the states.
 
     cell: `int16` holds thousandths of log-odds, `int8` steps of 1/32 from -4 to 3.97; `uint8` is Chien's byte (2020,
     3.5): 127 unknown, 0 free, 255 occupied.
     prior: probability that a cell is occupied before the first evidence on it (l0 of Valenti 2018, Eq 6.2). Most cells
     a camera sees are free, so probabilities agree with what is really there when it is well below a half. `prior` of
     the sensor model `stereo` should be the same. A cell that evidence made likelier than that is never free.
-    confirm_hits: frames that must hit an unknown cell at least before it is occupied; one frame raises it by no more
-        than that part of the way.
-    keep_times: remember for each cell when it got its last evidence (4 bytes a cell on top).
+    confirm_hits: least number of frames that must hit an unknown cell before it is occupied; one frame raises it by
+        at most that fraction.
+    keep_times: store when each cell got its last evidence (4 more bytes a cell).
     log_odds_min, log_odds_max: limits of a cell's log-odds.
     free_below, occupied_above: probabilities below which a cell is free, and above which it is occupied.
     forget_s: a cell without evidence for so many seconds of the recording becomes unknown; needs `keep_times`.

@@ -13,9 +13,9 @@ from stereovox.config.base import Section
 class ScanConfig(Section):
     """How a depth image becomes a scan (IST 2019, III-C).
 
-    method: `rows` takes the nearest of `rows` rows round the row that looks level, for a camera that is level; `cloud`
-        the nearest point between `heights`, for one that is tilted.
-    rows: 1 is the middle row alone (IST 2019). off_level_deg: most by which that row may leave the level.
+    method: `rows` takes the nearest of `rows` rows round the row that looks level, for level cameras; `cloud` takes the
+        nearest point between `heights`, for tilted ones.
+    rows: 1 is the middle row alone (IST 2019). off_level_deg: largest angle of that row off the level.
     heights: lowest and highest metres over the floor (z of the world) that count as an obstacle.
     angle_step_deg: width of a beam; not set: that of a pixel in the middle of the image.
     """
@@ -39,8 +39,8 @@ class GridConfig(Section):
     traversal: cells of a beam by `bresenham`'s line, or `exact`: every cell that it touches; other packages add theirs.
     update: a cell changes `once` a scan (a hit beats a pass), or by `every` beam that crosses it (IST 2019).
     thickness: metres behind the measured point that are occupied too (alpha of IST 2019, II-B); 0: its cell alone.
-    p_occupied, p_free: what one beam says of a cell it ends in, and of one it passes, where as many cells are occupied
-        as free (OctoMap's numbers); `prior` tells how many are.
+    p_occupied, p_free: probability after one beam of the cell it ends in, and of a cell it passes, at even odds before
+        (OctoMap's numbers); see `prior`.
     prior: probability that a cell is occupied before the first evidence on it.
     max_tilt_deg: scans of a sensor that leans more than this are refused: its beams meet the floor.
     """
@@ -57,19 +57,19 @@ class GridConfig(Section):
 class AmclConfig(Section):
     """Adaptive Monte Carlo localisation (Thrun, Burgard and Fox 2005, chapters 5, 6 and 8).
 
-    particles_min, particles_max: how many there are at least and at most.
-    kld_error, kld_z: there are so many particles that, up to the normal quantile `kld_z` (2.33: in 99 of 100 cases),
-        they differ from the true distribution by `kld_error` at most (Fox 2003); kld_bin, kld_bin_deg: its bins, in
-        metres and degrees, which also part the clusters the pose is taken from.
-    alpha1 ... alpha4: noise of the odometry (table 5.6): variance of a turn by a turn, of a turn by a way, of a way by
-        a way, of a way by a turn. 0.01 is a standard deviation of 10 %.
-    update_min_d, update_min_a: the map is asked after moving so many metres or turning so many radians.
-    resample_interval: particles are drawn anew after so many updates.
+    particles_min, particles_max: least and largest number of particles.
+    kld_error, kld_z: enough particles are used that, up to the normal quantile `kld_z` (2.33: in 99 of 100 cases),
+        they differ from the true distribution by at most `kld_error` (Fox 2003); kld_bin, kld_bin_deg: its bins, in
+        metres and degrees, which also separate the clusters that the pose is taken from.
+    alpha1 ... alpha4: noise of the odometry (table 5.6): variance of a turn by a turn, of a turn by a distance, of a
+        distance by a distance, of a distance by a turn. 0.01 is a standard deviation of 10 %.
+    update_min_d, update_min_a: update after moving this many metres or turning this many radians.
+    resample_interval: updates between two resamplings.
     model: `field` compares where beams end with the nearest obstacle (table 6.3); `beam` compares their lengths with
         what the map lets them be (table 6.1), which takes longer and suits maps of all that the lidar sees.
-    max_beams: how many of a scan's beams are used. max_range: metres beyond which a beam has seen nothing; not set: the
-        scan's own.
-    trust: power of a scan's likelihood: 1 takes the beams for independent (as printed), 1 / max_beams for a single one.
+    max_beams: number of a scan's beams that are used. max_range: metres beyond which a beam has seen nothing; not set:
+        the scan's own.
+    trust: power of a scan's likelihood: 1 treats the beams as independent (as printed), 1 / max_beams as a single one.
     z_hit, z_short, z_max, z_rand: shares of beams that end at what the map holds, before it, nowhere, and anywhere;
         only their proportions matter: `beam` divides them by their sum, which need not be 1 (it is not in ROS's amcl);
         `field` knows z_hit and z_rand only. sigma_hit: metres; lambda_short: 1 / metres.
@@ -79,11 +79,11 @@ class AmclConfig(Section):
     beam_skip_distance: a beam fits a particle for which it ends within so many metres of an obstacle.
     beam_skip_share: a beam is left out where it fits a smaller share of the particles.
     beam_skip_most: all beams are used where a larger share of them would be left out.
-    alpha_slow, alpha_fast: how quickly the long and the short memory of the likelihood fade (table 8.3); where the
+    alpha_slow, alpha_fast: decay rates of the long and the short average of the likelihood (table 8.3); where the
         short one falls below the long one, random particles help to find the robot again. 0: never.
-    recovery_least: a smaller share of random particles is taken for chance, and none are drawn; 0: as printed.
-    candidates: random poses that are tried for each random particle, of which the scan chooses; 1: any, as printed.
-    start_std: standard deviation of the first pose where it is given: metres, metres, radians.
+    recovery_least: a smaller share of random particles counts as chance, and none are drawn; 0: as printed.
+    candidates: random poses tried for each random particle, from which the scan chooses; 1: any, as printed.
+    start_std: standard deviation of a given first pose: metres, metres, radians.
     """
 
     particles_min: int = Field(500, ge=10)
@@ -135,24 +135,24 @@ class SlamConfig(Section):
     """Simultaneous localisation and mapping from a 2-D lidar (`localize/slam/pipeline.py`).
 
     voxel_size: side in metres of a cell of the map, and of the grid that scans are matched in.
-    max_range: metres up to which hits are matched; what is further is too sparse to lie on a line.
+    max_range: metres up to which hits are matched; farther ones are too sparse to lie on a line.
     sigma: metres that a hit may stand off a wall; beyond, it counts less and less (Geman and McClure).
     odometry: how far the odometry's step between two scans may be off: metres (above 0), metres per metre, radians
         (above 0), radians per radian. Turns are wide on purpose: odometry and lidar seldom have one clock, and matching
         knows better.
-    keyframe_distance, keyframe_turn: metres and radians between the scans that the map is made of.
-    local_keyframes: a scan is matched with the map of this many last keyframes.
+    keyframe_distance, keyframe_turn: metres and radians between the scans that make up the map.
+    local_keyframes: a scan is matched with the map of this many recent keyframes.
     submap_keyframes: keyframes of a submap, the unit that loops are closed with.
-    closure_path: metres of way between two visits, from which on they are a loop.
-    drift, drift_turn: what the search for loops allows the way between: metres per metre, radians per metre.
-    closure_window, closure_window_turn: largest metres and radians that are searched.
-    closure_score: mean likelihood of the points (0 to 1) from which on a place may be one seen before.
-    closure_rival: no loop is closed where another place scores this share of the best one's score.
+    closure_path: least metres of path between two visits for a loop.
+    drift, drift_turn: drift that the search for loops allows on the path between: metres and radians per metre.
+    closure_window, closure_window_turn: largest search window in metres and radians.
+    closure_score: least mean likelihood of the points (0 to 1) for a place to be one seen before.
+    closure_rival: no loop is closed where another place scores this share of the best score.
     closure_share: share of the points that must then lie on the earlier map's lines.
-    refine_rounds: how often all keyframes are matched with all that saw the same walls, at the end; 0 is quickest.
+    refine_rounds: rounds at the end in which all keyframes are matched with all that saw the same walls; 0 is fastest.
     refine_distance: metres between keyframes that are matched with each other.
-    clear_far: whether a beam that saw nothing clears the map up to `max_range`. Off, as many lidars tell black and
-        dazzling things in the same way.
+    clear_far: whether a beam without a return clears the map up to `max_range`. Off, since many lidars report black and
+        dazzling objects in the same way.
     """
 
     voxel_size: float = Field(0.05, ge=0.01, le=0.5)

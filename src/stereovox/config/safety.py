@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which frames may change a map, for how long it counts as current, and what is left out where time is short."""
+"""Settings of trust and deadline: which frames may change a map, and what is left out when time is short."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ class TrustConfig(Section):
     max_gap_s: so is one that is more than this many seconds ahead.
     max_speed_mps, max_turn_dps: metres and degrees a second beyond which a pose has jumped.
     max_pose_off_s: seconds that a pose may be extrapolated.
-    settle_s: after a jump or a reset, frames that agree with each other for so long are believed again; 0: at once.
+    settle_s: after a jump or a reset, frames that agree with each other for this long are accepted again; 0: at once.
     stale_s, lost_s: seconds without a trusted frame until the map is `stale` and until it is `lost`.
-    min_valid_share: share of the pixels that must say something (a depth, or too far); 0: one pixel is enough.
-    min_surface_share: share of the depths that must lie on surfaces; 0: not asked for.
+    min_valid_share: share of the pixels that must have a depth or be too far; 0: one pixel is enough.
+    min_surface_share: share of the depths that must lie on surfaces; 0: not checked.
     max_unexposed_share: share of the pixels of a stereo pair's image that may be black, or saturated; 1: all.
     frozen: refuse an image that is exactly the one before although the camera has moved.
-    max_disagreement: share of what a frame says of what the map is sure of that may be against the map, on top of what
-        is usual for its sensor; 1: not asked for.
-    pose_error_m: metres that poses are off now and then; a frame may disagree by that over the size of a cell.
-    changed_s: a world that has changed is believed after so many seconds of frames that disagree with the map, and at
-        least five of them; 0: at once.
-    moved_s: seconds after which frames are believed that would agree if the camera stood elsewhere.
+    max_disagreement: share of a frame's evidence on sure cells that may contradict the map, beyond what is usual for
+        its sensor; 1: not checked.
+    pose_error_m: occasional error of poses in metres; a frame may disagree by that over the size of a cell.
+    changed_s: a changed world is accepted after this many seconds of frames that disagree with the map, at least five
+        of them; 0: at once.
+    moved_s: seconds after which frames are accepted that would agree with the map from another pose.
     """
 
     ordered: bool = True
@@ -56,10 +56,10 @@ class TrustConfig(Section):
 
 
 class PaceConfig(Section):
-    """What is left out, step by step, where frames take longer than `deadline_ms` (docs/safety.md).
+    """Quality levels for frames that take longer than `deadline_ms` (docs/safety.md).
 
-    near_share: share of the maximum range that is left in the first step. stride: pixels along each side that become
-    one in the second, on top of `depth.downsample`. The third step is to leave out the frame.
+    near_share: share of the maximum range that the first step keeps. stride: pixels along each side that the second
+        step merges into one, on top of `depth.downsample`. The third step is to skip the frame.
     """
 
     near_share: float = Field(0.5, gt=0, le=1)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From a frame as delivered to a depth image that can be trusted."""
+"""From a frame as delivered to a checked depth image."""
 
-from stereovox.depth.pipeline import DepthPath
+from stereovox.depth.pipeline import DepthPipeline
 from stereovox.depth.prepare import prepare
 
-__all__ = ["DepthPath", "prepare"]
+__all__ = ["DepthPipeline", "prepare"]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernels on one depth image: metres and reasons, corrections, denoising, block minimum, range, quality."""
+"""Kernels on one depth image: metres and reasons, corrections, denoising, block minima, shorter range, quality."""
 
 import numpy as np
 
@@ -10,9 +10,9 @@ MASKED, UNKNOWN = np.uint8(4), np.uint8(5)
 NAN, NEAR, FAR = np.float32(np.nan), np.float32(-np.inf), np.float32(np.inf)
 ZERO, ONE, TWO = np.float32(0), np.float32(1), np.float32(2)
 CHUNK = 4096
-"""Pixels that stay in the fastest cache from one look at them to the next."""
+"""Pixels that stay in the fastest cache between two passes."""
 SEGMENT = 64
-"""Pixels of a row that are left out together where none of them is noisy."""
+"""Pixels of a row that are skipped together where none of them is noisy."""
 NONE = np.float32(-1e6)
 """Inverse depth of a pixel without value: far from every other."""
 COARSEST = np.float32(1e4)
@@ -20,12 +20,115 @@ COARSEST = np.float32(1e4)
 
 
 @kernel
+def classify(raw, scale, min_range, max_range, none, infinite, depth_m, reason):
+    """Fill `depth_m` (float32, REP 117) and `reason` (uint8) from flat `raw`; return the number of valid pixels.
+
+    none: a raw value that means "no value" beside zero, negative ones and NaN (65535 in uint16 images). -inf is too
+    near. infinite: what +inf means: itself (too far), or NaN (unknown).
+    """
+    valid = np.int64(0)
+    for start in range(0, raw.size, CHUNK):
+        part = slice(start, start + CHUNK)
+        _metres(raw[part], scale, min_range, max_range, none, infinite, depth_m[part])
+        valid += _reasons(depth_m[part], reason[part])
+    return valid
+
+
+@kernel
+def take_given(given, far, depth_m, reason):
+    """Overwrite reasons with those given by the source, where it has any; return the number of valid pixels.
+
+    far: what a given TOO_FAR becomes: itself or UNKNOWN. A depth within the range, or too near, contradicts it.
+    """
+    valid = np.int64(0)
+    for start in range(0, given.size, CHUNK):
+        part = slice(start, start + CHUNK)
+        valid += _take(given[part], far, depth_m[part], reason[part])
+    return valid
+
+
+@cell
+def _metres(raw, scale, min_range, max_range, none, infinite, depth_m):
+    for i in range(raw.size):  # single selects, no nested ones: those become branches and stop vectorisation
+        value = np.float32(raw[i])
+        d = value * scale
+        d = NAN if (value == none) | ((d <= ZERO) & (d > NEAR)) else d
+        d = infinite if d == FAR else d
+        d = NEAR if d < min_range else d
+        d = FAR if d > max_range else d
+        depth_m[i] = d
+
+
+@cell
+def _reasons(depth_m, reason):
+    valid = np.int32(0)
+    for i in range(depth_m.size):
+        d = depth_m[i]
+        why = np.int32(VALID) if d == d else np.int32(UNKNOWN)
+        why = np.int32(TOO_NEAR) if d == NEAR else why
+        why = np.int32(TOO_FAR) if d == FAR else why
+        reason[i] = np.uint8(why)
+        valid = np.int32(valid + (np.int32(1) if why == 0 else np.int32(0)))
+    return valid
+
+
+@cell
+def _take(given, far, depth_m, reason):
+    for i in range(given.size):
+        theirs, own = given[i], reason[i]
+        why = theirs if theirs != VALID else own
+        why = far if theirs == TOO_FAR else why
+        why = UNKNOWN if (theirs == TOO_FAR) & (own == VALID) else why
+        reason[i] = TOO_NEAR if (theirs == TOO_FAR) & (own == TOO_NEAR) else why
+    valid = np.int32(0)
+    for i in range(given.size):
+        why, d = reason[i], depth_m[i]
+        d = NAN if (why == UNMATCHED) | (why == MASKED) | (why == UNKNOWN) else d
+        d = NEAR if why == TOO_NEAR else d
+        d = FAR if why == TOO_FAR else d
+        depth_m[i] = d
+        valid = np.int32(valid + (np.int32(1) if why == VALID else np.int32(0)))
+    return valid
+
+
+@kernel
+def quadratics(s, q, x, y, depth_m):
+    """Divide `depth_m` (rows, columns) in place by 1 + s(x, y) + q(x, y) z; NaN: that is no depth; infinities stay.
+
+    s, q: (6,) float32, coefficients of 1, x, y, x^2, x y, y^2. x, y: slopes of columns and rows.
+    """
+    for v in range(y.size):
+        b = y[v]
+        s0, q0 = s[0] + b * (s[2] + b * s[5]), q[0] + b * (q[2] + b * q[5])
+        s1, q1 = s[1] + b * s[4], q[1] + b * q[4]
+        row = depth_m[v]
+        for u in range(x.size):
+            a, z = x[u], row[u]
+            divisor = ONE + s0 + a * (s1 + a * s[3]) + (q0 + a * (q1 + a * q[3])) * z
+            d = z / divisor if divisor > ZERO else NAN
+            row[u] = z if abs(z) == FAR else d
+
+
+@kernel
+def thesis(p, x, depth_m):
+    """Subtract p1 X^2 + p2 X + p3 with X = x z from `depth_m` (rows, columns) in place (Chien 2020, Eq A.3)."""
+    for v in range(depth_m.shape[0]):
+        row = depth_m[v]
+        for u in range(x.size):
+            z = row[u]
+            across = x[u] * z
+            d = z - (across * (p[0] * across + p[1]) + p[2])
+            d = d if d > ZERO else NAN
+            row[u] = z if abs(z) == FAR else d
+
+
+@kernel
 def denoise(depth_m, noise, steps, fine, widths, limit, low, high, rings):
     """Replace every depth by a weighted mean over neighbours, in place; pixels without value stay as they are.
 
     depth_m: (h, w) REP 117 depth image. noise: (3,) s0, s1, s2 of the depth noise in metres. One pass after another:
-    steps: (passes,) int64, how many pixels away its four neighbours are; fine: the noise in metres, up to which it
-    leaves a pixel; widths: how many sigma off a neighbour no longer counts; `limit`: metres, sigma counts for no more.
+    steps: (passes,) int64, distance of its four neighbours in pixels; fine: noise in metres up to which it leaves a
+    pixel unchanged; widths: difference in sigma at which a neighbour no longer counts; limit: cap of sigma, metres.
     low, high: results are kept within these depths. rings: scratch (passes + 1, 2 m + 1, w + 2 m), m the largest
     step: inverse depths of the rows that are needed, measured and after each pass.
     """
@@ -88,7 +191,7 @@ def _average(above, row, below, step, margin, noise, fine, wide, limit, out):
 
 @cell
 def _any_noisy(inverse, start, stop, noise, fine):
-    """Tell whether a pixel has more noise than `fine`."""
+    """Return whether any pixel has more noise than `fine`."""
     number = np.int32(0)
     for u in range(start, stop):
         c = inverse[u]
@@ -106,7 +209,7 @@ def _sigma(c, noise):
 def _four(c, p, q, r, s, scale):
     """Return the weighted sum of four neighbours' differences from `c`, and the sum of their weights.
 
-    A weight is (1 - difference^2 scale)^4, not below 0: a neighbour half as far off as may be counts a third.
+    A weight is (1 - difference^2 scale)^4, at least 0: a neighbour at half the largest difference counts a third.
     """
     p, q, r, s = p - c, q - c, r - c, s - c
     f, g, h, k = _weight(p * p * scale), _weight(q * q * scale), _weight(r * r * scale), _weight(s * s * scale)
@@ -118,37 +221,6 @@ def _weight(square):
     w = max(ONE - square, ZERO)
     w = w * w
     return w * w
-
-
-@kernel
-def quadratics(s, q, x, y, depth_m):
-    """Divide `depth_m` (rows, columns) in place by 1 + s(x, y) + q(x, y) z; NaN: that is no depth; infinities stay.
-
-    s, q: (6,) float32, coefficients of 1, x, y, x^2, x y, y^2. x, y: slopes of columns and rows.
-    """
-    for v in range(y.size):
-        b = y[v]
-        s0, q0 = s[0] + b * (s[2] + b * s[5]), q[0] + b * (q[2] + b * q[5])
-        s1, q1 = s[1] + b * s[4], q[1] + b * q[4]
-        row = depth_m[v]
-        for u in range(x.size):
-            a, z = x[u], row[u]
-            divisor = ONE + s0 + a * (s1 + a * s[3]) + (q0 + a * (q1 + a * q[3])) * z
-            d = z / divisor if divisor > ZERO else NAN
-            row[u] = z if abs(z) == FAR else d
-
-
-@kernel
-def thesis(p, x, depth_m):
-    """Take p1 X^2 + p2 X + p3 with X = x z off `depth_m` (rows, columns) in place (Chien 2020, Eq A.3)."""
-    for v in range(depth_m.shape[0]):
-        row = depth_m[v]
-        for u in range(x.size):
-            z = row[u]
-            across = x[u] * z
-            d = z - (across * (p[0] * across + p[1]) + p[2])
-            d = d if d > ZERO else NAN
-            row[u] = z if abs(z) == FAR else d
 
 
 @kernel
@@ -206,18 +278,18 @@ def shorten(depth_m, reason, valid_to, far_from, out_depth, out_reason):
 
 @kernel
 def count(depth_m, step, noise, slack, counts):
-    """Write to `counts` (4,) int64 how many pixels are looked at, and how many of them say something; of how many both
-    neighbours in the row have a depth as well, and how many of these lie on a surface with them.
+    """Count pixels into `counts` (4,) int64: sampled ones; those with a depth or too far; those whose neighbours in the
+    row have a depth as well; and those of them on a surface with both.
 
-    depth_m: (height, width) float32, REP 117; every `step`-th row is looked at. noise: (3,) s0, s1, s2 of the range
+    depth_m: (height, width) float32, REP 117; every `step`-th row is sampled. noise: (3,) s0, s1, s2 of the range
     noise, times what a second difference may be in sigma. slack: share of the inverse depth that it may be on top.
     """
-    looked, saying, compared, even = np.int64(0), np.int64(0), np.int64(0), np.int64(0)
+    looked, informative, compared, even = np.int64(0), np.int64(0), np.int64(0), np.int64(0)
     for v in range(0, depth_m.shape[0], step):
         row = depth_m[v]
         looked += row.size
         for u in range(row.size):
-            saying += row[u] > ZERO
+            informative += row[u] > ZERO
         for u in range(1, row.size - 1):
             a, b, c = row[u - 1], row[u], row[u + 1]
             both = (a > ZERO) & (b > ZERO) & (c > ZERO) & (a < FAR) & (b < FAR) & (c < FAR)
@@ -226,76 +298,4 @@ def count(depth_m, step, noise, slack, counts):
             allowed = (noise[0] * middle + noise[1] + slack) * middle + noise[2]
             compared += both
             even += both & (bend <= allowed)
-    counts[0], counts[1], counts[2], counts[3] = looked, saying, compared, even
-
-
-@kernel
-def classify(raw, scale, min_range, max_range, none, infinite, depth_m, reason):
-    """Fill `depth_m` (float32, REP 117) and `reason` (uint8) from flat `raw`; return the number of valid pixels.
-
-    none: a raw value that means "no value" beside zero, negative ones and NaN (65535 in uint16 images). -inf is too
-    near. infinite: what +inf means: itself (too far), or NaN (nobody knows).
-    """
-    valid = np.int64(0)
-    for start in range(0, raw.size, CHUNK):
-        part = slice(start, start + CHUNK)
-        _metres(raw[part], scale, min_range, max_range, none, infinite, depth_m[part])
-        valid += _reasons(depth_m[part], reason[part])
-    return valid
-
-
-@kernel
-def take_given(given, far, depth_m, reason):
-    """Let the source's own reasons, where it has any, come first; return the number of valid pixels.
-
-    far: what a given TOO_FAR becomes: itself or UNKNOWN. A depth within the range, or one too near, contradicts it.
-    """
-    valid = np.int64(0)
-    for start in range(0, given.size, CHUNK):
-        part = slice(start, start + CHUNK)
-        valid += _take(given[part], far, depth_m[part], reason[part])
-    return valid
-
-
-@cell
-def _metres(raw, scale, min_range, max_range, none, infinite, depth_m):
-    for i in range(raw.size):  # single selects, no nested ones: those become branches and stop vectorisation
-        value = np.float32(raw[i])
-        d = value * scale
-        d = NAN if (value == none) | ((d <= ZERO) & (d > NEAR)) else d
-        d = infinite if d == FAR else d
-        d = NEAR if d < min_range else d
-        d = FAR if d > max_range else d
-        depth_m[i] = d
-
-
-@cell
-def _reasons(depth_m, reason):
-    valid = np.int32(0)
-    for i in range(depth_m.size):
-        d = depth_m[i]
-        why = np.int32(VALID) if d == d else np.int32(UNKNOWN)
-        why = np.int32(TOO_NEAR) if d == NEAR else why
-        why = np.int32(TOO_FAR) if d == FAR else why
-        reason[i] = np.uint8(why)
-        valid = np.int32(valid + (np.int32(1) if why == 0 else np.int32(0)))
-    return valid
-
-
-@cell
-def _take(given, far, depth_m, reason):
-    for i in range(given.size):
-        said, own = given[i], reason[i]
-        why = said if said != VALID else own
-        why = far if said == TOO_FAR else why
-        why = UNKNOWN if (said == TOO_FAR) & (own == VALID) else why
-        reason[i] = TOO_NEAR if (said == TOO_FAR) & (own == TOO_NEAR) else why
-    valid = np.int32(0)
-    for i in range(given.size):
-        why, d = reason[i], depth_m[i]
-        d = NAN if (why == UNMATCHED) | (why == MASKED) | (why == UNKNOWN) else d
-        d = NEAR if why == TOO_NEAR else d
-        d = FAR if why == TOO_FAR else d
-        depth_m[i] = d
-        valid = np.int32(valid + (np.int32(1) if why == VALID else np.int32(0)))
-    return valid
+    counts[0], counts[1], counts[2], counts[3] = looked, informative, compared, even

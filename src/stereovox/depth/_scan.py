@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernel that gathers the pixels of a depth image in the beams of a scan."""
+"""Kernel that gathers the pixels of a depth image into the beams of a scan."""
 
 import numpy as np
 
@@ -21,7 +21,7 @@ def gather(depth_m, reason, columns, rows, edge_columns, edge_rows, turn, band, 
     height, width = depth_m.shape
     before, after, hits, starts, ends = scratch[0], scratch[1], scratch[2], scratch[3], scratch[4]
     firsts, lasts = scratch[5, :width].view(np.int32), scratch[6, :width].view(np.int32)
-    slopes, ways = scratch[7], scratch[8]
+    slopes, blinds = scratch[7], scratch[8]
     above = band.camera > band.high  # the steepest rays meet the band first, and they are in the lowest rows
     within = (band.camera >= band.low) & (band.camera <= band.high)
     _places(edge_columns, edge_rows[height if above else 0], turn, fan, before)
@@ -29,8 +29,8 @@ def gather(depth_m, reason, columns, rows, edge_columns, edge_rows, turn, band, 
         v = height - 1 - i if above else i
         _places(edge_columns, edge_rows[v if above else v + 1], turn, fan, after)
         _cover(before, after, fan, firsts, lasts)
-        _rays(depth_m[v], reason[v], columns, rows[v], turn, band, hits, starts, ends, slopes, ways)
-        _reach(firsts, lasts, slopes, ways, beams)
+        _rays(depth_m[v], reason[v], columns, rows[v], turn, band, hits, starts, ends, slopes, blinds)
+        _reach(firsts, lasts, slopes, blinds, beams)
         if within:
             _add(firsts, lasts, hits, ends, beams)
         else:
@@ -40,7 +40,7 @@ def gather(depth_m, reason, columns, rows, edge_columns, edge_rows, turn, band, 
 
 @cell
 def _places(columns, row, turn, fan, places):
-    """Fill where in the fan the rays of one row point."""
+    """Fill the places in the fan of the rays of one row."""
     down, ahead = row[0], row[1]
     f0, l0 = turn[0, 1] * down + turn[0, 2] * ahead, turn[1, 1] * down + turn[1, 2] * ahead
     for u in range(columns.size):
@@ -63,52 +63,52 @@ def _cover(before, after, fan, firsts, lasts):
 
 
 @cell
-def _rays(depth, reason, columns, row, turn, band, hits, starts, ends, slopes, ways):
-    """Fill what each ray of a row says, in metres along the floor: its hit, from where to where in the band it is free.
+def _rays(depth, reason, columns, row, turn, band, hits, starts, ends, slopes, blinds):
+    """Fill the hit of each ray of a row and the start and end of its free part in the band, in metres along the floor.
 
-    And where it goes: how much it rises a metre along the floor, and up to where nothing is measured on it.
+    Also its slope (rise per metre along the floor), and the distance up to which nothing is measured on it.
 
-    The hit is -inf where something too near may be in the band, inf where there is none. The floor right before the
-    camera is too near as well, and no obstacle: rays that would meet it there say nothing. A ray that says nothing, is
-    too steep or looks back is free up to 0.
+    The hit is -inf where something too near may be in the band, inf where there is none. The floor right in front
+    of the camera is too near as well, but no obstacle: rays that would meet it there are ignored. An ignored ray, one
+    that is too steep and one that looks back are free up to 0.
     """
     down, ahead = row[0], row[1]
     f0, l0 = turn[0, 1] * down + turn[0, 2] * ahead, turn[1, 1] * down + turn[1, 2] * ahead
     z0 = turn[2, 1] * down + turn[2, 2] * ahead
     for u in range(columns.size):
         forward, left, z = turn[0, 0] * columns[u] + f0, turn[1, 0] * columns[u] + l0, turn[2, 0] * columns[u] + z0
-        way = np.sqrt(forward * forward + left * left)
-        counts = (forward > ZERO) & (abs(z) < band.steepest * way)
+        floor_m = np.sqrt(forward * forward + left * left)
+        counts = (forward > ZERO) & (abs(z) < band.steepest * floor_m)
         rise = z if abs(z) > TINY else TINY
         a, b = (band.low - band.camera) / rise, (band.high - band.camera) / rise
         enter, leave = max(min(a, b), ZERO), max(a, b)
         why = reason[u]
         seen = depth[u] if why == VALID else (band.far if why == TOO_FAR else ZERO)
         level = band.camera + seen * z
-        inside = (why == VALID) & (level >= band.low) & (level <= band.high) & (seen * way <= band.range_max)
+        inside = (why == VALID) & (level >= band.low) & (level <= band.high) & (seen * floor_m <= band.range_max)
         floor = (why == TOO_NEAR) & (band.camera < -z * band.floor)
         near = (why == TOO_NEAR) & (enter <= leave) & (enter < band.near) & (not floor)
-        hit = seen * way if inside & counts else INF
+        hit = seen * floor_m if inside & counts else INF
         hits[u] = -INF if near & counts else hit
-        starts[u] = enter * way
-        ends[u] = min(min(seen, leave) * way, band.range_max) if counts else ZERO
-        slopes[u] = z / way if counts else INF
+        starts[u] = enter * floor_m
+        ends[u] = min(min(seen, leave) * floor_m, band.range_max) if counts else ZERO
+        slopes[u] = z / floor_m if counts else INF
         unmeasured = max(band.near, band.camera / max(-z, TINY) if floor else ZERO)
-        ways[u] = unmeasured * way if counts else ZERO
+        blinds[u] = unmeasured * floor_m if counts else ZERO
 
 
 @cell
-def _reach(firsts, lasts, slopes, ways, beams):
-    """Take in where the rays of a row go, whatever they met."""
+def _reach(firsts, lasts, slopes, blinds, beams):
+    """Add the directions of the rays of a row, whatever they met."""
     for u in range(firsts.size):
         for b in range(firsts[u], lasts[u] + 1):
             beams.lowest[b] = min(beams.lowest[b], slopes[u])
-            beams.unmeasured[b] = max(beams.unmeasured[b], ways[u])
+            beams.unmeasured[b] = max(beams.unmeasured[b], blinds[u])
 
 
 @cell
 def _add(firsts, lasts, hits, ends, beams):
-    """Take in the rays of a row that are in the band from the camera on."""
+    """Add the rays of a row that are in the band from the camera on."""
     for u in range(firsts.size):
         b = firsts[u]
         beams.hit[b] = min(beams.hit[b], hits[u])
@@ -120,7 +120,7 @@ def _add(firsts, lasts, hits, ends, beams):
 
 @cell
 def _join(firsts, lasts, hits, starts, ends, beams):
-    """Take in the rays of a row that enter the band somewhere; what lies in a gap between two rays nobody has seen."""
+    """Add the rays of a row that enter the band farther on; a gap between two rays is unseen."""
     for u in range(firsts.size):
         for b in range(firsts[u], lasts[u] + 1):
             beams.hit[b] = min(beams.hit[b], hits[u])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""All that happens between a frame and its depth image: match, check, clean, and gather on the sphere."""
+"""The depth pipeline, from frame to depth image: match, check, clean, gather on the spherical grid."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ from stereovox.depth.quality import check_depth, check_light
 from stereovox.depth.sphere.image import through_sphere
 from stereovox.depth.stereo.pipeline import StereoDepth
 from stereovox.frame import AnyFrame, DepthImage, Frame, StereoFrame
-from stereovox.trust.validate import check_form
+from stereovox.trust.validate import validate_fields
 
 
-class DepthPath:
-    """Makes depth images of frames as `config` says."""
+class DepthPipeline:
+    """Turns frames into depth images, as configured."""
 
     def __init__(self, config: Config):
         self._config = config
 
     def matched(self, frame: AnyFrame) -> Frame:
-        """Return a stereo frame as one with depth, any other as it is.
+        """Return a stereo frame with its depth, any other frame unchanged.
 
-        Raises FrameRefused as `StereoDepth` and `check_light`, and `bad_form` for what is no frame at all.
+        Raises FrameRefused as `StereoDepth` and `check_light`, and `bad_form` for anything but a frame.
         """
         if isinstance(frame, Frame):
-            return frame  # `prepare` looks at its form
-        check_form(frame, StereoFrame, Frame)
+            return frame  # `prepare` validates its fields
+        validate_fields(frame, StereoFrame, Frame)
         check_light(frame, self._config.trust.max_unexposed_share)
         return self._stereo(frame)
 
@@ -39,5 +39,5 @@ class DepthPath:
 
     @cached_property
     def _stereo(self) -> StereoDepth:
-        """Made with the first stereo frame: other recordings need no OpenCV."""
+        """Made for the first stereo frame: other recordings need no OpenCV."""
         return StereoDepth(self._config.stereo)

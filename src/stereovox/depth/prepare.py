@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Check a frame, convert its depth to metres, give every pixel without a value its reason."""
+"""Prepare a depth image: check the frame, convert to metres, give each pixel without a value its reason, denoise.
+
+Also the steps by themselves: depth correction, denoising, block minima, a shorter range.
+"""
 
 from __future__ import annotations
 
@@ -16,56 +19,54 @@ from stereovox.depth.quality import SPARSE, check_unit
 from stereovox.errors import ConfigError, FrameRefused, StereovoxError
 from stereovox.frame import DepthImage, Frame, Reason, name_of
 from stereovox.sensors.noise import RangeNoise
-from stereovox.trust.validate import check_form, for_kernels, rigid_pose
+from stereovox.trust.validate import for_kernels, rigid_pose, validate_fields
+
+DTYPES = (np.dtype(np.uint16), np.dtype(np.float32), np.dtype(np.float64))
+SATURATED = 65535
+"""Value that many cameras write into uint16 images for "no value"."""
+NO_REASONS = for_kernels(np.empty(0, np.uint8))
+"""Stand-in for frames without reasons, so that the kernel is compiled before the first frame with some."""
+SMALLEST = 1e-30
+"""Smallest metres per unit of a depth image that float32 can multiply with."""
+MAX_REASON = max(Reason)
+FINE = 0.15
+"""Noise below this share of a cell does not thicken a surface noticeably."""
+WORTH = 0.5
+"""Where no noise exceeds this share of a cell, raw depth maps as well; in the demo at 0.2 m even slightly better."""
+STEPS = np.array([1, 2, 4])
+"""Distance of the neighbours in pixels, pass by pass."""
+FROM = np.array([1, 1, 3])
+"""A pixel takes part in a pass where its noise is more than this many times FINE cells."""
+WIDTHS = np.array([4.5, 4.5, 4.0], np.float32)
+"""A neighbour counts less the more it differs, and not at all beyond this many sigma."""
+LIMIT = 1.3
+"""Cap of sigma in cells: what the map can separate is not mixed, however noisy the camera."""
 
 
-def shortened(image: DepthImage, valid_to: float, far_from: float) -> DepthImage:
-    """Return the image with depths up to `valid_to` metres; what is farther than `far_from` is TOO_FAR.
+def prepare(frame: Frame, config: Config) -> DepthImage:
+    """Return the frame's depth image in metres, corrected where its camera has a `correction`.
 
-    What lies between the two is UNMATCHED: near enough for its noise to matter, so nothing may be cleared through it.
+    A pixel is UNKNOWN where the value is zero, negative, NaN, +inf or a saturated uint16; TOO_NEAR and TOO_FAR outside
+    [min_range, max_range], TOO_NEAR also where it is -inf. The source's own reason, where it has one, comes first; but
+    its TOO_FAR only where neither a depth at the pixel nor the frame's `farthest` contradicts it. `depth.far` sets
+    which sources of "too far" count.
+    Raises FrameRefused with the reason: the source's `fault`, `bad_form` and others of `validate_fields`, `bad_dtype`,
+    `bad_shape`, `bad_scale`, `bad_units`, `bad_reason`, `no_pose`, `pose_not_finite`, `pose_not_rigid`,
+    `no_valid_depth`.
     """
-    depth_m, reason = np.empty_like(image.depth_m), np.empty_like(image.reason)
-    given, made = (image.depth_m, image.reason), (depth_m, reason)
-    limits = np.float32(valid_to), np.float32(far_from)
-    _images.shorten(*(array.reshape(-1) for array in given), *limits, *(array.reshape(-1) for array in made))
-    return DepthImage(depth_m, reason, image.camera, image.T_world_sensor, image.stamp_ns)
-
-
-def downsample(image: DepthImage, n: int) -> DepthImage:
-    """Return the image of block minima and its camera; n = 1 returns the image itself.
-
-    A block without any valid pixel is TOO_NEAR where one of its pixels is, TOO_FAR only where all of them are, else
-    MASKED where one is, else UNMATCHED where one is, else UNKNOWN. Blocks at the right and lower border may be cut.
-    Raises ConfigError for a wide camera, FrameRefused `bad_camera` where larger pixels are no pinhole's any more.
-    """
-    if n == 1:
-        return image
-    if not isinstance(image.camera, PinholeCamera):
-        raise ConfigError(f"depth.downsample {n}: a wide camera's image cannot be downsampled; use sphere.step_deg")
-    try:
-        camera = image.camera.binned(n)
-    except StereovoxError as error:
-        raise FrameRefused("bad_camera", f"blocks of {n} by {n} pixels: {error}") from None
-    depth_m = np.empty((camera.height, camera.width), np.float32)
-    reason = np.empty(depth_m.shape, np.uint8)
-    _images.block_minimum(image.depth_m, image.reason, n, np.empty(image.camera.width, np.float32), depth_m, reason)
-    return DepthImage(depth_m, reason, camera, image.T_world_sensor, image.stamp_ns)
-
-
-def corrected(
-    raw: NDArray[np.generic], scale: np.float32, none: np.float32, infinite: np.float32, camera: PinholeCamera
-) -> NDArray[np.float32]:
-    """Return the corrected depth (height * width,) in metres, float32, of a flat raw image; NaN: no value.
-
-    scale: metres per unit; none, infinite: as in `_cpu.classify`; infinities stay what they are. A pixel whose
-    correction leads to no positive depth has no value either: this clears nothing.
-    """
-    depth_m = np.empty(raw.size, np.float32)
-    _images.classify(
-        raw, scale, np.float32(0), np.float32(np.inf), none, infinite, depth_m, np.empty(raw.size, np.uint8)
-    )
-    correct(depth_m.reshape(camera.height, camera.width), camera)
-    return depth_m
+    _check_image(frame)
+    T_world_sensor = rigid_pose(frame, config.pose_rigidity_tolerance)
+    depth_m = np.empty(frame.depth.shape, np.float32)
+    reason = np.empty(frame.depth.shape, np.uint8)
+    usable = _classify(frame, config, depth_m, reason)
+    if usable < SPARSE * depth_m.size:
+        check_unit(frame, _sample_depths(frame), config)
+    if not usable and not (reason == Reason.TOO_FAR).any():
+        cure = "check its depth correction" if getattr(frame.camera, "correction", None) else "is the lens covered?"
+        raise FrameRefused("no_valid_depth", f"{name_of(frame)}: not one pixel has a valid depth; {cure}")
+    denoise(depth_m, frame.camera, config)
+    image = DepthImage(depth_m, reason, frame.camera, T_world_sensor, int(frame.stamp_ns))
+    return downsample(image, config.depth.downsample)
 
 
 def correct(depth_m: NDArray[np.float32], camera: PinholeCamera) -> None:
@@ -88,40 +89,26 @@ def quadratics(correction: DepthCorrection) -> tuple[NDArray[np.float64], NDArra
     return (numbers, nothing) if correction.model == "scale" else (nothing, numbers)
 
 
-FINE = 0.15
-"""Noise of this share of a cell does not thicken a surface noticeably."""
-WORTH = 0.5
-"""Where no noise exceeds this share of a cell, raw depth maps as well: in the demo at 0.2 m even a little better."""
-STEPS = np.array([1, 2, 4])
-"""How many pixels away the neighbours are, pass by pass."""
-FROM = np.array([1, 1, 3])
-"""In which pass a pixel takes part: where its noise is more than so many times FINE cells."""
-WIDTHS = np.array([4.5, 4.5, 4.0], np.float32)
-"""A neighbour counts less the more it differs, and not at all from so many sigma on."""
-LIMIT = 1.3
-"""Sigma counts for no more than so many cells: what the map can tell apart is not mixed, however noisy the camera."""
-
-
 def denoise(depth_m: NDArray[np.float32], camera: VirtualCamera, config: Config) -> None:
-    """Average each depth with its like neighbours, in place.
+    """Average each depth with similar neighbours, in place.
 
     depth_m: (height, width) float32 metres with REP 117's special values, contiguous. Pixels without value stay as they
-    are and count nowhere; values stay within min_range and max_range.
+    are and do not count; values stay within min_range and max_range.
 
     A sigma filter (Lee 1983) whose weights (1 - (difference / (k sigma))^2)^4 fall smoothly, in passes with holes
     ("a trous", Dammertz 2010): with the next neighbours to the left and right, above and below, then with those 2
-    pixels away, then 4. So few neighbours go far, and the noise of stereo, which is alike over about its matching
-    window, is taken out as well. It works on inverse depth, in which stereo noise is the same everywhere and a plane is
-    linear, so a mean over symmetric neighbours is true to it. sigma is the noise model's: the configured one, or the
-    camera's. A pixel asks for no more passes than it takes: it is left alone where sigma(depth) is at most FINE cells,
-    and by the last pass up to three times that. So what is near keeps every detail. Nothing is done where even the
-    farthest noise is less than WORTH cells.
+    pixels away, then 4. So few neighbours reach far, and stereo noise, which is correlated over about the matching
+    window, is removed as well. It works on inverse depth, in which stereo noise is the same everywhere and a plane is
+    linear, so a mean over symmetric neighbours is true to it. sigma is that of the noise model, configured or from
+    the camera. A pixel takes part in no more passes than it needs: it is left unchanged where sigma(depth) is at most
+    FINE cells, and by the last pass up to three times that. So near surfaces keep every detail. Nothing is done where
+    even the noise at the maximum range is less than WORTH cells.
 
-    Row and column together keep what is thin: a pole finds its like along the column while its row shows the wall
-    behind, and a wire the other way round; in later passes what noise is left no longer hides the step. Were the row
-    averaged alone first, a pole two sigma before its wall would be gone.
+    Averaging row and column together keeps thin objects: a pole has similar neighbours along the column while its row
+    shows the wall behind, and a wire the other way round; in later passes the remaining noise no longer hides the step.
+    Averaging rows first would remove a pole two sigma in front of its wall.
 
-    What it cannot do: a step of less than about two sigma is smoothed over some pixels.
+    Limitation: a step of less than about two sigma is smoothed over some pixels.
     """
     if not config.depth.denoise:
         return
@@ -130,79 +117,41 @@ def denoise(depth_m: NDArray[np.float32], camera: VirtualCamera, config: Config)
         _run(depth_m, noise, FINE * config.voxel_size, config)
 
 
-def _run(depth_m: NDArray[np.float32], noise: RangeNoise, fine: float, config: Config) -> None:
-    margin = int(STEPS.max())
-    rings = np.empty((len(STEPS) + 1, 2 * margin + 1, depth_m.shape[1] + 2 * margin), np.float32)
-    coefficients, least = np.array([noise.s0, noise.s1, noise.s2], np.float32), (fine * FROM).astype(np.float32)
-    low, high, limit = (np.float32(x) for x in (config.min_range, config.max_range, LIMIT * config.voxel_size))
-    _images.denoise(depth_m, coefficients, STEPS, least, WIDTHS, limit, low, high, rings)
+def downsample(image: DepthImage, n: int) -> DepthImage:
+    """Return the image of block minima and its camera; n = 1 returns the image itself.
 
-
-DTYPES = (np.dtype(np.uint16), np.dtype(np.float32), np.dtype(np.float64))
-SATURATED = 65535
-"""What many cameras write into uint16 images for "no value"."""
-NO_REASONS = for_kernels(np.empty(0, np.uint8))
-"""What is taken where a frame gives none: so the kernel is there when the first one does."""
-SMALLEST = 1e-30
-"""Metres per unit of a depth image that float32 can still multiply with."""
-MOST = max(Reason)
-
-
-def prepare(frame: Frame, config: Config) -> DepthImage:
-    """Return the frame's depth image in metres, corrected where its camera has a `correction`.
-
-    A pixel is UNKNOWN where the value is zero, negative, NaN, +inf or a saturated uint16; TOO_NEAR and TOO_FAR outside
-    [min_range, max_range], TOO_NEAR also where it is -inf. The source's own reason, where it has one, comes first; but
-    its TOO_FAR only where nothing contradicts it: a depth beside it, or the frame's `farthest`. `depth.far` says whose
-    word is taken for too far.
-    Raises FrameRefused with the reason: the source's `fault`, `bad_form` and others of `check_form`, `bad_dtype`,
-    `bad_shape`, `bad_scale`, `bad_units`, `bad_reason`, `no_pose`, `pose_not_finite`, `pose_not_rigid`,
-    `no_valid_depth`.
+    A block without any valid pixel is TOO_NEAR where one of its pixels is, TOO_FAR only where all of them are, else
+    MASKED where one is, else UNMATCHED where one is, else UNKNOWN. Blocks at the right and lower border may be cut.
+    Raises ConfigError for a wide camera, FrameRefused `bad_camera` where larger pixels make no valid pinhole camera.
     """
-    _check_image(frame)
-    T_world_sensor = rigid_pose(frame, config.pose_rigidity_tolerance)
-    depth_m = np.empty(frame.depth.shape, np.float32)
-    reason = np.empty(frame.depth.shape, np.uint8)
-    usable = _classify(frame, config, depth_m, reason)
-    if usable < SPARSE * depth_m.size:
-        check_unit(frame, _said(frame), config)
-    if not usable and not (reason == Reason.TOO_FAR).any():
-        cure = "check its depth correction" if getattr(frame.camera, "correction", None) else "is the lens covered?"
-        raise FrameRefused("no_valid_depth", f"{name_of(frame)}: not one pixel has a valid depth; {cure}")
-    denoise(depth_m, frame.camera, config)
-    image = DepthImage(depth_m, reason, frame.camera, T_world_sensor, int(frame.stamp_ns))
-    return downsample(image, config.depth.downsample)
+    if n == 1:
+        return image
+    if not isinstance(image.camera, PinholeCamera):
+        raise ConfigError(f"depth.downsample {n}: a wide camera's image cannot be downsampled; use sphere.step_deg")
+    try:
+        camera = image.camera.binned(n)
+    except StereovoxError as error:
+        raise FrameRefused("bad_camera", f"blocks of {n} by {n} pixels: {error}") from None
+    depth_m = np.empty((camera.height, camera.width), np.float32)
+    reason = np.empty(depth_m.shape, np.uint8)
+    _images.block_minimum(image.depth_m, image.reason, n, np.empty(image.camera.width, np.float32), depth_m, reason)
+    return DepthImage(depth_m, reason, camera, image.T_world_sensor, image.stamp_ns)
 
 
-def _classify(frame: Frame, config: Config, depth_m: NDArray, reason: NDArray) -> int:
-    raw, scale = for_kernels(frame.depth).reshape(-1), np.float32(frame.depth_scale)
-    none = np.float32(SATURATED if raw.dtype == np.uint16 else 0)
-    camera = frame.camera
-    infinite = np.float32(np.inf if config.depth.far == "infinite" else np.nan)
-    if isinstance(camera, PinholeCamera) and camera.correction:  # before the limits, which hold for true depths
-        raw, scale, none = corrected(raw, scale, none, infinite, camera), np.float32(1), np.float32(0)
-    limits = (np.float32(config.min_range), np.float32(config.max_range))
-    into = depth_m.reshape(-1), reason.reshape(-1)
-    usable = _images.classify(raw, scale, *limits, none, infinite, *into)
-    told = config.depth.far != "measured" and float(frame.farthest) >= config.max_range
-    far = np.uint8(Reason.TOO_FAR if told else Reason.UNKNOWN)
-    given = NO_REASONS if frame.reason is None else for_kernels(frame.reason).reshape(-1)
-    taken = _images.take_given(given, far, *into)
-    return usable if frame.reason is None else taken
+def shortened(image: DepthImage, valid_to: float, far_from: float) -> DepthImage:
+    """Return the image with depths up to `valid_to` metres; farther than `far_from` is TOO_FAR.
 
-
-def _said(frame: Frame) -> NDArray[np.float64]:
-    """Return some of a frame's depths (N,) in metres, but those that its source says are none."""
-    rows, columns = (slice(n // 128, None, max(1, n // 64)) for n in frame.depth.shape)
-    raw = np.asarray(frame.depth)[rows, columns]
-    none = raw == SATURATED if raw.dtype == np.uint16 else np.zeros(raw.shape, bool)
-    if frame.reason is not None:
-        none |= np.asarray(frame.reason)[rows, columns] != Reason.VALID
-    return raw[~none].astype(float) * float(frame.depth_scale)
+    Between the two a pixel is UNMATCHED: its noise could have put it there, so nothing may be cleared along it.
+    """
+    depth_m, reason = np.empty_like(image.depth_m), np.empty_like(image.reason)
+    given, made = (image.depth_m, image.reason), (depth_m, reason)
+    limits = np.float32(valid_to), np.float32(far_from)
+    _images.shorten(*(array.reshape(-1) for array in given), *limits, *(array.reshape(-1) for array in made))
+    return DepthImage(depth_m, reason, image.camera, image.T_world_sensor, image.stamp_ns)
 
 
 def _check_image(frame: Frame) -> None:
-    check_form(frame, Frame)
+    validate_fields(frame, Frame)
     name, depth, camera = name_of(frame), frame.depth, frame.camera
     if not isinstance(depth, np.ndarray) or depth.dtype not in DTYPES:
         kind = getattr(depth, "dtype", type(depth).__name__)
@@ -216,8 +165,59 @@ def _check_image(frame: Frame) -> None:
     if not SMALLEST < float(frame.depth_scale) < 1 / SMALLEST:  # NaN as well
         raise FrameRefused("bad_scale", f"{name}: depth_scale {frame.depth_scale} must be positive and finite")
     if frame.reason is not None and not _are_reasons(frame.reason, depth.shape):
-        raise FrameRefused("bad_reason", f"{name}: reason must be {depth.shape} uint8 of values 0 to {MOST}")
+        raise FrameRefused("bad_reason", f"{name}: reason must be {depth.shape} uint8 of values 0 to {MAX_REASON}")
 
 
 def _are_reasons(given: NDArray, shape: tuple[int, ...]) -> bool:
-    return given.dtype == np.uint8 and given.shape == shape and np.max(given.view(np.ndarray), initial=0) <= MOST
+    return given.dtype == np.uint8 and given.shape == shape and np.max(given.view(np.ndarray), initial=0) <= MAX_REASON
+
+
+def _classify(frame: Frame, config: Config, depth_m: NDArray, reason: NDArray) -> int:
+    raw, scale = for_kernels(frame.depth).reshape(-1), np.float32(frame.depth_scale)
+    none = np.float32(SATURATED if raw.dtype == np.uint16 else 0)
+    camera = frame.camera
+    infinite = np.float32(np.inf if config.depth.far == "infinite" else np.nan)
+    if isinstance(camera, PinholeCamera) and camera.correction:  # before the limits, which hold for true depths
+        raw, scale, none = corrected(raw, scale, none, infinite, camera), np.float32(1), np.float32(0)
+    limits = (np.float32(config.min_range), np.float32(config.max_range))
+    into = depth_m.reshape(-1), reason.reshape(-1)
+    usable = _images.classify(raw, scale, *limits, none, infinite, *into)
+    counts = config.depth.far != "measured" and float(frame.farthest) >= config.max_range
+    far = np.uint8(Reason.TOO_FAR if counts else Reason.UNKNOWN)
+    given = NO_REASONS if frame.reason is None else for_kernels(frame.reason).reshape(-1)
+    taken = _images.take_given(given, far, *into)
+    return usable if frame.reason is None else taken
+
+
+def corrected(
+    raw: NDArray[np.generic], scale: np.float32, none: np.float32, infinite: np.float32, camera: PinholeCamera
+) -> NDArray[np.float32]:
+    """Return the corrected depth (height * width,) in metres, float32, of a flat raw image; NaN: no value.
+
+    scale: metres per unit; none, infinite: as in `_images.classify`; infinities stay. A pixel whose corrected
+    depth is not positive has no value, which clears nothing.
+    """
+    depth_m = np.empty(raw.size, np.float32)
+    _images.classify(
+        raw, scale, np.float32(0), np.float32(np.inf), none, infinite, depth_m, np.empty(raw.size, np.uint8)
+    )
+    correct(depth_m.reshape(camera.height, camera.width), camera)
+    return depth_m
+
+
+def _sample_depths(frame: Frame) -> NDArray[np.float64]:
+    """Return a sample of a frame's depths (N,) in metres, without those that its source marks as no value."""
+    rows, columns = (slice(n // 128, None, max(1, n // 64)) for n in frame.depth.shape)
+    raw = np.asarray(frame.depth)[rows, columns]
+    none = raw == SATURATED if raw.dtype == np.uint16 else np.zeros(raw.shape, bool)
+    if frame.reason is not None:
+        none |= np.asarray(frame.reason)[rows, columns] != Reason.VALID
+    return raw[~none].astype(float) * float(frame.depth_scale)
+
+
+def _run(depth_m: NDArray[np.float32], noise: RangeNoise, fine: float, config: Config) -> None:
+    margin = int(STEPS.max())
+    rings = np.empty((len(STEPS) + 1, 2 * margin + 1, depth_m.shape[1] + 2 * margin), np.float32)
+    coefficients, least = np.array([noise.s0, noise.s1, noise.s2], np.float32), (fine * FROM).astype(np.float32)
+    low, high, limit = (np.float32(x) for x in (config.min_range, config.max_range, LIMIT * config.voxel_size))
+    _images.denoise(depth_m, coefficients, STEPS, least, WIDTHS, limit, low, high, rings)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A depth image as a scan: what a 2-D lidar would see in the camera's place (IST 2019, III-C)."""
+"""Reduce a depth image to the scan that a 2-D lidar would take in the camera's place (IST 2019, III-C)."""
 
 from __future__ import annotations
 
@@ -18,13 +18,63 @@ from stereovox.frame import DepthImage, Reason, Scan
 from stereovox.se2 import lifted
 
 STEEPEST_DEG = 80.0
-"""Rays steeper than this have no direction on the floor to speak of: they say nothing."""
+"""Steeper rays have no usable direction on the floor and are ignored."""
+STEEPEST = np.tan(np.radians(STEEPEST_DEG))
 FINEST_STEP = float(np.radians(0.01))
-"""Narrowest beam in radians, for cameras that would have narrower ones."""
+"""Narrowest beam in radians."""
+FLOOR_NOISE = 1.25
+"""Factor on the smallest measured depth within which TOO_NEAR may be the floor."""
+SPARSE = 4
+"""Step between the rows and columns that are searched for that depth."""
+WHOLE = 1e-3
+"""A beam that is free up to `range_max` except this share of it is free up to it: rays are not exactly level."""
+
+
+def scan_of(image: DepthImage, config: Config) -> Scan:
+    """Return the scan of a depth image; the world's z is the height above the floor.
+
+    The scan's sensor stands in the camera, upright, with its x axis where the camera looks; ranges are metres along
+    the floor. The mount on the robot is not known here: `T_base_sensor` is the identity. `scan.method` `rows` takes
+    the nearest of a few rows round the one that looks level (the job of depthimage_to_laserscan), `cloud` the nearest
+    of all points within `scan.heights` (pointcloud_to_laserscan). A pixel belongs to each beam whose middle it covers,
+    or else to the one in which its own middle is. Any camera will do; rays that look back or are steeper than 80
+    degrees say nothing.
+
+    A beam is -inf, and free nowhere, where something is too near that may be within the heights; else it has the range
+    of its nearest point; else +inf where it is free all the way to `max_range`, else NaN. `clear` says how far: up to
+    where some ray of the beam was seen to be free *within the heights*. Where all its rays end or leave the heights,
+    so does the knowledge. One ray is enough, as with a lidar: what stands lower than all rays of its beam goes unseen,
+    and is taken for free. Points farther than `max_range` along the floor are none: their rays are free up to there.
+
+    Raises FrameRefused: `camera_tilted` where no row looks level (method `rows`), `camera_vertical` where the camera
+    looks straight up or down, `heights_not_seen` where no ray meets the heights; ConfigError where z is not up.
+    """
+    if config.up.removeprefix("+") != "z":
+        raise ConfigError(f"up {config.up}: scans need a world whose z axis points up; turn the poses, and set up=z")
+    turn, yaw = levelled(image)
+    rays, rows, heights = rays_of(image.camera), slice(0, image.camera.height), config.scan.heights
+    if config.scan.method == "rows":
+        rows = level_rows(image, rays, turn, config.scan.rows, config.scan.off_level_deg)
+        rays, heights = rays.of_rows(rows), (-np.inf, np.inf)
+    check_heights(image, rays, turn, heights, config.max_range)
+    step = config.scan.angle_step_deg
+    where, flattest = directions(rays, turn, pixel_angle(image.camera) if step is None else np.radians(step))
+    camera, depths = image.T_world_sensor[2, 3], (config.min_range, config.max_range)
+    floor = FLOOR_NOISE * max(config.min_range, nearest(image)) if heights[0] > 0 else 0.0
+    band = Band(*np.array([*heights, camera, *depths, config.max_range, STEEPEST, floor], np.float32))
+    beams = _gathered(image.depth_m[rows], image.reason[rows], rays, turn, band, where)
+    closest = blind(beams, band) if config.scan.method == "cloud" else np.zeros(1, np.float32)
+    ranges, clear, clear_from = _to_ranges(beams, config.max_range, closest)
+    T = lifted([*image.T_world_sensor[:2, 3], yaw])
+    T[2, 3] = image.T_world_sensor[2, 3]
+    return Scan(
+        ranges, where.first, where.step, config.min_range * flattest, config.max_range, T,
+        clear=clear, clear_from=clear_from, stamp_ns=image.stamp_ns,
+    )  # fmt: skip
 
 
 class Directions(NamedTuple):
-    """Where the beams of a scan point: the first, the step between two (radians), and how many there are."""
+    """Directions of the beams of a scan: the first, the step between two (radians), and their number."""
 
     first: float
     step: float
@@ -53,6 +103,37 @@ class Rays:
         return np.concatenate([*sides, *ends], axis=1)
 
 
+class Band(NamedTuple):
+    """Heights and ranges that count, in metres; near and far are depths, range_max a distance along the floor."""
+
+    low: np.float32
+    high: np.float32
+    camera: np.float32
+    near: np.float32
+    far: np.float32
+    range_max: np.float32
+    steepest: np.float32  # rise per metre along the floor from which a ray is ignored
+    floor: np.float32  # depth up to which TOO_NEAR may be the floor; 0 where the floor is an obstacle
+
+
+class Fan(NamedTuple):
+    """A ray `angle` radians to the left falls at angle * per_radian + offset; beam b spans b - 0.5 to b + 0.5."""
+
+    per_radian: np.float32
+    offset: np.float32
+    last: np.float32
+
+
+class Beams(NamedTuple):
+    """State of the beams, (N,) arrays as the kernel writes them, in metres along the floor."""
+
+    hit: NDArray[np.float32]  # inf: none; -inf: something is nearer than the camera can tell
+    start: NDArray[np.float32]  # free from here
+    end: NDArray[np.float32]  # up to here; 0: nowhere
+    lowest: NDArray[np.float32]  # rise of its lowest ray for a metre along the floor; inf: it has no ray
+    unmeasured: NDArray[np.float32]  # nothing is measured nearer than this
+
+
 @lru_cache(maxsize=8)
 def rays_of(camera: VirtualCamera) -> Rays:
     """Return the rays of a camera; a border's ray is halfway between two pixels'."""
@@ -61,7 +142,7 @@ def rays_of(camera: VirtualCamera) -> Rays:
 
 
 def levelled(image: DepthImage) -> tuple[NDArray[np.float64], float]:
-    """Return what turns the optical frame into forward, left, up (3, 3), and the yaw of forward in the world.
+    """Return the rotation (3, 3) from the optical frame to forward, left, up, and the yaw of forward in the world.
 
     Raises FrameRefused `camera_vertical` where the camera looks so steeply that there is no forward.
     """
@@ -98,14 +179,14 @@ def level_rows(image: DepthImage, rays: Rays, turn: NDArray[np.float64], number:
 
 
 def directions(rays: Rays, turn: NDArray[np.float64], step: float) -> tuple[Directions, float]:
-    """Return the beams of `step` radians that a view covers, and the cosine of how steep it looks at most.
+    """Return the beams of `step` radians that a view covers, and the cosine of its steepest angle.
 
     A view that looks straight down or up somewhere has beams all over the half circle ahead, and no more.
     """
     forward, left, up = rays.border(turn)
-    way = np.hypot(forward, left)
+    floor_m = np.hypot(forward, left)
     flattest = float(np.cos(np.radians(STEEPEST_DEG)))
-    flat = float((way / np.hypot(way, up)).min())
+    flat = float((floor_m / np.hypot(floor_m, up)).min())
     ends = (-np.pi / 2, np.pi / 2)
     if forward.min() > 0 and flat > flattest:
         tangent = left / forward
@@ -135,100 +216,30 @@ def pixel_angle(camera: VirtualCamera) -> float:
     return max(camera.binning / camera.focal_px, FINEST_STEP)
 
 
-def name(image: DepthImage) -> str:
-    """Return what to call an image in a message."""
-    return f"frame at {image.stamp_ns} ns"
+def blind(beams: Beams, band: Band) -> NDArray[np.float32]:
+    """Return how far each beam is blind to objects on the floor, (N,) metres along it; inf: everywhere.
 
-
-def _borders(middles: NDArray[np.float32]) -> NDArray[np.float32]:
-    if len(middles) == 1:
-        return np.repeat(middles, 2, axis=0)
-    between = (middles[1:] + middles[:-1]) * np.float32(0.5)
-    ends = middles[[0, -1]] + (middles[[0, -1]] - between[[0, -1]])
-    return np.concatenate([ends[:1], between, ends[1:]])
-
-
-STEEPEST = np.tan(np.radians(STEEPEST_DEG))
-FLOOR_NOISE = 1.25
-"""The floor may be too near up to so many times the least depth that the camera measured elsewhere."""
-SPARSE = 4
-"""Every so manieth row and column is enough to find it."""
-WHOLE = 1e-3
-"""What is free up to `range_max` but for this share of it is free up to it: rays are not exactly level."""
-
-
-class Band(NamedTuple):
-    """Which heights count and how far, in metres; near and far are depths, range_max a way along the floor."""
-
-    low: np.float32
-    high: np.float32
-    camera: np.float32
-    near: np.float32
-    far: np.float32
-    range_max: np.float32
-    steepest: np.float32  # rise over way from which on a ray says nothing
-    floor: np.float32  # depth up to which the floor may be what is too near; 0 where the floor is an obstacle
-
-
-class Fan(NamedTuple):
-    """A ray at `angle` radians to the left points to angle * per_radian + offset; beam b is there from b - 0.5 on."""
-
-    per_radian: np.float32
-    offset: np.float32
-    last: np.float32
-
-
-class Beams(NamedTuple):
-    """What is known of each beam, (N,) arrays as the kernel writes them, in metres along the floor."""
-
-    hit: NDArray[np.float32]  # inf: none; -inf: something is nearer than the camera can tell
-    start: NDArray[np.float32]  # free from here
-    end: NDArray[np.float32]  # up to here; 0: nowhere
-    lowest: NDArray[np.float32]  # rise of its lowest ray for a metre along the floor; inf: it has no ray
-    unmeasured: NDArray[np.float32]  # so near nothing is measured
-
-
-def scan_of(image: DepthImage, config: Config) -> Scan:
-    """Return the scan that a depth image stands for; the world's z is the height over the floor.
-
-    The scan's sensor stands in the camera, upright, with its x axis where the camera looks; ranges are metres along
-    the floor. Where it sits on the robot is not known here: `T_base_sensor` is the identity. `scan.method` `rows` takes
-    the nearest of a few rows round the one that looks level (the job of depthimage_to_laserscan), `cloud` the nearest
-    of all points within `scan.heights` (pointcloud_to_laserscan). A pixel belongs to each beam whose middle it covers,
-    or else to the one in which its own middle is. Any camera will do; rays that look back or are steeper than 80
-    degrees say nothing.
-
-    A beam is -inf, and free nowhere, where something is too near that may be within the heights; else it has the range
-    of its nearest point; else +inf where it is free all the way to `max_range`, else NaN. `clear` says how far: up to
-    where some ray of the beam was seen to be free *within the heights*. Where all its rays end or leave the heights,
-    so does the knowledge. One ray is enough, as with a lidar: what stands lower than all rays of its beam goes unseen,
-    and is taken for free. Points farther than `max_range` along the floor are none: their rays are free up to there.
-
-    Raises FrameRefused: `camera_tilted` where no row looks level (method `rows`), `camera_vertical` where the camera
-    looks straight up or down, `heights_not_seen` where no ray meets the heights; ConfigError where z is not up.
+    Up to there its lowest ray is still above the lowest height, or nothing is measured so near to the camera.
     """
-    if config.up.removeprefix("+") != "z":
-        raise ConfigError(f"up {config.up}: scans need a world whose z axis points up; turn the poses, and set up=z")
-    turn, yaw = levelled(image)
-    rays, rows, heights = rays_of(image.camera), slice(0, image.camera.height), config.scan.heights
-    if config.scan.method == "rows":
-        rows = level_rows(image, rays, turn, config.scan.rows, config.scan.off_level_deg)
-        rays, heights = rays.of_rows(rows), (-np.inf, np.inf)
-    check_heights(image, rays, turn, heights, config.max_range)
-    step = config.scan.angle_step_deg
-    where, flattest = directions(rays, turn, pixel_angle(image.camera) if step is None else np.radians(step))
-    camera, depths = image.T_world_sensor[2, 3], (config.min_range, config.max_range)
-    floor = FLOOR_NOISE * max(config.min_range, nearest(image)) if heights[0] > 0 else 0.0
-    band = Band(*np.array([*heights, camera, *depths, config.max_range, STEEPEST, floor], np.float32))
-    beams = _gathered(image.depth_m[rows], image.reason[rows], rays, turn, band, where)
-    closest = blind(beams, band) if config.scan.method == "cloud" else np.zeros(1, np.float32)
-    ranges, clear, clear_from = _told(beams, config.max_range, closest)
-    T = lifted([*image.T_world_sensor[:2, 3], yaw])
-    T[2, 3] = image.T_world_sensor[2, 3]
-    return Scan(
-        ranges, where.first, where.step, config.min_range * flattest, config.max_range, T,
-        clear=clear, clear_from=clear_from, stamp_ns=image.stamp_ns,
-    )  # fmt: skip
+    drop = max(band.camera - band.low, np.float32(0))
+    with np.errstate(divide="ignore"):
+        sunk = np.where(beams.lowest < 0, drop / -beams.lowest, np.float32(np.inf if drop else 0))
+    return np.maximum(sunk, beams.unmeasured)
+
+
+def nearest(image: DepthImage) -> float:
+    """Return about the least depth in metres in the image (its 1st percentile); 0 where it has none.
+
+    The camera's own nearest depth may be larger than `min_range`, without being reported.
+    """
+    some = (slice(None, None, SPARSE), slice(None, None, SPARSE))
+    known = image.depth_m[some][image.reason[some] == Reason.VALID]
+    return float(np.partition(known, len(known) // 100)[len(known) // 100]) if known.size else 0.0
+
+
+def name(image: DepthImage) -> str:
+    """Return the name of an image for messages."""
+    return f"frame at {image.stamp_ns} ns"
 
 
 def _gathered(
@@ -250,7 +261,7 @@ def _gathered(
     return beams
 
 
-def _told(
+def _to_ranges(
     beams: Beams, range_max: float, closest: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
     """Return the ranges of the beams (REP 117), up to where they are free, and from where on, at least `closest`."""
@@ -265,22 +276,9 @@ def _told(
     return ranges, clear, clear_from
 
 
-def blind(beams: Beams, band: Band) -> NDArray[np.float32]:
-    """Return how far each beam is blind to what may stand on the floor, (N,) metres along it; inf: all the way.
-
-    Its lowest ray comes down to the lowest of the heights no earlier, and some way from the camera nothing is measured.
-    """
-    drop = max(band.camera - band.low, np.float32(0))
-    with np.errstate(divide="ignore"):
-        sunk = np.where(beams.lowest < 0, drop / -beams.lowest, np.float32(np.inf if drop else 0))
-    return np.maximum(sunk, beams.unmeasured)
-
-
-def nearest(image: DepthImage) -> float:
-    """Return about the least depth in metres that the image holds, whatever a few pixels say; 0: it holds none.
-
-    The camera may well know a nearest depth of its own that is larger than `min_range`, but not tell.
-    """
-    some = (slice(None, None, SPARSE), slice(None, None, SPARSE))
-    known = image.depth_m[some][image.reason[some] == Reason.VALID]
-    return float(np.partition(known, len(known) // 100)[len(known) // 100]) if known.size else 0.0
+def _borders(middles: NDArray[np.float32]) -> NDArray[np.float32]:
+    if len(middles) == 1:
+        return np.repeat(middles, 2, axis=0)
+    between = (middles[1:] + middles[:-1]) * np.float32(0.5)
+    ends = middles[[0, -1]] + (middles[[0, -1]] - between[[0, -1]])
+    return np.concatenate([ends[:1], between, ends[1:]])

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.cameras.pinhole import PinholeCamera
-from stereovox.depth import DepthPath
+from stereovox.depth import DepthPipeline
 from stereovox.errors import FrameRefused, MissingExtra
 from stereovox.formats.points import cell_colours
 from stereovox.frame import AnyFrame, DepthImage
@@ -124,7 +124,7 @@ class RerunFile:
 class RerunLog:
     """Writes each frame as it is mapped, and the map as often as mapping can spare the time."""
 
-    def __init__(self, file: RerunFile, depth: DepthPath):
+    def __init__(self, file: RerunFile, depth: DepthPipeline):
         self._file, self._depth = file, depth
         self._due = 0.0
 

@@ -18,13 +18,23 @@ INTEGRATORS = {
 
 
 class Integrator(Protocol):
-    """A way to turn depth images into evidence; made once from the settings, then called for each frame."""
+    """Turns depth images into evidence. Made once, with a `Config`, then called for each frame."""
 
     def evidence(self, image: DepthImage) -> Evidence:
-        """Return what `image` says about the cells it sees. The memory it lies in is used again by the next call."""
+        """Return the evidence of a depth image on the cells it sees.
+
+        Args:
+            image: The depth image with its camera and pose.
+
+        Returns:
+            Evidence in thousandths of log-odds; its memory may be reused by the next call.
+
+        Raises:
+            FrameRefused: The camera or its view is out of proportion (`bad_camera`, `view_too_large`).
+        """
         ...
 
 
 def make_integrator(config: Config) -> Integrator:
-    """Return the integrator that `config` names. Raises ConfigError for an unknown name."""
+    """Return the configured integrator. Raises ConfigError for an unknown name."""
     return registry.find("integrators", INTEGRATORS, config.integrator)(config)

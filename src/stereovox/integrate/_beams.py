@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernels of scan beams: where they go, and the cells they go through.
+"""Kernels of scan beams: their lines, and the cells those cross.
 
 Unlike elsewhere numbers are float64: beams are walked one by one, so wide registers gain nothing, and far from the
 origin cells keep their edges. Places are in cells, whole multiples of 2^-20, so that differences are exact.
@@ -10,16 +10,17 @@ import numpy as np
 from stereovox._jit import allocating_kernel, cell, kernel
 
 UNSIGNED = np.uint64
-"""Kind of index that costs no test whether it counts from the end."""
+"""Kind of index without the test for negative indices."""
 GRAIN = 2.0**20
+"""Coordinates are multiples of 1 / GRAIN cells."""
 ZERO = np.float32(0)
 SIDE_BITS = 6
 SIDE = 1 << SIDE_BITS
 POINT = 48
 ONE = 2.0**POINT
-"""Lines run in whole numbers, with so many bits behind the point: after 4,096 cells they are off by 2^-36."""
+"""Lines run in fixed point with POINT fractional bits: after 4,096 cells they are off by 2^-36."""
 CORNER = 1 << (POINT - 35)
-"""A line that passes a corner of cells so closely touches two of its four cells."""
+"""A line that passes a corner of cells this closely touches two of its four cells."""
 
 
 @cell

@@ -1,9 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernel cells shared by the integrators: one idea a function, float32 throughout."""
+"""Small kernel functions shared by the integrators, float32 throughout: views, cell keys, table rows."""
 
 import numpy as np
 
 from stereovox._jit import cell, kernel
+
+ZERO, HALF, ONE = np.float32(0), np.float32(0.5), np.float32(1)
+NARROW, WIDE = 10, 20
+"""Bits of each cell coordinate in a key of 32 and of 64 bits."""
+NEAR_PLANE = np.float32(1e-3)
+"""Cells with centres at a depth below this (metres) are skipped."""
+NO_RETURN = np.float32(1e6)
+"""Depth that stands for "nothing up to the maximum range"."""
 
 
 @kernel
@@ -42,13 +50,9 @@ def aim(T_world_camera, cell, side, intrinsics, size, rim, centres, block, rotat
             steps[row, c] = x * centres[0, c] + y * centres[1, c] + z * centres[2, c]
 
 
-NARROW, WIDE = 10, 20
-"""Bits for each cell coordinate in a key of 32 and of 64 bits."""
-
-
 @cell
 def bits(keys):
-    """Return the bits for each cell coordinate in keys of this kind."""
+    """Return the bits of each cell coordinate in keys of this kind."""
     return NARROW if np.iinfo(keys.dtype).bits == 32 else WIDE
 
 
@@ -81,13 +85,6 @@ def strides(signs, keys):
     )
 
 
-ZERO, HALF, ONE = np.float32(0), np.float32(0.5), np.float32(1)
-NEAR_PLANE = np.float32(1e-3)
-"""Cells whose centre lies nearer to the image plane of the camera than this (metres) are not looked at."""
-NO_RETURN = np.float32(1e6)
-"""Depth that stands for "nothing up to the maximum range"."""
-
-
 @cell
 def stronger(old, new):
     """Return the stronger evidence on one cell: positive beats negative, then the larger amount wins."""
@@ -111,13 +108,13 @@ def usable(depth):
 
 @cell
 def index(i):
-    """Return an int32 that is not negative as an index: no test for counting from the end, and gathers of 32 bits."""
+    """Return a non-negative int32 as an index without the test for negative indices, and with 32-bit gathers."""
     return np.uint32(i & np.int32(0x7FFFFFFF))
 
 
 @cell
 def bits_of(x):
-    """Return the bits of a float32 as int32; for numbers that are not negative they order like the numbers."""
+    """Return the bits of a float32 as int32; for non-negative numbers they order like the numbers."""
     return np.float32(x).view(np.int32)
 
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernels that scatter measured points into their cells, and weigh how much of each cell they fill.
+"""Kernels that scatter measured points into their cells, and weigh each hit by its share of the cell's footprint.
 
 Most pixels fall into the cell of their left or upper neighbour. Each pixel's cell is packed into one number, and only
-pixels whose number differs from their neighbours' are looked at further; groups without any cost one test.
+pixels whose number differs from their neighbours' go on; groups without any cost one test.
 """
 
 import numpy as np
@@ -164,7 +164,7 @@ def _evidence(view, table, full_share, listed, z, share, values):
 
 @cell
 def _slot(key):
-    """Return where a key stands in `seen`: a small memory of the cells entered lately."""
+    """Return the slot of a key in `seen`, a small cache of recently entered cells."""
     mixed = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
     return np.int64(mixed >> np.uint64(64 - SEEN_BITS))
 
@@ -231,7 +231,7 @@ def _wide_row(depths, columns, ray, position, now, before, news):
 
 @cell
 def _is_new(key, left, above, above_right):
-    """Tell whether a pixel holds a measurement whose cell none of three pixels seen before it has.
+    """Return whether a pixel holds a measurement whose cell none of three earlier pixels has.
 
     Noise makes the pixels of a surface near a cell's face fall into two cells by turns; these three were found to be
     worth their comparisons, further ones not.
@@ -241,7 +241,7 @@ def _is_new(key, left, above, above_right):
 
 @cell
 def _gather_news(news, fresh):
-    """List the pixels that are news; return how many. Free of unforeseeable branches within a group."""
+    """List the pixels with new cells; return how many. No unpredictable branches within a group."""
     groups = news.view(np.uint64)
     n = 0
     for group in range(groups.size):

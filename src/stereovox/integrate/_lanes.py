@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernel cells shared by ray casting and line drawing: many rays side by side, and what they give to cells.
+"""Kernel functions shared by ray casting and line drawing: many rays in step, and the evidence they give to cells.
 
 A step first finds, for all lanes, the key of the present cell and its evidence (`key`, `gain`): plain arithmetic, which
-the compiler does for many lanes at once. Then gains are summed in runs: neighbouring rays mostly cross the same cell.
+the compiler vectorises over lanes. Then gains are summed in runs, since neighbouring rays mostly cross the same cell.
 """
 
 import numpy as np
@@ -28,9 +28,9 @@ from stereovox.maps._cells import find_or_insert
 LANES = 32
 """Neighbouring pixels of a row that are walked in step."""
 MEMORY_BITS = 9
-"""The places of so many blocks (as a power of two: 8 along each axis) are remembered beside the pool's hash."""
+"""Binary logarithm of the blocks whose places are cached beside the pool's hash: 8 along each axis."""
 FRACTION_BITS = 10
-"""Weighted evidence is summed in thousandths times 2^10: whole numbers, so the order of rays does not matter."""
+"""Weighted evidence is summed in units of 2^-10 thousandths: integers, so the order of rays does not matter."""
 FRACTION = np.float32(1 << FRACTION_BITS)
 HALF_DIAGONAL = np.float32(0.8661)
 """Depth, in cells, from where a ray enters a cell to the middle of its way through it, at most."""
@@ -38,7 +38,7 @@ HALF_DIAGONAL = np.float32(0.8661)
 
 @cell
 def in_step(columns, ray):
-    """Return how many of the columns' rays go the same way along each axis, and that way: 1 or -1 along x, y and z."""
+    """Return how many of the columns' rays share their direction along each axis, and its signs along x, y and z."""
     signs = _signs(ray, columns[0])
     n = columns.size
     while _signs(ray, columns[n - 1]) != signs:  # directions change evenly from column to column
@@ -60,7 +60,7 @@ def _sign(direction):
 def aim(depths, columns, ray, position, view, table, lanes):
     """Fill depth, end, row, columns and hit of the lanes for a run of pixels.
 
-    Return the depth up to which a cell may begin that all of them call plainly free; NO_RETURN when there is no ray.
+    Return the depth up to which cells may begin that are plainly free for all of them; NO_RETURN without any ray.
 
     depths, columns: REP 117 depth and x/z of at most LANES pixels of one image row. ray: see `_row_rays`.
     """
@@ -100,7 +100,7 @@ def evidence(depth, measured, row, columns, look_up, width, table, weight):
 
 @cell
 def passed(table, depth):
-    """Return the most that a cell at `depth` loses when it is looked through: `table.free` or less, 0 for too near."""
+    """Return the largest loss of a cell at `depth` that is looked through: `table.free` or weaker, 0 for too near."""
     last = np.float32(np.int32(table.passed.size - 1))
     most = table.passed[np.uint32(np.int32(min(max(depth * table.rows_per_metre, ZERO), last)))]
     return most if depth > table.blind else np.int32(0)
@@ -117,7 +117,7 @@ def weighted(e, depth, weight):
 
 @cell
 def aim_at_hits(n, lanes, table, weight):
-    """Make the measured points' cells the ones that are given evidence; return what `give` wants to know."""
+    """Select the measured points' cells to be given evidence; return runs and total for `give`."""
     for i in range(n):
         hit = lanes.hit[i]
         lanes.key[i] = hit
@@ -141,8 +141,8 @@ def mark_runs(n, lanes):
 def give(n, lanes, runs, total, plain, weight, memory, pool_table, coords, count, values):
     """Give the gains of the first `n` lanes to their cells; return False when the block pool is full.
 
-    weight: gains of one cell add up; None: the strongest counts. runs, total: see `mark_runs`. plain: the most that any
-    lane may take away, where none gives anything; 0 for unlike ones.
+    weight: gains of one cell add up; None: the strongest counts. runs, total: see `mark_runs`. plain: the largest
+    loss that any lane may give, where none gives positive evidence; 0 where lanes differ.
     """
     b = np.int64(bits(lanes.key))
     if weight is None:
@@ -153,17 +153,17 @@ def give(n, lanes, runs, total, plain, weight, memory, pool_table, coords, count
         return _enter(lanes.key[0], b, total, weight, memory, pool_table, coords, count, values)
     room, before = True, np.int32(0)
     for r in range(_gather(n, lanes, weight)):
-        said = lanes.run_gain[r]
-        gain = np.int32(said - before)
+        run_gain = lanes.run_gain[r]
+        gain = np.int32(run_gain - before)
         room &= _enter(lanes.run_key[r], b, gain, weight, memory, pool_table, coords, count, values)
         if weight is not None:
-            before = said
+            before = run_gain
     return room
 
 
 @cell
 def _mark_unlike(n, lanes):
-    """Mark the last of each run of lanes in one cell that say the same; return how many runs there are."""
+    """Mark the last of each run of lanes with the same cell and gain; return how many runs there are."""
     lanes.key[n] = -1
     runs = np.int32(0)
     for i in range(n):
@@ -175,12 +175,12 @@ def _mark_unlike(n, lanes):
 
 @cell
 def _gather(n, lanes, weight):
-    """List what runs of lanes say; return how many there are. Sums run on from one to the next. Free of branches."""
-    runs, said = np.uint64(0), np.int32(0)  # unsigned: no check for indices that count from the end
+    """List the gains of the runs of lanes; return how many there are. Sums run on from one to the next. No branches."""
+    runs, total = np.uint64(0), np.int32(0)  # unsigned: no check for indices that count from the end
     for i in range(n):
-        said = lanes.gain[i] if weight is None else np.int32(said + lanes.gain[i])
+        total = lanes.gain[i] if weight is None else np.int32(total + lanes.gain[i])
         lanes.run_key[runs] = lanes.key[i]
-        lanes.run_gain[runs] = said
+        lanes.run_gain[runs] = total
         runs += np.uint64(lanes.last[i])
     return np.int64(runs)
 

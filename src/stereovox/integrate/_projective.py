@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Kernels of the projective integrator: cull blocks from coarse to fine, and evaluate each cell of those that are left.
 
-Nearly all cells are plain: free, for they lie well before what was measured, or behind it. So a layer of cells is first
-told apart by two comparisons, and only a layer with cells near a measurement is looked up in the sensor table.
+Nearly all cells are plain: either free, well before the measurement, or behind it. So a layer of cells is first
+classified by two comparisons, and only a layer with cells near a measurement is looked up in the sensor table.
 """
 
 import numpy as np
@@ -13,20 +13,24 @@ from stereovox.integrate._windows import COARSEST, place
 from stereovox.maps._cells import find
 
 SKIP, FREE, MIXED = 0, 1, 2
+"""Kinds of boxes; see `_classify`."""
 SLACK = np.float32(1e-3)
-"""Pixels and parts of a depth by which boxes are taken too large: culling may err only to the safe side."""
+"""Pixels, and share of a depth, by which boxes are enlarged: culling may err only on the safe side."""
 COARSE = 4
 """Blocks along each side of a coarse box; between it and a block stand boxes of two blocks."""
 STACK = 32
-"""Boxes that wait to be looked at, at most: eight of each of two sizes."""
+"""Most boxes on the stack: eight of each of two sizes."""
+LAYER = 64
+"""Cells classified together: one layer of a block."""
+UNSEEN = np.float32(-1e9)
+"""Depth that stands for "no measurement at this cell": every cell lies behind it."""
 
 
 @kernel
 def candidates(view, table, windows, nearest, end, stack, free, mixed):
-    """List the blocks that are wholly free and those that need a look at each cell; return both numbers.
+    """List the blocks that are wholly free and those that must be evaluated cell by cell; return both numbers.
 
     Both are -1 when a list is too short.
-
     end: depth in metres beyond which the image says nothing. stack: (STACK, 4) int32 scratch.
     free, mixed: (capacity, 3) int32 block coordinates from the camera's block.
     """
@@ -57,24 +61,6 @@ def candidates(view, table, windows, nearest, end, stack, free, mixed):
     return n_free, n_mixed
 
 
-@cell
-def _push(stack, waiting, x, y, z, size):
-    """Put a box that is still to be looked at on the stack; return how many wait there now."""
-    stack[waiting, 0], stack[waiting, 1], stack[waiting, 2], stack[waiting, 3] = x, y, z, size
-    return waiting + 1
-
-
-@cell
-def _enter(blocks, n, x, y, z, size):
-    """List all blocks of a box `size` blocks wide; return how many are listed now."""
-    for i in range(size):
-        for j in range(size):
-            for k in range(size):
-                blocks[n, 0], blocks[n, 1], blocks[n, 2] = x + i, y + j, z + k
-                n += 1
-    return n
-
-
 @kernel
 def with_hits(hit_table, hit_coords, n_hits, free, n_free, mixed, n_mixed, hit_of, listed):
     """Put all blocks that hold hits among the mixed ones; return the numbers of free and of mixed blocks.
@@ -102,6 +88,63 @@ def with_hits(hit_table, hit_coords, n_hits, free, n_free, mixed, n_mixed, hit_o
     return kept, n_mixed
 
 
+@kernel
+def evaluate(depth_m, view, table, windows, blocks, hit_of, hit_values, values, depths, measured):
+    """Fill `values` (n, 512) int16 with the evidence on the cells of `blocks` (n, 3), hits included.
+
+    depth_m: (h, w) REP 117 depth image, from which `windows` was made. hit_of: (n,) place of each block among the hits,
+    -1 for none. depths, measured: (LAYER,) float32 scratch.
+    """
+    side = np.float32(8) * view.voxel_size
+    for i in range(blocks.shape[0]):
+        x, y, z = blocks[i, 0], blocks[i, 1], blocks[i, 2]
+        px = np.float32(x) * side - view.position[0]
+        py = np.float32(y) * side - view.position[1]
+        pz = np.float32(z) * side - view.position[2]
+        R = view.rotation
+        cx = (R[0, 0] * px + R[0, 1] * py + R[0, 2] * pz) * view.intrinsics[0]
+        cy = (R[1, 0] * px + R[1, 1] * py + R[1, 2] * pz) * view.intrinsics[1]
+        cz = R[2, 0] * px + R[2, 1] * py + R[2, 2] * pz
+        out = values[i]
+        _clear(view, table, windows, cx, cy, cz, _passed(view, table, cz), depths, measured, out)
+        if table.marks:
+            _mark(depth_m, view, table, cx, cy, cz, out)
+        if hit_of[i] >= 0:
+            hits = hit_values[hit_of[i]]
+            for c in range(512):
+                out[c] = max(out[c], hits[c]) if hits[c] > 0 else out[c]
+
+
+@kernel
+def passed(view, table, blocks, out):
+    """Fill `out` (n,) int16 with the evidence on all cells of each of `blocks` (n, 3), which are wholly free."""
+    side = np.float32(8) * view.voxel_size
+    R = view.rotation
+    for i in range(blocks.shape[0]):
+        px = np.float32(blocks[i, 0]) * side - view.position[0]
+        py = np.float32(blocks[i, 1]) * side - view.position[1]
+        pz = np.float32(blocks[i, 2]) * side - view.position[2]
+        out[i] = np.int16(_passed(view, table, R[2, 0] * px + R[2, 1] * py + R[2, 2] * pz))
+
+
+@cell
+def _push(stack, waiting, x, y, z, size):
+    """Push a box on the stack; return the new height of the stack."""
+    stack[waiting, 0], stack[waiting, 1], stack[waiting, 2], stack[waiting, 3] = x, y, z, size
+    return waiting + 1
+
+
+@cell
+def _enter(blocks, n, x, y, z, size):
+    """List all blocks of a box `size` blocks wide; return how many are listed now."""
+    for i in range(size):
+        for j in range(size):
+            for k in range(size):
+                blocks[n, 0], blocks[n, 1], blocks[n, 2] = x + i, y + j, z + k
+                n += 1
+    return n
+
+
 @cell
 def _touched(view, end, axis):
     """Return the first blocks of the first and the last coarse box along an axis that the view up to `end` touches."""
@@ -122,10 +165,10 @@ def _touched(view, end, axis):
 
 @cell
 def _classify(view, table, windows, nearest, tile, blocks, bx, by, bz):
-    """Tell whether all cells of a box are free (FREE), untouched (SKIP) or neither (MIXED).
+    """Return whether all cells of a box are free (FREE), untouched (SKIP) or neither (MIXED).
 
     The box is `blocks` blocks wide and starts at block (bx, by, bz); only the centres of its cells count.
-    tile: 0 to look at tiles of 16 pixels (blocks), 1 for 64 (larger boxes).
+    tile: 0 for tiles of 16 pixels (blocks), 1 for 64 (larger boxes).
     """
     side = np.float32(8) * view.voxel_size
     half = (np.float32(4 * blocks) - HALF) * view.voxel_size
@@ -175,7 +218,7 @@ def _extent(rotation, axis):
 
 @cell
 def _outside(view, half, px, py, pz):
-    """Tell whether a box of half width `half` about (px, py, pz) lies wholly beyond one side of the image."""
+    """Return whether a box of half width `half` about (px, py, pz) lies wholly beyond one side of the image."""
     for side in range(4):
         plane = view.sides[side]
         height = plane[0] * px + plane[1] * py + plane[2] * pz + half * plane[3] + plane[4]
@@ -186,7 +229,7 @@ def _outside(view, half, px, py, pz):
 
 @cell
 def _behind(table, farthest, max_range):
-    """Return how far behind a measurement the sensor model still says anything."""
+    """Return how far behind a measurement the sensor model still gives evidence."""
     if not table.marks:
         return table.behind
     return table.reach[table_row(min(farthest, max_range), table.rows_per_metre, table.hit.size)]
@@ -199,7 +242,7 @@ def _pixel(x, last):
 
 @cell
 def _clear_to(table, depth):
-    """Return the z up to which every measurement of at least `depth` says "free" and nothing else."""
+    """Return the z up to which every measurement of at least `depth` gives plain free space."""
     if depth <= ZERO:
         return ZERO
     if depth >= NO_RETURN:
@@ -233,54 +276,9 @@ def _nearest(nearest, tile, u0, u1, v0, v1):
     return best
 
 
-LAYER = 64
-"""Cells told apart together: one layer of a block."""
-UNSEEN = np.float32(-1e9)
-"""Depth that stands for "nothing was measured where this cell is": every cell lies behind it."""
-
-
-@kernel
-def evaluate(depth_m, view, table, windows, blocks, hit_of, hit_values, values, depths, measured):
-    """Fill `values` (n, 512) int16 with the evidence on the cells of `blocks` (n, 3), hits included.
-
-    depth_m: (h, w) REP 117 depth image, from which `windows` was made. hit_of: (n,) place of each block among the hits,
-    -1 for none. depths, measured: (LAYER,) float32 scratch.
-    """
-    side = np.float32(8) * view.voxel_size
-    for i in range(blocks.shape[0]):
-        x, y, z = blocks[i, 0], blocks[i, 1], blocks[i, 2]
-        px = np.float32(x) * side - view.position[0]
-        py = np.float32(y) * side - view.position[1]
-        pz = np.float32(z) * side - view.position[2]
-        R = view.rotation
-        cx = (R[0, 0] * px + R[0, 1] * py + R[0, 2] * pz) * view.intrinsics[0]
-        cy = (R[1, 0] * px + R[1, 1] * py + R[1, 2] * pz) * view.intrinsics[1]
-        cz = R[2, 0] * px + R[2, 1] * py + R[2, 2] * pz
-        out = values[i]
-        _clear(view, table, windows, cx, cy, cz, _passed(view, table, cz), depths, measured, out)
-        if table.marks:
-            _mark(depth_m, view, table, cx, cy, cz, out)
-        if hit_of[i] >= 0:
-            hits = hit_values[hit_of[i]]
-            for c in range(512):
-                out[c] = max(out[c], hits[c]) if hits[c] > 0 else out[c]
-
-
-@kernel
-def passed(view, table, blocks, out):
-    """Fill `out` (n,) int16 with the evidence on all cells of each of `blocks` (n, 3), which are wholly free."""
-    side = np.float32(8) * view.voxel_size
-    R = view.rotation
-    for i in range(blocks.shape[0]):
-        px = np.float32(blocks[i, 0]) * side - view.position[0]
-        py = np.float32(blocks[i, 1]) * side - view.position[1]
-        pz = np.float32(blocks[i, 2]) * side - view.position[2]
-        out[i] = np.int16(_passed(view, table, R[2, 0] * px + R[2, 1] * py + R[2, 2] * pz))
-
-
 @cell
 def _passed(view, table, cz):
-    """Return the most that the cells of a block lose when they are looked through, by the depth of its centre.
+    """Return the largest loss of the cells of a block that are looked through, by the depth of its centre.
 
     cz: depth of the block's corner.
     """
@@ -291,7 +289,7 @@ def _passed(view, table, cz):
 
 @cell
 def _clear(view, table, windows, cx, cy, cz, most, depths, measured, out):
-    """Write the negative evidence: what the farthest pixel in a window about the cell's size says, `most` at most.
+    """Write the negative evidence of the farthest pixel in a window of about the cell's size, at most `most`.
 
     depths, measured: (LAYER,) scratch.
     """
@@ -303,7 +301,7 @@ def _clear(view, table, windows, cx, cy, cz, most, depths, measured, out):
         cells = slice(layer, layer + LAYER)
         steps = view.steps[0, cells], view.steps[1, cells], view.steps[2, cells]
         _measure(view, windows, max(NEAR_PLANE, table.blind), cx, cy, cz, steps, depths, measured)
-        if _tell_apart(depths, measured, before, table.behind, most, out[cells]):
+        if _classify_layer(depths, measured, before, table.behind, most, out[cells]):
             _look_up(view, table, depths, measured, most, out[cells])
 
 
@@ -311,7 +309,7 @@ def _clear(view, table, windows, cx, cy, cz, most, depths, measured, out):
 def _measure(view, windows, nearest, cx, cy, cz, steps, depths, measured):
     """Fill `depths` with the depth of each cell's centre and `measured` with what was measured there.
 
-    nearest: depth up to which cells are not looked at.
+    nearest: depth up to which cells are skipped.
     """
     fx_steps, fy_steps, z_steps = steps
     u_centre, v_centre = view.intrinsics[2] + HALF, view.intrinsics[3] + HALF
@@ -334,7 +332,7 @@ def _measure(view, windows, nearest, cx, cy, cz, steps, depths, measured):
 
 
 @cell
-def _tell_apart(depths, measured, before, behind, free, out):
+def _classify_layer(depths, measured, before, behind, free, out):
     """Write `free` for cells wholly before their measurement, else 0; return whether any lies near it."""
     near = np.int32(0)
     for c in range(LAYER):
@@ -346,7 +344,7 @@ def _tell_apart(depths, measured, before, behind, free, out):
 
 @cell
 def _look_up(view, table, depths, measured, most, out):
-    """Write what the sensor table says of cells that are not wholly before their measurement, `most` at most."""
+    """Write the sensor table's evidence on cells that are not wholly before their measurement, at most `most`."""
     last_row = np.int32(table.hit.size - 1)
     columns, clear = np.int32(table.clear.shape[1]), table.clear.reshape(table.clear.size)
     last_column, middle_column = np.float32(columns - 1), np.float32(columns) * HALF

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernels that make the window images: at each pixel the farthest depth within a window, for windows of all sizes.
+"""Kernels that build window images: at each pixel the farthest depth within a window, for windows of all sizes.
 
 Level 0 is the depth image itself, level l >= 1 holds, for each tile of 2^(l-1) pixels, the farthest depth in the
 3x3 tiles around it. For fast culling each level also has the nearest and farthest value of tiles of 16 and 64 of its
 own pixels. No value is 0, so it is the nearest of all and never clears anything.
 
 All levels stand in one image whose rows are `pitch` long: level 1 on top, level 0 below it, the others side by side
-below that; so where a pixel stands takes a few sums, and no look at a table (`place`).
+below that; so the place of a pixel takes a few sums and no table look-up (`place`).
 """
 
 import numpy as np

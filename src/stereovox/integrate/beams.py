@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From a scan to evidence on the cells of a floor: what its beams pass is free, where they end is occupied.
+"""From a scan to evidence on the cells of a grid: beams clear what they pass and mark where they end.
 
-IST 2019, section II. The map's Eq 5 adds what is found here.
+IST 2019, section II; the map adds the evidence by its Eq 5.
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ TRAVERSALS = {
 MAX_CELLS = 4096
 """Cells a beam may be long: a scan's patch is at most four times the square of it."""
 MAX_BEAMS = 65536
-"""Beams of a scan: so many times the largest evidence fit into 32 bits."""
+"""Most beams of a scan: the sum of their largest evidence fits into 32 bits."""
 UPDATES = {"once": (None, np.int16), "every": (1, np.int32)}
-"""Whether what beams say of a cell is added up (None: the last one counts), and what the sum is kept in."""
+"""Whether the evidence of beams on a cell is summed (None: the last one counts), and the dtype of the sum."""
 
 
 def make_beams(config: Config) -> Beams:
-    """Return what turns scans into evidence as `config.grid` says. Raises ConfigError for what cannot be done."""
+    """Return the configured `Beams`. Raises ConfigError for settings that cannot be met."""
     return Beams(config)
 
 
 class Beams:
-    """Turns scans into evidence, on cells of `config.voxel_size`; it never sees the map."""
+    """Turns scans into evidence on cells of `config.voxel_size`; it never sees the map."""
 
     def __init__(self, config: Config):
         grid = config.grid
@@ -60,14 +60,14 @@ class Beams:
         self._directions = np.empty((0, 2))
 
     def evidence(self, scan: Scan, origin: ArrayLike = (0.0, 0.0, 0.0)) -> GridEvidence:
-        """Return what a scan that can be trusted says about the cells of a grid with this `origin` (3,): x, y, yaw.
+        """Return the evidence of a validated scan on the cells of a grid with this `origin` (3,): x, y, yaw.
 
         A range from `range_min` to min(`range_max`, `config.max_range`) is a hit: its beam is free up to it, and
         occupied from it to `grid.thickness` behind. +inf, and a hit beyond `config.max_range`, is free up to that
-        minimum. All else says nothing, and where the scan has `clear` it tells how far beams are free,
-        `clear_from` from where on. A beam never
-        clears the cell it hits. Lengths are seen from above where the sensor leans.
-        The memory that evidence lies in is used again by the next call.
+        minimum. Other ranges give no evidence. Where the scan has `clear`, that is how far its beams are free,
+        and `clear_from` from where. A beam never clears the cell it hits. Where the sensor leans, lengths are as seen
+        from above.
+        The memory of the evidence is reused by the next call.
         Raises FrameRefused: `too_many_beams`, `bad_clear`, `bad_scan`, `pose_too_far`.
         """
         lines, box = self._aim(scan, np.asarray(origin, float))
@@ -80,14 +80,14 @@ class Beams:
         flat, dtype = values.reshape(-1), values.dtype.type
         free, hits, taken_back = lines
         passes = [(free, self._free), (hits, self._occupied)]
-        if self._adding:  # else hits, which come last, replace what they hit
+        if self._adding:  # otherwise hits, which come last, replace the value
             passes.append((taken_back, -self._free))
         for what, gain in passes:
             self._traverse(what, low * SIDE, columns, rows, dtype(gain), self._adding, flat)
         return GridEvidence(coords, values)
 
     def _aim(self, scan: Scan, origin: NDArray[np.float64]) -> tuple[list[NDArray[np.float64]], NDArray[np.int64]]:
-        """Return the lines to clear, to occupy, and those that a hit takes back, in cells, and the box they lie in."""
+        """Return the lines to clear, to occupy, and those whose clearing a hit cancels, in cells, and their box."""
         size, config = self._config.voxel_size, self._config
         ranges, clear, clear_from = _beams_of(scan)
         T = se2.lifted(se2.inverse(origin)) @ scan.T_world_sensor
@@ -128,15 +128,15 @@ class Beams:
 
 
 def _beams_of(scan: Scan) -> tuple[NDArray[np.float32], ...]:
-    """Return ranges, how far beams are known to be free (empty: ranges alone tell), and from where on (empty: 0)."""
+    """Return ranges, how far beams are known to be free (empty: as by ranges), and from where on (empty: 0)."""
     shape = np.shape(scan.ranges)
     if shape[0] > MAX_BEAMS:
         raise FrameRefused("too_many_beams", f"{name_of(scan)}: {shape[0]} beams; at most {MAX_BEAMS} are taken")
     for what in ("clear", "clear_from"):
         given = getattr(scan, what)
         if given is not None and (given.shape != shape or given.dtype.kind not in "fiu"):
-            said = f"{what} is {given.shape} {given.dtype}, ranges are {shape}"
-            raise FrameRefused("bad_clear", f"{name_of(scan)}: {said}")
+            detail = f"{what} is {given.shape} {given.dtype}, ranges are {shape}"
+            raise FrameRefused("bad_clear", f"{name_of(scan)}: {detail}")
     return _floats(scan.ranges), _floats(scan.clear), _floats(scan.clear_from)
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Wide depth images cut into pinhole images: the faces of a cube round the eye, as far as the camera sees them."""
+"""Cut wide depth images into pinhole images: the faces of a cube round the eye, as far as the camera sees them."""
 
 from __future__ import annotations
 
@@ -21,9 +21,7 @@ WideCamera = SphericalCamera | CylindricalCamera
 FORWARD = ((0, 0, 1), (0, 1, 0), (0, 0, -1), (0, -1, 0), (1, 0, 0), (-1, 0, 0))
 """Directions of the six faces in the optical frame of the wide camera."""
 MIN_PIXELS, MAX_SHARE = 1 << 18, 16
-"""Pixels that all faces may have however small the image, and for each pixel of it. A sphere needs less than two."""
-
-
+"""Pixels that all faces may have for any image, and more for each of its pixels. A sphere needs less than two."""
 Window = tuple[float, float, float, float]
 """Slopes of a face between which it sees something: left, top, right, bottom."""
 
@@ -42,8 +40,10 @@ class Face(NamedTuple):
 
 
 class FaceImage(NamedTuple):
-    """What one face sees. image: a pinhole's depth image. ends: (height, width) float32, the same, but for pixels that
-    see nothing up to the maximum range: the depth along the face's axis up to which that is so.
+    """The view of one face.
+
+    image: a pinhole's depth image. ends: (height, width) float32, the same, but for pixels that see nothing up to the
+    maximum range: the depth along the face's axis up to which that is so.
     """
 
     image: DepthImage
@@ -51,7 +51,7 @@ class FaceImage(NamedTuple):
 
 
 def faces_of(camera: WideCamera, config: Config) -> list[Face]:
-    """Return the faces that a wide camera sees. They do not overlap, and no row and no column is passed over, but for
+    """Return the faces that a wide camera sees. They do not overlap, and miss no row or column, except
     rows that crowd near the x axis.
 
     Raises FrameRefused `bad_camera` where the view or the faces were out of proportion to the image.
@@ -63,8 +63,8 @@ def faces_of(camera: WideCamera, config: Config) -> list[Face]:
         raise FrameRefused("bad_camera", str(error)) from None
     pixels = sum(pinhole.width * pinhole.height for _, pinhole in places)
     if pixels > MIN_PIXELS + MAX_SHARE * camera.width * camera.height:
-        said = f"{camera.width}x{camera.height} wide pixels need {pixels} of pinhole cameras"
-        raise FrameRefused("bad_camera", f"{said}: their sides differ too much; check the camera's steps")
+        detail = f"{camera.width}x{camera.height} wide pixels need {pixels} of pinhole cameras"
+        raise FrameRefused("bad_camera", f"{detail}: their sides differ too much; check the camera's steps")
     faces = [_face(camera, pinhole, forward) for forward, pinhole in places]
     return [face for face in faces if (face.pixel >= 0).any()]
 

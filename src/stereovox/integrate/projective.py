@@ -2,8 +2,9 @@
 """The projective integrator: cells are projected into the depth image, from coarse boxes to single cells.
 
 A frame updates each cell at most once. Cells that hold a measured point get its hit evidence, scattered from the
-pixels; every other cell gets what the farthest pixel in a window about its own size says. So thin near obstacles
-stay, small holes do not matter, and the outcome is what exact ray casting gives (docs/integrators.md has figures).
+pixels; every other cell gets the evidence of the farthest pixel in a window of about its own size. So thin near
+obstacles stay, small holes do not matter, and the result is that of exact ray casting (docs/integrators.md has
+figures).
 """
 
 from __future__ import annotations
@@ -37,14 +38,125 @@ from stereovox.maps.blocks import CELLS, BlockPool
 from stereovox.maps.evidence import Evidence
 from stereovox.sensors import make_sensor
 from stereovox.sensors.model import InverseSensorModel
-from stereovox.threads import in_shards, shards, together
+from stereovox.threads import in_shards, run_both, shards
+
+LEVELS = _windows.COARSEST + 1
+"""Number of window sizes: one pixel, and three tiles of 1 to 128 pixels."""
+ROOM = 4096
+"""Initial capacity of a camera's block lists."""
+WORTH_A_THREAD = 256
+"""Blocks whose evaluation takes longer than waking a thread."""
+
+
+class Projective:
+    """Evidence by projection, coarse to fine. Raises ConfigError for a bad sensor model."""
+
+    def __init__(self, config: Config):
+        self._config = config
+        sensor = make_sensor(config.sensor)
+        self._eyes = PerCamera(partial(_eye, sensor, config))  # without `self`, which would keep itself alive
+        self._faces = PerCamera(partial(_eyes_of_faces, sensor, config))
+
+    def evidence(self, image: DepthImage) -> Evidence:
+        """Return the evidence of `image` on the cells it sees; wide images are cut into pinhole images."""
+        if isinstance(image.camera, PinholeCamera):
+            return self._of_pinhole(self._eyes[image.camera], image, image.depth_m)
+        faces = [(eye, cut(image, face, self._config.max_range)) for face, eye in self._faces[image.camera]]
+        return strongest([self._of_pinhole(eye, face.image, face.ends) for eye, face in faces])
+
+    def _of_pinhole(self, eye: _Eye, image: DepthImage, ends: NDArray[np.float32]) -> Evidence:
+        depth_m = image.depth_m
+        view = eye.views.at(image.T_world_sensor)
+        threads = self._config.threads if eye.mixed_before >= 2 * WORTH_A_THREAD else 1
+        _, (windows, n_free, n_mixed) = run_both(
+            threads,
+            lambda: eye.hits.find(depth_m, view),
+            lambda: eye.candidates(depth_m, ends, view),
+        )
+        free, mixed, hit_of = eye.with_hits(n_free, n_mixed)
+        eye.mixed_before = len(mixed)
+        values = np.empty((len(mixed), CELLS), np.int16)
+        hits = eye.hits.blocks.values
+
+        def one_shard(part: slice) -> None:
+            scratch = np.empty((2, _projective.LAYER), np.float32)
+            _projective.evaluate(
+                depth_m, view, eye.table, windows, mixed[part], hit_of[part], hits, values[part], *scratch
+            )  # fmt: skip
+
+        in_shards(one_shard, shards(len(mixed), min(threads, len(mixed) // WORTH_A_THREAD or 1)))
+        free_values = np.empty(len(free), np.int16)
+        _projective.passed(view, eye.table, free, free_values)
+        origin = eye.views.block
+        return Evidence(mixed + origin, values, free + origin, free_values)
+
+
+class _Eye:
+    """Tools of one camera: its sensor table, and memory for the evidence of its images."""
+
+    def __init__(self, camera: PinholeCamera, table: KernelTable, config: Config, rim_share: float):
+        check_view(camera, config)
+        self._camera, self.table = camera, table
+        self.mixed_before = 0  # blocks evaluated in the frame before: the estimate for the next
+        self.views = Views(camera, config, rim_share)
+        self.hits = HitFinder(camera, table, config)
+        self._windows = WindowBuilder(camera)
+        self._max_range = config.max_range
+        self._free, self._mixed = (np.empty((ROOM, 3), np.int32) for _ in range(2))
+        self._stack = np.empty((_projective.STACK, 4), np.int32)
+
+    def candidates(
+        self, depth_m: NDArray[np.float32], ends: NDArray[np.float32], view: View
+    ) -> tuple[Windows, int, int]:
+        """List free and mixed blocks; return the window images, and how many there are of each.
+
+        ends: `depth_m`, but for pixels that see nothing: the depth up to which that is so.
+        """
+        windows, farthest = self._windows.build(ends, float(view.spread) / self._max_range)
+        if self.table.marks:
+            self._windows.build_nearest(depth_m)
+        end, nearest = np.float32(self._end_of_view(farthest)), self._windows.nearest
+        while True:
+            lists = self._stack, self._free, self._mixed
+            n_free, n_mixed = _projective.candidates(view, self.table, windows, nearest, end, *lists)
+            if n_free >= 0:
+                return windows, n_free, n_mixed
+            check_blocks(4 * len(self._free), self._camera)
+            self._free, self._mixed = (np.empty((4 * len(self._free), 3), np.int32) for _ in range(2))
+
+    def with_hits(self, n_free: int, n_mixed: int) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
+        """Return the free blocks, the mixed ones, those with hits included, and where each has its hits (-1: none)."""
+        hits = self.hits.blocks
+        most = n_mixed + len(hits)
+        if most > len(self._mixed):
+            self._mixed = np.concatenate([self._mixed, np.empty((most, 3), np.int32)])
+        hit_of, listed = np.empty(most, np.int32), np.zeros(len(hits), np.uint8)
+        n_free, n_mixed = _projective.with_hits(
+            hits.table, hits.coords, len(hits), self._free, n_free, self._mixed, n_mixed, hit_of, listed
+        )
+        return self._free[:n_free], self._mixed[:n_mixed], hit_of[:n_mixed]
+
+    def _end_of_view(self, farthest: float) -> float:
+        """Return the depth in metres beyond which this image gives no evidence."""
+        if farthest >= NO_RETURN:
+            return self._max_range
+        behind = float(self.table.reach[-1] if self.table.marks else self.table.behind)
+        return min(self._max_range, max(float(farthest), 10 * float(NEAR_PLANE)) * 1.001 + behind)
+
+
+def _eye(sensor: InverseSensorModel, config: Config, camera: PinholeCamera, rim_share: float = RIM_SHARE) -> _Eye:
+    return _Eye(camera, sensor_table(sensor, config, camera), config, rim_share)
+
+
+def _eyes_of_faces(sensor: InverseSensorModel, config: Config, camera: WideCamera) -> list[tuple[Face, _Eye]]:
+    return [(face, _eye(sensor, config, face.camera, 0.0)) for face in faces_of(camera, config)]
 
 
 class HitFinder:
-    """Keeps the memory for one camera's hits.
+    """Finds the hits of one camera, and keeps the memory for them.
 
-    blocks: what `find` found: evidence in thousandths on each cell that holds a point, 0 elsewhere; blocks count from
-    the one the camera stands in.
+    blocks: the result of `find`: evidence in thousandths on each cell that holds a point, 0 elsewhere; blocks count
+    from the one the camera stands in.
     """
 
     def __init__(self, camera: PinholeCamera, table: KernelTable, config: Config):
@@ -76,10 +188,6 @@ class HitFinder:
         return _hits.scatter(depth_m, view, *scratch, blocks.table, blocks.coords, blocks.count, blocks.values)
 
 
-LEVELS = _windows.COARSEST + 1
-"""Windows of one pixel, and of three tiles of 1 to 128 pixels."""
-
-
 class Windows(NamedTuple):
     """All window images in one; see `_windows.py`."""
 
@@ -94,7 +202,7 @@ class Windows(NamedTuple):
 
 
 class WindowBuilder:
-    """Keeps the memory for one camera's window images and fills it for each depth image."""
+    """Builds one camera's window images, and keeps the memory for them."""
 
     def __init__(self, camera: PinholeCamera):
         h, w = camera.height, camera.width
@@ -140,7 +248,7 @@ def _starts(sizes: NDArray[np.int64]) -> NDArray[np.int32]:
 def strongest(parts: Sequence[Evidence]) -> Evidence:
     """Return one frame's evidence: a cell keeps the strongest, positive before negative, of all `parts`.
 
-    Blocks that are wholly free in one part alone stay so; they are spelt out where another part has the block as well.
+    Blocks that are wholly free in one part alone stay uniform; they are expanded where another part has the block too.
     """
     if len(parts) == 1:
         return parts[0]
@@ -162,8 +270,8 @@ def strongest(parts: Sequence[Evidence]) -> Evidence:
 
 
 def _alone(parts: Sequence[Evidence]) -> tuple[NDArray[np.int32], NDArray[np.int16], list[NDArray[np.bool_]]]:
-    """Return the uniform blocks that no part spells out, each once with its strongest value, and for each part which of
-    its own others do."""
+    """Return the uniform blocks that no part expands, each once with its strongest value, and for each part a mask of
+    its own uniform blocks that another part expands."""
     spelt = np.unique(np.concatenate([part.coords for part in parts]), axis=0)
     known = {tuple(block) for block in spelt.tolist()}
     shared = [np.array([tuple(b) in known for b in part.uniform.tolist()], bool) for part in parts]
@@ -174,113 +282,3 @@ def _alone(parts: Sequence[Evidence]) -> tuple[NDArray[np.int32], NDArray[np.int
     values = np.zeros(len(alone), np.int16)
     np.minimum.at(values, of_block.ravel(), np.concatenate([part.uniform_values[~both] for part, both in pairs]))
     return alone.astype(np.int32).reshape(-1, 3), values, shared
-
-
-ROOM = 4096
-"""Blocks that a camera's lists have room for at first."""
-WORTH_A_THREAD = 256
-"""Blocks whose evaluation takes longer than it takes to wake a thread."""
-
-
-class Projective:
-    """Evidence by projection, coarse to fine. Raises ConfigError for a bad sensor model."""
-
-    def __init__(self, config: Config):
-        self._config = config
-        sensor = make_sensor(config.sensor)
-        self._eyes = PerCamera(partial(_eye, sensor, config))  # knows no `self`, which would keep itself alive
-        self._faces = PerCamera(partial(_eyes_of_faces, sensor, config))
-
-    def evidence(self, image: DepthImage) -> Evidence:
-        """Return what `image` says about the cells it sees; that of a wide camera is cut into pinhole images."""
-        if isinstance(image.camera, PinholeCamera):
-            return self._of_pinhole(self._eyes[image.camera], image, image.depth_m)
-        faces = [(eye, cut(image, face, self._config.max_range)) for face, eye in self._faces[image.camera]]
-        return strongest([self._of_pinhole(eye, face.image, face.ends) for eye, face in faces])
-
-    def _of_pinhole(self, eye: _Eye, image: DepthImage, ends: NDArray[np.float32]) -> Evidence:
-        depth_m = image.depth_m
-        view = eye.views.at(image.T_world_sensor)
-        threads = self._config.threads if eye.mixed_before >= 2 * WORTH_A_THREAD else 1
-        _, (windows, n_free, n_mixed) = together(
-            threads,
-            lambda: eye.hits.find(depth_m, view),
-            lambda: eye.candidates(depth_m, ends, view),
-        )
-        free, mixed, hit_of = eye.with_hits(n_free, n_mixed)
-        eye.mixed_before = len(mixed)
-        values = np.empty((len(mixed), CELLS), np.int16)
-        hits = eye.hits.blocks.values
-
-        def one_shard(part: slice) -> None:
-            scratch = np.empty((2, _projective.LAYER), np.float32)
-            _projective.evaluate(
-                depth_m, view, eye.table, windows, mixed[part], hit_of[part], hits, values[part], *scratch
-            )  # fmt: skip
-
-        in_shards(one_shard, shards(len(mixed), min(threads, len(mixed) // WORTH_A_THREAD or 1)))
-        free_values = np.empty(len(free), np.int16)
-        _projective.passed(view, eye.table, free, free_values)
-        origin = eye.views.block
-        return Evidence(mixed + origin, values, free + origin, free_values)
-
-
-def _eye(sensor: InverseSensorModel, config: Config, camera: PinholeCamera, rim_share: float = RIM_SHARE) -> _Eye:
-    return _Eye(camera, sensor_table(sensor, config, camera), config, rim_share)
-
-
-def _eyes_of_faces(sensor: InverseSensorModel, config: Config, camera: WideCamera) -> list[tuple[Face, _Eye]]:
-    return [(face, _eye(sensor, config, face.camera, 0.0)) for face in faces_of(camera, config)]
-
-
-class _Eye:
-    """What one camera needs: its sensor table, and memory for what its images say."""
-
-    def __init__(self, camera: PinholeCamera, table: KernelTable, config: Config, rim_share: float):
-        check_view(camera, config)
-        self._camera, self.table = camera, table
-        self.mixed_before = 0  # blocks to be evaluated in the frame before: about as much is to be done in the next
-        self.views = Views(camera, config, rim_share)
-        self.hits = HitFinder(camera, table, config)
-        self._windows = WindowBuilder(camera)
-        self._max_range = config.max_range
-        self._free, self._mixed = (np.empty((ROOM, 3), np.int32) for _ in range(2))
-        self._stack = np.empty((_projective.STACK, 4), np.int32)
-
-    def candidates(
-        self, depth_m: NDArray[np.float32], ends: NDArray[np.float32], view: View
-    ) -> tuple[Windows, int, int]:
-        """List free and mixed blocks; return the window images, and how many there are of each.
-
-        ends: `depth_m`, but for pixels that see nothing: how far that is.
-        """
-        windows, farthest = self._windows.build(ends, float(view.spread) / self._max_range)
-        if self.table.marks:
-            self._windows.build_nearest(depth_m)
-        end, nearest = np.float32(self._end_of_view(farthest)), self._windows.nearest
-        while True:
-            lists = self._stack, self._free, self._mixed
-            n_free, n_mixed = _projective.candidates(view, self.table, windows, nearest, end, *lists)
-            if n_free >= 0:
-                return windows, n_free, n_mixed
-            check_blocks(4 * len(self._free), self._camera)
-            self._free, self._mixed = (np.empty((4 * len(self._free), 3), np.int32) for _ in range(2))
-
-    def with_hits(self, n_free: int, n_mixed: int) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
-        """Return the free blocks, the mixed ones, those with hits included, and where each has its hits (-1: none)."""
-        hits = self.hits.blocks
-        most = n_mixed + len(hits)
-        if most > len(self._mixed):
-            self._mixed = np.concatenate([self._mixed, np.empty((most, 3), np.int32)])
-        hit_of, listed = np.empty(most, np.int32), np.zeros(len(hits), np.uint8)
-        n_free, n_mixed = _projective.with_hits(
-            hits.table, hits.coords, len(hits), self._free, n_free, self._mixed, n_mixed, hit_of, listed
-        )
-        return self._free[:n_free], self._mixed[:n_mixed], hit_of[:n_mixed]
-
-    def _end_of_view(self, farthest: float) -> float:
-        """Return the depth in metres beyond which this image says nothing."""
-        if farthest >= NO_RETURN:
-            return self._max_range
-        behind = float(self.table.reach[-1] if self.table.marks else self.table.behind)
-        return min(self._max_range, max(float(farthest), 10 * float(NEAR_PLANE)) * 1.001 + behind)

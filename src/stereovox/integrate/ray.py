@@ -39,67 +39,8 @@ Floats = NDArray[np.float32]
 Ints = NDArray[np.int32]
 Keys = NDArray[np.signedinteger]
 
-
-class Lanes(NamedTuple):
-    """One number a lane. Depths are along the optical axis, in metres; places in cells from the camera's block."""
-
-    depth: Floats  # measured depth, NO_RETURN for nothing up to the maximum range
-    end: Floats  # depth at which the ray ends, negative for a lane without a ray
-    entered: Floats  # depth at which the ray entered its present cell (or the depth of the sample)
-    row: Ints  # row of the sensor table
-    columns: Floats  # table columns a metre
-    x: Floats  # the face at which the ray leaves its cell along x: whole numbers, as floats because they meet floats
-    y: Floats
-    z: Floats
-    per_x: Floats  # depth one cell takes along each axis; for line drawing, cells one metre of depth takes
-    per_y: Floats
-    per_z: Floats
-    hit: Keys  # key of the cell that holds the measured point, -1 without one
-    cell: Keys  # key of the cell the ray goes into next
-    key: Keys  # key of the cell that is given evidence in this step
-    gain: Ints  # and the evidence
-    last: Ints  # whether the next lane says something else
-    run_key: Keys  # what neighbouring lanes say together, run by run
-    run_gain: Ints
-
-
-class Memory(NamedTuple):
-    """Blocks found lately, so that most need no search in the hash: (2^MEMORY_BITS,) each."""
-
-    block: NDArray[np.int64]  # key of its first cell, -1 for none
-    place: NDArray[np.int64]  # its place in the pool
-
-
-def make_lanes(wide: bool) -> Lanes:
-    """Return scratch with keys of 64 bits (`wide`) or 32 bits, which serve cells within 2^9 of the camera."""
-    types = {"Floats": np.float32, "Ints": np.int32, "Keys": np.int64 if wide else np.int32}
-    kinds = {name: getattr(kind, "__forward_arg__", kind) for name, kind in Lanes.__annotations__.items()}
-    arrays: dict[str, Any] = {name: np.full(LANES + 1, -2, types[kind]) for name, kind in kinds.items()}
-    return Lanes(**arrays)
-
-
-def make_memory() -> Memory:
-    """Return an empty memory of blocks."""
-    return Memory(*(np.full(1 << MEMORY_BITS, -1, np.int64) for _ in range(2)))
-
-
 MAX_CELL_PX = 512
-"""Pixels along a cell at a depth of one metre; of more, each would say so little that `_lanes` rounds it to nothing."""
-
-
-class _Eye(NamedTuple):
-    """What one camera needs: its sensor table, that table with both signs together, and scratch for each thread."""
-
-    table: KernelTable
-    look_up: NDArray[np.int32]
-    scratch: list[tuple[Lanes, Memory]]
-
-
-def _eye(sensor: InverseSensorModel, config: Config, camera: VirtualCamera) -> _Eye:
-    table = sensor_table(sensor, config, camera)
-    wide = uses_wide_keys(camera, config.max_range + (float(table.reach[-1]) if table.marks else 0), config)
-    scratch = [(make_lanes(wide), make_memory()) for _ in range(config.threads)]
-    return _Eye(table, (table.clear + table.mark).ravel(), scratch)
+"""Most pixels along a cell at a depth of one metre; with more, `_lanes` rounds the weight of one to nothing."""
 
 
 class Ray:
@@ -119,7 +60,7 @@ class Ray:
         self._eyes = PerCamera(partial(_eye, sensor, config))
 
     def evidence(self, image: DepthImage) -> Evidence:
-        """Return what `image` says about the cells its rays cross."""
+        """Return the evidence of `image` on the cells its rays cross."""
         config, image = self._config, self._of_countable_rays(image)
         camera = image.camera
         eye, view = self._eyes[camera], rays_of(image, config)
@@ -138,7 +79,7 @@ class Ray:
         return camera.focal_px / camera.binning * self._config.voxel_size
 
     def _of_countable_rays(self, image: DepthImage) -> DepthImage:
-        """Return the image, or its block minima where the weight of one ray were too small to be counted."""
+        """Return the image, or its block minima where the weight of one ray would be too small to count."""
         cell_px = self._cell_px(image.camera)
         if self._config.ray.update != "every" or cell_px <= MAX_CELL_PX:
             return image
@@ -178,3 +119,61 @@ class Line(Ray):
     """
 
     _kernel = staticmethod(_ray.draw)
+
+
+class _Eye(NamedTuple):
+    """Tools of one camera: its sensor table, the same with both signs together, and scratch for each thread."""
+
+    table: KernelTable
+    look_up: NDArray[np.int32]
+    scratch: list[tuple[Lanes, Memory]]
+
+
+def _eye(sensor: InverseSensorModel, config: Config, camera: VirtualCamera) -> _Eye:
+    table = sensor_table(sensor, config, camera)
+    wide = uses_wide_keys(camera, config.max_range + (float(table.reach[-1]) if table.marks else 0), config)
+    scratch = [(make_lanes(wide), make_memory()) for _ in range(config.threads)]
+    return _Eye(table, (table.clear + table.mark).ravel(), scratch)
+
+
+class Lanes(NamedTuple):
+    """State of the lanes, one number each. Depths along the optical axis in metres, places in cells from its block."""
+
+    depth: Floats  # measured depth, NO_RETURN for nothing up to the maximum range
+    end: Floats  # depth at which the ray ends, negative for a lane without a ray
+    entered: Floats  # depth at which the ray entered its present cell (or the depth of the sample)
+    row: Ints  # row of the sensor table
+    columns: Floats  # table columns a metre
+    x: Floats  # the face at which the ray leaves its cell along x: whole numbers, as floats because they meet floats
+    y: Floats
+    z: Floats
+    per_x: Floats  # depth one cell takes along each axis; for line drawing, cells one metre of depth takes
+    per_y: Floats
+    per_z: Floats
+    hit: Keys  # key of the cell that holds the measured point, -1 without one
+    cell: Keys  # key of the cell the ray goes into next
+    key: Keys  # key of the cell that is given evidence in this step
+    gain: Ints  # and the evidence
+    last: Ints  # whether the next lane differs
+    run_key: Keys  # cells and gains of runs of neighbouring lanes
+    run_gain: Ints
+
+
+class Memory(NamedTuple):
+    """Cache of recently found blocks, so that most need no hash look-up: (2^MEMORY_BITS,) each."""
+
+    block: NDArray[np.int64]  # key of its first cell, -1 for none
+    place: NDArray[np.int64]  # its place in the pool
+
+
+def make_lanes(wide: bool) -> Lanes:
+    """Return scratch with keys of 64 bits (`wide`) or 32 bits, which serve cells within 2^9 of the camera."""
+    types = {"Floats": np.float32, "Ints": np.int32, "Keys": np.int64 if wide else np.int32}
+    kinds = {name: getattr(kind, "__forward_arg__", kind) for name, kind in Lanes.__annotations__.items()}
+    arrays: dict[str, Any] = {name: np.full(LANES + 1, -2, types[kind]) for name, kind in kinds.items()}
+    return Lanes(**arrays)
+
+
+def make_memory() -> Memory:
+    """Return an empty cache of blocks."""
+    return Memory(*(np.full(1 << MEMORY_BITS, -1, np.int64) for _ in range(2)))

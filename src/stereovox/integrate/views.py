@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What kernels need to know of a camera, a pose and a sensor table, as tuples of float32 numbers and arrays."""
+"""Cameras, poses and sensor tables as kernels take them: tuples of float32 numbers and arrays; and their limits."""
 
 from __future__ import annotations
 
@@ -23,14 +23,27 @@ from stereovox.sensors.model import COLUMNS, REACH_SIGMA, InverseSensorModel, Se
 from stereovox.sensors.noise import PoseNoise, RangeNoise
 
 MAX_CAMERAS, MAX_PIXELS = 16, 1 << 26
-"""Cameras whose tools are kept, and pixels of all of them; where more come, as from a lens that zooms, all go."""
+"""Cameras whose tools are cached, and pixels of all of them; beyond, as with a zoom lens, the cache is emptied."""
+WINDOW_SHARE = 0.27
+"""Tile size of a cell's window image over the cell's size in the image; a window is three tiles wide.
 
+Chosen so that a cell is cleared when any ray through it goes on, as exact ray casting does (see docs/integrators.md).
+"""
+RIM_SHARE = 0.35
+"""`rim_share` of the image of a pinhole camera."""
+MIN_BLOCKS, BLOCKS_PER_PIXEL = 1 << 18, 32
+"""Blocks that a camera with any image may see, and more for each pixel."""
+MAX_BLOCKS = 1 << 21
+"""Most blocks of one frame: 10^9 cells. Their places fit into 22 bits (`_hits.scatter`)."""
+CURE = "check the camera's size and focal length, lower max_range, or use larger cells"
+CELL_CENTRES = (np.stack([axis.ravel() for axis in np.mgrid[:SIDE, :SIDE, :SIDE]]) + 0.5).astype(np.float32)
+"""(3, 512) centres of a block's cells from its corner, in cells."""
 Camera = TypeVar("Camera", bound=VirtualCamera)
 Tools = TypeVar("Tools")
 
 
 class PerCamera(Generic[Camera, Tools]):
-    """Makes the tools for a camera when it is first seen, and keeps them."""
+    """Cache of the tools for each camera, made when the camera is first seen."""
 
     def __init__(self, make: Callable[[Camera], Tools]):
         self._make = make
@@ -47,36 +60,18 @@ class PerCamera(Generic[Camera, Tools]):
         return tools
 
 
-WINDOW_SHARE = 0.27
-"""Tile size of a cell's window image over the cell's size in the image; a window is three tiles wide.
-
-Chosen so that a cell is cleared when any ray through it goes on, as exact ray casting does (see docs/integrators.md).
-"""
-RIM_SHARE = 0.35
-"""`rim_share` of the image of a pinhole camera."""
-
-MIN_BLOCKS, BLOCKS_PER_PIXEL = 1 << 18, 32
-"""Blocks that a camera may see however small its image, and for each pixel: an image of a few can tell of no more."""
-MAX_BLOCKS = 1 << 21
-"""Blocks that one frame may tell of: a thousand million cells. Their places fit into 22 bits (`_hits.scatter`)."""
-CURE = "check the camera's size and focal length, lower max_range, or use larger cells"
-
-CELL_CENTRES = (np.stack([axis.ravel() for axis in np.mgrid[:SIDE, :SIDE, :SIDE]]) + 0.5).astype(np.float32)
-"""(3, 512) centres of a block's cells from its corner, in cells."""
-
-
 class KernelTable(NamedTuple):
     """A sensor table in whole thousandths of log-odds, split by sign."""
 
     clear: NDArray[np.int32]  # (rows, columns) negative evidence, 0 elsewhere; column 0 exactly the free value
     mark: NDArray[np.int32]  # (rows, columns) positive evidence beside the hit, 0 elsewhere
     hit: NDArray[np.int32]  # (rows,) evidence of the cell that holds the measured point
-    passed: NDArray[np.int32]  # (rows,) most that a cell at the row's depth loses when it is looked through; negative
+    passed: NDArray[np.int32]  # (rows,) largest loss of a cell at the row's depth that is looked through; negative
     columns_per_metre: NDArray[np.float32]  # (rows,) table columns one metre spans
     reach: NDArray[np.float32]  # (rows,) half width of the table in metres
-    safe: NDArray[np.float32]  # (rows + 1,) nearest z that any later row does not call wholly free
-    before: NDArray[np.float32]  # (rows,) cells at z up to the row's end are wholly free so far before a measurement
-    behind: np.float32  # metres behind a measurement from which on there is no negative evidence
+    safe: NDArray[np.float32]  # (rows + 1,) nearest z that is not plainly free for some later row
+    before: NDArray[np.float32]  # (rows,) cells at z up to the row's end are plainly free this far before a measurement
+    behind: np.float32  # metres behind a measurement where negative evidence ends
     rows_per_metre: np.float32
     blind: np.float32  # depth in metres up to which nothing is cleared
     free: np.int32  # evidence far before a measurement, where `passed` allows it
@@ -157,8 +152,8 @@ def _before(edges: NDArray[np.float64], reach: NDArray[np.float64]) -> NDArray[n
 
 
 def _behind(clear: NDArray[np.int32], reach: NDArray[np.float64]) -> np.float32:
-    said = clear != 0
-    last = np.where(said.any(axis=1), COLUMNS - np.argmax(said[:, ::-1], axis=1), 0)  # columns from the first
+    clears = clear != 0
+    last = np.where(clears.any(axis=1), COLUMNS - np.argmax(clears[:, ::-1], axis=1), 0)  # columns from the first
     return np.float32(max(1.001 * ((last / COLUMNS - 0.5) * 2 * reach).max(), 0))
 
 
@@ -229,10 +224,10 @@ def check_view(camera: VirtualCamera, config: Config) -> None:
 
 
 def check_blocks(blocks: int, camera: VirtualCamera) -> None:
-    """Raise FrameRefused `view_too_large` where one frame tells of more blocks than can be kept, or befit its image."""
+    """Raise FrameRefused `view_too_large` for evidence on more blocks than can be kept, or than fit the image."""
     most = min(MAX_BLOCKS, _fitting_blocks(camera))
     if blocks > most:
-        raise FrameRefused("view_too_large", f"the frame tells of more than {CELLS * most:.2g} cells: {CURE}")
+        raise FrameRefused("view_too_large", f"the frame has evidence on more than {CELLS * most:.2g} cells: {CURE}")
 
 
 def _fitting_blocks(camera: VirtualCamera) -> int:
@@ -240,14 +235,14 @@ def _fitting_blocks(camera: VirtualCamera) -> int:
 
 
 def uses_wide_keys(camera: VirtualCamera, reach: float, config: Config) -> bool:
-    """Tell whether cells that a camera sees at depths up to `reach` metres need keys of 64 bits.
+    """Return whether cells that a camera sees at depths up to `reach` metres need keys of 64 bits.
 
-    Raises FrameRefused `bad_camera` where these would not do either.
+    Raises FrameRefused `bad_camera` where these do not suffice either.
     """
     cells = farthest_cells(camera, reach, config)
     if cells >= 1 << (_cells.WIDE - 1):
-        said = f"the camera's view and noise reach {cells:.2g} cells far, more than can be counted"
-        raise FrameRefused("bad_camera", f"{said}: check focal length and baseline, or use larger cells")
+        detail = f"the camera's view and noise reach {cells:.2g} cells far, more than can be counted"
+        raise FrameRefused("bad_camera", f"{detail}: check focal length and baseline, or use larger cells")
     return cells >= 1 << (_cells.NARROW - 1)
 
 

@@ -16,7 +16,7 @@ from stereovox.localize.amcl.models import DistanceField, distance_field
 from stereovox.localize.scan_beams import beams_of
 from stereovox.localize.track import Track
 from stereovox.maps.occupancy import UNKNOWN, OccupancyGrid
-from stereovox.trust.validate import sound
+from stereovox.trust.validate import validate_scan
 
 NEAR = 0.25
 """Metres from an obstacle of the map within which a beam fits."""
@@ -47,7 +47,7 @@ def _spread(count: int) -> list[int]:
 
 def _distances(field: DistanceField, scan: Scan, track: Track) -> np.ndarray:
     try:
-        beams = beams_of(sound(scan, RIGID)).some(BEAMS, hits_only=True)
+        beams = beams_of(validate_scan(scan, RIGID)).some(BEAMS, hits_only=True)
     except FrameRefused:
         return np.empty(0)
     pose = se2.compose(track.correction(scan.stamp_ns), scan.pose_world_base)

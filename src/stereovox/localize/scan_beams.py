@@ -51,7 +51,7 @@ def beams_of(scan: Scan, max_range: float | None = None) -> Beams:
     """Return what a scan says: NaN, -inf and what lies below `range_min` say nothing, +inf that nothing was met.
 
     max_range: metres beyond which nothing counts as met; None: the scan's own.
-    The scan must be `sound`. Raises FrameRefused with the reason: `bad_scan`, `no_valid_range`.
+    The scan must be `validate_scan`. Raises FrameRefused with the reason: `bad_scan`, `no_valid_range`.
     """
     ranges, farthest = np.asarray(scan.ranges, float), _farthest(scan, max_range)
     known = (ranges >= scan.range_min) & (ranges > 0)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Inverse sensor models: what a measured depth says about a point before, at or behind it. Plain NumPy."""
+"""Inverse sensor models: the occupancy that a measured depth implies before, at and behind it. Plain NumPy."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SENSORS = {
 
 
 def make_sensor(config: SensorConfig) -> InverseSensorModel:
-    """Return the model that `config` names, made with its parameters. Raises ConfigError, one line."""
+    """Return the configured sensor model. Raises ConfigError for an unknown model or parameter."""
     model = registry.find("sensors", SENSORS, config.model)
     parameters = config.parameters()
     known = {field.name for field in fields(model)}

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The constant hit / miss model, as OctoMap has it."""
+"""The constant hit / miss model of OctoMap."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from stereovox.sensors.model import Array
 
 @dataclass(frozen=True)
 class Constant:
-    """The measured point is occupied with `p_hit`, everything before it with `p_free`; behind it nothing is said.
+    """`p_hit` at the measured point, `p_free` before it, `p_unknown` behind it, whatever the noise.
 
-    Defaults are OctoMap's (Hornung et al. 2013). Noise plays no part.
+    Defaults are OctoMap's (Hornung et al. 2013).
     """
 
     p_hit: float = 0.7

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an inverse sensor model is, and how it becomes the table that kernels read."""
+"""The protocol of inverse sensor models, and the table that kernels read in their place."""
 
 from __future__ import annotations
 
@@ -22,19 +22,22 @@ REACH_SIGMA = 4.0
 """The table ends this many sigma before and behind the measurement; beyond it the model is p_free or p_unknown."""
 
 FAR_SIGMA = 12.0
-"""So far from a measurement a model must have come to p_free and p_unknown."""
+"""Distance from a measurement at which a model must have reached p_free and p_unknown."""
 END_TOLERANCE = 0.02
-"""How far it may still be from them there."""
+"""Largest deviation from them there."""
 
 
 class InverseSensorModel(Protocol):
-    """A sensor model: a dataclass of numbers with one function. Write one in plain NumPy and register it.
+    """An inverse sensor model: a dataclass of numbers with one function. Write it in plain NumPy and register it.
 
-    `p_free` is what the model says far before a measurement, `p_unknown` what it says far behind one. What it says of
-    the cell that holds the measured point is `probability` at that point; a model that knows better, since a cell has
-    a size, has another function `hit(z_measured, sigma, voxel_size)`. And where a cell that is looked through must not
-    lose as much as p_free says, since what stands in it may be thinner than a pixel, a function `passed(z, sigma,
-    voxel_size)` returns the least probability for it, by the depth of the cell.
+    The cell that holds the measured point gets `probability` at that point. Two optional methods refine this:
+    `hit(z_measured, sigma, voxel_size)` returns the probability of that cell instead, for models that consider its
+    size; `passed(z, sigma, voxel_size)` returns the least probability of a cell at depth `z` that is looked through,
+    where that must stay above p_free, since an object in it may be thinner than a pixel.
+
+    Attributes:
+        p_free: Probability of occupancy far before a measurement.
+        p_unknown: Probability of occupancy far behind one.
     """
 
     @property
@@ -48,20 +51,26 @@ class InverseSensorModel(Protocol):
         ...
 
     def probability(self, z: Array, z_measured: Array, sigma: Array) -> Array:
-        """Return p(occupied) of points at depth `z` on a ray that measured `z_measured` with noise `sigma`.
+        """Return the probability of occupancy of points on a ray. All arguments broadcast.
 
-        All in metres along the ray's depth axis, any shapes that broadcast. Strictly inside (0, 1).
+        Args:
+            z: Depth of the points in metres.
+            z_measured: Measured depth in metres.
+            sigma: Standard deviation of the measurement in metres.
+
+        Returns:
+            p(occupied), strictly inside (0, 1).
         """
         ...
 
 
 @dataclass(frozen=True, eq=False)
 class SensorTable:
-    """A sensor model as numbers.
+    """A tabulated sensor model.
 
     log_odds: (ROWS, COLUMNS) of a point at `z = z_measured + offset_sigma[column] * sigma[row]`; p_unknown is 0.
     hit: (ROWS,) log-odds of the cell that holds the measured point.
-    passed: (ROWS,) least log-odds, not positive, of a cell at the row's depth that is looked through.
+    passed: (ROWS,) least log-odds, at most 0, of a cell at the row's depth that is looked through.
     sigma: (ROWS,) noise in metres; row r stands for measured depths around `(r + 0.5) / rows_per_metre`.
     """
 
@@ -79,19 +88,19 @@ def tabulate(
     voxel_size: float = 0.05,
     pose_noise: PoseNoise | None = None,
 ) -> SensorTable:
-    """Return `model` as a table for measured depths up to `max_range` metres and cells of `voxel_size` metres.
+    """Tabulate `model` for measured depths up to `max_range` metres and cells of `voxel_size` metres.
 
-    Evidence is log(p / (1 - p)) less that of p_unknown (Valenti 2018, Eq 6.2: the prior is not counted twice). Noise
-    counts up to `max_range`, so that no ray is followed farther than 1 + REACH_SIGMA times as far. Where poses are
-    noisy a hit is as wide as they and the range noise make it together.
-    Raises ConfigError when the model leaves (0, 1), or does not come to p_free and p_unknown far off.
+    Evidence is log(p / (1 - p)) minus that of p_unknown (Valenti 2018, Eq 6.2: the prior is not counted twice). Sigma
+    is capped at `max_range`, so that no ray is followed farther than 1 + REACH_SIGMA times that. With noisy poses, the
+    width of a hit combines pose and range noise.
+    Raises ConfigError when the model leaves (0, 1), or does not reach p_free and p_unknown far off.
     """
     z_measured: Array = (np.arange(ROWS, dtype=float) + 0.5) * (max_range / ROWS)
-    sigma = np.clip(noise.sigma(z_measured), 1e-6, max_range)  # one that is noisier could be anywhere, too
+    sigma = np.clip(noise.sigma(z_measured), 1e-6, max_range)  # a noisier one could be anywhere as well
     z = z_measured[:, None] + offset_sigma() * sigma[:, None]
     _check_ends(model, z_measured, sigma)
     log_odds = _log_odds(model, model.probability(z, z_measured[:, None], sigma[:, None]))
-    log_odds[:, -1] = 0  # what lies farther behind is looked up there, and nothing is said about it
+    log_odds[:, -1] = 0  # looked up for everything farther behind, which gets no evidence
     at = model.probability(z_measured, z_measured, sigma)
     width = sigma if pose_noise is None else np.hypot(sigma, pose_noise.sigma(z_measured))
     hit = _log_odds(model, model.hit(z_measured, width, voxel_size) if hasattr(model, "hit") else at)  # pyright: ignore

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How uncertain a measured depth is."""
+"""Noise of measured depths and of poses."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from stereovox.cameras.wide import SphericalCamera
 from stereovox.config import NoiseConfig
 
 SUBPIXEL = 0.08
-"""Noise in pixels of a camera nothing is known of: that of a RealSense D435 (Chien 2020, 2.2.4)."""
+"""Default disparity noise in pixels: that of a RealSense D435 (Chien 2020, 2.2.4)."""
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class RangeNoise:
     def of(cls, config: NoiseConfig, camera: VirtualCamera) -> RangeNoise:
         """Return the configured noise; where s2 is not set, that of the camera's stereo geometry.
 
-        s2 = subpixel / (focal_px * baseline): Chien 2020, Eq 3.5 with the square that print lacks (Alg 3 has it), which
+        s2 = subpixel / (focal_px * baseline): Chien 2020, Eq 3.5 with the square missing in print (Alg 3 has it), which
         is also Valenti 2018, Eq 6.9. A spherical camera has subpixel * baseline / focal_px more at every depth: Eq 6.11
         in 6.10, with 1 / focal_px for the angle of a pixel. That holds at the middle of its rows; towards the sides
         the noise grows (`stereovox.depth.stereo.reproject`), which the thesis leaves out as well.
@@ -56,7 +56,7 @@ class PoseNoise:
     angle: float
 
     def sigma(self, z: ArrayLike) -> NDArray[np.float64]:
-        """Return by how many metres a point at depth `z` is moved along each axis."""
+        """Return the standard deviation in metres, along each axis, of a point at depth `z`."""
         return np.hypot(self.position, self.angle * np.asarray(z, float))
 
     @classmethod

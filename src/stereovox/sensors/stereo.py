@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The default model: hits count by how surely they belong into their cell, and clearing counts less than they do."""
+"""The default model: a hit counts by the probability that it lies in its cell; clearing counts less than hits."""
 
 from __future__ import annotations
 
@@ -13,20 +13,19 @@ from stereovox.sensors.model import Array
 
 @dataclass(frozen=True)
 class Stereo:
-    """A model that knows the range noise of stereo, and that cells have a size.
+    """A model of stereo's range noise and of the size of cells.
 
-    Within `fade` sigma of the range noise before the measured point nothing is said, and from there on the evidence for
-    free space grows like a Gaussian falls: a surface that is measured too far does not clear itself away, and neither
-    does a pole that the camera cannot tell from the wall behind it. Behind the point nothing is said either, so walls
-    do not grow thick (the weakness of Valenti 2018, section 8.4).
+    Within `fade` sigma of the range noise before the measured point there is no evidence; from there towards the camera
+    the evidence for free space grows as a Gaussian falls: a surface measured too far does not clear itself, nor does
+    a pole that the camera cannot separate from the wall behind it. Behind the point there is no evidence either, so
+    walls do not grow thick (the weakness of Valenti 2018, section 8.4).
 
-    The cell that holds the measured point is occupied as surely as the point is right (`p_right`) and its noise leaves
-    it in this cell, and with `p_least` however wide the noise is. This probability is turned into evidence against
-    cells being occupied with `prior` before, and `trust` of it is taken, since the errors of one frame are found again
-    in the next.
+    The cell that holds the measured point is occupied with the probability that the point is right (`p_right`) and that
+    its noise leaves it in this cell, but at least with `p_least`. It becomes evidence relative to `prior`, of which
+    the share `trust` is taken, since the errors of one frame recur in the next.
 
-    A cell that is looked through loses no more than `passes` of what a hit at its depth would give: of a pole thinner
-    than a pixel most frames see only what is behind it, and the frames that do see it must not be outvoted.
+    A cell that is looked through loses at most the share `passes` of what a hit at its depth would give: most frames
+    see only what is behind a pole thinner than a pixel, and must not outvote the frames that do see it.
     """
 
     p_right: float = 0.95
@@ -45,19 +44,19 @@ class Stereo:
         return np.where(t < 0, before, self.p_unknown)
 
     def hit(self, z_measured: Array, sigma: Array, voxel_size: float) -> Array:
-        """Return the probability of the cell that holds the measured point, for even odds before; at least p_least."""
+        """Return the probability of the cell that holds the measured point, at even prior odds; at least p_least."""
         p = self.p_right * _stays(np.asarray(sigma) / voxel_size)
         evidence = self.trust * (np.log(p / (1 - p)) - np.log(self.prior / (1 - self.prior)))
         return np.maximum(1 / (1 + np.exp(-evidence)), self.p_least)
 
     def passed(self, z: Array, sigma: Array, voxel_size: float) -> Array:
-        """Return the least probability of a cell at depth `z` that is looked through, for even odds before."""
+        """Return the least probability of a cell at depth `z` that is looked through, at even prior odds."""
         hit = self.hit(z, sigma, voxel_size)
         return 1 / (1 + (hit / (1 - hit)) ** self.passes)
 
 
 def _stays(ratio: Array) -> Array:
-    """Return how likely noise of `ratio` cells leaves a point in its cell, wherever in the cell it is.
+    """Return the probability that noise of `ratio` cells leaves a point in its cell, averaged over the cell.
 
     The mean of Phi((1 - x) / r) - Phi(-x / r) over x from 0 to 1.
     """

@@ -15,7 +15,7 @@ class Valenti:
     """Two half Gaussians that meet at the measurement (Valenti 2018, Eq 6.4 to 6.6).
 
     `sigma` is the thesis's dz; for a pinhole camera Eq 6.9 gives it: z^2 / (B f) * disparity noise, which is
-    `RangeNoise.of(...)`. `k` (0 to 1) says how much a measurement matters.
+    `RangeNoise.of(...)`. `k` (0 to 1) is the weight of a measurement.
     """
 
     k: float = 0.75

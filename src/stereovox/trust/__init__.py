@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether a frame may change the map, and what is remembered of those before it."""
+"""Which frames may change the map: validation, the gate, the frame history and health."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The way that cameras went while they made a map: as many of their poses as are worth to be drawn."""
+"""The path of the cameras that made a map, thinned to what is worth drawing."""
 
 from __future__ import annotations
 
@@ -15,16 +15,17 @@ from numpy.typing import NDArray
 from stereovox.se3 import Transform, apart
 
 SPACING_M = 0.05
-"""A pose is kept when the camera moved so far, or turned by twice as many radians, since the last one."""
+"""A pose is kept when the camera has moved this far, or turned by twice as many radians, since the last one."""
 MAX_STOPS = 2048
-"""Poses that are kept of all sensors; where there are more, the spacing doubles."""
+"""Poses kept of all sensors together; when there are more, the spacing doubles."""
 FARTHEST = 1e7
-"""No number of a pose is larger; `depth.prepare` refuses positions beyond a tenth of it."""
+"""Bound of all numbers of a pose; frames with positions beyond a tenth of it are refused."""
 POSE = 12
+"""Numbers of a pose."""
 
 
 class Seen(NamedTuple):
-    """Where a sensor was and when: pose is the 12 numbers of the upper three rows of T_world_sensor, row by row."""
+    """Pose of a sensor at a time: the 12 numbers of the upper three rows of T_world_sensor, row by row."""
 
     stamp_ns: int
     pose: tuple[float, ...]
@@ -32,17 +33,17 @@ class Seen(NamedTuple):
 
 @dataclass
 class CameraPath:
-    """Poses along the way of each sensor, in the order in which the map took their frames in.
+    """Poses along the path of each sensor, in the order in which their frames entered the map.
 
-    spacing: metres between two poses, at least, and half of the radians. stops: by sensor; numbers are rounded to
-    float32, as they are saved.
+    spacing: least metres between two poses, and half the least radians. stops: poses by sensor, rounded to float32 as
+    they are saved.
     """
 
     spacing: float = SPACING_M
     stops: dict[str, list[Seen]] = field(default_factory=dict)
 
     def walk(self, sensor: str, seen: Seen) -> None:
-        """Keep a pose, if it is far enough from the last one of its sensor."""
+        """Add a pose if it is far enough from the last one of its sensor."""
         stops = self.stops.setdefault(sensor, [])
         if stops and not self._is_far(stops[-1], seen):
             return
@@ -58,7 +59,7 @@ class CameraPath:
         return matrices
 
     def until(self, stamp_ns: float = inf) -> list[tuple[str, Transform]]:
-        """Return sensor and pose (4, 4) of each stop up to a time in nanoseconds, one sensor after the other."""
+        """Return sensor and T_world_sensor (4, 4) of each pose up to a time in nanoseconds, sensor by sensor."""
         return [
             (sensor, pose)
             for sensor, stops in self.stops.items()
@@ -67,7 +68,7 @@ class CameraPath:
         ]
 
     def saved(self) -> dict[str, Any]:
-        """Return what `loaded` reads, as plain values for JSON; numbers are packed, little-endian, in base64."""
+        """Return plain values for JSON, which `loaded` reads; numbers are packed, little-endian, in base64."""
         return {
             "spacing": self.spacing,
             "stops": {
@@ -81,7 +82,7 @@ class CameraPath:
 
     @classmethod
     def loaded(cls, saved: Any) -> CameraPath:
-        """Return a path that was saved. Raises KeyError, TypeError or ValueError for what cannot have been saved."""
+        """Return a saved path. Raises KeyError, TypeError or ValueError for what cannot have been saved."""
         spacing = float(saved["spacing"])
         if not SPACING_M <= spacing < FARTHEST:
             raise ValueError(f"camera_path: spacing {spacing:g}")
@@ -102,7 +103,7 @@ class CameraPath:
         return kept
 
     def __deepcopy__(self, memo: Any) -> CameraPath:
-        """Return a path that goes on by itself; its poses never change."""
+        """Return an independent copy; the poses themselves never change."""
         return CameraPath(self.spacing, {sensor: stops.copy() for sensor, stops in self.stops.items()})
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether a map is current: how old the last trusted frame is, and how frames fared lately."""
+"""The health of a map: the age of its last trusted frame, and what became of recent frames."""
 
 from __future__ import annotations
 
@@ -11,24 +11,28 @@ from typing import Any, Literal
 from stereovox.config import Config
 from stereovox.threads import MapLock
 
-MOST = 1000
-"""Frames that are looked back at."""
+MAX_FRAMES = 1000
+"""Recent frames that are remembered."""
 FULL = "full"
+"""Name of the quality level that leaves nothing out."""
 State = Literal["waiting", "current", "degraded", "stale", "lost"]
 
 
 @dataclass(frozen=True)
 class Health:
-    """How far a map can be relied on now.
+    """How current a map is.
 
-    state: `waiting`: no trusted frame yet; `current`; `degraded`: frames were lately refused or looked at less
-        thoroughly, or one of several sensors is silent; `stale`, `lost`: no trusted frame for longer than
-        `trust.stale_s`, `trust.lost_s`.
-    age_s: seconds since the last trusted frame arrived; None while waiting. ages_s: the same for each sensor.
-    stamp_ns: time of the last trusted frame by its own clock; None while waiting.
-    frames: frames offered within the last `trust.lost_s` seconds. refused: how many of them were refused, by reason.
-    reduced: how many were looked at less thoroughly, by the name of the way.
-    text: the same in one line.
+    Attributes:
+        state: `waiting`: no trusted frame yet. `current`. `degraded`: recent frames were refused or used at reduced
+            quality, or one of several sensors is silent. `stale`, `lost`: no trusted frame for longer than
+            `trust.stale_s`, `trust.lost_s`.
+        age_s: Seconds since the last trusted frame arrived; None while waiting.
+        ages_s: The same for each sensor.
+        stamp_ns: Time of the last trusted frame by its own clock, in nanoseconds; None while waiting.
+        frames: Frames offered within the last `trust.lost_s` seconds.
+        refused: How many of these were refused, by reason.
+        reduced: How many of these were used at reduced quality, by quality level.
+        text: All of it in one line.
     """
 
     state: State
@@ -42,16 +46,20 @@ class Health:
 
     @property
     def refused_share(self) -> float:
-        """Share of the frames of late that were refused, 0 to 1."""
+        """Share of the recent frames that were refused, 0 to 1."""
         return sum(self.refused.values()) / max(self.frames, 1)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return all that as plain values, for JSON."""
+        """Return all values as plain types for JSON.
+
+        Returns:
+            The attributes by name, and `refused_share`.
+        """
         return {**asdict(self), "refused_share": self.refused_share}
 
 
-class Onward:
-    """A clock that goes on where the one that it reads was set back; after a step forward it is ahead as well."""
+class MonotonicClock:
+    """A clock that never goes back: it continues where the clock it reads was set back."""
 
     def __init__(self, clock: Callable[[], int]):
         self._clock, self._lock = clock, MapLock()
@@ -59,7 +67,7 @@ class Onward:
         self._ahead_ns = 0
 
     def __call__(self, reading_ns: int | None = None) -> int:
-        """Return nanoseconds now, or at a reading of the clock as it goes now."""
+        """Return nanoseconds now, or those that correspond to a reading of the underlying clock."""
         if reading_ns is not None:
             return reading_ns + self._ahead_ns
         with self._lock:
@@ -69,40 +77,40 @@ class Onward:
             return now + self._ahead_ns
 
 
-class Watch:
-    """Sees every frame arrive. clock: nanoseconds now; one that is set back makes no frame younger than it was."""
+class HealthMonitor:
+    """Records when each frame arrived and what became of it. clock: nanoseconds now; it may be set back."""
 
     def __init__(self, config: Config, clock: Callable[[], int]):
-        self.now = Onward(clock)
+        self.now = MonotonicClock(clock)
         self._stale_ns, self._lost_ns = round(1e9 * config.trust.stale_s), round(1e9 * config.trust.lost_s)
         self._arrivals: dict[str, int] = {}
         self._stamp_ns: int | None = None
-        self._lately: deque[tuple[int, str, str]] = deque(maxlen=MOST)  # arrival, why it was refused, way
+        self._recent: deque[tuple[int, str, str]] = deque(maxlen=MAX_FRAMES)  # arrival, refusal, quality
 
-    def took(self, arrived_ns: int, sensor: str, stamp_ns: int, way: str) -> None:
-        """Note a frame that the map took in; arrived_ns: by `now`."""
+    def accept(self, arrived_ns: int, sensor: str, stamp_ns: int, quality: str) -> None:
+        """Record a frame that the map took in; arrived_ns: by `now`."""
         self._arrivals[sensor] = arrived_ns
         self._stamp_ns = stamp_ns
-        self._lately.append((arrived_ns, "", way))
+        self._recent.append((arrived_ns, "", quality))
 
-    def refused(self, arrived_ns: int, reason: str) -> None:
-        """Note a frame that was refused."""
-        self._lately.append((arrived_ns, str(reason), FULL))
+    def refuse(self, arrived_ns: int, reason: str) -> None:
+        """Record a frame that was refused."""
+        self._recent.append((arrived_ns, str(reason), FULL))
 
     def health(self, now_ns: int | None = None) -> Health:
-        """Return how things stand at `now_ns` by the clock; None: now."""
+        """Return the health at `now_ns` by the clock; None: now."""
         now = self.now(now_ns)
         ages = {sensor: now - arrived for sensor, arrived in self._arrivals.copy().items()}  # another thread may add
-        lately = [(why, way) for arrived, why, way in self._lately.copy() if now - arrived <= self._lost_ns]
-        refused = Counter(why for why, _ in lately if why)
-        reduced = Counter(way for _, way in lately if way != FULL)
+        recent = [(why, quality) for arrived, why, quality in self._recent.copy() if now - arrived <= self._lost_ns]
+        refused = Counter(why for why, _ in recent if why)
+        reduced = Counter(quality for _, quality in recent if quality != FULL)
         age = min(ages.values(), default=None)
         silent = {sensor: ns for sensor, ns in ages.items() if ns > self._stale_ns}
         state = self._state(age, bool(refused or reduced or silent))
-        text = _text(state, age, len(lately), refused, reduced, silent)
+        text = _text(state, age, len(recent), refused, reduced, silent)
         seconds = {sensor: ns / 1e9 for sensor, ns in ages.items()}
         return Health(
-            state, None if age is None else age / 1e9, seconds, self._stamp_ns, len(lately), dict(refused),
+            state, None if age is None else age / 1e9, seconds, self._stamp_ns, len(recent), dict(refused),
             dict(reduced), text,
         )  # fmt: skip
 
@@ -122,10 +130,10 @@ def _text(
     parts = ["no trusted frame yet" if age_ns is None else f"last trusted frame {age_ns / 1e9:.2f} s ago"]
     for word, counts in (("refused", refused), ("looked at less thoroughly", reduced)):
         if counts:
-            told = ", ".join(f"{number} x {name}" for name, number in counts.most_common(3))
+            listed = ", ".join(f"{number} x {name}" for name, number in counts.most_common(3))
             others = counts.total() - sum(number for _, number in counts.most_common(3))
-            told += f", {others} x other" if others else ""
-            parts.append(f"{counts.total()} of {frames} frames {word} ({told})")
+            listed += f", {others} x other" if others else ""
+            parts.append(f"{counts.total()} of {frames} frames {word} ({listed})")
     if state == "degraded":
         parts += [f"sensor '{sensor}' silent for {ns / 1e9:.2f} s" for sensor, ns in list(silent.items())[:3]]
     return f"{state}: {'; '.join(parts)}"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a map remembers of the frames that made it: how many, which were refused and why, and whom it trusted last."""
+"""The frame history of a map: how many it holds, which were refused and why, and each sensor's last trusted frame."""
 
 from __future__ import annotations
 
@@ -17,19 +17,21 @@ from stereovox.trust.camera_path import FARTHEST, CameraPath
 from stereovox.trust.camera_path import Seen as Seen
 
 MAX_SENSORS = 64
-"""Sensors that one map tells apart."""
+"""Sensors that one map distinguishes."""
 MAX_REASONS = 256
-"""Words that refusals are counted by; further ones count as OTHERS."""
+"""Reasons that refusals are counted by; further ones count as OTHERS."""
 OTHERS = "others"
-NOT_TOLD = "not_told"
-"""How refusals are counted that a map from before reasons were saved only tells the number of."""
+NOT_RECORDED = "not_told"
+"""Reason for the refusals in old maps that saved only their number."""
 MAX_NAME_LENGTH = 256
 EARLIEST, LATEST = -(2**63), 2**63 - 1
-"""Stamps in int64 nanoseconds."""
+"""Range of stamps in int64 nanoseconds."""
+CHANGED, MOVED = "changed", "moved"
+"""Verdicts on frames that disagree with the map: the world has changed, or the camera was moved."""
 
 
 class Streak(NamedTuple):
-    """Refused frames of one sensor that agree with each other: why the first one was, its stamp, and the last one."""
+    """Refused frames of one sensor that agree with each other: reason and stamp of the first one, and the last one."""
 
     why: str
     since_ns: int
@@ -37,33 +39,28 @@ class Streak(NamedTuple):
 
 
 class Look(NamedTuple):
-    """The last image of a sensor: a checksum, and the pose that it was first seen at, as in `Seen`."""
+    """The last image of a sensor: its checksum and the pose it was first seen at, as in `Seen`."""
 
     digest: int
     pose: tuple[float, ...]
 
 
-class Usual(NamedTuple):
-    """How far the frames of a sensor disagree with the map, 0 to 1: their mean, and how far they are from it."""
+class RunningMean(NamedTuple):
+    """Exponential mean of how far a sensor's frames disagree with the map, 0 to 1, and of the distance from it."""
 
     mean: float
     spread: float
 
-    def after(self, share: float, gain: float) -> Usual:
-        """Return both after one more frame; gain: its part."""
+    def updated(self, share: float, gain: float) -> RunningMean:
+        """Return both after one more frame, which counts with weight `gain`."""
         off = share - self.mean
-        return Usual(self.mean + gain * off, self.spread + gain * (abs(off) - self.spread))
-
-
-CHANGED, MOVED = "changed", "moved"
-"""Why frames disagree with the map: the world has changed, or the camera was moved."""
+        return RunningMean(self.mean + gain * off, self.spread + gain * (abs(off) - self.spread))
 
 
 class Doubt(NamedTuple):
-    """Frames of one sensor that disagree with the map: stamps of the first and the last one, and how many came after
-    the first.
+    """Frames of one sensor that disagree with the map: stamps of the first and the last, and how many follow the first.
 
-    fits: how many of them would agree if the camera stood elsewhere. verdict: CHANGED or MOVED; "" while they wait.
+    fits: how many of them would agree from another pose. verdict: CHANGED or MOVED; "" while it is open.
     """
 
     since_ns: int
@@ -77,22 +74,27 @@ class Doubt(NamedTuple):
         return self._replace(last_ns=stamp_ns, frames=self.frames + 1)
 
     def lasted_ns(self, untimed_hz: float) -> int:
-        """Return how long it has lasted; where stamps stand still, or went back, at so many frames a second."""
+        """Return how long it has lasted; `untimed_hz` is the frame rate where stamps stand still or went back."""
         return self.last_ns - self.since_ns if self.last_ns > self.since_ns else round(1e9 * self.frames / untimed_hz)
 
 
 @dataclass
 class History:
-    """What a map remembers of its frames; saved and loaded with it, so that a run may stop and go on anywhere.
+    """Everything a map remembers of its frames; saved with it, so that a run can stop and resume anywhere.
 
-    frames: how many are in the map. refused: how many were offered and refused, by reason. settled: how often frames
-    were believed again after a jump, a reset or a disagreement, by its reason. ways: how many frames were looked at how
-    thoroughly, by the name of the way. recording: the name of what the frames came from, if known. last_frame: name and
-    stamp of the one that was offered last.
-    trusted: the last trusted frame of each sensor. waiting: refused frames that may yet be believed, by sensor.
-    path: the way that the sensors of the frames in the map went.
-    looks: the last image of each camera. usual: how far the frames of each camera disagree with the map, 0 to 1.
-    doubts: cameras whose last frames disagree with it more than that.
+    Attributes:
+        frames: Number of frames in the map.
+        refused: Number of refused frames, by reason.
+        settled: How often frames were accepted again after a jump, a reset or a disagreement, by its reason.
+        ways: Number of frames by quality level (`full`, `near`, `coarse`).
+        recording: Name of the recording, if known.
+        last_frame: Name and stamp of the frame offered last.
+        trusted: Last trusted frame of each sensor.
+        waiting: Refused frames that may yet be accepted, by sensor.
+        path: Poses of the sensors.
+        looks: Last image of each camera.
+        usual: Usual disagreement with the map of each camera's frames, 0 to 1.
+        doubts: Cameras whose last frames disagree with the map more than usual.
     """
 
     frames: int = 0
@@ -105,15 +107,15 @@ class History:
     waiting: dict[str, Streak] = field(default_factory=dict)
     path: CameraPath = field(default_factory=CameraPath)
     looks: dict[str, Look] = field(default_factory=dict)
-    usual: dict[str, Usual] = field(default_factory=dict)
+    usual: dict[str, RunningMean] = field(default_factory=dict)
     doubts: dict[str, Doubt] = field(default_factory=dict)
 
     def offered(self, frame: object) -> None:
-        """Remember which frame was the last."""
+        """Remember the frame offered last."""
         name, stamp_ns = getattr(frame, "name", ""), getattr(frame, "stamp_ns", 0)
         whole = int(stamp_ns) if isinstance(stamp_ns, int | np.integer) else 0  # a refused frame may hold anything
-        told = name[:MAX_NAME_LENGTH] if isinstance(name, str) else ""
-        self.last_frame = told, min(max(whole, EARLIEST), LATEST)
+        text = name[:MAX_NAME_LENGTH] if isinstance(name, str) else ""
+        self.last_frame = text, min(max(whole, EARLIEST), LATEST)
 
     def refuse(self, reason: str) -> None:
         """Count one refused frame."""
@@ -121,11 +123,11 @@ class History:
         self.refused[reason if reason in self.refused or len(self.refused) < MAX_REASONS else OTHERS] += 1
 
     def copied(self) -> History:
-        """Return a history that goes on by itself."""
+        """Return an independent copy."""
         return copy.deepcopy(self)
 
     def saved(self) -> dict[str, Any]:
-        """Return what `loaded` reads, as plain values for JSON."""
+        """Return the history as plain values for JSON, which `loaded` reads."""
         return {
             "frames": self.frames,
             "frames_refused": self.refused.total(),
@@ -149,32 +151,36 @@ class History:
 
     @classmethod
     def loaded(cls, saved: dict[str, Any]) -> History:
-        """Return the history that a manifest tells; maps from before there was one have counts only.
+        """Return the history in a saved manifest; the oldest maps have counts only.
 
         Raises KeyError, TypeError or ValueError for what cannot have been saved.
         """
         frames, refused = _whole(saved["frames"], "frames"), _whole(saved["frames_refused"], "frames_refused")
         recording, last = one_line(str(saved["recording"])), _last_frame_from(saved.get("last_frame"))
-        told, path = saved.get("history"), _path_from(saved.get("camera_path"))
-        if told is None:
+        entries, path = saved.get("history"), _path_from(saved.get("camera_path"))
+        if entries is None:
             return cls(
-                frames, Counter({NOT_TOLD: refused} if refused else {}), recording=recording, last_frame=last, path=path
+                frames,
+                Counter({NOT_RECORDED: refused} if refused else {}),
+                recording=recording,
+                last_frame=last,
+                path=path,
             )
-        reasons, settled, ways = (_counts(told[name], name) for name in ("refused", "settled", "ways"))
-        trusted = {name: _seen_from(seen) for name, seen in _sensors(told["trusted"]).items()}
-        waiting = {name: _streak_from(streak) for name, streak in _sensors(told["waiting"]).items()}
+        reasons, settled, ways = (_counts(entries[name], name) for name in ("refused", "settled", "ways"))
+        trusted = {name: _seen_from(seen) for name, seen in _sensors(entries["trusted"]).items()}
+        waiting = {name: _streak_from(streak) for name, streak in _sensors(entries["waiting"]).items()}
         if not waiting.keys() <= trusted.keys():
             raise ValueError("history.waiting names a sensor that was never trusted")
-        looks = {name: _look_from(look) for name, look in _sensors(told.get("looks", {})).items()}
-        usual = {name: _usual_from(shares) for name, shares in _sensors(told.get("usual", {})).items()}
-        doubts = {name: _doubt_from(doubt) for name, doubt in _sensors(told.get("doubts", {})).items()}
+        looks = {name: _look_from(look) for name, look in _sensors(entries.get("looks", {})).items()}
+        usual = {name: _usual_from(shares) for name, shares in _sensors(entries.get("usual", {})).items()}
+        doubts = {name: _doubt_from(doubt) for name, doubt in _sensors(entries.get("doubts", {})).items()}
         history = cls(frames, reasons, settled, ways, recording, last, trusted, waiting, path, looks, usual, doubts)
         if history.refused.total() != refused:
             raise ValueError(f"frames_refused is {refused}, its reasons add up to {history.refused.total()}")
         return history
 
     def _last_frame(self) -> dict[str, Any] | None:
-        """Return which frame was the last: its number from 1 on, refused ones counted, its name and its stamp."""
+        """Return number (from 1, refused frames counted), name and stamp of the last frame."""
         if self.last_frame is None:
             return None
         name, stamp_ns = self.last_frame
@@ -182,12 +188,12 @@ class History:
 
 
 class WithHistory:
-    """What every map tells of the frames that made it."""
+    """Properties that every map has of its frame history."""
 
     history: History
 
     def _described(self, sides: Sequence[float], counts: dict[str, int], memory_bytes: int) -> str:
-        """Return what `repr` says of a map whose cells have `sides` in metres."""
+        """Return the `repr` of a map whose cells have `sides` in metres."""
         cells = ", ".join(f"{number:,} {state}" for state, number in counts.items())
         side = " x ".join(f"{x:g}" for x in sides)
         made_of = f"{self.history.frames:,} frames, {self.history.refused.total():,} refused"
@@ -195,7 +201,7 @@ class WithHistory:
 
     @property
     def frames(self) -> int:
-        """Frames that are in the map."""
+        """Number of frames in the map."""
         return self.history.frames
 
     @frames.setter
@@ -204,12 +210,12 @@ class WithHistory:
 
     @property
     def frames_refused(self) -> int:
-        """Frames that were offered and refused; `history.refused` tells why."""
+        """Number of refused frames; `history.refused` has the reasons."""
         return self.history.refused.total()
 
     @property
     def recording(self) -> str:
-        """Name of what the frames came from, if known."""
+        """Name of the recording, if known."""
         return self.history.recording
 
     @recording.setter
@@ -237,8 +243,8 @@ def _doubt_from(saved: Any) -> Doubt:
     return Doubt(since_ns, last_ns, frames, fits, saved["verdict"])
 
 
-def _usual_from(saved: Any) -> Usual:
-    shares = Usual(*saved)
+def _usual_from(saved: Any) -> RunningMean:
+    shares = RunningMean(*saved)
     if any(type(share) not in (float, int) or not 0 <= share <= 1 for share in shares):
         raise ValueError("history: a share is no number from 0 to 1")
     return shares
@@ -260,7 +266,7 @@ def _last_frame_from(saved: Any) -> tuple[str, int] | None:
 
 
 def _path_from(saved: Any) -> CameraPath:
-    """Return where the sensors went; maps from before it was kept do not know."""
+    """Return the sensors' path; empty for maps from before it was saved."""
     if saved is None:
         return CameraPath()
     return CameraPath.loaded({**saved, "stops": _sensors(saved["stops"])})

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Validates frames and scans: the types, shapes and poses of their fields, and whether a scan can be trusted."""
+"""Validate frames and scans: the types, shapes and poses of their fields."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from stereovox.errors import FrameRefused
 from stereovox.frame import Frame, Scan, StereoFrame, name_of
 
 EXACT = 1e-14
-"""How far a rotation of doubles may be off and still be the nearest there is."""
-FARTHEST = 1e6
-"""Positions beyond this many metres are taken for errors."""
+"""Rigidity error of a rotation in float64 that cannot be improved."""
+MAX_POSITION = 1e6
+"""Metres beyond which a position is an error."""
+MAX_INT = 2**63
+"""Integers from here on do not fit into 64 bits."""
 
 
 class Field(NamedTuple):
-    """What a field may be, how a message calls it, and what a frame is refused for where it is something else."""
+    """The types a field may have, their name in messages, and the reason for refusing others."""
 
     types: tuple[type, ...]
     wanted: str
     reason: str = "bad_form"
 
 
-LONGEST = 2**63
-"""Whole numbers from here on do not fit into 64 bits."""
 WHOLE = Field((int, np.integer), "a whole number of nanoseconds", "bad_stamp")
 NUMBER = Field((int, float, np.integer, np.floating), "a number")
 TEXT = Field((str,), "text")
@@ -45,6 +45,7 @@ SHARED = {
     "fault": TEXT_OR_NONE,
     "fault_detail": TEXT,
 }
+"""Fields that frames and scans have in common."""
 FIELDS = {
     Frame: {
         "camera": Field(get_args(VirtualCamera), "a camera"),
@@ -56,15 +57,17 @@ FIELDS = {
     Scan: dict.fromkeys(("angle_min", "angle_step", "range_min", "range_max"), NUMBER)
     | {"ranges": ARRAY, "clear": ARRAY_OR_NONE, "clear_from": ARRAY_OR_NONE},
 }
+"""The other fields of each kind; a frame's `depth` is checked by `depth.prepare`, poses by `rigid_pose`."""
 MEASURED = {Frame: ("depth",), StereoFrame: ("left", "right"), Scan: ("ranges",)}
+"""Fields that must not be masked arrays."""
 
 
-def check_form(seen: Any, *kinds: type) -> None:
-    """Raise FrameRefused for what is none of `kinds`, and where one of its fields is not what it should be.
+def validate_fields(seen: Any, *kinds: type) -> None:
+    """Raise FrameRefused for an object that is none of `kinds`, or that has a field of the wrong type.
 
-    The reason is `bad_form`, or `bad_stamp` for its times, `bad_sensor`, `bad_scale`, `bad_reason`.
-    kinds: out of Frame, StereoFrame and Scan. Looks into no array; a masked one is refused, for nobody asks it for its
-    mask. The source's own `fault` is raised too.
+    The reason is `bad_form`, or `bad_stamp` for its times, `bad_sensor`, `bad_scale`, `bad_reason`; or the source's own
+    `fault`. kinds: out of Frame, StereoFrame and Scan. Array elements are not checked; masked arrays are refused, since
+    nothing downstream reads their mask.
     """
     for kind in kinds:
         if isinstance(seen, kind):
@@ -73,16 +76,75 @@ def check_form(seen: Any, *kinds: type) -> None:
         names = " or a ".join(kind.__name__ for kind in kinds)
         raise FrameRefused("bad_form", f"{type(seen).__name__} is not a {names}")
     _check_fields(seen, SHARED)
-    if seen.fault:  # what the source could not deliver is not looked at
-        raise FrameRefused(seen.fault, seen.fault_detail or f"{_called(seen)}: {seen.fault}")
+    if seen.fault:  # the rest of a frame that the source could not deliver is not checked
+        raise FrameRefused(seen.fault, seen.fault_detail or f"{_label(seen)}: {seen.fault}")
     _check_fields(seen, FIELDS[kind])
     for name in MEASURED[kind]:
         if isinstance(getattr(seen, name), np.ma.MaskedArray):
-            raise FrameRefused("bad_form", f"{_called(seen)}: {name} is a masked array; fill it, `{name}.filled(0)`")
+            raise FrameRefused("bad_form", f"{_label(seen)}: {name} is a masked array; fill it, `{name}.filled(0)`")
+
+
+def validate_scan(scan: Scan, rigidity: float) -> Scan:
+    """Return the scan with exactly rigid pose and mount; `rigidity` is the largest error that is rounded away.
+
+    Raises FrameRefused: `bad_form`, the source's `fault`, `bad_shape`, `bad_scan`, `pose_not_finite`,
+    `pose_not_rigid`, `mount_not_rigid`, `no_valid_range`.
+    """
+    validate_fields(scan, Scan)
+    name = name_of(scan)
+    ranges = np.asarray(scan.ranges)
+    if ranges.ndim != 1 or not ranges.size or not np.issubdtype(ranges.dtype, np.floating):
+        raise FrameRefused("bad_shape", f"{name}: ranges are {ranges.shape} {ranges.dtype}; give (N,) float32 metres")
+    angles = float(scan.angle_min), float(scan.angle_step)
+    limits = float(scan.range_min), float(scan.range_max)
+    if (
+        not np.isfinite([*angles, angles[0] + angles[1] * ranges.size]).all()
+        or scan.angle_step == 0
+        or not (0 <= limits[0] < limits[1])
+    ):
+        found = f"angles from {angles[0]} by {angles[1]}, ranges from {limits[0]} to {limits[1]}"
+        raise FrameRefused("bad_scan", f"{name}: {found}; steps must not be 0, and ranges must rise")
+    T, mount = rigid_pose(scan, rigidity), _rigid_mount(scan, rigidity)
+    if np.isnan(ranges).all() and scan.clear is None:
+        raise FrameRefused("no_valid_range", f"{name}: not one beam has a range; is the lidar covered?")
+    return replace(scan, T_world_sensor=T, T_base_sensor=mount)
+
+
+def validate_upright_scan(scan: Scan, config: Config) -> Scan:
+    """Return the scan with an exactly rigid pose.
+
+    Raises FrameRefused as `validate_scan`, or `tilted` where the sensor leans by more than `grid.max_tilt_deg`.
+    """
+    scan = validate_scan(scan, config.pose_rigidity_tolerance)
+    upright = abs(scan.T_world_sensor[2, 2])  # a sensor may hang upside down
+    tilt_deg = np.degrees(np.arccos(min(upright, 1.0)))
+    if tilt_deg > config.grid.max_tilt_deg:
+        raise FrameRefused(
+            "tilted", f"{name_of(scan)}: leans {tilt_deg:.1f} degrees (grid.max_tilt_deg); its beams meet the floor"
+        )
+    return scan
+
+
+def rigid_pose(frame: Frame | Scan, tolerance: float) -> se3.Transform:
+    """Return the rigid motion nearest to the pose; `tolerance` is the largest error that is rounded away.
+
+    Raises FrameRefused: `no_pose` for None, `pose_not_finite`, `pose_not_rigid`.
+    """
+    if frame.T_world_sensor is None:
+        raise FrameRefused("no_pose", f"{name_of(frame)}: there is no pose; give a (4, 4) matrix, or wait for one")
+    T = matrix_of(frame.T_world_sensor)
+    if T.shape == (4, 4) and not all(-MAX_POSITION < x < MAX_POSITION for x in T.ravel().tolist()):
+        raise FrameRefused(
+            "pose_not_finite", f"{name_of(frame)}: the pose holds NaN, infinity or absurdly large numbers"
+        )
+    error = se3.rigidity_error(T)
+    if error > tolerance:
+        raise FrameRefused("pose_not_rigid", f"{name_of(frame)}: the pose is no rigid 4x4 motion (off by {error:.2g})")
+    return se3.orthonormalise(T) if error > EXACT else T
 
 
 def matrix_of(given: object) -> NDArray[np.float64]:
-    """Return a pose as float64, of whatever shape; an empty array (0,) for what is no array of real numbers."""
+    """Return a pose as float64, whatever its shape; an empty array (0,) for anything but real numbers."""
     try:
         numbers = np.asarray(given)
         return numbers.astype(float) if numbers.dtype.kind in "fiu" else np.empty(0)
@@ -91,9 +153,9 @@ def matrix_of(given: object) -> NDArray[np.float64]:
 
 
 def for_kernels(given: ArrayLike) -> NDArray:
-    """Return what a source measured as a plain array of one layout, whatever it lay in; floats as float32.
+    """Return an array as kernels take it: read-only, aligned, contiguous; floats as float32.
 
-    Read-only, aligned and without gaps: for arrays of other kinds kernels would be compiled anew, amid a run.
+    Arrays of other kinds would make Numba compile kernels anew in the middle of a run.
     """
     array = np.asarray(given)
     if array.dtype.kind == "f" and array.dtype != np.float32:
@@ -108,79 +170,20 @@ def _check_fields(seen: object, wanted: dict[str, Field]) -> None:
     for name, (types, what, reason) in wanted.items():
         value = getattr(seen, name)
         if not isinstance(value, types):
-            raise FrameRefused(reason, f"{_called(seen)}: {name} is {type(value).__name__}; give {what}")
-        if types[0] is int and isinstance(value, WHOLE.types) and abs(int(value)) >= LONGEST:
-            raise FrameRefused(reason, f"{_called(seen)}: {name} does not fit into 64 bits; give {what}")
+            raise FrameRefused(reason, f"{_label(seen)}: {name} is {type(value).__name__}; give {what}")
+        if types[0] is int and isinstance(value, WHOLE.types) and abs(int(value)) >= MAX_INT:
+            raise FrameRefused(reason, f"{_label(seen)}: {name} does not fit into 64 bits; give {what}")
 
 
-def _called(seen: object) -> str:
+def _label(seen: object) -> str:
     name = getattr(seen, "name", "")
     return name if isinstance(name, str) and name else f"a {type(seen).__name__}"
 
 
-def rigid_pose(frame: Frame | Scan, tolerance: float) -> se3.Transform:
-    """Return the rigid motion nearest to the pose.
-
-    Raises FrameRefused: `no_pose` for None, `pose_not_finite`, `pose_not_rigid`.
-    """
-    if frame.T_world_sensor is None:
-        raise FrameRefused("no_pose", f"{name_of(frame)}: there is no pose; give a (4, 4) matrix, or wait for one")
-    T = matrix_of(frame.T_world_sensor)
-    if T.shape == (4, 4) and not all(-FARTHEST < x < FARTHEST for x in T.ravel().tolist()):
-        raise FrameRefused(
-            "pose_not_finite", f"{name_of(frame)}: the pose holds NaN, infinity or absurdly large numbers"
-        )
-    error = se3.rigidity_error(T)
-    if error > tolerance:
-        raise FrameRefused("pose_not_rigid", f"{name_of(frame)}: the pose is no rigid 4x4 motion (off by {error:.2g})")
-    return se3.orthonormalise(T) if error > EXACT else T
-
-
-def trusted(scan: Scan, config: Config) -> Scan:
-    """Return the scan with an exactly rigid pose.
-
-    Raises FrameRefused as `sound` does, or `tilted` where the sensor leans by more than `grid.max_tilt_deg`.
-    """
-    scan = sound(scan, config.pose_rigidity_tolerance)
-    upright = abs(scan.T_world_sensor[2, 2])  # a sensor may hang upside down
-    tilt_deg = np.degrees(np.arccos(min(upright, 1.0)))
-    if tilt_deg > config.grid.max_tilt_deg:
-        raise FrameRefused(
-            "tilted", f"{name_of(scan)}: leans {tilt_deg:.1f} degrees (grid.max_tilt_deg); its beams meet the floor"
-        )
-    return scan
-
-
-def sound(scan: Scan, rigidity: float) -> Scan:
-    """Return the scan with an exactly rigid pose and mount; one off by more than `rigidity` is refused.
-
-    Raises FrameRefused with the reason: `bad_form`, the source's `fault`, `bad_shape`, `bad_scan`, `pose_not_finite`,
-    `pose_not_rigid`, `mount_not_rigid`, `no_valid_range`.
-    """
-    check_form(scan, Scan)
-    name = name_of(scan)
-    ranges = np.asarray(scan.ranges)
-    if ranges.ndim != 1 or not ranges.size or not np.issubdtype(ranges.dtype, np.floating):
-        raise FrameRefused("bad_shape", f"{name}: ranges are {ranges.shape} {ranges.dtype}; give (N,) float32 metres")
-    angles = float(scan.angle_min), float(scan.angle_step)
-    limits = float(scan.range_min), float(scan.range_max)
-    if (
-        not np.isfinite([*angles, angles[0] + angles[1] * ranges.size]).all()
-        or scan.angle_step == 0
-        or not (0 <= limits[0] < limits[1])
-    ):
-        said = f"angles from {angles[0]} by {angles[1]}, ranges from {limits[0]} to {limits[1]}"
-        raise FrameRefused("bad_scan", f"{name}: {said}; steps must not be 0, and ranges must rise")
-    T, mount = rigid_pose(scan, rigidity), _mount(scan, rigidity)
-    if np.isnan(ranges).all() and scan.clear is None:
-        raise FrameRefused("no_valid_range", f"{name}: not one beam has a range; is the lidar covered?")
-    return replace(scan, T_world_sensor=T, T_base_sensor=mount)
-
-
-def _mount(scan: Scan, rigidity: float) -> se3.Transform:
+def _rigid_mount(scan: Scan, rigidity: float) -> se3.Transform:
     T = matrix_of(scan.T_base_sensor)
     error = se3.rigidity_error(T)
-    if error > rigidity or (np.abs(T) >= FARTHEST).any():
-        said = "T_base_sensor, where the lidar sits on the robot, is no rigid 4x4 motion"
-        raise FrameRefused("mount_not_rigid", f"{name_of(scan)}: {said} (off by {error:.2g})")
+    if error > rigidity or (np.abs(T) >= MAX_POSITION).any():
+        detail = "T_base_sensor, where the lidar sits on the robot, is no rigid 4x4 motion"
+        raise FrameRefused("mount_not_rigid", f"{name_of(scan)}: {detail} (off by {error:.2g})")
     return se3.orthonormalise(T) if error > EXACT else T

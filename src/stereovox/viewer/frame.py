@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.config import Config
-from stereovox.depth import DepthPath
+from stereovox.depth import DepthPipeline
 from stereovox.errors import FrameRefused
 from stereovox.frame import AnyFrame, DepthImage, Frame, Reason, StereoFrame, UpdateReport, name_of
 from stereovox.view.plain import colour_depth
@@ -57,7 +57,7 @@ class FramePanel:
     """The depth image as the map saw it; image and told: what the page shows."""
 
     def __init__(self, server: ViserServer, config: Config):
-        self._config, self._path = config, DepthPath(config)
+        self._config, self._path = config, DepthPipeline(config)
         self.image = server.gui.add_image(EMPTY, format="jpeg", jpeg_quality=85)
         server.gui.add_html(reasons_key())
         self.told = server.gui.add_markdown("")

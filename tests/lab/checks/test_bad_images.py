@@ -62,7 +62,7 @@ def test_an_offer_leaves_all_as_it_was(frames):
 
 def test_pairs_of_images_are_spoilt_as_well():
     pairs = list(sv.open_source("sim:surround?scale=0.5", frames=":2"))
-    matched = Trial(voxel_size=0.2).way.depth.matched(pairs[1])
+    matched = Trial(voxel_size=0.2).quality.depth.matched(pairs[1])
     kinds = dict(bad_frames(pairs[1], matched, pairs[0], np.random.default_rng(0)))
     assert {"images black", "images saturated", "images of noise", "eyes swapped"} < set(kinds)
     tried = Trial(voxel_size=0.2)

@@ -20,23 +20,23 @@ from stereovox.se3 import Transform, transform_points
 from stereovox.sensors.noise import SUBPIXEL
 
 PIXEL = 1.5
-"""Pixels that a pixel covers, with its diagonal and some for what a grid's origin is nearer than the eye."""
+"""Size that a pixel counts as: its diagonal, and a margin since the grid's origin may be nearer than the eye."""
 NEVER = np.iinfo(np.int64).min
-"""Stamp of a cell that nobody has looked into."""
+"""Stamp of a cell that was never seen."""
 RANK = np.array([1, 3, 0, 2, 3, 3], np.uint8)
-"""Which `Reason` wins where two meet: too near, a surface, free up to somewhere, unknown."""
+"""Rank of each `Reason` where two meet, lowest first: too near, surface, free up to a range, unknown."""
 ARRAYS = ("range_m", "reason", "count", "stamp_ns")
 
 
 class Cells(NamedTuple):
-    """What is known of the ranges of each cell, flat arrays as kernels write them."""
+    """Statistics of the ranges in each cell, flat arrays as kernels write them."""
 
     number: NDArray[np.int32]
     mean: NDArray[np.float32]
     squares: NDArray[np.float32]  # sum of squared differences from the mean
     nearest: NDArray[np.float32]
     free_to: NDArray[np.float32]  # range up to which rays without an obstacle are free
-    too_near: NDArray[np.uint8]  # whether anything was nearer than the camera can tell
+    too_near: NDArray[np.uint8]  # whether anything was nearer than the camera can measure
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,8 +44,8 @@ class SphereGrid:
     """One range for each direction from the origin of the body, and how old it is. Arrays are (azimuths, polars).
 
     layout: the directions. range_m: float32 metres to the nearest surface where `reason` is VALID; up to which the
-        direction is free where it is TOO_FAR; 0 where it is TOO_NEAR; NaN where nobody has seen anything.
-    reason: uint8 of `Reason`, UNKNOWN where nobody has seen anything. count: int32 points of a cell.
+        direction is free where it is TOO_FAR; 0 where it is TOO_NEAR; NaN where nothing was seen.
+    reason: uint8 of `Reason`, UNKNOWN where nothing was seen. count: int32 points of a cell.
     stamp_ns: int64 time of a cell's range, NEVER where it has none.
     camera: of all that took part the one whose ranges are the noisiest; None where none is known.
     """
@@ -59,7 +59,7 @@ class SphereGrid:
 
     @property
     def known(self) -> NDArray[np.bool_]:
-        """Whether somebody has seen something (azimuths, polars)."""
+        """(azimuths, polars) bool: which cells have been seen."""
         return self.stamp_ns != NEVER
 
     def points(self) -> NDArray[np.float64]:
@@ -68,7 +68,7 @@ class SphereGrid:
         return self.layout.directions()[surface] * self.range_m[surface, None]
 
     def since(self, stamp_ns: int) -> SphereGrid:
-        """Return the grid without what is older than `stamp_ns`: that is unknown again."""
+        """Return the grid with all cells older than `stamp_ns` unknown again."""
         old, nothing = self.stamp_ns < stamp_ns, empty(self.layout)
         return replace(self, **{name: np.where(old, getattr(nothing, name), getattr(self, name)) for name in ARRAYS})
 
@@ -219,7 +219,7 @@ def _nearer(a: SphereGrid, b: SphereGrid) -> SphereGrid:
 
 
 def _noise(camera: VirtualCamera | None) -> float:
-    """Return how fast the noise of a camera's depths grows with the square of the depth; -1 where nobody knows."""
+    """Return the growth of a camera's noise with the square of the depth; 0 if unknown, -1 without a camera."""
     if camera is None or camera.baseline is None:
         return -1.0 if camera is None else 0.0
     return (camera.subpixel or SUBPIXEL) / (camera.focal_px * camera.baseline)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which directions the cells of a spherical grid stand for."""
+"""The directions of the cells of a spherical grid."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from stereovox.config import SphereConfig, load_config
 from stereovox.errors import ConfigError
 
 ROUNDING = 1e-6
-"""Cells by which a bound may stick out without asking for another cell."""
+"""Cells by which a bound may exceed a cell without adding another."""
 
 
 class KernelLayout(NamedTuple):

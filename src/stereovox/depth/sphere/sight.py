@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a spherical grid tells a pilot: how far one may fly in a direction. Unknown is never free."""
+"""Queries of a spherical grid: how far a vehicle may fly in a direction. Unknown is never free."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ MAIN_DIRECTIONS = {
 
 @dataclass(frozen=True)
 class Sight:
-    """What is known of the directions round one.
+    """The nearest range in a cone of directions.
 
-    range_m: the smallest range of all that were seen, metres. surface: whether that is a surface; if not, there is
-        none at least so far. stamp_ns: when that range was measured. oldest_ns: the oldest measurement of all.
-    seen: share (0 to 1) of the directions, by their solid angle, that anybody has seen.
+    range_m: the smallest range seen, metres. surface: whether that is a surface; if not, there is none up to that
+        range. stamp_ns: when that range was measured. oldest_ns: the oldest measurement of all.
+    seen: share (0 to 1) of the directions, by solid angle, that were seen.
     """
 
     range_m: float
@@ -59,7 +59,7 @@ def range_in(grid: SphereGrid, direction: ArrayLike, half_angle_deg: float = 0.0
 
 
 def sight_of(grid: SphereGrid, direction: ArrayLike, half_angle_deg: float = 0.0) -> Sight | None:
-    """Return the nearest thing in a cone, even if only part of the cone was seen; None if nothing was.
+    """Return the nearest range in a cone, even if only part of the cone was seen; None if nothing was.
 
     What was not seen may be nearer: see `Sight.seen`. Arguments and errors as for `range_in`.
     """
@@ -67,7 +67,7 @@ def sight_of(grid: SphereGrid, direction: ArrayLike, half_angle_deg: float = 0.0
 
 
 def surroundings(grid: SphereGrid, half_angle_deg: float = 45.0) -> dict[str, Sight | None]:
-    """Return the nearest thing round each of the six main directions of the body; None where nothing was seen."""
+    """Return the nearest range round each of the six main directions of the body; None where nothing was seen."""
     return {name: sight_of(grid, direction, half_angle_deg) for name, direction in MAIN_DIRECTIONS.items()}
 
 

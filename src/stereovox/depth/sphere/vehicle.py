@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What all cameras of a vehicle see together: the last grid of each, moved to where the vehicle is now."""
+"""The combined view of a vehicle's cameras: the last grid of each, moved to the vehicle's present pose."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from stereovox.cameras.rigs import StereoPair
 from stereovox.config import Config
-from stereovox.depth import DepthPath, prepare
+from stereovox.depth import DepthPipeline, prepare
 from stereovox.depth.sphere import T_BODY_OPTICAL, SphereGrid, SphereLayout, accumulate, empty, moved, stitch
 from stereovox.errors import FrameRefused, StereovoxError
 from stereovox.frame import AnyFrame, StereoFrame
@@ -28,7 +28,7 @@ def vehicle_grid(
     Raises StereovoxError where no frame at all could be used.
     """
     newest, why, refused = _newest(frames)
-    path, T_ahead_body = DepthPath(config), _axes(newest.values())
+    path, T_ahead_body = DepthPipeline(config), _axes(newest.values())
     last: dict[str, tuple[SphereGrid, Transform]] = {}
     for name, frame in newest.items():
         try:
@@ -69,14 +69,16 @@ def _axes(frames: Iterable[AnyFrame]) -> Transform:
 
 
 def _is_body(pair: StereoPair) -> bool:
-    """Tell whether the poses are those of the left eye's optical frame: its T_body_left is the identity."""
+    """Return whether the poses are those of the left eye's optical frame: its T_body_left is the identity."""
     T_left_camera = np.eye(4)
     if pair.eyes is not None:
         T_left_camera[:3, :3] = pair.eyes.rectifying_rotations()[0]
     return np.allclose(pair.T_body_camera, T_left_camera, atol=1e-6)
 
 
-def _grid_of(frame: AnyFrame, T_ahead_body: Transform, path: DepthPath, config: Config) -> tuple[SphereGrid, Transform]:
+def _grid_of(
+    frame: AnyFrame, T_ahead_body: Transform, path: DepthPipeline, config: Config
+) -> tuple[SphereGrid, Transform]:
     """Return the grid of one frame in the frame of the body that looks ahead, and T_world_ahead."""
     mounted = T_ahead_body @ frame.pair.T_body_camera if isinstance(frame, StereoFrame) else T_BODY_OPTICAL
     image = prepare(path.matched(frame), config)

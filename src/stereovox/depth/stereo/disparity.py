@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is done with a raw disparity: views of a pair, checks, confidence, reasons."""
+"""Matching of either image of a pair, and checks of the raw disparity: confidence, texture, reasons."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from stereovox.depth.stereo.matchers import Matcher
 Image = NDArray[np.uint8]
 Mask = NDArray[np.bool_] | None
 RADIUS = 10
-"""Confidence looks at a window of 21 by 21 pixels."""
+"""Half width of the confidence window, 21 by 21 pixels."""
 FAR_PX = 0.5
-"""Less disparity than that is none: the pixel is too far to have a depth."""
+"""Smaller disparities are none: the pixel is too far to have a depth."""
 SURE = 0.5
-"""Confidence a pixel needs to be called too far, because that clears what lies before it."""
+"""Confidence that TOO_FAR needs, since it clears everything before it."""
 DOUBTFUL_PX, SEEN = 3.0, 4.0
-"""Where there is nothing to see matchers tend to find no disparity: less than 3 px takes at least this texture."""
+"""Matchers tend to find small disparities where there is no texture: below 3 px at least this much is needed."""
 DOWN, ACROSS = 3, 7
-"""Texture is looked for in a window of 7 rows and 15 columns."""
+"""Half sizes of the texture window, 7 rows and 15 columns."""
 
 
 @dataclass(frozen=True, eq=False)
 class Disparity:
-    """What matching found out about each pixel of the image it is aligned with.
+    """The result of matching for each pixel of the aligned image.
 
     disparity: (height, width) float32, pixels of the full image; NaN: none.
-    confidence: (height, width) float32 from 0 (a guess) to 1 (sure); 0 without a value.
+    confidence: (height, width) float32 from 0 (a guess) to 1 (certain); 0 without a value.
     reason: (height, width) uint8 of `Reason`, VALID where there is a disparity.
     """
 
@@ -76,10 +76,10 @@ def doubled(disparity: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[n
 
 
 def confidence(disparity: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return how sure each disparity (height, width) is, 0 to 1: share / (1 + off / (1 + 0.1 disparity)).
+    """Return the confidence of each disparity (height, width), 0 to 1: share / (1 + off / (1 + 0.1 disparity)).
 
-    share: of the pixels in the window of 21 by 21 round it that have a disparity: where matching failed nearby, what is
-    left is mostly chance. off: pixels between the disparity and the mean of the window. Both were chosen, out of
+    share: of the pixels in the window of 21 by 21 round it that have a disparity: where matching failed nearby, the
+    rest is mostly chance. off: pixels between the disparity and the mean of the window. Both were chosen, out of
     texture, matching error, its curvature and others, for how well they rank errors (docs/stereo.md).
     """
     width = disparity.shape[1]

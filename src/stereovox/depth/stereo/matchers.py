@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stereo matchers by name: two rectified grey images go in, a raw disparity comes out."""
+"""Stereo matchers by name: from two rectified grey images to a raw disparity."""
 
 from __future__ import annotations
 
@@ -21,21 +21,33 @@ MATCHERS = {
 
 
 class Matcher(Protocol):
-    """What a matcher must do; it is made with a `StereoConfig` whose lengths are pixels of the images it will get."""
+    """A stereo matcher.
+
+    Args:
+        config: Settings of stereo matching; their lengths count pixels of the images that the matcher will get.
+
+    Raises:
+        ConfigError: The settings do not suit the method.
+        MissingExtra: The method's library is not installed.
+    """
 
     def __init__(self, config: StereoConfig) -> None: ...
 
     def __call__(self, left: NDArray[np.uint8], right: NDArray[np.uint8]) -> NDArray[np.float32]:
-        """Return the disparity (height, width) of the left image in pixels, NaN: none.
+        """Return the disparity of the left image.
 
-        left, right: (height, width) uint8, rectified: what the left image has at (u, v), the right has at
-        (u - disparity, v).
+        Args:
+            left: (height, width) uint8, rectified.
+            right: The same for the right eye: what the left image shows at (u, v), it shows at (u - disparity, v).
+
+        Returns:
+            (height, width) float32 pixels; NaN: no value.
         """
         ...
 
 
 def make_matcher(config: StereoConfig) -> Matcher:
-    """Return the matcher that `config` names. Other packages add theirs in the entry point group `stereovox.matchers`.
+    """Return the configured matcher. Other packages register theirs in the entry point group `stereovox.matchers`.
 
     Raises ConfigError for an unknown name, MissingExtra where a library is missing.
     """

@@ -17,13 +17,13 @@ from stereovox.errors import ConfigError, FrameRefused
 COUNTS = 16
 """OpenCV counts disparities in sixteenths of a pixel."""
 ROUNDED = -1 / 32
-"""It rounds up: on planes all its matchers are 0.03 px too near."""
+"""It rounds up: on planes all its matchers give 0.03 px too much."""
 LOCKING = 0.62
-"""Its semi-global matching pulls fractions to whole pixels: 0.5 (2 f)^0.62 makes them as frequent as they should be."""
+"""Its semi-global matching pulls fractions to whole pixels: 0.5 (2 f)^0.62 restores their uniform distribution."""
 PREFILTER = 63
+"""Cap of the gradients along a row."""
 MAX_COST = 32767
-"""OpenCV's semi-global matching adds costs up in 16 bits."""
-"""Gradients along a row count up to this."""
+"""Largest cost: OpenCV's semi-global matching adds costs in 16 bits."""
 
 
 class _OpenCv:
@@ -107,7 +107,7 @@ class FourWay(_SemiGlobal):
 
 
 class Block(_OpenCv):
-    """Each window by itself: quick, and empty where there is no texture. Windows are at least 5 pixels wide."""
+    """Block matching: fast, and without values where there is no texture. Windows are at least 5 pixels wide."""
 
     def _make(self, config: StereoConfig) -> Any:
         import cv2
@@ -139,7 +139,7 @@ def _left_right(config: StereoConfig) -> int:
 
 @contextmanager
 def _threads(wanted: int) -> Iterator[None]:
-    """Let OpenCV have so many threads; what it had before comes back."""
+    """Set the number of OpenCV's threads; restored afterwards."""
     import cv2
 
     before = cv2.getNumThreads()

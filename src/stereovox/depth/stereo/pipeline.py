@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From a stereo frame to a depth image: match, throw out what cannot be right, turn disparity into metres."""
+"""From a stereo frame to a depth image: match, remove implausible disparities, convert to metres."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from stereovox.trust.validate import matrix_of
 __all__ = ["Disparity", "StereoDepth"]
 
 LARGE = 450_000
-"""Images of more pixels are halved where the settings leave it open: those of street cameras, not 848x480 ones."""
+"""Images of more pixels are halved where `stereo.halve` is not set: street cameras, not 848x480 ones."""
 
 
 class StereoDepth:
-    """Makes depth images of stereo frames, as `config` says. One object serves one thread at a time."""
+    """Turns stereo frames into depth frames, as configured. Not for concurrent use by several threads."""
 
     def __init__(self, config: StereoConfig) -> None:
         """Raises ConfigError for an unknown method, MissingExtra where its library is missing."""
@@ -125,6 +125,6 @@ def _grey(image: NDArray[np.uint8], frame: StereoFrame, side: str) -> NDArray[np
 def _eye_pose(T_world_left: object, baseline: float, aligned: str) -> Transform:
     """Return T_world_eye (4, 4): the right eye stands the baseline along x from the left."""
     T = matrix_of(T_world_left)
-    if aligned == "right" and T.shape == (4, 4):  # prepare tells a bad pose
+    if aligned == "right" and T.shape == (4, 4):  # `prepare` refuses bad poses
         T[:3, 3] += T[:3, 0] * baseline
     return T

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.config import Config
-from stereovox.depth import DepthPath, prepare
+from stereovox.depth import DepthPipeline, prepare
 from stereovox.errors import FrameRefused, StereovoxError
 from stereovox.frame import AnyFrame, DepthImage, Frame, Reason
 
@@ -52,7 +52,7 @@ def read_frames(
     name = getattr(source, "name", "frames")
     frames: list[Frame] = []
     refusals: list[str] = []
-    path = DepthPath(config)
+    path = DepthPipeline(config)
     tell(0, total, "reading frames: compiling, if need be")
     for done, frame in enumerate(islice(source, limit), start=1):
         try:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from stereovox.comparison import Comparison
 from stereovox.config import load_config
-from stereovox.deadline import full
+from stereovox.deadline import full_quality
 from stereovox.errors import FrameRefused
 from stereovox.frame import AnyFrame, DepthImage, Frame, Reason, StereoFrame
 from stereovox.maps import State, VoxelMap, make_map
@@ -56,7 +56,7 @@ class Trial:
 
     def __init__(self, **settings: Any):
         self.config = load_config(**settings)
-        self.way, self.map = full(self.config), make_map(self.config)
+        self.quality, self.map = full_quality(self.config), make_map(self.config)
         self._gate = Gate(self.config, self.map.history)
         self._comparison = Comparison(self.config, self._gate)
 
@@ -69,7 +69,7 @@ class Trial:
         self.map.look_from(image.viewpoint)
         self.map.add(evidence)
         self.map.history.frames += 1
-        self._gate.took(passed)
+        self._gate.accept(passed)
         return ""
 
     def judge(self, bad: AnyFrame, true: AnyFrame) -> Verdict:
@@ -82,15 +82,15 @@ class Trial:
             return Verdict(refused.reason)
         finally:
             history.doubts, history.waiting = doubts, waiting
-        return self._effect(evidence, self.way.integrator.evidence(self._image(true)))
+        return self._effect(evidence, self.quality.integrator.evidence(self._image(true)))
 
     def _offer(self, frame: AnyFrame) -> tuple[DepthImage, Evidence, Passed]:
         image = self._image(frame)
         passed = self._gate.check(frame, image)
-        return image, *self._comparison.evidence(frame, image, passed, self.way.integrator, self.map)
+        return image, *self._comparison.evidence(frame, image, passed, self.quality.integrator, self.map)
 
     def _image(self, frame: AnyFrame) -> DepthImage:
-        return self.way.depth.image(self.way.depth.matched(frame))
+        return self.quality.depth.image(self.quality.depth.matched(frame))
 
     def _effect(self, bad: Evidence, true: Evidence) -> Verdict:
         coords = np.concatenate([bad.coords, bad.uniform])
@@ -124,7 +124,7 @@ def trial(source: Iterable[AnyFrame], every: int, seed: int = 0, **settings: Any
         frames += 1
         if every and frames > WARM and frames % every == 0 and before is not None and not frame.fault:
             with suppress(FrameRefused):  # the good frame is refused itself
-                matched = tried.way.depth.matched(frame)
+                matched = tried.quality.depth.matched(frame)
                 for kind, bad in bad_frames(frame, matched, before, random):
                     verdicts.setdefault(kind, []).append(tried.judge(bad, frame))
         why = tried.add(frame)

@@ -26,7 +26,7 @@ from stereovox.localize.scan_beams import Beams, beams_of
 from stereovox.localize.track import Track
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.maps.voxel_map import State
-from stereovox.trust.validate import sound
+from stereovox.trust.validate import validate_scan
 
 LATE = 3
 """Scans in a row that are too late, and in order among themselves, before it is asked who is right."""
@@ -156,12 +156,12 @@ class Localiser:
     def add(self, scan: Scan) -> Estimate:
         """Return where the robot is after one more scan.
 
-        Raises FrameRefused, and changes nothing but what is counted, where the scan cannot be trusted (`sound`,
+        Raises FrameRefused, and changes nothing but what is counted, where the scan cannot be trusted (`validate_scan`,
         `beams_of`) or is not later than the one before (`Clock`).
         """
         start = perf_counter()
         try:
-            scan = sound(scan, self._rigidity)
+            scan = validate_scan(scan, self._rigidity)
             beams = beams_of(scan, self.config.max_range)
             wrong = self._clock.take(scan)
         except FrameRefused as refusal:

@@ -26,7 +26,7 @@ from stereovox.localize.slam.loops import LoopFinder
 from stereovox.localize.track import Track
 from stereovox.maps.grid_map import GridMap
 from stereovox.maps.occupancy import OccupancyGrid
-from stereovox.trust.validate import trusted
+from stereovox.trust.validate import validate_upright_scan
 
 LATE = 3
 """Scans in a row that are too late, and in order among themselves, before it is asked who is right."""
@@ -149,7 +149,7 @@ class Slam:
     def add(self, scan: Scan) -> se2.Pose:
         """Take the next scan; return (3,) pose_map_base as known by now. Later loops may move it."""
         try:
-            scan = trusted(scan, self._config)
+            scan = validate_upright_scan(scan, self._config)
         except FrameRefused as refused:
             self._refuse(refused.reason)
             self._first = self._first or f", first: {refused}"

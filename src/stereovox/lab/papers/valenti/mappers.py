@@ -12,7 +12,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from stereovox.config import Config, load_config
-from stereovox.depth import DepthPath
+from stereovox.depth import DepthPipeline
 from stereovox.errors import FrameRefused, MissingExtra
 from stereovox.evaluate.cells import indices, keys
 from stereovox.formats.octomap import read_octomap
@@ -36,7 +36,7 @@ class Matched:
     """
 
     def __init__(self, drive: Drive, numbers: Sequence[int], config: Config, room: float = 1e9):
-        self._drive, self._numbers, self._depth = drive, numbers, DepthPath(config)
+        self._drive, self._numbers, self._depth = drive, numbers, DepthPipeline(config)
         camera = drive.camera
         self._keep = len(numbers) * camera.width * camera.height * PIXEL_BYTES <= room
         self._kept: list[tuple[int, Frame]] | None = None

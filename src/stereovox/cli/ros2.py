@@ -88,13 +88,13 @@ def run(arguments: Namespace) -> dict[str, Any]:
 
 def _map(arguments: Namespace, node: Any, mapping: Mapping, options: Options) -> dict[str, Any]:
     from stereovox.ros.node import MapNode
-    from stereovox.ros.options import FREE
+    from stereovox.ros.options import OUT
     from stereovox.run import Checkpoints, interrupt_between_steps
 
     reports: deque[UpdateReport] = deque(maxlen=MAX_REPORTS)
 
     def out() -> str:
-        return str(node.get_parameter(FREE).value)
+        return str(node.get_parameter(OUT).value)
 
     map_node = MapNode(node, mapping, options, out, reports.append)
     checkpoints = Checkpoints(lambda: mapping.save(out()), options.out, arguments.checkpoint if options.out else 0.0)

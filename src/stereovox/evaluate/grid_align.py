@@ -24,6 +24,14 @@ MAX_ACROSS = 3000
 STEPS = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
 Points = NDArray[np.float64]
 """(N, 2) x, y in metres."""
+COARSE, MAX_COARSE = 128, 512
+"""Pixels along the longer side of the smaller map's small picture, as far as the larger map's then has no more."""
+CANDIDATES, BEST = 12, 4
+"""Motions that are looked at closely, and very closely."""
+MAX_POINTS = 500_000
+"""Walls and floor cells of each map that are looked at."""
+ALIKE = 0.98
+"""Among motions so near to the best one the smallest is taken: a building may look alike from both ends."""
 
 
 class Fit:
@@ -119,16 +127,6 @@ def evenly(points: NDArray[Any], most: int) -> NDArray[Any]:
     if len(points) <= most:
         return points
     return points[np.linspace(0, len(points) - 1, most).astype(int)]
-
-
-COARSE, MAX_COARSE = 128, 512
-"""Pixels along the longer side of the smaller map's small picture, as far as the larger map's then has no more."""
-CANDIDATES, BEST = 12, 4
-"""Motions that are looked at closely, and very closely."""
-MAX_POINTS = 500_000
-"""Walls and floor cells of each map that are looked at."""
-ALIKE = 0.98
-"""Among motions so near to the best one the smallest is taken: a building may look alike from both ends."""
 
 
 def align_grids(grid: OccupancyGrid, reference: OccupancyGrid, start: ArrayLike = (0, 0, 0)) -> se2.Pose:

@@ -25,6 +25,15 @@ from stereovox.trust.history import History
 
 Corners = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
 """p0 and its three neighbours p1, p3, p4 along the edges of a box; (3,) each."""
+COARSE = 16
+"""The search starts with boxes this many blocks wide and halves them."""
+AT_ONCE = 2048
+"""Blocks looked at together: what is computed for them stays in the cache."""
+OCTANTS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
+CELLS = np.stack(np.meshgrid(*[np.arange(SIDE)] * 3, indexing="ij"), axis=-1).reshape(-1, 3) + 0.5
+FREE = ("view", "rays")
+IN_VIEW, CROSSED, HIT = 1, 2, 4
+"""What is marked in a cell: some frame had it in view and range; a lidar ray crossed it; a point fell into it."""
 
 
 def inside(points: NDArray[np.floating], corners: Corners) -> NDArray[np.bool_]:
@@ -58,14 +67,6 @@ def in_any_box(points: NDArray[np.floating], boxes: Iterable[Box], margin: float
     for box in boxes:
         found |= inside(points, corners_of(box, margin))
     return found
-
-
-COARSE = 16
-"""The search starts with boxes this many blocks wide and halves them."""
-AT_ONCE = 2048
-"""Blocks looked at together: what is computed for them stays in the cache."""
-OCTANTS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
-CELLS = np.stack(np.meshgrid(*[np.arange(SIDE)] * 3, indexing="ij"), axis=-1).reshape(-1, 3) + 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,11 +177,6 @@ def crossed_cells(origin: NDArray[np.float64], ends: NDArray[np.float64], voxel_
         next_face[row, axis] += per_cell[row, axis]
         left -= 1
     return np.unique(np.concatenate(found))
-
-
-FREE = ("view", "rays")
-IN_VIEW, CROSSED, HIT = 1, 2, 4
-"""What is marked in a cell: some frame had it in view and range; a lidar ray crossed it; a point fell into it."""
 
 
 @dataclass

@@ -13,6 +13,10 @@ from stereovox.evaluate.cells import Keys, indices, keys, position, within
 from stereovox.evaluate.truth import Piece, Truth
 from stereovox.maps import State, VoxelMap
 
+MIN_SHARE = 0.9
+MAX_GAP = 0.1
+"""A piece is missing where fewer of its seen cells are found, or where a gap is longer than this (or two cells)."""
+
 
 def ratio(part: float, whole: float) -> float | None:
     """Return part / whole, None where there is nothing to divide by."""
@@ -105,11 +109,6 @@ class Found:
     near: int
     longest_gap: float
     missing: bool
-
-
-MIN_SHARE = 0.9
-MAX_GAP = 0.1
-"""A piece is missing where fewer of its seen cells are found, or where a gap is longer than this (or two cells)."""
 
 
 def find_piece(piece: Piece, seen: NDArray[np.bool_], occupied: Keys, voxel_size: float, tolerance: int = 1) -> Found:

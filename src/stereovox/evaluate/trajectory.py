@@ -23,6 +23,8 @@ from stereovox.sources.trajectory import ns_from_seconds
 
 TOLERANCE_S = 0.05
 """A relation whose time is further than this from any pose is not scored."""
+LEVER_M, MIN_LEVER_M = 0.3, 0.001
+"""What headings weigh in an alignment at most and at least: that of a point so far ahead of the robot."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,10 +133,6 @@ def _nearest(stamps: NDArray[np.int64], wanted: NDArray[np.int64]) -> NDArray[np
     before = after - 1
     after = np.minimum(after, len(stamps) - 1)
     return np.where(wanted - stamps[before] <= stamps[after] - wanted, before, after)
-
-
-LEVER_M, MIN_LEVER_M = 0.3, 0.001
-"""What headings weigh in an alignment at most and at least: that of a point so far ahead of the robot."""
 
 
 @dataclass(frozen=True, eq=False)

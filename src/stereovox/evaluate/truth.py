@@ -19,6 +19,7 @@ from stereovox.simulate.scene import Scene, Solid
 
 _COARSE = 16
 """The search starts with cells this many times larger and halves them."""
+_OCTANTS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,9 +82,6 @@ def touched_cells(triangles: NDArray[np.floating], voxel_size: float) -> NDArray
             return indices(np.unique(keys(cell)))
         size //= 2
         owner, cell = np.repeat(owner, 8), (2 * cell[:, None, :] + _OCTANTS).reshape(-1, 3)
-
-
-_OCTANTS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
 
 
 def overlaps(triangles: NDArray[np.float64], low: NDArray[np.floating], size: float) -> NDArray[np.bool_]:

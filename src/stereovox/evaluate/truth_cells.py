@@ -19,6 +19,9 @@ _STEPS: tuple[int, ...] = tuple((keys(np.eye(3, dtype=int)) - keys([0, 0, 0])).t
 """How much a key grows by one cell along x, y and z."""
 _FARTHEST_BLOCK = 1 << 17
 """Keys know no block beyond."""
+MAX_TOLERANCE = 20
+_ROUNDING = 1e-6
+"""Log-odds are kept in steps of about a thousandth: what is nearer to a threshold than this is equal to it."""
 
 
 class CellReader:
@@ -65,11 +68,6 @@ class Neighbourhood:
         for table in reversed(self._tables):
             values = values[table].max(axis=1)
         return values
-
-
-MAX_TOLERANCE = 20
-_ROUNDING = 1e-6
-"""Log-odds are kept in steps of about a thousandth: what is nearer to a threshold than this is equal to it."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -31,6 +31,7 @@ FIGURES = (
     "RMS: distance from each corner to where the calibration puts it, both images. Rows: how far the rows of one "
     "corner are apart after rectification; unseen: the same, by a calibration without this pair. All in pixels."
 )
+EYES = ("left", "right")
 
 
 def write_stereo_report(folder: str | Path, found: StereoCalibration, rig_file: str) -> Path:
@@ -64,9 +65,6 @@ def stereo_page(found: StereoCalibration, png: bytes, rig_file: str) -> str:
         page.section("Lenses", "Distortion in OpenCV's order.", page.table(*_lenses(found))),
         page.section("The right eye in the frame of the left", "Metres.", page.code(_matrix(found.eyes.T_left_right))),
     )
-
-
-EYES = ("left", "right")
 
 
 def stereo_png(found: StereoCalibration) -> bytes:

@@ -23,6 +23,25 @@ SHADE = 0.8
 """How much a mark covers."""
 DARKEST = 0.75
 """How much of the ink a column gets that is as full as most walls."""
+KINDS = {
+    "became_known": ("became known", "#b9d8b0"),
+    "became_unknown": ("became unknown", "#d9c7e0"),
+    "vanished": ("vanished: occupied before, free now", "#2f7fd1"),
+    "appeared": ("appeared: free before, occupied now", "#d8352a"),
+}
+"""Name and colour; where one column holds several the last of these is shown."""
+COLOURS = ("#e0452f", "#2f7fd1", "#3a9a4b", "#c77d0a", "#8448a8", "#0f9aa0", "#c2408c", "#7a5a32")
+LABELLED = 12
+"""The largest frontiers, which get a number and their place to look from."""
+FOOTINGS = {
+    Footing.DRIVABLE: ("drivable", "#a9d8a0"),
+    Footing.TENTATIVE: ("not decided", "#e8c98a"),
+    Footing.OBSTACLE: ("obstacle", "#22304a"),
+    Footing.STEP: ("step", "#d8352a"),
+    Footing.STEEP: ("too steep", "#e07b2a"),
+    Footing.DROP: ("drop", "#7a3fa0"),
+    Footing.UNKNOWN: ("unknown", STATE_COLOURS[State.UNKNOWN]),
+}
 
 
 def page_of(shape: tuple[int, int], panels: int = 1) -> tuple[Any, list[Any]]:
@@ -82,15 +101,6 @@ def _number(floor: Floor, points: ArrayLike) -> NDArray[np.int64]:
     return number
 
 
-KINDS = {
-    "became_known": ("became known", "#b9d8b0"),
-    "became_unknown": ("became unknown", "#d9c7e0"),
-    "vanished": ("vanished: occupied before, free now", "#2f7fd1"),
-    "appeared": ("appeared: free before, occupied now", "#d8352a"),
-}
-"""Name and colour; where one column holds several the last of these is shown."""
-
-
 def draw_changes(a: VoxelMap, b: VoxelMap, heading: str) -> Any:
     """Return the matplotlib figure of what changed from map `a` to map `b`, in one frame and cells of one size."""
     from matplotlib.patches import Patch
@@ -112,11 +122,6 @@ def draw_changes(a: VoxelMap, b: VoxelMap, heading: str) -> Any:
 def facts(changes: Difference) -> list[str]:
     """Return how many cells changed, in words."""
     return [f"{len(getattr(changes, kind)):,} {kind.replace('_', ' ')}" for kind in reversed(KINDS)]
-
-
-COLOURS = ("#e0452f", "#2f7fd1", "#3a9a4b", "#c77d0a", "#8448a8", "#0f9aa0", "#c2408c", "#7a5a32")
-LABELLED = 12
-"""The largest frontiers, which get a number and their place to look from."""
 
 
 def draw_frontiers(voxel_map: VoxelMap, frontiers: Sequence[Frontier], heading: str) -> Any:
@@ -147,17 +152,6 @@ def _label(axis: Any, frontier: Frontier, number: int, axes: list[int]) -> None:
         x, y, str(number), ha="center", va="center", fontsize=11, weight="bold", color="white",
         bbox={"boxstyle": "circle,pad=0.2", "facecolor": COLOURS[(number - 1) % len(COLOURS)], "edgecolor": "white"},
     )  # fmt: skip
-
-
-FOOTINGS = {
-    Footing.DRIVABLE: ("drivable", "#a9d8a0"),
-    Footing.TENTATIVE: ("not decided", "#e8c98a"),
-    Footing.OBSTACLE: ("obstacle", "#22304a"),
-    Footing.STEP: ("step", "#d8352a"),
-    Footing.STEEP: ("too steep", "#e07b2a"),
-    Footing.DROP: ("drop", "#7a3fa0"),
-    Footing.UNKNOWN: ("unknown", STATE_COLOURS[State.UNKNOWN]),
-}
 
 
 def draw_ground(voxel_map: VoxelMap, ground: Ground, heading: str) -> Any:

@@ -13,6 +13,12 @@ from stereovox.maps import VoxelMap
 from stereovox.safe_io import replacing
 from stereovox.view.panels import GREY, INK, LINE
 
+DPI = 120
+ENDINGS = (".png", ".pdf", ".svg")
+MIN_DPI, MAX_DPI = 20, 2400
+WIDTH = 16.0
+"""Width of a page in inches."""
+
 
 def keep_clear(axis: Any) -> None:
     """Put the legend above a panel into a column at its right, where it would cover the panel's title.
@@ -68,13 +74,6 @@ def png_of(figure: Any, dpi: int) -> bytes:
     out = io.BytesIO()
     figure.savefig(out, dpi=dpi, format="png")
     return out.getvalue()
-
-
-DPI = 120
-ENDINGS = (".png", ".pdf", ".svg")
-MIN_DPI, MAX_DPI = 20, 2400
-WIDTH = 16.0
-"""Width of a page in inches."""
 
 
 def figure_of(height: float) -> Any:

@@ -17,6 +17,9 @@ SIZE_PX = 640
 MAX_PX = 24.0
 """A cube's side is no longer."""
 FROM = Direction.of(-60, 38)
+_LIGHT = np.array([0.8, 0.62, 1.0])
+"""Brightness of the faces across each axis."""
+_STATES = np.array([[int(STATE_COLOURS[state][i : i + 2], 16) for i in (1, 3, 5)] for state in sorted(State)], np.uint8)
 
 
 def plan_pixels(voxel_map: VoxelMap) -> NDArray[np.uint8]:
@@ -91,8 +94,5 @@ def _rainbow() -> NDArray[np.uint8]:
     return (255 * np.clip(1.5 - np.abs(position - peaks), 0, 1)).astype(np.uint8)
 
 
-_LIGHT = np.array([0.8, 0.62, 1.0])
-"""Brightness of the faces across each axis."""
 _RAINBOW = _rainbow()
 _DEPTHS = np.concatenate([np.zeros((1, 3), np.uint8), _RAINBOW[:0:-1]])
-_STATES = np.array([[int(STATE_COLOURS[state][i : i + 2], 16) for i in (1, 3, 5)] for state in sorted(State)], np.uint8)

@@ -20,6 +20,10 @@ from stereovox.view.viewpoint import FIELD_M, field_of_view
 
 Numbers = tuple[str, NDArray[np.float64], NDArray[np.float64]]
 """Label of an edge, where its ticks stand in metres, and the numbers written there."""
+BEHIND_DEG, ABOVE_DEG = 32.0, 38.0
+"""From where the map is seen: turned so far from straight behind the camera, and so far above the horizon."""
+DOTS = 300
+"""Points of a line at which it is asked whether cells hide it."""
 
 
 def numbers(label: str, low: float, high: float, least_m: float = 1e-6) -> Numbers:
@@ -97,12 +101,6 @@ def _text(
 ) -> None:
     axis.annotate(text, at, xytext=tuple(offset), textcoords="offset points", ha="center", va="center",
                   fontsize=size, color=GREY, rotation=turn, annotation_clip=False)  # fmt: skip
-
-
-BEHIND_DEG, ABOVE_DEG = 32.0, 38.0
-"""From where the map is seen: turned so far from straight behind the camera, and so far above the horizon."""
-DOTS = 300
-"""Points of a line at which it is asked whether cells hide it."""
 
 
 def draw_space(voxel_map: VoxelMap, heading: str, up: str, viewpoint: Viewpoint | None = None) -> Any:

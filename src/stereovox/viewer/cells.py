@@ -26,6 +26,26 @@ AGES = "plasma_r"
 TIMELESS = "#8a8f98"
 """Colour of cells that were put in without a time."""
 BESIDE = np.concatenate([np.eye(3, dtype=np.int32), -np.eye(3, dtype=np.int32)])
+FREE_COLOUR, UNKNOWN_COLOUR = "#6fa8dc", "#9b7fc4"
+DOT = 0.12
+"""Side of the squares that stand for cells that are not occupied, in cells: one can look through between them."""
+LABELS = {
+    State.OCCUPIED: "occupied",
+    State.TENTATIVE: "tentative",
+    State.FREE: "free",
+    State.UNKNOWN: "unknown beside free",
+}
+COLOUR_LABELS = {HEIGHT: "height of occupied cells {} [m]", PROBABILITY: "probability", AGE: "seconds since last seen"}
+CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], np.float32) - 0.5
+FACES = np.array(
+    [
+        [0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5],
+        [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6],
+        [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3],
+    ],
+    np.uint32,
+)  # fmt: skip
+"""Two triangles a side of the cube with `CORNERS`, counter-clockwise as seen from outside."""
 
 
 def unknown_shell(voxel_map: VoxelMap) -> NDArray[np.int32]:
@@ -68,28 +88,6 @@ def colours_of(values: NDArray[np.floating], colour: str, voxel_size: float) -> 
         return ScalarMappable(Normalize(0, 1), LinearSegmentedColormap.from_list(PROBABILITY, COLOURS))
     low, high = (float(known.min()), float(known.max())) if len(known) else (0.0, 1.0)
     return ScalarMappable(Normalize(low, max(high, low + 1e-3)), colormaps[AGES].with_extremes(bad=TIMELESS))
-
-
-FREE_COLOUR, UNKNOWN_COLOUR = "#6fa8dc", "#9b7fc4"
-DOT = 0.12
-"""Side of the squares that stand for cells that are not occupied, in cells: one can look through between them."""
-LABELS = {
-    State.OCCUPIED: "occupied",
-    State.TENTATIVE: "tentative",
-    State.FREE: "free",
-    State.UNKNOWN: "unknown beside free",
-}
-COLOUR_LABELS = {HEIGHT: "height of occupied cells {} [m]", PROBABILITY: "probability", AGE: "seconds since last seen"}
-CORNERS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], np.float32) - 0.5
-FACES = np.array(
-    [
-        [0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5],
-        [0, 4, 5], [0, 5, 1], [2, 3, 7], [2, 7, 6],
-        [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3],
-    ],
-    np.uint32,
-)  # fmt: skip
-"""Two triangles a side of the cube with `CORNERS`, counter-clockwise as seen from outside."""
 
 
 class Cells:

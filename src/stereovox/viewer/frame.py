@@ -27,6 +27,7 @@ REASON_COLOURS = {
 }
 SHARED = "near red, far blue"
 WIDEST_PX = 480
+EMPTY = np.full((180, 240, 3), 128, np.uint8)
 
 
 def depth_picture(image: DepthImage, max_range: float) -> NDArray[np.uint8]:
@@ -48,9 +49,6 @@ def reasons_key() -> str:
     words = [swatch.format(colour, why.name.lower().replace("_", " ")) for why, colour in REASON_COLOURS.items()]
     body = " &nbsp; ".join([SHARED, *words])
     return f'<div style="font-size:.75em;line-height:1.7;padding:0 1em .6em">{body}</div>'
-
-
-EMPTY = np.full((180, 240, 3), 128, np.uint8)
 
 
 class FramePanel:

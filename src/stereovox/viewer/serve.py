@@ -25,6 +25,14 @@ if TYPE_CHECKING:
     from viser import ViserServer
 
 HERE, PORT = "127.0.0.1", 8080
+TOKEN = re.compile(r"[A-Za-z0-9_-]{16,128}")
+"""What fits into a link and a cookie as it is, and cannot be guessed."""
+PATIENCE_S = 5.0
+"""Seconds in which a browser must have said what it wants."""
+ANSWER_S = 60.0
+"""Seconds in which the server must have refused a stranger, however busy the machine is."""
+STRANGER = "stranger.invalid"
+_STARTING = Lock()
 
 
 class Address(NamedTuple):
@@ -80,10 +88,6 @@ def url_of(host: str, port: int, token: str | None = None) -> str:
     host = "localhost" if host in ("0.0.0.0", "::") else host
     place = f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
     return place if token is None else f"{place}/?token={token}"
-
-
-TOKEN = re.compile(r"[A-Za-z0-9_-]{16,128}")
-"""What fits into a link and a cookie as it is, and cannot be guessed."""
 
 
 class Headers(Protocol):
@@ -185,14 +189,6 @@ def _in_cookies(headers: Iterable[str], name: str) -> Iterator[str]:
 def _cookie_name(port: int) -> str:
     """Return a name of its own for each port: browsers show cookies to all ports of a machine."""
     return f"stereovox_{port}"
-
-
-PATIENCE_S = 5.0
-"""Seconds in which a browser must have said what it wants."""
-ANSWER_S = 60.0
-"""Seconds in which the server must have refused a stranger, however busy the machine is."""
-STRANGER = "stranger.invalid"
-_STARTING = Lock()
 
 
 def serve(name: str, address: Address, guard: Guard) -> ViserServer:

@@ -18,6 +18,11 @@ from stereovox.maps import State
 from stereovox.se3 import inverse, transform_points
 from stereovox.simulate.passer_by import BEFORE, HZ, TALL, WALK_FROM, WALK_X, WIDE, Passing
 
+GONE = (State.FREE, State.TENTATIVE, State.UNKNOWN)
+"""States in which a cell is no obstacle any more."""
+NOISE = 0.3
+"""Metres about the person in which cells are followed: six standard deviations of the depth."""
+
 
 @dataclass(frozen=True, eq=False)
 class ClearTimes:
@@ -65,12 +70,6 @@ def first_true(flags: NDArray[np.bool_]) -> NDArray[np.float64]:
     if not len(flags):
         return np.full(flags.shape[1], np.inf)
     return np.where(flags.any(axis=0), flags.argmax(axis=0), np.inf)
-
-
-GONE = (State.FREE, State.TENTATIVE, State.UNKNOWN)
-"""States in which a cell is no obstacle any more."""
-NOISE = 0.3
-"""Metres about the person in which cells are followed: six standard deviations of the depth."""
 
 
 @dataclass(frozen=True, eq=False)

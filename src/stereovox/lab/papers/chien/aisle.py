@@ -31,6 +31,32 @@ FAR_M = 8.0
 """From this distance on a wall counts as far."""
 MAX_RANGE_M = 13.0
 """Depths that count here: the profile's 10 m would end before the aisle does."""
+WANTED = 0.95
+"""Share of what full resolution finds that counts as nothing lost."""
+SAID = (
+    "The resolution downsampling value affected aisle-like scenes a lot: only the closest depth of each block "
+    "counts, so the further depth of the aisle may be filtered out. The further cells cannot be updated often with a "
+    "higher ratio."
+)
+OURS = (
+    "The layer of cells below the camera's height; the aisle lies on its side, the camera stands at the left. Dark is "
+    "occupied, cream free, orange undecided, grey unknown; lines are the true walls. Far is right of the dotted line."
+)
+HEADS = ("variant", f"found beyond {FAR_M:g} m", "of exact rays", "found nearer", "stray", "ms a frame")
+WHY = (
+    "The yardstick is exact rays at full resolution with the strongest evidence a frame: whatever any pixel measured "
+    "is in that map. The footprint rule (integrator projective) comes to the same in a tenth of the time and needs "
+    "no smaller image: a near cell is judged by all pixels of its footprint, so nothing near is lost, and a far cell "
+    "by its own few pixels. The thesis's rule, by which all rays add up, loses far walls even at full resolution: "
+    "beyond 8 m the noise spreads the hits over several cells, each too weak against the rays that graze the cell on "
+    "their way further. A 4x4 minimum takes away part of that noise and finds more; from there on a higher ratio "
+    "only loses."
+)
+STRAY = (
+    "Stray: share of the occupied cells beyond 8 m that have no wall, floor or ceiling within one cell; noise along "
+    "the rays is 0.25 m at 8 m and 0.55 m at 12 m, so the end wall is smeared. Times are medians and include "
+    "preparing the image."
+)
 
 
 @dataclass(frozen=True)
@@ -167,34 +193,6 @@ def aisle_png(found: Sequence[AisleFound], solids: Sequence[Solid]) -> bytes:
 def _state_image(states: NDArray[np.uint8]) -> NDArray[np.uint8]:
     colours = [[int(STATE_COLOURS[state][i : i + 2], 16) for i in (1, 3, 5)] for state in sorted(STATE_COLOURS)]
     return np.array(colours, np.uint8)[states]
-
-
-WANTED = 0.95
-"""Share of what full resolution finds that counts as nothing lost."""
-SAID = (
-    "The resolution downsampling value affected aisle-like scenes a lot: only the closest depth of each block "
-    "counts, so the further depth of the aisle may be filtered out. The further cells cannot be updated often with a "
-    "higher ratio."
-)
-OURS = (
-    "The layer of cells below the camera's height; the aisle lies on its side, the camera stands at the left. Dark is "
-    "occupied, cream free, orange undecided, grey unknown; lines are the true walls. Far is right of the dotted line."
-)
-HEADS = ("variant", f"found beyond {FAR_M:g} m", "of exact rays", "found nearer", "stray", "ms a frame")
-WHY = (
-    "The yardstick is exact rays at full resolution with the strongest evidence a frame: whatever any pixel measured "
-    "is in that map. The footprint rule (integrator projective) comes to the same in a tenth of the time and needs "
-    "no smaller image: a near cell is judged by all pixels of its footprint, so nothing near is lost, and a far cell "
-    "by its own few pixels. The thesis's rule, by which all rays add up, loses far walls even at full resolution: "
-    "beyond 8 m the noise spreads the hits over several cells, each too weak against the rays that graze the cell on "
-    "their way further. A 4x4 minimum takes away part of that noise and finds more; from there on a higher ratio "
-    "only loses."
-)
-STRAY = (
-    "Stray: share of the occupied cells beyond 8 m that have no wall, floor or ceiling within one cell; noise along "
-    "the rays is 0.25 m at 8 m and 0.55 m at 12 m, so the end wall is smeared. Times are medians and include "
-    "preparing the image."
-)
 
 
 def chapter(found: Sequence[AisleFound], scene: Scene) -> Chapter:

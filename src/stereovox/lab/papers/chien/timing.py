@@ -34,6 +34,19 @@ FIRST = 10
 """Frames at the start that are not counted: they compile kernels, make room and fill caches."""
 VIEW_EVERY = 5
 """Views are made after every so many frames only: they take longer than all the rest."""
+STEP_HEADS = ("function", "thesis", "ours, mean", "ours, median", "ours, 99 %", "what was timed")
+FRAME_HEADS = ("condition", "thesis", "thesis, fps", "ours, mean", "ours, median", "ours, fps", "times faster")
+MEANS = (
+    "Means are compared because the thesis gives averages; whatever else the machine does makes them larger, the "
+    "median less so. The thesis's frame includes reading the cameras and extracting a point cloud; ours begins with "
+    "the raw image in memory, and no point cloud is made."
+)
+VIEWS = (
+    "With visualization: after a frame the map is turned into pixels on the same processor core. 2D is the layer at "
+    "the camera's height, 3D the occupied cells as shaded cubes, 640x640, both by NumPy and without a window; the "
+    "thesis's pictures come from a graphics card. Every fifth frame was timed. In practice stereovox view draws in "
+    "the browser and takes nothing of the mapping's time."
+)
 
 
 @dataclass(frozen=True)
@@ -217,21 +230,6 @@ def times_png(rows: Sequence[Timed]) -> bytes:
     axis.legend(frameon=False, loc="lower right")
     labels(axis, "milliseconds a frame, mean (logarithmic)", "")
     return png(figure)
-
-
-STEP_HEADS = ("function", "thesis", "ours, mean", "ours, median", "ours, 99 %", "what was timed")
-FRAME_HEADS = ("condition", "thesis", "thesis, fps", "ours, mean", "ours, median", "ours, fps", "times faster")
-MEANS = (
-    "Means are compared because the thesis gives averages; whatever else the machine does makes them larger, the "
-    "median less so. The thesis's frame includes reading the cameras and extracting a point cloud; ours begins with "
-    "the raw image in memory, and no point cloud is made."
-)
-VIEWS = (
-    "With visualization: after a frame the map is turned into pixels on the same processor core. 2D is the layer at "
-    "the camera's height, 3D the occupied cells as shaded cubes, 640x640, both by NumPy and without a window; the "
-    "thesis's pictures come from a graphics card. Every fifth frame was timed. In practice stereovox view draws in "
-    "the browser and takes nothing of the mapping's time."
-)
 
 
 def chapter(steps: Sequence[Timed], conditions: Sequence[Timed]) -> Chapter:

@@ -29,6 +29,25 @@ from stereovox.view.panels import measured, title
 TRACERS = ("ray", "line")
 RIM_CELLS = 1.5
 """A cell whose centre is so many cell widths or less inside the field of view, or outside it, lies at its rim."""
+SAID = (
+    "Line drawing tries to make the line as thin as possible with less effort; voxel traversal fills every cell the "
+    "ray passes. The missed cells can still be updated by other rays, except close to the edge of the field of view."
+)
+OURS = "One 8x8 frame in the apartment, layer at the camera's height; the camera is where the cone begins."
+HEADS = (
+    "downsampling",
+    "updated by traversal",
+    "by line",
+    "by both",
+    "only by traversal",
+    "only by line",
+    "ms, traversal",
+    "ms, line",
+)
+THICK = (
+    "Line drawing leaves more cells occupied: rays that only graze a cell do not clear it. With one sensor model for "
+    "both its walls are therefore a little thicker than those of voxel traversal."
+)
 
 
 @dataclass
@@ -164,27 +183,6 @@ def tracers_png(found: Comparison, size: float) -> bytes:
     title(axis, "Cells that one frame updates, layer at the camera's height, 8x8")
     measured(axis, ("x", "z", "y"))
     return png(figure)
-
-
-SAID = (
-    "Line drawing tries to make the line as thin as possible with less effort; voxel traversal fills every cell the "
-    "ray passes. The missed cells can still be updated by other rays, except close to the edge of the field of view."
-)
-OURS = "One 8x8 frame in the apartment, layer at the camera's height; the camera is where the cone begins."
-HEADS = (
-    "downsampling",
-    "updated by traversal",
-    "by line",
-    "by both",
-    "only by traversal",
-    "only by line",
-    "ms, traversal",
-    "ms, line",
-)
-THICK = (
-    "Line drawing leaves more cells occupied: rays that only graze a cell do not clear it. With one sensor model for "
-    "both its walls are therefore a little thicker than those of voxel traversal."
-)
 
 
 def chapter(found: Sequence[Comparison], size: float) -> Chapter:

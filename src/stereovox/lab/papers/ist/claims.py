@@ -11,6 +11,13 @@ from stereovox.lab.papers.ist.fans import Fan
 from stereovox.lab.papers.ist.survey import Judged, Survey
 from stereovox.lab.papers.ist.variants import MIDDLE, OURS, THEIRS
 
+RIGHT, AREA = 0.98, 0.03
+"""Least share of places on the beams with the right state; most by which counted cells differ from the areas."""
+TARGET_PERCENT = 10.0
+WALL_M, WAY_M = 0.04, 0.10
+"""Most metres, median, from a wall of the map to the reference's; most metres (RMS) that a way is off."""
+DRAWN_ODOMETRY = "ist2019, odometry"
+
 
 def numbers_of(found: Survey) -> dict[str, Any]:
     """Return maps, scores, ways and times."""
@@ -38,14 +45,6 @@ def numbers_of(found: Survey) -> dict[str, Any]:
             for name, one in found.judged.items()
         },
     }
-
-
-RIGHT, AREA = 0.98, 0.03
-"""Least share of places on the beams with the right state; most by which counted cells differ from the areas."""
-TARGET_PERCENT = 10.0
-WALL_M, WAY_M = 0.04, 0.10
-"""Most metres, median, from a wall of the map to the reference's; most metres (RMS) that a way is off."""
-DRAWN_ODOMETRY = "ist2019, odometry"
 
 
 def fan_claims(many: Fan, few: Fan) -> list[Claim]:

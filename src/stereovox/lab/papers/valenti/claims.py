@@ -14,6 +14,17 @@ from stereovox.lab.papers.valenti.judge import Judged
 from stereovox.lab.papers.valenti.mappers import DEFAULT, OCTOMAP, THESIS, Setting
 from stereovox.lab.papers.valenti.speed import Speed
 
+TARGET_RANGE = 20.0
+ERROR, ECE, HERTZ = 0.10, 0.05, 20.0
+"""Most mean squared error, most calibration error, and least frames a second."""
+NOT_THERE = "octomap-python is not installed"
+KINDS = {"view": "free: all in view", "rays": "free: what the lidar looked into"}
+"""Kinds of truth."""
+CLAIMED = "view"
+Found = Mapping[tuple[Setting, str], Judged]
+"""All maps of a drive by setting and mapper."""
+LESS_IS_BETTER = {"error", "calibration error"}
+
 
 class Target(NamedTuple):
     """Least precision and recall within one cell, at one threshold, and least correlation, for one cell size."""
@@ -25,15 +36,6 @@ class Target(NamedTuple):
 
 TARGETS = {0.5: Target(0.92, 0.95, 0.72), 0.4: Target(0.90, 0.94, 0.70), 0.2: Target(0.85, 0.92, 0.62)}
 """By cell size in metres, for a range of TARGET_RANGE metres."""
-TARGET_RANGE = 20.0
-ERROR, ECE, HERTZ = 0.10, 0.05, 20.0
-"""Most mean squared error, most calibration error, and least frames a second."""
-NOT_THERE = "octomap-python is not installed"
-KINDS = {"view": "free: all in view", "rays": "free: what the lidar looked into"}
-"""Kinds of truth."""
-CLAIMED = "view"
-Found = Mapping[tuple[Setting, str], Judged]
-"""All maps of a drive by setting and mapper."""
 
 
 class Result(NamedTuple):
@@ -132,7 +134,6 @@ MEASURES: dict[str, Callable[[Scores], float]] = {
     "calibration error": lambda scores: _or(scores.ece, 1.0),
 }
 """What is compared in (f)."""
-LESS_IS_BETTER = {"error", "calibration error"}
 
 
 def _or(value: float | None, otherwise: float) -> float:

@@ -19,6 +19,9 @@ from stereovox.lab.papers.valenti.mappers import MAPPERS, Contestant, Matched, S
 from stereovox.lab.papers.valenti.recordings import Drive
 from stereovox.maps import VoxelMap
 
+TOLERANCE = 1
+"""Cells."""
+
 
 @dataclass
 class ScoreSeries:
@@ -53,10 +56,6 @@ def _flat(score: QuickScores) -> dict[str, float | None]:
     numbers = score.as_dict()
     observed = numbers.pop("observed")
     return {**numbers, **{f"observed_{name}": value for name, value in observed.items()}}
-
-
-TOLERANCE = 1
-"""Cells."""
 
 
 @dataclass(frozen=True, eq=False)

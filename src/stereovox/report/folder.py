@@ -14,6 +14,6 @@ def out_folder(out: str | Path) -> Path:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except (OSError, ValueError) as error:  # ValueError: a character 0
-        said = getattr(error, "strerror", None) or error
-        raise StereovoxError(f"{str(out)!r}: cannot make this folder ({said}); choose another --out") from None
+        reason = getattr(error, "strerror", None) or error
+        raise StereovoxError(f"{str(out)!r}: cannot make this folder ({reason}); choose another --out") from None
     return folder

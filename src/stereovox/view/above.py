@@ -16,7 +16,7 @@ from stereovox.products.frontiers import Frontier
 from stereovox.products.ground import Footing, Ground
 from stereovox.products.ground_surfaces import Floor, floor_of
 from stereovox.products.merge import merge
-from stereovox.view.figures import WIDTH, figure_of, words_above
+from stereovox.view.figures import WIDTH, figure_of, title_above
 from stereovox.view.panels import GREY, INK, STATE_COLOURS, measured, scale_bar, title
 
 SHADE = 0.8
@@ -115,7 +115,7 @@ def draw_changes(a: VoxelMap, b: VoxelMap, heading: str) -> Any:
     finish(axis)
     patches = [Patch(fc=colour, label=name) for name, colour in KINDS.values()]
     figure.legend(handles=patches, loc="outside lower center", ncols=4, frameon=False, fontsize=11, labelcolor=INK)
-    words_above(figure, heading, [f"cells of {a.voxel_size:g} m", *facts(changes), "grey: both maps from above"])
+    title_above(figure, heading, [f"cells of {a.voxel_size:g} m", *facts(changes), "grey: both maps from above"])
     return figure
 
 
@@ -135,7 +135,7 @@ def draw_frontiers(voxel_map: VoxelMap, frontiers: Sequence[Frontier], heading: 
         _label(axis, frontier, n + 1, list(floor.axes[:2]))
     finish(axis)
     seen = sum(frontier.look_from is not None for frontier in frontiers)
-    words_above(figure, heading, [
+    title_above(figure, heading, [
         f"cells of {voxel_map.voxel_size:g} m", f"{len(frontiers)} frontiers, {seen} within reach",
         "dot: where to look at one from, the number: at its centroid",
     ])  # fmt: skip
@@ -174,7 +174,7 @@ def draw_ground(voxel_map: VoxelMap, ground: Ground, heading: str) -> Any:
     patches = [Patch(fc=colour, ec="#888", label=name) for name, colour in FOOTINGS.values()]
     figure.legend(handles=patches, loc="outside lower center", ncols=7, frameon=False, fontsize=11, labelcolor=INK)
     area = np.count_nonzero(ground.footing == Footing.DRIVABLE) * ground.resolution**2
-    words_above(figure, heading, [f"cells of {ground.resolution:g} m", f"{area:.1f} square metres drivable"])
+    title_above(figure, heading, [f"cells of {ground.resolution:g} m", f"{area:.1f} square metres drivable"])
     return figure
 
 

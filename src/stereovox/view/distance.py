@@ -12,7 +12,7 @@ from stereovox.errors import StereovoxError
 from stereovox.products.distance import DistanceField
 from stereovox.products.floor_axes import floor_axes
 from stereovox.view.drawn import UPS, checked_up
-from stereovox.view.figures import WIDTH, figure_of, save, words_above
+from stereovox.view.figures import WIDTH, figure_of, save, title_above
 
 COLOURS = "viridis"
 LINES = (0.1, 0.25, 0.5, 1.0, 2.0, 5.0, 10.0)
@@ -52,7 +52,7 @@ def draw_distance(field: DistanceField, up: str, at_m: float | None, title: str)
     _lines(axis, shown, extent)
     axis.set(xlabel=f"{'xyz'[right]} in metres", ylabel=f"{'xyz'[away]} in metres", facecolor="white")
     figure.colorbar(image, ax=axis, label="metres to the nearest obstacle", shrink=0.8)
-    words_above(figure, title, [f"layer at {'-' if sign < 0 else ''}{'xyz'[height]} = {at_m:.2f} m", "obstacles dark"])
+    title_above(figure, title, [f"layer at {'-' if sign < 0 else ''}{'xyz'[height]} = {at_m:.2f} m", "obstacles dark"])
     return figure
 
 

@@ -54,9 +54,9 @@ def blank(width: float, height: float) -> Any:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    made = Figure((width, height), facecolor="white", layout="constrained")
-    FigureCanvasAgg(made)
-    return made
+    figure = Figure((width, height), facecolor="white", layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
 
 
 def labels(axis: Any, x: str, y: str, letters: float = 9) -> None:
@@ -94,10 +94,10 @@ def headline(figure: Any, voxel_map: VoxelMap, text: str) -> None:
     counts = voxel_map.counts()
     facts = [f"cells of {voxel_map.voxel_size:g} m", f"{voxel_map.frames:,} frames"]
     facts += [f"{counts[state]:,} {state}" for state in ("occupied", "free", "tentative")]
-    words_above(figure, text, facts)
+    title_above(figure, text, facts)
 
 
-def words_above(figure: Any, text: str, facts: Sequence[str]) -> None:
+def title_above(figure: Any, text: str, facts: Sequence[str]) -> None:
     """Write a title, and below it a line of facts."""
     figure.text(0.02, 1 - 0.42 / figure.get_figheight(), text, fontsize=20, weight="bold", color=INK)
     figure.text(0.02, 1 - 0.76 / figure.get_figheight(), "   ·   ".join(facts), fontsize=12.5, color=GREY)

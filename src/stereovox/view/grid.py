@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from stereovox import se2
 from stereovox.maps import State
 from stereovox.maps.occupancy import OccupancyGrid
-from stereovox.view.figures import WIDTH, figure_of, save, words_above
+from stereovox.view.figures import WIDTH, figure_of, save, title_above
 from stereovox.view.panels import GREY, INK, PATH_COLOUR, STATE_COLOURS, measured, scale_bar
 
 MAX_PIXELS = 1500
@@ -49,7 +49,7 @@ def draw_grid(grid: OccupancyGrid, heading: str, track: ArrayLike | None = None)
         plan(axis, trimmed(grid), track)
         framed(axis, box)
         legend(figure, grid.states, track is not None)
-    words_above(figure, heading, facts(grid))
+    title_above(figure, heading, facts(grid))
     return figure
 
 
@@ -82,9 +82,9 @@ def bounds(grid: OccupancyGrid, track: ArrayLike | None = None) -> Box | None:
     return low - margin, high + margin
 
 
-def plan(axis: Any, grid: OccupancyGrid, track: ArrayLike | None = None, most: int = MAX_PIXELS) -> None:
+def plan(axis: Any, grid: OccupancyGrid, track: ArrayLike | None = None, max_px: int = MAX_PIXELS) -> None:
     """Draw the states of a map's cells into a panel in metres of the map's frame, and a robot's way if there is one."""
-    paint(axis, grid, grid.states, {int(state): STATE_COLOURS[state] for state in State}, most)
+    paint(axis, grid, grid.states, {int(state): STATE_COLOURS[state] for state in State}, max_px)
     axis.set_facecolor(STATE_COLOURS[State.UNKNOWN])
     if track is not None and np.size(track):
         x, y = np.asarray(track, float)[:, :2].T
@@ -94,7 +94,7 @@ def plan(axis: Any, grid: OccupancyGrid, track: ArrayLike | None = None, most: i
 
 
 def paint(
-    axis: Any, grid: OccupancyGrid, classes: NDArray[np.uint8], colours: Mapping[int, str], most: int = MAX_PIXELS
+    axis: Any, grid: OccupancyGrid, classes: NDArray[np.uint8], colours: Mapping[int, str], max_px: int = MAX_PIXELS
 ) -> None:
     """Draw classes (rows, columns) uint8 of the cells of `grid` into a panel.
 
@@ -105,7 +105,7 @@ def paint(
     from matplotlib.transforms import Affine2D
 
     x, y, yaw = grid.origin
-    step = -(-max(classes.shape) // most)
+    step = -(-max(classes.shape) // max_px)
     ranks = pooled(classes, list(colours), step)
     rows, columns = (n * step * grid.resolution for n in ranks.shape)
     axis.imshow(

@@ -67,10 +67,10 @@ def side_by_side_png(laid: Laid, names: tuple[str, str] = ("Reference", "Map")) 
     """Return a PNG of the reference, the map, and the binary difference (white: an error), all in one frame."""
     box = _box(laid)
     figure, panels = _panels(box, 3)
-    most = int(0.74 * DPI * WIDTH) // (1 if _is_wide(box) else 3)
+    max_px = int(0.74 * DPI * WIDTH) // (1 if _is_wide(box) else 3)
     for axis, grid in zip(panels, (laid.reference, laid.map), strict=False):
-        plan(axis, grid, most=most)
-    paint(panels[2], laid.reference, wrong(differences(laid)).astype(np.uint8), {0: "black", 1: "white"}, most)
+        plan(axis, grid, max_px=max_px)
+    paint(panels[2], laid.reference, wrong(differences(laid)).astype(np.uint8), {0: "black", 1: "white"}, max_px)
     panels[2].set_facecolor("black")
     for axis, name in zip(panels, (*names, "Difference (white: an error)"), strict=True):
         axis.set(xlim=(box[0][0], box[1][0]), ylim=(box[0][1], box[1][1]))

@@ -43,8 +43,8 @@ def outcomes_png(shown: Outcomes, up: str | None = None) -> bytes:
     size = (places.max(axis=0) - low + 1) if len(places) else np.ones(2, int)
     tall = size[1] > 0.6 * size[0]
     height = 0.8 + float(np.clip((0.46 if tall else 0.92) * WIDTH * size[1] / size[0], 2.0, 9.0))
-    made = blank(WIDTH, height if tall else 2 * height)
-    panels = made.subplots(*((1, 2) if tall else (2, 1)), squeeze=False).ravel()
+    figure = blank(WIDTH, height if tall else 2 * height)
+    panels = figure.subplots(*((1, 2) if tall else (2, 1)), squeeze=False).ravel()
     extent = np.stack([low, low + size], axis=1).ravel() * shown.voxel_size
     names = ("xyz"[across], "xyz"[away], up)
     for axis, classes, text in ((panels[0], EXACT, "Exact"), (panels[1], TOLERANT, "With tolerance")):
@@ -52,8 +52,8 @@ def outcomes_png(shown: Outcomes, up: str | None = None) -> bytes:
         axis.imshow(image, origin="lower", extent=extent, interpolation="nearest")
         title(axis, text)
         measured(axis, names)
-    _legend(made)
-    return png_of(made, DPI)
+    _legend(figure)
+    return png_of(figure, DPI)
 
 
 def mixed(

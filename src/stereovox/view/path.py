@@ -16,7 +16,7 @@ from stereovox.products.floor_axes import floor_axes
 from stereovox.products.path_check import point_along
 from stereovox.products.projection import project
 from stereovox.view.drawn import UPS, turned
-from stereovox.view.figures import WIDTH, figure_of, save, words_above
+from stereovox.view.figures import WIDTH, figure_of, save, title_above
 from stereovox.view.grid import bounds, framed, legend, plan, trimmed
 from stereovox.view.panels import INK, PATH_COLOUR, STATE_COLOURS, measured
 
@@ -49,42 +49,42 @@ def picture_path(
 
 
 def draw_path(
-    voxel_map: VoxelMap, way: NDArray[np.float64], radius: float, title: str, blocked_at: float | None = None
+    voxel_map: VoxelMap, waypoints: NDArray[np.float64], radius: float, title: str, blocked_at: float | None = None
 ) -> Any:
     """Return the matplotlib figure that `picture_path` saves."""
     up = voxel_map.config.up
-    heights = turned(way, up)[:, 2]
+    heights = turned(waypoints, up)[:, 2]
     room = max(radius, voxel_map.config.cell[UPS[up][2]])
     band = float(heights.min()) - room, float(heights.max()) + room
-    seen, flat = _seen(voxel_map, band), way[:, UPS[up][:2]]
-    box = bounds(seen, flat)
+    plan_grid, flat = _projected(voxel_map, band), waypoints[:, UPS[up][:2]]
+    box = bounds(plan_grid, flat)
     assert box is not None  # `project` found something
     (x0, y0), (x1, y1) = box
     tall = float(np.clip(0.92 * WIDTH * (y1 - y0) / (x1 - x0), 3, 12))
     figure = figure_of(tall + 7.6)
     above, aside, along = figure.subplots(3, 1, height_ratios=[tall, 3, 3])
-    plan(above, trimmed(seen), flat)
+    plan(above, trimmed(plan_grid), flat)
     names = "".join("xyz"[axis] for axis in UPS[up])
     measured(above, (names[0], names[1], names[2]))
     framed(above, box)
-    length = float(np.linalg.norm(np.diff(way, axis=0), axis=1).sum())
-    places = np.array([point_along(way, at) for at in np.linspace(0, length, STEPS)])
+    length = float(np.linalg.norm(np.diff(waypoints, axis=0), axis=1).sum())
+    places = np.array([point_along(waypoints, at) for at in np.linspace(0, length, STEPS)])
     _bodies(above, places[:, UPS[up][:2]], radius, length)
     _section(aside, voxel_map, places, radius, length)
     _room(along, voxel_map, places, radius, length)
     if blocked_at is not None:
-        _mark(above, (aside, along), point_along(way, blocked_at)[[*UPS[up][:2]]], blocked_at)
-    told = f"from above: what is {band[0]:.2f} to {band[1]:.2f} m high ({up}); the way may pass over or under it"
-    above.set_title(told, fontsize=11, color=INK)
-    legend(figure, seen.states, with_track=True)
+        _mark(above, (aside, along), point_along(waypoints, blocked_at)[[*UPS[up][:2]]], blocked_at)
+    caption = f"from above: what is {band[0]:.2f} to {band[1]:.2f} m high ({up}); the way may pass over or under it"
+    above.set_title(caption, fontsize=11, color=INK)
+    legend(figure, plan_grid.states, with_track=True)
     facts = [f"{length:.2f} m long", f"radius {radius:g} m", f"cells of {voxel_map.voxel_size:g} m"]
     if blocked_at is not None:
         facts.append(f"blocked after {blocked_at:.2f} m, at the cross")
-    words_above(figure, title, facts)
+    title_above(figure, title, facts)
     return figure
 
 
-def _seen(voxel_map: VoxelMap, band: tuple[float, float]) -> OccupancyGrid:
+def _projected(voxel_map: VoxelMap, band: tuple[float, float]) -> OccupancyGrid:
     try:
         return project(voxel_map, band)
     except StereovoxError as error:  # its cure is to give other heights, which are the path's own here
@@ -104,8 +104,10 @@ def _bodies(axis: Any, places: NDArray[np.float64], radius: float, length: float
     number = int(np.clip(length / max(DRAWN_EVERY * radius, length / MAX_BODIES, 1e-9) + 1, 2, MAX_BODIES))
     for n in np.linspace(0, len(places) - 1, number).round().astype(int):
         axis.add_patch(Circle(tuple(places[n]), radius, fill=False, color=PATH_COLOUR, alpha=0.6))
-    for place, word in ((places[0], "start"), (places[-1], "goal")):
-        axis.annotate(word, tuple(place), textcoords="offset points", xytext=(-12, -20), fontsize=13, color=PATH_COLOUR)
+    for place, label in ((places[0], "start"), (places[-1], "goal")):
+        axis.annotate(
+            label, tuple(place), textcoords="offset points", xytext=(-12, -20), fontsize=13, color=PATH_COLOUR
+        )
 
 
 def _section(axis: Any, voxel_map: VoxelMap, places: NDArray[np.float64], radius: float, length: float) -> None:

@@ -98,8 +98,8 @@ def _legend(figure: Any, axes: Any, near: float, far: float) -> None:
     bar.ax.yaxis.set_major_locator(FixedLocator(ticks))
     bar.ax.yaxis.set_minor_locator(NullLocator())
     bar.ax.set_yticklabels([f"{tick:g} m" for tick in ticks], color=GREY, fontsize=11)
-    words = ((UNKNOWN, "unknown"), (FREE, "free as far as seen"), (TOO_NEAR, "too near to measure"))
-    patches = [Patch(facecolor=colour, edgecolor=GREY, linewidth=0.4, label=word) for colour, word in words]
+    entries = ((UNKNOWN, "unknown"), (FREE, "free as far as seen"), (TOO_NEAR, "too near to measure"))
+    patches = [Patch(facecolor=colour, edgecolor=GREY, linewidth=0.4, label=text) for colour, text in entries]
     axes.legend(handles=patches, loc="upper right", bbox_to_anchor=(1, -0.09), ncols=3, frameon=False, fontsize=11)
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The report of a stereo calibration: what was seen, how well it fits, and a pair with its rows made one."""
+"""Report of a stereo calibration: the corners, how well they fit, and a rectified pair."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from stereovox.view.panels import GREY, title
 
 USED, DROPPED, ROW = "#2f9e62", "#d1603d", "#e8a33d"
 ACROSS = 3
-"""Pairs beside each other."""
+"""Pairs per row."""
 MAX_DRAWN = 24
-"""Pairs that are drawn; all stand in the table."""
+"""Largest number of pairs drawn; the table lists all."""
 ROWS = 15
-"""Lines through a rectified pair."""
+"""Number of lines through a rectified pair."""
 FIGURES = (
     "RMS: distance from each corner to where the calibration puts it, both images. Rows: how far the rows of one "
     "corner are apart after rectification; unseen: the same, by a calibration without this pair. All in pixels."
@@ -35,7 +35,7 @@ EYES = ("left", "right")
 
 
 def write_stereo_report(folder: str | Path, found: StereoCalibration, rig_file: str) -> Path:
-    """Write `stereo.html` and `stereo.png` into `folder`, made where it is missing, and return the page's path.
+    """Write `stereo.html` and `stereo.png` into `folder`, created if missing, and return the page's path.
 
     Raises StereovoxError where they cannot be written.
     """
@@ -44,7 +44,7 @@ def write_stereo_report(folder: str | Path, found: StereoCalibration, rig_file: 
 
 
 def stereo_page(found: StereoCalibration, png: bytes, rig_file: str) -> str:
-    """Return the page about a stereo calibration as text."""
+    """Return the page of a stereo calibration as text."""
     figures = found.as_dict()
     boxes = [
         (_pixels(figures["rms_px"]), "corners missed by, RMS"),

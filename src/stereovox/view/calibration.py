@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of calibrations: walls before and after a correction, noise against distance and against theory."""
+"""Pictures of calibrations: walls before and after a correction, noise by distance and beside theory."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from stereovox.view.panels import GREY, title
 
 DPI = 150
 WIDTH = 11.0
+"""Inches: the width at which a page shows it, so that letters keep their size."""
 LETTERS = 10
 """Size of the numbers along an axis, in points."""
-"""Inches: as wide as a page shows it, so that letters keep their size."""
 BEFORE, AFTER, WALL = "#d1603d", "#23618c", "#1b2333"
 THEORY = ((0.08, "--"), (0.04, ":"))
 """Sub-pixels of the curves in Chien 2020, Fig 3.9."""
@@ -28,7 +28,7 @@ ERRORS = (
 )
 DOTS = 6000
 BAND = 0.1
-"""Share of the rows in a top view: a wall that leans back would blur the rest."""
+"""Share of the rows used in a top view, since a tilted wall would blur it."""
 
 
 def wall_png(calibration: WallCalibration) -> bytes:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A picture of one layer of a distance field: how far the nearest obstacle is, in colours and lines."""
+"""Picture of one layer of a distance field: the distance to the nearest obstacle in colours and contours."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from stereovox.view.figures import WIDTH, figure_of, save, title_above
 
 COLOURS = "viridis"
 LINES = (0.1, 0.25, 0.5, 1.0, 2.0, 5.0, 10.0)
-"""Distances between lines, in metres; there are at most MAX_LINES."""
+"""Candidate intervals of contours in metres; there are at most MAX_LINES contours."""
 MAX_LINES = 10
 
 
@@ -25,7 +25,7 @@ def picture_distance(
 ) -> None:
     """Write a PNG of the layer across `up` at height `at_m` in metres along it, by default the middle of the box.
 
-    Obstacles are dark; lines join places of the same distance. Raises StereovoxError for a height outside the box, and
+    Obstacles are dark; contours join places of equal distance. Raises StereovoxError for a height outside the box, and
     as `figures.save` does.
     """
     save(draw_distance(field, up, at_m, title), path)
@@ -57,7 +57,7 @@ def draw_distance(field: DistanceField, up: str, at_m: float | None, title: str)
 
 
 def _layer(field: DistanceField, height: int, sign: int, at_m: float | None) -> tuple[int, float]:
-    """Return the number of the layer at a height, and where its middle stands."""
+    """Return the index of the layer at a height, and the height of its centre."""
     number, side = field.metres.shape[height], field.cell[height]
     layer = number // 2 if at_m is None else int(np.floor((sign * at_m - field.origin[height]) / side))
     if not 0 <= layer < number:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Charts of an evaluation: against the frame (Valenti 2018, Fig 8.4), the threshold and distance; ROC, reliability."""
+"""Charts of an evaluation: by frame (Valenti 2018, Fig 8.4), threshold and distance; ROC, reliability."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ DPI = 140
 WIDTH = 12.0
 """Inches."""
 LINE_LETTERS = 74
-"""Letters that fit above a chart of half the width."""
+"""Number of letters that fit above a chart of half the width."""
 PRECISION, RECALL, THIRD = "#23618c", "#d1603d", "#5b8c5a"
 EXACT, TOLERANT = ":", "-"
 CLASSES = (
@@ -35,7 +35,7 @@ LIKENESS = (("correlation", "correlation", THIRD), ("error", "error", INK), ("co
 
 
 def series_png(arrays: Mapping[str, NDArray[Any]]) -> bytes:
-    """Return a PNG of measures against the frame, `arrays` as `ScoreSeries.arrays` returns them, at least one frame."""
+    """Return a PNG of measures by frame, `arrays` as `ScoreSeries.arrays` returns them, at least one frame."""
     figure = blank(WIDTH, 4.4)
     left, right = figure.subplots(1, 2)
     frame = arrays["frame"]
@@ -56,7 +56,7 @@ def series_png(arrays: Mapping[str, NDArray[Any]]) -> bytes:
 
 
 def curves_png(scores: Scores) -> bytes:
-    """Return a PNG: precision and recall against the threshold, reliability with counts, ROC, and against distance."""
+    """Return a PNG: precision and recall by threshold and by distance, reliability with counts, and ROC."""
     figure = blank(WIDTH, 8.8)
     upper, lower = figure.subplots(2, 2)
     _thresholds(upper[0], scores.curve, scores.threshold, scores.tolerance_cells)
@@ -150,7 +150,7 @@ def _distance(axis: Any, found: ByDistance) -> None:
 
 
 def caption(axis: Any, heading: str, text: str) -> None:
-    """Write a chart's title, and below it one sentence about what to see in it."""
+    """Write a chart's title, and below it one sentence on how to read it."""
     lines = fill(text, LINE_LETTERS)
     axis.set_title(heading, loc="left", fontsize=12.5, color=INK, pad=10 + 12 * (1 + lines.count("\n")))
     place: dict[str, Any] = {"xycoords": "axes fraction", "textcoords": "offset points"}
@@ -158,7 +158,7 @@ def caption(axis: Any, heading: str, text: str) -> None:
 
 
 def legend_below(axis: Any, columns: int) -> None:
-    """Put the legend under a chart, where it hides nothing."""
+    """Put the legend below a chart."""
     axis.legend(
         loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=columns, frameon=False, fontsize=9.5, columnspacing=1.4
     )

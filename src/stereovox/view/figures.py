@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What all pictures share: figures with a headline, legends, charts."""
+"""Parts shared by all pictures: figures with a headline, legends, axes, saving."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ WIDTH = 16.0
 
 
 def keep_clear(axis: Any) -> None:
-    """Put the legend above a panel into a column at its right, where it would cover the panel's title.
+    """Move the legend above a panel into a column at its right where it would cover the panel's title.
 
-    To be called when all panels of the figure are there: how wide this one is, only the finished layout tells.
+    Call it when all panels of the figure are there: the width of this one is known only from the finished layout.
     """
     axis.figure.draw_without_rendering()
     legend = axis.get_legend()
@@ -60,7 +60,7 @@ def blank(width: float, height: float) -> Any:
 
 
 def labels(axis: Any, x: str, y: str, letters: float = 9) -> None:
-    """Label both axes of a chart in grey, ticks with `letters` points; an empty `x` leaves that axis as it is."""
+    """Label both axes of a chart in grey, ticks with `letters` points; an empty `x` leaves that axis unchanged."""
     if x:
         axis.set_xlabel(x, color=GREY)
     axis.set_ylabel(y, color=GREY)
@@ -70,7 +70,7 @@ def labels(axis: Any, x: str, y: str, letters: float = 9) -> None:
 
 
 def png_of(figure: Any, dpi: int) -> bytes:
-    """Return a figure as the bytes of a PNG."""
+    """Return a figure as PNG bytes."""
     out = io.BytesIO()
     figure.savefig(out, dpi=dpi, format="png")
     return out.getvalue()
@@ -90,7 +90,7 @@ def figure_of(height: float) -> Any:
 
 
 def headline(figure: Any, voxel_map: VoxelMap, text: str) -> None:
-    """Write the title, and below it what the map is."""
+    """Write the title, and below it the facts of the map."""
     counts = voxel_map.counts()
     facts = [f"cells of {voxel_map.voxel_size:g} m", f"{voxel_map.frames:,} frames"]
     facts += [f"{counts[state]:,} {state}" for state in ("occupied", "free", "tentative")]
@@ -104,10 +104,10 @@ def title_above(figure: Any, text: str, facts: Sequence[str]) -> None:
 
 
 def save(figure: Any, path: str | Path, dpi: float | None = None) -> None:
-    """Save a figure: as dots (.png), or letters and lines as vectors, with text as text (.pdf, .svg).
+    """Save a figure as pixels (.png) or vectors with text as text (.pdf, .svg).
 
-    dpi: dots an inch; by default the figure's own. In .pdf and .svg it is that of the cells, where these are an image.
-    Raises StereovoxError for another ending, dots that cannot be, or a file that cannot be written.
+    dpi: dots per inch; by default the figure's own. In .pdf and .svg it is that of cells drawn as an image.
+    Raises StereovoxError for another suffix, an invalid dpi, or a file that cannot be written.
     """
     from matplotlib import rc_context
 

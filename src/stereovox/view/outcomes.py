@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a map is right and where it is wrong, seen from above."""
+"""Right and wrong cells of a map, seen from above."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ TOLERANT = {
 def outcomes_png(shown: Outcomes, up: str | None = None) -> bytes:
     """Return a PNG of two top views: exact, and with the tolerance.
 
-    A column of cells has the colours of its cells, mixed by their numbers. up: the axis that points up, by default as
-    the truth's settings say. Raises StereovoxError for an `up` that is no axis.
+    A column has the mean colour of its cells. up: the axis that points up, by default from the truth's settings. Raises
+    StereovoxError for an invalid `up`.
     """
     up = checked_up(up or shown.up)
     across, away, _ = UPS[up]
@@ -62,9 +62,9 @@ def mixed(
     size: tuple[int, ...],
     classes: Mapping[str, tuple[str, list[Outcome]]],
 ) -> NDArray[np.float64]:
-    """Return an image (rows, columns, 3): each place has the mean colour of its cells, white where there are none.
+    """Return an image (rows, columns, 3): each pixel has the mean colour of its cells, white where there are none.
 
-    places: (M, 2) column and row of each cell; cells of no class are not drawn.
+    places: (M, 2) column and row of each cell; cells without a class are not drawn.
     """
     from matplotlib.colors import to_rgb
 

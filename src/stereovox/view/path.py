@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A picture of a path through a map: from above, unrolled from the side, and how much room there is along it."""
+"""Picture of a path through a map: from above, unrolled from the side, and the clearance along it."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from stereovox.view.grid import bounds, framed, legend, plan, trimmed
 from stereovox.view.panels import INK, PATH_COLOUR, STATE_COLOURS, measured
 
 STEPS = 400
-"""Places along the path at which the room is measured."""
+"""Number of points along the path at which the clearance is measured."""
 MORE_RADII = 3.0
-"""The section reaches so many radii above and below the path."""
+"""The section reaches this many radii above and below the path."""
 DRAWN_EVERY = 2.0
-"""The body is drawn along the path this many radii apart."""
+"""Distance in radii between drawings of the body along the path."""
 MAX_BODIES = 100
 NEAREST = {"obstacle": ([State.OCCUPIED, State.TENTATIVE], INK), "unknown cell": ([State.UNKNOWN], "tab:blue")}
 
@@ -40,10 +40,10 @@ def picture_path(
 ) -> None:
     """Write a PNG of a path (N, 3) in metres, world frame, of a ball of `radius` metres.
 
-    First the map from above, of the heights that the ball passes through; then the upright section along the path, so
-    that one sees what it passes over and under; then how far obstacles and unknown cells are from it.
-    blocked_at: metres along the path where it is blocked, which is marked.
-    Raises StereovoxError where nothing is known at these heights, and as `figures.save` does.
+    First the map from above, at the heights that the ball passes through; then the vertical section along the path,
+    which shows what it passes over and under; then the distance of obstacles and unknown cells.
+    blocked_at: metres along the path where it is blocked; this point is marked.
+    Raises StereovoxError where nothing is known at these heights, and as `figures.save`.
     """
     save(draw_path(voxel_map, np.asarray(waypoints, float), radius, title, blocked_at), path)
 
@@ -87,12 +87,12 @@ def draw_path(
 def _projected(voxel_map: VoxelMap, band: tuple[float, float]) -> OccupancyGrid:
     try:
         return project(voxel_map, band)
-    except StereovoxError as error:  # its cure is to give other heights, which are the path's own here
+    except StereovoxError as error:  # its cure, other heights, does not apply: they are the path's
         raise StereovoxError(f"no picture of this path: {str(error).partition(';')[0]}") from None
 
 
 def _mark(above: Any, others: tuple[Any, ...], place: NDArray[np.float64], at: float) -> None:
-    """Mark the place from which on the path is blocked."""
+    """Mark the point where the path is blocked."""
     above.plot(*place, marker="X", color=PATH_COLOUR, markeredgecolor="white", markersize=16, zorder=5)
     for axis in others:
         axis.axvline(at, color=PATH_COLOUR, linestyle=":")
@@ -111,7 +111,7 @@ def _bodies(axis: Any, places: NDArray[np.float64], radius: float, length: float
 
 
 def _section(axis: Any, voxel_map: VoxelMap, places: NDArray[np.float64], radius: float, length: float) -> None:
-    """Draw the states of the cells above and below the path, unrolled, and the room that the body takes."""
+    """Draw the states of the cells above and below the path, unrolled, and the space that the body takes."""
     from matplotlib.colors import ListedColormap
 
     up = voxel_map.config.up

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Plain pictures for a screen, without axes or words: a map's layer, its cells in space, a depth image. NumPy alone."""
+"""Plain pictures without axes or text, in NumPy alone: a layer of a map, its cells in 3-D, a depth image."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from stereovox.view.render import Direction
 SIZE_PX = 640
 """Width or height of a picture of a map, whichever is longer."""
 MAX_PX = 24.0
-"""A cube's side is no longer."""
+"""Largest side of a cube."""
 FROM = Direction.of(-60, 38)
 _LIGHT = np.array([0.8, 0.62, 1.0])
-"""Brightness of the faces across each axis."""
+"""Brightness of the faces perpendicular to each axis."""
 _STATES = np.array([[int(STATE_COLOURS[state][i : i + 2], 16) for i in (1, 3, 5)] for state in sorted(State)], np.uint8)
 
 
@@ -61,7 +61,7 @@ def colour_depth(depth_m: NDArray[np.floating], max_range: float) -> NDArray[np.
 
 
 def _cube(scale: float) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Return the pixels of a cube `scale` pixels long, from its middle: columns, rows, and the axis of their face."""
+    """Return the pixels of a cube `scale` pixels long, from its centre: columns, rows, and the axis of their face."""
     reach = int(np.ceil(0.9 * scale)) + 1
     down, across = (grid.ravel() for grid in np.mgrid[-reach : reach + 1, -reach : reach + 1])
     points = (across[:, None] * FROM.right - down[:, None] * FROM.up) / scale

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A spherical grid as a picture: all directions round the vehicle side by side, coloured by distance."""
+"""Picture of a spherical grid: all directions around the vehicle, coloured by distance."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ TOO_NEAR = "#d11149"
 COLOURS = "turbo_r"
 """Near is red, far is blue."""
 NEAREST, FARTHEST = 0.3, 10.0
-"""Least span of the colours' logarithmic scale in metres, as far as the grid has such ranges."""
+"""Minimum span of the logarithmic colour scale in metres, as far as the grid has such ranges."""
 
 
 def sphere_picture(
@@ -52,7 +52,7 @@ def draw_sphere(grid: SphereGrid, title: str, now_ns: int | None = None) -> Any:
 
 
 def panorama(grid: SphereGrid) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Return ranges in metres and reasons of all directions (polars, azimuths) as one sees them.
+    """Return ranges in metres and reasons of all directions (polars, azimuths) as a panorama.
 
     First row: straight up; first column: behind, then left, ahead in the middle, right. Outside of the grid: UNKNOWN.
     """

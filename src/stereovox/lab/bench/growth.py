@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Does a frame cost more the longer the flight was, or the larger the map is?"""
+"""Cost of a frame by length of the flight and by size of the map."""
 
 from __future__ import annotations
 

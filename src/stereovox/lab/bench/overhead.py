@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a frame costs before there is anything to do, and how much faster more threads make it."""
+"""Fixed cost of a frame, and speed-up by threads."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SIZES = ((8, 6), (160, 120), (320, 240), (640, 480))
 """Width and height of the images; the field of view is the same."""
 DEPTH_M = 0.5
 WARM = 20
-"""Rounds that do not count."""
+"""Warm-up rounds, not counted."""
 
 
 def thread_scaling(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Does a map forget a person who passed, and keep a thin pole that is often missed?"""
+"""Check that a map clears a person who has passed, and keeps a thin pole that is often missed."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def first_true(flags: NDArray[np.bool_]) -> NDArray[np.float64]:
 
 @dataclass(frozen=True, eq=False)
 class Ghosts:
-    """What became of the cells where a person had been, and of what stayed.
+    """Outcome for the cells where a person had been, and for static objects.
 
     number: (F,) ghosts after each frame: cells that are occupied though the frame truly sees through them.
     gone: frames until a cell that is seen free was no longer occupied; free: until it was free.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""IST 2019 made again: a Kinect maps two floors along the way a lidar finds, scored against the lidar's map."""
+"""Reproduction of IST 2019: a Kinect maps two floors along a lidar's trajectory, scored against the lidar's map."""
 
 from __future__ import annotations
 

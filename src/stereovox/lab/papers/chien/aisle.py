@@ -31,9 +31,9 @@ FAR_M = 8.0
 """From this distance on a wall counts as far."""
 MAX_RANGE_M = 13.0
 """Depths that count here: the profile's 10 m would end before the aisle does."""
-WANTED = 0.95
+MIN_SHARE = 0.95
 """Share of what full resolution finds that counts as nothing lost."""
-SAID = (
+PAPER = (
     "The resolution downsampling value affected aisle-like scenes a lot: only the closest depth of each block "
     "counts, so the further depth of the aisle may be filtered out. The further cells cannot be updated often with a "
     "higher ratio."
@@ -214,7 +214,7 @@ def chapter(found: Sequence[AisleFound], scene: Scene) -> Chapter:
         f"{FAR_M:g} m that a side wall or the end wall touches and a pixel sees: {found[0].far_cells} cells of 0.2 m. "
         "All variants get the same images and the sensor model of chien2020, with depths up to 13 m and no window.",
         claims,
-        [Shown("Fig 4.12", SAID, OURS, aisle_png(found, scene.solids))],
+        [Shown("Fig 4.12", PAPER, OURS, aisle_png(found, scene.solids))],
         [Sheet("All variants", HEADS, rows)],
         [WHY, STRAY],
         {"variants": [one.figures() for one in found]},
@@ -223,5 +223,5 @@ def chapter(found: Sequence[AisleFound], scene: Scene) -> Chapter:
 
 def _claim(one: AisleFound) -> Claim:
     """Return what is claimed of stereovox's own rule: it must find nearly all that exact rays do."""
-    text = f"{one.variant.name}: at least {100 * WANTED:.0f} % of the far cells that exact rays find"
-    return Claim(text, "a challenge left open", percent(one.against_full), one.against_full >= WANTED)
+    text = f"{one.variant.name}: at least {100 * MIN_SHARE:.0f} % of the far cells that exact rays find"
+    return Claim(text, "a challenge left open", percent(one.against_full), one.against_full >= MIN_SHARE)

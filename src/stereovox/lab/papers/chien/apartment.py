@@ -41,7 +41,7 @@ SEEN_FRAMES = 10
 BATCH = 16
 THINNED = 2
 """Only every so many pixels, across and down, are asked what they see of a wall: it is the wall's cells that count."""
-SAID = (
+PAPER = (
     "The result looks precise due to the on-board SLAM and re-localization of the T265. The walls are solid and "
     "straight and the corner is 90 degrees. The floor plan stands beside it; 255 is occupied, 0 free."
 )
@@ -211,7 +211,7 @@ def scan_apartment(
             tracked = _tracked(pair, i, exact)
             for scan, mapper in zip(scans, mappers, strict=True):
                 mapper.add(tracked if scan.poses == "T265" else exact)
-            _look(sightings, depth, exact)
+            _count_sightings(sightings, depth, exact)
             way.append(exact.T_world_sensor[:3, 3])
             reported.append(tracked.T_world_sensor[:3, 3])
             step()
@@ -255,7 +255,7 @@ def _wall_sightings(stage: Stage, size: float) -> Sightings:
     return Sightings(np.unique(keys(np.concatenate(walls))), size)
 
 
-def _look(sightings: dict[float, Sightings], depth_m: NDArray[np.float32], frame: Frame) -> None:
+def _count_sightings(sightings: dict[float, Sightings], depth_m: NDArray[np.float32], frame: Frame) -> None:
     thinned, n = depth_m[::THINNED, ::THINNED], THINNED
     camera = frame.camera
     assert isinstance(camera, PinholeCamera)  # what the simulation has
@@ -282,7 +282,7 @@ def chapter(found: Apartment) -> Chapter:
         f"{100 * off['end_m']:.0f} cm at the end. Walls are measured where the camera saw them often enough and "
         "neither furniture nor doors stand before them; 15 cm beside corners, floor and ceiling are left out.",
         [claim for name, one in figures.items() for claim in _claims(name, one)],
-        [Shown("Fig 4.11", SAID, OUR_PICTURE, picture)],
+        [Shown("Fig 4.11", PAPER, OUR_PICTURE, picture)],
         [_walls(found.scans), _corners(found.scans)],
         [MEASURES, LIMITS, EXPECTED],
         {"scans": figures, "images": len(found.way), "tracker_off": off},

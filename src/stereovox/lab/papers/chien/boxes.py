@@ -41,7 +41,7 @@ DIRECTIONS = ("left", "right", "top", "bottom", "front")
 TITLES = {"line": "Line drawing", "ray": "Voxel traversal"}
 SIZES_CM = {"large": "47 x 36.5 x 32 cm", "small": "25 x 18.5 x 9 cm"}
 FIGURES = {"large": ("Fig 4.6", "Fig 4.7"), "small": ("Fig 4.9", "Fig 4.10")}
-SAID = {
+PAPER = {
     "large": "The box occupies two cells. Only 3.5 cm of it lie in each outer cell, whose rays mostly pass by. The "
     "wall behind it is fully obstructed and has no update results.",
     "small": "The small box also occupies two cells, although it is 22 cm narrower: 12.5 cm of it lie in each, more "
@@ -317,7 +317,7 @@ def _pictures(size: str, found: Sequence[BoxFound]) -> list[Shown]:
         "optical axis and of the whole layer by line drawing. 127 is unknown, 0 free, 255 occupied."
     )
     return [
-        Shown(plan, SAID[size], ours, box_png(line, ray)),
+        Shown(plan, PAPER[size], ours, box_png(line, ray)),
         Shown(space, "The 3-D map; red lines are the field of view with 1 m depth.", "The same, by line drawing.",
               space_png(line.voxel_map, f"{size.capitalize()} box at 2 m")),
     ]  # fmt: skip

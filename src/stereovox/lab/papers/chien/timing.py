@@ -120,9 +120,9 @@ def time_tables(
     steps, conditions = _Steps(), [_Condition(condition) for condition in CONDITIONS]
     done = 0
     for batch in _batches(location, frames):
-        steps.take(batch, counted=done >= FIRST)
+        steps.add(batch, counted=done >= FIRST)
         for condition in conditions:
-            condition.take(batch, counted=done >= FIRST)
+            condition.add(batch, counted=done >= FIRST)
         done += len(batch)
         for _ in batch:
             step()
@@ -148,7 +148,7 @@ class _Steps:
         self._tracers = [(make_integrator(config), make_map(config)) for config in configs]
         self._ms: dict[str, list[float]] = defaultdict(list)
 
-    def take(self, batch: Sequence[Frame], counted: bool) -> None:
+    def add(self, batch: Sequence[Frame], counted: bool) -> None:
         names = [step.name for step in STEPS]
         images = [self._time(names[5], counted, prepare, frame, self._config) for frame in batch]
         small = [self._time(names[0], counted, downsample, image, 10) for image in images]
@@ -180,7 +180,7 @@ class _Condition:
         self._mapper = Mapper(load_config("chien2020", **settings))
         self._ms: list[float] = []
 
-    def take(self, batch: Sequence[Frame], counted: bool) -> None:
+    def add(self, batch: Sequence[Frame], counted: bool) -> None:
         for n, frame in enumerate(batch):
             shown = not self._condition.views or n % VIEW_EVERY == 0
             start = perf_counter()

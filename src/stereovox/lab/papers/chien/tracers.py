@@ -29,7 +29,7 @@ from stereovox.view.panels import measured, title
 TRACERS = ("ray", "line")
 RIM_CELLS = 1.5
 """A cell whose centre is so many cell widths or less inside the field of view, or outside it, lies at its rim."""
-SAID = (
+PAPER = (
     "Line drawing tries to make the line as thin as possible with less effort; voxel traversal fills every cell the "
     "ray passes. The missed cells can still be updated by other rays, except close to the edge of the field of view."
 )
@@ -199,7 +199,7 @@ def chapter(found: Sequence[Comparison], size: float) -> Chapter:
         "on which a frame says anything, summed over all frames, and the cells that are occupied in the end. The rim "
         "of the view is everything less than 1.5 cells inside it.",
         [claim for one in found for claim in _claims(one)],
-        [Shown("Fig 3.10", SAID, OURS, tracers_png(found[0], size))],
+        [Shown("Fig 3.10", PAPER, OURS, tracers_png(found[0], size))],
         [Sheet("Cells updated, all frames together; median time of a frame with map update", HEADS, rows)],
         [THICK],
         {"comparisons": [one.figures() for one in found]},

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The experiments of IST 2019 told: simulated beams, one chapter a floor, and the table of times."""
+"""Chapters of IST 2019: simulated beams, one chapter per floor, and the table of times."""
 
 from __future__ import annotations
 

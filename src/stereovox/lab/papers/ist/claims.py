@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What must hold of simulated beams and of a floor's maps, and whether it does."""
+"""Claims about simulated beams and floor maps, and whether they hold."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def claims_of(found: Survey, place: Place | None) -> list[Claim]:
     ]
     if place is None:
         return [*claims, *(_beside(one) for one in (middle, ours))]
-    claims += [_target(middle), _beside(ours), *_band(ours, theirs), _walls(middle), *_ways(found)]
+    claims += [_target(middle), _beside(ours), *_band(ours, theirs), _walls(middle), *_format_errors(found)]
     odometry = found.judged.get(DRAWN_ODOMETRY)
     if odometry is not None:
         less = theirs.scores.eq7_percent < odometry.scores.eq7_percent
@@ -147,7 +147,7 @@ def _walls(one: Judged) -> Claim:
     return Claim(text, f"at most {100 * WALL_M:g} cm", ours, holds)
 
 
-def _ways(found: Survey) -> list[Claim]:
+def _format_errors(found: Survey) -> list[Claim]:
     ways = {"SLAM's way": found.reference.way_error, "AMCL's way": found.way_error}
     return [
         Claim(f"{name}, off the true one (RMS, laid on it as a whole)", f"at most {100 * WAY_M:g} cm",

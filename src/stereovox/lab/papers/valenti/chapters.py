@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The evaluation told: Table 8.1 beside ours, one chapter a drive, and the time it takes."""
+"""Chapters of the evaluation: Table 8.1 beside ours, one chapter per drive, and the times."""
 
 from __future__ import annotations
 

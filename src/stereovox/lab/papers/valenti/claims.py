@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a map of a real drive must show, and whether it does."""
+"""Claims about maps of real drives, and whether they hold."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from stereovox.lab.papers.valenti.speed import Speed
 TARGET_RANGE = 20.0
 ERROR, ECE, HERTZ = 0.10, 0.05, 20.0
 """Most mean squared error, most calibration error, and least frames a second."""
-NOT_THERE = "octomap-python is not installed"
+NOT_INSTALLED = "octomap-python is not installed"
 KINDS = {"view": "free: all in view", "rays": "free: what the lidar looked into"}
 """Kinds of truth."""
 CLAIMED = "view"
@@ -88,7 +88,7 @@ def _against_octomap(curve: PrecisionRecall, octomap: PrecisionRecall | None) ->
     """Return (a): OctoMap's better precision and its better recall, of p > 0.7 and p >= 0.7, at once."""
     text = "exact precision and recall, at one threshold"
     if octomap is None:
-        return Result("a", text, NOT_THERE, _told(best(curve, EXACT), EXACT), None)
+        return Result("a", text, NOT_INSTALLED, _format_point(best(curve, EXACT), EXACT), None)
     points = [at(octomap, threshold) for threshold in (STRICT, AT_LEAST)]
     precision, recall = (max(point[name] or 0.0 for point in points) for name in EXACT)
     return _pair("a", text, curve, EXACT, (precision, recall), " (OctoMap's better ones)")
@@ -100,14 +100,14 @@ def _pair(
     point = best(curve, names, wanted)
     holds = all((point[name] or 0.0) >= goal for name, goal in zip(names, wanted, strict=True))
     goal = "at least {:.3f} and {:.3f}".format(*wanted)
-    return Result(letter, text, f"{goal}{why}", _told(point, names), holds)
+    return Result(letter, text, f"{goal}{why}", _format_point(point, names), holds)
 
 
 def _wins(found: Found, setting: Setting, rival: str) -> Claim:
     """Return claim (f): better in each measure that has a target, each map at the threshold that suits it best."""
     text = f"(f) {setting}: default is better than {rival} in every measure"
     if (setting, rival) not in found:
-        return Claim(text, "better in each", NOT_THERE, None)
+        return Claim(text, "better in each", NOT_INSTALLED, None)
     ours, theirs = (found[setting, name].scores[CLAIMED] for name in (DEFAULT, rival))
     pairs = {name: (measure(ours), measure(theirs)) for name, measure in MEASURES.items()}
     better = {name: a < b if name in LESS_IS_BETTER else a > b for name, (a, b) in pairs.items()}
@@ -140,7 +140,7 @@ def _or(value: float | None, otherwise: float) -> float:
     return otherwise if value is None else value
 
 
-def _told(point: Mapping[str, float | None], names: tuple[str, str]) -> str:
+def _format_point(point: Mapping[str, float | None], names: tuple[str, str]) -> str:
     precision, recall = (_number(point[name]) for name in names)
     return f"{precision} and {recall} at p > {point['threshold']:.4g}"
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The mappers that are compared, all behind one small interface: two profiles of ours, and OctoMap."""
+"""Mappers to compare, behind one small interface: two profiles of ours, and OctoMap."""
 
 from __future__ import annotations
 

@@ -69,7 +69,7 @@ def test_the_way_is_found_by_slam_or_in_a_map(tmp_path):
     assert steps[0] == (1, scans, "matching scans")
     assert "by SLAM" in told[0]
     told.clear()
-    settings = {"use": "lidar", "poses": tmp_path / "a.yaml", "tell": told.append}
+    settings = {"use": "lidar", "poses": tmp_path / "a.yaml", "notify": told.append}
     made = sv.map_floor(DRIVE, tmp_path / "b.yaml", **settings, start=(0, 0, 0))
     assert len(made.track.stamps_ns) == scans
     assert told[0] == f"finding the robot's way in {tmp_path / 'a.yaml'}"

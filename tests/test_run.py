@@ -60,7 +60,7 @@ def test_it_makes_the_map_of_the_command(tmp_path):
     assert result.out == tmp_path / "a.svox"
     assert [report for _, report in seen.reports] == result.reports
     assert result.summary()["frames"] == result.map.frames == 12
-    assert options.SECONDS == run.CHECKPOINT_S
+    assert options.CHECKPOINT_S == run.CHECKPOINT_S
 
 
 def test_a_run_that_was_stopped_goes_on_where_it_was(tmp_path):

@@ -257,7 +257,7 @@ def test_a_second_writer_is_refused_before_any_work(tmp_path, monkeypatch, capsy
 @pytest.mark.parametrize("command", ["grid", "slam"])
 def test_a_second_writer_of_a_floor_is_refused_before_any_work(tmp_path, monkeypatch, capsys, command):
     monkeypatch.setattr("stereovox.floor_run.open_robot", lambda _: pytest.fail("worked"))
-    monkeypatch.setattr("stereovox.sources.robots.robot.open_robot", lambda _: pytest.fail("worked"))
+    monkeypatch.setattr("stereovox.opening.open_robot", lambda _: pytest.fail("worked"))
     refused = []
     with only_writer_of(tmp_path / "floor.yaml"):
         run_in_thread(lambda: refused.append(main([command, "sim:floor", "--out", str(tmp_path / "floor.yaml")])))

@@ -49,7 +49,7 @@ def stopped():
 
 def test_it_makes_the_map_of_the_command(tmp_path):
     seen, told = Seen(), []
-    result = sv.map_floor(DRIVE, tmp_path / "a.yaml", **LIDAR, observers=[seen], tell=told.append)
+    result = sv.map_floor(DRIVE, tmp_path / "a.yaml", **LIDAR, observers=[seen], notify=told.append)
     words = ["grid", DRIVE, "--out", str(tmp_path / "b.yaml"), "--use", "lidar", "--poses", "odometry"]
     assert command(words) == 0
     same_cells(tmp_path / "a.yaml", tmp_path / "b.yaml")
@@ -62,14 +62,14 @@ def test_it_makes_the_map_of_the_command(tmp_path):
 
 def test_the_way_is_found_by_slam_or_in_a_map(tmp_path):
     told, steps = [], []
-    with sv.FloorRun(DRIVE, tmp_path / "a.yaml", use="lidar", tell=told.append) as going:
-        found = going.find_way(lambda *step: steps.append(step))
+    with sv.FloorRun(DRIVE, tmp_path / "a.yaml", use="lidar", notify=told.append) as going:
+        found = going.find_track(lambda *step: steps.append(step))
         assert going.finish().track is found
     scans = len(open_robot(DRIVE).scans)
     assert steps[0] == (1, scans, "matching scans")
     assert "by SLAM" in told[0]
     told.clear()
-    settings = {"use": "lidar", "poses": tmp_path / "a.yaml", "tell": told.append}
+    settings = {"use": "lidar", "poses": tmp_path / "a.yaml", "notify": told.append}
     made = sv.map_floor(DRIVE, tmp_path / "b.yaml", **settings, start=(0, 0, 0))
     assert len(made.track.stamps_ns) == scans
     assert told[0] == f"finding the robot's way in {tmp_path / 'a.yaml'}"
@@ -85,7 +85,7 @@ def test_the_way_is_found_by_slam_or_in_a_map(tmp_path):
 def test_a_run_that_is_told_to_stop_is_saved(tmp_path, then):
     told = []
     with pytest.raises(KeyboardInterrupt):
-        sv.map_floor(DRIVE, tmp_path / "a.yaml", **LIDAR, observers=[Seen(5, then)], tell=told.append, checkpoint_s=0)
+        sv.map_floor(DRIVE, tmp_path / "a.yaml", **LIDAR, observers=[Seen(5, then)], notify=told.append, checkpoint_s=0)
     assert told == [f"stopped after 5 of 16 readings; they are saved in {tmp_path / 'a.yaml'}"]
     sv.map_floor(DRIVE, tmp_path / "five.yaml", **LIDAR, frames=":5")
     same_cells(tmp_path / "a.yaml", tmp_path / "five.yaml")
@@ -201,6 +201,6 @@ def test_a_mapper_saves_by_the_ending_of_the_name(tmp_path):
 
 def test_nothing_is_looked_for_twice(tmp_path, monkeypatch):
     with sv.FloorRun(DRIVE, tmp_path / "a.yaml", use="lidar") as going:
-        going.find_way()
+        going.find_track()
         monkeypatch.setattr(floor_run, "slam_robot", lambda *_: pytest.fail("again"))
-        assert going.finish().track is going.find_way()
+        assert going.finish().track is going.find_track()

@@ -60,23 +60,23 @@ def test_it_makes_the_map_of_the_command(tmp_path):
     assert result.out == tmp_path / "a.svox"
     assert [report for _, report in seen.reports] == result.reports
     assert result.summary()["frames"] == result.map.frames == 12
-    assert options.SECONDS == run.CHECKPOINT_S
+    assert options.CHECKPOINT_S == run.CHECKPOINT_S
 
 
 def test_a_run_that_was_stopped_goes_on_where_it_was(tmp_path):
     told = []
     with pytest.raises(KeyboardInterrupt):
-        sv.map_recording(SOURCE, tmp_path / "a.svox", **SETTINGS, observers=[Seen(stop=5)], tell=told.append)
+        sv.map_recording(SOURCE, tmp_path / "a.svox", **SETTINGS, observers=[Seen(stop=5)], notify=told.append)
     assert told[-1].startswith("stopped after 5 frames")
     assert sv.load_map(tmp_path / "a.svox").frames == 5
-    with sv.MapRun(SOURCE, tmp_path / "a.svox", resume=True, frames=":12", tell=told.append) as going:
-        assert going.left == 7
+    with sv.MapRun(SOURCE, tmp_path / "a.svox", resume=True, frames=":12", notify=told.append) as going:
+        assert going.remaining == 7
         assert going.mapper.config.voxel_size == 0.1  # the map's own settings
         assert len(going.finish().reports) == 7
     assert told[-1] == "going on after frame 5"
     sv.map_recording(SOURCE, tmp_path / "whole.svox", **SETTINGS)
     same_cells(tmp_path / "a.svox", tmp_path / "whole.svox")
-    again = sv.map_recording(SOURCE, tmp_path / "a.svox", resume=True, frames=":12", tell=told.append)
+    again = sv.map_recording(SOURCE, tmp_path / "a.svox", resume=True, frames=":12", notify=told.append)
     assert again.reports == []
     assert "already holds all 12 frames" in told[-1]
 

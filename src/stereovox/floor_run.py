@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A ground robot's recording becomes a floor's map on disk, as `run.py` makes one in space.
+"""Map a ground robot's recording to a 2-D floor map on disk, as `run.py` does for 3-D maps.
 
-What `stereovox grid` does, for Python: `map_floor` in one call, `FloorRun` in steps. Whatever ends the run, the files
-hold all readings up to the last checkpoint. They do not say which readings these are: `resume` goes on with the cells,
-and with the readings that it is given.
+The Python side of `stereovox grid`: `map_floor` does it in one call, `FloorRun` in steps. However the run ends, the
+files hold all readings up to the last checkpoint. They do not record which readings: `resume` continues with the saved
+cells and adds the readings it is given.
 """
 
 from __future__ import annotations
@@ -56,58 +56,66 @@ def map_floor(
     resume: bool | str | Path = False,
     checkpoint_s: float = CHECKPOINT_S,
     observers: Sequence[Observer] = (),
-    tell: Callable[[str], None] = lambda line: None,
+    notify: Callable[[str], None] = lambda line: None,
     **overrides: Any,
 ) -> MapResult[GridMap]:
-    """Make a floor's map of a ground robot's recording, and save it while it is made, as files of map_server.
+    """Map a ground robot's recording to a 2-D floor map, saved at regular checkpoints as map_server files.
 
     Args:
-        source: As for `open_robot` (a bag, a CARMEN log, `sim:floor`), or a robot of your own.
+        source: As for `open_robot` (a bag, a CARMEN log, `sim:floor`), or a `Robot` of your own.
         out: The `.yaml`, `.pgm` or `.png` to write. An older map there stays whole until the first save.
         profile: Profile name, TOML file or Config; None: `default`.
-        poses: Where the robot was: `"slam"` finds it out by itself, the `.yaml` of a map localises the robot in that
-            map, `"odometry"` believes the wheels. None: the map to go on with, else SLAM, both where there is a lidar.
-        use: What to map: `"depth"`, `"lidar"` or `"both"`; None: depth images if there are any.
-        frames: Only these of them, as a Python slice: `"::4"`.
-        start: Where the robot stood first in the map it is localised in: x, y in metres and yaw in radians; None:
-            anywhere.
-        mode: How the files tell probabilities: `"trinary"`, `"scale"` or `"raw"` (see `write_map_server`).
-        resume: Go on with the cells of the map at `out` (True), or of the one whose `.yaml` this is. All readings
-            that `frames` picks are added: the files do not say which were in it.
-        checkpoint_s: Seconds from one save to the next; 0: only at the end.
-        observers: What is to see each reading.
-        tell: Takes lines that a user should see: what had to be assumed, how well the scans fit the map.
+        poses: Source of the robot's poses: `"slam"`, `"odometry"`, or the `.yaml` of a map to localise the robot in.
+            None: with a lidar, the map to resume, else SLAM; without one, odometry.
+        use: What to map: `"depth"`, `"lidar"` or `"both"`; None: depth images if there are any, else lidar.
+        frames: Python slice that selects readings: `"::4"`.
+        start: The robot's first pose in the map it is localised in: x, y in metres and yaw in radians; None: unknown.
+        mode: How the files store probabilities: `"trinary"`, `"scale"` or `"raw"` (see `write_map_server`).
+        resume: Continue with the cells of the map at `out` (True), or of the map whose `.yaml` this is. All readings
+            that `frames` selects are added: the files do not record which ones the map already holds.
+        checkpoint_s: Seconds between two saves; 0: save only at the end.
+        observers: Called after each reading.
+        notify: Called with each line that a user should see: assumptions about the recording, how well scans fit the
+            map.
         **overrides: Settings by name, as for `GridMapper`.
 
     Returns:
-        The map, the robot's way in it, and what became of each reading.
+        The map, the robot's trajectory in it, and the report of each reading.
 
     Raises:
-        StereovoxError: One line, where recording, settings or place are wrong, another run writes there, the disk is
-            full or not one reading could be used.
-        KeyboardInterrupt: Ctrl-C, SIGTERM or SIGHUP, between two readings; what is there is saved.
+        StereovoxError: One line: invalid recording, settings or output file, another run writes there, the disk is
+            full, or no reading could be used.
+        KeyboardInterrupt: Ctrl-C, SIGTERM or SIGHUP, raised between two readings after saving the map.
     """
     with FloorRun(
         source, out, profile=profile, poses=poses, use=use, frames=frames, start=start, mode=mode, resume=resume,
-        checkpoint_s=checkpoint_s, tell=tell, **overrides,
+        checkpoint_s=checkpoint_s, notify=notify, **overrides,
     ) as run:  # fmt: skip
         return run.finish(observers)
 
 
 class FloorRun:
-    """`map_floor` in steps: entered, all is open and checked; `find_way` finds where the robot was; `finish` maps.
+    """`map_floor` in steps: entering opens and checks everything, `find_track` finds the poses, `finish` maps.
 
-    While it is open nobody else can write at `out`. Arguments as of `map_floor`.
+    While it is open, no other run can write to `out`.
+
+    Args:
+        source: As for `map_floor`, like all other arguments.
 
     Attributes:
-        robot: The recording.
-        mapper: Makes the map.
-        left: How many readings are to be mapped.
+        robot: The recording, once entered.
+        mapper: The mapper, once entered.
+        remaining: Number of readings to map, once entered.
+        config: All settings, once entered.
+        out: File of the map.
+
+    Raises:
+        StereovoxError: On entering: invalid recording, settings or output file, or another run writes there.
     """
 
     robot: Robot
     mapper: GridMapper
-    left: int
+    remaining: int
 
     def __init__(
         self,
@@ -122,15 +130,15 @@ class FloorRun:
         mode: str = "trinary",
         resume: bool | str | Path = False,
         checkpoint_s: float = CHECKPOINT_S,
-        tell: Callable[[str], None] = lambda line: None,
+        notify: Callable[[str], None] = lambda line: None,
         **overrides: Any,
     ):
         self.out = Path(out)
-        self._where, self._profile, self._overrides = source, profile, overrides
+        self._source, self._profile, self._overrides = source, profile, overrides
         self._poses, self._use, self._frames, self._mode = None if poses is None else str(poses), use, frames, mode
         self._start = None if start is None else np.asarray(start, float)
-        self._before = (self.out if resume is True else Path(resume)) if resume else None
-        self._checkpoint_s, self._tell, self._open = checkpoint_s, tell, ExitStack()
+        self._resumed = (self.out if resume is True else Path(resume)) if resume else None
+        self._checkpoint_s, self._notify, self._open = checkpoint_s, notify, ExitStack()
 
     def __enter__(self) -> FloorRun:
         check_file(self.out, FLOOR_ENDINGS)
@@ -138,15 +146,15 @@ class FloorRun:
             raise StereovoxError(f"{self.out}: no mode '{self._mode}'{did_you_mean(self._mode, MODES)}")
         if self._mode == "scale" and self.out.suffix.lower() == ".pgm":
             raise StereovoxError(f"{self.out}: mode scale has no grey for unknown cells; name a .yaml or .png")
-        if self._before == self.out and not self.out.exists():
+        if self._resumed == self.out and not self.out.exists():
             raise StereovoxError(f"{self.out}: no map to go on with; start it without resume")
         with ExitStack() as stack:
             stack.enter_context(only_writer_of_floor(self.out))
             self.config = load_config(self._profile or "default", **self._overrides)
-            self.robot = self._opened()
-            self._seen, self.left = self._chosen()
-            self._how, self._floor = self._where_to_look()
-            self.mapper = self._mapper()
+            self.robot = self._open_robot()
+            self._readings, self.remaining = self._select_readings()
+            self._poses_from, self._floor = self._pose_source()
+            self.mapper = self._make_mapper()
             self._checkpoints = Checkpoints(
                 lambda: self.mapper.save(self.out, self._mode), self.out, self._checkpoint_s
             )
@@ -157,20 +165,37 @@ class FloorRun:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         self._open.close()
 
-    def find_way(self, progress: Progress = no_progress) -> Track | None:
-        """Return the robot's way in the map, found once; None: as its odometry has it. Raises as `map_floor`.
+    def find_track(self, progress: Progress = no_progress) -> Track | None:
+        """Find the robot's trajectory by SLAM or localisation, once; later calls return the same.
 
         Args:
-            progress: Called with scans done, scans in all, and what is being done.
+            progress: Called with the number of scans done, their total, and the current step in words.
+
+        Returns:
+            The trajectory in the map; None: the odometry's poses are used.
+
+        Raises:
+            StereovoxError: SLAM or localisation failed.
         """
-        if self._track is None and self._how != ODOMETRY:
-            self._track = self._slam(progress) if self._floor is None else self._localised(self._floor, progress)
+        if self._track is None and self._poses_from != ODOMETRY:
+            self._track = self._slam(progress) if self._floor is None else self._localise(self._floor, progress)
         return self._track
 
     def finish(self, observers: Sequence[Observer] = ()) -> MapResult[GridMap]:
-        """Add all readings, and save the map. Raises as `map_floor`."""
-        track = self.find_way()
-        readings = (track.corrected(one) if track else one for one in self._seen)
+        """Map all readings and save the map; finds the trajectory first where that was not done.
+
+        Args:
+            observers: Called after each reading.
+
+        Returns:
+            The map, the robot's trajectory in it, and the report of each reading.
+
+        Raises:
+            StereovoxError: SLAM or localisation failed, the disk is full, or no reading could be used.
+            KeyboardInterrupt: Ctrl-C, SIGTERM or SIGHUP, raised between two readings after saving the map.
+        """
+        track = self.find_track()
+        readings = (track.corrected(one) if track else one for one in self._readings)
         with interrupt_between_steps() as check:
             reports = add_all(self.mapper, readings, self._checkpoints, check, observers, self._stopped)
             if not self.mapper.map.frames:
@@ -179,42 +204,43 @@ class FloorRun:
         return MapResult(self.mapper.map, self.out, reports, track=track)
 
     def _stopped(self, done: int) -> None:
-        self._tell(f"stopped after {done} of {self.left} readings; they are saved in {self.out.with_suffix('.yaml')}")
+        saved = f"they are saved in {self.out.with_suffix('.yaml')}"
+        self._notify(f"stopped after {done} of {self.remaining} readings; {saved}")
 
-    def _opened(self) -> Robot:
-        robot = open_robot(self._where) if isinstance(self._where, str | Path) else self._where
+    def _open_robot(self) -> Robot:
+        robot = open_robot(self._source) if isinstance(self._source, str | Path) else self._source
         for note in robot.notes:
-            self._tell(f"note: {note}")
+            self._notify(f"note: {note}")
         return robot
 
-    def _chosen(self) -> tuple[Iterator[Scan | Frame], int]:
-        """Return what is to be mapped in order of time, and how much that is."""
+    def _select_readings(self) -> tuple[Iterator[Scan | Frame], int]:
+        """Return the readings to map, in order of time, and their number."""
         robot = self.robot
         use = self._use or ("depth" if len(robot.frames) else "lidar")
         kinds: dict[str, Sequence[Any]] = {"depth": robot.frames, "lidar": robot.scans}
         if use not in (*kinds, "both"):
             raise StereovoxError(f"use '{use}': give depth, lidar or both")
-        wanted = {name: kinds[name] for name in (kinds if use == "both" else (use,))}
-        missing = [name for name, there in wanted.items() if not len(there)]
+        selected = {name: kinds[name] for name in (kinds if use == "both" else (use,))}
+        missing = [name for name, readings in selected.items() if not len(readings)]
         if missing:
             what, other = {"depth": ("depth images", "lidar"), "lidar": ("lidar scans", "depth")}[missing[0]]
             raise StereovoxError(f"{robot.name}: holds no {what}; use {other}")
-        picked = {name: range(len(there))[parse_slice(self._frames or ":")] for name, there in wanted.items()}
+        picked = {name: range(len(readings))[parse_slice(self._frames or ":")] for name, readings in selected.items()}
         if not all(picked.values()):
             raise StereovoxError(f"frames '{self._frames}' picks none of {robot.name}; widen it")
-        streams = [map(wanted[name].__getitem__, numbers) for name, numbers in picked.items()]
+        streams = [map(selected[name].__getitem__, numbers) for name, numbers in picked.items()]
         return in_time_order(*streams), sum(map(len, picked.values()))
 
-    def _where_to_look(self) -> tuple[str, OccupancyGrid | None]:
-        """Return whose poses to take: `slam`, `odometry`, or the file of a map and that map."""
+    def _pose_source(self) -> tuple[str, OccupancyGrid | None]:
+        """Return the source of poses: `slam`, `odometry`, or the file of a map and that map."""
         how = self._poses
-        if how == SLAM and self._before:
+        if how == SLAM and self._resumed:
             raise StereovoxError(
-                f"{self._before}: SLAM makes a frame of its own; to go on, leave poses out: the robot is localised in "
+                f"{self._resumed}: SLAM makes a frame of its own; to go on, leave poses out: the robot is localised in "
                 "the map"
             )
         if how is None:
-            how = str(self._before or SLAM) if len(self.robot.scans) else ODOMETRY
+            how = str(self._resumed or SLAM) if len(self.robot.scans) else ODOMETRY
         if how in (SLAM, ODOMETRY):
             if self._start is not None:
                 raise StereovoxError(f"poses {how}: start says where in a map; give the map's .yaml, or no start")
@@ -225,26 +251,26 @@ class FloorRun:
         check_start(self._start, floor)
         return how, floor
 
-    def _mapper(self) -> GridMapper:
-        if self._before is None:
+    def _make_mapper(self) -> GridMapper:
+        if self._resumed is None:
             return GridMapper(self.config)
-        before = read_map_server(self._before)
+        before = read_map_server(self._resumed)
         size = self._overrides.get("voxel_size", before.resolution)
         return GridMapper(self.config, voxel_size=size, resume=before)
 
     def _slam(self, progress: Progress) -> Track:
-        self._tell("finding the robot's way by SLAM; poses could also be localised in a map, or the odometry's own")
+        self._notify("finding the robot's way by SLAM; poses could also be localised in a map, or the odometry's own")
         found = slam_robot(self.robot, self.config, progress)
-        self._say(refused_line(found.refused))
+        self._notify_unless_empty(refused_line(found.refused))
         return found.track
 
-    def _localised(self, floor: OccupancyGrid, progress: Progress) -> Track:
-        self._tell(f"finding the robot's way in {self._how}")
+    def _localise(self, floor: OccupancyGrid, progress: Progress) -> Track:
+        self._notify(f"finding the robot's way in {self._poses_from}")
         track = localise_robot(self.robot, floor, self.config, self._start, progress)
-        self._say(refused_line(track.refused, track.first_refusal))
-        self._say(fit_of(self.robot, floor, track)[1])
+        self._notify_unless_empty(refused_line(track.refused, track.first_refusal))
+        self._notify_unless_empty(fit_of(self.robot, floor, track)[1])
         return track
 
-    def _say(self, line: str) -> None:
+    def _notify_unless_empty(self, line: str) -> None:
         if line:
-            self._tell(line)
+            self._notify(line)

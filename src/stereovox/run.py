@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A recording, a simulation or a live camera becomes a map on disk; whatever ends the run costs its last seconds.
+"""Map a whole recording, simulation or live camera to disk, with checkpoints, resume and clean interrupts.
 
-What `stereovox map` does, for Python: `map_recording` in one call, `MapRun` for who wants the mapper before the first
-frame. `kill -9`, a full disk, Ctrl-C and SIGTERM leave a map that opens, and `resume` goes on with it as if nothing had
-happened.
+The Python side of `stereovox map`: `map_recording` does it in one call, `MapRun` gives access to the mapper before the
+first frame. After `kill -9`, a full disk, Ctrl-C or SIGTERM the map on disk still opens, at most the frames since the
+last checkpoint are lost, and `resume` continues as if nothing had happened.
 """
 
 from __future__ import annotations
@@ -39,29 +39,34 @@ MapT = TypeVar("MapT", VoxelMap, GridMap)
 
 CHECKPOINT_S = 10.0
 REST = 25
-"""Times as long as a save took must pass before the next: so saves take at most 4 % of a run."""
+"""Minimum pause between two saves, in durations of a save: saves take at most 4 % of a run."""
 MAX_UNUSABLE = 100
-"""Frames of a live camera that a run may refuse before the first that it does not."""
+"""Frames of a live camera that may be refused in a row at the start before the run gives up."""
 
 
 class Observer(Protocol):
-    """Sees each frame that was offered to the map: a progress bar, a page, a recorder."""
+    """Observer of a run, called for each frame: a progress bar, a live page, a recorder."""
 
     def after(self, frame: Any, report: UpdateReport) -> None:
-        """Note a frame, right after `Mapper.add` returned `report`."""
+        """Process a frame right after the mapper returned its report, whether it was mapped or refused.
+
+        Args:
+            frame: The `Frame`, `StereoFrame` or `Scan` that was offered.
+            report: What `add` of the mapper returned for it.
+        """
         ...
 
 
 @dataclass(frozen=True)
 class MapResult(Generic[MapT]):
-    """What a run made.
+    """Result of a run: the saved map and the report of each frame.
 
     Attributes:
-        map: The map, as saved.
-        out: Where.
-        reports: One for each frame of this run, in order.
-        dropped: Frames that a live camera delivered and nobody took in time.
-        track: Of a floor's run the robot's way in the map; None where its odometry was believed.
+        map: The map, as saved: a `VoxelMap` or, from `map_floor`, a `GridMap`.
+        out: Where it was saved.
+        reports: One report for each frame of this run, in order.
+        dropped: Number of frames that a live camera delivered while the mapper was busy.
+        track: The robot's trajectory in the map, from `map_floor`; None where the odometry's poses were used.
     """
 
     map: MapT
@@ -71,7 +76,11 @@ class MapResult(Generic[MapT]):
     track: Track | None = None
 
     def summary(self) -> dict[str, Any]:
-        """Return the numbers of `stereovox map --json`: frames, refusals by reason, milliseconds, cells, memory."""
+        """Summarise the run.
+
+        Returns:
+            The numbers of `stereovox map --json`: frames, refusals by reason, milliseconds, cells, memory.
+        """
         return summarise(self.map, self.reports)
 
 
@@ -85,42 +94,51 @@ def map_recording(
     camera: str | Path | None = None,
     checkpoint_s: float = CHECKPOINT_S,
     observers: Sequence[Observer] = (),
-    tell: Callable[[str], None] = lambda line: None,
+    notify: Callable[[str], None] = lambda line: None,
     **overrides: Any,
 ) -> MapResult[VoxelMap]:
-    """Make the map of a recording, a simulation or a live camera, and save it while it is made.
+    """Map a recording, a simulation or a live camera, and save the map at regular checkpoints.
 
     Args:
-        source: As for `open_source`, a live camera (`realsense:`), or a stream of your own.
-        out: Folder of the map to write. An older map there is replaced with the first save, and stays whole until then.
+        source: As for `open_source`, a live camera (`realsense:`), or a `Stream` of your own.
+        out: Folder of the map to write. An older map there stays whole until the first save replaces it.
         profile: Profile name, TOML file or Config; None: `default`, or with `resume` the map's own settings.
-        resume: Go on with the map at `out`; as many frames of the source are skipped as it has seen.
-        frames: Only these frames, as a Python slice: `"::4"`.
+        resume: Continue the map at `out`; the frames it has already seen are skipped.
+        frames: Python slice that selects frames: `"::4"`.
         camera: Camera file that replaces the recording's own.
-        checkpoint_s: Seconds from one save to the next; 0: only at the end.
-        observers: What is to see each frame.
-        tell: Takes lines that a user should see: what had to be assumed, where the run goes on.
+        checkpoint_s: Seconds between two saves; 0: save only at the end.
+        observers: Called after each frame.
+        notify: Called with each line that a user should see: assumptions about the source, where a run resumes.
         **overrides: Settings by name, as for `Mapper`.
 
     Returns:
-        The map and what became of each frame.
+        The map and the report of each frame.
 
     Raises:
-        StereovoxError: One line, where source, settings or place are wrong, another run writes there, the disk is full
-            or not one frame could be used.
-        KeyboardInterrupt: Ctrl-C, SIGTERM or SIGHUP, between two frames; what is there is saved.
+        StereovoxError: One line: invalid source, settings or output folder, another run writes there, the disk is full,
+            or no frame could be used.
+        KeyboardInterrupt: Ctrl-C, SIGTERM or SIGHUP, raised between two frames after saving the map.
     """
     settings = {"profile": profile, "resume": resume, "frames": frames, "camera": camera, "checkpoint_s": checkpoint_s}
-    with MapRun(source, out, **settings, tell=tell, **overrides) as run:
+    with MapRun(source, out, **settings, notify=notify, **overrides) as run:
         return run.finish(observers)
 
 
 class MapRun:
-    """`map_recording` in two steps: entered, it has its `mapper` and `source`; `finish` maps what is `left`.
+    """`map_recording` in two steps: `with MapRun(...) as run` opens and checks everything, `run.finish()` maps.
 
-    While it is open nobody else can write at `out`. Arguments as of `map_recording`.
+    While it is open, no other run can write to `out`.
 
-    source: the stream of frames. Raises StereovoxError, when it is entered, for what can be known to be wrong by then.
+    Args:
+        source: As for `map_recording`, like all other arguments.
+
+    Attributes:
+        mapper: The mapper, once entered.
+        source: The stream of frames, once entered.
+        out: Folder of the map.
+
+    Raises:
+        StereovoxError: On entering: invalid source, settings or output folder, or another run writes there.
     """
 
     mapper: Mapper
@@ -136,13 +154,13 @@ class MapRun:
         frames: str | None = None,
         camera: str | Path | None = None,
         checkpoint_s: float = CHECKPOINT_S,
-        tell: Callable[[str], None] = lambda line: None,
+        notify: Callable[[str], None] = lambda line: None,
         **overrides: Any,
     ):
         self.out = Path(out)
-        self._where, self._frames, self._camera = source, frames, camera
+        self._source, self._frames, self._camera = source, frames, camera
         self._profile, self._resume, self._overrides = profile, resume, overrides
-        self._tell, self._open = tell, ExitStack()
+        self._notify, self._open = notify, ExitStack()
         self._checkpoint_s = checkpoint_s
 
     def __enter__(self) -> MapRun:
@@ -153,13 +171,13 @@ class MapRun:
                 raise StereovoxError(f"{self.out}: no map to go on with; start it without resume")
             stack.enter_context(only_writer_in(self.out))
             sweep(self.out)
-            self.source = self._opened()
-            self.mapper = self._mapper()
+            self.source = self._open_source()
+            self.mapper = self._make_mapper()
             stack.callback(self.mapper.map.close)
             self._checkpoints = Checkpoints(lambda: self.mapper.map.save(self.out), self.out, self._checkpoint_s)
             self._check_recording()
             for note in self.source.notes:
-                self._tell(f"note: {note}")
+                self._notify(f"note: {note}")
             self._open = stack.pop_all()
         return self
 
@@ -167,24 +185,35 @@ class MapRun:
         self._open.close()
 
     def finish(self, observers: Sequence[Observer] = ()) -> MapResult[VoxelMap]:
-        """Add all frames that the map does not hold yet, and save it. Raises as `map_recording`."""
-        with interrupt_between_steps() as check, _there_at_once(self.mapper.map, self.out):
+        """Map all remaining frames and save the map.
+
+        Args:
+            observers: Called after each frame.
+
+        Returns:
+            The map and the report of each frame of this run.
+
+        Raises:
+            StereovoxError: The source failed, the disk is full, or no frame could be used.
+            KeyboardInterrupt: Ctrl-C, SIGTERM or SIGHUP, raised between two frames after saving the map.
+        """
+        with interrupt_between_steps() as check, _saved_from_start(self.mapper.map, self.out):
             reports = self._add_all(check, observers)
             if not self.mapper.map.frames:
                 raise StereovoxError(
                     f"{self.source.name}: not one frame could be used, no map is written ({_first_refusal(reports)})"
                 )
-            self._checkpoints.save(seen_by(self.mapper))
+            self._checkpoints.save(frames_offered(self.mapper))
         return MapResult(self.mapper.map, self.out, reports, self.source.dropped)
 
     @property
-    def left(self) -> int | None:
-        """How many frames are not in the map yet; None for a live camera."""
+    def remaining(self) -> int | None:
+        """Number of frames that are not in the map yet; None for a live camera."""
         length = self.source.length
-        return None if length is None else max(length - seen_by(self.mapper), 0)
+        return None if length is None else max(length - frames_offered(self.mapper), 0)
 
-    def _opened(self) -> Stream:
-        source = self._where
+    def _open_source(self) -> Stream:
+        source = self._source
         if isinstance(source, str | Path):
             source = opening.open_stream(str(source), self._frames)
         if self._camera is None:
@@ -193,7 +222,7 @@ class MapRun:
 
         return with_camera(source, str(self._camera))
 
-    def _mapper(self) -> Mapper:
+    def _make_mapper(self) -> Mapper:
         saved = load_map(self.out) if self._resume else None
         settings = self._profile
         if settings is None:
@@ -202,17 +231,17 @@ class MapRun:
         return Mapper(settings, resume=saved, tiles=tiles, **self._overrides)
 
     def _check_recording(self) -> None:
-        """Frames are counted, not recognised: going on with another recording would skip its first ones."""
-        made_of = self.mapper.map.recording
-        if made_of and made_of != self.source.name:
+        """Check that the map is of this recording: of another one, the first frames would be skipped."""
+        recorded_from = self.mapper.map.recording
+        if recorded_from and recorded_from != self.source.name:
             raise StereovoxError(
-                f"{self.out}: was made of '{made_of}', not of '{self.source.name}'; go on with that, or start "
+                f"{self.out}: was made of '{recorded_from}', not of '{self.source.name}'; go on with that, or start "
                 "anew without resume"
             )
         self.mapper.map.recording = self.source.name
 
     def _add_all(self, check: Callable[[], None], observers: Sequence[Observer]) -> list[UpdateReport]:
-        done, length = seen_by(self.mapper), self.source.length
+        done, length = frames_offered(self.mapper), self.source.length
         if done:
             if length is not None and done > length:
                 raise StereovoxError(
@@ -221,23 +250,25 @@ class MapRun:
                 )
             self._check_last(done)
             if done == length:  # whoever starts a run again after a kill need not know that it was complete
-                self._tell(f"{self.out} already holds all {done} frames of {self.source.name}")
+                self._notify(f"{self.out} already holds all {done} frames of {self.source.name}")
                 return []
-            self._tell(f"going on after frame {done}")
-        watching = (*observers, *([] if length is not None else [_Patience(self, done)]))
+            self._notify(f"going on after frame {done}")
+        all_observers = (*observers, *([] if length is not None else [_Patience(self, done)]))
         stopped = "stopped after {} frames; they are saved in " + f"{self.out}, go on there with resume (--resume)"
         frames = self.source.after(done) if done else self.source
-        return add_all(self.mapper, frames, self._checkpoints, check, watching, lambda n: self._tell(stopped.format(n)))
+        return add_all(
+            self.mapper, frames, self._checkpoints, check, all_observers, lambda n: self._notify(stopped.format(n))
+        )
 
     def _check_last(self, done: int) -> None:
-        """Frames are skipped by their number: under other frames some would be missed, and others counted twice."""
+        """Check the last frame in the map: with other `frames`, skipping by number would miss or repeat some."""
         last = self.mapper.map.history.last_frame
         if self.source.length is None or last is None:  # a live camera; a map from before this was saved
             return
-        there = next(iter(self.source.after(done - 1)))
-        if (one_line(there.name[:MAX_NAME_LENGTH]), there.stamp_ns) != last:
+        found = next(iter(self.source.after(done - 1)))
+        if (one_line(found.name[:MAX_NAME_LENGTH]), found.stamp_ns) != last:
             raise StereovoxError(
-                f"{self.out}: its frame {done} was '{last[0]}', here it is '{there.name}'; choose frames as "
+                f"{self.out}: its frame {done} was '{last[0]}', here it is '{found.name}'; choose frames as "
                 "before, or start anew without resume"
             )
 
@@ -250,43 +281,43 @@ def add_all(
     observers: Sequence[Observer],
     stopped: Callable[[int], None],
 ) -> list[UpdateReport]:
-    """Add all frames to a map in space or of a floor, saving between them; return what became of each.
+    """Add all frames to a 3-D map or a floor map, with checkpoints; return the report of each.
 
-    check: raises KeyboardInterrupt where it is enough (`interrupt_between_steps`). stopped: called with the number of
-    frames where it was, or the source failed, and what is there is saved; the error goes on.
+    check: raises KeyboardInterrupt once the run shall stop (`interrupt_between_steps`). stopped: called with the number
+    of frames after an interrupt or a failure of the source, once the map is saved; the error is then raised again.
     """
     reports: list[UpdateReport] = []
     try:
         for frame in frames:
-            reports.append(_added(mapper, frame, checkpoints))
+            reports.append(_add(mapper, frame, checkpoints))
             for one in observers:
                 one.after(frame, reports[-1])
             check()
             if mapper.map.frames:  # an empty map must not take the place of an older one
-                checkpoints.after(seen_by(mapper))
+                checkpoints.after(frames_offered(mapper))
     except (KeyboardInterrupt, SourceError):
         if mapper.map.frames:
-            checkpoints.save(seen_by(mapper))
+            checkpoints.save(frames_offered(mapper))
             stopped(len(reports))
         raise
     return reports
 
 
-def seen_by(mapper: AnyMapper[Any]) -> int:
-    """Return how many frames a mapper's map was offered."""
+def frames_offered(mapper: AnyMapper[Any]) -> int:
+    """Return the number of frames offered to a mapper's map, refused ones included."""
     return mapper.map.frames + mapper.map.frames_refused
 
 
-def _added(mapper: AnyMapper[SeenT], frame: SeenT, checkpoints: Checkpoints) -> UpdateReport:
+def _add(mapper: AnyMapper[SeenT], frame: SeenT, checkpoints: Checkpoints) -> UpdateReport:
     try:
         return mapper.add(frame)
     except MapFileError as error:  # no room for a tile; up to this frame the map is whole in memory
-        checkpoints.save(seen_by(mapper))
-        raise MapFileError(f"{error}; {checkpoints.left()}") from None
+        checkpoints.save(frames_offered(mapper))
+        raise MapFileError(f"{error}; {checkpoints.saved_so_far()}") from None
 
 
 class _Patience:
-    """Ends a run whose live camera delivers nothing that can be used: it would be refused for ever."""
+    """Ends a run whose live camera delivers no usable frame, which would otherwise go on for ever."""
 
     def __init__(self, run: MapRun, done: int):
         self._run, self._done, self._first, self._refused = run, done, "", 0
@@ -304,8 +335,8 @@ class _Patience:
 
 
 @contextmanager
-def _there_at_once(voxel_map: VoxelMap, out: Path) -> Iterator[None]:
-    """Save a map that is new before its first frame: one that is killed is there; remove it if it stays empty."""
+def _saved_from_start(voxel_map: VoxelMap, out: Path) -> Iterator[None]:
+    """Save a new map before its first frame, so that a killed run leaves one; remove it if it stays empty."""
     new = not is_map(out)
     if new:
         voxel_map.save(out)
@@ -321,10 +352,10 @@ def _first_refusal(reports: list[UpdateReport]) -> str:
 
 
 class Checkpoints:
-    """Saves a map between its frames, when it is time.
+    """Saves a map between frames when a checkpoint is due.
 
-    save: writes the map, all or nothing. out: where, for messages. seconds: from one save to the next; 0: none before
-    the end. clock: seconds now. Raises StereovoxError for seconds that cannot be.
+    save: writes the map atomically. out: its path, for messages. seconds: between two saves; 0: none before the end.
+    clock: returns seconds. Raises StereovoxError for negative or infinite seconds.
     """
 
     def __init__(self, save: Callable[[], None], out: object, seconds: float, clock: Callable[[], float] = monotonic):
@@ -336,7 +367,7 @@ class Checkpoints:
         self._saved = 0
 
     def after(self, frames: int) -> None:
-        """Save if it is time. frames: how many are in the map."""
+        """Save if a checkpoint is due. frames: number of frames in the map."""
         start = self._clock()
         if start >= self._due:
             self.save(frames)
@@ -344,15 +375,15 @@ class Checkpoints:
             self._due = done + max(self._seconds, REST * (done - start))
 
     def save(self, frames: int) -> None:
-        """Save now. Raises MapFileError, one line, where that fails; it also says what was saved before."""
+        """Save now. Raises MapFileError where that fails: one line that also says what was saved before."""
         try:
             self._save()
         except MapFileError as error:
-            raise MapFileError(f"{error}; {self.left()}") from None
+            raise MapFileError(f"{error}; {self.saved_so_far()}") from None
         self._saved = frames
 
-    def left(self) -> str:
-        """Return what of the run is saved."""
+    def saved_so_far(self) -> str:
+        """Describe how much of the run is saved."""
         if not self._saved:
             return "nothing of this run is saved"
         return f"{self._out} holds this run up to frame {self._saved}"
@@ -360,30 +391,30 @@ class Checkpoints:
 
 @contextmanager
 def interrupt_between_steps() -> Iterator[Callable[[], None]]:
-    """Give a function that raises KeyboardInterrupt if the run was told to stop: a step is never cut in half by it.
+    """Defer signals: yield a function that raises KeyboardInterrupt if one has arrived, so that no step is cut in half.
 
-    By Ctrl-C, of which a second one is obeyed at once, by SIGTERM (`kill`, systemd, docker stop) or by SIGHUP (the
-    terminal is gone), which may come several times: `timeout` sends two. The exception holds the signal's number.
+    Handles Ctrl-C (a second one acts at once), SIGTERM (`kill`, systemd, docker stop) and SIGHUP (the terminal is
+    gone), which may arrive several times: `timeout` sends two. The exception holds the signal's number.
     """
-    told: list[int] = []
+    received: list[int] = []
 
     def remember(number: int, _: object) -> None:
-        told.append(number)
+        received.append(number)
         if number == signal.SIGINT:
             signal.signal(signal.SIGINT, signal.default_int_handler)
 
     def check() -> None:
-        if told:
-            raise KeyboardInterrupt(told[0])
+        if received:
+            raise KeyboardInterrupt(received[0])
 
     with ExitStack() as stack:
-        for number in _stops() if threading.current_thread() is threading.main_thread() else ():
+        for number in _default_signals() if threading.current_thread() is threading.main_thread() else ():
             stack.callback(signal.signal, number, signal.signal(number, remember))
         yield check
 
 
-def _stops() -> list[int]:
-    """Return the signals that nobody handles or ignores: notebooks, servers, nohup, jobs in the background do."""
+def _default_signals() -> list[int]:
+    """Return the signals with default handling: notebooks, servers, nohup and background jobs set their own."""
     usual = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
     if hasattr(signal, "SIGHUP"):
         usual[signal.SIGHUP] = signal.SIG_DFL

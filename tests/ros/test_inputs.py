@@ -37,7 +37,7 @@ def info(**changes) -> bytes:
 
 def depth_input(topic: str = "/cam/depth/image") -> DepthInput:
     one = DepthInput(topic)
-    one.take_info(info())
+    one.on_camera_info(info())
     return one
 
 
@@ -106,18 +106,18 @@ def test_camera_info_that_cannot_be_is_told_and_a_good_one_stays():
     wide, huge = (np.array([f, 0, 0, 0, f, 0, 0, 0, 1]) for f in (0.006, 1e300))
     odd = [info(k=k, width=1, height=1) for k in (np.zeros(9), np.full(9, np.nan), wide, huge)]
     for bad in (*odd, info(width=0), info(width=2**31, height=2**31), b""):
-        one.take_info(bad)
+        one.on_camera_info(bad)
         assert not one.ready
     assert "camera" in one.frame(wire.image(DEPTH), there).fault_detail
-    one.take_info(info())
-    one.take_info(info(k=np.zeros(9)))
+    one.on_camera_info(info())
+    one.on_camera_info(info(k=np.zeros(9)))
     assert one.ready
 
 
 def test_rectified_images_have_the_camera_of_p():
     one = DepthInput("/d/image_rect", "/other/info")
     p = np.array([20.0, 0, 3, 0, 0, 21.0, 2, 0, 0, 0, 1, 0])
-    one.take_info(info(p=p))
+    one.on_camera_info(info(p=p))
     camera = one.frame(wire.image(DEPTH), there).camera
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (20, 21, 3, 2)
     assert one.info == "/other/info"

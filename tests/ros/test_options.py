@@ -11,7 +11,7 @@ from made_walks import depth_at
 from stereovox.cli import main
 from stereovox.errors import StereovoxError
 from stereovox.maps import load_map
-from stereovox.ros.options import Options, pair_of, with_parameters
+from stereovox.ros.options import Options, split_pair, with_parameters
 
 DEPTH = "/camera/depth/image_rect_raw"
 
@@ -30,7 +30,7 @@ def test_parameters_come_as_ros_has_them():
     assert (options.depth, options.cloud, options.wait_s, options.queue) == (("/a", "/b=/b/info"), ("/c",), 1.0, 3)
     assert options.heights == (0.1, 2.0)
     assert Options().heights is None
-    assert [pair_of(text) for text in options.depth] == [("/a", ""), ("/b", "/b/info")]
+    assert [split_pair(text) for text in options.depth] == [("/a", ""), ("/b", "/b/info")]
 
 
 @pytest.mark.parametrize(

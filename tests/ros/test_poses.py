@@ -6,7 +6,7 @@ import pytest
 import wire
 
 from stereovox.errors import FrameRefused, StereovoxError
-from stereovox.ros.poses import MOST, LiveTf, Whereabouts, fixed_transform
+from stereovox.ros.poses import MAX_TRANSFORMS, LiveTf, PoseBuffer, fixed_transform
 from stereovox.se3 import from_quaternion
 
 MS = 1_000_000
@@ -26,15 +26,15 @@ def tf(stamp_ns: int, *edges) -> bytes:
 @pytest.fixture
 def robot():
     """odom -> base_link at 0 m and, 100 ms later, at 1 m; the camera is mounted 0.5 m ahead."""
-    where = Whereabouts("", "", 0.1)
-    where.take_tf(tf(0, ("base_link", "camera", at(0.5))), fixed=True)
+    where = PoseBuffer("", "", 0.1)
+    where.on_tf(tf(0, ("base_link", "camera", at(0.5))), fixed=True)
     for k in range(2):
-        where.take_tf(tf(START + 100 * k * MS, ("odom", "base_link", at(k))), fixed=False)
+        where.on_tf(tf(START + 100 * k * MS, ("odom", "base_link", at(k))), fixed=False)
     return where
 
 
 def test_a_pose_between_two_transforms_is_settled(robot):
-    assert robot.settled("camera", START + 50 * MS)
+    assert robot.is_final("camera", START + 50 * MS)
     pose = robot.pose("camera", START + 50 * MS)
     assert pose.T_world_sensor[0, 3] == pytest.approx(1.0)
     assert pose.T_base_sensor[0, 3] == pytest.approx(0.5)
@@ -42,78 +42,78 @@ def test_a_pose_between_two_transforms_is_settled(robot):
 
 
 def test_a_pose_after_the_last_transform_is_not_settled_and_held_for_a_while_only(robot):
-    assert not robot.settled("camera", START + 101 * MS)
+    assert not robot.is_final("camera", START + 101 * MS)
     assert robot.pose("camera", START + 150 * MS).off_ns == 50 * MS
     with pytest.raises(FrameRefused, match=r"0\.101 s away"):
         robot.pose("camera", START + 201 * MS)
 
 
 def test_a_robot_that_stood_still_is_not_taken_for_one_that_cannot_move():
-    where = Whereabouts("", "", 0.1)
+    where = PoseBuffer("", "", 0.1)
     for k in range(5):
-        where.take_tf(tf(START + 100 * k * MS, ("odom", "camera", at(2.0))), fixed=False)
-    assert not where.settled("camera", START + 450 * MS)
+        where.on_tf(tf(START + 100 * k * MS, ("odom", "camera", at(2.0))), fixed=False)
+    assert not where.is_final("camera", START + 450 * MS)
     with pytest.raises(FrameRefused):
         where.pose("camera", START + 600 * MS)
 
 
 def test_a_gap_is_not_bridged(robot):
-    robot.take_tf(tf(START + 700 * MS, ("odom", "base_link", at(9))), fixed=False)
-    assert robot.settled("camera", START + 300 * MS)
+    robot.on_tf(tf(START + 700 * MS, ("odom", "base_link", at(9))), fixed=False)
+    assert robot.is_final("camera", START + 300 * MS)
     with pytest.raises(FrameRefused, match=r"no transform for 0\.600 s"):
         robot.pose("camera", START + 300 * MS)
 
 
 def test_unknown_frames_are_refused_with_a_cure(robot):
-    assert not robot.settled("kamera", START)
+    assert not robot.is_final("kamera", START)
     with pytest.raises(FrameRefused, match="kamera"):
         robot.pose("kamera", START)
     with pytest.raises(FrameRefused, match="world_frame"):
-        Whereabouts("", "", 0.1).pose("camera", START)
+        PoseBuffer("", "", 0.1).pose("camera", START)
 
 
 def test_the_map_frame_counts_before_odom_and_a_named_one_before_both(robot):
-    robot.take_tf(tf(START, ("map", "odom", at(10))), fixed=True)
+    robot.on_tf(tf(START, ("map", "odom", at(10))), fixed=True)
     assert robot.pose("camera", START).T_world_sensor[0, 3] == pytest.approx(10.5)
     assert robot.world == "map"
-    named = Whereabouts("odom", "", 0.1)
+    named = PoseBuffer("odom", "", 0.1)
     named.tf = robot.tf
     assert named.pose("camera", START).T_world_sensor[0, 3] == pytest.approx(0.5)
 
 
 def test_odometry_and_poses_count_like_transforms():
-    where = Whereabouts("", "base_link", 0.1)
+    where = PoseBuffer("", "base_link", 0.1)
     where.tf.add("base_link", "camera", 0, fixed_transform("base_link camera 0 0 1 0 0 0")[2], fixed=True)
     for k in range(2):
         told = wire.messages().odometry(np.array([k, 2.0, 0.0]), START + 100 * k * MS, "odom", "base_link")
-        where.take_odometry(wire.packed(told))
+        where.on_odometry(wire.packed(told))
     assert where.pose("camera", START + 25 * MS).T_world_sensor[:3, 3] == pytest.approx([0.25, 2, 1])
-    posed = Whereabouts("", "", 0.1)
+    posed = PoseBuffer("", "", 0.1)
     stamped = wire.made(
         "geometry_msgs/msg/PoseStamped", header=wire.header(START, "odom"), pose=wire.messages()._pose(at(3.0))
     )
-    posed.take_pose(wire.packed(stamped), "camera")
+    posed.on_pose(wire.packed(stamped), "camera")
     assert posed.pose("camera", START).T_world_sensor[0, 3] == 3
 
 
 def test_damaged_messages_are_counted_and_change_nothing(robot):
     whole = tf(START, ("odom", "base_link", at(7)))
     for data in (b"", whole[:3], whole[:-1], b"\xff" * 40):
-        robot.take_tf(data, fixed=False)
-        robot.take_odometry(data)
-        robot.take_pose(data, "camera")
+        robot.on_tf(data, fixed=False)
+        robot.on_odometry(data)
+        robot.on_pose(data, "camera")
     assert robot.tf.unreadable >= 9
     assert robot.pose("camera", START).T_world_sensor[0, 3] == pytest.approx(0.5)
 
 
 def test_old_transforms_go_and_a_clock_that_is_set_back_starts_anew():
     tree = LiveTf()
-    for k in range(5 * MOST):
+    for k in range(5 * MAX_TRANSFORMS):
         tree.add("odom", "base", START + k * MS, (k, 0, 0, 0, 0, 0, 1))
     edge = tree._up("base")
-    assert edge.count <= MOST
-    last = START + (5 * MOST - 1) * MS
-    assert tree.lookup("odom", "base", last - 100 * MS)[0, 3] == pytest.approx(5 * MOST - 101)
+    assert edge.count <= MAX_TRANSFORMS
+    last = START + (5 * MAX_TRANSFORMS - 1) * MS
+    assert tree.lookup("odom", "base", last - 100 * MS)[0, 3] == pytest.approx(5 * MAX_TRANSFORMS - 101)
     tree.add("odom", "base", START, (-5, 0, 0, 0, 0, 0, 1))
     assert tree.lookup("odom", "base", START)[0, 3] == -5
     with pytest.raises(FrameRefused):
@@ -121,7 +121,7 @@ def test_old_transforms_go_and_a_clock_that_is_set_back_starts_anew():
 
 
 def test_a_late_transform_is_put_where_it_belongs(robot):
-    robot.take_tf(tf(START + 50 * MS, ("odom", "base_link", at(0))), fixed=False)
+    robot.on_tf(tf(START + 50 * MS, ("odom", "base_link", at(0))), fixed=False)
     assert robot.pose("camera", START + 75 * MS).T_world_sensor[0, 3] == pytest.approx(1.0)
 
 

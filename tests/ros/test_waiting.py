@@ -35,7 +35,7 @@ def never(_: Arrival) -> bool:
 
 def taken(waiting: Waiting[str], is_ready) -> list[str]:
     found = []
-    while (one := waiting.take(is_ready)) is not None:
+    while (one := waiting.pop(is_ready)) is not None:
         found.append(one.content)
     return found
 
@@ -44,9 +44,9 @@ def test_a_frame_waits_until_it_is_ready_and_goes_on_as_it_is_after_that(clock):
     waiting = queue(clock)
     waiting.put("a", 5, "f", "one")
     clock.now = 100 * MS
-    assert waiting.take(never) is None
+    assert waiting.pop(never) is None
     clock.now += 1
-    assert waiting.take(never).content == "one"
+    assert waiting.pop(never).content == "one"
     assert len(waiting) == 0
     assert not waiting.dropped
 
@@ -55,7 +55,7 @@ def test_frames_of_one_sensor_keep_their_order_even_if_a_later_one_is_ready_firs
     waiting = queue(clock)
     for n, name in enumerate("abc"):
         waiting.put("s", n, "f", name)
-    assert waiting.take(lambda one: one.content != "a") is None
+    assert waiting.pop(lambda one: one.content != "a") is None
     assert taken(waiting, always) == ["a", "b", "c"]
 
 
@@ -72,8 +72,8 @@ def test_where_the_map_is_busy_the_newest_frames_count(clock):
     waiting = queue(clock)
     for n in range(4):
         waiting.put("s", n, "f", f"{n}")
-    assert waiting.take(always).content == "0"  # 1, 2 and 3 are not known to be ready so far
-    waiting.take(lambda one: one.content == "1")
+    assert waiting.pop(always).content == "0"  # 1, 2 and 3 are not known to be ready so far
+    waiting.pop(lambda one: one.content == "1")
     waiting = queue(clock)
     for n in range(4):
         waiting.put("s", n, "f", f"{n}")
@@ -90,7 +90,7 @@ def test_what_is_late_still_counts_where_nothing_newer_is_ready(clock):
     waiting.put("s", 2, "f", "new")
     waiting._queues["s"][0].ready_ns = clock.now
     clock.now += 60 * MS
-    assert waiting.take(lambda one: one.content == "old").content == "old"
+    assert waiting.pop(lambda one: one.content == "old").content == "old"
     assert not waiting.dropped
 
 
@@ -99,7 +99,7 @@ def test_a_burst_of_poses_drops_nothing(clock):
     for n in range(6):
         clock.now = 10 * n * MS
         waiting.put("s", n, "f", f"{n}")
-        assert waiting.take(never) is None
+        assert waiting.pop(never) is None
     clock.now = 99 * MS
     assert taken(waiting, always) == list("012345")
     assert not waiting.dropped

@@ -115,7 +115,7 @@ def test_free_cells_and_the_slice_come_when_ticked(page, viewer):
 
 def test_two_clicks_measure(page, viewer):
     viewer.measure.on.value = True
-    viewer.measure.told.content = "ready"  # messages are taken in order: clicks count when this is there
+    viewer.measure.text.content = "ready"  # messages are taken in order: clicks count when this is there
     page.get_by_text("ready", exact=True).wait_for()
     middle = HIGH / 2 + 6  # not between two cells
     page.mouse.click(WIDE / 2 - 60, middle)

@@ -56,15 +56,15 @@ def shows(live, mapper):
 def test_a_picture_that_cannot_be_drawn_ends_neither_mapping_nor_page(monkeypatch):
     mapper = new_mapper()
     with LiveView(mapper, port=0) as live:
-        take, broken = live.viewer.take, []
+        update, broken = live.viewer.update, []
 
         def break_twice(voxel_map):
             if len(broken) < 2:
                 broken.append(voxel_map)
                 raise RuntimeError("drawing broke")
-            take(voxel_map)
+            update(voxel_map)
 
-        monkeypatch.setattr(live.viewer, "take", break_twice)
+        monkeypatch.setattr(live.viewer, "update", break_twice)
         for i in range(6):
             live.add(SOURCE.frame(i))
             assert live._free.wait(PATIENCE_S)
@@ -76,7 +76,7 @@ def test_a_picture_that_cannot_be_drawn_ends_neither_mapping_nor_page(monkeypatc
 
 def test_what_could_not_be_drawn_is_reported():
     live = LiveView(new_mapper(), port=0)
-    live.viewer.take = None
+    live.viewer.update = None
 
     def add_and_wait():
         live.add(SOURCE.frame(0))

@@ -48,13 +48,13 @@ def test_two_clicks_tell_a_distance_and_what_is_cut_off_is_not_met():
     voxel_map = VoxelMap.from_cells(load_config(voxel_size=SIZE), [[0, 0, 0], [15, 0, 20], [15, 0, 30]], [2.0] * 3)
     with closing(open_viewer(voxel_map, port=0)) as viewer:
         measure = viewer.measure
-        assert measure.told.content == HOW
+        assert measure.text.content == HOW
         viewer.cells.below.value = 5.0
         measure.pick([0.1, -1, 0.1], [0, 1, 0])
         measure.pick([0.1, -1, 5.1], [0, 1, 0])
-        assert measure.told.content == FIRST
+        assert measure.text.content == FIRST
         measure.pick([3.1, 0.1, 9], [0, 0, -1])
-        assert measure.told.content == "**5.00 m** from middle to middle (x +3.00, y +0.00, z +4.00)"
+        assert measure.text.content == "**5.00 m** from middle to middle (x +3.00, y +0.00, z +4.00)"
         assert viewer.server.scene.get_handle_by_name("/measure/line") is not None
         measure.pick([3.1, 0.1, 9], [0, 0, -1])
         assert len(measure.picked) == 1

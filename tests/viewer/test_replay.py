@@ -67,8 +67,8 @@ def test_the_timeline_goes_to_any_frame(window):
             images.append(replay.frame.image.image.copy())
         assert (images[0] != images[1]).any()
         replay.at.value = 6
-        assert "frame 5" in replay.frame.told.content
-        assert "no" in replay.frame.told.content
+        assert "frame 5" in replay.frame.text.content
+        assert "no" in replay.frame.text.content
 
 
 def test_playing_ends_with_the_last_frame():
@@ -95,9 +95,9 @@ def test_a_growing_map_is_copied_between_frames_and_shown():
         while solid(live.viewer) != occupied(mapper.map) and time.monotonic() < until:
             time.sleep(0.02)
         assert solid(live.viewer) == occupied(mapper.map) == occupied(mapped(6)) != []
-        while "1 no" not in live.frame.told.content and time.monotonic() < until:
+        while "1 no" not in live.frame.text.content and time.monotonic() < until:
             time.sleep(0.02)
-        assert "frames in the map | 5" in live.frame.told.content
+        assert "frames in the map | 5" in live.frame.text.content
         middle = mapper.map.occupied().mean(axis=0)  # whoever opens the page now looks at the map
         assert np.linalg.norm(live.viewer.server.initial_camera.look_at - middle) < 1
     assert "stereovox-live-view" not in {thread.name for thread in threading.enumerate()}
@@ -115,7 +115,7 @@ def test_what_is_no_frame_is_told_and_the_page_goes_on():
         while solid(live.viewer) != occupied(mapper.map) and time.monotonic() < until:
             time.sleep(0.02)
         assert solid(live.viewer) == occupied(mapper.map)
-        assert "2 bad" in live.frame.told.content
+        assert "2 bad" in live.frame.text.content
 
 
 def test_a_snapshot_stays_as_it_was():

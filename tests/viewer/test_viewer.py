@@ -110,7 +110,7 @@ def test_the_slider_leaves_out_what_is_above(shown):
     assert not shown.cells.kinds[State.OCCUPIED].root.visible
     shown.cells.show[State.OCCUPIED].value = True
     assert shown.cells.kinds[State.OCCUPIED].root.visible
-    shown.take(box_map())
+    shown.update(box_map())
     assert shown.cells.below.value == 0.6
 
 
@@ -169,7 +169,7 @@ def test_colours_may_tell_the_probability_or_the_age():
 def test_another_map_takes_the_place_of_the_first(shown):
     other = VoxelMap.from_cells(box_map().config, [[9, 9, 9]], [2.0])
     shown.layer.show.value = True
-    shown.take(other)
+    shown.update(other)
     assert np.allclose(positions(shown), other.occupied())
     assert (shown.layer.at["x"].min, shown.layer.node.position[0]) == pytest.approx((1.9, 1.9))
 
@@ -248,7 +248,7 @@ def test_an_empty_map_says_so():
             viewer.cells.show[state].value = True
         viewer.layer.show.value = True
         assert (viewer.layer.node, len(positions(viewer))) == (None, 0)
-        viewer.take(box_map())
+        viewer.update(box_map())
         assert len(positions(viewer)) == 30
         assert viewer.layer.node is not None
     assert statistics(empty).startswith("This map is empty")

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command line. Human text goes to stderr; with --json the last line of stdout is one JSON object.
+"""The command line. Text for people goes to stderr; with --json the last line of stdout is one JSON object.
 
-Exit status: 0 ok, 2 bad usage or bad input (one line says what and how to cure it), 130 stopped by Ctrl-C,
+Exit status: 0 ok, 2 bad usage or bad input (one line names the problem and the cure), 130 stopped by Ctrl-C,
 143 by SIGTERM.
 """
 
@@ -49,13 +49,13 @@ COMMANDS = (
     "eval",
     "reproduce",
 )
-"""Each is a module here with a docstring, `EXAMPLE`, `add_arguments(parser)` and `run(arguments) -> dict`.
+"""Each is a module of this package with a docstring, `EXAMPLE`, `add_arguments(parser)` and `run(arguments) -> dict`.
 
-A module whose name Python keeps for itself has an underscore behind it.
+The module of a command that is a Python keyword has a trailing underscore.
 """
 
-ALONE = ("-h", "--help", "--version")
-"""Options that stand before a command, or without one."""
+GLOBAL_OPTIONS = ("-h", "--help", "--version")
+"""Options that may stand before a command or without one."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -68,7 +68,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _print_json(result) if arguments.json else 0
     except StereovoxError as error:
         return _fail(" ".join(str(error).split()), 2)
-    except OSError as error:  # what no command foresaw: a folder that may not be searched, a full disk
+    except OSError as error:  # not foreseen by a command: a folder without search permission, a full disk
         where = f"{error.filename}: " if error.filename else ""
         return _fail(f"{where}{error.strerror or error}; check that it exists and that you may use it", 2)
     except MemoryError:
@@ -94,7 +94,7 @@ def _fail(message: str, status: int) -> int:
 
 
 class _Parser(argparse.ArgumentParser):
-    """Options by their full name only, and errors that `main` prints as one line."""
+    """Argument parser that accepts full option names only and raises errors that `main` prints as one line."""
 
     def __init__(self, **settings: Any):
         self.options: list[str] = []
@@ -112,10 +112,10 @@ class _Parser(argparse.ArgumentParser):
         return super().parse_known_args(args, namespace)
 
     def error(self, message: str) -> NoReturn:
-        raise StereovoxError(f"{message}{self._joined(message)}; see: {self.prog} --help")
+        raise StereovoxError(f"{message}{self._minus_hint(message)}; see: {self.prog} --help")
 
-    def _joined(self, message: str) -> str:
-        """Return how to write a value that begins with a minus, if that is what is wrong."""
+    def _minus_hint(self, message: str) -> str:
+        """Return a hint on how to write a value that begins with a minus, where that is the mistake."""
         option = message.partition(":")[0].split("/")[-1].removeprefix("argument ")
         for word, value in pairwise(self._words):
             if word == option and value.startswith("-") and value.removeprefix("--") not in self.options:
@@ -123,7 +123,7 @@ class _Parser(argparse.ArgumentParser):
         return ""
 
     def refuse(self, word: str) -> NoReturn:
-        """Say what is wrong with a word that is left over."""
+        """Raise the error for an argument that was not recognised."""
         option = word.partition("=")[0]
         if option.startswith("-"):
             self.error(f"unknown option '{option}'{did_you_mean(option.strip('-'), self.options, '--')}")
@@ -149,8 +149,8 @@ def _parse(words: Sequence[str]) -> argparse.Namespace:
 
 
 def _check_command(words: Sequence[str]) -> None:
-    """Name the command that was perhaps meant, and where options stand, which argparse does not."""
-    if words and words[0].startswith("-") and words[0] not in ALONE:
+    """Raise an error that suggests the right command or order of options, which argparse does not."""
+    if words and words[0].startswith("-") and words[0] not in GLOBAL_OPTIONS:
         option, command = words[0].partition("=")[0], next((word for word in words if word in COMMANDS), "COMMAND")
         raise StereovoxError(f"'{option}' stands before the command; write it after: stereovox {command} ... {option}")
     if words and not words[0].startswith("-") and words[0] not in COMMANDS:

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Time stereovox and other mapping libraries on the same frames, in one process.
 
-Without SOURCE the frames come from the built-in room, so that anyone can run it. Figures are worth something only on a
-machine that does nothing else.
+Without SOURCE the frames come from the built-in room. The figures are meaningful only on an otherwise idle machine.
 """
 
 from __future__ import annotations
@@ -45,18 +44,21 @@ def add_arguments(parser: ArgumentParser) -> None:
         "the first three, where installed)",
     )
     parser.add_argument(
-        "--integrators", metavar="A,B", default="projective", help="of stereovox: projective, ray, line (%(default)s)"
+        "--integrators",
+        metavar="A,B",
+        default="projective",
+        help="integrators of stereovox: projective, ray, line (%(default)s)",
     )
-    parser.add_argument("--threads", type=int, metavar="N", help="threads for stereovox (1, and then all cores)")
-    parser.add_argument("--max-range", type=float, metavar="M", help="depth in metres up to which pixels count (5)")
+    parser.add_argument("--threads", type=int, metavar="N", help="threads of stereovox (both 1 and all cores)")
+    parser.add_argument("--max-range", type=float, metavar="M", help="largest depth in metres that is used (5)")
     parser.add_argument("--frames", metavar="A:B:S", help="only these frames, as a Python slice")
     parser.add_argument(
         "--also",
         metavar="A,B",
         default="",
-        help="measure more: threads, first-frame, start-up, overhead, map-size, path",
+        help="further measurements: threads, first-frame, start-up, overhead, map-size, path",
     )
-    parser.add_argument("--all", action="store_true", help="measure all of these")
+    parser.add_argument("--all", action="store_true", help="run all of these")
     parser.add_argument(
         "--frames-long", type=int, metavar="N", help="frames of the simulated flight of `path`, at least 500 (6000)"
     )
@@ -66,7 +68,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 
 def run(arguments: Namespace) -> dict[str, Any]:
-    """Run the comparison and what else was asked for; print the tables and write the files."""
+    """Run the comparison and all requested measurements; print the tables and write the files."""
     from stereovox.lab.bench import files
     from stereovox.report.folder import out_folder
 
@@ -83,24 +85,25 @@ def run(arguments: Namespace) -> dict[str, Any]:
     except (KeyboardInterrupt, StereovoxError, MemoryError):
         if result:
             say(f"stopped; this much is done{f' and written into {folder}' if folder else ''}:\n")
-            _tell(result, folder)
+            _print_result(result, folder)
         raise
-    _tell(result, folder)
+    _print_result(result, folder)
     return result
 
 
 def _measure(arguments: Namespace, so_far: Callable[[dict[str, Any]], None]) -> None:
-    """Measure all that was asked for, and hand over what is done whenever something is."""
+    """Run all requested measurements, and pass on each result as soon as it is there."""
     from stereovox.lab.bench.frames import read_frames
     from stereovox.lab.bench.more import MEASUREMENTS, Given, check_names
     from stereovox.lab.bench.rows import compare, find_peers
     from stereovox.opening import open_source
 
-    wanted = check_names(list(MEASUREMENTS) if arguments.all else _named(arguments.also))
+    measurements = check_names(list(MEASUREMENTS) if arguments.all else _named(arguments.also))
     sizes = arguments.voxel_size or VOXEL_SIZES
-    ways = _ways(arguments)
-    configs = [way.config(size, arguments.max_range) for way in ways for size in sizes]  # slips show before the work
-    limits = _limits(arguments, wanted)
+    variants = _variants(arguments)
+    # bad settings raise here, before the work
+    configs = [variant.config(size, arguments.max_range) for variant in variants for size in sizes]
+    limits = _limits(arguments, measurements)
     peers, missing = _peers(arguments.peers)
     kinds = find_peers(peers, configs[0].voxel_size)
     source = open_source(arguments.source, arguments.frames)
@@ -108,23 +111,29 @@ def _measure(arguments: Namespace, so_far: Callable[[dict[str, Any]], None]) -> 
     with progress_bar() as bar:
         task = bar.add_task("loading", note="")
 
-        def tell(done: int, total: int, text: str) -> None:
+        def show(done: int, total: int, text: str) -> None:
             bar.update(task, completed=done, total=total, description=text)
 
-        recording = read_frames(source, configs[0], tell=tell)
+        recording = read_frames(source, configs[0], tell=show)
         missed = {"not_installed": missing}
         result = compare(
-            recording, sizes, kinds, ways, arguments.max_range, tell, so_far=lambda found: so_far(found | missed)
+            recording,
+            sizes,
+            kinds,
+            variants,
+            arguments.max_range,
+            show,
+            so_far=lambda found: so_far(found | missed),
         )
-        given = Given(recording, sizes, ways[0], arguments.max_range, tell=tell, **limits)
+        given = Given(recording, sizes, variants[0], arguments.max_range, tell=show, **limits)
         more: dict[str, Any] = {}
-        for name in wanted:
+        for name in measurements:
             more[name] = MEASUREMENTS[name].run(given)
             so_far(result | missed | {"more": more})
 
 
-def _ways(arguments: Namespace) -> list[Variant]:
-    """Return how stereovox is run: each integrator on one thread and on all cores, or on as many as asked for."""
+def _variants(arguments: Namespace) -> list[Variant]:
+    """Return the variants of stereovox to time: each integrator on one thread and on all cores, or on --threads."""
     from stereovox import registry
     from stereovox.integrate import INTEGRATORS
     from stereovox.lab.bench.machine import cores
@@ -139,8 +148,8 @@ def _ways(arguments: Namespace) -> list[Variant]:
     return [Variant(name, number) for name in integrators for number in threads]
 
 
-def _limits(arguments: Namespace, wanted: Sequence[str]) -> dict[str, int]:
-    """Return the sizes of measurements that were asked for; raises StereovoxError for those that cannot be."""
+def _limits(arguments: Namespace, measurements: Sequence[str]) -> dict[str, int]:
+    """Return the requested sizes of measurements; raises StereovoxError for invalid ones."""
     from stereovox.lab.bench.growth import CELLS, MIN_FRAMES
 
     options = (
@@ -151,7 +160,7 @@ def _limits(arguments: Namespace, wanted: Sequence[str]) -> dict[str, int]:
     for option, name, number, least, measurement in options:
         if number is None:
             continue
-        if measurement not in wanted:
+        if measurement not in measurements:
             raise StereovoxError(f"{option} goes with --also {measurement} or --all; add one of these")
         if number < least:
             raise StereovoxError(f"{option} {number}: give at least {least}")
@@ -174,8 +183,8 @@ def _named(text: str) -> list[str]:
     return [name.strip() for name in text.split(",") if name.strip()]
 
 
-def _tell(result: dict[str, Any], folder: Path | None) -> None:
-    """Print the tables, draw the picture and say where the files are."""
+def _print_result(result: dict[str, Any], folder: Path | None) -> None:
+    """Print the tables and the paths of the files; draw the picture."""
     from stereovox.lab.bench import files
 
     say(files.text(result))

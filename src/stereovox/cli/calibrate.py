@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Find out from recordings what a camera measures wrongly, how noisy it is, or how cameras and trackers stand.
+"""Calibrate depth errors, noise, a stereo pair, or a camera on a tracker, from recordings.
 
-`stereovox calibrate wall --help`, `noise --help`, `pair --help`, `stereo --help` and `import --help` tell more.
+See `stereovox calibrate wall --help`, `noise --help`, `pair --help`, `stereo --help` and `import --help`.
 """
 
 from __future__ import annotations
@@ -11,14 +11,14 @@ from importlib import import_module
 from typing import Any
 
 KINDS = ("wall", "noise", "pair", "stereo", "import")
-"""Each is a module `calibrate_*` here, made as those of the commands."""
+"""Each is a module `calibrate_*` of this package with the parts of a command."""
 EXAMPLE = "stereovox calibrate wall recordings/wall --distance 1.4 --out camera.toml"
 
 
 def add_arguments(parser: ArgumentParser) -> None:
-    """Declare the kinds with their options."""
+    """Declare the kinds of calibration and their options."""
     kinds = parser.add_subparsers(dest="kind", metavar="|".join(KINDS), required=True)
-    options: list[str] = getattr(parser, "options", [])  # those that a slip of the pen is compared with
+    options: list[str] = getattr(parser, "options", [])  # candidates for "did you mean"
     for name in KINDS:
         module = _module(name)
         about = str(module.__doc__).strip()
@@ -33,7 +33,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 
 def run(arguments: Namespace) -> dict[str, Any]:
-    """Run one of them."""
+    """Run the chosen calibration."""
     return _module(arguments.kind).run(arguments)
 
 

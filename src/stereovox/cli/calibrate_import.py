@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Make a rig file of a stereo calibration that another tool wrote.
+"""Convert a stereo calibration from another tool to a rig file.
 
-Known are KITTI (calib_cam_to_cam.txt, or calib.txt with --size), ROS (camera_info yaml of the left and of the right
+Supported: KITTI (calib_cam_to_cam.txt, or calib.txt with --size), ROS (camera_info yaml of the left and the right
 eye), OpenCV (yml with M1 D1 M2 D2 R T, or intrinsics.yml and extrinsics.yml) and Kalibr (camchain yaml, pinhole-radtan
 and pinhole-equi).
 """
@@ -19,18 +19,18 @@ from stereovox.errors import StereovoxError
 
 EXAMPLE = "stereovox calibrate import camchain.yaml --out recordings/flight/rig.toml"
 
-LONGEST = 5.0
-"""Metres between two eyes; more is likely a calibration in millimetres."""
+MAX_BASELINE_M = 5.0
+"""A longer baseline likely means a calibration in millimetres."""
 
 
 def add_arguments(parser: ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument(
-        "files", nargs="+", metavar="FILE", help="the calibration; two files of ROS, first the left eye"
-    )
+    parser.add_argument("files", nargs="+", metavar="FILE", help="the calibration; for ROS two files, left eye first")
     parser.add_argument("--out", required=True, metavar="FILE", help="rig file to write, for example rig.toml")
-    parser.add_argument("--size", metavar="WxH", help="pixels of the images, where the file does not tell")
-    parser.add_argument("--lens", default="", metavar="MODEL", help="fisheye, where an OpenCV file is of fisheyes")
+    parser.add_argument("--size", metavar="WxH", help="size of the images in pixels, where the file lacks it")
+    parser.add_argument(
+        "--lens", default="", metavar="MODEL", help="fisheye, for an OpenCV calibration of fisheye lenses"
+    )
     parser.add_argument("--name", default="stereo", metavar="NAME", help="name of the pair (%(default)s)")
     parser.add_argument(
         "--rectify",
@@ -41,7 +41,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 
 def run(arguments: Namespace) -> dict[str, Any]:
-    """Read, write the rig file and tell what is in it."""
+    """Convert the calibration and print what it contains."""
     from stereovox.safe_io import replacing
     from stereovox.sources.calibration_files import import_rig
     from stereovox.sources.rig_file import Virtual, rig_text
@@ -49,8 +49,8 @@ def run(arguments: Namespace) -> dict[str, Any]:
     check_outputs(arguments.out)
     files = [Path(name) for name in arguments.files]
     rig = import_rig(files, image_size(arguments.size), arguments.lens, arguments.name)
-    pairs = tuple(replace(pair, virtual=Virtual(_model(pair.eyes, arguments.rectify))) for pair in rig.pairs)
-    rig = replace(rig, pairs=pairs)
+    virtual = tuple(replace(pair, virtual=Virtual(_model(pair.eyes, arguments.rectify))) for pair in rig.pairs)
+    rig = replace(rig, pairs=virtual)
     stereo = rig.stereo_pairs(Path(arguments.out).parent)
     remarks = (f"stereovox calibrate import {' '.join(path.name for path in files)}",)
     with replacing(arguments.out) as file:
@@ -59,11 +59,11 @@ def run(arguments: Namespace) -> dict[str, Any]:
         camera = pair.camera
         kind = "rectified images" if pair.eyes is None else f"{pair.eyes.left.model} lenses"
         say(f"  {pair.name}: {kind}, {camera.width}x{camera.height} pixels, baseline {camera.baseline:.4f} m")
-        if (camera.baseline or 0) > LONGEST:
+        if (camera.baseline or 0) > MAX_BASELINE_M:
             say(f"  note: that is far apart; was {pair.name} calibrated in millimetres? The rig file needs metres")
     say(f"saved {arguments.out}; put the images and poses beside it: docs/rigs.md")
-    told = [{"name": pair.name, "baseline_m": pair.camera.baseline, "rectified": pair.eyes is None} for pair in stereo]
-    return {"pairs": told, "out": arguments.out}
+    pairs = [{"name": pair.name, "baseline_m": pair.camera.baseline, "rectified": pair.eyes is None} for pair in stereo]
+    return {"pairs": pairs, "out": arguments.out}
 
 
 def image_size(text: str | None) -> tuple[int, int] | None:
@@ -79,5 +79,5 @@ def image_size(text: str | None) -> tuple[int, int] | None:
     return width, height
 
 
-def _model(eyes: Any, wanted: str) -> str:
-    return wanted or ("spherical" if eyes is not None and eyes.left.model == "fisheye" else "pinhole")
+def _model(eyes: Any, requested: str) -> str:
+    return requested or ("spherical" if eyes is not None and eyes.left.model == "fisheye" else "pinhole")

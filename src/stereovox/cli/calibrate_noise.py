@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measure how noisy a depth camera is before flat walls, and write a profile that makes the map use it.
+"""Measure the noise of a depth camera in front of flat walls, and write a profile with the result.
 
-Let the camera stand before a flat, textured wall at three or more distances, some 30 frames each, from near to as far
-as it is to be used. The middle of the image counts. Use the result with: stereovox map SOURCE --profile FILE.
+Record a flat, textured wall with a still camera from three or more distances, about 30 frames each, from the nearest to
+the farthest you will use. Only the middle of the image is used. Use the result with: stereovox map SOURCE --profile
+FILE.
 """
 
 from __future__ import annotations
@@ -31,15 +32,15 @@ def add_arguments(parser: ArgumentParser) -> None:
         "--region",
         default="0.6x0.4",
         metavar="WxH",
-        help="metres of the wall round the middle that count (%(default)s)",
+        help="metres of the wall around its middle that are used (%(default)s)",
     )
     parser.add_argument(
-        "--terms", default="s0,s1,s2", metavar="S,...", help="what is fitted, each needs a distance (%(default)s)"
+        "--terms", default="s0,s1,s2", metavar="S,...", help="coefficients to fit; each needs a distance (%(default)s)"
     )
 
 
 def run(arguments: Namespace) -> dict[str, Any]:
-    """Measure, write the profile and tell what was found."""
+    """Calibrate, write the profile and print the result."""
     from stereovox.calibrate.noise import calibrate_noise
 
     region, terms = _region(arguments.region), _terms(arguments.terms)
@@ -48,7 +49,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
     walls = read_walls(arguments.recordings, arguments.distance, arguments.frames, arguments.camera)
     found = calibrate_noise(walls, region, terms)
     _write(arguments.out, found)
-    _tell(found, arguments.out)
+    _print_result(found, arguments.out)
     result = {**found.as_dict(), "out": arguments.out}
     if arguments.report:
         from stereovox.report.calibration import write_noise_report
@@ -85,7 +86,7 @@ def _write(out: str, found: NoiseCalibration) -> None:
 
 
 def profile_text(found: NoiseCalibration) -> str:
-    """Return a profile that holds the noise, with what it was fitted to as comments."""
+    """Return the profile as text, with the measurements it was fitted to as comments."""
     lines = ["# range noise sigma(z) = s0 + s1 z + s2 z^2 in metres, measured by stereovox calibrate noise"]
     if found.subpixel is not None:
         lines.append(f"# s2 is a disparity error of {found.subpixel:.4f} px")
@@ -94,7 +95,7 @@ def profile_text(found: NoiseCalibration) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _tell(found: NoiseCalibration, out: str) -> None:
+def _print_result(found: NoiseCalibration, out: str) -> None:
     for note in found.notes:
         say(f"note: {note}")
     for point in found.points:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Find where a depth camera sits on a tracker, and how their clocks differ, from a recording of both.
+"""Calibrate the pose of a depth camera on a tracker, and their clock offset, from a recording of both.
 
-RECORDING is a folder with depth images and a tracker's poses (tracker.txt, or as its pair.toml says). Wave both for ten
-seconds or more, in a furnished room: pitch, yaw and roll by 20 degrees and more, not too fast.
+RECORDING is a folder with depth images and a tracker's poses (tracker.txt, or as its pair.toml says). Move both for
+ten seconds or more in a furnished room: rotate by 20 degrees or more in pitch, yaw and roll, not too fast.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ UNCERTAIN = (0.5, 0.02)
 """Standard deviations (degrees, metres) above which the user is warned."""
 
 SHORT_S = 3.0
-"""What fails with a recording shorter than this many seconds fails because of that, most likely."""
+"""A calibration that fails on a shorter recording most likely fails for that reason."""
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -36,7 +36,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--out", metavar="FILE", help="pair.toml to write; without it the result is only printed")
     parser.add_argument("--frames", metavar="A:B:S", help="only these images, as a Python slice")
     parser.add_argument(
-        "--within", type=float, metavar="S", help="only clock offsets within S seconds of the one in pair.toml (any)"
+        "--within", type=float, metavar="S", help="search clock offsets within S seconds of the one in pair.toml (all)"
     )
 
 
@@ -55,17 +55,17 @@ def run(arguments: Namespace) -> dict[str, Any]:
         say(f"note: {note}")
     depth = cast("DepthSource", Selection(depth, arguments.frames)) if arguments.frames else depth
     try:
-        found = _calibrated(depth, folder, settings, arguments.within)
+        found = _calibrate(depth, folder, settings, arguments.within)
     except StereovoxError as error:
         if type(error) is not StereovoxError:
             raise  # a file or library that is missing
         raise StereovoxError(f"{_too_short(depth)}{error}") from None
-    _tell(found)
+    _print_result(found)
     _write(arguments, folder, settings, found)
     return {**found.as_dict(), "out": arguments.out}
 
 
-def _calibrated(depth: DepthSource, folder: Path, settings: PairSettings, within_s: float | None) -> PairCalibration:
+def _calibrate(depth: DepthSource, folder: Path, settings: PairSettings, within_s: float | None) -> PairCalibration:
     from stereovox.calibrate.pair import calibrate_pair
     from stereovox.sources.pair import open_poses
 
@@ -82,7 +82,7 @@ def _calibrated(depth: DepthSource, folder: Path, settings: PairSettings, within
 
 
 def _too_short(depth: DepthSource) -> str:
-    """Return the first thing to say of a recording that was too short, whatever failed for it."""
+    """Return the beginning of the error message where the recording is too short, else an empty string."""
     from stereovox.sources.pair import image_times
 
     first_ns, last_ns = image_times(depth)
@@ -103,7 +103,7 @@ def _settings(folder: Path) -> PairSettings:
     return usual
 
 
-def _tell(found: PairCalibration) -> None:
+def _print_result(found: PairCalibration) -> None:
     import numpy as np
 
     from stereovox.se3 import rotation_vector
@@ -111,9 +111,10 @@ def _tell(found: PairCalibration) -> None:
     turn = np.degrees(rotation_vector(found.T_tracker_camera[:3, :3]))
     place = 1000 * found.T_tracker_camera[:3, 3]
     say(f"clock_offset_s {found.clock_offset_s:.4f}, standard deviation {1000 * found.offset_std_s:.1f} ms")
-    say(f"camera seen from the tracker (x right, y down, z forward): {_three(place, '+.1f')} mm,")
-    say(f"  standard deviations {_three(1000 * found.translation_std_m, '.1f')} mm")
-    say(f"  turned by {_three(turn, '+.2f')} deg, standard deviations {_three(found.rotation_std_deg, '.2f')} deg")
+    say(f"camera seen from the tracker (x right, y down, z forward): {_format_xyz(place, '+.1f')} mm,")
+    say(f"  standard deviations {_format_xyz(1000 * found.translation_std_m, '.1f')} mm")
+    turn_std = _format_xyz(found.rotation_std_deg, ".2f")
+    say(f"  turned by {_format_xyz(turn, '+.2f')} deg, standard deviations {turn_std} deg")
     fit = f"{found.rotation_residual_deg:.2f} deg and {1000 * found.translation_residual_m:.1f} mm"
     say(f"{found.pairs} of {found.images} images count; camera and tracker agree within {fit} (median)")
     degrees, metres = UNCERTAIN
@@ -121,7 +122,7 @@ def _tell(found: PairCalibration) -> None:
         say("note: this is uncertain; record for longer, with more pitch, yaw and roll, near corners and furniture")
 
 
-def _three(numbers: Any, form: str) -> str:
+def _format_xyz(numbers: Any, form: str) -> str:
     return " ".join(f"{name} {number:{form}}" for name, number in zip("xyz", numbers, strict=True))
 
 

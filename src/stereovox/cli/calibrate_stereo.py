@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Find the lenses of a stereo camera and how its eyes stand to each other, from pairs of images of a chessboard.
+"""Calibrate the lenses and the relative pose of a stereo camera from image pairs of a chessboard.
 
 FOLDER holds left01.png, right01.png and so on, or imageL0.png and imageR0.png, or folders left/ and right/. Take ten
-pairs or more: near and far, in all corners of both images, and tilted. The board lies flat and keeps still.
+pairs or more: near and far, in all corners of both images, and tilted. The board must be flat and still.
 """
 
 from __future__ import annotations
@@ -20,25 +20,25 @@ if TYPE_CHECKING:
 
 EXAMPLE = "stereovox calibrate stereo boards --board 9x6 --square 0.025 --out rig.toml --report boards-report"
 GOOD_PX = 0.5
-LONGEST = 5.0
-"""Metres between two eyes; more is likely a square given in millimetres."""
+MAX_BASELINE_M = 5.0
+"""A longer baseline likely means a square given in millimetres."""
 SHOWN = 5
 
 
 def add_arguments(parser: ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("folder", metavar="FOLDER", help="pairs of images of a chessboard")
+    parser.add_argument("folder", metavar="FOLDER", help="image pairs of a chessboard")
     parser.add_argument("--board", required=True, metavar="CxR", help="inner corners across and down, for example 9x6")
     parser.add_argument("--square", required=True, type=float, metavar="M", help="side of a square in metres")
     parser.add_argument("--out", required=True, metavar="FILE", help="rig file to write, for example rig.toml")
     parser.add_argument("--lens", default="pinhole", metavar="MODEL", help="pinhole (default) or fisheye")
     parser.add_argument("--name", default="stereo", metavar="NAME", help="name of the pair (%(default)s)")
-    parser.add_argument("--rectify", metavar="MODEL", help="pinhole, spherical or cylindrical (as the lens needs it)")
+    parser.add_argument("--rectify", metavar="MODEL", help="pinhole, spherical or cylindrical (chosen by the lens)")
     parser.add_argument("--report", metavar="DIR", help="folder for a page with figures and pictures")
 
 
 def run(arguments: Namespace) -> dict[str, Any]:
-    """Calibrate, write the rig file and tell how good it is."""
+    """Calibrate, write the rig file and print how well it fits."""
     from stereovox.calibrate.chessboard import unmatched
     from stereovox.calibrate.stereo import calibrate_stereo, check_model, read_boards
 
@@ -49,7 +49,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
     found = calibrate_stereo(pairs, board, arguments.lens)
     _write(arguments, found)
     alone = unmatched(arguments.folder)
-    _tell(found, arguments, alone)
+    _print_result(found, arguments, alone)
     result = {**found.as_dict(), "unmatched": alone, "out": arguments.out}
     if arguments.report:
         from stereovox.report.stereo import write_stereo_report
@@ -82,7 +82,7 @@ def _write(arguments: Namespace, found: StereoCalibration) -> None:
         file.write(rig_text(Rig((pair,)), (f"stereovox calibrate stereo: {used}", figures)).encode())
 
 
-def _tell(found: StereoCalibration, arguments: Namespace, alone: list[str]) -> None:
+def _print_result(found: StereoCalibration, arguments: Namespace, alone: list[str]) -> None:
     for pair in found.pairs:
         if pair.why:
             say(f"  {pair.name}: left out, {pair.why}")
@@ -91,20 +91,21 @@ def _tell(found: StereoCalibration, arguments: Namespace, alone: list[str]) -> N
     if alone:
         more = f" and {len(alone) - SHOWN} more" if len(alone) > SHOWN else ""
         say(f"note: no partner of the other eye for {', '.join(alone[:SHOWN])}{more}")
-    told = found.as_dict()
-    unseen = "" if told["unseen_px"] is None else f" ({told['unseen_px']:.3f} px in pairs the calibration has not seen)"
-    say(f"{told['used']} of {len(found.pairs)} pairs: corners missed by {told['rms_px']:.3f} px RMS,")
-    say(f"  rows after rectification by {told['epipolar_px']:.3f} px{unseen}")
-    say(f"baseline {1000 * told['baseline_m']:.2f} mm; fields of view {_fields(told)} deg")
-    if told["baseline_m"] > LONGEST:
-        length = f"{told['baseline_m']:.4g} m is a long baseline"
+    figures = found.as_dict()
+    unseen_px = figures["unseen_px"]
+    unseen = "" if unseen_px is None else f" ({unseen_px:.3f} px in pairs the calibration has not seen)"
+    say(f"{figures['used']} of {len(found.pairs)} pairs: corners missed by {figures['rms_px']:.3f} px RMS,")
+    say(f"  rows after rectification by {figures['epipolar_px']:.3f} px{unseen}")
+    say(f"baseline {1000 * figures['baseline_m']:.2f} mm; fields of view {_format_fields(figures)} deg")
+    if figures["baseline_m"] > MAX_BASELINE_M:
+        length = f"{figures['baseline_m']:.4g} m is a long baseline"
         say(f"note: {length}; --square {arguments.square:g}: millimetres? Give metres")
-    if max(told["rms_px"], told["epipolar_px"]) > GOOD_PX:
+    if max(figures["rms_px"], figures["epipolar_px"]) > GOOD_PX:
         say("note: that is a lot; is the board flat, the picture sharp, and --lens right? See the report")
     if len(found.used) < 10:
         say("note: few pairs; take ten or more, in all corners of the images")
     say(f"saved {arguments.out}")
 
 
-def _fields(told: dict[str, Any]) -> str:
-    return " and ".join(f"{across:.1f} x {down:.1f}" for across, down in told["field_of_view_deg"])
+def _format_fields(figures: dict[str, Any]) -> str:
+    return " and ".join(f"{across:.1f} x {down:.1f}" for across, down in figures["field_of_view_deg"])

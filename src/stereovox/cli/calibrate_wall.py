@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Find out from recordings of a flat wall what a depth camera measures wrongly, and write a camera file that cures it.
+"""Measure the depth errors of a camera from recordings of a flat wall, and write a camera file that corrects them.
 
-Let the camera stand before a flat, textured wall that fills its view, some 30 frames long; measure the distance from
-the camera to the wall along the optical axis. Two or more distances tell how the error grows. Put the camera file into
-the folder of a recording, or use it with: stereovox map SOURCE --camera FILE.
+Record a flat, textured wall that fills the view with a still camera, about 30 frames; measure the distance from the
+camera to the wall along the optical axis. Two or more distances show how the error grows. Put the camera file into the
+folder of a recording, or use it with: stereovox map SOURCE --camera FILE.
 """
 
 from __future__ import annotations
@@ -28,13 +28,15 @@ def add_arguments(parser: ArgumentParser) -> None:
         "--model",
         default="auto",
         metavar="NAME",
-        help="scale, disparity, scale+disparity, thesis (Chien 2020), or auto (default): what predicts best",
+        help="scale, disparity, scale+disparity, thesis (Chien 2020), or auto (default): the one that predicts best",
     )
     parser.add_argument(
-        "--square", action="store_true", help="the walls stand exactly square to the camera; else their lean is found"
+        "--square",
+        action="store_true",
+        help="the walls are exactly perpendicular to the optical axis; else their tilt is estimated",
     )
     parser.add_argument(
-        "--check", action="append", default=[], metavar="RECORDING", help="a wall to try the result on; repeatable"
+        "--check", action="append", default=[], metavar="RECORDING", help="a wall to test the result on; repeatable"
     )
     parser.add_argument(
         "--check-distance", action="append", type=float, default=[], metavar="M", help="its distance, once for each"
@@ -42,7 +44,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 
 def run(arguments: Namespace) -> dict[str, Any]:
-    """Calibrate, write the camera file and tell how flat the walls became."""
+    """Calibrate, write the camera file and print how flat the walls are before and after."""
     from stereovox.calibrate.wall import calibrate_wall, check_model
 
     check_model(arguments.model)
@@ -53,7 +55,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
     check = read_walls(arguments.check, arguments.check_distance, arguments.frames, raw=True)
     found = calibrate_wall(walls, arguments.model, arguments.square, check)
     _write(arguments.out, found)
-    _tell(found, arguments.out)
+    _print_result(found, arguments.out)
     result = {**found.as_dict(), "out": arguments.out}
     if arguments.report:
         from stereovox.report.calibration import write_wall_report
@@ -79,7 +81,7 @@ def _write(out: str, found: WallCalibration) -> None:
         file.write(camera_text(found.camera, provenance, ("written by stereovox calibrate wall",)).encode())
 
 
-def _tell(found: WallCalibration, out: str) -> None:
+def _print_result(found: WallCalibration, out: str) -> None:
     for note in found.notes:
         say(f"note: {note}")
     say(f"model {found.correction.model}: {found.why}")

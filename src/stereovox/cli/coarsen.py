@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Make a map of larger cells, each as bad as the worst it is made of: occupied, then tentative, unknown, free."""
+"""Make a map of larger cells; each takes the worst state of its parts: occupied, then tentative, unknown, free."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("map", metavar="MAP", help="folder of a map")
     parser.add_argument("out", metavar="OUT", help="folder of the new map")
-    parser.add_argument("--factor", type=int, metavar="N", required=True, help="cells that become one, along each side")
+    parser.add_argument("--factor", type=int, metavar="N", required=True, help="cells along each side that become one")
 
 
 def run(arguments: Namespace) -> dict[str, Any]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Take the part of a map that lies in a box, as a map of its own: whole cells, those whose middle is inside."""
+"""Crop a map to a box: the new map holds the cells whose centre lies inside."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ def add_arguments(parser: ArgumentParser) -> None:
         "--box",
         metavar=CORNERS,
         required=True,
-        help="lowest and highest corner in metres; inf and -inf where it has no end. --box=... where it begins with -",
+        help="lowest and highest corner in metres; inf and -inf for no limit. Write --box=... where it begins with -",
     )
 
 
 def run(arguments: Namespace) -> dict[str, Any]:
-    """Load the map and save the part."""
+    """Load the map and save the cropped one."""
     from stereovox.products.crop import crop
 
     box = numbers_of("--box", arguments.box, CORNERS)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fly a simulated camera through a built-in room: map, picture and report in under a minute.
+"""Fly a simulated camera through a built-in room; make a map, a picture and a report in under a minute.
 
 The report compares the map with the scene's exact occupancy.
 """
@@ -21,17 +21,17 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 
 def run(arguments: Namespace) -> dict[str, Any]:
-    """Run the demo and tell where its results are."""
+    """Run the demo and print where its results are."""
     from stereovox.lab.demo import demo
 
     say_about_compiling()
     with progress_of_steps("starting") as progress:
         result = demo(arguments.out, voxel_size=arguments.voxel_size, progress=progress)
-    _tell(result)
+    _print_result(result)
     return result
 
 
-def _tell(result: dict[str, Any]) -> None:
+def _print_result(result: dict[str, Any]) -> None:
     accuracy = result["accuracy"]
     parts = [f"{result[name]['median']:.2f} ms" for name in ("depth_ms", "integrate_ms")]
     say(f"{result['frames']} frames; a frame: {milliseconds(result['frame_ms'])}")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tell what changed from one map to another: which cells appeared, vanished, became known."""
+"""Show what changed from one map to another: which cells appeared, vanished or became known."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 
 def run(arguments: Namespace) -> dict[str, Any]:
-    """Compare the maps and tell how many cells changed."""
+    """Compare the maps and print how many cells changed."""
     from stereovox.maps import State
     from stereovox.products.difference import difference, write_difference
     from stereovox.products.moved import moved
@@ -47,7 +47,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
     if T_a_b is not None:
         b = moved(b, T_a_b)
     changes = difference(a, b)
-    result: dict[str, Any] = {kind: _tell(changes, kind) for kind in KINDS}
+    result: dict[str, Any] = {kind: _print_count(changes, kind) for kind in KINDS}
     names = [state.name.lower() for state in State]
     result["counts"] = {
         name: dict(zip(names, row, strict=True)) for name, row in zip(names, changes.counts.tolist(), strict=True)
@@ -64,7 +64,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
     return result
 
 
-def _tell(changes: Difference, kind: str) -> int:
+def _print_count(changes: Difference, kind: str) -> int:
     number = len(getattr(changes, kind))
     say(f"{thousands(number):>12} cells {KINDS[kind]}")
     return number

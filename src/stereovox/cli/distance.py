@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Write how far the nearest obstacle is from each cell of a box of the map (an ESDF without signs), for planners.
+"""Write the distance from each cell of a box to the nearest obstacle (an unsigned ESDF), for planners.
 
 FILE.npz holds the arrays distance (x, y, z) in metres, origin and cell.
 """
@@ -36,25 +36,25 @@ def add_arguments(parser: ArgumentParser) -> None:
         action="append",
         choices=STATES[1:],
         default=[],
-        help="besides occupied cells, count these as obstacles too; may be given twice",
+        help="cells that count as obstacles besides occupied ones; repeatable",
     )
     parser.add_argument(
-        "--box", metavar=CORNERS, help="lowest and highest corner in metres (default: all that is known)"
+        "--box", metavar=CORNERS, help="lowest and highest corner in metres (default: the known part of the map)"
     )
-    parser.add_argument("--max", type=float, metavar="M", default=np.inf, help="obstacles farther off count as none")
+    parser.add_argument("--max", type=float, metavar="M", default=np.inf, help="ignore obstacles farther away")
     parser.add_argument(
         "--measure",
         metavar="HOW",
         default="centres",
-        help="from the cell's middle to the obstacle's (centres, default), to its nearest face (faces), or from"
-        " whatever point of the cell is nearest (gap)",
+        help="from the cell's centre to the obstacle's (centres, default), to its nearest face (faces), or from the"
+        " nearest point of the cell (gap)",
     )
-    parser.add_argument("--picture", metavar="FILE.png", help="draw one layer as well")
+    parser.add_argument("--picture", metavar="FILE.png", help="picture of one layer to write as well")
     parser.add_argument("--at", type=float, metavar="M", help="height of that layer (default: the camera's)")
 
 
 def run(arguments: Namespace) -> dict[str, Any]:
-    """Measure the distances, write them and tell about them."""
+    """Compute the distances, write them and print a summary."""
     from stereovox.maps import State
     from stereovox.products.distance import DistanceField, write_distance
 
@@ -64,7 +64,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
     to = [State[name.upper()] for name in ("occupied", *arguments.to)]
     field = DistanceField(voxel_map, low, high, to=to, max_distance=arguments.max, measure=arguments.measure)
     write_distance(field, arguments.file)
-    result = _told(field, arguments)
+    result = _print_result(field, arguments)
     if arguments.picture:
         _draw(field, voxel_map, arguments)
         result["picture"] = arguments.picture
@@ -79,7 +79,7 @@ def _check_files(arguments: Namespace) -> None:
 
 
 def _box(text: str | None, voxel_map: VoxelMap) -> NDArray[np.float64]:
-    """Return lowest and highest corner (2, 3) in metres."""
+    """Return the lowest and the highest corner (2, 3) in metres."""
     bounds = voxel_map.bounds()
     if bounds is None:
         raise StereovoxError("the map is empty: there is nothing to be far from")
@@ -88,7 +88,7 @@ def _box(text: str | None, voxel_map: VoxelMap) -> NDArray[np.float64]:
     return np.reshape(numbers_of("--box", text, CORNERS), (2, 3))
 
 
-def _told(field: DistanceField, arguments: Namespace) -> dict[str, Any]:
+def _print_result(field: DistanceField, arguments: Namespace) -> dict[str, Any]:
     metres, file = field.metres, Path(arguments.file)
     near = metres[np.isfinite(metres)]
     shape, largest = list(metres.shape), float(near.max()) if len(near) else None

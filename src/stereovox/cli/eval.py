@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compare a map with the truth, cell by cell.
+"""Compare a map with the ground truth, cell by cell.
 
-MAP and TRUTH are folders of stereovox or OctoMap files (.bt, .ot) with cells of the same size; or both are floors' maps
-in map_server files (.yaml), of any cells, which are laid on each other first.
+MAP and TRUTH are stereovox folders or OctoMap files (.bt, .ot) with cells of the same size; or both are floor maps
+in map_server files (.yaml), of any cell size, which are aligned first.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from stereovox.evaluate.grid_scores import GridScores
     from stereovox.evaluate.scores import Scores
 
-KINDS = {
+DIFFERENCES = {
     "missed": "known to the reference only",
     "wrongly_occupied": "free in the reference",
     "wrongly_free": "occupied in the reference",
@@ -31,13 +31,73 @@ KINDS = {
 }
 ALIKE = 0.3
 """IoU of walls within a cell below which two maps may be of different places."""
+EXAMPLE = "stereovox eval drive.svox truth.svox --report drive-report"
+MEASURES = {
+    "precision": "of the cells called occupied, hold a surface",
+    "recall": "of the surface cells, are called occupied",
+    "tolerance_precision": "precision, a surface within {} is enough",
+    "tolerance_recall": "recall, an occupied cell within {} is enough",
+    "accuracy": "of all cells, are called right",
+    "specificity": "of the free cells, are not called occupied",
+    "npv": "of the cells not called occupied, are free",
+    "correlation": "of probability and truth, 1 is perfect",
+}
+AUC = "area under the ROC curve, 1 is perfect"
+SINGLE = {
+    "error": "mean squared error of the probabilities (Brier score), 0 is perfect",
+    "ece": "how far probabilities lie from the true shares (ECE), 0 is perfect",
+}
 
 
-def judge(arguments: Namespace) -> dict[str, Any]:
-    """Load both maps, lay one on the other, compare them, tell and report."""
+def add_arguments(parser: ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("map", metavar="MAP", help="map to evaluate")
+    parser.add_argument(
+        "truth", metavar="TRUTH", help="map whose occupied cells hold a surface and free cells hold none"
+    )
+    about = "a cell is called occupied above it (default: 0.7; for a floor map the threshold in its file)"
+    parser.add_argument("--threshold", type=float, metavar="P", help=about)
+    parser.add_argument(
+        "--tolerance", type=int, default=1, metavar="CELLS", help="distance that still counts as a match (default: 1)"
+    )
+    parser.add_argument("--path", metavar="FILE", help="poses of the camera, for precision and recall by distance")
+    parser.add_argument("--report", metavar="DIR", help="folder for a page with charts")
+    floors = parser.add_argument_group("only for floor maps")
+    about = "region that does not count, metres in TRUTH's frame; repeatable"
+    floors.add_argument("--exclude", action="append", default=[], type=region, metavar="X0,Y0,X1,Y1", help=about)
+    floors.add_argument("--no-align", action="store_true", help="both maps share a frame: do not align MAP")
+
+
+def run(arguments: Namespace) -> dict[str, Any]:
+    """Load both maps, compare them, print and report the scores."""
+    from stereovox.maps.store import is_map
+
+    kinds = {dimensions(path) for path in (arguments.map, arguments.truth)}
+    if len(kinds) == 2:
+        space = arguments.map if dimensions(arguments.map) == 3 else arguments.truth
+        command = ("export", space) if is_map(space) else ("grid", space, "--out")
+        cure = command_line(*command, "floor.yaml")
+        raise StereovoxError(f"{space}: no floor's map, the other one is; make one of it with: {cure}")
+    return COMPARE[kinds.pop()](arguments)
+
+
+def region(text: str) -> tuple[float, ...]:
+    """Parse a region: four finite numbers; raises ArgumentTypeError for anything else."""
+    try:
+        numbers = tuple(map(float, text.split(",")))
+    except ValueError:
+        numbers = ()
+    if len(numbers) != 4 or not all(map(math.isfinite, numbers)):
+        raise ArgumentTypeError(f"'{text}' is no region; give X0,Y0,X1,Y1 in metres, two opposite corners")
+    return numbers
+
+
+def _compare_grids(arguments: Namespace) -> dict[str, Any]:
+    """Load two floor maps, align them, compare them, print and report the scores."""
     from stereovox.evaluate.grid_scores import laid_on, score_laid
     from stereovox.evaluate.truth_cells import level
 
+    refuse_options(arguments, ("path",), "distances from a camera are not for floors' maps")
     if arguments.threshold is not None:
         level(arguments.threshold)
     reference, grid = open_grid(arguments.truth), open_grid(arguments.map)
@@ -47,7 +107,7 @@ def judge(arguments: Namespace) -> dict[str, Any]:
     laid = laid_on(grid, reference, arguments.exclude, aligned)
     scores = score_laid(laid, grid.resolution, aligned, arguments.tolerance)
     result = scores.as_dict()
-    _tell_grid(scores, len(arguments.exclude))
+    _print_grid_scores(scores, len(arguments.exclude))
     if arguments.report:
         from stereovox.report.grid import write_grid_report
 
@@ -58,13 +118,64 @@ def judge(arguments: Namespace) -> dict[str, Any]:
     return result
 
 
-def _tell_grid(scores: GridScores, regions: int) -> None:
+def _compare_cells(arguments: Namespace) -> dict[str, Any]:
+    from stereovox.evaluate.inputs import path_fits, read_camera_path, read_map
+    from stereovox.evaluate.outcomes import outcomes
+    from stereovox.evaluate.scores import score
+    from stereovox.evaluate.truth_cells import TruthCells, level
+
+    refuse_options(arguments, ("exclude", "no_align"), "only for floors' maps (.yaml)")
+    threshold = 0.7 if arguments.threshold is None else arguments.threshold
+    level(threshold)  # raises for a bad threshold before large maps are read
+    path = None if arguments.path is None else read_camera_path(arguments.path)
+    truth = TruthCells(read_map(arguments.truth), arguments.tolerance)
+    voxel_map = read_map(arguments.map)
+    scores = score(voxel_map, truth, threshold, path=path)
+    result = scores.as_dict()
+    if scores.distance is not None:
+        result["distance"] = scores.distance.rows()
+    _print_scores(scores)
+    if path is not None and not path_fits(path, truth, voxel_map.config.max_range):
+        say("the path does not fit the map: is it in the map's world frame?")
+    if arguments.report:
+        from stereovox.report.evaluation import Evaluated, write_evaluation_report
+
+        shown = outcomes(truth.read(voxel_map), truth, threshold)
+        evaluated = Evaluated(Path(arguments.map).name, scores, outcomes=shown)
+        page = write_evaluation_report(arguments.report, [evaluated], Path(arguments.truth).name)
+        say(f"report: {page}")
+        result["report"] = str(page)
+    return result
+
+
+COMPARE = {2: _compare_grids, 3: _compare_cells}
+
+
+def _print_scores(scores: Scores) -> None:
+    observed = scores.observed
+    say(f"{thousands(scores.cells)} cells of the truth, {scores.coverage:.1%} of them observed by the map")
+    if not observed.cells:
+        say("the map knows none of them: are both in the same world frame?")
+    say(f"occupied: p > {scores.threshold:g}")
+    say(f"{'':20}  {'all cells':>11}  {'observed':>11}")
+    for name in ("tp", "fp", "tn", "fn"):
+        say(f"{name:20}  {thousands(getattr(scores, name)):>11}  {thousands(getattr(observed, name)):>11}")
+    within = "1 cell" if scores.tolerance_cells == 1 else f"{scores.tolerance_cells} cells"
+    for name, text in MEASURES.items():
+        values = (_number(getattr(one, name)) for one in (scores, observed))
+        say(f"{name:20}  {next(values):>11}  {next(values):>11}  {text.format(within)}")
+    say(f"{'auc':20}  {_number(scores.auc):>11}  {_number(scores.observed_auc):>11}  {AUC}")
+    for name, text in SINGLE.items():
+        say(f"{name:20}  {'':>11}  {_number(getattr(scores, name)):>11}  {text}")
+
+
+def _print_grid_scores(scores: GridScores, regions: int) -> None:
     errors = scores.errors
     x, y, yaw = scores.motion
     if scores.aligned:
         say(f"the map was moved by {x:.3f}, {y:.3f} m and {np.degrees(yaw):.2f} degrees to lie on the reference")
     say(f"error {errors.eq7_percent:.2f} % (IST 2019, Eq 7): cells that differ, for 100 known to the reference")
-    for kind, what in KINDS.items():
+    for kind, what in DIFFERENCES.items():
         say(f"{thousands(getattr(errors, kind)):>11} {kind.replace('_', ' ')}: {what}")
     if regions:
         say(f"excluded: {thousands(errors.excluded)} cells, of which {thousands(errors.forgiven)} differ; with them "
@@ -91,122 +202,3 @@ def _percent(value: float | None) -> str:
 
 def _number(value: float | None) -> str:
     return "-" if value is None else f"{value:.3f}"
-
-
-EXAMPLE = "stereovox eval drive.svox truth.svox --report drive-report"
-MEASURES = {
-    "precision": "of the cells called occupied, hold a surface",
-    "recall": "of the surface cells, are called occupied",
-    "tolerance_precision": "precision, a surface within {} is enough",
-    "tolerance_recall": "recall, an occupied cell within {} is enough",
-    "accuracy": "of all cells, are called right",
-    "specificity": "of the free cells, are not called occupied",
-    "npv": "of the cells not called occupied, are free",
-    "correlation": "of probability and truth, 1 is perfect",
-}
-AUC = "area under the ROC curve, 1 is perfect"
-SINGLE = {
-    "error": "mean squared error of the probabilities (Brier score), 0 is perfect",
-    "ece": "how far probabilities lie from the true shares (ECE), 0 is perfect",
-}
-
-
-def add_arguments(parser: ArgumentParser) -> None:
-    """Declare the options."""
-    parser.add_argument("map", metavar="MAP", help="map to be judged")
-    parser.add_argument(
-        "truth", metavar="TRUTH", help="map whose occupied cells hold a surface and free cells hold none"
-    )
-    said = "a cell is called occupied above it (default: 0.7; of a floor's map what its file says)"
-    parser.add_argument("--threshold", type=float, metavar="P", help=said)
-    parser.add_argument(
-        "--tolerance", type=int, default=1, metavar="CELLS", help="distance that is forgiven (default: 1)"
-    )
-    parser.add_argument("--path", metavar="FILE", help="poses of the camera, for precision and recall by distance")
-    parser.add_argument("--report", metavar="DIR", help="write a page with charts there")
-    floors = parser.add_argument_group("only for floors' maps")
-    said = "region that does not count, metres in TRUTH's frame; may be given several times"
-    floors.add_argument("--exclude", action="append", default=[], type=region, metavar="X0,Y0,X1,Y1", help=said)
-    floors.add_argument("--no-align", action="store_true", help="both maps are in one frame: do not move MAP")
-
-
-def run(arguments: Namespace) -> dict[str, Any]:
-    """Load both maps, compare them, tell and report."""
-    from stereovox.maps.store import is_map
-
-    kinds = {dimensions(path) for path in (arguments.map, arguments.truth)}
-    if len(kinds) == 2:
-        space = arguments.map if dimensions(arguments.map) == 3 else arguments.truth
-        words = ("export", space) if is_map(space) else ("grid", space, "--out")
-        cure = command_line(*words, "floor.yaml")
-        raise StereovoxError(f"{space}: no floor's map, the other one is; make one of it with: {cure}")
-    return JUDGED[kinds.pop()](arguments)
-
-
-def region(text: str) -> tuple[float, ...]:
-    """Return four finite numbers."""
-    try:
-        numbers = tuple(map(float, text.split(",")))
-    except ValueError:
-        numbers = ()
-    if len(numbers) != 4 or not all(map(math.isfinite, numbers)):
-        raise ArgumentTypeError(f"'{text}' is no region; give X0,Y0,X1,Y1 in metres, two opposite corners")
-    return numbers
-
-
-def _judge_grids(arguments: Namespace) -> dict[str, Any]:
-    pass  # REHOUSED
-
-    refuse_options(arguments, ("path",), "distances from a camera are not for floors' maps")
-    return judge(arguments)
-
-
-def _judge_cells(arguments: Namespace) -> dict[str, Any]:
-    from stereovox.evaluate.inputs import path_fits, read_camera_path, read_map
-    from stereovox.evaluate.outcomes import outcomes
-    from stereovox.evaluate.scores import score
-    from stereovox.evaluate.truth_cells import TruthCells, level
-
-    refuse_options(arguments, ("exclude", "no_align"), "only for floors' maps (.yaml)")
-    threshold = 0.7 if arguments.threshold is None else arguments.threshold
-    level(threshold)  # a wrong number shows before large maps are read
-    path = None if arguments.path is None else read_camera_path(arguments.path)
-    truth = TruthCells(read_map(arguments.truth), arguments.tolerance)
-    voxel_map = read_map(arguments.map)
-    scores = score(voxel_map, truth, threshold, path=path)
-    result = scores.as_dict()
-    if scores.distance is not None:
-        result["distance"] = scores.distance.rows()
-    _tell(scores)
-    if path is not None and not path_fits(path, truth, voxel_map.config.max_range):
-        say("the path does not fit the map: is it in the map's world frame?")
-    if arguments.report:
-        from stereovox.report.evaluation import Evaluated, write_evaluation_report
-
-        shown = outcomes(truth.read(voxel_map), truth, threshold)
-        evaluated = Evaluated(Path(arguments.map).name, scores, outcomes=shown)
-        page = write_evaluation_report(arguments.report, [evaluated], Path(arguments.truth).name)
-        say(f"report: {page}")
-        result["report"] = str(page)
-    return result
-
-
-JUDGED = {2: _judge_grids, 3: _judge_cells}
-
-
-def _tell(scores: Scores) -> None:
-    observed = scores.observed
-    say(f"{thousands(scores.cells)} cells of the truth, {scores.coverage:.1%} of them observed by the map")
-    if not observed.cells:
-        say("the map knows none of them: are both in the same world frame?")
-    say(f"occupied: p > {scores.threshold:g}")
-    say(f"{'':20}  {'all cells':>11}  {'observed':>11}")
-    for name in ("tp", "fp", "tn", "fn"):
-        say(f"{name:20}  {thousands(getattr(scores, name)):>11}  {thousands(getattr(observed, name)):>11}")
-    within = "1 cell" if scores.tolerance_cells == 1 else f"{scores.tolerance_cells} cells"
-    for name, text in MEASURES.items():
-        values = (_number(getattr(one, name)) for one in (scores, observed))
-        say(f"{name:20}  {next(values):>11}  {next(values):>11}  {text.format(within)}")
-    say(f"{'auc':20}  {_number(scores.auc):>11}  {_number(scores.observed_auc):>11}  {AUC}")
-    for name, text in SINGLE.items():
-        say(f"{name:20}  {'':>11}  {_number(getattr(scores, name)):>11}  {text}")

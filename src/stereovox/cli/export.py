@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Write a map for other programs; the ending of FILE chooses the format.
+"""Export a map for other programs; the suffix of FILE selects the format.
 
 .bt and .ot for OctoMap, .ply and .pcd for point cloud viewers, .npz for NumPy, .glb for browsers and Blender, .obj and
-.stl for modellers, .rrd for the Rerun viewer; .bag, .mcap and .db3 for ROS; .pgm, .png or .yaml for map_server: the map
-seen from above, as a picture and its .yaml. The map of a floor (.yaml) goes into a bag as well.
+.stl for 3-D tools, .rrd for the Rerun viewer; .bag, .mcap and .db3 for ROS; .pgm, .png or .yaml for
+map_server: the map from above, as an image and its .yaml. A floor map (.yaml) can be exported to a bag as well.
 """
 
 from __future__ import annotations
@@ -21,27 +21,30 @@ EXAMPLE = "stereovox export kitchen.svox kitchen.bt"
 
 def add_arguments(parser: ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("map", metavar="MAP", help="folder of a map; for a bag also the .yaml of a floor's map")
+    parser.add_argument("map", metavar="MAP", help="folder of a map; for a bag also the .yaml of a floor map")
     parser.add_argument("file", metavar="FILE", help="file to write")
     parser.add_argument(
         "--heights",
         metavar="LO:HI",
-        help="2-D maps and bags: heights in metres between which obstacles count (the map's scan.heights); what is free"
-        " at any height is cleared. Below zero: --heights=-0.5:1",
+        help="2-D maps and bags: heights in metres between which obstacles count (the map's scan.heights); free cells"
+        " at any height clear. Below zero: --heights=-0.5:1",
     )
     parser.add_argument(
-        "--inflate", type=float, metavar="R", help="2-D maps: grow obstacles by a robot's radius in metres and one cell"
+        "--inflate",
+        type=float,
+        metavar="R",
+        help="2-D maps: inflate obstacles by a robot's radius in metres and one cell",
     )
 
 
 def run(arguments: Namespace) -> dict[str, Any]:
-    """Load the map and write it in the other format."""
+    """Load the map and export it."""
     from stereovox.formats import BAGS, FLAT, export
 
     file, heights = Path(arguments.file), heights_of(arguments.heights)
     ending = file.suffix.lower()
     if dimensions(arguments.map) == 2 and ending in BAGS:
-        return _floor(arguments)
+        return _export_floor(arguments)
     voxel_map = open_map(arguments.map)
     export(voxel_map, file, heights, arguments.inflate)
     result: dict[str, Any] = {"file": str(file), "bytes": file.stat().st_size}
@@ -58,8 +61,8 @@ def run(arguments: Namespace) -> dict[str, Any]:
     return result
 
 
-def _floor(arguments: Namespace) -> dict[str, Any]:
-    """Write the map of a floor into a bag."""
+def _export_floor(arguments: Namespace) -> dict[str, Any]:
+    """Write a floor map to a bag."""
     from stereovox.formats.bags import write_grid_bag
     from stereovox.formats.map_server import read_map_server
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Make a floor's map from a ground robot's depth images or lidar, as map_server files.
+"""Map a ground robot's depth images or lidar scans to a 2-D floor map (map_server files).
 
-Where the robot was: --poses slam finds out by itself, --poses MAP.yaml localises in that map, --poses odometry
-believes the wheels. Without --poses it is slam where there is a lidar.
+Poses come from SLAM (--poses slam), localisation in a map (--poses MAP.yaml) or the wheels (--poses odometry). The
+default is slam where there is a lidar.
 """
 
 from __future__ import annotations
@@ -36,43 +36,45 @@ def add_arguments(parser: ArgumentParser) -> None:
     add_robot(parser)
     parser.add_argument("--out", required=True, metavar="MAP", help="map_server files to write, for example floor.yaml")
     parser.add_argument("--poses", metavar="HOW", help="slam, odometry, or a MAP.yaml to localise in")
-    parser.add_argument("--use", choices=("depth", "lidar", "both"), help="what to map (depth images if there are any)")
-    parser.add_argument("--frames", metavar="A:B:S", help="map only these of them, as a Python slice")
-    parser.add_argument("--voxel-size", type=float, metavar="M", help="cell size in metres")
-    parser.add_argument("--max-range", type=float, metavar="M", help="metres up to which readings count")
-    parser.add_argument("--mode", choices=MODES, default="trinary", help="how the file tells probabilities (trinary)")
     parser.add_argument(
-        "--resume", metavar="MAP", help="go on with this map; without --poses the robot is localised in it"
+        "--use", choices=("depth", "lidar", "both"), help="readings to map (depth images if there are any)"
+    )
+    parser.add_argument("--frames", metavar="A:B:S", help="only these readings, as a Python slice")
+    parser.add_argument("--voxel-size", type=float, metavar="M", help="cell size in metres")
+    parser.add_argument("--max-range", type=float, metavar="M", help="largest range in metres that is used")
+    parser.add_argument("--mode", choices=MODES, default="trinary", help="how the files store probabilities (trinary)")
+    parser.add_argument(
+        "--resume", metavar="MAP", help="continue this map; without --poses the robot is localised in it"
     )
     add_start(parser)
     add_checkpoint(parser)
 
 
 def run(arguments: Namespace) -> dict[str, Any]:
-    """Map the recording, save the map and tell what was done."""
-    return mapped(
+    """Map the recording, save the map and print a summary."""
+    return run_floor(
         arguments.source, arguments.out, profile=arguments.profile, poses=arguments.poses, use=arguments.use,
         frames=arguments.frames, start=parse_start(arguments.start), mode=arguments.mode,
         resume=arguments.resume or False, checkpoint_s=arguments.checkpoint, **overrides(arguments),
     )  # fmt: skip
 
 
-def mapped(source: str, out: str, **settings: Any) -> dict[str, Any]:
-    """Make a floor's map, with progress bars, and tell what was done; arguments as of `map_floor`."""
+def run_floor(source: str, out: str, **settings: Any) -> dict[str, Any]:
+    """Make a floor map with progress bars and print a summary; arguments as for `map_floor`."""
     from stereovox.floor_run import FloorRun
 
-    with FloorRun(source, out, tell=say, **settings) as run:
+    with FloorRun(source, out, notify=say, **settings) as run:
         say_about_compiling()
         with progress_of_steps("finding the way") as progress:
-            run.find_way(progress)
-        with progress_of(run.left, "mapping") as bar:
-            made = run.finish([bar])
-    result = made.summary()
-    _tell(result, made.reports, made.out)
+            run.find_track(progress)
+        with progress_of(run.remaining, "mapping") as bar:
+            mapped = run.finish([bar])
+    result = mapped.summary()
+    _print_result(result, mapped.reports, mapped.out)
     return result
 
 
-def _tell(result: dict[str, Any], reports: list[UpdateReport], out: Path) -> None:
+def _print_result(result: dict[str, Any], reports: list[UpdateReport], out: Path) -> None:
     say_refusals(result, reports, "readings")
     say(f"a reading: scan {milliseconds(result['depth_ms'])}; map {milliseconds(result['integrate_ms'])}")
     say(cells_line(result))

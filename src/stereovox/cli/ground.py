@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Find the ground in a map and where a robot can drive on it; the ending of FILE chooses what is written.
+"""Find the ground in a map and where a robot can drive; the suffix of FILE selects the format.
 
-.npz for the heights of the ground and what each place is to the robot, .yaml or .pgm for map_server, .png for a
+.npz for the heights of the ground and the class of each place, .yaml or .pgm for map_server, .png for a
 picture.
 """
 
@@ -27,21 +27,31 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("map", metavar="MAP", help="folder of a map")
     parser.add_argument("file", metavar="FILE", help="file to write: .npz, .yaml, .pgm or .png")
     parser.add_argument(
-        "--height", type=float, default=1.0, metavar="M", help="room it needs above the ground (1 metre)"
+        "--height",
+        type=float,
+        default=1.0,
+        metavar="M",
+        help="height of the robot: clearance above the ground (1 metre)",
     )
-    parser.add_argument("--radius", type=float, default=0.25, metavar="M", help="its radius, for the slope (0.25)")
-    parser.add_argument("--max-step", type=float, default=0.1, metavar="M", help="highest step it climbs (0.1)")
+    parser.add_argument(
+        "--radius",
+        type=float,
+        default=0.25,
+        metavar="M",
+        help="radius of the robot, over which the slope is taken (0.25)",
+    )
+    parser.add_argument("--max-step", type=float, default=0.1, metavar="M", help="highest step the robot climbs (0.1)")
     parser.add_argument("--max-slope", type=float, default=20.0, metavar="DEG", help="steepest ground in degrees (20)")
     parser.add_argument(
         "--start",
         type=point,
         metavar="X,Y,Z",
-        help="a place on the ground in metres, or near (the lowest large surface)",
+        help="a point on or near the ground, in metres (the lowest large surface)",
     )
 
 
 def run(arguments: Namespace) -> dict[str, Any]:
-    """Load the map, find its ground and write it."""
+    """Load the map, find its ground, write it and print a summary."""
     from stereovox.products.ground import Robot, ground
 
     check_ending("FILE", arguments.file, ".npz", ".yaml", ".pgm", ".png")
@@ -49,7 +59,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
     voxel_map = open_map(arguments.map)
     found = ground(voxel_map, robot, arguments.start)
     _write(voxel_map, found, arguments)
-    return _tell(found, arguments.file)
+    return _print_result(found, arguments.file)
 
 
 def _write(voxel_map: VoxelMap, found: Ground, arguments: Namespace) -> None:
@@ -69,7 +79,7 @@ def _write(voxel_map: VoxelMap, found: Ground, arguments: Namespace) -> None:
         write_map_server(found.grid, arguments.file)
 
 
-def _tell(found: Ground, file: str) -> dict[str, Any]:
+def _print_result(found: Ground, file: str) -> dict[str, Any]:
     import numpy as np
 
     from stereovox.products.ground import Footing

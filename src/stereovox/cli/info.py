@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tell what a map holds and how it was made.
+"""Show what a map contains and how it was made.
 
-MAP is a folder of stereovox, or a floor's map in map_server files (.yaml).
+MAP is a folder written by stereovox, or a floor map in map_server files (.yaml).
 """
 
 from __future__ import annotations
@@ -17,21 +17,21 @@ if TYPE_CHECKING:
     from stereovox.config import Config
 
 EXAMPLE = "stereovox info kitchen.svox"
-TOLD = ("profile", "voxel_size", "integrator", "max_range")
-"""Settings that are told in any case."""
+ALWAYS_PRINTED = ("profile", "voxel_size", "integrator", "max_range")
+"""Settings that are printed in any case."""
 
 
 def add_arguments(parser: ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("map", metavar="MAP", help="folder of a map, or the .yaml of a floor's map")
+    parser.add_argument("map", metavar="MAP", help="folder of a map, or the .yaml of a floor map")
 
 
 def run(arguments: Namespace) -> dict[str, Any]:
-    """Load the map and tell about it."""
-    return ABOUT[dimensions(arguments.map)](arguments.map)
+    """Load the map and print what it contains."""
+    return DESCRIBE[dimensions(arguments.map)](arguments.map)
 
 
-def _about_cells(path: str) -> dict[str, Any]:
+def _describe_cells(path: str) -> dict[str, Any]:
     voxel_map = open_map(path)
     bounds, config = voxel_map.bounds(), voxel_map.config
     result = {
@@ -45,25 +45,25 @@ def _about_cells(path: str) -> dict[str, Any]:
         "refused": dict(voxel_map.history.refused.most_common()),
         "settled": dict(voxel_map.history.settled),
         "ways": dict(voxel_map.history.ways),
-        "last_stamps_ns": {sensor: seen.stamp_ns for sensor, seen in voxel_map.history.trusted.items()},
+        "last_stamps_ns": {sensor: frame.stamp_ns for sensor, frame in voxel_map.history.trusted.items()},
         "profile": config.profile,
         "settings": config.model_dump(mode="json"),
         "changed": _changed(config),
     }
-    _tell(result)
+    _print_result(result)
     return result
 
 
-def _about_grid(path: str) -> dict[str, Any]:
-    from stereovox.cli.maps import about
+def _describe_grid(path: str) -> dict[str, Any]:
+    from stereovox.cli.maps import describe_grid
 
-    return about(path)
-
-
-ABOUT = {2: _about_grid, 3: _about_cells}
+    return describe_grid(path)
 
 
-def _tell(result: dict[str, Any]) -> None:
+DESCRIBE = {2: _describe_grid, 3: _describe_cells}
+
+
+def _print_result(result: dict[str, Any]) -> None:
     from stereovox.trust.health import FULL
 
     settings = result["settings"]
@@ -81,15 +81,15 @@ def _tell(result: dict[str, Any]) -> None:
         say(f"  {number} x {reason}")
     for reason, number in result["settled"].items():
         say(f"  {number} x believed again after {reason}")
-    less = {way: number for way, number in result["ways"].items() if way != FULL}
-    if less:
-        say(f"looked at less thoroughly: {', '.join(f'{number} x {way}' for way, number in less.items())}")
+    reduced = {quality: number for quality, number in result["ways"].items() if quality != FULL}
+    if reduced:
+        say(f"looked at less thoroughly: {', '.join(f'{number} x {quality}' for quality, number in reduced.items())}")
     for sensor, stamp_ns in result["last_stamps_ns"].items():
         say(f"last trusted frame of '{sensor}' at {stamp_ns / 1e9:.3f} s")
 
 
 def _changed(config: Config) -> dict[str, Any]:
-    """Return the settings that are not those of the map's profile, or that a profile file itself changed."""
+    """Return the settings that differ from the map's profile, or that a profile file changed."""
     from stereovox.config import load_config, profile_names
 
     profile = config.profile if config.profile in profile_names() else {}  # a file lies on what is built into Config
@@ -97,7 +97,7 @@ def _changed(config: Config) -> dict[str, Any]:
     return {
         name: value
         for name, value in _flat(config.model_dump(mode="json"))
-        if name not in TOLD and (name not in usual or usual[name] != value)
+        if name not in ALWAYS_PRINTED and (name not in usual or usual[name] != value)
     }
 
 

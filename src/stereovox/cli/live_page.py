@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A page that shows a map while a command makes it, and stays when it is made."""
+"""Live outputs of `stereovox map`: a page that shows the growing map and stays afterwards, and a Rerun recording."""
 
 from __future__ import annotations
 
@@ -16,60 +16,60 @@ if TYPE_CHECKING:
     from stereovox.viewer.live import LiveView
 
 
-class NoPage:
-    """What a command tells of its frames where nobody wants to see."""
+class NoOutput:
+    """No live output; the base of those below."""
 
     def after(self, frame: AnyFrame, report: UpdateReport) -> None:
-        """Note a frame that was offered to the map."""
+        """Process a frame that was offered to the map."""
 
     def finish(self) -> None:
-        """Show the map whole, when its last frame is in it."""
+        """Show the complete map after its last frame."""
 
     def stay(self) -> None:
-        """Keep what is shown until somebody ends it."""
+        """Keep the output open until the user ends it."""
 
 
-class Page(NoPage):
-    """A live view for a command."""
+class LivePage(NoOutput):
+    """Live page of a command."""
 
     def __init__(self, live: LiveView):
         self._live = live
 
     def after(self, frame: AnyFrame, report: UpdateReport) -> None:
-        """Show the map, if it is time."""
+        """Update the page if an update is due."""
         self._live.after(frame, report)
 
     def finish(self) -> None:
-        """Show the map whole, when its last frame is in it."""
+        """Show the complete map after its last frame."""
         self._live.finish()
 
     def stay(self) -> None:
-        """Keep the page until Ctrl-C."""
+        """Keep the page open until Ctrl-C."""
         say(f"{self._live.url} shows the whole map; Ctrl-C ends")
         with suppress(KeyboardInterrupt):
             self._live.viewer.wait()
 
 
 @contextmanager
-def page_of(mapper: Mapper, name: str, port: int | None) -> Iterator[NoPage]:
-    """Serve a page of the mapper's map at `port` while this is open; None: none."""
+def page_of(mapper: Mapper, name: str, port: int | None) -> Iterator[NoOutput]:
+    """Serve a page of the mapper's map at `port` while the context is open; None: no page."""
     if port is None:
-        yield NoPage()
+        yield NoOutput()
         return
-    from stereovox.cli.view import quiet
+    from stereovox.cli.view import silence_server_log
     from stereovox.viewer.live import LiveView
 
-    quiet()
+    silence_server_log()
     with closing(LiveView(mapper, name, port=port)) as live:
         say(f"open {live.url} in a browser to see the map grow")
-        yield Page(live)
+        yield LivePage(live)
 
 
 @contextmanager
-def rerun_of(mapper: Mapper, file: str | None) -> Iterator[NoPage]:
-    """Write a Rerun recording of the mapper's frames and map while this is open; None: none."""
+def rerun_of(mapper: Mapper, file: str | None) -> Iterator[NoOutput]:
+    """Write a Rerun recording of frames and map while the context is open; None: no recording."""
     if file is None:
-        yield NoPage()
+        yield NoOutput()
         return
     from stereovox.depth import DepthPipeline
     from stereovox.formats.rerun import RerunLog, rerun_file
@@ -77,24 +77,24 @@ def rerun_of(mapper: Mapper, file: str | None) -> Iterator[NoPage]:
     with rerun_file(file, mapper.config.up) as opened:
         stopped = None
         try:
-            yield Recorded(mapper, RerunLog(opened, DepthPipeline(mapper.config)))
-        except KeyboardInterrupt as told:  # what was mapped is saved, and so is this
-            stopped = told
+            yield RerunRecording(mapper, RerunLog(opened, DepthPipeline(mapper.config)))
+        except KeyboardInterrupt as interrupt:  # the map is saved so far, and so is this
+            stopped = interrupt
     say(f"saved {file}; look at it with: rerun {file}")
     if stopped is not None:
         raise stopped
 
 
-class Recorded(NoPage):
-    """A Rerun recording for a command."""
+class RerunRecording(NoOutput):
+    """Rerun recording of a command."""
 
     def __init__(self, mapper: Mapper, log: RerunLog):
         self._mapper, self._log = mapper, log
 
     def after(self, frame: AnyFrame, report: UpdateReport) -> None:
-        """Write the frame, and the map, if it is time."""
+        """Write the frame, and the map if an update is due."""
         self._log.after(self._mapper.map, frame)
 
     def finish(self) -> None:
-        """Write the map whole."""
+        """Write the complete map."""
         self._log.finish(self._mapper.map)

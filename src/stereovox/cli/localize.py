@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Find out where a robot was in a map, from its lidar and odometry (adaptive Monte Carlo localisation).
+"""Localise a robot in a map from its lidar and odometry (adaptive Monte Carlo localisation).
 
-MAP is what map_server reads. Without --start the robot may be anywhere in it.
+MAP is a map_server file. Without --start the robot may be anywhere in it.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from stereovox.cli.robots import add_robot, opened, settings_of, way_error
+from stereovox.cli.robots import add_robot, open_robot, settings_of, trajectory_error
 from stereovox.cli.terminal import progress_of_steps, say, say_about_compiling
 from stereovox.errors import StereovoxError
 from stereovox.safe_io import check_file
@@ -39,36 +39,36 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 
 def add_start(parser: ArgumentParser) -> None:
-    """Declare where the robot began."""
-    parser.add_argument("--start", metavar="X,Y,DEG", help="where the robot stood first: metres and degrees")
+    """Declare --start."""
+    parser.add_argument("--start", metavar="X,Y,DEG", help="first pose of the robot in the map: metres and degrees")
 
 
 def run(arguments: Namespace) -> dict[str, Any]:
-    """Localise, save the way and tell where it ended."""
+    """Localise, save the trajectory and print where it ends."""
     from stereovox.formats.map_server import read_map_server
     from stereovox.localize.robot_way import check_start, fit_of, localise_robot, refused_line
 
     out, config = check_file(arguments.out, (*TEXT, *BAGS)), settings_of(arguments)
     start, grid = parse_start(arguments.start), read_map_server(arguments.map)
     check_start(start, grid)
-    robot = opened(arguments.source)
+    robot = open_robot(arguments.source)
     say_about_compiling()
     with progress_of_steps("localising") as progress:
         track = localise_robot(robot, grid, config, start, progress)
     _save(track, out)
-    fit, fits = fit_of(robot, grid, track)
-    for line in filter(None, (refused_line(track.refused, track.first_refusal), fits)):
+    fit, fit_line = fit_of(robot, grid, track)
+    for line in filter(None, (refused_line(track.refused, track.first_refusal), fit_line)):
         say(line)
     x, y, yaw = track.pose_map_base[-1]
     say(f"{len(track.stamps_ns)} poses saved in {out}")
     say(f"the robot ended at x {x:.2f} m, y {y:.2f} m, {np.degrees(yaw):.0f} degrees")
     refused = {"scans_refused": sum(track.refused.values()), "refused": dict(track.refused)}
     found = {"poses": len(track.stamps_ns), "last": [x, y, float(np.degrees(yaw))], "fit": fit}
-    return {**found, **refused, **way_error(track, robot)}
+    return {**found, **refused, **trajectory_error(track, robot)}
 
 
 def _save(track: Track, out: Path) -> None:
-    """Write the way as text, or as ROS's amcl tells it: /amcl_pose, and map -> odom on /tf."""
+    """Write the trajectory as text, or to a bag as ROS's amcl publishes it: /amcl_pose, and map -> odom on /tf."""
     if out.suffix.lower() in TEXT:
         return track.save(out)
     from stereovox import se2

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Turn a recording into a map.
+"""Map a recording, a simulation or a live camera.
 
-SOURCE is a 7-Scenes or TUM RGB-D folder, a camera pair, a RealSense .db3 or a ROS bag, all recognised by what they
-hold, the simulation sim:room, or a connected camera, realsense:. Under a profile of two dimensions (ist2019) it is the
+SOURCE is a 7-Scenes or TUM RGB-D folder, a camera pair, a RealSense .db3 or a ROS bag, recognised by their content,
+the simulation sim:room, or a connected camera, realsense:. Under a profile of two dimensions (ist2019) it is the
 recording of a ground robot, as for `stereovox grid`.
 """
 
@@ -43,7 +43,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     )
     parser.add_argument("--voxel-size", type=float, metavar="M", help="cell size in metres")
     parser.add_argument("--integrator", metavar="NAME", help="projective (default), ray or line")
-    parser.add_argument("--max-range", type=float, metavar="M", help="depth in metres up to which pixels count")
+    parser.add_argument("--max-range", type=float, metavar="M", help="largest depth in metres that is used")
     parser.add_argument("--frames", metavar="A:B:S", help="only these frames, as a Python slice")
     parser.add_argument("--camera", metavar="FILE", help="camera file (camera.toml) that replaces the recording's own")
     parser.add_argument("--threads", type=int, metavar="N", help="threads (1); the map does not depend on it")
@@ -51,7 +51,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--resume",
         action="store_true",
-        help="go on with the map at --out; as many frames of SOURCE are skipped as it has seen",
+        help="continue the map at --out; the frames of SOURCE that it has already seen are skipped",
     )
     add_checkpoint(parser)
     parser.add_argument(
@@ -60,7 +60,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         nargs="?",
         const=PORT,
         metavar="PORT",
-        help=f"show the map in a browser while it grows, and then until Ctrl-C ({PORT}; 0: any port that is free)",
+        help=f"show the map in a browser while it grows, and afterwards until Ctrl-C ({PORT}; 0: any free port)",
     )
     parser.add_argument(
         "--rerun", metavar="FILE.rrd", help="write depth images, camera and the growing map for the Rerun viewer"
@@ -68,71 +68,71 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 
 def run(arguments: Namespace) -> dict[str, Any]:
-    """Map the source, save the map and tell what was done."""
-    if _of_a_floor(arguments):
+    """Map the source, save the map and print a summary."""
+    if _is_floor_map(arguments):
         return _grid(arguments)
     check_ending("--rerun", arguments.rerun, ".rrd")
-    return _mapped(arguments, Path(arguments.out))
+    return _map(arguments, Path(arguments.out))
 
 
-def _mapped(arguments: Namespace, out: Path) -> dict[str, Any]:
+def _map(arguments: Namespace, out: Path) -> dict[str, Any]:
     from stereovox.run import MapRun
 
     run = MapRun(
         arguments.source, out, profile=arguments.profile, resume=arguments.resume, frames=arguments.frames,
-        camera=arguments.camera, checkpoint_s=arguments.checkpoint, tell=say, **overrides(arguments),
+        camera=arguments.camera, checkpoint_s=arguments.checkpoint, notify=say, **overrides(arguments),
     )  # fmt: skip
     with run, page_of(run.mapper, out.stem, arguments.view) as page:
         say_about_compiling()
-        with rerun_of(run.mapper, arguments.rerun) as recorded, progress_of(run.left, "mapping") as bar:
-            made = run.finish((page, recorded, bar))
+        with rerun_of(run.mapper, arguments.rerun) as recorded, progress_of(run.remaining, "mapping") as bar:
+            mapped = run.finish((page, recorded, bar))
             recorded.finish()
-        result = made.summary() | ({"dropped": made.dropped} if run.source.length is None else {})
+        result = mapped.summary() | ({"dropped": mapped.dropped} if run.source.length is None else {})
         page.finish()
-        _tell(result, made.reports, out, run.mapper.config.window)
+        _print_result(result, mapped.reports, out, run.mapper.config.window)
         page.stay()
     return result
 
 
-def _of_a_floor(arguments: Namespace) -> bool:
-    """Tell whether the settings ask for the 2-D map of a ground robot, as profile ist2019 does."""
+def _is_floor_map(arguments: Namespace) -> bool:
+    """Return whether the settings are for the 2-D map of a ground robot, as those of profile ist2019."""
     from stereovox.config import load_config
 
     return load_config(arguments.profile or "default", **overrides(arguments)).dimensions == 2
 
 
 def _grid(arguments: Namespace) -> dict[str, Any]:
-    """Do what `stereovox grid` does; it has more options."""
-    from stereovox.cli.grid import mapped
+    """Run `stereovox grid`, which has more options."""
+    from stereovox.cli.grid import run_floor
 
     for option in ("camera", "integrator", "threads", "view", "rerun"):
         if getattr(arguments, option) is not None:
             raise StereovoxError(f"--{option}: has no meaning for the map of a floor; leave it out")
-    return mapped(
+    return run_floor(
         arguments.source, arguments.out, profile=arguments.profile, frames=arguments.frames, resume=arguments.resume,
         checkpoint_s=arguments.checkpoint, **overrides(arguments),
     )  # fmt: skip
 
 
-def _tell(result: dict[str, Any], reports: list[UpdateReport], out: Path, window: WindowConfig) -> None:
+def _print_result(result: dict[str, Any], reports: list[UpdateReport], out: Path, window: WindowConfig) -> None:
     from stereovox.trust.health import FULL
 
     say_refusals(result, reports, "frames")
     if result.get("dropped"):
         say(f"  {result['dropped']} more came while the map was busy and were dropped; see --set deadline_ms=")
-    if reduced := [f"{number} {way}" for way, number in result["ways"].items() if way != FULL]:
+    if reduced := [f"{number} {quality}" for quality, number in result["ways"].items() if quality != FULL]:
         say(f"for want of time: {', '.join(reduced)}")
     if result["match_ms"]["max"]:  # stereo pairs
         say(f"a pair: matching {milliseconds(result['match_ms'])}")
     say(f"a frame: depth {milliseconds(result['depth_ms'])}; map {milliseconds(result['integrate_ms'])}")
     say(cells_line(result))
     if not result["occupied"]:
-        say(f"note: {_why_nothing(result, window)}")
+        say(f"note: {_why_empty(result, window)}")
     say(f"saved in {out}; look at it with: {command_line('picture', out, f'{out.stem}.png')}")
 
 
-def _why_nothing(result: dict[str, Any], window: WindowConfig) -> str:
-    """Return what to look at when a map ends without an occupied cell."""
+def _why_empty(result: dict[str, Any], window: WindowConfig) -> str:
+    """Return the likely reason for a map without an occupied cell."""
     if window.centre is not None and not result["free"] + result["tentative"]:
         return "no cell is known; the camera never was in the box of window.centre and window.size"
     if result["tentative"]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Maps that commands are given or make: open them, write them, tell about them."""
+"""Maps as arguments and results of commands: open, check, save and describe them."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ if TYPE_CHECKING:
     from stereovox.maps.occupancy import OccupancyGrid
 
 
-def check_new(out: str, *made_of: str) -> None:
-    """Raise StereovoxError where no map can be saved to `out`, or it would take the place of one it is made of."""
+def check_new(out: str, *inputs: str) -> None:
+    """Raise StereovoxError where no map can be saved to `out`, or it would overwrite one of its `inputs`."""
     from stereovox.maps.store import check_target
 
-    if os.path.realpath(out) in map(os.path.realpath, made_of):
+    if os.path.realpath(out) in map(os.path.realpath, inputs):
         raise StereovoxError(f"{out}: is what the new map is made of; give the new one another name")
     check_in_space(out)
     check_target(Path(out))
 
 
 def save_new(voxel_map: VoxelMap, out: str) -> dict[str, Any]:
-    """Save a map and say what it holds; return that as `info` tells it."""
+    """Save a map, print what it contains, and return that with the keys of `info`."""
     voxel_map.save(out)
     bounds = voxel_map.bounds()
     result = {
@@ -48,14 +48,14 @@ def save_new(voxel_map: VoxelMap, out: str) -> dict[str, Any]:
 
 
 def open_grid(path: str) -> OccupancyGrid:
-    """Return the map of map_server files; raises MapFileError, one line that names the file."""
+    """Read a map from map_server files; raises MapFileError, one line that names the file."""
     from stereovox.formats.map_server import read_map_server
 
     return read_map_server(path)
 
 
-def check_not_its_own(file: str, path: str) -> None:
-    """Raise StereovoxError where writing `file` would destroy the map at `path`, whose cells lie in a picture."""
+def check_not_map_image(file: str, path: str) -> None:
+    """Raise StereovoxError where writing `file` would overwrite the image with the cells of the map at `path`."""
     from stereovox.formats.map_server import read_meaning
 
     own = [Path(path), Path(path).with_suffix(".png")]
@@ -65,8 +65,8 @@ def check_not_its_own(file: str, path: str) -> None:
         raise StereovoxError(f"{file}: holds the cells of the map {path}; give the picture another name")
 
 
-def about(path: str) -> dict[str, Any]:
-    """Tell what a floor's map holds, and return it with the keys of a map in space where they mean something."""
+def describe_grid(path: str) -> dict[str, Any]:
+    """Print what a floor map contains, and return it with the keys of a 3-D map where they apply."""
     from stereovox.maps import State
     from stereovox.view.grid import known_bounds
 
@@ -88,11 +88,11 @@ def about(path: str) -> dict[str, Any]:
         "free_below": grid.free_below,
         "occupied_above": grid.occupied_above,
     }
-    _tell(result)
+    _print_grid(result)
     return result
 
 
-def _tell(result: dict[str, Any]) -> None:
+def _print_grid(result: dict[str, Any]) -> None:
     side = result["voxel_size"]
     say(f"a floor's map, {result['columns']} x {result['rows']} cells of {side:g} m")
     x, y, yaw = result["origin"]
@@ -107,35 +107,35 @@ def _tell(result: dict[str, Any]) -> None:
 
 
 def dimensions(path: str) -> int:
-    """Return 2 for the name of a map_server file, and 3 for all else."""
+    """Return 2 for the name of a map_server file, and 3 for anything else."""
     return 2 if Path(path).suffix.lower() in FLOOR_READABLE and not os.path.isdir(path) else 3
 
 
 def refuse_options(arguments: Namespace, names: Iterable[str], why: str) -> None:
-    """Raise StereovoxError for the first of these options that was given although it says nothing here."""
+    """Raise StereovoxError for the first of these options that was given although it does not apply."""
     for name in names:
         if getattr(arguments, name) not in (None, False, []):
             raise StereovoxError(f"--{name.replace('_', '-')}: {why}; leave the option out")
 
 
 def open_cubes(path: str) -> VoxelMap:
-    """Return the map saved at `path` for those who know only cubes; raises MapFileError as `open_map`."""
+    """Load the map at `path` with cubic cells; raises MapFileError as `open_map`."""
     from stereovox.maps.cubes import in_cubes
 
     return in_cubes(open_map(path))
 
 
 def open_map(path: str) -> VoxelMap:
-    """Return the map saved at `path`; raises MapFileError, one line that names the map or recording perhaps meant."""
+    """Load the map at `path`; raises MapFileError, one line that suggests the map or recording likely meant."""
     from stereovox.maps import load_map
     from stereovox.maps.store import is_map
 
     if not is_map(path):
-        raise MapFileError(f"{path}: {_instead(Path(path))}")
+        raise MapFileError(f"{path}: {_what_is_there(Path(path))}")
     return load_map(path)
 
 
-def _instead(path: Path) -> str:
+def _what_is_there(path: Path) -> str:
     from stereovox.maps.store import is_map
     from stereovox.opening import is_recording
 
@@ -143,10 +143,10 @@ def _instead(path: Path) -> str:
         return "no stereovox map here, nor anything else; check the name"
     if dimensions(str(path)) == 2:
         return "is the map of a floor; eval, info, picture and grid take it, this command wants one in space"
-    below = sorted(path.iterdir()) if path.is_dir() else []
-    meant = next((folder for folder in below if is_map(folder)), None)
-    if meant:
-        return f"no stereovox map here (did you mean {meant}?)"
+    entries = sorted(path.iterdir()) if path.is_dir() else []
+    candidate = next((folder for folder in entries if is_map(folder)), None)
+    if candidate:
+        return f"no stereovox map here (did you mean {candidate}?)"
     if is_recording(path):
         make = command_line("map", path, "--out", f"{path.resolve().stem}.svox")
         return f"no stereovox map here but a recording; make a map of it with: {make}"

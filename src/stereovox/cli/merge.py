@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Make one map of two: what both have seen adds up. The new one has the frame and the settings of A."""
+"""Merge two maps by adding up their evidence; the result has the frame and the settings of A."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ EXAMPLE = "stereovox merge kitchen.svox hall.svox --out both.svox --transform 4.
 def add_arguments(parser: ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("a", metavar="A", help="folder of a map")
-    parser.add_argument("b", metavar="B", help="folder of another with cells of the same size")
+    parser.add_argument("b", metavar="B", help="folder of another map with cells of the same size")
     parser.add_argument("--out", metavar="OUT", required=True, help="folder of the new map")
     add_transform(parser)
 
 
 def add_transform(parser: ArgumentParser) -> None:
-    """Declare where B is in A."""
+    """Declare --transform."""
     parser.add_argument(
         "--transform",
         metavar="T",
-        help="where B's frame is in A's (default: the same frame): tx,ty,tz,qx,qy,qz,qw in metres and a quaternion, or"
-        " a file with these or with a 4x4 matrix T_a_b. --transform=... where it begins with -",
+        help="pose of B's frame in A's (default: the same frame): tx,ty,tz,qx,qy,qz,qw in metres and a quaternion, or"
+        " a file with these or with a 4x4 matrix T_a_b. Write --transform=... where it begins with -",
     )
 
 
 def run(arguments: Namespace) -> dict[str, Any]:
-    """Load both maps and save the one they make."""
+    """Load both maps and save the merged one."""
     from stereovox.products.merge import merge
 
     T_a_b = None if arguments.transform is None else transform_of(arguments.transform)

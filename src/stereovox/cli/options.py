@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Options that several commands share: settings, numbers, how often a map is saved, endings of files."""
+"""Options shared by several commands: settings, numbers, checkpoints, file suffixes."""
 
 from __future__ import annotations
 
@@ -14,13 +14,17 @@ if TYPE_CHECKING:
     from stereovox.se3 import Transform
 
 CORNERS = "X0,Y0,Z0,X1,Y1,Z1"
-"""How a box is written: its lowest and its highest corner."""
+"""Syntax of a box: its lowest and its highest corner."""
 MAX_FILE = 10_000
-"""Bytes of a file that holds a transform."""
+"""Largest size in bytes of a file with a transform."""
+CHECKPOINT_S = 10.0
+"""Copy of `run.CHECKPOINT_S`, so that `--help` need not import `run`."""
+OWN_OPTIONS = ("voxel_size", "integrator", "max_range", "threads")
+"""Settings that may have an option of their own."""
 
 
 def numbers_of(option: str, text: str, names: str) -> list[float]:
-    """Return as many numbers as there are `names` ("X,Y,Z"); raises StereovoxError that names the option."""
+    """Parse as many numbers as there are `names` ("X,Y,Z"); raises StereovoxError that names the option."""
     try:
         numbers = [float(word) for word in text.split(",")]
     except ValueError:
@@ -31,7 +35,7 @@ def numbers_of(option: str, text: str, names: str) -> list[float]:
 
 
 def point(text: str) -> tuple[float, float, float]:
-    """Return three numbers in metres from X,Y,Z; raises ArgumentTypeError for anything else."""
+    """Parse X,Y,Z in metres; raises ArgumentTypeError for anything else."""
     try:
         x, y, z = map(float, text.split(","))
     except ValueError:
@@ -42,7 +46,7 @@ def point(text: str) -> tuple[float, float, float]:
 
 
 def transform_of(text: str) -> Transform:
-    """Return the transform that `--transform` names: seven numbers, or a file with them or with a 4x4 matrix.
+    """Parse --transform: seven numbers, or a file with them or with a 4x4 matrix.
 
     Raises StereovoxError: one line that names the value or file and the cure.
     """
@@ -69,7 +73,7 @@ def transform_of(text: str) -> Transform:
 
 
 def heights_of(text: str | None) -> tuple[float, float] | None:
-    """Return what --heights says; raises StereovoxError where that is not LO:HI."""
+    """Parse --heights LO:HI; raises StereovoxError for anything else."""
     if text is None:
         return None
     low, _, high = text.partition(":")
@@ -82,33 +86,25 @@ def heights_of(text: str | None) -> tuple[float, float] | None:
     return heights
 
 
-SECONDS = 10.0
-"""As `run.CHECKPOINT_S`, whose import `--help` need not wait for."""
-
-
 def add_checkpoint(parser: ArgumentParser) -> None:
-    """Declare the option."""
+    """Declare --checkpoint."""
     parser.add_argument(
         "--checkpoint",
         type=float,
-        default=SECONDS,
+        default=CHECKPOINT_S,
         metavar="SECONDS",
-        help=f"save the map as often while it is made ({SECONDS:g}; 0: only at the end), in 4 %% of the time at most",
+        help=f"save the map at this interval ({CHECKPOINT_S:g}; 0: only at the end), taking at most 4 %% of the time",
     )
 
 
 def check_ending(option: str, file: str | None, *endings: str) -> None:
-    """Raise StereovoxError where the file of an option does not end as it must."""
+    """Raise StereovoxError where the file of an option does not have one of these suffixes."""
     if file is not None and Path(file).suffix.lower() not in endings:
         raise StereovoxError(f"{option} {file}: end the file's name with {' or '.join(endings)}")
 
 
-NAMED = ("voxel_size", "integrator", "max_range", "threads")
-"""Settings that may have an option of their own."""
-
-
 def add_settings(parser: ArgumentParser, example: str) -> None:
-    """Declare --set; `example` is one setting that the command knows."""
+    """Declare --set; `example` is a setting for its help."""
     parser.add_argument(
         "--set",
         action="append",
@@ -120,7 +116,7 @@ def add_settings(parser: ArgumentParser, example: str) -> None:
 
 
 def overrides(arguments: Namespace) -> dict[str, Any]:
-    """Return what stands on top of the profile; raises StereovoxError for a --set that is none."""
+    """Return the settings that options override; raises StereovoxError for a bad --set."""
     from stereovox.config import parse_value
 
     found = {}
@@ -133,5 +129,5 @@ def overrides(arguments: Namespace) -> dict[str, Any]:
         if key.strip() in ("tiles", "self"):  # other names that `Mapper` knows
             raise StereovoxError(f"--set {setting}: this is no setting; leave it out")
         found[key.strip()] = parse_value(value.strip())
-    named = {name: getattr(arguments, name, None) for name in NAMED}
+    named = {name: getattr(arguments, name, None) for name in OWN_OPTIONS}
     return {**found, **{name: value for name, value in named.items() if value is not None}}

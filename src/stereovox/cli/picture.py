@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Draw a map as a whole, one layer of it, what the camera's optical axis meets, or its cells in space.
+"""Draw a map: an overview, one layer, the cells along the camera's optical axis, or all cells in 3-D.
 
-A floor's map in map_server files (.yaml) is drawn as a plan; --view and what goes with it is for maps in space.
+A floor map in map_server files (.yaml) is drawn as a plan; --view and its options are for 3-D maps.
 """
 
 from __future__ import annotations
@@ -20,20 +20,24 @@ if TYPE_CHECKING:
 
 EXAMPLE = "stereovox picture kitchen.svox kitchen.png --view layer --up=-y"
 
-USED = {"overview": (), "layer": ("at", "eye", "toward"), "axis": ("eye", "toward"), "space": ("eye", "toward")}
-"""Options that only some views can use."""
+VIEW_OPTIONS = {"overview": (), "layer": ("at", "eye", "toward"), "axis": ("eye", "toward"), "space": ("eye", "toward")}
+"""The options that each view uses besides the common ones."""
 
 
 def add_arguments(parser: ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("map", metavar="MAP", help="folder of a map, or the .yaml of a floor's map")
-    parser.add_argument("file", metavar="FILE.png", help="picture to write; .pdf and .svg hold letters and lines")
+    parser.add_argument("map", metavar="MAP", help="folder of a map, or the .yaml of a floor map")
+    parser.add_argument(
+        "file", metavar="FILE.png", help="picture to write; .pdf and .svg keep letters and lines as such"
+    )
     parser.add_argument("--view", metavar="NAME", help="overview (default), layer, axis or space")
     parser.add_argument("--at", type=float, metavar="M", help="height of the layer along --up (default: the camera's)")
     parser.add_argument(
-        "--up", metavar="AXIS", help="which way is up: z, -y, x ... (default: as the map's settings say)"
+        "--up", metavar="AXIS", help="axis that points up: z, -y, x ... (default: from the map's settings)"
     )
-    parser.add_argument("--eye", type=point, metavar="X,Y,Z", help="where the camera is (default: the last frame's)")
+    parser.add_argument(
+        "--eye", type=point, metavar="X,Y,Z", help="position of the camera (default: that of the last frame)"
+    )
     parser.add_argument("--toward", type=point, metavar="X,Y,Z", help="a point on its optical axis; goes with --eye")
     parser.add_argument("--title", metavar="TEXT", help="title instead of the map's name")
     parser.add_argument("--dpi", type=float, metavar="N", help="dots an inch (120; with --width-mm 600)")
@@ -41,7 +45,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         "--width-mm",
         type=float,
         metavar="W",
-        help="one panel for a paper, as wide as its column, with small letters and no headline: overview is from above",
+        help="one panel for a paper, as wide as its column, with small letters and no title; overview is the top view",
     )
 
 
@@ -53,21 +57,21 @@ def run(arguments: Namespace) -> dict[str, Any]:
     if file.suffix.lower() not in ENDINGS:
         raise StereovoxError(f"{file}: pictures are written as {', '.join(ENDINGS)}; name the file so")
     heading = _plain(arguments.title or Path(arguments.map).stem)
-    drawn = DRAWN[dimensions(arguments.map)](arguments, heading)
+    drawn = DRAW[dimensions(arguments.map)](arguments, heading)
     save(drawn, file, arguments.dpi)
     say(f"saved {file}")
     return {"picture": str(file)}
 
 
 def _draw_cells(arguments: Namespace, heading: str) -> Any:
-    """Return the figure of a map in space."""
+    """Return the figure of a 3-D map."""
     from stereovox.view.drawn import checked_up
     from stereovox.view.paper import draw_paper
     from stereovox.view.viewpoint import viewpoint_at
     from stereovox.view.views import draw_view
 
     arguments.view = arguments.view or "overview"
-    _check_use(arguments)
+    _check_options(arguments)
     voxel_map = open_cubes(arguments.map)
     up = checked_up(arguments.up or voxel_map.config.up)
     viewpoint = viewpoint_at(voxel_map, arguments.eye, arguments.toward, up)
@@ -76,34 +80,34 @@ def _draw_cells(arguments: Namespace, heading: str) -> Any:
     else:
         drawn = draw_paper(voxel_map, arguments.view, up, arguments.width_mm, arguments.at, viewpoint)
     if arguments.at is not None:
-        _tell_if_outside(voxel_map, up, arguments.at)
+        _note_if_outside(voxel_map, up, arguments.at)
     return drawn
 
 
 def _draw_grid(arguments: Namespace, heading: str) -> Any:
-    """Return the figure of a floor's map."""
-    from stereovox.cli.maps import check_not_its_own, open_grid
+    """Return the figure of a floor map."""
+    from stereovox.cli.maps import check_not_map_image, open_grid
     from stereovox.view.grid import draw_grid
 
     refuse_options(
         arguments, ("view", "at", "up", "eye", "toward", "width_mm"), f"{arguments.map} is a floor's map, always a plan"
     )
-    check_not_its_own(arguments.file, arguments.map)
+    check_not_map_image(arguments.file, arguments.map)
     return draw_grid(open_grid(arguments.map), heading)
 
 
-DRAWN = {2: _draw_grid, 3: _draw_cells}
+DRAW = {2: _draw_grid, 3: _draw_cells}
 
 
-def _check_use(arguments: Namespace) -> None:
-    """Refuse an option that the view would not look at."""
-    for name in ("at", "eye", "toward") if arguments.view in USED else ():
-        if getattr(arguments, name) is not None and name not in USED[arguments.view]:
-            users = ", ".join(f"--view {view}" for view, options in USED.items() if name in options)
+def _check_options(arguments: Namespace) -> None:
+    """Raise StereovoxError for an option that the view does not use."""
+    for name in ("at", "eye", "toward") if arguments.view in VIEW_OPTIONS else ():
+        if getattr(arguments, name) is not None and name not in VIEW_OPTIONS[arguments.view]:
+            users = ", ".join(f"--view {view}" for view, options in VIEW_OPTIONS.items() if name in options)
             raise StereovoxError(f"--{name}: the view '{arguments.view}' does not use it; it goes with: {users}")
 
 
-def _tell_if_outside(voxel_map: VoxelMap, up: str, at_m: float) -> None:
+def _note_if_outside(voxel_map: VoxelMap, up: str, at_m: float) -> None:
     bounds = voxel_map.bounds()
     if bounds is None:
         return
@@ -113,5 +117,5 @@ def _tell_if_outside(voxel_map: VoxelMap, up: str, at_m: float) -> None:
 
 
 def _plain(text: str) -> str:
-    """Return text that is drawn letter by letter: no formulas, no bytes that are no letters."""
+    """Return text that matplotlib draws literally: no formulas, no undecodable bytes."""
     return text.encode("utf-8", "replace").decode().replace("$", r"\$")

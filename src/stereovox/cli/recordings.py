@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the calibrations have in common: recordings of walls with their distances, and files that can be written."""
+"""Parts shared by the calibration commands: recordings of walls with their distances, and checks of output files."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ if TYPE_CHECKING:
     from stereovox.opening import Stream
 
 LIVE_FRAMES = 60
-"""Frames taken of a live camera where --frames names no last one."""
+"""Number of frames to take from a live camera where --frames has no end."""
 
 
 def add_recordings(parser: ArgumentParser) -> None:
-    """Declare the options that tell where the walls are."""
+    """Declare the recordings of walls and their distances."""
     parser.add_argument(
-        "recordings", nargs="+", metavar="RECORDING", help="a still camera before a flat wall; no poses"
+        "recordings", nargs="+", metavar="RECORDING", help="recording of a flat wall by a still camera; no poses"
     )
     parser.add_argument(
         "--distance",
@@ -34,17 +34,14 @@ def add_recordings(parser: ArgumentParser) -> None:
         type=float,
         default=[],
         metavar="M",
-        help="measured metres from the camera to the wall along its axis, once for each RECORDING",
+        help="measured distance in metres from the camera to the wall along the optical axis, once for each RECORDING",
     )
     parser.add_argument("--frames", metavar="A:B:S", help="only these frames of each, as a Python slice")
     parser.add_argument("--report", metavar="DIR", help="folder for a page with figures and pictures")
 
 
 def check_outputs(out: str, report: str | None = None) -> None:
-    """Find out before the work, not after it, that a result could not be written.
-
-    Raises StereovoxError, one line, also for a name that does not end in .toml.
-    """
+    """Raise StereovoxError before the work where a result could not be written or `out` does not end in .toml."""
     if Path(out).suffix != ".toml":
         raise StereovoxError(f"--out {out}: give a name that ends in .toml")
     if os.path.isdir(out):
@@ -53,16 +50,16 @@ def check_outputs(out: str, report: str | None = None) -> None:
     if report is not None:
         if os.path.exists(report) and not os.path.isdir(report):
             raise StereovoxError(f"--report {report}: is a file; name a folder")
-        there = next(path for path in (Path(report).absolute(), *Path(report).absolute().parents) if path.exists())
-        check_folder(there, f"--report {report}")
+        existing = next(path for path in (Path(report).absolute(), *Path(report).absolute().parents) if path.exists())
+        check_folder(existing, f"--report {report}")
 
 
 def read_walls(
     names: Sequence[str], distances: Sequence[float], frames: str | None, camera: str | None = None, raw: bool = False
 ) -> list[WallRecording]:
-    """Return what the recordings show; `distances` as `check_distances` has them.
+    """Return the walls of the recordings; `distances` as for `check_distances`.
 
-    camera: a camera file that replaces theirs. raw: the depths are taken as measured, whatever correction there is.
+    camera: a camera file that replaces theirs. raw: use the measured depths without any correction.
     """
     measured = distances or [None] * len(names)
     return [_read(name, distance, frames, camera, raw) for name, distance in zip(names, measured, strict=True)]
@@ -93,7 +90,7 @@ def _read(name: str, distance: float | None, frames: str | None, camera: str | N
 
 
 def check_distances(names: Sequence[str], distances: Sequence[float], option: str = "--distance") -> None:
-    """Raise StereovoxError unless there is a distance for each recording, or none at all, and each can be."""
+    """Raise StereovoxError unless there is a valid distance for each recording, or none at all."""
     if distances and len(distances) != len(names):
         many = f"{len(names)} recording{'s' * (len(names) != 1)}"
         raise StereovoxError(f"{many} but {len(distances)} x {option}: give one for each, in the same order, or none")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Make the experiments of a paper again: one report with its figures beside ours.
+"""Reproduce the experiments of a paper: one report with its figures beside ours.
 
 All of Chien 2020 is simulated and takes some minutes. --data also maps a recording of your own under its profile.
 Valenti 2018 maps recordings with lidar: --data is a folder with KITTI tracking sequences, or a drive of KITTI raw data.
@@ -20,12 +20,14 @@ def add_arguments(parser: ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("paper", metavar="PAPER", help="chien2020, valenti2018 or ist2019")
     parser.add_argument("--out", required=True, metavar="DIR", help="folder for report.html and numbers.json")
-    parser.add_argument("--data", metavar="SOURCE", help="valenti2018: folder of recordings; others: one of yours")
-    parser.add_argument("--quick", action="store_true", help="few frames: to see that it works, not to quote")
+    parser.add_argument(
+        "--data", metavar="SOURCE", help="valenti2018: folder of recordings; others: your own recording"
+    )
+    parser.add_argument("--quick", action="store_true", help="few frames: a trial run, not figures to quote")
 
 
 def run(arguments: Namespace) -> dict[str, Any]:
-    """Run the experiments and tell what holds."""
+    """Run the experiments and print which claims hold."""
     from stereovox.lab.papers import reproduce
 
     say_about_compiling()
@@ -38,11 +40,11 @@ def run(arguments: Namespace) -> dict[str, Any]:
             quick=arguments.quick,
             progress=lambda done, total, text: bar.update(task, completed=done, total=total, description=text),
         )
-    _tell(result)
+    _print_result(result)
     return result
 
 
-def _tell(result: dict[str, Any]) -> None:
+def _print_result(result: dict[str, Any]) -> None:
     failed = result["does_not_hold"]
     say(f"{result['holds']} claims hold, {len(failed)} do not, in {result['seconds']:.0f} s")
     if result["quick"] and failed:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the commands for ground robots have in common: recordings, settings, and the files they write."""
+"""Parts shared by the commands for ground robots: recordings, settings, and the files they write."""
 
 from __future__ import annotations
 
@@ -26,35 +26,35 @@ def add_robot(parser: ArgumentParser) -> None:
 
 
 def settings_of(arguments: Namespace) -> Config:
-    """Return the settings that profile and options ask for."""
+    """Return the settings from the profile and the options."""
     from stereovox.config import load_config
 
     return load_config(arguments.profile, **overrides(arguments))
 
 
-def opened(where: str) -> Robot:
-    """Open the recording and say what had to be assumed about it."""
-    from stereovox.opening import open_robot
+def open_robot(name: str) -> Robot:
+    """Open the recording and print its notes."""
+    from stereovox import opening
 
-    robot = open_robot(where)
+    robot = opening.open_robot(name)
     for note in robot.notes:
         say(f"note: {note}")
     return robot
 
 
-def way_error(track: Track, robot: Robot) -> dict[str, Any]:
-    """Say how far the way found is from the true one, where that is known, and return it."""
+def trajectory_error(track: Track, robot: Robot) -> dict[str, Any]:
+    """Print and return the error of the trajectory; empty where the true one is not known."""
     if robot.truth is None:
         return {}
-    from stereovox.evaluate.trajectory import trajectory_error
+    from stereovox.evaluate import trajectory
 
-    error = trajectory_error(track, robot.truth)
+    error = trajectory.trajectory_error(track, robot.truth)
     off = f"{100 * error.position_rms_m:.1f} cm (RMS) and {error.yaw_rms_deg:.2f} degrees"
     say(f"laid on the true way as a whole, it is off by {off}")
     return {"position_rms_m": error.position_rms_m, "yaw_rms_deg": error.yaw_rms_deg}
 
 
 def picture_line(out: Path) -> str:
-    """Return the command that draws the map at `out`, whose own cells may lie in a .png of its name."""
+    """Return the command that draws the map at `out`; a .png of its name may hold its cells and is avoided."""
     name = f"{out.stem}-picture.png" if out.with_suffix(".png").exists() else f"{out.stem}.png"
     return command_line("picture", out.with_suffix(".yaml"), name)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Map what comes on topics of ROS 2, live.
+"""Map live ROS 2 topics.
 
 Depth images with camera_info, point clouds and laser scans in, poses from /tf or odometry; a 2-D map, a cloud, an
-OctoMap and diagnostics out. All options and settings may be given as parameters too: docs/ros2.md.
+OctoMap and diagnostics out. All options and settings can also be given as parameters: docs/ros2.md.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from stereovox.run import Checkpoints
 
 EXAMPLE = "stereovox ros2 --depth /camera/depth/image_rect_raw --out room.svox"
-LATELY = 10_000
-"""Frames whose times are told at the end."""
+MAX_REPORTS = 10_000
+"""Number of last frames whose times are summarised at the end."""
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -36,30 +36,32 @@ def add_arguments(parser: ArgumentParser) -> None:
     topics = (
         ("depth", "TOPIC[=INFO]", "depth images (16UC1, 32FC1, .../compressedDepth), and their camera_info"),
         ("cloud", "TOPIC", "point clouds"),
-        ("scan", "TOPIC", "laser scans, for the map of a floor (--set dimensions=2)"),
-        ("odometry", "TOPIC", "poses of nav_msgs/Odometry, beside /tf"),
-        ("pose", "TOPIC=FRAME", "poses of geometry_msgs/PoseStamped of a frame"),
-        ("fixed", "TEXT", "where a frame is mounted: 'PARENT CHILD x y z yaw pitch roll'"),
+        ("scan", "TOPIC", "laser scans, for a floor map (--set dimensions=2)"),
+        ("odometry", "TOPIC", "poses as nav_msgs/Odometry, besides /tf"),
+        ("pose", "TOPIC=FRAME", "poses of a frame as geometry_msgs/PoseStamped"),
+        ("fixed", "TEXT", "fixed pose of a frame: 'PARENT CHILD x y z yaw pitch roll'"),
     )
     for name, value, about in topics:
         parser.add_argument(f"--{name}", action="append", metavar=value, help=f"{about}; repeatable")
     parser.add_argument("--world-frame", metavar="FRAME", help="frame of the map (map, else odom)")
     parser.add_argument("--base-frame", metavar="FRAME", help="frame of the robot (base_footprint, else base_link)")
-    parser.add_argument("--out", metavar="MAP", help="save the map there at the end, and when the service asks for it")
-    parser.add_argument("--load", metavar="MAP", help="go on with this map")
+    parser.add_argument("--out", metavar="MAP", help="where to save the map at the end, and when the service is called")
+    parser.add_argument("--load", metavar="MAP", help="continue this map")
     parser.add_argument("--profile", metavar="P", help="profile name or TOML file (default)")
     parser.add_argument("--voxel-size", type=float, metavar="M", help="cell size in metres")
-    parser.add_argument("--max-range", type=float, metavar="M", help="depth in metres up to which pixels count")
+    parser.add_argument("--max-range", type=float, metavar="M", help="largest depth in metres that is used")
     add_settings(parser, "sensor.model=andert")
     parser.add_argument(
         "--checkpoint", type=float, default=0.0, metavar="SECONDS",
-        help="save the map as often while it is made; frames wait meanwhile (0: only at the end)",
+        help="save the map at this interval; frames wait meanwhile (0: only at the end)",
     )  # fmt: skip
-    parser.add_argument("--ros-args", nargs=REMAINDER, default=[], help="all that follows is for ROS 2")
+    parser.add_argument(
+        "--ros-args", nargs=REMAINDER, default=[], help="arguments for ROS 2, up to the end of the line"
+    )
 
 
 def run(arguments: Namespace) -> dict[str, Any]:
-    """Map until Ctrl-C or SIGTERM, save the map and tell what was done."""
+    """Map until Ctrl-C or SIGTERM, save the map and print a summary."""
     from stereovox.ros.library import check_installed
 
     check_installed()
@@ -86,33 +88,33 @@ def run(arguments: Namespace) -> dict[str, Any]:
 
 def _map(arguments: Namespace, node: Any, mapping: Mapping, options: Options) -> dict[str, Any]:
     from stereovox.ros.node import MapNode
-    from stereovox.ros.options import FREE
+    from stereovox.ros.options import OUT
     from stereovox.run import Checkpoints, interrupt_between_steps
 
-    reports: deque[UpdateReport] = deque(maxlen=LATELY)
+    reports: deque[UpdateReport] = deque(maxlen=MAX_REPORTS)
 
     def out() -> str:
-        return str(node.get_parameter(FREE).value)
+        return str(node.get_parameter(OUT).value)
 
-    maker = MapNode(node, mapping, options, out, reports.append)
+    map_node = MapNode(node, mapping, options, out, reports.append)
     checkpoints = Checkpoints(lambda: mapping.save(out()), options.out, arguments.checkpoint if options.out else 0.0)
     say("listening; Ctrl-C ends")
     with interrupt_between_steps() as check:
         try:
             with suppress(KeyboardInterrupt):
                 while True:
-                    maker.spin_once()
+                    map_node.spin_once()
                     check()
                     _checkpoint(checkpoints, mapping.history.frames, node)
-        except Exception:  # whatever broke: what was mapped so far is not lost with it
+        except Exception:  # whatever failed, the map so far is saved
             _save(mapping, out())
             raise
-        maker.close()  # a second signal, as `timeout` sends it, is to spoil nothing here
-        return _finished(maker, mapping, out(), reports)
+        map_node.close()  # still under `check`: a second signal, as `timeout` sends it, must not interrupt this
+        return _print_result(map_node, mapping, out(), reports)
 
 
 def _checkpoint(checkpoints: Checkpoints, frames: int, node: Any) -> None:
-    """Save the map if it is time; a robot goes on although its disk is full."""
+    """Save the map if a checkpoint is due; a full disk is logged and does not stop the robot."""
     try:
         if frames:
             checkpoints.after(frames)
@@ -120,24 +122,24 @@ def _checkpoint(checkpoints: Checkpoints, frames: int, node: Any) -> None:
         node.get_logger().error(str(error), throttle_duration_sec=10.0)
 
 
-def _finished(maker: MapNode, mapping: Mapping, out: str, reports: deque[UpdateReport]) -> dict[str, Any]:
+def _print_result(map_node: MapNode, mapping: Mapping, out: str, reports: deque[UpdateReport]) -> dict[str, Any]:
     from stereovox.evaluate.summary import percentiles
 
-    taken = [one for one in reports if not one.refused]
+    mapped = [one for one in reports if not one.refused]
     result = {
         "frames": mapping.history.frames,
         "frames_refused": mapping.history.refused.total(),
         "refused": dict(mapping.history.refused.most_common()),
-        "received": dict(maker.received),
-        "dropped": dict(maker.waiting.dropped),
-        "frame_ms": percentiles([one.match_ms + one.depth_ms + one.integrate_ms for one in taken]),
+        "received": dict(map_node.received),
+        "dropped": dict(map_node.waiting.dropped),
+        "frame_ms": percentiles([one.match_ms + one.depth_ms + one.integrate_ms for one in mapped]),
         "out": "",
     }
     say(f"{result['frames']} frames mapped, {result['frames_refused']} refused, {sum(result['dropped'].values())} late")
     for reason, number in result["refused"].items():
         example = next((f", last: {one.detail}" for one in reversed(reports) if one.refused == reason), "")
         say(f"  {number} x {reason}{example}")
-    if taken:
+    if mapped:
         say(f"a frame: {milliseconds(result['frame_ms'])}")
     if _save(mapping, out):
         result["out"] = out
@@ -147,7 +149,7 @@ def _finished(maker: MapNode, mapping: Mapping, out: str, reports: deque[UpdateR
 
 
 def _save(mapping: Mapping, out: str) -> bool:
-    """Save the map if there is one and it is wanted; tell whether."""
+    """Save the map if it holds a frame and `out` is given; return whether it was saved."""
     if not (out and mapping.history.frames):
         return False
     mapping.save(out)
@@ -156,7 +158,7 @@ def _save(mapping: Mapping, out: str) -> bool:
 
 
 def _settings(arguments: Namespace, node: Any) -> tuple[Config, Options]:
-    """Return the settings of the map and the options of the node; the command line counts before parameters."""
+    """Return the settings of the map and the options of the node; the command line overrides parameters."""
     from stereovox.config import load_config
     from stereovox.ros.options import LISTS, Options, given_parameters, with_parameters
 
@@ -165,12 +167,12 @@ def _settings(arguments: Namespace, node: Any) -> tuple[Config, Options]:
     given.settings.pop("profile", None)
     config = load_config(profile, **{**given.settings, **overrides(arguments)})
     named = {name: getattr(arguments, name) for name in (*LISTS, "world_frame", "base_frame", "out")}
-    said = {name: value for name, value in named.items() if value}
-    return config, with_parameters(Options(), {**given.options, **said})
+    given_options = {name: value for name, value in named.items() if value}
+    return config, with_parameters(Options(), {**given.options, **given_options})
 
 
 def _reserve(out: str, dimensions: int, stack: ExitStack) -> None:
-    """Find out now, not at the end, that the map could not be saved, and keep others from writing there."""
+    """Check that the map can be saved, and keep others from writing there."""
     from stereovox.maps.lock import only_writer_in, only_writer_of_floor
     from stereovox.maps.store import check_target, sweep
 

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Make a floor's map from a robot's lidar and odometry, where there is no map yet.
+"""Make a floor map from a robot's lidar and odometry by SLAM.
 
-Scans are matched, loops closed, and the way and the map made to agree. The way is saved beside the map (`.tum`).
+Scans are matched, loops closed, and trajectory and map optimised together. The trajectory is saved beside the map
+(`.tum`).
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
-from stereovox.cli.robots import add_robot, opened, picture_line, settings_of, way_error
+from stereovox.cli.robots import add_robot, open_robot, picture_line, settings_of, trajectory_error
 from stereovox.cli.terminal import progress_of_steps, say, say_about_compiling
 from stereovox.safe_io import FLOOR_ENDINGS, check_file
 
@@ -29,29 +30,29 @@ def add_arguments(parser: ArgumentParser) -> None:
         "--out",
         required=True,
         metavar="MAP",
-        help="map_server files to write, for example floor.yaml; floor.tum beside it holds the way",
+        help="map_server files to write, for example floor.yaml; floor.tum beside it holds the trajectory",
     )
-    parser.add_argument("--relations", metavar="FILE", help="true relations between places, to score the way with")
+    parser.add_argument("--relations", metavar="FILE", help="true relations between poses, to score the trajectory")
 
 
 def run(arguments: Namespace) -> dict[str, Any]:
-    """Map, save map and way, and tell how it went."""
+    """Make and save map and trajectory, and print a summary."""
     from stereovox.maps.lock import only_writer_of_floor
 
     out = check_file(arguments.out, FLOOR_ENDINGS)
     with only_writer_of_floor(out):
-        return _mapped(arguments, out)
+        return _map(arguments, out)
 
 
-def _mapped(arguments: Namespace, out: Path) -> dict[str, Any]:
+def _map(arguments: Namespace, out: Path) -> dict[str, Any]:
     from stereovox.evaluate.trajectory import read_relations
     from stereovox.formats.map_server import write_map_server
     from stereovox.localize.robot_way import slam_robot
 
     config = settings_of(arguments)
     if arguments.relations is not None:
-        read_relations(Path(arguments.relations))  # what is wrong with it shows before the work
-    robot = opened(arguments.source)
+        read_relations(Path(arguments.relations))  # raises for a bad file before the work
+    robot = open_robot(arguments.source)
     say_about_compiling()
     start = perf_counter()
     with progress_of_steps("matching scans") as progress:
@@ -59,12 +60,12 @@ def _mapped(arguments: Namespace, out: Path) -> dict[str, Any]:
     seconds = perf_counter() - start
     write_map_server(found.grid, out)
     found.track.save(out.with_suffix(".tum"))
-    result = {**_told(robot, found, seconds), **_scored(found, arguments.relations)}
+    result = {**_print_result(robot, found, seconds), **_score(found, arguments.relations)}
     say(f"saved in {out}, the way in {out.with_suffix('.tum')}; look at it with: {picture_line(out)}")
     return result
 
 
-def _told(robot: Robot, found: SlamResult, seconds: float) -> dict[str, Any]:
+def _print_result(robot: Robot, found: SlamResult, seconds: float) -> dict[str, Any]:
     from stereovox.localize.robot_way import refused_line
 
     track = found.track
@@ -73,12 +74,12 @@ def _told(robot: Robot, found: SlamResult, seconds: float) -> dict[str, Any]:
         f"({recorded / seconds:.0f} times as fast as recorded)")  # fmt: skip
     if found.refused:
         say(refused_line(found.refused))
-    told = {"scans": len(track.stamps_ns), "scans_refused": sum(found.refused.values()), "refused": found.refused}
+    scans = {"scans": len(track.stamps_ns), "scans_refused": sum(found.refused.values()), "refused": found.refused}
     times = {"closures": found.closures, "seconds": seconds, "recorded_s": recorded}
-    return {**told, **times, **way_error(track, robot)}
+    return {**scans, **times, **trajectory_error(track, robot)}
 
 
-def _scored(found: SlamResult, relations: str | None) -> dict[str, Any]:
+def _score(found: SlamResult, relations: str | None) -> dict[str, Any]:
     if relations is None:
         return {}
     from stereovox.evaluate.trajectory import score_relations

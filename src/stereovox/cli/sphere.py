@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tell how far the nearest obstacles are round the vehicle, and draw them.
+"""Show the distances to the nearest obstacles around a vehicle.
 
-SOURCE is whatever `map` takes; of each camera on the vehicle its last frame counts, seen from where the vehicle is at
-the end. sim:surround is a drone with four stereo cameras.
+SOURCE is anything that `map` takes; the last frame of each camera counts, seen from where the vehicle is at the end.
+sim:surround is a drone with four stereo cameras.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 EXAMPLE = "stereovox sphere sim:surround --frames :4 --out sphere.png --step 2"
 STEP_DEG = 1.0
-"""Where neither the options nor the profile name a step."""
+"""Default where neither the options nor the profile set a step."""
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -29,11 +29,11 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--step", type=float, metavar="DEG", help=f"width of a cell (the profile's, else {STEP_DEG:g})")
     parser.add_argument("--frames", metavar="A:B:S", help="only these frames, as a Python slice")
     parser.add_argument("--profile", default="default", metavar="P", help="profile name or TOML file (default)")
-    parser.add_argument("--max-range", type=float, metavar="M", help="depth in metres up to which pixels count")
+    parser.add_argument("--max-range", type=float, metavar="M", help="largest depth in metres that is used")
 
 
 def run(arguments: Namespace) -> dict[str, Any]:
-    """Look round, tell what is near, and draw it."""
+    """Compute the distances, print them and draw them."""
     from stereovox.depth.sphere import surroundings
     from stereovox.depth.sphere.vehicle import vehicle_grid
     from stereovox.opening import open_stream
@@ -55,7 +55,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
         "directions": {name: _as_dict(sight, now_ns) for name, sight in sights.items()},
     }
     for name, sight in sights.items():
-        say(f"{name:>6}: {_words(sight, now_ns)}")
+        say(f"{name:>6}: {_format_sight(sight, now_ns)}")
     if arguments.out:
         from stereovox.view.sphere import sphere_picture
 
@@ -89,7 +89,7 @@ def _as_dict(sight: Sight | None, now_ns: int) -> dict[str, Any] | None:
     }
 
 
-def _words(sight: Sight | None, now_ns: int) -> str:
+def _format_sight(sight: Sight | None, now_ns: int) -> str:
     if sight is None:
         return "unknown"
     what = f"{sight.range_m:.2f} m" if sight.surface else f"free up to {sight.range_m:.2f} m"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Words and progress for the person at the terminal, all on stderr."""
+"""Messages and progress bars for the terminal, all on stderr."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ T = TypeVar("T")
 
 
 def say(text: str = "") -> None:
-    """Print a line on stderr, or several; names out of a recording cannot colour or move anything there."""
+    """Print one or more lines on stderr, with control characters from names in recordings made harmless."""
     print("\n".join(map(one_line, text.split("\n"))), file=sys.stderr, flush=True)
 
 
 def say_about_compiling() -> None:
-    """Tell the user why the first run on a machine takes its time."""
+    """Explain why the first run on a machine takes longer."""
     from stereovox._jit import cache_folder
 
     folder = cache_folder()
@@ -37,7 +37,7 @@ def say_about_compiling() -> None:
 
 @contextmanager
 def progress_bar() -> Iterator[Progress]:
-    """Give a progress bar with rate and time left on stderr, if that is a terminal; it goes away at the end."""
+    """Yield a progress bar with rate and remaining time, shown if stderr is a terminal; it disappears at the end."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -54,7 +54,7 @@ def progress_bar() -> Iterator[Progress]:
 
 
 def tracked(items: Iterable[T], total: int | None, text: str) -> Iterator[T]:
-    """Yield `items` with a progress bar; `total` is None where nobody knows how many there are."""
+    """Yield `items` with a progress bar; `total` is None where their number is unknown."""
     with progress_of(total, text) as bar:
         for item in items:
             yield item
@@ -63,47 +63,47 @@ def tracked(items: Iterable[T], total: int | None, text: str) -> Iterator[T]:
 
 @contextmanager
 def progress_of_steps(text: str) -> Iterator[Callable[[int, int, str], None]]:
-    """Give what draws a progress bar when it is called with steps done, steps in all, and what is being done."""
+    """Yield a function that updates a progress bar, called with steps done, their total, and the current step."""
     with progress_bar() as bar:
         task = bar.add_task(text, note="")
         yield lambda done, total, doing: bar.update(task, completed=done, total=total, description=doing)
 
 
 @contextmanager
-def progress_of(total: int | None, text: str) -> Iterator[ProgressOfFrames]:
-    """Give an observer that draws a progress bar; `total` is None where nobody knows how many frames there are."""
+def progress_of(total: int | None, text: str) -> Iterator[FrameProgress]:
+    """Yield an observer that draws a progress bar; `total` is None where the number of frames is unknown."""
     with progress_bar() as bar:
-        yield ProgressOfFrames(bar, bar.add_task(text, total=total, note=""))
+        yield FrameProgress(bar, bar.add_task(text, total=total, note=""))
 
 
-class ProgressOfFrames:
-    """Moves a progress bar on by each frame."""
+class FrameProgress:
+    """Observer that advances a progress bar by each frame."""
 
     def __init__(self, bar: Progress, task: TaskID):
         self._bar, self._task = bar, task
 
     def after(self, frame: object, report: object) -> None:
-        """Note a frame that was offered to the map."""
+        """Advance by the frame that was offered to the map."""
         self.advance()
 
     def advance(self) -> None:
-        """Move on by one step."""
+        """Advance by one step."""
         speed = self._bar.tasks[0].finished_speed or self._bar.tasks[0].speed
         self._bar.update(self._task, advance=1, note=f"{speed:.0f} a second" if speed else "")
 
 
 def command_line(*words: object) -> str:
-    """Return a stereovox command that can be copied to a shell, whatever the file names hold."""
+    """Return a stereovox command quoted for a shell."""
     return shlex.join(["stereovox", *map(str, words)])
 
 
 def milliseconds(figures: dict[str, float]) -> str:
-    """Return `median 1.2, 90 % 1.5, 99 % 1.9, longest 2.3 ms`."""
+    """Format figures: `median 1.2, 90 % 1.5, 99 % 1.9, longest 2.3 ms`."""
     return "median {median:.2f}, 90 % {p90:.2f}, 99 % {p99:.2f}, longest {max:.2f} ms".format(**figures)
 
 
 def size(number_of_bytes: float) -> str:
-    """Return a number of bytes as a person reads it."""
+    """Format a number of bytes: `12.3 MB`."""
     for unit in ("bytes", "kB", "MB"):
         if number_of_bytes < 1000:
             return f"{number_of_bytes:.3g} {unit}"
@@ -112,22 +112,22 @@ def size(number_of_bytes: float) -> str:
 
 
 def thousands(number: Any) -> str:
-    """Return a whole number with commas: 1,234,567."""
+    """Format a whole number with commas: 1,234,567."""
     return f"{number:,}"
 
 
 def say_refusals(result: dict[str, Any], reports: Sequence[UpdateReport], what: str) -> None:
-    """Say how many `what` (frames) were mapped, which were refused and why, and when they were believed again."""
+    """Print how many `what` (frames) were mapped, which were refused and why, and when they were accepted again."""
     say(f"{result['frames']} {what} mapped, {result['frames_refused']} refused")
     for reason, number in result["refused"].items():
         example = next(report.detail for report in reports if report.refused == reason)
         say(f"  {number} x {reason}, first: {example}")
-    for told, number in result["settled"].items():
-        say(f"  {number} x {told}")
+    for reason, number in result["settled"].items():
+        say(f"  {number} x {reason}")
 
 
 def cells_line(result: dict[str, Any]) -> str:
-    """Return one line about the cells of a map and the memory they need."""
+    """Format one line about the cells of a map and their memory."""
     occupied, free = thousands(result["occupied"]), thousands(result["free"])
     reserved = ", reserved for the window" if result.get("memory_reserved") else ""
     return f"{occupied} occupied and {free} free cells in {size(result['memory_bytes'])}{reserved}"

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Make a map of what is really there from a recording's lidar.
+"""Make a ground-truth map from a recording's lidar.
 
 SOURCE is a KITTI recording with lidar: a raw drive, a tracking or odometry sequence, or stereo 2015 scenes. A cell is
-occupied where one lidar point falls into it that is in the left image and in no annotated box.
+occupied where at least one lidar point in it is inside the left image and in no annotated box.
 """
 
 from __future__ import annotations
@@ -38,13 +38,15 @@ def add_arguments(parser: ArgumentParser) -> None:
         "--free",
         choices=("view", "rays"),
         default="view",
-        help="free are all other cells in view of a frame (view), or of these only what a lidar ray crosses (rays)",
+        help="free cells: all others in view of a frame (view), or only those of them that a lidar ray crosses (rays)",
     )
-    parser.add_argument("--box-margin", type=float, default=0.0, metavar="M", help="metres by which boxes grow (0)")
+    parser.add_argument(
+        "--box-margin", type=float, default=0.0, metavar="M", help="metres by which annotated boxes are enlarged (0)"
+    )
 
 
 def run(arguments: Namespace) -> dict[str, Any]:
-    """Make the map, save it and tell about it."""
+    """Make the map, save it and print a summary."""
     from stereovox.evaluate.lidar_truth import lidar_truth
     from stereovox.maps.store import check_target
     from stereovox.opening import open_source
@@ -61,15 +63,15 @@ def run(arguments: Namespace) -> dict[str, Any]:
         arguments.free,
         arguments.frames,
         box_margin=arguments.box_margin,
-        watch=_watched,
+        watch=_with_progress,
     )
     voxel_map.save(out)
-    _tell(counts, voxel_map.memory_bytes, out)
+    _print_result(counts, voxel_map.memory_bytes, out)
     return {**counts.as_dict(), "voxel_size": voxel_map.voxel_size, "memory_bytes": voxel_map.memory_bytes}
 
 
-def _watched(numbers: Iterable[int], count: int) -> Iterator[int]:
-    """Yield the frames with a progress bar; Ctrl-C stops between two."""
+def _with_progress(numbers: Iterable[int], count: int) -> Iterator[int]:
+    """Yield the frame numbers with a progress bar; Ctrl-C stops between two."""
     from stereovox.run import interrupt_between_steps
 
     with interrupt_between_steps() as check:
@@ -78,7 +80,7 @@ def _watched(numbers: Iterable[int], count: int) -> Iterator[int]:
             check()
 
 
-def _tell(counts: TruthCounts, memory_bytes: int, out: Path) -> None:
+def _print_result(counts: TruthCounts, memory_bytes: int, out: Path) -> None:
     say(f"{counts.frames} scans used, {counts.refused.total()} refused")
     for reason, number in counts.refused.items():
         say(f"  {number} x {reason}")
@@ -86,7 +88,7 @@ def _tell(counts: TruthCounts, memory_bytes: int, out: Path) -> None:
         say(f"  first: {counts.first_refusal}")
     far = f"{thousands(counts.out_of_range)} of them from beyond the range of their own frame"
     say(f"{thousands(counts.used)} of {thousands(counts.points)} points used, {far}; dropped:")
-    for name, words in DROPPED.items():
-        say(f"  {thousands(getattr(counts, name)):>11} {words}")
+    for name, text in DROPPED.items():
+        say(f"  {thousands(getattr(counts, name)):>11} {text}")
     say(cells_line({"occupied": counts.occupied, "free": counts.free, "memory_bytes": memory_bytes}))
     say(f"saved in {out}; compare a map with it: {command_line('eval', 'MAP', out)}")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Look at a map in the browser: turn it, cut it, measure in it, and replay the recording that it was made of."""
+"""View a map in the browser: turn it, cut it, measure in it, and replay the recording it was made from."""
 
 from __future__ import annotations
 
@@ -24,29 +24,29 @@ def add_arguments(parser: ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("map", metavar="MAP", help="folder of a map")
     parser.add_argument(
-        "--recording", metavar="SOURCE", help="what the map was made of: adds a timeline with depth images"
+        "--recording", metavar="SOURCE", help="recording the map was made from: adds a timeline with depth images"
     )
     parser.add_argument("--frames", metavar="A:B:S", help="only these frames of --recording, as a Python slice")
     parser.add_argument(
-        "--up", metavar="AXIS", help="which way is up: z, -y, x ... (default: as the map's settings say)"
+        "--up", metavar="AXIS", help="axis that points up: z, -y, x ... (default: from the map's settings)"
     )
     parser.add_argument(
         "--most-cells",
         type=int,
         default=250_000,
         metavar="N",
-        help="cells drawn at once, about; far ones are drawn coarser (250000; 20000 without a graphics card)",
+        help="approximate number of cells drawn at once; far ones are drawn coarser (250000; 20000 without a GPU)",
     )
     parser.add_argument(
         "--host",
         default="127.0.0.1",
-        help="address to serve; 0.0.0.0 lets others look who have the link (default here)",
+        help="address to serve (127.0.0.1); 0.0.0.0 lets others with the link view the map",
     )
-    parser.add_argument("--port", type=int, default=8080, help="port of the page; 0 for any that is free (8080)")
+    parser.add_argument("--port", type=int, default=8080, help="port of the page; 0 for any free one (8080)")
     parser.add_argument(
         "--token",
         metavar="WORD",
-        help=f"what the link must hold; better in {TOKEN}, for all users of a machine see its command lines",
+        help=f"secret of the link; better set {TOKEN}, since all users of a machine see its command lines",
     )
 
 
@@ -55,7 +55,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
     from stereovox.maps.cubes import in_cubes
     from stereovox.viewer.viewer import open_viewer
 
-    quiet()
+    silence_server_log()
     voxel_map, source = open_map(arguments.map), _recording(arguments)
     name, place = Path(arguments.map).stem, (arguments.host, arguments.port)
     token = arguments.token if arguments.token is not None else os.environ.get(TOKEN) or None
@@ -73,13 +73,13 @@ def run(arguments: Namespace) -> dict[str, Any]:
     return {"url": viewer.url}
 
 
-def quiet() -> None:
-    """Keep the server from telling of every browser that hangs up early."""
+def silence_server_log() -> None:
+    """Keep the server from logging every browser that disconnects early."""
     logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
 
 
 def _recording(arguments: Namespace) -> Source | None:
-    """Return the recording to replay, if one is named; raises StereovoxError for a live camera."""
+    """Return the recording to replay, None without --recording; raises StereovoxError for a live camera."""
     if arguments.recording is None:
         refuse_options(arguments, ("frames",), "picks frames of --recording, which is not given")
         return None

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How good is a map? Exact truth of simulated scenes, metrics, and a report."""
+"""Evaluation of maps and trajectories: ground truth, metrics and scores, in numbers only."""

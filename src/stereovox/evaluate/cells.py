@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sets of cells as sorted whole numbers: one int64 key a cell, so that membership is a binary search."""
+"""Sets of cells as sorted int64 keys, one per cell, so that membership is a binary search."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _BITS = 21
 _HALF = 1 << (_BITS - 1)
 
 Keys = NDArray[np.int64]
-"""(N,) int64, ascending and without repeats where it stands for a set."""
+"""(N,) int64, ascending and unique where it is a set."""
 
 
 def occupied_cells(voxel_map: VoxelMap) -> NDArray[np.int64]:
@@ -36,7 +36,7 @@ def indices(cell_keys: Keys) -> NDArray[np.int32]:
 
 
 def position(cell_keys: Keys, among: Keys) -> NDArray[np.int64]:
-    """Return where each key (N,) stands in the ascending set `among`, -1 where it is absent."""
+    """Return the index of each key (N,) in the ascending set `among`, -1 where it is absent."""
     if not len(among):
         return np.full(len(cell_keys), -1)
     place = np.minimum(np.searchsorted(among, cell_keys), len(among) - 1)
@@ -44,7 +44,7 @@ def position(cell_keys: Keys, among: Keys) -> NDArray[np.int64]:
 
 
 def within(cell_keys: Keys, among: Keys, tolerance: int) -> NDArray[np.bool_]:
-    """Tell which cells have a cell of the set `among` at most `tolerance` cells away along every axis."""
+    """Return which cells have a cell of the set `among` within `tolerance` cells along every axis."""
     found = position(cell_keys, among) >= 0
     reach = range(-tolerance, tolerance + 1)
     for dx, dy, dz in itertools.product(reach, reach, reach):

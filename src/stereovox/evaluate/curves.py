@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a map does at every threshold: ROC, and precision and recall with a tolerance."""
+"""Curves over all thresholds: ROC, and precision and recall with a tolerance."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ THRESHOLDS = np.arange(1, 100) / 100
 
 @dataclass(frozen=True, eq=False)
 class Roc:
-    """Receiver operating characteristic: what is gained and what it costs as the threshold falls from 1 to 0.
+    """Receiver operating characteristic, as the threshold falls from 1 to 0.
 
     threshold: (M,) falling, inf first; at each, cells with p >= threshold are called occupied.
     false_positive_rate: (M,) share of the free cells that are called so; true_positive_rate: (M,) of the occupied ones.
@@ -27,12 +27,12 @@ class Roc:
 
     @property
     def auc(self) -> float:
-        """Area under it: how often an occupied cell has a higher p than a free one, ties half; 0.5 is guessing."""
+        """Area under the curve: how often an occupied cell has a higher p than a free one, ties half; 0.5 is chance."""
         return float(np.trapezoid(self.true_positive_rate, self.false_positive_rate))
 
 
 def roc(p: NDArray[np.floating], actual: NDArray[np.bool_]) -> Roc | None:
-    """Return the curve of probabilities (N,); None unless some cells are occupied and some free."""
+    """Return the ROC curve of probabilities (N,); None unless some cells are occupied and some free."""
     values, of_cell = np.unique(p, return_inverse=True)
     occupied = np.bincount(of_cell, actual, len(values))[::-1]
     free = np.bincount(of_cell, ~actual, len(values))[::-1]
@@ -44,7 +44,7 @@ def roc(p: NDArray[np.floating], actual: NDArray[np.bool_]) -> Roc | None:
 
 @dataclass(frozen=True, eq=False)
 class PrecisionRecall:
-    """Precision and recall at each threshold (M,), exact and with the tolerance; NaN where nothing can be divided."""
+    """Precision and recall at each threshold (M,), exact and with tolerance; NaN for a division by zero."""
 
     threshold: NDArray[np.float64]
     precision: NDArray[np.float64]
@@ -58,7 +58,7 @@ def precision_recall(
 ) -> PrecisionRecall:
     """Return precision and recall over all cells of the truth at `thresholds` (M,).
 
-    actual, near: (N,) cells that hold a surface, that have one within the tolerance. Unobserved cells count as free.
+    actual, near: (N,) cells that hold a surface, and that have one within the tolerance. Unobserved cells are free.
     """
     thresholds = np.asarray(thresholds, float)
     levels = np.array([level(threshold) for threshold in thresholds])
@@ -73,11 +73,11 @@ def precision_recall(
 
 
 def above(values: NDArray[np.floating], levels: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return how many `values` (N,) are greater than each of the `levels` (M,)."""
+    """Count the `values` (N,) greater than each of the `levels` (M,)."""
     return len(values) - np.searchsorted(np.sort(values), levels, side="right")
 
 
 def shares(part: NDArray[np.integer], whole: NDArray[np.integer] | int) -> NDArray[np.float64]:
-    """Return part / whole, NaN where there is nothing to divide by."""
+    """Return part / whole, NaN where the whole is zero."""
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.where(np.asarray(whole) > 0, part / np.asarray(whole, float), np.nan)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a map does near the camera and far from it."""
+"""Precision and recall by distance from the camera."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ RINGS = 8
 class ByDistance:
     """Precision and recall of the cells in M rings; ring i holds edges[i] <= distance < edges[i + 1], in metres.
 
-    edges: (M + 1,). marked, surface: (M,) cells the map calls occupied, cells that truly are. The others: (M,), NaN in
-    a ring without such cells.
+    edges: (M + 1,). marked, surface: (M,) number of cells that the map calls occupied, and that truly are.
+    The others: (M,), NaN in a ring without such cells.
     """
 
     edges: NDArray[np.float64]
@@ -32,7 +32,7 @@ class ByDistance:
     tolerance_recall: NDArray[np.float64]
 
     def rows(self) -> list[dict[str, float | None]]:
-        """Return one dict a ring, `from_m`, `to_m` and the arrays' numbers: JSON, None instead of NaN."""
+        """Return one dict per ring for JSON: `from_m`, `to_m` and the values of the arrays, None instead of NaN."""
         columns = {"from_m": self.edges[:-1], "to_m": self.edges[1:], **vars(self)}
         columns.pop("edges")
         rows = zip(*(column.tolist() for column in columns.values()), strict=True)
@@ -42,18 +42,18 @@ class ByDistance:
 def by_distance(
     reading: Reading, truth: TruthCells, path: ArrayLike, threshold: float = 0.7, edges: ArrayLike | None = None
 ) -> ByDistance:
-    """Return precision and recall against the distance to the nearest camera position.
+    """Compute precision and recall by distance to the nearest camera position.
 
     path: camera positions (P, 3), or one (3,), in metres, world frame. edges: rising limits (M + 1,) of the rings in
-    metres; by default about eight of a round width. Cells beyond them are left out; unobserved cells count as free.
-    Raises StereovoxError for a path that is no list of points.
+    metres; by default about eight of a round width. Cells beyond the last are left out; unobserved cells count as free.
+    Raises StereovoxError for an invalid path.
     """
-    away = distances(truth.centers(), path)
-    limits = round_edges(float(away.max())) if edges is None else np.asarray(edges, float)
+    distance = distances(truth.centers(), path)
+    limits = round_edges(float(distance.max())) if edges is None else np.asarray(edges, float)
     marked, actual = reading.marked(threshold), truth.occupied
     chosen = (marked, actual, marked & actual, marked & truth.near)
-    n_marked, n_surface, right, close = (np.histogram(away[cells], limits)[0] for cells in chosen)
-    found = np.histogram(away[actual][reading.found(threshold)], limits)[0]
+    n_marked, n_surface, right, close = (np.histogram(distance[cells], limits)[0] for cells in chosen)
+    found = np.histogram(distance[actual][reading.found(threshold)], limits)[0]
     return ByDistance(
         limits,
         n_marked,
@@ -75,9 +75,9 @@ def distances(points: NDArray[np.float64], path: ArrayLike) -> NDArray[np.float6
     return KDTree(positions.reshape(-1, 3)).query(points)[0]
 
 
-def round_edges(longest: float) -> NDArray[np.float64]:
-    """Return edges from 0 to beyond `longest` in about eight steps of 1, 2 or 5 times a power of ten."""
-    rough = max(longest, 1e-3) / RINGS
+def round_edges(maximum: float) -> NDArray[np.float64]:
+    """Return edges from 0 to beyond `maximum`, in about eight steps of 1, 2 or 5 times a power of ten."""
+    rough = max(maximum, 1e-3) / RINGS
     power = 10.0 ** np.floor(np.log10(rough))
     width = next(step * power for step in (1, 2, 5, 10) if step * power >= rough * (1 - 1e-9))
-    return width * np.arange(np.floor(longest / width) + 2)
+    return width * np.arange(np.floor(maximum / width) + 2)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The motion that lays one 2-D map on another: a map made by SLAM stands in a frame of its own.
+"""Align one 2-D map with another: a map made by SLAM has a frame of its own.
 
-Coarse: for every turn, the correlation of two small pictures of the maps, by FFT, tells the best shift. Fine: the best
-of these, and the start, are moved until walls lie on walls (`grid_fit`). Nothing is drawn by lot.
+Coarse: for every rotation, the cross-correlation (FFT) of two small images of the maps gives the best shift. Fine: the
+best of these, and the start, are refined until walls lie on walls (`Fit`). Deterministic: nothing is sampled at random.
 """
 
 from __future__ import annotations
@@ -18,19 +18,27 @@ from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.maps.voxel_map import State
 
 FEW, MANY = 600, 4000
-"""Walls and floor cells of each map that are looked at, evenly taken: to sort out motions, and to find the best."""
+"""Number of wall and floor cells sampled from each map: to rank motions, and to refine the best."""
 MAX_ACROSS = 3000
-"""Pixels along the longer side of a picture of distances; larger maps get larger pixels."""
+"""Pixels along the longer side of a distance image; larger maps get larger pixels."""
 STEPS = ((1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1))
 Points = NDArray[np.float64]
 """(N, 2) x, y in metres."""
+COARSE, MAX_COARSE = 128, 512
+"""Pixels along the longer side of the small image: of the smaller map, and at most of the larger one."""
+CANDIDATES, BEST = 12, 4
+"""Number of motions that are refined coarsely, and then finely."""
+MAX_POINTS = 500_000
+"""Number of wall and floor cells of each map that are used."""
+ALIKE = 0.98
+"""Among motions with a score this close to the best, the smallest is taken: a building may be symmetric."""
 
 
 class Fit:
-    """Two maps as points: middles of their occupied and free cells, in metres from the lower left corner of each.
+    """Two maps as points: centres of their occupied and free cells, in metres from the lower left corner of each.
 
     walls, their_walls: at least one each. resolution: side of a cell in metres. reach: metres up to which distances
-    matter.
+    count.
     """
 
     def __init__(
@@ -43,14 +51,14 @@ class Fit:
         self._middle = (walls.min(axis=0) + walls.max(axis=0)) / 2
         self._radius = max(float(np.hypot(*np.ptp(walls, axis=0))) / 2, resolution)
 
-    def likelihood(self, pose: ArrayLike, width: float, most: int = MANY) -> float:
-        """Return how well walls lie on walls, 0 to 1: mean of exp(-d^2 / (2 width^2)) both ways.
+    def likelihood(self, pose: ArrayLike, width: float, max_points: int = MANY) -> float:
+        """Return how well walls lie on walls, 0 to 1: mean of exp(-d^2 / (2 width^2)) in both directions.
 
-        pose: (3,), our corner seen from theirs; width in metres; most: points of each map to look at.
+        pose: (3,), our corner in their frame; width in metres; max_points: number of points sampled from each map.
         """
-        there = se2.transform(pose, evenly(self._walls, most))
-        back = se2.transform(se2.inverse(pose), evenly(self._their_walls, most))
-        pairs = ((self._theirs, there), (self._ours, back))
+        moved = se2.transform(pose, evenly_sampled(self._walls, max_points))
+        back = se2.transform(se2.inverse(pose), evenly_sampled(self._their_walls, max_points))
+        pairs = ((self._theirs, moved), (self._ours, back))
         return float(np.mean([np.exp(-0.5 * (field.metres(at) / width) ** 2).mean() for field, at in pairs]))
 
     def agreement(self, pose: ArrayLike) -> float:
@@ -58,28 +66,28 @@ class Fit:
         walls = self.likelihood(pose, 2 * self.resolution)
         if not len(self._floor) or self._their_floor is None:
             return walls
-        metres = self._their_floor.metres(se2.transform(pose, evenly(self._floor, MANY)))
+        metres = self._their_floor.metres(se2.transform(pose, evenly_sampled(self._floor, MANY)))
         return walls + float((metres < self.resolution).mean())
 
-    def refined(self, pose: ArrayLike, width: float, stop: float, most: int = MANY) -> se2.Pose:
+    def refined(self, pose: ArrayLike, width: float, stop: float, max_points: int = MANY) -> se2.Pose:
         """Return the pose near `pose` of the highest likelihood: steps along x, y and yaw, halved where none helps.
 
         The likelihood's width is `width` at first and half as much at the end; `stop` is the smallest step in metres.
         """
         best = np.asarray(pose, float)
         for reach in (width, width / 2):
-            score, step = self.likelihood(best, reach, most), reach
+            score, step = self.likelihood(best, reach, max_points), reach
             while step > stop:
                 tried = [self._stepped(best, step * np.array(one)) for one in STEPS]
-                scores = [self.likelihood(one, reach, most) for one in tried]
+                scores = [self.likelihood(one, reach, max_points) for one in tried]
                 if max(scores) > score + 1e-9:
                     score, best = max(scores), tried[int(np.argmax(scores))]
                 else:
                     step /= 2
         return best
 
-    def way(self, start: ArrayLike, end: ArrayLike) -> float:
-        """Return the metres by which two poses differ: of the map's middle, and of its rim by the turn."""
+    def distance(self, start: ArrayLike, end: ArrayLike) -> float:
+        """Return the distance of two poses in metres: of the map's centre, plus that of its rim by the rotation."""
         x, y, yaw = se2.relative(self._at_middle(start), self._at_middle(end))
         return float(np.hypot(x, y) + self._radius * abs(yaw))
 
@@ -87,13 +95,13 @@ class Fit:
         return se2.compose(pose, [*self._middle, 0.0])
 
     def _stepped(self, pose: se2.Pose, step: NDArray[np.float64]) -> se2.Pose:
-        """Return the pose moved by step[:2] and turned about the walls' middle so that their rim moves step[2]."""
+        """Return the pose moved by step[:2] and rotated about the walls' centre so that their rim moves step[2]."""
         x, y, yaw = self._at_middle(pose) + step * [1, 1, 1 / self._radius]
         return se2.compose([x, y, yaw], [-self._middle[0], -self._middle[1], 0.0])
 
 
 class _Field:
-    """Distances to the nearest of some points, as a picture."""
+    """Distance to the nearest of a set of points, as an image."""
 
     def __init__(self, points: Points, resolution: float, margin: float):
         from scipy.ndimage import distance_transform_edt
@@ -107,38 +115,28 @@ class _Field:
         self._metres = np.asarray(distance_transform_edt(empty, sampling=self._side), np.float32)
 
     def metres(self, points: Points) -> NDArray[np.float32]:
-        """Return the distance of (N, 2) points, between pixels in proportion; beyond the picture that of its rim."""
+        """Interpolate the distance of (N, 2) points; beyond the image that of its rim."""
         from scipy.ndimage import map_coordinates
 
         places = (points - self._low).T[::-1] / self._side
         return np.asarray(map_coordinates(self._metres, places, order=1, mode="nearest"), np.float32)
 
 
-def evenly(points: NDArray[Any], most: int) -> NDArray[Any]:
-    """Return at most `most` rows of an array, evenly taken."""
-    if len(points) <= most:
+def evenly_sampled(points: NDArray[Any], max_points: int) -> NDArray[Any]:
+    """Return at most `max_points` rows of an array, evenly spaced."""
+    if len(points) <= max_points:
         return points
-    return points[np.linspace(0, len(points) - 1, most).astype(int)]
-
-
-COARSE, MAX_COARSE = 128, 512
-"""Pixels along the longer side of the smaller map's small picture, as far as the larger map's then has no more."""
-CANDIDATES, BEST = 12, 4
-"""Motions that are looked at closely, and very closely."""
-MAX_POINTS = 500_000
-"""Walls and floor cells of each map that are looked at."""
-ALIKE = 0.98
-"""Among motions so near to the best one the smallest is taken: a building may look alike from both ends."""
+    return points[np.linspace(0, len(points) - 1, max_points).astype(int)]
 
 
 def align_grids(grid: OccupancyGrid, reference: OccupancyGrid, start: ArrayLike = (0, 0, 0)) -> se2.Pose:
-    """Return (3,) pose_reference_map: the motion of `grid`'s map frame that lays it on `reference`.
+    """Return (3,) pose_reference_map, the motion of the frame of `grid` that aligns it with `reference`.
 
-    All turns and shifts are searched; of those that fit about as well as the best the one nearest to `start`, (3,), is
-    taken. Where one of the maps has no occupied cell there is nothing to go by, and `start` is returned.
+    All rotations and shifts are searched; among those that fit about as well as the best, the one nearest to `start`,
+    (3,), is returned. Where one of the maps has no occupied cell, `start` is returned.
     """
     start = np.asarray(start, float)
-    ours, theirs = _seen(grid), _seen(reference)
+    ours, theirs = _cell_centres(grid), _cell_centres(reference)
     if not len(ours.walls) or not len(theirs.walls):
         return start
     from_corner = se2.compose(se2.inverse(reference.origin), se2.compose(start, grid.origin))
@@ -147,22 +145,22 @@ def align_grids(grid: OccupancyGrid, reference: OccupancyGrid, start: ArrayLike 
 
 
 @dataclass(frozen=True, eq=False)
-class _Seen:
-    """Middles of occupied and of free cells, (N, 2) x, y in metres from the lower left corner of cell (0, 0)."""
+class _CellCentres:
+    """Centres of occupied and of free cells, (N, 2) x, y in metres from the lower left corner of cell (0, 0)."""
 
     walls: NDArray[np.float64]
     floor: NDArray[np.float64]
 
 
-def _seen(grid: OccupancyGrid) -> _Seen:
+def _cell_centres(grid: OccupancyGrid) -> _CellCentres:
     states, cornered = grid.states, replace(grid, origin=(0.0, 0.0, 0.0))
-    places = (evenly(np.argwhere(states == state), MAX_POINTS) for state in (State.OCCUPIED, State.FREE))
+    places = (evenly_sampled(np.argwhere(states == state), MAX_POINTS) for state in (State.OCCUPIED, State.FREE))
     walls, floor = (cornered.centres(*place.T) for place in places)
-    return _Seen(walls, floor)
+    return _CellCentres(walls, floor)
 
 
-def _best(ours: _Seen, theirs: _Seen, resolution: float, start: se2.Pose) -> se2.Pose:
-    """Return the pose of our corner seen from theirs."""
+def _best(ours: _CellCentres, theirs: _CellCentres, resolution: float, start: se2.Pose) -> se2.Pose:
+    """Return the pose of our corner in their frame."""
     small, large = sorted(float(np.ptp(one.walls, axis=0).max()) for one in (ours, theirs))
     side = max(small / COARSE, large / MAX_COARSE, 2 * resolution)
     fit = Fit(ours.walls, theirs.walls, ours.floor, theirs.floor, resolution, side)
@@ -171,11 +169,11 @@ def _best(ours: _Seen, theirs: _Seen, resolution: float, start: se2.Pose) -> se2
     poses = [fit.refined(pose, resolution, resolution / 50) for pose in poses]
     scores = [fit.agreement(pose) for pose in poses]
     alike = [pose for pose, score in zip(poses, scores, strict=True) if score >= ALIKE * max(scores)]
-    return min(alike, key=lambda pose: fit.way(start, pose))
+    return min(alike, key=lambda pose: fit.distance(start, pose))
 
 
-def _candidates(ours: _Seen, theirs: _Seen, side: float) -> list[se2.Pose]:
-    """Return the best shifts of the best turns, each well apart from the others."""
+def _candidates(ours: _CellCentres, theirs: _CellCentres, side: float) -> list[se2.Pose]:
+    """Return the best shifts of the best rotations, well apart from each other."""
     points, weights = _thinned(ours, side)
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
     points = points - middle
@@ -190,10 +188,10 @@ def _candidates(ours: _Seen, theirs: _Seen, side: float) -> list[se2.Pose]:
 
 
 class _Correlator:
-    """Finds the shift of weighted points that fits a picture best.
+    """Finds the shift of weighted points that fits an image best.
 
-    image: (rows, columns); corner: (2,) x, y of the middle of its first pixel; side: of a pixel in metres; reach:
-    pixels that no point lies further from (0, 0).
+    image: (rows, columns); corner: (2,) x, y of the centre of its first pixel; side: of a pixel in metres; reach:
+    largest distance of a point from (0, 0) in pixels.
     """
 
     def __init__(self, image: NDArray[np.float32], corner: NDArray[np.float64], side: float, reach: int):
@@ -213,7 +211,7 @@ class _Correlator:
 
 
 def _from_origin(pose_reference_middle: se2.Pose, middle: NDArray[np.float64]) -> se2.Pose:
-    """Return pose_reference_map of a pose of the map's middle, where the map was turned about that."""
+    """Return pose_reference_map from a pose of the map's centre, about which the map was rotated."""
     return se2.compose(pose_reference_middle, [-middle[0], -middle[1], 0.0])
 
 
@@ -228,12 +226,12 @@ def _apart(poses: list[se2.Pose], side: float, reach: int) -> list[se2.Pose]:
     return kept
 
 
-def _thinned(seen: _Seen, side: float) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-    """Return points (N, 2), at most one a cell of `side`, and their weights: walls above zero, floor below.
+def _thinned(centres: _CellCentres, side: float) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+    """Return points (N, 2), at most one per cell of `side`, and their weights: walls above zero, floor below.
 
-    A cell that holds both is a wall, and walls and floor weigh the same as a whole.
+    A cell that holds both is a wall; all walls together weigh as much as all floor.
     """
-    walls, floor = (np.floor(points / side).astype(np.int64) for points in (seen.walls, seen.floor))
+    walls, floor = (np.floor(points / side).astype(np.int64) for points in (centres.walls, centres.floor))
     cells = np.zeros(np.concatenate([walls, floor]).max(axis=0) + 1, np.int8)
     cells[tuple(floor.T)], cells[tuple(walls.T)] = -1, 1
     places = np.argwhere(cells)
@@ -245,7 +243,7 @@ def _thinned(seen: _Seen, side: float) -> tuple[NDArray[np.float64], NDArray[np.
 def _picture(
     points: NDArray[np.float64], weights: NDArray[np.float32], side: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-    """Return the picture of weighted points, its walls softened, and the middle (2,) x, y of its first cell."""
+    """Return the image of weighted points, its walls blurred, and the centre (2,) x, y of its first cell."""
     from scipy.ndimage import gaussian_filter
 
     low, high = points.min(axis=0), points.max(axis=0)

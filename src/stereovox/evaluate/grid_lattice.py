@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Two 2-D maps on the cells of one of them, whatever the sides, origins and turns of their own cells."""
+"""Resample one 2-D map onto the cells of another, whatever their cell sizes, origins and rotations."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from stereovox.maps.voxel_map import State
 
 MAX_CELLS = 40_000_000
 """Cells of the rectangle that holds both maps: 126 m x 126 m in cells of 2 cm. Distances take 40 bytes a cell."""
-NOTHING = "the reference has no free and no occupied cell: there is nothing to compare with; give another"
+EMPTY_REFERENCE = "the reference has no free and no occupied cell: there is nothing to compare with; give another"
 ROWS_AT_ONCE = 256
 TIE = 1e-6
-"""Share of a cell by which points that lie between two cells are pushed, so that rounding does not choose."""
+"""Share of a cell by which points on the border of two cells are shifted, so that rounding does not decide."""
 Rectangle = tuple[float, float, float, float]
 """x0, y0, x1, y1 in metres: two opposite corners, in the reference's map frame."""
 
 
 @dataclass(frozen=True, eq=False)
 class Laid:
-    """A map laid on a reference: both have the same cells, those of the reference, in the reference's map frame.
+    """A map laid on a reference: both on the cells of the reference, in the reference's map frame.
 
-    map, reference: cover all that either knows, at least one cell.
-    excluded: (rows, columns) bool, cells whose middle lies in an excluded region.
-    motion: (3,) pose_reference_map, how the map was moved to lie on the reference.
+    map, reference: cover all cells known to either, at least one.
+    excluded: (rows, columns) bool, cells whose centre lies in an excluded region.
+    motion: (3,) pose_reference_map by which the map was moved.
     """
 
     map: OccupancyGrid
@@ -44,59 +44,59 @@ def lay(
 ) -> Laid:
     """Lay `grid` on the cells of `reference`, moved by `motion`: (3,) pose_reference_map of the two map frames.
 
-    A cell takes the value at its middle; an occupied cell of the map in which no middle lies (a coarser reference, a
-    turn) is entered where its own middle lies, so that no obstacle is lost. Raises StereovoxError for a region that is
-    no rectangle, a reference that knows nothing, and maps so far apart that no picture holds both.
+    A cell takes the value at its centre; an occupied cell of the map that holds no such centre (a coarser reference, a
+    rotation) is entered where its own centre lies, so that no obstacle is lost. Raises StereovoxError for an invalid
+    region, a reference without known cells, and maps too far apart for one image.
     """
     motion = np.asarray(motion, float)
     pose = se2.compose(se2.inverse(reference.origin), se2.compose(motion, grid.origin))
     corners = se2.transform(pose, grid.known_corners * grid.resolution)[:, ::-1] / reference.resolution
     known = np.concatenate([reference.known_corners[:, ::-1], corners])
     if not (reference.cells != UNKNOWN).any():
-        raise StereovoxError(NOTHING)
+        raise StereovoxError(EMPTY_REFERENCE)
     first = np.floor(known.min(axis=0) + TIE).astype(int)
     rows, columns = (max(1, int(n)) for n in np.ceil(known.max(axis=0) - TIE) - first)
     _check_size(rows, columns, reference.resolution)
     offset = (first[1] * reference.resolution, first[0] * reference.resolution, 0.0)
     x, y, yaw = se2.compose(reference.origin, offset).tolist()
-    there = replace(reference, cells=_window(reference.cells, first, (rows, columns)), origin=(x, y, yaw))
-    pose_there_map = se2.compose(se2.inverse(offset), pose)
-    here = replace(there, cells=resampled(grid, pose_there_map, there))
-    here = replace(here, free_below=grid.free_below, occupied_above=grid.occupied_above)
-    return Laid(here, there, excluded_cells(there, exclude), motion)
+    target = replace(reference, cells=_window(reference.cells, first, (rows, columns)), origin=(x, y, yaw))
+    pose_target_map = se2.compose(se2.inverse(offset), pose)
+    source = replace(target, cells=resampled(grid, pose_target_map, target))
+    source = replace(source, free_below=grid.free_below, occupied_above=grid.occupied_above)
+    return Laid(source, target, excluded_cells(target, exclude), motion)
 
 
 def three_states(grid: OccupancyGrid) -> NDArray[np.uint8]:
-    """Return (rows, columns) uint8 of UNKNOWN, FREE and OCCUPIED: what is between is unknown, as to map_server."""
+    """Return (rows, columns) uint8 of UNKNOWN, FREE and OCCUPIED; tentative cells are unknown, as in map_server."""
     states = grid.states
     states[states == State.TENTATIVE] = State.UNKNOWN
     return states
 
 
-def resampled(grid: OccupancyGrid, pose_there_here: ArrayLike, there: OccupancyGrid) -> NDArray[np.int8]:
-    """Return the values of `grid` in the cells of `there`, (rows, columns) int8.
+def resampled(grid: OccupancyGrid, pose_target_source: ArrayLike, target: OccupancyGrid) -> NDArray[np.int8]:
+    """Resample `grid` onto the cells of `target`: (rows, columns) int8.
 
-    pose_there_here: (3,), the lower left corner of `grid` seen from that of `there`.
+    pose_target_source: (3,), the lower left corner of `grid` in the frame of that of `target`.
     """
-    shape = there.cells.shape
+    shape = target.cells.shape
     cells, found = np.full(shape, UNKNOWN, np.int8), np.zeros(grid.cells.shape, bool)
-    back = se2.inverse(pose_there_here)
+    back = se2.inverse(pose_target_source)
     for start in range(0, shape[0], ROWS_AT_ONCE):
         rows = np.arange(start, min(start + ROWS_AT_ONCE, shape[0]))
-        row, column = _landed(back, rows[:, None], np.arange(shape[1]), there.resolution, grid.resolution)
+        row, column = _landed(back, rows[:, None], np.arange(shape[1]), target.resolution, grid.resolution)
         inside = _inside(row, column, grid.cells.shape)
         row, column = row[inside], column[inside]
         cells[rows[0] : rows[-1] + 1][inside] = grid.cells[row, column]
         found[row, column] = True
     lost = np.nonzero((grid.states == State.OCCUPIED) & ~found)
-    row, column = _landed(pose_there_here, lost[0], lost[1], grid.resolution, there.resolution)
+    row, column = _landed(pose_target_source, lost[0], lost[1], grid.resolution, target.resolution)
     inside = _inside(row, column, shape)
     np.maximum.at(cells, (row[inside], column[inside]), grid.cells[lost][inside])
     return cells
 
 
 def excluded_cells(grid: OccupancyGrid, exclude: Iterable[Rectangle]) -> NDArray[np.bool_]:
-    """Return which cells (rows, columns) have their middle in one of the regions of the map frame."""
+    """Return which cells (rows, columns) have their centre in one of the regions of the map frame."""
     out = np.zeros(grid.cells.shape, bool)
     rows, columns = (np.arange(n) for n in out.shape)
     for region in exclude:
@@ -123,7 +123,7 @@ def _check_size(rows: int, columns: int, resolution: float) -> None:
 
 
 def _window(cells: NDArray[np.int8], first: NDArray[np.int_], shape: tuple[int, int]) -> NDArray[np.int8]:
-    """Return `shape` cells from the row and column `first` on; unknown where there are none."""
+    """Return `shape` cells from the row and column `first` on; unknown outside the map."""
     out = np.full(shape, UNKNOWN, np.int8)
     low = np.maximum(first, 0)
     high = np.minimum(first + shape, cells.shape)
@@ -136,7 +136,7 @@ def _window(cells: NDArray[np.int8], first: NDArray[np.int_], shape: tuple[int, 
 def _moved(
     pose: ArrayLike, rows: NDArray, columns: NDArray, side: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return x and y of the middles of cells, moved by `pose`; rows and columns are broadcast."""
+    """Return x and y of the centres of cells, moved by `pose`; rows and columns are broadcast."""
     x, y, yaw = np.asarray(pose, float)
     cosine, sine = np.cos(yaw), np.sin(yaw)
     along, up = (columns + 0.5) * side, (rows + 0.5) * side
@@ -144,7 +144,7 @@ def _moved(
 
 
 def _landed(pose: ArrayLike, rows: NDArray, columns: NDArray, side: float, other_side: float) -> tuple[NDArray, ...]:
-    """Return rows and columns of the cells, `other_side` large, that the middles of cells fall into."""
+    """Return rows and columns of the cells of size `other_side` that contain the centres of cells."""
     x, y = _moved(pose, rows, columns, side)
     return tuple(np.floor(value / other_side + TIE).astype(np.int64) for value in (y, x))
 

@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How good is a 2-D map beside another? The error of IST 2019, Eq 7, and measures that forgive a cell.
+"""Compare a 2-D map with a reference: the error of IST 2019, Eq 7, and measures with a tolerance.
 
-In which cells two 2-D maps differ and how: the error of IST 2019, Eq 7, and its difference image.
-What counts (IST 2019, IV-B): a cell is wrong where "the occupation value" differs, so there are three values, and a
-cell that only one of the maps knows is wrong too: the report says so itself of a corridor that its camera never saw,
-which is white in Fig 6. An excluded region is "compensated in the error formula, as being, in fact, black": its cells
-count as right, and still belong to the free and occupied cells of the reference that the number is divided by.
+As in IST 2019, IV-B, a cell is wrong where "the occupation value" differs, so there are three values, and a cell that
+only one of the maps knows is wrong too: the paper says so of a corridor that its camera never saw, which is white in
+Fig 6. An excluded region is "compensated in the error formula, as being, in fact, black": its cells count as right, and
+still belong to the free and occupied cells of the reference in the denominator.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from stereovox import se2
 from stereovox.errors import StereovoxError
 from stereovox.evaluate.grid_align import align_grids
-from stereovox.evaluate.grid_lattice import NOTHING, Laid, Rectangle, lay, three_states
+from stereovox.evaluate.grid_lattice import EMPTY_REFERENCE, Laid, Rectangle, lay, three_states
 from stereovox.evaluate.metrics import Confusion, ratio
 from stereovox.evaluate.reliability import brier, correlation
 from stereovox.maps.occupancy import UNKNOWN, OccupancyGrid
@@ -29,11 +28,10 @@ from stereovox.maps.voxel_map import State
 
 
 class Difference(IntEnum):
-    """What came of a cell.
+    """How a cell differs.
 
-    SAME: both maps say the same, or neither knows; MISSED: the reference knows it, the map does not; WRONGLY_OCCUPIED,
-    WRONGLY_FREE: the map says so and the reference the other; EXTRA: the map knows it, the reference does not;
-    FORGIVEN: differs in an excluded region.
+    SAME: both maps agree, or neither knows it; MISSED: only the reference knows it; WRONGLY_OCCUPIED, WRONGLY_FREE: the
+    map says so and the reference the opposite; EXTRA: only the map knows it; FORGIVEN: differs in an excluded region.
     """
 
     SAME = 0
@@ -58,21 +56,21 @@ def differences(laid: Laid) -> NDArray[np.uint8]:
 
 
 def wrong(found: NDArray[np.uint8]) -> NDArray[np.bool_]:
-    """Return B of IST 2019, Eq 7: where `differences` tells of an error, (rows, columns) bool."""
+    """Return B of IST 2019, Eq 7: the cells that `differences` counts as wrong, (rows, columns) bool."""
     return (found != Difference.SAME) & (found != Difference.FORGIVEN)
 
 
 @dataclass(frozen=True)
 class CellErrors:
-    """Cells counted by how they differ.
+    """Counts of cells by how they differ.
 
-    eq7_percent: IST 2019, Eq 7: all that differ / (free and occupied cells of the reference) * 100; can be above 100.
-    eq7_outside_percent: the same where excluded cells are taken out of the lower number too; never less.
-    known_error_percent: of the cells that both maps know, those that differ; None where there are none.
+    eq7_percent: IST 2019, Eq 7: all that differ / (free and occupied cells of the reference) * 100; can exceed 100.
+    eq7_outside_percent: the same without excluded cells in the denominator; never less.
+    known_error_percent: of the cells known to both maps, those that differ; None where there are none.
     missed, wrongly_occupied, wrongly_free, extra: the cells that differ, see `Difference`; forgiven: those that differ
         in excluded regions and do not count.
-    reference_occupied, reference_free: all such cells of the reference, excluded ones too.
-    excluded: cells in excluded regions, whatever they hold; known_in_both: cells outside them that both maps know.
+    reference_occupied, reference_free: all such cells of the reference, including excluded ones.
+    excluded: all cells in excluded regions; known_in_both: cells outside them known to both maps.
     """
 
     eq7_percent: float
@@ -90,13 +88,13 @@ class CellErrors:
 
 
 def cell_errors(laid: Laid, found: NDArray[np.uint8]) -> CellErrors:
-    """Count what `differences` found. Raises StereovoxError for a reference without any known cell."""
+    """Count the result of `differences`. Raises StereovoxError for a reference without any known cell."""
     here, there = three_states(laid.map), three_states(laid.reference)
     missed, occupied, free, extra, forgiven = np.bincount(found.ravel(), minlength=len(Difference))[1:].tolist()
     known = there != State.UNKNOWN
     total, outside = int(known.sum()), int((known & ~laid.excluded).sum())
     if not total:
-        raise StereovoxError(NOTHING)
+        raise StereovoxError(EMPTY_REFERENCE)
     both = int((known & (here != State.UNKNOWN) & ~laid.excluded).sum())
     differ = missed + occupied + free + extra
     return CellErrors(
@@ -122,9 +120,9 @@ def _percent(part: int, whole: int) -> float | None:
 
 @dataclass(frozen=True)
 class Distances:
-    """Metres from each of N cells to the nearest of others; None where there are none on either side.
+    """Distances in metres from each of N cells to the nearest of others; None where either set is empty.
 
-    mean, median, p95 (95 % are not further), max.
+    mean, median, p95 (95th percentile), max.
     """
 
     mean: float | None = None
@@ -134,7 +132,7 @@ class Distances:
 
     @classmethod
     def of(cls, metres: NDArray[np.floating]) -> Distances:
-        """Return the figures of (N,) distances."""
+        """Summarise (N,) distances."""
         if not len(metres):
             return cls()
         median, p95 = np.percentile(metres, [50, 95])
@@ -142,7 +140,7 @@ class Distances:
 
 
 def distances(start: NDArray[np.bool_], goal: NDArray[np.bool_], resolution: float) -> NDArray[np.float64]:
-    """Return (N,) metres from the middle of each cell of `start` to that of the nearest of `goal`; () where none is."""
+    """Return (N,) metres from the centre of each cell of `start` to the nearest of `goal`; empty where either is."""
     from scipy.ndimage import distance_transform_edt
 
     if not goal.any():
@@ -153,11 +151,11 @@ def distances(start: NDArray[np.bool_], goal: NDArray[np.bool_], resolution: flo
 
 @dataclass(frozen=True)
 class Overlap:
-    """How many cells of two sets match; None where there is nothing to divide by.
+    """Overlap of two sets of cells; None for a division by zero.
 
     iou: intersection over union. tolerance_precision: share of the map's cells with one of the reference within the
-    tolerance; tolerance_recall: of the reference's with one of the map. iou_tolerant: the iou where the intersection is
-    the mean of the two numbers of cells that have one within the tolerance.
+    tolerance; tolerance_recall: of the reference's with one of the map. iou_tolerant: the IoU whose intersection is the
+    mean of the two numbers of cells that have one within the tolerance.
     """
 
     iou: float | None
@@ -167,9 +165,9 @@ class Overlap:
 
 
 def overlap(ours: NDArray[np.bool_], theirs: NDArray[np.bool_], tolerance: int, counted: NDArray[np.bool_]) -> Overlap:
-    """Compare two sets of cells, (rows, columns) bool each, in cells that are `counted`.
+    """Compare two sets of cells, (rows, columns) bool each, among the `counted` cells.
 
-    tolerance: cells along each axis. A neighbour that is not counted may still be what is near.
+    tolerance: cells along each axis. A neighbour within it need not be counted itself.
     """
     near_theirs, near_ours = within(theirs, tolerance), within(ours, tolerance)
     ours, theirs = ours & counted, theirs & counted
@@ -185,7 +183,7 @@ def overlap(ours: NDArray[np.bool_], theirs: NDArray[np.bool_], tolerance: int, 
 
 
 def within(cells: NDArray[np.bool_], tolerance: int) -> NDArray[np.bool_]:
-    """Return the cells that lie within `tolerance` cells, along each axis, of one of `cells`."""
+    """Return the cells within `tolerance` cells, along each axis, of one of `cells`."""
     from scipy.ndimage import maximum_filter
 
     return np.asarray(maximum_filter(cells, size=2 * tolerance + 1, mode="constant", cval=0), bool)
@@ -215,13 +213,13 @@ class GridTally:
 class GridScores:
     """All measures of one map against a reference, over cells of the reference's size outside excluded regions.
 
-    errors: Eq 7 and what it is made of. tally: over all cells the reference knows, where one that the map does not
-    know is not called occupied; observed: over those that both know. error: mean squared error of the map's
+    errors: Eq 7 and its parts. tally: over all cells the reference knows, where a cell unknown to the map is not
+    called occupied; observed: over those known to both. error: mean squared error of the map's
     probabilities over those (Brier score). coverage: share of the reference's cells that the map knows.
     occupied: how well the occupied cells match, exactly and within `tolerance_cells` along each axis, also where the
     reference knows nothing; free_iou: intersection over union of the free cells.
     to_reference, from_reference: metres from each occupied cell of the map to the nearest of the reference, and back.
-    motion: (3,) pose_reference_map by which the map was moved; aligned: whether that was searched for.
+    motion: (3,) pose_reference_map by which the map was moved; aligned: whether it was searched for.
     resolution, map_resolution: side of a cell of the reference, and of the map.
     """
 
@@ -246,7 +244,7 @@ class GridScores:
         return self.errors.eq7_percent
 
     def as_dict(self) -> dict[str, Any]:
-        """Return all numbers: JSON without NaN."""
+        """Return all numbers for JSON, without NaN."""
         x, y, yaw = map(float, self.motion)
         return {
             **asdict(self.errors),
@@ -280,8 +278,8 @@ def score_grids(
     """Compare a 2-D map with a reference.
 
     exclude: regions (x0, y0, x1, y1) in metres of the reference's map frame that do not count. align: whether to search
-    for the motion that lays the map on the reference; else the map is moved by `start`, (3,) pose_reference_map.
-    tolerance: cells along each axis. Raises StereovoxError for a reference that knows nothing, maps that lie too far
+    for the motion that aligns the map with the reference; else the map is moved by `start`, (3,) pose_reference_map.
+    tolerance: cells along each axis. Raises StereovoxError for a reference without known cells, maps too far
     apart, and numbers out of range.
     """
     return score_laid(laid_on(grid, reference, exclude, align, start), grid.resolution, align, tolerance)
@@ -299,7 +297,7 @@ def laid_on(
 
 
 def score_laid(laid: Laid, map_resolution: float, aligned: bool, tolerance: int = 1) -> GridScores:
-    """Return the measures of two maps that lie on the same cells."""
+    """Score two maps on the same cells."""
     if not 0 <= tolerance <= 1000:
         raise StereovoxError(f"tolerance {tolerance}: give the cells that are forgiven, 0 to 1000")
     here, there, counted = three_states(laid.map), three_states(laid.reference), ~laid.excluded

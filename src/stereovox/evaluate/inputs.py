@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a comparison is made of: maps of whatever program, and where a camera was."""
+"""Inputs of an evaluation: maps of stereovox or OctoMap, and camera paths."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from stereovox.maps.store import is_map
 from stereovox.safe_io import MAX_LIST, read_text
 
 COLUMNS = {3: (0, 1, 2), 8: (1, 2, 3), 9: (1, 2, 3), 12: (3, 7, 11), 16: (3, 7, 11)}
-"""Where x, y, z stand, by the numbers in a line: x y z; TUM's, with or without a confidence; 3x4 and 4x4 matrices."""
+"""Columns of x, y, z by the numbers in a line: x y z; TUM, with or without a confidence; 3x4 and 4x4 matrices."""
 
 
 STRAYING = 1.5
-"""Surfaces farther from the camera than this times the map's range were not seen from there."""
+"""A path fits only if surfaces lie within this many times the map's range."""
 
 
 def read_camera_path(path: str | Path) -> NDArray[np.float64]:
-    """Return the camera positions (P, 3) in metres of a text file with one pose a line; `#` begins a comment.
+    """Read camera positions (P, 3) in metres from a text file with one pose per line; `#` begins a comment.
 
     A line holds x y z, or `stamp x y z qx qy qz qw` (TUM), or the 12 (KITTI) or 16 numbers of a matrix row by row.
     Raises SourceError: one line with the file and what is wrong.
@@ -41,16 +41,16 @@ def read_camera_path(path: str | Path) -> NDArray[np.float64]:
 
 
 def path_fits(path: NDArray[np.float64], truth: TruthCells, max_range: float) -> bool:
-    """Tell whether a path (P, 3) passes the truth's surfaces: half of them lie within reach of a position.
+    """Return whether a path (P, 3) fits the truth: half of the surfaces lie within reach of a position.
 
-    max_range: of the map, in metres. A path in another frame than the map's world seldom does.
+    max_range: of the map, in metres. A path in a frame other than the map's world seldom fits.
     """
     surfaces = truth.centers()[truth.occupied]
     return bool(2 * np.count_nonzero(distances(surfaces, path) > STRAYING * max_range) <= len(surfaces))
 
 
 def read_map(path: str | Path) -> VoxelMap:
-    """Return the map in a stereovox folder or in an OctoMap file (`.bt`, `.ot`).
+    """Read a map from a stereovox folder or an OctoMap file (`.bt`, `.ot`).
 
     Raises MapFileError: one line with the file and what is wrong.
     """

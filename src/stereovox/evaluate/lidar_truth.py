@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is really there, from a recording's lidar (Valenti 2018, 8.2)."""
+"""Make ground truth from a recording's lidar (Valenti 2018, 8.2)."""
 
 from __future__ import annotations
 
@@ -24,15 +24,24 @@ from stereovox.sources.lidar import Box, LidarScan, LidarSource
 from stereovox.trust.history import History
 
 Corners = tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]
-"""p0 and its three neighbours p1, p3, p4 along the edges of a box; (3,) each."""
+"""Corner p0 of a box and its three neighbours p1, p3, p4 along the edges; (3,) each."""
+COARSE = 16
+"""The search starts with boxes this many blocks wide and halves them."""
+AT_ONCE = 2048
+"""Blocks processed together, so that their intermediate arrays stay in the cache."""
+OCTANTS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
+CELLS = np.stack(np.meshgrid(*[np.arange(SIDE)] * 3, indexing="ij"), axis=-1).reshape(-1, 3) + 0.5
+FREE = ("view", "rays")
+IN_VIEW, CROSSED, HIT = 1, 2, 4
+"""Marks of a cell: in view and range of a frame; crossed by a lidar ray; hit by a point."""
 
 
 def inside(points: NDArray[np.floating], corners: Corners) -> NDArray[np.bool_]:
-    """Tell which points (N, 3) lie in the box with these corners, its faces included (Valenti 2018, Eq A.1-A.3).
+    """Return which points (N, 3) lie in the box with these corners, faces included (Valenti 2018, Eq A.1-A.3).
 
-    As printed the test can never hold: u, v and w cannot all three point from p0 to the other corners, whatever their
-    order, since (p0 - p1) x (p0 - p4) is the negative of what is meant, and Eq A.2 compares x, y, z where p belongs.
-    Here v is turned round, and all three where the corners follow each other left-handed.
+    As printed the test can never hold: u, v and w cannot all point from p0 to the other corners, whatever their order,
+    since (p0 - p1) x (p0 - p4) has the wrong sign, and Eq A.2 compares x, y, z in place of p. Here v is negated, and
+    all three are where the corners are left-handed.
     """
     p0, p1, p3, p4 = corners
     a, b, c = p1 - p0, p3 - p0, p4 - p0
@@ -45,7 +54,7 @@ def inside(points: NDArray[np.floating], corners: Corners) -> NDArray[np.bool_]:
 
 
 def corners_of(box: Box, margin: float = 0.0) -> Corners:
-    """Return four corners of `box` in the world, grown by `margin` metres on each side."""
+    """Return four corners of `box` in the world, enlarged by `margin` metres per side."""
     half = np.array(box.size) / 2 + margin
     signs = [(-1, -1, -1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)]
     p0, p1, p3, p4 = transform_points(box.T_world_box, signs * half)
@@ -53,19 +62,11 @@ def corners_of(box: Box, margin: float = 0.0) -> Corners:
 
 
 def in_any_box(points: NDArray[np.floating], boxes: Iterable[Box], margin: float = 0.0) -> NDArray[np.bool_]:
-    """Tell which points (N, 3), metres in the world, lie in one of `boxes` grown by `margin` metres on each side."""
+    """Return which points (N, 3), metres in the world, in one of `boxes` enlarged by `margin` metres."""
     found = np.zeros(len(points), bool)
     for box in boxes:
         found |= inside(points, corners_of(box, margin))
     return found
-
-
-COARSE = 16
-"""The search starts with boxes this many blocks wide and halves them."""
-AT_ONCE = 2048
-"""Blocks looked at together: what is computed for them stays in the cache."""
-OCTANTS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
-CELLS = np.stack(np.meshgrid(*[np.arange(SIDE)] * 3, indexing="ij"), axis=-1).reshape(-1, 3) + 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,7 +83,7 @@ class Volume:
 
 
 def project(camera: PinholeCamera, points: NDArray[np.floating]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Return the pixels (N, 2) of points (N, 3) in the optical frame, and which fall into the image.
+    """Project points (N, 3) in the optical frame to pixels (N, 2), and return which fall into the image.
 
     The image reaches half a pixel beyond the centres of its outermost pixels. Pixels of points behind the camera are
     NaN.
@@ -97,7 +98,7 @@ def project(camera: PinholeCamera, points: NDArray[np.floating]) -> tuple[NDArra
 
 
 def view_volume(viewpoint: Viewpoint, max_range: float, voxel_size: float) -> Volume:
-    """Return what the camera sees up to `max_range` metres along its axis, in cells of `voxel_size`, world frame."""
+    """Return the view volume up to `max_range` metres along the axis, in cells of `voxel_size`, world frame."""
     camera, T = viewpoint.camera, viewpoint.T_world_camera
     left, right = camera.cx + 0.5, camera.width - 0.5 - camera.cx
     top, bottom = camera.cy + 0.5, camera.height - 0.5 - camera.cy
@@ -121,7 +122,7 @@ def blocks_in(volume: Volume) -> Iterator[tuple[NDArray[np.int32], NDArray[np.bo
 
 
 def _candidates(volume: Volume) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Return the blocks wholly in the volume, and those that may be in it in part."""
+    """Return the blocks wholly inside the volume, and those that may be partly inside."""
     size = COARSE
     low = np.floor(volume.low / (size * SIDE)).astype(int)
     counts = np.floor(volume.high / (size * SIDE)).astype(int) - low + 1
@@ -135,7 +136,7 @@ def _candidates(volume: Volume) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
 
 
 def _sides(volume: Volume, boxes: NDArray[np.int_], width: int) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Tell which boxes (n, 3), `width` cells wide, lie wholly in the volume and which perhaps partly."""
+    """Return which boxes (n, 3), `width` cells wide, lie wholly inside the volume, and which may be partly inside."""
     distance = (boxes + 0.5) * width @ volume.normals.T + volume.offsets
     reach = width / 2 * np.abs(volume.normals).sum(axis=1)
     wholly = (distance >= reach).all(axis=1)
@@ -154,17 +155,17 @@ def _pieces(blocks: NDArray[np.int32]) -> Iterator[NDArray[np.int32]]:
 
 
 def crossed_cells(origin: NDArray[np.float64], ends: NDArray[np.float64], voxel_size: float) -> Keys:
-    """Return the cells, as ascending keys without repeats, that the rays from `origin` (3,) to `ends` (N, 3) cross.
+    """Return the cells, as ascending unique keys, that the rays from `origin` (3,) to `ends` (N, 3) cross.
 
-    All in metres. Those that hold the ends belong to them.
+    All in metres. The cells of the ends are included.
     """
     start, stop = origin / voxel_size, ends / voxel_size
     cell = np.broadcast_to(np.floor(start), stop.shape).copy()
-    last, way = np.floor(stop), stop - start
-    step = np.where(way < 0, -1.0, 1.0)
+    last, ray = np.floor(stop), stop - start
+    step = np.where(ray < 0, -1.0, 1.0)
     with np.errstate(divide="ignore", invalid="ignore"):
-        per_cell = np.where(way == 0, np.inf, 1 / np.abs(way))  # share of the way from one face to the next
-        next_face = np.where(way == 0, np.inf, (cell + (step > 0) - start) / way)
+        per_cell = np.where(ray == 0, np.inf, 1 / np.abs(ray))  # share of the ray from one face to the next
+        next_face = np.where(ray == 0, np.inf, (cell + (step > 0) - start) / ray)
     left = np.abs(last - cell).sum(axis=1).astype(int)  # a ray crosses as many faces as its cells are apart
     found = [keys(last)]
     while len(cell):
@@ -178,18 +179,13 @@ def crossed_cells(origin: NDArray[np.float64], ends: NDArray[np.float64], voxel_
     return np.unique(np.concatenate(found))
 
 
-FREE = ("view", "rays")
-IN_VIEW, CROSSED, HIT = 1, 2, 4
-"""What is marked in a cell: some frame had it in view and range; a lidar ray crossed it; a point fell into it."""
-
-
 @dataclass
 class TruthCounts:
-    """What became of the lidar points, and the cells they made.
+    """Counts of lidar points and of the resulting cells.
 
-    frames: scans used; refused: how many were not, by reason; first_refusal: one line about the first of them.
-    points: of all scans used; of these `used` were taken, `out_of_range` of them from beyond the range of their own
-    frame; the others were dropped: outside the left image, in an annotated box, on pixels flagged moving.
+    frames: scans used; refused: number of others by reason; first_refusal: one line about the first of them.
+    points: of all scans used; `used` of them count, `out_of_range` of those from beyond the range of their own frame;
+    the others were dropped: outside the left image, in an annotated box, on pixels flagged as moving.
     """
 
     frames: int = 0
@@ -205,7 +201,7 @@ class TruthCounts:
     free: int = 0
 
     def as_dict(self) -> dict[str, Any]:
-        """Return all of it as plain numbers for a JSON object."""
+        """Return all counts for JSON."""
         plain = {name: value for name, value in vars(self).items() if name not in ("refused", "first_refusal")}
         return {**plain, "frames_refused": self.refused.total(), "refused": dict(self.refused.most_common())}
 
@@ -220,14 +216,14 @@ def lidar_truth(
     box_margin: float = 0.0,
     watch: Callable[[Iterable[int], int], Iterable[int]] | None = None,
 ) -> tuple[VoxelMap, TruthCounts]:
-    """Return the true map of a recording, and how it came about.
+    """Make the true map of a recording; return it with the counts behind it.
 
-    The cells that count have their centre in view of at least one frame, at most `max_range` metres away along the
-    optical axis. Of these, one is occupied where one lidar point of any frame falls into it that is in the left image,
-    outside every annotated box (grown by `box_margin` metres) and not on something moving; the lidar is as exact far
-    away, so what one frame sees beyond the range counts for a frame that has it within. Free are all others (`view`),
-    or only those that a lidar ray crosses (`rays`). The rest is unknown. The points of a cell are not weighed against
-    rays through it: one point is enough.
+    Cells count if their centre is in view of at least one frame, at most `max_range` metres away along the optical
+    axis. Such a cell is occupied where at least one lidar point of any frame lies in it, inside the left image, outside
+    every annotated box (enlarged by `box_margin` metres) and not on something moving; since lidar is as exact far away,
+    a point beyond the range of its own frame counts for a frame that has it within. The others are free (`view`), or
+    only those that a lidar ray crosses (`rays`). The rest is unknown. Points are not weighed against rays through the
+    same cell: one point is enough.
     frames: which frames, as `A:B:S` or numbers; None: all. Their images are not read. watch(numbers, count) yields the
     numbers again, for a progress bar.
     Raises SourceError where the source has no lidar or not one scan can be used, StereovoxError for bad values.
@@ -245,7 +241,7 @@ def lidar_truth(
 
 
 class _Truth:
-    """The marks of all cells so far."""
+    """Marks of all cells so far."""
 
     def __init__(self, source: LidarSource, config: Config, rays: bool, box_margin: float):
         self.source, self.config, self.rays, self.box_margin = source, config, rays, box_margin
@@ -254,7 +250,7 @@ class _Truth:
         self._last: Viewpoint | None = None
 
     def add(self, i: int) -> None:
-        """Mark what frame `i` says; a frame whose scan or pose cannot be used is counted and left out."""
+        """Mark the cells of frame `i`; a frame without a usable scan or pose is counted and skipped."""
         try:
             scan, viewpoint, moving = self.source.scan(i), self.source.viewpoint(i), self.source.moving(i)
             boxes = self.source.boxes(i)
@@ -343,7 +339,7 @@ def _no_lidar(source: Any) -> SourceError:
 
 
 def _on(moving: NDArray[np.bool_] | None, pixels: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Tell which of `pixels` (N, 2), all inside the image, are flagged in `moving` (height, width)."""
+    """Return which of `pixels` (N, 2), all inside the image, are flagged in `moving` (height, width)."""
     if moving is None:
         return np.zeros(len(pixels), bool)
     u, v = np.floor(pixels + 0.5).astype(int).T

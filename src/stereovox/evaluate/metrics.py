@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How well a map agrees with the truth, as pure functions on sets of cells and on arrays of yes and no."""
+"""Agreement of a map with the truth: pure functions on sets of cells and boolean arrays."""
 
 from __future__ import annotations
 
@@ -13,15 +13,19 @@ from stereovox.evaluate.cells import Keys, indices, keys, position, within
 from stereovox.evaluate.truth import Piece, Truth
 from stereovox.maps import State, VoxelMap
 
+MIN_SHARE = 0.9
+MAX_GAP = 0.1
+"""A piece is missing where a smaller share of its seen cells is found, or a gap is longer (in metres)."""
+
 
 def ratio(part: float, whole: float) -> float | None:
-    """Return part / whole, None where there is nothing to divide by."""
+    """Return part / whole, None where the whole is zero."""
     return float(part / whole) if whole else None
 
 
 @dataclass(frozen=True)
 class Confusion:
-    """Cells counted by what the map says (positive = occupied) and whether that is right."""
+    """Confusion matrix of cells (positive = called occupied)."""
 
     tp: int
     fp: int
@@ -30,7 +34,7 @@ class Confusion:
 
     @classmethod
     def count(cls, predicted: NDArray[np.bool_], actual: NDArray[np.bool_]) -> Confusion:
-        """Compare two arrays (N,) of yes and no."""
+        """Compare two boolean arrays (N,)."""
         tp, fp = int((predicted & actual).sum()), int((predicted & ~actual).sum())
         fn = int((~predicted & actual).sum())
         return cls(tp, fp, len(predicted) - tp - fp - fn, fn)
@@ -53,7 +57,7 @@ def compare(
     """Compare the known cells of a map with the true surface.
 
     known: the map's cells, ascending keys (N,); occupied: (N,) whether the map calls them occupied; surface and
-    excluded: sets of true cells; known cells in `excluded` do not count, whatever the map says of them.
+    excluded: sets of true cells; known cells in `excluded` do not count.
     tolerance_precision is the share of occupied cells with a surface cell within `tolerance` cells,
     tolerance_recall the share of known surface cells with an occupied cell within `tolerance` cells.
     """
@@ -92,10 +96,10 @@ def compare_map(voxel_map: VoxelMap, truth: Truth, tolerance: int = 1) -> dict[s
 
 @dataclass(frozen=True)
 class Found:
-    """How much of one piece of the scene stands in the map.
+    """How much of one piece of the scene is in the map.
 
-    seen: its cells that enough frames saw; exact: those that are occupied; near: those with an occupied cell within
-    the tolerance; longest_gap: the longest stretch in metres along the piece's longest axis where seen cells have none.
+    seen: its cells seen by enough frames; exact: those that are occupied; near: those with an occupied cell within the
+    tolerance; longest_gap: the longest stretch in metres along the piece's longest axis where seen cells have none.
     """
 
     part: str
@@ -107,16 +111,11 @@ class Found:
     missing: bool
 
 
-MIN_SHARE = 0.9
-MAX_GAP = 0.1
-"""A piece is missing where fewer of its seen cells are found, or where a gap is longer than this (or two cells)."""
-
-
 def find_piece(piece: Piece, seen: NDArray[np.bool_], occupied: Keys, voxel_size: float, tolerance: int = 1) -> Found:
-    """Tell how much of `piece` is among the `occupied` cells; `seen` (N,) marks the piece's cells that must be there.
+    """Find `piece` among the `occupied` cells; `seen` (N,) marks the piece's cells that must be there.
 
     The piece is missing when less than MIN_SHARE of those have an occupied cell within `tolerance` cells, or when
-    a stretch of it longer than MAX_GAP metres and two cells has none. A piece nobody saw is not missing.
+    a stretch of it longer than MAX_GAP metres and two cells has none. An unseen piece is not missing.
     """
     cells = piece.cells[seen]
     near = within(cells, occupied, tolerance)
@@ -141,9 +140,10 @@ def longest_gap(along: NDArray[np.float64], found: NDArray[np.bool_]) -> int:
 def find_pieces(
     voxel_map: VoxelMap, truth: Truth, frames_seen: NDArray[np.integer], min_frames: int = 20, tolerance: int = 1
 ) -> list[Found]:
-    """Look for every piece of the scene in the map.
+    """Find every piece of the scene in the map.
 
-    frames_seen: (N,) frames that saw each cell of `truth.surface`; cells with fewer than `min_frames` do not count.
+    frames_seen: (N,) number of frames that saw each cell of `truth.surface`; cells with fewer than `min_frames` do
+    not count.
     """
     known, state = known_cells(voxel_map)
     occupied = known[state == State.OCCUPIED]
@@ -160,7 +160,7 @@ def find_pieces(
 
 
 def by_part(pieces: list[Found]) -> dict[str, dict[str, Any]]:
-    """Return for each part its pieces, the names of missing ones, its seen cells, recalls and longest gap."""
+    """Summarise each part: number of pieces, names of missing ones, seen cells, recalls and longest gap."""
     parts: dict[str, list[Found]] = {}
     for piece in pieces:
         parts.setdefault(piece.part, []).append(piece)

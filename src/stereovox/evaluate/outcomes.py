@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which cells are right and which are wrong, one by one, for pictures."""
+"""Classify each cell as right or wrong, for pictures."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from stereovox.evaluate.truth_cells import Reading, TruthCells
 
 
 class Outcome(IntEnum):
-    """What came of a cell that the map or the truth calls occupied.
+    """Outcome of a cell that the map or the truth calls occupied.
 
     HIT: both do. NEAR: only the map does, but a surface is within the tolerance; FALSE: none is. FOUND: only the truth
     does, but the map has an occupied cell within the tolerance; MISSED: it has none; UNSEEN: it has none and has never
@@ -40,7 +40,7 @@ class Outcomes:
 
 
 def outcomes(reading: Reading, truth: TruthCells, threshold: float = 0.7) -> Outcomes:
-    """Return what came of each cell of the truth that the truth or the map calls occupied."""
+    """Return the outcome of each cell of the truth that the truth or the map calls occupied."""
     marked, actual = reading.marked(threshold), truth.occupied
     outcome = np.where(truth.near, Outcome.NEAR, Outcome.FALSE).astype(np.uint8)
     missed = np.where(reading.observed[actual], Outcome.MISSED, Outcome.UNSEEN)

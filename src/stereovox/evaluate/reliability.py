@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Do probabilities mean what they say? Of all cells with p = 0.8, 80 % should be occupied."""
+"""Calibration of probabilities: of all cells with p = 0.8, 80 % should be occupied."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ BINS = 10
 
 @dataclass(frozen=True, eq=False)
 class Reliability:
-    """Cells sorted by their probability into B bins of equal width; bin i holds edges[i] <= p < edges[i + 1].
+    """Cells binned by probability into B bins of equal width; bin i holds edges[i] <= p < edges[i + 1].
 
     edges: (B + 1,) from 0 to 1; count: (B,) cells; mean_p, occupied_share: (B,) mean probability and share of truly
     occupied cells, NaN in an empty bin.
@@ -33,7 +33,7 @@ class Reliability:
 
 
 def reliability(p: NDArray[np.floating], actual: NDArray[np.bool_], bins: int = BINS) -> Reliability:
-    """Compare probabilities (N,) in [0, 1] with what the cells are (N,). p = 1 belongs to the last bin."""
+    """Compare probabilities (N,) in [0, 1] with the true state (N,). p = 1 belongs to the last bin."""
     bin_of = np.minimum((p * bins).astype(np.int64), bins - 1)
     count = np.bincount(bin_of, minlength=bins)
     with np.errstate(invalid="ignore"):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How good is a map beside the truth? All measures of Valenti 2018, 8.3, and what they leave out."""
+"""Score a map against the truth: all measures of Valenti 2018, 8.3, and more."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _NOT_NUMBERS = {"observed", "reliability", "roc", "curve", "distance"}
 
 @dataclass(frozen=True)
 class Tally:
-    """Measures over one set of cells; None where there is nothing to divide by.
+    """Measures over one set of cells; None for a division by zero.
 
     cells: how many; tp, fp, tn, fn: counts, positive = called occupied; accuracy to npv: Eq 8.2 to 8.6; correlation:
     Pearson's, of probability and truth (Eq 8.8-8.9, divided by N); tolerance_precision: share of the cells called
@@ -46,9 +46,9 @@ class Tally:
 
 @dataclass(frozen=True)
 class QuickScores(Tally):
-    """What can be told after every frame. The measures of `Tally` over all cells of the truth, unobserved ones free.
+    """Scores that are cheap enough for every frame: `Tally` over all cells of the truth, unobserved ones as free.
 
-    threshold, tolerance_cells: as asked; coverage: share of the cells the map knows something about. Over observed
+    threshold, tolerance_cells: as asked; coverage: share of the cells that the map has observed. Over observed
     cells: error, mean squared error of the probabilities (Eq 8.7); brier, the same under its other name; ece, expected
     calibration error; observed, the measures of `Tally`.
     """
@@ -62,7 +62,7 @@ class QuickScores(Tally):
     observed: Tally
 
     def as_dict(self) -> dict[str, Any]:
-        """Return all single numbers, with `observed` as a dict: JSON without NaN."""
+        """Return all single numbers for JSON, with `observed` as a dict and without NaN."""
         numbers = {field.name: getattr(self, field.name) for field in fields(self) if field.name not in _NOT_NUMBERS}
         return {**numbers, "observed": asdict(self.observed)}
 
@@ -83,7 +83,7 @@ class Scores(QuickScores):
     distance: ByDistance | None
 
     def as_dict(self) -> dict[str, Any]:
-        """Return all single numbers, with `observed` as a dict: JSON without NaN."""
+        """Return all single numbers for JSON, with `observed` as a dict and without NaN."""
         numbers = super().as_dict()
         numbers["observed"]["auc"] = numbers.pop("observed_auc")
         return numbers
@@ -106,7 +106,7 @@ def score(
     `TruthCells`, made once for many maps, which has its own tolerance. threshold: a cell is called occupied where
     p > threshold (Eq 8.1). tolerance: cells along each axis. bins: of the reliability diagram; thresholds: (M,) of the
     curve of precision and recall. path: camera positions (P, 3) or one (3,) in metres, world frame, for `distance`;
-    edges: its rings in metres. Raises StereovoxError for maps of different cells, a truth that holds nothing, and
+    edges: its rings in metres. Raises StereovoxError for maps of different cell sizes, an empty truth, and
     numbers out of range.
     """
     truth = truth_map if isinstance(truth_map, TruthCells) else TruthCells(truth_map, tolerance)
@@ -126,7 +126,7 @@ def score(
 
 
 def score_reading(reading: Reading, truth: TruthCells, threshold: float = 0.7, bins: int = BINS) -> QuickScores:
-    """Return the measures that need no sorting: a few milliseconds for 100,000 cells."""
+    """Compute the scores that need no sorting: a few milliseconds for 100,000 cells."""
     seen, p, actual = reading.observed, reading.probability, truth.occupied
     marked, found = reading.marked(threshold), reading.found(threshold)
     close = ratio(float((marked & truth.near).sum()), float(marked.sum()))
@@ -152,7 +152,7 @@ def _tally(
     p: NDArray[np.float64],
     close: float | None,
 ) -> Tally:
-    """Return the measures over N cells; found: (S,) for each truly occupied one; close: the tolerance precision."""
+    """Compute the measures over N cells; found: (S,) for each truly occupied one; close: the tolerance precision."""
     counted = Confusion.count(marked, actual)
     return Tally(
         cells=len(actual),

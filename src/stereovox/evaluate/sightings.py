@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How many frames saw each cell of the truth."""
+"""Count the frames that saw each cell of the truth."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from stereovox.se3 import Transform
 
 
 class Sightings:
-    """Counts for every cell of a set the frames in which it was seen.
+    """Counts the frames in which each cell of a set was seen.
 
-    cells: the set, ascending keys (N,). frames: (N,) int32, frames that saw each.
+    cells: the set, ascending keys (N,). frames: (N,) int32, number of frames that saw each.
     """
 
     def __init__(self, cells: Keys, voxel_size: float):
@@ -26,7 +26,7 @@ class Sightings:
     ) -> None:
         """Count one frame: a cell is seen where a pixel of exact depth (height, width) up to `max_range` lands in it.
 
-        Depth is metres along the optical axis; pixels with inf, NaN or nothing above 0 see nothing.
+        Depth is in metres along the optical axis; pixels with inf, NaN or a value not above 0 see nothing.
         """
         x, y = camera.ray_slopes()
         depth = np.asarray(depth_m, float)

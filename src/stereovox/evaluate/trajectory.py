@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far an estimated trajectory is from the true one: ATE, RPE, and known relations between pairs of poses.
+"""Errors of an estimated trajectory: ATE, RPE, and known relations between pairs of poses.
 
-By hand, because evo is GPL-3 and this is Apache-2.0.
+Written by hand, because evo is GPL-3 and this is Apache-2.0.
 """
 
 from __future__ import annotations
@@ -22,12 +22,14 @@ from stereovox.sources.poses import Poses
 from stereovox.sources.trajectory import ns_from_seconds
 
 TOLERANCE_S = 0.05
-"""A relation whose time is further than this from any pose is not scored."""
+"""A relation whose times have no pose within this tolerance is not scored."""
+LEVER_M, MIN_LEVER_M = 0.3, 0.001
+"""Largest and smallest weight of headings in an alignment: that of a point this far ahead of the robot."""
 
 
 @dataclass(frozen=True, eq=False)
 class Relations:
-    """Known motions of a robot, most of them between neighbouring times, some between visits of one place.
+    """Known motions of a robot, mostly between neighbouring times, some between revisits of a place.
 
     stamps_ns: (N, 2) int64, the two times. motion: (N, 3) float64, pose_first_second (x, y, yaw).
     """
@@ -41,9 +43,9 @@ class Relations:
 
 @dataclass(frozen=True, eq=False)
 class RelationErrors:
-    """What is left between a trajectory's motions and the known ones.
+    """Differences between a trajectory's motions and the known ones.
 
-    metres, radians: (N,) absolute errors of the relations that have poses. missed: how many have none.
+    metres, radians: (N,) absolute errors of the relations that have poses. missed: number of those without.
     """
 
     metres: NDArray[np.float64]
@@ -62,12 +64,12 @@ class RelationErrors:
         return {name: (float(values.mean()), float(values.std())) for name, values in table.items()}
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the figures by name, as a command's result."""
+        """Return the figures by name, for JSON."""
         table = {name: {"mean": mean, "std": std} for name, (mean, std) in self.rows().items()}
         return {"relations": len(self.metres), "without_pose": self.missed, **table}
 
     def line(self) -> str:
-        """Return the figures in one line."""
+        """Format the figures in one line."""
         rows = self.rows()
         metres, degrees = ("{:.4f} +- {:.4f}".format(*rows[name]) for name in ("absolute_m", "absolute_deg"))
         missed = f", {self.missed} more have no pose" if self.missed else ""
@@ -75,9 +77,9 @@ class RelationErrors:
 
 
 def read_relations(path: str | os.PathLike[str]) -> Relations:
-    """Return the relations of a file with lines `time1 time2 x y z roll pitch yaw` (seconds, metres, radians).
+    """Read the relations of a file with lines `time1 time2 x y z roll pitch yaw` (seconds, metres, radians).
 
-    Raises SourceError, one line, where it cannot be read, a line does not make sense, or there is none.
+    Raises SourceError, one line, for an unreadable file, an invalid line, or a file without relations.
     """
     path = Path(path)
     try:
@@ -91,10 +93,10 @@ def read_relations(path: str | os.PathLike[str]) -> Relations:
 
 
 def _row(path: Path, number: int, line: str) -> tuple[int, int, float, float, float]:
-    words = line.split()
+    fields = line.split()
     try:
-        first, second = (ns_from_seconds(word) for word in words[:2])
-        x, y, _, _, _, yaw = (float(word) for word in words[2:])
+        first, second = (ns_from_seconds(field) for field in fields[:2])
+        x, y, _, _, _, yaw = (float(field) for field in fields[2:])
         if not np.isfinite([x, y, yaw]).all():
             raise ValueError
     except ValueError:
@@ -103,14 +105,14 @@ def _row(path: Path, number: int, line: str) -> tuple[int, int, float, float, fl
 
 
 def score_relations(track: Track, path: str | os.PathLike[str]) -> RelationErrors:
-    """Return how far a track's motions are from those in a `.relations` file."""
+    """Compare a track's motions with those in a `.relations` file."""
     return relation_errors(read_relations(path), track.stamps_ns, track.pose_map_base)
 
 
 def relation_errors(
     relations: Relations, stamps_ns: ArrayLike, poses: ArrayLike, tolerance_s: float = TOLERANCE_S
 ) -> RelationErrors:
-    """Return how far a trajectory's motions are from the known ones.
+    """Compare a trajectory's motions with known ones.
 
     stamps_ns: (M,) int64, rising. poses: (M, 3) pose_map_base. Each time of a relation takes the pose nearest in time.
     The error is delta (-) delta*, length and angle apart: independent of the map's frame (Kuemmerle 2009, Eq 7).
@@ -126,15 +128,11 @@ def relation_errors(
     return RelationErrors(np.hypot(left[:, 0], left[:, 1]), np.abs(left[:, 2]), int((~near).sum()))
 
 
-def _nearest(stamps: NDArray[np.int64], wanted: NDArray[np.int64]) -> NDArray[np.int64]:
-    after = np.clip(np.searchsorted(stamps, wanted), 1, max(len(stamps) - 1, 1))
+def _nearest(stamps: NDArray[np.int64], queries: NDArray[np.int64]) -> NDArray[np.int64]:
+    after = np.clip(np.searchsorted(stamps, queries), 1, max(len(stamps) - 1, 1))
     before = after - 1
     after = np.minimum(after, len(stamps) - 1)
-    return np.where(wanted - stamps[before] <= stamps[after] - wanted, before, after)
-
-
-LEVER_M, MIN_LEVER_M = 0.3, 0.001
-"""What headings weigh in an alignment at most and at least: that of a point so far ahead of the robot."""
+    return np.where(queries - stamps[before] <= stamps[after] - queries, before, after)
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,9 +140,9 @@ class TrajectoryError:
     """Differences between N estimated poses and the true ones of the same times.
 
     position_rms_m to position_max_m: metres; yaw_rms_deg, yaw_max_deg: degrees (ATE).
-    step_rms_m, step_yaw_rms_deg: of the motion over `step_m` metres of the true way (RPE); None where it is shorter.
-    poses: N; without_truth: estimated poses of whose time the truth says nothing.
-    motion: (3,) pose_truth_map by which the estimate was moved first; zero where it was not aligned.
+    step_rms_m, step_yaw_rms_deg: of motions over `step_m` metres of the true path (RPE); None where it is shorter.
+    poses: N; without_truth: estimated poses without a true one at their time.
+    motion: (3,) pose_truth_map by which the estimate was aligned first; zero where it was not.
     """
 
     position_rms_m: float
@@ -161,7 +159,7 @@ class TrajectoryError:
     motion: se2.Pose
 
     def as_dict(self) -> dict[str, Any]:
-        """Return all numbers: JSON without NaN."""
+        """Return all numbers for JSON, without NaN."""
         x, y, yaw = map(float, self.motion)
         return {**asdict(self), "motion": {"x": x, "y": y, "yaw_deg": float(np.degrees(yaw))}}
 
@@ -169,10 +167,10 @@ class TrajectoryError:
 def trajectory_error(track: Track, truth: Poses, align: bool = True, step_m: float = 1.0) -> TrajectoryError:
     """Compare a track with true poses of the robot's base.
 
-    align: move the whole track first, rigidly and without a scale, to where it lies best on the true poses
-    (`best_motion`); for SLAM, whose map stands in a frame of its own.
-    step_m: metres of the true way over which motions are compared.
-    Raises StereovoxError where the truth knows no time of the track.
+    align: first align the whole track with the true poses, rigidly and without scale (`best_motion`); for SLAM, whose
+    map has a frame of its own.
+    step_m: metres along the true path over which motions are compared.
+    Raises StereovoxError where no time of the track has a true pose.
     """
     true, known = true_poses(track.stamps_ns, truth)
     if not known.any():
@@ -199,7 +197,7 @@ def trajectory_error(track: Track, truth: Poses, align: bool = True, step_m: flo
 
 
 def true_poses(stamps_ns: NDArray[np.int64], truth: Poses) -> tuple[se2.Pose, NDArray[np.bool_]]:
-    """Return (N, 3) true poses at these times, NaN where there is none near enough, and (N,) whether there is one."""
+    """Return (N, 3) true poses at these times, NaN where none is near enough, and (N,) whether one is."""
     poses = np.full((len(stamps_ns), 3), np.nan)
     for i, stamp_ns in enumerate(stamps_ns.tolist()):
         try:
@@ -209,37 +207,37 @@ def true_poses(stamps_ns: NDArray[np.int64], truth: Poses) -> tuple[se2.Pose, ND
     return poses, np.isfinite(poses[:, 0])
 
 
-def best_motion(poses_here: ArrayLike, poses_there: ArrayLike) -> se2.Pose:
-    """Return (3,) pose_there_here that lays (N, 3) poses best on (N, 3) others, by least squares (Horn 1987).
+def best_motion(poses_source: ArrayLike, poses_target: ArrayLike) -> se2.Pose:
+    """Return (3,) pose_target_source that best aligns (N, 3) poses with (N, 3) others, by least squares (Horn 1987).
 
-    Nearly by positions alone, as is usual; but where the robot hardly went anywhere they do not tell the turn, and its
-    headings do. So a heading counts like a point ahead of the robot, as far as positions and headings are off from each
-    other (metres per radian), and LEVER_M at most.
+    Nearly by positions alone, as usual; but where the robot hardly moved, positions do not determine the rotation, and
+    headings do. So a heading counts like a point ahead of the robot, at a distance of the ratio of position to heading
+    errors (metres per radian), at most LEVER_M.
     """
-    here, there = np.asarray(poses_here, float), np.asarray(poses_there, float)
-    a, b = (poses[:, :2] - poses[:, :2].mean(axis=0) for poses in (here, there))
+    source, target = np.asarray(poses_source, float), np.asarray(poses_target, float)
+    a, b = (poses[:, :2] - poses[:, :2].mean(axis=0) for poses in (source, target))
     fit = complex((a * b).sum(), (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum())
-    turns = there[:, 2] - here[:, 2]
+    turns = target[:, 2] - source[:, 2]
     turn = complex(np.cos(turns).sum(), np.sin(turns).sum())
     off = np.sqrt(max((a**2).sum() + (b**2).sum() - 2 * abs(fit), 0.0))
     off_turn = np.sqrt((se2.wrapped(turns - np.angle(turn)) ** 2).sum())
     lever = np.clip(off / max(off_turn, 1e-12), MIN_LEVER_M, LEVER_M)
     yaw = float(np.angle(fit + lever**2 * turn))
-    shift = there[:, :2].mean(axis=0) - se2.transform((0, 0, yaw), here[:, :2].mean(axis=0)[None])[0]
+    shift = target[:, :2].mean(axis=0) - se2.transform((0, 0, yaw), source[:, :2].mean(axis=0)[None])[0]
     return np.array([*shift, yaw])
 
 
 def _gaps(true: se2.Pose, found: se2.Pose) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return metres and degrees between poses (N, 3)."""
+    """Return the distances in metres and degrees between poses (N, 3)."""
     between = se2.relative(true, found)
     return np.hypot(between[:, 0], between[:, 1]), np.degrees(np.abs(between[:, 2]))
 
 
 def _steps(poses: se2.Pose, true: se2.Pose, step_m: float) -> se2.Pose:
-    """Return the motions (M, 3) from each pose to the first that lies `step_m` further along the true way."""
-    way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(true[:, :2], axis=0).T))])
-    end = np.searchsorted(way, way + step_m - 1e-9)
-    start = np.flatnonzero(end < len(way))
+    """Return the motions (M, 3) from each pose to the first that lies `step_m` further along the true path."""
+    travelled = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(true[:, :2], axis=0).T))])
+    end = np.searchsorted(travelled, travelled + step_m - 1e-9)
+    start = np.flatnonzero(end < len(travelled))
     return se2.relative(poses[start], poses[end[start]])
 
 

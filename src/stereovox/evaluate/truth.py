@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The exact occupancy of a scene: which cells its surfaces touch, and which lie wholly in its solids.
+"""Exact occupancy of a scene: the cells that its surfaces touch, and those wholly inside its solids.
 
 Cell i covers [i, i + 1) * voxel_size on each axis. Exact means the triangle-box separating axis test (Akenine-Moeller
 2001), not samples on the surface.
@@ -19,6 +19,7 @@ from stereovox.simulate.scene import Scene, Solid
 
 _COARSE = 16
 """The search starts with cells this many times larger and halves them."""
+_OCTANTS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,10 +34,10 @@ class Piece:
 
 @dataclass(frozen=True, eq=False)
 class Truth:
-    """Exact occupancy. `surface` and `inside` are disjoint sets of cell keys; every other cell is free.
+    """Exact occupancy. `surface` and `inside` are disjoint sets of cell keys; all other cells are free.
 
-    surface: cells that a surface touches and that are not wholly in a solid.
-    inside: cells wholly in solids: no camera can see them, so they are neither right nor wrong to mark.
+    surface: cells that a surface touches and that are not wholly inside a solid.
+    inside: cells wholly inside solids: no camera sees them, so they do not count.
     pieces: the solids one by one.
     """
 
@@ -67,9 +68,9 @@ def exact_occupancy(scene: Scene, voxel_size: float) -> Truth:
 
 
 def touched_cells(triangles: NDArray[np.floating], voxel_size: float) -> NDArray[np.int32]:
-    """Return the cells (M, 3), ascending and each once, that any triangle (N, 3, 3) in metres touches.
+    """Return the cells (M, 3), ascending and unique, that any triangle (N, 3, 3) in metres touches.
 
-    A triangle that lies in the face between two cells belongs to the upper one.
+    A triangle in the face between two cells belongs to the upper one.
     """
     corners = np.asarray(triangles, float) / voxel_size
     size = _COARSE
@@ -83,11 +84,8 @@ def touched_cells(triangles: NDArray[np.floating], voxel_size: float) -> NDArray
         owner, cell = np.repeat(owner, 8), (2 * cell[:, None, :] + _OCTANTS).reshape(-1, 3)
 
 
-_OCTANTS = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
-
-
 def overlaps(triangles: NDArray[np.float64], low: NDArray[np.floating], size: float) -> NDArray[np.bool_]:
-    """Tell for each pair whether triangle (N, 3, 3) and box [low, low + size), low (N, 3), share a point.
+    """Return for each pair whether triangle (N, 3, 3) and box [low, low + size), low (N, 3), share a point.
 
     They do not where one of 13 directions separates them: the box's axes, the triangle's normal, and the products of
     box axes and triangle edges. A triangle that merely touches a box's edge or corner counts as sharing it.
@@ -116,9 +114,9 @@ def interior_cells(solid: Solid, voxel_size: float) -> NDArray[np.int32]:
 
 
 def covered(solids: Sequence[Solid], cell_keys: Keys, voxel_size: float) -> NDArray[np.bool_]:
-    """Tell which cells lie wholly in solids taken together: all eight corners and the centre are in some solid.
+    """Return which cells lie wholly inside the union of solids: all eight corners and the centre are in some solid.
 
-    Such cells hold the faces where two solids touch, which nobody can see.
+    Such cells hold the faces where two solids touch, which are invisible.
     """
     probes = np.concatenate([_OCTANTS, [[0.5, 0.5, 0.5]]])
     cell = indices(cell_keys)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A map of the truth, made ready to judge other maps by it."""
+"""Truth map prepared for scoring other maps."""
 
 from __future__ import annotations
 
@@ -16,13 +16,16 @@ from stereovox.maps import State, VoxelMap
 from stereovox.maps.cubes import in_cubes
 
 _STEPS: tuple[int, ...] = tuple((keys(np.eye(3, dtype=int)) - keys([0, 0, 0])).tolist())
-"""How much a key grows by one cell along x, y and z."""
+"""Difference of keys by one cell along x, y and z."""
 _FARTHEST_BLOCK = 1 << 17
-"""Keys know no block beyond."""
+"""Keys cannot hold blocks beyond."""
+MAX_TOLERANCE = 20
+_ROUNDING = 1e-6
+"""Log-odds are stored in steps of about a thousandth: closer to a threshold counts as equal to it."""
 
 
 class CellReader:
-    """Reads the log-odds of a fixed set of cells, whatever kind of map holds them.
+    """Reads the log-odds of a fixed set of cells from any kind of map.
 
     cells: the set, ascending keys (N,).
     """
@@ -35,7 +38,7 @@ class CellReader:
         self._place = (of_cell << 9) | (low[:, 0] << 6) | (low[:, 1] << 3) | low[:, 2]
 
     def log_odds(self, voxel_map: VoxelMap) -> NDArray[np.float32]:
-        """Return the log-odds (N,) of the cells in the order of their keys; exactly 0 where the map knows nothing."""
+        """Return the log-odds (N,) of the cells in the order of their keys; exactly 0 where unobserved."""
         kind = voxel_map.cell_format
         stored = np.full((len(self._blocks), 512), kind.unknown, kind.dtype)
         for coords, values in voxel_map.slabs():
@@ -46,9 +49,9 @@ class CellReader:
 
 
 class Neighbourhood:
-    """All cells at most `tolerance` cells away, along every axis, from a fixed set of cells.
+    """All cells within `tolerance` cells, along every axis, of a fixed set of cells.
 
-    cells: the set, ascending keys (S,); around: all cells within reach, the set's own with them, ascending keys (D,).
+    cells: the set, ascending keys (S,); around: all cells within reach, including the set, ascending keys (D,).
     """
 
     def __init__(self, cells: Keys, tolerance: int):
@@ -67,17 +70,12 @@ class Neighbourhood:
         return values
 
 
-MAX_TOLERANCE = 20
-_ROUNDING = 1e-6
-"""Log-odds are kept in steps of about a thousandth: what is nearer to a threshold than this is equal to it."""
-
-
 @dataclass(frozen=True, eq=False)
 class Reading:
-    """What a map says about the cells of the truth.
+    """Values of a map in the cells of the truth.
 
-    log_odds: (N,) float32 of each cell of the truth, 0 where the map knows nothing. best: (S,) float32, for each truly
-    occupied cell the highest log-odds that the map has within the tolerance, -inf where it knows nothing there.
+    log_odds: (N,) float32 of each cell of the truth, 0 where unobserved. best: (S,) float32, for each truly occupied
+    cell the highest log-odds of the map within the tolerance, -inf where all is unobserved.
     """
 
     log_odds: NDArray[np.float32]
@@ -85,16 +83,16 @@ class Reading:
 
     @property
     def observed(self) -> NDArray[np.bool_]:
-        """Cells (N,) that the map knows something about."""
+        """Cells (N,) that the map has observed."""
         return self.log_odds != 0
 
     @property
     def probability(self) -> NDArray[np.float64]:
-        """Probability (N,) that each cell is occupied, 0.5 where the map knows nothing."""
+        """Probability (N,) that each cell is occupied, 0.5 where unobserved."""
         return 1 / (1 + np.exp(-self.log_odds.astype(float)))
 
     def marked(self, threshold: float) -> NDArray[np.bool_]:
-        """Cells (N,) the map calls occupied, p > threshold (Valenti 2018, Eq 8.1); never one it knows nothing about."""
+        """Cells (N,) the map calls occupied, p > threshold (Valenti 2018, Eq 8.1); never an unobserved one."""
         return (self.log_odds > level(threshold)) & self.observed
 
     def found(self, threshold: float) -> NDArray[np.bool_]:
@@ -106,9 +104,9 @@ class TruthCells:
     """The cells of a truth map that count, and what lies within `tolerance` cells of its surfaces.
 
     truth_map: its occupied cells hold a surface, its free cells were in view and hold none; all others, tentative ones
-    too, are not judged. cells: ascending keys (N,) of those that count; occupied: (N,) which of them hold a surface;
+    too, do not count. cells: ascending keys (N,) of those that count; occupied: (N,) which of them hold a surface;
     near: (N,) which have a surface within the tolerance. Distances count along each axis: diagonal neighbours are one
-    cell away. Raises StereovoxError for a truth without such cells and a tolerance that is no number of cells.
+    cell away. Raises StereovoxError for a truth without such cells and an invalid tolerance.
     """
 
     def __init__(self, truth_map: VoxelMap, tolerance: int = 1):
@@ -130,7 +128,7 @@ class TruthCells:
         self._around = np.searchsorted(self._reader.cells, around)
 
     def read(self, voxel_map: VoxelMap) -> Reading:
-        """Return what `voxel_map` says. Raises StereovoxError where its cells are not those of the truth."""
+        """Read `voxel_map`. Raises StereovoxError where its cells are not those of the truth."""
         voxel_map = in_cubes(voxel_map)
         if not np.allclose(voxel_map.voxel_size, self.voxel_size, rtol=1e-5, atol=0):
             raise StereovoxError(

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The laboratory: papers, benchmarks and checks. Nothing of the product imports it."""
+"""Laboratory: papers, benchmarks, checks and the demo. Only the command line imports it."""

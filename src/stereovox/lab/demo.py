@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The demo: a simulated camera flies through the built-in room; map, picture and report are made and checked."""
+"""Demo: a simulated camera flies through the built-in room; map, picture and report are made and checked."""
 
 from __future__ import annotations
 

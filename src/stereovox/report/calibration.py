@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reports of calibrations: one page that holds everything, and its picture beside it."""
+"""Reports of calibrations: a self-contained page, and its picture as a file."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ FORMULAS = {
     "thesis": "true depth = z - (p1 X^2 + p2 X + p3)",
 }
 HOLD = "\u00a0"
-"""A space at which no line ends: a unit stays with its number."""
+"""No-break space: a unit stays with its number."""
 PERCENT = (
     "Errors are root mean squares over the wall of (depth - wall) / wall, of the mean of all frames. Walls may lean a "
     "little; how much was found together with the correction."
@@ -26,7 +26,7 @@ PERCENT = (
 
 
 def write_wall_report(folder: str | Path, found: WallCalibration, camera_file: str) -> Path:
-    """Write `wall.html` and `wall.png` into `folder`, made where it is missing, and return the page's path.
+    """Write `wall.html` and `wall.png` into `folder`, created if missing, and return the page's path.
 
     Raises StereovoxError where they cannot be written.
     """
@@ -41,7 +41,7 @@ def write_noise_report(folder: str | Path, found: NoiseCalibration, profile: str
 
 
 def wall_page(found: WallCalibration, png: bytes, camera_file: str) -> str:
-    """Return the page about a wall calibration as text."""
+    """Return the page of a wall calibration as text."""
     walls = [wall.as_dict() for wall in found.walls]
     model = found.correction.model
     boxes = [
@@ -63,7 +63,7 @@ def wall_page(found: WallCalibration, png: bytes, camera_file: str) -> str:
 
 
 def noise_page(found: NoiseCalibration, png: bytes, profile: str) -> str:
-    """Return the page about a noise calibration as text."""
+    """Return the page of a noise calibration as text."""
     width, height = found.region
     boxes = [(f"{found.s0:.3g}", "s0 [m]"), (f"{found.s1:.3g}", "s1"), (f"{found.s2:.3g}", "s2 [1/m]")]
     if found.subpixel is not None:
@@ -155,5 +155,5 @@ def _noise_table(found: NoiseCalibration) -> tuple[list[str], list[list[str]]]:
 
 
 def write_page(folder: Path, name: str, text: str, png: bytes) -> Path:
-    """Write NAME.html and NAME.png into `folder`, made where it is missing, and return the page's path."""
+    """Write NAME.html and NAME.png into `folder`, created if missing, and return the page's path."""
     return page.write_files(folder, {f"{name}.html": text.encode(), f"{name}.png": png})

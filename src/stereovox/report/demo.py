@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One page of HTML without any outside file: what was run, how fast it was, and how good the map is."""
+"""Report of the demo, a self-contained HTML page: the run, its speed, and the quality of the map."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ LABELS = {
 
 
 def write_report(path: str | Path, summary: dict[str, Any], picture: str | Path) -> None:
-    """Write the page of a demo run: `summary` as `cli.demo.demo` returns it, `picture` a PNG file to put inside.
+    """Write the page of a demo run: `summary` as `lab.demo.demo` returns it, `picture` a PNG file to embed.
 
     Raises StereovoxError when the file cannot be written.
     """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The report of an evaluation: one page with a table like Valenti 2018, Table 8.1, and what the measures mean."""
+"""Report of an evaluation: a page with a table like Valenti 2018, Table 8.1, and explanations of the measures."""
 
 from __future__ import annotations
 
@@ -73,10 +73,10 @@ class Evaluated:
 def write_evaluation_report(
     folder: str | Path, results: Sequence[Evaluated], truth: str, heading: str = "How good is the map?"
 ) -> Path:
-    """Write `evaluation.html` into `folder`, made where it is missing, and return its path.
+    """Write `evaluation.html` into `folder`, created if missing, and return its path.
 
-    truth: what the maps were compared with, in words or as a file name. Raises StereovoxError for no result at all and
-    where the page cannot be written.
+    truth: name of what the maps were compared with. Raises StereovoxError for no result at all and where the page
+    cannot be written.
     """
     return page.write_page(folder, "evaluation.html", evaluation_page(results, truth, heading))
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The folder that `--out` names."""
+"""Folder of the option `--out`."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from stereovox.errors import StereovoxError
 
 
 def out_folder(out: str | Path) -> Path:
-    """Return the folder `out`, made if need be; raises StereovoxError, one line, where that cannot be done."""
+    """Return the folder `out`, created if missing; raises StereovoxError, one line, where that fails."""
     folder = Path(out)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except (OSError, ValueError) as error:  # ValueError: a character 0
-        said = getattr(error, "strerror", None) or error
-        raise StereovoxError(f"{str(out)!r}: cannot make this folder ({said}); choose another --out") from None
+        reason = getattr(error, "strerror", None) or error
+        raise StereovoxError(f"{str(out)!r}: cannot make this folder ({reason}); choose another --out") from None
     return folder

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The report on a 2-D map beside another: Eq 7 of IST 2019 with its difference image, and what forgives a cell."""
+"""Report of a 2-D map against a reference: Eq 7 of IST 2019 with its difference image, and measures with tolerance."""
 
 from __future__ import annotations
 
@@ -37,9 +37,9 @@ DIFFERENCE = (
 def write_grid_report(
     folder: str | Path, scores: GridScores, laid: Laid, name: str = "The map", reference: str = "the reference"
 ) -> Path:
-    """Write `evaluation.html` and `difference.png`, a pixel for each cell, into `folder`; return the page's path.
+    """Write `evaluation.html` and `difference.png`, one pixel per cell, into `folder`; return the page's path.
 
-    name, reference: what the maps are called. Raises StereovoxError where they cannot be written.
+    name, reference: names of the maps. Raises StereovoxError where they cannot be written.
     """
     text = grid_page(scores, laid, name, reference)
     return page.write_files(folder, {"evaluation.html": text.encode(), "difference.png": binary_png(laid)})

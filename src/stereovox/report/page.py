@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Parts of a report: one page of HTML without any outside file. All texts are escaped here."""
+"""Building blocks of a report, a self-contained HTML page. All text is escaped here."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from stereovox.errors import StereovoxError
 from stereovox.safe_io import replacing
 
 MANY = 7
-"""Columns of a table up to which a page has room for large letters."""
+"""Largest number of columns that fit a page in large letters."""
 
 
 def page(title: str, lead: str, *parts: str) -> str:
-    """Return a whole page; `parts` are what the functions below return."""
+    """Return a whole page; `parts` are results of the functions below."""
     text = (files("stereovox.view") / "page.html").read_text(encoding="utf-8")
     fields = {"title": escape(title), "lead": escape(lead), "body": "\n".join(parts)}
     for name, value in fields.items():
@@ -27,7 +27,7 @@ def page(title: str, lead: str, *parts: str) -> str:
 
 
 def write_page(folder: str | Path, name: str, text: str) -> Path:
-    """Write a page into `folder`, made where it is missing, and return its path.
+    """Write a page into `folder`, created if missing, and return its path.
 
     Raises StereovoxError, one line, where it cannot be written.
     """
@@ -35,7 +35,7 @@ def write_page(folder: str | Path, name: str, text: str) -> Path:
 
 
 def write_files(folder: str | Path, contents: dict[str, bytes]) -> Path:
-    """Write files into `folder`, made where it is missing, each all or nothing; return the path of the first.
+    """Write files into `folder`, created if missing, each atomically; return the path of the first.
 
     Raises StereovoxError, one line, where one cannot be written.
     """
@@ -55,13 +55,13 @@ def section(heading: str, text: str, *parts: str) -> str:
 
 
 def tiles(pairs: Iterable[tuple[str, str]]) -> str:
-    """Return a row of boxes, each with a value and what it is."""
+    """Return a row of boxes, each with a value and its label."""
     boxes = (f'<div class="tile"><b>{escape(value)}</b><span>{escape(what)}</span></div>' for value, what in pairs)
     return f'<div class="tiles">{"".join(boxes)}</div>'
 
 
 def table(heads: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-    """Return a table; one of many columns is set smaller, so that it fits the page."""
+    """Return a table; many columns are set in smaller letters to fit the page."""
     head = "".join(f"<th>{escape(text)}</th>" for text in heads)
     body = "".join("<tr>" + "".join(f"<td>{escape(str(cell))}</td>" for cell in row) + "</tr>" for row in rows)
     size = "wide many" if len(heads) > MANY else "wide"
@@ -69,10 +69,10 @@ def table(heads: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
 
 
 def figure(png: bytes, alt: str) -> str:
-    """Return a picture that lies inside the page."""
+    """Return a picture embedded in the page."""
     return f'<img alt="{escape(alt)}" src="data:image/png;base64,{base64.b64encode(png).decode()}">'
 
 
 def code(text: str) -> str:
-    """Return text as it stands in a file."""
+    """Return preformatted text."""
     return f"<pre>{escape(text)}</pre>"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The report of a stereo calibration: what was seen, how well it fits, and a pair with its rows made one."""
+"""Report of a stereo calibration: the corners, how well they fit, and a rectified pair."""
 
 from __future__ import annotations
 
@@ -22,19 +22,20 @@ from stereovox.view.panels import GREY, title
 
 USED, DROPPED, ROW = "#2f9e62", "#d1603d", "#e8a33d"
 ACROSS = 3
-"""Pairs beside each other."""
-MOST = 24
-"""Pairs that are drawn; all stand in the table."""
+"""Pairs per row."""
+MAX_DRAWN = 24
+"""Largest number of pairs drawn; the table lists all."""
 ROWS = 15
-"""Lines through a rectified pair."""
+"""Number of lines through a rectified pair."""
 FIGURES = (
     "RMS: distance from each corner to where the calibration puts it, both images. Rows: how far the rows of one "
     "corner are apart after rectification; unseen: the same, by a calibration without this pair. All in pixels."
 )
+EYES = ("left", "right")
 
 
 def write_stereo_report(folder: str | Path, found: StereoCalibration, rig_file: str) -> Path:
-    """Write `stereo.html` and `stereo.png` into `folder`, made where it is missing, and return the page's path.
+    """Write `stereo.html` and `stereo.png` into `folder`, created if missing, and return the page's path.
 
     Raises StereovoxError where they cannot be written.
     """
@@ -43,20 +44,20 @@ def write_stereo_report(folder: str | Path, found: StereoCalibration, rig_file: 
 
 
 def stereo_page(found: StereoCalibration, png: bytes, rig_file: str) -> str:
-    """Return the page about a stereo calibration as text."""
-    told = found.as_dict()
+    """Return the page of a stereo calibration as text."""
+    figures = found.as_dict()
     boxes = [
-        (_pixels(told["rms_px"]), "corners missed by, RMS"),
-        (_pixels(told["epipolar_px"]), "rows apart, RMS"),
-        (_pixels(told["unseen_px"]), "rows apart in unseen pairs"),
-        (f"{1000 * told['baseline_m']:.2f} mm", "baseline"),
-        *((f"{a:.1f} x {b:.1f} deg", f"{eye} eye sees") for eye, (a, b) in zip(EYES, _fields(told), strict=True)),
+        (_pixels(figures["rms_px"]), "corners missed by, RMS"),
+        (_pixels(figures["epipolar_px"]), "rows apart, RMS"),
+        (_pixels(figures["unseen_px"]), "rows apart in unseen pairs"),
+        (f"{1000 * figures['baseline_m']:.2f} mm", "baseline"),
+        *((f"{a:.1f} x {b:.1f} deg", f"{eye} eye sees") for eye, (a, b) in zip(EYES, _fields(figures), strict=True)),
     ]
-    rows = [_row(pair) for pair in told["pairs"]]
+    rows = [_row(pair) for pair in figures["pairs"]]
     board = f"{found.board.columns}x{found.board.rows} inner corners of {1000 * found.board.square:g} mm"
     return page.page(
         "Stereo calibration",
-        f"{told['used']} of {len(rows)} pairs of images of a chessboard ({board}); {told['lens']} lenses. "
+        f"{figures['used']} of {len(rows)} pairs of images of a chessboard ({board}); {figures['lens']} lenses. "
         f"The result is in {rig_file}.",
         page.tiles(boxes),
         page.figure(png, "Corners found in each pair, and one pair rectified, with lines along its rows"),
@@ -66,25 +67,22 @@ def stereo_page(found: StereoCalibration, png: bytes, rig_file: str) -> str:
     )
 
 
-EYES = ("left", "right")
-
-
 def stereo_png(found: StereoCalibration) -> bytes:
     """Return a PNG: the corners of each pair, and the pair that fits worst of those used, rectified."""
-    shown = found.pairs[:MOST]
+    shown = found.pairs[:MAX_DRAWN]
     rows = -(-len(shown) // ACROSS)
     example = max(found.used, key=lambda pair: pair.rms_px)
     wide = _rectified(found, example)
     height = 16.0 * wide.shape[0] / wide.shape[1]
     small = rows * (16.0 / ACROSS * wide.shape[0] / wide.shape[1] + 0.45)
-    made = blank(WIDTH, small + height + 0.8)
-    above, below = made.subfigures(2, 1, height_ratios=[small, height + 0.8])
+    figure = blank(WIDTH, small + height + 0.8)
+    above, below = figure.subfigures(2, 1, height_ratios=[small, height + 0.8])
     for axis, pair in zip(above.subplots(rows, ACROSS, squeeze=False).flat, shown, strict=False):
         _corners(axis, pair)
     for axis in above.axes:
         axis.set_axis_off()
     _lines(below.subplots(), wide, example.name)
-    return png_of(made, DPI)
+    return png_of(figure, DPI)
 
 
 def _corners(axis: Any, pair: BoardPair) -> None:
@@ -97,8 +95,8 @@ def _corners(axis: Any, pair: BoardPair) -> None:
             if corners is not None:
                 axis.plot(corners[:, 0] + shift, corners[:, 1], "-", color=colour, linewidth=0.6, alpha=0.7)
                 axis.plot(corners[:, 0] + shift, corners[:, 1], ".", color=colour, markersize=3)
-    said = pair.why or f"RMS {pair.rms_px:.2f} px, rows {pair.epipolar_px:.2f} px"
-    title(axis, f"{pair.name}: {said if len(said) < 48 else said[:45] + '...'}")
+    text = pair.why or f"RMS {pair.rms_px:.2f} px, rows {pair.epipolar_px:.2f} px"
+    title(axis, f"{pair.name}: {text if len(text) < 48 else text[:45] + '...'}")
 
 
 def _rectified(found: StereoCalibration, pair: BoardPair) -> NDArray[np.uint8]:
@@ -120,8 +118,8 @@ def _lines(axis: Any, wide: NDArray[np.uint8], name: str) -> None:
     title(axis, f"{name}, rectified")
 
 
-def _fields(told: dict[str, Any]) -> list[tuple[float, float]]:
-    return told["field_of_view_deg"]
+def _fields(figures: dict[str, Any]) -> list[tuple[float, float]]:
+    return figures["field_of_view_deg"]
 
 
 def _row(pair: dict[str, Any]) -> list[str]:

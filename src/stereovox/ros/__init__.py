@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A live ROS 2 node: messages become frames, frames a map, the map messages. `node.py` shows how."""
+"""ROS 2 node: messages become frames, frames update the map, the map is published. Start reading at `node.py`."""

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From messages, as bytes of CDR, to frames and scans, by the readers that read bags: a bag and its replay are one.
+"""Convert messages (CDR bytes) to frames and scans with the bag readers, so that a bag and its replay give the same.
 
-A frame waits until its pose is there, so an input reads a message twice: `header` says when and where it was taken,
-`frame` makes the frame of it. Whatever a message holds, `frame` returns one: with a `fault` where it cannot be used.
+A frame waits for its pose, so a message is read twice: `header` gives its time and frame, `frame` converts it. Whatever
+a message holds, `frame` returns a frame: with a `fault` where it cannot be used.
 """
 
 from __future__ import annotations
@@ -31,7 +31,12 @@ from stereovox.sources.robots.bag import posed_scan
 from stereovox.sources.robots.cloud_scan import CloudBand, scan_of_cloud
 
 EXACT = 1e-6
-"""Pixels by which disparities of a lidar, if it had some, were off: what the settings say of `noise` counts alone."""
+"""Disparity error in pixels of a lidar, practically zero: only the settings under `noise` count."""
+NO_POSE = np.full((4, 4), np.nan)
+NO_CAMERA = PinholeCamera(1, 1, 1.0, 1.0, 0.0, 0.0)
+COMPRESSED = "/compressedDepth"
+PoseLookup = Callable[[str, int], Pose]
+"""Returns the pose of a frame (by its name) at a time in nanoseconds; raises FrameRefused."""
 
 
 def frame_of_cloud(cloud: PointCloud, T_world_sensor: Transform, step_deg: float, name: str, sensor: str) -> Frame:
@@ -68,37 +73,30 @@ def _eye(step_deg: float) -> tuple[SphericalCamera, NDArray[np.int64], SphereLay
     return camera, columns, layout
 
 
-NOWHERE = np.full((4, 4), np.nan)
-NO_CAMERA = PinholeCamera(1, 1, 1.0, 1.0, 0.0, 0.0)
-COMPRESSED = "/compressedDepth"
-Place = Callable[[str, int], Pose]
-"""Tells where a frame (by its name) stood at a time; raises FrameRefused."""
-
-
 class Input(Protocol):
-    """One topic with something to map. kind: its message type as `package/Name`."""
+    """Input topic of the map. kind: its message type as `package/Name`."""
 
     topic: str
     kind: str
 
     @property
     def ready(self) -> bool:
-        """Whether all is there, but for the pose, that its messages need."""
+        """Whether everything but the pose is there to convert messages."""
         return True
 
-    def frame(self, data: bytes, where: Place) -> Frame | Scan:
-        """Return what a message shows; its `fault` says why it cannot be used."""
+    def frame(self, data: bytes, where: PoseLookup) -> Frame | Scan:
+        """Convert a message; the `fault` of the result says why it cannot be used."""
         ...
 
 
 def header(data: bytes) -> tuple[int, str]:
-    """Return time in nanoseconds and frame of a message that begins with a header; raises ValueError."""
+    """Read time in nanoseconds and frame from the header at the start of a message; raises ValueError."""
     stamp_ns, frame_id = Wire(data, cdr=True).header()
     return stamp_ns, frame_name(frame_id)
 
 
 class DepthInput(Input):
-    """Depth images (16UC1, 32FC1, or compressedDepth by the topic's name) and the camera_info that belongs to them."""
+    """Depth images (16UC1, 32FC1, or compressedDepth, by the topic's name) and their camera_info."""
 
     def __init__(self, topic: str, info: str = ""):
         self.topic, self._packed = topic, topic.endswith(COMPRESSED)
@@ -112,22 +110,22 @@ class DepthInput(Input):
         """Whether the camera is known."""
         return self._camera is not None
 
-    def take_info(self, data: bytes) -> None:
-        """Take in a `sensor_msgs/CameraInfo`; the newest one that can be counts."""
+    def on_camera_info(self, data: bytes) -> None:
+        """Process a `sensor_msgs/CameraInfo`; the newest valid one counts."""
         try:
             camera = camera_of(read_camera_info(Wire(data, cdr=True)), RECTIFIED.search(self.topic) is not None)
         except (StereovoxError, ValueError) as error:
             self._trouble = f"{self.info}: {error}"
             return
-        if camera != self._camera:  # the same object lets tables that were made for it be found quickly
+        if camera != self._camera:  # keep the same object: tables are cached by it
             self._camera = camera
 
-    def frame(self, data: bytes, where: Place) -> Frame:
-        """Return a depth image."""
-        blank = Frame(np.empty((0, 0), np.uint16), NO_CAMERA, NOWHERE, name=self.topic, sensor=self.topic)
+    def frame(self, data: bytes, where: PoseLookup) -> Frame:
+        """Convert a depth image."""
+        blank = Frame(np.empty((0, 0), np.uint16), NO_CAMERA, NO_POSE, name=self.topic, sensor=self.topic)
         try:
             stamp_ns, frame_id = header(data)
-            blank = replace(blank, stamp_ns=stamp_ns, name=_named(self.topic, stamp_ns))
+            blank = replace(blank, stamp_ns=stamp_ns, name=_frame_title(self.topic, stamp_ns))
             if self._camera is None:
                 raise FrameRefused("no_camera", self._trouble)
             wire, size = Wire(data, cdr=True), (self._camera.width, self._camera.height)
@@ -143,68 +141,68 @@ class DepthInput(Input):
 
 
 class CloudInput(Input):
-    """Point clouds for a map in space; see `frame_of_cloud`."""
+    """Point clouds for a 3-D map; see `frame_of_cloud`."""
 
     kind = "sensor_msgs/PointCloud2"
 
     def __init__(self, topic: str, step_deg: float):
         self.topic, self._step_deg = topic, step_deg
 
-    def frame(self, data: bytes, where: Place) -> Frame:
-        """Return a cloud as a depth image all round."""
+    def frame(self, data: bytes, where: PoseLookup) -> Frame:
+        """Convert a cloud to a spherical depth image."""
         try:
             cloud = read_point_cloud(Wire(data, cdr=True))
-            name = _named(self.topic, cloud.stamp_ns)
+            name = _frame_title(self.topic, cloud.stamp_ns)
             T_world_sensor, _, off_ns = where(frame_name(cloud.frame_id), cloud.stamp_ns)
             frame = frame_of_cloud(cloud, T_world_sensor, self._step_deg, name, self.topic)
         except (FrameRefused, ValueError) as error:
-            blank = Frame(np.empty((0, 0), np.uint16), NO_CAMERA, NOWHERE, name=self.topic, sensor=self.topic)
+            blank = Frame(np.empty((0, 0), np.uint16), NO_CAMERA, NO_POSE, name=self.topic, sensor=self.topic)
             return replace(blank, **_fault(error, self.topic))
         return replace(frame, pose_off_ns=off_ns)
 
 
 class FloorCloudInput(Input):
-    """Point clouds for the map of a floor: what a 2-D lidar would see of them (`sources.cloud_scan`)."""
+    """Point clouds for a floor map, reduced to what a 2-D lidar would see (`sources.cloud_scan`)."""
 
     kind = "sensor_msgs/PointCloud2"
 
     def __init__(self, topic: str):
         self.topic = topic
 
-    def frame(self, data: bytes, where: Place) -> Scan:
-        """Return a cloud as a scan."""
+    def frame(self, data: bytes, where: PoseLookup) -> Scan:
+        """Convert a cloud to a scan."""
         try:
             cloud = read_point_cloud(Wire(data, cdr=True))
             T_world, T_base, off_ns = where(frame_name(cloud.frame_id), cloud.stamp_ns)
-            told, T_base_scan = scan_of_cloud(cloud, T_base, CloudBand())
+            scan_message, T_base_scan = scan_of_cloud(cloud, T_base, CloudBand())
         except (FrameRefused, ValueError) as error:
             return _no_scan(self.topic, error)
         T_world_scan = T_world @ inverse(T_base) @ T_base_scan
-        scan = posed_scan(told, T_world_scan, T_base_scan, _named(self.topic, cloud.stamp_ns), off_ns)
+        scan = posed_scan(scan_message, T_world_scan, T_base_scan, _frame_title(self.topic, cloud.stamp_ns), off_ns)
         return replace(scan, sensor=self.topic)
 
 
 class ScanInput(Input):
-    """Scans of a 2-D lidar, for the map of a floor."""
+    """Scans of a 2-D lidar for a floor map."""
 
     kind = "sensor_msgs/LaserScan"
 
     def __init__(self, topic: str):
         self.topic = topic
 
-    def frame(self, data: bytes, where: Place) -> Scan:
-        """Return a scan."""
+    def frame(self, data: bytes, where: PoseLookup) -> Scan:
+        """Convert a laser scan."""
         try:
-            told = read_laser_scan(Wire(data, cdr=True))
-            T_world, T_base, off_ns = where(frame_name(told.frame_id), told.stamp_ns)
+            scan_message = read_laser_scan(Wire(data, cdr=True))
+            T_world, T_base, off_ns = where(frame_name(scan_message.frame_id), scan_message.stamp_ns)
         except (FrameRefused, ValueError) as error:
             return _no_scan(self.topic, error)
-        scan = posed_scan(told, T_world, T_base, _named(self.topic, told.stamp_ns), off_ns)
+        scan = posed_scan(scan_message, T_world, T_base, _frame_title(self.topic, scan_message.stamp_ns), off_ns)
         return replace(scan, sensor=self.topic)
 
 
 def _no_scan(topic: str, error: Exception) -> Scan:
-    blank = Scan(np.empty(0, np.float32), 0.0, 0.0, 0.0, 0.0, NOWHERE, name=topic, sensor=topic)
+    blank = Scan(np.empty(0, np.float32), 0.0, 0.0, 0.0, 0.0, NO_POSE, name=topic, sensor=topic)
     return replace(blank, **_fault(error, topic))
 
 
@@ -214,5 +212,5 @@ def _fault(error: Exception, name: str) -> dict[str, str]:
     return {"fault": "unreadable", "fault_detail": f"{name}: {error}; the message is damaged"}
 
 
-def _named(topic: str, stamp_ns: int) -> str:
+def _frame_title(topic: str, stamp_ns: int) -> str:
     return f"{topic} {seconds_from_ns(stamp_ns)}"

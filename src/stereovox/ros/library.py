@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""ROS 2's own packages, of the wheels on PyPI or of a sourced distribution; imported when they are needed."""
+"""Lazy imports of ROS 2 packages, from PyPI wheels or from a sourced distribution."""
 
 from __future__ import annotations
 
@@ -11,22 +11,24 @@ from typing import Any
 from stereovox.errors import MissingExtra, StereovoxError
 
 NAME = "stereovox"
+REQUIRED = ("rclpy", "sensor_msgs", "nav_msgs", "geometry_msgs", "diagnostic_msgs", "std_srvs")
+"""Packages that the node cannot do without."""
 
 
 @contextmanager
-def running_node(words: Sequence[str]) -> Iterator[Any]:
-    """Give a node of rclpy with the parameters that `words` name, which stand behind --ros-args.
+def running_node(arguments: Sequence[str]) -> Iterator[Any]:
+    """Yield an rclpy node with the parameters in `arguments`, those after --ros-args.
 
-    Signals are left alone. Raises StereovoxError, one line, for words that ROS does not know.
+    Signal handlers stay as they are. Raises StereovoxError, one line, for arguments unknown to ROS.
     """
     import rclpy
     from rclpy.signals import SignalHandlerOptions
 
     try:
-        rclpy.init(args=["--ros-args", *words], signal_handler_options=SignalHandlerOptions.NO)
+        rclpy.init(args=["--ros-args", *arguments], signal_handler_options=SignalHandlerOptions.NO)
         node = rclpy.create_node(NAME, automatically_declare_parameters_from_overrides=True)
     except Exception as error:  # rclpy's C library has many
-        raise StereovoxError(f"--ros-args {' '.join(words)}: {error}") from None
+        raise StereovoxError(f"--ros-args {' '.join(arguments)}: {error}") from None
     try:
         yield node
     finally:
@@ -34,13 +36,9 @@ def running_node(words: Sequence[str]) -> Iterator[Any]:
         rclpy.try_shutdown()
 
 
-ALWAYS = ("rclpy", "sensor_msgs", "nav_msgs", "geometry_msgs", "diagnostic_msgs", "std_srvs")
-"""Packages that the node needs in any case."""
-
-
 def check_installed() -> None:
-    """Raise MissingExtra, one line, where a package that the node cannot do without is not there."""
-    for package in ALWAYS:
+    """Raise MissingExtra, one line, where a required package is not installed."""
+    for package in REQUIRED:
         try:
             import_module(package)
         except ImportError:
@@ -48,7 +46,7 @@ def check_installed() -> None:
 
 
 def optional_message(package: str, name: str) -> Any | None:
-    """Return a message class of a package that need not be there, else None."""
+    """Return a message class of an optional package, None where it is not installed."""
     try:
         return getattr(import_module(f"{package}.msg"), name)
     except ImportError:

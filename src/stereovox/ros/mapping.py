@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The map that a node makes: its mapper, which another one replaces when a map is loaded or reset."""
+"""Map of the node: owns the mapper and replaces it when a map is loaded or reset."""
 
 from __future__ import annotations
 
@@ -21,12 +21,13 @@ from stereovox.trust.history import History
 
 
 class Mapping:
-    """A map in space or of a floor, as the settings say, seen from above.
+    """A 3-D map or a floor map, as the settings say, and its 2-D projection.
 
-    heights: between which obstacles mark the 2-D map of one in space. tiles: folder for cells that leave a window.
+    heights: range in metres in which obstacles mark the 2-D map of a 3-D map. tiles: folder for cells outside the
+    window.
 
     Attributes:
-        mapper: Makes the map; after `load` and `reset` another one.
+        mapper: The current mapper; `load` and `reset` replace it.
     """
 
     mapper: AnyMapper[Any]  # the node offers it only what its options allow
@@ -37,28 +38,28 @@ class Mapping:
 
     @property
     def config(self) -> Config:
-        """The settings of the map."""
+        """Settings of the map."""
         return self.mapper.config
 
     @property
     def history(self) -> History:
-        """What the map remembers of its frames."""
+        """History of the map's frames."""
         return self.mapper.map.history
 
-    def add(self, seen: Frame | Scan) -> UpdateReport:
-        """Take in a frame or scan."""
-        return self.mapper.add(seen)
+    def add(self, frame: Frame | Scan) -> UpdateReport:
+        """Add a frame or scan to the map."""
+        return self.mapper.add(frame)
 
     def health(self) -> Health:
         """Return how current the map is."""
         return self.mapper.health()
 
     def grid(self) -> OccupancyGrid | None:
-        """Return the map from above; None where nothing is known."""
+        """Return the 2-D map; None where nothing is known."""
         return self._above()
 
     def snapshot(self) -> Callable[[], VoxelMap] | None:
-        """Return what makes a copy of the cells in memory, in whatever thread; None for what is not in space."""
+        """Return a function that copies the cells in memory, callable from any thread; None for a floor map."""
         voxel_map = self.mapper.map
         if not isinstance(voxel_map, VoxelMap):
             return None
@@ -72,11 +73,11 @@ class Mapping:
         return copy
 
     def save(self, path: str) -> None:
-        """Save the map, all or nothing; raises MapFileError."""
+        """Save the map atomically; raises MapFileError."""
         self.mapper.save(path)
 
     def load(self, path: str) -> None:
-        """Go on with a saved map; raises StereovoxError, and changes nothing, where that cannot be."""
+        """Continue a saved map; raises StereovoxError, and changes nothing, where that is impossible."""
         if self.config.dimensions == 2:
             floor = read_map_server(path)
             self._begin_floor(load_config(self.config, voxel_size=floor.resolution), floor)
@@ -87,12 +88,12 @@ class Mapping:
             self._begin_space(self.config, saved)
 
     def reset(self) -> None:
-        """Begin anew with an empty map."""
+        """Start again with an empty map."""
         self.close()
         self._begin(self.config)
 
     def close(self) -> None:
-        """Give back what the map holds on disk."""
+        """Release the files that the map holds open."""
         self.mapper.close()
 
     def _begin(self, config: Config) -> None:

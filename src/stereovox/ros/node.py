@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The node: messages wait until their pose is there, become frames, the map takes them in, and is published.
+"""The node: messages wait for their pose, become frames and update the map, which is published.
 
-All happens in one thread, between two waits for messages; so nothing needs a lock, and a service meets a whole frame.
+Everything runs in one thread between two waits for messages, so nothing needs a lock and services run between frames.
 """
 
 from __future__ import annotations
@@ -14,23 +14,23 @@ from typing import Any
 from stereovox.frame import UpdateReport
 from stereovox.ros.inputs import CloudInput, DepthInput, FloorCloudInput, Input, ScanInput, header
 from stereovox.ros.mapping import Mapping
-from stereovox.ros.options import Options, pair_of
+from stereovox.ros.options import Options, split_pair
 from stereovox.ros.outputs import Outputs
-from stereovox.ros.poses import Whereabouts, fixed_transform
+from stereovox.ros.poses import PoseBuffer, fixed_transform
 from stereovox.ros.services import Services
 from stereovox.ros.subscriptions import Silence, Subscriptions
 from stereovox.ros.waiting import Arrival, Waiting
 
 IDLE_S, SOON_S = 0.05, 0.005
-"""Seconds to wait for messages: when nothing is to be done, and when something will be due soon."""
+"""Seconds to wait for messages: when idle, and while frames are waiting."""
 MAX_AT_ONCE = 256
-"""Messages that are taken in before the map has its turn."""
+"""Messages that are received before the next frame is mapped."""
 
 
 class MapNode:
-    """Makes a map of what comes on topics. node: rclpy's; told: called with what became of each frame.
+    """Maps live topics. node: rclpy's; on_report: called with the report of each frame.
 
-    Raises StereovoxError, one line, for options that cannot be.
+    Raises StereovoxError, one line, for invalid options.
     """
 
     def __init__(
@@ -39,28 +39,28 @@ class MapNode:
         mapping: Mapping,
         options: Options,
         out: Callable[[], str],
-        told: Callable[[UpdateReport], None] = lambda report: None,
+        on_report: Callable[[UpdateReport], None] = lambda report: None,
     ):
         from rclpy.executors import SingleThreadedExecutor
 
-        self._node, self._mapping, self._told = node, mapping, told
+        self._node, self._mapping, self._on_report = node, mapping, on_report
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(node)
-        self._where = Whereabouts(options.world_frame, options.base_frame, options.extrapolate_s)
+        self._poses = PoseBuffer(options.world_frame, options.base_frame, options.extrapolate_s)
         for text in options.fixed:
             parent, child, numbers = fixed_transform(text)
-            self._where.tf.add(parent, child, 0, numbers, fixed=True)
+            self._poses.tf.add(parent, child, 0, numbers, fixed=True)
         self._inputs = {one.topic: one for one in _inputs(options, mapping.config.dimensions)}
         wait_ns, late_ns = round(1e9 * options.wait_s), round(1e9 * options.late_s)
         self.waiting: Waiting[bytes] = Waiting(options.queue, wait_ns, late_ns, monotonic_ns)
         self.received: Counter[str] = Counter()
         self._outputs = Outputs(node, mapping, options, self.counts)
         Services(node, mapping, out, self._renewed)
-        self._heard = Subscriptions(node, options, self._where, self._inputs, self._arrived)
+        self._subscriptions = Subscriptions(node, options, self._poses, self._inputs, self._arrived)
         self._silence = Silence(node, self._inputs, self.received)
 
     def counts(self) -> dict[str, Any]:
-        """Return how many messages came, were dropped and wait, and what was refused why."""
+        """Return the numbers of messages received, dropped and waiting, and of refused frames by reason."""
         history = self._mapping.history
         return {
             "received": self.received.total(),
@@ -68,31 +68,31 @@ class MapNode:
             "waiting": len(self.waiting),
             "frames_in_map": history.frames,
             "refused_ever": dict(history.refused),
-            "transforms_unreadable": self._where.tf.unreadable,
+            "transforms_unreadable": self._poses.tf.unreadable,
         }
 
     def spin_once(self) -> None:
-        """Take in what has come, map one frame, publish what is due."""
-        self._take_in(SOON_S if len(self.waiting) else IDLE_S)
-        arrival = self.waiting.take(self._ready)
+        """Receive messages, map one frame, publish what is due."""
+        self._receive(SOON_S if len(self.waiting) else IDLE_S)
+        arrival = self.waiting.pop(self._ready)
         if arrival is not None:
             self._map(arrival)
         self._outputs.update()
         self._silence.update()
 
     def close(self) -> None:
-        """Map what still waits, and publish the last map."""
-        while (arrival := self.waiting.take(lambda one: True)) is not None:
+        """Map all waiting frames and publish the final map."""
+        while (arrival := self.waiting.pop(lambda one: True)) is not None:
             self._map(arrival)
         self._outputs.close()
 
-    def _take_in(self, wait_s: float) -> None:
-        """Wait for messages, and take in all that are there."""
-        idle = 0  # rclpy returns empty-handed once after each round of what was ready, whether or not more came
+    def _receive(self, wait_s: float) -> None:
+        """Wait for messages and receive all that are there."""
+        idle = 0  # rclpy returns without a message once after each round of ready ones, even if more have arrived
         for _ in range(MAX_AT_ONCE):
-            before = self._heard.messages
+            before = self._subscriptions.messages
             self._executor.spin_once(timeout_sec=wait_s)
-            idle = idle + 1 if self._heard.messages == before else 0
+            idle = idle + 1 if self._subscriptions.messages == before else 0
             if idle == 2:
                 break
             wait_s = 0.0
@@ -101,28 +101,28 @@ class MapNode:
         self.received[topic] += 1
         try:
             stamp_ns, frame_id = header(data)
-        except ValueError:  # there is nothing to wait for: it is refused in its turn
+        except ValueError:  # no pose to wait for: it is refused in its turn
             stamp_ns, frame_id = 0, ""
         self.waiting.put(topic, stamp_ns, frame_id, data)
 
     def _ready(self, one: Arrival[bytes]) -> bool:
-        return self._inputs[one.sensor].ready and self._where.settled(one.frame_id, one.stamp_ns)
+        return self._inputs[one.sensor].ready and self._poses.is_final(one.frame_id, one.stamp_ns)
 
     def _map(self, one: Arrival[bytes]) -> None:
-        report = self._mapping.add(self._inputs[one.sensor].frame(one.content, self._where.pose))
-        self._told(report)
+        report = self._mapping.add(self._inputs[one.sensor].frame(one.content, self._poses.pose))
+        self._on_report(report)
         if report.refused:
             self._node.get_logger().warning(f"refused: {report.detail}", throttle_duration_sec=5.0)
         else:
-            self._outputs.changed(one.stamp_ns, self._where.world)
+            self._outputs.changed(one.stamp_ns, self._poses.world)
 
     def _renewed(self) -> None:
         self.waiting.clear()
-        self._outputs.changed(self._node.get_clock().now().nanoseconds, self._where.world or "map")
+        self._outputs.changed(self._node.get_clock().now().nanoseconds, self._poses.world or "map")
 
 
 def _inputs(options: Options, dimensions: int) -> list[Input]:
     clouds = [FloorCloudInput(topic) if dimensions == 2 else CloudInput(topic, options.cloud_step_deg)
               for topic in options.cloud]  # fmt: skip
-    depth = [DepthInput(*pair_of(text)) for text in options.depth]
+    depth = [DepthInput(*split_pair(text)) for text in options.depth]
     return [*depth, *clouds, *map(ScanInput, options.scan)]

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the node itself is told, beside the settings of the map: topics, frames, times.
+"""Options of the node besides the settings of the map: topics, frames, times.
 
-Parameters of the node: settings of the map by their names, and with `ros.` before them what the node itself is told.
-They are read once, at the start; only `ros.out` may be set later.
+ROS parameters are settings of the map by their own names, and options of the node with the prefix `ros.`. They are read
+once, at the start; only `ros.out` may be set later.
 """
 
 from __future__ import annotations
@@ -16,25 +16,29 @@ from typing import Any, NamedTuple
 from stereovox.errors import StereovoxError, did_you_mean
 
 PREFIX = "ros."
-"""What the names of parameters begin with that are the node's own."""
+"""Prefix of the parameters that are options of the node."""
 LISTS = ("depth", "cloud", "scan", "odometry", "pose", "fixed")
+OUT = f"{PREFIX}out"
+"""The parameter that may change while the node runs."""
+ROS_PARAMETERS = ("use_sim_time", "start_type_description_service", "qos_overrides.")
+"""Parameters of rclpy itself, by name or prefix."""
 
 
 @dataclass(frozen=True)
 class Options:
-    """Options of the command, and parameters of the node under the same name with `ros.` before it.
+    """Options of the command, and parameters of the node with the prefix `ros.`.
 
     depth: topics of depth images; `TOPIC=INFO` where the camera_info is not beside it. cloud, scan: topics.
     odometry: topics of nav_msgs/Odometry; pose: `TOPIC=FRAME`, a topic of PoseStamped and the frame whose pose it is.
-    fixed: `PARENT CHILD x y z yaw pitch roll`, where a frame stands in another for good, metres and radians.
-    world_frame: the frame of the map; "": `map`, else `odom`, whichever is connected with the sensors first.
-    base_frame: frame of the robot, on the floor, for maps of a floor; "": `base_footprint`, else `base_link`.
-    wait_s: seconds that a frame waits for its pose. extrapolate_s: seconds by which a pose may be extrapolated then.
-    late_s: a frame that waited so long for a busy map gives way to newer ones. queue: frames of one topic that wait.
-    map_rate, cloud_rate: messages a second at most: of the 2-D map, and of the cloud and the OctoMap.
+    fixed: `PARENT CHILD x y z yaw pitch roll`, fixed pose of a frame in another, metres and radians.
+    world_frame: the frame of the map; "": `map`, else `odom`, whichever is connected to the sensors first.
+    base_frame: frame of the robot, on the floor, for floor maps; "": `base_footprint`, else `base_link`.
+    wait_s: seconds that a frame waits for its pose. extrapolate_s: seconds by which a pose may then be extrapolated.
+    late_s: a frame that has waited this long for a busy map gives way to newer ones. queue: frames that wait per topic.
+    map_rate, cloud_rate: largest rate in messages a second: of the 2-D map, and of the cloud and the OctoMap.
     low, high: heights in metres between which obstacles mark the 2-D map; NaN: those of the settings.
-    full_octomap: send log-odds, not only what is occupied and free. cloud_step_deg: see `clouds.frame_of_cloud`.
-    reliable: ask for images that are sent again when they get lost. out: where the map is saved; "": nowhere.
+    full_octomap: publish log-odds, not only occupied and free. cloud_step_deg: see `inputs.frame_of_cloud`.
+    reliable: request reliable delivery of images. out: where the map is saved; "": nowhere.
     """
 
     depth: tuple[str, ...] = ()
@@ -69,18 +73,18 @@ class Options:
             raise StereovoxError(f"{PREFIX}queue {self.queue}: give 1 to 1000 frames")
         if not 0.05 <= self.cloud_step_deg <= 10:
             raise StereovoxError(f"{PREFIX}cloud_step_deg {self.cloud_step_deg:g}: give 0.05 to 10 degrees")
-        if lacking := [text for text in self.pose if not all(pair_of(text))]:
+        if lacking := [text for text in self.pose if not all(split_pair(text))]:
             raise StereovoxError(f"{PREFIX}pose '{lacking[0]}': write TOPIC=FRAME, the frame whose pose it is")
         if math.isnan(self.low) != math.isnan(self.high) or self.low >= self.high:
             raise StereovoxError(f"{PREFIX}low {self.low:g}, {PREFIX}high {self.high:g}: give both, the second higher")
 
     @property
     def heights(self) -> tuple[float, float] | None:
-        """Heights in metres between which obstacles mark the 2-D map, None for those of the settings."""
+        """Heights in metres between which obstacles mark the 2-D map; None: those of the settings."""
         return None if math.isnan(self.low) else (self.low, self.high)
 
     def check_sources(self, dimensions: int) -> Options:
-        """Return these options; raises StereovoxError where nothing is to be mapped, or what such a map cannot take."""
+        """Return these options; raises StereovoxError for no input topic or one that this kind of map cannot use."""
         if not (self.depth or self.cloud or self.scan):
             raise StereovoxError("no topic to map; give --depth /camera/depth/image_rect_raw, --cloud or --scan")
         if self.scan and dimensions == 3:
@@ -91,9 +95,9 @@ class Options:
 
 
 def with_parameters(options: Options, given: Mapping[str, Any]) -> Options:
-    """Return options with parameters of the node on top, by their names without `ros.`.
+    """Return options overridden by parameters of the node, given by their names without `ros.`.
 
-    Raises StereovoxError, one line, for an unknown one and for a value of another kind.
+    Raises StereovoxError, one line, for an unknown name or a value of the wrong type.
     """
     kinds = {field.name: field for field in fields(Options)}
     changed = {}
@@ -114,47 +118,41 @@ def _as_kind(name: str, value: Any, default: Any) -> Any:
     return value
 
 
-def pair_of(text: str) -> tuple[str, str]:
-    """Return both sides of `TOPIC=OTHER`, the second "" where there is none."""
+def split_pair(text: str) -> tuple[str, str]:
+    """Split `TOPIC=OTHER` into both sides; the second is "" where there is none."""
     first, _, second = text.partition("=")
     return first.strip(), second.strip()
 
 
-FREE = f"{PREFIX}out"
-"""The parameter that may change while the node runs."""
-OF_ROS = ("use_sim_time", "start_type_description_service", "qos_overrides.")
-"""Parameters, and beginnings of some, that rclpy itself has."""
-
-
 class Given(NamedTuple):
-    """settings: of the map, by dotted names. options: of the node, without `ros.`."""
+    """Parameters by their owner. settings: of the map, by dotted names. options: of the node, without `ros.`."""
 
     settings: dict[str, Any]
     options: dict[str, Any]
 
 
 def given_parameters(node: Any) -> Given:
-    """Return the parameters that a node was started with."""
+    """Return the parameters a node was started with."""
     found = Given({}, {})
     for name, parameter in node.get_parameters_by_prefix("").items():
         value = list(parameter.value) if isinstance(parameter.value, array) else parameter.value
         if name.startswith(PREFIX):
             found.options[name.removeprefix(PREFIX)] = value
-        elif not name.startswith(OF_ROS):
+        elif not name.startswith(ROS_PARAMETERS):
             found.settings[name] = value
     return found
 
 
 def freeze(node: Any, out: str) -> None:
-    """Declare `ros.out`, and let nothing else be set from now on."""
+    """Declare `ros.out` and refuse changes of all other parameters from now on."""
     from rcl_interfaces.msg import SetParametersResult
 
-    if not node.has_parameter(FREE):
-        node.declare_parameter(FREE, out)
+    if not node.has_parameter(OUT):
+        node.declare_parameter(OUT, out)
 
     def check(parameters: list[Any]) -> Any:
-        fixed = [one.name for one in parameters if one.name != FREE and not one.name.startswith(OF_ROS)]
-        said = f"{', '.join(fixed)}: read at the start only; start the node anew" if fixed else ""
-        return SetParametersResult(successful=not fixed, reason=said)
+        fixed = [one.name for one in parameters if one.name != OUT and not one.name.startswith(ROS_PARAMETERS)]
+        reason = f"{', '.join(fixed)}: read at the start only; start the node anew" if fixed else ""
+        return SetParametersResult(successful=not fixed, reason=reason)
 
     node.add_on_set_parameters_callback(check)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the node publishes, and when: the 2-D map with each frame, what is large seldom and in a thread of its own."""
+"""Publish the map: the 2-D map with each frame, large messages at a lower rate from a thread of their own."""
 
 from __future__ import annotations
 
@@ -26,7 +26,12 @@ POINT = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("probability", "<f4
 FLOAT32 = 7
 """`sensor_msgs/PointField` type."""
 LEVELS = {"current": b"\0", "waiting": b"\1", "degraded": b"\1", "lost": b"\2", "stale": b"\3"}
-"""Of `diagnostic_msgs/DiagnosticStatus`: OK, WARN, ERROR, STALE."""
+"""Levels of `diagnostic_msgs/DiagnosticStatus`: OK, WARN, ERROR, STALE."""
+UNHEARD_S = 1.0
+"""Seconds between 2-D maps without a subscriber: a late subscriber gets one at most this old."""
+DIAGNOSED_S = 1.0
+MAP, CLOUD, BINARY, FULL = "map_mapping", "occupied_cells", "octomap_binary", "octomap_full"
+"""Topics; those of the OctoMap have the names of octomap_server."""
 
 
 def time_of(stamp_ns: int) -> Any:
@@ -77,7 +82,7 @@ def cloud_message(voxel_map: VoxelMap, stamp_ns: int, frame_id: str) -> Any:
 
 
 def octomap_message(voxel_map: VoxelMap, full: bool, stamp_ns: int, frame_id: str) -> Any:
-    """Return an `octomap_msgs/Octomap`; full: with log-odds, else only what is occupied and free.
+    """Return an `octomap_msgs/Octomap`; full: with log-odds, else only occupied and free.
 
     Raises MapFileError for cells that an octree cannot hold.
     """
@@ -94,29 +99,24 @@ def diagnostics_message(name: str, health: Health, more: Table[str, object], now
     """Return a `diagnostic_msgs/DiagnosticArray` of one status, with health and `more` as values."""
     from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 
-    told = {**health.as_dict(), **more}
-    values = [KeyValue(key=key, value=_said(value)) for key, value in told.items() if key not in ("state", "text")]
+    figures = {**health.as_dict(), **more}
+    values = [
+        KeyValue(key=key, value=_format_value(value)) for key, value in figures.items() if key not in ("state", "text")
+    ]
     status = DiagnosticStatus(
         level=LEVELS[health.state], name=name, message=health.text, hardware_id="stereovox", values=values
     )
     return DiagnosticArray(header=header(now_ns, ""), status=[status])
 
 
-def _said(value: object) -> str:
+def _format_value(value: object) -> str:
     if isinstance(value, Table):
-        return ", ".join(f"{key} {_said(one)}" for key, one in value.items())
+        return ", ".join(f"{key} {_format_value(one)}" for key, one in value.items())
     return f"{value:.3f}" if isinstance(value, float) else str(value)
 
 
-UNHEARD_S = 1.0
-"""Seconds between 2-D maps while nobody listens: who comes later finds one that is no older."""
-DIAGNOSED_S = 1.0
-MAP, CLOUD, BINARY, FULL = "map_mapping", "occupied_cells", "octomap_binary", "octomap_full"
-"""Topics; those of the OctoMap are named as octomap_server does."""
-
-
 class Outputs:
-    """Publishes a map. counts: what diagnostics tell beside health. clock: seconds that never step."""
+    """Publishes a map. counts: returns the values of diagnostics besides health. clock: monotonic seconds."""
 
     def __init__(
         self,
@@ -128,15 +128,15 @@ class Outputs:
     ):
         self._node, self._mapping, self._options = node, mapping, options
         self._counts, self._clock = counts, clock
-        self._made = _Makers(node, mapping.config.dimensions, options)
+        self._publishers = _Publishers(node, mapping.config.dimensions, options)
         self._stamp_ns, self._frame_id = 0, ""
         self._new_map = self._new_cloud = False
-        self._next_map = self._next_cloud = self._next_told = 0.0
+        self._next_map = self._next_cloud = self._next_diagnostics = 0.0
         self._worker = ThreadPoolExecutor(1, "stereovox-messages")
         self._busy: Future[None] | None = None
 
     def changed(self, stamp_ns: int, frame_id: str) -> None:
-        """Note that the map has taken in a frame of that time, and the name of the map's own frame."""
+        """Mark the map as changed by a frame of that time. frame_id: name of the map's frame."""
         self._stamp_ns, self._frame_id = stamp_ns, frame_id
         self._new_map = self._new_cloud = True
 
@@ -145,32 +145,32 @@ class Outputs:
         now = self._clock()
         if self._new_map and now >= self._next_map:
             self._publish_map(now)
-        if self._new_cloud and now >= self._next_cloud and self._made.wanted() and self._idle():
+        if self._new_cloud and now >= self._next_cloud and self._publishers.has_subscribers() and self._idle():
             self._publish_cells(now)
-        if now >= self._next_told:
-            self._next_told = now + DIAGNOSED_S
+        if now >= self._next_diagnostics:
+            self._next_diagnostics = now + DIAGNOSED_S
             stamp_ns = self._node.get_clock().now().nanoseconds
             name = f"{self._node.get_fully_qualified_name()}: map"
-            self._made.status.publish(diagnostics_message(name, self._mapping.health(), self._counts(), stamp_ns))
+            self._publishers.status.publish(diagnostics_message(name, self._mapping.health(), self._counts(), stamp_ns))
 
     def close(self) -> None:
-        """Publish the last map, and wait for what is being published."""
+        """Publish the final map and wait for messages in progress."""
         if self._new_map:
             self._publish_map(self._clock())
         self._worker.shutdown()
 
     def _publish_map(self, now: float) -> None:
         self._new_map = False
-        heard = self._made.map.get_subscription_count() > 0
+        heard = self._publishers.map.get_subscription_count() > 0
         period = 1 / self._options.map_rate if heard else UNHEARD_S
-        self._next_map = max(self._next_map, now - period) + period  # one may come early: cameras are not exact
+        self._next_map = max(self._next_map, now - period) + period  # one frame may come early: camera rates vary
         try:
             grid = self._mapping.grid()
         except StereovoxError as error:
-            self._complain(error)
+            self._log_error(error)
             return
         if grid is not None:
-            self._made.map.publish(occupancy_message(grid, self._stamp_ns, self._frame_id))
+            self._publishers.map.publish(occupancy_message(grid, self._stamp_ns, self._frame_id))
 
     def _publish_cells(self, now: float) -> None:
         self._new_cloud, self._next_cloud = False, now + 1 / self._options.cloud_rate
@@ -180,24 +180,24 @@ class Outputs:
 
     def _send_cells(self, copy: Callable[[], VoxelMap], stamp_ns: int, frame_id: str) -> None:
         try:
-            self._made.send(copy(), stamp_ns, frame_id)
+            self._publishers.send(copy(), stamp_ns, frame_id)
         except StereovoxError as error:
-            self._complain(error)
+            self._log_error(error)
 
-    def _complain(self, error: StereovoxError) -> None:
+    def _log_error(self, error: StereovoxError) -> None:
         self._node.get_logger().error(f"cannot be published: {error}", throttle_duration_sec=10.0)
 
     def _idle(self) -> bool:
         if self._busy is None:
             return True
         if self._busy.done():
-            self._busy.result()  # what nobody foresaw is raised here
+            self._busy.result()  # raises unforeseen errors of the worker
             return True
         return False
 
 
-class _Makers:
-    """The publishers, and the messages of what is large."""
+class _Publishers:
+    """The publishers of the node."""
 
     def __init__(self, node: Any, dimensions: int, options: Options):
         from diagnostic_msgs.msg import DiagnosticArray
@@ -205,31 +205,31 @@ class _Makers:
         from sensor_msgs.msg import PointCloud2
 
         self._full = options.full_octomap
-        self.map = node.create_publisher(OccupancyGrid, MAP, _kept())
+        self.map = node.create_publisher(OccupancyGrid, MAP, _latched_qos())
         self.status = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._cloud = self._octomap = None
         if dimensions == 3:
-            self._cloud = node.create_publisher(PointCloud2, CLOUD, _kept())
+            self._cloud = node.create_publisher(PointCloud2, CLOUD, _latched_qos())
             octomap = optional_message("octomap_msgs", "Octomap")
             if octomap is None:
                 node.get_logger().info("octomap_msgs is not installed: no OctoMap is published")
             else:
-                self._octomap = node.create_publisher(octomap, FULL if self._full else BINARY, _kept())
+                self._octomap = node.create_publisher(octomap, FULL if self._full else BINARY, _latched_qos())
 
-    def wanted(self) -> bool:
-        """Tell whether anybody listens to what is large."""
+    def has_subscribers(self) -> bool:
+        """Return whether the cloud or the OctoMap has a subscriber."""
         return any(one is not None and one.get_subscription_count() > 0 for one in (self._cloud, self._octomap))
 
     def send(self, voxel_map: VoxelMap, stamp_ns: int, frame_id: str) -> None:
-        """Publish what somebody listens to."""
+        """Publish the cloud and the OctoMap where they have subscribers."""
         if self._cloud is not None and self._cloud.get_subscription_count():
             self._cloud.publish(cloud_message(voxel_map, stamp_ns, frame_id))
         if self._octomap is not None and self._octomap.get_subscription_count():
             self._octomap.publish(octomap_message(voxel_map, self._full, stamp_ns, frame_id))
 
 
-def _kept() -> Any:
-    """Return the quality of service of maps: reliable, and the last one is kept for who comes later."""
+def _latched_qos() -> Any:
+    """Return the quality of service of maps: reliable, and the last one is kept for late subscribers."""
     from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
     return QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the sensors stand in the map's frame: from /tf, odometry, poses, and what is fixed."""
+"""Buffer the poses of the sensors in the map's frame, from /tf, odometry, pose topics and fixed transforms."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ from stereovox.sources.bags.robot_messages import frame_name, read_odometry, rea
 from stereovox.sources.bags.tf import Edge, Limits, Tf, tf_poses
 from stereovox.sources.robots.frames import BASES
 
-MOST = 2000
-"""Transforms of a frame that are kept at most; half of them go when there are more."""
+MAX_TRANSFORMS = 2000
+"""Transforms kept per frame; the older half is dropped when there are more."""
 RESET_NS = 1_000_000_000
-"""A transform that is so much older than the newest one is of a clock that was set back: those before it are over."""
+"""A transform this much older than the newest one means that the clock was set back: all before it are dropped."""
 
 
 class LiveEdge(Edge):
-    """Where a frame stood in its parent lately.
+    """Recent poses of a frame in its parent.
 
-    A frame that has not moved so far may move at any time: unlike in a recording, it is never taken for fixed.
+    A frame that has not moved may still move: unlike in a recording, it is never treated as fixed.
     """
 
     def add(self, stamp_ns: int, numbers: Iterable[float]) -> None:
-        """Take in tx ty tz qx qy qz qw at a time."""
-        if self._stamps and stamp_ns < max(self._stamps[-MOST // 8 :]) - RESET_NS:
+        """Add tx ty tz qx qy qz qw at a time."""
+        if self._stamps and stamp_ns < max(self._stamps[-MAX_TRANSFORMS // 8 :]) - RESET_NS:
             self._keep(0)
-        elif len(self._stamps) >= MOST:
-            self._keep(MOST // 2)
+        elif len(self._stamps) >= MAX_TRANSFORMS:
+            self._keep(MAX_TRANSFORMS // 2)
         super().add(stamp_ns, numbers)
 
     def _keep(self, newest: int) -> None:
@@ -47,23 +47,23 @@ class LiveEdge(Edge):
 
 
 class LiveTf(Tf):
-    """Transforms between frames of a robot that is running."""
+    """Transforms between the frames of a running robot."""
 
     edge: ClassVar[type[Edge]] = LiveEdge
 
 
 class Pose(NamedTuple):
-    """T_world_sensor (4, 4), where the sensor sits on the robot, and nanoseconds by which the pose is extrapolated."""
+    """T_world_sensor (4, 4), T_base_sensor (4, 4), and nanoseconds by which the pose is extrapolated."""
 
     T_world_sensor: Transform
     T_base_sensor: Transform
     off_ns: int
 
 
-class Whereabouts:
-    """Takes messages in as they come, as bytes of CDR, and tells poses.
+class PoseBuffer:
+    """Receives messages as CDR bytes and looks up poses.
 
-    world, base: frames of the map and of the robot, "" to take the usual one that is there first; it is kept then.
+    world, base: frames of the map and of the robot; "": the first of the usual ones to appear, which is then kept.
     extrapolate_s: seconds by which a pose may be extrapolated.
     """
 
@@ -71,18 +71,18 @@ class Whereabouts:
         self.world, self._base = frame_name(world), frame_name(base)
         self.tf = LiveTf("/tf", Limits(extrapolate_s=extrapolate_s))
 
-    def take_tf(self, data: bytes, fixed: bool) -> None:
-        """Take in a `tf2_msgs/TFMessage`; fixed: of /tf_static."""
+    def on_tf(self, data: bytes, fixed: bool) -> None:
+        """Add a `tf2_msgs/TFMessage`; fixed: from /tf_static."""
         try:
-            told = read_transforms(Wire(data, cdr=True))
+            transforms = read_transforms(Wire(data, cdr=True))
         except ValueError:
             self.tf.unreadable += 1
             return
-        for one in told:
+        for one in transforms:
             self.tf.add(one.parent, one.child, one.stamp_ns, one.numbers, fixed)
 
-    def take_odometry(self, data: bytes) -> None:
-        """Take in a `nav_msgs/Odometry`: where its child_frame_id stands in its frame_id."""
+    def on_odometry(self, data: bytes) -> None:
+        """Add a `nav_msgs/Odometry`: the pose of its child_frame_id in its frame_id."""
         try:
             one = read_odometry(Wire(data, cdr=True))
         except ValueError:
@@ -90,8 +90,8 @@ class Whereabouts:
             return
         self.tf.add(one.parent, one.child, one.stamp_ns, one.numbers)
 
-    def take_pose(self, data: bytes, child: str) -> None:
-        """Take in a `geometry_msgs/PoseStamped`: where frame `child` stands in its frame_id."""
+    def on_pose(self, data: bytes, child: str) -> None:
+        """Add a `geometry_msgs/PoseStamped`: the pose of frame `child` in its frame_id."""
         try:
             wire = Wire(data, cdr=True)
             (stamp_ns, parent), numbers = wire.header(), wire.numbers("d", 7)
@@ -100,15 +100,15 @@ class Whereabouts:
             return
         self.tf.add(parent, child, stamp_ns, numbers)
 
-    def settled(self, frame_id: str, stamp_ns: int) -> bool:
-        """Tell whether later messages change nothing about a pose: all it needs was told for that time or later."""
+    def is_final(self, frame_id: str, stamp_ns: int) -> bool:
+        """Return whether a pose is final: no later message can change it."""
         try:
             return self.tf.off_ns(self._world_of(frame_id), frame_id, stamp_ns) == 0
         except FrameRefused:
             return False
 
     def pose(self, frame_id: str, stamp_ns: int) -> Pose:
-        """Return where frame `frame_id` stood in the world at a time; raises FrameRefused `no_pose`."""
+        """Return the pose of frame `frame_id` in the world at a time; raises FrameRefused `no_pose`."""
         world, base = self._world_of(frame_id), self._base_of(frame_id)
         T_base_sensor = np.eye(4) if base == frame_id else self.tf.lookup(base, frame_id, stamp_ns)
         T_world_sensor = self.tf.lookup(world, frame_id, stamp_ns)
@@ -128,9 +128,9 @@ class Whereabouts:
 
 
 def fixed_transform(text: str) -> tuple[str, str, tuple[float, ...]]:
-    """Return parent, child and tx ty tz qx qy qz qw of `PARENT CHILD x y z yaw pitch roll` (metres, radians).
+    """Parse `PARENT CHILD x y z yaw pitch roll` (metres, radians) into parent, child and tx ty tz qx qy qz qw.
 
-    Raises StereovoxError, one line, for what is none.
+    Raises StereovoxError, one line, for anything else.
     """
     words = text.split()
     try:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the node can be asked to do: save, load and reset the map."""
+"""Services of the node: save, load and reset the map."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from stereovox.ros.mapping import Mapping
 class Services:
     """`~/save` and `~/reset` (std_srvs/Trigger), `~/load` (nav_msgs/LoadMap).
 
-    out: tells where to save, "" nowhere. renewed: called when another map has taken the place of the one before.
+    out: returns where to save, "": nowhere. renewed: called after another map has replaced the current one.
     They run between two frames.
     """
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the node listens to. Messages come as bytes: nothing is unpacked twice, and readers of bags take them as such.
+"""Subscriptions of the node. Messages stay bytes: the bag readers parse them, and nothing is parsed twice.
 
-Where a publisher offers what does not fit, rclpy says so in the log ("offering incompatible QoS").
+Where the quality of service of a publisher does not match, rclpy logs "offering incompatible QoS".
 """
 
 from __future__ import annotations
@@ -15,15 +15,17 @@ from typing import Any
 from stereovox.errors import StereovoxError, one_line
 from stereovox.ros.inputs import DepthInput, Input
 from stereovox.ros.library import optional_message
-from stereovox.ros.options import Options, pair_of
-from stereovox.ros.poses import Whereabouts
+from stereovox.ros.options import Options, split_pair
+from stereovox.ros.poses import PoseBuffer
 
 FIRST_S, AGAIN_S = 5.0, 30.0
-"""Seconds after which it is told, and told again."""
+"""Seconds until the first warning, and between repeated ones."""
+POSE_QUEUE = 100
+"""Length of the middleware's queues for pose messages."""
 
 
 class Silence:
-    """Warns of topics on which nothing has come yet. received: messages so far, by topic."""
+    """Warns about topics without any message so far. received: number of messages by topic."""
 
     def __init__(
         self,
@@ -36,7 +38,7 @@ class Silence:
         self._next = clock() + FIRST_S
 
     def update(self) -> None:
-        """Warn if it is time."""
+        """Warn if a warning is due."""
         now = self._clock()
         if now < self._next:
             return
@@ -59,39 +61,35 @@ class Silence:
         return f"nobody publishes it, nor {kind} on any other topic; does the camera run, with the same ROS_DOMAIN_ID?"
 
 
-TRANSFORMS = 100
-"""Messages of poses that wait in the middleware."""
-
-
 class Subscriptions:
-    """Subscribes to all that options name, and to /tf and /tf_static.
+    """Subscribes to all topics in the options, and to /tf and /tf_static.
 
-    arrived: called with topic and bytes of what is to be mapped. messages: how many came, of all kinds.
-    Raises StereovoxError, one line, for what cannot be the name of a topic.
+    arrived: called with topic and bytes of a message to map. messages: number of messages received, of all kinds.
+    Raises StereovoxError, one line, for an invalid topic name.
     """
 
     def __init__(
         self,
         node: Any,
         options: Options,
-        where: Whereabouts,
+        where: PoseBuffer,
         inputs: Mapping[str, Input],
         arrived: Callable[[str, bytes], None],
     ):
         self._node, self.messages = node, 0
-        images = _quality(options.queue, options.reliable)
+        images = _qos(options.queue, options.reliable)
         for topic, one in inputs.items():
             self._listen(one.kind, topic, partial(arrived, topic), images)
             if isinstance(one, DepthInput):
-                self._listen("sensor_msgs/CameraInfo", one.info, one.take_info, images)
-        poses = _quality(TRANSFORMS, reliable=False)
+                self._listen("sensor_msgs/CameraInfo", one.info, one.on_camera_info, images)
+        poses = _qos(POSE_QUEUE, reliable=False)
         for topic in options.odometry:
-            self._listen("nav_msgs/Odometry", topic, where.take_odometry, poses)
-        for topic, child in map(pair_of, options.pose):
-            self._listen("geometry_msgs/PoseStamped", topic, partial(where.take_pose, child=child), poses)
+            self._listen("nav_msgs/Odometry", topic, where.on_odometry, poses)
+        for topic, child in map(split_pair, options.pose):
+            self._listen("geometry_msgs/PoseStamped", topic, partial(where.on_pose, child=child), poses)
         self._listen_to_tf(where)
 
-    def _listen_to_tf(self, where: Whereabouts) -> None:
+    def _listen_to_tf(self, where: PoseBuffer) -> None:
         kind = optional_message("tf2_msgs", "TFMessage")
         if kind is None:
             self._node.get_logger().warning(
@@ -99,33 +97,33 @@ class Subscriptions:
                 "alone; source a ROS 2 distribution, or see docs/ros2.md for how to build it"
             )
             return
-        moving, fixed = partial(where.take_tf, fixed=False), partial(where.take_tf, fixed=True)
-        self._subscribe(kind, "/tf", moving, _quality(TRANSFORMS, reliable=True))
-        self._subscribe(kind, "/tf_static", fixed, _quality(TRANSFORMS, reliable=True, kept=True))
+        moving, fixed = partial(where.on_tf, fixed=False), partial(where.on_tf, fixed=True)
+        self._subscribe(kind, "/tf", moving, _qos(POSE_QUEUE, reliable=True))
+        self._subscribe(kind, "/tf_static", fixed, _qos(POSE_QUEUE, reliable=True, latched=True))
 
-    def _listen(self, kind: str, topic: str, callback: Callable[[bytes], None], quality: Any) -> None:
+    def _listen(self, kind: str, topic: str, callback: Callable[[bytes], None], qos: Any) -> None:
         package, _, name = kind.partition("/")
-        self._subscribe(getattr(import_module(f"{package}.msg"), name), topic, callback, quality)
+        self._subscribe(getattr(import_module(f"{package}.msg"), name), topic, callback, qos)
 
-    def _subscribe(self, kind: Any, topic: str, callback: Callable[[bytes], None], quality: Any) -> None:
-        def take(data: bytes) -> None:
+    def _subscribe(self, kind: Any, topic: str, callback: Callable[[bytes], None], qos: Any) -> None:
+        def receive(data: bytes) -> None:
             self.messages += 1
             callback(data)
 
         from rclpy.exceptions import InvalidTopicNameException
 
         try:
-            self._node.create_subscription(kind, topic, take, quality, raw=True)
+            self._node.create_subscription(kind, topic, receive, qos, raw=True)
         except InvalidTopicNameException as error:
             raise StereovoxError(f"topic '{topic}': {one_line(str(error).splitlines()[0].rstrip(':'))}") from None
 
 
-def _quality(depth: int, reliable: bool, kept: bool = False) -> Any:
-    """Return a quality of service. kept: what was sent before is wanted too."""
+def _qos(depth: int, reliable: bool, latched: bool = False) -> Any:
+    """Return a quality of service. latched: also receive the last message sent before."""
     from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
     return QoSProfile(
         depth=depth,
         reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
-        durability=DurabilityPolicy.TRANSIENT_LOCAL if kept else DurabilityPolicy.VOLATILE,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
     )

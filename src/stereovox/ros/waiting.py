@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frames that wait: for their pose, and for a map that is busy."""
+"""Queues of messages that wait for their pose or for a busy map."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ T = TypeVar("T")
 
 @dataclass
 class Arrival(Generic[T]):
-    """A message that is to become a frame.
+    """A message waiting to become a frame.
 
-    sensor: its topic. stamp_ns, frame_id: of its header. content: the message. arrived_ns: by the clock of the queue;
-    ready_ns: the same, since when all that it needs is there, None: it waits.
+    sensor: its topic. stamp_ns, frame_id: from its header. content: the message. arrived_ns: time of arrival by the
+    queue's clock; ready_ns: when all that it needs was there, None: not yet.
     """
 
     sensor: str
@@ -30,13 +30,13 @@ class Arrival(Generic[T]):
 class Waiting(Generic[T]):
     """A short queue for each sensor. Frames of one sensor keep their order.
 
-    most: frames of a sensor that wait; one on top pushes the oldest out. wait_ns: a frame that is not ready by then
-    goes on as it is. late_ns: a frame that was ready for so long gives way where a newer one is ready too.
-    dropped: how many went so, by sensor. clock: nanoseconds of a clock that never steps.
+    max_length: frames that wait per sensor; one more drops the oldest. wait_ns: a frame that is not ready after this
+    time is returned as it is. late_ns: a frame that has been ready this long is dropped where a newer one is ready too.
+    dropped: number of dropped frames by sensor. clock: monotonic nanoseconds.
     """
 
-    def __init__(self, most: int, wait_ns: int, late_ns: int, clock: Callable[[], int]):
-        self._most, self._wait_ns, self._late_ns, self._clock = most, wait_ns, late_ns, clock
+    def __init__(self, max_length: int, wait_ns: int, late_ns: int, clock: Callable[[], int]):
+        self._max_length, self._wait_ns, self._late_ns, self._clock = max_length, wait_ns, late_ns, clock
         self._queues: dict[str, deque[Arrival[T]]] = {}
         self.dropped: Counter[str] = Counter()
 
@@ -44,16 +44,16 @@ class Waiting(Generic[T]):
         return sum(map(len, self._queues.values()))
 
     def put(self, sensor: str, stamp_ns: int, frame_id: str, content: T) -> None:
-        """Let a message wait from now on."""
+        """Add a message to the queue of its sensor."""
         queue = self._queues.setdefault(sensor, deque())
-        if len(queue) == self._most:
+        if len(queue) == self._max_length:
             self._drop(queue)
         queue.append(Arrival(sensor, stamp_ns, frame_id, content, self._clock()))
 
-    def take(self, is_ready: Callable[[Arrival[T]], bool]) -> Arrival[T] | None:
-        """Return the frame that is next, None where all have to wait: the oldest of those that are first of a sensor.
+    def pop(self, is_ready: Callable[[Arrival[T]], bool]) -> Arrival[T] | None:
+        """Remove and return the next frame, the oldest among the first of each sensor; None where all must wait.
 
-        is_ready: tells whether all is there that a frame needs.
+        is_ready: returns whether everything that a frame needs is there.
         """
         now = self._clock()
         due = [queue for queue in self._queues.values() if queue and self._due(queue[0], is_ready, now)]
@@ -63,7 +63,7 @@ class Waiting(Generic[T]):
         return min(due, key=lambda queue: queue[0].stamp_ns).popleft() if due else None
 
     def clear(self) -> None:
-        """Forget all frames; they do not count as dropped."""
+        """Remove all frames without counting them as dropped."""
         self._queues.clear()
 
     def _due(self, one: Arrival[T], is_ready: Callable[[Arrival[T]], bool], now: int) -> bool:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One frame of nothing through the whole flow, so that the first real one does not wait for kernels."""
+"""Compile the kernels with an empty frame, so that the first real one does not wait for them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from stereovox.sources.tracker import AXES
 
 
 def warm_up(config: Config) -> None:
-    """Load or compile all kernels that depth images need under these settings; the map is thrown away."""
+    """Load or compile all kernels that depth images need under these settings; the map is discarded."""
     mapping = Mapping(load_config(config, **{"window.outside": "drop"}))
     camera = PinholeCamera.from_field_of_view(64, 48, 60.0)
     T_world_camera = np.eye(4)

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ways to look at a map."""
+"""Pictures of maps, grids, calibrations and evaluations."""

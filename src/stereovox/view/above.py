@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of a map from above: its columns, what changed, its frontiers, its ground."""
+"""Pictures of a map from above: its columns, changes, frontiers and ground."""
 
 from __future__ import annotations
 
@@ -16,13 +16,32 @@ from stereovox.products.frontiers import Frontier
 from stereovox.products.ground import Footing, Ground
 from stereovox.products.ground_surfaces import Floor, floor_of
 from stereovox.products.merge import merge
-from stereovox.view.figures import WIDTH, figure_of, words_above
+from stereovox.view.figures import WIDTH, figure_of, title_above
 from stereovox.view.panels import GREY, INK, STATE_COLOURS, measured, scale_bar, title
 
 SHADE = 0.8
-"""How much a mark covers."""
+"""Opacity of a mark."""
 DARKEST = 0.75
-"""How much of the ink a column gets that is as full as most walls."""
+"""Share of full ink for a column as full as most walls."""
+KINDS = {
+    "became_known": ("became known", "#b9d8b0"),
+    "became_unknown": ("became unknown", "#d9c7e0"),
+    "vanished": ("vanished: occupied before, free now", "#2f7fd1"),
+    "appeared": ("appeared: free before, occupied now", "#d8352a"),
+}
+"""Name and colour; a column with several kinds shows the last of them."""
+COLOURS = ("#e0452f", "#2f7fd1", "#3a9a4b", "#c77d0a", "#8448a8", "#0f9aa0", "#c2408c", "#7a5a32")
+LABELLED = 12
+"""Number of frontiers, the largest, that are labelled with a number and their viewpoint."""
+FOOTINGS = {
+    Footing.DRIVABLE: ("drivable", "#a9d8a0"),
+    Footing.TENTATIVE: ("not decided", "#e8c98a"),
+    Footing.OBSTACLE: ("obstacle", "#22304a"),
+    Footing.STEP: ("step", "#d8352a"),
+    Footing.STEEP: ("too steep", "#e07b2a"),
+    Footing.DROP: ("drop", "#7a3fa0"),
+    Footing.UNKNOWN: ("unknown", STATE_COLOURS[State.UNKNOWN]),
+}
 
 
 def page_of(shape: tuple[int, int], panels: int = 1) -> tuple[Any, list[Any]]:
@@ -33,7 +52,7 @@ def page_of(shape: tuple[int, int], panels: int = 1) -> tuple[Any, list[Any]]:
 
 
 def draw_columns(axis: Any, floor: Floor) -> None:
-    """Draw what is known of each column of a floor."""
+    """Draw how full each column of a floor is."""
     from matplotlib.colors import to_rgb
 
     unknown, free, ink = (
@@ -47,7 +66,7 @@ def draw_columns(axis: Any, floor: Floor) -> None:
 
 
 def show(axis: Any, floor: Floor, image: NDArray, **how: Any) -> Any:
-    """Draw an image (rows, columns) or (rows, columns, 3) of a floor in metres; return what matplotlib does."""
+    """Draw an image (rows, columns) or (rows, columns, 3) of a floor in metres; return matplotlib's image."""
     (rows, columns), side, (x, y, _) = floor.shape, floor.resolution, floor.origin
     extent = (x, x + columns * side, y, y + rows * side)
     drawn = axis.imshow(image, origin="lower", extent=extent, interpolation="nearest", **how)
@@ -56,7 +75,7 @@ def show(axis: Any, floor: Floor, image: NDArray, **how: Any) -> Any:
 
 
 def mark(axis: Any, floor: Floor, points: ArrayLike, colour: str) -> None:
-    """Draw the columns that hold places (N, 3) in metres in one colour."""
+    """Draw the columns that hold points (N, 3) in metres in one colour."""
     from matplotlib.colors import to_rgba
 
     image = np.zeros((*floor.shape, 4))
@@ -65,7 +84,7 @@ def mark(axis: Any, floor: Floor, points: ArrayLike, colour: str) -> None:
 
 
 def finish(axis: Any) -> None:
-    """Put a scale bar in a strip below a panel."""
+    """Add a scale bar in a strip below a panel."""
     axis.set_facecolor(STATE_COLOURS[State.UNKNOWN])
     bottom, top = axis.get_ylim()
     axis.set_ylim(bottom - 0.06 * (top - bottom), top)
@@ -73,7 +92,7 @@ def finish(axis: Any) -> None:
 
 
 def _number(floor: Floor, points: ArrayLike) -> NDArray[np.int64]:
-    """Return how many of the places (N, 3) lie in each column (rows, columns); those beyond the floor in none."""
+    """Count the points (N, 3) in each column (rows, columns); points beyond the floor are ignored."""
     across = np.asarray(points, float).reshape(-1, 3)[:, floor.axes[:2]] / floor.resolution
     columns, rows = (np.floor(across).astype(np.int64) - floor.first).T
     inside = (rows >= 0) & (columns >= 0) & (rows < floor.shape[0]) & (columns < floor.shape[1])
@@ -82,17 +101,8 @@ def _number(floor: Floor, points: ArrayLike) -> NDArray[np.int64]:
     return number
 
 
-KINDS = {
-    "became_known": ("became known", "#b9d8b0"),
-    "became_unknown": ("became unknown", "#d9c7e0"),
-    "vanished": ("vanished: occupied before, free now", "#2f7fd1"),
-    "appeared": ("appeared: free before, occupied now", "#d8352a"),
-}
-"""Name and colour; where one column holds several the last of these is shown."""
-
-
 def draw_changes(a: VoxelMap, b: VoxelMap, heading: str) -> Any:
-    """Return the matplotlib figure of what changed from map `a` to map `b`, in one frame and cells of one size."""
+    """Return the matplotlib figure of the changes from map `a` to map `b`, of one frame and cell size."""
     from matplotlib.patches import Patch
 
     a, b = in_cubes(a), in_cubes(b)
@@ -105,18 +115,13 @@ def draw_changes(a: VoxelMap, b: VoxelMap, heading: str) -> Any:
     finish(axis)
     patches = [Patch(fc=colour, label=name) for name, colour in KINDS.values()]
     figure.legend(handles=patches, loc="outside lower center", ncols=4, frameon=False, fontsize=11, labelcolor=INK)
-    words_above(figure, heading, [f"cells of {a.voxel_size:g} m", *facts(changes), "grey: both maps from above"])
+    title_above(figure, heading, [f"cells of {a.voxel_size:g} m", *facts(changes), "grey: both maps from above"])
     return figure
 
 
 def facts(changes: Difference) -> list[str]:
-    """Return how many cells changed, in words."""
+    """Describe how many cells changed."""
     return [f"{len(getattr(changes, kind)):,} {kind.replace('_', ' ')}" for kind in reversed(KINDS)]
-
-
-COLOURS = ("#e0452f", "#2f7fd1", "#3a9a4b", "#c77d0a", "#8448a8", "#0f9aa0", "#c2408c", "#7a5a32")
-LABELLED = 12
-"""The largest frontiers, which get a number and their place to look from."""
 
 
 def draw_frontiers(voxel_map: VoxelMap, frontiers: Sequence[Frontier], heading: str) -> Any:
@@ -130,7 +135,7 @@ def draw_frontiers(voxel_map: VoxelMap, frontiers: Sequence[Frontier], heading: 
         _label(axis, frontier, n + 1, list(floor.axes[:2]))
     finish(axis)
     seen = sum(frontier.look_from is not None for frontier in frontiers)
-    words_above(figure, heading, [
+    title_above(figure, heading, [
         f"cells of {voxel_map.voxel_size:g} m", f"{len(frontiers)} frontiers, {seen} within reach",
         "dot: where to look at one from, the number: at its centroid",
     ])  # fmt: skip
@@ -149,19 +154,8 @@ def _label(axis: Any, frontier: Frontier, number: int, axes: list[int]) -> None:
     )  # fmt: skip
 
 
-FOOTINGS = {
-    Footing.DRIVABLE: ("drivable", "#a9d8a0"),
-    Footing.TENTATIVE: ("not decided", "#e8c98a"),
-    Footing.OBSTACLE: ("obstacle", "#22304a"),
-    Footing.STEP: ("step", "#d8352a"),
-    Footing.STEEP: ("too steep", "#e07b2a"),
-    Footing.DROP: ("drop", "#7a3fa0"),
-    Footing.UNKNOWN: ("unknown", STATE_COLOURS[State.UNKNOWN]),
-}
-
-
 def draw_ground(voxel_map: VoxelMap, ground: Ground, heading: str) -> Any:
-    """Return the matplotlib figure of the ground of a map: heights, and what each place is to the robot."""
+    """Return the matplotlib figure of the ground of a map: heights, and where the robot can drive."""
     from matplotlib.patches import Patch
 
     floor = floor_of(voxel_map)
@@ -180,7 +174,7 @@ def draw_ground(voxel_map: VoxelMap, ground: Ground, heading: str) -> Any:
     patches = [Patch(fc=colour, ec="#888", label=name) for name, colour in FOOTINGS.values()]
     figure.legend(handles=patches, loc="outside lower center", ncols=7, frameon=False, fontsize=11, labelcolor=INK)
     area = np.count_nonzero(ground.footing == Footing.DRIVABLE) * ground.resolution**2
-    words_above(figure, heading, [f"cells of {ground.resolution:g} m", f"{area:.1f} square metres drivable"])
+    title_above(figure, heading, [f"cells of {ground.resolution:g} m", f"{area:.1f} square metres drivable"])
     return figure
 
 

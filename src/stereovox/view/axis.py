@@ -17,16 +17,16 @@ from stereovox.view.scale import Scale, scale_of
 from stereovox.view.viewpoint import known_viewpoint
 
 BEYOND = 6
-"""Cells that are drawn after the last known one."""
+"""Number of cells drawn after the last known one."""
 
 
 def draw_axis(
     voxel_map: VoxelMap, heading: str, length_m: float | None = None, viewpoint: Viewpoint | None = None
 ) -> Any:
-    """Return a figure of the log-odds of the cells that the camera's optical axis crosses.
+    """Return a figure of the log-odds of the cells along the camera's optical axis.
 
-    length_m: how far; by default the map's `max_range`. viewpoint: by default the map's last.
-    Raises StereovoxError where nobody knows the camera.
+    length_m: length of the axis; by default the map's `max_range`. viewpoint: by default the map's last.
+    Raises StereovoxError where the camera is not known.
     """
     figure = figure_of(6.5)
     axis = figure.add_subplot()
@@ -41,9 +41,9 @@ def draw_axis(
 def draw_profile(
     axis: Any, voxel_map: VoxelMap, length_m: float | None = None, viewpoint: Viewpoint | None = None
 ) -> tuple[float, float] | None:
-    """Draw one step a cell in its state's colour, with the limits of free and occupied; bytes where the map has them.
+    """Draw one step per cell in its state's colour, with the thresholds; in bytes where the map has them.
 
-    Returns where the first occupied cells begin and end in metres, None where all are free or unknown.
+    Returns the start and end of the first occupied cells in metres, None where there are none.
     """
     T = known_viewpoint(viewpoint or voxel_map.viewpoint).T_world_camera
     distance, log_odds = along_ray(voxel_map, T[:3, 3], T[:3, 2], length_m or voxel_map.config.max_range)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures of calibrations: walls before and after a correction, noise against distance and against theory."""
+"""Pictures of calibrations: walls before and after a correction, noise by distance and beside theory."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from stereovox.view.panels import GREY, title
 
 DPI = 150
 WIDTH = 11.0
+"""Inches: the width at which a page shows it, so that letters keep their size."""
 LETTERS = 10
 """Size of the numbers along an axis, in points."""
-"""Inches: as wide as a page shows it, so that letters keep their size."""
 BEFORE, AFTER, WALL = "#d1603d", "#23618c", "#1b2333"
 THEORY = ((0.08, "--"), (0.04, ":"))
 """Sub-pixels of the curves in Chien 2020, Fig 3.9."""
@@ -28,30 +28,30 @@ ERRORS = (
 )
 DOTS = 6000
 BAND = 0.1
-"""Share of the rows in a top view: a wall that leans back would blur the rest."""
+"""Share of the rows used in a top view, since a tilted wall would blur it."""
 
 
 def wall_png(calibration: WallCalibration) -> bytes:
     """Return a PNG: histogram, top view, error over the image before and after, for each wall (after Fig A.1-A.3)."""
     walls = calibration.walls
-    made = blank(WIDTH, 7.4 * len(walls))
-    grid = made.subplots(2 * len(walls), 2, squeeze=False, height_ratios=[3.1, 4.3] * len(walls))
+    figure = blank(WIDTH, 7.4 * len(walls))
+    grid = figure.subplots(2 * len(walls), 2, squeeze=False, height_ratios=[3.1, 4.3] * len(walls))
     for axes, wall in zip(grid.reshape(-1, 4), walls, strict=True):
         _histogram(axes[0], wall)
         _top_view(axes[1], wall)
-        _error_map(made, axes[2], wall.before, "Before")
-        _error_map(made, axes[3], wall.after, "After")
-    return png_of(made, DPI)
+        _error_map(figure, axes[2], wall.before, "Before")
+        _error_map(figure, axes[3], wall.after, "After")
+    return png_of(figure, DPI)
 
 
 def noise_png(calibration: NoiseCalibration) -> bytes:
     """Return a PNG: RMSE against distance with theory (after Fig 3.7 and 3.9), sub-pixel, and share of valid pixels."""
-    made = blank(WIDTH, 6.2)
-    axes = made.subplot_mosaic([["rmse", "subpixel"], ["rmse", "shares"]], width_ratios=[1.7, 1])
+    figure = blank(WIDTH, 6.2)
+    axes = figure.subplot_mosaic([["rmse", "subpixel"], ["rmse", "shares"]], width_ratios=[1.7, 1])
     _rmse(axes["rmse"], calibration)
     _subpixel(axes["subpixel"], calibration)
     _shares(axes["shares"], calibration)
-    return png_of(made, DPI)
+    return png_of(figure, DPI)
 
 
 def _histogram(axis: Any, wall: WallResult) -> None:
@@ -83,13 +83,13 @@ def _top_view(axis: Any, wall: WallResult) -> None:
     labels(axis, "x, to the right [m]", "z, depth [m]", LETTERS)
 
 
-def _error_map(made: Any, axis: Any, error: NDArray[np.float64], name: str) -> None:
+def _error_map(figure: Any, axis: Any, error: NDArray[np.float64], name: str) -> None:
     limit = max(0.1, 100 * float(np.nanpercentile(np.abs(error), 98)))
     rms = 100 * np.sqrt(np.nanmean(error**2))
     drawn = axis.imshow(100 * error, cmap="RdBu_r", vmin=-limit, vmax=limit, interpolation="antialiased")
     axis.set(xticks=[], yticks=[], facecolor="#d9d9d9")
     title(axis, f"{name}: {rms:.2f} % RMS")
-    bar = made.colorbar(drawn, ax=axis, orientation="horizontal", pad=0.02, fraction=0.06, aspect=30)
+    bar = figure.colorbar(drawn, ax=axis, orientation="horizontal", pad=0.02, fraction=0.06, aspect=30)
     bar.set_label("too far [% of the depth]", color=GREY)
     bar.ax.tick_params(colors=GREY)
     bar.outline.set_visible(False)

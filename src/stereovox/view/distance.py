@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A picture of one layer of a distance field: how far the nearest obstacle is, in colours and lines."""
+"""Picture of one layer of a distance field: the distance to the nearest obstacle in colours and contours."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from stereovox.errors import StereovoxError
 from stereovox.products.distance import DistanceField
 from stereovox.products.floor_axes import floor_axes
 from stereovox.view.drawn import UPS, checked_up
-from stereovox.view.figures import WIDTH, figure_of, save, words_above
+from stereovox.view.figures import WIDTH, figure_of, save, title_above
 
 COLOURS = "viridis"
 LINES = (0.1, 0.25, 0.5, 1.0, 2.0, 5.0, 10.0)
-"""Distances between lines, in metres; there are at most MAX_LINES."""
+"""Candidate intervals of contours in metres; there are at most MAX_LINES contours."""
 MAX_LINES = 10
 
 
@@ -25,7 +25,7 @@ def picture_distance(
 ) -> None:
     """Write a PNG of the layer across `up` at height `at_m` in metres along it, by default the middle of the box.
 
-    Obstacles are dark; lines join places of the same distance. Raises StereovoxError for a height outside the box, and
+    Obstacles are dark; contours join places of equal distance. Raises StereovoxError for a height outside the box, and
     as `figures.save` does.
     """
     save(draw_distance(field, up, at_m, title), path)
@@ -52,12 +52,12 @@ def draw_distance(field: DistanceField, up: str, at_m: float | None, title: str)
     _lines(axis, shown, extent)
     axis.set(xlabel=f"{'xyz'[right]} in metres", ylabel=f"{'xyz'[away]} in metres", facecolor="white")
     figure.colorbar(image, ax=axis, label="metres to the nearest obstacle", shrink=0.8)
-    words_above(figure, title, [f"layer at {'-' if sign < 0 else ''}{'xyz'[height]} = {at_m:.2f} m", "obstacles dark"])
+    title_above(figure, title, [f"layer at {'-' if sign < 0 else ''}{'xyz'[height]} = {at_m:.2f} m", "obstacles dark"])
     return figure
 
 
 def _layer(field: DistanceField, height: int, sign: int, at_m: float | None) -> tuple[int, float]:
-    """Return the number of the layer at a height, and where its middle stands."""
+    """Return the index of the layer at a height, and the height of its centre."""
     number, side = field.metres.shape[height], field.cell[height]
     layer = number // 2 if at_m is None else int(np.floor((sign * at_m - field.origin[height]) / side))
     if not 0 <= layer < number:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A map made ready for drawing: turned upright, with the layers at which to cut it."""
+"""Map prepared for drawing: turned upright, with the layers at which to cut it."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from stereovox.errors import StereovoxError, did_you_mean
 from stereovox.maps import State, VoxelMap
 
 UPS = {"z": (0, 1, 2), "-z": (1, 0, 2), "y": (2, 0, 1), "-y": (0, 2, 1), "x": (1, 2, 0), "-x": (2, 1, 0)}
-"""For each axis that may point up: the map's axes that go right, away and up (the last flipped where minus)."""
+"""For each up axis: the map's axes that point right, away and up in a picture (the last flipped where minus)."""
 SLAB = 1.6
-"""A layer that holds so many times the cells of the median layer is a floor or a ceiling."""
+"""A layer with this many times the cells of the median layer is a floor or a ceiling."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,14 +44,14 @@ class Drawn:
 
     @cached_property
     def cut(self) -> float | None:
-        """Height in metres from which cells are left out, None where all are drawn."""
+        """Height in metres above which cells are hidden, None where all are drawn."""
         if len(self.below_ceiling) == len(self.occupied):
             return None
         return ceiling(self.occupied) * self.voxel_size
 
     @cached_property
     def layer(self) -> int:
-        """The layer that tells most: many known cells, no floor or ceiling, and of those the most occupied cells."""
+        """The most informative layer: no floor or ceiling, many known cells, and then the most occupied cells."""
         low, known = _layers(self.cells)
         occupied = np.bincount(self.occupied[:, 2] - low, minlength=len(known))
         usual = np.median(occupied[occupied > 0]) if occupied.any() else np.inf
@@ -60,7 +60,7 @@ class Drawn:
 
 
 def checked_up(up: str) -> str:
-    """Return a key of `UPS` (`+z` is `z`). Raises StereovoxError for a word that is no axis."""
+    """Return a key of `UPS` (`+z` is `z`). Raises StereovoxError for an invalid axis."""
     if up.removeprefix("+") not in UPS:
         raise StereovoxError(f"up '{up}' is no axis of the map{did_you_mean(up, UPS)}")
     return up.removeprefix("+")
@@ -73,7 +73,7 @@ def turned(points: ArrayLike, up: str) -> NDArray[np.float64]:
 
 
 def upright(voxel_map: VoxelMap, trajectory: ArrayLike | None, up: str) -> Drawn:
-    """Turn a map so that its axis `up` (`z`, `-y`, ...) becomes the third. Raises StereovoxError for another word."""
+    """Turn a map so that its axis `up` (`z`, `-y`, ...) becomes the third. Raises StereovoxError if invalid."""
     up = checked_up(up)
     cells, _ = voxel_map.cells()
     state = voxel_map.state(voxel_map.centers(cells))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Charts of an evaluation: against the frame (Valenti 2018, Fig 8.4), the threshold and distance; ROC, reliability."""
+"""Charts of an evaluation: by frame (Valenti 2018, Fig 8.4), threshold and distance; ROC, reliability."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ DPI = 140
 WIDTH = 12.0
 """Inches."""
 LINE_LETTERS = 74
-"""Letters that fit above a chart of half the width."""
+"""Number of letters that fit above a chart of half the width."""
 PRECISION, RECALL, THIRD = "#23618c", "#d1603d", "#5b8c5a"
 EXACT, TOLERANT = ":", "-"
 CLASSES = (
@@ -35,9 +35,9 @@ LIKENESS = (("correlation", "correlation", THIRD), ("error", "error", INK), ("co
 
 
 def series_png(arrays: Mapping[str, NDArray[Any]]) -> bytes:
-    """Return a PNG of measures against the frame, `arrays` as `ScoreSeries.arrays` returns them, at least one frame."""
-    made = blank(WIDTH, 4.4)
-    left, right = made.subplots(1, 2)
+    """Return a PNG of measures by frame, `arrays` as `ScoreSeries.arrays` returns them, at least one frame."""
+    figure = blank(WIDTH, 4.4)
+    left, right = figure.subplots(1, 2)
     frame = arrays["frame"]
     dot = "o" if len(frame) < 60 else ""
     for axis, lines in ((left, CLASSES), (right, LIKENESS)):
@@ -50,15 +50,15 @@ def series_png(arrays: Mapping[str, NDArray[Any]]) -> bytes:
         axis.set_ylim(-0.02, 1.02)
         legend_below(axis, 3)
         labels(axis, "frame", "")
-    told(left, "Right or wrong, all cells", "A cell counts as free until the map calls it occupied.")
-    told(right, "Likeness, and with tolerance", "Error should fall or stay level, all others should rise.")
-    return png_of(made, DPI)
+    caption(left, "Right or wrong, all cells", "A cell counts as free until the map calls it occupied.")
+    caption(right, "Likeness, and with tolerance", "Error should fall or stay level, all others should rise.")
+    return png_of(figure, DPI)
 
 
 def curves_png(scores: Scores) -> bytes:
-    """Return a PNG: precision and recall against the threshold, reliability with counts, ROC, and against distance."""
-    made = blank(WIDTH, 8.8)
-    upper, lower = made.subplots(2, 2)
+    """Return a PNG: precision and recall by threshold and by distance, reliability with counts, and ROC."""
+    figure = blank(WIDTH, 8.8)
+    upper, lower = figure.subplots(2, 2)
     _thresholds(upper[0], scores.curve, scores.threshold, scores.tolerance_cells)
     _reliability(upper[1], scores.reliability, scores.ece)
     _roc(lower[0], scores.roc)
@@ -66,7 +66,7 @@ def curves_png(scores: Scores) -> bytes:
         _both(lower[1], scores.curve, scores.threshold)
     else:
         _distance(lower[1], scores.distance)
-    return png_of(made, DPI)
+    return png_of(figure, DPI)
 
 
 def _thresholds(axis: Any, curve: PrecisionRecall, threshold: float, tolerance: int) -> None:
@@ -78,7 +78,9 @@ def _thresholds(axis: Any, curve: PrecisionRecall, threshold: float, tolerance: 
     axis.axvline(threshold, color=GREY, linewidth=1, linestyle="--")
     axis.set(xlim=(0, 1), ylim=(0, 1.02))
     legend_below(axis, 2)
-    told(axis, "Precision and recall against the threshold", "A more careful map is more often right and misses more.")
+    caption(
+        axis, "Precision and recall against the threshold", "A more careful map is more often right and misses more."
+    )
     labels(axis, f"threshold (dashed: {threshold:g})", "")
 
 
@@ -90,7 +92,9 @@ def _both(axis: Any, curve: PrecisionRecall, threshold: float) -> None:
         axis.plot(recall[here], precision[here], "o", color=PRECISION)
     axis.set(xlim=(0, 1.02), ylim=(0, 1.02))
     legend_below(axis, 2)
-    told(axis, "Precision against recall", "What more recall costs in precision: the further up and right, the better.")
+    caption(
+        axis, "Precision against recall", "What more recall costs in precision: the further up and right, the better."
+    )
     labels(axis, f"recall (dot: threshold {curve.threshold[here]:g})", "precision")
 
 
@@ -110,7 +114,7 @@ def _reliability(axis: Any, found: Reliability, ece: float | None) -> None:
     axis.set(xlim=(0, 1), ylim=(0, 1.02))
     legend_below(axis, 2)
     text = "Of all cells with p = 0.8, 80 % should be occupied; below the dashed line the map claims too much."
-    told(axis, "Reliability" + ("" if ece is None else f", ECE {ece:.3f}"), text)
+    caption(axis, "Reliability" + ("" if ece is None else f", ECE {ece:.3f}"), text)
     labels(axis, "probability the map gives", "share that is truly occupied")
 
 
@@ -121,7 +125,7 @@ def _roc(axis: Any, curve: Roc | None) -> None:
     axis.set(xlim=(-0.01, 1), ylim=(0, 1.02))
     legend_below(axis, 2)
     text = "What each threshold wins and what it costs: the nearer to the upper left corner, the better."
-    told(axis, "ROC" + ("" if curve is None else f", area {curve.auc:.3f}"), text)
+    caption(axis, "ROC" + ("" if curve is None else f", area {curve.auc:.3f}"), text)
     labels(axis, "free cells called occupied", "occupied cells called occupied")
 
 
@@ -141,12 +145,12 @@ def _distance(axis: Any, found: ByDistance) -> None:
     axis.set(xlim=found.edges[[0, -1]], ylim=(0, 1.02))
     legend_below(axis, 2)
     text = "Stereo knows less about what is far away; bars show how much of the truth is there."
-    told(axis, "Precision and recall by distance", text)
+    caption(axis, "Precision and recall by distance", text)
     labels(axis, "distance to the nearest camera position [m]", "")
 
 
-def told(axis: Any, heading: str, text: str) -> None:
-    """Write a chart's title, and below it one sentence about what to see in it."""
+def caption(axis: Any, heading: str, text: str) -> None:
+    """Write a chart's title, and below it one sentence on how to read it."""
     lines = fill(text, LINE_LETTERS)
     axis.set_title(heading, loc="left", fontsize=12.5, color=INK, pad=10 + 12 * (1 + lines.count("\n")))
     place: dict[str, Any] = {"xycoords": "axes fraction", "textcoords": "offset points"}
@@ -154,7 +158,7 @@ def told(axis: Any, heading: str, text: str) -> None:
 
 
 def legend_below(axis: Any, columns: int) -> None:
-    """Put the legend under a chart, where it hides nothing."""
+    """Put the legend below a chart."""
     axis.legend(
         loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=columns, frameon=False, fontsize=9.5, columnspacing=1.4
     )

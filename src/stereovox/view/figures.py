@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What all pictures share: figures with a headline, legends, charts."""
+"""Parts shared by all pictures: figures with a headline, legends, axes, saving."""
 
 from __future__ import annotations
 
@@ -13,11 +13,17 @@ from stereovox.maps import VoxelMap
 from stereovox.safe_io import replacing
 from stereovox.view.panels import GREY, INK, LINE
 
+DPI = 120
+ENDINGS = (".png", ".pdf", ".svg")
+MIN_DPI, MAX_DPI = 20, 2400
+WIDTH = 16.0
+"""Width of a page in inches."""
+
 
 def keep_clear(axis: Any) -> None:
-    """Put the legend above a panel into a column at its right, where it would cover the panel's title.
+    """Move the legend above a panel into a column at its right where it would cover the panel's title.
 
-    To be called when all panels of the figure are there: how wide this one is, only the finished layout tells.
+    Call it when all panels of the figure are there: the width of this one is known only from the finished layout.
     """
     axis.figure.draw_without_rendering()
     legend = axis.get_legend()
@@ -48,13 +54,13 @@ def blank(width: float, height: float) -> Any:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    made = Figure((width, height), facecolor="white", layout="constrained")
-    FigureCanvasAgg(made)
-    return made
+    figure = Figure((width, height), facecolor="white", layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
 
 
 def labels(axis: Any, x: str, y: str, letters: float = 9) -> None:
-    """Label both axes of a chart in grey, ticks with `letters` points; an empty `x` leaves that axis as it is."""
+    """Label both axes of a chart in grey, ticks with `letters` points; an empty `x` leaves that axis unchanged."""
     if x:
         axis.set_xlabel(x, color=GREY)
     axis.set_ylabel(y, color=GREY)
@@ -64,17 +70,10 @@ def labels(axis: Any, x: str, y: str, letters: float = 9) -> None:
 
 
 def png_of(figure: Any, dpi: int) -> bytes:
-    """Return a figure as the bytes of a PNG."""
+    """Return a figure as PNG bytes."""
     out = io.BytesIO()
     figure.savefig(out, dpi=dpi, format="png")
     return out.getvalue()
-
-
-DPI = 120
-ENDINGS = (".png", ".pdf", ".svg")
-MIN_DPI, MAX_DPI = 20, 2400
-WIDTH = 16.0
-"""Width of a page in inches."""
 
 
 def figure_of(height: float) -> Any:
@@ -91,24 +90,24 @@ def figure_of(height: float) -> Any:
 
 
 def headline(figure: Any, voxel_map: VoxelMap, text: str) -> None:
-    """Write the title, and below it what the map is."""
+    """Write the title, and below it the facts of the map."""
     counts = voxel_map.counts()
     facts = [f"cells of {voxel_map.voxel_size:g} m", f"{voxel_map.frames:,} frames"]
     facts += [f"{counts[state]:,} {state}" for state in ("occupied", "free", "tentative")]
-    words_above(figure, text, facts)
+    title_above(figure, text, facts)
 
 
-def words_above(figure: Any, text: str, facts: Sequence[str]) -> None:
+def title_above(figure: Any, text: str, facts: Sequence[str]) -> None:
     """Write a title, and below it a line of facts."""
     figure.text(0.02, 1 - 0.42 / figure.get_figheight(), text, fontsize=20, weight="bold", color=INK)
     figure.text(0.02, 1 - 0.76 / figure.get_figheight(), "   ·   ".join(facts), fontsize=12.5, color=GREY)
 
 
 def save(figure: Any, path: str | Path, dpi: float | None = None) -> None:
-    """Save a figure: as dots (.png), or letters and lines as vectors, with text as text (.pdf, .svg).
+    """Save a figure as pixels (.png) or vectors with text as text (.pdf, .svg).
 
-    dpi: dots an inch; by default the figure's own. In .pdf and .svg it is that of the cells, where these are an image.
-    Raises StereovoxError for another ending, dots that cannot be, or a file that cannot be written.
+    dpi: dots per inch; by default the figure's own. In .pdf and .svg it is that of cells drawn as an image.
+    Raises StereovoxError for another suffix, an invalid dpi, or a file that cannot be written.
     """
     from matplotlib import rc_context
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A picture of a floor's map: free, occupied and unknown cells, metres at the edges, and a robot's way through it."""
+"""Picture of a floor map: free, occupied and unknown cells, metres at the edges, and a robot's trajectory."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from numpy.typing import ArrayLike, NDArray
 from stereovox import se2
 from stereovox.maps import State
 from stereovox.maps.occupancy import OccupancyGrid
-from stereovox.view.figures import WIDTH, figure_of, save, words_above
+from stereovox.view.figures import WIDTH, figure_of, save, title_above
 from stereovox.view.panels import GREY, INK, PATH_COLOUR, STATE_COLOURS, measured, scale_bar
 
 MAX_PIXELS = 1500
-"""Cells along the longer side up to which each has a pixel of its own; beyond, one of several is shown."""
+"""Largest number of cells along the longer side that are drawn one per pixel; beyond, cells are pooled."""
 Box = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Lowest and highest (2,) x, y in metres."""
 NAMES = {State.UNKNOWN: "unknown", State.FREE: "free", State.TENTATIVE: "tentative", State.OCCUPIED: "occupied"}
@@ -27,10 +27,10 @@ NAMES = {State.UNKNOWN: "unknown", State.FREE: "free", State.TENTATIVE: "tentati
 def picture_grid(
     grid: OccupancyGrid, path: str | Path, *, title: str | None = None, track: ArrayLike | None = None
 ) -> None:
-    """Write a PNG of a floor's map.
+    """Write a PNG of a floor map.
 
-    track: (N, 2) or (N, 3) places x, y (and yaw) of a robot in the map's frame, drawn as a line. A map that knows
-    nothing gives a picture that says so. Raises StereovoxError for a name that does not end in .png or a file that
+    track: (N, 2) or (N, 3) positions x, y (and yaw) of a robot in the map's frame, drawn as a line. A map without
+    known cells gives a picture that says so. Raises StereovoxError for a name that does not end in .png or a file that
     cannot be written.
     """
     save(draw_grid(grid, title or "Floor map", track), path)
@@ -49,7 +49,7 @@ def draw_grid(grid: OccupancyGrid, heading: str, track: ArrayLike | None = None)
         plan(axis, trimmed(grid), track)
         framed(axis, box)
         legend(figure, grid.states, track is not None)
-    words_above(figure, heading, facts(grid))
+    title_above(figure, heading, facts(grid))
     return figure
 
 
@@ -62,7 +62,7 @@ def framed(axis: Any, box: Box) -> None:
 
 
 def facts(grid: OccupancyGrid) -> list[str]:
-    """Return what a map holds, in words."""
+    """Describe the contents of a map."""
     rows, columns = grid.cells.shape
     counts = np.bincount(grid.states.ravel(), minlength=len(State))
     size = f"{columns * grid.resolution:.1f} x {rows * grid.resolution:.1f} m"
@@ -71,7 +71,7 @@ def facts(grid: OccupancyGrid) -> list[str]:
 
 
 def bounds(grid: OccupancyGrid, track: ArrayLike | None = None) -> Box | None:
-    """Return lowest and highest (2,) x, y of what is known and of the track, with a margin; None where nothing is."""
+    """Return lowest and highest (2,) x, y of known cells and track, with a margin; None where there are none."""
     corners = se2.transform(grid.origin, grid.known_corners * grid.resolution)
     if track is not None and np.size(track):
         corners = np.concatenate([corners, np.asarray(track, float)[:, :2]])
@@ -82,9 +82,9 @@ def bounds(grid: OccupancyGrid, track: ArrayLike | None = None) -> Box | None:
     return low - margin, high + margin
 
 
-def plan(axis: Any, grid: OccupancyGrid, track: ArrayLike | None = None, most: int = MAX_PIXELS) -> None:
-    """Draw the states of a map's cells into a panel in metres of the map's frame, and a robot's way if there is one."""
-    paint(axis, grid, grid.states, {int(state): STATE_COLOURS[state] for state in State}, most)
+def plan(axis: Any, grid: OccupancyGrid, track: ArrayLike | None = None, max_px: int = MAX_PIXELS) -> None:
+    """Draw the states of a map's cells into a panel in metres of the map's frame, and a robot's track if given."""
+    paint(axis, grid, grid.states, {int(state): STATE_COLOURS[state] for state in State}, max_px)
     axis.set_facecolor(STATE_COLOURS[State.UNKNOWN])
     if track is not None and np.size(track):
         x, y = np.asarray(track, float)[:, :2].T
@@ -94,18 +94,18 @@ def plan(axis: Any, grid: OccupancyGrid, track: ArrayLike | None = None, most: i
 
 
 def paint(
-    axis: Any, grid: OccupancyGrid, classes: NDArray[np.uint8], colours: Mapping[int, str], most: int = MAX_PIXELS
+    axis: Any, grid: OccupancyGrid, classes: NDArray[np.uint8], colours: Mapping[int, str], max_px: int = MAX_PIXELS
 ) -> None:
     """Draw classes (rows, columns) uint8 of the cells of `grid` into a panel.
 
-    colours: of each class, and in this order they cover each other where one pixel stands for several cells, so that a
-    wall one cell wide is not lost. most: pixels along the longer side.
+    colours: of each class; where one pixel stands for several cells the last class in this order is shown, so that a
+    wall one cell wide is not lost. max_px: pixels along the longer side.
     """
     from matplotlib.colors import ListedColormap
     from matplotlib.transforms import Affine2D
 
     x, y, yaw = grid.origin
-    step = -(-max(classes.shape) // most)
+    step = -(-max(classes.shape) // max_px)
     ranks = pooled(classes, list(colours), step)
     rows, columns = (n * step * grid.resolution for n in ranks.shape)
     axis.imshow(
@@ -123,7 +123,7 @@ def paint(
 
 
 def pooled(classes: NDArray[np.uint8], rising: Sequence[int], step: int) -> NDArray[np.uint8]:
-    """Return the place in `rising` of the class that comes last there, in each square of `step` cells a side."""
+    """Return, for each square of `step` by `step` cells, the index in `rising` of its class that comes last there."""
     rank = np.zeros(256, np.uint8)
     rank[np.asarray(rising, int)] = np.arange(len(rising))
     rows, columns = (-(-n // step) * step for n in classes.shape)
@@ -133,20 +133,20 @@ def pooled(classes: NDArray[np.uint8], rising: Sequence[int], step: int) -> NDAr
 
 
 def trimmed(grid: OccupancyGrid) -> OccupancyGrid:
-    """Return a map without the rows and columns at its rim of which nothing is known."""
+    """Return a map without the unknown rows and columns at its rim."""
     rows, columns = grid.known_span
     x, y, yaw = se2.compose(grid.origin, [columns.start * grid.resolution, rows.start * grid.resolution, 0]).tolist()
     return replace(grid, cells=grid.cells[rows, columns], origin=(x, y, yaw))
 
 
 def known_bounds(grid: OccupancyGrid) -> NDArray[np.float64] | None:
-    """Return lowest and highest (2, 2) x, y in metres of what is known, in the map's frame; None where nothing is."""
+    """Return lowest and highest (2, 2) x, y in metres of the known cells, in the map's frame; None without any."""
     corners = se2.transform(grid.origin, grid.known_corners * grid.resolution)
     return np.stack([corners.min(axis=0), corners.max(axis=0)]) if len(corners) else None
 
 
 def legend(figure: Any, shown: NDArray[np.uint8], with_track: bool) -> None:
-    """Write below a figure what the colours of `plan` mean, of the states that are `shown`."""
+    """Add the legend of `plan` below a figure, for the states that are `shown`."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 

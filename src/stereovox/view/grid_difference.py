@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where two 2-D maps differ: the binary image of IST 2019, Fig 6 and 9, and one that tells in which way."""
+"""Differences of two 2-D maps: the binary image of IST 2019, Fig 6 and 9, and one with the kinds of difference."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ DPI = 140
 WIDTH = 12.0
 """Inches."""
 BOTH_FREE, BOTH_OCCUPIED, BOTH_UNKNOWN = 10, 11, 12
-"""What `classes` tells of cells that do not differ."""
+"""Classes of cells that do not differ."""
 KINDS = {
     BOTH_UNKNOWN: ("unknown to both", "#cfd4db"),
     BOTH_FREE: ("both free", "#eef1f4"),
@@ -32,11 +32,11 @@ KINDS = {
     Difference.WRONGLY_FREE: ("wrongly free", "#8b1e5b"),
     Difference.WRONGLY_OCCUPIED: ("wrongly occupied", "#d1603d"),
 }
-"""Name and colour; where one pixel stands for several cells the last of these is shown."""
+"""Name and colour; where one pixel stands for several cells, the last of these is shown."""
 
 
 def binary_png(laid: Laid) -> bytes:
-    """Return a PNG with a pixel for each cell, north up: white where the maps differ, black where not (IST 2019)."""
+    """Return a PNG with one pixel per cell, north up: white where the maps differ, else black (IST 2019)."""
     from matplotlib.image import imsave
 
     out = io.BytesIO()
@@ -45,7 +45,7 @@ def binary_png(laid: Laid) -> bytes:
 
 
 def classes(laid: Laid) -> NDArray[np.uint8]:
-    """Return for each cell, (rows, columns) uint8, its `Difference`, or where there is none what both maps say."""
+    """Return for each cell, (rows, columns) uint8, its `Difference`, or where there is none the common state."""
     found = differences(laid)
     same = np.full(len(State), BOTH_UNKNOWN, np.uint8)
     same[State.FREE], same[State.OCCUPIED] = BOTH_FREE, BOTH_OCCUPIED
@@ -53,7 +53,7 @@ def classes(laid: Laid) -> NDArray[np.uint8]:
 
 
 def difference_png(laid: Laid) -> bytes:
-    """Return a PNG that tells in colours how the maps differ, in metres of the reference's frame."""
+    """Return a PNG with the kinds of difference in colours, in metres of the reference's frame."""
     box = _box(laid)
     figure, (axis,) = _panels(box, 1)
     paint(axis, laid.reference, classes(laid), {int(kind): colour for kind, (_, colour) in KINDS.items()})
@@ -67,10 +67,10 @@ def side_by_side_png(laid: Laid, names: tuple[str, str] = ("Reference", "Map")) 
     """Return a PNG of the reference, the map, and the binary difference (white: an error), all in one frame."""
     box = _box(laid)
     figure, panels = _panels(box, 3)
-    most = int(0.74 * DPI * WIDTH) // (1 if _is_wide(box) else 3)
+    max_px = int(0.74 * DPI * WIDTH) // (1 if _is_wide(box) else 3)
     for axis, grid in zip(panels, (laid.reference, laid.map), strict=False):
-        plan(axis, grid, most=most)
-    paint(panels[2], laid.reference, wrong(differences(laid)).astype(np.uint8), {0: "black", 1: "white"}, most)
+        plan(axis, grid, max_px=max_px)
+    paint(panels[2], laid.reference, wrong(differences(laid)).astype(np.uint8), {0: "black", 1: "white"}, max_px)
     panels[2].set_facecolor("black")
     for axis, name in zip(panels, (*names, "Difference (white: an error)"), strict=True):
         axis.set(xlim=(box[0][0], box[1][0]), ylim=(box[0][1], box[1][1]))
@@ -79,7 +79,7 @@ def side_by_side_png(laid: Laid, names: tuple[str, str] = ("Reference", "Map")) 
 
 
 def _box(laid: Laid) -> Box:
-    """Return what to show: all that one of the maps knows."""
+    """Return the box of all cells known to either map."""
     box = bounds(replace(laid.reference, cells=np.maximum(laid.map.cells, laid.reference.cells)))
     return box if box is not None else (np.zeros(2), np.ones(2))
 
@@ -90,7 +90,7 @@ def _is_wide(box: Box) -> bool:
 
 
 def _panels(box: Box, number: int) -> tuple[Any, list[Any]]:
-    """Return a figure of panels: side by side, or for wide maps one below another."""
+    """Return a figure with panels side by side or, for wide maps, below each other."""
     width, height = box[1] - box[0]
     rows, columns = (number, 1) if _is_wide(box) else (1, number)
     inches = float(np.clip(0.93 * WIDTH / columns * height / width, 1.6, 11.0)) + 0.7

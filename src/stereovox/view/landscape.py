@@ -17,7 +17,7 @@ from stereovox.view.scale import Scale, scale_of
 from stereovox.view.space import draw_frame, fit, numbers
 
 MAX_COLUMNS = 160
-"""Cells along a side; larger layers are thinned, and the value furthest from unknown stays."""
+"""Cells along a side; larger layers are thinned, keeping the value farthest from unknown."""
 TALL = 0.3
 """Height of the landscape as a share of its longer side."""
 WIDE_PX = 8 * DPI
@@ -25,7 +25,7 @@ FROM = Direction.of(-115, 40)
 
 
 def draw_landscape(axis: Any, one: Layer, voxel_map: VoxelMap) -> None:
-    """Draw one column a cell, as high as its log-odds (bytes where the map has them); unknown cells are grey."""
+    """Draw one column per cell, as high as its log-odds (bytes where the map has them); unknown cells are grey."""
     from matplotlib.colors import to_rgb
 
     scale = scale_of(voxel_map)
@@ -44,7 +44,7 @@ def draw_landscape(axis: Any, one: Layer, voxel_map: VoxelMap) -> None:
 
 
 def thinned(values: NDArray[np.float64], unknown: float) -> tuple[NDArray[np.float64], int]:
-    """Return values (rows, columns), NaN unknown, of which each stands for step by step cells, and the step."""
+    """Return values (rows, columns), NaN unknown, each for step by step cells, and the step."""
     step = max(1, -(-max(values.shape) // MAX_COLUMNS))
     if step == 1:
         return values, 1
@@ -57,7 +57,7 @@ def thinned(values: NDArray[np.float64], unknown: float) -> tuple[NDArray[np.flo
 
 
 def columns(heights: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the cells (N, 3) of columns of these heights (rows, columns) >= 1, without those that nobody can see."""
+    """Return the cells (N, 3) of columns of these heights (rows, columns) >= 1, without hidden ones."""
     around = np.pad(heights, 1)
     sides = (around[:-2, 1:-1], around[2:, 1:-1], around[1:-1, :-2], around[1:-1, 2:])
     lowest = np.minimum(np.minimum.reduce(sides), heights - 1)

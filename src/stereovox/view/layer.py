@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""One layer of a map: its states as a plan, and its log-odds as colours and as a landscape (Chien 2020, Fig 4.6)."""
+"""One layer of a map: its states as a plan, its log-odds in colours and as a landscape (Chien 2020, Fig 4.6)."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from stereovox.view.scale import scale_of
 from stereovox.view.viewpoint import FIELD_M
 
 MAX_SQUARES = 90
-"""Columns of cells up to which each is drawn as a square with an outline."""
+"""Largest number of columns in which cells are drawn as outlined squares."""
 
 
 def draw_layer(
@@ -29,8 +29,8 @@ def draw_layer(
 ) -> Any:
     """Return a figure of one layer: states, log-odds as colours, log-odds as a landscape, and along the optical axis.
 
-    at_m: height in metres along `up`; by default the camera's, or that of the layer that tells most where nobody knows
-    the camera. viewpoint: by default the map's last. Raises StereovoxError for an empty map or an `up` that is no axis.
+    at_m: height in metres along `up`; by default the camera's, or that of the most informative layer without one.
+    viewpoint: by default the map's last. Raises StereovoxError for an empty map or an invalid `up`.
     """
     viewpoint = viewpoint or voxel_map.viewpoint
     up = checked_up(up)
@@ -63,7 +63,7 @@ def upright_layer(voxel_map: VoxelMap, up: str, at_m: float) -> Layer:
 
 
 def draw_plan(axis: Any, one: Layer, viewpoint: Viewpoint | None = None) -> None:
-    """Draw the states of a layer as squares, and in it the camera with its field of view, one metre deep."""
+    """Draw the states of a layer as squares, and the camera with its field of view, one metre deep."""
     from matplotlib.colors import ListedColormap
     from matplotlib.patches import Patch
 
@@ -80,7 +80,7 @@ def draw_plan(axis: Any, one: Layer, viewpoint: Viewpoint | None = None) -> None
 
 
 def draw_values(figure: Any, axis: Any, one: Layer, voxel_map: VoxelMap, viewpoint: Viewpoint | None = None) -> None:
-    """Draw the log-odds of a layer in colours with their bar; unknown cells are grey."""
+    """Draw the log-odds of a layer in colours with a colour bar; unknown cells are grey."""
     scale = scale_of(voxel_map)
     colours, norm = scale.colours()
     drawn = axis.imshow(
@@ -100,7 +100,7 @@ def draw_values(figure: Any, axis: Any, one: Layer, voxel_map: VoxelMap, viewpoi
 
 
 def shown_height(voxel_map: VoxelMap, up: str, viewpoint: Viewpoint | None) -> float:
-    """Return the height in metres along `up` of the layer to show: the camera's, or of the one that tells most."""
+    """Return the height in metres along `up` of the layer to show: the camera's, or the most informative one."""
     if viewpoint is None:
         drawn = upright(voxel_map, None, up)
         return (drawn.layer + 0.5) * voxel_map.voxel_size if len(drawn.cells) else 0.0
@@ -115,7 +115,7 @@ def _where(one: Layer) -> str:
 
 
 def _squares(axis: Any, one: Layer) -> None:
-    """Outline the cells where they are large enough to be told apart."""
+    """Outline the cells where they are large enough to be distinguished."""
     rows, columns = one.state.shape
     if max(rows, columns) > MAX_SQUARES:
         return
@@ -142,7 +142,7 @@ def _camera(axis: Any, one: Layer, viewpoint: Viewpoint) -> None:
 
 
 def _stretched(start: NDArray[np.float64], end: NDArray[np.float64], one: Layer) -> NDArray[np.float64]:
-    """Return a point on the way from `start` through `end` that lies beyond the layer."""
+    """Return a point on the ray from `start` through `end` that lies beyond the layer."""
     reach = float(np.hypot(one.extent[1] - one.extent[0], one.extent[3] - one.extent[2]))
     length = float(np.linalg.norm(end - start))
     return end if length < 1e-6 else start + (end - start) * min(reach / length, 1e4)

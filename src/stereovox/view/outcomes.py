@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a map is right and where it is wrong, seen from above."""
+"""Right and wrong cells of a map, seen from above."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ TOLERANT = {
 def outcomes_png(shown: Outcomes, up: str | None = None) -> bytes:
     """Return a PNG of two top views: exact, and with the tolerance.
 
-    A column of cells has the colours of its cells, mixed by their numbers. up: the axis that points up, by default as
-    the truth's settings say. Raises StereovoxError for an `up` that is no axis.
+    A column has the mean colour of its cells. up: the axis that points up, by default from the truth's settings. Raises
+    StereovoxError for an invalid `up`.
     """
     up = checked_up(up or shown.up)
     across, away, _ = UPS[up]
@@ -43,8 +43,8 @@ def outcomes_png(shown: Outcomes, up: str | None = None) -> bytes:
     size = (places.max(axis=0) - low + 1) if len(places) else np.ones(2, int)
     tall = size[1] > 0.6 * size[0]
     height = 0.8 + float(np.clip((0.46 if tall else 0.92) * WIDTH * size[1] / size[0], 2.0, 9.0))
-    made = blank(WIDTH, height if tall else 2 * height)
-    panels = made.subplots(*((1, 2) if tall else (2, 1)), squeeze=False).ravel()
+    figure = blank(WIDTH, height if tall else 2 * height)
+    panels = figure.subplots(*((1, 2) if tall else (2, 1)), squeeze=False).ravel()
     extent = np.stack([low, low + size], axis=1).ravel() * shown.voxel_size
     names = ("xyz"[across], "xyz"[away], up)
     for axis, classes, text in ((panels[0], EXACT, "Exact"), (panels[1], TOLERANT, "With tolerance")):
@@ -52,8 +52,8 @@ def outcomes_png(shown: Outcomes, up: str | None = None) -> bytes:
         axis.imshow(image, origin="lower", extent=extent, interpolation="nearest")
         title(axis, text)
         measured(axis, names)
-    _legend(made)
-    return png_of(made, DPI)
+    _legend(figure)
+    return png_of(figure, DPI)
 
 
 def mixed(
@@ -62,9 +62,9 @@ def mixed(
     size: tuple[int, ...],
     classes: Mapping[str, tuple[str, list[Outcome]]],
 ) -> NDArray[np.float64]:
-    """Return an image (rows, columns, 3): each place has the mean colour of its cells, white where there are none.
+    """Return an image (rows, columns, 3): each pixel has the mean colour of its cells, white where there are none.
 
-    places: (M, 2) column and row of each cell; cells of no class are not drawn.
+    places: (M, 2) column and row of each cell; cells without a class are not drawn.
     """
     from matplotlib.colors import to_rgb
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The panels of a picture: a view of the occupied cells, and a slice with all four states."""
+"""Panels of a picture: a view of the occupied cells, and a slice with all four states."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def slice_(axis: Any, drawn: Drawn) -> None:
 
 
 def measured(axis: Any, names: tuple[str, str, str]) -> None:
-    """Label the axes of a panel that is seen from above."""
+    """Label the axes of a top view."""
     axis.set_xlabel(f"{names[0]} [m]", color=GREY)
     axis.set_ylabel(f"{names[1]} [m]", color=GREY)
     axis.tick_params(colors=GREY, labelsize=9)
@@ -96,7 +96,7 @@ def _trajectory(axis: Any, points: NDArray[np.float64]) -> None:
 
 
 def scale_bar(axis: Any) -> None:
-    """Draw a bar of a round length, with that length, at the lower right of a panel in metres."""
+    """Draw a labelled scale bar of a round length at the lower right of a panel in metres."""
     left, right = axis.get_xlim()
     bottom, top = axis.get_ylim()
     length = round_length((right - left) / 6)
@@ -107,7 +107,7 @@ def scale_bar(axis: Any) -> None:
 
 
 def round_length(length: float) -> float:
-    """Return the largest 1, 2 or 5 times a power of ten that is not above `length`."""
+    """Return the largest 1, 2 or 5 times a power of ten not above `length`."""
     power = 10.0 ** np.floor(np.log10(length))
     return float(max(step for step in (1, 2, 5) if step * power <= length * 1.0001) * power)
 

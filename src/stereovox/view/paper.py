@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A map as one figure of a paper: as wide as a column, small letters that can be read, and no headline."""
+"""Map as a figure for a paper: as wide as a column, with small readable letters and no title."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ MM = 1 / 25.4
 """Inches."""
 NARROWEST_MM, WIDEST_MM = 30.0, 400.0
 DPI = 600
-"""Dots an inch of cells that are drawn as an image; letters and lines are never dots in .pdf and .svg."""
+"""Dots per inch of cells drawn as an image; letters and lines stay vectors in .pdf and .svg."""
 LETTERS_PT, LINE_PT, PATH_PT = 7.0, 0.5, 0.9
 BAR_SHARE = 0.12
-"""Share of the width beside cells that the colour bar takes."""
+"""Width of the colour bar, as a share of the figure's."""
 STYLE: dict[Any, Any] = {
     "font.size": LETTERS_PT,
     "axes.linewidth": LINE_PT,
@@ -55,8 +55,8 @@ def draw_paper(
 ) -> Any:
     """Return a figure `width_mm` wide: `overview` from above, `space` from the side, or the states of a `layer`.
 
-    All have metres: axes, or a bar for scale. The camera's path is drawn where the map knows it. at_m, viewpoint: as in
-    `draw_view`. Raises StereovoxError for another view, a width that no page has, and a map with nothing to draw.
+    All show metres, on axes or a scale bar. The camera's path is drawn where the map knows it. at_m, viewpoint: as in
+    `draw_view`. Raises StereovoxError for another view, an invalid width, and an empty map.
     """
     from matplotlib import rc_context
 
@@ -113,7 +113,7 @@ def _cells(drawn: Drawn, direction: Direction, width_mm: float) -> tuple[Any, An
 
 
 def _layer(voxel_map: VoxelMap, one: Layer, width_mm: float) -> Any:
-    """Draw the states as rectangles, one for each run of equal cells in a row: sharp at any size."""
+    """Draw the states as rectangles, one per run of equal cells in a row: sharp at any size."""
     from matplotlib.collections import PolyCollection
     from matplotlib.patches import Patch
 
@@ -149,7 +149,7 @@ def runs(chosen: NDArray[np.bool_]) -> NDArray[np.float64]:
 
 
 def _figure(width_mm: float, shape: float) -> tuple[Any, Any]:
-    """Return an empty figure for a panel that is `shape` times as high as wide, and the panel."""
+    """Return an empty figure with a panel `shape` times as high as wide, and the panel."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
     from matplotlib.layout_engine import ConstrainedLayoutEngine

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A picture of a path through a map: from above, unrolled from the side, and how much room there is along it."""
+"""Picture of a path through a map: from above, unrolled from the side, and the clearance along it."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from stereovox.products.floor_axes import floor_axes
 from stereovox.products.path_check import point_along
 from stereovox.products.projection import project
 from stereovox.view.drawn import UPS, turned
-from stereovox.view.figures import WIDTH, figure_of, save, words_above
+from stereovox.view.figures import WIDTH, figure_of, save, title_above
 from stereovox.view.grid import bounds, framed, legend, plan, trimmed
 from stereovox.view.panels import INK, PATH_COLOUR, STATE_COLOURS, measured
 
 STEPS = 400
-"""Places along the path at which the room is measured."""
+"""Number of points along the path at which the clearance is measured."""
 MORE_RADII = 3.0
-"""The section reaches so many radii above and below the path."""
+"""The section reaches this many radii above and below the path."""
 DRAWN_EVERY = 2.0
-"""The body is drawn along the path this many radii apart."""
+"""Distance in radii between drawings of the body along the path."""
 MAX_BODIES = 100
 NEAREST = {"obstacle": ([State.OCCUPIED, State.TENTATIVE], INK), "unknown cell": ([State.UNKNOWN], "tab:blue")}
 
@@ -40,59 +40,59 @@ def picture_path(
 ) -> None:
     """Write a PNG of a path (N, 3) in metres, world frame, of a ball of `radius` metres.
 
-    First the map from above, of the heights that the ball passes through; then the upright section along the path, so
-    that one sees what it passes over and under; then how far obstacles and unknown cells are from it.
-    blocked_at: metres along the path where it is blocked, which is marked.
-    Raises StereovoxError where nothing is known at these heights, and as `figures.save` does.
+    First the map from above, at the heights that the ball passes through; then the vertical section along the path,
+    which shows what it passes over and under; then the distance of obstacles and unknown cells.
+    blocked_at: metres along the path where it is blocked; this point is marked.
+    Raises StereovoxError where nothing is known at these heights, and as `figures.save`.
     """
     save(draw_path(voxel_map, np.asarray(waypoints, float), radius, title, blocked_at), path)
 
 
 def draw_path(
-    voxel_map: VoxelMap, way: NDArray[np.float64], radius: float, title: str, blocked_at: float | None = None
+    voxel_map: VoxelMap, waypoints: NDArray[np.float64], radius: float, title: str, blocked_at: float | None = None
 ) -> Any:
     """Return the matplotlib figure that `picture_path` saves."""
     up = voxel_map.config.up
-    heights = turned(way, up)[:, 2]
+    heights = turned(waypoints, up)[:, 2]
     room = max(radius, voxel_map.config.cell[UPS[up][2]])
     band = float(heights.min()) - room, float(heights.max()) + room
-    seen, flat = _seen(voxel_map, band), way[:, UPS[up][:2]]
-    box = bounds(seen, flat)
+    plan_grid, flat = _projected(voxel_map, band), waypoints[:, UPS[up][:2]]
+    box = bounds(plan_grid, flat)
     assert box is not None  # `project` found something
     (x0, y0), (x1, y1) = box
     tall = float(np.clip(0.92 * WIDTH * (y1 - y0) / (x1 - x0), 3, 12))
     figure = figure_of(tall + 7.6)
     above, aside, along = figure.subplots(3, 1, height_ratios=[tall, 3, 3])
-    plan(above, trimmed(seen), flat)
+    plan(above, trimmed(plan_grid), flat)
     names = "".join("xyz"[axis] for axis in UPS[up])
     measured(above, (names[0], names[1], names[2]))
     framed(above, box)
-    length = float(np.linalg.norm(np.diff(way, axis=0), axis=1).sum())
-    places = np.array([point_along(way, at) for at in np.linspace(0, length, STEPS)])
+    length = float(np.linalg.norm(np.diff(waypoints, axis=0), axis=1).sum())
+    places = np.array([point_along(waypoints, at) for at in np.linspace(0, length, STEPS)])
     _bodies(above, places[:, UPS[up][:2]], radius, length)
     _section(aside, voxel_map, places, radius, length)
     _room(along, voxel_map, places, radius, length)
     if blocked_at is not None:
-        _mark(above, (aside, along), point_along(way, blocked_at)[[*UPS[up][:2]]], blocked_at)
-    told = f"from above: what is {band[0]:.2f} to {band[1]:.2f} m high ({up}); the way may pass over or under it"
-    above.set_title(told, fontsize=11, color=INK)
-    legend(figure, seen.states, with_track=True)
+        _mark(above, (aside, along), point_along(waypoints, blocked_at)[[*UPS[up][:2]]], blocked_at)
+    caption = f"from above: what is {band[0]:.2f} to {band[1]:.2f} m high ({up}); the way may pass over or under it"
+    above.set_title(caption, fontsize=11, color=INK)
+    legend(figure, plan_grid.states, with_track=True)
     facts = [f"{length:.2f} m long", f"radius {radius:g} m", f"cells of {voxel_map.voxel_size:g} m"]
     if blocked_at is not None:
         facts.append(f"blocked after {blocked_at:.2f} m, at the cross")
-    words_above(figure, title, facts)
+    title_above(figure, title, facts)
     return figure
 
 
-def _seen(voxel_map: VoxelMap, band: tuple[float, float]) -> OccupancyGrid:
+def _projected(voxel_map: VoxelMap, band: tuple[float, float]) -> OccupancyGrid:
     try:
         return project(voxel_map, band)
-    except StereovoxError as error:  # its cure is to give other heights, which are the path's own here
+    except StereovoxError as error:  # its cure, other heights, does not apply: they are the path's
         raise StereovoxError(f"no picture of this path: {str(error).partition(';')[0]}") from None
 
 
 def _mark(above: Any, others: tuple[Any, ...], place: NDArray[np.float64], at: float) -> None:
-    """Mark the place from which on the path is blocked."""
+    """Mark the point where the path is blocked."""
     above.plot(*place, marker="X", color=PATH_COLOUR, markeredgecolor="white", markersize=16, zorder=5)
     for axis in others:
         axis.axvline(at, color=PATH_COLOUR, linestyle=":")
@@ -104,12 +104,14 @@ def _bodies(axis: Any, places: NDArray[np.float64], radius: float, length: float
     number = int(np.clip(length / max(DRAWN_EVERY * radius, length / MAX_BODIES, 1e-9) + 1, 2, MAX_BODIES))
     for n in np.linspace(0, len(places) - 1, number).round().astype(int):
         axis.add_patch(Circle(tuple(places[n]), radius, fill=False, color=PATH_COLOUR, alpha=0.6))
-    for place, word in ((places[0], "start"), (places[-1], "goal")):
-        axis.annotate(word, tuple(place), textcoords="offset points", xytext=(-12, -20), fontsize=13, color=PATH_COLOUR)
+    for place, label in ((places[0], "start"), (places[-1], "goal")):
+        axis.annotate(
+            label, tuple(place), textcoords="offset points", xytext=(-12, -20), fontsize=13, color=PATH_COLOUR
+        )
 
 
 def _section(axis: Any, voxel_map: VoxelMap, places: NDArray[np.float64], radius: float, length: float) -> None:
-    """Draw the states of the cells above and below the path, unrolled, and the room that the body takes."""
+    """Draw the states of the cells above and below the path, unrolled, and the space that the body takes."""
     from matplotlib.colors import ListedColormap
 
     up = voxel_map.config.up

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A map on one page: from above, from three sides, and cut open at one height."""
+"""Overview of a map on one page: from above, from three sides, and a slice at one height."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from stereovox.view.panels import GREY, measured, oblique, slice_, title, view
 from stereovox.view.render import Direction, extent
 
 LONG = 1.8
-"""A map so many times longer than wide runs across the whole page."""
+"""A map this many times longer than wide runs across the whole page."""
 HEIGHT_COLOURS = "viridis"
 TOP = Direction.of(-90, 90)
 
@@ -32,8 +32,8 @@ def picture(
     """Write a PNG of a map: top view, three oblique views coloured by height, and a slice with all four states.
 
     trajectory: camera positions (N, 3) in metres, drawn as a line. up: the map's axis that points up (`z`, `-y`, ...).
-    A ceiling is cut away. An empty map gives a picture that says so. Raises StereovoxError for a bad `up`, a name that
-    does not end in .png or a file that cannot be written.
+    A ceiling is hidden. An empty map gives a picture that says so. Raises StereovoxError for an invalid `up`, a name
+    that does not end in .png or a file that cannot be written.
     """
     save(draw(voxel_map, heading=title or "Occupancy map", trajectory=trajectory, up=up), path)
 
@@ -87,7 +87,7 @@ def _page(drawn: Drawn) -> Any:
 
 
 def height_bar(figure: Any, axis: Any, mappable: Any, drawn: Drawn) -> None:
-    """Put the colour bar of heights beside a panel."""
+    """Add the colour bar of heights beside a panel."""
     bar = figure.colorbar(mappable, ax=axis, pad=0.01, fraction=0.03, aspect=25)
     bar.set_label(f"height {drawn.names[2]} [m]", color=GREY)
     bar.ax.tick_params(colors=GREY)
@@ -121,13 +121,13 @@ def _square_page(solid: NDArray[np.int32], shape: float) -> tuple[Any, list[Any]
 
 
 def _row_height(solid: NDArray[np.int32], panels: list[tuple[float, Direction]]) -> float:
-    """Return the height in inches of a row of panels of these widths: as the tallest needs, within reason."""
+    """Return the height in inches of a row of panels of these widths, limited to a reasonable range."""
     needed = [width * np.divide(*np.ptp(extent(solid, 1.0, direction), axis=0)[::-1]) for width, direction in panels]
     return float(np.clip(1.1 * max(needed) + 0.4, 3.0, 6.0))
 
 
 def height_colours(drawn: Drawn) -> tuple[NDArray[np.float64], Any]:
-    """Return the colour (N, 3) of every drawn cell, pale enough for shading to show, and what a colour bar needs."""
+    """Return the colour (N, 3) of every drawn cell, pale enough for shading, and the mappable of a colour bar."""
     height = (drawn.below_ceiling[:, 2] + 0.5) * drawn.voxel_size
     mappable = height_scale(height, drawn.voxel_size)
     return mappable.to_rgba(height)[:, :3], mappable

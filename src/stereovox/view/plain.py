@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Plain pictures for a screen, without axes or words: a map's layer, its cells in space, a depth image. NumPy alone."""
+"""Plain pictures without axes or text, in NumPy alone: a layer of a map, its cells in 3-D, a depth image."""
 
 from __future__ import annotations
 
@@ -15,8 +15,11 @@ from stereovox.view.render import Direction
 SIZE_PX = 640
 """Width or height of a picture of a map, whichever is longer."""
 MAX_PX = 24.0
-"""A cube's side is no longer."""
+"""Largest side of a cube."""
 FROM = Direction.of(-60, 38)
+_LIGHT = np.array([0.8, 0.62, 1.0])
+"""Brightness of the faces perpendicular to each axis."""
+_STATES = np.array([[int(STATE_COLOURS[state][i : i + 2], 16) for i in (1, 3, 5)] for state in sorted(State)], np.uint8)
 
 
 def plan_pixels(voxel_map: VoxelMap) -> NDArray[np.uint8]:
@@ -58,7 +61,7 @@ def colour_depth(depth_m: NDArray[np.floating], max_range: float) -> NDArray[np.
 
 
 def _cube(scale: float) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Return the pixels of a cube `scale` pixels long, from its middle: columns, rows, and the axis of their face."""
+    """Return the pixels of a cube `scale` pixels long, from its centre: columns, rows, and the axis of their face."""
     reach = int(np.ceil(0.9 * scale)) + 1
     down, across = (grid.ravel() for grid in np.mgrid[-reach : reach + 1, -reach : reach + 1])
     points = (across[:, None] * FROM.right - down[:, None] * FROM.up) / scale
@@ -91,8 +94,5 @@ def _rainbow() -> NDArray[np.uint8]:
     return (255 * np.clip(1.5 - np.abs(position - peaks), 0, 1)).astype(np.uint8)
 
 
-_LIGHT = np.array([0.8, 0.62, 1.0])
-"""Brightness of the faces across each axis."""
 _RAINBOW = _rainbow()
 _DEPTHS = np.concatenate([np.zeros((1, 3), np.uint8), _RAINBOW[:0:-1]])
-_STATES = np.array([[int(STATE_COLOURS[state][i : i + 2], 16) for i in (1, 3, 5)] for state in sorted(State)], np.uint8)

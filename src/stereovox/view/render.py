@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cells as shaded cubes in an image: orthographic, with hidden surfaces removed, in NumPy alone.
+"""Render cells as shaded cubes: orthographic, with hidden surfaces removed, in NumPy alone.
 
 All cells are equal and the projection is parallel, so every visible face of one direction covers the same pattern of
 pixels; a face is drawn by writing its cell's rank from far to near wherever the pattern falls and nothing nearer is.
@@ -15,16 +15,16 @@ from numpy.typing import NDArray
 from stereovox.evaluate.cells import keys, position
 
 LIGHT = {"top": 1.0, "x": 0.80, "y": 0.62}
-"""Brightness of the faces across each axis."""
+"""Brightness of the faces perpendicular to each axis."""
 _SUPERSAMPLING = 2
 _MAX_WRITES = 60_000_000
 _MAX_CELL_PX = 20
-"""A cell is drawn at most so many pixels wide; whoever shows the image may enlarge it."""
+"""Largest width of a cell in pixels; the caller may enlarge the image."""
 
 
 @dataclass(frozen=True, eq=False)
 class Direction:
-    """How a picture is taken: unit vectors (3,) to the right, up, and towards the viewer."""
+    """Direction of view: unit vectors (3,) to the right, up, and towards the viewer."""
 
     right: NDArray[np.float64]
     up: NDArray[np.float64]
@@ -47,8 +47,8 @@ class Direction:
 class Rendering:
     """An RGBA image (height, width, 4) float32 and what it covers: left, right, bottom, top in picture metres.
 
-    near: (rows, columns) float32, how far towards the viewer the middle of the cell in each pixel is, in metres; -inf
-    where none is. It may be finer than the image.
+    near: (rows, columns) float32, how far towards the viewer the centre of the cell in each pixel is, in metres; -inf
+    where there is none. It may be finer than the image.
     """
 
     image: NDArray[np.float32]
@@ -56,9 +56,9 @@ class Rendering:
     near: NDArray[np.float32]
 
     def hidden(self, flat: NDArray[np.float64], toward: NDArray[np.float64], slack: float) -> NDArray[np.bool_]:
-        """Tell which points lie behind cells: picture coordinates (N, 2), and metres towards the viewer (N,).
+        """Return which points lie behind cells: picture coordinates (N, 2), and metres towards the viewer (N,).
 
-        slack: metres that a cell's middle may be nearer before the cell counts as in front.
+        slack: metres by which a cell's centre may be nearer before the cell counts as in front.
         """
         left, right, bottom, top = self.extent
         rows, columns = self.near.shape

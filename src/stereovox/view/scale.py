@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The numbers and colours in which log-odds are shown: as they are, or as the byte a map keeps them in."""
+"""Scale of displayed log-odds, with colours: as they are, or as the bytes that a map stores."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from stereovox.maps import VoxelMap
 from stereovox.maps.cell_format import CellFormat, CellRules
 
 COLOURS = ("#1f5f8b", "#6fa8c9", "#eef0ee", "#e8a27a", "#c23b2a")
-"""From surely free to surely occupied, at equal steps; the middle stands for "no evidence either way"."""
+"""From certainly free to certainly occupied, at equal steps; the middle means no evidence."""
 
 
 @dataclass(frozen=True)
 class Scale:
-    """What a map's log-odds look like in a picture.
+    """How a map's log-odds are displayed.
 
-    label: what the numbers are; unknown, free_below, occupied_above, lowest, highest: in these numbers.
+    label: name of the numbers; unknown, free_below, occupied_above, lowest, highest: in these numbers.
     """
 
     label: str
@@ -39,7 +39,7 @@ class Scale:
         return np.where(np.isnan(values), np.nan, self.cell_format.stored(np.nan_to_num(values)))
 
     def colours(self) -> tuple[Any, Any]:
-        """Return matplotlib's colour map and norm; "no evidence" lies in the middle."""
+        """Return matplotlib's colour map and norm; no evidence is in the middle."""
         from matplotlib.colors import LinearSegmentedColormap, Normalize
 
         reach = max(self.highest - self.unknown, self.unknown - self.lowest)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The occupied cells in space, with the camera's field of view as lines (Chien 2020, Fig 4.7)."""
+"""Occupied cells in 3-D, with the camera's field of view as lines (Chien 2020, Fig 4.7)."""
 
 from __future__ import annotations
 
@@ -19,7 +19,11 @@ from stereovox.view.render import Direction, Rendering, render
 from stereovox.view.viewpoint import FIELD_M, field_of_view
 
 Numbers = tuple[str, NDArray[np.float64], NDArray[np.float64]]
-"""Label of an edge, where its ticks stand in metres, and the numbers written there."""
+"""Label of an edge, its ticks in metres, and their numbers."""
+BEHIND_DEG, ABOVE_DEG = 32.0, 38.0
+"""Direction of view: angle from straight behind the camera, and above the horizon."""
+DOTS = 300
+"""Number of points of a line that are tested for being hidden by cells."""
 
 
 def numbers(label: str, low: float, high: float, least_m: float = 1e-6) -> Numbers:
@@ -53,7 +57,7 @@ def draw_frame(
 
 
 def fit(axis: Any, direction: Direction, low: ArrayLike, high: ArrayLike, margin: float = 0.09) -> float:
-    """Show the whole box with room for its numbers, without axes; return height divided by width."""
+    """Fit the view to the whole box with room for its numbers, without axes; return height divided by width."""
     low, high = np.asarray(low, float), np.asarray(high, float)
     corners = np.stack(np.meshgrid(*zip(low, high, strict=True)), axis=-1).reshape(-1, 3)
     flat = direction.flat(corners)
@@ -99,17 +103,11 @@ def _text(
                   fontsize=size, color=GREY, rotation=turn, annotation_clip=False)  # fmt: skip
 
 
-BEHIND_DEG, ABOVE_DEG = 32.0, 38.0
-"""From where the map is seen: turned so far from straight behind the camera, and so far above the horizon."""
-DOTS = 300
-"""Points of a line at which it is asked whether cells hide it."""
-
-
 def draw_space(voxel_map: VoxelMap, heading: str, up: str, viewpoint: Viewpoint | None = None) -> Any:
     """Return a figure of the occupied cells, seen from behind the camera and above, with its field of view in red.
 
-    viewpoint: by default the map's last; the lines are left out where nobody knows it. A ceiling is cut away.
-    Raises StereovoxError for a map without occupied cells or an `up` that is no axis.
+    viewpoint: by default the map's last; without any the lines are left out. A ceiling is hidden.
+    Raises StereovoxError for a map without occupied cells or an invalid `up`.
     """
     up = checked_up(up)
     viewpoint = viewpoint or voxel_map.viewpoint
@@ -152,7 +150,7 @@ def draw_cells(figure: Any, axis: Any, drawn: Drawn, lines: NDArray[np.float64] 
 
 
 def _line(axis: Any, line: NDArray[np.float64], direction: Direction, rendering: Rendering, slack: float) -> None:
-    """Draw a line (2, 3), strong where it is seen, dashed and pale where cells stand before it."""
+    """Draw a line (2, 3), strong where visible, dashed and pale behind cells."""
     points = line[0] + np.linspace(0, 1, DOTS)[:, None] * (line[1] - line[0])
     flat = direction.flat(points)
     hidden = rendering.hidden(flat, points @ direction.toward, slack)
@@ -162,7 +160,7 @@ def _line(axis: Any, line: NDArray[np.float64], direction: Direction, rendering:
 
 
 def _eye(axis: Any, place: NDArray[np.float64], direction: Direction, rendering: Rendering, slack: float) -> None:
-    """Draw the camera at `place` (1, 3) as a dot, as a ring where cells stand before it."""
+    """Draw the camera at `place` (1, 3) as a dot, or as a ring behind cells."""
     flat = direction.flat(place)
     behind = rendering.hidden(flat, place @ direction.toward, slack)[0]
     fill, edge = ("none", PATH_COLOUR) if behind else (PATH_COLOUR, "white")
@@ -170,7 +168,7 @@ def _eye(axis: Any, place: NDArray[np.float64], direction: Direction, rendering:
 
 
 def _azimuth(lines: NDArray[np.float64] | None) -> float:
-    """Return from where to look, in degrees: behind the camera and to its side."""
+    """Return the azimuth of the view in degrees: behind the camera and to its side."""
     if lines is None:
         return -60.0
     forward = (lines[:4, 1] - lines[:4, 0]).mean(axis=0)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A spherical grid as a picture: all directions round the vehicle side by side, coloured by distance."""
+"""Picture of a spherical grid: all directions around the vehicle, coloured by distance."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ TOO_NEAR = "#d11149"
 COLOURS = "turbo_r"
 """Near is red, far is blue."""
 NEAREST, FARTHEST = 0.3, 10.0
-"""Least span of the colours' logarithmic scale in metres, as far as the grid has such ranges."""
+"""Minimum span of the logarithmic colour scale in metres, as far as the grid has such ranges."""
 
 
 def sphere_picture(
@@ -52,7 +52,7 @@ def draw_sphere(grid: SphereGrid, title: str, now_ns: int | None = None) -> Any:
 
 
 def panorama(grid: SphereGrid) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Return ranges in metres and reasons of all directions (polars, azimuths) as one sees them.
+    """Return ranges in metres and reasons of all directions (polars, azimuths) as a panorama.
 
     First row: straight up; first column: behind, then left, ahead in the middle, right. Outside of the grid: UNKNOWN.
     """
@@ -98,8 +98,8 @@ def _legend(figure: Any, axes: Any, near: float, far: float) -> None:
     bar.ax.yaxis.set_major_locator(FixedLocator(ticks))
     bar.ax.yaxis.set_minor_locator(NullLocator())
     bar.ax.set_yticklabels([f"{tick:g} m" for tick in ticks], color=GREY, fontsize=11)
-    words = ((UNKNOWN, "unknown"), (FREE, "free as far as seen"), (TOO_NEAR, "too near to measure"))
-    patches = [Patch(facecolor=colour, edgecolor=GREY, linewidth=0.4, label=word) for colour, word in words]
+    entries = ((UNKNOWN, "unknown"), (FREE, "free as far as seen"), (TOO_NEAR, "too near to measure"))
+    patches = [Patch(facecolor=colour, edgecolor=GREY, linewidth=0.4, label=text) for colour, text in entries]
     axes.legend(handles=patches, loc="upper right", bbox_to_anchor=(1, -0.09), ncols=3, frameon=False, fontsize=11)
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where the camera is in a picture: as the map remembers it, or as the user says."""
+"""Viewpoint of a picture: the camera that the map remembers, or one given by the user."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The ways to draw a map, by name."""
+"""Views of a map by name."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def draw_view(
 
     overview: from above, from three sides, and a slice. layer: one layer across `up`, at height `at_m` along it or at
     the camera's. axis: log-odds along the optical axis. space: cells and field of view in space. viewpoint: by default
-    the map's last. Raises StereovoxError for an unknown view, or where the view needs a camera that nobody knows.
+    the map's last. Raises StereovoxError for an unknown view, or where the view needs a camera that is not known.
     """
     up = checked_up(up)
     if view == "overview":

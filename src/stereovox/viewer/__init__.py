@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The viewer: maps and recordings on a local page."""
+"""Viewer: maps and recordings on a local page."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The cameras in the viewer: the last one, the way they went, and from where the page looks at first."""
+"""Cameras in the viewer: the last one, their path, and the initial viewpoint of the page."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 AXES_M = 0.3
 FAR = 0.8
-"""How far the page stands from the middle of the map, in diagonals of the map."""
+"""Initial distance of the viewpoint from the centre of the map, in diagonals of the map."""
 FRUSTUM_M = 0.15
 """Depth of the small fields of view along the path."""
 MAX_FRUSTA = 60
@@ -30,7 +30,7 @@ FRUSTA_COLOUR = "#2a78c2"
 
 
 class Cameras:
-    """The last camera, the path of all of them, fields of view along it, and the check boxes for these."""
+    """The last camera, the path of all cameras, fields of view along it, and their check boxes."""
 
     def __init__(self, server: ViserServer, voxel_map: VoxelMap):
         self._server, self._map = server, voxel_map
@@ -42,10 +42,10 @@ class Cameras:
         for box in (self.last, self.path, self.frusta):
             box.on_update(lambda _: self._draw())
         self._drawn: FrameHandle | None = None
-        self.take(voxel_map)
+        self.update(voxel_map)
 
-    def take(self, voxel_map: VoxelMap) -> None:
-        """Show where the cameras of another map were, which nobody changes from now on."""
+    def update(self, voxel_map: VoxelMap) -> None:
+        """Show the cameras of another map, which must not change from now on."""
         self._map = voxel_map
         viewpoint = voxel_map.viewpoint
         if viewpoint is not None:
@@ -78,7 +78,7 @@ def add_camera(server: ViserServer, viewpoint: Viewpoint, reach_m: float) -> Fra
 
 
 def add_path(server: ViserServer, voxel_map: VoxelMap) -> None:
-    """Add a line along the way of each sensor; one that a map no longer has goes."""
+    """Add a line along the path of each sensor; remove those that the map no longer has."""
     path = voxel_map.history.path
     lines = [np.stack([p[:-1, :3, 3], p[1:, :3, 3]], axis=1) for p in map(path.poses, path.stops)]
     segments = np.concatenate([np.empty((0, 2, 3)), *lines])
@@ -89,7 +89,7 @@ def add_path(server: ViserServer, voxel_map: VoxelMap) -> None:
 
 
 def add_frusta(server: ViserServer, voxel_map: VoxelMap) -> None:
-    """Add small fields of view at places along the path, all like that of the last camera."""
+    """Add small fields of view along the path, all with the optics of the last camera."""
     stops, viewpoint = voxel_map.history.path.until(), voxel_map.viewpoint
     if viewpoint is None or not stops:
         return _remove(server, "/frusta/views")
@@ -107,10 +107,10 @@ def _remove(server: ViserServer, name: str) -> None:
 
 
 def first_look(voxel_map: VoxelMap, up: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return from where the page looks at first, and at what: (3,) each in metres.
+    """Return the initial viewpoint of the page and the point it looks at: (3,) each in metres.
 
-    It looks from behind the depth camera and above at the middle of the camera and the occupied cells, or of all
-    cells if none is occupied; a few far outliers do not count.
+    It looks from behind and above the depth camera at the centre of the camera and the occupied cells, or of all cells
+    if none is occupied; a few far outliers do not count.
     """
     cells = voxel_map.cells_in(State.OCCUPIED)
     centres = voxel_map.centers(cells if len(cells) else voxel_map.cells()[0])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The cells of a map in the viewer: occupied ones in colours and cut off at a height, the others on demand."""
+"""Cells of a map in the viewer: occupied ones in colour up to a height, the others on demand."""
 
 from __future__ import annotations
 
@@ -24,55 +24,11 @@ if TYPE_CHECKING:
 HEIGHT, PROBABILITY, AGE = "height", "probability", "age"
 AGES = "plasma_r"
 TIMELESS = "#8a8f98"
-"""Colour of cells that were put in without a time."""
+"""Colour of cells without a time."""
 BESIDE = np.concatenate([np.eye(3, dtype=np.int32), -np.eye(3, dtype=np.int32)])
-
-
-def unknown_shell(voxel_map: VoxelMap) -> NDArray[np.int32]:
-    """Return indices (N, 3) of the cells without evidence that share a face with a free cell: where knowledge ends."""
-    free = voxel_map.cells_in(State.FREE)
-    known = np.sort(keys(np.concatenate([free, *map(voxel_map.cells_in, (State.TENTATIVE, State.OCCUPIED))])))
-    shell = [np.empty((0, 3), np.int32)]
-    for step in BESIDE:
-        beside = free + step
-        shell.append(beside[position(keys(beside), known) < 0])
-    cells = np.concatenate(shell)
-    return cells[np.unique(keys(cells), return_index=True)[1]]
-
-
-def values_of(voxel_map: VoxelMap, cells: NDArray[np.int32], colour: str, up: str) -> NDArray[np.float64]:
-    """Return what cells (N, 3) are coloured by, (N,): height in metres along `up`, probability, or age in seconds."""
-    if colour == HEIGHT:
-        return heights(voxel_map, cells, up)
-    centres = voxel_map.centers(cells)
-    found = voxel_map.probability(centres) if colour == PROBABILITY else voxel_map.age(centres)
-    return np.asarray(found, float)
-
-
-def heights(voxel_map: VoxelMap, cells: NDArray[np.int32], up: str) -> NDArray[np.float64]:
-    """Return the height (N,) in metres along `up` of the middle of cells (N, 3)."""
-    _, _, axis, sign = floor_axes(up)
-    return sign * (cells[:, axis].astype(np.float64) + 0.5) * voxel_map.voxel_size
-
-
-def colours_of(values: NDArray[np.floating], colour: str, voxel_size: float) -> Any:
-    """Return matplotlib's colours for what `values_of` gave: a mappable."""
-    from matplotlib import colormaps
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import LinearSegmentedColormap, Normalize
-
-    known = values[np.isfinite(values)]
-    if colour == HEIGHT:
-        return height_scale(known, voxel_size)
-    if colour == PROBABILITY:
-        return ScalarMappable(Normalize(0, 1), LinearSegmentedColormap.from_list(PROBABILITY, COLOURS))
-    low, high = (float(known.min()), float(known.max())) if len(known) else (0.0, 1.0)
-    return ScalarMappable(Normalize(low, max(high, low + 1e-3)), colormaps[AGES].with_extremes(bad=TIMELESS))
-
-
 FREE_COLOUR, UNKNOWN_COLOUR = "#6fa8dc", "#9b7fc4"
 DOT = 0.12
-"""Side of the squares that stand for cells that are not occupied, in cells: one can look through between them."""
+"""Side of the squares that show cells that are not occupied, in cells: small, so that one can see through."""
 LABELS = {
     State.OCCUPIED: "occupied",
     State.TENTATIVE: "tentative",
@@ -89,39 +45,81 @@ FACES = np.array(
     ],
     np.uint32,
 )  # fmt: skip
-"""Two triangles a side of the cube with `CORNERS`, counter-clockwise as seen from outside."""
+"""Two triangles per side of the cube with `CORNERS`, counter-clockwise as seen from outside."""
+
+
+def unknown_shell(voxel_map: VoxelMap) -> NDArray[np.int32]:
+    """Return indices (N, 3) of the unknown cells that share a face with a free cell."""
+    free = voxel_map.cells_in(State.FREE)
+    known = np.sort(keys(np.concatenate([free, *map(voxel_map.cells_in, (State.TENTATIVE, State.OCCUPIED))])))
+    shell = [np.empty((0, 3), np.int32)]
+    for step in BESIDE:
+        beside = free + step
+        shell.append(beside[position(keys(beside), known) < 0])
+    cells = np.concatenate(shell)
+    return cells[np.unique(keys(cells), return_index=True)[1]]
+
+
+def values_of(voxel_map: VoxelMap, cells: NDArray[np.int32], colour: str, up: str) -> NDArray[np.float64]:
+    """Return the values (N,) that colour cells (N, 3): height in metres along `up`, probability, or age in seconds."""
+    if colour == HEIGHT:
+        return heights(voxel_map, cells, up)
+    centres = voxel_map.centers(cells)
+    found = voxel_map.probability(centres) if colour == PROBABILITY else voxel_map.age(centres)
+    return np.asarray(found, float)
+
+
+def heights(voxel_map: VoxelMap, cells: NDArray[np.int32], up: str) -> NDArray[np.float64]:
+    """Return the height (N,) in metres along `up` of the centres of cells (N, 3)."""
+    _, _, axis, sign = floor_axes(up)
+    return sign * (cells[:, axis].astype(np.float64) + 0.5) * voxel_map.voxel_size
+
+
+def colours_of(values: NDArray[np.floating], colour: str, voxel_size: float) -> Any:
+    """Return a matplotlib mappable for the result of `values_of`."""
+    from matplotlib import colormaps
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import LinearSegmentedColormap, Normalize
+
+    known = values[np.isfinite(values)]
+    if colour == HEIGHT:
+        return height_scale(known, voxel_size)
+    if colour == PROBABILITY:
+        return ScalarMappable(Normalize(0, 1), LinearSegmentedColormap.from_list(PROBABILITY, COLOURS))
+    low, high = (float(known.min()), float(known.max())) if len(known) else (0.0, 1.0)
+    return ScalarMappable(Normalize(low, max(high, low + 1e-3)), colormaps[AGES].with_extremes(bad=TIMELESS))
 
 
 class Cells:
-    """What the scene shows of the cells, and the controls for it.
+    """The cells in the scene and their controls.
 
-    kinds: the cells in the scene by state. show: a check box for each state. colour: drop-down with what occupied cells
-    are coloured by. below: slider in metres along `up`; cells above it are left out. solid: occupied cells
-    (N, 3) that are shown now. scale: what a colour bar needs, None where no cell is occupied. most: cells of one kind
+    kinds: the cells in the scene by state. show: a check box for each state. colour: drop-down of what colours occupied
+    cells. below: slider in metres along `up`; cells above it are hidden. solid: occupied cells (N, 3) that are
+    shown now. scale: mappable for a colour bar, None where no cell is occupied. most: cells of one kind
     that are in the scene at once, about.
     """
 
-    def __init__(self, server: ViserServer, voxel_map: VoxelMap, up: str, most: int = MAX_CELLS):
+    def __init__(self, server: ViserServer, voxel_map: VoxelMap, up: str, max_cells: int = MAX_CELLS):
         self._server, self._up, self._map = server, up, voxel_map
         self._found: dict[State, NDArray[np.int32]] = {}
         self.solid = np.empty((0, 3), np.int32)
         self.scale: Any = None
         size = voxel_map.voxel_size
         self.kinds = {
-            state: Chunks(server, f"/cells/{state.name.lower()}", size, _draws_of(state), most) for state in LABELS
+            state: Chunks(server, f"/cells/{state.name.lower()}", size, _draws_of(state), max_cells) for state in LABELS
         }
         self.draw, self._look = Newest(self._draw), Newest(self._come_closer)
         self._controls()
-        self.take(voxel_map)
-        self._watch_lookers()
+        self.update(voxel_map)
+        self._watch_viewpoints()
 
     @property
     def label(self) -> str:
-        """What the colours of occupied cells mean."""
+        """Meaning of the colours of occupied cells."""
         return COLOUR_LABELS[self.colour.value].format(self._up)
 
-    def take(self, voxel_map: VoxelMap) -> None:
-        """Show another map of the same cells, which nobody changes from now on."""
+    def update(self, voxel_map: VoxelMap) -> None:
+        """Show another map with cells of the same size, which must not change from now on."""
         found = {State.OCCUPIED: voxel_map.cells_in(State.OCCUPIED)}
         self._map = voxel_map
         self._found = found
@@ -146,7 +144,7 @@ class Cells:
             self.draw()
 
     def _fit_slider(self) -> None:
-        """Let the slider reach from the lowest to the highest layer; at first it leaves out a ceiling."""
+        """Let the slider reach from the lowest to the highest layer; initially it hides a ceiling."""
         cells, size = self._found[State.OCCUPIED], self._map.voxel_size
         if not len(cells):
             return
@@ -189,11 +187,11 @@ class Cells:
         self.kinds[state].show(cells, np.tile(rgb(colour), (len(cells), 1)), self._eyes())
 
     def _eyes(self) -> NDArray[np.float64]:
-        """Return where those who look stand, (n, 3) in metres; the first look, if nobody does."""
+        """Return the viewpoints of all connected browsers, (n, 3) in metres; the initial one if there is none."""
         eyes = [client.camera.position for client in self._server.get_clients().values()]
         return np.array(eyes or [self._server.initial_camera.position], float).reshape(-1, 3)
 
-    def _watch_lookers(self) -> None:
+    def _watch_viewpoints(self) -> None:
         @self._server.on_client_connect
         def _(client: Any) -> None:
             client.camera.on_update(lambda _: self._look())

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cells of one kind in the viewer: those near a looker as they are, those far away in coarser ones.
+"""Level of detail: cells of one kind in the viewer, full size near a viewpoint and coarser far away.
 
-A browser draws some hundred thousand cubes fluently, and a map may hold millions of cells. They are cut into chunks;
-each is sent with cells of 1, 2, 4 ... times the side, so coarse that a looker hardly sees it, and coarser where all
-would still be too many. What changes is sent, and nothing else.
+A browser draws some hundred thousand cubes smoothly, and a map may hold millions of cells. They are split into chunks;
+each is sent with cells of 1, 2, 4 ... times the side, as coarse as is hardly visible, and coarser where there are still
+too many. Only changes are sent.
 """
 
 from __future__ import annotations
@@ -21,29 +21,29 @@ CHUNK_BITS = 6
 SIDE = 1 << CHUNK_BITS
 """Cells along a side of a chunk."""
 COARSEST = 4
-"""Times that the side of a cell is doubled, at most."""
+"""Largest number of doublings of a cell's side."""
 MAX_CELLS = 250_000
-"""Cells of one kind that are sent at once, about, if nobody asks for another number."""
+"""Default for the approximate number of cells of one kind that are sent at once."""
 ANGLE = 0.002
-"""A cell that looks smaller than so many radians, about two pixels, may be drawn coarser."""
+"""A cell that appears smaller than this angle in radians, about two pixels, may be drawn coarser."""
 WIDER = 1.25
 HALF = 1 << 20
-"""Indices of cells lie between its negative and itself."""
+"""Indices of cells lie between -HALF and HALF."""
 Key = tuple[int, int, int]
 
 
 class Draws(Protocol):
-    """Adds cells to a scene: their centres (N, 3) in metres, colours (N, 3) uint8, and the length of their sides."""
+    """Adds cells to a scene: centres (N, 3) in metres, colours (N, 3) uint8, side in metres."""
 
     def __call__(
         self, server: ViserServer, name: str, centres: NDArray[np.floating], colours: NDArray[np.uint8], size: float
     ) -> SceneNodeHandle:
-        """Return the node, which takes the place of one with the same name."""
+        """Return the node, which replaces one with the same name."""
         ...
 
 
 class Chunk:
-    """Cells of one chunk: indices (N, 3) int32, colours (N, 3) uint8; sent: how often the side was doubled, or None."""
+    """Cells of one chunk: indices (N, 3) int32, colours (N, 3) uint8; sent: number of doublings as sent, or None."""
 
     def __init__(self, cells: NDArray[np.int32], colours: NDArray[np.uint8]):
         self.cells, self.colours = cells, colours
@@ -51,7 +51,7 @@ class Chunk:
         self.node: SceneNodeHandle | None = None
 
     def is_like(self, other: Chunk) -> bool:
-        """Tell whether both would look the same."""
+        """Return whether both look the same."""
         return np.array_equal(self.cells, other.cells) and np.array_equal(self.colours, other.colours)
 
 
@@ -62,9 +62,9 @@ class Chunks:
     origin on.
     """
 
-    def __init__(self, server: ViserServer, name: str, size: float, draws: Draws, most: int = MAX_CELLS):
+    def __init__(self, server: ViserServer, name: str, size: float, draws: Draws, max_cells: int = MAX_CELLS):
         self.chunks: dict[Key, Chunk] = {}
-        self._server, self._name, self._size, self._draws, self._most = server, name, size, draws, most
+        self._server, self._name, self._size, self._draws, self._max_cells = server, name, size, draws, max_cells
         self.root = server.scene.add_frame(name, show_axes=False)
 
     @property
@@ -73,7 +73,7 @@ class Chunks:
         return [chunk.node for chunk in self.chunks.values() if chunk.node is not None]
 
     def show(self, cells: NDArray[np.int32], colours: NDArray[np.uint8], eyes: NDArray[np.floating]) -> None:
-        """Show these cells (N, 3) in colours (N, 3), and no others, to lookers at `eyes` (n, 3) in metres."""
+        """Show only these cells (N, 3) in colours (N, 3), to viewpoints at `eyes` (n, 3) in metres."""
         now = {key: Chunk(*parts) for key, parts in split(cells, colours)}
         for key, chunk in self.chunks.items():
             if key not in now:
@@ -86,10 +86,10 @@ class Chunks:
         self.look_from(eyes)
 
     def look_from(self, eyes: NDArray[np.floating]) -> None:
-        """Send what lookers at `eyes` (n, 3) need that they have not got."""
+        """Send what viewpoints at `eyes` (n, 3) need in addition."""
         keys = list(self.chunks)
         numbers = np.array([len(self.chunks[key].cells) for key in keys])
-        found = levels(np.array(keys), numbers, eyes, self._size, self._most)
+        found = levels(np.array(keys), numbers, eyes, self._size, self._max_cells)
         for key, doublings in zip(keys, found.tolist(), strict=True):
             chunk = self.chunks[key]
             if chunk.sent != doublings:
@@ -108,7 +108,7 @@ class Chunks:
 def split(
     cells: NDArray[np.int32], colours: NDArray[np.uint8]
 ) -> Iterator[tuple[Key, tuple[NDArray[np.int32], NDArray[np.uint8]]]]:
-    """Yield each chunk's place, with its cells (n, 3) and their colours (n, 3) in a fixed order."""
+    """Yield each chunk's index, with its cells (n, 3) and their colours (n, 3) in a fixed order."""
     if not len(cells):
         return
     (px, py, pz), (x, y, z) = ((cells + HALF) >> CHUNK_BITS).astype(np.int64).T, (cells & (SIDE - 1)).T
@@ -124,7 +124,7 @@ def split(
 def coarser(
     cells: NDArray[np.int32], colours: NDArray[np.uint8], doublings: int
 ) -> tuple[NDArray[np.int32], NDArray[np.uint8]]:
-    """Return the cells of a chunk in cells of 2^doublings times the side, in the mean colour of what they hold."""
+    """Return the cells of a chunk in cells of 2^doublings times the side, in the mean colour of their parts."""
     if not doublings:
         return cells, colours
     bits = CHUNK_BITS - doublings
@@ -142,12 +142,12 @@ def levels(
     numbers: NDArray[np.integer],
     eyes: NDArray[np.floating],
     size: float,
-    most: int = MAX_CELLS,
+    max_cells: int = MAX_CELLS,
 ) -> NDArray[np.int64]:
-    """Return how often the side of cells is doubled in chunks at `places` (n, 3) with `numbers` (n,) cells: (n,).
+    """Return the number of doublings (n,) of cells in chunks at `places` (n, 3) with `numbers` (n,) cells.
 
     eyes: (m, 3) in metres; each chunk is as fine as the nearest needs. Cells of surfaces become a quarter with each
-    doubling, about; the least coarse levels are taken that leave `most`.
+    doubling, about; the least coarse levels are taken that leave `max_cells`.
     """
     if not len(places):
         return np.zeros(0, np.int64)
@@ -157,7 +157,7 @@ def levels(
     angle = ANGLE
     while True:
         doublings = np.log2(np.maximum(nearest * angle / size, 1)).astype(np.int64).clip(0, COARSEST)
-        if (numbers / 4.0**doublings).sum() <= most or (doublings == COARSEST)[nearest > 0].all():
+        if (numbers / 4.0**doublings).sum() <= max_cells or (doublings == COARSEST)[nearest > 0].all():
             return doublings
         angle *= WIDER
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The depth image of one frame in the viewer's panel, and a line about it."""
+"""Panel of the viewer with the depth image of one frame and a line about it."""
 
 from __future__ import annotations
 
@@ -26,15 +26,16 @@ REASON_COLOURS = {
     Reason.UNKNOWN: "#7d7d7d",
 }
 SHARED = "near red, far blue"
-WIDEST_PX = 480
+MAX_WIDTH_PX = 480
+EMPTY = np.full((180, 240, 3), 128, np.uint8)
 
 
 def depth_picture(image: DepthImage, max_range: float) -> NDArray[np.uint8]:
-    """Return a depth image as RGB (rows, columns, 3), at most `WIDEST_PX` wide: near red, far blue, else the reason.
+    """Return a depth image as RGB (rows, columns, 3), at most `MAX_WIDTH_PX` wide: near red, far blue.
 
-    max_range: metres; what is farther has the colour of that distance.
+    Invalid pixels have the colour of their reason. max_range: metres; farther pixels have the colour of that distance.
     """
-    step = -(-image.depth_m.shape[1] // WIDEST_PX)
+    step = -(-image.depth_m.shape[1] // MAX_WIDTH_PX)
     depth_m, reason = image.depth_m[::step, ::step], image.reason[::step, ::step]
     picture = colour_depth(np.where(reason == Reason.VALID, depth_m, np.nan), max_range)
     for why, colour in REASON_COLOURS.items():
@@ -43,37 +44,34 @@ def depth_picture(image: DepthImage, max_range: float) -> NDArray[np.uint8]:
 
 
 def reasons_key() -> str:
-    """Return a line of HTML that tells what the colours mean."""
+    """Return a line of HTML with the legend of the colours."""
     swatch = '<span style="display:inline-block;width:.8em;height:.8em;border:1px solid #888;background:{}"></span> {}'
-    words = [swatch.format(colour, why.name.lower().replace("_", " ")) for why, colour in REASON_COLOURS.items()]
-    body = " &nbsp; ".join([SHARED, *words])
+    text = [swatch.format(colour, why.name.lower().replace("_", " ")) for why, colour in REASON_COLOURS.items()]
+    body = " &nbsp; ".join([SHARED, *text])
     return f'<div style="font-size:.75em;line-height:1.7;padding:0 1em .6em">{body}</div>'
 
 
-EMPTY = np.full((180, 240, 3), 128, np.uint8)
-
-
 class FramePanel:
-    """The depth image as the map saw it; image and told: what the page shows."""
+    """The depth image as the map uses it. image, text: the elements of the page."""
 
     def __init__(self, server: ViserServer, config: Config):
         self._config, self._path = config, DepthPipeline(config)
         self.image = server.gui.add_image(EMPTY, format="jpeg", jpeg_quality=85)
         server.gui.add_html(reasons_key())
-        self.told = server.gui.add_markdown("")
+        self.text = server.gui.add_markdown("")
 
-    def show(self, frame: AnyFrame, words: str) -> None:
-        """Show the depth image of a frame, which may be one that is refused, with `words` below."""
+    def show(self, frame: AnyFrame, text: str) -> None:
+        """Show the depth image of a frame, which may be a refused one, with `text` below."""
         try:
             image = self._path.image(self._path.matched(frame))
             self.image.image = depth_picture(image, self._config.max_range)
         except FrameRefused:
             self.image.image = EMPTY
-        self.told.content = words
+        self.text.content = text
 
 
-def frame_words(frame: AnyFrame, report: UpdateReport | None) -> str:
-    """Return name and fate of a frame, or of what was offered as one, as Markdown."""
+def describe_frame(frame: AnyFrame, report: UpdateReport | None) -> str:
+    """Return name and outcome of a frame, or of any object offered as one, as Markdown."""
     called = name_of(frame) if isinstance(frame, Frame | StereoFrame) else type(frame).__name__
     name = plain(str(called).rpartition("/")[2])
     if report is None:

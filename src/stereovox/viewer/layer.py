@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A layer of cells in the viewer: a plane coloured by log-odds that sliders move through the map."""
+"""One layer of cells in the viewer: a plane coloured by log-odds, moved through the map by sliders."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ if TYPE_CHECKING:
     from viser import ImageHandle, ViserServer
 
 SHARP_PX = 1024
-"""Browsers blur enlarged images: a layer's longer side is sent with at least about half so many pixels."""
+"""Browsers blur enlarged images: a layer's longer side is sent with at least about half this many pixels."""
 MAX_PX = 4096
 """Largest side of an image that every browser can draw; longer layers are thinned."""
 
 
 class LayerPlane:
-    """The plane, and the controls for it.
+    """The plane and its controls.
 
-    node: the scene's image, None before it is first asked for. show: check box. across: drop-down with the axis
-    that the plane stands across. at: for each axis a slider in metres, of which one is visible. scale and colours:
-    the numbers that it shows, and what a colour bar of them needs.
+    node: the scene's image, None before it is first shown. show: check box. across: drop-down of the axis that the
+    plane is perpendicular to. at: for each axis a slider in metres, of which one is visible. scale, colours: the
+    numbers that it shows, and the mappable for their colour bar.
     """
 
     def __init__(self, server: ViserServer, voxel_map: VoxelMap, up: str):
@@ -42,12 +42,12 @@ class LayerPlane:
             self.show = gui.add_checkbox("show", False)
             self.across = gui.add_dropdown("across", ("x", "y", "z"), initial_value=up[-1])
             self.at = {name: gui.add_slider(f"{name} [m]", 0.0, 1.0, size, 0.0) for name in "xyz"}
-        self.take(voxel_map)
+        self.update(voxel_map)
         for control in (self.show, self.across, *self.at.values()):
             control.on_update(lambda _: self.draw())
 
-    def take(self, voxel_map: VoxelMap) -> None:
-        """Cut another map of the same cells, which nobody changes from now on."""
+    def update(self, voxel_map: VoxelMap) -> None:
+        """Show another map with cells of the same size, which must not change from now on."""
         self._map, bounds = voxel_map, voxel_map.bounds()
         if bounds is not None:
             for axis, slider in enumerate(self.at.values()):
@@ -57,7 +57,7 @@ class LayerPlane:
         self.draw()
 
     def _draw(self) -> None:
-        """Put the plane where the controls say."""
+        """Move the plane to where the controls say."""
         across = self.across.value
         for name, slider in self.at.items():
             slider.visible = name == across
@@ -69,7 +69,7 @@ class LayerPlane:
             self.node.visible = False
 
     def _fit(self, slider: Any, bounds: NDArray[np.float64]) -> None:
-        """Let a slider reach from the middle of the lowest layer to that of the highest, one step a layer."""
+        """Let a slider reach from the centre of the lowest layer to that of the highest, one step per layer."""
         size = self._map.voxel_size
         low, high = (round(float(face), 6) for face in (bounds[0] + size / 2, bounds[1] - size / 2))
         slider.max = max(high, low + size)
@@ -84,7 +84,7 @@ class LayerPlane:
 
 
 def layer_colours(scale: Scale) -> Any:
-    """Return matplotlib's colours of the numbers that a scale shows; unknown cells are see-through."""
+    """Return matplotlib's colours of the numbers that a scale shows; unknown cells are transparent."""
     from matplotlib.cm import ScalarMappable
 
     colours, norm = scale.colours()
@@ -92,7 +92,7 @@ def layer_colours(scale: Scale) -> Any:
 
 
 def add_plane(server: ViserServer, one: Layer, image: NDArray[np.uint8]) -> ImageHandle:
-    """Add an image (rows, columns, 4) of a layer where its cells lie in the world, in the middle of them."""
+    """Add an image (rows, columns, 4) of a layer at its place in the world, at the centre of the cells."""
     from viser.transforms import SO3
 
     left, right, bottom, top = one.extent
@@ -113,7 +113,7 @@ def add_plane(server: ViserServer, one: Layer, image: NDArray[np.uint8]) -> Imag
 
 
 def sharp(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return an image (H, W, 4) with its pixels repeated, so that cells keep their edges; a too large one thinned."""
+    """Return an image (H, W, 4) with its pixels repeated, so that cells stay sharp; too large ones are thinned."""
     longer = max(image.shape[:2])
     if longer > MAX_PX:
         step = -(-longer // MAX_PX)
@@ -123,7 +123,7 @@ def sharp(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def _first_place(voxel_map: VoxelMap, up: str) -> NDArray[np.float64]:
-    """Return where the sliders begin, (3,) in metres: at the camera, or at the layer that tells most."""
+    """Return the initial values of the sliders, (3,) in metres: at the camera, or at the most informative layer."""
     if voxel_map.viewpoint is not None:
         return voxel_map.viewpoint.T_world_camera[:3, 3]
     cells = voxel_map.cells_in(State.OCCUPIED)

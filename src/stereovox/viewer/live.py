@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A map that grows, on a page: shown as often as mapping can spare the time."""
+"""Live view: a growing map on a page, updated as often as mapping can spare the time."""
 
 from __future__ import annotations
 
@@ -14,23 +14,36 @@ from stereovox.mapper import Mapper
 from stereovox.maps import VoxelMap
 from stereovox.maps.cubes import in_cubes
 from stereovox.trust.history import History
-from stereovox.viewer.frame import FramePanel, frame_words
+from stereovox.viewer.frame import FramePanel, describe_frame
 from stereovox.viewer.panel import plain
 from stereovox.viewer.serve import HERE, PORT
 from stereovox.viewer.viewer import open_viewer
 
 MIN_S = 0.5
-"""Seconds from one picture to the next, at least."""
+"""Minimum seconds between two updates."""
 COPY_REST, DRAW_REST = 25, 4
-"""Times as long as a copy, and as a drawing, took must pass before the next: at most 4 % of mapping, 20 % of a core."""
+"""Minimum pause in durations of a copy and of a drawing: at most 4 % of mapping, 20 % of a core."""
 PATIENCE_S = 10.0
 
 
 class LiveView:
-    """A page that shows the map of a `Mapper` while it grows. Give each frame to `add` instead of the mapper's.
+    """Page that shows the map of a `Mapper` while it grows. Pass each frame to `add` instead of the mapper's.
 
-    Between two frames the map is copied, and the page is drawn from the copy in a thread of its own: nothing reads
-    the map while a kernel writes it. viewer: the page, as `open_viewer` makes it with these arguments.
+    It is also an `Observer` for `map_recording`. Between two frames the map is copied, and the page is drawn from the
+    copy in a thread of its own: nothing reads the map while a kernel writes it.
+
+    Args:
+        mapper: The mapper whose map is shown.
+        name: Heading of the page.
+        host: Name or address to serve at, as for `open_viewer`.
+        port: Port of the page; 0: any free one.
+        token: Secret of the link, as for `open_viewer`.
+
+    Attributes:
+        viewer: The page, as returned by `open_viewer`.
+
+    Raises:
+        StereovoxError: As for `open_viewer`.
     """
 
     def __init__(
@@ -52,17 +65,29 @@ class LiveView:
 
     @property
     def url(self) -> str:
-        """Where the page is."""
+        """Link to the page."""
         return self.viewer.url
 
     def add(self, frame: AnyFrame) -> UpdateReport:
-        """Take a frame into the map, as `Mapper.add`, and show it when it is time."""
+        """Add a frame to the map, and update the page if an update is due.
+
+        Args:
+            frame: As for `Mapper.add`.
+
+        Returns:
+            The report of `Mapper.add`.
+        """
         report = self._mapper.add(frame)
         self.after(frame, report)
         return report
 
     def after(self, frame: AnyFrame, report: UpdateReport) -> None:
-        """Show the map if it is time; to be called between frames, from the thread that maps."""
+        """Update the page if an update is due. Call it between frames, from the thread that maps.
+
+        Args:
+            frame: The frame that was offered to the mapper.
+            report: What `Mapper.add` returned for it.
+        """
         start = monotonic()
         self._arrivals.append(start)
         self._last = frame, report
@@ -72,7 +97,7 @@ class LiveView:
             self._due = done + max(MIN_S, COPY_REST * (done - start))
 
     def finish(self) -> None:
-        """Show the map as it is now, whole; to be called when the last frame is in it."""
+        """Show the complete map. Call it after the last frame."""
         if self._stopped.is_set():
             return
         self._free.wait(PATIENCE_S)
@@ -80,7 +105,7 @@ class LiveView:
             self._hand_over(*self._last)
 
     def close(self) -> None:
-        """Take the page down."""
+        """Close the page."""
         self._stopped.set()
         self._ask.set()
         self._thread.join()
@@ -91,18 +116,18 @@ class LiveView:
         return self
 
     def __exit__(self, *_: Any) -> None:
-        """Take the page down."""
+        """Close the page."""
         self.close()
 
     def _hand_over(self, frame: AnyFrame, report: UpdateReport) -> None:
         copy = _copy(self._mapper)
-        waiting = copy, frame, f"{frame_words(frame, report)}\n\n{self._pace(copy.history)}"
+        waiting = copy, frame, f"{describe_frame(frame, report)}\n\n{self._progress(copy.history)}"
         self._free.clear()
         self._waiting = waiting
         self._ask.set()
 
     def _run(self) -> None:
-        """Draw what is handed over; then leave the machine to the mapping for a while."""
+        """Draw each copy, then leave the processor to mapping for a while."""
         while True:
             self._ask.wait()
             self._ask.clear()
@@ -111,18 +136,18 @@ class LiveView:
             start = monotonic()
             try:
                 self._draw(*self._waiting)
-            except Exception as error:  # whatever breaks a picture, the next one may be drawn, and mapping goes on
+            except Exception as error:  # a failed drawing must stop neither the next one nor mapping
                 warnings.warn(f"the live view could not be drawn ({type(error).__name__}: {error})", stacklevel=1)
             self._stopped.wait(min(DRAW_REST * (monotonic() - start), PATIENCE_S / 2))
             self._free.set()
 
-    def _draw(self, voxel_map: VoxelMap, frame: AnyFrame, words: str) -> None:
-        self.frame.show(frame, words)
-        self.viewer.take(voxel_map)
+    def _draw(self, voxel_map: VoxelMap, frame: AnyFrame, text: str) -> None:
+        self.frame.show(frame, text)
+        self.viewer.update(voxel_map)
         self.viewer.follow()
 
-    def _pace(self, history: History) -> str:
-        """Return how mapping fares, as Markdown."""
+    def _progress(self, history: History) -> str:
+        """Describe the progress of mapping as Markdown."""
         times, health = self._arrivals, self._mapper.health()
         rate = (len(times) - 1) / max(times[-1] - times[0], 1e-9)
         rows = [

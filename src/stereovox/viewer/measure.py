@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measuring in the viewer: two clicks on cells, a line between them, and how long it is."""
+"""Distance measurement in the viewer: two clicks on cells, a line between them, and its length."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ FIRST = "Click the other cell."
 
 
 class Measure:
-    """Cells that were clicked, and what lies between them.
+    """Clicked cells and the distance between them.
 
-    on: check box. picked: centres (3,) in metres of one or two cells. told: what the page says.
+    on: check box. picked: centres (3,) in metres of one or two cells. text: element of the page.
     """
 
     def __init__(self, server: ViserServer, cells: Cells, size: float):
@@ -29,11 +29,11 @@ class Measure:
         self.picked: list[NDArray[np.floating]] = []
         with server.gui.add_folder("Measure"):
             self.on = server.gui.add_checkbox("measure", False)
-            self.told = server.gui.add_markdown(HOW)
+            self.text = server.gui.add_markdown(HOW)
         self.on.on_update(lambda _: self._switch())
 
     def pick(self, origin: ArrayLike, direction: ArrayLike) -> None:
-        """Take the cell that a click meets, if there is one; a third click begins anew."""
+        """Pick the cell under a click, if there is one; a third click starts again."""
         cell = first_hit(self._cells.solid, self._size, origin, direction)
         if cell is None:
             return
@@ -56,17 +56,17 @@ class Measure:
         root = scene.add_frame("/measure", show_axes=False)  # what was below it goes
         for n, point in enumerate(points):
             scene.add_icosphere(f"{root.name}/{n}", self._size / 2, tuple(rgb(COLOUR).tolist()), position=point)
-        self.told.content = FIRST if points else HOW
+        self.text.content = FIRST if points else HOW
         if len(points) == 2:
             scene.add_line_segments("/measure/line", np.array([points]), rgb(COLOUR), thickness=4,
                                     thickness_units="screen")  # fmt: skip
             metres = float(np.linalg.norm(points[1] - points[0]))
             scene.add_label("/measure/label", f"{metres:.2f} m", position=np.mean(points, axis=0))
-            self.told.content = told(points)
+            self.text.content = format_distance(points)
 
 
-def told(points: list[NDArray[np.floating]]) -> str:
-    """Return how far apart two points (3,) in metres are, as Markdown."""
+def format_distance(points: list[NDArray[np.floating]]) -> str:
+    """Format the distance of two points (3,) in metres as Markdown."""
     step = points[1] - points[0]
     along = ", ".join(f"{name} {value:+.2f}" for name, value in zip("xyz", step, strict=True))
     return f"**{np.linalg.norm(step):.2f} m** from middle to middle ({along})"
@@ -75,7 +75,7 @@ def told(points: list[NDArray[np.floating]]) -> str:
 def first_hit(
     cells: NDArray[np.int32], size: float, origin: ArrayLike, direction: ArrayLike
 ) -> NDArray[np.int32] | None:
-    """Return which of the cells (N, 3) with sides of `size` metres a ray meets first, (3,); None: none.
+    """Return the first of the cells (N, 3) with sides of `size` metres that a ray hits, (3,); None: none.
 
     origin, direction: (3,) in metres, world frame.
     """

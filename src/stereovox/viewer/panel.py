@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the viewer's panel says about a map: statistics, colour bars, and the log-odds along the optical axis."""
+"""Contents of the viewer's panel: statistics, colour bars, and the log-odds along the optical axis."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from stereovox.view.axis import draw_profile
 from stereovox.view.panels import GREY
 
 WIDTH_IN, DPI = 4.8, 180
-"""Width of the panel's pictures: in inches as text size sees it, and pixels an inch."""
+"""Width of the panel's pictures in inches, relative to text size, and pixels per inch."""
 
 
 def statistics(voxel_map: VoxelMap) -> str:
-    """Return what a map holds, as Markdown."""
+    """Describe the contents of a map as Markdown."""
     counts, bounds = voxel_map.counts(), voxel_map.bounds()
     rows = {state: f"{counts[state]:,}" for state in ("occupied", "free", "tentative")}
     rows["cell"] = f"{voxel_map.voxel_size:g} m"
@@ -35,16 +35,16 @@ def statistics(voxel_map: VoxelMap) -> str:
 
 
 def plain(text: str) -> str:
-    """Return text for Markdown that is shown letter by letter.
+    """Escape text so that Markdown shows it literally.
 
-    The page would run `{...}` and `<...>` as program text, and a map may come from somebody else.
+    The page would execute `{...}` and `<...>`, and a map may come from someone else.
     """
     text = " ".join(text.encode("utf-8", "replace").decode().split())
     return re.sub(r"([!-/:-@\[-`{-~])", r"\\\1", text)
 
 
 def colour_bar(scale: Any, label: str, limits: tuple[float, float] | None = None) -> NDArray[np.uint8]:
-    """Return a picture (H, W, 3) of a colour bar for a matplotlib mappable; `limits`: where it begins and ends."""
+    """Return a picture (H, W, 3) of a colour bar for a matplotlib mappable; `limits`: its ends."""
     figure = _figure(0.8)
     bar = figure.colorbar(scale, cax=figure.add_subplot(), orientation="horizontal")
     if limits is not None:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A recording in the viewer: a timeline, the depth image of a frame, and the map as it was then."""
+"""Replay of a recording in the viewer: a timeline, the depth image of a frame, and the map at that time."""
 
 from __future__ import annotations
 
@@ -13,22 +13,22 @@ from stereovox.mapper import Mapper
 from stereovox.maps import VoxelMap
 from stereovox.maps.cubes import in_cubes
 from stereovox.threads import Newest
-from stereovox.viewer.frame import FramePanel, frame_words
+from stereovox.viewer.frame import FramePanel, describe_frame
 from stereovox.viewer.viewer import Viewer
 
 if TYPE_CHECKING:
     from stereovox.opening import Source
 
 KEPT = 16
-"""Maps along the recording that are kept, so that going back need not begin at the first frame."""
+"""Number of maps kept along the recording, so that going back need not start at the first frame."""
 MAX_KEPT_BYTES = 1 << 30
 SLOWEST_S = 0.1
-"""A recording without times plays with so many seconds a frame."""
-TOLD_S = 0.5
+"""Seconds per frame of a recording without times."""
+NOTICE_S = 0.5
 
 
 class Replay:
-    """Maps a recording anew up to the frame that the timeline names.
+    """Maps a recording again up to the frame chosen on the timeline.
 
     at: slider with the number of the last frame that is in the map, from 1 on. play: check box.
     """
@@ -50,25 +50,25 @@ class Replay:
         self.frame.show(source.frame(len(source) - 1), "the last frame; move the timeline or tick play")
 
     def _draw(self) -> None:
-        """Show the map as of the frame that the slider names by now."""
+        """Show the map as of the frame that the slider is at now."""
         number = int(self.at.value)
         self._go_to(number)
         frame = self._source.frame(number - 1)
-        self.frame.show(frame, frame_words(frame, self._report))
-        self._viewer.take(in_cubes(self._mapper.map.snapshot()))
+        self.frame.show(frame, describe_frame(frame, self._report))
+        self._viewer.update(in_cubes(self._mapper.map.snapshot()))
 
     def _go_to(self, number: int) -> None:
         before = self._nearest(number - 1)  # the frame itself is added last: the page tells what it did
         if number < self._done or before > self._done:
             self._start_from(before)
-        due = monotonic() + TOLD_S
+        due = monotonic() + NOTICE_S
         while self._done < number:
             self._report = self._mapper.add(self._source.frame(self._done))
             self._done += 1
             self._keep()
             if monotonic() > due:
-                self.frame.told.content = f"mapping frame {self._done:,} on the way to {number:,}"
-                due = monotonic() + TOLD_S
+                self.frame.text.content = f"mapping frame {self._done:,} on the way to {number:,}"
+                due = monotonic() + NOTICE_S
 
     def _nearest(self, number: int) -> int:
         return max((kept for kept in self._kept if kept <= number), default=0)
@@ -78,7 +78,7 @@ class Replay:
         self._mapper, self._done, self._report = Mapper(self._config, resume=earlier), number, None
 
     def _keep(self) -> None:
-        """Keep a copy now and then, as far as memory goes."""
+        """Keep a copy from time to time, as memory allows."""
         room = MAX_KEPT_BYTES // max(self._mapper.map.memory_bytes, 1)
         apart = max(1, len(self._source) // max(1, min(KEPT, room)))
         if self._done % apart == 0 and self._done not in self._kept:
@@ -89,16 +89,16 @@ class Replay:
             threading.Thread(target=self._play, daemon=True).start()
 
     def _play(self) -> None:
-        """Move the timeline as time goes by, over frames that could not be drawn meanwhile."""
+        """Move the timeline in real time, skipping frames that cannot be drawn in time."""
         seconds = self._seconds_a_frame()
         if self.at.value >= len(self._source):
             self.at.value = 1
-        took = 0.0
+        duration = 0.0
         while self.play.value and self.at.value < len(self._source):
             start = monotonic()
-            self.at.value = min(self.at.value + max(1, int(took / seconds)), len(self._source))
-            took = monotonic() - start
-            sleep(max(0.0, seconds - took))
+            self.at.value = min(self.at.value + max(1, int(duration / seconds)), len(self._source))
+            duration = monotonic() - start
+            sleep(max(0.0, seconds - duration))
         self.play.value = False
 
     def _seconds_a_frame(self) -> float:
@@ -108,5 +108,5 @@ class Replay:
 
 
 def _as_shown(config: Config) -> Config:
-    """Return settings that leave no cell and no frame out: what a picture of the recording needs."""
+    """Return settings that drop no cell and no frame."""
     return config.model_copy(update={"window": WindowConfig.model_validate({}), "deadline_ms": None})

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Serving a page: its addresses, who may look at it, and the server that asks before it answers."""
+"""Page server: addresses, access control, and a server that checks every request."""
 
 from __future__ import annotations
 
@@ -25,10 +25,18 @@ if TYPE_CHECKING:
     from viser import ViserServer
 
 HERE, PORT = "127.0.0.1", 8080
+TOKEN = re.compile(r"[A-Za-z0-9_-]{16,128}")
+"""A token that fits into a link and a cookie without escaping and cannot be guessed."""
+PATIENCE_S = 5.0
+"""Seconds within which a browser must send its request."""
+ANSWER_S = 60.0
+"""Seconds within which the server must refuse a stranger, even on a busy machine."""
+STRANGER = "stranger.invalid"
+_STARTING = Lock()
 
 
 class Address(NamedTuple):
-    """Where to listen. host: as the user named it; number: the one address of it that is used."""
+    """Address to listen on. host: as given by the user; number: the IP address that is used."""
 
     host: str
     number: str
@@ -41,7 +49,7 @@ class Address(NamedTuple):
 
 
 def is_loopback(number: str) -> bool:
-    """Tell whether an address is one of those that never leave the machine; False for names."""
+    """Return whether an address is a loopback address; False for names."""
     try:
         return ip_address(number).is_loopback
     except ValueError:
@@ -49,9 +57,9 @@ def is_loopback(number: str) -> bool:
 
 
 def find_address(host: str, port: int) -> Address:
-    """Return where to listen: the first address of `host`, which is asked for once lest the answer change.
+    """Return the address to listen on: the first one of `host`, resolved only once, since the answer may change.
 
-    Raises StereovoxError where no page can be served there; viser would take another or wait for ever.
+    Raises StereovoxError where no page can be served there; viser would use another port or wait for ever.
     """
     if not 0 <= port <= 65535:
         raise StereovoxError(f"port {port} does not exist; give one from 0 to 65535")
@@ -76,31 +84,27 @@ def find_address(host: str, port: int) -> Address:
 
 
 def url_of(host: str, port: int, token: str | None = None) -> str:
-    """Return the link to a page; one that is served to everybody is found at localhost."""
+    """Return the link to a page; a page on all addresses is linked at localhost."""
     host = "localhost" if host in ("0.0.0.0", "::") else host
     place = f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
     return place if token is None else f"{place}/?token={token}"
-
-
-TOKEN = re.compile(r"[A-Za-z0-9_-]{16,128}")
-"""What fits into a link and a cookie as it is, and cannot be guessed."""
 
 
 class Headers(Protocol):
     """Headers of a request."""
 
     def get_all(self, key: str) -> list[str]:
-        """Return all headers of a name, whatever its case."""
+        """Return all headers of a name, ignoring case."""
         ...
 
 
 def new_token() -> str:
-    """Return a token that nobody can guess."""
+    """Return a random token."""
     return secrets.token_urlsafe(24)
 
 
 def checked_token(token: str) -> str:
-    """Return a token that a user chose; raises StereovoxError for one that is short or does not fit into a link."""
+    """Return the user's token; raises StereovoxError for one that is too short or does not fit into a link."""
     if not TOKEN.fullmatch(token):
         raise StereovoxError(
             f"a token of {len(token)} characters: give 16 to 128 letters, digits, - or _, or none and one is made"
@@ -109,18 +113,18 @@ def checked_token(token: str) -> str:
 
 
 class Guard:
-    """Lets in who knows the token; without one, whoever sits at this machine.
+    """Access control: admits requests with the token or, without one, from this machine.
 
-    host: the name or address that is served. A browser is believed only when the page that asks came from here: else
-    any page on the web could read the map through the browser that shows it, or by a name of its own that leads to
-    this machine (DNS rebinding).
+    host: the name or address that is served. A browser is admitted only if the requesting page came from this server:
+    else any page on the web could read the map through that browser, or through a name of its own that resolves to this
+    machine (DNS rebinding).
     """
 
     def __init__(self, host: str, token: str | None):
         self._host, self._token = host.lower(), token
 
     def refusal(self, path: str, headers: Headers, port: int) -> str | None:
-        """Return in a line why a request is refused, None where it may pass. path: with its query."""
+        """Return in one line why a request is refused, None where it is admitted. path: with its query."""
         named, origins = headers.get_all("Host"), headers.get_all("Origin")
         if len(named) != 1:
             return "one Host header is needed"
@@ -134,9 +138,9 @@ class Guard:
         return "open the link that stereovox printed: it holds the token"
 
     def cookie(self, path: str, port: int) -> str | None:
-        """Return the header that lets a browser in from now on, for requests whose link holds the token.
+        """Return the cookie header that admits a browser from now on, for requests whose link holds the token.
 
-        Neither scripts nor other sites ever see it.
+        It is hidden from scripts and other sites.
         """
         if not any(self._is_token(one) for one in _in_link(path)):
             return None
@@ -183,23 +187,15 @@ def _in_cookies(headers: Iterable[str], name: str) -> Iterator[str]:
 
 
 def _cookie_name(port: int) -> str:
-    """Return a name of its own for each port: browsers show cookies to all ports of a machine."""
+    """Return a name per port, since browsers send cookies to all ports of a machine."""
     return f"stereovox_{port}"
-
-
-PATIENCE_S = 5.0
-"""Seconds in which a browser must have said what it wants."""
-ANSWER_S = 60.0
-"""Seconds in which the server must have refused a stranger, however busy the machine is."""
-STRANGER = "stranger.invalid"
-_STARTING = Lock()
 
 
 def serve(name: str, address: Address, guard: Guard) -> ViserServer:
     """Start a server whose every page, file and websocket is behind `guard`.
 
-    Raises MissingExtra without viser, StereovoxError where the port was taken meanwhile and where this viser does not
-    ask the guard.
+    Raises MissingExtra without viser, StereovoxError where the port has been taken meanwhile or this version of viser
+    does not ask the guard.
     """
     try:
         import viser
@@ -218,14 +214,14 @@ def serve(name: str, address: Address, guard: Guard) -> ViserServer:
 
 
 def stop(server: ViserServer) -> None:
-    """Take the server down."""
+    """Stop the server."""
     with redirect_stdout(io.StringIO()):  # viser says goodbye there
         server.stop()
 
 
 @contextmanager
 def _guarded(guard: Guard) -> Iterator[None]:
-    """While this is open, servers that viser starts ask `guard` first: viser has no way to tell it so."""
+    """Make servers that viser starts in this context ask `guard` first; viser has no option for it."""
     import websockets.asyncio.server as websockets
 
     plain = websockets.serve
@@ -257,7 +253,7 @@ def _asking(guard: Guard, answer: Callable[..., Any] | None) -> Callable[..., An
 
 
 def _is_guarded(number: str, port: int) -> bool:
-    """Ask as a stranger, whom a guard never lets in."""
+    """Return whether a request as a stranger, which a guard never admits, is refused."""
     here = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(number, number)
     connection = HTTPConnection(here, port, timeout=ANSWER_S)
     try:

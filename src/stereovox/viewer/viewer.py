@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A map on a local page: cells, one layer, the cameras, measuring, and what the map holds."""
+"""Viewer of a map on a local page: cells, one layer, cameras, distance measurement, statistics."""
 
 from __future__ import annotations
 
@@ -22,15 +22,22 @@ from stereovox.viewer.serve import HERE, PORT, Guard, checked_token, find_addres
 if TYPE_CHECKING:
     from viser import ViserServer
 
-GROWN, ASIDE, MOVED = 1.2, 0.1, 0.01
-"""The page looks anew at a map that grew by so much, or whose middle went aside by such a share of the distance, if a
-looker moved by less than the last."""
+GROWTH, SHIFT, MOVED = 1.2, 0.1, 0.01
+"""A viewpoint follows a map that grew by this factor, or whose centre shifted by this share of the distance, unless the
+user moved it by more than the last share."""
 
 
 class Viewer:
-    """A running page; url leads to it.
+    """A running page, made by `open_viewer`.
 
-    cells, layer, cameras and measure hold what is in the scene and its controls; dark: the check box of the theme.
+    Attributes:
+        url: Link to the page.
+        server: The viser server behind it.
+        cells: Cells in the scene and their controls.
+        layer: Plane of one layer and its controls.
+        cameras: Cameras in the scene and their controls.
+        measure: Distance measurement.
+        dark: Check box of the dark theme.
     """
 
     def __init__(self, url: str, server: ViserServer, voxel_map: VoxelMap, name: str, up: str, most_cells: int):
@@ -38,7 +45,7 @@ class Viewer:
         self._name, self._map, self._up = name, voxel_map, up
         _dress(server)
         server.scene.set_up_direction(as_tuple(up_vector(up)))
-        self._eye, self._middle, self._away = np.zeros(3), np.zeros(3), 0.0
+        self._eye, self._middle, self._distance = np.zeros(3), np.zeros(3), 0.0
         self.follow()
         self.cells = Cells(server, voxel_map, up, most_cells)
         self._legend = _Legend(server)
@@ -46,47 +53,55 @@ class Viewer:
         self.cameras = Cameras(server, voxel_map)
         self.measure = Measure(server, self.cells, voxel_map.voxel_size)
         with server.gui.add_folder("Map"):
-            self._told = server.gui.add_markdown("")
+            self._statistics = server.gui.add_markdown("")
             self.dark = server.gui.add_checkbox("dark page", False)
         self.dark.on_update(lambda _: _theme(server, self.dark.value))
         for control in (self.cells.colour, self.layer.show):
             control.on_update(lambda _: self._explain())
-        self._tell()
+        self._show_statistics()
         if voxel_map.viewpoint is not None:
             with server.gui.add_folder("Optical axis", expand_by_default=False):
                 server.gui.add_image(axis_chart(voxel_map), format="png")
 
-    def take(self, voxel_map: VoxelMap) -> None:
-        """Show another map with the same settings, which nobody changes from now on: a copy of one that grows."""
+    def update(self, voxel_map: VoxelMap) -> None:
+        """Show another map with the same settings.
+
+        Args:
+            voxel_map: The map, which must not change from now on: pass a copy of a growing one.
+        """
         self._map = voxel_map
         for part in (self.cells, self.layer, self.cameras):
-            part.take(voxel_map)
-        self._tell()
+            part.update(voxel_map)
+        self._show_statistics()
 
     def wait(self) -> None:
-        """Do nothing until Ctrl-C, which raises KeyboardInterrupt as ever."""
+        """Block until Ctrl-C.
+
+        Raises:
+            KeyboardInterrupt: Ctrl-C.
+        """
         threading.Event().wait()
 
     def close(self) -> None:
-        """Take the page down."""
+        """Close the page."""
         stop(self.server)
 
     def follow(self) -> None:
-        """Let those who look see the whole map when it has grown, unless they went to look from elsewhere."""
+        """Move the viewpoints to show the whole map after it has grown, except those that users have moved."""
         look_from, look_at = first_look(self._map, self._up)
-        away = float(np.linalg.norm(look_from - look_at))
+        distance = float(np.linalg.norm(look_from - look_at))
         moved = float(np.linalg.norm(look_at - self._middle))
-        if away < GROWN * self._away and moved < ASIDE * self._away:
+        if distance < GROWTH * self._distance and moved < SHIFT * self._distance:
             return
         cameras = [client.camera for client in self.server.get_clients().values()]
-        if self._away:
-            cameras = [one for one in cameras if np.linalg.norm(one.position - self._eye) < MOVED * self._away]
-        self._eye, self._middle, self._away = look_from, look_at, away
+        if self._distance:
+            cameras = [one for one in cameras if np.linalg.norm(one.position - self._eye) < MOVED * self._distance]
+        self._eye, self._middle, self._distance = look_from, look_at, distance
         for camera in (self.server.initial_camera, *cameras):
             camera.position, camera.look_at = as_tuple(look_from), as_tuple(look_at)
 
-    def _tell(self) -> None:
-        self._told.content = f"**{plain(self._name)}**\n\n{statistics(self._map)}"
+    def _show_statistics(self) -> None:
+        self._statistics.content = f"**{plain(self._name)}**\n\n{statistics(self._map)}"
         self._explain()
 
     def _explain(self) -> None:
@@ -100,18 +115,18 @@ class _Legend:
         blank = np.full((1, 1, 3), 255, np.uint8)
         with server.gui.add_folder("Legend"):
             self._cells, self._slice = (server.gui.add_image(blank, format="png", visible=False) for _ in range(2))
-        self._said: Any = None
+        self._explained: Any = None
 
     def explain(self, cells: Cells, plane: LayerPlane) -> None:
-        """Put up the bars of the cells' colours, and of the layer where it is shown."""
+        """Update the colour bars of the cells, and of the layer where it is shown."""
         limits = None if cells.scale is None else (cells.scale.norm.vmin, cells.scale.norm.vmax)
         self._slice.visible = plane.show.value
-        if self._said is None:
+        if self._explained is None:
             ends = plane.scale.lowest, plane.scale.highest
             self._slice.image = colour_bar(plane.colours, f"in the slice: {plane.scale.label}", ends)
-        if limits is not None and self._said != (cells.label, limits):
+        if limits is not None and self._explained != (cells.label, limits):
             self._cells.image, self._cells.visible = colour_bar(cells.scale, cells.label), True
-        self._said = cells.label, limits
+        self._explained = cells.label, limits
 
 
 def open_viewer(
@@ -123,15 +138,25 @@ def open_viewer(
     token: str | None = None,
     most_cells: int = MAX_CELLS,
 ) -> Viewer:
-    """Serve a page of a map, under the heading `name`, until it is closed; port 0 takes any free one.
+    """Serve a page that shows a map, until it is closed. Visitors cannot change or share the map.
 
-    up: the map's axis that points up (`z`, `-y`, ...); by default as its settings say.
-    token: what a browser must show once, 16 to 128 letters, digits, - or _; `url` holds it. Where others reach `host`
-    one is made if none is given; else whoever sits at this machine can look. Nobody can change or share the map.
-    most_cells: of each kind, about, that are drawn at once; where a map has more, far ones are drawn coarser. Fewer are
-    for browsers without a graphics card.
-    Raises MissingExtra without viser, and StereovoxError for an `up` that is no axis, for a short token, for no cells
-    at all, and where the address cannot be used.
+    Args:
+        voxel_map: The map, which must not change while it is shown.
+        name: Heading of the page.
+        host: Name or address to serve at; by default only this machine can reach it.
+        port: Port of the page; 0: any free one.
+        up: The map's axis that points up (`z`, `-y`, ...); None: from its settings.
+        token: Secret that a browser must send once, 16 to 128 letters, digits, - or _; it is part of `Viewer.url`.
+            None: a random one if other machines can reach `host`, else none.
+        most_cells: Approximate number of cells of each kind drawn at once; beyond it, far ones are drawn coarser.
+            Choose fewer for browsers without a GPU.
+
+    Returns:
+        The running page.
+
+    Raises:
+        MissingExtra: viser is not installed.
+        StereovoxError: Invalid `up`, `token` or `most_cells`, or the address cannot be used.
     """
     if most_cells < 1:
         raise StereovoxError(f"{most_cells} cells at once: give a number above 0, 250000 for most browsers")

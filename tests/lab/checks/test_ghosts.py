@@ -5,11 +5,13 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from stereovox.errors import SourceError
+from stereovox.errors import SourceError, StereovoxError
 from stereovox.frame import Reason
-from stereovox.lab.checks.ghosts import ghosts, seen_free
+from stereovox.lab.checks.ghosts import ghosts, seen_free, time_to_clear
+from stereovox.maps import State
 from stereovox.simulate.passer_by import BEFORE, POLE, WALK_X, Passing
 
+U, F, T, O = State.UNKNOWN, State.FREE, State.TENTATIVE, State.OCCUPIED  # noqa: E741
 SMALL = {"image_width": 160, "pole_m": 0.04}
 
 
@@ -100,3 +102,36 @@ def test_what_a_frame_sees_through():
     assert seen_free(source, 0, points, 0.1, 5.0).tolist() == [True, True, False, False, False, True]
     assert seen_free(source, BEFORE + 64, points, 0.1, 5.0).tolist() == [True, False, False, False, False, False]
     assert not seen_free(source, 0, points, 0.1, 3.0)[1]
+
+
+@pytest.mark.parametrize(
+    ("before", "states", "seen", "frames"),
+    [
+        (O, [F, F, F], [1, 1, 1], 1),  # the first look clears it
+        (O, [O, T, F], [1, 1, 1], 3),
+        (O, [O, T, F], [0, 1, 1], 2),  # the clock starts with the first look
+        (O, [O, F, F], [1, 0, 0], 2),  # frames that look elsewhere count as well
+        (O, [F, F, F], [0, 1, 1], np.nan),  # clear before anybody looked
+        (O, [O, O, T], [1, 1, 1], np.inf),
+        (O, [O, O, O], [0, 0, 0], np.nan),
+        (U, [O, O, F], [0, 1, 1], 2),
+        (U, [F, F, F], [1, 1, 1], np.nan),
+        (U, [F, O, F], [1, 0, 1], 1),  # occupied later, cleared by the look after that
+        (U, [O, F, F], [1, 1, 1], 1),  # the first look found it unknown, the second occupied
+    ],
+)
+def test_time_to_clear_one_cell(before, states, seen, frames):
+    found = time_to_clear(np.array(states)[:, None], np.array(seen)[:, None], before=[before])
+    assert found.frames == pytest.approx([frames], nan_ok=True)
+
+
+def test_time_to_clear_of_many_cells():
+    states = np.array([[O, O, O, F], [F, T, O, F], [F, F, O, F]])
+    found = time_to_clear(states, np.ones((3, 4)), before=[O, O, O, F])
+    assert found.as_dict() == {"cells": 3, "cleared": 2 / 3, "median": 2.5, "p90": 2.9, "longest": 3}
+    not_occupied = time_to_clear(states, np.ones((3, 4)), (State.FREE, State.TENTATIVE), [O, O, O, F])
+    assert not_occupied.frames[:2].tolist() == [2, 2]
+    nothing = time_to_clear(np.zeros((0, 2)), np.zeros((0, 2)))
+    assert nothing.as_dict() == {"cells": 0, "cleared": None, "median": None, "p90": None, "longest": None}
+    with pytest.raises(StereovoxError, match=r"\(3, 4\).*\(4, 3\)"):
+        time_to_clear(states, np.ones((4, 3)))

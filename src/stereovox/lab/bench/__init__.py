@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How fast stereovox is beside other libraries."""
+"""Benchmarks: stereovox beside other libraries."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A benchmark's results as files: `bench.json`, `bench.md`; and as text. Written anew whenever something is done."""
+"""Write benchmark results: `bench.json`, `bench.md`, `bench.png`, and text for the terminal."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ SIZE = 13.0, 6.4
 """Inches."""
 OURS = "#d1402f"
 FURTHER = ("#e8963d", "#b56576")
-"""Integrators of ours beside the first."""
+"""Colours of our further integrators."""
 OTHERS = ("#23618c", "#5b8c5a", "#a07cc0", "#6b7280", "#4aa3a2", "#94793f")
 DASHES = ("-", (0, (4, 2)), (0, (1, 1.5)), (0, (4, 2, 1, 2)))
 MARKERS = "osD^vP"
 CAMERA_MS = 1000 / 30
-"""A camera that gives 30 images a second leaves so much time."""
+"""Time per image of a camera at 30 images per second."""
 
 
 def speed_png(result: dict[str, Any]) -> bytes:
-    """Return a PNG of the result of `bench`: milliseconds a frame, and the map's megabytes, by voxel size."""
+    """Return a PNG of the result of `bench`: milliseconds per frame, and the map's megabytes, by voxel size."""
     figure = blank(*SIZE)
     left, right = figure.subplots(1, 2)
     lines = _lines(result)
@@ -41,8 +41,8 @@ def speed_png(result: dict[str, Any]) -> bytes:
         left.axhline(CAMERA_MS, color=GREY, linewidth=1, zorder=0)
         place = {"xycoords": ("axes fraction", "data"), "textcoords": "offset points", "ha": "center"}
         left.annotate("30 frames a second", (0.5, CAMERA_MS), (0, 3), fontsize=9, color=GREY, **place)
-    _words(left, "Time to take in a frame", "median milliseconds (lower is better)")
-    _words(right, "Memory of the finished map", "megabytes (lower is better)")
+    _label_axes(left, "Time to take in a frame", "median milliseconds (lower is better)")
+    _label_axes(right, "Memory of the finished map", "megabytes (lower is better)")
     handles, names = left.get_legend_handles_labels()
     figure.legend(handles, names, loc="outside lower center", ncols=min(len(names), 5), frameon=False, fontsize=10.5)
     frames = f"{result['frames']} frames of {result['image']}, depth up to {result['max_range']:g} m"
@@ -62,7 +62,7 @@ def _lines(result: dict[str, Any]) -> dict[str, list[dict[str, Any]]]:
 
 
 def _again(row: dict[str, Any], result: dict[str, Any]) -> bool:
-    """Tell whether a row is one of ours with more threads, which make the same map."""
+    """Return whether a row is one of ours with more threads, which makes the same map."""
     return is_ours(row) and row["threads"] != result["rows"][0]["threads"]
 
 
@@ -103,7 +103,7 @@ def _numbers(axis: Any, sizes: Sequence[float], values: Sequence[float]) -> None
 
 
 def _ticks(axis: Any, sizes: Sequence[float], values: Sequence[float]) -> None:
-    """Name the voxel sizes that were measured, and write numbers as people do; two powers of ten at least."""
+    """Label the measured voxel sizes with plain numbers; span at least two powers of ten."""
     from matplotlib.ticker import FuncFormatter, NullFormatter, NullLocator
 
     axis.set_xticks(sizes, [f"{size:g}" for size in sizes])
@@ -118,18 +118,18 @@ def _ticks(axis: Any, sizes: Sequence[float], values: Sequence[float]) -> None:
     axis.set_axisbelow(True)
 
 
-def _words(axis: Any, title: str, unit: str) -> None:
+def _label_axes(axis: Any, title: str, unit: str) -> None:
     axis.set_title(title, loc="left", fontsize=12.5, color=INK)
     labels(axis, "size of a cell, metres", unit, 10.5)
 
 
 def _plain(text: str) -> str:
-    """Return text that matplotlib takes for no formula."""
+    """Escape text so that matplotlib does not read it as a formula."""
     return text.replace("$", r"\$")
 
 
 def tables(result: dict[str, Any]) -> list[Table]:
-    """Return the tables of all that is in a result: the comparison, and what stands under `more`."""
+    """Return all tables of a result: the comparison, and those under `more`."""
     compared = [comparison_table(result)] if result.get("rows") else []
     return compared + [MEASUREMENTS[name].table(found) for name, found in result.get("more", {}).items()]
 
@@ -140,7 +140,7 @@ def text(result: dict[str, Any]) -> str:
 
 
 def write(result: dict[str, Any], folder: Path) -> list[Path]:
-    """Write `bench.json` and `bench.md` into `folder`; older ones stay whole until then. Return the paths."""
+    """Write `bench.json` and `bench.md` into `folder`; atomically. Return the paths."""
     pages = [f"# stereovox benchmark\n\n{machine_line(result['machine'])}.\n"] if "machine" in result else []
     pages += [table.markdown() for table in tables(result)]
     contents = {"bench.json": json.dumps(result, indent=1), "bench.md": "\n".join(pages)}
@@ -152,8 +152,6 @@ def write(result: dict[str, Any], folder: Path) -> list[Path]:
 
 def write_picture(result: dict[str, Any], folder: Path) -> Path:
     """Draw the comparison into `bench.png` in `folder`."""
-    pass  # REHOUSED
-
     path = folder / "bench.png"
     with replacing(path) as file:
         file.write(speed_png(result))

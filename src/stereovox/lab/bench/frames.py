@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The frames of a benchmark: in memory before any clock starts, only pixels that count for everybody."""
+"""Frames of a benchmark: in memory before timing starts, with only the pixels that all libraries use."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from stereovox.errors import FrameRefused, StereovoxError
 from stereovox.frame import AnyFrame, DepthImage, Frame, Reason
 
 Progress = Callable[[int, int, str], None]
-"""Called with steps done, steps in all (0: not known), and what is being done."""
+"""Called with steps done, their total (0: unknown), and the current step in words."""
 
 
 def silent(done: int, total: int, text: str) -> None:
-    """Tell nobody."""
+    """Report no progress."""
 
 
 @dataclass(frozen=True)
 class Recording:
-    """Frames that can be used, where they came from, and why others were left out."""
+    """Usable frames, their source, and why others were refused."""
 
     name: str
     frames: list[Frame]
@@ -42,10 +42,10 @@ class Recording:
 def read_frames(
     source: Iterable[AnyFrame], config: Config, limit: int | None = None, tell: Progress = silent
 ) -> Recording:
-    """Return the frames of `source` (at most `limit`) that can be used.
+    """Read the usable frames of `source` (at most `limit`).
 
-    Pixels without a value and beyond `config.max_range` are 0 in them, so that nobody clears space through them, and
-    poses are exactly rigid. Raises StereovoxError when no frame can be used.
+    Pixels without a value and beyond `config.max_range` are 0, so that no library clears space through them, and poses
+    are exactly rigid. Raises StereovoxError when no frame can be used.
     """
     total = operator.length_hint(source)
     total = total if limit is None else min(total, limit)

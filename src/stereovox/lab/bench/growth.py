@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Does a frame cost more the longer the flight was, or the larger the map is?"""
+"""Cost of a frame by length of the flight and by size of the map."""
 
 from __future__ import annotations
 
@@ -29,6 +29,17 @@ BYTES_A_CELL = 7
 both, beside the evidence that is added."""
 ROUNDS = 3
 SEED = 0
+FRAMES = 6000
+"""A minute."""
+MIN_FRAMES = 500
+"""Shorter flights have no start and end to compare."""
+FRAMES_A_METRE = 6
+SETTINGS = {"voxel_size": 0.2, "max_range": 5.0}
+WINDOW = {"window.size": [20.0, 20.0, 16.0]}
+"""Holds all that the camera sees up to 5 m; what leaves it is dropped."""
+MAPS = {"rolling window": {**SETTINGS, **WINDOW}, "unbounded": SETTINGS}
+CHUNK = 50
+"""Frames whose median is one figure."""
 
 
 def cost_by_map_size(
@@ -135,19 +146,6 @@ def size_table(result: dict[str, Any]) -> Table:
         rows.append((f"{row['cells']:,}", size, f"{row['integrate_ms_median']:.2f}", f"{row['ratio']:.2f}"))
     title = f"Cost against the size of the map, {result['integrator']}, {result['voxel_size']:g} m"
     return Table(title, ("cells in the map", "MB", "ms/frame", "to the first"), [rows], notes)
-
-
-FRAMES = 6000
-"""A minute."""
-MIN_FRAMES = 500
-"""Shorter flights have no start and end to compare."""
-FRAMES_A_METRE = 6
-SETTINGS = {"voxel_size": 0.2, "max_range": 5.0}
-WINDOW = {"window.size": [20.0, 20.0, 16.0]}
-"""Holds all that the camera sees up to 5 m; what leaves it is dropped."""
-MAPS = {"rolling window": {**SETTINGS, **WINDOW}, "unbounded": SETTINGS}
-CHUNK = 50
-"""Frames whose median is one figure."""
 
 
 @dataclass

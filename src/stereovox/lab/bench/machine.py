@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a benchmark ran on: without it no figure means anything."""
+"""Describe the machine that a benchmark ran on."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def machine() -> dict[str, Any]:
 
 
 def machine_line(facts: dict[str, Any]) -> str:
-    """Return what `machine` told as one line."""
+    """Format the result of `machine` as one line."""
     cores = f"{facts['cores']} core{'s' * (facts['cores'] != 1)}"
     versions = ", ".join(f"{name} {facts[name]}" for name in ("python", "numpy", "numba"))
     return f"{facts['cpu']}, {cores}; {versions}; {facts['system']}"
@@ -37,7 +37,7 @@ def cores() -> int:
 
 
 def memory_left() -> int | None:
-    """Return the bytes of memory that are free or can be freed; None where the system does not tell."""
+    """Return the bytes of memory that are free or can be freed; None where the system does not report it."""
     return _meminfo("MemAvailable")
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What else there is to measure, by name."""
+"""Further measurements by name."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ USUAL_SIZE = 0.05
 
 @dataclass(frozen=True)
 class Given:
-    """What measurements are made with: frames in memory, and what was asked for."""
+    """Inputs of measurements: frames in memory, and options."""
 
     recording: Recording
     voxel_sizes: Sequence[float]
@@ -41,7 +41,7 @@ class Given:
 
 @dataclass(frozen=True)
 class Measurement:
-    """What is measured, in words; how; and the table of its result."""
+    """A measurement: description, function, and table of its result."""
 
     about: str
     run: Callable[[Given], dict[str, Any]]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a frame costs before there is anything to do, and how much faster more threads make it."""
+"""Fixed cost of a frame, and speed-up by threads."""
 
 from __future__ import annotations
 
@@ -21,6 +21,11 @@ from stereovox.mapper import Mapper
 
 PASSES = 4
 """The first is not timed; threads take turns in each."""
+SIZES = ((8, 6), (160, 120), (320, 240), (640, 480))
+"""Width and height of the images; the field of view is the same."""
+DEPTH_M = 0.5
+WARM = 20
+"""Warm-up rounds, not counted."""
 
 
 def thread_scaling(
@@ -70,13 +75,6 @@ def thread_table(result: dict[str, Any]) -> Table:
         for size in sizes
     ]
     return Table(f"Threads, {result['integrator']}", ("voxel", "threads", "ms/frame", "faster"), groups)
-
-
-SIZES = ((8, 6), (160, 120), (320, 240), (640, 480))
-"""Width and height of the images; the field of view is the same."""
-DEPTH_M = 0.5
-WARM = 20
-"""Rounds that do not count."""
 
 
 def overhead(

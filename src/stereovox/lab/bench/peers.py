@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Other mapping libraries behind one small interface, so that `bench` can feed them the frames that stereovox gets.
+"""Other mapping libraries behind one small interface, so that `bench` gives them the same frames as stereovox.
 
 octomap-python and pyoctomap each bring their own OctoMap 1.10. They live in one process without a clash (the first is
 linked statically, the second's libraries carry a hash in their names); alone, together and in either order they give
@@ -31,7 +31,7 @@ PEERS = {
 """Libraries by name; other packages add theirs with entry points in the group `stereovox.peers`."""
 
 USUAL = ("octomap", "pyoctomap", "wavemap")
-"""What stereovox is compared with where nothing else is asked for, as far as it is installed."""
+"""Default peers, as far as they are installed."""
 
 WAVEMAP_FROM = "git+https://github.com/ethz-asl/wavemap#subdirectory=library/python"
 """Where its own pages say pip finds it; it is not on PyPI."""
@@ -42,41 +42,82 @@ TREE_DEPTH = 16
 
 
 class Peer(Protocol):
-    """A map of another library; its class is made with the cell size in metres and raises MissingExtra."""
+    """Map of another library, a plug-in of `stereovox bench`.
+
+    Args:
+        voxel_size: Cell size in metres.
+
+    Raises:
+        MissingExtra: The library is not installed.
+    """
 
     def __init__(self, voxel_size: float): ...
 
     def insert(self, points: NDArray[np.float64], origin: NDArray[np.float64]) -> None:
-        """Take in points (N, 3) in metres, in the world, seen from `origin` (3,). This, and only this, is timed."""
+        """Insert points. This, and only this, is timed.
+
+        Args:
+            points: (N, 3) metres, world frame.
+            origin: (3,) position of the camera in metres, world frame.
+        """
         ...
 
     def counts(self) -> tuple[int, int]:
-        """Return the numbers of occupied and of free cells, a node that stands for many cells counted as that many."""
+        """Count cells.
+
+        Returns:
+            The numbers of occupied and of free cells; a node that stands for many cells counts as that many.
+        """
         ...
 
     def bytes(self) -> int:
-        """Return the memory the map needs, as the library itself tells."""
+        """Report memory.
+
+        Returns:
+            The bytes of the map, as reported by the library.
+        """
         ...
 
 
 @runtime_checkable
 class ImagePeer(Protocol):
-    """A peer that takes depth images in place of points."""
+    """Peer that takes depth images in place of points.
+
+    Args:
+        voxel_size: Cell size in metres.
+
+    Raises:
+        MissingExtra: The library is not installed.
+    """
 
     def __init__(self, voxel_size: float): ...
 
     def insert_image(
         self, depth_m: NDArray[np.float32], camera: VirtualCamera, T_world_camera: NDArray[np.float64]
     ) -> None:
-        """Take in a depth image (height, width) in metres, 0 where it has no value. This, and only this, is timed."""
+        """Insert a depth image. This, and only this, is timed.
+
+        Args:
+            depth_m: (height, width) float32 metres, 0 where there is no value.
+            camera: Camera of the image.
+            T_world_camera: (4, 4) pose of the optical frame.
+        """
         ...
 
     def counts(self) -> tuple[int, int]:
-        """Return the numbers of occupied and of free cells."""
+        """Count cells.
+
+        Returns:
+            The numbers of occupied and of free cells.
+        """
         ...
 
     def bytes(self) -> int:
-        """Return the memory the map needs."""
+        """Report memory.
+
+        Returns:
+            The bytes of the map.
+        """
         ...
 
 
@@ -220,7 +261,7 @@ class Wavemap:
         """Let the pipeline integrate the image."""
         deepest = float(depth_m.max())
         if camera is not self._camera or deepest > self._reach:
-            self._look_through(camera, np.ceil(deepest))
+            self._use_camera(camera, np.ceil(deepest))
         wave = self._wave
         posed = wave.PosedImage(wave.Pose(T_world_camera), wave.Image(depth_m.T))
         self._pipeline.run_pipeline(["camera"], posed)
@@ -243,7 +284,7 @@ class Wavemap:
         """Return what `memory_usage` tells."""
         return self._map.memory_usage
 
-    def _look_through(self, camera: VirtualCamera, reach: float) -> None:
+    def _use_camera(self, camera: VirtualCamera, reach: float) -> None:
         """Set up for this camera; cells beyond `reach` metres, where the images end, are not looked at."""
         if not isinstance(camera, PinholeCamera):
             raise StereovoxError("wavemap is compared on pinhole cameras only; leave it out with --peers")

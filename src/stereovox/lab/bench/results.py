@@ -65,7 +65,7 @@ def comparison_table(result: dict[str, Any]) -> Table:
 
 
 def is_ours(row: dict[str, Any]) -> bool:
-    """Tell whether a row is one of stereovox, and not a peer's."""
+    """Return whether a row is one of stereovox, not of a peer."""
     return "integrator" in row
 
 
@@ -101,7 +101,7 @@ def _cells(row: dict[str, Any], first: bool, ratio: dict[str, float] | None) -> 
 
 
 def _faster(times: float | None) -> str:
-    """Return a ratio in words, from our side; nothing for our own rows."""
+    """Format a ratio in words, from our side; empty for our own rows."""
     if times is None:
         return ""
     if times < 1:
@@ -132,7 +132,7 @@ def _notes(result: dict[str, Any]) -> list[str]:
 
 
 def _busy(rows: Sequence[dict[str, Any]]) -> list[str]:
-    """Return a line about other programs that were in the way, if they were."""
+    """Return a note if other programs slowed the benchmark down."""
     alone = [row for row in rows if row["threads"] == 1 and "cpu_share" in row]
     short = [row for row in alone if row["cpu_share"] < QUIET]
     if not short:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How fast is stereovox beside other libraries? The same frames through all of them, in one process."""
+"""Time stereovox and other libraries on the same frames, in one process."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ from stereovox.lab.bench.results import format_table as format_table
 from stereovox.mapper import Mapper
 
 MIN_FRAMES = 5
-"""A peer does so many frames however long they take."""
+"""Minimum number of frames of a peer, however long they take."""
 PASSES = 3
-"""stereovox flies all frames so many times, and once more after each peer, so that a machine's moods meet all."""
+"""stereovox maps all frames this many times, and once more after each peer, to spread the machine's variations."""
 ENOUGH_S = 5.0
-"""A variant of stereovox whose timed frames took so many seconds flies no further pass."""
+"""A variant of stereovox makes no further pass once its timed frames took this many seconds."""
 
 T = TypeVar("T")
 SoFar = Callable[[dict[str, Any]], None]
@@ -35,7 +35,7 @@ SoFar = Callable[[dict[str, Any]], None]
 
 @dataclass(frozen=True)
 class Variant:
-    """One way to run stereovox: an integrator by name, on so many threads."""
+    """Variant of stereovox: an integrator by name and a number of threads."""
 
     integrator: str = "projective"
     threads: int = 1
@@ -53,7 +53,7 @@ class Variant:
 
 @dataclass
 class _Watch:
-    """Times of calls in milliseconds, and the processor's time they got in all."""
+    """Times of calls in milliseconds, and their total processor time."""
 
     times_ms: list[float] = field(default_factory=list)
     cpu_ms: float = 0.0
@@ -118,11 +118,11 @@ def bench(
     Raises ConfigError for an unknown or unusable peer or bad setting, MissingExtra for a peer that is not installed,
     StereovoxError when no frame can be used or a peer fails: one line each.
     """
-    ways = [Variant(threads=threads), *variants]
-    configs = _configs(voxel_sizes, ways, max_range)
+    variants = [Variant(threads=threads), *variants]
+    configs = _configs(voxel_sizes, variants, max_range)
     kinds = find_peers(peers, configs[0][0].voxel_size)
     recording = read_frames(source, configs[0][0], frames_limit, progress or silent)
-    return compare(recording, voxel_sizes, kinds, ways, max_range, progress or silent, budget_s)
+    return compare(recording, voxel_sizes, kinds, variants, max_range, progress or silent, budget_s)
 
 
 def find_peers(names: Sequence[str], voxel_size: float) -> dict[str, PeerClass]:
@@ -138,17 +138,17 @@ def compare(
     recording: Recording,
     voxel_sizes: Sequence[float],
     peers: dict[str, PeerClass],
-    ways: Sequence[Variant],
+    variants: Sequence[Variant],
     max_range: float | None = None,
     tell: Progress = silent,
     budget_s: float = 60.0,
     so_far: SoFar = lambda result: None,
 ) -> dict[str, Any]:
-    """Do what `bench` does with frames in memory; the first of `ways` is what peers are compared with.
+    """Do what `bench` does with frames in memory; the first of `variants` is what peers are compared with.
 
     so_far: called with the result after each voxel size, so that a long run can be stopped.
     """
-    sizes = _configs(voxel_sizes, ways, max_range)
+    sizes = _configs(voxel_sizes, variants, max_range)
     result: dict[str, Any] = {
         "source": recording.name,
         "image": recording.size,
@@ -163,7 +163,9 @@ def compare(
         "ratio": {},
     }
     for configs in sizes:
-        flights = [_Flights(way, config, recording.frames, tell) for way, config in zip(ways, configs, strict=True)]
+        flights = [
+            _Flights(variant, config, recording.frames, tell) for variant, config in zip(variants, configs, strict=True)
+        ]
         theirs = _timed(flights, peers, recording.frames, configs[0], _Limits(budget_s), tell)
         ours, *others = [flight.row() for flight in flights]
         result["rows"] += [ours, *theirs]
@@ -173,8 +175,8 @@ def compare(
     return result
 
 
-def _configs(voxel_sizes: Sequence[float], ways: Sequence[Variant], max_range: float | None) -> list[list[Config]]:
-    configs = [[way.config(size, max_range) for way in ways] for size in dict.fromkeys(voxel_sizes)]
+def _configs(voxel_sizes: Sequence[float], variants: Sequence[Variant], max_range: float | None) -> list[list[Config]]:
+    configs = [[variant.config(size, max_range) for variant in variants] for size in dict.fromkeys(voxel_sizes)]
     if not configs:
         raise StereovoxError("no voxel size to time; give at least one in metres, for example 0.05")
     return configs
@@ -206,8 +208,8 @@ def _timed(
 class _Flights:
     """The frames through stereovox, as often as it is flown: each time into a new map."""
 
-    def __init__(self, way: Variant, config: Config, frames: list[Frame], tell: Progress):
-        self._way, self._config, self._frames, self._tell = way, config, frames, tell
+    def __init__(self, variant: Variant, config: Config, frames: list[Frame], tell: Progress):
+        self._variant, self._config, self._frames, self._tell = variant, config, frames, tell
         self._reports: list[UpdateReport] = []
         self._watch = _Watch()
         self._map: dict[str, Any] = {}
@@ -219,8 +221,8 @@ class _Flights:
 
     def fly(self, text: str, timed: bool = False) -> None:
         """Add all frames to a new map, and remember the times if they are `timed`."""
-        mapper, threads = Mapper(self._config), self._way.threads
-        where = f"{self._way.library}{f', {threads} threads,' * (threads > 1)} at {self._config.voxel_size:g} m"
+        mapper, threads = Mapper(self._config), self._variant.threads
+        where = f"{self._variant.library}{f', {threads} threads,' * (threads > 1)} at {self._config.voxel_size:g} m"
         self._tell(0, len(self._frames), f"{where}, {text}{'' if timed else ': compiling, if need be'}")
         for i, frame in enumerate(self._frames):
             if timed:
@@ -233,11 +235,11 @@ class _Flights:
 
     def row(self) -> dict[str, Any]:
         """Return the row of this way to run stereovox."""
-        row = _row(self._way.library, self._config, self._way.threads, [r.integrate_ms for r in self._reports])
+        row = _row(self._variant.library, self._config, self._variant.threads, [r.integrate_ms for r in self._reports])
         more = {
             "frames": len(self._frames),
             "passes": len(self._reports) // len(self._frames),
-            "integrator": self._way.integrator,
+            "integrator": self._variant.integrator,
             "depth_ms_median": median([report.depth_ms for report in self._reports]),
             "add_ms_median": median(self._watch.times_ms),
             "cpu_share": self._watch.share,

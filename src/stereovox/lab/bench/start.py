@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a user waits for: until the first frame is in the map, with and without compiled kernels, and for `--help`."""
+"""Start-up times: until the first frame is mapped, with and without compiled kernels, and for `--help`."""
 
 from __future__ import annotations
 

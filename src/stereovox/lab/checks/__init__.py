@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checks on simulated and spoilt recordings that are too long for tests."""
+"""Checks on simulated and corrupted recordings that are too long for tests."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How well two maps of the same frames agree on what is occupied."""
+"""Agreement of two maps of the same frames on occupied cells."""
 
 from __future__ import annotations
 

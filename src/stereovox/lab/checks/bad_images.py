@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Bad frames of many kinds, made of good ones: which of them does a mapper refuse, and what do the others do?"""
+"""Corrupt good frames in many ways: which of them does a mapper refuse, and what effect have the others?"""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ SIDES = (("right", "left"), ("down", "up"), ("forward", "back"))
 
 
 class Verdict(NamedTuple):
-    """What became of a bad frame.
+    """Outcome of a bad frame.
 
     refused: why it was ("": it was not). changed: share of sure cells, of those it says something of, whose state it
     would change otherwise than the true frame; freed: occupied cells that it would make free, and the true one not.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Does a map forget a person who passed, and keep a thin pole that is often missed?"""
+"""Check that a map clears a person who has passed, and keeps a thin pole that is often missed."""
 
 from __future__ import annotations
 
@@ -17,6 +17,11 @@ from stereovox.mapper import Mapper
 from stereovox.maps import State
 from stereovox.se3 import inverse, transform_points
 from stereovox.simulate.passer_by import BEFORE, HZ, TALL, WALK_FROM, WALK_X, WIDE, Passing
+
+GONE = (State.FREE, State.TENTATIVE, State.UNKNOWN)
+"""States in which a cell is no obstacle any more."""
+NOISE = 0.3
+"""Metres about the person in which cells are followed: six standard deviations of the depth."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,15 +72,9 @@ def first_true(flags: NDArray[np.bool_]) -> NDArray[np.float64]:
     return np.where(flags.any(axis=0), flags.argmax(axis=0), np.inf)
 
 
-GONE = (State.FREE, State.TENTATIVE, State.UNKNOWN)
-"""States in which a cell is no obstacle any more."""
-NOISE = 0.3
-"""Metres about the person in which cells are followed: six standard deviations of the depth."""
-
-
 @dataclass(frozen=True, eq=False)
 class Ghosts:
-    """What became of the cells where a person had been, and of what stayed.
+    """Outcome for the cells where a person had been, and for static objects.
 
     number: (F,) ghosts after each frame: cells that are occupied though the frame truly sees through them.
     gone: frames until a cell that is seen free was no longer occupied; free: until it was free.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How true a spherical grid is: against the surfaces of a simulated scene, direction by direction."""
+"""Accuracy of a spherical grid against the surfaces of a simulated scene, direction by direction."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Experiments of papers, made again on simulated recordings, with the paper's figures beside ours."""
+"""Reproductions: experiments of papers on simulated recordings, with the paper's figures beside ours."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def reproduce(
     quick: bool = False,
     progress: Progress | None = None,
 ) -> dict[str, Any]:
-    """Make the experiments of a paper again and write `report.html` and `numbers.json` into folder `out`.
+    """Reproduce the experiments of a paper and write `report.html` and `numbers.json` into folder `out`.
 
     data: what the paper's experiments need besides simulation (chien2020: a recording of your own, mapped as well;
     valenti2018: a folder with KITTI tracking sequences, or a drive of KITTI raw data; ist2019: a bag of your own, in

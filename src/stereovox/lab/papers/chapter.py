@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What an experiment has to say: claims that hold or not, tables and pictures."""
+"""Result of an experiment: claims that hold or not, tables and pictures."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ YES, NO = "\u2713 yes", "\u2717 no"
 
 @dataclass(frozen=True)
 class Claim:
-    """One row of "does it hold?". holds: None where nobody claimed anything and the number only stands beside."""
+    """One row of "does it hold?". holds: None where nothing is claimed and the number is for comparison."""
 
     text: str
     thesis: str

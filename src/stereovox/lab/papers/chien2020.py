@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Chien 2020 made again: which experiments, how large, in which order, and the two files they end in."""
+"""Reproduction of Chien 2020: its experiments, their size and order, and the report."""
 
 from __future__ import annotations
 

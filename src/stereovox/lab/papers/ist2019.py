@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""IST 2019 made again: a Kinect maps two floors along the way a lidar finds, scored against the lidar's map."""
+"""Reproduction of IST 2019: a Kinect maps two floors along a lidar's trajectory, scored against the lidar's map."""
 
 from __future__ import annotations
 
@@ -34,6 +34,8 @@ OWN = (
     "occupancy grids from its depth images. The report's figures are of its own recordings."
 )
 HEADS = ("claim", "report, or wanted", "ours", "holds?")
+FAST = "speed=1.5&scan_hz=4"
+_OTHERS = 2 + TIMES
 
 
 @dataclass(frozen=True)
@@ -45,7 +47,6 @@ class Sizes:
     published: int = SIDE
 
 
-FAST = "speed=1.5&scan_hz=4"
 QUICK = Sizes(Extent(f"{FAST}&depth_hz=2&image_width=320", FAST), (*VARIANTS[:3], VARIANTS[4]), 1000)
 """Whole drives, but fewer scans and images, and small ones."""
 
@@ -83,9 +84,6 @@ def own(robot: Robot, out: Path, sizes: Sizes, progress: Progress) -> list[Chapt
     recording = Recording(name, robot, robot)
     found = survey(recording, sizes.variants, out, steps.of(f"mapping: {recording.name}"))
     return _chapters([(None, found)], sizes, steps.of)
-
-
-_OTHERS = 2 + TIMES
 
 
 def _steps(robot: Any, first: Any) -> int:

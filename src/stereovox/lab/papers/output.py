@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What all reproductions end in: two files, and a progress bar on the way there."""
+"""Output of all reproductions: report, numbers and progress."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the pictures of a reproduction share."""
+"""Parts shared by the pictures of reproductions."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Valenti 2018, chapter 8, made again: maps of real drives against lidar, and what must hold of them."""
+"""Reproduction of Valenti 2018, chapter 8: maps of real drives against lidar, and the claims about them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from stereovox.lab.papers.valenti.mappers import (
     why_missing,
 )
 from stereovox.lab.papers.valenti.recordings import Drive, find_drives
-from stereovox.lab.papers.valenti.speed import MOST, time_mapping
+from stereovox.lab.papers.valenti.speed import MAX_FRAMES, time_mapping
 
 TITLE = "Valenti 2018, made again"
 LEAD = (
@@ -89,4 +89,4 @@ def experiments(drives: list[Drive], extent: Extent, progress: Progress) -> list
 
 def _total(frames: list[list[int]], extent: Extent) -> int:
     passes = len(extent.settings) * (len(FREE) + 2)
-    return passes * sum(map(len, frames)) + 4 * min(len(frames[0]), MOST)
+    return passes * sum(map(len, frames)) + 4 * min(len(frames[0]), MAX_FRAMES)

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The experiments of Chien 2020: what was measured, what the paper says, and the pictures."""
+"""Experiments of Chien 2020, one per module: measurement, chapter and pictures."""

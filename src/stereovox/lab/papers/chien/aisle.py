@@ -31,6 +31,32 @@ FAR_M = 8.0
 """From this distance on a wall counts as far."""
 MAX_RANGE_M = 13.0
 """Depths that count here: the profile's 10 m would end before the aisle does."""
+MIN_SHARE = 0.95
+"""Share of what full resolution finds that counts as nothing lost."""
+PAPER = (
+    "The resolution downsampling value affected aisle-like scenes a lot: only the closest depth of each block "
+    "counts, so the further depth of the aisle may be filtered out. The further cells cannot be updated often with a "
+    "higher ratio."
+)
+OURS = (
+    "The layer of cells below the camera's height; the aisle lies on its side, the camera stands at the left. Dark is "
+    "occupied, cream free, orange undecided, grey unknown; lines are the true walls. Far is right of the dotted line."
+)
+HEADS = ("variant", f"found beyond {FAR_M:g} m", "of exact rays", "found nearer", "stray", "ms a frame")
+WHY = (
+    "The yardstick is exact rays at full resolution with the strongest evidence a frame: whatever any pixel measured "
+    "is in that map. The footprint rule (integrator projective) comes to the same in a tenth of the time and needs "
+    "no smaller image: a near cell is judged by all pixels of its footprint, so nothing near is lost, and a far cell "
+    "by its own few pixels. The thesis's rule, by which all rays add up, loses far walls even at full resolution: "
+    "beyond 8 m the noise spreads the hits over several cells, each too weak against the rays that graze the cell on "
+    "their way further. A 4x4 minimum takes away part of that noise and finds more; from there on a higher ratio "
+    "only loses."
+)
+STRAY = (
+    "Stray: share of the occupied cells beyond 8 m that have no wall, floor or ceiling within one cell; noise along "
+    "the rays is 0.25 m at 8 m and 0.55 m at 12 m, so the end wall is smeared. Times are medians and include "
+    "preparing the image."
+)
 
 
 @dataclass(frozen=True)
@@ -169,34 +195,6 @@ def _state_image(states: NDArray[np.uint8]) -> NDArray[np.uint8]:
     return np.array(colours, np.uint8)[states]
 
 
-WANTED = 0.95
-"""Share of what full resolution finds that counts as nothing lost."""
-SAID = (
-    "The resolution downsampling value affected aisle-like scenes a lot: only the closest depth of each block "
-    "counts, so the further depth of the aisle may be filtered out. The further cells cannot be updated often with a "
-    "higher ratio."
-)
-OURS = (
-    "The layer of cells below the camera's height; the aisle lies on its side, the camera stands at the left. Dark is "
-    "occupied, cream free, orange undecided, grey unknown; lines are the true walls. Far is right of the dotted line."
-)
-HEADS = ("variant", f"found beyond {FAR_M:g} m", "of exact rays", "found nearer", "stray", "ms a frame")
-WHY = (
-    "The yardstick is exact rays at full resolution with the strongest evidence a frame: whatever any pixel measured "
-    "is in that map. The footprint rule (integrator projective) comes to the same in a tenth of the time and needs "
-    "no smaller image: a near cell is judged by all pixels of its footprint, so nothing near is lost, and a far cell "
-    "by its own few pixels. The thesis's rule, by which all rays add up, loses far walls even at full resolution: "
-    "beyond 8 m the noise spreads the hits over several cells, each too weak against the rays that graze the cell on "
-    "their way further. A 4x4 minimum takes away part of that noise and finds more; from there on a higher ratio "
-    "only loses."
-)
-STRAY = (
-    "Stray: share of the occupied cells beyond 8 m that have no wall, floor or ceiling within one cell; noise along "
-    "the rays is 0.25 m at 8 m and 0.55 m at 12 m, so the end wall is smeared. Times are medians and include "
-    "preparing the image."
-)
-
-
 def chapter(found: Sequence[AisleFound], scene: Scene) -> Chapter:
     """Return the chapter."""
     lines = [one for one in found if one.variant.integrator == "line" and one.variant.downsample > 1]
@@ -216,7 +214,7 @@ def chapter(found: Sequence[AisleFound], scene: Scene) -> Chapter:
         f"{FAR_M:g} m that a side wall or the end wall touches and a pixel sees: {found[0].far_cells} cells of 0.2 m. "
         "All variants get the same images and the sensor model of chien2020, with depths up to 13 m and no window.",
         claims,
-        [Shown("Fig 4.12", SAID, OURS, aisle_png(found, scene.solids))],
+        [Shown("Fig 4.12", PAPER, OURS, aisle_png(found, scene.solids))],
         [Sheet("All variants", HEADS, rows)],
         [WHY, STRAY],
         {"variants": [one.figures() for one in found]},
@@ -225,5 +223,5 @@ def chapter(found: Sequence[AisleFound], scene: Scene) -> Chapter:
 
 def _claim(one: AisleFound) -> Claim:
     """Return what is claimed of stereovox's own rule: it must find nearly all that exact rays do."""
-    text = f"{one.variant.name}: at least {100 * WANTED:.0f} % of the far cells that exact rays find"
-    return Claim(text, "a challenge left open", percent(one.against_full), one.against_full >= WANTED)
+    text = f"{one.variant.name}: at least {100 * MIN_SHARE:.0f} % of the far cells that exact rays find"
+    return Claim(text, "a challenge left open", percent(one.against_full), one.against_full >= MIN_SHARE)

@@ -36,6 +36,41 @@ from stereovox.sources.pair import CameraPair
 from stereovox.view.figures import labels
 from stereovox.view.panels import GREY, INK, PATH_COLOUR, measured, title
 
+SEEN_FRAMES = 10
+"""A wall is judged where so many frames saw it, of those of a whole scan (902)."""
+BATCH = 16
+THINNED = 2
+"""Only every so many pixels, across and down, are asked what they see of a wall: it is the wall's cells that count."""
+PAPER = (
+    "The result looks precise due to the on-board SLAM and re-localization of the T265. The walls are solid and "
+    "straight and the corner is 90 degrees. The floor plan stands beside it; 255 is occupied, 0 free."
+)
+OUR_PICTURE = (
+    "True floor plan (walls black, furniture brown) with the camera's way; how far the tracker is off; then the "
+    "layer at the first camera's height of each map, with the true walls as thin lines. Grey is unknown."
+)
+MEASURES = (
+    "The thesis judges by eye. Here thickness is the number of occupied cells in a column straight through the wall; "
+    "straightness is how far the middles of the columns are from the plane fitted to them (root mean square); a "
+    "corner is the angle between the planes of two walls of a room. An inner wall is 12 cm thick: cells behind its "
+    "middle belong to the other room's side."
+)
+OUTER_M = 7.8
+"""Length of the shortest outer wall."""
+LIMITS = (
+    "Planes are fitted to whole cells, and here the walls stand 0.9 degrees askew to them. On 2 m of wall one cell "
+    "of 5 cm is 1.4 degrees, one of 0.2 m 5.7; on the apartment's outer walls, 7.8 m and longer, it is 0.4 and 1.5. So "
+    "the claim is about the apartment's four corners, within 1 degree or one cell, and the "
+    "rooms' own corners are only listed. No pose is corrected afterwards: what the tracker gets wrong stays in the "
+    "map, and a wall that was seen before and after a drift is drawn twice. Exact poses show what the mapping alone "
+    "does."
+)
+EXPECTED = (
+    "Two claims are expected not to hold: with the drifting tracker and cells of 5 cm walls are neither at most two "
+    "cells thick nor straight to half a cell. The tracker is off by up to two cells, so what it saw before and after "
+    "stands twice; with exact poses both hold. The thesis's cells of 0.2 m are coarser than the drift and hide it."
+)
+
 
 def apartment_png(
     maps: Sequence[tuple[str, VoxelMap]],
@@ -107,13 +142,6 @@ def _colour_bar(figure: Any, axis: Any, mappable: Any, voxel_map: VoxelMap) -> N
         bar.set_label("log-odds", color=GREY)
 
 
-SEEN_FRAMES = 10
-"""A wall is judged where so many frames saw it, of those of a whole scan (902)."""
-BATCH = 16
-THINNED = 2
-"""Only every so many pixels, across and down, are asked what they see of a wall: it is the wall's cells that count."""
-
-
 @dataclass(frozen=True)
 class Scan:
     """One way to map the apartment. poses: `T265` (drifting, as the camera pair reports them) or `exact`."""
@@ -183,7 +211,7 @@ def scan_apartment(
             tracked = _tracked(pair, i, exact)
             for scan, mapper in zip(scans, mappers, strict=True):
                 mapper.add(tracked if scan.poses == "T265" else exact)
-            _look(sightings, depth, exact)
+            _count_sightings(sightings, depth, exact)
             way.append(exact.T_world_sensor[:3, 3])
             reported.append(tracked.T_world_sensor[:3, 3])
             step()
@@ -227,7 +255,7 @@ def _wall_sightings(stage: Stage, size: float) -> Sightings:
     return Sightings(np.unique(keys(np.concatenate(walls))), size)
 
 
-def _look(sightings: dict[float, Sightings], depth_m: NDArray[np.float32], frame: Frame) -> None:
+def _count_sightings(sightings: dict[float, Sightings], depth_m: NDArray[np.float32], frame: Frame) -> None:
     thinned, n = depth_m[::THINNED, ::THINNED], THINNED
     camera = frame.camera
     assert isinstance(camera, PinholeCamera)  # what the simulation has
@@ -235,37 +263,6 @@ def _look(sightings: dict[float, Sightings], depth_m: NDArray[np.float32], frame
                       fx=camera.fx / n, fy=camera.fy / n, cx=camera.cx / n, cy=camera.cy / n)  # fmt: skip
     for one in sightings.values():
         one.add(thinned, smaller, frame.T_world_sensor)
-
-
-SAID = (
-    "The result looks precise due to the on-board SLAM and re-localization of the T265. The walls are solid and "
-    "straight and the corner is 90 degrees. The floor plan stands beside it; 255 is occupied, 0 free."
-)
-OUR_PICTURE = (
-    "True floor plan (walls black, furniture brown) with the camera's way; how far the tracker is off; then the "
-    "layer at the first camera's height of each map, with the true walls as thin lines. Grey is unknown."
-)
-MEASURES = (
-    "The thesis judges by eye. Here thickness is the number of occupied cells in a column straight through the wall; "
-    "straightness is how far the middles of the columns are from the plane fitted to them (root mean square); a "
-    "corner is the angle between the planes of two walls of a room. An inner wall is 12 cm thick: cells behind its "
-    "middle belong to the other room's side."
-)
-OUTER_M = 7.8
-"""Length of the shortest outer wall."""
-LIMITS = (
-    "Planes are fitted to whole cells, and here the walls stand 0.9 degrees askew to them. On 2 m of wall one cell "
-    "of 5 cm is 1.4 degrees, one of 0.2 m 5.7; on the apartment's outer walls, 7.8 m and longer, it is 0.4 and 1.5. So "
-    "the claim is about the apartment's four corners, within 1 degree or one cell, and the "
-    "rooms' own corners are only listed. No pose is corrected afterwards: what the tracker gets wrong stays in the "
-    "map, and a wall that was seen before and after a drift is drawn twice. Exact poses show what the mapping alone "
-    "does."
-)
-EXPECTED = (
-    "Two claims are expected not to hold: with the drifting tracker and cells of 5 cm walls are neither at most two "
-    "cells thick nor straight to half a cell. The tracker is off by up to two cells, so what it saw before and after "
-    "stands twice; with exact poses both hold. The thesis's cells of 0.2 m are coarser than the drift and hide it."
-)
 
 
 def chapter(found: Apartment) -> Chapter:
@@ -285,7 +282,7 @@ def chapter(found: Apartment) -> Chapter:
         f"{100 * off['end_m']:.0f} cm at the end. Walls are measured where the camera saw them often enough and "
         "neither furniture nor doors stand before them; 15 cm beside corners, floor and ceiling are left out.",
         [claim for name, one in figures.items() for claim in _claims(name, one)],
-        [Shown("Fig 4.11", SAID, OUR_PICTURE, picture)],
+        [Shown("Fig 4.11", PAPER, OUR_PICTURE, picture)],
         [_walls(found.scans), _corners(found.scans)],
         [MEASURES, LIMITS, EXPECTED],
         {"scans": figures, "images": len(found.way), "tracker_off": off},

@@ -38,6 +38,30 @@ CLEAR_M = 0.6
 NEAREST_M, IN_VIEW = 1.0, 0.9
 """Nearest front of a box; share of the field of view that it may reach."""
 DIRECTIONS = ("left", "right", "top", "bottom", "front")
+TITLES = {"line": "Line drawing", "ray": "Voxel traversal"}
+SIZES_CM = {"large": "47 x 36.5 x 32 cm", "small": "25 x 18.5 x 9 cm"}
+FIGURES = {"large": ("Fig 4.6", "Fig 4.7"), "small": ("Fig 4.9", "Fig 4.10")}
+PAPER = {
+    "large": "The box occupies two cells. Only 3.5 cm of it lie in each outer cell, whose rays mostly pass by. The "
+    "wall behind it is fully obstructed and has no update results.",
+    "small": "The small box also occupies two cells, although it is 22 cm narrower: 12.5 cm of it lie in each, more "
+    "than half of the cell. It barely blocks the wall.",
+}
+NAMES = {"line": "line drawing", "ray": "voxel traversal"}
+MARGIN = (
+    "The accuracy is practical for the positions of obstacles but not for exact dimensions, therefore a margin of one "
+    "cell is required (chapter 5)."
+)
+WHY = (
+    "Why two cells: in an outer cell of the large box most rays pass by and win; in each of the small box's cells "
+    "enough rays end. The front of both stands exactly on the border of two cells, and the nearest of 64 noisy "
+    "pixels is some centimetres too near, so the front also appears in the cell before it (front +1)."
+)
+OPEN = (
+    "Not given in the thesis: k and p_min of Eq 3.3 and the value at which it is clamped. Here they are chosen so that "
+    "both boxes come out two cells wide: k = 0.05 m, p_min = 0.25, clamp 0.93. A cell then becomes occupied when a bit "
+    "less than a third of its rays end in it."
+)
 
 
 @dataclass(frozen=True)
@@ -191,9 +215,6 @@ def _width(cells: NDArray[np.int64]) -> int:
     return int(np.unique(rows, return_counts=True)[1].max()) if len(rows) else 0
 
 
-TITLES = {"line": "Line drawing", "ray": "Voxel traversal"}
-
-
 def box_png(line: BoxFound, ray: BoxFound) -> bytes:
     """Return the layer at the camera's height by both tracers, the optical axis and the landscape (after Fig 4.6)."""
     figure = figure_of(11.0)
@@ -238,31 +259,6 @@ def placements_png(found: Sequence[BoxFound]) -> bytes:
 def _true_box(axis: Any, found: BoxFound) -> None:
     (x0, _, z0), (x1, _, z1) = found.placement.bounds
     axis.fill([x0, x1, x1, x0], [z0, z0, z1, z1], fill=False, edgecolor=PATH_COLOUR, linewidth=2)
-
-
-SIZES_CM = {"large": "47 x 36.5 x 32 cm", "small": "25 x 18.5 x 9 cm"}
-FIGURES = {"large": ("Fig 4.6", "Fig 4.7"), "small": ("Fig 4.9", "Fig 4.10")}
-SAID = {
-    "large": "The box occupies two cells. Only 3.5 cm of it lie in each outer cell, whose rays mostly pass by. The "
-    "wall behind it is fully obstructed and has no update results.",
-    "small": "The small box also occupies two cells, although it is 22 cm narrower: 12.5 cm of it lie in each, more "
-    "than half of the cell. It barely blocks the wall.",
-}
-NAMES = {"line": "line drawing", "ray": "voxel traversal"}
-MARGIN = (
-    "The accuracy is practical for the positions of obstacles but not for exact dimensions, therefore a margin of one "
-    "cell is required (chapter 5)."
-)
-WHY = (
-    "Why two cells: in an outer cell of the large box most rays pass by and win; in each of the small box's cells "
-    "enough rays end. The front of both stands exactly on the border of two cells, and the nearest of 64 noisy "
-    "pixels is some centimetres too near, so the front also appears in the cell before it (front +1)."
-)
-OPEN = (
-    "Not given in the thesis: k and p_min of Eq 3.3 and the value at which it is clamped. Here they are chosen so that "
-    "both boxes come out two cells wide: k = 0.05 m, p_min = 0.25, clamp 0.93. A cell then becomes occupied when a bit "
-    "less than a third of its rays end in it."
-)
 
 
 def chapter(two: Sequence[BoxFound], many: Sequence[BoxFound], updates: int) -> Chapter:
@@ -321,7 +317,7 @@ def _pictures(size: str, found: Sequence[BoxFound]) -> list[Shown]:
         "optical axis and of the whole layer by line drawing. 127 is unknown, 0 free, 255 occupied."
     )
     return [
-        Shown(plan, SAID[size], ours, box_png(line, ray)),
+        Shown(plan, PAPER[size], ours, box_png(line, ray)),
         Shown(space, "The 3-D map; red lines are the field of view with 1 m depth.", "The same, by line drawing.",
               space_png(line.voxel_map, f"{size.capitalize()} box at 2 m")),
     ]  # fmt: skip

@@ -18,13 +18,12 @@ from stereovox.maps import VoxelMap
 from stereovox.sources.base import Stream
 from stereovox.view.picture import draw
 
+PROFILES = ("chien2020", "default")
+
 
 def overview_png(voxel_map: VoxelMap, way: NDArray[np.float64], heading: str) -> bytes:
     """Return a map from above, from three sides and cut open, with the camera's way (N, 3)."""
     return png(draw(voxel_map, heading=heading, trajectory=way, up=voxel_map.config.up), 70)
-
-
-PROFILES = ("chien2020", "default")
 
 
 def map_own(source: Stream, step: Callable[[], None] = lambda: None) -> Chapter:

@@ -25,6 +25,12 @@ BESIDE_M = 0.15
 """So far on either side of an inner wall that ends at an outer one the outer one is not judged."""
 REACH_M = 0.24
 """Occupied cells up to so far before and behind a wall's face are taken for the wall, which is 0.25 m thick."""
+INSET_M = 0.15
+"""So much of a wall beside a corner, the floor and the ceiling is not judged: the other wall stands there too."""
+IN_FRONT_M = 0.4
+"""Occupied cells up to so far before a face are taken for its wall; behind it, up to the wall's middle."""
+INNER_HALF_M, OUTER_M = 0.06, 0.25
+"""Half the thickness of inner walls, behind whose middle the other room's face begins; thickness of outer ones."""
 
 
 def measure_outer(voxel_map: VoxelMap, stage: Stage, only: Keys, others: Keys) -> dict[str, WallFound]:
@@ -74,14 +80,6 @@ def _whole_face(side: str, faces: Sequence[Face]) -> Wall:
 def _inner_walls(stage: Stage, size: float) -> NDArray[np.int64]:
     inner = [grown(solid, BESIDE_M) for solid in stage.scene.part("walls") if not solid.name.startswith(INNER)]
     return np.unique(keys(np.concatenate([touched_cells(solid.triangles, size) for solid in inner])))
-
-
-INSET_M = 0.15
-"""So much of a wall beside a corner, the floor and the ceiling is not judged: the other wall stands there too."""
-IN_FRONT_M = 0.4
-"""Occupied cells up to so far before a face are taken for its wall; behind it, up to the wall's middle."""
-INNER_HALF_M, OUTER_M = 0.06, 0.25
-"""Half the thickness of inner walls, behind whose middle the other room's face begins; thickness of outer ones."""
 
 
 @dataclass(frozen=True, eq=False)

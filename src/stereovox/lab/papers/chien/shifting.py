@@ -26,6 +26,18 @@ DOWNSAMPLE = 2
 """Images of the flight are 212 pixels wide: 2x2 of them are 8x8 of a D435."""
 OUTSIDE = ("drop", "keep")
 """What happens to cells that leave the window: lost, or kept in tiles on disk."""
+NEAR_M = 0.5
+"""Cells up to so far above and below the first camera are drawn: without floor and ceiling."""
+PAPER = (
+    "Once the camera hits the trigger boundary, the whole map shifts one unit; the dynamic region moves with the "
+    "vehicle and is the only one that is updated. Cells outside are eliminated and can be stored in another memory, "
+    "or removed."
+)
+OUR_PICTURE = (
+    "The flight from above: the window at four moments (blue, the last one orange), in it the trigger box (red); grey "
+    "squares are the tiles of 32 cells a side that went to disk. Right: what a move costs."
+)
+NAMES = {"drop": "Cells that leave are dropped", "keep": "Cells that leave are kept in tiles"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,10 +115,6 @@ def _tiles(voxel_map: RollingMap) -> NDArray[np.float64]:
     return np.stack([low, low + 1], axis=1) * TILE * voxel_map.voxel_size
 
 
-NEAR_M = 0.5
-"""Cells up to so far above and below the first camera are drawn: without floor and ceiling."""
-
-
 def flight_png(flight: Flight) -> bytes:
     """Return the flight from above with windows and tiles (after Fig 3.14 to 3.16), and what moves cost."""
     figure = figure_of(7.0)
@@ -143,18 +151,6 @@ def _rectangle(low: NDArray[np.float64], high: NDArray[np.float64]) -> tuple[lis
     return [low[2], high[2], high[2], low[2]], [low[0], low[0], high[0], high[0]]
 
 
-SAID = (
-    "Once the camera hits the trigger boundary, the whole map shifts one unit; the dynamic region moves with the "
-    "vehicle and is the only one that is updated. Cells outside are eliminated and can be stored in another memory, "
-    "or removed."
-)
-OUR_PICTURE = (
-    "The flight from above: the window at four moments (blue, the last one orange), in it the trigger box (red); grey "
-    "squares are the tiles of 32 cells a side that went to disk. Right: what a move costs."
-)
-WAYS = {"drop": "Cells that leave are dropped", "keep": "Cells that leave are kept in tiles"}
-
-
 def chapter(flights: Sequence[Flight]) -> Chapter:
     """Return the chapter; the last flight is drawn."""
     figures = {flight.outside: flight.figures() for flight in flights}
@@ -171,13 +167,13 @@ def chapter(flights: Sequence[Flight]) -> Chapter:
         "Table 4.1: 20x6x20 m, trigger box 1 m to all sides. Images are 212 pixels wide and downsampled 2x2, so a "
         "frame has as many rays as 8x8 of a D435.",
         claims,
-        [Shown("Fig 3.14 to 3.16", SAID, OUR_PICTURE, flight_png(flights[-1]))],
+        [Shown("Fig 3.14 to 3.16", PAPER, OUR_PICTURE, flight_png(flights[-1]))],
         numbers=figures,
     )
 
 
 def _claims(flight: Flight) -> list[Claim]:
-    figures, way = flight.figures(), WAYS[flight.outside]
+    figures, way = flight.figures(), NAMES[flight.outside]
     move, stay = 1e3 * figures["shift_ms_median"], 1e3 * figures["stay_ms_median"]
     return [
         Claim(f"{way}: a move of one cell", "no time given",

@@ -34,6 +34,19 @@ FIRST = 10
 """Frames at the start that are not counted: they compile kernels, make room and fill caches."""
 VIEW_EVERY = 5
 """Views are made after every so many frames only: they take longer than all the rest."""
+STEP_HEADS = ("function", "thesis", "ours, mean", "ours, median", "ours, 99 %", "what was timed")
+FRAME_HEADS = ("condition", "thesis", "thesis, fps", "ours, mean", "ours, median", "ours, fps", "times faster")
+MEANS = (
+    "Means are compared because the thesis gives averages; whatever else the machine does makes them larger, the "
+    "median less so. The thesis's frame includes reading the cameras and extracting a point cloud; ours begins with "
+    "the raw image in memory, and no point cloud is made."
+)
+VIEWS = (
+    "With visualization: after a frame the map is turned into pixels on the same processor core. 2D is the layer at "
+    "the camera's height, 3D the occupied cells as shaded cubes, 640x640, both by NumPy and without a window; the "
+    "thesis's pictures come from a graphics card. Every fifth frame was timed. In practice stereovox view draws in "
+    "the browser and takes nothing of the mapping's time."
+)
 
 
 @dataclass(frozen=True)
@@ -107,9 +120,9 @@ def time_tables(
     steps, conditions = _Steps(), [_Condition(condition) for condition in CONDITIONS]
     done = 0
     for batch in _batches(location, frames):
-        steps.take(batch, counted=done >= FIRST)
+        steps.add(batch, counted=done >= FIRST)
         for condition in conditions:
-            condition.take(batch, counted=done >= FIRST)
+            condition.add(batch, counted=done >= FIRST)
         done += len(batch)
         for _ in batch:
             step()
@@ -135,7 +148,7 @@ class _Steps:
         self._tracers = [(make_integrator(config), make_map(config)) for config in configs]
         self._ms: dict[str, list[float]] = defaultdict(list)
 
-    def take(self, batch: Sequence[Frame], counted: bool) -> None:
+    def add(self, batch: Sequence[Frame], counted: bool) -> None:
         names = [step.name for step in STEPS]
         images = [self._time(names[5], counted, prepare, frame, self._config) for frame in batch]
         small = [self._time(names[0], counted, downsample, image, 10) for image in images]
@@ -167,7 +180,7 @@ class _Condition:
         self._mapper = Mapper(load_config("chien2020", **settings))
         self._ms: list[float] = []
 
-    def take(self, batch: Sequence[Frame], counted: bool) -> None:
+    def add(self, batch: Sequence[Frame], counted: bool) -> None:
         for n, frame in enumerate(batch):
             shown = not self._condition.views or n % VIEW_EVERY == 0
             start = perf_counter()
@@ -217,21 +230,6 @@ def times_png(rows: Sequence[Timed]) -> bytes:
     axis.legend(frameon=False, loc="lower right")
     labels(axis, "milliseconds a frame, mean (logarithmic)", "")
     return png(figure)
-
-
-STEP_HEADS = ("function", "thesis", "ours, mean", "ours, median", "ours, 99 %", "what was timed")
-FRAME_HEADS = ("condition", "thesis", "thesis, fps", "ours, mean", "ours, median", "ours, fps", "times faster")
-MEANS = (
-    "Means are compared because the thesis gives averages; whatever else the machine does makes them larger, the "
-    "median less so. The thesis's frame includes reading the cameras and extracting a point cloud; ours begins with "
-    "the raw image in memory, and no point cloud is made."
-)
-VIEWS = (
-    "With visualization: after a frame the map is turned into pixels on the same processor core. 2D is the layer at "
-    "the camera's height, 3D the occupied cells as shaded cubes, 640x640, both by NumPy and without a window; the "
-    "thesis's pictures come from a graphics card. Every fifth frame was timed. In practice stereovox view draws in "
-    "the browser and takes nothing of the mapping's time."
-)
 
 
 def chapter(steps: Sequence[Timed], conditions: Sequence[Timed]) -> Chapter:

@@ -29,6 +29,25 @@ from stereovox.view.panels import measured, title
 TRACERS = ("ray", "line")
 RIM_CELLS = 1.5
 """A cell whose centre is so many cell widths or less inside the field of view, or outside it, lies at its rim."""
+PAPER = (
+    "Line drawing tries to make the line as thin as possible with less effort; voxel traversal fills every cell the "
+    "ray passes. The missed cells can still be updated by other rays, except close to the edge of the field of view."
+)
+OURS = "One 8x8 frame in the apartment, layer at the camera's height; the camera is where the cone begins."
+HEADS = (
+    "downsampling",
+    "updated by traversal",
+    "by line",
+    "by both",
+    "only by traversal",
+    "only by line",
+    "ms, traversal",
+    "ms, line",
+)
+THICK = (
+    "Line drawing leaves more cells occupied: rays that only graze a cell do not clear it. With one sensor model for "
+    "both its walls are therefore a little thicker than those of voxel traversal."
+)
 
 
 @dataclass
@@ -166,27 +185,6 @@ def tracers_png(found: Comparison, size: float) -> bytes:
     return png(figure)
 
 
-SAID = (
-    "Line drawing tries to make the line as thin as possible with less effort; voxel traversal fills every cell the "
-    "ray passes. The missed cells can still be updated by other rays, except close to the edge of the field of view."
-)
-OURS = "One 8x8 frame in the apartment, layer at the camera's height; the camera is where the cone begins."
-HEADS = (
-    "downsampling",
-    "updated by traversal",
-    "by line",
-    "by both",
-    "only by traversal",
-    "only by line",
-    "ms, traversal",
-    "ms, line",
-)
-THICK = (
-    "Line drawing leaves more cells occupied: rays that only graze a cell do not clear it. With one sensor model for "
-    "both its walls are therefore a little thicker than those of voxel traversal."
-)
-
-
 def chapter(found: Sequence[Comparison], size: float) -> Chapter:
     """Return the chapter; the first comparison is drawn. size: of a cell in metres."""
     rows = [
@@ -201,7 +199,7 @@ def chapter(found: Sequence[Comparison], size: float) -> Chapter:
         "on which a frame says anything, summed over all frames, and the cells that are occupied in the end. The rim "
         "of the view is everything less than 1.5 cells inside it.",
         [claim for one in found for claim in _claims(one)],
-        [Shown("Fig 3.10", SAID, OURS, tracers_png(found[0], size))],
+        [Shown("Fig 3.10", PAPER, OURS, tracers_png(found[0], size))],
         [Sheet("Cells updated, all frames together; median time of a frame with map update", HEADS, rows)],
         [THICK],
         {"comparisons": [one.figures() for one in found]},

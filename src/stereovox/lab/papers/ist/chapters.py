@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The experiments of IST 2019 told: simulated beams, one chapter a floor, and the table of times."""
+"""Chapters of IST 2019: simulated beams, one chapter per floor, and the table of times."""
 
 from __future__ import annotations
 
@@ -28,6 +28,29 @@ HEIGHTS = {
     "band": "0.1 to 1.8 m over the floor",
     "above": "the same, with table tops",
 }
+MAP_DPI = 75
+EQ7 = (
+    "Error: IST 2019, Eq 7: cells whose state (unknown, free, occupied) differs, over the free and occupied cells of "
+    "the reference. A wall that stands one cell of 2 cm aside counts twice in it, and so does every cell of a wall "
+    "that is drawn thicker; walls within one cell and the metres between walls forgive that. Maps and reference have "
+    "one frame, that of the localisation; nothing was aligned afterwards."
+)
+POSES = (
+    "Odometry: as the Pioneer's wheels tell it, without localisation. True poses: those of the simulation, moved as a "
+    "whole to the reference's frame; what is left is not due to localisation."
+)
+BAND = (
+    "The lidar, 22.5 cm over the floor, sees a table's legs and nothing of its top, of a 20 cm high carton, or a panel "
+    "on the wall. The profile default maps all that stands between 0.1 and 1.8 m. That is right, and an error in Eq 7 "
+    "all the same, whose reference does not know it: the table's area is missed. So each map is compared with the "
+    "simulated building itself as well: its slice at the lidar's height, and the band."
+)
+LIMITS = (
+    "What keeps the reference from being the truth: a lidar's noise of 1 % (at least 1 cm) a reading and the few "
+    "centimetres of SLAM's way, in cells of 2 cm. Beyond that the report's own reasons count here too: a camera of 57 "
+    "degrees sees less than a lidar of 240 on the same way, here in narrow places behind doors and furniture."
+)
+GROWS = "The map has no frame to run out of: tiles are made where a scan says something (the report's future work)."
 
 
 def maps_sheet(found: Survey) -> Sheet:
@@ -113,9 +136,6 @@ def _cm(metres: float | None) -> str:
     return _share(metres, 100, 1)
 
 
-MAP_DPI = 75
-
-
 def fans_png(fans: Sequence[Fan]) -> bytes:
     """Return the maps that synthetic beams made, side by side, with counted cells (after Fig 3)."""
     figure = figure_of(8.0)
@@ -138,30 +158,6 @@ def _fan(axis: Any, fan: Fan) -> None:
     if len(ends) < 50:
         axis.plot(*ends.T, ".", color="#d1603d", markersize=4)
     title(axis, f"{len(ends)} beams: {fan.free:,} cells free, {fan.occupied:,} occupied")
-
-
-EQ7 = (
-    "Error: IST 2019, Eq 7: cells whose state (unknown, free, occupied) differs, over the free and occupied cells of "
-    "the reference. A wall that stands one cell of 2 cm aside counts twice in it, and so does every cell of a wall "
-    "that is drawn thicker; walls within one cell and the metres between walls forgive that. Maps and reference have "
-    "one frame, that of the localisation; nothing was aligned afterwards."
-)
-POSES = (
-    "Odometry: as the Pioneer's wheels tell it, without localisation. True poses: those of the simulation, moved as a "
-    "whole to the reference's frame; what is left is not due to localisation."
-)
-BAND = (
-    "The lidar, 22.5 cm over the floor, sees a table's legs and nothing of its top, of a 20 cm high carton, or a panel "
-    "on the wall. The profile default maps all that stands between 0.1 and 1.8 m. That is right, and an error in Eq 7 "
-    "all the same, whose reference does not know it: the table's area is missed. So each map is compared with the "
-    "simulated building itself as well: its slice at the lidar's height, and the band."
-)
-LIMITS = (
-    "What keeps the reference from being the truth: a lidar's noise of 1 % (at least 1 cm) a reading and the few "
-    "centimetres of SLAM's way, in cells of 2 cm. Beyond that the report's own reasons count here too: a camera of 57 "
-    "degrees sees less than a lidar of 240 on the same way, here in narrow places behind doors and furniture."
-)
-GROWS = "The map has no frame to run out of: tiles are made where a scan says something (the report's future work)."
 
 
 def fans_chapter(many: Fan, few: Fan) -> Chapter:

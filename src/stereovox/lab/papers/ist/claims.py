@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What must hold of simulated beams and of a floor's maps, and whether it does."""
+"""Claims about simulated beams and floor maps, and whether they hold."""
 
 from __future__ import annotations
 
@@ -10,6 +10,13 @@ from stereovox.lab.papers.ist.drives import Place
 from stereovox.lab.papers.ist.fans import Fan
 from stereovox.lab.papers.ist.survey import Judged, Survey
 from stereovox.lab.papers.ist.variants import MIDDLE, OURS, THEIRS
+
+RIGHT, AREA = 0.98, 0.03
+"""Least share of places on the beams with the right state; most by which counted cells differ from the areas."""
+TARGET_PERCENT = 10.0
+WALL_M, WAY_M = 0.04, 0.10
+"""Most metres, median, from a wall of the map to the reference's; most metres (RMS) that a way is off."""
+DRAWN_ODOMETRY = "ist2019, odometry"
 
 
 def numbers_of(found: Survey) -> dict[str, Any]:
@@ -38,14 +45,6 @@ def numbers_of(found: Survey) -> dict[str, Any]:
             for name, one in found.judged.items()
         },
     }
-
-
-RIGHT, AREA = 0.98, 0.03
-"""Least share of places on the beams with the right state; most by which counted cells differ from the areas."""
-TARGET_PERCENT = 10.0
-WALL_M, WAY_M = 0.04, 0.10
-"""Most metres, median, from a wall of the map to the reference's; most metres (RMS) that a way is off."""
-DRAWN_ODOMETRY = "ist2019, odometry"
 
 
 def fan_claims(many: Fan, few: Fan) -> list[Claim]:
@@ -85,7 +84,7 @@ def claims_of(found: Survey, place: Place | None) -> list[Claim]:
     ]
     if place is None:
         return [*claims, *(_beside(one) for one in (middle, ours))]
-    claims += [_target(middle), _beside(ours), *_band(ours, theirs), _walls(middle), *_ways(found)]
+    claims += [_target(middle), _beside(ours), *_band(ours, theirs), _walls(middle), *_format_errors(found)]
     odometry = found.judged.get(DRAWN_ODOMETRY)
     if odometry is not None:
         less = theirs.scores.eq7_percent < odometry.scores.eq7_percent
@@ -148,7 +147,7 @@ def _walls(one: Judged) -> Claim:
     return Claim(text, f"at most {100 * WALL_M:g} cm", ours, holds)
 
 
-def _ways(found: Survey) -> list[Claim]:
+def _format_errors(found: Survey) -> list[Claim]:
     ways = {"SLAM's way": found.reference.way_error, "AMCL's way": found.way_error}
     return [
         Claim(f"{name}, off the true one (RMS, laid on it as a whole)", f"at most {100 * WAY_M:g} cm",

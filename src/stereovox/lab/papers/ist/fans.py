@@ -82,11 +82,11 @@ def _right(mapper: GridMapper, scan: Scan, config: Config) -> float:
     for direction, r in zip(directions, scan.ranges.astype(float), strict=True):
         before = np.arange(size, r - size, size / 2)[:, None] * direction
         within = np.arange(r + size, r + config.grid.thickness - size, size / 2)[:, None] * direction
-        right += [_there(mapper, before, State.FREE), _there(mapper, within, State.OCCUPIED)]
+        right += [_has_state(mapper, before, State.FREE), _has_state(mapper, within, State.OCCUPIED)]
     return float(np.concatenate(right).mean())
 
 
-def _there(mapper: GridMapper, points: NDArray[np.float64], state: State) -> NDArray[np.bool_]:
+def _has_state(mapper: GridMapper, points: NDArray[np.float64], state: State) -> NDArray[np.bool_]:
     """Tell which points (N, 2) have a cell of this state at most one cell away."""
     size = mapper.map.voxel_size
     around = [points + np.array([x, y]) * size for x in (-1, 0, 1) for y in (-1, 0, 1)]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How long it takes to publish a map (IST 2019, IV-D: 15 s for 3000 x 3000 cells)."""
+"""Time to publish a map (IST 2019, IV-D: 15 s for 3000 x 3000 cells)."""
 
 from __future__ import annotations
 

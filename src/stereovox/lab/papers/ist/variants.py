@@ -20,6 +20,8 @@ from stereovox.products.projection import project
 REACH = 5.0
 """Metres (III-C)."""
 AMCL, ODOMETRY, TRUTH = "amcl", "odometry", "truth"
+THEIRS, OURS, MIDDLE, SPACE = "ist2019", "default", "default, middle row", "default, 3-D"
+SMALL = {"voxel_size": 0.02, "max_range": REACH}
 
 
 @dataclass(frozen=True)
@@ -40,8 +42,6 @@ class Variant:
         return load_config(self.profile, **self.settings)
 
 
-THEIRS, OURS, MIDDLE, SPACE = "ist2019", "default", "default, middle row", "default, 3-D"
-SMALL = {"voxel_size": 0.02, "max_range": REACH}
 VARIANTS = (
     Variant(THEIRS, "ist2019", "as the report: middle row, Bresenham, every beam, thickness alpha", "ist2019"),
     Variant(OURS, "default", "all obstacles from 0.1 to 1.8 m over the floor, once a scan", settings=SMALL),

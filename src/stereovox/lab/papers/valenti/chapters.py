@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The evaluation told: Table 8.1 beside ours, one chapter a drive, and the time it takes."""
+"""Chapters of the evaluation: Table 8.1 beside ours, one chapter per drive, and the times."""
 
 from __future__ import annotations
 
@@ -23,6 +23,43 @@ from stereovox.view.outcomes import outcomes_png
 from stereovox.view.panels import GREY
 
 VERDICTS = {True: YES, False: NO, None: "-"}
+COLOURS = {THESIS: "#8a8f99", DEFAULT: OURS, OCTOMAP: SECOND}
+TARGET = "#5b8c5a"
+TABLE = ("tp", "fp", "tn", "fn", "accuracy", "precision", "recall", "specificity", "npv", "error", "correlation")
+TRUTH = (
+    "Truth: a cell is occupied where one lidar point of any frame falls into it that is in the left image and on "
+    "nothing annotated as an object. Cells count that some frame has in view and in range. Free are all others; "
+    "beside it stands a second, kinder truth, whose free cells are only those that a lidar ray crossed. The first "
+    "blames a map for every surface that the sparse lidar missed, the second asks only where the lidar knows."
+)
+OTHER_DATA = (
+    "The thesis's rows are its own printed figures, of other drives than ours unless sequences 0000 to 0009 of the "
+    "tracking data stand below them; the thesis tells neither the cell size nor the range of its table."
+)
+MEASURES = (
+    "Exact and within one cell: a cell called occupied is right where the truth has a surface in it, or within one "
+    "cell along each axis; recall likewise. The thesis's rule is p > 0.7; one hit leaves a cell of OctoMap at 0.7, so "
+    "p >= 0.7 is told as well. Balanced: the threshold at which the lesser of precision and recall within one cell is "
+    "largest. Cells never observed count as free; error and calibration are over observed cells, as in the thesis."
+)
+ALL_CELLS = (
+    "The correlation over all cells of the truth has no target: cells that a map never observed stand at p = 0.5, most "
+    "of them behind surfaces, so it mostly tells how much of the box was never seen, the more so the surer a map is "
+    "of the free air that it did see."
+)
+RIVAL = (
+    "OctoMap (octomap-python, its own settings, one ray for the points of a cell) gets the points of the same "
+    "disparities as `default`, and pixels beyond the range clear their rays up to it. Its range is a distance, ours a "
+    "depth; points in the image's corners between the two are marked occupied for it all the same."
+)
+FIG_8_4 = (
+    "Recall and correlation rise while the drive goes on and more of the scene is seen; precision and error stay about "
+    "level."
+)
+BETTER = (
+    "Claims are made against the first truth, free is all in view. Better in every measure (f): each map is taken at "
+    "the threshold that suits it best, and of precision and recall the lesser counts."
+)
 
 
 def points_sheet(judged: Sequence[Judged], kind: str, missing: str) -> Sheet:
@@ -133,10 +170,6 @@ PRINTED = (
 positives, so one digit of 32727 seems to be wrong."""
 
 
-COLOURS = {THESIS: "#8a8f99", DEFAULT: OURS, OCTOMAP: SECOND}
-TARGET = "#5b8c5a"
-
-
 def tolerances_png(judged: Sequence[Judged]) -> bytes:
     """Return precision against recall within one cell: a row a range, a column a cell size, a line a map."""
     return _charts(judged, _tolerance, ("recall within one cell", "precision within one cell"))
@@ -182,43 +215,6 @@ def _reliability(axis: Any, one: Judged) -> None:
     axis.plot([0, 1], [0, 1], "--", color=GREY, linewidth=1)
     axis.plot(found.mean_p, found.occupied_share, "o-", markersize=4, color=COLOURS[one.mapper], label=one.mapper)
     axis.set(xlim=(0, 1), ylim=(0, 1.02))
-
-
-TABLE = ("tp", "fp", "tn", "fn", "accuracy", "precision", "recall", "specificity", "npv", "error", "correlation")
-TRUTH = (
-    "Truth: a cell is occupied where one lidar point of any frame falls into it that is in the left image and on "
-    "nothing annotated as an object. Cells count that some frame has in view and in range. Free are all others; "
-    "beside it stands a second, kinder truth, whose free cells are only those that a lidar ray crossed. The first "
-    "blames a map for every surface that the sparse lidar missed, the second asks only where the lidar knows."
-)
-OTHER_DATA = (
-    "The thesis's rows are its own printed figures, of other drives than ours unless sequences 0000 to 0009 of the "
-    "tracking data stand below them; the thesis tells neither the cell size nor the range of its table."
-)
-MEASURES = (
-    "Exact and within one cell: a cell called occupied is right where the truth has a surface in it, or within one "
-    "cell along each axis; recall likewise. The thesis's rule is p > 0.7; one hit leaves a cell of OctoMap at 0.7, so "
-    "p >= 0.7 is told as well. Balanced: the threshold at which the lesser of precision and recall within one cell is "
-    "largest. Cells never observed count as free; error and calibration are over observed cells, as in the thesis."
-)
-ALL_CELLS = (
-    "The correlation over all cells of the truth has no target: cells that a map never observed stand at p = 0.5, most "
-    "of them behind surfaces, so it mostly tells how much of the box was never seen, the more so the surer a map is "
-    "of the free air that it did see."
-)
-RIVAL = (
-    "OctoMap (octomap-python, its own settings, one ray for the points of a cell) gets the points of the same "
-    "disparities as `default`, and pixels beyond the range clear their rays up to it. Its range is a distance, ours a "
-    "depth; points in the image's corners between the two are marked occupied for it all the same."
-)
-FIG_8_4 = (
-    "Recall and correlation rise while the drive goes on and more of the scene is seen; precision and error stay about "
-    "level."
-)
-BETTER = (
-    "Claims are made against the first truth, free is all in view. Better in every measure (f): each map is taken at "
-    "the threshold that suits it best, and of precision and recall the lesser counts."
-)
 
 
 def table_chapter(judged: Sequence[Judged], setting: Setting, missing: str) -> Chapter:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a map of a real drive must show, and whether it does."""
+"""Claims about maps of real drives, and whether they hold."""
 
 from __future__ import annotations
 
@@ -14,6 +14,17 @@ from stereovox.lab.papers.valenti.judge import Judged
 from stereovox.lab.papers.valenti.mappers import DEFAULT, OCTOMAP, THESIS, Setting
 from stereovox.lab.papers.valenti.speed import Speed
 
+TARGET_RANGE = 20.0
+ERROR, ECE, HERTZ = 0.10, 0.05, 20.0
+"""Most mean squared error, most calibration error, and least frames a second."""
+NOT_INSTALLED = "octomap-python is not installed"
+KINDS = {"view": "free: all in view", "rays": "free: what the lidar looked into"}
+"""Kinds of truth."""
+CLAIMED = "view"
+Found = Mapping[tuple[Setting, str], Judged]
+"""All maps of a drive by setting and mapper."""
+LESS_IS_BETTER = {"error", "calibration error"}
+
 
 class Target(NamedTuple):
     """Least precision and recall within one cell, at one threshold, and least correlation, for one cell size."""
@@ -25,15 +36,6 @@ class Target(NamedTuple):
 
 TARGETS = {0.5: Target(0.92, 0.95, 0.72), 0.4: Target(0.90, 0.94, 0.70), 0.2: Target(0.85, 0.92, 0.62)}
 """By cell size in metres, for a range of TARGET_RANGE metres."""
-TARGET_RANGE = 20.0
-ERROR, ECE, HERTZ = 0.10, 0.05, 20.0
-"""Most mean squared error, most calibration error, and least frames a second."""
-NOT_THERE = "octomap-python is not installed"
-KINDS = {"view": "free: all in view", "rays": "free: what the lidar looked into"}
-"""Kinds of truth."""
-CLAIMED = "view"
-Found = Mapping[tuple[Setting, str], Judged]
-"""All maps of a drive by setting and mapper."""
 
 
 class Result(NamedTuple):
@@ -86,7 +88,7 @@ def _against_octomap(curve: PrecisionRecall, octomap: PrecisionRecall | None) ->
     """Return (a): OctoMap's better precision and its better recall, of p > 0.7 and p >= 0.7, at once."""
     text = "exact precision and recall, at one threshold"
     if octomap is None:
-        return Result("a", text, NOT_THERE, _told(best(curve, EXACT), EXACT), None)
+        return Result("a", text, NOT_INSTALLED, _format_point(best(curve, EXACT), EXACT), None)
     points = [at(octomap, threshold) for threshold in (STRICT, AT_LEAST)]
     precision, recall = (max(point[name] or 0.0 for point in points) for name in EXACT)
     return _pair("a", text, curve, EXACT, (precision, recall), " (OctoMap's better ones)")
@@ -98,14 +100,14 @@ def _pair(
     point = best(curve, names, wanted)
     holds = all((point[name] or 0.0) >= goal for name, goal in zip(names, wanted, strict=True))
     goal = "at least {:.3f} and {:.3f}".format(*wanted)
-    return Result(letter, text, f"{goal}{why}", _told(point, names), holds)
+    return Result(letter, text, f"{goal}{why}", _format_point(point, names), holds)
 
 
 def _wins(found: Found, setting: Setting, rival: str) -> Claim:
     """Return claim (f): better in each measure that has a target, each map at the threshold that suits it best."""
     text = f"(f) {setting}: default is better than {rival} in every measure"
     if (setting, rival) not in found:
-        return Claim(text, "better in each", NOT_THERE, None)
+        return Claim(text, "better in each", NOT_INSTALLED, None)
     ours, theirs = (found[setting, name].scores[CLAIMED] for name in (DEFAULT, rival))
     pairs = {name: (measure(ours), measure(theirs)) for name, measure in MEASURES.items()}
     better = {name: a < b if name in LESS_IS_BETTER else a > b for name, (a, b) in pairs.items()}
@@ -132,14 +134,13 @@ MEASURES: dict[str, Callable[[Scores], float]] = {
     "calibration error": lambda scores: _or(scores.ece, 1.0),
 }
 """What is compared in (f)."""
-LESS_IS_BETTER = {"error", "calibration error"}
 
 
 def _or(value: float | None, otherwise: float) -> float:
     return otherwise if value is None else value
 
 
-def _told(point: Mapping[str, float | None], names: tuple[str, str]) -> str:
+def _format_point(point: Mapping[str, float | None], names: tuple[str, str]) -> str:
     precision, recall = (_number(point[name]) for name in names)
     return f"{precision} and {recall} at p > {point['threshold']:.4g}"
 

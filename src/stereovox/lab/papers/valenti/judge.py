@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""All mappers over one drive at one setting, each map compared with the truth that lidar tells (Valenti 2018, 8.2)."""
+"""Run all mappers over one drive at one setting, and score each map against lidar truth (Valenti 2018, 8.2)."""
 
 from __future__ import annotations
 
@@ -18,6 +18,9 @@ from stereovox.lab.papers.valenti.figures import THRESHOLDS, figures
 from stereovox.lab.papers.valenti.mappers import MAPPERS, Contestant, Matched, Setting, make_contestant
 from stereovox.lab.papers.valenti.recordings import Drive
 from stereovox.maps import VoxelMap
+
+TOLERANCE = 1
+"""Cells."""
 
 
 @dataclass
@@ -53,10 +56,6 @@ def _flat(score: QuickScores) -> dict[str, float | None]:
     numbers = score.as_dict()
     observed = numbers.pop("observed")
     return {**numbers, **{f"observed_{name}": value for name, value in observed.items()}}
-
-
-TOLERANCE = 1
-"""Cells."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,7 +95,7 @@ def judge(
     every_frame: bool = False,
     step: Callable[[], None] = lambda: None,
 ) -> tuple[list[Judged], dict[str, Any]]:
-    """Return what came of each mapper, and what became of the lidar's points.
+    """Return the result of each mapper, and the counts of the lidar's points.
 
     numbers: frames of the drive; matched: the same as depth images, by profile. every_frame: also score each map after
     every frame. step: called after each frame of each pass: one pass for each kind of truth and each profile.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The mappers that are compared, all behind one small interface: two profiles of ours, and OctoMap."""
+"""Mappers to compare, behind one small interface: two profiles of ours, and OctoMap."""
 
 from __future__ import annotations
 
@@ -26,6 +26,9 @@ from stereovox.sources.base import prefetch
 
 PIXEL_BYTES = 5
 """Depth and reason of a pixel."""
+THESIS, DEFAULT, OCTOMAP = "valenti2018", "default", "OctoMap"
+MAPPERS = {THESIS: THESIS, DEFAULT: DEFAULT, OCTOMAP: DEFAULT}
+"""Names of all mappers, each with the profile that its pairs are matched by."""
 
 
 class Matched:
@@ -60,11 +63,6 @@ class Matched:
                 yield number, self._depth.matched(pair)
             except FrameRefused:
                 continue
-
-
-THESIS, DEFAULT, OCTOMAP = "valenti2018", "default", "OctoMap"
-MAPPERS = {THESIS: THESIS, DEFAULT: DEFAULT, OCTOMAP: DEFAULT}
-"""Names of all mappers, each with the profile that its pairs are matched by."""
 
 
 class Setting(NamedTuple):

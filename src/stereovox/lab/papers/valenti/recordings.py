@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which recordings lie below a folder: sequences of KITTI tracking, and drives of KITTI raw data."""
+"""Find recordings below a folder: sequences of KITTI tracking, and drives of KITTI raw data."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How long it takes from a stereo pair to an updated map, and where the time goes."""
+"""Time from a stereo pair to an updated map, by part."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from stereovox.mapper import Mapper
 from stereovox.sources.base import prefetch
 
 THREADS = 2
-MOST = 100
+MAX_FRAMES = 100
 """Frames are enough."""
 
 
@@ -48,7 +48,7 @@ def time_mapping(
     drive: Drive, numbers: Sequence[int], profile: str, setting: Setting, step: Callable[[], None] = lambda: None
 ) -> Speed:
     """Map the drive twice and time the second pass, when all kernels are compiled. step: called after each frame."""
-    numbers = numbers[:MOST]
+    numbers = numbers[:MAX_FRAMES]
     config = config_of(profile, setting, threads=THREADS, **{"stereo.threads": THREADS})
     _map_all(drive, numbers, config, step)
     seconds, reading, reports = _map_all(drive, numbers, config, step)

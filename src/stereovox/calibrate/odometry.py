@@ -24,19 +24,73 @@ VARIETY = 0.02
 """Least share of normals along any axis: noise tilts those of a single wall, but by less."""
 FLOOR = (np.radians(0.03), 0.002)
 """Errors that no count of points averages away (radians, metres)."""
+CELL = 0.08
+"""Metres; points nearer to each other than this are merged."""
+REACH = 0.3
+"""Metres; points further apart do not belong together."""
+FEWEST = 200
+"""Points an image needs."""
+INLIERS = 0.55
+"""Share of the points that must find a partner."""
+NEW_REFERENCE = (np.radians(35), 0.6, 0.7)
+"""The reference is renewed beyond this turn (radians) or way (metres), or below this share of partners."""
+WEAKEST = (np.radians(1.0), 0.05)
+"""A registration that leaves any turn or way less certain than this is none: one wall says nothing about sliding."""
+
+
+def camera_motion(clouds: Iterable[tuple[int, NDArray[np.float64]]]) -> CameraMotion:
+    """Return the motion between images, given in order as time in nanoseconds and (M, 3) points in the optical frame.
+
+    An image that cannot be registered becomes the next reference itself, without a link to those before.
+    Raises MissingExtra without small_gicp.
+    """
+    register = _Registration()
+    stamps: list[int] = []
+    links: list[Link] = []
+    key, step = -1, np.eye(4)
+    for i, (stamp_ns, points) in enumerate(clouds):
+        stamps.append(stamp_ns)
+        guess = links[-1].T @ step if key >= 0 and key != i - 1 else step
+        found = register.against(points, guess) if key >= 0 else None
+        links.append(replace(found, reference=key) if found else Link())
+        step = np.eye(4)
+        if found:
+            step = found.T if key == i - 1 else inverse(links[-2].T) @ found.T
+        if not found or _is_far(found):
+            key = i if register.take(points) else -1
+    return CameraMotion(
+        np.array(stamps, np.int64),
+        np.array([link.reference for link in links], np.intp),
+        np.reshape([link.T for link in links], (-1, 4, 4)),
+        np.reshape([link.covariance for link in links], (-1, 6, 6)),
+    )
 
 
 @dataclass(frozen=True, eq=False)
-class Surface:
-    """Points (N, 3) in metres and normals (N, 3) of length one."""
+class CameraMotion:
+    """How a camera moved between the images of a recording.
 
-    points: NDArray[np.float64]
-    normals: NDArray[np.float64]
+    stamps_ns: (N,) int64. reference: (N,) the number of the image that each was registered with, -1 for none.
+    T_reference_camera: (N, 4, 4), NaN without reference. covariance: (N, 6, 6) of the small motion (rotation vector,
+    then translation) by which it may be off, seen from the camera: T_true = T exp(error).
+    """
 
-    @classmethod
-    def of(cls, cloud: Any) -> Surface:
-        """Return what a small_gicp cloud holds."""
-        return cls(np.array(cloud.points())[:, :3], np.array(cloud.normals())[:, :3])
+    stamps_ns: NDArray[np.int64]
+    reference: NDArray[np.intp]
+    T_reference_camera: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+
+    @property
+    def steps(self) -> NDArray[np.float64]:
+        """Return (N - 1, 4, 4) T_i_j from each image i to the next j, NaN where it is not known."""
+        T, reference = self.T_reference_camera, self.reference
+        steps = np.full((max(len(T) - 1, 0), 4, 4), np.nan)
+        for i in range(len(steps)):
+            if reference[i + 1] == i:
+                steps[i] = T[i + 1]
+            elif reference[i + 1] >= 0 and reference[i + 1] == reference[i]:
+                steps[i] = inverse(T[i]) @ T[i + 1]
+        return steps
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +105,19 @@ class Link:
     T: Transform = field(default_factory=lambda: np.full((4, 4), np.nan))
     covariance: NDArray[np.float64] = field(default_factory=lambda: np.full((6, 6), np.nan))
     share: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Points (N, 3) in metres and normals (N, 3) of length one."""
+
+    points: NDArray[np.float64]
+    normals: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, cloud: Any) -> Surface:
+        """Return what a small_gicp cloud holds."""
+        return cls(np.array(cloud.points())[:, :3], np.array(cloud.normals())[:, :3])
 
 
 def refined(T: Transform, source: Surface, target: Surface, tree: Any) -> Link:
@@ -105,75 +172,6 @@ def _motion(change: NDArray[np.float64]) -> Transform:
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = rotation_matrix(change[:3]), change[3:]
     return T
-
-
-CELL = 0.08
-"""Metres; points nearer to each other than this are merged."""
-REACH = 0.3
-"""Metres; points further apart do not belong together."""
-FEWEST = 200
-"""Points an image needs."""
-INLIERS = 0.55
-"""Share of the points that must find a partner."""
-NEW_REFERENCE = (np.radians(35), 0.6, 0.7)
-"""The reference is renewed beyond this turn (radians) or way (metres), or below this share of partners."""
-WEAKEST = (np.radians(1.0), 0.05)
-"""A registration that leaves any turn or way less certain than this is none: one wall says nothing about sliding."""
-
-
-@dataclass(frozen=True, eq=False)
-class CameraMotion:
-    """How a camera moved between the images of a recording.
-
-    stamps_ns: (N,) int64. reference: (N,) the number of the image that each was registered with, -1 for none.
-    T_reference_camera: (N, 4, 4), NaN without reference. covariance: (N, 6, 6) of the small motion (rotation vector,
-    then translation) by which it may be off, seen from the camera: T_true = T exp(error).
-    """
-
-    stamps_ns: NDArray[np.int64]
-    reference: NDArray[np.intp]
-    T_reference_camera: NDArray[np.float64]
-    covariance: NDArray[np.float64]
-
-    @property
-    def steps(self) -> NDArray[np.float64]:
-        """Return (N - 1, 4, 4) T_i_j from each image i to the next j, NaN where it is not known."""
-        T, reference = self.T_reference_camera, self.reference
-        steps = np.full((max(len(T) - 1, 0), 4, 4), np.nan)
-        for i in range(len(steps)):
-            if reference[i + 1] == i:
-                steps[i] = T[i + 1]
-            elif reference[i + 1] >= 0 and reference[i + 1] == reference[i]:
-                steps[i] = inverse(T[i]) @ T[i + 1]
-        return steps
-
-
-def camera_motion(clouds: Iterable[tuple[int, NDArray[np.float64]]]) -> CameraMotion:
-    """Return the motion between images, given in order as time in nanoseconds and (M, 3) points in the optical frame.
-
-    An image that cannot be registered becomes the next reference itself, without a link to those before.
-    Raises MissingExtra without small_gicp.
-    """
-    register = _Registration()
-    stamps: list[int] = []
-    links: list[Link] = []
-    key, step = -1, np.eye(4)
-    for i, (stamp_ns, points) in enumerate(clouds):
-        stamps.append(stamp_ns)
-        guess = links[-1].T @ step if key >= 0 and key != i - 1 else step
-        found = register.against(points, guess) if key >= 0 else None
-        links.append(replace(found, reference=key) if found else Link())
-        step = np.eye(4)
-        if found:
-            step = found.T if key == i - 1 else inverse(links[-2].T) @ found.T
-        if not found or _is_far(found):
-            key = i if register.take(points) else -1
-    return CameraMotion(
-        np.array(stamps, np.int64),
-        np.array([link.reference for link in links], np.intp),
-        np.reshape([link.T for link in links], (-1, 4, 4)),
-        np.reshape([link.covariance for link in links], (-1, 6, 6)),
-    )
 
 
 def _is_far(link: Link) -> bool:

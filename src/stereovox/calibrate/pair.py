@@ -38,88 +38,46 @@ MIN_TURN = np.radians(3.0)
 """Root mean square turn between registered images that tells anything."""
 MIN_SECOND_TURN = np.radians(1.2)
 """The same about the second axis: about one axis only, where the camera sits along it remains open."""
-
-
-def check_turning(vectors: NDArray[np.float64]) -> None:
-    """Raise StereovoxError, one line, where (N, 3) rotation vectors are too small or all about one axis."""
-    weights, axes = np.linalg.eigh(vectors.T @ vectors / max(len(vectors), 1))
-    first, second = np.sqrt(np.maximum(weights[::-1][:2], 0))
-    if first < MIN_TURN:
-        raise StereovoxError(
-            f"motion: too small, images are turned by {np.degrees(first):.1f} deg (rms); turn by 30 deg about two axes"
-        )
-    if second < MIN_SECOND_TURN:
-        axis = " ".join(f"{number:+.2f}" for number in axes[:, -1])
-        raise StereovoxError(
-            f"motion: turns about one axis only ({axis} in the camera's frame); pitch, yaw and roll while recording"
-        )
-
-
-def hand_eye(A: NDArray[np.float64], B: NDArray[np.float64]) -> Transform:
-    """Return X (4, 4) with A X = X B, of (N, 4, 4) motions; pairs whose turns differ in size count as outliers."""
-    from scipy.spatial.transform import Rotation
-
-    a, b = (Rotation.from_matrix(T[:, :3, :3]).as_rotvec() for T in (A, B))
-    differ = np.abs(np.linalg.norm(a, axis=1) - np.linalg.norm(b, axis=1))
-    usual = differ <= 3 * np.median(differ) + 1e-9
-    X = np.eye(4)
-    X[:3, :3] = Rotation.align_vectors(a[usual], b[usual])[0].as_matrix()
-    X[:3, 3] = _translation(A[usual], B[usual], X[:3, :3])
-    return X
-
-
-def _translation(A: NDArray[np.float64], B: NDArray[np.float64], R: NDArray[np.float64]) -> NDArray[np.float64]:
-    left = (A[:, :3, :3] - np.eye(3)).reshape(-1, 3)
-    right = (B[:, :3, 3] @ R.T - A[:, :3, 3]).ravel()
-    return np.linalg.lstsq(left, right, rcond=None)[0].astype(float)
-
-
 COLUMNS = 106
 """About how many blocks an image is wide: 8 pixels each for 848."""
 SPREAD = 0.15
 """Blocks whose inverse depths differ by more than this share of their mean lie across an edge."""
-
-
-def reduced_points(image: DepthImage, farthest: float) -> NDArray[np.float64]:
-    """Return (N, 3) points up to depth `farthest`, one for each block of pixels that sees one smooth surface.
-
-    The mean is taken over inverse depth: there a stereo camera's noise is even, and a plane is linear in the pixel.
-    A block counts when half of its pixels are VALID and their inverse depths lie close together. The image must reach
-    further than `farthest`: a limit on pixels would keep those that noise makes nearer, a shell that moves along.
-    """
-    n = max(1, round(image.camera.width / COLUMNS))
-    valid = image.reason == Reason.VALID
-    inverse = np.divide(1.0, image.depth_m, where=valid, out=np.zeros(valid.shape))
-    counts, sums = _blocks(valid, n).sum((1, 3)), _blocks(inverse, n).sum((1, 3))
-    lowest = _blocks(np.where(valid, inverse, np.inf), n).min((1, 3))
-    highest = _blocks(inverse, n).max((1, 3))
-    usable = counts >= max(1, n * n // 2)
-    mean = np.divide(sums, counts, where=usable, out=np.ones(sums.shape))
-    usable &= (highest - lowest <= SPREAD * mean) & (mean * farthest >= 1)
-    rows, columns = np.nonzero(usable)
-    camera, middle = image.camera, (n - 1) / 2
-    assert isinstance(camera, PinholeCamera)
-    depth = 1 / mean[rows, columns]
-    x = (columns * n + middle - camera.cx) / camera.fx
-    y = (rows * n + middle - camera.cy) / camera.fy
-    return np.stack([x * depth, y * depth, depth], axis=1)
-
-
-def _blocks(image: NDArray, n: int) -> NDArray:
-    """Return (rows, n, columns, n); what is left over at the right and lower border is cut off."""
-    height, width = image.shape[0] // n * n, image.shape[1] // n * n
-    return image[:height, :width].reshape(height // n, n, width // n, n)
-
-
 FEWEST = 20
 """Registered images with trusted poses that a calibration needs."""
 REGISTERED = 0.5
 """Share of the images that must be registered."""
 MAX_RANGE = 5.0
 """Metres; depth beyond is too noisy to register."""
-
 UNIQUE, SAME_S = 2.0, 0.05
 """A second offset (further away than SAME_S seconds) must fit so many times worse."""
+
+
+def calibrate_pair(
+    depth: DepthSource,
+    poses: Poses,
+    *,
+    min_confidence: float = 2.0,
+    max_speed_mps: float = 10.0,
+    max_turn_dps: float = 720.0,
+    guess_s: float = 0.0,
+    within_s: float | None = None,
+    progress: Callable[[Iterable[Frame], int], Iterable[Frame]] | None = None,
+) -> PairCalibration:
+    """Return extrinsics and clock offset of a depth camera and a tracker.
+
+    poses: T_world_tracker with the body in optical axes, on the tracker's own clock. The three limits are those of a
+    `pair.toml`. within_s: only offsets this near to `guess_s`; None: any. progress: wraps the frames as they are read.
+    Raises StereovoxError, one line, where motion or depth do not suffice or the recordings do not overlap;
+    MissingExtra without small_gicp.
+    """
+    motion = camera_motion(_clouds(depth, progress))
+    _check_depth(motion, depth)
+    track = PoseTrack(poses, min_confidence, max_speed_mps, max_turn_dps)
+    starts = (int(motion.stamps_ns[0]) - track.start_ns) / 1e9
+    between = None if within_s is None else (guess_s - starts - within_s, guess_s - starts + within_s)
+    check_turning(_rotation_vectors(motion))
+    found, correlation = _best(motion, track, find_offsets(motion, track, between))
+    return _result(found, starts, correlation, motion)
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,32 +108,69 @@ class PairCalibration:
         return {key: getattr(value, "tolist", lambda value=value: value)() for key, value in vars(self).items()}
 
 
-def calibrate_pair(
-    depth: DepthSource,
-    poses: Poses,
-    *,
-    min_confidence: float = 2.0,
-    max_speed_mps: float = 10.0,
-    max_turn_dps: float = 720.0,
-    guess_s: float = 0.0,
-    within_s: float | None = None,
-    progress: Callable[[Iterable[Frame], int], Iterable[Frame]] | None = None,
-) -> PairCalibration:
-    """Return extrinsics and clock offset of a depth camera and a tracker.
+def reduced_points(image: DepthImage, farthest: float) -> NDArray[np.float64]:
+    """Return (N, 3) points up to depth `farthest`, one for each block of pixels that sees one smooth surface.
 
-    poses: T_world_tracker with the body in optical axes, on the tracker's own clock. The three limits are those of a
-    `pair.toml`. within_s: only offsets this near to `guess_s`; None: any. progress: wraps the frames as they are read.
-    Raises StereovoxError, one line, where motion or depth do not suffice or the recordings do not overlap;
-    MissingExtra without small_gicp.
+    The mean is taken over inverse depth: there a stereo camera's noise is even, and a plane is linear in the pixel.
+    A block counts when half of its pixels are VALID and their inverse depths lie close together. The image must reach
+    further than `farthest`: a limit on pixels would keep those that noise makes nearer, a shell that moves along.
     """
-    motion = camera_motion(_clouds(depth, progress))
-    _check_depth(motion, depth)
-    track = PoseTrack(poses, min_confidence, max_speed_mps, max_turn_dps)
-    starts = (int(motion.stamps_ns[0]) - track.start_ns) / 1e9
-    between = None if within_s is None else (guess_s - starts - within_s, guess_s - starts + within_s)
-    check_turning(_rotation_vectors(motion))
-    found, correlation = _best(motion, track, find_offsets(motion, track, between))
-    return _result(found, starts, correlation, motion)
+    n = max(1, round(image.camera.width / COLUMNS))
+    valid = image.reason == Reason.VALID
+    inverse = np.divide(1.0, image.depth_m, where=valid, out=np.zeros(valid.shape))
+    counts, sums = _blocks(valid, n).sum((1, 3)), _blocks(inverse, n).sum((1, 3))
+    lowest = _blocks(np.where(valid, inverse, np.inf), n).min((1, 3))
+    highest = _blocks(inverse, n).max((1, 3))
+    usable = counts >= max(1, n * n // 2)
+    mean = np.divide(sums, counts, where=usable, out=np.ones(sums.shape))
+    usable &= (highest - lowest <= SPREAD * mean) & (mean * farthest >= 1)
+    rows, columns = np.nonzero(usable)
+    camera, middle = image.camera, (n - 1) / 2
+    assert isinstance(camera, PinholeCamera)
+    depth = 1 / mean[rows, columns]
+    x = (columns * n + middle - camera.cx) / camera.fx
+    y = (rows * n + middle - camera.cy) / camera.fy
+    return np.stack([x * depth, y * depth, depth], axis=1)
+
+
+def hand_eye(A: NDArray[np.float64], B: NDArray[np.float64]) -> Transform:
+    """Return X (4, 4) with A X = X B, of (N, 4, 4) motions; pairs whose turns differ in size count as outliers."""
+    from scipy.spatial.transform import Rotation
+
+    a, b = (Rotation.from_matrix(T[:, :3, :3]).as_rotvec() for T in (A, B))
+    differ = np.abs(np.linalg.norm(a, axis=1) - np.linalg.norm(b, axis=1))
+    usual = differ <= 3 * np.median(differ) + 1e-9
+    X = np.eye(4)
+    X[:3, :3] = Rotation.align_vectors(a[usual], b[usual])[0].as_matrix()
+    X[:3, 3] = _translation(A[usual], B[usual], X[:3, :3])
+    return X
+
+
+def check_turning(vectors: NDArray[np.float64]) -> None:
+    """Raise StereovoxError, one line, where (N, 3) rotation vectors are too small or all about one axis."""
+    weights, axes = np.linalg.eigh(vectors.T @ vectors / max(len(vectors), 1))
+    first, second = np.sqrt(np.maximum(weights[::-1][:2], 0))
+    if first < MIN_TURN:
+        raise StereovoxError(
+            f"motion: too small, images are turned by {np.degrees(first):.1f} deg (rms); turn by 30 deg about two axes"
+        )
+    if second < MIN_SECOND_TURN:
+        axis = " ".join(f"{number:+.2f}" for number in axes[:, -1])
+        raise StereovoxError(
+            f"motion: turns about one axis only ({axis} in the camera's frame); pitch, yaw and roll while recording"
+        )
+
+
+def _translation(A: NDArray[np.float64], B: NDArray[np.float64], R: NDArray[np.float64]) -> NDArray[np.float64]:
+    left = (A[:, :3, :3] - np.eye(3)).reshape(-1, 3)
+    right = (B[:, :3, 3] @ R.T - A[:, :3, 3]).ravel()
+    return np.linalg.lstsq(left, right, rcond=None)[0].astype(float)
+
+
+def _blocks(image: NDArray, n: int) -> NDArray:
+    """Return (rows, n, columns, n); what is left over at the right and lower border is cut off."""
+    height, width = image.shape[0] // n * n, image.shape[1] // n * n
+    return image[:height, :width].reshape(height // n, n, width // n, n)
 
 
 def _best(motion: CameraMotion, track: PoseTrack, offsets: list[Offset]) -> tuple[Refined, float]:

@@ -15,6 +15,16 @@ from stereovox.sources.tracker import angles, jumps
 
 SMOOTH = 0.03
 """Seconds; a hand that swings twice a second loses 0.6 % of its turns by that."""
+STEP = 0.01
+"""Seconds between the samples that are compared."""
+OVERLAP = 0.5
+"""Share of the shorter recording that must lie within the other."""
+CLEAR = 0.6
+"""Least correlation of a match."""
+APART, ALMOST, MOST = 0.3, 0.85, 5
+"""Other matches that are looked at: so far beside better ones (seconds), so well correlated (share of the best)."""
+LONGEST = 86_400.0
+"""Seconds; what seems to last longer holds a wrong time, and its samples would fill the memory."""
 
 
 class PoseTrack:
@@ -63,38 +73,6 @@ class PoseTrack:
         return np.where(within & (self._breaks[before] == self._breaks[after]), self._breaks[after], -1)
 
 
-def _poses_to_average(times: NDArray[np.float64]) -> int:
-    """Return the odd number of poses that SMOOTH holds; one where they come too slowly or there are too few."""
-    count = int(SMOOTH / np.median(np.diff(times))) // 2 * 2 + 1
-    return count if len(times) > 2 * count else 1
-
-
-def _quaternions(poses: Poses) -> NDArray[np.float64]:
-    """Return (N, 4) unit quaternions, neighbours on the same side of the sphere."""
-    from scipy.spatial.transform import Rotation
-
-    quaternions = Rotation.from_matrix(poses.T_world_body[:, :3, :3]).as_quat()
-    sides = np.where(np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0, -1.0, 1.0)
-    return quaternions * np.cumprod(np.concatenate([[1.0], sides]))[:, None]
-
-
-def _averages(values: NDArray[np.float64], count: int) -> NDArray[np.float64]:
-    """Return the running means (N - count + 1, K) over `count` rows of (N, K)."""
-    return np.lib.stride_tricks.sliding_window_view(values, count, axis=0).mean(axis=-1)
-
-
-STEP = 0.01
-"""Seconds between the samples that are compared."""
-OVERLAP = 0.5
-"""Share of the shorter recording that must lie within the other."""
-CLEAR = 0.6
-"""Least correlation of a match."""
-APART, ALMOST, MOST = 0.3, 0.85, 5
-"""Other matches that are looked at: so far beside better ones (seconds), so well correlated (share of the best)."""
-LONGEST = 86_400.0
-"""Seconds; what seems to last longer holds a wrong time, and its samples would fill the memory."""
-
-
 @dataclass(frozen=True)
 class Offset:
     """Seconds to add to times of the track to get times of the camera (both since their starts); its correlation."""
@@ -130,6 +108,26 @@ def find_offsets(motion: CameraMotion, track: PoseTrack, between: tuple[float, f
         chosen.append(int(np.argmax(left)))
         left[np.abs(offsets - offsets[chosen[-1]]) < APART] = -1.0
     return [Offset(float(offsets[k] + STEP * _peak(correlation, k)), float(correlation[k])) for k in chosen]
+
+
+def _poses_to_average(times: NDArray[np.float64]) -> int:
+    """Return the odd number of poses that SMOOTH holds; one where they come too slowly or there are too few."""
+    count = int(SMOOTH / np.median(np.diff(times))) // 2 * 2 + 1
+    return count if len(times) > 2 * count else 1
+
+
+def _quaternions(poses: Poses) -> NDArray[np.float64]:
+    """Return (N, 4) unit quaternions, neighbours on the same side of the sphere."""
+    from scipy.spatial.transform import Rotation
+
+    quaternions = Rotation.from_matrix(poses.T_world_body[:, :3, :3]).as_quat()
+    sides = np.where(np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0, -1.0, 1.0)
+    return quaternions * np.cumprod(np.concatenate([[1.0], sides]))[:, None]
+
+
+def _averages(values: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+    """Return the running means (N - count + 1, K) over `count` rows of (N, K)."""
+    return np.lib.stride_tricks.sliding_window_view(values, count, axis=0).mean(axis=-1)
 
 
 def _check_span(what: str, seconds: float) -> None:

@@ -27,29 +27,6 @@ TAKES = {
     "topic": (".bag", ".mcap", ".db3"),
 }
 """Which files' readers want to know more, by keyword."""
-
-
-def import_map(path: str | Path, voxel_size: float | None = None, topic: str | None = None) -> VoxelMap:
-    """Return the map in a file of another program, or in one that `export` wrote.
-
-    `.bt`, `.ot`: OctoMap's cells. `.npz`: ours, exactly. `.ply`, `.pcd`: each cell that holds a point is occupied, all
-    others are unknown. `.bag`, `.mcap`, `.db3` or a rosbag2 folder: the last Octomap, or PointCloud2, of a topic.
-    voxel_size: metres, for points of other programs; ours tell it. topic: see `bag_maps.read_bag_map`.
-    Raises StereovoxError: one line with the file and what is wrong, or an option that says nothing for such a file.
-    """
-    ending = ".mcap" if Path(path).is_dir() else Path(path).suffix.lower()
-    known = registry.names("import", IMPORTS)
-    if ending not in known:
-        raise StereovoxError(f"{path}: cannot import '{ending}'; the file's name ends in one of {', '.join(known)}")
-    told = {"voxel_size": voxel_size, "topic": topic}
-    given = {name: value for name, value in told.items() if value is not None}
-    for name in given:
-        if ending not in TAKES[name]:
-            option = f"--{name.replace('_', '-')}"
-            raise StereovoxError(f"{path}: {option} says nothing about a '{ending}'; leave it out")
-    return registry.find("import", IMPORTS, ending)(path, **given)
-
-
 EXPORTS = {
     ".bt": "stereovox.formats.octomap:write_bt",
     ".ot": "stereovox.formats.octomap:write_ot",
@@ -72,7 +49,6 @@ FLAT = (".pgm", ".png", ".yaml")
 """Endings of 2-D maps, whose writer takes `heights` and `inflate` too."""
 BAGS = (".bag", ".mcap", ".db3")
 """Endings of recordings of ROS, with a 2-D map in them, whose writer takes `heights` too."""
-
 __all__ = ["BAGS", "EXPORTS", "FLAT", "export", "read_octomap"]
 
 
@@ -100,3 +76,24 @@ def export(
     given = {name: value for name, value in options.items() if value is not None}
     write = registry.find("export", EXPORTS, ending)
     write(voxel_map if ending in FLAT else in_cubes(voxel_map), path, **given)
+
+
+def import_map(path: str | Path, voxel_size: float | None = None, topic: str | None = None) -> VoxelMap:
+    """Return the map in a file of another program, or in one that `export` wrote.
+
+    `.bt`, `.ot`: OctoMap's cells. `.npz`: ours, exactly. `.ply`, `.pcd`: each cell that holds a point is occupied, all
+    others are unknown. `.bag`, `.mcap`, `.db3` or a rosbag2 folder: the last Octomap, or PointCloud2, of a topic.
+    voxel_size: metres, for points of other programs; ours tell it. topic: see `bag_maps.read_bag_map`.
+    Raises StereovoxError: one line with the file and what is wrong, or an option that says nothing for such a file.
+    """
+    ending = ".mcap" if Path(path).is_dir() else Path(path).suffix.lower()
+    known = registry.names("import", IMPORTS)
+    if ending not in known:
+        raise StereovoxError(f"{path}: cannot import '{ending}'; the file's name ends in one of {', '.join(known)}")
+    told = {"voxel_size": voxel_size, "topic": topic}
+    given = {name: value for name, value in told.items() if value is not None}
+    for name in given:
+        if ending not in TAKES[name]:
+            option = f"--{name.replace('_', '-')}"
+            raise StereovoxError(f"{path}: {option} says nothing about a '{ending}'; leave it out")
+    return registry.find("import", IMPORTS, ending)(path, **given)

@@ -22,6 +22,91 @@ from stereovox.safe_io import MAX_YAML, read_bounded, replacing, shown, yaml_val
 
 MODES = ("trinary", "scale", "raw")
 NEEDED = ("image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh")
+MAX_PIXELS = 1 << 28
+MAX_BYTES = 1 << 31
+"""Pictures of more pixels, and files of more bytes, are refused."""
+WHITE = 255.0
+FORMATS = ("PNG", "BMP", "PPM", "JPEG", "GIF")
+PIXELS_A_BYTE = 512
+PIXELS_OF_ANY = 1 << 22
+"""A packed picture holds at most so many pixels for each byte of its file; one of few pixels may hold fewer bytes."""
+_NUMBER = re.compile(rb"\s*(?:#[^\n\r]*[\n\r]\s*)*(\d{1,9})")
+OCCUPIED_THRESH, FREE_THRESH = 0.65, 0.196
+"""What map_saver writes. With a free_thresh of 0.25, as nav2 has it, its own grey 205, unknown, is read as free."""
+FREE_PIXEL, UNKNOWN_PIXEL, OCCUPIED_PIXEL, NO_PIXEL = 254, 205, 0, 128
+SCALE_STEPS = 254
+"""Greys of mode scale between 0 and 99 per cent: each per cent is read back as it was."""
+
+
+def read_map_server(path: str | Path) -> OccupancyGrid:
+    """Return the map whose .yaml is `path`, or stands beside `path` where that is its picture.
+
+    With p = (255 - brightness) / 255, or brightness / 255 where `negate` is set, cells are, by mode:
+    trinary: 100 where p > occupied_thresh, 0 where p < free_thresh, else -1; opacity counts as one more colour.
+    scale: the same, but between them 99 (p - free_thresh) / (occupied_thresh - free_thresh) rounded down, and -1
+    where the picture lets the background through.
+    raw: the brightness, rounded down, where that is 0 to 100, else -1. The map's thresholds are then the file's.
+    (map_server 1.17, image_loader.cpp. nav2_map_server scales by 100 and rounds, and negates no raw maps.)
+    Raises MapFileError: one line with the file and what is wrong.
+    """
+    meaning = read_meaning(_yaml_of(Path(path)))
+    cells = np.ascontiguousarray(_cells(read_picture(meaning.image), meaning)[::-1])
+    if meaning.mode != "raw":
+        return OccupancyGrid(cells, meaning.resolution, meaning.origin)
+    return OccupancyGrid(cells, meaning.resolution, meaning.origin, meaning.free_thresh, meaning.occupied_thresh)
+
+
+def write_map_server(grid: OccupancyGrid, path: str | Path, mode: str = "trinary", negate: bool = False) -> None:
+    """Write a picture and its .yaml; `path` names either (a .yaml's picture is a .pgm; scaled: a .png).
+
+    Both or none: if the power goes, the .yaml names a picture that belongs to it, for a moment one of another name.
+
+    trinary: free cells 254, occupied ones 0, all others 205, which are unknown. scale: per cent as greys, unknown cells
+    are see-through and need a .png. raw: per cent as they are, unknown 255; the thresholds are the map's own. Scaled
+    and raw maps are read back as they were. negate: white is occupied.
+    Raises MapFileError: one line about an empty map, an unknown mode or ending, or a place that cannot be written.
+    """
+    yaml, image = _files(Path(path), mode)
+    png = image.suffix.lower() == ".png"
+    _check(grid, image, mode, negate)
+    greys, occupied, free = _greys(grid, mode)
+    shown = np.ascontiguousarray(grid.cells[::-1])
+    pixels = _through(255 - greys if negate else greys, shown)
+    opaque = shown >= 0 if mode == "scale" else None
+    spare = image.with_name(f".{image.name}")
+    # They take their places from the last to the first: so whenever it ends, a .yaml names a picture of its own.
+    with (
+        replacing(yaml) as text,
+        replacing(image) as picture,
+        replacing(yaml) as text_between,
+        replacing(spare) as picture_between,
+    ):
+        for file, name in ((text, image), (text_between, spare)):
+            file.write(Meaning(name, grid.resolution, grid.origin, negate, occupied, free, mode).text().encode())
+        for file in (picture, picture_between):
+            if png:
+                write_png(file, pixels, opaque)
+            else:
+                write_pgm(file, pixels, f"CREATOR: stereovox {grid.resolution:.3f} m/pix")
+        for file in (text, picture, text_between):
+            file.flush()  # a full disk shows before the first of them is in its place
+    spare.unlink(missing_ok=True)
+
+
+def write_grid(
+    voxel_map: VoxelMap, path: str | Path, heights: Heights | None = None, inflate: float | None = None
+) -> None:
+    """Write the map seen from above as map_server's two files, a picture and its .yaml; `path` names either.
+
+    heights: see `project`. inflate: radius of a robot in metres by which obstacles grow, with a margin of one cell.
+    Raises StereovoxError as `project`, `inflated_grid` and `write_map_server` do.
+    """
+    try:
+        grid = project(voxel_map, heights)
+        grid = grid if inflate is None else inflated_grid(grid, inflate)
+    except StereovoxError as error:
+        raise StereovoxError(f"{path}: {error}") from None
+    write_map_server(grid, path)
 
 
 @dataclass(frozen=True)
@@ -71,61 +156,6 @@ def read_meaning(path: Path) -> Meaning:
     return _checked(path, says)
 
 
-def _checked(path: Path, says: dict[Any, Any]) -> Meaning:
-    missing = [name for name in NEEDED if name not in says]
-    if missing:
-        raise MapFileError(f"{path}: has no '{missing[0]}', which the .yaml of a map_server map needs")
-    mode, origin, image = says.get("mode", MODES[0]), says["origin"], says["image"]
-    if mode not in MODES:
-        raise MapFileError(f"{path}: mode '{mode}'{did_you_mean(str(mode), MODES)}")
-    if not isinstance(origin, list) or len(origin) != 3:
-        raise MapFileError(f"{path}: origin {shown(origin)}; give [x, y, yaw]")
-    if not isinstance(image, str) or not image or "\0" in image:
-        raise MapFileError(f"{path}: image {shown(image)}; give the name of the picture")
-    x, y, yaw = (_number(path, "origin", number) for number in origin)
-    resolution, occupied, free, negate = (
-        _number(path, name, says[name]) for name in ("resolution", "occupied_thresh", "free_thresh", "negate")
-    )
-    if not resolution > 0:
-        raise MapFileError(f"{path}: resolution {resolution:g}; cells have a side above 0 metres")
-    if not 0 <= free < occupied <= 1:
-        raise MapFileError(f"{path}: free_thresh {free:g} and occupied_thresh {occupied:g} must rise, from 0 to 1")
-    return Meaning(path.parent / image, resolution, (x, y, yaw), bool(negate), occupied, free, str(mode))
-
-
-def _number(path: Path, name: str, value: Any) -> float:
-    try:
-        number = float(value)  # text too: YAML takes 1e-5 for such
-    except (TypeError, ValueError, OverflowError):
-        number = np.nan
-    if not np.isfinite(number):
-        raise MapFileError(f"{path}: {name} {shown(value)} is no number")
-    return number
-
-
-def _plain(number: float) -> str:
-    """Return a number in full and without exponent, which YAML would take for text."""
-    return np.format_float_positional(float(number), trim="0")
-
-
-def _quoted(name: str) -> str:
-    """Return a file name as YAML takes it for text, whatever is in it."""
-    import yaml
-
-    return yaml.safe_dump(name, allow_unicode=True, width=10**6).removesuffix("\n").removesuffix("\n...")
-
-
-MAX_PIXELS = 1 << 28
-MAX_BYTES = 1 << 31
-"""Pictures of more pixels, and files of more bytes, are refused."""
-WHITE = 255.0
-FORMATS = ("PNG", "BMP", "PPM", "JPEG", "GIF")
-PIXELS_A_BYTE = 512
-PIXELS_OF_ANY = 1 << 22
-"""A packed picture holds at most so many pixels for each byte of its file; one of few pixels may hold fewer bytes."""
-_NUMBER = re.compile(rb"\s*(?:#[^\n\r]*[\n\r]\s*)*(\d{1,9})")
-
-
 @dataclass(frozen=True, eq=False)
 class Picture:
     """A picture with its top row first; all arrays (height, width).
@@ -169,6 +199,50 @@ def write_png(file: IO[bytes], pixels: NDArray[np.uint8], opaque: NDArray[np.boo
         alpha = np.where(opaque, np.uint8(255), np.uint8(0))
         pixels = np.stack([pixels, pixels, pixels, alpha], axis=-1)
     Image.fromarray(np.ascontiguousarray(pixels)).save(file, "PNG", compress_level=1)
+
+
+def _checked(path: Path, says: dict[Any, Any]) -> Meaning:
+    missing = [name for name in NEEDED if name not in says]
+    if missing:
+        raise MapFileError(f"{path}: has no '{missing[0]}', which the .yaml of a map_server map needs")
+    mode, origin, image = says.get("mode", MODES[0]), says["origin"], says["image"]
+    if mode not in MODES:
+        raise MapFileError(f"{path}: mode '{mode}'{did_you_mean(str(mode), MODES)}")
+    if not isinstance(origin, list) or len(origin) != 3:
+        raise MapFileError(f"{path}: origin {shown(origin)}; give [x, y, yaw]")
+    if not isinstance(image, str) or not image or "\0" in image:
+        raise MapFileError(f"{path}: image {shown(image)}; give the name of the picture")
+    x, y, yaw = (_number(path, "origin", number) for number in origin)
+    resolution, occupied, free, negate = (
+        _number(path, name, says[name]) for name in ("resolution", "occupied_thresh", "free_thresh", "negate")
+    )
+    if not resolution > 0:
+        raise MapFileError(f"{path}: resolution {resolution:g}; cells have a side above 0 metres")
+    if not 0 <= free < occupied <= 1:
+        raise MapFileError(f"{path}: free_thresh {free:g} and occupied_thresh {occupied:g} must rise, from 0 to 1")
+    return Meaning(path.parent / image, resolution, (x, y, yaw), bool(negate), occupied, free, str(mode))
+
+
+def _number(path: Path, name: str, value: Any) -> float:
+    try:
+        number = float(value)  # text too: YAML takes 1e-5 for such
+    except (TypeError, ValueError, OverflowError):
+        number = np.nan
+    if not np.isfinite(number):
+        raise MapFileError(f"{path}: {name} {shown(value)} is no number")
+    return number
+
+
+def _plain(number: float) -> str:
+    """Return a number in full and without exponent, which YAML would take for text."""
+    return np.format_float_positional(float(number), trim="0")
+
+
+def _quoted(name: str) -> str:
+    """Return a file name as YAML takes it for text, whatever is in it."""
+    import yaml
+
+    return yaml.safe_dump(name, allow_unicode=True, width=10**6).removesuffix("\n").removesuffix("\n...")
 
 
 def _read_pgm(path: Path) -> NDArray[Any]:
@@ -256,68 +330,6 @@ def _damaged(path: Path, why: str) -> MapFileError:
     return MapFileError(f"{path}: damaged or no picture ({why}); save the map anew")
 
 
-OCCUPIED_THRESH, FREE_THRESH = 0.65, 0.196
-"""What map_saver writes. With a free_thresh of 0.25, as nav2 has it, its own grey 205, unknown, is read as free."""
-FREE_PIXEL, UNKNOWN_PIXEL, OCCUPIED_PIXEL, NO_PIXEL = 254, 205, 0, 128
-SCALE_STEPS = 254
-"""Greys of mode scale between 0 and 99 per cent: each per cent is read back as it was."""
-
-
-def read_map_server(path: str | Path) -> OccupancyGrid:
-    """Return the map whose .yaml is `path`, or stands beside `path` where that is its picture.
-
-    With p = (255 - brightness) / 255, or brightness / 255 where `negate` is set, cells are, by mode:
-    trinary: 100 where p > occupied_thresh, 0 where p < free_thresh, else -1; opacity counts as one more colour.
-    scale: the same, but between them 99 (p - free_thresh) / (occupied_thresh - free_thresh) rounded down, and -1
-    where the picture lets the background through.
-    raw: the brightness, rounded down, where that is 0 to 100, else -1. The map's thresholds are then the file's.
-    (map_server 1.17, image_loader.cpp. nav2_map_server scales by 100 and rounds, and negates no raw maps.)
-    Raises MapFileError: one line with the file and what is wrong.
-    """
-    meaning = read_meaning(_yaml_of(Path(path)))
-    cells = np.ascontiguousarray(_cells(read_picture(meaning.image), meaning)[::-1])
-    if meaning.mode != "raw":
-        return OccupancyGrid(cells, meaning.resolution, meaning.origin)
-    return OccupancyGrid(cells, meaning.resolution, meaning.origin, meaning.free_thresh, meaning.occupied_thresh)
-
-
-def write_map_server(grid: OccupancyGrid, path: str | Path, mode: str = "trinary", negate: bool = False) -> None:
-    """Write a picture and its .yaml; `path` names either (a .yaml's picture is a .pgm; scaled: a .png).
-
-    Both or none: if the power goes, the .yaml names a picture that belongs to it, for a moment one of another name.
-
-    trinary: free cells 254, occupied ones 0, all others 205, which are unknown. scale: per cent as greys, unknown cells
-    are see-through and need a .png. raw: per cent as they are, unknown 255; the thresholds are the map's own. Scaled
-    and raw maps are read back as they were. negate: white is occupied.
-    Raises MapFileError: one line about an empty map, an unknown mode or ending, or a place that cannot be written.
-    """
-    yaml, image = _files(Path(path), mode)
-    png = image.suffix.lower() == ".png"
-    _check(grid, image, mode, negate)
-    greys, occupied, free = _greys(grid, mode)
-    shown = np.ascontiguousarray(grid.cells[::-1])
-    pixels = _through(255 - greys if negate else greys, shown)
-    opaque = shown >= 0 if mode == "scale" else None
-    spare = image.with_name(f".{image.name}")
-    # They take their places from the last to the first: so whenever it ends, a .yaml names a picture of its own.
-    with (
-        replacing(yaml) as text,
-        replacing(image) as picture,
-        replacing(yaml) as text_between,
-        replacing(spare) as picture_between,
-    ):
-        for file, name in ((text, image), (text_between, spare)):
-            file.write(Meaning(name, grid.resolution, grid.origin, negate, occupied, free, mode).text().encode())
-        for file in (picture, picture_between):
-            if png:
-                write_png(file, pixels, opaque)
-            else:
-                write_pgm(file, pixels, f"CREATOR: stereovox {grid.resolution:.3f} m/pix")
-        for file in (text, picture, text_between):
-            file.flush()  # a full disk shows before the first of them is in its place
-    spare.unlink(missing_ok=True)
-
-
 def _cells(picture: Picture, meaning: Meaning) -> NDArray[np.int8]:
     if meaning.mode == "trinary" and picture.with_opacity is not None:
         return _percent(picture.with_opacity, None, meaning)
@@ -390,19 +402,3 @@ def _yaml_of(path: Path) -> Path:
     if not there:
         raise MapFileError(f"{path}: no {path.stem}.yaml beside it, which tells what its greys mean")
     return there[0]
-
-
-def write_grid(
-    voxel_map: VoxelMap, path: str | Path, heights: Heights | None = None, inflate: float | None = None
-) -> None:
-    """Write the map seen from above as map_server's two files, a picture and its .yaml; `path` names either.
-
-    heights: see `project`. inflate: radius of a robot in metres by which obstacles grow, with a margin of one cell.
-    Raises StereovoxError as `project`, `inflated_grid` and `write_map_server` do.
-    """
-    try:
-        grid = project(voxel_map, heights)
-        grid = grid if inflate is None else inflated_grid(grid, inflate)
-    except StereovoxError as error:
-        raise StereovoxError(f"{path}: {error}") from None
-    write_map_server(grid, path)

@@ -33,14 +33,13 @@ GROUP = 8
 """Blocks along each side of the cubes of the map that are looked at one by one."""
 LEAST = 0.05
 """Part of the way from one cell's middle to the next by which a vertex keeps away from both."""
-
-
-@dataclass(frozen=True, eq=False)
-class Mesh:
-    """Triangles: vertices (N, 3) float32 in metres, world frame; faces (M, 3) int32, anticlockwise from outside."""
-
-    vertices: NDArray[np.float32]
-    faces: NDArray[np.int32]
+SPAN = 1 << 21
+"""Corners of cells on each axis that three of them fit into one int64."""
+TRIANGLES = ((0, 1, 2), (0, 2, 3))
+TITLE = "stereovox: surface of occupied cells, metres"
+STL_TITLE_BYTES = 80
+OBJ_DIGITS = 6
+"""Decimals of a coordinate in an `.obj`: a micrometre."""
 
 
 @one_state
@@ -65,58 +64,12 @@ def surface(voxel_map: VoxelMap) -> Mesh:
     return Mesh(metres.astype(np.float32), same.ravel()[faces].astype(np.int32))
 
 
-def _parts(voxel_map: VoxelMap) -> Iterator[tuple[NDArray[np.float64], NDArray[np.int64]]]:
-    """Yield vertices (n, 3) in cells, 0 in the middle of cell 0, and faces (m, 3) of each cube of blocks."""
-    try:
-        from skimage.measure import marching_cubes
-    except ImportError:
-        raise MissingExtra("scikit-image", "mesh") from None
-    for corner in _groups(voxel_map):
-        field = _field(voxel_map, corner)
-        if field.min() < 0 < field.max():
-            vertices, faces, _, _ = marching_cubes(field, 0.0, gradient_direction="ascent")
-            yield vertices.astype(float) + corner * SIDE, faces.astype(np.int64)
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """Triangles: vertices (N, 3) float32 in metres, world frame; faces (M, 3) int32, anticlockwise from outside."""
 
-
-def _groups(voxel_map: VoxelMap) -> NDArray[np.int32]:
-    """Return the lowest blocks (n, 3) of all cubes of blocks that the surface may pass."""
-    rules, found = CellRules(voxel_map.config.map), [np.empty((0, 3), np.int32)]
-    for coords, cells in voxel_map.slabs():
-        found.append(coords[(rules.states(cells) == State.OCCUPIED).any(axis=1)])
-    blocks = np.concatenate(found)
-    beside = np.concatenate([blocks - step for step in np.ndindex(2, 2, 2)])  # the cubes below end in its first layer
-    return (np.unique(beside // GROUP, axis=0) * GROUP).astype(np.int32)
-
-
-def _field(voxel_map: VoxelMap, corner: NDArray[np.int32]) -> NDArray[np.float32]:
-    """Return how far above the threshold each cell is, (n, n, n), negative below; one layer more than the cube has."""
-    rules, side = CellRules(voxel_map.config.map), GROUP + 1
-    coords = corner + np.argwhere(np.ones((side,) * 3)).astype(np.int32)
-    cells = cells_at(voxel_map, coords)
-    level = int(rules.thresholds.occupied_least) - 0.5
-    span = max(float(rules.highest) - level, level - float(rules.lowest))
-    field = np.where(cells == rules.format.unknown, -span, cells - level)
-    field = np.sign(field) * np.maximum(np.abs(field), LEAST * span)
-    whole = field.reshape(side, side, side, SIDE, SIDE, SIDE).transpose(0, 3, 1, 4, 2, 5).reshape((side * SIDE,) * 3)
-    return whole[(slice(0, GROUP * SIDE + 1),) * 3].astype(np.float32)
-
-
-def _names(vertices: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the edge between cells' middles that each vertex stands on, (N, 3): the same whichever cube it comes from.
-
-    Twice the place of its middle: so one that stands on no edge, of which a cube has at most one, has its own name.
-    """
-    whole = np.rint(vertices)
-    return (np.where(np.abs(vertices - whole) < LEAST / 2, 2 * whole, 2 * np.floor(vertices) + 1)).astype(np.int64)
-
-
-SPAN = 1 << 21
-"""Corners of cells on each axis that three of them fit into one int64."""
-TRIANGLES = ((0, 1, 2), (0, 2, 3))
-TITLE = "stereovox: surface of occupied cells, metres"
-STL_TITLE_BYTES = 80
-OBJ_DIGITS = 6
-"""Decimals of a coordinate in an `.obj`: a micrometre."""
+    vertices: NDArray[np.float32]
+    faces: NDArray[np.int32]
 
 
 def write_glb(voxel_map: VoxelMap, path: str | Path) -> None:
@@ -188,6 +141,51 @@ def cube_faces(voxel_map: VoxelMap) -> Mesh:
     faces = of_corner.reshape(-1, 4)[:, TRIANGLES].reshape(-1, 3)
     vertices = (_places(codes) + lowest) * np.array(voxel_map.config.cell)
     return Mesh(vertices.astype(np.float32), faces.astype(np.int32))
+
+
+def _parts(voxel_map: VoxelMap) -> Iterator[tuple[NDArray[np.float64], NDArray[np.int64]]]:
+    """Yield vertices (n, 3) in cells, 0 in the middle of cell 0, and faces (m, 3) of each cube of blocks."""
+    try:
+        from skimage.measure import marching_cubes
+    except ImportError:
+        raise MissingExtra("scikit-image", "mesh") from None
+    for corner in _groups(voxel_map):
+        field = _field(voxel_map, corner)
+        if field.min() < 0 < field.max():
+            vertices, faces, _, _ = marching_cubes(field, 0.0, gradient_direction="ascent")
+            yield vertices.astype(float) + corner * SIDE, faces.astype(np.int64)
+
+
+def _groups(voxel_map: VoxelMap) -> NDArray[np.int32]:
+    """Return the lowest blocks (n, 3) of all cubes of blocks that the surface may pass."""
+    rules, found = CellRules(voxel_map.config.map), [np.empty((0, 3), np.int32)]
+    for coords, cells in voxel_map.slabs():
+        found.append(coords[(rules.states(cells) == State.OCCUPIED).any(axis=1)])
+    blocks = np.concatenate(found)
+    beside = np.concatenate([blocks - step for step in np.ndindex(2, 2, 2)])  # the cubes below end in its first layer
+    return (np.unique(beside // GROUP, axis=0) * GROUP).astype(np.int32)
+
+
+def _field(voxel_map: VoxelMap, corner: NDArray[np.int32]) -> NDArray[np.float32]:
+    """Return how far above the threshold each cell is, (n, n, n), negative below; one layer more than the cube has."""
+    rules, side = CellRules(voxel_map.config.map), GROUP + 1
+    coords = corner + np.argwhere(np.ones((side,) * 3)).astype(np.int32)
+    cells = cells_at(voxel_map, coords)
+    level = int(rules.thresholds.occupied_least) - 0.5
+    span = max(float(rules.highest) - level, level - float(rules.lowest))
+    field = np.where(cells == rules.format.unknown, -span, cells - level)
+    field = np.sign(field) * np.maximum(np.abs(field), LEAST * span)
+    whole = field.reshape(side, side, side, SIDE, SIDE, SIDE).transpose(0, 3, 1, 4, 2, 5).reshape((side * SIDE,) * 3)
+    return whole[(slice(0, GROUP * SIDE + 1),) * 3].astype(np.float32)
+
+
+def _names(vertices: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return the edge between cells' middles that each vertex stands on, (N, 3): the same whichever cube it comes from.
+
+    Twice the place of its middle: so one that stands on no edge, of which a cube has at most one, has its own name.
+    """
+    whole = np.rint(vertices)
+    return (np.where(np.abs(vertices - whole) < LEAST / 2, 2 * whole, 2 * np.floor(vertices) + 1)).astype(np.int64)
 
 
 def _quads(cells: NDArray[np.int64], present: NDArray[np.int64], axis: int, side: int) -> NDArray[np.int64]:

@@ -20,6 +20,98 @@ from stereovox.threads import one_state
 
 LEAST = 2
 """Cells on each side over which a slope is taken at least: heights come in whole cells."""
+MARGIN = 1e-3
+"""Part of a cell by which boxes keep away from the cells beside them."""
+PERCENT = np.array([UNKNOWN, 0, 50, 100, 100, 100, 100], np.int8)
+"""What each `Footing` is in an occupancy grid."""
+
+
+@one_state
+def ground(voxel_map: VoxelMap, robot: Robot | None = None, start: ArrayLike | None = None) -> Ground:
+    """Return the height of the ground and where a robot can drive on it.
+
+    Ground is occupied, has a free cell above it within a step, and nothing occupied in the robot's height. It grows
+    from the surface nearest to `start` ((3,) metres; without it from the lowest of the large ones) to all that is no
+    higher or lower by more than a step from one cell to the next; so a table top is no ground, a ramp is. Ground beyond
+    a gap that was not seen counts where it begins no more than a step higher or lower. Of two floors above one another
+    the one nearest in height to `start` counts, or else the lower one.
+    A place is drivable where the whole room above the step is free over ground that is not too steep (by the plane that
+    fits best within the robot's radius) and has no step beside it. Where no ground was seen, something occupied in the
+    robot's height above the nearest ground is an obstacle, a surface lower than a step below it a drop; all else is
+    unknown. The footprint of the robot is not added: inflate the grid for that.
+    robot: by default a `Robot` of 1 m. Raises StereovoxError where the map has no ground or is too large.
+    """
+    robot = robot or Robot()
+    floor = floor_of(voxel_map)
+    levels, lower = ground_levels(floor, robot.height, robot.max_step, start)
+    height = np.where(levels.mask, np.nan, levels.filled(0) * floor.side)
+    footing = _on_ground(floor, height, robot)
+    missing = np.isnan(height)
+    footing[missing] = _off_ground(floor, height, lower, robot)[missing]
+    return Ground(height.astype(np.float32), footing, floor.resolution, floor.origin)
+
+
+@dataclass(frozen=True, eq=False)
+class Ground:
+    """A floor seen from above; row 0 and column 0 are the lowest.
+
+    height: (rows, columns) float32, metres along the map's `up`, of the upper face of the ground; NaN where none was
+    seen. footing: (rows, columns) uint8 `Footing`. resolution: side of a cell in metres. origin: x, y, yaw of the
+    corner of cell (0, 0), in the axes of `project`.
+    """
+
+    height: NDArray[np.float32]
+    footing: NDArray[np.uint8]
+    resolution: float
+    origin: tuple[float, float, float]
+
+    @property
+    def grid(self) -> OccupancyGrid:
+        """Where the robot can drive: 0 per cent there, 50 where that is tentative, 100 where it cannot, -1 unknown."""
+        return OccupancyGrid(PERCENT[self.footing], self.resolution, self.origin)
+
+
+@dataclass(frozen=True, eq=False)
+class Robot:
+    """What a robot needs: metres, and degrees.
+
+    height: how much room above the ground. radius: about its middle, over which the slope is taken. max_step: the
+    highest step it climbs, up or down; lower things are no obstacles. max_slope_deg: the steepest ground.
+    """
+
+    height: float = 1.0
+    radius: float = 0.25
+    max_step: float = 0.1
+    max_slope_deg: float = 20.0
+
+    def __post_init__(self) -> None:
+        if not (0 <= self.max_step < self.height and isfinite(self.height)):
+            raise StereovoxError(f"max_step {self.max_step:g} must be 0 or more and less than height {self.height:g}")
+        if not (0 < self.radius < np.inf and 0 < self.max_slope_deg < 90):
+            raise StereovoxError(
+                f"radius {self.radius:g} must be above 0, max_slope_deg {self.max_slope_deg:g} between 0 and 90"
+            )
+
+
+class Footing(IntEnum):
+    """What a place is to the robot."""
+
+    UNKNOWN = 0
+    DRIVABLE = 1
+    TENTATIVE = 2  # something above the ground is not decided
+    OBSTACLE = 3  # something stands or hangs there
+    STEP = 4  # the ground beside is higher or lower by more than a step
+    STEEP = 5
+    DROP = 6  # what is there lies lower by more than a step, and no way leads down
+
+
+def write_ground(found: Ground, path: str | Path) -> None:
+    """Write a `Ground` for `numpy.load`: its arrays, `resolution` in metres, and `origin` x, y, yaw.
+
+    Raises MapFileError when the place cannot be written.
+    """
+    with replacing(path) as file:
+        np.savez_compressed(file, **asdict(found))
 
 
 def slopes(height: NDArray[np.float64], side: float, radius: float) -> NDArray[np.float64]:
@@ -61,102 +153,6 @@ def beside(height: NDArray[np.float64]) -> NDArray[np.float64]:
     lowest = minimum_filter(np.where(known, height, np.inf), 3, mode="nearest")
     here = np.where(known, height, 0.0)
     return np.where(known, np.maximum(highest - here, here - lowest), 0.0)
-
-
-MARGIN = 1e-3
-"""Part of a cell by which boxes keep away from the cells beside them."""
-
-
-class Footing(IntEnum):
-    """What a place is to the robot."""
-
-    UNKNOWN = 0
-    DRIVABLE = 1
-    TENTATIVE = 2  # something above the ground is not decided
-    OBSTACLE = 3  # something stands or hangs there
-    STEP = 4  # the ground beside is higher or lower by more than a step
-    STEEP = 5
-    DROP = 6  # what is there lies lower by more than a step, and no way leads down
-
-
-PERCENT = np.array([UNKNOWN, 0, 50, 100, 100, 100, 100], np.int8)
-"""What each `Footing` is in an occupancy grid."""
-
-
-@dataclass(frozen=True, eq=False)
-class Robot:
-    """What a robot needs: metres, and degrees.
-
-    height: how much room above the ground. radius: about its middle, over which the slope is taken. max_step: the
-    highest step it climbs, up or down; lower things are no obstacles. max_slope_deg: the steepest ground.
-    """
-
-    height: float = 1.0
-    radius: float = 0.25
-    max_step: float = 0.1
-    max_slope_deg: float = 20.0
-
-    def __post_init__(self) -> None:
-        if not (0 <= self.max_step < self.height and isfinite(self.height)):
-            raise StereovoxError(f"max_step {self.max_step:g} must be 0 or more and less than height {self.height:g}")
-        if not (0 < self.radius < np.inf and 0 < self.max_slope_deg < 90):
-            raise StereovoxError(
-                f"radius {self.radius:g} must be above 0, max_slope_deg {self.max_slope_deg:g} between 0 and 90"
-            )
-
-
-@dataclass(frozen=True, eq=False)
-class Ground:
-    """A floor seen from above; row 0 and column 0 are the lowest.
-
-    height: (rows, columns) float32, metres along the map's `up`, of the upper face of the ground; NaN where none was
-    seen. footing: (rows, columns) uint8 `Footing`. resolution: side of a cell in metres. origin: x, y, yaw of the
-    corner of cell (0, 0), in the axes of `project`.
-    """
-
-    height: NDArray[np.float32]
-    footing: NDArray[np.uint8]
-    resolution: float
-    origin: tuple[float, float, float]
-
-    @property
-    def grid(self) -> OccupancyGrid:
-        """Where the robot can drive: 0 per cent there, 50 where that is tentative, 100 where it cannot, -1 unknown."""
-        return OccupancyGrid(PERCENT[self.footing], self.resolution, self.origin)
-
-
-@one_state
-def ground(voxel_map: VoxelMap, robot: Robot | None = None, start: ArrayLike | None = None) -> Ground:
-    """Return the height of the ground and where a robot can drive on it.
-
-    Ground is occupied, has a free cell above it within a step, and nothing occupied in the robot's height. It grows
-    from the surface nearest to `start` ((3,) metres; without it from the lowest of the large ones) to all that is no
-    higher or lower by more than a step from one cell to the next; so a table top is no ground, a ramp is. Ground beyond
-    a gap that was not seen counts where it begins no more than a step higher or lower. Of two floors above one another
-    the one nearest in height to `start` counts, or else the lower one.
-    A place is drivable where the whole room above the step is free over ground that is not too steep (by the plane that
-    fits best within the robot's radius) and has no step beside it. Where no ground was seen, something occupied in the
-    robot's height above the nearest ground is an obstacle, a surface lower than a step below it a drop; all else is
-    unknown. The footprint of the robot is not added: inflate the grid for that.
-    robot: by default a `Robot` of 1 m. Raises StereovoxError where the map has no ground or is too large.
-    """
-    robot = robot or Robot()
-    floor = floor_of(voxel_map)
-    levels, lower = ground_levels(floor, robot.height, robot.max_step, start)
-    height = np.where(levels.mask, np.nan, levels.filled(0) * floor.side)
-    footing = _on_ground(floor, height, robot)
-    missing = np.isnan(height)
-    footing[missing] = _off_ground(floor, height, lower, robot)[missing]
-    return Ground(height.astype(np.float32), footing, floor.resolution, floor.origin)
-
-
-def write_ground(found: Ground, path: str | Path) -> None:
-    """Write a `Ground` for `numpy.load`: its arrays, `resolution` in metres, and `origin` x, y, yaw.
-
-    Raises MapFileError when the place cannot be written.
-    """
-    with replacing(path) as file:
-        np.savez_compressed(file, **asdict(found))
 
 
 def _on_ground(floor: Floor, height: NDArray[np.float64], robot: Robot) -> NDArray[np.uint8]:

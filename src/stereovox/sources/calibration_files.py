@@ -42,6 +42,30 @@ INFO = {
 }
 SIZES = (("width", "height"), ("image_width", "image_height"), ("imageWidth", "imageHeight"))
 TOLERANCE = 5e-3
+KINDS = "KITTI calib_cam_to_cam.txt or calib.txt, ROS camera_info yaml (two files), OpenCV yml, Kalibr camchain yaml"
+Size = tuple[int, int]
+
+
+def import_rig(files: Sequence[Path], size: Size | None = None, lens: str = "", name: str = "stereo") -> Rig:
+    """Return the rig in calibration files of a kind that is recognised by content; see `KINDS`.
+
+    size: width and height of the images where the files do not tell. lens: `fisheye` where an OpenCV file is of one;
+    the others say it. name: of the pair; KITTI's are `grey` and `colour`.
+    Raises SourceError, one line, for files of another kind, and for what cannot be brought into a rig.
+    """
+    if not 1 <= len(files) <= 2:
+        raise SourceError(f"{len(files)} files: give one, or two of one stereo camera")
+    if _is_kitti(files[0]):
+        return _kitti(files[0], size)
+    pass  # REHOUSED
+
+    try:
+        eyes, T_body_left = eyes_of([read_yaml(path) for path in files], size, lens)
+    except SourceError as error:
+        raise SourceError(f"{error}" if str(files[0]) in str(error) else f"{files[0]}: {error}") from None
+    except StereovoxError as error:
+        raise SourceError(f"{files[0]}: {error}") from None
+    return Rig((RigPair(name, eyes=eyes, T_body_left=T_body_left),))
 
 
 def read_yaml(path: Path) -> Table:
@@ -222,32 +246,6 @@ def _numbers(value: Any, what: str, count: int | None = None) -> list[float]:
         many = "numbers" if count is None else f"{count} numbers"
         raise SourceError(f"{what} must be {many}; give the file as the calibration wrote it")
     return [float(number) for number in numbers]
-
-
-KINDS = "KITTI calib_cam_to_cam.txt or calib.txt, ROS camera_info yaml (two files), OpenCV yml, Kalibr camchain yaml"
-Size = tuple[int, int]
-
-
-def import_rig(files: Sequence[Path], size: Size | None = None, lens: str = "", name: str = "stereo") -> Rig:
-    """Return the rig in calibration files of a kind that is recognised by content; see `KINDS`.
-
-    size: width and height of the images where the files do not tell. lens: `fisheye` where an OpenCV file is of one;
-    the others say it. name: of the pair; KITTI's are `grey` and `colour`.
-    Raises SourceError, one line, for files of another kind, and for what cannot be brought into a rig.
-    """
-    if not 1 <= len(files) <= 2:
-        raise SourceError(f"{len(files)} files: give one, or two of one stereo camera")
-    if _is_kitti(files[0]):
-        return _kitti(files[0], size)
-    pass  # REHOUSED
-
-    try:
-        eyes, T_body_left = eyes_of([read_yaml(path) for path in files], size, lens)
-    except SourceError as error:
-        raise SourceError(f"{error}" if str(files[0]) in str(error) else f"{files[0]}: {error}") from None
-    except StereovoxError as error:
-        raise SourceError(f"{files[0]}: {error}") from None
-    return Rig((RigPair(name, eyes=eyes, T_body_left=T_body_left),))
 
 
 def _is_kitti(path: Path) -> bool:

@@ -27,6 +27,10 @@ NEEDED = {
 """What a key is, for those who left it out."""
 KEYS = (*SIZES, *INTRINSICS, "baseline", "correction")
 CORRECTION = ("model", "coefficients", "provenance")
+MATRIX, LIST = "camera-intrinsics.txt", "calibration.txt"
+VGA = (640, 480)
+Intrinsics = tuple[float, float, float, float]
+"""fx, fy, cx, cy in pixels."""
 
 
 def read_camera(path: Path) -> PinholeCamera:
@@ -59,74 +63,6 @@ def camera_text(camera: PinholeCamera, provenance: Mapping[str, Any] | None = No
     return "\n".join(lines) + "\n"
 
 
-def _camera(table: dict[str, Any]) -> PinholeCamera:
-    if "pair" in table:
-        raise SourceError("is a rig file, no camera file; put it into the recording's folder as rig.toml")
-    _check_keys(table, KEYS, "")
-    for key, what in NEEDED.items():
-        if key not in table:
-            raise SourceError(f"{key} is missing; write {key} = {what}")
-    sizes = [_number(table, key) for key in SIZES]
-    if not all(size.is_integer() and 0 < size < 100_000 for size in sizes):
-        raise SourceError(f"width and height must be whole numbers of pixels, not {sizes[0]:g} and {sizes[1]:g}")
-    baseline = _number(table, "baseline") if "baseline" in table else None
-    correction = _correction(table["correction"]) if "correction" in table else None
-    fx, fy, cx, cy = (_number(table, key) for key in INTRINSICS)
-    return pinhole((int(sizes[0]), int(sizes[1])), (fx, fy, cx, cy), baseline, correction)
-
-
-def pinhole(
-    size: tuple[int, int],
-    intrinsics: tuple[float, float, float, float],
-    baseline: float | None,
-    correction: DepthCorrection | None = None,
-) -> PinholeCamera:
-    """Return a camera from numbers in a file: (width, height), and fx, fy, cx, cy; all finite.
-
-    Raises SourceError that names the number which cannot be.
-    """
-    named = {"fx": intrinsics[0], "fy": intrinsics[1], "baseline": 1.0 if baseline is None else baseline}
-    for name, number in named.items():
-        if number <= 0:
-            raise SourceError(f"{name} = {number:g} must be positive")
-    try:
-        return PinholeCamera(*size, *intrinsics, baseline, correction=correction)
-    except StereovoxError as error:  # which shows the whole camera; its last words tell what is wrong
-        numbers = " ".join(f"{number:g}" for number in intrinsics)
-        raise SourceError(f"fx fy cx cy = {numbers}: {str(error).rpartition(': ')[2]}") from None
-
-
-def _correction(table: Any) -> DepthCorrection:
-    if not isinstance(table, dict):
-        raise SourceError("correction must be a table [correction] with model and coefficients")
-    _check_keys(table, CORRECTION, "correction.")
-    model, numbers = table.get("model"), table.get("coefficients")
-    if not isinstance(model, str) or not isinstance(numbers, list):
-        raise SourceError("[correction] needs model, a text, and coefficients, a list of numbers")
-    if not all(is_number(number) for number in numbers):
-        raise SourceError(f"correction.coefficients {shown(numbers)} must be numbers")
-    return DepthCorrection(model, tuple(map(float, numbers)))
-
-
-def _check_keys(table: dict[str, Any], known: Sequence[str], prefix: str) -> None:
-    for key in table:
-        if key not in known:
-            raise SourceError(f"unknown key '{prefix}{key}'{did_you_mean(key, known)}")
-
-
-def _number(table: dict[str, Any], key: str) -> float:
-    value = table[key]
-    if not is_number(value):
-        raise SourceError(f"{key} = {shown(value)} must be a number")
-    return float(value)
-
-
-MATRIX, LIST = "camera-intrinsics.txt", "calibration.txt"
-VGA = (640, 480)
-Intrinsics = tuple[float, float, float, float]
-"""fx, fy, cx, cy in pixels."""
-
-
 def find_camera(
     folders: Sequence[Path], size: tuple[int, int], baseline: float, default: Intrinsics
 ) -> tuple[PinholeCamera, tuple[str, ...]]:
@@ -157,59 +93,19 @@ def find_camera(
     return PinholeCamera(*size, *default, baseline), (note, *passed_over)
 
 
-def correction_words(camera: PinholeCamera) -> str:
-    """Return in words what the depth of a camera will be corrected by."""
-    return f"depth correction '{camera.correction.model}'" if camera.correction else "no depth correction"
+def with_camera(stream: Stream, file: str | os.PathLike[str]) -> Stream:
+    """Return `stream` with the camera in `file`; without a baseline there, the stream's own counts.
 
-
-def read_intrinsics(path: Path) -> Intrinsics:
-    """Return fx, fy, cx, cy in pixels from a 3x3 matrix or from these four numbers; `#` starts a comment.
-
-    Raises SourceError naming the file for anything else, also for skew: such a camera is no plain pinhole.
+    Raises SourceError, one line, for a bad file and for a camera with another number of pixels.
     """
-    numbers = _numbers(path)
-    if len(numbers) == 4:
-        fx, fy, cx, cy = numbers
-    elif len(numbers) == 9 and numbers[6:] == [0, 0, 1] and numbers[1] == numbers[3] == 0:
-        fx, _, cx, _, fy, cy, *_ = numbers
-    else:
-        raise SourceError(f"{path}: needs the matrix 'fx 0 cx / 0 fy cy / 0 0 1' or the four numbers fx fy cx cy")
-    return fx, fy, cx, cy
-
-
-def _read(path: Path, size: tuple[int, int], baseline: float) -> PinholeCamera:
-    return _of_size(path, size, baseline) if path.name == FILE else _plain(path, size, baseline)
-
-
-def _of_size(path: Path, size: tuple[int, int], baseline: float) -> PinholeCamera:
-    camera = read_camera(path)
-    if (camera.width, camera.height) != size:
+    camera, own = read_camera(Path(file)), stream.camera
+    if (camera.width, camera.height) != (own.width, own.height):
         raise SourceError(
-            f"{path}: is of a camera with {camera.width}x{camera.height} pixels, the images have {size[0]}x{size[1]}; "
-            "replace or remove it"
+            f"{file}: is of a camera with {camera.width}x{camera.height} pixels, {stream.name} has "
+            f"{own.width}x{own.height}; give the file of its own camera"
         )
-    return camera if camera.baseline else replace(camera, baseline=baseline)
-
-
-def _numbers(path: Path) -> list[float]:
-    try:
-        lines = read_text(path).splitlines()
-        numbers = [float(word) for line in lines for word in line.partition("#")[0].replace(",", " ").split()]
-    except OSError as error:
-        raise SourceError(f"{path}: {error.strerror}; make it readable") from None
-    except ValueError as error:
-        raise SourceError(f"{path}: {error}; write plain numbers") from None
-    if not all(map(math.isfinite, numbers)):
-        raise SourceError(f"{path}: holds NaN or infinity; write plain numbers")
-    return numbers
-
-
-def _plain(path: Path, size: tuple[int, int], baseline: float) -> PinholeCamera:
-    intrinsics = read_intrinsics(path)
-    try:
-        return pinhole(size, intrinsics, baseline)
-    except StereovoxError as error:
-        raise SourceError(f"{path}: {error}") from None
+    note = f"{file} is used in place of the recording's own camera ({correction_words(camera)})"
+    return WithCamera(stream, camera if camera.baseline else replace(camera, baseline=own.baseline), (note,))
 
 
 class WithCamera(Stream):
@@ -246,16 +142,118 @@ class WithCamera(Stream):
                 close()
 
 
-def with_camera(stream: Stream, file: str | os.PathLike[str]) -> Stream:
-    """Return `stream` with the camera in `file`; without a baseline there, the stream's own counts.
+def read_intrinsics(path: Path) -> Intrinsics:
+    """Return fx, fy, cx, cy in pixels from a 3x3 matrix or from these four numbers; `#` starts a comment.
 
-    Raises SourceError, one line, for a bad file and for a camera with another number of pixels.
+    Raises SourceError naming the file for anything else, also for skew: such a camera is no plain pinhole.
     """
-    camera, own = read_camera(Path(file)), stream.camera
-    if (camera.width, camera.height) != (own.width, own.height):
+    numbers = _numbers(path)
+    if len(numbers) == 4:
+        fx, fy, cx, cy = numbers
+    elif len(numbers) == 9 and numbers[6:] == [0, 0, 1] and numbers[1] == numbers[3] == 0:
+        fx, _, cx, _, fy, cy, *_ = numbers
+    else:
+        raise SourceError(f"{path}: needs the matrix 'fx 0 cx / 0 fy cy / 0 0 1' or the four numbers fx fy cx cy")
+    return fx, fy, cx, cy
+
+
+def correction_words(camera: PinholeCamera) -> str:
+    """Return in words what the depth of a camera will be corrected by."""
+    return f"depth correction '{camera.correction.model}'" if camera.correction else "no depth correction"
+
+
+def pinhole(
+    size: tuple[int, int],
+    intrinsics: tuple[float, float, float, float],
+    baseline: float | None,
+    correction: DepthCorrection | None = None,
+) -> PinholeCamera:
+    """Return a camera from numbers in a file: (width, height), and fx, fy, cx, cy; all finite.
+
+    Raises SourceError that names the number which cannot be.
+    """
+    named = {"fx": intrinsics[0], "fy": intrinsics[1], "baseline": 1.0 if baseline is None else baseline}
+    for name, number in named.items():
+        if number <= 0:
+            raise SourceError(f"{name} = {number:g} must be positive")
+    try:
+        return PinholeCamera(*size, *intrinsics, baseline, correction=correction)
+    except StereovoxError as error:  # which shows the whole camera; its last words tell what is wrong
+        numbers = " ".join(f"{number:g}" for number in intrinsics)
+        raise SourceError(f"fx fy cx cy = {numbers}: {str(error).rpartition(': ')[2]}") from None
+
+
+def _camera(table: dict[str, Any]) -> PinholeCamera:
+    if "pair" in table:
+        raise SourceError("is a rig file, no camera file; put it into the recording's folder as rig.toml")
+    _check_keys(table, KEYS, "")
+    for key, what in NEEDED.items():
+        if key not in table:
+            raise SourceError(f"{key} is missing; write {key} = {what}")
+    sizes = [_number(table, key) for key in SIZES]
+    if not all(size.is_integer() and 0 < size < 100_000 for size in sizes):
+        raise SourceError(f"width and height must be whole numbers of pixels, not {sizes[0]:g} and {sizes[1]:g}")
+    baseline = _number(table, "baseline") if "baseline" in table else None
+    correction = _correction(table["correction"]) if "correction" in table else None
+    fx, fy, cx, cy = (_number(table, key) for key in INTRINSICS)
+    return pinhole((int(sizes[0]), int(sizes[1])), (fx, fy, cx, cy), baseline, correction)
+
+
+def _correction(table: Any) -> DepthCorrection:
+    if not isinstance(table, dict):
+        raise SourceError("correction must be a table [correction] with model and coefficients")
+    _check_keys(table, CORRECTION, "correction.")
+    model, numbers = table.get("model"), table.get("coefficients")
+    if not isinstance(model, str) or not isinstance(numbers, list):
+        raise SourceError("[correction] needs model, a text, and coefficients, a list of numbers")
+    if not all(is_number(number) for number in numbers):
+        raise SourceError(f"correction.coefficients {shown(numbers)} must be numbers")
+    return DepthCorrection(model, tuple(map(float, numbers)))
+
+
+def _check_keys(table: dict[str, Any], known: Sequence[str], prefix: str) -> None:
+    for key in table:
+        if key not in known:
+            raise SourceError(f"unknown key '{prefix}{key}'{did_you_mean(key, known)}")
+
+
+def _number(table: dict[str, Any], key: str) -> float:
+    value = table[key]
+    if not is_number(value):
+        raise SourceError(f"{key} = {shown(value)} must be a number")
+    return float(value)
+
+
+def _read(path: Path, size: tuple[int, int], baseline: float) -> PinholeCamera:
+    return _of_size(path, size, baseline) if path.name == FILE else _plain(path, size, baseline)
+
+
+def _of_size(path: Path, size: tuple[int, int], baseline: float) -> PinholeCamera:
+    camera = read_camera(path)
+    if (camera.width, camera.height) != size:
         raise SourceError(
-            f"{file}: is of a camera with {camera.width}x{camera.height} pixels, {stream.name} has "
-            f"{own.width}x{own.height}; give the file of its own camera"
+            f"{path}: is of a camera with {camera.width}x{camera.height} pixels, the images have {size[0]}x{size[1]}; "
+            "replace or remove it"
         )
-    note = f"{file} is used in place of the recording's own camera ({correction_words(camera)})"
-    return WithCamera(stream, camera if camera.baseline else replace(camera, baseline=own.baseline), (note,))
+    return camera if camera.baseline else replace(camera, baseline=baseline)
+
+
+def _numbers(path: Path) -> list[float]:
+    try:
+        lines = read_text(path).splitlines()
+        numbers = [float(word) for line in lines for word in line.partition("#")[0].replace(",", " ").split()]
+    except OSError as error:
+        raise SourceError(f"{path}: {error.strerror}; make it readable") from None
+    except ValueError as error:
+        raise SourceError(f"{path}: {error}; write plain numbers") from None
+    if not all(map(math.isfinite, numbers)):
+        raise SourceError(f"{path}: holds NaN or infinity; write plain numbers")
+    return numbers
+
+
+def _plain(path: Path, size: tuple[int, int], baseline: float) -> PinholeCamera:
+    intrinsics = read_intrinsics(path)
+    try:
+        return pinhole(size, intrinsics, baseline)
+    except StereovoxError as error:
+        raise SourceError(f"{path}: {error}") from None

@@ -22,6 +22,17 @@ from stereovox.se3 import Transform, orthonormalise, rigidity_error
 from stereovox.sources.images import read_picture_png
 
 FILE = "rig.toml"
+CAMERAS = {"pinhole": PinholeCamera, "spherical": SphericalCamera, "cylindrical": CylindricalCamera}
+LENS = ("model", "width", "height", "fx", "fy", "cx", "cy", "distortion")
+EYES = ("left_lens", "right_lens", "T_left_right")
+KEYS = ("name", "left", "right", "index", "T_body_left", "mask_rectangles", "mask", "camera", "virtual", *EYES)
+WORDS = ("left", "right", "index", "mask")
+SIZES = ("width", "height")
+LARGEST = 32_767
+"""Pixels along a side; OpenCV takes no more."""
+TOLERANCE = 5e-3
+"""Largest entry of abs(R^T R - I) that passes for rounding."""
+UNWRITTEN = ("binning", "correction")
 
 
 @dataclass(frozen=True)
@@ -136,19 +147,6 @@ def write_rig(path: Path | str, rig: Rig, remarks: Sequence[str] = ()) -> None:
 
     with replacing(path, SourceError) as file:
         file.write(rig_text(rig, remarks).encode())
-
-
-CAMERAS = {"pinhole": PinholeCamera, "spherical": SphericalCamera, "cylindrical": CylindricalCamera}
-LENS = ("model", "width", "height", "fx", "fy", "cx", "cy", "distortion")
-EYES = ("left_lens", "right_lens", "T_left_right")
-KEYS = ("name", "left", "right", "index", "T_body_left", "mask_rectangles", "mask", "camera", "virtual", *EYES)
-WORDS = ("left", "right", "index", "mask")
-SIZES = ("width", "height")
-LARGEST = 32_767
-"""Pixels along a side; OpenCV takes no more."""
-TOLERANCE = 5e-3
-"""Largest entry of abs(R^T R - I) that passes for rounding."""
-UNWRITTEN = ("binning", "correction")
 
 
 def rig_of(table: dict[str, Any]) -> Rig:

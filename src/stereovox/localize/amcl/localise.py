@@ -30,104 +30,40 @@ from stereovox.trust.validate import sound
 
 LATE = 3
 """Scans in a row that are too late, and in order among themselves, before it is asked who is right."""
-
-
-class Clock:
-    """The stamps of the scans so far, rising.
-
-    A lone stamp in the future would make all later scans too late. So once more scans in a row are late than there are
-    scans that they would have to come before, it is those before that had the wrong stamps (as `slam_way.Way`).
-    """
-
-    def __init__(self):
-        self._stamps_ns = array("q")
-        self._late, self._late_ns = 0, 0
-
-    def take(self, scan: Scan) -> int:
-        """Go on to the time of a scan; return how many of the last scans turn out to have had a wrong stamp.
-
-        Raises FrameRefused with the reason `not_in_order` where the scan is not later than the one before.
-        """
-        ahead = len(self._stamps_ns) - bisect_left(self._stamps_ns, scan.stamp_ns)
-        if ahead:
-            self._count_late(scan, ahead)
-            del self._stamps_ns[-ahead:]
-        self._stamps_ns.append(scan.stamp_ns)
-        self._late = 0
-        return ahead
-
-    def _count_late(self, scan: Scan, ahead: int) -> None:
-        self._late = self._late + 1 if self._late and scan.stamp_ns > self._late_ns else 1
-        self._late_ns = scan.stamp_ns
-        if self._late <= max(ahead, LATE):
-            said = f"at {scan.stamp_ns} ns, is not later than the scan before it at {self._stamps_ns[-1]} ns"
-            raise FrameRefused("not_in_order", f"{name_of(scan)}: {said}; give scans in order of time")
-
-
-class FreeFloor:
-    """The free cells of a map. Raises MapFileError where there is none, or nothing occupied to go by."""
-
-    def __init__(self, grid: OccupancyGrid):
-        states = grid.states
-        self.grid = grid
-        self._free = np.flatnonzero(states == State.FREE).astype(np.uint32)
-        for state, count in (("free", len(self._free)), ("occupied", int((states == State.OCCUPIED).sum()))):
-            if not count:
-                raise MapFileError(f"the map has no {state} cell: nobody can be localised in it; give a finished map")
-
-    def anywhere(self, count: int, rng: np.random.Generator) -> se2.Pose:
-        """Return (count, 3) poses evenly spread over all free cells and directions."""
-        chosen = self._free[rng.integers(len(self._free), size=count)]
-        rows, columns = np.divmod(chosen, np.uint32(self.grid.cells.shape[1]))
-        local = (np.column_stack([columns, rows]) + rng.random((count, 2))) * self.grid.resolution
-        turns = rng.uniform(-np.pi, np.pi, count)
-        return np.column_stack([se2.transform(self.grid.origin, local), turns])
-
-
-def near(start: se2.Pose, std: ArrayLike, count: int, rng: np.random.Generator) -> se2.Pose:
-    """Return (count, 3) poses normally distributed round a (3,) pose; std: (3,) metres, metres, radians."""
-    poses = start + rng.standard_normal((count, 3)) * np.asarray(std)
-    poses[:, 2] = se2.wrapped(poses[:, 2])
-    return poses
-
-
-def checked_start(start: ArrayLike) -> NDArray[np.float64]:
-    """Return a start pose as (3,) float64. Raises ConfigError, one line, where it is none."""
-    try:
-        pose = np.asarray(start, float)
-    except (TypeError, ValueError):
-        pose = np.empty(0)
-    if pose.shape != (3,) or not np.isfinite(pose).all():
-        raise ConfigError(f"start {start!r}: give three finite numbers x, y, yaw (metres, metres, radians), or none")
-    return pose
-
-
 MAX_AT_START = 1_000_000
 """Poses that are tried at once where the robot may be anywhere."""
 SETTLED_SHARE, SETTLED_M = 0.95, 0.3
 """The robot knows where it is when so much weight is in one cluster, which is so wide (standard deviation)."""
 
 
-@dataclass(frozen=True, eq=False)
-class Estimate:
-    """Where the robot is after a scan, as ROS's amcl gives it.
+def localise(
+    grid: OccupancyGrid,
+    scans: Iterable[Scan],
+    config: Config,
+    start: ArrayLike | None = None,
+    seed: int = 0,
+    progress: Callable[[int], object] | None = None,
+) -> Track:
+    """Return a robot's way through a map; scans that cannot be trusted are left out, and counted in `Track.refused`.
 
-    pose_map_base: (3,) float64, the mean of the heaviest cluster of particles, moved by the odometry since.
-    covariance: (3, 3) float64, mean square of how far the particles of all clusters are from it (metres, radians).
-    pose_map_odom: (3,) float64, what turns the odometry's poses into those of the map.
-    particles: (N, 3) float64, equally likely poses in the map, as of the last update.
-    moved: tells whether the scan was compared with the map: at first, and then after moving far enough.
-    settled: tells whether nearly all particles agree; False while the robot may be in several places.
-    ms: milliseconds the scan took.
+    start, seed: as in `Localiser`; progress: called with the number of scans done.
+    Where the particles disagree, the way is that of the odometry, with a drift in between those of the sure poses
+    before and after; before the first sure pose it has that one's.
+    Scans that later ones show to have a wrong stamp (`Clock`) are taken out of the way again, and counted too.
+    Raises what `Localiser` raises, and SourceError where not one scan can be trusted.
     """
-
-    pose_map_base: se2.Pose
-    covariance: NDArray[np.float64]
-    pose_map_odom: se2.Pose
-    particles: se2.Pose
-    moved: bool
-    settled: bool
-    ms: float
+    localiser, way, first_refusal = Localiser(grid, config, start, seed), _Way(), ""
+    for done, scan in enumerate(scans, 1):
+        try:
+            way.add(scan.stamp_ns, localiser.add(scan))
+        except FrameRefused as refusal:
+            first_refusal = first_refusal or str(refusal)
+        if progress:
+            progress(done)
+    if not way.stamps_ns:
+        said = f"every one was refused, the first: {first_refusal}" if first_refusal else "there are none"
+        raise SourceError(f"no scan to localise by: {said}")
+    return way.track(dict(localiser.refused), first_refusal)
 
 
 class Localiser:
@@ -249,34 +185,96 @@ class Localiser:
         return poses, weights
 
 
-def localise(
-    grid: OccupancyGrid,
-    scans: Iterable[Scan],
-    config: Config,
-    start: ArrayLike | None = None,
-    seed: int = 0,
-    progress: Callable[[int], object] | None = None,
-) -> Track:
-    """Return a robot's way through a map; scans that cannot be trusted are left out, and counted in `Track.refused`.
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """Where the robot is after a scan, as ROS's amcl gives it.
 
-    start, seed: as in `Localiser`; progress: called with the number of scans done.
-    Where the particles disagree, the way is that of the odometry, with a drift in between those of the sure poses
-    before and after; before the first sure pose it has that one's.
-    Scans that later ones show to have a wrong stamp (`Clock`) are taken out of the way again, and counted too.
-    Raises what `Localiser` raises, and SourceError where not one scan can be trusted.
+    pose_map_base: (3,) float64, the mean of the heaviest cluster of particles, moved by the odometry since.
+    covariance: (3, 3) float64, mean square of how far the particles of all clusters are from it (metres, radians).
+    pose_map_odom: (3,) float64, what turns the odometry's poses into those of the map.
+    particles: (N, 3) float64, equally likely poses in the map, as of the last update.
+    moved: tells whether the scan was compared with the map: at first, and then after moving far enough.
+    settled: tells whether nearly all particles agree; False while the robot may be in several places.
+    ms: milliseconds the scan took.
     """
-    localiser, way, first_refusal = Localiser(grid, config, start, seed), _Way(), ""
-    for done, scan in enumerate(scans, 1):
-        try:
-            way.add(scan.stamp_ns, localiser.add(scan))
-        except FrameRefused as refusal:
-            first_refusal = first_refusal or str(refusal)
-        if progress:
-            progress(done)
-    if not way.stamps_ns:
-        said = f"every one was refused, the first: {first_refusal}" if first_refusal else "there are none"
-        raise SourceError(f"no scan to localise by: {said}")
-    return way.track(dict(localiser.refused), first_refusal)
+
+    pose_map_base: se2.Pose
+    covariance: NDArray[np.float64]
+    pose_map_odom: se2.Pose
+    particles: se2.Pose
+    moved: bool
+    settled: bool
+    ms: float
+
+
+class Clock:
+    """The stamps of the scans so far, rising.
+
+    A lone stamp in the future would make all later scans too late. So once more scans in a row are late than there are
+    scans that they would have to come before, it is those before that had the wrong stamps (as `slam_way.Way`).
+    """
+
+    def __init__(self):
+        self._stamps_ns = array("q")
+        self._late, self._late_ns = 0, 0
+
+    def take(self, scan: Scan) -> int:
+        """Go on to the time of a scan; return how many of the last scans turn out to have had a wrong stamp.
+
+        Raises FrameRefused with the reason `not_in_order` where the scan is not later than the one before.
+        """
+        ahead = len(self._stamps_ns) - bisect_left(self._stamps_ns, scan.stamp_ns)
+        if ahead:
+            self._count_late(scan, ahead)
+            del self._stamps_ns[-ahead:]
+        self._stamps_ns.append(scan.stamp_ns)
+        self._late = 0
+        return ahead
+
+    def _count_late(self, scan: Scan, ahead: int) -> None:
+        self._late = self._late + 1 if self._late and scan.stamp_ns > self._late_ns else 1
+        self._late_ns = scan.stamp_ns
+        if self._late <= max(ahead, LATE):
+            said = f"at {scan.stamp_ns} ns, is not later than the scan before it at {self._stamps_ns[-1]} ns"
+            raise FrameRefused("not_in_order", f"{name_of(scan)}: {said}; give scans in order of time")
+
+
+class FreeFloor:
+    """The free cells of a map. Raises MapFileError where there is none, or nothing occupied to go by."""
+
+    def __init__(self, grid: OccupancyGrid):
+        states = grid.states
+        self.grid = grid
+        self._free = np.flatnonzero(states == State.FREE).astype(np.uint32)
+        for state, count in (("free", len(self._free)), ("occupied", int((states == State.OCCUPIED).sum()))):
+            if not count:
+                raise MapFileError(f"the map has no {state} cell: nobody can be localised in it; give a finished map")
+
+    def anywhere(self, count: int, rng: np.random.Generator) -> se2.Pose:
+        """Return (count, 3) poses evenly spread over all free cells and directions."""
+        chosen = self._free[rng.integers(len(self._free), size=count)]
+        rows, columns = np.divmod(chosen, np.uint32(self.grid.cells.shape[1]))
+        local = (np.column_stack([columns, rows]) + rng.random((count, 2))) * self.grid.resolution
+        turns = rng.uniform(-np.pi, np.pi, count)
+        return np.column_stack([se2.transform(self.grid.origin, local), turns])
+
+
+def near(start: se2.Pose, std: ArrayLike, count: int, rng: np.random.Generator) -> se2.Pose:
+    """Return (count, 3) poses normally distributed round a (3,) pose; std: (3,) metres, metres, radians."""
+    poses = start + rng.standard_normal((count, 3)) * np.asarray(std)
+    poses[:, 2] = se2.wrapped(poses[:, 2])
+    return poses
+
+
+def checked_start(start: ArrayLike) -> NDArray[np.float64]:
+    """Return a start pose as (3,) float64. Raises ConfigError, one line, where it is none."""
+    try:
+        pose = np.asarray(start, float)
+    except (TypeError, ValueError):
+        pose = np.empty(0)
+    if pose.shape != (3,) or not np.isfinite(pose).all():
+        raise ConfigError(f"start {start!r}: give three finite numbers x, y, yaw (metres, metres, radians), or none")
+    return pose
 
 
 class _Way:

@@ -13,6 +13,9 @@ from stereovox.config.robot import AmclConfig
 from stereovox.localize.amcl import _amcl
 from stereovox.se2 import Pose
 
+NEIGHBOURS = np.array([step for step in product((-1, 0, 1), repeat=3) if step > (0, 0, 0)])
+"""Half of a bin's 26 neighbours: the other half has the bin among theirs."""
+
 
 class Recovery:
     """A long and a short memory of how well scans fit the map.
@@ -116,10 +119,6 @@ def draw(
         if count >= min(needed, many):
             return kept, taken
         count = min(needed, many)
-
-
-NEIGHBOURS = np.array([step for step in product((-1, 0, 1), repeat=3) if step > (0, 0, 0)])
-"""Half of a bin's 26 neighbours: the other half has the bin among theirs."""
 
 
 class Clusters:

@@ -14,42 +14,6 @@ from stereovox.localize.slam import _bound
 from stereovox.localize.slam.graph import Edge, Keyframe, in_second_frame
 from stereovox.localize.slam.line_map import Cloud, LineMap, Match, joined
 
-
-@dataclass(frozen=True)
-class Submap:
-    """A run of keyframes that is short enough not to have drifted: keyframes `first` to `last` - 1."""
-
-    first: int
-    last: int
-
-    @property
-    def anchor(self) -> int:
-        """The keyframe in its middle, whose frame is the submap's."""
-        return (self.first + self.last) // 2
-
-
-def submap_cloud(keyframes: list[Keyframe], submap: Submap, max_range: float, cell: float = 0.0) -> Cloud:
-    """Return the points of a submap within `max_range` of each robot pose, in its anchor's frame.
-
-    cell: side in metres of squares of which each gives one point; 0: all points.
-    """
-    pose = keyframes[submap.anchor].pose
-    clouds = []
-    for keyframe in keyframes[submap.first : submap.last]:
-        if np.hypot(*(keyframe.pose - pose)[:2]) > max_range:
-            continue  # the odometry jumped
-        near = (keyframe.cloud.points**2).sum(axis=1) < max_range**2
-        part = Cloud(keyframe.cloud.points[near], keyframe.cloud.views[near])
-        clouds.append(part.moved(se2.relative(pose, keyframe.pose)))
-    cloud = joined(clouds)
-    if not cell or not len(cloud.points):
-        return cloud
-    squares = np.floor(cloud.points / cell).astype(np.int64)
-    _, first = np.unique(squares[:, 0] * (1 << 32) + squares[:, 1], return_index=True)
-    first.sort()
-    return Cloud(cloud.points[first], cloud.views[first])
-
-
 COARSE = 2
 """Cells of the map on the side of one cell of the search."""
 SEEDS = 400
@@ -57,64 +21,6 @@ SEEDS = 400
 LEVELS = 6
 RIVAL = 0.6
 """Metres from the best place, within which a good score is the same place's."""
-
-
-class ClosureSearch:
-    """Searches the place of clouds on the map of an earlier cloud."""
-
-    def __init__(self, config: SlamConfig):
-        self._config = config
-        self._coarse = LineMap(COARSE * config.voxel_size, reach=0.3, sigma=0.12)
-        self._fine = LineMap(config.voxel_size, reach=0.4)
-        self._pad = 1 << LEVELS
-        self._pyramid = np.empty((LEVELS, 0, 0), np.float32)
-
-    def onto(self, earlier: Cloud) -> None:
-        """Take the cloud that the next ones are laid onto."""
-        self._coarse.build(earlier)
-        self._fine.build(earlier)
-        rows, columns = self._coarse.extent
-        self._pyramid = np.empty((LEVELS, rows + self._pad, columns + self._pad), np.float32)
-        _bound.coarsen(self._coarse.score[:rows, :columns], self._pad, self._pyramid)
-
-    def lay(self, cloud: Cloud, guess: ArrayLike, side: float, side_yaw: float) -> Match | None:
-        """Return the best match of a cloud within `side` metres and `side_yaw` of a guess.
-
-        None where no place is good enough, or another one is nearly as good.
-        """
-        seeds = cloud.points[:: max(len(cloud.points) // SEEDS, 1)]
-        if not len(seeds):
-            return None
-        pose = self.place(seeds, np.asarray(guess, float), side, side_yaw)
-        if pose is None:
-            return None
-        match = self._fine.refine(cloud, pose, 0.3)
-        for sigma in (0.15, 1.5 * self._config.sigma):
-            match = self._fine.refine(cloud, match.pose, sigma)
-        return match
-
-    def place(self, seeds: NDArray[np.float32], guess: se2.Pose, side: float, side_yaw: float) -> se2.Pose | None:
-        """Return the pose with the best score, None where it is below `closure_score` or has a rival."""
-        cell, config = self._coarse.cell, self._config
-        step = cell / max(float(np.sqrt((seeds**2).sum(axis=1).max())), 1.0)
-        turns = int(np.ceil(side_yaw / step))
-        yaws = guess[2] + step * np.arange(-turns, turns + 1)
-        cosine, sine = np.cos(yaws)[:, None], np.sin(yaws)[:, None]
-        x = guess[0] - self._coarse.corner[0] + cosine * seeds[:, 0] - sine * seeds[:, 1]
-        y = guess[1] - self._coarse.corner[1] + sine * seeds[:, 0] + cosine * seeds[:, 1]
-        places = np.floor(np.stack([y, x], axis=-1) / cell).astype(np.int32)
-        cells, least = int(np.ceil(side / cell)), np.float32(config.closure_score * len(seeds))
-        best, rival, nowhere = np.zeros(3, np.int64), np.zeros(3, np.int64), np.zeros(3, np.int64)
-        top = _bound.climb(places, cells, self._pyramid, self._pad, least, nowhere, -1, best)
-        if top <= least:
-            return None
-        least = np.float32(config.closure_rival * top)
-        apart = round(RIVAL / cell)
-        if _bound.climb(places, cells, self._pyramid, self._pad, least, best, apart, rival) > least:
-            return None
-        return np.array([guess[0] + best[2] * cell, guess[1] + best[1] * cell, yaws[best[0]]])
-
-
 ROOM = 4.0
 """Metres by which two submaps' middles may be apart and still show the same walls, beyond what drift explains."""
 NEAR_RANGE, FAR_RANGE = 10.0, 20.0
@@ -130,7 +36,6 @@ WITNESS_PATH = 15.0
 """Metres of way within which two findings can bear each other out."""
 WITNESS = (0.1, 0.02, 0.02)
 """How far they may disagree: metres, metres per metre of way, radians."""
-
 SHORT_CUT = 1e-3
 """Metres along which drift adds up over a closure: none, but a graph has no edges of length 0."""
 
@@ -228,3 +133,94 @@ class LoopFinder:
         rows, columns = np.array(list(lengths), np.int64).reshape(-1, 2).T
         graph = coo_matrix((list(lengths.values()), (rows, columns)), shape=(len(anchors), len(anchors)))
         return dijkstra(graph.tocsr(), directed=False, indices=len(anchors) - 1)
+
+
+class ClosureSearch:
+    """Searches the place of clouds on the map of an earlier cloud."""
+
+    def __init__(self, config: SlamConfig):
+        self._config = config
+        self._coarse = LineMap(COARSE * config.voxel_size, reach=0.3, sigma=0.12)
+        self._fine = LineMap(config.voxel_size, reach=0.4)
+        self._pad = 1 << LEVELS
+        self._pyramid = np.empty((LEVELS, 0, 0), np.float32)
+
+    def onto(self, earlier: Cloud) -> None:
+        """Take the cloud that the next ones are laid onto."""
+        self._coarse.build(earlier)
+        self._fine.build(earlier)
+        rows, columns = self._coarse.extent
+        self._pyramid = np.empty((LEVELS, rows + self._pad, columns + self._pad), np.float32)
+        _bound.coarsen(self._coarse.score[:rows, :columns], self._pad, self._pyramid)
+
+    def lay(self, cloud: Cloud, guess: ArrayLike, side: float, side_yaw: float) -> Match | None:
+        """Return the best match of a cloud within `side` metres and `side_yaw` of a guess.
+
+        None where no place is good enough, or another one is nearly as good.
+        """
+        seeds = cloud.points[:: max(len(cloud.points) // SEEDS, 1)]
+        if not len(seeds):
+            return None
+        pose = self.place(seeds, np.asarray(guess, float), side, side_yaw)
+        if pose is None:
+            return None
+        match = self._fine.refine(cloud, pose, 0.3)
+        for sigma in (0.15, 1.5 * self._config.sigma):
+            match = self._fine.refine(cloud, match.pose, sigma)
+        return match
+
+    def place(self, seeds: NDArray[np.float32], guess: se2.Pose, side: float, side_yaw: float) -> se2.Pose | None:
+        """Return the pose with the best score, None where it is below `closure_score` or has a rival."""
+        cell, config = self._coarse.cell, self._config
+        step = cell / max(float(np.sqrt((seeds**2).sum(axis=1).max())), 1.0)
+        turns = int(np.ceil(side_yaw / step))
+        yaws = guess[2] + step * np.arange(-turns, turns + 1)
+        cosine, sine = np.cos(yaws)[:, None], np.sin(yaws)[:, None]
+        x = guess[0] - self._coarse.corner[0] + cosine * seeds[:, 0] - sine * seeds[:, 1]
+        y = guess[1] - self._coarse.corner[1] + sine * seeds[:, 0] + cosine * seeds[:, 1]
+        places = np.floor(np.stack([y, x], axis=-1) / cell).astype(np.int32)
+        cells, least = int(np.ceil(side / cell)), np.float32(config.closure_score * len(seeds))
+        best, rival, nowhere = np.zeros(3, np.int64), np.zeros(3, np.int64), np.zeros(3, np.int64)
+        top = _bound.climb(places, cells, self._pyramid, self._pad, least, nowhere, -1, best)
+        if top <= least:
+            return None
+        least = np.float32(config.closure_rival * top)
+        apart = round(RIVAL / cell)
+        if _bound.climb(places, cells, self._pyramid, self._pad, least, best, apart, rival) > least:
+            return None
+        return np.array([guess[0] + best[2] * cell, guess[1] + best[1] * cell, yaws[best[0]]])
+
+
+@dataclass(frozen=True)
+class Submap:
+    """A run of keyframes that is short enough not to have drifted: keyframes `first` to `last` - 1."""
+
+    first: int
+    last: int
+
+    @property
+    def anchor(self) -> int:
+        """The keyframe in its middle, whose frame is the submap's."""
+        return (self.first + self.last) // 2
+
+
+def submap_cloud(keyframes: list[Keyframe], submap: Submap, max_range: float, cell: float = 0.0) -> Cloud:
+    """Return the points of a submap within `max_range` of each robot pose, in its anchor's frame.
+
+    cell: side in metres of squares of which each gives one point; 0: all points.
+    """
+    pose = keyframes[submap.anchor].pose
+    clouds = []
+    for keyframe in keyframes[submap.first : submap.last]:
+        if np.hypot(*(keyframe.pose - pose)[:2]) > max_range:
+            continue  # the odometry jumped
+        near = (keyframe.cloud.points**2).sum(axis=1) < max_range**2
+        part = Cloud(keyframe.cloud.points[near], keyframe.cloud.views[near])
+        clouds.append(part.moved(se2.relative(pose, keyframe.pose)))
+    cloud = joined(clouds)
+    if not cell or not len(cloud.points):
+        return cloud
+    squares = np.floor(cloud.points / cell).astype(np.int64)
+    _, first = np.unique(squares[:, 0] * (1 << 32) + squares[:, 1], return_index=True)
+    first.sort()
+    return Cloud(cloud.points[first], cloud.views[first])

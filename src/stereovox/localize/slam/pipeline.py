@@ -30,66 +30,7 @@ from stereovox.trust.validate import trusted
 
 LATE = 3
 """Scans in a row that are too late, and in order among themselves, before it is asked who is right."""
-
-
-@dataclass(frozen=True, eq=False)
-class Step:
-    """A scan: where the odometry saw the robot (3,), and where it stood (3,) as seen from keyframe `keyframe`."""
-
-    stamp_ns: int
-    odometry: se2.Pose
-    keyframe: int
-    since: se2.Pose
-
-
-class Way:
-    """The steps so far, stamps rising."""
-
-    def __init__(self) -> None:
-        self._steps: list[Step] = []
-        self._begun = False
-        self._late, self._late_ns, self._against = 0, 0, 0
-
-    def room(self, stamp_ns: int) -> int | None:
-        """Make room for a scan at `stamp_ns`; return how many earlier ones gave way, None where it is itself too late.
-
-        A lone stamp in the future would make all later scans too late. So once more scans in a row are late than there
-        were steps later than the first of them, those steps have the wrong stamps, and go.
-        """
-        ahead = len(self._steps) - bisect_left(self._steps, stamp_ns, key=lambda step: step.stamp_ns)
-        if not ahead:
-            self._late = 0
-            return 0
-        if not self._late or stamp_ns <= self._late_ns:
-            self._late, self._against = 0, ahead
-        self._late, self._late_ns = self._late + 1, stamp_ns
-        if self._late <= max(self._against, LATE):
-            return None
-        del self._steps[-ahead:]
-        self._late = 0
-        return ahead
-
-    def add(self, scan: Scan, pose: se2.Pose, keyframes: list[Keyframe]) -> None:
-        """Take a scan that there is room for, and where (3,) the robot stood.
-
-        What comes before there is a keyframe is kept as seen from the first one.
-        """
-        if keyframes and not self._begun:
-            self._begun = True
-            self._steps = [replace(s, since=se2.relative(keyframes[0].pose, s.since)) for s in self._steps]
-        since = se2.relative(keyframes[-1].pose, pose) if keyframes else pose
-        self._steps.append(Step(scan.stamp_ns, scan.pose_world_base, max(len(keyframes) - 1, 0), since))
-
-    def track(self, keyframes: list[Keyframe]) -> Track:
-        """Return the way, with the keyframes where they stand now."""
-        anchors = np.array([keyframes[step.keyframe].pose for step in self._steps])
-        poses = se2.compose(anchors, np.array([step.since for step in self._steps]))
-        corrections = se2.compose(poses, se2.inverse(np.array([step.odometry for step in self._steps])))
-        return Track(np.array([step.stamp_ns for step in self._steps], np.int64), poses, corrections)
-
-
 Progress = Callable[[int, int, str], object]
-
 CLOSURE_TRUST, PATCH_TRUST = 0.02, 0.1
 """What a match's information is worth: its points are not independent, nor is what they lie on exact."""
 LOOKS = 2.25
@@ -100,25 +41,17 @@ JUMP, JUMP_TURN = 0.05, 0.01
 """Metres and radians that a closure must be off, before the graph is solved anew on the way."""
 
 
-@dataclass(frozen=True, eq=False)
-class SlamResult:
-    """A robot's way, and the map of what it saw.
+def map_scans(scans: Iterable[Scan], config: Config, progress: Progress | None = None) -> SlamResult:
+    """Return the way and the map of scans in order of time, whose poses are those of the odometry.
 
-    track: the pose of every scan that was not refused. grid: the map, made of the keyframes. keyframes: with their
-    final poses. closures: loops closed. edges: those, between keyframes. refused: scans by the reason why they could
-    not be used.
+    progress: called with how many are done, how many there are (0: not known) and what is going on.
     """
-
-    track: Track
-    grid: OccupancyGrid
-    keyframes: list[Keyframe]
-    edges: list[Edge]
-    refused: dict[str, int]
-
-    @property
-    def closures(self) -> int:
-        """How many pairs of submaps were found to show one place."""
-        return len(self.edges)
+    slam, total = Slam(config), len(scans) if isinstance(scans, Sized) else 0
+    for done, scan in enumerate(scans, 1):
+        slam.add(scan)
+        if progress:
+            progress(done, total, "matching scans")
+    return slam.finish(progress)
 
 
 class Slam:
@@ -213,23 +146,87 @@ class Slam:
         return grid.occupancy()
 
 
+@dataclass(frozen=True, eq=False)
+class SlamResult:
+    """A robot's way, and the map of what it saw.
+
+    track: the pose of every scan that was not refused. grid: the map, made of the keyframes. keyframes: with their
+    final poses. closures: loops closed. edges: those, between keyframes. refused: scans by the reason why they could
+    not be used.
+    """
+
+    track: Track
+    grid: OccupancyGrid
+    keyframes: list[Keyframe]
+    edges: list[Edge]
+    refused: dict[str, int]
+
+    @property
+    def closures(self) -> int:
+        """How many pairs of submaps were found to show one place."""
+        return len(self.edges)
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """A scan: where the odometry saw the robot (3,), and where it stood (3,) as seen from keyframe `keyframe`."""
+
+    stamp_ns: int
+    odometry: se2.Pose
+    keyframe: int
+    since: se2.Pose
+
+
+class Way:
+    """The steps so far, stamps rising."""
+
+    def __init__(self) -> None:
+        self._steps: list[Step] = []
+        self._begun = False
+        self._late, self._late_ns, self._against = 0, 0, 0
+
+    def room(self, stamp_ns: int) -> int | None:
+        """Make room for a scan at `stamp_ns`; return how many earlier ones gave way, None where it is itself too late.
+
+        A lone stamp in the future would make all later scans too late. So once more scans in a row are late than there
+        were steps later than the first of them, those steps have the wrong stamps, and go.
+        """
+        ahead = len(self._steps) - bisect_left(self._steps, stamp_ns, key=lambda step: step.stamp_ns)
+        if not ahead:
+            self._late = 0
+            return 0
+        if not self._late or stamp_ns <= self._late_ns:
+            self._late, self._against = 0, ahead
+        self._late, self._late_ns = self._late + 1, stamp_ns
+        if self._late <= max(self._against, LATE):
+            return None
+        del self._steps[-ahead:]
+        self._late = 0
+        return ahead
+
+    def add(self, scan: Scan, pose: se2.Pose, keyframes: list[Keyframe]) -> None:
+        """Take a scan that there is room for, and where (3,) the robot stood.
+
+        What comes before there is a keyframe is kept as seen from the first one.
+        """
+        if keyframes and not self._begun:
+            self._begun = True
+            self._steps = [replace(s, since=se2.relative(keyframes[0].pose, s.since)) for s in self._steps]
+        since = se2.relative(keyframes[-1].pose, pose) if keyframes else pose
+        self._steps.append(Step(scan.stamp_ns, scan.pose_world_base, max(len(keyframes) - 1, 0), since))
+
+    def track(self, keyframes: list[Keyframe]) -> Track:
+        """Return the way, with the keyframes where they stand now."""
+        anchors = np.array([keyframes[step.keyframe].pose for step in self._steps])
+        poses = se2.compose(anchors, np.array([step.since for step in self._steps]))
+        corrections = se2.compose(poses, se2.inverse(np.array([step.odometry for step in self._steps])))
+        return Track(np.array([step.stamp_ns for step in self._steps], np.int64), poses, corrections)
+
+
 def _said_again(p: float) -> float:
     """Return what a keyframe says of a cell where a scan says `p`."""
     odds = (p / (1 - p)) ** LOOKS
     return odds / (1 + odds)
-
-
-def map_scans(scans: Iterable[Scan], config: Config, progress: Progress | None = None) -> SlamResult:
-    """Return the way and the map of scans in order of time, whose poses are those of the odometry.
-
-    progress: called with how many are done, how many there are (0: not known) and what is going on.
-    """
-    slam, total = Slam(config), len(scans) if isinstance(scans, Sized) else 0
-    for done, scan in enumerate(scans, 1):
-        slam.add(scan)
-        if progress:
-            progress(done, total, "matching scans")
-    return slam.finish(progress)
 
 
 def _check_extent(poses: se2.Pose, cell: float) -> None:

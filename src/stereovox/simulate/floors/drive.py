@@ -102,13 +102,13 @@ def zigzag(start: tuple[float, float], end: tuple[float, float], aside: float, p
     return [Stop(*(place + side * left)) for place, side in zip(middle, sides, strict=True)]
 
 
+def metres(poses: Pose) -> NDArray[np.float64]:
+    """Return how far the robot has come at each pose, (N,)."""
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(poses[:, :2], axis=0), axis=1))])
+
+
 def _chained(steps: Pose) -> Pose:
     """Return the poses (N + 1, 3) that steps (N, 3) lead to from the origin."""
     yaw = np.concatenate([[0.0], np.cumsum(steps[:, 2])])
     moves = compose(np.column_stack([np.zeros((len(steps), 2)), yaw[:-1]]), steps)[:, :2]
     return np.column_stack([np.vstack([np.zeros(2), np.cumsum(moves, axis=0)]), wrapped(yaw)])
-
-
-def metres(poses: Pose) -> NDArray[np.float64]:
-    """Return how far the robot has come at each pose, (N,)."""
-    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(poses[:, :2], axis=0), axis=1))])

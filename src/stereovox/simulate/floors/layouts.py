@@ -11,6 +11,53 @@ import numpy as np
 from stereovox.simulate.floors.drive import Stop, zigzag
 from stereovox.simulate.floors.plan import CEILING, FloorPlan, Rectangle, Thing, block, post
 
+SHIFT = (0.0137, 0.0219)
+"""Metres by which all of a floor is moved, so that no wall lies exactly on a cell's face for any round cell size."""
+OFFICES = {"a": 7.35, "b": 11.65, "c": 15.95}
+"""x at which the offices of both rows begin; they are 4.1 m wide, and all alike."""
+WIDTH = 4.1
+SOUTH, NORTH = (2.15, 4.70), (4.85, 7.45)
+"""y of the two rows of offices: doors of the first lead to the south corridor, those of the second to the north one."""
+CORRIDORS: tuple[Rectangle, ...] = (
+    (0.0, 0.0, 22.0, 2.0),  # south
+    (20.2, 0.0, 22.0, 9.2),  # east
+    (5.6, 7.6, 22.0, 9.2),  # north
+    (5.6, 0.0, 7.2, 9.2),  # west
+)
+CORNERS: tuple[Rectangle, ...] = (
+    (1.2, 2.2, 2.6, 7.4),  # the stairs' corridor and its door
+    (1.45, 2.0, 2.35, 2.2),
+    (9.0, -2.9, 12.4, -0.15),  # toilets and their door
+    (10.3, -0.15, 11.2, 0.0),
+    (16.2, -1.2, 18.8, 0.0),  # niche before two elevators
+    (16.5, -1.28, 17.35, -1.2),
+    (17.65, -1.28, 18.5, -1.2),
+    (13.4, 9.2, 14.8, 9.75),  # niche of a copier
+)
+"""Zones that are like no other (IST 2019, III-D)."""
+OPEN = ((10.25, SOUTH), (16.25, SOUTH), (11.95, NORTH))
+"""Doors of 0.9 m that stand open: x from, and the row of offices."""
+SHUT = ((14.55, SOUTH), (7.65, NORTH), (16.25, NORTH))
+BEHIND: Rectangle = (1.0, 2.08, 2.8, 7.6)
+"""The stairs' corridor, from the middle of its door on."""
+FREE: tuple[Rectangle, ...] = (
+    (0.0, 0.0, 12.0, 9.0),  # hall
+    (12.0, 6.2, 13.2, 8.2),  # alcove
+    (-5.0, 3.6, -0.15, 5.4),  # corridor that leads there
+    (-0.15, 3.9, 0.0, 5.1),
+    (-3.3, 5.4, -2.4, 5.5),  # shut doors in the corridor
+    (-4.2, 3.5, -3.3, 3.6),
+)
+STOPS = tuple(Stop(*numbers) for numbers in [
+    (-4.3, 4.5, 360), (-3.5, 4.5), (-2.4, 4.8), (-1.2, 4.3), (0.7, 4.5, 180), (0.8, 3.4, -90), (0.75, 1.5),
+    (2.6, 1.2, 90), (3.2, 3.0), (4.8, 1.3, 90), (5.4, 3.2), (7.6, 3.4), (7.7, 1.2, -180), (7.9, 3.0),
+    (9.6, 3.3, -360), (11.0, 1.9), (10.9, 3.0), (11.05, 4.7), (11.4, 5.4), (11.4, 6.4), (12.3, 7.1, 360),
+    (11.2, 7.0), (9.6, 7.9), (9.4, 6.2), (7.4, 5.8, 180), (6.6, 4.6), (4.9, 4.9), (4.8, 6.6), (4.7, 7.9, -360),
+    (4.7, 6.5), (2.6, 5.9, 90), (0.9, 6.3), (0.9, 8.2, 180), (0.9, 6.0), (2.8, 3.7), (6.0, 3.7, 180),
+    (7.4, 5.3), (9.2, 5.2, -180), (6.0, 5.0), (2.6, 5.2), (0.8, 4.5), (-1.2, 4.6), (-3.6, 4.5),
+])  # fmt: skip
+"""Criss-cross through the hall, with returns."""
+
 
 def table(name: str, x: float, y: float, size: tuple[float, float] = (1.6, 0.8), turn_deg: float = 0.0) -> list[Thing]:
     """Return a table with its middle at (x, y): four thin legs, and a top that a low lidar does not see."""
@@ -47,18 +94,6 @@ def shelf(name: str, where: tuple[float, float, float, float]) -> list[Thing]:
     return [*sides, *boards]
 
 
-def _round(x: float, y: float, half_x: float, half_y: float) -> tuple[float, float, float, float]:
-    return x - half_x, y - half_y, x + half_x, y + half_y
-
-
-def _four(x: float, y: float) -> tuple[tuple[float, float], ...]:
-    return (-x, -y), (x, -y), (x, y), (-x, y)
-
-
-SHIFT = (0.0137, 0.0219)
-"""Metres by which all of a floor is moved, so that no wall lies exactly on a cell's face for any round cell size."""
-
-
 @dataclass(frozen=True, eq=False)
 class Layout:
     """A floor, the way of a robot through it, and the rectangle that a shut door closes off (None: no such door)."""
@@ -81,35 +116,6 @@ class Layout:
         return Layout(plan, stops, None if self.behind_door is None else rectangle(self.behind_door))
 
 
-OFFICES = {"a": 7.35, "b": 11.65, "c": 15.95}
-"""x at which the offices of both rows begin; they are 4.1 m wide, and all alike."""
-WIDTH = 4.1
-SOUTH, NORTH = (2.15, 4.70), (4.85, 7.45)
-"""y of the two rows of offices: doors of the first lead to the south corridor, those of the second to the north one."""
-CORRIDORS: tuple[Rectangle, ...] = (
-    (0.0, 0.0, 22.0, 2.0),  # south
-    (20.2, 0.0, 22.0, 9.2),  # east
-    (5.6, 7.6, 22.0, 9.2),  # north
-    (5.6, 0.0, 7.2, 9.2),  # west
-)
-CORNERS: tuple[Rectangle, ...] = (
-    (1.2, 2.2, 2.6, 7.4),  # the stairs' corridor and its door
-    (1.45, 2.0, 2.35, 2.2),
-    (9.0, -2.9, 12.4, -0.15),  # toilets and their door
-    (10.3, -0.15, 11.2, 0.0),
-    (16.2, -1.2, 18.8, 0.0),  # niche before two elevators
-    (16.5, -1.28, 17.35, -1.2),
-    (17.65, -1.28, 18.5, -1.2),
-    (13.4, 9.2, 14.8, 9.75),  # niche of a copier
-)
-"""Zones that are like no other (IST 2019, III-D)."""
-OPEN = ((10.25, SOUTH), (16.25, SOUTH), (11.95, NORTH))
-"""Doors of 0.9 m that stand open: x from, and the row of offices."""
-SHUT = ((14.55, SOUTH), (7.65, NORTH), (16.25, NORTH))
-BEHIND: Rectangle = (1.0, 2.08, 2.8, 7.6)
-"""The stairs' corridor, from the middle of its door on."""
-
-
 def corridors(shut: bool) -> Layout:
     """Return the floor and a drive of about 110 m. shut: the stairs' door is closed, and the robot drives past it."""
     rooms = [(x, row[0], x + WIDTH, row[1]) for row in (SOUTH, NORTH) for x in OFFICES.values()]
@@ -119,6 +125,20 @@ def corridors(shut: bool) -> Layout:
         things.append(block("doors", "door to the stairs", (1.45, 2.08, 2.35, 2.12), (0.0, CEILING)))
     plan = FloorPlan([*CORRIDORS, *CORNERS, *rooms, *doors], things)
     return Layout(plan, _stops(shut), BEHIND).moved(*SHIFT)
+
+
+def testbed(shut: bool) -> Layout:
+    """Return the hall and a drive of about 75 m. There is no door to shut: `shut` changes nothing."""
+    del shut
+    return Layout(FloorPlan(FREE, _things()), STOPS).moved(*SHIFT)
+
+
+def _round(x: float, y: float, half_x: float, half_y: float) -> tuple[float, float, float, float]:
+    return x - half_x, y - half_y, x + half_x, y + half_y
+
+
+def _four(x: float, y: float) -> tuple[tuple[float, float], ...]:
+    return (-x, -y), (x, -y), (x, y), (-x, y)
 
 
 def _door(x: float, row: tuple[float, float], deep: float) -> Rectangle:
@@ -195,22 +215,6 @@ def _stops(shut: bool) -> list[Stop]:
     ]
 
 
-FREE: tuple[Rectangle, ...] = (
-    (0.0, 0.0, 12.0, 9.0),  # hall
-    (12.0, 6.2, 13.2, 8.2),  # alcove
-    (-5.0, 3.6, -0.15, 5.4),  # corridor that leads there
-    (-0.15, 3.9, 0.0, 5.1),
-    (-3.3, 5.4, -2.4, 5.5),  # shut doors in the corridor
-    (-4.2, 3.5, -3.3, 3.6),
-)
-
-
-def testbed(shut: bool) -> Layout:
-    """Return the hall and a drive of about 75 m. There is no door to shut: `shut` changes nothing."""
-    del shut
-    return Layout(FloorPlan(FREE, _things()), STOPS).moved(*SHIFT)
-
-
 def _things() -> list[Thing]:
     return [
         block("pillars", "pillar west", (3.8, 4.3, 4.2, 4.7), (0.0, CEILING)),
@@ -235,14 +239,3 @@ def _things() -> list[Thing]:
         post("posts", "column", (12.75, 7.8), 0.3, 2.0),
         post("posts", "barrel", (0.6, 0.6), 0.55, 0.9),
     ]
-
-
-STOPS = tuple(Stop(*numbers) for numbers in [
-    (-4.3, 4.5, 360), (-3.5, 4.5), (-2.4, 4.8), (-1.2, 4.3), (0.7, 4.5, 180), (0.8, 3.4, -90), (0.75, 1.5),
-    (2.6, 1.2, 90), (3.2, 3.0), (4.8, 1.3, 90), (5.4, 3.2), (7.6, 3.4), (7.7, 1.2, -180), (7.9, 3.0),
-    (9.6, 3.3, -360), (11.0, 1.9), (10.9, 3.0), (11.05, 4.7), (11.4, 5.4), (11.4, 6.4), (12.3, 7.1, 360),
-    (11.2, 7.0), (9.6, 7.9), (9.4, 6.2), (7.4, 5.8, 180), (6.6, 4.6), (4.9, 4.9), (4.8, 6.6), (4.7, 7.9, -360),
-    (4.7, 6.5), (2.6, 5.9, 90), (0.9, 6.3), (0.9, 8.2, 180), (0.9, 6.0), (2.8, 3.7), (6.0, 3.7, 180),
-    (7.4, 5.3), (9.2, 5.2, -180), (6.0, 5.0), (2.6, 5.2), (0.8, 4.5), (-1.2, 4.6), (-3.6, 4.5),
-])  # fmt: skip
-"""Criss-cross through the hall, with returns."""

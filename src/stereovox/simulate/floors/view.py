@@ -21,6 +21,9 @@ from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.simulate.floors.plan import CEILING, FloorPlan, Thing
 
+OCCUPIED, FREE = 100, 0
+NONE = np.float32(np.inf)
+
 
 def cast(
     segments: NDArray[np.float64], origin: ArrayLike, angles: ArrayLike, longest: float = np.inf
@@ -63,9 +66,6 @@ def within_reach(segments: NDArray[np.float64], origin: ArrayLike, reach: float)
     return segments[near]
 
 
-OCCUPIED, FREE = 100, 0
-
-
 def with_lids(grid: OccupancyGrid, things: Sequence[Thing], heights: tuple[float, float], eye: float) -> OccupancyGrid:
     """Return a perfect map of a floor with all lids occupied that lie between `heights` and can be seen.
 
@@ -95,20 +95,6 @@ def lid(thing: Thing, eye: float) -> float | None:
     if thing.low > eye:
         return thing.low
     return thing.high if thing.high < eye else None
-
-
-def _inside(thing: Thing, grid: OccupancyGrid) -> NDArray[np.bool_]:
-    """Tell which cells' middles lie within a thing's outline, (rows, columns)."""
-    rows, columns = grid.cells.shape
-    x = grid.origin[0] + (np.arange(columns) + 0.5) * grid.resolution
-    y = grid.origin[1] + (np.arange(rows)[:, None] + 0.5) * grid.resolution
-    inside = np.ones(grid.cells.shape, bool)
-    for x0, y0, x1, y1 in thing.outline:  # the body is on the left of each side
-        inside &= (x1 - x0) * (y - y0) - (y1 - y0) * (x - x0) >= 0
-    return inside
-
-
-NONE = np.float32(np.inf)
 
 
 class LevelView:
@@ -192,6 +178,17 @@ class LevelView:
     def _rows(self, slopes: list[float]) -> slice:
         """Return the rows that look down at slopes between the least and the largest of these."""
         return slice(*np.searchsorted(self._down, [min(slopes) - 1e-6, max(slopes) + 1e-6]).tolist())
+
+
+def _inside(thing: Thing, grid: OccupancyGrid) -> NDArray[np.bool_]:
+    """Tell which cells' middles lie within a thing's outline, (rows, columns)."""
+    rows, columns = grid.cells.shape
+    x = grid.origin[0] + (np.arange(columns) + 0.5) * grid.resolution
+    y = grid.origin[1] + (np.arange(rows)[:, None] + 0.5) * grid.resolution
+    inside = np.ones(grid.cells.shape, bool)
+    for x0, y0, x1, y1 in thing.outline:  # the body is on the left of each side
+        inside &= (x1 - x0) * (y - y0) - (y1 - y0) * (x - x0) >= 0
+    return inside
 
 
 def _through(

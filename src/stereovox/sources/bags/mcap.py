@@ -35,138 +35,6 @@ SMALLEST = HEAD + 40
 ENTRY = np.dtype([("time", "<u8"), ("offset", "<u8")])
 ENCODINGS = {"cdr": True, "ros1": False}
 """How messages may be serialised, and whether that is ROS 2's way; others (JSON, protobuf) are none of ROS."""
-
-
-class Record(NamedTuple):
-    """Where a record's fields stand, in a file or in an unpacked chunk."""
-
-    kind: int
-    start: int
-    end: int
-
-
-class Channel(NamedTuple):
-    """A topic as one publisher sends it."""
-
-    topic: str
-    type: str
-    cdr: bool
-
-
-class Chunk(NamedTuple):
-    """A chunk by the index at the end of a file: counts and places of its messages' indexes, by channel."""
-
-    start: int
-    end: int
-    indexes: dict[int, int]
-    counts: dict[int, int]
-
-
-class McapBytes:
-    """A file that never gives out, and never makes room for, more bytes than it has; it is not kept open."""
-
-    def __init__(self, path: Path):
-        self.path, self.size = path, path.stat().st_size
-
-    def at(self, start: int, end: int) -> bytes:
-        """Return the bytes from `start` to `end`; raises ValueError where there are not so many, or absurdly many."""
-        if not 0 <= start <= end <= self.size:
-            raise ValueError("the file is cut off")
-        if end - start > MAX_BYTES:
-            raise ValueError("tells of an absurd size")
-        with self.path.open("rb") as file:
-            file.seek(start)
-            data = file.read(end - start)
-        if len(data) != end - start:
-            raise ValueError("the file is cut off")
-        return data
-
-    def record(self, start: int) -> Record:
-        """Return the record at `start`; raises ValueError where the file does not hold it to its end."""
-        return record(self.at(start, min(start + HEAD, self.size)), start, self.size)
-
-    def fields(self, found: Record, kind: int) -> Wire:
-        """Return the fields of a record, which must be of this kind."""
-        if found.kind != kind:
-            raise ValueError("the index points to something else")
-        return Wire(self.at(found.start, found.end), cdr=False)
-
-    def chunk(self, found: Record) -> bytes:
-        """Return the unpacked contents of a chunk; raises ValueError for a damaged one."""
-        wire = self.fields(found, CHUNK)
-        _, _, size = wire.numbers("Q", 3)
-        checksum, packing = wire.number(), wire.text()
-        data = wire.block(wire.number("Q"))
-        if size > MAX_BYTES:
-            raise ValueError("a chunk unpacks to an absurd size")
-        inner = unpacked(data, packing, size)
-        if len(inner) != size or (checksum and zlib.crc32(inner) != checksum):
-            raise ValueError("a chunk is damaged")
-        return inner
-
-
-def record(head: bytes, start: int, limit: int) -> Record:
-    """Return the record that starts with `head` at `start`; raises ValueError for none that ends within `limit`."""
-    if len(head) < HEAD:
-        raise ValueError("the file is cut off")
-    end = start + HEAD + int.from_bytes(head[1:HEAD], "little")
-    if end > limit:
-        raise ValueError("the file is cut off")
-    if head[0] == 0:
-        raise ValueError("no record where one should be")
-    return Record(head[0], start + HEAD, end)
-
-
-def read_schema(wire: Wire) -> tuple[int, str]:
-    """Return number and message type of a schema, as `sensor_msgs/Image`."""
-    return wire.number("H"), one_line(wire.text()).replace("/msg/", "/")
-
-
-def read_channel(wire: Wire, schemas: dict[int, str]) -> tuple[int, Channel | None]:
-    """Return number and channel; None for one that is not serialised as ROS does, ValueError for an unknown type."""
-    number, schema = wire.numbers("H", 2)
-    topic, encoding = one_line(wire.text()), wire.text()
-    if schema and schema not in schemas:
-        raise ValueError("the index is not complete")
-    return number, Channel(topic, schemas[schema], ENCODINGS[encoding]) if schema and encoding in ENCODINGS else None
-
-
-def read_chunk_index(wire: Wire) -> Chunk:
-    """Return where a chunk and the indexes of its messages stand; raises ValueError where that cannot be."""
-    _, _, start, length = wire.numbers("Q", 4)
-    if length < SMALLEST:
-        raise ValueError("the index is damaged")
-    places = np.frombuffer(wire.data(), np.dtype([("channel", "<u2"), ("at", "<u8")]))
-    end = start + length + wire.number("Q")
-    indexes = dict(zip(places["channel"].tolist(), places["at"].tolist(), strict=True))
-    inner = sorted(indexes.items(), key=lambda item: item[1])
-    bounds = [at for _, at in inner] + [end]
-    sizes = [after - at - INDEX_HEAD for at, after in pairwise(bounds)]
-    if any(size < 0 for size in sizes) or bounds[0] < start + length:
-        raise ValueError("the index is damaged")
-    counts = {channel: size // ENTRY.itemsize for (channel, _), size in zip(inner, sizes, strict=True)}
-    return Chunk(start, end, indexes, counts)
-
-
-def read_message_index(wire: Wire, channel: int) -> NDArray[np.void]:
-    """Return the (N,) times and places within their chunk of a channel's messages."""
-    if wire.number("H") != channel:
-        raise ValueError("the index points to something else")
-    return np.frombuffer(wire.data(), ENTRY)
-
-
-def message_at(data: bytes, start: int) -> tuple[int, int, memoryview]:
-    """Return channel, time and serialised data of the message that stands at `start` in an unpacked chunk."""
-    if start < 0:
-        raise ValueError("the index points to nowhere")
-    found = record(data[start : start + HEAD], start, len(data))
-    wire = Wire(memoryview(data)[found.start : found.end], cdr=False)
-    if found.kind != MESSAGE:
-        raise ValueError("the index points to something else")
-    channel, _, time = wire.number("H"), wire.number(), wire.numbers("Q", 2)[0]
-    return channel, time, wire.block(wire.left)
-
-
 TAIL = HEAD + 20 + len(START)
 """Bytes of the last record and of what ends a file."""
 LOOSE = -1
@@ -174,9 +42,88 @@ LOOSE = -1
 MAX_RECORDS = 10_000_000
 """More than these are not gone through: hours of a robot, and 240 MB of memory if all are messages."""
 LATEST = 2**63 - 1
-
 Places = NDArray[np.int64]
 """(N, 3) int64: time in nanoseconds, start of the chunk or `LOOSE`, start of the message in its chunk or the file."""
+CHUNKS = 4
+"""Unpacked chunks kept: enough for an image, its camera and the poses around it."""
+
+
+class McapFile(BagFile):
+    """A recording of ROS 2, or of ROS 1 turned into `.mcap`: chunks not packed or with zstd or lz4.
+
+    Read by the index at its end. Where that is missing, as after a recording that was cut off, or of no use, the file
+    is gone through once when it is opened, and what is whole counts; `notes` then tell so.
+    Raises SourceError, one line, for a file that holds nothing that can be read.
+    """
+
+    def __init__(self, path: Path):
+        self.path = path
+        self.notes = ()
+        self._bytes = McapBytes(path)
+        self._lock = threading.Lock()
+        self._chunks: OrderedDict[int, bytes] = OrderedDict()
+        self._places: dict[str, Places] = {}
+        try:
+            self._index: Summary | Scanned = Summary(self._bytes)
+        except ValueError as error:
+            self._index = self._scan(str(error))
+        self.types = {channel.topic: channel.type for channel in self._index.channels.values()}
+
+    def stamps(self, topic: str) -> NDArray[np.int64]:
+        """Return the times at which the messages of `topic` were recorded; raises SourceError for a damaged file."""
+        return self._of(topic)[:, 0]
+
+    def read(self, topic: str, i: int) -> Wire:
+        """Return message `i`; raises FrameRefused `unreadable` where the file is damaged."""
+        try:
+            with self._lock:
+                time, chunk, start = self._of(topic)[i].tolist()
+                number, recorded, data = self._message(chunk, start)
+            channel = self._index.channels.get(number)
+            if channel is None or channel.topic != topic or recorded != time:
+                raise ValueError("the index points to something else")
+            return Wire(unzipped(bytes(data), MAX_BYTES), cdr=channel.cdr)
+        except (OSError, SourceError, ValueError, MemoryError) as error:
+            raise FrameRefused("unreadable", f"{self.path}: message {i} of {topic}: {one_line(error)}") from None
+
+    def _scan(self, why: str) -> Scanned:
+        """Go through the file and note what was found."""
+        found = Scanned(self._bytes)
+        if not found.complete and not found.channels:
+            raise SourceError(f"{self.path}: cut off or damaged before the first message; record or copy it again")
+        rest = (
+            ""
+            if found.complete
+            else f"; cut off or damaged at byte {found.whole} of {self._bytes.size}, the rest is lost"
+        )
+        lost = f"; {found.damaged} damaged chunks left out" if found.damaged else ""
+        self.notes = (f"{self.path}: {one_line(why)}: gone through from the beginning{lost}{rest}",)
+        return found
+
+    def _of(self, topic: str) -> Places:
+        """Return where the messages of a topic stand, in order of time."""
+        if topic not in self._places:
+            try:
+                places = self._index.places(topic)
+            except (OSError, ValueError) as error:
+                cure = "repair it with 'mcap recover' or record it again"
+                raise SourceError(f"{self.path}: topic {topic}: {one_line(error)}; {cure}") from None
+            self._places[topic] = places[np.argsort(places[:, 0], kind="stable")]
+        return self._places[topic]
+
+    def _message(self, chunk: int, start: int) -> tuple[int, int, memoryview]:
+        if chunk != LOOSE:
+            return message_at(self._chunk(chunk), start)
+        found = self._bytes.record(start)
+        return message_at(self._bytes.at(start, found.end), 0)
+
+    def _chunk(self, start: int) -> bytes:
+        if start not in self._chunks:
+            self._chunks[start] = self._bytes.chunk(self._bytes.record(start))
+            while len(self._chunks) > CHUNKS:
+                self._chunks.popitem(last=False)
+        self._chunks.move_to_end(start)
+        return self._chunks[start]
 
 
 class Summary:
@@ -320,6 +267,136 @@ class Scanned:
         self._found.setdefault(number, array("q")).extend((time, chunk.start - HEAD if chunk else LOOSE, place))
 
 
+class Record(NamedTuple):
+    """Where a record's fields stand, in a file or in an unpacked chunk."""
+
+    kind: int
+    start: int
+    end: int
+
+
+class Channel(NamedTuple):
+    """A topic as one publisher sends it."""
+
+    topic: str
+    type: str
+    cdr: bool
+
+
+class Chunk(NamedTuple):
+    """A chunk by the index at the end of a file: counts and places of its messages' indexes, by channel."""
+
+    start: int
+    end: int
+    indexes: dict[int, int]
+    counts: dict[int, int]
+
+
+class McapBytes:
+    """A file that never gives out, and never makes room for, more bytes than it has; it is not kept open."""
+
+    def __init__(self, path: Path):
+        self.path, self.size = path, path.stat().st_size
+
+    def at(self, start: int, end: int) -> bytes:
+        """Return the bytes from `start` to `end`; raises ValueError where there are not so many, or absurdly many."""
+        if not 0 <= start <= end <= self.size:
+            raise ValueError("the file is cut off")
+        if end - start > MAX_BYTES:
+            raise ValueError("tells of an absurd size")
+        with self.path.open("rb") as file:
+            file.seek(start)
+            data = file.read(end - start)
+        if len(data) != end - start:
+            raise ValueError("the file is cut off")
+        return data
+
+    def record(self, start: int) -> Record:
+        """Return the record at `start`; raises ValueError where the file does not hold it to its end."""
+        return record(self.at(start, min(start + HEAD, self.size)), start, self.size)
+
+    def fields(self, found: Record, kind: int) -> Wire:
+        """Return the fields of a record, which must be of this kind."""
+        if found.kind != kind:
+            raise ValueError("the index points to something else")
+        return Wire(self.at(found.start, found.end), cdr=False)
+
+    def chunk(self, found: Record) -> bytes:
+        """Return the unpacked contents of a chunk; raises ValueError for a damaged one."""
+        wire = self.fields(found, CHUNK)
+        _, _, size = wire.numbers("Q", 3)
+        checksum, packing = wire.number(), wire.text()
+        data = wire.block(wire.number("Q"))
+        if size > MAX_BYTES:
+            raise ValueError("a chunk unpacks to an absurd size")
+        inner = unpacked(data, packing, size)
+        if len(inner) != size or (checksum and zlib.crc32(inner) != checksum):
+            raise ValueError("a chunk is damaged")
+        return inner
+
+
+def record(head: bytes, start: int, limit: int) -> Record:
+    """Return the record that starts with `head` at `start`; raises ValueError for none that ends within `limit`."""
+    if len(head) < HEAD:
+        raise ValueError("the file is cut off")
+    end = start + HEAD + int.from_bytes(head[1:HEAD], "little")
+    if end > limit:
+        raise ValueError("the file is cut off")
+    if head[0] == 0:
+        raise ValueError("no record where one should be")
+    return Record(head[0], start + HEAD, end)
+
+
+def read_schema(wire: Wire) -> tuple[int, str]:
+    """Return number and message type of a schema, as `sensor_msgs/Image`."""
+    return wire.number("H"), one_line(wire.text()).replace("/msg/", "/")
+
+
+def read_channel(wire: Wire, schemas: dict[int, str]) -> tuple[int, Channel | None]:
+    """Return number and channel; None for one that is not serialised as ROS does, ValueError for an unknown type."""
+    number, schema = wire.numbers("H", 2)
+    topic, encoding = one_line(wire.text()), wire.text()
+    if schema and schema not in schemas:
+        raise ValueError("the index is not complete")
+    return number, Channel(topic, schemas[schema], ENCODINGS[encoding]) if schema and encoding in ENCODINGS else None
+
+
+def read_chunk_index(wire: Wire) -> Chunk:
+    """Return where a chunk and the indexes of its messages stand; raises ValueError where that cannot be."""
+    _, _, start, length = wire.numbers("Q", 4)
+    if length < SMALLEST:
+        raise ValueError("the index is damaged")
+    places = np.frombuffer(wire.data(), np.dtype([("channel", "<u2"), ("at", "<u8")]))
+    end = start + length + wire.number("Q")
+    indexes = dict(zip(places["channel"].tolist(), places["at"].tolist(), strict=True))
+    inner = sorted(indexes.items(), key=lambda item: item[1])
+    bounds = [at for _, at in inner] + [end]
+    sizes = [after - at - INDEX_HEAD for at, after in pairwise(bounds)]
+    if any(size < 0 for size in sizes) or bounds[0] < start + length:
+        raise ValueError("the index is damaged")
+    counts = {channel: size // ENTRY.itemsize for (channel, _), size in zip(inner, sizes, strict=True)}
+    return Chunk(start, end, indexes, counts)
+
+
+def read_message_index(wire: Wire, channel: int) -> NDArray[np.void]:
+    """Return the (N,) times and places within their chunk of a channel's messages."""
+    if wire.number("H") != channel:
+        raise ValueError("the index points to something else")
+    return np.frombuffer(wire.data(), ENTRY)
+
+
+def message_at(data: bytes, start: int) -> tuple[int, int, memoryview]:
+    """Return channel, time and serialised data of the message that stands at `start` in an unpacked chunk."""
+    if start < 0:
+        raise ValueError("the index points to nowhere")
+    found = record(data[start : start + HEAD], start, len(data))
+    wire = Wire(memoryview(data)[found.start : found.end], cdr=False)
+    if found.kind != MESSAGE:
+        raise ValueError("the index points to something else")
+    channel, _, time = wire.number("H"), wire.number(), wire.numbers("Q", 2)[0]
+    return channel, time, wire.block(wire.left)
+
+
 def _summary(file: McapBytes) -> tuple[int, bytes]:
     """Return start and records of the summary of a whole file; raises ValueError where there is none."""
     tail = file.at(file.size - TAIL, file.size)
@@ -343,85 +420,3 @@ def _records(data: bytes) -> Iterator[Record]:
         found = record(data[at : at + HEAD], at, len(data))
         yield found
         at = found.end
-
-
-CHUNKS = 4
-"""Unpacked chunks kept: enough for an image, its camera and the poses around it."""
-
-
-class McapFile(BagFile):
-    """A recording of ROS 2, or of ROS 1 turned into `.mcap`: chunks not packed or with zstd or lz4.
-
-    Read by the index at its end. Where that is missing, as after a recording that was cut off, or of no use, the file
-    is gone through once when it is opened, and what is whole counts; `notes` then tell so.
-    Raises SourceError, one line, for a file that holds nothing that can be read.
-    """
-
-    def __init__(self, path: Path):
-        self.path = path
-        self.notes = ()
-        self._bytes = McapBytes(path)
-        self._lock = threading.Lock()
-        self._chunks: OrderedDict[int, bytes] = OrderedDict()
-        self._places: dict[str, Places] = {}
-        try:
-            self._index: Summary | Scanned = Summary(self._bytes)
-        except ValueError as error:
-            self._index = self._scan(str(error))
-        self.types = {channel.topic: channel.type for channel in self._index.channels.values()}
-
-    def stamps(self, topic: str) -> NDArray[np.int64]:
-        """Return the times at which the messages of `topic` were recorded; raises SourceError for a damaged file."""
-        return self._of(topic)[:, 0]
-
-    def read(self, topic: str, i: int) -> Wire:
-        """Return message `i`; raises FrameRefused `unreadable` where the file is damaged."""
-        try:
-            with self._lock:
-                time, chunk, start = self._of(topic)[i].tolist()
-                number, recorded, data = self._message(chunk, start)
-            channel = self._index.channels.get(number)
-            if channel is None or channel.topic != topic or recorded != time:
-                raise ValueError("the index points to something else")
-            return Wire(unzipped(bytes(data), MAX_BYTES), cdr=channel.cdr)
-        except (OSError, SourceError, ValueError, MemoryError) as error:
-            raise FrameRefused("unreadable", f"{self.path}: message {i} of {topic}: {one_line(error)}") from None
-
-    def _scan(self, why: str) -> Scanned:
-        """Go through the file and note what was found."""
-        found = Scanned(self._bytes)
-        if not found.complete and not found.channels:
-            raise SourceError(f"{self.path}: cut off or damaged before the first message; record or copy it again")
-        rest = (
-            ""
-            if found.complete
-            else f"; cut off or damaged at byte {found.whole} of {self._bytes.size}, the rest is lost"
-        )
-        lost = f"; {found.damaged} damaged chunks left out" if found.damaged else ""
-        self.notes = (f"{self.path}: {one_line(why)}: gone through from the beginning{lost}{rest}",)
-        return found
-
-    def _of(self, topic: str) -> Places:
-        """Return where the messages of a topic stand, in order of time."""
-        if topic not in self._places:
-            try:
-                places = self._index.places(topic)
-            except (OSError, ValueError) as error:
-                cure = "repair it with 'mcap recover' or record it again"
-                raise SourceError(f"{self.path}: topic {topic}: {one_line(error)}; {cure}") from None
-            self._places[topic] = places[np.argsort(places[:, 0], kind="stable")]
-        return self._places[topic]
-
-    def _message(self, chunk: int, start: int) -> tuple[int, int, memoryview]:
-        if chunk != LOOSE:
-            return message_at(self._chunk(chunk), start)
-        found = self._bytes.record(start)
-        return message_at(self._bytes.at(start, found.end), 0)
-
-    def _chunk(self, start: int) -> bytes:
-        if start not in self._chunks:
-            self._chunks[start] = self._bytes.chunk(self._bytes.record(start))
-            while len(self._chunks) > CHUNKS:
-                self._chunks.popitem(last=False)
-        self._chunks.move_to_end(start)
-        return self._chunks[start]

@@ -23,47 +23,6 @@ from stereovox.maps.occupancy import UNKNOWN, OccupancyGrid
 from stereovox.sources.bags.messages import Wire
 
 OCCUPANCY_GRID, OCTOMAP = "nav_msgs/OccupancyGrid", "octomap_msgs/Octomap"
-
-
-@dataclass(frozen=True)
-class OctomapMessage:
-    """An `octomap_msgs/Octomap`: nodes as in a `.bt` (binary) or `.ot` file; resolution: side of a cell in metres."""
-
-    frame_id: str
-    binary: bool
-    tree: str
-    resolution: float
-    data: bytes
-
-
-def read_octomap_message(wire: Wire) -> OctomapMessage:
-    """Return an `octomap_msgs/Octomap`."""
-    _, frame_id = wire.header()
-    binary, tree, resolution = bool(wire.number("B")), wire.text(), wire.number("d")
-    return OctomapMessage(frame_id, binary, tree, resolution, bytes(wire.data()))
-
-
-def read_occupancy_grid(wire: Wire) -> OccupancyGrid:
-    """Return a `nav_msgs/OccupancyGrid`; numbers that are no per cent are unknown, as navigation programs take them.
-
-    The message's resolution is a float32: the shortest number that means it is taken, 0.05 for 0.0500000007.
-    """
-    wire.header()
-    wire.numbers("I", 2)  # when the map was loaded
-    resolution = float(str(np.float32(wire.number("f"))))
-    width, height = wire.numbers("I", 2)
-    x, y, _, qx, qy, qz, qw = wire.numbers("d", 7)
-    count = wire.number()
-    if count != width * height or not count:
-        raise ValueError(f"a grid of {width} x {height} with {count} cells")
-    yaw = atan2(2 * (qw * qz + qx * qy), qw * qw + qx * qx - qy * qy - qz * qz)
-    if not (0 < resolution < np.inf and all(map(isfinite, (x, y, yaw)))):
-        raise ValueError(f"a grid with cells of {resolution:g} m at {x:g}, {y:g}")
-    cells = np.frombuffer(wire.block(count), np.int8)
-    known = (cells >= 0) & (cells <= 100)
-    return OccupancyGrid(np.where(known, cells, np.int8(UNKNOWN)).reshape(height, width), resolution, (x, y, yaw))
-
-
 LASER_SCAN, POINT_CLOUD, ODOMETRY = "sensor_msgs/LaserScan", "sensor_msgs/PointCloud2", "nav_msgs/Odometry"
 TF_TYPES = ("tf2_msgs/TFMessage", "tf/tfMessage")
 FLOATS = {7: "f4", 8: "f8"}
@@ -172,24 +131,6 @@ def read_point_cloud(wire: Wire) -> PointCloud:
         return PointCloud(stamp_ns, frame_id, np.stack(columns, axis=1).astype(np.float32))
 
 
-def _fields(wire: Wire) -> dict[str, tuple[int, int]]:
-    """Return offset and type of each field by its name."""
-    count = wire.number()
-    if count > MAX_FIELDS:
-        raise ValueError(f"a cloud with {count} fields")
-    found = {}
-    for _ in range(count):
-        name, offset, kind, _ = wire.text(), wire.number(), wire.number("B"), wire.number()
-        found.setdefault(name, (offset, kind))
-    return found
-
-
-def _check_size(height: int, width: int, point_step: int, row_step: int, size: int) -> None:
-    needed = (height - 1) * row_step + width * point_step if height and width else 0
-    if needed > size:
-        raise ValueError(f"a cloud of {width}x{height} points needs {needed} bytes and has {size}")
-
-
 @dataclass(frozen=True)
 class StampedTransform:
     """Where frame `child` stands in frame `parent`: tx ty tz in metres, quaternion qx qy qz qw of any length.
@@ -222,6 +163,63 @@ def is_motion(numbers: Sequence[float]) -> bool:
 def frame_name(frame_id: str) -> str:
     """Return the name of a frame as tf2 writes it: tf1 puts a slash in front."""
     return frame_id.strip().lstrip("/")
+
+
+def read_occupancy_grid(wire: Wire) -> OccupancyGrid:
+    """Return a `nav_msgs/OccupancyGrid`; numbers that are no per cent are unknown, as navigation programs take them.
+
+    The message's resolution is a float32: the shortest number that means it is taken, 0.05 for 0.0500000007.
+    """
+    wire.header()
+    wire.numbers("I", 2)  # when the map was loaded
+    resolution = float(str(np.float32(wire.number("f"))))
+    width, height = wire.numbers("I", 2)
+    x, y, _, qx, qy, qz, qw = wire.numbers("d", 7)
+    count = wire.number()
+    if count != width * height or not count:
+        raise ValueError(f"a grid of {width} x {height} with {count} cells")
+    yaw = atan2(2 * (qw * qz + qx * qy), qw * qw + qx * qx - qy * qy - qz * qz)
+    if not (0 < resolution < np.inf and all(map(isfinite, (x, y, yaw)))):
+        raise ValueError(f"a grid with cells of {resolution:g} m at {x:g}, {y:g}")
+    cells = np.frombuffer(wire.block(count), np.int8)
+    known = (cells >= 0) & (cells <= 100)
+    return OccupancyGrid(np.where(known, cells, np.int8(UNKNOWN)).reshape(height, width), resolution, (x, y, yaw))
+
+
+@dataclass(frozen=True)
+class OctomapMessage:
+    """An `octomap_msgs/Octomap`: nodes as in a `.bt` (binary) or `.ot` file; resolution: side of a cell in metres."""
+
+    frame_id: str
+    binary: bool
+    tree: str
+    resolution: float
+    data: bytes
+
+
+def read_octomap_message(wire: Wire) -> OctomapMessage:
+    """Return an `octomap_msgs/Octomap`."""
+    _, frame_id = wire.header()
+    binary, tree, resolution = bool(wire.number("B")), wire.text(), wire.number("d")
+    return OctomapMessage(frame_id, binary, tree, resolution, bytes(wire.data()))
+
+
+def _fields(wire: Wire) -> dict[str, tuple[int, int]]:
+    """Return offset and type of each field by its name."""
+    count = wire.number()
+    if count > MAX_FIELDS:
+        raise ValueError(f"a cloud with {count} fields")
+    found = {}
+    for _ in range(count):
+        name, offset, kind, _ = wire.text(), wire.number(), wire.number("B"), wire.number()
+        found.setdefault(name, (offset, kind))
+    return found
+
+
+def _check_size(height: int, width: int, point_step: int, row_step: int, size: int) -> None:
+    needed = (height - 1) * row_step + width * point_step if height and width else 0
+    if needed > size:
+        raise ValueError(f"a cloud of {width}x{height} points needs {needed} bytes and has {size}")
 
 
 def _transform(wire: Wire) -> StampedTransform:

@@ -106,10 +106,6 @@ def frame_id_of(file: BagFile, topic: str) -> str:
     return ""
 
 
-def _of_kind(file: BagFile, kind: str) -> list[str]:
-    return sorted(topic for topic, known in file.types.items() if known == kind)
-
-
 def odometry_topic(file: BagFile, given: str = "", other: str = "") -> tuple[str, tuple[str, ...]]:
     """Return the topic with the robot's odometry, "" where there is none, and notes.
 
@@ -154,3 +150,7 @@ def odometry_edge(file: BagFile, topic: str, parent: str, child: str) -> Edge:
     if not edge.count:
         raise SourceError(f"{file.path}: {topic}: not one pose can be read; name another with ?odom=/topic")
     return edge
+
+
+def _of_kind(file: BagFile, kind: str) -> list[str]:
+    return sorted(topic for topic, known in file.types.items() if known == kind)

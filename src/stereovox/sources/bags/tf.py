@@ -22,6 +22,8 @@ from stereovox.sources.bags.robot_messages import TF_TYPES, frame_name, is_motio
 from stereovox.sources.poses import seconds_from_ns
 
 STILL = 1e-9
+WORLDS = ("map", "odom")
+"""Frames taken for the world, the first that is there: REP 105."""
 
 
 @dataclass(frozen=True)
@@ -125,18 +127,6 @@ class Edge:
             self._sorted = stamps, rows
             self._still = len(rows) > 1 and bool(np.abs(rows - rows[0]).max() <= STILL)
         return self._sorted
-
-
-def _motion(numbers: NDArray[np.float64]) -> Transform:
-    return from_quaternion(numbers[:3], numbers[3:])
-
-
-def _seconds(ns: int) -> str:
-    return f"{ns / 1e9:.3f} s"
-
-
-Way = tuple[tuple[Edge, ...], tuple[Edge, ...]]
-"""Edges from a target up to the common ancestor, and from a source up to it."""
 
 
 class Tf:
@@ -275,10 +265,6 @@ class Tf:
         return T
 
 
-WORLDS = ("map", "odom")
-"""Frames taken for the world, the first that is there: REP 105."""
-
-
 def tf_topics(file: BagFile) -> list[str]:
     """Return `/tf` and `/tf_static`, or where there is neither those of a namespace (`/robot/tf`)."""
     found = sorted(topic for topic, kind in file.types.items() if kind in TF_TYPES)
@@ -347,3 +333,15 @@ def tf_poses(tf: Tf, body: str, world: str = "") -> TfPoses | str:
             raise SourceError(f"{refused}; correct ?world_frame={world}") from None
         return str(refused)
     return f"{tf.where}: tells how {body} is mounted on {name}, not where that was"
+
+
+Way = tuple[tuple[Edge, ...], tuple[Edge, ...]]
+"""Edges from a target up to the common ancestor, and from a source up to it."""
+
+
+def _motion(numbers: NDArray[np.float64]) -> Transform:
+    return from_quaternion(numbers[:3], numbers[3:])
+
+
+def _seconds(ns: int) -> str:
+    return f"{ns / 1e9:.3f} s"

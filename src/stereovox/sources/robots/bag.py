@@ -26,6 +26,11 @@ from stereovox.sources.robots.cloud_scan import CloudBand, scan_of_cloud
 from stereovox.sources.robots.frames import FrameOptions, RobotFrames
 from stereovox.sources.tracker import AXES
 
+NOWHERE = np.full((4, 4), np.nan)
+T_BODY_OPTICAL = np.eye(4)
+"""An optical frame (z forward) in a body that looks the same way (x forward, z up)."""
+T_BODY_OPTICAL[:3, :3] = AXES["ros"].T
+
 
 @dataclass(frozen=True)
 class RobotOptions:
@@ -86,12 +91,6 @@ def mounted(key: str, text: str) -> Transform | None:
     T[:3, :3] = rotation_matrix([0, 0, yaw]) @ rotation_matrix([0, pitch, 0]) @ rotation_matrix([roll, 0, 0])
     T[:3, 3] = numbers[:3]
     return T
-
-
-NOWHERE = np.full((4, 4), np.nan)
-T_BODY_OPTICAL = np.eye(4)
-"""An optical frame (z forward) in a body that looks the same way (x forward, z up)."""
-T_BODY_OPTICAL[:3, :3] = AXES["ros"].T
 
 
 class RobotBag:

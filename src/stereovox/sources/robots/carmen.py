@@ -28,6 +28,63 @@ NO_ECHO = (50.0, 81.9)
 FARTHEST = 1e6
 """Metres from the world's origin within which a robot can be."""
 MAX_BEAMS = 100_000
+ENDINGS = (".clf", ".log", ".clf.bz2", ".log.bz2")
+LONGEST = 1 << 20
+"""Bytes of a line; what is longer is no line of a log."""
+SMALL, PACKED_BEST = 1 << 18, 100
+"""A packed log may become so many bytes, or so many for each of its own; text packs to a tenth."""
+NO_ECHO_MEANS = {"unknown": np.nan, "free": np.inf}
+OFFSETS = {"robot_frontlaser_offset", "robot_front_laser_offset", "frontlaser_offset"}
+
+
+class CarmenLog:
+    """Scans (FLASER, ROBOTLASER1) of a CARMEN log, with the robot's raw odometry as poses.
+
+    The mount is PARAM robot_frontlaser_offset (metres forward), in ROBOTLASER1 the difference of its two poses. Stamps
+    are `ipc_timestamp`, which is what `.relations` files name. Lines that do not make sense are left out, counted and
+    named in `notes`. `frames` is empty, `truth` unknown.
+    Raises SourceError where the file cannot be read or holds no scan.
+    """
+
+    def __init__(self, where: str):
+        location, given = parameters.split(where)
+        options = Options(**parameters.typed(given, parameters.defaults(Options)))
+        path = Path(location)
+        self.name = path.name.partition(".")[0]
+        self.damaged: list[str] = []
+        found = _readings(path, self.damaged)
+        self._readings = sorted(found, key=lambda reading: reading.stamp_ns)
+        if not self._readings:
+            raise SourceError(f"{path}: holds no scan (FLASER or ROBOTLASER1 line)")
+        self._max_range = options.max_range or self._readings[0].max_range or _no_echo(self._readings)
+        self.notes = tuple(_notes(path, self.damaged, self._max_range, options.no_echo))
+        self.scans: Sequence[Scan] = _Scans(self._readings, self._max_range, NO_ECHO_MEANS[options.no_echo])
+        self.frames: Sequence[Frame] = ()
+        self.truth: Poses | None = None
+
+    @classmethod
+    def recognises(cls, where: str) -> bool:
+        """Tell whether the name ends like a CARMEN log's."""
+        return str(where).partition("?")[0].lower().endswith(ENDINGS)
+
+
+@dataclass(frozen=True)
+class Options:
+    """What may stand behind the file's name, as in `aces.clf.bz2?max_range=40`.
+
+    max_range: metres from which on a range says "no echo"; 0: what the file says, else what its numbers say: the least
+        of 50 m and 81.9 m (a SICK's "no echo") that the log holds as such.
+    no_echo: what that means: `unknown`, since black and dazzling things give no echo either, or `free` up to there.
+    """
+
+    max_range: float = 0.0
+    no_echo: str = "unknown"
+
+    def __post_init__(self) -> None:
+        if self.max_range < 0:
+            raise SourceError(f"max_range={self.max_range:g} must be a positive number")
+        if self.no_echo not in NO_ECHO_MEANS:
+            raise SourceError(f"no_echo={self.no_echo} must be {' or '.join(NO_ECHO_MEANS)}")
 
 
 class DamagedLine(ValueError):  # noqa: N818 - reads as what happened
@@ -116,65 +173,6 @@ def _angles(beams: int) -> tuple[float, float]:
         raise DamagedLine("FLASER without ranges")
     steps = beams - 1 if beams % 2 or beams < 3 else beams
     return -math.pi / 2, math.pi / max(steps, 1)
-
-
-ENDINGS = (".clf", ".log", ".clf.bz2", ".log.bz2")
-LONGEST = 1 << 20
-"""Bytes of a line; what is longer is no line of a log."""
-SMALL, PACKED_BEST = 1 << 18, 100
-"""A packed log may become so many bytes, or so many for each of its own; text packs to a tenth."""
-NO_ECHO_MEANS = {"unknown": np.nan, "free": np.inf}
-OFFSETS = {"robot_frontlaser_offset", "robot_front_laser_offset", "frontlaser_offset"}
-
-
-@dataclass(frozen=True)
-class Options:
-    """What may stand behind the file's name, as in `aces.clf.bz2?max_range=40`.
-
-    max_range: metres from which on a range says "no echo"; 0: what the file says, else what its numbers say: the least
-        of 50 m and 81.9 m (a SICK's "no echo") that the log holds as such.
-    no_echo: what that means: `unknown`, since black and dazzling things give no echo either, or `free` up to there.
-    """
-
-    max_range: float = 0.0
-    no_echo: str = "unknown"
-
-    def __post_init__(self) -> None:
-        if self.max_range < 0:
-            raise SourceError(f"max_range={self.max_range:g} must be a positive number")
-        if self.no_echo not in NO_ECHO_MEANS:
-            raise SourceError(f"no_echo={self.no_echo} must be {' or '.join(NO_ECHO_MEANS)}")
-
-
-class CarmenLog:
-    """Scans (FLASER, ROBOTLASER1) of a CARMEN log, with the robot's raw odometry as poses.
-
-    The mount is PARAM robot_frontlaser_offset (metres forward), in ROBOTLASER1 the difference of its two poses. Stamps
-    are `ipc_timestamp`, which is what `.relations` files name. Lines that do not make sense are left out, counted and
-    named in `notes`. `frames` is empty, `truth` unknown.
-    Raises SourceError where the file cannot be read or holds no scan.
-    """
-
-    def __init__(self, where: str):
-        location, given = parameters.split(where)
-        options = Options(**parameters.typed(given, parameters.defaults(Options)))
-        path = Path(location)
-        self.name = path.name.partition(".")[0]
-        self.damaged: list[str] = []
-        found = _readings(path, self.damaged)
-        self._readings = sorted(found, key=lambda reading: reading.stamp_ns)
-        if not self._readings:
-            raise SourceError(f"{path}: holds no scan (FLASER or ROBOTLASER1 line)")
-        self._max_range = options.max_range or self._readings[0].max_range or _no_echo(self._readings)
-        self.notes = tuple(_notes(path, self.damaged, self._max_range, options.no_echo))
-        self.scans: Sequence[Scan] = _Scans(self._readings, self._max_range, NO_ECHO_MEANS[options.no_echo])
-        self.frames: Sequence[Frame] = ()
-        self.truth: Poses | None = None
-
-    @classmethod
-    def recognises(cls, where: str) -> bool:
-        """Tell whether the name ends like a CARMEN log's."""
-        return str(where).partition("?")[0].lower().endswith(ENDINGS)
 
 
 class _Scans(Sequence[Scan]):

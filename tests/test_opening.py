@@ -74,3 +74,8 @@ def test_each_layout_is_recognised_by_one_kind_only(tmp_path):
     places = {"seven_scenes": str(tmp_path / "seven_scenes"), "tum": str(tmp_path / "tum"), "simulation": "sim:room"}
     for name, where in places.items():
         assert [kind for kind in SOURCES if find("sources", SOURCES, kind).recognises(where)] == [name]
+
+
+def test_images_of_a_camera_pair_are_opened_through_the_pair(tmp_path):
+    folder = record(Simulation("sim:box?image_width=32&frames=3"), tmp_path / "pair").track and tmp_path / "pair"
+    assert len(open_images(folder, "1:")) == 2

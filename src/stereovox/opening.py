@@ -53,7 +53,7 @@ def open_source(path_or_name: str | os.PathLike[str], frames: str | None = None)
     where = os.fspath(path_or_name)
     if frames is not None:
         parse_slice(frames)  # a slip of the pen shows before a long recording is opened
-    source = _opened(where)
+    source = _open(_recognise(where), where)
     return source if frames is None else Selection(source, frames)
 
 
@@ -65,7 +65,7 @@ def open_stream(path_or_name: str | os.PathLike[str], frames: str | None = None)
     Raises SourceError as `open_source`.
     """
     where = os.fspath(path_or_name)
-    live = _live(where)
+    live = _live_class(where)
     if live is None:
         return open_source(where, frames)
     if frames is not None:
@@ -82,11 +82,11 @@ def open_images(path_or_name: str | os.PathLike[str], frames: str | None = None)
     from stereovox.sources.tum import StampedImages
 
     where = os.fspath(path_or_name)
-    if _live(where):
+    if _live_class(where):
         return open_stream(where, frames)
     stamped = StampedImages.recognises(where) and not os.path.isfile(os.path.join(where, FILE))
     kind: Any = StampedImages if stamped else _recognise(where)
-    source = kind.depth_only(where)
+    source = _open(kind, where) if _is_composite(kind) else kind.depth_only(where)
     return source if frames is None else Selection(source, frames)
 
 
@@ -126,40 +126,44 @@ def open_robot(where: str | os.PathLike[str]) -> Robot:
 
 def is_recording(path: str | os.PathLike[str]) -> bool:
     """Tell whether `path` is a folder or file that `open_source` knows."""
-    return any(kind.recognises(os.fspath(path)) for kind in _kinds())
+    return any(kind.recognises(os.fspath(path)) for kind in _classes())
 
 
 def _depth_of(where: str) -> DepthSource:
     """Return the depth images of a recording that is made of no others."""
-    for kind in _kinds():
-        if not getattr(kind, "opens_others", False) and kind.recognises(where):
+    for kind in _classes():
+        if not _is_composite(kind) and kind.recognises(where):
             return kind.depth_only(where)
     raise SourceError(f"{where}: no depth images; name a folder with depth.txt or depth/, or a recording, as 'depth'")
 
 
-def _kinds() -> Iterator[Any]:
+def _classes() -> Iterator[Any]:
     """Yield the classes of recordings, one by one: what is not needed is not imported."""
     return (registry.find("sources", SOURCES, name) for name in registry.names("sources", SOURCES))
 
 
-def _live(where: str) -> Any:
+def _live_class(where: str) -> Any:
     """Return the class of the live camera that `where` names, if it does."""
     kinds = (registry.find("streams", STREAMS, name) for name in registry.names("streams", STREAMS))
     return next((kind for kind in kinds if kind.recognises(where)), None)
 
 
-def _opened(where: str) -> Any:
-    kind = _recognise(where)
-    return kind(where, open_depth) if getattr(kind, "opens_others", False) else kind(where)
+def _open(kind: Any, where: str) -> Any:
+    """Return the source of class `kind`; a composite one is handed what opens its parts."""
+    return kind(where, open_depth) if _is_composite(kind) else kind(where)
+
+
+def _is_composite(kind: Any) -> bool:
+    return getattr(kind, "composite", False)
 
 
 def _recognise(where: str) -> Any:
     kinds = []
-    for kind in _kinds():
+    for kind in _classes():
         kinds.append(kind)
         if kind.recognises(where):
             return kind
-    if not os.path.exists(where) and not _live(where):
+    if not os.path.exists(where) and not _live_class(where):
         raise SourceError(f"{where}: no such folder or file")
     if os.path.isfile(os.path.join(where, "manifest.json")):
         raise SourceError(f"{where}: is a map, not a recording; what it was made of: stereovox info {where}")
@@ -169,7 +173,7 @@ def _recognise(where: str) -> Any:
 
 def _problem(where: str, kinds: list[Any]) -> str:
     """Return why nothing can be made of `where`, and the folder below it that was perhaps meant."""
-    if _live(where):
+    if _live_class(where):
         return "a live camera can be mapped, but has no frames to go back to: record it into a file first"
     if not os.path.isdir(where):
         return "is a file, but no recording of a known kind"
@@ -177,5 +181,5 @@ def _problem(where: str, kinds: list[Any]) -> str:
         below = sorted(entry.path for entry in os.scandir(where) if entry.is_dir())
     except OSError as error:
         return f"{error.strerror}, so it cannot be listed"
-    meant = next((folder for folder in below for kind in kinds if kind.recognises(folder)), None)
-    return "not a recording of a known layout" + (f" (did you mean {meant}?)" if meant else "")
+    likely = next((folder for folder in below for kind in kinds if kind.recognises(folder)), None)
+    return "not a recording of a known layout" + (f" (did you mean {likely}?)" if likely else "")

@@ -15,9 +15,9 @@ from stereovox.se3 import Transform, inverse, orthonormalise, rotation_matrix, r
 
 PLANE_REACH = 0.12
 """Metres; points further apart do not belong together."""
-ALIKE = 0.9
+MIN_NORMAL_COSINE = 0.9
 """Least cosine of the angle between two normals that belong together."""
-CLOSE = 0.03
+INLIER_DISTANCE = 0.03
 """Metres; a partner counts as found when it lies no further off the plane."""
 STEPS = 10
 VARIETY = 0.02
@@ -28,7 +28,7 @@ CELL = 0.08
 """Metres; points nearer to each other than this are merged."""
 REACH = 0.3
 """Metres; points further apart do not belong together."""
-FEWEST = 200
+MIN_POINTS = 200
 """Points an image needs."""
 INLIERS = 0.55
 """Share of the points that must find a partner."""
@@ -57,7 +57,7 @@ def camera_motion(clouds: Iterable[tuple[int, NDArray[np.float64]]]) -> CameraMo
         if found:
             step = found.T if key == i - 1 else inverse(links[-2].T) @ found.T
         if not found or _is_far(found):
-            key = i if register.take(points) else -1
+            key = i if register.set_reference(points) else -1
     return CameraMotion(
         np.array(stamps, np.int64),
         np.array([link.reference for link in links], np.intp),
@@ -137,7 +137,12 @@ def refined(T: Transform, source: Surface, target: Surface, tree: Any) -> Link:
         information = (J.T * weights) @ J + 1e-6 * np.eye(6)
         change = np.asarray(np.linalg.solve(information, (J.T * weights) @ distances), float)
         covariance = usual**2 * np.linalg.inv(information) + np.diag(np.repeat(np.square(FLOOR), 3))
-        link = Link(-1, T, np.asarray(covariance, float), float((np.abs(distances) < CLOSE).sum() / len(source.points)))
+        link = Link(
+            -1,
+            T,
+            np.asarray(covariance, float),
+            float((np.abs(distances) < INLIER_DISTANCE).sum() / len(source.points)),
+        )
         T = T @ _motion(change)
         if np.abs(change).max() < 1e-5:
             break
@@ -154,7 +159,7 @@ def _equations(
     moved = source.points @ T[:3, :3].T + T[:3, 3]
     indices, squared = (np.asarray(found).ravel() for found in tree.batch_nearest_neighbor_search(moved))
     local = target.normals[indices] @ T[:3, :3]
-    alike = np.abs(np.einsum("ij,ij->i", local, source.normals)) > ALIKE
+    alike = np.abs(np.einsum("ij,ij->i", local, source.normals)) > MIN_NORMAL_COSINE
     near = alike & (squared < PLANE_REACH**2)
     local = local[near]
     gaps = target.points[indices[near]] - moved[near]
@@ -187,16 +192,16 @@ class _Registration:
         self._gicp = _small_gicp()
         self._target: Any = None
 
-    def take(self, points: NDArray[np.float64]) -> bool:
+    def set_reference(self, points: NDArray[np.float64]) -> bool:
         """Make these points the reference; False where they are too few."""
-        if len(points) < FEWEST:
+        if len(points) < MIN_POINTS:
             return False
         self._target = self._gicp.preprocess_points(points, CELL, num_neighbors=12)
         return True
 
     def against(self, points: NDArray[np.float64], guess: Transform) -> Link | None:
         """Return where the points' camera stood in the reference's frame; None where that is not certain enough."""
-        if len(points) < FEWEST:
+        if len(points) < MIN_POINTS:
             return None
         cloud, _ = self._gicp.preprocess_points(points, CELL, num_neighbors=12)
         target, tree = self._target

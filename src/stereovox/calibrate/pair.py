@@ -42,9 +42,9 @@ COLUMNS = 106
 """About how many blocks an image is wide: 8 pixels each for 848."""
 SPREAD = 0.15
 """Blocks whose inverse depths differ by more than this share of their mean lie across an edge."""
-FEWEST = 20
+MIN_IMAGES = 20
 """Registered images with trusted poses that a calibration needs."""
-REGISTERED = 0.5
+MIN_REGISTERED = 0.5
 """Share of the images that must be registered."""
 MAX_RANGE = 5.0
 """Metres; depth beyond is too noisy to register."""
@@ -177,7 +177,7 @@ def _best(motion: CameraMotion, track: PoseTrack, offsets: list[Offset]) -> tupl
     """Return what fits best of all that the angular speeds allow; where a camera sits tells the false ones."""
     tried = [(found, rough.correlation) for rough in offsets if (found := _refined(motion, track, rough.seconds))]
     if not tried:
-        raise StereovoxError(f"poses: fewer than {FEWEST} images have trusted poses; record for longer, or slower")
+        raise StereovoxError(f"poses: fewer than {MIN_IMAGES} images have trusted poses; record for longer, or slower")
     tried.sort(key=lambda one: one[0].misfit)
     if len(tried) > 1 and tried[1][0].misfit < UNIQUE * tried[0][0].misfit:
         apart = abs(tried[1][0].offset - tried[0][0].offset)
@@ -189,7 +189,7 @@ def _best(motion: CameraMotion, track: PoseTrack, offsets: list[Offset]) -> tupl
 
 def _refined(motion: CameraMotion, track: PoseTrack, offset: float) -> Refined | None:
     pairs = usable_pairs(motion, track, offset)
-    if len(pairs.first) < FEWEST:
+    if len(pairs.first) < MIN_IMAGES:
         return None
     return refine(pairs, track, offset, hand_eye(tracker_motion(pairs, track, offset), pairs.T_first_second))
 
@@ -209,7 +209,7 @@ def _clouds(
 
 def _check_depth(motion: CameraMotion, depth: DepthSource) -> None:
     registered = int((motion.reference >= 0).sum())
-    if registered < max(FEWEST, REGISTERED * len(depth)):
+    if registered < max(MIN_IMAGES, MIN_REGISTERED * len(depth)):
         raise StereovoxError(
             f"{depth.name}: only {registered} of {len(depth)} depth images could be registered with another; film "
             f"corners and furniture within {MAX_RANGE:g} m, for at least some seconds, and move slowly"

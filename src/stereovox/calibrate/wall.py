@@ -28,11 +28,11 @@ SIMPLEST_FIRST = ("scale", "disparity", "scale+disparity")
 MODELS = ("auto", *SIMPLEST_FIRST, "thesis")
 SAMPLES = 20_000
 """Pixels of each wall that are fitted; its figures are of all."""
-MISTAKEN = 0.2
+MAX_DISTANCE_ERROR = 0.2
 """A measured distance that is off by a larger share of what the camera sees belongs to another wall."""
-ALIKE = 1.1
+SAME_DISTANCE = 1.1
 """Distances whose ratio is smaller count as one."""
-SIMPLER = 1.1
+SIMPLER_FACTOR = 1.1
 """A simpler model is taken unless its error on walls it has not seen is so many times the best one's."""
 ROUGH = 0.01
 """Error after the correction, as a share of the depth, that the user should know about."""
@@ -156,7 +156,7 @@ def distance_groups(distances: Sequence[float]) -> list[int]:
     """Return for each distance the number of its group; distances within a tenth of the group's least are one group."""
     groups, starts = [0] * len(distances), []
     for i in np.argsort(distances):
-        if not starts or distances[i] > ALIKE * starts[-1]:
+        if not starts or distances[i] > SAME_DISTANCE * starts[-1]:
             starts.append(distances[i])
         groups[i] = len(starts) - 1
     return groups
@@ -290,7 +290,7 @@ def _check(recordings: Sequence[WallRecording], check: Sequence[WallRecording]) 
 
 def _check_distance(recording: WallRecording, wall: Wall) -> None:
     given = recording.distance
-    if given is not None and abs(wall.distance / given - 1) > MISTAKEN:
+    if given is not None and abs(wall.distance / given - 1) > MAX_DISTANCE_ERROR:
         raise StereovoxError(
             f"{recording.name}: the camera sees the wall at {wall.distance:.2f} m, not near {given:g} m; "
             "check the distances and their order"
@@ -341,7 +341,7 @@ def _choose(scores: dict[str, dict[str, float]], groups: Sequence[int]) -> tuple
             "changes a depth by a larger share than here. Record a second distance to find out"
         )
     best = min(unseen.values())
-    chosen = next(model for model, error in unseen.items() if error <= SIMPLER * best)
+    chosen = next(model for model, error in unseen.items() if error <= SIMPLER_FACTOR * best)
     distances = len(set(groups))
     return chosen, f"of {distances} distances, each left out in turn, it predicts the left out one best or as well"
 

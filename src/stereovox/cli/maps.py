@@ -56,11 +56,11 @@ def open_grid(path: str) -> OccupancyGrid:
 
 def check_not_its_own(file: str, path: str) -> None:
     """Raise StereovoxError where writing `file` would destroy the map at `path`, whose cells lie in a picture."""
-    from stereovox.formats.map_server import read_meaning
+    from stereovox.formats.map_server import read_metadata
 
     own = [Path(path), Path(path).with_suffix(".png")]
     if Path(path).suffix.lower() in (".yaml", ".yml"):
-        own = [read_meaning(Path(path)).image]
+        own = [read_metadata(Path(path)).image]
     if os.path.realpath(file) in map(os.path.realpath, own):
         raise StereovoxError(f"{file}: holds the cells of the map {path}; give the picture another name")
 

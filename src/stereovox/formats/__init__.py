@@ -22,7 +22,7 @@ IMPORTS = {
     ".db3": "stereovox.formats.bags:read_bag_map",
 }
 """File ending -> reader `(path) -> VoxelMap`; other packages add theirs as entry points `stereovox.import`."""
-TAKES = {
+OPTIONS = {
     "voxel_size": (".ply", ".pcd", ".bag", ".mcap", ".db3"),
     "topic": (".bag", ".mcap", ".db3"),
 }
@@ -49,7 +49,7 @@ FLAT = (".pgm", ".png", ".yaml")
 """Endings of 2-D maps, whose writer takes `heights` and `inflate` too."""
 BAGS = (".bag", ".mcap", ".db3")
 """Endings of recordings of ROS, with a 2-D map in them, whose writer takes `heights` too."""
-__all__ = ["BAGS", "EXPORTS", "FLAT", "export", "read_octomap"]
+__all__ = ["BAGS", "EXPORTS", "FLAT", "IMPORTS", "export", "import_map", "read_octomap"]
 
 
 def export(
@@ -90,10 +90,10 @@ def import_map(path: str | Path, voxel_size: float | None = None, topic: str | N
     known = registry.names("import", IMPORTS)
     if ending not in known:
         raise StereovoxError(f"{path}: cannot import '{ending}'; the file's name ends in one of {', '.join(known)}")
-    told = {"voxel_size": voxel_size, "topic": topic}
-    given = {name: value for name, value in told.items() if value is not None}
+    options = {"voxel_size": voxel_size, "topic": topic}
+    given = {name: value for name, value in options.items() if value is not None}
     for name in given:
-        if ending not in TAKES[name]:
+        if ending not in OPTIONS[name]:
             option = f"--{name.replace('_', '-')}"
             raise StereovoxError(f"{path}: {option} says nothing about a '{ending}'; leave it out")
     return registry.find("import", IMPORTS, ending)(path, **given)

@@ -31,7 +31,7 @@ from stereovox.threads import one_state
 
 MAP_FRAME, CELLS_FRAME = "map", "map_cells"
 """Names of the frame whose z is up, and of that of the cells where another axis is up in it."""
-Made = TypeVar("Made")
+MapT = TypeVar("MapT")
 
 
 @one_state
@@ -107,7 +107,7 @@ def _octomap_cells(wire: Wire) -> VoxelMap:
     return map_of_nodes(BINARY_TITLE if message.binary else TREE_TITLE, message.data, message.resolution)
 
 
-def _last(path: Path, topic: str | None, readers: dict[str, Callable[[Wire], Made]]) -> Made:
+def _last(path: Path, topic: str | None, readers: dict[str, Callable[[Wire], MapT]]) -> MapT:
     """Return what its type's reader makes of a topic's last message; None: the only topic of the first type."""
     try:
         bag = open_bag(path)

@@ -49,11 +49,11 @@ def read_map_server(path: str | Path) -> OccupancyGrid:
     (map_server 1.17, image_loader.cpp. nav2_map_server scales by 100 and rounds, and negates no raw maps.)
     Raises MapFileError: one line with the file and what is wrong.
     """
-    meaning = read_meaning(_yaml_of(Path(path)))
-    cells = np.ascontiguousarray(_cells(read_picture(meaning.image), meaning)[::-1])
-    if meaning.mode != "raw":
-        return OccupancyGrid(cells, meaning.resolution, meaning.origin)
-    return OccupancyGrid(cells, meaning.resolution, meaning.origin, meaning.free_thresh, meaning.occupied_thresh)
+    metadata = read_metadata(_yaml_of(Path(path)))
+    cells = np.ascontiguousarray(_cells(read_picture(metadata.image), metadata)[::-1])
+    if metadata.mode != "raw":
+        return OccupancyGrid(cells, metadata.resolution, metadata.origin)
+    return OccupancyGrid(cells, metadata.resolution, metadata.origin, metadata.free_thresh, metadata.occupied_thresh)
 
 
 def write_map_server(grid: OccupancyGrid, path: str | Path, mode: str = "trinary", negate: bool = False) -> None:
@@ -82,7 +82,7 @@ def write_map_server(grid: OccupancyGrid, path: str | Path, mode: str = "trinary
         replacing(spare) as picture_between,
     ):
         for file, name in ((text, image), (text_between, spare)):
-            file.write(Meaning(name, grid.resolution, grid.origin, negate, occupied, free, mode).text().encode())
+            file.write(Metadata(name, grid.resolution, grid.origin, negate, occupied, free, mode).text().encode())
         for file in (picture, picture_between):
             if png:
                 write_png(file, pixels, opaque)
@@ -110,7 +110,7 @@ def write_grid(
 
 
 @dataclass(frozen=True)
-class Meaning:
+class Metadata:
     """What a map's picture means.
 
     image: the picture. resolution: side of a cell in metres. origin: x, y in metres and yaw of its lower left corner.
@@ -135,7 +135,7 @@ class Meaning:
         )
 
 
-def read_meaning(path: Path) -> Meaning:
+def read_metadata(path: Path) -> Metadata:
     """Return what the .yaml `path` says; `image` is relative to it. Raises MapFileError, one line, for all else."""
     try:
         if path.is_dir():
@@ -144,16 +144,16 @@ def read_meaning(path: Path) -> Meaning:
             )
         if not path.is_file():
             raise MapFileError(f"{path}: no such file; give the .yaml of a map_server map")
-        says: Any = yaml_value(read_bounded(path, MAX_YAML))
+        fields: Any = yaml_value(read_bounded(path, MAX_YAML))
     except OSError as error:
         raise MapFileError(f"{path}: cannot be read ({error.strerror or error})") from None
     except MapFileError:
         raise
     except ValueError as error:
         raise MapFileError(f"{path}: is no YAML ({str(error)[:200]})") from None
-    if not isinstance(says, dict) or not any(name in says for name in NEEDED):
+    if not isinstance(fields, dict) or not any(name in fields for name in NEEDED):
         raise MapFileError(f"{path}: is not the .yaml of a map_server map")
-    return _checked(path, says)
+    return _checked(path, fields)
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,7 +179,7 @@ def read_picture(path: Path) -> Picture:
             raise MapFileError(f"{path}: larger than {MAX_BYTES} bytes; no map is")
         with path.open("rb") as file:
             kind = file.read(2)
-        return Picture(_read_pgm(path)) if kind in (b"P5", b"P2") else _read_other(path)
+        return Picture(_read_pgm(path)) if kind in (b"P5", b"P2") else _read_with_pillow(path)
     except OSError as error:
         raise MapFileError(f"{path}: cannot be read ({error.strerror or error})") from None
 
@@ -201,11 +201,11 @@ def write_png(file: IO[bytes], pixels: NDArray[np.uint8], opaque: NDArray[np.boo
     Image.fromarray(np.ascontiguousarray(pixels)).save(file, "PNG", compress_level=1)
 
 
-def _checked(path: Path, says: dict[Any, Any]) -> Meaning:
-    missing = [name for name in NEEDED if name not in says]
+def _checked(path: Path, fields: dict[Any, Any]) -> Metadata:
+    missing = [name for name in NEEDED if name not in fields]
     if missing:
         raise MapFileError(f"{path}: has no '{missing[0]}', which the .yaml of a map_server map needs")
-    mode, origin, image = says.get("mode", MODES[0]), says["origin"], says["image"]
+    mode, origin, image = fields.get("mode", MODES[0]), fields["origin"], fields["image"]
     if mode not in MODES:
         raise MapFileError(f"{path}: mode '{mode}'{did_you_mean(str(mode), MODES)}")
     if not isinstance(origin, list) or len(origin) != 3:
@@ -214,13 +214,13 @@ def _checked(path: Path, says: dict[Any, Any]) -> Meaning:
         raise MapFileError(f"{path}: image {shown(image)}; give the name of the picture")
     x, y, yaw = (_number(path, "origin", number) for number in origin)
     resolution, occupied, free, negate = (
-        _number(path, name, says[name]) for name in ("resolution", "occupied_thresh", "free_thresh", "negate")
+        _number(path, name, fields[name]) for name in ("resolution", "occupied_thresh", "free_thresh", "negate")
     )
     if not resolution > 0:
         raise MapFileError(f"{path}: resolution {resolution:g}; cells have a side above 0 metres")
     if not 0 <= free < occupied <= 1:
         raise MapFileError(f"{path}: free_thresh {free:g} and occupied_thresh {occupied:g} must rise, from 0 to 1")
-    return Meaning(path.parent / image, resolution, (x, y, yaw), bool(negate), occupied, free, str(mode))
+    return Metadata(path.parent / image, resolution, (x, y, yaw), bool(negate), occupied, free, str(mode))
 
 
 def _number(path: Path, name: str, value: Any) -> float:
@@ -285,7 +285,7 @@ def _words(data: bytes, at: int, count: int, white: int) -> NDArray[Any]:
     return np.minimum(numbers, white).astype(np.uint8 if white < 256 else np.uint16)
 
 
-def _read_other(path: Path) -> Picture:
+def _read_with_pillow(path: Path) -> Picture:
     from PIL import Image
 
     try:
@@ -330,12 +330,12 @@ def _damaged(path: Path, why: str) -> MapFileError:
     return MapFileError(f"{path}: damaged or no picture ({why}); save the map anew")
 
 
-def _cells(picture: Picture, meaning: Meaning) -> NDArray[np.int8]:
-    if meaning.mode == "trinary" and picture.with_opacity is not None:
-        return _percent(picture.with_opacity, None, meaning)
+def _cells(picture: Picture, metadata: Metadata) -> NDArray[np.int8]:
+    if metadata.mode == "trinary" and picture.with_opacity is not None:
+        return _percent(picture.with_opacity, None, metadata)
     if picture.brightness.dtype == np.uint8:
-        return _through(_percent(np.arange(256.0), None, meaning), picture.brightness).view(np.int8)
-    return _percent(picture.brightness, picture.see_through, meaning)
+        return _through(_percent(np.arange(256.0), None, metadata), picture.brightness).view(np.int8)
+    return _percent(picture.brightness, picture.see_through, metadata)
 
 
 def _through(table: NDArray[Any], cells: NDArray[Any]) -> NDArray[np.uint8]:
@@ -343,17 +343,17 @@ def _through(table: NDArray[Any], cells: NDArray[Any]) -> NDArray[np.uint8]:
     return np.frombuffer(cells.tobytes().translate(table.tobytes()), np.uint8).reshape(cells.shape)
 
 
-def _percent(brightness: NDArray[Any], see_through: NDArray[np.bool_] | None, meaning: Meaning) -> NDArray[np.int8]:
-    brightness = 255 - brightness if meaning.negate else brightness
-    if meaning.mode == "raw":
+def _percent(brightness: NDArray[Any], see_through: NDArray[np.bool_] | None, metadata: Metadata) -> NDArray[np.int8]:
+    brightness = 255 - brightness if metadata.negate else brightness
+    if metadata.mode == "raw":
         value = np.floor(brightness)
         return np.where(value <= 100, value, UNKNOWN).astype(np.int8)
     p, between = (255 - brightness) / 255, np.float64(UNKNOWN)
-    if meaning.mode == "scale":
-        between = np.trunc(99 * ((p - meaning.free_thresh) / (meaning.occupied_thresh - meaning.free_thresh)))
+    if metadata.mode == "scale":
+        between = np.trunc(99 * ((p - metadata.free_thresh) / (metadata.occupied_thresh - metadata.free_thresh)))
         between = between if see_through is None else np.where(see_through, UNKNOWN, between)
-    free = np.where(p < meaning.free_thresh, 0, between)
-    return np.where(p > meaning.occupied_thresh, 100, free).astype(np.int8)
+    free = np.where(p < metadata.free_thresh, 0, between)
+    return np.where(p > metadata.occupied_thresh, 100, free).astype(np.int8)
 
 
 def _greys(grid: OccupancyGrid, mode: str) -> tuple[NDArray[np.uint8], float, float]:

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 GROUP = 8
 """Blocks along each side of the cubes of the map that are looked at one by one."""
-LEAST = 0.05
+MIN_OFFSET = 0.05
 """Part of the way from one cell's middle to the next by which a vertex keeps away from both."""
 SPAN = 1 << 21
 """Corners of cells on each axis that three of them fit into one int64."""
@@ -174,7 +174,7 @@ def _field(voxel_map: VoxelMap, corner: NDArray[np.int32]) -> NDArray[np.float32
     level = int(rules.thresholds.occupied_least) - 0.5
     span = max(float(rules.highest) - level, level - float(rules.lowest))
     field = np.where(cells == rules.format.unknown, -span, cells - level)
-    field = np.sign(field) * np.maximum(np.abs(field), LEAST * span)
+    field = np.sign(field) * np.maximum(np.abs(field), MIN_OFFSET * span)
     whole = field.reshape(side, side, side, SIDE, SIDE, SIDE).transpose(0, 3, 1, 4, 2, 5).reshape((side * SIDE,) * 3)
     return whole[(slice(0, GROUP * SIDE + 1),) * 3].astype(np.float32)
 
@@ -185,7 +185,7 @@ def _names(vertices: NDArray[np.float64]) -> NDArray[np.int64]:
     Twice the place of its middle: so one that stands on no edge, of which a cube has at most one, has its own name.
     """
     whole = np.rint(vertices)
-    return (np.where(np.abs(vertices - whole) < LEAST / 2, 2 * whole, 2 * np.floor(vertices) + 1)).astype(np.int64)
+    return (np.where(np.abs(vertices - whole) < MIN_OFFSET / 2, 2 * whole, 2 * np.floor(vertices) + 1)).astype(np.int64)
 
 
 def _quads(cells: NDArray[np.int64], present: NDArray[np.int64], axis: int, side: int) -> NDArray[np.int64]:

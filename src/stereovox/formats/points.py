@@ -106,7 +106,7 @@ def _ply_header(number: int, voxel_size: float) -> str:
     lines = [
         "ply",
         "format binary_little_endian 1.0",
-        f"comment {_told(voxel_size)}",
+        f"comment {_format_voxel_size(voxel_size)}",
         f"element vertex {number}",
         *properties,
         "end_header",
@@ -117,7 +117,7 @@ def _ply_header(number: int, voxel_size: float) -> str:
 def _pcd_header(number: int, voxel_size: float) -> str:
     names = PCD_POINT.names or ()
     lines = [
-        f"# {_told(voxel_size)}",
+        f"# {_format_voxel_size(voxel_size)}",
         "VERSION 0.7",
         f"FIELDS {' '.join(names)}",
         f"SIZE {' '.join(str(PCD_POINT[name].itemsize) for name in names)}",
@@ -132,6 +132,6 @@ def _pcd_header(number: int, voxel_size: float) -> str:
     return "\n".join([*lines, ""])
 
 
-def _told(voxel_size: float) -> str:
+def _format_voxel_size(voxel_size: float) -> str:
     """Return what a file says of its points; `point_files` reads the size of a cell from it."""
     return f"centres of occupied cells of {voxel_size!r} m"

@@ -40,7 +40,7 @@ PLY_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"
 COLUMNS = "columns"
 """The order of packed points: all numbers of one field, little-endian, then all of the next."""
 PCD_ORDERS = {"ascii": "", "binary": "<", "binary_compressed": COLUMNS}
-PACKED_BEST = 100
+MAX_RATIO = 100
 """LZF makes at best 264 bytes of 3."""
 PCD_KINDS = {"I": "i", "U": "u", "F": "f"}
 PCD_SIZES = {"i": (1, 2, 4, 8), "u": (1, 2, 4, 8), "f": (4, 8)}
@@ -120,7 +120,7 @@ def read_points(path: str | Path) -> Points:
     try:
         content = read_bounded(Path(path), MAX_BYTES)
         head = (_ply_head if content.startswith(b"ply") else _pcd_head)(content)
-        return Points(_xyz(content[head.start :], head), _told_size(content[: head.start]))
+        return Points(_xyz(content[head.start :], head), _parse_voxel_size(content[: head.start]))
     except OSError as error:
         raise MapFileError(f"{path}: cannot be read ({error.strerror or error}); name a file of points") from None
     except (ValueError, ConfigError) as error:
@@ -221,7 +221,7 @@ def _packed_xyz(body: bytes, head: _Head, names: list[str]) -> NDArray[np.float6
     types = [np.dtype((f"<{kind}", (n,))) for _, kind, n in head.record]
     starts = np.cumsum([0, *(head.number * kind.itemsize for kind in types)]).tolist()
     size, whole = np.frombuffer(body[:8], "<u4").tolist() if len(body) >= 8 else (0, -1)
-    if whole != starts[-1] or size > len(body) - 8 or whole > PACKED_BEST * size:
+    if whole != starts[-1] or size > len(body) - 8 or whole > MAX_RATIO * size:
         raise ValueError(f"{head.number} points in {starts[-1]} bytes, packed in {len(body) - 8} bytes, cannot be")
     columns = np.empty(whole, np.uint8)
     if unpack(np.frombuffer(body, np.uint8, size, 8), columns) != whole:
@@ -259,7 +259,7 @@ def _numbers(text: bytes, most: int) -> Iterator[NDArray[np.float64]]:
         start, most = end, most - len(words)
 
 
-def _told_size(head: bytes) -> float | None:
+def _parse_voxel_size(head: bytes) -> float | None:
     found = OURS.search(head.decode("ascii", "replace"))
     try:
         return float(found[1]) if found else None

@@ -25,13 +25,13 @@ from stereovox.safe_io import replacing
 from stereovox.se3 import Transform
 from stereovox.threads import one_state
 
-CAMERA, CELLS, WAY = "world/camera", "world/occupied", "world/path"
+CAMERA, CELLS, PATH = "world/camera", "world/occupied", "world/path"
 TIME = "stamp"
 MAX_BOXES = 300_000
 """More cells than this are written as points."""
 WIDEST_PX = 320
 """Depth images are thinned to so many columns."""
-REST = 25
+REWRITE_RATIO = 25
 """Times as long as writing the map took must pass before it is written again."""
 PATH_COLOUR = (224, 69, 47)
 
@@ -84,7 +84,7 @@ class RerunFile:
         self._stream.log(CELLS, self._cells(centres, cell_colours(cubes, centres), size), static=stamp_ns is None)
         lines = [poses[:, :3, 3] for poses in map(voxel_map.history.path.poses, voxel_map.history.path.stops)]
         way = self._rerun.LineStrips3D(lines, colors=[PATH_COLOUR] * len(lines))
-        self._stream.log(WAY, way, static=stamp_ns is None)
+        self._stream.log(PATH, way, static=stamp_ns is None)
 
     def add_camera(self, camera: PinholeCamera | None, T_world_camera: Transform, stamp_ns: int) -> None:
         """Add where a camera stood at a time."""
@@ -138,7 +138,7 @@ class RerunLog:
         if start >= self._due:
             self._file.add_map(voxel_map.snapshot(), int(frame.stamp_ns))
             done = monotonic()
-            self._due = done + REST * (done - start)
+            self._due = done + REWRITE_RATIO * (done - start)
 
     def finish(self, voxel_map: VoxelMap) -> None:
         """Write the map as it is when the last frame is in it."""

@@ -11,7 +11,7 @@ from stereovox.errors import StereovoxError
 from stereovox.maps import State, VoxelMap
 from stereovox.maps.cell_format import CellRules
 from stereovox.maps.voxel_map import cells_where
-from stereovox.products.side_by_side import put_times
+from stereovox.products.side_by_side import set_times
 from stereovox.threads import one_state
 
 Parents = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.uint32]]
@@ -34,7 +34,7 @@ def coarsen(voxel_map: VoxelMap, factor: int) -> VoxelMap:
     sure = (number == int(factor) ** 3) | (CellRules(voxel_map.config.map).states(stored) != State.FREE)
     coarse = VoxelMap.from_cells(settings, indices[sure], voxel_map.cell_format.log_odds(stored[sure]))
     if settings.map.keep_times:
-        put_times(coarse, indices[sure], times[sure], voxel_map.times_start_ns)
+        set_times(coarse, indices[sure], times[sure], voxel_map.times_start_ns)
     coarse.take_history(voxel_map)
     return coarse
 

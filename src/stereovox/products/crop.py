@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from stereovox.errors import StereovoxError
 from stereovox.maps import VoxelMap
 from stereovox.maps.blocks import CELLS, SIDE
-from stereovox.products.side_by_side import take
+from stereovox.products.side_by_side import add_blocks
 from stereovox.threads import one_state
 
 
@@ -27,7 +27,7 @@ def crop(voxel_map: VoxelMap, low: ArrayLike, high: ArrayLike) -> VoxelMap:
         touched = ((coords * SIDE < beyond) & ((coords + 1) * SIDE > first)).all(axis=1)
         coords, cells = coords[touched], cells[touched]
         inside = _inside(coords, first, beyond)
-        take(cropped, voxel_map, coords, np.where(inside, cells, cells.dtype.type(voxel_map.cell_format.unknown)))
+        add_blocks(cropped, voxel_map, coords, np.where(inside, cells, cells.dtype.type(voxel_map.cell_format.unknown)))
     cropped.take_history(voxel_map)
     return cropped
 

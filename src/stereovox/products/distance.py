@@ -66,7 +66,7 @@ class DistanceField:
         self._transform = Transform(tuple(shape.tolist()), self._cell, max_distance, MEASURES[measure])
         blocks = ((self._low + shape - 1) >> 3) - (self._low >> 3) + 1
         self._seen = np.zeros((int(blocks.prod()), CELLS), np.uint8)
-        self._shape, self._made = shape, False
+        self._shape, self._refreshed = shape, False
         if not self._follows or voxel_map.viewpoint is not None:
             self.update()
 
@@ -86,7 +86,7 @@ class DistanceField:
                     self._follow()
                 changed, dirty = self._refresh()
             self._transform.update(dirty, self._map.config.threads)
-            self._made = True
+            self._refreshed = True
             return changed
 
     @property
@@ -200,7 +200,7 @@ class DistanceField:
         assert self._map.viewpoint is not None
         camera = self._map.viewpoint.T_world_camera[:3, 3] / self._cell
         away = np.abs(camera - (self._low + self._shape / 2))
-        if not self._made or (away > np.maximum(TRIGGER * self._shape, SIDE)).any():
+        if not self._refreshed or (away > np.maximum(TRIGGER * self._shape, SIDE)).any():
             self._low = SIDE * np.rint((camera - self._shape / 2) / SIDE).astype(np.int64)
 
 

@@ -25,7 +25,7 @@ from stereovox.threads import one_state
 if TYPE_CHECKING:
     from scipy.spatial import KDTree
 
-LOOKS = 32
+MAX_VIEWPOINTS = 32
 """Cells from which a view of a frontier is tried."""
 NOT_FREE = (State.UNKNOWN, State.TENTATIVE, State.OCCUPIED)
 
@@ -87,14 +87,14 @@ def write_frontiers(found: Sequence[Frontier], path: str | Path) -> None:
     Arrays: `cells` (N, 3) int32, `frontier` (N,) int32 the number of the one each is of; `centroid` (K, 3) and
     `look_from` (K, 3) in metres, NaN where there is none. Raises MapFileError when the place cannot be written.
     """
-    nowhere = np.full(3, np.nan)
+    no_viewpoint = np.full(3, np.nan)
     with replacing(path) as file:
         np.savez_compressed(
             file,
             cells=np.concatenate([np.empty((0, 3), np.int32), *(one.cells for one in found)]),
             frontier=np.repeat(np.arange(len(found), dtype=np.int32), [len(one.cells) for one in found]),
             centroid=np.reshape([one.centroid for one in found], (-1, 3)),
-            look_from=np.reshape([nowhere if one.look_from is None else one.look_from for one in found], (-1, 3)),
+            look_from=np.reshape([no_viewpoint if one.look_from is None else one.look_from for one in found], (-1, 3)),
         )
 
 
@@ -158,14 +158,14 @@ def _frontier(voxel_map: VoxelMap, cells: NDArray[np.int32], reached: KDTree) ->
     points = voxel_map.centers(cells)
     centroid = points.mean(axis=0)
     middle = points[np.argmin(((points - centroid) ** 2).sum(axis=1))]
-    return Frontier(cells, centroid, _look_at(voxel_map, middle, reached))
+    return Frontier(cells, centroid, _viewpoint(voxel_map, middle, reached))
 
 
-def _look_at(voxel_map: VoxelMap, point: NDArray[np.float64], reached: KDTree) -> NDArray[np.float64] | None:
+def _viewpoint(voxel_map: VoxelMap, point: NDArray[np.float64], reached: KDTree) -> NDArray[np.float64] | None:
     """Return the nearest place that sees a point past free cells alone, of LOOKS that are nearest."""
     if not reached.n:
         return None
-    away, nearest = map(np.ravel, reached.query(point, k=min(LOOKS, reached.n)))
+    away, nearest = map(np.ravel, reached.query(point, k=min(MAX_VIEWPOINTS, reached.n)))
     for distance, place in zip(away.tolist(), reached.data[nearest], strict=True):
         if distance == 0 or np.isinf(voxel_map.cast_rays(place, point - place, distance, NOT_FREE).distance[0]):
             return place

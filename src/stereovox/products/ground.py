@@ -18,7 +18,7 @@ from stereovox.products.ground_surfaces import Floor, floor_of, ground_levels
 from stereovox.safe_io import replacing
 from stereovox.threads import one_state
 
-LEAST = 2
+MIN_REACH = 2
 """Cells on each side over which a slope is taken at least: heights come in whole cells."""
 MARGIN = 1e-3
 """Part of a cell by which boxes keep away from the cells beside them."""
@@ -122,7 +122,7 @@ def slopes(height: NDArray[np.float64], side: float, radius: float) -> NDArray[n
     """
     from scipy.ndimage import correlate1d
 
-    reach = max(int(np.ceil(min(radius / side, max(height.shape)) - 1e-9)), LEAST)  # farther off there is nothing
+    reach = max(int(np.ceil(min(radius / side, max(height.shape)) - 1e-9)), MIN_REACH)  # farther off there is nothing
     known = ~np.isnan(height)
     z = np.where(known, height - (height[known].mean() if known.any() else 0), 0.0)
     run = np.arange(-reach, reach + 1) * side

@@ -17,7 +17,7 @@ from stereovox.maps.occupancy import UNKNOWN, OccupancyGrid, Percent
 from stereovox.maps.rolling import RollingMap
 from stereovox.maps.voxel_map import EVERYWHERE
 from stereovox.products.floor_axes import Heights, floor_axes
-from stereovox.products.projection import NOTHING, Patch, layers_of, patch_of
+from stereovox.products.projection import EMPTY, Patch, layers_of, patch_of
 
 STEP = 8 * SIDE
 """The grid grows by so many cells: programs that plan in it need not make room anew with each frame."""
@@ -78,9 +78,9 @@ class LiveProjection:
         return self._shown()
 
     def _in_percent(self, patch: Patch) -> NDArray[np.int8]:
-        number = np.where(patch.marked != NOTHING, patch.marked, patch.cleared).astype(np.int32)
+        number = np.where(patch.marked != EMPTY, patch.marked, patch.cleared).astype(np.int32)
         known = self._percent.shown[np.maximum(number, self._percent.lowest) - self._percent.lowest]
-        return np.where(number == NOTHING, np.int8(UNKNOWN), known)
+        return np.where(number == EMPTY, np.int8(UNKNOWN), known)
 
     def _shown(self) -> OccupancyGrid | None:
         if not self._canvas.cells.size:

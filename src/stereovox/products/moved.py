@@ -15,7 +15,7 @@ from stereovox.maps.blocks import CELLS, SIDE
 from stereovox.maps.cell_format import CellRules
 from stereovox.maps.voxel_map import INDEX_LIMIT, cells_where
 from stereovox.products import _moved
-from stereovox.products.side_by_side import cells_at, in_memory, put_times
+from stereovox.products.side_by_side import cells_at, in_memory, set_times
 from stereovox.se3 import Transform, inverse, orthonormalise, rigidity_error, transform_points
 from stereovox.threads import one_state
 from stereovox.trust.camera_path import CameraPath, Seen
@@ -132,7 +132,7 @@ def _pushed(voxel_map: VoxelMap, T: Transform) -> VoxelMap:
     indices = np.floor(places + NEAR).astype(np.int64)
     pushed = VoxelMap.from_cells(voxel_map.config, indices, voxel_map.cell_format.log_odds(stored[order]))
     if voxel_map.config.map.keep_times:
-        put_times(pushed, indices, times[order].astype(np.uint32), voxel_map.times_start_ns)
+        set_times(pushed, indices, times[order].astype(np.uint32), voxel_map.times_start_ns)
     return pushed
 
 

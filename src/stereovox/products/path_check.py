@@ -59,12 +59,12 @@ def check_path(
     if len(points) < 2:
         raise StereovoxError(f"waypoints: {len(points)} of them make no path; give two or more")
     worst = voxel_map.check_capsules(points[:-1], points[1:], radius)
-    in_the_way = [State.OCCUPIED, State.TENTATIVE] + ([] if through_unknown else [State.UNKNOWN])
-    stopped = np.flatnonzero(np.isin(worst, in_the_way))
+    blocking = [State.OCCUPIED, State.TENTATIVE] + ([] if through_unknown else [State.UNKNOWN])
+    stopped = np.flatnonzero(np.isin(worst, blocking))
     blocked_at = None
     if len(stopped):
         lengths, first = np.linalg.norm(np.diff(points, axis=0), axis=1), stopped[0]
-        share = _free_share(voxel_map, points[first], points[first + 1], radius, in_the_way)
+        share = _free_share(voxel_map, points[first], points[first + 1], radius, blocking)
         blocked_at = float(lengths[:first].sum() + share * lengths[first])
     return PathCheck(worst, blocked_at, _oldest(voxel_map, points, radius, now_ns))
 
@@ -77,15 +77,15 @@ def point_along(waypoints: ArrayLike, metres: float) -> NDArray[np.float64]:
 
 
 def _free_share(
-    voxel_map: VoxelMap, start: NDArray[np.float64], end: NDArray[np.float64], radius: float, in_the_way: list[State]
+    voxel_map: VoxelMap, start: NDArray[np.float64], end: NDArray[np.float64], radius: float, blocking: list[State]
 ) -> float:
     """Return how much of a blocked segment, 0 to 1, the ball can go: what it touched once stays touched."""
-    if voxel_map.check_capsules(start, start, radius)[0] in in_the_way:
+    if voxel_map.check_capsules(start, start, radius)[0] in blocking:
         return 0.0
     low, high = 0.0, 1.0
     for _ in range(HALVINGS):
         middle = (low + high) / 2
-        if voxel_map.check_capsules(start, start + middle * (end - start), radius)[0] in in_the_way:
+        if voxel_map.check_capsules(start, start + middle * (end - start), radius)[0] in blocking:
             high = middle
         else:
             low = middle

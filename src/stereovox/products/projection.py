@@ -31,7 +31,7 @@ MARGIN = 1
 TILE = 64
 """Cells along each side of the boxes that a map is worked off in."""
 INFLATE_TIE = 1e-6
-NOTHING = np.iinfo(np.int16).min
+EMPTY = np.iinfo(np.int16).min
 """What a column is stored as of which nothing is known; no cell is stored so."""
 MAX_CELLS = 2**30
 """Cells of the largest grid."""
@@ -59,8 +59,8 @@ def project(voxel_map: VoxelMap, heights: Heights | None = None) -> OccupancyGri
     layers = layers_of(voxel_map, order[2], heights)
     patches = [patch_of(voxel_map, *slab, order, layers) for slab in voxel_map.slabs() if len(slab[0])]
     patch = _joined(patches)
-    if patch is None or not (patch.marked != NOTHING).any():
-        raise StereovoxError(_nothing_there(voxel_map, order[2], heights))
+    if patch is None or not (patch.marked != EMPTY).any():
+        raise StereovoxError(_format_empty(voxel_map, order[2], heights))
     return _grid(voxel_map, patch, voxel_map.config.cell[order[0]])
 
 
@@ -178,7 +178,7 @@ def _empty(low: NDArray[np.int64], high: NDArray[np.int64]) -> Patch:
         raise StereovoxError(
             f"a grid of {columns} x {rows} cells is too large; map a smaller place, with --set window.size=[X,Y,Z]"
         )
-    return Patch(low, np.full((rows, columns), NOTHING, np.int16), np.full((rows, columns), NOTHING, np.int16))
+    return Patch(low, np.full((rows, columns), EMPTY, np.int16), np.full((rows, columns), EMPTY, np.int16))
 
 
 def _joined(patches: list[Patch]) -> Patch | None:
@@ -195,19 +195,19 @@ def _joined(patches: list[Patch]) -> Patch | None:
 
 
 def _grid(voxel_map: VoxelMap, patch: Patch, side: float) -> OccupancyGrid:
-    number = np.where(patch.marked != NOTHING, patch.marked, patch.cleared)
-    rows, columns = (np.flatnonzero((number != NOTHING).any(axis=across)) for across in (1, 0))
+    number = np.where(patch.marked != EMPTY, patch.marked, patch.cleared)
+    rows, columns = (np.flatnonzero((number != EMPTY).any(axis=across)) for across in (1, 0))
     number = number[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
     percent = Percent(CellRules(voxel_map.config.map))
     known = percent.shown[np.maximum(number, percent.lowest).astype(np.int32) - percent.lowest]
     left, bottom = ((patch.corner + np.array([columns[0], rows[0]])) * side).round(9).tolist()
     return OccupancyGrid(
-        np.where(number == NOTHING, np.int8(UNKNOWN), known), side, (left, bottom, 0.0),
+        np.where(number == EMPTY, np.int8(UNKNOWN), known), side, (left, bottom, 0.0),
         percent.free_below, percent.occupied_above,
     )  # fmt: skip
 
 
-def _nothing_there(voxel_map: VoxelMap, axis: int, heights: Heights) -> str:
+def _format_empty(voxel_map: VoxelMap, axis: int, heights: Heights) -> str:
     bounds = voxel_map.bounds()
     if bounds is None:
         return "the map is empty: there is nothing to project"

@@ -56,7 +56,7 @@ def check_alike(a: VoxelMap, b: VoxelMap, T_a_b: ArrayLike | None) -> None:
         )
 
 
-def take(target: VoxelMap, source: VoxelMap, coords: NDArray[np.int32], cells: NDArray[np.integer]) -> None:
+def add_blocks(target: VoxelMap, source: VoxelMap, coords: NDArray[np.int32], cells: NDArray[np.integer]) -> None:
     """Put blocks (n, 3) with cells (n, 512) into `target`, with the times that `source` keeps of them."""
     known = (cells != target.cell_format.unknown).any(axis=1)
     target.insert(coords[known], cells[known])
@@ -64,7 +64,7 @@ def take(target: VoxelMap, source: VoxelMap, coords: NDArray[np.int32], cells: N
         target.set_times(coords[known], source.times_of(coords[known]), source.times_start_ns)
 
 
-def put_times(target: VoxelMap, indices: NDArray[np.integer], times: NDArray[np.uint32], start_ns: int | None) -> None:
+def set_times(target: VoxelMap, indices: NDArray[np.integer], times: NDArray[np.uint32], start_ns: int | None) -> None:
     """Set the times (N,) of cells (N, 3) of a map, each named once; they count from `start_ns`."""
     blocks, of_cell = blocks_of_cells(indices)
     low = indices & (SIDE - 1)

@@ -31,7 +31,7 @@ BEFORE, AFTER = 30, 45
 """Frames in which nobody is there, at the beginning and at the end."""
 
 
-class Passing(DepthSource):
+class PasserBy(DepthSource):
     """Frames of a simulated D435, 30 a second: nobody, a person from left to right, nobody. World: z up, metres.
 
     background: `near`, a wall within range; `far`: nothing behind the person but the floor, and the camera says that it
@@ -90,7 +90,7 @@ class Passing(DepthSource):
         """Return the exact depth (height, width) in metres of frame `i`, inf where nothing is."""
         return self._cast(self.person(i), pole=True)
 
-    def sees_person(self, i: int) -> bool:
+    def shows_person(self, i: int) -> bool:
         """Tell whether a pixel of frame `i` shows the person."""
         return self.person(i) is not None and bool((self.true_depth(i) < self._cast(None, pole=True)).any())
 

@@ -66,7 +66,7 @@ def stage() -> Stage:
 def room() -> Scene:
     """Return the furnished room and its corridor."""
     house = (_room_shell, _corridor_shell, _door, _window)
-    furniture = (_poles, _table, _chairs, _sofa, _shelf, _lamp, _corridor_things)
+    furniture = (_poles, _table, _chairs, _sofa, _shelf, _lamp, _corridor_furniture)
     solids = [solid for build in (*house, *furniture) for solid in build()]
     return Scene([Solid(solid.part, solid.name, solid.triangles + SHIFT) for solid in solids])
 
@@ -211,7 +211,7 @@ def _lamp() -> list[Solid]:
     ]
 
 
-def _corridor_things() -> list[Solid]:
+def _corridor_furniture() -> list[Solid]:
     _, x1, y0, y1, _ = CORRIDOR
     frames = [("left", x, y1 - 0.04, y1) for x in (9.0, 13.0)] + [("right", x, y0, y0 + 0.04) for x in (10.6, 15.6)]
     return [

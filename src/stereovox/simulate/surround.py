@@ -91,7 +91,7 @@ class Surround(Source):
         pair, T_world_left, stamp_ns, name = self._at(i)
         depth = self._cast(pair, T_world_left)
         reason = np.where(np.isfinite(depth), Reason.VALID, Reason.TOO_FAR).astype(np.uint8)
-        reason[~seen_by_both(pair)] = Reason.MASKED
+        reason[~visible_to_both(pair)] = Reason.MASKED
         depth = np.where(reason == Reason.VALID, depth, np.float32(0))
         return Frame(depth, pair.camera, T_world_left, stamp_ns, reason=reason, name=name, sensor=pair.name)
 
@@ -157,7 +157,7 @@ class Mount:
     width: int
     height: int
     distortion: tuple[float, ...]
-    looks_to: tuple[float, float, float]
+    forward: tuple[float, float, float]
     down: tuple[float, float, float]
     centre: tuple[float, float, float]
 
@@ -187,7 +187,7 @@ def surround_pair(name: str, scale: float = 1.0) -> StereoPair:
 
 
 @lru_cache(maxsize=8)
-def seen_by_both(pair: StereoPair) -> NDArray[np.bool_]:
+def visible_to_both(pair: StereoPair) -> NDArray[np.bool_]:
     """Tell which pixels (height, width) of the rectified left image look where both lenses see, far away."""
     assert pair.eyes is not None
     R_left, R_right = pair.eyes.rectifying_rotations()
@@ -216,7 +216,7 @@ def _right_eye() -> Transform:
 
 def _mounted(mount: Mount) -> Transform:
     """Return T_body_camera of the rectified left eye."""
-    T_body_camera: NDArray[np.float64] = look_at(np.zeros(3), mount.looks_to, -np.array(mount.down))
+    T_body_camera: NDArray[np.float64] = look_at(np.zeros(3), mount.forward, -np.array(mount.down))
     T_body_camera[:3, 3] = np.array(mount.centre) - BASELINE / 2 * T_body_camera[:3, 0]
     return T_body_camera
 

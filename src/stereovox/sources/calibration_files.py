@@ -57,8 +57,6 @@ def import_rig(files: Sequence[Path], size: Size | None = None, lens: str = "", 
         raise SourceError(f"{len(files)} files: give one, or two of one stereo camera")
     if _is_kitti(files[0]):
         return _kitti(files[0], size)
-    pass  # REHOUSED
-
     try:
         eyes, T_body_left = eyes_of([read_yaml(path) for path in files], size, lens)
     except SourceError as error:
@@ -97,12 +95,12 @@ def eyes_of(tables: Sequence[Table], size: tuple[int, int] | None, lens: str) ->
     first = tables[0]
     if "cam0" in first:
         return _kalibr(first)
-    if any(key in first for key in INFO["P"]) and _given(first, INFO["K"]) is not None:
+    if any(key in first for key in INFO["P"]) and _first_present(first, INFO["K"]) is not None:
         if len(tables) != 2:
             raise SourceError("is the camera_info of one eye; give both files, first the left")
         return _camera_info(tables[0], tables[1])
     merged: Table = {key: value for table in reversed(tables) for key, value in table.items()}
-    if _given(merged, OPENCV["K1"]) is not None:
+    if _first_present(merged, OPENCV["K1"]) is not None:
         return _opencv(merged, size, lens)
     raise SourceError("is no stereo calibration of a known kind: KITTI, ROS camera_info, OpenCV or Kalibr")
 
@@ -211,12 +209,12 @@ def _rigid(value: Any, what: str) -> Transform:
     return orthonormalise(T)
 
 
-def _given(table: Mapping[str, Any], names: Sequence[str]) -> Any:
+def _first_present(table: Mapping[str, Any], names: Sequence[str]) -> Any:
     return next((table[name] for name in names if name in table), None)
 
 
 def _named(table: Mapping[str, Any], names: Sequence[str], whose: str) -> Any:
-    found = _given(table, names)
+    found = _first_present(table, names)
     if found is None:
         raise SourceError(f"the {whose} {names[0]} is missing; give the file as the calibration wrote it")
     return found
@@ -267,8 +265,8 @@ def _kitti(path: Path, size: Size | None) -> Rig:
     pairs = []
     for name, left in (("grey", 0), ("colour", 2)):
         if {left, left + 1} <= set(calibration.projections):
-            told = [number for number in values.get(f"S_rect_0{left}", ()) if math.isfinite(number)]
-            pixels = size or ((int(told[0]), int(told[1])) if len(told) == 2 else None)
+            size_entry = [number for number in values.get(f"S_rect_0{left}", ()) if math.isfinite(number)]
+            pixels = size or ((int(size_entry[0]), int(size_entry[1])) if len(size_entry) == 2 else None)
             if pixels is None:
                 raise SourceError(f"{path}: does not tell the size of the images; give it with --size WIDTHxHEIGHT")
             T_cam0_left = inverse(calibration.offset_of(left))

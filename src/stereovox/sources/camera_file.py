@@ -77,12 +77,12 @@ def find_camera(
     found = [path for path in places if os.path.isfile(path)]  # Path.is_file may raise
     far = [folder / FILE for folder in folders[1:] if os.path.isfile(folder / FILE)]
     cure = "it counts only in the recording's own folder; give it with --camera"
-    passed_over = [f"{path} is not used: {cure}" for path in far]
-    passed_over += [f"{path} is not used: {found[0]} comes first" for path in found[1:]]
+    ignored = [f"{path} is not used: {cure}" for path in far]
+    ignored += [f"{path} is not used: {found[0]} comes first" for path in found[1:]]
     if found:
         camera = _read(found[0], size, baseline)
-        used = (f"{found[0]} is used ({correction_words(camera)})",) if found[0].name == FILE else ()
-        return camera, (*used, *passed_over)
+        used = (f"{found[0]} is used ({describe_correction(camera)})",) if found[0].name == FILE else ()
+        return camera, (*used, *ignored)
     if size != VGA:
         raise SourceError(
             f"{folders[0] / MATRIX}: no such file, and {size[0]}x{size[1]} images have no standard calibration; "
@@ -90,7 +90,7 @@ def find_camera(
         )
     numbers = " ".join(f"{n:g}" for n in default)
     note = f"{folders[0]} has no {MATRIX}: assuming the data set's standard fx fy cx cy = {numbers}"
-    return PinholeCamera(*size, *default, baseline), (note, *passed_over)
+    return PinholeCamera(*size, *default, baseline), (note, *ignored)
 
 
 def with_camera(stream: Stream, file: str | os.PathLike[str]) -> Stream:
@@ -104,7 +104,7 @@ def with_camera(stream: Stream, file: str | os.PathLike[str]) -> Stream:
             f"{file}: is of a camera with {camera.width}x{camera.height} pixels, {stream.name} has "
             f"{own.width}x{own.height}; give the file of its own camera"
         )
-    note = f"{file} is used in place of the recording's own camera ({correction_words(camera)})"
+    note = f"{file} is used in place of the recording's own camera ({describe_correction(camera)})"
     return WithCamera(stream, camera if camera.baseline else replace(camera, baseline=own.baseline), (note,))
 
 
@@ -157,7 +157,7 @@ def read_intrinsics(path: Path) -> Intrinsics:
     return fx, fy, cx, cy
 
 
-def correction_words(camera: PinholeCamera) -> str:
+def describe_correction(camera: PinholeCamera) -> str:
     """Return in words what the depth of a camera will be corrected by."""
     return f"depth correction '{camera.correction.model}'" if camera.correction else "no depth correction"
 

@@ -32,13 +32,13 @@ START = SIGNATURE + b"\0\0\0\rIHDR"
 HEADER_BYTES = 33  # signature, then IHDR: length, name, 13 bytes, check sum
 MAX_BYTES = 1 << 28
 """Bytes of a file: more than so many pixels can need."""
-MAX_SWOLLEN = 1100
+MAX_RATIO = 1100
 """Bytes that one byte of a PNG can stand for (deflate: 1032)."""
 GREY_16 = (16, 0)  # bit depth and colour type
-DEPTH = frozenset({GREY_16})
-PICTURE = frozenset({(8, 0), (8, 2)})
+DEPTH_KINDS = frozenset({GREY_16})
+PICTURE_KINDS = frozenset({(8, 0), (8, 2)})
 """Kinds of PNG that are read: 16-bit grey; 8-bit grey and RGB."""
-WANTED = {DEPTH: "depth must be a 16-bit grey PNG", PICTURE: "pictures must be 8-bit grey or RGB PNGs"}
+EXPECTED = {DEPTH_KINDS: "depth must be a 16-bit grey PNG", PICTURE_KINDS: "pictures must be 8-bit grey or RGB PNGs"}
 Kinds = frozenset[tuple[int, int]]
 
 
@@ -56,7 +56,7 @@ def decode_depth_png(path: Path | str, data: bytes, size: tuple[int, int]) -> ND
 
     Raises FrameRefused as `read_depth_png`.
     """
-    _check(path, data, size, DEPTH)
+    _check(path, data, size, DEPTH_KINDS)
     image = _decode(path, data)
     if image.dtype != np.uint16 or image.ndim != 2:
         raise _undecodable(path)
@@ -69,27 +69,27 @@ def read_picture_png(path: Path, size: tuple[int, int]) -> NDArray[np.uint8]:
     Its size must be (width, height) = `size`. Raises FrameRefused as `read_depth_png`; `bad_dtype`: neither of both.
     """
     data = _read(path)
-    _check(path, data, size, PICTURE)
+    _check(path, data, size, PICTURE_KINDS)
     image = _decode(path, data)
     if image.dtype != np.uint8 or image.shape[2:] not in ((), (3,)):
         raise _undecodable(path)
     return np.ascontiguousarray(image[..., ::-1] if image.ndim == 3 else image, np.uint8)  # OpenCV gives BGR
 
 
-def png_size(path: Path, kinds: Kinds = DEPTH) -> tuple[int, int]:
+def png_size(path: Path, kinds: Kinds = DEPTH_KINDS) -> tuple[int, int]:
     """Return (width, height) as the header of a PNG of these kinds tells; raises FrameRefused as `read_depth_png`."""
     return _header_size(path, _read(path, header_only=True), kinds)
 
 
-def common_size(paths: Sequence[Path], looks: int = 5, kinds: Kinds = DEPTH) -> tuple[int, int] | None:
-    """Return the (width, height) that most of `looks` readable images spread over `paths` have; None if none is."""
+def common_size(paths: Sequence[Path], samples: int = 5, kinds: Kinds = DEPTH_KINDS) -> tuple[int, int] | None:
+    """Return the (width, height) that most of `samples` readable images spread over `paths` have; None if none is."""
     found: Counter[tuple[int, int]] = Counter()
-    for path in _spread(paths, looks):
+    for path in _spread(paths, samples):
         try:
             found[png_size(path, kinds)] += 1
         except FrameRefused:
             continue  # it is reported when its turn comes
-        if found.total() == looks:
+        if found.total() == samples:
             break
     return found.most_common(1)[0][0] if found else None
 
@@ -126,8 +126,8 @@ class DepthFolder(DepthSource, ABC):
             T_world_camera = self.pose(i)
             depth = read_depth_png(path, (self.camera.width, self.camera.height))
         except FrameRefused as refused:
-            nothing, nowhere = np.empty((0, 0), np.uint16), np.full((4, 4), np.nan)
-            blank = Frame(nothing, self.camera, nowhere, stamp_ns, self.depth_scale, name=str(path))
+            no_depth, no_pose = np.empty((0, 0), np.uint16), np.full((4, 4), np.nan)
+            blank = Frame(no_depth, self.camera, no_pose, stamp_ns, self.depth_scale, name=str(path))
             return replace(blank, fault=refused.reason, fault_detail=str(refused))
         return Frame(depth, self.camera, T_world_camera, stamp_ns, self.depth_scale, name=str(path))
 
@@ -148,9 +148,9 @@ def file_names(folder: Path) -> list[str]:
         raise SourceError(f"{folder}: {error.strerror}; give a folder you may read") from None
 
 
-def _spread(paths: Sequence[Path], looks: int) -> list[Path]:
+def _spread(paths: Sequence[Path], samples: int) -> list[Path]:
     """Return all paths, those at even distances first."""
-    step = max(1, len(paths) // looks)
+    step = max(1, len(paths) // samples)
     return [path for start in range(step) for path in paths[start::step]]
 
 
@@ -170,8 +170,10 @@ def _check(path: Path | str, data: bytes, size: tuple[int, int], kinds: Kinds) -
     """Raise FrameRefused unless `data` is a whole PNG of one of `kinds` and of this size."""
     found = _header_size(path, data, kinds)
     if found != size:
-        raise FrameRefused("bad_shape", f"{path}: {_times(found)} pixels, the recording has {_times(size)}; remove it")
-    if not _is_whole(data) or size[0] * size[1] > MAX_SWOLLEN * len(data):
+        raise FrameRefused(
+            "bad_shape", f"{path}: {_format_size(found)} pixels, the recording has {_format_size(size)}; remove it"
+        )
+    if not _is_whole(data) or size[0] * size[1] > MAX_RATIO * len(data):
         raise FrameRefused("unreadable", f"{path}: the PNG is cut off or damaged; copy it again or remove it")
 
 
@@ -181,10 +183,12 @@ def _header_size(path: Path | str, data: bytes, kinds: Kinds) -> tuple[int, int]
         raise FrameRefused("unreadable", f"{path}: no PNG file, or its header is damaged; copy it again or remove it")
     width, height, bits, colour = struct.unpack_from(">IIBB", header, 4)
     if not 0 < width * height <= MAX_PIXELS:
-        raise FrameRefused("unreadable", f"{path}: its header tells of {_times((width, height))} pixels; remove it")
+        raise FrameRefused(
+            "unreadable", f"{path}: its header tells of {_format_size((width, height))} pixels; remove it"
+        )
     if (bits, colour) not in kinds:
         kind = "grey" if colour == 0 else "colour"
-        raise FrameRefused("bad_dtype", f"{path}: {bits}-bit {kind} image; {WANTED[kinds]}")
+        raise FrameRefused("bad_dtype", f"{path}: {bits}-bit {kind} image; {EXPECTED[kinds]}")
     return width, height
 
 
@@ -218,5 +222,5 @@ def _undecodable(path: Path | str) -> FrameRefused:
     return FrameRefused("unreadable", f"{path}: OpenCV cannot decode it; write it again as a plain PNG")
 
 
-def _times(size: tuple[int, int]) -> str:
+def _format_size(size: tuple[int, int]) -> str:
     return f"{size[0]}x{size[1]}"

@@ -30,11 +30,11 @@ class Latest(Generic[T]):
     """
 
     def __init__(self, frames: Iterable[T], waiting: int = WAITING):
-        self._frames, self._most = frames, max(1, waiting)
+        self._frames, self._capacity = frames, max(1, waiting)
         self.dropped = 0
 
     def __iter__(self) -> Iterator[T]:
-        queue: _Queue[T] = _Queue(self._most)
+        queue: _Queue[T] = _Queue(self._capacity)
         reader = Thread(target=self._read, args=(queue,), name="stereovox-camera", daemon=True)
         reader.start()
         try:
@@ -65,15 +65,15 @@ class Latest(Generic[T]):
 class _Queue(Generic[T]):
     """Items between two threads. stopped: nobody takes them any more."""
 
-    def __init__(self, most: int):
-        self._most, self._waiting = most, deque[T]()
+    def __init__(self, capacity: int):
+        self._capacity, self._waiting = capacity, deque[T]()
         self._change, self._ended, self._error = Condition(), False, None
         self.stopped = Event()
 
     def put(self, item: T) -> int:
         """Append an item; return how many were dropped for it."""
         with self._change:
-            full = len(self._waiting) == self._most
+            full = len(self._waiting) == self._capacity
             if full:
                 self._waiting.popleft()
             self._waiting.append(item)

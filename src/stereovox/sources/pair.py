@@ -23,8 +23,10 @@ from stereovox.sources.tracker import jumps, on_clock, read_tracker
 
 NEAR_JUMP_NS = 100_000_000
 """Frames this near (0.1 s) to a jump, on either side, are refused: a tracker is rarely right just before one."""
-LOOKS = 5
+MAX_ATTEMPTS = 5
 CALIBRATE = "stereovox calibrate pair"
+OpenDepth = Callable[[Path, PairSettings], DepthSource]
+"""Opens the depth images that the settings of a pair's folder name; see `opening.open_depth`."""
 
 
 class CameraPair(DepthSource):
@@ -42,10 +44,9 @@ class CameraPair(DepthSource):
 
     layout = f"a camera pair ({FILE} that names depth images and a tracker's poses)"
 
-    opens_others = True
+    composite = True
 
-    def __init__(self, where: str | os.PathLike[str], open_depth: Callable[[Path, PairSettings], DepthSource]):
-        """`open_depth`: opens the depth images that the settings of a folder name; see `sources.open_depth`."""
+    def __init__(self, where: str | os.PathLike[str], open_depth: OpenDepth):
         self.folder = Path(where)
         self.name = self.folder.resolve().name
         file = self.folder / FILE
@@ -77,8 +78,8 @@ class CameraPair(DepthSource):
         try:
             return replace(frame, T_world_sensor=self.pose_at(frame.stamp_ns))
         except FrameRefused as refused:
-            nowhere = np.full((4, 4), np.nan)
-            return replace(frame, T_world_sensor=nowhere, fault=refused.reason, fault_detail=f"{frame.name}: {refused}")
+            no_pose = np.full((4, 4), np.nan)
+            return replace(frame, T_world_sensor=no_pose, fault=refused.reason, fault_detail=f"{frame.name}: {refused}")
 
     def pose_at(self, stamp_ns: int) -> Transform:
         """Return T_world_camera (4, 4) at a time of the depth camera's clock; raises FrameRefused (see the class)."""
@@ -113,9 +114,9 @@ class CameraPair(DepthSource):
         if not len(self._jumps):
             return ()
         largest = self._jump_steps().max()
-        many = f"{len(self._jumps)} jumps" if len(self._jumps) > 1 else "one jump"
-        left_out = "images near are left out, later ones count as they are"
-        return (f"{self._poses.where}: {many} of up to {largest:.2f} m; {left_out}",)
+        count = f"{len(self._jumps)} jumps" if len(self._jumps) > 1 else "one jump"
+        consequence = "images near are left out, later ones count as they are"
+        return (f"{self._poses.where}: {count} of up to {largest:.2f} m; {consequence}",)
 
 
 def open_poses(folder: Path, settings: PairSettings) -> Poses:
@@ -136,7 +137,7 @@ def image_times(depth: DepthSource) -> tuple[int, int]:
     A damaged message of a recorded file has only the time at which it was recorded, perhaps by another clock: where
     there is a sound one among the first or last few, that counts.
     """
-    few = range(min(LOOKS, len(depth)))
+    few = range(min(MAX_ATTEMPTS, len(depth)))
     return _stamp(depth, few), _stamp(depth, [-1 - i for i in few])
 
 

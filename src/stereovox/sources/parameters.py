@@ -21,15 +21,15 @@ def split(location: str) -> tuple[str, dict[str, str]]:
     Raises SourceError for a parameter without a value and for one that is given twice.
     """
     name, _, query = location.partition("?")
-    given: dict[str, str] = {}
+    texts: dict[str, str] = {}
     for text in filter(None, query.split("&")):
         key, equals, value = text.partition("=")
         if not (key and equals and value):
             raise SourceError(f"'{text}' is no parameter; write key=value")
-        if key in given:
+        if key in texts:
             raise SourceError(f"'{key}' is given twice; give it once")
-        given[key] = value
-    return name, given
+        texts[key] = value
+    return name, texts
 
 
 def defaults(function: Callable[..., Any]) -> dict[str, Any]:
@@ -37,12 +37,12 @@ def defaults(function: Callable[..., Any]) -> dict[str, Any]:
     return {name: parameter.default for name, parameter in inspect.signature(function).parameters.items()}
 
 
-def typed(given: Mapping[str, str], known: Mapping[str, Any]) -> dict[str, Any]:
+def typed(texts: Mapping[str, str], known: Mapping[str, Any]) -> dict[str, Any]:
     """Return the parameters as values of the types that the defaults in `known` have: bool, int, float or str.
 
     Raises SourceError for an unknown parameter, with the one that was perhaps meant, and for unreadable values.
     """
-    return {key: _value(key, text, known) for key, text in given.items()}
+    return {key: _value(key, text, known) for key, text in texts.items()}
 
 
 def _value(key: str, text: str, known: Mapping[str, Any]) -> Any:

@@ -155,14 +155,14 @@ def _device(rs: Any, context: Any, location: str, serial: str) -> Any:
         raise SourceError(f"{location}: no RealSense camera is connected; {cure}")
     if serial:
         if serial not in devices:
-            raise SourceError(f"{location}: not connected; there is {_ways(devices)}")
+            raise SourceError(f"{location}: not connected; there is {_device_names(devices)}")
         return devices[serial]
     if len(devices) > 1:
-        raise SourceError(f"{location}: several cameras are connected, say which: {_ways(devices)}")
+        raise SourceError(f"{location}: several cameras are connected, say which: {_device_names(devices)}")
     return next(iter(devices.values()))
 
 
-def _ways(devices: dict[str, Any]) -> str:
+def _device_names(devices: dict[str, Any]) -> str:
     return " or ".join(PREFIX + serial for serial in devices)
 
 
@@ -229,11 +229,13 @@ def _baseline(rs: Any, sensor: Any) -> float | None:
 
 
 def _camera(profile: Any, baseline: float | None, location: str) -> tuple[PinholeCamera, tuple[str, ...]]:
-    told = profile.get_intrinsics()
-    numbers = (told.width, told.height, told.fx, told.fy, told.ppx, told.ppy)
+    intrinsics = profile.get_intrinsics()
+    numbers = (intrinsics.width, intrinsics.height, intrinsics.fx, intrinsics.fy, intrinsics.ppx, intrinsics.ppy)
     note = f"{location}: the camera tells of lens distortion in its depth, which is not corrected"
     try:
-        return PinholeCamera(*numbers, None if baseline is None else abs(baseline)), (note,) if any(told.coeffs) else ()
+        return PinholeCamera(*numbers, None if baseline is None else abs(baseline)), (note,) if any(
+            intrinsics.coeffs
+        ) else ()
     except StereovoxError as error:
         raise SourceError(f"{location}: {error}") from None
 

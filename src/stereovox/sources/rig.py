@@ -16,7 +16,7 @@ from stereovox.errors import FrameRefused, SourceError
 from stereovox.frame import StereoFrame
 from stereovox.se3 import Transform
 from stereovox.sources.base import Source
-from stereovox.sources.images import PICTURE, file_names, png_size, read_picture_png
+from stereovox.sources.images import PICTURE_KINDS, file_names, png_size, read_picture_png
 from stereovox.sources.rig_file import FILE, RigPair, read_rig
 from stereovox.sources.trajectory import Trajectory, by_time, inside, stamped_lines
 
@@ -75,8 +75,8 @@ class StereoRig(Source):
         """Return frame `i`; its images are (0, 0) and its pose NaN where it has a `fault`."""
         shot = self._shots[range(len(self))[i]]
         pair = self.pairs[shot.pair]
-        nothing, nowhere = np.empty((0, 0), np.uint8), np.full((4, 4), np.nan)
-        frame = StereoFrame(nothing, nothing, pair, nowhere, shot.stamp_ns, str(shot.left), sensor=pair.name)
+        no_image, no_pose = np.empty((0, 0), np.uint8), np.full((4, 4), np.nan)
+        frame = StereoFrame(no_image, no_image, pair, no_pose, shot.stamp_ns, str(shot.left), sensor=pair.name)
         try:
             T_world_camera = self._pose(shot, pair)
             left, right = (_picture(path, size) for path, size in zip(shot[2:], _sizes(pair), strict=True))
@@ -103,8 +103,8 @@ def _picture(path: Path, size: tuple[int, int]) -> NDArray[np.uint8]:
     except FrameRefused as refused:
         if refused.reason != "bad_shape":
             raise
-    (width, height), told = png_size(path, PICTURE), f"{size[0]}x{size[1]}"
-    message = f"{path}: {width}x{height} pixels, {FILE} says {told}; correct width and height there, or the image"
+    (width, height), expected = png_size(path, PICTURE_KINDS), f"{size[0]}x{size[1]}"
+    message = f"{path}: {width}x{height} pixels, {FILE} says {expected}; correct width and height there, or the image"
     raise FrameRefused("bad_shape", message) from None
 
 

@@ -131,7 +131,6 @@ class Rig:
 
 def read_rig(path: Path | str) -> Rig:
     """Return what `path` says; raises SourceError, one line with file, pair and key, for anything wrong in it."""
-    pass  # REHOUSED
     from stereovox.safe_io import read_table
 
     table = read_table(Path(path))
@@ -143,8 +142,6 @@ def read_rig(path: Path | str) -> Rig:
 
 def write_rig(path: Path | str, rig: Rig, remarks: Sequence[str] = ()) -> None:
     """Write `rig` so that `read_rig` gives it back; `remarks` are comments at its top. Raises SourceError."""
-    pass  # REHOUSED
-
     with replacing(path, SourceError) as file:
         file.write(rig_text(rig, remarks).encode())
 

@@ -52,7 +52,7 @@ def localise(
     Scans that later ones show to have a wrong stamp (`Clock`) are taken out of the way again, and counted too.
     Raises what `Localiser` raises, and SourceError where not one scan can be trusted.
     """
-    localiser, way, first_refusal = Localiser(grid, config, start, seed), _Way(), ""
+    localiser, way, first_refusal = Localiser(grid, config, start, seed), _TrackBuilder(), ""
     for done, scan in enumerate(scans, 1):
         try:
             way.add(scan.stamp_ns, localiser.add(scan))
@@ -99,7 +99,7 @@ class Localiser:
         try:
             scan = sound(scan, self._rigidity)
             beams = beams_of(scan, self.config.max_range)
-            wrong = self._clock.take(scan)
+            wrong = self._clock.accept(scan)
         except FrameRefused as refusal:
             self.refused[refusal.reason] += 1
             raise
@@ -141,7 +141,9 @@ class Localiser:
         if not len(beams.ranges):
             return
         log_likelihood = self._sensor.log_likelihood(self._particles, beams).astype(float)
-        self._recovery.see(log_likelihood, self._weights, len(beams.ranges))  # all: skipping would hide that it is lost
+        self._recovery.observe(
+            log_likelihood, self._weights, len(beams.ranges)
+        )  # all: skipping would hide that it is lost
         fitting = self._fitting(beams)
         if fitting is not beams:
             log_likelihood = self._sensor.log_likelihood(self._particles, fitting).astype(float)
@@ -218,7 +220,7 @@ class Clock:
         self._stamps_ns = array("q")
         self._late, self._late_ns = 0, 0
 
-    def take(self, scan: Scan) -> int:
+    def accept(self, scan: Scan) -> int:
         """Go on to the time of a scan; return how many of the last scans turn out to have had a wrong stamp.
 
         Raises FrameRefused with the reason `not_in_order` where the scan is not later than the one before.
@@ -277,7 +279,7 @@ def checked_start(start: ArrayLike) -> NDArray[np.float64]:
     return pose
 
 
-class _Way:
+class _TrackBuilder:
     """What is kept of the estimates: all but the particles, of which hours would not fit into memory."""
 
     def __init__(self):

@@ -15,7 +15,7 @@ from stereovox.localize.scan_beams import Beams
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.maps.voxel_map import State
 
-MIN_WAY = 0.01
+MIN_TRAVEL = 0.01
 """Metres below which the direction of a way says nothing: the robot turned on the spot."""
 LENGTHS = 1024
 """So many lengths of beams are told apart by the beam model, from 0 to the longest."""
@@ -100,7 +100,7 @@ def turn_go_turn(pose_odom_before: se2.Pose, pose_odom_after: se2.Pose) -> NDArr
     """Return the (3,) first turn, way and second turn (radians, metres) that lead from one (3,) pose to the other."""
     step = se2.relative(pose_odom_before, pose_odom_after)
     way = float(np.hypot(step[0], step[1]))
-    first = float(np.arctan2(step[1], step[0])) if way >= MIN_WAY else 0.0
+    first = float(np.arctan2(step[1], step[0])) if way >= MIN_TRAVEL else 0.0
     return np.array([first, way, float(se2.wrapped(step[2] - first))])
 
 

@@ -32,7 +32,7 @@ class Recovery:
         self._long = self._short = 0.0
         self._seen = 0
 
-    def see(self, log_likelihood: NDArray[np.float64], weights: NDArray[np.float64], beams: int) -> None:
+    def observe(self, log_likelihood: NDArray[np.float64], weights: NDArray[np.float64], beams: int) -> None:
         """Take in (N,) log likelihoods of `beams` beams by particles whose weights have the sum 1."""
         if self._alpha_slow <= 0 or self._alpha_fast <= 0:
             return

@@ -24,7 +24,7 @@ STRIDE = 3
 """Keyframes from one patch's middle to the next."""
 WEAK = 0.1
 """Share of information below which a direction is a corridor's."""
-MAX_OTHERS = 120
+MAX_NEIGHBOURS = 120
 """Keyframes that are laid onto a patch: a robot may pass the same place all day."""
 MIN_SHARE = 0.4
 """Share of a keyframe's points that must lie on a patch's lines."""
@@ -108,7 +108,7 @@ def patch_edges(keyframes: list[Keyframe], config: SlamConfig) -> Iterator[Edge]
     patch = LineMap(config.voxel_size)
     for middle in range(0, len(keyframes), STRIDE):
         first, last = max(middle - PATCH, 0), min(middle + PATCH + 1, len(keyframes))
-        others = _others(places, middle, first, last, config)
+        others = _neighbours(places, middle, first, last, config)
         if not len(others):
             continue
         pose = places[middle]
@@ -146,11 +146,11 @@ def optimised(
     return np.array([_numbers(found.atPose2(i)) for i in range(len(poses))])
 
 
-def _others(places: se2.Pose, middle: int, first: int, last: int, config: SlamConfig) -> NDArray[np.int64]:
+def _neighbours(places: se2.Pose, middle: int, first: int, last: int, config: SlamConfig) -> NDArray[np.int64]:
     far = np.hypot(*(places[:, :2] - places[middle, :2]).T)
     near = np.nonzero(far < config.refine_distance)[0]
     near = near[(near < first) | (near >= last)]
-    return near[:: len(near) // MAX_OTHERS + 1]
+    return near[:: len(near) // MAX_NEIGHBOURS + 1]
 
 
 def _edge(

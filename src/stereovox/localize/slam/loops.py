@@ -65,23 +65,23 @@ class LoopFinder:
             self._close(self._submaps[-1])
 
     def _close(self, later: Submap) -> None:
-        ways = self._ways()
+        drift_distances = self._drift_distances()
         cloud = submap_cloud(self._keyframes, later, NEAR_RANGE, cell=2 * self._config.voxel_size)
         windows: dict[Submap, tuple[float, float]] = {}
-        for earlier, way in zip(self._submaps[:-1], ways.tolist(), strict=False):
-            window = self._window(earlier, later, way)
+        for earlier, drift_m in zip(self._submaps[:-1], drift_distances.tolist(), strict=False):
+            window = self._window(earlier, later, drift_m)
             if window is not None:
                 windows[earlier] = window
         there = self._keyframes[later.anchor].pose
         near = sorted(windows, key=lambda e: float(np.hypot(*(self._keyframes[e.anchor].pose - there)[:2])))
         for earlier in near[:MAX_TRIED]:
-            self._search.onto(submap_cloud(self._keyframes, earlier, FAR_RANGE))
-            self._lay(earlier, later, cloud, windows[earlier])
+            self._search.set_target(submap_cloud(self._keyframes, earlier, FAR_RANGE))
+            self._match_pair(earlier, later, cloud, windows[earlier])
 
-    def _lay(self, earlier: Submap, later: Submap, cloud: Cloud, window: tuple[float, float]) -> None:
+    def _match_pair(self, earlier: Submap, later: Submap, cloud: Cloud, window: tuple[float, float]) -> None:
         first, second = earlier.anchor, later.anchor
         guess = se2.relative(self._keyframes[first].pose, self._keyframes[second].pose)
-        match = self._search.lay(cloud, guess, *window)
+        match = self._search.match(cloud, guess, *window)
         if match is None or match.share < self._config.closure_share:
             return
         along = np.linalg.eigvalsh(match.information[:2, :2])
@@ -99,27 +99,27 @@ class LoopFinder:
 
     def _agree(self, a: Edge, b: Edge) -> bool:
         keyframes = self._keyframes
-        way = sum(
+        drift_m = sum(
             abs(keyframes[i].travelled - keyframes[k].travelled) for i, k in ((a.first, b.first), (a.second, b.second))
         )
-        if way > WITNESS_PATH:
+        if drift_m > WITNESS_PATH:
             return False
         over = se2.relative(keyframes[a.first].pose, keyframes[b.first].pose)
         back = se2.relative(keyframes[b.second].pose, keyframes[a.second].pose)
         left = se2.relative(a.motion, se2.compose(se2.compose(over, b.motion), back))
-        return bool(np.hypot(left[0], left[1]) < WITNESS[0] + WITNESS[1] * way and abs(left[2]) < WITNESS[2])
+        return bool(np.hypot(left[0], left[1]) < WITNESS[0] + WITNESS[1] * drift_m and abs(left[2]) < WITNESS[2])
 
-    def _window(self, earlier: Submap, later: Submap, way: float) -> tuple[float, float] | None:
+    def _window(self, earlier: Submap, later: Submap, drift_m: float) -> tuple[float, float] | None:
         """Metres and radians to search for the later submap, None where it cannot show the same place."""
         config, a, b = self._config, self._keyframes[earlier.anchor], self._keyframes[later.anchor]
         if b.travelled - a.travelled < config.closure_path:
             return None
-        side = min(BASE_WINDOW + config.drift * way, config.closure_window)
+        side = min(BASE_WINDOW + config.drift * drift_m, config.closure_window)
         if np.hypot(*(b.pose - a.pose)[:2]) > side + ROOM:
             return None
-        return side, min(BASE_WINDOW_TURN + config.drift_turn * way, config.closure_window_turn)
+        return side, min(BASE_WINDOW_TURN + config.drift_turn * drift_m, config.closure_window_turn)
 
-    def _ways(self) -> NDArray[np.float64]:
+    def _drift_distances(self) -> NDArray[np.float64]:
         """Metres along which drift adds up between the last submap and each other one: closures are short cuts."""
         from scipy.sparse import coo_matrix
         from scipy.sparse.csgraph import dijkstra
@@ -127,7 +127,7 @@ class LoopFinder:
         anchors = [submap.anchor for submap in self._submaps]
         number = {anchor: i for i, anchor in enumerate(anchors)}
         along = np.array([self._keyframes[anchor].travelled for anchor in anchors])
-        steps = {(i, i + 1): max(float(way), SHORT_CUT) for i, way in enumerate(np.diff(along))}
+        steps = {(i, i + 1): max(float(drift_m), SHORT_CUT) for i, drift_m in enumerate(np.diff(along))}
         # One length for each pair: a matrix made of several adds them up.
         lengths = steps | {(number[edge.first], number[edge.second]): SHORT_CUT for edge in self.edges}
         rows, columns = np.array(list(lengths), np.int64).reshape(-1, 2).T
@@ -145,7 +145,7 @@ class ClosureSearch:
         self._pad = 1 << LEVELS
         self._pyramid = np.empty((LEVELS, 0, 0), np.float32)
 
-    def onto(self, earlier: Cloud) -> None:
+    def set_target(self, earlier: Cloud) -> None:
         """Take the cloud that the next ones are laid onto."""
         self._coarse.build(earlier)
         self._fine.build(earlier)
@@ -153,7 +153,7 @@ class ClosureSearch:
         self._pyramid = np.empty((LEVELS, rows + self._pad, columns + self._pad), np.float32)
         _bound.coarsen(self._coarse.score[:rows, :columns], self._pad, self._pyramid)
 
-    def lay(self, cloud: Cloud, guess: ArrayLike, side: float, side_yaw: float) -> Match | None:
+    def match(self, cloud: Cloud, guess: ArrayLike, side: float, side_yaw: float) -> Match | None:
         """Return the best match of a cloud within `side` metres and `side_yaw` of a guess.
 
         None where no place is good enough, or another one is nearly as good.

@@ -33,7 +33,7 @@ LATE = 3
 Progress = Callable[[int, int, str], object]
 CLOSURE_TRUST, PATCH_TRUST = 0.02, 0.1
 """What a match's information is worth: its points are not independent, nor is what they lie on exact."""
-LOOKS = 2.25
+SCANS_PER_KEYFRAME = 2.25
 """A keyframe counts in the map as so many scans: it stands for those around it, and one is enough to know a cell."""
 MAX_CELLS = 40_000
 """Cells on a side of the finished map."""
@@ -67,7 +67,7 @@ class Slam:
         self._config = config
         self._follower = Follower(config.slam)
         self._loops = LoopFinder(config.slam, self._follower.keyframes)
-        self._way = Way()
+        self._builder = TrackBuilder()
 
     @property
     def pose(self) -> se2.Pose:
@@ -87,12 +87,12 @@ class Slam:
             self._refuse(refused.reason)
             self._first = self._first or f", first: {refused}"
             return self.pose
-        wrong = self._way.room(scan.stamp_ns)
+        wrong = self._builder.room(scan.stamp_ns)
         self._refuse("not_in_order", 1 if wrong is None else wrong)
         if wrong is None:
             return self.pose
         is_key = self._follower.add(scan)
-        self._way.add(scan, self.pose, self.keyframes)
+        self._builder.add(scan, self.pose, self.keyframes)
         if is_key and any(_off(self.keyframes, edge) for edge in self._loops.update()):
             self._solve(self._loops.edges, CLOSURE_TRUST)
         return self.pose
@@ -114,7 +114,7 @@ class Slam:
             if progress:
                 progress(done, rounds, "polishing the map")
             self._solve(list(patch_edges(self.keyframes, self._config.slam)), PATCH_TRUST)
-        track = self._way.track(self.keyframes)
+        track = self._builder.track(self.keyframes)
         return SlamResult(track, self._grid(), self.keyframes, self._loops.edges, self.refused)
 
     def _refuse(self, reason: str, count: int = 1) -> None:
@@ -135,7 +135,7 @@ class Slam:
 
     def _grid(self) -> OccupancyGrid:
         settings = self._config.slam
-        evidence = {f"grid.{name}": _said_again(getattr(self._config.grid, name)) for name in ("p_occupied", "p_free")}
+        evidence = {f"grid.{name}": _repeated(getattr(self._config.grid, name)) for name in ("p_occupied", "p_free")}
         config = load_config(self._config, voxel_size=settings.voxel_size, max_range=settings.max_range, **evidence)
         _check_extent(self._poses(), settings.voxel_size)
         grid, beams = GridMap(config), make_beams(config)
@@ -177,12 +177,12 @@ class Step:
     since: se2.Pose
 
 
-class Way:
+class TrackBuilder:
     """The steps so far, stamps rising."""
 
     def __init__(self) -> None:
         self._steps: list[Step] = []
-        self._begun = False
+        self._started = False
         self._late, self._late_ns, self._against = 0, 0, 0
 
     def room(self, stamp_ns: int) -> int | None:
@@ -209,8 +209,8 @@ class Way:
 
         What comes before there is a keyframe is kept as seen from the first one.
         """
-        if keyframes and not self._begun:
-            self._begun = True
+        if keyframes and not self._started:
+            self._started = True
             self._steps = [replace(s, since=se2.relative(keyframes[0].pose, s.since)) for s in self._steps]
         since = se2.relative(keyframes[-1].pose, pose) if keyframes else pose
         self._steps.append(Step(scan.stamp_ns, scan.pose_world_base, max(len(keyframes) - 1, 0), since))
@@ -223,9 +223,9 @@ class Way:
         return Track(np.array([step.stamp_ns for step in self._steps], np.int64), poses, corrections)
 
 
-def _said_again(p: float) -> float:
+def _repeated(p: float) -> float:
     """Return what a keyframe says of a cell where a scan says `p`."""
-    odds = (p / (1 - p)) ** LOOKS
+    odds = (p / (1 - p)) ** SCANS_PER_KEYFRAME
     return odds / (1 + odds)
 
 

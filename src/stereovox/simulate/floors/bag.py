@@ -19,7 +19,7 @@ from stereovox.sources.robots.robot import Robot
 
 BASE, LASER, CAMERA, OPTICAL = "base_link", "laser", "camera_link", "camera_depth_optical_frame"
 TRUTH = "/ground_truth"
-Told = tuple[int, Scan | Frame | se2.Pose]
+Recorded = tuple[int, Scan | Frame | se2.Pose]
 
 
 def write_bag(
@@ -37,7 +37,7 @@ def write_bag(
     total = len(robot.odometry) + len(robot.scans) + len(robot.frames)
     with BagWriter(path) as bag:
         _fixed(bag, robot)
-        for done, (stamp_ns, one) in enumerate(merge(*_streams(robot), key=lambda told: told[0]), 1):
+        for done, (stamp_ns, one) in enumerate(merge(*_streams(robot), key=lambda recorded: recorded[0]), 1):
             if isinstance(one, Scan):
                 bag.scan(one, "/scan", LASER)
             elif isinstance(one, Frame):
@@ -49,7 +49,7 @@ def write_bag(
                 progress(done, total)
 
 
-def _streams(robot: Floor) -> Iterator[Iterator[Told]]:
+def _streams(robot: Floor) -> Iterator[Iterator[Recorded]]:
     odometry = zip(robot.odometry.stamps_ns.tolist(), robot.odometry.T_world_body, strict=True)
     yield ((stamp_ns, se2.flattened(T)) for stamp_ns, T in odometry)
     yield ((scan.stamp_ns, scan) for scan in robot.scans)

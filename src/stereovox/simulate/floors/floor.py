@@ -138,7 +138,7 @@ class Floor:
         occupied as a whole. Without them its rim is, as beams on the floor have it.
         """
         grid = self.plan.truth(resolution, self.start[:2], heights)
-        return with_lids(grid, self.plan.things, heights, float(self.T_base_camera[2, 3])) if lids else grid
+        return with_lids(grid, self.plan.obstacles, heights, float(self.T_base_camera[2, 3])) if lids else grid
 
     def true_ranges(self, stamp_ns: int) -> NDArray[np.float64]:
         """Return the exact distances (N,) in metres that the lidar's beams run, inf beyond its reach."""

@@ -75,10 +75,10 @@ class DepthTopic:
         packed = self._file.types[self.topic] == COMPRESSED
         depth, encoding = decoded(picture, packed, (self.camera.width, self.camera.height), name)
         stamp_ns, unit = picture.stamp_ns, picture.depth_units
-        told = self._metadata.at(self.stamp_ns(i)) if self._metadata else {}
-        if "timestamp" in told:  # only .db3 has it: there the header counts from the start of the recording
-            stamp_ns = ns_from_ms(told["timestamp"]) or stamp_ns
-        unit = unit or _positive(told.get("depth_units", "")) or self._unit
+        info = self._metadata.at(self.stamp_ns(i)) if self._metadata else {}
+        if "timestamp" in info:  # only .db3 has it: there the header counts from the start of the recording
+            stamp_ns = ns_from_ms(info["timestamp"]) or stamp_ns
+        unit = unit or _positive(info.get("depth_units", "")) or self._unit
         return depth, stamp_ns, unit or UNITS[encoding]
 
 
@@ -87,9 +87,9 @@ def find_depth(file: BagFile, topic: str = "", info: str = "") -> DepthTopic:
 
     Raises SourceError where there is no such topic, none or several.
     """
-    for given in filter(None, (topic, info)):
-        if given not in file.types:
-            raise SourceError(f"{file.path}: no topic {given} with messages{did_you_mean(given, file.types)}")
+    for named in filter(None, (topic, info)):
+        if named not in file.types:
+            raise SourceError(f"{file.path}: no topic {named} with messages{did_you_mean(named, file.types)}")
     if topic and file.types[topic] not in (IMAGE, COMPRESSED):
         raise SourceError(f"{file.path}: {topic} holds {file.types[topic]}, no images; leave ?depth= out")
     found = [topic] if topic else depth_topics(file)
@@ -108,9 +108,9 @@ def depth_topics(file: BagFile) -> list[str]:
     return [topic for topic in found if topic.removesuffix(f"/{PACKED}") not in set(found) - {topic}]
 
 
-def first_picture(file: BagFile, topic: str, looks: int = 3) -> Picture | None:
+def first_picture(file: BagFile, topic: str, attempts: int = 3) -> Picture | None:
     """Return the first readable image of a topic, None where none of the first few is."""
-    for i in range(min(looks, len(file.stamps(topic)))):
+    for i in range(min(attempts, len(file.stamps(topic)))):
         try:
             return read_picture(file, topic, i, topic)
         except FrameRefused:
@@ -163,27 +163,27 @@ def find_camera(
         raise SourceError(f"{file.path}: no {where[0]} that tells the camera of {topic}; {say}")
     rectified = RECTIFIED.search(topic) is not None
     try:
-        told = _read(file, found)
+        message = _read(file, found)
         millimetres = option(file, sensor, "Stereo Baseline") if sensor else None
-        camera = camera_of(told, rectified, millimetres and millimetres / 1000)
+        camera = camera_of(message, rectified, millimetres and millimetres / 1000)
     except (FrameRefused, StereovoxError, ValueError) as error:
         raise SourceError(f"{file.path}: {found}: {error}") from None
-    if any(told.D) and not rectified:
+    if any(message.D) and not rectified:
         return camera, (f"{file.path}: {found} tells of lens distortion, which is not corrected in {topic}",)
     return camera, ()
 
 
-def camera_of(told: CameraInfo, rectified: bool, baseline: float | None = None) -> PinholeCamera:
+def camera_of(info: CameraInfo, rectified: bool, baseline: float | None = None) -> PinholeCamera:
     """Return the camera that a message tells; rectified: its images are, so that P counts and not K.
 
     Raises StereovoxError for one that cannot be.
     """
-    fx, _, cx, _, fy, cy = told.K[:6]
-    if rectified and told.P[0] > 0:
-        fx, cx, fy, cy = told.P[0], told.P[2], told.P[5], told.P[6]
-    if told.width * told.height > MAX_PIXELS:
-        raise SourceError(f"tells of {told.width}x{told.height} pixels; correct it or name another with ?info=/topic")
-    return PinholeCamera(told.width, told.height, fx, fy, cx, cy, baseline)
+    fx, _, cx, _, fy, cy = info.K[:6]
+    if rectified and info.P[0] > 0:
+        fx, cx, fy, cy = info.P[0], info.P[2], info.P[5], info.P[6]
+    if info.width * info.height > MAX_PIXELS:
+        raise SourceError(f"tells of {info.width}x{info.height} pixels; correct it or name another with ?info=/topic")
+    return PinholeCamera(info.width, info.height, fx, fy, cx, cy, baseline)
 
 
 class Metadata:

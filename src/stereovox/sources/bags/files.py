@@ -41,7 +41,7 @@ class BagFile(Protocol):
         ...
 
 
-def one_line(said: object) -> str:
+def one_line(error: object) -> str:
     """Return the text of an error or name in one line, without a full stop."""
-    plain = re.sub(r"\('(.*?)',?\)", r"\1", str(said))  # some print the arguments of an exception as they are
-    return " ".join(plain.split()).rstrip(".") or f"damaged ({type(said).__name__})"
+    plain = re.sub(r"\('(.*?)',?\)", r"\1", str(error))  # some print the arguments of an exception as they are
+    return " ".join(plain.split()).rstrip(".") or f"damaged ({type(error).__name__})"

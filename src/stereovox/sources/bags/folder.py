@@ -82,8 +82,8 @@ def _files(folder: Path) -> tuple[list[str], tuple[str, ...]]:
         if not names:
             raise SourceError(f"{folder}: no {METADATA} in it; give the folder that rosbag2 made, or a file of it")
         return names, (f"{folder}: no {METADATA}, as after a recording that was cut off: {_few(names)} taken",)
-    told = _metadata(folder / METADATA)
-    names = told.get("relative_file_paths")
+    metadata = _metadata(folder / METADATA)
+    names = metadata.get("relative_file_paths")
     if not isinstance(names, list) or not names or not all(isinstance(name, str) and name for name in names):
         raise SourceError(f"{folder / METADATA}: names no files; write it anew with 'ros2 bag reindex'")
     return list(dict.fromkeys(PurePath(name).name for name in names)), ()  # older ones tell the folder as well
@@ -91,13 +91,13 @@ def _files(folder: Path) -> tuple[list[str], tuple[str, ...]]:
 
 def _metadata(path: Path) -> dict[str, Any]:
     try:
-        told = yaml_value(read_bounded(path, MAX_METADATA))[TITLE]
-        if not isinstance(told, dict):
+        metadata = yaml_value(read_bounded(path, MAX_METADATA))[TITLE]
+        if not isinstance(metadata, dict):
             raise TypeError(f"{TITLE} holds nothing")
     except (OSError, ValueError, TypeError, KeyError) as error:
         cure = "write it anew with 'ros2 bag reindex'"
         raise SourceError(f"{path}: {one_line(error)[:200]}; {cure}") from None
-    return told
+    return metadata
 
 
 def _numbered(folder: Path) -> list[str]:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from stereovox.errors import FrameRefused, MissingExtra, SourceError
 from stereovox.sources.bags.files import MAX_BYTES, BagFile, one_line
 from stereovox.sources.bags.messages import Wire
-from stereovox.sources.bags.unpack import most_unpacked, unpacked, unzipped
+from stereovox.sources.bags.unpack import decompress, decompress_message, max_unpacked
 
 START = b"\x89MCAP0\r\n"
 FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX, STATISTICS = 2, 3, 4, 5, 6, 7, 8, 11
@@ -30,20 +30,20 @@ MESSAGE_HEAD = 22
 """Bytes of a message before its data: channel, number, time of recording and of sending."""
 INDEX_HEAD = HEAD + 6
 """Bytes of a message index before its entries, of 16 bytes each."""
-SMALLEST = HEAD + 40
+MIN_CHUNK_BYTES = HEAD + 40
 """Bytes of an empty chunk."""
 ENTRY = np.dtype([("time", "<u8"), ("offset", "<u8")])
 ENCODINGS = {"cdr": True, "ros1": False}
 """How messages may be serialised, and whether that is ROS 2's way; others (JSON, protobuf) are none of ROS."""
 TAIL = HEAD + 20 + len(START)
 """Bytes of the last record and of what ends a file."""
-LOOSE = -1
+NO_CHUNK = -1
 """In the place of its chunk's: a message that stands in none."""
 MAX_RECORDS = 10_000_000
 """More than these are not gone through: hours of a robot, and 240 MB of memory if all are messages."""
-LATEST = 2**63 - 1
+MAX_STAMP_NS = 2**63 - 1
 Places = NDArray[np.int64]
-"""(N, 3) int64: time in nanoseconds, start of the chunk or `LOOSE`, start of the message in its chunk or the file."""
+"""(N, 3) int64: time in nanoseconds, start of the chunk or `NO_CHUNK`, start of the message in its chunk or the file."""
 CHUNKS = 4
 """Unpacked chunks kept: enough for an image, its camera and the poses around it."""
 
@@ -64,7 +64,7 @@ class McapFile(BagFile):
         self._chunks: OrderedDict[int, bytes] = OrderedDict()
         self._places: dict[str, Places] = {}
         try:
-            self._index: Summary | Scanned = Summary(self._bytes)
+            self._index: Summary | ScannedFile = Summary(self._bytes)
         except ValueError as error:
             self._index = self._scan(str(error))
         self.types = {channel.topic: channel.type for channel in self._index.channels.values()}
@@ -82,13 +82,13 @@ class McapFile(BagFile):
             channel = self._index.channels.get(number)
             if channel is None or channel.topic != topic or recorded != time:
                 raise ValueError("the index points to something else")
-            return Wire(unzipped(bytes(data), MAX_BYTES), cdr=channel.cdr)
+            return Wire(decompress_message(bytes(data), MAX_BYTES), cdr=channel.cdr)
         except (OSError, SourceError, ValueError, MemoryError) as error:
             raise FrameRefused("unreadable", f"{self.path}: message {i} of {topic}: {one_line(error)}") from None
 
-    def _scan(self, why: str) -> Scanned:
+    def _scan(self, why: str) -> ScannedFile:
         """Go through the file and note what was found."""
-        found = Scanned(self._bytes)
+        found = ScannedFile(self._bytes)
         if not found.complete and not found.channels:
             raise SourceError(f"{self.path}: cut off or damaged before the first message; record or copy it again")
         rest = (
@@ -112,7 +112,7 @@ class McapFile(BagFile):
         return self._places[topic]
 
     def _message(self, chunk: int, start: int) -> tuple[int, int, memoryview]:
-        if chunk != LOOSE:
+        if chunk != NO_CHUNK:
             return message_at(self._chunk(chunk), start)
         found = self._bytes.record(start)
         return message_at(self._bytes.at(start, found.end), 0)
@@ -176,13 +176,13 @@ class Summary:
     def _in_chunk(self, chunk: Chunk, channel: int) -> Places:
         file = self._file
         entries = read_message_index(file.fields(file.record(chunk.indexes[channel]), MESSAGE_INDEX), channel)
-        if len(entries) != chunk.counts[channel] or entries["time"].max() > LATEST:
+        if len(entries) != chunk.counts[channel] or entries["time"].max() > MAX_STAMP_NS:
             raise ValueError("the index is damaged")
         start = np.full(len(entries), chunk.start)
         return np.stack([entries["time"].astype(np.int64), start, entries["offset"].astype(np.int64)], axis=1)
 
 
-class Scanned:
+class ScannedFile:
     """The messages found by going through a file from its beginning, as far as it is whole.
 
     whole: how far that is, in bytes; complete: whether the file ends there as it should; damaged: chunks left out.
@@ -194,8 +194,8 @@ class Scanned:
         self.whole, self.complete, self.damaged = len(START), False, 0
         self._schemas: dict[int, str] = {}
         self._found: dict[int, array[int]] = {}
-        self._file, self._count, self._swollen = file, 0, 0
-        self._go_through()
+        self._file, self._count, self._unpacked_bytes = file, 0, 0
+        self._scan_records()
         self.channels = {key: known for key, known in self.channels.items() if key in self._found}
 
     def places(self, topic: str) -> Places:
@@ -203,43 +203,47 @@ class Scanned:
         keys = [key for key, known in self.channels.items() if known.topic == topic]
         return np.concatenate([np.frombuffer(self._found[key], np.int64).reshape(-1, 3) for key in keys])
 
-    def _go_through(self) -> None:
+    def _scan_records(self) -> None:
         while True:
             try:
                 found = self._file.record(self.whole)
                 if found.kind in (DATA_END, FOOTER):
                     self.complete = True
                     return
-                self._take_in(found)
+                self._add_record(found)
             except (MissingExtra, SourceError):
                 raise
             except ValueError:
                 return
             self.whole = found.end
 
-    def _take_in(self, found: Record) -> None:
+    def _add_record(self, found: Record) -> None:
         if found.kind == CHUNK:
             try:
                 inner = self._file.chunk(found)
-                self._swollen += len(inner)
-                if self._swollen > most_unpacked(self._file.size):
+                self._unpacked_bytes += len(inner)
+                if self._unpacked_bytes > max_unpacked(self._file.size):
                     raise SourceError(f"{self._file.path}: its chunks unpack to an absurd size; record it again")
                 for part in _records(inner):
-                    self._note(part, inner[part.start : min(part.end, part.start + self._needed(part))], found)
+                    self._add_fields(
+                        part, inner[part.start : min(part.end, part.start + self._bytes_needed(part))], found
+                    )
             except (MissingExtra, SourceError):
                 raise
             except ValueError:
                 self.damaged += 1
         elif found.kind in (SCHEMA, CHANNEL, MESSAGE):
-            self._note(found, self._file.at(found.start, min(found.end, found.start + self._needed(found))), None)
+            self._add_fields(
+                found, self._file.at(found.start, min(found.end, found.start + self._bytes_needed(found))), None
+            )
 
     @staticmethod
-    def _needed(found: Record) -> int:
+    def _bytes_needed(found: Record) -> int:
         if found.kind == MESSAGE:
             return MESSAGE_HEAD
         return found.end - found.start if found.kind in (SCHEMA, CHANNEL) else 0
 
-    def _note(self, found: Record, fields: bytes, chunk: Record | None) -> None:
+    def _add_fields(self, found: Record, fields: bytes, chunk: Record | None) -> None:
         """Take in a schema, channel or message."""
         self._count += 1
         if self._count > MAX_RECORDS:
@@ -253,18 +257,18 @@ class Scanned:
             if channel is not None:
                 self.channels[number] = channel
         elif found.kind == MESSAGE:
-            self._note_message(found, fields, chunk)
+            self._add_message(found, fields, chunk)
 
-    def _note_message(self, found: Record, fields: bytes, chunk: Record | None) -> None:
+    def _add_message(self, found: Record, fields: bytes, chunk: Record | None) -> None:
         if len(fields) < MESSAGE_HEAD:
             raise ValueError("a message without its head")
         number, _, time, _ = struct.unpack("<HIQQ", fields)
         if number not in self.channels:
             return
-        if time > LATEST:
+        if time > MAX_STAMP_NS:
             raise ValueError("a time that cannot be")
         place = found.start - HEAD
-        self._found.setdefault(number, array("q")).extend((time, chunk.start - HEAD if chunk else LOOSE, place))
+        self._found.setdefault(number, array("q")).extend((time, chunk.start - HEAD if chunk else NO_CHUNK, place))
 
 
 class Record(NamedTuple):
@@ -329,7 +333,7 @@ class McapBytes:
         data = wire.block(wire.number("Q"))
         if size > MAX_BYTES:
             raise ValueError("a chunk unpacks to an absurd size")
-        inner = unpacked(data, packing, size)
+        inner = decompress(data, packing, size)
         if len(inner) != size or (checksum and zlib.crc32(inner) != checksum):
             raise ValueError("a chunk is damaged")
         return inner
@@ -364,7 +368,7 @@ def read_channel(wire: Wire, schemas: dict[int, str]) -> tuple[int, Channel | No
 def read_chunk_index(wire: Wire) -> Chunk:
     """Return where a chunk and the indexes of its messages stand; raises ValueError where that cannot be."""
     _, _, start, length = wire.numbers("Q", 4)
-    if length < SMALLEST:
+    if length < MIN_CHUNK_BYTES:
         raise ValueError("the index is damaged")
     places = np.frombuffer(wire.data(), np.dtype([("channel", "<u2"), ("at", "<u8")]))
     end = start + length + wire.number("Q")

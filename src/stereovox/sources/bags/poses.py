@@ -64,7 +64,7 @@ def topic_poses(file: BagFile, topic: str, frame_id: str = "") -> FoundPoses:
     if topic not in file.types:
         raise SourceError(f"{file.path}: no topic {topic} with messages{did_you_mean(topic, file.types)}")
     if file.types[topic] not in POSE_TYPES:
-        raise SourceError(f"{file.path}: {topic} holds {file.types[topic]}, no poses; name one of {_known()}")
+        raise SourceError(f"{file.path}: {topic} holds {file.types[topic]}, no poses; name one of {_supported_types()}")
     return _read(file, topic, frame_id)
 
 
@@ -95,16 +95,16 @@ def _read(file: BagFile, topic: str, frame_id: str) -> FoundPoses:
             pose = read_pose(file.read(topic, i), kind)
         except (FrameRefused, ValueError):
             continue  # images near it find no pose near enough
-        told = metadata.at(int(recorded[i])) if metadata else {}
-        stamps.append(_stamp(pose, told, int(recorded[i])))
+        values = metadata.at(int(recorded[i])) if metadata else {}
+        stamps.append(_stamp(pose, values, int(recorded[i])))
         numbers.append(pose.numbers)
-        confidence.append(_confidence(told.get("Tracker Confidence", "")))
+        confidence.append(_confidence(values.get("Tracker Confidence", "")))
         child = child or pose.child
     where = f"{file.path} {topic}"
     if not stamps:
         return FoundPoses(None, f"{where}: not one pose can be read; {CURE}")
     rows = np.array(numbers)
-    faults = _spoil(rows, stamps, where)
+    faults = _mark_unusable(rows, stamps, where)
     trusted = np.array(confidence) if np.isfinite(confidence).any() else None
     with np.errstate(invalid="ignore"):
         poses = Poses(stamps, transforms(rows), trusted, where=where, faults=faults)
@@ -113,10 +113,10 @@ def _read(file: BagFile, topic: str, frame_id: str) -> FoundPoses:
     return FoundPoses(poses, "", bool(match), bool(child) and child.strip("/") == frame_id.strip("/"), assumed)
 
 
-def _stamp(pose: StampedPose, told: dict[str, str], recorded_ns: int) -> int:
+def _stamp(pose: StampedPose, metadata: dict[str, str], recorded_ns: int) -> int:
     if pose.stamp_ns is not None:
         return pose.stamp_ns
-    stamp_ns = ns_from_ms(told.get("frame_timestamp", ""))
+    stamp_ns = ns_from_ms(metadata.get("frame_timestamp", ""))
     return recorded_ns if stamp_ns is None else stamp_ns
 
 
@@ -127,12 +127,12 @@ def _confidence(text: str) -> float:
         return math.nan
 
 
-def _spoil(rows: np.ndarray, stamps: list[int], where: str) -> dict[int, str]:
+def _mark_unusable(rows: np.ndarray, stamps: list[int], where: str) -> dict[int, str]:
     """Turn poses that are none into NaN, and return by stamp what is wrong with them."""
     bad = ~np.isfinite(rows).all(axis=1) | (np.linalg.norm(rows[:, 3:], axis=1) < 1e-6)
     rows[bad] = np.nan
     return {stamps[k]: f"{where}: message {k} holds no pose; leave the images near it out" for k in np.flatnonzero(bad)}
 
 
-def _known() -> str:
+def _supported_types() -> str:
     return ", ".join(sorted(POSE_TYPES))

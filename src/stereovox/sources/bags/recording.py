@@ -24,7 +24,7 @@ from stereovox.sources.poses import Poses
 from stereovox.sources.tracker import AXES, WORLDS, turned
 
 STANDING = ("", "fixed")
-Given = TypeVar("Given")
+OptionsT = TypeVar("OptionsT")
 
 
 @dataclass(frozen=True)
@@ -172,12 +172,12 @@ def parse(where: str) -> tuple[Path, Options]:
     return parse_as(where, Options)
 
 
-def parse_as(where: str, kind: type[Given]) -> tuple[Path, Given]:
+def parse_as(where: str, kind: type[OptionsT]) -> tuple[Path, OptionsT]:
     """Return file and options of a kind; raises SourceError, one line, for bad options."""
     file = file_part(where)
     try:
-        _, given = parameters.split(where[len(file) :])
-        return Path(file), kind(**parameters.typed(given, parameters.defaults(kind)))
+        _, texts = parameters.split(where[len(file) :])
+        return Path(file), kind(**parameters.typed(texts, parameters.defaults(kind)))
     except SourceError as error:
         raise SourceError(f"{where}: {error}") from None
 

@@ -59,8 +59,8 @@ def read_laser_scan(wire: Wire, range_max: float = 0.0) -> LaserScan:
     make no sense.
     """
     stamp_ns, frame_id = wire.header()
-    angle_min, _, angle_step, _, _, range_min, told_max = wire.numbers("f", 7)
-    range_max = range_max or told_max
+    angle_min, _, angle_step, _, _, range_min, declared_max = wire.numbers("f", 7)
+    range_max = range_max or declared_max
     count = wire.number()
     if count > MAX_BEAMS:
         raise ValueError(f"a scan of {count} ranges; no lidar has so many beams")

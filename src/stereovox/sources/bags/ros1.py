@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from stereovox.errors import FrameRefused, MissingExtra, SourceError
 from stereovox.sources.bags.files import MAX_BYTES, BagFile, one_line
 from stereovox.sources.bags.messages import Wire
-from stereovox.sources.bags.unpack import unpacked
+from stereovox.sources.bags.unpack import decompress
 
 CHUNKS = 4
 """Unpacked chunks kept: enough for an image, its metadata and the poses around it."""
@@ -119,4 +119,4 @@ def _unpacked(data: bytes, decompressor: Any) -> bytes:
     from rosbags.rosbag1.reader import decompressors
 
     packing = next((name for name in ("bz2", "lz4") if decompressors[name] is decompressor), "")
-    return unpacked(data, packing, MAX_BYTES)
+    return decompress(data, packing, MAX_BYTES)

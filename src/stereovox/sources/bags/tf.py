@@ -94,9 +94,10 @@ class Edge:
             return self._held(stamp_ns, max(after - 1, 0), limits, where)
         start, end = int(stamps[after - 1]), int(stamps[after])
         if end - start > limits.max_gap_s * 1e9 and not self._still:
-            told = f"has no transform for {_seconds(end - start)} after {seconds_from_ns(start)} s"
+            message = f"has no transform for {_seconds(end - start)} after {seconds_from_ns(start)} s"
             raise FrameRefused(
-                "no_pose", f"{where}: {self} {told} (at most {limits.max_gap_s:g} s is bridged); record it more often"
+                "no_pose",
+                f"{where}: {self} {message} (at most {limits.max_gap_s:g} s is bridged); record it more often",
             )
         return interpolate(_motion(rows[after - 1]), _motion(rows[after]), (stamp_ns - start) / (end - start))
 
@@ -116,8 +117,8 @@ class Edge:
         limit_s = max(limits.max_gap_s, limits.extrapolate_s) if self._still else limits.extrapolate_s
         if away > limit_s * 1e9:
             side = "begins after" if stamp_ns < stamps[nearest] else "ends before"
-            told = f"{side} {seconds_from_ns(stamp_ns)} s, {_seconds(away)} away (at most {limit_s:g} s)"
-            raise FrameRefused("no_pose", f"{where}: {self} {told}; leave that part of the recording out")
+            message = f"{side} {seconds_from_ns(stamp_ns)} s, {_seconds(away)} away (at most {limit_s:g} s)"
+            raise FrameRefused("no_pose", f"{where}: {self} {message}; leave that part of the recording out")
         return _motion(rows[nearest])
 
     def _in_order(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
@@ -146,8 +147,8 @@ class Tf:
     def __init__(self, where: str = "tf", limits: Limits | None = None):
         self.where, self.limits, self.unreadable = where, limits or Limits(), 0
         self._parents: dict[str, dict[str, Edge]] = {}
-        self._ways: dict[tuple[str, str], Way] = {}
-        self._left_out = 0
+        self._paths: dict[tuple[str, str], EdgePath] = {}
+        self._skipped = 0
 
     def add(self, parent: str, child: str, stamp_ns: int, numbers: Iterable[float], fixed: bool = False) -> None:
         """Take in where `child` stood in `parent` at a time, or always: tx ty tz in metres, quaternion qx qy qz qw.
@@ -156,7 +157,7 @@ class Tf:
         """
         row, parent, child = tuple(map(float, numbers)), frame_name(parent), frame_name(child)
         if not (parent and child and parent != child and is_motion(row)):
-            self._left_out += 1
+            self._skipped += 1
         elif fixed:
             self.add_fixed(parent, child, from_quaternion(row[:3], row[3:]))
         else:
@@ -180,8 +181,8 @@ class Tf:
             for child, edge in torn.items()
             if edge
         ]
-        if self._left_out:
-            notes.append(f"{self.where}: {self._left_out} transforms are none and were left out")
+        if self._skipped:
+            notes.append(f"{self.where}: {self._skipped} transforms are none and were left out")
         if self.unreadable:
             notes.append(f"{self.where}: {self.unreadable} messages cannot be read and were left out")
         return tuple(notes)
@@ -192,25 +193,25 @@ class Tf:
         Raises FrameRefused `no_pose`, one line: an unknown frame, frames that nothing connects or that go round in a
         loop, a gap in time (see `Edge.at`).
         """
-        up, down = self._way(frame_name(target), frame_name(source))
+        up, down = self._path(frame_name(target), frame_name(source))
         return inverse(self._along(up, stamp_ns)) @ self._along(down, stamp_ns)
 
     def off_ns(self, target: str, source: str, stamp_ns: int) -> int:
         """Return how far `lookup` extrapolates; raises FrameRefused as it does for frames that nothing connects."""
-        up, down = self._way(frame_name(target), frame_name(source))
+        up, down = self._path(frame_name(target), frame_name(source))
         return max((edge.off_ns(int(stamp_ns)) for edge in (*up, *down)), default=0)
 
     def connected(self, target: str, source: str) -> bool:
         """Tell whether both frames are there and some way connects them."""
         try:
-            self._way(frame_name(target), frame_name(source))
+            self._path(frame_name(target), frame_name(source))
         except FrameRefused:
             return False
         return True
 
     def moving(self, target: str, source: str) -> bool:
         """Tell whether one frame was seen to move in the other; raises FrameRefused where nothing connects them."""
-        return any(edge.moves for part in self._way(frame_name(target), frame_name(source)) for edge in part)
+        return any(edge.moves for part in self._path(frame_name(target), frame_name(source)) for edge in part)
 
     def root(self, frame: str) -> str:
         """Return the frame that has no parent, above `frame`; raises FrameRefused for an unknown frame and a loop."""
@@ -218,7 +219,7 @@ class Tf:
         return chain[-1].parent if chain else frame_name(frame)
 
     def _edge(self, parent: str, child: str) -> Edge:
-        self._ways.clear()
+        self._paths.clear()
         parent, child = frame_name(parent), frame_name(child)
         edges = self._parents.setdefault(child, {})
         if parent not in edges:
@@ -243,8 +244,8 @@ class Tf:
             seen.append(edge.parent)
         return tuple(chain)
 
-    def _way(self, target: str, source: str) -> Way:
-        if (target, source) not in self._ways:
+    def _path(self, target: str, source: str) -> EdgePath:
+        if (target, source) not in self._paths:
             up, down = self._chain(target), self._chain(source)
             roots = [chain[-1].parent if chain else frame for chain, frame in ((up, target), (down, source))]
             if roots[0] != roots[1]:
@@ -254,8 +255,8 @@ class Tf:
                 raise FrameRefused("no_pose", f"{self.where}: nothing connects {parts}; record what joins them")
             while up and down and up[-1] is down[-1]:
                 up, down = up[:-1], down[:-1]
-            self._ways[target, source] = up, down
-        return self._ways[target, source]
+            self._paths[target, source] = up, down
+        return self._paths[target, source]
 
     def _along(self, edges: tuple[Edge, ...], stamp_ns: int) -> Transform:
         """Return T_ancestor_frame of the edges from a frame up to its ancestor."""
@@ -263,6 +264,10 @@ class Tf:
         for edge in edges:
             T = edge.at(int(stamp_ns), self.limits, self.where) @ T
         return T
+
+
+EdgePath = tuple[tuple[Edge, ...], tuple[Edge, ...]]
+"""Edges from a target up to the common ancestor, and from a source up to it."""
 
 
 def tf_topics(file: BagFile) -> list[str]:
@@ -285,11 +290,11 @@ def read_tf(file: BagFile, limits: Limits | None = None) -> Tf | None:
         fixed = topic.endswith("tf_static")
         for i in range(len(file.stamps(topic))):
             try:
-                told = read_transforms(file.read(topic, i))
+                message = read_transforms(file.read(topic, i))
             except (FrameRefused, ValueError):
                 tf.unreadable += 1
                 continue
-            for one in told:
+            for one in message:
                 tf.add(one.parent, one.child, one.stamp_ns, one.numbers, fixed)
     return tf
 
@@ -333,10 +338,6 @@ def tf_poses(tf: Tf, body: str, world: str = "") -> TfPoses | str:
             raise SourceError(f"{refused}; correct ?world_frame={world}") from None
         return str(refused)
     return f"{tf.where}: tells how {body} is mounted on {name}, not where that was"
-
-
-Way = tuple[tuple[Edge, ...], tuple[Edge, ...]]
-"""Edges from a target up to the common ancestor, and from a source up to it."""
 
 
 def _motion(numbers: NDArray[np.float64]) -> Transform:

@@ -72,7 +72,7 @@ class BagWriter:
             self._file.abort()
             return
         try:
-            self._tell_fixed()
+            self._flush_fixed()
         except BaseException:
             self._file.abort()
             raise
@@ -186,10 +186,10 @@ class BagWriter:
 
     def _write(self, topic: str, kind: str, stamp_ns: int, message: Any, latched: bool = False) -> None:
         self._last_ns = stamp_ns
-        self._tell_fixed()
+        self._flush_fixed()
         self._file.write(topic, kind, stamp_ns, message, latched)
 
-    def _tell_fixed(self) -> None:
+    def _flush_fixed(self) -> None:
         if self._due:
             self._due = False
             message = self._messages.transforms(self._last_ns, list(self._fixed.values()))
@@ -230,7 +230,7 @@ class BagFileWriter:
     def open(self) -> None:
         """Begin; nothing is at `path` yet."""
         try:
-            with self._told():
+            with self._one_line_errors():
                 self._folder.mkdir()
                 self._writer = self._ros1() if self.ros == 1 else self._ros2()
                 self._writer.open()
@@ -246,7 +246,7 @@ class BagFileWriter:
         if self._writer is None:
             raise SourceError(f"{self.path}: not open; write 'with BagWriter(path) as bag:'")
         self.check_stamp(stamp_ns)
-        with self._told():
+        with self._one_line_errors():
             if topic not in self._connections:
                 self._connections[topic] = self._connect(topic, kind, latched)
             if (held := self._connections[topic].msgtype) != kind:
@@ -263,7 +263,7 @@ class BagFileWriter:
     def finish(self) -> None:
         """Complete the recording and put it where it belongs; an older file of that name is replaced."""
         try:
-            with self._told():
+            with self._one_line_errors():
                 self._writer.close()
                 self._move()
         finally:
@@ -328,7 +328,7 @@ class BagFileWriter:
         sync_folder(self._target.parent)
 
     @contextmanager
-    def _told(self) -> Iterator[None]:
+    def _one_line_errors(self) -> Iterator[None]:
         """Turn what goes wrong while writing into one line."""
         try:
             yield

@@ -19,7 +19,7 @@ from stereovox.safe_io import MAX_LIST, read_text
 from stereovox.se3 import Transform, inverse
 from stereovox.sources import parameters
 from stereovox.sources.base import Source
-from stereovox.sources.images import PICTURE, common_size, file_names, read_picture_png
+from stereovox.sources.images import PICTURE_KINDS, common_size, file_names, read_picture_png
 from stereovox.sources.kitti.calibration import KittiCalibration
 from stereovox.sources.lidar import Box, LidarScan, read_velodyne
 
@@ -77,9 +77,9 @@ class KittiSource(Source, ABC):
             size = (pair.camera.width, pair.camera.height)
             left, right = (read_picture_png(path, size) for path in paths)
         except FrameRefused as refused:
-            nothing, nowhere = np.empty((0, 0), np.uint8), np.full((4, 4), np.nan)
+            no_image, no_pose = np.empty((0, 0), np.uint8), np.full((4, 4), np.nan)
             return StereoFrame(
-                nothing, nothing, pair, nowhere, stamp_ns, str(paths[0]), refused.reason, fault_detail=str(refused)
+                no_image, no_image, pair, no_pose, stamp_ns, str(paths[0]), refused.reason, fault_detail=str(refused)
             )
         return StereoFrame(left, right, pair, T_world_left, stamp_ns, str(paths[0]))
 
@@ -115,7 +115,7 @@ class KittiSource(Source, ABC):
     def _size(self) -> tuple[int, int]:
         """Return (width, height) of the left images; raises SourceError where none can be read."""
         paths = [self.images(i)[0] for i in range(len(self))]
-        size = common_size(paths, kinds=PICTURE)
+        size = common_size(paths, kinds=PICTURE_KINDS)
         if size is None:
             folder = paths[0].parent if paths else self.name
             raise SourceError(f"{folder}: none of its {len(paths)} images is a readable 8-bit PNG; copy them again")

@@ -80,13 +80,13 @@ class KittiRaw(KittiSource):
             path, lines = self._eye(0) / "timestamps.txt", len(self._stamps)
             raise SourceError(f"{path}: has {lines} lines, but there is an image {numbers[-1]}.png; copy it again")
 
-    def _poses(self, wanted: str) -> FramePoses:
-        if not wanted:
+    def _poses(self, choice: str) -> FramePoses:
+        if not choice:
             there = [kind for kind, name in POSE_FILES.items() if os.path.isfile(self.folder / name)]
-            wanted = there[0] if there else OXTS
-        if wanted == OXTS:
+            choice = there[0] if there else OXTS
+        if choice == OXTS:
             return self._oxts()
-        path = self.folder / POSE_FILES[wanted] if wanted in POSE_FILES else named_file(wanted, self.folder)
+        path = self.folder / POSE_FILES[choice] if choice in POSE_FILES else named_file(choice, self.folder)
         return read_pose_file(path, len(self))
 
     def _oxts(self) -> FramePoses:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.cameras.rigs import StereoPair
 from stereovox.errors import FrameRefused, SourceError
-from stereovox.sources.images import PICTURE, png_size, read_picture_png
+from stereovox.sources.images import PICTURE_KINDS, png_size, read_picture_png
 from stereovox.sources.kitti.base import KittiSource, folder_of, location, numbers_in
 from stereovox.sources.kitti.calibration import KittiCalibration, from_raw_files, read_calibration
 from stereovox.sources.kitti.poses import StandingPoses
@@ -95,7 +95,7 @@ class KittiStereo2015(KittiSource):
 
     def _camera(self, i: int, usual: tuple[int, int]) -> PinholeCamera:
         try:
-            size = png_size(self.images(i)[0], PICTURE)
+            size = png_size(self.images(i)[0], PICTURE_KINDS)
         except FrameRefused:  # said when the frame is read
             size = usual
         return self._calibrations[i].camera(*self.eyes, size)

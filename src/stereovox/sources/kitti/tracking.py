@@ -87,9 +87,9 @@ class KittiTracking(KittiSource):
     def _file(self, kind: str) -> Path:
         return self.folder / kind / f"{self.sequence}.txt"
 
-    def _poses(self, wanted: str) -> FramePoses:
-        if wanted and wanted != OXTS:
-            return read_pose_file(named_file(wanted, self.folder), len(self))
+    def _poses(self, choice: str) -> FramePoses:
+        if choice and choice != OXTS:
+            return read_pose_file(named_file(choice, self.folder), len(self))
         c = self.calibration
         if c.T_cam0_velo is None or c.T_velo_imu is None:
             missing = "R_rect and Tr_velo_cam" if c.T_cam0_velo is None else "Tr_imu_velo"
@@ -156,17 +156,17 @@ def _label(words: list[str], where: str) -> tuple[int, Label]:
     raise SourceError(f"{where}: needs {FIELDS} fields 'frame track kind ... h w l x y z rotation_y'; correct the line")
 
 
-def _sequence(folder: Path, wanted: str) -> tuple[Path, str]:
+def _sequence(folder: Path, choice: str) -> tuple[Path, str]:
     """Return the folder that holds all sequences, and the number of the one that is meant."""
     whole = Path(os.path.abspath(folder))
     if whole.parent.name == LEFT:
-        if wanted:
-            raise SourceError(f"{folder}: is a sequence already; leave sequence={wanted} out")
+        if choice:
+            raise SourceError(f"{folder}: is a sequence already; leave sequence={choice} out")
         return whole.parents[1], whole.name
     known = numbers_in(folder / LEFT, SEQUENCE)
-    if not wanted and len(known) == 1:
+    if not choice and len(known) == 1:
         return folder, known[0]
-    if wanted not in known:
+    if choice not in known:
         found = f"holds sequences {', '.join(known)}" if known else f"has no sequence in {LEFT}"
         raise SourceError(f"{folder}: {found}; say which: {folder}?sequence={known[0] if known else '0000'}")
-    return folder, wanted
+    return folder, choice

@@ -18,7 +18,7 @@ from stereovox.sources.bags.files import BagFile
 from stereovox.sources.bags.poses import topic_poses
 from stereovox.sources.bags.recording import depth_frame, file_part, parse_as
 from stereovox.sources.bags.robot_messages import LaserScan, frame_name
-from stereovox.sources.bags.scans import find_scans, most
+from stereovox.sources.bags.scans import busiest_topic, find_scans
 from stereovox.sources.bags.tf import Limits
 from stereovox.sources.base import Lazy
 from stereovox.sources.poses import Poses
@@ -26,7 +26,7 @@ from stereovox.sources.robots.cloud_scan import CloudBand, scan_of_cloud
 from stereovox.sources.robots.frames import FrameOptions, RobotFrames
 from stereovox.sources.tracker import AXES
 
-NOWHERE = np.full((4, 4), np.nan)
+NO_POSE = np.full((4, 4), np.nan)
 T_BODY_OPTICAL = np.eye(4)
 """An optical frame (z forward) in a body that looks the same way (x forward, z up)."""
 T_BODY_OPTICAL[:3, :3] = AXES["ros"].T
@@ -120,9 +120,9 @@ class RobotBag:
         depth_frame_id = frame_name(self._depth.frame_id) if self._depth else ""
         self._scans, scan_notes = find_scans(file, options.scan, options.range_max, depth_frame_id)
         if not (self._scans or self._depth):
-            seen = ", ".join(f"{name} ({kind})" for name, kind in sorted(file.types.items())[:5]) or "nothing at all"
+            pixels = ", ".join(f"{name} ({kind})" for name, kind in sorted(file.types.items())[:5]) or "nothing at all"
             why = f"{depth_notes[0]}; else" if depth_notes else f"{path}:"
-            raise SourceError(f"{why} no scans, point clouds or depth images in it; it holds {seen}")
+            raise SourceError(f"{why} no scans, point clouds or depth images in it; it holds {pixels}")
         limits = Limits(options.max_gap, options.extrapolate)
         chosen = FrameOptions(options.odom, options.base_frame, options.odom_frame, options.truth, limits)
         scan_frame_id = self._scans.frame_id if self._scans else ""
@@ -156,21 +156,21 @@ class RobotBag:
         topic = self._scans
         assert topic
         blank = Scan(
-            np.empty(0, np.float32), 0.0, 0.0, 0.0, 0.0, NOWHERE, stamp_ns=topic.recorded_ns(i), name=topic.name(i)
+            np.empty(0, np.float32), 0.0, 0.0, 0.0, 0.0, NO_POSE, stamp_ns=topic.recorded_ns(i), name=topic.name(i)
         )
         try:
-            told = topic.read(i)
-            blank = replace(blank, stamp_ns=told.stamp_ns)
-            sensor = self._lidar if told.frame_id == topic.frame_id else told.frame_id
-            T_base, T_odom = (look(sensor, told.stamp_ns) for look in (self.where.in_base, self.where.in_odom))
-            off_ns = self.where.off_ns(sensor, told.stamp_ns)
+            message = topic.read(i)
+            blank = replace(blank, stamp_ns=message.stamp_ns)
+            sensor = self._lidar if message.frame_id == topic.frame_id else message.frame_id
+            T_base, T_odom = (look(sensor, message.stamp_ns) for look in (self.where.in_base, self.where.in_odom))
+            off_ns = self.where.off_ns(sensor, message.stamp_ns)
         except FrameRefused as refused:
             return replace(blank, fault=refused.reason, fault_detail=str(refused))
-        if isinstance(told, LaserScan):
-            return posed_scan(told, T_odom, T_base, blank.name, off_ns)
+        if isinstance(message, LaserScan):
+            return posed_scan(message, T_odom, T_base, blank.name, off_ns)
         band = CloudBand(self._options.lowest, self._options.highest)
         band = replace(band, range_max=self._options.range_max or band.range_max)
-        flat, T_base_scan = scan_of_cloud(told, T_base, band)
+        flat, T_base_scan = scan_of_cloud(message, T_base, band)
         return posed_scan(flat, T_odom @ inverse(T_base) @ T_base_scan, T_base_scan, blank.name, off_ns)
 
     def _frame(self, i: int) -> Frame:
@@ -185,12 +185,12 @@ class RobotBag:
         return T if self._options.axes == "optical" else T @ T_BODY_OPTICAL
 
 
-def posed_scan(told: LaserScan, T_odom_sensor: Transform, T_base_sensor: Transform, name: str, off_ns: int) -> Scan:
+def posed_scan(message: LaserScan, T_odom_sensor: Transform, T_base_sensor: Transform, name: str, off_ns: int) -> Scan:
     """Return a message as a scan. off_ns: as `Scan.pose_off_ns`."""
-    angles = told.angle_min, told.angle_step
-    limits = told.range_min, told.range_max
+    angles = message.angle_min, message.angle_step
+    limits = message.range_min, message.range_max
     return Scan(
-        told.ranges, *angles, *limits, T_odom_sensor, T_base_sensor, stamp_ns=told.stamp_ns, name=name,
+        message.ranges, *angles, *limits, T_odom_sensor, T_base_sensor, stamp_ns=message.stamp_ns, name=name,
         pose_off_ns=off_ns,
     )  # fmt: skip
 
@@ -205,7 +205,7 @@ def _find_depth(file: BagFile, options: RobotOptions) -> tuple[DepthTopic | None
     found, notes = depth_topics(file), ()
     if not found:
         return None, ()
-    best = most(file, found)
+    best = busiest_topic(file, found)
     if len(found) > 1:
         others = ", ".join(name for name in found if name != best)
         notes = (f"{file.path}: depth images of {best}; there are {others} too: say ?depth=/topic for those",)

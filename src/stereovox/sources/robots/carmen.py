@@ -25,15 +25,15 @@ from stereovox.sources.poses import Poses
 LASERS = {b"FLASER": 100.0, b"ROBOTLASER1": 100.0}
 """Kinds of lines that hold a scan of the front laser, and the metres within which it must sit on the robot."""
 NO_ECHO = (50.0, 81.9)
-FARTHEST = 1e6
+MAX_DISTANCE = 1e6
 """Metres from the world's origin within which a robot can be."""
 MAX_BEAMS = 100_000
 ENDINGS = (".clf", ".log", ".clf.bz2", ".log.bz2")
-LONGEST = 1 << 20
+MAX_LINE_BYTES = 1 << 20
 """Bytes of a line; what is longer is no line of a log."""
-SMALL, PACKED_BEST = 1 << 18, 100
+ALWAYS_ALLOWED, MAX_RATIO = 1 << 18, 100
 """A packed log may become so many bytes, or so many for each of its own; text packs to a tenth."""
-NO_ECHO_MEANS = {"unknown": np.nan, "free": np.inf}
+NO_ECHO_VALUES = {"unknown": np.nan, "free": np.inf}
 OFFSETS = {"robot_frontlaser_offset", "robot_front_laser_offset", "frontlaser_offset"}
 
 
@@ -58,7 +58,7 @@ class CarmenLog:
             raise SourceError(f"{path}: holds no scan (FLASER or ROBOTLASER1 line)")
         self._max_range = options.max_range or self._readings[0].max_range or _no_echo(self._readings)
         self.notes = tuple(_notes(path, self.damaged, self._max_range, options.no_echo))
-        self.scans: Sequence[Scan] = _Scans(self._readings, self._max_range, NO_ECHO_MEANS[options.no_echo])
+        self.scans: Sequence[Scan] = _Scans(self._readings, self._max_range, NO_ECHO_VALUES[options.no_echo])
         self.frames: Sequence[Frame] = ()
         self.truth: Poses | None = None
 
@@ -83,8 +83,8 @@ class Options:
     def __post_init__(self) -> None:
         if self.max_range < 0:
             raise SourceError(f"max_range={self.max_range:g} must be a positive number")
-        if self.no_echo not in NO_ECHO_MEANS:
-            raise SourceError(f"no_echo={self.no_echo} must be {' or '.join(NO_ECHO_MEANS)}")
+        if self.no_echo not in NO_ECHO_VALUES:
+            raise SourceError(f"no_echo={self.no_echo} must be {' or '.join(NO_ECHO_VALUES)}")
 
 
 class DamagedLine(ValueError):  # noqa: N818 - reads as what happened
@@ -136,7 +136,7 @@ def _robotlaser(words: list[bytes], number: int) -> Reading:
     ranges, tail = _numbers(words, 8)
     _, tail = _numbers([b"", *tail], 1)
     laser, robot = _poses(tail[:6])
-    if not (math.isfinite(start) and math.isfinite(step) and 0 < abs(step) < 1 and 0 <= most <= FARTHEST):
+    if not (math.isfinite(start) and math.isfinite(step) and 0 < abs(step) < 1 and 0 <= most <= MAX_DISTANCE):
         raise DamagedLine(f"ROBOTLASER1 with beams {step:g} apart, from {start:g}, of {most:g} m")
     mount = se2.relative(robot, laser)
     if np.hypot(*mount[:2]) > LASERS[b"ROBOTLASER1"]:
@@ -155,7 +155,7 @@ def _numbers(words: list[bytes], at: int) -> tuple[NDArray[np.float32], list[byt
 
 def _poses(words: list[bytes]) -> tuple[se2.Pose, se2.Pose]:
     values = np.array([float(word) for word in words])
-    if len(values) != 6 or not np.abs(values).max() < FARTHEST:
+    if len(values) != 6 or not np.abs(values).max() < MAX_DISTANCE:
         raise DamagedLine("a pose that is missing, not finite or beyond 1000 km")
     return values[:3], values[3:]
 
@@ -225,8 +225,8 @@ def _offset(line: bytes, before: float) -> float:
 def _lines(path: Path, damaged: list[str]) -> Iterator[tuple[int, bytes]]:
     try:
         with _opened(path) as file:
-            number, size, most = 0, 0, max(SMALL, PACKED_BEST * path.stat().st_size)
-            while line := file.readline(LONGEST):
+            number, size, most = 0, 0, max(ALWAYS_ALLOWED, MAX_RATIO * path.stat().st_size)
+            while line := file.readline(MAX_LINE_BYTES):
                 number, size = number + 1, size + len(line)
                 if size > most:
                     damaged.append(f"the packed file swells to more than {most} bytes; the rest is left out")

@@ -55,7 +55,7 @@ class RobotFrames:
             self._edge = odometry_edge(file, topic, first.parent or ODOMS[0], child)
             self.odom, how = self._edge.parent, (*noted, *said)
         if not self.odom:
-            self.odom, how = self._anything_moving()
+            self.odom, how = self._moving_root()
         self.notes = (*based, *how, *self.tf.notes)
 
     def mount(self, sensor: str, alias: str, given: Transform | None, T_frame: Transform) -> tuple[str, Notes]:
@@ -142,7 +142,7 @@ class RobotFrames:
             raise SourceError(f"{refused}; correct ?odom_frame={given}") from None
         return given
 
-    def _anything_moving(self) -> tuple[str, Notes]:
+    def _moving_root(self) -> tuple[str, Notes]:
         """Return the root above the robot, where it moves there; else "": it is taken to stand still."""
         if self.base in self.tf.frames and self._moved(self.base):
             root = self.tf.root(self.base)

@@ -8,8 +8,10 @@ from made_recordings import depth_image, seven_scenes, tum, write_png
 
 from stereovox import open_source as public_open_source
 from stereovox.errors import SourceError
-from stereovox.opening import SOURCES, open_source
+from stereovox.opening import SOURCES, open_images, open_source
 from stereovox.registry import find
+from stereovox.simulate.recorder import record
+from stereovox.simulate.simulation import Simulation
 from stereovox.sources.seven_scenes import SevenScenes
 from stereovox.sources.tum import TumRgbd
 
@@ -77,5 +79,5 @@ def test_each_layout_is_recognised_by_one_kind_only(tmp_path):
 
 
 def test_images_of_a_camera_pair_are_opened_through_the_pair(tmp_path):
-    folder = record(Simulation("sim:box?image_width=32&frames=3"), tmp_path / "pair").track and tmp_path / "pair"
-    assert len(open_images(folder, "1:")) == 2
+    record(Simulation("sim:box?image_width=32&frames=3"), tmp_path / "pair")
+    assert len(open_images(tmp_path / "pair", "1:")) == 2

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How noisy a depth camera is, from recordings of a flat wall at several distances (Chien 2020, 2.2.4 and 3.3)."""
+"""Noise of a depth camera, from recordings of a flat wall at several distances (Chien 2020, 2.2.4 and 3.3)."""
 
 from __future__ import annotations
 

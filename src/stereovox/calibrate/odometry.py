@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a depth camera moved, from its images alone: each is registered with an earlier one (small_gicp)."""
+"""Motion of a depth camera from its images alone: each is registered with an earlier one (small_gicp)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ PLANE_REACH = 0.12
 MIN_NORMAL_COSINE = 0.9
 """Least cosine of the angle between two normals that belong together."""
 INLIER_DISTANCE = 0.03
-"""Metres; a partner counts as found when it lies no further off the plane."""
+"""Metres off the plane up to which a point has found its partner."""
 STEPS = 10
 VARIETY = 0.02
 """Least share of normals along any axis: noise tilts those of a single wall, but by less."""
@@ -29,13 +29,13 @@ CELL = 0.08
 REACH = 0.3
 """Metres; points further apart do not belong together."""
 MIN_POINTS = 200
-"""Points an image needs."""
+"""Fewest points of a usable image."""
 INLIERS = 0.55
 """Share of the points that must find a partner."""
 NEW_REFERENCE = (np.radians(35), 0.6, 0.7)
-"""The reference is renewed beyond this turn (radians) or way (metres), or below this share of partners."""
+"""The reference is replaced beyond this turn (radians) or travel (metres), or below this share of inliers."""
 WEAKEST = (np.radians(1.0), 0.05)
-"""A registration that leaves any turn or way less certain than this is none: one wall says nothing about sliding."""
+"""Uncertainty of turn (radians) or travel (metres) above which a registration fails: one wall does not fix sliding."""
 
 
 def camera_motion(clouds: Iterable[tuple[int, NDArray[np.float64]]]) -> CameraMotion:
@@ -186,14 +186,14 @@ def _is_far(link: Link) -> bool:
 
 
 class _Registration:
-    """Registers point clouds with the one that was taken as reference last."""
+    """Registers point clouds with the current reference."""
 
     def __init__(self) -> None:
         self._gicp = _small_gicp()
         self._target: Any = None
 
     def set_reference(self, points: NDArray[np.float64]) -> bool:
-        """Make these points the reference; False where they are too few."""
+        """Make these points the reference; return False where they are too few."""
         if len(points) < MIN_POINTS:
             return False
         self._target = self._gicp.preprocess_points(points, CELL, num_neighbors=12)

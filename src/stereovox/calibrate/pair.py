@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a depth camera sits on a tracker, and how their clocks differ, from a recording of both.
+"""Extrinsics and clock offset of a depth camera on a tracker, from a recording of both.
 
-The camera's motion comes from its depth images, the tracker's from its poses. How fast both turn gives the offset of
+The camera's motion comes from its depth images, the tracker's from its poses. Their angular speeds give the offset of
 the clocks, whatever the extrinsics; hand-eye calibration gives rotation and translation; then all are refined together.
 
-Hand-eye calibration in closed form: A X = X B for motions A of a tracker, B of a camera on the same body.
-Rotation after Park & Martin 1994 (rotation vectors of A are those of B, turned by X); translation by linear least
-squares of (R_A - I) t_X = R_X t_B - t_A (Tsai & Lenz 1989).
+Hand-eye calibration in closed form: A X = X B for motions A of the tracker, B of the camera on the same body. Rotation
+after Park & Martin 1994 (rotation vectors of A are those of B, turned by X); translation by linear least squares of
+(R_A - I) t_X = R_X t_B - t_A (Tsai & Lenz 1989).
 
-Not cv2.calibrateHandEye: OpenCV 5 has none, and that of version 4 wants poses, not motions, and knows no outliers
-(`benchmarks/hand_eye.py`: errors of 0.1 deg and 3 mm here, of 0.4 deg and 13 mm or more there; with 5 % of the motions
-wrong 0.1 deg and 3 mm here, 3 deg and 9 cm there).
+Not cv2.calibrateHandEye: OpenCV 5 has none, and that of version 4 wants poses, not motions, and has no outlier
+rejection (`benchmarks/hand_eye.py`: errors of 0.1 deg and 3 mm here, of 0.4 deg and 13 mm or more there; with 5 % of
+the motions wrong 0.1 deg and 3 mm here, 3 deg and 9 cm there).
 """
 
 from __future__ import annotations
@@ -35,15 +35,15 @@ from stereovox.se3 import Transform
 from stereovox.sources.poses import Poses
 
 MIN_TURN = np.radians(3.0)
-"""Root mean square turn between registered images that tells anything."""
+"""Fewest radians, root mean square, that the camera must turn between registered images."""
 MIN_SECOND_TURN = np.radians(1.2)
-"""The same about the second axis: about one axis only, where the camera sits along it remains open."""
+"""The same about the second axis: rotation about one axis leaves the camera's place along it open."""
 COLUMNS = 106
 """About how many blocks an image is wide: 8 pixels each for 848."""
 SPREAD = 0.15
 """Blocks whose inverse depths differ by more than this share of their mean lie across an edge."""
 MIN_IMAGES = 20
-"""Registered images with trusted poses that a calibration needs."""
+"""Fewest registered images with trusted poses for a calibration."""
 MIN_REGISTERED = 0.5
 """Share of the images that must be registered."""
 MAX_RANGE = 5.0
@@ -82,12 +82,12 @@ def calibrate_pair(
 
 @dataclass(frozen=True, eq=False)
 class PairCalibration:
-    """What was found.
+    """The result of `calibrate_pair`.
 
     T_tracker_camera: (4, 4) metres, depth camera's optical frame to the tracker's body, both in optical axes.
     clock_offset_s: depth stamp = tracker stamp + offset, seconds.
     offset_std_s, rotation_std_deg (3,) about the camera's axes, translation_std_m (3,) along the tracker's: standard
-        deviations. rotation_residual_deg, translation_residual_m: median misfit of a registered pair of images.
+    deviations. rotation_residual_deg, translation_residual_m: median misfit of a registered pair of images.
     correlation: of the two angular speeds. images, registered, pairs: how many there were and how many counted.
     """
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A stereo pair's lenses and their places, from pairs of images of a chessboard."""
+"""Lenses and extrinsics of a stereo pair, from image pairs of a chessboard."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from stereovox.errors import StereovoxError
 from stereovox.se3 import inverse
 
 MIN_PAIRS = 3
-"""Pairs of images that say enough."""
+"""Fewest usable image pairs."""
 FAR_PX, FAR_TIMES = 0.5, 3.0
 """A pair is dropped where its RMS is larger than this and than this many times the median of all pairs."""
 FOLDS = 6
-"""Parts of the pairs that are left out in turn, to see how good the rest predicts them."""
+"""Parts of the pairs left out in turn, to see how well the rest predicts them."""
 Names = tuple[str, Path, Path]
 Shown = Callable[[list[Names]], Iterable[Names]]
 Pixels = NDArray[np.float64]
@@ -58,7 +58,7 @@ class BoardPair:
 
 @dataclass(frozen=True, eq=False)
 class StereoCalibration:
-    """What was found: both lenses and the right eye's place, and how well all pairs agree with it."""
+    """Both lenses, the right eye's extrinsics, and how well all pairs agree with them."""
 
     eyes: Eyes
     board: Board
@@ -103,7 +103,7 @@ def calibrate_stereo(pairs: Iterable[BoardPair], board: Board, model: str = "pin
 
 
 def check_model(model: str) -> None:
-    """Raise StereovoxError for a model of a lens that there is not."""
+    """Raise StereovoxError for an unknown lens model."""
     if model not in MODELS:
         raise StereovoxError(f"--lens {model}: must be one of {', '.join(MODELS)}")
 

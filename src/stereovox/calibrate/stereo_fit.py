@@ -24,11 +24,11 @@ from stereovox.errors import StereovoxError
 from stereovox.se3 import Transform, inverse, rotation_matrix, rotation_vector, transform_points
 
 FULL_MODEL_VIEWS = 10
-"""Views from which on a fifth coefficient of Brown and Conrady's is found as well; with fewer it only follows noise."""
+"""Views from which on a fifth Brown-Conrady coefficient is fitted; with fewer it only follows noise."""
 GUESSES = {"pinhole": np.geomspace(0.4, 4.0, 14), "fisheye": np.geomspace(0.25, 1.5, 14)}
 """Focal lengths in widths of the image that are tried at the start."""
 UNSEEN_PX = 1e3
-"""Pixels that a corner counts for which the lens cannot see at all; it leads away from such lenses."""
+"""Residual in pixels of a corner that the lens cannot see; it steers away from such lenses."""
 STEP = 1e-6
 MAX_STEPS, MIN_GAIN = 60, 1e-6
 """The search ends after so many steps, or when one makes things better by so small a share."""

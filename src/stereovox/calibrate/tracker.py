@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Poses of a tracker at many times at once, where they may be trusted, and how far its clock is off."""
+"""A tracker's poses, vectorised and smoothed, and the offset between its clock and a camera's."""
 
 from __future__ import annotations
 
@@ -22,9 +22,11 @@ OVERLAP = 0.5
 MIN_CORRELATION = 0.6
 """Least correlation of a match."""
 RIVAL_GAP_S, RIVAL_SHARE, MAX_RIVALS = 0.3, 0.85, 5
-"""Other matches that are looked at: so far beside better ones (seconds), so well correlated (share of the best)."""
+"""Rival matches that are tried as well: this many seconds away from better ones, this well correlated (share of the
+best), at most this many.
+"""
 MAX_SPAN_S = 86_400.0
-"""Seconds; what seems to last longer holds a wrong time, and its samples would fill the memory."""
+"""Seconds; a longer recording has a wrong stamp, and its samples would fill the memory."""
 
 
 class PoseTrack:

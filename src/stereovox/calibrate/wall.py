@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a depth camera measures wrongly, from recordings of flat walls (after Chien 2020, App. A).
+"""Systematic depth errors of a camera, from recordings of flat walls (after Chien 2020, App. A).
 
-Fit the models of `DepthCorrection` to walls, all by linear least squares in 1/z.
-With m = 1/z measured and a plane 1/z = a + b x + c y, the models scale and disparity say a + b x + c y = m (1 + s) + q
-for each pixel: linear in the coefficients of the quadratics s and q and in b and c of each wall.
+The models of `DepthCorrection` are fitted to walls by linear least squares in 1/z. With m = 1/z measured and a plane
+1/z = a + b x + c y, the models scale and disparity say a + b x + c y = m (1 + s) + q for each pixel: linear in the
+coefficients of the quadratics s and q and in b and c of each wall.
 
-What is linear across the image cannot be told from a wall that leans. So s and q have no terms x and y, and the lean is
-the wall's; only walls that are known to stand square to the optical axis fix these terms too. A constant term needs
+An error that is linear across the image cannot be distinguished from a leaning wall. So s and q have no terms x and y,
+and the lean is the wall's; only walls known to be square to the optical axis fix these terms too. A constant term needs
 measured distances.
 """
 
@@ -29,13 +29,13 @@ MODELS = ("auto", *SIMPLEST_FIRST, "thesis")
 SAMPLES = 20_000
 """Pixels of each wall that are fitted; its figures are of all."""
 MAX_DISTANCE_ERROR = 0.2
-"""A measured distance that is off by a larger share of what the camera sees belongs to another wall."""
+"""A measured distance that differs from the camera's by a larger share belongs to another wall."""
 SAME_DISTANCE = 1.1
 """Distances whose ratio is smaller count as one."""
 SIMPLER_FACTOR = 1.1
-"""A simpler model is taken unless its error on walls it has not seen is so many times the best one's."""
+"""A simpler model is chosen unless its error on unseen walls is this many times the best one's."""
 ROUGH = 0.01
-"""Error after the correction, as a share of the depth, that the user should know about."""
+"""Error after the correction, as a share of the depth, above which the user is warned."""
 NARROW = 0.8
 """Share of the image's width and height that the wall should span."""
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A map as a mesh file, written by trimesh: `.glb` for browsers and phones, `.obj` and `.stl` for modellers.
+"""Maps as meshes, written by trimesh: `.glb` for browsers and phones, `.obj` and `.stl` for modelling programs.
 
-A `.glb` (Khronos glTF 2.0) shows the outer faces of the cells, the others the smoothed surface of `mesh.surface`. The
-faces of the cells are found here: trimesh would keep those between two occupied cells, which nobody sees.
+A `.glb` (Khronos glTF 2.0) shows the outer faces of the cells, the others the smooth surface of `surface`. Cell faces
+are found here, because trimesh would keep the invisible ones between two occupied cells.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ if TYPE_CHECKING:
     from trimesh.visual import TextureVisuals
 
 GROUP = 8
-"""Blocks along each side of the cubes of the map that are looked at one by one."""
+"""Blocks along each side of the cubes in which the map is processed."""
 MIN_OFFSET = 0.05
-"""Part of the way from one cell's middle to the next by which a vertex keeps away from both."""
+"""Smallest distance of a vertex from a cell centre, as a share of the way to the next centre."""
 SPAN = 1 << 21
 """Corners of cells on each axis that three of them fit into one int64."""
 TRIANGLES = ((0, 1, 2), (0, 2, 3))
@@ -44,13 +44,22 @@ OBJ_DIGITS = 6
 
 @one_state
 def surface(voxel_map: VoxelMap) -> Mesh:
-    """Return the closed surface about what is occupied: every occupied cell's middle is inside, every other's outside.
+    """Extract the closed surface around the occupied cells: every occupied centre is inside, every other outside.
 
-    Marching cubes (Lorensen and Cline 1987, by the tables of Lewiner et al. 2003): the surface stands where the
-    log-odds, linear between the middles of neighbouring cells, pass `map.occupied_above`. An unknown cell counts as
-    surely free, so that nothing is invented there: towards it the surface stands no farther out than the occupied
-    cell's own face. A wall seen from one side has two sides all the same: it is as thick as its cells.
-    Raises StereovoxError where nothing is occupied, MissingExtra without scikit-image.
+    Marching cubes (Lorensen and Cline 1987, by the tables of Lewiner et al. 2003): the surface is where the log-odds,
+    linear between neighbouring cell centres, cross `map.occupied_above`. Unknown cells count as surely free, so that
+    nothing is invented: towards them the surface reaches no farther than the occupied cell's own face. A wall seen from
+    one side still has two sides: it is as thick as its cells.
+
+    Args:
+        voxel_map: The map.
+
+    Returns:
+        The mesh.
+
+    Raises:
+        StereovoxError: Nothing is occupied.
+        MissingExtra: scikit-image is not installed.
     """
     voxel_map = in_memory(voxel_map)
     parts = [part for part in _parts(voxel_map) if len(part[1])]
@@ -66,7 +75,12 @@ def surface(voxel_map: VoxelMap) -> Mesh:
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
-    """Triangles: vertices (N, 3) float32 in metres, world frame; faces (M, 3) int32, anticlockwise from outside."""
+    """A triangle mesh.
+
+    Attributes:
+        vertices: (N, 3) float32 metres, world frame.
+        faces: (M, 3) int32, anticlockwise seen from outside.
+    """
 
     vertices: NDArray[np.float32]
     faces: NDArray[np.int32]
@@ -99,10 +113,9 @@ def write_glb(voxel_map: VoxelMap, path: str | Path) -> None:
 
 
 def write_obj(voxel_map: VoxelMap, path: str | Path) -> None:
-    """Write the surface about the occupied cells (`mesh.surface`) as text: metres, in the map's own frame.
+    """Write the surface around the occupied cells (`surface`) as text: metres, in the map's own frame.
 
-    Raises MapFileError for a map without occupied cells and a place that cannot be written, MissingExtra without
-    scikit-image.
+    Raises MapFileError for a map without occupied cells and for an unwritable place, MissingExtra without scikit-image.
     """
     from trimesh.exchange.obj import export_obj
 
@@ -112,7 +125,7 @@ def write_obj(voxel_map: VoxelMap, path: str | Path) -> None:
 
 
 def write_stl(voxel_map: VoxelMap, path: str | Path) -> None:
-    """Write the surface about the occupied cells (`mesh.surface`) as binary STL: metres, in the map's own frame.
+    """Write the surface around the occupied cells (`surface`) as binary STL: metres, in the map's own frame.
 
     Raises as `write_obj` does.
     """

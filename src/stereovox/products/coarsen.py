@@ -15,16 +15,25 @@ from stereovox.products.side_by_side import set_times
 from stereovox.threads import one_state
 
 Parents = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.uint32]]
-"""Cells (N, 3); and (N,) of how many known cells they are made, the largest number these store, their latest time."""
+"""Cells (N, 3); and (N,) the number of known cells in each, the largest value these store, their latest time."""
 
 
 @one_state
 def coarsen(voxel_map: VoxelMap, factor: int) -> VoxelMap:
-    """Return an unbounded map in cells that are `factor` times as long on each side, with the history of the map.
+    """Merge cells into larger ones.
 
-    A cell gets the worst state of those it is made of: occupied, then tentative, unknown, free; it is free only where
+    A coarse cell has the worst state of its parts: occupied, then tentative, unknown, free. So it is free only where
     all of them are, and nothing occupied is lost. Its log-odds are the largest of theirs, its time the latest.
-    Raises StereovoxError for a factor that is no whole number from 1 on, or makes cells too large.
+
+    Args:
+        voxel_map: The map.
+        factor: How many times longer each side becomes; a whole number from 1 on.
+
+    Returns:
+        An unbounded map with the history of `voxel_map`.
+
+    Raises:
+        StereovoxError: `factor` is not such a number, or makes cells too large.
     """
     if not 1 <= factor < 2**31 or factor != int(factor):
         raise StereovoxError(f"factor {factor}: give a whole number of cells, 1 or more")

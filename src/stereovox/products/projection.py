@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A 3-D map seen from above: the 2-D grid a ground robot plans in.
+"""A 3-D map seen from above: the 2-D grid in which a ground robot plans, and obstacles inflated by a robot's radius.
 
-Obstacles grown by a robot's radius, so that it may be planned for as a point.
-Chien 2020 (5): what is occupied may be one cell larger or smaller than the thing itself, therefore "a one cell margin
-is required for path planning and obstacle avoidance".
+Chien 2020 (5): occupied cells may reach one cell too far or not far enough, therefore "a one cell margin is required
+for path planning and obstacle avoidance".
 """
 
 from __future__ import annotations
@@ -27,12 +26,12 @@ from stereovox.products.transform import transformed
 from stereovox.threads import one_state
 
 MARGIN = 1
-"""Cells by which an obstacle may be larger than the map says."""
+"""Cells by which an obstacle may be larger than its occupied cells."""
 TILE = 64
-"""Cells along each side of the boxes that a map is worked off in."""
+"""Cells along each side of the boxes in which a map is processed."""
 INFLATE_TIE = 1e-6
 EMPTY = np.iinfo(np.int16).min
-"""What a column is stored as of which nothing is known; no cell is stored so."""
+"""Stored value of a column in which nothing is known; no cell is stored as this."""
 MAX_CELLS = 2**30
 """Cells of the largest grid."""
 TIE = 1e-9
@@ -42,15 +41,15 @@ TIE = 1e-9
 def project(voxel_map: VoxelMap, heights: Heights | None = None) -> OccupancyGrid:
     """Return the map seen from above, just large enough for what is known.
 
-    heights: lowest and highest metres along the map's `up`, from the world's origin; a cell whose middle is between
-    them marks. Without it those of the map's own `scan.heights`.
-    The heights are for marking alone. A column has the largest probability of all its known cells between them: one
-    that is occupied makes it occupied (a table top is not thicker), one that is neither keeps it from being free. Where
-    nothing between them is known, free cells at any other height clear it, and it has the largest probability of those.
-    Else it is unknown.
-    The grid's x and y are the map's, where z is up; else the two axes that make a right-handed frame with `up`: y and z
+    heights: lowest and highest metres along the map's `up`, from the world's origin, between which a cell's centre
+    marks; None: the map's own `scan.heights`.
+    The heights only limit marking. A column has the largest probability of all its known cells between them: an
+    occupied one makes it occupied (a table top is no thicker), one that is neither keeps it from being free. Where
+    nothing between them is known, free cells at any other height clear the column, and it has the largest probability
+    of those. Otherwise it is unknown.
+    The grid's x and y are the map's where z is up; else the two axes that make a right-handed frame with `up`: y and z
     for x, z and x for y, and with a minus the same two swapped. Uneven cells become cubes where the floor needs it.
-    Raises StereovoxError, one line, where no cell between the heights is known, or the grid were too large.
+    Raises StereovoxError where no cell between the heights is known, or for too large a grid.
     """
     order = list(floor_axes(voxel_map.config.up)[:3])
     if voxel_map.config.cell[order[0]] != voxel_map.config.cell[order[1]]:
@@ -109,9 +108,9 @@ def layers_of(voxel_map: VoxelMap, axis: int, heights: Heights) -> NDArray[np.in
 
 @one_state
 def inflated(voxel_map: VoxelMap, radius: float, margin: int = MARGIN) -> VoxelMap:
-    """Return a map without bounds in which all cells are occupied in which a robot of `radius` metres may not be.
+    """Return an unbounded map in which all cells that a robot of `radius` metres must avoid are occupied.
 
-    Occupied cells grow as in `inflated_mask`, over free, tentative and unknown ones. When cells were seen is not kept.
+    Occupied cells grow as in `inflated_mask`, over free, tentative and unknown ones. Cell times are not kept.
     """
     _check(radius, margin)
     known, log_odds = voxel_map.cells()
@@ -124,9 +123,9 @@ def inflated(voxel_map: VoxelMap, radius: float, margin: int = MARGIN) -> VoxelM
 
 
 def inflated_grid(grid: OccupancyGrid, radius: float, margin: int = MARGIN) -> OccupancyGrid:
-    """Return a 2-D map with 100 per cent in all cells in which a robot of `radius` metres may not be.
+    """Return a 2-D map with 100 per cent in all cells that a robot of `radius` metres must avoid.
 
-    Occupied cells grow as in `inflated_mask`, over free, tentative and unknown ones; the picture does not.
+    Occupied cells grow as in `inflated_mask`, over free, tentative and unknown ones; the grid keeps its size.
     """
     near = inflated_mask(grid.states == State.OCCUPIED, grid.resolution, radius, margin)
     return replace(grid, cells=np.where(near, np.int8(100), grid.cells))
@@ -135,11 +134,11 @@ def inflated_grid(grid: OccupancyGrid, radius: float, margin: int = MARGIN) -> O
 def inflated_mask(
     blocked: NDArray[np.bool_], sides: ArrayLike, radius: float, margin: int = MARGIN
 ) -> NDArray[np.bool_]:
-    """Return the cells in which a robot's middle may not be: (x, y, z) or (rows, columns) bool, as `blocked`.
+    """Return the cells that a robot's centre must avoid: (x, y, z) or (rows, columns) bool, as `blocked`.
 
-    In all others it may stand anywhere in the cell: no obstacle is nearer than `radius` metres, even if each is larger
-    by `margin` cells to all sides. sides: of a cell in metres, one for each axis. What is outside counts for nothing.
-    Raises StereovoxError for a radius that is not above 0, or a margin below.
+    Anywhere in the other cells no obstacle is nearer than `radius` metres, even if each is larger by `margin` cells on
+    all sides. sides: of a cell in metres, one per axis. What is outside counts for nothing. Raises StereovoxError for a
+    radius that is not above 0 or a margin below 0.
     """
     _check(radius, margin)
     shape = (1,) * (3 - blocked.ndim) + blocked.shape

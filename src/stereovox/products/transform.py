@@ -20,7 +20,7 @@ from stereovox.threads import in_shards
 LANES = 32
 """Rows are padded to a multiple of it: whole vectors."""
 MAX_CELLS, MAX_SIDE = 2**28, 2**14
-"""The largest box, in cells; it needs 20 bytes a cell, with padding more. Its longest side."""
+"""Longest side of a box, in cells."""
 UNLIMITED = np.float32(3e38)
 
 
@@ -78,7 +78,7 @@ class Transform:
         self.field = self._empty(slabs, rows)
 
     def update(self, dirty: NDArray[np.uint8], threads: int = 1) -> None:
-        """Bring `field` up to date after its mask changed in the slabs that are marked in `dirty` (slabs,)."""
+        """Update `field` after its mask changed in the slabs marked in `dirty` (slabs,)."""
 
         def in_slabs(part: slice) -> None:
             _transform.across_slabs(self.field, self.costs, self.lanes, dirty, part.start, threads)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What AMCL knows of robots and lidars: the odometry motion model and how likely a scan is from many poses."""
+"""AMCL's models: odometry motion, and the likelihood of a scan from many poses (likelihood field and beam model)."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.maps.voxel_map import State
 
 MIN_TRAVEL = 0.01
-"""Metres below which the direction of a way says nothing: the robot turned on the spot."""
+"""Metres of travel below which its direction is meaningless: the robot turned on the spot."""
 LENGTHS = 1024
-"""So many lengths of beams are told apart by the beam model, from 0 to the longest."""
+"""Bins of beam length in the beam model, from 0 to the longest."""
 MIN_LEVEL = 1e-6
 """Metres on the map for one of a beam's length, below which it points straight up or down."""
 WITNESSES = 500
-"""So many particles are asked whether a beam fits the map."""
+"""Particles that vote on whether a beam fits the map."""
 
 
 class FieldModel:
@@ -97,7 +97,7 @@ class BeamModel:
 
 
 def turn_go_turn(pose_odom_before: se2.Pose, pose_odom_after: se2.Pose) -> NDArray[np.float64]:
-    """Return the (3,) first turn, way and second turn (radians, metres) that lead from one (3,) pose to the other."""
+    """Return first turn, travel and second turn (3,) (radians, metres) that lead from one (3,) pose to the other."""
     step = se2.relative(pose_odom_before, pose_odom_after)
     way = float(np.hypot(step[0], step[1]))
     first = float(np.arctan2(step[1], step[0])) if way >= MIN_TRAVEL else 0.0
@@ -105,9 +105,9 @@ def turn_go_turn(pose_odom_before: se2.Pose, pose_odom_after: se2.Pose) -> NDArr
 
 
 def deviations(motion: NDArray[np.float64], config: AmclConfig) -> NDArray[np.float64]:
-    """Return the (3,) standard deviations of first turn, way and second turn (table 5.6, with variances).
+    """Return the (3,) standard deviations of first turn, travel and second turn (table 5.6, with variances).
 
-    Who drives backwards does not turn by 180 degrees twice: a turn counts by its distance from 0 or 180 degrees.
+    A robot that reverses does not turn by 180 degrees twice: a turn counts by its distance from 0 or 180 degrees.
     """
     first, way, second = motion
     turn1, turn2 = (min(abs(turn), np.pi - abs(turn)) for turn in (first, second))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The particles of AMCL: drawn anew by their weights, clustered, and spread when the robot is lost."""
+"""AMCL's particle set: resampling, clustering, and recovery when the robot is lost."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Recovery:
         self._seen = 0
 
     def observe(self, log_likelihood: NDArray[np.float64], weights: NDArray[np.float64], beams: int) -> None:
-        """Take in (N,) log likelihoods of `beams` beams by particles whose weights have the sum 1."""
+        """Add (N,) log likelihoods of `beams` beams, by particles whose weights sum to 1."""
         if self._alpha_slow <= 0 or self._alpha_fast <= 0:
             return
         best = log_likelihood.max()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Finds where the robot comes back to, and believes it only where two findings agree."""
+"""Loop closure: finds revisited places, and accepts them only where two findings agree."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ class LoopFinder:
         self._judge(found)
 
     def _judge(self, found: Edge) -> None:
-        """Believe a finding, and those it bears out, once one other agrees with it."""
+        """Accept a finding, and those it confirms, once another one agrees with it."""
         witnesses = [other for other in self.candidates if self._agree(found, other)]
         self.candidates.append(found)
         if witnesses:
@@ -120,7 +120,7 @@ class LoopFinder:
         return side, min(BASE_WINDOW_TURN + config.drift_turn * drift_m, config.closure_window_turn)
 
     def _drift_distances(self) -> NDArray[np.float64]:
-        """Metres along which drift adds up between the last submap and each other one: closures are short cuts."""
+        """Metres over which drift accumulates between the last submap and each other one: closures are short cuts."""
         from scipy.sparse import coo_matrix
         from scipy.sparse.csgraph import dijkstra
 
@@ -146,7 +146,7 @@ class ClosureSearch:
         self._pyramid = np.empty((LEVELS, 0, 0), np.float32)
 
     def set_target(self, earlier: Cloud) -> None:
-        """Take the cloud that the next ones are laid onto."""
+        """Set the cloud that the next ones are matched against."""
         self._coarse.build(earlier)
         self._fine.build(earlier)
         rows, columns = self._coarse.extent
@@ -193,7 +193,7 @@ class ClosureSearch:
 
 @dataclass(frozen=True)
 class Submap:
-    """A run of keyframes that is short enough not to have drifted: keyframes `first` to `last` - 1."""
+    """A run of keyframes short enough not to drift: keyframes `first` to `last` - 1."""
 
     first: int
     last: int

@@ -34,7 +34,7 @@ Progress = Callable[[int, int, str], object]
 CLOSURE_TRUST, PATCH_TRUST = 0.02, 0.1
 """What a match's information is worth: its points are not independent, nor is what they lie on exact."""
 SCANS_PER_KEYFRAME = 2.25
-"""A keyframe counts in the map as so many scans: it stands for those around it, and one is enough to know a cell."""
+"""Scans that a keyframe counts as in the map: it stands for those around it, and one is enough to know a cell."""
 MAX_CELLS = 40_000
 """Cells on a side of the finished map."""
 JUMP, JUMP_TURN = 0.05, 0.01
@@ -42,9 +42,9 @@ JUMP, JUMP_TURN = 0.05, 0.01
 
 
 def map_scans(scans: Iterable[Scan], config: Config, progress: Progress | None = None) -> SlamResult:
-    """Return the way and the map of scans in order of time, whose poses are those of the odometry.
+    """Return the track and the map of scans in time order, whose poses are those of the odometry.
 
-    progress: called with how many are done, how many there are (0: not known) and what is going on.
+    progress: called with how many are done, how many there are (0: unknown) and the current activity.
     """
     slam, total = Slam(config), len(scans) if isinstance(scans, Sized) else 0
     for done, scan in enumerate(scans, 1):
@@ -55,10 +55,10 @@ def map_scans(scans: Iterable[Scan], config: Config, progress: Progress | None =
 
 
 class Slam:
-    """Takes scans in order of time, with the odometry as pose; the map's frame is the odometry's at the first scan.
+    """SLAM over scans in time order, with the odometry as pose; the map's frame is the odometry's at the first scan.
 
-    refused: scans by the reason why they could not be used; they change nothing. `not_in_order`: those not later than
-    the one before, and those whose stamp most scans after them show to be wrong; these are only left out of the track.
+    refused: refused scans by reason; they change nothing. `not_in_order`: those not later than the one before, and
+    those whose stamp most later scans show to be wrong; the latter are only left out of the track.
     """
 
     def __init__(self, config: Config):
@@ -80,7 +80,7 @@ class Slam:
         return self._follower.keyframes
 
     def add(self, scan: Scan) -> se2.Pose:
-        """Take the next scan; return (3,) pose_map_base as known by now. Later loops may move it."""
+        """Process the next scan; return (3,) pose_map_base as known so far. Later loops may move it."""
         try:
             scan = trusted(scan, self._config)
         except FrameRefused as refused:
@@ -98,7 +98,7 @@ class Slam:
         return self.pose
 
     def finish(self, progress: Progress | None = None) -> SlamResult:
-        """Return the way and the map, after a last search for loops and a last polish.
+        """Return the track and the map, after a last search for loops and a last refinement.
 
         Raises StereovoxError where no scan could be used, MissingExtra where loops were found and gtsam is missing.
         """
@@ -148,11 +148,10 @@ class Slam:
 
 @dataclass(frozen=True, eq=False)
 class SlamResult:
-    """A robot's way, and the map of what it saw.
+    """A robot's track, and the map of what it saw.
 
-    track: the pose of every scan that was not refused. grid: the map, made of the keyframes. keyframes: with their
-    final poses. closures: loops closed. edges: those, between keyframes. refused: scans by the reason why they could
-    not be used.
+    track: the pose of every scan that was not refused. grid: the map, built from the keyframes. keyframes: with their
+    final poses. closures: number of loops closed. edges: those, between keyframes. refused: refused scans by reason.
     """
 
     track: Track
@@ -178,7 +177,7 @@ class Step:
 
 
 class TrackBuilder:
-    """The steps so far, stamps rising."""
+    """The steps so far, with ascending stamps."""
 
     def __init__(self) -> None:
         self._steps: list[Step] = []
@@ -186,10 +185,11 @@ class TrackBuilder:
         self._late, self._late_ns, self._against = 0, 0, 0
 
     def room(self, stamp_ns: int) -> int | None:
-        """Make room for a scan at `stamp_ns`; return how many earlier ones gave way, None where it is itself too late.
+        """Make room for a scan at `stamp_ns`; return how many earlier ones were dropped, None where it is itself too
+        late.
 
-        A lone stamp in the future would make all later scans too late. So once more scans in a row are late than there
-        were steps later than the first of them, those steps have the wrong stamps, and go.
+        A single stamp in the future would make all later scans late. So once more scans in a row are late than there
+        were steps after the first of them, those steps have the wrong stamps and are dropped.
         """
         ahead = len(self._steps) - bisect_left(self._steps, stamp_ns, key=lambda step: step.stamp_ns)
         if not ahead:
@@ -205,9 +205,9 @@ class TrackBuilder:
         return ahead
 
     def add(self, scan: Scan, pose: se2.Pose, keyframes: list[Keyframe]) -> None:
-        """Take a scan that there is room for, and where (3,) the robot stood.
+        """Append a scan that there is room for, and the pose (3,) of the robot.
 
-        What comes before there is a keyframe is kept as seen from the first one.
+        Steps before the first keyframe are stored relative to it.
         """
         if keyframes and not self._started:
             self._started = True
@@ -216,7 +216,7 @@ class TrackBuilder:
         self._steps.append(Step(scan.stamp_ns, scan.pose_world_base, max(len(keyframes) - 1, 0), since))
 
     def track(self, keyframes: list[Keyframe]) -> Track:
-        """Return the way, with the keyframes where they stand now."""
+        """Return the track, with the keyframes at their current poses."""
         anchors = np.array([keyframes[step.keyframe].pose for step in self._steps])
         poses = se2.compose(anchors, np.array([step.since for step in self._steps]))
         corrections = se2.compose(poses, se2.inverse(np.array([step.odometry for step in self._steps])))
@@ -224,7 +224,7 @@ class TrackBuilder:
 
 
 def _repeated(p: float) -> float:
-    """Return what a keyframe says of a cell where a scan says `p`."""
+    """Return the probability that a keyframe gives a cell to which a scan gives `p`."""
     odds = (p / (1 - p)) ** SCANS_PER_KEYFRAME
     return odds / (1 + odds)
 

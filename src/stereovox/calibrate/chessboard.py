@@ -97,7 +97,7 @@ def image_pairs(folder: str | os.PathLike[str]) -> list[tuple[str, Path, Path]]:
     """Return name, left file and right file of each pair in `folder`, in order of name.
 
     Both files have the same name in folders `left` and `right`, or differ only in `left` and `right` or L and R.
-    Raises StereovoxError, one line, where there is no folder or no pair.
+    Raises StereovoxError where there is no folder or no pair.
     """
     where = Path(folder)
     if not where.is_dir():

@@ -93,7 +93,7 @@ def calibrate_noise(
     The fixed part belongs into sigma as well: it does not average out where the camera stands, and where it moves the
     map meets it as one more error of each measurement. `fitted` names those of s0, s1, s2 that need not be 0; each
     needs a distance of its own.
-    Raises StereovoxError, one line: no wall, nothing in the region, different cameras, too few distances.
+    Raises StereovoxError: no wall, nothing in the region, different cameras, too few distances.
     """
     if not recordings:
         raise StereovoxError("no recording of a wall; give several, at different distances")

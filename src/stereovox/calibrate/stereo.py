@@ -88,7 +88,7 @@ class StereoCalibration:
 def calibrate_stereo(pairs: Iterable[BoardPair], board: Board, model: str = "pinhole") -> StereoCalibration:
     """Return the calibration of `model` lenses from the corners of all pairs; those that do not fit are dropped.
 
-    Raises StereovoxError, one line, for an unknown model, or where fewer than three pairs are left.
+    Raises StereovoxError for an unknown model, or where fewer than three pairs are left.
     """
     check_model(model)
     pairs = list(pairs)
@@ -193,7 +193,7 @@ def _measure(used: Sequence[BoardPair], fit: Fit, board: Board) -> None:
 
 
 def _drop_worst(pairs: Sequence[BoardPair]) -> bool:
-    """Drop the pair that fits worst, if it fits much worse than the others, and tell whether there was one."""
+    """Drop the pair that fits worst, if it fits much worse than the others, and return whether there was one."""
     used = [pair for pair in pairs if not pair.why]
     worst, usual = max(used, key=lambda pair: pair.rms_px), float(np.median([pair.rms_px for pair in used]))
     if worst.rms_px <= max(FAR_PX, FAR_TIMES * usual):

@@ -87,7 +87,7 @@ def find_offsets(motion: CameraMotion, track: PoseTrack, between: tuple[float, f
     """Return the offsets at which the two angular speeds fit, the best first; one, unless the motion repeats itself.
 
     Times of the camera count from its first image, those of the track from its first pose. `between`: only offsets in
-    this range, in seconds. Raises StereovoxError, one line, where no offset fits.
+    this range, in seconds. Raises StereovoxError where no offset fits.
     """
     _check_span("images", (motion.stamps_ns[-1] - motion.stamps_ns[0]) / 1e9)
     _check_span("poses", track.times[-1])

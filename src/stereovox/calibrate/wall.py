@@ -51,7 +51,7 @@ def calibrate_wall(
     model: of `DepthCorrection`, or `auto`: the one that does best at distances it was not fitted to; with a single
     distance `scale`, whose error stays the same share of the depth wherever it is used. square: the walls are known to
     stand perpendicular to the optical axis. check: walls that are only looked at afterwards.
-    Raises StereovoxError, one line: no wall, distances for some of the walls only or that cannot be, another camera,
+    Raises StereovoxError: no wall, distances for some of the walls only or that cannot be, another camera,
     an unknown model.
     """
     check_model(model)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Maps as ROS's map_server and nav2_map_server read and write them: a picture, and a .yaml that tells what it means."""
+"""Maps of ROS's map_server and nav2_map_server: an image, and a .yaml with its meaning."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ MODES = ("trinary", "scale", "raw")
 NEEDED = ("image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh")
 MAX_PIXELS = 1 << 28
 MAX_BYTES = 1 << 31
-"""Pictures of more pixels, and files of more bytes, are refused."""
+"""Images of more pixels, and files of more bytes, are refused."""
 WHITE = 255.0
 FORMATS = ("PNG", "BMP", "PPM", "JPEG", "GIF")
 PIXELS_A_BYTE = 512
 PIXELS_OF_ANY = 1 << 22
-"""A packed picture holds at most so many pixels for each byte of its file; one of few pixels may hold fewer bytes."""
+"""A compressed image has at most so many pixels per byte of its file; one of few pixels may have fewer bytes."""
 _NUMBER = re.compile(rb"\s*(?:#[^\n\r]*[\n\r]\s*)*(\d{1,9})")
 OCCUPIED_THRESH, FREE_THRESH = 0.65, 0.196
 """What map_saver writes. With a free_thresh of 0.25, as nav2 has it, its own grey 205, unknown, is read as free."""
@@ -57,14 +57,15 @@ def read_map_server(path: str | Path) -> OccupancyGrid:
 
 
 def write_map_server(grid: OccupancyGrid, path: str | Path, mode: str = "trinary", negate: bool = False) -> None:
-    """Write a picture and its .yaml; `path` names either (a .yaml's picture is a .pgm; scaled: a .png).
+    """Write an image and its .yaml; `path` names either (a .yaml's image is a .pgm, a scaled one a .png).
 
-    Both or none: if the power goes, the .yaml names a picture that belongs to it, for a moment one of another name.
+    Both or neither: after a power failure the .yaml still names an image that belongs to it, perhaps one of a temporary
+    name.
 
     trinary: free cells 254, occupied ones 0, all others 205, which are unknown. scale: per cent as greys, unknown cells
-    are see-through and need a .png. raw: per cent as they are, unknown 255; the thresholds are the map's own. Scaled
-    and raw maps are read back as they were. negate: white is occupied.
-    Raises MapFileError: one line about an empty map, an unknown mode or ending, or a place that cannot be written.
+    are transparent and need a .png. raw: per cent as they are, unknown 255; the thresholds are the map's own. Scaled
+    and raw maps are read back exactly. negate: white is occupied. Raises MapFileError about an empty map, an unknown
+    mode or ending, or an unwritable place.
     """
     yaml, image = _files(Path(path), mode)
     png = image.suffix.lower() == ".png"
@@ -96,7 +97,7 @@ def write_map_server(grid: OccupancyGrid, path: str | Path, mode: str = "trinary
 def write_grid(
     voxel_map: VoxelMap, path: str | Path, heights: Heights | None = None, inflate: float | None = None
 ) -> None:
-    """Write the map seen from above as map_server's two files, a picture and its .yaml; `path` names either.
+    """Write the map seen from above as map_server's two files, an image and its .yaml; `path` names either.
 
     heights: see `project`. inflate: radius of a robot in metres by which obstacles grow, with a margin of one cell.
     Raises StereovoxError as `project`, `inflated_grid` and `write_map_server` do.
@@ -111,7 +112,7 @@ def write_grid(
 
 @dataclass(frozen=True)
 class Metadata:
-    """What a map's picture means.
+    """The contents of a map's .yaml.
 
     image: the picture. resolution: side of a cell in metres. origin: x, y in metres and yaw of its lower left corner.
     negate: white is occupied. occupied_thresh, free_thresh: probabilities. mode: one of MODES.
@@ -126,7 +127,7 @@ class Metadata:
     mode: str
 
     def text(self) -> str:
-        """Return it as YAML."""
+        """Return the YAML text."""
         origin = ", ".join(map(_plain, self.origin))
         return (
             f"image: {_quoted(self.image.name)}\nmode: {self.mode}\nresolution: {_plain(self.resolution)}\n"
@@ -136,7 +137,7 @@ class Metadata:
 
 
 def read_metadata(path: Path) -> Metadata:
-    """Return what the .yaml `path` says; `image` is relative to it. Raises MapFileError, one line, for all else."""
+    """Read the .yaml `path`; `image` is relative to it. Raises MapFileError for anything invalid."""
     try:
         if path.is_dir():
             raise MapFileError(
@@ -158,11 +159,10 @@ def read_metadata(path: Path) -> Metadata:
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """A picture with its top row first; all arrays (height, width).
+    """An image with its top row first; all arrays (height, width).
 
-    brightness: uint8 or float64, mean of the colours, from 0 (black) to 255.
-    see_through: bool, where it lets any background through; None: nowhere.
-    with_opacity: float64, mean of the colours and the opacity; None where it knows no opacity.
+    brightness: uint8 or float64, mean of the colours, from 0 (black) to 255. see_through: bool, where any background
+    shows through; None: nowhere. with_opacity: float64, mean of the colours and the opacity; None without opacity.
     """
 
     brightness: NDArray[Any]
@@ -171,7 +171,7 @@ class Picture:
 
 
 def read_picture(path: Path) -> Picture:
-    """Return the picture in a file. Raises MapFileError, one line: missing, damaged, too large or no picture."""
+    """Return the picture in a file. Raises MapFileError: missing, damaged, too large or no picture."""
     try:
         if not path.is_file():
             raise MapFileError(f"{path}: no such picture; the map's .yaml names it as its image")
@@ -304,7 +304,7 @@ def _read_with_pillow(path: Path) -> Picture:
 
 
 def _mean(pixels: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """Return the mean of the channels: NumPy's own takes five times as long."""
+    """Return the mean of the channels; NumPy's own is five times slower."""
     total = pixels[..., 0].astype(np.uint16)
     for channel in range(1, pixels.shape[2]):
         total += pixels[..., channel]
@@ -339,7 +339,7 @@ def _cells(picture: Picture, metadata: Metadata) -> NDArray[np.int8]:
 
 
 def _through(table: NDArray[Any], cells: NDArray[Any]) -> NDArray[np.uint8]:
-    """Return what a table of 256 bytes makes of each byte: four times as quick as an index."""
+    """Map each byte through a table of 256 bytes: four times faster than indexing."""
     return np.frombuffer(cells.tobytes().translate(table.tobytes()), np.uint8).reshape(cells.shape)
 
 

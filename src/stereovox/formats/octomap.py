@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""OctoMap's `.bt` and `.ot` files: read into voxel maps and written, node by node of a pruned octree.
+"""OctoMap's file formats `.bt` (free or occupied) and `.ot` (log-odds), read and written.
 
-OctoMap's two file formats: `.bt` (free or occupied) and `.ot` (log-odds).
-Both are a short text header and then the nodes of a 16-level octree, each before its children (format: OctoMap 1.10,
-classes AbstractOcTree, OccupancyOcTreeBase and OcTreeDataNode). OctoMap's cell i covers the same space as ours.
+Both are a short text header and then the nodes of a 16-level pruned octree, each before its children (format: OctoMap
+1.10, classes AbstractOcTree, OccupancyOcTreeBase and OcTreeDataNode). OctoMap's cell i covers the same space as ours.
 """
 
 from __future__ import annotations
@@ -29,18 +28,18 @@ DEPTH = 16
 KEY_ZERO = 1 << (DEPTH - 1)
 """The key of cell index 0: keys are indices plus this."""
 FREE, OCCUPIED, BRANCH = 1, 2, 3
-"""What a node says about each child, in two bits; 0 where there is none."""
+"""Two bits per child of a node; 0 for no child."""
 BINARY_TITLE = "# Octomap OcTree binary file"
 TREE_TITLE = "# Octomap OcTree file"
 TREE_NODE = np.dtype([("log_odds", "<f4"), ("children", "u1")])
 """One node of an `.ot` file; bit i of `children` says that child i exists."""
 MAX_BLOCKS = 2**18
-"""Blocks of 8x8x8 cells a file may unfold to (134 million cells); one node can claim 35 million million cells."""
+"""Blocks of 8x8x8 cells a file may expand to (134 million cells); one node can claim 35 million million cells."""
 BLOCKS_OF_ANY, BLOCKS_A_LEAF = 2**16, 256
-"""Few leaves may unfold to fewer: a file of 40 bytes is not to take a second."""
+"""Blocks that any file may expand to, and more per leaf: a file of 40 bytes must not take a second."""
 MAX_LOG_ODDS = 30.0
 OCTOMAP: dict[str, Any] = {"map.prior": 0.5, "map.log_odds_min": -2.0, "map.log_odds_max": 3.5}
-"""What OctoMap does when nothing else is said; the files do not tell."""
+"""OctoMap's defaults, which its files do not record."""
 MAX_HEADER_LENGTH = 1 << 16
 MAX_NODES = 2 * 512 * MAX_BLOCKS
 MAX_BYTES = 8 * MAX_NODES
@@ -94,11 +93,10 @@ def map_of_nodes(title: str, body: bytes, voxel_size: float, size: int | None = 
 def binary_tree(voxel_map: VoxelMap) -> Tree:
     """Return the map as OctoMap's binary tree: each cell free, occupied or unknown; eight equal cells become one.
 
-    Occupied and free cells stay so. The tree has no word for a tentative cell: with p >= 0.5 (OctoMap's own threshold)
-    it becomes occupied, below that unknown. So who flies by the file meets no free cell that the map does not call
-    free, and no obstacle that the map has reason to suspect is missing; a cell that counts as tentative here may
-    count as occupied there.
-    Raises MapFileError for cells outside [-32768, 32768).
+    Occupied and free cells stay so. The format cannot express tentative cells: with p >= 0.5 (OctoMap's own threshold)
+    they become occupied, below that unknown. So a user of the file meets no free cell that is not free in the map, and
+    misses no obstacle that the map suspects; but a tentative cell may count as occupied there. Raises MapFileError for
+    cells outside [-32768, 32768).
     """
     indices, log_odds = voxel_map.cells()
     state = voxel_map.state(voxel_map.centers(indices))
@@ -122,7 +120,7 @@ def full_tree(voxel_map: VoxelMap) -> Tree:
 
 
 class Tree(NamedTuple):
-    """The nodes of a tree as OctoMap's files and `octomap_msgs/Octomap` hold them, and how many they are."""
+    """The nodes of a tree as in OctoMap's files and `octomap_msgs/Octomap`, and their number."""
 
     size: int
     data: bytes

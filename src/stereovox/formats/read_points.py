@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Read the points of `.ply` and `.pcd` files, of ours and of other programs (formats: Turk 1994; PCL's PCD 0.7).
+"""Read maps from points: `.ply` and `.pcd` of any program, and our `.npz` (formats: Turk 1994; PCL's PCD 0.7).
 
-By hand, because trimesh reads no PCD and no dependency unpacks its LZF.
+Written by hand, because trimesh reads no PCD and no dependency decompresses its LZF.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ from stereovox.maps.queries import INDEX_LIMIT
 from stereovox.safe_io import json_value, read_arrays, read_bounded, shown
 
 MAX_BLOCKS = 2**19
-"""Blocks of 8x8x8 cells, 1 KB each, that cells of a file may lie in: a file of far points is not to fill the memory."""
+"""Most blocks of 8x8x8 cells, 1 KB each, so that a file of far-apart points cannot fill the memory."""
 ARRAYS = ("indices", "log_odds", "voxel_size", "free_below", "occupied_above", "settings")
 MAX_BYTES = 1 << 32
 MAX_HEADER_LENGTH, MAX_FIELDS = 1 << 16, 256
 TEXT_PIECE, BLANK = 1 << 20, re.compile(rb"\s")
-"""Bytes of text that are read at once, and what parts its numbers."""
+"""Bytes of text read at once, and the separator of its numbers."""
 OURS = re.compile(r"centres of occupied cells of (\S+) m")
-"""The comment in files of ours that tells the side of a cell."""
+"""The comment in our own files with the side of a cell."""
 PLY_TYPES = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
     "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
@@ -38,10 +38,10 @@ PLY_TYPES = {
 }  # fmt: skip
 PLY_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 COLUMNS = "columns"
-"""The order of packed points: all numbers of one field, little-endian, then all of the next."""
+"""The order of compressed points: all numbers of one field, little-endian, then all of the next."""
 PCD_ORDERS = {"ascii": "", "binary": "<", "binary_compressed": COLUMNS}
 MAX_RATIO = 100
-"""LZF makes at best 264 bytes of 3."""
+"""Largest LZF compression ratio accepted; at best it makes 264 bytes of 3."""
 PCD_KINDS = {"I": "i", "U": "u", "F": "f"}
 PCD_SIZES = {"i": (1, 2, 4, 8), "u": (1, 2, 4, 8), "f": (4, 8)}
 
@@ -63,7 +63,7 @@ def read_point_map(path: str | Path, voxel_size: float | None = None) -> VoxelMa
 
 
 def read_npz(path: str | Path) -> VoxelMap:
-    """Return the map in a `.npz` of ours, cell for cell; what it remembered of its frames is not in such a file.
+    """Return the map in one of our `.npz`, cell for cell; the file does not hold the map's history.
 
     Raises MapFileError: one line with the file and what is wrong.
     """
@@ -86,8 +86,8 @@ def read_npz(path: str | Path) -> VoxelMap:
 def cells_of_points(points: ArrayLike, voxel_size: float) -> VoxelMap:
     """Return a map of the default profile in which each cell that holds a point is occupied, all others unknown.
 
-    points: (N, 3) metres, world frame; those that are not finite count for nothing. voxel_size: metres.
-    Raises StereovoxError for points so far away that no cell can be there, for too many blocks, or a bad size.
+    points: (N, 3) metres, world frame; those that are not finite are ignored. voxel_size: metres. Raises StereovoxError
+    for points too far away for any cell, for too many blocks, or a bad size.
     """
     points = np.asarray(points, np.float64).reshape(-1, 3)
     config = load_config(voxel_size=voxel_size)

@@ -62,7 +62,7 @@ class Track:
     def save(self, path: str | Path) -> None:
         """Write where the robot stood as lines `stamp tx ty tz qx qy qz qw` (TUM): seconds, metres, quaternion.
 
-        Raises MapFileError, one line, where the file cannot be written; an older one is then still there.
+        Raises MapFileError where the file cannot be written; an older one is then still there.
         """
         with replacing(path) as file:
             file.write(b"# stamp tx ty tz qx qy qz qw: robot in the map, on the floor\n")

@@ -37,7 +37,7 @@ def refresh(stored, rules, wanted, low, order, shape, seen, mask, dirty):
 
 @cell
 def _find_changes(stored, rules, wanted, x, y, z, now, seen):
-    """Set `now` (512,) to which cells of a block are obstacles; tell whether any differs from `seen`."""
+    """Set `now` (512,) to which cells of a block are obstacles; return whether any differs from `seen`."""
     row = row_of(stored, x, y, z)
     differ = np.uint8(0)
     if row < 0:

@@ -106,7 +106,7 @@ def _square(costs, run):
 
 @cell
 def _amended(new, old, moved, costs, before, best):
-    """Set `best` to the row `before`, amended for the lanes that moved; tell whether that is all there is to do.
+    """Set `best` to the row `before`, amended for the lanes that moved; return whether that is all there is to do.
 
     It is where no lane that moved away was the nearest of any other.
     """
@@ -226,7 +226,7 @@ def _lower_by_two(best, row, mirrored, cost):
 
 @cell
 def _lower_unless_missed(best, row, superseded, cost):
-    """Do what `_lower` does, and tell whether what is `superseded` from the row may have been the least anywhere."""
+    """Do what `_lower` does, and return whether what is `superseded` from the row may have been the least anywhere."""
     most, missed = NO, NO
     for c in range(best.size):
         other = row[c] + cost

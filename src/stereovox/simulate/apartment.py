@@ -129,7 +129,7 @@ BOXES: dict[str, dict[str, tuple[Point, Point]]] = {
         "chest": ((0.06, 3.36, 0), (0.5, 4.1, 0.8)),
     },
 }
-"""Part, name, lowest and highest corner."""
+"""Lowest and highest corner by part and name."""
 SHIFT = np.array([0.0137, 0.0219, -0.0123])
 """World coordinates of the plan's origin in metres."""
 HEIGHT, OUTSIDE = 2.5, 0.25
@@ -162,10 +162,10 @@ PASSAGE = (0.9, 1.9)
 def stage(*, speed: float = 0.8) -> Stage:
     """Return the furnished apartment and a scan of all rooms at walking `speed` (m/s), 15 images a second.
 
-    The way begins and ends at the same place, so that a tracker that drifts sees it again. The camera's sway is that of
-    a hand. World: z up, walls along x and y. Parts: `walls`, `floor`, `ceiling`, `door frames` and the furniture.
-    faces: the four sides of every room, named `kitchen west` and the like; doors are holes in them, and furniture
-    stands before them. Raises SourceError for values out of range.
+    The path begins and ends at the same place, so that a drifting tracker revisits it. The camera sways as in a hand.
+    World: z up, walls along x and y. Parts: `walls`, `floor`, `ceiling`, `door frames` and the furniture. faces: the
+    four sides of every room, named `kitchen west` and the like; doors are holes in them, and furniture stands before
+    them. Raises SourceError for values out of range.
     """
     within("speed", speed, 0.1, 5)
     T_world_plan = np.eye(4)
@@ -180,9 +180,9 @@ def stage(*, speed: float = 0.8) -> Stage:
 
 
 def walk(speed: float) -> tuple[Callable[[float], Transform], float]:
-    """Return the way (T_plan_camera at a share of it) and how many seconds it takes at `speed` m/s.
+    """Return the path (T_plan_camera at a share of it) and how many seconds it takes at `speed` m/s.
 
-    Between waypoints the camera walks and turns at once; whatever takes longer sets the time. The first image looks
+    Between waypoints the camera walks and turns at once; whichever takes longer sets the time. The first image looks
     exactly level.
     """
     from scipy.interpolate import PchipInterpolator

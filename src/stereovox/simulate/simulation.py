@@ -84,7 +84,7 @@ class Simulation(DepthSource):
     UNMATCHED beside edges and where the right eye sees nothing.
     noise: False gives exact depth in metres (float32, inf where nothing is) without noise or holes.
     frames: how many frames are taken on the whole way; None leaves it to the scene. The way takes as long all the same.
-    Raises SourceError, one line, for an unknown scene or parameter and for values out of range.
+    Raises SourceError for an unknown scene or parameter and for values out of range.
     """
 
     layout = f"simulation ({', '.join(f'sim:{name}' for name in SCENES)})"
@@ -108,7 +108,7 @@ class Simulation(DepthSource):
 
     @classmethod
     def recognises(cls, location: str | Path) -> bool:
-        """Tell whether `location` names a simulation."""
+        """Return whether `location` names a simulation."""
         return str(location).startswith("sim:")
 
     @cached_property

@@ -44,7 +44,7 @@ class Surround(Source):
     location: `sim:surround` or with parameters `sim:surround?pair=front&scale=0.5`, see `Options`. The images are as
     the lenses make them. World: z up, metres; the drone's body is level, x forward, y left, z up. Every frame can be
     asked for by itself and is always the same for the same `seed`.
-    Raises SourceError, one line, for an unknown parameter and for values out of range.
+    Raises SourceError for an unknown parameter and for values out of range.
     """
 
     layout = "four stereo cameras round a drone (sim:surround)"
@@ -62,7 +62,7 @@ class Surround(Source):
 
     @classmethod
     def recognises(cls, location: str | Path) -> bool:
-        """Tell whether `location` names this simulation."""
+        """Return whether `location` names this simulation."""
         return str(location).partition("?")[0] == "sim:surround"
 
     @cached_property
@@ -188,7 +188,7 @@ def surround_pair(name: str, scale: float = 1.0) -> StereoPair:
 
 @lru_cache(maxsize=8)
 def visible_to_both(pair: StereoPair) -> NDArray[np.bool_]:
-    """Tell which pixels (height, width) of the rectified left image look where both lenses see, far away."""
+    """Return which pixels (height, width) of the rectified left image look where both lenses see, far away."""
     assert pair.eyes is not None
     R_left, R_right = pair.eyes.rectifying_rotations()
     rays = _rays(pair).astype(float)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a RealSense T265 makes of a true motion: jitter, drift, re-localisation, a confidence, a clock of its own.
+"""Sensor model of a RealSense T265: jitter, drift, re-localisation, confidence, and a clock of its own.
 
 The tracker's file and body have OpenGL axes: x right, y up, z backward. Its world starts at its first pose, with y
 against gravity and z against its first heading (Chien 2020, 4.1 and Fig 4.1).
@@ -19,13 +19,14 @@ from stereovox.se3 import Transform, inverse
 from stereovox.sources.poses import seconds_from_ns
 
 STEP_S = 0.05
-"""Drift is slow: it is worked out so often and interpolated."""
+"""Seconds between steps of the drift, which is slow and interpolated."""
 WALK_M = 5.0
-"""Metres over which the drift keeps its direction: over shorter ways it grows with the way, then with its root."""
+"""Metres over which the drift keeps its direction: over shorter distances it grows linearly, then with the square root.
+"""
 ALIKE = 0.5
-"""A place is known again where the camera looks the same way within 60 degrees (cosine)."""
+"""Largest change of heading, as a cosine (60 degrees), at which a place is recognised."""
 SPACING_M = 0.3
-"""A place is remembered every so many metres."""
+"""Metres between remembered places."""
 RATE_HZ = 200
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 """T_opengl_optical: turns optical axes (x right, y down, z forward) into OpenGL ones; it is its own inverse."""
@@ -37,11 +38,11 @@ FAILED, LOW, MEDIUM, HIGH = range(4)
 class Drift:
     """Drift and re-localisation of a tracker.
 
-    share: error per metre of way, in all directions (0.01 is a good tracker's); yaw_deg: drift of the heading over
-        one metre, in degrees; it grows with the root of the way. Gravity keeps roll and pitch right.
-    find_again_m: a place seen before is known again from so far away (0: never), if the way since is longer than
-        `loop_m`; pull_s: time in which two thirds of the error since then are taken back. Chien 2020, 2.2.3: the pose
-        "will become more precise upon further visits to the same area".
+    share: error per metre travelled, in all directions (0.01 is a good tracker's); yaw_deg: drift of the heading over
+    one metre, in degrees; it grows with the square root of the distance. Gravity keeps roll and pitch right.
+    find_again_m: distance within which a visited place is recognised (0: never), if the path since is longer than
+    `loop_m`; pull_s: time in which two thirds of the error since then are removed. Chien 2020, 2.2.3: the pose "will
+    become more precise upon further visits to the same area".
     """
 
     share: float = 0.01
@@ -55,15 +56,15 @@ class Drift:
 class T265:
     """A model of the tracker. All its noise follows from `seed`.
 
-    jitter_m, jitter_deg: standard deviation of the noise of each axis; jitter_s: time over which it is alike.
-    drift: how it drifts and finds places again; see `Drift`.
-    settle_s: so long the confidence is low and the jitter five times larger, unless the camera has moved 0.3 m before;
-        Chien 2020, 2.2.3: "low at the beginning and improves as the camera starts moving".
-    clock_offset_s, clock_drift_ppm: camera time = tracker time + clock_offset_s, at the first pose; then the tracker's
-        clock gains so many millionths.
-    jump_s, jump_m: at this time (None: never) the position jumps sideways by so many metres, until it finds a place
-        again. lost_s: from and to which time (None: never) the confidence is low and the jitter twenty times larger.
-    Times count from the first pose.
+    jitter_m, jitter_deg: standard deviation of the noise of each axis; jitter_s: its correlation time. drift: how it
+    drifts and recognises places; see `Drift`. settle_s: for this long the confidence is low and the jitter five times
+    larger, unless the camera has moved 0.3 m before; Chien 2020, 2.2.3: "low at the beginning and improves as the
+    camera starts moving".
+    clock_offset_s, clock_drift_ppm: camera time = tracker time + clock_offset_s, at the first pose; from then on the
+    tracker's clock gains this many millionths.
+    jump_s, jump_m: at this time (None: never) the position jumps sideways by this many metres, until it recognises a
+    place. lost_s: from and to which time (None: never) the confidence is low and the jitter twenty times larger. Times
+    count from the first pose.
     """
 
     seed: int = 0
@@ -181,7 +182,7 @@ def drifted(
 
 
 def start_frame(T_world_first: Transform) -> Transform:
-    """Return T_start_world (4, 4): the world that the tracker makes of its first pose, in OpenGL axes.
+    """Return T_start_world (4, 4): the world that the tracker derives from its first pose, in OpenGL axes.
 
     T_world_first: body in optical axes, world z up. Raises StereovoxError where it has no heading.
     """
@@ -207,7 +208,7 @@ def write_track(path: Path, track: Track) -> None:
 
 @dataclass
 class _Places:
-    """What the tracker remembers: where it was, how it looked, after which way, and its errors there."""
+    """The tracker's memory: places, headings, distance travelled, and its errors there."""
 
     where: list[NDArray[np.float64]] = field(default_factory=list)
     ahead: list[NDArray[np.float64]] = field(default_factory=list)
@@ -286,7 +287,7 @@ def _step(
 
 
 def _alike(white: NDArray[np.float64], steps: float) -> NDArray[np.float64]:
-    """Return noise (N, K) of the same size that is alike over so many steps (first-order low pass)."""
+    """Return noise (N, K) of the same variance, correlated over so many steps (first-order low pass)."""
     from scipy.signal import lfilter
 
     keep = np.exp(-1 / steps) if steps > 0 else 0.0

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stereo calibrations of other tools as rigs: KITTI, ROS camera_info, OpenCV and Kalibr."""
+"""Import stereo calibrations of other tools as rigs: KITTI, ROS camera_info, OpenCV and Kalibr."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from stereovox.sources.rig_file import Rig, RigPair
 
 Table = dict[str, Any]
 Found = tuple[Eyes, Transform]
-"""Both eyes, and T_body_left: the body is the inertial unit where Kalibr tells it, else the left eye."""
+"""Both eyes, and T_body_left: the body is the inertial unit if Kalibr's file has one, else the left eye."""
 KALIBR = {"radtan": "pinhole", "equidistant": "fisheye", "none": "pinhole"}
 ROS = {"plumb_bob": "pinhole", "rational_polynomial": "pinhole", "equidistant": "fisheye", "fisheye": "fisheye"}
 OPENCV = {
@@ -31,7 +31,7 @@ OPENCV = {
     "R": ("R",),
     "T": ("T",),
 }
-"""Names that OpenCV's samples and their descendants use."""
+"""Names used by OpenCV's samples and their descendants."""
 INFO = {
     "K": ("camera_matrix", "K", "k"),
     "D": ("distortion_coefficients", "D", "d"),
@@ -47,11 +47,11 @@ Size = tuple[int, int]
 
 
 def import_rig(files: Sequence[Path], size: Size | None = None, lens: str = "", name: str = "stereo") -> Rig:
-    """Return the rig in calibration files of a kind that is recognised by content; see `KINDS`.
+    """Return the rig in calibration files of a kind recognised by content; see `KINDS`.
 
-    size: width and height of the images where the files do not tell. lens: `fisheye` where an OpenCV file is of one;
-    the others say it. name: of the pair; KITTI's are `grey` and `colour`.
-    Raises SourceError, one line, for files of another kind, and for what cannot be brought into a rig.
+    size: width and height of the images where the files lack them. lens: `fisheye` where an OpenCV file has fisheye
+    lenses; the other kinds declare it. name: of the pair; KITTI's are `grey` and `colour`. Raises SourceError for files
+    of another kind, and for what cannot be expressed as a rig.
     """
     if not 1 <= len(files) <= 2:
         raise SourceError(f"{len(files)} files: give one, or two of one stereo camera")
@@ -67,7 +67,7 @@ def import_rig(files: Sequence[Path], size: Size | None = None, lens: str = "", 
 
 
 def read_yaml(path: Path) -> Table:
-    """Return the table in a YAML file, also one of OpenCV's; raises SourceError, one line."""
+    """Return the table in a YAML file, also one of OpenCV's; raises SourceError."""
     import yaml
 
     class Loader(yaml.SafeLoader):
@@ -91,7 +91,7 @@ def read_yaml(path: Path) -> Table:
 
 
 def eyes_of(tables: Sequence[Table], size: tuple[int, int] | None, lens: str) -> Found:
-    """Return both eyes of the calibration in `tables`; raises SourceError for another kind and for what is missing."""
+    """Return both eyes of the calibration in `tables`; raises SourceError for another kind or missing keys."""
     first = tables[0]
     if "cam0" in first:
         return _kalibr(first)
@@ -196,7 +196,7 @@ def _lens(model: str, K: NDArray[np.float64], distortion: Any, size: tuple[int, 
 
 
 def _in_order(a: Lens, b: Lens, T_a_b: Transform, bodies: Sequence[Transform | None]) -> Found:
-    """Return the eyes with the left one first, whichever way round the file has them."""
+    """Return the eyes with the left one first, whatever their order in the file."""
     if T_a_b[0, 3] < 0:
         a, b, T_a_b, bodies = b, a, inverse(T_a_b), bodies[::-1]
     return Eyes(a, b, T_a_b), np.eye(4) if bodies[0] is None else bodies[0]

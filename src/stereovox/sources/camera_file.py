@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The camera of a recording: from `camera.toml`, or from the small text files that lie beside the images."""
+"""The camera of a recording: `camera.toml`, or the small text files beside the images."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ NEEDED = {
     **dict.fromkeys(("fx", "fy"), "its focal length in pixels"),
     **dict.fromkeys(("cx", "cy"), "where the optical axis meets the image, in pixels"),
 }
-"""What a key is, for those who left it out."""
+"""Explains each required key."""
 KEYS = (*SIZES, *INTRINSICS, "baseline", "correction")
 CORRECTION = ("model", "coefficients", "provenance")
 MATRIX, LIST = "camera-intrinsics.txt", "calibration.txt"
@@ -34,7 +34,7 @@ Intrinsics = tuple[float, float, float, float]
 
 
 def read_camera(path: Path) -> PinholeCamera:
-    """Return the camera in `path`; raises SourceError, one line with file and key, for anything wrong in it.
+    """Return the camera in `path`; raises SourceError naming file and key for anything wrong in it.
 
     Keys: width, height, fx, fy, cx, cy in pixels, perhaps baseline in metres, perhaps a table [correction] with model
     and coefficients as `DepthCorrection` has them, and a table [correction.provenance] of anything.
@@ -47,9 +47,9 @@ def read_camera(path: Path) -> PinholeCamera:
 
 
 def camera_text(camera: PinholeCamera, provenance: Mapping[str, Any] | None = None, remarks: Sequence[str] = ()) -> str:
-    """Return a camera as the text of a camera file, `remarks` as comments at its top.
+    """Return the text of a camera file, with `remarks` as comments at its top.
 
-    provenance: texts, numbers and lists of them that tell where the correction comes from.
+    provenance: texts, numbers and lists of them that document the origin of the correction.
     """
     lines = [f"# {remark}" for remark in remarks]
     lines += [f"{key} = {toml_text(getattr(camera, key))}" for key in (*SIZES, *INTRINSICS)]
@@ -66,12 +66,12 @@ def camera_text(camera: PinholeCamera, provenance: Mapping[str, Any] | None = No
 def find_camera(
     folders: Sequence[Path], size: tuple[int, int], baseline: float, default: Intrinsics
 ) -> tuple[PinholeCamera, tuple[str, ...]]:
-    """Return the camera of images of (width, height) = `size`, and notes: what was assumed, used, or passed over.
+    """Return the camera of images of (width, height) = `size`, and notes: what was assumed, used or ignored.
 
-    The first file found counts: `camera.toml` (see `camera_file`) in the first of `folders`, the recording's own; then
+    The first file found counts: `camera.toml` (see `read_camera`) in the first of `folders`, the recording's own; then
     `camera-intrinsics.txt` (3x3 matrix) and `calibration.txt` (fx fy cx cy), in the order of `folders`. Without one,
-    640x480 images get `default`. `baseline` in metres, where the file tells none.
-    Raises SourceError for a bad file, or where there is none and the images have another size.
+    640x480 images get `default`. `baseline` in metres applies where the file has none. Raises SourceError for a bad
+    file, or where there is none and the images have another size.
     """
     places = [folders[0] / FILE, *(folder / name for folder in folders for name in (MATRIX, LIST))]
     found = [path for path in places if os.path.isfile(path)]  # Path.is_file may raise
@@ -94,9 +94,9 @@ def find_camera(
 
 
 def with_camera(stream: Stream, file: str | os.PathLike[str]) -> Stream:
-    """Return `stream` with the camera in `file`; without a baseline there, the stream's own counts.
+    """Return `stream` with the camera in `file`; without a baseline there, the stream's own is kept.
 
-    Raises SourceError, one line, for a bad file and for a camera with another number of pixels.
+    Raises SourceError for a bad file and for a camera with another number of pixels.
     """
     camera, own = read_camera(Path(file)), stream.camera
     if (camera.width, camera.height) != (own.width, own.height):
@@ -109,7 +109,7 @@ def with_camera(stream: Stream, file: str | os.PathLike[str]) -> Stream:
 
 
 class WithCamera(Stream):
-    """The frames of `stream`, all with `camera`, which has as many pixels; `notes` follow its own."""
+    """A stream whose frames get another `camera` of the same size; `notes` follow the stream's own."""
 
     def __init__(self, stream: Stream, camera: PinholeCamera, notes: tuple[str, ...] = ()):
         self._stream, self.camera, self._notes = stream, camera, notes
@@ -117,16 +117,16 @@ class WithCamera(Stream):
 
     @property
     def length(self) -> int | None:
-        """Number of frames, as the stream tells."""
+        """Number of frames of the stream."""
         return self._stream.length
 
     @property
     def dropped(self) -> int:
-        """Frames that nobody took in time, as the stream tells."""
+        """Frames dropped by the stream."""
         return self._stream.dropped
 
     def after(self, count: int) -> Stream:
-        """Return what is left after `count` frames, with the same camera."""
+        """Return the remaining frames after `count`, with the same camera."""
         return WithCamera(self._stream.after(count), self.camera, self._notes)
 
     def __iter__(self) -> Iterator[Frame]:
@@ -145,7 +145,7 @@ class WithCamera(Stream):
 def read_intrinsics(path: Path) -> Intrinsics:
     """Return fx, fy, cx, cy in pixels from a 3x3 matrix or from these four numbers; `#` starts a comment.
 
-    Raises SourceError naming the file for anything else, also for skew: such a camera is no plain pinhole.
+    Raises SourceError naming the file for anything else, including skew: such a camera is no plain pinhole.
     """
     numbers = _numbers(path)
     if len(numbers) == 4:
@@ -158,7 +158,7 @@ def read_intrinsics(path: Path) -> Intrinsics:
 
 
 def describe_correction(camera: PinholeCamera) -> str:
-    """Return in words what the depth of a camera will be corrected by."""
+    """Describe a camera's depth correction in words."""
     return f"depth correction '{camera.correction.model}'" if camera.correction else "no depth correction"
 
 
@@ -168,9 +168,9 @@ def pinhole(
     baseline: float | None,
     correction: DepthCorrection | None = None,
 ) -> PinholeCamera:
-    """Return a camera from numbers in a file: (width, height), and fx, fy, cx, cy; all finite.
+    """Return a camera from numbers of a file: (width, height), and fx, fy, cx, cy; all finite.
 
-    Raises SourceError that names the number which cannot be.
+    Raises SourceError naming the invalid number.
     """
     named = {"fx": intrinsics[0], "fy": intrinsics[1], "baseline": 1.0 if baseline is None else baseline}
     for name, number in named.items():

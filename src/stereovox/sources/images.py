@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Images in PNG files, trusted only when they are whole, and folders of them.
+"""PNG images and folders of them; only intact files are decoded.
 
-Decoders differ in what they do with a damaged file: a half image, noise, or lines on the terminal from the C library.
-So the file's own check sums are verified first (0.02 ms for 90 kB) and only a whole file is decoded.
+Decoders differ on damaged files: half an image, noise, or lines on the terminal from the C library. So the file's own
+checksums are verified first (0.02 ms for 90 kB).
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ SIGNATURE = b"\x89PNG\r\n\x1a\n"
 START = SIGNATURE + b"\0\0\0\rIHDR"
 HEADER_BYTES = 33  # signature, then IHDR: length, name, 13 bytes, check sum
 MAX_BYTES = 1 << 28
-"""Bytes of a file: more than so many pixels can need."""
+"""Largest file: more than the most pixels can need."""
 MAX_RATIO = 1100
-"""Bytes that one byte of a PNG can stand for (deflate: 1032)."""
+"""Most bytes that one byte of a PNG can decompress to (deflate: 1032)."""
 GREY_16 = (16, 0)  # bit depth and colour type
 DEPTH_KINDS = frozenset({GREY_16})
 PICTURE_KINDS = frozenset({(8, 0), (8, 2)})
@@ -45,7 +45,7 @@ Kinds = frozenset[tuple[int, int]]
 def read_depth_png(path: Path, size: tuple[int, int]) -> NDArray[np.uint16]:
     """Return the (height, width) uint16 image in `path`, whose size must be (width, height) = `size`.
 
-    Raises FrameRefused, one line: `missing_file`; `unreadable` (no PNG, cut off, damaged, absurdly large); `bad_dtype`
+    Raises FrameRefused: `missing_file`; `unreadable` (no PNG, cut off, damaged, absurdly large); `bad_dtype`
     (not 16-bit grey); `bad_shape` (another size).
     """
     return decode_depth_png(path, _read(path), size)
@@ -66,7 +66,8 @@ def decode_depth_png(path: Path | str, data: bytes, size: tuple[int, int]) -> ND
 def read_picture_png(path: Path, size: tuple[int, int]) -> NDArray[np.uint8]:
     """Return the (height, width) uint8 grey or (height, width, 3) uint8 RGB image in `path`.
 
-    Its size must be (width, height) = `size`. Raises FrameRefused as `read_depth_png`; `bad_dtype`: neither of both.
+    Its size must be (width, height) = `size`. Raises FrameRefused as `read_depth_png`; `bad_dtype`: neither grey nor
+    RGB.
     """
     data = _read(path)
     _check(path, data, size, PICTURE_KINDS)
@@ -77,12 +78,14 @@ def read_picture_png(path: Path, size: tuple[int, int]) -> NDArray[np.uint8]:
 
 
 def png_size(path: Path, kinds: Kinds = DEPTH_KINDS) -> tuple[int, int]:
-    """Return (width, height) as the header of a PNG of these kinds tells; raises FrameRefused as `read_depth_png`."""
+    """Return (width, height) from the header of a PNG of these kinds; raises FrameRefused as `read_depth_png`."""
     return _header_size(path, _read(path, header_only=True), kinds)
 
 
 def common_size(paths: Sequence[Path], samples: int = 5, kinds: Kinds = DEPTH_KINDS) -> tuple[int, int] | None:
-    """Return the (width, height) that most of `samples` readable images spread over `paths` have; None if none is."""
+    """Return the most frequent (width, height) of `samples` readable images spread over `paths`; None if none is
+    readable.
+    """
     found: Counter[tuple[int, int]] = Counter()
     for path in _spread(paths, samples):
         try:
@@ -95,11 +98,11 @@ def common_size(paths: Sequence[Path], samples: int = 5, kinds: Kinds = DEPTH_KI
 
 
 class DepthFolder(DepthSource, ABC):
-    """Frames from depth PNGs, one file each; a file that cannot be used becomes a frame with a `fault`.
+    """Frames from depth PNGs, one file each; an unusable file becomes a frame with a `fault`.
 
-    A layout sets `depth_scale` (metres per unit), `baseline` (metres) and `intrinsics` (what 640x480 images have
-    without a calibration file), calls `_set_camera` when it is made, and tells each frame's image and pose.
-    The PNGs hold 0 or 65535 for every pixel without value and do not say why: all are UNKNOWN, none clears.
+    A layout sets `depth_scale` (metres per unit), `baseline` (metres) and `intrinsics` (for 640x480 images without a
+    calibration file), calls `_set_camera` in its constructor, and provides each frame's image and pose. The PNGs hold 0
+    or 65535 for every pixel without value and no reason: all are UNKNOWN, none clears.
     """
 
     depth_scale: float
@@ -141,7 +144,7 @@ class DepthFolder(DepthSource, ABC):
 
 
 def file_names(folder: Path) -> list[str]:
-    """Return the names of what lies in `folder`; raises SourceError where it cannot be listed."""
+    """Return the names of the entries of `folder`; raises SourceError where it cannot be listed."""
     try:
         return os.listdir(folder)
     except OSError as error:
@@ -149,7 +152,7 @@ def file_names(folder: Path) -> list[str]:
 
 
 def _spread(paths: Sequence[Path], samples: int) -> list[Path]:
-    """Return all paths, those at even distances first."""
+    """Return all paths, beginning with evenly spaced ones."""
     step = max(1, len(paths) // samples)
     return [path for start in range(step) for path in paths[start::step]]
 
@@ -193,7 +196,7 @@ def _header_size(path: Path | str, data: bytes, kinds: Kinds) -> tuple[int, int]
 
 
 def _is_whole(data: bytes) -> bool:
-    """Tell whether every chunk up to the end mark is there and has its right check sum."""
+    """Return whether every chunk up to the end mark is present and has the right checksum."""
     view, at, kind = memoryview(data), len(SIGNATURE), b""
     while kind != b"IEND":
         if at + 12 > len(data):

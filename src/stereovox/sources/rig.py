@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings of stereo rigs: a folder with a rig file, images of each pair, and the vehicle's poses."""
+"""Recordings of stereo rigs: a folder with a rig file, the images of each pair, and the vehicle's poses."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from stereovox.sources.rig_file import FILE, RigPair, read_rig
 from stereovox.sources.trajectory import Trajectory, by_time, inside, stamped_lines
 
 SHORTEST_NS = 1_000_000
-"""Names of a pair's images that span less are their numbers, not their times."""
+"""Image names of a pair that span less are numbers, not times."""
 
 
 class _Shot(NamedTuple):
@@ -42,7 +42,7 @@ class StereoRig(Source):
     away. World: that of the poses.
     Each pair is a sensor of its own, by its name. Why a pixel has no value is found out by matching (`depth.stereo`);
     the rig's masks make it MASKED.
-    Faults: those of `read_picture_png` and of `Poses.at`. Raises SourceError, one line, for a bad rig file, masks or
+    Faults: those of `read_picture_png` and of `Poses.at`. Raises SourceError for a bad rig file, masks or
     folders that cannot be read, names that are no times, and where there is no image or no file of poses.
     Names of several images that span less than a millisecond are no times.
     """
@@ -65,7 +65,7 @@ class StereoRig(Source):
 
     @classmethod
     def recognises(cls, where: str) -> bool:
-        """Tell whether `where` is a folder with a `rig.toml`."""
+        """Return whether `where` is a folder with a `rig.toml`."""
         return os.path.isfile(os.path.join(where, FILE))
 
     def __len__(self) -> int:

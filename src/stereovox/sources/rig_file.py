@@ -77,7 +77,7 @@ class RigPair:
     def stereo_pair(self, folder: Path | str = ".") -> StereoPair:
         """Return the pair; `folder` is where its mask is looked for.
 
-        Raises SourceError, one line, for a mask that cannot be read or has another size, a rectangle that lies outside
+        Raises SourceError for a mask that cannot be read or has another size, a rectangle that lies outside
         the image, and a virtual camera that cannot be.
         """
         try:
@@ -130,7 +130,7 @@ class Rig:
 
 
 def read_rig(path: Path | str) -> Rig:
-    """Return what `path` says; raises SourceError, one line with file, pair and key, for anything wrong in it."""
+    """Return what `path` says; raises SourceError naming file, pair and key for anything wrong in it."""
     from stereovox.safe_io import read_table
 
     table = read_table(Path(path))

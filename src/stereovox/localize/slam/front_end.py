@@ -45,7 +45,7 @@ class Follower:
         self._moved: dict[int, Cloud] = {}
 
     def add(self, scan: Scan) -> bool:
-        """Find the pose of the next scan; tell whether it became a keyframe."""
+        """Find the pose of the next scan; return whether it became a keyframe."""
         odometry, cloud = scan.pose_world_base, cloud_of(scan, self._config.max_range)
         if self._odometry is None:
             self.pose = odometry

@@ -68,8 +68,8 @@ class LoopFinder:
         drift_distances = self._drift_distances()
         cloud = submap_cloud(self._keyframes, later, NEAR_RANGE, cell=2 * self._config.voxel_size)
         windows: dict[Submap, tuple[float, float]] = {}
-        for earlier, drift_m in zip(self._submaps[:-1], drift_distances.tolist(), strict=False):
-            window = self._window(earlier, later, drift_m)
+        for earlier, path_m in zip(self._submaps[:-1], drift_distances.tolist(), strict=False):
+            window = self._window(earlier, later, path_m)
             if window is not None:
                 windows[earlier] = window
         there = self._keyframes[later.anchor].pose
@@ -99,25 +99,25 @@ class LoopFinder:
 
     def _agree(self, a: Edge, b: Edge) -> bool:
         keyframes = self._keyframes
-        drift_m = sum(
+        path_m = sum(
             abs(keyframes[i].travelled - keyframes[k].travelled) for i, k in ((a.first, b.first), (a.second, b.second))
         )
-        if drift_m > WITNESS_PATH:
+        if path_m > WITNESS_PATH:
             return False
         over = se2.relative(keyframes[a.first].pose, keyframes[b.first].pose)
         back = se2.relative(keyframes[b.second].pose, keyframes[a.second].pose)
         left = se2.relative(a.motion, se2.compose(se2.compose(over, b.motion), back))
-        return bool(np.hypot(left[0], left[1]) < WITNESS[0] + WITNESS[1] * drift_m and abs(left[2]) < WITNESS[2])
+        return bool(np.hypot(left[0], left[1]) < WITNESS[0] + WITNESS[1] * path_m and abs(left[2]) < WITNESS[2])
 
-    def _window(self, earlier: Submap, later: Submap, drift_m: float) -> tuple[float, float] | None:
+    def _window(self, earlier: Submap, later: Submap, path_m: float) -> tuple[float, float] | None:
         """Metres and radians to search for the later submap, None where it cannot show the same place."""
         config, a, b = self._config, self._keyframes[earlier.anchor], self._keyframes[later.anchor]
         if b.travelled - a.travelled < config.closure_path:
             return None
-        side = min(BASE_WINDOW + config.drift * drift_m, config.closure_window)
+        side = min(BASE_WINDOW + config.drift * path_m, config.closure_window)
         if np.hypot(*(b.pose - a.pose)[:2]) > side + ROOM:
             return None
-        return side, min(BASE_WINDOW_TURN + config.drift_turn * drift_m, config.closure_window_turn)
+        return side, min(BASE_WINDOW_TURN + config.drift_turn * path_m, config.closure_window_turn)
 
     def _drift_distances(self) -> NDArray[np.float64]:
         """Metres over which drift accumulates between the last submap and each other one: closures are short cuts."""
@@ -127,7 +127,7 @@ class LoopFinder:
         anchors = [submap.anchor for submap in self._submaps]
         number = {anchor: i for i, anchor in enumerate(anchors)}
         along = np.array([self._keyframes[anchor].travelled for anchor in anchors])
-        steps = {(i, i + 1): max(float(drift_m), SHORT_CUT) for i, drift_m in enumerate(np.diff(along))}
+        steps = {(i, i + 1): max(float(path_m), SHORT_CUT) for i, path_m in enumerate(np.diff(along))}
         # One length for each pair: a matrix made of several adds them up.
         lengths = steps | {(number[edge.first], number[edge.second]): SHORT_CUT for edge in self.edges}
         rows, columns = np.array(list(lengths), np.int64).reshape(-1, 2).T

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The drive through a simulated floor as a bag, with the topics and frames of the robot of IST 2019."""
+"""Write the drive through a simulated floor as a bag, with the topics and frames of the robot of IST 2019."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ Recorded = tuple[int, Scan | Frame | se2.Pose]
 def write_bag(
     robot: Robot | Floor, path: str | os.PathLike[str], progress: Callable[[int, int], None] | None = None
 ) -> None:
-    """Write all that a simulated robot records: ROS 1 for `.bag`, ROS 2 for `.mcap` and `.db3`.
+    """Write everything that a simulated robot records: ROS 1 for `.bag`, ROS 2 for `.mcap` and `.db3`.
 
     Topics: /scan, /camera/depth/image_raw and its camera_info, /odom, /tf (odom -> base_link), /tf_static, and the true
-    pose in the building on /ground_truth. Depth is in millimetres, 0 where there is none: a bag does not tell why.
-    progress: called with what is done and in all: odometry's poses, scans and images.
-    Raises SourceError, one line, for a robot that is none of this simulation and where the file cannot be written.
+    pose in the building on /ground_truth. Depth is in millimetres, 0 for none: a bag cannot say why. progress: called
+    with messages done and in all: odometry poses, scans and images. Raises SourceError for a robot that is not of this
+    simulation and where the file cannot be written.
     """
     if not isinstance(robot, Floor):
         raise SourceError(f"{robot.name}: only a simulated robot is recorded; give sim:floor")

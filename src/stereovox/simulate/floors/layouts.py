@@ -34,7 +34,7 @@ CORNERS: tuple[Rectangle, ...] = (
     (17.65, -1.28, 18.5, -1.2),
     (13.4, 9.2, 14.8, 9.75),  # niche of a copier
 )
-"""Zones that are like no other (IST 2019, III-D)."""
+"""Distinctive zones (IST 2019, III-D)."""
 OPEN = ((10.25, SOUTH), (16.25, SOUTH), (11.95, NORTH))
 """Doors of 0.9 m that stand open: x from, and the row of offices."""
 SHUT = ((14.55, SOUTH), (7.65, NORTH), (16.25, NORTH))
@@ -98,14 +98,14 @@ def shelf(name: str, where: tuple[float, float, float, float]) -> list[Obstacle]
 
 @dataclass(frozen=True, eq=False)
 class Layout:
-    """A floor, the way of a robot through it, and the rectangle that a shut door closes off (None: no such door)."""
+    """A floor, the robot's path, and the rectangle that a shut door closes off (None: no such door)."""
 
     plan: FloorPlan
     stops: Sequence[Stop]
     behind_door: Rectangle | None = None
 
     def moved(self, x: float, y: float) -> Layout:
-        """Return the same floor somewhere else."""
+        """Return the same floor at another place."""
 
         def rectangle(one: Rectangle) -> Rectangle:
             return one[0] + x, one[1] + y, one[2] + x, one[3] + y

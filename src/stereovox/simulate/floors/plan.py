@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The plan of one floor of a building: rooms, and upright things that stand in them.
+"""The plan of one floor of a building: rooms, and upright obstacles in them.
 
 Metres; x, y on the floor, z up from it.
 """
@@ -49,10 +49,10 @@ class Obstacle:
 
 @dataclass(frozen=True, eq=False)
 class FloorPlan:
-    """Walls round the free rectangles (rooms, corridors, openings of doors), and the things in them.
+    """Walls around the free rectangles (rooms, corridors, door openings), and the obstacles in them.
 
-    free: rectangles whose union is where no wall stands; they may overlap. things: all else. A door that is shut is a
-    thing in an opening.
+    free: rectangles whose union is free of walls; they may overlap. obstacles: everything else. A shut door is an
+    obstacle in an opening.
     """
 
     free: Sequence[Rectangle]

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a level camera and a lidar see of a simulated floor, exactly.
+"""Exact views of a simulated floor by a level camera and by a lidar.
 
-So each column needs one ray on the plan, and each thing the two places where that ray enters and leaves its outline.
+For a level camera each column needs one ray on the plan, and for each obstacle the two places where that ray enters and
+leaves its outline.
 
-Tops and undersides of things as a camera sees them: what a 3-D map has inside of the rims of a floor's things.
-A camera that is lower than a table looks at its underside, so a map in three dimensions has the whole table, and so has
-its projection. Beams in one plane find nothing but the rim.
+Lids are the tops and undersides that a camera sees: what a 3-D map has inside the outlines of obstacles. A camera lower
+than a table looks at its underside, so a 3-D map has the whole table, and so has its projection; beams in one plane
+find only the outline.
 """
 
 from __future__ import annotations
@@ -69,11 +70,11 @@ def within_reach(segments: NDArray[np.float64], origin: ArrayLike, reach: float)
 def with_lids(
     grid: OccupancyGrid, obstacles: Sequence[Obstacle], heights: tuple[float, float], eye: float
 ) -> OccupancyGrid:
-    """Return a perfect map of a floor with all lids occupied that lie between `heights` and can be seen.
+    """Return a perfect map of a floor with all visible lids between `heights` occupied.
 
-    grid: what `FloorPlan.truth` returns, in the plan's frame. eye: height of the camera over the floor. A lid is an
-    underside above the eye or a top below it. Not seen: what stands on another thing or carries one there, and what
-    stands nowhere beside a free cell. Nothing that is free in `grid` changes.
+    grid: what `FloorPlan.truth` returns, in the plan's frame. eye: height of the camera above the floor. A lid is an
+    underside above the eye or a top below it. Not visible: lids that rest on another obstacle or carry one, and those
+    not beside a free cell. Nothing that is free in `grid` changes.
     """
     from scipy import ndimage
 
@@ -93,7 +94,9 @@ def with_lids(
 
 
 def lid(obstacle: Obstacle, eye: float) -> float | None:
-    """Return the height of the underside or top that a camera at the height `eye` looks at; None beside the thing."""
+    """Return the height of the underside or top that a camera at the height `eye` sees; None at the obstacle's own
+    height.
+    """
     if obstacle.low > eye:
         return obstacle.low
     return obstacle.high if obstacle.high < eye else None
@@ -183,7 +186,7 @@ class LevelView:
 
 
 def _inside(obstacle: Obstacle, grid: OccupancyGrid) -> NDArray[np.bool_]:
-    """Tell which cells' middles lie within a thing's outline, (rows, columns)."""
+    """Return which cells have their centre inside an obstacle's outline, (rows, columns)."""
     rows, columns = grid.cells.shape
     x = grid.origin[0] + (np.arange(columns) + 0.5) * grid.resolution
     y = grid.origin[1] + (np.arange(rows)[:, None] + 0.5) * grid.resolution

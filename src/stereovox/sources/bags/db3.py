@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings in one SQLite file, by any message."""
+"""ROS 2 recordings in one SQLite file."""
 
 from __future__ import annotations
 
@@ -17,28 +17,28 @@ from stereovox.sources.bags.messages import Wire
 from stereovox.sources.bags.unpack import decompress_message
 
 STEPS = 10_000
-"""Instructions of SQLite between two looks at how many there were."""
+"""SQLite instructions between two checks of their number."""
 SUSPICIOUS_TABLES = """
     SELECT (SELECT count(*) FROM sqlite_master WHERE lower(name) IN ('topics', 'messages')
             AND (type <> 'table' OR NOT rootpage > 0))
         + (SELECT count(*) FROM pragma_table_xinfo('topics') WHERE hidden)
         + (SELECT count(*) FROM pragma_table_xinfo('messages') WHERE hidden)
 """
-"""Counts views, virtual tables and computed columns where tables should be: they make SQLite run what the file says."""
+"""Counts views, virtual tables and computed columns in place of tables: they make SQLite run what the file says."""
 
 
 class _StepLimit:
-    """Ends a query that takes more steps than there can be rows in a file of `size` bytes: damaged pages go round."""
+    """Aborts a query of more steps than a file of `size` bytes has rows: damaged pages form cycles."""
 
     def __init__(self, size: int):
         self._most, self._done = 1_000_000 + 10 * size, 0
 
     def begin(self) -> None:
-        """Count from here on."""
+        """Reset the count."""
         self._done = 0
 
     def is_over(self) -> bool:
-        """Count `STEPS` more."""
+        """Count `STEPS` more; return whether the limit is exceeded."""
         self._done += STEPS
         return self._done > self._most
 

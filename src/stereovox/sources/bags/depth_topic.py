@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The depth topic of a recording: its images as arrays, its camera, and what stands beside them."""
+"""The depth topic of a recording: images as arrays, their camera, and metadata recorded with them."""
 
 from __future__ import annotations
 
@@ -28,23 +28,23 @@ PAIRS = ("diagnostic_msgs/KeyValue", "std_msgs/String")
 VALUES = ("std_msgs/Float32", "std_msgs/String")
 CAMERA_INFO = "sensor_msgs/CameraInfo"
 RECTIFIED = re.compile(r"(?<![a-z])rect")
-"""In the names of topics: `image_rect`, `rectified`, but not `direct`."""
+"""Matches topic names such as `image_rect` and `rectified`, but not `direct`."""
 REALSENSE = re.compile(r"((/device_\d+/sensor_\d+)/Depth_\d+)/image/data(/compressedDepth)?")
 IMAGE, COMPRESSED = "sensor_msgs/Image", "sensor_msgs/CompressedImage"
 PACKED = "compressedDepth"
 UNITS = {"16UC1": 0.001, "mono16": 0.001, "32FC1": 1.0}
-"""Encodings and the metres per unit they usually have (REP 118); librealsense calls its own images mono16."""
+"""Encodings and their usual metres per unit (REP 118); librealsense calls its own images mono16."""
 DTYPES = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 DEPTH = ("16UC1", "32FC1")
-"""Encodings that are depth; mono16 is so only in RealSense files or where the user says so."""
+"""Encodings that are depth; mono16 is only in RealSense files, or where the user says so."""
 PNG_AT = 12
 """A compressedDepth image starts with 12 bytes about how floats were packed; the PNG follows."""
 
 
 class DepthTopic:
-    """Depth images of one topic, of one camera; see `Bag`.
+    """Depth images of one topic, from one camera; see `Bag`.
 
-    frame_id: what the first image calls the frame it is in, "" where unknown.
+    frame_id: frame of the first image, "" if unknown.
     """
 
     def __init__(self, file: BagFile, topic: str, info: str = ""):
@@ -69,7 +69,7 @@ class DepthTopic:
     def image(self, i: int, name: str) -> tuple[NDArray[np.generic], int, float]:
         """Return depth (height, width) uint16 or float32, its time in nanoseconds, and metres per unit.
 
-        Raises FrameRefused `unreadable`, `bad_dtype` or `bad_shape`; `name` stands in its message.
+        Raises FrameRefused `unreadable`, `bad_dtype` or `bad_shape`, with `name` in the message.
         """
         picture = read_picture(self._file, self.topic, i, name)
         packed = self._file.types[self.topic] == COMPRESSED
@@ -83,9 +83,9 @@ class DepthTopic:
 
 
 def find_depth(file: BagFile, topic: str = "", info: str = "") -> DepthTopic:
-    """Return the depth images of `topic`, or of the only topic that has some.
+    """Return the depth images of `topic`, or of the only topic that has any.
 
-    Raises SourceError where there is no such topic, none or several.
+    Raises SourceError where there is no such topic, or none or several.
     """
     for named in filter(None, (topic, info)):
         if named not in file.types:
@@ -130,8 +130,8 @@ def read_picture(file: BagFile, topic: str, i: int, name: str) -> Picture:
 def decoded(picture: Picture, packed: bool, size: tuple[int, int], name: str) -> tuple[NDArray[np.generic], str]:
     """Return depth (height, width) uint16 or float32, and its encoding, one of `UNITS`.
 
-    packed: the picture is a `CompressedImage`. size: width and height of its camera. `name` stands in messages.
-    Raises FrameRefused `unreadable`, `bad_dtype` or `bad_shape`.
+    packed: the picture is a `CompressedImage`. size: width and height of its camera. `name` is used in messages. Raises
+    FrameRefused `unreadable`, `bad_dtype` or `bad_shape`.
     """
     if packed:
         encoding = picture.encoding.partition(";")[0].strip()
@@ -149,11 +149,11 @@ def decoded(picture: Picture, packed: bool, size: tuple[int, int], name: str) ->
 def find_camera(
     file: BagFile, topic: str, info: str, stream: str | None, sensor: str
 ) -> tuple[PinholeCamera, tuple[str, ...]]:
-    """Return the camera of depth `topic`, and notes. `info`: topic that tells it, "" to look for one.
+    """Return the camera of depth `topic`, and notes. `info`: its CameraInfo topic, "" to search for one.
 
     stream, sensor: prefixes of a RealSense stream (`/device_0/sensor_0/Depth_0`) and sensor, None and "" for others.
-    Intrinsics: K, or P where the topic's name says that images are rectified. Baseline: the sensor's, else None.
-    Raises SourceError where there is no camera, or no possible one.
+    Intrinsics: K, or P where the topic's name says that images are rectified. Baseline: the sensor's, else None. Raises
+    SourceError where there is no camera, or no valid one.
     """
     where = [info] if info else _places(topic, stream)
     found = next((place for place in where if place in file.types), None)
@@ -174,9 +174,9 @@ def find_camera(
 
 
 def camera_of(info: CameraInfo, rectified: bool, baseline: float | None = None) -> PinholeCamera:
-    """Return the camera that a message tells; rectified: its images are, so that P counts and not K.
+    """Return the camera of a CameraInfo message; rectified: the images are, so that P counts and not K.
 
-    Raises StereovoxError for one that cannot be.
+    Raises StereovoxError for an invalid camera.
     """
     fx, _, cx, _, fy, cy = info.K[:6]
     if rectified and info.P[0] > 0:
@@ -187,7 +187,7 @@ def camera_of(info: CameraInfo, rectified: bool, baseline: float | None = None) 
 
 
 class Metadata:
-    """Keys and values that were recorded at the very time of a message of another topic; {} where there are none."""
+    """Keys and values recorded at exactly the time of another topic's message; {} where there are none."""
 
     def __init__(self, file: BagFile, topic: str):
         self._file, self._topic = file, topic
@@ -195,7 +195,7 @@ class Metadata:
         self._stamps = file.stamps(topic) if self._kind in PAIRS else np.empty(0, np.int64)
 
     def at(self, recorded_ns: int) -> dict[str, str]:
-        """Return what was recorded at that time; what cannot be read is left out."""
+        """Return what was recorded at that time, without values that cannot be read."""
         found: dict[str, str] = {}
         first, last = (int(np.searchsorted(self._stamps, recorded_ns, side)) for side in ("left", "right"))
         for i in range(first, last):
@@ -207,7 +207,7 @@ class Metadata:
 
 
 def option(file: BagFile, sensor: str, name: str) -> float | None:
-    """Return a setting of a RealSense sensor (`/device_0/sensor_0`), for example "Depth Units"; None where not told.
+    """Return a setting of a RealSense sensor (`/device_0/sensor_0`), for example "Depth Units"; None if not recorded.
 
     Spaces in the name became underscores in librealsense 2.57.
     """
@@ -225,7 +225,7 @@ def option(file: BagFile, sensor: str, name: str) -> float | None:
 
 
 def sibling(topic: str, name: str) -> str:
-    """Return the topic `name` beside `topic`."""
+    """Return the name of the topic `name` next to `topic`."""
     return f"{topic.rpartition('/')[0]}/{name}"
 
 

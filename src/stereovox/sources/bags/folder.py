@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings of ROS 2 as rosbag2 makes them: a folder with one or several `.mcap` or `.db3` files."""
+"""ROS 2 recordings as rosbag2 folders with one or several `.mcap` or `.db3` files."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ NUMBERED = re.compile(r".*_(\d+)\.(mcap|db3)", re.DOTALL)
 
 
 class FolderFile(BagFile):
-    """A folder that rosbag2 recorded; a recording that was split is one, whatever its files are called.
+    """A rosbag2 folder; the parts of a split recording are joined, whatever their names.
 
-    Without `metadata.yaml`, which rosbag2 writes at the end, the numbered files of the folder count, and `notes` say
-    so. open_part: opens one of the files. Raises SourceError, one line, for files that are missing, damaged, or packed
-    as a whole.
+    Without `metadata.yaml`, which rosbag2 writes at the end, the numbered files of the folder are used, and `notes` say
+    so. open_part: opens one of the files. Raises SourceError for files that are missing, damaged, or compressed as a
+    whole and not readable.
     """
 
     def __init__(self, path: Path, open_part: Callable[[Path], BagFile]):
@@ -49,7 +49,7 @@ class FolderFile(BagFile):
         return self._parts[part].read(topic, k)
 
     def _of(self, topic: str) -> NDArray[np.int64]:
-        """Return time, file and number there of a topic's messages, (N, 3), in order of time."""
+        """Return time, file number and message number of a topic's messages, (N, 3), in time order."""
         if topic not in self._places:
             rows = []
             for number, part in enumerate(self._parts):
@@ -62,7 +62,7 @@ class FolderFile(BagFile):
 
 
 def is_bag_folder(path: str) -> bool:
-    """Tell whether a folder is such a recording. Never raises."""
+    """Return whether a folder is a rosbag2 recording. Never raises."""
     folder = Path(path)
     try:
         if not folder.is_dir():

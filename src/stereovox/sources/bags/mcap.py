@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings in one `.mcap` file: its records (mcap.dev/spec), its index, and any message."""
+"""Recordings in one `.mcap` file (mcap.dev/spec): read by the index, or by scanning a file that has none."""
 
 from __future__ import annotations
 
@@ -25,35 +25,35 @@ START = b"\x89MCAP0\r\n"
 FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX, STATISTICS = 2, 3, 4, 5, 6, 7, 8, 11
 DATA_END = 15
 HEAD = 9
-"""Bytes before the fields of a record: opcode and length."""
+"""Bytes before a record's fields: opcode and length."""
 MESSAGE_HEAD = 22
-"""Bytes of a message before its data: channel, number, time of recording and of sending."""
+"""Bytes of a message before its data: channel, number, times of recording and sending."""
 INDEX_HEAD = HEAD + 6
-"""Bytes of a message index before its entries, of 16 bytes each."""
+"""Bytes of a message index before its entries of 16 bytes each."""
 MIN_CHUNK_BYTES = HEAD + 40
 """Bytes of an empty chunk."""
 ENTRY = np.dtype([("time", "<u8"), ("offset", "<u8")])
 ENCODINGS = {"cdr": True, "ros1": False}
-"""How messages may be serialised, and whether that is ROS 2's way; others (JSON, protobuf) are none of ROS."""
+"""Supported message encodings, and whether each is that of ROS 2; others (JSON, protobuf) do not come from ROS."""
 TAIL = HEAD + 20 + len(START)
-"""Bytes of the last record and of what ends a file."""
+"""Bytes of the last record and of the magic that ends a file."""
 NO_CHUNK = -1
-"""In the place of its chunk's: a message that stands in none."""
+"""Stands for the chunk of a message that is in none."""
 MAX_RECORDS = 10_000_000
-"""More than these are not gone through: hours of a robot, and 240 MB of memory if all are messages."""
+"""Most records that a scan accepts: hours of a robot, and 240 MB of memory if all are messages."""
 MAX_STAMP_NS = 2**63 - 1
 Places = NDArray[np.int64]
-"""(N, 3) int64: time in nanoseconds, start of the chunk or `NO_CHUNK`, start of the message in its chunk or the file."""
+"""(N, 3) int64: time in nanoseconds, start of the chunk or `NO_CHUNK`, start of the message in its chunk or file."""
 CHUNKS = 4
-"""Unpacked chunks kept: enough for an image, its camera and the poses around it."""
+"""Decompressed chunks kept: enough for an image, its camera and the poses around it."""
 
 
 class McapFile(BagFile):
-    """A recording of ROS 2, or of ROS 1 turned into `.mcap`: chunks not packed or with zstd or lz4.
+    """A recording of ROS 2, or of ROS 1 converted to `.mcap`: chunks uncompressed or with zstd or lz4.
 
-    Read by the index at its end. Where that is missing, as after a recording that was cut off, or of no use, the file
-    is gone through once when it is opened, and what is whole counts; `notes` then tell so.
-    Raises SourceError, one line, for a file that holds nothing that can be read.
+    Read by the index at its end. Where that is missing, as after an interrupted recording, or unusable, the file is
+    scanned once when it is opened, and what is intact counts; `notes` then say so. Raises SourceError for a file
+    without anything readable.
     """
 
     def __init__(self, path: Path):
@@ -87,7 +87,7 @@ class McapFile(BagFile):
             raise FrameRefused("unreadable", f"{self.path}: message {i} of {topic}: {one_line(error)}") from None
 
     def _scan(self, why: str) -> ScannedFile:
-        """Go through the file and note what was found."""
+        """Scan the file and note what was found."""
         found = ScannedFile(self._bytes)
         if not found.complete and not found.channels:
             raise SourceError(f"{self.path}: cut off or damaged before the first message; record or copy it again")
@@ -101,7 +101,7 @@ class McapFile(BagFile):
         return found
 
     def _of(self, topic: str) -> Places:
-        """Return where the messages of a topic stand, in order of time."""
+        """Return where the messages of a topic are, in time order."""
         if topic not in self._places:
             try:
                 places = self._index.places(topic)
@@ -127,7 +127,7 @@ class McapFile(BagFile):
 
 
 class Summary:
-    """The index at the end of a file; raises ValueError where it is missing, damaged or not complete."""
+    """The index at the end of a file; raises ValueError where it is missing, damaged or incomplete."""
 
     def __init__(self, file: McapBytes):
         self._file = file
@@ -142,14 +142,14 @@ class Summary:
         self.channels = {key: known for key, known in self.channels.items() if key in counted}
 
     def places(self, topic: str) -> Places:
-        """Return where the messages of `topic` stand; raises ValueError for a damaged index."""
+        """Return where the messages of `topic` are; raises ValueError for a damaged index."""
         parts = [np.empty((0, 3), np.int64)]
         for channel in (key for key, known in self.channels.items() if known.topic == topic):
             parts.extend(self._in_chunk(chunk, channel) for chunk in self._chunks if chunk.counts.get(channel))
         return np.concatenate(parts)
 
     def _read(self, data: bytes, limit: int) -> int:
-        """Take in the summary, of a file whose chunks end at `limit`, and return the number of messages."""
+        """Read the summary of a file whose chunks end at `limit`, and return the number of messages."""
         schemas, count, end = {}, None, 0
         for found in _records(data):
             wire = Wire(memoryview(data)[found.start : found.end], cdr=False)
@@ -183,10 +183,10 @@ class Summary:
 
 
 class ScannedFile:
-    """The messages found by going through a file from its beginning, as far as it is whole.
+    """The messages found by scanning a file from its beginning, as far as it is intact.
 
-    whole: how far that is, in bytes; complete: whether the file ends there as it should; damaged: chunks left out.
-    Raises SourceError for more records than can be kept in mind, MissingExtra where chunks cannot be unpacked.
+    whole: intact bytes; complete: whether the file ends there as it should; damaged: chunks skipped. Raises SourceError
+    for more records than memory allows, MissingExtra where chunks cannot be decompressed.
     """
 
     def __init__(self, file: McapBytes):
@@ -199,7 +199,7 @@ class ScannedFile:
         self.channels = {key: known for key, known in self.channels.items() if key in self._found}
 
     def places(self, topic: str) -> Places:
-        """Return where the messages of `topic` stand."""
+        """Return where the messages of `topic` are."""
         keys = [key for key, known in self.channels.items() if known.topic == topic]
         return np.concatenate([np.frombuffer(self._found[key], np.int64).reshape(-1, 3) for key in keys])
 
@@ -244,7 +244,7 @@ class ScannedFile:
         return found.end - found.start if found.kind in (SCHEMA, CHANNEL) else 0
 
     def _add_fields(self, found: Record, fields: bytes, chunk: Record | None) -> None:
-        """Take in a schema, channel or message."""
+        """Add a schema, channel or message."""
         self._count += 1
         if self._count > MAX_RECORDS:
             cure = "index it with 'mcap recover'"
@@ -272,7 +272,7 @@ class ScannedFile:
 
 
 class Record(NamedTuple):
-    """Where a record's fields stand, in a file or in an unpacked chunk."""
+    """Where a record's fields are, in a file or a decompressed chunk."""
 
     kind: int
     start: int
@@ -280,7 +280,7 @@ class Record(NamedTuple):
 
 
 class Channel(NamedTuple):
-    """A topic as one publisher sends it."""
+    """A topic as sent by one publisher."""
 
     topic: str
     type: str
@@ -288,7 +288,7 @@ class Channel(NamedTuple):
 
 
 class Chunk(NamedTuple):
-    """A chunk by the index at the end of a file: counts and places of its messages' indexes, by channel."""
+    """A chunk according to the index: counts of its messages and places of their indexes, by channel."""
 
     start: int
     end: int
@@ -297,13 +297,13 @@ class Chunk(NamedTuple):
 
 
 class McapBytes:
-    """A file that never gives out, and never makes room for, more bytes than it has; it is not kept open."""
+    """Bounded reads of a file: never more bytes, or more memory, than it has; it is not kept open."""
 
     def __init__(self, path: Path):
         self.path, self.size = path, path.stat().st_size
 
     def at(self, start: int, end: int) -> bytes:
-        """Return the bytes from `start` to `end`; raises ValueError where there are not so many, or absurdly many."""
+        """Return the bytes from `start` to `end`; raises ValueError for a truncated file or an absurd size."""
         if not 0 <= start <= end <= self.size:
             raise ValueError("the file is cut off")
         if end - start > MAX_BYTES:
@@ -316,7 +316,7 @@ class McapBytes:
         return data
 
     def record(self, start: int) -> Record:
-        """Return the record at `start`; raises ValueError where the file does not hold it to its end."""
+        """Return the record at `start`; raises ValueError where the file ends before it does."""
         return record(self.at(start, min(start + HEAD, self.size)), start, self.size)
 
     def fields(self, found: Record, kind: int) -> Wire:
@@ -326,7 +326,7 @@ class McapBytes:
         return Wire(self.at(found.start, found.end), cdr=False)
 
     def chunk(self, found: Record) -> bytes:
-        """Return the unpacked contents of a chunk; raises ValueError for a damaged one."""
+        """Return the decompressed contents of a chunk; raises ValueError for a damaged one."""
         wire = self.fields(found, CHUNK)
         _, _, size = wire.numbers("Q", 3)
         checksum, packing = wire.number(), wire.text()
@@ -357,7 +357,7 @@ def read_schema(wire: Wire) -> tuple[int, str]:
 
 
 def read_channel(wire: Wire, schemas: dict[int, str]) -> tuple[int, Channel | None]:
-    """Return number and channel; None for one that is not serialised as ROS does, ValueError for an unknown type."""
+    """Return number and channel; None for an encoding that is not ROS's, ValueError for an unknown type."""
     number, schema = wire.numbers("H", 2)
     topic, encoding = one_line(wire.text()), wire.text()
     if schema and schema not in schemas:
@@ -366,7 +366,7 @@ def read_channel(wire: Wire, schemas: dict[int, str]) -> tuple[int, Channel | No
 
 
 def read_chunk_index(wire: Wire) -> Chunk:
-    """Return where a chunk and the indexes of its messages stand; raises ValueError where that cannot be."""
+    """Return where a chunk and the indexes of its messages are; raises ValueError for impossible places."""
     _, _, start, length = wire.numbers("Q", 4)
     if length < MIN_CHUNK_BYTES:
         raise ValueError("the index is damaged")
@@ -390,7 +390,7 @@ def read_message_index(wire: Wire, channel: int) -> NDArray[np.void]:
 
 
 def message_at(data: bytes, start: int) -> tuple[int, int, memoryview]:
-    """Return channel, time and serialised data of the message that stands at `start` in an unpacked chunk."""
+    """Return channel, time and serialised data of the message at `start` of a decompressed chunk."""
     if start < 0:
         raise ValueError("the index points to nowhere")
     found = record(data[start : start + HEAD], start, len(data))

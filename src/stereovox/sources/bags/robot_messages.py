@@ -1,12 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The messages of ground robots and of finished maps, read from their serialised bytes.
+"""Messages of ground robots and finished maps (OccupancyGrid, Octomap), parsed from their serialised bytes.
 
-ROS 1 and ROS 2 (CDR) alike, as in `bag_messages`. All raise ValueError, one line, for bytes that do not suffice or say
-what cannot be; nothing is allocated for a length that lies.
-
-The messages of finished maps, read from their serialised bytes: `nav_msgs/OccupancyGrid`, `octomap_msgs/Octomap`.
-ROS 1 and ROS 2 (CDR) alike, as in `bag_messages`. Both raise ValueError, one line, for bytes that do not suffice or say
-what cannot be; nothing is allocated for a length that lies.
+ROS 1 and ROS 2 (CDR) alike, as in `messages`. All raise ValueError, one line, for bytes that are too few or values that
+are impossible; no allocation trusts a declared length.
 """
 
 from __future__ import annotations
@@ -30,7 +26,7 @@ FLOATS = {7: "f4", 8: "f8"}
 MAX_FIELDS = 256
 MAX_BEAMS = 100_000
 LARGEST = 1e9
-"""Metres: no robot goes there, and the products of such numbers are finite."""
+"""Metres: beyond any robot's reach, while products of such numbers stay finite."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,12 +47,12 @@ class LaserScan:
 
 
 def read_laser_scan(wire: Wire, range_max: float = 0.0) -> LaserScan:
-    """Return a `sensor_msgs/LaserScan`; `range_max`, where given, stands in place of the message's own.
+    """Return a `sensor_msgs/LaserScan`; `range_max`, if given, replaces the message's own.
 
-    What the driver wrote becomes (REP 117): NaN stays NaN; below range_min, -inf and 0.0 (what many drivers write for
-    "no reading") -inf, which clears nothing; range_max itself, all beyond it (drivers of Hokuyo write range_max + 1 for
-    "no echo") and +inf become +inf, which clears up to range_max. Raises ValueError also for angles and limits that
-    make no sense.
+    Ranges become (REP 117): NaN stays NaN; below range_min, -inf and 0.0 (what many drivers write for "no reading")
+    become -inf, which clears nothing; range_max itself, all beyond it (drivers of Hokuyo write range_max + 1 for "no
+    echo") and +inf become +inf, which clears up to range_max. Raises ValueError also for angles and limits that make no
+    sense.
     """
     stamp_ns, frame_id = wire.header()
     angle_min, _, angle_step, _, _, range_min, declared_max = wire.numbers("f", 7)
@@ -78,7 +74,7 @@ def read_laser_scan(wire: Wire, range_max: float = 0.0) -> LaserScan:
 
 
 def marked_ranges(ranges: NDArray[np.float32], range_min: float, range_max: float) -> NDArray[np.float32]:
-    """Return (N,) float32 ranges in which only what lies in [range_min, range_max) is a number (see `LaserScan`)."""
+    """Return (N,) float32 ranges in which only those in [range_min, range_max) are numbers (see `LaserScan`)."""
     with np.errstate(invalid="ignore"):
         near = (ranges < np.float32(range_min)) | (ranges <= 0)
         return np.where(near, -np.inf, np.where(ranges >= np.float32(range_max), np.inf, ranges)).astype(np.float32)
@@ -133,9 +129,9 @@ def read_point_cloud(wire: Wire) -> PointCloud:
 
 @dataclass(frozen=True)
 class StampedTransform:
-    """Where frame `child` stands in frame `parent`: tx ty tz in metres, quaternion qx qy qz qw of any length.
+    """The pose of frame `child` in frame `parent`: tx ty tz in metres, quaternion qx qy qz qw of any length.
 
-    Names are as in tf2: without the slash that tf1 puts in front of them.
+    Names are as in tf2: without the leading slash of tf1.
     """
 
     stamp_ns: int
@@ -155,20 +151,20 @@ def read_transforms(wire: Wire) -> list[StampedTransform]:
 
 
 def is_motion(numbers: Sequence[float]) -> bool:
-    """Tell whether tx ty tz qx qy qz qw are seven numbers below `LARGEST` with a quaternion longer than zero."""
+    """Return whether tx ty tz qx qy qz qw are seven numbers below `LARGEST` with a non-zero quaternion."""
     return len(numbers) == 7 and all(abs(x) < LARGEST for x in numbers) and hypot(*numbers[3:]) > 1e-6
 
 
 @lru_cache(maxsize=1024)
 def frame_name(frame_id: str) -> str:
-    """Return the name of a frame as tf2 writes it: tf1 puts a slash in front."""
+    """Return a frame's name as tf2 writes it, without the leading slash of tf1."""
     return frame_id.strip().lstrip("/")
 
 
 def read_occupancy_grid(wire: Wire) -> OccupancyGrid:
-    """Return a `nav_msgs/OccupancyGrid`; numbers that are no per cent are unknown, as navigation programs take them.
+    """Return a `nav_msgs/OccupancyGrid`; values outside 0 to 100 are unknown, as navigation programs treat them.
 
-    The message's resolution is a float32: the shortest number that means it is taken, 0.05 for 0.0500000007.
+    The message's resolution is a float32: the shortest number that rounds to it is used, 0.05 for 0.0500000007.
     """
     wire.header()
     wire.numbers("I", 2)  # when the map was loaded

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""ROS 1 bags, by any message: rosbags reads the index, a bounded file and bounded unpacking keep damage harmless."""
+"""ROS 1 bags: rosbags reads the index; a bounded file and bounded decompression keep damage harmless."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from stereovox.sources.bags.messages import Wire
 from stereovox.sources.bags.unpack import decompress
 
 CHUNKS = 4
-"""Unpacked chunks kept: enough for an image, its metadata and the poses around it."""
+"""Decompressed chunks kept: enough for an image, its metadata and the poses around it."""
 
 
 class Ros1File(BagFile):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The topics of a ground robot in a recording: scans, or point clouds in their place, and odometry."""
+"""Topics of a ground robot in a recording: scans, or point clouds in their place, and odometry."""
 
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ from stereovox.sources.bags.robot_messages import (
 from stereovox.sources.bags.tf import Edge
 
 MAX_ATTEMPTS = 5
+"""Messages tried before a topic counts as unreadable."""
 
 
 class ScanTopic:
@@ -92,7 +93,7 @@ def check_topic(file: BagFile, topic: str, kinds: Iterable[str], option: str) ->
 
 
 def busiest_topic(file: BagFile, topics: list[str]) -> str:
-    """Return the topic with most messages, of several the first."""
+    """Return the topic with most messages, the first of several."""
     return max(topics, key=lambda topic: len(file.stamps(topic)))
 
 
@@ -107,10 +108,10 @@ def frame_id_of(file: BagFile, topic: str) -> str:
 
 
 def odometry_topic(file: BagFile, given: str = "", other: str = "") -> tuple[str, tuple[str, ...]]:
-    """Return the topic with the robot's odometry, "" where there is none, and notes.
+    """Return the topic with the robot's odometry, "" if there is none, and notes.
 
-    given: counts, where it is not ""; other: a topic that is not meant. Of several the one with most messages counts.
-    Raises SourceError where the given one does not exist or is none.
+    given: preferred unless ""; other: a topic to ignore. Of several the one with most messages counts. Raises
+    SourceError where the given one does not exist or is not odometry.
     """
     if given:
         check_topic(file, given, (ODOMETRY,), "odom")
@@ -135,9 +136,10 @@ def first_odometry(file: BagFile, topic: str) -> StampedTransform | None:
 
 
 def odometry_edge(file: BagFile, topic: str, parent: str, child: str) -> Edge:
-    """Return the poses of a topic as transforms of `child` in `parent`; what cannot be read or is no pose is a gap.
+    """Return the poses of a topic as transforms of `child` in `parent`; unreadable messages and invalid poses leave
+    gaps.
 
-    Raises SourceError where not one pose can be read.
+    Raises SourceError where no pose can be read.
     """
     edge, recorded = Edge(parent, child, topic), file.stamps(topic)
     for i in range(len(recorded)):

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A tree of frames over a whole recording: where one frame stood in another at a time (what ROS calls tf).
+"""The tree of coordinate frames over a whole recording (ROS's tf): transforms between frames at a time.
 
-Frames are named as tf2 does it, without a slash in front. Every frame has one parent; what connects two frames is the
-way up to their common ancestor and down again.
+Frames are named as in tf2, without a leading slash. Every frame has one parent; two frames are connected through their
+common ancestor.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from stereovox.sources.poses import seconds_from_ns
 
 STILL = 1e-9
 WORLDS = ("map", "odom")
-"""Frames taken for the world, the first that is there: REP 105."""
+"""Frames used as the world, the first that exists: REP 105."""
 
 
 @dataclass(frozen=True)
 class Limits:
-    """How far transforms may be from a time they are asked for.
+    """How far in time transforms may be from a query.
 
     max_gap_s: longest time between two transforms that is bridged. extrapolate_s: how long the last transform holds
     after its time, and the first before it; a robot of 1 m/s is 0.1 m off after 0.1 s.
@@ -39,10 +39,10 @@ class Limits:
 
 
 class Edge:
-    """Where frame `child` stood in frame `parent`: at the times of its transforms and between them, or always (fixed).
+    """The pose of frame `child` in frame `parent`: at the times of its transforms and between them, or always (fixed).
 
-    A frame that has the same transform in all messages, two at least, is taken for a fixed one that is sent again and
-    again: any gap between them is bridged, and the ends hold for `max_gap_s`.
+    A frame that has the same transform in all messages, at least two, counts as a fixed one that is sent repeatedly:
+    any gap between them is bridged, and the ends hold for `max_gap_s`.
     """
 
     def __init__(self, parent: str, child: str, name: str = ""):
@@ -59,7 +59,7 @@ class Edge:
 
     @property
     def count(self) -> int:
-        """How many transforms it has, 1 where it is fixed."""
+        """Number of transforms, 1 if fixed."""
         return 1 if self.fixed else len(self._stamps)
 
     @property
@@ -70,13 +70,13 @@ class Edge:
         return not (self.fixed or self._still)
 
     def add(self, stamp_ns: int, numbers: Iterable[float]) -> None:
-        """Take in tx ty tz qx qy qz qw at a time; of several with one time the first counts."""
+        """Add tx ty tz qx qy qz qw at a time; of several with one time the first counts."""
         self._stamps.append(stamp_ns)
         self._rows.extend(numbers)
         self._sorted = None
 
     def fix(self, T_parent_child: Transform) -> None:
-        """Take in where the child always stands."""
+        """Set the constant pose of the child."""
         self._fixed = np.array(T_parent_child, float)
 
     def at(self, stamp_ns: int, limits: Limits, where: str) -> Transform:
@@ -133,12 +133,11 @@ class Edge:
 class Tf:
     """Transforms between frames, looked up at a time of the recording.
 
-    where: what they came from, for messages. limits: how far apart transforms may be, and how long the last one holds.
-    unreadable: how many messages of transforms could not be read.
+    where: their origin, for messages. limits: how far apart transforms may be, and how long the last one holds.
+    unreadable: number of unreadable messages of transforms.
 
-    Where several parents of one frame are named, one with a fixed transform counts, else the one that is named most
-    often, else the first; `notes` tells. Transforms that are none (see `is_motion`), or that put a frame into itself,
-    are left out, as tf2 does it.
+    Where a frame has several parents, one with a fixed transform counts, else the most frequent, else the first;
+    `notes` say so. Invalid transforms (see `is_motion`), and those of a frame to itself, are skipped, as in tf2.
     """
 
     edge: ClassVar[type[Edge]] = Edge
@@ -151,7 +150,7 @@ class Tf:
         self._skipped = 0
 
     def add(self, parent: str, child: str, stamp_ns: int, numbers: Iterable[float], fixed: bool = False) -> None:
-        """Take in where `child` stood in `parent` at a time, or always: tx ty tz in metres, quaternion qx qy qz qw.
+        """Add the pose of `child` in `parent` at a time, or at all times: tx ty tz in metres, quaternion qx qy qz qw.
 
         In any order. Of several with one time the first counts, of several fixed ones the last.
         """
@@ -164,7 +163,7 @@ class Tf:
             self._edge(parent, child).add(stamp_ns, row)
 
     def add_fixed(self, parent: str, child: str, T_parent_child: Transform) -> None:
-        """Take in where `child` always stands in `parent`, (4, 4)."""
+        """Add the constant pose of `child` in `parent`, (4, 4)."""
         self._edge(parent, child).fix(T_parent_child)
 
     @property
@@ -174,7 +173,7 @@ class Tf:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What had to be decided or left out, one line each."""
+        """What had to be decided or skipped, one line each."""
         torn = {child: self._up(child) for child, edges in sorted(self._parents.items()) if len(edges) > 1}
         notes = [
             f"{self.where}: {child} has several parents ({', '.join(self._parents[child])}); {edge.parent} counts"
@@ -190,19 +189,19 @@ class Tf:
     def lookup(self, target: str, source: str, stamp_ns: int) -> Transform:
         """Return T_target_source (4, 4) at a time in int64 nanoseconds.
 
-        Raises FrameRefused `no_pose`, one line: an unknown frame, frames that nothing connects or that go round in a
-        loop, a gap in time (see `Edge.at`).
+        Raises FrameRefused `no_pose`: an unknown frame, frames that are not connected or form a loop, a gap in time
+        (see `Edge.at`).
         """
         up, down = self._path(frame_name(target), frame_name(source))
         return inverse(self._along(up, stamp_ns)) @ self._along(down, stamp_ns)
 
     def off_ns(self, target: str, source: str, stamp_ns: int) -> int:
-        """Return how far `lookup` extrapolates; raises FrameRefused as it does for frames that nothing connects."""
+        """Return how far `lookup` extrapolates; raises FrameRefused as it does for frames that are not connected."""
         up, down = self._path(frame_name(target), frame_name(source))
         return max((edge.off_ns(int(stamp_ns)) for edge in (*up, *down)), default=0)
 
     def connected(self, target: str, source: str) -> bool:
-        """Tell whether both frames are there and some way connects them."""
+        """Return whether both frames exist and are connected."""
         try:
             self._path(frame_name(target), frame_name(source))
         except FrameRefused:
@@ -210,7 +209,7 @@ class Tf:
         return True
 
     def moving(self, target: str, source: str) -> bool:
-        """Tell whether one frame was seen to move in the other; raises FrameRefused where nothing connects them."""
+        """Return whether one frame was seen to move in the other; raises FrameRefused where they are not connected."""
         return any(edge.moves for part in self._path(frame_name(target), frame_name(source)) for edge in part)
 
     def root(self, frame: str) -> str:
@@ -279,8 +278,7 @@ def tf_topics(file: BagFile) -> list[str]:
 def read_tf(file: BagFile, limits: Limits | None = None) -> Tf | None:
     """Return the transforms of a recording, None where it has no topic of them.
 
-    What stands in a topic named `tf_static` counts at all times. Messages that cannot be read are left out: what they
-    would have told is then a gap.
+    Those of a topic named `tf_static` are valid at all times. Unreadable messages are skipped and leave gaps.
     """
     topics = tf_topics(file)
     if not topics:
@@ -301,7 +299,7 @@ def read_tf(file: BagFile, limits: Limits | None = None) -> Tf | None:
 
 @dataclass(frozen=True)
 class TfPoses:
-    """Poses of frame `body` in frame `world`, looked up in the tree when they are asked for."""
+    """Poses of frame `body` in frame `world`, looked up on demand."""
 
     tf: Tf
     world: str
@@ -322,10 +320,10 @@ class TfPoses:
 
 
 def tf_poses(tf: Tf, body: str, world: str = "") -> TfPoses | str:
-    """Return the poses of frame `body` in `world`, or in one line why there are none.
+    """Return the poses of frame `body` in `world`, or the reason, in one line, why there are none.
 
     world: "" for `map`, else `odom`, where it is connected with `body`, else the root of its tree if it moved there.
-    Raises SourceError where a `world` that is given is not connected with `body`.
+    Raises SourceError where a given `world` is not connected with `body`.
     """
     body, world = frame_name(body), frame_name(world)
     try:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Unpack what recordings pack, chunk by chunk or message by message, without room for more than a limit."""
+"""Bounded decompression of recordings, by chunk or by message."""
 
 from __future__ import annotations
 
@@ -10,24 +10,23 @@ from stereovox.errors import MissingExtra
 
 STEP = 4 * 1024 * 1024
 MAX_RATIO = 1000
-"""Bytes that one packed byte stands for at most: a recording of real things does not pack so well."""
+"""Largest ratio of decompressed to compressed bytes: recordings of real scenes do not compress as well."""
 ALWAYS_ALLOWED = 32 * 1024 * 1024
-"""Bytes that anything may unpack to: a picture of nothing packs to almost nothing."""
+"""Decompressed bytes that are always accepted: an empty image compresses to almost nothing."""
 ZSTD = b"\x28\xb5\x2f\xfd"
-"""What a zstd frame starts with; no serialised ROS message does."""
+"""Magic of a zstd frame; no serialised ROS message starts with it."""
 
 
 def max_unpacked(packed: int) -> int:
-    """Return how many bytes so many packed ones may become; more is taken for an attack."""
+    """Return the largest decompressed size accepted for so many compressed bytes; more is treated as an attack."""
     return max(ALWAYS_ALLOWED, MAX_RATIO * packed)
 
 
 def decompress(data: bytes | memoryview, compression: str, limit: int) -> bytes:
-    """Return unpacked bytes; packing: `bz2`, `lz4`, `zstd`, or "" and `none` for what is not packed.
+    """Return decompressed bytes; compression: `bz2`, `lz4`, `zstd`, or "" and `none` for none.
 
-    Raises ValueError for data that are damaged, cut off, of another packing, or swell beyond `limit` or what
-    `max_unpacked` grants, and
-    MissingExtra where the library that unpacks them is not installed.
+    Raises ValueError for data that is damaged, truncated, compressed otherwise, or exceeds `limit` or `max_unpacked`,
+    and MissingExtra where the library for it is not installed.
     """
     if compression in ("", "none"):
         return bytes(data)
@@ -50,7 +49,7 @@ def decompress(data: bytes | memoryview, compression: str, limit: int) -> bytes:
 
 
 def decompress_message(data: bytes, limit: int) -> bytes:
-    """Return a message, unpacked where it was packed by itself: rosbag2's mode `message`, and librealsense 2.57.
+    """Return a message, decompressed if it was compressed by itself: rosbag2's mode `message`, and librealsense 2.57.
 
     Raises as `decompress`.
     """

@@ -50,7 +50,7 @@ class BagWriter:
 
     Times are int64 nanoseconds since whatever the clock counts from, not negative; each message is recorded at its own
     time. Messages may come in any order, but readers are quickest where they come in order of time.
-    Raises MissingExtra without rosbags; SourceError, one line, for what cannot be written.
+    Raises MissingExtra without rosbags; SourceError for what cannot be written.
     """
 
     def __init__(self, path: str | os.PathLike[str], *, packed: bool = True):
@@ -79,7 +79,7 @@ class BagWriter:
         self._file.finish()
 
     def scan(self, scan: Scan, topic: str = "/scan", frame_id: str = "laser") -> None:
-        """Write a `sensor_msgs/LaserScan`; where the lidar sits and stood is told by `fixed` and `odometry`."""
+        """Write a `sensor_msgs/LaserScan`; write its mount and the robot's poses with `fixed` and `odometry`."""
         if scan.fault:
             raise SourceError(f"{self.path}: {scan.name or topic} has a fault ({scan.fault}); leave it out")
         self._write(topic, "sensor_msgs/msg/LaserScan", scan.stamp_ns, self._messages.scan(scan, frame_id))
@@ -132,10 +132,10 @@ class BagWriter:
         self._write("/tf", TF_MESSAGE, stamp_ns, self._messages.transforms(stamp_ns, [edge]))
 
     def fixed(self, parent: str, child: str, T_parent_child: Transform) -> None:
-        """Write where a frame stands in its parent for good, (4, 4), on `/tf_static`.
+        """Write the constant pose of a frame in its parent, (4, 4), on `/tf_static`.
 
-        All that were told so far go into one message before the next of another kind, since only the last message of
-        this topic is kept for who comes later.
+        All poses given so far go into one message before the next of another kind, since only the last message of this
+        topic is kept for late subscribers.
         """
         self._fixed[child] = parent, child, self._rigid(T_parent_child, parent, child)
         self._due = True
@@ -158,7 +158,7 @@ class BagWriter:
         self._write(topic, "geometry_msgs/msg/PoseWithCovarianceStamped", stamp_ns, message)
 
     def occupancy(self, stamp_ns: int, grid: OccupancyGrid, topic: str = "/map_mapping", frame_id: str = "map") -> None:
-        """Write a `nav_msgs/OccupancyGrid`, kept for who comes later (latched)."""
+        """Write a `nav_msgs/OccupancyGrid`, latched: kept for late subscribers."""
         message = self._messages.occupancy(grid, stamp_ns, frame_id)
         self._write(topic, "nav_msgs/msg/OccupancyGrid", stamp_ns, message, latched=True)
 
@@ -212,7 +212,7 @@ class BagFileWriter:
 
     ros: 1 for a path that ends in `.bag`, else 2. store: rosbags' types of that ROS. packed: chunks of a `.bag` are
     packed with lz4, those of an `.mcap` and of a folder with zstd; `.db3` has no such thing.
-    Raises MissingExtra without rosbags, SourceError, one line, where the recording cannot be written.
+    Raises MissingExtra without rosbags, SourceError where the recording cannot be written.
     """
 
     def __init__(self, path: Path, packed: bool = True):
@@ -241,7 +241,7 @@ class BagFileWriter:
     def write(self, topic: str, kind: str, stamp_ns: int, message: Any, latched: bool = False) -> None:
         """Write one message of the store's type `kind` (`nav_msgs/msg/Odometry`), recorded at `stamp_ns`.
 
-        latched: whoever comes later is to see the last one of the topic.
+        latched: the topic's last message is kept for late subscribers.
         """
         if self._writer is None:
             raise SourceError(f"{self.path}: not open; write 'with BagWriter(path) as bag:'")
@@ -255,13 +255,13 @@ class BagFileWriter:
             self._writer.write(self._connections[topic], int(stamp_ns), pack(message, kind))
 
     def check_stamp(self, stamp_ns: int) -> None:
-        """Raise SourceError for a time that ROS cannot write down."""
+        """Raise SourceError for a time that ROS cannot represent."""
         if not 0 <= stamp_ns < SECONDS[self.ros] * 1_000_000_000:
             limit = f"0 and {SECONDS[self.ros]} seconds"
             raise SourceError(f"{self.path}: the time {stamp_ns} ns must lie between {limit}; shift the clock")
 
     def finish(self) -> None:
-        """Complete the recording and put it where it belongs; an older file of that name is replaced."""
+        """Complete the recording and move it into place; an older file of that name is replaced."""
         try:
             with self._one_line_errors():
                 self._writer.close()
@@ -270,7 +270,7 @@ class BagFileWriter:
             self.abort()
 
     def abort(self) -> None:
-        """Give up: nothing is left, and an older file stays as it was."""
+        """Discard the recording; an older file stays intact."""
         if self._writer is not None:
             with suppress(Exception):
                 self._writer.abort()
@@ -329,7 +329,7 @@ class BagFileWriter:
 
     @contextmanager
     def _one_line_errors(self) -> Iterator[None]:
-        """Turn what goes wrong while writing into one line."""
+        """Convert errors of writing into one-line SourceErrors."""
         try:
             yield
         except OSError as error:
@@ -356,7 +356,7 @@ def typestore(ros: int) -> Any:
 
 
 def _transient_local() -> Any:
-    """Return ROS 2's word for latched: reliable, the last message kept for who comes later."""
+    """Return ROS 2's QoS for latched topics: reliable, the last message kept for late subscribers."""
     from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 
     never = QosTime(0, 0)

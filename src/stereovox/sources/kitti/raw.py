@@ -36,7 +36,7 @@ class KittiRaw(KittiSource):
         poses: `refined` (`poses_refined.txt`), `ins` (`poses_ins.txt`), `oxts` (computed from the GPS and inertial
             packets), or a file of 3x4 matrices T_world_cam0 line by line; without it the first of these there is.
     Time: image_0X/timestamps.txt of the left camera, exact to the nanosecond. Every line of it is a frame.
-    World and faults: see `KittiSource`. Raises SourceError, one line, for what is missing as a whole.
+    World and faults: see `KittiSource`. Raises SourceError for what is missing as a whole.
     """
 
     layout = "a KITTI raw drive (image_00 and image_01 with data/*.png; calib_*.txt beside the drive)"
@@ -53,7 +53,7 @@ class KittiRaw(KittiSource):
 
     @classmethod
     def recognises(cls, where: str) -> bool:
-        """Tell whether `where` is a folder with the images of a grey or a colour pair as in KITTI raw."""
+        """Return whether `where` is a folder with the images of a grey or a colour pair as in KITTI raw."""
         return any(_has(Path(folder_of(where)), name) for name in PAIRS)
 
     def __len__(self) -> int:

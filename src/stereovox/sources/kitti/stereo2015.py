@@ -30,7 +30,7 @@ class KittiStereo2015(KittiSource):
     calib_imu_to_velo beside it; scenes may differ, in image size too, so `camera` is only that of the first one.
     Scans: `velodyne/000000.bin`, which the benchmark does not have but some collections add. Moving objects: obj_map.
     World: camera 0 of each scene, upright; there are no poses. Time: one second for each scene number.
-    Faults: see `KittiSource`. Raises SourceError, one line, where a calibration is missing or bad.
+    Faults: see `KittiSource`. Raises SourceError where a calibration is missing or bad.
     """
 
     layout = "KITTI stereo 2015 scenes (training with image_2/000000_10.png and image_3)"
@@ -50,7 +50,7 @@ class KittiStereo2015(KittiSource):
 
     @classmethod
     def recognises(cls, where: str) -> bool:
-        """Tell whether `where` is a folder with scenes as in KITTI stereo 2015."""
+        """Return whether `where` is a folder with scenes as in KITTI stereo 2015."""
         folder = Path(folder_of(where))
         try:
             with os.scandir(folder / LEFT) as entries:
@@ -67,7 +67,7 @@ class KittiStereo2015(KittiSource):
         return left, right
 
     def stamp_ns(self, i: int) -> int:
-        """Return a time that tells scenes apart: a second for each number."""
+        """Return a stamp that distinguishes scenes: one second per number."""
         return int(self._scenes[i]) * 1_000_000_000
 
     def velodyne(self, i: int) -> Path:

@@ -37,7 +37,7 @@ class KittiTracking(KittiSource):
     where: `training/image_02/0000`, or `training?sequence=0000`; further parameters:
         poses: a file of 3x4 matrices T_world_cam0 line by line instead of `oxts/0000.txt`.
     Time: the files hold none; frame number / 10 Hz. Colour images; label boxes are in rectified camera 0.
-    World and faults: see `KittiSource`. Raises SourceError, one line, for what is missing as a whole and bad labels.
+    World and faults: see `KittiSource`. Raises SourceError for what is missing as a whole and bad labels.
     """
 
     layout = "a KITTI tracking sequence (training?sequence=0000 with image_02/0000 and calib/0000.txt)"
@@ -57,7 +57,7 @@ class KittiTracking(KittiSource):
 
     @classmethod
     def recognises(cls, where: str) -> bool:
-        """Tell whether `where` is a folder of sequences as in KITTI tracking, or the left images of one."""
+        """Return whether `where` is a folder of sequences as in KITTI tracking, or the left images of one."""
         folder = Path(os.path.abspath(folder_of(where)))  # unlike resolve() it takes any text
         if folder.parent.name == LEFT:
             return os.path.isdir(folder) and os.path.isdir(folder.parents[1] / "calib")
@@ -129,7 +129,7 @@ def box_pose(h: float, w: float, l: float, x: float, y: float, z: float, rotatio
 
 
 def read_labels(path: Path) -> Labels:
-    """Return the annotated objects; raises SourceError, one line with file and line, for what cannot be read."""
+    """Return the annotated objects; raises SourceError naming file and line for what cannot be read."""
     try:
         lines = read_text(path, MAX_LIST, "replace").splitlines()
     except OSError as error:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings of ground robots in bags of ROS 1 and ROS 2: scans, depth images, odometry, tf."""
+"""Recordings of ground robots in ROS 1 and ROS 2 bags: scans, depth images, odometry, tf."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ class RobotOptions:
 
 
 def mounted(key: str, text: str) -> Transform | None:
-    """Return T_base_body of `x,y,z,yaw,pitch,roll`, None for ""; raises SourceError for anything else."""
+    """Parse `x,y,z,yaw,pitch,roll` as T_base_body, None for ""; raises SourceError for anything else."""
     if not text:
         return None
     try:
@@ -107,7 +107,7 @@ class RobotBag:
     Pixels without value are as in `Bag`. At the ends of tf a pose is held for `extrapolate` seconds (`pose_off_ns`).
     Order: as recorded, which is that of the stamps unless the clock was set back meanwhile.
     Faults: `unreadable`, `no_pose`, for images also `bad_dtype` and `bad_shape`.
-    Raises SourceError, one line, for files that are empty, damaged or without scans and depth, and for bad options.
+    Raises SourceError for files that are empty, damaged or without scans and depth, and for bad options.
     """
 
     layout = "a bag with scans or depth images of a robot"
@@ -136,7 +136,7 @@ class RobotBag:
 
     @classmethod
     def recognises(cls, where: str) -> bool:
-        """Tell whether `where` is, or by its name should be, a bag; options may follow. Never raises."""
+        """Return whether `where` is, or by its name should be, a bag; options may follow. Never raises."""
         return bool(suffix_of(file_part(where)))
 
     def _mount_lidar(self, frame_id: str) -> tuple[str, tuple[str, ...]]:
@@ -196,9 +196,9 @@ def posed_scan(message: LaserScan, T_odom_sensor: Transform, T_base_sensor: Tran
 
 
 def _find_depth(file: BagFile, options: RobotOptions) -> tuple[DepthTopic | None, tuple[str, ...]]:
-    """Return the depth images that are named, or else the topic with most, and notes; None where there are none.
+    """Return the named depth images, or else those of the busiest topic, and notes; None if there are none.
 
-    Without being asked for, images that cannot be used (without CameraInfo) only make a note.
+    Unless they were named, unusable images (without CameraInfo) only cause a note.
     """
     if options.depth:
         return find_depth(file, options.depth, options.info), ()

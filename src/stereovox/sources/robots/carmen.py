@@ -23,16 +23,16 @@ from stereovox.sources import parameters
 from stereovox.sources.poses import Poses
 
 LASERS = {b"FLASER": 100.0, b"ROBOTLASER1": 100.0}
-"""Kinds of lines that hold a scan of the front laser, and the metres within which it must sit on the robot."""
+"""Line types with a scan of the front laser, and the largest distance in metres of its mount from the robot."""
 NO_ECHO = (50.0, 81.9)
 MAX_DISTANCE = 1e6
 """Metres from the world's origin within which a robot can be."""
 MAX_BEAMS = 100_000
 ENDINGS = (".clf", ".log", ".clf.bz2", ".log.bz2")
 MAX_LINE_BYTES = 1 << 20
-"""Bytes of a line; what is longer is no line of a log."""
+"""Bytes of the longest line that a log can have."""
 ALWAYS_ALLOWED, MAX_RATIO = 1 << 18, 100
-"""A packed log may become so many bytes, or so many for each of its own; text packs to a tenth."""
+"""Decompressed bytes that a log may always have, and most per compressed byte; text compresses to a tenth."""
 NO_ECHO_VALUES = {"unknown": np.nan, "free": np.inf}
 OFFSETS = {"robot_frontlaser_offset", "robot_front_laser_offset", "frontlaser_offset"}
 
@@ -64,7 +64,7 @@ class CarmenLog:
 
     @classmethod
     def recognises(cls, where: str) -> bool:
-        """Tell whether the name ends like a CARMEN log's."""
+        """Return whether the name has an ending of a CARMEN log."""
         return str(where).partition("?")[0].lower().endswith(ENDINGS)
 
 
@@ -88,15 +88,15 @@ class Options:
 
 
 class DamagedLine(ValueError):  # noqa: N818 - reads as what happened
-    """A line does not make sense; the message says why."""
+    """A line that makes no sense; the message says why."""
 
 
 @dataclass(frozen=True, eq=False)
 class Reading:
-    """One scan as the log holds it.
+    """One scan as logged.
 
     ranges: (N,) float32 metres. pose_odom_base, pose_base_sensor: (3,) x, y, yaw. line: its number in the file.
-    max_range: metres from which on nothing was seen, 0 where the line does not tell.
+    max_range: metres from which on nothing was detected, 0 where the line lacks it.
     """
 
     ranges: NDArray[np.float32]
@@ -246,7 +246,7 @@ def _opened(path: Path) -> BinaryIO | bz2.BZ2File:
 
 
 def _no_echo(readings: list[Reading]) -> float:
-    """The range from which on a SICK means "no echo": one of its two conventions that is a peak in the log."""
+    """Return the range from which on a SICK means "no echo": one of its two conventions that is a peak in the log."""
     largest = max(float(np.max(reading.ranges, initial=0.0, where=np.isfinite(reading.ranges))) for reading in readings)
     return min((limit for limit in NO_ECHO if limit <= largest < 1.1 * limit), default=NO_ECHO[-1])
 

@@ -82,7 +82,7 @@ class FloorPlan:
         """Return what a perfect map shows of the floor as seen from the place `inside` (2,).
 
         Occupied: cells that an upright surface between `heights` crosses and that border on free ones. Free: the others
-        that can be reached from `inside`. Unknown: what is behind the surfaces; `floor_lids` adds tops and undersides.
+        that can be reached from `inside`. Unknown: what is behind the surfaces; `with_lids` adds tops and undersides.
         Cell corners lie at whole multiples of `resolution`.
         """
         from scipy import ndimage

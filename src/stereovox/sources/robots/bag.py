@@ -43,7 +43,7 @@ class RobotOptions:
         roll in radians, of which the last may be left out. A camera without turn looks forward.
     axes: `ros` where depth images name the camera's body (x forward) as their frame, not its optical frame.
     scale: metres per unit of depth (0: as the file says). range_max: metres, in place of what the scans say.
-    max_gap, extrapolate: seconds, see `tf_edge.Limits`.
+    max_gap, extrapolate: seconds, see `tf.Limits`.
     lowest, highest: metres over the floor between which points of a cloud count.
     """
 

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from stereovox.lab.checks.ghosts import Ghosts, ghosts
-from stereovox.simulate.passer_by import BACKGROUNDS, HZ, MISSES, Passing
+from stereovox.simulate.passer_by import BACKGROUNDS, HZ, MISSES, PasserBy
 
 MODELS: dict[str, dict[str, Any]] = {
     "default": {},
@@ -55,7 +55,7 @@ def main() -> None:
     if not wanted.json:
         print(f"{'background':11} {'model':13}", *(f"{name:>15}" for name in COLUMNS))
     for background in BACKGROUNDS:
-        source = Passing(
+        source = PasserBy(
             background, pole_m=wanted.pole, pole_every=wanted.every, missed=wanted.missed, image_width=wanted.width
         )
         frames = [source.frame(i) for i in range(len(source))]

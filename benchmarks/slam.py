@@ -58,8 +58,8 @@ def timed(config, scans) -> tuple[list, list[float], SlamResult, float]:
 
     map_scans(scans[:3], config)  # compiles
     search, cloud = ClosureSearch(config.slam), cloud_of(scans[0], 20.0)
-    search.onto(cloud)
-    search.lay(cloud, np.zeros(3), 0.3, 0.1)
+    search.set_target(cloud)
+    search.match(cloud, np.zeros(3), 0.3, 0.1)
     slam, live, each = Slam(config), [], []
     for scan in scans:
         start = time.process_time()

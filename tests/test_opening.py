@@ -8,8 +8,10 @@ from made_recordings import depth_image, seven_scenes, tum, write_png
 
 from stereovox import open_source as public_open_source
 from stereovox.errors import SourceError
-from stereovox.opening import SOURCES, open_source
+from stereovox.opening import SOURCES, open_images, open_source
 from stereovox.registry import find
+from stereovox.simulate.recorder import record
+from stereovox.simulate.simulation import Simulation
 from stereovox.sources.seven_scenes import SevenScenes
 from stereovox.sources.tum import TumRgbd
 
@@ -74,3 +76,8 @@ def test_each_layout_is_recognised_by_one_kind_only(tmp_path):
     places = {"seven_scenes": str(tmp_path / "seven_scenes"), "tum": str(tmp_path / "tum"), "simulation": "sim:room"}
     for name, where in places.items():
         assert [kind for kind in SOURCES if find("sources", SOURCES, kind).recognises(where)] == [name]
+
+
+def test_images_of_a_camera_pair_are_opened_through_the_pair(tmp_path):
+    record(Simulation("sim:box?image_width=32&frames=3"), tmp_path / "pair")
+    assert len(open_images(tmp_path / "pair", "1:")) == 2

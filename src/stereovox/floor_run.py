@@ -21,7 +21,7 @@ from stereovox.config import Config, load_config
 from stereovox.errors import StereovoxError, did_you_mean
 from stereovox.formats.map_server import MODES, read_map_server
 from stereovox.frame import Frame, Scan
-from stereovox.localize.robot_way import (
+from stereovox.localize.robot_track import (
     Progress,
     check_start,
     fit_of,

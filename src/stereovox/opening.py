@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where frames come from: recordings and simulations, recognised by what they hold, and live cameras."""
+"""Open recordings, simulations and live cameras; what a path holds is recognised by its content."""
 
 from __future__ import annotations
 
@@ -35,37 +35,55 @@ SOURCES = {
 }
 """Asked in this order, then those of other packages (entry points in the group `stereovox.opening`)."""
 STREAMS = {"realsense": "stereovox.sources.realsense:RealSense"}
-"""Live cameras, which can only be followed; entry points in the group `stereovox.streams`."""
+"""Live cameras, which cannot be rewound; entry points in the group `stereovox.streams`."""
 ROBOTS = {
     "floor": "stereovox.simulate.floors.floor:Floor",
     "carmen": "stereovox.sources.robots.carmen:CarmenLog",
     "bag": "stereovox.sources.robots.bag:RobotBag",
 }
-"""Kinds of recordings, asked in this order, then those of other packages (entry points `stereovox.robots`)."""
+"""Recordings of ground robots, asked in this order, then those of other packages (entry points `stereovox.robots`)."""
 
 
 def open_source(path_or_name: str | os.PathLike[str], frames: str | None = None) -> Source:
-    """Return the frames of a recorded folder or file or of a simulation (`sim:room`).
+    """Open a recorded folder or file, or a simulation (`sim:room`).
 
-    The layout is recognised by content. `frames` picks some of them as a Python slice does (`A:B:S`).
-    Raises SourceError, one line, where there is nothing, nothing known or nothing usable, or `frames` picks nothing.
+    The layout is recognised by content.
+
+    Args:
+        path_or_name: Folder, file or name of a simulation; some layouts take options behind a `?`.
+        frames: Frames to keep, as a Python slice (`A:B:S`); None for all.
+
+    Returns:
+        The frames, which can be counted and read in any order.
+
+    Raises:
+        SourceError: Nothing there, no known layout, nothing usable in it, or `frames` selects nothing.
     """
     where = os.fspath(path_or_name)
     if frames is not None:
         parse_slice(frames)  # a slip of the pen shows before a long recording is opened
-    source = _opened(where)
+    source = _open(_recognise(where), where)
     return source if frames is None else Selection(source, frames)
 
 
 def open_stream(path_or_name: str | os.PathLike[str], frames: str | None = None) -> Stream:
-    """Return what `open_source` returns, or the frames that a live camera (`realsense:`) delivers from now on.
+    """Open a source as `open_source` does, or start a live camera (`realsense:`).
 
-    A live camera is read by a thread of its own; frames that nobody takes in time are dropped, the oldest first, and
-    counted (`dropped`). Of it, `frames` can only count forwards: `:300` are the next 300 that are taken.
-    Raises SourceError as `open_source`.
+    A live camera is read by its own thread; frames that are not consumed in time are dropped, oldest first, and counted
+    in `dropped`.
+
+    Args:
+        path_or_name: As for `open_source`, or the name of a live camera.
+        frames: Frames to keep (`A:B:S`); for a live camera it can only count forwards: `:300` is the next 300 consumed.
+
+    Returns:
+        The frames in time order.
+
+    Raises:
+        SourceError: As for `open_source`.
     """
     where = os.fspath(path_or_name)
-    live = _live(where)
+    live = _live_class(where)
     if live is None:
         return open_source(where, frames)
     if frames is not None:
@@ -75,27 +93,26 @@ def open_stream(path_or_name: str | os.PathLike[str], frames: str | None = None)
 
 
 def open_images(path_or_name: str | os.PathLike[str], frames: str | None = None) -> Stream:
-    """Return what `open_stream` returns, but without poses where the recording can do without them.
+    """Open a source as `open_stream` does, but without poses where the recording can do without them.
 
-    So a folder of stamped images needs no groundtruth.txt. Raises SourceError as `open_stream`.
+    A folder of stamped images then needs no groundtruth.txt. Raises SourceError as `open_stream`.
     """
     from stereovox.sources.tum import StampedImages
 
     where = os.fspath(path_or_name)
-    if _live(where):
+    if _live_class(where):
         return open_stream(where, frames)
     stamped = StampedImages.recognises(where) and not os.path.isfile(os.path.join(where, FILE))
     kind: Any = StampedImages if stamped else _recognise(where)
-    source = kind.depth_only(where)
+    source = _open(kind, where) if _is_composite(kind) else kind.depth_only(where)
     return source if frames is None else Selection(source, frames)
 
 
 def open_depth(folder: Path, settings: PairSettings) -> DepthSource:
-    """Return the depth images of a pair; their own poses, if there are any, do not count.
+    """Return the depth images of a camera pair; poses they may have of their own are ignored.
 
     A folder with `depth.txt` or `depth/` holds stamped images (see `StampedImages`); anything else is opened by the
-    source that recognises it, by its `depth_only(where)`.
-    Raises SourceError where there are no depth images.
+    source that recognises it, with its `depth_only(where)`. Raises SourceError where there are no depth images.
     """
     from stereovox.sources.pair import CorrectedDepth
     from stereovox.sources.tum import StampedImages
@@ -108,9 +125,9 @@ def open_depth(folder: Path, settings: PairSettings) -> DepthSource:
 
 
 def open_robot(where: str | os.PathLike[str]) -> Robot:
-    """Return the recording of a ground robot: a bag, a CARMEN log (`.clf`, `.clf.bz2`) or `sim:floor`.
+    """Open the recording of a ground robot: a bag, a CARMEN log (`.clf`, `.clf.bz2`) or `sim:floor`.
 
-    Raises SourceError, one line, where there is nothing, nothing known or nothing usable.
+    Raises SourceError where there is nothing, nothing known or nothing usable.
     """
     place = os.fspath(where)
     for name in registry.names("robots", ROBOTS):
@@ -125,41 +142,45 @@ def open_robot(where: str | os.PathLike[str]) -> Robot:
 
 
 def is_recording(path: str | os.PathLike[str]) -> bool:
-    """Tell whether `path` is a folder or file that `open_source` knows."""
-    return any(kind.recognises(os.fspath(path)) for kind in _kinds())
+    """Return whether `open_source` recognises `path`."""
+    return any(kind.recognises(os.fspath(path)) for kind in _classes())
 
 
 def _depth_of(where: str) -> DepthSource:
-    """Return the depth images of a recording that is made of no others."""
-    for kind in _kinds():
-        if not getattr(kind, "opens_others", False) and kind.recognises(where):
+    """Return the depth images of a recording that is not composite."""
+    for kind in _classes():
+        if not _is_composite(kind) and kind.recognises(where):
             return kind.depth_only(where)
     raise SourceError(f"{where}: no depth images; name a folder with depth.txt or depth/, or a recording, as 'depth'")
 
 
-def _kinds() -> Iterator[Any]:
-    """Yield the classes of recordings, one by one: what is not needed is not imported."""
+def _classes() -> Iterator[Any]:
+    """Yield the classes of recordings one by one, so that only those needed are imported."""
     return (registry.find("sources", SOURCES, name) for name in registry.names("sources", SOURCES))
 
 
-def _live(where: str) -> Any:
-    """Return the class of the live camera that `where` names, if it does."""
+def _live_class(where: str) -> Any:
+    """Return the class of the live camera that `where` names, None if it names none."""
     kinds = (registry.find("streams", STREAMS, name) for name in registry.names("streams", STREAMS))
     return next((kind for kind in kinds if kind.recognises(where)), None)
 
 
-def _opened(where: str) -> Any:
-    kind = _recognise(where)
-    return kind(where, open_depth) if getattr(kind, "opens_others", False) else kind(where)
+def _open(kind: Any, where: str) -> Any:
+    """Return the source of class `kind`; a composite one is handed what opens its parts."""
+    return kind(where, open_depth) if _is_composite(kind) else kind(where)
+
+
+def _is_composite(kind: Any) -> bool:
+    return getattr(kind, "composite", False)
 
 
 def _recognise(where: str) -> Any:
     kinds = []
-    for kind in _kinds():
+    for kind in _classes():
         kinds.append(kind)
         if kind.recognises(where):
             return kind
-    if not os.path.exists(where) and not _live(where):
+    if not os.path.exists(where) and not _live_class(where):
         raise SourceError(f"{where}: no such folder or file")
     if os.path.isfile(os.path.join(where, "manifest.json")):
         raise SourceError(f"{where}: is a map, not a recording; what it was made of: stereovox info {where}")
@@ -168,8 +189,8 @@ def _recognise(where: str) -> Any:
 
 
 def _problem(where: str, kinds: list[Any]) -> str:
-    """Return why nothing can be made of `where`, and the folder below it that was perhaps meant."""
-    if _live(where):
+    """Explain why `where` cannot be opened, and name the folder inside it that was probably meant."""
+    if _live_class(where):
         return "a live camera can be mapped, but has no frames to go back to: record it into a file first"
     if not os.path.isdir(where):
         return "is a file, but no recording of a known kind"
@@ -177,5 +198,5 @@ def _problem(where: str, kinds: list[Any]) -> str:
         below = sorted(entry.path for entry in os.scandir(where) if entry.is_dir())
     except OSError as error:
         return f"{error.strerror}, so it cannot be listed"
-    meant = next((folder for folder in below for kind in kinds if kind.recognises(folder)), None)
-    return "not a recording of a known layout" + (f" (did you mean {meant}?)" if meant else "")
+    likely = next((folder for folder in below for kind in kinds if kind.recognises(folder)), None)
+    return "not a recording of a known layout" + (f" (did you mean {likely}?)" if likely else "")

@@ -15,7 +15,7 @@ from stereovox.cli import main, ros2
 from stereovox.config import load_config
 from stereovox.formats.map_server import read_map_server
 from stereovox.frame import Scan
-from stereovox.localize import robot_way
+from stereovox.localize import robot_track
 from stereovox.localize.slam.pipeline import SlamResult
 from stereovox.localize.track import Track
 from stereovox.maps import load_map
@@ -85,7 +85,7 @@ class FloorBySlam(Floor):
             stamps_ns = np.array([robot.scans[i].stamp_ns for i in range(n + 2)])
             return SlamResult(Track(stamps_ns, np.full((n + 2, 3), float(n)), np.zeros((n + 2, 3))), grid, [], [], {})
 
-        robot_way.slam_robot = found
+        robot_track.slam_robot = found
         done("slam", DRIVE, "--out", self.out)
 
     def seen(self):

@@ -22,10 +22,10 @@ class Scene:
 
     def __init__(self, columns=40, rows=20):
         self.floor = np.zeros((rows, columns), int)
-        self.things = {}
+        self.obstacles = {}
 
     def thing(self, columns, rows, heights, log_odds=3.0):
-        self.things |= dict.fromkeys(itertools.product(range(*columns), range(*rows), range(*heights)), log_odds)
+        self.obstacles |= dict.fromkeys(itertools.product(range(*columns), range(*rows), range(*heights)), log_odds)
         return self
 
     def map(self, up="z", **more):
@@ -33,7 +33,7 @@ class Scene:
         for (row, column), top in np.ndenumerate(self.floor):
             cells |= {(column, row, top - k): 3.0 for k in (1, 2)}
             cells |= {(column, row, k): -3.0 for k in range(top, HIGH)}
-        cells |= self.things
+        cells |= self.obstacles
         cells = {cell: value for cell, value in cells.items() if value != 0}
         order = ["xyz".index(axis) for axis in AXES[up]]
         indices = np.empty((len(cells), 3), int)

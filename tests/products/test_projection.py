@@ -211,7 +211,7 @@ def test_a_floor_seen_by_a_kinect():
     scores = score_grids(grid, floor.true_grid(0.05, heights, lids=True), align=False)
     assert scores.occupied.tolerance_precision > 0.97
     assert scores.to_reference.p95 <= 0.051
-    for thing in floor.plan.things:
+    for thing in floor.plan.obstacles:
         if thing.name in ("table 2: top", "table 3: top", "hung panel"):  # one cell thick, and free below
             low, high = thing.corners.min(axis=0) + 0.025, thing.corners.max(axis=0)
             inside = np.stack(np.mgrid[low[0] : high[0] : 0.05, low[1] : high[1] : 0.05], axis=-1).reshape(-1, 2)

@@ -26,7 +26,7 @@ from stereovox.sources.bags import unpack
 from stereovox.sources.bags.db3 import Db3File
 from stereovox.sources.bags.messages import Wire, ns_from_ms, read_camera_info
 from stereovox.sources.bags.robot_messages import read_laser_scan, read_point_cloud
-from stereovox.sources.bags.unpack import SMALL, most_unpacked, unpacked
+from stereovox.sources.bags.unpack import ALWAYS_ALLOWED, decompress, max_unpacked
 from stereovox.sources.images import SIGNATURE, read_depth_png, read_picture_png
 from stereovox.sources.robots import carmen
 from stereovox.sources.robots.carmen import CarmenLog
@@ -37,26 +37,26 @@ PACK = {"bz2": bz2.compress, "lz4": lz4.frame.compress, "zstd": zstd.compress}
 
 @pytest.mark.parametrize("packing", PACK)
 def test_a_small_piece_that_swells_is_refused_early(packing, monkeypatch):
-    monkeypatch.setattr(unpack, "SMALL", 1 << 20)
-    monkeypatch.setattr(unpack, "PACKED_BEST", 20)
+    monkeypatch.setattr(unpack, "ALWAYS_ALLOWED", 1 << 20)
+    monkeypatch.setattr(unpack, "MAX_RATIO", 20)
     bomb = PACK[packing](bytes(60 << 20))
-    assert most_unpacked(len(bomb)) < 20 << 20
+    assert max_unpacked(len(bomb)) < 20 << 20
     tracemalloc.start()
     with pytest.raises(ValueError, match="absurd size"):
-        unpacked(bomb, packing, 1 << 40)
+        decompress(bomb, packing, 1 << 40)
     assert tracemalloc.get_traced_memory()[1] < 30_000_000
     tracemalloc.stop()
-    assert unpacked(PACK[packing](bytes(1 << 20)), packing, 1 << 40) == bytes(1 << 20)
+    assert decompress(PACK[packing](bytes(1 << 20)), packing, 1 << 40) == bytes(1 << 20)
 
 
 def test_what_may_swell_how_far():
-    assert most_unpacked(0) == SMALL
-    assert most_unpacked(10**6) == 10**9
+    assert max_unpacked(0) == ALWAYS_ALLOWED
+    assert max_unpacked(10**6) == 10**9
 
 
 def test_many_chunks_that_swell_a_little(tmp_path, monkeypatch):
     """Each alone is small enough; without an index the whole file is gone through."""
-    monkeypatch.setattr(unpack, "SMALL", 1 << 20)
+    monkeypatch.setattr(unpack, "ALWAYS_ALLOWED", 1 << 20)
     inner = record(200, bytes((1 << 20) - 9))
     bomb = chunk_record(inner, 0, 1, Style("zstd"))
     (tmp_path / "a.mcap").write_bytes(MAGIC + record(1, text("") + text("")) + bomb * 30)
@@ -182,7 +182,7 @@ def test_a_png_with_too_much_or_too_little_in_it(tmp_path):
 
 
 def test_a_packed_log_that_swells(tmp_path, monkeypatch):
-    monkeypatch.setattr(carmen, "SMALL", 1 << 16)
+    monkeypatch.setattr(carmen, "ALWAYS_ALLOWED", 1 << 16)
     path = tmp_path / "a.log.bz2"
     path.write_bytes(bz2.compress(FLASER + b"#" * (1 << 22)))
     log = CarmenLog(str(path))

@@ -9,7 +9,7 @@ import pytest
 from made_recordings import SIZE, depth_image, png_bytes, write_png
 
 from stereovox.errors import FrameRefused
-from stereovox.sources.images import PICTURE, common_size, png_size, read_depth_png, read_picture_png
+from stereovox.sources.images import PICTURE_KINDS, common_size, png_size, read_depth_png, read_picture_png
 
 
 @pytest.fixture
@@ -121,8 +121,8 @@ def test_pictures_come_back_value_by_value_in_grey_or_rgb(tmp_path):
     found = read_picture_png(path, SIZE)
     np.testing.assert_array_equal(found, rgb)
     assert found.dtype == np.uint8
-    assert png_size(path, PICTURE) == SIZE
-    assert common_size([path], kinds=PICTURE) == SIZE
+    assert png_size(path, PICTURE_KINDS) == SIZE
+    assert common_size([path], kinds=PICTURE_KINDS) == SIZE
 
 
 def test_a_picture_is_no_depth_and_depth_no_picture(tmp_path, good):

@@ -181,7 +181,7 @@ def test_live_streams_are_read_so_and_tell_what_was_dropped(monkeypatch):
         def __new__(cls, where):
             return camera
 
-    monkeypatch.setattr("stereovox.opening._live", lambda where: Fake if Fake.recognises(where) else None)
+    monkeypatch.setattr("stereovox.opening._live_class", lambda where: Fake if Fake.recognises(where) else None)
     stream = open_stream("fake:")
     assert isinstance(stream, LatestStream)
     assert (stream.name, stream.camera, stream.notes, stream.length) == ("fake:", CAMERA, ("a note",), None)

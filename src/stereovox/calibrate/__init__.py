@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Find out from recordings what a camera measures wrongly, how noisy it is, and how it sits beside a tracker."""
+"""Calibration from recordings: depth errors and noise of a camera, stereo lenses, and a camera's place on a tracker."""

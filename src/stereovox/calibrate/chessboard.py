@@ -16,11 +16,11 @@ from stereovox.errors import StereovoxError
 
 ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm")
 SIDES = re.compile(r"left|right|(?<![a-z])[lr](?![a-z])|[LR](?=[^A-Za-z]*$)", re.IGNORECASE)
-"""What tells the eye in the name of a file without its ending: left01, cam_r_3, imageL0."""
+"""Marks the eye in a file name without its ending: left01, cam_r_3, imageL0."""
 WIDEST_WINDOW = 11
 """Pixels on each side of a corner in which it is made precise; less where squares are small."""
 MAX_PIXELS = 100_000_000
-"""An image that tells of more is taken for a lie; nothing is allocated for it."""
+"""Headers that claim more pixels are rejected; nothing is allocated for them."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ def read_grey(path: Path) -> NDArray[np.uint8] | None:
 
 
 def unmatched(folder: str | os.PathLike[str]) -> list[str]:
-    """Return the names of the images in `folder` of an eye that have no partner of the other eye's."""
+    """Return the names of the images in `folder` that belong to one eye and have no partner of the other."""
     eyes = _eyes(Path(folder))
     return sorted(
         path.name for ours, theirs in ("lr", "rl") for key, path in eyes[ours].items() if key not in eyes[theirs]
@@ -97,7 +97,7 @@ def image_pairs(folder: str | os.PathLike[str]) -> list[tuple[str, Path, Path]]:
     """Return name, left file and right file of each pair in `folder`, in order of name.
 
     Both files have the same name in folders `left` and `right`, or differ only in `left` and `right` or L and R.
-    Raises StereovoxError, one line, where there is no folder or no pair.
+    Raises StereovoxError where there is no folder or no pair.
     """
     where = Path(folder)
     if not where.is_dir():

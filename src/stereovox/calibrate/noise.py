@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How noisy a depth camera is, from recordings of a flat wall at several distances (Chien 2020, 2.2.4 and 3.3)."""
+"""Noise of a depth camera, from recordings of a flat wall at several distances (Chien 2020, 2.2.4 and 3.3)."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def calibrate_noise(
     The fixed part belongs into sigma as well: it does not average out where the camera stands, and where it moves the
     map meets it as one more error of each measurement. `fitted` names those of s0, s1, s2 that need not be 0; each
     needs a distance of its own.
-    Raises StereovoxError, one line: no wall, nothing in the region, different cameras, too few distances.
+    Raises StereovoxError: no wall, nothing in the region, different cameras, too few distances.
     """
     if not recordings:
         raise StereovoxError("no recording of a wall; give several, at different distances")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a depth camera moved, from its images alone: each is registered with an earlier one (small_gicp)."""
+"""Motion of a depth camera from its images alone: each is registered with an earlier one (small_gicp)."""
 
 from __future__ import annotations
 
@@ -15,110 +15,55 @@ from stereovox.se3 import Transform, inverse, orthonormalise, rotation_matrix, r
 
 PLANE_REACH = 0.12
 """Metres; points further apart do not belong together."""
-ALIKE = 0.9
+MIN_NORMAL_COSINE = 0.9
 """Least cosine of the angle between two normals that belong together."""
-CLOSE = 0.03
-"""Metres; a partner counts as found when it lies no further off the plane."""
+INLIER_DISTANCE = 0.03
+"""Metres off the plane up to which a point has found its partner."""
 STEPS = 10
 VARIETY = 0.02
 """Least share of normals along any axis: noise tilts those of a single wall, but by less."""
 FLOOR = (np.radians(0.03), 0.002)
 """Errors that no count of points averages away (radians, metres)."""
-
-
-@dataclass(frozen=True, eq=False)
-class Surface:
-    """Points (N, 3) in metres and normals (N, 3) of length one."""
-
-    points: NDArray[np.float64]
-    normals: NDArray[np.float64]
-
-    @classmethod
-    def of(cls, cloud: Any) -> Surface:
-        """Return what a small_gicp cloud holds."""
-        return cls(np.array(cloud.points())[:, :3], np.array(cloud.normals())[:, :3])
-
-
-@dataclass(frozen=True, eq=False)
-class Link:
-    """Where an image was taken: `T` (4, 4) in the frame of image number `reference` (-1: not known, `T` is NaN).
-
-    covariance: (6, 6) of the small motion (rotation vector, translation) by which it may be off, T_true = T exp(error).
-    share: of the image's points that lie on the reference's surfaces.
-    """
-
-    reference: int = -1
-    T: Transform = field(default_factory=lambda: np.full((4, 4), np.nan))
-    covariance: NDArray[np.float64] = field(default_factory=lambda: np.full((6, 6), np.nan))
-    share: float = 0.0
-
-
-def refined(T: Transform, source: Surface, target: Surface, tree: Any) -> Link:
-    """Return the motion near `T` that moves the source onto the target's surfaces best.
-
-    Iterated least squares of the distances d to the planes of the nearest points, weighted 1 / (1 + (d / s)^2) (Cauchy)
-    with s twice their usual size, so that what only one image sees has little say. `tree` finds points of `target`.
-    Surfaces that all look the same way let the other slide: such a link has no reference and share 0.
-    """
-    link = Link()
-    for _ in range(STEPS):
-        J, distances = _equations(T, source, target, tree)
-        if len(distances) < 6 or _variety(J[:, 3:]) < VARIETY:
-            return Link()
-        usual = max(1.4826 * float(np.median(np.abs(distances))), 1e-3)
-        weights = 1 / (1 + (distances / (2 * usual)) ** 2)
-        information = (J.T * weights) @ J + 1e-6 * np.eye(6)
-        change = np.asarray(np.linalg.solve(information, (J.T * weights) @ distances), float)
-        covariance = usual**2 * np.linalg.inv(information) + np.diag(np.repeat(np.square(FLOOR), 3))
-        link = Link(-1, T, np.asarray(covariance, float), float((np.abs(distances) < CLOSE).sum() / len(source.points)))
-        T = T @ _motion(change)
-        if np.abs(change).max() < 1e-5:
-            break
-    return replace(link, T=orthonormalise(T))  # or the errors of rounding double from image to image
-
-
-def _equations(
-    T: Transform, source: Surface, target: Surface, tree: Any
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return J (M, 6) and distances (M,) for all points that have a partner.
-
-    A small motion (w, v) of the source changes a distance to a plane by w . (p x n) + v . n, n seen from the source.
-    """
-    moved = source.points @ T[:3, :3].T + T[:3, 3]
-    indices, squared = (np.asarray(found).ravel() for found in tree.batch_nearest_neighbor_search(moved))
-    local = target.normals[indices] @ T[:3, :3]
-    alike = np.abs(np.einsum("ij,ij->i", local, source.normals)) > ALIKE
-    near = alike & (squared < PLANE_REACH**2)
-    local = local[near]
-    gaps = target.points[indices[near]] - moved[near]
-    return np.hstack([np.cross(source.points[near], local), local]), np.einsum(
-        "ij,ij->i", gaps, target.normals[indices[near]]
-    )
-
-
-def _variety(normals: NDArray[np.float64]) -> float:
-    """Return the share of normals (N, 3) that look along the axis along which fewest do."""
-    return float(np.linalg.eigvalsh(normals.T @ normals / len(normals))[0])
-
-
-def _motion(change: NDArray[np.float64]) -> Transform:
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = rotation_matrix(change[:3]), change[3:]
-    return T
-
-
 CELL = 0.08
 """Metres; points nearer to each other than this are merged."""
 REACH = 0.3
 """Metres; points further apart do not belong together."""
-FEWEST = 200
-"""Points an image needs."""
+MIN_POINTS = 200
+"""Fewest points of a usable image."""
 INLIERS = 0.55
 """Share of the points that must find a partner."""
 NEW_REFERENCE = (np.radians(35), 0.6, 0.7)
-"""The reference is renewed beyond this turn (radians) or way (metres), or below this share of partners."""
+"""The reference is replaced beyond this turn (radians) or travel (metres), or below this share of inliers."""
 WEAKEST = (np.radians(1.0), 0.05)
-"""A registration that leaves any turn or way less certain than this is none: one wall says nothing about sliding."""
+"""Uncertainty of turn (radians) or travel (metres) above which a registration fails: one wall does not fix sliding."""
+
+
+def camera_motion(clouds: Iterable[tuple[int, NDArray[np.float64]]]) -> CameraMotion:
+    """Return the motion between images, given in order as time in nanoseconds and (M, 3) points in the optical frame.
+
+    An image that cannot be registered becomes the next reference itself, without a link to those before.
+    Raises MissingExtra without small_gicp.
+    """
+    register = _Registration()
+    stamps: list[int] = []
+    links: list[Link] = []
+    key, step = -1, np.eye(4)
+    for i, (stamp_ns, points) in enumerate(clouds):
+        stamps.append(stamp_ns)
+        guess = links[-1].T @ step if key >= 0 and key != i - 1 else step
+        found = register.against(points, guess) if key >= 0 else None
+        links.append(replace(found, reference=key) if found else Link())
+        step = np.eye(4)
+        if found:
+            step = found.T if key == i - 1 else inverse(links[-2].T) @ found.T
+        if not found or _is_far(found):
+            key = i if register.set_reference(points) else -1
+    return CameraMotion(
+        np.array(stamps, np.int64),
+        np.array([link.reference for link in links], np.intp),
+        np.reshape([link.T for link in links], (-1, 4, 4)),
+        np.reshape([link.covariance for link in links], (-1, 6, 6)),
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,32 +93,90 @@ class CameraMotion:
         return steps
 
 
-def camera_motion(clouds: Iterable[tuple[int, NDArray[np.float64]]]) -> CameraMotion:
-    """Return the motion between images, given in order as time in nanoseconds and (M, 3) points in the optical frame.
+@dataclass(frozen=True, eq=False)
+class Link:
+    """Where an image was taken: `T` (4, 4) in the frame of image number `reference` (-1: not known, `T` is NaN).
 
-    An image that cannot be registered becomes the next reference itself, without a link to those before.
-    Raises MissingExtra without small_gicp.
+    covariance: (6, 6) of the small motion (rotation vector, translation) by which it may be off, T_true = T exp(error).
+    share: of the image's points that lie on the reference's surfaces.
     """
-    register = _Registration()
-    stamps: list[int] = []
-    links: list[Link] = []
-    key, step = -1, np.eye(4)
-    for i, (stamp_ns, points) in enumerate(clouds):
-        stamps.append(stamp_ns)
-        guess = links[-1].T @ step if key >= 0 and key != i - 1 else step
-        found = register.against(points, guess) if key >= 0 else None
-        links.append(replace(found, reference=key) if found else Link())
-        step = np.eye(4)
-        if found:
-            step = found.T if key == i - 1 else inverse(links[-2].T) @ found.T
-        if not found or _is_far(found):
-            key = i if register.take(points) else -1
-    return CameraMotion(
-        np.array(stamps, np.int64),
-        np.array([link.reference for link in links], np.intp),
-        np.reshape([link.T for link in links], (-1, 4, 4)),
-        np.reshape([link.covariance for link in links], (-1, 6, 6)),
+
+    reference: int = -1
+    T: Transform = field(default_factory=lambda: np.full((4, 4), np.nan))
+    covariance: NDArray[np.float64] = field(default_factory=lambda: np.full((6, 6), np.nan))
+    share: float = 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Surface:
+    """Points (N, 3) in metres and normals (N, 3) of length one."""
+
+    points: NDArray[np.float64]
+    normals: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, cloud: Any) -> Surface:
+        """Return what a small_gicp cloud holds."""
+        return cls(np.array(cloud.points())[:, :3], np.array(cloud.normals())[:, :3])
+
+
+def refined(T: Transform, source: Surface, target: Surface, tree: Any) -> Link:
+    """Return the motion near `T` that moves the source onto the target's surfaces best.
+
+    Iterated least squares of the distances d to the planes of the nearest points, weighted 1 / (1 + (d / s)^2) (Cauchy)
+    with s twice their usual size, so that what only one image sees has little say. `tree` finds points of `target`.
+    Surfaces that all look the same way let the other slide: such a link has no reference and share 0.
+    """
+    link = Link()
+    for _ in range(STEPS):
+        J, distances = _equations(T, source, target, tree)
+        if len(distances) < 6 or _variety(J[:, 3:]) < VARIETY:
+            return Link()
+        usual = max(1.4826 * float(np.median(np.abs(distances))), 1e-3)
+        weights = 1 / (1 + (distances / (2 * usual)) ** 2)
+        information = (J.T * weights) @ J + 1e-6 * np.eye(6)
+        change = np.asarray(np.linalg.solve(information, (J.T * weights) @ distances), float)
+        covariance = usual**2 * np.linalg.inv(information) + np.diag(np.repeat(np.square(FLOOR), 3))
+        link = Link(
+            -1,
+            T,
+            np.asarray(covariance, float),
+            float((np.abs(distances) < INLIER_DISTANCE).sum() / len(source.points)),
+        )
+        T = T @ _motion(change)
+        if np.abs(change).max() < 1e-5:
+            break
+    return replace(link, T=orthonormalise(T))  # or the errors of rounding double from image to image
+
+
+def _equations(
+    T: Transform, source: Surface, target: Surface, tree: Any
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return J (M, 6) and distances (M,) for all points that have a partner.
+
+    A small motion (w, v) of the source changes a distance to a plane by w . (p x n) + v . n, n seen from the source.
+    """
+    moved = source.points @ T[:3, :3].T + T[:3, 3]
+    indices, squared = (np.asarray(found).ravel() for found in tree.batch_nearest_neighbor_search(moved))
+    local = target.normals[indices] @ T[:3, :3]
+    alike = np.abs(np.einsum("ij,ij->i", local, source.normals)) > MIN_NORMAL_COSINE
+    near = alike & (squared < PLANE_REACH**2)
+    local = local[near]
+    gaps = target.points[indices[near]] - moved[near]
+    return np.hstack([np.cross(source.points[near], local), local]), np.einsum(
+        "ij,ij->i", gaps, target.normals[indices[near]]
     )
+
+
+def _variety(normals: NDArray[np.float64]) -> float:
+    """Return the share of normals (N, 3) that look along the axis along which fewest do."""
+    return float(np.linalg.eigvalsh(normals.T @ normals / len(normals))[0])
+
+
+def _motion(change: NDArray[np.float64]) -> Transform:
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = rotation_matrix(change[:3]), change[3:]
+    return T
 
 
 def _is_far(link: Link) -> bool:
@@ -183,22 +186,22 @@ def _is_far(link: Link) -> bool:
 
 
 class _Registration:
-    """Registers point clouds with the one that was taken as reference last."""
+    """Registers point clouds with the current reference."""
 
     def __init__(self) -> None:
         self._gicp = _small_gicp()
         self._target: Any = None
 
-    def take(self, points: NDArray[np.float64]) -> bool:
-        """Make these points the reference; False where they are too few."""
-        if len(points) < FEWEST:
+    def set_reference(self, points: NDArray[np.float64]) -> bool:
+        """Make these points the reference; return False where they are too few."""
+        if len(points) < MIN_POINTS:
             return False
         self._target = self._gicp.preprocess_points(points, CELL, num_neighbors=12)
         return True
 
     def against(self, points: NDArray[np.float64], guess: Transform) -> Link | None:
         """Return where the points' camera stood in the reference's frame; None where that is not certain enough."""
-        if len(points) < FEWEST:
+        if len(points) < MIN_POINTS:
             return None
         cloud, _ = self._gicp.preprocess_points(points, CELL, num_neighbors=12)
         target, tree = self._target

@@ -1,16 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a depth camera sits on a tracker, and how their clocks differ, from a recording of both.
+"""Extrinsics and clock offset of a depth camera on a tracker, from a recording of both.
 
-The camera's motion comes from its depth images, the tracker's from its poses. How fast both turn gives the offset of
+The camera's motion comes from its depth images, the tracker's from its poses. Their angular speeds give the offset of
 the clocks, whatever the extrinsics; hand-eye calibration gives rotation and translation; then all are refined together.
 
-Hand-eye calibration in closed form: A X = X B for motions A of a tracker, B of a camera on the same body.
-Rotation after Park & Martin 1994 (rotation vectors of A are those of B, turned by X); translation by linear least
-squares of (R_A - I) t_X = R_X t_B - t_A (Tsai & Lenz 1989).
+Hand-eye calibration in closed form: A X = X B for motions A of the tracker, B of the camera on the same body. Rotation
+after Park & Martin 1994 (rotation vectors of A are those of B, turned by X); translation by linear least squares of
+(R_A - I) t_X = R_X t_B - t_A (Tsai & Lenz 1989).
 
-Not cv2.calibrateHandEye: OpenCV 5 has none, and that of version 4 wants poses, not motions, and knows no outliers
-(`benchmarks/hand_eye.py`: errors of 0.1 deg and 3 mm here, of 0.4 deg and 13 mm or more there; with 5 % of the motions
-wrong 0.1 deg and 3 mm here, 3 deg and 9 cm there).
+Not cv2.calibrateHandEye: OpenCV 5 has none, and that of version 4 wants poses, not motions, and has no outlier
+rejection (`benchmarks/hand_eye.py`: errors of 0.1 deg and 3 mm here, of 0.4 deg and 13 mm or more there; with 5 % of
+the motions wrong 0.1 deg and 3 mm here, 3 deg and 9 cm there).
 """
 
 from __future__ import annotations
@@ -35,49 +35,77 @@ from stereovox.se3 import Transform
 from stereovox.sources.poses import Poses
 
 MIN_TURN = np.radians(3.0)
-"""Root mean square turn between registered images that tells anything."""
+"""Fewest radians, root mean square, that the camera must turn between registered images."""
 MIN_SECOND_TURN = np.radians(1.2)
-"""The same about the second axis: about one axis only, where the camera sits along it remains open."""
-
-
-def check_turning(vectors: NDArray[np.float64]) -> None:
-    """Raise StereovoxError, one line, where (N, 3) rotation vectors are too small or all about one axis."""
-    weights, axes = np.linalg.eigh(vectors.T @ vectors / max(len(vectors), 1))
-    first, second = np.sqrt(np.maximum(weights[::-1][:2], 0))
-    if first < MIN_TURN:
-        raise StereovoxError(
-            f"motion: too small, images are turned by {np.degrees(first):.1f} deg (rms); turn by 30 deg about two axes"
-        )
-    if second < MIN_SECOND_TURN:
-        axis = " ".join(f"{number:+.2f}" for number in axes[:, -1])
-        raise StereovoxError(
-            f"motion: turns about one axis only ({axis} in the camera's frame); pitch, yaw and roll while recording"
-        )
-
-
-def hand_eye(A: NDArray[np.float64], B: NDArray[np.float64]) -> Transform:
-    """Return X (4, 4) with A X = X B, of (N, 4, 4) motions; pairs whose turns differ in size count as outliers."""
-    from scipy.spatial.transform import Rotation
-
-    a, b = (Rotation.from_matrix(T[:, :3, :3]).as_rotvec() for T in (A, B))
-    differ = np.abs(np.linalg.norm(a, axis=1) - np.linalg.norm(b, axis=1))
-    usual = differ <= 3 * np.median(differ) + 1e-9
-    X = np.eye(4)
-    X[:3, :3] = Rotation.align_vectors(a[usual], b[usual])[0].as_matrix()
-    X[:3, 3] = _translation(A[usual], B[usual], X[:3, :3])
-    return X
-
-
-def _translation(A: NDArray[np.float64], B: NDArray[np.float64], R: NDArray[np.float64]) -> NDArray[np.float64]:
-    left = (A[:, :3, :3] - np.eye(3)).reshape(-1, 3)
-    right = (B[:, :3, 3] @ R.T - A[:, :3, 3]).ravel()
-    return np.linalg.lstsq(left, right, rcond=None)[0].astype(float)
-
-
+"""The same about the second axis: rotation about one axis leaves the camera's place along it open."""
 COLUMNS = 106
 """About how many blocks an image is wide: 8 pixels each for 848."""
 SPREAD = 0.15
 """Blocks whose inverse depths differ by more than this share of their mean lie across an edge."""
+MIN_IMAGES = 20
+"""Fewest registered images with trusted poses for a calibration."""
+MIN_REGISTERED = 0.5
+"""Share of the images that must be registered."""
+MAX_RANGE = 5.0
+"""Metres; depth beyond is too noisy to register."""
+UNIQUE, SAME_S = 2.0, 0.05
+"""A second offset (further away than SAME_S seconds) must fit so many times worse."""
+
+
+def calibrate_pair(
+    depth: DepthSource,
+    poses: Poses,
+    *,
+    min_confidence: float = 2.0,
+    max_speed_mps: float = 10.0,
+    max_turn_dps: float = 720.0,
+    guess_s: float = 0.0,
+    within_s: float | None = None,
+    progress: Callable[[Iterable[Frame], int], Iterable[Frame]] | None = None,
+) -> PairCalibration:
+    """Return extrinsics and clock offset of a depth camera and a tracker.
+
+    poses: T_world_tracker with the body in optical axes, on the tracker's own clock. The three limits are those of a
+    `pair.toml`. within_s: only offsets this near to `guess_s`; None: any. progress: wraps the frames as they are read.
+    Raises StereovoxError where motion or depth do not suffice or the recordings do not overlap;
+    MissingExtra without small_gicp.
+    """
+    motion = camera_motion(_clouds(depth, progress))
+    _check_depth(motion, depth)
+    track = PoseTrack(poses, min_confidence, max_speed_mps, max_turn_dps)
+    starts = (int(motion.stamps_ns[0]) - track.start_ns) / 1e9
+    between = None if within_s is None else (guess_s - starts - within_s, guess_s - starts + within_s)
+    check_turning(_rotation_vectors(motion))
+    found, correlation = _best(motion, track, find_offsets(motion, track, between))
+    return _result(found, starts, correlation, motion)
+
+
+@dataclass(frozen=True, eq=False)
+class PairCalibration:
+    """The result of `calibrate_pair`.
+
+    T_tracker_camera: (4, 4) metres, depth camera's optical frame to the tracker's body, both in optical axes.
+    clock_offset_s: depth stamp = tracker stamp + offset, seconds.
+    offset_std_s, rotation_std_deg (3,) about the camera's axes, translation_std_m (3,) along the tracker's: standard
+    deviations. rotation_residual_deg, translation_residual_m: median misfit of a registered pair of images.
+    correlation: of the two angular speeds. images, registered, pairs: how many there were and how many counted.
+    """
+
+    T_tracker_camera: Transform
+    clock_offset_s: float
+    offset_std_s: float
+    rotation_std_deg: NDArray[np.float64]
+    translation_std_m: NDArray[np.float64]
+    rotation_residual_deg: float
+    translation_residual_m: float
+    correlation: float
+    images: int
+    registered: int
+    pairs: int
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the same with lists instead of arrays."""
+        return {key: getattr(value, "tolist", lambda value=value: value)() for key, value in vars(self).items()}
 
 
 def reduced_points(image: DepthImage, farthest: float) -> NDArray[np.float64]:
@@ -105,84 +133,51 @@ def reduced_points(image: DepthImage, farthest: float) -> NDArray[np.float64]:
     return np.stack([x * depth, y * depth, depth], axis=1)
 
 
+def hand_eye(A: NDArray[np.float64], B: NDArray[np.float64]) -> Transform:
+    """Return X (4, 4) with A X = X B, of (N, 4, 4) motions; pairs whose turns differ in size count as outliers."""
+    from scipy.spatial.transform import Rotation
+
+    a, b = (Rotation.from_matrix(T[:, :3, :3]).as_rotvec() for T in (A, B))
+    differ = np.abs(np.linalg.norm(a, axis=1) - np.linalg.norm(b, axis=1))
+    usual = differ <= 3 * np.median(differ) + 1e-9
+    X = np.eye(4)
+    X[:3, :3] = Rotation.align_vectors(a[usual], b[usual])[0].as_matrix()
+    X[:3, 3] = _translation(A[usual], B[usual], X[:3, :3])
+    return X
+
+
+def check_turning(vectors: NDArray[np.float64]) -> None:
+    """Raise StereovoxError where (N, 3) rotation vectors are too small or all about one axis."""
+    weights, axes = np.linalg.eigh(vectors.T @ vectors / max(len(vectors), 1))
+    first, second = np.sqrt(np.maximum(weights[::-1][:2], 0))
+    if first < MIN_TURN:
+        raise StereovoxError(
+            f"motion: too small, images are turned by {np.degrees(first):.1f} deg (rms); turn by 30 deg about two axes"
+        )
+    if second < MIN_SECOND_TURN:
+        axis = " ".join(f"{number:+.2f}" for number in axes[:, -1])
+        raise StereovoxError(
+            f"motion: turns about one axis only ({axis} in the camera's frame); pitch, yaw and roll while recording"
+        )
+
+
+def _translation(A: NDArray[np.float64], B: NDArray[np.float64], R: NDArray[np.float64]) -> NDArray[np.float64]:
+    left = (A[:, :3, :3] - np.eye(3)).reshape(-1, 3)
+    right = (B[:, :3, 3] @ R.T - A[:, :3, 3]).ravel()
+    return np.linalg.lstsq(left, right, rcond=None)[0].astype(float)
+
+
 def _blocks(image: NDArray, n: int) -> NDArray:
     """Return (rows, n, columns, n); what is left over at the right and lower border is cut off."""
     height, width = image.shape[0] // n * n, image.shape[1] // n * n
     return image[:height, :width].reshape(height // n, n, width // n, n)
 
 
-FEWEST = 20
-"""Registered images with trusted poses that a calibration needs."""
-REGISTERED = 0.5
-"""Share of the images that must be registered."""
-MAX_RANGE = 5.0
-"""Metres; depth beyond is too noisy to register."""
-
-UNIQUE, SAME_S = 2.0, 0.05
-"""A second offset (further away than SAME_S seconds) must fit so many times worse."""
-
-
-@dataclass(frozen=True, eq=False)
-class PairCalibration:
-    """What was found.
-
-    T_tracker_camera: (4, 4) metres, depth camera's optical frame to the tracker's body, both in optical axes.
-    clock_offset_s: depth stamp = tracker stamp + offset, seconds.
-    offset_std_s, rotation_std_deg (3,) about the camera's axes, translation_std_m (3,) along the tracker's: standard
-        deviations. rotation_residual_deg, translation_residual_m: median misfit of a registered pair of images.
-    correlation: of the two angular speeds. images, registered, pairs: how many there were and how many counted.
-    """
-
-    T_tracker_camera: Transform
-    clock_offset_s: float
-    offset_std_s: float
-    rotation_std_deg: NDArray[np.float64]
-    translation_std_m: NDArray[np.float64]
-    rotation_residual_deg: float
-    translation_residual_m: float
-    correlation: float
-    images: int
-    registered: int
-    pairs: int
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the same with lists instead of arrays."""
-        return {key: getattr(value, "tolist", lambda value=value: value)() for key, value in vars(self).items()}
-
-
-def calibrate_pair(
-    depth: DepthSource,
-    poses: Poses,
-    *,
-    min_confidence: float = 2.0,
-    max_speed_mps: float = 10.0,
-    max_turn_dps: float = 720.0,
-    guess_s: float = 0.0,
-    within_s: float | None = None,
-    progress: Callable[[Iterable[Frame], int], Iterable[Frame]] | None = None,
-) -> PairCalibration:
-    """Return extrinsics and clock offset of a depth camera and a tracker.
-
-    poses: T_world_tracker with the body in optical axes, on the tracker's own clock. The three limits are those of a
-    `pair.toml`. within_s: only offsets this near to `guess_s`; None: any. progress: wraps the frames as they are read.
-    Raises StereovoxError, one line, where motion or depth do not suffice or the recordings do not overlap;
-    MissingExtra without small_gicp.
-    """
-    motion = camera_motion(_clouds(depth, progress))
-    _check_depth(motion, depth)
-    track = PoseTrack(poses, min_confidence, max_speed_mps, max_turn_dps)
-    starts = (int(motion.stamps_ns[0]) - track.start_ns) / 1e9
-    between = None if within_s is None else (guess_s - starts - within_s, guess_s - starts + within_s)
-    check_turning(_rotation_vectors(motion))
-    found, correlation = _best(motion, track, find_offsets(motion, track, between))
-    return _result(found, starts, correlation, motion)
-
-
 def _best(motion: CameraMotion, track: PoseTrack, offsets: list[Offset]) -> tuple[Refined, float]:
     """Return what fits best of all that the angular speeds allow; where a camera sits tells the false ones."""
     tried = [(found, rough.correlation) for rough in offsets if (found := _refined(motion, track, rough.seconds))]
     if not tried:
-        raise StereovoxError(f"poses: fewer than {FEWEST} images have trusted poses; record for longer, or slower")
+        raise StereovoxError(f"poses: fewer than {MIN_IMAGES} images have trusted poses; record for longer, or slower")
     tried.sort(key=lambda one: one[0].misfit)
     if len(tried) > 1 and tried[1][0].misfit < UNIQUE * tried[0][0].misfit:
         apart = abs(tried[1][0].offset - tried[0][0].offset)
@@ -194,7 +189,7 @@ def _best(motion: CameraMotion, track: PoseTrack, offsets: list[Offset]) -> tupl
 
 def _refined(motion: CameraMotion, track: PoseTrack, offset: float) -> Refined | None:
     pairs = usable_pairs(motion, track, offset)
-    if len(pairs.first) < FEWEST:
+    if len(pairs.first) < MIN_IMAGES:
         return None
     return refine(pairs, track, offset, hand_eye(tracker_motion(pairs, track, offset), pairs.T_first_second))
 
@@ -214,7 +209,7 @@ def _clouds(
 
 def _check_depth(motion: CameraMotion, depth: DepthSource) -> None:
     registered = int((motion.reference >= 0).sum())
-    if registered < max(FEWEST, REGISTERED * len(depth)):
+    if registered < max(MIN_IMAGES, MIN_REGISTERED * len(depth)):
         raise StereovoxError(
             f"{depth.name}: only {registered} of {len(depth)} depth images could be registered with another; film "
             f"corners and furniture within {MAX_RANGE:g} m, for at least some seconds, and move slowly"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A recording of a flat wall by a camera that stands, boiled down to a few numbers for each pixel."""
+"""A recording of a flat wall by a camera at rest, reduced to a few sums per pixel."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from stereovox.errors import StereovoxError
 from stereovox.frame import Frame, Reason
 
 GROSS = 0.25
-"""Values off by a larger share of the depth are no noise: mismatches, or somebody who walks through."""
+"""Values off by a larger share of the depth are not noise: mismatches, or a person walking through."""
 USUAL = 0.5
 """A pixel counts if it has a value in this share of the frames; rarer ones are those that scatter in one direction."""
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Clock offset, rotation and translation together, by robust least squares, with honest standard deviations."""
+"""Joint robust refinement of clock offset, rotation and translation, with jackknife standard deviations."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A stereo pair's lenses and their places, from pairs of images of a chessboard."""
+"""Lenses and extrinsics of a stereo pair, from image pairs of a chessboard."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from stereovox.cameras.rigs import Eyes
 from stereovox.errors import StereovoxError
 from stereovox.se3 import inverse
 
-FEWEST = 3
-"""Pairs of images that say enough."""
+MIN_PAIRS = 3
+"""Fewest usable image pairs."""
 FAR_PX, FAR_TIMES = 0.5, 3.0
 """A pair is dropped where its RMS is larger than this and than this many times the median of all pairs."""
 FOLDS = 6
-"""Parts of the pairs that are left out in turn, to see how good the rest predicts them."""
+"""Parts of the pairs left out in turn, to see how well the rest predicts them."""
 Names = tuple[str, Path, Path]
 Shown = Callable[[list[Names]], Iterable[Names]]
 Pixels = NDArray[np.float64]
@@ -52,13 +52,13 @@ class BoardPair:
 
     def as_dict(self) -> dict[str, Any]:
         """Return what is worth telling, with None for what is not known."""
-        told = {key: _known(getattr(self, key)) for key in ("rms_px", "epipolar_px", "unseen_px")}
+        told = {key: _finite_or_none(getattr(self, key)) for key in ("rms_px", "epipolar_px", "unseen_px")}
         return {"name": self.name, "used": not self.why, "why": self.why, **told}
 
 
 @dataclass(frozen=True, eq=False)
 class StereoCalibration:
-    """What was found: both lenses and the right eye's place, and how well all pairs agree with it."""
+    """Both lenses, the right eye's extrinsics, and how well all pairs agree with them."""
 
     eyes: Eyes
     board: Board
@@ -79,7 +79,7 @@ class StereoCalibration:
             "lens": self.eyes.left.model,
             "pairs": [pair.as_dict() for pair in self.pairs],
             "used": len(self.used),
-            **{key: _known(self.overall(key)) for key in ("rms_px", "epipolar_px", "unseen_px")},
+            **{key: _finite_or_none(self.overall(key)) for key in ("rms_px", "epipolar_px", "unseen_px")},
             "baseline_m": self.eyes.baseline,
             "field_of_view_deg": [field_of_view(lens) for lens in (self.eyes.left, self.eyes.right)],
         }
@@ -88,22 +88,22 @@ class StereoCalibration:
 def calibrate_stereo(pairs: Iterable[BoardPair], board: Board, model: str = "pinhole") -> StereoCalibration:
     """Return the calibration of `model` lenses from the corners of all pairs; those that do not fit are dropped.
 
-    Raises StereovoxError, one line, for an unknown model, or where fewer than three pairs are left.
+    Raises StereovoxError for an unknown model, or where fewer than three pairs are left.
     """
     check_model(model)
     pairs = list(pairs)
     fit = None
     while fit is None or _drop_worst(pairs):
-        used = _used(pairs)
+        used = _usable(pairs)
         left, right = _corners(used)
         fit = fit_stereo(model, used[0].size, board.points(), left, right)
         _measure(used, fit, board)
-    _predict(_used(pairs), fit, board)
+    _predict(_usable(pairs), fit, board)
     return StereoCalibration(fit.eyes, board, pairs)
 
 
 def check_model(model: str) -> None:
-    """Raise StereovoxError for a model of a lens that there is not."""
+    """Raise StereovoxError for an unknown lens model."""
     if model not in MODELS:
         raise StereovoxError(f"--lens {model}: must be one of {', '.join(MODELS)}")
 
@@ -114,12 +114,12 @@ def read_boards(folder: str | Path, board: Board, shown: Shown = iter) -> list[B
     shown: is given the list of pairs and yields them one by one; it may tell a person how far they are.
     Raises StereovoxError where there is no pair at all.
     """
-    pairs = [_seen(BoardPair(*names), board) for names in shown(image_pairs(folder))]
+    pairs = [_with_corners(BoardPair(*names), board) for names in shown(image_pairs(folder))]
     sizes = [pair.size for pair in pairs if not pair.why]
     usual = max(set(sizes), key=sizes.count, default=(0, 0))
     for pair in pairs:
         if not pair.why and pair.size != usual:
-            pair.why = f"{_times(pair.size)} pixels, most others have {_times(usual)}"
+            pair.why = f"{_format_size(pair.size)} pixels, most others have {_format_size(usual)}"
     return pairs
 
 
@@ -147,7 +147,7 @@ def field_of_view(lens: Lens) -> tuple[float, float]:
     return float(off[0] + off[1]), float(off[2] + off[3])
 
 
-def _seen(pair: BoardPair, board: Board) -> BoardPair:
+def _with_corners(pair: BoardPair, board: Board) -> BoardPair:
     images = [read_grey(path) for path in (pair.left_file, pair.right_file)]
     for path, image in zip((pair.left_file, pair.right_file), images, strict=True):
         if image is None:
@@ -156,7 +156,7 @@ def _seen(pair: BoardPair, board: Board) -> BoardPair:
     left, right = (image for image in images if image is not None)
     pair.size = left.shape[1], left.shape[0]
     if left.shape != right.shape:
-        pair.why = f"left {_times(pair.size)} pixels, right {right.shape[1]}x{right.shape[0]}"
+        pair.why = f"left {_format_size(pair.size)} pixels, right {right.shape[1]}x{right.shape[0]}"
         return pair
     pair.left, pair.right = find_corners(left, board), find_corners(right, board)
     blind = [path.name for path, found in ((pair.left_file, pair.left), (pair.right_file, pair.right)) if found is None]
@@ -167,12 +167,12 @@ def _seen(pair: BoardPair, board: Board) -> BoardPair:
     return pair
 
 
-def _used(pairs: Sequence[BoardPair]) -> list[BoardPair]:
+def _usable(pairs: Sequence[BoardPair]) -> list[BoardPair]:
     used = [pair for pair in pairs if not pair.why]
-    if len(used) < FEWEST:
+    if len(used) < MIN_PAIRS:
         reasons = "; ".join(f"{pair.name}: {pair.why}" for pair in pairs if pair.why)
         said = f" ({reasons})" if reasons else ""
-        raise StereovoxError(f"only {len(used)} pairs of images are of use, {FEWEST} are needed{said}; take more")
+        raise StereovoxError(f"only {len(used)} pairs of images are of use, {MIN_PAIRS} are needed{said}; take more")
     return used
 
 
@@ -193,7 +193,7 @@ def _measure(used: Sequence[BoardPair], fit: Fit, board: Board) -> None:
 
 
 def _drop_worst(pairs: Sequence[BoardPair]) -> bool:
-    """Drop the pair that fits worst, if it fits much worse than the others, and tell whether there was one."""
+    """Drop the pair that fits worst, if it fits much worse than the others, and return whether there was one."""
     used = [pair for pair in pairs if not pair.why]
     worst, usual = max(used, key=lambda pair: pair.rms_px), float(np.median([pair.rms_px for pair in used]))
     if worst.rms_px <= max(FAR_PX, FAR_TIMES * usual):
@@ -204,12 +204,12 @@ def _drop_worst(pairs: Sequence[BoardPair]) -> bool:
 
 def _predict(used: Sequence[BoardPair], fit: Fit, board: Board) -> None:
     """Tell of each pair how far its rows differ by a calibration that has not seen it."""
-    if len(used) <= FEWEST:
+    if len(used) <= MIN_PAIRS:
         return
     left, right = _corners(used)
     for fold in range(min(FOLDS, len(used))):
         rest = [k for k in range(len(used)) if k % FOLDS != fold]
-        if len(rest) < FEWEST:
+        if len(rest) < MIN_PAIRS:
             continue
         eyes = fit.eyes
         T, a, b = ([many[k] for k in rest] for many in (fit.T_left_board, left, right))
@@ -218,7 +218,7 @@ def _predict(used: Sequence[BoardPair], fit: Fit, board: Board) -> None:
             used[k].unseen_px = _rms(epipolar_errors(without.eyes, left[k], right[k]))
 
 
-def _known(number: float) -> float | None:
+def _finite_or_none(number: float) -> float | None:
     return float(number) if np.isfinite(number) else None
 
 
@@ -226,5 +226,5 @@ def _rms(numbers: Pixels) -> float:
     return float(np.sqrt(np.mean(numbers**2)))
 
 
-def _times(size: tuple[int, int]) -> str:
+def _format_size(size: tuple[int, int]) -> str:
     return f"{size[0]}x{size[1]}"

@@ -23,14 +23,14 @@ from stereovox.cameras.rigs import Eyes
 from stereovox.errors import StereovoxError
 from stereovox.se3 import Transform, inverse, rotation_matrix, rotation_vector, transform_points
 
-MANY = 10
-"""Views from which on a fifth coefficient of Brown and Conrady's is found as well; with fewer it only follows noise."""
+FULL_MODEL_VIEWS = 10
+"""Views from which on a fifth Brown-Conrady coefficient is fitted; with fewer it only follows noise."""
 GUESSES = {"pinhole": np.geomspace(0.4, 4.0, 14), "fisheye": np.geomspace(0.25, 1.5, 14)}
 """Focal lengths in widths of the image that are tried at the start."""
-FAR_OFF = 1e3
-"""Pixels that a corner counts for which the lens cannot see at all; it leads away from such lenses."""
+UNSEEN_PX = 1e3
+"""Residual in pixels of a corner that the lens cannot see; it steers away from such lenses."""
 STEP = 1e-6
-MAX_STEPS, ENOUGH = 60, 1e-6
+MAX_STEPS, MIN_GAIN = 60, 1e-6
 """The search ends after so many steps, or when one makes things better by so small a share."""
 Vector = NDArray[np.float64]
 Missed = Callable[[Vector, Vector], Vector]
@@ -104,7 +104,7 @@ def _guess(
 ) -> tuple[Lens, list[Transform]]:
     """Return the undistorted lens of all focal lengths tried that fits best, with the boards' places."""
     best, found = np.inf, None
-    count = 4 if model == "fisheye" or len(corners) < MANY else 5
+    count = 4 if model == "fisheye" or len(corners) < FULL_MODEL_VIEWS else 5
     for share in GUESSES[model]:
         focal = share * size[0]
         lens = Lens(model, *size, focal, focal, (size[0] - 1) / 2, (size[1] - 1) / 2, (0.0,) * count)
@@ -138,7 +138,7 @@ def missed_pixels(lens: Lens, T: Sequence[Transform], board: NDArray[np.float64]
     """Return (views, 2 N) pixels by which each corner is missed."""
     seen = lens.project(np.concatenate([transform_points(one, board) for one in T]))
     missed = (seen - np.concatenate(list(corners))).reshape(len(T), -1)
-    return np.where(np.isfinite(missed), missed, FAR_OFF)
+    return np.where(np.isfinite(missed), missed, UNSEEN_PX)
 
 
 def _least_squares(missed: Missed, shared: Vector, places: Vector) -> tuple[Vector, Vector]:
@@ -162,7 +162,7 @@ def _least_squares(missed: Missed, shared: Vector, places: Vector) -> tuple[Vect
                 (shared, places), residuals, damping = tried, there, max(damping / 5, 1e-9)
                 break
             damping *= 4
-        if not after < before * (1 - ENOUGH):
+        if not after < before * (1 - MIN_GAIN):
             break
     return shared, places
 

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Find the wall in a depth image that may be distorted, and the plane it is.
+"""Find the wall in a possibly distorted depth image, and fit its plane.
 
 Seen from a pinhole camera a plane is linear in the slopes x = X/Z and y = Y/Z of the pixels: 1/z = a + b x + c y. So
-the wall, however it leans, costs three numbers, and a distorted one is a little more: a quadratic.
+the wall, however it leans, has three parameters, and a distorted one is approximated by a quadratic.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Poses of a tracker at many times at once, where they may be trusted, and how far its clock is off."""
+"""A tracker's poses, vectorised and smoothed, and the offset between its clock and a camera's."""
 
 from __future__ import annotations
 
@@ -15,6 +15,18 @@ from stereovox.sources.tracker import angles, jumps
 
 SMOOTH = 0.03
 """Seconds; a hand that swings twice a second loses 0.6 % of its turns by that."""
+STEP = 0.01
+"""Seconds between the samples that are compared."""
+OVERLAP = 0.5
+"""Share of the shorter recording that must lie within the other."""
+MIN_CORRELATION = 0.6
+"""Least correlation of a match."""
+RIVAL_GAP_S, RIVAL_SHARE, MAX_RIVALS = 0.3, 0.85, 5
+"""Rival matches that are tried as well: this many seconds away from better ones, this well correlated (share of the
+best), at most this many.
+"""
+MAX_SPAN_S = 86_400.0
+"""Seconds; a longer recording has a wrong stamp, and its samples would fill the memory."""
 
 
 class PoseTrack:
@@ -63,6 +75,43 @@ class PoseTrack:
         return np.where(within & (self._breaks[before] == self._breaks[after]), self._breaks[after], -1)
 
 
+@dataclass(frozen=True)
+class Offset:
+    """Seconds to add to times of the track to get times of the camera (both since their starts); its correlation."""
+
+    seconds: float
+    correlation: float
+
+
+def find_offsets(motion: CameraMotion, track: PoseTrack, between: tuple[float, float] | None = None) -> list[Offset]:
+    """Return the offsets at which the two angular speeds fit, the best first; one, unless the motion repeats itself.
+
+    Times of the camera count from its first image, those of the track from its first pose. `between`: only offsets in
+    this range, in seconds. Raises StereovoxError where no offset fits.
+    """
+    _check_span("images", (motion.stamps_ns[-1] - motion.stamps_ns[0]) / 1e9)
+    _check_span("poses", track.times[-1])
+    lags, correlation = _correlate(_camera_speed(motion), _track_speed(track, _frame_time(motion)))
+    offsets = lags * STEP
+    allowed = np.isfinite(correlation)
+    if between is not None:
+        allowed &= (offsets >= between[0]) & (offsets <= between[1])
+    if not allowed.any():
+        raise StereovoxError("clocks: at no allowed offset do images and poses overlap enough; record both together")
+    correlation = np.where(allowed, correlation, -1.0)
+    best = float(correlation.max())
+    if best < MIN_CORRELATION:
+        found = f"the best correlation of the angular speeds is {best:.2f}, below {MIN_CORRELATION:g}"
+        cure = "the recordings do not overlap, or turn too little; record both together and turn irregularly"
+        raise StereovoxError(f"clocks: {found}; {cure}")
+    chosen: list[int] = []
+    left = correlation.copy()
+    while len(chosen) < MAX_RIVALS and left.max() >= max(MIN_CORRELATION, RIVAL_SHARE * best):
+        chosen.append(int(np.argmax(left)))
+        left[np.abs(offsets - offsets[chosen[-1]]) < RIVAL_GAP_S] = -1.0
+    return [Offset(float(offsets[k] + STEP * _peak(correlation, k)), float(correlation[k])) for k in chosen]
+
+
 def _poses_to_average(times: NDArray[np.float64]) -> int:
     """Return the odd number of poses that SMOOTH holds; one where they come too slowly or there are too few."""
     count = int(SMOOTH / np.median(np.diff(times))) // 2 * 2 + 1
@@ -83,57 +132,8 @@ def _averages(values: NDArray[np.float64], count: int) -> NDArray[np.float64]:
     return np.lib.stride_tricks.sliding_window_view(values, count, axis=0).mean(axis=-1)
 
 
-STEP = 0.01
-"""Seconds between the samples that are compared."""
-OVERLAP = 0.5
-"""Share of the shorter recording that must lie within the other."""
-CLEAR = 0.6
-"""Least correlation of a match."""
-APART, ALMOST, MOST = 0.3, 0.85, 5
-"""Other matches that are looked at: so far beside better ones (seconds), so well correlated (share of the best)."""
-LONGEST = 86_400.0
-"""Seconds; what seems to last longer holds a wrong time, and its samples would fill the memory."""
-
-
-@dataclass(frozen=True)
-class Offset:
-    """Seconds to add to times of the track to get times of the camera (both since their starts); its correlation."""
-
-    seconds: float
-    correlation: float
-
-
-def find_offsets(motion: CameraMotion, track: PoseTrack, between: tuple[float, float] | None = None) -> list[Offset]:
-    """Return the offsets at which the two angular speeds fit, the best first; one, unless the motion repeats itself.
-
-    Times of the camera count from its first image, those of the track from its first pose. `between`: only offsets in
-    this range, in seconds. Raises StereovoxError, one line, where no offset fits.
-    """
-    _check_span("images", (motion.stamps_ns[-1] - motion.stamps_ns[0]) / 1e9)
-    _check_span("poses", track.times[-1])
-    lags, correlation = _correlate(_camera_speed(motion), _track_speed(track, _frame_time(motion)))
-    offsets = lags * STEP
-    allowed = np.isfinite(correlation)
-    if between is not None:
-        allowed &= (offsets >= between[0]) & (offsets <= between[1])
-    if not allowed.any():
-        raise StereovoxError("clocks: at no allowed offset do images and poses overlap enough; record both together")
-    correlation = np.where(allowed, correlation, -1.0)
-    best = float(correlation.max())
-    if best < CLEAR:
-        found = f"the best correlation of the angular speeds is {best:.2f}, below {CLEAR:g}"
-        cure = "the recordings do not overlap, or turn too little; record both together and turn irregularly"
-        raise StereovoxError(f"clocks: {found}; {cure}")
-    chosen: list[int] = []
-    left = correlation.copy()
-    while len(chosen) < MOST and left.max() >= max(CLEAR, ALMOST * best):
-        chosen.append(int(np.argmax(left)))
-        left[np.abs(offsets - offsets[chosen[-1]]) < APART] = -1.0
-    return [Offset(float(offsets[k] + STEP * _peak(correlation, k)), float(correlation[k])) for k in chosen]
-
-
 def _check_span(what: str, seconds: float) -> None:
-    if not STEP < seconds < LONGEST:
+    if not STEP < seconds < MAX_SPAN_S:
         cure = "record for some seconds, and remove what has a wrong time (longest: a day)"
         raise StereovoxError(f"clocks: the {what} span {seconds:.9g} s from first to last; {cure}")
 
@@ -169,18 +169,18 @@ def _correlate(a: NDArray[np.float64], b: NDArray[np.float64]) -> tuple[NDArray[
     """
     from scipy.signal import correlate, correlation_lags
 
-    known_a, known_b = np.isfinite(a).astype(float), np.isfinite(b).astype(float)
+    valid_a, valid_b = np.isfinite(a).astype(float), np.isfinite(b).astype(float)
     a, b = (np.nan_to_num(x - np.nanmean(x)) if np.isfinite(x).any() else np.zeros(len(x)) for x in (a, b))
 
     def cross(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
         return correlate(x, y, "full", "fft")
 
-    count = np.rint(cross(known_a, known_b))
-    fewest = max(OVERLAP * min(known_a.sum(), known_b.sum()), 50)
+    count = np.rint(cross(valid_a, valid_b))
+    fewest = max(OVERLAP * min(valid_a.sum(), valid_b.sum()), 50)
     n = np.where(count >= fewest, count, np.nan)
-    sum_a, sum_b = cross(a, known_b), cross(known_a, b)
-    spread_a = cross(a * a, known_b) - sum_a**2 / n
-    spread_b = cross(known_a, b * b) - sum_b**2 / n
+    sum_a, sum_b = cross(a, valid_b), cross(valid_a, b)
+    spread_a = cross(a * a, valid_b) - sum_a**2 / n
+    spread_b = cross(valid_a, b * b) - sum_b**2 / n
     least = 1e-6 * n
     spread = np.where((spread_a > least) & (spread_b > least), spread_a * spread_b, np.nan)
     return correlation_lags(len(a), len(b), "full"), (cross(a, b) - sum_a * sum_b / n) / np.sqrt(spread)

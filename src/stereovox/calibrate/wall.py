@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a depth camera measures wrongly, from recordings of flat walls (after Chien 2020, App. A).
+"""Systematic depth errors of a camera, from recordings of flat walls (after Chien 2020, App. A).
 
-Fit the models of `DepthCorrection` to walls, all by linear least squares in 1/z.
-With m = 1/z measured and a plane 1/z = a + b x + c y, the models scale and disparity say a + b x + c y = m (1 + s) + q
-for each pixel: linear in the coefficients of the quadratics s and q and in b and c of each wall.
+The models of `DepthCorrection` are fitted to walls by linear least squares in 1/z. With m = 1/z measured and a plane
+1/z = a + b x + c y, the models scale and disparity say a + b x + c y = m (1 + s) + q for each pixel: linear in the
+coefficients of the quadratics s and q and in b and c of each wall.
 
-What is linear across the image cannot be told from a wall that leans. So s and q have no terms x and y, and the lean is
-the wall's; only walls that are known to stand square to the optical axis fix these terms too. A constant term needs
+An error that is linear across the image cannot be distinguished from a leaning wall. So s and q have no terms x and y,
+and the lean is the wall's; only walls known to be square to the optical axis fix these terms too. A constant term needs
 measured distances.
 """
 
@@ -25,21 +25,141 @@ from stereovox.depth.prepare import quadratics
 from stereovox.errors import StereovoxError, did_you_mean
 
 SIMPLEST_FIRST = ("scale", "disparity", "scale+disparity")
+MODELS = ("auto", *SIMPLEST_FIRST, "thesis")
+SAMPLES = 20_000
+"""Pixels of each wall that are fitted; its figures are of all."""
+MAX_DISTANCE_ERROR = 0.2
+"""A measured distance that differs from the camera's by a larger share belongs to another wall."""
+SAME_DISTANCE = 1.1
+"""Distances whose ratio is smaller count as one."""
+SIMPLER_FACTOR = 1.1
+"""A simpler model is chosen unless its error on unseen walls is this many times the best one's."""
+ROUGH = 0.01
+"""Error after the correction, as a share of the depth, above which the user is warned."""
+NARROW = 0.8
+"""Share of the image's width and height that the wall should span."""
+
+
+def calibrate_wall(
+    recordings: Sequence[WallRecording],
+    model: str = "auto",
+    square: bool = False,
+    check: Sequence[WallRecording] = (),
+) -> WallCalibration:
+    """Return the correction that makes the recorded walls flat.
+
+    model: of `DepthCorrection`, or `auto`: the one that does best at distances it was not fitted to; with a single
+    distance `scale`, whose error stays the same share of the depth wherever it is used. square: the walls are known to
+    stand perpendicular to the optical axis. check: walls that are only looked at afterwards.
+    Raises StereovoxError: no wall, distances for some of the walls only or that cannot be, another camera,
+    an unknown model.
+    """
+    check_model(model)
+    _check(recordings, check)
+    found = [find_wall(recording.inverse, recording.camera, recording.name) for recording in recordings]
+    for recording, wall in zip(recordings, found, strict=True):
+        _check_distance(recording, wall)
+    points = [_points(recording, wall, square) for recording, wall in zip(recordings, found, strict=True)]
+    groups = distance_groups([wall.distance for wall in found])
+    scores = _scores(points, groups)
+    chosen, why = _choose(scores, groups) if model == "auto" else (model, "it was asked for")
+    if chosen == "scale+disparity" and len(set(groups)) < 2:
+        raise StereovoxError(f"too few distances for --model {chosen}: record another, or use scale or disparity")
+    correction = fit(chosen, points)
+    results = [_result(*pair, correction, square, True) for pair in zip(recordings, found, strict=True)]
+    for recording in check:
+        wall = find_wall(recording.inverse, recording.camera, recording.name)
+        _check_distance(recording, wall)
+        results.append(_result(recording, wall, correction, square, False))
+    camera = replace(recordings[0].camera, correction=correction)
+    return WallCalibration(camera, why, scores, tuple(results), _notes(results))
 
 
 @dataclass(frozen=True, eq=False)
-class Points:
-    """Pixels of one wall: slopes x, y and measured 1/z in 1/m, each (N,).
+class WallCalibration:
+    """The camera with its correction, how the model was chosen, and what it does to each wall.
 
-    distance: where the optical axis meets the wall in metres, None: not known. square: the wall is known to stand
-    perpendicular to the axis.
+    scores: for each model its error in percent on the walls it was fitted to (`fit`), and, where there are several
+    distances, on those left out in turn (`unseen`), infinite where it leaves no depth there.
     """
 
-    x: Array
-    y: Array
-    inverse: Array
-    distance: float | None = None
-    square: bool = False
+    camera: PinholeCamera
+    why: str
+    scores: dict[str, dict[str, float]]
+    walls: tuple[WallResult, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def correction(self) -> DepthCorrection:
+        """The correction that was found."""
+        assert self.camera.correction
+        return self.camera.correction
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return everything but the images."""
+        return {
+            "model": self.correction.model,
+            "coefficients": list(self.correction.coefficients),
+            "why": self.why,
+            "models": {model: {key: _finite(error) for key, error in of.items()} for model, of in self.scores.items()},
+            "walls": [wall.as_dict() for wall in self.walls],
+            "notes": list(self.notes),
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class WallResult:
+    """One wall before and after the correction.
+
+    before, after: (height, width) of (z - z_wall) / z_wall, mean over the frames, NaN off the wall. points_before,
+    points_after: (height, width, 3) metres in the optical frame. plane: (a, b, c) of the wall, 1/z = a + b x + c y.
+    fitted: False for a wall that was only looked at afterwards.
+    """
+
+    recording: WallRecording
+    plane: Array
+    before: Array
+    after: Array
+    points_before: Array
+    points_after: Array
+    fitted: bool
+
+    @property
+    def distance(self) -> float:
+        """Metres from the camera to the wall along the optical axis."""
+        return float(1 / self.plane[0])
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the figures: percent of the depth, degrees, metres, shares."""
+        return {
+            "name": self.recording.name,
+            "distance_m": self.distance,
+            "distance_given": self.recording.distance is not None,
+            "fitted": self.fitted,
+            "tilt_deg": tilt_deg(self.plane),
+            "before_percent": 100 * rms(self.before),
+            "after_percent": 100 * rms(self.after),
+            "worst_after_percent": 100 * float(np.nanpercentile(np.abs(self.after), 99)),
+            "wall_share": float(np.isfinite(self.before).mean()),
+            "frames": self.recording.frames,
+            "frames_skipped": self.recording.skipped,
+        }
+
+
+def check_model(model: str) -> None:
+    """Raise StereovoxError for a model that does not exist."""
+    if model not in MODELS:
+        raise StereovoxError(f"unknown model '{model}'{did_you_mean(model, MODELS)}")
+
+
+def distance_groups(distances: Sequence[float]) -> list[int]:
+    """Return for each distance the number of its group; distances within a tenth of the group's least are one group."""
+    groups, starts = [0] * len(distances), []
+    for i in np.argsort(distances):
+        if not starts or distances[i] > SAME_DISTANCE * starts[-1]:
+            starts.append(distances[i])
+        groups[i] = len(starts) - 1
+    return groups
 
 
 def fit(model: str, walls: Sequence[Points]) -> DepthCorrection:
@@ -56,6 +176,21 @@ def fit(model: str, walls: Sequence[Points]) -> DepthCorrection:
     coefficients = np.zeros((count // int(active.sum()), active.size))
     coefficients[:, active] = solution.reshape(len(coefficients), -1)
     return DepthCorrection(model, tuple(coefficients.ravel()))
+
+
+@dataclass(frozen=True, eq=False)
+class Points:
+    """Pixels of one wall: slopes x, y and measured 1/z in 1/m, each (N,).
+
+    distance: where the optical axis meets the wall in metres, None: not known. square: the wall is known to stand
+    perpendicular to the axis.
+    """
+
+    x: Array
+    y: Array
+    inverse: Array
+    distance: float | None = None
+    square: bool = False
 
 
 def corrected_inverse(correction: DepthCorrection | None, x: Array, y: Array, inverse: Array) -> Array:
@@ -137,145 +272,8 @@ def _fit_thesis(walls: Sequence[Points]) -> DepthCorrection:
     return DepthCorrection("thesis", tuple(p))
 
 
-MODELS = ("auto", *SIMPLEST_FIRST, "thesis")
-SAMPLES = 20_000
-"""Pixels of each wall that are fitted; its figures are of all."""
-MISTAKEN = 0.2
-"""A measured distance that is off by a larger share of what the camera sees belongs to another wall."""
-ALIKE = 1.1
-"""Distances whose ratio is smaller count as one."""
-SIMPLER = 1.1
-"""A simpler model is taken unless its error on walls it has not seen is so many times the best one's."""
-ROUGH = 0.01
-"""Error after the correction, as a share of the depth, that the user should know about."""
-NARROW = 0.8
-"""Share of the image's width and height that the wall should span."""
-
-
-@dataclass(frozen=True, eq=False)
-class WallResult:
-    """One wall before and after the correction.
-
-    before, after: (height, width) of (z - z_wall) / z_wall, mean over the frames, NaN off the wall. points_before,
-    points_after: (height, width, 3) metres in the optical frame. plane: (a, b, c) of the wall, 1/z = a + b x + c y.
-    fitted: False for a wall that was only looked at afterwards.
-    """
-
-    recording: WallRecording
-    plane: Array
-    before: Array
-    after: Array
-    points_before: Array
-    points_after: Array
-    fitted: bool
-
-    @property
-    def distance(self) -> float:
-        """Metres from the camera to the wall along the optical axis."""
-        return float(1 / self.plane[0])
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return the figures: percent of the depth, degrees, metres, shares."""
-        return {
-            "name": self.recording.name,
-            "distance_m": self.distance,
-            "distance_given": self.recording.distance is not None,
-            "fitted": self.fitted,
-            "tilt_deg": tilt_deg(self.plane),
-            "before_percent": 100 * rms(self.before),
-            "after_percent": 100 * rms(self.after),
-            "worst_after_percent": 100 * float(np.nanpercentile(np.abs(self.after), 99)),
-            "wall_share": float(np.isfinite(self.before).mean()),
-            "frames": self.recording.frames,
-            "frames_skipped": self.recording.skipped,
-        }
-
-
-@dataclass(frozen=True, eq=False)
-class WallCalibration:
-    """The camera with its correction, how the model was chosen, and what it does to each wall.
-
-    scores: for each model its error in percent on the walls it was fitted to (`fit`), and, where there are several
-    distances, on those left out in turn (`unseen`), infinite where it leaves no depth there.
-    """
-
-    camera: PinholeCamera
-    why: str
-    scores: dict[str, dict[str, float]]
-    walls: tuple[WallResult, ...]
-    notes: tuple[str, ...]
-
-    @property
-    def correction(self) -> DepthCorrection:
-        """The correction that was found."""
-        assert self.camera.correction
-        return self.camera.correction
-
-    def as_dict(self) -> dict[str, Any]:
-        """Return everything but the images."""
-        return {
-            "model": self.correction.model,
-            "coefficients": list(self.correction.coefficients),
-            "why": self.why,
-            "models": {model: {key: _finite(error) for key, error in of.items()} for model, of in self.scores.items()},
-            "walls": [wall.as_dict() for wall in self.walls],
-            "notes": list(self.notes),
-        }
-
-
-def calibrate_wall(
-    recordings: Sequence[WallRecording],
-    model: str = "auto",
-    square: bool = False,
-    check: Sequence[WallRecording] = (),
-) -> WallCalibration:
-    """Return the correction that makes the recorded walls flat.
-
-    model: of `DepthCorrection`, or `auto`: the one that does best at distances it was not fitted to; with a single
-    distance `scale`, whose error stays the same share of the depth wherever it is used. square: the walls are known to
-    stand perpendicular to the optical axis. check: walls that are only looked at afterwards.
-    Raises StereovoxError, one line: no wall, distances for some of the walls only or that cannot be, another camera,
-    an unknown model.
-    """
-    check_model(model)
-    _check(recordings, check)
-    found = [find_wall(recording.inverse, recording.camera, recording.name) for recording in recordings]
-    for recording, wall in zip(recordings, found, strict=True):
-        _check_distance(recording, wall)
-    points = [_points(recording, wall, square) for recording, wall in zip(recordings, found, strict=True)]
-    groups = distance_groups([wall.distance for wall in found])
-    scores = _scores(points, groups)
-    chosen, why = _choose(scores, groups) if model == "auto" else (model, "it was asked for")
-    if chosen == "scale+disparity" and len(set(groups)) < 2:
-        raise StereovoxError(f"too few distances for --model {chosen}: record another, or use scale or disparity")
-    correction = fit(chosen, points)
-    results = [_result(*pair, correction, square, True) for pair in zip(recordings, found, strict=True)]
-    for recording in check:
-        wall = find_wall(recording.inverse, recording.camera, recording.name)
-        _check_distance(recording, wall)
-        results.append(_result(recording, wall, correction, square, False))
-    camera = replace(recordings[0].camera, correction=correction)
-    return WallCalibration(camera, why, scores, tuple(results), _notes(results))
-
-
 def _finite(error: float) -> float | None:
     return error if np.isfinite(error) else None
-
-
-def check_model(model: str) -> None:
-    """Raise StereovoxError for a model that does not exist."""
-    if model not in MODELS:
-        raise StereovoxError(f"unknown model '{model}'{did_you_mean(model, MODELS)}")
-
-
-def distance_groups(distances: Sequence[float]) -> list[int]:
-    """Return for each distance the number of its group; distances within a tenth of the group's least are one group."""
-    groups, starts = [0] * len(distances), []
-    for i in np.argsort(distances):
-        if not starts or distances[i] > ALIKE * starts[-1]:
-            starts.append(distances[i])
-        groups[i] = len(starts) - 1
-    return groups
 
 
 def _check(recordings: Sequence[WallRecording], check: Sequence[WallRecording]) -> None:
@@ -292,7 +290,7 @@ def _check(recordings: Sequence[WallRecording], check: Sequence[WallRecording]) 
 
 def _check_distance(recording: WallRecording, wall: Wall) -> None:
     given = recording.distance
-    if given is not None and abs(wall.distance / given - 1) > MISTAKEN:
+    if given is not None and abs(wall.distance / given - 1) > MAX_DISTANCE_ERROR:
         raise StereovoxError(
             f"{recording.name}: the camera sees the wall at {wall.distance:.2f} m, not near {given:g} m; "
             "check the distances and their order"
@@ -343,7 +341,7 @@ def _choose(scores: dict[str, dict[str, float]], groups: Sequence[int]) -> tuple
             "changes a depth by a larger share than here. Record a second distance to find out"
         )
     best = min(unseen.values())
-    chosen = next(model for model, error in unseen.items() if error <= SIMPLER * best)
+    chosen = next(model for model, error in unseen.items() if error <= SIMPLER_FACTOR * best)
     distances = len(set(groups))
     return chosen, f"of {distances} distances, each left out in turn, it predicts the left out one best or as well"
 

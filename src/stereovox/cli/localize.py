@@ -46,7 +46,7 @@ def add_start(parser: ArgumentParser) -> None:
 def run(arguments: Namespace) -> dict[str, Any]:
     """Localise, save the trajectory and print where it ends."""
     from stereovox.formats.map_server import read_map_server
-    from stereovox.localize.robot_way import check_start, fit_of, localise_robot, refused_line
+    from stereovox.localize.robot_track import check_start, fit_of, localise_robot, refused_line
 
     out, config = check_file(arguments.out, (*TEXT, *BAGS)), settings_of(arguments)
     start, grid = parse_start(arguments.start), read_map_server(arguments.map)

@@ -56,11 +56,11 @@ def open_grid(path: str) -> OccupancyGrid:
 
 def check_not_map_image(file: str, path: str) -> None:
     """Raise StereovoxError where writing `file` would overwrite the image with the cells of the map at `path`."""
-    from stereovox.formats.map_server import read_meaning
+    from stereovox.formats.map_server import read_metadata
 
     own = [Path(path), Path(path).with_suffix(".png")]
     if Path(path).suffix.lower() in (".yaml", ".yml"):
-        own = [read_meaning(Path(path)).image]
+        own = [read_metadata(Path(path)).image]
     if os.path.realpath(file) in map(os.path.realpath, own):
         raise StereovoxError(f"{file}: holds the cells of the map {path}; give the picture another name")
 

@@ -47,7 +47,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
 def _map(arguments: Namespace, out: Path) -> dict[str, Any]:
     from stereovox.evaluate.trajectory import read_relations
     from stereovox.formats.map_server import write_map_server
-    from stereovox.localize.robot_way import slam_robot
+    from stereovox.localize.robot_track import slam_robot
 
     config = settings_of(arguments)
     if arguments.relations is not None:
@@ -66,7 +66,7 @@ def _map(arguments: Namespace, out: Path) -> dict[str, Any]:
 
 
 def _print_result(robot: Robot, found: SlamResult, seconds: float) -> dict[str, Any]:
-    from stereovox.localize.robot_way import refused_line
+    from stereovox.localize.robot_track import refused_line
 
     track = found.track
     recorded = 1e-9 * float(track.stamps_ns[-1] - track.stamps_ns[0])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Maps for other programs and from them: one writer and one reader a file type, chosen by the file's ending."""
+"""Import and export of maps: one reader and one writer per file type, chosen by the file name's ending."""
 
 from __future__ import annotations
 
@@ -22,34 +22,11 @@ IMPORTS = {
     ".db3": "stereovox.formats.bags:read_bag_map",
 }
 """File ending -> reader `(path) -> VoxelMap`; other packages add theirs as entry points `stereovox.import`."""
-TAKES = {
+OPTIONS = {
     "voxel_size": (".ply", ".pcd", ".bag", ".mcap", ".db3"),
     "topic": (".bag", ".mcap", ".db3"),
 }
-"""Which files' readers want to know more, by keyword."""
-
-
-def import_map(path: str | Path, voxel_size: float | None = None, topic: str | None = None) -> VoxelMap:
-    """Return the map in a file of another program, or in one that `export` wrote.
-
-    `.bt`, `.ot`: OctoMap's cells. `.npz`: ours, exactly. `.ply`, `.pcd`: each cell that holds a point is occupied, all
-    others are unknown. `.bag`, `.mcap`, `.db3` or a rosbag2 folder: the last Octomap, or PointCloud2, of a topic.
-    voxel_size: metres, for points of other programs; ours tell it. topic: see `bag_maps.read_bag_map`.
-    Raises StereovoxError: one line with the file and what is wrong, or an option that says nothing for such a file.
-    """
-    ending = ".mcap" if Path(path).is_dir() else Path(path).suffix.lower()
-    known = registry.names("import", IMPORTS)
-    if ending not in known:
-        raise StereovoxError(f"{path}: cannot import '{ending}'; the file's name ends in one of {', '.join(known)}")
-    told = {"voxel_size": voxel_size, "topic": topic}
-    given = {name: value for name, value in told.items() if value is not None}
-    for name in given:
-        if ending not in TAKES[name]:
-            option = f"--{name.replace('_', '-')}"
-            raise StereovoxError(f"{path}: {option} says nothing about a '{ending}'; leave it out")
-    return registry.find("import", IMPORTS, ending)(path, **given)
-
-
+"""Endings whose readers take these keyword arguments."""
 EXPORTS = {
     ".bt": "stereovox.formats.octomap:write_bt",
     ".ot": "stereovox.formats.octomap:write_ot",
@@ -69,23 +46,28 @@ EXPORTS = {
 }
 """File ending -> writer `(voxel_map, path) -> None`; other packages add theirs as entry points `stereovox.export`."""
 FLAT = (".pgm", ".png", ".yaml")
-"""Endings of 2-D maps, whose writer takes `heights` and `inflate` too."""
+"""Endings of 2-D maps, whose writers also take `heights` and `inflate`."""
 BAGS = (".bag", ".mcap", ".db3")
-"""Endings of recordings of ROS, with a 2-D map in them, whose writer takes `heights` too."""
-
-__all__ = ["BAGS", "EXPORTS", "FLAT", "export", "read_octomap"]
+"""Endings of ROS recordings, with a 2-D map in them, whose writers also take `heights`."""
+__all__ = ["BAGS", "EXPORTS", "FLAT", "IMPORTS", "export", "import_map", "read_octomap"]
 
 
 def export(
     voxel_map: VoxelMap, path: str | Path, heights: tuple[float, float] | None = None, inflate: float | None = None
 ) -> None:
-    """Write `voxel_map` to the file `path` in the format its ending names; a failed export leaves an older file whole.
+    """Write a map in the format that the file name's ending selects; a failed export leaves an older file intact.
 
-    Uneven cells become cubes where the format knows only those.
-    heights: for 2-D maps and bags, the lowest and highest metres that mark cells (see `projection.project`).
-    inflate: for 2-D maps, a robot's radius in metres by which obstacles grow (see `inflate.inflated_grid`).
-    Raises StereovoxError: one line about an unknown ending, a place that cannot be written, cells the format cannot
-    hold, or heights or inflation where they have no meaning.
+    Cells that are not cubes are resampled to cubes where the format knows only those.
+
+    Args:
+        voxel_map: The map.
+        path: File to write; `EXPORTS` lists the endings.
+        heights: For 2-D maps and bags: lowest and highest metres that mark cells (see `projection.project`).
+        inflate: For 2-D maps: robot radius in metres by which obstacles grow (see `projection.inflated_grid`).
+
+    Raises:
+        StereovoxError: Unknown ending, unwritable place, cells that the format cannot hold, or `heights` or `inflate`
+            where they have no meaning.
     """
     ending = Path(path).suffix.lower()
     known = registry.names("export", EXPORTS)
@@ -100,3 +82,33 @@ def export(
     given = {name: value for name, value in options.items() if value is not None}
     write = registry.find("export", EXPORTS, ending)
     write(voxel_map if ending in FLAT else in_cubes(voxel_map), path, **given)
+
+
+def import_map(path: str | Path, voxel_size: float | None = None, topic: str | None = None) -> VoxelMap:
+    """Read a map from another program's file, or from one that `export` wrote.
+
+    `.bt`, `.ot`: OctoMap's cells. `.npz`: ours, exactly. `.ply`, `.pcd`: each cell that holds a point is occupied, all
+    others are unknown. `.bag`, `.mcap`, `.db3` or a rosbag2 folder: the last Octomap, or PointCloud2, of a topic.
+
+    Args:
+        path: File or rosbag2 folder.
+        voxel_size: Metres, for points from other programs; our own files declare it.
+        topic: Topic in a bag (see `bags.read_bag_map`).
+
+    Returns:
+        The map.
+
+    Raises:
+        StereovoxError: What is wrong with the file, or an option that this kind of file does not take.
+    """
+    ending = ".mcap" if Path(path).is_dir() else Path(path).suffix.lower()
+    known = registry.names("import", IMPORTS)
+    if ending not in known:
+        raise StereovoxError(f"{path}: cannot import '{ending}'; the file's name ends in one of {', '.join(known)}")
+    options = {"voxel_size": voxel_size, "topic": topic}
+    given = {name: value for name, value in options.items() if value is not None}
+    for name in given:
+        if ending not in OPTIONS[name]:
+            option = f"--{name.replace('_', '-')}"
+            raise StereovoxError(f"{path}: {option} says nothing about a '{ending}'; leave it out")
+    return registry.find("import", IMPORTS, ending)(path, **given)

@@ -31,7 +31,7 @@ from stereovox.threads import one_state
 
 MAP_FRAME, CELLS_FRAME = "map", "map_cells"
 """Names of the frame whose z is up, and of that of the cells where another axis is up in it."""
-Made = TypeVar("Made")
+MapT = TypeVar("MapT")
 
 
 @one_state
@@ -41,7 +41,7 @@ def write_bag(voxel_map: VoxelMap, path: str | Path, heights: Heights | None = N
     `/octomap_full`: an Octomap of every known cell with its log-odds. `/occupied_cells`: a PointCloud2 of the centres
     of the occupied cells. `/map_mapping`: an OccupancyGrid, the map seen from above; heights: see `projection.project`.
     All are in frame `map`; where the map's `up` is not z, the first two are in `map_cells`, which `/tf_static` turns.
-    Stamps are the last frame's, or zero. Raises MapFileError, one line, for what cannot be written, MissingExtra
+    Stamps are the last frame's, or zero. Raises MapFileError for what cannot be written, MissingExtra
     without rosbags.
     """
     axes = upright_axes(voxel_map.config.up)
@@ -78,8 +78,8 @@ def write_grid_bag(grid: OccupancyGrid, path: str | Path) -> None:
 def read_bag_map(path: str | Path, voxel_size: float | None = None, topic: str | None = None) -> VoxelMap:
     """Return the map in the last Octomap of a bag's topic, cell for cell; or the cells that a PointCloud2 marks.
 
-    topic: where the bag has several Octomaps, or for a PointCloud2, whose points are taken for places in the world.
-    voxel_size: metres, for a PointCloud2 alone. Raises MapFileError, one line.
+    topic: required where the bag has several Octomaps, and for a PointCloud2, whose points are used as world
+    coordinates. voxel_size: metres, for a PointCloud2 only. Raises MapFileError.
     """
 
     def octomap_cells(wire: Wire) -> VoxelMap:
@@ -96,7 +96,7 @@ def read_bag_map(path: str | Path, voxel_size: float | None = None, topic: str |
 
 
 def read_bag_grid(path: str | Path, topic: str | None = None) -> OccupancyGrid:
-    """Return the last OccupancyGrid of a bag's topic; topic: where there are several. Raises MapFileError, one line."""
+    """Return the last OccupancyGrid of a bag's topic; topic: required where there are several. Raises MapFileError."""
     return _last(Path(path), topic, {OCCUPANCY_GRID: read_occupancy_grid})
 
 
@@ -107,8 +107,8 @@ def _octomap_cells(wire: Wire) -> VoxelMap:
     return map_of_nodes(BINARY_TITLE if message.binary else TREE_TITLE, message.data, message.resolution)
 
 
-def _last(path: Path, topic: str | None, readers: dict[str, Callable[[Wire], Made]]) -> Made:
-    """Return what its type's reader makes of a topic's last message; None: the only topic of the first type."""
+def _last(path: Path, topic: str | None, readers: dict[str, Callable[[Wire], MapT]]) -> MapT:
+    """Return what the reader of its type makes of a topic's last message; None: the only topic of the first type."""
     try:
         bag = open_bag(path)
         topic = topic or _only(bag.types, next(iter(readers)))

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A map as a mesh file, written by trimesh: `.glb` for browsers and phones, `.obj` and `.stl` for modellers.
+"""Maps as meshes, written by trimesh: `.glb` for browsers and phones, `.obj` and `.stl` for modelling programs.
 
-A `.glb` (Khronos glTF 2.0) shows the outer faces of the cells, the others the smoothed surface of `mesh.surface`. The
-faces of the cells are found here: trimesh would keep those between two occupied cells, which nobody sees.
+A `.glb` (Khronos glTF 2.0) shows the outer faces of the cells, the others the smooth surface of `surface`. Cell faces
+are found here, because trimesh would keep the invisible ones between two occupied cells.
 """
 
 from __future__ import annotations
@@ -30,28 +30,36 @@ if TYPE_CHECKING:
     from trimesh.visual import TextureVisuals
 
 GROUP = 8
-"""Blocks along each side of the cubes of the map that are looked at one by one."""
-LEAST = 0.05
-"""Part of the way from one cell's middle to the next by which a vertex keeps away from both."""
-
-
-@dataclass(frozen=True, eq=False)
-class Mesh:
-    """Triangles: vertices (N, 3) float32 in metres, world frame; faces (M, 3) int32, anticlockwise from outside."""
-
-    vertices: NDArray[np.float32]
-    faces: NDArray[np.int32]
+"""Blocks along each side of the cubes in which the map is processed."""
+MIN_OFFSET = 0.05
+"""Smallest distance of a vertex from a cell centre, as a share of the way to the next centre."""
+SPAN = 1 << 21
+"""Corners of cells on each axis that three of them fit into one int64."""
+TRIANGLES = ((0, 1, 2), (0, 2, 3))
+TITLE = "stereovox: surface of occupied cells, metres"
+STL_TITLE_BYTES = 80
+OBJ_DIGITS = 6
+"""Decimals of a coordinate in an `.obj`: a micrometre."""
 
 
 @one_state
 def surface(voxel_map: VoxelMap) -> Mesh:
-    """Return the closed surface about what is occupied: every occupied cell's middle is inside, every other's outside.
+    """Extract the closed surface around the occupied cells: every occupied centre is inside, every other outside.
 
-    Marching cubes (Lorensen and Cline 1987, by the tables of Lewiner et al. 2003): the surface stands where the
-    log-odds, linear between the middles of neighbouring cells, pass `map.occupied_above`. An unknown cell counts as
-    surely free, so that nothing is invented there: towards it the surface stands no farther out than the occupied
-    cell's own face. A wall seen from one side has two sides all the same: it is as thick as its cells.
-    Raises StereovoxError where nothing is occupied, MissingExtra without scikit-image.
+    Marching cubes (Lorensen and Cline 1987, by the tables of Lewiner et al. 2003): the surface is where the log-odds,
+    linear between neighbouring cell centres, cross `map.occupied_above`. Unknown cells count as surely free, so that
+    nothing is invented: towards them the surface reaches no farther than the occupied cell's own face. A wall seen from
+    one side still has two sides: it is as thick as its cells.
+
+    Args:
+        voxel_map: The map.
+
+    Returns:
+        The mesh.
+
+    Raises:
+        StereovoxError: Nothing is occupied.
+        MissingExtra: scikit-image is not installed.
     """
     voxel_map = in_memory(voxel_map)
     parts = [part for part in _parts(voxel_map) if len(part[1])]
@@ -63,6 +71,89 @@ def surface(voxel_map: VoxelMap) -> Mesh:
     _, kept, same = np.unique(_names(vertices), axis=0, return_index=True, return_inverse=True)
     metres = (vertices[kept] + 0.5) * voxel_map.config.cell
     return Mesh(metres.astype(np.float32), same.ravel()[faces].astype(np.int32))
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """A triangle mesh.
+
+    Attributes:
+        vertices: (N, 3) float32 metres, world frame.
+        faces: (M, 3) int32, anticlockwise seen from outside.
+    """
+
+    vertices: NDArray[np.float32]
+    faces: NDArray[np.int32]
+
+
+def write_glb(voxel_map: VoxelMap, path: str | Path) -> None:
+    """Write the outer faces of the occupied cells, coloured by height; glTF's y is the map's `up`, units are metres.
+
+    Vertices are in the map's own frame, a node turns them. Raises MapFileError for a map without occupied cells and
+    for a place that cannot be written.
+    """
+    from trimesh import Scene
+    from trimesh.exchange.gltf import export_glb
+    from trimesh.visual import TextureVisuals
+    from trimesh.visual.material import PBRMaterial
+
+    mesh = cube_faces(voxel_map)
+    if not len(mesh.faces):
+        raise MapFileError(f"{path}: the map holds no occupied cell, there is nothing to show")
+    across, along, up = upright_axes(voxel_map.config.up)
+    turn = np.eye(4)
+    turn[:3, :3] = [across, up, -along]
+    matt = TextureVisuals(material=PBRMaterial(metallicFactor=0.0, roughnessFactor=1.0, doubleSided=True))
+    matt.vertex_attributes["color"] = _linear_colours(mesh.vertices @ up)
+    scene = Scene()
+    scene.add_geometry(_trimesh(mesh, matt), node_name="map", geom_name="map", transform=turn)
+    content = export_glb(scene, include_normals=False)
+    with replacing(path) as file:
+        file.write(content)
+
+
+def write_obj(voxel_map: VoxelMap, path: str | Path) -> None:
+    """Write the surface around the occupied cells (`surface`) as text: metres, in the map's own frame.
+
+    Raises MapFileError for a map without occupied cells and for an unwritable place, MissingExtra without scikit-image.
+    """
+    from trimesh.exchange.obj import export_obj
+
+    text = export_obj(_surface(voxel_map, path), include_normals=False, digits=OBJ_DIGITS, header=TITLE)
+    with replacing(path) as file:
+        file.write(f"{text}\n".encode())
+
+
+def write_stl(voxel_map: VoxelMap, path: str | Path) -> None:
+    """Write the surface around the occupied cells (`surface`) as binary STL: metres, in the map's own frame.
+
+    Raises as `write_obj` does.
+    """
+    from trimesh.exchange.stl import export_stl
+
+    content = export_stl(_surface(voxel_map, path))
+    with replacing(path) as file:
+        file.write(TITLE.encode().ljust(STL_TITLE_BYTES))
+        file.write(memoryview(content)[STL_TITLE_BYTES:])
+
+
+def cube_faces(voxel_map: VoxelMap) -> Mesh:
+    """Return each face between an occupied cell and one that is not, as two triangles; equal corners are one vertex.
+
+    Raises StereovoxError for a map that is too wide.
+    """
+    cells = voxel_map.cells_in(State.OCCUPIED).astype(np.int64)
+    lowest = cells.min(axis=0) - 1 if len(cells) else np.zeros(3, np.int64)
+    cells = cells - lowest
+    if len(cells) and cells.max() + 1 >= SPAN:
+        raise StereovoxError(f"a map of more than {SPAN - 2} cells in a row has no picture; crop it")
+    present = np.sort(_codes(cells))
+    quads = [_quads(cells, present, axis, side) for axis in range(3) for side in (0, 1)]
+    corners = np.concatenate([np.zeros((0, 4, 3), np.int64), *quads])
+    codes, of_corner = np.unique(_codes(corners.reshape(-1, 3)), return_inverse=True)
+    faces = of_corner.reshape(-1, 4)[:, TRIANGLES].reshape(-1, 3)
+    vertices = (_places(codes) + lowest) * np.array(voxel_map.config.cell)
+    return Mesh(vertices.astype(np.float32), faces.astype(np.int32))
 
 
 def _parts(voxel_map: VoxelMap) -> Iterator[tuple[NDArray[np.float64], NDArray[np.int64]]]:
@@ -96,7 +187,7 @@ def _field(voxel_map: VoxelMap, corner: NDArray[np.int32]) -> NDArray[np.float32
     level = int(rules.thresholds.occupied_least) - 0.5
     span = max(float(rules.highest) - level, level - float(rules.lowest))
     field = np.where(cells == rules.format.unknown, -span, cells - level)
-    field = np.sign(field) * np.maximum(np.abs(field), LEAST * span)
+    field = np.sign(field) * np.maximum(np.abs(field), MIN_OFFSET * span)
     whole = field.reshape(side, side, side, SIDE, SIDE, SIDE).transpose(0, 3, 1, 4, 2, 5).reshape((side * SIDE,) * 3)
     return whole[(slice(0, GROUP * SIDE + 1),) * 3].astype(np.float32)
 
@@ -107,87 +198,7 @@ def _names(vertices: NDArray[np.float64]) -> NDArray[np.int64]:
     Twice the place of its middle: so one that stands on no edge, of which a cube has at most one, has its own name.
     """
     whole = np.rint(vertices)
-    return (np.where(np.abs(vertices - whole) < LEAST / 2, 2 * whole, 2 * np.floor(vertices) + 1)).astype(np.int64)
-
-
-SPAN = 1 << 21
-"""Corners of cells on each axis that three of them fit into one int64."""
-TRIANGLES = ((0, 1, 2), (0, 2, 3))
-TITLE = "stereovox: surface of occupied cells, metres"
-STL_TITLE_BYTES = 80
-OBJ_DIGITS = 6
-"""Decimals of a coordinate in an `.obj`: a micrometre."""
-
-
-def write_glb(voxel_map: VoxelMap, path: str | Path) -> None:
-    """Write the outer faces of the occupied cells, coloured by height; glTF's y is the map's `up`, units are metres.
-
-    Vertices are in the map's own frame, a node turns them. Raises MapFileError for a map without occupied cells and
-    for a place that cannot be written.
-    """
-    from trimesh import Scene
-    from trimesh.exchange.gltf import export_glb
-    from trimesh.visual import TextureVisuals
-    from trimesh.visual.material import PBRMaterial
-
-    mesh = cube_faces(voxel_map)
-    if not len(mesh.faces):
-        raise MapFileError(f"{path}: the map holds no occupied cell, there is nothing to show")
-    across, along, up = upright_axes(voxel_map.config.up)
-    turn = np.eye(4)
-    turn[:3, :3] = [across, up, -along]
-    matt = TextureVisuals(material=PBRMaterial(metallicFactor=0.0, roughnessFactor=1.0, doubleSided=True))
-    matt.vertex_attributes["color"] = _linear_colours(mesh.vertices @ up)
-    scene = Scene()
-    scene.add_geometry(_trimesh(mesh, matt), node_name="map", geom_name="map", transform=turn)
-    content = export_glb(scene, include_normals=False)
-    with replacing(path) as file:
-        file.write(content)
-
-
-def write_obj(voxel_map: VoxelMap, path: str | Path) -> None:
-    """Write the surface about the occupied cells (`mesh.surface`) as text: metres, in the map's own frame.
-
-    Raises MapFileError for a map without occupied cells and a place that cannot be written, MissingExtra without
-    scikit-image.
-    """
-    from trimesh.exchange.obj import export_obj
-
-    text = export_obj(_surface(voxel_map, path), include_normals=False, digits=OBJ_DIGITS, header=TITLE)
-    with replacing(path) as file:
-        file.write(f"{text}\n".encode())
-
-
-def write_stl(voxel_map: VoxelMap, path: str | Path) -> None:
-    """Write the surface about the occupied cells (`mesh.surface`) as binary STL: metres, in the map's own frame.
-
-    Raises as `write_obj` does.
-    """
-    from trimesh.exchange.stl import export_stl
-
-    content = export_stl(_surface(voxel_map, path))
-    with replacing(path) as file:
-        file.write(TITLE.encode().ljust(STL_TITLE_BYTES))
-        file.write(memoryview(content)[STL_TITLE_BYTES:])
-
-
-def cube_faces(voxel_map: VoxelMap) -> Mesh:
-    """Return each face between an occupied cell and one that is not, as two triangles; equal corners are one vertex.
-
-    Raises StereovoxError for a map that is too wide.
-    """
-    cells = voxel_map.cells_in(State.OCCUPIED).astype(np.int64)
-    lowest = cells.min(axis=0) - 1 if len(cells) else np.zeros(3, np.int64)
-    cells = cells - lowest
-    if len(cells) and cells.max() + 1 >= SPAN:
-        raise StereovoxError(f"a map of more than {SPAN - 2} cells in a row has no picture; crop it")
-    present = np.sort(_codes(cells))
-    quads = [_quads(cells, present, axis, side) for axis in range(3) for side in (0, 1)]
-    corners = np.concatenate([np.zeros((0, 4, 3), np.int64), *quads])
-    codes, of_corner = np.unique(_codes(corners.reshape(-1, 3)), return_inverse=True)
-    faces = of_corner.reshape(-1, 4)[:, TRIANGLES].reshape(-1, 3)
-    vertices = (_places(codes) + lowest) * np.array(voxel_map.config.cell)
-    return Mesh(vertices.astype(np.float32), faces.astype(np.int32))
+    return (np.where(np.abs(vertices - whole) < MIN_OFFSET / 2, 2 * whole, 2 * np.floor(vertices) + 1)).astype(np.int64)
 
 
 def _quads(cells: NDArray[np.int64], present: NDArray[np.int64], axis: int, side: int) -> NDArray[np.int64]:

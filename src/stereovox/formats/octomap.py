@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""OctoMap's `.bt` and `.ot` files: read into voxel maps and written, node by node of a pruned octree.
+"""OctoMap's file formats `.bt` (free or occupied) and `.ot` (log-odds), read and written.
 
-OctoMap's two file formats: `.bt` (free or occupied) and `.ot` (log-odds).
-Both are a short text header and then the nodes of a 16-level octree, each before its children (format: OctoMap 1.10,
-classes AbstractOcTree, OccupancyOcTreeBase and OcTreeDataNode). OctoMap's cell i covers the same space as ours.
+Both are a short text header and then the nodes of a 16-level pruned octree, each before its children (format: OctoMap
+1.10, classes AbstractOcTree, OccupancyOcTreeBase and OcTreeDataNode). OctoMap's cell i covers the same space as ours.
 """
 
 from __future__ import annotations
@@ -29,7 +28,102 @@ DEPTH = 16
 KEY_ZERO = 1 << (DEPTH - 1)
 """The key of cell index 0: keys are indices plus this."""
 FREE, OCCUPIED, BRANCH = 1, 2, 3
-"""What a node says about each child, in two bits; 0 where there is none."""
+"""Two bits per child of a node; 0 for no child."""
+BINARY_TITLE = "# Octomap OcTree binary file"
+TREE_TITLE = "# Octomap OcTree file"
+TREE_NODE = np.dtype([("log_odds", "<f4"), ("children", "u1")])
+"""One node of an `.ot` file; bit i of `children` says that child i exists."""
+MAX_BLOCKS = 2**18
+"""Blocks of 8x8x8 cells a file may expand to (134 million cells); one node can claim 35 million million cells."""
+BLOCKS_OF_ANY, BLOCKS_A_LEAF = 2**16, 256
+"""Blocks that any file may expand to, and more per leaf: a file of 40 bytes must not take a second."""
+MAX_LOG_ODDS = 30.0
+OCTOMAP: dict[str, Any] = {"map.prior": 0.5, "map.log_odds_min": -2.0, "map.log_odds_max": 3.5}
+"""OctoMap's defaults, which its files do not record."""
+MAX_HEADER_LENGTH = 1 << 16
+MAX_NODES = 2 * 512 * MAX_BLOCKS
+MAX_BYTES = 8 * MAX_NODES
+"""A tree of so many cells has fewer nodes and bytes."""
+
+
+def read_octomap(path: str | Path) -> VoxelMap:
+    """Return the map in an OctoMap file of the tree type OcTree; pruned nodes become the cells they stand for.
+
+    `.bt` cells get OctoMap's own clamping limits (log-odds -2 and 3.5). `.ot` cells keep their log-odds to the nearest
+    thousandth, at most 30 either way; a log-odds of zero becomes 0.001, "just known". The map's settings are the
+    default profile's with the file's voxel size, OctoMap's prior of 0.5, and limits that hold the file's values.
+    Raises MapFileError: one line with the file and what is wrong.
+    """
+    content = _read(Path(path))
+    try:
+        title, header, body = _split(content)
+        return map_of_nodes(title, body, _voxel_size(header), _size(header))
+    except (ValueError, ConfigError) as error:
+        raise MapFileError(f"{path}: not a whole OctoMap file: {error}; export it again") from None
+
+
+def write_bt(voxel_map: VoxelMap, path: str | Path) -> None:
+    """Write the map as OctoMap's binary tree; see `binary_tree`.
+
+    Raises MapFileError for cells outside [-32768, 32768), no cell at all, or a place that cannot be written.
+    """
+    _write(path, BINARY_TITLE, voxel_map, binary_tree(voxel_map))
+
+
+def write_ot(voxel_map: VoxelMap, path: str | Path) -> None:
+    """Write the map as OctoMap's full tree; see `full_tree`.
+
+    Raises MapFileError for cells outside [-32768, 32768), no cell at all, or a place that cannot be written.
+    """
+    _write(path, TREE_TITLE, voxel_map, full_tree(voxel_map))
+
+
+def map_of_nodes(title: str, body: bytes, voxel_size: float, size: int | None = None) -> VoxelMap:
+    """Return the map in the nodes `body` of a tree, those of BINARY_TITLE or of TREE_TITLE.
+
+    voxel_size: metres. size: how many nodes there should be, if that is known.
+    Raises ValueError for damaged nodes, ConfigError for a size that no cell can have.
+    """
+    config = load_config(voxel_size=voxel_size, **OCTOMAP)
+    leaves = _binary_leaves(body, size, config) if title == BINARY_TITLE else _tree_leaves(body, size)
+    return _map_of(leaves, _with_limits(config, leaves.log_odds))
+
+
+@one_state
+def binary_tree(voxel_map: VoxelMap) -> Tree:
+    """Return the map as OctoMap's binary tree: each cell free, occupied or unknown; eight equal cells become one.
+
+    Occupied and free cells stay so. The format cannot express tentative cells: with p >= 0.5 (OctoMap's own threshold)
+    they become occupied, below that unknown. So a user of the file meets no free cell that is not free in the map, and
+    misses no obstacle that the map suspects; but a tentative cell may count as occupied there. Raises MapFileError for
+    cells outside [-32768, 32768).
+    """
+    indices, log_odds = voxel_map.cells()
+    state = voxel_map.state(voxel_map.centers(indices))
+    occupied = (state == State.OCCUPIED) | ((state == State.TENTATIVE) & (log_odds >= 0))
+    known = occupied | (state == State.FREE)
+    nodes = build_octree(indices[known], np.where(occupied, 1, -1)[known].astype(np.float32))
+    return Tree(len(nodes), nodes.children[nodes.children > 0].astype("<u2").tobytes())
+
+
+def full_tree(voxel_map: VoxelMap) -> Tree:
+    """Return the map as OctoMap's full tree: every known cell with its log-odds, branches with their highest.
+
+    Raises MapFileError for cells outside [-32768, 32768).
+    """
+    nodes = build_octree(*voxel_map.cells())
+    records = np.zeros(len(nodes), TREE_NODE)
+    records["log_odds"] = nodes.values
+    for child in range(8):
+        records["children"] |= ((nodes.children >> 2 * child & 3 > 0) << child).astype(np.uint8)
+    return Tree(len(nodes), records.tobytes())
+
+
+class Tree(NamedTuple):
+    """The nodes of a tree as in OctoMap's files and `octomap_msgs/Octomap`, and their number."""
+
+    size: int
+    data: bytes
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,66 +215,6 @@ def _with_sort_keys(level: Nodes, height: int) -> Nodes:
     return Nodes(keys, level.values, level.children)
 
 
-BINARY_TITLE = "# Octomap OcTree binary file"
-TREE_TITLE = "# Octomap OcTree file"
-TREE_NODE = np.dtype([("log_odds", "<f4"), ("children", "u1")])
-"""One node of an `.ot` file; bit i of `children` says that child i exists."""
-
-
-class Tree(NamedTuple):
-    """The nodes of a tree as OctoMap's files and `octomap_msgs/Octomap` hold them, and how many they are."""
-
-    size: int
-    data: bytes
-
-
-def write_bt(voxel_map: VoxelMap, path: str | Path) -> None:
-    """Write the map as OctoMap's binary tree; see `binary_tree`.
-
-    Raises MapFileError for cells outside [-32768, 32768), no cell at all, or a place that cannot be written.
-    """
-    _write(path, BINARY_TITLE, voxel_map, binary_tree(voxel_map))
-
-
-def write_ot(voxel_map: VoxelMap, path: str | Path) -> None:
-    """Write the map as OctoMap's full tree; see `full_tree`.
-
-    Raises MapFileError for cells outside [-32768, 32768), no cell at all, or a place that cannot be written.
-    """
-    _write(path, TREE_TITLE, voxel_map, full_tree(voxel_map))
-
-
-@one_state
-def binary_tree(voxel_map: VoxelMap) -> Tree:
-    """Return the map as OctoMap's binary tree: each cell free, occupied or unknown; eight equal cells become one.
-
-    Occupied and free cells stay so. The tree has no word for a tentative cell: with p >= 0.5 (OctoMap's own threshold)
-    it becomes occupied, below that unknown. So who flies by the file meets no free cell that the map does not call
-    free, and no obstacle that the map has reason to suspect is missing; a cell that counts as tentative here may
-    count as occupied there.
-    Raises MapFileError for cells outside [-32768, 32768).
-    """
-    indices, log_odds = voxel_map.cells()
-    state = voxel_map.state(voxel_map.centers(indices))
-    occupied = (state == State.OCCUPIED) | ((state == State.TENTATIVE) & (log_odds >= 0))
-    known = occupied | (state == State.FREE)
-    nodes = build_octree(indices[known], np.where(occupied, 1, -1)[known].astype(np.float32))
-    return Tree(len(nodes), nodes.children[nodes.children > 0].astype("<u2").tobytes())
-
-
-def full_tree(voxel_map: VoxelMap) -> Tree:
-    """Return the map as OctoMap's full tree: every known cell with its log-odds, branches with their highest.
-
-    Raises MapFileError for cells outside [-32768, 32768).
-    """
-    nodes = build_octree(*voxel_map.cells())
-    records = np.zeros(len(nodes), TREE_NODE)
-    records["log_odds"] = nodes.values
-    for child in range(8):
-        records["children"] |= ((nodes.children >> 2 * child & 3 > 0) << child).astype(np.uint8)
-    return Tree(len(nodes), records.tobytes())
-
-
 def _write(path: str | Path, title: str, voxel_map: VoxelMap, tree: Tree) -> None:
     if not tree.size:
         raise MapFileError(f"{path}: the map holds no cell that such a file knows, there is nothing to write")
@@ -198,51 +232,11 @@ def _write(path: str | Path, title: str, voxel_map: VoxelMap, tree: Tree) -> Non
         file.write(tree.data)
 
 
-MAX_BLOCKS = 2**18
-"""Blocks of 8x8x8 cells a file may unfold to (134 million cells); one node can claim 35 million million cells."""
-BLOCKS_OF_ANY, BLOCKS_A_LEAF = 2**16, 256
-"""Few leaves may unfold to fewer: a file of 40 bytes is not to take a second."""
-MAX_LOG_ODDS = 30.0
-OCTOMAP: dict[str, Any] = {"map.prior": 0.5, "map.log_odds_min": -2.0, "map.log_odds_max": 3.5}
-"""What OctoMap does when nothing else is said; the files do not tell."""
-MAX_HEADER_LENGTH = 1 << 16
-MAX_NODES = 2 * 512 * MAX_BLOCKS
-MAX_BYTES = 8 * MAX_NODES
-"""A tree of so many cells has fewer nodes and bytes."""
-
-
 @dataclass(frozen=True, eq=False)
 class _Leaves:
     corners: NDArray[np.int32]
     heights: NDArray[np.uint8]
     log_odds: NDArray[np.float32]
-
-
-def read_octomap(path: str | Path) -> VoxelMap:
-    """Return the map in an OctoMap file of the tree type OcTree; pruned nodes become the cells they stand for.
-
-    `.bt` cells get OctoMap's own clamping limits (log-odds -2 and 3.5). `.ot` cells keep their log-odds to the nearest
-    thousandth, at most 30 either way; a log-odds of zero becomes 0.001, "just known". The map's settings are the
-    default profile's with the file's voxel size, OctoMap's prior of 0.5, and limits that hold the file's values.
-    Raises MapFileError: one line with the file and what is wrong.
-    """
-    content = _read(Path(path))
-    try:
-        title, header, body = _split(content)
-        return map_of_nodes(title, body, _voxel_size(header), _size(header))
-    except (ValueError, ConfigError) as error:
-        raise MapFileError(f"{path}: not a whole OctoMap file: {error}; export it again") from None
-
-
-def map_of_nodes(title: str, body: bytes, voxel_size: float, size: int | None = None) -> VoxelMap:
-    """Return the map in the nodes `body` of a tree, those of BINARY_TITLE or of TREE_TITLE.
-
-    voxel_size: metres. size: how many nodes there should be, if that is known.
-    Raises ValueError for damaged nodes, ConfigError for a size that no cell can have.
-    """
-    config = load_config(voxel_size=voxel_size, **OCTOMAP)
-    leaves = _binary_leaves(body, size, config) if title == BINARY_TITLE else _tree_leaves(body, size)
-    return _map_of(leaves, _with_limits(config, leaves.log_odds))
 
 
 def _read(path: Path) -> bytes:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A map as plain points: `.ply` and `.pcd` for point cloud programs, `.npz` for NumPy."""
+"""Maps as points: `.ply` and `.pcd` for point cloud programs, `.npz` for NumPy."""
 
 from __future__ import annotations
 
@@ -41,9 +41,9 @@ def write_ply(voxel_map: VoxelMap, path: str | Path) -> None:
 
 @one_state
 def write_pcd(voxel_map: VoxelMap, path: str | Path) -> None:
-    """Write the occupied cells as PCL's binary point cloud, with what `write_ply` tells of them.
+    """Write the occupied cells as PCL's binary point cloud, with the same fields as `write_ply`.
 
-    Raises MapFileError when the place cannot be written.
+    Raises MapFileError where the file cannot be written.
     """
     points, colours = _occupied(voxel_map, PCD_POINT)
     points["rgb"] = colours.astype(np.uint32) @ np.array([1 << 16, 1 << 8, 1], np.uint32)
@@ -51,12 +51,12 @@ def write_pcd(voxel_map: VoxelMap, path: str | Path) -> None:
 
 
 def write_npz(voxel_map: VoxelMap, path: str | Path) -> None:
-    """Write every known cell for `numpy.load`, and the settings, so that `npz_read.read_npz` gives the same cells.
+    """Write every known cell for `numpy.load`, with the settings, so that `read_points.read_npz` restores the same
+    cells.
 
     Arrays: `indices` (N, 3) int32, cell i covers [i, i + 1) * voxel_size; `log_odds` (N,) float32; and the numbers
-    `voxel_size` in metres, `free_below` and `occupied_above` (probabilities). What is not named is unknown.
-    `settings` (M,) uint8 is JSON.
-    Raises MapFileError when the place cannot be written.
+    `voxel_size` in metres, `free_below` and `occupied_above` (probabilities). Cells not listed are unknown. `settings`
+    (M,) uint8 is JSON. Raises MapFileError where the file cannot be written.
     """
     indices, log_odds = voxel_map.cells()
     limits = voxel_map.config.map
@@ -106,7 +106,7 @@ def _ply_header(number: int, voxel_size: float) -> str:
     lines = [
         "ply",
         "format binary_little_endian 1.0",
-        f"comment {_told(voxel_size)}",
+        f"comment {_format_voxel_size(voxel_size)}",
         f"element vertex {number}",
         *properties,
         "end_header",
@@ -117,7 +117,7 @@ def _ply_header(number: int, voxel_size: float) -> str:
 def _pcd_header(number: int, voxel_size: float) -> str:
     names = PCD_POINT.names or ()
     lines = [
-        f"# {_told(voxel_size)}",
+        f"# {_format_voxel_size(voxel_size)}",
         "VERSION 0.7",
         f"FIELDS {' '.join(names)}",
         f"SIZE {' '.join(str(PCD_POINT[name].itemsize) for name in names)}",
@@ -132,6 +132,6 @@ def _pcd_header(number: int, voxel_size: float) -> str:
     return "\n".join([*lines, ""])
 
 
-def _told(voxel_size: float) -> str:
-    """Return what a file says of its points; `point_files` reads the size of a cell from it."""
+def _format_voxel_size(voxel_size: float) -> str:
+    """Return the comment from which `read_points` reads the size of a cell."""
     return f"centres of occupied cells of {voxel_size!r} m"

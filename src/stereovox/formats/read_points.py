@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Read the points of `.ply` and `.pcd` files, of ours and of other programs (formats: Turk 1994; PCL's PCD 0.7).
+"""Read maps from points: `.ply` and `.pcd` of any program, and our `.npz` (formats: Turk 1994; PCL's PCD 0.7).
 
-By hand, because trimesh reads no PCD and no dependency unpacks its LZF.
+Written by hand, because trimesh reads no PCD and no dependency decompresses its LZF.
 """
 
 from __future__ import annotations
@@ -23,14 +23,71 @@ from stereovox.maps.queries import INDEX_LIMIT
 from stereovox.safe_io import json_value, read_arrays, read_bounded, shown
 
 MAX_BLOCKS = 2**19
-"""Blocks of 8x8x8 cells, 1 KB each, that cells of a file may lie in: a file of far points is not to fill the memory."""
+"""Most blocks of 8x8x8 cells, 1 KB each, so that a file of far-apart points cannot fill the memory."""
+ARRAYS = ("indices", "log_odds", "voxel_size", "free_below", "occupied_above", "settings")
+MAX_BYTES = 1 << 32
+MAX_HEADER_LENGTH, MAX_FIELDS = 1 << 16, 256
+TEXT_PIECE, BLANK = 1 << 20, re.compile(rb"\s")
+"""Bytes of text read at once, and the separator of its numbers."""
+OURS = re.compile(r"centres of occupied cells of (\S+) m")
+"""The comment in our own files with the side of a cell."""
+PLY_TYPES = {
+    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
+    "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
+    "float": "f4", "double": "f8", "float32": "f4", "float64": "f8",
+}  # fmt: skip
+PLY_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+COLUMNS = "columns"
+"""The order of compressed points: all numbers of one field, little-endian, then all of the next."""
+PCD_ORDERS = {"ascii": "", "binary": "<", "binary_compressed": COLUMNS}
+MAX_RATIO = 100
+"""Largest LZF compression ratio accepted; at best it makes 264 bytes of 3."""
+PCD_KINDS = {"I": "i", "U": "u", "F": "f"}
+PCD_SIZES = {"i": (1, 2, 4, 8), "u": (1, 2, 4, 8), "f": (4, 8)}
+
+
+def read_point_map(path: str | Path, voxel_size: float | None = None) -> VoxelMap:
+    """Return a map in which each cell that holds a point of a `.ply` or `.pcd` is occupied, all others unknown.
+
+    voxel_size: metres; None where the file is one of ours and tells it. The file's x, y and z are taken for metres.
+    Raises MapFileError: one line with the file and what is wrong.
+    """
+    points = read_points(path)
+    size = points.voxel_size if voxel_size is None else voxel_size
+    if size is None:
+        raise MapFileError(f"{path}: does not tell how large cells should be; give --voxel-size in metres")
+    try:
+        return cells_of_points(points.xyz, size)
+    except StereovoxError as error:
+        raise MapFileError(f"{path}: {error}") from None
+
+
+def read_npz(path: str | Path) -> VoxelMap:
+    """Return the map in one of our `.npz`, cell for cell; the file does not hold the map's history.
+
+    Raises MapFileError: one line with the file and what is wrong.
+    """
+    try:
+        arrays = read_arrays(path, ARRAYS, "cells of a map; write them with stereovox export")
+        settings = json_value(arrays["settings"].astype(np.uint8, casting="safe").tobytes())
+        if not isinstance(settings, dict):
+            raise ValueError("settings is no table")
+        indices, log_odds = _checked(arrays["indices"], arrays["log_odds"])
+        return VoxelMap.from_cells(load_config(settings), indices, log_odds)
+    except MapFileError:
+        raise
+    except OSError as error:
+        raise MapFileError(f"{path}: cannot be read ({error.strerror or error}); name a file of cells") from None
+    except Exception as error:  # what a damaged file can raise in zipfile, zlib and NumPy is not bounded
+        why = " ".join(str(error).split()) or type(error).__name__
+        raise MapFileError(f"{path}: no cells that can be read ({why}); export them again") from None
 
 
 def cells_of_points(points: ArrayLike, voxel_size: float) -> VoxelMap:
     """Return a map of the default profile in which each cell that holds a point is occupied, all others unknown.
 
-    points: (N, 3) metres, world frame; those that are not finite count for nothing. voxel_size: metres.
-    Raises StereovoxError for points so far away that no cell can be there, for too many blocks, or a bad size.
+    points: (N, 3) metres, world frame; those that are not finite are ignored. voxel_size: metres. Raises StereovoxError
+    for points too far away for any cell, for too many blocks, or a bad size.
     """
     points = np.asarray(points, np.float64).reshape(-1, 3)
     config = load_config(voxel_size=voxel_size)
@@ -51,28 +108,23 @@ def check_room(indices: NDArray[np.integer]) -> None:
         raise StereovoxError(f"its cells lie in {blocks} blocks, more than {MAX_BLOCKS}; use larger cells or crop it")
 
 
-ARRAYS = ("indices", "log_odds", "voxel_size", "free_below", "occupied_above", "settings")
+class Points(NamedTuple):
+    """xyz: (N, 3) float64, as they stand in the file. voxel_size: metres, where the file tells that of its cells."""
+
+    xyz: NDArray[np.float64]
+    voxel_size: float | None
 
 
-def read_npz(path: str | Path) -> VoxelMap:
-    """Return the map in a `.npz` of ours, cell for cell; what it remembered of its frames is not in such a file.
-
-    Raises MapFileError: one line with the file and what is wrong.
-    """
+def read_points(path: str | Path) -> Points:
+    """Return the points of a `.ply` or `.pcd` file; raises MapFileError: one line with the file and what is wrong."""
     try:
-        arrays = read_arrays(path, ARRAYS, "cells of a map; write them with stereovox export")
-        settings = json_value(arrays["settings"].astype(np.uint8, casting="safe").tobytes())
-        if not isinstance(settings, dict):
-            raise ValueError("settings is no table")
-        indices, log_odds = _checked(arrays["indices"], arrays["log_odds"])
-        return VoxelMap.from_cells(load_config(settings), indices, log_odds)
-    except MapFileError:
-        raise
+        content = read_bounded(Path(path), MAX_BYTES)
+        head = (_ply_head if content.startswith(b"ply") else _pcd_head)(content)
+        return Points(_xyz(content[head.start :], head), _parse_voxel_size(content[: head.start]))
     except OSError as error:
-        raise MapFileError(f"{path}: cannot be read ({error.strerror or error}); name a file of cells") from None
-    except Exception as error:  # what a damaged file can raise in zipfile, zlib and NumPy is not bounded
-        why = " ".join(str(error).split()) or type(error).__name__
-        raise MapFileError(f"{path}: no cells that can be read ({why}); export them again") from None
+        raise MapFileError(f"{path}: cannot be read ({error.strerror or error}); name a file of points") from None
+    except (ValueError, ConfigError) as error:
+        raise MapFileError(f"{path}: no points that can be read: {error}") from None
 
 
 def _checked(indices: NDArray[np.integer], log_odds: NDArray[np.floating]) -> tuple[NDArray, NDArray]:
@@ -86,34 +138,6 @@ def _checked(indices: NDArray[np.integer], log_odds: NDArray[np.floating]) -> tu
     return indices, log_odds
 
 
-MAX_BYTES = 1 << 32
-MAX_HEADER_LENGTH, MAX_FIELDS = 1 << 16, 256
-TEXT_PIECE, BLANK = 1 << 20, re.compile(rb"\s")
-"""Bytes of text that are read at once, and what parts its numbers."""
-OURS = re.compile(r"centres of occupied cells of (\S+) m")
-"""The comment in files of ours that tells the side of a cell."""
-PLY_TYPES = {
-    "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
-    "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4",
-    "float": "f4", "double": "f8", "float32": "f4", "float64": "f8",
-}  # fmt: skip
-PLY_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
-COLUMNS = "columns"
-"""The order of packed points: all numbers of one field, little-endian, then all of the next."""
-PCD_ORDERS = {"ascii": "", "binary": "<", "binary_compressed": COLUMNS}
-PACKED_BEST = 100
-"""LZF makes at best 264 bytes of 3."""
-PCD_KINDS = {"I": "i", "U": "u", "F": "f"}
-PCD_SIZES = {"i": (1, 2, 4, 8), "u": (1, 2, 4, 8), "f": (4, 8)}
-
-
-class Points(NamedTuple):
-    """xyz: (N, 3) float64, as they stand in the file. voxel_size: metres, where the file tells that of its cells."""
-
-    xyz: NDArray[np.float64]
-    voxel_size: float | None
-
-
 class _Head(NamedTuple):
     """record: one point, name, kind and count of its fields. order: "" for text. start: where points begin."""
 
@@ -121,34 +145,6 @@ class _Head(NamedTuple):
     number: int
     order: str
     start: int
-
-
-def read_point_map(path: str | Path, voxel_size: float | None = None) -> VoxelMap:
-    """Return a map in which each cell that holds a point of a `.ply` or `.pcd` is occupied, all others unknown.
-
-    voxel_size: metres; None where the file is one of ours and tells it. The file's x, y and z are taken for metres.
-    Raises MapFileError: one line with the file and what is wrong.
-    """
-    points = read_points(path)
-    size = points.voxel_size if voxel_size is None else voxel_size
-    if size is None:
-        raise MapFileError(f"{path}: does not tell how large cells should be; give --voxel-size in metres")
-    try:
-        return cells_of_points(points.xyz, size)
-    except StereovoxError as error:
-        raise MapFileError(f"{path}: {error}") from None
-
-
-def read_points(path: str | Path) -> Points:
-    """Return the points of a `.ply` or `.pcd` file; raises MapFileError: one line with the file and what is wrong."""
-    try:
-        content = read_bounded(Path(path), MAX_BYTES)
-        head = (_ply_head if content.startswith(b"ply") else _pcd_head)(content)
-        return Points(_xyz(content[head.start :], head), _told_size(content[: head.start]))
-    except OSError as error:
-        raise MapFileError(f"{path}: cannot be read ({error.strerror or error}); name a file of points") from None
-    except (ValueError, ConfigError) as error:
-        raise MapFileError(f"{path}: no points that can be read: {error}") from None
 
 
 def _lines(content: bytes, last: Callable[[list[str]], bool]) -> tuple[list[list[str]], int]:
@@ -225,7 +221,7 @@ def _packed_xyz(body: bytes, head: _Head, names: list[str]) -> NDArray[np.float6
     types = [np.dtype((f"<{kind}", (n,))) for _, kind, n in head.record]
     starts = np.cumsum([0, *(head.number * kind.itemsize for kind in types)]).tolist()
     size, whole = np.frombuffer(body[:8], "<u4").tolist() if len(body) >= 8 else (0, -1)
-    if whole != starts[-1] or size > len(body) - 8 or whole > PACKED_BEST * size:
+    if whole != starts[-1] or size > len(body) - 8 or whole > MAX_RATIO * size:
         raise ValueError(f"{head.number} points in {starts[-1]} bytes, packed in {len(body) - 8} bytes, cannot be")
     columns = np.empty(whole, np.uint8)
     if unpack(np.frombuffer(body, np.uint8, size, 8), columns) != whole:
@@ -263,7 +259,7 @@ def _numbers(text: bytes, most: int) -> Iterator[NDArray[np.float64]]:
         start, most = end, most - len(words)
 
 
-def _told_size(head: bytes) -> float | None:
+def _parse_voxel_size(head: bytes) -> float | None:
     found = OURS.search(head.decode("ascii", "replace"))
     try:
         return float(found[1]) if found else None

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A map, and frames over time, as a recording for the Rerun viewer (.rrd)."""
+"""Maps, and frames over time, as a recording for the Rerun viewer (.rrd)."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ from stereovox.safe_io import replacing
 from stereovox.se3 import Transform
 from stereovox.threads import one_state
 
-CAMERA, CELLS, WAY = "world/camera", "world/occupied", "world/path"
+CAMERA, CELLS, PATH = "world/camera", "world/occupied", "world/path"
 TIME = "stamp"
 MAX_BOXES = 300_000
-"""More cells than this are written as points."""
+"""Maps of more cells are written as points."""
 WIDEST_PX = 320
-"""Depth images are thinned to so many columns."""
-REST = 25
-"""Times as long as writing the map took must pass before it is written again."""
+"""Most columns of a depth image; larger ones are thinned."""
+REWRITE_RATIO = 25
+"""The map is written again only after this many times as long as writing it took."""
 PATH_COLOUR = (224, 69, 47)
 
 
@@ -53,7 +53,7 @@ def write_rrd(voxel_map: VoxelMap, path: str | Path) -> None:
 
 @contextmanager
 def rerun_file(path: str | Path, up: str) -> Iterator[RerunFile]:
-    """Yield what writes a recording that becomes the file `path` when the block ends well.
+    """Yield the writer of a recording that becomes the file `path` when the block ends without an error.
 
     up: the world's axis that points up. Raises as `write_rrd`.
     """
@@ -84,7 +84,7 @@ class RerunFile:
         self._stream.log(CELLS, self._cells(centres, cell_colours(cubes, centres), size), static=stamp_ns is None)
         lines = [poses[:, :3, 3] for poses in map(voxel_map.history.path.poses, voxel_map.history.path.stops)]
         way = self._rerun.LineStrips3D(lines, colors=[PATH_COLOUR] * len(lines))
-        self._stream.log(WAY, way, static=stamp_ns is None)
+        self._stream.log(PATH, way, static=stamp_ns is None)
 
     def add_camera(self, camera: PinholeCamera | None, T_world_camera: Transform, stamp_ns: int) -> None:
         """Add where a camera stood at a time."""
@@ -122,14 +122,14 @@ class RerunFile:
 
 
 class RerunLog:
-    """Writes each frame as it is mapped, and the map as often as mapping can spare the time."""
+    """Logs each frame as it is mapped, and the map as often as time permits."""
 
     def __init__(self, file: RerunFile, depth: DepthPipeline):
         self._file, self._depth = file, depth
         self._due = 0.0
 
     def after(self, voxel_map: VoxelMap, frame: AnyFrame) -> None:
-        """Write a frame that was offered to the map, between two frames."""
+        """Log a frame that was offered to the map, between two frames."""
         start = monotonic()
         try:
             self._file.add_depth(self._depth.image(self._depth.matched(frame)))
@@ -138,10 +138,10 @@ class RerunLog:
         if start >= self._due:
             self._file.add_map(voxel_map.snapshot(), int(frame.stamp_ns))
             done = monotonic()
-            self._due = done + REST * (done - start)
+            self._due = done + REWRITE_RATIO * (done - start)
 
     def finish(self, voxel_map: VoxelMap) -> None:
-        """Write the map as it is when the last frame is in it."""
+        """Log the map after its last frame."""
         stamp_ns = 0 if voxel_map.viewpoint is None else voxel_map.viewpoint.stamp_ns
         self._file.add_map(voxel_map.snapshot(), stamp_ns)
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How well a robot's scans fit a map along the way that was found: whether it is the right map, and the right place."""
+"""How well a robot's scans fit a map along its track: whether it is the right map and the right place."""
 
 from __future__ import annotations
 

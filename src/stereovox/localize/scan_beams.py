@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A scan that can be trusted, as beams in the robot's frame seen from above."""
+"""A validated scan as beams in the robot's frame, seen from above."""
 
 from __future__ import annotations
 
@@ -48,10 +48,10 @@ class Beams:
 
 
 def beams_of(scan: Scan, max_range: float | None = None) -> Beams:
-    """Return what a scan says: NaN, -inf and what lies below `range_min` say nothing, +inf that nothing was met.
+    """Return the beams of a scan: NaN, -inf and ranges below `range_min` are ignored, +inf means that nothing was met.
 
-    max_range: metres beyond which nothing counts as met; None: the scan's own.
-    The scan must be `validate_scan`. Raises FrameRefused with the reason: `bad_scan`, `no_valid_range`.
+    max_range: metres beyond which nothing counts as met; None: the scan's own. The scan must be validated (`validate_scan`). Raises
+    FrameRefused with the reason: `bad_scan`, `no_valid_range`.
     """
     ranges, farthest = np.asarray(scan.ranges, float), _farthest(scan, max_range)
     known = (ranges >= scan.range_min) & (ranges > 0)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What localisation finds: by how much the odometry has drifted, over time."""
+"""The result of localisation: a robot's track and its odometry's drift over time."""
 
 from __future__ import annotations
 
@@ -21,13 +21,12 @@ Posed = TypeVar("Posed", bound=Frame | Scan)
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """A robot's way through a map, and its odometry's drift.
+    """A robot's track through a map, and its odometry's drift.
 
-    stamps_ns: (N,) int64 nanoseconds, rising.
-    pose_map_base: (N, 3) float64, where the robot stood in the map.
-    pose_map_odom: (N, 3) float64, what turns the odometry's poses into those (the `map -> odom` of ROS).
-    refused: how many scans were left out, by reason; first_refusal: what was said of the first one.
-    Raises StereovoxError, one line, where stamps do not rise: times between them would then be looked up wrongly.
+    stamps_ns: (N,) int64 nanoseconds, ascending. pose_map_base: (N, 3) float64, the robot in the map. pose_map_odom:
+    (N, 3) float64, from the odometry's poses to those (the `map -> odom` of ROS). refused: scans left out, by reason;
+    first_refusal: message of the first one. Raises StereovoxError where stamps do not ascend: times between them would
+    be looked up wrongly.
     """
 
     stamps_ns: NDArray[np.int64]
@@ -63,7 +62,7 @@ class Track:
     def save(self, path: str | Path) -> None:
         """Write where the robot stood as lines `stamp tx ty tz qx qy qz qw` (TUM): seconds, metres, quaternion.
 
-        Raises MapFileError, one line, where the file cannot be written; an older one is then still there.
+        Raises MapFileError where the file cannot be written; an older one is then still there.
         """
         with replacing(path) as file:
             file.write(b"# stamp tx ty tz qx qy qz qw: robot in the map, on the floor\n")

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is made of maps: distances, frontiers, ground, paths, and other maps."""
+"""Products of maps: distances, frontiers, ground, paths, projections, and maps derived from maps."""

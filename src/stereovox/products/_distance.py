@@ -28,7 +28,7 @@ def refresh(stored, rules, wanted, low, order, shape, seen, mask, dirty):
     for x in range(first[0], last[0] + 1):
         for y in range(first[1], last[1] + 1):
             for z in range(first[2], last[2] + 1):
-                if _look(stored, rules, wanted, x, y, z, now, seen[number]):
+                if _find_changes(stored, rules, wanted, x, y, z, now, seen[number]):
                     block = (8 * x - low[0], 8 * y - low[1], 8 * z - low[2])
                     changed += _enter(now, seen[number], block, order, shape, mask, dirty)
                 number += 1
@@ -36,8 +36,8 @@ def refresh(stored, rules, wanted, low, order, shape, seen, mask, dirty):
 
 
 @cell
-def _look(stored, rules, wanted, x, y, z, now, seen):
-    """Set `now` (512,) to which cells of a block are obstacles; tell whether any differs from `seen`."""
+def _find_changes(stored, rules, wanted, x, y, z, now, seen):
+    """Set `now` (512,) to which cells of a block are obstacles; return whether any differs from `seen`."""
     row = row_of(stored, x, y, z)
     differ = np.uint8(0)
     if row < 0:

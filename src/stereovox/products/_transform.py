@@ -36,10 +36,10 @@ def across_slabs(field, costs, lanes, dirty, first, step):
                 if number:
                     old = field.partial[b, a]
                     if not _amended(runs[b], field.runs[a, b], moved[:number], costs, old, best):
-                        _made(runs[b], lanes, costs, line, best)
+                        _rebuild(runs[b], lanes, costs, line, best)
                     for c in range(padded):
                         field.runs[a, b, c] = runs[b, c]
-                    _take_over(field, b, a, lanes, best)
+                    _replace(field, b, a, lanes, best)
 
 
 @allocating_kernel
@@ -106,7 +106,7 @@ def _square(costs, run):
 
 @cell
 def _amended(new, old, moved, costs, before, best):
-    """Set `best` to the row `before`, amended for the lanes that moved; tell whether that is all there is to do.
+    """Set `best` to the row `before`, amended for the lanes that moved; return whether that is all there is to do.
 
     It is where no lane that moved away was the nearest of any other.
     """
@@ -128,7 +128,7 @@ def _amended(new, old, moved, costs, before, best):
 
 
 @cell
-def _made(runs, lanes, costs, line, best):
+def _rebuild(runs, lanes, costs, line, best):
     """Make a row anew: `line` holds it between two rows of nothing, so that it can be looked at from any lane off."""
     padded, middle = best.size, costs.lanes.size // 2
     least, most = LARGEST, NO
@@ -144,15 +144,15 @@ def _made(runs, lanes, costs, line, best):
 
 
 @cell
-def _take_over(field, b, a, lanes, best):
+def _replace(field, b, a, lanes, best):
     """Put `best` in the place of a row of `partial`; remember what was less before, and the least that changed."""
-    row, gone = field.partial[b, a], field.gone[b, a]
+    row, superseded = field.partial[b, a], field.superseded[b, a]
     least, lowest = LARGEST, LARGEST
     for c in range(best.size):
         old, new = row[c], best[c]
         least = min(least, _bits(min(old, new)) if old != new else LARGEST)
         lowest = min(lowest, _bits(new) if c < lanes else LARGEST)
-        gone[c] = old if old < new else INFINITE
+        superseded[c] = old if old < new else INFINITE
         row[c] = new
     if least < LARGEST:
         field.touched[b, a], field.lowest[b, a] = _number(least), _number(lowest)
@@ -170,7 +170,7 @@ def _renew(field, costs, b, a, listed, best):
         for other in listed:
             off = cost[abs(a - other)]
             if field.touched[b, other] + off <= highest and missed == NO:
-                most, missed = _lower_unless_missed(best, field.partial[b, other], field.gone[b, other], off)
+                most, missed = _lower_unless_missed(best, field.partial[b, other], field.superseded[b, other], off)
                 seen = YES
     if missed:
         most = _across(field.partial[b], field.lowest[b], cost, a, best)
@@ -225,13 +225,13 @@ def _lower_by_two(best, row, mirrored, cost):
 
 
 @cell
-def _lower_unless_missed(best, row, gone, cost):
-    """Do what `_lower` does, and tell whether what is `gone` from the row may have been the least anywhere."""
+def _lower_unless_missed(best, row, superseded, cost):
+    """Do what `_lower` does, and return whether what is `superseded` from the row may have been the least anywhere."""
     most, missed = NO, NO
     for c in range(best.size):
         other = row[c] + cost
         least = other if other < best[c] else best[c]
         best[c] = least
         most = max(most, _bits(least))
-        missed |= YES if gone[c] + cost <= least else NO
+        missed |= YES if superseded[c] + cost <= least else NO
     return most, missed

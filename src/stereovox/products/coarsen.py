@@ -11,20 +11,29 @@ from stereovox.errors import StereovoxError
 from stereovox.maps import State, VoxelMap
 from stereovox.maps.cell_format import CellRules
 from stereovox.maps.voxel_map import cells_where
-from stereovox.products.side_by_side import put_times
+from stereovox.products.side_by_side import set_times
 from stereovox.threads import one_state
 
 Parents = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], NDArray[np.uint32]]
-"""Cells (N, 3); and (N,) of how many known cells they are made, the largest number these store, their latest time."""
+"""Cells (N, 3); and (N,) the number of known cells in each, the largest value these store, their latest time."""
 
 
 @one_state
 def coarsen(voxel_map: VoxelMap, factor: int) -> VoxelMap:
-    """Return an unbounded map in cells that are `factor` times as long on each side, with the history of the map.
+    """Merge cells into larger ones.
 
-    A cell gets the worst state of those it is made of: occupied, then tentative, unknown, free; it is free only where
+    A coarse cell has the worst state of its parts: occupied, then tentative, unknown, free. So it is free only where
     all of them are, and nothing occupied is lost. Its log-odds are the largest of theirs, its time the latest.
-    Raises StereovoxError for a factor that is no whole number from 1 on, or makes cells too large.
+
+    Args:
+        voxel_map: The map.
+        factor: How many times longer each side becomes; a whole number from 1 on.
+
+    Returns:
+        An unbounded map with the history of `voxel_map`.
+
+    Raises:
+        StereovoxError: `factor` is not such a number, or makes cells too large.
     """
     if not 1 <= factor < 2**31 or factor != int(factor):
         raise StereovoxError(f"factor {factor}: give a whole number of cells, 1 or more")
@@ -34,7 +43,7 @@ def coarsen(voxel_map: VoxelMap, factor: int) -> VoxelMap:
     sure = (number == int(factor) ** 3) | (CellRules(voxel_map.config.map).states(stored) != State.FREE)
     coarse = VoxelMap.from_cells(settings, indices[sure], voxel_map.cell_format.log_odds(stored[sure]))
     if settings.map.keep_times:
-        put_times(coarse, indices[sure], times[sure], voxel_map.times_start_ns)
+        set_times(coarse, indices[sure], times[sure], voxel_map.times_start_ns)
     coarse.take_history(voxel_map)
     return coarse
 

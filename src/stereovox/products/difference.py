@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What changed from one map to another."""
+"""Changes from one map to another."""
 
 from __future__ import annotations
 
@@ -20,10 +20,14 @@ from stereovox.threads import one_state
 
 @dataclass(frozen=True, eq=False)
 class Difference:
-    """How an earlier map `a` became `b`: cells (N, 3) int32 in ascending order, in the frame of `a`.
+    """How map `a` became map `b`: cells (N, 3) int32 in ascending order, in the frame of `a`.
 
-    appeared: free before, occupied now. vanished: occupied before, free now. became_known, became_unknown: no matter as
-    what. counts: (4, 4) int64 cells by their `State` in `a` (row) and in `b` (column); 0 where unknown to both.
+    Attributes:
+        appeared: Free before, occupied now.
+        vanished: Occupied before, free now.
+        became_known: Unknown before, known now in any state.
+        became_unknown: Known before, unknown now.
+        counts: (4, 4) int64, cells by their `State` in `a` (row) and in `b` (column); 0 where unknown to both.
     """
 
     appeared: NDArray[np.int32]
@@ -35,11 +39,20 @@ class Difference:
 
 @one_state
 def difference(a: VoxelMap, b: VoxelMap, T_a_b: ArrayLike | None = None) -> Difference:
-    """Return what changed from map `a` to map `b`; each map's own settings tell its states.
+    """Compare two maps cell by cell; each map's own settings determine its states.
 
-    T_a_b: (4, 4) maps the world frame of `b` into that of `a`, see `moved`; none where both are the same. Cells that
-    are tentative in one of the maps count as neither appeared nor vanished. Raises StereovoxError where the cells
-    differ in size, T_a_b is no rigid motion, or there is none and the maps' `up` differs.
+    Cells that are tentative in one of the maps count as neither appeared nor vanished.
+
+    Args:
+        a: The earlier map.
+        b: The later map.
+        T_a_b: (4, 4), maps the world frame of `b` into that of `a` (see `moved`); None where they are the same.
+
+    Returns:
+        The changes.
+
+    Raises:
+        StereovoxError: The cell sizes differ, T_a_b is not a rigid motion, or there is none and the maps' `up` differs.
     """
     check_alike(a, b, T_a_b)
     a, b = in_memory(a), in_memory(b) if T_a_b is None else moved(in_memory(b), T_a_b)
@@ -58,14 +71,14 @@ def difference(a: VoxelMap, b: VoxelMap, T_a_b: ArrayLike | None = None) -> Diff
 def write_difference(changes: Difference, cell: tuple[float, float, float], path: str | Path) -> None:
     """Write the arrays of a `Difference` for `numpy.load`, and `cell`, the sides of a cell in metres.
 
-    Raises MapFileError when the place cannot be written.
+    Raises MapFileError where the file cannot be written.
     """
     with replacing(path) as file:
         np.savez_compressed(file, cell=np.array(cell), **asdict(changes))
 
 
 def _kinds(pairs: NDArray[np.uint8]) -> list[NDArray[np.bool_]]:
-    """Tell which cells, by the number of their state before and that after, are of the four kinds."""
+    """Return masks of the four kinds of changes, by the state numbers before and after."""
     before, after = np.divmod(pairs, len(State))
     return [
         (before == State.FREE) & (after == State.OCCUPIED),

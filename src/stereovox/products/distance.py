@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far the nearest obstacle is from every cell of a box (an unsigned ESDF), brought up to date frame by frame."""
+"""Distance from every cell of a box to the nearest obstacle (an unsigned ESDF), updated frame by frame."""
 
 from __future__ import annotations
 
@@ -21,28 +21,38 @@ from stereovox.safe_io import replacing
 from stereovox.threads import MapLock
 
 TRIGGER = 1 / 8
-"""A window follows when the camera is farther from its middle than this share of the window."""
+"""A window follows the camera once that is farther from its centre than this share of the window."""
 TIE = 1e-6
-"""A face of the box that is so near to a face of cells, in cells, stands on it."""
+"""A face of the box this near to a face of cells, in cells, counts as on it."""
 MEASURES = {"centres": 0.0, "faces": 0.5, "gap": 1.0}
 """How many cells nearer an obstacle counts along each axis."""
 
 
 class DistanceField:
-    """Distances of all cells of a box to the nearest obstacle in the box, exact, in metres.
+    """Exact distances in metres from all cells of a box to the nearest obstacle in the box.
 
-    The box is `low` to `high` (3,) in metres, widened to whole cells, or a window of `size` (3,) metres about the
-    camera, which it follows by whole blocks of 8 cells as soon as the map knows a camera.
-    to: states that are obstacles (not FREE); with UNKNOWN, what was never seen keeps a robot off, too.
-    max_distance: metres; obstacles farther off count as none.
-    measure: `centres` from the middle of a cell to the middle of the obstacle's cell, 0 in an obstacle, as
-    `scipy.ndimage.distance_transform_edt` measures; `faces` to the nearest face of the obstacle's cell; `gap` from
-    whatever point of the cell is nearest: a ball about any point of the cell meets nothing if its radius is less.
-    What is outside the box counts for nothing: a cell nearer to the box's border than to an obstacle may be nearer to
-    one beyond it. After `update` the field is what it would be if it were made anew.
-    One thread may update, others ask for `distance` and `gradient`: each answer is that of one update. What the
-    properties return is for the thread that updates.
-    Raises StereovoxError, one line, for a box that is none or too large, and for other bad input.
+    The box is `low` to `high`, widened to whole cells, or a window of `size` about the camera, which it follows by
+    whole blocks of 8 cells once the map knows a camera. Obstacles outside the box do not count: a cell nearer to the
+    border of the box than to an obstacle may be nearer to one beyond it. After `update` the field equals one computed
+    from scratch.
+
+    One thread may update while others call `distance` and `gradient`: each answer belongs to a single update. The
+    properties are for the updating thread only.
+
+    Args:
+        voxel_map: The map.
+        low: Lowest corner (3,) of the box in metres, world frame.
+        high: Highest corner (3,).
+        size: Sides (3,) of a moving window in metres, in place of `low` and `high`.
+        max_distance: Metres; obstacles farther away count as none.
+        to: States that count as obstacles (not FREE); with UNKNOWN, unseen space also keeps a robot away.
+        measure: `centres`: from cell centre to cell centre, 0 in an obstacle, as
+            `scipy.ndimage.distance_transform_edt`. `faces`: from the centre to the nearest face of the obstacle's cell.
+            `gap`: from the nearest point of the cell: a ball about any point of the cell meets nothing if its radius is
+            smaller.
+
+    Raises:
+        StereovoxError: No box, too large a box, or other bad input.
     """
 
     def __init__(
@@ -66,7 +76,7 @@ class DistanceField:
         self._transform = Transform(tuple(shape.tolist()), self._cell, max_distance, MEASURES[measure])
         blocks = ((self._low + shape - 1) >> 3) - (self._low >> 3) + 1
         self._seen = np.zeros((int(blocks.prod()), CELLS), np.uint8)
-        self._shape, self._made = shape, False
+        self._shape, self._refreshed = shape, False
         if not self._follows or voxel_map.viewpoint is not None:
             self.update()
 
@@ -75,9 +85,13 @@ class DistanceField:
         return f"<DistanceField of {shape} cells of {cell} m>"
 
     def update(self) -> int:
-        """Bring the field up to date with the map; return how many cells became obstacles or ceased to be.
+        """Bring the field up to date with the map.
 
-        Raises StereovoxError where a window has no camera to stand about: the map has no frame yet.
+        Returns:
+            How many cells became obstacles or ceased to be.
+
+        Raises:
+            StereovoxError: A window has no camera to follow, since the map has no frame yet.
         """
         with ExitStack() as mine:
             with self._map.lock:  # always before this field's own, and only as long as the map is read
@@ -86,7 +100,7 @@ class DistanceField:
                     self._follow()
                 changed, dirty = self._refresh()
             self._transform.update(dirty, self._map.config.threads)
-            self._made = True
+            self._refreshed = True
             return changed
 
     @property
@@ -103,31 +117,42 @@ class DistanceField:
     def metres(self) -> NDArray[np.float32]:
         """Distances of all cells (x, y, z) in metres, infinite where no obstacle is near enough.
 
-        A view, not to be written to; `update` changes it.
+        A read-only view that `update` changes.
         """
         self._check_place()
         return self._transform.metres
 
     @property
     def obstacles(self) -> NDArray[np.bool_]:
-        """Which cells (x, y, z) are obstacles; a view, not to be written to."""
+        """Which cells (x, y, z) are obstacles; a read-only view."""
         self._check_place()
         return self._transform.as_box(self._transform.field.mask).view(bool)
 
     def distance(self, points: ArrayLike) -> NDArray[np.float32]:
-        """Return the distances (N,) in metres of the cells that hold points (N, 3) in metres, world frame.
+        """Look up distances.
 
-        Infinite where no obstacle is near enough, NaN outside the box and where a point is not finite.
+        Args:
+            points: (N, 3) metres, world frame.
+
+        Returns:
+            (N,) float32 metres of the cells that hold the points: infinite where no obstacle is near enough, NaN
+                outside the box and for points that are not finite.
         """
         with self._lock:
             return self._at(*self._cells_of(points))
 
     def gradient(self, points: ArrayLike) -> NDArray[np.float32]:
-        """Return how the distance grows (N, 3) at points (N, 3): metres a metre along each axis, world frame.
+        """Return the gradient of the distance, which points away from the nearest obstacle.
 
-        It points away from the nearest obstacle, is about 1 long, and shorter midway between obstacles. Taken between
-        the cells on both sides, on one side at the border of the box and beside cells without a distance. NaN where
-        the point's own cell has none.
+        Its length is about 1, and smaller midway between obstacles. Central differences; one-sided at the border of the
+        box and beside cells without a distance.
+
+        Args:
+            points: (N, 3) metres, world frame.
+
+        Returns:
+            (N, 3) float32 metres per metre along each axis, world frame; NaN where the point's own cell has no
+                distance.
         """
         with self._lock:
             cells, inside = self._cells_of(points)
@@ -136,7 +161,7 @@ class DistanceField:
         return np.where(np.isfinite(here)[:, None], np.stack(slopes, axis=1), np.float32(np.nan))
 
     def _refresh(self) -> tuple[int, NDArray[np.uint8]]:
-        """Look at the map; return how many cells are obstacles or free of them anew, and which slabs have such."""
+        """Read the map; return how many cells changed, and which slabs they are in."""
         field, order = self._transform.field, np.array(self._transform.order)
         dirty = np.zeros(len(field.mask), np.uint8)
         changed = _distance.refresh(
@@ -165,7 +190,7 @@ class DistanceField:
         return rise / np.maximum(offs[0].astype(np.float32) + offs[1], 1)
 
     def _cells_of(self, points: ArrayLike) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-        """Return places (N, 3) in the box, and which points (N,) are in it."""
+        """Return cells (N, 3) of the box, and which points (N,) are inside it."""
         with np.errstate(invalid="ignore"):
             cells = np.floor(points_of(points) / self._cell) - self._low
             inside = np.all((cells >= 0) & (cells < self._shape), axis=1)  # False for NaN
@@ -188,19 +213,19 @@ class DistanceField:
         return first, np.ceil(corners[1] - TIE).astype(np.int64) - first
 
     def _about_zero(self, size: ArrayLike | None) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Return the window where it stands until the camera is known, on faces of blocks."""
+        """Return the window as it stands until the camera is known, on faces of blocks."""
         wanted = points_of([] if size is None else size, "size") / self._cell
         if wanted.shape != (1, 3) or not ((wanted > 0) & (wanted < INDEX_LIMIT)).all():
             raise StereovoxError(f"size {size}: give three lengths in metres")
         return np.zeros(3, np.int64), np.ceil(wanted[0] - TIE).astype(np.int64)
 
     def _follow(self) -> None:
-        """Move the window where the camera is too far from its middle, by whole blocks: `_seen` goes by blocks."""
+        """Move the window by whole blocks where the camera is too far from its centre: `_seen` is stored by blocks."""
         self._check_place()
         assert self._map.viewpoint is not None
         camera = self._map.viewpoint.T_world_camera[:3, 3] / self._cell
         away = np.abs(camera - (self._low + self._shape / 2))
-        if not self._made or (away > np.maximum(TRIGGER * self._shape, SIDE)).any():
+        if not self._refreshed or (away > np.maximum(TRIGGER * self._shape, SIDE)).any():
             self._low = SIDE * np.rint((camera - self._shape / 2) / SIDE).astype(np.int64)
 
 
@@ -208,8 +233,8 @@ def write_distance(field: DistanceField, path: str | Path) -> None:
     """Write a field for `numpy.load`.
 
     Arrays: `distance` (x, y, z) float32 metres, infinite where no obstacle is near enough; `origin` (3,) metres, lowest
-    corner of cell [0, 0, 0]; `cell` (3,) metres, its sides. Cell (i, j, k) has its middle at origin + (i + 0.5, ...)
-    times cell. Raises StereovoxError for another ending than .npz, MapFileError where it cannot be written.
+    corner of cell [0, 0, 0]; `cell` (3,) metres, its sides. The centre of cell (i, j, k) is at origin + (i + 0.5, ...)
+    * cell. Raises StereovoxError for an ending other than .npz, MapFileError where the file cannot be written.
     """
     if Path(path).suffix.lower() != ".npz":
         raise StereovoxError(f"{path}: distances are written as .npz; name the file so")

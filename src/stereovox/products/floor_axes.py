@@ -13,7 +13,8 @@ Heights = tuple[float, float]
 
 
 def floor_axes(up: str) -> tuple[int, int, int, int]:
-    """Return the axes of the map that are x and y of its floor, the one that stands across it, and its sign along `up`.
+    """Return the map axes that are x and y of its floor, the axis across the floor, and the sign of the latter along
+    `up`.
 
     x and y are the map's where z is up; else the two axes that make a right-handed frame with `up`: y and z for x, z
     and x for y, and with a minus the same two swapped.
@@ -40,7 +41,7 @@ def heights_of(points: ArrayLike, up: str) -> NDArray[np.float64]:
 
 
 def checked_heights(heights: Heights) -> Heights:
-    """Return two heights; raises StereovoxError where they do not rise."""
+    """Validate two heights; raises StereovoxError where they do not ascend."""
     low, high = heights
     if not low < high:
         raise StereovoxError(f"heights {low:g}:{high:g} must be two numbers that rise, LO:HI in metres")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a map can grow: free cells beside unknown ones (Yamauchi 1997), in groups, and a place to look at each from."""
+"""Frontiers: groups of free cells beside unknown ones (Yamauchi 1997), each with a place to view it from."""
 
 from __future__ import annotations
 
@@ -25,18 +25,20 @@ from stereovox.threads import one_state
 if TYPE_CHECKING:
     from scipy.spatial import KDTree
 
-LOOKS = 32
-"""Cells from which a view of a frontier is tried."""
+MAX_VIEWPOINTS = 32
+"""Candidate viewpoints tried per frontier."""
 NOT_FREE = (State.UNKNOWN, State.TENTATIVE, State.OCCUPIED)
 
 
 @dataclass(frozen=True, eq=False)
 class Frontier:
-    """Free cells beside unknown ones that hang together.
+    """Connected free cells beside unknown ones.
 
-    cells: (N, 3) int32, ascending. centroid: (3,) metres, mean of their middles: not always free itself. look_from:
-    (3,) metres, the middle of a free cell that can be reached and sees the cell nearest to the centroid; None where
-    none is.
+    Attributes:
+        cells: (N, 3) int32, ascending.
+        centroid: (3,) metres, mean of the cell centres; not always free itself.
+        look_from: (3,) metres, centre of a reachable free cell that sees the cell nearest to the centroid; None if
+            there is none.
     """
 
     cells: NDArray[np.int32]
@@ -53,16 +55,27 @@ def frontiers(
     start: ArrayLike | None = None,
     radius: float = 0.25,
 ) -> list[Frontier]:
-    """Return the frontiers of a map, the largest first.
+    """Find the frontiers of a map.
 
-    A free cell is of a frontier where one of the six cells at its faces is unknown; cells that share a corner are of
-    one frontier, which is halved across its longest direction until it is no longer than `longest` metres (Zhou et al.
-    2021, FUEL, IV-A).
-    smallest: cells of the least frontier that counts, before it is halved. heights: lowest and highest metres along the
-    map's `up` for the middles of its cells; all without it. start: (3,) metres, where the robot is, by default the
-    camera of the last frame; it reaches what free cells connect with the one nearest to it, face by face. Without
-    either it is in the largest connected part. radius: metres about the robot's middle that must be free.
-    Raises StereovoxError for values that make no sense.
+    A free cell belongs to a frontier where one of the six cells at its faces is unknown. Cells that share a corner form
+    one frontier, which is halved across its longest direction until it is no longer than `longest` (Zhou et al. 2021,
+    FUEL, IV-A).
+
+    Args:
+        voxel_map: The map.
+        smallest: Fewest cells of a frontier, before it is halved.
+        longest: Largest extent in metres.
+        heights: Lowest and highest metres along the map's `up` for cell centres; None for all.
+        start: (3,) metres, where the robot is; None: the camera of the last frame. The robot reaches the free cells
+            that are connected, face by face, with the one nearest to it; with neither, it is in the largest connected
+            part.
+        radius: Metres about the robot's centre that must be free.
+
+    Returns:
+        The frontiers, largest first.
+
+    Raises:
+        StereovoxError: Values that make no sense.
     """
     from scipy.spatial import KDTree
 
@@ -84,17 +97,17 @@ def frontiers(
 def write_frontiers(found: Sequence[Frontier], path: str | Path) -> None:
     """Write frontiers for `numpy.load`.
 
-    Arrays: `cells` (N, 3) int32, `frontier` (N,) int32 the number of the one each is of; `centroid` (K, 3) and
-    `look_from` (K, 3) in metres, NaN where there is none. Raises MapFileError when the place cannot be written.
+    Arrays: `cells` (N, 3) int32, `frontier` (N,) int32, the number of the frontier of each cell; `centroid` (K, 3) and
+    `look_from` (K, 3) in metres, NaN where there is none. Raises MapFileError where the file cannot be written.
     """
-    nowhere = np.full(3, np.nan)
+    no_viewpoint = np.full(3, np.nan)
     with replacing(path) as file:
         np.savez_compressed(
             file,
             cells=np.concatenate([np.empty((0, 3), np.int32), *(one.cells for one in found)]),
             frontier=np.repeat(np.arange(len(found), dtype=np.int32), [len(one.cells) for one in found]),
             centroid=np.reshape([one.centroid for one in found], (-1, 3)),
-            look_from=np.reshape([nowhere if one.look_from is None else one.look_from for one in found], (-1, 3)),
+            look_from=np.reshape([no_viewpoint if one.look_from is None else one.look_from for one in found], (-1, 3)),
         )
 
 
@@ -132,7 +145,7 @@ def _parts(voxel_map: VoxelMap, cells: NDArray[np.int32], longest: float) -> lis
 def _reached(
     voxel_map: VoxelMap, cells: NDArray[np.int32], start: ArrayLike | None, radius: float
 ) -> NDArray[np.float64]:
-    """Return the middles (N, 3) of the free cells where the robot can be."""
+    """Return the centres (N, 3) of the free cells that the robot can reach."""
     if not 0 <= radius < np.inf:
         raise StereovoxError(f"radius {radius}: give metres, 0 or more")
     here, points = _start(voxel_map, start), voxel_map.centers(cells)
@@ -158,14 +171,14 @@ def _frontier(voxel_map: VoxelMap, cells: NDArray[np.int32], reached: KDTree) ->
     points = voxel_map.centers(cells)
     centroid = points.mean(axis=0)
     middle = points[np.argmin(((points - centroid) ** 2).sum(axis=1))]
-    return Frontier(cells, centroid, _look_at(voxel_map, middle, reached))
+    return Frontier(cells, centroid, _viewpoint(voxel_map, middle, reached))
 
 
-def _look_at(voxel_map: VoxelMap, point: NDArray[np.float64], reached: KDTree) -> NDArray[np.float64] | None:
-    """Return the nearest place that sees a point past free cells alone, of LOOKS that are nearest."""
+def _viewpoint(voxel_map: VoxelMap, point: NDArray[np.float64], reached: KDTree) -> NDArray[np.float64] | None:
+    """Return the nearest of MAX_VIEWPOINTS places that sees a point through free cells only."""
     if not reached.n:
         return None
-    away, nearest = map(np.ravel, reached.query(point, k=min(LOOKS, reached.n)))
+    away, nearest = map(np.ravel, reached.query(point, k=min(MAX_VIEWPOINTS, reached.n)))
     for distance, place in zip(away.tolist(), reached.data[nearest], strict=True):
         if distance == 0 or np.isinf(voxel_map.cast_rays(place, point - place, distance, NOT_FREE).distance[0]):
             return place

@@ -19,7 +19,7 @@ from stereovox.products.side_by_side import in_memory
 
 TIE = 1e-6
 """Cells: lengths that are so near to whole cells are."""
-NOWHERE = 2**40
+NO_SURFACE = 2**40
 """Stands for a level, in cells, where there is no surface."""
 LARGE = 0.25
 """A floor has at least such a part of the cells of the largest surface: tables may be seen better than floors."""
@@ -115,7 +115,7 @@ def ground_levels(
     first = _lowest_large(surfaces, group) if here is None else group[_nearest(floor, surfaces, here)]
     levels = _lowest(floor.shape, surfaces[group == first], here)
     _add_islands(levels, surfaces, group, climb, here)
-    return np.ma.masked_equal(levels, NOWHERE), _lowest(floor.shape, surfaces, None)
+    return np.ma.masked_equal(levels, NO_SURFACE), _lowest(floor.shape, surfaces, None)
 
 
 def _start(floor: Floor, start: ArrayLike) -> NDArray[np.float64]:
@@ -144,7 +144,7 @@ def _nearest(floor: Floor, surfaces: NDArray[np.int64], here: NDArray[np.float64
 def _lowest(shape: tuple[int, ...], surfaces: NDArray[np.int64], here: NDArray[np.float64] | None) -> NDArray[np.int64]:
     """Return one level (rows, columns) of the surfaces in each column: nearest in height to a place, or the lowest."""
     order = np.argsort(-surfaces[:, 2] if here is None else -np.abs(surfaces[:, 2] - here[2]), kind="stable")
-    levels = np.full(shape, NOWHERE, np.int64)
+    levels = np.full(shape, NO_SURFACE, np.int64)
     rows, columns, heights = surfaces[order].T
     levels[rows, columns] = heights  # of several the last one stays
     return levels
@@ -160,11 +160,11 @@ def _add_islands(
     """Add to `levels` the groups of surfaces that are no more than `climb` higher or lower than the nearest ground."""
     from scipy.ndimage import distance_transform_edt
 
-    away, nearest = map(np.asarray, distance_transform_edt(levels == NOWHERE, return_indices=True) or ())
+    away, nearest = map(np.asarray, distance_transform_edt(levels == NO_SURFACE, return_indices=True) or ())
     rows, columns, heights = surfaces.T
     run, rise = away[rows, columns], np.abs(heights - levels[tuple(nearest[:, rows, columns])])
     order = np.lexsort((rise, run))  # the nearest of each group comes first
     _, firsts = np.unique(group[order], return_index=True)
     level = rise[order[firsts]] <= climb
     more = _lowest(levels.shape, surfaces[level[group]], here)
-    np.copyto(levels, more, where=levels == NOWHERE)
+    np.copyto(levels, more, where=levels == NO_SURFACE)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A 3-D map seen from above while it is made: only what changed is looked at again."""
+"""A 3-D map seen from above, kept up to date while it is built: only what changed is projected again."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from stereovox.maps.occupancy import UNKNOWN, OccupancyGrid, Percent
 from stereovox.maps.rolling import RollingMap
 from stereovox.maps.voxel_map import EVERYWHERE
 from stereovox.products.floor_axes import Heights, floor_axes
-from stereovox.products.projection import NOTHING, Patch, layers_of, patch_of
+from stereovox.products.projection import EMPTY, Patch, layers_of, patch_of
 
 STEP = 8 * SIDE
-"""The grid grows by so many cells: programs that plan in it need not make room anew with each frame."""
+"""The grid grows by this many cells, so that planners need not reallocate with each frame."""
 MAX_CELLS = 2**26
-"""Cells of the largest grid; nobody wants to be sent more with each frame."""
+"""Cells of the largest grid; more is too much to send with each frame."""
 
 
 class LiveProjection:
-    """Keeps a map seen from above, as `projection.project` makes it, at the price of what changed.
+    """Projects a map from above, as `projection.project`, at the cost of what changed.
 
-    heights: as for `project`. The grid is as large as what is known, in steps of 64 cells. Of a map in a window only
-    the cells in memory count; that and a map that forgets are looked at as a whole.
-    Raises StereovoxError where the heights hold no cell, and where cells are not as long as wide.
+    heights: as for `project`. The grid covers what is known, in steps of 64 cells. Of a map in a window only the cells
+    in memory count; such a map, and one that forgets, is projected as a whole each time. Raises StereovoxError where
+    the heights hold no cell, and where cells are not as long as wide.
     """
 
     def __init__(self, voxel_map: VoxelMap, heights: Heights | None = None):
@@ -48,15 +48,15 @@ class LiveProjection:
         voxel_map.listeners.append(lambda evidence: (method := note()) and method(evidence))
 
     def grid(self) -> OccupancyGrid | None:
-        """Return the map from above as it is now; None where nothing is known. Its cells are a copy.
+        """Return the current map from above, None where nothing is known. Its cells are a copy.
 
-        Raises StereovoxError where it were too large.
+        Raises StereovoxError for too large a grid.
         """
         with self._map.lock:  # `_note` is called with it held
             return self._grid()
 
     def _note(self, evidence: Evidence) -> None:
-        """Widen the columns that changed by those of a frame."""
+        """Add the columns that a frame changed to those to be projected again."""
         for coords in (evidence.coords, evidence.uniform):
             if len(coords):
                 floor = coords[:, self._order[:2]]
@@ -78,9 +78,9 @@ class LiveProjection:
         return self._shown()
 
     def _in_percent(self, patch: Patch) -> NDArray[np.int8]:
-        number = np.where(patch.marked != NOTHING, patch.marked, patch.cleared).astype(np.int32)
+        number = np.where(patch.marked != EMPTY, patch.marked, patch.cleared).astype(np.int32)
         known = self._percent.shown[np.maximum(number, self._percent.lowest) - self._percent.lowest]
-        return np.where(number == NOTHING, np.int8(UNKNOWN), known)
+        return np.where(number == EMPTY, np.int8(UNKNOWN), known)
 
     def _shown(self) -> OccupancyGrid | None:
         if not self._canvas.cells.size:
@@ -92,19 +92,19 @@ class LiveProjection:
 
 
 class _Canvas:
-    """A picture that grows. corner: column and row of its first cell; cells: (rows, columns) int8 per cent."""
+    """A growing image. corner: column and row of its first cell; cells: (rows, columns) int8 per cent."""
 
     def __init__(self) -> None:
         self.corner = np.zeros(2, np.int64)
         self.cells = np.empty((0, 0), np.int8)
 
     def paint(self, patch: NDArray[np.int8], corner: NDArray[np.int64]) -> None:
-        """Put a patch over what stood there; it is within reach."""
+        """Overwrite a part of the canvas with a patch that lies inside it."""
         left, bottom = (corner - self.corner).tolist()
         self.cells[bottom : bottom + patch.shape[0], left : left + patch.shape[1]] = patch
 
     def reach(self, low: NDArray[np.int64], high: NDArray[np.int64]) -> None:
-        """Grow by whole steps, so that columns and rows from `low` to below `high` are in it; raises StereovoxError."""
+        """Grow by whole steps to cover columns and rows from `low` to below `high`; raises StereovoxError."""
         low, high = low // STEP * STEP, -(-high // STEP) * STEP
         if self.cells.size:
             before = self.corner + self.cells.shape[::-1]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Two maps as one: what both have seen adds up."""
+"""Merge two maps by adding their evidence."""
 
 from __future__ import annotations
 
@@ -23,15 +23,23 @@ from stereovox.trust.history import MAX_REASONS, OTHERS, History
 
 @one_state
 def merge(a: VoxelMap, b: VoxelMap, T_a_b: ArrayLike | None = None) -> VoxelMap:
-    """Return an unbounded map of all that two maps know, with the settings of `a`.
+    """Merge two maps.
 
-    T_a_b: (4, 4) maps the world frame of `b` into that of `a`, see `moved`; none where both are the same.
-    The evidence of both adds up: log-odds a + b - prior, for each started from its prior, then clamped (Thrun et al.
-    2005, Probabilistic Robotics, 9.2). Where nothing was clamped before, that is the map of all frames together, but
-    for one step of a stored number where a sum passed just through "unknown". A cell that one map does not know is the
-    other's. Times are the later ones, frames and refusals are counted together, the viewpoint is the later one.
-    Raises StereovoxError where the cells differ in size, T_a_b is no rigid motion, or there is none and the maps' `up`
-    differs.
+    Evidence adds up: log-odds a + b - prior, each counted from its own prior, then clamped (Thrun et al. 2005,
+    Probabilistic Robotics, 9.2). Where nothing was clamped before, the result is the map of all frames together, except
+    for one step of a stored number where a sum passed just through "unknown". A cell unknown to one map is the other's.
+    Times are the later ones, frames and refusals are summed, the viewpoint is the later one.
+
+    Args:
+        a: A map, whose settings the result has.
+        b: Another map.
+        T_a_b: (4, 4), maps the world frame of `b` into that of `a` (see `moved`); None where they are the same.
+
+    Returns:
+        An unbounded map.
+
+    Raises:
+        StereovoxError: The cell sizes differ, T_a_b is not a rigid motion, or there is none and the maps' `up` differs.
     """
     check_alike(a, b, T_a_b)
     b = in_memory(b)
@@ -51,7 +59,7 @@ def merge(a: VoxelMap, b: VoxelMap, T_a_b: ArrayLike | None = None) -> VoxelMap:
 
 
 def _summed(a: VoxelMap, mine: NDArray[np.integer], b: VoxelMap, theirs: NDArray[np.integer]) -> NDArray[np.integer]:
-    """Return what cells as `a` stores them hold with the evidence of cells as `b` stores them."""
+    """Return `a`'s stored cells with the evidence of `b`'s stored cells added."""
     rules, other = CellRules(a.config.map), CellRules(b.config.map)
     scale = rules.format.per_log_odds / other.format.per_log_odds
     evidence = np.rint((theirs.astype(np.int32) - other.prior) * scale).astype(np.int32)
@@ -73,7 +81,7 @@ def _later(a: VoxelMap, b: VoxelMap, coords: NDArray[np.int32], start_ns: int | 
 
 
 def _together(a: History, b: History) -> History:
-    """Return the counts of both; whom each trusted last says nothing about the next frame of the two together."""
+    """Return the summed counts; which sensor each map trusted last does not carry over to the next frame."""
     names = dict.fromkeys(name for name in (a.recording, b.recording) if name)
     lasts = [one for one in (a.last_frame, b.last_frame) if one]
     return History(
@@ -88,7 +96,7 @@ def _together(a: History, b: History) -> History:
 
 
 def _both_paths(a: CameraPath, b: CameraPath) -> CameraPath:
-    """Return the ways of all cameras; one of `b` that is called like one of `a` gets a plus behind its name."""
+    """Return the paths of all cameras; a camera of `b` with a name of `a` gets a plus sign."""
     path = replace(deepcopy(a), spacing=max(a.spacing, b.spacing))
     for sensor, stops in b.stops.items():
         while sensor in path.stops:
@@ -99,7 +107,7 @@ def _both_paths(a: CameraPath, b: CameraPath) -> CameraPath:
 
 
 def _counts(counts: Counter[str]) -> Counter[str]:
-    """Return counts of no more words than a saved map may have."""
+    """Return the counts, limited to as many reasons as a saved map may have."""
     kept = Counter(dict(counts.most_common(MAX_REASONS)))
     if rest := counts.total() - kept.total():
         kept[OTHERS] += rest

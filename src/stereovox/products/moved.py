@@ -15,34 +15,34 @@ from stereovox.maps.blocks import CELLS, SIDE
 from stereovox.maps.cell_format import CellRules
 from stereovox.maps.voxel_map import INDEX_LIMIT, cells_where
 from stereovox.products import _moved
-from stereovox.products.side_by_side import cells_at, in_memory, put_times
+from stereovox.products.side_by_side import cells_at, in_memory, set_times
 from stereovox.se3 import Transform, inverse, orthonormalise, rigidity_error, transform_points
 from stereovox.threads import one_state
 from stereovox.trust.camera_path import CameraPath, Seen
 
 PIECE = 512
-"""Blocks looked at together."""
+"""Blocks processed together."""
 RIGID = 1e-3
 """Largest entry of |R^T R - I| that still passes for rounding."""
 NEAR = 1e-6
-"""Cells by which a place may miss the face it stands on for all its digits."""
+"""Rounding tolerance, in cells, for a point on a face."""
 TOUCHING = 2e-5
-"""Share of a cell by which two may overlap for all their digits and yet only touch."""
+"""Rounding tolerance, in cells, by which touching cells may overlap."""
 PARALLEL = 1e-6
-"""Sine of the angle between edges so parallel that they have no direction in common that tells boxes apart."""
+"""Sine of the angle below which edges are parallel and define no separating axis."""
 
 
 @one_state
 def moved(voxel_map: VoxelMap, T_a_b: ArrayLike) -> VoxelMap:
-    """Return what a map in frame b says in frame a, in cells of the same size; T_a_b (4, 4) maps b into a.
+    """Return a map in frame b resampled in frame a, in cells of the same size; T_a_b (4, 4) maps b into a.
 
-    A cell gets the log-odds and the time of the cell that its middle lies in. Where the motion maps cells onto cells
+    A cell gets the log-odds and the time of the cell that its centre lies in. Where the motion maps cells onto cells
     (whole cells, quarter turns) that is exact. Where it does not, nothing occupied, tentative or unknown becomes free:
 
-    - a cell also gets the log-odds of any cell that is occupied or tentative and whose middle lies in it, if they are
-      higher: so whatever is occupied stays so, in at least one cell;
-    - one that would be free after that, but overlaps an occupied or tentative cell, is tentative. What speaks for an
-      obstacle in the cells it overlaps counts by its share of the cell;
+    - a cell also gets the log-odds of any occupied or tentative cell whose centre lies in it, if higher: so whatever is
+    occupied stays so, in at least one cell;
+    - one that would then be free, but overlaps an occupied or tentative cell, is tentative. The evidence for an
+    obstacle in the cells it overlaps counts by its share of the cell;
     - one that would be free, but overlaps an unknown cell, is unknown.
 
     Raises StereovoxError where T_a_b is no rigid motion, or leads too far away.
@@ -70,7 +70,7 @@ def moved(voxel_map: VoxelMap, T_a_b: ArrayLike) -> VoxelMap:
 
 
 def rigid(T: ArrayLike) -> Transform:
-    """Return a (4, 4) rigid motion without what rounding did to it; raises StereovoxError where it is none."""
+    """Return a (4, 4) rigid motion with rounding removed; raises StereovoxError where it is none."""
     T = np.asarray(T, float)
     error = rigidity_error(T)
     if not error <= RIGID:
@@ -106,10 +106,11 @@ def _doubt(voxel_map: VoxelMap, T: Transform, coords: NDArray[np.int32], cells: 
 def _separating_axes(
     R_b_a: NDArray[np.float64], sides: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the directions (n, 3) that tell cells of both frames apart, and from how far apart their middles are (n,).
+    """Return the separating directions (n, 3) of cells of both frames, and the centre distance (n,) from which they
+    separate.
 
-    Both in cells of frame b, whose cells are 1 wide along each direction: those of the edges in both frames and what is
-    normal to an edge of each, but for edges that are parallel.
+    Both in cells of frame b, whose cells are 1 wide along each direction: the edges of both frames, and the normals of
+    an edge of each, except for parallel edges.
     """
     normals = np.cross(np.eye(3)[:, None], R_b_a.T).reshape(9, 3)
     axes = np.concatenate([np.eye(3), R_b_a.T, normals[np.linalg.norm(normals, axis=1) > PARALLEL]]) * sides
@@ -132,7 +133,7 @@ def _pushed(voxel_map: VoxelMap, T: Transform) -> VoxelMap:
     indices = np.floor(places + NEAR).astype(np.int64)
     pushed = VoxelMap.from_cells(voxel_map.config, indices, voxel_map.cell_format.log_odds(stored[order]))
     if voxel_map.config.map.keep_times:
-        put_times(pushed, indices, times[order].astype(np.uint32), voxel_map.times_start_ns)
+        set_times(pushed, indices, times[order].astype(np.uint32), voxel_map.times_start_ns)
     return pushed
 
 

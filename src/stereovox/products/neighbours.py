@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which cells touch which: blocks with a margin, and sets of cells that hang together."""
+"""Neighbouring cells: blocks with a margin, and connected components."""
 
 from __future__ import annotations
 
@@ -34,9 +34,9 @@ def shifted(margins: NDArray, step: tuple[int, int, int]) -> NDArray:
 
 
 def components(cells: NDArray[np.integer], steps: Iterable[tuple[int, int, int]]) -> NDArray[np.int32]:
-    """Return the number (N,) from 0 on of the group that each of the cells (N, 3) belongs to, each named once.
+    """Return the number (N,) of the component of each of the distinct cells (N, 3), from 0 on.
 
-    Cells that are one of the `steps` apart, one way or the other, are of one group.
+    Cells that are one of the `steps` apart, in either direction, belong to one component.
     """
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components

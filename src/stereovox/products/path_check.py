@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether a ball may go along a path, where it would be stopped, and how old the evidence for that is."""
+"""Check whether a ball can move along a path, where it would be stopped, and how old the evidence is."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from stereovox.maps.queries import points_of
 from stereovox.threads import one_state
 
 HALVINGS = 48
-"""How often a part of a segment is halved in search of a place on it."""
+"""Bisection steps in the search for a place on a segment."""
 PIECE = 8
-"""Cells of ages are looked for about pieces of a segment of so many cells, or of its radius if that is more."""
+"""Segments are searched for cell ages in pieces of this many cells, or of the radius if that is more."""
 
 
 class PathCheck(NamedTuple):
-    """What a map says of a path of N segments.
+    """What a map says about a path of N segments.
 
-    worst: (N,) uint8, the worst `State` of the cells that the ball touches on each segment (`check_capsules`).
-    blocked_at: metres along the path that the ball can go until it touches a cell that is in its way; None where it
-        can go to the end.
-    oldest_s: (N,) float32 seconds since the last evidence for that known cell a segment touches which has been without
-        any the longest; NaN where it touches none. None where the map keeps no times.
+    Attributes:
+        worst: (N,) uint8, the worst `State` that the ball touches on each segment (`check_capsules`).
+        blocked_at: Metres along the path until the ball touches a blocking cell; None if it reaches the end.
+        oldest_s: (N,) float32 seconds since the last evidence of the stalest known cell that a segment touches; NaN
+            where it touches none. None where the map keeps no times.
     """
 
     worst: NDArray[np.uint8]
@@ -37,7 +37,7 @@ class PathCheck(NamedTuple):
 
     @property
     def free(self) -> bool:
-        """Whether nothing is in the way."""
+        """Whether nothing blocks the path."""
         return self.blocked_at is None
 
 
@@ -49,43 +49,54 @@ def check_path(
     through_unknown: bool = False,
     now_ns: int | None = None,
 ) -> PathCheck:
-    """Tell whether a ball of `radius` metres may go from waypoint to waypoint, (N + 1, 3) in metres, world frame.
+    """Check whether a ball can move along a path.
 
-    Cells that are occupied, tentative or unknown are in its way; with `through_unknown` unknown ones are not.
-    now_ns: the time from which ages count, by default that of the map's last frame.
-    Raises StereovoxError, one line, for fewer than two waypoints and other bad input.
+    Occupied, tentative and unknown cells block it.
+
+    Args:
+        voxel_map: The map.
+        waypoints: (N + 1, 3) metres, world frame.
+        radius: Radius of the ball in metres.
+        through_unknown: Unknown cells do not block.
+        now_ns: Time from which ages count; None: that of the map's last frame.
+
+    Returns:
+        The verdict on each segment.
+
+    Raises:
+        StereovoxError: Fewer than two waypoints or other bad input.
     """
     points = points_of(waypoints, "waypoints").astype(float)
     if len(points) < 2:
         raise StereovoxError(f"waypoints: {len(points)} of them make no path; give two or more")
     worst = voxel_map.check_capsules(points[:-1], points[1:], radius)
-    in_the_way = [State.OCCUPIED, State.TENTATIVE] + ([] if through_unknown else [State.UNKNOWN])
-    stopped = np.flatnonzero(np.isin(worst, in_the_way))
+    blocking = [State.OCCUPIED, State.TENTATIVE] + ([] if through_unknown else [State.UNKNOWN])
+    stopped = np.flatnonzero(np.isin(worst, blocking))
     blocked_at = None
     if len(stopped):
         lengths, first = np.linalg.norm(np.diff(points, axis=0), axis=1), stopped[0]
-        share = _free_share(voxel_map, points[first], points[first + 1], radius, in_the_way)
+        share = _free_share(voxel_map, points[first], points[first + 1], radius, blocking)
         blocked_at = float(lengths[:first].sum() + share * lengths[first])
     return PathCheck(worst, blocked_at, _oldest(voxel_map, points, radius, now_ns))
 
 
 def point_along(waypoints: ArrayLike, metres: float) -> NDArray[np.float64]:
-    """Return the place (3,) that is so many metres along a path (N, 3); its end where the path is shorter."""
+    """Return the point (3,) that many metres along a path (N, 3); its end if the path is shorter."""
     points = points_of(waypoints, "waypoints").astype(float)
     at = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
     return np.array([np.interp(metres, at, points[:, axis]) for axis in range(3)])
 
 
 def _free_share(
-    voxel_map: VoxelMap, start: NDArray[np.float64], end: NDArray[np.float64], radius: float, in_the_way: list[State]
+    voxel_map: VoxelMap, start: NDArray[np.float64], end: NDArray[np.float64], radius: float, blocking: list[State]
 ) -> float:
-    """Return how much of a blocked segment, 0 to 1, the ball can go: what it touched once stays touched."""
-    if voxel_map.check_capsules(start, start, radius)[0] in in_the_way:
+    """Return how much of a blocked segment, 0 to 1, the ball can travel."""
+    if voxel_map.check_capsules(start, start, radius)[0] in blocking:
         return 0.0
     low, high = 0.0, 1.0
     for _ in range(HALVINGS):
         middle = (low + high) / 2
-        if voxel_map.check_capsules(start, start + middle * (end - start), radius)[0] in in_the_way:
+        if voxel_map.check_capsules(start, start + middle * (end - start), radius)[0] in blocking:
             high = middle
         else:
             low = middle

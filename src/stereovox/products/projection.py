@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A 3-D map seen from above: the 2-D grid a ground robot plans in.
+"""A 3-D map seen from above: the 2-D grid in which a ground robot plans, and obstacles inflated by a robot's radius.
 
-Obstacles grown by a robot's radius, so that it may be planned for as a point.
-Chien 2020 (5): what is occupied may be one cell larger or smaller than the thing itself, therefore "a one cell margin
-is required for path planning and obstacle avoidance".
+Chien 2020 (5): occupied cells may reach one cell too far or not far enough, therefore "a one cell margin is required
+for path planning and obstacle avoidance".
 """
 
 from __future__ import annotations
@@ -27,42 +26,91 @@ from stereovox.products.transform import transformed
 from stereovox.threads import one_state
 
 MARGIN = 1
-"""Cells by which an obstacle may be larger than the map says."""
+"""Cells by which an obstacle may be larger than its occupied cells."""
 TILE = 64
-"""Cells along each side of the boxes that a map is worked off in."""
+"""Cells along each side of the boxes in which a map is processed."""
 INFLATE_TIE = 1e-6
+EMPTY = np.iinfo(np.int16).min
+"""Stored value of a column in which nothing is known; no cell is stored as this."""
+MAX_CELLS = 2**30
+"""Cells of the largest grid."""
+TIE = 1e-9
 
 
-def inflated_mask(
-    blocked: NDArray[np.bool_], sides: ArrayLike, radius: float, margin: int = MARGIN
-) -> NDArray[np.bool_]:
-    """Return the cells in which a robot's middle may not be: (x, y, z) or (rows, columns) bool, as `blocked`.
+@one_state
+def project(voxel_map: VoxelMap, heights: Heights | None = None) -> OccupancyGrid:
+    """Return the map seen from above, just large enough for what is known.
 
-    In all others it may stand anywhere in the cell: no obstacle is nearer than `radius` metres, even if each is larger
-    by `margin` cells to all sides. sides: of a cell in metres, one for each axis. What is outside counts for nothing.
-    Raises StereovoxError for a radius that is not above 0, or a margin below.
+    heights: lowest and highest metres along the map's `up`, from the world's origin, between which a cell's centre
+    marks; None: the map's own `scan.heights`.
+    The heights only limit marking. A column has the largest probability of all its known cells between them: an
+    occupied one makes it occupied (a table top is no thicker), one that is neither keeps it from being free. Where
+    nothing between them is known, free cells at any other height clear the column, and it has the largest probability
+    of those. Otherwise it is unknown.
+    The grid's x and y are the map's where z is up; else the two axes that make a right-handed frame with `up`: y and z
+    for x, z and x for y, and with a minus the same two swapped. Uneven cells become cubes where the floor needs it.
+    Raises StereovoxError where no cell between the heights is known, or for too large a grid.
     """
-    _check(radius, margin)
-    shape = (1,) * (3 - blocked.ndim) + blocked.shape
-    steps = np.concatenate([np.ones(3 - blocked.ndim), np.broadcast_to(sides, blocked.ndim)])
-    gaps = transformed(blocked.reshape(shape), steps, max_distance=radius, nearer=1 + margin)
-    return (gaps < radius * (1 - INFLATE_TIE)).reshape(blocked.shape)
+    order = list(floor_axes(voxel_map.config.up)[:3])
+    if voxel_map.config.cell[order[0]] != voxel_map.config.cell[order[1]]:
+        voxel_map = in_cubes(voxel_map)
+    heights = heights or voxel_map.config.scan.heights
+    layers = layers_of(voxel_map, order[2], heights)
+    patches = [patch_of(voxel_map, *slab, order, layers) for slab in voxel_map.slabs() if len(slab[0])]
+    patch = _joined(patches)
+    if patch is None or not (patch.marked != EMPTY).any():
+        raise StereovoxError(_format_empty(voxel_map, order[2], heights))
+    return _grid(voxel_map, patch, voxel_map.config.cell[order[0]])
 
 
-def inflated_grid(grid: OccupancyGrid, radius: float, margin: int = MARGIN) -> OccupancyGrid:
-    """Return a 2-D map with 100 per cent in all cells in which a robot of `radius` metres may not be.
+class Patch(NamedTuple):
+    """Some blocks seen from above: lowest column and row, and (rows, columns) int16 as `look_down` fills them."""
 
-    Occupied cells grow as in `inflated_mask`, over free, tentative and unknown ones; the picture does not.
+    corner: NDArray[np.int64]
+    marked: NDArray[np.int16]
+    cleared: NDArray[np.int16]
+
+
+def patch_of(
+    voxel_map: VoxelMap,
+    coords: NDArray[np.int32],
+    values: NDArray[np.integer],
+    order: list[int],
+    layers: NDArray[np.int64],
+) -> Patch:
+    """Return what blocks (n, 3), n > 0, with their cells (n, 512) as stored, show from above.
+
+    order: axes along columns, along rows and up, see `floor_axes`; layers: as `layers_of` returns them.
     """
-    near = inflated_mask(grid.states == State.OCCUPIED, grid.resolution, radius, margin)
-    return replace(grid, cells=np.where(near, np.int8(100), grid.cells))
+    floor = coords[:, order[:2]].astype(np.int64)
+    low, high = floor.min(axis=0) * SIDE, (floor.max(axis=0) + 1) * SIDE
+    patch = _empty(low, high)
+    rules = CellRules(voxel_map.config.map)
+    _projection.look_down(
+        np.ascontiguousarray(coords), np.ascontiguousarray(values), np.array(order), low, layers,
+        np.int16(rules.format.unknown), np.int16(np.ceil(rules.free_below)), patch.marked, patch.cleared,
+    )  # fmt: skip
+    return patch
+
+
+def layers_of(voxel_map: VoxelMap, axis: int, heights: Heights) -> NDArray[np.int64]:
+    """Return the first and the last layer of cells whose middle is above the lower height, and not above the upper."""
+    low, high = heights
+    if not (np.isfinite(heights).all() and low < high):
+        raise StereovoxError(f"heights {low:g}:{high:g} must be two numbers that rise, LO:HI in metres")
+    step = voxel_map.config.cell[axis]
+    below, top = np.floor(np.array(heights) / step - 0.5 + TIE)
+    layers = np.clip([below + 1, top], -(2.0**40), 2.0**40).astype(np.int64)
+    if layers[0] > layers[1]:
+        raise StereovoxError(f"heights {low:g}:{high:g} hold the middle of no cell of {step:g} m; widen them")
+    return -1 - layers[::-1] if voxel_map.config.up.startswith("-") else layers
 
 
 @one_state
 def inflated(voxel_map: VoxelMap, radius: float, margin: int = MARGIN) -> VoxelMap:
-    """Return a map without bounds in which all cells are occupied in which a robot of `radius` metres may not be.
+    """Return an unbounded map in which all cells that a robot of `radius` metres must avoid are occupied.
 
-    Occupied cells grow as in `inflated_mask`, over free, tentative and unknown ones. When cells were seen is not kept.
+    Occupied cells grow as in `inflated_mask`, over free, tentative and unknown ones. Cell times are not kept.
     """
     _check(radius, margin)
     known, log_odds = voxel_map.cells()
@@ -72,6 +120,31 @@ def inflated(voxel_map: VoxelMap, radius: float, margin: int = MARGIN) -> VoxelM
     made = VoxelMap.from_cells(voxel_map.config, np.concatenate([known, grown]), np.concatenate([log_odds, surest]))
     made.take_history(voxel_map)
     return made
+
+
+def inflated_grid(grid: OccupancyGrid, radius: float, margin: int = MARGIN) -> OccupancyGrid:
+    """Return a 2-D map with 100 per cent in all cells that a robot of `radius` metres must avoid.
+
+    Occupied cells grow as in `inflated_mask`, over free, tentative and unknown ones; the grid keeps its size.
+    """
+    near = inflated_mask(grid.states == State.OCCUPIED, grid.resolution, radius, margin)
+    return replace(grid, cells=np.where(near, np.int8(100), grid.cells))
+
+
+def inflated_mask(
+    blocked: NDArray[np.bool_], sides: ArrayLike, radius: float, margin: int = MARGIN
+) -> NDArray[np.bool_]:
+    """Return the cells that a robot's centre must avoid: (x, y, z) or (rows, columns) bool, as `blocked`.
+
+    Anywhere in the other cells no obstacle is nearer than `radius` metres, even if each is larger by `margin` cells on
+    all sides. sides: of a cell in metres, one per axis. What is outside counts for nothing. Raises StereovoxError for a
+    radius that is not above 0 or a margin below 0.
+    """
+    _check(radius, margin)
+    shape = (1,) * (3 - blocked.ndim) + blocked.shape
+    steps = np.concatenate([np.ones(3 - blocked.ndim), np.broadcast_to(sides, blocked.ndim)])
+    gaps = transformed(blocked.reshape(shape), steps, max_distance=radius, nearer=1 + margin)
+    return (gaps < radius * (1 - INFLATE_TIE)).reshape(blocked.shape)
 
 
 def _tiles(cells: NDArray[np.int32]) -> list[NDArray[np.int32]]:
@@ -98,89 +171,13 @@ def _check(radius: float, margin: int) -> None:
         raise StereovoxError(f"margin {margin}: give a number of cells, 0 or more")
 
 
-NOTHING = np.iinfo(np.int16).min
-"""What a column is stored as of which nothing is known; no cell is stored so."""
-MAX_CELLS = 2**30
-"""Cells of the largest grid."""
-TIE = 1e-9
-
-
-class Patch(NamedTuple):
-    """Some blocks seen from above: lowest column and row, and (rows, columns) int16 as `look_down` fills them."""
-
-    corner: NDArray[np.int64]
-    marked: NDArray[np.int16]
-    cleared: NDArray[np.int16]
-
-
-@one_state
-def project(voxel_map: VoxelMap, heights: Heights | None = None) -> OccupancyGrid:
-    """Return the map seen from above, just large enough for what is known.
-
-    heights: lowest and highest metres along the map's `up`, from the world's origin; a cell whose middle is between
-    them marks. Without it those of the map's own `scan.heights`.
-    The heights are for marking alone. A column has the largest probability of all its known cells between them: one
-    that is occupied makes it occupied (a table top is not thicker), one that is neither keeps it from being free. Where
-    nothing between them is known, free cells at any other height clear it, and it has the largest probability of those.
-    Else it is unknown.
-    The grid's x and y are the map's, where z is up; else the two axes that make a right-handed frame with `up`: y and z
-    for x, z and x for y, and with a minus the same two swapped. Uneven cells become cubes where the floor needs it.
-    Raises StereovoxError, one line, where no cell between the heights is known, or the grid were too large.
-    """
-    order = list(floor_axes(voxel_map.config.up)[:3])
-    if voxel_map.config.cell[order[0]] != voxel_map.config.cell[order[1]]:
-        voxel_map = in_cubes(voxel_map)
-    heights = heights or voxel_map.config.scan.heights
-    layers = layers_of(voxel_map, order[2], heights)
-    patches = [patch_of(voxel_map, *slab, order, layers) for slab in voxel_map.slabs() if len(slab[0])]
-    patch = _joined(patches)
-    if patch is None or not (patch.marked != NOTHING).any():
-        raise StereovoxError(_nothing_there(voxel_map, order[2], heights))
-    return _grid(voxel_map, patch, voxel_map.config.cell[order[0]])
-
-
-def layers_of(voxel_map: VoxelMap, axis: int, heights: Heights) -> NDArray[np.int64]:
-    """Return the first and the last layer of cells whose middle is above the lower height, and not above the upper."""
-    low, high = heights
-    if not (np.isfinite(heights).all() and low < high):
-        raise StereovoxError(f"heights {low:g}:{high:g} must be two numbers that rise, LO:HI in metres")
-    step = voxel_map.config.cell[axis]
-    below, top = np.floor(np.array(heights) / step - 0.5 + TIE)
-    layers = np.clip([below + 1, top], -(2.0**40), 2.0**40).astype(np.int64)
-    if layers[0] > layers[1]:
-        raise StereovoxError(f"heights {low:g}:{high:g} hold the middle of no cell of {step:g} m; widen them")
-    return -1 - layers[::-1] if voxel_map.config.up.startswith("-") else layers
-
-
-def patch_of(
-    voxel_map: VoxelMap,
-    coords: NDArray[np.int32],
-    values: NDArray[np.integer],
-    order: list[int],
-    layers: NDArray[np.int64],
-) -> Patch:
-    """Return what blocks (n, 3), n > 0, with their cells (n, 512) as stored, show from above.
-
-    order: axes along columns, along rows and up, see `floor_axes`; layers: as `layers_of` returns them.
-    """
-    floor = coords[:, order[:2]].astype(np.int64)
-    low, high = floor.min(axis=0) * SIDE, (floor.max(axis=0) + 1) * SIDE
-    patch = _empty(low, high)
-    rules = CellRules(voxel_map.config.map)
-    _projection.look_down(
-        np.ascontiguousarray(coords), np.ascontiguousarray(values), np.array(order), low, layers,
-        np.int16(rules.format.unknown), np.int16(np.ceil(rules.free_below)), patch.marked, patch.cleared,
-    )  # fmt: skip
-    return patch
-
-
 def _empty(low: NDArray[np.int64], high: NDArray[np.int64]) -> Patch:
     columns, rows = (high - low).tolist()
     if columns * rows > MAX_CELLS:
         raise StereovoxError(
             f"a grid of {columns} x {rows} cells is too large; map a smaller place, with --set window.size=[X,Y,Z]"
         )
-    return Patch(low, np.full((rows, columns), NOTHING, np.int16), np.full((rows, columns), NOTHING, np.int16))
+    return Patch(low, np.full((rows, columns), EMPTY, np.int16), np.full((rows, columns), EMPTY, np.int16))
 
 
 def _joined(patches: list[Patch]) -> Patch | None:
@@ -197,19 +194,19 @@ def _joined(patches: list[Patch]) -> Patch | None:
 
 
 def _grid(voxel_map: VoxelMap, patch: Patch, side: float) -> OccupancyGrid:
-    number = np.where(patch.marked != NOTHING, patch.marked, patch.cleared)
-    rows, columns = (np.flatnonzero((number != NOTHING).any(axis=across)) for across in (1, 0))
+    number = np.where(patch.marked != EMPTY, patch.marked, patch.cleared)
+    rows, columns = (np.flatnonzero((number != EMPTY).any(axis=across)) for across in (1, 0))
     number = number[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
     percent = Percent(CellRules(voxel_map.config.map))
     known = percent.shown[np.maximum(number, percent.lowest).astype(np.int32) - percent.lowest]
     left, bottom = ((patch.corner + np.array([columns[0], rows[0]])) * side).round(9).tolist()
     return OccupancyGrid(
-        np.where(number == NOTHING, np.int8(UNKNOWN), known), side, (left, bottom, 0.0),
+        np.where(number == EMPTY, np.int8(UNKNOWN), known), side, (left, bottom, 0.0),
         percent.free_below, percent.occupied_above,
     )  # fmt: skip
 
 
-def _nothing_there(voxel_map: VoxelMap, axis: int, heights: Heights) -> str:
+def _format_empty(voxel_map: VoxelMap, axis: int, heights: Heights) -> str:
     bounds = voxel_map.bounds()
     if bounds is None:
         return "the map is empty: there is nothing to project"

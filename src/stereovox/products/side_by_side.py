@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Maps block by block: the cells of any block of a map, and two maps side by side."""
+"""Access to maps block by block, singly and in pairs."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Blocks = tuple[NDArray[np.int32], NDArray[np.integer], NDArray[np.integer]]
 
 
 def in_memory(voxel_map: VoxelMap) -> VoxelMap:
-    """Return the map with all its cells in memory; one that is there already is returned as it is."""
+    """Return the map with all its cells in memory: the map itself if they already are."""
     return voxel_map.unbounded(voxel_map.config) if isinstance(voxel_map, RollingMap) else voxel_map
 
 
@@ -44,7 +44,7 @@ def side_by_side(a: VoxelMap, b: VoxelMap) -> Iterator[Blocks]:
 
 
 def check_alike(a: VoxelMap, b: VoxelMap, T_a_b: ArrayLike | None) -> None:
-    """Raise StereovoxError where cells of two maps differ in size, or, without a transform, in which way is up."""
+    """Raise StereovoxError where two maps differ in cell size, or, without a transform, in `up`."""
     if T_a_b is None and a.config.up != b.config.up:
         raise StereovoxError(
             f"up is {a.config.up} in one map and {b.config.up} in the other; give the transform between them"
@@ -56,16 +56,16 @@ def check_alike(a: VoxelMap, b: VoxelMap, T_a_b: ArrayLike | None) -> None:
         )
 
 
-def take(target: VoxelMap, source: VoxelMap, coords: NDArray[np.int32], cells: NDArray[np.integer]) -> None:
-    """Put blocks (n, 3) with cells (n, 512) into `target`, with the times that `source` keeps of them."""
+def add_blocks(target: VoxelMap, source: VoxelMap, coords: NDArray[np.int32], cells: NDArray[np.integer]) -> None:
+    """Add blocks (n, 3) with cells (n, 512) to `target`, with the times that `source` keeps of them."""
     known = (cells != target.cell_format.unknown).any(axis=1)
     target.insert(coords[known], cells[known])
     if source.config.map.keep_times:
         target.set_times(coords[known], source.times_of(coords[known]), source.times_start_ns)
 
 
-def put_times(target: VoxelMap, indices: NDArray[np.integer], times: NDArray[np.uint32], start_ns: int | None) -> None:
-    """Set the times (N,) of cells (N, 3) of a map, each named once; they count from `start_ns`."""
+def set_times(target: VoxelMap, indices: NDArray[np.integer], times: NDArray[np.uint32], start_ns: int | None) -> None:
+    """Set the times (N,), counted from `start_ns`, of distinct cells (N, 3) of a map."""
     blocks, of_cell = blocks_of_cells(indices)
     low = indices & (SIDE - 1)
     kept = np.zeros((len(blocks), CELLS), np.uint32)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a map says on one layer of cells, and along one ray (Chien 2020, Fig 4.6 and 4.9)."""
+"""One layer of a map's cells, and its cells along a ray (Chien 2020, Fig 4.6 and 4.9)."""
 
 from __future__ import annotations
 

@@ -19,8 +19,8 @@ from stereovox.threads import in_shards
 
 LANES = 32
 """Rows are padded to a multiple of it: whole vectors."""
-MAX_CELLS, LONGEST = 2**28, 2**14
-"""The largest box, in cells; it needs 20 bytes a cell, with padding more. Its longest side."""
+MAX_CELLS, MAX_SIDE = 2**28, 2**14
+"""Longest side of a box, in cells."""
 UNLIMITED = np.float32(3e38)
 
 
@@ -39,7 +39,7 @@ class Field(NamedTuple):
     mask: NDArray[np.uint8]
     runs: NDArray[np.int16]
     partial: NDArray[np.float32]
-    gone: NDArray[np.float32]
+    superseded: NDArray[np.float32]
     squares: NDArray[np.float32]
     metres: NDArray[np.float32]
     lowest: NDArray[np.float32]
@@ -78,7 +78,7 @@ class Transform:
         self.field = self._empty(slabs, rows)
 
     def update(self, dirty: NDArray[np.uint8], threads: int = 1) -> None:
-        """Bring `field` up to date after its mask changed in the slabs that are marked in `dirty` (slabs,)."""
+        """Update `field` after its mask changed in the slabs marked in `dirty` (slabs,)."""
 
         def in_slabs(part: slice) -> None:
             _transform.across_slabs(self.field, self.costs, self.lanes, dirty, part.start, threads)
@@ -117,9 +117,9 @@ class Transform:
         mask, runs = np.zeros((slabs, rows, padded), np.uint8), np.full((slabs, rows, padded), _transform.FAR)
         squares = np.zeros((rows, slabs, padded), np.float32)  # zero in the padding: nothing to look for there
         squares[:, :, : self.lanes] = none
-        gone, metres = np.empty_like(squares), np.full_like(squares, np.inf)
+        superseded, metres = np.empty_like(squares), np.full_like(squares, np.inf)
         lowest, touched = np.full((rows, slabs), none), np.full((rows, slabs), _transform.UNCHANGED)
-        return Field(mask, runs, squares, gone, squares.copy(), metres, lowest, lowest.copy(), touched)
+        return Field(mask, runs, squares, superseded, squares.copy(), metres, lowest, lowest.copy(), touched)
 
 
 def transformed(
@@ -138,6 +138,6 @@ def transformed(
 def _check(shape: tuple[int, ...], max_distance: float) -> None:
     if not max_distance > 0:
         raise StereovoxError(f"max_distance {max_distance:g}: give a length of more than 0 m")
-    if np.prod(np.array(shape, float)) > MAX_CELLS or max(shape) > LONGEST:
+    if np.prod(np.array(shape, float)) > MAX_CELLS or max(shape) > MAX_SIDE:
         told = " x ".join(map(str, shape))
         raise StereovoxError(f"a box of {told} cells is too large for a distance field; choose a smaller one")

@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Simulated recordings: scenes, cameras, robots and what their sensors make of the truth."""
+"""Simulated recordings: scenes, cameras, robots and models of their sensors."""

@@ -81,47 +81,6 @@ WAYPOINTS = np.array([
     [1.60, 1.60, 630],
     [0.90, 1.60, 720],
 ])  # fmt: skip
-
-
-def walk(speed: float) -> tuple[Callable[[float], Transform], float]:
-    """Return the way (T_plan_camera at a share of it) and how many seconds it takes at `speed` m/s.
-
-    Between waypoints the camera walks and turns at once; whatever takes longer sets the time. The first image looks
-    exactly level.
-    """
-    from scipy.interpolate import PchipInterpolator
-
-    times = _times(speed)
-    way = PchipInterpolator(times, WAYPOINTS)  # no overshoot: it would walk into walls
-
-    def path(share: float) -> Transform:
-        seconds = share * times[-1]
-        x, y, yaw_deg = way(seconds)
-        return _held(np.array([x, y, EYE]), np.radians(yaw_deg), seconds)
-
-    return path, float(times[-1])
-
-
-def _times(speed: float) -> NDArray[np.float64]:
-    """Return the second (N,) at which each waypoint is reached."""
-    steps = np.diff(WAYPOINTS, axis=0)
-    walking = np.linalg.norm(steps[:, :2], axis=1) / speed
-    turning = np.abs(steps[:, 2]) / TURN_DEG
-    return np.append(0.0, np.cumsum(np.maximum(walking, turning)))
-
-
-def _held(eye: NDArray[np.float64], yaw: float, seconds: float) -> Transform:
-    """Return T_plan_camera as a hand holds it: it bobs with the steps, sways and looks a little down."""
-    beat = 2 * np.pi * seconds
-    eye = eye + np.array([0, 0, 0.012 * np.sin(1.8 * beat)])
-    pitch = np.radians(PITCH_DEG * (1 - np.exp(-seconds)) + 1.5 * np.sin(0.7 * beat))
-    roll = np.radians(1.2 * np.sin(0.9 * beat))
-    ahead = np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), np.sin(pitch)])
-    T = look_at(eye, eye + ahead)
-    T[:3, :3] = T[:3, :3] @ rotation_matrix([0, 0, roll])
-    return T
-
-
 BOXES: dict[str, dict[str, tuple[Point, Point]]] = {
     "sofa": {
         "seat": ((1.2, 0.25, 0.1), (3.1, 0.9, 0.42)),
@@ -170,42 +129,7 @@ BOXES: dict[str, dict[str, tuple[Point, Point]]] = {
         "chest": ((0.06, 3.36, 0), (0.5, 4.1, 0.8)),
     },
 }
-"""Part, name, lowest and highest corner."""
-
-
-def furniture() -> list[Solid]:
-    """Return all furniture, unturned boxes and round legs, chairs turned by odd angles."""
-    boxes = [
-        box(part, f"{part}: {name}", *corners) for part, things in BOXES.items() for name, corners in things.items()
-    ]
-    return [
-        *boxes,
-        cylinder("kitchen", "kitchen: table foot", (7.75, 2.2, 0), (7.75, 2.2, 0.71), 0.08),
-        cylinder("lamp", "lamp: stand", (4.25, 0.35, 0), (4.25, 0.35, 1.5), 0.03),
-        cylinder("lamp", "lamp: shade", (4.25, 0.35, 1.5), (4.25, 0.35, 1.75), 0.3),
-        cylinder("desk", "desk: leg, south", (7.68, 5.48, 0), (7.68, 5.48, 0.71), 0.05),
-        *_chair("kitchen chair", 7.1, 2.3, 0.35),
-        *_chair("desk chair", 7.35, 6.15, -0.5),
-    ]
-
-
-def _chair(name: str, x: float, y: float, turn: float) -> list[Solid]:
-    """Return a chair whose sitter looks along +x turned by `turn` radians."""
-
-    def part(label: str, low: Point, high: Point) -> Solid:
-        (x0, y0, z0), (x1, y1, z1) = low, high
-        return box("chairs", f"{name}: {label}", (x + x0, y + y0, z0), (x + x1, y + y1, z1), turn, about=(x, y))
-
-    return [
-        part("seat", (-0.2, -0.2, 0.43), (0.2, 0.2, 0.47)),
-        part("back", (-0.2, -0.2, 0.47), (-0.165, 0.2, 0.9)),
-        *(
-            part(f"leg {n}", (a, b, 0), (a + 0.035, b + 0.035, 0.43))
-            for n, (a, b) in enumerate(((-0.2, -0.2), (0.165, -0.2), (-0.2, 0.165), (0.165, 0.165)), 1)
-        ),
-    ]
-
-
+"""Lowest and highest corner by part and name."""
 SHIFT = np.array([0.0137, 0.0219, -0.0123])
 """World coordinates of the plan's origin in metres."""
 HEIGHT, OUTSIDE = 2.5, 0.25
@@ -238,10 +162,10 @@ PASSAGE = (0.9, 1.9)
 def stage(*, speed: float = 0.8) -> Stage:
     """Return the furnished apartment and a scan of all rooms at walking `speed` (m/s), 15 images a second.
 
-    The way begins and ends at the same place, so that a tracker that drifts sees it again. The camera's sway is that of
-    a hand. World: z up, walls along x and y. Parts: `walls`, `floor`, `ceiling`, `door frames` and the furniture.
-    faces: the four sides of every room, named `kitchen west` and the like; doors are holes in them, and furniture
-    stands before them. Raises SourceError for values out of range.
+    The path begins and ends at the same place, so that a drifting tracker revisits it. The camera sways as in a hand.
+    World: z up, walls along x and y. Parts: `walls`, `floor`, `ceiling`, `door frames` and the furniture. faces: the
+    four sides of every room, named `kitchen west` and the like; doors are holes in them, and furniture stands before
+    them. Raises SourceError for values out of range.
     """
     within("speed", speed, 0.1, 5)
     T_world_plan = np.eye(4)
@@ -253,6 +177,78 @@ def stage(*, speed: float = 0.8) -> Stage:
         return moved(Scene([*_shell(), *_walls(), *_frames(), *furniture()]), T_world_plan)
 
     return Stage(build, lambda share: T_world_plan @ path(share), round(seconds * HZ) + 1, HZ, faces=faces)
+
+
+def walk(speed: float) -> tuple[Callable[[float], Transform], float]:
+    """Return the path (T_plan_camera at a share of it) and how many seconds it takes at `speed` m/s.
+
+    Between waypoints the camera walks and turns at once; whichever takes longer sets the time. The first image looks
+    exactly level.
+    """
+    from scipy.interpolate import PchipInterpolator
+
+    times = _times(speed)
+    way = PchipInterpolator(times, WAYPOINTS)  # no overshoot: it would walk into walls
+
+    def path(share: float) -> Transform:
+        seconds = share * times[-1]
+        x, y, yaw_deg = way(seconds)
+        return _held(np.array([x, y, EYE]), np.radians(yaw_deg), seconds)
+
+    return path, float(times[-1])
+
+
+def furniture() -> list[Solid]:
+    """Return all furniture, unturned boxes and round legs, chairs turned by odd angles."""
+    boxes = [
+        box(part, f"{part}: {name}", *corners) for part, things in BOXES.items() for name, corners in things.items()
+    ]
+    return [
+        *boxes,
+        cylinder("kitchen", "kitchen: table foot", (7.75, 2.2, 0), (7.75, 2.2, 0.71), 0.08),
+        cylinder("lamp", "lamp: stand", (4.25, 0.35, 0), (4.25, 0.35, 1.5), 0.03),
+        cylinder("lamp", "lamp: shade", (4.25, 0.35, 1.5), (4.25, 0.35, 1.75), 0.3),
+        cylinder("desk", "desk: leg, south", (7.68, 5.48, 0), (7.68, 5.48, 0.71), 0.05),
+        *_chair("kitchen chair", 7.1, 2.3, 0.35),
+        *_chair("desk chair", 7.35, 6.15, -0.5),
+    ]
+
+
+def _times(speed: float) -> NDArray[np.float64]:
+    """Return the second (N,) at which each waypoint is reached."""
+    steps = np.diff(WAYPOINTS, axis=0)
+    walking = np.linalg.norm(steps[:, :2], axis=1) / speed
+    turning = np.abs(steps[:, 2]) / TURN_DEG
+    return np.append(0.0, np.cumsum(np.maximum(walking, turning)))
+
+
+def _held(eye: NDArray[np.float64], yaw: float, seconds: float) -> Transform:
+    """Return T_plan_camera as a hand holds it: it bobs with the steps, sways and looks a little down."""
+    beat = 2 * np.pi * seconds
+    eye = eye + np.array([0, 0, 0.012 * np.sin(1.8 * beat)])
+    pitch = np.radians(PITCH_DEG * (1 - np.exp(-seconds)) + 1.5 * np.sin(0.7 * beat))
+    roll = np.radians(1.2 * np.sin(0.9 * beat))
+    ahead = np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), np.sin(pitch)])
+    T = look_at(eye, eye + ahead)
+    T[:3, :3] = T[:3, :3] @ rotation_matrix([0, 0, roll])
+    return T
+
+
+def _chair(name: str, x: float, y: float, turn: float) -> list[Solid]:
+    """Return a chair whose sitter looks along +x turned by `turn` radians."""
+
+    def part(label: str, low: Point, high: Point) -> Solid:
+        (x0, y0, z0), (x1, y1, z1) = low, high
+        return box("chairs", f"{name}: {label}", (x + x0, y + y0, z0), (x + x1, y + y1, z1), turn, about=(x, y))
+
+    return [
+        part("seat", (-0.2, -0.2, 0.43), (0.2, 0.2, 0.47)),
+        part("back", (-0.2, -0.2, 0.47), (-0.165, 0.2, 0.9)),
+        *(
+            part(f"leg {n}", (a, b, 0), (a + 0.035, b + 0.035, 0.43))
+            for n, (a, b) in enumerate(((-0.2, -0.2), (0.165, -0.2), (-0.2, 0.165), (0.165, 0.165)), 1)
+        ),
+    ]
 
 
 def _sides() -> list[Face]:

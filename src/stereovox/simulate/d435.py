@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a RealSense D435 makes of a true depth image: disparity noise, holes beside edges, near and far limits."""
+"""Sensor model of a RealSense D435: disparity noise, holes beside edges, near and far limits."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def classify(depth_m: NDArray[np.floating], nearest: float, farthest: float) -> 
 
 
 def hidden_from_right_eye(disparity: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Tell which pixels of the left image (height, width) the right eye cannot see.
+    """Return which pixels of the left image (height, width) the right eye cannot see.
 
     Each pixel moves left by its disparity; where a nearer surface lands on the same pixel of the right image, or
     where it leaves that image, there is nothing to match.
@@ -119,12 +119,12 @@ def hidden_from_right_eye(disparity: NDArray[np.float32]) -> NDArray[np.bool_]:
 
 
 def beside_nearer_surface(disparity: NDArray[np.float32], radius: int) -> NDArray[np.bool_]:
-    """Tell which pixels have a nearer surface within `radius` pixels."""
+    """Return which pixels have a nearer surface within `radius` pixels."""
     return _extreme(np.maximum, disparity, radius) > disparity + JUMP_PX
 
 
 def on_border(disparity: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Tell which pixels have a farther surface right beside them."""
+    """Return which pixels have a farther surface right beside them."""
     return _extreme(np.minimum, disparity, 1) < disparity - JUMP_PX
 
 

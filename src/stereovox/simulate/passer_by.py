@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A person walks across the view of a camera that stands, and is gone; beside the way stands a thin pole."""
+"""A person crosses the view of a camera at rest and leaves; a thin pole stands beside the path."""
 
 from __future__ import annotations
 
@@ -28,17 +28,16 @@ WIDE, TALL = 0.45, 1.75
 WALL = 4.0
 POLE = (1.5, -0.47)
 BEFORE, AFTER = 30, 45
-"""Frames in which nobody is there, at the beginning and at the end."""
+"""Frames without the person, at the beginning and at the end."""
 
 
-class Passing(DepthSource):
-    """Frames of a simulated D435, 30 a second: nobody, a person from left to right, nobody. World: z up, metres.
+class PasserBy(DepthSource):
+    """Frames of a simulated D435, 30 a second: empty, a person walking from left to right, empty. World: z up, metres.
 
-    background: `near`, a wall within range; `far`: nothing behind the person but the floor, and the camera says that it
-        is too far away; `silent`: the same, but the camera does not say why it has no value.
-    pole_m: thickness of the pole. pole_every: it is measured in one frame of so many; `missed` tells how the others
-        miss it: its pixels show what lies behind it (`background`), or have no value (`unmatched`).
-    Raises SourceError for unknown words.
+    background: `near`, a wall within range; `far`: nothing behind the person but the floor, and the camera reports it
+    as too far away; `silent`: the same, but the camera does not say why it has no value. pole_m: thickness of the pole.
+    pole_every: it is measured in one frame of this many; `missed` says how the others miss it: its pixels show the
+    background (`background`) or have no value (`unmatched`). Raises SourceError for unknown words.
     """
 
     layout = "a person who crosses the view (for `stereovox.lab.checks.ghosts`)"
@@ -69,16 +68,16 @@ class Passing(DepthSource):
 
     @cached_property
     def static(self) -> Scene:
-        """What stays where it is: floor, pole, and the wall where there is one."""
+        """What does not move: floor, pole, and the wall if there is one."""
         return Scene([*self._surroundings, self.pole])
 
     @cached_property
     def pole(self) -> Solid:
-        """The thin thing that is often missed."""
+        """The thin pole that is often missed."""
         return cylinder("pole", "pole", (*POLE, 0.0), (*POLE, 3.0), self.pole_m, sections=12)
 
     def person(self, i: int) -> Solid | None:
-        """Return the person in frame `i`, None where nobody is there."""
+        """Return the person in frame `i`, None if absent."""
         step = i - BEFORE
         if not 0 <= step < self._walk:
             return None
@@ -90,8 +89,8 @@ class Passing(DepthSource):
         """Return the exact depth (height, width) in metres of frame `i`, inf where nothing is."""
         return self._cast(self.person(i), pole=True)
 
-    def sees_person(self, i: int) -> bool:
-        """Tell whether a pixel of frame `i` shows the person."""
+    def shows_person(self, i: int) -> bool:
+        """Return whether a pixel of frame `i` shows the person."""
         return self.person(i) is not None and bool((self.true_depth(i) < self._cast(None, pole=True)).any())
 
     def frame(self, i: int) -> Frame:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Plain scenes of Chien 2020: `sim:aisle` (Fig 4.12), `sim:box` (4.4.1) and `sim:wall` (Appendix B)."""
+"""Simple scenes of Chien 2020: `sim:aisle` (Fig 4.12), `sim:box` (4.4.1) and `sim:wall` (Appendix B)."""
 
 from __future__ import annotations
 
@@ -15,6 +15,15 @@ SIZES = {"large": (0.47, 0.365, 0.32), "small": (0.25, 0.185, 0.09)}
 """Width, height and depth in metres (Chien 2020, Fig 4.5 and 4.8)."""
 FRAMES = 120
 THICKNESS = 0.2
+WALL_FRAMES = 30
+STEEPEST = 25.0
+"""Degrees by which the wall may turn; further, the camera's outermost rays hardly meet it."""
+START = 0.1
+"""Metres between the wall behind the camera and the camera."""
+STOP = 2.0
+"""Metres before the end wall at which a walking camera stops."""
+FARTHEST = 16.0
+"""Depth up to which the camera delivers: Chien 2020, 2.2 trusts his D435 up to 16 m."""
 
 
 def box_stage(
@@ -62,11 +71,6 @@ def box_stage(
     return Stage(build, lambda share: T_world_camera, FRAMES, faces=faces)
 
 
-WALL_FRAMES = 30
-STEEPEST = 25.0
-"""Degrees by which the wall may turn; further, the camera's outermost rays hardly meet it."""
-
-
 def wall_stage(*, distance: float = 1.4, tilt: float = 0.0, turn: float = 0.0) -> Stage:
     """Return a wall that the optical axis meets at `distance` metres, and a camera that stands.
 
@@ -89,14 +93,6 @@ def wall_stage(*, distance: float = 1.4, tilt: float = 0.0, turn: float = 0.0) -
     T_world_camera = look_at((0, 0, 0), (1, 0, 0))
     face = Face("wall", corners @ T_world_wall[:3, :3].T + T_world_wall[:3, 3])
     return Stage(build, lambda share: T_world_camera, WALL_FRAMES, faces=(face,))
-
-
-START = 0.1
-"""Metres between the wall behind the camera and the camera."""
-STOP = 2.0
-"""Metres before the end wall at which a walking camera stops."""
-FARTHEST = 16.0
-"""Depth up to which the camera delivers: Chien 2020, 2.2 trusts his D435 up to 16 m."""
 
 
 def aisle_stage(

@@ -42,7 +42,7 @@ class Solid:
         return np.unique(planes.round(9), axis=0)
 
     def contains(self, points: ArrayLike, margin: float = 1e-6) -> NDArray[np.bool_]:
-        """Tell which points (N, 3) lie in the solid; points up to `margin` metres outside count as in it."""
+        """Return which points (N, 3) lie in the solid; points up to `margin` metres outside count as in it."""
         planes = self.planes
         return np.all(planes[:, :3] @ np.asarray(points, float).T <= planes[:, 3:] + margin, axis=0)
 

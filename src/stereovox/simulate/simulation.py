@@ -84,7 +84,7 @@ class Simulation(DepthSource):
     UNMATCHED beside edges and where the right eye sees nothing.
     noise: False gives exact depth in metres (float32, inf where nothing is) without noise or holes.
     frames: how many frames are taken on the whole way; None leaves it to the scene. The way takes as long all the same.
-    Raises SourceError, one line, for an unknown scene or parameter and for values out of range.
+    Raises SourceError for an unknown scene or parameter and for values out of range.
     """
 
     layout = f"simulation ({', '.join(f'sim:{name}' for name in SCENES)})"
@@ -93,9 +93,9 @@ class Simulation(DepthSource):
         self, location: str | Path = "sim:room", *, noise: bool = True, frames: int | None = None, seed: int = 0
     ):
         self.name = str(location)
-        given = {"noise": noise, "frames": frames or 0, "seed": seed}
+        texts = {"noise": noise, "frames": frames or 0, "seed": seed}
         try:
-            self.options, stage = _read(self.name.removeprefix("sim:"), given)
+            self.options, stage = _read(self.name.removeprefix("sim:"), texts)
         except (SourceError, ConfigError) as error:
             raise SourceError(f"{location}: {error}") from None
         self.device = _device(stage.device, self.options)
@@ -108,7 +108,7 @@ class Simulation(DepthSource):
 
     @classmethod
     def recognises(cls, location: str | Path) -> bool:
-        """Tell whether `location` names a simulation."""
+        """Return whether `location` names a simulation."""
         return str(location).startswith("sim:")
 
     @cached_property
@@ -184,13 +184,13 @@ class Simulation(DepthSource):
         return np.ascontiguousarray(grid.reshape(-1, 3))
 
 
-def _read(text: str, given: dict[str, Any]) -> tuple[Options, Stage]:
-    """Return what a location without its `sim:` asks for; `given` counts where it says nothing."""
+def _read(text: str, texts: dict[str, Any]) -> tuple[Options, Stage]:
+    """Return what a location without its `sim:` asks for; `texts` counts where it says nothing."""
     name, written = parameters.split(text)
     build = registry.find("scenes", SCENES, name)
     own, common = parameters.defaults(build), parameters.defaults(Options)
     values = parameters.typed(written, {**common, **own})
-    options = Options(**{**given, **{key: value for key, value in values.items() if key in common}})
+    options = Options(**{**texts, **{key: value for key, value in values.items() if key in common}})
     return options, build(**{key: value for key, value in values.items() if key in own})
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a simulation needs to know: a scene, the camera and its way through the scene, and the planes to judge it by."""
+"""The stage of a simulation: a scene, the camera and its path, and the planes by which a map is judged."""
 
 from __future__ import annotations
 
@@ -49,10 +49,9 @@ def rectangle(name: str, low: Point, high: Point, towards: Point) -> Face:
 class Stage:
     """A scene and a camera that moves through it. World: z up, metres.
 
-    build: makes the scene; it is asked once, when the scene is needed.
-    path: T_world_camera (4, 4) at a share of the way, 0 (start) to 1 (end).
-    frames, hz: how many images are taken on the way, and how many a second.
-    faces: flat surfaces of the scene by which a map can be judged.
+    build: makes the scene; called once, when it is needed. path: T_world_camera (4, 4) at a share of the path, 0
+    (start) to 1 (end). frames, hz: number of images on the path, and images a second. faces: flat surfaces of the scene
+    by which a map can be judged.
     """
 
     build: Callable[[], Scene]
@@ -95,6 +94,6 @@ def within(name: str, value: float, low: float, high: float) -> None:
 
 
 def one_of(name: str, value: str, known: tuple[str, ...]) -> None:
-    """Raise SourceError where a parameter is none of the known words."""
+    """Raise SourceError where a parameter is not one of the known words."""
     if value not in known:
         raise SourceError(f"{name}={value} is unknown; use {' or '.join(known)}")

@@ -33,98 +33,9 @@ FISHEYE_DEG = (150.0, 140.0)
 a pair sees along its own baseline, and its ranges are four times as noisy as in the middle (Valenti 2018, Eq 4.7)."""
 BACKWARD_DEG = 20.0
 """The side cameras are turned so far backward, so that behind the vehicle both see something."""
-
-
-@dataclass(frozen=True)
-class Mount:
-    """A camera of Table 3.1, at half its resolution.
-
-    hfov_deg, width, height: of the image. distortion: of both lenses. looks_to, down: unit vectors in the body's frame
-    (x forward, y left, z up): optical axis, and what is down in the image. centre: between both eyes, metres.
-    """
-
-    model: str
-    hfov_deg: float
-    width: int
-    height: int
-    distortion: tuple[float, ...]
-    looks_to: tuple[float, float, float]
-    down: tuple[float, float, float]
-    centre: tuple[float, float, float]
-
-
-def _aside(sign: float) -> tuple[float, float, float]:
-    azimuth = sign * math.radians(90 + BACKWARD_DEG)
-    return math.cos(azimuth), math.sin(azimuth), 0.0
-
-
 _FISHEYE = ("fisheye", 175.0, 640, 360, (-0.01, 0.002, 0.0, 0.0))
-MOUNTS = {
-    "front": Mount("pinhole", 91.0, 960, 540, (-0.03, 0.006), (1, 0, 0), (0, 0, -1), (0.12, 0, 0)),
-    "left": Mount(*_FISHEYE, _aside(1), (0, 0, -1), (0, 0.12, 0)),
-    "right": Mount(*_FISHEYE, _aside(-1), (0, 0, -1), (0, -0.12, 0)),
-    "down": Mount("pinhole", 105.0, 640, 360, (-0.03, 0.006), (0, 0, -1), (-1, 0, 0), (0, 0, -0.08)),
-}
-"""The four pairs by name, in the order in which they deliver."""
-
-
-def surround_pair(name: str, scale: float = 1.0) -> StereoPair:
-    """Return the stereo pair of this name; its images are `scale` times as wide as half those of Table 3.1."""
-    mount = MOUNTS[name]
-    width, height = max(16, round(mount.width * scale)), max(9, round(mount.height * scale))
-    lens = Lens.from_field_of_view(mount.model, width, height, mount.hfov_deg)
-    bent = Lens(lens.model, width, height, lens.fx, lens.fy, lens.cx, lens.cy, mount.distortion)
-    eyes = Eyes(bent, bent, _right_eye())
-    return StereoPair(_virtual(mount, width, height), eyes, _mounted(mount), name=name)
-
-
-def _virtual(mount: Mount, width: int, height: int) -> PinholeCamera | SphericalCamera:
-    if mount.model == "pinhole":
-        return PinholeCamera.from_field_of_view(width, height, mount.hfov_deg, BASELINE)
-    columns, rows = (round(width * angle / mount.hfov_deg) for angle in FISHEYE_DEG)
-    return SphericalCamera.from_field_of_view(columns, rows, *FISHEYE_DEG, BASELINE)
-
-
-def _right_eye() -> Transform:
-    """Return T_left_right. Toe-in and roll leave the rectified left frame where the left eye's is."""
-    T_left_right = np.eye(4)
-    turn, roll = rotation_matrix([0, math.radians(TOE_IN_DEG), 0]), rotation_matrix([0, 0, math.radians(ROLL_DEG)])
-    T_left_right[:3, :3], T_left_right[0, 3] = turn @ roll, BASELINE
-    return T_left_right
-
-
-def _mounted(mount: Mount) -> Transform:
-    """Return T_body_camera of the rectified left eye."""
-    T_body_camera: NDArray[np.float64] = look_at(np.zeros(3), mount.looks_to, -np.array(mount.down))
-    T_body_camera[:3, 3] = np.array(mount.centre) - BASELINE / 2 * T_body_camera[:3, 0]
-    return T_body_camera
-
-
 HZ = 10.0
 ALL = "all"
-
-
-@dataclass(frozen=True)
-class Options:
-    """Parameters of `sim:surround`.
-
-    pair: `all`, or one of `front`, `left`, `right`, `down`. moments: how often all pairs take an image on the way
-    through room and corridor, ten times a second. scale: size of the images, 1: half of Valenti 2018, Table 3.1; 2 as
-    there. noise: of the images, grey levels. seed: of the noise.
-    """
-
-    pair: str = ALL
-    moments: int = 80
-    scale: float = 1.0
-    noise: float = 1.5
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        one_of("pair", self.pair, (ALL, *MOUNTS))
-        within("moments", self.moments, 1, 1_000_000)
-        within("scale", self.scale, 0.05, 2)
-        within("noise", self.noise, 0, 100)
-        within("seed", self.seed, 0, 2**63)
 
 
 class Surround(Source):
@@ -133,7 +44,7 @@ class Surround(Source):
     location: `sim:surround` or with parameters `sim:surround?pair=front&scale=0.5`, see `Options`. The images are as
     the lenses make them. World: z up, metres; the drone's body is level, x forward, y left, z up. Every frame can be
     asked for by itself and is always the same for the same `seed`.
-    Raises SourceError, one line, for an unknown parameter and for values out of range.
+    Raises SourceError for an unknown parameter and for values out of range.
     """
 
     layout = "four stereo cameras round a drone (sim:surround)"
@@ -151,7 +62,7 @@ class Surround(Source):
 
     @classmethod
     def recognises(cls, location: str | Path) -> bool:
-        """Tell whether `location` names this simulation."""
+        """Return whether `location` names this simulation."""
         return str(location).partition("?")[0] == "sim:surround"
 
     @cached_property
@@ -180,7 +91,7 @@ class Surround(Source):
         pair, T_world_left, stamp_ns, name = self._at(i)
         depth = self._cast(pair, T_world_left)
         reason = np.where(np.isfinite(depth), Reason.VALID, Reason.TOO_FAR).astype(np.uint8)
-        reason[~seen_by_both(pair)] = Reason.MASKED
+        reason[~visible_to_both(pair)] = Reason.MASKED
         depth = np.where(reason == Reason.VALID, depth, np.float32(0))
         return Frame(depth, pair.camera, T_world_left, stamp_ns, reason=reason, name=name, sensor=pair.name)
 
@@ -210,9 +121,74 @@ class Surround(Source):
         return self.scene.cast(T_world_left[:3, 3], directions).reshape(pair.camera.height, pair.camera.width)
 
 
+@dataclass(frozen=True)
+class Options:
+    """Parameters of `sim:surround`.
+
+    pair: `all`, or one of `front`, `left`, `right`, `down`. moments: how often all pairs take an image on the way
+    through room and corridor, ten times a second. scale: size of the images, 1: half of Valenti 2018, Table 3.1; 2 as
+    there. noise: of the images, grey levels. seed: of the noise.
+    """
+
+    pair: str = ALL
+    moments: int = 80
+    scale: float = 1.0
+    noise: float = 1.5
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        one_of("pair", self.pair, (ALL, *MOUNTS))
+        within("moments", self.moments, 1, 1_000_000)
+        within("scale", self.scale, 0.05, 2)
+        within("noise", self.noise, 0, 100)
+        within("seed", self.seed, 0, 2**63)
+
+
+@dataclass(frozen=True)
+class Mount:
+    """A camera of Table 3.1, at half its resolution.
+
+    hfov_deg, width, height: of the image. distortion: of both lenses. looks_to, down: unit vectors in the body's frame
+    (x forward, y left, z up): optical axis, and what is down in the image. centre: between both eyes, metres.
+    """
+
+    model: str
+    hfov_deg: float
+    width: int
+    height: int
+    distortion: tuple[float, ...]
+    forward: tuple[float, float, float]
+    down: tuple[float, float, float]
+    centre: tuple[float, float, float]
+
+
+def _aside(sign: float) -> tuple[float, float, float]:
+    azimuth = sign * math.radians(90 + BACKWARD_DEG)
+    return math.cos(azimuth), math.sin(azimuth), 0.0
+
+
+MOUNTS = {
+    "front": Mount("pinhole", 91.0, 960, 540, (-0.03, 0.006), (1, 0, 0), (0, 0, -1), (0.12, 0, 0)),
+    "left": Mount(*_FISHEYE, _aside(1), (0, 0, -1), (0, 0.12, 0)),
+    "right": Mount(*_FISHEYE, _aside(-1), (0, 0, -1), (0, -0.12, 0)),
+    "down": Mount("pinhole", 105.0, 640, 360, (-0.03, 0.006), (0, 0, -1), (-1, 0, 0), (0, 0, -0.08)),
+}
+"""The four pairs by name, in the order in which they deliver."""
+
+
+def surround_pair(name: str, scale: float = 1.0) -> StereoPair:
+    """Return the stereo pair of this name; its images are `scale` times as wide as half those of Table 3.1."""
+    mount = MOUNTS[name]
+    width, height = max(16, round(mount.width * scale)), max(9, round(mount.height * scale))
+    lens = Lens.from_field_of_view(mount.model, width, height, mount.hfov_deg)
+    bent = Lens(lens.model, width, height, lens.fx, lens.fy, lens.cx, lens.cy, mount.distortion)
+    eyes = Eyes(bent, bent, _right_eye())
+    return StereoPair(_virtual(mount, width, height), eyes, _mounted(mount), name=name)
+
+
 @lru_cache(maxsize=8)
-def seen_by_both(pair: StereoPair) -> NDArray[np.bool_]:
-    """Tell which pixels (height, width) of the rectified left image look where both lenses see, far away."""
+def visible_to_both(pair: StereoPair) -> NDArray[np.bool_]:
+    """Return which pixels (height, width) of the rectified left image look where both lenses see, far away."""
     assert pair.eyes is not None
     R_left, R_right = pair.eyes.rectifying_rotations()
     rays = _rays(pair).astype(float)
@@ -221,6 +197,28 @@ def seen_by_both(pair: StereoPair) -> NDArray[np.bool_]:
         u, v = lens.project(rays @ R.T).T
         seen &= (u >= 0) & (u <= lens.width - 1) & (v >= 0) & (v <= lens.height - 1)
     return seen.reshape(pair.camera.height, pair.camera.width)
+
+
+def _virtual(mount: Mount, width: int, height: int) -> PinholeCamera | SphericalCamera:
+    if mount.model == "pinhole":
+        return PinholeCamera.from_field_of_view(width, height, mount.hfov_deg, BASELINE)
+    columns, rows = (round(width * angle / mount.hfov_deg) for angle in FISHEYE_DEG)
+    return SphericalCamera.from_field_of_view(columns, rows, *FISHEYE_DEG, BASELINE)
+
+
+def _right_eye() -> Transform:
+    """Return T_left_right. Toe-in and roll leave the rectified left frame where the left eye's is."""
+    T_left_right = np.eye(4)
+    turn, roll = rotation_matrix([0, math.radians(TOE_IN_DEG), 0]), rotation_matrix([0, 0, math.radians(ROLL_DEG)])
+    T_left_right[:3, :3], T_left_right[0, 3] = turn @ roll, BASELINE
+    return T_left_right
+
+
+def _mounted(mount: Mount) -> Transform:
+    """Return T_body_camera of the rectified left eye."""
+    T_body_camera: NDArray[np.float64] = look_at(np.zeros(3), mount.forward, -np.array(mount.down))
+    T_body_camera[:3, 3] = np.array(mount.centre) - BASELINE / 2 * T_body_camera[:3, 0]
+    return T_body_camera
 
 
 def _rays(pair: StereoPair) -> NDArray[np.float32]:

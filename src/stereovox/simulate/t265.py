@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a RealSense T265 makes of a true motion: jitter, drift, re-localisation, a confidence, a clock of its own.
+"""Sensor model of a RealSense T265: jitter, drift, re-localisation, confidence, and a clock of its own.
 
 The tracker's file and body have OpenGL axes: x right, y up, z backward. Its world starts at its first pose, with y
 against gravity and z against its first heading (Chien 2020, 4.1 and Fig 4.1).
@@ -19,24 +19,30 @@ from stereovox.se3 import Transform, inverse
 from stereovox.sources.poses import seconds_from_ns
 
 STEP_S = 0.05
-"""Drift is slow: it is worked out so often and interpolated."""
+"""Seconds between steps of the drift, which is slow and interpolated."""
 WALK_M = 5.0
-"""Metres over which the drift keeps its direction: over shorter ways it grows with the way, then with its root."""
+"""Metres over which the drift keeps its direction: over shorter distances it grows linearly, then with the square root.
+"""
 ALIKE = 0.5
-"""A place is known again where the camera looks the same way within 60 degrees (cosine)."""
+"""Largest change of heading, as a cosine (60 degrees), at which a place is recognised."""
 SPACING_M = 0.3
-"""A place is remembered every so many metres."""
+"""Metres between remembered places."""
+RATE_HZ = 200
+OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+"""T_opengl_optical: turns optical axes (x right, y down, z forward) into OpenGL ones; it is its own inverse."""
+FAILED, LOW, MEDIUM, HIGH = range(4)
+"""Confidence of a pose."""
 
 
 @dataclass(frozen=True)
 class Drift:
     """Drift and re-localisation of a tracker.
 
-    share: error per metre of way, in all directions (0.01 is a good tracker's); yaw_deg: drift of the heading over
-        one metre, in degrees; it grows with the root of the way. Gravity keeps roll and pitch right.
-    find_again_m: a place seen before is known again from so far away (0: never), if the way since is longer than
-        `loop_m`; pull_s: time in which two thirds of the error since then are taken back. Chien 2020, 2.2.3: the pose
-        "will become more precise upon further visits to the same area".
+    share: error per metre travelled, in all directions (0.01 is a good tracker's); yaw_deg: drift of the heading over
+    one metre, in degrees; it grows with the square root of the distance. Gravity keeps roll and pitch right.
+    find_again_m: distance within which a visited place is recognised (0: never), if the path since is longer than
+    `loop_m`; pull_s: time in which two thirds of the error since then are removed. Chien 2020, 2.2.3: the pose "will
+    become more precise upon further visits to the same area".
     """
 
     share: float = 0.01
@@ -46,148 +52,19 @@ class Drift:
     pull_s: float = 0.7
 
 
-@dataclass
-class _Places:
-    """What the tracker remembers: where it was, how it looked, after which way, and its errors there."""
-
-    where: list[NDArray[np.float64]] = field(default_factory=list)
-    ahead: list[NDArray[np.float64]] = field(default_factory=list)
-    way: list[float] = field(default_factory=list)
-    error: list[NDArray[np.float64]] = field(default_factory=list)
-
-    def remember(self, T: NDArray[np.float64], way: float, error: NDArray[np.float64]) -> None:
-        if not self.way or way - self.way[-1] >= SPACING_M:
-            self.where.append(T[:3, 3])
-            self.ahead.append(-T[:3, 2])
-            self.way.append(way)
-            self.error.append(error)
-
-    def find(self, T: NDArray[np.float64], way: float, drift: Drift) -> NDArray[np.float64] | None:
-        """Return the errors at the earliest place known again, else None."""
-        old = int(np.searchsorted(self.way, way - drift.loop_m))
-        if not old:
-            return None
-        near = np.linalg.norm(np.array(self.where[:old]) - T[:3, 3], axis=1) < drift.find_again_m
-        known = near & (np.array(self.ahead[:old]) @ -T[:3, 2] > ALIKE)
-        return self.error[int(np.argmax(known))] if known.any() else None
-
-
-def drifted(
-    drift: Drift,
-    seconds: NDArray[np.float64],
-    poses: NDArray[np.float64],
-    jumps_m: NDArray[np.float64],
-    random: np.random.Generator,
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the errors of position (N, 3) in metres and of heading (N,) in radians about y.
-
-    seconds: (N,). poses: (N, 4, 4) in OpenGL axes, y up. jumps_m: (N,) sudden sideways errors.
-    """
-    steps = np.unique(np.append(np.arange(0, len(seconds), _stride(seconds)), len(seconds) - 1))
-    coarse = _walk(drift, seconds[steps], poses[steps], _sudden(jumps_m, steps), random)
-    fine = np.stack([np.interp(seconds, seconds[steps], column) for column in coarse.T], axis=1)
-    for k in np.flatnonzero(jumps_m):  # interpolation would make a ramp of it
-        after = int(np.searchsorted(steps, k))
-        between = np.arange(steps[max(after - 1, 0)], steps[after])
-        fine[between] = np.where((between < k)[:, None], coarse[max(after - 1, 0)], coarse[after])
-    return fine[:, :3], fine[:, 3]
-
-
-def _stride(seconds: NDArray[np.float64]) -> int:
-    return max(1, round(STEP_S / float(np.median(np.diff(seconds)))))
-
-
-def _sudden(jumps_m: NDArray[np.float64], steps: NDArray[np.intp]) -> NDArray[np.float64]:
-    """Return the jumps (S,) between each step and the one before."""
-    total = np.cumsum(jumps_m)[steps]
-    return np.diff(total, prepend=0.0)
-
-
-def _walk(
-    drift: Drift,
-    seconds: NDArray[np.float64],
-    poses: NDArray[np.float64],
-    jumps_m: NDArray[np.float64],
-    random: np.random.Generator,
-) -> NDArray[np.float64]:
-    """Return the errors (S, 4): x, y, z and heading, step by step."""
-    places, error, way = _Places(), np.zeros(4), 0.0
-    course = random.standard_normal(3) / np.sqrt(3)
-    errors = [error]
-    places.remember(poses[0], way, error)
-    for k in range(1, len(poses)):
-        move = poses[k, :3, 3] - poses[k - 1, :3, 3]
-        length = float(np.linalg.norm(move))
-        way += length
-        keep = np.exp(-length / WALK_M)
-        course = keep * course + np.sqrt((1 - keep**2) / 3) * random.standard_normal(3)
-        error = error + _step(drift, error[3], move, length, course, random)
-        error[0] += jumps_m[k]
-        found = places.find(poses[k], way, drift)
-        if found is not None:
-            error = error + (found - error) * (1 - np.exp((seconds[k - 1] - seconds[k]) / drift.pull_s))
-        else:
-            places.remember(poses[k], way, error)
-        errors.append(error)
-    return np.array(errors)
-
-
-def _step(
-    drift: Drift,
-    yaw: float,
-    move: NDArray[np.float64],
-    length: float,
-    course: NDArray[np.float64],
-    random: np.random.Generator,
-) -> NDArray[np.float64]:
-    """Return what one step adds to the errors (4,): a wrong heading also sends the position astray."""
-    cosine, sine = np.cos(yaw), np.sin(yaw)
-    astray = [(cosine - 1) * move[0] + sine * move[2], 0.0, (cosine - 1) * move[2] - sine * move[0]]
-    turn = np.radians(drift.yaw_deg) * np.sqrt(length) * random.standard_normal()
-    return np.append(drift.share * length * course + astray, turn)
-
-
-RATE_HZ = 200
-OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-"""T_opengl_optical: turns optical axes (x right, y down, z forward) into OpenGL ones; it is its own inverse."""
-FAILED, LOW, MEDIUM, HIGH = range(4)
-"""Confidence of a pose."""
-
-
-@dataclass(frozen=True, eq=False)
-class Track:
-    """What a tracker reported, and what it should have reported.
-
-    stamps_ns: (N,) int64, the tracker's own clock. positions: (N, 3) metres. quaternions: (N, 4) x, y, z, w.
-    confidence: (N,) uint8, 0 (failed) to 3 (high). All in OpenGL axes, tracker to the tracker's world.
-    truth: (N, 4, 4) the exact poses, in the same axes and the same world.
-    """
-
-    stamps_ns: NDArray[np.int64]
-    positions: NDArray[np.float64]
-    quaternions: NDArray[np.float64]
-    confidence: NDArray[np.uint8]
-    truth: NDArray[np.float64]
-
-    @cached_property
-    def errors_m(self) -> NDArray[np.float64]:
-        """How far (N,) each position is from the true one, in metres."""
-        return np.linalg.norm(self.positions - self.truth[:, :3, 3], axis=1)
-
-
 @dataclass(frozen=True)
 class T265:
     """A model of the tracker. All its noise follows from `seed`.
 
-    jitter_m, jitter_deg: standard deviation of the noise of each axis; jitter_s: time over which it is alike.
-    drift: how it drifts and finds places again; see `Drift`.
-    settle_s: so long the confidence is low and the jitter five times larger, unless the camera has moved 0.3 m before;
-        Chien 2020, 2.2.3: "low at the beginning and improves as the camera starts moving".
-    clock_offset_s, clock_drift_ppm: camera time = tracker time + clock_offset_s, at the first pose; then the tracker's
-        clock gains so many millionths.
-    jump_s, jump_m: at this time (None: never) the position jumps sideways by so many metres, until it finds a place
-        again. lost_s: from and to which time (None: never) the confidence is low and the jitter twenty times larger.
-    Times count from the first pose.
+    jitter_m, jitter_deg: standard deviation of the noise of each axis; jitter_s: its correlation time. drift: how it
+    drifts and recognises places; see `Drift`. settle_s: for this long the confidence is low and the jitter five times
+    larger, unless the camera has moved 0.3 m before; Chien 2020, 2.2.3: "low at the beginning and improves as the
+    camera starts moving".
+    clock_offset_s, clock_drift_ppm: camera time = tracker time + clock_offset_s, at the first pose; from then on the
+    tracker's clock gains this many millionths.
+    jump_s, jump_m: at this time (None: never) the position jumps sideways by this many metres, until it recognises a
+    place. lost_s: from and to which time (None: never) the confidence is low and the jitter twenty times larger. Times
+    count from the first pose.
     """
 
     seed: int = 0
@@ -262,8 +139,50 @@ class T265:
         return truth[:, :3, 3] + shift + self.jitter_m * trembles[:, :3], turned.as_quat()
 
 
+@dataclass(frozen=True, eq=False)
+class Track:
+    """What a tracker reported, and what it should have reported.
+
+    stamps_ns: (N,) int64, the tracker's own clock. positions: (N, 3) metres. quaternions: (N, 4) x, y, z, w.
+    confidence: (N,) uint8, 0 (failed) to 3 (high). All in OpenGL axes, tracker to the tracker's world.
+    truth: (N, 4, 4) the exact poses, in the same axes and the same world.
+    """
+
+    stamps_ns: NDArray[np.int64]
+    positions: NDArray[np.float64]
+    quaternions: NDArray[np.float64]
+    confidence: NDArray[np.uint8]
+    truth: NDArray[np.float64]
+
+    @cached_property
+    def errors_m(self) -> NDArray[np.float64]:
+        """How far (N,) each position is from the true one, in metres."""
+        return np.linalg.norm(self.positions - self.truth[:, :3, 3], axis=1)
+
+
+def drifted(
+    drift: Drift,
+    seconds: NDArray[np.float64],
+    poses: NDArray[np.float64],
+    jumps_m: NDArray[np.float64],
+    random: np.random.Generator,
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the errors of position (N, 3) in metres and of heading (N,) in radians about y.
+
+    seconds: (N,). poses: (N, 4, 4) in OpenGL axes, y up. jumps_m: (N,) sudden sideways errors.
+    """
+    steps = np.unique(np.append(np.arange(0, len(seconds), _stride(seconds)), len(seconds) - 1))
+    coarse = _walk(drift, seconds[steps], poses[steps], _sudden(jumps_m, steps), random)
+    fine = np.stack([np.interp(seconds, seconds[steps], column) for column in coarse.T], axis=1)
+    for k in np.flatnonzero(jumps_m):  # interpolation would make a ramp of it
+        after = int(np.searchsorted(steps, k))
+        between = np.arange(steps[max(after - 1, 0)], steps[after])
+        fine[between] = np.where((between < k)[:, None], coarse[max(after - 1, 0)], coarse[after])
+    return fine[:, :3], fine[:, 3]
+
+
 def start_frame(T_world_first: Transform) -> Transform:
-    """Return T_start_world (4, 4): the world that the tracker makes of its first pose, in OpenGL axes.
+    """Return T_start_world (4, 4): the world that the tracker derives from its first pose, in OpenGL axes.
 
     T_world_first: body in optical axes, world z up. Raises StereovoxError where it has no heading.
     """
@@ -287,8 +206,88 @@ def write_track(path: Path, track: Track) -> None:
     path.write_text("# stamp tx ty tz qx qy qz qw confidence\n" + "\n".join(lines) + "\n", "utf-8")
 
 
+@dataclass
+class _Places:
+    """The tracker's memory: places, headings, distance travelled, and its errors there."""
+
+    where: list[NDArray[np.float64]] = field(default_factory=list)
+    ahead: list[NDArray[np.float64]] = field(default_factory=list)
+    way: list[float] = field(default_factory=list)
+    error: list[NDArray[np.float64]] = field(default_factory=list)
+
+    def remember(self, T: NDArray[np.float64], way: float, error: NDArray[np.float64]) -> None:
+        if not self.way or way - self.way[-1] >= SPACING_M:
+            self.where.append(T[:3, 3])
+            self.ahead.append(-T[:3, 2])
+            self.way.append(way)
+            self.error.append(error)
+
+    def find(self, T: NDArray[np.float64], way: float, drift: Drift) -> NDArray[np.float64] | None:
+        """Return the errors at the earliest place known again, else None."""
+        old = int(np.searchsorted(self.way, way - drift.loop_m))
+        if not old:
+            return None
+        near = np.linalg.norm(np.array(self.where[:old]) - T[:3, 3], axis=1) < drift.find_again_m
+        known = near & (np.array(self.ahead[:old]) @ -T[:3, 2] > ALIKE)
+        return self.error[int(np.argmax(known))] if known.any() else None
+
+
+def _stride(seconds: NDArray[np.float64]) -> int:
+    return max(1, round(STEP_S / float(np.median(np.diff(seconds)))))
+
+
+def _sudden(jumps_m: NDArray[np.float64], steps: NDArray[np.intp]) -> NDArray[np.float64]:
+    """Return the jumps (S,) between each step and the one before."""
+    total = np.cumsum(jumps_m)[steps]
+    return np.diff(total, prepend=0.0)
+
+
+def _walk(
+    drift: Drift,
+    seconds: NDArray[np.float64],
+    poses: NDArray[np.float64],
+    jumps_m: NDArray[np.float64],
+    random: np.random.Generator,
+) -> NDArray[np.float64]:
+    """Return the errors (S, 4): x, y, z and heading, step by step."""
+    places, error, way = _Places(), np.zeros(4), 0.0
+    course = random.standard_normal(3) / np.sqrt(3)
+    errors = [error]
+    places.remember(poses[0], way, error)
+    for k in range(1, len(poses)):
+        move = poses[k, :3, 3] - poses[k - 1, :3, 3]
+        length = float(np.linalg.norm(move))
+        way += length
+        keep = np.exp(-length / WALK_M)
+        course = keep * course + np.sqrt((1 - keep**2) / 3) * random.standard_normal(3)
+        error = error + _step(drift, error[3], move, length, course, random)
+        error[0] += jumps_m[k]
+        found = places.find(poses[k], way, drift)
+        if found is not None:
+            error = error + (found - error) * (1 - np.exp((seconds[k - 1] - seconds[k]) / drift.pull_s))
+        else:
+            places.remember(poses[k], way, error)
+        errors.append(error)
+    return np.array(errors)
+
+
+def _step(
+    drift: Drift,
+    yaw: float,
+    move: NDArray[np.float64],
+    length: float,
+    course: NDArray[np.float64],
+    random: np.random.Generator,
+) -> NDArray[np.float64]:
+    """Return what one step adds to the errors (4,): a wrong heading also sends the position astray."""
+    cosine, sine = np.cos(yaw), np.sin(yaw)
+    astray = [(cosine - 1) * move[0] + sine * move[2], 0.0, (cosine - 1) * move[2] - sine * move[0]]
+    turn = np.radians(drift.yaw_deg) * np.sqrt(length) * random.standard_normal()
+    return np.append(drift.share * length * course + astray, turn)
+
+
 def _alike(white: NDArray[np.float64], steps: float) -> NDArray[np.float64]:
-    """Return noise (N, K) of the same size that is alike over so many steps (first-order low pass)."""
+    """Return noise (N, K) of the same variance, correlated over so many steps (first-order low pass)."""
     from scipy.signal import lfilter
 
     keep = np.exp(-1 / steps) if steps > 0 else 0.0

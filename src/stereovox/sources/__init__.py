@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings and live cameras: one module a layout."""
+"""Recordings and live cameras: one module per layout."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What every source of frames offers, reading ahead in the background, and picking some of the frames."""
+"""The protocols of sources of frames, reading ahead in the background, and selections of frames."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ T = TypeVar("T")
 
 
 class Lazy(Sequence[T]):
-    """The items `read(k)` of the numbers `k`, each read anew whenever it is asked for; a slice is as lazy."""
+    """The items `read(k)` for the numbers `k`, read each time they are accessed; slices are lazy too."""
 
     def __init__(self, read: Callable[[int], T], numbers: range):
         self._read, self._numbers = read, numbers
@@ -37,45 +37,60 @@ class Lazy(Sequence[T]):
 
 
 AHEAD = 4
-"""Frames read before they are asked for: enough to even out slow ones, at 0.6 MB each for 640x480."""
+"""Frames read ahead: enough to even out slow ones, at 0.6 MB each for 640x480."""
 
 
 class Stream(Protocol):
-    """Frames one after the other in time order: a recording, or a live camera, which nobody can count or rewind.
+    """Frames in time order from a recording or a live camera; it need not have a length nor be rewindable.
 
-    name: short name for messages and reports.
-    camera: the camera of all frames; of stereo pairs the rectified left eye of the first (of a wide one its `middle`).
-    notes: lines a user should see, for example a calibration that had to be assumed.
-    layout: how to recognise this kind of source, for messages.
+    A registered class also has `recognises(where: str) -> bool`, which is cheap and never raises, and is constructed
+    from `where` alone; it raises SourceError where the recording or device as a whole cannot be used.
 
-    A class that is registered also has `recognises(where: str) -> bool`, which is cheap and never raises, and is made
-    from that `where` alone; it raises SourceError where the recording or device as a whole cannot be used.
+    Attributes:
+        name: Short name for messages and reports.
+        camera: Camera of all frames; for stereo pairs the rectified left eye of the first (for a wide one its
+            `middle`).
+        notes: Lines the user should see, for example a calibration that had to be assumed.
+        layout: How to recognise this kind of source, for messages.
+        composite: The class combines other recordings; its second argument is the function that opens them (see
+            `CameraPair`).
     """
 
     name: str
     camera: PinholeCamera
     notes: tuple[str, ...] = ()
     layout: str = ""
+    composite: bool = False
 
     @property
     def length(self) -> int | None:
-        """Number of frames; None where more come for as long as somebody asks for them."""
+        """Number of frames; None for a live camera."""
         return None
 
     @property
     def dropped(self) -> int:
-        """Frames that a live camera delivered and nobody took in time; of a recording none."""
+        """Frames that a live camera delivered and that were not consumed in time; 0 for a recording."""
         return 0
 
     def after(self, count: int) -> Stream:
-        """Return what is left after `count` frames; of a live camera that is itself, its past frames are gone."""
+        """Skip frames, to resume a run.
+
+        Args:
+            count: Number of frames to skip.
+
+        Returns:
+            The remaining frames; a live camera returns itself, since its past frames are gone.
+
+        Raises:
+            SourceError: A recording has no more than `count` frames.
+        """
         return self
 
     def __iter__(self) -> Iterator[AnyFrame]: ...
 
 
 class Source(Stream, Protocol):
-    """A stream that is recorded: its frames can be counted, and asked for one by one in any order."""
+    """A recorded stream: its frames can be counted and read in any order."""
 
     @property
     def length(self) -> int | None:
@@ -83,15 +98,24 @@ class Source(Stream, Protocol):
         return len(self)
 
     def after(self, count: int) -> Stream:
-        """Return the frames from number `count` on; raises SourceError where there is none."""
+        """Return the frames from number `count` on; raises SourceError if there are none."""
         return Selection(self, f"{count}:")
 
     def __len__(self) -> int: ...
 
     def frame(self, i: int) -> AnyFrame:
-        """Return frame `i` (negative: from the end); never fails for bad files: the frame then has a `fault`.
+        """Read one frame.
 
-        Raises IndexError for a frame that does not exist.
+        A bad file never raises: the frame then has a `fault`.
+
+        Args:
+            i: Number of the frame; negative from the end.
+
+        Returns:
+            The frame.
+
+        Raises:
+            IndexError: There is no such frame.
         """
         ...
 
@@ -100,15 +124,25 @@ class Source(Stream, Protocol):
 
     @classmethod
     def depth_only(cls, where: str) -> Source:
-        """Open `where` for its depth images alone; a recording that can do without its poses says so here."""
+        """Open only the depth images; a recording that can do without its poses overrides this.
+
+        Args:
+            where: As for the class itself.
+
+        Returns:
+            The source, perhaps without poses.
+
+        Raises:
+            SourceError: As for the class itself.
+        """
         return cls(where)  # pyright: ignore[reportCallIssue] - what is registered is made from its place
 
 
 class DepthSource(Source, Protocol):
-    """A source of depth images, not of stereo pairs."""
+    """A source of depth images rather than stereo pairs."""
 
     def frame(self, i: int) -> Frame:
-        """Return frame `i` as `Source.frame` does."""
+        """Read frame `i` as `Source.frame` does."""
         ...
 
     def __iter__(self) -> Iterator[Frame]:
@@ -116,9 +150,9 @@ class DepthSource(Source, Protocol):
 
 
 class Selection(Source):
-    """The frames of `source` that the Python slice text `frames` (`A:B:S`) picks, in its order.
+    """The frames of `source` that the Python slice `frames` (`A:B:S`, as text) selects, in its order.
 
-    Raises SourceError for text that is no slice and where not one frame is picked.
+    Raises SourceError for text that is not a slice and for an empty selection.
     """
 
     def __init__(self, source: Source, frames: str):
@@ -133,14 +167,14 @@ class Selection(Source):
         return len(self._picked)
 
     def frame(self, i: int) -> AnyFrame:
-        """Return the frame that was picked as number `i`."""
+        """Return frame number `i` of the selection."""
         return self._source.frame(self._picked[i])
 
 
 class Excerpt(Stream):
-    """Of the frames that a live camera delivers from now on those that the Python slice text `frames` (`A:B:S`) picks.
+    """The frames that the Python slice `frames` (`A:B:S`, as text) selects from a live camera, counted from now.
 
-    Raises SourceError for text that is no slice, that picks none, or that counts from an end which does not exist.
+    Raises SourceError for text that is not a slice, selects nothing, or counts from the end, which a live camera lacks.
     """
 
     def __init__(self, stream: Stream, frames: str):
@@ -156,7 +190,7 @@ class Excerpt(Stream):
 
     @property
     def dropped(self) -> int:
-        """Frames that the camera delivered and nobody took in time."""
+        """Frames that the camera delivered and that were not consumed in time."""
         return self._stream.dropped
 
     def __iter__(self) -> Iterator[AnyFrame]:
@@ -170,7 +204,7 @@ class Excerpt(Stream):
 
 
 def parse_slice(text: str) -> slice:
-    """Return the slice that `A:B:S` means, as in Python; raises SourceError for anything else."""
+    """Parse `A:B:S` as a Python slice; raises SourceError for anything else."""
     parts = text.split(":")
     try:
         numbers = [int(part) if part.strip() else None for part in parts]
@@ -182,9 +216,9 @@ def parse_slice(text: str) -> slice:
 
 
 def prefetch(read: Callable[[int], T], count: int, ahead: int = AHEAD) -> Iterator[T]:
-    """Yield `read(0)` to `read(count - 1)` in order while one background thread reads up to `ahead` further ones.
+    """Yield `read(0)` to `read(count - 1)` in order while a background thread reads up to `ahead` items in advance.
 
-    What `read` raises is raised here, in its turn. When the consumer stops early, so does the reading.
+    An exception of `read` is raised here, at that item. Reading stops when the consumer does.
     """
     reader = ThreadPoolExecutor(max_workers=1, thread_name_prefix="stereovox-source")
     waiting = deque(reader.submit(read, i) for i in range(min(ahead, count)))

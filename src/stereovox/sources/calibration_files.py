@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Stereo calibrations of other tools as rigs: KITTI, ROS camera_info, OpenCV and Kalibr."""
+"""Import stereo calibrations of other tools as rigs: KITTI, ROS camera_info, OpenCV and Kalibr."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from stereovox.sources.rig_file import Rig, RigPair
 
 Table = dict[str, Any]
 Found = tuple[Eyes, Transform]
-"""Both eyes, and T_body_left: the body is the inertial unit where Kalibr tells it, else the left eye."""
+"""Both eyes, and T_body_left: the body is the inertial unit if Kalibr's file has one, else the left eye."""
 KALIBR = {"radtan": "pinhole", "equidistant": "fisheye", "none": "pinhole"}
 ROS = {"plumb_bob": "pinhole", "rational_polynomial": "pinhole", "equidistant": "fisheye", "fisheye": "fisheye"}
 OPENCV = {
@@ -31,7 +31,7 @@ OPENCV = {
     "R": ("R",),
     "T": ("T",),
 }
-"""Names that OpenCV's samples and their descendants use."""
+"""Names used by OpenCV's samples and their descendants."""
 INFO = {
     "K": ("camera_matrix", "K", "k"),
     "D": ("distortion_coefficients", "D", "d"),
@@ -42,10 +42,32 @@ INFO = {
 }
 SIZES = (("width", "height"), ("image_width", "image_height"), ("imageWidth", "imageHeight"))
 TOLERANCE = 5e-3
+KINDS = "KITTI calib_cam_to_cam.txt or calib.txt, ROS camera_info yaml (two files), OpenCV yml, Kalibr camchain yaml"
+Size = tuple[int, int]
+
+
+def import_rig(files: Sequence[Path], size: Size | None = None, lens: str = "", name: str = "stereo") -> Rig:
+    """Return the rig in calibration files of a kind recognised by content; see `KINDS`.
+
+    size: width and height of the images where the files lack them. lens: `fisheye` where an OpenCV file has fisheye
+    lenses; the other kinds declare it. name: of the pair; KITTI's are `grey` and `colour`. Raises SourceError for files
+    of another kind, and for what cannot be expressed as a rig.
+    """
+    if not 1 <= len(files) <= 2:
+        raise SourceError(f"{len(files)} files: give one, or two of one stereo camera")
+    if _is_kitti(files[0]):
+        return _kitti(files[0], size)
+    try:
+        eyes, T_body_left = eyes_of([read_yaml(path) for path in files], size, lens)
+    except SourceError as error:
+        raise SourceError(f"{error}" if str(files[0]) in str(error) else f"{files[0]}: {error}") from None
+    except StereovoxError as error:
+        raise SourceError(f"{files[0]}: {error}") from None
+    return Rig((RigPair(name, eyes=eyes, T_body_left=T_body_left),))
 
 
 def read_yaml(path: Path) -> Table:
-    """Return the table in a YAML file, also one of OpenCV's; raises SourceError, one line."""
+    """Return the table in a YAML file, also one of OpenCV's; raises SourceError."""
     import yaml
 
     class Loader(yaml.SafeLoader):
@@ -69,16 +91,16 @@ def read_yaml(path: Path) -> Table:
 
 
 def eyes_of(tables: Sequence[Table], size: tuple[int, int] | None, lens: str) -> Found:
-    """Return both eyes of the calibration in `tables`; raises SourceError for another kind and for what is missing."""
+    """Return both eyes of the calibration in `tables`; raises SourceError for another kind or missing keys."""
     first = tables[0]
     if "cam0" in first:
         return _kalibr(first)
-    if any(key in first for key in INFO["P"]) and _given(first, INFO["K"]) is not None:
+    if any(key in first for key in INFO["P"]) and _first_present(first, INFO["K"]) is not None:
         if len(tables) != 2:
             raise SourceError("is the camera_info of one eye; give both files, first the left")
         return _camera_info(tables[0], tables[1])
     merged: Table = {key: value for table in reversed(tables) for key, value in table.items()}
-    if _given(merged, OPENCV["K1"]) is not None:
+    if _first_present(merged, OPENCV["K1"]) is not None:
         return _opencv(merged, size, lens)
     raise SourceError("is no stereo calibration of a known kind: KITTI, ROS camera_info, OpenCV or Kalibr")
 
@@ -174,7 +196,7 @@ def _lens(model: str, K: NDArray[np.float64], distortion: Any, size: tuple[int, 
 
 
 def _in_order(a: Lens, b: Lens, T_a_b: Transform, bodies: Sequence[Transform | None]) -> Found:
-    """Return the eyes with the left one first, whichever way round the file has them."""
+    """Return the eyes with the left one first, whatever their order in the file."""
     if T_a_b[0, 3] < 0:
         a, b, T_a_b, bodies = b, a, inverse(T_a_b), bodies[::-1]
     return Eyes(a, b, T_a_b), np.eye(4) if bodies[0] is None else bodies[0]
@@ -187,12 +209,12 @@ def _rigid(value: Any, what: str) -> Transform:
     return orthonormalise(T)
 
 
-def _given(table: Mapping[str, Any], names: Sequence[str]) -> Any:
+def _first_present(table: Mapping[str, Any], names: Sequence[str]) -> Any:
     return next((table[name] for name in names if name in table), None)
 
 
 def _named(table: Mapping[str, Any], names: Sequence[str], whose: str) -> Any:
-    found = _given(table, names)
+    found = _first_present(table, names)
     if found is None:
         raise SourceError(f"the {whose} {names[0]} is missing; give the file as the calibration wrote it")
     return found
@@ -224,32 +246,6 @@ def _numbers(value: Any, what: str, count: int | None = None) -> list[float]:
     return [float(number) for number in numbers]
 
 
-KINDS = "KITTI calib_cam_to_cam.txt or calib.txt, ROS camera_info yaml (two files), OpenCV yml, Kalibr camchain yaml"
-Size = tuple[int, int]
-
-
-def import_rig(files: Sequence[Path], size: Size | None = None, lens: str = "", name: str = "stereo") -> Rig:
-    """Return the rig in calibration files of a kind that is recognised by content; see `KINDS`.
-
-    size: width and height of the images where the files do not tell. lens: `fisheye` where an OpenCV file is of one;
-    the others say it. name: of the pair; KITTI's are `grey` and `colour`.
-    Raises SourceError, one line, for files of another kind, and for what cannot be brought into a rig.
-    """
-    if not 1 <= len(files) <= 2:
-        raise SourceError(f"{len(files)} files: give one, or two of one stereo camera")
-    if _is_kitti(files[0]):
-        return _kitti(files[0], size)
-    pass  # REHOUSED
-
-    try:
-        eyes, T_body_left = eyes_of([read_yaml(path) for path in files], size, lens)
-    except SourceError as error:
-        raise SourceError(f"{error}" if str(files[0]) in str(error) else f"{files[0]}: {error}") from None
-    except StereovoxError as error:
-        raise SourceError(f"{files[0]}: {error}") from None
-    return Rig((RigPair(name, eyes=eyes, T_body_left=T_body_left),))
-
-
 def _is_kitti(path: Path) -> bool:
     try:
         text = read_text(path, errors="replace")
@@ -269,8 +265,8 @@ def _kitti(path: Path, size: Size | None) -> Rig:
     pairs = []
     for name, left in (("grey", 0), ("colour", 2)):
         if {left, left + 1} <= set(calibration.projections):
-            told = [number for number in values.get(f"S_rect_0{left}", ()) if math.isfinite(number)]
-            pixels = size or ((int(told[0]), int(told[1])) if len(told) == 2 else None)
+            size_entry = [number for number in values.get(f"S_rect_0{left}", ()) if math.isfinite(number)]
+            pixels = size or ((int(size_entry[0]), int(size_entry[1])) if len(size_entry) == 2 else None)
             if pixels is None:
                 raise SourceError(f"{path}: does not tell the size of the images; give it with --size WIDTHxHEIGHT")
             T_cam0_left = inverse(calibration.offset_of(left))

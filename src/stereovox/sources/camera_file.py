@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The camera of a recording: from `camera.toml`, or from the small text files that lie beside the images."""
+"""The camera of a recording: `camera.toml`, or the small text files beside the images."""
 
 from __future__ import annotations
 
@@ -24,13 +24,17 @@ NEEDED = {
     **dict.fromkeys(("fx", "fy"), "its focal length in pixels"),
     **dict.fromkeys(("cx", "cy"), "where the optical axis meets the image, in pixels"),
 }
-"""What a key is, for those who left it out."""
+"""Explains each required key."""
 KEYS = (*SIZES, *INTRINSICS, "baseline", "correction")
 CORRECTION = ("model", "coefficients", "provenance")
+MATRIX, LIST = "camera-intrinsics.txt", "calibration.txt"
+VGA = (640, 480)
+Intrinsics = tuple[float, float, float, float]
+"""fx, fy, cx, cy in pixels."""
 
 
 def read_camera(path: Path) -> PinholeCamera:
-    """Return the camera in `path`; raises SourceError, one line with file and key, for anything wrong in it.
+    """Return the camera in `path`; raises SourceError naming file and key for anything wrong in it.
 
     Keys: width, height, fx, fy, cx, cy in pixels, perhaps baseline in metres, perhaps a table [correction] with model
     and coefficients as `DepthCorrection` has them, and a table [correction.provenance] of anything.
@@ -43,9 +47,9 @@ def read_camera(path: Path) -> PinholeCamera:
 
 
 def camera_text(camera: PinholeCamera, provenance: Mapping[str, Any] | None = None, remarks: Sequence[str] = ()) -> str:
-    """Return a camera as the text of a camera file, `remarks` as comments at its top.
+    """Return the text of a camera file, with `remarks` as comments at its top.
 
-    provenance: texts, numbers and lists of them that tell where the correction comes from.
+    provenance: texts, numbers and lists of them that document the origin of the correction.
     """
     lines = [f"# {remark}" for remark in remarks]
     lines += [f"{key} = {toml_text(getattr(camera, key))}" for key in (*SIZES, *INTRINSICS)]
@@ -57,6 +61,126 @@ def camera_text(camera: PinholeCamera, provenance: Mapping[str, Any] | None = No
     if camera.correction and provenance:
         lines += ["", "[correction.provenance]", *(f"{key} = {toml_text(value)}" for key, value in provenance.items())]
     return "\n".join(lines) + "\n"
+
+
+def find_camera(
+    folders: Sequence[Path], size: tuple[int, int], baseline: float, default: Intrinsics
+) -> tuple[PinholeCamera, tuple[str, ...]]:
+    """Return the camera of images of (width, height) = `size`, and notes: what was assumed, used or ignored.
+
+    The first file found counts: `camera.toml` (see `read_camera`) in the first of `folders`, the recording's own; then
+    `camera-intrinsics.txt` (3x3 matrix) and `calibration.txt` (fx fy cx cy), in the order of `folders`. Without one,
+    640x480 images get `default`. `baseline` in metres applies where the file has none. Raises SourceError for a bad
+    file, or where there is none and the images have another size.
+    """
+    places = [folders[0] / FILE, *(folder / name for folder in folders for name in (MATRIX, LIST))]
+    found = [path for path in places if os.path.isfile(path)]  # Path.is_file may raise
+    far = [folder / FILE for folder in folders[1:] if os.path.isfile(folder / FILE)]
+    cure = "it counts only in the recording's own folder; give it with --camera"
+    ignored = [f"{path} is not used: {cure}" for path in far]
+    ignored += [f"{path} is not used: {found[0]} comes first" for path in found[1:]]
+    if found:
+        camera = _read(found[0], size, baseline)
+        used = (f"{found[0]} is used ({describe_correction(camera)})",) if found[0].name == FILE else ()
+        return camera, (*used, *ignored)
+    if size != VGA:
+        raise SourceError(
+            f"{folders[0] / MATRIX}: no such file, and {size[0]}x{size[1]} images have no standard calibration; "
+            "write the 3x3 camera matrix into it"
+        )
+    numbers = " ".join(f"{n:g}" for n in default)
+    note = f"{folders[0]} has no {MATRIX}: assuming the data set's standard fx fy cx cy = {numbers}"
+    return PinholeCamera(*size, *default, baseline), (note, *ignored)
+
+
+def with_camera(stream: Stream, file: str | os.PathLike[str]) -> Stream:
+    """Return `stream` with the camera in `file`; without a baseline there, the stream's own is kept.
+
+    Raises SourceError for a bad file and for a camera with another number of pixels.
+    """
+    camera, own = read_camera(Path(file)), stream.camera
+    if (camera.width, camera.height) != (own.width, own.height):
+        raise SourceError(
+            f"{file}: is of a camera with {camera.width}x{camera.height} pixels, {stream.name} has "
+            f"{own.width}x{own.height}; give the file of its own camera"
+        )
+    note = f"{file} is used in place of the recording's own camera ({describe_correction(camera)})"
+    return WithCamera(stream, camera if camera.baseline else replace(camera, baseline=own.baseline), (note,))
+
+
+class WithCamera(Stream):
+    """A stream whose frames get another `camera` of the same size; `notes` follow the stream's own."""
+
+    def __init__(self, stream: Stream, camera: PinholeCamera, notes: tuple[str, ...] = ()):
+        self._stream, self.camera, self._notes = stream, camera, notes
+        self.name, self.notes = stream.name, (*getattr(stream, "notes", ()), *notes)
+
+    @property
+    def length(self) -> int | None:
+        """Number of frames of the stream."""
+        return self._stream.length
+
+    @property
+    def dropped(self) -> int:
+        """Frames dropped by the stream."""
+        return self._stream.dropped
+
+    def after(self, count: int) -> Stream:
+        """Return the remaining frames after `count`, with the same camera."""
+        return WithCamera(self._stream.after(count), self.camera, self._notes)
+
+    def __iter__(self) -> Iterator[Frame]:
+        frames = iter(self._stream)
+        try:
+            for frame in frames:
+                if isinstance(frame, StereoFrame):
+                    raise SourceError(f"{self.name}: has stereo pairs, which no camera file fits; correct its rig file")
+                yield replace(frame, camera=self.camera)
+        finally:
+            close = getattr(frames, "close", None)
+            if close:  # a generator: a live camera is to stop now
+                close()
+
+
+def read_intrinsics(path: Path) -> Intrinsics:
+    """Return fx, fy, cx, cy in pixels from a 3x3 matrix or from these four numbers; `#` starts a comment.
+
+    Raises SourceError naming the file for anything else, including skew: such a camera is no plain pinhole.
+    """
+    numbers = _numbers(path)
+    if len(numbers) == 4:
+        fx, fy, cx, cy = numbers
+    elif len(numbers) == 9 and numbers[6:] == [0, 0, 1] and numbers[1] == numbers[3] == 0:
+        fx, _, cx, _, fy, cy, *_ = numbers
+    else:
+        raise SourceError(f"{path}: needs the matrix 'fx 0 cx / 0 fy cy / 0 0 1' or the four numbers fx fy cx cy")
+    return fx, fy, cx, cy
+
+
+def describe_correction(camera: PinholeCamera) -> str:
+    """Describe a camera's depth correction in words."""
+    return f"depth correction '{camera.correction.model}'" if camera.correction else "no depth correction"
+
+
+def pinhole(
+    size: tuple[int, int],
+    intrinsics: tuple[float, float, float, float],
+    baseline: float | None,
+    correction: DepthCorrection | None = None,
+) -> PinholeCamera:
+    """Return a camera from numbers of a file: (width, height), and fx, fy, cx, cy; all finite.
+
+    Raises SourceError naming the invalid number.
+    """
+    named = {"fx": intrinsics[0], "fy": intrinsics[1], "baseline": 1.0 if baseline is None else baseline}
+    for name, number in named.items():
+        if number <= 0:
+            raise SourceError(f"{name} = {number:g} must be positive")
+    try:
+        return PinholeCamera(*size, *intrinsics, baseline, correction=correction)
+    except StereovoxError as error:  # which shows the whole camera; its last words tell what is wrong
+        numbers = " ".join(f"{number:g}" for number in intrinsics)
+        raise SourceError(f"fx fy cx cy = {numbers}: {str(error).rpartition(': ')[2]}") from None
 
 
 def _camera(table: dict[str, Any]) -> PinholeCamera:
@@ -73,27 +197,6 @@ def _camera(table: dict[str, Any]) -> PinholeCamera:
     correction = _correction(table["correction"]) if "correction" in table else None
     fx, fy, cx, cy = (_number(table, key) for key in INTRINSICS)
     return pinhole((int(sizes[0]), int(sizes[1])), (fx, fy, cx, cy), baseline, correction)
-
-
-def pinhole(
-    size: tuple[int, int],
-    intrinsics: tuple[float, float, float, float],
-    baseline: float | None,
-    correction: DepthCorrection | None = None,
-) -> PinholeCamera:
-    """Return a camera from numbers in a file: (width, height), and fx, fy, cx, cy; all finite.
-
-    Raises SourceError that names the number which cannot be.
-    """
-    named = {"fx": intrinsics[0], "fy": intrinsics[1], "baseline": 1.0 if baseline is None else baseline}
-    for name, number in named.items():
-        if number <= 0:
-            raise SourceError(f"{name} = {number:g} must be positive")
-    try:
-        return PinholeCamera(*size, *intrinsics, baseline, correction=correction)
-    except StereovoxError as error:  # which shows the whole camera; its last words tell what is wrong
-        numbers = " ".join(f"{number:g}" for number in intrinsics)
-        raise SourceError(f"fx fy cx cy = {numbers}: {str(error).rpartition(': ')[2]}") from None
 
 
 def _correction(table: Any) -> DepthCorrection:
@@ -119,62 +222,6 @@ def _number(table: dict[str, Any], key: str) -> float:
     if not is_number(value):
         raise SourceError(f"{key} = {shown(value)} must be a number")
     return float(value)
-
-
-MATRIX, LIST = "camera-intrinsics.txt", "calibration.txt"
-VGA = (640, 480)
-Intrinsics = tuple[float, float, float, float]
-"""fx, fy, cx, cy in pixels."""
-
-
-def find_camera(
-    folders: Sequence[Path], size: tuple[int, int], baseline: float, default: Intrinsics
-) -> tuple[PinholeCamera, tuple[str, ...]]:
-    """Return the camera of images of (width, height) = `size`, and notes: what was assumed, used, or passed over.
-
-    The first file found counts: `camera.toml` (see `camera_file`) in the first of `folders`, the recording's own; then
-    `camera-intrinsics.txt` (3x3 matrix) and `calibration.txt` (fx fy cx cy), in the order of `folders`. Without one,
-    640x480 images get `default`. `baseline` in metres, where the file tells none.
-    Raises SourceError for a bad file, or where there is none and the images have another size.
-    """
-    places = [folders[0] / FILE, *(folder / name for folder in folders for name in (MATRIX, LIST))]
-    found = [path for path in places if os.path.isfile(path)]  # Path.is_file may raise
-    far = [folder / FILE for folder in folders[1:] if os.path.isfile(folder / FILE)]
-    cure = "it counts only in the recording's own folder; give it with --camera"
-    passed_over = [f"{path} is not used: {cure}" for path in far]
-    passed_over += [f"{path} is not used: {found[0]} comes first" for path in found[1:]]
-    if found:
-        camera = _read(found[0], size, baseline)
-        used = (f"{found[0]} is used ({correction_words(camera)})",) if found[0].name == FILE else ()
-        return camera, (*used, *passed_over)
-    if size != VGA:
-        raise SourceError(
-            f"{folders[0] / MATRIX}: no such file, and {size[0]}x{size[1]} images have no standard calibration; "
-            "write the 3x3 camera matrix into it"
-        )
-    numbers = " ".join(f"{n:g}" for n in default)
-    note = f"{folders[0]} has no {MATRIX}: assuming the data set's standard fx fy cx cy = {numbers}"
-    return PinholeCamera(*size, *default, baseline), (note, *passed_over)
-
-
-def correction_words(camera: PinholeCamera) -> str:
-    """Return in words what the depth of a camera will be corrected by."""
-    return f"depth correction '{camera.correction.model}'" if camera.correction else "no depth correction"
-
-
-def read_intrinsics(path: Path) -> Intrinsics:
-    """Return fx, fy, cx, cy in pixels from a 3x3 matrix or from these four numbers; `#` starts a comment.
-
-    Raises SourceError naming the file for anything else, also for skew: such a camera is no plain pinhole.
-    """
-    numbers = _numbers(path)
-    if len(numbers) == 4:
-        fx, fy, cx, cy = numbers
-    elif len(numbers) == 9 and numbers[6:] == [0, 0, 1] and numbers[1] == numbers[3] == 0:
-        fx, _, cx, _, fy, cy, *_ = numbers
-    else:
-        raise SourceError(f"{path}: needs the matrix 'fx 0 cx / 0 fy cy / 0 0 1' or the four numbers fx fy cx cy")
-    return fx, fy, cx, cy
 
 
 def _read(path: Path, size: tuple[int, int], baseline: float) -> PinholeCamera:
@@ -210,52 +257,3 @@ def _plain(path: Path, size: tuple[int, int], baseline: float) -> PinholeCamera:
         return pinhole(size, intrinsics, baseline)
     except StereovoxError as error:
         raise SourceError(f"{path}: {error}") from None
-
-
-class WithCamera(Stream):
-    """The frames of `stream`, all with `camera`, which has as many pixels; `notes` follow its own."""
-
-    def __init__(self, stream: Stream, camera: PinholeCamera, notes: tuple[str, ...] = ()):
-        self._stream, self.camera, self._notes = stream, camera, notes
-        self.name, self.notes = stream.name, (*getattr(stream, "notes", ()), *notes)
-
-    @property
-    def length(self) -> int | None:
-        """Number of frames, as the stream tells."""
-        return self._stream.length
-
-    @property
-    def dropped(self) -> int:
-        """Frames that nobody took in time, as the stream tells."""
-        return self._stream.dropped
-
-    def after(self, count: int) -> Stream:
-        """Return what is left after `count` frames, with the same camera."""
-        return WithCamera(self._stream.after(count), self.camera, self._notes)
-
-    def __iter__(self) -> Iterator[Frame]:
-        frames = iter(self._stream)
-        try:
-            for frame in frames:
-                if isinstance(frame, StereoFrame):
-                    raise SourceError(f"{self.name}: has stereo pairs, which no camera file fits; correct its rig file")
-                yield replace(frame, camera=self.camera)
-        finally:
-            close = getattr(frames, "close", None)
-            if close:  # a generator: a live camera is to stop now
-                close()
-
-
-def with_camera(stream: Stream, file: str | os.PathLike[str]) -> Stream:
-    """Return `stream` with the camera in `file`; without a baseline there, the stream's own counts.
-
-    Raises SourceError, one line, for a bad file and for a camera with another number of pixels.
-    """
-    camera, own = read_camera(Path(file)), stream.camera
-    if (camera.width, camera.height) != (own.width, own.height):
-        raise SourceError(
-            f"{file}: is of a camera with {camera.width}x{camera.height} pixels, {stream.name} has "
-            f"{own.width}x{own.height}; give the file of its own camera"
-        )
-    note = f"{file} is used in place of the recording's own camera ({correction_words(camera)})"
-    return WithCamera(stream, camera if camera.baseline else replace(camera, baseline=own.baseline), (note,))

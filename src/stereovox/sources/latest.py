@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The newest frames of a camera that does not wait: what nobody took in time is dropped, oldest first."""
+"""The newest frames of a live camera: frames that are not consumed in time are dropped, oldest first."""
 
 from __future__ import annotations
 
@@ -13,28 +13,35 @@ from stereovox.sources.base import Stream
 
 T = TypeVar("T")
 WAITING = 2
-"""Frames that wait while the map is busy: one to go on with, and one that is being taken meanwhile."""
+"""Frames kept while the map is busy: one to go on with, and one that arrives meanwhile."""
 STOPPING_S = 6.0
-"""Seconds that a camera gets to deliver a last frame before it is left to itself; RealSense gives up after 5."""
+"""Seconds a camera has to deliver its last frame before its thread is abandoned; RealSense gives up after 5."""
 
 
 class Latest(Generic[T]):
-    """What `frames` delivers, read by a thread of its own, so that a slow consumer never holds the camera up.
+    """The newest items of an iterable, read by its own thread, so that a slow consumer never holds the camera up.
 
-    Of what was not taken yet the newest `waiting` wait, in order; the oldest is dropped for each that comes on top, and
-    counted in `dropped`. What `frames` raises is raised here, after the frames before it; its end ends the iteration.
-    When the consumer stops, so does the thread, and `frames` is closed.
+    The newest `waiting` items are kept in order; for each further one the oldest is dropped and counted. An exception
+    of `frames` is raised to the consumer after the items before it; the end of `frames` ends the iteration. When the
+    consumer stops, the thread stops and `frames` is closed.
 
         for frame in sv.Latest(camera):
             mapper.add(frame)
+
+    Args:
+        frames: What the thread iterates over, usually a live camera.
+        waiting: Items kept, at least one.
+
+    Attributes:
+        dropped: Items dropped so far.
     """
 
     def __init__(self, frames: Iterable[T], waiting: int = WAITING):
-        self._frames, self._most = frames, max(1, waiting)
+        self._frames, self._capacity = frames, max(1, waiting)
         self.dropped = 0
 
     def __iter__(self) -> Iterator[T]:
-        queue: _Queue[T] = _Queue(self._most)
+        queue: _Queue[T] = _Queue(self._capacity)
         reader = Thread(target=self._read, args=(queue,), name="stereovox-camera", daemon=True)
         reader.start()
         try:
@@ -63,17 +70,17 @@ class Latest(Generic[T]):
 
 
 class _Queue(Generic[T]):
-    """Items between two threads. stopped: nobody takes them any more."""
+    """A bounded queue between two threads; `stopped` is set when the consumer is gone."""
 
-    def __init__(self, most: int):
-        self._most, self._waiting = most, deque[T]()
+    def __init__(self, capacity: int):
+        self._capacity, self._waiting = capacity, deque[T]()
         self._change, self._ended, self._error = Condition(), False, None
         self.stopped = Event()
 
     def put(self, item: T) -> int:
         """Append an item; return how many were dropped for it."""
         with self._change:
-            full = len(self._waiting) == self._most
+            full = len(self._waiting) == self._capacity
             if full:
                 self._waiting.popleft()
             self._waiting.append(item)
@@ -81,13 +88,13 @@ class _Queue(Generic[T]):
         return int(full)
 
     def end(self, error: Exception | None) -> None:
-        """Say that no more items come, and why."""
+        """Close the queue, with the error that ended the frames, if any."""
         with self._change:
             self._ended, self._error = True, error
             self._change.notify()
 
     def items(self) -> Iterator[T]:
-        """Yield items as they come; raise what ended them."""
+        """Yield items as they arrive; raise the error that ended them."""
         while True:
             with self._change:
                 self._change.wait_for(lambda: self._waiting or self._ended)
@@ -100,7 +107,7 @@ class _Queue(Generic[T]):
 
 
 class LatestStream(Stream):
-    """The frames of a live camera as `Latest` has them."""
+    """A live camera read through `Latest`."""
 
     def __init__(self, camera: Stream):
         self._latest: Latest[AnyFrame] = Latest(camera)
@@ -109,7 +116,7 @@ class LatestStream(Stream):
 
     @property
     def dropped(self) -> int:
-        """Frames that the camera delivered and nobody took in time."""
+        """Frames that the camera delivered and that were not consumed in time."""
         return self._latest.dropped
 
     def __iter__(self) -> Iterator[AnyFrame]:

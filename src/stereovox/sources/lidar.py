@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a recording with a lidar offers beside its images: scans, annotated boxes, and where something moved."""
+"""The protocol of recordings with a lidar: scans, annotated boxes, and masks of what moved."""
 
 from __future__ import annotations
 
@@ -50,14 +50,14 @@ class Box:
 
 @runtime_checkable
 class LidarSource(Protocol):
-    """A source that may have lidar scans beside its frames, one each; `i` as in `Source.frame`."""
+    """A source that may have a lidar scan beside each frame; `i` as in `Source.frame`."""
 
     name: str
     notes: tuple[str, ...]
 
     @property
     def has_lidar(self) -> bool:
-        """Whether there are scans, and it is known where the lidar sits."""
+        """Whether there are scans, and the lidar's mount is known."""
         ...
 
     def __len__(self) -> int: ...
@@ -69,7 +69,7 @@ class LidarSource(Protocol):
     def scan(self, i: int) -> LidarScan | None:
         """Return the scan of frame `i`, None where the recording has none at all.
 
-        Raises FrameRefused, one line: `missing_file`, `unreadable` (cut off), and what `viewpoint` raises.
+        Raises FrameRefused: `missing_file`, `unreadable` (cut off), and what `viewpoint` raises.
         """
         ...
 
@@ -78,14 +78,14 @@ class LidarSource(Protocol):
         ...
 
     def moving(self, i: int) -> NDArray[np.bool_] | None:
-        """Return the pixels (height, width) of the left image that show something that moved; None if not told."""
+        """Return which pixels (height, width) of the left image show something that moved; None if not recorded."""
         ...
 
 
 def read_velodyne(path: Path) -> NDArray[np.float32]:
     """Return the points (N, 3) float32 of a KITTI `.bin`, those that are not finite left out.
 
-    Raises FrameRefused, one line: `missing_file`; `unreadable` where the file holds no points or is cut off.
+    Raises FrameRefused: `missing_file`; `unreadable` where the file holds no points or is cut off.
     """
     if not os.path.isfile(path):
         raise FrameRefused("missing_file", f"{path}: no such file; put the scan back or leave its frame out")

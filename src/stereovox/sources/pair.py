@@ -23,29 +23,39 @@ from stereovox.sources.tracker import jumps, on_clock, read_tracker
 
 NEAR_JUMP_NS = 100_000_000
 """Frames this near (0.1 s) to a jump, on either side, are refused: a tracker is rarely right just before one."""
-LOOKS = 5
+MAX_ATTEMPTS = 5
+"""Images tried at each end of the recording for a sound stamp."""
 CALIBRATE = "stereovox calibrate pair"
+OpenDepth = Callable[[Path, PairSettings], DepthSource]
+"""Opens the depth images that the settings of a pair's folder name; see `opening.open_depth`."""
 
 
 class CameraPair(DepthSource):
     """A folder with `pair.toml` (see `PairSettings`): depth images, and the poses of a tracker beside them.
 
+    The depth images can be any other recording, so the class is given the function that opens them.
+
     Pose of an image: the tracker's, interpolated at the image's time on the depth camera's clock, times
-    T_tracker_camera. World: as `world` says; gravity is the tracker's business.
+    T_tracker_camera. World: as `world` says; gravity is left to the tracker.
     Faults besides those of the depth source: `no_pose` and `bad_pose_file` (see `Poses.at`), `low_confidence` (a pose
     next to the image's time is below `min_confidence`), `pose_jump` (the image was taken within 0.1 s of a jump).
-    After a jump the tracker's new poses count again as they are: a T265 jumps when it recognises a place, and is then
-    nearer to where it was when it first mapped that place. What was mapped just before the jump stays where it is.
-    Raises SourceError, one line, for a bad `pair.toml`, without T_tracker_camera, for depth images or poses that
-    cannot be opened, and where the two clocks have no time in common.
+    After a jump the tracker's new poses are used unchanged: a T265 jumps when it recognises a place, and is then nearer
+    to where it was when it first mapped that place. What was mapped just before the jump stays where it is.
+
+    Args:
+        where: The folder.
+        open_depth: Opens the depth images that the settings name; usually `opening.open_depth`.
+
+    Raises:
+        SourceError: A bad `pair.toml`, no T_tracker_camera, depth images or poses that cannot be opened, or clocks
+            without a common time.
     """
 
     layout = f"a camera pair ({FILE} that names depth images and a tracker's poses)"
 
-    opens_others = True
+    composite = True
 
-    def __init__(self, where: str | os.PathLike[str], open_depth: Callable[[Path, PairSettings], DepthSource]):
-        """`open_depth`: opens the depth images that the settings of a folder name; see `sources.open_depth`."""
+    def __init__(self, where: str | os.PathLike[str], open_depth: OpenDepth):
         self.folder = Path(where)
         self.name = self.folder.resolve().name
         file = self.folder / FILE
@@ -63,7 +73,7 @@ class CameraPair(DepthSource):
 
     @classmethod
     def recognises(cls, where: str) -> bool:
-        """Tell whether `where` is a folder with a `pair.toml`."""
+        """Return whether `where` is a folder with a `pair.toml`."""
         return os.path.isfile(os.path.join(where, FILE))
 
     def __len__(self) -> int:
@@ -77,8 +87,8 @@ class CameraPair(DepthSource):
         try:
             return replace(frame, T_world_sensor=self.pose_at(frame.stamp_ns))
         except FrameRefused as refused:
-            nowhere = np.full((4, 4), np.nan)
-            return replace(frame, T_world_sensor=nowhere, fault=refused.reason, fault_detail=f"{frame.name}: {refused}")
+            no_pose = np.full((4, 4), np.nan)
+            return replace(frame, T_world_sensor=no_pose, fault=refused.reason, fault_detail=f"{frame.name}: {refused}")
 
     def pose_at(self, stamp_ns: int) -> Transform:
         """Return T_world_camera (4, 4) at a time of the depth camera's clock; raises FrameRefused (see the class)."""
@@ -94,7 +104,7 @@ class CameraPair(DepthSource):
         return T_world_tracker @ self._T_tracker_camera
 
     def _check_jumps(self, stamp_ns: int) -> None:
-        """Refuse what was taken near a jump."""
+        """Raise FrameRefused for an image taken near a jump."""
         before, after = self._poses.stamps_ns[self._jumps].T
         near = (before - NEAR_JUMP_NS < stamp_ns) & (stamp_ns < after + NEAR_JUMP_NS)
         if near.any():
@@ -113,9 +123,9 @@ class CameraPair(DepthSource):
         if not len(self._jumps):
             return ()
         largest = self._jump_steps().max()
-        many = f"{len(self._jumps)} jumps" if len(self._jumps) > 1 else "one jump"
-        left_out = "images near are left out, later ones count as they are"
-        return (f"{self._poses.where}: {many} of up to {largest:.2f} m; {left_out}",)
+        count = f"{len(self._jumps)} jumps" if len(self._jumps) > 1 else "one jump"
+        consequence = "images near are left out, later ones count as they are"
+        return (f"{self._poses.where}: {count} of up to {largest:.2f} m; {consequence}",)
 
 
 def open_poses(folder: Path, settings: PairSettings) -> Poses:
@@ -133,10 +143,10 @@ def open_poses(folder: Path, settings: PairSettings) -> Poses:
 def image_times(depth: DepthSource) -> tuple[int, int]:
     """Return the times in nanoseconds of the first and of the last image.
 
-    A damaged message of a recorded file has only the time at which it was recorded, perhaps by another clock: where
-    there is a sound one among the first or last few, that counts.
+    A damaged message of a recording has only its recording time, perhaps by another clock: the stamp of an intact one
+    among the first or last few is preferred.
     """
-    few = range(min(LOOKS, len(depth)))
+    few = range(min(MAX_ATTEMPTS, len(depth)))
     return _stamp(depth, few), _stamp(depth, [-1 - i for i in few])
 
 
@@ -160,7 +170,7 @@ def check_clocks(image_ns: tuple[int, int], poses: Poses, file: Path) -> None:
 
 
 class CorrectedDepth(DepthSource):
-    """A depth source whose unit or baseline `pair.toml` knows better."""
+    """A depth source with the unit or baseline of `pair.toml` in place of its own."""
 
     def __init__(self, source: DepthSource, settings: PairSettings):
         self._source, self._scale = source, settings.depth_scale

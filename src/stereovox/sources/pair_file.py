@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`pair.toml`: which depth images and which tracker belong together, and how cameras and clocks are related."""
+"""`pair.toml`: which depth images and which tracker belong together, and how their frames and clocks are related."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ WORDS = {"axes": tuple(AXES), "world": WORLDS}
 
 
 def read_pair(path: Path) -> PairSettings:
-    """Return the settings in `path`; raises SourceError, one line with file and key, for anything wrong in it."""
+    """Return the settings in `path`; raises SourceError naming file and key for anything wrong in it."""
     table = read_table(path)
     known = [field.name for field in fields(PairSettings)]
     for key in table:

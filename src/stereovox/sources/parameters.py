@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Names with parameters, written like a web address: `sim:box?size=small&distance=2`."""
+"""Names with parameters in the style of a URL: `sim:box?size=small&distance=2`."""
 
 from __future__ import annotations
 
@@ -12,37 +12,37 @@ from stereovox.errors import SourceError, did_you_mean
 
 SWITCHES = {"1": True, "true": True, "yes": True, "on": True, "0": False, "false": False, "no": False, "off": False}
 LARGEST = 2**63
-"""Whole numbers beyond it are of use to nobody, and do not fit into a float when an error names them."""
+"""Largest whole number: beyond it none is useful, and none fits into a float for an error message."""
 
 
 def split(location: str) -> tuple[str, dict[str, str]]:
-    """Return the name before `?` and the parameters `key=value` behind it, which stand between `&`.
+    """Return the name before `?` and the parameters `key=value` behind it, separated by `&`.
 
-    Raises SourceError for a parameter without a value and for one that is given twice.
+    Raises SourceError for a parameter without a value and for a repeated one.
     """
     name, _, query = location.partition("?")
-    given: dict[str, str] = {}
+    texts: dict[str, str] = {}
     for text in filter(None, query.split("&")):
         key, equals, value = text.partition("=")
         if not (key and equals and value):
             raise SourceError(f"'{text}' is no parameter; write key=value")
-        if key in given:
+        if key in texts:
             raise SourceError(f"'{key}' is given twice; give it once")
-        given[key] = value
-    return name, given
+        texts[key] = value
+    return name, texts
 
 
 def defaults(function: Callable[..., Any]) -> dict[str, Any]:
-    """Return the parameters that `function` takes and their default values."""
+    """Return the parameters of `function` with their default values."""
     return {name: parameter.default for name, parameter in inspect.signature(function).parameters.items()}
 
 
-def typed(given: Mapping[str, str], known: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the parameters as values of the types that the defaults in `known` have: bool, int, float or str.
+def typed(texts: Mapping[str, str], known: Mapping[str, Any]) -> dict[str, Any]:
+    """Convert parameters to the types of the defaults in `known`: bool, int, float or str.
 
-    Raises SourceError for an unknown parameter, with the one that was perhaps meant, and for unreadable values.
+    Raises SourceError for an unknown parameter, with a suggestion, and for unreadable values.
     """
-    return {key: _value(key, text, known) for key, text in given.items()}
+    return {key: _value(key, text, known) for key, text in texts.items()}
 
 
 def _value(key: str, text: str, known: Mapping[str, Any]) -> Any:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Poses over time, and the pose at a time between two of them."""
+"""Poses over time, interpolated at the time of an image."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from stereovox.errors import FrameRefused, SourceError
 from stereovox.se3 import Transform, interpolate
 
 MAX_GAP_NS = 100_000_000
-"""A pose this far (0.1 s) or further from an image, on either side, says too little about the image's own."""
+"""An image whose neighbouring poses are 0.1 s or more away, on either side, has no pose."""
 
 
 class Poses:

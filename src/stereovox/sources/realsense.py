@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A RealSense depth camera that is connected now (D400 series); recorded files are `bag.py`'s."""
+"""A connected RealSense depth camera (D400 series), read live; recorded files are `bags.recording`'s."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from stereovox.sources.base import Stream
 
 PREFIX = "realsense:"
 WAITING = 2
-"""Frames that wait while the map is busy; what is older is dropped, so the map never falls behind the camera."""
+"""Frames kept while the map is busy; older ones are dropped, so that the map never lags behind the camera."""
 PATIENCE_MS = 5000
 PREFERRED = (848, 480, 30)
 """Width, height, frames a second: where the D435 measures best, and what Chien 2020 used."""
@@ -25,11 +25,11 @@ PREFERRED = (848, 480, 30)
 
 @dataclass(frozen=True)
 class Options:
-    """What may stand behind the name, as in `realsense:?width=848&height=480&fps=30`; 0 or -1: as the camera has it.
+    """Options after the name, as in `realsense:?width=848&height=480&fps=30`; 0 or -1: the camera's own.
 
     width, height in pixels, fps in frames a second. emitter: 0 off, 1 on. laser_power in milliwatts (D435: 0 to 360).
-    baseline: metres between the two infrared cameras, where the camera does not tell it.
-    pose: `fixed` for a camera that stands still; every pose is then the identity.
+    baseline: metres between the two infrared cameras, where the camera does not report it. pose: `fixed` for a camera
+    at rest; every pose is then the identity.
     """
 
     width: int = 0
@@ -58,7 +58,7 @@ class RealSense(Stream):
     Time: the frame's, in the clock domain of the camera. Camera, unit and baseline are told by the device. Without
     `pose=fixed` every frame has the fault `no_pose`, but its depth all the same: a camera does not know where it is,
     and pyrealsense2 2.55 and later no longer supports the T265.
-    Raises MissingExtra without pyrealsense2; SourceError, one line, where no camera or not the right one is connected,
+    Raises MissingExtra without pyrealsense2; SourceError where no camera or not the right one is connected,
     for modes and settings that it does not have, and while frames are taken, where none came for 5 s.
     """
 
@@ -81,11 +81,13 @@ class RealSense(Stream):
 
     @classmethod
     def recognises(cls, location: str) -> bool:
-        """Tell whether `location` names a connected camera."""
+        """Return whether `location` names a connected camera."""
         return location.startswith(PREFIX)
 
     def __iter__(self) -> Iterator[Frame]:
-        """Start the camera, yield its frames, and stop it when the consumer does; frames nobody took are dropped."""
+        """Start the camera, yield its frames, and stop it when the consumer stops; frames not consumed in time are
+        dropped.
+        """
         queue = self._rs.frame_queue(WAITING)
         try:
             self._sensor.open(self._profile)
@@ -155,14 +157,14 @@ def _device(rs: Any, context: Any, location: str, serial: str) -> Any:
         raise SourceError(f"{location}: no RealSense camera is connected; {cure}")
     if serial:
         if serial not in devices:
-            raise SourceError(f"{location}: not connected; there is {_ways(devices)}")
+            raise SourceError(f"{location}: not connected; there is {_device_names(devices)}")
         return devices[serial]
     if len(devices) > 1:
-        raise SourceError(f"{location}: several cameras are connected, say which: {_ways(devices)}")
+        raise SourceError(f"{location}: several cameras are connected, say which: {_device_names(devices)}")
     return next(iter(devices.values()))
 
 
-def _ways(devices: dict[str, Any]) -> str:
+def _device_names(devices: dict[str, Any]) -> str:
     return " or ".join(PREFIX + serial for serial in devices)
 
 
@@ -179,7 +181,7 @@ def _depth_sensor(device: Any, location: str) -> Any:
 
 
 def _profile(rs: Any, sensor: Any, options: Options, location: str) -> Any:
-    """Return the mode that was asked for; what was not asked for is as in PREFERRED, or near it."""
+    """Return the requested mode; what was not requested is as in PREFERRED, or near it."""
     modes = {}
     for profile in sensor.get_stream_profiles():
         if profile.stream_type() == rs.stream.depth and profile.format() == rs.format.z16:
@@ -229,11 +231,13 @@ def _baseline(rs: Any, sensor: Any) -> float | None:
 
 
 def _camera(profile: Any, baseline: float | None, location: str) -> tuple[PinholeCamera, tuple[str, ...]]:
-    told = profile.get_intrinsics()
-    numbers = (told.width, told.height, told.fx, told.fy, told.ppx, told.ppy)
+    intrinsics = profile.get_intrinsics()
+    numbers = (intrinsics.width, intrinsics.height, intrinsics.fx, intrinsics.fy, intrinsics.ppx, intrinsics.ppy)
     note = f"{location}: the camera tells of lens distortion in its depth, which is not corrected"
     try:
-        return PinholeCamera(*numbers, None if baseline is None else abs(baseline)), (note,) if any(told.coeffs) else ()
+        return PinholeCamera(*numbers, None if baseline is None else abs(baseline)), (note,) if any(
+            intrinsics.coeffs
+        ) else ()
     except StereovoxError as error:
         raise SourceError(f"{location}: {error}") from None
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings of stereo rigs: a folder with a rig file, images of each pair, and the vehicle's poses."""
+"""Recordings of stereo rigs: a folder with a rig file, the images of each pair, and the vehicle's poses."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from stereovox.errors import FrameRefused, SourceError
 from stereovox.frame import StereoFrame
 from stereovox.se3 import Transform
 from stereovox.sources.base import Source
-from stereovox.sources.images import PICTURE, file_names, png_size, read_picture_png
+from stereovox.sources.images import PICTURE_KINDS, file_names, png_size, read_picture_png
 from stereovox.sources.rig_file import FILE, RigPair, read_rig
 from stereovox.sources.trajectory import Trajectory, by_time, inside, stamped_lines
 
 SHORTEST_NS = 1_000_000
-"""Names of a pair's images that span less are their numbers, not their times."""
+"""Image names of a pair that span less are numbers, not times."""
 
 
 class _Shot(NamedTuple):
@@ -42,7 +42,7 @@ class StereoRig(Source):
     away. World: that of the poses.
     Each pair is a sensor of its own, by its name. Why a pixel has no value is found out by matching (`depth.stereo`);
     the rig's masks make it MASKED.
-    Faults: those of `read_picture_png` and of `Poses.at`. Raises SourceError, one line, for a bad rig file, masks or
+    Faults: those of `read_picture_png` and of `Poses.at`. Raises SourceError for a bad rig file, masks or
     folders that cannot be read, names that are no times, and where there is no image or no file of poses.
     Names of several images that span less than a millisecond are no times.
     """
@@ -65,7 +65,7 @@ class StereoRig(Source):
 
     @classmethod
     def recognises(cls, where: str) -> bool:
-        """Tell whether `where` is a folder with a `rig.toml`."""
+        """Return whether `where` is a folder with a `rig.toml`."""
         return os.path.isfile(os.path.join(where, FILE))
 
     def __len__(self) -> int:
@@ -75,8 +75,8 @@ class StereoRig(Source):
         """Return frame `i`; its images are (0, 0) and its pose NaN where it has a `fault`."""
         shot = self._shots[range(len(self))[i]]
         pair = self.pairs[shot.pair]
-        nothing, nowhere = np.empty((0, 0), np.uint8), np.full((4, 4), np.nan)
-        frame = StereoFrame(nothing, nothing, pair, nowhere, shot.stamp_ns, str(shot.left), sensor=pair.name)
+        no_image, no_pose = np.empty((0, 0), np.uint8), np.full((4, 4), np.nan)
+        frame = StereoFrame(no_image, no_image, pair, no_pose, shot.stamp_ns, str(shot.left), sensor=pair.name)
         try:
             T_world_camera = self._pose(shot, pair)
             left, right = (_picture(path, size) for path, size in zip(shot[2:], _sizes(pair), strict=True))
@@ -103,8 +103,8 @@ def _picture(path: Path, size: tuple[int, int]) -> NDArray[np.uint8]:
     except FrameRefused as refused:
         if refused.reason != "bad_shape":
             raise
-    (width, height), told = png_size(path, PICTURE), f"{size[0]}x{size[1]}"
-    message = f"{path}: {width}x{height} pixels, {FILE} says {told}; correct width and height there, or the image"
+    (width, height), expected = png_size(path, PICTURE_KINDS), f"{size[0]}x{size[1]}"
+    message = f"{path}: {width}x{height} pixels, {FILE} says {expected}; correct width and height there, or the image"
     raise FrameRefused("bad_shape", message) from None
 
 

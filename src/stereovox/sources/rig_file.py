@@ -22,6 +22,17 @@ from stereovox.se3 import Transform, orthonormalise, rigidity_error
 from stereovox.sources.images import read_picture_png
 
 FILE = "rig.toml"
+CAMERAS = {"pinhole": PinholeCamera, "spherical": SphericalCamera, "cylindrical": CylindricalCamera}
+LENS = ("model", "width", "height", "fx", "fy", "cx", "cy", "distortion")
+EYES = ("left_lens", "right_lens", "T_left_right")
+KEYS = ("name", "left", "right", "index", "T_body_left", "mask_rectangles", "mask", "camera", "virtual", *EYES)
+WORDS = ("left", "right", "index", "mask")
+SIZES = ("width", "height")
+LARGEST = 32_767
+"""Pixels along a side; OpenCV takes no more."""
+TOLERANCE = 5e-3
+"""Largest entry of abs(R^T R - I) that passes for rounding."""
+UNWRITTEN = ("binning", "correction")
 
 
 @dataclass(frozen=True)
@@ -66,7 +77,7 @@ class RigPair:
     def stereo_pair(self, folder: Path | str = ".") -> StereoPair:
         """Return the pair; `folder` is where its mask is looked for.
 
-        Raises SourceError, one line, for a mask that cannot be read or has another size, a rectangle that lies outside
+        Raises SourceError for a mask that cannot be read or has another size, a rectangle that lies outside
         the image, and a virtual camera that cannot be.
         """
         try:
@@ -119,8 +130,7 @@ class Rig:
 
 
 def read_rig(path: Path | str) -> Rig:
-    """Return what `path` says; raises SourceError, one line with file, pair and key, for anything wrong in it."""
-    pass  # REHOUSED
+    """Return what `path` says; raises SourceError naming file, pair and key for anything wrong in it."""
     from stereovox.safe_io import read_table
 
     table = read_table(Path(path))
@@ -132,23 +142,8 @@ def read_rig(path: Path | str) -> Rig:
 
 def write_rig(path: Path | str, rig: Rig, remarks: Sequence[str] = ()) -> None:
     """Write `rig` so that `read_rig` gives it back; `remarks` are comments at its top. Raises SourceError."""
-    pass  # REHOUSED
-
     with replacing(path, SourceError) as file:
         file.write(rig_text(rig, remarks).encode())
-
-
-CAMERAS = {"pinhole": PinholeCamera, "spherical": SphericalCamera, "cylindrical": CylindricalCamera}
-LENS = ("model", "width", "height", "fx", "fy", "cx", "cy", "distortion")
-EYES = ("left_lens", "right_lens", "T_left_right")
-KEYS = ("name", "left", "right", "index", "T_body_left", "mask_rectangles", "mask", "camera", "virtual", *EYES)
-WORDS = ("left", "right", "index", "mask")
-SIZES = ("width", "height")
-LARGEST = 32_767
-"""Pixels along a side; OpenCV takes no more."""
-TOLERANCE = 5e-3
-"""Largest entry of abs(R^T R - I) that passes for rounding."""
-UNWRITTEN = ("binning", "correction")
 
 
 def rig_of(table: dict[str, Any]) -> Rig:

@@ -46,7 +46,7 @@ class SevenScenes(DepthFolder):
 
     @classmethod
     def recognises(cls, where: str) -> bool:
-        """Tell whether `where` is a folder with at least one image or pose named as in 7-Scenes."""
+        """Return whether `where` is a folder with at least one image or pose named as in 7-Scenes."""
         try:
             with os.scandir(where) as entries:
                 return any(FILE.fullmatch(entry.name) for entry in entries)

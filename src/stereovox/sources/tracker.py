@@ -33,9 +33,9 @@ def read_tracker(path: Path, axes: str = "opengl", world: str = "up") -> Poses:
     """Return the poses in a file of lines `stamp tx ty tz qx qy qz qw [confidence]`, in optical axes of the body.
 
     The confidence is 0 (failed), 1 (low), 2 (medium) or 3 (high); either every line has one or none. T_world_body maps
-    the tracker's body, in optical axes, into `world` (see `WORLDS`); `axes` tells what the file holds.
-    Raises SourceError for unknown axes, a file that cannot be read or holds no pose; a line that has a stamp but no
-    usable pose is remembered (see `Poses`).
+    the tracker's body, in optical axes, into `world` (see `WORLDS`); `axes`: those of the file. Raises SourceError for
+    unknown axes and a file that cannot be read or holds no pose; a line with a stamp but no usable pose is kept (see
+    `Poses`).
     """
     _check_word("axes", axes, AXES)
     _check_word("world", world, WORLDS)

@@ -43,7 +43,7 @@ class StampedImages(DepthFolder):
 
     @classmethod
     def recognises(cls, where: str) -> bool:
-        """Tell whether `where` is a folder with a list of depth images or a folder of them."""
+        """Return whether `where` is a folder with a list of depth images or a folder of them."""
         return os.path.isfile(os.path.join(where, LIST)) or os.path.isdir(os.path.join(where, IMAGES))
 
     def __len__(self) -> int:
@@ -75,7 +75,7 @@ class TumRgbd(StampedImages):
 
     @classmethod
     def recognises(cls, where: str) -> bool:
-        """Tell whether `where` is a folder that has poses, and a list of depth images or a folder of them."""
+        """Return whether `where` is a folder that has poses, and a list of depth images or a folder of them."""
         return super().recognises(where) and os.path.isfile(os.path.join(where, POSES))
 
     def pose(self, i: int) -> Transform:

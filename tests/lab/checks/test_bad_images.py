@@ -9,7 +9,7 @@ import pytest
 
 import stereovox as sv
 from stereovox.lab.checks.bad_images import Trial, bad_frames, displaced, metres, trial
-from stereovox.simulate.passer_by import Passing
+from stereovox.simulate.passer_by import PasserBy
 from stereovox.simulate.scene import box
 
 CANNOT_BE_TOLD = {"half black"}
@@ -87,7 +87,7 @@ def test_a_knocked_camera_is_not_believed_until_it_agrees_again():
     assert mapper.map.history.settled == {}
 
 
-class Changing(Passing):
+class Changing(PasserBy):
     """A wall with a cupboard before it, from frame to frame there or not."""
 
     def __init__(self):

@@ -9,7 +9,7 @@ from stereovox.errors import SourceError, StereovoxError
 from stereovox.frame import Reason
 from stereovox.lab.checks.ghosts import ghosts, seen_free, time_to_clear
 from stereovox.maps import State
-from stereovox.simulate.passer_by import BEFORE, POLE, WALK_X, Passing
+from stereovox.simulate.passer_by import BEFORE, POLE, WALK_X, PasserBy
 
 U, F, T, O = State.UNKNOWN, State.FREE, State.TENTATIVE, State.OCCUPIED  # noqa: E741
 SMALL = {"image_width": 160, "pole_m": 0.04}
@@ -17,7 +17,7 @@ SMALL = {"image_width": 160, "pole_m": 0.04}
 
 @lru_cache
 def passed(background, **changes):
-    source = Passing(background, **SMALL)
+    source = PasserBy(background, **SMALL)
     return ghosts(source, voxel_size=0.1, **changes)
 
 
@@ -53,7 +53,7 @@ def test_a_pole_seen_in_one_frame_of_three_stays(background):
 
 def test_figures_fail_where_clearing_or_keeping_breaks():
     """The same scene under models that clear hardly, and too much: the figures tell both."""
-    source = Passing("near", **SMALL)
+    source = PasserBy("near", **SMALL)
     frames = [source.frame(i) for i in range(len(source))]
     slow = ghosts(source, frames, voxel_size=0.1, **{"sensor.p_free": 0.48})
     assert slow.as_dict()["gone_longest_s"] > 0.5
@@ -62,12 +62,12 @@ def test_figures_fail_where_clearing_or_keeping_breaks():
 
 
 def test_the_scene_is_what_it_says():
-    near, far, silent = (Passing(background, **SMALL) for background in ("near", "far", "silent"))
+    near, far, silent = (PasserBy(background, **SMALL) for background in ("near", "far", "silent"))
     middle = BEFORE + 64
     assert near.person(BEFORE - 1) is None
     assert near.person(len(near) - 1) is None
-    assert near.sees_person(middle)
-    assert not near.sees_person(0)
+    assert near.shows_person(middle)
+    assert not near.shows_person(0)
     assert near.true_depth(middle)[45, 80] == pytest.approx(WALK_X - 0.2, abs=0.05)
     assert near.true_depth(0)[20, 80] == pytest.approx(4.0)
     assert np.isinf(far.true_depth(0)[20, 80])
@@ -78,12 +78,12 @@ def test_the_scene_is_what_it_says():
     for a, b in zip((seen.depth, seen.reason), (far.frame(0).depth, far.frame(0).reason), strict=True):
         np.testing.assert_array_equal(a, b)
     with pytest.raises(SourceError, match="background=fog is unknown; use near or far or silent"):
-        Passing("fog")
+        PasserBy("fog")
 
 
 @pytest.mark.parametrize("missed", ["background", "unmatched"])
 def test_the_pole_is_missed_in_two_frames_of_three(missed):
-    source = Passing("near", missed=missed, **SMALL)
+    source = PasserBy("near", missed=missed, **SMALL)
     camera = source.camera
     u = round(-POLE[1] / POLE[0] * camera.fx + camera.cx)
     images = [source.frame(i) for i in range(6)]
@@ -95,7 +95,7 @@ def test_the_pole_is_missed_in_two_frames_of_three(missed):
 
 
 def test_what_a_frame_sees_through():
-    source = Passing("near", **SMALL)
+    source = PasserBy("near", **SMALL)
     points = np.array(
         [[1.5, 1.0, 1.2], [3.5, 0.05, 1.2], [4.1, 0.05, 1.2], [-1.0, 0.0, 1.2], [*POLE, 1.2], [2.6, 0.0, 1.2]]
     )

@@ -279,28 +279,28 @@ def test_one_stamp_from_the_future_ends_nothing(driven):
 def test_where_the_clock_is_set_back_the_majority_is_believed(before):
     clock = Clock()
     for stamp_ns in range(100, 100 + before):
-        assert clock.take(replace(SOME_SCAN, stamp_ns=stamp_ns)) == 0
+        assert clock.accept(replace(SOME_SCAN, stamp_ns=stamp_ns)) == 0
     patience = max(before, 3)
     for stamp_ns in range(patience):
         with pytest.raises(FrameRefused):
-            clock.take(replace(SOME_SCAN, stamp_ns=stamp_ns))
-    wrong = [clock.take(replace(SOME_SCAN, stamp_ns=patience + stamp_ns)) for stamp_ns in (0, 1, 50)]
+            clock.accept(replace(SOME_SCAN, stamp_ns=stamp_ns))
+    wrong = [clock.accept(replace(SOME_SCAN, stamp_ns=patience + stamp_ns)) for stamp_ns in (0, 1, 50)]
     assert wrong == [before, 0, 0]
 
 
 def test_late_scans_are_only_believed_where_they_rise_in_a_row():
     clock = Clock()
-    clock.take(replace(SOME_SCAN, stamp_ns=1000))
+    clock.accept(replace(SOME_SCAN, stamp_ns=1000))
     stuck = [7] * 20
     overtaken = [stamp_ns for n in range(1002, 1030, 2) for stamp_ns in (n, n - 1)]  # two by two in the wrong order
     last_ns = 1000
     for stamp_ns in stuck + overtaken:
         if stamp_ns > last_ns:
             last_ns = stamp_ns
-            assert clock.take(replace(SOME_SCAN, stamp_ns=stamp_ns)) == 0
+            assert clock.accept(replace(SOME_SCAN, stamp_ns=stamp_ns)) == 0
             continue
         with pytest.raises(FrameRefused) as caught:
-            clock.take(replace(SOME_SCAN, stamp_ns=stamp_ns))
+            clock.accept(replace(SOME_SCAN, stamp_ns=stamp_ns))
         assert caught.value.reason == "not_in_order"
 
 

@@ -10,7 +10,7 @@ def fed(values, beams=5, **settings):
     """Share of strangers after scans whose likelihood per beam is `values` for every particle."""
     recovery = Recovery(AmclConfig(**settings))
     for value in values:
-        recovery.see(np.full(3, beams * np.log(value)), np.array([0.2, 0.3, 0.5]), beams)
+        recovery.observe(np.full(3, beams * np.log(value)), np.array([0.2, 0.3, 0.5]), beams)
     return recovery.strangers
 
 
@@ -27,8 +27,8 @@ def test_the_share_is_that_of_table_8_3():
 
 def test_the_likelihood_is_that_of_all_particles_by_their_weights():
     recovery = Recovery(AmclConfig(alpha_slow=0.5, alpha_fast=1.0, recovery_least=0))
-    recovery.see(np.log([1.0, 1.0]), np.array([0.5, 0.5]), 2)
-    recovery.see(np.log([0.04, 0.64]), np.array([0.25, 0.75]), 2)
+    recovery.observe(np.log([1.0, 1.0]), np.array([0.5, 0.5]), 2)
+    recovery.observe(np.log([0.04, 0.64]), np.array([0.25, 0.75]), 2)
     now = np.sqrt(0.25 * 0.04 + 0.75 * 0.64)
     assert recovery.strangers == pytest.approx(1 - now / (0.5 + 0.5 * now))
 
@@ -45,6 +45,6 @@ def test_better_scans_small_changes_and_zero_rates_draw_nobody():
 def test_likelihoods_far_beyond_floats_are_fine():
     recovery = Recovery(AmclConfig(recovery_least=0))
     for _ in range(10):
-        recovery.see(np.full(2, -5000.0), np.full(2, 0.5), 60)
-    recovery.see(np.full(2, -9000.0), np.full(2, 0.5), 60)
+        recovery.observe(np.full(2, -5000.0), np.full(2, 0.5), 60)
+    recovery.observe(np.full(2, -9000.0), np.full(2, 0.5), 60)
     assert 0 < recovery.strangers <= 1

@@ -99,8 +99,8 @@ def test_a_place_that_looks_like_its_neighbour_is_not_taken():
     search, there = ClosureSearch(load_config().slam), np.array([1.3, 0.2, 0.05])
     for things, clear in (([], False), ([(-0.5, -1, 0.2, -0.3), (3.0, -1, 3.2, -0.5)], True)):
         walls = corridor(*things)
-        search.onto(seen(walls, [0, 0, 0]))
-        match = search.lay(seen(walls, there), [0.0, 0.0, 0.0], 4.0, 0.2)
+        search.set_target(seen(walls, [0, 0, 0]))
+        match = search.match(seen(walls, there), [0.0, 0.0, 0.0], 4.0, 0.2)
         assert (match is not None) == clear
         if match is not None:
             assert np.allclose(match.pose, there, atol=0.02)
@@ -109,10 +109,10 @@ def test_a_place_that_looks_like_its_neighbour_is_not_taken():
 def test_a_place_is_found_from_far_off():
     walls = np.vstack([box(-5, -3, 6, 4), box(1, 1, 2, 1.5), box(-3, -3, -2.5, 0)])
     search, there = ClosureSearch(load_config().slam), np.array([2.0, -1.0, 0.4])
-    search.onto(seen(walls, [0, 0, 0]))
+    search.set_target(seen(walls, [0, 0, 0]))
     guess = se2.compose([1.5, -1.2, -0.3], there)
-    match = search.lay(seen(walls, there), guess, 3.5, 0.5)
+    match = search.match(seen(walls, there), guess, 3.5, 0.5)
     assert match is not None
     assert np.allclose(match.pose, there, atol=0.01)
     assert match.share > 0.9
-    assert search.lay(seen(box(-1, -1, 1.2, 1), [0, 0, 0]), guess, 1.0, 0.3) is None
+    assert search.match(seen(box(-1, -1, 1.2, 1), [0, 0, 0]), guess, 1.0, 0.3) is None

@@ -22,10 +22,10 @@ class Said:
     def __init__(self, tell):
         self.tell, self.windows = tell, []
 
-    def onto(self, earlier):
+    def set_target(self, earlier):
         pass
 
-    def lay(self, _cloud, guess, side, side_yaw):
+    def match(self, _cloud, guess, side, side_yaw):
         self.windows.append((side, side_yaw))
         told = self.tell(len(self.windows) - 1)
         if told is None:
@@ -122,10 +122,10 @@ def test_drift_adds_up_along_the_shortest_way(edges):
     anchors = [submap.anchor for submap in finder._submaps]
     finder.edges = [Edge(anchors[a], anchors[b], np.zeros(3), np.eye(3)) for a, b in edges]
     along = [finder._keyframes[anchor].travelled for anchor in anchors]
-    assert np.allclose(finder._ways(), shortest(anchors, along, edges), rtol=0, atol=1e-9)
+    assert np.allclose(finder._drift_distances(), shortest(anchors, along, edges), rtol=0, atol=1e-9)
     finder._submaps = finder._submaps[:1]
     finder.edges = []
-    assert finder._ways().tolist() == [0.0]
+    assert finder._drift_distances().tolist() == [0.0]
 
 
 @pytest.mark.parametrize("wrong", [None, 0, 5, 11])

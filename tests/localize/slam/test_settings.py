@@ -106,10 +106,10 @@ class Search:
     def __init__(self):
         self.windows = []
 
-    def onto(self, earlier):
+    def set_target(self, earlier):
         pass
 
-    def lay(self, _cloud, guess, side, side_yaw):
+    def match(self, _cloud, guess, side, side_yaw):
         self.windows.append((side, side_yaw))
         return Match(np.asarray(guess, float), 1e4 * np.eye(3), 0.6, 0.01)
 
@@ -157,8 +157,8 @@ def cloud(walls, pose):
 
 def found_in(config, here, there, pose):
     search = ClosureSearch(config.slam)
-    search.onto(cloud(here, [0, 0, 0]))
-    return search.lay(cloud(there, pose), [0.0, 0.0, 0.0], 2.5, 0.2) is not None
+    search.set_target(cloud(here, [0, 0, 0]))
+    return search.match(cloud(there, pose), [0.0, 0.0, 0.0], 2.5, 0.2) is not None
 
 
 def found_half_hidden(config):

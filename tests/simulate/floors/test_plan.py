@@ -104,12 +104,12 @@ LIDS = [  # x from, heights, whether a camera at 0.3 m sees a lid between 0.1 an
 
 
 def test_a_camera_sees_tops_below_and_undersides_above_it():
-    things = [block("boxes", name, (x, 0.5, x + 0.5, 1.0), heights) for name, x, heights, _ in LIDS]
-    things.append(block("legs", "leg", (0.6, 0.6, 0.7, 0.7), (0.0, 0.7)))
-    things.append(block("tables", "shut away", (9.0, 0.5, 9.5, 1.0), (0.7, 0.75)))
-    plan = FloorPlan([(0.0, 0.0, 8.0, 2.0), (8.5, 0.0, 10.0, 2.0)], things)
+    obstacles = [block("boxes", name, (x, 0.5, x + 0.5, 1.0), heights) for name, x, heights, _ in LIDS]
+    obstacles.append(block("legs", "leg", (0.6, 0.6, 0.7, 0.7), (0.0, 0.7)))
+    obstacles.append(block("tables", "shut away", (9.0, 0.5, 9.5, 1.0), (0.7, 0.75)))
+    plan = FloorPlan([(0.0, 0.0, 8.0, 2.0), (8.5, 0.0, 10.0, 2.0)], obstacles)
     slice_ = plan.truth(0.02, (0.1, 0.1))
-    grid = with_lids(slice_, things, (0.1, 1.8), 0.3)
+    grid = with_lids(slice_, obstacles, (0.1, 1.8), 0.3)
     at = lambda cells, x, y: int(cells[tuple(grid.indices([(x, y)])[0])])  # noqa: E731 - short and local
     for name, x, heights, seen in LIDS:
         passed = heights[0] > 1.8 or heights[1] < 0.1  # nothing between the heights: the floor there is free
@@ -126,10 +126,10 @@ def test_a_camera_sees_tops_below_and_undersides_above_it():
 def test_a_perfect_map_of_a_floor_can_have_lids():
     floor = Floor("sim:floor?plan=testbed&seconds=1")
     slice_, whole = (floor.true_grid(0.05, (0.1, 1.8), lids=lids) for lids in (False, True))
-    table = next(thing for thing in floor.plan.things if thing.name == "table 2: top")
-    crate = next(thing for thing in floor.plan.things if thing.name == "crate")
-    for thing, seen in ((table, 100), (crate, -1)):
-        row, column = slice_.indices([thing.corners.mean(axis=0)])[0]
+    table = next(obstacle for obstacle in floor.plan.obstacles if obstacle.name == "table 2: top")
+    crate = next(obstacle for obstacle in floor.plan.obstacles if obstacle.name == "crate")
+    for obstacle, seen in ((table, 100), (crate, -1)):
+        row, column = slice_.indices([obstacle.corners.mean(axis=0)])[0]
         assert slice_.cells[row, column] == -1
         assert whole.cells[row, column] == seen
     np.testing.assert_array_equal(floor.true_grid(0.05, lids=True).cells, floor.true_grid(0.05).cells)  # the lidar's

@@ -16,7 +16,7 @@ from stereovox.frame import Frame
 from stereovox.mapper import Mapper
 from stereovox.maps import State
 from stereovox.se3 import inverse, transform_points
-from stereovox.simulate.passer_by import BEFORE, HZ, TALL, WALK_FROM, WALK_X, WIDE, Passing
+from stereovox.simulate.passer_by import BEFORE, HZ, TALL, WALK_FROM, WALK_X, WIDE, PasserBy
 
 GONE = (State.FREE, State.TENTATIVE, State.UNKNOWN)
 """States in which a cell is no obstacle any more."""
@@ -118,7 +118,7 @@ class Ghosts:
         }
 
 
-def ghosts(source: Passing, frames: list[Frame] | None = None, **settings: Any) -> Ghosts:
+def ghosts(source: PasserBy, frames: list[Frame] | None = None, **settings: Any) -> Ghosts:
     """Map the frames of `source` and follow all cells where the person passes, and those of the pole.
 
     frames: those of the source, where several maps are made of the same ones. settings: of the mapper.
@@ -149,7 +149,7 @@ def passed_cells(side: float) -> NDArray[np.int32]:
 
 
 def seen_free(
-    source: Passing, i: int, centers: NDArray[np.float64], side: float, max_range: float
+    source: PasserBy, i: int, centers: NDArray[np.float64], side: float, max_range: float
 ) -> NDArray[np.bool_]:
     """Tell which cells (N,) with sides `side` frame `i` truly sees through; the person must be a cell away."""
     camera = source.camera
@@ -167,7 +167,7 @@ def seen_free(
 
 
 def _judged(
-    source: Passing,
+    source: PasserBy,
     mapper: Mapper,
     states: NDArray[np.uint8],
     centers: NDArray[np.float64],
@@ -178,7 +178,7 @@ def _judged(
     seen = np.array([seen_free(source, i, centers, side, reach) for i in range(frames)])
     ever_seen = seen[BEFORE:].any(axis=0)
     left = states[-1] == State.OCCUPIED
-    empty_from = next(i for i in range(frames - 1, 0, -1) if source.sees_person(i - 1))
+    empty_from = next(i for i in range(frames - 1, 0, -1) if source.shows_person(i - 1))
     ghost = ((states[empty_from:] == State.OCCUPIED) & ever_seen).any(axis=1)
     return Ghosts(
         ((states == State.OCCUPIED) & seen).sum(axis=1),

@@ -108,7 +108,7 @@ def _cast(clear, x, y, u, v, farthest):
 def join(indices, keys, round_, steps, parent):
     """Fill `parent` (K,) int64 with the number of the first bin of each bin's cluster.
 
-    indices: (K, 3) int64 of different bins x, y, yaw, in order of their keys (K,) int64 (`amcl_kld.bin_keys`);
+    indices: (K, 3) int64 of different bins x, y, yaw, in order of their keys (K,) int64 (`particles.bin_keys`);
     round_: bins once round; steps: (M, 3) int64 to neighbours that belong together.
     """
     for i in range(keys.size):

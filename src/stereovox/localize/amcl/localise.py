@@ -29,114 +29,49 @@ from stereovox.maps.voxel_map import State
 from stereovox.trust.validate import validate_scan
 
 LATE = 3
-"""Scans in a row that are too late, and in order among themselves, before it is asked who is right."""
-
-
-class Clock:
-    """The stamps of the scans so far, rising.
-
-    A lone stamp in the future would make all later scans too late. So once more scans in a row are late than there are
-    scans that they would have to come before, it is those before that had the wrong stamps (as `slam_way.Way`).
-    """
-
-    def __init__(self):
-        self._stamps_ns = array("q")
-        self._late, self._late_ns = 0, 0
-
-    def take(self, scan: Scan) -> int:
-        """Go on to the time of a scan; return how many of the last scans turn out to have had a wrong stamp.
-
-        Raises FrameRefused with the reason `not_in_order` where the scan is not later than the one before.
-        """
-        ahead = len(self._stamps_ns) - bisect_left(self._stamps_ns, scan.stamp_ns)
-        if ahead:
-            self._count_late(scan, ahead)
-            del self._stamps_ns[-ahead:]
-        self._stamps_ns.append(scan.stamp_ns)
-        self._late = 0
-        return ahead
-
-    def _count_late(self, scan: Scan, ahead: int) -> None:
-        self._late = self._late + 1 if self._late and scan.stamp_ns > self._late_ns else 1
-        self._late_ns = scan.stamp_ns
-        if self._late <= max(ahead, LATE):
-            said = f"at {scan.stamp_ns} ns, is not later than the scan before it at {self._stamps_ns[-1]} ns"
-            raise FrameRefused("not_in_order", f"{name_of(scan)}: {said}; give scans in order of time")
-
-
-class FreeFloor:
-    """The free cells of a map. Raises MapFileError where there is none, or nothing occupied to go by."""
-
-    def __init__(self, grid: OccupancyGrid):
-        states = grid.states
-        self.grid = grid
-        self._free = np.flatnonzero(states == State.FREE).astype(np.uint32)
-        for state, count in (("free", len(self._free)), ("occupied", int((states == State.OCCUPIED).sum()))):
-            if not count:
-                raise MapFileError(f"the map has no {state} cell: nobody can be localised in it; give a finished map")
-
-    def anywhere(self, count: int, rng: np.random.Generator) -> se2.Pose:
-        """Return (count, 3) poses evenly spread over all free cells and directions."""
-        chosen = self._free[rng.integers(len(self._free), size=count)]
-        rows, columns = np.divmod(chosen, np.uint32(self.grid.cells.shape[1]))
-        local = (np.column_stack([columns, rows]) + rng.random((count, 2))) * self.grid.resolution
-        turns = rng.uniform(-np.pi, np.pi, count)
-        return np.column_stack([se2.transform(self.grid.origin, local), turns])
-
-
-def near(start: se2.Pose, std: ArrayLike, count: int, rng: np.random.Generator) -> se2.Pose:
-    """Return (count, 3) poses normally distributed round a (3,) pose; std: (3,) metres, metres, radians."""
-    poses = start + rng.standard_normal((count, 3)) * np.asarray(std)
-    poses[:, 2] = se2.wrapped(poses[:, 2])
-    return poses
-
-
-def checked_start(start: ArrayLike) -> NDArray[np.float64]:
-    """Return a start pose as (3,) float64. Raises ConfigError, one line, where it is none."""
-    try:
-        pose = np.asarray(start, float)
-    except (TypeError, ValueError):
-        pose = np.empty(0)
-    if pose.shape != (3,) or not np.isfinite(pose).all():
-        raise ConfigError(f"start {start!r}: give three finite numbers x, y, yaw (metres, metres, radians), or none")
-    return pose
-
-
+"""Late scans in a row, in order among themselves, before it is decided which stamps are wrong."""
 MAX_AT_START = 1_000_000
-"""Poses that are tried at once where the robot may be anywhere."""
+"""Particles tried at once where the robot may be anywhere."""
 SETTLED_SHARE, SETTLED_M = 0.95, 0.3
-"""The robot knows where it is when so much weight is in one cluster, which is so wide (standard deviation)."""
+"""The robot is localised once this share of the weight is in one cluster of this standard deviation in metres."""
 
 
-@dataclass(frozen=True, eq=False)
-class Estimate:
-    """Where the robot is after a scan, as ROS's amcl gives it.
+def localise(
+    grid: OccupancyGrid,
+    scans: Iterable[Scan],
+    config: Config,
+    start: ArrayLike | None = None,
+    seed: int = 0,
+    progress: Callable[[int], object] | None = None,
+) -> Track:
+    """Return a robot's track through a map; untrusted scans are left out and counted in `Track.refused`.
 
-    pose_map_base: (3,) float64, the mean of the heaviest cluster of particles, moved by the odometry since.
-    covariance: (3, 3) float64, mean square of how far the particles of all clusters are from it (metres, radians).
-    pose_map_odom: (3,) float64, what turns the odometry's poses into those of the map.
-    particles: (N, 3) float64, equally likely poses in the map, as of the last update.
-    moved: tells whether the scan was compared with the map: at first, and then after moving far enough.
-    settled: tells whether nearly all particles agree; False while the robot may be in several places.
-    ms: milliseconds the scan took.
+    start, seed: as in `Localiser`; progress: called with the number of scans done. Where the particles disagree, the
+    track follows the odometry, with the drift interpolated between the certain poses before and after; before the first
+    certain pose it has that one's drift. Scans that later ones show to have a wrong stamp (`Clock`) are removed from
+    the track and counted too. Raises what `Localiser` raises, and SourceError where no scan can be trusted.
     """
-
-    pose_map_base: se2.Pose
-    covariance: NDArray[np.float64]
-    pose_map_odom: se2.Pose
-    particles: se2.Pose
-    moved: bool
-    settled: bool
-    ms: float
+    localiser, way, first_refusal = Localiser(grid, config, start, seed), _TrackBuilder(), ""
+    for done, scan in enumerate(scans, 1):
+        try:
+            way.add(scan.stamp_ns, localiser.add(scan))
+        except FrameRefused as refusal:
+            first_refusal = first_refusal or str(refusal)
+        if progress:
+            progress(done)
+    if not way.stamps_ns:
+        said = f"every one was refused, the first: {first_refusal}" if first_refusal else "there are none"
+        raise SourceError(f"no scan to localise by: {said}")
+    return way.track(dict(localiser.refused), first_refusal)
 
 
 class Localiser:
-    """Follows a robot through a map by its scans and odometry.
+    """Tracks a robot through a map by its scans and odometry.
 
-    start: (3,) x, y, yaw where the robot is at the first scan, good to `amcl.start_std`; None: it may be anywhere.
-    seed: of all random numbers; the same scans then give the same estimates.
-    refused: how many scans were refused, by reason; `not_in_order` are also those that later ones show to be.
-    Raises MapFileError for a map without free or occupied cells, ConfigError for a start that is no pose.
+    start: (3,) x, y, yaw of the robot at the first scan, accurate to `amcl.start_std`; None: anywhere. seed: of all
+    random numbers; the same scans then give the same estimates. refused: refused scans by reason; `not_in_order`
+    includes those that later scans show to be wrong. Raises MapFileError for a map without free or occupied cells,
+    ConfigError for an invalid start.
     """
 
     def __init__(self, grid: OccupancyGrid, config: Config, start: ArrayLike | None = None, seed: int = 0):
@@ -154,7 +89,7 @@ class Localiser:
         self._pose_map_odom, self._covariance, self._settled = np.zeros(3), np.zeros((3, 3)), False
 
     def add(self, scan: Scan) -> Estimate:
-        """Return where the robot is after one more scan.
+        """Estimate where the robot is after one more scan.
 
         Raises FrameRefused, and changes nothing but what is counted, where the scan cannot be trusted (`validate_scan`,
         `beams_of`) or is not later than the one before (`Clock`).
@@ -163,7 +98,7 @@ class Localiser:
         try:
             scan = validate_scan(scan, self._rigidity)
             beams = beams_of(scan, self.config.max_range)
-            wrong = self._clock.take(scan)
+            wrong = self._clock.accept(scan)
         except FrameRefused as refusal:
             self.refused[refusal.reason] += 1
             raise
@@ -205,7 +140,9 @@ class Localiser:
         if not len(beams.ranges):
             return
         log_likelihood = self._sensor.log_likelihood(self._particles, beams).astype(float)
-        self._recovery.see(log_likelihood, self._weights, len(beams.ranges))  # all: skipping would hide that it is lost
+        self._recovery.observe(
+            log_likelihood, self._weights, len(beams.ranges)
+        )  # all: skipping would hide that it is lost
         fitting = self._fitting(beams)
         if fitting is not beams:
             log_likelihood = self._sensor.log_likelihood(self._particles, fitting).astype(float)
@@ -249,38 +186,100 @@ class Localiser:
         return poses, weights
 
 
-def localise(
-    grid: OccupancyGrid,
-    scans: Iterable[Scan],
-    config: Config,
-    start: ArrayLike | None = None,
-    seed: int = 0,
-    progress: Callable[[int], object] | None = None,
-) -> Track:
-    """Return a robot's way through a map; scans that cannot be trusted are left out, and counted in `Track.refused`.
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """Where the robot is after a scan, as ROS's amcl gives it.
 
-    start, seed: as in `Localiser`; progress: called with the number of scans done.
-    Where the particles disagree, the way is that of the odometry, with a drift in between those of the sure poses
-    before and after; before the first sure pose it has that one's.
-    Scans that later ones show to have a wrong stamp (`Clock`) are taken out of the way again, and counted too.
-    Raises what `Localiser` raises, and SourceError where not one scan can be trusted.
+    pose_map_base: (3,) float64, the mean of the heaviest cluster of particles, moved by the odometry since.
+    covariance: (3, 3) float64, mean square of how far the particles of all clusters are from it (metres, radians).
+    pose_map_odom: (3,) float64, what turns the odometry's poses into those of the map.
+    particles: (N, 3) float64, equally likely poses in the map, as of the last update.
+    moved: tells whether the scan was compared with the map: at first, and then after moving far enough.
+    settled: tells whether nearly all particles agree; False while the robot may be in several places.
+    ms: milliseconds the scan took.
     """
-    localiser, way, first_refusal = Localiser(grid, config, start, seed), _Way(), ""
-    for done, scan in enumerate(scans, 1):
-        try:
-            way.add(scan.stamp_ns, localiser.add(scan))
-        except FrameRefused as refusal:
-            first_refusal = first_refusal or str(refusal)
-        if progress:
-            progress(done)
-    if not way.stamps_ns:
-        said = f"every one was refused, the first: {first_refusal}" if first_refusal else "there are none"
-        raise SourceError(f"no scan to localise by: {said}")
-    return way.track(dict(localiser.refused), first_refusal)
+
+    pose_map_base: se2.Pose
+    covariance: NDArray[np.float64]
+    pose_map_odom: se2.Pose
+    particles: se2.Pose
+    moved: bool
+    settled: bool
+    ms: float
 
 
-class _Way:
-    """What is kept of the estimates: all but the particles, of which hours would not fit into memory."""
+class Clock:
+    """Ascending stamps of the scans so far, with recovery from wrong ones.
+
+    A single stamp in the future would make all later scans late. So once more scans in a row are late than there are
+    scans that they would have to precede, the earlier ones had the wrong stamps (as in `slam.pipeline.TrackBuilder`).
+    """
+
+    def __init__(self):
+        self._stamps_ns = array("q")
+        self._late, self._late_ns = 0, 0
+
+    def accept(self, scan: Scan) -> int:
+        """Advance to the time of a scan; return how many of the last scans turn out to have had a wrong stamp.
+
+        Raises FrameRefused with the reason `not_in_order` where the scan is not later than the one before.
+        """
+        ahead = len(self._stamps_ns) - bisect_left(self._stamps_ns, scan.stamp_ns)
+        if ahead:
+            self._count_late(scan, ahead)
+            del self._stamps_ns[-ahead:]
+        self._stamps_ns.append(scan.stamp_ns)
+        self._late = 0
+        return ahead
+
+    def _count_late(self, scan: Scan, ahead: int) -> None:
+        self._late = self._late + 1 if self._late and scan.stamp_ns > self._late_ns else 1
+        self._late_ns = scan.stamp_ns
+        if self._late <= max(ahead, LATE):
+            said = f"at {scan.stamp_ns} ns, is not later than the scan before it at {self._stamps_ns[-1]} ns"
+            raise FrameRefused("not_in_order", f"{name_of(scan)}: {said}; give scans in order of time")
+
+
+class FreeFloor:
+    """The free cells of a map. Raises MapFileError where no cell is free, or none occupied."""
+
+    def __init__(self, grid: OccupancyGrid):
+        states = grid.states
+        self.grid = grid
+        self._free = np.flatnonzero(states == State.FREE).astype(np.uint32)
+        for state, count in (("free", len(self._free)), ("occupied", int((states == State.OCCUPIED).sum()))):
+            if not count:
+                raise MapFileError(f"the map has no {state} cell: nobody can be localised in it; give a finished map")
+
+    def anywhere(self, count: int, rng: np.random.Generator) -> se2.Pose:
+        """Draw (count, 3) poses uniformly over all free cells and directions."""
+        chosen = self._free[rng.integers(len(self._free), size=count)]
+        rows, columns = np.divmod(chosen, np.uint32(self.grid.cells.shape[1]))
+        local = (np.column_stack([columns, rows]) + rng.random((count, 2))) * self.grid.resolution
+        turns = rng.uniform(-np.pi, np.pi, count)
+        return np.column_stack([se2.transform(self.grid.origin, local), turns])
+
+
+def near(start: se2.Pose, std: ArrayLike, count: int, rng: np.random.Generator) -> se2.Pose:
+    """Draw (count, 3) poses normally distributed around a (3,) pose; std: (3,) metres, metres, radians."""
+    poses = start + rng.standard_normal((count, 3)) * np.asarray(std)
+    poses[:, 2] = se2.wrapped(poses[:, 2])
+    return poses
+
+
+def checked_start(start: ArrayLike) -> NDArray[np.float64]:
+    """Validate a start pose and return it as (3,) float64. Raises ConfigError."""
+    try:
+        pose = np.asarray(start, float)
+    except (TypeError, ValueError):
+        pose = np.empty(0)
+    if pose.shape != (3,) or not np.isfinite(pose).all():
+        raise ConfigError(f"start {start!r}: give three finite numbers x, y, yaw (metres, metres, radians), or none")
+    return pose
+
+
+class _TrackBuilder:
+    """Collects the estimates without their particles, of which hours would not fit into memory."""
 
     def __init__(self):
         self.stamps_ns: list[int] = []
@@ -289,7 +288,7 @@ class _Way:
         self._sure: list[bool] = []
 
     def add(self, stamp_ns: int, estimate: Estimate) -> None:
-        """Take in the next estimate; earlier ones of the same time or later go (`Clock`)."""
+        """Append an estimate; earlier ones of the same time or later are removed (`Clock`)."""
         while self.stamps_ns and self.stamps_ns[-1] >= stamp_ns:
             for kept in (self.stamps_ns, self._base, self._odom, self._sure):
                 kept.pop()
@@ -299,7 +298,7 @@ class _Way:
         self._sure.append(estimate.settled)
 
     def track(self, refused: dict[str, int], first_refusal: str) -> Track:
-        """Return the way by what was sure alone: between, the odometry's drift is taken to be in between."""
+        """Return the track from the certain poses alone; between them the odometry's drift is interpolated."""
         stamps_ns, base, odom = np.array(self.stamps_ns, np.int64), np.array(self._base), np.array(self._odom)
         sure = np.array(self._sure)
         if sure.any() and not sure.all():

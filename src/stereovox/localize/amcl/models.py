@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What AMCL knows of robots and lidars: the odometry motion model and how likely a scan is from many poses."""
+"""AMCL's models: odometry motion, and the likelihood of a scan from many poses (likelihood field and beam model)."""
 
 from __future__ import annotations
 
@@ -15,90 +15,14 @@ from stereovox.localize.scan_beams import Beams
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.maps.voxel_map import State
 
-MIN_WAY = 0.01
-"""Metres below which the direction of a way says nothing: the robot turned on the spot."""
-
-
-def turn_go_turn(pose_odom_before: se2.Pose, pose_odom_after: se2.Pose) -> NDArray[np.float64]:
-    """Return the (3,) first turn, way and second turn (radians, metres) that lead from one (3,) pose to the other."""
-    step = se2.relative(pose_odom_before, pose_odom_after)
-    way = float(np.hypot(step[0], step[1]))
-    first = float(np.arctan2(step[1], step[0])) if way >= MIN_WAY else 0.0
-    return np.array([first, way, float(se2.wrapped(step[2] - first))])
-
-
-def deviations(motion: NDArray[np.float64], config: AmclConfig) -> NDArray[np.float64]:
-    """Return the (3,) standard deviations of first turn, way and second turn (table 5.6, with variances).
-
-    Who drives backwards does not turn by 180 degrees twice: a turn counts by its distance from 0 or 180 degrees.
-    """
-    first, way, second = motion
-    turn1, turn2 = (min(abs(turn), np.pi - abs(turn)) for turn in (first, second))
-    return np.sqrt(
-        [
-            config.alpha1 * turn1**2 + config.alpha2 * way**2,
-            config.alpha3 * way**2 + config.alpha4 * (turn1**2 + turn2**2),
-            config.alpha1 * turn2**2 + config.alpha2 * way**2,
-        ]
-    )
-
-
-def moved(particles: se2.Pose, motion: NDArray[np.float64], config: AmclConfig, rng: np.random.Generator) -> se2.Pose:
-    """Return (N, 3) particles after a (3,) motion of `turn_go_turn`, each with noise of its own."""
-    noise = rng.standard_normal((3, len(particles))) * deviations(motion, config)[:, None]
-    first, way, second = motion[:, None] - noise
-    heading = particles[:, 2] + first
-    x, y = particles[:, 0] + way * np.cos(heading), particles[:, 1] + way * np.sin(heading)
-    return np.column_stack([x, y, se2.wrapped(heading + second)])
-
-
-@dataclass(frozen=True, eq=False)
-class DistanceField:
-    """Distances to the nearest occupied cell, cell by cell.
-
-    distance_m: (rows, columns) float32 metres from a cell's middle to the middle of the nearest occupied cell, at most
-        `farthest`; 0 in occupied cells.
-    resolution, origin: as in `OccupancyGrid`.
-    farthest: metres that stand for anything further away, and for all that lies outside of the map.
-    """
-
-    distance_m: NDArray[np.float32]
-    resolution: float
-    origin: tuple[float, float, float]
-    farthest: float
-
-    def at(self, points: ArrayLike) -> NDArray[np.float32]:
-        """Return the (N,) float32 distance of the cells that hold (N, 2) points x, y of the map's frame, in metres."""
-        cells = np.floor(self.in_cells(points))
-        columns, rows = cells[:, 0], cells[:, 1]
-        inside = (rows >= 0) & (columns >= 0) & (rows < self.distance_m.shape[0]) & (columns < self.distance_m.shape[1])
-        found = np.full(len(cells), self.farthest, np.float32)
-        found[inside] = self.distance_m[rows[inside].astype(np.int64), columns[inside].astype(np.int64)]
-        return found
-
-    def in_cells(self, points: ArrayLike) -> NDArray[np.float64]:
-        """Return (N, 2) points of the map's frame as columns and rows: (0, 0) is the corner of cell (0, 0)."""
-        return se2.transform(se2.inverse(self.origin), points) / self.resolution
-
-
-def distance_field(grid: OccupancyGrid, farthest: float = np.inf) -> DistanceField:
-    """Return the exact Euclidean distances of a map; all of it is `farthest` (metres) where nothing is occupied."""
-    from scipy.ndimage import distance_transform_edt
-
-    occupied = grid.states == State.OCCUPIED
-    if occupied.any():
-        distance = np.asarray(distance_transform_edt(~occupied), np.float32) * np.float32(grid.resolution)
-    else:
-        distance = np.full(occupied.shape, farthest, np.float32)
-    return DistanceField(np.minimum(distance, np.float32(farthest)), grid.resolution, grid.origin, farthest)
-
-
+MIN_TRAVEL = 0.01
+"""Metres of travel below which its direction is meaningless: the robot turned on the spot."""
 LENGTHS = 1024
-"""So many lengths of beams are told apart by the beam model, from 0 to the longest."""
+"""Bins of beam length in the beam model, from 0 to the longest."""
 MIN_LEVEL = 1e-6
 """Metres on the map for one of a beam's length, below which it points straight up or down."""
 WITNESSES = 500
-"""So many particles are asked whether a beam fits the map."""
+"""Particles that vote on whether a beam fits the map."""
 
 
 class FieldModel:
@@ -170,6 +94,80 @@ class BeamModel:
             likely = beam_likelihood(measured, at_max, lengths, range_max, self.config)
             self._tables = {range_max: np.log(np.maximum(likely, 1e-12)).astype(np.float32)}
         return self._tables[range_max]
+
+
+def turn_go_turn(pose_odom_before: se2.Pose, pose_odom_after: se2.Pose) -> NDArray[np.float64]:
+    """Return first turn, travel and second turn (3,) (radians, metres) that lead from one (3,) pose to the other."""
+    step = se2.relative(pose_odom_before, pose_odom_after)
+    way = float(np.hypot(step[0], step[1]))
+    first = float(np.arctan2(step[1], step[0])) if way >= MIN_TRAVEL else 0.0
+    return np.array([first, way, float(se2.wrapped(step[2] - first))])
+
+
+def deviations(motion: NDArray[np.float64], config: AmclConfig) -> NDArray[np.float64]:
+    """Return the (3,) standard deviations of first turn, travel and second turn (table 5.6, with variances).
+
+    A robot that reverses does not turn by 180 degrees twice: a turn counts by its distance from 0 or 180 degrees.
+    """
+    first, way, second = motion
+    turn1, turn2 = (min(abs(turn), np.pi - abs(turn)) for turn in (first, second))
+    return np.sqrt(
+        [
+            config.alpha1 * turn1**2 + config.alpha2 * way**2,
+            config.alpha3 * way**2 + config.alpha4 * (turn1**2 + turn2**2),
+            config.alpha1 * turn2**2 + config.alpha2 * way**2,
+        ]
+    )
+
+
+def moved(particles: se2.Pose, motion: NDArray[np.float64], config: AmclConfig, rng: np.random.Generator) -> se2.Pose:
+    """Return (N, 3) particles after a (3,) motion of `turn_go_turn`, each with noise of its own."""
+    noise = rng.standard_normal((3, len(particles))) * deviations(motion, config)[:, None]
+    first, way, second = motion[:, None] - noise
+    heading = particles[:, 2] + first
+    x, y = particles[:, 0] + way * np.cos(heading), particles[:, 1] + way * np.sin(heading)
+    return np.column_stack([x, y, se2.wrapped(heading + second)])
+
+
+@dataclass(frozen=True, eq=False)
+class DistanceField:
+    """Distances to the nearest occupied cell, cell by cell.
+
+    distance_m: (rows, columns) float32 metres from a cell's middle to the middle of the nearest occupied cell, at most
+        `farthest`; 0 in occupied cells.
+    resolution, origin: as in `OccupancyGrid`.
+    farthest: metres that stand for anything further away, and for all that lies outside of the map.
+    """
+
+    distance_m: NDArray[np.float32]
+    resolution: float
+    origin: tuple[float, float, float]
+    farthest: float
+
+    def at(self, points: ArrayLike) -> NDArray[np.float32]:
+        """Return the (N,) float32 distance of the cells that hold (N, 2) points x, y of the map's frame, in metres."""
+        cells = np.floor(self.in_cells(points))
+        columns, rows = cells[:, 0], cells[:, 1]
+        inside = (rows >= 0) & (columns >= 0) & (rows < self.distance_m.shape[0]) & (columns < self.distance_m.shape[1])
+        found = np.full(len(cells), self.farthest, np.float32)
+        found[inside] = self.distance_m[rows[inside].astype(np.int64), columns[inside].astype(np.int64)]
+        return found
+
+    def in_cells(self, points: ArrayLike) -> NDArray[np.float64]:
+        """Return (N, 2) points of the map's frame as columns and rows: (0, 0) is the corner of cell (0, 0)."""
+        return se2.transform(se2.inverse(self.origin), points) / self.resolution
+
+
+def distance_field(grid: OccupancyGrid, farthest: float = np.inf) -> DistanceField:
+    """Return the exact Euclidean distances of a map; all of it is `farthest` (metres) where nothing is occupied."""
+    from scipy.ndimage import distance_transform_edt
+
+    occupied = grid.states == State.OCCUPIED
+    if occupied.any():
+        distance = np.asarray(distance_transform_edt(~occupied), np.float32) * np.float32(grid.resolution)
+    else:
+        distance = np.full(occupied.shape, farthest, np.float32)
+    return DistanceField(np.minimum(distance, np.float32(farthest)), grid.resolution, grid.origin, farthest)
 
 
 MODELS = {"field": FieldModel, "beam": BeamModel}

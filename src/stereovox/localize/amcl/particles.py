@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The particles of AMCL: drawn anew by their weights, clustered, and spread when the robot is lost."""
+"""AMCL's particle set: resampling, clustering, and recovery when the robot is lost."""
 
 from __future__ import annotations
 
@@ -12,6 +12,9 @@ from stereovox import se2
 from stereovox.config.robot import AmclConfig
 from stereovox.localize.amcl import _amcl
 from stereovox.se2 import Pose
+
+NEIGHBOURS = np.array([step for step in product((-1, 0, 1), repeat=3) if step > (0, 0, 0)])
+"""Half of a bin's 26 neighbours: the other half has the bin among theirs."""
 
 
 class Recovery:
@@ -29,8 +32,8 @@ class Recovery:
         self._long = self._short = 0.0
         self._seen = 0
 
-    def see(self, log_likelihood: NDArray[np.float64], weights: NDArray[np.float64], beams: int) -> None:
-        """Take in (N,) log likelihoods of `beams` beams by particles whose weights have the sum 1."""
+    def observe(self, log_likelihood: NDArray[np.float64], weights: NDArray[np.float64], beams: int) -> None:
+        """Add (N,) log likelihoods of `beams` beams, by particles whose weights sum to 1."""
         if self._alpha_slow <= 0 or self._alpha_fast <= 0:
             return
         best = log_likelihood.max()
@@ -116,10 +119,6 @@ def draw(
         if count >= min(needed, many):
             return kept, taken
         count = min(needed, many)
-
-
-NEIGHBOURS = np.array([step for step in product((-1, 0, 1), repeat=3) if step > (0, 0, 0)])
-"""Half of a bin's 26 neighbours: the other half has the bin among theirs."""
 
 
 class Clusters:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Follows the robot from scan to scan: each is laid onto the map of the last keyframes."""
+"""SLAM front end: matches each scan against the map of the last keyframes."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Follower:
         self._moved: dict[int, Cloud] = {}
 
     def add(self, scan: Scan) -> bool:
-        """Find the pose of the next scan; tell whether it became a keyframe."""
+        """Find the pose of the next scan; return whether it became a keyframe."""
         odometry, cloud = scan.pose_world_base, cloud_of(scan, self._config.max_range)
         if self._odometry is None:
             self.pose = odometry
@@ -63,7 +63,7 @@ class Follower:
         return True
 
     def moved(self, keyframe_before: se2.Pose) -> None:
-        """Go on from where the last keyframe now stands; it stood at `keyframe_before` (3,)."""
+        """Continue from the last keyframe's new pose; it was at `keyframe_before` (3,)."""
         self.pose = se2.compose(self.keyframes[-1].pose, se2.relative(keyframe_before, self.pose))
         self._moved.clear()
         self._rebuild()

@@ -18,6 +18,18 @@ from stereovox.localize.slam.line_map import Cloud, LineMap, joined
 
 STEP_SIGMA = (0.01, 0.03, 0.003, 0.02)
 """Standard deviation of a matched step between keyframes: metres, per metre, radians, per radian."""
+PATCH = 4
+"""Keyframes before and after a patch's middle that belong to it: few enough to be rigid."""
+STRIDE = 3
+"""Keyframes from one patch's middle to the next."""
+WEAK = 0.1
+"""Share of information below which a direction is a corridor's."""
+MAX_NEIGHBOURS = 120
+"""Keyframes that are laid onto a patch: a robot may pass the same place all day."""
+MIN_SHARE = 0.4
+"""Share of a keyframe's points that must lie on a patch's lines."""
+OUTLIER = 3.0
+"""Standard deviations from which on a robust edge pulls less and less (Cauchy)."""
 
 
 @dataclass(eq=False)
@@ -86,18 +98,6 @@ def without_weak(information: NDArray[np.float64], floor: float) -> NDArray[np.f
     return keep @ information @ keep
 
 
-PATCH = 4
-"""Keyframes before and after a patch's middle that belong to it: few enough to be rigid."""
-STRIDE = 3
-"""Keyframes from one patch's middle to the next."""
-WEAK = 0.1
-"""Share of information below which a direction is a corridor's."""
-MAX_OTHERS = 120
-"""Keyframes that are laid onto a patch: a robot may pass the same place all day."""
-MIN_SHARE = 0.4
-"""Share of a keyframe's points that must lie on a patch's lines."""
-
-
 def patch_edges(keyframes: list[Keyframe], config: SlamConfig) -> Iterator[Edge]:
     """Yield what each keyframe says of where it stands to each patch of other keyframes nearby.
 
@@ -108,7 +108,7 @@ def patch_edges(keyframes: list[Keyframe], config: SlamConfig) -> Iterator[Edge]
     patch = LineMap(config.voxel_size)
     for middle in range(0, len(keyframes), STRIDE):
         first, last = max(middle - PATCH, 0), min(middle + PATCH + 1, len(keyframes))
-        others = _others(places, middle, first, last, config)
+        others = _neighbours(places, middle, first, last, config)
         if not len(others):
             continue
         pose = places[middle]
@@ -118,30 +118,6 @@ def patch_edges(keyframes: list[Keyframe], config: SlamConfig) -> Iterator[Edge]
             edge = _edge(patch, keyframes, (middle, other), guess, config)
             if edge is not None:
                 yield edge
-
-
-def _others(places: se2.Pose, middle: int, first: int, last: int, config: SlamConfig) -> NDArray[np.int64]:
-    far = np.hypot(*(places[:, :2] - places[middle, :2]).T)
-    near = np.nonzero(far < config.refine_distance)[0]
-    near = near[(near < first) | (near >= last)]
-    return near[:: len(near) // MAX_OTHERS + 1]
-
-
-def _edge(
-    patch: LineMap, keyframes: list[Keyframe], pair: tuple[int, int], guess: se2.Pose, config: SlamConfig
-) -> Edge | None:
-    cloud = keyframes[pair[1]].cloud
-    match = patch.refine(cloud, guess, 2 * config.sigma, iterations=6)
-    match = patch.refine(cloud, match.pose, config.sigma, iterations=8)
-    moved = match.pose - guess
-    if match.share < MIN_SHARE or moved[0] ** 2 + moved[1] ** 2 > 0.1 or abs(moved[2]) > 0.1:
-        return None
-    information = without_weak(in_second_frame(match.information, float(match.pose[2])), WEAK)
-    return Edge(*pair, match.pose, information, match.share)
-
-
-OUTLIER = 3.0
-"""Standard deviations from which on a robust edge pulls less and less (Cauchy)."""
 
 
 def optimised(
@@ -168,6 +144,26 @@ def optimised(
     parameters.setMaxIterations(50)
     found = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
     return np.array([_numbers(found.atPose2(i)) for i in range(len(poses))])
+
+
+def _neighbours(places: se2.Pose, middle: int, first: int, last: int, config: SlamConfig) -> NDArray[np.int64]:
+    far = np.hypot(*(places[:, :2] - places[middle, :2]).T)
+    near = np.nonzero(far < config.refine_distance)[0]
+    near = near[(near < first) | (near >= last)]
+    return near[:: len(near) // MAX_NEIGHBOURS + 1]
+
+
+def _edge(
+    patch: LineMap, keyframes: list[Keyframe], pair: tuple[int, int], guess: se2.Pose, config: SlamConfig
+) -> Edge | None:
+    cloud = keyframes[pair[1]].cloud
+    match = patch.refine(cloud, guess, 2 * config.sigma, iterations=6)
+    match = patch.refine(cloud, match.pose, config.sigma, iterations=8)
+    moved = match.pose - guess
+    if match.share < MIN_SHARE or moved[0] ** 2 + moved[1] ** 2 > 0.1 or abs(moved[2]) > 0.1:
+        return None
+    information = without_weak(in_second_frame(match.information, float(match.pose[2])), WEAK)
+    return Edge(*pair, match.pose, information, match.share)
 
 
 def _gtsam() -> Any:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Finds where the robot comes back to, and believes it only where two findings agree."""
+"""Loop closure: finds revisited places, and accepts them only where two findings agree."""
 
 from __future__ import annotations
 
@@ -14,42 +14,6 @@ from stereovox.localize.slam import _bound
 from stereovox.localize.slam.graph import Edge, Keyframe, in_second_frame
 from stereovox.localize.slam.line_map import Cloud, LineMap, Match, joined
 
-
-@dataclass(frozen=True)
-class Submap:
-    """A run of keyframes that is short enough not to have drifted: keyframes `first` to `last` - 1."""
-
-    first: int
-    last: int
-
-    @property
-    def anchor(self) -> int:
-        """The keyframe in its middle, whose frame is the submap's."""
-        return (self.first + self.last) // 2
-
-
-def submap_cloud(keyframes: list[Keyframe], submap: Submap, max_range: float, cell: float = 0.0) -> Cloud:
-    """Return the points of a submap within `max_range` of each robot pose, in its anchor's frame.
-
-    cell: side in metres of squares of which each gives one point; 0: all points.
-    """
-    pose = keyframes[submap.anchor].pose
-    clouds = []
-    for keyframe in keyframes[submap.first : submap.last]:
-        if np.hypot(*(keyframe.pose - pose)[:2]) > max_range:
-            continue  # the odometry jumped
-        near = (keyframe.cloud.points**2).sum(axis=1) < max_range**2
-        part = Cloud(keyframe.cloud.points[near], keyframe.cloud.views[near])
-        clouds.append(part.moved(se2.relative(pose, keyframe.pose)))
-    cloud = joined(clouds)
-    if not cell or not len(cloud.points):
-        return cloud
-    squares = np.floor(cloud.points / cell).astype(np.int64)
-    _, first = np.unique(squares[:, 0] * (1 << 32) + squares[:, 1], return_index=True)
-    first.sort()
-    return Cloud(cloud.points[first], cloud.views[first])
-
-
 COARSE = 2
 """Cells of the map on the side of one cell of the search."""
 SEEDS = 400
@@ -57,6 +21,118 @@ SEEDS = 400
 LEVELS = 6
 RIVAL = 0.6
 """Metres from the best place, within which a good score is the same place's."""
+ROOM = 4.0
+"""Metres by which two submaps' middles may be apart and still show the same walls, beyond what drift explains."""
+NEAR_RANGE, FAR_RANGE = 10.0, 20.0
+"""Metres from the robot up to which points of the later, and of the earlier submap are used: what is near is seen from
+both."""
+BASE_WINDOW, BASE_WINDOW_TURN = 0.5, 0.1
+"""Metres and radians that are searched even where no drift is to be feared."""
+CORRIDOR = 0.03
+"""Share of the strongest direction's information below which the weakest is a corridor's: no closure there."""
+MAX_TRIED = 16
+"""Earlier submaps that a new one is laid onto, the nearest: a robot may pass the same place all day."""
+WITNESS_PATH = 15.0
+"""Metres of way within which two findings can bear each other out."""
+WITNESS = (0.1, 0.02, 0.02)
+"""How far they may disagree: metres, metres per metre of way, radians."""
+SHORT_CUT = 1e-3
+"""Metres along which drift adds up over a closure: none, but a graph has no edges of length 0."""
+
+
+class LoopFinder:
+    """Keeps the submaps so far, and finds edges between those that show the same place.
+
+    edges: closures believed. candidates: all that were found.
+    """
+
+    def __init__(self, config: SlamConfig, keyframes: list[Keyframe]):
+        self.edges: list[Edge] = []
+        self.candidates: list[Edge] = []
+        self._config, self._keyframes = config, keyframes
+        self._search = ClosureSearch(config)
+        self._submaps: list[Submap] = []
+
+    def update(self, end: bool = False) -> list[Edge]:
+        """Search for the places of submaps that are complete since the last call; return the edges now believed too."""
+        before, size = len(self.edges), self._config.submap_keyframes
+        while True:
+            first = len(self._submaps) * max(size // 2, 1)
+            last = first + size
+            if len(self._keyframes) < last and not (end and len(self._keyframes) > first + size // 2):
+                return self.edges[before:]
+            self._submaps.append(Submap(first, min(last, len(self._keyframes))))
+            self._close(self._submaps[-1])
+
+    def _close(self, later: Submap) -> None:
+        drift_distances = self._drift_distances()
+        cloud = submap_cloud(self._keyframes, later, NEAR_RANGE, cell=2 * self._config.voxel_size)
+        windows: dict[Submap, tuple[float, float]] = {}
+        for earlier, path_m in zip(self._submaps[:-1], drift_distances.tolist(), strict=False):
+            window = self._window(earlier, later, path_m)
+            if window is not None:
+                windows[earlier] = window
+        there = self._keyframes[later.anchor].pose
+        near = sorted(windows, key=lambda e: float(np.hypot(*(self._keyframes[e.anchor].pose - there)[:2])))
+        for earlier in near[:MAX_TRIED]:
+            self._search.set_target(submap_cloud(self._keyframes, earlier, FAR_RANGE))
+            self._match_pair(earlier, later, cloud, windows[earlier])
+
+    def _match_pair(self, earlier: Submap, later: Submap, cloud: Cloud, window: tuple[float, float]) -> None:
+        first, second = earlier.anchor, later.anchor
+        guess = se2.relative(self._keyframes[first].pose, self._keyframes[second].pose)
+        match = self._search.match(cloud, guess, *window)
+        if match is None or match.share < self._config.closure_share:
+            return
+        along = np.linalg.eigvalsh(match.information[:2, :2])
+        if along[0] < CORRIDOR * along[1]:
+            return
+        found = Edge(first, second, match.pose, in_second_frame(match.information, float(match.pose[2])), match.share)
+        self._judge(found)
+
+    def _judge(self, found: Edge) -> None:
+        """Accept a finding, and those it confirms, once another one agrees with it."""
+        witnesses = [other for other in self.candidates if self._agree(found, other)]
+        self.candidates.append(found)
+        if witnesses:
+            self.edges += [edge for edge in (*witnesses, found) if edge not in self.edges]
+
+    def _agree(self, a: Edge, b: Edge) -> bool:
+        keyframes = self._keyframes
+        path_m = sum(
+            abs(keyframes[i].travelled - keyframes[k].travelled) for i, k in ((a.first, b.first), (a.second, b.second))
+        )
+        if path_m > WITNESS_PATH:
+            return False
+        over = se2.relative(keyframes[a.first].pose, keyframes[b.first].pose)
+        back = se2.relative(keyframes[b.second].pose, keyframes[a.second].pose)
+        left = se2.relative(a.motion, se2.compose(se2.compose(over, b.motion), back))
+        return bool(np.hypot(left[0], left[1]) < WITNESS[0] + WITNESS[1] * path_m and abs(left[2]) < WITNESS[2])
+
+    def _window(self, earlier: Submap, later: Submap, path_m: float) -> tuple[float, float] | None:
+        """Metres and radians to search for the later submap, None where it cannot show the same place."""
+        config, a, b = self._config, self._keyframes[earlier.anchor], self._keyframes[later.anchor]
+        if b.travelled - a.travelled < config.closure_path:
+            return None
+        side = min(BASE_WINDOW + config.drift * path_m, config.closure_window)
+        if np.hypot(*(b.pose - a.pose)[:2]) > side + ROOM:
+            return None
+        return side, min(BASE_WINDOW_TURN + config.drift_turn * path_m, config.closure_window_turn)
+
+    def _drift_distances(self) -> NDArray[np.float64]:
+        """Metres over which drift accumulates between the last submap and each other one: closures are short cuts."""
+        from scipy.sparse import coo_matrix
+        from scipy.sparse.csgraph import dijkstra
+
+        anchors = [submap.anchor for submap in self._submaps]
+        number = {anchor: i for i, anchor in enumerate(anchors)}
+        along = np.array([self._keyframes[anchor].travelled for anchor in anchors])
+        steps = {(i, i + 1): max(float(path_m), SHORT_CUT) for i, path_m in enumerate(np.diff(along))}
+        # One length for each pair: a matrix made of several adds them up.
+        lengths = steps | {(number[edge.first], number[edge.second]): SHORT_CUT for edge in self.edges}
+        rows, columns = np.array(list(lengths), np.int64).reshape(-1, 2).T
+        graph = coo_matrix((list(lengths.values()), (rows, columns)), shape=(len(anchors), len(anchors)))
+        return dijkstra(graph.tocsr(), directed=False, indices=len(anchors) - 1)
 
 
 class ClosureSearch:
@@ -69,15 +145,15 @@ class ClosureSearch:
         self._pad = 1 << LEVELS
         self._pyramid = np.empty((LEVELS, 0, 0), np.float32)
 
-    def onto(self, earlier: Cloud) -> None:
-        """Take the cloud that the next ones are laid onto."""
+    def set_target(self, earlier: Cloud) -> None:
+        """Set the cloud that the next ones are matched against."""
         self._coarse.build(earlier)
         self._fine.build(earlier)
         rows, columns = self._coarse.extent
         self._pyramid = np.empty((LEVELS, rows + self._pad, columns + self._pad), np.float32)
         _bound.coarsen(self._coarse.score[:rows, :columns], self._pad, self._pyramid)
 
-    def lay(self, cloud: Cloud, guess: ArrayLike, side: float, side_yaw: float) -> Match | None:
+    def match(self, cloud: Cloud, guess: ArrayLike, side: float, side_yaw: float) -> Match | None:
         """Return the best match of a cloud within `side` metres and `side_yaw` of a guess.
 
         None where no place is good enough, or another one is nearly as good.
@@ -115,116 +191,36 @@ class ClosureSearch:
         return np.array([guess[0] + best[2] * cell, guess[1] + best[1] * cell, yaws[best[0]]])
 
 
-ROOM = 4.0
-"""Metres by which two submaps' middles may be apart and still show the same walls, beyond what drift explains."""
-NEAR_RANGE, FAR_RANGE = 10.0, 20.0
-"""Metres from the robot up to which points of the later, and of the earlier submap are used: what is near is seen from
-both."""
-BASE_WINDOW, BASE_WINDOW_TURN = 0.5, 0.1
-"""Metres and radians that are searched even where no drift is to be feared."""
-CORRIDOR = 0.03
-"""Share of the strongest direction's information below which the weakest is a corridor's: no closure there."""
-MAX_TRIED = 16
-"""Earlier submaps that a new one is laid onto, the nearest: a robot may pass the same place all day."""
-WITNESS_PATH = 15.0
-"""Metres of way within which two findings can bear each other out."""
-WITNESS = (0.1, 0.02, 0.02)
-"""How far they may disagree: metres, metres per metre of way, radians."""
+@dataclass(frozen=True)
+class Submap:
+    """A run of keyframes short enough not to drift: keyframes `first` to `last` - 1."""
 
-SHORT_CUT = 1e-3
-"""Metres along which drift adds up over a closure: none, but a graph has no edges of length 0."""
+    first: int
+    last: int
+
+    @property
+    def anchor(self) -> int:
+        """The keyframe in its middle, whose frame is the submap's."""
+        return (self.first + self.last) // 2
 
 
-class LoopFinder:
-    """Keeps the submaps so far, and finds edges between those that show the same place.
+def submap_cloud(keyframes: list[Keyframe], submap: Submap, max_range: float, cell: float = 0.0) -> Cloud:
+    """Return the points of a submap within `max_range` of each robot pose, in its anchor's frame.
 
-    edges: closures believed. candidates: all that were found.
+    cell: side in metres of squares of which each gives one point; 0: all points.
     """
-
-    def __init__(self, config: SlamConfig, keyframes: list[Keyframe]):
-        self.edges: list[Edge] = []
-        self.candidates: list[Edge] = []
-        self._config, self._keyframes = config, keyframes
-        self._search = ClosureSearch(config)
-        self._submaps: list[Submap] = []
-
-    def update(self, end: bool = False) -> list[Edge]:
-        """Search for the places of submaps that are complete since the last call; return the edges now believed too."""
-        before, size = len(self.edges), self._config.submap_keyframes
-        while True:
-            first = len(self._submaps) * max(size // 2, 1)
-            last = first + size
-            if len(self._keyframes) < last and not (end and len(self._keyframes) > first + size // 2):
-                return self.edges[before:]
-            self._submaps.append(Submap(first, min(last, len(self._keyframes))))
-            self._close(self._submaps[-1])
-
-    def _close(self, later: Submap) -> None:
-        ways = self._ways()
-        cloud = submap_cloud(self._keyframes, later, NEAR_RANGE, cell=2 * self._config.voxel_size)
-        windows: dict[Submap, tuple[float, float]] = {}
-        for earlier, way in zip(self._submaps[:-1], ways.tolist(), strict=False):
-            window = self._window(earlier, later, way)
-            if window is not None:
-                windows[earlier] = window
-        there = self._keyframes[later.anchor].pose
-        near = sorted(windows, key=lambda e: float(np.hypot(*(self._keyframes[e.anchor].pose - there)[:2])))
-        for earlier in near[:MAX_TRIED]:
-            self._search.onto(submap_cloud(self._keyframes, earlier, FAR_RANGE))
-            self._lay(earlier, later, cloud, windows[earlier])
-
-    def _lay(self, earlier: Submap, later: Submap, cloud: Cloud, window: tuple[float, float]) -> None:
-        first, second = earlier.anchor, later.anchor
-        guess = se2.relative(self._keyframes[first].pose, self._keyframes[second].pose)
-        match = self._search.lay(cloud, guess, *window)
-        if match is None or match.share < self._config.closure_share:
-            return
-        along = np.linalg.eigvalsh(match.information[:2, :2])
-        if along[0] < CORRIDOR * along[1]:
-            return
-        found = Edge(first, second, match.pose, in_second_frame(match.information, float(match.pose[2])), match.share)
-        self._judge(found)
-
-    def _judge(self, found: Edge) -> None:
-        """Believe a finding, and those it bears out, once one other agrees with it."""
-        witnesses = [other for other in self.candidates if self._agree(found, other)]
-        self.candidates.append(found)
-        if witnesses:
-            self.edges += [edge for edge in (*witnesses, found) if edge not in self.edges]
-
-    def _agree(self, a: Edge, b: Edge) -> bool:
-        keyframes = self._keyframes
-        way = sum(
-            abs(keyframes[i].travelled - keyframes[k].travelled) for i, k in ((a.first, b.first), (a.second, b.second))
-        )
-        if way > WITNESS_PATH:
-            return False
-        over = se2.relative(keyframes[a.first].pose, keyframes[b.first].pose)
-        back = se2.relative(keyframes[b.second].pose, keyframes[a.second].pose)
-        left = se2.relative(a.motion, se2.compose(se2.compose(over, b.motion), back))
-        return bool(np.hypot(left[0], left[1]) < WITNESS[0] + WITNESS[1] * way and abs(left[2]) < WITNESS[2])
-
-    def _window(self, earlier: Submap, later: Submap, way: float) -> tuple[float, float] | None:
-        """Metres and radians to search for the later submap, None where it cannot show the same place."""
-        config, a, b = self._config, self._keyframes[earlier.anchor], self._keyframes[later.anchor]
-        if b.travelled - a.travelled < config.closure_path:
-            return None
-        side = min(BASE_WINDOW + config.drift * way, config.closure_window)
-        if np.hypot(*(b.pose - a.pose)[:2]) > side + ROOM:
-            return None
-        return side, min(BASE_WINDOW_TURN + config.drift_turn * way, config.closure_window_turn)
-
-    def _ways(self) -> NDArray[np.float64]:
-        """Metres along which drift adds up between the last submap and each other one: closures are short cuts."""
-        from scipy.sparse import coo_matrix
-        from scipy.sparse.csgraph import dijkstra
-
-        anchors = [submap.anchor for submap in self._submaps]
-        number = {anchor: i for i, anchor in enumerate(anchors)}
-        along = np.array([self._keyframes[anchor].travelled for anchor in anchors])
-        steps = {(i, i + 1): max(float(way), SHORT_CUT) for i, way in enumerate(np.diff(along))}
-        # One length for each pair: a matrix made of several adds them up.
-        lengths = steps | {(number[edge.first], number[edge.second]): SHORT_CUT for edge in self.edges}
-        rows, columns = np.array(list(lengths), np.int64).reshape(-1, 2).T
-        graph = coo_matrix((list(lengths.values()), (rows, columns)), shape=(len(anchors), len(anchors)))
-        return dijkstra(graph.tocsr(), directed=False, indices=len(anchors) - 1)
+    pose = keyframes[submap.anchor].pose
+    clouds = []
+    for keyframe in keyframes[submap.first : submap.last]:
+        if np.hypot(*(keyframe.pose - pose)[:2]) > max_range:
+            continue  # the odometry jumped
+        near = (keyframe.cloud.points**2).sum(axis=1) < max_range**2
+        part = Cloud(keyframe.cloud.points[near], keyframe.cloud.views[near])
+        clouds.append(part.moved(se2.relative(pose, keyframe.pose)))
+    cloud = joined(clouds)
+    if not cell or not len(cloud.points):
+        return cloud
+    squares = np.floor(cloud.points / cell).astype(np.int64)
+    _, first = np.unique(squares[:, 0] * (1 << 32) + squares[:, 1], return_index=True)
+    first.sort()
+    return Cloud(cloud.points[first], cloud.views[first])

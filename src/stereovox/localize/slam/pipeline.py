@@ -30,102 +30,35 @@ from stereovox.trust.validate import validate_upright_scan
 
 LATE = 3
 """Scans in a row that are too late, and in order among themselves, before it is asked who is right."""
-
-
-@dataclass(frozen=True, eq=False)
-class Step:
-    """A scan: where the odometry saw the robot (3,), and where it stood (3,) as seen from keyframe `keyframe`."""
-
-    stamp_ns: int
-    odometry: se2.Pose
-    keyframe: int
-    since: se2.Pose
-
-
-class Way:
-    """The steps so far, stamps rising."""
-
-    def __init__(self) -> None:
-        self._steps: list[Step] = []
-        self._begun = False
-        self._late, self._late_ns, self._against = 0, 0, 0
-
-    def room(self, stamp_ns: int) -> int | None:
-        """Make room for a scan at `stamp_ns`; return how many earlier ones gave way, None where it is itself too late.
-
-        A lone stamp in the future would make all later scans too late. So once more scans in a row are late than there
-        were steps later than the first of them, those steps have the wrong stamps, and go.
-        """
-        ahead = len(self._steps) - bisect_left(self._steps, stamp_ns, key=lambda step: step.stamp_ns)
-        if not ahead:
-            self._late = 0
-            return 0
-        if not self._late or stamp_ns <= self._late_ns:
-            self._late, self._against = 0, ahead
-        self._late, self._late_ns = self._late + 1, stamp_ns
-        if self._late <= max(self._against, LATE):
-            return None
-        del self._steps[-ahead:]
-        self._late = 0
-        return ahead
-
-    def add(self, scan: Scan, pose: se2.Pose, keyframes: list[Keyframe]) -> None:
-        """Take a scan that there is room for, and where (3,) the robot stood.
-
-        What comes before there is a keyframe is kept as seen from the first one.
-        """
-        if keyframes and not self._begun:
-            self._begun = True
-            self._steps = [replace(s, since=se2.relative(keyframes[0].pose, s.since)) for s in self._steps]
-        since = se2.relative(keyframes[-1].pose, pose) if keyframes else pose
-        self._steps.append(Step(scan.stamp_ns, scan.pose_world_base, max(len(keyframes) - 1, 0), since))
-
-    def track(self, keyframes: list[Keyframe]) -> Track:
-        """Return the way, with the keyframes where they stand now."""
-        anchors = np.array([keyframes[step.keyframe].pose for step in self._steps])
-        poses = se2.compose(anchors, np.array([step.since for step in self._steps]))
-        corrections = se2.compose(poses, se2.inverse(np.array([step.odometry for step in self._steps])))
-        return Track(np.array([step.stamp_ns for step in self._steps], np.int64), poses, corrections)
-
-
 Progress = Callable[[int, int, str], object]
-
 CLOSURE_TRUST, PATCH_TRUST = 0.02, 0.1
 """What a match's information is worth: its points are not independent, nor is what they lie on exact."""
-LOOKS = 2.25
-"""A keyframe counts in the map as so many scans: it stands for those around it, and one is enough to know a cell."""
+SCANS_PER_KEYFRAME = 2.25
+"""Scans that a keyframe counts as in the map: it stands for those around it, and one is enough to know a cell."""
 MAX_CELLS = 40_000
 """Cells on a side of the finished map."""
 JUMP, JUMP_TURN = 0.05, 0.01
 """Metres and radians that a closure must be off, before the graph is solved anew on the way."""
 
 
-@dataclass(frozen=True, eq=False)
-class SlamResult:
-    """A robot's way, and the map of what it saw.
+def map_scans(scans: Iterable[Scan], config: Config, progress: Progress | None = None) -> SlamResult:
+    """Return the track and the map of scans in time order, whose poses are those of the odometry.
 
-    track: the pose of every scan that was not refused. grid: the map, made of the keyframes. keyframes: with their
-    final poses. closures: loops closed. edges: those, between keyframes. refused: scans by the reason why they could
-    not be used.
+    progress: called with how many are done, how many there are (0: unknown) and the current activity.
     """
-
-    track: Track
-    grid: OccupancyGrid
-    keyframes: list[Keyframe]
-    edges: list[Edge]
-    refused: dict[str, int]
-
-    @property
-    def closures(self) -> int:
-        """How many pairs of submaps were found to show one place."""
-        return len(self.edges)
+    slam, total = Slam(config), len(scans) if isinstance(scans, Sized) else 0
+    for done, scan in enumerate(scans, 1):
+        slam.add(scan)
+        if progress:
+            progress(done, total, "matching scans")
+    return slam.finish(progress)
 
 
 class Slam:
-    """Takes scans in order of time, with the odometry as pose; the map's frame is the odometry's at the first scan.
+    """SLAM over scans in time order, with the odometry as pose; the map's frame is the odometry's at the first scan.
 
-    refused: scans by the reason why they could not be used; they change nothing. `not_in_order`: those not later than
-    the one before, and those whose stamp most scans after them show to be wrong; these are only left out of the track.
+    refused: refused scans by reason; they change nothing. `not_in_order`: those not later than the one before, and
+    those whose stamp most later scans show to be wrong; the latter are only left out of the track.
     """
 
     def __init__(self, config: Config):
@@ -134,7 +67,7 @@ class Slam:
         self._config = config
         self._follower = Follower(config.slam)
         self._loops = LoopFinder(config.slam, self._follower.keyframes)
-        self._way = Way()
+        self._builder = TrackBuilder()
 
     @property
     def pose(self) -> se2.Pose:
@@ -147,25 +80,25 @@ class Slam:
         return self._follower.keyframes
 
     def add(self, scan: Scan) -> se2.Pose:
-        """Take the next scan; return (3,) pose_map_base as known by now. Later loops may move it."""
+        """Process the next scan; return (3,) pose_map_base as known so far. Later loops may move it."""
         try:
             scan = validate_upright_scan(scan, self._config)
         except FrameRefused as refused:
             self._refuse(refused.reason)
             self._first = self._first or f", first: {refused}"
             return self.pose
-        wrong = self._way.room(scan.stamp_ns)
+        wrong = self._builder.room(scan.stamp_ns)
         self._refuse("not_in_order", 1 if wrong is None else wrong)
         if wrong is None:
             return self.pose
         is_key = self._follower.add(scan)
-        self._way.add(scan, self.pose, self.keyframes)
+        self._builder.add(scan, self.pose, self.keyframes)
         if is_key and any(_off(self.keyframes, edge) for edge in self._loops.update()):
             self._solve(self._loops.edges, CLOSURE_TRUST)
         return self.pose
 
     def finish(self, progress: Progress | None = None) -> SlamResult:
-        """Return the way and the map, after a last search for loops and a last polish.
+        """Return the track and the map, after a last search for loops and a last refinement.
 
         Raises StereovoxError where no scan could be used, MissingExtra where loops were found and gtsam is missing.
         """
@@ -181,7 +114,7 @@ class Slam:
             if progress:
                 progress(done, rounds, "polishing the map")
             self._solve(list(patch_edges(self.keyframes, self._config.slam)), PATCH_TRUST)
-        track = self._way.track(self.keyframes)
+        track = self._builder.track(self.keyframes)
         return SlamResult(track, self._grid(), self.keyframes, self._loops.edges, self.refused)
 
     def _refuse(self, reason: str, count: int = 1) -> None:
@@ -202,7 +135,7 @@ class Slam:
 
     def _grid(self) -> OccupancyGrid:
         settings = self._config.slam
-        evidence = {f"grid.{name}": _said_again(getattr(self._config.grid, name)) for name in ("p_occupied", "p_free")}
+        evidence = {f"grid.{name}": _repeated(getattr(self._config.grid, name)) for name in ("p_occupied", "p_free")}
         config = load_config(self._config, voxel_size=settings.voxel_size, max_range=settings.max_range, **evidence)
         _check_extent(self._poses(), settings.voxel_size)
         grid, beams = GridMap(config), make_beams(config)
@@ -213,23 +146,87 @@ class Slam:
         return grid.occupancy()
 
 
-def _said_again(p: float) -> float:
-    """Return what a keyframe says of a cell where a scan says `p`."""
-    odds = (p / (1 - p)) ** LOOKS
-    return odds / (1 + odds)
+@dataclass(frozen=True, eq=False)
+class SlamResult:
+    """A robot's track, and the map of what it saw.
 
-
-def map_scans(scans: Iterable[Scan], config: Config, progress: Progress | None = None) -> SlamResult:
-    """Return the way and the map of scans in order of time, whose poses are those of the odometry.
-
-    progress: called with how many are done, how many there are (0: not known) and what is going on.
+    track: the pose of every scan that was not refused. grid: the map, built from the keyframes. keyframes: with their
+    final poses. closures: number of loops closed. edges: those, between keyframes. refused: refused scans by reason.
     """
-    slam, total = Slam(config), len(scans) if isinstance(scans, Sized) else 0
-    for done, scan in enumerate(scans, 1):
-        slam.add(scan)
-        if progress:
-            progress(done, total, "matching scans")
-    return slam.finish(progress)
+
+    track: Track
+    grid: OccupancyGrid
+    keyframes: list[Keyframe]
+    edges: list[Edge]
+    refused: dict[str, int]
+
+    @property
+    def closures(self) -> int:
+        """How many pairs of submaps were found to show one place."""
+        return len(self.edges)
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """A scan: where the odometry saw the robot (3,), and where it stood (3,) as seen from keyframe `keyframe`."""
+
+    stamp_ns: int
+    odometry: se2.Pose
+    keyframe: int
+    since: se2.Pose
+
+
+class TrackBuilder:
+    """The steps so far, with ascending stamps."""
+
+    def __init__(self) -> None:
+        self._steps: list[Step] = []
+        self._started = False
+        self._late, self._late_ns, self._against = 0, 0, 0
+
+    def room(self, stamp_ns: int) -> int | None:
+        """Make room for a scan at `stamp_ns`; return how many earlier ones were dropped, None where it is itself too
+        late.
+
+        A single stamp in the future would make all later scans late. So once more scans in a row are late than there
+        were steps after the first of them, those steps have the wrong stamps and are dropped.
+        """
+        ahead = len(self._steps) - bisect_left(self._steps, stamp_ns, key=lambda step: step.stamp_ns)
+        if not ahead:
+            self._late = 0
+            return 0
+        if not self._late or stamp_ns <= self._late_ns:
+            self._late, self._against = 0, ahead
+        self._late, self._late_ns = self._late + 1, stamp_ns
+        if self._late <= max(self._against, LATE):
+            return None
+        del self._steps[-ahead:]
+        self._late = 0
+        return ahead
+
+    def add(self, scan: Scan, pose: se2.Pose, keyframes: list[Keyframe]) -> None:
+        """Append a scan that there is room for, and the pose (3,) of the robot.
+
+        Steps before the first keyframe are stored relative to it.
+        """
+        if keyframes and not self._started:
+            self._started = True
+            self._steps = [replace(s, since=se2.relative(keyframes[0].pose, s.since)) for s in self._steps]
+        since = se2.relative(keyframes[-1].pose, pose) if keyframes else pose
+        self._steps.append(Step(scan.stamp_ns, scan.pose_world_base, max(len(keyframes) - 1, 0), since))
+
+    def track(self, keyframes: list[Keyframe]) -> Track:
+        """Return the track, with the keyframes at their current poses."""
+        anchors = np.array([keyframes[step.keyframe].pose for step in self._steps])
+        poses = se2.compose(anchors, np.array([step.since for step in self._steps]))
+        corrections = se2.compose(poses, se2.inverse(np.array([step.odometry for step in self._steps])))
+        return Track(np.array([step.stamp_ns for step in self._steps], np.int64), poses, corrections)
+
+
+def _repeated(p: float) -> float:
+    """Return the probability that a keyframe gives a cell to which a scan gives `p`."""
+    odds = (p / (1 - p)) ** SCANS_PER_KEYFRAME
+    return odds / (1 + odds)
 
 
 def _check_extent(poses: se2.Pose, cell: float) -> None:

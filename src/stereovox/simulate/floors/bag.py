@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The drive through a simulated floor as a bag, with the topics and frames of the robot of IST 2019."""
+"""Write the drive through a simulated floor as a bag, with the topics and frames of the robot of IST 2019."""
 
 from __future__ import annotations
 
@@ -19,25 +19,25 @@ from stereovox.sources.robots.robot import Robot
 
 BASE, LASER, CAMERA, OPTICAL = "base_link", "laser", "camera_link", "camera_depth_optical_frame"
 TRUTH = "/ground_truth"
-Told = tuple[int, Scan | Frame | se2.Pose]
+Recorded = tuple[int, Scan | Frame | se2.Pose]
 
 
 def write_bag(
     robot: Robot | Floor, path: str | os.PathLike[str], progress: Callable[[int, int], None] | None = None
 ) -> None:
-    """Write all that a simulated robot records: ROS 1 for `.bag`, ROS 2 for `.mcap` and `.db3`.
+    """Write everything that a simulated robot records: ROS 1 for `.bag`, ROS 2 for `.mcap` and `.db3`.
 
     Topics: /scan, /camera/depth/image_raw and its camera_info, /odom, /tf (odom -> base_link), /tf_static, and the true
-    pose in the building on /ground_truth. Depth is in millimetres, 0 where there is none: a bag does not tell why.
-    progress: called with what is done and in all: odometry's poses, scans and images.
-    Raises SourceError, one line, for a robot that is none of this simulation and where the file cannot be written.
+    pose in the building on /ground_truth. Depth is in millimetres, 0 for none: a bag cannot say why. progress: called
+    with messages done and in all: odometry poses, scans and images. Raises SourceError for a robot that is not of this
+    simulation and where the file cannot be written.
     """
     if not isinstance(robot, Floor):
         raise SourceError(f"{robot.name}: only a simulated robot is recorded; give sim:floor")
     total = len(robot.odometry) + len(robot.scans) + len(robot.frames)
     with BagWriter(path) as bag:
         _fixed(bag, robot)
-        for done, (stamp_ns, one) in enumerate(merge(*_streams(robot), key=lambda told: told[0]), 1):
+        for done, (stamp_ns, one) in enumerate(merge(*_streams(robot), key=lambda recorded: recorded[0]), 1):
             if isinstance(one, Scan):
                 bag.scan(one, "/scan", LASER)
             elif isinstance(one, Frame):
@@ -49,7 +49,7 @@ def write_bag(
                 progress(done, total)
 
 
-def _streams(robot: Floor) -> Iterator[Iterator[Told]]:
+def _streams(robot: Floor) -> Iterator[Iterator[Recorded]]:
     odometry = zip(robot.odometry.stamps_ns.tolist(), robot.odometry.T_world_body, strict=True)
     yield ((stamp_ns, se2.flattened(T)) for stamp_ns, T in odometry)
     yield ((scan.stamp_ns, scan) for scan in robot.scans)

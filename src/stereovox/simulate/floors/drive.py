@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The drive of a differential-drive robot past a list of stops, and what its odometry makes of it."""
+"""The drive of a differential-drive robot past a list of stops, and an error model of its odometry."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ STEP_NS = 20_000_000
 TURN = 0.8
 """Fastest turn in rad/s."""
 STRAIGHT = 0.6
-"""A robot whose next stop lies further to a side (radians) turns on the spot before it goes on."""
+"""A robot whose next stop is further to a side (radians) turns on the spot first."""
 NEAR = 0.1
 """Metres from a stop at which it counts as reached."""
 
 
 class Stop(NamedTuple):
-    """A place on the way in metres, and by how many degrees the robot turns there on the spot (left is positive)."""
+    """A place on the path in metres, and by how many degrees the robot turns there on the spot (left is positive)."""
 
     x: float
     y: float
@@ -32,11 +32,11 @@ class Stop(NamedTuple):
 
 @dataclass(frozen=True)
 class Odometry:
-    """Errors of a robot's odometry; those of a Pioneer that nobody has calibrated.
+    """Errors of a robot's odometry; by default those of an uncalibrated Pioneer.
 
-    distance, turn: shares by which ways and turns are measured wrongly; veer: radians a metre by which it is believed
-    to turn left while it drives straight (wheels of unequal size). Standard deviations: distance_noise metres in a
-    metre of way, turn_noise radians in a radian of turning, veer_noise radians in a metre; all grow with the root.
+    distance, turn: relative errors of distances and turns; veer: radians per metre by which it seems to turn left while
+    it drives straight (wheels of unequal size). Standard deviations: distance_noise metres per metre travelled,
+    turn_noise radians per radian of turning, veer_noise radians per metre; all grow with the square root.
     """
 
     distance: float = 0.02
@@ -47,9 +47,9 @@ class Odometry:
     veer_noise: float = 0.01
 
     def measured(self, poses: Pose, seed: int | list[int], drift: float = 1.0) -> Pose:
-        """Return what the odometry believes (N, 3) of true poses (N, 3), in the frame of the first of them.
+        """Return the odometry's poses (N, 3) for true poses (N, 3), in the frame of the first of them.
 
-        drift: all errors are so many times as large.
+        drift: factor on all errors.
         """
         random = np.random.default_rng(seed)
         step = relative(poses[:-1], poses[1:])
@@ -67,9 +67,9 @@ class Odometry:
 
 
 def drive(stops: Sequence[Stop], speed: float) -> Pose:
-    """Return where a robot stands (N, 3), one pose each `STEP_NS`, that drives from the first stop past all others.
+    """Return the poses (N, 3), one each `STEP_NS`, of a robot that drives from the first stop past all others.
 
-    It looks towards the second stop first. speed: m/s on straight ways.
+    It first faces the second stop. speed: m/s on straight lines.
     """
     dt = STEP_NS / 1e9
     x, y = stops[0][:2]
@@ -102,13 +102,13 @@ def zigzag(start: tuple[float, float], end: tuple[float, float], aside: float, p
     return [Stop(*(place + side * left)) for place, side in zip(middle, sides, strict=True)]
 
 
+def metres(poses: Pose) -> NDArray[np.float64]:
+    """Return the distance travelled at each pose, (N,)."""
+    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(poses[:, :2], axis=0), axis=1))])
+
+
 def _chained(steps: Pose) -> Pose:
     """Return the poses (N + 1, 3) that steps (N, 3) lead to from the origin."""
     yaw = np.concatenate([[0.0], np.cumsum(steps[:, 2])])
     moves = compose(np.column_stack([np.zeros((len(steps), 2)), yaw[:-1]]), steps)[:, :2]
     return np.column_stack([np.vstack([np.zeros(2), np.cumsum(moves, axis=0)]), wrapped(yaw)])
-
-
-def metres(poses: Pose) -> NDArray[np.float64]:
-    """Return how far the robot has come at each pose, (N,)."""
-    return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(poses[:, :2], axis=0), axis=1))])

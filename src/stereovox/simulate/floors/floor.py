@@ -43,10 +43,10 @@ SCAN_DELAY_NS, FRAME_DELAY_NS = 40_000_000, 60_000_000
 class Options:
     """Parameters of `sim:floor`.
 
-    plan: `corridors` or `testbed`. seed: of all noise. shut: the door to the stairs of `corridors` is closed.
-    drift: the odometry's errors are so many times as large; noise: 0 makes lidar and camera exact.
-    speed: m/s. scan_hz, depth_hz: scans and depth images a second (0: none). image_width: of the Kinect, in pixels.
-    seconds: the drive ends then (0: at its last stop).
+    plan: `corridors` or `testbed`. seed: of all noise. shut: the door to the stairs of `corridors` is closed. drift:
+    factor on the odometry's errors; noise: 0 makes lidar and camera exact. speed: m/s. scan_hz, depth_hz: scans and
+    depth images a second (0: none). image_width: of the Kinect, in pixels. seconds: the drive ends then (0: at its last
+    stop).
     """
 
     plan: str = "corridors"
@@ -80,7 +80,7 @@ class Floor:
     Everything follows from the parameters: the same `where` gives the same recording.
     T_base_lidar, T_base_camera: (4, 4) float64, where the sensors sit (IST 2019, III-E), the camera's frame optical.
     odometry: T_odom_base at 10 Hz. truth: T_world_base each 20 ms.
-    Raises SourceError, one line, for an unknown parameter and for values out of range.
+    Raises SourceError for an unknown parameter and for values out of range.
     """
 
     notes: tuple[str, ...] = ()
@@ -106,17 +106,17 @@ class Floor:
 
     @classmethod
     def recognises(cls, where: str) -> bool:
-        """Tell whether `where` names this simulation."""
+        """Return whether `where` names this simulation."""
         return where.partition("?")[0] == "sim:floor"
 
     @cached_property
     def layout(self) -> Layout:
-        """The floor and the way through it."""
+        """The floor and the robot's path."""
         return registry.find("floors", PLANS, self.options.plan)(self.options.shut)
 
     @property
     def plan(self) -> FloorPlan:
-        """Walls and things, in the world of `truth`."""
+        """Walls and obstacles, in the world of `truth`."""
         return self.layout.plan
 
     @property
@@ -138,7 +138,7 @@ class Floor:
         occupied as a whole. Without them its rim is, as beams on the floor have it.
         """
         grid = self.plan.truth(resolution, self.start[:2], heights)
-        return with_lids(grid, self.plan.things, heights, float(self.T_base_camera[2, 3])) if lids else grid
+        return with_lids(grid, self.plan.obstacles, heights, float(self.T_base_camera[2, 3])) if lids else grid
 
     def true_ranges(self, stamp_ns: int) -> NDArray[np.float64]:
         """Return the exact distances (N,) in metres that the lidar's beams run, inf beyond its reach."""

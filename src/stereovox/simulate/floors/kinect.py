@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a Kinect makes of a true depth image: whole steps of disparity, noise, shadows beside edges, limits."""
+"""Sensor model of a Kinect: quantised disparity, noise, shadows beside edges, limits."""
 
 from __future__ import annotations
 
@@ -24,7 +24,8 @@ WIDTH = 640
 def kinect_camera(width: int = WIDTH) -> PinholeCamera:
     """Return the Kinect's depth camera (IST 2019, III-C), or a smaller image of the same field of view.
 
-    It tells its baseline and the noise of its disparity, whole steps included, so a mapper knows how sure depth is.
+    It declares its baseline and the noise of its disparity, quantisation included, so that a mapper knows the
+    uncertainty of depth.
     """
     height = round(width * 480 / WIDTH)
     subpixel = math.hypot(NOISE, STEP / math.sqrt(12)) * width / WIDTH
@@ -75,5 +76,5 @@ class Kinect:
 
 
 def _in_shadow(disparity: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Tell which pixels the projector does not light; its beam is wider than the image."""
+    """Return which pixels the projector does not light; its beam is wider than the image."""
     return hidden_from_right_eye(disparity) & (np.arange(disparity.shape[1]) >= disparity)

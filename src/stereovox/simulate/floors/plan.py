@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The plan of one floor of a building: rooms, and upright things that stand in them.
+"""The plan of one floor of a building: rooms, and upright obstacles in them.
 
 Metres; x, y on the floor, z up from it.
 """
@@ -24,7 +24,7 @@ WALL = 0.2
 
 
 @dataclass(frozen=True, eq=False)
-class Thing:
+class Obstacle:
     """An upright body with a flat bottom and top.
 
     part, name: as in `Solid`. corners: (K, 2) of its convex outline, counter-clockwise. low, high: heights.
@@ -49,14 +49,14 @@ class Thing:
 
 @dataclass(frozen=True, eq=False)
 class FloorPlan:
-    """Walls round the free rectangles (rooms, corridors, openings of doors), and the things in them.
+    """Walls around the free rectangles (rooms, corridors, door openings), and the obstacles in them.
 
-    free: rectangles whose union is where no wall stands; they may overlap. things: all else. A door that is shut is a
-    thing in an opening.
+    free: rectangles whose union is free of walls; they may overlap. obstacles: everything else. A shut door is an
+    obstacle in an opening.
     """
 
     free: Sequence[Rectangle]
-    things: Sequence[Thing] = field(default_factory=tuple)
+    obstacles: Sequence[Obstacle] = field(default_factory=tuple)
 
     @cached_property
     def walls(self) -> NDArray[np.float64]:
@@ -69,7 +69,7 @@ class FloorPlan:
 
     def outline(self, low: float, high: float) -> NDArray[np.float64]:
         """Return all surfaces (N, 4) that a level ray somewhere between two heights may meet."""
-        standing = [thing.outline for thing in self.things if thing.low <= high and thing.high >= low]
+        standing = [obstacle.outline for obstacle in self.obstacles if obstacle.low <= high and obstacle.high >= low]
         return np.concatenate([self.walls, *standing])
 
     @cached_property
@@ -82,7 +82,7 @@ class FloorPlan:
         """Return what a perfect map shows of the floor as seen from the place `inside` (2,).
 
         Occupied: cells that an upright surface between `heights` crosses and that border on free ones. Free: the others
-        that can be reached from `inside`. Unknown: what is behind the surfaces; `floor_lids` adds tops and undersides.
+        that can be reached from `inside`. Unknown: what is behind the surfaces; `with_lids` adds tops and undersides.
         Cell corners lie at whole multiples of `resolution`.
         """
         from scipy import ndimage
@@ -111,7 +111,7 @@ class FloorPlan:
         corners = _corners(xs[0], ys[0], xs[-1], ys[-1])
         floor = upright("floor", "floor", corners, -WALL, 0)
         ceiling = upright("ceiling", "ceiling", corners, CEILING, CEILING + WALL)
-        return Scene([floor, ceiling, *blocks, *(thing.solid for thing in self.things)])
+        return Scene([floor, ceiling, *blocks, *(obstacle.solid for obstacle in self.obstacles)])
 
     @cached_property
     def _compressed(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
@@ -134,20 +134,20 @@ def block(
     heights: tuple[float, float],
     turn_deg: float = 0.0,
     about: tuple[float, float] | None = None,
-) -> Thing:
+) -> Obstacle:
     """Return an upright box whose outline is a rectangle, turned to the left about a place (its middle)."""
     corners = _corners(*where)
     middle = corners.mean(0) if about is None else np.asarray(about, float)
     turn = np.radians(turn_deg)
     rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-    return Thing(part, name, (corners - middle) @ rotation.T + middle, *heights)
+    return Obstacle(part, name, (corners - middle) @ rotation.T + middle, *heights)
 
 
-def post(part: str, name: str, middle: tuple[float, float], diameter: float, high: float) -> Thing:
+def post(part: str, name: str, middle: tuple[float, float], diameter: float, high: float) -> Obstacle:
     """Return a round post that stands on the floor, with sixteen sides."""
     angles = np.arange(16) * np.pi / 8
     ring = np.column_stack([np.cos(angles), np.sin(angles)]) * diameter / 2
-    return Thing(part, name, ring + np.asarray(middle, float), 0.0, high)
+    return Obstacle(part, name, ring + np.asarray(middle, float), 0.0, high)
 
 
 def upright(part: str, name: str, corners: NDArray[np.float64], low: float, high: float) -> Solid:

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a level camera and a lidar see of a simulated floor, exactly.
+"""Exact views of a simulated floor by a level camera and by a lidar.
 
-So each column needs one ray on the plan, and each thing the two places where that ray enters and leaves its outline.
+For a level camera each column needs one ray on the plan, and for each obstacle the two places where that ray enters and
+leaves its outline.
 
-Tops and undersides of things as a camera sees them: what a 3-D map has inside of the rims of a floor's things.
-A camera that is lower than a table looks at its underside, so a map in three dimensions has the whole table, and so has
-its projection. Beams in one plane find nothing but the rim.
+Lids are the tops and undersides that a camera sees: what a 3-D map has inside the outlines of obstacles. A camera lower
+than a table looks at its underside, so a 3-D map has the whole table, and so has its projection; beams in one plane
+find only the outline.
 """
 
 from __future__ import annotations
@@ -19,7 +20,10 @@ from numpy.typing import ArrayLike, NDArray
 from stereovox import se2
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.maps.occupancy import OccupancyGrid
-from stereovox.simulate.floors.plan import CEILING, FloorPlan, Thing
+from stereovox.simulate.floors.plan import CEILING, FloorPlan, Obstacle
+
+OCCUPIED, FREE = 100, 0
+NONE = np.float32(np.inf)
 
 
 def cast(
@@ -63,52 +67,39 @@ def within_reach(segments: NDArray[np.float64], origin: ArrayLike, reach: float)
     return segments[near]
 
 
-OCCUPIED, FREE = 100, 0
+def with_lids(
+    grid: OccupancyGrid, obstacles: Sequence[Obstacle], heights: tuple[float, float], eye: float
+) -> OccupancyGrid:
+    """Return a perfect map of a floor with all visible lids between `heights` occupied.
 
-
-def with_lids(grid: OccupancyGrid, things: Sequence[Thing], heights: tuple[float, float], eye: float) -> OccupancyGrid:
-    """Return a perfect map of a floor with all lids occupied that lie between `heights` and can be seen.
-
-    grid: what `FloorPlan.truth` returns, in the plan's frame. eye: height of the camera over the floor. A lid is an
-    underside above the eye or a top below it. Not seen: what stands on another thing or carries one there, and what
-    stands nowhere beside a free cell. Nothing that is free in `grid` changes.
+    grid: what `FloorPlan.truth` returns, in the plan's frame. eye: height of the camera above the floor. A lid is an
+    underside above the eye or a top below it. Not visible: lids that rest on another obstacle or carry one, and those
+    not beside a free cell. Nothing that is free in `grid` changes.
     """
     from scipy import ndimage
 
     beside = np.asarray(ndimage.binary_dilation(grid.cells == FREE, np.ones((5, 5))), bool)
-    inside = [_inside(thing, grid) for thing in things]
+    inside = [_inside(obstacle, grid) for obstacle in obstacles]
     seen = np.zeros(grid.cells.shape, bool)
-    for thing, here in zip(things, inside, strict=True):
-        height = lid(thing, eye)
+    for obstacle, here in zip(obstacles, inside, strict=True):
+        height = lid(obstacle, eye)
         if height is None or not heights[0] <= height <= heights[1] or not (here & beside).any():
             continue
         open_ = here.copy()
-        for other, there in zip(things, inside, strict=True):
-            if other is not thing and other.low <= height <= other.high:
+        for other, there in zip(obstacles, inside, strict=True):
+            if other is not obstacle and other.low <= height <= other.high:
                 open_ &= ~there
         seen |= open_
     return replace(grid, cells=np.where(seen & (grid.cells != FREE), np.int8(OCCUPIED), grid.cells))
 
 
-def lid(thing: Thing, eye: float) -> float | None:
-    """Return the height of the underside or top that a camera at the height `eye` looks at; None beside the thing."""
-    if thing.low > eye:
-        return thing.low
-    return thing.high if thing.high < eye else None
-
-
-def _inside(thing: Thing, grid: OccupancyGrid) -> NDArray[np.bool_]:
-    """Tell which cells' middles lie within a thing's outline, (rows, columns)."""
-    rows, columns = grid.cells.shape
-    x = grid.origin[0] + (np.arange(columns) + 0.5) * grid.resolution
-    y = grid.origin[1] + (np.arange(rows)[:, None] + 0.5) * grid.resolution
-    inside = np.ones(grid.cells.shape, bool)
-    for x0, y0, x1, y1 in thing.outline:  # the body is on the left of each side
-        inside &= (x1 - x0) * (y - y0) - (y1 - y0) * (x - x0) >= 0
-    return inside
-
-
-NONE = np.float32(np.inf)
+def lid(obstacle: Obstacle, eye: float) -> float | None:
+    """Return the height of the underside or top that a camera at the height `eye` sees; None at the obstacle's own
+    height.
+    """
+    if obstacle.low > eye:
+        return obstacle.low
+    return obstacle.high if obstacle.high < eye else None
 
 
 class LevelView:
@@ -130,10 +121,10 @@ class LevelView:
         walls = cast_along(self._plan.walls, (x, y), directions).astype(np.float32)
         image = np.minimum(self._level[:, None], walls)
         seen = se2.inverse((x, y, yaw))
-        for thing in self._plan.things:
-            columns = self._columns(se2.transform(seen, thing.corners))
+        for obstacle in self._plan.obstacles:
+            columns = self._columns(se2.transform(seen, obstacle.corners))
             if len(columns):
-                self._draw(image, thing, columns, (x, y), directions, walls)
+                self._draw(image, obstacle, columns, (x, y), directions, walls)
         return image
 
     def _columns(self, corners: NDArray[np.float64]) -> range:
@@ -150,7 +141,7 @@ class LevelView:
     def _draw(
         self,
         image: NDArray[np.float32],
-        thing: Thing,
+        obstacle: Obstacle,
         columns: range,
         origin: tuple[float, float],
         directions: NDArray[np.float64],
@@ -158,7 +149,7 @@ class LevelView:
     ) -> None:
         """Draw one body where it is nearer than what is there."""
         part = slice(columns.start, columns.stop)
-        enter, leave = _through(thing.corners, np.asarray(origin), directions[part])
+        enter, leave = _through(obstacle.corners, np.asarray(origin), directions[part])
         met = np.flatnonzero((enter < leave) & (enter > 0) & (enter < walls[part]))
         if not len(met):
             return
@@ -166,24 +157,24 @@ class LevelView:
         enter, leave = (
             np.where(enter < leave, one, np.inf)[met[0] : met[-1] + 1].astype(np.float32) for one in (enter, leave)
         )
-        self._side(image[:, start:end], thing, enter)
-        self._lid(image[:, start:end], thing, enter, leave)
+        self._side(image[:, start:end], obstacle, enter)
+        self._lid(image[:, start:end], obstacle, enter, leave)
 
-    def _side(self, image: NDArray[np.float32], thing: Thing, enter: NDArray[np.float32]) -> None:
+    def _side(self, image: NDArray[np.float32], obstacle: Obstacle, enter: NDArray[np.float32]) -> None:
         near, far = enter.min(), enter[np.isfinite(enter)].max()
-        slopes = [(self._height - z) / s for z in (thing.low, thing.high) for s in (near, far)]
+        slopes = [(self._height - z) / s for z in (obstacle.low, obstacle.high) for s in (near, far)]
         rows = self._rows(slopes)
         z = np.float32(self._height) - self._down[rows, None] * np.where(np.isfinite(enter), enter, 0)
-        there = (z >= thing.low) & (z <= thing.high) & np.isfinite(enter)
+        there = (z >= obstacle.low) & (z <= obstacle.high) & np.isfinite(enter)
         np.minimum(image[rows], np.where(there, enter, NONE), out=image[rows])
 
     def _lid(
-        self, image: NDArray[np.float32], thing: Thing, enter: NDArray[np.float32], leave: NDArray[np.float32]
+        self, image: NDArray[np.float32], obstacle: Obstacle, enter: NDArray[np.float32], leave: NDArray[np.float32]
     ) -> None:
         """Draw the top of a body that is lower than the camera, or the bottom of one that is higher."""
-        if thing.low <= self._height <= thing.high:
+        if obstacle.low <= self._height <= obstacle.high:
             return
-        drop = self._height - (thing.high if thing.high < self._height else thing.low)
+        drop = self._height - (obstacle.high if obstacle.high < self._height else obstacle.low)
         rows = self._rows([drop / float(enter.min()), drop / float(leave[np.isfinite(leave)].max())])
         flat = np.float32(drop) / self._down[rows, None]
         there = (flat >= enter) & (flat <= leave) & np.isfinite(enter)
@@ -192,6 +183,17 @@ class LevelView:
     def _rows(self, slopes: list[float]) -> slice:
         """Return the rows that look down at slopes between the least and the largest of these."""
         return slice(*np.searchsorted(self._down, [min(slopes) - 1e-6, max(slopes) + 1e-6]).tolist())
+
+
+def _inside(obstacle: Obstacle, grid: OccupancyGrid) -> NDArray[np.bool_]:
+    """Return which cells have their centre inside an obstacle's outline, (rows, columns)."""
+    rows, columns = grid.cells.shape
+    x = grid.origin[0] + (np.arange(columns) + 0.5) * grid.resolution
+    y = grid.origin[1] + (np.arange(rows)[:, None] + 0.5) * grid.resolution
+    inside = np.ones(grid.cells.shape, bool)
+    for x0, y0, x1, y1 in obstacle.outline:  # the body is on the left of each side
+        inside &= (x1 - x0) * (y - y0) - (y1 - y0) * (x - x0) >= 0
+    return inside
 
 
 def _through(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings of ROS 1, ROS 2 and RealSense: recognised by their first bytes, and opened."""
+"""ROS 1, ROS 2 and RealSense recordings, recognised by their first bytes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ FOLDER = "folder"
 def suffix_of(path: str) -> str:
     """Return `.bag`, `.db3` or `.mcap` for a file that is, or by its name should be, such a recording, else "".
 
-    `FOLDER` for a folder that rosbag2 made. Never raises.
+    `FOLDER` for a rosbag2 folder. Never raises.
     """
     try:
         if os.path.isdir(path):
@@ -35,7 +35,7 @@ def suffix_of(path: str) -> str:
 
 
 def open_bag(path: Path) -> BagFile:
-    """Open a `.bag`, `.db3`, `.mcap` or rosbag2 folder; raises SourceError, one line, for anything else or damage."""
+    """Open a `.bag`, `.db3`, `.mcap` or rosbag2 folder; raises SourceError for anything else or damage."""
     if path.is_dir():
         from stereovox.sources.bags.folder import FolderFile
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings in one SQLite file, by any message."""
+"""ROS 2 recordings in one SQLite file."""
 
 from __future__ import annotations
 
@@ -14,31 +14,31 @@ from numpy.typing import NDArray
 from stereovox.errors import FrameRefused, SourceError
 from stereovox.sources.bags.files import MAX_BYTES, BagFile, one_line
 from stereovox.sources.bags.messages import Wire
-from stereovox.sources.bags.unpack import unzipped
+from stereovox.sources.bags.unpack import decompress_message
 
 STEPS = 10_000
-"""Instructions of SQLite between two looks at how many there were."""
-STRANGE = """
+"""SQLite instructions between two checks of their number."""
+SUSPICIOUS_TABLES = """
     SELECT (SELECT count(*) FROM sqlite_master WHERE lower(name) IN ('topics', 'messages')
             AND (type <> 'table' OR NOT rootpage > 0))
         + (SELECT count(*) FROM pragma_table_xinfo('topics') WHERE hidden)
         + (SELECT count(*) FROM pragma_table_xinfo('messages') WHERE hidden)
 """
-"""Counts views, virtual tables and computed columns where tables should be: they make SQLite run what the file says."""
+"""Counts views, virtual tables and computed columns in place of tables: they make SQLite run what the file says."""
 
 
-class _Patience:
-    """Ends a query that takes more steps than there can be rows in a file of `size` bytes: damaged pages go round."""
+class _StepLimit:
+    """Aborts a query of more steps than a file of `size` bytes has rows: damaged pages form cycles."""
 
     def __init__(self, size: int):
         self._most, self._done = 1_000_000 + 10 * size, 0
 
     def begin(self) -> None:
-        """Count from here on."""
+        """Reset the count."""
         self._done = 0
 
     def is_over(self) -> bool:
-        """Count `STEPS` more."""
+        """Count `STEPS` more; return whether the limit is exceeded."""
         self._done += STEPS
         return self._done > self._most
 
@@ -53,7 +53,7 @@ class Db3File(BagFile):
         self.path = path
         self._lock = threading.Lock()
         size = path.stat().st_size
-        self._patience = _Patience(size)
+        self._patience = _StepLimit(size)
         try:
             self._file = sqlite3.connect(
                 f"{path.resolve().as_uri()}?mode=ro&immutable=1", uri=True, check_same_thread=False
@@ -61,7 +61,7 @@ class Db3File(BagFile):
             self._file.text_factory = lambda data: data.decode("utf-8", "replace")
             self._file.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, min(MAX_BYTES, size))
             self._file.set_progress_handler(self._patience.is_over, STEPS)
-            if self._rows(STRANGE)[0][0]:
+            if self._rows(SUSPICIOUS_TABLES)[0][0]:
                 raise ValueError("topics or messages is no plain table")
             rows = self._rows("SELECT id, name, type FROM topics WHERE id IS NOT NULL")
             used = {row[0] for row in self._rows("SELECT DISTINCT topic_id FROM messages")}
@@ -86,7 +86,7 @@ class Db3File(BagFile):
                 rows = self._rows("SELECT data FROM messages WHERE id = ?", key)
             if len(rows) != 1 or not isinstance(rows[0][0], bytes):
                 raise ValueError("holds no message")
-            return Wire(unzipped(rows[0][0], MAX_BYTES), cdr=True)
+            return Wire(decompress_message(rows[0][0], MAX_BYTES), cdr=True)
         except (sqlite3.Error, SourceError, ValueError, OverflowError, MemoryError) as error:
             raise FrameRefused("unreadable", f"{self.path}: message {i} of {topic}: {one_line(error)}") from None
 

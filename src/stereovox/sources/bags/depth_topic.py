@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The depth topic of a recording: its images as arrays, its camera, and what stands beside them."""
+"""The depth topic of a recording: images as arrays, their camera, and metadata recorded with them."""
 
 from __future__ import annotations
 
@@ -26,135 +26,25 @@ from stereovox.sources.images import decode_depth_png
 
 PAIRS = ("diagnostic_msgs/KeyValue", "std_msgs/String")
 VALUES = ("std_msgs/Float32", "std_msgs/String")
-
-
-class Metadata:
-    """Keys and values that were recorded at the very time of a message of another topic; {} where there are none."""
-
-    def __init__(self, file: BagFile, topic: str):
-        self._file, self._topic = file, topic
-        self._kind = file.types.get(topic, "")
-        self._stamps = file.stamps(topic) if self._kind in PAIRS else np.empty(0, np.int64)
-
-    def at(self, recorded_ns: int) -> dict[str, str]:
-        """Return what was recorded at that time; what cannot be read is left out."""
-        found: dict[str, str] = {}
-        first, last = (int(np.searchsorted(self._stamps, recorded_ns, side)) for side in ("left", "right"))
-        for i in range(first, last):
-            try:
-                found.update(read_pairs(self._file.read(self._topic, i), self._kind))
-            except (FrameRefused, ValueError):
-                continue
-        return found
-
-
-def option(file: BagFile, sensor: str, name: str) -> float | None:
-    """Return a setting of a RealSense sensor (`/device_0/sensor_0`), for example "Depth Units"; None where not told.
-
-    Spaces in the name became underscores in librealsense 2.57.
-    """
-    for written in (name, name.replace(" ", "_")):
-        topic = f"{sensor}/option/{written}/value"
-        kind = file.types.get(topic, "")
-        if kind in VALUES:
-            try:
-                value = read_value(file.read(topic, 0), kind)
-            except (FrameRefused, ValueError):
-                continue
-            if math.isfinite(value) and value > 0:
-                return value
-    return None
-
-
-def sibling(topic: str, name: str) -> str:
-    """Return the topic `name` beside `topic`."""
-    return f"{topic.rpartition('/')[0]}/{name}"
-
-
 CAMERA_INFO = "sensor_msgs/CameraInfo"
 RECTIFIED = re.compile(r"(?<![a-z])rect")
-"""In the names of topics: `image_rect`, `rectified`, but not `direct`."""
-
-
-def find_camera(
-    file: BagFile, topic: str, info: str, stream: str | None, sensor: str
-) -> tuple[PinholeCamera, tuple[str, ...]]:
-    """Return the camera of depth `topic`, and notes. `info`: topic that tells it, "" to look for one.
-
-    stream, sensor: prefixes of a RealSense stream (`/device_0/sensor_0/Depth_0`) and sensor, None and "" for others.
-    Intrinsics: K, or P where the topic's name says that images are rectified. Baseline: the sensor's, else None.
-    Raises SourceError where there is no camera, or no possible one.
-    """
-    where = [info] if info else _places(topic, stream)
-    found = next((place for place in where if place in file.types), None)
-    if found is None:
-        known = sorted(name for name, kind in file.types.items() if kind == CAMERA_INFO)
-        say = f"give one with ?info=/topic{f' (there are: {_few(known)})' if known else ', for example of another bag'}"
-        raise SourceError(f"{file.path}: no {where[0]} that tells the camera of {topic}; {say}")
-    rectified = RECTIFIED.search(topic) is not None
-    try:
-        told = _read(file, found)
-        millimetres = option(file, sensor, "Stereo Baseline") if sensor else None
-        camera = camera_of(told, rectified, millimetres and millimetres / 1000)
-    except (FrameRefused, StereovoxError, ValueError) as error:
-        raise SourceError(f"{file.path}: {found}: {error}") from None
-    if any(told.D) and not rectified:
-        return camera, (f"{file.path}: {found} tells of lens distortion, which is not corrected in {topic}",)
-    return camera, ()
-
-
-def _places(topic: str, stream: str | None) -> list[str]:
-    if stream:
-        return [f"{stream}/info/camera_info", f"{stream}/camera_info", f"{stream}/image/camera_info"]
-    return [sibling(topic.removesuffix("/compressedDepth"), "camera_info")]
-
-
-def _read(file: BagFile, topic: str) -> CameraInfo:
-    if file.types[topic] == CAMERA_INFO:
-        return read_camera_info(file.read(topic, 0))
-    pairs = read_pairs(file.read(topic, 0), file.types[topic])
-    try:
-        width, height = int(pairs["width"]), int(pairs["height"])
-        fx, fy, cx, cy = (float(pairs[key]) for key in ("fx", "fy", "ppx", "ppy"))
-    except KeyError as error:
-        raise ValueError(f"{error} is missing; name a topic of {CAMERA_INFO} with ?info=/topic") from None
-    D = tuple(float(word) for word in pairs.get("coeffs", "").split(",") if word)
-    return CameraInfo(width, height, (fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0), D)
-
-
-def camera_of(told: CameraInfo, rectified: bool, baseline: float | None = None) -> PinholeCamera:
-    """Return the camera that a message tells; rectified: its images are, so that P counts and not K.
-
-    Raises StereovoxError for one that cannot be.
-    """
-    fx, _, cx, _, fy, cy = told.K[:6]
-    if rectified and told.P[0] > 0:
-        fx, cx, fy, cy = told.P[0], told.P[2], told.P[5], told.P[6]
-    if told.width * told.height > MAX_PIXELS:
-        raise SourceError(f"tells of {told.width}x{told.height} pixels; correct it or name another with ?info=/topic")
-    return PinholeCamera(told.width, told.height, fx, fy, cx, cy, baseline)
-
-
-def _few(names: list[str]) -> str:
-    return ", ".join(names[:6]) + (", ..." if len(names) > 6 else "")
-
-
+"""Matches topic names such as `image_rect` and `rectified`, but not `direct`."""
 REALSENSE = re.compile(r"((/device_\d+/sensor_\d+)/Depth_\d+)/image/data(/compressedDepth)?")
 IMAGE, COMPRESSED = "sensor_msgs/Image", "sensor_msgs/CompressedImage"
 PACKED = "compressedDepth"
 UNITS = {"16UC1": 0.001, "mono16": 0.001, "32FC1": 1.0}
-"""Encodings and the metres per unit they usually have (REP 118); librealsense calls its own images mono16."""
+"""Encodings and their usual metres per unit (REP 118); librealsense calls its own images mono16."""
 DTYPES = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
 DEPTH = ("16UC1", "32FC1")
-"""Encodings that are depth; mono16 is so only in RealSense files or where the user says so."""
+"""Encodings that are depth; mono16 is only in RealSense files, or where the user says so."""
 PNG_AT = 12
 """A compressedDepth image starts with 12 bytes about how floats were packed; the PNG follows."""
 
 
 class DepthTopic:
-    """Depth images of one topic, of one camera; see `Bag`.
+    """Depth images of one topic, from one camera; see `Bag`.
 
-    frame_id: what the first image calls the frame it is in, "" where unknown.
+    frame_id: frame of the first image, "" if unknown.
     """
 
     def __init__(self, file: BagFile, topic: str, info: str = ""):
@@ -179,46 +69,27 @@ class DepthTopic:
     def image(self, i: int, name: str) -> tuple[NDArray[np.generic], int, float]:
         """Return depth (height, width) uint16 or float32, its time in nanoseconds, and metres per unit.
 
-        Raises FrameRefused `unreadable`, `bad_dtype` or `bad_shape`; `name` stands in its message.
+        Raises FrameRefused `unreadable`, `bad_dtype` or `bad_shape`, with `name` in the message.
         """
         picture = read_picture(self._file, self.topic, i, name)
         packed = self._file.types[self.topic] == COMPRESSED
         depth, encoding = decoded(picture, packed, (self.camera.width, self.camera.height), name)
         stamp_ns, unit = picture.stamp_ns, picture.depth_units
-        told = self._metadata.at(self.stamp_ns(i)) if self._metadata else {}
-        if "timestamp" in told:  # only .db3 has it: there the header counts from the start of the recording
-            stamp_ns = ns_from_ms(told["timestamp"]) or stamp_ns
-        unit = unit or _positive(told.get("depth_units", "")) or self._unit
+        info = self._metadata.at(self.stamp_ns(i)) if self._metadata else {}
+        if "timestamp" in info:  # only .db3 has it: there the header counts from the start of the recording
+            stamp_ns = ns_from_ms(info["timestamp"]) or stamp_ns
+        unit = unit or _positive(info.get("depth_units", "")) or self._unit
         return depth, stamp_ns, unit or UNITS[encoding]
 
 
-def decoded(picture: Picture, packed: bool, size: tuple[int, int], name: str) -> tuple[NDArray[np.generic], str]:
-    """Return depth (height, width) uint16 or float32, and its encoding, one of `UNITS`.
-
-    packed: the picture is a `CompressedImage`. size: width and height of its camera. `name` stands in messages.
-    Raises FrameRefused `unreadable`, `bad_dtype` or `bad_shape`.
-    """
-    if packed:
-        encoding = picture.encoding.partition(";")[0].strip()
-        if PACKED not in picture.encoding or encoding not in ("16UC1", "mono16"):
-            raise FrameRefused("bad_dtype", f"{name}: '{picture.encoding}' is not read; record it as 16UC1")
-        return decode_depth_png(name, bytes(picture.data[PNG_AT:]), size), encoding
-    if picture.encoding not in DTYPES:
-        raise FrameRefused("bad_dtype", f"{name}: '{picture.encoding}' is no depth; it must be 16UC1 or 32FC1")
-    if (picture.width, picture.height) != size:
-        found, wanted = f"{picture.width}x{picture.height}", f"{size[0]}x{size[1]}"
-        raise FrameRefused("bad_shape", f"{name}: {found} pixels, its camera has {wanted}; give ?info=/topic")
-    return _pixels(picture, name), picture.encoding
-
-
 def find_depth(file: BagFile, topic: str = "", info: str = "") -> DepthTopic:
-    """Return the depth images of `topic`, or of the only topic that has some.
+    """Return the depth images of `topic`, or of the only topic that has any.
 
-    Raises SourceError where there is no such topic, none or several.
+    Raises SourceError where there is no such topic, or none or several.
     """
-    for given in filter(None, (topic, info)):
-        if given not in file.types:
-            raise SourceError(f"{file.path}: no topic {given} with messages{did_you_mean(given, file.types)}")
+    for named in filter(None, (topic, info)):
+        if named not in file.types:
+            raise SourceError(f"{file.path}: no topic {named} with messages{did_you_mean(named, file.types)}")
     if topic and file.types[topic] not in (IMAGE, COMPRESSED):
         raise SourceError(f"{file.path}: {topic} holds {file.types[topic]}, no images; leave ?depth= out")
     found = [topic] if topic else depth_topics(file)
@@ -237,9 +108,9 @@ def depth_topics(file: BagFile) -> list[str]:
     return [topic for topic in found if topic.removesuffix(f"/{PACKED}") not in set(found) - {topic}]
 
 
-def first_picture(file: BagFile, topic: str, looks: int = 3) -> Picture | None:
+def first_picture(file: BagFile, topic: str, attempts: int = 3) -> Picture | None:
     """Return the first readable image of a topic, None where none of the first few is."""
-    for i in range(min(looks, len(file.stamps(topic)))):
+    for i in range(min(attempts, len(file.stamps(topic)))):
         try:
             return read_picture(file, topic, i, topic)
         except FrameRefused:
@@ -254,6 +125,131 @@ def read_picture(file: BagFile, topic: str, i: int, name: str) -> Picture:
         return read_image(wire) if file.types[topic] == IMAGE else read_compressed(wire)
     except ValueError as error:
         raise FrameRefused("unreadable", f"{name}: {error}; the message is damaged, leave the frame out") from None
+
+
+def decoded(picture: Picture, packed: bool, size: tuple[int, int], name: str) -> tuple[NDArray[np.generic], str]:
+    """Return depth (height, width) uint16 or float32, and its encoding, one of `UNITS`.
+
+    packed: the picture is a `CompressedImage`. size: width and height of its camera. `name` is used in messages. Raises
+    FrameRefused `unreadable`, `bad_dtype` or `bad_shape`.
+    """
+    if packed:
+        encoding = picture.encoding.partition(";")[0].strip()
+        if PACKED not in picture.encoding or encoding not in ("16UC1", "mono16"):
+            raise FrameRefused("bad_dtype", f"{name}: '{picture.encoding}' is not read; record it as 16UC1")
+        return decode_depth_png(name, bytes(picture.data[PNG_AT:]), size), encoding
+    if picture.encoding not in DTYPES:
+        raise FrameRefused("bad_dtype", f"{name}: '{picture.encoding}' is no depth; it must be 16UC1 or 32FC1")
+    if (picture.width, picture.height) != size:
+        found, wanted = f"{picture.width}x{picture.height}", f"{size[0]}x{size[1]}"
+        raise FrameRefused("bad_shape", f"{name}: {found} pixels, its camera has {wanted}; give ?info=/topic")
+    return _pixels(picture, name), picture.encoding
+
+
+def find_camera(
+    file: BagFile, topic: str, info: str, stream: str | None, sensor: str
+) -> tuple[PinholeCamera, tuple[str, ...]]:
+    """Return the camera of depth `topic`, and notes. `info`: its CameraInfo topic, "" to search for one.
+
+    stream, sensor: prefixes of a RealSense stream (`/device_0/sensor_0/Depth_0`) and sensor, None and "" for others.
+    Intrinsics: K, or P where the topic's name says that images are rectified. Baseline: the sensor's, else None. Raises
+    SourceError where there is no camera, or no valid one.
+    """
+    where = [info] if info else _places(topic, stream)
+    found = next((place for place in where if place in file.types), None)
+    if found is None:
+        known = sorted(name for name, kind in file.types.items() if kind == CAMERA_INFO)
+        say = f"give one with ?info=/topic{f' (there are: {_few(known)})' if known else ', for example of another bag'}"
+        raise SourceError(f"{file.path}: no {where[0]} that tells the camera of {topic}; {say}")
+    rectified = RECTIFIED.search(topic) is not None
+    try:
+        message = _read(file, found)
+        millimetres = option(file, sensor, "Stereo Baseline") if sensor else None
+        camera = camera_of(message, rectified, millimetres and millimetres / 1000)
+    except (FrameRefused, StereovoxError, ValueError) as error:
+        raise SourceError(f"{file.path}: {found}: {error}") from None
+    if any(message.D) and not rectified:
+        return camera, (f"{file.path}: {found} tells of lens distortion, which is not corrected in {topic}",)
+    return camera, ()
+
+
+def camera_of(info: CameraInfo, rectified: bool, baseline: float | None = None) -> PinholeCamera:
+    """Return the camera of a CameraInfo message; rectified: the images are, so that P counts and not K.
+
+    Raises StereovoxError for an invalid camera.
+    """
+    fx, _, cx, _, fy, cy = info.K[:6]
+    if rectified and info.P[0] > 0:
+        fx, cx, fy, cy = info.P[0], info.P[2], info.P[5], info.P[6]
+    if info.width * info.height > MAX_PIXELS:
+        raise SourceError(f"tells of {info.width}x{info.height} pixels; correct it or name another with ?info=/topic")
+    return PinholeCamera(info.width, info.height, fx, fy, cx, cy, baseline)
+
+
+class Metadata:
+    """Keys and values recorded at exactly the time of another topic's message; {} where there are none."""
+
+    def __init__(self, file: BagFile, topic: str):
+        self._file, self._topic = file, topic
+        self._kind = file.types.get(topic, "")
+        self._stamps = file.stamps(topic) if self._kind in PAIRS else np.empty(0, np.int64)
+
+    def at(self, recorded_ns: int) -> dict[str, str]:
+        """Return what was recorded at that time, without values that cannot be read."""
+        found: dict[str, str] = {}
+        first, last = (int(np.searchsorted(self._stamps, recorded_ns, side)) for side in ("left", "right"))
+        for i in range(first, last):
+            try:
+                found.update(read_pairs(self._file.read(self._topic, i), self._kind))
+            except (FrameRefused, ValueError):
+                continue
+        return found
+
+
+def option(file: BagFile, sensor: str, name: str) -> float | None:
+    """Return a setting of a RealSense sensor (`/device_0/sensor_0`), for example "Depth Units"; None if not recorded.
+
+    Spaces in the name became underscores in librealsense 2.57.
+    """
+    for written in (name, name.replace(" ", "_")):
+        topic = f"{sensor}/option/{written}/value"
+        kind = file.types.get(topic, "")
+        if kind in VALUES:
+            try:
+                value = read_value(file.read(topic, 0), kind)
+            except (FrameRefused, ValueError):
+                continue
+            if math.isfinite(value) and value > 0:
+                return value
+    return None
+
+
+def sibling(topic: str, name: str) -> str:
+    """Return the name of the topic `name` next to `topic`."""
+    return f"{topic.rpartition('/')[0]}/{name}"
+
+
+def _places(topic: str, stream: str | None) -> list[str]:
+    if stream:
+        return [f"{stream}/info/camera_info", f"{stream}/camera_info", f"{stream}/image/camera_info"]
+    return [sibling(topic.removesuffix("/compressedDepth"), "camera_info")]
+
+
+def _read(file: BagFile, topic: str) -> CameraInfo:
+    if file.types[topic] == CAMERA_INFO:
+        return read_camera_info(file.read(topic, 0))
+    pairs = read_pairs(file.read(topic, 0), file.types[topic])
+    try:
+        width, height = int(pairs["width"]), int(pairs["height"])
+        fx, fy, cx, cy = (float(pairs[key]) for key in ("fx", "fy", "ppx", "ppy"))
+    except KeyError as error:
+        raise ValueError(f"{error} is missing; name a topic of {CAMERA_INFO} with ?info=/topic") from None
+    D = tuple(float(word) for word in pairs.get("coeffs", "").split(",") if word)
+    return CameraInfo(width, height, (fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0), D)
+
+
+def _few(names: list[str]) -> str:
+    return ", ".join(names[:6]) + (", ..." if len(names) > 6 else "")
 
 
 def _is_depth(file: BagFile, topic: str) -> bool:

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The kinds of files that hold recorded ROS messages: `.bag` (ROS 1), `.db3` and `.mcap` (ROS 2), and rosbag2 folders.
+"""The protocol of recordings of ROS messages: `.bag` (ROS 1), `.db3` and `.mcap` (ROS 2), and rosbag2 folders.
 
-All give any message of any topic by its number. Whatever is wrong with a file ends in one line, and nothing is
-allocated because a damaged file says so: reads are bounded by the size of the file, unpacking by `MAX_BYTES`.
-By hand, because in the usual readers a hostile file sizes the buffers.
+Every message of every topic can be read by its number. Any damage ends in a one-line error, and no allocation trusts a
+size that the file declares: reads are bounded by the size of the file, decompression by `MAX_BYTES`. Written by hand,
+because in the usual readers a hostile file sizes the buffers.
 """
 
 from __future__ import annotations
@@ -18,14 +18,16 @@ from numpy.typing import NDArray
 from stereovox.sources.bags.messages import Wire
 
 MAX_BYTES = 256 * 1024 * 1024
-"""A message or chunk that unpacks to more than this is taken for damaged."""
+"""Largest message or chunk after decompression; anything larger is treated as damaged."""
 
 
 class BagFile(Protocol):
-    """Recorded messages by topic and number, in order of the time at which they were recorded.
+    """Recorded messages by topic and number, in order of their recording time.
 
-    types: message type of every topic that has messages, as `sensor_msgs/Image`.
-    notes: what is wrong with the file though it can be read, one line each.
+    Attributes:
+        path: The file or folder.
+        types: Message type of each topic that has messages, as `sensor_msgs/Image`.
+        notes: Defects of a file that can be read all the same, one line each.
     """
 
     path: Path
@@ -33,15 +35,36 @@ class BagFile(Protocol):
     notes: tuple[str, ...] = ()
 
     def stamps(self, topic: str) -> NDArray[np.int64]:
-        """Return the (N,) times in nanoseconds at which the messages of `topic` were recorded, in order."""
+        """Return when the messages of a topic were recorded.
+
+        Args:
+            topic: A topic of `types`.
+
+        Returns:
+            (N,) int64 nanoseconds, ascending.
+
+        Raises:
+            SourceError: The file is damaged.
+        """
         ...
 
     def read(self, topic: str, i: int) -> Wire:
-        """Return message `i`; raises FrameRefused `unreadable` where the file is damaged."""
+        """Read one message.
+
+        Args:
+            topic: A topic of `types`.
+            i: Number of the message, in the order of `stamps`.
+
+        Returns:
+            The serialised message.
+
+        Raises:
+            FrameRefused: `unreadable`, where the file is damaged.
+        """
         ...
 
 
-def one_line(said: object) -> str:
-    """Return the text of an error or name in one line, without a full stop."""
-    plain = re.sub(r"\('(.*?)',?\)", r"\1", str(said))  # some print the arguments of an exception as they are
-    return " ".join(plain.split()).rstrip(".") or f"damaged ({type(said).__name__})"
+def one_line(error: object) -> str:
+    """Return the text of an error or name on one line, without a full stop."""
+    plain = re.sub(r"\('(.*?)',?\)", r"\1", str(error))  # some print the arguments of an exception as they are
+    return " ".join(plain.split()).rstrip(".") or f"damaged ({type(error).__name__})"

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings of ROS 2 as rosbag2 makes them: a folder with one or several `.mcap` or `.db3` files."""
+"""ROS 2 recordings as rosbag2 folders with one or several `.mcap` or `.db3` files."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ NUMBERED = re.compile(r".*_(\d+)\.(mcap|db3)", re.DOTALL)
 
 
 class FolderFile(BagFile):
-    """A folder that rosbag2 recorded; a recording that was split is one, whatever its files are called.
+    """A rosbag2 folder; the parts of a split recording are joined, whatever their names.
 
-    Without `metadata.yaml`, which rosbag2 writes at the end, the numbered files of the folder count, and `notes` say
-    so. open_part: opens one of the files. Raises SourceError, one line, for files that are missing, damaged, or packed
-    as a whole.
+    Without `metadata.yaml`, which rosbag2 writes at the end, the numbered files of the folder are used, and `notes` say
+    so. open_part: opens one of the files. Raises SourceError for files that are missing, damaged, or compressed as a
+    whole and not readable.
     """
 
     def __init__(self, path: Path, open_part: Callable[[Path], BagFile]):
@@ -49,7 +49,7 @@ class FolderFile(BagFile):
         return self._parts[part].read(topic, k)
 
     def _of(self, topic: str) -> NDArray[np.int64]:
-        """Return time, file and number there of a topic's messages, (N, 3), in order of time."""
+        """Return time, file number and message number of a topic's messages, (N, 3), in time order."""
         if topic not in self._places:
             rows = []
             for number, part in enumerate(self._parts):
@@ -62,7 +62,7 @@ class FolderFile(BagFile):
 
 
 def is_bag_folder(path: str) -> bool:
-    """Tell whether a folder is such a recording. Never raises."""
+    """Return whether a folder is a rosbag2 recording. Never raises."""
     folder = Path(path)
     try:
         if not folder.is_dir():
@@ -82,8 +82,8 @@ def _files(folder: Path) -> tuple[list[str], tuple[str, ...]]:
         if not names:
             raise SourceError(f"{folder}: no {METADATA} in it; give the folder that rosbag2 made, or a file of it")
         return names, (f"{folder}: no {METADATA}, as after a recording that was cut off: {_few(names)} taken",)
-    told = _metadata(folder / METADATA)
-    names = told.get("relative_file_paths")
+    metadata = _metadata(folder / METADATA)
+    names = metadata.get("relative_file_paths")
     if not isinstance(names, list) or not names or not all(isinstance(name, str) and name for name in names):
         raise SourceError(f"{folder / METADATA}: names no files; write it anew with 'ros2 bag reindex'")
     return list(dict.fromkeys(PurePath(name).name for name in names)), ()  # older ones tell the folder as well
@@ -91,13 +91,13 @@ def _files(folder: Path) -> tuple[list[str], tuple[str, ...]]:
 
 def _metadata(path: Path) -> dict[str, Any]:
     try:
-        told = yaml_value(read_bounded(path, MAX_METADATA))[TITLE]
-        if not isinstance(told, dict):
+        metadata = yaml_value(read_bounded(path, MAX_METADATA))[TITLE]
+        if not isinstance(metadata, dict):
             raise TypeError(f"{TITLE} holds nothing")
     except (OSError, ValueError, TypeError, KeyError) as error:
         cure = "write it anew with 'ros2 bag reindex'"
         raise SourceError(f"{path}: {one_line(error)[:200]}; {cure}") from None
-    return told
+    return metadata
 
 
 def _numbered(folder: Path) -> list[str]:

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The few ROS messages that matter here, read from their serialised bytes: ROS 1 and ROS 2 (CDR) alike.
+"""The few ROS messages needed for depth images and poses, parsed from their bytes: ROS 1 and ROS 2 (CDR) alike.
 
-Written out by hand, because librealsense's ROS 1 images are longer than their own definition tells (a float with the
-depth unit follows where the header's frame_id is "1"), which general readers refuse, and because nothing is allocated
-for a length that lies.
+Written by hand, because librealsense's ROS 1 images are longer than their own definition (a float with the depth unit
+follows where the header's frame_id is "1"), which general readers refuse, and because no allocation here trusts a
+declared length.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ POSE_TYPES = frozenset({"geometry_msgs/Transform", "nav_msgs/Odometry"} | {f"geo
 
 
 class Wire:
-    """Reads a serialised message from front to back; raises ValueError where the bytes do not suffice.
+    """A serialised message, read from front to back; raises ValueError where it is too short.
 
     cdr: ROS 2's encoding: four bytes of header, numbers aligned to their own size, text ends in a zero byte.
     """
@@ -39,7 +39,7 @@ class Wire:
 
     @property
     def left(self) -> int:
-        """Bytes not read so far."""
+        """Bytes not read yet."""
         return len(self._view) - self._at
 
     def numbers(self, code: str, count: int = 1) -> tuple[Any, ...]:
@@ -117,7 +117,7 @@ def read_compressed(wire: Wire) -> Picture:
 
 @dataclass(frozen=True)
 class CameraInfo:
-    """What a `sensor_msgs/CameraInfo` tells: K (3x3) and P (3x4) row by row, and the distortion coefficients D."""
+    """A `sensor_msgs/CameraInfo`: K (3x3) and P (3x4) row by row, and the distortion coefficients D."""
 
     width: int
     height: int

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What tells poses in a recording: a T265's own topic, /tf, or a topic of ordinary ROS messages."""
+"""Find the poses in a recording: a T265's own topic, /tf, or a topic of ordinary ROS messages."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from stereovox.sources.poses import Poses
 from stereovox.sources.trajectory import transforms
 
 T265 = re.compile(r"(/device_\d+/sensor_\d+/Pose_\d+/pose)/transform/data")
-"""Its geometry_msgs/Transform has no time: that stands in the metadata, with the confidence."""
+"""A geometry_msgs/Transform without a time: that is in the metadata, with the confidence."""
 CURE = "put poses beside it in a camera pair (pair.toml), or add ?pose=fixed for a camera that stood still"
 
 
 @dataclass(frozen=True)
 class FoundPoses:
-    """Poses as the file has them, in its axes; None, and why in one line, where there are none.
+    """Poses as the file has them, in its axes; None, and the reason in one line, where there are none.
 
     tracker: they are a T265's, in OpenGL axes; of_camera: the messages say that they are those of the depth camera;
     assumed: else, what is assumed about them.
@@ -38,10 +38,10 @@ class FoundPoses:
 
 
 def find_poses(file: BagFile, topic: str = "", frame_id: str = "", world_frame: str = "") -> FoundPoses:
-    """Return the poses of `topic`, else what /tf tells of the camera, else those of the only topic that has some.
+    """Return the poses of `topic`, else the camera's according to /tf, else those of the only topic that has any.
 
-    frame_id: frame of the depth images, "" to leave /tf alone. world_frame: see `bag_tf.tf_poses`.
-    Raises SourceError where the named topic does not exist or has no poses, and where /tf does not know `world_frame`.
+    frame_id: frame of the depth images, "" to skip /tf. world_frame: see `tf.tf_poses`. Raises SourceError where the
+    named topic does not exist or has no poses, and where /tf does not know `world_frame`.
     """
     if topic:
         return topic_poses(file, topic, frame_id)
@@ -64,12 +64,12 @@ def topic_poses(file: BagFile, topic: str, frame_id: str = "") -> FoundPoses:
     if topic not in file.types:
         raise SourceError(f"{file.path}: no topic {topic} with messages{did_you_mean(topic, file.types)}")
     if file.types[topic] not in POSE_TYPES:
-        raise SourceError(f"{file.path}: {topic} holds {file.types[topic]}, no poses; name one of {_known()}")
+        raise SourceError(f"{file.path}: {topic} holds {file.types[topic]}, no poses; name one of {_supported_types()}")
     return _read(file, topic, frame_id)
 
 
 def _from_tf(file: BagFile, frame_id: str, world_frame: str) -> tuple[TfPoses | None, str]:
-    """Return what /tf tells of the camera; without it, why it does not."""
+    """Return the camera's poses according to /tf, or the reason why there are none."""
     tf = read_tf(file)
     if tf is None or not frame_id:
         if world_frame:
@@ -81,7 +81,7 @@ def _from_tf(file: BagFile, frame_id: str, world_frame: str) -> tuple[TfPoses | 
 
 
 def pose_topics(file: BagFile) -> list[str]:
-    """Return the topics with poses; a RealSense file also tells how its own sensors are mounted, which is none."""
+    """Return the topics with poses, without those that say how a RealSense's own sensors are mounted."""
     loose = "geometry_msgs/Transform"
     return sorted(t for t, kind in file.types.items() if kind in POSE_TYPES and (kind != loose or T265.fullmatch(t)))
 
@@ -95,16 +95,16 @@ def _read(file: BagFile, topic: str, frame_id: str) -> FoundPoses:
             pose = read_pose(file.read(topic, i), kind)
         except (FrameRefused, ValueError):
             continue  # images near it find no pose near enough
-        told = metadata.at(int(recorded[i])) if metadata else {}
-        stamps.append(_stamp(pose, told, int(recorded[i])))
+        values = metadata.at(int(recorded[i])) if metadata else {}
+        stamps.append(_stamp(pose, values, int(recorded[i])))
         numbers.append(pose.numbers)
-        confidence.append(_confidence(told.get("Tracker Confidence", "")))
+        confidence.append(_confidence(values.get("Tracker Confidence", "")))
         child = child or pose.child
     where = f"{file.path} {topic}"
     if not stamps:
         return FoundPoses(None, f"{where}: not one pose can be read; {CURE}")
     rows = np.array(numbers)
-    faults = _spoil(rows, stamps, where)
+    faults = _mark_unusable(rows, stamps, where)
     trusted = np.array(confidence) if np.isfinite(confidence).any() else None
     with np.errstate(invalid="ignore"):
         poses = Poses(stamps, transforms(rows), trusted, where=where, faults=faults)
@@ -113,10 +113,10 @@ def _read(file: BagFile, topic: str, frame_id: str) -> FoundPoses:
     return FoundPoses(poses, "", bool(match), bool(child) and child.strip("/") == frame_id.strip("/"), assumed)
 
 
-def _stamp(pose: StampedPose, told: dict[str, str], recorded_ns: int) -> int:
+def _stamp(pose: StampedPose, metadata: dict[str, str], recorded_ns: int) -> int:
     if pose.stamp_ns is not None:
         return pose.stamp_ns
-    stamp_ns = ns_from_ms(told.get("frame_timestamp", ""))
+    stamp_ns = ns_from_ms(metadata.get("frame_timestamp", ""))
     return recorded_ns if stamp_ns is None else stamp_ns
 
 
@@ -127,12 +127,12 @@ def _confidence(text: str) -> float:
         return math.nan
 
 
-def _spoil(rows: np.ndarray, stamps: list[int], where: str) -> dict[int, str]:
-    """Turn poses that are none into NaN, and return by stamp what is wrong with them."""
+def _mark_unusable(rows: np.ndarray, stamps: list[int], where: str) -> dict[int, str]:
+    """Replace invalid poses by NaN, and return by stamp what is wrong with them."""
     bad = ~np.isfinite(rows).all(axis=1) | (np.linalg.norm(rows[:, 3:], axis=1) < 1e-6)
     rows[bad] = np.nan
     return {stamps[k]: f"{where}: message {k} holds no pose; leave the images near it out" for k in np.flatnonzero(bad)}
 
 
-def _known() -> str:
+def _supported_types() -> str:
     return ", ".join(sorted(POSE_TYPES))

@@ -24,7 +24,7 @@ from stereovox.sources.poses import Poses
 from stereovox.sources.tracker import AXES, WORLDS, turned
 
 STANDING = ("", "fixed")
-Given = TypeVar("Given")
+OptionsT = TypeVar("OptionsT")
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ class Bag(DepthSource):
     pose of the depth camera's optical frame unless `axes` says otherwise; where the poses are those of another camera,
     or in another file, a camera pair (`pair.toml`) puts them together.
     Faults: `unreadable`, `bad_dtype`, `bad_shape`; `no_pose` and `bad_pose_file` with the depth image all the same.
-    Raises SourceError, one line, for files that are empty, damaged or without usable depth, and for bad options.
+    Raises SourceError for files that are empty, damaged or without usable depth, and for bad options.
     """
 
     layout = "a RealSense .db3 or .bag, or a .bag, .db3, .mcap or rosbag2 folder with depth images"
@@ -107,7 +107,7 @@ class Bag(DepthSource):
 
     @classmethod
     def recognises(cls, where: str) -> bool:
-        """Tell whether `where` is, or by its name should be, such a file or folder; options may follow."""
+        """Return whether `where` is, or by its name should be, such a file or folder; options may follow."""
         return bool(suffix_of(file_part(where)))
 
     @classmethod
@@ -159,7 +159,7 @@ def depth_frame(
 
 
 def file_part(where: str) -> str:
-    """Return `where` without options; a file or folder whose name holds a `?` comes first. Never raises."""
+    """Return `where` without options; an existing path with a `?` in its name comes first. Never raises."""
     try:
         whole = Path(where).exists()
     except (OSError, ValueError):
@@ -168,23 +168,23 @@ def file_part(where: str) -> str:
 
 
 def parse(where: str) -> tuple[Path, Options]:
-    """Return file and options; raises SourceError, one line, for bad options."""
+    """Return file and options; raises SourceError for bad options."""
     return parse_as(where, Options)
 
 
-def parse_as(where: str, kind: type[Given]) -> tuple[Path, Given]:
-    """Return file and options of a kind; raises SourceError, one line, for bad options."""
+def parse_as(where: str, kind: type[OptionsT]) -> tuple[Path, OptionsT]:
+    """Return file and options of a given class; raises SourceError for bad options."""
     file = file_part(where)
     try:
-        _, given = parameters.split(where[len(file) :])
-        return Path(file), kind(**parameters.typed(given, parameters.defaults(kind)))
+        _, texts = parameters.split(where[len(file) :])
+        return Path(file), kind(**parameters.typed(texts, parameters.defaults(kind)))
     except SourceError as error:
         raise SourceError(f"{where}: {error}") from None
 
 
 @dataclass(frozen=True)
 class TurnedTf:
-    """Poses out of /tf of a body in optical axes; see `tracker.turned`."""
+    """Poses from /tf of a body in optical axes; see `tracker.turned`."""
 
     poses: TfPoses
     axes: str
@@ -196,7 +196,7 @@ class TurnedTf:
 
 
 def read_poses(file: Any, options: Options, frame_id: str) -> tuple[Poses | TurnedTf | None, str, tuple[str, ...]]:
-    """Return the poses in a bag, if there are any, why there are none, and notes about what had to be assumed."""
+    """Return the poses in a bag, if any, the reason if there are none, and notes about assumptions."""
     found = find_poses(file, options.poses, frame_id, options.world_frame)
     if found.poses is None:
         return None, found.missing, ()

@@ -1,12 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The messages of ground robots and of finished maps, read from their serialised bytes.
+"""Messages of ground robots and finished maps (OccupancyGrid, Octomap), parsed from their serialised bytes.
 
-ROS 1 and ROS 2 (CDR) alike, as in `bag_messages`. All raise ValueError, one line, for bytes that do not suffice or say
-what cannot be; nothing is allocated for a length that lies.
-
-The messages of finished maps, read from their serialised bytes: `nav_msgs/OccupancyGrid`, `octomap_msgs/Octomap`.
-ROS 1 and ROS 2 (CDR) alike, as in `bag_messages`. Both raise ValueError, one line, for bytes that do not suffice or say
-what cannot be; nothing is allocated for a length that lies.
+ROS 1 and ROS 2 (CDR) alike, as in `messages`. All raise ValueError, one line, for bytes that are too few or values that
+are impossible; no allocation trusts a declared length.
 """
 
 from __future__ import annotations
@@ -23,47 +19,6 @@ from stereovox.maps.occupancy import UNKNOWN, OccupancyGrid
 from stereovox.sources.bags.messages import Wire
 
 OCCUPANCY_GRID, OCTOMAP = "nav_msgs/OccupancyGrid", "octomap_msgs/Octomap"
-
-
-@dataclass(frozen=True)
-class OctomapMessage:
-    """An `octomap_msgs/Octomap`: nodes as in a `.bt` (binary) or `.ot` file; resolution: side of a cell in metres."""
-
-    frame_id: str
-    binary: bool
-    tree: str
-    resolution: float
-    data: bytes
-
-
-def read_octomap_message(wire: Wire) -> OctomapMessage:
-    """Return an `octomap_msgs/Octomap`."""
-    _, frame_id = wire.header()
-    binary, tree, resolution = bool(wire.number("B")), wire.text(), wire.number("d")
-    return OctomapMessage(frame_id, binary, tree, resolution, bytes(wire.data()))
-
-
-def read_occupancy_grid(wire: Wire) -> OccupancyGrid:
-    """Return a `nav_msgs/OccupancyGrid`; numbers that are no per cent are unknown, as navigation programs take them.
-
-    The message's resolution is a float32: the shortest number that means it is taken, 0.05 for 0.0500000007.
-    """
-    wire.header()
-    wire.numbers("I", 2)  # when the map was loaded
-    resolution = float(str(np.float32(wire.number("f"))))
-    width, height = wire.numbers("I", 2)
-    x, y, _, qx, qy, qz, qw = wire.numbers("d", 7)
-    count = wire.number()
-    if count != width * height or not count:
-        raise ValueError(f"a grid of {width} x {height} with {count} cells")
-    yaw = atan2(2 * (qw * qz + qx * qy), qw * qw + qx * qx - qy * qy - qz * qz)
-    if not (0 < resolution < np.inf and all(map(isfinite, (x, y, yaw)))):
-        raise ValueError(f"a grid with cells of {resolution:g} m at {x:g}, {y:g}")
-    cells = np.frombuffer(wire.block(count), np.int8)
-    known = (cells >= 0) & (cells <= 100)
-    return OccupancyGrid(np.where(known, cells, np.int8(UNKNOWN)).reshape(height, width), resolution, (x, y, yaw))
-
-
 LASER_SCAN, POINT_CLOUD, ODOMETRY = "sensor_msgs/LaserScan", "sensor_msgs/PointCloud2", "nav_msgs/Odometry"
 TF_TYPES = ("tf2_msgs/TFMessage", "tf/tfMessage")
 FLOATS = {7: "f4", 8: "f8"}
@@ -71,7 +26,7 @@ FLOATS = {7: "f4", 8: "f8"}
 MAX_FIELDS = 256
 MAX_BEAMS = 100_000
 LARGEST = 1e9
-"""Metres: no robot goes there, and the products of such numbers are finite."""
+"""Metres: beyond any robot's reach, while products of such numbers stay finite."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,16 +47,16 @@ class LaserScan:
 
 
 def read_laser_scan(wire: Wire, range_max: float = 0.0) -> LaserScan:
-    """Return a `sensor_msgs/LaserScan`; `range_max`, where given, stands in place of the message's own.
+    """Return a `sensor_msgs/LaserScan`; `range_max`, if given, replaces the message's own.
 
-    What the driver wrote becomes (REP 117): NaN stays NaN; below range_min, -inf and 0.0 (what many drivers write for
-    "no reading") -inf, which clears nothing; range_max itself, all beyond it (drivers of Hokuyo write range_max + 1 for
-    "no echo") and +inf become +inf, which clears up to range_max. Raises ValueError also for angles and limits that
-    make no sense.
+    Ranges become (REP 117): NaN stays NaN; below range_min, -inf and 0.0 (what many drivers write for "no reading")
+    become -inf, which clears nothing; range_max itself, all beyond it (drivers of Hokuyo write range_max + 1 for "no
+    echo") and +inf become +inf, which clears up to range_max. Raises ValueError also for angles and limits that make no
+    sense.
     """
     stamp_ns, frame_id = wire.header()
-    angle_min, _, angle_step, _, _, range_min, told_max = wire.numbers("f", 7)
-    range_max = range_max or told_max
+    angle_min, _, angle_step, _, _, range_min, declared_max = wire.numbers("f", 7)
+    range_max = range_max or declared_max
     count = wire.number()
     if count > MAX_BEAMS:
         raise ValueError(f"a scan of {count} ranges; no lidar has so many beams")
@@ -119,7 +74,7 @@ def read_laser_scan(wire: Wire, range_max: float = 0.0) -> LaserScan:
 
 
 def marked_ranges(ranges: NDArray[np.float32], range_min: float, range_max: float) -> NDArray[np.float32]:
-    """Return (N,) float32 ranges in which only what lies in [range_min, range_max) is a number (see `LaserScan`)."""
+    """Return (N,) float32 ranges in which only those in [range_min, range_max) are numbers (see `LaserScan`)."""
     with np.errstate(invalid="ignore"):
         near = (ranges < np.float32(range_min)) | (ranges <= 0)
         return np.where(near, -np.inf, np.where(ranges >= np.float32(range_max), np.inf, ranges)).astype(np.float32)
@@ -172,29 +127,11 @@ def read_point_cloud(wire: Wire) -> PointCloud:
         return PointCloud(stamp_ns, frame_id, np.stack(columns, axis=1).astype(np.float32))
 
 
-def _fields(wire: Wire) -> dict[str, tuple[int, int]]:
-    """Return offset and type of each field by its name."""
-    count = wire.number()
-    if count > MAX_FIELDS:
-        raise ValueError(f"a cloud with {count} fields")
-    found = {}
-    for _ in range(count):
-        name, offset, kind, _ = wire.text(), wire.number(), wire.number("B"), wire.number()
-        found.setdefault(name, (offset, kind))
-    return found
-
-
-def _check_size(height: int, width: int, point_step: int, row_step: int, size: int) -> None:
-    needed = (height - 1) * row_step + width * point_step if height and width else 0
-    if needed > size:
-        raise ValueError(f"a cloud of {width}x{height} points needs {needed} bytes and has {size}")
-
-
 @dataclass(frozen=True)
 class StampedTransform:
-    """Where frame `child` stands in frame `parent`: tx ty tz in metres, quaternion qx qy qz qw of any length.
+    """The pose of frame `child` in frame `parent`: tx ty tz in metres, quaternion qx qy qz qw of any length.
 
-    Names are as in tf2: without the slash that tf1 puts in front of them.
+    Names are as in tf2: without the leading slash of tf1.
     """
 
     stamp_ns: int
@@ -214,14 +151,71 @@ def read_transforms(wire: Wire) -> list[StampedTransform]:
 
 
 def is_motion(numbers: Sequence[float]) -> bool:
-    """Tell whether tx ty tz qx qy qz qw are seven numbers below `LARGEST` with a quaternion longer than zero."""
+    """Return whether tx ty tz qx qy qz qw are seven numbers below `LARGEST` with a non-zero quaternion."""
     return len(numbers) == 7 and all(abs(x) < LARGEST for x in numbers) and hypot(*numbers[3:]) > 1e-6
 
 
 @lru_cache(maxsize=1024)
 def frame_name(frame_id: str) -> str:
-    """Return the name of a frame as tf2 writes it: tf1 puts a slash in front."""
+    """Return a frame's name as tf2 writes it, without the leading slash of tf1."""
     return frame_id.strip().lstrip("/")
+
+
+def read_occupancy_grid(wire: Wire) -> OccupancyGrid:
+    """Return a `nav_msgs/OccupancyGrid`; values outside 0 to 100 are unknown, as navigation programs treat them.
+
+    The message's resolution is a float32: the shortest number that rounds to it is used, 0.05 for 0.0500000007.
+    """
+    wire.header()
+    wire.numbers("I", 2)  # when the map was loaded
+    resolution = float(str(np.float32(wire.number("f"))))
+    width, height = wire.numbers("I", 2)
+    x, y, _, qx, qy, qz, qw = wire.numbers("d", 7)
+    count = wire.number()
+    if count != width * height or not count:
+        raise ValueError(f"a grid of {width} x {height} with {count} cells")
+    yaw = atan2(2 * (qw * qz + qx * qy), qw * qw + qx * qx - qy * qy - qz * qz)
+    if not (0 < resolution < np.inf and all(map(isfinite, (x, y, yaw)))):
+        raise ValueError(f"a grid with cells of {resolution:g} m at {x:g}, {y:g}")
+    cells = np.frombuffer(wire.block(count), np.int8)
+    known = (cells >= 0) & (cells <= 100)
+    return OccupancyGrid(np.where(known, cells, np.int8(UNKNOWN)).reshape(height, width), resolution, (x, y, yaw))
+
+
+@dataclass(frozen=True)
+class OctomapMessage:
+    """An `octomap_msgs/Octomap`: nodes as in a `.bt` (binary) or `.ot` file; resolution: side of a cell in metres."""
+
+    frame_id: str
+    binary: bool
+    tree: str
+    resolution: float
+    data: bytes
+
+
+def read_octomap_message(wire: Wire) -> OctomapMessage:
+    """Return an `octomap_msgs/Octomap`."""
+    _, frame_id = wire.header()
+    binary, tree, resolution = bool(wire.number("B")), wire.text(), wire.number("d")
+    return OctomapMessage(frame_id, binary, tree, resolution, bytes(wire.data()))
+
+
+def _fields(wire: Wire) -> dict[str, tuple[int, int]]:
+    """Return offset and type of each field by its name."""
+    count = wire.number()
+    if count > MAX_FIELDS:
+        raise ValueError(f"a cloud with {count} fields")
+    found = {}
+    for _ in range(count):
+        name, offset, kind, _ = wire.text(), wire.number(), wire.number("B"), wire.number()
+        found.setdefault(name, (offset, kind))
+    return found
+
+
+def _check_size(height: int, width: int, point_step: int, row_step: int, size: int) -> None:
+    needed = (height - 1) * row_step + width * point_step if height and width else 0
+    if needed > size:
+        raise ValueError(f"a cloud of {width}x{height} points needs {needed} bytes and has {size}")
 
 
 def _transform(wire: Wire) -> StampedTransform:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""ROS 1 bags, by any message: rosbags reads the index, a bounded file and bounded unpacking keep damage harmless."""
+"""ROS 1 bags: rosbags reads the index; a bounded file and bounded decompression keep damage harmless."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from stereovox.errors import FrameRefused, MissingExtra, SourceError
 from stereovox.sources.bags.files import MAX_BYTES, BagFile, one_line
 from stereovox.sources.bags.messages import Wire
-from stereovox.sources.bags.unpack import unpacked
+from stereovox.sources.bags.unpack import decompress
 
 CHUNKS = 4
-"""Unpacked chunks kept: enough for an image, its metadata and the poses around it."""
+"""Decompressed chunks kept: enough for an image, its metadata and the poses around it."""
 
 
 class Ros1File(BagFile):
@@ -119,4 +119,4 @@ def _unpacked(data: bytes, decompressor: Any) -> bytes:
     from rosbags.rosbag1.reader import decompressors
 
     packing = next((name for name in ("bz2", "lz4") if decompressors[name] is decompressor), "")
-    return unpacked(data, packing, MAX_BYTES)
+    return decompress(data, packing, MAX_BYTES)

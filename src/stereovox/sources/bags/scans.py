@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The topics of a ground robot in a recording: scans, or point clouds in their place, and odometry."""
+"""Topics of a ground robot in a recording: scans, or point clouds in their place, and odometry."""
 
 from __future__ import annotations
 
@@ -23,7 +23,8 @@ from stereovox.sources.bags.robot_messages import (
 )
 from stereovox.sources.bags.tf import Edge
 
-LOOKS = 5
+MAX_ATTEMPTS = 5
+"""Messages tried before a topic counts as unreadable."""
 
 
 class ScanTopic:
@@ -53,10 +54,10 @@ class ScanTopic:
         """Return scan `i`, with the time of recording where it has none; raises FrameRefused `unreadable`."""
         wire = self._file.read(self.topic, i)
         try:
-            told = read_point_cloud(wire) if self.is_cloud else read_laser_scan(wire, self._range_max)
+            message = read_point_cloud(wire) if self.is_cloud else read_laser_scan(wire, self._range_max)
         except ValueError as error:
             raise FrameRefused("unreadable", f"{self.name(i)}: {error}; leave it out") from None
-        return replace(told, stamp_ns=told.stamp_ns or self.recorded_ns(i), frame_id=frame_name(told.frame_id))
+        return replace(message, stamp_ns=message.stamp_ns or self.recorded_ns(i), frame_id=frame_name(message.frame_id))
 
 
 def find_scans(
@@ -70,17 +71,17 @@ def find_scans(
     if topic:
         check_topic(file, topic, (LASER_SCAN, POINT_CLOUD), "scan")
         return ScanTopic(file, topic, range_max), ()
-    found = _of_kind(file, LASER_SCAN)
+    found = _topics_of_type(file, LASER_SCAN)
     if not found:
-        clouds = _of_kind(file, POINT_CLOUD)
+        clouds = _topics_of_type(file, POINT_CLOUD)
         found = [name for name in clouds if not depth_frame or frame_id_of(file, name) != frame_name(depth_frame)]
     if not found:
         return None, ()
-    best, said = most(file, found), ()
+    best, note = busiest_topic(file, found), ()
     if len(found) > 1:
         others = ", ".join(name for name in found if name != best)
-        said = (f"{file.path}: scans of {best}, which has most; there are {others} too: say ?scan=/topic for those",)
-    return ScanTopic(file, best, range_max), said
+        note = (f"{file.path}: scans of {best}, which has most; there are {others} too: say ?scan=/topic for those",)
+    return ScanTopic(file, best, range_max), note
 
 
 def check_topic(file: BagFile, topic: str, kinds: Iterable[str], option: str) -> None:
@@ -91,14 +92,14 @@ def check_topic(file: BagFile, topic: str, kinds: Iterable[str], option: str) ->
         raise SourceError(f"{file.path}: {topic} holds {file.types[topic]}; ?{option}= needs {' or '.join(kinds)}")
 
 
-def most(file: BagFile, topics: list[str]) -> str:
-    """Return the topic with most messages, of several the first."""
+def busiest_topic(file: BagFile, topics: list[str]) -> str:
+    """Return the topic with most messages, the first of several."""
     return max(topics, key=lambda topic: len(file.stamps(topic)))
 
 
 def frame_id_of(file: BagFile, topic: str) -> str:
     """Return the frame that the header of the first readable message of a topic names, "" where none does."""
-    for i in range(min(LOOKS, len(file.stamps(topic)))):
+    for i in range(min(MAX_ATTEMPTS, len(file.stamps(topic)))):
         try:
             return frame_name(file.read(topic, i).header()[1])
         except (FrameRefused, ValueError):
@@ -106,15 +107,11 @@ def frame_id_of(file: BagFile, topic: str) -> str:
     return ""
 
 
-def _of_kind(file: BagFile, kind: str) -> list[str]:
-    return sorted(topic for topic, known in file.types.items() if known == kind)
-
-
 def odometry_topic(file: BagFile, given: str = "", other: str = "") -> tuple[str, tuple[str, ...]]:
-    """Return the topic with the robot's odometry, "" where there is none, and notes.
+    """Return the topic with the robot's odometry, "" if there is none, and notes.
 
-    given: counts, where it is not ""; other: a topic that is not meant. Of several the one with most messages counts.
-    Raises SourceError where the given one does not exist or is none.
+    given: preferred unless ""; other: a topic to ignore. Of several the one with most messages counts. Raises
+    SourceError where the given one does not exist or is not odometry.
     """
     if given:
         check_topic(file, given, (ODOMETRY,), "odom")
@@ -122,15 +119,15 @@ def odometry_topic(file: BagFile, given: str = "", other: str = "") -> tuple[str
     found = sorted(topic for topic, kind in file.types.items() if kind == ODOMETRY and topic != other)
     if not found:
         return "", ()
-    best = most(file, found)
+    best = busiest_topic(file, found)
     others = ", ".join(topic for topic in found if topic != best)
-    said = f"odometry of {best}, which has most; there is {others} too: say ?odom=/topic or ?truth=/topic for it"
-    return best, (f"{file.path}: {said}",) if others else ()
+    note = f"odometry of {best}, which has most; there is {others} too: say ?odom=/topic or ?truth=/topic for it"
+    return best, (f"{file.path}: {note}",) if others else ()
 
 
 def first_odometry(file: BagFile, topic: str) -> StampedTransform | None:
     """Return the first readable message, None where none of the first few is."""
-    for i in range(min(LOOKS, len(file.stamps(topic)))):
+    for i in range(min(MAX_ATTEMPTS, len(file.stamps(topic)))):
         try:
             return read_odometry(file.read(topic, i))
         except (FrameRefused, ValueError):
@@ -139,18 +136,23 @@ def first_odometry(file: BagFile, topic: str) -> StampedTransform | None:
 
 
 def odometry_edge(file: BagFile, topic: str, parent: str, child: str) -> Edge:
-    """Return the poses of a topic as transforms of `child` in `parent`; what cannot be read or is no pose is a gap.
+    """Return the poses of a topic as transforms of `child` in `parent`; unreadable messages and invalid poses leave
+    gaps.
 
-    Raises SourceError where not one pose can be read.
+    Raises SourceError where no pose can be read.
     """
     edge, recorded = Edge(parent, child, topic), file.stamps(topic)
     for i in range(len(recorded)):
         try:
-            told = read_odometry(file.read(topic, i))
+            message = read_odometry(file.read(topic, i))
         except (FrameRefused, ValueError):
             continue
-        if is_motion(told.numbers):
-            edge.add(told.stamp_ns or int(recorded[i]), told.numbers)
+        if is_motion(message.numbers):
+            edge.add(message.stamp_ns or int(recorded[i]), message.numbers)
     if not edge.count:
         raise SourceError(f"{file.path}: {topic}: not one pose can be read; name another with ?odom=/topic")
     return edge
+
+
+def _topics_of_type(file: BagFile, kind: str) -> list[str]:
+    return sorted(topic for topic, known in file.types.items() if known == kind)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A tree of frames over a whole recording: where one frame stood in another at a time (what ROS calls tf).
+"""The tree of coordinate frames over a whole recording (ROS's tf): transforms between frames at a time.
 
-Frames are named as tf2 does it, without a slash in front. Every frame has one parent; what connects two frames is the
-way up to their common ancestor and down again.
+Frames are named as in tf2, without a leading slash. Every frame has one parent; two frames are connected through their
+common ancestor.
 """
 
 from __future__ import annotations
@@ -22,11 +22,13 @@ from stereovox.sources.bags.robot_messages import TF_TYPES, frame_name, is_motio
 from stereovox.sources.poses import seconds_from_ns
 
 STILL = 1e-9
+WORLDS = ("map", "odom")
+"""Frames used as the world, the first that exists: REP 105."""
 
 
 @dataclass(frozen=True)
 class Limits:
-    """How far transforms may be from a time they are asked for.
+    """How far in time transforms may be from a query.
 
     max_gap_s: longest time between two transforms that is bridged. extrapolate_s: how long the last transform holds
     after its time, and the first before it; a robot of 1 m/s is 0.1 m off after 0.1 s.
@@ -37,10 +39,10 @@ class Limits:
 
 
 class Edge:
-    """Where frame `child` stood in frame `parent`: at the times of its transforms and between them, or always (fixed).
+    """The pose of frame `child` in frame `parent`: at the times of its transforms and between them, or always (fixed).
 
-    A frame that has the same transform in all messages, two at least, is taken for a fixed one that is sent again and
-    again: any gap between them is bridged, and the ends hold for `max_gap_s`.
+    A frame that has the same transform in all messages, at least two, counts as a fixed one that is sent repeatedly:
+    any gap between them is bridged, and the ends hold for `max_gap_s`.
     """
 
     def __init__(self, parent: str, child: str, name: str = ""):
@@ -57,7 +59,7 @@ class Edge:
 
     @property
     def count(self) -> int:
-        """How many transforms it has, 1 where it is fixed."""
+        """Number of transforms, 1 if fixed."""
         return 1 if self.fixed else len(self._stamps)
 
     @property
@@ -68,13 +70,13 @@ class Edge:
         return not (self.fixed or self._still)
 
     def add(self, stamp_ns: int, numbers: Iterable[float]) -> None:
-        """Take in tx ty tz qx qy qz qw at a time; of several with one time the first counts."""
+        """Add tx ty tz qx qy qz qw at a time; of several with one time the first counts."""
         self._stamps.append(stamp_ns)
         self._rows.extend(numbers)
         self._sorted = None
 
     def fix(self, T_parent_child: Transform) -> None:
-        """Take in where the child always stands."""
+        """Set the constant pose of the child."""
         self._fixed = np.array(T_parent_child, float)
 
     def at(self, stamp_ns: int, limits: Limits, where: str) -> Transform:
@@ -92,9 +94,10 @@ class Edge:
             return self._held(stamp_ns, max(after - 1, 0), limits, where)
         start, end = int(stamps[after - 1]), int(stamps[after])
         if end - start > limits.max_gap_s * 1e9 and not self._still:
-            told = f"has no transform for {_seconds(end - start)} after {seconds_from_ns(start)} s"
+            message = f"has no transform for {_seconds(end - start)} after {seconds_from_ns(start)} s"
             raise FrameRefused(
-                "no_pose", f"{where}: {self} {told} (at most {limits.max_gap_s:g} s is bridged); record it more often"
+                "no_pose",
+                f"{where}: {self} {message} (at most {limits.max_gap_s:g} s is bridged); record it more often",
             )
         return interpolate(_motion(rows[after - 1]), _motion(rows[after]), (stamp_ns - start) / (end - start))
 
@@ -114,8 +117,8 @@ class Edge:
         limit_s = max(limits.max_gap_s, limits.extrapolate_s) if self._still else limits.extrapolate_s
         if away > limit_s * 1e9:
             side = "begins after" if stamp_ns < stamps[nearest] else "ends before"
-            told = f"{side} {seconds_from_ns(stamp_ns)} s, {_seconds(away)} away (at most {limit_s:g} s)"
-            raise FrameRefused("no_pose", f"{where}: {self} {told}; leave that part of the recording out")
+            message = f"{side} {seconds_from_ns(stamp_ns)} s, {_seconds(away)} away (at most {limit_s:g} s)"
+            raise FrameRefused("no_pose", f"{where}: {self} {message}; leave that part of the recording out")
         return _motion(rows[nearest])
 
     def _in_order(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
@@ -127,27 +130,14 @@ class Edge:
         return self._sorted
 
 
-def _motion(numbers: NDArray[np.float64]) -> Transform:
-    return from_quaternion(numbers[:3], numbers[3:])
-
-
-def _seconds(ns: int) -> str:
-    return f"{ns / 1e9:.3f} s"
-
-
-Way = tuple[tuple[Edge, ...], tuple[Edge, ...]]
-"""Edges from a target up to the common ancestor, and from a source up to it."""
-
-
 class Tf:
     """Transforms between frames, looked up at a time of the recording.
 
-    where: what they came from, for messages. limits: how far apart transforms may be, and how long the last one holds.
-    unreadable: how many messages of transforms could not be read.
+    where: their origin, for messages. limits: how far apart transforms may be, and how long the last one holds.
+    unreadable: number of unreadable messages of transforms.
 
-    Where several parents of one frame are named, one with a fixed transform counts, else the one that is named most
-    often, else the first; `notes` tells. Transforms that are none (see `is_motion`), or that put a frame into itself,
-    are left out, as tf2 does it.
+    Where a frame has several parents, one with a fixed transform counts, else the most frequent, else the first;
+    `notes` say so. Invalid transforms (see `is_motion`), and those of a frame to itself, are skipped, as in tf2.
     """
 
     edge: ClassVar[type[Edge]] = Edge
@@ -156,24 +146,24 @@ class Tf:
     def __init__(self, where: str = "tf", limits: Limits | None = None):
         self.where, self.limits, self.unreadable = where, limits or Limits(), 0
         self._parents: dict[str, dict[str, Edge]] = {}
-        self._ways: dict[tuple[str, str], Way] = {}
-        self._left_out = 0
+        self._paths: dict[tuple[str, str], EdgePath] = {}
+        self._skipped = 0
 
     def add(self, parent: str, child: str, stamp_ns: int, numbers: Iterable[float], fixed: bool = False) -> None:
-        """Take in where `child` stood in `parent` at a time, or always: tx ty tz in metres, quaternion qx qy qz qw.
+        """Add the pose of `child` in `parent` at a time, or at all times: tx ty tz in metres, quaternion qx qy qz qw.
 
         In any order. Of several with one time the first counts, of several fixed ones the last.
         """
         row, parent, child = tuple(map(float, numbers)), frame_name(parent), frame_name(child)
         if not (parent and child and parent != child and is_motion(row)):
-            self._left_out += 1
+            self._skipped += 1
         elif fixed:
             self.add_fixed(parent, child, from_quaternion(row[:3], row[3:]))
         else:
             self._edge(parent, child).add(stamp_ns, row)
 
     def add_fixed(self, parent: str, child: str, T_parent_child: Transform) -> None:
-        """Take in where `child` always stands in `parent`, (4, 4)."""
+        """Add the constant pose of `child` in `parent`, (4, 4)."""
         self._edge(parent, child).fix(T_parent_child)
 
     @property
@@ -183,15 +173,15 @@ class Tf:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What had to be decided or left out, one line each."""
+        """What had to be decided or skipped, one line each."""
         torn = {child: self._up(child) for child, edges in sorted(self._parents.items()) if len(edges) > 1}
         notes = [
             f"{self.where}: {child} has several parents ({', '.join(self._parents[child])}); {edge.parent} counts"
             for child, edge in torn.items()
             if edge
         ]
-        if self._left_out:
-            notes.append(f"{self.where}: {self._left_out} transforms are none and were left out")
+        if self._skipped:
+            notes.append(f"{self.where}: {self._skipped} transforms are none and were left out")
         if self.unreadable:
             notes.append(f"{self.where}: {self.unreadable} messages cannot be read and were left out")
         return tuple(notes)
@@ -199,28 +189,28 @@ class Tf:
     def lookup(self, target: str, source: str, stamp_ns: int) -> Transform:
         """Return T_target_source (4, 4) at a time in int64 nanoseconds.
 
-        Raises FrameRefused `no_pose`, one line: an unknown frame, frames that nothing connects or that go round in a
-        loop, a gap in time (see `Edge.at`).
+        Raises FrameRefused `no_pose`: an unknown frame, frames that are not connected or form a loop, a gap in time
+        (see `Edge.at`).
         """
-        up, down = self._way(frame_name(target), frame_name(source))
+        up, down = self._path(frame_name(target), frame_name(source))
         return inverse(self._along(up, stamp_ns)) @ self._along(down, stamp_ns)
 
     def off_ns(self, target: str, source: str, stamp_ns: int) -> int:
-        """Return how far `lookup` extrapolates; raises FrameRefused as it does for frames that nothing connects."""
-        up, down = self._way(frame_name(target), frame_name(source))
+        """Return how far `lookup` extrapolates; raises FrameRefused as it does for frames that are not connected."""
+        up, down = self._path(frame_name(target), frame_name(source))
         return max((edge.off_ns(int(stamp_ns)) for edge in (*up, *down)), default=0)
 
     def connected(self, target: str, source: str) -> bool:
-        """Tell whether both frames are there and some way connects them."""
+        """Return whether both frames exist and are connected."""
         try:
-            self._way(frame_name(target), frame_name(source))
+            self._path(frame_name(target), frame_name(source))
         except FrameRefused:
             return False
         return True
 
     def moving(self, target: str, source: str) -> bool:
-        """Tell whether one frame was seen to move in the other; raises FrameRefused where nothing connects them."""
-        return any(edge.moves for part in self._way(frame_name(target), frame_name(source)) for edge in part)
+        """Return whether one frame was seen to move in the other; raises FrameRefused where they are not connected."""
+        return any(edge.moves for part in self._path(frame_name(target), frame_name(source)) for edge in part)
 
     def root(self, frame: str) -> str:
         """Return the frame that has no parent, above `frame`; raises FrameRefused for an unknown frame and a loop."""
@@ -228,7 +218,7 @@ class Tf:
         return chain[-1].parent if chain else frame_name(frame)
 
     def _edge(self, parent: str, child: str) -> Edge:
-        self._ways.clear()
+        self._paths.clear()
         parent, child = frame_name(parent), frame_name(child)
         edges = self._parents.setdefault(child, {})
         if parent not in edges:
@@ -253,8 +243,8 @@ class Tf:
             seen.append(edge.parent)
         return tuple(chain)
 
-    def _way(self, target: str, source: str) -> Way:
-        if (target, source) not in self._ways:
+    def _path(self, target: str, source: str) -> EdgePath:
+        if (target, source) not in self._paths:
             up, down = self._chain(target), self._chain(source)
             roots = [chain[-1].parent if chain else frame for chain, frame in ((up, target), (down, source))]
             if roots[0] != roots[1]:
@@ -264,8 +254,8 @@ class Tf:
                 raise FrameRefused("no_pose", f"{self.where}: nothing connects {parts}; record what joins them")
             while up and down and up[-1] is down[-1]:
                 up, down = up[:-1], down[:-1]
-            self._ways[target, source] = up, down
-        return self._ways[target, source]
+            self._paths[target, source] = up, down
+        return self._paths[target, source]
 
     def _along(self, edges: tuple[Edge, ...], stamp_ns: int) -> Transform:
         """Return T_ancestor_frame of the edges from a frame up to its ancestor."""
@@ -275,8 +265,8 @@ class Tf:
         return T
 
 
-WORLDS = ("map", "odom")
-"""Frames taken for the world, the first that is there: REP 105."""
+EdgePath = tuple[tuple[Edge, ...], tuple[Edge, ...]]
+"""Edges from a target up to the common ancestor, and from a source up to it."""
 
 
 def tf_topics(file: BagFile) -> list[str]:
@@ -288,8 +278,7 @@ def tf_topics(file: BagFile) -> list[str]:
 def read_tf(file: BagFile, limits: Limits | None = None) -> Tf | None:
     """Return the transforms of a recording, None where it has no topic of them.
 
-    What stands in a topic named `tf_static` counts at all times. Messages that cannot be read are left out: what they
-    would have told is then a gap.
+    Those of a topic named `tf_static` are valid at all times. Unreadable messages are skipped and leave gaps.
     """
     topics = tf_topics(file)
     if not topics:
@@ -299,18 +288,18 @@ def read_tf(file: BagFile, limits: Limits | None = None) -> Tf | None:
         fixed = topic.endswith("tf_static")
         for i in range(len(file.stamps(topic))):
             try:
-                told = read_transforms(file.read(topic, i))
+                message = read_transforms(file.read(topic, i))
             except (FrameRefused, ValueError):
                 tf.unreadable += 1
                 continue
-            for one in told:
+            for one in message:
                 tf.add(one.parent, one.child, one.stamp_ns, one.numbers, fixed)
     return tf
 
 
 @dataclass(frozen=True)
 class TfPoses:
-    """Poses of frame `body` in frame `world`, looked up in the tree when they are asked for."""
+    """Poses of frame `body` in frame `world`, looked up on demand."""
 
     tf: Tf
     world: str
@@ -331,10 +320,10 @@ class TfPoses:
 
 
 def tf_poses(tf: Tf, body: str, world: str = "") -> TfPoses | str:
-    """Return the poses of frame `body` in `world`, or in one line why there are none.
+    """Return the poses of frame `body` in `world`, or the reason, in one line, why there are none.
 
     world: "" for `map`, else `odom`, where it is connected with `body`, else the root of its tree if it moved there.
-    Raises SourceError where a `world` that is given is not connected with `body`.
+    Raises SourceError where a given `world` is not connected with `body`.
     """
     body, world = frame_name(body), frame_name(world)
     try:
@@ -347,3 +336,11 @@ def tf_poses(tf: Tf, body: str, world: str = "") -> TfPoses | str:
             raise SourceError(f"{refused}; correct ?world_frame={world}") from None
         return str(refused)
     return f"{tf.where}: tells how {body} is mounted on {name}, not where that was"
+
+
+def _motion(numbers: NDArray[np.float64]) -> Transform:
+    return from_quaternion(numbers[:3], numbers[3:])
+
+
+def _seconds(ns: int) -> str:
+    return f"{ns / 1e9:.3f} s"

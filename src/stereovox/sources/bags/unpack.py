@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Unpack what recordings pack, chunk by chunk or message by message, without room for more than a limit."""
+"""Bounded decompression of recordings, by chunk or by message."""
 
 from __future__ import annotations
 
@@ -9,34 +9,33 @@ from typing import Any
 from stereovox.errors import MissingExtra
 
 STEP = 4 * 1024 * 1024
-PACKED_BEST = 1000
-"""Bytes that one packed byte stands for at most: a recording of real things does not pack so well."""
-SMALL = 32 * 1024 * 1024
-"""Bytes that anything may unpack to: a picture of nothing packs to almost nothing."""
+MAX_RATIO = 1000
+"""Largest ratio of decompressed to compressed bytes: recordings of real scenes do not compress as well."""
+ALWAYS_ALLOWED = 32 * 1024 * 1024
+"""Decompressed bytes that are always accepted: an empty image compresses to almost nothing."""
 ZSTD = b"\x28\xb5\x2f\xfd"
-"""What a zstd frame starts with; no serialised ROS message does."""
+"""Magic of a zstd frame; no serialised ROS message starts with it."""
 
 
-def most_unpacked(packed: int) -> int:
-    """Return how many bytes so many packed ones may become; more is taken for an attack."""
-    return max(SMALL, PACKED_BEST * packed)
+def max_unpacked(packed: int) -> int:
+    """Return the largest decompressed size accepted for so many compressed bytes; more is treated as an attack."""
+    return max(ALWAYS_ALLOWED, MAX_RATIO * packed)
 
 
-def unpacked(data: bytes | memoryview, packing: str, limit: int) -> bytes:
-    """Return unpacked bytes; packing: `bz2`, `lz4`, `zstd`, or "" and `none` for what is not packed.
+def decompress(data: bytes | memoryview, compression: str, limit: int) -> bytes:
+    """Return decompressed bytes; compression: `bz2`, `lz4`, `zstd`, or "" and `none` for none.
 
-    Raises ValueError for data that are damaged, cut off, of another packing, or swell beyond `limit` or what
-    `most_unpacked` grants, and
-    MissingExtra where the library that unpacks them is not installed.
+    Raises ValueError for data that is damaged, truncated, compressed otherwise, or exceeds `limit` or `max_unpacked`,
+    and MissingExtra where the library for it is not installed.
     """
-    if packing in ("", "none"):
+    if compression in ("", "none"):
         return bytes(data)
-    limit = min(limit, most_unpacked(len(data)))
-    if packing == "zstd" and _announced(data) > limit:
+    limit = min(limit, max_unpacked(len(data)))
+    if compression == "zstd" and _declared_size(data) > limit:
         raise ValueError("tells of an absurd size")
     parts, size, rest = [], 0, bytes(data)
     while rest and size <= limit:  # several packed pieces may follow each other
-        unpacking = _unpacking(packing)
+        unpacking = _decompressor(compression)
         while not unpacking.eof and size <= limit:  # in steps: lz4 makes room for all of `max_length` at once
             parts.append(_step(unpacking, rest))
             rest = b""
@@ -49,15 +48,15 @@ def unpacked(data: bytes | memoryview, packing: str, limit: int) -> bytes:
     return b"".join(parts)
 
 
-def unzipped(data: bytes, limit: int) -> bytes:
-    """Return a message, unpacked where it was packed by itself: rosbag2's mode `message`, and librealsense 2.57.
+def decompress_message(data: bytes, limit: int) -> bytes:
+    """Return a message, decompressed if it was compressed by itself: rosbag2's mode `message`, and librealsense 2.57.
 
-    Raises as `unpacked`.
+    Raises as `decompress`.
     """
-    return unpacked(data, "zstd", limit) if data[:4] == ZSTD else data
+    return decompress(data, "zstd", limit) if data[:4] == ZSTD else data
 
 
-def _announced(data: bytes | memoryview) -> int:
+def _declared_size(data: bytes | memoryview) -> int:
     zstd = _zstd()
     try:
         return zstd.get_frame_info(bytes(data[:32])).decompressed_size or 0  # it need not be told
@@ -72,16 +71,16 @@ def _step(unpacking: Any, data: bytes) -> bytes:
         raise ValueError(f"cannot be unpacked: {error}") from None
 
 
-def _unpacking(packing: str) -> Any:
-    if packing == "bz2":
+def _decompressor(compression: str) -> Any:
+    if compression == "bz2":
         import bz2
 
         return bz2.BZ2Decompressor()
-    if packing == "lz4":
+    if compression == "lz4":
         return _lz4().LZ4FrameDecompressor()
-    if packing == "zstd":
+    if compression == "zstd":
         return _zstd().ZstdDecompressor()
-    raise ValueError(f"packed with '{packing[:20]}', which is not known")
+    raise ValueError(f"packed with '{compression[:20]}', which is not known")
 
 
 def _lz4() -> Any:

@@ -36,6 +36,175 @@ NOT_IN_ROSBAGS = {
 """Definitions of messages that rosbags' types of a ROS may lack."""
 VERSION = 8
 """Of rosbag2's metadata: the newest that every distribution since Humble reads."""
+IMAGE, PACKED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+RIGID = 1e-6
+
+
+class BagWriter:
+    """Writes a recording, all or nothing: it stands at `path` when the `with` block ends well, else nothing does.
+
+    path: ends in `.bag` for ROS 1, in `.db3` or `.mcap` for one file of ROS 2; any other name is a rosbag2 folder,
+        with an `.mcap` in it. An older file is replaced, and stays whole if writing fails; a folder must be new or
+        empty.
+    packed: chunks of a `.bag` are packed with lz4, those of `.mcap` with zstd; `.db3` is never packed.
+
+    Times are int64 nanoseconds since whatever the clock counts from, not negative; each message is recorded at its own
+    time. Messages may come in any order, but readers are quickest where they come in order of time.
+    Raises MissingExtra without rosbags; SourceError for what cannot be written.
+    """
+
+    def __init__(self, path: str | os.PathLike[str], *, packed: bool = True):
+        self.path = Path(path)
+        self._file = BagFileWriter(self.path, packed)
+        self._messages = Messages(self._file.store, self._file.ros)
+        self._fixed: dict[str, tuple[str, str, Transform]] = {}
+        self._last_ns = 0
+        self._due = False
+
+    def __enter__(self) -> Self:
+        self._file.open()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if kind is not None:
+            self._file.abort()
+            return
+        try:
+            self._flush_fixed()
+        except BaseException:
+            self._file.abort()
+            raise
+        self._file.finish()
+
+    def scan(self, scan: Scan, topic: str = "/scan", frame_id: str = "laser") -> None:
+        """Write a `sensor_msgs/LaserScan`; write its mount and the robot's poses with `fixed` and `odometry`."""
+        if scan.fault:
+            raise SourceError(f"{self.path}: {scan.name or topic} has a fault ({scan.fault}); leave it out")
+        self._write(topic, "sensor_msgs/msg/LaserScan", scan.stamp_ns, self._messages.scan(scan, frame_id))
+
+    def depth(
+        self,
+        frame: Frame,
+        topic: str = "/camera/depth/image_raw",
+        frame_id: str = "camera_depth_optical_frame",
+        *,
+        compressed: bool = False,
+    ) -> None:
+        """Write a depth image and, on `camera_info` beside it, its camera; the pose is not written.
+
+        uint16 depth becomes 16UC1 millimetres, float depth 32FC1 metres (REP 118). compressed: whole millimetres as PNG
+        on `<topic>/compressedDepth`. What a `sensor_msgs/CameraInfo` does not hold is lost: the baseline, a correction,
+        and the reasons why pixels have no value.
+        """
+        camera = frame.camera
+        if not isinstance(camera, PinholeCamera) or frame.depth.shape != (camera.height, camera.width):
+            what = frame.fault or f"{frame.depth.shape} pixels of a {type(camera).__name__}"
+            raise SourceError(f"{self.path}: {frame.name or topic}: {what}; only whole images of a pinhole are written")
+        stamp_ns, messages = frame.stamp_ns, self._messages
+        if compressed:
+            picture = messages.compressed(packed_png(millimetres(frame)), stamp_ns, frame_id)
+            self._write(f"{topic}/compressedDepth", PACKED, stamp_ns, picture)
+        else:
+            depth = millimetres(frame) if frame.depth.dtype.kind == "u" else metres(frame)
+            self._write(topic, IMAGE, stamp_ns, messages.image(depth, stamp_ns, frame_id))
+        info = messages.camera_info(camera, stamp_ns, frame_id)
+        self._write(sibling(topic, "camera_info"), "sensor_msgs/msg/CameraInfo", stamp_ns, info)
+
+    def odometry(
+        self,
+        stamp_ns: int,
+        pose_odom_base: ArrayLike,
+        topic: str = "/odom",
+        odom_frame: str = "odom",
+        base_frame: str = "base_link",
+    ) -> None:
+        """Write a `nav_msgs/Odometry`, and the same as transform odom -> base_link on `/tf`; pose: (3,) x, y, yaw."""
+        pose = self._planar(pose_odom_base)
+        message = self._messages.odometry(pose, stamp_ns, odom_frame, base_frame)
+        self._write(topic, "nav_msgs/msg/Odometry", stamp_ns, message)
+        self.transform(stamp_ns, odom_frame, base_frame, lifted(pose))
+
+    def transform(self, stamp_ns: int, parent: str, child: str, T_parent_child: Transform) -> None:
+        """Write where a frame stands in its parent at one moment, (4, 4), on `/tf`."""
+        edge = parent, child, self._rigid(T_parent_child, parent, child)
+        self._write("/tf", TF_MESSAGE, stamp_ns, self._messages.transforms(stamp_ns, [edge]))
+
+    def fixed(self, parent: str, child: str, T_parent_child: Transform) -> None:
+        """Write the constant pose of a frame in its parent, (4, 4), on `/tf_static`.
+
+        All poses given so far go into one message before the next of another kind, since only the last message of this
+        topic is kept for late subscribers.
+        """
+        self._fixed[child] = parent, child, self._rigid(T_parent_child, parent, child)
+        self._due = True
+
+    def pose(
+        self,
+        stamp_ns: int,
+        pose_map_base: ArrayLike,
+        covariance: ArrayLike | None = None,
+        topic: str = "/amcl_pose",
+        frame_id: str = "map",
+    ) -> None:
+        """Write a `geometry_msgs/PoseWithCovarianceStamped` of a (3,) pose x, y, yaw.
+
+        covariance: (3, 3) of x, y, yaw in m^2, m rad and rad^2, (6, 6) in ROS's order, or None for zeros.
+        """
+        if covariance is not None and np.shape(covariance) not in ((3, 3), (6, 6)):
+            raise SourceError(f"{self.path}: a covariance of {np.shape(covariance)} on {topic}; give (3, 3) or (6, 6)")
+        message = self._messages.pose(self._planar(pose_map_base), covariance, stamp_ns, frame_id)
+        self._write(topic, "geometry_msgs/msg/PoseWithCovarianceStamped", stamp_ns, message)
+
+    def occupancy(self, stamp_ns: int, grid: OccupancyGrid, topic: str = "/map_mapping", frame_id: str = "map") -> None:
+        """Write a `nav_msgs/OccupancyGrid`, latched: kept for late subscribers."""
+        message = self._messages.occupancy(grid, stamp_ns, frame_id)
+        self._write(topic, "nav_msgs/msg/OccupancyGrid", stamp_ns, message, latched=True)
+
+    def octomap(
+        self,
+        stamp_ns: int,
+        tree: bytes,
+        resolution: float,
+        topic: str = "/octomap_full",
+        frame_id: str = "map",
+        *,
+        binary: bool = False,
+    ) -> None:
+        """Write an `octomap_msgs/Octomap`, latched: the nodes of an OcTree as in an `.ot` file, binary: in a `.bt`.
+
+        resolution: side of a cell in metres.
+        """
+        message = self._messages.octomap(tree, binary, resolution, stamp_ns, frame_id)
+        self._write(topic, OCTOMAP, stamp_ns, message, latched=True)
+
+    def cloud(self, stamp_ns: int, points: ArrayLike, topic: str = "/occupied_cells", frame_id: str = "map") -> None:
+        """Write a `sensor_msgs/PointCloud2` of (N, 3) metres, latched."""
+        message = self._messages.cloud(np.asarray(points, np.float32).reshape(-1, 3), stamp_ns, frame_id)
+        self._write(topic, "sensor_msgs/msg/PointCloud2", stamp_ns, message, latched=True)
+
+    def _write(self, topic: str, kind: str, stamp_ns: int, message: Any, latched: bool = False) -> None:
+        self._last_ns = stamp_ns
+        self._flush_fixed()
+        self._file.write(topic, kind, stamp_ns, message, latched)
+
+    def _flush_fixed(self) -> None:
+        if self._due:
+            self._due = False
+            message = self._messages.transforms(self._last_ns, list(self._fixed.values()))
+            self._file.write("/tf_static", TF_MESSAGE, self._last_ns, message, latched=True)
+
+    def _planar(self, pose: ArrayLike) -> NDArray[np.float64]:
+        numbers = np.asarray(pose, float)
+        if numbers.shape != (3,) or not np.isfinite(numbers).all():
+            raise SourceError(f"{self.path}: {pose} is no pose; give x, y and yaw, all finite")
+        return numbers
+
+    def _rigid(self, T: Transform, parent: str, child: str) -> Transform:
+        if rigidity_error(T) > RIGID:
+            raise SourceError(f"{self.path}: {parent} -> {child} is no rigid motion; give a (4, 4) rotation and shift")
+        return np.asarray(T, float)
 
 
 class BagFileWriter:
@@ -43,7 +212,7 @@ class BagFileWriter:
 
     ros: 1 for a path that ends in `.bag`, else 2. store: rosbags' types of that ROS. packed: chunks of a `.bag` are
     packed with lz4, those of an `.mcap` and of a folder with zstd; `.db3` has no such thing.
-    Raises MissingExtra without rosbags, SourceError, one line, where the recording cannot be written.
+    Raises MissingExtra without rosbags, SourceError where the recording cannot be written.
     """
 
     def __init__(self, path: Path, packed: bool = True):
@@ -61,7 +230,7 @@ class BagFileWriter:
     def open(self) -> None:
         """Begin; nothing is at `path` yet."""
         try:
-            with self._told():
+            with self._one_line_errors():
                 self._folder.mkdir()
                 self._writer = self._ros1() if self.ros == 1 else self._ros2()
                 self._writer.open()
@@ -72,12 +241,12 @@ class BagFileWriter:
     def write(self, topic: str, kind: str, stamp_ns: int, message: Any, latched: bool = False) -> None:
         """Write one message of the store's type `kind` (`nav_msgs/msg/Odometry`), recorded at `stamp_ns`.
 
-        latched: whoever comes later is to see the last one of the topic.
+        latched: the topic's last message is kept for late subscribers.
         """
         if self._writer is None:
             raise SourceError(f"{self.path}: not open; write 'with BagWriter(path) as bag:'")
         self.check_stamp(stamp_ns)
-        with self._told():
+        with self._one_line_errors():
             if topic not in self._connections:
                 self._connections[topic] = self._connect(topic, kind, latched)
             if (held := self._connections[topic].msgtype) != kind:
@@ -86,22 +255,22 @@ class BagFileWriter:
             self._writer.write(self._connections[topic], int(stamp_ns), pack(message, kind))
 
     def check_stamp(self, stamp_ns: int) -> None:
-        """Raise SourceError for a time that ROS cannot write down."""
+        """Raise SourceError for a time that ROS cannot represent."""
         if not 0 <= stamp_ns < SECONDS[self.ros] * 1_000_000_000:
             limit = f"0 and {SECONDS[self.ros]} seconds"
             raise SourceError(f"{self.path}: the time {stamp_ns} ns must lie between {limit}; shift the clock")
 
     def finish(self) -> None:
-        """Complete the recording and put it where it belongs; an older file of that name is replaced."""
+        """Complete the recording and move it into place; an older file of that name is replaced."""
         try:
-            with self._told():
+            with self._one_line_errors():
                 self._writer.close()
                 self._move()
         finally:
             self.abort()
 
     def abort(self) -> None:
-        """Give up: nothing is left, and an older file stays as it was."""
+        """Discard the recording; an older file stays intact."""
         if self._writer is not None:
             with suppress(Exception):
                 self._writer.abort()
@@ -159,8 +328,8 @@ class BagFileWriter:
         sync_folder(self._target.parent)
 
     @contextmanager
-    def _told(self) -> Iterator[None]:
-        """Turn what goes wrong while writing into one line."""
+    def _one_line_errors(self) -> Iterator[None]:
+        """Convert errors of writing into one-line SourceErrors."""
         try:
             yield
         except OSError as error:
@@ -187,180 +356,9 @@ def typestore(ros: int) -> Any:
 
 
 def _transient_local() -> Any:
-    """Return ROS 2's word for latched: reliable, the last message kept for who comes later."""
+    """Return ROS 2's QoS for latched topics: reliable, the last message kept for late subscribers."""
     from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 
     never = QosTime(0, 0)
     kept = QosHistory.KEEP_LAST, 1, QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL
     return Qos(*kept, never, never, QosLiveliness.SYSTEM_DEFAULT, never, False)
-
-
-IMAGE, PACKED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
-RIGID = 1e-6
-
-
-class BagWriter:
-    """Writes a recording, all or nothing: it stands at `path` when the `with` block ends well, else nothing does.
-
-    path: ends in `.bag` for ROS 1, in `.db3` or `.mcap` for one file of ROS 2; any other name is a rosbag2 folder,
-        with an `.mcap` in it. An older file is replaced, and stays whole if writing fails; a folder must be new or
-        empty.
-    packed: chunks of a `.bag` are packed with lz4, those of `.mcap` with zstd; `.db3` is never packed.
-
-    Times are int64 nanoseconds since whatever the clock counts from, not negative; each message is recorded at its own
-    time. Messages may come in any order, but readers are quickest where they come in order of time.
-    Raises MissingExtra without rosbags; SourceError, one line, for what cannot be written.
-    """
-
-    def __init__(self, path: str | os.PathLike[str], *, packed: bool = True):
-        self.path = Path(path)
-        self._file = BagFileWriter(self.path, packed)
-        self._messages = Messages(self._file.store, self._file.ros)
-        self._fixed: dict[str, tuple[str, str, Transform]] = {}
-        self._last_ns = 0
-        self._due = False
-
-    def __enter__(self) -> Self:
-        self._file.open()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if kind is not None:
-            self._file.abort()
-            return
-        try:
-            self._tell_fixed()
-        except BaseException:
-            self._file.abort()
-            raise
-        self._file.finish()
-
-    def scan(self, scan: Scan, topic: str = "/scan", frame_id: str = "laser") -> None:
-        """Write a `sensor_msgs/LaserScan`; where the lidar sits and stood is told by `fixed` and `odometry`."""
-        if scan.fault:
-            raise SourceError(f"{self.path}: {scan.name or topic} has a fault ({scan.fault}); leave it out")
-        self._write(topic, "sensor_msgs/msg/LaserScan", scan.stamp_ns, self._messages.scan(scan, frame_id))
-
-    def depth(
-        self,
-        frame: Frame,
-        topic: str = "/camera/depth/image_raw",
-        frame_id: str = "camera_depth_optical_frame",
-        *,
-        compressed: bool = False,
-    ) -> None:
-        """Write a depth image and, on `camera_info` beside it, its camera; the pose is not written.
-
-        uint16 depth becomes 16UC1 millimetres, float depth 32FC1 metres (REP 118). compressed: whole millimetres as PNG
-        on `<topic>/compressedDepth`. What a `sensor_msgs/CameraInfo` does not hold is lost: the baseline, a correction,
-        and the reasons why pixels have no value.
-        """
-        camera = frame.camera
-        if not isinstance(camera, PinholeCamera) or frame.depth.shape != (camera.height, camera.width):
-            what = frame.fault or f"{frame.depth.shape} pixels of a {type(camera).__name__}"
-            raise SourceError(f"{self.path}: {frame.name or topic}: {what}; only whole images of a pinhole are written")
-        stamp_ns, messages = frame.stamp_ns, self._messages
-        if compressed:
-            picture = messages.compressed(packed_png(millimetres(frame)), stamp_ns, frame_id)
-            self._write(f"{topic}/compressedDepth", PACKED, stamp_ns, picture)
-        else:
-            depth = millimetres(frame) if frame.depth.dtype.kind == "u" else metres(frame)
-            self._write(topic, IMAGE, stamp_ns, messages.image(depth, stamp_ns, frame_id))
-        info = messages.camera_info(camera, stamp_ns, frame_id)
-        self._write(sibling(topic, "camera_info"), "sensor_msgs/msg/CameraInfo", stamp_ns, info)
-
-    def odometry(
-        self,
-        stamp_ns: int,
-        pose_odom_base: ArrayLike,
-        topic: str = "/odom",
-        odom_frame: str = "odom",
-        base_frame: str = "base_link",
-    ) -> None:
-        """Write a `nav_msgs/Odometry`, and the same as transform odom -> base_link on `/tf`; pose: (3,) x, y, yaw."""
-        pose = self._planar(pose_odom_base)
-        message = self._messages.odometry(pose, stamp_ns, odom_frame, base_frame)
-        self._write(topic, "nav_msgs/msg/Odometry", stamp_ns, message)
-        self.transform(stamp_ns, odom_frame, base_frame, lifted(pose))
-
-    def transform(self, stamp_ns: int, parent: str, child: str, T_parent_child: Transform) -> None:
-        """Write where a frame stands in its parent at one moment, (4, 4), on `/tf`."""
-        edge = parent, child, self._rigid(T_parent_child, parent, child)
-        self._write("/tf", TF_MESSAGE, stamp_ns, self._messages.transforms(stamp_ns, [edge]))
-
-    def fixed(self, parent: str, child: str, T_parent_child: Transform) -> None:
-        """Write where a frame stands in its parent for good, (4, 4), on `/tf_static`.
-
-        All that were told so far go into one message before the next of another kind, since only the last message of
-        this topic is kept for who comes later.
-        """
-        self._fixed[child] = parent, child, self._rigid(T_parent_child, parent, child)
-        self._due = True
-
-    def pose(
-        self,
-        stamp_ns: int,
-        pose_map_base: ArrayLike,
-        covariance: ArrayLike | None = None,
-        topic: str = "/amcl_pose",
-        frame_id: str = "map",
-    ) -> None:
-        """Write a `geometry_msgs/PoseWithCovarianceStamped` of a (3,) pose x, y, yaw.
-
-        covariance: (3, 3) of x, y, yaw in m^2, m rad and rad^2, (6, 6) in ROS's order, or None for zeros.
-        """
-        if covariance is not None and np.shape(covariance) not in ((3, 3), (6, 6)):
-            raise SourceError(f"{self.path}: a covariance of {np.shape(covariance)} on {topic}; give (3, 3) or (6, 6)")
-        message = self._messages.pose(self._planar(pose_map_base), covariance, stamp_ns, frame_id)
-        self._write(topic, "geometry_msgs/msg/PoseWithCovarianceStamped", stamp_ns, message)
-
-    def occupancy(self, stamp_ns: int, grid: OccupancyGrid, topic: str = "/map_mapping", frame_id: str = "map") -> None:
-        """Write a `nav_msgs/OccupancyGrid`, kept for who comes later (latched)."""
-        message = self._messages.occupancy(grid, stamp_ns, frame_id)
-        self._write(topic, "nav_msgs/msg/OccupancyGrid", stamp_ns, message, latched=True)
-
-    def octomap(
-        self,
-        stamp_ns: int,
-        tree: bytes,
-        resolution: float,
-        topic: str = "/octomap_full",
-        frame_id: str = "map",
-        *,
-        binary: bool = False,
-    ) -> None:
-        """Write an `octomap_msgs/Octomap`, latched: the nodes of an OcTree as in an `.ot` file, binary: in a `.bt`.
-
-        resolution: side of a cell in metres.
-        """
-        message = self._messages.octomap(tree, binary, resolution, stamp_ns, frame_id)
-        self._write(topic, OCTOMAP, stamp_ns, message, latched=True)
-
-    def cloud(self, stamp_ns: int, points: ArrayLike, topic: str = "/occupied_cells", frame_id: str = "map") -> None:
-        """Write a `sensor_msgs/PointCloud2` of (N, 3) metres, latched."""
-        message = self._messages.cloud(np.asarray(points, np.float32).reshape(-1, 3), stamp_ns, frame_id)
-        self._write(topic, "sensor_msgs/msg/PointCloud2", stamp_ns, message, latched=True)
-
-    def _write(self, topic: str, kind: str, stamp_ns: int, message: Any, latched: bool = False) -> None:
-        self._last_ns = stamp_ns
-        self._tell_fixed()
-        self._file.write(topic, kind, stamp_ns, message, latched)
-
-    def _tell_fixed(self) -> None:
-        if self._due:
-            self._due = False
-            message = self._messages.transforms(self._last_ns, list(self._fixed.values()))
-            self._file.write("/tf_static", TF_MESSAGE, self._last_ns, message, latched=True)
-
-    def _planar(self, pose: ArrayLike) -> NDArray[np.float64]:
-        numbers = np.asarray(pose, float)
-        if numbers.shape != (3,) or not np.isfinite(numbers).all():
-            raise SourceError(f"{self.path}: {pose} is no pose; give x, y and yaw, all finite")
-        return numbers
-
-    def _rigid(self, T: Transform, parent: str, child: str) -> Transform:
-        if rigidity_error(T) > RIGID:
-            raise SourceError(f"{self.path}: {parent} -> {child} is no rigid motion; give a (4, 4) rotation and shift")
-        return np.asarray(T, float)

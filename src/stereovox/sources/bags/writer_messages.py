@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a robot measures, as ROS 1 or ROS 2 messages of rosbags' types."""
+"""Build ROS 1 or ROS 2 messages of rosbags' types from scans, images, poses and maps."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ from stereovox.safe_io import MAX_LIST, read_text
 from stereovox.se3 import Transform, inverse
 from stereovox.sources import parameters
 from stereovox.sources.base import Source
-from stereovox.sources.images import PICTURE, common_size, file_names, read_picture_png
+from stereovox.sources.images import PICTURE_KINDS, common_size, file_names, read_picture_png
 from stereovox.sources.kitti.calibration import KittiCalibration
 from stereovox.sources.lidar import Box, LidarScan, read_velodyne
 
@@ -28,7 +28,7 @@ PAIRS = {"grey": (0, 1), "colour": (2, 3)}
 
 
 class CameraPoses(Protocol):
-    """Whatever tells the pose of camera 0 for each frame; see `kitti_poses`."""
+    """Poses of camera 0 for each frame; see `kitti.poses`."""
 
     def at(self, i: int) -> Transform:
         """Return T_world_cam0 (4, 4); raises FrameRefused where there is none."""
@@ -77,9 +77,9 @@ class KittiSource(Source, ABC):
             size = (pair.camera.width, pair.camera.height)
             left, right = (read_picture_png(path, size) for path in paths)
         except FrameRefused as refused:
-            nothing, nowhere = np.empty((0, 0), np.uint8), np.full((4, 4), np.nan)
+            no_image, no_pose = np.empty((0, 0), np.uint8), np.full((4, 4), np.nan)
             return StereoFrame(
-                nothing, nothing, pair, nowhere, stamp_ns, str(paths[0]), refused.reason, fault_detail=str(refused)
+                no_image, no_image, pair, no_pose, stamp_ns, str(paths[0]), refused.reason, fault_detail=str(refused)
             )
         return StereoFrame(left, right, pair, T_world_left, stamp_ns, str(paths[0]))
 
@@ -91,7 +91,7 @@ class KittiSource(Source, ABC):
 
     @property
     def has_lidar(self) -> bool:
-        """Whether there are lidar scans, and a calibration that tells where the lidar sits."""
+        """Whether there are lidar scans, and a calibration with the lidar's mount."""
         return self.calibration.T_cam0_velo is not None and os.path.isdir(self.velodyne(0).parent)
 
     def scan(self, i: int) -> LidarScan | None:
@@ -108,14 +108,14 @@ class KittiSource(Source, ABC):
         return ()
 
     def moving(self, i: int) -> NDArray[np.bool_] | None:
-        """Return the pixels that moved, None where the recording does not tell."""
+        """Return the mask of moving pixels, None where the recording has none."""
         range(len(self))[i]
         return None
 
     def _size(self) -> tuple[int, int]:
         """Return (width, height) of the left images; raises SourceError where none can be read."""
         paths = [self.images(i)[0] for i in range(len(self))]
-        size = common_size(paths, kinds=PICTURE)
+        size = common_size(paths, kinds=PICTURE_KINDS)
         if size is None:
             folder = paths[0].parent if paths else self.name
             raise SourceError(f"{folder}: none of its {len(paths)} images is a readable 8-bit PNG; copy them again")
@@ -123,9 +123,9 @@ class KittiSource(Source, ABC):
 
 
 def location(where: str | os.PathLike[str], known: dict[str, str]) -> tuple[Path, dict[str, str]]:
-    """Return the folder in `FOLDER?key=value` and its parameters on top of `known`, the defaults.
+    """Return the folder in `FOLDER?key=value` and its parameters, with the defaults in `known`.
 
-    Raises SourceError, one line, for a parameter that is not known or not complete.
+    Raises SourceError for an unknown or incomplete parameter.
     """
     try:
         folder, given = parameters.split(os.fspath(where))
@@ -135,7 +135,7 @@ def location(where: str | os.PathLike[str], known: dict[str, str]) -> tuple[Path
 
 
 def time_lines(path: Path, whose: str) -> list[str]:
-    """Return the lines of a file of times, stripped; raises SourceError, one line, where there is none."""
+    """Return the stripped lines of a file of times; raises SourceError where there is none."""
     try:
         lines = read_text(path, MAX_LIST, "replace").rstrip().splitlines()
     except OSError as error:
@@ -146,14 +146,14 @@ def time_lines(path: Path, whose: str) -> list[str]:
 
 
 def folder_of(where: str) -> str:
-    """Return what stands before the parameters; never raises."""
+    """Return the part before the parameters; never raises."""
     return where.partition("?")[0]
 
 
 def choose_pair(where: Path, camera: str, present: dict[str, bool]) -> tuple[int, int]:
     """Return the camera numbers of the pair that `camera` names, or of the first present one (grey) for ''.
 
-    Raises SourceError, one line, for an unknown name or a pair that is not there.
+    Raises SourceError for an unknown name or a pair that is not there.
     """
     if camera and camera not in PAIRS:
         raise SourceError(f"{where}: camera={camera}{did_you_mean(camera, PAIRS)}")

@@ -68,7 +68,7 @@ class KittiCalibration:
 
 
 def read_raw_calibration(folder: Path) -> KittiCalibration:
-    """Return what the three files of KITTI raw in a date folder say; raises SourceError, one line, as they are.
+    """Return the calibration in the three files of KITTI raw in a date folder; raises SourceError.
 
     Those of lidar and inertial unit may be missing.
     """
@@ -99,7 +99,7 @@ def read_calibration(path: Path) -> KittiCalibration:
 def read_values(path: Path) -> dict[str, list[float]]:
     """Return the numbers behind each name; the colon may be missing, and what is no number (a date) is left out.
 
-    Raises SourceError, one line, where the file cannot be read or holds nothing of the kind.
+    Raises SourceError where the file cannot be read or holds nothing of the kind.
     """
     try:
         lines = read_text(path).splitlines()

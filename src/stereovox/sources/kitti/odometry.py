@@ -34,7 +34,7 @@ class KittiOdometry(KittiSource):
         poses: a file of 3x4 matrices T_world_cam0 line by line; without it `poses/00.txt` beside `sequences`, which
             the benchmark publishes for 00 to 10 only.
     Time: times.txt, seconds since the first frame; every line is a frame. Scans (`velodyne/`) are untwisted there.
-    World and faults: see `KittiSource`. Raises SourceError, one line, for what is missing as a whole.
+    World and faults: see `KittiSource`. Raises SourceError for what is missing as a whole.
     """
 
     layout = "a KITTI odometry sequence (sequences/00 with image_0, image_1, calib.txt and times.txt)"
@@ -54,7 +54,7 @@ class KittiOdometry(KittiSource):
 
     @classmethod
     def recognises(cls, where: str) -> bool:
-        """Tell whether `where` is a folder with the times and an image pair as in KITTI odometry."""
+        """Return whether `where` is a folder with the times and an image pair as in KITTI odometry."""
         folder = Path(folder_of(where))
         return os.path.isfile(folder / TIMES) and any(_has(folder, name) for name in PAIRS)
 

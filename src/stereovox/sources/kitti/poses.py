@@ -65,7 +65,7 @@ class StandingPoses:
 def read_pose_file(path: Path, frames: int) -> FramePoses:
     """Return the poses in a file of `frames` lines, each 12 numbers: the 3x4 matrix T_world_cam0, row by row.
 
-    Fewer lines leave the last frames without a pose. Raises SourceError, one line, for a file that cannot be read or
+    Fewer lines leave the last frames without a pose. Raises SourceError for a file that cannot be read or
     has more lines than there are frames: it is then that of another recording.
     """
     lines = _frame_lines(path, frames)

@@ -36,7 +36,7 @@ class KittiRaw(KittiSource):
         poses: `refined` (`poses_refined.txt`), `ins` (`poses_ins.txt`), `oxts` (computed from the GPS and inertial
             packets), or a file of 3x4 matrices T_world_cam0 line by line; without it the first of these there is.
     Time: image_0X/timestamps.txt of the left camera, exact to the nanosecond. Every line of it is a frame.
-    World and faults: see `KittiSource`. Raises SourceError, one line, for what is missing as a whole.
+    World and faults: see `KittiSource`. Raises SourceError for what is missing as a whole.
     """
 
     layout = "a KITTI raw drive (image_00 and image_01 with data/*.png; calib_*.txt beside the drive)"
@@ -53,7 +53,7 @@ class KittiRaw(KittiSource):
 
     @classmethod
     def recognises(cls, where: str) -> bool:
-        """Tell whether `where` is a folder with the images of a grey or a colour pair as in KITTI raw."""
+        """Return whether `where` is a folder with the images of a grey or a colour pair as in KITTI raw."""
         return any(_has(Path(folder_of(where)), name) for name in PAIRS)
 
     def __len__(self) -> int:
@@ -80,13 +80,13 @@ class KittiRaw(KittiSource):
             path, lines = self._eye(0) / "timestamps.txt", len(self._stamps)
             raise SourceError(f"{path}: has {lines} lines, but there is an image {numbers[-1]}.png; copy it again")
 
-    def _poses(self, wanted: str) -> FramePoses:
-        if not wanted:
+    def _poses(self, choice: str) -> FramePoses:
+        if not choice:
             there = [kind for kind, name in POSE_FILES.items() if os.path.isfile(self.folder / name)]
-            wanted = there[0] if there else OXTS
-        if wanted == OXTS:
+            choice = there[0] if there else OXTS
+        if choice == OXTS:
             return self._oxts()
-        path = self.folder / POSE_FILES[wanted] if wanted in POSE_FILES else named_file(wanted, self.folder)
+        path = self.folder / POSE_FILES[choice] if choice in POSE_FILES else named_file(choice, self.folder)
         return read_pose_file(path, len(self))
 
     def _oxts(self) -> FramePoses:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.cameras.rigs import StereoPair
 from stereovox.errors import FrameRefused, SourceError
-from stereovox.sources.images import PICTURE, png_size, read_picture_png
+from stereovox.sources.images import PICTURE_KINDS, png_size, read_picture_png
 from stereovox.sources.kitti.base import KittiSource, folder_of, location, numbers_in
 from stereovox.sources.kitti.calibration import KittiCalibration, from_raw_files, read_calibration
 from stereovox.sources.kitti.poses import StandingPoses
@@ -30,7 +30,7 @@ class KittiStereo2015(KittiSource):
     calib_imu_to_velo beside it; scenes may differ, in image size too, so `camera` is only that of the first one.
     Scans: `velodyne/000000.bin`, which the benchmark does not have but some collections add. Moving objects: obj_map.
     World: camera 0 of each scene, upright; there are no poses. Time: one second for each scene number.
-    Faults: see `KittiSource`. Raises SourceError, one line, where a calibration is missing or bad.
+    Faults: see `KittiSource`. Raises SourceError where a calibration is missing or bad.
     """
 
     layout = "KITTI stereo 2015 scenes (training with image_2/000000_10.png and image_3)"
@@ -50,7 +50,7 @@ class KittiStereo2015(KittiSource):
 
     @classmethod
     def recognises(cls, where: str) -> bool:
-        """Tell whether `where` is a folder with scenes as in KITTI stereo 2015."""
+        """Return whether `where` is a folder with scenes as in KITTI stereo 2015."""
         folder = Path(folder_of(where))
         try:
             with os.scandir(folder / LEFT) as entries:
@@ -67,7 +67,7 @@ class KittiStereo2015(KittiSource):
         return left, right
 
     def stamp_ns(self, i: int) -> int:
-        """Return a time that tells scenes apart: a second for each number."""
+        """Return a stamp that distinguishes scenes: one second per number."""
         return int(self._scenes[i]) * 1_000_000_000
 
     def velodyne(self, i: int) -> Path:
@@ -95,7 +95,7 @@ class KittiStereo2015(KittiSource):
 
     def _camera(self, i: int, usual: tuple[int, int]) -> PinholeCamera:
         try:
-            size = png_size(self.images(i)[0], PICTURE)
+            size = png_size(self.images(i)[0], PICTURE_KINDS)
         except FrameRefused:  # said when the frame is read
             size = usual
         return self._calibrations[i].camera(*self.eyes, size)

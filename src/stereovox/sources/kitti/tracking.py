@@ -25,60 +25,6 @@ FIELDS = 17
 NO_BOX = "DontCare"
 """Marks a region of the image in which nothing is annotated; it has no 3-D box."""
 Label = tuple[int, str, tuple[float, ...]]
-
-
-@dataclass(frozen=True)
-class Labels:
-    """The annotated objects of a sequence by frame: track, kind, and h, w, l, x, y, z, rotation_y as in the file."""
-
-    by_frame: dict[int, list[Label]]
-
-    def boxes(self, i: int, T_world_cam0: Transform) -> tuple[Box, ...]:
-        """Return the boxes of frame `i` in the world; T_world_cam0: pose of rectified camera 0 at that frame."""
-        return tuple(
-            Box(T_world_cam0 @ box_pose(*numbers), (numbers[2], numbers[1], numbers[0]), kind, track)
-            for track, kind, numbers in self.by_frame.get(i, [])
-        )
-
-
-def box_pose(h: float, w: float, l: float, x: float, y: float, z: float, rotation_y: float) -> Transform:  # noqa: E741
-    """Return T_cam0_box (4, 4): from the frame of `Box` into rectified camera 0.
-
-    KITTI's position is the middle of the box's bottom, y points down, and rotation_y turns about y: at 0 the object
-    faces along camera x, at -90 degrees along the optical axis.
-    """
-    c, s = math.cos(rotation_y), math.sin(rotation_y)
-    return np.array([[c, s, 0, x], [0, 0, -1, y - h / 2], [-s, c, 0, z], [0, 0, 0, 1.0]])
-
-
-def read_labels(path: Path) -> Labels:
-    """Return the annotated objects; raises SourceError, one line with file and line, for what cannot be read."""
-    try:
-        lines = read_text(path, MAX_LIST, "replace").splitlines()
-    except OSError as error:
-        raise SourceError(f"{path}: {error.strerror}; make it readable") from None
-    found: dict[int, list[Label]] = defaultdict(list)
-    for n, line in enumerate(lines, 1):
-        words = line.split()
-        if words and (len(words) < 3 or words[2] != NO_BOX):
-            frame, label = _label(words, f"{path}:{n}")
-            found[frame].append(label)
-    return Labels(dict(found))
-
-
-def _label(words: list[str], where: str) -> tuple[int, Label]:
-    try:
-        frame, track, kind, *rest = words
-        numbers = tuple(float(word) for word in rest)
-        label = int(track), kind, numbers[7:14]
-        good = len(numbers) >= FIELDS - 3 and all(map(math.isfinite, numbers[7:14])) and min(numbers[7:10]) > 0
-        if good:
-            return int(frame), label
-    except ValueError:
-        pass
-    raise SourceError(f"{where}: needs {FIELDS} fields 'frame track kind ... h w l x y z rotation_y'; correct the line")
-
-
 IMAGE = re.compile(r"(\d{6})\.png")
 SEQUENCE = re.compile(r"(\d{4})")
 LEFT, RIGHT, OXTS = "image_02", "image_03", "oxts"
@@ -91,7 +37,7 @@ class KittiTracking(KittiSource):
     where: `training/image_02/0000`, or `training?sequence=0000`; further parameters:
         poses: a file of 3x4 matrices T_world_cam0 line by line instead of `oxts/0000.txt`.
     Time: the files hold none; frame number / 10 Hz. Colour images; label boxes are in rectified camera 0.
-    World and faults: see `KittiSource`. Raises SourceError, one line, for what is missing as a whole and bad labels.
+    World and faults: see `KittiSource`. Raises SourceError for what is missing as a whole and bad labels.
     """
 
     layout = "a KITTI tracking sequence (training?sequence=0000 with image_02/0000 and calib/0000.txt)"
@@ -111,7 +57,7 @@ class KittiTracking(KittiSource):
 
     @classmethod
     def recognises(cls, where: str) -> bool:
-        """Tell whether `where` is a folder of sequences as in KITTI tracking, or the left images of one."""
+        """Return whether `where` is a folder of sequences as in KITTI tracking, or the left images of one."""
         folder = Path(os.path.abspath(folder_of(where)))  # unlike resolve() it takes any text
         if folder.parent.name == LEFT:
             return os.path.isdir(folder) and os.path.isdir(folder.parents[1] / "calib")
@@ -141,9 +87,9 @@ class KittiTracking(KittiSource):
     def _file(self, kind: str) -> Path:
         return self.folder / kind / f"{self.sequence}.txt"
 
-    def _poses(self, wanted: str) -> FramePoses:
-        if wanted and wanted != OXTS:
-            return read_pose_file(named_file(wanted, self.folder), len(self))
+    def _poses(self, choice: str) -> FramePoses:
+        if choice and choice != OXTS:
+            return read_pose_file(named_file(choice, self.folder), len(self))
         c = self.calibration
         if c.T_cam0_velo is None or c.T_velo_imu is None:
             missing = "R_rect and Tr_velo_cam" if c.T_cam0_velo is None else "Tr_imu_velo"
@@ -158,17 +104,69 @@ class KittiTracking(KittiSource):
         return Labels({})
 
 
-def _sequence(folder: Path, wanted: str) -> tuple[Path, str]:
+@dataclass(frozen=True)
+class Labels:
+    """The annotated objects of a sequence by frame: track, kind, and h, w, l, x, y, z, rotation_y as in the file."""
+
+    by_frame: dict[int, list[Label]]
+
+    def boxes(self, i: int, T_world_cam0: Transform) -> tuple[Box, ...]:
+        """Return the boxes of frame `i` in the world; T_world_cam0: pose of rectified camera 0 at that frame."""
+        return tuple(
+            Box(T_world_cam0 @ box_pose(*numbers), (numbers[2], numbers[1], numbers[0]), kind, track)
+            for track, kind, numbers in self.by_frame.get(i, [])
+        )
+
+
+def box_pose(h: float, w: float, l: float, x: float, y: float, z: float, rotation_y: float) -> Transform:  # noqa: E741
+    """Return T_cam0_box (4, 4): from the frame of `Box` into rectified camera 0.
+
+    KITTI's position is the middle of the box's bottom, y points down, and rotation_y turns about y: at 0 the object
+    faces along camera x, at -90 degrees along the optical axis.
+    """
+    c, s = math.cos(rotation_y), math.sin(rotation_y)
+    return np.array([[c, s, 0, x], [0, 0, -1, y - h / 2], [-s, c, 0, z], [0, 0, 0, 1.0]])
+
+
+def read_labels(path: Path) -> Labels:
+    """Return the annotated objects; raises SourceError naming file and line for what cannot be read."""
+    try:
+        lines = read_text(path, MAX_LIST, "replace").splitlines()
+    except OSError as error:
+        raise SourceError(f"{path}: {error.strerror}; make it readable") from None
+    found: dict[int, list[Label]] = defaultdict(list)
+    for n, line in enumerate(lines, 1):
+        words = line.split()
+        if words and (len(words) < 3 or words[2] != NO_BOX):
+            frame, label = _label(words, f"{path}:{n}")
+            found[frame].append(label)
+    return Labels(dict(found))
+
+
+def _label(words: list[str], where: str) -> tuple[int, Label]:
+    try:
+        frame, track, kind, *rest = words
+        numbers = tuple(float(word) for word in rest)
+        label = int(track), kind, numbers[7:14]
+        good = len(numbers) >= FIELDS - 3 and all(map(math.isfinite, numbers[7:14])) and min(numbers[7:10]) > 0
+        if good:
+            return int(frame), label
+    except ValueError:
+        pass
+    raise SourceError(f"{where}: needs {FIELDS} fields 'frame track kind ... h w l x y z rotation_y'; correct the line")
+
+
+def _sequence(folder: Path, choice: str) -> tuple[Path, str]:
     """Return the folder that holds all sequences, and the number of the one that is meant."""
     whole = Path(os.path.abspath(folder))
     if whole.parent.name == LEFT:
-        if wanted:
-            raise SourceError(f"{folder}: is a sequence already; leave sequence={wanted} out")
+        if choice:
+            raise SourceError(f"{folder}: is a sequence already; leave sequence={choice} out")
         return whole.parents[1], whole.name
     known = numbers_in(folder / LEFT, SEQUENCE)
-    if not wanted and len(known) == 1:
+    if not choice and len(known) == 1:
         return folder, known[0]
-    if wanted not in known:
+    if choice not in known:
         found = f"holds sequences {', '.join(known)}" if known else f"has no sequence in {LEFT}"
         raise SourceError(f"{folder}: {found}; say which: {folder}?sequence={known[0] if known else '0000'}")
-    return folder, wanted
+    return folder, choice

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings of ground robots in bags of ROS 1 and ROS 2: scans, depth images, odometry, tf."""
+"""Recordings of ground robots in ROS 1 and ROS 2 bags: scans, depth images, odometry, tf."""
 
 from __future__ import annotations
 
@@ -18,13 +18,18 @@ from stereovox.sources.bags.files import BagFile
 from stereovox.sources.bags.poses import topic_poses
 from stereovox.sources.bags.recording import depth_frame, file_part, parse_as
 from stereovox.sources.bags.robot_messages import LaserScan, frame_name
-from stereovox.sources.bags.scans import find_scans, most
+from stereovox.sources.bags.scans import busiest_topic, find_scans
 from stereovox.sources.bags.tf import Limits
 from stereovox.sources.base import Lazy
 from stereovox.sources.poses import Poses
 from stereovox.sources.robots.cloud_scan import CloudBand, scan_of_cloud
 from stereovox.sources.robots.frames import FrameOptions, RobotFrames
 from stereovox.sources.tracker import AXES
+
+NO_POSE = np.full((4, 4), np.nan)
+T_BODY_OPTICAL = np.eye(4)
+"""An optical frame (z forward) in a body that looks the same way (x forward, z up)."""
+T_BODY_OPTICAL[:3, :3] = AXES["ros"].T
 
 
 @dataclass(frozen=True)
@@ -38,7 +43,7 @@ class RobotOptions:
         roll in radians, of which the last may be left out. A camera without turn looks forward.
     axes: `ros` where depth images name the camera's body (x forward) as their frame, not its optical frame.
     scale: metres per unit of depth (0: as the file says). range_max: metres, in place of what the scans say.
-    max_gap, extrapolate: seconds, see `tf_edge.Limits`.
+    max_gap, extrapolate: seconds, see `tf.Limits`.
     lowest, highest: metres over the floor between which points of a cloud count.
     """
 
@@ -72,7 +77,7 @@ class RobotOptions:
 
 
 def mounted(key: str, text: str) -> Transform | None:
-    """Return T_base_body of `x,y,z,yaw,pitch,roll`, None for ""; raises SourceError for anything else."""
+    """Parse `x,y,z,yaw,pitch,roll` as T_base_body, None for ""; raises SourceError for anything else."""
     if not text:
         return None
     try:
@@ -86,12 +91,6 @@ def mounted(key: str, text: str) -> Transform | None:
     T[:3, :3] = rotation_matrix([0, 0, yaw]) @ rotation_matrix([0, pitch, 0]) @ rotation_matrix([roll, 0, 0])
     T[:3, 3] = numbers[:3]
     return T
-
-
-NOWHERE = np.full((4, 4), np.nan)
-T_BODY_OPTICAL = np.eye(4)
-"""An optical frame (z forward) in a body that looks the same way (x forward, z up)."""
-T_BODY_OPTICAL[:3, :3] = AXES["ros"].T
 
 
 class RobotBag:
@@ -108,7 +107,7 @@ class RobotBag:
     Pixels without value are as in `Bag`. At the ends of tf a pose is held for `extrapolate` seconds (`pose_off_ns`).
     Order: as recorded, which is that of the stamps unless the clock was set back meanwhile.
     Faults: `unreadable`, `no_pose`, for images also `bad_dtype` and `bad_shape`.
-    Raises SourceError, one line, for files that are empty, damaged or without scans and depth, and for bad options.
+    Raises SourceError for files that are empty, damaged or without scans and depth, and for bad options.
     """
 
     layout = "a bag with scans or depth images of a robot"
@@ -121,9 +120,9 @@ class RobotBag:
         depth_frame_id = frame_name(self._depth.frame_id) if self._depth else ""
         self._scans, scan_notes = find_scans(file, options.scan, options.range_max, depth_frame_id)
         if not (self._scans or self._depth):
-            seen = ", ".join(f"{name} ({kind})" for name, kind in sorted(file.types.items())[:5]) or "nothing at all"
+            pixels = ", ".join(f"{name} ({kind})" for name, kind in sorted(file.types.items())[:5]) or "nothing at all"
             why = f"{depth_notes[0]}; else" if depth_notes else f"{path}:"
-            raise SourceError(f"{why} no scans, point clouds or depth images in it; it holds {seen}")
+            raise SourceError(f"{why} no scans, point clouds or depth images in it; it holds {pixels}")
         limits = Limits(options.max_gap, options.extrapolate)
         chosen = FrameOptions(options.odom, options.base_frame, options.odom_frame, options.truth, limits)
         scan_frame_id = self._scans.frame_id if self._scans else ""
@@ -137,7 +136,7 @@ class RobotBag:
 
     @classmethod
     def recognises(cls, where: str) -> bool:
-        """Tell whether `where` is, or by its name should be, a bag; options may follow. Never raises."""
+        """Return whether `where` is, or by its name should be, a bag; options may follow. Never raises."""
         return bool(suffix_of(file_part(where)))
 
     def _mount_lidar(self, frame_id: str) -> tuple[str, tuple[str, ...]]:
@@ -157,21 +156,21 @@ class RobotBag:
         topic = self._scans
         assert topic
         blank = Scan(
-            np.empty(0, np.float32), 0.0, 0.0, 0.0, 0.0, NOWHERE, stamp_ns=topic.recorded_ns(i), name=topic.name(i)
+            np.empty(0, np.float32), 0.0, 0.0, 0.0, 0.0, NO_POSE, stamp_ns=topic.recorded_ns(i), name=topic.name(i)
         )
         try:
-            told = topic.read(i)
-            blank = replace(blank, stamp_ns=told.stamp_ns)
-            sensor = self._lidar if told.frame_id == topic.frame_id else told.frame_id
-            T_base, T_odom = (look(sensor, told.stamp_ns) for look in (self.where.in_base, self.where.in_odom))
-            off_ns = self.where.off_ns(sensor, told.stamp_ns)
+            message = topic.read(i)
+            blank = replace(blank, stamp_ns=message.stamp_ns)
+            sensor = self._lidar if message.frame_id == topic.frame_id else message.frame_id
+            T_base, T_odom = (look(sensor, message.stamp_ns) for look in (self.where.in_base, self.where.in_odom))
+            off_ns = self.where.off_ns(sensor, message.stamp_ns)
         except FrameRefused as refused:
             return replace(blank, fault=refused.reason, fault_detail=str(refused))
-        if isinstance(told, LaserScan):
-            return posed_scan(told, T_odom, T_base, blank.name, off_ns)
+        if isinstance(message, LaserScan):
+            return posed_scan(message, T_odom, T_base, blank.name, off_ns)
         band = CloudBand(self._options.lowest, self._options.highest)
         band = replace(band, range_max=self._options.range_max or band.range_max)
-        flat, T_base_scan = scan_of_cloud(told, T_base, band)
+        flat, T_base_scan = scan_of_cloud(message, T_base, band)
         return posed_scan(flat, T_odom @ inverse(T_base) @ T_base_scan, T_base_scan, blank.name, off_ns)
 
     def _frame(self, i: int) -> Frame:
@@ -186,27 +185,27 @@ class RobotBag:
         return T if self._options.axes == "optical" else T @ T_BODY_OPTICAL
 
 
-def posed_scan(told: LaserScan, T_odom_sensor: Transform, T_base_sensor: Transform, name: str, off_ns: int) -> Scan:
+def posed_scan(message: LaserScan, T_odom_sensor: Transform, T_base_sensor: Transform, name: str, off_ns: int) -> Scan:
     """Return a message as a scan. off_ns: as `Scan.pose_off_ns`."""
-    angles = told.angle_min, told.angle_step
-    limits = told.range_min, told.range_max
+    angles = message.angle_min, message.angle_step
+    limits = message.range_min, message.range_max
     return Scan(
-        told.ranges, *angles, *limits, T_odom_sensor, T_base_sensor, stamp_ns=told.stamp_ns, name=name,
+        message.ranges, *angles, *limits, T_odom_sensor, T_base_sensor, stamp_ns=message.stamp_ns, name=name,
         pose_off_ns=off_ns,
     )  # fmt: skip
 
 
 def _find_depth(file: BagFile, options: RobotOptions) -> tuple[DepthTopic | None, tuple[str, ...]]:
-    """Return the depth images that are named, or else the topic with most, and notes; None where there are none.
+    """Return the named depth images, or else those of the busiest topic, and notes; None if there are none.
 
-    Without being asked for, images that cannot be used (without CameraInfo) only make a note.
+    Unless they were named, unusable images (without CameraInfo) only cause a note.
     """
     if options.depth:
         return find_depth(file, options.depth, options.info), ()
     found, notes = depth_topics(file), ()
     if not found:
         return None, ()
-    best = most(file, found)
+    best = busiest_topic(file, found)
     if len(found) > 1:
         others = ", ".join(name for name in found if name != best)
         notes = (f"{file.path}: depth images of {best}; there are {others} too: say ?depth=/topic for those",)

@@ -23,23 +23,80 @@ from stereovox.sources import parameters
 from stereovox.sources.poses import Poses
 
 LASERS = {b"FLASER": 100.0, b"ROBOTLASER1": 100.0}
-"""Kinds of lines that hold a scan of the front laser, and the metres within which it must sit on the robot."""
+"""Line types with a scan of the front laser, and the largest distance in metres of its mount from the robot."""
 NO_ECHO = (50.0, 81.9)
-FARTHEST = 1e6
+MAX_DISTANCE = 1e6
 """Metres from the world's origin within which a robot can be."""
 MAX_BEAMS = 100_000
+ENDINGS = (".clf", ".log", ".clf.bz2", ".log.bz2")
+MAX_LINE_BYTES = 1 << 20
+"""Bytes of the longest line that a log can have."""
+ALWAYS_ALLOWED, MAX_RATIO = 1 << 18, 100
+"""Decompressed bytes that a log may always have, and most per compressed byte; text compresses to a tenth."""
+NO_ECHO_VALUES = {"unknown": np.nan, "free": np.inf}
+OFFSETS = {"robot_frontlaser_offset", "robot_front_laser_offset", "frontlaser_offset"}
+
+
+class CarmenLog:
+    """Scans (FLASER, ROBOTLASER1) of a CARMEN log, with the robot's raw odometry as poses.
+
+    The mount is PARAM robot_frontlaser_offset (metres forward), in ROBOTLASER1 the difference of its two poses. Stamps
+    are `ipc_timestamp`, which is what `.relations` files name. Lines that do not make sense are left out, counted and
+    named in `notes`. `frames` is empty, `truth` unknown.
+    Raises SourceError where the file cannot be read or holds no scan.
+    """
+
+    def __init__(self, where: str):
+        location, given = parameters.split(where)
+        options = Options(**parameters.typed(given, parameters.defaults(Options)))
+        path = Path(location)
+        self.name = path.name.partition(".")[0]
+        self.damaged: list[str] = []
+        found = _readings(path, self.damaged)
+        self._readings = sorted(found, key=lambda reading: reading.stamp_ns)
+        if not self._readings:
+            raise SourceError(f"{path}: holds no scan (FLASER or ROBOTLASER1 line)")
+        self._max_range = options.max_range or self._readings[0].max_range or _no_echo(self._readings)
+        self.notes = tuple(_notes(path, self.damaged, self._max_range, options.no_echo))
+        self.scans: Sequence[Scan] = _Scans(self._readings, self._max_range, NO_ECHO_VALUES[options.no_echo])
+        self.frames: Sequence[Frame] = ()
+        self.truth: Poses | None = None
+
+    @classmethod
+    def recognises(cls, where: str) -> bool:
+        """Return whether the name has an ending of a CARMEN log."""
+        return str(where).partition("?")[0].lower().endswith(ENDINGS)
+
+
+@dataclass(frozen=True)
+class Options:
+    """What may stand behind the file's name, as in `aces.clf.bz2?max_range=40`.
+
+    max_range: metres from which on a range says "no echo"; 0: what the file says, else what its numbers say: the least
+        of 50 m and 81.9 m (a SICK's "no echo") that the log holds as such.
+    no_echo: what that means: `unknown`, since black and dazzling things give no echo either, or `free` up to there.
+    """
+
+    max_range: float = 0.0
+    no_echo: str = "unknown"
+
+    def __post_init__(self) -> None:
+        if self.max_range < 0:
+            raise SourceError(f"max_range={self.max_range:g} must be a positive number")
+        if self.no_echo not in NO_ECHO_VALUES:
+            raise SourceError(f"no_echo={self.no_echo} must be {' or '.join(NO_ECHO_VALUES)}")
 
 
 class DamagedLine(ValueError):  # noqa: N818 - reads as what happened
-    """A line does not make sense; the message says why."""
+    """A line that makes no sense; the message says why."""
 
 
 @dataclass(frozen=True, eq=False)
 class Reading:
-    """One scan as the log holds it.
+    """One scan as logged.
 
     ranges: (N,) float32 metres. pose_odom_base, pose_base_sensor: (3,) x, y, yaw. line: its number in the file.
-    max_range: metres from which on nothing was seen, 0 where the line does not tell.
+    max_range: metres from which on nothing was detected, 0 where the line lacks it.
     """
 
     ranges: NDArray[np.float32]
@@ -79,7 +136,7 @@ def _robotlaser(words: list[bytes], number: int) -> Reading:
     ranges, tail = _numbers(words, 8)
     _, tail = _numbers([b"", *tail], 1)
     laser, robot = _poses(tail[:6])
-    if not (math.isfinite(start) and math.isfinite(step) and 0 < abs(step) < 1 and 0 <= most <= FARTHEST):
+    if not (math.isfinite(start) and math.isfinite(step) and 0 < abs(step) < 1 and 0 <= most <= MAX_DISTANCE):
         raise DamagedLine(f"ROBOTLASER1 with beams {step:g} apart, from {start:g}, of {most:g} m")
     mount = se2.relative(robot, laser)
     if np.hypot(*mount[:2]) > LASERS[b"ROBOTLASER1"]:
@@ -98,7 +155,7 @@ def _numbers(words: list[bytes], at: int) -> tuple[NDArray[np.float32], list[byt
 
 def _poses(words: list[bytes]) -> tuple[se2.Pose, se2.Pose]:
     values = np.array([float(word) for word in words])
-    if len(values) != 6 or not np.abs(values).max() < FARTHEST:
+    if len(values) != 6 or not np.abs(values).max() < MAX_DISTANCE:
         raise DamagedLine("a pose that is missing, not finite or beyond 1000 km")
     return values[:3], values[3:]
 
@@ -116,65 +173,6 @@ def _angles(beams: int) -> tuple[float, float]:
         raise DamagedLine("FLASER without ranges")
     steps = beams - 1 if beams % 2 or beams < 3 else beams
     return -math.pi / 2, math.pi / max(steps, 1)
-
-
-ENDINGS = (".clf", ".log", ".clf.bz2", ".log.bz2")
-LONGEST = 1 << 20
-"""Bytes of a line; what is longer is no line of a log."""
-SMALL, PACKED_BEST = 1 << 18, 100
-"""A packed log may become so many bytes, or so many for each of its own; text packs to a tenth."""
-NO_ECHO_MEANS = {"unknown": np.nan, "free": np.inf}
-OFFSETS = {"robot_frontlaser_offset", "robot_front_laser_offset", "frontlaser_offset"}
-
-
-@dataclass(frozen=True)
-class Options:
-    """What may stand behind the file's name, as in `aces.clf.bz2?max_range=40`.
-
-    max_range: metres from which on a range says "no echo"; 0: what the file says, else what its numbers say: the least
-        of 50 m and 81.9 m (a SICK's "no echo") that the log holds as such.
-    no_echo: what that means: `unknown`, since black and dazzling things give no echo either, or `free` up to there.
-    """
-
-    max_range: float = 0.0
-    no_echo: str = "unknown"
-
-    def __post_init__(self) -> None:
-        if self.max_range < 0:
-            raise SourceError(f"max_range={self.max_range:g} must be a positive number")
-        if self.no_echo not in NO_ECHO_MEANS:
-            raise SourceError(f"no_echo={self.no_echo} must be {' or '.join(NO_ECHO_MEANS)}")
-
-
-class CarmenLog:
-    """Scans (FLASER, ROBOTLASER1) of a CARMEN log, with the robot's raw odometry as poses.
-
-    The mount is PARAM robot_frontlaser_offset (metres forward), in ROBOTLASER1 the difference of its two poses. Stamps
-    are `ipc_timestamp`, which is what `.relations` files name. Lines that do not make sense are left out, counted and
-    named in `notes`. `frames` is empty, `truth` unknown.
-    Raises SourceError where the file cannot be read or holds no scan.
-    """
-
-    def __init__(self, where: str):
-        location, given = parameters.split(where)
-        options = Options(**parameters.typed(given, parameters.defaults(Options)))
-        path = Path(location)
-        self.name = path.name.partition(".")[0]
-        self.damaged: list[str] = []
-        found = _readings(path, self.damaged)
-        self._readings = sorted(found, key=lambda reading: reading.stamp_ns)
-        if not self._readings:
-            raise SourceError(f"{path}: holds no scan (FLASER or ROBOTLASER1 line)")
-        self._max_range = options.max_range or self._readings[0].max_range or _no_echo(self._readings)
-        self.notes = tuple(_notes(path, self.damaged, self._max_range, options.no_echo))
-        self.scans: Sequence[Scan] = _Scans(self._readings, self._max_range, NO_ECHO_MEANS[options.no_echo])
-        self.frames: Sequence[Frame] = ()
-        self.truth: Poses | None = None
-
-    @classmethod
-    def recognises(cls, where: str) -> bool:
-        """Tell whether the name ends like a CARMEN log's."""
-        return str(where).partition("?")[0].lower().endswith(ENDINGS)
 
 
 class _Scans(Sequence[Scan]):
@@ -227,8 +225,8 @@ def _offset(line: bytes, before: float) -> float:
 def _lines(path: Path, damaged: list[str]) -> Iterator[tuple[int, bytes]]:
     try:
         with _opened(path) as file:
-            number, size, most = 0, 0, max(SMALL, PACKED_BEST * path.stat().st_size)
-            while line := file.readline(LONGEST):
+            number, size, most = 0, 0, max(ALWAYS_ALLOWED, MAX_RATIO * path.stat().st_size)
+            while line := file.readline(MAX_LINE_BYTES):
                 number, size = number + 1, size + len(line)
                 if size > most:
                     damaged.append(f"the packed file swells to more than {most} bytes; the rest is left out")
@@ -248,7 +246,7 @@ def _opened(path: Path) -> BinaryIO | bz2.BZ2File:
 
 
 def _no_echo(readings: list[Reading]) -> float:
-    """The range from which on a SICK means "no echo": one of its two conventions that is a peak in the log."""
+    """Return the range from which on a SICK means "no echo": one of its two conventions that is a peak in the log."""
     largest = max(float(np.max(reading.ranges, initial=0.0, where=np.isfinite(reading.ranges))) for reading in readings)
     return min((limit for limit in NO_ECHO if limit <= largest < 1.1 * limit), default=NO_ECHO[-1])
 

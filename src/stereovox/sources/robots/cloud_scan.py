@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a 2-D lidar would see of a point cloud."""
+"""Convert a point cloud to the scan of a virtual 2-D lidar."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from stereovox.sources.bags.robot_messages import LaserScan, PointCloud
 
 @dataclass(frozen=True)
 class CloudBand:
-    """Which points of a cloud count, in the robot's frame.
+    """The part of a cloud that becomes a scan, in the robot's frame.
 
-    lowest, highest: metres over the floor. range_min, range_max: metres from the sensor, seen from above; nearer points
-    are the robot's own and do not count. step: width of a beam in radians, about.
+    lowest, highest: metres above the floor. range_min, range_max: metres from the sensor, seen from above; nearer
+    points are the robot's own and are ignored. step: approximate width of a beam in radians.
     """
 
     lowest: float = 0.1
@@ -30,10 +30,10 @@ class CloudBand:
 
 
 def scan_of_cloud(cloud: PointCloud, T_base_sensor: Transform, band: CloudBand) -> tuple[LaserScan, Transform]:
-    """Return the scan all round, and T_base_scan: its frame is upright and stands where the sensor does.
+    """Return the scan of a full turn, and T_base_scan: its frame is upright at the sensor's place.
 
     A beam has the distance of its nearest point in the band; +inf where that is `range_max` or more; NaN where there is
-    no point, since a cloud does not tell why.
+    no point, since a cloud does not say why.
     """
     points = transform_points(T_base_sensor, cloud.points[np.isfinite(cloud.points).all(axis=1)])
     T_base_scan = lifted(flattened(T_base_sensor))

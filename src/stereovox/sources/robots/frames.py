@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a recorded robot stood and where its sensors sit: from tf, an odometry topic, options, or assumed."""
+"""Poses and sensor mounts of a recorded robot: from tf, an odometry topic, options, or assumptions."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from stereovox.sources.bags.scans import first_odometry, odometry_edge, odometry
 from stereovox.sources.bags.tf import Edge, Limits, Tf, read_tf
 
 BASES = ("base_footprint", "base_link")
-"""Frames taken for the robot, the first that is connected with its sensors: REP 120 and REP 105."""
+"""The robot's frame is the first of these connected with its sensors: REP 120 and REP 105."""
 ODOMS = ("odom", "odom_combined")
 Notes = tuple[str, ...]
 
 
 @dataclass(frozen=True)
 class FrameOptions:
-    """Names that were given; "" to look for them. odom: topic of nav_msgs/Odometry; truth: one that is not odometry."""
+    """Names given by the user; "" to search. odom: topic of nav_msgs/Odometry; truth: a topic that is not odometry."""
 
     odom: str = ""
     base_frame: str = ""
@@ -34,11 +34,10 @@ class FrameOptions:
 class RobotFrames:
     """Poses of a robot's sensors in the world of its odometry.
 
-    sensors: frames that the sensors name, "" where they name none; they help to choose the robot's own.
-    tf: all transforms; empty without /tf. `mount` adds what is assumed.
-    base, odom: frames of the robot and of its odometry; odom is "" where the robot is taken to stand still. notes: what
-    had to be assumed.
-    Raises SourceError, one line, for topics and frames that were given and are not there.
+    sensors: frames named by the sensors, "" where there is no name; they help to choose the robot's own. tf: all
+    transforms; empty without /tf. `mount` adds assumed ones. base, odom: frames of the robot and of its odometry; odom
+    is "" where the robot is assumed to stand still. notes: assumptions made. Raises SourceError for given topics and
+    frames that do not exist.
     """
 
     def __init__(self, file: BagFile, options: FrameOptions, sensors: tuple[str, ...]):
@@ -55,14 +54,14 @@ class RobotFrames:
             self._edge = odometry_edge(file, topic, first.parent or ODOMS[0], child)
             self.odom, how = self._edge.parent, (*noted, *said)
         if not self.odom:
-            self.odom, how = self._anything_moving()
+            self.odom, how = self._moving_root()
         self.notes = (*based, *how, *self.tf.notes)
 
     def mount(self, sensor: str, alias: str, given: Transform | None, T_frame: Transform) -> tuple[str, Notes]:
         """Return the frame in which a sensor's poses can be looked up, and notes.
 
-        given: T_base_body of the options, which counts before tf. T_frame: T_body_sensor of a frame that tf does not
-        know (for a camera its optical frame). alias: what to call the sensor.
+        given: T_base_body of the options, which takes precedence over tf. T_frame: T_body_sensor of a frame unknown to
+        tf (for a camera its optical frame). alias: name of the sensor in messages.
         """
         if given is not None:
             self.tf.add_fixed(self.base, f"{alias}?", given @ T_frame)
@@ -99,7 +98,7 @@ class RobotFrames:
         return np.eye(4) if target == source else self.tf.lookup(target, source, stamp_ns)
 
     def _find_base(self, given: str, child: str) -> tuple[str, Notes]:
-        """Return the robot's frame; child: the frame whose pose the odometry topic tells."""
+        """Return the robot's frame; child: the child frame of the odometry topic."""
         if given:
             if self.tf.frames and given not in {*self.tf.frames, child}:
                 known = did_you_mean(given, self.tf.frames)
@@ -114,7 +113,7 @@ class RobotFrames:
         return self._sensors[0], (f"{self.path}: {said}",)
 
     def _body(self, child: str, topic: str) -> tuple[str, Notes]:
-        """Return the frame whose pose an odometry topic tells: what it says, where that has to do with the robot."""
+        """Return the frame whose pose an odometry topic holds: its child frame, if that is connected with the robot."""
         if child in ("", self.base) or self.tf.connected(child, self.base):
             return child or self.base, ()
         return self.base, (f"{self.path}: {topic} tells where {child} is: taken for {self.base}",)
@@ -142,8 +141,8 @@ class RobotFrames:
             raise SourceError(f"{refused}; correct ?odom_frame={given}") from None
         return given
 
-    def _anything_moving(self) -> tuple[str, Notes]:
-        """Return the root above the robot, where it moves there; else "": it is taken to stand still."""
+    def _moving_root(self) -> tuple[str, Notes]:
+        """Return the root above the robot, if it moves there; else "": it is assumed to stand still."""
         if self.base in self.tf.frames and self._moved(self.base):
             root = self.tf.root(self.base)
             said = f"no {ODOMS[0]} in /tf: poses are those of {self.base} in {root}; else give ?odom_frame="

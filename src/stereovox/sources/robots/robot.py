@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings of ground robots: lidar scans, depth images and odometry, in order of time."""
+"""The protocol of ground robots' recordings: lidar scans, depth images and odometry in time order."""
 
 from __future__ import annotations
 
@@ -12,12 +12,14 @@ from stereovox.sources.poses import Poses
 
 
 class Robot(Protocol):
-    """What a ground robot recorded. Poses are those of its odometry (`T_world_sensor` = T_odom_sensor).
+    """The recording of a ground robot. Poses are those of its odometry (`T_world_sensor` = T_odom_sensor).
 
-    name: what the recording is called; notes: what had to be assumed, one line each.
-    scans: the lidar's scans in order of time, read when they are asked for; empty where there is no lidar.
-    frames: the depth images in order of time, likewise.
-    truth: T_world_base where it is known (simulation), else None.
+    Attributes:
+        name: Name of the recording.
+        notes: What had to be assumed, one line each.
+        scans: Lidar scans in time order, read on access; empty without a lidar.
+        frames: Depth images in time order, read on access; empty without a depth camera.
+        truth: T_world_base where it is known (simulation), else None.
     """
 
     name: str
@@ -28,10 +30,17 @@ class Robot(Protocol):
 
     @classmethod
     def recognises(cls, where: str) -> bool:
-        """Tell whether `where` is, or by its name should be, such a recording. Never raises."""
+        """Check cheaply whether this class can open a recording; never raises.
+
+        Args:
+            where: Path or name, perhaps with options behind a `?`.
+
+        Returns:
+            Whether `where` is, or by its name should be, such a recording.
+        """
         ...
 
 
 def in_time_order(*streams: Iterable[Scan | Frame]) -> Iterator[Scan | Frame]:
-    """Yield what several streams hold, each in order of time, as it came."""
+    """Merge streams that are each in time order."""
     yield from merge(*streams, key=lambda seen: seen.stamp_ns)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Where a ground robot was along its recording: found by SLAM, or by localising it in a map."""
+"""The track of a ground robot's recording, from SLAM or from localisation in a map, and how well it fits."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.sources.robots.robot import Robot
 
 Progress = Callable[[int, int, str], object]
-"""Called with scans done, scans in all, and what is being done."""
+"""Called with scans done, scans in all, and the current activity."""
 DOUBTFUL = 0.6
-"""Share of beams that fit the map below which the way may be wrong."""
+"""Share of fitting beams below which the track may be wrong."""
 
 
 def no_progress(done: int, total: int, text: str) -> None:
-    """Tell nobody."""
+    """Ignore progress."""
 
 
 def slam_robot(robot: Robot, config: Config, progress: Progress = no_progress) -> SlamResult:
-    """Return the way and the map that SLAM makes of the robot's scans.
+    """Run SLAM over a robot's scans.
 
     Raises MissingExtra without gtsam, StereovoxError where there are no scans, and as `map_scans`.
     """
@@ -47,7 +47,7 @@ def localise_robot(
     start: NDArray[np.floating] | None,
     progress: Progress = no_progress,
 ) -> Track:
-    """Return the robot's way through a map; `start`: x, y, yaw in metres and radians, None: anywhere.
+    """Return the robot's track through a map; `start`: x, y, yaw in metres and radians, None: anywhere.
 
     Raises StereovoxError where there are no scans, and as `localise`.
     """
@@ -58,7 +58,7 @@ def localise_robot(
 
 
 def check_start(start: NDArray[np.floating] | None, floor: OccupancyGrid) -> None:
-    """Raise StereovoxError for a start (x, y, yaw in radians) that is no three numbers or outside of the map."""
+    """Raise StereovoxError for a start (x, y, yaw in radians) that is not three numbers or lies outside the map."""
     if start is None:
         return
     if start.shape != (3,) or not np.isfinite(start).all():
@@ -72,7 +72,7 @@ def check_start(start: NDArray[np.floating] | None, floor: OccupancyGrid) -> Non
 
 
 def refused_line(refused: Mapping[str, int], first: str = "") -> str:
-    """Return one line about the scans that could not be used, by reason; "" where all could."""
+    """Return one line about the refused scans, by reason; "" if there are none."""
     if not refused:
         return ""
     reasons = ", ".join(f"{number} x {reason}" for reason, number in refused.items())
@@ -80,7 +80,8 @@ def refused_line(refused: Mapping[str, int], first: str = "") -> str:
 
 
 def fit_of(robot: Robot, floor: OccupancyGrid, track: Track) -> tuple[float | None, str]:
-    """Return the share of beams that fit the map along the way, and a line that says so, and doubts it where few do.
+    """Return the share of beams that fit the map along the track, and a line that states it, with a warning if it is
+    low.
 
     None and "" where no beam met anything.
     """

@@ -50,8 +50,8 @@ class Beams:
 def beams_of(scan: Scan, max_range: float | None = None) -> Beams:
     """Return the beams of a scan: NaN, -inf and ranges below `range_min` are ignored, +inf means that nothing was met.
 
-    max_range: metres beyond which nothing counts as met; None: the scan's own. The scan must be validated (`validate_scan`). Raises
-    FrameRefused with the reason: `bad_scan`, `no_valid_range`.
+    max_range: metres beyond which nothing counts as met; None: the scan's own. The scan must be validated
+    (`validate_scan`). Raises FrameRefused with the reason: `bad_scan`, `no_valid_range`.
     """
     ranges, farthest = np.asarray(scan.ranges, float), _farthest(scan, max_range)
     known = (ranges >= scan.range_min) & (ranges > 0)

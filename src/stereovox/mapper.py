@@ -109,8 +109,8 @@ class Mapper:
             passed = offer.check(image)
             evidence, passed = self._comparison.evidence(frame, image, passed, way.integrator, self.map)
             with self.map.lock:
-                self.map.check_room(evidence)
-                self.map.look_from(image.viewpoint)
+                self.map.storage.check_room(evidence)
+                self.map.storage.look_from(image.viewpoint)
                 cells = self.map.add(evidence)
                 offer.took(passed, way.name)
                 self.map.history.ways[way.name] += 1
@@ -172,7 +172,7 @@ class GridMapper:
             prepared = perf_counter()
             evidence = self._beams.evidence(scan, self.map.origin)
             with self.map.lock:
-                self.map.check_room(evidence)
+                self.map.storage.check_room(evidence)
                 cells = self.map.add(evidence)
                 offer.took(passed)
             done = perf_counter()
@@ -212,7 +212,8 @@ def _grid_map(config: Config, resume: GridMap | OccupancyGrid | None) -> GridMap
         return GridMap(config)
     if isinstance(resume, OccupancyGrid):
         return GridMap.from_occupancy(resume, config)
-    return resume.with_config(config)
+    resume.storage.continue_with(config)
+    return resume
 
 
 def _described(mapper: AnyMapper[Any]) -> str:

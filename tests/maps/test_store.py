@@ -68,7 +68,7 @@ def test_slabs_of_any_size_are_saved_in_whole_chunks(tmp_path, monkeypatch):
     monkeypatch.setattr(store, "BLOCKS_PER_CHUNK", 16)
     cells = np.random.default_rng(0).permutation(8 * np.argwhere(np.ones((4, 5, 6), bool)))
     whole = small_map(cells)
-    coords, values = whole.blocks()
+    coords, values = whole.storage.blocks()
 
     class Slabs(VoxelMap):
         def slabs(self):
@@ -77,7 +77,7 @@ def test_slabs_of_any_size_are_saved_in_whole_chunks(tmp_path, monkeypatch):
 
     saved = Slabs(CONFIG)
     saved.save(tmp_path / "m")
-    for got, wanted in zip(load_map(tmp_path / "m").blocks(), (coords, values), strict=True):
+    for got, wanted in zip(load_map(tmp_path / "m").storage.blocks(), (coords, values), strict=True):
         np.testing.assert_array_equal(got, wanted)
     assert len(list((tmp_path / "m").rglob("cells/c/*/0"))) == 8  # 120 blocks by 16
     written = json.loads(next((tmp_path / "m").rglob("cells/zarr.json")).read_text())

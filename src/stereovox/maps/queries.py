@@ -60,15 +60,17 @@ class NearestCells(NamedTuple):
     cell: NDArray[np.int32]
 
 
-def points_of(values: ArrayLike, name: str = "points") -> NDArray[np.float32] | NDArray[np.float64]:
-    """Return places (N, 3), float32 if they are, else float64; one place (3,) is a batch of one, [] one of none.
+def points_of(values: ArrayLike, name: str = "points", axes: int = 3) -> NDArray[np.float32] | NDArray[np.float64]:
+    """Return places (N, axes), float32 if they are, else float64; one place (axes,) is a batch of one, [] one of none.
 
     Raises StereovoxError for any other shape and for what is no number; NaN and infinity are numbers.
     """
-    numbers = _numbers(values, name, "numbers of shape (N, 3)")
-    if numbers.shape not in {(0,), (3,)} and (numbers.ndim != 2 or numbers.shape[1] != 3):
-        raise StereovoxError(f"{name}: shape {numbers.shape} is not (N, 3), or (3,) for one")
-    numbers = numbers.reshape(-1, 3)
+    numbers = _numbers(values, name, f"numbers of shape (N, {axes})")
+    if numbers.shape not in {(0,), (axes,)} and (numbers.ndim != 2 or numbers.shape[1] != axes):
+        raise StereovoxError(
+            f"{name} are {numbers.shape} {numbers.dtype}; give (N, {axes}) metres, or ({axes},) for one"
+        )
+    numbers = numbers.reshape(-1, axes)
     return numbers if numbers.dtype == np.float32 else numbers.astype(float, copy=False)
 
 

@@ -24,7 +24,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,9 +34,10 @@ from stereovox.config import Config, load_config
 from stereovox.errors import MapFileError
 from stereovox.frame import Viewpoint
 from stereovox.maps.blocks import CELLS, SIDE
-from stereovox.maps.cell_format import FORMATS, CellFormat
+from stereovox.maps.cell_format import FORMATS
 from stereovox.maps.lock import LOCK, only_writer_in
 from stereovox.maps.queries import INDEX_LIMIT
+from stereovox.maps.storage import Storage
 from stereovox.safe_io import count_in, json_value, read_bounded, sync_folder, sync_tree
 from stereovox.trust.history import History
 
@@ -164,33 +165,6 @@ Slab = tuple[NDArray, ...]
 """Block coordinates (n, 3), cells (n, 512), and times (n, 512) where they are kept."""
 
 
-class Saveable(Protocol):
-    """What a map must offer to be saved; see `VoxelMap` for what each is."""
-
-    config: Config
-    history: History
-    viewpoint: Viewpoint | None
-    window_state: dict[str, Any] | None
-
-    @property
-    def cell_format(self) -> CellFormat:
-        """How cells are stored."""
-        ...
-
-    @property
-    def times_start_ns(self) -> int | None:
-        """The stamp that times of cells count from."""
-        ...
-
-    def slabs(self) -> Iterator[Slab]:
-        """Yield block coordinates and cells, in ascending order."""
-        ...
-
-    def timed(self) -> Iterator[Slab]:
-        """Yield block coordinates, cells and their times."""
-        ...
-
-
 class SavedMap(NamedTuple):
     """What a saved map holds; `times` is None where none were kept."""
 
@@ -204,8 +178,8 @@ class SavedMap(NamedTuple):
     times_start_ns: int | None
 
 
-def save_map(voxel_map: Saveable, path: str | Path) -> None:
-    """Write `voxel_map` to the folder `path`, so that the disk holds all of it when this returns.
+def save_map(storage: Storage, path: str | Path) -> None:
+    """Write a map to the folder `path`, so that the disk holds all of it when this returns.
 
     Raises MapFileError when it cannot be written, is no map, or is being written by another run; an older map is then
     as it was.
@@ -216,9 +190,9 @@ def save_map(voxel_map: Saveable, path: str | Path) -> None:
     with only_writer_in(folder):
         sweep(folder)
         try:
-            blocks, checksum = _write_arrays(folder / data, voxel_map)
+            blocks, checksum = _write_arrays(folder / data, storage)
             sync_tree(folder / data)
-            _write_manifest(folder, _manifest(voxel_map, data, blocks, checksum))
+            _write_manifest(folder, _manifest(storage, data, blocks, checksum))
         except BaseException as error:
             _let_writes_end()
             if _named(folder) != data:  # else it is the map already, whatever the disk says
@@ -351,18 +325,18 @@ def _named(folder: Path) -> Any:
     return None
 
 
-def _manifest(voxel_map: Saveable, data: str, blocks: int, checksum: list[int]) -> dict[str, Any]:
+def _manifest(storage: Storage, data: str, blocks: int, checksum: list[int]) -> dict[str, Any]:
     return {
         "format": FORMAT,
         "version": VERSION,
-        **voxel_map.history.saved(),
+        **storage.history.saved(),
         "blocks": blocks,
         "data": data,
         "checksum": checksum,
-        "viewpoint": _viewpoint_to(voxel_map.viewpoint),
-        "window": voxel_map.window_state,
-        "times_start_ns": voxel_map.times_start_ns,
-        "config": voxel_map.config.model_dump(),
+        "viewpoint": _viewpoint_to(storage.viewpoint),
+        "window": storage.window_state,
+        "times_start_ns": storage.times_start_ns,
+        "config": storage.config.model_dump(),
     }
 
 
@@ -414,16 +388,16 @@ def _as_number(number: Any) -> Any:
     return number.item()
 
 
-def _write_arrays(folder: Path, voxel_map: Saveable) -> tuple[int, list[int]]:
+def _write_arrays(folder: Path, storage: Storage) -> tuple[int, list[int]]:
     """Write all blocks, piece by piece; return their number and the checksum of each array."""
     import zarr
 
     group = zarr.open_group(folder, mode="w", zarr_format=3)
     arrays, checksums = None, []
-    slabs = voxel_map.timed() if voxel_map.config.map.keep_times else voxel_map.slabs()
+    slabs = storage.timed() if storage.config.map.keep_times else storage.slabs()
     for slab in _whole_chunks(slabs):
         if arrays is None:
-            fills = (0, voxel_map.cell_format.unknown, 0)
+            fills = (0, storage.cell_format.unknown, 0)
             arrays = [_new_array(group, *what) for what in zip(ARRAYS, slab, fills, strict=False)]
             checksums = [0] * len(arrays)
         for n, part in enumerate(slab):

@@ -140,7 +140,7 @@ class DistanceField:
         field, order = self._transform.field, np.array(self._transform.order)
         dirty = np.zeros(len(field.mask), np.uint8)
         changed = _distance.refresh(
-            self._map.stored_cells, CellRules(self._map.config.map).thresholds, self._wanted, self._low, order,
+            self._map.storage.stored_cells, CellRules(self._map.config.map).thresholds, self._wanted, self._low, order,
             self._shape[order], self._seen, field.mask, dirty,
         )  # fmt: skip
         return int(changed), dirty

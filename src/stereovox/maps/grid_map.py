@@ -22,7 +22,7 @@ from stereovox.maps.evidence import CELLS, LOG_ODDS_SCALE, SIDE, GridEvidence
 from stereovox.maps.lock import only_writer_of
 from stereovox.maps.memory import told
 from stereovox.maps.occupancy import UNKNOWN, OccupancyGrid, Percent
-from stereovox.maps.queries import INDEX_LIMIT, points_of
+from stereovox.maps.queries import INDEX_LIMIT, points_of, shape_error
 from stereovox.maps.storage import OnStorage
 from stereovox.safe_io import json_value, read_arrays, replacing
 from stereovox.threads import Guarded, MapLock
@@ -158,11 +158,14 @@ class GridMap(Guarded, OnStorage):
 
     Args:
         config: The settings.
-        origin: x, y in metres and yaw in radians of the grid's frame in the map's.
+        origin: (3,) x, y in metres and yaw in radians of the grid's frame in the map's.
+
+    Raises:
+        StereovoxError: `origin` is of another shape.
 
     Attributes:
         lock: Re-entrant; hold it over several calls that must see the same state.
-        origin: (3,) float64, as given.
+        origin: As given, float64.
         storage: The tiles as they are stored, for programs that read or write whole tiles.
     """
 
@@ -171,7 +174,9 @@ class GridMap(Guarded, OnStorage):
     def __init__(self, config: Config, origin: ArrayLike = (0.0, 0.0, 0.0)):
         self.storage = GridStorage(config)
         self.lock = self.storage.lock
-        self.origin = np.array(origin, float).reshape(3)
+        self.origin = np.array(origin, float)
+        if self.origin.shape != (3,):
+            raise shape_error("origin", self.origin, "(3,): x, y in metres and yaw in radians")
         self._percent = Percent(self.storage.rules)
 
     @classmethod

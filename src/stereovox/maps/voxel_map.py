@@ -75,10 +75,15 @@ class VoxelMap(Guarded, OnBlocks):
 
         Returns:
             The map, of no frames.
+
+        Raises:
+            StereovoxError: The arrays are of other shapes.
         """
         voxel_map = cls(config)
         rules, unknown = voxel_map.storage.rules, voxel_map.storage.cell_format.unknown
-        indices = np.asarray(indices, np.int64).reshape(-1, 3)
+        indices, log_odds = _cells_of(indices).astype(np.int64, copy=False), np.asarray(log_odds, float)
+        if log_odds.shape not in {(), (len(indices),)}:
+            raise queries.shape_error("log_odds", log_odds, f"({len(indices)},), one for each cell")
         blocks, of_cell = blocks_of_cells(indices)
         stored = np.clip(rules.format.stored(log_odds), rules.lowest, rules.highest)
         low = indices & (SIDE - 1)
@@ -288,8 +293,8 @@ class VoxelMap(Guarded, OnBlocks):
         return np.concatenate(found)
 
     def centers(self, indices: ArrayLike) -> NDArray[np.float64]:
-        """Return the centres (N, 3) in metres of cells (N, 3)."""
-        return (np.asarray(indices) + 0.5) * self.config.cell
+        """Return the centres (N, 3) in metres of cells (N, 3); raises StereovoxError for another shape."""
+        return (_cells_of(indices) + 0.5) * self.config.cell
 
     def occupied(self) -> NDArray[np.float64]:
         """Return the centres (N, 3) in metres of all occupied cells."""
@@ -394,6 +399,16 @@ def cells_where(
     block, column = np.nonzero(chosen)
     low = np.stack([column >> 6, (column >> 3) & 7, column & 7], axis=1)
     return (coords[block] * SIDE + low).astype(np.int32), values[block, column]
+
+
+def _cells_of(indices: ArrayLike) -> NDArray:
+    """Return cell indices (N, 3); raises StereovoxError for another shape, but for [] and one cell (3,)."""
+    cells = np.asarray(indices)
+    if cells.shape in {(0,), (3,)}:
+        return cells.reshape(-1, 3)
+    if cells.ndim != 2 or cells.shape[1] != 3:
+        raise queries.shape_error("indices", cells, "(N, 3) whole numbers")
+    return cells
 
 
 def _span(coords: NDArray[np.int32], known: NDArray[np.bool_]) -> tuple[list[int], list[int]] | None:

@@ -305,7 +305,7 @@ def test_what_cannot_be_written_of_a_tile_ends_the_run(tmp_path, monkeypatch, st
     rolling.storage.look_from(at(0.0))
     coords, cells = small_map(3).storage.blocks()
     rolling.storage.insert(coords - np.array([2, 0, 0], np.int32), cells)  # in two tiles
-    monkeypatch.setattr(getattr(rolling, stopped), "_write", lambda *_: no_room())
+    monkeypatch.setattr(getattr(rolling.storage, stopped), "_write", lambda *_: no_room())
     monkeypatch.setattr("stereovox.maps.tiles.WAITING", 1)  # nobody waits for what cannot be written
     rolling.storage.look_from(at(10.0))
     for tiles in (rolling.storage._store, rolling.storage._times_store):

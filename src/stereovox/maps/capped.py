@@ -8,7 +8,7 @@ from stereovox.errors import ConfigError, FrameRefused
 from stereovox.maps.cell_pool import CellPool
 from stereovox.maps.cell_times import CellTimes
 from stereovox.maps.evidence import Evidence
-from stereovox.maps.memory import most_blocks, told
+from stereovox.maps.memory import format_bytes, most_blocks
 from stereovox.maps.storage import Storage
 from stereovox.maps.voxel_map import VoxelMap
 
@@ -25,7 +25,7 @@ class CappedStorage(Storage):
 
     def __init__(self, config: Config):
         super().__init__(config)
-        self._most = most_blocks(config)
+        self._most, self._allowed = most_blocks(config), format_bytes(config.max_memory or 0)
         self._pool = CellPool(self.rules, self._most, self._most)
         self._times = CellTimes(config.map, self._most) if config.map.keep_times else None
 
@@ -36,7 +36,7 @@ class CappedStorage(Storage):
             rows, bare = self._pool.needed_by(cells)
             if max(rows, bare) > self._most or (self._times is not None and len(self._pool) + len(coords) > self._most):
                 raise ConfigError(
-                    f"cannot go on: the map needs more memory than max_memory {told(self.config.max_memory or 0)}; "
+                    f"cannot go on: the map needs more memory than max_memory {self._allowed}; "
                     'allow more, or set when_full to "spill"'
                 )
             self.insert(coords, cells)
@@ -53,7 +53,7 @@ class CappedStorage(Storage):
         if needed > self._most:
             raise FrameRefused(
                 "memory_full",
-                f"the map would need {needed} blocks of cells, max_memory {told(self.config.max_memory or 0)} holds "
+                f"the map would need {needed} blocks of cells, max_memory {self._allowed} holds "
                 f'{self._most}; allow more, use larger cells, or set when_full to "roll" or "spill"',
             )
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The 2-D occupancy grid of a floor: no frame to run out of, fixed-point log-odds in 16 or 8 bits a cell."""
+"""The 2-D occupancy grid of a floor: unbounded, sparse, fixed-point log-odds in 16 or 8 bits a cell."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from stereovox.maps.blocks import BlockPool
 from stereovox.maps.cell_format import CellRules, State
 from stereovox.maps.evidence import CELLS, LOG_ODDS_SCALE, SIDE, GridEvidence
 from stereovox.maps.lock import only_writer_of
-from stereovox.maps.memory import told
+from stereovox.maps.memory import format_bytes
 from stereovox.maps.occupancy import UNKNOWN, OccupancyGrid, Percent
 from stereovox.maps.queries import INDEX_LIMIT, points_of, shape_error
 from stereovox.maps.storage import OnStorage
@@ -85,8 +85,8 @@ class GridStorage(Guarded):
         if 3 * needed > self.config.max_memory:
             raise FrameRefused(
                 "memory_full",
-                f"the grid would need {told(3 * needed)}, more than max_memory {told(self.config.max_memory)}; "
-                "allow more or use larger cells",
+                f"the grid would need {format_bytes(3 * needed)}, "
+                f"more than max_memory {format_bytes(self.config.max_memory)}; allow more or use larger cells",
             )
 
     def add(self, evidence: GridEvidence) -> int:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a voxel map is made of: its blocks as they are stored, the times of their cells, settings and history.
+"""Storage of a voxel map: its blocks, the times of their cells, its settings and history.
 
 `VoxelMap` answers its users from it; whatever reads or writes whole blocks uses it as `voxel_map.storage`.
 """

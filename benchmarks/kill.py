@@ -84,14 +84,14 @@ def contents(out: Path) -> dict[str, Any]:
     def read() -> None:
         try:
             one = load_map(out)
-            cells = b"".join(part.tobytes() for part in one.blocks())
+            cells = b"".join(part.tobytes() for part in one.storage.blocks())
             writer.send(
                 {
                     "digest": hashlib.sha256(cells).hexdigest(),
                     "frames": one.frames,
                     "refused": one.frames_refused,
                     "last_frame": one.history.last_frame,
-                    "window": one.window_state,
+                    "window": one.storage.window_state,
                     "config": one.config.model_dump(),
                 }
             )
@@ -201,7 +201,7 @@ def judged() -> int:
         mapper = Mapper("default", voxel_size=given.voxel_size, **words)
         for frame in open_stream(given.source, given.frames):
             mapper.add(frame)
-        make_map(mapper.config, mapper.map).blocks()
+        make_map(mapper.config, mapper.map).storage.blocks()
     start, told = time.monotonic(), []
     with tempfile.TemporaryDirectory(prefix="stereovox-kill-") as name:
         kinds = []

@@ -40,7 +40,10 @@ def main() -> None:
         ("unbounded", {k: v for k, v in FLIGHT.items() if not k.startswith("window")}),
     ):
         maps[name] = fly(name, source, settings)
-    same = all(np.array_equal(a, b) for a, b in zip(maps["keep"].blocks(), maps["unbounded"].blocks(), strict=True))
+    same = all(
+        np.array_equal(a, b)
+        for a, b in zip(maps["keep"].storage.blocks(), maps["unbounded"].storage.blocks(), strict=True)
+    )
     print(f"tiles and window together equal the unbounded map: {same}")
 
 
@@ -54,7 +57,7 @@ def shift_ms(outside: str) -> float:
         T[0, 3] = 0.2 * i + 1.0
         view = Viewpoint(camera, T, i)
         start = perf_counter()
-        rolling.look_from(view)
+        rolling.storage.look_from(view)
         times.append(1e3 * (perf_counter() - start))
         rolling.add(full)
     rolling.close()

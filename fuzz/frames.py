@@ -182,8 +182,8 @@ def check(holds: bool, otherwise: str) -> None:
 
 def digest(voxel_map: Any) -> tuple[Any, ...]:
     """Return what a map is, in a few numbers; raises AssertionError where a cell is out of range."""
-    coords, cells = voxel_map.tiles() if hasattr(voxel_map, "tiles") else voxel_map.blocks()
-    limits, format = voxel_map.config.map, voxel_map.cell_format
+    coords, cells = voxel_map.storage.tiles() if hasattr(voxel_map.storage, "tiles") else voxel_map.storage.blocks()
+    limits, format = voxel_map.config.map, voxel_map.storage.cell_format
     lowest, highest = format.stored(np.array([limits.log_odds_min, limits.log_odds_max])).tolist()
     if cells.size:
         least, most = int(cells.min()), int(cells.max())

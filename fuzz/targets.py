@@ -209,7 +209,7 @@ def read_cells(data: bytes, folder: Path) -> None:
     try:
         (path / "manifest.json").write_text(json.dumps(manifest))
         loaded = load_map(path)
-        assert len(loaded.blocks()[0]) <= len(coords)
+        assert len(loaded.storage.blocks()[0]) <= len(coords)
     finally:
         (path / "manifest.json").write_text(whole)
 
@@ -231,7 +231,7 @@ def grids(folder: Path) -> list[bytes]:
 
 
 def read_about(data: bytes, folder: Path) -> None:
-    coords, cells = small_grid().tiles()
+    coords, cells = small_grid().storage.tiles()
     np.savez_compressed(folder / "b.npz", about=np.frombuffer(data, np.uint8), coords=coords, cells=cells)
     load_grid(folder / "b.npz")
 

@@ -94,12 +94,12 @@ def test_a_report_tells_what_a_scan_did():
 def test_what_cannot_be_trusted_is_refused_and_counted(changes, reason):
     mapper = GridMapper(voxel_size=0.05)
     mapper.add(made_scan())
-    before = mapper.map.tiles()
+    before = mapper.map.storage.tiles()
     report = mapper.add(replace(made_scan(), **changes))
     assert report.refused == reason
     assert report.detail
     assert "\n" not in report.detail
-    assert all((a == b).all() for a, b in zip(before, mapper.map.tiles(), strict=True))
+    assert all((a == b).all() for a, b in zip(before, mapper.map.storage.tiles(), strict=True))
     assert (mapper.map.frames, mapper.map.frames_refused) == (1, 1)
 
 
@@ -175,13 +175,13 @@ def scans(draw):
 def test_any_scan(grid, sequence):
     mapper = GridMapper(voxel_size=0.25, max_range=4.0, grid={**grid, "thickness": 0.3})
     for scan in sequence:
-        before = mapper.map.tiles()
+        before = mapper.map.storage.tiles()
         report = mapper.add(scan)
         if report.refused:
-            assert all((a == b).all() for a, b in zip(before, mapper.map.tiles(), strict=True))
+            assert all((a == b).all() for a, b in zip(before, mapper.map.storage.tiles(), strict=True))
             assert report.detail
             assert "\n" not in report.detail
-    _, values = mapper.map.tiles()
+    _, values = mapper.map.storage.tiles()
     assert values.min(initial=0) >= -4000
     assert values.max(initial=0) <= 3500
     assert mapper.map.frames + mapper.map.frames_refused == len(sequence)

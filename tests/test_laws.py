@@ -131,7 +131,7 @@ def test_the_order_of_frames_does_not_matter_before_the_clamp(integrator, seed, 
         mapper = mapper_of(**INTEGRATORS[integrator], **wide)
         for number in order:
             assert mapper.add(frames[number]).refused in (None, "no_valid_depth")
-        maps.append(mapper.map.blocks())
+        maps.append(mapper.map.storage.blocks())
     assert all((a == b).all() for a, b in zip(*maps, strict=True))
 
 

@@ -111,7 +111,7 @@ def test_a_refused_frame_changes_nothing(integrator):
     mapper = sv.Mapper("default", voxel_size=0.1, max_range=2.5, integrator=integrator)
     image = made_image(0)
     mapper.add(frame_of(image))
-    before = [array.copy() for array in mapper.map.blocks()]
+    before = [array.copy() for array in mapper.map.storage.blocks()]
     bad_pose = image.T_world_sensor.copy()
     bad_pose[1, 3] = np.nan
     for bad in (
@@ -124,7 +124,7 @@ def test_a_refused_frame_changes_nothing(integrator):
         assert report.refused
         assert report.detail
         assert report.cells == 0
-    after = mapper.map.blocks()
+    after = mapper.map.storage.blocks()
     assert all((a == b).all() for a, b in zip(before, after, strict=True))
     assert mapper.map.frames == 1
     report = mapper.add(frame_of(image))
@@ -150,7 +150,7 @@ def test_thread_count_and_a_stop_between_change_no_bit(integrator, tmp_path):
     for frame in frames[3:]:
         resumed.add(frame)
     for other in (maps[1], resumed.map):
-        assert all((a == b).all() for a, b in zip(maps[0].blocks(), other.blocks(), strict=True))
+        assert all((a == b).all() for a, b in zip(maps[0].storage.blocks(), other.storage.blocks(), strict=True))
 
 
 def test_resuming_with_another_voxel_size_is_refused():
@@ -195,16 +195,16 @@ def test_cameras_may_change_between_frames():
     same = sv.Mapper("default", voxel_size=0.1)
     for camera_frame in (wall, sv.Frame(np.full((6, 8), 2.0, np.float32), small, wall.T_world_sensor), wall):
         same.add(camera_frame)
-    assert all((a == b).all() for a, b in zip(mapper.map.blocks(), same.map.blocks(), strict=True))
+    assert all((a == b).all() for a, b in zip(mapper.map.storage.blocks(), same.map.storage.blocks(), strict=True))
 
 
 def test_a_frame_that_does_not_fit_into_the_memory_is_refused_and_changes_nothing():
     mapper, frame = sv.Mapper(max_memory="40 kB", voxel_size=0.1), wall_frame()
     assert mapper.add(frame).refused is None
-    before, viewpoint = mapper.map.blocks(), mapper.map.viewpoint
+    before, viewpoint = mapper.map.storage.blocks(), mapper.map.viewpoint
     behind = replace(frame, T_world_sensor=np.diag([-1.0, -1, 1, 1]) @ frame.T_world_sensor, sensor="behind")
     report = mapper.add(behind)
     assert report.refused == "memory_full"
     assert "max_memory 40 kB holds" in report.detail
     assert mapper.map.viewpoint is viewpoint
-    assert all((a == b).all() for a, b in zip(mapper.map.blocks(), before, strict=True))
+    assert all((a == b).all() for a, b in zip(mapper.map.storage.blocks(), before, strict=True))

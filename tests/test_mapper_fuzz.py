@@ -48,14 +48,14 @@ def frames(draw):
 def test_any_frame(integrator, sequence):
     mapper = sv.Mapper("default", voxel_size=0.25, max_range=4.0, integrator=integrator)
     for frame in sequence:
-        before = mapper.map.blocks()
+        before = mapper.map.storage.blocks()
         report = mapper.add(frame)
         if report.refused:
-            after = mapper.map.blocks()
+            after = mapper.map.storage.blocks()
             assert all((a == b).all() for a, b in zip(before, after, strict=True))
             assert report.detail
             assert "\n" not in report.detail
-    _, values = mapper.map.blocks()
+    _, values = mapper.map.storage.blocks()
     assert values.min(initial=0) >= -4000
     assert values.max(initial=0) <= 3500
     assert mapper.map.frames + mapper.map.frames_refused == len(sequence)

@@ -201,10 +201,10 @@ def test_a_mapper_steps_down_leaves_out_and_comes_back(monkeypatch):
     for frame_ms, count in ((5.0, 4), (15.0, 20), (5.0, 40)):
         clock.frame_ms = frame_ms
         for _ in range(count):
-            before = mapper.map.blocks()[1].copy()
+            before = mapper.map.storage.blocks()[1].copy()
             reports.append(mapper.add(frame))
             if reports[-1].refused:
-                assert np.array_equal(before, mapper.map.blocks()[1])
+                assert np.array_equal(before, mapper.map.storage.blocks()[1])
     ways = [report.refused or report.way for report in reports]
     assert ways[:9] == ["full"] * 5 + ["near"] * 2 + ["coarse"] * 2
     assert "no_time" in ways[9:24]

@@ -21,6 +21,9 @@ from stereovox.frame import Viewpoint
 from stereovox.mapper import GridMapper
 from stereovox.maps import cell_pool, cubes
 from stereovox.maps.evidence import Evidence, GridEvidence
+from stereovox.maps.occupancy import Percent
+from stereovox.maps.storage import OnStorage, Storage
+from stereovox.maps.voxel_map import OnBlocks
 from stereovox.products import (
     coarsen,
     crop,
@@ -101,7 +104,7 @@ SPACE = {
     "check_cells": "config",
     "agreement": (NO_EVIDENCE, 1),
     "check_room": (NO_EVIDENCE,),
-    "go_on_with": "map",
+    "go_on_with": "storage",
     "insert": (NO_BLOCKS, np.empty((0, 512), np.int16)),
     "log_odds": (PLACE,),
     "look_from": (Viewpoint(CAMERA, np.eye(4), 0),),
@@ -110,11 +113,13 @@ SPACE = {
     "save": "path",
     "set_times": (NO_BLOCKS, np.empty((0, 512), np.uint32), None),
     "state": (PLACE,),
-    "take_history": "map",
+    "take_history": "storage",
     "times_at": (np.array(PLACE),),
     "times_of": (NO_BLOCKS,),
-    "unbounded": "config",
-    "with_config": "config",
+    "stored_at": (np.array(PLACE),),
+    "seconds_ago": (np.zeros(1, np.uint32), 0),
+    "continue_with": "config",
+    "fill": "blocks",
 }
 FLOOR = {
     "add": (NO_SCAN,),
@@ -124,7 +129,9 @@ FLOOR = {
     "probability": ([[0.1, 0.2]],),
     "save": "path",
     "state": ([[0.1, 0.2]],),
-    "with_config": "config",
+    "stored_at": (np.zeros((1, 2), np.int64),),
+    "paint": "picture",
+    "continue_with": "config",
 }
 WINDOW = {"window.size": [4, 4, 3], "window.outside": "keep"}
 
@@ -133,19 +140,29 @@ WINDOW = {"window.size": [4, 4, 3], "window.outside": "keep"}
 def test_every_call_holds_the_lock_once(kind, tmp_path):
     settings = {"plain": {}, "capped": {"max_memory": "16M"}, "window": WINDOW, "floor": {}}[kind]
     mapper = GridMapper(voxel_size=0.1) if kind == "floor" else mapped(**settings)
-    one, given = mapper.map, FLOOR if kind == "floor" else SPACE
-    one.lock = lock = CountingLock()
-    makers = {"config": lambda: one.config, "map": lambda: sv.VoxelMap(one.config), "path": lambda: tmp_path / "m"}
-    names = [name for name in dir(type(one)) if not name.startswith("_") and name not in vars(WithHistory)]
-    names = [name for name in names if not inspect.ismethod(getattr(type(one), name))]
-    assert len(names) > 12
-    for name in sorted(names, key="close".__eq__):
-        before, what = lock.times, given.get(name, ())
-        value = getattr(one, name)
-        if inspect.isgeneratorfunction(inspect.unwrap(getattr(type(one), name))):
+    given = FLOOR if kind == "floor" else SPACE
+    one = mapper.map
+    one.lock = one.storage.lock = lock = CountingLock()
+    makers = {
+        "config": lambda: (one.config,),
+        "storage": lambda: (sv.VoxelMap(one.config).storage,),
+        "blocks": lambda: (sv.VoxelMap(one.config).storage, []),
+        "path": lambda: (tmp_path / "m",),
+        "picture": lambda: (0, 0, Percent(one.storage.rules), np.zeros((2, 2), np.int8)),
+    }
+    plain = {*vars(WithHistory), *vars(OnStorage), *vars(OnBlocks), "bounded"}
+    names = [(part, name) for part in (one, one.storage) for name in dir(type(part)) if name[0] != "_"]
+    names = [(part, name) for part, name in names if name not in plain]
+    names = [(part, name) for part, name in names if not inspect.ismethod(getattr(type(part), name))]
+    assert len(names) > 20
+    for part, name in sorted(names, key=lambda one: one[1] == "close"):
+        what = given.get(name, ())
+        what = makers[what]() if isinstance(what, str) else what
+        before, value = lock.times, getattr(part, name)
+        if inspect.isgeneratorfunction(inspect.unwrap(getattr(type(part), name))):
             assert next(value()) is not None
         elif callable(value):
-            value(*([makers[what]()] if isinstance(what, str) else what))
+            value(*what)
         assert lock.times == before + 1, name
 
 
@@ -181,7 +198,7 @@ def test_what_reads_a_map_in_several_calls_lets_it_not_change_between_them(name,
     if name in NEEDS:
         pytest.importorskip(NEEDS[name])
     one = mapped().map
-    one.lock = CountingLock()
+    one.lock = one.storage.lock = CountingLock()
     with suppress(StereovoxError) if name == "ground" else nullcontext():  # there is none: it looked for it
         ALONE[name](one, tmp_path)
     assert one.lock.times == 1
@@ -190,9 +207,9 @@ def test_what_reads_a_map_in_several_calls_lets_it_not_change_between_them(name,
 def test_a_live_projection_misses_no_frame_while_it_looks(monkeypatch):
     mapper = mapped()
     above, seen = LiveProjection(mapper.map, (-9, 9)), []
-    within = type(mapper.map).blocks_within
+    within = Storage.blocks_within
     monkeypatch.setattr(
-        type(mapper.map), "blocks_within", lambda *words: (within(*words), seen.append(taken(mapper.map.lock)))[0]
+        Storage, "blocks_within", lambda *words: (within(*words), seen.append(taken(mapper.map.lock)))[0]
     )
     assert above.grid() is not None
     assert seen == [True]
@@ -219,7 +236,7 @@ def test_two_maps_are_always_locked_in_the_same_order():
 
 def test_a_reader_that_stops_half_way_keeps_nobody_waiting():
     one = mapped().map
-    for generator in (one.slabs(), one.timed()):
+    for generator in (one.storage.slabs(), one.storage.timed()):
         next(generator)
         assert not taken(one.lock)
     with one.lock:
@@ -227,7 +244,7 @@ def test_a_reader_that_stops_half_way_keeps_nobody_waiting():
 
 
 def blocks_by_place(one):
-    return dict(zip(map(tuple, one.blocks()[0].tolist()), one.blocks()[1], strict=True))
+    return dict(zip(map(tuple, one.storage.blocks()[0].tolist()), one.storage.blocks()[1], strict=True))
 
 
 @pytest.mark.parametrize("window", [{}, WINDOW], ids=["plain", "window"])
@@ -235,7 +252,7 @@ def test_pieces_of_a_map_that_grows_are_as_it_is_at_their_time(window, monkeypat
     monkeypatch.setattr(cell_pool, "PIECE", 4)
     mapper, found = mapped(**window), []
     before, frames = blocks_by_place(mapper.map), list(frames_of(0, 40))[6:]
-    for coords, cells in mapper.map.slabs():
+    for coords, cells in mapper.map.storage.slabs():
         now = blocks_by_place(mapper.map)
         for place, block in zip(map(tuple, coords.tolist()), cells, strict=True):
             assert np.array_equal(block, now[place])
@@ -265,7 +282,7 @@ def test_who_holds_the_lock_cannot_add_a_frame():
         except StereovoxError as error:
             slips.append(str(error))
 
-    mapper.map.listeners.append(add_another)
+    mapper.map.storage.listeners.append(add_another)
     assert mapper.add(frame).refused is None
     assert len(slips) == 1
     assert mapper.map.frames == 5
@@ -279,8 +296,8 @@ def test_who_listens_to_a_map_does_not_listen_to_its_copy(way):
     mapper = mapped()
     seen = LiveProjection(mapper.map, (0.0, 2.0))
     twin = way(mapper.map)
-    assert len(mapper.map.listeners) == 1
-    assert twin.listeners == []
+    assert len(mapper.map.storage.listeners) == 1
+    assert twin.storage.listeners == []
     assert twin.lock is not mapper.map.lock
     twin.add(Evidence(np.zeros((1, 3), np.int32), np.full((1, 512), 999, np.int16), np.empty((0, 3), np.int32), 0))
     assert twin.counts() != mapper.map.counts()
@@ -312,9 +329,9 @@ def test_a_copy_is_made_with_the_lock_held(way, monkeypatch):
     monkeypatch.setattr(cell_pool.CellPool, "__getstate__", state, raising=False)
     twin = way(one)
     assert held[0]
-    assert np.array_equal(twin.blocks()[1], one.blocks()[1])
-    twin._pool.values[:] = 0
+    assert np.array_equal(twin.storage.blocks()[1], one.storage.blocks()[1])
+    twin.storage._pool.values[:] = 0
     assert one.counts() != twin.counts()
-    kept = one.__getstate__()["history"]
+    kept = one.storage.__getstate__()["history"]
     one.history.refused["later"] += 1
     assert kept.refused["later"] == 0

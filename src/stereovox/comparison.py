@@ -58,7 +58,7 @@ class Comparison:
             return evidence, passed
         self._prepare(voxel_map, image)
         firm, fits = self._firm[image.camera], False
-        against = voxel_map.agreement(evidence, firm).against
+        against = voxel_map.storage.agreement(evidence, firm).against
         limit = self._gate.limit_elsewhere(passed, against)
         if limit is not None:
             fits = _fits_elsewhere(image, integrator, voxel_map, firm, limit)
@@ -138,7 +138,7 @@ def _fits_elsewhere(image: DepthImage, integrator: Integrator, voxel_map: VoxelM
     pose = pose_on_surfaces(voxel_map, image)
     if pose is None:
         return False
-    against = voxel_map.agreement(integrator.evidence(replace(image, T_world_sensor=pose)), firm).against
+    against = voxel_map.storage.agreement(integrator.evidence(replace(image, T_world_sensor=pose)), firm).against
     return against is not None and against <= limit
 
 

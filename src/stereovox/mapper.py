@@ -140,8 +140,8 @@ class Mapper:
             passed = offer.check(image)
             evidence, passed = self._comparison.evidence(frame, image, passed, quality.integrator, self.map)
             with self.map.lock:
-                self.map.check_room(evidence)
-                self.map.look_from(image.viewpoint)
+                self.map.storage.check_room(evidence)
+                self.map.storage.look_from(image.viewpoint)
                 cells = self.map.add(evidence)
                 offer.accept(passed, quality.name)
                 self.map.history.ways[quality.name] += 1
@@ -238,7 +238,7 @@ class GridMapper:
             prepared = perf_counter()
             evidence = self._beams.evidence(scan, self.map.origin)
             with self.map.lock:
-                self.map.check_room(evidence)
+                self.map.storage.check_room(evidence)
                 cells = self.map.add(evidence)
                 offer.accept(passed)
             done = perf_counter()
@@ -297,7 +297,8 @@ def _grid_map(config: Config, resume: GridMap | OccupancyGrid | None) -> GridMap
         return GridMap(config)
     if isinstance(resume, OccupancyGrid):
         return GridMap.from_occupancy(resume, config)
-    return resume.with_config(config)
+    resume.storage.continue_with(config)
+    return resume
 
 
 def _summary(mapper: AnyMapper[Any]) -> str:

@@ -153,7 +153,9 @@ def test_saves_in_between_change_nothing(tmp_path, monkeypatch, seconds):
     keep = ["--set", "window.size=[3, 3, 3]", "--set", "window.trigger=0.4", "--set", "window.outside=keep"]
     assert mapped(tmp_path / "a", *keep) == 0
     assert mapped(tmp_path / "b", *keep, "--checkpoint", seconds) == 0
-    for one, other in zip(load_map(tmp_path / "a").blocks(), load_map(tmp_path / "b").blocks(), strict=True):
+    for one, other in zip(
+        load_map(tmp_path / "a").storage.blocks(), load_map(tmp_path / "b").storage.blocks(), strict=True
+    ):
         np.testing.assert_array_equal(one, other)
 
 
@@ -209,11 +211,11 @@ def test_a_tile_without_room_saves_what_there_is(tmp_path, monkeypatch, capsys):
 
 def test_going_on_with_other_frames_is_refused(tmp_path, capsys):
     assert mapped(tmp_path / "m", "--frames", ":20:2") == 0
-    before = load_map(tmp_path / "m").blocks()
+    before = load_map(tmp_path / "m").storage.blocks()
     assert mapped(tmp_path / "m", "--resume") == 2
     assert "frame 18', here it is" in (said := capsys.readouterr().err)
     assert "choose frames as before" in said
-    for one, other in zip(load_map(tmp_path / "m").blocks(), before, strict=True):
+    for one, other in zip(load_map(tmp_path / "m").storage.blocks(), before, strict=True):
         np.testing.assert_array_equal(one, other)
     assert mapped(tmp_path / "m", "--resume", "--frames", "::2") == 0
     assert load_map(tmp_path / "m").frames == 15

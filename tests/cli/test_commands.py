@@ -108,11 +108,11 @@ def test_resume_equals_one_run(recording, tmp_path, capsys):
     assert run("map", recording, "--out", tmp_path / "parts", "--resume", "--json") == 0
     assert last_json(capsys)["frames"] == 3
     whole, parts = sv.load_map(tmp_path / "whole"), sv.load_map(tmp_path / "parts")
-    assert all((a == b).all() for a, b in zip(whole.blocks(), parts.blocks(), strict=True))
+    assert all((a == b).all() for a, b in zip(whole.storage.blocks(), parts.storage.blocks(), strict=True))
     assert (parts.frames, parts.frames_refused) == (whole.frames, whole.frames_refused) == (5, 1)
     assert run("map", recording, "--out", tmp_path / "parts", "--resume") == 0
     assert "already holds all 6 frames" in capsys.readouterr().err
-    assert (sv.load_map(tmp_path / "parts").blocks()[1] == whole.blocks()[1]).all()
+    assert (sv.load_map(tmp_path / "parts").storage.blocks()[1] == whole.storage.blocks()[1]).all()
     fewer = ["map", recording, "--out", tmp_path / "parts", "--resume", "--frames", ":4"]
     fails_with_one_line(capsys, "holds 6 frames, more than the 4", *fewer)
     other_size = ["--resume", "--voxel-size", 0.2]
@@ -304,7 +304,7 @@ def test_ctrl_c_never_cuts_a_frame_in_half(recording, tmp_path, monkeypatch):
     assert run("map", recording, "--out", tmp_path / "three", "--voxel-size", 0.1, "--frames", ":3") == 0
     stopped, three = sv.load_map(tmp_path / "m"), sv.load_map(tmp_path / "three")
     assert stopped.frames == 3
-    assert all((a == b).all() for a, b in zip(stopped.blocks(), three.blocks(), strict=True))
+    assert all((a == b).all() for a, b in zip(stopped.storage.blocks(), three.storage.blocks(), strict=True))
 
 
 @pytest.mark.parametrize(

@@ -28,10 +28,10 @@ def test_tiles_are_in_the_saved_map_and_gone_from_the_disk(tmp_path, capsys):
     memory = json.loads(capsys.readouterr().out)["memory_bytes"]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["kept"]
     whole = mapped(tmp_path / "whole")
-    np.testing.assert_array_equal(kept.blocks()[0], whole.blocks()[0])
-    np.testing.assert_array_equal(kept.blocks()[1], whole.blocks()[1])
+    np.testing.assert_array_equal(kept.storage.blocks()[0], whole.storage.blocks()[0])
+    np.testing.assert_array_equal(kept.storage.blocks()[1], whole.storage.blocks()[1])
     dropped = mapped(tmp_path / "dropped", *WINDOW)
-    assert len(dropped.blocks()[0]) < 0.6 * len(kept.blocks()[0])
+    assert len(dropped.storage.blocks()[0]) < 0.6 * len(kept.storage.blocks()[0])
     assert memory < 10e6
 
 
@@ -40,7 +40,7 @@ def test_a_resumed_flight_ends_like_an_uninterrupted_one(tmp_path):
     whole = mapped(tmp_path / "whole", *options)
     mapped(tmp_path / "half", *options, "--frames", ":25")
     half = mapped(tmp_path / "half", *options, "--resume")
-    for a, b in zip(half.blocks(), whole.blocks(), strict=True):
+    for a, b in zip(half.storage.blocks(), whole.storage.blocks(), strict=True):
         np.testing.assert_array_equal(a, b)
     assert half.frames == whole.frames
 
@@ -74,7 +74,7 @@ def test_ctrl_c_leaves_no_tiles_and_the_run_goes_on(tmp_path, monkeypatch):
     assert load_map(tmp_path / "m").frames == 25
     assert command(tmp_path / "m", "--resume") == 0
     whole = mapped(tmp_path / "whole", *KEEP)
-    for a, b in zip(load_map(tmp_path / "m").blocks(), whole.blocks(), strict=True):
+    for a, b in zip(load_map(tmp_path / "m").storage.blocks(), whole.storage.blocks(), strict=True):
         np.testing.assert_array_equal(a, b)
 
 
@@ -116,7 +116,7 @@ def test_frames_of_no_use_leave_no_tiles_and_the_map_as_it_was(tmp_path, monkeyp
     for wanted in (["--set", "window.size=[16,14,12]"], ["--set", "window.lead_s=0.5"]):
         monkeypatch.setattr(Mapper, "add", lambda self, frame: refused)
         assert command(tmp_path / "m", "--resume", *wanted) == 0
-        for a, b in zip(load_map(tmp_path / "m").blocks(), first.blocks(), strict=True):
+        for a, b in zip(load_map(tmp_path / "m").storage.blocks(), first.storage.blocks(), strict=True):
             np.testing.assert_array_equal(a, b)
     assert left(tmp_path) == ["m"]
 
@@ -125,7 +125,7 @@ def test_ctrl_c_before_the_first_good_frame_of_another_window_keeps_the_map(tmp_
     first = mapped(tmp_path / "m", "--frames", ":20")
     monkeypatch.setattr(Mapper, "add", stop_after(Mapper.add, 0))
     assert command(tmp_path / "m", "--resume", *KEEP) == 130
-    for a, b in zip(load_map(tmp_path / "m").blocks(), first.blocks(), strict=True):
+    for a, b in zip(load_map(tmp_path / "m").storage.blocks(), first.storage.blocks(), strict=True):
         np.testing.assert_array_equal(a, b)
     assert left(tmp_path) == ["m"]
 

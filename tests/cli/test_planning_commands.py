@@ -27,8 +27,8 @@ def saved(tmp_path_factory):
     wall = (cells[:, 0] == 15) & (cells[:, 1] > 9)
     config = load_config(voxel_size=0.1, **{"map.keep_times": True})
     voxel_map = VoxelMap.from_cells(config, cells, np.where(outside | wall, 2.0, -3.0))
-    coords, blocks = voxel_map.blocks()
-    voxel_map.set_times(coords, np.full(blocks.shape, 2**30 + 100, np.uint32), 0)
+    coords, blocks = voxel_map.storage.blocks()
+    voxel_map.storage.set_times(coords, np.full(blocks.shape, 2**30 + 100, np.uint32), 0)
     path = tmp_path_factory.mktemp("maps") / "room.svox"
     voxel_map.save(path)
     return str(path)

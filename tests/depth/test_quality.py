@@ -130,9 +130,9 @@ def test_depths_that_are_no_metres_are_refused_with_the_cure(scale, cure):
     mapper = sv.Mapper(voxel_size=0.1)
     for _ in range(5):
         mapper.add(frame_of(np.full((120, 160), 1.5)))
-    before = mapper.map.blocks()[1].tobytes()
+    before = mapper.map.storage.blocks()[1].tobytes()
     assert mapper.add(frame).refused == "bad_units"
-    assert mapper.map.blocks()[1].tobytes() == before
+    assert mapper.map.storage.blocks()[1].tobytes() == before
 
 
 def test_a_street_seen_by_a_map_that_ends_near_is_no_matter_of_units():

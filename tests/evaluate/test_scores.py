@@ -168,13 +168,13 @@ def test_cells_are_read_from_a_window_with_tiles_on_disk_as_well(tmp_path):
     for x in (0.0, 60.0):  # far enough for what was near the first place to go to disk
         T = np.eye(4)
         T[0, 3] = x
-        rolling.look_from(Viewpoint(camera, T))
+        rolling.storage.look_from(Viewpoint(camera, T))
         block = np.array([[int(x / SIZE) >> 3, 0, 0]], np.int32)
         values = random.integers(-900, 900, (1, 512)).astype(np.int16)
         rolling.add(Evidence(block, values, np.empty((0, 3), np.int32), 0))
     assert isinstance(rolling, RollingMap)
-    assert rolling.store is not None
-    assert len(rolling.store.tiles()) > 0
+    assert rolling.storage.tile_store is not None
+    assert len(rolling.storage.tile_store.tiles()) > 0
     cells, log_odds = rolling.cells()
     assert np.array_equal(CellReader(keys(cells)).log_odds(rolling), log_odds)
     rolling.save(tmp_path / "rolling.svox")

@@ -65,7 +65,7 @@ def test_npz_gives_the_same_map(tmp_path, cell):
     export(made, tmp_path / "map.npz")
     again = sv.import_map(tmp_path / "map.npz")
     assert again.config == made.config
-    for ours, theirs in zip(made.blocks(), again.blocks(), strict=True):
+    for ours, theirs in zip(made.storage.blocks(), again.storage.blocks(), strict=True):
         np.testing.assert_array_equal(ours, theirs)
 
 

@@ -80,7 +80,7 @@ def test_numbers_of_a_camera_are_plain_ones():
 def test_a_small_image_tells_of_few_cells_or_nothing(integrator, camera):
     mapper = sv.Mapper(integrator=integrator, voxel_size=0.05, max_range=10.0)
     report = mapper.add(frame_of(camera))
-    blocks, _ = mapper.map.blocks()
+    blocks, _ = mapper.map.storage.blocks()
     assert report.refused in (None, "bad_camera", "view_too_large")
     assert len(blocks) <= 2 * views.MIN_BLOCKS
     assert not (report.refused and len(blocks))

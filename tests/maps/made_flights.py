@@ -48,8 +48,8 @@ def flight(seed, frames, step_m=0.4, step_s=0.3, blocks=16):
 
 def fly(one, moments):
     for viewpoint, evidence in moments:
-        one.check_room(evidence)
-        one.look_from(viewpoint)
+        one.storage.check_room(evidence)
+        one.storage.look_from(viewpoint)
         one.add(evidence)
         one.frames += 1
     return one
@@ -57,7 +57,7 @@ def fly(one, moments):
 
 def blocks_and_times(one):
     """All that a map says of its cells."""
-    parts = zip(*(one.timed() if one.config.map.keep_times else one.slabs()), strict=True)
+    parts = zip(*(one.storage.timed() if one.config.map.keep_times else one.storage.slabs()), strict=True)
     return [np.concatenate(part) for part in parts]
 
 

@@ -49,7 +49,7 @@ class Merge:
 
     def seen(self):
         found = load_map(self.out)
-        return found.frames, found.blocks()[1].tobytes()
+        return found.frames, found.storage.blocks()[1].tobytes()
 
     def whole(self):
         return len(list(self.out.iterdir())) == 2

@@ -59,7 +59,7 @@ def digest(*arrays):
 
 
 def cells_of(one):
-    return digest(*(one.tiles() if hasattr(one, "tiles") else one.blocks()))
+    return digest(*(one.storage.tiles() if hasattr(one.storage, "tiles") else one.storage.blocks()))
 
 
 def at_work(workers, others):

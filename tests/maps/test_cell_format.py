@@ -24,7 +24,7 @@ def add(voxel_map, *first_cells):
 
 
 def stored(voxel_map):
-    return voxel_map.blocks()[1][0][:8].tolist()
+    return voxel_map.storage.blocks()[1][0][:8].tolist()
 
 
 def test_the_thesis_numbers():
@@ -52,7 +52,7 @@ STATES = [(180, "TENTATIVE"), (181, "OCCUPIED"), (127, "UNKNOWN"), (128, "TENTAT
 @pytest.mark.parametrize(("number", "state"), STATES)
 def test_states_of_bytes(number, state):
     one = byte_map()
-    one.insert(np.zeros((1, 3), np.int32), np.full((1, 512), number, np.uint8))
+    one.storage.insert(np.zeros((1, 3), np.int32), np.full((1, 512), number, np.uint8))
     assert one.state(CENTRES[:1]) == State[state]
 
 
@@ -79,7 +79,7 @@ def test_evidence_too_small_for_a_byte_changes_nothing():
     one = byte_map()
     one.add(Evidence(np.empty((0, 3), np.int32), np.empty((0, 512), np.int16), np.zeros((1, 3), np.int32), -5))
     assert one.counts() == {"free": 0, "tentative": 0, "occupied": 0}
-    assert len(one.blocks()[0]) == 0
+    assert len(one.storage.blocks()[0]) == 0
 
 
 def test_save_and_load(tmp_path):
@@ -87,16 +87,16 @@ def test_save_and_load(tmp_path):
     add(one, 800, -800, 8000)
     one.save(tmp_path / "map")
     again = load_map(tmp_path / "map")
-    assert again.blocks()[1].dtype == np.uint8
-    np.testing.assert_array_equal(again.blocks()[1], one.blocks()[1])
+    assert again.storage.blocks()[1].dtype == np.uint8
+    np.testing.assert_array_equal(again.storage.blocks()[1], one.storage.blocks()[1])
     np.testing.assert_array_equal(again.cells()[1], one.cells()[1])
 
 
 def test_the_profile_of_the_thesis():
     config = load_config("chien2020")
     rolling = make_map(config)
-    assert rolling.cell_format.dtype == np.uint8
-    assert (rolling._rules.lowest, rolling._rules.highest) == (0, 255)
+    assert rolling.storage.cell_format.dtype == np.uint8
+    assert (rolling.storage.rules.lowest, rolling.storage.rules.highest) == (0, 255)
     assert (config.voxel_size, config.depth.downsample, config.integrator) == (0.2, 8, "line")
     assert np.prod(np.array(config.window.size) / 0.2).round() == 100 * 30 * 100
 
@@ -123,12 +123,12 @@ def test_the_signed_byte_holds_the_default_limits():
     assert signed.stored([0, 1, -1, 3.5, -4, -30, 30]).tolist() == [0, 32, -32, 112, -128, -128, 127]
     np.testing.assert_array_equal(signed.log_odds(np.array([112, -128, 0], np.int8)), [3.5, -4, 0])
     one = signed_map()
-    assert (one._rules.lowest, one._rules.highest) == (-128, 112)
+    assert (one.storage.rules.lowest, one.storage.rules.highest) == (-128, 112)
     add(one, 800, -800, 8000, -8000, 32, -31)
     assert stored(one) == [26, -26, 112, -128, 1, -1, 0, 0]
     add(one, -800, 800, 8000, -8000)
     assert stored(one)[:4] == [1, 1, 112, -128]  # back at the start is not "unknown"
-    assert one.blocks()[1].dtype == np.int8
+    assert one.storage.blocks()[1].dtype == np.int8
     assert one.memory_bytes < 512 + 12 + VoxelMap(load_config()).memory_bytes + 1
 
 
@@ -145,7 +145,7 @@ SIGNED_STATES = [
 @pytest.mark.parametrize(("number", "state"), SIGNED_STATES)  # 0.3 and 0.7 are -27.1 and 27.1
 def test_states_of_signed_bytes(number, state):
     one = signed_map()
-    one.insert(np.zeros((1, 3), np.int32), np.full((1, 512), number, np.int8))
+    one.storage.insert(np.zeros((1, 3), np.int32), np.full((1, 512), number, np.int8))
     assert one.state(CENTRES[:1]) == State[state]
 
 
@@ -169,7 +169,7 @@ def test_a_frame_before_and_after_a_save_count_alike(tmp_path):
         for one in (whole, half):
             add(one, *values)
             one.frames += 1
-    np.testing.assert_array_equal(whole.blocks()[1], half.blocks()[1])
+    np.testing.assert_array_equal(whole.storage.blocks()[1], half.storage.blocks()[1])
 
 
 def test_chiens_byte_rounds_to_the_nearest_in_every_frame():

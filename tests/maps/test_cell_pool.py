@@ -205,7 +205,7 @@ def free_map():
 
 def test_a_map_looks_the_same_whatever_its_blocks_are_kept_in(tmp_path):
     voxel_map = free_map()
-    coords, cells = voxel_map.blocks()
+    coords, cells = voxel_map.storage.blocks()
     assert coords.tolist() == [[0, 0, -4], [1, 0, 0]]
     assert [np.unique(row).tolist() for row in cells] == [[-4000], [-4000, 0]]
     assert voxel_map.counts() == {"free": 1023, "tentative": 0, "occupied": 0}
@@ -221,10 +221,10 @@ def test_a_map_looks_the_same_whatever_its_blocks_are_kept_in(tmp_path):
 def test_a_block_that_becomes_unknown_is_gone():
     voxel_map = free_map()
     full = voxel_map.memory_bytes
-    coords, cells = voxel_map.blocks()
-    voxel_map.insert(coords, np.zeros_like(cells))
+    coords, cells = voxel_map.storage.blocks()
+    voxel_map.storage.insert(coords, np.zeros_like(cells))
     assert voxel_map.bounds() is None
-    assert len(voxel_map.blocks()[0]) == 0
+    assert len(voxel_map.storage.blocks()[0]) == 0
     assert voxel_map.memory_bytes == full - 1024 - 2 * 12
 
 

@@ -55,7 +55,7 @@ def test_never_fewer_whatever_else_is_said(cell, hits):
         one.add(Evidence(np.zeros((1, 3), np.int32), values, NONE, 0))
         one.frames += 1
         hit_frames += values[0] > 0
-        states = one._rules.states(one.blocks()[1][0])
+        states = one.storage.rules.states(one.storage.blocks()[1][0])
         assert (hit_frames[states == State.OCCUPIED] >= hits).all()
         occupied += int((states == State.OCCUPIED).sum())
     assert occupied
@@ -82,13 +82,13 @@ def test_equals_plain_numbers(cell):
             if step:
                 total = min(max((start if numbers[c] == unknown else numbers[c]) + step, limits[0]), limits[1])
                 numbers[c] = total + (total == unknown)
-        assert one.blocks()[1][0].tolist() == numbers
+        assert one.storage.blocks()[1][0].tolist() == numbers
 
 
 def test_one_hit_is_enough_by_default_and_nothing_is_copied():
     one = VoxelMap(load_config())
     evidence = Evidence(np.zeros((1, 3), np.int32), np.full((1, 512), 32767, np.int16), NONE, 0)
-    assert one._in_my_units(evidence) is evidence
+    assert one.storage._in_my_units(evidence) is evidence
     assert CellRules(load_config().map).most_rise is None
 
 

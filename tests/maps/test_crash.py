@@ -256,10 +256,10 @@ def test_no_room_for_a_tile_loses_no_cell(tmp_path):
         told = []
         for x in (0.0, 10.0, 20.0, 30.0, 40.0):
             try:
-                rolling.look_from(at(x))
+                rolling.storage.look_from(at(x))
             except MapFileError as error:
                 told.append(str(error))
-            rolling.store._writer.submit(lambda: None).result()  # all that waited was tried
+            rolling.storage.tile_store._writer.submit(lambda: None).result()  # all that waited was tried
     assert len(told) == 4  # all but the first, which put them there
     assert "a tile cannot be written (No space left" in told[0]
     assert rolling.viewpoint.T_world_camera[0, 3] == 0.0
@@ -277,12 +277,12 @@ def test_what_a_killed_run_left_of_its_tiles_goes_with_the_next(tmp_path, again)
 
     def killed_run():
         rolling = make_map(config, tiles=tmp_path / "tiles")
-        rolling.look_from(at(0.0))
-        rolling.insert(*small_map(9).blocks())
-        coords = small_map(9).blocks()[0]
-        rolling.set_times(coords, np.full((len(coords), 512), 1 << 30, np.uint32), 0)
-        rolling.look_from(at(10.0))
-        for tiles in (rolling._store, rolling._times_store):
+        rolling.storage.look_from(at(0.0))
+        rolling.storage.insert(*small_map(9).storage.blocks())
+        coords = small_map(9).storage.blocks()[0]
+        rolling.storage.set_times(coords, np.full((len(coords), 512), 1 << 30, np.uint32), 0)
+        rolling.storage.look_from(at(10.0))
+        for tiles in (rolling.storage._store, rolling.storage._times_store):
             tiles._writer.submit(lambda: None).result()
         os.kill(os.getpid(), signal.SIGKILL)
 
@@ -302,16 +302,16 @@ def test_what_a_killed_run_left_of_its_tiles_goes_with_the_next(tmp_path, again)
 def test_what_cannot_be_written_of_a_tile_ends_the_run(tmp_path, monkeypatch, stopped):
     config = load_config(voxel_size=0.1, window={"size": [3.2, 3.2, 3.2], "outside": "keep"}, map={"keep_times": True})
     rolling = make_map(config, tiles=tmp_path / "tiles")
-    rolling.look_from(at(0.0))
-    coords, cells = small_map(3).blocks()
-    rolling.insert(coords - np.array([2, 0, 0], np.int32), cells)  # in two tiles
-    monkeypatch.setattr(getattr(rolling, stopped), "_write", lambda *_: no_room())
+    rolling.storage.look_from(at(0.0))
+    coords, cells = small_map(3).storage.blocks()
+    rolling.storage.insert(coords - np.array([2, 0, 0], np.int32), cells)  # in two tiles
+    monkeypatch.setattr(getattr(rolling.storage, stopped), "_write", lambda *_: no_room())
     monkeypatch.setattr("stereovox.maps.tiles.WAITING", 1)  # nobody waits for what cannot be written
-    rolling.look_from(at(10.0))
-    for tiles in (rolling._store, rolling._times_store):
+    rolling.storage.look_from(at(10.0))
+    for tiles in (rolling.storage._store, rolling.storage._times_store):
         tiles._writer.submit(lambda: None).result()
     with pytest.raises(MapFileError, match="a tile cannot be written"):
-        rolling.look_from(at(20.0))
+        rolling.storage.look_from(at(20.0))
     rolling.close()
     assert names(tmp_path) == []
 

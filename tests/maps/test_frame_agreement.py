@@ -20,10 +20,10 @@ def made(cell, seed=0, blocks=12):
     coords = random.choice(6**3, blocks, replace=False)
     coords = np.stack([coords // 36, coords // 6 % 6, coords % 6], axis=1).astype(np.int32) - 3
     odds = random.choice([-9, -3.5, -2.5, -1, 0.5, 1.5, 2.5, 9], (blocks, 512))
-    cells = voxel_map.cell_format.stored(odds)
-    cells[random.random(cells.shape) < 0.3] = voxel_map.cell_format.unknown
-    cells[0] = voxel_map.cell_format.stored(-9)
-    voxel_map.insert(coords, cells)
+    cells = voxel_map.storage.cell_format.stored(odds)
+    cells[random.random(cells.shape) < 0.3] = voxel_map.storage.cell_format.unknown
+    cells[0] = voxel_map.storage.cell_format.stored(-9)
+    voxel_map.storage.insert(coords, cells)
     others = coords[: blocks // 2] + np.array([100, 0, 0], np.int32)
     wanted = np.concatenate([coords[:-3], others])
     values = random.choice([0, 0, -619, 300, 1599, 1600, 4000], (len(wanted), 512)).astype(np.int16)
@@ -33,8 +33,8 @@ def made(cell, seed=0, blocks=12):
 def slow(voxel_map, evidence):
     """The same cell by cell, of what the map itself says of them."""
     out = dict.fromkeys(("hits", "passes", "into_free", "at_edge", "every"), 0.0)
-    stored = {tuple(c): cells for c, cells in zip(*voxel_map.blocks(), strict=True)}
-    rules = voxel_map._rules
+    stored = {tuple(c): cells for c, cells in zip(*voxel_map.storage.blocks(), strict=True)}
+    rules = voxel_map.storage.rules
     free_most, occupied_least = map(int, rules.thresholds)
     spoken = [*zip(evidence.coords, evidence.values, strict=True)]
     spoken += [(c, np.full(512, step)) for c, step in zip(evidence.uniform, evidence.uniform_values, strict=True)]
@@ -66,19 +66,19 @@ def test_weights_are_those_of_plain_python(cell, seed):
     voxel_map, evidence = made(cell, seed)
     expected = slow(voxel_map, evidence)
     assert min(expected) > 0
-    np.testing.assert_allclose(voxel_map.agreement(evidence, FIRM), expected)
+    np.testing.assert_allclose(voxel_map.storage.agreement(evidence, FIRM), expected)
 
 
 def test_the_sample_of_many_blocks_is_fair_and_does_not_depend_on_their_order(monkeypatch):
     voxel_map, evidence = made("int16", blocks=200)
-    whole = voxel_map.agreement(evidence, FIRM)
+    whole = voxel_map.storage.agreement(evidence, FIRM)
     monkeypatch.setattr(frame_agreement, "SAMPLE", 60)
-    some = voxel_map.agreement(evidence, FIRM)
+    some = voxel_map.storage.agreement(evidence, FIRM)
     assert some != whole
     np.testing.assert_allclose(some, whole, rtol=0.35)
     order = np.random.default_rng(0).permutation(len(evidence.coords))
     turned = Evidence(evidence.coords[order], evidence.values[order], evidence.uniform[::-1].copy(), -619)
-    assert voxel_map.agreement(turned, FIRM) == some
+    assert voxel_map.storage.agreement(turned, FIRM) == some
 
 
 def test_a_frame_is_judged_by_what_is_known_alone():

@@ -25,7 +25,7 @@ def settings(max_memory="200 kB", **more):
 
 def refusal(one, evidence):
     try:
-        one.check_room(evidence)
+        one.storage.check_room(evidence)
     except FrameRefused as why:
         return why
     return None
@@ -76,7 +76,7 @@ def test_cells_that_are_forgotten_in_a_full_map_take_no_more(window):
     one = make_map(settings("3 MB", **TIMES, **{"map.forget_s": 8.0}, **window))
     coords = np.array([(x, y, z) for x in range(-16, 16) for y in range(-2, 2) for z in range(-2, 2)], np.int32)
     if not window:
-        coords = np.repeat(np.arange(one._most, dtype=np.int32), 3).reshape(-1, 3)
+        coords = np.repeat(np.arange(one.storage._most, dtype=np.int32), 3).reshape(-1, 3)
     taken, random = one.reserved_bytes, np.random.default_rng(0)
     for second in range(40):
         values = random.integers(-300, 300, (len(coords), 512)).astype(np.int16)
@@ -104,8 +104,8 @@ def test_what_is_no_memory_is_one_line(max_memory):
 def test_a_window_takes_what_there_is_and_no_more(when_full, outside, times):
     one = make_map(settings("200 MB", when_full=when_full, **times))
     assert 0.6 * 200e6 < one.reserved_bytes <= 200e6
-    assert one._settings.window.outside == outside
-    one.look_from(made.at((3, 3, 3)))
+    assert one.storage._settings.window.outside == outside
+    one.storage.look_from(made.at((3, 3, 3)))
     wide, deep, high = np.diff(one.window, axis=0)[0]
     assert wide == deep >= 2 * (5.0 + 1.0)
     assert high >= 5.0 + 2 * 1.0
@@ -156,9 +156,11 @@ def test_a_grid_refuses_what_does_not_fit():
             break
         one.add(evidence)
     assert 20 < n < 199
-    pool = one._pool
+    pool = one.storage._pool
     assert pool.values.nbytes + pool.coords.nbytes + pool.table.nbytes < 1e6
-    one.check_room(GridEvidence(np.array([[0, 0, 0], [999, 0, 0]], np.int32), np.full((2, 4096), [[9], [0]], np.int16)))
+    one.storage.check_room(
+        GridEvidence(np.array([[0, 0, 0], [999, 0, 0]], np.int32), np.full((2, 4096), [[9], [0]], np.int16))
+    )
 
 
 LONG_FLIGHT = """
@@ -193,10 +195,10 @@ for moment in moments(400):
 assert peak() - before < 60e6, peak() - before
 if sys.argv[1] == "refuse":
     assert refused > 300, refused
-    assert len(one._pool) > 10_000
+    assert len(one.storage._pool) > 10_000
     plain = load_config(config, max_memory=None, when_full="refuse", **{"map.keep_times": False})
     whole = made.fly(VoxelMap(plain), moments(one.frames))
-    for a, b in zip(one.slabs(), whole.slabs()):
+    for a, b in zip(one.storage.slabs(), whole.storage.slabs()):
         assert all((x == y).all() for x, y in zip(a, b))
 else:
     assert refused == 0

@@ -53,12 +53,13 @@ def test_a_grid_is_the_same_for_any_split(cell, tmp_path):
     for frame in range(9):
         if frame in (3, 7):
             split.save(tmp_path / "grid.npz")
-            split = load_grid(tmp_path / "grid.npz").with_config(config)
+            split = load_grid(tmp_path / "grid.npz")
+            split.storage.continue_with(config)
         coords = np.array([[frame // 3, 0, 0], [9, frame % 2, 0]], np.int32)
         evidence = GridEvidence(coords, random.integers(-900, 900, (2, 4096)).astype(np.int16))
         for one in (whole, split):
-            one.check_room(evidence)
+            one.storage.check_room(evidence)
             one.add(evidence)
             one.frames += 1
-    for a, b in zip(whole.tiles(), split.tiles(), strict=True):
+    for a, b in zip(whole.storage.tiles(), split.storage.tiles(), strict=True):
         np.testing.assert_array_equal(a, b)

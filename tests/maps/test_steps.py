@@ -32,7 +32,7 @@ def settings(integrator="ray", **more):
 
 def mapped(image, config):
     voxel_map = make_map(config)
-    voxel_map.look_from(Viewpoint(image.camera, image.T_world_sensor))
+    voxel_map.storage.look_from(Viewpoint(image.camera, image.T_world_sensor))
     voxel_map.add(make_integrator(config).evidence(image))
     return voxel_map
 
@@ -81,8 +81,8 @@ def test_rays_clear_the_cells_on_their_way():
 @pytest.mark.parametrize("integrator", ["projective", "ray", "line"])
 def test_equal_steps_change_nothing(integrator):
     image = made_image(2)
-    plain = mapped(image, settings(integrator, steps=None, voxel_size=0.1)).blocks()
-    equal = mapped(image, settings(integrator, steps=(0.1, 0.1, 0.1))).blocks()
+    plain = mapped(image, settings(integrator, steps=None, voxel_size=0.1)).storage.blocks()
+    equal = mapped(image, settings(integrator, steps=(0.1, 0.1, 0.1))).storage.blocks()
     for a, b in zip(plain, equal, strict=True):
         np.testing.assert_array_equal(a, b)
 

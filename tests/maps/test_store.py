@@ -11,6 +11,7 @@ from stereovox.config import load_config
 from stereovox.errors import MapFileError
 from stereovox.frame import Viewpoint
 from stereovox.maps import VoxelMap, load_map, store
+from stereovox.maps.storage import Storage
 
 CONFIG = load_config(voxel_size=0.1)
 CAMERA = PinholeCamera.from_field_of_view(64, 48, 90, 0.05)
@@ -68,16 +69,16 @@ def test_slabs_of_any_size_are_saved_in_whole_chunks(tmp_path, monkeypatch):
     monkeypatch.setattr(store, "BLOCKS_PER_CHUNK", 16)
     cells = np.random.default_rng(0).permutation(8 * np.argwhere(np.ones((4, 5, 6), bool)))
     whole = small_map(cells)
-    coords, values = whole.blocks()
+    coords, values = whole.storage.blocks()
 
-    class Slabs(VoxelMap):
+    class Slabs(Storage):
         def slabs(self):
             for start, end in ((0, 1), (1, 4), (4, 4), (4, 70), (70, 73), (73, 120)):
                 yield coords[start:end], values[start:end]
 
-    saved = Slabs(CONFIG)
+    saved = VoxelMap(CONFIG, storage=Slabs(CONFIG))
     saved.save(tmp_path / "m")
-    for got, wanted in zip(load_map(tmp_path / "m").blocks(), (coords, values), strict=True):
+    for got, wanted in zip(load_map(tmp_path / "m").storage.blocks(), (coords, values), strict=True):
         np.testing.assert_array_equal(got, wanted)
     assert len(list((tmp_path / "m").rglob("cells/c/*/0"))) == 8  # 120 blocks by 16
     written = json.loads(next((tmp_path / "m").rglob("cells/zarr.json")).read_text())

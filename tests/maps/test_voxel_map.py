@@ -144,7 +144,7 @@ def test_cells_come_back_as_they_went_in(case):
     voxel_map = VoxelMap.from_cells(CONFIG, cells, np.array(units) / 1000)
     assert cells_of(voxel_map) == {cell: unit or 1 for cell, unit in zip(cells, units, strict=True)}
     shuffled = VoxelMap.from_cells(CONFIG, cells[::-1], np.array(units[::-1]) / 1000)
-    assert [a.tolist() for a in shuffled.blocks()] == [a.tolist() for a in voxel_map.blocks()]
+    assert [a.tolist() for a in shuffled.storage.blocks()] == [a.tolist() for a in voxel_map.storage.blocks()]
 
 
 def random_map(seed=0, number=4000):
@@ -161,7 +161,7 @@ def test_save_load_save(tmp_path):
     second.save(tmp_path / "b.svox")
     third = load_map(tmp_path / "b.svox")
     for other in (second, third):
-        assert all((a == b).all() for a, b in zip(first.blocks(), other.blocks(), strict=True))
+        assert all((a == b).all() for a, b in zip(first.storage.blocks(), other.storage.blocks(), strict=True))
         assert other.frames == 17
         assert other.config == CONFIG
     second.add(evidence_of([], [], [[0, 0, 0]]))  # a loaded map goes on
@@ -170,7 +170,7 @@ def test_save_load_save(tmp_path):
 def test_saving_again_replaces_and_leaves_nothing_behind(tmp_path):
     random_map(1).save(tmp_path / "m")
     random_map(2).save(tmp_path / "m")
-    assert (load_map(tmp_path / "m").blocks()[1] == random_map(2).blocks()[1]).all()
+    assert (load_map(tmp_path / "m").storage.blocks()[1] == random_map(2).storage.blocks()[1]).all()
     assert len(list((tmp_path / "m").glob("cells-*"))) == 1
 
 
@@ -181,7 +181,7 @@ def test_a_save_that_dies_leaves_the_old_map(tmp_path, monkeypatch):
     )
     with pytest.raises(MapFileError, match="No space left"):
         random_map(2).save(tmp_path / "m")
-    assert (load_map(tmp_path / "m").blocks()[1] == random_map(1).blocks()[1]).all()
+    assert (load_map(tmp_path / "m").storage.blocks()[1] == random_map(1).storage.blocks()[1]).all()
 
 
 def test_empty_map(tmp_path):

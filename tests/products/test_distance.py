@@ -63,7 +63,7 @@ def put(voxel_map, cells, log_odds):
     anew = VoxelMap.from_cells(
         voxel_map.config, np.concatenate([known, cells]), np.concatenate([numbers, np.full(len(cells), log_odds)])
     )
-    voxel_map.insert(*anew.blocks())
+    voxel_map.storage.insert(*anew.storage.blocks())
 
 
 def wanted_metres(voxel_map, field, to):
@@ -93,7 +93,7 @@ def test_a_field_follows_its_map(cell, to, steps):
 def stand(voxel_map, *position):
     pose = np.eye(4)
     pose[:3, 3] = position
-    voxel_map.look_from(Viewpoint(0, pose))
+    voxel_map.storage.look_from(Viewpoint(0, pose))
 
 
 def test_a_window_follows_the_camera_and_keeps_nothing_of_where_it_was():

@@ -11,6 +11,7 @@ from stereovox.config import load_config
 from stereovox.errors import StereovoxError
 from stereovox.frame import Frame
 from stereovox.mapper import Mapper
+from stereovox.maps.storage import Storage
 from stereovox.maps.voxel_map import VoxelMap
 from stereovox.products.live_projection import STEP, LiveProjection
 from stereovox.products.projection import project
@@ -65,12 +66,12 @@ def test_after_every_frame_it_is_the_map_from_above(settings):
 def test_it_looks_at_what_changed_alone(monkeypatch):
     mapper = Mapper("default", voxel_size=0.2, max_range=3.0)
     live, looked = LiveProjection(mapper.map), []
-    within = VoxelMap.blocks_within
-    monkeypatch.setattr(VoxelMap, "blocks_within", lambda *a: looked.append(within(*a)) or looked[-1])
+    within = Storage.blocks_within
+    monkeypatch.setattr(Storage, "blocks_within", lambda *a: looked.append(within(*a)) or looked[-1])
     for frame in frames(6, seed=2):
         mapper.add(frame)
         live.grid()
-    assert len(looked[-1][0]) < 0.6 * len(mapper.map.blocks()[0])
+    assert len(looked[-1][0]) < 0.6 * len(mapper.map.storage.blocks()[0])
     assert live.grid().cells.size
     assert len(looked[-1][0]) == 0  # nothing changed since
 

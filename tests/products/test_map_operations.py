@@ -32,9 +32,9 @@ def on_disk(voxel_map):
     window = {"window.size": [0.8] * 3, "window.trigger": 0.1, "window.outside": "keep"}
     config = load_config(voxel_map.config, **window)
     same, moving = VoxelMap(config), RollingMap(config)
-    same.insert(*voxel_map.blocks())
-    moving.go_on_with(same)
-    moving.look_from(made.at((5.0, 5.0, 5.0)))
+    same.storage.insert(*voxel_map.storage.blocks())
+    moving.storage.go_on_with(same.storage)
+    moving.storage.look_from(made.at((5.0, 5.0, 5.0)))
     return moving
 
 
@@ -73,14 +73,20 @@ def test_boxes_that_are_none(box):
 def summed(a, b):
     """What a cell of both should hold, from the tables of both."""
     config = a.config.map
-    prior = round(math.log(config.prior / (1 - config.prior)) * a.cell_format.per_log_odds) / a.cell_format.per_log_odds
+    prior = (
+        round(math.log(config.prior / (1 - config.prior)) * a.storage.cell_format.per_log_odds)
+        / a.storage.cell_format.per_log_odds
+    )
     first, second = table(a), table(b)
-    lowest, highest = (float(a.cell_format.log_odds(np.array([end]))[0]) for end in (a._rules.lowest, a._rules.highest))
+    lowest, highest = (
+        float(a.storage.cell_format.log_odds(np.array([end]))[0])
+        for end in (a.storage.rules.lowest, a.storage.rules.highest)
+    )
     prior = min(max(prior, lowest), highest)
     result = first | second
     for cell in first.keys() & second.keys():
         total = min(max(first[cell] + second[cell] - prior, lowest), highest)
-        result[cell] = total or 1 / a.cell_format.per_log_odds
+        result[cell] = total or 1 / a.storage.cell_format.per_log_odds
     return result
 
 
@@ -90,7 +96,7 @@ def test_merged_log_odds_add_up(kind):
     found, wanted = table(sv.merge(a, b)), summed(a, b)
     assert found.keys() == wanted.keys()
     np.testing.assert_allclose(
-        [found[cell] for cell in wanted], list(wanted.values()), atol=1.1 / a.cell_format.per_log_odds
+        [found[cell] for cell in wanted], list(wanted.values()), atol=1.1 / a.storage.cell_format.per_log_odds
     )
 
 
@@ -243,13 +249,13 @@ class SlowMove:
                 yield state
 
     def prior(self):
-        return float(self.map.cell_format.log_odds(np.array([self.map._rules.prior]))[0])
+        return float(self.map.storage.cell_format.log_odds(np.array([self.map.storage.rules.prior]))[0])
 
     def shared(self, target):
         """What speaks for an obstacle in 4 x 4 x 4 places in a cell, on the average, on top of the prior."""
         steps = (np.arange(4) + 0.5) / 4
         values = [self.known.get(self.under(target, inside), -99) for inside in itertools.product(steps, repeat=3)]
-        rules, there = self.map._rules, self.map.cell_format
+        rules, there = self.map.storage.rules, self.map.storage.cell_format
         highest = float(there.log_odds(np.array([rules.thresholds.occupied_least - 1]))[0])
         return min(self.prior() + np.mean(np.maximum(np.array(values) - self.prior(), 0)), highest)
 
@@ -257,7 +263,10 @@ class SlowMove:
         """The log-odds of a cell in the new frame; None: unknown."""
         values = [table[at] for table, at in ((self.known, self.under(target)), (self.pushed, target)) if at in table]
         value = max(values, default=None)
-        if value is None or self.map._rules.states(self.map.cell_format.stored([value]))[0] != State.FREE:
+        if (
+            value is None
+            or self.map.storage.rules.states(self.map.storage.cell_format.stored([value]))[0] != State.FREE
+        ):
             return value
         worst = next(self.overlapped(target), State.FREE)
         return value if worst == State.FREE else None if worst == State.UNKNOWN else self.shared(target)
@@ -267,7 +276,7 @@ class SlowMove:
 def test_any_other_motion_makes_each_cell_as_bad_as_what_it_overlaps(kind):
     voxel_map = random_map(4, kind, 200, low=-4, high=4)
     T = motion([0.4, -0.7, 1.1], [0.123, 0.456, -0.789])
-    there, slow, step = moved(voxel_map, T), SlowMove(voxel_map, T), 1 / voxel_map.cell_format.per_log_odds
+    there, slow, step = moved(voxel_map, T), SlowMove(voxel_map, T), 1 / voxel_map.storage.cell_format.per_log_odds
     found = table(there)
     low, high = np.array(list(found)).min(0) - 1, np.array(list(found)).max(0) + 2
     for target in itertools.product(*(range(a, b) for a, b in zip(low.tolist(), high.tolist(), strict=True))):
@@ -387,7 +396,7 @@ def test_maps_that_lie_on_disk_give_the_same():
     a, b = random_map(1), random_map(2)
     far, T = on_disk(a), motion([0.2, 0.1, 0], [0.5, 0, 0])
     try:
-        assert len(list(far.store.tiles())) > 1
+        assert len(list(far.storage.tile_store.tiles())) > 1
         assert table(sv.crop(far, *BOX)) == table(sv.crop(a, *BOX))
         assert table(sv.coarsen(far, 2)) == table(sv.coarsen(a, 2))
         assert table(sv.merge(far, b)) == table(sv.merge(b, far)) == table(sv.merge(a, b))

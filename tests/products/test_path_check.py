@@ -57,9 +57,9 @@ def test_a_ball_that_stands_in_something_goes_nowhere():
 def test_the_oldest_evidence_is_that_of_the_cells_it_touches():
     numbers = np.random.default_rng(4)
     voxel_map = corridor({(3, 0, 0): None}, **{"map.keep_times": True})
-    coords, cells = voxel_map.blocks()
+    coords, cells = voxel_map.storage.blocks()
     times = (2**30 + numbers.integers(1, 5000, cells.shape)).astype(np.uint32)
-    voxel_map.set_times(coords, times, 0)
+    voxel_map.storage.set_times(coords, times, 0)
     now_ns, path = 60 * 10**9, np.array([(0, 0, 0), (1.03, 0.4, 0.2), (1.9, -0.3, 0.1)])
     found = check_path(voxel_map, path, 0.17, now_ns=now_ns)
     known, _ = voxel_map.cells()

@@ -15,6 +15,7 @@ from stereovox.formats.map_server import read_map_server
 from stereovox.mapper import Mapper
 from stereovox.maps import State, VoxelMap
 from stereovox.maps.cubes import in_cubes
+from stereovox.maps.storage import Storage
 from stereovox.products.projection import project
 from stereovox.simulate.floors.floor import Floor
 
@@ -99,7 +100,7 @@ def test_uneven_cells_are_made_cubes():
     compare(project(voxel_map), in_cubes(voxel_map), (0.1, 1.0))
 
 
-class InPieces(VoxelMap):
+class InPieces(Storage):
     """As a map whose far tiles lie on disk: blocks come piece by piece, and columns are cut."""
 
     def slabs(self):
@@ -110,8 +111,8 @@ class InPieces(VoxelMap):
 
 @pytest.mark.parametrize("up", ["z", "x", "-y"])
 def test_a_map_that_comes_in_pieces_is_seen_whole(up):
-    whole, pieces = random_map(settings(up=up)), InPieces(settings(up=up))
-    pieces.insert(*whole.blocks())
+    whole, pieces = random_map(settings(up=up)), VoxelMap(settings(up=up), storage=InPieces(settings(up=up)))
+    pieces.storage.insert(*whole.storage.blocks())
     compare(project(pieces), whole, (0.1, 1.0))
 
 

@@ -215,7 +215,7 @@ def test_names_that_no_topic_has_end_in_one_line(robot):
 
 def test_save_reset_and_load(robot, tmp_path):
     robot.drive(3)
-    before = robot.mapping.snapshot()().blocks()
+    before = robot.mapping.snapshot()().storage.blocks()
     saved = robot.call(Trigger, "/stereovox/save")
     assert (saved.success, "3 frames" in saved.message) == (True, True)
     assert robot.call(Trigger, "/stereovox/reset").success
@@ -227,7 +227,7 @@ def test_save_reset_and_load(robot, tmp_path):
     assert no_name.result == LoadMap.Response.RESULT_MAP_DOES_NOT_EXIST
     loaded = robot.call(LoadMap, "/stereovox/load", LoadMap.Request(map_url=f"file://{tmp_path / 'live.svox'}"))
     assert loaded.result == LoadMap.Response.RESULT_SUCCESS
-    for mine, theirs in zip(robot.mapping.snapshot()().blocks(), before, strict=True):
+    for mine, theirs in zip(robot.mapping.snapshot()().storage.blocks(), before, strict=True):
         np.testing.assert_array_equal(mine, theirs)
     assert load_map(tmp_path / "live.svox").frames == 3
     (tmp_path / "other").mkdir()

@@ -50,7 +50,7 @@ def mapped(recording: str) -> VoxelMap:
 def check_same(told: dict, live: VoxelMap, expected: VoxelMap) -> None:
     assert (told["frames"], told["refused"], told["dropped"]) == (12, {}, {})
     assert told["received"] == {DEPTH: 12}
-    for mine, theirs in zip(live.blocks(), expected.blocks(), strict=True):
+    for mine, theirs in zip(live.storage.blocks(), expected.storage.blocks(), strict=True):
         np.testing.assert_array_equal(mine, theirs)
     np.testing.assert_array_equal(live.viewpoint.T_world_camera, expected.viewpoint.T_world_camera)
 

@@ -212,10 +212,10 @@ def test_the_gate_decides_as_the_slow_one(flight):
 
 def state_of(voxel_map):
     """All that a refused frame must leave as it is."""
-    coords, cells = voxel_map.blocks()
+    coords, cells = voxel_map.storage.blocks()
     view = voxel_map.viewpoint
     pose = None if view is None else (view.T_world_camera.tobytes(), view.stamp_ns)
-    return coords.tobytes(), cells.tobytes(), pose, repr(voxel_map.window_state)
+    return coords.tobytes(), cells.tobytes(), pose, repr(voxel_map.storage.window_state)
 
 
 SETTINGS = {"voxel_size": 0.25, "max_range": 3.0}
@@ -280,7 +280,7 @@ def test_a_floors_run_may_be_split_anywhere(tmp_path):
     jump, reset = "pose_jump", "clock_reset"
     assert refused == [None, None, "stamp_backwards", None, *[jump] * 4, None, *[reset] * 2, None, None, None]
     assert parts.map.history == whole.map.history
-    assert all((a == b).all() for a, b in zip(parts.map.tiles(), whole.map.tiles(), strict=True))
+    assert all((a == b).all() for a, b in zip(parts.map.storage.tiles(), whole.map.storage.tiles(), strict=True))
 
 
 def test_a_report_tells_that_frames_are_believed_again():

@@ -20,7 +20,7 @@ MASKED = np.ma.masked_array(DEPTH, DEPTH > 1)
 
 
 def state_of(voxel_map):
-    cells = voxel_map.tiles() if isinstance(voxel_map, sv.GridMap) else voxel_map.blocks()
+    cells = voxel_map.storage.tiles() if isinstance(voxel_map, sv.GridMap) else voxel_map.storage.blocks()
     return [array.tobytes() for array in cells], voxel_map.frames, getattr(voxel_map, "viewpoint", None)
 
 
@@ -123,7 +123,7 @@ def test_what_means_the_same_does_the_same(same):
     for frame in (FRAME, replace(FRAME, **same)):
         mapper = sv.Mapper(voxel_size=0.25, max_range=4.0)
         assert mapper.add(frame).refused is None
-        maps.append(mapper.map.blocks())
+        maps.append(mapper.map.storage.blocks())
     assert all((a == b).all() for a, b in zip(*maps, strict=True))
 
 

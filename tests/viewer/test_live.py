@@ -37,7 +37,10 @@ def same_as_alone(mapper, number):
     alone = new_mapper()
     for i in range(number):
         alone.add(SOURCE.frame(i))
-    return all(np.array_equal(one, other) for one, other in zip(mapper.map.blocks(), alone.map.blocks(), strict=True))
+    return all(
+        np.array_equal(one, other)
+        for one, other in zip(mapper.map.storage.blocks(), alone.map.storage.blocks(), strict=True)
+    )
 
 
 def wait_for(condition):

@@ -147,7 +147,7 @@ def test_colours_may_tell_the_probability_or_the_age():
     voxel_map = VoxelMap.from_cells(config, indices, log_odds)
     times = np.zeros((1, 512), np.uint32)
     times[0, [0, 64, 128]] = 1, 200, 0
-    voxel_map.set_times(np.zeros((1, 3), np.int32), times, 0)
+    voxel_map.storage.set_times(np.zeros((1, 3), np.int32), times, 0)
     voxel_map.viewpoint = Viewpoint(CAMERA, LOOKS_ALONG_X, 10**9)
     with closing(open_viewer(voxel_map, port=0)) as viewer:
 

@@ -37,6 +37,8 @@ class Eyes:
     T_left_right: Transform
 
     def __post_init__(self) -> None:
+        if np.shape(self.T_left_right) != (4, 4):
+            raise StereovoxError(f"eyes: T_left_right is {np.shape(self.T_left_right)}; give a (4, 4) rigid motion")
         if rigidity_error(self.T_left_right) > 5e-3:
             raise StereovoxError(
                 "eyes: T_left_right is no rigid motion; give a rotation and metres, below them 0 0 0 1"

@@ -165,7 +165,9 @@ def _check_image(frame: Frame) -> None:
     if not SMALLEST < float(frame.depth_scale) < 1 / SMALLEST:  # NaN as well
         raise FrameRefused("bad_scale", f"{name}: depth_scale {frame.depth_scale} must be positive and finite")
     if frame.reason is not None and not _are_reasons(frame.reason, depth.shape):
-        raise FrameRefused("bad_reason", f"{name}: reason must be {depth.shape} uint8 of values 0 to {MAX_REASON}")
+        given = f"{np.shape(frame.reason)} {getattr(frame.reason, 'dtype', type(frame.reason).__name__)}"
+        wanted = f"{depth.shape} uint8 of values 0 to {MAX_REASON}"
+        raise FrameRefused("bad_reason", f"{name}: reason is {given}; give {wanted}")
 
 
 def _are_reasons(given: NDArray, shape: tuple[int, ...]) -> bool:

@@ -279,9 +279,9 @@ class _Truth:
         voxel_map = VoxelMap(self.config)
         voxel_map.history = History(counts.frames, Counter(counts.refused), recording=self.source.name)
         if self._last is not None:
-            voxel_map.look_from(self._last)
+            voxel_map.storage.look_from(self._last)
         coords, cells = self._cells()
-        voxel_map.insert(coords, cells)
+        voxel_map.storage.insert(coords, cells)
         states = voxel_map.counts()
         counts.occupied, counts.free = states["occupied"], states["free"]
         return voxel_map
@@ -314,7 +314,7 @@ class _Truth:
 
     def _cells(self) -> tuple[NDArray[np.int32], NDArray[np.integer]]:
         """Return all blocks (n, 3) with their cells (n, 512) as a map stores them."""
-        n, form, limits = len(self._marks), VoxelMap(self.config).cell_format, self.config.map
+        n, form, limits = len(self._marks), VoxelMap(self.config).storage.cell_format, self.config.map
         free = IN_VIEW | CROSSED if self.rays else IN_VIEW
         log_odds = np.array([limits.log_odds_min if marks & free == free else 0.0 for marks in range(2 * HIT)])
         log_odds[[HIT | IN_VIEW, HIT | IN_VIEW | CROSSED]] = limits.log_odds_max

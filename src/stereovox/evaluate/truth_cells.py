@@ -39,9 +39,9 @@ class CellReader:
 
     def log_odds(self, voxel_map: VoxelMap) -> NDArray[np.float32]:
         """Return the log-odds (N,) of the cells in the order of their keys; exactly 0 where unobserved."""
-        kind = voxel_map.cell_format
+        kind = voxel_map.storage.cell_format
         stored = np.full((len(self._blocks), 512), kind.unknown, kind.dtype)
-        for coords, values in voxel_map.slabs():
+        for coords, values in voxel_map.storage.slabs():
             row = position(keys(coords), self._blocks)
             here = (row >= 0) & (np.abs(coords) < _FARTHEST_BLOCK).all(axis=1)
             stored[row[here]] = values[here]

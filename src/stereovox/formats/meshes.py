@@ -172,7 +172,7 @@ def _parts(voxel_map: VoxelMap) -> Iterator[tuple[NDArray[np.float64], NDArray[n
 def _groups(voxel_map: VoxelMap) -> NDArray[np.int32]:
     """Return the lowest blocks (n, 3) of all cubes of blocks that the surface may pass."""
     rules, found = CellRules(voxel_map.config.map), [np.empty((0, 3), np.int32)]
-    for coords, cells in voxel_map.slabs():
+    for coords, cells in voxel_map.storage.slabs():
         found.append(coords[(rules.states(cells) == State.OCCUPIED).any(axis=1)])
     blocks = np.concatenate(found)
     beside = np.concatenate([blocks - step for step in np.ndindex(2, 2, 2)])  # the cubes below end in its first layer

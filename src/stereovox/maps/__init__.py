@@ -7,9 +7,9 @@ from pathlib import Path
 
 from stereovox.config import Config
 from stereovox.errors import ConfigError
-from stereovox.maps.voxel_map import State, VoxelMap, load_map
+from stereovox.maps.voxel_map import State, VoxelMap, load_map, unbounded
 
-__all__ = ["State", "VoxelMap", "load_map", "make_map"]
+__all__ = ["State", "VoxelMap", "load_map", "make_map", "unbounded"]
 
 
 def make_map(config: Config, resume: VoxelMap | None = None, tiles: Path | None = None) -> VoxelMap:
@@ -25,7 +25,7 @@ def make_map(config: Config, resume: VoxelMap | None = None, tiles: Path | None 
             f"profile {config.profile}: dimensions 2 is a floor's grid; use GridMapper, map_floor or `stereovox grid`"
         )
     if resume is not None:
-        resume.check_cells(config)  # before anything lies on the disk
+        resume.storage.check_cells(config)  # before anything lies on the disk
     try:
         return _made(config, resume, tiles)
     except MemoryError:
@@ -40,7 +40,7 @@ def _made(config: Config, resume: VoxelMap | None, tiles: Path | None) -> VoxelM
     rolling = RollingMap(config, tiles)
     if resume is not None:
         try:
-            rolling.go_on_with(resume)
+            rolling.storage.go_on_with(resume.storage)
         except BaseException:
             rolling.close()
             raise
@@ -49,10 +49,18 @@ def _made(config: Config, resume: VoxelMap | None, tiles: Path | None) -> VoxelM
 
 def _without_window(config: Config, resume: VoxelMap | None) -> VoxelMap:
     if config.max_memory is None:
-        return VoxelMap(config) if resume is None else resume.with_config(config)
+        return VoxelMap(config) if resume is None else _continued(resume, config)
     from stereovox.maps.capped import CappedMap
 
     capped = CappedMap(config)
     if resume is not None:
-        capped.go_on_with(resume)
+        capped.storage.go_on_with(resume.storage)
     return capped
+
+
+def _continued(resume: VoxelMap, config: Config) -> VoxelMap:
+    """Return the map itself with the settings of the run that goes on; a copy of one that has bounds."""
+    if resume.storage.bounded:
+        return unbounded(resume, config)
+    resume.storage.continue_with(config)
+    return resume

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a cell's log-odds are kept in: thousandths in 16 bits, steps of 1/32 in 8, or the byte of Chien 2020."""
+"""Cell formats: log-odds as thousandths in 16 bits, as steps of 1/32 in 8, or as the byte of Chien 2020."""
 
 from __future__ import annotations
 
@@ -21,7 +21,14 @@ BYTE_THRESHOLD = 180
 
 
 class State(IntEnum):
-    """What a map says about a cell."""
+    """State of a cell, by its probability of being occupied.
+
+    Attributes:
+        UNKNOWN: No evidence.
+        FREE: p < `map.free_below`.
+        TENTATIVE: Between both thresholds.
+        OCCUPIED: p > `map.occupied_above`.
+    """
 
     UNKNOWN = _cells.UNKNOWN
     FREE = _cells.FREE

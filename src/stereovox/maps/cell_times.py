@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""When each cell of a map got its last evidence, and which cells have had none for too long."""
+"""Times of cells: when each got its last evidence, and which cells are to be forgotten."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Maps whose cells are no cubes, made into cubes for all that draws them or writes files that know only those."""
+"""Resample maps with cells that are not cubes, for drawing and for file formats that know cubes only."""
 
 from __future__ import annotations
 

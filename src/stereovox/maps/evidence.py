@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What one frame or scan says, before any map knows it: integrators make it, a map adds it."""
+"""Evidence of one frame or scan: integrators make it, a map adds it."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class GridEvidence:
 
     @classmethod
     def nothing(cls) -> GridEvidence:
-        """Return the evidence of a scan that says nothing."""
+        """Return empty evidence."""
         return cls(np.empty((0, 3), np.int32), np.empty((0, CELLS), np.int16))
 
     def cells(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far one frame agrees with what a map is sure of."""
+"""Agreement of one frame with what a map is sure of."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class Agreement(NamedTuple):
 
 
 def agreement(stored: StoredCells, rules: CellRules, evidence: Evidence, firm: int) -> Agreement:
-    """Weigh `evidence` against the cells of a map; see `VoxelMap.agreement`.
+    """Weigh `evidence` against the cells of a map; see `Storage.agreement`.
 
     Of a frame with more than SAMPLE blocks every second, fourth ... is looked at, by a hash of its coordinates: the
     same ones whatever their order.

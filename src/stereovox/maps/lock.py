@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """One writer at a time: a lock on a file that the system lifts when its holder ends, however it ends.
 
-Readers need no lock. The file is left behind by a process that is killed, which is in nobody's way.
+Readers need no lock. The file is left behind by a process that is killed, which does no harm.
 """
 
 from __future__ import annotations
@@ -15,14 +15,14 @@ from stereovox.errors import MapFileError
 from stereovox.safe_io import FLOOR_ENDINGS, sweep_unfinished, sync_folder
 
 LOCK = ".lock"
-"""The file in a folder that tells of its writer."""
+"""The lock file in a folder that is being written."""
 PATIENCE_S = 0.1
 """How long a writer waits for another: just long enough for one that is about to end."""
 
 
 @contextmanager
 def only_writer_in(folder: Path) -> Iterator[None]:
-    """Be the only process that writes to `folder`, which is made, and is removed at the end if it is empty then.
+    """Hold the right to write to `folder`, which is made, and is removed at the end if it is empty then.
 
     Within one thread this may be entered again. Raises MapFileError where another process or thread is the writer and
     where the folder cannot be written.
@@ -33,14 +33,14 @@ def only_writer_in(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def only_store_in(folder: Path) -> Iterator[None]:
-    """Be the only object that writes to `folder`: as `only_writer_in`, but it cannot be entered again."""
+    """Hold the right to write to `folder` for one object: as `only_writer_in`, but it cannot be entered again."""
     with _made(folder), _held(folder, folder / LOCK, again=False):
         yield
 
 
 @contextmanager
 def only_writer_of(file: Path, *others: Path) -> Iterator[None]:
-    """Be the only process that writes `file`, and `others` with it: as `only_writer_in`; the lock stands beside it.
+    """Hold the right to write `file`, and `others` with it: as `only_writer_in`; the lock stands beside it.
 
     What a writer left of them that was killed is removed.
     """
@@ -50,7 +50,7 @@ def only_writer_of(file: Path, *others: Path) -> Iterator[None]:
 
 
 def only_writer_of_floor(out: Path) -> AbstractContextManager[None]:
-    """Be the only one who writes a floor's map, its pictures and its way, whichever of them `out` names."""
+    """Hold the right to write a floor's map, its pictures and its trajectory, whichever of them `out` names."""
     yaml, *pictures, way = (out.with_suffix(ending) for ending in (*FLOOR_ENDINGS, ".tum"))
     between = [picture.with_name(f".{picture.name}") for picture in pictures]
     return only_writer_of(yaml, *pictures, *between, way)
@@ -60,7 +60,7 @@ def only_writer_of_floor(out: Path) -> AbstractContextManager[None]:
 def _made(folder: Path) -> Iterator[None]:
     made = [place for place in (folder, *folder.parents) if not place.exists()]
     try:
-        with _told(folder):
+        with _one_line_errors(folder):
             folder.mkdir(parents=True, exist_ok=True)
             for place in made:
                 sync_folder(place.parent)
@@ -76,7 +76,7 @@ def _held(what: Path, where: Path, again: bool) -> Iterator[None]:
     from filelock import FileLock, Timeout
 
     where = Path(os.path.realpath(where.parent)) / where.name  # by any name it is the same lock
-    with _told(what):
+    with _one_line_errors(what):
         os.stat(where.parent)  # filelock would make the folder
         lock = FileLock(where, is_singleton=again, thread_local=again)
         try:
@@ -95,8 +95,8 @@ def _held(what: Path, where: Path, again: bool) -> Iterator[None]:
 
 
 @contextmanager
-def _told(what: Path) -> Iterator[None]:
-    """Turn what the system says into one line."""
+def _one_line_errors(what: Path) -> Iterator[None]:
+    """Turn errors of the system into a MapFileError of one line."""
     try:
         yield
     except (OSError, NotImplementedError) as error:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How many cells fit into the memory that a run may take, and what window that makes."""
+"""Memory limits: how many blocks fit, and how large the window may be."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from stereovox.maps.window import most_touched, size_in_cells
 
 MAX_BYTES = 8_000_000_000
 """A window that would need more memory is taken for a mistake, unless `max_memory` allows it."""
-MAX_TOLD = 10**24
-"""More bytes than that are told as that many: a whole number may be larger than any float."""
+MAX_FORMATTED = 10**24
+"""Larger numbers of bytes are written as this one: a whole number may be larger than any float."""
 UNITS = (1e12, "TB"), (1e9, "GB"), (1e6, "MB"), (1e3, "kB")
 MAX_BLOCKS = 1 << 29
 """Places of blocks are kept in 32 bits, those with numbers and those without one after the other."""
@@ -69,16 +69,16 @@ def within_memory(config: Config) -> Config:
     return config
 
 
-def told(number_of_bytes: float) -> str:
+def format_bytes(number_of_bytes: float) -> str:
     """Return a number of bytes as text."""
-    number = float(min(number_of_bytes, MAX_TOLD))
+    number = float(min(number_of_bytes, MAX_FORMATTED))
     size, unit = next(((size, unit) for size, unit in UNITS if number >= size), (1.0, "bytes"))
     return f"{number / size:.0f} {unit}" if number >= 10 * size else f"{number / size:.2g} {unit}"
 
 
-def _enough(number_of_bytes: int) -> str:
+def _format_at_least(number_of_bytes: int) -> str:
     """Return at least this number of bytes as text, so that who sets just what it says has enough."""
-    number = min(number_of_bytes, int(MAX_TOLD))
+    number = min(number_of_bytes, int(MAX_FORMATTED))
     size, unit = next(((int(size), unit) for size, unit in UNITS if number >= size), (1, "bytes"))
     part = 1 if number >= 10 * size or size == 1 else 10
     return f"{-(-number * part // size) / part:g} {unit}"
@@ -93,8 +93,9 @@ def _widest(config: Config) -> float:
     if width < least:
         needed = _window_bytes(_as_wide(config, step * -(-least // step)))
         raise ConfigError(
-            f"max_memory {told(config.max_memory or 0)}: a window that holds the view needs {_enough(needed)}; "
-            "allow more, or set a smaller max_range or larger cells"
+            f"max_memory {format_bytes(config.max_memory or 0)}: "
+            f"a window that holds the view needs {_format_at_least(needed)}; allow more, or set a smaller max_range or "
+            "larger cells"
         )
     return width
 
@@ -125,8 +126,8 @@ def _check(config: Config, most: int, cure: str) -> None:
     if needed > most:
         size = " x ".join(f"{x:g}" for x in config.window.largest or config.window.size)
         raise ConfigError(
-            f"window of {size} m in cells of {config.voxel_size:g} m needs {told(needed)} of memory, "
-            f"more than {told(most)}; {cure}"
+            f"window of {size} m in cells of {config.voxel_size:g} m needs {format_bytes(needed)} of memory, "
+            f"more than {format_bytes(most)}; {cure}"
         )
 
 

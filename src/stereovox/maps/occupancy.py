@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A finished 2-D map as plain numbers: what map_server serves, AMCL localises in, and two maps are compared as."""
+"""A finished 2-D map as plain numbers, as map_server serves it, AMCL localises in it and comparisons take it."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from stereovox import se2
 from stereovox.maps.cell_format import CellRules, State
+from stereovox.maps.queries import points_of, shape_error
 
 UNKNOWN = -1
 
@@ -19,11 +20,16 @@ UNKNOWN = -1
 class OccupancyGrid:
     """A picture of a floor, in the meaning of `nav_msgs/OccupancyGrid`.
 
-    cells: (rows, columns) int8, probability of being occupied in per cent (0 to 100), -1 unknown. Row 0 is the lowest
-        y, column 0 the lowest x.
-    resolution: side of a cell in metres.
-    origin: (3,) x, y, yaw of the lower left corner of cell (0, 0) in the map's frame.
-    free_below, occupied_above: probabilities below and above which a known cell counts as free, and as occupied.
+    Attributes:
+        cells: (rows, columns) int8, probability of being occupied in per cent (0 to 100), -1 unknown. Row 0 is the
+            lowest y, column 0 the lowest x.
+        resolution: Side of a cell in metres.
+        origin: (3,) x, y in metres and yaw in radians of the lower left corner of cell (0, 0) in the map's frame.
+        free_below: Probability below which a known cell counts as free.
+        occupied_above: Probability above which a known cell counts as occupied.
+
+    Raises:
+        StereovoxError: `cells` or `origin` is of another shape.
     """
 
     cells: NDArray[np.int8]
@@ -31,6 +37,12 @@ class OccupancyGrid:
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     free_below: float = 0.3
     occupied_above: float = 0.7
+
+    def __post_init__(self) -> None:
+        if np.ndim(self.cells) != 2:
+            raise shape_error("cells", self.cells, "(rows, columns) int8, per cent")
+        if np.shape(self.origin) != (3,):
+            raise shape_error("origin", self.origin, "(3,): x, y in metres and yaw in radians")
 
     @property
     def states(self) -> NDArray[np.uint8]:
@@ -59,18 +71,41 @@ class OccupancyGrid:
         return np.array([(x, y) for x in (columns.start, columns.stop) for y in (rows.start, rows.stop)], float)
 
     def indices(self, points: ArrayLike) -> NDArray[np.int64]:
-        """Return the (N, 2) row and column of the cells that hold (N, 2) points x, y; may lie outside."""
-        local = se2.transform(se2.inverse(self.origin), points)
+        """Return which cells hold points.
+
+        Args:
+            points: (N, 2) x, y in metres, the map's frame.
+
+        Returns:
+            Row and column (N, 2) int64; they may lie outside the picture.
+
+        Raises:
+            StereovoxError: `points` is of another shape.
+        """
+        local = se2.transform(se2.inverse(self.origin), points_of(points, axes=2))
         return np.floor(local[:, ::-1] / self.resolution).astype(np.int64)
 
     def centres(self, rows: ArrayLike, columns: ArrayLike) -> NDArray[np.float64]:
-        """Return the (N, 2) x, y of the middles of cells."""
+        """Return the centres of cells.
+
+        Args:
+            rows: (N,)
+            columns: (N,)
+
+        Returns:
+            (N, 2) x, y in metres, the map's frame.
+
+        Raises:
+            StereovoxError: There are not as many rows as columns, or they are of another shape.
+        """
+        if np.shape(rows) != np.shape(columns) or np.ndim(rows) > 1:
+            raise shape_error("rows", rows, f"(N,), as many as columns, which are {np.shape(columns)}")
         local = (np.column_stack([columns, rows]) + 0.5) * self.resolution
         return se2.transform(self.origin, local)
 
 
 class Percent:
-    """What numbers that are stored by `rules` mean.
+    """Stored numbers as per cent, by `rules`.
 
     A cell is of the same state as a number and in per cent, for which rounding gives way. The surest cells that the
     rules allow are 0 and 100 per cent, since many programs take nothing less for occupied.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What planners ask a map: cells at points, rays, boxes, capsules, the nearest obstacle; one kernel call a batch.
+"""Queries of planners: cells at points, rays, boxes, capsules, the nearest obstacle; one kernel call a batch.
 
 `VoxelMap` offers them as methods.
 """
@@ -24,7 +24,7 @@ INDEX_LIMIT = 2**30
 NO_CELL = -(2**31)
 """Stands on all three axes where no cell was found."""
 BADNESS = (State.FREE, State.UNKNOWN, State.TENTATIVE, State.OCCUPIED)
-"""States as a planner fears them, the best first."""
+"""States from best to worst for a planner."""
 
 
 class Asked(NamedTuple):
@@ -60,16 +60,25 @@ class NearestCells(NamedTuple):
     cell: NDArray[np.int32]
 
 
-def points_of(values: ArrayLike, name: str = "points") -> NDArray[np.float32] | NDArray[np.float64]:
-    """Return places (N, 3), float32 if they are, else float64; one place (3,) is a batch of one, [] one of none.
+def points_of(
+    values: ArrayLike, name: str = "points", axes: int = 3, wanted: str = ""
+) -> NDArray[np.float32] | NDArray[np.float64]:
+    """Return places (N, axes), float32 if they are, else float64; one place (axes,) is a batch of one, [] one of none.
 
-    Raises StereovoxError for any other shape and for what is no number; NaN and infinity are numbers.
+    wanted: what the caller takes, for the message. Raises StereovoxError for any other shape and for what is no number;
+    NaN and infinity are numbers.
     """
-    numbers = _numbers(values, name, "numbers of shape (N, 3)")
-    if numbers.shape not in {(0,), (3,)} and (numbers.ndim != 2 or numbers.shape[1] != 3):
-        raise StereovoxError(f"{name}: shape {numbers.shape} is not (N, 3), or (3,) for one")
-    numbers = numbers.reshape(-1, 3)
+    numbers = _numbers(values, name, f"numbers of shape (N, {axes})")
+    if numbers.shape not in {(0,), (axes,)} and (numbers.ndim != 2 or numbers.shape[1] != axes):
+        raise shape_error(name, numbers, wanted or f"(N, {axes}) metres, or ({axes},) for one")
+    numbers = numbers.reshape(-1, axes)
     return numbers if numbers.dtype == np.float32 else numbers.astype(float, copy=False)
+
+
+def shape_error(name: str, given: ArrayLike, wanted: str) -> StereovoxError:
+    """Return the error that names the shape and dtype of `given`, and what to give instead."""
+    numbers, verb = np.asarray(given), "are" if name.endswith("s") and name != "radius" else "is"
+    return StereovoxError(f"{name} {verb} {numbers.shape} {numbers.dtype}; give {wanted}")
 
 
 def stored_at(
@@ -136,7 +145,7 @@ def state_bits(states: Iterable[State], name: str) -> NDArray[np.uint8]:
         wanted = set()
     if not wanted or not wanted <= set(BADNESS[1:]):
         raise StereovoxError(
-            f"{name}: give one or more of State.UNKNOWN, State.TENTATIVE and State.OCCUPIED, not {_told(states)}"
+            f"{name}: give one or more of State.UNKNOWN, State.TENTATIVE and State.OCCUPIED, not {_shortened(states)}"
         )
     return np.bitwise_or.reduce(_each(wanted)).reshape(1)
 
@@ -160,11 +169,11 @@ def _numbers(values: ArrayLike, name: str, wanted: str) -> NDArray:
     except (TypeError, ValueError):  # lists of unequal lengths
         numbers = None
     if numbers is None or numbers.dtype.kind not in "biuf":
-        raise StereovoxError(f"{name}: {_told(values)} is not {wanted}")
+        raise StereovoxError(f"{name}: {_shortened(values)} is not {wanted}")
     return numbers
 
 
-def _told(values: object) -> str:
+def _shortened(values: object) -> str:
     return " ".join(shortened(values).split())
 
 
@@ -180,7 +189,7 @@ def _lengths(values: ArrayLike, name: str) -> NDArray[np.float64]:
     """Return (N,) lengths of 0 or more, infinity allowed; a single number is a batch of one."""
     lengths = np.array(_numbers(values, name, "a length in metres"), float, ndmin=1)
     if lengths.ndim != 1:
-        raise StereovoxError(f"{name}: shape {lengths.shape} is not (N,)")
+        raise shape_error(name, lengths, "(N,) metres, or one number for all")
     if not (lengths >= 0).all():
         raise StereovoxError(f"{name}: {lengths[~(lengths >= 0)][0]:g} is not a length of 0 m or more")
     return lengths

@@ -20,37 +20,38 @@ from stereovox.maps.cell_pool import CellPool
 from stereovox.maps.cell_times import NEVER, CellTimes
 from stereovox.maps.evidence import Evidence
 from stereovox.maps.memory import window_blocks, within_memory
+from stereovox.maps.queries import INDEX_LIMIT
+from stereovox.maps.storage import Blocks, Storage
 from stereovox.maps.tiles import BLOCKS, INNER, TILE, Tile, TileStore, blocks_of, slabs_of
-from stereovox.maps.voxel_map import INDEX_LIMIT, VoxelMap
+from stereovox.maps.voxel_map import VoxelMap
 from stereovox.maps.window import Box, Window, coarser, without
 
 TIMES = CellFormat(np.dtype(np.uint32), NEVER, 1.0)
 """How tiles hold the times of cells."""
 
 
-class RollingMap(VoxelMap):
-    """A map whose cells are updated only within a window (Chien 2020, 3.6: map shifting).
+class RollingStorage(Storage):
+    """The blocks of a window that moves with the camera, and tiles on disk for what left it; see `RollingMap`.
 
-    With `window.outside = "drop"` cells that leave become unknown; with "keep" they go to tiles on disk (`tiles`: the
-    folder, a temporary one by default) and come back with the window. All memory of the window is taken at the start:
-    `memory_bytes` never changes. Up to `tiles.WAITING` tiles that wait for the disk come on top, and the map that
-    another run left until the first frame places the window. Whoever asks for a cell is answered wherever it lies;
-    cells in tiles are read from the disk, which is slow. `close` removes the tiles.
+    All memory of the window is taken at the start: `memory_bytes` never changes. Up to `tiles.WAITING` tiles that wait
+    for the disk come on top, and the map that another run left until the first frame places the window.
     """
+
+    bounded = True
 
     def __init__(self, config: Config, tiles: Path | None = None):
         super().__init__(config)
         self._settings = within_memory(config)  # those of the window; `config` may leave it to the memory
         self._window = Window(self._settings)
         capacity = window_blocks(self._settings)
-        self._pool = CellPool(self._rules, capacity, capacity)
+        self._pool = CellPool(self.rules, capacity, capacity)
         self._times = CellTimes(config.map, capacity) if config.map.keep_times else None
-        self._earlier: VoxelMap | None = None
+        self._earlier: Storage | None = None
         self._store = self._times_store = None
         self._turned: list[int] = []  # stamps between which the clock was set back
         self._since: dict[Tile, int] = {}  # how many of them there were when a tile was put to the disk
         if self._settings.window.outside == "keep":  # last: they leave folders
-            self._store = TileStore(self._format, tiles)
+            self._store = TileStore(self.cell_format, tiles)
             self._times_store = self._store_of_times(self._store.folder / INNER)
 
     @property
@@ -64,7 +65,7 @@ class RollingMap(VoxelMap):
         return self.reserved_bytes
 
     @property
-    def store(self) -> TileStore | None:
+    def tile_store(self) -> TileStore | None:
         """Where cells outside the window are kept, if they are."""
         return self._store
 
@@ -73,7 +74,7 @@ class RollingMap(VoxelMap):
         """What kernels that only read need: the window, or the map made before until it is placed."""
         return super().stored_cells if self._earlier is None else self._earlier.stored_cells
 
-    def go_on_with(self, earlier: VoxelMap) -> None:
+    def go_on_with(self, earlier: Storage) -> None:
         """Start from the cells of a map made before; they enter when the window is placed, and are the map till then.
 
         A window with the same settings goes on where it was; any other is placed by the first frame.
@@ -91,13 +92,6 @@ class RollingMap(VoxelMap):
             self.window_state = earlier.window_state
             self._take_over()
             self._rehearse()
-
-    def with_config(self, config: Config) -> VoxelMap:
-        """Return an unbounded map of all cells, with the settings of a run that goes on with it.
-
-        Raises ConfigError when they would change what its cells mean.
-        """
-        return self.unbounded(config)
 
     def look_from(self, viewpoint: Viewpoint) -> None:
         """Remember where the camera stands and move the window after it.
@@ -148,7 +142,7 @@ class RollingMap(VoxelMap):
             if store is not None:
                 store.close()
 
-    def _slabs(self) -> Iterator[tuple[NDArray[np.int32], NDArray[np.integer]]]:
+    def _slabs(self) -> Iterator[Blocks]:
         """Yield all blocks, those on disk with them, piece by piece in ascending order."""
         if self._earlier is not None:  # no frame has placed the window so far
             yield from self._earlier.slabs()
@@ -166,17 +160,18 @@ class RollingMap(VoxelMap):
         if empty:
             yield from super()._slabs()
 
-    def _tile(self, tile: Tile) -> tuple[NDArray[np.int32], NDArray[np.integer]]:
+    def _tile(self, tile: Tile) -> Blocks:
         """Return the blocks of a tile, wherever it is now."""
         coords, cells = self._pool.get(blocks_of(tile))
         if len(coords) or self._store is None or tile not in self._store or self._in_window(tile):
             return coords, cells
         return self._kept(tile)[:2]
 
-    def _stored_at(self, points: NDArray[np.floating]) -> NDArray[np.integer]:
+    def stored_at(self, points: NDArray[np.floating]) -> NDArray[np.integer]:
+        """Return the stored numbers (N,) of the cells at points (N, 3), wherever they are kept."""
         if self._earlier is not None:
-            return self._earlier._stored_at(points)
-        stored = super()._stored_at(points)
+            return self._earlier.stored_at(points)
+        stored = super().stored_at(points)
         if self._store is not None:
             self._look_into_tiles(points, stored)
         return stored
@@ -185,7 +180,7 @@ class RollingMap(VoxelMap):
         """Set what the window does not know and a tile does, tile by tile."""
         assert self._store is not None
         within = (np.abs(points) < INDEX_LIMIT * np.array(self.config.cell)).all(axis=1)  # False for NaN
-        asked = np.flatnonzero(within & (stored == self._format.unknown))
+        asked = np.flatnonzero(within & (stored == self.cell_format.unknown))
         if not len(asked):
             return
         cells = np.floor(points[asked] / self.config.cell).astype(np.int64)
@@ -196,7 +191,7 @@ class RollingMap(VoxelMap):
                 found = self._store.stored_at(tile, cells[group])
                 if self._times_store is not None:
                     over = self._over(tile, self._times_store.stored_at(tile, cells[group]))
-                    found = np.where(over, self._format.unknown, found)
+                    found = np.where(over, self.cell_format.unknown, found)
                 stored[asked[group]] = found
 
     def _in_window(self, tile: Tile) -> bool:
@@ -236,7 +231,7 @@ class RollingMap(VoxelMap):
             low = self._window.box[0]
             self._drop((low, low), self._window.box)
             return
-        nowhere, nothing = np.empty((0, 3), np.int32), np.empty((0, CELLS), self._format.dtype)
+        nowhere, nothing = np.empty((0, 3), np.int32), np.empty((0, CELLS), self.cell_format.dtype)
         self._pool.get(nowhere)
         self._pool.remove(nowhere)
         self.insert(nowhere, nothing)
@@ -245,7 +240,7 @@ class RollingMap(VoxelMap):
 
     def _drop(self, slab: Box, now: Box) -> None:
         low, high, *window = (np.array(corner, np.int32) for corner in (*slab, *now))
-        _window.vacate(*self._pool.arrays, np.int16(self._format.unknown), self._rules.lowest, low, high, *window)
+        _window.vacate(*self._pool.arrays, np.int16(self.cell_format.unknown), self.rules.lowest, low, high, *window)
         if self._times is not None:
             self._times.follow(self._pool, low, high)
 
@@ -282,8 +277,8 @@ class RollingMap(VoxelMap):
             return coords, cells, None
         times = self._times_store.blocks_at(tile, coords)
         over = self._over(tile, times)
-        cells, times = np.where(over, cells.dtype.type(self._format.unknown), cells), np.where(over, NEVER, times)
-        left = (cells != self._format.unknown).any(axis=1)
+        cells, times = np.where(over, cells.dtype.type(self.cell_format.unknown), cells), np.where(over, NEVER, times)
+        left = (cells != self.cell_format.unknown).any(axis=1)
         return coords[left], cells[left], times[left]
 
     def _note_time(self, before_ns: int, now_ns: int) -> None:
@@ -342,6 +337,26 @@ class RollingMap(VoxelMap):
         around = tuple(tuple(SIDE * x for x in corner) for corner in blocks)
         for slab in without(around, self._window.box):  # pyright: ignore
             self._drop(slab, self._window.box)
+
+
+class RollingMap(VoxelMap):
+    """A map whose cells are updated only within a window (Chien 2020, 3.6: map shifting).
+
+    With `window.outside = "drop"` cells that leave become unknown; with "keep" they go to tiles on disk (`tiles`: the
+    folder, a temporary one by default) and come back with the window. All memory of the window is taken at the start:
+    `memory_bytes` never changes. Queries are answered wherever a cell lies; cells in tiles are read from the disk,
+    which is slow. `close` removes the tiles.
+    """
+
+    storage: RollingStorage  # pyright: ignore[reportIncompatibleVariableOverride] - set once
+
+    def __init__(self, config: Config, tiles: Path | None = None):
+        super().__init__(config, storage=RollingStorage(config, tiles))
+
+    @property
+    def window(self) -> NDArray[np.float64] | None:
+        """Lowest and highest corner (2, 3) of the window in metres, None before the first frame."""
+        return self.storage.window
 
 
 def _window_of(config: Config) -> WindowConfig:

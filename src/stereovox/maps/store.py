@@ -3,11 +3,11 @@
 
 Zarr writes are not transactional, so each save goes to a folder of its own and becomes the map when the manifest
 that names it is renamed into place; only then is the older save removed. Each step waits until the disk has it: a save
-that is killed, or that a power cut ends, leaves the older map whole. What it leaves beside it, the next one removes.
+that is killed, or that a power cut ends, leaves the older map whole. The next save removes what it left.
 
-The arrays of a saved map, read as `store` writes them and in no other way.
-Zarr would follow whatever a stranger's folder says: any packing, any shape, arrays of arrays, links to elsewhere. Here
-all of it is checked before Zarr sees the folder, and nothing is allocated for what is not there.
+Arrays are read as they are written here and in no other form. Zarr would follow whatever a stranger's folder says: any
+packing, any shape, arrays of arrays, links to elsewhere. So all of it is checked before Zarr sees the folder, and
+nothing is allocated for what is not there.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,9 +34,10 @@ from stereovox.config import Config, load_config
 from stereovox.errors import MapFileError
 from stereovox.frame import Viewpoint
 from stereovox.maps.blocks import CELLS, SIDE
-from stereovox.maps.cell_format import FORMATS, CellFormat
+from stereovox.maps.cell_format import FORMATS
 from stereovox.maps.lock import LOCK, only_writer_in
 from stereovox.maps.queries import INDEX_LIMIT
+from stereovox.maps.storage import Storage
 from stereovox.safe_io import count_in, json_value, read_bounded, sync_folder, sync_tree
 from stereovox.trust.history import History
 
@@ -48,110 +49,6 @@ SMALL, PACKED_BEST = 1 << 24, 100
 """Coordinates may unpack to so many bytes, or to so many for each of theirs on disk."""
 BYTES, LITTLE = {"name": "bytes"}, {"name": "bytes", "configuration": {"endian": "little"}}
 ZSTD = b"\x28\xb5\x2f\xfd"
-
-
-def read_blocks(folder: Path, blocks: int, *dtypes: np.dtype[Any]) -> tuple[NDArray[Any], ...]:
-    """Return coordinates (n, 3) int32 and what is kept of each cell (n, 512) of all blocks; no block is named twice.
-
-    dtypes: those of the cells, and of their times where there are any. They are read last: their room is that of
-    coordinates which are really there.
-    Raises ValueError, one line, where the folder is not just what `store` writes, and OSError.
-    """
-    sizes = dict(_files(folder))
-    if not 0 <= blocks * 3 * 4 <= max(SMALL, PACKED_BEST * sum(sizes.values())):
-        raise ValueError(f"{blocks} blocks where there are {sum(sizes.values())} bytes")
-    coords = _read_array(folder, "coords", (blocks, 3), np.dtype(np.int32), sizes)
-    _check_coords(coords)
-    kept = zip(ARRAYS[1:], dtypes, strict=False)
-    return coords, *(_read_array(folder, name, (blocks, CELLS), dtype, sizes) for name, dtype in kept)
-
-
-def _files(folder: Path) -> Iterator[tuple[str, int]]:
-    """Yield path below `folder` and bytes of all files; raises ValueError for links and what is no file."""
-    if folder.is_symlink():
-        raise ValueError(f"{folder.name} is a link")
-    for above, folders, names in os.walk(folder):
-        for name in (*folders, *names):
-            status = os.lstat(os.path.join(above, name))
-            if name in names and stat.S_ISREG(status.st_mode):
-                yield os.path.relpath(os.path.join(above, name), folder), status.st_size
-            elif not stat.S_ISDIR(status.st_mode):
-                raise ValueError(f"{name} is a link or no file")
-
-
-def _read_array(
-    folder: Path, name: str, shape: tuple[int, int], dtype: np.dtype[Any], sizes: dict[str, int]
-) -> NDArray[Any]:
-    import zarr
-
-    rows = _rows_a_chunk(json_value(read_bounded(folder / name / "zarr.json")), name, shape, dtype)
-    for number in range(-(-shape[0] // rows)):
-        place = os.path.join(name, "c", str(number), "0")
-        if place in sizes:
-            _check_chunk(folder / place, sizes[place], rows * shape[1] * dtype.itemsize)
-    array = zarr.open_array(folder / name, mode="r", zarr_format=3)
-    return np.asarray(array[:])
-
-
-def _rows_a_chunk(told: Any, name: str, shape: tuple[int, int], dtype: np.dtype[Any]) -> int:
-    """Return the rows of a chunk; raises ValueError for an array that `store` would not write."""
-    rows, width = told["chunk_grid"]["configuration"]["chunk_shape"]
-    if told["shape"] != list(shape) or told["data_type"] != dtype.name:
-        raise ValueError(f"array of {told['shape']} {told['data_type']} where {list(shape)} {dtype} belongs")
-    if type(rows) is not int or not 0 < rows * width * dtype.itemsize <= MAX_CHUNK or width != shape[1]:
-        raise ValueError(f"{name}: chunks of {rows} x {width}")
-    order = BYTES if dtype.itemsize == 1 else LITTLE
-    _, packing = told["codecs"]
-    wanted = {
-        "node_type": "array",
-        "zarr_format": 3,
-        "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": [rows, width]}},
-        "chunk_key_encoding": {"name": "default", "configuration": {"separator": "/"}},
-        "codecs": [order, {"name": "zstd", "configuration": packing["configuration"]}],
-        "storage_transformers": [],
-    }
-    for key, value in wanted.items():
-        if told.get(key, []) != value:
-            raise ValueError(f"{name}: {key} {told.get(key)} is not what stereovox writes")
-    if type(told["fill_value"]) is not int:
-        raise ValueError(f"{name}: fill_value {told['fill_value']}")
-    return rows
-
-
-def _check_chunk(path: Path, size: int, unpacked: int) -> None:
-    """Raise ValueError for a chunk that does not say that it unpacks to just so many bytes."""
-    with path.open("rb") as file:
-        head = file.read(18)
-    if len(head) < 6 or head[:4] != ZSTD or _announced(head) != unpacked or size > 2 * unpacked + 64:
-        raise ValueError(f"chunk {path.parent.name} of {path.parents[2].name} does not unpack to {unpacked} bytes")
-
-
-def _announced(head: bytes) -> int | None:
-    """Return the size that a zstd frame says it unpacks to (RFC 8878, 3.1.1); None where it says nothing."""
-    flags = head[4]
-    alone, dictionary, length = flags >> 5 & 1, (0, 1, 2, 4)[flags & 3], (0, 2, 4, 8)[flags >> 6]
-    length = length or alone
-    start = 5 + (1 - alone) + dictionary
-    told = int.from_bytes(head[start : start + length], "little")
-    return (told + 256 if length == 2 else told) if length and len(head) >= start + length else None
-
-
-def _check_coords(coords: NDArray[np.int32]) -> None:
-    """Raise ValueError for a block that is named twice or lies farther away than cells can."""
-    if (np.abs(coords.astype(np.int64)) >= INDEX_LIMIT // SIDE).any():
-        raise ValueError("a block that lies too far away")
-    if _ascend(coords):
-        return
-    if not _ascend(coords[np.lexsort(coords.T[::-1])]):
-        raise ValueError("a block that is named twice")
-
-
-def _ascend(coords: NDArray[np.int32]) -> bool:
-    """Tell whether each block stands behind the one before: by x, then y, then z."""
-    steps = np.sign(np.diff(coords.astype(np.int64), axis=0)) @ [4, 2, 1]
-    return bool((steps > 0).all())
-
-
 FORMAT = "stereovox-map"
 VERSION, READABLE = 2, (1, 2)
 MANIFEST = "manifest.json"
@@ -159,36 +56,9 @@ MAX_MANIFEST = 1 << 22
 """Bytes of a manifest."""
 BLOCKS_PER_CHUNK = 4096
 UNFINISHED = re.compile(r"cells-[0-9a-f]{12}|\.manifest\.json\.new|\.lock")
-"""What a save that was killed leaves."""
+"""Names of what a killed save leaves."""
 Slab = tuple[NDArray, ...]
 """Block coordinates (n, 3), cells (n, 512), and times (n, 512) where they are kept."""
-
-
-class Saveable(Protocol):
-    """What a map must offer to be saved; see `VoxelMap` for what each is."""
-
-    config: Config
-    history: History
-    viewpoint: Viewpoint | None
-    window_state: dict[str, Any] | None
-
-    @property
-    def cell_format(self) -> CellFormat:
-        """How cells are stored."""
-        ...
-
-    @property
-    def times_start_ns(self) -> int | None:
-        """The stamp that times of cells count from."""
-        ...
-
-    def slabs(self) -> Iterator[Slab]:
-        """Yield block coordinates and cells, in ascending order."""
-        ...
-
-    def timed(self) -> Iterator[Slab]:
-        """Yield block coordinates, cells and their times."""
-        ...
 
 
 class SavedMap(NamedTuple):
@@ -204,8 +74,8 @@ class SavedMap(NamedTuple):
     times_start_ns: int | None
 
 
-def save_map(voxel_map: Saveable, path: str | Path) -> None:
-    """Write `voxel_map` to the folder `path`, so that the disk holds all of it when this returns.
+def save_map(storage: Storage, path: str | Path) -> None:
+    """Write a map to the folder `path`, so that the disk holds all of it when this returns.
 
     Raises MapFileError when it cannot be written, is no map, or is being written by another run; an older map is then
     as it was.
@@ -216,9 +86,9 @@ def save_map(voxel_map: Saveable, path: str | Path) -> None:
     with only_writer_in(folder):
         sweep(folder)
         try:
-            blocks, checksum = _write_arrays(folder / data, voxel_map)
+            blocks, checksum = _write_arrays(folder / data, storage)
             sync_tree(folder / data)
-            _write_manifest(folder, _manifest(voxel_map, data, blocks, checksum))
+            _write_manifest(folder, _manifest(storage, data, blocks, checksum))
         except BaseException as error:
             _let_writes_end()
             if _named(folder) != data:  # else it is the map already, whatever the disk says
@@ -287,6 +157,108 @@ def _read(folder: Path, manifest: dict[str, Any]) -> SavedMap:
     return SavedMap(config, history, viewpoint, window, coords, cells, times[0] if times else None, start_ns)
 
 
+def read_blocks(folder: Path, blocks: int, *dtypes: np.dtype[Any]) -> tuple[NDArray[Any], ...]:
+    """Return coordinates (n, 3) int32 and what is kept of each cell (n, 512) of all blocks; no block is named twice.
+
+    dtypes: those of the cells, and of their times where there are any. They are read last: their room is that of
+    coordinates which are really there.
+    Raises ValueError, one line, where the folder is not just what `store` writes, and OSError.
+    """
+    sizes = dict(_files(folder))
+    if not 0 <= blocks * 3 * 4 <= max(SMALL, PACKED_BEST * sum(sizes.values())):
+        raise ValueError(f"{blocks} blocks where there are {sum(sizes.values())} bytes")
+    coords = _read_array(folder, "coords", (blocks, 3), np.dtype(np.int32), sizes)
+    _check_coords(coords)
+    kept = zip(ARRAYS[1:], dtypes, strict=False)
+    return coords, *(_read_array(folder, name, (blocks, CELLS), dtype, sizes) for name, dtype in kept)
+
+
+def _files(folder: Path) -> Iterator[tuple[str, int]]:
+    """Yield path below `folder` and bytes of all files; raises ValueError for links and what is no file."""
+    if folder.is_symlink():
+        raise ValueError(f"{folder.name} is a link")
+    for above, folders, names in os.walk(folder):
+        for name in (*folders, *names):
+            status = os.lstat(os.path.join(above, name))
+            if name in names and stat.S_ISREG(status.st_mode):
+                yield os.path.relpath(os.path.join(above, name), folder), status.st_size
+            elif not stat.S_ISDIR(status.st_mode):
+                raise ValueError(f"{name} is a link or no file")
+
+
+def _read_array(
+    folder: Path, name: str, shape: tuple[int, int], dtype: np.dtype[Any], sizes: dict[str, int]
+) -> NDArray[Any]:
+    import zarr
+
+    rows = _rows_per_chunk(json_value(read_bounded(folder / name / "zarr.json")), name, shape, dtype)
+    for number in range(-(-shape[0] // rows)):
+        place = os.path.join(name, "c", str(number), "0")
+        if place in sizes:
+            _check_chunk(folder / place, sizes[place], rows * shape[1] * dtype.itemsize)
+    array = zarr.open_array(folder / name, mode="r", zarr_format=3)
+    return np.asarray(array[:])
+
+
+def _rows_per_chunk(header: Any, name: str, shape: tuple[int, int], dtype: np.dtype[Any]) -> int:
+    """Return the rows of a chunk; raises ValueError for an array that `store` would not write."""
+    rows, width = header["chunk_grid"]["configuration"]["chunk_shape"]
+    if header["shape"] != list(shape) or header["data_type"] != dtype.name:
+        raise ValueError(f"array of {header['shape']} {header['data_type']} where {list(shape)} {dtype} belongs")
+    if type(rows) is not int or not 0 < rows * width * dtype.itemsize <= MAX_CHUNK or width != shape[1]:
+        raise ValueError(f"{name}: chunks of {rows} x {width}")
+    order = BYTES if dtype.itemsize == 1 else LITTLE
+    _, packing = header["codecs"]
+    wanted = {
+        "node_type": "array",
+        "zarr_format": 3,
+        "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": [rows, width]}},
+        "chunk_key_encoding": {"name": "default", "configuration": {"separator": "/"}},
+        "codecs": [order, {"name": "zstd", "configuration": packing["configuration"]}],
+        "storage_transformers": [],
+    }
+    for key, value in wanted.items():
+        if header.get(key, []) != value:
+            raise ValueError(f"{name}: {key} {header.get(key)} is not what stereovox writes")
+    if type(header["fill_value"]) is not int:
+        raise ValueError(f"{name}: fill_value {header['fill_value']}")
+    return rows
+
+
+def _check_chunk(path: Path, size: int, unpacked: int) -> None:
+    """Raise ValueError for a chunk that does not say that it unpacks to just so many bytes."""
+    with path.open("rb") as file:
+        head = file.read(18)
+    if len(head) < 6 or head[:4] != ZSTD or _announced(head) != unpacked or size > 2 * unpacked + 64:
+        raise ValueError(f"chunk {path.parent.name} of {path.parents[2].name} does not unpack to {unpacked} bytes")
+
+
+def _announced(head: bytes) -> int | None:
+    """Return the size that a zstd frame says it unpacks to (RFC 8878, 3.1.1); None where it says nothing."""
+    flags = head[4]
+    alone, dictionary, length = flags >> 5 & 1, (0, 1, 2, 4)[flags & 3], (0, 2, 4, 8)[flags >> 6]
+    length = length or alone
+    start = 5 + (1 - alone) + dictionary
+    size = int.from_bytes(head[start : start + length], "little")
+    return (size + 256 if length == 2 else size) if length and len(head) >= start + length else None
+
+
+def _check_coords(coords: NDArray[np.int32]) -> None:
+    """Raise ValueError for a block that is named twice or lies farther away than cells can."""
+    if (np.abs(coords.astype(np.int64)) >= INDEX_LIMIT // SIDE).any():
+        raise ValueError("a block that lies too far away")
+    if _ascend(coords):
+        return
+    if not _ascend(coords[np.lexsort(coords.T[::-1])]):
+        raise ValueError("a block that is named twice")
+
+
+def _ascend(coords: NDArray[np.int32]) -> bool:
+    """Tell whether each block stands behind the one before: by x, then y, then z."""
+    steps = np.sign(np.diff(coords.astype(np.int64), axis=0)) @ [4, 2, 1]
+    return bool((steps > 0).all())
+
+
 def is_map(path: str | Path) -> bool:
     """Tell whether a folder holds a saved map."""
     return (Path(path) / MANIFEST).is_file()
@@ -319,16 +291,16 @@ def read_manifest(folder: Path) -> dict[str, Any]:
 
 
 def _is_free(folder: Path) -> bool:
-    """Tell whether a folder holds nothing but what a save left that was killed."""
+    """Tell whether a folder holds nothing but what a killed save left."""
     return folder.is_dir() and all(UNFINISHED.fullmatch(entry.name) for entry in folder.iterdir())
 
 
 def sweep(folder: Path) -> None:
-    """Remove what saves left that were killed or failed: all that the manifest does not name. The lock must be held."""
+    """Remove what killed or failed saves left: all that the manifest does not name. The lock must be held."""
     named = _named(folder)
     if named is None and is_map(folder):
         return  # a damaged map stays as it is
-    with suppress(OSError):  # what cannot be removed is in nobody's way
+    with suppress(OSError):  # what cannot be removed does no harm
         for entry in folder.iterdir():
             if UNFINISHED.fullmatch(entry.name) and entry.name not in (named, LOCK):
                 shutil.rmtree(entry, ignore_errors=True) if entry.is_dir() else entry.unlink()
@@ -351,18 +323,18 @@ def _named(folder: Path) -> Any:
     return None
 
 
-def _manifest(voxel_map: Saveable, data: str, blocks: int, checksum: list[int]) -> dict[str, Any]:
+def _manifest(storage: Storage, data: str, blocks: int, checksum: list[int]) -> dict[str, Any]:
     return {
         "format": FORMAT,
         "version": VERSION,
-        **voxel_map.history.saved(),
+        **storage.history.saved(),
         "blocks": blocks,
         "data": data,
         "checksum": checksum,
-        "viewpoint": _viewpoint_to(voxel_map.viewpoint),
-        "window": voxel_map.window_state,
-        "times_start_ns": voxel_map.times_start_ns,
-        "config": voxel_map.config.model_dump(),
+        "viewpoint": _viewpoint_to(storage.viewpoint),
+        "window": storage.window_state,
+        "times_start_ns": storage.times_start_ns,
+        "config": storage.config.model_dump(),
     }
 
 
@@ -414,16 +386,16 @@ def _as_number(number: Any) -> Any:
     return number.item()
 
 
-def _write_arrays(folder: Path, voxel_map: Saveable) -> tuple[int, list[int]]:
+def _write_arrays(folder: Path, storage: Storage) -> tuple[int, list[int]]:
     """Write all blocks, piece by piece; return their number and the checksum of each array."""
     import zarr
 
     group = zarr.open_group(folder, mode="w", zarr_format=3)
     arrays, checksums = None, []
-    slabs = voxel_map.timed() if voxel_map.config.map.keep_times else voxel_map.slabs()
+    slabs = storage.timed() if storage.config.map.keep_times else storage.slabs()
     for slab in _whole_chunks(slabs):
         if arrays is None:
-            fills = (0, voxel_map.cell_format.unknown, 0)
+            fills = (0, storage.cell_format.unknown, 0)
             arrays = [_new_array(group, *what) for what in zip(ARRAYS, slab, fills, strict=False)]
             checksums = [0] * len(arrays)
         for n, part in enumerate(slab):

@@ -3,192 +3,193 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stereovox.config import Config
-from stereovox.errors import ConfigError, StereovoxError
 from stereovox.frame import Viewpoint
-from stereovox.maps import _add, queries
-from stereovox.maps.blocks import CELLS, SIDE, StoredCells, blocks_of_cells
-from stereovox.maps.cell_format import CellFormat, CellRules
+from stereovox.maps import queries
+from stereovox.maps.blocks import CELLS, SIDE, blocks_of_cells
 from stereovox.maps.cell_format import State as State
-from stereovox.maps.cell_pool import CellPool
-from stereovox.maps.cell_times import NEVER, CellTimes
-from stereovox.maps.evidence import LARGEST, LOG_ODDS_SCALE, Evidence
-from stereovox.maps.frame_agreement import Agreement, agreement
+from stereovox.maps.cell_times import NEVER
+from stereovox.maps.evidence import Evidence
 from stereovox.maps.queries import INDEX_LIMIT as INDEX_LIMIT
 from stereovox.maps.queries import Asked, NearestCells, RayHits
+from stereovox.maps.storage import OnStorage, Storage
 from stereovox.maps.store import read_map, save_map
-from stereovox.threads import Guarded, MapLock, in_steps
-from stereovox.trust.history import History, WithHistory
+from stereovox.threads import Guarded
 
-EVERYWHERE = np.array([[-(2**30)] * 3, [2**30] * 3])
-"""Lowest block that `VoxelMap.blocks_within` may be asked for, and the first beyond the highest."""
+IN_STORAGE = frozenset({"blocks_within", "insert", "listeners", "slabs", "timed"})
+"""Names of `Storage` that could be reached at the map itself in version 0.1.0, and still can."""
 
 
-class VoxelMap(Guarded, WithHistory):
+class OnBlocks(OnStorage):
+    """Attributes of a voxel map that its storage keeps."""
+
+    @property
+    def viewpoint(self) -> Viewpoint | None:
+        """Where the camera stood last; None before the first frame."""
+        return self.storage.viewpoint
+
+    @viewpoint.setter
+    def viewpoint(self, viewpoint: Viewpoint | None) -> None:
+        self.storage.viewpoint = viewpoint
+
+
+class VoxelMap(Guarded, OnBlocks):
     """A sparse occupancy map in the world frame (z up unless the recording says otherwise).
 
     Cell i covers [i, i + 1) * voxel_size on each axis, or of `config.cell` where its sides differ. A cell without
     evidence is unknown: log-odds 0, probability 0.5. With evidence it is free (p < free_below), occupied
     (p > occupied_above) or tentative between them.
-    `config` holds the settings the map was made with, `history` what it remembers of its frames, `viewpoint` where the
-    camera stood last, `window_state` where its window was, if it had one. `listeners` are called after every `add`
-    with the evidence: no other block has changed, but for those that a window or time took away.
-    Several threads may use a map: each call holds its `lock`. Listeners are called with it held.
+
+    Several threads may use a map: each call holds its `lock`.
+
+    Args:
+        config: The settings.
+        storage: Where its cells are kept; by default in memory, without bounds.
+
+    Attributes:
+        lock: Re-entrant; hold it over several calls that must see the same state.
+        storage: The blocks as they are stored, for programs that read or write whole blocks.
     """
 
-    def __init__(self, config: Config):
-        self.lock = MapLock()
-        self.config = config
-        self.voxel_size = config.voxel_size
-        self.history = History()
-        self.viewpoint: Viewpoint | None = None
-        self.window_state: dict[str, Any] | None = None
-        self.listeners: list[Callable[[Evidence], None]] = []
-        self._rules = CellRules(config.map)
-        self._format = self._rules.format
-        self._most_rise = self._rules.most_rise
-        self._pool = CellPool(self._rules)
-        self._times = CellTimes(config.map) if config.map.keep_times else None
+    storage: Storage
+
+    def __init__(self, config: Config, *, storage: Storage | None = None):
+        self.storage = Storage(config) if storage is None else storage
+        self.lock = self.storage.lock
 
     @classmethod
     def from_cells(cls, config: Config, indices: ArrayLike, log_odds: ArrayLike) -> VoxelMap:
-        """Return a map of these cells: (N, 3) whole cell indices and (N,) log-odds, clamped as `config` says.
+        """Make a map of these cells. A cell named twice keeps its last value.
 
-        A cell named twice keeps its last value; a log-odds of zero is stored as the smallest positive one.
+        Args:
+            config: The settings; log-odds are clamped as they say.
+            indices: (N, 3) whole cell indices.
+            log_odds: (N,); zero is stored as the smallest positive one.
+
+        Returns:
+            The map, of no frames.
+
+        Raises:
+            StereovoxError: The arrays are of other shapes.
         """
         voxel_map = cls(config)
-        indices = np.asarray(indices, np.int64).reshape(-1, 3)
+        rules, unknown = voxel_map.storage.rules, voxel_map.storage.cell_format.unknown
+        indices, log_odds = _cells_of(indices).astype(np.int64, copy=False), np.asarray(log_odds, float)
+        if log_odds.shape not in {(), (len(indices),)}:
+            raise queries.shape_error("log_odds", log_odds, f"({len(indices)},), one for each cell")
         blocks, of_cell = blocks_of_cells(indices)
-        rules, unknown = voxel_map._rules, voxel_map._format.unknown
-        stored = np.clip(voxel_map._format.stored(log_odds), rules.lowest, rules.highest)
+        stored = np.clip(rules.format.stored(log_odds), rules.lowest, rules.highest)
         low = indices & (SIDE - 1)
         column = (low[:, 0] << 6) | (low[:, 1] << 3) | low[:, 2]
-        cells = np.full((len(blocks), CELLS), unknown, voxel_map._format.dtype)
+        cells = np.full((len(blocks), CELLS), unknown, rules.format.dtype)
         cells[of_cell, column] = np.where(stored == unknown, unknown + 1, stored)
-        voxel_map._pool.put(blocks.astype(np.int32), cells)
+        voxel_map.storage.insert(blocks.astype(np.int32), cells)
         return voxel_map
 
-    def with_config(self, config: Config) -> VoxelMap:
-        """Take over the settings of a run that goes on with this map.
-
-        Raises ConfigError when they would change what its cells mean.
-        """
-        self.check_cells(config)
-        self.config = config
-        return self
-
-    def unbounded(self, config: Config) -> VoxelMap:
-        """Return a map without bounds of all cells and what is known of them, with the settings `config`.
-
-        Raises ConfigError when these would change what its cells mean.
-        """
-        self.check_cells(config)
-        return self._copied(config, self.slabs())
-
     def snapshot(self) -> VoxelMap:
-        """Return a copy to look at while this map goes on: of all cells, or of those in the window."""
-        return self._copied(self.config, self._pool.pieces())
+        """Copy the map, to look at while it goes on: all cells, or those in its window.
 
-    def take_history(self, earlier: VoxelMap) -> None:
-        """Take over what `earlier` says of the frames that are in it."""
-        self.history, self.viewpoint = earlier.history.copied(), earlier.viewpoint
-
-    def check_cells(self, config: Config) -> None:
-        """Raise ConfigError when `config` gives cells another meaning: their size or the `map` section."""
-        for name in ("voxel_size", "steps", "map"):
-            old, new = getattr(self.config, name), getattr(config, name)
-            if old != new:
-                raise ConfigError(f"cannot go on: the map was made with {name} {old}, now {new} is wanted")
-
-    def look_from(self, viewpoint: Viewpoint) -> None:
-        """Remember where the camera stands; a bounded map moves with it, cells without evidence for long go."""
-        before, self.viewpoint = self.viewpoint, viewpoint
-        if self._times is not None:
-            self._times.forget(self._pool, (before or viewpoint).stamp_ns, viewpoint.stamp_ns)
-
-    @property
-    def cell_format(self) -> CellFormat:
-        """What the log-odds of a cell are kept in."""
-        return self._format
-
-    @property
-    def stored_cells(self) -> StoredCells:
-        """What kernels that only read need; holds until the map changes."""
-        return self._pool.stored_cells
-
-    def insert(self, coords: NDArray[np.int32], cells: NDArray[np.integer]) -> None:
-        """Set whole blocks: coordinates (n, 3), cells (n, 512) as stored; what stood there before is lost."""
-        cells = np.clip(cells, self._rules.lowest, self._rules.highest)
-        self._pool.put(coords, cells.astype(self._format.dtype, copy=False))
-        if self._times is not None:
-            self._times.remove(coords)
-
-    def check_room(self, evidence: Evidence) -> None:
-        """Raise FrameRefused `memory_full` where `evidence` needs more memory than the map may take."""
-
-    def agreement(self, evidence: Evidence, firm: int) -> Agreement:
-        """Return how far `evidence` agrees with what the map is sure of.
-
-        firm: evidence of a hit, in thousandths, below which noise may have put it there.
+        Returns:
+            A map without bounds, with a lock of its own.
         """
-        return agreement(self.stored_cells, self._rules, evidence, firm)
+        copy = VoxelMap(self.config)
+        copy.storage.fill(self.storage, self.storage.in_memory())
+        return copy
 
     def add(self, evidence: Evidence) -> int:
-        """Add what one frame says; return the number of cells whose value changed."""
-        if not (len(evidence.coords) or len(evidence.uniform)):
-            return 0
-        mine = self._in_my_units(evidence)
-        if self._times is not None:
-            self._times.write(mine, self._now_ns)
-        changed = self._pool.add(mine.coords, mine.values, mine.uniform, mine.uniform_values, self.config.threads)
-        for listener in self.listeners:
-            listener(mine)
-        return changed
+        """Add the evidence of one frame.
+
+        Args:
+            evidence: What an integrator makes of a depth image.
+
+        Returns:
+            The number of cells whose value changed.
+        """
+        return self.storage.add(evidence)
 
     def log_odds(self, points: ArrayLike) -> NDArray[np.float32]:
-        """Return the log-odds (N,) at points (N, 3) in metres, world frame; 0 where unknown or not finite.
+        """Look up log-odds.
 
-        Raises StereovoxError for what is not numbers (N, 3), or (3,) for one.
+        Args:
+            points: (N, 3) in metres, world frame, or (3,) for one.
+
+        Returns:
+            (N,) float32; 0 where unknown or not finite.
+
+        Raises:
+            StereovoxError: `points` is not numbers of such a shape.
         """
-        return self._format.log_odds(self._stored_at(queries.points_of(points)))
+        return self.storage.cell_format.log_odds(self._stored_at(points))
 
     def probability(self, points: ArrayLike) -> NDArray[np.float32]:
-        """Return the occupancy probability (N,) at points (N, 3) in metres, world frame; 0.5 where unknown.
+        """Look up occupancy probabilities.
 
-        Raises StereovoxError as `log_odds` does.
+        Args:
+            points: (N, 3) in metres, world frame, or (3,) for one.
+
+        Returns:
+            (N,) float32; 0.5 where unknown or not finite.
+
+        Raises:
+            StereovoxError: `points` is not numbers of such a shape.
         """
         return np.asarray(1 / (1 + np.exp(-self.log_odds(points))), np.float32)
 
     def state(self, points: ArrayLike) -> NDArray[np.uint8]:
-        """Return the `State` (N,) uint8 at points (N, 3) in metres, world frame; UNKNOWN where not finite.
+        """Look up the `State` of cells.
 
-        Raises StereovoxError as `log_odds` does.
+        Args:
+            points: (N, 3) in metres, world frame, or (3,) for one.
+
+        Returns:
+            (N,) uint8; UNKNOWN where not finite.
+
+        Raises:
+            StereovoxError: `points` is not numbers of such a shape.
         """
-        return self._rules.states(self._stored_at(queries.points_of(points)))
+        return self.storage.rules.states(self._stored_at(points))
 
     def age(self, points: ArrayLike, now_ns: int | None = None) -> NDArray[np.float32]:
-        """Return how many seconds (N,) ago the cells at points (N, 3) got their last evidence, by frames' stamps.
+        """Return how long ago cells got their last evidence, by the stamps of the frames.
 
-        points: metres, world frame. now_ns: time in nanoseconds, by default that of the last frame. NaN where the cell
-        is unknown or was put in without a time; negative where the evidence is stamped later than now.
-        Raises StereovoxError where the map keeps no times, and as `log_odds` does.
+        Args:
+            points: (N, 3) in metres, world frame, or (3,) for one.
+            now_ns: Time in nanoseconds; None: the stamp of the last frame.
+
+        Returns:
+            (N,) float32 in seconds. NaN where the cell is unknown or was put in without a time; negative where the
+            evidence is stamped later than now.
+
+        Raises:
+            StereovoxError: The map keeps no times, or `points` is not numbers of such a shape.
         """
         points = queries.points_of(points)
-        known = self._stored_at(points) != self._format.unknown
-        return self._seconds_ago(np.where(known, self.times_at(points), NEVER), now_ns)
+        known = self.storage.stored_at(points) != self.storage.cell_format.unknown
+        return self.storage.seconds_ago(np.where(known, self.storage.times_at(points), NEVER), now_ns)
 
     def ages(self, now_ns: int | None = None) -> NDArray[np.float32]:
-        """Return the `age` (N,) of all known cells, in the order of `cells`."""
-        found = [cells_where(coords, times, cells != self._format.unknown) for coords, cells, times in self.timed()]
+        """Return the `age` of all known cells.
+
+        Args:
+            now_ns: Time in nanoseconds; None: the stamp of the last frame.
+
+        Returns:
+            (N,) float32 in seconds, in the order of `cells`.
+
+        Raises:
+            StereovoxError: The map keeps no times.
+        """
+        unknown = self.storage.cell_format.unknown
+        found = [cells_where(coords, times, cells != unknown) for coords, cells, times in self.storage.timed()]
         indices, times = (np.concatenate(part) for part in zip(*found, strict=True))
-        return self._seconds_ago(times[np.lexsort(indices.T[::-1])], now_ns)
+        return self.storage.seconds_ago(times[np.lexsort(indices.T[::-1])], now_ns)
 
     def cast_rays(
         self,
@@ -197,93 +198,103 @@ class VoxelMap(Guarded, WithHistory):
         max_distance: float,
         stop_at: Iterable[State] = (State.OCCUPIED,),
     ) -> RayHits:
-        """Return where rays stop: at the first cell in one of the states `stop_at` (not FREE), entered by then.
+        """Find where rays stop.
 
-        origins: (N, 3), or (3,) for all rays; directions: (N, 3) of any length but zero; metres, world frame. A ray
-        begins in the cell that holds its origin and looks at every cell it crosses; one that it touches in an edge
-        only may count or not. max_distance: metres, may be infinite. Raises StereovoxError for bad input.
+        A ray begins in the cell that holds its origin and looks at every cell it crosses; one that it touches in an
+        edge only may count or not.
+
+        Args:
+            origins: (N, 3) in metres, world frame, or (3,) for all rays.
+            directions: (N, 3) of any length but zero.
+            max_distance: Metres along the ray by which the cell must be entered; may be infinite.
+            stop_at: States of cells that stop a ray; FREE is not allowed.
+
+        Returns:
+            Distance, cell and state where each ray stops.
+
+        Raises:
+            StereovoxError: Bad input.
         """
         return queries.cast_rays(self._asked, origins, directions, max_distance, stop_at)
 
     def check_boxes(self, low: ArrayLike, high: ArrayLike) -> NDArray[np.uint8]:
-        """Return the worst `State` (N,) uint8 in each box; worst is OCCUPIED, then TENTATIVE, UNKNOWN, FREE.
+        """Return the worst state in boxes; worst is OCCUPIED, then TENTATIVE, UNKNOWN, FREE.
 
-        low, high: (N, 3) corners in metres, world frame. A cell counts that holds a point of the box, faces included:
-        what `state` would say of all points from low to high. Raises StereovoxError for bad input.
+        A cell counts that holds a point of the box, faces included: what `state` would say of all points from low to
+        high.
+
+        Args:
+            low: (N, 3) lowest corners in metres, world frame.
+            high: (N, 3) highest corners.
+
+        Returns:
+            `State` (N,) uint8.
+
+        Raises:
+            StereovoxError: Bad input.
         """
         return queries.check_boxes(self._asked, low, high)
 
     def check_capsules(self, start: ArrayLike, end: ArrayLike, radius: ArrayLike) -> NDArray[np.uint8]:
-        """Return the worst `State` (N,) uint8 that each capsule touches; worst is OCCUPIED, then TENTATIVE, UNKNOWN.
+        """Return the worst state that capsules touch; worst is OCCUPIED, then TENTATIVE, UNKNOWN, FREE.
 
-        start, end: (N, 3) ends of the axis in metres, world frame, the same for a ball; radius: metres, (N,) or one for
-        all. A cell counts that is no farther from the axis than the radius. Raises StereovoxError for bad input.
+        A cell counts that is no farther from the axis than the radius.
+
+        Args:
+            start: (N, 3) beginnings of the axes in metres, world frame.
+            end: (N, 3) ends of the axes; the same as `start` for a ball.
+            radius: Metres, (N,) or one for all.
+
+        Returns:
+            `State` (N,) uint8.
+
+        Raises:
+            StereovoxError: Bad input.
         """
         return queries.check_capsules(self._asked, start, end, radius)
 
     def nearest_obstacle(
-        self, points: ArrayLike, max_distance: float, obstacles: Iterable[State] = (State.OCCUPIED,)
+        self, points: ArrayLike, max_distance: float = np.inf, obstacles: Iterable[State] = (State.OCCUPIED,)
     ) -> NearestCells:
-        """Return how far the nearest cell is that is in one of the states `obstacles` (not FREE), and which it is.
+        """Find the nearest cell that is an obstacle.
 
-        points: (N, 3) in metres, world frame; max_distance: metres, may be infinite. Raises StereovoxError for bad
-        input.
+        Args:
+            points: (N, 3) in metres, world frame, or (3,) for one.
+            max_distance: Metres; obstacles farther off count as none. By default the nearest one is found however far
+                it is; a limit makes the search quicker where obstacles are far.
+            obstacles: States of cells that are obstacles; FREE is not allowed.
+
+        Returns:
+            Distance to each nearest cell, and its indices.
+
+        Raises:
+            StereovoxError: Bad input.
         """
         return queries.nearest(self._asked, points, max_distance, obstacles)
 
     def cells(self) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
-        """Return all known cells: indices (N, 3) int32 in ascending order, and their log-odds (N,)."""
-        indices, stored = self._where(lambda values: values != self._format.unknown)
-        return indices, self._format.log_odds(stored)
+        """Return all known cells.
 
-    def blocks(self) -> tuple[NDArray[np.int32], NDArray[np.integer]]:
-        """Return block coordinates (n, 3) in ascending order and their cells (n, 512) as they are stored."""
-        coords, values = zip(*self.slabs(), strict=True)
-        return np.concatenate(coords), np.concatenate(values)
-
-    def blocks_within(self, low: ArrayLike, high: ArrayLike) -> tuple[NDArray[np.int32], NDArray[np.integer]]:
-        """Return the blocks in memory with coordinates (3,) from `low` to below `high`, in no order.
-
-        Coordinates (n, 3), cells (n, 512) as they are stored; both are copies.
+        Returns:
+            Indices (N, 3) int32 in ascending order, and their log-odds (N,) float32.
         """
-        return self._pool.within(np.asarray(low), np.asarray(high))
-
-    def slabs(self) -> Iterator[tuple[NDArray[np.int32], NDArray[np.integer]]]:
-        """Yield all blocks as in `blocks`, piece by piece in ascending order.
-
-        Where the map changes meanwhile, each piece is as it is at its time; hold `lock` to read one state.
-        """
-        yield from in_steps(self.lock, self._slabs())
-
-    def timed(self) -> Iterator[tuple[NDArray[np.int32], NDArray[np.integer], NDArray[np.uint32]]]:
-        """Yield all blocks as `slabs` does, with the times (n, 512) of their cells, 0 where there is none.
-
-        Raises StereovoxError where the map keeps no times. What they mean: `CellTimes`.
-        """
-        yield from in_steps(self.lock, self._timed())
-
-    def times_of(self, coords: NDArray[np.int32]) -> NDArray[np.uint32]:
-        """Return the times (n, 512) of the cells of blocks (n, 3); they mean something where the cell is known."""
-        return self._kept_times.get(coords)
-
-    def set_times(self, coords: NDArray[np.int32], times: NDArray[np.uint32], start_ns: int | None) -> None:
-        """Set the times (n, 512) of blocks (n, 3) that are in the map; they count from `start_ns`."""
-        self._kept_times.put(coords, times)
-        self._kept_times.start_ns = start_ns
-
-    @property
-    def times_start_ns(self) -> int | None:
-        """Stamp in nanoseconds from which times of cells are counted; None before the first and where none are kept."""
-        return None if self._times is None else self._times.start_ns
+        unknown = self.storage.cell_format.unknown
+        indices, stored = self._where(lambda values: values != unknown)
+        return indices, self.storage.cell_format.log_odds(stored)
 
     def cells_in(self, state: State) -> NDArray[np.int32]:
-        """Return the indices (N, 3) of the cells in a known state, block by block."""
-        found = [cells_where(coords, stored, self._rules.states(stored) == state)[0] for coords, stored in self.slabs()]
+        """Return the cells in a state other than UNKNOWN.
+
+        Returns:
+            Indices (N, 3) int32, block by block.
+        """
+        states = self.storage.rules.states
+        found = [cells_where(coords, stored, states(stored) == state)[0] for coords, stored in self.storage.slabs()]
         return np.concatenate(found)
 
     def centers(self, indices: ArrayLike) -> NDArray[np.float64]:
-        """Return the centres (N, 3) in metres of cells (N, 3)."""
-        return (np.asarray(indices) + 0.5) * self.config.cell
+        """Return the centres (N, 3) in metres of cells (N, 3); raises StereovoxError for another shape."""
+        return (_cells_of(indices) + 0.5) * self.config.cell
 
     def occupied(self) -> NDArray[np.float64]:
         """Return the centres (N, 3) in metres of all occupied cells."""
@@ -301,14 +312,15 @@ class VoxelMap(Guarded, WithHistory):
     def counts(self) -> dict[str, int]:
         """Return the number of cells in each known state: `free`, `tentative`, `occupied`."""
         number = np.zeros(4, np.int64)
-        for _, values in self.slabs():
-            states = self._rules.states(values)
+        for _, values in self.storage.slabs():
+            states = self.storage.rules.states(values)
             number += [np.count_nonzero(states == state) for state in State]
         return {state.name.lower(): int(number[state]) for state in (State.FREE, State.TENTATIVE, State.OCCUPIED)}
 
     def bounds(self) -> NDArray[np.float64] | None:
         """Return the lowest and highest corner (2, 3) in metres of all known cells; None for an empty map."""
-        pieces = (_span(coords, values != self._format.unknown) for coords, values in self.slabs())
+        unknown = self.storage.cell_format.unknown
+        pieces = (_span(coords, values != unknown) for coords, values in self.storage.slabs())
         spans = [span for span in pieces if span is not None]
         if not spans:
             return None
@@ -318,93 +330,66 @@ class VoxelMap(Guarded, WithHistory):
     @property
     def memory_bytes(self) -> int:
         """Bytes the map uses: stored numbers, times, block coordinates and hash."""
-        return self._pool.memory_bytes + (0 if self._times is None else self._times.memory_bytes)
+        return self.storage.memory_bytes
 
     @property
     def reserved_bytes(self) -> int:
-        """Bytes the map has taken: those in use, and room to grow (which the system gives when it is first used)."""
-        return self._pool.reserved_bytes + (0 if self._times is None else self._times.reserved_bytes)
+        """Bytes allocated: those in use, and room to grow (which the system gives when it is first used)."""
+        return self.storage.reserved_bytes
 
     def save(self, path: str | Path) -> None:
-        """Save to the folder `path` (Zarr inside); an older map there stays whole until the new one is complete."""
-        save_map(self, path)
+        """Save the map; an older one there stays whole until the new one is complete.
+
+        Args:
+            path: The folder (Zarr inside).
+
+        Raises:
+            MapFileError: It cannot be written, holds something else, or is being written by another run.
+        """
+        save_map(self.storage, path)
 
     def close(self) -> None:
-        """Give back what the map holds outside memory (nothing, unless it keeps tiles on disk)."""
+        """Remove what the map keeps outside memory (nothing, unless it keeps tiles on disk)."""
+        self.storage.close()
 
-    def _slabs(self) -> Iterator[tuple[NDArray[np.int32], NDArray[np.integer]]]:
-        """Yield what `slabs` does; the lock is held while an item is made."""
-        yield from self._pool.pieces()
+    if not TYPE_CHECKING:
 
-    def _timed(self) -> Iterator[tuple[NDArray[np.int32], NDArray[np.integer], NDArray[np.uint32]]]:
-        for coords, cells in self._slabs():
-            times = self.times_of(coords)
-            times[cells == self._format.unknown] = NEVER
-            yield coords, cells, times
-
-    def _in_my_units(self, evidence: Evidence) -> Evidence:
-        """Return the evidence as differences of stored numbers; blocks that would get a uniform 0 are left out."""
-        factor, most = self._format.per_log_odds / LOG_ODDS_SCALE, self._most_rise
-        if factor == 1 and most is None and evidence.uniform_values.all():
-            return evidence
-        shift = self._format.shift(self.frames)
-        values = np.empty_like(evidence.values)
-        _add.rescale(evidence.values, np.float32(factor), np.float32(shift), np.float32(most or LARGEST), values)
-        steps = np.floor(evidence.uniform_values * factor + shift).astype(np.int16)
-        some = steps != 0
-        return Evidence(evidence.coords, values, evidence.uniform[some], steps[some])
-
-    @property
-    def _now_ns(self) -> int:
-        return 0 if self.viewpoint is None else self.viewpoint.stamp_ns
-
-    def _copied(self, config: Config, blocks: Iterable[tuple[NDArray[np.int32], NDArray[np.integer]]]) -> VoxelMap:
-        """Return a map without bounds of these of the map's blocks, and of what is known of them."""
-        copy = VoxelMap(config)
-        for coords, cells in blocks:
-            copy.insert(coords, cells)
-            if self._times is not None:
-                copy.set_times(coords, self.times_of(coords), self.times_start_ns)
-        copy.take_history(self)
-        return copy
-
-    @property
-    def _kept_times(self) -> CellTimes:
-        if self._times is None:
-            raise StereovoxError("the map does not keep when cells were seen; make it with map.keep_times = true")
-        return self._times
-
-    def times_at(self, points: NDArray[np.floating]) -> NDArray[np.uint32]:
-        """Return the times (N,) of the cells at points, NEVER where no cell can be."""
-        times = np.zeros(len(points), np.uint32)
-        within = (np.abs(points) < INDEX_LIMIT * np.array(self.config.cell)).all(axis=1)  # False for NaN
-        cells = np.floor(points[within] / self.config.cell).astype(np.int64)
-        blocks, of_cell = blocks_of_cells(cells)
-        x, y, z = (cells & (SIDE - 1)).T
-        times[within] = self.times_of(blocks.astype(np.int32))[of_cell, (x << 6) | (y << 3) | z]
-        return times
-
-    def _seconds_ago(self, times: NDArray[np.uint32], now_ns: int | None) -> NDArray[np.float32]:
-        return self._kept_times.seconds_ago(times, self._now_ns if now_ns is None else now_ns)
+        def __getattr__(self, name: str) -> Any:
+            if name in IN_STORAGE:
+                return getattr(self.storage, name)
+            raise AttributeError(f"'{type(self).__name__}' object has no attribute '{name}'")
 
     @property
     def _asked(self) -> Asked:
-        return Asked(self.stored_cells, self._rules, self.config.cell)
+        return Asked(self.storage.stored_cells, self.storage.rules, self.config.cell)
 
-    def _stored_at(self, points: NDArray[np.floating]) -> NDArray[np.integer]:
-        return queries.stored_at(self.stored_cells, self.config.cell, points)
+    def _stored_at(self, points: ArrayLike) -> NDArray[np.integer]:
+        return self.storage.stored_at(queries.points_of(points))
 
     def _centers_of(self, state: State) -> NDArray[np.float64]:
-        return self.centers(self._where(lambda values: self._rules.states(values) == state)[0])
+        return self.centers(self._where(lambda values: self.storage.rules.states(values) == state)[0])
 
     def _where(
         self, chosen: Callable[[NDArray[np.integer]], NDArray[np.bool_]]
     ) -> tuple[NDArray[np.int32], NDArray[np.integer]]:
         """Return indices (N, 3) of the cells whose stored numbers are `chosen`, in ascending order, and these (N,)."""
-        found = [cells_where(coords, values, chosen(values)) for coords, values in self.slabs()]
+        found = [cells_where(coords, values, chosen(values)) for coords, values in self.storage.slabs()]
         indices, stored = (np.concatenate(part) for part in zip(*found, strict=True))
         order = np.lexsort(indices.T[::-1])
         return indices[order], stored[order]
+
+
+def unbounded(voxel_map: VoxelMap, config: Config | None = None) -> VoxelMap:
+    """Return a map without bounds of all cells and what is known of them, with the settings `config` or its own.
+
+    Raises ConfigError when these would change what its cells mean.
+    """
+    with voxel_map.lock:
+        config = config or voxel_map.config
+        voxel_map.storage.check_cells(config)
+        copy = VoxelMap(config)
+        copy.storage.fill(voxel_map.storage, voxel_map.storage.slabs())
+    return copy
 
 
 def cells_where(
@@ -414,6 +399,16 @@ def cells_where(
     block, column = np.nonzero(chosen)
     low = np.stack([column >> 6, (column >> 3) & 7, column & 7], axis=1)
     return (coords[block] * SIDE + low).astype(np.int32), values[block, column]
+
+
+def _cells_of(indices: ArrayLike) -> NDArray:
+    """Return cell indices (N, 3); raises StereovoxError for another shape, but for [] and one cell (3,)."""
+    cells = np.asarray(indices)
+    if cells.shape in {(0,), (3,)}:
+        return cells.reshape(-1, 3)
+    if cells.ndim != 2 or cells.shape[1] != 3:
+        raise queries.shape_error("indices", cells, "(N, 3) whole numbers")
+    return cells
 
 
 def _span(coords: NDArray[np.int32], known: NDArray[np.bool_]) -> tuple[list[int], list[int]] | None:
@@ -432,12 +427,20 @@ def _span(coords: NDArray[np.int32], known: NDArray[np.bool_]) -> tuple[list[int
 def load_map(path: str | Path) -> VoxelMap:
     """Read a map saved by `VoxelMap.save`, all of it, whatever window it was made in.
 
-    Raises MapFileError: one line with the file and what is wrong.
+    Args:
+        path: The folder of the map.
+
+    Returns:
+        The map, without bounds, in memory.
+
+    Raises:
+        MapFileError: One line with the file and what is wrong with it.
     """
     saved = read_map(path)
     voxel_map = VoxelMap(saved.config)
-    voxel_map.history, voxel_map.viewpoint, voxel_map.window_state = saved.history, saved.viewpoint, saved.window_state
-    voxel_map.insert(saved.coords, saved.cells)
+    storage = voxel_map.storage
+    storage.history, storage.viewpoint, storage.window_state = saved.history, saved.viewpoint, saved.window_state
+    storage.insert(saved.coords, saved.cells)
     if saved.times is not None:
-        voxel_map.set_times(saved.coords, saved.times, saved.times_start_ns)
+        storage.set_times(saved.coords, saved.times, saved.times_start_ns)
     return voxel_map

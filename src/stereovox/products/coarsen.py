@@ -38,13 +38,13 @@ def coarsen(voxel_map: VoxelMap, factor: int) -> VoxelMap:
     if not 1 <= factor < 2**31 or factor != int(factor):
         raise StereovoxError(f"factor {factor}: give a whole number of cells, 1 or more")
     settings = _coarser(voxel_map.config, int(factor))
-    parts = [_parents(voxel_map, coords, cells, int(factor)) for coords, cells in voxel_map.slabs()]
+    parts = [_parents(voxel_map, coords, cells, int(factor)) for coords, cells in voxel_map.storage.slabs()]
     indices, number, stored, times = _grouped(*map(np.concatenate, zip(*parts, strict=True)))
     sure = (number == int(factor) ** 3) | (CellRules(voxel_map.config.map).states(stored) != State.FREE)
-    coarse = VoxelMap.from_cells(settings, indices[sure], voxel_map.cell_format.log_odds(stored[sure]))
+    coarse = VoxelMap.from_cells(settings, indices[sure], voxel_map.storage.cell_format.log_odds(stored[sure]))
     if settings.map.keep_times:
-        set_times(coarse, indices[sure], times[sure], voxel_map.times_start_ns)
-    coarse.take_history(voxel_map)
+        set_times(coarse, indices[sure], times[sure], voxel_map.storage.times_start_ns)
+    coarse.storage.take_history(voxel_map.storage)
     return coarse
 
 
@@ -54,11 +54,11 @@ def _coarser(config: Config, factor: int) -> Config:
 
 
 def _parents(voxel_map: VoxelMap, coords: NDArray[np.int32], cells: NDArray[np.integer], factor: int) -> Parents:
-    known = cells != voxel_map.cell_format.unknown
+    known = cells != voxel_map.storage.cell_format.unknown
     indices, stored = cells_where(coords, cells, known)
     times = np.zeros(len(stored), np.uint32)
     if voxel_map.config.map.keep_times:
-        times = voxel_map.times_of(coords)[known]
+        times = voxel_map.storage.times_of(coords)[known]
     return _grouped(indices.astype(np.int64) // factor, np.ones(len(stored), np.int64), stored.astype(np.int64), times)
 
 

@@ -33,12 +33,14 @@ def crop(voxel_map: VoxelMap, low: ArrayLike, high: ArrayLike) -> VoxelMap:
     sides = np.array(voxel_map.config.cell)
     first, beyond = (np.ceil(corner / sides - 0.5) for corner in corners_of(low, high))
     cropped = VoxelMap(voxel_map.config)
-    for coords, cells in voxel_map.slabs():
+    for coords, cells in voxel_map.storage.slabs():
         touched = ((coords * SIDE < beyond) & ((coords + 1) * SIDE > first)).all(axis=1)
         coords, cells = coords[touched], cells[touched]
         inside = _inside(coords, first, beyond)
-        add_blocks(cropped, voxel_map, coords, np.where(inside, cells, cells.dtype.type(voxel_map.cell_format.unknown)))
-    cropped.take_history(voxel_map)
+        add_blocks(
+            cropped, voxel_map, coords, np.where(inside, cells, cells.dtype.type(voxel_map.storage.cell_format.unknown))
+        )
+    cropped.storage.take_history(voxel_map.storage)
     return cropped
 
 

@@ -24,6 +24,7 @@ TRIGGER = 1 / 8
 """A window follows the camera once that is farther from its centre than this share of the window."""
 TIE = 1e-6
 """A face of the box this near to a face of cells, in cells, counts as on it."""
+CORNER = "(3,) metres, x y z"
 MEASURES = {"centres": 0.0, "faces": 0.5, "gap": 1.0}
 """How many cells nearer an obstacle counts along each axis."""
 
@@ -165,7 +166,7 @@ class DistanceField:
         field, order = self._transform.field, np.array(self._transform.order)
         dirty = np.zeros(len(field.mask), np.uint8)
         changed = _distance.refresh(
-            self._map.stored_cells, CellRules(self._map.config.map).thresholds, self._wanted, self._low, order,
+            self._map.storage.stored_cells, CellRules(self._map.config.map).thresholds, self._wanted, self._low, order,
             self._shape[order], self._seen, field.mask, dirty,
         )  # fmt: skip
         return int(changed), dirty
@@ -206,7 +207,9 @@ class DistanceField:
             raise StereovoxError(
                 "a distance field needs low and high of a box, or the size of a window about the camera"
             )
-        corners = np.concatenate([points_of(low, "low"), points_of(high, "high")]) / self._cell
+        corners = (
+            np.concatenate([points_of(low, "low", wanted=CORNER), points_of(high, "high", wanted=CORNER)]) / self._cell
+        )
         if corners.shape != (2, 3) or not (np.abs(corners) < INDEX_LIMIT).all() or not (corners[0] < corners[1]).all():
             raise StereovoxError(f"box {low} to {high}: give two corners x, y, z in metres, the lower one first")
         first = np.floor(corners[0] + TIE).astype(np.int64)
@@ -214,7 +217,7 @@ class DistanceField:
 
     def _about_zero(self, size: ArrayLike | None) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return the window as it stands until the camera is known, on faces of blocks."""
-        wanted = points_of([] if size is None else size, "size") / self._cell
+        wanted = points_of([] if size is None else size, "size", wanted="(3,) metres") / self._cell
         if wanted.shape != (1, 3) or not ((wanted > 0) & (wanted < INDEX_LIMIT)).all():
             raise StereovoxError(f"size {size}: give three lengths in metres")
         return np.zeros(3, np.int64), np.ceil(wanted[0] - TIE).astype(np.int64)

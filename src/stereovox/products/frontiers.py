@@ -15,6 +15,7 @@ from stereovox.errors import StereovoxError
 from stereovox.maps import State, VoxelMap
 from stereovox.maps.blocks import CELLS
 from stereovox.maps.cell_format import CellRules
+from stereovox.maps.queries import points_of
 from stereovox.maps.voxel_map import cells_where
 from stereovox.products.floor_axes import Heights, checked_heights, heights_of
 from stereovox.products.neighbours import CORNERS, FACES, components, shifted, with_margins
@@ -161,7 +162,7 @@ def _reached(
 def _start(voxel_map: VoxelMap, start: ArrayLike | None) -> NDArray[np.float64] | None:
     if start is None:
         return None if voxel_map.viewpoint is None else voxel_map.viewpoint.T_world_camera[:3, 3]
-    here = np.asarray(start, float)
+    here = points_of(start, "start", wanted="(3,) metres, x y z").astype(float).ravel()
     if here.shape != (3,) or not np.isfinite(here).all():
         raise StereovoxError(f"start {start}: give a point X, Y, Z in metres")
     return here

@@ -15,7 +15,7 @@ from stereovox.maps.cell_format import CellRules
 from stereovox.maps.evidence import Evidence
 from stereovox.maps.occupancy import UNKNOWN, OccupancyGrid, Percent
 from stereovox.maps.rolling import RollingMap
-from stereovox.maps.voxel_map import EVERYWHERE
+from stereovox.maps.storage import EVERYWHERE
 from stereovox.products.floor_axes import Heights, floor_axes
 from stereovox.products.projection import EMPTY, Patch, layers_of, patch_of
 
@@ -45,7 +45,7 @@ class LiveProjection:
         self._changed = EVERYWHERE.copy()
         self._canvas = _Canvas()
         note = WeakMethod(self._note)  # the map does not keep alive what only looks at it
-        voxel_map.listeners.append(lambda evidence: (method := note()) and method(evidence))
+        voxel_map.storage.listeners.append(lambda evidence: (method := note()) and method(evidence))
 
     def grid(self) -> OccupancyGrid | None:
         """Return the current map from above, None where nothing is known. Its cells are a copy.
@@ -68,7 +68,7 @@ class LiveProjection:
     def _grid(self) -> OccupancyGrid | None:
         if self._whole:
             self._changed, self._canvas = EVERYWHERE.copy(), _Canvas()
-        coords, cells = self._map.blocks_within(*self._changed)
+        coords, cells = self._map.storage.blocks_within(*self._changed)
         if len(coords):
             floor = SIDE * coords[:, self._order[:2]].astype(np.int64)
             self._canvas.reach(floor.min(axis=0), floor.max(axis=0) + SIDE)

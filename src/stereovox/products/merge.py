@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stereovox.maps import VoxelMap
+from stereovox.maps import VoxelMap, unbounded
 from stereovox.maps.blocks import CELLS
 from stereovox.maps.cell_format import CellRules
 from stereovox.maps.cell_times import LAST, NEVER, UNIT_NS
@@ -45,13 +45,13 @@ def merge(a: VoxelMap, b: VoxelMap, T_a_b: ArrayLike | None = None) -> VoxelMap:
     b = in_memory(b)
     if T_a_b is not None:
         b = moved(b, T_a_b)
-    merged = a.unbounded(a.config)
-    start_ns = b.times_start_ns if a.times_start_ns is None else a.times_start_ns
-    for coords, cells in b.slabs():
+    merged = unbounded(a)
+    start_ns = b.storage.times_start_ns if a.storage.times_start_ns is None else a.storage.times_start_ns
+    for coords, cells in b.storage.slabs():
         times = _later(merged, b, coords, start_ns) if a.config.map.keep_times else None
-        merged.insert(coords, _summed(a, cells_at(merged, coords), b, cells))
+        merged.storage.insert(coords, _summed(a, cells_at(merged, coords), b, cells))
         if times is not None:
-            merged.set_times(coords, times, start_ns)
+            merged.storage.set_times(coords, times, start_ns)
     merged.history = _together(a.history, b.history)
     viewpoints = [one.viewpoint for one in (a, b) if one.viewpoint]
     merged.viewpoint = max(viewpoints, key=lambda viewpoint: viewpoint.stamp_ns, default=None)
@@ -73,9 +73,11 @@ def _later(a: VoxelMap, b: VoxelMap, coords: NDArray[np.int32], start_ns: int | 
     """Return the later time (n, 512) of each cell of blocks (n, 3), from `start_ns` on; NEVER where none is kept."""
     times = np.full((len(coords), CELLS), NEVER, np.int64)
     for one in (a, b):
-        if one.config.map.keep_times and one.times_start_ns is not None and start_ns is not None:
-            kept = np.where(cells_at(one, coords) == one.cell_format.unknown, NEVER, one.times_of(coords))
-            shifted = kept.astype(np.int64) + (one.times_start_ns - start_ns) // UNIT_NS
+        if one.config.map.keep_times and one.storage.times_start_ns is not None and start_ns is not None:
+            kept = np.where(
+                cells_at(one, coords) == one.storage.cell_format.unknown, NEVER, one.storage.times_of(coords)
+            )
+            shifted = kept.astype(np.int64) + (one.storage.times_start_ns - start_ns) // UNIT_NS
             times = np.maximum(times, np.where(kept == NEVER, NEVER, np.clip(shifted, NEVER + 1, LAST)))
     return times.astype(np.uint32)
 

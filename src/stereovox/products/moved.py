@@ -53,13 +53,13 @@ def moved(voxel_map: VoxelMap, T_a_b: ArrayLike) -> VoxelMap:
         coords = blocks[start : start + PIECE]
         points = transform_points(inverse(T), there.centers(_cells_of(coords)))
         cells = _stored_at(voxel_map, points).reshape(-1, CELLS)
-        cells = higher(cells, cells_at(pushed, coords), there.cell_format.unknown)
+        cells = higher(cells, cells_at(pushed, coords), there.storage.cell_format.unknown)
         _doubt(voxel_map, T, coords, cells)
-        known = (cells != there.cell_format.unknown).any(axis=1)
-        there.insert(coords[known], cells[known])
+        known = (cells != there.storage.cell_format.unknown).any(axis=1)
+        there.storage.insert(coords[known], cells[known])
         if there.config.map.keep_times:
-            times = np.maximum(voxel_map.times_at(points).reshape(-1, CELLS), pushed.times_of(coords))
-            there.set_times(coords[known], times[known], voxel_map.times_start_ns)
+            times = np.maximum(voxel_map.storage.times_at(points).reshape(-1, CELLS), pushed.storage.times_of(coords))
+            there.storage.set_times(coords[known], times[known], voxel_map.storage.times_start_ns)
     path = _moved_path(voxel_map.history.path, T)
     there.history = replace(
         voxel_map.history.copied(), trusted={}, waiting={}, looks={}, doubts={}, path=path
@@ -100,7 +100,7 @@ def _doubt(voxel_map: VoxelMap, T: Transform, coords: NDArray[np.int32], cells: 
     axes, reach = _separating_axes(R_b_a, sides)
     arrays = R_b_a * sides / sides[:, None], axes, reach, corners - low
     turn, axes, reach, rest = (array.astype(np.float32) for array in arrays)
-    _moved.doubt(voxel_map.stored_cells, rules.thresholds, rules.prior, turn, axes, reach, low, rest, cells)
+    _moved.doubt(voxel_map.storage.stored_cells, rules.thresholds, rules.prior, turn, axes, reach, low, rest, cells)
 
 
 def _separating_axes(
@@ -122,25 +122,25 @@ def _separating_axes(
 def _pushed(voxel_map: VoxelMap, T: Transform) -> VoxelMap:
     """Return a map of the occupied and tentative cells alone, each moved into the one cell that holds its middle."""
     rules, parts = CellRules(voxel_map.config.map), []
-    for coords, cells in voxel_map.slabs():
+    for coords, cells in voxel_map.storage.slabs():
         solid = rules.states(cells) >= State.TENTATIVE
         indices, stored = cells_where(coords, cells, solid)
-        times = voxel_map.times_of(coords)[solid] if voxel_map.config.map.keep_times else np.zeros(len(stored))
+        times = voxel_map.storage.times_of(coords)[solid] if voxel_map.config.map.keep_times else np.zeros(len(stored))
         parts.append((indices, stored, times))
     indices, stored, times = (np.concatenate(part) for part in zip(*parts, strict=True))
     order = np.argsort(stored, kind="stable")  # of several in one cell the last counts, the highest
     places = transform_points(T, voxel_map.centers(indices[order])) / voxel_map.config.cell
     indices = np.floor(places + NEAR).astype(np.int64)
-    pushed = VoxelMap.from_cells(voxel_map.config, indices, voxel_map.cell_format.log_odds(stored[order]))
+    pushed = VoxelMap.from_cells(voxel_map.config, indices, voxel_map.storage.cell_format.log_odds(stored[order]))
     if voxel_map.config.map.keep_times:
-        set_times(pushed, indices, times[order].astype(np.uint32), voxel_map.times_start_ns)
+        set_times(pushed, indices, times[order].astype(np.uint32), voxel_map.storage.times_start_ns)
     return pushed
 
 
 def _reached(voxel_map: VoxelMap, T: Transform) -> NDArray[np.int32]:
     """Return the blocks (n, 3) that the map's blocks may lie in after the motion, each once."""
     block = SIDE * np.array(voxel_map.config.cell)
-    coords = np.concatenate([coords for coords, _ in voxel_map.slabs()])
+    coords = np.concatenate([coords for coords, _ in voxel_map.storage.slabs()])
     corners = np.array(list(product((0, 1), repeat=3)))
     places = transform_points(T, ((coords[:, None] + corners) * block).reshape(-1, 3)).reshape(-1, 8, 3) / block
     if np.abs(places).max(initial=0) * SIDE >= INDEX_LIMIT:
@@ -160,6 +160,6 @@ def _cells_of(coords: NDArray[np.int32]) -> NDArray[np.int64]:
 
 def _stored_at(voxel_map: VoxelMap, points: NDArray[np.float64]) -> NDArray[np.integer]:
     """Return what the cells at points (N, 3) store; no known cell has a log-odds of just zero."""
-    log_odds, cell_format = voxel_map.log_odds(points), voxel_map.cell_format
+    log_odds, cell_format = voxel_map.log_odds(points), voxel_map.storage.cell_format
     stored = np.where(log_odds == 0, cell_format.unknown, cell_format.stored(log_odds))
     return stored.astype(cell_format.dtype)

@@ -56,7 +56,7 @@ def project(voxel_map: VoxelMap, heights: Heights | None = None) -> OccupancyGri
         voxel_map = in_cubes(voxel_map)
     heights = heights or voxel_map.config.scan.heights
     layers = layers_of(voxel_map, order[2], heights)
-    patches = [patch_of(voxel_map, *slab, order, layers) for slab in voxel_map.slabs() if len(slab[0])]
+    patches = [patch_of(voxel_map, *slab, order, layers) for slab in voxel_map.storage.slabs() if len(slab[0])]
     patch = _joined(patches)
     if patch is None or not (patch.marked != EMPTY).any():
         raise StereovoxError(_format_empty(voxel_map, order[2], heights))
@@ -118,7 +118,7 @@ def inflated(voxel_map: VoxelMap, radius: float, margin: int = MARGIN) -> VoxelM
     grown = np.concatenate([known[:0], *(_grown(voxel_map, tile, radius, margin) for tile in tiles)])
     surest = np.full(len(grown), voxel_map.config.map.log_odds_max)
     made = VoxelMap.from_cells(voxel_map.config, np.concatenate([known, grown]), np.concatenate([log_odds, surest]))
-    made.take_history(voxel_map)
+    made.storage.take_history(voxel_map.storage)
     return made
 
 

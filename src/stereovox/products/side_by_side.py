@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stereovox.errors import StereovoxError
-from stereovox.maps import VoxelMap, _pool
+from stereovox.maps import VoxelMap, _pool, unbounded
 from stereovox.maps.blocks import CELLS, SIDE, blocks_of_cells
 from stereovox.maps.rolling import RollingMap
 
@@ -19,12 +19,12 @@ Blocks = tuple[NDArray[np.int32], NDArray[np.integer], NDArray[np.integer]]
 
 def in_memory(voxel_map: VoxelMap) -> VoxelMap:
     """Return the map with all its cells in memory: the map itself if they already are."""
-    return voxel_map.unbounded(voxel_map.config) if isinstance(voxel_map, RollingMap) else voxel_map
+    return unbounded(voxel_map) if isinstance(voxel_map, RollingMap) else voxel_map
 
 
 def cells_at(voxel_map: VoxelMap, coords: NDArray[np.int32]) -> NDArray[np.integer]:
     """Return the cells (n, 512) as stored of blocks (n, 3) of a map in memory; all unknown where it has no block."""
-    stored, places = voxel_map.stored_cells, np.empty(len(coords), np.int64)
+    stored, places = voxel_map.storage.stored_cells, np.empty(len(coords), np.int64)
     _pool.find_all(stored.table, stored.coords, np.ascontiguousarray(coords, np.int32), places)
     cells = np.full((len(coords), CELLS), stored.unknown, stored.values.dtype)
     has_row = (places >= 0) & (places < len(stored.values))
@@ -35,11 +35,11 @@ def cells_at(voxel_map: VoxelMap, coords: NDArray[np.int32]) -> NDArray[np.integ
 
 def side_by_side(a: VoxelMap, b: VoxelMap) -> Iterator[Blocks]:
     """Yield every block that one of two maps in memory has, with the cells of both, piece by piece."""
-    for coords, cells in a.slabs():
+    for coords, cells in a.storage.slabs():
         yield coords, cells, cells_at(b, coords)
-    for coords, cells in b.slabs():
+    for coords, cells in b.storage.slabs():
         theirs = cells_at(a, coords)
-        new = (theirs == a.cell_format.unknown).all(axis=1)
+        new = (theirs == a.storage.cell_format.unknown).all(axis=1)
         yield coords[new], theirs[new], cells[new]
 
 
@@ -58,10 +58,10 @@ def check_alike(a: VoxelMap, b: VoxelMap, T_a_b: ArrayLike | None) -> None:
 
 def add_blocks(target: VoxelMap, source: VoxelMap, coords: NDArray[np.int32], cells: NDArray[np.integer]) -> None:
     """Add blocks (n, 3) with cells (n, 512) to `target`, with the times that `source` keeps of them."""
-    known = (cells != target.cell_format.unknown).any(axis=1)
-    target.insert(coords[known], cells[known])
+    known = (cells != target.storage.cell_format.unknown).any(axis=1)
+    target.storage.insert(coords[known], cells[known])
     if source.config.map.keep_times:
-        target.set_times(coords[known], source.times_of(coords[known]), source.times_start_ns)
+        target.storage.set_times(coords[known], source.storage.times_of(coords[known]), source.storage.times_start_ns)
 
 
 def set_times(target: VoxelMap, indices: NDArray[np.integer], times: NDArray[np.uint32], start_ns: int | None) -> None:
@@ -70,7 +70,7 @@ def set_times(target: VoxelMap, indices: NDArray[np.integer], times: NDArray[np.
     low = indices & (SIDE - 1)
     kept = np.zeros((len(blocks), CELLS), np.uint32)
     kept[of_cell, (low[:, 0] << 6) | (low[:, 1] << 3) | low[:, 2]] = times
-    target.set_times(blocks.astype(np.int32), kept, start_ns)
+    target.storage.set_times(blocks.astype(np.int32), kept, start_ns)
 
 
 def _short(voxel_map: VoxelMap) -> tuple[float, ...]:

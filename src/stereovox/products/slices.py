@@ -56,8 +56,8 @@ def layer(voxel_map: VoxelMap, across: str, at_m: float, bounds: NDArray[np.floa
     stored = _stored(voxel_map, number, (normal, columns, rows), (left >> 3, bottom >> 3, right >> 3, top >> 3))
     row, column = bottom & 7, left & 7
     stored = stored[row : row + top - bottom, column : column + right - left]
-    known = stored != voxel_map.cell_format.unknown
-    log_odds = np.where(known, voxel_map.cell_format.log_odds(stored), np.float32(np.nan))
+    known = stored != voxel_map.storage.cell_format.unknown
+    log_odds = np.where(known, voxel_map.storage.cell_format.log_odds(stored), np.float32(np.nan))
     extent = (left * size, right * size, bottom * size, top * size)
     return Layer(
         log_odds, CellRules(voxel_map.config.map).states(stored), extent, ACROSS[across], across, (number + 0.5) * size
@@ -92,11 +92,11 @@ def _stored(
     """Return the cells (rows, columns) as stored of layer `number`, of the blocks left, bottom, right, top, all in."""
     normal, columns, rows = axes
     low, high = np.array(blocks).reshape(2, 2)
-    cell_format = voxel_map.cell_format
+    cell_format = voxel_map.storage.cell_format
     across, up = (high - low + 1).tolist()
     shape = (up, SIDE, across, SIDE)
     found = np.full(shape, cell_format.unknown, cell_format.dtype)
-    for coords, cells in voxel_map.slabs():
+    for coords, cells in voxel_map.storage.slabs():
         place = coords[:, [columns, rows]]
         here = (coords[:, normal] == number >> 3) & (place >= low).all(axis=1) & (place <= high).all(axis=1)
         column, row = (place[here] - low).T

@@ -13,7 +13,7 @@ from stereovox.frame import Frame, Scan, UpdateReport
 from stereovox.mapper import AnyMapper, GridMapper, Mapper
 from stereovox.maps import VoxelMap, load_map
 from stereovox.maps.occupancy import OccupancyGrid
-from stereovox.maps.voxel_map import EVERYWHERE
+from stereovox.maps.storage import EVERYWHERE
 from stereovox.products.floor_axes import Heights
 from stereovox.products.live_projection import LiveProjection
 from stereovox.trust.health import Health
@@ -63,11 +63,11 @@ class Mapping:
         voxel_map = self.mapper.map
         if not isinstance(voxel_map, VoxelMap):
             return None
-        coords, cells = voxel_map.blocks_within(*EVERYWHERE)
+        coords, cells = voxel_map.storage.blocks_within(*EVERYWHERE)
 
         def copy() -> VoxelMap:
             copied = VoxelMap(voxel_map.config)
-            copied.insert(coords, cells)
+            copied.storage.insert(coords, cells)
             return copied
 
         return copy
@@ -83,7 +83,7 @@ class Mapping:
             self._begin_floor(load_config(self.config, voxel_size=floor.resolution), floor)
         else:
             saved = load_map(path)
-            saved.check_cells(self.config)  # before the map in use is given up
+            saved.storage.check_cells(self.config)  # before the map in use is given up
             self.close()
             self._begin_space(self.config, saved)
 

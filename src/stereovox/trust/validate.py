@@ -139,7 +139,7 @@ def rigid_pose(frame: Frame | Scan, tolerance: float) -> se3.Transform:
         )
     error = se3.rigidity_error(T)
     if error > tolerance:
-        raise FrameRefused("pose_not_rigid", f"{name_of(frame)}: the pose is no rigid 4x4 motion (off by {error:.2g})")
+        raise FrameRefused("pose_not_rigid", f"{name_of(frame)}: the pose is no rigid 4x4 motion ({_off(T, error)})")
     return se3.orthonormalise(T) if error > EXACT else T
 
 
@@ -185,5 +185,10 @@ def _rigid_mount(scan: Scan, rigidity: float) -> se3.Transform:
     error = se3.rigidity_error(T)
     if error > rigidity or (np.abs(T) >= MAX_POSITION).any():
         detail = "T_base_sensor, where the lidar sits on the robot, is no rigid 4x4 motion"
-        raise FrameRefused("mount_not_rigid", f"{name_of(scan)}: {detail} (off by {error:.2g})")
+        raise FrameRefused("mount_not_rigid", f"{name_of(scan)}: {detail} ({_off(T, error)})")
     return se3.orthonormalise(T) if error > EXACT else T
+
+
+def _off(T: NDArray[np.float64], error: float) -> str:
+    """Return how far an array is from a rigid motion, as text."""
+    return f"off by {error:.2g}" if T.shape == (4, 4) else f"its shape is {T.shape}"

@@ -181,13 +181,13 @@ def test_far_blocks_are_many_distinct_near_and_out_of_reach():
 def test_a_large_map_holds_the_cells_and_frames_do_not_touch_them():
     recording = a_recording()
     mapper = growth._large_map(recording, COARSE, 100_000)
-    before = mapper.map.blocks()
+    before = mapper.map.storage.blocks()
     assert len(before[0]) == 196
     assert mapper.map.cells()[0].shape == (196 * 512, 3)
     assert sum(mapper.map.counts().values()) == 196 * 512
     for frame in recording.frames:
         mapper.add(frame)
-    after = dict(zip(map(tuple, mapper.map.blocks()[0]), mapper.map.blocks()[1], strict=True))
+    after = dict(zip(map(tuple, mapper.map.storage.blocks()[0]), mapper.map.storage.blocks()[1], strict=True))
     assert len(after) > 196
     assert all((after[tuple(coords)] == values).all() for coords, values in zip(*before, strict=True))
 

@@ -57,7 +57,7 @@ def test_an_offer_leaves_all_as_it_was(frames):
                 tried.judge(bad, frame)
         assert tried.add(frame) == other.add(frame) == ""
     assert tried.map.history == other.map.history
-    assert tried.map.blocks()[1].tobytes() == other.map.blocks()[1].tobytes()
+    assert tried.map.storage.blocks()[1].tobytes() == other.map.storage.blocks()[1].tobytes()
 
 
 def test_pairs_of_images_are_spoilt_as_well():
@@ -106,7 +106,7 @@ def test_a_world_that_has_changed_is_believed_after_a_second(before):
     mapper = sv.Mapper(voxel_size=0.1)
     for i in range(20):
         assert mapper.add(source.at(i, before)).refused is None
-    cells = mapper.map.blocks()[1].tobytes()
+    cells = mapper.map.storage.blocks()[1].tobytes()
     reports = [mapper.add(source.at(i, not before)) for i in range(20, 70)]
     refused = [report.refused for report in reports]
     late = refused.index(None)
@@ -117,7 +117,7 @@ def test_a_world_that_has_changed_is_believed_after_a_second(before):
     assert mapper.map.history.settled == {"disagrees_with_map": 1}
     face = [[2.25, y, z] for y in (-0.5, 0.5) for z in (1.0, 1.5)]
     assert set(mapper.map.state(face).tolist()) == {int(sv.State.FREE if before else sv.State.OCCUPIED)}
-    assert cells != mapper.map.blocks()[1].tobytes()
+    assert cells != mapper.map.storage.blocks()[1].tobytes()
 
 
 WINDOWS = {
@@ -148,7 +148,7 @@ def test_a_run_with_bad_frames_may_be_split_anywhere(settings):
     assert {"frozen_image", "disagrees_with_map"} <= reasons
     assert "camera_moved" in reasons or "window.size" in settings
     assert parts.map.history == whole.map.history
-    for mine, theirs in zip(parts.map.blocks(), whole.map.blocks(), strict=True):
+    for mine, theirs in zip(parts.map.storage.blocks(), whole.map.storage.blocks(), strict=True):
         np.testing.assert_array_equal(mine, theirs)
     parts.map.close()
     whole.map.close()
@@ -160,10 +160,10 @@ def test_every_way_to_evidence_is_compared(frames, integrator, more):
     mapper = sv.Mapper(voxel_size=0.2, integrator=integrator, **more)
     for frame in frames[:20]:
         assert mapper.add(frame).refused is None
-    before = mapper.map.blocks()[1].tobytes()
+    before = mapper.map.storage.blocks()[1].tobytes()
     farther = replace(frames[20], depth=1.3 * metres(frames[20]), depth_scale=1.0, reason=None)
     assert mapper.add(farther).refused == "disagrees_with_map"
-    assert mapper.map.blocks()[1].tobytes() == before
+    assert mapper.map.storage.blocks()[1].tobytes() == before
 
 
 def test_it_can_be_switched_off(frames):

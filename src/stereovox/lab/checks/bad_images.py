@@ -66,7 +66,7 @@ class Trial:
             image, evidence, passed = self._offer(frame)
         except FrameRefused as refused:
             return refused.reason
-        self.map.look_from(image.viewpoint)
+        self.map.storage.look_from(image.viewpoint)
         self.map.add(evidence)
         self.map.history.frames += 1
         self._gate.accept(passed)

@@ -134,9 +134,9 @@ def _layer(axis: Any, voxel_map: VoxelMap, at_m: float) -> Any:
 def _colour_bar(figure: Any, axis: Any, mappable: Any, voxel_map: VoxelMap) -> None:
     bar = figure.colorbar(mappable, ax=axis, pad=0.01, fraction=0.03, aspect=25)
     bar.outline.set_visible(False)
-    if voxel_map.cell_format.unknown:
+    if voxel_map.storage.cell_format.unknown:
         stored = np.array([0, 64, 127, 180, 255], np.uint8)
-        bar.set_ticks(voxel_map.cell_format.log_odds(stored).tolist(), labels=stored.astype(str).tolist())
+        bar.set_ticks(voxel_map.storage.cell_format.log_odds(stored).tolist(), labels=stored.astype(str).tolist())
         bar.set_label("cell value", color=GREY)
     else:
         bar.set_label("log-odds", color=GREY)

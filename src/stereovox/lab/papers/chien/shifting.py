@@ -91,7 +91,7 @@ def fly(outside: str, *, length_m: float = 80.0, step: Callable[[], None] = lamb
     for frame in simulation:
         image = prepare(frame, config)
         start = perf_counter()
-        voxel_map.look_from(image.viewpoint)
+        voxel_map.storage.look_from(image.viewpoint)
         ms = 1e3 * (perf_counter() - start)
         voxel_map.add(integrator.evidence(image))
         voxel_map.frames += 1
@@ -109,9 +109,9 @@ def fly(outside: str, *, length_m: float = 80.0, step: Callable[[], None] = lamb
 
 
 def _tiles(voxel_map: RollingMap) -> NDArray[np.float64]:
-    if voxel_map.store is None:
+    if voxel_map.storage.tile_store is None:
         return np.zeros((0, 2, 3))
-    low = np.array(voxel_map.store.tiles()).reshape(-1, 3)
+    low = np.array(voxel_map.storage.tile_store.tiles()).reshape(-1, 3)
     return np.stack([low, low + 1], axis=1) * TILE * voxel_map.voxel_size
 
 

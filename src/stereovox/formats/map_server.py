@@ -366,7 +366,7 @@ def _greys(grid: OccupancyGrid, mode: str) -> tuple[NDArray[np.uint8], float, fl
     if mode == "scale":
         dark = np.where(percent < 100, np.ceil(percent.astype(float) * SCALE_STEPS / 99), 255)
         return np.where(known, 255 - dark, NO_PIXEL).astype(np.uint8), SCALE_STEPS / 255, 0.0
-    states = OccupancyGrid(percent, 1.0, (0, 0, 0), grid.free_below, grid.occupied_above).states
+    states = OccupancyGrid(percent[None], 1.0, (0, 0, 0), grid.free_below, grid.occupied_above).states[0]
     greys = np.full(256, UNKNOWN_PIXEL, np.uint8)
     greys[states == State.FREE], greys[states == State.OCCUPIED] = FREE_PIXEL, OCCUPIED_PIXEL
     return greys, OCCUPIED_THRESH, FREE_THRESH

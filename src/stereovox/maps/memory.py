@@ -94,8 +94,8 @@ def _widest(config: Config) -> float:
         needed = _window_bytes(_as_wide(config, step * -(-least // step)))
         raise ConfigError(
             f"max_memory {format_bytes(config.max_memory or 0)}: "
-            f"a window that holds the view needs {_format_at_least(needed)}; allow more, or set a smaller max_range or "
-            "larger cells"
+            f"a window that holds the view needs {_format_at_least(needed)}; "
+            "allow more, or set a smaller max_range or larger cells"
         )
     return width
 

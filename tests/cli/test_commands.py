@@ -158,7 +158,7 @@ def test_ctrl_c_saves_what_there_is(recording, tmp_path, capsys, monkeypatch):
 
     monkeypatch.setattr(Mapper, "add", add_three)
     assert run("map", recording, "--out", tmp_path / "m", "--voxel-size", 0.1) == 130
-    assert "resume goes on there" in capsys.readouterr().err
+    assert "--resume" in capsys.readouterr().err
     assert sv.load_map(tmp_path / "m").frames == 3
 
 

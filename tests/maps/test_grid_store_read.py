@@ -72,7 +72,7 @@ def test_shapes_that_lie(tmp_path, parts, name, shape):
 def test_pickles_are_not_opened(tmp_path, parts):
     file = io.BytesIO()
     np.save(file, np.array([print], object), allow_pickle=True)
-    assert "tells of (1,) object" in refusal(packed(tmp_path / "a.npz", {**parts, "coords.npy": file.getvalue()}))
+    assert "claims (1,) object" in refusal(packed(tmp_path / "a.npz", {**parts, "coords.npy": file.getvalue()}))
 
 
 @pytest.mark.parametrize("kind", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])

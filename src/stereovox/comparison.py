@@ -39,21 +39,27 @@ FIRM = 0.4
 
 
 class Comparison:
-    """Makes the evidence of a frame and lets the gate decide whether to accept it."""
+    """Compares the evidence of each frame with the map, and lets the gate decide whether to accept the frame."""
 
     def __init__(self, config: Config, gate: Gate):
         self._gate, self._compares = gate, config.trust.max_disagreement < 1
         self._firm = PerCamera(partial(_firm, make_sensor(config.sensor), config))
         self._prepared = False
 
-    def evidence(
-        self, frame: AnyFrame, image: DepthImage, passed: Passed, integrator: Integrator, voxel_map: VoxelMap
+    def check(
+        self,
+        frame: AnyFrame,
+        image: DepthImage,
+        evidence: Evidence,
+        passed: Passed,
+        integrator: Integrator,
+        voxel_map: VoxelMap,
     ) -> tuple[Evidence, Passed]:
-        """Return the evidence of an image, and what the gate needs to accept the frame.
+        """Return the evidence to add, and what the gate needs to accept the frame.
 
-        passed: what `Gate.check` returned. Raises FrameRefused as `Gate.check_agreement`.
+        evidence: what `integrator` made of `image`. passed: what `Gate.check` returned. Raises FrameRefused as
+        `Gate.check_agreement`.
         """
-        evidence = integrator.evidence(image)
         if not self._compares:
             return evidence, passed
         self._prepare(voxel_map, image)

@@ -138,7 +138,8 @@ class Mapper:
             image = quality.depth.image(depth_frame)
             prepared = perf_counter()
             passed = offer.check(image)
-            evidence, passed = self._comparison.evidence(frame, image, passed, quality.integrator, self.map)
+            evidence = quality.integrator.evidence(image)
+            evidence, passed = self._comparison.check(frame, image, evidence, passed, quality.integrator, self.map)
             with self.map.lock:
                 self.map.storage.check_room(evidence)
                 self.map.storage.look_from(image.viewpoint)

@@ -33,7 +33,7 @@ SOURCES = {
     "simulation": "stereovox.simulate.simulation:Simulation",
     "bag": "stereovox.sources.bags.recording:Bag",
 }
-"""Asked in this order, then those of other packages (entry points in the group `stereovox.opening`)."""
+"""Asked in this order, then those of other packages (entry points in the group `stereovox.sources`)."""
 STREAMS = {"realsense": "stereovox.sources.realsense:RealSense"}
 """Live cameras, which cannot be rewound; entry points in the group `stereovox.streams`."""
 ROBOTS = {

@@ -121,10 +121,10 @@ def _print_result(result: dict[str, Any], reports: list[UpdateReport], out: Path
     if result.get("dropped"):
         say(f"  {result['dropped']} more came while the map was busy and were dropped; see --set deadline_ms=")
     if reduced := [f"{number} {quality}" for quality, number in result["ways"].items() if quality != FULL]:
-        say(f"for want of time: {', '.join(reduced)}")
+        say(f"reduced quality to meet the deadline: {', '.join(reduced)}")
     if result["match_ms"]["max"]:  # stereo pairs
-        say(f"a pair: matching {milliseconds(result['match_ms'])}")
-    say(f"a frame: depth {milliseconds(result['depth_ms'])}; map {milliseconds(result['integrate_ms'])}")
+        say(f"per pair: matching {milliseconds(result['match_ms'])}")
+    say(f"per frame: depth {milliseconds(result['depth_ms'])}; map {milliseconds(result['integrate_ms'])}")
     say(cells_line(result))
     if not result["occupied"]:
         say(f"note: {_why_empty(result, window)}")

@@ -50,7 +50,7 @@ def trajectory_error(track: Track, robot: Robot) -> dict[str, Any]:
 
     error = trajectory.trajectory_error(track, robot.truth)
     off = f"{100 * error.position_rms_m:.1f} cm (RMS) and {error.yaw_rms_deg:.2f} degrees"
-    say(f"laid on the true way as a whole, it is off by {off}")
+    say(f"aligned with the true trajectory as a whole, the error is {off}")
     return {"position_rms_m": error.position_rms_m, "yaw_rms_deg": error.yaw_rms_deg}
 
 

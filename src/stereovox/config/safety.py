@@ -13,7 +13,7 @@ class TrustConfig(Section):
 
     ordered: the stamps of each sensor must not go back; `false` for runs that repeat or reverse a recording.
     clock_reset_s: a stamp that steps by more than this many seconds backwards is a clock that was reset.
-    max_gap_s: so is one that is more than this many seconds ahead.
+    max_gap_s: a stamp more than this many seconds ahead counts as a clock reset, too.
     max_speed_mps, max_turn_dps: metres and degrees a second beyond which a pose has jumped.
     max_pose_off_s: seconds that a pose may be extrapolated.
     settle_s: after a jump or a reset, frames that agree with each other for this long are accepted again; 0: at once.

@@ -288,8 +288,8 @@ def _passed(view, table, cz):
 
 
 @cell
-def _clear(view, table, windows, cx, cy, cz, most, depths, measured, out):
-    """Write the negative evidence of the farthest pixel in a window of about the cell's size, at most `most`.
+def _clear(view, table, windows, cx, cy, cz, lowest, depths, measured, out):
+    """Write the negative evidence of the farthest pixel in a window of about the cell's size, never below `lowest`.
 
     depths, measured: (LAYER,) scratch.
     """
@@ -301,8 +301,8 @@ def _clear(view, table, windows, cx, cy, cz, most, depths, measured, out):
         cells = slice(layer, layer + LAYER)
         steps = view.steps[0, cells], view.steps[1, cells], view.steps[2, cells]
         _measure(view, windows, max(NEAR_PLANE, table.blind), cx, cy, cz, steps, depths, measured)
-        if _classify_layer(depths, measured, before, table.behind, most, out[cells]):
-            _look_up(view, table, depths, measured, most, out[cells])
+        if _write_free_layer(depths, measured, before, table.behind, lowest, out[cells]):
+            _look_up(view, table, depths, measured, lowest, out[cells])
 
 
 @cell
@@ -332,19 +332,19 @@ def _measure(view, windows, nearest, cx, cy, cz, steps, depths, measured):
 
 
 @cell
-def _classify_layer(depths, measured, before, behind, free, out):
-    """Write `free` for cells wholly before their measurement, else 0; return whether any lies near it."""
+def _write_free_layer(depths, measured, before, behind, lowest, out):
+    """Write `lowest` for cells wholly before their measurement, else 0; return whether any lies near it."""
     near = np.int32(0)
     for c in range(LAYER):
         ahead = measured[c] - depths[c]
-        out[c] = np.int16(free if ahead > before else np.int32(0))
+        out[c] = np.int16(lowest if ahead > before else np.int32(0))
         near |= np.int32((ahead <= before) & (ahead >= -behind) & (measured[c] > ZERO))
     return near != 0
 
 
 @cell
-def _look_up(view, table, depths, measured, most, out):
-    """Write the sensor table's evidence on cells that are not wholly before their measurement, at most `most`."""
+def _look_up(view, table, depths, measured, lowest, out):
+    """Write the sensor table's evidence on cells that are not wholly before their measurement, never below `lowest`."""
     last_row = np.int32(table.hit.size - 1)
     columns, clear = np.int32(table.clear.shape[1]), table.clear.reshape(table.clear.size)
     last_column, middle_column = np.float32(columns - 1), np.float32(columns) * HALF
@@ -353,7 +353,7 @@ def _look_up(view, table, depths, measured, most, out):
         row = min(np.int32(min(max(d, ZERO), view.max_range) * table.rows_per_metre), last_row)
         t = (depths[c] - d) * table.columns_per_metre[index(row)] + middle_column
         k = np.int32(min(max(t, ZERO), last_column))
-        e = max(clear[index(np.int32(np.int32(row * columns) + k))], most)
+        e = max(clear[index(np.int32(np.int32(row * columns) + k))], lowest)
         out[c] = np.int16(e if d > ZERO else np.int32(0))
 
 

@@ -11,7 +11,7 @@ from stereovox.maps._cells import added, find, find_or_insert
 def add_tiles(table, coords, count, cells, wanted, values, unknown, prior, lowest, highest):
     """Add `values` (n, 4096) to tiles `wanted` (n, 3) with clamping; return how many cells changed.
 
-    As `_cpu.add_values` does to blocks: a tile whose values are all zero is not made, cells without evidence start from
+    As `_add.add` does for blocks: a tile whose values are all zero is not made, cells without evidence start from
     `prior`, and a sum of just `unknown` is stored as one more.
     """
     changed = 0

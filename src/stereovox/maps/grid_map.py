@@ -342,7 +342,7 @@ class GridMap(Guarded, OnStorage):
     if not TYPE_CHECKING:
 
         def __getattr__(self, name: str) -> Any:
-            if name == "insert":  # could be reached here in version 0.1.0
+            if name == "insert":  # was once reached here
                 return self.storage.insert
             raise AttributeError(f"'{type(self).__name__}' object has no attribute '{name}'")
 

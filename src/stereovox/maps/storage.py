@@ -127,7 +127,7 @@ class Storage(Guarded):
             self._times.forget(self._pool, (before or viewpoint).stamp_ns, viewpoint.stamp_ns)
 
     def check_room(self, evidence: Evidence) -> None:
-        """Raise FrameRefused `memory_full` where `evidence` needs more memory than the map may take."""
+        """Do nothing: memory is not bounded here. Storage that is raises FrameRefused `memory_full`."""
 
     def agreement(self, evidence: Evidence, firm: int) -> Agreement:
         """Return how far `evidence` agrees with what the map is sure of.

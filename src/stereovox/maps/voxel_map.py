@@ -24,7 +24,7 @@ from stereovox.maps.store import read_map, save_map
 from stereovox.threads import Guarded
 
 IN_STORAGE = frozenset({"blocks_within", "insert", "listeners", "slabs", "timed"})
-"""Names of `Storage` that could be reached at the map itself in version 0.1.0, and still can."""
+"""Names of `Storage` that were once reached at the map itself, and still are."""
 
 
 class OnBlocks(OnStorage):

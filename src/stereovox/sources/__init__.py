@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings and live cameras: one module per layout."""
+"""Layouts of recordings, live cameras, and the readers of files that they share."""

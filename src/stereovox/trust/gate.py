@@ -97,8 +97,8 @@ class Gate:
 
     A frame that jumped, or whose clock was reset, is refused, and so are the frames after it that belong to it. Once
     they have agreed with each other for `trust.settle_s` (by their stamps) they are accepted again, so that a tracker
-    that relocalised is not refused for ever. A frame belongs to the refused ones, and not to the trusted one, where
-    the motion from there would be slower. A frame that fits the trusted one ends the wait of the others.
+    that relocalised is not refused for ever. A frame counts with the refused ones where coming from them takes a lower
+    speed than from the trusted one. A frame that fits the trusted one ends the wait of the others.
     """
 
     def __init__(self, config: Config, history: History):

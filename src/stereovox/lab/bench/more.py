@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Further measurements by name."""
+"""Measurements beyond time per frame, by name: start, overhead, threads, growth with path and map."""
 
 from __future__ import annotations
 

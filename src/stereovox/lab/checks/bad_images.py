@@ -87,7 +87,8 @@ class Trial:
     def _offer(self, frame: AnyFrame) -> tuple[DepthImage, Evidence, Passed]:
         image = self._image(frame)
         passed = self._gate.check(frame, image)
-        return image, *self._comparison.evidence(frame, image, passed, self.quality.integrator, self.map)
+        evidence = self.quality.integrator.evidence(image)
+        return image, *self._comparison.check(frame, image, evidence, passed, self.quality.integrator, self.map)
 
     def _image(self, frame: AnyFrame) -> DepthImage:
         return self.quality.depth.image(self.quality.depth.matched(frame))

@@ -8,9 +8,9 @@ for frame in sv.open_source("sim:room", frames=":10"):  # or a folder
     report = mapper.add(frame)  # UpdateReport: milliseconds, cells changed, why it was refused (None if it was not)
 
 m = mapper.map
-points = [[3.0, 0.0, 1.0], [3.0, 0.5, 1.0]]  # metres, world frame
-m.state(points)  # 0 unknown, 1 free, 2 tentative, 3 occupied: sv.State
-m.probability(points)  # 0.5 where nothing is known
+points = [[4.0, -2.0, 1.0], [2.15, -2.35, 0.45], [3.0, 0.0, 1.0]]  # metres, world frame
+print(m.state(points))  # 0 unknown, 1 free, 2 tentative, 3 occupied: sv.State
+print(m.probability(points))  # 0.5 where nothing is known
 m.occupied()  # (N, 3) centres of all occupied cells
 
 m.save("room.svox")

@@ -259,7 +259,7 @@ class FloorRun:
         return GridMapper(self.config, voxel_size=size, resume=before)
 
     def _slam(self, progress: Progress) -> Track:
-        self._notify("finding the robot's way by SLAM; poses could also be localised in a map, or the odometry's own")
+        self._notify("finding the robot's trajectory by SLAM; others: poses=MAP.yaml to localise in a map, poses=odometry")
         found = slam_robot(self.robot, self.config, progress)
         self._notify_unless_empty(refused_line(found.refused))
         return found.track

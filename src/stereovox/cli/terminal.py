@@ -32,7 +32,7 @@ def say_about_compiling() -> None:
     if folder is None:
         say("no folder for compiled kernels can be written: they are compiled in every run (set STEREOVOX_CACHE)")
     elif not any(folder.rglob("*.nbi")):
-        say("compiling the kernels, once on this machine: about half a minute")
+        say("compiling the kernels, once on this machine: 20 to 40 seconds")
 
 
 @contextmanager

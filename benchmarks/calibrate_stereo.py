@@ -23,7 +23,7 @@ import numpy as np
 from stereovox.calibrate import stereo
 from stereovox.calibrate.chessboard import Board
 from stereovox.calibrate.stereo import BoardPair, calibrate_stereo, epipolar_errors
-from stereovox.calibrate.stereo_fit import GUESSES, MANY, Corners, Fit, fit_stereo
+from stereovox.calibrate.stereo_fit import FULL_MODEL_VIEWS, GUESSES, Corners, Fit, fit_stereo
 from stereovox.cameras.lenses import Lens
 from stereovox.cameras.rigs import Eyes
 from stereovox.errors import StereovoxError
@@ -123,7 +123,7 @@ def opencv(model: str, size: tuple[int, int], board: np.ndarray, left: Corners, 
 
 
 def _pinholes(size: tuple[int, int], board: np.ndarray, left: Corners, right: Corners) -> Found:
-    count, flags = (4, cv2.CALIB_FIX_K3) if len(left) < MANY else (5, 0)
+    count, flags = (4, cv2.CALIB_FIX_K3) if len(left) < FULL_MODEL_VIEWS else (5, 0)
     points = [board.astype(np.float32)] * len(left)
     a, b = ([corners.astype(np.float32) for corners in many] for many in (left, right))
     (K1, d1), (K2, d2) = (

@@ -11,7 +11,7 @@ with `sys.setprofile`, in a process that made the trip before: modules are impor
 
 files: source files with a function that is entered, kernels included where Python calls them. lines: what these files
 hold. moves: how often a function is entered that lies in another file than the one entered before. --house adds what
-`benchmarks/house.py` says. Another checkout is measured with `PYTHONPATH=OTHER/src`.
+`benchmarks/house.py` says. A later checkout is measured with `PYTHONPATH=OTHER/src`.
 """
 
 from __future__ import annotations

@@ -39,7 +39,7 @@ HOMES = {
     "embreex": r"simulate/.*",
     "geometry_msgs": r"ros/.*",
     "gtsam": r"localize/.*",
-    "matplotlib": r"(view|viewer|report|lab|products)/.*",
+    "matplotlib": r"(view|viewer|report|lab)/.*",
     "nav_msgs": r"ros/.*",
     "numba": r"(.*/)?_[a-z]\w*\.py",
     "octomap": r"lab/.*",
@@ -59,7 +59,6 @@ HOMES = {
     "std_srvs": r"ros/.*",
     "tf2_msgs": r"ros/.*",
     "trimesh": r"(formats|simulate)/.*",
-    "typer": r"cli/.*",
     "viser": r"viewer/.*",
     "zarr": r"maps/.*",
 }
@@ -80,8 +79,8 @@ def imported(tree: ast.Module, package: list[str]) -> Iterator[tuple[int, str]]:
 
 
 def is_kernel_file(file: str) -> bool:
-    """Tell whether a file holds kernels: `_name.py`, but for slow twins."""
-    return bool(re.fullmatch(r"(.*/)?_(?!.*reference)[a-z]\w*\.py", file))
+    """Return whether a file holds kernels: `_name.py`."""
+    return bool(re.fullmatch(r"(.*/)?_[a-z]\w*\.py", file))
 
 
 def broken_rules(root: Path) -> list[str]:

@@ -15,7 +15,7 @@ from types import TracebackType
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from stereovox.config import Config, load_config
 from stereovox.errors import StereovoxError, did_you_mean
@@ -36,7 +36,15 @@ from stereovox.maps.grid_map import GridMap
 from stereovox.maps.lock import only_writer_of_floor
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.opening import open_robot, parse_slice
-from stereovox.run import CHECKPOINT_S, Checkpoints, MapResult, Observer, add_all, interrupt_between_steps
+from stereovox.run import (
+    CHECKPOINT_S,
+    Checkpoints,
+    MapResult,
+    Observer,
+    add_all,
+    first_refusal,
+    interrupt_between_steps,
+)
 from stereovox.safe_io import FLOOR_ENDINGS, FLOOR_READABLE, check_file
 from stereovox.sources.robots.robot import Robot, in_time_order
 
@@ -136,7 +144,7 @@ class FloorRun:
         self.out = Path(out)
         self._source, self._profile, self._overrides = source, profile, overrides
         self._poses, self._use, self._frames, self._mode = None if poses is None else str(poses), use, frames, mode
-        self._start = None if start is None else np.asarray(start, float)
+        self._start = None if start is None else _pose_of(start)
         self._resumed = (self.out if resume is True else Path(resume)) if resume else None
         self._checkpoint_s, self._notify, self._open = checkpoint_s, notify, ExitStack()
 
@@ -199,7 +207,7 @@ class FloorRun:
         with interrupt_between_steps() as check:
             reports = add_all(self.mapper, readings, self._checkpoints, check, observers, self._stopped)
             if not self.mapper.map.frames:
-                raise StereovoxError(f"not one reading could be used, no map is written ({reports[0].detail})")
+                raise StereovoxError(f"not one reading could be used, no map is written ({first_refusal(reports)})")
             self._checkpoints.save(len(reports))
         return MapResult(self.mapper.map, self.out, reports, track=track)
 
@@ -259,7 +267,8 @@ class FloorRun:
         return GridMapper(self.config, voxel_size=size, resume=before)
 
     def _slam(self, progress: Progress) -> Track:
-        self._notify("finding the robot's trajectory by SLAM; others: poses=MAP.yaml to localise in a map, poses=odometry")
+        others = "others: poses (--poses) MAP.yaml to localise in a map, or odometry"
+        self._notify(f"finding the robot's trajectory by SLAM; {others}")
         found = slam_robot(self.robot, self.config, progress)
         self._notify_unless_empty(refused_line(found.refused))
         return found.track
@@ -274,3 +283,11 @@ class FloorRun:
     def _notify_unless_empty(self, line: str) -> None:
         if line:
             self._notify(line)
+
+
+def _pose_of(start: ArrayLike) -> NDArray[np.float64]:
+    """Return x, y and yaw as an array. Raises StereovoxError for what is not numbers."""
+    try:
+        return np.asarray(start, float)
+    except (TypeError, ValueError):
+        raise StereovoxError(f"start {start!r}: give x, y in metres and the yaw, three finite numbers") from None

@@ -15,6 +15,7 @@ from stereovox.comparison import Comparison
 from stereovox.config import Config, load_config
 from stereovox.deadline import Deadline
 from stereovox.depth import DepthPipeline
+from stereovox.errors import MapFileError
 from stereovox.frame import AnyFrame, Scan
 from stereovox.frame import UpdateReport as UpdateReport
 from stereovox.intake import Intake
@@ -282,6 +283,8 @@ class GridMapper:
             return self.map.save(path)
         from stereovox.formats.map_server import write_map_server
 
+        if not any(self.map.counts().values()):
+            raise MapFileError(f"{path}: nothing is mapped so far; save it later")
         write_map_server(self.map.occupancy(), path, mode=mode)
 
     def close(self) -> None:

@@ -201,7 +201,7 @@ class MapRun:
             reports = self._add_all(check, observers)
             if not self.mapper.map.frames:
                 raise StereovoxError(
-                    f"{self.source.name}: not one frame could be used, no map is written ({_first_refusal(reports)})"
+                    f"{self.source.name}: not one frame could be used, no map is written ({first_refusal(reports)})"
                 )
             self._checkpoints.save(frames_offered(self.mapper))
         return MapResult(self.mapper.map, self.out, reports, self.source.dropped)
@@ -347,7 +347,8 @@ def _saved_from_start(voxel_map: VoxelMap, out: Path) -> Iterator[None]:
             remove_map(out)
 
 
-def _first_refusal(reports: list[UpdateReport]) -> str:
+def first_refusal(reports: list[UpdateReport]) -> str:
+    """Return why the first of the refused frames was refused, for the error that none could be used."""
     return next((report.detail for report in reports if report.refused), "the source is empty")
 
 
@@ -360,7 +361,7 @@ class Checkpoints:
 
     def __init__(self, save: Callable[[], None], out: object, seconds: float, clock: Callable[[], float] = monotonic):
         if not (isfinite(seconds) and seconds >= 0):
-            raise StereovoxError(f"a checkpoint every {seconds:g} s cannot be; give seconds, or 0 for none")
+            raise StereovoxError(f"checkpoint_s {seconds:g}: give seconds, or 0 for none")
         self._save, self._out, self._clock = save, out, clock
         self._seconds = seconds or inf
         self._due = clock() + self._seconds

@@ -73,7 +73,7 @@ def test_without_seconds_nothing_is_saved_before_the_end():
 @pytest.mark.parametrize("seconds", ["-1", "nan", "inf"])
 def test_seconds_that_cannot_be_are_one_line(tmp_path, capsys, seconds):
     assert mapped(tmp_path / "m", f"--checkpoint={seconds}") == 2
-    assert f"a checkpoint every {seconds} s cannot be; give seconds, or 0" in capsys.readouterr().err
+    assert f"checkpoint_s {seconds}: give seconds, or 0" in capsys.readouterr().err
     assert names(tmp_path) == []
 
 

@@ -181,3 +181,10 @@ def test_mistakes_end_in_one_line(words, said, tmp_path, capsys, monkeypatch):
     assert len(lines) == 1
     assert said in lines[0]
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", ["mode", "use", "notify", "source"])
+def test_settings_named_as_arguments_are_unknown_settings(bag, tmp_path, capsys, name):
+    assert f"unknown setting '{name}'" in refused(
+        capsys, "grid", bag, "--out", tmp_path / "a.yaml", "--set", f"{name}=x"
+    )

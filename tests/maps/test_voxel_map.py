@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stereovox.config import load_config
-from stereovox.errors import MapFileError
+from stereovox.errors import MapFileError, StereovoxError
 from stereovox.maps import State, VoxelMap, load_map
 from stereovox.maps.blocks import blocks_of_cells
 from stereovox.maps.evidence import Evidence
@@ -246,3 +246,31 @@ def test_the_blocks_of_cells_are_those_of_plain_rows(reach):
     np.testing.assert_array_equal(blocks, wanted)
     np.testing.assert_array_equal(of_cell, of_row.ravel())
     assert [part.shape for part in blocks_of_cells(cells[:0])] == [(0, 3), (0,)]
+
+
+@pytest.mark.parametrize(
+    "indices",
+    [[[np.nan, 0, 0]], [[0.5, 0, 0]], [[2**30, 0, 0]], [[-(2**40), 0, 0]], [[1j, 0, 0]], [["a", 0, 0]], [[0], [1, 2]]],
+)
+def test_cells_that_are_none_are_refused(indices):
+    with pytest.raises(StereovoxError, match="indices"):
+        VoxelMap.from_cells(load_config(), indices, [1.0])
+
+
+@pytest.mark.parametrize("log_odds", [[np.nan], ["a"], None])
+def test_log_odds_that_are_none_are_refused(log_odds):
+    with pytest.raises(StereovoxError, match="log_odds"):
+        VoxelMap.from_cells(load_config(), [[0, 0, 0]], log_odds)
+
+
+def test_blocks_of_another_shape_are_refused():
+    voxel_map = VoxelMap(load_config())
+    with pytest.raises(StereovoxError, match=r"cells \(1, 5\)"):
+        voxel_map.insert(np.zeros((1, 3), np.int32), np.zeros((1, 5), np.int16))
+    assert voxel_map.counts() == {"free": 0, "tentative": 0, "occupied": 0}
+
+
+def test_listeners_can_be_replaced():
+    voxel_map, seen = VoxelMap(load_config()), []
+    voxel_map.listeners = [seen.append]
+    assert voxel_map.storage.listeners == [seen.append]

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from stereovox.cli.localize import add_start, parse_start
 from stereovox.cli.options import add_checkpoint, overrides
-from stereovox.cli.robots import add_robot, picture_line
+from stereovox.cli.robots import add_robot, picture_line, settings_of
 from stereovox.cli.terminal import (
     cells_line,
     milliseconds,
@@ -52,10 +52,11 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Map the recording, save the map and print a summary."""
+    named = {name: value for name, value in overrides(arguments).items() if name == "voxel_size"}
     return run_floor(
-        arguments.source, arguments.out, profile=arguments.profile, poses=arguments.poses, use=arguments.use,
+        arguments.source, arguments.out, profile=settings_of(arguments), poses=arguments.poses, use=arguments.use,
         frames=arguments.frames, start=parse_start(arguments.start), mode=arguments.mode,
-        resume=arguments.resume or False, checkpoint_s=arguments.checkpoint, **overrides(arguments),
+        resume=arguments.resume or False, checkpoint_s=arguments.checkpoint, **named,
     )  # fmt: skip
 
 
@@ -65,7 +66,7 @@ def run_floor(source: str, out: str, **settings: Any) -> dict[str, Any]:
 
     with FloorRun(source, out, notify=say, **settings) as run:
         say_about_compiling()
-        with progress_of_steps("finding the way") as progress:
+        with progress_of_steps("finding the trajectory") as progress:
             run.find_track(progress)
         with progress_of(run.remaining, "mapping") as bar:
             mapped = run.finish([bar])

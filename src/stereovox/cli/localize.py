@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from stereovox.cli.robots import add_robot, open_robot, settings_of, trajectory_error
+from stereovox.cli.robots import add_robot, open_noting, print_trajectory_error, settings_of
 from stereovox.cli.terminal import progress_of_steps, say, say_about_compiling
 from stereovox.errors import StereovoxError
 from stereovox.safe_io import check_file
@@ -51,7 +51,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
     out, config = check_file(arguments.out, (*TEXT, *BAGS)), settings_of(arguments)
     start, grid = parse_start(arguments.start), read_map_server(arguments.map)
     check_start(start, grid)
-    robot = open_robot(arguments.source)
+    robot = open_noting(arguments.source)
     say_about_compiling()
     with progress_of_steps("localising") as progress:
         track = localise_robot(robot, grid, config, start, progress)
@@ -64,7 +64,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
     say(f"the robot ended at x {x:.2f} m, y {y:.2f} m, {np.degrees(yaw):.0f} degrees")
     refused = {"scans_refused": sum(track.refused.values()), "refused": dict(track.refused)}
     found = {"poses": len(track.stamps_ns), "last": [x, y, float(np.degrees(yaw))], "fit": fit}
-    return {**found, **refused, **trajectory_error(track, robot)}
+    return {**found, **refused, **print_trajectory_error(track, robot)}
 
 
 def _save(track: Track, out: Path) -> None:

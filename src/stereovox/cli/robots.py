@@ -32,7 +32,7 @@ def settings_of(arguments: Namespace) -> Config:
     return load_config(arguments.profile, **overrides(arguments))
 
 
-def open_robot(name: str) -> Robot:
+def open_noting(name: str) -> Robot:
     """Open the recording and print its notes."""
     from stereovox import opening
 
@@ -42,7 +42,7 @@ def open_robot(name: str) -> Robot:
     return robot
 
 
-def trajectory_error(track: Track, robot: Robot) -> dict[str, Any]:
+def print_trajectory_error(track: Track, robot: Robot) -> dict[str, Any]:
     """Print and return the error of the trajectory; empty where the true one is not known."""
     if robot.truth is None:
         return {}

@@ -9,7 +9,7 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 from typing import Any
 
-from stereovox.cli.robots import open_robot
+from stereovox.cli.robots import open_noting
 from stereovox.cli.terminal import command_line, progress_bar, say, size
 from stereovox.safe_io import check_file
 
@@ -27,7 +27,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
     from stereovox.simulate.floors.bag import write_bag
 
     out = check_file(arguments.out, (".bag", ".mcap", ".db3"))
-    robot = open_robot(arguments.source)
+    robot = open_noting(arguments.source)
     with progress_bar() as bar:
         task = bar.add_task("driving", note="")
         write_bag(robot, out, lambda done, total: bar.update(task, completed=done, total=total))

@@ -12,7 +12,7 @@ from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Any
 
-from stereovox.cli.robots import add_robot, open_robot, picture_line, settings_of, trajectory_error
+from stereovox.cli.robots import add_robot, open_noting, picture_line, print_trajectory_error, settings_of
 from stereovox.cli.terminal import progress_of_steps, say, say_about_compiling
 from stereovox.safe_io import FLOOR_ENDINGS, check_file
 
@@ -52,7 +52,7 @@ def _map(arguments: Namespace, out: Path) -> dict[str, Any]:
     config = settings_of(arguments)
     if arguments.relations is not None:
         read_relations(Path(arguments.relations))  # raises for a bad file before the work
-    robot = open_robot(arguments.source)
+    robot = open_noting(arguments.source)
     say_about_compiling()
     start = perf_counter()
     with progress_of_steps("matching scans") as progress:
@@ -76,7 +76,7 @@ def _print_result(robot: Robot, found: SlamResult, seconds: float) -> dict[str, 
         say(refused_line(found.refused))
     scans = {"scans": len(track.stamps_ns), "scans_refused": sum(found.refused.values()), "refused": found.refused}
     times = {"closures": found.closures, "seconds": seconds, "recorded_s": recorded}
-    return {**scans, **times, **trajectory_error(track, robot)}
+    return {**scans, **times, **print_trajectory_error(track, robot)}
 
 
 def _score(found: SlamResult, relations: str | None) -> dict[str, Any]:

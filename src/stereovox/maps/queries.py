@@ -162,6 +162,14 @@ def _each(states: Iterable[int]) -> NDArray[np.uint8]:
     return np.array([1 << state for state in states], np.uint8)
 
 
+def numbers_of(values: ArrayLike, name: str) -> NDArray[np.float64]:
+    """Return numbers of any shape; raises StereovoxError for what is none, NaN among it."""
+    numbers = _numbers(values, name, "numbers").astype(float)
+    if np.isnan(numbers).any():
+        raise StereovoxError(f"{name}: NaN is no value; give numbers")
+    return numbers
+
+
 def _numbers(values: ArrayLike, name: str, wanted: str) -> NDArray:
     """Return whole or real numbers of any shape."""
     try:

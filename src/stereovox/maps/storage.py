@@ -16,7 +16,7 @@ from stereovox.config import Config
 from stereovox.errors import ConfigError, StereovoxError
 from stereovox.frame import Viewpoint
 from stereovox.maps import _add, queries
-from stereovox.maps.blocks import SIDE, StoredCells, blocks_of_cells
+from stereovox.maps.blocks import CELLS, SIDE, StoredCells, blocks_of_cells
 from stereovox.maps.cell_format import CellRules
 from stereovox.maps.cell_pool import CellPool
 from stereovox.maps.cell_times import NEVER, CellTimes
@@ -114,7 +114,12 @@ class Storage(Guarded):
         self.take_history(other)
 
     def insert(self, coords: NDArray[np.int32], cells: NDArray[np.integer]) -> None:
-        """Set whole blocks: coordinates (n, 3), cells (n, 512) as stored; what stood there before is lost."""
+        """Set whole blocks: coordinates (n, 3), cells (n, 512) as stored; what stood there before is lost.
+
+        Raises StereovoxError for arrays of other shapes.
+        """
+        if coords.ndim != 2 or coords.shape[1] != 3 or cells.shape != (len(coords), CELLS):
+            raise StereovoxError(f"blocks are {coords.shape} with cells {cells.shape}; give (n, 3) and (n, {CELLS})")
         cells = np.clip(cells, self.rules.lowest, self.rules.highest)
         self._pool.put(coords, cells.astype(self.cell_format.dtype, copy=False))
         if self._times is not None:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stereovox.config import Config
+from stereovox.errors import StereovoxError
 from stereovox.frame import Viewpoint
 from stereovox.maps import queries
 from stereovox.maps.blocks import CELLS, SIDE, blocks_of_cells
@@ -23,7 +24,7 @@ from stereovox.maps.storage import OnStorage, Storage
 from stereovox.maps.store import read_map, save_map
 from stereovox.threads import Guarded
 
-IN_STORAGE = frozenset({"blocks_within", "insert", "listeners", "slabs", "timed"})
+IN_STORAGE = frozenset({"blocks_within", "insert", "slabs", "timed"})
 """Names of `Storage` that were once reached at the map itself, and still are."""
 
 
@@ -38,6 +39,15 @@ class OnBlocks(OnStorage):
     @viewpoint.setter
     def viewpoint(self, viewpoint: Viewpoint | None) -> None:
         self.storage.viewpoint = viewpoint
+
+    @property
+    def listeners(self) -> list[Callable[[Evidence], None]]:
+        """Called with the evidence after every `add`, the lock held; see `Storage`."""
+        return self.storage.listeners
+
+    @listeners.setter
+    def listeners(self, listeners: list[Callable[[Evidence], None]]) -> None:
+        self.storage.listeners = listeners
 
 
 class VoxelMap(Guarded, OnBlocks):
@@ -77,11 +87,11 @@ class VoxelMap(Guarded, OnBlocks):
             The map, of no frames.
 
         Raises:
-            StereovoxError: The arrays are of other shapes.
+            StereovoxError: The arrays are of other shapes, indices no whole numbers or too large, log-odds no numbers.
         """
         voxel_map = cls(config)
         rules, unknown = voxel_map.storage.rules, voxel_map.storage.cell_format.unknown
-        indices, log_odds = _cells_of(indices).astype(np.int64, copy=False), np.asarray(log_odds, float)
+        indices, log_odds = _whole(_cells_of(indices)), queries.numbers_of(log_odds, "log_odds")
         if log_odds.shape not in {(), (len(indices),)}:
             raise queries.shape_error("log_odds", log_odds, f"({len(indices)},), one for each cell")
         blocks, of_cell = blocks_of_cells(indices)
@@ -403,12 +413,22 @@ def cells_where(
 
 def _cells_of(indices: ArrayLike) -> NDArray:
     """Return cell indices (N, 3); raises StereovoxError for another shape, but for [] and one cell (3,)."""
-    cells = np.asarray(indices)
-    if cells.shape in {(0,), (3,)}:
-        return cells.reshape(-1, 3)
-    if cells.ndim != 2 or cells.shape[1] != 3:
-        raise queries.shape_error("indices", cells, "(N, 3) whole numbers")
-    return cells
+    if not (isinstance(indices, np.ndarray) and indices.dtype.kind in "iu"):
+        return queries.points_of(indices, "indices", wanted="(N, 3) whole numbers")
+    if indices.shape in {(0,), (3,)}:
+        return indices.reshape(-1, 3)
+    if indices.ndim != 2 or indices.shape[1] != 3:
+        raise queries.shape_error("indices", indices, "(N, 3) whole numbers")
+    return indices
+
+
+def _whole(cells: NDArray) -> NDArray[np.int64]:
+    """Return indices (N, 3) as int64; raises StereovoxError for fractions, NaN, and cells beyond INDEX_LIMIT."""
+    if cells.dtype.kind == "f" and not (np.isfinite(cells) & (cells == np.floor(cells))).all():
+        raise StereovoxError("indices: give whole numbers, for example floor(points / voxel_size)")
+    if cells.size and not (cells.min() > -INDEX_LIMIT and cells.max() < INDEX_LIMIT):
+        raise StereovoxError(f"indices: from {cells.min():g} to {cells.max():g}; give less than 2^30 either way")
+    return cells.astype(np.int64, copy=False)
 
 
 def _span(coords: NDArray[np.int32], known: NDArray[np.bool_]) -> tuple[list[int], list[int]] | None:

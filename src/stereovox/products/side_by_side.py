@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from stereovox.errors import StereovoxError
 from stereovox.maps import VoxelMap, _pool, unbounded
 from stereovox.maps.blocks import CELLS, SIDE, blocks_of_cells
-from stereovox.maps.rolling import RollingMap
+from stereovox.maps.rolling import RollingStorage
 
 Blocks = tuple[NDArray[np.int32], NDArray[np.integer], NDArray[np.integer]]
 """Coordinates (n, 3), and the cells (n, 512) of two maps as each stores them."""
@@ -19,7 +19,7 @@ Blocks = tuple[NDArray[np.int32], NDArray[np.integer], NDArray[np.integer]]
 
 def in_memory(voxel_map: VoxelMap) -> VoxelMap:
     """Return the map with all its cells in memory: the map itself if they already are."""
-    return unbounded(voxel_map) if isinstance(voxel_map, RollingMap) else voxel_map
+    return unbounded(voxel_map) if isinstance(voxel_map.storage, RollingStorage) else voxel_map
 
 
 def cells_at(voxel_map: VoxelMap, coords: NDArray[np.int32]) -> NDArray[np.integer]:

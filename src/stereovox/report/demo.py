@@ -41,7 +41,7 @@ def write_report(path: str | Path, summary: dict[str, Any], picture: str | Path)
 
 def report(summary: dict[str, Any], png: bytes) -> str:
     """Return the page as text; see `write_report`."""
-    page = (files("stereovox.evaluate") / "report.html").read_text(encoding="utf-8")
+    page = (files("stereovox.report") / "demo.html").read_text(encoding="utf-8")
     fields = {
         "title": f"Map of {summary['source']}",
         "lead": _lead(summary),

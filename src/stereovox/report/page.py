@@ -19,7 +19,7 @@ MANY = 7
 
 def page(title: str, lead: str, *parts: str) -> str:
     """Return a whole page; `parts` are results of the functions below."""
-    text = (files("stereovox.view") / "page.html").read_text(encoding="utf-8")
+    text = (files("stereovox.report") / "page.html").read_text(encoding="utf-8")
     fields = {"title": escape(title), "lead": escape(lead), "body": "\n".join(parts)}
     for name, value in fields.items():
         text = text.replace(f"{{{{{name}}}}}", value)

@@ -21,7 +21,7 @@ from stereovox.lab.papers.chien.tracers import compare_tracers
 from stereovox.lab.papers.output import Steps, output_files, write_result
 from stereovox.opening import open_source
 
-TITLE = "Chien 2020, made again"
+TITLE = "Reproduction of Chien 2020"
 LEAD = (
     "A 3-D occupancy grid from a RealSense D435 and T265 on a drone (MSc thesis, Penn State 2020): its "
     "experiments with simulated cameras in simulated scenes, whose truth is known. The thesis's recordings were "

@@ -22,7 +22,7 @@ from stereovox.lab.papers.output import Steps, output_files, write_result
 from stereovox.opening import open_robot
 from stereovox.sources.robots.robot import Robot
 
-TITLE = "IST 2019, made again"
+TITLE = "Reproduction of IST 2019"
 LEAD = (
     "A Pioneer robot with a Kinect maps a floor in two dimensions (report, Instituto Superior T\u00e9cnico, 2019): a "
     "reference map by SLAM from its lidar, localisation in that map, then an occupancy grid from depth images. The "

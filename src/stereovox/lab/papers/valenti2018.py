@@ -27,7 +27,7 @@ from stereovox.lab.papers.valenti.mappers import (
 from stereovox.lab.papers.valenti.recordings import Drive, find_drives
 from stereovox.lab.papers.valenti.speed import MAX_FRAMES, time_mapping
 
-TITLE = "Valenti 2018, made again"
+TITLE = "Reproduction of Valenti 2018"
 LEAD = (
     "Stereo pairs of a driving car become maps, which are compared with what the car's lidar saw (PhD thesis, Parma "
     "2018, chapter 8). Three mappers on the same frames: valenti2018, which does as the thesis does; default, "

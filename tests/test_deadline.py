@@ -1,4 +1,4 @@
-"""How thoroughly there is time to look at a frame: no clock, the milliseconds are given."""
+"""The deadline scheduler chooses the quality level of each frame."""
 
 from itertools import pairwise
 

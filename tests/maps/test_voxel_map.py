@@ -250,7 +250,15 @@ def test_the_blocks_of_cells_are_those_of_plain_rows(reach):
 
 @pytest.mark.parametrize(
     "indices",
-    [[[np.nan, 0, 0]], [[0.5, 0, 0]], [[2**30, 0, 0]], [[-(2**40), 0, 0]], [[1j, 0, 0]], [["a", 0, 0]], [[0], [1, 2]]],
+    [
+        [[np.nan, 0, 0]],
+        [[0.5, 0, 0]],
+        [[2**30 + 1, 0, 0]],
+        [[-(2**40), 0, 0]],
+        [[1j, 0, 0]],
+        [["a", 0, 0]],
+        [[0], [1, 2]],
+    ],
 )
 def test_cells_that_are_none_are_refused(indices):
     with pytest.raises(StereovoxError, match="indices"):

@@ -427,7 +427,7 @@ def _whole(cells: NDArray) -> NDArray[np.int64]:
     if cells.dtype.kind == "f" and not (np.isfinite(cells) & (cells == np.floor(cells))).all():
         raise StereovoxError("indices: give whole numbers, for example floor(points / voxel_size)")
     if cells.size and not (cells.min() > -INDEX_LIMIT and cells.max() < INDEX_LIMIT):
-        raise StereovoxError(f"indices: from {cells.min():g} to {cells.max():g}; give less than 2^30 either way")
+        raise StereovoxError(f"indices: from {cells.min():g} to {cells.max():g}; give at most 2^30 either way")
     return cells.astype(np.int64, copy=False)
 
 

@@ -426,7 +426,7 @@ def _whole(cells: NDArray) -> NDArray[np.int64]:
     """Return indices (N, 3) as int64; raises StereovoxError for fractions, NaN, and cells beyond INDEX_LIMIT."""
     if cells.dtype.kind == "f" and not (np.isfinite(cells) & (cells == np.floor(cells))).all():
         raise StereovoxError("indices: give whole numbers, for example floor(points / voxel_size)")
-    if cells.size and not (cells.min() > -INDEX_LIMIT and cells.max() < INDEX_LIMIT):
+    if cells.size and not (cells.min() >= -INDEX_LIMIT and cells.max() <= INDEX_LIMIT):
         raise StereovoxError(f"indices: from {cells.min():g} to {cells.max():g}; give at most 2^30 either way")
     return cells.astype(np.int64, copy=False)
 

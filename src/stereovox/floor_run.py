@@ -262,7 +262,9 @@ class FloorRun:
     def _make_mapper(self) -> GridMapper:
         if self._resumed is None:
             return GridMapper(self.config)
-        before = read_map_server(self._resumed)
+        before = self._floor
+        if before is None or Path(self._poses_from) != self._resumed:
+            before = read_map_server(self._resumed)
         size = self._overrides.get("voxel_size", before.resolution)
         return GridMapper(self.config, voxel_size=size, resume=before)
 

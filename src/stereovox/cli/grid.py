@@ -52,19 +52,22 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Map the recording, save the map and print a summary."""
-    named = {name: value for name, value in overrides(arguments).items() if name == "voxel_size"}
     return run_floor(
-        arguments.source, arguments.out, profile=settings_of(arguments), poses=arguments.poses, use=arguments.use,
-        frames=arguments.frames, start=parse_start(arguments.start), mode=arguments.mode,
-        resume=arguments.resume or False, checkpoint_s=arguments.checkpoint, **named,
-    )  # fmt: skip
+        arguments, poses=arguments.poses, use=arguments.use, start=parse_start(arguments.start), mode=arguments.mode
+    )
 
 
-def run_floor(source: str, out: str, **settings: Any) -> dict[str, Any]:
-    """Make a floor map with progress bars and print a summary; arguments as for `map_floor`."""
+def run_floor(arguments: Namespace, **more: Any) -> dict[str, Any]:
+    """Make a floor map with progress bars and print a summary; more: arguments of `map_floor` that `map` has not."""
     from stereovox.floor_run import FloorRun
 
-    with FloorRun(source, out, notify=say, **settings) as run:
+    given = overrides(arguments)
+    named = {"voxel_size": given["voxel_size"]} if "voxel_size" in given else {}  # else a map to resume has its own
+    run = FloorRun(
+        arguments.source, arguments.out, profile=settings_of(arguments), frames=arguments.frames,
+        resume=arguments.resume or False, checkpoint_s=arguments.checkpoint, notify=say, **named, **more,
+    )  # fmt: skip
+    with run:
         say_about_compiling()
         with progress_of_steps("finding the trajectory") as progress:
             run.find_track(progress)

@@ -96,9 +96,9 @@ def _map(arguments: Namespace, out: Path) -> dict[str, Any]:
 
 def _is_floor_map(arguments: Namespace) -> bool:
     """Return whether the settings are for the 2-D map of a ground robot, as those of profile ist2019."""
-    from stereovox.config import load_config
+    from stereovox.cli.robots import settings_of
 
-    return load_config(arguments.profile or "default", **overrides(arguments)).dimensions == 2
+    return settings_of(arguments).dimensions == 2
 
 
 def _grid(arguments: Namespace) -> dict[str, Any]:
@@ -108,10 +108,7 @@ def _grid(arguments: Namespace) -> dict[str, Any]:
     for option in ("camera", "integrator", "threads", "view", "rerun"):
         if getattr(arguments, option) is not None:
             raise StereovoxError(f"--{option}: has no meaning for the map of a floor; leave it out")
-    return run_floor(
-        arguments.source, arguments.out, profile=arguments.profile, frames=arguments.frames, resume=arguments.resume,
-        checkpoint_s=arguments.checkpoint, **overrides(arguments),
-    )  # fmt: skip
+    return run_floor(arguments)
 
 
 def _print_result(result: dict[str, Any], reports: list[UpdateReport], out: Path, window: WindowConfig) -> None:

@@ -29,7 +29,7 @@ def settings_of(arguments: Namespace) -> Config:
     """Return the settings from the profile and the options."""
     from stereovox.config import load_config
 
-    return load_config(arguments.profile, **overrides(arguments))
+    return load_config(arguments.profile or "default", **overrides(arguments))
 
 
 def open_noting(name: str) -> Robot:

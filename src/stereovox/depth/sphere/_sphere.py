@@ -9,7 +9,6 @@ VALID, TOO_NEAR, TOO_FAR = np.uint8(0), np.uint8(2), np.uint8(3)
 ZERO, ONE, HALF = np.float32(0), np.float32(1), np.float32(0.5)
 PI, HALF_PI = np.float32(np.pi), np.float32(np.pi / 2)
 TINY = np.float32(1e-30)
-PER_TURN = np.float32(1 / (2 * np.pi))
 A1, A3, A5 = np.float32(0.99997726), np.float32(-0.33262347), np.float32(0.19354346)
 A7, A9, A11 = np.float32(-0.11643287), np.float32(0.05265332), np.float32(-0.01172120)
 

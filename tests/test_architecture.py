@@ -23,7 +23,7 @@ LAYERS = (
     {"intake", "integrate", "products", "sources"},
     {"comparison", "deadline", "formats", "localize", "simulate"},
     {"mapper", "opening"},
-    {"calibrate", "evaluate"},
+    {"calibrate", "evaluate", "survey"},
     {"run", "view"},
     {"floor_run", "ros", "report", "viewer"},
     {"lab"},

@@ -46,6 +46,9 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--max-range", type=float, metavar="M", help="largest depth in metres that is used")
     parser.add_argument("--frames", metavar="A:B:S", help="only these frames, as a Python slice")
     parser.add_argument("--camera", metavar="FILE", help="camera file (camera.toml) that replaces the recording's own")
+    parser.add_argument(
+        "--level", action="store_true", help="turn the recording's world so that z points up, for level layers"
+    )
     parser.add_argument("--threads", type=int, metavar="N", help="threads (1); the map does not depend on it")
     add_settings(parser, "sensor.model=andert")
     parser.add_argument(
@@ -80,7 +83,8 @@ def _map(arguments: Namespace, out: Path) -> dict[str, Any]:
 
     run = MapRun(
         arguments.source, out, profile=arguments.profile, resume=arguments.resume, frames=arguments.frames,
-        camera=arguments.camera, checkpoint_s=arguments.checkpoint, notify=say, **overrides(arguments),
+        camera=arguments.camera, level=arguments.level, checkpoint_s=arguments.checkpoint, notify=say,
+        **overrides(arguments),
     )  # fmt: skip
     with run, page_of(run.mapper, out.stem, arguments.view) as page:
         say_about_compiling()
@@ -105,8 +109,8 @@ def _grid(arguments: Namespace) -> dict[str, Any]:
     """Run `stereovox grid`, which has more options."""
     from stereovox.cli.grid import run_floor
 
-    for option in ("camera", "integrator", "threads", "view", "rerun"):
-        if getattr(arguments, option) is not None:
+    for option in ("camera", "integrator", "level", "threads", "view", "rerun"):
+        if getattr(arguments, option) not in (None, False):
             raise StereovoxError(f"--{option}: has no meaning for the map of a floor; leave it out")
     return run_floor(arguments)
 

@@ -65,6 +65,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
 
 def _draw_cells(arguments: Namespace, heading: str) -> Any:
     """Return the figure of a 3-D map."""
+    from stereovox.products.moved import levelled
     from stereovox.view.drawn import checked_up
     from stereovox.view.paper import draw_paper
     from stereovox.view.viewpoint import viewpoint_at
@@ -73,6 +74,8 @@ def _draw_cells(arguments: Namespace, heading: str) -> Any:
     arguments.view = arguments.view or "overview"
     _check_options(arguments)
     voxel_map = open_cubes(arguments.map)
+    if arguments.up is None:
+        voxel_map = levelled(voxel_map)
     up = checked_up(arguments.up or voxel_map.config.up)
     viewpoint = viewpoint_at(voxel_map, arguments.eye, arguments.toward, up)
     if arguments.width_mm is None:

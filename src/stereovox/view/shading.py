@@ -13,6 +13,9 @@ from stereovox.evaluate.cells import Keys, keys, position
 RADII = ((1, 0.15), (2, 0.4), (4, 0.9))
 """Radii in cells of the boxes before a face whose occupied share darkens it, and how strongly."""
 
+BURIED = 0.6
+"""Mean brightness of a cell without an exposed face, seen where cells are drawn coarser."""
+
 
 class Occlusion:
     """What the faces of a set of cells see of the sky.
@@ -36,6 +39,16 @@ class Occlusion:
         if (axis, side) not in self._found:
             self._found[axis, side] = self._look(axis, side)
         return self._found[axis, side]
+
+    def mean(self) -> NDArray[np.float32]:
+        """Return the mean brightness (N,) of each cell's exposed faces, for whoever has one colour for a cell."""
+        total, number = np.zeros(len(self._keys), np.float32), np.zeros(len(self._keys), np.float32)
+        for axis in range(3):
+            for side in (-1, 1):
+                brightness = self.brightness(axis, side)
+                total += brightness
+                number += brightness > 0
+        return np.where(number > 0, total / np.maximum(number, 1), BURIED).astype(np.float32)
 
     def _look(self, axis: int, side: int) -> NDArray[np.float32]:
         step = np.zeros(3, np.int64)

@@ -142,7 +142,7 @@ def _triad(axis: Any, direction: Direction, names: tuple[str, str, str], corner:
 
     area = DrawingArea(64, 64, 0, 0)
     tips = direction.flat(np.eye(3)) * 22
-    above = (0, 0, 8)  # the longer word clears the other two
+    above = (0, 0, 6)  # the longer word clears the other two
     for name, (x, y), higher in zip((*names[:2], f"{names[2]} up"), tips, above, strict=True):
         area.add_artist(
             FancyArrowPatch(

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from stereovox.evaluate.cells import Keys, keys, position
 
-RADII = ((1, 0.15), (2, 0.4), (4, 0.9))
+RADII = ((1, 0.15), (2, 0.3), (3, 0.4), (4, 0.6))
 """Radii in cells of the boxes before a face whose occupied share darkens it, and how strongly."""
 
 BURIED = 0.6

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from stereovox.maps import VoxelMap
 from stereovox.view.axis import draw_profile
-from stereovox.view.panels import GREY
 
 WIDTH_IN, DPI = 4.8, 180
 """Width of the panel's pictures in inches, relative to text size, and pixels per inch."""

@@ -191,6 +191,8 @@ class MapRun:
             stack.callback(self.mapper.map.close)
             self._checkpoints = Checkpoints(lambda: self.mapper.map.save(self.out), self.out, self._checkpoint_s)
             self._check_recording()
+            if not self._resume and is_map(self.out):
+                self._notify(replaces(self.out))
             for note in (*self.source.notes, *lines):
                 self._notify(f"note: {note}")
             self._open = stack.pop_all()
@@ -392,6 +394,16 @@ def _saved_from_start(voxel_map: VoxelMap, out: Path) -> Iterator[None]:
     finally:
         if new and is_map(out) and not read_manifest(out)["frames"]:
             remove_map(out)
+
+
+def replaces(out: Path) -> str:
+    """Return a line about the map at `out` that the first save of a new one will replace."""
+    try:
+        manifest = read_manifest(out)
+        made_of = f" made of '{one_line(str(manifest['recording']))}'" if manifest.get("recording") else ""
+        return f"note: {out} replaces the map of {manifest['frames']:,} frames{made_of} that is there"
+    except (MapFileError, KeyError, ValueError):
+        return f"note: {out} replaces a damaged map that is there"
 
 
 def first_refusal(reports: list[UpdateReport]) -> str:

@@ -109,3 +109,12 @@ def test_a_layer_outside_the_map_is_told(saved, tmp_path, capsys, up, at, said):
     assert main(["picture", str(saved), str(tmp_path / "map.png"), "--view", "layer", f"--up={up}", f"--at={at}"]) == 0
     err = capsys.readouterr().err
     assert f"outside the map ({said})" in err if said else "note:" not in err
+
+
+def test_a_dark_picture_has_a_dark_page(saved, tmp_path):
+    from PIL import Image
+
+    assert main(["picture", str(saved), str(tmp_path / "map.png"), "--dark"]) == 0
+    picture = np.asarray(Image.open(tmp_path / "map.png").convert("RGB"))
+    assert (picture[0, 0] < 40).all()
+    assert (picture > 200).all(axis=-1).mean() > 0.001

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from stereovox.cli import main
+from stereovox.cli.slam import _pace
 from stereovox.formats.map_server import read_map_server
 from stereovox.opening import open_robot
 from stereovox.sources.bags import open_bag
@@ -59,6 +60,21 @@ def test_slam_saves_map_and_way(bag, reference, tmp_path, capsys):
     assert result["position_rms_m"] < 0.1
     assert result["scans"] == len(way)
     np.testing.assert_array_equal(read_map_server(tmp_path / "again.yaml").cells, floor.cells)
+
+
+@pytest.mark.parametrize(
+    ("recorded", "seconds", "words"),
+    [
+        (0.0, 2.0, ""),
+        (0.05, 2.0, ""),
+        (1.0, 2.0, " (0.5 times"),
+        (9.0, 2.0, " (4.5 times"),
+        (274.0, 2.0, " (137 times"),
+    ],
+)
+def test_slam_says_its_pace_only_where_stamps_tell(recorded, seconds, words):
+    assert _pace(recorded, seconds).startswith(words)
+    assert bool(_pace(recorded, seconds)) == bool(words)
 
 
 def test_slam_scores_relations(tmp_path, capsys):

@@ -39,6 +39,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         "--eye", type=point, metavar="X,Y,Z", help="position of the camera (default: that of the last frame)"
     )
     parser.add_argument("--toward", type=point, metavar="X,Y,Z", help="a point on its optical axis; goes with --eye")
+    parser.add_argument("--dark", action="store_true", help="a dark page, for dark slides and sites")
     parser.add_argument("--title", metavar="TEXT", help="title instead of the map's name")
     parser.add_argument("--dpi", type=float, metavar="N", help="dots an inch (120; with --width-mm 600)")
     parser.add_argument(
@@ -51,6 +52,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Load the map and write its picture."""
+    from stereovox.view.dark import darken
     from stereovox.view.figures import ENDINGS, save
 
     file = Path(arguments.file)
@@ -58,6 +60,8 @@ def run(arguments: Namespace) -> dict[str, Any]:
         raise StereovoxError(f"{file}: pictures are written as {', '.join(ENDINGS)}; name the file so")
     heading = _plain(arguments.title or Path(arguments.map).stem)
     drawn = DRAW[dimensions(arguments.map)](arguments, heading)
+    if arguments.dark:
+        darken(drawn)
     save(drawn, file, arguments.dpi)
     say(f"saved {file}")
     return {"picture": str(file)}

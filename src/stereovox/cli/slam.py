@@ -70,13 +70,21 @@ def _print_result(robot: Robot, found: SlamResult, seconds: float) -> dict[str, 
 
     track = found.track
     recorded = 1e-9 * float(track.stamps_ns[-1] - track.stamps_ns[0])
-    say(f"{len(track.stamps_ns)} scans, {found.closures} loops closed, in {seconds:.1f} s "
-        f"({recorded / seconds:.0f} times as fast as recorded)")  # fmt: skip
+    pace = _pace(recorded, seconds)
+    say(f"{len(track.stamps_ns)} scans, {found.closures} loops closed, in {seconds:.1f} s{pace}")
     if found.refused:
         say(refused_line(found.refused))
     scans = {"scans": len(track.stamps_ns), "scans_refused": sum(found.refused.values()), "refused": found.refused}
     times = {"closures": found.closures, "seconds": seconds, "recorded_s": recorded}
     return {**scans, **times, **print_trajectory_error(track, robot)}
+
+
+def _pace(recorded: float, seconds: float) -> str:
+    """Say how much faster than the robot drove; nothing of a recording whose stamps stand still."""
+    times = recorded / seconds if seconds > 0 else 0.0
+    if times < 0.05:
+        return ""
+    return f" ({times:.1f} times as fast as recorded)" if times < 10 else f" ({times:.0f} times as fast as recorded)"
 
 
 def _score(found: SlamResult, relations: str | None) -> dict[str, Any]:

@@ -338,6 +338,15 @@ class VoxelMap(Guarded, OnBlocks):
         return np.stack([np.min(lowest, axis=0), np.max(highest, axis=0)]) * self.config.cell
 
     @property
+    def path(self) -> NDArray[np.float64]:
+        """Positions of the camera (N, 3) in metres, world frame, in the order of the frames; of several, one by one.
+
+        They are saved with the map and thinned evenly: at most 2048, 5 cm or 0.1 rad apart, farther on long paths.
+        (0, 3) for a map of no frames, such as an imported one.
+        """
+        return np.concatenate([np.empty((0, 3)), *self.history.path.lines()])
+
+    @property
     def memory_bytes(self) -> int:
         """Bytes the map uses: stored numbers, times, block coordinates and hash."""
         return self.storage.memory_bytes

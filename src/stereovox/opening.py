@@ -25,6 +25,7 @@ SOURCES = {
     "seven_scenes": "stereovox.sources.seven_scenes:SevenScenes",
     "tum": "stereovox.sources.tum:TumRgbd",
     "rig": "stereovox.sources.rig:StereoRig",
+    "asl": "stereovox.sources.asl:AslRig",
     "kitti_raw": "stereovox.sources.kitti.raw:KittiRaw",
     "kitti_tracking": "stereovox.sources.kitti.tracking:KittiTracking",
     "kitti_odometry": "stereovox.sources.kitti.odometry:KittiOdometry",

@@ -49,6 +49,7 @@ from stereovox.sources.kitti.poses import read_oxts_file, read_pose_file
 from stereovox.sources.kitti.tracking import read_labels
 from stereovox.sources.lidar import read_velodyne
 from stereovox.sources.pair_file import PairSettings, pair_text, read_pair
+from stereovox.sources.rgbd.depth_files import read_depth
 from stereovox.sources.rig_file import read_rig
 from stereovox.sources.robots.bag import RobotBag
 from stereovox.sources.robots.carmen import CarmenLog
@@ -506,7 +507,7 @@ TARGETS: dict[str, Target] = {
     "velodyne": file_target("0.bin", read_velodyne, SCAN),
     "carmen": file_target("a.log", read_log, FLASER, ROBOTLASER, FLASER + ROBOTLASER),
     "carmen_bz2": file_target("a.log.bz2", read_log, bz2.compress(FLASER * 3)),
-    "depth_png": Target(depth_pngs, partial(read_png, images.read_depth_png)),
+    "depth_png": Target(depth_pngs, partial(read_png, read_depth)),
     "picture_png": Target(grey_pngs, partial(read_png, images.read_picture_png)),
     "map_manifest": Target(manifests, read_manifest),
     "map_arrays": Target(pieces, read_piece),

@@ -12,8 +12,8 @@ from stereovox.opening import SOURCES, open_images, open_source
 from stereovox.registry import find
 from stereovox.simulate.recorder import record
 from stereovox.simulate.simulation import Simulation
-from stereovox.sources.seven_scenes import SevenScenes
-from stereovox.sources.tum import TumRgbd
+from stereovox.sources.rgbd.seven_scenes import SevenScenes
+from stereovox.sources.rgbd.tum import TumRgbd
 
 POSES = "1 0 0 0 0 0 0 1\n"
 
@@ -37,8 +37,9 @@ def test_bad_frames_are_told_before_the_folder_is_looked_at():
 
 @pytest.mark.parametrize("where", ["no-such-folder", "x" * 5000, "nul\0byte", ""])
 def test_a_missing_folder(where):
-    with pytest.raises(SourceError, match=r": no such folder or file$"):
+    with pytest.raises(SourceError, match=r": no such folder or file; check the name$") as caught:
         open_source(where)
+    assert len(str(caught.value)) <= 300
 
 
 def test_a_file_is_no_recording(tmp_path):
@@ -48,11 +49,26 @@ def test_a_file_is_no_recording(tmp_path):
         open_source(path)
 
 
-def test_an_unknown_folder_tells_what_was_looked_for(tmp_path):
-    (tmp_path / "image.png").write_bytes(b"")
-    with pytest.raises(SourceError, match=r"not a recording .*frame-\*\.depth\.png.*groundtruth\.txt") as caught:
+def test_an_unknown_folder_tells_what_it_holds_and_where_layouts_are_described(tmp_path):
+    (tmp_path / "image.jpg").write_bytes(b"")
+    with pytest.raises(SourceError, match=r"1 \.jpg, no depth images.*docs/recordings\.md") as caught:
         open_source(tmp_path)
-    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) <= 300
+
+
+def test_a_name_that_is_nearly_there_is_suggested(tmp_path):
+    (tmp_path / "kitchen").mkdir()
+    with pytest.raises(SourceError, match=r"did you mean \S*kitchen\?"):
+        open_source(tmp_path / "kitchn")
+
+
+def test_what_the_nearest_layout_lacks_is_named_with_the_cure(tmp_path):
+    (tmp_path / "depth").mkdir()
+    for stamp in ("1.0", "2.0"):
+        write_png(tmp_path / "depth" / f"{stamp}.png", depth_image(0))
+    with pytest.raises(SourceError, match=r"has depth images \(2\) but no poses; write groundtruth\.txt") as caught:
+        open_source(tmp_path)
+    assert len(str(caught.value)) <= 300
 
 
 def test_a_folder_of_recordings_points_to_the_first_of_them(tmp_path):

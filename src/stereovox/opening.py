@@ -4,26 +4,30 @@
 from __future__ import annotations
 
 import os
+import shlex
+from collections import Counter
 from collections.abc import Iterator
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
 from stereovox import registry
-from stereovox.errors import SourceError
+from stereovox.errors import MAX_WORD_LENGTH, SourceError
 from stereovox.sources.base import DepthSource as DepthSource
 from stereovox.sources.base import Excerpt as Excerpt
+from stereovox.sources.base import Part as Part
 from stereovox.sources.base import Selection as Selection
 from stereovox.sources.base import Source as Source
 from stereovox.sources.base import Stream as Stream
 from stereovox.sources.base import parse_slice as parse_slice
 from stereovox.sources.latest import LatestStream
-from stereovox.sources.pair_file import FILE, PairSettings
+from stereovox.sources.pair_file import PairSettings
 from stereovox.sources.robots.robot import Robot
 
 SOURCES = {
     "pair": "stereovox.sources.pair:CameraPair",  # first: such a folder may hold groundtruth.txt as well
-    "seven_scenes": "stereovox.sources.seven_scenes:SevenScenes",
-    "tum": "stereovox.sources.tum:TumRgbd",
+    "seven_scenes": "stereovox.sources.rgbd.seven_scenes:SevenScenes",
+    "tum": "stereovox.sources.rgbd.tum:TumRgbd",
     "rig": "stereovox.sources.rig:StereoRig",
     "asl": "stereovox.sources.asl:AslRig",
     "two_view": "stereovox.sources.two_view:TwoView",
@@ -34,6 +38,7 @@ SOURCES = {
     "surround": "stereovox.simulate.surround:Surround",  # before all others of sim:
     "simulation": "stereovox.simulate.simulation:Simulation",
     "bag": "stereovox.sources.bags.recording:Bag",
+    "plain": "stereovox.sources.rgbd.plain:DepthAndPoses",  # last: nearly any folder with depth images
 }
 """Asked in this order, then those of other packages (entry points in the group `stereovox.sources`)."""
 STREAMS = {"realsense": "stereovox.sources.realsense:RealSense"}
@@ -44,6 +49,12 @@ ROBOTS = {
     "bag": "stereovox.sources.robots.bag:RobotBag",
 }
 """Recordings of ground robots, asked in this order, then those of other packages (entry points `stereovox.robots`)."""
+
+
+MAX_BELOW, MAX_LISTED = 50, 10_000
+"""Most folders that are tried, and most entries that are counted, to explain why a folder cannot be opened."""
+MAX_SHOWN = 100
+"""Characters of a path that a message shows."""
 
 
 def open_source(path_or_name: str | os.PathLike[str], frames: str | None = None) -> Source:
@@ -99,14 +110,13 @@ def open_images(path_or_name: str | os.PathLike[str], frames: str | None = None)
 
     A folder of stamped images then needs no groundtruth.txt. Raises SourceError as `open_stream`.
     """
-    from stereovox.sources.tum import StampedImages
-
     where = os.fspath(path_or_name)
     if _live_class(where):
         return open_stream(where, frames)
-    stamped = StampedImages.recognises(where) and not os.path.isfile(os.path.join(where, FILE))
-    kind: Any = StampedImages if stamped else _recognise(where)
-    source = _open(kind, where) if _is_composite(kind) else kind.depth_only(where)
+    kind = next((kind for kind in _classes() if kind.recognises(where)), None)
+    source = (
+        _images_alone(where) if kind is None else _open(kind, where) if _is_composite(kind) else kind.depth_only(where)
+    )
     return source if frames is None else Selection(source, frames)
 
 
@@ -117,10 +127,8 @@ def open_depth(folder: Path, settings: PairSettings) -> DepthSource:
     source that recognises it, with its `depth_only(where)`. Raises SourceError where there are no depth images.
     """
     from stereovox.sources.pair import CorrectedDepth
-    from stereovox.sources.tum import StampedImages
 
-    where = os.path.join(folder, settings.depth)
-    source = StampedImages(where) if StampedImages.recognises(where) else _depth_of(where)
+    source = _depth_of(os.path.join(folder, settings.depth))
     if settings.depth_scale is None and settings.baseline is None:
         return source
     return CorrectedDepth(source, settings)
@@ -149,11 +157,23 @@ def is_recording(path: str | os.PathLike[str]) -> bool:
 
 
 def _depth_of(where: str) -> DepthSource:
-    """Return the depth images of a recording that is not composite."""
+    """Return the depth images of a recording that is not composite, or images alone."""
     for kind in _classes():
         if not _is_composite(kind) and kind.recognises(where):
             return kind.depth_only(where)
-    raise SourceError(f"{where}: no depth images; name a folder with depth.txt or depth/, or a recording, as 'depth'")
+    return _images_alone(where)
+
+
+def _images_alone(where: str) -> DepthSource:
+    """Return depth images without poses; raises SourceError where there are none."""
+    from stereovox.sources.rgbd.plain import DepthOnly
+    from stereovox.sources.rgbd.tum import StampedImages
+
+    for kind in (StampedImages, DepthOnly):
+        if kind.recognises(where):
+            return kind(where)
+    _recognise(where)  # which says what is wrong with it
+    raise SourceError(f"{where}: no depth images; name a folder with depth.txt or depth/, or a recording")
 
 
 def _classes() -> Iterator[Any]:
@@ -182,23 +202,63 @@ def _recognise(where: str) -> Any:
         kinds.append(kind)
         if kind.recognises(where):
             return kind
-    if not os.path.exists(where) and not _live_class(where):
-        raise SourceError(f"{where}: no such folder or file")
-    if os.path.isfile(os.path.join(where, "manifest.json")):
-        raise SourceError(f"{where}: is a map, not a recording; what it was made of: stereovox info {where}")
-    known = ", ".join(getattr(kind, "layout", "") or kind.__name__ for kind in kinds)
-    raise SourceError(f"{where}: {_problem(where, kinds)}; known: {known}")
+    raise SourceError(f"{_short(where)}: {_problem(where, kinds)}")
+
+
+def _short(text: str) -> str:
+    """Return text with a long middle left out."""
+    return text if len(text) <= MAX_SHOWN else f"{text[: MAX_SHOWN // 2]}...{text[-MAX_SHOWN // 2 :]}"
 
 
 def _problem(where: str, kinds: list[Any]) -> str:
-    """Explain why `where` cannot be opened, and name the folder inside it that was probably meant."""
+    """Explain in less than 300 characters why `where` cannot be opened, and name the cure."""
     if _live_class(where):
         return "a live camera can be mapped, but has no frames to go back to: record it into a file first"
-    if not os.path.isdir(where):
-        return "is a file, but no recording of a known kind"
+    place = where if os.path.exists(where) else where.partition("?")[0]
+    if not os.path.exists(place):
+        return f"no such folder or file{_near(place)}"
+    if os.path.isfile(os.path.join(place, "manifest.json")):
+        return f"is a map, not a recording; see what it was made of with: stereovox info {shlex.quote(place)}"
+    if not os.path.isdir(place):
+        return f"is a file, but no recording that is known; see: stereovox info {shlex.quote(place)}"
     try:
-        below = sorted(entry.path for entry in os.scandir(where) if entry.is_dir())
+        below = sorted(entry.path for entry in os.scandir(place) if entry.is_dir())
     except OSError as error:
         return f"{error.strerror}, so it cannot be listed"
-    likely = next((folder for folder in below for kind in kinds if kind.recognises(folder)), None)
-    return "not a recording of a known layout" + (f" (did you mean {likely}?)" if likely else "")
+    likely = next((folder for folder in below[:MAX_BELOW] for kind in kinds if kind.recognises(folder)), None)
+    if likely:
+        return f"no recording itself; did you mean {likely}?"
+    return _missing(place, kinds) or f"no recording: {_contents(place)}; layouts: see docs/recordings.md"
+
+
+def _missing(folder: str, kinds: list[Any]) -> str:
+    """Say what the nearest layout has in `folder` and what it lacks, with the cure; empty where none is near."""
+    best, words = 0.0, ""
+    for kind in kinds:
+        parts: tuple[Part, ...] = getattr(kind, "parts", ())
+        counts = [part.count(folder) for part in parts]
+        share = sum(map(bool, counts)) / max(len(parts), 1)
+        if best < share < 1:
+            there = [f"{part.what} ({count})" for part, count in zip(parts, counts, strict=True) if count]
+            lacks = next(part for part, count in zip(parts, counts, strict=True) if not count)
+            best = share
+            words = f"has {', '.join(there)} but no {lacks.what}; {lacks.cure or f'put {lacks.patterns[0]} there'}"
+    return words
+
+
+def _contents(folder: str) -> str:
+    """Describe what a folder holds, by suffix."""
+    entries = [entry for entry in os.scandir(folder) if not entry.name.startswith(".")][:MAX_LISTED]
+    kinds = Counter("folders" if entry.is_dir() else os.path.splitext(entry.name)[1] or "others" for entry in entries)
+    found = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common(4))
+    return f"it holds {found or 'nothing'}, no depth images, stereo pairs or bag"
+
+
+def _near(place: str) -> str:
+    """Return a hint with the name in the same folder that is nearest to a name that is not there."""
+    folder, name = os.path.split(os.path.abspath(place))
+    try:
+        close = get_close_matches(name[:MAX_WORD_LENGTH], os.listdir(folder), n=1) if place else []
+    except (OSError, ValueError):
+        close = []
+    return f" (did you mean {os.path.join(os.path.dirname(place), close[0])}?)" if close else "; check the name"

@@ -27,7 +27,8 @@ from stereovox.sources.bags.db3 import Db3File
 from stereovox.sources.bags.messages import Wire, ns_from_ms, read_camera_info
 from stereovox.sources.bags.robot_messages import read_laser_scan, read_point_cloud
 from stereovox.sources.bags.unpack import ALWAYS_ALLOWED, decompress, max_unpacked
-from stereovox.sources.images import SIGNATURE, read_depth_png, read_picture_png
+from stereovox.sources.images import SIGNATURE, read_picture_png
+from stereovox.sources.rgbd.depth_files import read_depth
 from stereovox.sources.robots import carmen
 from stereovox.sources.robots.carmen import CarmenLog
 
@@ -152,7 +153,7 @@ def png(width, height, data, bits=16):
     return SIGNATURE + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(data, 9)) + chunk(b"IEND", b"")
 
 
-def refused(path, size, reader=read_depth_png):
+def refused(path, size, reader=read_depth):
     with pytest.raises(FrameRefused) as caught:
         reader(path, size)
     return caught.value.reason
@@ -172,7 +173,7 @@ def test_a_png_that_tells_of_more_than_it_can_hold(tmp_path, monkeypatch):
 def test_a_png_with_too_much_or_too_little_in_it(tmp_path):
     path = tmp_path / "a.png"
     path.write_bytes(png(4, 2, bytes(50_000_000)))
-    assert read_depth_png(path, (4, 2)).tolist() == [[0] * 4] * 2  # what is too much is never unpacked
+    assert read_depth(path, (4, 2)).tolist() == [[0] * 4] * 2  # what is too much is never unpacked
     for short in (0, 1, 17):
         path.write_bytes(png(4, 2, bytes(short)))
         assert refused(path, (4, 2)) == "unreadable"

@@ -9,7 +9,8 @@ import pytest
 from made_recordings import SIZE, depth_image, png_bytes, write_png
 
 from stereovox.errors import FrameRefused
-from stereovox.sources.images import PICTURE_KINDS, common_size, png_size, read_depth_png, read_picture_png
+from stereovox.sources.images import PICTURE_KINDS, common_size, png_size, read_picture_png
+from stereovox.sources.rgbd.depth_files import read_depth
 
 
 @pytest.fixture
@@ -21,14 +22,14 @@ def good(tmp_path):
 
 def refusal(path, size=SIZE):
     with pytest.raises(FrameRefused) as caught:
-        read_depth_png(path, size)
+        read_depth(path, size)
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
     return caught.value.reason
 
 
 def test_a_good_image_comes_back_value_by_value(good):
-    image = read_depth_png(good, SIZE)
+    image = read_depth(good, SIZE)
     assert image.dtype == np.uint16
     np.testing.assert_array_equal(image, depth_image(3))
     assert png_size(good) == SIZE
@@ -51,7 +52,7 @@ def test_any_flipped_byte_is_refused_and_the_terminal_stays_clean(good, capfd):
 
 def test_bytes_after_the_end_mark_do_no_harm(good):
     good.write_bytes(good.read_bytes() + b"rest")
-    np.testing.assert_array_equal(read_depth_png(good, SIZE), depth_image(3))
+    np.testing.assert_array_equal(read_depth(good, SIZE), depth_image(3))
 
 
 def test_a_file_of_more_bytes_than_an_image_needs_is_not_read(good):

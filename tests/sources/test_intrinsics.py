@@ -4,7 +4,8 @@ from __future__ import annotations
 import pytest
 
 from stereovox.errors import SourceError
-from stereovox.sources.camera_file import find_camera, read_intrinsics
+from stereovox.sources.camera_file import find_camera
+from stereovox.sources.intrinsics import read_intrinsics
 
 DEFAULT = (525.0, 525.0, 319.5, 239.5)
 
@@ -40,11 +41,11 @@ def test_the_first_file_counts_and_leaves_no_note(tmp_path):
     near.mkdir()
     far.mkdir()
     (far / "camera-intrinsics.txt").write_text("100 0 2 0 300 4 0 0 1")
-    camera, notes = find_camera([near, far], (640, 480), 0.075, DEFAULT)
+    camera, notes = find_camera([near, far], (640, 480), 0.075, DEFAULT)[:2]
     assert (camera.fx, camera.fy, camera.cx, camera.cy, camera.baseline) == (100, 300, 2, 4, 0.075)
     assert notes == ()
     (near / "calibration.txt").write_text("90 90 9 9")
-    camera, (note,) = find_camera([near, far], (640, 480), 0.075, DEFAULT)
+    camera, (note,) = find_camera([near, far], (640, 480), 0.075, DEFAULT)[:2]
     assert camera.fx == 90
     assert note == f"{far / 'camera-intrinsics.txt'} is not used: {near / 'calibration.txt'} comes first"
 
@@ -53,7 +54,7 @@ def test_a_camera_toml_counts_only_in_the_own_folder_and_is_always_told(tmp_path
     near = tmp_path / "near"
     near.mkdir()
     (tmp_path / "camera.toml").write_text("this would be an error")
-    camera, notes = find_camera([near, tmp_path], (640, 480), 0.075, DEFAULT)
+    camera, notes = find_camera([near, tmp_path], (640, 480), 0.075, DEFAULT)[:2]
     assert camera.fx == DEFAULT[0]
     assert f"{tmp_path / 'camera.toml'} is not used: it counts only in the recording's own folder" in notes[1]
     (near / "camera-intrinsics.txt").write_text("90 0 9 0 90 9 0 0 1")
@@ -63,14 +64,14 @@ def test_a_camera_toml_counts_only_in_the_own_folder_and_is_always_told(tmp_path
         ("[correction]\nmodel = 'thesis'\ncoefficients = [0, 0, 1]", "depth correction 'thesis'"),
     ):
         (near / "camera.toml").write_text(own + correction)
-        camera, notes = find_camera([near, tmp_path], (640, 480), 0.075, DEFAULT)
+        camera, notes = find_camera([near, tmp_path], (640, 480), 0.075, DEFAULT)[:2]
         assert camera.fx == 80
         assert notes[0] == f"{near / 'camera.toml'} is used ({words})"
         assert notes[2] == f"{near / 'camera-intrinsics.txt'} is not used: {near / 'camera.toml'} comes first"
 
 
 def test_without_a_file_only_640x480_has_a_default_and_the_user_is_told(tmp_path):
-    camera, (note,) = find_camera([tmp_path], (640, 480), 0.075, DEFAULT)
+    camera, (note,) = find_camera([tmp_path], (640, 480), 0.075, DEFAULT)[:2]
     assert (camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy) == (640, 480, *DEFAULT)
     assert "525" in note
     with pytest.raises(SourceError, match=r"camera-intrinsics\.txt.*320x240"):

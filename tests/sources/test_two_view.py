@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from made_recordings import write_png
 
-from stereovox.config import load_config
+from stereovox.config.depth import StereoConfig
+from stereovox.depth.stereo.pipeline import StereoDepth
 from stereovox.depth.stereo.rectify import rectified
 from stereovox.errors import SourceError
-from stereovox.mapper import Mapper
 from stereovox.opening import open_source
 from stereovox.sources.two_view import TwoView
 
@@ -40,11 +40,9 @@ def scene(folder: Path, doffs: float = 0.0, brackets: bool = True, times: float 
 
 
 def distance_of_the_wall(where: Path | str) -> float:
-    """Return the mean x (the camera looks along x) of what a map of the first frame holds."""
-    mapper = Mapper(load_config("default", {"map.voxel_size": 0.02, "map.prior": 0.3, "stereo.disparities": 32}))
-    report = mapper.add(open_source(where).frame(0))
-    assert report.refused is None
-    return float(np.mean(mapper.map.occupied()[:, 0]))
+    """Return the median depth of the first frame."""
+    depth = StereoDepth(StereoConfig(disparities=32))(open_source(where).frame(0)).depth
+    return float(np.nanmedian(depth))
 
 
 @pytest.mark.parametrize(("doffs", "distance"), [(0.0, 1.25), (2.5, 10 / 10.5)])

@@ -19,7 +19,7 @@ from stereovox.simulate.t265 import OPENGL, RATE_HZ, T265, Track, start_frame, w
 from stereovox.sources.camera_file import MATRIX
 from stereovox.sources.pair_file import FILE, PairSettings, pair_text
 from stereovox.sources.poses import seconds_from_ns
-from stereovox.sources.tum import IMAGES, LIST
+from stereovox.sources.rgbd.tum import IMAGES, LIST
 
 TRACKER = "tracker.txt"
 START_NS = 1_000_000_000_000

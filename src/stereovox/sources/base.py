@@ -3,12 +3,14 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from itertools import islice
-from typing import Protocol, TypeVar, overload
+from pathlib import Path
+from typing import NamedTuple, Protocol, TypeVar, overload
 
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.errors import SourceError
@@ -36,6 +38,25 @@ class Lazy(Sequence[T]):
         return self._read(self._numbers[i])
 
 
+class Part(NamedTuple):
+    """Part of a recording that a layout needs.
+
+    patterns: names inside the folder as in `glob`, of which one must be there; the first is the usual one. what: what
+    it holds, in words. cure: what to do where it is missing, if that is not just to put it there.
+    """
+
+    patterns: tuple[str, ...]
+    what: str
+    cure: str = ""
+
+    def count(self, folder: str | os.PathLike[str]) -> int:
+        """Return how many files or folders match; 0 where the folder cannot be read."""
+        try:
+            return max(sum(1 for _ in Path(folder).glob(pattern)) for pattern in self.patterns)
+        except (OSError, ValueError):
+            return 0
+
+
 AHEAD = 4
 """Frames read ahead: enough to even out slow ones, at 0.6 MB each for 640x480."""
 
@@ -52,6 +73,7 @@ class Stream(Protocol):
             `middle`).
         notes: Lines the user should see, for example a calibration that had to be assumed.
         layout: How to recognise this kind of source, for messages.
+        parts: What a folder of this layout holds, to say what is missing in one that is nearly so.
         composite: The class combines other recordings; its second argument is the function that opens them (see
             `CameraPair`).
     """
@@ -60,6 +82,7 @@ class Stream(Protocol):
     camera: PinholeCamera
     notes: tuple[str, ...] = ()
     layout: str = ""
+    parts: tuple[Part, ...] = ()
     composite: bool = False
 
     @property

@@ -3,18 +3,18 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from stereovox.cameras.pinhole import DepthCorrection, PinholeCamera
 from stereovox.errors import SourceError, StereovoxError, did_you_mean
 from stereovox.frame import Frame, StereoFrame
-from stereovox.safe_io import is_number, read_table, read_text, shown, toml_text
+from stereovox.safe_io import is_number, read_table, shown, toml_text
 from stereovox.sources.base import Stream
+from stereovox.sources.intrinsics import NAMES, Intrinsics, read_camera_numbers
 
 FILE = "camera.toml"
 SIZES = ("width", "height")
@@ -27,10 +27,9 @@ NEEDED = {
 """Explains each required key."""
 KEYS = (*SIZES, *INTRINSICS, "baseline", "correction")
 CORRECTION = ("model", "coefficients", "provenance")
-MATRIX, LIST = "camera-intrinsics.txt", "calibration.txt"
+MATRIX = "camera-intrinsics.txt"
 VGA = (640, 480)
-Intrinsics = tuple[float, float, float, float]
-"""fx, fy, cx, cy in pixels."""
+OTHER = "give the file of their own camera"
 
 
 def read_camera(path: Path) -> PinholeCamera:
@@ -63,42 +62,75 @@ def camera_text(camera: PinholeCamera, provenance: Mapping[str, Any] | None = No
     return "\n".join(lines) + "\n"
 
 
+class FoundCamera(NamedTuple):
+    """Camera of a recording, and what its file says besides.
+
+    notes: what was assumed, used or ignored. mirrored: its file has a negative fy, so the second axis of the camera of
+    its poses points up (see `rgbd.folder`). depth_scale: metres per unit of depth images, None where no file says.
+    """
+
+    camera: PinholeCamera
+    notes: tuple[str, ...] = ()
+    mirrored: bool = False
+    depth_scale: float | None = None
+
+
 def find_camera(
-    folders: Sequence[Path], size: tuple[int, int], baseline: float, default: Intrinsics
-) -> tuple[PinholeCamera, tuple[str, ...]]:
-    """Return the camera of images of (width, height) = `size`, and notes: what was assumed, used or ignored.
+    folders: Sequence[Path],
+    size: tuple[int, int],
+    baseline: float | None,
+    default: Intrinsics | None,
+    names: Sequence[str] = NAMES,
+) -> FoundCamera:
+    """Find the camera of images of (width, height) = `size`.
 
     The first file found counts: `camera.toml` (see `read_camera`) in the first of `folders`, the recording's own; then
-    `camera-intrinsics.txt` (3x3 matrix) and `calibration.txt` (fx fy cx cy), in the order of `folders`. Without one,
-    640x480 images get `default`. `baseline` in metres applies where the file has none. Raises SourceError for a bad
-    file, or where there is none and the images have another size.
+    the `names`, in the order of `folders`, each as `read_camera_numbers` reads it. Without one, 640x480 images get
+    `default`. `baseline` in metres applies where the file has none. Raises SourceError for a bad file, or where there
+    is none and the images have another size.
     """
-    places = [folders[0] / FILE, *(folder / name for folder in folders for name in (MATRIX, LIST))]
-    found = [path for path in places if os.path.isfile(path)]  # Path.is_file may raise
+    places = [folders[0] / FILE, *(folder / name for folder in folders for name in names)]
+    found = [path for path in dict.fromkeys(places) if os.path.isfile(path)]  # Path.is_file may raise
     far = [folder / FILE for folder in folders[1:] if os.path.isfile(folder / FILE)]
     cure = "it counts only in the recording's own folder; give it with --camera"
     ignored = [f"{path} is not used: {cure}" for path in far]
     ignored += [f"{path} is not used: {found[0]} comes first" for path in found[1:]]
     if found:
-        camera = _read(found[0], size, baseline)
-        used = (f"{found[0]} is used ({describe_correction(camera)})",) if found[0].name == FILE else ()
-        return camera, (*used, *ignored)
-    if size != VGA:
+        camera = camera_in(found[0], size, baseline)
+        return camera._replace(notes=(*camera.notes, *ignored))
+    if size != VGA or default is None:
         raise SourceError(
             f"{folders[0] / MATRIX}: no such file, and {size[0]}x{size[1]} images have no standard calibration; "
-            "write the 3x3 camera matrix into it"
+            "write the 3x3 camera matrix into it, or add ?camera=FILE"
         )
     numbers = " ".join(f"{n:g}" for n in default)
     note = f"{folders[0]} has no {MATRIX}: assuming the data set's standard fx fy cx cy = {numbers}"
-    return PinholeCamera(*size, *default, baseline), (note, *ignored)
+    return FoundCamera(PinholeCamera(*size, *default, baseline), (note, *ignored))
+
+
+def camera_in(path: Path, size: tuple[int, int], baseline: float | None) -> FoundCamera:
+    """Return the camera in a camera.toml or another program's file, for images of (width, height) = `size`.
+
+    Raises SourceError for a bad file, and for a camera of other images.
+    """
+    if path.suffix.lower() != ".toml":
+        return _foreign(path, size, baseline)
+    camera = _of_size(path, size, baseline)
+    return FoundCamera(camera, (f"{path} is used ({describe_correction(camera)})",))
 
 
 def with_camera(stream: Stream, file: str | os.PathLike[str]) -> Stream:
-    """Return `stream` with the camera in `file`; without a baseline there, the stream's own is kept.
+    """Return `stream` with the camera in `file` (see `camera_in`); without a baseline there, the stream's own is kept.
 
     Raises SourceError for a bad file and for a camera with another number of pixels.
     """
-    camera, own = read_camera(Path(file)), stream.camera
+    own, path = stream.camera, Path(file)
+    if path.suffix.lower() != ".toml":
+        found = _foreign(path, (own.width, own.height), own.baseline)
+        if found.mirrored:
+            raise SourceError(f"{file}: fy is negative, which turns poses as well; give it behind the folder: ?camera=")
+        return WithCamera(stream, found.camera, (f"{file} is used in place of the recording's own camera",))
+    camera = read_camera(path)
     if (camera.width, camera.height) != (own.width, own.height):
         raise SourceError(
             f"{file}: is of a camera with {camera.width}x{camera.height} pixels, {stream.name} has "
@@ -140,21 +172,6 @@ class WithCamera(Stream):
             close = getattr(frames, "close", None)
             if close:  # a generator: a live camera is to stop now
                 close()
-
-
-def read_intrinsics(path: Path) -> Intrinsics:
-    """Return fx, fy, cx, cy in pixels from a 3x3 matrix or from these four numbers; `#` starts a comment.
-
-    Raises SourceError naming the file for anything else, including skew: such a camera is no plain pinhole.
-    """
-    numbers = _numbers(path)
-    if len(numbers) == 4:
-        fx, fy, cx, cy = numbers
-    elif len(numbers) == 9 and numbers[6:] == [0, 0, 1] and numbers[1] == numbers[3] == 0:
-        fx, _, cx, _, fy, cy, *_ = numbers
-    else:
-        raise SourceError(f"{path}: needs the matrix 'fx 0 cx / 0 fy cy / 0 0 1' or the four numbers fx fy cx cy")
-    return fx, fy, cx, cy
 
 
 def describe_correction(camera: PinholeCamera) -> str:
@@ -224,11 +241,7 @@ def _number(table: dict[str, Any], key: str) -> float:
     return float(value)
 
 
-def _read(path: Path, size: tuple[int, int], baseline: float) -> PinholeCamera:
-    return _of_size(path, size, baseline) if path.name == FILE else _plain(path, size, baseline)
-
-
-def _of_size(path: Path, size: tuple[int, int], baseline: float) -> PinholeCamera:
+def _of_size(path: Path, size: tuple[int, int], baseline: float | None) -> PinholeCamera:
     camera = read_camera(path)
     if (camera.width, camera.height) != size:
         raise SourceError(
@@ -238,22 +251,20 @@ def _of_size(path: Path, size: tuple[int, int], baseline: float) -> PinholeCamer
     return camera if camera.baseline else replace(camera, baseline=baseline)
 
 
-def _numbers(path: Path) -> list[float]:
+def _foreign(path: Path, size: tuple[int, int], baseline: float | None) -> FoundCamera:
+    """Return the camera in a file of another program, its numbers scaled where they are for images of another size."""
+    numbers = read_camera_numbers(path)
+    fx, fy, cx, cy = numbers.intrinsics
+    notes: tuple[str, ...] = ()
+    if numbers.size not in (None, size):
+        width, height = numbers.size
+        if abs(size[0] / width - size[1] / height) > 0.01 * size[0] / width:
+            raise SourceError(f"{path}: is for {width}x{height} images, these have {size[0]}x{size[1]}; {OTHER}")
+        factor = size[0] / width
+        fx, fy, cx, cy = factor * fx, factor * fy, factor * (cx + 0.5) - 0.5, factor * (cy + 0.5) - 0.5
+        notes = (f"{path} is for {width}x{height} images; its numbers are scaled to {size[0]}x{size[1]}",)
     try:
-        lines = read_text(path).splitlines()
-        numbers = [float(word) for line in lines for word in line.partition("#")[0].replace(",", " ").split()]
-    except OSError as error:
-        raise SourceError(f"{path}: {error.strerror}; make it readable") from None
-    except ValueError as error:
-        raise SourceError(f"{path}: {error}; write plain numbers") from None
-    if not all(map(math.isfinite, numbers)):
-        raise SourceError(f"{path}: holds NaN or infinity; write plain numbers")
-    return numbers
-
-
-def _plain(path: Path, size: tuple[int, int], baseline: float) -> PinholeCamera:
-    intrinsics = read_intrinsics(path)
-    try:
-        return pinhole(size, intrinsics, baseline)
+        camera = pinhole(size, (fx, abs(fy), cx, cy), baseline)
     except StereovoxError as error:
         raise SourceError(f"{path}: {error}") from None
+    return FoundCamera(camera, notes, mirrored=fy < 0, depth_scale=numbers.depth_scale)

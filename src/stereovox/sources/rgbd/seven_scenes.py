@@ -5,17 +5,17 @@ from __future__ import annotations
 
 import os
 import re
-from pathlib import Path
 
 import numpy as np
 
-from stereovox.errors import FrameRefused, SourceError
-from stereovox.safe_io import read_text
 from stereovox.se3 import Transform
-from stereovox.sources.images import DepthFolder, file_names
+from stereovox.sources.base import Part
+from stereovox.sources.camera_file import FoundCamera, find_camera
+from stereovox.sources.images import file_names
+from stereovox.sources.rgbd.folder import SECOND, DepthFolder, ImageFile, folder_part
+from stereovox.sources.rgbd.pose_files import read_pose
 
 FILE = re.compile(r"frame-(\d+)\.(depth\.png|pose\.txt)")
-FRAMES_PER_SECOND = 30
 
 
 class SevenScenes(DepthFolder):
@@ -27,54 +27,45 @@ class SevenScenes(DepthFolder):
     Camera: `camera.toml` in the folder, else `camera-intrinsics.txt` there or one folder up; without them, 585 585 320
     240 as the data set's authors state, for 640x480 only. Baseline 0.075 m (Kinect v1).
     Time: the files hold none; frame number / 30 Hz, rounded down to whole nanoseconds.
-    Every number that has an image or a pose is a frame. Faults: those of `read_depth_png`, `no_pose` (no file),
+    Every number that has an image or a pose is a frame. Faults: those of `read_depth`, `no_pose` (no file),
     `bad_pose_file` (not 16 numbers).
     """
 
     layout = "a 7-Scenes folder (frame-*.depth.png with frame-*.pose.txt)"
+    parts = (Part(("frame-*.depth.png",), "depth images"), Part(("frame-*.pose.txt",), "poses"))
     depth_scale = 0.001
     baseline = 0.075
     intrinsics = (585.0, 585.0, 320.0, 240.0)
 
-    def __init__(self, where: str | os.PathLike[str]):
-        super().__init__(where)
+    certain = True
+
+    def list_images(self) -> list[ImageFile]:
+        """Return the image files in the order of their numbers, which all that have a pose or an image are in."""
         numbers = {match[1] for name in file_names(self.folder) if (match := FILE.fullmatch(name))}
-        if not numbers:
-            raise SourceError(f"{self.folder}: no frame-*.depth.png in it; give the folder that holds the images")
-        self._numbers = sorted(numbers, key=int)
-        self._set_camera(self.folder, self.folder.resolve().parent)
+        return [
+            ImageFile(self.folder / f"frame-{number}.depth.png", int(int(number) * SECOND / self.fps))
+            for number in sorted(numbers, key=int)
+        ]
+
+    def find_camera(self, size: tuple[int, int]) -> FoundCamera:
+        """Return the camera from the folder or the one above."""
+        folders = [self.folder, self.folder.resolve().parent]
+        return find_camera(folders, size, self.baseline, self.intrinsics, self.calibrations)
 
     @classmethod
     def recognises(cls, where: str) -> bool:
         """Return whether `where` is a folder with at least one image or pose named as in 7-Scenes."""
         try:
-            with os.scandir(where) as entries:
+            with os.scandir(folder_part(where)) as entries:
                 return any(FILE.fullmatch(entry.name) for entry in entries)
         except (OSError, ValueError):
             return False
 
-    def __len__(self) -> int:
-        return len(self._numbers)
-
-    def image(self, i: int) -> tuple[Path, int]:
-        """Return the image file of frame `i` and its time in nanoseconds."""
-        number = self._numbers[i]
-        return self.folder / f"frame-{number}.depth.png", int(number) * 1_000_000_000 // FRAMES_PER_SECOND
-
-    def pose(self, i: int) -> Transform:
+    def pose_in_file(self, i: int) -> Transform:
         """Return T_world_camera (4, 4) just as in the file; raises FrameRefused `no_pose` or `bad_pose_file`."""
-        path = self.folder / f"frame-{self._numbers[i]}.pose.txt"
-        try:
-            numbers = [float(word) for word in read_text(path).split()]
-        except FileNotFoundError:
-            raise FrameRefused("no_pose", f"{path}: no such file; put it back or remove the image") from None
-        except OSError as error:
-            raise FrameRefused("bad_pose_file", f"{path}: {error.strerror}; make it readable") from None
-        except ValueError as error:
-            raise FrameRefused("bad_pose_file", f"{path}: {error}; write a 4x4 matrix of plain numbers") from None
-        if len(numbers) != 16:
-            raise FrameRefused("bad_pose_file", f"{path}: holds {len(numbers)} numbers; write a 4x4 matrix")
-        return np.array(numbers).reshape(4, 4)
+        if self._poses is not None:
+            return super().pose_in_file(i)
+        return read_pose(self._images[i].path.with_name(self._images[i].path.name.replace("depth.png", "pose.txt")))
 
     @classmethod
     def depth_only(cls, where: str) -> SevenScenes:
@@ -83,5 +74,7 @@ class SevenScenes(DepthFolder):
 
 
 class _Images(SevenScenes):
-    def pose(self, i: int) -> Transform:
+    posed = False
+
+    def pose_in_file(self, i: int) -> Transform:
         return np.full((4, 4), np.nan)

@@ -6,57 +6,55 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-import numpy as np
-
 from stereovox.errors import SourceError
-from stereovox.se3 import Transform
-from stereovox.sources.images import DepthFolder, file_names
-from stereovox.sources.trajectory import StampedLine, Trajectory, by_time, inside, ns_from_seconds, stamped_lines
+from stereovox.sources.base import Part
+from stereovox.sources.images import file_names
+from stereovox.sources.rgbd.depth_files import SUFFIXES
+from stereovox.sources.rgbd.folder import DepthFolder, ImageFile, folder_part
+from stereovox.sources.trajectory import (
+    FORMAT,
+    StampedLine,
+    Trajectory,
+    by_time,
+    inside,
+    ns_from_seconds,
+    stamped_lines,
+)
 
 LIST, IMAGES, POSES = "depth.txt", "depth", "groundtruth.txt"
 
 
 class StampedImages(DepthFolder):
-    """`depth.txt` (lines `stamp file`), else all `depth/<stamp>.png`; uint16, 5000 per metre. No poses: all are NaN.
+    """`depth.txt` (lines `stamp file`), else all `depth/<stamp>.png`; 5000 per metre by convention. No poses.
 
     Camera: `camera.toml`, else `camera-intrinsics.txt` (3x3), else `calibration.txt` (fx fy cx cy) in the folder. The
     layout has no such file of its own; without one, 640x480 images get 525 525 319.5 239.5, which TUM recommends for
     all its sequences because the depth is registered to the colour image with it. Baseline 0.075 m (Kinect v1, Xtion).
     Images are in order of time, of several with one stamp the first counts; stamps are exact to the nanosecond.
-    Faults: those of `read_depth_png`. Raises SourceError with file and line for a bad depth.txt.
+    Faults: see `DepthFolder`. Raises SourceError with file and line for a bad depth.txt.
     """
 
     layout = "stamped depth images (depth.txt or depth/*.png)"
+    parts = (Part((LIST, f"{IMAGES}/*"), "depth images"),)
     depth_scale = 1 / 5000
     baseline = 0.075
     intrinsics = (525.0, 525.0, 319.5, 239.5)
 
-    def __init__(self, where: str | os.PathLike[str]):
-        super().__init__(where)
+    def list_images(self) -> list[ImageFile]:
+        """Return the image files in order of time, of several with one stamp the first."""
         lines = _listed(self.folder) if os.path.isfile(self.folder / LIST) else _named(self.folder)
-        self._images = by_time(lines)
-        if len(lines) > len(self._images):
-            self.notes = (f"{self.folder}: left out {len(lines) - len(self._images)} images with a stamp used before",)
-        if not self._images:
+        images = by_time(lines)
+        if len(lines) > len(images):
+            self.notes = (f"{self.folder}: left out {len(lines) - len(images)} images with a stamp used before",)
+        if not images:
             raise SourceError(f"{self.folder}: {LIST} and {IMAGES}/ name no image; give a folder that has some")
-        self._set_camera(self.folder)
+        return [ImageFile(self.folder / name, stamp_ns) for stamp_ns, name, _ in images]
 
     @classmethod
     def recognises(cls, where: str) -> bool:
         """Return whether `where` is a folder with a list of depth images or a folder of them."""
-        return os.path.isfile(os.path.join(where, LIST)) or os.path.isdir(os.path.join(where, IMAGES))
-
-    def __len__(self) -> int:
-        return len(self._images)
-
-    def image(self, i: int) -> tuple[Path, int]:
-        """Return the image file of frame `i` and its time in nanoseconds."""
-        stamp_ns, name, _ = self._images[i]
-        return self.folder / name, stamp_ns
-
-    def pose(self, i: int) -> Transform:
-        """Return a (4, 4) of NaN: nothing is known."""
-        return np.full((4, 4), np.nan)
+        folder = folder_part(where)
+        return os.path.isfile(os.path.join(folder, LIST)) or os.path.isdir(os.path.join(folder, IMAGES))
 
 
 class TumRgbd(StampedImages):
@@ -68,19 +66,24 @@ class TumRgbd(StampedImages):
     """
 
     layout = "a TUM RGB-D folder (depth.txt or depth/*.png, with groundtruth.txt)"
+    parts = (
+        *StampedImages.parts,
+        Part((POSES,), "poses", f"write {POSES} with lines '{FORMAT}', or add ?poses=FILE (other forms too)"),
+    )
 
-    def __init__(self, where: str | os.PathLike[str]):
-        self._trajectory = Trajectory(Path(where) / POSES)
-        super().__init__(where)
+    def read_poses(self) -> Trajectory:
+        """Return the poses of groundtruth.txt."""
+        return Trajectory(self.folder / POSES)
 
     @classmethod
     def recognises(cls, where: str) -> bool:
         """Return whether `where` is a folder that has poses, and a list of depth images or a folder of them."""
-        return super().recognises(where) and os.path.isfile(os.path.join(where, POSES))
+        return super().recognises(where) and os.path.isfile(os.path.join(folder_part(where), POSES))
 
-    def pose(self, i: int) -> Transform:
-        """Return T_world_camera (4, 4) at the image's time; raises FrameRefused `no_pose` or `bad_pose_file`."""
-        return self._trajectory.at(self._images[i][0])
+    @classmethod
+    def depth_only(cls, where: str) -> StampedImages:
+        """Return the images without looking for poses: every pose is NaN."""
+        return StampedImages(where)
 
 
 def _listed(folder: Path) -> list[StampedLine]:
@@ -93,7 +96,7 @@ def _listed(folder: Path) -> list[StampedLine]:
 
 
 def _named(folder: Path) -> list[StampedLine]:
-    images = [f"{IMAGES}/{name}" for name in sorted(file_names(folder / IMAGES)) if name.endswith(".png")]
+    images = [f"{IMAGES}/{name}" for name in sorted(file_names(folder / IMAGES)) if name.lower().endswith(SUFFIXES)]
     return [(_stamp(folder / image), image, image) for image in images]
 
 

@@ -9,7 +9,7 @@ from made_recordings import depth_image, pose, seven_scenes, write_png
 
 from stereovox.errors import SourceError
 from stereovox.opening import open_source
-from stereovox.sources.seven_scenes import SevenScenes
+from stereovox.sources.rgbd.seven_scenes import SevenScenes
 
 KITCHEN = Path(__file__).resolve().parents[2] / "../shared/data/sevenscenes_redkitchen"
 
@@ -110,7 +110,7 @@ def test_not_one_readable_image_is_an_error(tmp_path):
     folder = seven_scenes(tmp_path)
     for path in folder.glob("*.png"):
         path.write_bytes(b"no")
-    with pytest.raises(SourceError, match="none of its 4 depth images"):
+    with pytest.raises(SourceError, match="none of the 4 depth images"):
         SevenScenes(folder)
 
 

@@ -1,0 +1,212 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Depth images of the usual kinds of files, recognised by content: PNG, PGM, TIFF, PFM, OpenEXR, NumPy.
+
+A PNG's checksums are verified before it is decoded (see `images`); the other kinds have none.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+from collections import Counter
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.cameras.pinhole import MAX_PIXELS
+from stereovox.errors import FrameRefused, MissingExtra
+from stereovox.safe_io import read_bounded
+from stereovox.sources.images import GREY_16, MAX_BYTES, SIGNATURE, decode_png, size_text, spread
+
+SUFFIXES = (".png", ".pgm", ".tif", ".tiff", ".pfm", ".exr", ".npy", ".npz")
+"""Suffixes of depth images, in lower case."""
+PACKED_KINDS = frozenset({(8, 2), (8, 6)})
+"""8-bit RGB and RGBA, whose bytes may be those of a depth."""
+FLOAT_TOP = (58, 69)
+"""Smallest and largest leading byte of float32 depths from 1 mm to 2 km."""
+CARLA_M, CARLA_MAX = 1000.0, 256**3 - 1
+"""CARLA's depth camera: (R + 256 G + 65536 B) / (256^3 - 1) of 1000 m."""
+KIND = "depth must be a 16-bit grey PNG, PGM or TIFF, or floats (TIFF, PFM, EXR, NPY)"
+Depth = NDArray[np.uint16] | NDArray[np.float32]
+
+
+def read_depth(path: Path, size: tuple[int, int]) -> Depth:
+    """Read a depth image.
+
+    Args:
+        path: The file.
+        size: (width, height) that it must have.
+
+    Returns:
+        (height, width) uint16, or float32 where the file holds floats or larger integers; in the file's unit.
+
+    Raises:
+        FrameRefused: `missing_file`; `unreadable` (cut off, damaged, absurdly large); `bad_dtype` (a picture);
+            `bad_shape` (another size).
+    """
+    image = _decoded(path, size)
+    found = image.shape[1], image.shape[0]
+    if found != size:
+        raise FrameRefused(
+            "bad_shape", f"{path}: {size_text(found)} pixels, the recording has {size_text(size)}; remove it"
+        )
+    return image
+
+
+def depth_size(path: Path) -> tuple[int, int]:
+    """Return (width, height) of a depth image; raises FrameRefused as `read_depth`."""
+    height, width = _decoded(path).shape
+    return width, height
+
+
+def common_depth_size(paths: Sequence[Path], samples: int = 5) -> tuple[int, int] | str:
+    """Return the most frequent (width, height) of readable images spread over `paths`.
+
+    Where none is readable: what is wrong with the first.
+    """
+    found: Counter[tuple[int, int]] = Counter()
+    fault = "there is no image"
+    for path in spread(paths, samples):
+        try:
+            found[depth_size(path)] += 1
+        except FrameRefused as refused:
+            fault = str(refused) if fault == "there is no image" else fault
+        if found.total() == samples:
+            break
+    return found.most_common(1)[0][0] if found else fault
+
+
+def _decoded(path: Path, size: tuple[int, int] | None = None) -> Depth:
+    content = _read(path)
+    if content.startswith(SIGNATURE):
+        return _depth(path, _png(path, content, size))
+    for start, decode in DECODERS.items():
+        if content.startswith(start):
+            return _depth(path, decode(path, content))
+    raise FrameRefused("unreadable", f"{path}: no depth image of a known kind ({', '.join(SUFFIXES)})")
+
+
+def _read(path: Path) -> bytes:
+    if not os.path.isfile(path):  # Path.is_file may raise
+        raise FrameRefused("missing_file", f"{path}: no such file; put it back or remove its entry")
+    try:
+        return read_bounded(path, MAX_BYTES)
+    except OSError as error:
+        raise FrameRefused("unreadable", f"{path}: {error.strerror}; make it readable or remove it") from None
+
+
+def _depth(path: Path, image: NDArray[np.generic]) -> Depth:
+    """Return the decoded array as a depth image; raises FrameRefused `bad_dtype` or `unreadable`."""
+    image = image[..., 0] if image.ndim == 3 and image.shape[2] == 1 else image
+    if image.ndim != 2 or image.dtype.kind not in "uif" or (image.dtype.kind in "ui" and image.dtype.itemsize == 1):
+        what = f"{' x '.join(map(str, image.shape))} {image.dtype}"
+        raise FrameRefused("bad_dtype", f"{path}: holds {what}; {KIND}")
+    if not 0 < image.size <= MAX_PIXELS:
+        raise FrameRefused("unreadable", f"{path}: {image.size} pixels; remove it")
+    if image.dtype == np.uint16:
+        return np.ascontiguousarray(image, np.uint16)
+    with np.errstate(over="ignore"):
+        return np.ascontiguousarray(image, np.float32)
+
+
+def _png(path: Path, content: bytes, size: tuple[int, int] | None) -> NDArray[np.generic]:
+    image = decode_png(path, content, size, frozenset({GREY_16}) | PACKED_KINDS, KIND)
+    return image if image.ndim == 2 else _unpacked(path, image.astype(np.uint8, copy=False))
+
+
+def _unpacked(path: Path, image: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Return depths of a PNG that packs them into its bytes: float32 as RGBA, or CARLA's 24 bits.
+
+    image: (height, width, 3 or 4) uint8 in the order B, G, R, A of OpenCV. Raises FrameRefused for a picture.
+    """
+    blue, green, red = (image[..., k].astype(np.uint32) for k in range(3))
+    if image.shape[2] == 4:
+        top = image[..., 3]
+        used = top > 0
+        if used.any() and np.mean((top[used] >= FLOAT_TOP[0]) & (top[used] <= FLOAT_TOP[1])) > 0.99:
+            orders = [(blue, red), (red, blue)]  # of OpenCV (RTAB-Map), and of programs that write R first
+            made = [(low | green << 8 | high << 16 | top.astype(np.uint32) << 24) for low, high in orders]
+            return min((bits.view(np.float32) for bits in made), key=_roughness)
+    if _counts_over(blue, green) > 0.8:
+        return ((red + 256 * green + 65536 * blue) * (CARLA_M / CARLA_MAX)).astype(np.float32)
+    raise FrameRefused("bad_dtype", f"{path}: is a colour picture; {KIND}")
+
+
+def _roughness(depth: NDArray[np.float32]) -> float:
+    """Return the median relative step from pixel to pixel."""
+    step = np.abs(np.diff(depth.astype(np.float64), axis=1)) / np.maximum(np.abs(depth[:, 1:]), 1e-9)
+    return float(np.nanmedian(step)) if step.size else 0.0
+
+
+def _counts_over(high: NDArray[np.uint32], low: NDArray[np.uint32]) -> float:
+    """Return in how many neighbours whose `high` byte differs by one the `low` byte starts anew, as in a number."""
+    rise, fall = (np.diff(byte.astype(np.int32), axis=1) for byte in (high, low))
+    one = np.abs(rise) == 1
+    return float(np.mean(fall[one] * rise[one] < -128)) if one.any() else 0.0
+
+
+def _opencv(path: Path, content: bytes) -> NDArray[np.generic]:
+    import cv2
+
+    try:
+        image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        image = None
+    if image is None:
+        raise FrameRefused("unreadable", f"{path}: is cut off or damaged; copy it again or remove it")
+    return image
+
+
+def _pgm(path: Path, content: bytes) -> NDArray[np.generic]:
+    """Return the image of a PGM; one that is cut off is refused (OpenCV fills it up)."""
+    image = _opencv(path, content)
+    if len(content) < image.nbytes and content.startswith(b"P5"):
+        raise FrameRefused("unreadable", f"{path}: is cut off; copy it again or remove it")
+    return image
+
+
+def _numpy(path: Path, content: bytes) -> NDArray[np.generic]:
+    """Return the array of an `.npy`, or of an `.npz` with one array or one named `depth`."""
+    try:
+        found = np.load(io.BytesIO(content), allow_pickle=False)
+        if isinstance(found, np.ndarray):
+            return np.squeeze(found)
+        name = "depth" if "depth" in found.files else found.files[0] if len(found.files) == 1 else ""
+        return np.squeeze(found[name])
+    except Exception as error:  # what a damaged file can raise in zipfile, zlib and NumPy is not bounded
+        why = " ".join(str(error).split())[:100]
+        raise FrameRefused("unreadable", f"{path}: no array of depths ({why}); save it again") from None
+
+
+def _exr(path: Path, content: bytes) -> NDArray[np.generic]:
+    """Return the depth channel of an OpenEXR image: Z or depth, else its only one or the first of equal ones."""
+    try:
+        import OpenEXR
+    except ImportError:
+        raise MissingExtra("OpenEXR", "exr") from None
+    try:
+        with OpenEXR.File(os.fspath(path), separate_channels=True) as file:
+            channels = {name: np.asarray(channel.pixels) for name, channel in file.channels().items()}
+    except Exception as error:  # the library raises plain RuntimeError and more
+        why = " ".join(str(error).split())[:100]
+        raise FrameRefused("unreadable", f"{path}: no OpenEXR image that can be read ({why})") from None
+    named = next((name for name in channels if name.rpartition(".")[2].lower() in ("z", "depth", "y", "v")), None)
+    first = channels[named or next(iter(channels))]
+    if named is None and any(not np.array_equal(first, other, equal_nan=True) for other in channels.values()):
+        raise FrameRefused("bad_dtype", f"{path}: its channels {', '.join(channels)} differ, none is Z; {KIND}")
+    return first
+
+
+DECODERS: dict[bytes, Callable[[Path, bytes], NDArray[np.generic]]] = {
+    b"P5": _pgm,
+    b"P2": _pgm,
+    b"Pf": _opencv,
+    b"II*\0": _opencv,
+    b"MM\0*": _opencv,
+    b"\x76\x2f\x31\x01": _exr,
+    b"\x93NUMPY": _numpy,
+    b"PK\x03\x04": _numpy,
+}
+"""By the first bytes of a file; PNG besides."""

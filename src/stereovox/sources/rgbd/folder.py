@@ -1,0 +1,272 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Recordings of a depth camera as a folder: image files, poses, a camera; and the options behind a folder's name."""
+
+from __future__ import annotations
+
+import os
+import re
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from stereovox.errors import FrameRefused, SourceError, did_you_mean
+from stereovox.frame import Frame
+from stereovox.se3 import Transform
+from stereovox.sources import parameters
+from stereovox.sources.base import DepthSource
+from stereovox.sources.camera_file import FoundCamera, camera_in, find_camera
+from stereovox.sources.images import file_names
+from stereovox.sources.intrinsics import NAMES, Intrinsics, metres_per_unit
+from stereovox.sources.poses import Poses
+from stereovox.sources.rgbd.depth_files import SUFFIXES, Depth, common_depth_size, read_depth
+from stereovox.sources.rgbd.depth_unit import DepthUnit, find_unit, pairs_of, unit_words
+from stereovox.sources.rgbd.pose_files import ImagePoses, in_optical_axes, number_in, read_poses
+from stereovox.sources.tracker import AXES
+from stereovox.sources.trajectory import ns_from_seconds
+
+SECOND = 1_000_000_000
+MIRROR_CAMERA, MIRROR_WORLD = np.diag([1.0, -1, 1, 1]), np.diag([1.0, 1, -1, 1])
+"""Turn the poses of a camera whose second axis points up, a left-handed frame, into rigid ones of optical axes: the
+image is right as it is, so the world is mirrored, along its third axis."""
+
+
+class ImageFile(NamedTuple):
+    """A depth image's file and its time in nanoseconds."""
+
+    path: Path
+    stamp_ns: int
+
+
+@dataclass(frozen=True)
+class FolderOptions:
+    """What may stand behind a folder's name, as in `scan?depth_scale=1000&poses=trajectory.log`.
+
+    depth_scale: unit of the images; 1000 and 0.001 both mean millimetres (0: as the layout has it, checked against
+        the poses). camera: file of the camera, in place of the layout's own (see `camera_in`). fps: images a second
+        where they have no times (0: the layout's). poses: file or folder of poses in place of the layout's own (see
+        `pose_files`). axes: axes of the posed camera, `optical`, `opengl` (x right, y up, z backward) or `ros`. invert:
+        whether poses are world to camera.
+    File names are looked up as they stand, then inside the folder.
+    """
+
+    depth_scale: float = 0.0
+    camera: str = ""
+    fps: float = 0.0
+    poses: str = ""
+    axes: str = ""
+    invert: bool = False
+
+    def __post_init__(self) -> None:
+        if self.axes and self.axes not in AXES:
+            raise SourceError(f"axes={self.axes} is unknown{did_you_mean(self.axes, AXES)}")
+        for key in ("depth_scale", "fps"):
+            if getattr(self, key) < 0:
+                raise SourceError(f"{key}={getattr(self, key):g} must be positive")
+
+
+def folder_part(where: str | os.PathLike[str]) -> str:
+    """Return the folder in `FOLDER?key=value`; never raises."""
+    text = os.fspath(where)
+    return text if "?" not in text or os.path.exists(text) else text.partition("?")[0]
+
+
+def folder_options(where: str | os.PathLike[str]) -> tuple[Path, FolderOptions]:
+    """Return the folder in `FOLDER?key=value` and its options; raises SourceError for unknown or bad ones."""
+    text = os.fspath(where)
+    folder = folder_part(text)
+    known = {field.name: field.default for field in fields(FolderOptions)}
+    try:
+        _, given = parameters.split(f"folder{text[len(folder) :]}")
+        return Path(folder), FolderOptions(**parameters.typed(given, known))
+    except SourceError as error:
+        raise SourceError(f"{where}: {error}") from None
+
+
+class DepthFolder(DepthSource, ABC):
+    """Frames from depth images, one file each; an unusable file becomes a frame with a `fault`.
+
+    A layout lists its images and reads its poses; what it does not say otherwise is looked for: the camera beside the
+    images, the unit by convention and by how images agree with each other (see `depth_unit`). The options behind the
+    folder's name come before all of it (see `FolderOptions`).
+    Pixels hold 0, 65535, NaN or infinity where there is no value, without a reason: all are UNKNOWN, none clears.
+    Faults: those of `read_depth`, and `no_pose` and `bad_pose_file`.
+    Raises SourceError where there is no readable image, no camera or no poses.
+
+    Attributes:
+        depth_scale: Metres per unit of integer images, by convention; floats are metres.
+        baseline: Metres between the eyes of the sensor, None if unknown.
+        intrinsics: fx, fy, cx, cy of 640x480 images without a file of the camera; None: there must be one.
+        axes: Axes of the posed camera.
+        fps: Images a second, where they have no times.
+        calibrations: Names of files of the camera, in order of preference.
+        certain: Whether all who write this layout use its unit; else a unit that cannot be checked leaves a note.
+        posed: Whether anything is known about poses; False: all are NaN.
+        unit: The unit of the images, and what speaks for it.
+    """
+
+    depth_scale: float = 0.001
+    baseline: float | None = None
+    intrinsics: Intrinsics | None = None
+    axes: str = "optical"
+    fps: float = 30.0
+    calibrations: tuple[str, ...] = NAMES
+    certain: bool = False
+    unit: DepthUnit
+    posed: bool = True
+    _poses: Poses | ImagePoses | None = None
+
+    def __init__(self, where: str | os.PathLike[str]):
+        self.folder, self.options = folder_options(where)
+        self.name = self.folder.resolve().name
+        self.axes, self.fps = self.options.axes or self.axes, self.options.fps or self.fps
+        self._images = self.list_images()
+        if not self._images:
+            raise SourceError(f"{self.folder}: has no depth image ({', '.join(SUFFIXES)}); give a folder that has some")
+        self._poses = self._read_poses()
+        self.posed = self.posed and (self._poses is not None or self._has_own_poses())
+        self.camera, notes, self._mirrored, scale = self._find_camera()
+        self.unit = self._find_unit(scale)
+        unit_note = () if self.options.depth_scale else self._unit_note(scale or self.depth_scale)
+        self.depth_scale = self.unit.scale
+        self.notes = (*self.notes, *notes, *unit_note)
+
+    @abstractmethod
+    def list_images(self) -> list[ImageFile]:
+        """Return the image files in order of time."""
+
+    def read_poses(self) -> Poses | ImagePoses | None:
+        """Return the layout's poses; None: nothing is known, all are NaN."""
+        return None
+
+    def find_camera(self, size: tuple[int, int]) -> FoundCamera:
+        """Return the camera of images of (width, height) = `size`."""
+        return find_camera([self.folder], size, self.baseline, self.intrinsics, self.calibrations)
+
+    def __len__(self) -> int:
+        return len(self._images)
+
+    def image(self, i: int) -> ImageFile:
+        """Return the image file of frame `i` (0 to len - 1) and its time in nanoseconds."""
+        return self._images[i]
+
+    def pose_in_file(self, i: int) -> Transform:
+        """Return the pose (4, 4) of frame `i` just as it is given; raises FrameRefused where there is none."""
+        if isinstance(self._poses, ImagePoses):
+            return self._poses.at(i)
+        return np.full((4, 4), np.nan) if self._poses is None else self._poses.at(self._images[i].stamp_ns)
+
+    def pose(self, i: int) -> Transform:
+        """Return T_world_camera (4, 4) of frame `i` (0 to len - 1); raises FrameRefused where there is none."""
+        T = self.pose_in_file(i)
+        if self._mirrored:
+            T = MIRROR_WORLD @ T @ MIRROR_CAMERA
+        plain = self.axes == "optical" and not self.options.invert
+        return T if plain else in_optical_axes(T, self.axes, self.options.invert)
+
+    def read(self, i: int) -> Depth:
+        """Return the depth image (height, width) of frame `i` (0 to len - 1); raises FrameRefused (`read_depth`)."""
+        return read_depth(self._images[i].path, (self.camera.width, self.camera.height))
+
+    def frame(self, i: int) -> Frame:
+        """Return frame `i`; depth is (0, 0) and the pose NaN where the frame has a `fault`."""
+        i = range(len(self))[i]
+        path, stamp_ns = self.image(i)
+        try:
+            T_world_camera = self.pose(i)
+            depth = self.read(i)
+        except FrameRefused as refused:
+            no_depth, no_pose = np.empty((0, 0), np.uint16), np.full((4, 4), np.nan)
+            blank = Frame(no_depth, self.camera, no_pose, stamp_ns, self.depth_scale, name=str(path))
+            return replace(blank, fault=refused.reason, fault_detail=str(refused))
+        return Frame(depth, self.camera, T_world_camera, stamp_ns, self.depth_scale, name=str(path))
+
+    def _read_poses(self) -> Poses | ImagePoses | None:
+        if not self.options.poses:
+            return self.read_poses()
+        found = read_poses(self._file(self.options.poses))
+        if isinstance(found, Poses):
+            first, last = self._images[0].stamp_ns, self._images[-1].stamp_ns
+            if found.stamps_ns[0] <= last and first <= found.stamps_ns[-1]:
+                return found
+            found = ImagePoses(list(found.T_world_body), found.where)  # times of another clock
+        if len(found) != len(self):
+            raise SourceError(
+                f"{found.where}: holds {len(found)} poses for {len(self)} images of {self.folder}; give one for each"
+            )
+        return found
+
+    def _find_camera(self) -> FoundCamera:
+        size = common_depth_size([image.path for image in self._images])
+        if isinstance(size, str):
+            raise SourceError(f"none of the {len(self)} depth images of {self.folder} can be read: {size}")
+        if self.options.camera:
+            return camera_in(self._file(self.options.camera), size, self.baseline)
+        return self.find_camera(size)
+
+    def _find_unit(self, in_file: float | None) -> DepthUnit:
+        """Return the unit of the images; `in_file`: metres per unit that the file of the camera says."""
+        if self.options.depth_scale:
+            return DepthUnit(metres_per_unit(self.options.depth_scale), True, "as ?depth_scale= says")
+        floats = self._dtype().kind == "f"
+        expected = in_file or (1.0 if floats else self.depth_scale)
+        pairs = pairs_of(len(self), self.pose, self.read) if self.posed else []
+        return find_unit(pairs, self.camera, expected)
+
+    def _unit_note(self, expected: float) -> tuple[str, ...]:
+        """Return a note where the unit is not the `expected` one, or could neither be checked nor is certain."""
+        unit, usual = self.unit, abs(self.unit.scale / expected - 1) < 1e-6
+        if usual and (unit.sure or (unit.plausible and (self.certain or not self.posed))):
+            return ()
+        contrary = "" if usual else f", not {unit_words(expected)}"
+        override = f"else give {self.folder}?depth_scale={5000 if unit.scale == 0.001 else 1000}"
+        return (f"depth is taken to be in {unit.words}{contrary} ({unit.why}); {override}",)
+
+    def _has_own_poses(self) -> bool:
+        """Return whether the layout overrides `pose_in_file`."""
+        return type(self).pose_in_file is not DepthFolder.pose_in_file
+
+    def _dtype(self) -> np.dtype[np.generic]:
+        """Return the type of the images, that of the first that can be read."""
+        for i in range(len(self)):
+            try:
+                return self.read(i).dtype
+            except FrameRefused:
+                continue
+        return np.dtype(np.uint16)
+
+    def _file(self, text: str) -> Path:
+        """Return the file that an option names: as it stands, else inside the folder; raises SourceError."""
+        found = next((path for path in (Path(text), self.folder / text) if os.path.exists(path)), None)
+        if found is None:
+            raise SourceError(f"{text}: no such file, nor in {self.folder}; check the name")
+        return found
+
+
+def images_in(folder: Path, pattern: str, fps: float) -> list[ImageFile]:
+    """Return the images of a folder whose names match a regular expression, in the order of their numbers.
+
+    Their times are the numbers divided by `fps`, or, where names are times (a point and six or more decimals, or 16 or
+    more digits of nanoseconds or microseconds), those.
+    """
+    names = [name for name in file_names(folder) if re.fullmatch(pattern, name, re.IGNORECASE)]
+    stems = [os.path.splitext(name)[0] for name in names]
+    if stems and all(re.fullmatch(r"\d{9,}\.\d+", stem) for stem in stems):
+        stamps = [ns_from_seconds(stem) for stem in stems]
+    elif stems and all(re.fullmatch(r"\d{16,19}", stem) for stem in stems):
+        stamps = [int(stem) * (1 if len(stem) > 17 else 1000) for stem in stems]
+    else:
+        names.sort(key=number_in)
+        numbers = [number_in(name)[0] for name in names]
+        numbers = numbers if len(set(numbers)) == len(numbers) and min(numbers, default=0) >= 0 else range(len(names))
+        stamps = [int(number * SECOND / fps) for number in numbers]
+    files = [ImageFile(folder / name, stamp) for name, stamp in zip(names, stamps, strict=True)]
+    return sorted(files, key=lambda image: image.stamp_ns)
+
+
+def image_pattern(names: Sequence[str] = SUFFIXES) -> str:
+    """Return a regular expression of all files with these suffixes."""
+    return rf"[^.].*({'|'.join(re.escape(name) for name in names)})"

@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Depth images with a file or folder of poses beside them, as most programs export recordings."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from stereovox.errors import SourceError
+from stereovox.sources.base import Part
+from stereovox.sources.camera_file import FoundCamera, find_camera
+from stereovox.sources.intrinsics import NAMES
+from stereovox.sources.poses import Poses
+from stereovox.sources.rgbd.depth_files import SUFFIXES, common_depth_size
+from stereovox.sources.rgbd.folder import DepthFolder, ImageFile, folder_part, image_pattern, images_in
+from stereovox.sources.rgbd.pose_files import ImagePoses, read_poses
+
+POSES = Part(
+    ("poses.txt", "trajectory.log", "trajectory.txt", "traj.txt", "pose.txt", "groundtruth.txt", "CameraTrajectory.txt",
+     "*.log", "poses", "pose"),
+    "poses",
+    "write poses.txt with lines 'stamp tx ty tz qx qy qz qw' or a 4x4 matrix for each image, or add ?poses=FILE",
+)  # fmt: skip
+DEPTH = Part(
+    tuple(f"{place}*{suffix}" for place in ("depth/", "depths/", "*depth*/", "*depth*", "") for suffix in SUFFIXES),
+    "depth images",
+)
+
+
+class DepthAndPoses(DepthFolder):
+    """Depth images in a folder `depth/` (or the like, or beside the poses) and one file or folder of poses.
+
+    Poses: see `pose_files` for the forms; those over time need images whose names are times, all others are one for
+    each image, in order of the numbers in the names. World: that of the poses.
+    Unit: millimetres by convention, else what the poses show (see `depth_unit`). Camera: see `find_camera`; there is no
+    default. Ground robots, hand-held scanners, simulators: what the poses and the camera are is for the user to check.
+    """
+
+    layout = "depth images with a file of poses (depth/ with poses.txt, trajectory.log or traj.txt)"
+    parts = (DEPTH, POSES)
+
+    def list_images(self) -> list[ImageFile]:
+        """Return the depth images in the order of their numbers or times."""
+        folder, pattern = image_place(self.folder)
+        return images_in(folder, pattern, self.fps)
+
+    def read_poses(self) -> Poses | ImagePoses | None:
+        """Return the poses beside the images."""
+        return poses_beside(self.folder, POSES, len(self))
+
+    def find_camera(self, size: tuple[int, int]) -> FoundCamera:
+        """Return the camera from the folder, or the one above."""
+        names = (*NAMES, *(f"{inner}/{name}" for inner in ("intrinsic", "intrinsics", "camera") for name in NAMES))
+        return find_camera([self.folder, self.folder.resolve().parent], size, self.baseline, self.intrinsics, names)
+
+    @classmethod
+    def recognises(cls, where: str) -> bool:
+        """Return whether `where` is a folder with depth images and poses, or says where its poses are."""
+        folder = folder_part(where)
+        posed = "poses=" in where[len(folder) :] or POSES.count(folder) > 0
+        return posed and has_depth(folder)
+
+    @classmethod
+    def depth_only(cls, where: str) -> DepthOnly:
+        """Return the images without looking for poses: every pose is NaN."""
+        return DepthOnly(where)
+
+
+class DepthOnly(DepthAndPoses):
+    """The same images without poses: all are NaN."""
+
+    posed = False
+
+    def read_poses(self) -> None:
+        """Return None."""
+
+    @classmethod
+    def recognises(cls, where: str) -> bool:
+        """Return whether `where` is a folder with depth images."""
+        return has_depth(folder_part(where))
+
+
+def has_depth(folder: str) -> bool:
+    """Return whether `folder` holds depth images: by their names, or because the first image is one."""
+    if not os.path.isdir(folder) or not DEPTH.count(folder):
+        return False
+    place, pattern = image_place(Path(folder))
+    images = images_in(place, pattern, 1.0)
+    named = "depth" in f"{place.name} {images[0].path.name}".lower() if images else False
+    return named or (bool(images) and not isinstance(common_depth_size([images[0].path]), str))
+
+
+def image_place(folder: Path) -> tuple[Path, str]:
+    """Return the folder that holds the depth images, and a regular expression of their names."""
+    for pattern in DEPTH.patterns:
+        found = next(iter(sorted(folder.glob(pattern))), None)
+        if found is not None:
+            named = found.parent == folder and "depth" in found.name.lower()
+            return found.parent, (r"[^.].*depth.*|depth.*" if named else image_pattern((found.suffix,)))
+    return folder, image_pattern()
+
+
+def poses_beside(folder: Path, part: Part, images: int) -> Poses | ImagePoses:
+    """Return the poses of the first file or folder of `part` in `folder`.
+
+    Raises SourceError where there is none, or one for each image but of another number.
+    """
+    path = next((path for pattern in part.patterns for path in sorted(folder.glob(pattern))), None)
+    if path is None:
+        raise SourceError(f"{folder}: has depth images but no poses; {part.cure}")
+    found = read_poses(path)
+    if isinstance(found, ImagePoses) and len(found) != images:
+        raise SourceError(
+            f"{path}: holds {len(found)} poses for {images} images; give one for each, or add ?poses=FILE"
+        )
+    return found

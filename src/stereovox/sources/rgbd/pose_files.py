@@ -1,0 +1,176 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Poses from files in any of the usual forms: one for each image, or over time.
+
+| form | lines | who writes it |
+|---|---|---|
+| TUM | `stamp tx ty tz qx qy qz qw` | TUM RGB-D, ORB-SLAM, evo, most SLAM programs |
+| KITTI | 12 numbers, a 3x4 matrix row by row | KITTI, kiss-icp |
+| matrices | 16 numbers a line, or 4x4 matrices below each other | Replica, NICE-SLAM |
+| log | `i i i`, then a 4x4 matrix | Redwood, Open3D |
+| a folder | a file for each image, with 16 or 12 numbers or `tx ty tz qx qy qz qw` | ScanNet, 7-Scenes |
+
+All are T_world_camera (camera to world) in metres, unless the options of a folder (`axes`, `invert`) say otherwise.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from stereovox.errors import FrameRefused, SourceError
+from stereovox.safe_io import MAX_LIST, read_text
+from stereovox.se3 import Transform, from_quaternion, inverse
+from stereovox.sources.poses import Poses
+from stereovox.sources.tracker import AXES
+from stereovox.sources.trajectory import Trajectory
+
+FORMS = "TUM lines 'stamp tx ty tz qx qy qz qw', KITTI's 12 numbers a line, 4x4 matrices, or Open3D's .log"
+SUFFIXES = (".txt", ".log", ".csv", ".tum", ".kitti", ".pose", ".dat")
+
+
+class ImagePoses:
+    """Poses of a camera, one for each image, in order.
+
+    Args:
+        T_world_camera: For each image (4, 4) in metres, or what is wrong with it in one line.
+        where: What they came from, for messages.
+
+    Raises:
+        SourceError: Not one image has a pose.
+    """
+
+    def __init__(self, T_world_camera: Sequence[Transform | str], where: str):
+        if all(isinstance(T, str) for T in T_world_camera):
+            why = T_world_camera[0] if T_world_camera else "it is empty"
+            raise SourceError(f"{where}: holds no pose that can be used ({why}); write {FORMS}")
+        self._poses = list(T_world_camera)
+        self.where = where
+
+    def __len__(self) -> int:
+        return len(self._poses)
+
+    def at(self, i: int) -> Transform:
+        """Return T_world_camera (4, 4) of image `i`; raises FrameRefused `no_pose` or `bad_pose_file`."""
+        if not 0 <= i < len(self._poses):
+            raise FrameRefused("no_pose", f"{self.where}: has no pose for image {i}; leave it out or add one")
+        found = self._poses[i]
+        if isinstance(found, str):
+            raise FrameRefused("bad_pose_file", found)
+        return found.copy()
+
+
+def read_poses(path: Path) -> Poses | ImagePoses:
+    """Read a file or folder of poses.
+
+    Args:
+        path: File in one of the forms above, or a folder of files, in the order of the numbers in their names.
+
+    Returns:
+        `Poses` over time for the TUM form, else `ImagePoses`.
+
+    Raises:
+        SourceError: It cannot be read, is of no known form, or holds no usable pose.
+    """
+    if os.path.isdir(path):
+        return _read_folder(path)
+    rows = _rows(path)
+    widths = {len(row) for row in rows}
+    if widths <= {8, 9}:  # the ninth: a tracker's confidence
+        return Trajectory(path)
+    if widths == {12} or widths == {16}:
+        return ImagePoses([_matrix(row, f"{path}:{n}") for n, row in enumerate(rows, 1)], str(path))
+    if widths <= {3, 4} and len(rows) % 5 == 0 and all(len(row) == 3 for row in rows[::5]):
+        return _stacked(path, [rows[k + 1 : k + 5] for k in range(0, len(rows), 5)])
+    if widths == {4} and len(rows) % 4 == 0:
+        return _stacked(path, [rows[k : k + 4] for k in range(0, len(rows), 4)])
+    many = ", ".join(map(str, sorted(widths)[:5])) or "no"
+    raise SourceError(f"{path}: its lines have {many} numbers, which is no form of poses; write {FORMS}")
+
+
+def read_pose(path: Path) -> Transform:
+    """Return the one pose (4, 4) in a file of 16 or 12 numbers, or `tx ty tz qx qy qz qw`; raises FrameRefused."""
+    try:
+        numbers = [float(word) for word in _plain(read_text(path))]
+    except FileNotFoundError:
+        raise FrameRefused("no_pose", f"{path}: no such file; put it back or remove the image") from None
+    except OSError as error:
+        raise FrameRefused("bad_pose_file", f"{path}: {error.strerror}; make it readable") from None
+    except ValueError as error:
+        raise FrameRefused("bad_pose_file", f"{path}: {error}; write a 4x4 matrix of plain numbers") from None
+    found = _matrix(numbers, str(path))
+    if isinstance(found, str):
+        raise FrameRefused("bad_pose_file", found)
+    return found
+
+
+def in_optical_axes(T: Transform, axes: str, inverted: bool) -> Transform:
+    """Return T_world_camera (4, 4) in optical axes of the pose of a camera in `axes`; the world stays as it is.
+
+    inverted: `T` is T_camera_world. axes: a key of `AXES`.
+    """
+    C = np.eye(4)
+    C[:3, :3] = AXES[axes].T
+    return (inverse(T) if inverted else T) @ C
+
+
+def number_in(name: str) -> tuple[int, str]:
+    """Return the last number in the name of a file, by which files are put in order, and the name; -1 where none is."""
+    found = re.findall(r"\d+", name.rpartition(".")[0] or name)
+    return (int(found[-1]) if found else -1), name
+
+
+def _read_folder(path: Path) -> ImagePoses:
+    try:
+        names = [name for name in os.listdir(path) if name.endswith(".txt")]
+    except OSError as error:
+        raise SourceError(f"{path}: {error.strerror}; give a folder you may read") from None
+    if not names:
+        raise SourceError(f"{path}: holds no .txt with a pose; write one file with a 4x4 matrix for each image")
+    found: list[Transform | str] = []
+    for name in sorted(names, key=number_in):
+        try:
+            found.append(read_pose(path / name))
+        except FrameRefused as refused:
+            found.append(str(refused))
+    return ImagePoses(found, str(path))
+
+
+def _rows(path: Path) -> list[list[float]]:
+    """Return the numbers of all lines; raises SourceError with the line for anything else."""
+    try:
+        lines = read_text(path, MAX_LIST, "replace").splitlines()
+    except OSError as error:
+        raise SourceError(f"{path}: {error.strerror}; give a file of poses: {FORMS}") from None
+    rows = []
+    for n, line in enumerate(lines, 1):
+        try:
+            rows.append([float(word) for word in _plain(line)])
+        except ValueError as error:
+            raise SourceError(f"{path}:{n}: {error}; correct or delete the line") from None
+    return [row for row in rows if row]
+
+
+def _plain(text: str) -> list[str]:
+    return " ".join(line.partition("#")[0] for line in text.splitlines()).replace(",", " ").split()
+
+
+def _stacked(path: Path, blocks: list[list[list[float]]]) -> ImagePoses:
+    flat = [[number for row in block for number in row] for block in blocks]
+    return ImagePoses([_matrix(numbers, f"{path}, pose {n}") for n, numbers in enumerate(flat)], str(path))
+
+
+def _matrix(numbers: Sequence[float], where: str) -> Transform | str:
+    """Return the pose in 16, 12 or 7 numbers, or what is wrong with their form; the gate judges the rest."""
+    if len(numbers) == 7:
+        if not any(numbers[3:]):
+            return f"{where}: a quaternion of length zero; correct it"
+        return from_quaternion(numbers[:3], numbers[3:])
+    if len(numbers) not in (12, 16):
+        return f"{where}: holds {len(numbers)} numbers; write a 4x4 matrix"
+    T = np.eye(4)
+    T[: len(numbers) // 4] = np.reshape(numbers, (-1, 4))
+    return T

@@ -13,13 +13,15 @@ import numpy as np
 from stereovox.errors import SourceError
 from stereovox.safe_io import MAX_LIST, read_text
 from stereovox.se3 import Transform, inverse
+from stereovox.sources.base import Part
 from stereovox.sources.calibration_files import read_calibration
 from stereovox.sources.calibration_values import StereoCalibration, read_yaml, rigid
 from stereovox.sources.images import file_names
-from stereovox.sources.kitti.base import folder_of, location
 from stereovox.sources.poses import Poses, seconds_from_ns
+from stereovox.sources.rgbd.folder import folder_part
 from stereovox.sources.rig import RigSource, Shot
 from stereovox.sources.rig_file import Rig, RigPair, Virtual, usual_virtual
+from stereovox.sources.rig_options import POSES, as_body, file_of, folder_and_options, poses_of_images
 from stereovox.sources.trajectory import Trajectory, inside, transforms
 
 ROOT, EYES, DATA, SENSOR = "mav0", ("cam0", "cam1"), "data.csv", "sensor.yaml"
@@ -36,8 +38,11 @@ SAME_NS = 1_000_000
 class AslRig(RigSource):
     """A folder `mav0` or the one that holds it: cam0 and cam1 with images named or listed by ns, calibration and poses.
 
-    where: the folder, or with parameters `MH_01_easy?rectify=pinhole`: rectify: `pinhole`, `spherical` or
-        `cylindrical`; without it spherical for fisheyes, else pinhole.
+    where: the folder, or with options `MH_01_easy?rectify=pinhole&poses=CameraTrajectory.txt&axes=optical`:
+        rectify: `pinhole`, `spherical` or `cylindrical`; without it spherical for fisheyes, else pinhole.
+        poses: a file or folder of poses of any form (see `rgbd.pose_files`), of the body.
+        axes: the poses are those of the left eye instead, in `optical`, `opengl` or `ros` axes. invert: 1 where they
+        map the world into what is posed.
     Images: `cam0/data.csv` (lines `ns,file`), else all `cam0/data/*.png`; those that the list names but that are not
     there are left out, with a note. The right image is that of the same time, or less than 1 ms away.
     Calibration: `sensor.yaml` of both cameras, else a camchain.yaml of Kalibr there, above or in `dso/`.
@@ -48,9 +53,13 @@ class AslRig(RigSource):
     """
 
     layout = "a EuRoC / ASL folder (mav0 with cam0, cam1 and state_groundtruth_estimate0)"
+    parts = (
+        *(Part((f"{ROOT}/{eye}", eye), f"images of {eye}", "copy it there: stereo needs both cameras") for eye in EYES),
+        Part(tuple(f"{place}{name}/{DATA}" for place in (f"{ROOT}/", "") for name in TRUTHS), "poses"),
+    )
 
     def __init__(self, where: str | os.PathLike[str]):
-        self.folder, options = location(where, {"rectify": ""})
+        self.folder, options = folder_and_options(where, {"rectify": "", **POSES})
         self.name = self.folder.resolve().name
         root = _root(str(self.folder))
         if root is None:
@@ -63,8 +72,12 @@ class AslRig(RigSource):
         virtual = Virtual(options["rectify"]) if options["rectify"] else usual_virtual(found.eyes)
         pair = RigPair("stereo", camera=found.camera, eyes=found.eyes, T_body_left=found.T_body_left, virtual=virtual)
         left, right = (_Images(root / eye) for eye in (EYES[::-1] if found.swapped else EYES))
-        poses = _poses(root)
-        _check_clocks(left, poses)
+        if options["poses"]:
+            poses = poses_of_images(file_of(options["poses"], self.folder), left.stamps)
+        else:
+            poses = _poses(root)
+            _check_clocks(left, poses)
+        poses = as_body(poses, found.T_body_left, options["axes"], options["invert"])
         try:
             self._set(Rig((pair,)), root, _shots(left, right), poses, calibration)
         except SourceError as error:
@@ -74,7 +87,7 @@ class AslRig(RigSource):
     @classmethod
     def recognises(cls, where: str) -> bool:
         """Return whether `where` is a folder `mav0`, or holds one, with a camera in it."""
-        return _root(folder_of(where)) is not None
+        return _root(folder_part(where)) is not None
 
 
 class _Images:
@@ -142,7 +155,7 @@ def _poses(root: Path) -> Poses:
     said = "leica0 has positions but no directions" if os.path.isdir(root / "leica0") else "no poses of the vehicle"
     raise SourceError(
         f"{root}: {said}; put {TRUTHS[0]}/{DATA} or {TRUTHS[1]}/{DATA} there, "
-        f"or {TEXTS[0]} with lines 'stamp tx ty tz qx qy qz qw' (seconds)"
+        f"or {TEXTS[0]} with lines 'stamp tx ty tz qx qy qz qw' (seconds), or add ?poses=FILE"
     )
 
 

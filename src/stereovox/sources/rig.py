@@ -17,10 +17,13 @@ from stereovox.cameras.rigs import StereoPair
 from stereovox.errors import FrameRefused, SourceError
 from stereovox.frame import StereoFrame
 from stereovox.se3 import Transform
-from stereovox.sources.base import Source
+from stereovox.sources.base import Part, Source
 from stereovox.sources.images import EYE_KINDS, file_names, png_size, read_picture_png
 from stereovox.sources.poses import Poses
+from stereovox.sources.rgbd.folder import SECOND, folder_part
+from stereovox.sources.rgbd.pose_files import number_in
 from stereovox.sources.rig_file import FILE, Rig, RigPair, read_rig
+from stereovox.sources.rig_options import POSES, as_body, file_of, folder_and_options, poses_of_images
 from stereovox.sources.trajectory import Trajectory, by_time, inside, stamped_lines
 
 SHORTEST_NS = 1_000_000
@@ -92,6 +95,10 @@ class RigSource(Source, ABC):
 class StereoRig(RigSource):
     """A folder with `rig.toml` (see `Rig`), images of each pair, and a file of poses T_world_body in TUM format.
 
+    where: the folder, or with options `flight?poses=trajectory.log&fps=20`:
+        poses: a file or folder of poses of any form (see `rgbd.pose_files`) in place of the rig file's.
+        axes: the poses are those of the first pair's left eye, in `optical`, `opengl` or `ros` axes, not the body's.
+        invert: 1 where poses map the world into what is posed. fps: images a second, where their names are numbers.
     Frames: a `StereoFrame` for each left image of each pair, in order of time; of one time in the rig file's order.
     Both images of a moment have the same name, their time in nanoseconds, or stand in a line of the pair's index.
     Poses and faults: see `RigSource`. Why a pixel has no value is found out by matching (`depth.stereo`); the rig's
@@ -101,9 +108,14 @@ class StereoRig(RigSource):
     """
 
     layout = f"a stereo rig ({FILE} that names pairs, folders of images and poses)"
+    parts = (
+        Part(("left/*.png", "*/left/*.png"), "left images"),
+        Part(("right/*.png", "*/right/*.png"), "right images"),
+        Part((FILE,), FILE, f"write it with: stereovox calibrate import CALIBRATION --out {FILE} (docs/rigs.md)"),
+    )
 
     def __init__(self, where: str | os.PathLike[str]):
-        self.folder = Path(where)
+        self.folder, options = folder_and_options(where, {**POSES, "fps": 0.0})
         self.name = self.folder.resolve().name
         file = self.folder / FILE
         rig = read_rig(file)
@@ -111,18 +123,26 @@ class StereoRig(RigSource):
             rig.stereo_pairs(self.folder)
         except SourceError as error:
             raise SourceError(f"{file}: {error}") from None
-        shots = [shot for number, pair in enumerate(rig.pairs) for shot in _shots(self.folder, number, pair)]
-        self._set(rig, self.folder, shots, _poses(self.folder, rig.poses), FILE)
+        fps = options["fps"]
+        shots = [shot for number, pair in enumerate(rig.pairs) for shot in _shots(self.folder, number, pair, fps)]
+        if options["poses"]:
+            poses = poses_of_images(file_of(options["poses"], self.folder), [shot.stamp_ns for shot in shots])
+        else:
+            poses = _poses(self.folder, rig.poses)
+        poses = as_body(poses, rig.pairs[0].T_body_left, options["axes"], options["invert"])
+        self._set(rig, self.folder, shots, poses, FILE)
 
     @classmethod
     def recognises(cls, where: str) -> bool:
         """Return whether `where` is a folder with a `rig.toml`."""
-        return os.path.isfile(os.path.join(where, FILE))
+        return os.path.isfile(os.path.join(folder_part(where), FILE))
 
 
 def _poses(folder: Path, name: str) -> Trajectory:
     if not os.path.isfile(folder / name):
-        raise SourceError(f"{folder / name}: no such file of poses; write it, or set poses = in {folder / FILE}")
+        raise SourceError(
+            f"{folder / name}: no such file of poses; write it, or set poses = in {folder / FILE}, or add ?poses=FILE"
+        )
     return Trajectory(folder / name)
 
 
@@ -131,7 +151,8 @@ def _sizes(pair: StereoPair) -> tuple[tuple[int, int], tuple[int, int]]:
     return (left.width, left.height), (right.width, right.height)
 
 
-def _shots(folder: Path, number: int, pair: RigPair) -> list[Shot]:
+def _shots(folder: Path, number: int, pair: RigPair, fps: float) -> list[Shot]:
+    """Return the images of a pair. fps: images a second, whose names are numbers; 0: names are times."""
     left, right = (folder / name for name in pair.folders())
     for side, place in (("left", left), ("right", right)):
         if not os.path.isdir(place):
@@ -142,11 +163,15 @@ def _shots(folder: Path, number: int, pair: RigPair) -> list[Shot]:
     names = sorted(name for name in file_names(left) if name.endswith(".png"))
     if not names:
         raise SourceError(f"{left}: holds no PNG; put the left images of pair '{pair.name}' there, named by ns")
-    shots = [Shot(_stamp(left / name), number, left / name, right / name) for name in names]
+    if fps:
+        stamp_of = {name: int(number_in(name)[0] * SECOND / fps) for name in names}
+    else:
+        stamp_of = {name: _stamp(left / name) for name in names}
+    shots = [Shot(stamp_of[name], number, left / name, right / name) for name in names]
     stamps = [shot.stamp_ns for shot in shots]
     if len(shots) > 1 and max(stamps) - min(stamps) < SHORTEST_NS:
         said = f"its {len(shots)} images would all be taken within a millisecond ({names[0]} to {names[-1]})"
-        raise SourceError(f"{left}: {said}; name them by time in ns or give an index file")
+        raise SourceError(f"{left}: {said}; name them by time in ns, give an index file, or add ?fps=")
     return shots
 
 

@@ -16,12 +16,14 @@ from stereovox.cameras.rigs import Eyes
 from stereovox.config.depth import StereoConfig
 from stereovox.errors import FrameRefused, SourceError, StereovoxError
 from stereovox.safe_io import read_text
+from stereovox.sources.base import Part
 from stereovox.sources.images import EYE_KINDS, png_size
-from stereovox.sources.kitti.base import folder_of, location
 from stereovox.sources.kitti.poses import UPRIGHT
 from stereovox.sources.poses import Poses
+from stereovox.sources.rgbd.folder import folder_part
 from stereovox.sources.rig import RigSource, Shot
 from stereovox.sources.rig_file import Rig, RigPair, Virtual
+from stereovox.sources.rig_options import folder_and_options
 
 IMAGES, CALIBRATION = ("im0.png", "im1.png"), "calib.txt"
 SECOND_NS = 1_000_000_000
@@ -36,7 +38,7 @@ EXAMPLE = "'cam0=[f 0 cx; 0 f cy; 0 0 1]', 'cam1=[...]' and 'baseline=' in mm"
 class TwoView(RigSource):
     """A folder with im0.png, im1.png and calib.txt, or a folder of such folders: each is a single moment.
 
-    where: the folder, or with parameters `Motorcycle?scale=0.5`: scale: size of the images in use, above 0 to 1;
+    where: the folder, or with options `Motorcycle?scale=0.5`: scale: size of the images in use, above 0 to 1;
         without it the largest 1/n at which no disparity (`ndisp` + `doffs`) exceeds the default `stereo.disparities`.
     calib.txt: lines `key=value`: `cam0` and `cam1`, 3x3; `baseline` in millimetres; perhaps `width` and `height`. The
     eyes may differ in cx (`doffs`), then the images are shifted as they are rectified. Images that are smaller or
@@ -46,9 +48,10 @@ class TwoView(RigSource):
     """
 
     layout = "a stereo pair of Middlebury or ETH3D (im0.png, im1.png and calib.txt)"
+    parts = (Part(IMAGES[:1], "left image"), Part(IMAGES[1:], "right image"), Part((CALIBRATION,), CALIBRATION))
 
     def __init__(self, where: str | os.PathLike[str]):
-        self.folder, options = location(where, {"scale": ""})
+        self.folder, options = folder_and_options(where, {"scale": ""})
         self.name = self.folder.resolve().name
         scenes = _scenes(self.folder)
         if not scenes:
@@ -65,7 +68,7 @@ class TwoView(RigSource):
     @classmethod
     def recognises(cls, where: str) -> bool:
         """Return whether `where` is a folder with such a pair, or with folders that have one."""
-        return bool(_scenes(Path(folder_of(where))))
+        return bool(_scenes(Path(folder_part(where))))
 
 
 def _scenes(folder: Path) -> list[Path]:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from made_recordings import write_png
 
-from stereovox.config.depth import StereoConfig
+from stereovox.config import load_config
 from stereovox.depth.stereo.pipeline import StereoDepth
 from stereovox.depth.stereo.rectify import rectified
 from stereovox.errors import SourceError
@@ -41,7 +41,7 @@ def scene(folder: Path, doffs: float = 0.0, brackets: bool = True, times: float 
 
 def distance_of_the_wall(where: Path | str) -> float:
     """Return the median depth of the first frame."""
-    depth = StereoDepth(StereoConfig(disparities=32))(open_source(where).frame(0)).depth
+    depth = StereoDepth(load_config(**{"stereo.disparities": 32}).stereo)(open_source(where).frame(0)).depth
     return float(np.nanmedian(depth))
 
 

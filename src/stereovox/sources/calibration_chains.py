@@ -31,6 +31,7 @@ from stereovox.sources.calibration_values import (
     matrix,
     numbers,
     of_eyes,
+    of_mounts,
     read_yaml,
     rigid,
 )
@@ -111,7 +112,7 @@ def _asl(tables: Sequence[Table], folder: Path) -> StereoCalibration:
         ours = lens_model(table.get("distortion_model"), f"the {eye} distortion_model")
         lenses.append(_listed_lens(table, eye, ours, "distortion_coefficients"))
         bodies.append(rigid(_needed(table, eye, "T_BS"), f"{eye} T_BS"))
-    return of_eyes(*lenses, inverse(bodies[0]) @ bodies[1], bodies)
+    return of_mounts(lenses, bodies)
 
 
 def _okvis(tables: Sequence[Table], folder: Path) -> StereoCalibration:
@@ -127,7 +128,7 @@ def _okvis(tables: Sequence[Table], folder: Path) -> StereoCalibration:
         model = lens_model(str(camera.get("distortion_type", "")).removesuffix("8"), f"{name}.distortion_type")
         lenses.append(lens_of(model, (*focal, *centre), camera.get("distortion_coefficients", []), size, name))
         bodies.append(rigid(_needed(camera, name, "T_SC"), f"{name}.T_SC"))
-    return of_eyes(*lenses, inverse(bodies[0]) @ bodies[1], bodies)
+    return of_mounts(lenses, bodies)
 
 
 def _vins(tables: Sequence[Table], folder: Path) -> StereoCalibration:
@@ -139,7 +140,7 @@ def _vins(tables: Sequence[Table], folder: Path) -> StereoCalibration:
         path = folder / os.path.basename(str(table[f"{name}_calib"]))
         lenses.append(_vins_lens(read_yaml(path), str(path)))
         bodies.append(rigid(_needed(table, "the file", f"body_T_{name}"), f"body_T_{name}"))
-    return of_eyes(*lenses, inverse(bodies[0]) @ bodies[1], bodies)
+    return of_mounts(lenses, bodies)
 
 
 def _vins_lens(table: Table, name: str) -> Lens:
@@ -182,8 +183,7 @@ def _orb(tables: Sequence[Table], folder: Path) -> StereoCalibration:
         raise SourceError("Stereo.T_c1_c2 is missing; write how the right camera's frame maps into the left one's")
     lenses = [_orb_lens(table, name, kind, size) for name in (first, "Camera2")]
     T_body_left = _orb_body(table)
-    T_left_right = rigid(T, "Stereo.T_c1_c2")
-    return of_eyes(*lenses, T_left_right, (T_body_left, T_body_left @ T_left_right))
+    return of_mounts(lenses, (T_body_left, T_body_left @ rigid(T, "Stereo.T_c1_c2")))
 
 
 def _bent(table: Table, name: str) -> bool:
@@ -198,7 +198,8 @@ def _orb_body(table: Table) -> Transform:
 def _orb_lens(table: Table, name: str, kind: str, size: Sequence[float]) -> Lens:
     model, coefficients = ORB[kind]
     intrinsics = [_number(table, "the file", f"{name}.{key}") for key in FOCAL]
-    k = numbers([table.get(f"{name}.{key}", 0.0) for key in coefficients], f"{name} distortion")
+    given = coefficients if f"{name}.k3" in table else coefficients[:4]
+    k = numbers([table.get(f"{name}.{key}", 0.0) for key in given], f"{name} distortion")
     return lens_of(model, intrinsics, k, size, name)
 
 
@@ -248,7 +249,7 @@ def _basalt(tables: Sequence[Table], folder: Path) -> StereoCalibration:
         what = f"value0.T_imu_cam[{number}]"
         place = [[_number(places[number], what, key) for key in ("px", "py", "pz", "qx", "qy", "qz", "qw")]]
         bodies.append(rigid(transforms(np.array(place))[0], what))
-    return of_eyes(*lenses, inverse(bodies[0]) @ bodies[1], bodies)
+    return of_mounts(lenses, bodies)
 
 
 def _needed(table: Any, name: str, key: str) -> Any:

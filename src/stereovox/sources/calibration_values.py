@@ -114,6 +114,12 @@ def from_rectification(
     return of_eyes(lenses[0], lenses[1], rigid(T_left_right, "rectification_matrix"))
 
 
+def of_mounts(lenses: Sequence[Lens], mounts: Sequence[Transform]) -> StereoCalibration:
+    """Return two eyes, whose mounts T_body_camera (4, 4) are known, with the left one first."""
+    (a, b), (T_body_a, T_body_b) = lenses, mounts
+    return of_eyes(a, b, inverse(T_body_a) @ T_body_b, (T_body_a, T_body_b))
+
+
 def lens_model(distortion: Any, what: str) -> str:
     """Return our model of a named distortion; raises SourceError for one we do not have."""
     name = re.sub(r"[-_ ]", "", distortion.lower()) if isinstance(distortion, str) else None

@@ -77,7 +77,7 @@ def read_picture_png(path: Path, size: tuple[int, int], kinds: Kinds = PICTURE_K
     _check(path, data, size, kinds)
     image = _decode(path, data)
     if GREY_16 in kinds and image.dtype == np.uint16:
-        image = (image >> 8).astype(np.uint8)
+        image = np.right_shift(image.astype(np.uint16, copy=False), 8).astype(np.uint8)
     image = image[..., :3] if image.shape[2:] == (4,) else image
     if image.dtype != np.uint8 or image.shape[2:] not in ((), (3,)):
         raise _undecodable(path)

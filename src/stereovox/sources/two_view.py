@@ -27,6 +27,7 @@ from stereovox.sources.rig_options import folder_and_options
 
 IMAGES, CALIBRATION = ("im0.png", "im1.png"), "calib.txt"
 SECOND_NS = 1_000_000_000
+DISPARITIES: int = StereoConfig.model_fields["disparities"].default
 METRES = 2.0
 """The baseline is in millimetres; a smaller number can only be metres."""
 NUMBER = re.compile(r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?")
@@ -117,16 +118,17 @@ def _calibrated(scene: Path, values: dict[str, list[float]], scale: float | None
         )
     (f, cx0, cy), (_, cx1, _) = (_camera(values, key, factor) for key in ("cam0", "cam1"))
     largest = _one(values, "ndisp", 0.0) * factor + cx1 - cx0
-    divisor = math.ceil(largest / StereoConfig().disparities) if scale is None and largest > 0 else 1
+    divisor = math.ceil(largest / DISPARITIES) if scale is None and largest > 0 else 1
     used = scale if scale is not None else 1 / divisor
     if divisor > 1:
-        why = f"so that its {largest:.0f} disparities fit into {StereoConfig().disparities}"
+        why = f"so that its {largest:.0f} disparities fit into {DISPARITIES}"
         notes.append(f"{scene}: images are used at 1/{divisor} of their size {why}; ?scale=1 keeps it")
     if cx0 == cx1 and used == 1:
         return RigPair(scene.name, camera=PinholeCamera(*size, f, f, cx0, cy, metres)), notes
     T_left_right = np.eye(4)
     T_left_right[0, 3] = metres
-    eyes = Eyes(*(Lens("pinhole", *size, f, f, cx, cy) for cx in (cx0, cx1)), T_left_right)
+    left, right = (Lens("pinhole", *size, f, f, cx, cy) for cx in (cx0, cx1))
+    eyes = Eyes(left, right, T_left_right)
     smaller = None if used == 1 else (round(size[0] * used), round(size[1] * used))
     return RigPair(scene.name, eyes=eyes, virtual=Virtual(size=smaller)), notes
 

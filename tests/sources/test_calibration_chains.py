@@ -43,7 +43,7 @@ def saved(folder, text, name="calibration.yaml"):
 def opencv(name, matrix):
     """A matrix as OpenCV's FileStorage writes it, though without the blank after `data:`."""
     rows, columns = np.shape(matrix)
-    numbers = ", ".join(f"{number:.12g}" for number in np.ravel(matrix))
+    numbers = "\n      ".join(", ".join(f"{number:.12g}" for number in row) for row in matrix)  # commas forgotten
     return f"{name}: !!opencv-matrix\n   rows: {rows}\n   cols: {columns}\n   dt: d\n   data:[{numbers}]\n"
 
 
@@ -99,7 +99,7 @@ def test_two_sensor_yaml(tmp_path, lenses, model):
     ]
     check(import_rig(files), lenses)
     check(import_rig(files[::-1]), lenses)
-    with pytest.raises(SourceError, match="is the sensor.yaml of one camera; give both files"):
+    with pytest.raises(SourceError, match=r"is the sensor\.yaml of one camera; give both files"):
         import_rig(files[:1])
 
 
@@ -165,7 +165,7 @@ def test_orb_slam3(tmp_path, kind, lenses):
     text = orb(kind, lenses) + opencv("Stereo.T_c1_c2", T)
     check(import_rig(saved(tmp_path, text)), lenses, np.eye(4))
     check(import_rig(saved(tmp_path, text + opencv("IMU.T_b_c1", FORWARD))), lenses)
-    with pytest.raises(SourceError, match="Stereo.T_c1_c2 is missing"):
+    with pytest.raises(SourceError, match=r"Stereo\.T_c1_c2 is missing"):
         import_rig(saved(tmp_path, orb(kind, lenses)))
     with pytest.raises(SourceError, match=r"Camera\.type \w+ without Camera2\.fx has one lens"):
         import_rig(saved(tmp_path, orb(kind, lenses[:1])))
@@ -230,7 +230,8 @@ CONTRADICTION = [{**to_body()[0], "T_cam_imu": FORWARD.tolist()}, to_body()[1]]
         ({"value0": {}}, "value0.T_imu_cam is missing"),
         ({"value0": {"T_imu_cam": [1], "intrinsics": 1, "resolution": 2}}, "lists one camera"),
         ({"T_BS": [1], "intrinsics": 2}, "sensor.yaml of one camera"),
-        ({"Camera.type": "PinHole"}, "Camera.width is missing"),
+        ({"Camera.type": "PinHole"}, "Camera.type PinHole without Camera2.fx has one lens"),
+        ({"Camera.type": "Rectified"}, "Camera.width is missing"),
         ({"LEFT.K": 1}, "LEFT.width is missing"),
     ],
 )

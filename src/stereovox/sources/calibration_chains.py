@@ -139,7 +139,7 @@ def _vins(tables: Sequence[Table], folder: Path) -> StereoCalibration:
     for name in ("cam0", "cam1"):
         path = folder / os.path.basename(str(table[f"{name}_calib"]))
         lenses.append(_vins_lens(read_yaml(path), str(path)))
-        bodies.append(rigid(_needed(table, "the file", f"body_T_{name}"), f"body_T_{name}"))
+        bodies.append(rigid(_needed(table, "", f"body_T_{name}"), f"body_T_{name}"))
     return of_mounts(lenses, bodies)
 
 
@@ -169,15 +169,15 @@ def _orb(tables: Sequence[Table], folder: Path) -> StereoCalibration:
     if any(key.endswith("DepthMapFactor") for key in table):
         raise SourceError("is of a depth camera, which has one lens; give the settings of a stereo camera")
     kind = str(table.get("Camera.type", "PinHole"))
-    size = [_number(table, "the file", f"Camera.{side}") for side in ("width", "height")]
     first = "Camera1" if "Camera1.fx" in table else "Camera"
     rectified = kind == "Rectified" or ("Camera.bf" in table and kind == "PinHole" and not _bent(table, first))
-    if rectified:
-        return StereoCalibration(None, _orb_camera(table, first, size), _orb_body(table))
-    if kind not in ORB or "Camera2.fx" not in table:
+    if not rectified and (kind not in ORB or "Camera2.fx" not in table):
         raise SourceError(
             f"Camera.type {kind} without Camera2.fx has one lens, so there is no stereo; give the settings of a pair"
         )
+    size = [_number(table, "", f"Camera.{side}") for side in ("width", "height")]
+    if rectified:
+        return StereoCalibration(None, _orb_camera(table, first, size), _orb_body(table))
     T = table.get("Stereo.T_c1_c2", table.get("Tlr"))
     if T is None:
         raise SourceError("Stereo.T_c1_c2 is missing; write how the right camera's frame maps into the left one's")
@@ -197,29 +197,29 @@ def _orb_body(table: Table) -> Transform:
 
 def _orb_lens(table: Table, name: str, kind: str, size: Sequence[float]) -> Lens:
     model, coefficients = ORB[kind]
-    intrinsics = [_number(table, "the file", f"{name}.{key}") for key in FOCAL]
+    intrinsics = [_number(table, "", f"{name}.{key}") for key in FOCAL]
     given = coefficients if f"{name}.k3" in table else coefficients[:4]
     k = numbers([table.get(f"{name}.{key}", 0.0) for key in given], f"{name} distortion")
     return lens_of(model, intrinsics, k, size, name)
 
 
 def _orb_camera(table: Table, name: str, size: Sequence[float]) -> PinholeCamera:
-    fx, fy, cx, cy = (_number(table, "the file", f"{name}.{key}") for key in FOCAL)
-    baseline = _number(table, "the file", "Stereo.b") if "Stereo.b" in table else None
+    fx, fy, cx, cy = (_number(table, "", f"{name}.{key}") for key in FOCAL)
+    baseline = _number(table, "", "Stereo.b") if "Stereo.b" in table else None
     if baseline is None:
-        baseline = _number(table, "the file", "Camera.bf") / fx
+        baseline = _number(table, "", "Camera.bf") / fx
     return PinholeCamera(int(size[0]), int(size[1]), fx, fy, cx, cy, baseline)
 
 
 def _orb_rectification(table: Table) -> StereoCalibration:
     lenses, turns, places = [], [], []
     for eye in ("LEFT", "RIGHT"):
-        size = [_number(table, "the file", f"{eye}.{side}") for side in ("width", "height")]
+        size = [_number(table, "", f"{eye}.{side}") for side in ("width", "height")]
         K, R, P = (
-            matrix(_needed(table, "the file", f"{eye}.{key}"), f"{eye}.{key}", 3, columns)
+            matrix(_needed(table, "", f"{eye}.{key}"), f"{eye}.{key}", 3, columns)
             for key, columns in (("K", 3), ("R", 3), ("P", 4))
         )
-        D = _needed(table, "the file", f"{eye}.D")
+        D = _needed(table, "", f"{eye}.D")
         D = D.get("data", []) if isinstance(D, dict) else D
         model = "fisheye" if table.get("Camera.type") == "KannalaBrandt8" else "pinhole"
         lenses.append(lens_of(model, intrinsics_of(K), D, size, eye))
@@ -254,12 +254,16 @@ def _basalt(tables: Sequence[Table], folder: Path) -> StereoCalibration:
 
 def _needed(table: Any, name: str, key: str) -> Any:
     if not isinstance(table, dict) or key not in table:
-        raise SourceError(f"{name}.{key} is missing; give the file as its tool wrote it")
+        raise SourceError(f"{_dotted(name, key)} is missing; give the file as its tool wrote it")
     return table[key]
 
 
 def _number(table: Any, name: str, key: str) -> float:
-    return numbers([_needed(table, name, key)], f"{name}.{key}", 1)[0]
+    return numbers([_needed(table, name, key)], _dotted(name, key), 1)[0]
+
+
+def _dotted(name: str, key: str) -> str:
+    return f"{name}.{key}" if name else key
 
 
 CHAINS: tuple[tuple[Callable[[Table], bool], Callable[[Sequence[Table], Path], StereoCalibration]], ...] = (

@@ -179,7 +179,12 @@ def matrix(value: Any, what: str, rows: int, columns: int) -> NDArray[np.float64
 
 
 def numbers(value: Any, what: str, count: int | None = None) -> list[float]:
-    """Return finite numbers, `count` of them where it is given; raises SourceError for anything else."""
+    """Return finite numbers, `count` of them where it is given; raises SourceError for anything else.
+
+    Two with a blank or line end in place of the comma, which OpenCV reads, are two.
+    """
+    if isinstance(value, list):
+        value = [word for item in value for word in (item.split() if isinstance(item, str) else [item])]
     try:
         found = np.array(value, float).ravel()
     except (TypeError, ValueError, OverflowError):

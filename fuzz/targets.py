@@ -20,11 +20,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from made_asl import START, asl, poses_csv, sensor_text
 from made_bags import ros_bag
 from made_kitti import label, packet, pose_lines, raw_calibration, single_calibration
 from made_mcap import Message, Style, mcap
 from made_recordings import depth_image, write_png
-from made_rigs import recorded
+from made_rigs import FORWARD, eyes, recorded
 from made_robot_bags import START_NS, Messages, RobotBagMaker, planar_numbers
 from numcodecs import Zstd
 
@@ -77,6 +78,44 @@ D2: !!opencv-matrix {rows: 1, cols: 5, dt: d, data: [-0.3, 0.1, 0., 0., 0.]}
 R: !!opencv-matrix {rows: 3, cols: 3, dt: d, data: [1., 0., 0., 0., 1., 0., 0., 0., 1.]}
 T: !!opencv-matrix {rows: 3, cols: 1, dt: d, data: [-0.12, 0., 0.]}
 imageSize: [640, 480]
+"""
+PLACE = "[1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]"
+OPENVINS = KALIBR.replace("T_cn_cnm1: [[1, 0, 0, -0.12]", "T_imu_cam: [[1, 0, 0, 0.12]").replace(
+    "cam1:", f"  T_imu_cam: {PLACE}\ncam1:"
+)
+ORB = f"""%YAML:1.0
+Camera.type: "KannalaBrandt8"
+Camera.width: 640
+Camera.height: 480
+Camera1.fx: 250.0
+Camera1.fy: 250.0
+Camera1.cx: 320.0
+Camera1.cy: 240.0
+Camera1.k1: 0.01
+Camera2.fx: 250.0
+Camera2.fy: 250.0
+Camera2.cx: 320.0
+Camera2.cy: 240.0
+Stereo.T_c1_c2: !!opencv-matrix
+   rows: 4
+   cols: 4
+   dt: f
+   data:{PLACE.replace("1, 0, 0, 0,", "1, 0, 0, 0.1,", 1)}
+"""
+LENS = "image_dimension: [640, 480], distortion_type: radialtangential, focal_length: [5, 5], principal_point: [3, 2]"
+OKVIS = f"""cameras:
+  - {{T_SC: {PLACE}, {LENS}}}
+  - {{T_SC: {PLACE.replace("1, 0, 0, 0,", "1, 0, 0, 0.1,", 1)}, {LENS}}}
+"""
+SENSOR = sensor_text(eyes().left, FORWARD, "equidistant")
+TRUTH = "state_groundtruth_estimate0/data.csv"
+TWO_VIEW = """cam0=[20 0 7.5; 0 20 5.5; 0 0 1]
+cam1=[20 0 8.5; 0 20 5.5; 0 0 1]
+doffs=1
+baseline=193.001
+width=16
+height=12
+ndisp=290
 """
 PROFILE = """voxel_size = 0.1
 max_range = 8.0
@@ -459,6 +498,28 @@ def rigs(folder: Path) -> list[bytes]:
     return [(recorded(folder / "rig") / "rig.toml").read_bytes()]
 
 
+def read_asl(name: str, data: bytes, folder: Path) -> None:
+    """A folder `mav0`, one of whose lists is these bytes."""
+    if not (folder / "mav0").exists():
+        asl(folder)
+    (folder / "mav0" / name).write_bytes(data)
+    frames_of(open_source(folder))
+
+
+def read_sensors(path: Path) -> None:
+    """Two sensor.yaml, the first of which is given."""
+    path.with_name("right.yaml").write_text(sensor_text(eyes().right, FORWARD @ eyes().T_left_right, "equidistant"))
+    import_rig([path, path.with_name("right.yaml")])
+
+
+def read_two_view(data: bytes, folder: Path) -> None:
+    """A pair whose calib.txt is these bytes."""
+    for name in ("im0.png", "im1.png"):
+        write_png(folder / name, np.zeros((12, 16), np.uint8))
+    (folder / "calib.txt").write_bytes(data)
+    frames_of(open_source(folder))
+
+
 def raw_files(folder: Path) -> list[bytes]:
     raw_calibration(folder)
     return [(folder / "calib_cam_to_cam.txt").read_bytes()]
@@ -490,7 +551,11 @@ TARGETS: dict[str, Target] = {
     "camera": file_target("camera.toml", read_camera, CAMERA),
     "pair": file_target("pair.toml", read_pair, pair_text(PairSettings(T_tracker_camera=np.eye(4), baseline=0.05))),
     "rig": Target(rigs, read_rig_folder),
-    "calibration": file_target("calib.yaml", lambda path: import_rig([path]), KALIBR, OPENCV),
+    "calibration": file_target("calib.yaml", lambda path: import_rig([path]), KALIBR, OPENVINS, OPENCV, ORB, OKVIS),
+    "asl_sensor": file_target("sensor.yaml", read_sensors, SENSOR),
+    "asl_images": Target(lambda _: [f"#ns,file\n{START},{START}.png\n".encode()], partial(read_asl, "cam0/data.csv")),
+    "asl_poses": Target(lambda _: [poses_csv([START - 1, START + 1]).encode()], partial(read_asl, TRUTH)),
+    "two_view": Target(lambda _: [TWO_VIEW.encode()], read_two_view),
     "intrinsics": file_target("camera-intrinsics.txt", read_matrix, "20 0 7.5\n0 21 5.5\n0 0 1\n"),
     "images_list": Target(
         lambda _: [b"# list\n0.1 depth/0.1.png\n0.2 depth/0.2.png\n"], partial(read_list, "depth.txt")

@@ -124,7 +124,7 @@ def test_grid_takes_both_kinds_of_readings(tmp_path, capsys):
 def test_going_on_localises_in_the_map_and_takes_its_cells(bag, reference, tmp_path, capsys):
     out = tmp_path / "more.yaml"
     _, said = run(capsys, "grid", bag, "--resume", reference, "--start=0,0,0", "--out", out, "--profile", "ist2019")
-    assert f"way in {reference}" in said
+    assert f"localising the robot in {reference}" in said
     assert read_map_server(out).resolution == read_map_server(reference).resolution
     assert "SLAM makes a frame of its own" in refused(
         capsys, "grid", bag, "--resume", reference, "--poses", "slam", "--out", out

@@ -82,6 +82,10 @@ class MapResult(Generic[MapT]):
     dropped: int = 0
     track: Track | None = None
 
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows: the map's picture and facts."""
+        return self.map._repr_html_(f"MapResult, saved in {self.out}")
+
     def summary(self) -> dict[str, Any]:
         """Summarise the run.
 

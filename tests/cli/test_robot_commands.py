@@ -73,8 +73,8 @@ def test_slam_saves_map_and_way(bag, reference, tmp_path, capsys):
     ],
 )
 def test_slam_says_its_pace_only_where_stamps_tell(recorded, seconds, words):
-    assert _pace(recorded, seconds).startswith(words)
-    assert bool(_pace(recorded, seconds)) == bool(words)
+    assert _pace(recorded, seconds, False).startswith(words)
+    assert bool(_pace(recorded, seconds, False)) == bool(words)
 
 
 def test_slam_scores_relations(tmp_path, capsys):
@@ -140,7 +140,7 @@ def test_grid_takes_both_kinds_of_readings(tmp_path, capsys):
 def test_going_on_localises_in_the_map_and_takes_its_cells(bag, reference, tmp_path, capsys):
     out = tmp_path / "more.yaml"
     _, said = run(capsys, "grid", bag, "--resume", reference, "--start=0,0,0", "--out", out, "--profile", "ist2019")
-    assert f"way in {reference}" in said
+    assert f"localising the robot in {reference}" in said
     assert read_map_server(out).resolution == read_map_server(reference).resolution
     assert "SLAM makes a frame of its own" in refused(
         capsys, "grid", bag, "--resume", reference, "--poses", "slam", "--out", out

@@ -17,6 +17,7 @@ from stereovox.cli.options import add_checkpoint, add_settings, check_ending, ov
 from stereovox.cli.terminal import (
     cells_line,
     command_line,
+    first_included,
     milliseconds,
     progress_of,
     say,
@@ -125,7 +126,8 @@ def _print_result(result: dict[str, Any], reports: list[UpdateReport], out: Path
         say(f"reduced quality to meet the deadline: {', '.join(reduced)}")
     if result["match_ms"]["max"]:  # stereo pairs
         say(f"per pair: matching {milliseconds(result['match_ms'])}")
-    say(f"per frame: depth {milliseconds(result['depth_ms'])}; map {milliseconds(result['integrate_ms'])}")
+    times = f"depth {milliseconds(result['depth_ms'])}; map {milliseconds(result['integrate_ms'])}"
+    say(f"per frame: {times}{first_included(result)}")
     say(cells_line(result))
     if not result["occupied"]:
         say(f"note: {_why_empty(result, window)}")

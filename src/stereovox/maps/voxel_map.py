@@ -319,6 +319,18 @@ class VoxelMap(Guarded, OnBlocks):
             self.config.cell if self.config.steps else self.config.cell[:1], self.counts(), self.memory_bytes
         )
 
+    def _repr_html_(self, title: str | None = None) -> str:
+        """Return what a notebook shows: a small picture from above, and facts. title: by default the class's name."""
+        from stereovox.maps.notebook import card, facts_of, voxels_from_above
+
+        with self.lock:
+            cell = self.config.cell
+            sides = cell if self.config.steps else cell[:1]
+            facts = facts_of(sides, self.counts(), self.bounds(), self.memory_bytes, self.history)
+            blocks = self.storage.slabs()
+            picture = voxels_from_above(blocks, self.storage.rules.states, cell, self.config.up, self.history)
+        return card(title or type(self).__name__, facts, *picture)
+
     def counts(self) -> dict[str, int]:
         """Return the number of cells in each known state: `free`, `tentative`, `occupied`."""
         number = np.zeros(4, np.int64)

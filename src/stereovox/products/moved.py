@@ -109,7 +109,7 @@ def rigid(T: ArrayLike) -> Transform:
     T = np.asarray(T, float)
     error = rigidity_error(T)
     if not error <= RIGID:
-        raise StereovoxError("the transform is no rigid motion: give a 4x4 matrix, without scale or mirror")
+        raise StereovoxError("the transform is not a rigid motion: give a 4x4 matrix, without scale or mirror")
     return orthonormalise(T)
 
 

@@ -11,14 +11,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from stereovox.errors import StereovoxError, did_you_mean
 from stereovox.maps import State, VoxelMap
+from stereovox.maps.upright import SLAB, ceiling, layers, turned_cells
+from stereovox.maps.upright import UPS as UPS
+from stereovox.maps.upright import turned as turned
 from stereovox.view.shading import Occlusion
 
-UPS = {"z": (0, 1, 2), "-z": (1, 0, 2), "y": (2, 0, 1), "-y": (0, 2, 1), "x": (1, 2, 0), "-x": (2, 1, 0)}
-"""For each up axis: the map's axes that point right, away and up in a picture (the last flipped where minus)."""
 BESIDE = 0.1
 """A camera's path is drawn up to this share of the map's longest side beside its known cells."""
-SLAB = 1.6
-"""A layer with this many times the cells of the median layer is a floor or a ceiling."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +59,7 @@ class Drawn:
     @cached_property
     def layer(self) -> int:
         """The most informative layer: no floor or ceiling, many known cells, and then the most occupied cells."""
-        low, known = _layers(self.cells)
+        low, known = layers(self.cells)
         occupied = np.bincount(self.occupied[:, 2] - low, minlength=len(known))
         usual = np.median(occupied[occupied > 0]) if occupied.any() else np.inf
         known = np.where(occupied > SLAB * usual, 0, known)
@@ -90,12 +89,6 @@ def checked_up(up: str) -> str:
     return up.removeprefix("+")
 
 
-def turned(points: ArrayLike, up: str) -> NDArray[np.float64]:
-    """Return points (..., 3) of a map in the axes of its picture: right, away, up."""
-    points = np.asarray(points, float)[..., list(UPS[up])]
-    return points * [1, 1, -1] if up.startswith("-") else points
-
-
 def upright(voxel_map: VoxelMap, trajectory: ArrayLike | None, up: str) -> Drawn:
     """Turn a map so that its axis `up` (`z`, `-y`, ...) becomes the third, and a path (M, 3) with it.
 
@@ -117,25 +110,4 @@ def stood_up(
 ) -> Drawn:
     """Return cells (N, 3) of a map whose axis `up`, a key of `UPS`, becomes the third. path: turned already."""
     order = list(UPS[up])
-    cells = cells[:, order]
-    if up.startswith("-"):
-        cells[:, 2] = -1 - cells[:, 2]
-    return Drawn(cells, state, voxel_size, path, ("xyz"[order[0]], "xyz"[order[1]], up))
-
-
-def ceiling(occupied: NDArray[np.int32]) -> int:
-    """Return the layer (third index) at which the ceiling of occupied cells (K, 3) begins; beyond the highest if none.
-
-    A ceiling is a layer in the upper part of the map that holds far more cells than layers usually do.
-    """
-    if not len(occupied):
-        return 0
-    low, count = _layers(occupied)
-    upper = np.arange(len(count)) > 0.55 * len(count)
-    slabs = np.flatnonzero(upper & (count > SLAB * np.median(count)))
-    return int(low + (slabs[0] - 1 if len(slabs) else len(count)))
-
-
-def _layers(cells: NDArray[np.int32]) -> tuple[int, NDArray[np.int64]]:
-    low = int(cells[:, 2].min())
-    return low, np.bincount(cells[:, 2] - low)
+    return Drawn(turned_cells(cells, up), state, voxel_size, path, ("xyz"[order[0]], "xyz"[order[1]], up))

@@ -4,8 +4,11 @@
 import itertools
 
 import numpy as np
+import pytest
 
-from stereovox.integrate.crossing import crossed_cells
+from stereovox.errors import StereovoxError
+from stereovox.integrate import crossing
+from stereovox.integrate.crossing import crossed_cells, scan_evidence
 
 
 def slowly_crossed(start: np.ndarray, stop: np.ndarray) -> set[tuple[int, ...]]:
@@ -38,3 +41,26 @@ def test_rays_cross_what_the_slow_loop_says():
 
 def test_no_rays_cross_no_cells():
     assert len(crossed_cells(np.zeros(3), np.empty((0, 3)), 0.1)) == 0
+
+
+def test_pieces_change_nothing(monkeypatch):
+    ends = np.random.default_rng(3).uniform(-9, 9, (200, 3))
+    whole = crossed_cells(np.zeros(3), ends, 0.3)
+    monkeypatch.setattr(crossing, "AT_ONCE", 100)
+    np.testing.assert_array_equal(crossed_cells(np.zeros(3), ends, 0.3), whole)
+
+
+def test_a_ray_too_long_to_walk_is_refused():
+    with pytest.raises(StereovoxError, match="use larger cells"):
+        crossed_cells(np.zeros(3), np.array([[1e9, 0, 0]]), 0.1)
+
+
+def test_evidence_of_a_scan_is_of_its_hits_first():
+    origin, ends = np.array([0.05, 0.05, 0.05]), np.array([[1.05, 0.05, 0.05], [2.05, 0.05, 0.05], [-3.01, -0.52, 0.7]])
+    evidence = scan_evidence(origin, ends, 0.1, 900, -400)
+    block, column = np.nonzero(evidence.values)
+    cells = evidence.coords[block] * 8 + np.stack([column >> 6, column >> 3 & 7, column & 7], axis=1)
+    found = dict(zip(map(tuple, cells.tolist()), evidence.values[block, column].tolist(), strict=True))
+    hits = {tuple(cell) for cell in np.floor(ends / 0.1).astype(int).tolist()}
+    expected = dict.fromkeys(map(tuple, crossed_cells(origin, ends, 0.1).tolist()), -400)
+    assert found == expected | dict.fromkeys(hits, 900)

@@ -4,8 +4,8 @@
 .bt, .ot and .graph of OctoMap; .npz of stereovox; clouds and meshes (.ply, .pcd, .las, .laz, .xyz, .csv, .txt, .asc,
 .pts, .bin of KITTI, .stl, .obj, .off): each cell that holds a point or a piece of surface becomes occupied; .bag,
 .mcap, .db3 and rosbag2 folders with an octomap_msgs/Octomap or a PointCloud2; .yaml of map_server with --heights. The
-size of cells is suggested where it is not given. Where MAP ends in .yaml, .pgm or .png, FILE is a floor's map, or a bag with a
-nav_msgs/OccupancyGrid, and is saved as map_server files.
+size of cells is suggested where it is not given. Where MAP ends in .yaml, .pgm or .png, FILE is a floor's map, or a
+bag with a nav_msgs/OccupancyGrid, and is saved as map_server files.
 """
 
 from __future__ import annotations

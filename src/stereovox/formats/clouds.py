@@ -205,13 +205,17 @@ def _on_surface(xyz: NDArray[np.float64], faces: NDArray[np.integer], voxel_size
     length, step = sides.max(axis=1, initial=0.0), voxel_size / PER_CELL
     height = np.linalg.norm(np.cross(b - a, c - a), axis=1) / np.where(length > 0, length, 1.0)
     rows, along = np.ceil(height / step), np.ceil(length / step)
-    if not float(((rows + 2) * (along + 2)).sum()) <= MAX_SAMPLES:
+    if not float(((rows + 4) * (along + 2)).sum()) <= MAX_SAMPLES:
         raise StereovoxError(f"its surface takes too many cells of {voxel_size:g} m; give a larger --voxel-size")
     of_row, t = _shares(rows.astype(np.int64))
     of_point, s = _shares(np.ceil(along[of_row] * (1 - t)).astype(np.int64))
     of_face, t = of_row[of_point], t[of_point]
+    edges = np.concatenate([np.stack([a, c], axis=1), np.stack([b, c], axis=1)])  # rows alone may leave gaps in these
+    lengths = np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1)
+    of_edge, share = _shares(np.ceil(lengths / step).astype(np.int64))
+    on_edges = edges[of_edge, 0] + share[:, None] * (edges[of_edge, 1] - edges[of_edge, 0])
     a, b, c, s, t = a[of_face], b[of_face], c[of_face], s[:, None], t[:, None]
-    return a + t * (c - a) + s * (1 - t) * (b - a)
+    return np.concatenate([a + t * (c - a) + s * (1 - t) * (b - a), on_edges])
 
 
 def _shares(steps: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stereovox.config import load_config
+from stereovox.config import Config, load_config
 from stereovox.errors import ConfigError, MapFileError, StereovoxError
 from stereovox.formats._lzf import unpack
 from stereovox.maps import VoxelMap
@@ -24,6 +24,8 @@ from stereovox.safe_io import json_value, read_arrays, read_bounded, shown
 
 MAX_BLOCKS = 2**19
 """Most blocks of 8x8x8 cells, 1 KB each, so that a file of far-apart points cannot fill the memory."""
+MAX_RANGE_CELLS = 8000
+"""Cells of the settings' range, which may span 8192."""
 ARRAYS = ("indices", "log_odds", "voxel_size", "free_below", "occupied_above", "settings")
 MAX_BYTES = 1 << 32
 MAX_HEADER_LENGTH, MAX_FIELDS = 1 << 16, 256
@@ -76,7 +78,7 @@ def cells_of_points(points: ArrayLike, voxel_size: float) -> VoxelMap:
     for points too far away for any cell, for too many blocks, or a bad size.
     """
     points = np.asarray(points, np.float64).reshape(-1, 3)
-    config = load_config(voxel_size=voxel_size)
+    config = _config(voxel_size)
     cells = np.floor(points[np.isfinite(points).all(axis=1)] / voxel_size)
     if (np.abs(cells) >= INDEX_LIMIT).any():
         raise StereovoxError(
@@ -85,6 +87,13 @@ def cells_of_points(points: ArrayLike, voxel_size: float) -> VoxelMap:
     indices = cells.astype(np.int64)
     check_room(indices)
     return VoxelMap.from_cells(config, indices, np.full(len(indices), config.map.log_odds_max))
+
+
+def _config(voxel_size: float) -> Config:
+    """Return the default profile with a cell size, and a range that so many cells can span: nothing measured these."""
+    usual = load_config()
+    small = 0 < voxel_size * MAX_RANGE_CELLS < usual.max_range
+    return load_config(voxel_size=voxel_size, **({"max_range": voxel_size * MAX_RANGE_CELLS} if small else {}))
 
 
 def check_room(indices: NDArray[np.integer]) -> None:

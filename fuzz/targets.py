@@ -36,8 +36,11 @@ from stereovox.evaluate.inputs import read_camera_path
 from stereovox.evaluate.trajectory import read_relations
 from stereovox.formats import export, read_octomap
 from stereovox.formats.bags import read_bag_grid, read_bag_map
+from stereovox.formats.clouds import read_cloud_map
 from stereovox.formats.map_server import read_map_server, write_map_server
-from stereovox.formats.read_points import read_npz, read_point_map
+from stereovox.formats.raised_floor import raised
+from stereovox.formats.read_points import read_npz
+from stereovox.formats.scan_graph import read_scan_graph
 from stereovox.maps import VoxelMap, load_map
 from stereovox.maps.grid_map import GridMap, load_grid
 from stereovox.maps.occupancy import OccupancyGrid
@@ -305,7 +308,7 @@ def bodies(folder: Path) -> list[bytes]:
 def read_yaml(data: bytes, folder: Path) -> None:
     (folder / "map.pgm").write_bytes(b"P5\n2 2\n255\n\0\xcd\xfe\xfe")
     (folder / "map.yaml").write_bytes(data)
-    read_map_server(folder / "map.yaml")
+    raised(read_map_server(folder / "map.yaml"), (0.0, 0.2))
 
 
 def read_picture(data: bytes, folder: Path) -> None:
@@ -350,6 +353,49 @@ def text_points(_: Path) -> list[bytes]:
     packed = b"\x1f" + columns  # a run of 32 bytes
     compressed = pcd.replace(b"ascii", b"binary_compressed") + struct.pack("<II", len(packed), len(columns)) + packed
     return [ply + rows, pcd + rows, compressed]
+
+
+ROWS = (
+    "x,y,z\n" + "".join(f"{k % 5}.5,{k // 5},0.25\n" for k in range(20)),
+    "// a comment\n3\n1 2 3 0 0\n4 5 6 0 0\n-7 8e1 9 0 0\n",
+    "i;Z;Y;X [m]\n1;2;3;4\n",
+)
+POSE = struct.pack("<i3di4dI", 3, 1, 0, 1, 4, 0.7, 0, 0, 0.7, 1)
+GRAPHS = (
+    "# scans\nNODE 0 0 1 0 0.1 0.2\n1 2 3\n 9\n2 1 0.5\nNODE 1 0 1 0 0 3\n1 1 1\n",
+    struct.pack("<II", 2, 2) + struct.pack("<i3d", 3, 1, 2, 3) * 2 + POSE
+    + struct.pack("<I", 1) + struct.pack("<i3d", 3, 2, 1, 0) + POSE
+    + struct.pack("<I", 0),
+)  # fmt: skip
+
+
+def surveys(ending: str, folder: Path) -> list[bytes]:
+    import laspy
+
+    steps = np.stack(np.meshgrid(np.arange(8.0), np.arange(6.0), [1.0]), axis=-1).reshape(-1, 3)
+    text = 'PROJCS["x",GEOGCS["y",UNIT["degree",0.017]],UNIT["foot",0.3048]]'
+    found = []
+    for version, kind in (("1.2", 3), ("1.4", 6)):
+        header = laspy.LasHeader(version=version, point_format=kind)
+        header.scales = [0.01] * 3
+        if kind == 6:
+            header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(text))
+        made = laspy.LasData(header)
+        made.x, made.y, made.z = steps.T
+        made.write(str(folder / f"seed{ending}"))
+        found.append((folder / f"seed{ending}").read_bytes())
+    return found
+
+
+def read_survey(name: str, data: bytes, folder: Path) -> None:
+    file_target(name, lambda path: read_cloud_map(path, 0.5)).read(data, folder)
+
+
+def meshes(kind: str, _: Path) -> list[bytes]:
+    import trimesh
+
+    made = trimesh.creation.box((2.0, 1.0, 0.6)).export(file_type=kind)
+    return [made.encode() if isinstance(made, str) else made]
 
 
 # bags ---------------------------------------------------------------------------------------------------------------
@@ -586,14 +632,23 @@ TARGETS: dict[str, Target] = {
     ),
     "cells_settings": Target(settings, read_settings),
     "points_text": Target(
-        text_points, lambda data, folder: file_target("a", lambda path: read_point_map(path, 0.1)).read(data, folder)
+        text_points,
+        lambda data, folder: file_target("a.ply", lambda path: read_cloud_map(path, 0.1)).read(data, folder),
     ),
     "points_ply": Target(
-        partial(exported, ".ply"), lambda data, folder: file_target("a", read_point_map).read(data, folder)
+        partial(exported, ".ply"), lambda data, folder: file_target("a.ply", read_cloud_map).read(data, folder)
     ),
     "points_pcd": Target(
-        partial(exported, ".pcd"), lambda data, folder: file_target("a", read_point_map).read(data, folder)
+        partial(exported, ".pcd"), lambda data, folder: file_target("a.pcd", read_cloud_map).read(data, folder)
     ),
+    "points_rows": file_target("a.csv", read_cloud_map, *ROWS),
+    "points_las": Target(partial(surveys, ".las"), lambda data, folder: read_survey("a.las", data, folder)),
+    "points_laz": Target(partial(surveys, ".laz"), lambda data, folder: read_survey("a.laz", data, folder)),
+    "mesh_ply": Target(partial(meshes, "ply"), file_target("a.ply", lambda path: read_cloud_map(path, 0.2)).read),
+    "mesh_obj": Target(partial(meshes, "obj"), file_target("a.obj", lambda path: read_cloud_map(path, 0.2)).read),
+    "mesh_off": Target(partial(meshes, "off"), file_target("a.off", lambda path: read_cloud_map(path, 0.2)).read),
+    "mesh_stl": Target(partial(meshes, "stl"), file_target("a.stl", lambda path: read_cloud_map(path, 0.2)).read),
+    "scan_graph": file_target("a.graph", lambda path: read_scan_graph(path, 0.2), *GRAPHS),
     "map_yaml": file_target("map.yaml", lambda path: read_yaml(path.read_bytes(), path.parent), MAP_YAML),
     "map_picture": Target(pictures, read_picture),
     "bag_ros1": Target(ros1_bags, partial(read_bag, "a.bag")),

@@ -58,6 +58,7 @@ HOMES = {
     "std_msgs": r"ros/.*",
     "std_srvs": r"ros/.*",
     "tf2_msgs": r"ros/.*",
+    "laspy": r"formats/.*",
     "trimesh": r"(formats|simulate)/.*",
     "viser": r"viewer/.*",
     "zarr": r"maps/.*",

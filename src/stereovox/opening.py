@@ -27,6 +27,9 @@ from stereovox.sources.robots.robot import Robot
 SOURCES = {
     "pair": "stereovox.sources.pair:CameraPair",  # first: such a folder may hold groundtruth.txt as well
     "seven_scenes": "stereovox.sources.rgbd.seven_scenes:SevenScenes",
+    "icl_nuim": "stereovox.sources.rgbd.icl_nuim:IclNuim",  # before tum: it may hold groundtruth.txt as well
+    "icl_scene": "stereovox.sources.rgbd.icl_nuim:IclNuimScene",
+    "sun3d": "stereovox.sources.rgbd.sun3d:Sun3d",
     "tum": "stereovox.sources.rgbd.tum:TumRgbd",
     "rig": "stereovox.sources.rig:StereoRig",
     "asl": "stereovox.sources.asl:AslRig",
@@ -38,6 +41,10 @@ SOURCES = {
     "surround": "stereovox.simulate.surround:Surround",  # before all others of sim:
     "simulation": "stereovox.simulate.simulation:Simulation",
     "bag": "stereovox.sources.bags.recording:Bag",
+    "sens": "stereovox.sources.rgbd.packed:SensFile",
+    "slambench": "stereovox.sources.rgbd.packed:SlambenchRaw",
+    "replica": "stereovox.sources.rgbd.replica:Replica",
+    "open3d": "stereovox.sources.rgbd.open3d:Open3DFolder",
     "plain": "stereovox.sources.rgbd.plain:DepthAndPoses",  # last: nearly any folder with depth images
 }
 """Asked in this order, then those of other packages (entry points in the group `stereovox.sources`)."""

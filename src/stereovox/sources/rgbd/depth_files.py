@@ -24,8 +24,8 @@ SUFFIXES = (".png", ".pgm", ".tif", ".tiff", ".pfm", ".exr", ".npy", ".npz")
 """Suffixes of depth images, in lower case."""
 PACKED_KINDS = frozenset({(8, 2), (8, 6)})
 """8-bit RGB and RGBA, whose bytes may be those of a depth."""
-FLOAT_TOP = (58, 69)
-"""Smallest and largest leading byte of float32 depths from 1 mm to 2 km."""
+FLOAT_TOP = (58, 71)
+"""Smallest and largest leading byte of float32 depths from 1 mm to 100 km (the sky of simulators)."""
 CARLA_M, CARLA_MAX = 1000.0, 256**3 - 1
 """CARLA's depth camera: (R + 256 G + 65536 B) / (256^3 - 1) of 1000 m."""
 KIND = "depth must be a 16-bit grey PNG, PGM or TIFF, or floats (TIFF, PFM, EXR, NPY)"
@@ -46,7 +46,7 @@ def read_depth(path: Path, size: tuple[int, int]) -> Depth:
         FrameRefused: `missing_file`; `unreadable` (cut off, damaged, absurdly large); `bad_dtype` (a picture);
             `bad_shape` (another size).
     """
-    image = _decoded(path, size)
+    image = decode_depth(path, _read(path), size)
     found = image.shape[1], image.shape[0]
     if found != size:
         raise FrameRefused(
@@ -57,7 +57,7 @@ def read_depth(path: Path, size: tuple[int, int]) -> Depth:
 
 def depth_size(path: Path) -> tuple[int, int]:
     """Return (width, height) of a depth image; raises FrameRefused as `read_depth`."""
-    height, width = _decoded(path).shape
+    height, width = decode_depth(path, _read(path)).shape
     return width, height
 
 
@@ -78,8 +78,11 @@ def common_depth_size(paths: Sequence[Path], samples: int = 5) -> tuple[int, int
     return found.most_common(1)[0][0] if found else fault
 
 
-def _decoded(path: Path, size: tuple[int, int] | None = None) -> Depth:
-    content = _read(path)
+def decode_depth(path: Path, content: bytes, size: tuple[int, int] | None = None) -> Depth:
+    """Return the depth image in the bytes of a file, as `read_depth` does; `path` names it in messages.
+
+    size: (width, height) that a PNG must have; None: any.
+    """
     if content.startswith(SIGNATURE):
         return _depth(path, _png(path, content, size))
     for start, decode in DECODERS.items():

@@ -4,6 +4,7 @@
 | form | lines | who writes it |
 |---|---|---|
 | TUM | `stamp tx ty tz qx qy qz qw` | TUM RGB-D, ORB-SLAM, evo, most SLAM programs |
+| poses alone | `tx ty tz qx qy qz qw` | TartanAir, small demos |
 | KITTI | 12 numbers, a 3x4 matrix row by row | KITTI, kiss-icp |
 | matrices | 16 numbers a line, or 4x4 matrices below each other | Replica, NICE-SLAM |
 | log | `i i i`, then a 4x4 matrix | Redwood, Open3D |
@@ -81,7 +82,7 @@ def read_poses(path: Path) -> Poses | ImagePoses:
     widths = {len(row) for row in rows}
     if widths <= {8, 9}:  # the ninth: a tracker's confidence
         return Trajectory(path)
-    if widths == {12} or widths == {16}:
+    if widths in ({7}, {12}, {16}):
         return ImagePoses([_matrix(row, f"{path}:{n}") for n, row in enumerate(rows, 1)], str(path))
     if widths <= {3, 4} and len(rows) % 5 == 0 and all(len(row) == 3 for row in rows[::5]):
         return _stacked(path, [rows[k + 1 : k + 5] for k in range(0, len(rows), 5)])

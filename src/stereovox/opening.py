@@ -38,6 +38,8 @@ SOURCES = {
     "rtabmap_db": "stereovox.sources.rgbd.rtabmap_db:RtabmapDatabase",  # before bags, which may be SQLite files too
     "bag": "stereovox.sources.bags.recording:Bag",
     "nerfstudio": "stereovox.sources.rgbd.nerfstudio:NerfTransforms",
+    "rtabmap": "stereovox.sources.rgbd.rtabmap:RtabmapExport",
+    "colmap": "stereovox.sources.rgbd.colmap:Colmap",
     "tartanair": "stereovox.sources.rgbd.tartanair:TartanAir",
     "stray_scanner": "stereovox.sources.rgbd.stray_scanner:StrayScanner",
     "plain": "stereovox.sources.rgbd.plain:DepthAndPoses",  # last: nearly any folder with depth images

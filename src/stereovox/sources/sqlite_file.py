@@ -24,7 +24,7 @@ class SqliteFile:
         longest: Most bytes of a value.
 
     Raises:
-        ValueError, sqlite3.Error: It is no SQLite file, is damaged, or a table is missing or no plain one; see `FAULTS`.
+        ValueError, sqlite3.Error: It is no SQLite file, is damaged, or a table is no plain one; see `FAULTS`.
     """
 
     def __init__(self, path: Path, tables: Sequence[str], longest: int):

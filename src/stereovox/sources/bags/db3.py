@@ -15,6 +15,7 @@ from stereovox.sources.bags.messages import Wire
 from stereovox.sources.bags.unpack import decompress_message
 from stereovox.sources.sqlite_file import SqliteFile
 
+
 class Db3File(BagFile):
     """A ROS 2 recording in one SQLite file, as realsense-viewer and pyrealsense2 2.57 and later write it.
 

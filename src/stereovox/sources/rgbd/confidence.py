@@ -37,4 +37,4 @@ def without_low(depth: Depth, path: Path, lowest: int) -> Depth:
         raise FrameRefused("unreadable", f"{path}: {error.strerror}; make it readable or remove it") from None
     size = depth.shape[1], depth.shape[0]
     confidence = decode_png(path, content, size, KINDS, "confidence must be an 8-bit grey PNG")
-    return np.where(confidence < lowest, depth.dtype.type(0), depth)
+    return np.where(confidence.astype(np.uint8) < lowest, depth.dtype.type(0), depth)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import os
+import re
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -29,6 +30,8 @@ FLOAT_TOP = (58, 71)
 CARLA_M, CARLA_MAX = 1000.0, 256**3 - 1
 """CARLA's depth camera: (R + 256 G + 65536 B) / (256^3 - 1) of 1000 m."""
 KIND = "depth must be a 16-bit grey PNG, PGM or TIFF, or floats (TIFF, PFM, EXR, NPY)"
+COLMAP = re.compile(rb"(\d{1,6})&(\d{1,6})&1&")
+"""Start of COLMAP's depth maps: columns, rows and channels; then float32 row by row."""
 Depth = NDArray[np.uint16] | NDArray[np.float32]
 
 
@@ -85,6 +88,8 @@ def decode_depth(path: Path, content: bytes, size: tuple[int, int] | None = None
     """
     if content.startswith(SIGNATURE):
         return _depth(path, _png(path, content, size))
+    if COLMAP.match(content):
+        return _depth(path, _colmap(path, content))
     for start, decode in DECODERS.items():
         if content.startswith(start):
             return _depth(path, decode(path, content))
@@ -168,6 +173,15 @@ def _pgm(path: Path, content: bytes) -> NDArray[np.generic]:
     if len(content) < image.nbytes and content.startswith(b"P5"):
         raise FrameRefused("unreadable", f"{path}: is cut off; copy it again or remove it")
     return image
+
+
+def _colmap(path: Path, content: bytes) -> NDArray[np.float32]:
+    """Return one of COLMAP's depth maps, in the unit of its poses."""
+    start = COLMAP.match(content)
+    width, height = (int(start[k]) for k in (1, 2)) if start else (0, 0)
+    if start is None or len(content) - start.end() != 4 * width * height:
+        raise FrameRefused("unreadable", f"{path}: is cut off or damaged; copy it again")
+    return np.frombuffer(content, "<f4", offset=start.end()).reshape(height, width)
 
 
 def _numpy(path: Path, content: bytes) -> NDArray[np.generic]:

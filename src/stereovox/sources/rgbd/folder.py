@@ -218,7 +218,7 @@ class DepthFolder(DepthSource, ABC):
         return self.find_camera(size)
 
     def _find_unit(self, expected: float) -> DepthUnit:
-        """Return the unit of the images; `expected`: metres per unit by convention or as the file of the camera says."""
+        """Return the unit of the images; `expected`: metres per unit by convention, or as the camera's file says."""
         if self.options.depth_scale:
             return DepthUnit(metres_per_unit(self.options.depth_scale), True, "as ?depth_scale= says")
         pairs = pairs_of(len(self), self.pose, self.read) if self.posed else []

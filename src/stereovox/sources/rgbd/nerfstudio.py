@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.errors import SourceError
@@ -20,6 +19,7 @@ from stereovox.sources.camera_file import FoundCamera, pinhole
 from stereovox.sources.rgbd.depth_files import SUFFIXES, Depth
 from stereovox.sources.rgbd.folder import SECOND, DepthFolder, ImageFile, folder_part
 from stereovox.sources.rgbd.pose_files import ImagePoses, number_in
+from stereovox.sources.rgbd.undistort import Undistortion
 from stereovox.sources.trajectory import inside
 
 FILE = "transforms.json"
@@ -29,8 +29,6 @@ SCALE_KEYS = ("depth_unit_scale_factor", "integer_depth_scale")
 """Keys of metres per unit of the depth images."""
 RADIAL = ("k1", "k2", "p1", "p2", "k3")
 """Coefficients of the distortion, in OpenCV's order."""
-NEGLIGIBLE_PX = 0.5
-"""Distortion that moves no pixel farther is left as it is."""
 PLAIN_MODELS = ("", "OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "RADIAL", "SIMPLE_RADIAL")
 Table = dict[str, Any]
 
@@ -58,10 +56,10 @@ class NerfTransforms(DepthFolder):
         ),
     )
     axes = "opengl"
-    _undistort: tuple[NDArray[np.float32], NDArray[np.float32]] | None = None
 
     def list_images(self) -> list[ImageFile]:
         """Return the depth images that the frames name, in the order of the numbers in their names."""
+        self._cameras: list[PinholeCamera] = []
         self._table = _read(self.folder / FILE)
         every = self._table["frames"]
         named = [frame for frame in every if _depth_name(frame)]
@@ -90,26 +88,20 @@ class NerfTransforms(DepthFolder):
             return super().find_camera(size)
         where = self.folder / FILE
         self._cameras = [_camera({**self._table, **frame}, size, where) for frame in self._frames]
-        camera, notes = self._cameras[0], []
-        self._undistort, moved = _undistortion(self._table | self._frames[0], camera, where)
-        if self._undistort is not None:
-            notes.append(f"{where}: images are distorted by up to {moved:.1f} pixels; depth is undistorted")
-        scale = next((self._table[key] for key in SCALE_KEYS if is_number(self._table.get(key))), None)
-        return FoundCamera(camera, tuple(notes), depth_scale=scale if scale is not None and scale > 0 else None)
+        self._undistort = Undistortion(self._cameras[0], _coefficients(self._table | self._frames[0], where))
+        moved = self._undistort.moved_px
+        notes = (f"{where}: pictures are distorted by up to {moved:.1f} pixels; depth is undistorted",) if moved else ()
+        scale = next((self._table[key] for key in SCALE_KEYS if is_number(self._table.get(key))), 0.0)
+        return FoundCamera(self._cameras[0], notes, depth_scale=scale if scale > 0 else None)
 
     def camera_of(self, i: int) -> PinholeCamera:
         """Return the camera of frame `i`."""
-        own = getattr(self, "_cameras", None)
-        return self.camera if own is None or self.options.camera else own[i]
+        return self._cameras[i] if self._cameras and not self.options.camera else self.camera
 
     def read(self, i: int) -> Depth:
         """Return depth image `i`, undistorted; raises FrameRefused."""
         depth = super().read(i)
-        if self._undistort is None or self.options.camera:
-            return depth
-        import cv2
-
-        return cv2.remap(depth, *self._undistort, cv2.INTER_NEAREST, borderValue=0).astype(depth.dtype, copy=False)
+        return self._undistort(depth) if self._cameras and not self.options.camera else depth
 
     @classmethod
     def recognises(cls, where: str) -> bool:
@@ -167,7 +159,9 @@ def _camera(table: Table, size: tuple[int, int], where: Path) -> PinholeCamera:
     """Return the pinhole camera of a frame, scaled to depth images of (width, height) = `size`."""
     model = str(table.get("camera_model", "")).upper()
     if model not in PLAIN_MODELS or table.get("is_fisheye"):
-        raise SourceError(f"{where}: a {model[:40] or 'fisheye'} camera; undistort the images to a pinhole camera first")
+        raise SourceError(
+            f"{where}: a {model[:40] or 'fisheye'} camera; undistort the images to a pinhole camera first"
+        )
     numbers = {key: float(table[key]) for key in ("fl_x", "fl_y", "cx", "cy", "w", "h") if is_number(table.get(key))}
     width, height = numbers.get("w", float(size[0])), numbers.get("h", float(size[1]))
     if "fl_x" not in numbers and is_number(table.get("camera_angle_x")):
@@ -188,23 +182,8 @@ def _camera(table: Table, size: tuple[int, int], where: Path) -> PinholeCamera:
         raise SourceError(f"{where}: {error}") from None
 
 
-def _undistortion(
-    table: Table, camera: PinholeCamera, where: Path
-) -> tuple[tuple[NDArray[np.float32], NDArray[np.float32]] | None, float]:
-    """Return for each pixel (height, width) the column and row of the distorted image, and the longest way between.
-
-    None instead of the columns and rows where no pixel moves noticeably.
-    """
-    coefficients = [float(table[key]) if is_number(table.get(key)) else 0.0 for key in RADIAL]
+def _coefficients(table: Table, where: Path) -> list[float]:
+    """Return the coefficients of the distortion; raises SourceError for a fisheye camera."""
     if is_number(table.get("k4")) and table["k4"]:
         raise SourceError(f"{where}: k4 belongs to a fisheye camera; undistort the images to a pinhole camera first")
-    if not any(coefficients):
-        return None, 0.0
-    import cv2
-
-    K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
-    size = camera.width, camera.height
-    columns, rows = cv2.initUndistortRectifyMap(K, np.array(coefficients), np.eye(3), K, size, cv2.CV_32FC1)
-    v, u = np.mgrid[: camera.height, : camera.width]
-    moved = float(np.hypot(columns - u, rows - v).max())
-    return ((columns, rows) if not moved <= NEGLIGIBLE_PX else None), moved
+    return [float(table[key]) if is_number(table.get(key)) else 0.0 for key in RADIAL]

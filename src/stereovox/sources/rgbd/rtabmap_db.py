@@ -10,7 +10,7 @@ import zlib
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,7 +69,7 @@ class RtabmapDatabase(DepthFolder):
         """Return the depth images in order of time, named by node and, of several cameras, their number."""
         self.name = self.folder.stem
         try:
-            self._file = SqliteFile(self.folder, TABLES, MAX_BYTES)
+            self._sqlite = SqliteFile(self.folder, TABLES, MAX_BYTES)
             self._nodes = self._read_nodes()
         except FAULTS as error:
             if isinstance(error, SourceError):
@@ -79,19 +79,23 @@ class RtabmapDatabase(DepthFolder):
             ) from None
         self._views = [(node, k) for node in self._nodes for k in range(len(node.cameras))]
         if not self._views:
-            count = self._file.rows("SELECT count(*) FROM Node")[0][0]
+            count = self._sqlite.rows("SELECT count(*) FROM Node")[0][0]
             raise SourceError(
                 f"{self.folder}: its {count} nodes hold no depth images; record with a depth camera and keep them "
                 "(Mem/BinDataKept true)"
             )
         many = any(len(node.cameras) > 1 for node in self._nodes)
         names = [f"node {node.id}" + (f" camera {k}" if many else "") for node, k in self._views]
-        return [ImageFile(self.folder / name, node.stamp_ns) for name, (node, _) in zip(names, self._views, strict=True)]
+        return [
+            ImageFile(self.folder / name, node.stamp_ns) for name, (node, _) in zip(names, self._views, strict=True)
+        ]
 
     def read_poses(self) -> ImagePoses:
         """Return T_world_camera of all images."""
         found = [
-            node.T_world_base if isinstance(node.T_world_base, str) else node.T_world_base @ node.cameras[k].T_base_camera
+            node.T_world_base
+            if isinstance(node.T_world_base, str)
+            else node.T_world_base @ node.cameras[k].T_base_camera
             for node, k in self._views
         ]
         return ImagePoses(found, str(self.folder))
@@ -139,14 +143,15 @@ class RtabmapDatabase(DepthFolder):
             return False
 
     def _read_nodes(self) -> list[_Node]:
-        version = _version(self._file.rows("SELECT version FROM Admin"))
+        version = _version(self._sqlite.rows("SELECT version FROM Admin"))
         if version < OLDEST:
             raise SourceError(
                 f"{self.folder}: is of RTAB-Map {'.'.join(map(str, version))}; open it once in a newer one, or {EXPORT}"
             )
-        rows = self._file.rows(
-            "SELECT Node.id, Node.map_id, Node.stamp, Node.pose, Data.calibration FROM Node JOIN Data ON "
-            "Data.id = Node.id WHERE length(Data.depth) > 0 AND length(Data.calibration) > 0 ORDER BY Node.stamp, Node.id"
+        rows = self._sqlite.rows(
+            "SELECT Node.id, Node.map_id, Node.stamp, Node.pose, Data.calibration FROM Node JOIN Data "
+            "ON Data.id = Node.id WHERE length(Data.depth) > 0 AND length(Data.calibration) > 0 "
+            "ORDER BY Node.stamp, Node.id"
         )
         known = self._optimised(version)
         if not known:
@@ -161,13 +166,13 @@ class RtabmapDatabase(DepthFolder):
         """Return the poses of the optimised graph by node; empty where it was not saved."""
         if version < (0, 17, 0):
             return {}
-        ids, poses = self._file.rows("SELECT opt_ids, opt_poses FROM Admin")[0]
+        ids, poses = self._sqlite.rows("SELECT opt_ids, opt_poses FROM Admin")[0]
         if not ids or not poses:
             return {}
         numbers, matrices = _unpacked(ids).view("<i4"), _unpacked(poses).view("<f4").reshape(-1, 12)
         return {int(n): transform(row) for n, row in zip(numbers, matrices, strict=True)}
 
-    def _by_odometry(self, rows: list[tuple]) -> tuple[dict[int, Transform], list[tuple]]:
+    def _by_odometry(self, rows: list[Any]) -> tuple[dict[int, Transform], list[Any]]:
         """Return the poses of odometry by node, and the rows of the session with most of them."""
         sessions = Counter(row[1] for row in rows)
         if not sessions:
@@ -175,7 +180,7 @@ class RtabmapDatabase(DepthFolder):
         session, count = sessions.most_common(1)[0]
         if count < len(rows):
             self.notes += (f"{self.folder}: {len(rows) - count} images of {len(sessions) - 1} other sessions left out",)
-        loops = self._file.rows(f"SELECT count(*) FROM Link WHERE type IN {LOOPS}")[0][0]
+        loops = self._sqlite.rows(f"SELECT count(*) FROM Link WHERE type IN {LOOPS}")[0][0]
         if loops:
             self.notes += (
                 f"{self.folder}: holds no optimised poses, so {loops} loop closures are not used (odometry is); "
@@ -189,12 +194,12 @@ class RtabmapDatabase(DepthFolder):
         node, k = self._views[i]
         path = self.image(i).path
         try:
-            content = self._file.rows("SELECT depth FROM Data WHERE id = ?", node.id)[0][0]
+            content = self._sqlite.rows("SELECT depth FROM Data WHERE id = ?", node.id)[0][0]
         except FAULTS as error:
             raise FrameRefused("unreadable", f"{path}: {one_line(str(error))[:100]}; leave it out") from None
         depth = _rvl_depth(path, content) if content.startswith(RVL) else decode_depth(path, content)
         width = depth.shape[1] // len(node.cameras)
-        return np.ascontiguousarray(depth[:, k * width : (k + 1) * width])
+        return cast("Depth", np.ascontiguousarray(depth[:, k * width : (k + 1) * width]))
 
     def _pinhole(self, i: int) -> PinholeCamera:
         node, k = self._views[i]
@@ -283,7 +288,7 @@ def _rvl_depth(path: Path, content: bytes) -> Depth:
     return depth.reshape(height, width)
 
 
-def _version(rows: list[tuple]) -> tuple[int, ...]:
+def _version(rows: list[Any]) -> tuple[int, ...]:
     """Return the newest version in the table of versions."""
     found = [tuple(int(n) for n in re.findall(r"\d+", str(row[0]))[:3]) for row in rows]
     if not found:

@@ -22,8 +22,12 @@ AXES = {
     "optical": np.eye(3),
     "opengl": np.diag([1.0, -1.0, -1.0]),
     "ros": np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]),
+    "ned": np.array([[0.0, 1, 0], [0, 0, 1], [1, 0, 0]]),
 }
-"""Rotations that turn coordinates in these axes into optical ones. `ros`: x forward, y left, z up (REP 103)."""
+"""Rotations that turn coordinates in these axes into optical ones.
+
+`ros`: x forward, y left, z up (REP 103); `ned`: x forward, y right, z down (aircraft, AirSim).
+"""
 WORLDS = ("up", "optical", "file")
 """Axes of the map: z up, x forward, y left; optical (Chien 2020); or just those of the file."""
 HIGHEST_CONFIDENCE = 3

@@ -4,9 +4,7 @@
 from __future__ import annotations
 
 import sqlite3
-import threading
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,32 +13,7 @@ from stereovox.errors import FrameRefused, SourceError
 from stereovox.sources.bags.files import MAX_BYTES, BagFile, one_line
 from stereovox.sources.bags.messages import Wire
 from stereovox.sources.bags.unpack import decompress_message
-
-STEPS = 10_000
-"""SQLite instructions between two checks of their number."""
-SUSPICIOUS_TABLES = """
-    SELECT (SELECT count(*) FROM sqlite_master WHERE lower(name) IN ('topics', 'messages')
-            AND (type <> 'table' OR NOT rootpage > 0))
-        + (SELECT count(*) FROM pragma_table_xinfo('topics') WHERE hidden)
-        + (SELECT count(*) FROM pragma_table_xinfo('messages') WHERE hidden)
-"""
-"""Counts views, virtual tables and computed columns in place of tables: they make SQLite run what the file says."""
-
-
-class _StepLimit:
-    """Aborts a query of more steps than a file of `size` bytes has rows: damaged pages form cycles."""
-
-    def __init__(self, size: int):
-        self._most, self._done = 1_000_000 + 10 * size, 0
-
-    def begin(self) -> None:
-        """Reset the count."""
-        self._done = 0
-
-    def is_over(self) -> bool:
-        """Count `STEPS` more; return whether the limit is exceeded."""
-        self._done += STEPS
-        return self._done > self._most
+from stereovox.sources.sqlite_file import SqliteFile
 
 
 class Db3File(BagFile):
@@ -51,20 +24,10 @@ class Db3File(BagFile):
 
     def __init__(self, path: Path):
         self.path = path
-        self._lock = threading.Lock()
-        size = path.stat().st_size
-        self._patience = _StepLimit(size)
         try:
-            self._file = sqlite3.connect(
-                f"{path.resolve().as_uri()}?mode=ro&immutable=1", uri=True, check_same_thread=False
-            )
-            self._file.text_factory = lambda data: data.decode("utf-8", "replace")
-            self._file.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, min(MAX_BYTES, size))
-            self._file.set_progress_handler(self._patience.is_over, STEPS)
-            if self._rows(SUSPICIOUS_TABLES)[0][0]:
-                raise ValueError("topics or messages is no plain table")
-            rows = self._rows("SELECT id, name, type FROM topics WHERE id IS NOT NULL")
-            used = {row[0] for row in self._rows("SELECT DISTINCT topic_id FROM messages")}
+            self._file = SqliteFile(path, ("topics", "messages"), MAX_BYTES)
+            rows = self._file.rows("SELECT id, name, type FROM topics WHERE id IS NOT NULL")
+            used = {row[0] for row in self._file.rows("SELECT DISTINCT topic_id FROM messages")}
         except (sqlite3.Error, MemoryError, ValueError) as error:  # ValueError: messages that are no text
             raise SourceError(
                 f"{path}: {one_line(error)}; no .db3 recording, or damaged: record or copy it again"
@@ -81,25 +44,20 @@ class Db3File(BagFile):
     def read(self, topic: str, i: int) -> Wire:
         """Return message `i`; raises FrameRefused `unreadable` where the file is damaged."""
         try:
-            with self._lock:
-                key = int(self._index(topic)[1][i])
-                rows = self._rows("SELECT data FROM messages WHERE id = ?", key)
+            key = int(self._index(topic)[1][i])
+            rows = self._file.rows("SELECT data FROM messages WHERE id = ?", key)
             if len(rows) != 1 or not isinstance(rows[0][0], bytes):
                 raise ValueError("holds no message")
             return Wire(decompress_message(rows[0][0], MAX_BYTES), cdr=True)
         except (sqlite3.Error, SourceError, ValueError, OverflowError, MemoryError) as error:
             raise FrameRefused("unreadable", f"{self.path}: message {i} of {topic}: {one_line(error)}") from None
 
-    def _rows(self, query: str, *values: Any) -> list[Any]:
-        self._patience.begin()
-        return self._file.execute(query, values).fetchall()
-
     def _index(self, topic: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return times and row numbers of a topic's messages."""
         if topic not in self._ids:
             query = "SELECT timestamp, id FROM messages WHERE topic_id = ? ORDER BY timestamp, id"
             try:
-                rows = np.array(self._rows(query, self._keys[topic]), np.int64)
+                rows = np.array(self._file.rows(query, self._keys[topic]), np.int64)
             except (sqlite3.Error, ValueError, TypeError, OverflowError) as error:
                 raise SourceError(f"{self.path}: topic {topic}: {one_line(error)}; record or copy it again") from None
             self._ids[topic] = rows[:, 0], rows[:, 1]

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import os
+import re
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -24,11 +25,13 @@ SUFFIXES = (".png", ".pgm", ".tif", ".tiff", ".pfm", ".exr", ".npy", ".npz")
 """Suffixes of depth images, in lower case."""
 PACKED_KINDS = frozenset({(8, 2), (8, 6)})
 """8-bit RGB and RGBA, whose bytes may be those of a depth."""
-FLOAT_TOP = (58, 69)
-"""Smallest and largest leading byte of float32 depths from 1 mm to 2 km."""
+FLOAT_TOP = (58, 71)
+"""Smallest and largest leading byte of float32 depths from 1 mm to 100 km (the sky of simulators)."""
 CARLA_M, CARLA_MAX = 1000.0, 256**3 - 1
 """CARLA's depth camera: (R + 256 G + 65536 B) / (256^3 - 1) of 1000 m."""
 KIND = "depth must be a 16-bit grey PNG, PGM or TIFF, or floats (TIFF, PFM, EXR, NPY)"
+COLMAP = re.compile(rb"(\d{1,6})&(\d{1,6})&1&")
+"""Start of COLMAP's depth maps: columns, rows and channels; then float32 row by row."""
 Depth = NDArray[np.uint16] | NDArray[np.float32]
 
 
@@ -46,7 +49,7 @@ def read_depth(path: Path, size: tuple[int, int]) -> Depth:
         FrameRefused: `missing_file`; `unreadable` (cut off, damaged, absurdly large); `bad_dtype` (a picture);
             `bad_shape` (another size).
     """
-    image = _decoded(path, size)
+    image = decode_depth(path, _read(path), size)
     found = image.shape[1], image.shape[0]
     if found != size:
         raise FrameRefused(
@@ -57,7 +60,7 @@ def read_depth(path: Path, size: tuple[int, int]) -> Depth:
 
 def depth_size(path: Path) -> tuple[int, int]:
     """Return (width, height) of a depth image; raises FrameRefused as `read_depth`."""
-    height, width = _decoded(path).shape
+    height, width = decode_depth(path, _read(path)).shape
     return width, height
 
 
@@ -78,10 +81,15 @@ def common_depth_size(paths: Sequence[Path], samples: int = 5) -> tuple[int, int
     return found.most_common(1)[0][0] if found else fault
 
 
-def _decoded(path: Path, size: tuple[int, int] | None = None) -> Depth:
-    content = _read(path)
+def decode_depth(path: Path, content: bytes, size: tuple[int, int] | None = None) -> Depth:
+    """Return the depth image in the bytes of a file, as `read_depth` does; `path` names it in messages.
+
+    size: (width, height) that a PNG must have; None: any.
+    """
     if content.startswith(SIGNATURE):
         return _depth(path, _png(path, content, size))
+    if COLMAP.match(content):
+        return _depth(path, _colmap(path, content))
     for start, decode in DECODERS.items():
         if content.startswith(start):
             return _depth(path, decode(path, content))
@@ -165,6 +173,15 @@ def _pgm(path: Path, content: bytes) -> NDArray[np.generic]:
     if len(content) < image.nbytes and content.startswith(b"P5"):
         raise FrameRefused("unreadable", f"{path}: is cut off; copy it again or remove it")
     return image
+
+
+def _colmap(path: Path, content: bytes) -> NDArray[np.float32]:
+    """Return one of COLMAP's depth maps, in the unit of its poses."""
+    start = COLMAP.match(content)
+    width, height = (int(start[k]) for k in (1, 2)) if start else (0, 0)
+    if start is None or len(content) - start.end() != 4 * width * height:
+        raise FrameRefused("unreadable", f"{path}: is cut off or damaged; copy it again")
+    return np.frombuffer(content, "<f4", offset=start.end()).reshape(height, width)
 
 
 def _numpy(path: Path, content: bytes) -> NDArray[np.generic]:

@@ -13,6 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.errors import FrameRefused, SourceError, did_you_mean
 from stereovox.frame import Frame
 from stereovox.se3 import Transform
@@ -136,8 +137,9 @@ class DepthFolder(DepthSource, ABC):
         self._poses = self._read_poses()
         self.posed = self.posed and (self._poses is not None or self._has_own_poses())
         self.camera, notes, self._mirrored, scale = self._find_camera()
-        self.unit = self._find_unit(scale)
-        unit_note = () if self.options.depth_scale else self._unit_note(scale or self.depth_scale)
+        expected = scale or (1.0 if self._dtype().kind == "f" else self.depth_scale)
+        self.unit = self._find_unit(expected)
+        unit_note = () if self.options.depth_scale else self._unit_note(expected)
         self.depth_scale = self.unit.scale
         self.notes = (*self.notes, *notes, *unit_note)
 
@@ -185,6 +187,10 @@ class DepthFolder(DepthSource, ABC):
         plain = self.axes == "optical" and not self.options.invert
         return T if plain else in_optical_axes(T, self.axes, self.options.invert)
 
+    def camera_of(self, i: int) -> PinholeCamera:
+        """Return the camera of frame `i` (0 to len - 1); a layout may have one for each image, of the same size."""
+        return self.camera
+
     def read(self, i: int) -> Depth:
         """Return the depth image (height, width) of frame `i` (0 to len - 1); raises FrameRefused (`read_depth`)."""
         return read_depth(self._images[i].path, (self.camera.width, self.camera.height))
@@ -200,7 +206,7 @@ class DepthFolder(DepthSource, ABC):
             no_depth, no_pose = np.empty((0, 0), np.uint16), np.full((4, 4), np.nan)
             blank = Frame(no_depth, self.camera, no_pose, stamp_ns, self.depth_scale, name=str(path))
             return replace(blank, fault=refused.reason, fault_detail=str(refused))
-        return Frame(depth, self.camera, T_world_camera, stamp_ns, self.depth_scale, name=str(path))
+        return Frame(depth, self.camera_of(i), T_world_camera, stamp_ns, self.depth_scale, name=str(path))
 
     def _read_poses(self) -> Poses | ImagePoses | None:
         if not self.options.poses:
@@ -237,12 +243,10 @@ class DepthFolder(DepthSource, ABC):
             return camera_in(self._file(self.options.camera), size, self.baseline)
         return self.find_camera(size)
 
-    def _find_unit(self, in_file: float | None) -> DepthUnit:
-        """Return the unit of the images; `in_file`: metres per unit that the file of the camera says."""
+    def _find_unit(self, expected: float) -> DepthUnit:
+        """Return the unit of the images; `expected`: metres per unit by convention, or as the camera's file says."""
         if self.options.depth_scale:
             return DepthUnit(metres_per_unit(self.options.depth_scale), True, "as ?depth_scale= says")
-        floats = self._dtype().kind == "f"
-        expected = in_file or (1.0 if floats else self.depth_scale)
         pairs = pairs_of(len(self), self.pose, self.read) if self.posed else []
         return find_unit(pairs, self.camera, expected)
 
@@ -273,7 +277,7 @@ class DepthFolder(DepthSource, ABC):
         inside = self.folder if os.path.isdir(self.folder) else self.folder.parent
         found = next((path for path in (Path(text), inside / text) if os.path.exists(path)), None)
         if found is None:
-            raise SourceError(f"{text}: no such file, nor in {self.folder}; check the name")
+            raise SourceError(f"{text}: no such file, nor in {folder}; check the name")
         return found
 
 

@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Depth images of a camera whose lens distorts, turned into those of a pinhole camera."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.cameras.pinhole import PinholeCamera
+from stereovox.sources.rgbd.depth_files import Depth
+
+NEGLIGIBLE_PX = 0.5
+"""Distortion that moves no pixel farther is left as it is."""
+
+
+class Undistortion:
+    """Moves the pixels of depth images to where a pinhole camera of the same numbers sees them.
+
+    Each pixel gets the value of the nearest one of the distorted image, as depth must not be averaged across edges.
+
+    Args:
+        camera: The pinhole camera.
+        coefficients: k1, k2, p1, p2, k3 and so on, in OpenCV's order.
+
+    Attributes:
+        moved_px: Longest way that a pixel moves; 0 where it is negligible, and then nothing is changed.
+    """
+
+    def __init__(self, camera: PinholeCamera, coefficients: Sequence[float]):
+        self._maps: tuple[NDArray[Any], NDArray[Any]] | None = None
+        self.moved_px = 0.0
+        if not any(coefficients):
+            return
+        import cv2
+
+        K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+        size = camera.width, camera.height
+        columns, rows = cv2.initUndistortRectifyMap(K, np.array(coefficients), np.eye(3), K, size, cv2.CV_32FC1)
+        v, u = np.mgrid[: camera.height, : camera.width]
+        moved = float(np.hypot(columns - u, rows - v).max())
+        if not moved <= NEGLIGIBLE_PX:
+            self._maps, self.moved_px = (columns, rows), moved
+
+    def __call__(self, depth: Depth) -> Depth:
+        """Return the undistorted depth image (height, width), 0 where the distorted one showed nothing."""
+        if self._maps is None:
+            return depth
+        import cv2
+
+        return cast("Depth", cv2.remap(depth, *self._maps, cv2.INTER_NEAREST, borderValue=0))

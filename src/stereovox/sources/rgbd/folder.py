@@ -277,7 +277,7 @@ class DepthFolder(DepthSource, ABC):
         inside = self.folder if os.path.isdir(self.folder) else self.folder.parent
         found = next((path for path in (Path(text), inside / text) if os.path.exists(path)), None)
         if found is None:
-            raise SourceError(f"{text}: no such file, nor in {folder}; check the name")
+            raise SourceError(f"{text}: no such file, nor in {inside}; check the name")
         return found
 
 

@@ -91,7 +91,8 @@ def test_each_layout_is_recognised_by_one_kind_only(tmp_path):
     tum(tmp_path / "tum", ["1.0"], POSES)
     places = {"seven_scenes": str(tmp_path / "seven_scenes"), "tum": str(tmp_path / "tum"), "simulation": "sim:room"}
     for name, where in places.items():
-        assert [kind for kind in SOURCES if find("sources", SOURCES, kind).recognises(where)] == [name]
+        kinds = [kind for kind in SOURCES if find("sources", SOURCES, kind).recognises(where)]
+        assert [kind for kind in kinds if kind != "plain"] == [name]  # the last, for nearly any folder with depth
 
 
 def test_images_of_a_camera_pair_are_opened_through_the_pair(tmp_path):

@@ -27,8 +27,13 @@ from stereovox.sources.robots.robot import Robot
 SOURCES = {
     "pair": "stereovox.sources.pair:CameraPair",  # first: such a folder may hold groundtruth.txt as well
     "seven_scenes": "stereovox.sources.rgbd.seven_scenes:SevenScenes",
+    "icl_nuim": "stereovox.sources.rgbd.icl_nuim:IclNuim",  # before tum: it may hold groundtruth.txt as well
+    "icl_scene": "stereovox.sources.rgbd.icl_nuim:IclNuimScene",
+    "sun3d": "stereovox.sources.rgbd.sun3d:Sun3d",
     "tum": "stereovox.sources.rgbd.tum:TumRgbd",
     "rig": "stereovox.sources.rig:StereoRig",
+    "asl": "stereovox.sources.asl:AslRig",
+    "two_view": "stereovox.sources.two_view:TwoView",
     "kitti_raw": "stereovox.sources.kitti.raw:KittiRaw",
     "kitti_tracking": "stereovox.sources.kitti.tracking:KittiTracking",
     "kitti_odometry": "stereovox.sources.kitti.odometry:KittiOdometry",
@@ -42,6 +47,10 @@ SOURCES = {
     "colmap": "stereovox.sources.rgbd.colmap:Colmap",
     "tartanair": "stereovox.sources.rgbd.tartanair:TartanAir",
     "stray_scanner": "stereovox.sources.rgbd.stray_scanner:StrayScanner",
+    "sens": "stereovox.sources.rgbd.packed:SensFile",
+    "slambench": "stereovox.sources.rgbd.packed:SlambenchRaw",
+    "replica": "stereovox.sources.rgbd.replica:Replica",
+    "open3d": "stereovox.sources.rgbd.open3d:Open3DFolder",
     "plain": "stereovox.sources.rgbd.plain:DepthAndPoses",  # last: nearly any folder with depth images
 }
 """Asked in this order, then those of other packages (entry points in the group `stereovox.sources`)."""

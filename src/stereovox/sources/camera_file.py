@@ -29,6 +29,8 @@ KEYS = (*SIZES, *INTRINSICS, "baseline", "correction")
 CORRECTION = ("model", "coefficients", "provenance")
 MATRIX = "camera-intrinsics.txt"
 VGA = (640, 480)
+Standard = Intrinsics | Mapping[tuple[int, int], Intrinsics]
+"""Usual camera of a data set: of 640x480 images, or of each size (width, height)."""
 OTHER = "give the file of their own camera"
 
 
@@ -79,15 +81,15 @@ def find_camera(
     folders: Sequence[Path],
     size: tuple[int, int],
     baseline: float | None,
-    default: Intrinsics | None,
+    default: Standard | None,
     names: Sequence[str] = NAMES,
 ) -> FoundCamera:
     """Find the camera of images of (width, height) = `size`.
 
     The first file found counts: `camera.toml` (see `read_camera`) in the first of `folders`, the recording's own; then
-    the `names`, in the order of `folders`, each as `read_camera_numbers` reads it. Without one, 640x480 images get
-    `default`. `baseline` in metres applies where the file has none. Raises SourceError for a bad file, or where there
-    is none and the images have another size.
+    the `names`, in the order of `folders`, each as `read_camera_numbers` reads it. Without one, images get the
+    `default` of their size. `baseline` in metres applies where the file has none. Raises SourceError for a bad file, or
+    where there is none and the images have another size.
     """
     places = [folders[0] / FILE, *(folder / name for folder in folders for name in names)]
     found = [path for path in dict.fromkeys(places) if os.path.isfile(path)]  # Path.is_file may raise
@@ -98,14 +100,16 @@ def find_camera(
     if found:
         camera = camera_in(found[0], size, baseline)
         return camera._replace(notes=(*camera.notes, *ignored))
-    if size != VGA or default is None:
+    standard = default.get(size) if isinstance(default, Mapping) else default if size == VGA else None
+    if standard is None:
         raise SourceError(
             f"{folders[0] / MATRIX}: no such file, and {size[0]}x{size[1]} images have no standard calibration; "
             "write the 3x3 camera matrix into it, or add ?camera=FILE"
         )
-    numbers = " ".join(f"{n:g}" for n in default)
+    fx, fy, cx, cy = standard
+    numbers = f"{fx:g} {fy:g} {cx:g} {cy:g}"
     note = f"{folders[0]} has no {MATRIX}: assuming the data set's standard fx fy cx cy = {numbers}"
-    return FoundCamera(PinholeCamera(*size, *default, baseline), (note, *ignored))
+    return FoundCamera(PinholeCamera(*size, fx, abs(fy), cx, cy, baseline), (note, *ignored), mirrored=fy < 0)
 
 
 def camera_in(path: Path, size: tuple[int, int], baseline: float | None) -> FoundCamera:

@@ -21,6 +21,7 @@ JSON_NAMES = (
 )  # fmt: skip
 TEXT_NAMES = (
     "camera-intrinsics.txt", "calibration.txt", "intrinsics.txt", "intrinsic.txt", "intrinsics_depth.txt", "K.txt",
+    "intrinsics.K.txt", "intrinsic_depth.txt",
     "camera.txt", "cam_intrinsics.txt", "depth_intrinsics.txt", "intrinsic/intrinsic_depth.txt",
 )  # fmt: skip
 YAML_NAMES = ("camera.yaml", "camera.yml", "calibration.yaml", "calibration.yml", "camera_info.yaml", "intrinsics.yaml")
@@ -104,6 +105,10 @@ def _of_numbers(path: Path, numbers: Sequence[float]) -> CameraNumbers:
 
 def _four(path: Path, numbers: Sequence[float]) -> Intrinsics:
     if len(numbers) == 16 and list(numbers[12:]) == [0, 0, 0, 1]:
+        numbers = [numbers[k] for k in (0, 1, 2, 4, 5, 6, 8, 9, 10)]
+    if len(numbers) == 12 and list(numbers[9:]) == [0, 0, 1]:  # its last line twice
+        numbers = numbers[:9]
+    if len(numbers) == 12 and numbers[3] == numbers[7] == numbers[11] == 0:
         numbers = [numbers[k] for k in (0, 1, 2, 4, 5, 6, 8, 9, 10)]
     if len(numbers) == 4:
         fx, fy, cx, cy = numbers

@@ -129,7 +129,7 @@ def _second(first: int, count: int, pose: Callable[[int], Transform]) -> int | N
         except FrameRefused:
             continue
         if not turned <= TURNED:
-            break
+            continue
         if moved > farthest:
             best, farthest = number, moved
         if moved >= MOVED_M:

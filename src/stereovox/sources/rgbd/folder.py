@@ -19,13 +19,20 @@ from stereovox.frame import Frame
 from stereovox.se3 import Transform
 from stereovox.sources import parameters
 from stereovox.sources.base import DepthSource
-from stereovox.sources.camera_file import FoundCamera, camera_in, find_camera
+from stereovox.sources.camera_file import FoundCamera, Standard, camera_in, find_camera
 from stereovox.sources.images import file_names
-from stereovox.sources.intrinsics import NAMES, Intrinsics, metres_per_unit
+from stereovox.sources.intrinsics import NAMES, metres_per_unit
 from stereovox.sources.poses import Poses
 from stereovox.sources.rgbd.depth_files import SUFFIXES, Depth, common_depth_size, read_depth
 from stereovox.sources.rgbd.depth_unit import DepthUnit, find_unit, pairs_of, unit_words
-from stereovox.sources.rgbd.pose_files import ImagePoses, in_optical_axes, number_in, read_poses
+from stereovox.sources.rgbd.pose_files import (
+    ImagePoses,
+    image_numbers,
+    in_optical_axes,
+    in_order,
+    number_in,
+    read_poses,
+)
 from stereovox.sources.tracker import AXES
 from stereovox.sources.trajectory import ns_from_seconds
 
@@ -100,7 +107,7 @@ class DepthFolder(DepthSource, ABC):
     Attributes:
         depth_scale: Metres per unit of integer images, by convention; floats are metres.
         baseline: Metres between the eyes of the sensor, None if unknown.
-        intrinsics: fx, fy, cx, cy of 640x480 images without a file of the camera; None: there must be one.
+        intrinsics: fx, fy, cx, cy of 640x480 images, or by size, without a file of the camera; None: there must be one.
         axes: Axes of the posed camera.
         fps: Images a second, where they have no times.
         calibrations: Names of files of the camera, in order of preference.
@@ -111,7 +118,7 @@ class DepthFolder(DepthSource, ABC):
 
     depth_scale: float = 0.001
     baseline: float | None = None
-    intrinsics: Intrinsics | None = None
+    intrinsics: Standard | None = None
     axes: str = "optical"
     fps: float = 30.0
     calibrations: tuple[str, ...] = NAMES
@@ -144,6 +151,17 @@ class DepthFolder(DepthSource, ABC):
         """Return the layout's poses; None: nothing is known, all are NaN."""
         return None
 
+    def numbers(self) -> list[int]:
+        """Return the numbers of the images, those in the names of their files; -1 where there is none."""
+        return [number_in(image.path.name)[0] for image in self._images]
+
+    def size(self) -> tuple[int, int]:
+        """Return (width, height) of the images; raises SourceError where none can be read."""
+        size = common_depth_size([image.path for image in self._images])
+        if isinstance(size, str):
+            raise SourceError(f"none of the {len(self)} depth images of {self.folder} can be read: {size}")
+        return size
+
     def find_camera(self, size: tuple[int, int]) -> FoundCamera:
         """Return the camera of images of (width, height) = `size`."""
         return find_camera([self.folder], size, self.baseline, self.intrinsics, self.calibrations)
@@ -169,10 +187,6 @@ class DepthFolder(DepthSource, ABC):
         plain = self.axes == "optical" and not self.options.invert
         return T if plain else in_optical_axes(T, self.axes, self.options.invert)
 
-    def image_size(self) -> tuple[int, int] | str:
-        """Return (width, height) of most images; where none is readable: what is wrong with the first."""
-        return common_depth_size([image.path for image in self._images])
-
     def camera_of(self, i: int) -> PinholeCamera:
         """Return the camera of frame `i` (0 to len - 1); a layout may have one for each image, of the same size."""
         return self.camera
@@ -197,22 +211,34 @@ class DepthFolder(DepthSource, ABC):
     def _read_poses(self) -> Poses | ImagePoses | None:
         if not self.options.poses:
             return self.read_poses()
-        found = read_poses(self._file(self.options.poses))
-        if isinstance(found, Poses):
+        return self.fitted(read_poses(self._file(self.options.poses)))
+
+    def fitted(self, found: Poses | ImagePoses) -> Poses | ImagePoses:
+        """Return poses as they belong to the images: by number, by time, or one for each in order.
+
+        Raises SourceError where there are too few or too many and neither numbers nor times say which is whose.
+        """
+        numbers, known = self.numbers(), image_numbers(found)
+        stamps = [image.stamp_ns for image in self._images]
+        invented = any(stamps == [int(n * SECOND / self.fps) for n in which] for which in (numbers, range(len(self))))
+        shifted = len(found) == len(self) and known is not None and set(known) != set(numbers)
+        poses = found if isinstance(found, ImagePoses) else in_order(found)
+        if invented and known is not None and not shifted and 2 * len(set(known) & set(numbers)) >= len(self):
+            return poses.of(numbers)
+        if isinstance(found, Poses) and not (invented and len(found) == len(self)):
             first, last = self._images[0].stamp_ns, self._images[-1].stamp_ns
             if found.stamps_ns[0] <= last and first <= found.stamps_ns[-1]:
+                if invented:
+                    self.notes += (f"images are taken to be {self.fps:g} a second; else give {self.folder}?fps=15",)
                 return found
-            found = ImagePoses(list(found.T_world_body), found.where)  # times of another clock
         if len(found) != len(self):
             raise SourceError(
                 f"{found.where}: holds {len(found)} poses for {len(self)} images of {self.folder}; give one for each"
             )
-        return found
+        return poses
 
     def _find_camera(self) -> FoundCamera:
-        size = self.image_size()
-        if isinstance(size, str):
-            raise SourceError(f"none of the {len(self)} depth images of {self.folder} can be read: {size}")
+        size = self.size()
         if self.options.camera:
             return camera_in(self._file(self.options.camera), size, self.baseline)
         return self.find_camera(size)
@@ -248,10 +274,10 @@ class DepthFolder(DepthSource, ABC):
 
     def _file(self, text: str) -> Path:
         """Return the file that an option names: as it stands, else inside the folder; raises SourceError."""
-        folder = self.folder.parent if os.path.isfile(self.folder) else self.folder
-        found = next((path for path in (Path(text), folder / text) if os.path.exists(path)), None)
+        inside = self.folder if os.path.isdir(self.folder) else self.folder.parent
+        found = next((path for path in (Path(text), inside / text) if os.path.exists(path)), None)
         if found is None:
-            raise SourceError(f"{text}: no such file, nor in {folder}; check the name")
+            raise SourceError(f"{text}: no such file, nor in {inside}; check the name")
         return found
 
 

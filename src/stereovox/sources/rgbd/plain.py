@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+import re
 from pathlib import Path
 
 from stereovox.errors import SourceError
@@ -13,18 +14,23 @@ from stereovox.sources.intrinsics import NAMES
 from stereovox.sources.poses import Poses
 from stereovox.sources.rgbd.depth_files import SUFFIXES, common_depth_size
 from stereovox.sources.rgbd.folder import DepthFolder, ImageFile, folder_part, image_pattern, images_in
-from stereovox.sources.rgbd.pose_files import ImagePoses, read_poses
+from stereovox.sources.rgbd.pose_files import ImagePoses, read_pose_folder, read_poses
 
 POSES = Part(
-    ("poses.txt", "trajectory.log", "trajectory.txt", "traj.txt", "pose.txt", "groundtruth.txt", "CameraTrajectory.txt",
-     "*.log", "poses", "pose"),
+    ("poses.txt", "trajectory.log", "trajectory.txt", "traj.txt", "traj_w_c.txt", "pose.txt", "groundtruth.txt",
+     "gt.txt", "*.freiburg", "CameraTrajectory.txt", "KeyFrameTrajectory.txt", "poses", "pose", "scene/trajectory.log",
+     "*_scene/trajectory.log", "*.log", "trajectory.json", "*truth*.txt", "*cam*pose*.txt", "*pose*.txt",
+     "*traj*.txt", "*poses*.npy"),
     "poses",
     "write poses.txt with lines 'stamp tx ty tz qx qy qz qw' or a 4x4 matrix for each image, or add ?poses=FILE",
 )  # fmt: skip
 DEPTH = Part(
-    tuple(f"{place}*{suffix}" for place in ("depth/", "depths/", "*depth*/", "*depth*", "") for suffix in SUFFIXES),
+    tuple(f"{place}{suffix}" for place in ("depth/*", "depths/*", "*depth*/*", "results/*depth*", "*depth*", "*")
+          for suffix in SUFFIXES),
     "depth images",
-)
+)  # fmt: skip
+POSE_FILE = r".*pose.*\d.*\.txt|.*\d.*pose.*\.txt"
+"""A file with the pose of one image, beside it."""
 
 
 class DepthAndPoses(DepthFolder):
@@ -45,8 +51,29 @@ class DepthAndPoses(DepthFolder):
         return images_in(folder, pattern, self.fps)
 
     def read_poses(self) -> Poses | ImagePoses | None:
-        """Return the poses beside the images."""
-        return poses_beside(self.folder, POSES, len(self))
+        """Return the poses beside the images: of the first file or folder that holds as many as there are images."""
+        found, error = [], None
+        for path in self.pose_places():
+            try:
+                found.append(
+                    self.fitted(read_pose_folder(path, POSE_FILE) if path == self.folder else read_poses(path))
+                )
+                break
+            except SourceError as refused:
+                error = error or refused
+        if not found:
+            raise error or SourceError(f"{self.folder}: has depth images but no poses; {POSES.cure}")
+        if len(self.pose_places()) > 1:
+            self.notes += (f"poses are those of {found[0].where}; else add ?poses=FILE",)
+        return found[0]
+
+    def pose_places(self) -> list[Path]:
+        """Return the files and folders that may hold the poses, the likely first; the folder itself: one file each."""
+        places = [path for pattern in POSES.patterns for path in sorted(self.folder.glob(pattern))]
+        single = [path for path in places if path.parent == self.folder and re.fullmatch(POSE_FILE, path.name)]
+        if len(single) > 1:
+            places = [self.folder, *(path for path in places if path not in single)]
+        return list(dict.fromkeys(places))
 
     def find_camera(self, size: tuple[int, int]) -> FoundCamera:
         """Return the camera from the folder, or the one above."""
@@ -86,7 +113,7 @@ def has_depth(folder: str) -> bool:
         return False
     place, pattern = image_place(Path(folder))
     images = images_in(place, pattern, 1.0)
-    named = "depth" in f"{place.name} {images[0].path.name}".lower() if images else False
+    named = bool(images) and "depth" in f"{place.name} {images[0].path.name}".lower()
     return named or (bool(images) and not isinstance(common_depth_size([images[0].path]), str))
 
 
@@ -95,22 +122,10 @@ def image_place(folder: Path) -> tuple[Path, str]:
     for pattern in DEPTH.patterns:
         found = next(iter(sorted(folder.glob(pattern))), None)
         if found is not None:
-            named = found.parent == folder and "depth" in found.name.lower()
-            return found.parent, (r"[^.].*depth.*|depth.*" if named else image_pattern((found.suffix,)))
+            named = "depth" not in found.parent.name.lower() or found.parent == folder
+            suffix = re.escape(found.suffix)
+            named = named and "depth" in found.name.lower()
+            return found.parent, (
+                rf"[^.].*depth.*{suffix}|depth.*{suffix}" if named else image_pattern((found.suffix,))
+            )
     return folder, image_pattern()
-
-
-def poses_beside(folder: Path, part: Part, images: int) -> Poses | ImagePoses:
-    """Return the poses of the first file or folder of `part` in `folder`.
-
-    Raises SourceError where there is none, or one for each image but of another number.
-    """
-    path = next((path for pattern in part.patterns for path in sorted(folder.glob(pattern))), None)
-    if path is None:
-        raise SourceError(f"{folder}: has depth images but no poses; {part.cure}")
-    found = read_poses(path)
-    if isinstance(found, ImagePoses) and len(found) != images:
-        raise SourceError(
-            f"{path}: holds {len(found)} poses for {images} images; give one for each, or add ?poses=FILE"
-        )
-    return found

@@ -4,10 +4,13 @@
 | form | lines | who writes it |
 |---|---|---|
 | TUM | `stamp tx ty tz qx qy qz qw` | TUM RGB-D, ORB-SLAM, evo, most SLAM programs |
-| poses alone | `tx ty tz qx qy qz qw` | TartanAir, small demos |
 | KITTI | 12 numbers, a 3x4 matrix row by row | KITTI, kiss-icp |
 | matrices | 16 numbers a line, or 4x4 matrices below each other | Replica, NICE-SLAM |
+| without times | `tx ty tz qx qy qz qw` | slambook, TartanAir |
+| 3x4 below each other | three lines of four numbers for each | SUN3D |
 | log | `i i i`, then a 4x4 matrix | Redwood, Open3D |
+| JSON | a PinholeCameraTrajectory (world to camera, which is inverted) | Open3D |
+| NumPy | `.npy` of (N, 4, 4), (N, 16), (N, 12) or (N, 7) numbers | scripts |
 | a folder | a file for each image, with 16 or 12 numbers or `tx ty tz qx qy qz qw` | ScanNet, 7-Scenes |
 
 All are T_world_camera (camera to world) in metres, unless the options of a folder (`axes`, `invert`) say otherwise.
@@ -15,6 +18,7 @@ All are T_world_camera (camera to world) in metres, unless the options of a fold
 
 from __future__ import annotations
 
+import io
 import os
 import re
 from collections.abc import Sequence
@@ -23,45 +27,53 @@ from pathlib import Path
 import numpy as np
 
 from stereovox.errors import FrameRefused, SourceError
-from stereovox.safe_io import MAX_LIST, read_text
+from stereovox.safe_io import MAX_LIST, is_number, json_value, read_bounded, read_text
 from stereovox.se3 import Transform, from_quaternion, inverse
 from stereovox.sources.poses import Poses
 from stereovox.sources.tracker import AXES
 from stereovox.sources.trajectory import Trajectory
 
 FORMS = "TUM lines 'stamp tx ty tz qx qy qz qw', KITTI's 12 numbers a line, 4x4 matrices, or Open3D's .log"
-SUFFIXES = (".txt", ".log", ".csv", ".tum", ".kitti", ".pose", ".dat")
+SECOND = 1_000_000_000
+MAX_NUMBER = 10_000_000
+"""Whole stamps in seconds below this may be numbers of images; times since 1970 are larger."""
 
 
 class ImagePoses:
     """Poses of a camera, one for each image, in order.
 
     Args:
-        T_world_camera: For each image (4, 4) in metres, or what is wrong with it in one line.
+        T_world_camera: For each image (4, 4) in metres, or what is wrong with it in one line, or None without a pose.
         where: What they came from, for messages.
+        numbers: The number of the image that each is of; None where they only have an order.
 
     Raises:
         SourceError: Not one image has a pose.
     """
 
-    def __init__(self, T_world_camera: Sequence[Transform | str], where: str):
-        if all(isinstance(T, str) for T in T_world_camera):
+    def __init__(self, T_world_camera: Sequence[Transform | str | None], where: str, numbers: list[int] | None = None):
+        if all(T is None or isinstance(T, str) for T in T_world_camera):
             why = T_world_camera[0] if T_world_camera else "it is empty"
             raise SourceError(f"{where}: holds no pose that can be used ({why}); write {FORMS}")
         self._poses = list(T_world_camera)
-        self.where = where
+        self.where, self.numbers = where, numbers
 
     def __len__(self) -> int:
         return len(self._poses)
 
     def at(self, i: int) -> Transform:
         """Return T_world_camera (4, 4) of image `i`; raises FrameRefused `no_pose` or `bad_pose_file`."""
-        if not 0 <= i < len(self._poses):
+        found = self._poses[i] if 0 <= i < len(self._poses) else None
+        if found is None:
             raise FrameRefused("no_pose", f"{self.where}: has no pose for image {i}; leave it out or add one")
-        found = self._poses[i]
         if isinstance(found, str):
             raise FrameRefused("bad_pose_file", found)
         return found.copy()
+
+    def of(self, numbers: Sequence[int]) -> ImagePoses:
+        """Return the poses of images with these numbers, by the poses' own numbers; raises SourceError for no pose."""
+        known = dict(zip(self.numbers or range(len(self)), self._poses, strict=True))
+        return ImagePoses([known.get(number) for number in numbers], self.where)
 
 
 def read_poses(path: Path) -> Poses | ImagePoses:
@@ -77,17 +89,21 @@ def read_poses(path: Path) -> Poses | ImagePoses:
         SourceError: It cannot be read, is of no known form, or holds no usable pose.
     """
     if os.path.isdir(path):
-        return _read_folder(path)
+        return read_pose_folder(path)
+    if path.suffix.lower() in (".json", ".npy"):
+        return _of_json(path) if path.suffix.lower() == ".json" else _of_numpy(path)
     rows = _rows(path)
     widths = {len(row) for row in rows}
-    if widths <= {8, 9}:  # the ninth: a tracker's confidence
+    if widths and widths <= {8, 9}:  # the ninth: a tracker's confidence
         return Trajectory(path)
     if widths in ({7}, {12}, {16}):
         return ImagePoses([_matrix(row, f"{path}:{n}") for n, row in enumerate(rows, 1)], str(path))
-    if widths <= {3, 4} and len(rows) % 5 == 0 and all(len(row) == 3 for row in rows[::5]):
+    if widths and widths <= {3, 4} and len(rows) % 5 == 0 and all(len(row) == 3 for row in rows[::5]):
         return _stacked(path, [rows[k + 1 : k + 5] for k in range(0, len(rows), 5)])
-    if widths == {4} and len(rows) % 4 == 0:
+    if widths == {4} and len(rows) % 4 == 0 and all(row == [0, 0, 0, 1] for row in rows[3::4]):
         return _stacked(path, [rows[k : k + 4] for k in range(0, len(rows), 4)])
+    if widths == {4} and len(rows) % 3 == 0:
+        return _stacked(path, [rows[k : k + 3] for k in range(0, len(rows), 3)])
     many = ", ".join(map(str, sorted(widths)[:5])) or "no"
     raise SourceError(f"{path}: its lines have {many} numbers, which is no form of poses; write {FORMS}")
 
@@ -124,20 +140,78 @@ def number_in(name: str) -> tuple[int, str]:
     return (int(found[-1]) if found else -1), name
 
 
-def _read_folder(path: Path) -> ImagePoses:
+def image_numbers(poses: Poses | ImagePoses) -> list[int] | None:
+    """Return the numbers of the images that poses are of, None where they have none.
+
+    Stamps of whole seconds that are too small for a date are numbers (ICL-NUIM).
+    """
+    if isinstance(poses, ImagePoses):
+        return poses.numbers
+    stamps = poses.stamps_ns
+    if np.any(stamps % SECOND) or stamps[0] < 0 or stamps[-1] >= MAX_NUMBER * SECOND:
+        return None
+    return (stamps // SECOND).tolist()
+
+
+def in_order(poses: Poses) -> ImagePoses:
+    """Return poses over time as poses of images, in order of their times."""
+    faults = [None if np.isfinite(T).all() else f"{poses.where}: a pose cannot be used" for T in poses.T_world_body]
+    found = [T if fault is None else fault for T, fault in zip(poses.T_world_body, faults, strict=True)]
+    return ImagePoses(found, poses.where, image_numbers(poses))
+
+
+def read_pose_folder(path: Path, pattern: str = r".*\.(txt|pose)") -> ImagePoses:
+    """Read a folder with a file for each pose whose name matches a regular expression; raises SourceError."""
     try:
-        names = [name for name in os.listdir(path) if name.endswith(".txt")]
+        names = [name for name in os.listdir(path) if re.fullmatch(pattern, name, re.IGNORECASE)]
     except OSError as error:
         raise SourceError(f"{path}: {error.strerror}; give a folder you may read") from None
     if not names:
         raise SourceError(f"{path}: holds no .txt with a pose; write one file with a 4x4 matrix for each image")
-    found: list[Transform | str] = []
-    for name in sorted(names, key=number_in):
+    found: list[Transform | str | None] = []
+    names.sort(key=number_in)
+    for name in names:
         try:
             found.append(read_pose(path / name))
         except FrameRefused as refused:
             found.append(str(refused))
-    return ImagePoses(found, str(path))
+    numbers = [number_in(name)[0] for name in names]
+    unique = len(set(numbers)) == len(numbers) and numbers[0] >= 0
+    return ImagePoses(found, str(path), numbers if unique else None)
+
+
+def _of_json(path: Path) -> ImagePoses:
+    """Return the poses of Open3D's PinholeCameraTrajectory; matrices are column by column, world to camera."""
+    try:
+        table = json_value(read_text(path, MAX_LIST))
+    except (OSError, ValueError) as error:
+        raise SourceError(f"{path}: no JSON that can be read ({error}); write it again") from None
+    cameras = table.get("parameters") if isinstance(table, dict) else None
+    matrices = [_extrinsic(camera) for camera in cameras] if isinstance(cameras, list) else []
+    if not matrices or not all(matrices):
+        raise SourceError(f"{path}: no PinholeCameraTrajectory with an extrinsic for each image; write {FORMS}")
+    return ImagePoses([_inverted(np.reshape(matrix, (4, 4)).T, str(path)) for matrix in matrices], str(path))
+
+
+def _extrinsic(camera: object) -> list[float]:
+    """Return the 16 numbers of a camera's extrinsic; empty where it has none."""
+    found = camera.get("extrinsic") if isinstance(camera, dict) else None
+    right = isinstance(found, list) and len(found) == 16 and all(map(is_number, found))
+    return [float(number) for number in found] if right else []
+
+
+def _inverted(T: Transform, where: str) -> Transform | str:
+    return inverse(T) if np.isfinite(T).all() else f"{where}: a pose holds NaN or infinity; remove its image"
+
+
+def _of_numpy(path: Path) -> ImagePoses:
+    try:
+        numbers = np.load(io.BytesIO(read_bounded(path, MAX_LIST)), allow_pickle=False)
+        rows = np.asarray(numbers, float).reshape(len(numbers), -1)
+    except Exception as error:  # what a damaged file can raise in NumPy is not bounded
+        why = " ".join(str(error).split())[:100]
+        raise SourceError(f"{path}: no array of poses ({why}); save one of (N, 4, 4) numbers") from None
+    return ImagePoses([_matrix(row, f"{path}, pose {n}") for n, row in enumerate(rows.tolist())], str(path))
 
 
 def _rows(path: Path) -> list[list[float]]:
@@ -151,7 +225,8 @@ def _rows(path: Path) -> list[list[float]]:
         try:
             rows.append([float(word) for word in _plain(line)])
         except ValueError as error:
-            raise SourceError(f"{path}:{n}: {error}; correct or delete the line") from None
+            if n > 1:  # the first line may be a heading
+                raise SourceError(f"{path}:{n}: {error}; correct or delete the line") from None
     return [row for row in rows if row]
 
 

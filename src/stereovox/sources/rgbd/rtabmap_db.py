@@ -100,8 +100,12 @@ class RtabmapDatabase(DepthFolder):
         ]
         return ImagePoses(found, str(self.folder))
 
-    def image_size(self) -> tuple[int, int] | str:
-        """Return (width, height) of the images of one camera."""
+    def numbers(self) -> list[int]:
+        """Return the numbers of the nodes."""
+        return [node.id for node, _ in self._views]
+
+    def size(self) -> tuple[int, int]:
+        """Return (width, height) of the images of one camera; raises SourceError where none can be read."""
         found, fault = Counter[tuple[int, int]](), "there is no image"
         for i in np.unique(np.linspace(0, len(self) - 1, 5).astype(int)).tolist():
             try:
@@ -109,7 +113,9 @@ class RtabmapDatabase(DepthFolder):
                 found[depth.shape[1], depth.shape[0]] += 1
             except FrameRefused as refused:
                 fault = str(refused)
-        return found.most_common(1)[0][0] if found else fault
+        if not found:
+            raise SourceError(f"{self.folder}: no depth image can be read: {fault}")
+        return found.most_common(1)[0][0]
 
     def find_camera(self, size: tuple[int, int]) -> FoundCamera:
         """Return the camera of the first image."""

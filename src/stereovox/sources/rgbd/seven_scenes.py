@@ -1,21 +1,26 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Folders of Microsoft's 7-Scenes data set (Kinect v1), and of others that use its layout."""
+"""Folders of Microsoft's 7-Scenes data set (Kinect v1), and of others that use its layout (BundleFusion, 3RScan)."""
 
 from __future__ import annotations
 
 import os
 import re
+from pathlib import Path
 
 import numpy as np
 
+from stereovox.safe_io import read_text
 from stereovox.se3 import Transform
 from stereovox.sources.base import Part
 from stereovox.sources.camera_file import FoundCamera, find_camera
 from stereovox.sources.images import file_names
+from stereovox.sources.intrinsics import NAMES
 from stereovox.sources.rgbd.folder import SECOND, DepthFolder, ImageFile, folder_part
 from stereovox.sources.rgbd.pose_files import read_pose
 
-FILE = re.compile(r"frame-(\d+)\.(depth\.png|pose\.txt)")
+FILE = re.compile(r"frame-(\d+)\.(depth\.png|depth\.pgm|pose\.txt)")
+INFO = ("info.txt", "_info.txt")
+"""BundleFusion's and 3RScan's file with m_calibrationDepthIntrinsic and m_depthShift."""
 
 
 class SevenScenes(DepthFolder):
@@ -24,15 +29,16 @@ class SevenScenes(DepthFolder):
     World: exactly that of the pose files. In 7-Scenes it is the optical frame of the first camera of the scene's model:
     x right, y down, z forward, so z is NOT up. It is left so because ground truth and other results for these folders
     are in it; heights in a picture are therefore distances from that first camera.
-    Camera: `camera.toml` in the folder, else `camera-intrinsics.txt` there or one folder up; without them, 585 585 320
-    240 as the data set's authors state, for 640x480 only. Baseline 0.075 m (Kinect v1).
+    Camera: `camera.toml` in the folder, else `camera-intrinsics.txt` or another program's file there or one folder up,
+    also the `info.txt` of BundleFusion and 3RScan, which says the unit as well; without them, 585 585 320 240 as the
+    data set's authors state, for 640x480 only. Baseline 0.075 m (Kinect v1).
     Time: the files hold none; frame number / 30 Hz, rounded down to whole nanoseconds.
     Every number that has an image or a pose is a frame. Faults: those of `read_depth`, `no_pose` (no file),
     `bad_pose_file` (not 16 numbers).
     """
 
     layout = "a 7-Scenes folder (frame-*.depth.png with frame-*.pose.txt)"
-    parts = (Part(("frame-*.depth.png",), "depth images"), Part(("frame-*.pose.txt",), "poses"))
+    parts = (Part(("frame-*.depth.png", "frame-*.depth.pgm"), "depth images"), Part(("frame-*.pose.txt",), "poses"))
     depth_scale = 0.001
     baseline = 0.075
     intrinsics = (585.0, 585.0, 320.0, 240.0)
@@ -41,16 +47,19 @@ class SevenScenes(DepthFolder):
 
     def list_images(self) -> list[ImageFile]:
         """Return the image files in the order of their numbers, which all that have a pose or an image are in."""
-        numbers = {match[1] for name in file_names(self.folder) if (match := FILE.fullmatch(name))}
+        names = file_names(self.folder)
+        numbers = {match[1] for name in names if (match := FILE.fullmatch(name))}
+        suffix = "png" if any(name.endswith(".depth.png") for name in names) else "pgm"
         return [
-            ImageFile(self.folder / f"frame-{number}.depth.png", int(int(number) * SECOND / self.fps))
+            ImageFile(self.folder / f"frame-{number}.depth.{suffix}", int(int(number) * SECOND / self.fps))
             for number in sorted(numbers, key=int)
         ]
 
     def find_camera(self, size: tuple[int, int]) -> FoundCamera:
         """Return the camera from the folder or the one above."""
         folders = [self.folder, self.folder.resolve().parent]
-        return find_camera(folders, size, self.baseline, self.intrinsics, self.calibrations)
+        names = [name for name in INFO if any(_tells_camera(folder / name) for folder in folders)]
+        return find_camera(folders, size, self.baseline, self.intrinsics, (*names, *NAMES))
 
     @classmethod
     def recognises(cls, where: str) -> bool:
@@ -65,12 +74,20 @@ class SevenScenes(DepthFolder):
         """Return T_world_camera (4, 4) just as in the file; raises FrameRefused `no_pose` or `bad_pose_file`."""
         if self._poses is not None:
             return super().pose_in_file(i)
-        return read_pose(self._images[i].path.with_name(self._images[i].path.name.replace("depth.png", "pose.txt")))
+        path = self._images[i].path
+        return read_pose(path.with_name(re.sub(r"depth\.\w+$", "pose.txt", path.name)))
 
     @classmethod
     def depth_only(cls, where: str) -> SevenScenes:
         """Return the images without looking for poses: every pose is NaN."""
         return _Images(where)
+
+
+def _tells_camera(path: Path) -> bool:
+    try:
+        return os.path.isfile(path) and "m_calibrationDepthIntrinsic" in read_text(path, errors="replace")
+    except (OSError, ValueError):
+        return False
 
 
 class _Images(SevenScenes):

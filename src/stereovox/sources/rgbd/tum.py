@@ -3,14 +3,20 @@
 
 from __future__ import annotations
 
+import math
 import os
+import re
 from pathlib import Path
 
 from stereovox.errors import SourceError
 from stereovox.sources.base import Part
+from stereovox.sources.camera_file import FoundCamera, find_camera
 from stereovox.sources.images import file_names
+from stereovox.sources.intrinsics import NAMES
+from stereovox.sources.poses import Poses
 from stereovox.sources.rgbd.depth_files import SUFFIXES
 from stereovox.sources.rgbd.folder import DepthFolder, ImageFile, folder_part
+from stereovox.sources.rgbd.pose_files import ImagePoses
 from stereovox.sources.trajectory import (
     FORMAT,
     StampedLine,
@@ -22,14 +28,23 @@ from stereovox.sources.trajectory import (
 )
 
 LIST, IMAGES, POSES = "depth.txt", "depth", "groundtruth.txt"
+PAIRED = ("associations.txt", "association.txt", "associate.txt", "associated.txt", "rgbd_assoc.txt")
+"""Lists of colour and depth images with their times: `stamp file stamp file`."""
+OTHER_POSES = ("*truth*.txt", "CameraTrajectory.txt", "KeyFrameTrajectory.txt", "trajectory.txt", "poses.txt",
+               "pose.txt", "*cam*pose*.txt", "*traj*.txt")  # fmt: skip
+"""Other files of poses, most of SLAM programs, in order of preference; groundtruth.txt comes first."""
+BONN, BONN_INTRINSICS = "rgbd_bonn", (542.822841, 542.57687, 315.59352, 237.756098)
+"""Folders of the Bonn dynamic data set, and the camera of its page."""
 
 
 class StampedImages(DepthFolder):
     """`depth.txt` (lines `stamp file`), else all `depth/<stamp>.png`; 5000 per metre by convention. No poses.
 
-    Camera: `camera.toml`, else `camera-intrinsics.txt` (3x3), else `calibration.txt` (fx fy cx cy) in the folder. The
-    layout has no such file of its own; without one, 640x480 images get 525 525 319.5 239.5, which TUM recommends for
-    all its sequences because the depth is registered to the colour image with it. Baseline 0.075 m (Kinect v1, Xtion).
+    Without both, the depth images in `associations.txt` (lines `stamp file stamp file`).
+    Camera: `camera.toml`, else `camera-intrinsics.txt` (3x3), else `calibration.txt` (fx fy cx cy), else another
+    program's file, also the only YAML, in the folder. The layout has no such file of its own; without one, 640x480
+    images get 525 525 319.5 239.5, which TUM recommends for all its sequences because the depth is registered to the
+    colour image with it (folders `rgbd_bonn*`: the camera of that data set). Baseline 0.075 m (Kinect v1, Xtion).
     Images are in order of time, of several with one stamp the first counts; stamps are exact to the nanosecond.
     Faults: see `DepthFolder`. Raises SourceError with file and line for a bad depth.txt.
     """
@@ -42,7 +57,7 @@ class StampedImages(DepthFolder):
 
     def list_images(self) -> list[ImageFile]:
         """Return the image files in order of time, of several with one stamp the first."""
-        lines = _listed(self.folder) if os.path.isfile(self.folder / LIST) else _named(self.folder)
+        lines = _lines(self.folder)
         images = by_time(lines)
         if len(lines) > len(images):
             self.notes = (f"{self.folder}: left out {len(lines) - len(images)} images with a stamp used before",)
@@ -50,17 +65,26 @@ class StampedImages(DepthFolder):
             raise SourceError(f"{self.folder}: {LIST} and {IMAGES}/ name no image; give a folder that has some")
         return [ImageFile(self.folder / name, stamp_ns) for stamp_ns, name, _ in images]
 
+    def find_camera(self, size: tuple[int, int]) -> FoundCamera:
+        """Return the camera from the folder."""
+        yaml = [name for name in sorted(file_names(self.folder)) if name.endswith((".yaml", ".yml"))]
+        default = BONN_INTRINSICS if self.name.startswith(BONN) else self.intrinsics
+        names = (*NAMES, *(yaml if len(yaml) == 1 else ()))
+        return find_camera([self.folder], size, self.baseline, default, names)
+
     @classmethod
     def recognises(cls, where: str) -> bool:
         """Return whether `where` is a folder with a list of depth images or a folder of them."""
         folder = folder_part(where)
-        return os.path.isfile(os.path.join(folder, LIST)) or os.path.isdir(os.path.join(folder, IMAGES))
+        lists = any(os.path.isfile(os.path.join(folder, name)) for name in (LIST, *PAIRED))
+        return lists or os.path.isdir(os.path.join(folder, IMAGES))
 
 
 class TumRgbd(StampedImages):
     """Stamped images (see `StampedImages`) with `groundtruth.txt`, the poses of the optical frame.
 
-    World: that of groundtruth.txt (TUM's motion capture: z up).
+    Without it, where depth.txt or associations.txt lists the images or their names are times, those of a SLAM program
+    (`CameraTrajectory.txt` and the like), with a note. World: that of the poses (TUM's motion capture: z up).
     Pose: between the neighbours before and after the image's time, straight in position, even in turning; both must
     be less than 0.1 s away. Further faults: those of `Poses.at`.
     """
@@ -68,17 +92,28 @@ class TumRgbd(StampedImages):
     layout = "a TUM RGB-D folder (depth.txt or depth/*.png, with groundtruth.txt)"
     parts = (
         *StampedImages.parts,
-        Part((POSES,), "poses", f"write {POSES} with lines '{FORMAT}', or add ?poses=FILE (other forms too)"),
+        Part(
+            (POSES, *OTHER_POSES), "poses", f"write {POSES} with lines '{FORMAT}', or add ?poses=FILE (other forms too)"
+        ),
     )
 
-    def read_poses(self) -> Trajectory:
-        """Return the poses of groundtruth.txt."""
-        return Trajectory(self.folder / POSES)
+    def read_poses(self) -> Poses | ImagePoses:
+        """Return the poses of groundtruth.txt, else of a SLAM program."""
+        if os.path.isfile(self.folder / POSES):
+            return Trajectory(self.folder / POSES)
+        path = _other_poses(self.folder)
+        if path is None:
+            raise SourceError(f"{self.folder}: has no {POSES}; {self.parts[-1].cure}")
+        self.notes += (f"{self.folder} has no {POSES}: poses are those of {path.name}; else add ?poses=FILE",)
+        return self.fitted(Trajectory(path))
 
     @classmethod
     def recognises(cls, where: str) -> bool:
         """Return whether `where` is a folder that has poses, and a list of depth images or a folder of them."""
-        return super().recognises(where) and os.path.isfile(os.path.join(folder_part(where), POSES))
+        folder = folder_part(where)
+        if not super().recognises(where):
+            return False
+        return os.path.isfile(os.path.join(folder, POSES)) or (_is_stamped(Path(folder)) and _posed(where))
 
     @classmethod
     def depth_only(cls, where: str) -> StampedImages:
@@ -86,13 +121,74 @@ class TumRgbd(StampedImages):
         return StampedImages(where)
 
 
-def _listed(folder: Path) -> list[StampedLine]:
-    lines = stamped_lines(folder / LIST)
+def _posed(where: str) -> bool:
+    folder = folder_part(where)
+    return "poses=" in where[len(folder) :] or _other_poses(Path(folder)) is not None
+
+
+def _other_poses(folder: Path) -> Path | None:
+    """Return the file of a SLAM program whose lines look like stamped poses, None where there is none."""
+    paths = (path for pattern in OTHER_POSES for path in sorted(folder.glob(pattern)))
+    return next((path for path in paths if _is_trajectory(path)), None)
+
+
+def _is_trajectory(path: Path) -> bool:
+    try:
+        with path.open("rb") as file:
+            start = file.read(4096).decode(errors="replace").splitlines()
+        words = next((plain.split() for line in start if (plain := line.partition("#")[0].strip())), [])
+        return len(words) == 8 and all(math.isfinite(float(word)) for word in words)
+    except (OSError, ValueError):
+        return False
+
+
+def _is_stamped(folder: Path) -> bool:
+    """Return whether the images have times: in a list, or as their names."""
+    if any(os.path.isfile(folder / name) for name in (LIST, *PAIRED)):
+        return True
+    try:
+        names = sorted(name for name in os.listdir(folder / IMAGES) if name.lower().endswith(SUFFIXES))
+    except OSError:
+        return False
+    return bool(names) and re.fullmatch(r"\d+\.\d{3,}", os.path.splitext(names[0])[0]) is not None
+
+
+def _lines(folder: Path) -> list[StampedLine]:
+    paired = next((folder / name for name in PAIRED if os.path.isfile(folder / name)), None)
+    if os.path.isfile(folder / LIST):
+        return _listed(folder / LIST)
+    if paired is not None:
+        return _depth_of_pairs(paired)
+    return _named(folder)
+
+
+def _listed(path: Path) -> list[StampedLine]:
+    lines = stamped_lines(path)
     for _, name, where in lines:
         if not name:
             raise SourceError(f"{where}: needs 'stamp file'; correct or delete the line")
         inside(name, where)
     return lines
+
+
+def _depth_of_pairs(path: Path) -> list[StampedLine]:
+    """Return the depth images of lines `stamp file stamp file`: the column with `depth` in its names, else the second
+    of both.
+    """
+    lines = stamped_lines(path)
+    pairs = [(stamp_ns, rest.split(), where) for stamp_ns, rest, where in lines]
+    bad = next((where for _, words, where in pairs if len(words) != 3), None)
+    if bad:
+        raise SourceError(f"{bad}: needs 'stamp file stamp file'; correct or delete the line")
+    first = bool(pairs) and "depth" in pairs[0][1][0] and "depth" not in pairs[0][1][2]
+    found = []
+    for stamp_ns, (name, stamp, other), where in pairs:
+        try:
+            found.append((stamp_ns, name, where) if first else (ns_from_seconds(stamp), other, where))
+        except ValueError as error:
+            raise SourceError(f"{where}: {error}; correct or delete the line") from None
+        inside(found[-1][1], where)
+    return found
 
 
 def _named(folder: Path) -> list[StampedLine]:

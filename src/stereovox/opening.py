@@ -42,15 +42,15 @@ SOURCES = {
     "simulation": "stereovox.simulate.simulation:Simulation",
     "rtabmap_db": "stereovox.sources.rgbd.rtabmap_db:RtabmapDatabase",  # before bags, which may be SQLite files too
     "bag": "stereovox.sources.bags.recording:Bag",
+    "sens": "stereovox.sources.rgbd.packed:SensFile",
+    "slambench": "stereovox.sources.rgbd.packed:SlambenchRaw",
+    "replica": "stereovox.sources.rgbd.replica:Replica",
+    "open3d": "stereovox.sources.rgbd.open3d:Open3DFolder",
     "nerfstudio": "stereovox.sources.rgbd.nerfstudio:NerfTransforms",
     "rtabmap": "stereovox.sources.rgbd.rtabmap:RtabmapExport",
     "colmap": "stereovox.sources.rgbd.colmap:Colmap",
     "tartanair": "stereovox.sources.rgbd.tartanair:TartanAir",
     "stray_scanner": "stereovox.sources.rgbd.stray_scanner:StrayScanner",
-    "sens": "stereovox.sources.rgbd.packed:SensFile",
-    "slambench": "stereovox.sources.rgbd.packed:SlambenchRaw",
-    "replica": "stereovox.sources.rgbd.replica:Replica",
-    "open3d": "stereovox.sources.rgbd.open3d:Open3DFolder",
     "plain": "stereovox.sources.rgbd.plain:DepthAndPoses",  # last: nearly any folder with depth images
 }
 """Asked in this order, then those of other packages (entry points in the group `stereovox.sources`)."""

@@ -114,7 +114,7 @@ class RtabmapDatabase(DepthFolder):
             except FrameRefused as refused:
                 fault = str(refused)
         if not found:
-            raise SourceError(f"{self.folder}: no depth image can be read: {fault}")
+            raise SourceError(f"{self.folder}: none of its {len(self)} depth images can be read: {fault}")
         return found.most_common(1)[0][0]
 
     def find_camera(self, size: tuple[int, int]) -> FoundCamera:

@@ -4,10 +4,9 @@
 | form | lines | who writes it |
 |---|---|---|
 | TUM | `stamp tx ty tz qx qy qz qw` | TUM RGB-D, ORB-SLAM, evo, most SLAM programs |
-| poses alone | `tx ty tz qx qy qz qw` | TartanAir, small demos |
 | KITTI | 12 numbers, a 3x4 matrix row by row | KITTI, kiss-icp |
 | matrices | 16 numbers a line, or 4x4 matrices below each other | Replica, NICE-SLAM |
-| without times | `tx ty tz qx qy qz qw` | slambook |
+| without times | `tx ty tz qx qy qz qw` | slambook, TartanAir |
 | 3x4 below each other | three lines of four numbers for each | SUN3D |
 | log | `i i i`, then a 4x4 matrix | Redwood, Open3D |
 | JSON | a PinholeCameraTrajectory (world to camera, which is inverted) | Open3D |

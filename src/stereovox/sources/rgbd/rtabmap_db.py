@@ -100,6 +100,10 @@ class RtabmapDatabase(DepthFolder):
         ]
         return ImagePoses(found, str(self.folder))
 
+    def numbers(self) -> list[int]:
+        """Return the numbers of the nodes."""
+        return [node.id for node, _ in self._views]
+
     def size(self) -> tuple[int, int]:
         """Return (width, height) of the images of one camera; raises SourceError where none can be read."""
         found, fault = Counter[tuple[int, int]](), "there is no image"

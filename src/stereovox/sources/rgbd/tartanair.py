@@ -8,8 +8,7 @@ from stereovox.sources.base import Part
 from stereovox.sources.camera_file import FoundCamera, pinhole
 from stereovox.sources.poses import Poses
 from stereovox.sources.rgbd.folder import DepthFolder, ImageFile, folder_part, images_in
-from stereovox.sources.rgbd.plain import poses_beside
-from stereovox.sources.rgbd.pose_files import ImagePoses
+from stereovox.sources.rgbd.pose_files import ImagePoses, read_poses
 
 SIDES = ("left", "right", "lcam_front", "rcam_front")
 FOCAL = 320.0
@@ -44,7 +43,7 @@ class TartanAir(DepthFolder):
     def read_poses(self) -> Poses | ImagePoses:
         """Return the poses of the same eye."""
         side = self.image(0).path.parent.name.removeprefix("depth_")
-        return poses_beside(self.folder, Part((f"pose_{side}.txt",), "poses"), len(self))
+        return self.fitted(read_poses(self.folder / f"pose_{side}.txt"))
 
     def find_camera(self, size: tuple[int, int]) -> FoundCamera:
         """Return the camera in the folder, else that of the data set."""

@@ -20,7 +20,9 @@ def camera(frames=20, hz=30):
         time.sleep(1 / hz)
 
 
-mapper = sv.Mapper(voxel_size=0.1, deadline_ms=30)
+settings = {"voxel_size": 0.1, "deadline_ms": 30}
+sv.Mapper(**settings).add(next(camera()))  # loads the kernels, the first time ever compiles them, before time counts
+mapper = sv.Mapper(**settings)
 for frame in sv.Latest(camera(), waiting=2):  # a thread reads the camera; two frames wait, older ones are dropped
     report = mapper.add(frame)
     if report.refused:

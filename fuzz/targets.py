@@ -20,11 +20,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from made_asl import START, asl, poses_csv, sensor_text
 from made_bags import ros_bag
 from made_kitti import label, packet, pose_lines, raw_calibration, single_calibration
 from made_mcap import Message, Style, mcap
 from made_recordings import depth_image, write_png
-from made_rigs import recorded
+from made_rigs import FORWARD, eyes, recorded
 from made_robot_bags import START_NS, Messages, RobotBagMaker, planar_numbers
 from numcodecs import Zstd
 
@@ -35,8 +36,11 @@ from stereovox.evaluate.inputs import read_camera_path
 from stereovox.evaluate.trajectory import read_relations
 from stereovox.formats import export, read_octomap
 from stereovox.formats.bags import read_bag_grid, read_bag_map
+from stereovox.formats.clouds import read_cloud_map
 from stereovox.formats.map_server import read_map_server, write_map_server
-from stereovox.formats.read_points import read_npz, read_point_map
+from stereovox.formats.raised_floor import raised
+from stereovox.formats.read_points import read_npz
+from stereovox.formats.scan_graph import read_scan_graph
 from stereovox.maps import VoxelMap, load_map
 from stereovox.maps.grid_map import GridMap, load_grid
 from stereovox.maps.occupancy import OccupancyGrid
@@ -77,6 +81,44 @@ D2: !!opencv-matrix {rows: 1, cols: 5, dt: d, data: [-0.3, 0.1, 0., 0., 0.]}
 R: !!opencv-matrix {rows: 3, cols: 3, dt: d, data: [1., 0., 0., 0., 1., 0., 0., 0., 1.]}
 T: !!opencv-matrix {rows: 3, cols: 1, dt: d, data: [-0.12, 0., 0.]}
 imageSize: [640, 480]
+"""
+PLACE = "[1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]"
+OPENVINS = KALIBR.replace("T_cn_cnm1: [[1, 0, 0, -0.12]", "T_imu_cam: [[1, 0, 0, 0.12]").replace(
+    "cam1:", f"  T_imu_cam: {PLACE}\ncam1:"
+)
+ORB = f"""%YAML:1.0
+Camera.type: "KannalaBrandt8"
+Camera.width: 640
+Camera.height: 480
+Camera1.fx: 250.0
+Camera1.fy: 250.0
+Camera1.cx: 320.0
+Camera1.cy: 240.0
+Camera1.k1: 0.01
+Camera2.fx: 250.0
+Camera2.fy: 250.0
+Camera2.cx: 320.0
+Camera2.cy: 240.0
+Stereo.T_c1_c2: !!opencv-matrix
+   rows: 4
+   cols: 4
+   dt: f
+   data:{PLACE.replace("1, 0, 0, 0,", "1, 0, 0, 0.1,", 1)}
+"""
+LENS = "image_dimension: [640, 480], distortion_type: radialtangential, focal_length: [5, 5], principal_point: [3, 2]"
+OKVIS = f"""cameras:
+  - {{T_SC: {PLACE}, {LENS}}}
+  - {{T_SC: {PLACE.replace("1, 0, 0, 0,", "1, 0, 0, 0.1,", 1)}, {LENS}}}
+"""
+SENSOR = sensor_text(eyes().left, FORWARD, "equidistant")
+TRUTH = "state_groundtruth_estimate0/data.csv"
+TWO_VIEW = """cam0=[20 0 7.5; 0 20 5.5; 0 0 1]
+cam1=[20 0 8.5; 0 20 5.5; 0 0 1]
+doffs=1
+baseline=193.001
+width=16
+height=12
+ndisp=290
 """
 PROFILE = """voxel_size = 0.1
 max_range = 8.0
@@ -266,7 +308,7 @@ def bodies(folder: Path) -> list[bytes]:
 def read_yaml(data: bytes, folder: Path) -> None:
     (folder / "map.pgm").write_bytes(b"P5\n2 2\n255\n\0\xcd\xfe\xfe")
     (folder / "map.yaml").write_bytes(data)
-    read_map_server(folder / "map.yaml")
+    raised(read_map_server(folder / "map.yaml"), (0.0, 0.2))
 
 
 def read_picture(data: bytes, folder: Path) -> None:
@@ -311,6 +353,49 @@ def text_points(_: Path) -> list[bytes]:
     packed = b"\x1f" + columns  # a run of 32 bytes
     compressed = pcd.replace(b"ascii", b"binary_compressed") + struct.pack("<II", len(packed), len(columns)) + packed
     return [ply + rows, pcd + rows, compressed]
+
+
+ROWS = (
+    "x,y,z\n" + "".join(f"{k % 5}.5,{k // 5},0.25\n" for k in range(20)),
+    "// a comment\n3\n1 2 3 0 0\n4 5 6 0 0\n-7 8e1 9 0 0\n",
+    "i;Z;Y;X [m]\n1;2;3;4\n",
+)
+POSE = struct.pack("<i3di4dI", 3, 1, 0, 1, 4, 0.7, 0, 0, 0.7, 1)
+GRAPHS = (
+    "# scans\nNODE 0 0 1 0 0.1 0.2\n1 2 3\n 9\n2 1 0.5\nNODE 1 0 1 0 0 3\n1 1 1\n",
+    struct.pack("<II", 2, 2) + struct.pack("<i3d", 3, 1, 2, 3) * 2 + POSE
+    + struct.pack("<I", 1) + struct.pack("<i3d", 3, 2, 1, 0) + POSE
+    + struct.pack("<I", 0),
+)  # fmt: skip
+
+
+def surveys(ending: str, folder: Path) -> list[bytes]:
+    import laspy
+
+    steps = np.stack(np.meshgrid(np.arange(8.0), np.arange(6.0), [1.0]), axis=-1).reshape(-1, 3)
+    text = 'PROJCS["x",GEOGCS["y",UNIT["degree",0.017]],UNIT["foot",0.3048]]'
+    found = []
+    for version, kind in (("1.2", 3), ("1.4", 6)):
+        header = laspy.LasHeader(version=version, point_format=kind)
+        header.scales = [0.01] * 3
+        if kind == 6:
+            header.vlrs.append(laspy.vlrs.known.WktCoordinateSystemVlr(text))
+        made = laspy.LasData(header)
+        made.x, made.y, made.z = steps.T
+        made.write(str(folder / f"seed{ending}"))
+        found.append((folder / f"seed{ending}").read_bytes())
+    return found
+
+
+def read_survey(name: str, data: bytes, folder: Path) -> None:
+    file_target(name, lambda path: read_cloud_map(path, 0.5)).read(data, folder)
+
+
+def meshes(kind: str, _: Path) -> list[bytes]:
+    import trimesh
+
+    made = trimesh.creation.box((2.0, 1.0, 0.6)).export(file_type=kind)
+    return [made.encode() if isinstance(made, str) else made]
 
 
 # bags ---------------------------------------------------------------------------------------------------------------
@@ -459,6 +544,28 @@ def rigs(folder: Path) -> list[bytes]:
     return [(recorded(folder / "rig") / "rig.toml").read_bytes()]
 
 
+def read_asl(name: str, data: bytes, folder: Path) -> None:
+    """A folder `mav0`, one of whose lists is these bytes."""
+    if not (folder / "mav0").exists():
+        asl(folder)
+    (folder / "mav0" / name).write_bytes(data)
+    frames_of(open_source(folder))
+
+
+def read_sensors(path: Path) -> None:
+    """Two sensor.yaml, the first of which is given."""
+    path.with_name("right.yaml").write_text(sensor_text(eyes().right, FORWARD @ eyes().T_left_right, "equidistant"))
+    import_rig([path, path.with_name("right.yaml")])
+
+
+def read_two_view(data: bytes, folder: Path) -> None:
+    """A pair whose calib.txt is these bytes."""
+    for name in ("im0.png", "im1.png"):
+        write_png(folder / name, np.zeros((12, 16), np.uint8))
+    (folder / "calib.txt").write_bytes(data)
+    frames_of(open_source(folder))
+
+
 def raw_files(folder: Path) -> list[bytes]:
     raw_calibration(folder)
     return [(folder / "calib_cam_to_cam.txt").read_bytes()]
@@ -490,7 +597,11 @@ TARGETS: dict[str, Target] = {
     "camera": file_target("camera.toml", read_camera, CAMERA),
     "pair": file_target("pair.toml", read_pair, pair_text(PairSettings(T_tracker_camera=np.eye(4), baseline=0.05))),
     "rig": Target(rigs, read_rig_folder),
-    "calibration": file_target("calib.yaml", lambda path: import_rig([path]), KALIBR, OPENCV),
+    "calibration": file_target("calib.yaml", lambda path: import_rig([path]), KALIBR, OPENVINS, OPENCV, ORB, OKVIS),
+    "asl_sensor": file_target("sensor.yaml", read_sensors, SENSOR),
+    "asl_images": Target(lambda _: [f"#ns,file\n{START},{START}.png\n".encode()], partial(read_asl, "cam0/data.csv")),
+    "asl_poses": Target(lambda _: [poses_csv([START - 1, START + 1]).encode()], partial(read_asl, TRUTH)),
+    "two_view": Target(lambda _: [TWO_VIEW.encode()], read_two_view),
     "intrinsics": file_target("camera-intrinsics.txt", read_matrix, "20 0 7.5\n0 21 5.5\n0 0 1\n"),
     "images_list": Target(
         lambda _: [b"# list\n0.1 depth/0.1.png\n0.2 depth/0.2.png\n"], partial(read_list, "depth.txt")
@@ -521,14 +632,23 @@ TARGETS: dict[str, Target] = {
     ),
     "cells_settings": Target(settings, read_settings),
     "points_text": Target(
-        text_points, lambda data, folder: file_target("a", lambda path: read_point_map(path, 0.1)).read(data, folder)
+        text_points,
+        lambda data, folder: file_target("a.ply", lambda path: read_cloud_map(path, 0.1)).read(data, folder),
     ),
     "points_ply": Target(
-        partial(exported, ".ply"), lambda data, folder: file_target("a", read_point_map).read(data, folder)
+        partial(exported, ".ply"), lambda data, folder: file_target("a.ply", read_cloud_map).read(data, folder)
     ),
     "points_pcd": Target(
-        partial(exported, ".pcd"), lambda data, folder: file_target("a", read_point_map).read(data, folder)
+        partial(exported, ".pcd"), lambda data, folder: file_target("a.pcd", read_cloud_map).read(data, folder)
     ),
+    "points_rows": file_target("a.csv", read_cloud_map, *ROWS),
+    "points_las": Target(partial(surveys, ".las"), lambda data, folder: read_survey("a.las", data, folder)),
+    "points_laz": Target(partial(surveys, ".laz"), lambda data, folder: read_survey("a.laz", data, folder)),
+    "mesh_ply": Target(partial(meshes, "ply"), file_target("a.ply", lambda path: read_cloud_map(path, 0.2)).read),
+    "mesh_obj": Target(partial(meshes, "obj"), file_target("a.obj", lambda path: read_cloud_map(path, 0.2)).read),
+    "mesh_off": Target(partial(meshes, "off"), file_target("a.off", lambda path: read_cloud_map(path, 0.2)).read),
+    "mesh_stl": Target(partial(meshes, "stl"), file_target("a.stl", lambda path: read_cloud_map(path, 0.2)).read),
+    "scan_graph": file_target("a.graph", lambda path: read_scan_graph(path, 0.2), *GRAPHS),
     "map_yaml": file_target("map.yaml", lambda path: read_yaml(path.read_bytes(), path.parent), MAP_YAML),
     "map_picture": Target(pictures, read_picture),
     "bag_ros1": Target(ros1_bags, partial(read_bag, "a.bag")),

@@ -13,7 +13,7 @@ import pytest
 import stereovox as sv
 from stereovox import floor_run, run
 from stereovox.cli import main as command
-from stereovox.errors import MapFileError
+from stereovox.errors import MapFileError, MissingExtra
 from stereovox.formats.map_server import read_map_server
 from stereovox.mapper import GridMapper
 from stereovox.maps.grid_map import load_grid
@@ -72,12 +72,23 @@ def test_the_way_is_found_by_slam_or_in_a_map(tmp_path):
     settings = {"use": "lidar", "poses": tmp_path / "a.yaml", "notify": told.append}
     made = sv.map_floor(DRIVE, tmp_path / "b.yaml", **settings, start=(0, 0, 0))
     assert len(made.track.stamps_ns) == scans
-    assert told[0] == f"finding the robot's way in {tmp_path / 'a.yaml'}"
+    assert told[0] == f"localising the robot in {tmp_path / 'a.yaml'}"
     assert "of the beams end within" in told[-1]
     with pytest.raises(sv.StereovoxError, match=r"start 900, 0 m, 0 degrees: lies outside of the map"):
         sv.map_floor(DRIVE, tmp_path / "b.yaml", **settings, start=(900, 0, 0))
     with pytest.raises(sv.StereovoxError, match="three finite numbers"):
         sv.map_floor(DRIVE, tmp_path / "b.yaml", **settings, start=(1, 2))
+
+
+def test_without_gtsam_the_way_on_is_named(tmp_path, monkeypatch):
+    def closes_a_loop(*_):
+        raise MissingExtra("gtsam", "slam")
+
+    monkeypatch.setattr("stereovox.floor_run.slam_robot", closes_a_loop)
+    with pytest.raises(sv.StereovoxError, match=r"'stereovox\[slam\]'; or go on.*--poses odometry") as error:
+        sv.map_floor(DRIVE, tmp_path / "a.yaml", use="lidar")
+    assert len(str(error.value)) <= 300
+    assert sv.map_floor(DRIVE, tmp_path / "a.yaml", **LIDAR).map.frames
 
 
 @pytest.mark.usefixtures("obeys_signals")

@@ -103,6 +103,18 @@ def test_what_is_wrong_is_said_in_one_line_and_leaves_the_map(tmp_path):
         assert "another run" in str(other.exception())
 
 
+def test_a_run_says_which_map_it_replaces(tmp_path):
+    notes, out = [], tmp_path / "a.svox"
+    for frames in (":3", ":2"):
+        sv.map_recording(SOURCE, out, voxel_size=0.1, frames=frames, notify=notes.append)
+    (line,) = (note for note in notes if "replaces" in note)
+    assert line == f"note: {out} replaces the map of 3 frames made of '{sv.load_map(out).recording}' that is there"
+    sv.map_recording(SOURCE, out, voxel_size=0.1, frames=":4", resume=True, notify=notes.append)
+    assert sum("replaces" in note for note in notes) == 1
+    (out / "manifest.json").write_text("{")
+    assert run.replaces(out) == f"note: {out} replaces a damaged map that is there"
+
+
 def test_names_of_a_floors_map_are_refused_in_space(tmp_path):
     for name in ("a.yaml", "a.yml", "a.pgm", "a.PNG"):
         with pytest.raises(sv.StereovoxError, match=r"names a floor's map; end the name of a map in space in \.svox"):

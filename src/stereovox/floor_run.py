@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stereovox.config import Config, load_config
-from stereovox.errors import StereovoxError, did_you_mean
+from stereovox.errors import MissingExtra, StereovoxError, did_you_mean
 from stereovox.formats.map_server import MODES, read_map_server
 from stereovox.frame import Frame, Scan
 from stereovox.localize.robot_track import (
@@ -271,12 +271,15 @@ class FloorRun:
     def _slam(self, progress: Progress) -> Track:
         others = "others: poses (--poses) MAP.yaml to localise in a map, or odometry"
         self._notify(f"finding the robot's trajectory by SLAM; {others}")
-        found = slam_robot(self.robot, self.config, progress)
+        try:
+            found = slam_robot(self.robot, self.config, progress)
+        except MissingExtra as missing:
+            raise StereovoxError(f"{missing}; or go on without SLAM: poses odometry (--poses odometry)") from None
         self._notify_unless_empty(refused_line(found.refused))
         return found.track
 
     def _localise(self, floor: OccupancyGrid, progress: Progress) -> Track:
-        self._notify(f"finding the robot's way in {self._poses_from}")
+        self._notify(f"localising the robot in {self._poses_from}")
         track = localise_robot(self.robot, floor, self.config, self._start, progress)
         self._notify_unless_empty(refused_line(track.refused, track.first_refusal))
         self._notify_unless_empty(fit_of(self.robot, floor, track)[1])

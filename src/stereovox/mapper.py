@@ -160,6 +160,10 @@ class Mapper:
     def __repr__(self) -> str:
         return _summary(self)
 
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows: the map's picture and facts."""
+        return self.map._repr_html_(f"Mapper, profile '{self.config.profile}'")
+
     def health(self, now_ns: int | None = None) -> Health:
         """Return how current the map is.
 
@@ -249,6 +253,10 @@ class GridMapper:
 
     def __repr__(self) -> str:
         return _summary(self)
+
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows: the map's picture and facts."""
+        return self.map._repr_html_(f"GridMapper, profile '{self.config.profile}'")
 
     def health(self, now_ns: int | None = None) -> Health:
         """Return how current the map is.

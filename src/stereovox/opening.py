@@ -32,6 +32,8 @@ SOURCES = {
     "sun3d": "stereovox.sources.rgbd.sun3d:Sun3d",
     "tum": "stereovox.sources.rgbd.tum:TumRgbd",
     "rig": "stereovox.sources.rig:StereoRig",
+    "asl": "stereovox.sources.asl:AslRig",
+    "two_view": "stereovox.sources.two_view:TwoView",
     "kitti_raw": "stereovox.sources.kitti.raw:KittiRaw",
     "kitti_tracking": "stereovox.sources.kitti.tracking:KittiTracking",
     "kitti_odometry": "stereovox.sources.kitti.odometry:KittiOdometry",

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import signal
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from math import inf, isfinite
@@ -31,7 +31,12 @@ from stereovox.maps.grid_map import GridMap
 from stereovox.maps.lock import only_writer_in
 from stereovox.maps.store import check_target, is_map, read_manifest, remove_map, sweep
 from stereovox.opening import Stream
+from stereovox.products.floor_axes import upright_axes
+from stereovox.products.moved import level_transform
 from stereovox.safe_io import check_in_space
+from stereovox.sources.camera_file import with_camera
+from stereovox.sources.turned import Turned
+from stereovox.survey import survey
 from stereovox.trust.history import MAX_NAME_LENGTH
 
 SeenT = TypeVar("SeenT")
@@ -40,6 +45,8 @@ MapT = TypeVar("MapT", VoxelMap, GridMap)
 CHECKPOINT_S = 10.0
 REST = 25
 """Minimum pause between two saves, in durations of a save: saves take at most 4 % of a run."""
+SURVEYED = 10
+"""Frames of a recording that are read before it is mapped, for the settings that it suggests."""
 MAX_UNUSABLE = 100
 """Frames of a live camera that may be refused in a row at the start before the run gives up."""
 
@@ -75,6 +82,10 @@ class MapResult(Generic[MapT]):
     dropped: int = 0
     track: Track | None = None
 
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows: the map's picture and facts."""
+        return self.map._repr_html_(f"MapResult, saved in {self.out}")
+
     def summary(self) -> dict[str, Any]:
         """Summarise the run.
 
@@ -92,12 +103,16 @@ def map_recording(
     resume: bool = False,
     frames: str | None = None,
     camera: str | Path | None = None,
+    level: bool = False,
     checkpoint_s: float = CHECKPOINT_S,
     observers: Sequence[Observer] = (),
     notify: Callable[[str], None] = lambda line: None,
     **overrides: Any,
 ) -> MapResult[VoxelMap]:
     """Map a recording, a simulation or a live camera, and save the map at regular checkpoints.
+
+    Without a profile, what a quick look at a recording suggests is used and passed to `notify`: which way is up, the
+    range and the cell size (see `survey`). Settings given here come first.
 
     Args:
         source: As for `open_source`, a live camera (`realsense:`), or a `Stream` of your own.
@@ -106,6 +121,8 @@ def map_recording(
         resume: Continue the map at `out`; the frames it has already seen are skipped.
         frames: Python slice that selects frames: `"::4"`.
         camera: Camera file that replaces the recording's own.
+        level: Turn the recording's world so that z points up; the map is then level, but no longer in the
+            coordinates of the recording's poses.
         checkpoint_s: Seconds between two saves; 0: save only at the end.
         observers: Called after each frame.
         notify: Called with each line that a user should see: assumptions about the source, where a run resumes.
@@ -119,8 +136,8 @@ def map_recording(
             or no frame could be used.
         KeyboardInterrupt: Ctrl-C, SIGTERM or SIGHUP, raised between two frames after saving the map.
     """
-    settings = {"profile": profile, "resume": resume, "frames": frames, "camera": camera, "checkpoint_s": checkpoint_s}
-    with MapRun(source, out, **settings, notify=notify, **overrides) as run:
+    settings = {"profile": profile, "resume": resume, "frames": frames, "camera": camera, "level": level}
+    with MapRun(source, out, **settings, checkpoint_s=checkpoint_s, notify=notify, **overrides) as run:
         return run.finish(observers)
 
 
@@ -153,6 +170,7 @@ class MapRun:
         resume: bool = False,
         frames: str | None = None,
         camera: str | Path | None = None,
+        level: bool = False,
         checkpoint_s: float = CHECKPOINT_S,
         notify: Callable[[str], None] = lambda line: None,
         **overrides: Any,
@@ -161,7 +179,7 @@ class MapRun:
         self._source, self._frames, self._camera = source, frames, camera
         self._profile, self._resume, self._overrides = profile, resume, overrides
         self._notify, self._open = notify, ExitStack()
-        self._checkpoint_s = checkpoint_s
+        self._checkpoint_s, self._level = checkpoint_s, level
 
     def __enter__(self) -> MapRun:
         with ExitStack() as stack:
@@ -171,12 +189,15 @@ class MapRun:
                 raise StereovoxError(f"{self.out}: no map to go on with; start it without resume")
             stack.enter_context(only_writer_in(self.out))
             sweep(self.out)
-            self.source = self._open_source()
-            self.mapper = self._make_mapper()
+            saved = load_map(self.out) if self._resume else None
+            suggested, lines = self._prepare(saved)
+            self.mapper = self._make_mapper(saved, suggested)
             stack.callback(self.mapper.map.close)
             self._checkpoints = Checkpoints(lambda: self.mapper.map.save(self.out), self.out, self._checkpoint_s)
             self._check_recording()
-            for note in self.source.notes:
+            if not self._resume and is_map(self.out):
+                self._notify(replaces(self.out))
+            for note in (*self.source.notes, *lines):
                 self._notify(f"note: {note}")
             self._open = stack.pop_all()
         return self
@@ -212,23 +233,55 @@ class MapRun:
         length = self.source.length
         return None if length is None else max(length - frames_offered(self.mapper), 0)
 
-    def _open_source(self) -> Stream:
+    def _prepare(self, saved: VoxelMap | None) -> tuple[dict[str, Any], list[str]]:
+        """Open the source; return settings that it suggests, and lines about them. A levelled world is turned here."""
         source = self._source
         if isinstance(source, str | Path):
             source = opening.open_stream(str(source), self._frames)
-        if self._camera is None:
-            return source
-        from stereovox.sources.camera_file import with_camera
+        self.source = source if self._camera is None else with_camera(source, str(self._camera))
+        settings, lines = {}, []
+        if (
+            isinstance(self._source, str | Path)
+            and self._profile is None
+            and saved is None
+            and hasattr(source, "frame")
+        ):
+            settings, lines = survey(source, SURVEYED).settings(self._overrides)  # pyright: ignore[reportArgumentType]
+        direction = saved.config.levelled_from if saved else self._level_direction(settings)
+        if direction is not None:
+            self.source = Turned(self.source, level_transform(direction))
+            settings = {**settings, "up": "z", "up_direction": None, "levelled_from": direction}
+        return settings if saved is None else {}, lines
 
-        return with_camera(source, str(self._camera))
+    def _suggested(self, source: Stream) -> tuple[dict[str, Any], list[str]]:
+        """Return settings that a recording suggests where no profile chose them, and lines about them."""
+        named = isinstance(self._source, str | Path) and hasattr(source, "frame")  # a live camera cannot be looked at
+        if not named or (self._profile is not None and not self._level):
+            return {}, []
+        found = survey(source, SURVEYED)  # pyright: ignore[reportArgumentType]
+        return found.settings(self._overrides) if self._profile is None else found.up_settings(self._overrides)
 
-    def _make_mapper(self) -> Mapper:
-        saved = load_map(self.out) if self._resume else None
+    def _level_direction(self, settings: Mapping[str, Any]) -> tuple[float, float, float] | None:
+        """Return what is up in the recording's world, None where it is not to be levelled.
+
+        Raises StereovoxError where nobody says it.
+        """
+        if not self._level:
+            return None
+        chosen = {**settings, **self._overrides}
+        if "up" not in chosen:
+            raise StereovoxError("level: which way is up in this recording is not certain; say it: --set up=AXIS")
+        direction = chosen.get("up_direction")
+        if direction is None or "up" in self._overrides:
+            direction = tuple(upright_axes(chosen["up"])[2].tolist())
+        return direction
+
+    def _make_mapper(self, saved: VoxelMap | None, suggested: Mapping[str, Any]) -> Mapper:
         settings = self._profile
         if settings is None:
             settings = saved.config if saved else "default"
         tiles = self.out.parent / f".{self.out.name}-tiles"  # beside the map, not in a temporary folder in memory
-        return Mapper(settings, resume=saved, tiles=tiles, **self._overrides)
+        return Mapper(settings, resume=saved, tiles=tiles, **{**self._overrides, **suggested})
 
     def _check_recording(self) -> None:
         """Check that the map is of this recording: of another one, the first frames would be skipped."""
@@ -345,6 +398,16 @@ def _saved_from_start(voxel_map: VoxelMap, out: Path) -> Iterator[None]:
     finally:
         if new and is_map(out) and not read_manifest(out)["frames"]:
             remove_map(out)
+
+
+def replaces(out: Path) -> str:
+    """Return a line about the map at `out` that the first save of a new one will replace."""
+    try:
+        manifest = read_manifest(out)
+        made_of = f" made of '{one_line(str(manifest['recording']))}'" if manifest.get("recording") else ""
+        return f"note: {out} replaces the map of {manifest['frames']:,} frames{made_of} that is there"
+    except (MapFileError, KeyError, ValueError):
+        return f"note: {out} replaces a damaged map that is there"
 
 
 def first_refusal(reports: list[UpdateReport]) -> str:

@@ -89,7 +89,7 @@ def replacing(path: str | Path, error: type[StereovoxError] = MapFileError) -> I
         if target.is_dir():
             raise error(f"{path}: is a folder; name a file")
         if target.exists() and not target.is_file():
-            raise error(f"{path}: is no plain file, which could be replaced; name another")
+            raise error(f"{path}: is not a plain file, which could be replaced; name another")
         with temporary.open("xb") as file:
             yield file
             file.flush()

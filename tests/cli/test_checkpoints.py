@@ -237,8 +237,8 @@ def test_the_end_tells_what_was_refused_and_when_frames_were_believed_again(tmp_
     refused = told["refused"]["pose_jump"]
     assert f"{30 - refused} frames mapped, {refused} refused" in said
     assert f"  {refused} x pose_jump, first: " in said
-    assert "  1 x frames of 'camera' are believed again after pose_jump\n" in said
-    assert told["settled"] == {"frames of 'camera' are believed again after pose_jump": 1}
+    assert "  1 x frames of 'camera' are accepted again after pose_jump\n" in said
+    assert told["settled"] == {"frames of 'camera' are accepted again after pose_jump": 1}
 
 
 @pytest.mark.parametrize("resume", [False, True])

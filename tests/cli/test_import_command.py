@@ -50,7 +50,7 @@ def test_a_floor_there_and_back(capsys):
     ("words", "said"),
     [
         (["import", "none.bt", "m"], "none.bt: cannot be read"),
-        (["import", "floor.yaml", "m"], "floor.yaml: cannot import '.yaml'"),
+        (["import", "floor.yaml", "m"], "floor.yaml: is the map of a floor"),
         (["import", "room.ply", "m", "--voxel-size", "0"], "voxel_size"),
         (["import", "room.ply", "room.ply"], "room.ply"),
         (["import", "room.ply", "m", "--topic", "/a"], "--topic says nothing"),

@@ -82,8 +82,8 @@ def test_rectangles_cover_just_the_chosen_cells():
         (["--width-mm", "5"], "--width-mm 5: give 30 to 400"),
         (["--dpi", "1"], "--dpi 1: give 20 to 2400"),
         (["--view", "axis"], "--eye=X,Y,Z --toward=X,Y,Z"),
-        (["--view", "axis", "--eye=1,2"], "'1,2' is no point"),
-        (["--view", "axis", "--eye=1,2,nan", "--toward=1,2,3"], "'1,2,nan' is no point"),
+        (["--view", "axis", "--eye=1,2"], "'1,2' is not a point"),
+        (["--view", "axis", "--eye=1,2,nan", "--toward=1,2,3"], "'1,2,nan' is not a point"),
         (["--view", "axis", "--eye=1,2,3"], "needs both"),
         (["--view", "axes"], "did you mean 'axis'"),
         (["--view", "layer", "--at", "inf"], "layer at inf"),
@@ -109,3 +109,12 @@ def test_a_layer_outside_the_map_is_told(saved, tmp_path, capsys, up, at, said):
     assert main(["picture", str(saved), str(tmp_path / "map.png"), "--view", "layer", f"--up={up}", f"--at={at}"]) == 0
     err = capsys.readouterr().err
     assert f"outside the map ({said})" in err if said else "note:" not in err
+
+
+def test_a_dark_picture_has_a_dark_page(saved, tmp_path):
+    from PIL import Image
+
+    assert main(["picture", str(saved), str(tmp_path / "map.png"), "--dark"]) == 0
+    picture = np.asarray(Image.open(tmp_path / "map.png").convert("RGB"))
+    assert (picture[0, 0] < 40).all()
+    assert (picture > 200).all(axis=-1).mean() > 0.001

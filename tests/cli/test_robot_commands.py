@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from stereovox.cli import main
+from stereovox.cli.slam import _pace
 from stereovox.formats.map_server import read_map_server
 from stereovox.opening import open_robot
 from stereovox.sources.bags import open_bag
@@ -59,6 +60,21 @@ def test_slam_saves_map_and_way(bag, reference, tmp_path, capsys):
     assert result["position_rms_m"] < 0.1
     assert result["scans"] == len(way)
     np.testing.assert_array_equal(read_map_server(tmp_path / "again.yaml").cells, floor.cells)
+
+
+@pytest.mark.parametrize(
+    ("recorded", "seconds", "words"),
+    [
+        (0.0, 2.0, ""),
+        (0.05, 2.0, ""),
+        (1.0, 2.0, " (0.5 times"),
+        (9.0, 2.0, " (4.5 times"),
+        (274.0, 2.0, " (137 times"),
+    ],
+)
+def test_slam_says_its_pace_only_where_stamps_tell(recorded, seconds, words):
+    assert _pace(recorded, seconds, False).startswith(words)
+    assert bool(_pace(recorded, seconds, False)) == bool(words)
 
 
 def test_slam_scores_relations(tmp_path, capsys):
@@ -124,7 +140,7 @@ def test_grid_takes_both_kinds_of_readings(tmp_path, capsys):
 def test_going_on_localises_in_the_map_and_takes_its_cells(bag, reference, tmp_path, capsys):
     out = tmp_path / "more.yaml"
     _, said = run(capsys, "grid", bag, "--resume", reference, "--start=0,0,0", "--out", out, "--profile", "ist2019")
-    assert f"way in {reference}" in said
+    assert f"localising the robot in {reference}" in said
     assert read_map_server(out).resolution == read_map_server(reference).resolution
     assert "SLAM makes a frame of its own" in refused(
         capsys, "grid", bag, "--resume", reference, "--poses", "slam", "--out", out

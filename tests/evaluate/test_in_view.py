@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from stereovox.cameras.pinhole import PinholeCamera
-from stereovox.evaluate.cells import indices
-from stereovox.evaluate.lidar_truth import blocks_in, crossed_cells, project, view_volume
+from stereovox.evaluate.lidar_truth import blocks_in, project, view_volume
 from stereovox.frame import Viewpoint
 from stereovox.se3 import look_at
 
@@ -64,35 +63,3 @@ def test_project_knows_the_borders_of_the_image():
     np.testing.assert_array_equal(shown, [*(inside for *_, inside in edges), False, False])
     np.testing.assert_allclose(pixels[2], [39.49, 23.49])
     assert np.isnan(pixels[-2:]).all()
-
-
-def slowly_crossed(start: np.ndarray, stop: np.ndarray) -> set[tuple[int, ...]]:
-    """Cells of size 1 in which the ray has a piece: between any two of its crossings, look at the middle."""
-    at = [0.0, 1.0]
-    for axis in range(3):
-        low, high = sorted((start[axis], stop[axis]))
-        if high > low:
-            at += [
-                (face - start[axis]) / (stop[axis] - start[axis]) for face in range(int(np.ceil(low)), int(high) + 1)
-            ]
-    at = sorted(share for share in at if 0 <= share <= 1)
-    middles = [(a + b) / 2 for a, b in itertools.pairwise(at) if b - a > 1e-12]
-    return {tuple(int(c) for c in np.floor(start + share * (stop - start))) for share in middles}
-
-
-def test_rays_cross_what_the_slow_loop_says():
-    rng = np.random.default_rng(7)
-    origin, ends = rng.uniform(-2, 2, 3), rng.uniform(-9, 9, (60, 3))
-    ends[0] = origin + np.array([4, 0, 0])  # along an axis
-    ends[1] = origin + np.array([0, -3, 2])
-    ends[2] = origin + 0.01  # in the same cell, most likely
-    for end in ends:
-        found = {tuple(int(c) for c in cell) for cell in indices(crossed_cells(origin * 0.2, end[None] * 0.2, 0.2))}
-        assert found == slowly_crossed(origin, end)
-    together = indices(crossed_cells(origin, ends, 1.0))
-    expected = set().union(*(slowly_crossed(origin, end) for end in ends))
-    assert sorted(map(tuple, together.tolist())) == sorted(expected)
-
-
-def test_no_rays_cross_no_cells():
-    assert len(crossed_cells(np.zeros(3), np.empty((0, 3)), 0.1)) == 0

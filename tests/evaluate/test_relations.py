@@ -80,11 +80,11 @@ def test_stamps_are_exact(tmp_path):
 @pytest.mark.parametrize(
     ("lines", "complaint"),
     [
-        (("0 1 1 0 0 0 0",), "line 1 is no relation"),
-        (("0 1 1 0 0 0 0 0", "0 1 1 0 0 0 0 x"), "line 2 is no relation"),
-        (("0 1 nan 0 0 0 0 0",), "line 1 is no relation"),
-        (("0 1e99 1 0 0 0 0 0",), "line 1 is no relation"),
-        (("0 inf 1 0 0 0 0 0",), "line 1 is no relation"),
+        (("0 1 1 0 0 0 0",), "line 1 is not a relation"),
+        (("0 1 1 0 0 0 0 0", "0 1 1 0 0 0 0 x"), "line 2 is not a relation"),
+        (("0 1 nan 0 0 0 0 0",), "line 1 is not a relation"),
+        (("0 1e99 1 0 0 0 0 0",), "line 1 is not a relation"),
+        (("0 inf 1 0 0 0 0 0",), "line 1 is not a relation"),
         (("# nothing",), "holds no relation"),
     ],
 )

@@ -133,8 +133,8 @@ def test_the_numbers_are_json_and_hold_the_contract():
         ({"threshold": float("nan")}, "threshold nan"),
         ({"tolerance": -1}, "tolerance -1"),
         ({"tolerance": 21}, "tolerance 21"),
-        ({"path": [[0, 0]]}, "no list of points"),
-        ({"path": np.empty((0, 3))}, "no list of points"),
+        ({"path": [[0, 0]]}, "not a list of points"),
+        ({"path": np.empty((0, 3))}, "not a list of points"),
     ],
 )
 def test_numbers_out_of_range_are_named(settings, said):

@@ -241,7 +241,7 @@ def test_a_file_cut_anywhere(tmp_path, ending):
 @pytest.mark.parametrize(
     ("old", "new", "what"),
     [
-        (b"id OcTree", b"id ColorOcTree", "ColorOcTree"),
+        (b"id OcTree", b"id CountingOcTree", "CountingOcTree"),
         (b"id OcTree\n", b"", "tree type"),
         (b"res 0.1", b"res 0", "voxel_size"),
         (b"res 0.1", b"res nan", "voxel_size"),
@@ -309,3 +309,19 @@ def test_files_that_are_not_there(tmp_path):
         assert "\n" not in str(error.value)
     one_line(tmp_path / "noise.bt", np.random.default_rng(0).bytes(5000), "first line")
     one_line(tmp_path / "nothing.bt", b"", "first line")
+
+
+def test_the_cells_of_a_tree_with_colours(tmp_path):
+    """As ColorOcTreeNode.writeData has it: the value, three bytes of colour, then the byte of the children."""
+    export(room(), tmp_path / "a.ot")
+    head, _, body = (tmp_path / "a.ot").read_bytes().partition(b"data\n")
+    nodes = [body[k : k + 4] + b"\x10\x80\xff" + body[k + 4 : k + 5] for k in range(0, len(body), 5)]
+    coloured = head.replace(b"id OcTree", b"id ColorOcTree") + b"data\n" + b"".join(nodes)
+    (tmp_path / "b.ot").write_bytes(coloured)
+    for one, other in zip(
+        read_octomap(tmp_path / "a.ot").cells(), read_octomap(tmp_path / "b.ot").cells(), strict=True
+    ):
+        np.testing.assert_array_equal(one, other)
+    (tmp_path / "b.ot").write_bytes(coloured[:-3])
+    with pytest.raises(MapFileError, match="ends inside a node"):
+        read_octomap(tmp_path / "b.ot")

@@ -346,7 +346,7 @@ def test_a_file_is_replaced_whole_or_not_at_all(tmp_path):
         assert path.read_bytes() == (b"new" if done else b"old")
         assert "f.ply: cannot be written (No space" in failed or step == steps
         assert names(tmp_path) == ["f.ply"]
-    with pytest.raises(MapFileError, match="no plain file"), replacing("/dev/null"):
+    with pytest.raises(MapFileError, match="not a plain file"), replacing("/dev/null"):
         pass
 
 

@@ -207,6 +207,15 @@ def test_without_tf2_msgs_odometry_and_mounts_do(robot, monkeypatch, capfd):
     np.testing.assert_allclose(T_world_camera[:3, 2], [1, 0, 0], atol=1e-4)  # it looks ahead
 
 
+def test_without_tf2_msgs_and_any_other_pose_the_node_says_so_at_once(robot, monkeypatch):
+    monkeypatch.setattr("stereovox.ros.subscriptions.optional_message", lambda *_: None)
+    other = rclpy.create_node("no_poses")
+    with pytest.raises(StereovoxError, match=r"^no poses: tf2_msgs is not installed.*--odometry TOPIC") as error:
+        MapNode(other, Mapping(load_config(voxel_size=0.1)), Options(depth=(DEPTH,)), str)
+    assert len(str(error.value)) <= 300
+    other.destroy_node()
+
+
 def test_names_that_no_topic_has_end_in_one_line(robot):
     for options in (Options(depth=("a b",)), Options(depth=("",)), Options(depth=(DEPTH,), odometry=("1x",))):
         with pytest.raises(StereovoxError, match=r"^topic '.*': Invalid topic name.*[^:]$"):

@@ -92,7 +92,7 @@ def test_whatever_breaks_the_map_is_saved(monkeypatch, tmp_path, alone):
     monkeypatch.setattr(MapNode, "spin_once", breaks)
     monkeypatch.setattr("stereovox.ros.warm_up.warm_up", lambda config: None)
     with pytest.raises(RuntimeError, match="foresaw"):
-        main(["ros2", "--depth", DEPTH, "--out", str(tmp_path / "live.svox")])
+        main(["ros2", "--depth", DEPTH, "--odometry", "/odom", "--out", str(tmp_path / "live.svox")])
     assert load_map(tmp_path / "live.svox").frames == 1
 
 

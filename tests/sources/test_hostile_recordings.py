@@ -201,7 +201,7 @@ def test_a_log_with_times_beyond_all_bounds(tmp_path, stamp):
     assert len(log.scans) == 1
     assert len(log.damaged) == 1
     (tmp_path / "a.relations").write_text(f"{stamp} 2 0.1 0.2 0 0 0 0.1\n")
-    with pytest.raises(SourceError, match="line 1 is no relation"):
+    with pytest.raises(SourceError, match="line 1 is not a relation"):
         read_relations(tmp_path / "a.relations")
 
 

@@ -101,9 +101,67 @@ def test_numbers_are_no_times(tmp_path):
     assert len(open_source(tmp_path)) == 1, "one image may be taken at any time"
     write_png(tmp_path / "left" / "0000000008.png", picture(1, (32, 24)))
     with pytest.raises(
-        SourceError, match=r"left: .*millisecond .*; name them by time in ns or give an index"
+        SourceError, match=r"left: .*millisecond .*; name them by time in ns, give an index file, or add .fps="
     ) as caught:
         open_source(tmp_path)
     assert "\n" not in str(caught.value)
     (tmp_path / "left" / "0000000008.png").rename(tmp_path / "left" / "0001000007.png")
     assert [frame.stamp_ns for frame in open_source(tmp_path)] == [7, 1_000_007]
+
+
+def numbered(folder):
+    """Three images named by numbers, and their pair."""
+    write_rig(folder / "rig.toml", Rig((RigPair(left="left", right="right", camera=CAMERA, T_body_left=FORWARD),)))
+    for name in ("0007", "0008", "0010"):
+        write_png(folder / "left" / f"{name}.png", picture(1, (32, 24)))
+        write_png(folder / "right" / f"{name}.png", picture(2, (32, 24)))
+    return folder
+
+
+def test_numbered_images_have_times_by_fps_and_poses_of_any_form(tmp_path):
+    folder = numbered(tmp_path)
+    T = [np.eye(4) for _ in range(3)]
+    for i in range(3):
+        T[i][:3, 3] = i, 2, 3
+    (folder / "kitti.txt").write_text("".join(" ".join(f"{n:g}" for n in one[:3].ravel()) + "\n" for one in T))
+    text = "".join(
+        f"{i} {i} {i + 1}\n" + "\n".join(" ".join(map(str, row)) for row in one) + "\n" for i, one in enumerate(T)
+    )
+    (folder / "trajectory.log").write_text(text)
+    for name in ("kitti.txt", "trajectory.log"):
+        frames = list(open_source(f"{folder}?fps=20&poses={name}"))
+        assert [frame.stamp_ns for frame in frames] == [350_000_000, 400_000_000, 500_000_000]
+        for frame, one in zip(frames, T, strict=True):
+            np.testing.assert_allclose(frame.T_world_sensor, one @ FORWARD, atol=1e-9)
+    eye = open_source(f"{folder}?fps=20&poses=kitti.txt&axes=opengl").frame(1)
+    np.testing.assert_allclose(eye.T_world_sensor, T[1] @ np.diag([1.0, -1, -1, 1]), atol=1e-9)
+    inverted = open_source(f"{folder}?fps=20&poses=kitti.txt&axes=optical&invert=1").frame(1)
+    np.testing.assert_allclose(inverted.T_world_sensor[:3, 3], [-1, -2, -3], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ("fps=-2", "fps=-2 must be positive"),
+        ("axes=opengel", "axes=opengel is unknown.*opengl"),
+        ("fps=10&poses=none.txt", "none.txt: no such file, nor in"),
+        ("fps=10&poses=two.txt", "two.txt: holds 2 poses for 3 images; give one for each"),
+        ("fps=10&poses=late.txt", "late.txt: poses from 9.* to 9.*, images from 0.7.*: no time in common"),
+        ("speed=10", "unknown parameter 'speed'"),
+    ],
+)
+def test_options_that_cannot_be_used(tmp_path, options, said):
+    folder = numbered(tmp_path)
+    (folder / "two.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 2)
+    (folder / "late.txt").write_text("900 1 2 3 0 0 0 1\n901 1 2 3 0 0 0 1\n")
+    with pytest.raises(SourceError, match=said) as caught:
+        open_source(f"{folder}?{options}")
+    assert len(str(caught.value).replace(str(tmp_path), "")) < 250
+
+
+def test_images_of_both_eyes_without_a_rig_file(tmp_path):
+    (numbered(tmp_path) / "rig.toml").unlink()
+    with pytest.raises(
+        SourceError, match=r"has left images \(3\), right images \(3\) but no rig.toml; write it with: "
+    ):
+        open_source(tmp_path)

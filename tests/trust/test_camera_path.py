@@ -73,6 +73,8 @@ def test_a_map_remembers_where_its_camera_went(tmp_path):
     path = mapper.map.history.path
     assert np.allclose(path.poses("camera"), wanted, atol=1e-6)
     assert len(path.until(2 * 10**9)) == 3
+    np.testing.assert_allclose(mapper.map.path, np.array(wanted)[:, :3, 3], atol=1e-6)
+    assert sv.VoxelMap.from_cells(sv.load_config(), [[0, 0, 0]], [1.0]).path.shape == (0, 3)
     copy = mapper.map.history.copied().path
     copy.walk("camera", seen(9, 99.0))
     assert len(path.stops["camera"]) == 4

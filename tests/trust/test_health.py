@@ -115,7 +115,7 @@ def test_frames_looked_at_less_thoroughly_degrade_the_map(monkeypatch):
     assert mapper.add(frame()).way == "near"
     health = mapper.health()
     assert (health.state, health.reduced) == ("degraded", {"near": 1})
-    assert "1 of 2 frames looked at less thoroughly (1 x near)" in health.text
+    assert "1 of 2 frames mapped at reduced quality (1 x near)" in health.text
     assert mapper.map.history.ways == {"full": 1, "near": 1}
 
 

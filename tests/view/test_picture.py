@@ -7,8 +7,9 @@ from matplotlib.text import Text
 from stereovox.config import load_config
 from stereovox.errors import StereovoxError
 from stereovox.maps import State, VoxelMap
-from stereovox.view.drawn import ceiling, upright
-from stereovox.view.panels import STATE_COLOURS, round_length
+from stereovox.trust.camera_path import Seen
+from stereovox.view.drawn import camera_path, ceiling, upright
+from stereovox.view.panels import PATH_COLOUR, STATE_COLOURS, round_length
 from stereovox.view.picture import picture
 from stereovox.view.render import LIGHT, Direction, render
 from stereovox.view.views import draw_view
@@ -42,6 +43,47 @@ def test_a_picture_shows_all_states_and_heights(tmp_path):
     coloured = image[..., :3].max(-1) - image[..., :3].min(-1) > 0.25
     assert coloured.mean() > 0.05, "cells coloured by height"
     assert (image[..., :3] > 0.99).all(-1).mean() > 0.2, "a white page round them"
+
+
+def seen_from(*places, sensor="camera"):
+    """A room whose history says that cameras stood at these places."""
+    voxel_map = a_room()
+    for n, place in enumerate(places):
+        pose = np.column_stack([np.eye(3), place])
+        voxel_map.history.path.walk(sensor, Seen(n, tuple(pose.ravel().tolist())))
+    return voxel_map
+
+
+def lines_of(figure):
+    return [line.get_xydata() for line in figure.axes[0].lines if line.get_color() == PATH_COLOUR]
+
+
+def test_a_picture_shows_the_path_that_the_map_remembers():
+    places = [[0.5, 0.5, 1], [2, 1, 1], [3, 1, 1]]
+    figure = draw_view(seen_from(*places), "overview", "A room", "z")
+    wanted = np.array(places)[:, :2]
+    assert any(line.shape == (3, 2) and np.allclose(line, wanted, atol=1e-5) for line in lines_of(figure))
+    assert any("camera's path, 2.6 m" in text.get_text() for text in figure.texts)
+    plain = draw_view(a_room(), "overview", "A room", "z")
+    assert not lines_of(plain)
+    assert not any("path" in text.get_text() for text in plain.texts)
+
+
+def test_a_path_breaks_where_it_leaves_the_map_and_between_cameras():
+    voxel_map = seen_from([0.5, 0.5, 1], [1, 1, 1], [50, 1, 1], [2, 1, 1])
+    voxel_map.history.path.walk("other", Seen(9, tuple(np.column_stack([np.eye(3), [3, 1, 1]]).ravel().tolist())))
+    x = camera_path(voxel_map)[:, 0]
+    np.testing.assert_array_equal(x, [0.5, 1, np.nan, 2, np.nan, 3])
+    far = seen_from([50, 1, 1], [60, 1, 1])
+    assert len(far.path) == 2
+    assert not len(camera_path(far))
+
+
+def test_a_path_behind_cells_is_pale():
+    figure = draw_view(seen_from([1, 1, -0.1], [3, 1, -0.1]), "overview", "A room", "z")  # below the floor
+    strong = [line for line in figure.axes[0].lines if line.get_color() == PATH_COLOUR and not line.get_alpha()]
+    assert all(np.isnan(line.get_xydata()).all() or len(line.get_xydata()) == 1 for line in strong)
+    assert any(line.get_alpha() for line in figure.axes[0].lines if line.get_color() == PATH_COLOUR)
 
 
 @pytest.mark.parametrize("log_odds", [None, -1.5])

@@ -17,6 +17,7 @@ from stereovox.view.layer import upright_layer
 from stereovox.view.panels import PATH_COLOUR
 from stereovox.view.render import render
 from stereovox.view.scale import scale_of
+from stereovox.view.shading import Occlusion
 from stereovox.view.space import numbers
 from stereovox.view.viewpoint import field_of_view, viewpoint_at
 from stereovox.view.views import VIEWS, draw_view
@@ -88,7 +89,10 @@ def test_the_landscape_leaves_out_only_what_nobody_can_see():
     some = columns(heights)
     assert set(map(tuple, some.tolist())) < set(map(tuple, every.tolist()))
     paint = np.random.default_rng(2).uniform(size=(7, 9, 3))
-    pictures = [render(cells, paint[cells[:, 1], cells[:, 0]], 1.0, FROM, 300, 300) for cells in (some, every)]
+    pictures = [
+        render(cells, paint[cells[:, 1], cells[:, 0]], 1.0, FROM, 300, 300, Occlusion(cells, ()))
+        for cells in (some, every)
+    ]
     np.testing.assert_array_equal(pictures[0].image, pictures[1].image)
 
 

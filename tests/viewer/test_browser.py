@@ -118,9 +118,10 @@ def test_two_clicks_measure(page, viewer):
     viewer.measure.text.content = "ready"  # messages are taken in order: clicks count when this is there
     page.get_by_text("ready", exact=True).wait_for()
     middle = HIGH / 2 + 6  # not between two cells
-    page.mouse.click(WIDE / 2 - 60, middle)
+    centre = page.locator("canvas").first.bounding_box()["width"] / 2
+    page.mouse.click(centre - 60, middle)
     until(lambda: len(viewer.measure.picked) == 1)
-    page.mouse.click(WIDE / 2 - 160, middle)
+    page.mouse.click(centre - 160, middle)
     until(lambda: len(viewer.measure.picked) == 2)
     first, second = viewer.measure.picked
     assert first[1] == second[1] == pytest.approx(0.55)
@@ -146,6 +147,30 @@ def test_both_themes_can_be_read(page, viewer):
     for dark in (True, False):
         viewer.dark.value = dark
         until(lambda dark=dark: can_be_read(page, dark))
+
+
+def test_the_controls_stand_beside_the_map_and_leave_a_phone_most_of_its_screen(page, viewer):
+    canvas = page.locator("canvas").first
+    assert canvas.bounding_box()["width"] < page.get_by_text("colour", exact=True).first.bounding_box()["x"]
+    phone = page.context.browser.new_page(viewport={"width": 390, "height": 844})
+    try:
+        phone.goto(viewer.url)
+        name = phone.get_by_text("wall", exact=True).first
+        name.wait_for()
+        until(lambda: name.bounding_box()["y"] > 0.75 * 844)
+        assert phone.locator("canvas").first.bounding_box()["width"] == 390
+        far = as_seen(viewer, 390)
+        assert far > 1.5 * np.linalg.norm(np.subtract((1.9, -1.7, 0.8), (1.9, 0.5, 0.8)))
+    finally:
+        phone.close()
+
+
+def as_seen(viewer, width):
+    """Return the distance from a page of this width to what it looks at, once it stands where it should."""
+    (client,) = (one for one in viewer.server.get_clients().values() if one.camera.image_width == width)
+    stands = viewer._stand(client.camera.aspect)
+    until(lambda: np.linalg.norm(client.camera.position - stands) < 0.01)
+    return np.linalg.norm(client.camera.position - client.camera.look_at)
 
 
 def can_be_read(page, dark):

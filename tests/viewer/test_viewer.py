@@ -15,7 +15,7 @@ from stereovox.frame import Viewpoint
 from stereovox.maps import State
 from stereovox.view.scale import scale_of
 from stereovox.viewer.cameras import first_look, up_vector
-from stereovox.viewer.cells import CORNERS, FACES
+from stereovox.viewer.cells import CORNERS, FACES, linear, shaded
 from stereovox.viewer.layer import MAX_PX, layer_colours, sharp
 from stereovox.viewer.panel import colour_bar, plain, statistics
 from stereovox.viewer.viewer import open_viewer
@@ -163,7 +163,7 @@ def test_colours_may_tell_the_probability_or_the_age():
         viewer.cells.colour.value = "age"
         assert viewer.cells.label.startswith("seconds")
         assert len(np.unique(colours(), axis=0)) == 3
-        assert colours()[2].tolist() == [0x8A, 0x8F, 0x98]
+        assert colours()[2].tolist() == linear(np.array([0x8A, 0x8F, 0x98], np.uint8)).tolist()
 
 
 def test_another_map_takes_the_place_of_the_first(shown):
@@ -276,11 +276,22 @@ def test_statistics_count_what_is_there():
         assert line in text
 
 
+def test_cells_in_a_corner_are_darker_and_keep_their_hue():
+    floor = np.argwhere(np.ones((12, 12, 1)))
+    wall = np.argwhere(np.ones((1, 12, 12)))[:, [0, 1, 2]] + [12, 0, 0]
+    cells = np.concatenate([floor, wall]).astype(np.int32)
+    colours = shaded(cells, np.tile(np.array([200, 100, 50], np.uint8), (len(cells), 1))).astype(int)
+    beside, open_floor = (np.flatnonzero((cells == at).all(axis=1))[0] for at in ([11, 6, 0], [3, 6, 0]))
+    assert colours[open_floor].tolist() == [200, 100, 50]
+    assert colours[beside, 0] < 190
+    assert colours[beside, 0] == pytest.approx(2 * colours[beside, 1], abs=2)
+
+
 def test_the_legend_of_the_layer_ends_where_log_odds_end():
     scale = scale_of(box_map())
     bar = colour_bar(layer_colours(scale), "log-odds", (scale.lowest, scale.highest))
     row = bar[bar.shape[0] // 8].astype(int)
-    row = row[(row < 250).any(axis=1)][5:-5]
+    row = row[row[:, 3] == 255][5:-5, :3]
     colours, norm = scale.colours()
     for pixel, value in ((row[0], scale.lowest), (row[-1], scale.highest)):
         assert np.abs(pixel - 255 * np.array(colours(norm(value))[:3])).max() < 8

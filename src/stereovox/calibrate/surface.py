@@ -182,4 +182,4 @@ def _check(wall: Wall, surface: Array, plane: Array, share: float, name: str) ->
         )
     curved = np.abs(surface / plane - 1)[wall.on_wall].max()
     if curved > MAX_CURVED:
-        raise StereovoxError(f"{name}: the surface bends by {curved:.0%} of its depth: that is no flat wall")
+        raise StereovoxError(f"{name}: the surface bends by {curved:.0%} of its depth: that is not a flat wall")

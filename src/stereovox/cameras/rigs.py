@@ -41,7 +41,7 @@ class Eyes:
             raise StereovoxError(f"eyes: T_left_right is {np.shape(self.T_left_right)}; give a (4, 4) rigid motion")
         if rigidity_error(self.T_left_right) > 5e-3:
             raise StereovoxError(
-                "eyes: T_left_right is no rigid motion; give a rotation and metres, below them 0 0 0 1"
+                "eyes: T_left_right is not a rigid motion; give a rotation and metres, below them 0 0 0 1"
             )
         object.__setattr__(self, "T_left_right", orthonormalise(self.T_left_right))
         place = self.T_left_right[:3, 3]
@@ -206,5 +206,5 @@ def _usual(eyes: Eyes, axis: int, most: float) -> float:
 
 def _checked(angle_deg: float) -> float:
     if not 0 < angle_deg < 360:
-        raise StereovoxError(f"virtual camera: {angle_deg} deg is no field of view; give degrees above 0")
+        raise StereovoxError(f"virtual camera: {angle_deg} deg is not a field of view; give degrees above 0")
     return angle_deg

@@ -2,8 +2,9 @@
 """Convert a stereo calibration from another tool to a rig file.
 
 Supported: KITTI (calib_cam_to_cam.txt, or calib.txt with --size), ROS (camera_info yaml of the left and the right
-eye), OpenCV (yml with M1 D1 M2 D2 R T, or intrinsics.yml and extrinsics.yml) and Kalibr (camchain yaml, pinhole-radtan
-and pinhole-equi).
+eye), OpenCV (yml with M1 D1 M2 D2 R T, or intrinsics.yml and extrinsics.yml), Kalibr (camchain yaml, pinhole-radtan
+and pinhole-equi, also as OpenVINS writes it), EuRoC (cam0/sensor.yaml and cam1/sensor.yaml), and the settings of
+ORB-SLAM3, VINS-Fusion, OKVIS and Basalt (kb4).
 """
 
 from __future__ import annotations
@@ -44,12 +45,13 @@ def run(arguments: Namespace) -> dict[str, Any]:
     """Convert the calibration and print what it contains."""
     from stereovox.safe_io import replacing
     from stereovox.sources.calibration_files import import_rig
-    from stereovox.sources.rig_file import Virtual, rig_text
+    from stereovox.sources.rig_file import Virtual, rig_text, usual_virtual
 
     check_outputs(arguments.out)
     files = [Path(name) for name in arguments.files]
     rig = import_rig(files, image_size(arguments.size), arguments.lens, arguments.name)
-    virtual = tuple(replace(pair, virtual=Virtual(_model(pair.eyes, arguments.rectify))) for pair in rig.pairs)
+    wanted = Virtual(arguments.rectify) if arguments.rectify else None
+    virtual = tuple(replace(pair, virtual=wanted or usual_virtual(pair.eyes)) for pair in rig.pairs)
     rig = replace(rig, pairs=virtual)
     stereo = rig.stereo_pairs(Path(arguments.out).parent)
     remarks = (f"stereovox calibrate import {' '.join(path.name for path in files)}",)
@@ -77,7 +79,3 @@ def image_size(text: str | None) -> tuple[int, int] | None:
     if not (0 < width < 100_000 and 0 < height < 100_000):
         raise StereovoxError(f"--size {text}: write width x height in pixels, for example 640x480")
     return width, height
-
-
-def _model(eyes: Any, requested: str) -> str:
-    return requested or ("spherical" if eyes is not None and eyes.left.model == "fisheye" else "pinhole")

@@ -88,7 +88,7 @@ def region(text: str) -> tuple[float, ...]:
     except ValueError:
         numbers = ()
     if len(numbers) != 4 or not all(map(math.isfinite, numbers)):
-        raise ArgumentTypeError(f"'{text}' is no region; give X0,Y0,X1,Y1 in metres, two opposite corners")
+        raise ArgumentTypeError(f"'{text}' is not a region; give X0,Y0,X1,Y1 in metres, two opposite corners")
     return numbers
 
 

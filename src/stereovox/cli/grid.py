@@ -16,6 +16,7 @@ from stereovox.cli.options import add_checkpoint, overrides
 from stereovox.cli.robots import add_robot, picture_line, settings_of
 from stereovox.cli.terminal import (
     cells_line,
+    first_included,
     milliseconds,
     progress_of,
     progress_of_steps,
@@ -80,8 +81,9 @@ def run_floor(arguments: Namespace, **more: Any) -> dict[str, Any]:
 
 def _print_result(result: dict[str, Any], reports: list[UpdateReport], out: Path) -> None:
     say_refusals(result, reports, "readings")
-    say(f"a reading: scan {milliseconds(result['depth_ms'])}; map {milliseconds(result['integrate_ms'])}")
+    times = f"scan {milliseconds(result['depth_ms'])}; map {milliseconds(result['integrate_ms'])}"
+    say(f"per reading: {times}{first_included(result)}")
     say(cells_line(result))
     say(f"saved in {out.with_suffix('.yaml')}; look at it with: {picture_line(out)}")
     if not result["occupied"] and not result["free"]:
-        say("note: no cell is known yet: one look decides nothing; map more readings")
+        say("note: no cell is known yet: a single reading is too little evidence; map more")

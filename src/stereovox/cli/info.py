@@ -42,6 +42,8 @@ def _describe_cells(path: str) -> dict[str, Any]:
         "frames": voxel_map.frames,
         "frames_refused": voxel_map.frames_refused,
         "recording": voxel_map.recording,
+        "imported": None if voxel_map.history.imported is None else voxel_map.history.imported._asdict(),
+        "made_of": voxel_map.history.made_of(),
         "refused": dict(voxel_map.history.refused.most_common()),
         "settled": dict(voxel_map.history.settled),
         "ways": dict(voxel_map.history.ways),
@@ -66,17 +68,19 @@ DESCRIBE = {2: _describe_grid, 3: _describe_cells}
 def _print_result(result: dict[str, Any]) -> None:
     from stereovox.trust.health import FULL
 
-    settings = result["settings"]
-    say(f"made of {result['recording'] or 'frames without a name'}, profile {result['profile']}")
-    say(f"cells of {result['voxel_size']:g} m, {settings['integrator']}, depth up to {settings['max_range']:g} m")
-    if result["changed"]:
+    settings, of_frames = result["settings"], result["imported"] is None or result["frames"] > 0
+    say(result["made_of"] + (f", profile {result['profile']}" if of_frames else ""))
+    how = f", {settings['integrator']}, depth up to {settings['max_range']:g} m" if of_frames else ""
+    say(f"cells of {result['voxel_size']:g} m{how}")
+    if result["changed"] and of_frames:
         say(f"changed: {', '.join(f'{name} = {value}' for name, value in result['changed'].items())}")
     if result["bounds"]:
         (x0, y0, z0), (x1, y1, z1) = result["bounds"]
         say(f"from ({x0:g}, {y0:g}, {z0:g}) to ({x1:g}, {y1:g}, {z1:g}) m")
     say(", ".join(f"{thousands(result[state])} {state}" for state in ("occupied", "free", "tentative")))
     loaded = "in memory once loaded" + ("" if settings["window"]["size"] is None else ", whatever its window took")
-    say(f"{result['frames']} frames ({result['frames_refused']} refused), {size(result['memory_bytes'])} {loaded}")
+    frames = f"{result['frames']} frames ({result['frames_refused']} refused), " if of_frames else ""
+    say(f"{frames}{size(result['memory_bytes'])} {loaded}")
     for reason, number in result["refused"].items():
         say(f"  {number} x {reason}")
     for reason, number in result["settled"].items():

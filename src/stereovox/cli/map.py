@@ -17,6 +17,7 @@ from stereovox.cli.options import add_checkpoint, add_settings, check_ending, ov
 from stereovox.cli.terminal import (
     cells_line,
     command_line,
+    first_included,
     milliseconds,
     progress_of,
     say,
@@ -46,6 +47,9 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--max-range", type=float, metavar="M", help="largest depth in metres that is used")
     parser.add_argument("--frames", metavar="A:B:S", help="only these frames, as a Python slice")
     parser.add_argument("--camera", metavar="FILE", help="camera file (camera.toml) that replaces the recording's own")
+    parser.add_argument(
+        "--level", action="store_true", help="turn the recording's world so that z points up, for level layers"
+    )
     parser.add_argument("--threads", type=int, metavar="N", help="threads (1); the map does not depend on it")
     add_settings(parser, "sensor.model=andert")
     parser.add_argument(
@@ -80,7 +84,8 @@ def _map(arguments: Namespace, out: Path) -> dict[str, Any]:
 
     run = MapRun(
         arguments.source, out, profile=arguments.profile, resume=arguments.resume, frames=arguments.frames,
-        camera=arguments.camera, checkpoint_s=arguments.checkpoint, notify=say, **overrides(arguments),
+        camera=arguments.camera, level=arguments.level, checkpoint_s=arguments.checkpoint, notify=say,
+        **overrides(arguments),
     )  # fmt: skip
     with run, page_of(run.mapper, out.stem, arguments.view) as page:
         say_about_compiling()
@@ -105,8 +110,8 @@ def _grid(arguments: Namespace) -> dict[str, Any]:
     """Run `stereovox grid`, which has more options."""
     from stereovox.cli.grid import run_floor
 
-    for option in ("camera", "integrator", "threads", "view", "rerun"):
-        if getattr(arguments, option) is not None:
+    for option in ("camera", "integrator", "level", "threads", "view", "rerun"):
+        if getattr(arguments, option) not in (None, False):
             raise StereovoxError(f"--{option}: has no meaning for the map of a floor; leave it out")
     return run_floor(arguments)
 
@@ -121,7 +126,8 @@ def _print_result(result: dict[str, Any], reports: list[UpdateReport], out: Path
         say(f"reduced quality to meet the deadline: {', '.join(reduced)}")
     if result["match_ms"]["max"]:  # stereo pairs
         say(f"per pair: matching {milliseconds(result['match_ms'])}")
-    say(f"per frame: depth {milliseconds(result['depth_ms'])}; map {milliseconds(result['integrate_ms'])}")
+    times = f"depth {milliseconds(result['depth_ms'])}; map {milliseconds(result['integrate_ms'])}"
+    say(f"per frame: {times}{first_included(result)}")
     say(cells_line(result))
     if not result["occupied"]:
         say(f"note: {_why_empty(result, window)}")

@@ -65,6 +65,13 @@ def check_not_map_image(file: str, path: str) -> None:
         raise StereovoxError(f"{file}: holds the cells of the map {path}; give the picture another name")
 
 
+def check_new_floor(out: str, *inputs: str | Path) -> None:
+    """Raise StereovoxError where the picture or .yaml of a new floor map would overwrite one of its `inputs`."""
+    written = {os.path.realpath(Path(out).with_suffix(ending)) for ending in FLOOR_READABLE}
+    if written & {os.path.realpath(file) for file in inputs}:
+        raise StereovoxError(f"{out}: would overwrite what it is made of; give the new map another name")
+
+
 def describe_grid(path: str) -> dict[str, Any]:
     """Print what a floor map contains, and return it with the keys of a 3-D map where they apply."""
     from stereovox.maps import State

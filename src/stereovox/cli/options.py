@@ -41,7 +41,7 @@ def point(text: str) -> tuple[float, float, float]:
     except ValueError:
         x = y = z = math.nan
     if not math.isfinite(x + y + z):
-        raise ArgumentTypeError(f"'{text}' is no point; give X,Y,Z in metres")
+        raise ArgumentTypeError(f"'{text}' is not a point; give X,Y,Z in metres")
     return x, y, z
 
 
@@ -125,9 +125,9 @@ def overrides(arguments: Namespace) -> dict[str, Any]:
         if not equals or not key:
             raise StereovoxError(f"--set {setting}: write KEY=VALUE, for example --set sensor.p_free=0.3")
         if key.strip() in ("profile", "resume"):
-            raise StereovoxError(f"--set {setting}: this is no setting; use --{key.strip()}")
+            raise StereovoxError(f"--set {setting}: this is not a setting; use --{key.strip()}")
         if key.strip() in ("tiles", "self"):  # other names that `Mapper` knows
-            raise StereovoxError(f"--set {setting}: this is no setting; leave it out")
+            raise StereovoxError(f"--set {setting}: this is not a setting; leave it out")
         found[key.strip()] = parse_value(value.strip())
     named = {name: getattr(arguments, name, None) for name in OWN_OPTIONS}
     return {**found, **{name: value for name, value in named.items() if value is not None}}

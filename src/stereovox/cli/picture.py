@@ -39,6 +39,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         "--eye", type=point, metavar="X,Y,Z", help="position of the camera (default: that of the last frame)"
     )
     parser.add_argument("--toward", type=point, metavar="X,Y,Z", help="a point on its optical axis; goes with --eye")
+    parser.add_argument("--dark", action="store_true", help="a dark page, for dark slides and sites")
     parser.add_argument("--title", metavar="TEXT", help="title instead of the map's name")
     parser.add_argument("--dpi", type=float, metavar="N", help="dots an inch (120; with --width-mm 600)")
     parser.add_argument(
@@ -51,6 +52,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Load the map and write its picture."""
+    from stereovox.view.dark import darken
     from stereovox.view.figures import ENDINGS, save
 
     file = Path(arguments.file)
@@ -58,6 +60,8 @@ def run(arguments: Namespace) -> dict[str, Any]:
         raise StereovoxError(f"{file}: pictures are written as {', '.join(ENDINGS)}; name the file so")
     heading = _plain(arguments.title or Path(arguments.map).stem)
     drawn = DRAW[dimensions(arguments.map)](arguments, heading)
+    if arguments.dark:
+        darken(drawn)
     save(drawn, file, arguments.dpi)
     say(f"saved {file}")
     return {"picture": str(file)}
@@ -65,6 +69,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
 
 def _draw_cells(arguments: Namespace, heading: str) -> Any:
     """Return the figure of a 3-D map."""
+    from stereovox.products.moved import levelled
     from stereovox.view.drawn import checked_up
     from stereovox.view.paper import draw_paper
     from stereovox.view.viewpoint import viewpoint_at
@@ -73,6 +78,8 @@ def _draw_cells(arguments: Namespace, heading: str) -> Any:
     arguments.view = arguments.view or "overview"
     _check_options(arguments)
     voxel_map = open_cubes(arguments.map)
+    if arguments.up is None:
+        voxel_map = levelled(voxel_map)
     up = checked_up(arguments.up or voxel_map.config.up)
     viewpoint = viewpoint_at(voxel_map, arguments.eye, arguments.toward, up)
     if arguments.width_mm is None:

@@ -48,7 +48,7 @@ def _print_result(result: dict[str, Any]) -> None:
     failed = result["does_not_hold"]
     say(f"{result['holds']} claims hold, {len(failed)} do not, in {result['seconds']:.0f} s")
     if result["quick"] and failed:
-        say("these were few frames (--quick): what does not hold here may hold of the whole run")
+        say("only few frames were used (--quick): a claim that fails here may hold for the whole run")
     for text in failed:
         say(f"does not hold: {text}")
     for name, path in result["files"].items():

@@ -53,30 +53,38 @@ def _map(arguments: Namespace, out: Path) -> dict[str, Any]:
     if arguments.relations is not None:
         read_relations(Path(arguments.relations))  # raises for a bad file before the work
     robot = open_noting(arguments.source)
-    say_about_compiling()
+    compiling = say_about_compiling()
     start = perf_counter()
     with progress_of_steps("matching scans") as progress:
         found = slam_robot(robot, config, progress)
     seconds = perf_counter() - start
     write_map_server(found.grid, out)
     found.track.save(out.with_suffix(".tum"))
-    result = {**_print_result(robot, found, seconds), **_score(found, arguments.relations)}
-    say(f"saved in {out}, the way in {out.with_suffix('.tum')}; look at it with: {picture_line(out)}")
+    result = {**_print_result(robot, found, seconds, compiling), **_score(found, arguments.relations)}
+    say(f"saved in {out}, the trajectory in {out.with_suffix('.tum')}; look at it with: {picture_line(out)}")
     return result
 
 
-def _print_result(robot: Robot, found: SlamResult, seconds: float) -> dict[str, Any]:
+def _print_result(robot: Robot, found: SlamResult, seconds: float, compiling: bool) -> dict[str, Any]:
     from stereovox.localize.robot_track import refused_line
 
     track = found.track
     recorded = 1e-9 * float(track.stamps_ns[-1] - track.stamps_ns[0])
-    say(f"{len(track.stamps_ns)} scans, {found.closures} loops closed, in {seconds:.1f} s "
-        f"({recorded / seconds:.0f} times as fast as recorded)")  # fmt: skip
+    pace = _pace(recorded, seconds, compiling)
+    say(f"{len(track.stamps_ns)} scans, {found.closures} loops closed, in {seconds:.1f} s{pace}")
     if found.refused:
         say(refused_line(found.refused))
     scans = {"scans": len(track.stamps_ns), "scans_refused": sum(found.refused.values()), "refused": found.refused}
     times = {"closures": found.closures, "seconds": seconds, "recorded_s": recorded}
     return {**scans, **times, **print_trajectory_error(track, robot)}
+
+
+def _pace(recorded: float, seconds: float, compiling: bool) -> str:
+    """Say how much faster than the robot drove; nothing of a recording whose stamps stand still."""
+    times = recorded / seconds if seconds > 0 else 0.0
+    if times < 0.05:
+        return ""
+    return f" ({times:.{0 if times >= 10 else 1}f} times as fast as recorded{', compiling included' * compiling})"
 
 
 def _score(found: SlamResult, relations: str | None) -> dict[str, Any]:

@@ -24,8 +24,8 @@ def say(text: str = "") -> None:
     print("\n".join(map(one_line, text.split("\n"))), file=sys.stderr, flush=True)
 
 
-def say_about_compiling() -> None:
-    """Explain why the first run on a machine takes longer."""
+def say_about_compiling() -> bool:
+    """Explain why the first run on a machine takes longer; return whether this is one."""
     from stereovox._jit import cache_folder
 
     folder = cache_folder()
@@ -33,6 +33,9 @@ def say_about_compiling() -> None:
         say("no folder for compiled kernels can be written: they are compiled in every run (set STEREOVOX_CACHE)")
     elif not any(folder.rglob("*.nbi")):
         say("compiling the kernels, once on this machine: 20 to 40 seconds")
+    else:
+        return False
+    return True
 
 
 @contextmanager
@@ -95,6 +98,11 @@ class FrameProgress:
 def command_line(*words: object) -> str:
     """Return a stereovox command quoted for a shell."""
     return shlex.join(["stereovox", *map(str, words)])
+
+
+def first_included(result: dict[str, Any]) -> str:
+    """Return a remark on times in a summary where they are those of a single frame, the first; else nothing."""
+    return " (a single frame: loading or compiling the kernels included)" if result["frames"] == 1 else ""
 
 
 def milliseconds(figures: dict[str, float]) -> str:

@@ -7,6 +7,7 @@ A profile is a TOML file in `profiles/` or elsewhere; settings that it does not 
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
@@ -42,6 +43,8 @@ class Config(Section):
         min_range: Least depth along the optical axis that counts.
         max_range: Largest depth along the optical axis that counts.
         up: The axis of the world that points up (`z`, `-y`, ...); pictures and heights follow it.
+        up_direction: Unit vector that points up, where it lies between the axes; `up` is then the nearest axis.
+        levelled_from: Direction in the recording's world that is z in this map: `map --level` turned the poses by it.
         blind_range: Depth in metres up to which a camera clears nothing, since it sees nothing that near. Not set:
             0.3, but at most a tenth of max_range and at least min_range.
         integrator: `projective`, `ray`, `line`, or one that another package registers.
@@ -77,6 +80,8 @@ class Config(Section):
     max_range: float = Field(5.0, gt=0, le=1000)
     blind_range: float | None = Field(None, ge=0, le=1000)
     up: str = Field("z", pattern="^[+-]?[xyz]$")
+    up_direction: tuple[float, float, float] | None = None
+    levelled_from: tuple[float, float, float] | None = None
     integrator: str = "projective"
     threads: int = Field(1, ge=1, le=256)
     pose_rigidity_tolerance: float = Field(5e-3, gt=0, le=0.1)
@@ -119,6 +124,28 @@ class Config(Section):
         if self.blind_range is not None:
             return self.blind_range
         return min(max(self.min_range, BLIND_RANGE), max(self.min_range, 0.1 * self.max_range))
+
+    @property
+    def tilt(self) -> float:
+        """Angle in radians between the axis `up` and the direction that points up."""
+        if self.up_direction is None:
+            return 0.0
+        return math.acos(min(1.0, self._along_up()))
+
+    def _along_up(self) -> float:
+        """Return the part of `up_direction` along the axis `up`."""
+        x, y, z = self.up_direction or (0.0, 0.0, 0.0)
+        return {"x": x, "y": y, "z": z}[self.up[-1]] * (-1 if self.up.startswith("-") else 1)
+
+    @model_validator(mode="after")
+    def _upright(self) -> Config:
+        if self.up_direction is not None:
+            length = math.hypot(*self.up_direction)
+            if not abs(length - 1) < 0.01 or self._along_up() < 0.99 * max(map(abs, self.up_direction)):
+                raise ValueError(
+                    f"up_direction {list(self.up_direction)} must be a unit vector nearest to up {self.up}"
+                )
+        return self
 
     @model_validator(mode="after")
     def _ordered(self) -> Config:

@@ -71,7 +71,7 @@ def distances(points: NDArray[np.float64], path: ArrayLike) -> NDArray[np.float6
 
     positions = np.asarray(path, float)
     if positions.size == 0 or positions.shape[-1] != 3 or not np.isfinite(positions).all():
-        raise StereovoxError(f"a path of shape {positions.shape} is no list of points; give (P, 3) numbers in metres")
+        raise StereovoxError(f"a path of shape {positions.shape} is not a list of points; give (P, 3) metres")
     return KDTree(positions.reshape(-1, 3)).query(points)[0]
 
 

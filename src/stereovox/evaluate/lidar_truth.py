@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.config import Config, load_config
 from stereovox.errors import FrameRefused, SourceError, StereovoxError
-from stereovox.evaluate.cells import Keys, indices, keys
+from stereovox.evaluate.cells import indices, keys
 from stereovox.frame import Viewpoint
+from stereovox.integrate.crossing import crossed_cells
 from stereovox.maps import VoxelMap
 from stereovox.maps.blocks import SIDE, BlockPool
 from stereovox.opening import parse_slice
@@ -154,31 +155,6 @@ def _pieces(blocks: NDArray[np.int32]) -> Iterator[NDArray[np.int32]]:
     return (blocks[start : start + AT_ONCE] for start in range(0, len(blocks), AT_ONCE))
 
 
-def crossed_cells(origin: NDArray[np.float64], ends: NDArray[np.float64], voxel_size: float) -> Keys:
-    """Return the cells, as ascending unique keys, that the rays from `origin` (3,) to `ends` (N, 3) cross.
-
-    All in metres. The cells of the ends are included.
-    """
-    start, stop = origin / voxel_size, ends / voxel_size
-    cell = np.broadcast_to(np.floor(start), stop.shape).copy()
-    last, ray = np.floor(stop), stop - start
-    step = np.where(ray < 0, -1.0, 1.0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        per_cell = np.where(ray == 0, np.inf, 1 / np.abs(ray))  # share of the ray from one face to the next
-        next_face = np.where(ray == 0, np.inf, (cell + (step > 0) - start) / ray)
-    left = np.abs(last - cell).sum(axis=1).astype(int)  # a ray crosses as many faces as its cells are apart
-    found = [keys(last)]
-    while len(cell):
-        found.append(np.unique(keys(cell)))
-        going = left > 0
-        cell, next_face, per_cell, step, left = (a[going] for a in (cell, next_face, per_cell, step, left))
-        axis, row = np.argmin(next_face, axis=1), np.arange(len(cell))
-        cell[row, axis] += step[row, axis]
-        next_face[row, axis] += per_cell[row, axis]
-        left -= 1
-    return np.unique(np.concatenate(found))
-
-
 @dataclass
 class TruthCounts:
     """Counts of lidar points and of the resulting cells.
@@ -303,8 +279,7 @@ class _Truth:
             self._marks.values[places] |= np.where(cells, np.uint8(IN_VIEW), np.uint8(0))
         self._mark_cells(np.floor(points / size).astype(np.int64), HIT)
         if self.rays:
-            crossed = crossed_cells(scan.T_world_lidar[:3, 3], points, size)
-            self._mark_cells(indices(crossed).astype(np.int64), CROSSED)
+            self._mark_cells(crossed_cells(scan.T_world_lidar[:3, 3], points, size), CROSSED)
 
     def _mark_cells(self, cells: NDArray[np.int64], mark: int) -> None:
         blocks, of_cell = np.unique(keys(cells >> 3), return_inverse=True)

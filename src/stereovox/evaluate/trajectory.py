@@ -100,7 +100,7 @@ def _row(path: Path, number: int, line: str) -> tuple[int, int, float, float, fl
         if not np.isfinite([x, y, yaw]).all():
             raise ValueError
     except ValueError:
-        raise SourceError(f"{path}: line {number} is no relation (time1 time2 x y z roll pitch yaw)") from None
+        raise SourceError(f"{path}: line {number} is not a relation (time1 time2 x y z roll pitch yaw)") from None
     return first, second, x, y, yaw
 
 
@@ -174,7 +174,7 @@ def trajectory_error(track: Track, truth: Poses, align: bool = True, step_m: flo
     """
     true, known = true_poses(track.stamps_ns, truth)
     if not known.any():
-        raise StereovoxError(f"{truth.where}: knows no time of the track; give the truth of the same recording")
+        raise StereovoxError(f"{truth.where}: no time in common with the track; give the truth of the same recording")
     true, found = true[known], np.asarray(track.pose_map_base, float)[known]
     motion = best_motion(found, true) if align else np.zeros(3)
     moved = se2.compose(motion, found)

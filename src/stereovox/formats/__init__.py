@@ -3,30 +3,57 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from difflib import get_close_matches
 from pathlib import Path
 
 from stereovox import registry
-from stereovox.errors import StereovoxError
+from stereovox.errors import StereovoxError, did_you_mean
 from stereovox.formats.octomap import read_octomap
 from stereovox.maps import VoxelMap
 from stereovox.maps.cubes import in_cubes
+from stereovox.maps.store import is_map
+from stereovox.trust.history import Imported
 
+CLOUDS = (".ply", ".pcd", ".las", ".laz", ".xyz", ".csv", ".txt", ".asc", ".pts", ".bin", ".stl", ".obj", ".off")
+"""Endings of point clouds and meshes."""
+FLOORS = (".yaml", ".yml", ".pgm", ".png", ".bmp")
+"""Endings of 2-D maps that can be read."""
 IMPORTS = {
     ".bt": "stereovox.formats.octomap:read_octomap",
     ".ot": "stereovox.formats.octomap:read_octomap",
     ".npz": "stereovox.formats.read_points:read_npz",
-    ".ply": "stereovox.formats.read_points:read_point_map",
-    ".pcd": "stereovox.formats.read_points:read_point_map",
+    ".graph": "stereovox.formats.scan_graph:read_scan_graph",
+    **dict.fromkeys(CLOUDS, "stereovox.formats.clouds:read_cloud_map"),
+    **dict.fromkeys(FLOORS, "stereovox.formats.raised_floor:read_raised_floor"),
     ".bag": "stereovox.formats.bags:read_bag_map",
     ".mcap": "stereovox.formats.bags:read_bag_map",
     ".db3": "stereovox.formats.bags:read_bag_map",
 }
 """File ending -> reader `(path) -> VoxelMap`; other packages add theirs as entry points `stereovox.import`."""
 OPTIONS = {
-    "voxel_size": (".ply", ".pcd", ".bag", ".mcap", ".db3"),
+    "voxel_size": (*CLOUDS, ".graph", ".bag", ".mcap", ".db3"),
+    "unit": CLOUDS,
+    "origin": CLOUDS,
+    "heights": FLOORS,
     "topic": (".bag", ".mcap", ".db3"),
 }
 """Endings whose readers take these keyword arguments."""
+UNREADABLE = {
+    ".vdb": "no Python package reads OpenVDB grids here; write the centres of its active voxels as .xyz, one a line",
+    ".bonxai": "Bonxai's files have no reader in Python; write the cells of forEachCell as .xyz, x y z a line",
+    ".e57": "convert it, for example: pdal translate scan.e57 scan.laz",
+    ".pcap": "holds lidar packets; let the lidar's driver write a bag or .pcd",
+    ".svox": "is a map already; open it with stereovox info, picture or view",
+    ".pbstream": "is Cartographer's state; let cartographer_pbstream_to_ros_map write a .yaml",
+    ".drc": "is packed by Draco; convert it to .ply",
+    ".zip": "unpack it first",
+    ".gz": "unpack it first",
+    ".bz2": "unpack it first",
+}
+"""What to do with files that cannot be imported, by their ending."""
+LFS = b"version https://git-lfs"
+"""Beginning of what git leaves in place of a large file."""
 EXPORTS = {
     ".bt": "stereovox.formats.octomap:write_bt",
     ".ot": "stereovox.formats.octomap:write_ot",
@@ -49,7 +76,7 @@ FLAT = (".pgm", ".png", ".yaml")
 """Endings of 2-D maps, whose writers also take `heights` and `inflate`."""
 BAGS = (".bag", ".mcap", ".db3")
 """Endings of ROS recordings, with a 2-D map in them, whose writers also take `heights`."""
-__all__ = ["BAGS", "EXPORTS", "FLAT", "IMPORTS", "export", "import_map", "read_octomap"]
+__all__ = ["BAGS", "CLOUDS", "EXPORTS", "FLAT", "FLOORS", "IMPORTS", "export", "import_map", "read_octomap"]
 
 
 def export(
@@ -84,16 +111,31 @@ def export(
     write(voxel_map if ending in FLAT else in_cubes(voxel_map), path, **given)
 
 
-def import_map(path: str | Path, voxel_size: float | None = None, topic: str | None = None) -> VoxelMap:
+def import_map(
+    path: str | Path,
+    voxel_size: float | None = None,
+    topic: str | None = None,
+    *,
+    unit: str | None = None,
+    origin: Sequence[float] | None = None,
+    heights: tuple[float, float] | None = None,
+) -> VoxelMap:
     """Read a map from another program's file, or from one that `export` wrote.
 
-    `.bt`, `.ot`: OctoMap's cells. `.npz`: ours, exactly. `.ply`, `.pcd`: each cell that holds a point is occupied, all
-    others are unknown. `.bag`, `.mcap`, `.db3` or a rosbag2 folder: the last Octomap, or PointCloud2, of a topic.
+    `.bt`, `.ot`: OctoMap's cells. `.graph`: OctoMap's scans, with what they passed free. `.npz`: ours, exactly.
+    Point clouds and meshes (`CLOUDS`): each cell that holds a point or a piece of surface is occupied, all others are
+    unknown. `.bag`, `.mcap`, `.db3` or a rosbag2 folder: the last Octomap, or PointCloud2, of a topic. Floors
+    (`FLOORS`): their cells as columns between `heights`. What was decided for want of an option stands in the map's
+    `history.imported`.
 
     Args:
         path: File or rosbag2 folder.
-        voxel_size: Metres, for points from other programs; our own files declare it.
+        voxel_size: Metres, for points; None: one suggested by their density, or that in our own files.
         topic: Topic in a bag (see `bags.read_bag_map`).
+        unit: Unit of points: `m`, `cm`, `mm`, `ft` or `us-ft`; None: the file's own, else metres.
+        origin: (3,) point of the file, in metres, that becomes the map's origin; None: 0, or where points lie more than
+            10 km from it, a point among them.
+        heights: Lowest and highest metres to which a floor's map is raised.
 
     Returns:
         The map.
@@ -101,14 +143,41 @@ def import_map(path: str | Path, voxel_size: float | None = None, topic: str | N
     Raises:
         StereovoxError: What is wrong with the file, or an option that this kind of file does not take.
     """
-    ending = ".mcap" if Path(path).is_dir() else Path(path).suffix.lower()
+    ending = ".mcap" if Path(path).is_dir() and not is_map(path) else Path(path).suffix.lower()
     known = registry.names("import", IMPORTS)
     if ending not in known:
-        raise StereovoxError(f"{path}: cannot import '{ending}'; the file's name ends in one of {', '.join(known)}")
-    options = {"voxel_size": voxel_size, "topic": topic}
+        raise StereovoxError(f"{path}: {_cure(ending, known)}")
+    options = {"voxel_size": voxel_size, "topic": topic, "unit": unit, "origin": origin, "heights": heights}
     given = {name: value for name, value in options.items() if value is not None}
     for name in given:
         if ending not in OPTIONS[name]:
             option = f"--{name.replace('_', '-')}"
             raise StereovoxError(f"{path}: {option} says nothing about a '{ending}'; leave it out")
-    return registry.find("import", IMPORTS, ending)(path, **given)
+    _check_content(Path(path))
+    made = registry.find("import", IMPORTS, ending)(path, **given)
+    if made.history.imported is None:
+        made.history.imported = Imported(Path(path).name, ending[1:])
+    return made
+
+
+def _cure(ending: str, known: Sequence[str]) -> str:
+    if ending in UNREADABLE:
+        return UNREADABLE[ending]
+    if not ending:
+        return f"has no ending that tells what it is; rename it to one of {' '.join(sorted(known))}"
+    return (
+        f"cannot import '{ending}'{did_you_mean(ending, known) if get_close_matches(ending, known) else ''}; points as "
+        "text end in .xyz, clouds in .ply, .pcd or .las, OctoMap's files in .bt, .ot or .graph; "
+        "all kinds: stereovox import --help"
+    )
+
+
+def _check_content(path: Path) -> None:
+    """Raise StereovoxError where git left a pointer in place of a large file."""
+    try:
+        with path.open("rb") as file:
+            pointer = path.is_file() and file.read(len(LFS)) == LFS
+    except OSError:
+        return  # the reader says what is wrong
+    if pointer:
+        raise StereovoxError(f"{path}: is a pointer of git-lfs, not the file; fetch it with: git lfs pull")

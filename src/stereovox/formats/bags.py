@@ -10,8 +10,8 @@ from typing import TypeVar
 import numpy as np
 
 from stereovox.errors import ConfigError, FrameRefused, MapFileError, SourceError, StereovoxError
+from stereovox.formats.clouds import Cloud, map_of_cloud
 from stereovox.formats.octomap import BINARY_TITLE, TREE_TITLE, full_tree, map_of_nodes
-from stereovox.formats.read_points import cells_of_points
 from stereovox.maps import VoxelMap
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.products.floor_axes import upright_axes
@@ -79,8 +79,9 @@ def read_bag_map(path: str | Path, voxel_size: float | None = None, topic: str |
     """Return the map in the last Octomap of a bag's topic, cell for cell; or the cells that a PointCloud2 marks.
 
     topic: required where the bag has several Octomaps, and for a PointCloud2, whose points are used as world
-    coordinates. voxel_size: metres, for a PointCloud2 only. Raises MapFileError.
+    coordinates. voxel_size: metres, for a PointCloud2 only; None: one suggested. Raises MapFileError.
     """
+    path_name = Path(path).name
 
     def octomap_cells(wire: Wire) -> VoxelMap:
         if voxel_size is not None:
@@ -88,9 +89,9 @@ def read_bag_map(path: str | Path, voxel_size: float | None = None, topic: str |
         return _octomap_cells(wire)
 
     def cloud_cells(wire: Wire) -> VoxelMap:
-        if voxel_size is None:
-            raise ValueError("points do not tell how large cells should be; give --voxel-size in metres")
-        return cells_of_points(read_point_cloud(wire).points, voxel_size)
+        points = np.asarray(read_point_cloud(wire).points, np.float64).reshape(-1, 3)
+        cloud = Cloud(points, f"{POINT_CLOUD}, {len(points):,} points", metres=((1.0, 1.0, 1.0), "metres"))
+        return map_of_cloud(cloud, path_name, voxel_size, origin=(0.0, 0.0, 0.0))
 
     return _last(Path(path), topic, {OCTOMAP: octomap_cells, POINT_CLOUD: cloud_cells})
 
@@ -102,9 +103,8 @@ def read_bag_grid(path: str | Path, topic: str | None = None) -> OccupancyGrid:
 
 def _octomap_cells(wire: Wire) -> VoxelMap:
     message = read_octomap_message(wire)
-    if message.tree != "OcTree":
-        raise ValueError(f"its tree type is '{message.tree}', only OcTree can be read")
-    return map_of_nodes(BINARY_TITLE if message.binary else TREE_TITLE, message.data, message.resolution)
+    title = BINARY_TITLE if message.binary else TREE_TITLE
+    return map_of_nodes(title, message.data, message.resolution, tree=message.tree)
 
 
 def _last(path: Path, topic: str | None, readers: dict[str, Callable[[Wire], MapT]]) -> MapT:

@@ -49,11 +49,19 @@ def read_map_server(path: str | Path) -> OccupancyGrid:
     (map_server 1.17, image_loader.cpp. nav2_map_server scales by 100 and rounds, and negates no raw maps.)
     Raises MapFileError: one line with the file and what is wrong.
     """
-    metadata = read_metadata(_yaml_of(Path(path)))
+    metadata = metadata_of(path)
     cells = np.ascontiguousarray(_cells(read_picture(metadata.image), metadata)[::-1])
     if metadata.mode != "raw":
         return OccupancyGrid(cells, metadata.resolution, metadata.origin)
     return OccupancyGrid(cells, metadata.resolution, metadata.origin, metadata.free_thresh, metadata.occupied_thresh)
+
+
+def metadata_of(path: str | Path) -> Metadata:
+    """Return the contents of the .yaml `path`, or of that beside `path` where that is a picture.
+
+    Raises MapFileError for anything invalid.
+    """
+    return read_metadata(_yaml_of(Path(path)))
 
 
 def write_map_server(grid: OccupancyGrid, path: str | Path, mode: str = "trinary", negate: bool = False) -> None:

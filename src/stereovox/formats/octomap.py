@@ -22,6 +22,7 @@ from stereovox.maps import State, VoxelMap
 from stereovox.maps.evidence import Evidence, to_units
 from stereovox.safe_io import read_bounded, replacing
 from stereovox.threads import one_state
+from stereovox.trust.history import Imported
 
 DEPTH = 16
 """Levels below the root; a cell of the finest level has a 16-bit key on each axis."""
@@ -33,6 +34,10 @@ BINARY_TITLE = "# Octomap OcTree binary file"
 TREE_TITLE = "# Octomap OcTree file"
 TREE_NODE = np.dtype([("log_odds", "<f4"), ("children", "u1")])
 """One node of an `.ot` file; bit i of `children` says that child i exists."""
+COLOUR_NODE = np.dtype([("log_odds", "<f4"), ("colour", "u1", 3), ("children", "u1")])
+"""One node of a ColorOcTree; its colour is not read."""
+TREES = {"OcTree": TREE_NODE, "1": TREE_NODE, "OcTreeStamped": TREE_NODE, "ColorOcTree": COLOUR_NODE}
+"""Nodes of an `.ot` file by its tree type ("1" in files of OctoMap's first years); a `.bt` has the same for all."""
 MAX_BLOCKS = 2**18
 """Blocks of 8x8x8 cells a file may expand to (134 million cells); one node can claim 35 million million cells."""
 BLOCKS_OF_ANY, BLOCKS_A_LEAF = 2**16, 256
@@ -47,7 +52,7 @@ MAX_BYTES = 8 * MAX_NODES
 
 
 def read_octomap(path: str | Path) -> VoxelMap:
-    """Return the map in an OctoMap file of the tree type OcTree; pruned nodes become the cells they stand for.
+    """Return the map in an OctoMap file of one of the tree types `TREES`; pruned nodes become the cells they stand for.
 
     `.bt` cells get OctoMap's own clamping limits (log-odds -2 and 3.5). `.ot` cells keep their log-odds to the nearest
     thousandth, at most 30 either way; a log-odds of zero becomes 0.001, "just known". The map's settings are the
@@ -57,9 +62,11 @@ def read_octomap(path: str | Path) -> VoxelMap:
     content = _read(Path(path))
     try:
         title, header, body = _split(content)
-        return map_of_nodes(title, body, _voxel_size(header), _size(header))
+        made = map_of_nodes(title, body, _voxel_size(header), _size(header), _tree(header.get("id", "")))
     except (ValueError, ConfigError) as error:
         raise MapFileError(f"{path}: not a whole OctoMap file: {error}; export it again") from None
+    made.history.imported = Imported(Path(path).name, f"OctoMap, {_size(header):,} nodes")
+    return made
 
 
 def write_bt(voxel_map: VoxelMap, path: str | Path) -> None:
@@ -78,14 +85,15 @@ def write_ot(voxel_map: VoxelMap, path: str | Path) -> None:
     _write(path, TREE_TITLE, voxel_map, full_tree(voxel_map))
 
 
-def map_of_nodes(title: str, body: bytes, voxel_size: float, size: int | None = None) -> VoxelMap:
+def map_of_nodes(title: str, body: bytes, voxel_size: float, size: int | None = None, tree: str = "OcTree") -> VoxelMap:
     """Return the map in the nodes `body` of a tree, those of BINARY_TITLE or of TREE_TITLE.
 
-    voxel_size: metres. size: how many nodes there should be, if that is known.
+    voxel_size: metres. size: how many nodes there should be, if that is known. tree: its type, one of `TREES`.
     Raises ValueError for damaged nodes, ConfigError for a size that no cell can have.
     """
     config = load_config(voxel_size=voxel_size, **OCTOMAP)
-    leaves = _binary_leaves(body, size, config) if title == BINARY_TITLE else _tree_leaves(body, size)
+    kind = TREES[_tree(tree)]
+    leaves = _binary_leaves(body, size, config) if title == BINARY_TITLE else _tree_leaves(body, size, kind)
     return _map_of(leaves, _with_limits(config, leaves.log_odds))
 
 
@@ -264,10 +272,13 @@ def _split(content: bytes) -> tuple[str, dict[str, str], bytes]:
     raise ValueError("its header has no line 'data'")
 
 
+def _tree(name: str) -> str:
+    if name not in TREES:
+        raise ValueError(f"its tree type is '{name}', only {', '.join(TREES)} can be read")
+    return name
+
+
 def _size(header: dict[str, str]) -> int:
-    tree = header.get("id", "")
-    if tree not in ("OcTree", "1"):  # "1" in files of OctoMap's first years
-        raise ValueError(f"its tree type is '{tree}', only OcTree can be read")
     text = header.get("size", "")
     if not (text.isascii() and text.isdigit() and len(text) < 16):
         raise ValueError(f"its size '{text}' is not a number of nodes")
@@ -302,10 +313,10 @@ def _nodes_in(body: bytes) -> int:
     return int(numbers @ pairs) + 1 if body else 0
 
 
-def _tree_leaves(body: bytes, size: int | None) -> _Leaves:
-    if len(body) % TREE_NODE.itemsize:
+def _tree_leaves(body: bytes, size: int | None, kind: np.dtype) -> _Leaves:
+    if len(body) % kind.itemsize:
         raise ValueError("it ends inside a node")
-    nodes = np.frombuffer(body, TREE_NODE)
+    nodes = np.frombuffer(body, kind)
     size = _checked_size(size, len(nodes), len(body))
     corners, heights = _room_for(size)
     records = np.zeros(size, np.int64)

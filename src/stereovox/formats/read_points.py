@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from stereovox.config import load_config
+from stereovox.config import Config, load_config
 from stereovox.errors import ConfigError, MapFileError, StereovoxError
 from stereovox.formats._lzf import unpack
 from stereovox.maps import VoxelMap
@@ -24,6 +24,8 @@ from stereovox.safe_io import json_value, read_arrays, read_bounded, shown
 
 MAX_BLOCKS = 2**19
 """Most blocks of 8x8x8 cells, 1 KB each, so that a file of far-apart points cannot fill the memory."""
+MAX_RANGE_CELLS = 8000
+"""Cells of the settings' range, which may span 8192."""
 ARRAYS = ("indices", "log_odds", "voxel_size", "free_below", "occupied_above", "settings")
 MAX_BYTES = 1 << 32
 MAX_HEADER_LENGTH, MAX_FIELDS = 1 << 16, 256
@@ -37,6 +39,8 @@ PLY_TYPES = {
     "float": "f4", "double": "f8", "float32": "f4", "float64": "f8",
 }  # fmt: skip
 PLY_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+FACES = ("face", "tristrips")
+"""Elements of a `.ply` that make a mesh of its points."""
 COLUMNS = "columns"
 """The order of compressed points: all numbers of one field, little-endian, then all of the next."""
 PCD_ORDERS = {"ascii": "", "binary": "<", "binary_compressed": COLUMNS}
@@ -44,22 +48,6 @@ MAX_RATIO = 100
 """Largest LZF compression ratio accepted; at best it makes 264 bytes of 3."""
 PCD_KINDS = {"I": "i", "U": "u", "F": "f"}
 PCD_SIZES = {"i": (1, 2, 4, 8), "u": (1, 2, 4, 8), "f": (4, 8)}
-
-
-def read_point_map(path: str | Path, voxel_size: float | None = None) -> VoxelMap:
-    """Return a map in which each cell that holds a point of a `.ply` or `.pcd` is occupied, all others unknown.
-
-    voxel_size: metres; None where the file is one of ours and tells it. The file's x, y and z are taken for metres.
-    Raises MapFileError: one line with the file and what is wrong.
-    """
-    points = read_points(path)
-    size = points.voxel_size if voxel_size is None else voxel_size
-    if size is None:
-        raise MapFileError(f"{path}: does not tell how large cells should be; give --voxel-size in metres")
-    try:
-        return cells_of_points(points.xyz, size)
-    except StereovoxError as error:
-        raise MapFileError(f"{path}: {error}") from None
 
 
 def read_npz(path: str | Path) -> VoxelMap:
@@ -90,7 +78,7 @@ def cells_of_points(points: ArrayLike, voxel_size: float) -> VoxelMap:
     for points too far away for any cell, for too many blocks, or a bad size.
     """
     points = np.asarray(points, np.float64).reshape(-1, 3)
-    config = load_config(voxel_size=voxel_size)
+    config = _config(voxel_size)
     cells = np.floor(points[np.isfinite(points).all(axis=1)] / voxel_size)
     if (np.abs(cells) >= INDEX_LIMIT).any():
         raise StereovoxError(
@@ -101,6 +89,13 @@ def cells_of_points(points: ArrayLike, voxel_size: float) -> VoxelMap:
     return VoxelMap.from_cells(config, indices, np.full(len(indices), config.map.log_odds_max))
 
 
+def _config(voxel_size: float) -> Config:
+    """Return the default profile with a cell size, and a range that so many cells can span: nothing measured these."""
+    usual = load_config()
+    small = 0 < voxel_size * MAX_RANGE_CELLS < usual.max_range
+    return load_config(voxel_size=voxel_size, **({"max_range": voxel_size * MAX_RANGE_CELLS} if small else {}))
+
+
 def check_room(indices: NDArray[np.integer]) -> None:
     """Raise StereovoxError where cells (N, 3) lie in more than `MAX_BLOCKS` blocks."""
     blocks = len(blocks_of_cells(indices)[0]) if len(indices) > MAX_BLOCKS else len(indices)
@@ -109,10 +104,20 @@ def check_room(indices: NDArray[np.integer]) -> None:
 
 
 class Points(NamedTuple):
-    """xyz: (N, 3) float64, as they stand in the file. voxel_size: metres, where the file tells that of its cells."""
+    """Points as they stand in a file.
+
+    xyz: (N, 3) float64. voxel_size: metres, where the file tells that of its cells. ply: whether it is a `.ply`. faces:
+    how many faces stand behind the points of a `.ply`. width, height: of an organised `.pcd`, whose points are the
+    pixels of an image; height 1 for all others. turned: whether a `.pcd` has a VIEWPOINT that turns or moves points.
+    """
 
     xyz: NDArray[np.float64]
     voxel_size: float | None
+    ply: bool = False
+    faces: int = 0
+    width: int = 0
+    height: int = 1
+    turned: bool = False
 
 
 def read_points(path: str | Path) -> Points:
@@ -120,7 +125,9 @@ def read_points(path: str | Path) -> Points:
     try:
         content = read_bounded(Path(path), MAX_BYTES)
         head = (_ply_head if content.startswith(b"ply") else _pcd_head)(content)
-        return Points(_xyz(content[head.start :], head), _parse_voxel_size(content[: head.start]))
+        size, ply = _parse_voxel_size(content[: head.start]), content.startswith(b"ply")
+        xyz = _xyz(content[head.start :], head)
+        return Points(xyz, size, ply, head.faces, *(head.shape or (len(xyz), 1)), head.turned)
     except OSError as error:
         raise MapFileError(f"{path}: cannot be read ({error.strerror or error}); name a file of points") from None
     except (ValueError, ConfigError) as error:
@@ -139,12 +146,18 @@ def _checked(indices: NDArray[np.integer], log_odds: NDArray[np.floating]) -> tu
 
 
 class _Head(NamedTuple):
-    """record: one point, name, kind and count of its fields. order: "" for text. start: where points begin."""
+    """record: one point, name, kind and count of its fields. order: "" for text. start: where points begin.
+
+    faces, shape and turned: as in `Points`; shape is None where there are no rows and columns.
+    """
 
     record: list[tuple[str, str, int]]
     number: int
     order: str
     start: int
+    faces: int = 0
+    shape: tuple[int, int] | None = None
+    turned: bool = False
 
 
 def _lines(content: bytes, last: Callable[[list[str]], bool]) -> tuple[list[list[str]], int]:
@@ -161,7 +174,7 @@ def _lines(content: bytes, last: Callable[[list[str]], bool]) -> tuple[list[list
 
 def _ply_head(content: bytes) -> _Head:
     lines, start = _lines(content, lambda words: words == ["end_header"])
-    order, count, record, element = None, None, [], ""
+    order, count, record, element, faces = None, None, [], "", 0
     for words in lines:
         match words:
             case ["format", form, *_]:
@@ -170,13 +183,14 @@ def _ply_head(content: bytes) -> _Head:
                 if element != "vertex" and count is None:
                     raise ValueError(f"{shown(element)} stands before its vertices; write the vertices first")
                 count = _count(number) if element == "vertex" else count
+                faces = _count(number) if element in FACES else faces
             case ["property", kind, name] if element == "vertex" and kind in PLY_TYPES:
                 record.append((name, PLY_TYPES[kind], 1))
             case ["property", *rest] if element == "vertex":
                 raise ValueError(f"its vertices have {shown(' '.join(rest))}, which no point has")
     if order is None or count is None:
         raise ValueError("its header tells no format or no vertices")
-    return _Head(record, count, order, start)
+    return _Head(record, count, order, start, faces)
 
 
 def _pcd_head(content: bytes) -> _Head:
@@ -190,7 +204,12 @@ def _pcd_head(content: bytes) -> _Head:
     if data not in PCD_ORDERS:
         raise ValueError(f"DATA is {shown(data)}, only {', '.join(PCD_ORDERS)} can be read")
     record = [(name, *one) for name, one in zip(names, map(_pcd_type, kinds, sizes, counts), strict=True)]
-    return _Head(record, _count(" ".join(told.get("POINTS", []))), PCD_ORDERS[data], start)
+    number = _count(" ".join(told.get("POINTS", [])))
+    width, height = (" ".join(told.get(name, ["1"])) for name in ("WIDTH", "HEIGHT"))
+    rows = _count(height) if height.isdigit() else 1
+    shape = (_count(width), rows) if rows > 1 and width.isdigit() and _count(width) * rows == number else None
+    turned = not set(told.get("VIEWPOINT", [])[:3] + told.get("VIEWPOINT", [])[4:]) <= {"0", "-0", "0.0"}
+    return _Head(record, number, PCD_ORDERS[data], start, shape=shape, turned=turned)
 
 
 def _pcd_type(kind: str, size: str, count: str) -> tuple[str, int]:

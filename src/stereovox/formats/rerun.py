@@ -82,7 +82,7 @@ class RerunFile:
         cubes = in_cubes(voxel_map)
         centres, size = cubes.occupied(), cubes.voxel_size
         self._stream.log(CELLS, self._cells(centres, cell_colours(cubes, centres), size), static=stamp_ns is None)
-        lines = [poses[:, :3, 3] for poses in map(voxel_map.history.path.poses, voxel_map.history.path.stops)]
+        lines = voxel_map.history.path.lines()
         way = self._rerun.LineStrips3D(lines, colors=[PATH_COLOUR] * len(lines))
         self._stream.log(PATH, way, static=stamp_ns is None)
 

@@ -61,8 +61,7 @@ def demo(
     mapped = perf_counter()
     tell(len(source), len(source), "checking the map and drawing it")
     summary = {**_facts(source, made), **_quality(made.map, truth, watch.sightings.frames, min_frames)}
-    trajectory = [source.pose(i)[:3, 3] for i in range(len(source))]
-    picture(made.map, files["picture"], title=f"stereovox demo: {source.name}", trajectory=trajectory)
+    picture(made.map, files["picture"], title=f"stereovox demo: {source.name}")
     write_report(files["report"], summary, files["picture"])
     end = perf_counter()
     seconds = {"simulate_and_map": mapped - start, "check_and_draw": end - mapped, "total": end - start}

@@ -289,6 +289,17 @@ class GridMap(Guarded, OnStorage):
     def __repr__(self) -> str:
         return self._described((self.config.voxel_size,), self.counts(), self.memory_bytes)
 
+    def _repr_html_(self, title: str | None = None) -> str:
+        """Return what a notebook shows: a small picture from above, and facts. title: by default the class's name."""
+        from stereovox.maps.notebook import card, facts_of, floor_from_above
+
+        with self.lock:
+            facts = facts_of((self.voxel_size,), self.counts(), self.bounds(), self.memory_bytes, self.history)
+            box = self.storage.box()
+            size = np.zeros(2, int) if box is None else box[1] - box[0]
+            picture = floor_from_above(size[::-1], lambda: self.occupancy().states)
+        return card(title or type(self).__name__, facts, *picture)
+
     def counts(self) -> dict[str, int]:
         """Return the number of cells in each known state: `free`, `tentative`, `occupied`."""
         number = np.bincount(self.storage.rules.states(self.storage.values).ravel(), minlength=4)

@@ -70,6 +70,17 @@ class OccupancyGrid:
             return np.zeros((0, 2))
         return np.array([(x, y) for x in (columns.start, columns.stop) for y in (rows.start, rows.stop)], float)
 
+    def _repr_html_(self) -> str:
+        """Return what a notebook shows: a small picture from above, and facts."""
+        from stereovox.maps.notebook import card, facts_of, floor_from_above
+
+        known = self.states[self.known_span]
+        number = np.bincount(known.ravel(), minlength=len(State))
+        counts = {state.name.lower(): int(number[state]) for state in (State.FREE, State.TENTATIVE, State.OCCUPIED)}
+        extent = np.array([(0, 0), known.shape[::-1]]) * self.resolution if known.size else None
+        facts = facts_of((self.resolution,), counts, extent)
+        return card(type(self).__name__, facts, *floor_from_above(known.shape, lambda: known))
+
     def indices(self, points: ArrayLike) -> NDArray[np.int64]:
         """Return which cells hold points.
 

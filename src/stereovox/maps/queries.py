@@ -166,7 +166,7 @@ def numbers_of(values: ArrayLike, name: str) -> NDArray[np.float64]:
     """Return numbers of any shape; raises StereovoxError for what is none, NaN among it."""
     numbers = _numbers(values, name, "numbers").astype(float)
     if np.isnan(numbers).any():
-        raise StereovoxError(f"{name}: NaN is no value; give numbers")
+        raise StereovoxError(f"{name}: NaN is not a value; give numbers")
     return numbers
 
 

@@ -136,7 +136,7 @@ class TileStore:
         except OSError as error:
             raise MapFileError(f"{self.folder}: cannot keep tiles here ({error.strerror or error})") from None
         if names and not (names & {LOCK, "zarr.json"} and all(map(OURS.fullmatch, names))):
-            raise MapFileError(f"{self.folder}: holds something that is no tile; move it away")
+            raise MapFileError(f"{self.folder}: holds something that is not a tile; move it away")
 
     def _clear(self) -> None:
         """Remove all but the lock: tiles of this store, or of one whose run was killed."""

@@ -319,6 +319,18 @@ class VoxelMap(Guarded, OnBlocks):
             self.config.cell if self.config.steps else self.config.cell[:1], self.counts(), self.memory_bytes
         )
 
+    def _repr_html_(self, title: str | None = None) -> str:
+        """Return what a notebook shows: a small picture from above, and facts. title: by default the class's name."""
+        from stereovox.maps.notebook import card, facts_of, voxels_from_above
+
+        with self.lock:
+            cell = self.config.cell
+            sides = cell if self.config.steps else cell[:1]
+            facts = facts_of(sides, self.counts(), self.bounds(), self.memory_bytes, self.history)
+            blocks = self.storage.slabs()
+            picture = voxels_from_above(blocks, self.storage.rules.states, cell, self.config.up, self.history)
+        return card(title or type(self).__name__, facts, *picture)
+
     def counts(self) -> dict[str, int]:
         """Return the number of cells in each known state: `free`, `tentative`, `occupied`."""
         number = np.zeros(4, np.int64)
@@ -336,6 +348,15 @@ class VoxelMap(Guarded, OnBlocks):
             return None
         lowest, highest = zip(*spans, strict=True)
         return np.stack([np.min(lowest, axis=0), np.max(highest, axis=0)]) * self.config.cell
+
+    @property
+    def path(self) -> NDArray[np.float64]:
+        """Positions of the camera (N, 3) in metres, world frame, in the order of the frames; of several, one by one.
+
+        They are saved with the map and thinned evenly: at most 2048, 5 cm or 0.1 rad apart, farther on long paths.
+        (0, 3) for a map of no frames, such as an imported one.
+        """
+        return np.concatenate([np.empty((0, 3)), *self.history.path.lines()])
 
     @property
     def memory_bytes(self) -> int:

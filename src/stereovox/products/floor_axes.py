@@ -34,6 +34,12 @@ def upright_axes(up: str) -> NDArray[np.float64]:
     return np.stack([unit[x], unit[y], sign * unit[upright]])
 
 
+def nearest_axis(direction: NDArray[np.float64]) -> str:
+    """Return the axis (`z`, `-y`, ...) that is nearest to a direction (3,)."""
+    k = int(np.argmax(np.abs(direction)))
+    return f"{'-' if direction[k] < 0 else ''}{'xyz'[k]}"
+
+
 def heights_of(points: ArrayLike, up: str) -> NDArray[np.float64]:
     """Return the heights (N,) in metres of points (N, 3)."""
     _, _, upright, sign = floor_axes(up)

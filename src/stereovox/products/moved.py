@@ -9,12 +9,14 @@ from itertools import product
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from stereovox.config import Config
 from stereovox.errors import StereovoxError
 from stereovox.maps import State, VoxelMap
 from stereovox.maps.blocks import CELLS, SIDE
 from stereovox.maps.cell_format import CellRules
 from stereovox.maps.voxel_map import INDEX_LIMIT, cells_where
-from stereovox.products import _moved
+from stereovox.products import _moved as _kernels
+from stereovox.products.floor_axes import nearest_axis, upright_axes
 from stereovox.products.side_by_side import cells_at, in_memory, set_times
 from stereovox.se3 import Transform, inverse, orthonormalise, rigidity_error, transform_points
 from stereovox.threads import one_state
@@ -47,8 +49,17 @@ def moved(voxel_map: VoxelMap, T_a_b: ArrayLike) -> VoxelMap:
 
     Raises StereovoxError where T_a_b is no rigid motion, or leads too far away.
     """
-    T, voxel_map = rigid(T_a_b), in_memory(voxel_map)
-    there, blocks, pushed = VoxelMap(voxel_map.config), _reached(voxel_map, T), _pushed(voxel_map, T)
+    config = voxel_map.config
+    if config.up_direction is not None:
+        direction = np.asarray(T_a_b, float)[:3, :3] @ config.up_direction
+        config = config.model_copy(update={"up": nearest_axis(direction), "up_direction": tuple(direction.tolist())})
+    return _resampled(voxel_map, rigid(T_a_b), config)
+
+
+def _resampled(voxel_map: VoxelMap, T: Transform, config: Config) -> VoxelMap:
+    """Return a map in frame b resampled in frame a, with the settings of the new one."""
+    voxel_map = in_memory(voxel_map)
+    there, blocks, pushed = VoxelMap(config), _reached(voxel_map, T), _pushed(voxel_map, T)
     for start in range(0, len(blocks), PIECE):
         coords = blocks[start : start + PIECE]
         points = transform_points(inverse(T), there.centers(_cells_of(coords)))
@@ -69,12 +80,36 @@ def moved(voxel_map: VoxelMap, T_a_b: ArrayLike) -> VoxelMap:
     return there
 
 
+def levelled(voxel_map: VoxelMap) -> VoxelMap:
+    """Return a map turned so that its z axis points up, where up lies between its axes; else the map itself.
+
+    The turn is about a level axis, so directions on the floor stay as near to the map's as can be. Its settings then
+    say `up = "z"`. Raises StereovoxError as `moved`.
+    """
+    if voxel_map.config.up_direction is None:
+        return voxel_map
+    T = level_transform(voxel_map.config.up_direction)
+    config = voxel_map.config.model_copy(update={"up": "z", "up_direction": None})
+    return _resampled(voxel_map, T, config)
+
+
+def level_transform(up_direction: ArrayLike) -> Transform:
+    """Return the motion (4, 4), about the origin, into a world whose z axis is `up_direction` (3,), a unit vector."""
+    up = np.asarray(up_direction, float)
+    x = upright_axes(nearest_axis(up))[0]
+    x = x - (x @ up) * up
+    x /= np.linalg.norm(x)
+    T = np.eye(4)
+    T[:3, :3] = x, np.cross(up, x), up
+    return T
+
+
 def rigid(T: ArrayLike) -> Transform:
     """Return a (4, 4) rigid motion with rounding removed; raises StereovoxError where it is none."""
     T = np.asarray(T, float)
     error = rigidity_error(T)
     if not error <= RIGID:
-        raise StereovoxError("the transform is no rigid motion: give a 4x4 matrix, without scale or mirror")
+        raise StereovoxError("the transform is not a rigid motion: give a 4x4 matrix, without scale or mirror")
     return orthonormalise(T)
 
 
@@ -100,7 +135,7 @@ def _doubt(voxel_map: VoxelMap, T: Transform, coords: NDArray[np.int32], cells: 
     axes, reach = _separating_axes(R_b_a, sides)
     arrays = R_b_a * sides / sides[:, None], axes, reach, corners - low
     turn, axes, reach, rest = (array.astype(np.float32) for array in arrays)
-    _moved.doubt(voxel_map.storage.stored_cells, rules.thresholds, rules.prior, turn, axes, reach, low, rest, cells)
+    _kernels.doubt(voxel_map.storage.stored_cells, rules.thresholds, rules.prior, turn, axes, reach, low, rest, cells)
 
 
 def _separating_axes(

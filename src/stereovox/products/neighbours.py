@@ -61,7 +61,7 @@ def _places(cells: NDArray[np.integer], longest: int) -> tuple[NDArray[np.int64]
     low = cells.min(axis=0).astype(np.int64)
     extent = [int(n) + 1 + longest for n in cells.max(axis=0) - low]
     if extent[0] * extent[1] * extent[2] > MAX_PLACES:
-        raise StereovoxError("the map reaches too far to tell what hangs together; take a part of it: stereovox crop")
+        raise StereovoxError("the map reaches too far to find what is connected; take a part of it: stereovox crop")
     x, y, z = (cells - low).T
     return (x * extent[1] + y) * extent[2] + z, extent
 

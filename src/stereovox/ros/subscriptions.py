@@ -20,6 +20,8 @@ from stereovox.ros.poses import PoseBuffer
 
 FIRST_S, AGAIN_S = 5.0, 30.0
 """Seconds until the first warning, and between repeated ones."""
+TF2_MSGS = "Source a ROS 2 distribution (source /opt/ros/jazzy/setup.bash) or build it (docs/ros2.md)"
+"""Where `tf2_msgs` comes from: it is not on PyPI."""
 POSE_QUEUE = 100
 """Length of the middleware's queues for pose messages."""
 
@@ -65,7 +67,8 @@ class Subscriptions:
     """Subscribes to all topics in the options, and to /tf and /tf_static.
 
     arrived: called with topic and bytes of a message to map. messages: number of messages received, of all kinds.
-    Raises StereovoxError, one line, for an invalid topic name.
+    Raises StereovoxError, one line, for an invalid topic name, and where nothing can give a pose: no /tf, for want of
+    `tf2_msgs`, and no other source of poses in the options.
     """
 
     def __init__(
@@ -87,14 +90,19 @@ class Subscriptions:
             self._listen("nav_msgs/Odometry", topic, where.on_odometry, poses)
         for topic, child in map(split_pair, options.pose):
             self._listen("geometry_msgs/PoseStamped", topic, partial(where.on_pose, child=child), poses)
-        self._listen_to_tf(where)
+        self._listen_to_tf(where, bool(options.odometry or options.pose or options.fixed))
 
-    def _listen_to_tf(self, where: PoseBuffer) -> None:
+    def _listen_to_tf(self, where: PoseBuffer, other_poses: bool) -> None:
         kind = optional_message("tf2_msgs", "TFMessage")
+        if kind is None and not other_poses:
+            raise StereovoxError(
+                f"no poses: tf2_msgs is not installed, so /tf cannot be heard. {TF2_MSGS}, or give --odometry TOPIC or "
+                "--pose TOPIC=FRAME (ros.odometry, ros.pose)"
+            )
         if kind is None:
             self._node.get_logger().warning(
                 "tf2_msgs is not installed: /tf is not heard, poses come from ros.odometry, ros.pose and ros.fixed "
-                "alone; source a ROS 2 distribution, or see docs/ros2.md for how to build it"
+                f"alone. {TF2_MSGS}"
             )
             return
         moving, fixed = partial(where.on_tf, fixed=False), partial(where.on_tf, fixed=True)

@@ -32,7 +32,13 @@ GREY_16 = (16, 0)  # bit depth and colour type
 DEPTH_KINDS = frozenset({GREY_16})
 PICTURE_KINDS = frozenset({(8, 0), (8, 2)})
 """Kinds of PNG that are read: 16-bit grey; 8-bit grey and RGB."""
-EXPECTED = {DEPTH_KINDS: "depth must be a 16-bit grey PNG", PICTURE_KINDS: "pictures must be 8-bit grey or RGB PNGs"}
+EYE_KINDS = frozenset({GREY_16, (8, 0), (8, 2), (8, 6)})
+"""Kinds of PNG that stereo cameras write: also 16-bit grey (TUM VI), and RGB with transparency."""
+EXPECTED = {
+    DEPTH_KINDS: "depth must be a 16-bit grey PNG",
+    PICTURE_KINDS: "pictures must be 8-bit grey or RGB PNGs",
+    EYE_KINDS: "pictures must be 8-bit grey or RGB, or 16-bit grey PNGs",
+}
 Kinds = frozenset[tuple[int, int]]
 
 
@@ -61,15 +67,18 @@ def decode_png(
     return _decode(path, data)
 
 
-def read_picture_png(path: Path, size: tuple[int, int]) -> NDArray[np.uint8]:
+def read_picture_png(path: Path, size: tuple[int, int], kinds: Kinds = PICTURE_KINDS) -> NDArray[np.uint8]:
     """Return the (height, width) uint8 grey or (height, width, 3) uint8 RGB image in `path`.
 
-    Its size must be (width, height) = `size`. Raises FrameRefused as `decode_depth_png`; `bad_dtype`: neither grey nor
-    RGB.
+    Its size must be (width, height) = `size`. Where `kinds` allow them, images of 16 bits keep the upper eight, and
+    transparency is ignored. Raises FrameRefused as `decode_depth_png`; `bad_dtype`: of none of these kinds.
     """
     data = _read(path)
-    _check(path, data, size, PICTURE_KINDS)
+    _check(path, data, size, kinds)
     image = _decode(path, data)
+    if GREY_16 in kinds and image.dtype == np.uint16:
+        image = np.right_shift(image.astype(np.uint16, copy=False), 8).astype(np.uint8)
+    image = image[..., :3] if image.shape[2:] == (4,) else image
     if image.dtype != np.uint8 or image.shape[2:] not in ((), (3,)):
         raise _undecodable(path)
     return np.ascontiguousarray(image[..., ::-1] if image.ndim == 3 else image, np.uint8)  # OpenCV gives BGR

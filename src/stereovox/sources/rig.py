@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import os
+from abc import ABC
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -15,16 +17,20 @@ from stereovox.cameras.rigs import StereoPair
 from stereovox.errors import FrameRefused, SourceError
 from stereovox.frame import StereoFrame
 from stereovox.se3 import Transform
-from stereovox.sources.base import Source
-from stereovox.sources.images import PICTURE_KINDS, file_names, png_size, read_picture_png
-from stereovox.sources.rig_file import FILE, RigPair, read_rig
+from stereovox.sources.base import Part, Source
+from stereovox.sources.images import EYE_KINDS, file_names, png_size, read_picture_png
+from stereovox.sources.poses import Poses
+from stereovox.sources.rgbd.folder import SECOND, folder_part
+from stereovox.sources.rgbd.pose_files import number_in
+from stereovox.sources.rig_file import FILE, Rig, RigPair, read_rig
+from stereovox.sources.rig_options import POSES, as_body, file_of, folder_and_options, poses_of_images
 from stereovox.sources.trajectory import Trajectory, by_time, inside, stamped_lines
 
 SHORTEST_NS = 1_000_000
 """Image names of a pair that span less are numbers, not times."""
 
 
-class _Shot(NamedTuple):
+class Shot(NamedTuple):
     """One picture of one pair: time, number of the pair, both files."""
 
     stamp_ns: int
@@ -33,40 +39,25 @@ class _Shot(NamedTuple):
     right: Path
 
 
-class StereoRig(Source):
-    """A folder with `rig.toml` (see `Rig`), images of each pair, and a file of poses T_world_body in TUM format.
+class RigSource(Source, ABC):
+    """Frames of stereo pairs whose images are files, with the poses of the vehicle over time.
 
-    Frames: a `StereoFrame` for each left image of each pair, in order of time; of one time in the rig file's order.
-    Both images of a moment have the same name, their time in nanoseconds, or stand in a line of the pair's index.
-    Pose: between the neighbours before and after the image's time, times T_body_camera; both must be less than 0.1 s
-    away. World: that of the poses.
-    Each pair is a sensor of its own, by its name. Why a pixel has no value is found out by matching (`depth.stereo`);
-    the rig's masks make it MASKED.
-    Faults: those of `read_picture_png` and of `Poses.at`. Raises SourceError for a bad rig file, masks or
-    folders that cannot be read, names that are no times, and where there is no image or no file of poses.
-    Names of several images that span less than a millisecond are no times.
+    A layout calls `_set` in its constructor.
+    Frames: a `StereoFrame` for each shot. Pose: between the neighbours before and after the image's time, times
+    T_body_camera; both must be less than 0.1 s away. World: that of the poses. Each pair is a sensor of its own, by its
+    name. Faults: those of `read_picture_png` and of `Poses.at`.
     """
 
-    layout = f"a stereo rig ({FILE} that names pairs, folders of images and poses)"
+    pairs: list[StereoPair]
+    _calibration: str
+    """The file that tells the images' sizes, for messages."""
 
-    def __init__(self, where: str | os.PathLike[str]):
-        self.folder = Path(where)
-        self.name = self.folder.resolve().name
-        file = self.folder / FILE
-        rig = read_rig(file)
-        try:
-            self.pairs: list[StereoPair] = rig.stereo_pairs(self.folder)
-        except SourceError as error:
-            raise SourceError(f"{file}: {error}") from None
+    def _set(self, rig: Rig, folder: Path, shots: Iterable[Shot], poses: Poses, calibration: str) -> None:
+        """Set the pairs and their images, which are put in order of time."""
+        self.pairs = rig.stereo_pairs(folder)
         self.camera = self.pairs[0].camera.middle
-        shots = [_shots(self.folder, number, pair) for number, pair in enumerate(rig.pairs)]
-        self._shots = sorted((shot for some in shots for shot in some), key=lambda shot: (shot.stamp_ns, shot.pair))
-        self._poses = _poses(self.folder, rig.poses)
-
-    @classmethod
-    def recognises(cls, where: str) -> bool:
-        """Return whether `where` is a folder with a `rig.toml`."""
-        return os.path.isfile(os.path.join(where, FILE))
+        self._shots = sorted(shots, key=lambda shot: (shot.stamp_ns, shot.pair))
+        self._poses, self._calibration = poses, calibration
 
     def __len__(self) -> int:
         return len(self._shots)
@@ -79,33 +70,80 @@ class StereoRig(Source):
         frame = StereoFrame(no_image, no_image, pair, no_pose, shot.stamp_ns, str(shot.left), sensor=pair.name)
         try:
             T_world_camera = self._pose(shot, pair)
-            left, right = (_picture(path, size) for path, size in zip(shot[2:], _sizes(pair), strict=True))
+            left, right = (self._picture(path, size) for path, size in zip(shot[2:], _sizes(pair), strict=True))
         except FrameRefused as refused:
             return replace(frame, fault=refused.reason, fault_detail=str(refused))
         return replace(frame, left=left, right=right, T_world_sensor=T_world_camera)
 
-    def _pose(self, shot: _Shot, pair: StereoPair) -> Transform:
+    def _pose(self, shot: Shot, pair: StereoPair) -> Transform:
         try:
             return self._poses.at(shot.stamp_ns) @ pair.T_body_camera
         except FrameRefused as refused:
             raise FrameRefused(refused.reason, f"{shot.left}: {refused}") from None
 
+    def _picture(self, path: Path, size: tuple[int, int]) -> NDArray[np.uint8]:
+        try:
+            return read_picture_png(path, size, EYE_KINDS)
+        except FrameRefused as refused:
+            if refused.reason != "bad_shape":
+                raise
+        (width, height), expected = png_size(path, EYE_KINDS), f"{size[0]}x{size[1]}"
+        said = f"{path}: {width}x{height} pixels, {self._calibration} says {expected}"
+        raise FrameRefused("bad_shape", f"{said}; correct width and height there, or the image") from None
+
+
+class StereoRig(RigSource):
+    """A folder with `rig.toml` (see `Rig`), images of each pair, and a file of poses T_world_body in TUM format.
+
+    where: the folder, or with options `flight?poses=trajectory.log&fps=20`:
+        poses: a file or folder of poses of any form (see `rgbd.pose_files`) in place of the rig file's.
+        axes: the poses are those of the first pair's left eye, in `optical`, `opengl` or `ros` axes, not the body's.
+        invert: 1 where poses map the world into what is posed. fps: images a second, where their names are numbers.
+    Frames: a `StereoFrame` for each left image of each pair, in order of time; of one time in the rig file's order.
+    Both images of a moment have the same name, their time in nanoseconds, or stand in a line of the pair's index.
+    Poses and faults: see `RigSource`. Why a pixel has no value is found out by matching (`depth.stereo`); the rig's
+    masks make it MASKED. Raises SourceError for a bad rig file, masks or folders that cannot be read, names that are no
+    times, and where there is no image or no file of poses.
+    Names of several images that span less than a millisecond are no times.
+    """
+
+    layout = f"a stereo rig ({FILE} that names pairs, folders of images and poses)"
+    parts = (
+        Part(("left/*.png", "*/left/*.png"), "left images"),
+        Part(("right/*.png", "*/right/*.png"), "right images"),
+        Part((FILE,), FILE, f"write it with: stereovox calibrate import CALIBRATION --out {FILE} (docs/rigs.md)"),
+    )
+
+    def __init__(self, where: str | os.PathLike[str]):
+        self.folder, options = folder_and_options(where, {**POSES, "fps": 0.0})
+        self.name = self.folder.resolve().name
+        file = self.folder / FILE
+        rig = read_rig(file)
+        try:
+            rig.stereo_pairs(self.folder)
+        except SourceError as error:
+            raise SourceError(f"{file}: {error}") from None
+        fps = options["fps"]
+        shots = [shot for number, pair in enumerate(rig.pairs) for shot in _shots(self.folder, number, pair, fps)]
+        if options["poses"]:
+            poses = poses_of_images(file_of(options["poses"], self.folder), [shot.stamp_ns for shot in shots])
+        else:
+            poses = _poses(self.folder, rig.poses)
+        poses = as_body(poses, rig.pairs[0].T_body_left, options["axes"], options["invert"])
+        self._set(rig, self.folder, shots, poses, FILE)
+
+    @classmethod
+    def recognises(cls, where: str) -> bool:
+        """Return whether `where` is a folder with a `rig.toml`."""
+        return os.path.isfile(os.path.join(folder_part(where), FILE))
+
 
 def _poses(folder: Path, name: str) -> Trajectory:
     if not os.path.isfile(folder / name):
-        raise SourceError(f"{folder / name}: no such file of poses; write it, or set poses = in {folder / FILE}")
+        raise SourceError(
+            f"{folder / name}: no such file of poses; write it, or set poses = in {folder / FILE}, or add ?poses=FILE"
+        )
     return Trajectory(folder / name)
-
-
-def _picture(path: Path, size: tuple[int, int]) -> NDArray[np.uint8]:
-    try:
-        return read_picture_png(path, size)
-    except FrameRefused as refused:
-        if refused.reason != "bad_shape":
-            raise
-    (width, height), expected = png_size(path, PICTURE_KINDS), f"{size[0]}x{size[1]}"
-    message = f"{path}: {width}x{height} pixels, {FILE} says {expected}; correct width and height there, or the image"
-    raise FrameRefused("bad_shape", message) from None
 
 
 def _sizes(pair: StereoPair) -> tuple[tuple[int, int], tuple[int, int]]:
@@ -113,7 +151,8 @@ def _sizes(pair: StereoPair) -> tuple[tuple[int, int], tuple[int, int]]:
     return (left.width, left.height), (right.width, right.height)
 
 
-def _shots(folder: Path, number: int, pair: RigPair) -> list[_Shot]:
+def _shots(folder: Path, number: int, pair: RigPair, fps: float) -> list[Shot]:
+    """Return the images of a pair. fps: images a second, whose names are numbers; 0: names are times."""
     left, right = (folder / name for name in pair.folders())
     for side, place in (("left", left), ("right", right)):
         if not os.path.isdir(place):
@@ -124,15 +163,19 @@ def _shots(folder: Path, number: int, pair: RigPair) -> list[_Shot]:
     names = sorted(name for name in file_names(left) if name.endswith(".png"))
     if not names:
         raise SourceError(f"{left}: holds no PNG; put the left images of pair '{pair.name}' there, named by ns")
-    shots = [_Shot(_stamp(left / name), number, left / name, right / name) for name in names]
+    if fps:
+        stamp_of = {name: int(number_in(name)[0] * SECOND / fps) for name in names}
+    else:
+        stamp_of = {name: _stamp(left / name) for name in names}
+    shots = [Shot(stamp_of[name], number, left / name, right / name) for name in names]
     stamps = [shot.stamp_ns for shot in shots]
     if len(shots) > 1 and max(stamps) - min(stamps) < SHORTEST_NS:
         said = f"its {len(shots)} images would all be taken within a millisecond ({names[0]} to {names[-1]})"
-        raise SourceError(f"{left}: {said}; name them by time in ns or give an index file")
+        raise SourceError(f"{left}: {said}; name them by time in ns, give an index file, or add ?fps=")
     return shots
 
 
-def _listed(path: Path, number: int, left: Path, right: Path) -> list[_Shot]:
+def _listed(path: Path, number: int, left: Path, right: Path) -> list[Shot]:
     shots = []
     for stamp_ns, rest, where in by_time(stamped_lines(path)):
         names = rest.split()
@@ -140,7 +183,7 @@ def _listed(path: Path, number: int, left: Path, right: Path) -> list[_Shot]:
             raise SourceError(f"{where}: needs 'stamp left [right]'; correct or delete the line")
         for name in names:
             inside(name, where)
-        shots.append(_Shot(stamp_ns, number, left / names[0], right / names[-1]))
+        shots.append(Shot(stamp_ns, number, left / names[0], right / names[-1]))
     if not shots:
         raise SourceError(f"{path}: names no image; write lines 'stamp left [right]'")
     return shots

@@ -45,6 +45,11 @@ class Virtual:
     vfov_deg: float | None = None
 
 
+def usual_virtual(eyes: Eyes | None) -> Virtual:
+    """Return the virtual camera that suits most lenses: spherical for fisheyes, else a pinhole."""
+    return Virtual("spherical" if eyes is not None and eyes.left.model == "fisheye" else "pinhole")
+
+
 @dataclass(frozen=True, eq=False)
 class RigPair:
     """One `[[pair]]` of a rig file. It has either `eyes`, whose images are to be rectified, or `camera`.

@@ -58,6 +58,10 @@ class CameraPath:
         matrices[:, :3] = np.reshape([seen.pose for seen in self.stops[sensor]], (-1, 3, 4))
         return matrices
 
+    def lines(self) -> list[NDArray[np.float64]]:
+        """Return the positions (N, 3) in metres, world frame, of each sensor that has any, in the order of frames."""
+        return [self.poses(sensor)[:, :3, 3] for sensor, stops in self.stops.items() if stops]
+
     def until(self, stamp_ns: float = inf) -> list[tuple[str, Transform]]:
         """Return sensor and T_world_sensor (4, 4) of each pose up to a time in nanoseconds, sensor by sensor."""
         return [

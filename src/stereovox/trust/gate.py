@@ -89,7 +89,7 @@ class Passed(NamedTuple):
     @property
     def note(self) -> str:
         """Line for the report, "" where there is nothing to report."""
-        return f"frames of '{self.sensor}' are believed again after {self.after}" if self.after else ""
+        return f"frames of '{self.sensor}' are accepted again after {self.after}" if self.after else ""
 
 
 class Gate:
@@ -156,7 +156,7 @@ class Gate:
             detail = f"{name_of(frame)}: its pose is extrapolated by {off_ns / 1e9:.3f} s ({limit}); give poses in time"
             raise FrameRefused("pose_extrapolated", detail)
         if len(frame.sensor) > MAX_NAME_LENGTH or not frame.sensor.isprintable():
-            detail = f"sensor is no word of at most {MAX_NAME_LENGTH} letters that can be shown; name it otherwise"
+            detail = f"sensor is not a printable name of at most {MAX_NAME_LENGTH} characters; rename it"
             raise FrameRefused("bad_sensor", f"{name_of(frame)}: {detail}")
         return frame.sensor or ("scan" if isinstance(frame, Scan) else "camera"), int(frame.stamp_ns)
 
@@ -226,7 +226,7 @@ class Gate:
         seconds = (now.stamp_ns - before.stamp_ns) / 1e9
         if why == BACKWARDS:
             return f"taken {-seconds:.6g} s before the last trusted one; put frames in order or set trust.ordered=false"
-        until = f"believed again once frames agree for {self._trust.settle_s:g} s"
+        until = f"accepted again once frames agree for {self._trust.settle_s:g} s"
         if why == RESET:
             return f"its clock is {seconds:+.6g} s off the last trusted frame's, it was reset; {until}"
         metres, angle = apart(before.pose, now.pose)
@@ -329,7 +329,7 @@ class DisagreementMonitor:
         else:
             detail = f"it disagrees with the map ({against or 0:.0%} of what it says, {limit:.0%} may)"
         seconds = self._trust.moved_s if doubt.verdict == MOVED else self._trust.changed_s
-        detail += f"; believed once frames do for {seconds:g} s"
+        detail += f"; accepted once frames agree for {seconds:g} s"
         return FrameRefused(REASONS[doubt.verdict], f"{name_of(frame)}: {detail}")
 
 

@@ -128,7 +128,7 @@ def _text(
     state: State, age_ns: int | None, frames: int, refused: Counter[str], reduced: Counter[str], silent: dict[str, int]
 ) -> str:
     parts = ["no trusted frame yet" if age_ns is None else f"last trusted frame {age_ns / 1e9:.2f} s ago"]
-    for word, counts in (("refused", refused), ("looked at less thoroughly", reduced)):
+    for word, counts in (("refused", refused), ("mapped at reduced quality", reduced)):
         if counts:
             listed = ", ".join(f"{number} x {name}" for name, number in counts.most_common(3))
             others = counts.total() - sum(number for _, number in counts.most_common(3))

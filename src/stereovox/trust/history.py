@@ -24,6 +24,8 @@ OTHERS = "others"
 NOT_RECORDED = "not_told"
 """Reason for the refusals in old maps that saved only their number."""
 MAX_NAME_LENGTH = 256
+MAX_NOTES = 16
+"""Notes about an imported file."""
 EARLIEST, LATEST = -(2**63), 2**63 - 1
 """Range of stamps in int64 nanoseconds."""
 CHANGED, MOVED = "changed", "moved"
@@ -78,6 +80,22 @@ class Doubt(NamedTuple):
         return self.last_ns - self.since_ns if self.last_ns > self.since_ns else round(1e9 * self.frames / untimed_hz)
 
 
+class Imported(NamedTuple):
+    """What a map was imported from.
+
+    file: name of the file, without its folder. holds: what that is, in a few words (`PLY, 12,345 points`).
+    notes: what was decided for the user, a phrase each (`cells of 0.05 m, since points lie about 0.021 m apart`).
+    """
+
+    file: str
+    holds: str
+    notes: tuple[str, ...] = ()
+
+    def lines(self) -> str:
+        """Return lines for people: `imported from cloud.ply (PLY, 12,345 points)`, then the notes, one a line."""
+        return "\n  ".join((f"imported from {self.file} ({self.holds})", *self.notes))
+
+
 @dataclass
 class History:
     """Everything a map remembers of its frames; saved with it, so that a run can stop and resume anywhere.
@@ -95,6 +113,7 @@ class History:
         looks: Last image of each camera.
         usual: Usual disagreement with the map of each camera's frames, 0 to 1.
         doubts: Cameras whose last frames disagree with the map more than usual.
+        imported: The file of another program that the map began with; None where there was none.
     """
 
     frames: int = 0
@@ -109,6 +128,14 @@ class History:
     looks: dict[str, Look] = field(default_factory=dict)
     usual: dict[str, RunningMean] = field(default_factory=dict)
     doubts: dict[str, Doubt] = field(default_factory=dict)
+    imported: Imported | None = None
+
+    def made_of(self) -> str:
+        """Return lines for people: the recording, or the imported file and the notes about it, or both."""
+        frames = f"made of {self.recording or 'frames without a name'}"
+        if self.imported is None:
+            return frames
+        return f"{self.imported.lines()}\n{frames}" if self.frames else self.imported.lines()
 
     def offered(self, frame: object) -> None:
         """Remember the frame offered last."""
@@ -133,6 +160,7 @@ class History:
             "frames_refused": self.refused.total(),
             "last_frame": self._last_frame(),
             "recording": self.recording,
+            "imported": None if self.imported is None else self.imported._asdict(),
             "history": {
                 "refused": dict(self.refused),
                 "settled": dict(self.settled),
@@ -158,6 +186,7 @@ class History:
         frames, refused = _whole(saved["frames"], "frames"), _whole(saved["frames_refused"], "frames_refused")
         recording, last = one_line(str(saved["recording"])), _last_frame_from(saved.get("last_frame"))
         entries, path = saved.get("history"), _path_from(saved.get("camera_path"))
+        imported = _imported_from(saved.get("imported"))
         if entries is None:
             return cls(
                 frames,
@@ -165,6 +194,7 @@ class History:
                 recording=recording,
                 last_frame=last,
                 path=path,
+                imported=imported,
             )
         reasons, settled, ways = (_counts(entries[name], name) for name in ("refused", "settled", "ways"))
         trusted = {name: _seen_from(seen) for name, seen in _sensors(entries["trusted"]).items()}
@@ -174,7 +204,9 @@ class History:
         looks = {name: _look_from(look) for name, look in _sensors(entries.get("looks", {})).items()}
         usual = {name: _usual_from(shares) for name, shares in _sensors(entries.get("usual", {})).items()}
         doubts = {name: _doubt_from(doubt) for name, doubt in _sensors(entries.get("doubts", {})).items()}
-        history = cls(frames, reasons, settled, ways, recording, last, trusted, waiting, path, looks, usual, doubts)
+        history = cls(
+            frames, reasons, settled, ways, recording, last, trusted, waiting, path, looks, usual, doubts, imported
+        )
         if history.refused.total() != refused:
             raise ValueError(f"frames_refused is {refused}, its reasons add up to {history.refused.total()}")
         return history
@@ -263,6 +295,14 @@ def _last_frame_from(saved: Any) -> tuple[str, int] | None:
     if saved is None:
         return None
     return _name(saved["name"]), _whole(saved["stamp_ns"], "last_frame: stamp_ns", EARLIEST)
+
+
+def _imported_from(saved: Any) -> Imported | None:
+    if saved is None:
+        return None
+    if not isinstance(saved["notes"], list | tuple) or len(saved["notes"]) > MAX_NOTES:
+        raise ValueError(f"imported: notes are no list of at most {MAX_NOTES}")
+    return Imported(_name(saved["file"]), _name(saved["holds"]), tuple(map(_name, saved["notes"])))
 
 
 def _path_from(saved: Any) -> CameraPath:

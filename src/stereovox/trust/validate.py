@@ -139,7 +139,7 @@ def rigid_pose(frame: Frame | Scan, tolerance: float) -> se3.Transform:
         )
     error = se3.rigidity_error(T)
     if error > tolerance:
-        raise FrameRefused("pose_not_rigid", f"{name_of(frame)}: the pose is no rigid 4x4 motion ({_off(T, error)})")
+        raise FrameRefused("pose_not_rigid", f"{name_of(frame)}: the pose is not a rigid 4x4 motion ({_off(T, error)})")
     return se3.orthonormalise(T) if error > EXACT else T
 
 
@@ -184,7 +184,7 @@ def _rigid_mount(scan: Scan, rigidity: float) -> se3.Transform:
     T = matrix_of(scan.T_base_sensor)
     error = se3.rigidity_error(T)
     if error > rigidity or (np.abs(T) >= MAX_POSITION).any():
-        detail = "T_base_sensor, where the lidar sits on the robot, is no rigid 4x4 motion"
+        detail = "T_base_sensor, where the lidar sits on the robot, is not a rigid 4x4 motion"
         raise FrameRefused("mount_not_rigid", f"{name_of(scan)}: {detail} ({_off(T, error)})")
     return se3.orthonormalise(T) if error > EXACT else T
 

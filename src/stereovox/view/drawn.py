@@ -11,19 +11,21 @@ from numpy.typing import ArrayLike, NDArray
 
 from stereovox.errors import StereovoxError, did_you_mean
 from stereovox.maps import State, VoxelMap
+from stereovox.maps.upright import SLAB, ceiling, layers, turned_cells
+from stereovox.maps.upright import UPS as UPS
+from stereovox.maps.upright import turned as turned
+from stereovox.view.shading import Occlusion
 
-UPS = {"z": (0, 1, 2), "-z": (1, 0, 2), "y": (2, 0, 1), "-y": (0, 2, 1), "x": (1, 2, 0), "-x": (2, 1, 0)}
-"""For each up axis: the map's axes that point right, away and up in a picture (the last flipped where minus)."""
-SLAB = 1.6
-"""A layer with this many times the cells of the median layer is a floor or a ceiling."""
+BESIDE = 0.1
+"""A camera's path is drawn up to this share of the map's longest side beside its known cells."""
 
 
 @dataclass(frozen=True, eq=False)
 class Drawn:
     """A map whose third axis points up.
 
-    cells: (N, 3) int32 known cells; state: (N,) uint8 of `State`; path: camera positions (M, 3) in metres, or None;
-    names: the map's own names of the three axes.
+    cells: (N, 3) int32 known cells; state: (N,) uint8 of `State`; path: camera positions (M, 3) in metres, NaN where
+    the line breaks, or None; names: the map's own names of the three axes.
     """
 
     cells: NDArray[np.int32]
@@ -43,6 +45,11 @@ class Drawn:
         return self.occupied[self.occupied[:, 2] < ceiling(self.occupied)]
 
     @cached_property
+    def occlusion(self) -> Occlusion:
+        """What stands before the faces of the cells `below_ceiling`."""
+        return Occlusion(self.below_ceiling)
+
+    @cached_property
     def cut(self) -> float | None:
         """Height in metres above which cells are hidden, None where all are drawn."""
         if len(self.below_ceiling) == len(self.occupied):
@@ -52,11 +59,27 @@ class Drawn:
     @cached_property
     def layer(self) -> int:
         """The most informative layer: no floor or ceiling, many known cells, and then the most occupied cells."""
-        low, known = _layers(self.cells)
+        low, known = layers(self.cells)
         occupied = np.bincount(self.occupied[:, 2] - low, minlength=len(known))
         usual = np.median(occupied[occupied > 0]) if occupied.any() else np.inf
         known = np.where(occupied > SLAB * usual, 0, known)
         return int(low + np.argmax(np.where(known >= 0.9 * known.max(), occupied + 1, 0)))
+
+
+def camera_path(voxel_map: VoxelMap) -> NDArray[np.float64]:
+    """Return the path (N, 3) in metres of the cameras that made a map, as it is drawn: NaN where the line breaks.
+
+    It breaks between two cameras, and where the path leaves the map: a map may be a part of what its cameras saw.
+    """
+    lines, bounds = voxel_map.history.path.lines(), voxel_map.bounds()
+    if not lines or bounds is None:
+        return np.empty((0, 3))
+    gap = np.full((1, 3), np.nan)
+    path = np.concatenate([part for line in lines for part in (line, gap)][:-1])
+    low, high = bounds
+    margin = BESIDE * float((high - low).max())
+    inside = ((path >= low - margin) & (path <= high + margin)).all(axis=1)
+    return np.where(inside[:, None], path, np.nan) if inside.any() else np.empty((0, 3))
 
 
 def checked_up(up: str) -> str:
@@ -66,14 +89,11 @@ def checked_up(up: str) -> str:
     return up.removeprefix("+")
 
 
-def turned(points: ArrayLike, up: str) -> NDArray[np.float64]:
-    """Return points (..., 3) of a map in the axes of its picture: right, away, up."""
-    points = np.asarray(points, float)[..., list(UPS[up])]
-    return points * [1, 1, -1] if up.startswith("-") else points
-
-
 def upright(voxel_map: VoxelMap, trajectory: ArrayLike | None, up: str) -> Drawn:
-    """Turn a map so that its axis `up` (`z`, `-y`, ...) becomes the third. Raises StereovoxError if invalid."""
+    """Turn a map so that its axis `up` (`z`, `-y`, ...) becomes the third, and a path (M, 3) with it.
+
+    Raises StereovoxError for an invalid axis.
+    """
     up = checked_up(up)
     cells, _ = voxel_map.cells()
     state = voxel_map.state(voxel_map.centers(cells))
@@ -90,25 +110,4 @@ def stood_up(
 ) -> Drawn:
     """Return cells (N, 3) of a map whose axis `up`, a key of `UPS`, becomes the third. path: turned already."""
     order = list(UPS[up])
-    cells = cells[:, order]
-    if up.startswith("-"):
-        cells[:, 2] = -1 - cells[:, 2]
-    return Drawn(cells, state, voxel_size, path, ("xyz"[order[0]], "xyz"[order[1]], up))
-
-
-def ceiling(occupied: NDArray[np.int32]) -> int:
-    """Return the layer (third index) at which the ceiling of occupied cells (K, 3) begins; beyond the highest if none.
-
-    A ceiling is a layer in the upper part of the map that holds far more cells than layers usually do.
-    """
-    if not len(occupied):
-        return 0
-    low, count = _layers(occupied)
-    upper = np.arange(len(count)) > 0.55 * len(count)
-    slabs = np.flatnonzero(upper & (count > SLAB * np.median(count)))
-    return int(low + (slabs[0] - 1 if len(slabs) else len(count)))
-
-
-def _layers(cells: NDArray[np.int32]) -> tuple[int, NDArray[np.int64]]:
-    low = int(cells[:, 2].min())
-    return low, np.bincount(cells[:, 2] - low)
+    return Drawn(turned_cells(cells, up), state, voxel_size, path, ("xyz"[order[0]], "xyz"[order[1]], up))

@@ -89,12 +89,12 @@ def figure_of(height: float) -> Any:
     return figure
 
 
-def headline(figure: Any, voxel_map: VoxelMap, text: str) -> None:
-    """Write the title, and below it the facts of the map."""
+def headline(figure: Any, voxel_map: VoxelMap, text: str, more: Sequence[str] = ()) -> None:
+    """Write the title, and below it the facts of the map, and `more` of them."""
     counts = voxel_map.counts()
     facts = [f"cells of {voxel_map.voxel_size:g} m", f"{voxel_map.frames:,} frames"]
     facts += [f"{counts[state]:,} {state}" for state in ("occupied", "free", "tentative")]
-    title_above(figure, text, facts)
+    title_above(figure, text, [*facts, *more])
 
 
 def title_above(figure: Any, text: str, facts: Sequence[str]) -> None:

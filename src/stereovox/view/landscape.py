@@ -14,6 +14,7 @@ from stereovox.view.figures import DPI
 from stereovox.view.panels import STATE_COLOURS, round_length, title
 from stereovox.view.render import Direction, render
 from stereovox.view.scale import Scale, scale_of
+from stereovox.view.shading import Occlusion
 from stereovox.view.space import draw_frame, fit, numbers
 
 MAX_COLUMNS = 160
@@ -37,7 +38,8 @@ def draw_landscape(axis: Any, one: Layer, voxel_map: VoxelMap) -> None:
     painted = colours(norm(np.nan_to_num(values, nan=scale.unknown)))[..., :3]
     painted[np.isnan(values)] = to_rgb(STATE_COLOURS[State.UNKNOWN])
     size = voxel_map.voxel_size * step
-    rendering = render(cells, painted[cells[:, 1], cells[:, 0]], size, FROM, WIDE_PX, WIDE_PX)
+    plain = Occlusion(cells, ())  # its heights are no surface
+    rendering = render(cells, painted[cells[:, 1], cells[:, 0]], size, FROM, WIDE_PX, WIDE_PX, plain)
     axis.imshow(rendering.image, extent=rendering.extent, interpolation="antialiased", zorder=2)
     _frame(axis, one, scale, np.array([*values.shape[::-1], levels]) * size)
     title(axis, f"{'Log-odds' if scale.unknown == 0 else 'Cell values'} as height")

@@ -12,7 +12,7 @@ from stereovox.maps import State
 from stereovox.view.drawn import Drawn
 from stereovox.view.render import Direction, render
 
-INK, GREY, LINE = "#1b2333", "#555d6b", "#c9ced6"
+INK, GREY, LINE = "#1b2333", "#555d6b", "#c8cdd5"
 STATE_COLOURS = {
     State.UNKNOWN: "#c9ced6",
     State.FREE: "#fbfaf5",
@@ -20,6 +20,8 @@ STATE_COLOURS = {
     State.OCCUPIED: "#22304a",
 }
 PATH_COLOUR = "#e0452f"
+HALO = "#fdfdfd"
+"""Rim of a path, which stays white on dark pages."""
 
 
 def title(axis: Any, text: str) -> None:
@@ -29,10 +31,12 @@ def title(axis: Any, text: str) -> None:
 
 def view(axis: Any, drawn: Drawn, colours: NDArray[np.floating], direction: Direction, width_px: int) -> None:
     """Draw the occupied cells below the ceiling as cubes in `colours` (N, 3), seen from `direction`."""
-    rendering = render(drawn.below_ceiling, colours, drawn.voxel_size, direction, width_px, width_px)
+    cells = drawn.below_ceiling
+    rendering = render(cells, colours, drawn.voxel_size, direction, width_px, width_px, drawn.occlusion)
     axis.imshow(rendering.image, extent=rendering.extent, interpolation="antialiased")
     if drawn.path is not None:
-        _trajectory(axis, direction.flat(drawn.path))
+        flat = direction.flat(drawn.path)
+        trajectory(axis, flat, rendering.hidden(flat, drawn.path @ direction.toward, drawn.voxel_size))
 
 
 def oblique(axis: Any, drawn: Drawn, colours: NDArray[np.floating], direction: Direction, width_px: int) -> None:
@@ -59,10 +63,11 @@ def slice_(axis: Any, drawn: Drawn) -> None:
     extent = np.column_stack([low, high]).ravel() * drawn.voxel_size
     colours = ListedColormap([STATE_COLOURS[state] for state in State])
     axis.imshow(image, cmap=colours, vmin=0, vmax=3, origin="lower", extent=extent, interpolation="nearest")
+    axis.set_facecolor(STATE_COLOURS[State.UNKNOWN])  # the path may leave what is known
     between = " to ".join(f"{number * drawn.voxel_size:.2f}" for number in (drawn.layer, drawn.layer + 1))
     title(axis, f"Slice at {drawn.names[2]} = {between} m")
     if drawn.path is not None:
-        _trajectory(axis, drawn.path[:, :2])
+        trajectory(axis, drawn.path[:, :2])
     patches = [Patch(fc=colour, ec="#888", label=state.name.lower()) for state, colour in STATE_COLOURS.items()]
     axis.legend(
         handles=patches,
@@ -88,11 +93,18 @@ def measured(axis: Any, names: tuple[str, str, str]) -> None:
         spine.set_color(LINE)
 
 
-def _trajectory(axis: Any, points: NDArray[np.float64]) -> None:
-    axis.plot(*points.T, color="white", linewidth=3, alpha=0.7, solid_capstyle="round")
-    axis.plot(*points.T, color=PATH_COLOUR, linewidth=1.5)
-    axis.plot(*points[:1].T, "o", color=PATH_COLOUR, markeredgecolor="white", markersize=7)
-    axis.plot(*points[-1:].T, "s", color=PATH_COLOUR, markeredgecolor="white", markersize=7)
+def trajectory(axis: Any, points: NDArray[np.float64], hidden: NDArray[np.bool_] | None = None) -> None:
+    """Draw a path (N, 2) with NaN where it breaks, from a dot to a square; pale where it is `hidden` (N,)."""
+    whole = points[np.isfinite(points).all(axis=1)]
+    if not len(whole):
+        return
+    if hidden is not None:
+        axis.plot(*points.T, color=PATH_COLOUR, linewidth=1.2, alpha=0.45)
+        points = np.where(hidden[:, None], np.nan, points)
+    axis.plot(*points.T, color=HALO, linewidth=3.2, alpha=0.75, solid_capstyle="round")
+    axis.plot(*points.T, color=PATH_COLOUR, linewidth=1.6, solid_capstyle="round")
+    for end, marker in ((whole[:1], "o"), (whole[-1:], "s")):
+        axis.plot(*end.T, marker, color=PATH_COLOUR, markeredgecolor=HALO, markersize=7)
 
 
 def scale_bar(axis: Any) -> None:
@@ -129,11 +141,15 @@ def _triad(axis: Any, direction: Direction, names: tuple[str, str, str], corner:
     from matplotlib.text import Text
 
     area = DrawingArea(64, 64, 0, 0)
-    for name, (x, y) in zip(names, direction.flat(np.eye(3)) * 22, strict=True):
+    tips = direction.flat(np.eye(3)) * 22
+    above = (0, 0, 6)  # the longer word clears the other two
+    for name, (x, y), higher in zip((*names[:2], f"{names[2]} up"), tips, above, strict=True):
         area.add_artist(
             FancyArrowPatch(
                 (32, 32), (32 + x, 32 + y), arrowstyle="-|>", mutation_scale=9, color=GREY, shrinkA=0, shrinkB=0
             )
         )
-        area.add_artist(Text(32 + 1.3 * x, 32 + 1.3 * y, name, ha="center", va="center", fontsize=9, color=GREY))
+        area.add_artist(
+            Text(32 + 1.3 * x, 32 + 1.3 * y + higher, name, ha="center", va="center", fontsize=9, color=GREY)
+        )
     axis.add_artist(AnchoredOffsetbox(corner, child=area, pad=0, borderpad=0, frameon=False))

@@ -13,7 +13,7 @@ from stereovox.errors import StereovoxError
 from stereovox.frame import Viewpoint
 from stereovox.maps import State, VoxelMap
 from stereovox.products.slices import Layer
-from stereovox.view.drawn import Drawn, checked_up, turned, upright
+from stereovox.view.drawn import Drawn, camera_path, checked_up, turned, upright
 from stereovox.view.layer import shown_height, upright_layer
 from stereovox.view.panels import INK, PATH_COLOUR, STATE_COLOURS, round_length
 from stereovox.view.picture import TOP, height_colours
@@ -69,14 +69,10 @@ def draw_paper(
         if view == "layer":
             height = shown_height(voxel_map, up, viewpoint or voxel_map.viewpoint) if at_m is None else at_m
             return _layer(voxel_map, upright_layer(voxel_map, up, height), width_mm)
-        drawn = upright(voxel_map, _path(voxel_map), up)
+        drawn = upright(voxel_map, camera_path(voxel_map), up)
         if not len(drawn.below_ceiling):
             raise StereovoxError("the map holds no occupied cell to draw; look at a layer instead (--view layer)")
         return DRAWN[view](drawn, width_mm)
-
-
-def _path(voxel_map: VoxelMap) -> NDArray[np.float64]:
-    return np.array([pose[:3, 3] for _, pose in voxel_map.history.path.until()]).reshape(-1, 3)
 
 
 def _from_above(drawn: Drawn, width_mm: float) -> Any:
@@ -100,7 +96,7 @@ def _cells(drawn: Drawn, direction: Direction, width_mm: float) -> tuple[Any, An
     """Return figure and panel with the cells below a ceiling, the path, and a bar of the heights."""
     colours, mappable = height_colours(drawn)
     width_px = int(width_mm * MM * DPI * (1 - BAR_SHARE))
-    rendering = render(drawn.below_ceiling, colours, drawn.voxel_size, direction, width_px, width_px)
+    rendering = render(drawn.below_ceiling, colours, drawn.voxel_size, direction, width_px, width_px, drawn.occlusion)
     left, right, bottom, top = rendering.extent
     figure, axis = _figure(width_mm, (top - bottom) / (right - left) * (1 - 2 * BAR_SHARE))
     axis.imshow(rendering.image, extent=rendering.extent, interpolation="antialiased")
@@ -127,7 +123,7 @@ def _layer(voxel_map: VoxelMap, one: Layer, width_mm: float) -> Any:
         axis.add_collection(
             PolyCollection(list(corners), facecolor=STATE_COLOURS[state], edgecolor=STATE_COLOURS[state], linewidth=0.1)
         )
-    path = turned(_path(voxel_map), one.across)
+    path = turned(camera_path(voxel_map), one.across)
     if len(path):
         axis.plot(*path[:, :2].T, color=PATH_COLOUR, linewidth=PATH_PT)
     axis.set(xlim=one.extent[:2], ylim=one.extent[2:], aspect="equal")

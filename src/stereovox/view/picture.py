@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stereovox.maps import VoxelMap
-from stereovox.view.drawn import Drawn, upright
+from stereovox.view.drawn import Drawn, camera_path, upright
 from stereovox.view.figures import DPI, WIDTH, figure_of, headline, keep_clear, save
 from stereovox.view.panels import GREY, measured, oblique, slice_, title, view
 from stereovox.view.render import Direction, extent
@@ -18,6 +18,8 @@ from stereovox.view.render import Direction, extent
 LONG = 1.8
 """A map this many times longer than wide runs across the whole page."""
 HEIGHT_COLOURS = "viridis"
+DARKEST, PALE = 0.1, 0.24
+"""Share of these colours left out at the dark end, and of white mixed in: shading and dark pages need the room."""
 TOP = Direction.of(-90, 90)
 
 
@@ -31,24 +33,33 @@ def picture(
 ) -> None:
     """Write a PNG of a map: top view, three oblique views coloured by height, and a slice with all four states.
 
-    trajectory: camera positions (N, 3) in metres, drawn as a line. up: the map's axis that points up (`z`, `-y`, ...).
-    A ceiling is hidden. An empty map gives a picture that says so. Raises StereovoxError for an invalid `up`, a name
-    that does not end in .png or a file that cannot be written.
+    trajectory: camera positions (N, 3) in metres, drawn as a line; by default the path that the map remembers, and none
+    where it is empty. up: the map's axis that points up (`z`, `-y`, ...). A ceiling is hidden. An empty map gives a
+    picture that says so. Raises StereovoxError for an invalid `up`, a name that does not end in .png or a file that
+    cannot be written.
     """
     save(draw(voxel_map, heading=title or "Occupancy map", trajectory=trajectory, up=up), path)
 
 
 def draw(voxel_map: VoxelMap, *, heading: str, trajectory: ArrayLike | None = None, up: str = "z") -> Any:
     """Return the matplotlib figure that `picture` saves."""
-    drawn = upright(voxel_map, trajectory, up)
+    drawn = upright(voxel_map, camera_path(voxel_map) if trajectory is None else trajectory, up)
     if not len(drawn.cells):
         figure = _note("This map is empty: no cell is known yet.")
     elif not len(drawn.below_ceiling):
         figure = _only_slice(drawn)
     else:
         figure = _page(drawn)
-    headline(figure, voxel_map, heading)
+    headline(figure, voxel_map, heading, _about_path(drawn))
     return figure
+
+
+def _about_path(drawn: Drawn) -> list[str]:
+    """Return a fact for the headline: what the line is, and how long."""
+    if drawn.path is None or not np.isfinite(drawn.path).any():
+        return []
+    length = np.nansum(np.linalg.norm(np.diff(drawn.path, axis=0), axis=1))
+    return [f"red: the camera's path, {length:.1f} m, from dot to square"]
 
 
 def _note(text: str) -> Any:
@@ -68,6 +79,9 @@ def _only_slice(drawn: Drawn) -> Any:
 
 def _page(drawn: Drawn) -> Any:
     solid = drawn.below_ceiling
+    if drawn.path is not None:  # what the panels must hold besides
+        there = drawn.path[np.isfinite(drawn.path).all(axis=1)]
+        solid = np.concatenate([solid, np.floor(there / drawn.voxel_size).astype(np.int32)])
     across, away = np.ptp(extent(solid, 1.0, TOP), axis=0)
     lay_out = _long_page if across > LONG * away else _square_page
     figure, spots, directions = lay_out(solid, away / across)
@@ -140,5 +154,5 @@ def height_scale(height: NDArray[np.floating], voxel_size: float) -> Any:
     from matplotlib.colors import ListedColormap, Normalize
 
     low, high = np.percentile(height, [0.5, 99.5]) if len(height) else (0.0, 0.0)
-    table = colormaps[HEIGHT_COLOURS](np.linspace(0, 1, 256))[:, :3] * 0.84 + 0.16
+    table = colormaps[HEIGHT_COLOURS](np.linspace(DARKEST, 1, 256))[:, :3] * (1 - PALE) + PALE
     return ScalarMappable(Normalize(low - voxel_size / 2, high + voxel_size / 2), ListedColormap(table))

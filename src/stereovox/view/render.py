@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox.evaluate.cells import keys, position
+from stereovox.view.shading import Occlusion
 
-LIGHT = {"top": 1.0, "x": 0.80, "y": 0.62}
-"""Brightness of the faces perpendicular to each axis."""
+LIGHT = {"top": 1.0, "x": 0.84, "y": 0.70}
+"""Brightness of the faces perpendicular to each axis, before ambient occlusion."""
 _SUPERSAMPLING = 2
 _MAX_WRITES = 60_000_000
 _MAX_CELL_PX = 20
@@ -58,13 +58,15 @@ class Rendering:
     def hidden(self, flat: NDArray[np.float64], toward: NDArray[np.float64], slack: float) -> NDArray[np.bool_]:
         """Return which points lie behind cells: picture coordinates (N, 2), and metres towards the viewer (N,).
 
-        slack: metres by which a cell's centre may be nearer before the cell counts as in front.
+        NaN is behind nothing. slack: metres by which a cell's centre may be nearer before the cell counts as in front.
         """
         left, right, bottom, top = self.extent
         rows, columns = self.near.shape
+        there = np.isfinite(toward)
+        flat = np.where(there[:, None], flat, [left, top])
         column = np.floor((flat[:, 0] - left) / (right - left) * columns).astype(int)
         row = np.floor((top - flat[:, 1]) / (top - bottom) * rows).astype(int)
-        inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
+        inside = there & (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
         found = np.zeros(len(flat), bool)
         found[inside] = self.near[row[inside], column[inside]] > toward[inside] + slack
         return found
@@ -77,11 +79,16 @@ def render(
     direction: Direction,
     width_px: int,
     height_px: int,
+    occlusion: Occlusion | None = None,
 ) -> Rendering:
-    """Draw `cells` (N, 3) in `colours` (N, 3) as large as fits an image of this size; N > 0."""
+    """Draw `cells` (N, 3) in `colours` (N, 3) as large as fits an image of this size; N > 0.
+
+    occlusion: that of `cells`, for several views of the same ones.
+    """
     order = np.argsort((cells + 0.5) @ direction.toward, kind="stable")
+    light = _lit(occlusion or Occlusion(cells), direction)[order]
     cells, colours = cells[order], colours[order]
-    faces = [_exposed(cells, axis, direction) for axis in range(3)]
+    faces = [np.flatnonzero(light[:, axis]) for axis in range(3)]
     low, high = extent(cells, voxel_size, direction)
     scale = float(min(width_px / (high[0] - low[0]), height_px / (high[1] - low[1]), _MAX_CELL_PX / voxel_size))
     area = sum(len(face) for face in faces) * (scale * voxel_size) ** 2
@@ -91,7 +98,7 @@ def render(
         canvas.draw(cells[face], face * 3 + axis, axis, voxel_size, direction)
     depth = (cells + 0.5) @ direction.toward * voxel_size
     near = np.where(canvas.front >= 0, depth[np.maximum(canvas.front, 0) // 3], -np.inf).astype(np.float32)
-    image = _shade(canvas.front, near, colours.astype(np.float32), voxel_size)
+    image = _shade(canvas.front, near, colours.astype(np.float32), light, voxel_size)
     return Rendering(_reduced(image, finer), (low[0], high[0], low[1], high[1]), near)
 
 
@@ -127,13 +134,14 @@ class _Canvas:
             np.maximum.at(self.front.ravel(), y * width + x, numbers)
 
 
-def _exposed(cells: NDArray[np.integer], axis: int, direction: Direction) -> NDArray[np.int64]:
-    """Return which cells have no neighbour on the side of `axis` that looks at the viewer."""
-    if abs(direction.toward[axis]) < 1e-6:
-        return np.zeros(0, np.int64)
-    step = np.zeros(3, np.int64)
-    step[axis] = np.sign(direction.toward[axis])
-    return np.flatnonzero(position(keys(cells + step), np.sort(keys(cells))) < 0)
+def _lit(occlusion: Occlusion, direction: Direction) -> NDArray[np.float32]:
+    """Return the brightness (N, 3) of each cell's three faces that look at the viewer, 0 where one cannot be seen."""
+    light = []
+    for axis, name in enumerate(("x", "y", "top")):
+        edge_on = abs(direction.toward[axis]) < 1e-6
+        side = int(np.sign(direction.toward[axis]))
+        light.append(LIGHT[name] * occlusion.brightness(axis, side) * (not edge_on))
+    return np.stack(light, axis=1).astype(np.float32)
 
 
 def extent(cells: NDArray[np.integer], voxel_size: float, direction: Direction) -> NDArray[np.float64]:
@@ -161,13 +169,16 @@ def _pattern(sides: NDArray[np.float64]) -> NDArray[np.int64]:
 
 
 def _shade(
-    front: NDArray[np.int32], near: NDArray[np.float32], colours: NDArray[np.float32], voxel_size: float
+    front: NDArray[np.int32],
+    near: NDArray[np.float32],
+    colours: NDArray[np.float32],
+    light: NDArray[np.float32],
+    voxel_size: float,
 ) -> NDArray[np.float32]:
-    light = np.array([LIGHT["x"], LIGHT["y"], LIGHT["top"]], np.float32)
     drawn = front >= 0
     cell, side = np.divmod(np.maximum(front, 0), 3)
     image = np.zeros((*front.shape, 4), np.float32)
-    image[..., :3] = colours[cell] * (light[side] * _contour(near, voxel_size))[..., None]
+    image[..., :3] = colours[cell] * (light[cell, side] * _contour(near, voxel_size))[..., None]
     image[..., 3] = drawn
     image[~drawn] = 0
     return image

@@ -132,7 +132,7 @@ def draw_cells(figure: Any, axis: Any, drawn: Drawn, lines: NDArray[np.float64] 
     colours, mappable = height_colours(drawn)
     direction = Direction.of(_azimuth(lines), ABOVE_DEG)
     width_px = int(0.85 * WIDTH * DPI)
-    rendering = render(drawn.below_ceiling, colours, drawn.voxel_size, direction, width_px, width_px)
+    rendering = render(drawn.below_ceiling, colours, drawn.voxel_size, direction, width_px, width_px, drawn.occlusion)
     axis.imshow(rendering.image, extent=rendering.extent, interpolation="antialiased", zorder=2)
     corners = [drawn.below_ceiling.min(0) * drawn.voxel_size, (drawn.below_ceiling.max(0) + 1) * drawn.voxel_size]
     corners = np.concatenate([corners, *([] if lines is None else [lines.reshape(-1, 3)])])

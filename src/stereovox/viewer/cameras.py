@@ -79,8 +79,7 @@ def add_camera(server: ViserServer, viewpoint: Viewpoint, reach_m: float) -> Fra
 
 def add_path(server: ViserServer, voxel_map: VoxelMap) -> None:
     """Add a line along the path of each sensor; remove those that the map no longer has."""
-    path = voxel_map.history.path
-    lines = [np.stack([p[:-1, :3, 3], p[1:, :3, 3]], axis=1) for p in map(path.poses, path.stops)]
+    lines = [np.stack([line[:-1], line[1:]], axis=1) for line in voxel_map.history.path.lines()]
     segments = np.concatenate([np.empty((0, 2, 3)), *lines])
     if len(segments):
         server.scene.add_line_segments("/path/line", segments, rgb(PATH_COLOUR), thickness=3, thickness_units="screen")

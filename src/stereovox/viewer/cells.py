@@ -16,6 +16,7 @@ from stereovox.view.drawn import stood_up
 from stereovox.view.panels import STATE_COLOURS
 from stereovox.view.picture import height_scale
 from stereovox.view.scale import COLOURS
+from stereovox.view.shading import Occlusion
 from stereovox.viewer.chunks import MAX_CELLS, Chunks, Draws
 
 if TYPE_CHECKING:
@@ -29,6 +30,11 @@ BESIDE = np.concatenate([np.eye(3, dtype=np.int32), -np.eye(3, dtype=np.int32)])
 FREE_COLOUR, UNKNOWN_COLOUR = "#6fa8dc", "#9b7fc4"
 DOT = 0.12
 """Side of the squares that show cells that are not occupied, in cells: small, so that one can see through."""
+RADII = ((2, 0.4), (4, 1.0))
+"""Radii and weights of the ambient occlusion of a cell."""
+MAX_SHADED = 1_000_000
+"""Most cells whose ambient occlusion is worth the wait."""
+GAMMA = 2.2
 LABELS = {
     State.OCCUPIED: "occupied",
     State.TENTATIVE: "tentative",
@@ -88,6 +94,13 @@ def colours_of(values: NDArray[np.floating], colour: str, voxel_size: float) -> 
         return ScalarMappable(Normalize(0, 1), LinearSegmentedColormap.from_list(PROBABILITY, COLOURS))
     low, high = (float(known.min()), float(known.max())) if len(known) else (0.0, 1.0)
     return ScalarMappable(Normalize(low, max(high, low + 1e-3)), colormaps[AGES].with_extremes(bad=TIMELESS))
+
+
+def shaded(cells: NDArray[np.int32], colours: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return the colours (N, 3) of cells (N, 3), darker in corners and gaps; of very many cells as they are."""
+    if len(cells) > MAX_SHADED:
+        return colours
+    return (colours * Occlusion(cells, RADII).mean()[:, None]).astype(np.uint8)
 
 
 class Cells:
@@ -174,6 +187,7 @@ class Cells:
         colours = np.empty((0, 3), np.uint8)
         if self.scale is not None:
             colours = self.scale.to_rgba(np.ma.masked_invalid(values[shown]), bytes=True)[:, :3]
+            colours = shaded(self.solid, colours)
         self.kinds[State.OCCUPIED].show(self.solid, colours, self._eyes())
 
     def _show_dots(self, state: State) -> None:
@@ -213,12 +227,17 @@ def add_cubes(
         FACES,
         batched_wxyzs=np.tile(np.array([1, 0, 0, 0], np.float32), (len(centres), 1)),
         batched_positions=centres.astype(np.float32),
-        batched_colors=colours,
+        batched_colors=linear(colours),
         lod="off",  # a cube with fewer triangles is no cube
         flat_shading=True,
         cast_shadow=False,
         receive_shadow=False,
     )
+
+
+def linear(colours: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Return sRGB colours (N, 3) as shares of light: the page takes those of batched meshes so, and bleaches others."""
+    return np.rint(255 * (colours / 255) ** GAMMA).astype(np.uint8)
 
 
 def add_points(

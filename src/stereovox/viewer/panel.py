@@ -11,10 +11,12 @@ from numpy.typing import NDArray
 
 from stereovox.maps import VoxelMap
 from stereovox.view.axis import draw_profile
-from stereovox.view.panels import GREY
 
 WIDTH_IN, DPI = 4.8, 180
 """Width of the panel's pictures in inches, relative to text size, and pixels per inch."""
+
+BOTH = "#7d8695"
+"""A grey that is legible on white and on black."""
 
 
 def statistics(voxel_map: VoxelMap) -> str:
@@ -44,15 +46,19 @@ def plain(text: str) -> str:
 
 
 def colour_bar(scale: Any, label: str, limits: tuple[float, float] | None = None) -> NDArray[np.uint8]:
-    """Return a picture (H, W, 3) of a colour bar for a matplotlib mappable; `limits`: its ends."""
-    figure = _figure(0.8)
+    """Return a picture (H, W, 4) of a colour bar for a matplotlib mappable, legible on light and dark pages.
+
+    limits: its ends.
+    """
+    figure = _figure(0.8, "none")
     bar = figure.colorbar(scale, cax=figure.add_subplot(), orientation="horizontal")
     if limits is not None:
         bar.ax.set_xlim(limits)
-    bar.set_label(label, color=GREY)
-    bar.ax.tick_params(colors=GREY)
+    bar.set_label(label, color=BOTH)
+    bar.ax.tick_params(colors=BOTH)
     bar.outline.set_visible(False)
-    return _pixels(figure)
+    figure.canvas.draw()
+    return np.asarray(figure.canvas.buffer_rgba()).copy()
 
 
 def axis_chart(voxel_map: VoxelMap) -> NDArray[np.uint8]:
@@ -70,11 +76,11 @@ def axis_chart(voxel_map: VoxelMap) -> NDArray[np.uint8]:
     return _pixels(figure)
 
 
-def _figure(height: float) -> Any:
+def _figure(height: float, page: str = "white") -> Any:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure((WIDTH_IN, height), dpi=DPI, facecolor="white", layout="constrained")
+    figure = Figure((WIDTH_IN, height), dpi=DPI, facecolor=page, layout="constrained")
     FigureCanvasAgg(figure)
     return figure
 

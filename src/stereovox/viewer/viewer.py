@@ -7,9 +7,11 @@ import threading
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stereovox.errors import StereovoxError
 from stereovox.maps import VoxelMap
+from stereovox.products.floor_axes import upright_axes
 from stereovox.view.drawn import checked_up
 from stereovox.viewer.cameras import Cameras, as_tuple, first_look, up_vector
 from stereovox.viewer.cells import Cells
@@ -20,11 +22,32 @@ from stereovox.viewer.panel import axis_chart, colour_bar, plain, statistics
 from stereovox.viewer.serve import HERE, PORT, Guard, checked_token, find_address, new_token, serve, stop, url_of
 
 if TYPE_CHECKING:
-    from viser import ViserServer
+    from viser import ClientHandle, ViserServer
 
 GROWTH, SHIFT, MOVED = 1.2, 0.1, 0.01
 """A viewpoint follows a map that grew by this factor, or whose centre shifted by this share of the distance, unless the
 user moved it by more than the last share."""
+
+
+AMBIENT = 1.1
+LIGHTS = ((-0.35, -0.6, 1.0, 2.2), (0.8, 0.35, 0.25, 0.7))
+"""Right, away and up of the directions that light comes from, and how much."""
+PEEK = """<style>
+@media (max-width: 36em) {
+  div[style*="position: fixed"][style*="width: 20em"] { width: 100% !important; max-height: 11em !important; }
+  div[style*="position: fixed"][style*="width: 20em"]:is(:hover, :focus-within) { max-height: 60% !important; }
+  div[style*="position: fixed"] div[style*="width: 20em"] { width: 100% !important; }
+}
+</style>"""
+"""On a phone the controls show little more than the colour bar until they are touched: they lie over the map."""
+
+
+WIDE_ENOUGH = 0.8
+"""Width over height of a page that shows a whole map from the usual distance."""
+BEFORE = (3.0, 3.0, 3.0)
+"""Where the camera of a page stands before it learns of the initial viewpoint."""
+NARROW_PX = 480
+"""Narrower maps have no room for the controls beside them."""
 
 
 class Viewer:
@@ -45,8 +68,10 @@ class Viewer:
         self._name, self._map, self._up = name, voxel_map, up
         _dress(server)
         server.scene.set_up_direction(as_tuple(up_vector(up)))
+        _light(server, up)
         self._eye, self._middle, self._distance = np.zeros(3), np.zeros(3), 0.0
         self.follow()
+        server.on_client_connect(self._welcome)
         self.cells = Cells(server, voxel_map, up, most_cells)
         self._legend = _Legend(server)
         self.layer = LayerPlane(server, voxel_map, up)
@@ -95,10 +120,25 @@ class Viewer:
             return
         cameras = [client.camera for client in self.server.get_clients().values()]
         if self._distance:
-            cameras = [one for one in cameras if np.linalg.norm(one.position - self._eye) < MOVED * self._distance]
+            near = MOVED * self._distance
+            cameras = [one for one in cameras if np.linalg.norm(one.position - self._stand(one.aspect)) < near]
         self._eye, self._middle, self._distance = look_from, look_at, distance
-        for camera in (self.server.initial_camera, *cameras):
-            camera.position, camera.look_at = as_tuple(look_from), as_tuple(look_at)
+        self.server.initial_camera.position, self.server.initial_camera.look_at = as_tuple(look_from), as_tuple(look_at)
+        for camera in cameras:
+            camera.position, camera.look_at = as_tuple(self._stand(camera.aspect)), as_tuple(look_at)
+
+    def _stand(self, aspect: float) -> NDArray[np.float64]:
+        """Return the viewpoint (3,) in metres for a page of this width over height: high ones stand farther off."""
+        return self._middle + (self._eye - self._middle) * max(1.0, WIDE_ENOUGH / max(aspect, 0.1))
+
+    def _welcome(self, client: ClientHandle) -> None:
+        """Show a new visitor with a small screen the whole map, with the controls folded away."""
+        camera = client.camera
+        if camera.image_width < NARROW_PX:
+            client.gui.main_panel.minimize()
+        new = min(np.linalg.norm(camera.position - place) for place in (self._eye, BEFORE)) < MOVED * self._distance
+        if new and camera.aspect < WIDE_ENOUGH:
+            camera.position, camera.look_at = as_tuple(self._stand(camera.aspect)), as_tuple(self._middle)
 
     def _show_statistics(self) -> None:
         self._statistics.content = f"**{plain(self._name)}**\n\n{statistics(self._map)}"
@@ -113,7 +153,7 @@ class _Legend:
 
     def __init__(self, server: ViserServer):
         blank = np.full((1, 1, 3), 255, np.uint8)
-        with server.gui.add_folder("Legend"):
+        with server.gui.add_folder("Legend", order=0.2):
             self._cells, self._slice = (server.gui.add_image(blank, format="png", visible=False) for _ in range(2))
         self._explained: Any = None
 
@@ -170,8 +210,19 @@ def open_viewer(
 def _dress(server: Any) -> None:
     server.request_share_url = lambda *_, **__: None  # else any page in the browser could ask it to publish the map
     server.scene.configure_environment_map(hdri=None)  # its reflections make all heights look alike
-    server.scene.add_light_ambient("/light", intensity=1.5)
+    server.gui.main_panel.dock_right()  # beside the map, not over it
+    server.gui.add_html(PEEK)
     _theme(server, False)
+
+
+def _light(server: ViserServer, up: str) -> None:
+    """Light the sides of cells differently, so that shapes show; the lights of the page itself bleach colours."""
+    server.scene.configure_default_lights(False)
+    server.scene.add_light_ambient("/light/ambient", intensity=AMBIENT)
+    right, away, upwards = upright_axes(up)
+    for n, (x, y, z, intensity) in enumerate(LIGHTS):
+        place = x * right + y * away + z * upwards
+        server.scene.add_light_directional(f"/light/{n}", intensity=intensity, position=as_tuple(place))
 
 
 def _theme(server: ViserServer, dark: bool) -> None:

@@ -223,7 +223,7 @@ def test_eyes_that_cannot_be():
     swapped[0, 3] = -0.148
     with pytest.raises(StereovoxError, match="exchange the eyes"):
         Eyes(NARROW, OTHER, swapped)
-    with pytest.raises(StereovoxError, match="no rigid motion"):
+    with pytest.raises(StereovoxError, match="not a rigid motion"):
         Eyes(NARROW, OTHER, 2 * np.eye(4))
 
 

@@ -425,7 +425,7 @@ def fails(*_):
     [
         (a_peer(insert=None), "peer 'toys:Toy' has no insert; it needs insert or insert_image, counts and bytes"),
         (a_peer(counts=None, bytes=None), "peer 'toys:Toy' has no counts and no bytes; "),
-        (3, "peer 'toys:Toy' is no class but int; write module:Class"),
+        (3, "peer 'toys:Toy' is not a class but int; write module:Class"),
         (a_peer(__init__=lambda self: None), "peer 'toys:Toy' cannot be made: TypeError: "),
         (a_peer(__init__=fails), "peer 'toys:Toy' cannot be made: RuntimeError: no more of this"),
     ],

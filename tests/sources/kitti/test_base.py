@@ -13,7 +13,7 @@ from made_recordings import png_bytes
 from stereovox.errors import FrameRefused, SourceError
 from stereovox.opening import SOURCES, open_source
 from stereovox.registry import find
-from stereovox.se3 import transform_points
+from stereovox.se3 import inverse, transform_points
 from stereovox.sources.lidar import LidarSource
 
 LAYOUTS = {
@@ -202,6 +202,41 @@ def test_odometry_takes_another_pose_file(tmp_path):
         open_source(sequence)
     source = open_source(f"{sequence}?poses={tmp_path}/slam.txt")
     np.testing.assert_allclose(source.viewpoint(2).T_world_camera, made.cam0_pose(2), atol=1e-6)
+
+
+def test_poses_of_other_forms_in_other_axes(tmp_path):
+    sequence = made.odometry(tmp_path)
+    opengl = [made.file_pose(n) @ np.diag([1.0, -1, -1, 1]) for n in range(4)]
+    text = "".join(f"{n} {n} {n + 1}\n{chr(10).join(made.row(line) for line in T)}\n" for n, T in enumerate(opengl))
+    (tmp_path / "trajectory.log").write_text(text)
+    (tmp_path / "inverse.txt").write_text("".join(made.row(inverse(made.file_pose(n))[:3]) + "\n" for n in range(4)))
+    (tmp_path / "tum.txt").write_text("".join(f"{0.1 * n} {n} 0 5 0 0 0 1\n" for n in range(4)))
+    for query in ("trajectory.log&axes=opengl", "inverse.txt&invert=1"):
+        source = open_source(f"{sequence}?poses={tmp_path}/{query}")
+        np.testing.assert_allclose(source.viewpoint(3).T_world_camera, made.cam0_pose(3), atol=1e-5)
+    source = open_source(f"{sequence}?poses={tmp_path}/tum.txt")
+    np.testing.assert_allclose(source.viewpoint(3).T_world_camera[:3, 3], [0, -3, 0], atol=1e-9)
+    (tmp_path / "tum.txt").write_text("70 0 0 5 0 0 0 1\n71 0 0 5 0 0 0 1\n")
+    with pytest.raises(SourceError, match=r"tum\.txt: poses from 70.* no time in common"):
+        open_source(f"{sequence}?poses={tmp_path}/tum.txt")
+
+
+def test_odometry_without_a_list_of_times(tmp_path):
+    sequence = made.odometry(tmp_path)
+    (sequence / "times.txt").unlink()
+    source = open_source(sequence)
+    assert [frame.stamp_ns for frame in source] == [0, 100_000_000, 200_000_000, 300_000_000]
+    assert "has no times.txt: assuming 10 frames a second" in source.notes[0]
+    assert open_source(f"{sequence}?fps=20").stamp_ns(3) == 150_000_000
+    assert open_source(f"{made.tracking(tmp_path / 't')}?fps=20").stamp_ns(3) == 150_000_000
+
+
+def test_an_odometry_folder_that_lacks_its_calibration(tmp_path):
+    sequence = made.odometry(tmp_path)
+    for name in ("times.txt", "calib.txt"):
+        (sequence / name).unlink()
+    with pytest.raises(SourceError, match=r"has left images .* but no calib\.txt; copy it from the data set"):
+        open_source(sequence)
 
 
 def test_scenes_of_stereo_2015_stand_each_in_its_own_world(tmp_path):

@@ -173,7 +173,7 @@ def _class_in(name: str) -> PeerClass:
 def _check_class(name: str, kind: Any) -> None:
     """Raise ConfigError for what is no class, or one that lacks a method."""
     if not isinstance(kind, type):
-        raise ConfigError(f"peer '{name}' is no class but {type(kind).__name__}; write module:Class")
+        raise ConfigError(f"peer '{name}' is not a class but {type(kind).__name__}; write module:Class")
     wanted = ("insert_image" if hasattr(kind, "insert_image") else "insert", "counts", "bytes")
     lacking = [method for method in wanted if not callable(getattr(kind, method, None))]
     if lacking:

@@ -249,7 +249,7 @@ class FreeFloor:
         self._free = np.flatnonzero(states == State.FREE).astype(np.uint32)
         for state, count in (("free", len(self._free)), ("occupied", int((states == State.OCCUPIED).sum()))):
             if not count:
-                raise MapFileError(f"the map has no {state} cell: nobody can be localised in it; give a finished map")
+                raise MapFileError(f"the map has no {state} cell: no robot can be localised in it; give a finished map")
 
     def anywhere(self, count: int, rng: np.random.Generator) -> se2.Pose:
         """Draw (count, 3) poses uniformly over all free cells and directions."""

@@ -233,8 +233,8 @@ def _check_extent(poses: se2.Pose, cell: float) -> None:
     span = float(np.ptp(poses[:, :2], axis=0).max())
     if span > MAX_CELLS * cell:
         raise StereovoxError(
-            f"the robot's way spans {span:.0f} m, more than {MAX_CELLS} cells of {cell:g} m; does its odometry jump? "
-            "Else set slam.voxel_size larger"
+            f"the robot's trajectory spans {span:.0f} m, more than {MAX_CELLS} cells of {cell:g} m; does its odometry "
+            "jump? Else set slam.voxel_size larger"
         )
 
 

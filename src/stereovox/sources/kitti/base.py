@@ -17,7 +17,6 @@ from stereovox.errors import FrameRefused, SourceError, did_you_mean
 from stereovox.frame import StereoFrame, Viewpoint
 from stereovox.safe_io import MAX_LIST, read_text
 from stereovox.se3 import Transform, inverse
-from stereovox.sources import parameters
 from stereovox.sources.base import Source
 from stereovox.sources.images import PICTURE_KINDS, common_size, file_names, read_picture_png
 from stereovox.sources.kitti.calibration import KittiCalibration
@@ -122,18 +121,6 @@ class KittiSource(Source, ABC):
         return size
 
 
-def location(where: str | os.PathLike[str], known: dict[str, str]) -> tuple[Path, dict[str, str]]:
-    """Return the folder in `FOLDER?key=value` and its parameters, with the defaults in `known`.
-
-    Raises SourceError for an unknown or incomplete parameter.
-    """
-    try:
-        folder, given = parameters.split(os.fspath(where))
-        return Path(folder), {**known, **parameters.typed(given, known)}
-    except SourceError as error:
-        raise SourceError(f"{where}: {error}") from None
-
-
 def time_lines(path: Path, whose: str) -> list[str]:
     """Return the stripped lines of a file of times; raises SourceError where there is none."""
     try:
@@ -143,11 +130,6 @@ def time_lines(path: Path, whose: str) -> list[str]:
     if not lines:
         raise SourceError(f"{path}: holds no time; put the {whose}'s own file there")
     return [line.strip() for line in lines]
-
-
-def folder_of(where: str) -> str:
-    """Return the part before the parameters; never raises."""
-    return where.partition("?")[0]
 
 
 def choose_pair(where: Path, camera: str, present: dict[str, bool]) -> tuple[int, int]:

@@ -8,55 +8,67 @@ import re
 from pathlib import Path
 
 from stereovox.errors import SourceError
+from stereovox.sources.base import Part
 from stereovox.sources.kitti.base import (
     PAIRS,
     KittiSource,
     choose_pair,
-    folder_of,
-    location,
     named_file,
     numbers_in,
     time_lines,
 )
 from stereovox.sources.kitti.calibration import KittiCalibration, read_calibration
-from stereovox.sources.kitti.poses import read_pose_file
+from stereovox.sources.kitti.poses import read_named_poses
+from stereovox.sources.rgbd.folder import folder_part
+from stereovox.sources.rig_options import POSES, folder_and_options
 from stereovox.sources.trajectory import ns_from_seconds
 
 IMAGE = re.compile(r"(\d{6})\.png")
 CALIBRATION, TIMES = "calib.txt", "times.txt"
+FPS, SECOND_NS = 10.0, 1_000_000_000
 
 
 class KittiOdometry(KittiSource):
     """A folder `sequences/00` with image_0 and image_1 (grey) or image_2 and image_3 (colour), calib.txt, times.txt.
 
-    where: the folder, or with parameters `sequences/00?camera=colour&poses=FILE`:
+    where: the folder, or with options `sequences/00?camera=colour&poses=FILE`:
         camera: `grey` or `colour`; without it grey where there are such images.
-        poses: a file of 3x4 matrices T_world_cam0 line by line; without it `poses/00.txt` beside `sequences`, which
-            the benchmark publishes for 00 to 10 only.
+        poses: a file of T_world_cam0 of any form (see `rgbd.pose_files`); without it `poses/00.txt` beside `sequences`,
+            which the benchmark publishes for 00 to 10 only.
+        axes: of the camera they are of, `optical` (without it), `opengl` or `ros`. invert: 1 for world to camera.
+        fps: frames a second where there is no times.txt, 10 without it.
     Time: times.txt, seconds since the first frame; every line is a frame. Scans (`velodyne/`) are untwisted there.
     World and faults: see `KittiSource`. Raises SourceError for what is missing as a whole.
     """
 
     layout = "a KITTI odometry sequence (sequences/00 with image_0, image_1, calib.txt and times.txt)"
 
+    parts = (
+        Part(("image_0", "image_2"), "left images (image_0)"),
+        Part(("image_1", "image_3"), "right images (image_1)"),
+        Part((CALIBRATION,), CALIBRATION, "copy it from the data set, with lines 'P0: 12 numbers' to 'P3:'"),
+    )
+
     def __init__(self, where: str | os.PathLike[str]):
-        self.folder, options = location(where, {"camera": "", "poses": ""})
+        self.folder, options = folder_and_options(where, {"camera": "", "fps": 0.0, **POSES})
         sequence = self.folder.resolve().name
         self.name = f"kitti_odometry_{sequence}"
         self.eyes = choose_pair(self.folder, options["camera"], {name: _has(self.folder, name) for name in PAIRS})
         self.calibration: KittiCalibration = read_calibration(self.folder / CALIBRATION)
-        self._stamps = _stamps(self.folder / TIMES)
+        self._stamps = self._times(options["fps"])
         self._check_numbers()
         self.camera = self.calibration.camera(*self.eyes, self._size())
         usual = self.folder.resolve().parents[1] / "poses" / f"{sequence}.txt"
         path = named_file(options["poses"], self.folder) if options["poses"] else usual
-        self.poses = read_pose_file(path, len(self))
+        self.poses = read_named_poses(path, self._stamps, options["axes"], options["invert"])
 
     @classmethod
     def recognises(cls, where: str) -> bool:
-        """Return whether `where` is a folder with the times and an image pair as in KITTI odometry."""
-        folder = Path(folder_of(where))
-        return os.path.isfile(folder / TIMES) and any(_has(folder, name) for name in PAIRS)
+        """Return whether `where` is a folder with an image pair and times or a calibration as in KITTI odometry."""
+        folder = Path(folder_part(where))
+        return any(os.path.isfile(folder / name) for name in (TIMES, CALIBRATION)) and any(
+            _has(folder, name) for name in PAIRS
+        )
 
     def __len__(self) -> int:
         return len(self._stamps)
@@ -73,6 +85,19 @@ class KittiOdometry(KittiSource):
     def velodyne(self, i: int) -> Path:
         """Return the scan's file of frame `i`."""
         return self.folder / "velodyne" / f"{i:06d}.bin"
+
+    def _times(self, fps: float) -> list[int]:
+        """Return the times of all frames in nanoseconds; from numbers where there is no list or `fps` is given."""
+        if not fps and os.path.isfile(self.folder / TIMES):
+            return _stamps(self.folder / TIMES)
+        folder = self.folder / f"image_{self.eyes[0]}"
+        numbers = numbers_in(folder, IMAGE)
+        if not numbers:
+            raise SourceError(f"{folder}: no 000000.png in it; give a folder with images")
+        if not fps:
+            fps = FPS
+            self.notes = (f"{self.folder} has no {TIMES}: assuming {fps:g} frames a second; else add ?fps=",)
+        return [int(i * SECOND_NS / fps) for i in range(int(numbers[-1]) + 1)]
 
     def _check_numbers(self) -> None:
         numbers = numbers_in(self.folder / f"image_{self.eyes[0]}", IMAGE)

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,6 +14,9 @@ from numpy.typing import NDArray
 from stereovox.errors import FrameRefused, SourceError
 from stereovox.safe_io import MAX_LIST, read_text
 from stereovox.se3 import Transform, inverse, orthonormalise, rigidity_error
+from stereovox.sources.poses import Poses
+from stereovox.sources.rgbd.pose_files import in_optical_axes
+from stereovox.sources.rig_options import poses_of_images
 
 EARTH_RADIUS = 6378137.0
 """Metres, as KITTI's own development kit has it."""
@@ -70,6 +74,37 @@ def read_pose_file(path: Path, frames: int) -> FramePoses:
     """
     lines = _frame_lines(path, frames)
     return FramePoses([_pose(line, f"{path}:{n}") for n, line in enumerate(lines, 1)], str(path))
+
+
+def read_named_poses(path: Path, stamps_ns: Sequence[int], axes: str = "", inverted: bool = False) -> FramePoses:
+    """Return the poses of camera 0 in a file or folder that an option names, one for each of the times `stamps_ns`.
+
+    Twelve numbers a line are read as `read_pose_file` does, any other form as `poses_of_images`. axes: of the posed
+    camera, `optical` where it is empty. inverted: they map the world into the camera. Raises SourceError.
+    """
+    if not os.path.isdir(path) and _is_kitti(path):
+        found = [_pose(line, f"{path}:{n}") for n, line in enumerate(_frame_lines(path, len(stamps_ns)), 1)]
+    else:
+        poses = poses_of_images(path, stamps_ns)
+        found = [_at(poses, stamp) for stamp in stamps_ns]
+    axes = axes or "optical"
+    return FramePoses([T if isinstance(T, str) else in_optical_axes(T, axes, inverted) for T in found], str(path))
+
+
+def _is_kitti(path: Path) -> bool:
+    """Return whether the first line has twelve words, or there is none."""
+    try:
+        lines = read_text(path, MAX_LIST, "replace").split("\n", 1)
+    except OSError:
+        return True  # which says what is wrong
+    return len(lines[0].split()) in (0, 12)
+
+
+def _at(poses: Poses, stamp_ns: int) -> Transform | str:
+    try:
+        return poses.at(stamp_ns)
+    except FrameRefused as refused:
+        return str(refused)
 
 
 def read_oxts_file(path: Path, frames: int, T_cam0_imu: Transform) -> FramePoses:

@@ -10,18 +10,19 @@ from pathlib import Path
 import numpy as np
 
 from stereovox.errors import SourceError
+from stereovox.sources.base import Part
 from stereovox.sources.kitti.base import (
     PAIRS,
     KittiSource,
     choose_pair,
-    folder_of,
-    location,
     named_file,
     numbers_in,
     time_lines,
 )
 from stereovox.sources.kitti.calibration import CAM_TO_CAM, KittiCalibration, read_raw_calibration
-from stereovox.sources.kitti.poses import FramePoses, read_oxts_files, read_pose_file
+from stereovox.sources.kitti.poses import FramePoses, read_named_poses, read_oxts_files
+from stereovox.sources.rgbd.folder import folder_part
+from stereovox.sources.rig_options import POSES, folder_and_options
 
 IMAGE = re.compile(r"(\d{10})\.png")
 REFINED, INS, OXTS = "poses_refined.txt", "poses_ins.txt", "oxts"
@@ -31,30 +32,38 @@ POSE_FILES = {"refined": REFINED, "ins": INS}
 class KittiRaw(KittiSource):
     """A drive folder `2011_09_26_drive_0001_sync`, with the three `calib_*.txt` in the date folder above it.
 
-    where: the folder, or with parameters `DRIVE?camera=colour&poses=oxts`:
+    where: the folder, or with options `DRIVE?camera=colour&poses=oxts`:
         camera: `grey` (image_00 and 01) or `colour` (02 and 03); without it grey where there are such images.
         poses: `refined` (`poses_refined.txt`), `ins` (`poses_ins.txt`), `oxts` (computed from the GPS and inertial
-            packets), or a file of 3x4 matrices T_world_cam0 line by line; without it the first of these there is.
+            packets), or a file of T_world_cam0 of any form (see `rgbd.pose_files`); without it the first of these there
+            is. axes: of the camera they are of, `optical` (without it), `opengl` or `ros`. invert: 1 for world to
+            camera.
     Time: image_0X/timestamps.txt of the left camera, exact to the nanosecond. Every line of it is a frame.
     World and faults: see `KittiSource`. Raises SourceError for what is missing as a whole.
     """
 
     layout = "a KITTI raw drive (image_00 and image_01 with data/*.png; calib_*.txt beside the drive)"
 
+    parts = (
+        Part(("image_00/data", "image_02/data"), "left images (image_00/data)"),
+        Part(("image_01/data", "image_03/data"), "right images (image_01/data)"),
+        Part(("image_0?/timestamps.txt",), "image_00/timestamps.txt"),
+    )
+
     def __init__(self, where: str | os.PathLike[str]):
-        self.folder, options = location(where, {"camera": "", "poses": ""})
+        self.folder, options = folder_and_options(where, {"camera": "", **POSES})
         self.name = self.folder.resolve().name
         self.calibration = _calibration(self.folder)
         self.eyes = choose_pair(self.folder, options["camera"], {name: _has(self.folder, name) for name in PAIRS})
         self._stamps = _stamps(self._eye(0) / "timestamps.txt")
         self._check_numbers()
         self.camera = self.calibration.camera(*self.eyes, self._size())
-        self.poses = self._poses(options["poses"])
+        self.poses = self._poses(options["poses"], options["axes"], options["invert"])
 
     @classmethod
     def recognises(cls, where: str) -> bool:
         """Return whether `where` is a folder with the images of a grey or a colour pair as in KITTI raw."""
-        return any(_has(Path(folder_of(where)), name) for name in PAIRS)
+        return any(_has(Path(folder_part(where)), name) for name in PAIRS)
 
     def __len__(self) -> int:
         return len(self._stamps)
@@ -80,14 +89,14 @@ class KittiRaw(KittiSource):
             path, lines = self._eye(0) / "timestamps.txt", len(self._stamps)
             raise SourceError(f"{path}: has {lines} lines, but there is an image {numbers[-1]}.png; copy it again")
 
-    def _poses(self, choice: str) -> FramePoses:
+    def _poses(self, choice: str, axes: str, inverted: bool) -> FramePoses:
         if not choice:
             there = [kind for kind, name in POSE_FILES.items() if os.path.isfile(self.folder / name)]
             choice = there[0] if there else OXTS
         if choice == OXTS:
             return self._oxts()
         path = self.folder / POSE_FILES[choice] if choice in POSE_FILES else named_file(choice, self.folder)
-        return read_pose_file(path, len(self))
+        return read_named_poses(path, self._stamps, axes, inverted)
 
     def _oxts(self) -> FramePoses:
         c = self.calibration

@@ -14,9 +14,11 @@ from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.cameras.rigs import StereoPair
 from stereovox.errors import FrameRefused, SourceError
 from stereovox.sources.images import PICTURE_KINDS, png_size, read_picture_png
-from stereovox.sources.kitti.base import KittiSource, folder_of, location, numbers_in
+from stereovox.sources.kitti.base import KittiSource, numbers_in
 from stereovox.sources.kitti.calibration import KittiCalibration, from_raw_files, read_calibration
 from stereovox.sources.kitti.poses import StandingPoses
+from stereovox.sources.rgbd.folder import folder_part
+from stereovox.sources.rig_options import folder_and_options
 
 SCENE = re.compile(r"(\d{6})_10\.png")
 LEFT, RIGHT, MOVING = "image_2", "image_3", "obj_map"
@@ -36,7 +38,7 @@ class KittiStereo2015(KittiSource):
     layout = "KITTI stereo 2015 scenes (training with image_2/000000_10.png and image_3)"
 
     def __init__(self, where: str | os.PathLike[str]):
-        self.folder, _ = location(where, {})
+        self.folder, _ = folder_and_options(where, {})
         self.name, self.eyes, self.poses = "kitti_stereo2015", (2, 3), StandingPoses()
         self._scenes = numbers_in(self.folder / LEFT, SCENE)
         if not self._scenes:
@@ -51,7 +53,7 @@ class KittiStereo2015(KittiSource):
     @classmethod
     def recognises(cls, where: str) -> bool:
         """Return whether `where` is a folder with scenes as in KITTI stereo 2015."""
-        folder = Path(folder_of(where))
+        folder = Path(folder_part(where))
         try:
             with os.scandir(folder / LEFT) as entries:
                 return os.path.isdir(folder / RIGHT) and any(SCENE.fullmatch(entry.name) for entry in entries)

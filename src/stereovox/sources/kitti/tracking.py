@@ -15,10 +15,12 @@ import numpy as np
 from stereovox.errors import SourceError
 from stereovox.safe_io import MAX_LIST, read_text
 from stereovox.se3 import Transform
-from stereovox.sources.kitti.base import KittiSource, folder_of, location, named_file, numbers_in
+from stereovox.sources.kitti.base import KittiSource, named_file, numbers_in
 from stereovox.sources.kitti.calibration import KittiCalibration, read_calibration
-from stereovox.sources.kitti.poses import FramePoses, read_oxts_file, read_pose_file
+from stereovox.sources.kitti.poses import FramePoses, read_named_poses, read_oxts_file
 from stereovox.sources.lidar import Box
+from stereovox.sources.rgbd.folder import folder_part
+from stereovox.sources.rig_options import POSES, folder_and_options
 
 FIELDS = 17
 """frame, track, kind, truncated, occluded, alpha, 4 of the 2-D box, h, w, l, x, y, z, rotation_y; perhaps a score."""
@@ -28,37 +30,39 @@ Label = tuple[int, str, tuple[float, ...]]
 IMAGE = re.compile(r"(\d{6})\.png")
 SEQUENCE = re.compile(r"(\d{4})")
 LEFT, RIGHT, OXTS = "image_02", "image_03", "oxts"
-PERIOD_NS = 100_000_000
+FPS, SECOND_NS = 10.0, 1_000_000_000
 
 
 class KittiTracking(KittiSource):
     """One sequence: `training/image_02/0000/000000.png`, image_03, velodyne, oxts, calib, label_02.
 
-    where: `training/image_02/0000`, or `training?sequence=0000`; further parameters:
-        poses: a file of 3x4 matrices T_world_cam0 line by line instead of `oxts/0000.txt`.
-    Time: the files hold none; frame number / 10 Hz. Colour images; label boxes are in rectified camera 0.
+    where: `training/image_02/0000`, or `training?sequence=0000`; further options:
+        poses: a file of T_world_cam0 of any form (see `rgbd.pose_files`) instead of `oxts/0000.txt`. axes: of the
+            camera they are of, `optical` (without it), `opengl` or `ros`. invert: 1 for world to camera.
+        fps: frames a second.
+    Time: the files hold none; frame number / 10 Hz, or `fps`. Colour images; label boxes are in rectified camera 0.
     World and faults: see `KittiSource`. Raises SourceError for what is missing as a whole and bad labels.
     """
 
     layout = "a KITTI tracking sequence (training?sequence=0000 with image_02/0000 and calib/0000.txt)"
 
     def __init__(self, where: str | os.PathLike[str]):
-        folder, options = location(where, {"sequence": "", "poses": ""})
+        folder, options = folder_and_options(where, {"sequence": "", "fps": FPS, **POSES})
         self.folder, self.sequence = _sequence(folder, options["sequence"])
         self.name, self.eyes = f"kitti_tracking_{self.sequence}", (2, 3)
         self.calibration: KittiCalibration = read_calibration(self._file("calib"))
         numbers = numbers_in(self.folder / LEFT / self.sequence, IMAGE)
         if not numbers:
             raise SourceError(f"{self.folder / LEFT / self.sequence}: no 000000.png in it; give a folder with images")
-        self._frames = int(numbers[-1]) + 1
+        self._frames, self._fps = int(numbers[-1]) + 1, options["fps"]
         self.camera = self.calibration.camera(*self.eyes, self._size())
-        self.poses = self._poses(options["poses"])
+        self.poses = self._poses(options["poses"], options["axes"], options["invert"])
         self._labels = self._read_labels()
 
     @classmethod
     def recognises(cls, where: str) -> bool:
         """Return whether `where` is a folder of sequences as in KITTI tracking, or the left images of one."""
-        folder = Path(os.path.abspath(folder_of(where)))  # unlike resolve() it takes any text
+        folder = Path(os.path.abspath(folder_part(where)))  # unlike resolve() it takes any text
         if folder.parent.name == LEFT:
             return os.path.isdir(folder) and os.path.isdir(folder.parents[1] / "calib")
         return os.path.isdir(folder / LEFT) and os.path.isdir(folder / "calib")
@@ -73,7 +77,7 @@ class KittiTracking(KittiSource):
 
     def stamp_ns(self, i: int) -> int:
         """Return the time of frame `i` in nanoseconds after the first."""
-        return i * PERIOD_NS
+        return int(i * SECOND_NS / self._fps)
 
     def velodyne(self, i: int) -> Path:
         """Return the scan's file of frame `i`."""
@@ -87,9 +91,10 @@ class KittiTracking(KittiSource):
     def _file(self, kind: str) -> Path:
         return self.folder / kind / f"{self.sequence}.txt"
 
-    def _poses(self, choice: str) -> FramePoses:
+    def _poses(self, choice: str, axes: str, inverted: bool) -> FramePoses:
         if choice and choice != OXTS:
-            return read_pose_file(named_file(choice, self.folder), len(self))
+            stamps = [self.stamp_ns(i) for i in range(len(self))]
+            return read_named_poses(named_file(choice, self.folder), stamps, axes, inverted)
         c = self.calibration
         if c.T_cam0_velo is None or c.T_velo_imu is None:
             missing = "R_rect and Tr_velo_cam" if c.T_cam0_velo is None else "Tr_imu_velo"

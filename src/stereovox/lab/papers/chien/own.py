@@ -41,7 +41,7 @@ def map_own(source: Stream, step: Callable[[], None] = lambda: None) -> Chapter:
             way.append(frame.T_world_sensor[:3, 3])
         step()
     if not way:
-        raise StereovoxError(f"{source.name}: not one frame can be used; stereovox map tells why")
+        raise StereovoxError(f"{source.name}: not one frame can be used; stereovox map says why")
     figures = {name: summarise(mapper.map, reports[name]) for name, mapper in mappers.items()}
     heads = ("profile", "frames", "refused", "ms a frame, median", "occupied", "free")
     rows = [(name, *_row(one)) for name, one in figures.items()]

@@ -1,0 +1,266 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Point clouds and meshes of other programs as maps: their unit, their origin and the size of the cells.
+
+`read_cloud` takes a file for what it is, `map_of_cloud` decides what the file leaves open, and the map remembers both.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Sequence
+from math import prod
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.errors import MapFileError, StereovoxError
+from stereovox.formats.cell_size import extents, suggested_cell, suggested_for_mesh
+from stereovox.formats.las import read_las
+from stereovox.formats.read_points import MAX_BYTES, cells_of_points, read_points
+from stereovox.formats.text_points import read_text_points
+from stereovox.maps import VoxelMap
+from stereovox.safe_io import read_bounded
+from stereovox.sources.lidar import read_velodyne
+from stereovox.trust.history import Imported
+
+UNITS = {"m": 1.0, "cm": 0.01, "mm": 0.001, "ft": 0.3048, "us-ft": 1200 / 3937}
+"""Metres of each unit that `--unit` knows."""
+FAR, ROUND = 10_000.0, 100.0
+"""Metres from 0 beyond which coordinates get another origin, and what that is a multiple of."""
+EARTH = 2e7
+"""Metres; no map has larger coordinates: half of the way round the Earth."""
+SPARSE, TINY = 0.5, 0.02
+"""Points so many metres apart, or a cloud so many metres long: metres may be the wrong unit."""
+MAX_SAMPLES = 30_000_000
+"""Points that a mesh is sampled to."""
+PER_CELL = 2
+"""Samples of a mesh along the side of a cell."""
+MAX_LIDAR_M = 1000.0
+"""Metres within which the points of a KITTI scan lie."""
+MESHES = (".stl", ".obj", ".off")
+TEXTS = (".xyz", ".csv", ".txt", ".asc", ".pts")
+LAS = (".las", ".laz")
+
+
+class Cloud(NamedTuple):
+    """Points as they stand in a file.
+
+    xyz: (N, 3) float64, in the file's unit and frame; not finite where there is none. holds: what the file is, in a few
+    words. voxel_size: metres, where the file has the centres of cells and says so. faces: (M, 3) whole numbers, which
+    points are the corners of each triangle; None for bare points. metres: metres per unit along each axis, and how the
+    file says so; None where it says nothing. notes: what the user should know.
+    """
+
+    xyz: NDArray[np.float64]
+    holds: str
+    voxel_size: float | None = None
+    faces: NDArray[np.integer] | None = None
+    metres: tuple[tuple[float, float, float], str] | None = None
+    notes: tuple[str, ...] = ()
+
+
+def read_cloud_map(
+    path: str | Path,
+    voxel_size: float | None = None,
+    unit: str | None = None,
+    origin: Sequence[float] | None = None,
+) -> VoxelMap:
+    """Return a map in which each cell that holds a point, or a piece of a mesh, is occupied, all others unknown.
+
+    voxel_size: metres; None: the file's own, else one suggested. unit: of `UNITS`; None: the file's own, else metres.
+    origin: (3,) point in metres, in the file's frame, that becomes the map's origin; None: that of the file, unless it
+    is far away. Raises MapFileError: one line with the file and what is wrong.
+    """
+    try:
+        return map_of_cloud(read_cloud(path), Path(path).name, voxel_size, unit, origin)
+    except MapFileError:
+        raise
+    except StereovoxError as error:
+        raise MapFileError(f"{path}: {error}") from None
+
+
+def read_cloud(path: str | Path) -> Cloud:
+    """Return the points of a file with one of the endings `formats.CLOUDS`.
+
+    Raises MapFileError, MissingExtra where the library for `.las` is not installed.
+    """
+    ending = Path(path).suffix.lower()
+    if ending in LAS:
+        return Cloud(**read_las(path)._asdict())
+    if ending in TEXTS:
+        xyz = read_text_points(path)
+        return Cloud(xyz, f"text, {_count(xyz)}")
+    if ending == ".bin":
+        return _lidar_scan(path)
+    if ending in MESHES:
+        return _mesh(path, ending[1:])
+    points = read_points(path)
+    if points.faces:
+        return _mesh(path, "ply")
+    kind = "PLY" if points.ply else "PCD"
+    rows = f"{points.width} x {points.height}, " if points.height > 1 else ""
+    notes = ("its VIEWPOINT is not applied: points lie as the file has them",) if points.turned else ()
+    return Cloud(points.xyz, f"{kind}, {rows}{_count(points.xyz)}", points.voxel_size, notes=notes)
+
+
+def map_of_cloud(
+    cloud: Cloud,
+    name: str,
+    voxel_size: float | None = None,
+    unit: str | None = None,
+    origin: Sequence[float] | None = None,
+) -> VoxelMap:
+    """Return the map of a cloud; name: of its file, for the map's memory; the rest as in `read_cloud_map`.
+
+    Raises StereovoxError.
+    """
+    if cloud.voxel_size is not None and unit is None and origin is None:  # one of ours: nothing is left open
+        made = cells_of_points(cloud.xyz, cloud.voxel_size if voxel_size is None else voxel_size)
+        made.history.imported = Imported(name, cloud.holds)
+        return made
+    if not np.isfinite(cloud.xyz).all(axis=1).any():
+        raise StereovoxError("holds no point; name a file with points")
+    xyz, unit_notes = _in_metres(cloud, unit)
+    xyz, origin_notes = _near_origin(xyz, origin)
+    size, size_notes = _sized(xyz, cloud, name, voxel_size, unit)
+    points = xyz if cloud.faces is None else _on_surface(xyz, cloud.faces, size)
+    made = cells_of_points(points, size)
+    made.history.imported = Imported(name, cloud.holds, (*size_notes, *unit_notes, *origin_notes, *cloud.notes))
+    return made
+
+
+def _count(xyz: NDArray[np.float64]) -> str:
+    return f"{int(np.isfinite(xyz).all(axis=1).sum()):,} points"
+
+
+def _in_metres(cloud: Cloud, unit: str | None) -> tuple[NDArray[np.float64], tuple[str, ...]]:
+    """Return the points in metres, and a note where the file decided that; raises StereovoxError for a bad unit."""
+    if unit is not None:
+        if unit not in UNITS:
+            raise StereovoxError(f"--unit {unit}: no unit that is known; give one of {', '.join(UNITS)}")
+        return cloud.xyz * UNITS[unit], (f"taken as {unit}",) if unit != "m" else ()
+    if cloud.metres is None or cloud.metres[0] == (1.0, 1.0, 1.0):
+        return cloud.xyz, ()
+    return cloud.xyz * cloud.metres[0], (f"unit: {cloud.metres[1]}, as the file says (--unit overrides)",)
+
+
+def _near_origin(
+    xyz: NDArray[np.float64], origin: Sequence[float] | None
+) -> tuple[NDArray[np.float64], tuple[str, ...]]:
+    """Return the points about the map's origin, and a note where that is not the file's."""
+    finite = xyz[np.isfinite(xyz).all(axis=1)]
+    if np.abs(finite).max() > EARTH:
+        raise StereovoxError(
+            f"a coordinate of {np.abs(finite).max():.3g} m lies beyond the Earth; give --unit, or name columns x,y,z"
+        )
+    if origin is not None:
+        given = np.asarray(origin, np.float64)
+        return xyz - given, (f"its origin is ({_point(given)}) m of the file",) if given.any() else ()
+    middle = np.median(finite, axis=0)
+    if (np.abs(middle) <= FAR).all():
+        return xyz, ()
+    moved = np.where(np.abs(middle) > FAR, np.floor(middle / ROUND) * ROUND, 0.0)
+    return xyz - moved, (f"its origin is ({_point(moved)}) m of the file, far from 0 (--origin 0,0,0 keeps its own)",)
+
+
+def _point(point: NDArray[np.float64]) -> str:
+    return ", ".join(f"{number:.12g}" for number in point)
+
+
+def _sized(
+    xyz: NDArray[np.float64], cloud: Cloud, name: str, voxel_size: float | None, unit: str | None
+) -> tuple[float, tuple[str, ...]]:
+    """Return the side of a cell, and notes: why it was chosen, and where the unit is doubtful."""
+    finite = xyz[np.isfinite(xyz).all(axis=1)]
+    if voxel_size is not None:
+        return voxel_size, ()
+    if cloud.voxel_size is not None:
+        return cloud.voxel_size, ()
+    suggested = suggested_cell(finite) if cloud.faces is None else suggested_for_mesh(finite)
+    if suggested is None:
+        raise StereovoxError(
+            f"{len(finite)} points do not tell a size of cells; type: stereovox import {name} MAP --voxel-size 0.05"
+        )
+    notes = (f"cells of {suggested.voxel_size:g} m, {suggested.why} (--voxel-size overrides)",)
+    length = float(extents(finite).max())
+    sparse = suggested.spacing is not None and suggested.spacing > SPARSE
+    if unit is None and cloud.metres is None and (sparse or length < TINY or cloud.faces is not None):
+        notes += (f"unit unsure: {length:.3g} long, taken as metres (else --unit mm, cm or ft)",)
+    return suggested.voxel_size, notes
+
+
+def _on_surface(xyz: NDArray[np.float64], faces: NDArray[np.integer], voxel_size: float) -> NDArray[np.float64]:
+    """Return points (M, 3) on all triangles, in rows along their longest sides; rows and points lie at most half a cell
+    apart.
+
+    Raises StereovoxError for too many points.
+    """
+    corners = xyz[faces]
+    corners = corners[np.isfinite(corners).all(axis=(1, 2))]
+    sides = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
+    turn = (np.argmax(sides, axis=1)[:, None] + [0, 1, 2]) % 3
+    a, b, c = np.moveaxis(np.take_along_axis(corners, turn[:, :, None], axis=1), 1, 0)
+    length, step = sides.max(axis=1, initial=0.0), voxel_size / PER_CELL
+    height = np.linalg.norm(np.cross(b - a, c - a), axis=1) / np.where(length > 0, length, 1.0)
+    rows, along = np.ceil(height / step), np.ceil(length / step)
+    if not float(((rows + 4) * (along + 2)).sum()) <= MAX_SAMPLES:
+        raise StereovoxError(f"its surface takes too many cells of {voxel_size:g} m; give a larger --voxel-size")
+    of_row, t = _shares(rows.astype(np.int64))
+    of_point, s = _shares(np.ceil(along[of_row] * (1 - t)).astype(np.int64))
+    of_face, t = of_row[of_point], t[of_point]
+    edges = np.concatenate([np.stack([a, c], axis=1), np.stack([b, c], axis=1)])  # rows alone may leave gaps in these
+    lengths = np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1)
+    of_edge, share = _shares(np.ceil(lengths / step).astype(np.int64))
+    on_edges = edges[of_edge, 0] + share[:, None] * (edges[of_edge, 1] - edges[of_edge, 0])
+    a, b, c, s, t = a[of_face], b[of_face], c[of_face], s[:, None], t[:, None]
+    return np.concatenate([a + t * (c - a) + s * (1 - t) * (b - a), on_edges])
+
+
+def _shares(steps: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return for each of `steps` (N,) the shares 0, 1/steps, ..., 1 (M,), and which of the N each belongs to (M,)."""
+    owner = np.repeat(np.arange(len(steps)), steps + 1)
+    number = np.arange(len(owner)) - np.repeat(np.cumsum(steps + 1) - steps - 1, steps + 1)
+    return owner, number / np.maximum(steps, 1)[owner]
+
+
+def _lidar_scan(path: str | Path) -> Cloud:
+    """Return the points of a KITTI velodyne scan, in the frame of the lidar."""
+    try:
+        xyz = read_velodyne(Path(path)).astype(np.float64)
+    except StereovoxError as error:
+        raise MapFileError(str(error)) from None
+    if not len(xyz) or np.abs(xyz).max() > MAX_LIDAR_M:
+        raise MapFileError(f"{path}: no KITTI velodyne scan (float32 x, y, z, reflectance); save it as .ply or .pcd")
+    return Cloud(xyz, f"KITTI velodyne scan, {_count(xyz)}", metres=((1.0, 1.0, 1.0), "metres"))
+
+
+def _mesh(path: str | Path, kind: str) -> Cloud:
+    """Return the corners and triangles of a mesh, larger faces cut into triangles; of one without, its points."""
+    import trimesh
+
+    content = _bytes(path)
+    load: Callable[..., Any] = trimesh.load
+    try:
+        loaded: Any = load(io.BytesIO(content), file_type=kind, process=False, skip_materials=True)
+        parts: list[Any] = list(loaded.dump()) if isinstance(loaded, trimesh.Scene) else [loaded]
+        sizes = np.cumsum([0, *(len(part.vertices) for part in parts)])
+        xyz = np.concatenate([np.empty((0, 3)), *(np.asarray(part.vertices, np.float64) for part in parts)])
+        faces = [np.asarray(getattr(part, "faces", np.empty((0, 3))), np.int64) for part in parts]
+        faces = np.concatenate([np.empty((0, 3), np.int64), *(f + n for f, n in zip(faces, sizes, strict=False))])
+        if prod(faces.shape) and not (faces.min() >= 0 and faces.max() < len(xyz)):
+            raise ValueError("a triangle has corners that are not there")
+    except Exception as error:  # what a damaged file can raise in trimesh is not bounded
+        why = (" ".join(str(error).split()) or type(error).__name__)[:100]
+        raise MapFileError(f"{path}: no mesh that can be read ({why}); export it again") from None
+    if not len(faces):
+        return Cloud(xyz, f"{kind.upper()}, {_count(xyz)}")
+    return Cloud(xyz, f"{kind.upper()} mesh, surface of {len(faces):,} triangles", faces=faces)
+
+
+def _bytes(path: str | Path) -> bytes:
+    try:
+        return read_bounded(Path(path), MAX_BYTES)
+    except OSError as error:
+        raise MapFileError(f"{path}: cannot be read ({error.strerror or error}); name a file of points") from None

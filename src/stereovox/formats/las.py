@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Lidar surveys, `.las` and `.laz` (ASPRS LAS 1.0 to 1.4), read by laspy, with the unit of their coordinate system."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.errors import MapFileError, MissingExtra
+from stereovox.safe_io import read_bounded
+
+MAX_BYTES = 1 << 32
+MAX_POINTS = 1 << 28
+PER_BYTE = 50
+"""Points for each byte of a packed file; LAZ needs several bytes for a point, but for equal ones."""
+AT_ONCE = 1 << 20
+MODEL, LINEAR_UNIT, VERTICAL_UNIT = 1024, 3076, 4099
+"""Keys of GeoTIFF 1.8.2: kind of the coordinate system, unit of x and y, unit of z."""
+GEOGRAPHIC = 2
+EPSG_UNITS = {9001: (1.0, "metres"), 9002: (0.3048, "feet"), 9003: (1200 / 3937, "US survey feet")}
+WKT_UNIT = re.compile(r'UNIT\["([^"]*)",\s*([0-9.eE+-]+)')
+DEGREES = (
+    "its x and y are degrees, no lengths; project it, for example: pdal translate IN OUT reprojection "
+    "--filters.reprojection.out_srs=EPSG:32633 (the UTM zone of the place)"
+)
+
+
+class _Degrees(Exception):  # noqa: N818 - what the coordinates are
+    """The coordinates are degrees."""
+
+
+class LasPoints(NamedTuple):
+    """As `clouds.Cloud`."""
+
+    xyz: NDArray[np.float64]
+    holds: str
+    metres: tuple[tuple[float, float, float], str] | None
+
+
+def read_las(path: str | Path) -> LasPoints:
+    """Return the points of a survey, and the unit of its coordinate system where it names one.
+
+    Raises MapFileError: unreadable, damaged, or in degrees; MissingExtra without laspy.
+    """
+    try:
+        import laspy
+    except ImportError:
+        raise MissingExtra("laspy", "las") from None
+    try:
+        size = len(read_bounded(Path(path), MAX_BYTES)[:375]) and Path(path).stat().st_size
+        with laspy.open(str(path)) as reader:
+            header = reader.header
+            _check_count(header, size)
+            metres = _metres(header)
+            xyz = np.concatenate([np.empty((0, 3)), *_pieces(reader)])
+    except OSError as error:
+        raise MapFileError(f"{path}: cannot be read ({error.strerror or error}); name a file of points") from None
+    except _Degrees:
+        raise MapFileError(f"{path}: {DEGREES}") from None
+    except BaseException as error:  # what a damaged file can raise in laspy and its Rust library is not bounded
+        if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
+            raise
+        why = (" ".join(str(error).split()) or type(error).__name__)[:120]
+        raise MapFileError(f"{path}: no points that can be read: {why}; copy or export it again") from None
+    kind = "LAZ" if header.are_points_compressed else "LAS"
+    return LasPoints(xyz, f"{kind} {header.version}, {len(xyz):,} points", metres)
+
+
+def _check_count(header: Any, size: int) -> None:
+    """Raise ValueError for more points than a file of `size` bytes can hold."""
+    count = header.point_count
+    least = count / PER_BYTE if header.are_points_compressed else count * header.point_format.size
+    if count > MAX_POINTS or least > size:
+        raise ValueError(f"{count} points in {size} bytes")
+
+
+def _pieces(reader: Any) -> Iterator[NDArray[np.float64]]:
+    for points in reader.chunk_iterator(AT_ONCE):
+        yield np.column_stack([points.x, points.y, points.z]).astype(np.float64)
+
+
+def _metres(header: Any) -> tuple[tuple[float, float, float], str] | None:
+    """Return metres per unit along x, y and z, and the unit's name; None where the file names none.
+
+    Raises _Degrees where x and y are degrees.
+    """
+    texts = [vlr.string for vlr in header.vlrs if hasattr(vlr, "string")]
+    keys = [key for vlr in header.vlrs for key in getattr(vlr, "geo_keys", ())]
+    return _by_text(" ".join(texts)) if any(texts) else _by_keys({key.id: key.value_offset for key in keys})
+
+
+def _by_keys(keys: dict[int, int]) -> tuple[tuple[float, float, float], str] | None:
+    if keys.get(MODEL) == GEOGRAPHIC:
+        raise _Degrees
+    if keys.get(LINEAR_UNIT) not in EPSG_UNITS:
+        return None
+    flat, name = EPSG_UNITS[keys[LINEAR_UNIT]]
+    upright, _ = EPSG_UNITS.get(keys.get(VERTICAL_UNIT, 0), (flat, name))
+    return (flat, flat, upright), name
+
+
+def _by_text(text: str) -> tuple[tuple[float, float, float], str] | None:
+    units = [(name, float(factor)) for name, factor in WKT_UNIT.findall(text)]
+    lengths = [(name, factor) for name, factor in units if not re.search("degree|radian|unity", name, re.IGNORECASE)]
+    if "PROJ" not in text and "GEOG" in text:
+        raise _Degrees
+    if not lengths or not all(1e-4 < factor < 1e4 for _, factor in lengths):
+        return None
+    (name, flat), (_, upright) = lengths[0], lengths[-1]
+    return (flat, flat, upright), name

@@ -1,0 +1,45 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Cells turned so that their third axis points up, and where the ceiling above them begins."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+UPS = {"z": (0, 1, 2), "-z": (1, 0, 2), "y": (2, 0, 1), "-y": (0, 2, 1), "x": (1, 2, 0), "-x": (2, 1, 0)}
+"""For each up axis: the map's axes that point right, away and up in a picture (the last flipped where minus)."""
+SLAB = 1.6
+"""A layer with this many times the cells of the median layer is a floor or a ceiling."""
+
+
+def turned(points: ArrayLike, up: str) -> NDArray[np.float64]:
+    """Return points (..., 3) of a map in the axes of its picture: right, away, up."""
+    points = np.asarray(points, float)[..., list(UPS[up])]
+    return points * [1, 1, -1] if up.startswith("-") else points
+
+
+def turned_cells(cells: NDArray[np.int32], up: str) -> NDArray[np.int32]:
+    """Return cells (N, 3) of a map in the axes of its picture; `up` is a key of `UPS`."""
+    cells = cells[:, list(UPS[up])]
+    if up.startswith("-"):
+        cells[:, 2] = -1 - cells[:, 2]
+    return cells
+
+
+def ceiling(occupied: NDArray[np.int32]) -> int:
+    """Return the layer (third index) at which the ceiling of occupied cells (K, 3) begins; beyond the highest if none.
+
+    A ceiling is a layer in the upper part of the map that holds far more cells than layers usually do.
+    """
+    if not len(occupied):
+        return 0
+    low, count = layers(occupied)
+    upper = np.arange(len(count)) > 0.55 * len(count)
+    slabs = np.flatnonzero(upper & (count > SLAB * np.median(count)))
+    return int(low + (slabs[0] - 1 if len(slabs) else len(count)))
+
+
+def layers(cells: NDArray[np.int32]) -> tuple[int, NDArray[np.int64]]:
+    """Return the lowest layer (third index) of cells (N, 3), N > 0, and the number of cells in each from there on."""
+    low = int(cells[:, 2].min())
+    return low, np.bincount(cells[:, 2] - low)

@@ -1,0 +1,37 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A recording in another world: all poses turned by the same motion."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+from stereovox.frame import AnyFrame
+from stereovox.se3 import Transform
+from stereovox.sources.base import Stream
+
+
+class Turned(Stream):
+    """The frames of `stream` in a new world; T_new_world (4, 4) maps the recording's world into it."""
+
+    def __init__(self, stream: Stream, T_new_world: Transform):
+        self._stream, self._T_new_world = stream, T_new_world
+        self.name, self.camera, self.notes = stream.name, stream.camera, stream.notes
+
+    @property
+    def length(self) -> int | None:
+        """Number of frames of the stream."""
+        return self._stream.length
+
+    @property
+    def dropped(self) -> int:
+        """Frames dropped by the stream."""
+        return self._stream.dropped
+
+    def after(self, count: int) -> Stream:
+        """Return the remaining frames after `count`, in the same world."""
+        return Turned(self._stream.after(count), self._T_new_world)
+
+    def __iter__(self) -> Iterator[AnyFrame]:
+        for frame in self._stream:
+            yield replace(frame, T_world_sensor=self._T_new_world @ frame.T_world_sensor)

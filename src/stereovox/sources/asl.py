@@ -72,11 +72,14 @@ class AslRig(RigSource):
         virtual = Virtual(options["rectify"]) if options["rectify"] else usual_virtual(found.eyes)
         pair = RigPair("stereo", camera=found.camera, eyes=found.eyes, T_body_left=found.T_body_left, virtual=virtual)
         left, right = (_Images(root / eye) for eye in (EYES[::-1] if found.swapped else EYES))
+        self.up: str | None = None
+        """The world's axis that points up, where the layout defines it: with its own ground truth."""
         if options["poses"]:
             poses = poses_of_images(file_of(options["poses"], self.folder), left.stamps)
         else:
             poses = _poses(root)
             _check_clocks(left, poses)
+            self.up = "z" if any(os.path.isfile(root / name / DATA) for name in TRUTHS) else None
         poses = as_body(poses, found.T_body_left, options["axes"], options["invert"])
         try:
             self._set(Rig((pair,)), root, _shots(left, right), poses, calibration)

@@ -72,8 +72,6 @@ class AslRig(RigSource):
         virtual = Virtual(options["rectify"]) if options["rectify"] else usual_virtual(found.eyes)
         pair = RigPair("stereo", camera=found.camera, eyes=found.eyes, T_body_left=found.T_body_left, virtual=virtual)
         left, right = (_Images(root / eye) for eye in (EYES[::-1] if found.swapped else EYES))
-        self.up: str | None = None
-        """The world's axis that points up, where the layout defines it: with its own ground truth."""
         if options["poses"]:
             poses = poses_of_images(file_of(options["poses"], self.folder), left.stamps)
         else:

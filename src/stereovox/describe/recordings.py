@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 
 from stereovox.describe import Description, command_line, metres, thousands
 from stereovox.errors import StereovoxError
-from stereovox.opening import is_recording, open_images, open_robot, open_source
+from stereovox.opening import is_recording, is_robot, open_images, open_robot, open_source
 from stereovox.sources.bags import open_bag, suffix_of
 from stereovox.sources.bags.files import BagFile
 from stereovox.sources.bags.recording import file_part
@@ -29,13 +30,10 @@ def describe_recording(path: str) -> Description | None:
     """
     if suffix_of(file_part(path)):
         return _bag(path)
-    if is_recording(path):
-        return _recording(path)
-    try:
-        robot = open_robot(path)
-    except StereovoxError:
-        return _images(path)
-    return _robot(path, robot)
+    if is_robot(path):
+        with suppress(StereovoxError):  # a .log may hold anything else
+            return _robot(path, open_robot(path))
+    return _recording(path) if is_recording(path) else _images(path)
 
 
 def _recording(path: str) -> Description:
@@ -171,7 +169,7 @@ def robot_lines(robot: Robot) -> tuple[list[str], dict[str, Any]]:
         lines.append(f"scans of {len(first.ranges)} beams over {wide:.0f} degrees, up to {first.range_max:g} m")
         positions = [scan.pose_world_base[:2] for scan in robot.scans[:: max(1, len(robot.scans) // 200)]]
         moved = np.array([place for place in positions if np.isfinite(place).all()])
-        if len(moved):
+        if len(moved) and np.ptp(moved, axis=0).any():
             facts["extent_m"] = np.ptp(moved, axis=0).round(4).tolist()
             lines.append(f"by its odometry the robot moves within {metres(np.ptp(moved, axis=0))}")
         else:

@@ -29,6 +29,16 @@ DEPTH = Part(
           for suffix in SUFFIXES),
     "depth images",
 )  # fmt: skip
+
+
+class DepthPart(Part):
+    """Depth images, which count only where the first is one: pictures have the same endings."""
+
+    def count(self, folder: str | os.PathLike[str]) -> int:
+        """Return how many depth images there are."""
+        return super().count(folder) if has_depth(os.fspath(folder)) else 0
+
+
 POSE_FILE = r".*pose.*\d.*\.txt|.*\d.*pose.*\.txt"
 """A file with the pose of one image, beside it."""
 
@@ -43,7 +53,7 @@ class DepthAndPoses(DepthFolder):
     """
 
     layout = "depth images with a file of poses (depth/ with poses.txt, trajectory.log or traj.txt)"
-    parts = (DEPTH, POSES)
+    parts = (DepthPart(*DEPTH), POSES)
 
     def list_images(self) -> list[ImageFile]:
         """Return the depth images in the order of their numbers or times."""

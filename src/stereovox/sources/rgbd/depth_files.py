@@ -217,12 +217,18 @@ def _numpy(path: Path, content: bytes) -> NDArray[np.generic]:
     try:
         found = np.load(io.BytesIO(content), allow_pickle=False)
         if isinstance(found, np.ndarray):
-            return np.squeeze(found)
+            return _squeezed(found)
         name = "depth" if "depth" in found.files else found.files[0] if len(found.files) == 1 else ""
-        return np.squeeze(found[name])
+        return _squeezed(found[name])
     except Exception as error:  # what a damaged file can raise in zipfile, zlib and NumPy is not bounded
         why = " ".join(str(error).split())[:100]
         raise FrameRefused("unreadable", f"{path}: no array of depths ({why}); save it again") from None
+
+
+def _squeezed(array: NDArray[np.generic]) -> NDArray[np.generic]:
+    """Return the array without axes of length one beyond the second."""
+    axes = [axis for axis, length in enumerate(array.shape) if length == 1]
+    return np.squeeze(array, tuple(axes[: max(array.ndim - 2, 0)]))
 
 
 def _exr(path: Path, content: bytes) -> NDArray[np.generic]:

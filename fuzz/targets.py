@@ -357,8 +357,8 @@ def text_points(_: Path) -> list[bytes]:
 
 ROWS = (
     "x,y,z\n" + "".join(f"{k % 5}.5,{k // 5},0.25\n" for k in range(20)),
-    "// a comment\n3\n1 2 3 0 0\n4 5 6 0 0\n-7 8e1 9 0 0\n",
-    "i;Z;Y;X [m]\n1;2;3;4\n",
+    "// a comment\n12\n" + "".join(f"{k} {-k} 1e1 0 0\n" for k in range(12)),
+    "i;Z;Y;X [m]\n" + "".join(f"0;{k};2;{k * k}\n" for k in range(12)),
 )
 POSE = struct.pack("<i3di4dI", 3, 1, 0, 1, 4, 0.7, 0, 0, 0.7, 1)
 GRAPHS = (

@@ -3,8 +3,11 @@
 
 from __future__ import annotations
 
+import io
 import re
+import struct
 from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,6 +22,12 @@ MAX_POINTS = 1 << 28
 PER_BYTE = 50
 """Points for each byte of a packed file; LAZ needs several bytes for a point, but for equal ones."""
 AT_ONCE = 1 << 20
+HEADER, RECORD, LONG_RECORD, LEAST_POINT = 227, 54, 60, 20
+"""Fewest bytes of the header, of a record, of a long record and of a point."""
+LASZIP, LAYERED, FEWEST_LAYERS = 22204, 6, 9
+"""Record that describes the packing; first point format that is packed in layers, and how many it has."""
+PACKED = 0xC0
+"""Bits of the point format that mark packed points."""
 MODEL, LINEAR_UNIT, VERTICAL_UNIT = 1024, 3076, 4099
 """Keys of GeoTIFF 1.8.2: kind of the coordinate system, unit of x and y, unit of z."""
 GEOGRAPHIC = 2
@@ -52,16 +61,21 @@ def read_las(path: str | Path) -> LasPoints:
     except ImportError:
         raise MissingExtra("laspy", "las") from None
     try:
-        size = len(read_bounded(Path(path), MAX_BYTES)[:375]) and Path(path).stat().st_size
-        with laspy.open(str(path)) as reader:
+        content = read_bounded(Path(path), MAX_BYTES)
+        _check_header(content)
+        one_thread = laspy.LazBackend.Lazrs  # several make room for whole chunks, however long the file says they are
+        with laspy.open(io.BytesIO(content), laz_backend=one_thread) as reader:
             header = reader.header
-            _check_count(header, size)
+            _check_count(header, len(content))
+            _check_layers(content, header)
             metres = _metres(header)
             xyz = np.concatenate([np.empty((0, 3)), *_pieces(reader)])
     except OSError as error:
         raise MapFileError(f"{path}: cannot be read ({error.strerror or error}); name a file of points") from None
     except _Degrees:
         raise MapFileError(f"{path}: {DEGREES}") from None
+    except struct.error:
+        raise MapFileError(f"{path}: no points that can be read: it is cut off; copy or export it again") from None
     except BaseException as error:  # what a damaged file can raise in laspy and its Rust library is not bounded
         if not isinstance(error, Exception) and type(error).__name__ != "PanicException":
             raise
@@ -71,12 +85,60 @@ def read_las(path: str | Path) -> LasPoints:
     return LasPoints(xyz, f"{kind} {header.version}, {len(xyz):,} points", metres)
 
 
+def _check_header(content: bytes) -> None:
+    """Raise ValueError for counts and places in the header that the file has no room for; laspy believes them all."""
+    size = len(content)
+    if not content.startswith(b"LASF") or size < HEADER:
+        raise ValueError("it does not begin as a survey does")
+    start, offset, records = struct.unpack_from("<HII", content, 94)
+    if not start + records * RECORD <= offset <= size:
+        raise ValueError(f"{records} records before byte {offset} of {size}")
+    if content[25] >= 4 and size >= 247:
+        place, more = struct.unpack_from("<QI", content, 235)
+        if more and place + more * LONG_RECORD > size:
+            raise ValueError(f"{more} long records behind byte {place} of {size}")
+    if content[104] & PACKED:
+        _check_chunks(content, offset)
+
+
+def _check_chunks(content: bytes, offset: int) -> None:
+    """Raise ValueError where the table of packed chunks lies outside the file or names too many of them."""
+    (table,) = struct.unpack_from("<q", content, offset)
+    (table,) = struct.unpack_from("<q", content, len(content) - 8) if table == -1 else (table,)
+    if not offset + 8 <= table <= len(content) - 8:
+        raise ValueError(f"the table of its chunks lies at byte {table} of {len(content)}")
+    (chunks,) = struct.unpack_from("<I", content, table + 4)
+    if chunks * LEAST_POINT > len(content):
+        raise ValueError(f"{chunks} chunks in {len(content)} bytes")
+
+
 def _check_count(header: Any, size: int) -> None:
     """Raise ValueError for more points than a file of `size` bytes can hold."""
     count = header.point_count
     least = count / PER_BYTE if header.are_points_compressed else count * header.point_format.size
     if count > MAX_POINTS or least > size:
         raise ValueError(f"{count} points in {size} bytes")
+
+
+def _check_layers(content: bytes, header: Any) -> None:
+    """Raise ValueError where a packed chunk says that one of its layers is longer than the chunk.
+
+    Points of format 6 and more are packed in layers: a chunk is a point, a count, the bytes of each layer, and these.
+    """
+    if not header.are_points_compressed or header.point_format.id < LAYERED:
+        return
+    lazrs: Any = import_module("lazrs")  # which tells checkers nothing of what it holds
+    stream = io.BytesIO(content)
+    stream.seek(header.offset_to_point_data)
+    packing = next(vlr for vlr in header.vlrs if vlr.record_id == LASZIP)
+    table = lazrs.read_chunk_table(stream, lazrs.LazVlr(packing.record_data))
+    at, layers = header.offset_to_point_data + 8, FEWEST_LAYERS + header.point_format.num_extra_bytes
+    layers += {7: 1, 8: 2, 10: 3}.get(header.point_format.id, 0) + (header.point_format.id == 9)
+    for points, size in table:
+        lengths = struct.unpack_from(f"<{layers}I", content, at + header.point_format.size + 4) if points else ()
+        if sum(lengths) > size or at + size > len(content):
+            raise ValueError(f"a chunk of {size} bytes with layers of {sum(lengths)}")
+        at += size
 
 
 def _pieces(reader: Any) -> Iterator[NDArray[np.float64]]:

@@ -92,8 +92,8 @@ def cells_of_points(points: ArrayLike, voxel_size: float) -> VoxelMap:
 def _config(voxel_size: float) -> Config:
     """Return the default profile with a cell size, and a range that so many cells can span: nothing measured these."""
     usual = load_config()
-    small = 0 < voxel_size * MAX_RANGE_CELLS < usual.max_range
-    return load_config(voxel_size=voxel_size, **({"max_range": voxel_size * MAX_RANGE_CELLS} if small else {}))
+    deepest = voxel_size * MAX_RANGE_CELLS
+    return load_config(voxel_size=voxel_size, max_range=deepest if 0 < deepest < usual.max_range else usual.max_range)
 
 
 def check_room(indices: NDArray[np.integer]) -> None:

@@ -112,7 +112,7 @@ class DepthFolder(DepthSource, ABC):
         fps: Images a second, where they have no times.
         calibrations: Names of files of the camera, in order of preference.
         certain: Whether all who write this layout use its unit; else a unit that cannot be checked leaves a note.
-        posed: Whether anything is known about poses; False: all are NaN.
+        posed: Whether anything is known about poses; False, or given as False: all are NaN.
         unit: The unit of the images, and what speaks for it.
     """
 
@@ -127,14 +127,15 @@ class DepthFolder(DepthSource, ABC):
     posed: bool = True
     _poses: Poses | ImagePoses | None = None
 
-    def __init__(self, where: str | os.PathLike[str]):
+    def __init__(self, where: str | os.PathLike[str], posed: bool = True):
         self.folder, self.options = folder_options(where)
         self.name = self.folder.resolve().name
         self.axes, self.fps = self.options.axes or self.axes, self.options.fps or self.fps
         self._images = self.list_images()
         if not self._images:
             raise SourceError(f"{self.folder}: has no depth image ({', '.join(SUFFIXES)}); give a folder that has some")
-        self._poses = self._read_poses()
+        self.posed = posed and self.posed
+        self._poses = self._read_poses() if self.posed else None
         self.posed = self.posed and (self._poses is not None or self._has_own_poses())
         self.camera, notes, self._mirrored, scale = self._find_camera()
         expected = scale or (1.0 if self._dtype().kind == "f" else self.depth_scale)
@@ -142,6 +143,11 @@ class DepthFolder(DepthSource, ABC):
         unit_note = () if self.options.depth_scale else self._unit_note(expected)
         self.depth_scale = self.unit.scale
         self.notes = (*self.notes, *notes, *unit_note)
+
+    @classmethod
+    def depth_only(cls, where: str) -> DepthFolder:
+        """Return the images without looking for poses: every pose is NaN."""
+        return cls(where, posed=False)
 
     @abstractmethod
     def list_images(self) -> list[ImageFile]:
@@ -181,6 +187,8 @@ class DepthFolder(DepthSource, ABC):
 
     def pose(self, i: int) -> Transform:
         """Return T_world_camera (4, 4) of frame `i` (0 to len - 1); raises FrameRefused where there is none."""
+        if not self.posed:
+            return np.full((4, 4), np.nan)
         T = self.pose_in_file(i)
         if self._mirrored:
             T = MIRROR_WORLD @ T @ MIRROR_CAMERA

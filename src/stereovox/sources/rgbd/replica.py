@@ -30,10 +30,10 @@ class Replica(DepthAndPoses):
 
     intrinsics = RENDERED
 
-    def __init__(self, where: str | os.PathLike[str]):
+    def __init__(self, where: str | os.PathLike[str], posed: bool = True):
         if Part((SEQUENCE,), "").count(folder_part(where)) == 0:
             self.depth_scale = 1 / 6553.5
-        super().__init__(where)
+        super().__init__(where, posed)
 
     def pose_places(self) -> list[Path]:
         """Return the file of the poses."""

@@ -85,7 +85,7 @@ def test_a_cell_that_one_scan_hits_and_another_passes_is_tentative(tmp_path):
         (b"NODE 0 0 0 0 0 0\n", {}, "hold no point"),
         (b"NODE 0 0 0 0 0 0\n1 2 3\n", {}, "type: stereovox import a.graph MAP --voxel-size 0.05"),
         (b"NODE 0 0 0 0 0 0\n9e8 2 3\n", {"voxel_size": 1e-3}, "give a larger --voxel-size"),
-        (b"NODE 0 0 0 0 0 0\n9e6 2 3\n", {"voxel_size": 1.0}, "use larger cells"),
+        (b"NODE 0 0 0 0 0 0\n9e6 2 3\n", {"voxel_size": 1.0}, "give a larger --voxel-size"),
     ],
 )
 def test_damaged_graphs_end_in_one_line(tmp_path, content, options, said):

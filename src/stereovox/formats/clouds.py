@@ -33,8 +33,8 @@ EARTH = 2e7
 """Metres; no map has larger coordinates: half of the way round the Earth."""
 SPARSE, TINY = 0.5, 0.02
 """Points so many metres apart, or a cloud so many metres long: metres may be the wrong unit."""
-MAX_SAMPLES = 30_000_000
-"""Points that a mesh is sampled to."""
+SAMPLES_OF_ANY, SAMPLES_A_TRIANGLE, MAX_SAMPLES = 4_000_000, 1000, 16_000_000
+"""Points that any mesh may be sampled to, more for each of its triangles, and never more than these."""
 PER_CELL = 2
 """Samples of a mesh along the side of a cell."""
 MAX_LIDAR_M = 1000.0
@@ -204,8 +204,9 @@ def _on_surface(xyz: NDArray[np.float64], faces: NDArray[np.integer], voxel_size
     a, b, c = np.moveaxis(np.take_along_axis(corners, turn[:, :, None], axis=1), 1, 0)
     length, step = sides.max(axis=1, initial=0.0), voxel_size / PER_CELL
     height = np.linalg.norm(np.cross(b - a, c - a), axis=1) / np.where(length > 0, length, 1.0)
+    most = min(MAX_SAMPLES, SAMPLES_OF_ANY + SAMPLES_A_TRIANGLE * len(corners))
     rows, along = np.ceil(height / step), np.ceil(length / step)
-    if not float(((rows + 4) * (along + 2)).sum()) <= MAX_SAMPLES:
+    if not float(((rows + 4) * (along + 2)).sum()) <= most:
         raise StereovoxError(f"its surface takes too many cells of {voxel_size:g} m; give a larger --voxel-size")
     of_row, t = _shares(rows.astype(np.int64))
     of_point, s = _shares(np.ceil(along[of_row] * (1 - t)).astype(np.int64))

@@ -35,8 +35,8 @@ SKIPPED = re.compile(r"^[# ].*$", re.MULTILINE)
 SENSOR: dict[str, Any] = {"map.prior": 0.5, "map.log_odds_min": -4.0, "map.log_odds_max": 3.5}
 HIT, MISS = 1386, -944
 """Log-odds in thousandths, of p = 0.8 and 0.28: one scan is enough to make a cell occupied or free."""
-MAX_STEPS = 1 << 31
-"""Cells along all rays together."""
+STEPS_OF_ANY, STEPS_A_POINT, MAX_STEPS = 1 << 19, 10_000, 1 << 31
+"""Cells along all rays together: of any graph, more for each of its points, and never more than these."""
 BLOCK_BYTES = 1024
 MAX_PLACE = 1e9
 
@@ -94,7 +94,7 @@ def _map_of(scans: list[Scan], name: str, voxel_size: float | None) -> VoxelMap:
     made = VoxelMap(config)
     lengths = (np.abs(points - scan.T_world_sensor[:3, 3]).sum() for scan, points in zip(scans, world, strict=True))
     steps = float(sum(lengths))
-    if steps / size > MAX_STEPS:
+    if steps / size > min(MAX_STEPS, STEPS_OF_ANY + STEPS_A_POINT * sum(map(len, world))):
         raise StereovoxError(f"its rays cross {steps / size:.2g} cells of {size:g} m; give a larger --voxel-size")
     for scan, points in zip(scans, world, strict=True):
         if len(points):

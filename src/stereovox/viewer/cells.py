@@ -32,8 +32,8 @@ DOT = 0.12
 """Side of the squares that show cells that are not occupied, in cells: small, so that one can see through."""
 RADII = ((2, 0.4), (4, 1.0))
 """Radii and weights of the ambient occlusion of a cell."""
-MAX_SHADED = 1_000_000
-"""Most cells whose ambient occlusion is worth the wait."""
+MAX_SHADED = 400_000
+"""Most cells whose ambient occlusion is worth the wait: seconds, once a map."""
 GAMMA = 2.2
 LABELS = {
     State.OCCUPIED: "occupied",
@@ -96,11 +96,9 @@ def colours_of(values: NDArray[np.floating], colour: str, voxel_size: float) -> 
     return ScalarMappable(Normalize(low, max(high, low + 1e-3)), colormaps[AGES].with_extremes(bad=TIMELESS))
 
 
-def shaded(cells: NDArray[np.int32], colours: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return the colours (N, 3) of cells (N, 3), darker in corners and gaps; of very many cells as they are."""
-    if len(cells) > MAX_SHADED:
-        return colours
-    return (colours * Occlusion(cells, RADII).mean()[:, None]).astype(np.uint8)
+def brightness(cells: NDArray[np.int32]) -> NDArray[np.float32]:
+    """Return the brightness (N,) of cells (N, 3), less in corners and gaps; of very many cells 1."""
+    return Occlusion(cells, RADII).mean() if len(cells) <= MAX_SHADED else np.ones(len(cells), np.float32)
 
 
 class Cells:
@@ -116,6 +114,7 @@ class Cells:
         self._server, self._up, self._map = server, up, voxel_map
         self._found: dict[State, NDArray[np.int32]] = {}
         self.solid = np.empty((0, 3), np.int32)
+        self._shaded = self.solid, np.empty(0, np.float32)
         self.scale: Any = None
         size = voxel_map.voxel_size
         self.kinds = {
@@ -187,8 +186,16 @@ class Cells:
         colours = np.empty((0, 3), np.uint8)
         if self.scale is not None:
             colours = self.scale.to_rgba(np.ma.masked_invalid(values[shown]), bytes=True)[:, :3]
-            colours = shaded(self.solid, colours)
+            colours = (colours * self._shades(cells)[shown, None]).astype(np.uint8)
         self.kinds[State.OCCUPIED].show(self.solid, colours, self._eyes())
+
+    def _shades(self, cells: NDArray[np.int32]) -> NDArray[np.float32]:
+        """Return the brightness (N,) of the map's occupied cells, found once: what is cut off still gives shade."""
+        shaded, shades = self._shaded
+        if shaded is not cells:
+            shades = brightness(cells)
+            self._shaded = cells, shades
+        return shades
 
     def _show_dots(self, state: State) -> None:
         found = self._found  # read before the map, which `take` sets first: no dots of an older map are kept

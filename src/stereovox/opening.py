@@ -14,6 +14,7 @@ from typing import Any
 
 from stereovox import registry
 from stereovox.errors import MAX_WORD_LENGTH, SourceError
+from stereovox.formats import IMPORTS, UNREADABLE
 from stereovox.sources.base import DepthSource as DepthSource
 from stereovox.sources.base import Excerpt as Excerpt
 from stereovox.sources.base import Part as Part
@@ -21,6 +22,7 @@ from stereovox.sources.base import Selection as Selection
 from stereovox.sources.base import Source as Source
 from stereovox.sources.base import Stream as Stream
 from stereovox.sources.base import parse_slice as parse_slice
+from stereovox.sources.foreign_files import cure_of
 from stereovox.sources.latest import LatestStream
 from stereovox.sources.pair_file import PairSettings
 from stereovox.sources.robots.robot import Robot
@@ -44,6 +46,7 @@ SOURCES = {
     "rtabmap_db": "stereovox.sources.rgbd.rtabmap_db:RtabmapDatabase",  # before bags, which may be SQLite files too
     "bag": "stereovox.sources.bags.recording:Bag",
     "sens": "stereovox.sources.rgbd.packed:SensFile",
+    "klg": "stereovox.sources.rgbd.klg:KlgLog",
     "slambench": "stereovox.sources.rgbd.packed:SlambenchRaw",
     "replica": "stereovox.sources.rgbd.replica:Replica",
     "open3d": "stereovox.sources.rgbd.open3d:Open3DFolder",
@@ -240,7 +243,7 @@ def _problem(where: str, kinds: list[Any]) -> str:
     if os.path.isfile(os.path.join(place, "manifest.json")):
         return f"is a map, not a recording; see what it was made of with: stereovox info {shlex.quote(place)}"
     if not os.path.isdir(place):
-        return f"is a file, but no recording that is known; see: stereovox info {shlex.quote(place)}"
+        return _file_problem(place)
     try:
         below = _below(place)
     except OSError as error:
@@ -259,6 +262,19 @@ def _below(folder: str) -> list[str]:
         with suppress(OSError):
             deeper += sorted(entry.path for entry in os.scandir(path) if entry.is_dir())[:MAX_BELOW]
     return [*inside, *deeper][: 2 * MAX_BELOW]
+
+
+def _file_problem(file: str) -> str:
+    """Say what a file is, and name the cure, by its ending."""
+    ending = os.path.splitext(file)[1].lower()
+    name = shlex.quote(file) if len(file) <= MAX_SHOWN else "FILE"
+    if cure_of(file):
+        return cure_of(file)
+    if ending in registry.names("import", IMPORTS):
+        return f"is a map or cloud, no recording; import it with: stereovox import {name} map.svox"
+    if ending in UNREADABLE:
+        return f"is no recording: {UNREADABLE[ending]}"
+    return f"is a file, but no recording that is known; see: stereovox info {name}"
 
 
 def _missing(folder: str, kinds: list[Any]) -> str:

@@ -15,6 +15,8 @@ SIZE = (64, 48)
 FX, FY, CX, CY = 50.0, 52.0, 30.5, 24.5
 LOW, HIGH = np.array([-2.0, -2.5, 0.0]), np.array([3.0, 2.0, 2.5])
 COUNT = 5
+T_BASE_CAMERA = np.array([[0.0, 0, 1, 0.1], [-1, 0, 0, 0.02], [0, -1, 0, 0.3], [0, 0, 0, 1]])
+"""Mounting of the camera on a robot whose x points forward and z up."""
 
 
 def pose(k: int) -> np.ndarray:

@@ -73,7 +73,7 @@ class RtabmapDatabase(DepthFolder):
             self._nodes = self._read_nodes()
         except FAULTS as error:
             if isinstance(error, SourceError):
-                raise
+                raise SourceError(f"{self.folder}: {error}") from None
             raise SourceError(
                 f"{self.folder}: {one_line(str(error))[:100]}; no RTAB-Map database that can be read: {EXPORT}"
             ) from None
@@ -151,9 +151,7 @@ class RtabmapDatabase(DepthFolder):
     def _read_nodes(self) -> list[_Node]:
         version = _version(self._sqlite.rows("SELECT version FROM Admin"))
         if version < OLDEST:
-            raise SourceError(
-                f"{self.folder}: is of RTAB-Map {'.'.join(map(str, version))}; open it once in a newer one, or {EXPORT}"
-            )
+            raise SourceError(f"is of RTAB-Map {'.'.join(map(str, version))}; open it once in a newer one, or {EXPORT}")
         rows = self._sqlite.rows(
             "SELECT Node.id, Node.map_id, Node.stamp, Node.pose, Data.calibration FROM Node JOIN Data "
             "ON Data.id = Node.id WHERE length(Data.depth) > 0 AND length(Data.calibration) > 0 "
@@ -278,8 +276,10 @@ def _floats(blob: bytes) -> list[Calibration]:
 
 def _unpacked(blob: bytes) -> NDArray[np.uint8]:
     """Return the bytes of a matrix that is packed with zlib, its rows, columns and type behind it."""
-    unpacking = zlib.decompressobj()
-    return np.frombuffer(unpacking.decompress(blob, MAX_BYTES), np.uint8)
+    try:
+        return np.frombuffer(zlib.decompressobj().decompress(blob, MAX_BYTES), np.uint8)
+    except zlib.error as error:
+        raise ValueError(str(error)) from None
 
 
 def _rvl_depth(path: Path, content: bytes) -> Depth:

@@ -1,0 +1,40 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import shlex
+
+import pytest
+
+from stereovox.errors import SourceError
+from stereovox.opening import open_source
+from stereovox.sources.foreign_files import CURES, cure_of
+
+CLOUDS = ".ply", ".pcd", ".las", ".bt", ".e57", ".svox"
+
+
+@pytest.mark.parametrize("ending", [*CURES, *CLOUDS])
+def test_each_kind_of_file_names_its_cure_in_one_short_line(tmp_path, ending):
+    file = tmp_path / f"walk 1{ending}"
+    file.write_bytes(b"?")
+    with pytest.raises(SourceError) as caught:
+        open_source(file)
+    said = str(caught.value)
+    assert said.startswith(f"{file}: ")
+    assert "that is known" not in said
+    assert len(said.replace(str(tmp_path), "")) <= 300
+
+
+def test_commands_quote_the_name(tmp_path):
+    assert shlex.quote("my walk.svo") in cure_of("my walk.svo")
+    assert len(cure_of("x" * 500 + ".svo")) <= 200
+
+
+def test_clouds_are_imported(tmp_path):
+    file = tmp_path / "room.PLY"
+    file.write_bytes(b"ply\n")
+    with pytest.raises(SourceError, match=r"stereovox import \S*room\.PLY map\.svox"):
+        open_source(file)
+
+
+def test_others_have_none():
+    assert cure_of("notes.txt") == ""

@@ -24,11 +24,8 @@ POSES = Part(
     "poses",
     "write poses.txt with lines 'stamp tx ty tz qx qy qz qw' or a 4x4 matrix for each image, or add ?poses=FILE",
 )  # fmt: skip
-DEPTH = Part(
-    tuple(f"{place}{suffix}" for place in ("depth/*", "depths/*", "*depth*/*", "results/*depth*", "*depth*", "*")
-          for suffix in SUFFIXES),
-    "depth images",
-)  # fmt: skip
+POSE_FILE = r".*pose.*\d.*\.txt|.*\d.*pose.*\.txt"
+"""A file with the pose of one image, beside it."""
 
 
 class DepthPart(Part):
@@ -39,8 +36,11 @@ class DepthPart(Part):
         return super().count(folder) if has_depth(os.fspath(folder)) else 0
 
 
-POSE_FILE = r".*pose.*\d.*\.txt|.*\d.*pose.*\.txt"
-"""A file with the pose of one image, beside it."""
+DEPTH = DepthPart(
+    tuple(f"{place}{suffix}" for place in ("depth/*", "depths/*", "*depth*/*", "results/*depth*", "*depth*", "*")
+          for suffix in SUFFIXES),
+    "depth images",
+)  # fmt: skip
 
 
 class DepthAndPoses(DepthFolder):
@@ -53,7 +53,7 @@ class DepthAndPoses(DepthFolder):
     """
 
     layout = "depth images with a file of poses (depth/ with poses.txt, trajectory.log or traj.txt)"
-    parts = (DepthPart(*DEPTH), POSES)
+    parts = (DEPTH, POSES)
 
     def list_images(self) -> list[ImageFile]:
         """Return the depth images in the order of their numbers or times."""
@@ -119,7 +119,7 @@ class DepthOnly(DepthAndPoses):
 
 def has_depth(folder: str) -> bool:
     """Return whether `folder` holds depth images: by their names, or because the first image is one."""
-    if not os.path.isdir(folder) or not DEPTH.count(folder):
+    if not os.path.isdir(folder):
         return False
     place, pattern = image_place(Path(folder))
     images = images_in(place, pattern, 1.0)

@@ -84,18 +84,23 @@ def find_unit(pairs: Sequence[tuple[View, View]], camera: PinholeCamera, expecte
         expected: Metres per unit by convention, kept where the images do not contradict it.
 
     Returns:
-        The unit: another than `expected` only where it is sure.
+        The unit: another than `expected` only where it is sure, and half the depths are not kilometres away: images
+        in millimetres whose poses are in millimetres too agree in metres.
     """
     units = [expected, *(unit for unit in UNITS if abs(unit / expected - 1) > 1e-6)]
-    found = [_differences(pairs, camera, unit) for unit in units]
-    medians = np.array([np.median(differences) if len(differences) else np.inf for differences, _ in found])
-    agree = np.array([np.sum(differences < AGREES) / max(points, 1) for differences, points in found])
+    found = [differences(pairs, camera, unit) for unit in units]
+    medians = np.array([np.median(differ) if len(differ) else np.inf for differ, _ in found])
+    agree = np.array([np.sum(differ < AGREES) / max(points, 1) for differ, points in found])
     best = int(np.argmax(agree))
     needed, more, less = SURE
     others, differ = np.delete(agree, best).max(), np.delete(medians, best).min()
     if agree[best] >= max(needed, more * others) and differ > less * max(medians[best], 1e-4):
         why = f"{100 * agree[best]:.0f} % of the points agree from image to image, in other units {100 * others:.0f} %"
-        return DepthUnit(units[best], True, why)
+        far = _middle(pairs, units[best])
+        if far <= LIKELY_M[1]:
+            return DepthUnit(units[best], True, why)
+        if units[best] == expected:
+            return DepthUnit(expected, True, f"{why}, but half the depths are beyond {far:.3g} m", False)
     return _unchecked(pairs, expected)
 
 
@@ -140,7 +145,7 @@ def _numbers(T: Transform) -> tuple[float, ...]:
     return tuple(T[:3].ravel().tolist())
 
 
-def _differences(
+def differences(
     pairs: Sequence[tuple[View, View]], camera: PinholeCamera, unit: float
 ) -> tuple[NDArray[np.float64], int]:
     """Return relative differences (K,) of depths of points seen twice, and the number of all points."""
@@ -183,12 +188,22 @@ def _usable(depth: Depth) -> NDArray[np.bool_]:
     return usable & (depth < 65535) if depth.dtype == np.uint16 else usable
 
 
+def is_likely(pairs: Sequence[tuple[View, View]], unit: float) -> bool:
+    """Return whether half the depths are as far away as those of scenes usually are."""
+    return LIKELY_M[0] <= _middle(pairs, unit) <= LIKELY_M[1]
+
+
+def _middle(pairs: Sequence[tuple[View, View]], unit: float) -> float:
+    """Return the median depth in metres, NaN where there is none."""
+    depths = [view.depth[_usable(view.depth)] for pair in pairs for view in pair]
+    return float(np.median(np.concatenate(depths))) * unit if any(map(len, depths)) else np.nan
+
+
 def _unchecked(pairs: Sequence[tuple[View, View]], expected: float) -> DepthUnit:
     """Return the expected unit, with what the range of the depths says about it."""
-    depths = [view.depth[_usable(view.depth)] for pair in pairs for view in pair]
-    if not any(map(len, depths)):
+    middle = _middle(pairs, expected)
+    if np.isnan(middle):
         return DepthUnit(expected, False, "no two posed images are far enough apart to check it")
-    middle = float(np.median(np.concatenate(depths))) * expected
     plausible = LIKELY_M[0] <= middle <= LIKELY_M[1]
     why = f"half the depths are below {middle:.3g} m" + ("" if plausible else ", which is unusual")
     return DepthUnit(expected, False, why, plausible)

@@ -170,7 +170,7 @@ class RtabmapDatabase(DepthFolder):
         """Return the poses of the optimised graph by node; empty where it was not saved."""
         if version < (0, 17, 0):
             return {}
-        ids, poses = self._sqlite.rows("SELECT opt_ids, opt_poses FROM Admin")[0]
+        ids, poses = next(iter(self._sqlite.rows("SELECT opt_ids, opt_poses FROM Admin")), (None, None))
         if not ids or not poses:
             return {}
         numbers, matrices = _unpacked(ids).view("<i4"), _unpacked(poses).view("<f4").reshape(-1, 12)
@@ -250,7 +250,10 @@ def _packed(blob: bytes) -> list[Calibration]:
         at += 8 * sum(lengths[:4])
         T = transform(np.frombuffer(blob, "<f4", 12, at)) if lengths[4] == 12 else np.eye(4)
         at += 4 * lengths[4]
-        fx, fy, cx, cy = P[[0, 5, 2, 6]] if len(P) == 12 and P[0] > 0 else K[[0, 4, 2, 5]]
+        projected = len(P) == 12 and P[0] > 0
+        if not projected and len(K) != 9:
+            raise ValueError("a calibration without a camera matrix")
+        fx, fy, cx, cy = P[[0, 5, 2, 6]] if projected else K[[0, 4, 2, 5]]
         size = (width, height) if width > 0 and height > 0 else None
         found.append(Calibration((float(fx), float(fy), float(cx), float(cy)), size, T))
     return found

@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from made_asl import START, asl, poses_csv, sensor_text
 from made_bags import ros_bag
+from made_depth import posed, sens
 from made_kitti import label, packet, pose_lines, raw_calibration, single_calibration
 from made_mcap import Message, Style, mcap
 from made_recordings import depth_image, write_png
@@ -54,6 +55,7 @@ from stereovox.sources.kitti.tracking import read_labels
 from stereovox.sources.lidar import read_velodyne
 from stereovox.sources.pair_file import PairSettings, pair_text, read_pair
 from stereovox.sources.rgbd.depth_files import read_depth
+from stereovox.sources.rgbd.pose_files import read_poses
 from stereovox.sources.rig_file import read_rig
 from stereovox.sources.robots.bag import RobotBag
 from stereovox.sources.robots.carmen import CarmenLog
@@ -515,6 +517,68 @@ def depth_pngs(folder: Path) -> list[bytes]:
     return [(folder / "s.png").read_bytes()]
 
 
+def depth_files(folder: Path) -> list[bytes]:
+    """Depth as PGM, PFM, TIFF and NumPy arrays; a packed PNG has its own sums to get past (`depth_png`)."""
+    image = depth_image(1)
+    for name, pixels in (("s.pgm", image), ("s.pfm", image.astype(np.float32)), ("s.tiff", image)):
+        write_png(folder / name, pixels)
+    np.save(folder / "s.npy", image)
+    np.savez_compressed(folder / "s.npz", depth=image)
+    plain = f"P2\n16 12\n65535\n{' '.join(map(str, image.ravel()))}\n".encode()
+    return [(folder / f"s.{kind}").read_bytes() for kind in ("pgm", "pfm", "tiff", "npy", "npz")] + [plain]
+
+
+def read_depth_file(data: bytes, folder: Path) -> None:
+    (folder / "a.dat").write_bytes(data)
+    assert read_depth(folder / "a.dat", SIZE).shape == SIZE[::-1]
+
+
+def read_pose_text(data: bytes, folder: Path) -> None:
+    """The bytes as a file of poses, and as one of a folder of them."""
+    refused = []
+    for name in ("p.txt", "p.json", "p.npy"):
+        (folder / name).write_bytes(data)
+        try:
+            found = read_poses(folder / name)
+            assert len(found) > 0
+        except StereovoxError as error:
+            refused.append(error)
+    (folder / "poses").mkdir(exist_ok=True)
+    (folder / "poses/1.txt").write_bytes(data)
+    try:
+        read_poses(folder / "poses")
+    except StereovoxError as error:
+        refused.append(error)
+    if len(refused) == 4:
+        raise refused[0]
+
+
+def pose_texts(folder: Path) -> list[bytes]:
+    np.save(folder / "s.npy", np.stack([np.eye(4)] * 3))
+    line = " ".join(map(str, np.eye(4).ravel()))
+    table = {"parameters": [{"extrinsic": np.eye(4).ravel().tolist()}]}
+    rows = "0 0 1\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"
+    texts = [POSES, f"{line}\n{line}\n", rows, json.dumps(table), POSES.replace("# stamp", "stamp")]
+    return [*(text.encode() for text in texts), (folder / "s.npy").read_bytes()]
+
+
+def read_packed(name: str, data: bytes, folder: Path) -> None:
+    """A .sens, or a SLAMBench .raw with poses beside it."""
+    (folder / "camera-intrinsics.txt").write_text("20 0 7.5\n0 21 5.5\n0 0 1\n")
+    (folder / "p.txt").write_text("".join(f"{k} 0 0 0 0 0 0 1\n" for k in range(2)))
+    (folder / name).write_bytes(data)
+    frames_of(open_source(f"{folder / name}?poses=p.txt" if name.endswith("raw") else folder / name))
+
+
+def sens_files(folder: Path) -> list[bytes]:
+    return [sens(folder / "s.sens", posed(2), code).read_bytes() for code in (0, 1)]
+
+
+def raw_frames(_: Path) -> list[bytes]:
+    head = struct.pack("<2I", *SIZE)
+    return [(head + depth_image(1).tobytes() + head + bytes(3 * 16 * 12)) * 2]
+
+
 def grey_pngs(folder: Path) -> list[bytes]:
     made = []
     for shape in ((12, 16), (12, 16, 3)):
@@ -619,6 +683,10 @@ TARGETS: dict[str, Target] = {
     "carmen": file_target("a.log", read_log, FLASER, ROBOTLASER, FLASER + ROBOTLASER),
     "carmen_bz2": file_target("a.log.bz2", read_log, bz2.compress(FLASER * 3)),
     "depth_png": Target(depth_pngs, partial(read_png, read_depth)),
+    "depth_file": Target(depth_files, read_depth_file),
+    "pose_file": Target(pose_texts, read_pose_text),
+    "sens": Target(sens_files, partial(read_packed, "a.sens")),
+    "slambench_raw": Target(raw_frames, partial(read_packed, "a.raw")),
     "picture_png": Target(grey_pngs, partial(read_png, images.read_picture_png)),
     "map_manifest": Target(manifests, read_manifest),
     "map_arrays": Target(pieces, read_piece),

@@ -25,7 +25,7 @@ LAYERS = (
     {"mapper", "opening"},
     {"calibrate", "evaluate", "survey"},
     {"run", "view"},
-    {"floor_run", "ros", "report", "viewer"},
+    {"describe", "floor_run", "ros", "report", "viewer"},
     {"lab"},
     {"cli"},
     {"__main__"},

@@ -73,6 +73,7 @@ _HOMES = {
     "State": "maps",
     "VoxelMap": "maps",
     "load_map": "maps",
+    "describe": "describe",
     "GridMap": "maps.grid_map",
     "OccupancyGrid": "maps.occupancy",
     "export": "formats",

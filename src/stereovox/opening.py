@@ -7,6 +7,7 @@ import os
 import shlex
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import suppress
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
@@ -169,6 +170,12 @@ def open_robot(where: str | os.PathLike[str]) -> Robot:
     raise SourceError(f"{place}: no recording of a ground robot; give a bag with scans, a CARMEN log or sim:floor")
 
 
+def is_robot(path: str | os.PathLike[str]) -> bool:
+    """Return whether `open_robot` recognises `path`, by its name or content."""
+    kinds = (registry.find("robots", ROBOTS, name) for name in registry.names("robots", ROBOTS))
+    return any(kind.recognises(os.fspath(path)) for kind in kinds)
+
+
 def is_recording(path: str | os.PathLike[str]) -> bool:
     """Return whether `open_source` recognises `path`."""
     return any(kind.recognises(os.fspath(path)) for kind in _classes())
@@ -240,13 +247,23 @@ def _problem(where: str, kinds: list[Any]) -> str:
     if not os.path.isdir(place):
         return _file_problem(place)
     try:
-        below = sorted(entry.path for entry in os.scandir(place) if entry.is_dir())
+        below = _below(place)
     except OSError as error:
         return f"{error.strerror}, so it cannot be listed"
-    likely = next((folder for folder in below[:MAX_BELOW] for kind in kinds if kind.recognises(folder)), None)
+    likely = next((folder for folder in below for kind in kinds if kind.recognises(folder)), None)
     if likely:
         return f"no recording itself; did you mean {likely}?"
     return _missing(place, kinds) or f"no recording: {_contents(place)}; layouts: see docs/recordings.md"
+
+
+def _below(folder: str) -> list[str]:
+    """Return folders in a folder, and those in these; raises OSError where it cannot be listed."""
+    inside = sorted(entry.path for entry in os.scandir(folder) if entry.is_dir())[:MAX_BELOW]
+    deeper = []
+    for path in inside:
+        with suppress(OSError):
+            deeper += sorted(entry.path for entry in os.scandir(path) if entry.is_dir())[:MAX_BELOW]
+    return [*inside, *deeper][: 2 * MAX_BELOW]
 
 
 def _file_problem(file: str) -> str:
@@ -269,7 +286,7 @@ def _missing(folder: str, kinds: list[Any]) -> str:
         parts: tuple[Part, ...] = getattr(kind, "parts", ())
         counts = [part.count(folder) for part in parts]
         share = sum(map(bool, counts)) / max(len(parts), 1)
-        if best < share < 1:
+        if counts and counts[0] and best < share < 1:  # the images; poses alone may belong to anything
             there = [f"{part.what} ({count})" for part, count in zip(parts, counts, strict=True) if count]
             lacks = next(part for part, count in zip(parts, counts, strict=True) if not count)
             best = share

@@ -82,6 +82,8 @@ class Survey:
         without_value: Share of pixels without depth; None for stereo pairs.
         depths_m: (N,) metres, a sample of all depths; empty for stereo pairs.
         unit: Unit of the depth images in words; None where it is not known.
+        unit_m: The same in metres.
+        unit_sure: Whether the images themselves confirm it.
         unit_why: What speaks for the unit.
         up: Which way is up; None without poses.
         max_range: Suggested longest depth in metres.
@@ -102,6 +104,8 @@ class Survey:
     without_value: float | None
     depths_m: NDArray[np.float64]
     unit: str | None
+    unit_m: float | None
+    unit_sure: bool
     unit_why: str
     up: Up | None
     max_range: Suggestion
@@ -203,6 +207,8 @@ def survey(source: Source, frames: int = FRAMES) -> Survey:
         without_value=1 - valid.size / pixels if pixels else None,
         depths_m=valid,
         unit=None if unit is None else unit.words,
+        unit_m=None if unit is None else unit.scale,
+        unit_sure=unit is not None and unit.sure,
         unit_why="" if unit is None else unit.why,
         up=find_up(source, posed) if posed else None,
         max_range=max_range,
@@ -237,8 +243,8 @@ def find_up(source: Any, frames: list[AnyFrame]) -> Up:
     direction, share = _level_direction(mean / steady, normals)
     axis = nearest_axis(direction)
     off = float(np.arccos(np.clip(direction @ upright_axes(axis)[2], -1, 1)))
-    if not len(normals):
-        return Up(axis, direction, off, off < UPRIGHT, "by the attitude of the camera")
+    if not len(normals):  # the mean attitude alone is good for the axis, not for the angle
+        return Up(axis, upright_axes(axis)[2], 0.0, off < UPRIGHT, "by the attitude of the camera")
     sure = share >= HORIZONTAL_SHARE and off < UPRIGHT
     why = f"by the attitude of the camera, and {100 * share:.0f} % of what it saw is level"
     return Up(axis, direction, off, sure, why)

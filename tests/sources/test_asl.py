@@ -32,6 +32,9 @@ def test_a_euroc_folder_opens_by_either_name(tmp_path):
     source = open_source(folder)
     assert isinstance(source, AslRig)
     assert source.name == "MH_01_easy"
+    assert open_source(folder, frames=":1").up == source.up == "z", (
+        "the data sets' own ground truth is upright, however the camera was held"
+    )
     assert isinstance(open_source(folder / "mav0"), AslRig)
     frames = list(source)
     assert [(frame.stamp_ns, frame.fault) for frame in frames] == [(START, None), (START + STEP, None)]
@@ -154,6 +157,7 @@ def test_poses_in_tum_format(tmp_path):
     (folder / "mav0/groundtruth.txt").write_text(
         f"{START / 1e9:.9f} 1 2 3 0 0 0 1\n{(START + 2 * STEP) / 1e9:.9f} 1 2 3 0 0 0 1"
     )
+    assert open_source(folder).up is None
     frame = open_source(folder).frame(1)
     assert frame.fault is None
     np.testing.assert_allclose(frame.T_world_sensor[:3, 3], FORWARD[:3, 3] + [1, 2, 3], atol=1e-6)

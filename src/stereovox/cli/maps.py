@@ -9,9 +9,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from stereovox.cli.terminal import cells_line, command_line, say, thousands
+from stereovox.cli.terminal import cells_line, command_line, say
 from stereovox.errors import MapFileError, StereovoxError
 from stereovox.safe_io import FLOOR_READABLE, check_in_space
 
@@ -70,47 +68,6 @@ def check_new_floor(out: str, *inputs: str | Path) -> None:
     written = {os.path.realpath(Path(out).with_suffix(ending)) for ending in FLOOR_READABLE}
     if written & {os.path.realpath(file) for file in inputs}:
         raise StereovoxError(f"{out}: would overwrite what it is made of; give the new map another name")
-
-
-def describe_grid(path: str) -> dict[str, Any]:
-    """Print what a floor map contains, and return it with the keys of a 3-D map where they apply."""
-    from stereovox.maps import State
-    from stereovox.view.grid import known_bounds
-
-    grid = open_grid(path)
-    counts = np.bincount(grid.states.ravel(), minlength=len(State)).tolist()
-    bounds = known_bounds(grid)
-    rows, columns = grid.cells.shape
-    result = {
-        "dimensions": 2,
-        "voxel_size": grid.resolution,
-        "bounds": None if bounds is None else bounds.round(6).tolist(),
-        **{state.name.lower(): counts[state] for state in (State.OCCUPIED, State.FREE, State.TENTATIVE, State.UNKNOWN)},
-        "memory_bytes": grid.cells.nbytes,
-        "frames": None,
-        "profile": None,
-        "rows": rows,
-        "columns": columns,
-        "origin": list(map(float, grid.origin)),
-        "free_below": grid.free_below,
-        "occupied_above": grid.occupied_above,
-    }
-    _print_grid(result)
-    return result
-
-
-def _print_grid(result: dict[str, Any]) -> None:
-    side = result["voxel_size"]
-    say(f"a floor's map, {result['columns']} x {result['rows']} cells of {side:g} m")
-    x, y, yaw = result["origin"]
-    turned = f", turned by {np.degrees(yaw):.2f} degrees" if yaw else ""
-    say(f"its lower left corner lies at ({x:g}, {y:g}) m{turned}")
-    if result["bounds"]:
-        (x0, y0), (x1, y1) = result["bounds"]
-        say(f"known from ({x0:g}, {y0:g}) to ({x1:g}, {y1:g}) m")
-    say(", ".join(f"{thousands(result[state])} {state}" for state in ("occupied", "free", "tentative", "unknown")))
-    if result["tentative"]:
-        say(f"free: p < {result['free_below']:g}; occupied: p > {result['occupied_above']:g}")
 
 
 def dimensions(path: str) -> int:

@@ -3,12 +3,14 @@
 
 from __future__ import annotations
 
-import shlex
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from stereovox.describe import command_line as command_line
+from stereovox.describe import size as size
+from stereovox.describe import thousands as thousands
 from stereovox.errors import one_line
 
 if TYPE_CHECKING:
@@ -95,11 +97,6 @@ class FrameProgress:
         self._bar.update(self._task, advance=1, note=f"{speed:.0f} a second" if speed else "")
 
 
-def command_line(*words: object) -> str:
-    """Return a stereovox command quoted for a shell."""
-    return shlex.join(["stereovox", *map(str, words)])
-
-
 def first_included(result: dict[str, Any]) -> str:
     """Return a remark on times in a summary where they are those of a single frame, the first; else nothing."""
     return " (a single frame: loading or compiling the kernels included)" if result["frames"] == 1 else ""
@@ -108,20 +105,6 @@ def first_included(result: dict[str, Any]) -> str:
 def milliseconds(figures: dict[str, float]) -> str:
     """Format figures: `median 1.2, 90 % 1.5, 99 % 1.9, longest 2.3 ms`."""
     return "median {median:.2f}, 90 % {p90:.2f}, 99 % {p99:.2f}, longest {max:.2f} ms".format(**figures)
-
-
-def size(number_of_bytes: float) -> str:
-    """Format a number of bytes: `12.3 MB`."""
-    for unit in ("bytes", "kB", "MB"):
-        if number_of_bytes < 1000:
-            return f"{number_of_bytes:.3g} {unit}"
-        number_of_bytes /= 1000
-    return f"{number_of_bytes:.3g} GB"
-
-
-def thousands(number: Any) -> str:
-    """Format a whole number with commas: 1,234,567."""
-    return f"{number:,}"
 
 
 def say_refusals(result: dict[str, Any], reports: Sequence[UpdateReport], what: str) -> None:

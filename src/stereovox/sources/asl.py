@@ -77,6 +77,7 @@ class AslRig(RigSource):
         else:
             poses = _poses(root)
             _check_clocks(left, poses)
+            self.up = "z" if any(os.path.isfile(root / name / DATA) for name in TRUTHS) else None
         poses = as_body(poses, found.T_body_left, options["axes"], options["invert"])
         try:
             self._set(Rig((pair,)), root, _shots(left, right), poses, calibration)

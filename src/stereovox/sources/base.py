@@ -74,6 +74,7 @@ class Stream(Protocol):
         notes: Lines the user should see, for example a calibration that had to be assumed.
         layout: How to recognise this kind of source, for messages.
         parts: What a folder of this layout holds, to say what is missing in one that is nearly so.
+        up: The world's axis that points up (`z`, `-y`), where this kind of recording defines it; else None.
         composite: The class combines other recordings; its second argument is the function that opens them (see
             `CameraPair`).
     """
@@ -83,6 +84,7 @@ class Stream(Protocol):
     notes: tuple[str, ...] = ()
     layout: str = ""
     parts: tuple[Part, ...] = ()
+    up: str | None = None
     composite: bool = False
 
     @property
@@ -184,7 +186,7 @@ class Selection(Source):
         if not self._picked:
             raise SourceError(f"frames '{frames}' picks none of the {len(source)} frames of {source.name}; widen it")
         self.name, self.camera = source.name, source.camera
-        self.notes = getattr(source, "notes", ())
+        self.notes, self.up = getattr(source, "notes", ()), getattr(source, "up", None)
 
     def __len__(self) -> int:
         return len(self._picked)

@@ -49,6 +49,7 @@ class TwoView(RigSource):
     """
 
     layout = "a stereo pair of Middlebury or ETH3D (im0.png, im1.png and calib.txt)"
+    up = "z"
     parts = (Part(IMAGES[:1], "left image"), Part(IMAGES[1:], "right image"), Part((CALIBRATION,), CALIBRATION))
 
     def __init__(self, where: str | os.PathLike[str]):

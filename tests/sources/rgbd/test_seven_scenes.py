@@ -5,10 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from made_depth import check, posed, render, units, write
 from made_recordings import depth_image, pose, seven_scenes, write_png
 
 from stereovox.errors import SourceError
 from stereovox.opening import open_source
+from stereovox.sources.base import Selection
 from stereovox.sources.rgbd.seven_scenes import SevenScenes
 
 KITCHEN = Path(__file__).resolve().parents[2] / "../shared/data/sevenscenes_redkitchen"
@@ -133,3 +135,40 @@ def test_the_kitchen():
     assert 0.5 < np.median(depths) < 4
     assert 0.6 < depths.size / first.depth.size < 1
     assert all(frame.fault is None for frame in open_source(KITCHEN, "::20"))
+
+
+INFO = """m_versionNumber = 4
+m_sensorName = StructureSensor
+m_colorWidth = 640
+m_colorHeight = 480
+m_depthWidth = 64
+m_depthHeight = 48
+m_depthShift = 4000
+m_calibrationColorIntrinsic = 583 0 320 0 0 583 240 0 0 0 1 0 0 0 0 1
+m_calibrationColorExtrinsic = 1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1
+m_calibrationDepthIntrinsic = 52 0 31 0 0 51 24 0 0 0 1 0 0 0 0 1
+m_calibrationDepthExtrinsic = 1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1
+m_frames.size = 4
+"""
+
+
+@pytest.mark.parametrize("name", ["info.txt", "_info.txt"])
+@pytest.mark.parametrize("suffix", ["png", "pgm"])
+def test_bundlefusion_and_3rscan_say_camera_and_unit(tmp_path, name, suffix):
+    for k, T in enumerate([*posed(), np.full((4, 4), -np.inf)]):
+        seen = posed()[0] if k == 4 else T
+        write(tmp_path / f"frame-{k:06d}.depth.{suffix}", units(render(seen), 4000))
+        np.savetxt(tmp_path / f"frame-{k:06d}.pose.txt", T)
+    (tmp_path / name).write_text(INFO)
+    source = SevenScenes(
+        tmp_path,
+    )
+    check(Selection(source, ":4"), posed(), 4000)
+    assert source.unit.sure
+    assert not np.isfinite(source.frame(4).T_world_sensor).any()  # tracking was lost; the gate refuses it
+
+
+def test_an_info_txt_of_something_else_is_no_camera(tmp_path):
+    folder = seven_scenes(tmp_path)
+    (folder / "info.txt").write_text("recorded on a Tuesday\n")
+    assert SevenScenes(folder).camera.fx == 20

@@ -6,6 +6,7 @@ import pytest
 from made_recordings import SIZE, depth_image, tum, write_png
 
 from stereovox.errors import SourceError
+from stereovox.opening import open_source
 from stereovox.sources.rgbd.tum import TumRgbd
 
 STAMPS = ["1305031102.160407", "1305031102.194330", "1305031102.226738"]
@@ -98,3 +99,59 @@ def test_without_intrinsics_640x480_gets_tums_own_and_says_so(tmp_path):
     assert "525" in source.notes[0]
     (folder / "calibration.txt").write_text("517.3 516.5 318.6 255.3")
     assert TumRgbd(folder).camera.fx == 517.3
+
+
+@pytest.mark.parametrize("name", ["CameraTrajectory.txt", "KeyFrameTrajectory.txt", "truth_cam_poses.txt"])
+def test_without_groundtruth_the_poses_of_a_slam_program_are_used_and_named(tmp_path, name):
+    folder = tum(tmp_path, STAMPS, STRAIGHT)
+    (folder / "groundtruth.txt").rename(folder / name)
+    (folder / "a_trajectory_notes.txt").write_text("walked slowly\n")
+    source = open_source(folder)
+    assert isinstance(source, TumRgbd)
+    assert [frame.fault for frame in source] == [None] * 3
+    assert source.frame(1).T_world_sensor[0, 3] == pytest.approx(0.19433)
+    assert f"poses are those of {name}" in source.notes[0]
+    (folder / "groundtruth.txt").write_text(STRAIGHT)
+    assert not any(name in note for note in open_source(folder).notes)
+
+
+def test_poses_may_be_one_for_each_image_where_the_clocks_differ(tmp_path):
+    folder = tum(tmp_path, STAMPS, STRAIGHT)
+    (folder / "groundtruth.txt").unlink()
+    (folder / "CameraTrajectory.txt").write_text("".join(f"{k}.5 {k} 0 0 0 0 0 1\n" for k in range(3)))
+    assert [frame.T_world_sensor[0, 3] for frame in open_source(folder)] == [0, 1, 2]
+    (folder / "CameraTrajectory.txt").write_text("0.5 0 0 0 0 0 0 1\n1.5 0 0 0 0 0 0 1\n")
+    with pytest.raises(SourceError, match="2 poses for 3 images"):
+        open_source(folder)
+
+
+@pytest.mark.parametrize("line", ["{0}1 rgb/x.png {0} depth/{0}.png\n", "{0} depth/{0}.png {0}1 rgb/x.png\n"])
+def test_a_list_of_pairs_names_the_depth_images(tmp_path, line):
+    folder = tum(tmp_path, STAMPS, STRAIGHT, listed=False)
+    (folder / "associations.txt").write_text("".join(line.format(stamp) for stamp in STAMPS[:2]))
+    source = open_source(folder)
+    assert [frame.depth[5, 5] for frame in source] == [depth_image(n)[5, 5] for n in range(2)]
+    assert source.frame(0).stamp_ns == 1_305_031_102_160_407_000
+    (folder / "associations.txt").write_text("1.0 depth/a.png 2.0\n")
+    with pytest.raises(SourceError, match=r"associations\.txt:1: needs"):
+        open_source(folder)
+
+
+def test_a_folder_without_poses_names_them_as_what_is_missing(tmp_path):
+    folder = tum(tmp_path, STAMPS, STRAIGHT)
+    (folder / "groundtruth.txt").unlink()
+    with pytest.raises(SourceError, match=r"but no poses; write groundtruth\.txt .*\?poses=FILE"):
+        open_source(folder)
+
+
+def test_bonns_camera_and_the_only_yaml(tmp_path):
+    folder = tum(tmp_path / "rgbd_bonn_crowd", STAMPS, STRAIGHT, intrinsics=None)
+    for stamp in STAMPS:
+        write_png(folder / "depth" / f"{stamp}.png", depth_image(0, (640, 480)))
+    assert TumRgbd(folder).camera.fx == 542.822841
+    yaml = "%YAML:1.0\nCamera.fx: 535.4\nCamera.fy: 539.2\nCamera.cx: 320.1\nCamera.cy: 247.6\nDepthMapFactor: 1000.0\n"
+    (folder / "TUM3.yaml").write_text(yaml)
+    source = TumRgbd(folder)
+    assert (source.camera.fx, source.depth_scale) == (535.4, 0.001)
+    (folder / "another.yaml").write_text(yaml)
+    assert TumRgbd(folder).camera.fx == 542.822841

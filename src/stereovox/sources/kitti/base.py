@@ -46,6 +46,7 @@ class KittiSource(Source, ABC):
     calibration: KittiCalibration
     poses: CameraPoses
     eyes: tuple[int, int]
+    up = "z"
 
     @abstractmethod
     def images(self, i: int) -> tuple[Path, Path]:

@@ -29,9 +29,15 @@ FLOAT_TOP = (58, 71)
 """Smallest and largest leading byte of float32 depths from 1 mm to 100 km (the sky of simulators)."""
 CARLA_M, CARLA_MAX = 1000.0, 256**3 - 1
 """CARLA's depth camera: (R + 256 G + 65536 B) / (256^3 - 1) of 1000 m."""
+COUNTS, FEWEST, ROUGH = 0.03, 20, 0.1
+"""Share of such neighbours in packed depth (photos have none at all), fewest to tell by, most relative step."""
 KIND = "depth must be a 16-bit grey PNG, PGM or TIFF, or floats (TIFF, PFM, EXR, NPY)"
 COLMAP = re.compile(rb"(\d{1,6})&(\d{1,6})&1&")
 """Start of COLMAP's depth maps: columns, rows and channels; then float32 row by row."""
+HEADER = re.compile(
+    rb"(P5|P2|Pf)\s(?:\s|#[^\n]*\n)*(\d{1,6})(?:\s|#[^\n]*\n)+(\d{1,6})(?:\s|#[^\n]*\n)+(-?[\d.]{1,12})\s"
+)
+"""Kind, width, height, and largest value or, of a PFM, scale, whose sign is the order of bytes."""
 Depth = NDArray[np.uint16] | NDArray[np.float32]
 
 
@@ -43,7 +49,8 @@ def read_depth(path: Path, size: tuple[int, int]) -> Depth:
         size: (width, height) that it must have.
 
     Returns:
-        (height, width) uint16, or float32 where the file holds floats or larger integers; in the file's unit.
+        (height, width) uint16, or float32 where the file holds floats or larger integers; in the file's unit. Negative
+        integers become 0, no value.
 
     Raises:
         FrameRefused: `missing_file`; `unreadable` (cut off, damaged, absurdly large); `bad_dtype` (a picture);
@@ -113,8 +120,8 @@ def _depth(path: Path, image: NDArray[np.generic]) -> Depth:
         raise FrameRefused("bad_dtype", f"{path}: holds {what}; {KIND}")
     if not 0 < image.size <= MAX_PIXELS:
         raise FrameRefused("unreadable", f"{path}: {image.size} pixels; remove it")
-    if image.dtype == np.uint16:
-        return np.ascontiguousarray(image, np.uint16)
+    if image.dtype.kind in "ui" and image.max() <= np.iinfo(np.uint16).max:
+        return np.ascontiguousarray(np.maximum(image, 0), np.uint16)
     with np.errstate(over="ignore"):
         return np.ascontiguousarray(image, np.float32)
 
@@ -137,42 +144,79 @@ def _unpacked(path: Path, image: NDArray[np.uint8]) -> NDArray[np.float32]:
             orders = [(blue, red), (red, blue)]  # of OpenCV (RTAB-Map), and of programs that write R first
             made = [(low | green << 8 | high << 16 | top.astype(np.uint32) << 24) for low, high in orders]
             return min((bits.view(np.float32) for bits in made), key=_roughness)
-    if _counts_over(blue, green) > 0.8:
-        return ((red + 256 * green + 65536 * blue) * (CARLA_M / CARLA_MAX)).astype(np.float32)
+    code = red + 256 * green + 65536 * blue
+    if max(_counts_over(blue, green), _counts_over(green, red)) > COUNTS and _roughness(code) < ROUGH:
+        return (code * (CARLA_M / CARLA_MAX)).astype(np.float32)
     raise FrameRefused("bad_dtype", f"{path}: is a colour picture; {KIND}")
 
 
-def _roughness(depth: NDArray[np.float32]) -> float:
+def _roughness(depth: NDArray[np.generic]) -> float:
     """Return the median relative step from pixel to pixel."""
-    step = np.abs(np.diff(depth.astype(np.float64), axis=1)) / np.maximum(np.abs(depth[:, 1:]), 1e-9)
+    values = np.asarray(depth, np.float64)
+    step = np.abs(np.diff(values, axis=1)) / np.maximum(np.abs(values[:, 1:]), 1e-9)
     return float(np.nanmedian(step)) if step.size else 0.0
 
 
 def _counts_over(high: NDArray[np.uint32], low: NDArray[np.uint32]) -> float:
-    """Return in how many neighbours whose `high` byte differs by one the `low` byte starts anew, as in a number."""
-    rise, fall = (np.diff(byte.astype(np.int32), axis=1) for byte in (high, low))
-    one = np.abs(rise) == 1
-    return float(np.mean(fall[one] * rise[one] < -128)) if one.any() else 0.0
+    """Return in how many neighbours whose `high` byte differs by one the `low` byte starts anew, as in a number.
+
+    0 where there are too few such neighbours to tell.
+    """
+    found = []
+    for axis in (0, 1):
+        rise, fall = (np.diff(byte.astype(np.int32), axis=axis) for byte in (high, low))
+        one = np.abs(rise) == 1
+        found.append(fall[one] * rise[one] < -128)
+    over = np.concatenate(found)
+    return float(np.mean(over)) if len(over) >= FEWEST else 0.0
 
 
-def _opencv(path: Path, content: bytes) -> NDArray[np.generic]:
+def _tiff(path: Path, content: bytes) -> NDArray[np.generic]:
     import cv2
 
+    level = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # else a damaged file writes to the terminal
     try:
         image = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
         image = None
+    finally:
+        cv2.utils.logging.setLogLevel(level)
     if image is None:
         raise FrameRefused("unreadable", f"{path}: is cut off or damaged; copy it again or remove it")
     return image
 
 
-def _pgm(path: Path, content: bytes) -> NDArray[np.generic]:
-    """Return the image of a PGM; one that is cut off is refused (OpenCV fills it up)."""
-    image = _opencv(path, content)
-    if len(content) < image.nbytes and content.startswith(b"P5"):
+def _netpbm(path: Path, content: bytes) -> NDArray[np.generic]:
+    """Return the image of a PGM (P5 binary, P2 text) or grey PFM (Pf, its lowest row first).
+
+    OpenCV fills up what is cut off.
+    """
+    header = HEADER.match(content)
+    if header is None:
+        raise FrameRefused("unreadable", f"{path}: its header is damaged; copy it again or remove it")
+    kind, (width, height), most = header[1], (int(header[2]), int(header[3])), float(header[4])
+    if not 0 < width * height <= MAX_PIXELS or not 0 < abs(most) < 65536:
+        raise FrameRefused("unreadable", f"{path}: its header tells of {width}x{height} pixels; remove it")
+    order = "<" if kind == b"Pf" and most < 0 else ">"
+    dtype = np.dtype(f"{order}f4" if kind == b"Pf" else ">u2" if most > 255 else "u1")
+    rest = content[header.end() :]
+    if kind == b"P2":
+        return _plain_pgm(path, rest, (height, width), dtype)
+    if len(rest) < width * height * dtype.itemsize:
         raise FrameRefused("unreadable", f"{path}: is cut off; copy it again or remove it")
-    return image
+    image = np.frombuffer(rest, dtype, width * height).reshape(height, width)
+    return (image[::-1] if kind == b"Pf" else image).astype(dtype.newbyteorder("="))
+
+
+def _plain_pgm(path: Path, text: bytes, shape: tuple[int, int], dtype: np.dtype[np.generic]) -> NDArray[np.generic]:
+    try:
+        numbers = np.array(text.split(), np.int64)
+    except (ValueError, OverflowError):
+        numbers = np.empty(0, np.int64)
+    if numbers.size != shape[0] * shape[1] or numbers.min() < 0 or numbers.max() > 65535:
+        raise FrameRefused("unreadable", f"{path}: is cut off or damaged; copy it again or remove it")
+    return numbers.reshape(shape).astype(dtype.newbyteorder("="))
 
 
 def _colmap(path: Path, content: bytes) -> NDArray[np.float32]:
@@ -189,12 +233,18 @@ def _numpy(path: Path, content: bytes) -> NDArray[np.generic]:
     try:
         found = np.load(io.BytesIO(content), allow_pickle=False)
         if isinstance(found, np.ndarray):
-            return np.squeeze(found)
+            return _squeezed(found)
         name = "depth" if "depth" in found.files else found.files[0] if len(found.files) == 1 else ""
-        return np.squeeze(found[name])
+        return _squeezed(found[name])
     except Exception as error:  # what a damaged file can raise in zipfile, zlib and NumPy is not bounded
         why = " ".join(str(error).split())[:100]
         raise FrameRefused("unreadable", f"{path}: no array of depths ({why}); save it again") from None
+
+
+def _squeezed(array: NDArray[np.generic]) -> NDArray[np.generic]:
+    """Return the array without axes of length one beyond the second."""
+    axes = [axis for axis, length in enumerate(array.shape) if length == 1]
+    return np.squeeze(array, tuple(axes[: max(array.ndim - 2, 0)]))
 
 
 def _exr(path: Path, content: bytes) -> NDArray[np.generic]:
@@ -217,11 +267,11 @@ def _exr(path: Path, content: bytes) -> NDArray[np.generic]:
 
 
 DECODERS: dict[bytes, Callable[[Path, bytes], NDArray[np.generic]]] = {
-    b"P5": _pgm,
-    b"P2": _pgm,
-    b"Pf": _opencv,
-    b"II*\0": _opencv,
-    b"MM\0*": _opencv,
+    b"P5": _netpbm,
+    b"P2": _netpbm,
+    b"Pf": _netpbm,
+    b"II*\0": _tiff,
+    b"MM\0*": _tiff,
     b"\x76\x2f\x31\x01": _exr,
     b"\x93NUMPY": _numpy,
     b"PK\x03\x04": _numpy,

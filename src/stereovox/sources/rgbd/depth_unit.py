@@ -37,8 +37,9 @@ POINTS_ACROSS = 80
 """Points of an image, across, that are compared."""
 AGREES = 0.03
 """Relative difference of depths that are of the same surface."""
-SURE = 0.4, 2.0
-"""Share of points that must agree, and how many times less the median difference must be than in any other unit."""
+SURE = 0.4, 1.15, 2.0
+"""Share of points that must agree, how many times more than in any other unit, and how many times less the median
+difference must be."""
 LIKELY_M = 0.25, 40.0
 """Median depth in metres of a scene that a unit is plausible for, where there is nothing else to go by."""
 
@@ -90,12 +91,10 @@ def find_unit(pairs: Sequence[tuple[View, View]], camera: PinholeCamera, expecte
     medians = np.array([np.median(differences) if len(differences) else np.inf for differences, _ in found])
     agree = np.array([np.sum(differences < AGREES) / max(points, 1) for differences, points in found])
     best = int(np.argmax(agree))
-    others = np.delete(medians, best)
-    needed, times = SURE
-    if agree[best] >= needed and len(others) and others.min() > times * max(medians[best], 1e-4):
-        why = (
-            f"{100 * agree[best]:.0f} % of the points seen twice agree; else {100 * np.delete(agree, best).max():.0f} %"
-        )
+    needed, more, less = SURE
+    others, differ = np.delete(agree, best).max(), np.delete(medians, best).min()
+    if agree[best] >= max(needed, more * others) and differ > less * max(medians[best], 1e-4):
+        why = f"{100 * agree[best]:.0f} % of the points agree from image to image, in other units {100 * others:.0f} %"
         return DepthUnit(units[best], True, why)
     return _unchecked(pairs, expected)
 

@@ -24,13 +24,23 @@ POSES = Part(
     "poses",
     "write poses.txt with lines 'stamp tx ty tz qx qy qz qw' or a 4x4 matrix for each image, or add ?poses=FILE",
 )  # fmt: skip
-DEPTH = Part(
+POSE_FILE = r".*pose.*\d.*\.txt|.*\d.*pose.*\.txt"
+"""A file with the pose of one image, beside it."""
+
+
+class DepthPart(Part):
+    """Depth images, which count only where the first is one: pictures have the same endings."""
+
+    def count(self, folder: str | os.PathLike[str]) -> int:
+        """Return how many depth images there are."""
+        return super().count(folder) if has_depth(os.fspath(folder)) else 0
+
+
+DEPTH = DepthPart(
     tuple(f"{place}{suffix}" for place in ("depth/*", "depths/*", "*depth*/*", "results/*depth*", "*depth*", "*")
           for suffix in SUFFIXES),
     "depth images",
 )  # fmt: skip
-POSE_FILE = r".*pose.*\d.*\.txt|.*\d.*pose.*\.txt"
-"""A file with the pose of one image, beside it."""
 
 
 class DepthAndPoses(DepthFolder):
@@ -109,7 +119,7 @@ class DepthOnly(DepthAndPoses):
 
 def has_depth(folder: str) -> bool:
     """Return whether `folder` holds depth images: by their names, or because the first image is one."""
-    if not os.path.isdir(folder) or not DEPTH.count(folder):
+    if not os.path.isdir(folder):
         return False
     place, pattern = image_place(Path(folder))
     images = images_in(place, pattern, 1.0)

@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a path holds: a map, recording, bag, cloud, image, poses or calibration; and the commands that use it."""
+
+from __future__ import annotations
+
+import os
+import shlex
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from importlib import import_module
+from typing import Any
+
+KINDS = (
+    "stereovox.describe.maps:describe_map",
+    "stereovox.describe.maps:describe_floor",
+    "stereovox.describe.recordings:describe_recording",
+    "stereovox.describe.files:describe_cloud",
+    "stereovox.describe.files:describe_settings",
+    "stereovox.describe.files:describe_calibration",
+    "stereovox.describe.files:describe_poses",
+    "stereovox.describe.files:describe_image",
+)
+"""Asked in this order; each returns None for what is not of its kind."""
+
+
+@dataclass(frozen=True)
+class Description:
+    """What a path holds.
+
+    Attributes:
+        kind: `map`, `floor map`, `recording`, `bag`, `robot`, `cloud`, `settings`, `calibration`, `poses`, `depth
+            image` or `picture`.
+        lines: Lines for people.
+        facts: The same as numbers and texts, as `stereovox info --json` prints them.
+        commands: Command lines that use it, the likely one first.
+    """
+
+    kind: str
+    lines: list[str]
+    facts: dict[str, Any]
+    commands: list[str] = field(default_factory=list)
+
+
+def describe(path: str | os.PathLike[str]) -> Description:
+    """Find out what a path holds and what to do with it; a recording is looked at, not read whole.
+
+    Args:
+        path: A folder or file, also with options behind a `?`, or a simulation (`sim:room`).
+
+    Returns:
+        What it holds.
+
+    Raises:
+        StereovoxError: There is nothing, or nothing that any command uses: one line that says what it seems to be, what
+            is missing, and the cure.
+    """
+    from stereovox.opening import open_source
+
+    text = os.fspath(path)
+    for name in KINDS:
+        module, _, function = name.partition(":")
+        known: Callable[[str], Description | None] = getattr(import_module(module), function)
+        found = known(text)
+        if found is not None:
+            return found
+    open_source(text)  # which says what is missing
+    raise AssertionError(f"{text}: a recording that is not described")
+
+
+def command_line(*words: object) -> str:
+    """Return a stereovox command quoted for a shell."""
+    return shlex.join(["stereovox", *map(str, words)])
+
+
+def size(number_of_bytes: float) -> str:
+    """Format a number of bytes: `12.3 MB`."""
+    for unit in ("bytes", "kB", "MB"):
+        if number_of_bytes < 1000:
+            return f"{number_of_bytes:.3g} {unit}"
+        number_of_bytes /= 1000
+    return f"{number_of_bytes:.3g} GB"
+
+
+def thousands(number: Any) -> str:
+    """Format a whole number with commas: 1,234,567."""
+    return f"{number:,}"
+
+
+def metres(numbers: Any) -> str:
+    """Format lengths along axes: `1.9 x 0.6 x 1 m`."""
+    return " x ".join(f"{number:.2g}" if number < 10 else f"{number:.0f}" for number in numbers) + " m"

@@ -56,8 +56,8 @@ class FolderOptions:
     depth_scale: unit of the images; 1000 and 0.001 both mean millimetres (0: as the layout has it, checked against
         the poses). camera: file of the camera, in place of the layout's own (see `camera_in`). fps: images a second
         where they have no times (0: the layout's). poses: file or folder of poses in place of the layout's own (see
-        `pose_files`). axes: axes of the posed camera, `optical`, `opengl` (x right, y up, z backward) or `ros`. invert:
-        whether poses are world to camera.
+        `pose_files`). axes: axes of the posed camera, `optical`, `opengl` (x right, y up, z backward), `ros` or
+        `ned`. invert: whether poses are world to camera.
     File names are looked up as they stand, then inside the folder.
     """
 

@@ -196,8 +196,9 @@ def _of_json(path: Path) -> ImagePoses:
 def _extrinsic(camera: object) -> list[float]:
     """Return the 16 numbers of a camera's extrinsic; empty where it has none."""
     found = camera.get("extrinsic") if isinstance(camera, dict) else None
-    right = isinstance(found, list) and len(found) == 16 and all(map(is_number, found))
-    return [float(number) for number in found] if right else []
+    if not isinstance(found, list) or len(found) != 16 or not all(map(is_number, found)):
+        return []
+    return [float(number) for number in found]
 
 
 def _inverted(T: Transform, where: str) -> Transform | str:

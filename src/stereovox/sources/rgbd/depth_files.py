@@ -185,7 +185,7 @@ def _tiff(path: Path, content: bytes) -> NDArray[np.generic]:
 
 
 def _tiff_pixels(content: bytes) -> int:
-    """Return width times height times samples as the first directory of a TIFF tells them; 0 where it cannot be read."""
+    """Return width times height times samples by the first directory of a TIFF; 0 where it cannot be read."""
     order: Literal["little", "big"] = "little" if content.startswith(b"II") else "big"
     start = int.from_bytes(content[4:8], order)
     told = {256: 0, 257: 0, 277: 1}  # width, height, samples
@@ -240,7 +240,8 @@ def _numpy(path: Path, content: bytes) -> NDArray[np.generic]:
         if content.startswith(b"PK"):
             with zipfile.ZipFile(io.BytesIO(content)) as arrays:
                 _check_pixels(path, max(1, max(array.file_size for array in arrays.infolist()) // 8))
-        found = np.load(io.BytesIO(content), allow_pickle=False)
+        with np.errstate(all="ignore"):  # a damaged shape
+            found = np.load(io.BytesIO(content), allow_pickle=False)
         if isinstance(found, np.ndarray):
             return _squeezed(found)
         name = "depth" if "depth" in found.files else found.files[0] if len(found.files) == 1 else ""

@@ -251,5 +251,3 @@ def _change(path: Path, dice: random.Random) -> None:
 def _mixed(first: Path, second: Path, target: Path) -> None:
     _copy(first, target)
     shutil.copytree(second, target, symlinks=True, dirs_exist_ok=True)
-
-

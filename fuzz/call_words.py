@@ -18,9 +18,36 @@ SLOW = ("demo", "bench", "reproduce", "ros2", "view")
 """Commands that run for long, or until they are stopped, where nothing is wrong: each call gets a wrong word."""
 SIMULATIONS = ("sim:room", "sim:nothing", "sim:", "sim:floor", "realsense:", "sim:room?noise=x", "sim:room?seed=1&fx=0")
 NUMBERS = ("0", "1", "-1", "0.05", "0.5", "3", "nan", "inf", "-inf", "1e308", "1e-320", "1e-9", "x", "", "٣", "1_0")
-LISTS = ("0,0,0", "1,2,3", "0,0,0,1,1,1", "1,1,1,0,0,0", "nan,0,0", "0,0", "1e300,0,0", "a,b,c", "0.5,0.5,90", "1,2,3,4")
+LISTS = (
+    "0,0,0",
+    "1,2,3",
+    "0,0,0,1,1,1",
+    "1,1,1,0,0,0",
+    "nan,0,0",
+    "0,0",
+    "1e300,0,0",
+    "a,b,c",
+    "0.5,0.5,90",
+    "1,2,3,4",
+)
 RANGES = (":2", "::2", "1:", "0:0", "5:1", "-2:", "::0", "a:b", "1:2:3:4", "9999999999999999999:", "::-1", "7")
-WORDS = ("z", "-y", "y", "up", "mm", "inch", "trinary", "andert", "ray", "line", "6x4", "640x480", "0:1", "1:0", "/topic")
+WORDS = (
+    "z",
+    "-y",
+    "y",
+    "up",
+    "mm",
+    "inch",
+    "trinary",
+    "andert",
+    "ray",
+    "line",
+    "6x4",
+    "640x480",
+    "0:1",
+    "1:0",
+    "/topic",
+)
 SETTINGS = ("voxel_size=0.1", "voxel_size=nan", "up=-y", "up=w", "sensor.model=andert", "sensor.model=", "max_range=-1",
             "max_range=1e9", "steps=[0.1]", "steps=x", "window.size=[1,2]", "a.b.c=1", "=", "x", "map.cell=int8",
             "map.memory_mb=1", "threads=99999999", "prior=2", "up_direction=[0,0,0]", "sensor=1")  # fmt: skip
@@ -94,7 +121,9 @@ def _value(action: Any, draw: Draw, dice: random.Random) -> str:
         return dice.choice(LISTS)
     if "out" in what.split() or (action.metavar in ("MAP", "FILE", "OUT") and action.dest in ("file", "out", "map")):
         return f"out{dice.randrange(3)}{dice.choice(SUFFIXES)}" if dice.random() < 0.8 else _place(draw, dice)
-    if any(word in what for word in ("SOURCE", "RECORDING", "PATH", "ROBOT", "FILE", "MAP", "FOLDER", "TRUTH", " A", " B")):
+    if any(
+        word in what for word in ("SOURCE", "RECORDING", "PATH", "ROBOT", "FILE", "MAP", "FOLDER", "TRUTH", " A", " B")
+    ):
         return _place(draw, dice)
     return dice.choice((*WORDS, *NUMBERS, *LISTS))
 

@@ -122,7 +122,7 @@ def _value(command: str, action: Any, draw: Draw, dice: random.Random) -> str:
         return dice.choice(SETTINGS)
     if "," in what or "box" in what:
         return dice.choice(LISTS)
-    if "out" in what.split() or action.dest == "file" and command in ("export", "distance", "picture", "ground"):
+    if "out" in what.split() or (action.dest == "file" and command in ("export", "distance", "picture", "ground")):
         ending = ENDINGS.get(command, dice.choice(SUFFIXES) if command == "export" else ".svox")
         return f"out{dice.randrange(3)}{dice.choice((*[ending] * 9, *SUFFIXES))}"
     if action.metavar and action.metavar.startswith("FILE."):

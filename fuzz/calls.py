@@ -104,7 +104,7 @@ def run(folder: Path, arguments: argparse.Namespace) -> tuple[dict[str, Counter[
         if arguments.show or outcome.seconds > MAX_SECONDS / 3:
             print(number, f"{outcome.seconds:.1f} s", outcome.status, ascii(words), last[:400], file=sys.stderr)
         if problem:
-            problems.append(f"{number}: {problem}: {ascii(words)}: {outcome.printed[-1500:]}")
+            problems.append(f"{number}: {problem}: {words!a}: {outcome.printed[-1500:]}")
             print(problems[-1], file=sys.stderr, flush=True)
     os.chdir(HERE)
     return counts, problems

@@ -15,19 +15,22 @@ import numpy as np
 
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.errors import FrameRefused
-from stereovox.se3 import Transform
+from stereovox.se3 import Transform, inverse
 from stereovox.sources.rgbd.depth_files import Depth
-from stereovox.sources.rgbd.depth_unit import AGREES, SURE, View, differences, find_unit, is_likely, pairs_of
+from stereovox.sources.rgbd.depth_unit import View, difference, find_unit, is_likely, pairs_of
 from stereovox.sources.rgbd.pose_files import in_optical_axes
 from stereovox.sources.tracker import AXES
 
 POSE_SCALES = (1.0, 0.001, 0.01)
 """Metres per unit of poses that are tried."""
+AGREES = 0.03
+"""Relative difference of depths that are of the same surface."""
 FAR_OFF, FEW, SEEN_TWICE = 0.06, 0.25, 0.1
 """Poses do not fit where the median relative difference of depths is larger, a smaller share of the points agrees, and
 at least this share is seen by both images, so that it means something."""
-BETTER, ENOUGH = 1.5, 0.2
-"""Times as many points that must agree under another reading of the poses, and the least share of all."""
+BETTER, CLOSER, ENOUGH = 1.5, 2.0, 0.2
+"""Times as many points that must agree under another reading of the poses, times as small the median difference must
+be, and the least share of all points that must agree."""
 MIN_PAIRS = 2
 """Pairs of images that must speak for another reading."""
 SAME = 0.5
@@ -101,7 +104,7 @@ def misfit(
     better = _better(count, pose, read, camera, unit, now)
     if better is not None:
         reading, scale, found = better
-        if found.share > BETTER * as_it_is.share and as_it_is.median > SURE[2] * max(found.median, 1e-4):
+        if found.share > BETTER * as_it_is.share and as_it_is.median > CLOSER * max(found.median, 1e-4):
             options = [now.options(reading), *([] if scale == unit else [f"depth_scale={1 / scale:g}"])]
             return f"{words}; try ?{'&'.join(options)}, with which {100 * found.share:.0f} % agree"
     if as_it_is.median > FAR_OFF and as_it_is.share < FEW and as_it_is.seen > SEEN_TWICE:
@@ -111,9 +114,15 @@ def misfit(
 
 def agreement(pairs: Sequence[tuple[View, View]], camera: PinholeCamera, unit: float) -> Agreement:
     """Return how images of pairs agree with each other where their unit is `unit` metres."""
-    found, points = differences(pairs, camera, unit)
-    median = float(np.median(found)) if len(found) else np.inf
-    return Agreement(float(np.sum(found < AGREES)) / max(points, 1), median, len(found) / max(points, 1))
+    found, points = [np.empty(0)], 0
+    for first, second in pairs:
+        T_second_first = inverse(second.T_world_camera) @ first.T_world_camera
+        differ, of = difference(first.depth, second.depth, camera, T_second_first, unit)
+        found.append(differ)
+        points += of
+    differ = np.concatenate(found)
+    median = float(np.median(differ)) if len(differ) else np.inf
+    return Agreement(float(np.sum(differ < AGREES)) / max(points, 1), median, len(differ) / max(points, 1))
 
 
 def _better(

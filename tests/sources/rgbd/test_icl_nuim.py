@@ -11,12 +11,13 @@ from stereovox.sources.rgbd.icl_nuim import INTRINSICS, IclNuim, IclNuimScene
 from stereovox.sources.rgbd.tum import TumRgbd
 
 
-def icl(folder, poses="livingRoom2.gt.freiburg", count=4):
-    """Images 0 to count - 1; the data set has no pose for image 0."""
-    for k, T in enumerate(posed(count)):
+def icl(folder, poses="livingRoom2.gt.freiburg", places=posed()):
+    """Images at T_world_camera (4, 4); the data set has no pose for image 0."""
+    count = len(places)
+    for k, T in enumerate(places):
         write(folder / f"depth/{k}.png", units(render(T, INTRINSICS, VGA), 5000))
     (folder / "associations.txt").write_text("".join(f"{k} depth/{k}.png {k} rgb/{k}.png\n" for k in range(count)))
-    (folder / poses).write_text("".join(tum_line(k, left_handed(T)) for k, T in enumerate(posed(count)) if k))
+    (folder / poses).write_text("".join(tum_line(k, left_handed(T)) for k, T in enumerate(places) if k))
     return folder
 
 
@@ -37,10 +38,17 @@ def test_a_file_of_the_camera_does_not_turn_it_again(tmp_path, fy):
     check(open_source(folder), posed(), 5000, INTRINSICS, missing=[0])
 
 
+def turned_down(angle):
+    T = np.eye(4)
+    T[1:3, 1:3] = [[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]]
+    return T
+
+
 def test_walls_do_not_stand_twice_and_would_with_the_poses_as_they_are(tmp_path):
-    """The share of points of one image that lie where the next has a surface: all that it sees, or few."""
-    source = open_source(icl(tmp_path))
-    assert float(source.unit.why.split()[0]) > 70
+    """By how much the depths of one image differ from those that the next has there."""
+    nodding = [T @ turned_down(0.15 * k) for k, T in enumerate(posed())]
+    source = open_source(icl(tmp_path, places=nodding))
+    assert float(source.unit.why.split()[3]) < 1
     folder = tmp_path / "wrong"
     folder.mkdir()
     (folder / "depth").symlink_to(tmp_path / "depth")
@@ -49,6 +57,7 @@ def test_walls_do_not_stand_twice_and_would_with_the_poses_as_they_are(tmp_path)
     wrong = open_source(folder)
     assert isinstance(wrong, TumRgbd)
     assert not wrong.unit.sure
+    assert any("poses do not fit the images" in note for note in wrong.notes)
 
 
 def test_depth_along_the_rays_and_povray_cameras(tmp_path):

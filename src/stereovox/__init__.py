@@ -73,7 +73,7 @@ _HOMES = {
     "State": "maps",
     "VoxelMap": "maps",
     "load_map": "maps",
-    "describe": "describe",
+    "describe": "contents",
     "GridMap": "maps.grid_map",
     "OccupancyGrid": "maps.occupancy",
     "export": "formats",

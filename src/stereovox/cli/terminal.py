@@ -8,9 +8,9 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from stereovox.describe.description import command_line as command_line
-from stereovox.describe.description import size as size
-from stereovox.describe.description import thousands as thousands
+from stereovox.contents.description import command_line as command_line
+from stereovox.contents.description import size as size
+from stereovox.contents.description import thousands as thousands
 from stereovox.errors import one_line
 
 if TYPE_CHECKING:

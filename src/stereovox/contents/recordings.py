@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from stereovox.describe.description import Description, command_line, metres, thousands
+from stereovox.contents.description import Description, command_line, metres, thousands
 from stereovox.errors import StereovoxError
 from stereovox.opening import is_recording, is_robot, open_images, open_robot, open_source
 from stereovox.sources.bags import open_bag, suffix_of

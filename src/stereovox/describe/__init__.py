@@ -8,7 +8,10 @@ import shlex
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from importlib import import_module
+from pathlib import Path
 from typing import Any
+
+from stereovox.safe_io import FLOOR_READABLE
 
 KINDS = (
     "stereovox.describe.maps:describe_map",
@@ -87,5 +90,22 @@ def thousands(number: Any) -> str:
 
 
 def metres(numbers: Any) -> str:
-    """Format lengths along axes: `1.9 x 0.6 x 1 m`."""
-    return " x ".join(f"{number:.2g}" if number < 10 else f"{number:.0f}" for number in numbers) + " m"
+    """Format lengths along axes: `1.9 x 0.6 x 1.0 m`, or `3 x 98 x 6 mm` where all are short."""
+    if max(numbers) < 0.1:
+        return " x ".join(f"{1000 * number:.0f}" for number in numbers) + " mm"
+    return " x ".join(f"{number:.1f}" if number < 10 else f"{number:.0f}" for number in numbers) + " m"
+
+
+def map_name(source: str, ending: str = ".svox") -> str:
+    """Return the usual name of the map of a recording: `kitchen.svox`, and `room.svox` for `sim:room`."""
+    place = source if os.path.exists(source) else source.partition("?")[0]
+    kind, colon, rest = place.partition(":")
+    if colon and not os.path.exists(place):
+        return f"{rest or kind}{ending}"
+    return f"{Path(place).resolve().stem or 'map'}{ending}"
+
+
+def picture_name(path: str) -> str:
+    """Return the usual name of the picture of a map; the image of a floor's map may have the shorter name."""
+    place = Path(path).resolve()
+    return f"{place.stem}{'-picture' if place.suffix.lower() in FLOOR_READABLE else ''}.png"

@@ -132,7 +132,9 @@ def describe_poses(path: str) -> Description | None:
     when = "one for each image" if seconds is None else f"over {seconds:.1f} s"
     lines = [
         f"{thousands(len(T))} poses, {when}",
-        f"a path of {length:.3g} m within {metres(np.ptp(places, axis=0))}",
+        f"a path of {length:,.0f} m within {metres(np.ptp(places, axis=0))}"
+        if length >= 100
+        else f"a path of {length:.3g} m within {metres(np.ptp(places, axis=0))}",
         "poses alone make no map: give them to the depth images they belong to",
     ]
     facts = {"kind": "poses", "poses": len(T), "seconds": seconds, "path_m": length,

@@ -9,17 +9,20 @@ from typing import Any
 
 import numpy as np
 
-from stereovox.describe import Description, command_line, metres, thousands
+from stereovox.describe import Description, command_line, map_name, metres, picture_name, thousands
 from stereovox.errors import StereovoxError
 from stereovox.opening import is_recording, is_robot, open_images, open_robot, open_source
 from stereovox.sources.bags import open_bag, suffix_of
 from stereovox.sources.bags.files import BagFile
 from stereovox.sources.bags.recording import file_part
+from stereovox.sources.rgbd.rtabmap_db import RtabmapDatabase
 from stereovox.sources.robots.robot import Robot
 from stereovox.survey import Survey, Up, survey
 
 MAX_TOPICS = 40
 """Topics of a bag that are printed."""
+MAX_RATE_HZ = 2000.0
+"""Frames a second beyond which the stamps of a recording are wrong."""
 MAPS_IN_BAGS = ("octomap_msgs/Octomap", "nav_msgs/OccupancyGrid", "sensor_msgs/PointCloud2")
 
 
@@ -28,7 +31,7 @@ def describe_recording(path: str) -> Description | None:
 
     Raises SourceError for a damaged one, or one that lacks a part.
     """
-    if suffix_of(file_part(path)):
+    if suffix_of(file_part(path)) and not RtabmapDatabase.recognises(path):
         return _bag(path)
     if is_robot(path):
         with suppress(StereovoxError):  # a .log may hold anything else
@@ -53,20 +56,20 @@ def _images(path: str) -> Description | None:
     except StereovoxError as error:
         missing = str(error)
     facts = survey_facts(found) | {"missing": missing}
-    commands = [command_line("calibrate", "wall", path, "--distance", "1.00", "--out", "camera.toml")]
-    return Description("recording", [*_survey_lines(found), f"cannot be mapped yet: {missing}"], facts, commands)
+    add = "&" if "?" in path else "?"
+    commands = [command_line("map", f"{path}{add}poses=FILE", "--out", map_name(path))] if "?poses=" in missing else []
+    why = f"cannot be mapped yet: {missing.removeprefix(f'{path}: ')}"
+    return Description("recording", [*_survey_lines(found), why], facts, commands)
 
 
 def survey_commands(path: str, found: Survey) -> list[str]:
     """Return command lines that use a recording."""
-    name = Path(file_part(path)).resolve().stem or "map"
-    name = path.partition(":")[2].partition("?")[0] if path.startswith("sim:") else name
     if not found.posed:
         return []
-    commands = [command_line("map", path, "--out", f"{name}.svox")]
-    if found.up is not None and found.up.sure and found.up.off > np.radians(5):
-        commands.append(command_line("map", path, "--out", f"{name}.svox", "--level"))
-    return [*commands, command_line("bench", path)]
+    name = map_name(path)
+    tilted = found.up is not None and found.up.sure and found.up.off > np.radians(5)
+    level = [command_line("map", path, "--out", name, "--level")] if tilted else []
+    return [command_line("map", path, "--out", name), *level, command_line("picture", name, picture_name(name))]
 
 
 def survey_facts(found: Survey) -> dict[str, Any]:
@@ -105,26 +108,30 @@ def survey_facts(found: Survey) -> dict[str, Any]:
 def _survey_lines(found: Survey) -> list[str]:
     camera, many = found.camera, "depth images" if found.kind == "depth" else "stereo pairs"
     when = "" if found.rate_hz is None else f", {found.seconds:.1f} s, {found.rate_hz:.3g} a second"
+    if found.rate_hz is not None and found.rate_hz > MAX_RATE_HZ:
+        when = f", whose stamps span {found.seconds:.3f} s, which cannot be right"
     lines = [f"{found.name}: {thousands(found.frames)} {many} of {camera.width}x{camera.height}{when}"]
     baseline = "unknown" if camera.baseline is None else f"{camera.baseline:.4g} m"
     lines.append(
         f"camera: fx {camera.fx:.5g}, fy {camera.fy:.5g}, cx {camera.cx:.5g}, cy {camera.cy:.5g}, baseline {baseline}"
     )
     if found.unit is not None:
-        lines.append(f"depth in {found.unit}{'' if found.unit_sure else ', not certain'} ({found.unit_why})")
+        noted = any(found.unit_why in note for note in found.notes)
+        why = "" if noted else f" ({found.unit_why})"
+        lines.append(f"depth in {found.unit}{'' if found.unit_sure else ', which is not certain'}{why}")
     if found.depth_m is not None and found.without_value is not None:
         near, middle, far = found.depth_m
         lines.append(
-            f"90 % of the depths lie from {near:.2f} to {far:.2f} m, half below {middle:.2f} m; "
-            f"{100 * found.without_value:.0f} % of the pixels have none"
+            f"90 % of the depths lie from {near:.2f} to {far:.2f} m, half of them below {middle:.2f} m; "
+            f"{100 * found.without_value:.0f} % of the pixels have no depth"
         )
     lines += _pose_lines(found)
     for reason, count in found.faults.most_common():
         lines.append(f"{count} of {found.read} frames looked at cannot be used: {reason}")
     if found.posed:
         lines.append(
-            f"suggested: depth up to {found.max_range.value:g} m ({found.max_range.why}), cells of "
-            f"{found.voxel_size.value:g} m"
+            f"mapped by default: depth up to {found.max_range.value:g} m ({found.max_range.why}), cells of "
+            f"{found.voxel_size.value:g} m ({found.voxel_size.why}); else give --max-range, --voxel-size"
         )
     return [*lines, *(f"note: {note}" for note in found.notes)]
 
@@ -140,16 +147,12 @@ def _pose_lines(found: Survey) -> list[str]:
 
 
 def _up_line(up: Up) -> str:
-    off = f", {np.degrees(up.off):.0f} degrees off" if up.off > np.radians(5) else ""
-    return (
-        f"up is {up.axis}{off}, {up.why}" if up.sure else f"which way is up is not certain, perhaps {up.axis}: {up.why}"
-    )
+    return f"{up.words} ({up.why})" if up.sure else f"which way is up is not certain, perhaps {up.axis} ({up.why})"
 
 
 def _robot(path: str, robot: Robot) -> Description:
-    name = Path(file_part(path)).resolve().stem if not path.startswith("sim:") else path.removeprefix("sim:")
     lines, facts = robot_lines(robot)
-    out = f"{name.partition('?')[0]}.yaml"
+    out = map_name(path, ".yaml")
     commands = [command_line("slam", path, "--out", out), command_line("grid", path, "--out", out)]
     return Description("robot", lines, {"kind": "robot", **facts}, commands)
 
@@ -242,8 +245,7 @@ def _bag_robot(path: str, file: BagFile, lines: list[str], facts: dict[str, Any]
 
 def _bag_maps(path: str, file: BagFile, lines: list[str], facts: dict[str, Any], commands: list[str]) -> None:
     """Add the maps and clouds that can be imported."""
-    name = Path(file_part(path)).resolve().stem
     for topic, kind in sorted(file.types.items()):
         if kind in MAPS_IN_BAGS:
-            out = f"{name}.yaml" if kind == "nav_msgs/OccupancyGrid" else f"{name}.svox"
+            out = map_name(path, ".yaml" if kind == "nav_msgs/OccupancyGrid" else ".svox")
             commands.append(command_line("import", path, out, "--topic", topic))

@@ -54,6 +54,8 @@ SOURCES = {
     "rtabmap": "stereovox.sources.rgbd.rtabmap:RtabmapExport",
     "colmap": "stereovox.sources.rgbd.colmap:Colmap",
     "tartanair": "stereovox.sources.rgbd.tartanair:TartanAir",
+    "polycam": "stereovox.sources.rgbd.polycam:Polycam",
+    "record3d": "stereovox.sources.rgbd.record3d:Record3D",
     "stray_scanner": "stereovox.sources.rgbd.stray_scanner:StrayScanner",
     "plain": "stereovox.sources.rgbd.plain:DepthAndPoses",  # last: nearly any folder with depth images
 }

@@ -73,7 +73,7 @@ def read_yaml(path: Path) -> Table:
     except OSError as error:
         raise SourceError(f"{path}: {error.strerror}; give a file you may read") from None
     except ValueError as error:
-        raise SourceError(f"{path}: no YAML that can be read ({error}); correct it") from None
+        raise SourceError(f"{path}: no YAML that can be read ({str(error)[:120]}); correct it") from None
     if not isinstance(table, dict):
         raise SourceError(f"{path}: holds no table of a calibration; give the file that the calibration wrote")
     return table

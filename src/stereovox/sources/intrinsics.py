@@ -99,6 +99,8 @@ def metres_per_unit(scale: float) -> float:
 def _of_numbers(path: Path, numbers: Sequence[float]) -> CameraNumbers:
     if len(numbers) == 6:
         width, height, *numbers = numbers
+        if not (1 <= width < 1e5 and 1 <= height < 1e5):
+            raise SourceError(f"{path}: width {width:g} and height {height:g} are no numbers of pixels; correct them")
         return CameraNumbers(_four(path, numbers), (int(width), int(height)))
     return CameraNumbers(_four(path, numbers))
 

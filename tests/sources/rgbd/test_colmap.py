@@ -149,6 +149,7 @@ def test_a_model_alone_says_what_is_missing(tmp_path):
         ((1, "PINHOLE", 64, 48, (50, -50, 32, 24)), "fy = -50 must be positive"),
         ((1, "PINHOLE", 64, 48, ("x", 50, 32, 24)), "is damaged"),
         ((2, "PINHOLE", 64, 48, (50, 50)), "a PINHOLE camera"),
+        ((1, "PINHOLE", 64, 0, (50, 50, 32, 24)), "a camera of 64x0 pixels"),
     ],
 )
 def test_a_camera_of_no_use_is_one_line(tmp_path, camera, said):

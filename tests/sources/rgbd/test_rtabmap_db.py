@@ -171,6 +171,7 @@ def test_a_damaged_image_spoils_its_own_frame_only(tmp_path):
         ("UPDATE Admin SET version = '0.10.4'", r"is of RTAB-Map 0\.10\.4"),
         ("DROP TABLE Data", "no RTAB-Map database that can be read"),
         ("UPDATE Data SET calibration = x'0102'", "a calibration that is cut off"),
+        ("UPDATE Data SET calibration = zeroblob(44)", "a damaged calibration"),
         ("UPDATE Admin SET opt_poses = x'01020304'", "no RTAB-Map database"),
         ("UPDATE Node SET stamp = 'soon'", "no RTAB-Map database"),
     ],

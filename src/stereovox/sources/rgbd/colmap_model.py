@@ -23,6 +23,8 @@ MODELS = {
 """Models of cameras in the order of their numbers in binary files, and how many parameters they have."""
 ONE_FOCAL = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")
 READABLE = (*ONE_FOCAL, "PINHOLE", "OPENCV", "FULL_OPENCV")
+LARGEST = 1e9
+"""Numbers of poses and pixels are smaller."""
 UNDISTORT = "undistort its images first: colmap image_undistorter"
 
 
@@ -81,7 +83,7 @@ def read_model(folder: Path) -> ColmapModel:
             found.append({})
         except OSError as error:
             raise SourceError(f"{path}: {error.strerror}; make it readable") from None
-        except (ValueError, struct.error, IndexError) as error:
+        except (ValueError, struct.error, IndexError, OverflowError) as error:
             if isinstance(error, SourceError):
                 raise
             raise SourceError(f"{path}: is damaged ({str(error)[:80]}); export the model again") from None
@@ -95,18 +97,18 @@ def read_model(folder: Path) -> ColmapModel:
 def _camera(path: Path, model: str, size: tuple[int, int], numbers: list[float]) -> ColmapCamera:
     if model not in READABLE or len(numbers) != MODELS[model]:
         raise SourceError(f"{path}: a {model[:40]} camera; {UNDISTORT}")
-    if not np.isfinite(numbers).all():
-        raise ValueError("NaN or infinity")
+    if not np.isfinite(numbers).all() or min(size) <= 0:
+        raise ValueError(f"a camera of {size[0]}x{size[1]} pixels, or NaN or infinity")
     fx, fy, cx, cy, *rest = [numbers[0], *numbers] if model in ONE_FOCAL else numbers
     return ColmapCamera(size, (fx, fy, cx - 0.5, cy - 0.5), tuple(rest))  # COLMAP's first pixel begins at 0
 
 
 def _image(name: str, camera: int, seven: list[float], pixels: NDArray[np.float64], points: NDArray) -> ColmapImage:
     qw, qx, qy, qz, *t = seven
-    if not any(seven[:4]) or not np.isfinite(seven).all():
-        raise ValueError(f"{name[:60]} has no rotation")
+    if not max(map(abs, seven)) < LARGEST or max(map(abs, seven[:4])) < 1e-6:
+        raise ValueError(f"{name[:60]} has no pose")
     T_world_camera = inverse(from_quaternion(t, (qx, qy, qz, qw)))
-    seen = points >= 0
+    seen = (points >= 0) & (np.abs(pixels) < LARGEST).all(1)
     return ColmapImage(name, camera, T_world_camera, pixels[seen] - 0.5, points[seen].astype(np.int64))
 
 
@@ -139,7 +141,7 @@ def _images_txt(path: Path, content: bytes) -> list[ColmapImage]:
 
 def _points_txt(path: Path, content: bytes) -> dict[int, NDArray[np.float64]]:
     rows = (line.split(maxsplit=4) for line in filter(str.strip, _lines(content)))
-    return {int(row[0]): np.array(row[1:4], float) for row in rows}
+    return {int(row[0]): np.array(row[1:4], float) for row in rows if len(row) > 3}
 
 
 def _cameras_bin(path: Path, content: bytes) -> dict[int, ColmapCamera]:

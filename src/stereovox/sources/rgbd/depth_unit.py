@@ -29,17 +29,21 @@ UNITS = {
     1 / 10000: "1/10000 m",
 }
 """Usual units of depth images, in metres."""
-PAIRS, SEARCHED = 6, 60
+PAIRS, SEARCHED = 8, 60
 """Pairs of images that are compared, and most images after the first of a pair in which the second is looked for."""
-MOVED_M, TURNED = 0.15, 0.6
+MOVED_M, TURNED = 0.3, 0.5
 """Metres that the camera should have moved between the images of a pair, and radians it may have turned."""
 POINTS_ACROSS = 80
 """Points of an image, across, that are compared."""
-AGREES = 0.03
-"""Relative difference of depths that are of the same surface."""
-SURE = 0.4, 1.15, 2.0
-"""Share of points that must agree, how many times more than in any other unit, and how many times less the median
-difference must be."""
+CLEARLY = 0.8, 1.25
+"""A unit clearly beats another where it fits better in this share of the pairs, and so many times better altogether."""
+MIN_PAIRS = 3
+OVERLAP = 0.2
+"""Share of an image's points that another must see for the two to be compared."""
+STILL = 1e6
+"""A unit so large that no motion of the camera is seen."""
+WORST = 0.06
+"""Largest median difference of depths, relative, with which images fit together at all."""
 LIKELY_M = 0.25, 40.0
 """Median depth in metres of a scene that a unit is plausible for, where there is nothing else to go by."""
 
@@ -87,16 +91,30 @@ def find_unit(pairs: Sequence[tuple[View, View]], camera: PinholeCamera, expecte
         The unit: another than `expected` only where it is sure.
     """
     units = [expected, *(unit for unit in UNITS if abs(unit / expected - 1) > 1e-6)]
-    found = [_differences(pairs, camera, unit) for unit in units]
-    medians = np.array([np.median(differences) if len(differences) else np.inf for differences, _ in found])
-    agree = np.array([np.sum(differences < AGREES) / max(points, 1) for differences, points in found])
-    best = int(np.argmax(agree))
-    needed, more, less = SURE
-    others, differ = np.delete(agree, best).max(), np.delete(medians, best).min()
-    if agree[best] >= max(needed, more * others) and differ > less * max(medians[best], 1e-4):
-        why = f"{100 * agree[best]:.0f} % of the points agree from image to image, in other units {100 * others:.0f} %"
-        return DepthUnit(units[best], True, why)
-    return _unchecked(pairs, expected)
+    tried = [*units, STILL]  # last: as if the camera had not moved, which noise of the poses favours
+    medians = np.array([[_median(first, second, camera, unit) for unit in tried] for first, second in pairs])
+    if not len(pairs) or not np.isfinite(medians).any():
+        return _unchecked(pairs, expected)
+    best = int(np.argmin(np.median(medians, axis=0)[:-1]))
+    beaten = [_beats(medians[:, best], medians[:, k]) for k in range(len(tried)) if k != best]
+    fits = float(np.median(medians[:, best]))
+    moves = np.mean(medians[:, best] < medians[:, -1]) >= CLEARLY[0]
+    if fits > WORST or not moves or (best and not _beats(medians[:, best], medians[:, 0])):
+        return _unchecked(pairs, expected)
+    second = float(np.delete(np.median(medians, axis=0), best).min())
+    why = f"depths differ by {100 * fits:.1f} % from image to image, in any other unit by {_percent(second)}"
+    return DepthUnit(units[best], all(beaten), why)
+
+
+def _percent(share: float) -> str:
+    return f"{100 * share:.1f} % or more" if np.isfinite(share) else "far more"
+
+
+def _beats(one: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
+    """Return whether the medians (pairs,) of one unit are clearly less than those of another."""
+    wins, less = CLEARLY
+    count = len(one)
+    return bool(count >= MIN_PAIRS and np.mean(one < other) >= wins and less * np.median(one) < np.median(other))
 
 
 def pairs_of(count: int, pose: Callable[[int], Transform], read: Callable[[int], Depth]) -> list[tuple[View, View]]:
@@ -117,7 +135,7 @@ def pairs_of(count: int, pose: Callable[[int], Transform], read: Callable[[int],
 
 def _second(first: int, count: int, pose: Callable[[int], Transform]) -> int | None:
     """Return the number of the next image that was taken far enough away, None where there is none."""
-    best, farthest = None, 0.2 * MOVED_M
+    best, farthest = None, 0.1 * MOVED_M
     try:
         start = _numbers(pose(first))
     except FrameRefused:
@@ -140,17 +158,11 @@ def _numbers(T: Transform) -> tuple[float, ...]:
     return tuple(T[:3].ravel().tolist())
 
 
-def _differences(
-    pairs: Sequence[tuple[View, View]], camera: PinholeCamera, unit: float
-) -> tuple[NDArray[np.float64], int]:
-    """Return relative differences (K,) of depths of points seen twice, and the number of all points."""
-    found, points = [np.empty(0)], 0
-    for first, second in pairs:
-        T_second_first = inverse(second.T_world_camera) @ first.T_world_camera
-        differences, of = difference(first.depth, second.depth, camera, T_second_first, unit)
-        found.append(differences)
-        points += of
-    return np.concatenate(found), points
+def _median(first: View, second: View, camera: PinholeCamera, unit: float) -> float:
+    """Return the median relative difference of what two images show of the same points; inf where they share few."""
+    T_second_first = inverse(second.T_world_camera) @ first.T_world_camera
+    differences, points = difference(first.depth, second.depth, camera, T_second_first, unit)
+    return float(np.median(differences)) if len(differences) > OVERLAP * points else np.inf
 
 
 def difference(

@@ -56,8 +56,8 @@ class FolderOptions:
     depth_scale: unit of the images; 1000 and 0.001 both mean millimetres (0: as the layout has it, checked against
         the poses). camera: file of the camera, in place of the layout's own (see `camera_in`). fps: images a second
         where they have no times (0: the layout's). poses: file or folder of poses in place of the layout's own (see
-        `pose_files`). axes: axes of the posed camera, `optical`, `opengl` (x right, y up, z backward) or `ros`. invert:
-        whether poses are world to camera.
+        `pose_files`). axes: axes of the posed camera, `optical`, `opengl` (x right, y up, z backward), `ros` or
+        `ned`. invert: whether poses are world to camera.
     File names are looked up as they stand, then inside the folder.
     """
 
@@ -292,12 +292,12 @@ class DepthFolder(DepthSource, ABC):
 def images_in(folder: Path, pattern: str, fps: float) -> list[ImageFile]:
     """Return the images of a folder whose names match a regular expression, in the order of their numbers.
 
-    Their times are the numbers divided by `fps`, or, where names are times (a point and six or more decimals, or 16 or
-    more digits of nanoseconds or microseconds), those.
+    Their times are the numbers divided by `fps`, or, where all names are times (seconds with decimals, or 16 or more
+    digits of nanoseconds or microseconds), those.
     """
     names = [name for name in file_names(folder) if re.fullmatch(pattern, name, re.IGNORECASE)]
     stems = [os.path.splitext(name)[0] for name in names]
-    if stems and all(re.fullmatch(r"\d{9,}\.\d+", stem) for stem in stems):
+    if stems and all(re.fullmatch(r"\d+\.\d+", stem) for stem in stems):
         stamps = [ns_from_seconds(stem) for stem in stems]
     elif stems and all(re.fullmatch(r"\d{16,19}", stem) for stem in stems):
         stamps = [int(stem) * (1 if len(stem) > 17 else 1000) for stem in stems]

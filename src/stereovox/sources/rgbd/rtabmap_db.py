@@ -241,7 +241,8 @@ def _packed(blob: bytes) -> list[Calibration]:
         _, _, _, kind, width, height, *lengths = struct.unpack_from("<11i", blob, at)
         if kind != 0:
             raise SourceError(f"holds stereo pairs, not depth; {EXPORT}, and map these as a stereo rig")
-        if not all(0 <= length <= 14 for length in lengths):
+        sound = lengths[0] in (0, 9) and lengths[3] in (0, 12) and lengths[4] in (0, 12)
+        if not sound or not any((lengths[0], lengths[3])) or not all(0 <= length <= 14 for length in lengths[1:3]):
             raise ValueError("a damaged calibration")
         at += 44
         K, _, _, P = (
@@ -250,7 +251,7 @@ def _packed(blob: bytes) -> list[Calibration]:
         at += 8 * sum(lengths[:4])
         T = transform(np.frombuffer(blob, "<f4", 12, at)) if lengths[4] == 12 else np.eye(4)
         at += 4 * lengths[4]
-        fx, fy, cx, cy = P[[0, 5, 2, 6]] if len(P) == 12 and P[0] > 0 else K[[0, 4, 2, 5]]
+        fx, fy, cx, cy = P[[0, 5, 2, 6]] if len(P) and (P[0] > 0 or not len(K)) else K[[0, 4, 2, 5]]
         size = (width, height) if width > 0 and height > 0 else None
         found.append(Calibration((float(fx), float(fy), float(cx), float(cy)), size, T))
     return found

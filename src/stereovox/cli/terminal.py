@@ -8,9 +8,9 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from stereovox.describe import command_line as command_line
-from stereovox.describe import size as size
-from stereovox.describe import thousands as thousands
+from stereovox.description.words import command_line as command_line
+from stereovox.description.words import size as size
+from stereovox.description.words import thousands as thousands
 from stereovox.errors import one_line
 
 if TYPE_CHECKING:

@@ -1,29 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a path holds: a map, recording, bag, cloud, image, poses or calibration; and the commands that use it."""
+"""A description of what a path holds, and the words, names and command lines that go into it."""
 
 from __future__ import annotations
 
 import os
 import shlex
-from collections.abc import Callable
 from dataclasses import dataclass, field
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from stereovox.safe_io import FLOOR_READABLE
-
-KINDS = (
-    "stereovox.describe.maps:describe_map",
-    "stereovox.describe.maps:describe_floor",
-    "stereovox.describe.recordings:describe_recording",
-    "stereovox.describe.files:describe_cloud",
-    "stereovox.describe.files:describe_settings",
-    "stereovox.describe.files:describe_calibration",
-    "stereovox.describe.files:describe_poses",
-    "stereovox.describe.files:describe_image",
-)
-"""Asked in this order; each returns None for what is not of its kind."""
 
 
 @dataclass(frozen=True)
@@ -44,32 +30,6 @@ class Description:
     commands: list[str] = field(default_factory=list)
 
 
-def describe(path: str | os.PathLike[str]) -> Description:
-    """Find out what a path holds and what to do with it; a recording is looked at, not read whole.
-
-    Args:
-        path: A folder or file, also with options behind a `?`, or a simulation (`sim:room`).
-
-    Returns:
-        What it holds.
-
-    Raises:
-        StereovoxError: There is nothing, or nothing that any command uses: one line that says what it seems to be, what
-            is missing, and the cure.
-    """
-    from stereovox.opening import open_source
-
-    text = os.fspath(path)
-    for name in KINDS:
-        module, _, function = name.partition(":")
-        known: Callable[[str], Description | None] = getattr(import_module(module), function)
-        found = known(text)
-        if found is not None:
-            return found
-    open_source(text)  # which says what is missing
-    raise AssertionError(f"{text}: a recording that is not described")
-
-
 def command_line(*words: object) -> str:
     """Return a stereovox command quoted for a shell."""
     return shlex.join(["stereovox", *map(str, words)])
@@ -82,6 +42,11 @@ def size(number_of_bytes: float) -> str:
             return f"{number_of_bytes:.3g} {unit}"
         number_of_bytes /= 1000
     return f"{number_of_bytes:.3g} GB"
+
+
+def many(number: int, thing: str) -> str:
+    """Format a number of things: `1 pose`, `4,541 poses`."""
+    return f"{number:,} {thing}{'' if number == 1 else 's'}"
 
 
 def thousands(number: Any) -> str:
@@ -102,7 +67,9 @@ def map_name(source: str, ending: str = ".svox") -> str:
     kind, colon, rest = place.partition(":")
     if colon and not os.path.exists(place):
         return f"{rest or kind}{ending}"
-    return f"{Path(place).resolve().stem or 'map'}{ending}"
+    name = Path(place).resolve().name
+    packed = name.lower().endswith((".bz2", ".gz"))
+    return f"{Path(Path(name).stem if packed else name).stem or 'map'}{ending}"
 
 
 def picture_name(path: str) -> str:

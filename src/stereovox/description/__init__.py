@@ -1,0 +1,48 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a path holds: a map, recording, bag, cloud, image, poses or calibration; and the commands that use it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from importlib import import_module
+
+from stereovox.description.words import Description as Description
+
+KINDS = (
+    "stereovox.description.maps:describe_map",
+    "stereovox.description.maps:describe_floor",
+    "stereovox.description.recordings:describe_recording",
+    "stereovox.description.files:describe_cloud",
+    "stereovox.description.files:describe_settings",
+    "stereovox.description.files:describe_calibration",
+    "stereovox.description.files:describe_poses",
+    "stereovox.description.files:describe_image",
+)
+"""Asked in this order; each returns None for what is not of its kind."""
+
+
+def describe(path: str | os.PathLike[str]) -> Description:
+    """Find out what a path holds and what to do with it; a recording is looked at, not read whole.
+
+    Args:
+        path: A folder or file, also with options behind a `?`, or a simulation (`sim:room`).
+
+    Returns:
+        What it holds.
+
+    Raises:
+        StereovoxError: There is nothing, or nothing that any command uses: one line that says what it seems to be, what
+            is missing, and the cure.
+    """
+    from stereovox.opening import open_source
+
+    text = os.fspath(path)
+    for name in KINDS:
+        module, _, function = name.partition(":")
+        known: Callable[[str], Description | None] = getattr(import_module(module), function)
+        found = known(text)
+        if found is not None:
+            return found
+    open_source(text)  # which says what is missing
+    raise AssertionError(f"{text}: a recording that is not described")

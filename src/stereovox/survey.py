@@ -167,7 +167,7 @@ class Survey:
         if self.up.off < LEVEL_ENOUGH:
             level, chosen = "", {"up": self.up.axis}
         else:
-            level = "pictures are turned upright, --level turns the map as well; "
+            level = "pictures are turned upright, with --level the map is as well; "
             direction = tuple(round(float(part), 4) for part in self.up.direction)
             chosen = {"up": self.up.axis, "up_direction": direction}
         if chosen == {"up": "z"}:

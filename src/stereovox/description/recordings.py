@@ -147,7 +147,7 @@ def _pose_lines(found: Survey) -> list[str]:
 def _up_line(up: Up) -> str:
     if not up.sure:
         return f"which way is up is not certain, perhaps {up.axis} ({up.why})"
-    tilted = "; pictures are turned upright, --level turns the map as well" if up.off > LEVEL_ENOUGH else ""
+    tilted = "; pictures are turned upright, with --level the map is as well" if up.off > LEVEL_ENOUGH else ""
     return f"{up.words} ({up.why}){tilted}"
 
 

@@ -558,7 +558,7 @@ def pose_texts(folder: Path) -> list[bytes]:
     line = " ".join(map(str, np.eye(4).ravel()))
     table = {"parameters": [{"extrinsic": np.eye(4).ravel().tolist()}]}
     rows = "0 0 1\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"
-    texts = [POSES, f"{line}\n{line}\n", rows, json.dumps(table), POSES.replace("# stamp", "stamp")]
+    texts = [POSES, f"{line}\n{line}\n", rows, json.dumps(table)]
     return [*(text.encode() for text in texts), (folder / "s.npy").read_bytes()]
 
 

@@ -4,12 +4,15 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterable
 
 MAX_WORD_LENGTH = 100
 """Characters of a word that are compared; words from a file may be longer."""
 MAX_LINE_LENGTH = 10_000
 """Characters of a message."""
+MAX_PRINTED, MAX_SHOWN = 289, 100
+"""Characters of a message that a command prints (a line of 300 with its name), and of a path in one that is longer."""
 
 
 class StereovoxError(ValueError):
@@ -61,6 +64,31 @@ def one_line(text: str) -> str:
     if len(text) > MAX_LINE_LENGTH:
         text = f"{text[: MAX_LINE_LENGTH // 2]} ... {text[-MAX_LINE_LENGTH // 2 :]}"
     return text if text.isprintable() else "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
+
+
+def shortened(text: str, length: int = MAX_SHOWN) -> str:
+    """Return `text` in at most `length` characters: a long middle is left out."""
+    if len(text) <= length:
+        return text
+    start = (length - 3) // 2
+    return f"{text[:start]}...{text[len(text) + start + 3 - length :]}"
+
+
+def printed(message: str, names: Iterable[str] = ()) -> str:
+    """Return a message in at most MAX_PRINTED characters: long paths lose their middles first, the cure stays.
+
+    names: words that may hold spaces and stand in the message, such as the paths that a command was given.
+    """
+    names = sorted({one_line(name) for name in names}, key=len, reverse=True)
+    line = message
+    for length in (MAX_SHOWN, 60, 40):
+        if len(line) <= MAX_PRINTED:
+            return line
+        line = message
+        for name in names:
+            line = line.replace(name, shortened(name, length)) if len(name) > length else line
+        line = re.sub(rf"\S{{{length + 1},}}", lambda word, length=length: shortened(word[0], length), line)
+    return shortened(line, MAX_PRINTED)
 
 
 def did_you_mean(word: str, known: Iterable[str], prefix: str = "") -> str:

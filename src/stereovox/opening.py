@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from stereovox import registry
-from stereovox.errors import MAX_WORD_LENGTH, SourceError
+from stereovox.errors import MAX_SHOWN, MAX_WORD_LENGTH, SourceError, shortened
 from stereovox.formats import IMPORTS, UNREADABLE
 from stereovox.sources.base import DepthSource as DepthSource
 from stereovox.sources.base import Excerpt as Excerpt
@@ -72,8 +72,6 @@ ROBOTS = {
 
 MAX_BELOW, MAX_LISTED = 50, 10_000
 """Most folders that are tried, and most entries that are counted, to explain why a folder cannot be opened."""
-MAX_SHOWN = 100
-"""Characters of a path that a message shows."""
 
 
 def open_source(path_or_name: str | os.PathLike[str], frames: str | None = None) -> Source:
@@ -227,12 +225,7 @@ def _recognise(where: str) -> Any:
         kinds.append(kind)
         if kind.recognises(where):
             return kind
-    raise SourceError(f"{_short(where)}: {_problem(where, kinds)}")
-
-
-def _short(text: str) -> str:
-    """Return text with a long middle left out."""
-    return text if len(text) <= MAX_SHOWN else f"{text[: MAX_SHOWN // 2]}...{text[-MAX_SHOWN // 2 :]}"
+    raise SourceError(f"{shortened(where)}: {_problem(where, kinds)}")
 
 
 def _problem(where: str, kinds: list[Any]) -> str:

@@ -5,7 +5,7 @@ import pytest
 
 from stereovox.errors import SourceError
 from stereovox.sources.camera_file import find_camera
-from stereovox.sources.intrinsics import read_intrinsics
+from stereovox.sources.intrinsics import read_camera_numbers, read_intrinsics
 
 DEFAULT = (525.0, 525.0, 319.5, 239.5)
 
@@ -85,3 +85,16 @@ def test_impossible_focal_lengths_name_the_file(tmp_path):
     (tmp_path / "calibration.txt").write_text("1 500 320 240")
     with pytest.raises(SourceError, match=r"calibration\.txt: fx fy cx cy = 1 500 320 240: a ray 8\d\.\d deg"):
         find_camera([tmp_path], (640, 480), 0.075, DEFAULT)
+
+
+@pytest.mark.parametrize("text", ["0 480 500 500 320 240", "640 -1 500 500 320 240", "1 PINHOLE 0 480 500 500 320 240"])
+def test_a_size_of_no_pixels_is_refused(tmp_path, text):
+    (tmp_path / "camera.txt").write_text(text)
+    with pytest.raises(SourceError, match="pixels"):
+        read_camera_numbers(tmp_path / "camera.txt")
+
+
+def test_a_matrix_with_a_fourth_column_or_its_last_line_twice(tmp_path):
+    for text in ("500 0 320 0\n0 501 240 0\n0 0 1 0\n", "500 0 320\n0 501 240\n0 0 1\n0 0 1\n"):
+        (tmp_path / "K.txt").write_text(text)
+        assert read_intrinsics(tmp_path / "K.txt") == (500, 501, 320, 240)

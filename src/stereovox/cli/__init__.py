@@ -19,7 +19,7 @@ from keyword import iskeyword
 from typing import Any, NoReturn
 
 import stereovox
-from stereovox.errors import StereovoxError, did_you_mean
+from stereovox.errors import StereovoxError, did_you_mean, one_line, printed
 
 COMMANDS = (
     "demo",
@@ -67,10 +67,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         result = _module(arguments.command).run(arguments)
         return _print_json(result) if arguments.json else 0
     except StereovoxError as error:
-        return _fail(" ".join(str(error).split()), 2)
+        return _fail(" ".join(str(error).split()), 2, words)
     except OSError as error:  # not foreseen by a command: a folder without search permission, a full disk
         where = f"{error.filename}: " if error.filename else ""
-        return _fail(f"{where}{error.strerror or error}; check that it exists and that you may use it", 2)
+        return _fail(f"{where}{error.strerror or error}; check that it exists and that you may use it", 2, words)
     except MemoryError:
         return _fail("not enough memory; use larger cells (--voxel-size) or a shorter --max-range", 2)
     except KeyboardInterrupt as stopped:
@@ -88,8 +88,9 @@ def _print_json(result: dict[str, Any]) -> int:
     return 0
 
 
-def _fail(message: str, status: int) -> int:
-    print(f"stereovox: {message}", file=sys.stderr)
+def _fail(message: str, status: int, words: Sequence[str] = ()) -> int:
+    names = [name for word in words for name in (word, word.partition("?")[0], word.partition("=")[2])]
+    print(f"stereovox: {printed(one_line(message), names)}", file=sys.stderr)
     return status
 
 

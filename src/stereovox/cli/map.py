@@ -87,7 +87,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
 
 def _usual_out(arguments: Namespace, ending: str) -> str:
     """Return the name of the map where none is given; raises StereovoxError where that would replace something."""
-    from stereovox.description.words import map_name
+    from stereovox.contents.description import map_name
 
     out = map_name(arguments.source, ending)
     if Path(out).exists() and not arguments.resume:
@@ -133,7 +133,7 @@ def _grid(arguments: Namespace) -> dict[str, Any]:
 
 
 def _print_result(result: dict[str, Any], reports: list[UpdateReport], out: Path, config: Config) -> None:
-    from stereovox.description.words import picture_name
+    from stereovox.contents.description import picture_name
     from stereovox.trust.health import FULL
 
     say_refusals(result, reports, "frames")

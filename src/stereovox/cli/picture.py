@@ -73,7 +73,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
 
 def _usual_file(path: str) -> str:
     """Return the name of the picture where none is given; raises StereovoxError where that would replace a file."""
-    from stereovox.description.words import command_line, picture_name
+    from stereovox.contents.description import command_line, picture_name
 
     name = picture_name(path)
     if Path(name).exists():

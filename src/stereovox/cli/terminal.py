@@ -8,9 +8,9 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from stereovox.description.words import command_line as command_line
-from stereovox.description.words import size as size
-from stereovox.description.words import thousands as thousands
+from stereovox.contents.description import command_line as command_line
+from stereovox.contents.description import size as size
+from stereovox.contents.description import thousands as thousands
 from stereovox.errors import one_line
 
 if TYPE_CHECKING:

@@ -166,11 +166,13 @@ def _leaves(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def _of_colmap(path: Path, words: Sequence[str]) -> CameraNumbers:
-    model, size = words[1], (int(words[2]), int(words[3]))
     try:
+        model, size = words[1], (int(words[2]), int(words[3]))
         numbers = [float(word) for word in words[4:]]
     except ValueError as error:
         raise SourceError(f"{path}: {error}; write plain numbers") from None
+    if not all(0 < pixels < 100_000 for pixels in size):
+        raise SourceError(f"{path}: {size[0]}x{size[1]} pixels; write the size of its images")
     if model == "SIMPLE_PINHOLE" and len(numbers) == 3:
         numbers.insert(0, numbers[0])
     if model not in ("PINHOLE", "SIMPLE_PINHOLE"):

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
+import struct
 import sys
 
 import cv2
@@ -208,6 +209,23 @@ def test_headers_that_claim_too_much_are_not_believed(tmp_path):
     np.savez(tmp_path / "a.npz", a=np.array([{}], object))
     for name in ("a.pgm", "a.npy", "a.npz"):
         assert reason(tmp_path / name) == "unreadable"
+
+
+@pytest.mark.parametrize("name", ["a.tiff", "z.exr"])
+def test_sizes_in_headers_are_checked_before_anything_is_decoded(tmp_path, name):
+    if name.endswith(".exr"):
+        pytest.importorskip("OpenEXR")
+    {**MILLIMETRES, **METRES}[name](tmp_path / name)
+    data = (tmp_path / name).read_bytes()
+    if name == "a.tiff":
+        data = data.replace(struct.pack("<HHII", 256, 4, 1, 160), struct.pack("<HHII", 256, 4, 1, 900_000))
+        data = data.replace(struct.pack("<HHIHH", 256, 3, 1, 160, 0), struct.pack("<HHII", 256, 4, 1, 900_000))
+    else:
+        data = data.replace(struct.pack("<4i", 0, 0, 159, 119), struct.pack("<4i", 0, 0, 99_999, 99_999))
+    (tmp_path / name).write_bytes(data)
+    with pytest.raises(FrameRefused, match="tells of") as refused:
+        read_depth(tmp_path / name, SIZE)
+    assert refused.value.reason == "unreadable"
 
 
 def test_the_most_frequent_size_counts(tmp_path):

@@ -9,9 +9,12 @@ from __future__ import annotations
 import io
 import os
 import re
+import struct
+import zipfile
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -174,6 +177,7 @@ def _counts_over(high: NDArray[np.uint32], low: NDArray[np.uint32]) -> float:
 def _tiff(path: Path, content: bytes) -> NDArray[np.generic]:
     import cv2
 
+    _check_pixels(path, _tiff_pixels(content))
     level = cv2.utils.logging.getLogLevel()
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # else a damaged file writes to the terminal
     try:
@@ -185,6 +189,24 @@ def _tiff(path: Path, content: bytes) -> NDArray[np.generic]:
     if image is None:
         raise FrameRefused("unreadable", f"{path}: is cut off or damaged; copy it again or remove it")
     return image
+
+
+def _tiff_pixels(content: bytes) -> int:
+    """Return width times height times samples by the first directory of a TIFF; 0 where it cannot be read."""
+    order: Literal["little", "big"] = "little" if content.startswith(b"II") else "big"
+    start = int.from_bytes(content[4:8], order)
+    told = {256: 0, 257: 0, 277: 1}  # width, height, samples
+    for at in range(start + 2, start + 2 + 12 * int.from_bytes(content[start : start + 2], order), 12):
+        tag, kind = (int.from_bytes(content[at + k : at + k + 2], order) for k in (0, 2))
+        if tag in told:
+            told[tag] = int.from_bytes(content[at + 8 : at + (10 if kind == 3 else 12)], order)
+    return told[256] * told[257] * told[277]
+
+
+def _check_pixels(path: Path, pixels: int) -> None:
+    """Raise FrameRefused where a header claims no pixels, or more than are believed."""
+    if not 0 < pixels <= MAX_PIXELS:
+        raise FrameRefused("unreadable", f"{path}: its header is damaged or tells of {pixels} pixels; remove it")
 
 
 def _netpbm(path: Path, content: bytes) -> NDArray[np.generic]:
@@ -231,11 +253,17 @@ def _colmap(path: Path, content: bytes) -> NDArray[np.float32]:
 def _numpy(path: Path, content: bytes) -> NDArray[np.generic]:
     """Return the array of an `.npy`, or of an `.npz` with one array or one named `depth`."""
     try:
-        found = np.load(io.BytesIO(content), allow_pickle=False)
+        if content.startswith(b"PK"):
+            with zipfile.ZipFile(io.BytesIO(content)) as arrays:
+                _check_pixels(path, max(1, max(array.file_size for array in arrays.infolist()) // 8))
+        with np.errstate(all="ignore"):  # a damaged shape
+            found = np.load(io.BytesIO(content), allow_pickle=False)
         if isinstance(found, np.ndarray):
             return _squeezed(found)
         name = "depth" if "depth" in found.files else found.files[0] if len(found.files) == 1 else ""
         return _squeezed(found[name])
+    except FrameRefused:
+        raise
     except Exception as error:  # what a damaged file can raise in zipfile, zlib and NumPy is not bounded
         why = " ".join(str(error).split())[:100]
         raise FrameRefused("unreadable", f"{path}: no array of depths ({why}); save it again") from None
@@ -253,6 +281,9 @@ def _exr(path: Path, content: bytes) -> NDArray[np.generic]:
         import OpenEXR
     except ImportError:
         raise MissingExtra("OpenEXR", "exr") from None
+    window = re.search(rb"dataWindow\0box2i\0\x10\0\0\0(.{16})", content, re.DOTALL)
+    left, low, right, high = struct.unpack("<4i", window[1]) if window else (0, 0, -1, -1)
+    _check_pixels(path, max(0, right - left + 1) * max(0, high - low + 1))
     try:
         with OpenEXR.File(os.fspath(path), separate_channels=True) as file:
             channels = {name: np.asarray(channel.pixels) for name, channel in file.channels().items()}

@@ -37,6 +37,8 @@ POINTS_ACROSS = 80
 """Points of an image, across, that are compared."""
 CLEARLY = 0.8, 1.25
 """A unit clearly beats another where it fits better in this share of the pairs, and so many times better altogether."""
+FEW_PAIRS = 1.0, 2.5
+"""The same for fewer pairs than `MIN_PAIRS`."""
 MIN_PAIRS = 3
 OVERLAP = 0.2
 """Share of an image's points that another must see for the two to be compared."""
@@ -112,9 +114,8 @@ def _percent(share: float) -> str:
 
 def _beats(one: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
     """Return whether the medians (pairs,) of one unit are clearly less than those of another."""
-    wins, less = CLEARLY
-    count = len(one)
-    return bool(count >= MIN_PAIRS and np.mean(one < other) >= wins and less * np.median(one) < np.median(other))
+    wins, less = CLEARLY if len(one) >= MIN_PAIRS else FEW_PAIRS
+    return bool(np.mean(one < other) >= wins and less * np.median(one) < np.median(other))
 
 
 def pairs_of(count: int, pose: Callable[[int], Transform], read: Callable[[int], Depth]) -> list[tuple[View, View]]:

@@ -207,7 +207,8 @@ def _inverted(T: Transform, where: str) -> Transform | str:
 
 def _of_numpy(path: Path) -> ImagePoses:
     try:
-        numbers = np.load(io.BytesIO(read_bounded(path, MAX_LIST)), allow_pickle=False)
+        with np.errstate(all="ignore"):  # a damaged shape
+            numbers = np.load(io.BytesIO(read_bounded(path, MAX_LIST)), allow_pickle=False)
         rows = np.asarray(numbers, float).reshape(len(numbers), -1)
     except Exception as error:  # what a damaged file can raise in NumPy is not bounded
         why = " ".join(str(error).split())[:100]

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from stereovox.description.words import Description, command_line, many, metres, size, thousands
+from stereovox.contents.description import Description, command_line, many, metres, size, thousands
 from stereovox.errors import FrameRefused, MissingExtra, SourceError, StereovoxError
 from stereovox.sources.rgbd.depth_files import SUFFIXES, depth_size, read_depth
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from stereovox.config import Config, load_config, profile_names
-from stereovox.description.words import Description, command_line, picture_name, size, thousands
+from stereovox.contents.description import Description, command_line, picture_name, size, thousands
 from stereovox.formats.map_server import read_map_server
 from stereovox.maps import State, load_map
 from stereovox.maps.store import is_map

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from stereovox.description.words import Description, command_line, many, map_name, metres, picture_name, thousands
+from stereovox.contents.description import Description, command_line, many, map_name, metres, picture_name, thousands
 from stereovox.errors import StereovoxError
 from stereovox.opening import is_recording, is_robot, open_images, open_robot, open_source
 from stereovox.sources.bags import open_bag, suffix_of

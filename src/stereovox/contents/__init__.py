@@ -7,17 +7,17 @@ import os
 from collections.abc import Callable
 from importlib import import_module
 
-from stereovox.description.words import Description as Description
+from stereovox.contents.description import Description as Description
 
 KINDS = (
-    "stereovox.description.maps:describe_map",
-    "stereovox.description.maps:describe_floor",
-    "stereovox.description.recordings:describe_recording",
-    "stereovox.description.files:describe_cloud",
-    "stereovox.description.files:describe_settings",
-    "stereovox.description.files:describe_calibration",
-    "stereovox.description.files:describe_poses",
-    "stereovox.description.files:describe_image",
+    "stereovox.contents.maps:describe_map",
+    "stereovox.contents.maps:describe_floor",
+    "stereovox.contents.recordings:describe_recording",
+    "stereovox.contents.files:describe_cloud",
+    "stereovox.contents.files:describe_settings",
+    "stereovox.contents.files:describe_calibration",
+    "stereovox.contents.files:describe_poses",
+    "stereovox.contents.files:describe_image",
 )
 """Asked in this order; each returns None for what is not of its kind."""
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import stereovox as sv
-from stereovox.description.words import many, metres
+from stereovox.contents.description import many, metres
 from stereovox.survey import Up
 
 

@@ -117,8 +117,9 @@ def say_refusals(result: dict[str, Any], reports: Sequence[UpdateReport], what: 
         say(f"  {number} x {reason}")
 
 
-def cells_line(result: dict[str, Any]) -> str:
-    """Format one line about the cells of a map and their memory."""
+def cells_line(result: dict[str, Any], voxel_size: float | None = None) -> str:
+    """Format one line about the cells of a map, also their side in metres if it is given, and their memory."""
     occupied, free = thousands(result["occupied"]), thousands(result["free"])
     reserved = ", reserved for the window" if result.get("memory_reserved") else ""
-    return f"{occupied} occupied and {free} free cells in {size(result['memory_bytes'])}{reserved}"
+    side = "" if voxel_size is None else f" of {voxel_size:g} m"
+    return f"{occupied} occupied and {free} free cells{side} in {size(result['memory_bytes'])}{reserved}"

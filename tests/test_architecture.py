@@ -25,7 +25,7 @@ LAYERS = (
     {"mapper", "opening"},
     {"calibrate", "evaluate", "survey"},
     {"run", "view"},
-    {"describe", "floor_run", "ros", "report", "viewer"},
+    {"contents", "floor_run", "ros", "report", "viewer"},
     {"lab"},
     {"cli"},
     {"__main__"},

@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from stereovox.cameras.wide import SphericalCamera as SphericalCamera
     from stereovox.config import Config as Config
     from stereovox.config import load_config as load_config
+    from stereovox.contents import describe as describe
     from stereovox.errors import StereovoxError as StereovoxError
     from stereovox.floor_run import FloorRun as FloorRun
     from stereovox.floor_run import map_floor as map_floor
@@ -73,7 +74,7 @@ _HOMES = {
     "State": "maps",
     "VoxelMap": "maps",
     "load_map": "maps",
-    "describe": "describe",
+    "describe": "contents",
     "GridMap": "maps.grid_map",
     "OccupancyGrid": "maps.occupancy",
     "export": "formats",

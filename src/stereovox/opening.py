@@ -279,7 +279,8 @@ def _missing(folder: str, kinds: list[Any]) -> str:
         parts: tuple[Part, ...] = getattr(kind, "parts", ())
         counts = [part.count(folder) for part in parts]
         share = sum(map(bool, counts)) / max(len(parts), 1)
-        if counts and counts[0] and best < share < 1:  # the images; poses alone may belong to anything
+        near = bool(counts) and counts[0] > 0  # it has the images: poses alone may belong to anything
+        if near and best <= share < 1:  # of equals the last, which is the most general
             there = [f"{part.what} ({count})" for part, count in zip(parts, counts, strict=True) if count]
             lacks = next(part for part, count in zip(parts, counts, strict=True) if not count)
             best = share

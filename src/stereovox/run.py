@@ -239,14 +239,7 @@ class MapRun:
         if isinstance(source, str | Path):
             source = opening.open_stream(str(source), self._frames)
         self.source = source if self._camera is None else with_camera(source, str(self._camera))
-        settings, lines = {}, []
-        if (
-            isinstance(self._source, str | Path)
-            and self._profile is None
-            and saved is None
-            and hasattr(source, "frame")
-        ):
-            settings, lines = survey(source, SURVEYED).settings(self._overrides)  # pyright: ignore[reportArgumentType]
+        settings, lines = ({}, []) if saved else self._suggested(source)
         direction = saved.config.levelled_from if saved else self._level_direction(settings)
         if direction is not None:
             self.source = Turned(self.source, level_transform(direction))

@@ -56,6 +56,11 @@ class Up(NamedTuple):
     sure: bool
     why: str
 
+    @property
+    def words(self) -> str:
+        """The direction in words: `up is -y`, or `up is 27 degrees from -y`."""
+        return f"up is {'' if self.off < LEVEL_ENOUGH else f'{np.degrees(self.off):.0f} degrees from '}{self.axis}"
+
 
 class Suggestion(NamedTuple):
     """Suggested value of a setting, and why, in words."""
@@ -141,7 +146,7 @@ class Survey:
         options = {"max_range": "--max-range", "voxel_size": "--voxel-size"}
         what = ", ".join(words[name].format(value) for name, value in chosen.items())
         why = self.max_range.why if "max_range" in chosen else cell.why
-        return chosen, [f"{what}, since {why}; other: {' '.join(options[name] for name in chosen)}"]
+        return chosen, [f"{what} ({why}); else give {' or '.join(options[name] for name in chosen)}"]
 
     def up_settings(self, given: Mapping[str, Any]) -> tuple[dict[str, Any], list[str]]:
         """Choose which way is up.
@@ -156,16 +161,18 @@ class Survey:
             return {}, []
         if not self.up.sure:
             likely = f", perhaps {self.up.axis}" if self.up.axis != "z" else ""
-            return {}, [f"which way is up is not certain{likely} ({self.up.why}); z is assumed, other: --set up=AXIS"]
+            return {}, [
+                f"which way is up is not certain{likely} ({self.up.why}); z is assumed, else give --set up=AXIS"
+            ]
         if self.up.off < LEVEL_ENOUGH:
-            tilt, chosen = "", {"up": self.up.axis}
+            level, chosen = "", {"up": self.up.axis}
         else:
-            tilt = f", {np.degrees(self.up.off):.0f} degrees off"
+            level = "pictures are turned upright, with --level the map is as well; "
             direction = tuple(round(float(part), 4) for part in self.up.direction)
             chosen = {"up": self.up.axis, "up_direction": direction}
         if chosen == {"up": "z"}:
             return {}, []
-        return chosen, [f"up is {self.up.axis}{tilt}, {self.up.why}; other: --set up=AXIS"]
+        return chosen, [f"{self.up.words} ({self.up.why}); {level}else give --set up=AXIS"]
 
     @property
     def rate_hz(self) -> float | None:
@@ -237,16 +244,16 @@ def find_up(source: Any, frames: list[AnyFrame]) -> Up:
     steady = float(np.linalg.norm(mean))
     if steady < STEADY:
         axis = nearest_axis(mean) if steady > 0 else "z"
-        return Up(axis, mean, float("nan"), False, "the camera was turned over, so its attitude does not show it")
+        return Up(axis, mean, float("nan"), False, "the camera was turned over on its way")
     normals = [_normals(frame) for frame in frames if isinstance(frame, Frame) and frame.depth.size]
     normals = np.concatenate([np.empty((0, 3)), *normals])
     direction, share = _level_direction(mean / steady, normals)
     axis = nearest_axis(direction)
     off = float(np.arccos(np.clip(direction @ upright_axes(axis)[2], -1, 1)))
     if not len(normals):  # the mean attitude alone is good for the axis, not for the angle
-        return Up(axis, upright_axes(axis)[2], 0.0, bool(off < UPRIGHT), "by the attitude of the camera")
+        return Up(axis, upright_axes(axis)[2], 0.0, bool(off < UPRIGHT), "by how the camera was held")
     sure = bool(share >= HORIZONTAL_SHARE and off < UPRIGHT)
-    why = f"by the attitude of the camera, and {100 * share:.0f} % of what it saw is level"
+    why = f"by how the camera was held; {100 * share:.0f} % of what it saw is level"
     return Up(axis, direction, off, sure, why)
 
 
@@ -260,10 +267,12 @@ def suggest_range(depths: NDArray[np.float64], camera: PinholeCamera, stereo: bo
     if stereo:
         value = max((m for m in RANGES_M if m <= 1.1 * precise), default=RANGES_M[0])
         error = f"{100 * DEPTH_ERROR:.0f} % depth error at {precise:.0f} m"
-        return Suggestion(value, f"a baseline of {baseline or 0:.2g} m has {error}")
+        return Suggestion(value, f"a baseline of {baseline or 0:.2g} m gives {error}")
     far = float(np.mean(depths > USUAL_RANGE_M)) if depths.size else 0.0
     if far < FAR_SHARE:
-        return Suggestion(USUAL_RANGE_M, f"{100 * far:.0f} % of the depths lie beyond")
+        return Suggestion(
+            USUAL_RANGE_M, f"{100 * far:.0f} % of the depths lie beyond" if far >= 0.005 else "no depth lies beyond"
+        )
     needed = float(np.percentile(depths, 95))
     fitting = [m for m in RANGES_M if m <= 1.1 * precise]
     value = next((m for m in fitting if m >= 0.95 * needed), max(fitting, default=USUAL_RANGE_M))

@@ -108,7 +108,7 @@ def test_a_cloud_far_from_its_origin_is_moved_and_says_so(tmp_path):
 
 def test_units(tmp_path):
     (tmp_path / "a.pcd").write_bytes(pcd(WALL * 1000))
-    assert "unit unsure: 1.98e+03 long, taken as metres" in notes(import_map(tmp_path / "a.pcd"))
+    assert "unit unsure: 1980 long, taken as metres" in notes(import_map(tmp_path / "a.pcd"))
     made = import_map(tmp_path / "a.pcd", unit="mm")
     size_and_bounds(made, 0.05)
     assert "unsure" not in notes(made)

@@ -32,14 +32,14 @@ def room() -> Scene:
 
 
 def posed(count: int = 4) -> list[np.ndarray]:
-    """T_world_camera (4, 4) in a world with z up: looking along x, moving along y, turning a little."""
+    """T_world_camera (4, 4) in a world with z up: looking along x, moving along y and up, turning a little."""
     found = []
     for k in range(count):
         yaw = 0.3 - 0.15 * k
         forward, left = np.array([np.cos(yaw), np.sin(yaw), 0]), np.array([-np.sin(yaw), np.cos(yaw), 0])
         T = np.eye(4)
         T[:3, :3] = np.stack([-left, [0, 0, -1], forward], axis=1)
-        T[:3, 3] = 0.6 + 0.2 * k, 1.0 + 0.1 * k, 1.3
+        T[:3, 3] = 0.6 + 0.2 * k, 1.0 + 0.1 * k, 1.0 + 0.15 * k
         found.append(T)
     return found
 

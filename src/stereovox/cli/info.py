@@ -22,7 +22,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Find out what the path holds, and print it."""
-    from stereovox.describe import describe
+    from stereovox.contents import describe
 
     found = describe(arguments.path)
     for line in found.lines:

@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """Map a recording, a simulation or a live camera.
 
-SOURCE is a 7-Scenes or TUM RGB-D folder, a camera pair, a RealSense .db3 or a ROS bag, recognised by their content,
-the simulation sim:room, or a connected camera, realsense:. Under a profile of two dimensions (ist2019) it is the
-recording of a ground robot, as for `stereovox grid`.
+SOURCE is a folder or file with depth images or stereo pairs and poses, recognised by its content (`stereovox info`
+says what it holds, docs/recordings.md what is known), the simulation sim:room, or a connected camera, realsense:. Which
+way is up, the range and the cell size follow from a look at the recording where no option or profile gives them. Under
+a profile of two dimensions (ist2019) it is the recording of a ground robot, as for `stereovox grid`.
 """
 
 from __future__ import annotations
 
+import shlex
 from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,7 +20,6 @@ from stereovox.cli.terminal import (
     cells_line,
     command_line,
     first_included,
-    milliseconds,
     progress_of,
     say,
     say_about_compiling,
@@ -28,17 +29,19 @@ from stereovox.cli.terminal import (
 from stereovox.errors import StereovoxError
 
 if TYPE_CHECKING:
-    from stereovox.config import WindowConfig
+    from stereovox.config import Config, WindowConfig
     from stereovox.frame import UpdateReport
 
 PORT = 8080
-EXAMPLE = "stereovox map recordings/kitchen --out kitchen.svox --voxel-size 0.05"
+EXAMPLE = "stereovox map recordings/kitchen --out kitchen.svox"
 
 
 def add_arguments(parser: ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("source", metavar="SOURCE", help="recorded folder or file, sim:room etc., or realsense:")
-    parser.add_argument("--out", required=True, metavar="MAP", help="folder of the map to write, for example room.svox")
+    parser.add_argument(
+        "--out", metavar="MAP", help="folder of the map to write (default: NAME.svox here, unless there is one)"
+    )
     parser.add_argument(
         "--profile", metavar="P", help="profile name or TOML file (default; with --resume the map's own settings)"
     )
@@ -73,10 +76,23 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Map the source, save the map and print a summary."""
-    if _is_floor_map(arguments):
+    floor = _is_floor_map(arguments)
+    if arguments.out is None:
+        arguments.out = _usual_out(arguments, ".yaml" if floor else ".svox")
+    if floor:
         return _grid(arguments)
     check_ending("--rerun", arguments.rerun, ".rrd")
     return _map(arguments, Path(arguments.out))
+
+
+def _usual_out(arguments: Namespace, ending: str) -> str:
+    """Return the name of the map where none is given; raises StereovoxError where that would replace something."""
+    from stereovox.contents.description import map_name
+
+    out = map_name(arguments.source, ending)
+    if Path(out).exists() and not arguments.resume:
+        raise StereovoxError(f"{out}: is here already; replace it with --out {shlex.quote(out)}, or give another name")
+    return out
 
 
 def _map(arguments: Namespace, out: Path) -> dict[str, Any]:
@@ -94,7 +110,7 @@ def _map(arguments: Namespace, out: Path) -> dict[str, Any]:
             recorded.finish()
         result = mapped.summary() | ({"dropped": mapped.dropped} if run.source.length is None else {})
         page.finish()
-        _print_result(result, mapped.reports, out, run.mapper.config.window)
+        _print_result(result, mapped.reports, out, run.mapper.config)
         page.stay()
     return result
 
@@ -116,7 +132,8 @@ def _grid(arguments: Namespace) -> dict[str, Any]:
     return run_floor(arguments)
 
 
-def _print_result(result: dict[str, Any], reports: list[UpdateReport], out: Path, window: WindowConfig) -> None:
+def _print_result(result: dict[str, Any], reports: list[UpdateReport], out: Path, config: Config) -> None:
+    from stereovox.contents.description import picture_name
     from stereovox.trust.health import FULL
 
     say_refusals(result, reports, "frames")
@@ -125,13 +142,14 @@ def _print_result(result: dict[str, Any], reports: list[UpdateReport], out: Path
     if reduced := [f"{number} {quality}" for quality, number in result["ways"].items() if quality != FULL]:
         say(f"reduced quality to meet the deadline: {', '.join(reduced)}")
     if result["match_ms"]["max"]:  # stereo pairs
-        say(f"per pair: matching {milliseconds(result['match_ms'])}")
-    times = f"depth {milliseconds(result['depth_ms'])}; map {milliseconds(result['integrate_ms'])}"
+        say(f"per pair: {result['match_ms']['median']:.3g} ms to match it (median)")
+    depth, cells = result["depth_ms"]["median"], result["integrate_ms"]["median"]
+    times = f"{depth:.2g} ms to prepare the depth image, {cells:.2g} ms to map it (medians)"
     say(f"per frame: {times}{first_included(result)}")
-    say(cells_line(result))
+    say(cells_line(result, config.voxel_size))
     if not result["occupied"]:
-        say(f"note: {_why_empty(result, window)}")
-    say(f"saved in {out}; look at it with: {command_line('picture', out, f'{out.stem}.png')}")
+        say(f"note: {_why_empty(result, config.window)}")
+    say(f"saved in {out}; look at it with: {command_line('picture', out, picture_name(str(out)))}")
 
 
 def _why_empty(result: dict[str, Any], window: WindowConfig) -> str:

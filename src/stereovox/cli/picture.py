@@ -28,7 +28,10 @@ def add_arguments(parser: ArgumentParser) -> None:
     """Declare the options."""
     parser.add_argument("map", metavar="MAP", help="folder of a map, or the .yaml of a floor map")
     parser.add_argument(
-        "file", metavar="FILE.png", help="picture to write; .pdf and .svg keep letters and lines as such"
+        "file",
+        nargs="?",
+        metavar="FILE.png",
+        help="picture to write; .pdf and .svg keep letters and lines (default: NAME.png here, unless there is one)",
     )
     parser.add_argument("--view", metavar="NAME", help="overview (default), layer, axis or space")
     parser.add_argument("--at", type=float, metavar="M", help="height of the layer along --up (default: the camera's)")
@@ -55,6 +58,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
     from stereovox.view.dark import darken
     from stereovox.view.figures import ENDINGS, save
 
+    arguments.file = arguments.file or _usual_file(arguments.map)
     file = Path(arguments.file)
     if file.suffix.lower() not in ENDINGS:
         raise StereovoxError(f"{file}: pictures are written as {', '.join(ENDINGS)}; name the file so")
@@ -65,6 +69,16 @@ def run(arguments: Namespace) -> dict[str, Any]:
     save(drawn, file, arguments.dpi)
     say(f"saved {file}")
     return {"picture": str(file)}
+
+
+def _usual_file(path: str) -> str:
+    """Return the name of the picture where none is given; raises StereovoxError where that would replace a file."""
+    from stereovox.contents.description import command_line, picture_name
+
+    name = picture_name(path)
+    if Path(name).exists():
+        raise StereovoxError(f"{name}: is here already; replace it with: {command_line('picture', path, name)}")
+    return name
 
 
 def _draw_cells(arguments: Namespace, heading: str) -> Any:

@@ -8,9 +8,9 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from stereovox.describe.description import command_line as command_line
-from stereovox.describe.description import size as size
-from stereovox.describe.description import thousands as thousands
+from stereovox.contents.description import command_line as command_line
+from stereovox.contents.description import size as size
+from stereovox.contents.description import thousands as thousands
 from stereovox.errors import one_line
 
 if TYPE_CHECKING:
@@ -117,8 +117,9 @@ def say_refusals(result: dict[str, Any], reports: Sequence[UpdateReport], what: 
         say(f"  {number} x {reason}")
 
 
-def cells_line(result: dict[str, Any]) -> str:
-    """Format one line about the cells of a map and their memory."""
+def cells_line(result: dict[str, Any], voxel_size: float | None = None) -> str:
+    """Format one line about the cells of a map, also their side in metres if it is given, and their memory."""
     occupied, free = thousands(result["occupied"]), thousands(result["free"])
     reserved = ", reserved for the window" if result.get("memory_reserved") else ""
-    return f"{occupied} occupied and {free} free cells in {size(result['memory_bytes'])}{reserved}"
+    side = "" if voxel_size is None else f" of {voxel_size:g} m"
+    return f"{occupied} occupied and {free} free cells{side} in {size(result['memory_bytes'])}{reserved}"

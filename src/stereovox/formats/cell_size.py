@@ -48,7 +48,11 @@ def suggested_cell(xyz: NDArray[np.float64]) -> Suggestion | None:
     extent = float(extents(xyz).max())
     if extent / MOST_ALONG > PER_CELL * spacing:
         return Suggestion(_allowed(extent / MOST_ALONG), f"since it is {extent:.3g} m long", spacing)
-    return Suggestion(_allowed(PER_CELL * spacing), f"since its points lie about {spacing:.2g} m apart", spacing)
+    return Suggestion(
+        _allowed(PER_CELL * spacing),
+        f"since its points lie about {spacing if spacing < 10 else round(spacing):.3g} m apart",
+        spacing,
+    )
 
 
 def suggested_for_mesh(vertices: NDArray[np.float64]) -> Suggestion | None:

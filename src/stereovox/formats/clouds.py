@@ -187,7 +187,8 @@ def _sized(
     length = float(extents(finite).max())
     sparse = suggested.spacing is not None and suggested.spacing > SPARSE
     if unit is None and cloud.metres is None and (sparse or length < TINY or cloud.faces is not None):
-        notes += (f"unit unsure: {length:.3g} long, taken as metres (else --unit mm, cm or ft)",)
+        long = f"{length:.3g}" if length < 1000 else f"{length:.0f}"
+        notes += (f"unit unsure: {long} long, taken as metres (else --unit mm, cm or ft)",)
     return suggested.voxel_size, notes
 
 
@@ -207,7 +208,9 @@ def _on_surface(xyz: NDArray[np.float64], faces: NDArray[np.integer], voxel_size
     most = min(MAX_SAMPLES, SAMPLES_OF_ANY + SAMPLES_A_TRIANGLE * len(corners))
     rows, along = np.ceil(height / step), np.ceil(length / step)
     if not float(((rows + 4) * (along + 2)).sum()) <= most:
-        raise StereovoxError(f"its surface takes too many cells of {voxel_size:g} m; give a larger --voxel-size")
+        raise StereovoxError(
+            f"its surface takes too many cells of {voxel_size:g} m; give a larger --voxel-size, or its unit: --unit mm"
+        )
     of_row, t = _shares(rows.astype(np.int64))
     of_point, s = _shares(np.ceil(along[of_row] * (1 - t)).astype(np.int64))
     of_face, t = of_row[of_point], t[of_point]

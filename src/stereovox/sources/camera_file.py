@@ -108,7 +108,7 @@ def find_camera(
         )
     fx, fy, cx, cy = standard
     numbers = f"{fx:g} {fy:g} {cx:g} {cy:g}"
-    note = f"{folders[0]} has no {MATRIX}: assuming the data set's standard fx fy cx cy = {numbers}"
+    note = f"{folders[0]} has no {MATRIX}: fx fy cx cy are taken to be the usual {numbers}; else give --camera FILE"
     return FoundCamera(PinholeCamera(*size, fx, abs(fy), cx, cy, baseline), (note, *ignored), mirrored=fy < 0)
 
 

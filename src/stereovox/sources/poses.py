@@ -87,7 +87,7 @@ class Poses:
         for side, gap in gaps.items():
             if gap is None or gap >= MAX_GAP_NS:
                 found = "there is none" if gap is None else f"the nearest is {gap / 1e9:.3f} s away"
-                wanted = f"needs a pose less than {MAX_GAP_NS / 1e9:g} s {side} {seconds_from_ns(stamp_ns)} s"
+                wanted = f"needs a pose less than {MAX_GAP_NS / 1e9:g} s {side} {stamp_ns / 1e9:.3f} s"
                 raise FrameRefused("no_pose", f"{self.where}: {wanted}, {found}; leave the image out or add poses")
 
     def _pose(self, k: int) -> NDArray[np.float64]:

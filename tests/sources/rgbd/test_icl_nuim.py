@@ -7,6 +7,8 @@ from made_depth import VGA, check, left_handed, posed, render, tum_line, units, 
 
 from stereovox.errors import SourceError
 from stereovox.opening import open_source
+from stereovox.se3 import inverse
+from stereovox.sources.rgbd.depth_unit import difference, pairs_of
 from stereovox.sources.rgbd.icl_nuim import INTRINSICS, IclNuim, IclNuimScene
 from stereovox.sources.rgbd.tum import TumRgbd
 
@@ -38,17 +40,9 @@ def test_a_file_of_the_camera_does_not_turn_it_again(tmp_path, fy):
     check(open_source(folder), posed(), 5000, INTRINSICS, missing=[0])
 
 
-def turned_down(angle):
-    T = np.eye(4)
-    T[1:3, 1:3] = [[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]]
-    return T
-
-
 def test_walls_do_not_stand_twice_and_would_with_the_poses_as_they_are(tmp_path):
-    """By how much the depths of one image differ from those that the next has there."""
-    nodding = [T @ turned_down(0.15 * k) for k, T in enumerate(posed())]
-    source = open_source(icl(tmp_path, places=nodding))
-    assert float(source.unit.why.split()[3]) < 1
+    """The share of points of one image that lie where the next has a surface: all that it sees, or few."""
+    source = open_source(icl(tmp_path))
     folder = tmp_path / "wrong"
     folder.mkdir()
     (folder / "depth").symlink_to(tmp_path / "depth")
@@ -56,8 +50,37 @@ def test_walls_do_not_stand_twice_and_would_with_the_poses_as_they_are(tmp_path)
     (folder / "camera-intrinsics.txt").write_text("481.2 480 319.5 239.5")
     wrong = open_source(folder)
     assert isinstance(wrong, TumRgbd)
+    assert agreeing(source) > 0.95 * seen_twice(source)
+    assert agreeing(wrong) < 0.9 * seen_twice(wrong)
+
+
+def agreeing(source):
+    return sum(np.sum(differences < 0.03) for differences, _ in compared(source))
+
+
+def seen_twice(source):
+    return sum(len(differences) for differences, _ in compared(source))
+
+
+def compared(source):
+    for first, second in pairs_of(len(source), source.pose, source.read):
+        T = inverse(second.T_world_camera) @ first.T_world_camera
+        yield difference(first.depth, second.depth, source.camera, T, source.depth_scale)
+
+
+def test_a_camera_that_is_turned_over_does_not_fit_where_it_nods(tmp_path):
+    folder = icl(tmp_path, "groundtruth.txt", [T @ turned_down(0.15 * k) for k, T in enumerate(posed())])
+    assert open_source(folder).unit.sure
+    (folder / "camera-intrinsics.txt").write_text("481.2 480 319.5 239.5")
+    wrong = open_source(folder)
     assert not wrong.unit.sure
     assert any("poses do not fit the images" in note for note in wrong.notes)
+
+
+def turned_down(angle):
+    T = np.eye(4)
+    T[1:3, 1:3] = [[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]]
+    return T
 
 
 def test_depth_along_the_rays_and_povray_cameras(tmp_path):

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from stereovox.describe.description import Description, command_line, metres, size, thousands
+from stereovox.contents.description import Description, command_line, many, metres, size, thousands
 from stereovox.errors import FrameRefused, MissingExtra, SourceError, StereovoxError
 from stereovox.sources.rgbd.depth_files import SUFFIXES, depth_size, read_depth
 
@@ -131,9 +131,11 @@ def describe_poses(path: str) -> Description | None:
     length = float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
     when = "one for each image" if seconds is None else f"over {seconds:.1f} s"
     lines = [
-        f"{thousands(len(T))} poses, {when}",
-        f"a path of {length:.3g} m within {metres(np.ptp(places, axis=0))}",
-        "poses alone make no map: give them to the depth images they belong to",
+        f"{many(len(T), 'pose')}, {when}",
+        f"a path of {length:,.0f} m within {metres(np.ptp(places, axis=0))}"
+        if length >= 100
+        else f"a path of {length:.3g} m within {metres(np.ptp(places, axis=0))}",
+        "poses alone make no map: name them with the depth images they belong to",
     ]
     facts = {"kind": "poses", "poses": len(T), "seconds": seconds, "path_m": length,
              "extent_m": np.ptp(places, axis=0).round(4).tolist()}  # fmt: skip

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from stereovox.config import Config, load_config, profile_names
-from stereovox.describe.description import Description, command_line, size, thousands
+from stereovox.contents.description import Description, command_line, picture_name, size, thousands
 from stereovox.formats.map_server import read_map_server
 from stereovox.maps import State, load_map
 from stereovox.maps.store import is_map
@@ -50,8 +51,7 @@ def describe_map(path: str) -> Description | None:
         "settings": config.model_dump(mode="json"),
         "changed": _changed(config),
     }
-    picture = f"{Path(path).resolve().stem}.png"
-    commands = [command_line("picture", path, picture), command_line("view", path)]
+    commands = [command_line("picture", path, picture_name(path)), command_line("view", path)]
     return Description("map", _lines(result), result, commands)
 
 
@@ -81,8 +81,7 @@ def describe_floor(path: str) -> Description | None:
         "free_below": grid.free_below,
         "occupied_above": grid.occupied_above,
     }
-    picture = f"{Path(path).stem}-picture.png"
-    commands = [command_line("picture", path, picture), command_line("localize", "ROBOT", "--map", path)]
+    commands = [command_line("picture", path, picture_name(path)), command_line("localize", "ROBOT", "--map", path)]
     return Description("floor map", _floor_lines(result), result, commands)
 
 
@@ -90,7 +89,9 @@ def _has_metadata(path: Path) -> bool:
     """Return whether a file is a map_server .yaml, or an image with one beside it."""
     if path.suffix.lower() in (".yaml", ".yml"):
         try:
-            return b"resolution" in path.read_bytes()[:10_000]
+            return {b"image", b"resolution"} <= set(
+                re.findall(rb"^(\w+)\s*:", path.read_bytes()[:10_000], re.MULTILINE)
+            )
         except OSError:
             return False
     return any(os.path.isfile(path.with_suffix(ending)) for ending in (".yaml", ".yml"))

@@ -9,17 +9,20 @@ from typing import Any
 
 import numpy as np
 
-from stereovox.describe.description import Description, command_line, metres, thousands
+from stereovox.contents.description import Description, command_line, many, map_name, metres, picture_name, thousands
 from stereovox.errors import StereovoxError
 from stereovox.opening import is_recording, is_robot, open_images, open_robot, open_source
 from stereovox.sources.bags import open_bag, suffix_of
 from stereovox.sources.bags.files import BagFile
 from stereovox.sources.bags.recording import file_part
+from stereovox.sources.rgbd.rtabmap_db import RtabmapDatabase
 from stereovox.sources.robots.robot import Robot
-from stereovox.survey import Survey, Up, survey
+from stereovox.survey import LEVEL_ENOUGH, Survey, Up, survey
 
 MAX_TOPICS = 40
 """Topics of a bag that are printed."""
+MAX_RATE_HZ = 2000.0
+"""Frames a second beyond which the stamps of a recording are wrong."""
 MAPS_IN_BAGS = ("octomap_msgs/Octomap", "nav_msgs/OccupancyGrid", "sensor_msgs/PointCloud2")
 
 
@@ -28,7 +31,7 @@ def describe_recording(path: str) -> Description | None:
 
     Raises SourceError for a damaged one, or one that lacks a part.
     """
-    if suffix_of(file_part(path)):
+    if suffix_of(file_part(path)) and not RtabmapDatabase.recognises(path):
         return _bag(path)
     if is_robot(path):
         with suppress(StereovoxError):  # a .log may hold anything else
@@ -53,20 +56,18 @@ def _images(path: str) -> Description | None:
     except StereovoxError as error:
         missing = str(error)
     facts = survey_facts(found) | {"missing": missing}
-    commands = [command_line("calibrate", "wall", path, "--distance", "1.00", "--out", "camera.toml")]
-    return Description("recording", [*_survey_lines(found), f"cannot be mapped yet: {missing}"], facts, commands)
+    add = "&" if "?" in path else "?"
+    line = command_line("map", f"{path}{add}poses=FILE", "--out", map_name(path))
+    why = f"cannot be mapped yet: {missing.removeprefix(f'{path}: ')}"
+    return Description("recording", [*_survey_lines(found), why], facts, [line] if "?poses=" in missing else [])
 
 
 def survey_commands(path: str, found: Survey) -> list[str]:
     """Return command lines that use a recording."""
-    name = Path(file_part(path)).resolve().stem or "map"
-    name = path.partition(":")[2].partition("?")[0] if path.startswith("sim:") else name
     if not found.posed:
         return []
-    commands = [command_line("map", path, "--out", f"{name}.svox")]
-    if found.up is not None and found.up.sure and found.up.off > np.radians(5):
-        commands.append(command_line("map", path, "--out", f"{name}.svox", "--level"))
-    return [*commands, command_line("bench", path)]
+    name = map_name(path)
+    return [command_line("map", path, "--out", name), command_line("picture", name, picture_name(name))]
 
 
 def survey_facts(found: Survey) -> dict[str, Any]:
@@ -103,28 +104,32 @@ def survey_facts(found: Survey) -> dict[str, Any]:
 
 
 def _survey_lines(found: Survey) -> list[str]:
-    camera, many = found.camera, "depth images" if found.kind == "depth" else "stereo pairs"
-    when = "" if found.rate_hz is None else f", {found.seconds:.1f} s, {found.rate_hz:.3g} a second"
-    lines = [f"{found.name}: {thousands(found.frames)} {many} of {camera.width}x{camera.height}{when}"]
+    camera, images = found.camera, many(found.frames, "depth image" if found.kind == "depth" else "stereo pair")
+    when = "" if found.rate_hz is None else f", {found.seconds:.1f} s{_rate(found.rate_hz)}"
+    if found.rate_hz is not None and found.rate_hz > MAX_RATE_HZ:
+        when = f", whose stamps span {found.seconds:.3f} s, which cannot be right"
+    lines = [f"{found.name}: {images} of {camera.width}x{camera.height}{when}"]
     baseline = "unknown" if camera.baseline is None else f"{camera.baseline:.4g} m"
     lines.append(
         f"camera: fx {camera.fx:.5g}, fy {camera.fy:.5g}, cx {camera.cx:.5g}, cy {camera.cy:.5g}, baseline {baseline}"
     )
     if found.unit is not None:
-        lines.append(f"depth in {found.unit}{'' if found.unit_sure else ', not certain'} ({found.unit_why})")
+        noted = any(found.unit_why in note for note in found.notes)
+        why = "" if noted else f" ({found.unit_why})"
+        lines.append(f"depth in {found.unit}{'' if found.unit_sure else ', which is not certain'}{why}")
     if found.depth_m is not None and found.without_value is not None:
         near, middle, far = found.depth_m
         lines.append(
-            f"90 % of the depths lie from {near:.2f} to {far:.2f} m, half below {middle:.2f} m; "
-            f"{100 * found.without_value:.0f} % of the pixels have none"
+            f"90 % of the depths lie from {near:.2f} to {far:.2f} m, half of them below {middle:.2f} m; "
+            f"{100 * found.without_value:.0f} % of the pixels have no depth"
         )
     lines += _pose_lines(found)
     for reason, count in found.faults.most_common():
         lines.append(f"{count} of {found.read} frames looked at cannot be used: {reason}")
     if found.posed:
         lines.append(
-            f"suggested: depth up to {found.max_range.value:g} m ({found.max_range.why}), cells of "
-            f"{found.voxel_size.value:g} m"
+            f"mapped by default with depth up to {found.max_range.value:g} m ({found.max_range.why}) and cells of "
+            f"{found.voxel_size.value:g} m; else give --max-range, --voxel-size"
         )
     return [*lines, *(f"note: {note}" for note in found.notes)]
 
@@ -132,25 +137,32 @@ def _survey_lines(found: Survey) -> list[str]:
 def _pose_lines(found: Survey) -> list[str]:
     if not found.posed or found.extent_m is None:
         return ["no frame looked at has a pose, which a map needs"]
-    many = "all" if found.posed == found.read else f"{found.posed} of {found.read}"
+    share = "all" if found.posed == found.read else f"{found.posed} of {found.read}"
     return [
-        f"{many} frames looked at have poses; the camera moves within {metres(found.extent_m)}",
+        f"{share} frames looked at have poses; the camera moves within {metres(found.extent_m)}",
         *([] if found.up is None else [_up_line(found.up)]),
     ]
 
 
 def _up_line(up: Up) -> str:
-    off = f", {np.degrees(up.off):.0f} degrees off" if up.off > np.radians(5) else ""
-    return (
-        f"up is {up.axis}{off}, {up.why}" if up.sure else f"which way is up is not certain, perhaps {up.axis}: {up.why}"
-    )
+    if not up.sure:
+        return f"which way is up is not certain, perhaps {up.axis} ({up.why})"
+    tilted = "; pictures are turned upright, with --level the map is as well" if up.off > LEVEL_ENOUGH else ""
+    return f"{up.words} ({up.why}){tilted}"
+
+
+def _rate(rate_hz: float | None) -> str:
+    """Say how many a second, where the stamps can be right."""
+    return "" if rate_hz is None or rate_hz > MAX_RATE_HZ else f", {rate_hz:.3g} a second"
 
 
 def _robot(path: str, robot: Robot) -> Description:
-    name = Path(file_part(path)).resolve().stem if not path.startswith("sim:") else path.removeprefix("sim:")
     lines, facts = robot_lines(robot)
-    out = f"{name.partition('?')[0]}.yaml"
-    commands = [command_line("slam", path, "--out", out), command_line("grid", path, "--out", out)]
+    out = map_name(path, ".yaml")
+    commands = [command_line("slam", path, "--out", out)] if len(robot.scans) else []
+    if len(robot.frames) or "extent_m" in facts:  # it knows where it was
+        commands.append(command_line("grid", path, "--out", out))
+    commands = [*commands, command_line("picture", out, picture_name(out))]
     return Description("robot", lines, {"kind": "robot", **facts}, commands)
 
 
@@ -164,8 +176,8 @@ def robot_lines(robot: Robot) -> tuple[list[str], dict[str, Any]]:
             np.degrees(abs(np.ptp(first.angles))) if len(first.ranges) else 0,
         )
         facts |= {"seconds": seconds, "beams": len(first.ranges), "range_max": float(first.range_max)}
-        rate = f", {(len(robot.scans) - 1) / seconds:.3g} a second" if seconds > 0 else ""
-        lines.append(f"{robot.name}: {thousands(len(robot.scans))} scans in {seconds:.1f} s{rate}")
+        rate = _rate((len(robot.scans) - 1) / seconds if seconds > 0 else None)
+        lines.append(f"{robot.name}: {many(len(robot.scans), 'scan')} in {seconds:.1f} s{rate}")
         lines.append(f"scans of {len(first.ranges)} beams over {wide:.0f} degrees, up to {first.range_max:g} m")
         positions = [scan.pose_world_base[:2] for scan in robot.scans[:: max(1, len(robot.scans) // 200)]]
         moved = np.array([place for place in positions if np.isfinite(place).all()])
@@ -173,9 +185,9 @@ def robot_lines(robot: Robot) -> tuple[list[str], dict[str, Any]]:
             facts["extent_m"] = np.ptp(moved, axis=0).round(4).tolist()
             lines.append(f"by its odometry the robot moves within {metres(np.ptp(moved, axis=0))}")
         else:
-            lines.append("there is no odometry: stereovox slam finds the poses, stereovox grid needs them")
+            lines.append("there is no odometry, so only stereovox slam makes a map of it")
     if len(robot.frames):
-        lines.append(f"{thousands(len(robot.frames))} depth images")
+        lines.append(many(len(robot.frames), "depth image"))
     return [*lines, *(f"note: {note}" for note in robot.notes)], facts
 
 
@@ -184,10 +196,10 @@ def _bag(path: str) -> Description:
     topics = _topics(file)
     spans = [topic["seconds"] for topic in topics]
     count = sum(topic["messages"] for topic in topics)
-    lines = [f"a bag with {thousands(count)} messages on {len(topics)} topics, {max(spans, default=0.0):.1f} s"]
+    lines = [f"a bag with {many(count, 'message')} on {many(len(topics), 'topic')}, {max(spans, default=0.0):.1f} s"]
     width = max((len(topic["topic"]) for topic in topics[:MAX_TOPICS]), default=0)
     for topic in topics[:MAX_TOPICS]:
-        rate = "" if topic["rate_hz"] is None else f", {topic['rate_hz']:.3g} a second"
+        rate = _rate(topic["rate_hz"])
         lines.append(f"  {topic['topic']:<{width}}  {topic['type']}, {thousands(topic['messages'])}{rate}")
     if len(topics) > MAX_TOPICS:
         lines.append(f"  and {len(topics) - MAX_TOPICS} more (all with --json)")
@@ -242,8 +254,7 @@ def _bag_robot(path: str, file: BagFile, lines: list[str], facts: dict[str, Any]
 
 def _bag_maps(path: str, file: BagFile, lines: list[str], facts: dict[str, Any], commands: list[str]) -> None:
     """Add the maps and clouds that can be imported."""
-    name = Path(file_part(path)).resolve().stem
     for topic, kind in sorted(file.types.items()):
         if kind in MAPS_IN_BAGS:
-            out = f"{name}.yaml" if kind == "nav_msgs/OccupancyGrid" else f"{name}.svox"
+            out = map_name(path, ".yaml" if kind == "nav_msgs/OccupancyGrid" else ".svox")
             commands.append(command_line("import", path, out, "--topic", topic))

@@ -7,17 +7,17 @@ import os
 from collections.abc import Callable
 from importlib import import_module
 
-from stereovox.describe.description import Description as Description
+from stereovox.contents.description import Description as Description
 
 KINDS = (
-    "stereovox.describe.maps:describe_map",
-    "stereovox.describe.maps:describe_floor",
-    "stereovox.describe.recordings:describe_recording",
-    "stereovox.describe.files:describe_cloud",
-    "stereovox.describe.files:describe_settings",
-    "stereovox.describe.files:describe_calibration",
-    "stereovox.describe.files:describe_poses",
-    "stereovox.describe.files:describe_image",
+    "stereovox.contents.maps:describe_map",
+    "stereovox.contents.maps:describe_floor",
+    "stereovox.contents.recordings:describe_recording",
+    "stereovox.contents.files:describe_cloud",
+    "stereovox.contents.files:describe_settings",
+    "stereovox.contents.files:describe_calibration",
+    "stereovox.contents.files:describe_poses",
+    "stereovox.contents.files:describe_image",
 )
 """Asked in this order; each returns None for what is not of its kind."""
 

@@ -16,7 +16,7 @@ WEIGHTS = {"info": 8, "map": 8, "import": 5, "calibrate": 3, "picture": 3, "expo
 """How often a command is called, compared with others (1)."""
 SLOW = ("demo", "bench", "reproduce", "ros2", "view")
 """Commands that run for long, or until they are stopped, where nothing is wrong: each call gets a wrong word."""
-SIMULATIONS = ("sim:room", "sim:nothing", "sim:", "sim:floor", "realsense:", "sim:room?noise=x", "sim:room?seed=1&fx=0")
+SIMULATIONS = ("sim:nothing", "sim:", "realsense:", "sim:room?noise=x", "sim:room?seed=1&fx=0")
 NUMBERS = ("0", "1", "-1", "0.05", "0.5", "3", "nan", "inf", "-inf", "1e308", "1e-320", "1e-9", "x", "", "٣", "1_0")
 LISTS = (
     "0,0,0",
@@ -57,6 +57,9 @@ OPTIONS = ("depth_scale=1000", "depth_scale=0", "depth_scale=x", "depth_scale=in
            "=", "&&", "depth_scale", "poses=/dev/zero", "unit=3", "topic=/a", "stride=0")  # fmt: skip
 PLACES = ("gone", "/dev/null", "/dev/zero", "", ".", "empty/pipe", "/proc/self/mem", "gone/deep/er", "~", "x" * 300,
           "d/" * 600, "http://example.com/a.bag", "-", "-h", "--", "con\nfused", "a?b?c")  # fmt: skip
+ENDINGS = {"localize": ".tum", "slam": ".yaml", "grid": ".yaml", "ground": ".yaml", "calibrate": ".toml",
+           "simulate": ".mcap", "distance": ".npz", "picture": ".png"}  # fmt: skip
+"""Ending of what a command writes, where it is not a map."""
 SUFFIXES = (".svox", ".ply", ".pcd", ".bt", ".npz", ".png", ".yaml", ".toml", ".bag", ".tum", ".rrd", ".glb", ".gz", "")
 
 
@@ -72,7 +75,7 @@ def call(draw: Draw, dice: random.Random) -> list[str]:
         kind = dice.choice(sorted(below[0].choices))
         words, parser = [command, kind], below[0].choices[kind]
     for action in parser._actions:
-        words += _words_of(action, draw, dice)
+        words += _words_of(command, action, draw, dice)
     if command in SLOW:
         words.append(dice.choice(("--no-such-option", "--voxel-sze=1", "--frames=::0")))
     if dice.random() < 0.05:
@@ -90,21 +93,21 @@ def _parser(command: str) -> argparse.ArgumentParser:
     return parser
 
 
-def _words_of(action: Any, draw: Draw, dice: random.Random) -> list[str]:
+def _words_of(command: str, action: Any, draw: Draw, dice: random.Random) -> list[str]:
     """Return an argument with a value, or nothing where it is left out."""
     if not action.option_strings:
         many = dice.choice((1, 1, 2)) if action.nargs in ("+", "*", "...") else 1
-        return [_value(action, draw, dice) for _ in range(many)]
+        return [_value(command, action, draw, dice) for _ in range(many)]
     option = action.option_strings[-1]
-    if not (action.required or dice.random() < 0.12) or option in ("--view", "--help") or dice.random() < 0.01:
+    if not (action.required or dice.random() < 0.07) or option in ("--view", "--help") or dice.random() < 0.01:
         return []
     if action.nargs == 0:
         return [option]
-    value = _value(action, draw, dice)
+    value = _value(command, action, draw, dice)
     return [f"{option}={value}"] if value.startswith("-") or dice.random() < 0.1 else [option, value]
 
 
-def _value(action: Any, draw: Draw, dice: random.Random) -> str:
+def _value(command: str, action: Any, draw: Draw, dice: random.Random) -> str:
     """Return a value that is meant for the argument, mostly; else any."""
     what = f"{action.dest} {action.metavar}"
     if action.option_strings and dice.random() < 0.15:
@@ -119,8 +122,15 @@ def _value(action: Any, draw: Draw, dice: random.Random) -> str:
         return dice.choice(SETTINGS)
     if "," in what or "box" in what:
         return dice.choice(LISTS)
-    if "out" in what.split() or (action.metavar in ("MAP", "FILE", "OUT") and action.dest in ("file", "out", "map")):
-        return f"out{dice.randrange(3)}{dice.choice(SUFFIXES)}" if dice.random() < 0.8 else _place(draw, dice)
+    if "out" in what.split() or (action.dest == "file" and command in ("export", "distance", "picture", "ground")):
+        ending = ENDINGS.get(command, dice.choice(SUFFIXES) if command == "export" else ".svox")
+        return f"out{dice.randrange(3)}{dice.choice((*[ending] * 9, *SUFFIXES))}"
+    if action.metavar and action.metavar.startswith("FILE."):
+        return f"out{dice.randrange(3)}{action.metavar[4:]}"
+    if command == "import" and action.dest == "map":
+        return f"out{dice.randrange(3)}.svox"
+    if (action.metavar in ("MAP", "A", "B") or action.dest == "map") and dice.random() < 0.5:
+        return dice.choice(("map.svox", "out0.svox", "out1.svox", "floor.yaml", "cloud.ply"))
     if any(
         word in what for word in ("SOURCE", "RECORDING", "PATH", "ROBOT", "FILE", "MAP", "FOLDER", "TRUTH", " A", " B")
     ):

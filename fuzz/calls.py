@@ -56,7 +56,9 @@ class Outcome(NamedTuple):
 
     def _is_named(self, line: str) -> bool:
         parts = [part for word in self.words for part in word.replace("=", "/").replace("?", "/").split("/")]
-        return any(repr(part[:12])[1:-1] in line for part in parts if part) or "not enough memory" in line
+        parts += [part.replace("-", "_") for part in parts]  # a setting of that name
+        parts += os.listdir()  # a message may name a file that an option names, or that lies beside
+        return any(repr(part[:12])[1:-1] in line for part in parts if part) or "" in self.words
 
 
 def main() -> int:

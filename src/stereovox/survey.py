@@ -251,8 +251,8 @@ def find_up(source: Any, frames: list[AnyFrame]) -> Up:
     axis = nearest_axis(direction)
     off = float(np.arccos(np.clip(direction @ upright_axes(axis)[2], -1, 1)))
     if not len(normals):  # the mean attitude alone is good for the axis, not for the angle
-        return Up(axis, upright_axes(axis)[2], 0.0, off < UPRIGHT, "by how the camera was held")
-    sure = share >= HORIZONTAL_SHARE and off < UPRIGHT
+        return Up(axis, upright_axes(axis)[2], 0.0, bool(off < UPRIGHT), "by how the camera was held")
+    sure = bool(share >= HORIZONTAL_SHARE and off < UPRIGHT)
     why = f"by how the camera was held; {100 * share:.0f} % of what it saw is level"
     return Up(axis, direction, off, sure, why)
 

@@ -104,6 +104,7 @@ class Simulation(DepthSource):
         self._frames = self.options.frames or stage.frames
         self.period_ns = round(1e9 / stage.hz * max(stage.frames - 1, 1) / max(self._frames - 1, 1))
         self._world = stage
+        self.up = "z" if self.options.axes == "world" else ""
         self._seen: tuple[Transform, NDArray[np.float32]] | None = None
 
     @classmethod

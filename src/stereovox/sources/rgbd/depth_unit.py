@@ -90,7 +90,8 @@ def find_unit(pairs: Sequence[tuple[View, View]], camera: PinholeCamera, expecte
         expected: Metres per unit by convention, kept where the images do not contradict it.
 
     Returns:
-        The unit: another than `expected` only where it is sure.
+        The unit: another than `expected` only where it is sure, and half the depths are not kilometres away: images
+        in millimetres whose poses are in millimetres too agree in metres.
     """
     units = [expected, *(unit for unit in UNITS if abs(unit / expected - 1) > 1e-6)]
     tried = [*units, STILL]  # last: as if the camera had not moved, which noise of the poses favours
@@ -105,7 +106,12 @@ def find_unit(pairs: Sequence[tuple[View, View]], camera: PinholeCamera, expecte
         return _unchecked(pairs, expected)
     second = float(np.delete(np.median(medians, axis=0), best).min())
     why = f"depths differ by {100 * fits:.1f} % from image to image, in any other unit by {_percent(second)}"
-    return DepthUnit(units[best], all(beaten), why)
+    far = _middle(pairs, units[best])
+    if far <= LIKELY_M[1]:
+        return DepthUnit(units[best], all(beaten), why)
+    if best:
+        return _unchecked(pairs, expected)
+    return DepthUnit(expected, all(beaten), f"{why}; but half the depths are beyond {far:.3g} m", False)
 
 
 def _percent(share: float) -> str:
@@ -196,12 +202,22 @@ def _usable(depth: Depth) -> NDArray[np.bool_]:
     return usable & (depth < 65535) if depth.dtype == np.uint16 else usable
 
 
+def is_likely(pairs: Sequence[tuple[View, View]], unit: float) -> bool:
+    """Return whether half the depths are as far away as those of scenes usually are."""
+    return LIKELY_M[0] <= _middle(pairs, unit) <= LIKELY_M[1]
+
+
+def _middle(pairs: Sequence[tuple[View, View]], unit: float) -> float:
+    """Return the median depth in metres, NaN where there is none."""
+    depths = [view.depth[_usable(view.depth)] for pair in pairs for view in pair]
+    return float(np.median(np.concatenate(depths))) * unit if any(map(len, depths)) else np.nan
+
+
 def _unchecked(pairs: Sequence[tuple[View, View]], expected: float) -> DepthUnit:
     """Return the expected unit, with what the range of the depths says about it."""
-    depths = [view.depth[_usable(view.depth)] for pair in pairs for view in pair]
-    if not any(map(len, depths)):
+    middle = _middle(pairs, expected)
+    if np.isnan(middle):
         return DepthUnit(expected, False, "no two posed images are far enough apart to check it")
-    middle = float(np.median(np.concatenate(depths))) * expected
     plausible = LIKELY_M[0] <= middle <= LIKELY_M[1]
     why = f"half the depths are below {middle:.3g} m" + ("" if plausible else ", which is unusual")
     return DepthUnit(expected, False, why, plausible)

@@ -25,14 +25,8 @@ from stereovox.sources.intrinsics import NAMES, metres_per_unit
 from stereovox.sources.poses import Poses
 from stereovox.sources.rgbd.depth_files import SUFFIXES, Depth, common_depth_size, read_depth
 from stereovox.sources.rgbd.depth_unit import DepthUnit, find_unit, pairs_of, unit_words
-from stereovox.sources.rgbd.pose_files import (
-    ImagePoses,
-    image_numbers,
-    in_optical_axes,
-    in_order,
-    number_in,
-    read_poses,
-)
+from stereovox.sources.rgbd.pose_files import ImagePoses, image_numbers, in_order, number_in, read_poses
+from stereovox.sources.rgbd.pose_fit import Reading, misfit
 from stereovox.sources.tracker import AXES
 from stereovox.sources.trajectory import ns_from_seconds
 
@@ -57,7 +51,8 @@ class FolderOptions:
         the poses). camera: file of the camera, in place of the layout's own (see `camera_in`). fps: images a second
         where they have no times (0: the layout's). poses: file or folder of poses in place of the layout's own (see
         `pose_files`). axes: axes of the posed camera, `optical`, `opengl` (x right, y up, z backward), `ros` or
-        `ned`. invert: whether poses are world to camera.
+        `ned`. invert: whether poses are world to camera. poses_scale: metres per unit of the poses' positions (0.001:
+        millimetres).
     File names are looked up as they stand, then inside the folder.
     """
 
@@ -67,6 +62,7 @@ class FolderOptions:
     poses: str = ""
     axes: str = ""
     invert: bool = False
+    poses_scale: float = 1.0
 
     def __post_init__(self) -> None:
         if self.axes and self.axes not in AXES:
@@ -74,6 +70,8 @@ class FolderOptions:
         for key in ("depth_scale", "fps"):
             if getattr(self, key) < 0:
                 raise SourceError(f"{key}={getattr(self, key):g} must be positive")
+        if not self.poses_scale > 0:
+            raise SourceError(f"poses_scale={self.poses_scale:g} must be above 0: metres per unit of the poses")
 
 
 def folder_part(where: str | os.PathLike[str]) -> str:
@@ -131,6 +129,7 @@ class DepthFolder(DepthSource, ABC):
         self.folder, self.options = folder_options(where)
         self.name = self.folder.resolve().name
         self.axes, self.fps = self.options.axes or self.axes, self.options.fps or self.fps
+        self._reading = Reading(self.axes, self.options.invert, self.options.poses_scale)
         self._images = self.list_images()
         if not self._images:
             raise SourceError(f"{self.folder}: has no depth image ({', '.join(SUFFIXES)}); give a folder that has some")
@@ -142,7 +141,7 @@ class DepthFolder(DepthSource, ABC):
         self.unit = self._find_unit(expected)
         unit_note = () if self.options.depth_scale else self._unit_note(expected)
         self.depth_scale = self.unit.scale
-        self.notes = (*self.notes, *notes, *unit_note)
+        self.notes = (*self.notes, *notes, *unit_note, *self._misfit())
 
     @classmethod
     def depth_only(cls, where: str) -> DepthFolder:
@@ -189,11 +188,12 @@ class DepthFolder(DepthSource, ABC):
         """Return T_world_camera (4, 4) of frame `i` (0 to len - 1); raises FrameRefused where there is none."""
         if not self.posed:
             return np.full((4, 4), np.nan)
+        return self._reading.pose(self._pose_as_written(i))
+
+    def _pose_as_written(self, i: int) -> Transform:
+        """Return the pose of frame `i` in a right-handed world; raises FrameRefused where there is none."""
         T = self.pose_in_file(i)
-        if self._mirrored:
-            T = MIRROR_WORLD @ T @ MIRROR_CAMERA
-        plain = self.axes == "optical" and not self.options.invert
-        return T if plain else in_optical_axes(T, self.axes, self.options.invert)
+        return MIRROR_WORLD @ T @ MIRROR_CAMERA if self._mirrored else T
 
     def camera_of(self, i: int) -> PinholeCamera:
         """Return the camera of frame `i` (0 to len - 1); a layout may have one for each image, of the same size."""
@@ -261,11 +261,20 @@ class DepthFolder(DepthSource, ABC):
     def _unit_note(self, expected: float) -> tuple[str, ...]:
         """Return a note where the unit is not the `expected` one, or could neither be checked nor is certain."""
         unit, usual = self.unit, abs(self.unit.scale / expected - 1) < 1e-6
-        if usual and (unit.sure or (unit.plausible and (self.certain or not self.posed))):
+        if usual and unit.plausible and (unit.sure or self.certain or not self.posed):
             return ()
         contrary = "" if usual else f", not {unit_words(expected)}"
         override = f"else give {self.folder}?depth_scale={5000 if unit.scale == 0.001 else 1000}"
-        return (f"depth is taken to be in {unit.words}{contrary} ({unit.why}); {override}",)
+        poses = "&poses_scale=0.001" if unit.sure and not unit.plausible else ""  # which agree in any common unit
+        return (f"depth is taken to be in {unit.words}{contrary} ({unit.why}); {override}{poses}",)
+
+    def _misfit(self) -> tuple[str, ...]:
+        """Return a note where poses do not fit the images."""
+        confirmed = self.unit.sure and not self.options.depth_scale
+        if not self.posed or confirmed:
+            return ()
+        found = misfit(len(self), self._pose_as_written, self.read, self.camera, self.unit.scale, self._reading)
+        return (found,) if found else ()
 
     def _has_own_poses(self) -> bool:
         """Return whether the layout overrides `pose_in_file`."""

@@ -170,7 +170,7 @@ class RtabmapDatabase(DepthFolder):
         """Return the poses of the optimised graph by node; empty where it was not saved."""
         if version < (0, 17, 0):
             return {}
-        ids, poses = self._sqlite.rows("SELECT opt_ids, opt_poses FROM Admin")[0]
+        ids, poses = next(iter(self._sqlite.rows("SELECT opt_ids, opt_poses FROM Admin")), (None, None))
         if not ids or not poses:
             return {}
         numbers, matrices = _unpacked(ids).view("<i4"), _unpacked(poses).view("<f4").reshape(-1, 12)

@@ -1,0 +1,180 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether poses belong to the images they come with: found by how well images agree with each other at their poses.
+
+Poses that are inverted, of a camera with other axes, or not in metres put every surface somewhere else from image to
+image. Where the images agree under another reading of the same poses, that reading is right.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+
+from stereovox.cameras.pinhole import PinholeCamera
+from stereovox.errors import FrameRefused
+from stereovox.se3 import Transform, inverse
+from stereovox.sources.rgbd.depth_files import Depth
+from stereovox.sources.rgbd.depth_unit import View, difference, find_unit, is_likely, pairs_of
+from stereovox.sources.rgbd.pose_files import in_optical_axes
+from stereovox.sources.tracker import AXES
+
+POSE_SCALES = (1.0, 0.001, 0.01)
+"""Metres per unit of poses that are tried."""
+AGREES = 0.03
+"""Relative difference of depths that are of the same surface."""
+FAR_OFF, FEW, SEEN_TWICE = 0.06, 0.25, 0.1
+"""Poses do not fit where the median relative difference of depths is larger, a smaller share of the points agrees, and
+at least this share is seen by both images, so that it means something."""
+BETTER, CLOSER, ENOUGH = 1.5, 2.0, 0.2
+"""Times as many points that must agree under another reading of the poses, times as small the median difference must
+be, and the least share of all points that must agree."""
+MIN_PAIRS = 2
+"""Pairs of images that must speak for another reading."""
+SAME = 0.5
+"""Share of the points that stay where they are in images of a camera that does not move."""
+
+
+class Reading(NamedTuple):
+    """How poses are read.
+
+    axes: a key of `AXES`. invert: whether they are world to camera. poses_scale: metres per unit of their positions.
+    """
+
+    axes: str = "optical"
+    invert: bool = False
+    poses_scale: float = 1.0
+
+    def pose(self, T: Transform) -> Transform:
+        """Return T_world_camera (4, 4) in metres and optical axes of a pose (4, 4) as it is in a file."""
+        if self == Reading():
+            return T
+        scaled = T.copy()
+        scaled[:3, 3] *= self.poses_scale
+        return in_optical_axes(scaled, self.axes, self.invert)
+
+    def options(self, other: Reading) -> str:
+        """Return the options behind a folder's name that lead from this reading to another."""
+        changes = {"invert": "01"[other.invert], "axes": other.axes, "poses_scale": f"{other.poses_scale:g}"}
+        return "&".join(f"{key}={text}" for key, text in changes.items() if getattr(self, key) != getattr(other, key))
+
+
+class Agreement(NamedTuple):
+    """How images agree with each other.
+
+    share: of all points, those that the other image shows where they must be. median: of the relative differences of
+    depths, infinity without any. seen: share of the points that both images show.
+    """
+
+    share: float
+    median: float
+    seen: float
+
+
+def misfit(
+    count: int,
+    pose: Callable[[int], Transform],
+    read: Callable[[int], Depth],
+    camera: PinholeCamera,
+    unit: float,
+    now: Reading,
+) -> str:
+    """Say that poses do not fit the images, and how to read them so that they do.
+
+    Args:
+        count: Number of images.
+        pose: Pose (4, 4) by number as it is in the file; may raise FrameRefused.
+        read: Image by number; may raise FrameRefused.
+        camera: The camera of all.
+        unit: Metres per unit of the images.
+        now: How the poses are read.
+
+    Returns:
+        What is wrong and what to try, in words; empty where nothing speaks against the poses.
+    """
+    views = _pairs(count, pose, read, now)
+    if not views:
+        return _standing(count, pose, read, camera, unit, now)
+    as_it_is = agreement(views, camera, unit)
+    if as_it_is.share * BETTER > 1:
+        return ""
+    words = f"poses do not fit the images: only {100 * as_it_is.share:.0f} % of the points agree from image to image"
+    better = _better(count, pose, read, camera, unit, now)
+    if better is not None:
+        reading, scale, found = better
+        if found.share > BETTER * as_it_is.share and as_it_is.median > CLOSER * max(found.median, 1e-4):
+            options = [now.options(reading), *([] if scale == unit else [f"depth_scale={1 / scale:g}"])]
+            return f"{words}; try ?{'&'.join(options)}, with which {100 * found.share:.0f} % agree"
+    if as_it_is.median > FAR_OFF and as_it_is.share < FEW and as_it_is.seen > SEEN_TWICE:
+        return f"{words}; check that poses, camera and depth unit belong to these images"
+    return ""
+
+
+def agreement(pairs: Sequence[tuple[View, View]], camera: PinholeCamera, unit: float) -> Agreement:
+    """Return how images of pairs agree with each other where their unit is `unit` metres."""
+    found, points = [np.empty(0)], 0
+    for first, second in pairs:
+        T_second_first = inverse(second.T_world_camera) @ first.T_world_camera
+        differ, of = difference(first.depth, second.depth, camera, T_second_first, unit)
+        found.append(differ)
+        points += of
+    differ = np.concatenate(found)
+    median = float(np.median(differ)) if len(differ) else np.inf
+    return Agreement(float(np.sum(differ < AGREES)) / max(points, 1), median, len(differ) / max(points, 1))
+
+
+def _better(
+    count: int,
+    pose: Callable[[int], Transform],
+    read: Callable[[int], Depth],
+    camera: PinholeCamera,
+    expected: float,
+    now: Reading,
+) -> tuple[Reading, float, Agreement] | None:
+    """Return the other reading of the poses, and unit of the images, under which these agree best; None without any.
+
+    Another unit than the `expected` one counts only where the images confirm it.
+    """
+    best: tuple[Reading, float, Agreement] | None = None
+    for invert, axes, scale in product((False, True), AXES, POSE_SCALES):
+        reading = Reading(axes, invert, scale)
+        pairs = [] if reading == now else _pairs(count, pose, read, reading)
+        if len(pairs) < MIN_PAIRS:
+            continue
+        unit = find_unit(pairs, camera, expected).scale if scale == 1 else expected
+        found = agreement(pairs, camera, unit)
+        fits = found.median < AGREES and found.share > ENOUGH and is_likely(pairs, unit)
+        if fits and (best is None or found.share > best[2].share):
+            best = reading, unit, found
+    return best
+
+
+def _pairs(
+    count: int, pose: Callable[[int], Transform], read: Callable[[int], Depth], reading: Reading
+) -> list[tuple[View, View]]:
+    return pairs_of(count, lambda i: reading.pose(pose(i)), read)
+
+
+def _standing(
+    count: int,
+    pose: Callable[[int], Transform],
+    read: Callable[[int], Depth],
+    camera: PinholeCamera,
+    unit: float,
+    now: Reading,
+) -> str:
+    """Say that poses stand still while the images change; empty where they do not."""
+    try:
+        first, *others = [View(read(i), now.pose(pose(i))) for i in sorted({0, count // 2, count - 1})]
+    except FrameRefused:
+        return ""
+    alike = [np.allclose(first.T_world_camera, view.T_world_camera, atol=1e-6) for view in others]
+    found = agreement([(first, view) for view in others], camera, unit)
+    if not others or not all(alike) or not found.seen or found.share > SAME * found.seen:
+        return ""
+    return (
+        f"poses are all alike, but the images change: only {100 * found.share / found.seen:.0f} % of the points stay "
+        "where they are; give the poses of a moving camera"
+    )

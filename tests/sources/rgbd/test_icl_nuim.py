@@ -13,12 +13,13 @@ from stereovox.sources.rgbd.icl_nuim import INTRINSICS, IclNuim, IclNuimScene
 from stereovox.sources.rgbd.tum import TumRgbd
 
 
-def icl(folder, poses="livingRoom2.gt.freiburg", count=4):
-    """Images 0 to count - 1; the data set has no pose for image 0."""
-    for k, T in enumerate(posed(count)):
+def icl(folder, poses="livingRoom2.gt.freiburg", places=posed()):
+    """Images at T_world_camera (4, 4); the data set has no pose for image 0."""
+    count = len(places)
+    for k, T in enumerate(places):
         write(folder / f"depth/{k}.png", units(render(T, INTRINSICS, VGA), 5000))
     (folder / "associations.txt").write_text("".join(f"{k} depth/{k}.png {k} rgb/{k}.png\n" for k in range(count)))
-    (folder / poses).write_text("".join(tum_line(k, left_handed(T)) for k, T in enumerate(posed(count)) if k))
+    (folder / poses).write_text("".join(tum_line(k, left_handed(T)) for k, T in enumerate(places) if k))
     return folder
 
 
@@ -65,6 +66,21 @@ def compared(source):
     for first, second in pairs_of(len(source), source.pose, source.read):
         T = inverse(second.T_world_camera) @ first.T_world_camera
         yield difference(first.depth, second.depth, source.camera, T, source.depth_scale)
+
+
+def test_a_camera_that_is_turned_over_does_not_fit_where_it_nods(tmp_path):
+    folder = icl(tmp_path, "groundtruth.txt", [T @ turned_down(0.15 * k) for k, T in enumerate(posed())])
+    assert open_source(folder).unit.sure
+    (folder / "camera-intrinsics.txt").write_text("481.2 480 319.5 239.5")
+    wrong = open_source(folder)
+    assert not wrong.unit.sure
+    assert any("poses do not fit the images" in note for note in wrong.notes)
+
+
+def turned_down(angle):
+    T = np.eye(4)
+    T[1:3, 1:3] = [[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]]
+    return T
 
 
 def test_depth_along_the_rays_and_povray_cameras(tmp_path):

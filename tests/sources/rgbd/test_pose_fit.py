@@ -62,7 +62,7 @@ def test_poses_that_do_not_fit_are_named_with_the_options_that_cure_them(tmp_pat
 def test_options_that_are_wrong_are_named_as_well(tmp_path):
     folder = recording(tmp_path, posed(6))
     assert fit_notes(open_source(folder)) == []
-    for options, cure in (("invert=1", "invert=0"), ("axes=ros", "axes=optical"), ("poses_scale=5", "poses_scale=1")):
+    for options, cure in (("invert=1", "invert=0"), ("axes=ros", "axes=optical"), ("poses_scale=100", "poses_scale=1")):
         (note,) = fit_notes(open_source(f"{folder}?{options}"))
         assert f"try ?{cure}, with which" in note
 

@@ -8,6 +8,7 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -26,7 +27,7 @@ from stereovox.sources.poses import Poses
 from stereovox.sources.rgbd.depth_files import SUFFIXES, Depth, common_depth_size, read_depth
 from stereovox.sources.rgbd.depth_unit import DepthUnit, find_unit, pairs_of, unit_words
 from stereovox.sources.rgbd.pose_files import ImagePoses, image_numbers, in_order, number_in, read_poses
-from stereovox.sources.rgbd.pose_fit import Reading, misfit
+from stereovox.sources.rgbd.pose_fit import Images, Reading, misfit
 from stereovox.sources.tracker import AXES
 from stereovox.sources.trajectory import ns_from_seconds
 
@@ -141,7 +142,7 @@ class DepthFolder(DepthSource, ABC):
         self.unit = self._find_unit(expected)
         unit_note = () if self.options.depth_scale else self._unit_note(expected)
         self.depth_scale = self.unit.scale
-        self.notes = (*self.notes, *notes, *unit_note, *self._misfit())
+        self.notes = (*self.notes, *notes, *unit_note, *self._misfit(expected))
 
     @classmethod
     def depth_only(cls, where: str) -> DepthFolder:
@@ -268,12 +269,15 @@ class DepthFolder(DepthSource, ABC):
         poses = "&poses_scale=0.001" if unit.sure and not unit.plausible else ""  # which agree in any common unit
         return (f"depth is taken to be in {unit.words}{contrary} ({unit.why}); {override}{poses}",)
 
-    def _misfit(self) -> tuple[str, ...]:
-        """Return a note where poses do not fit the images."""
+    def _misfit(self, expected: float) -> tuple[str, ...]:
+        """Return a note where poses do not fit the images, whose unit is `expected` by convention."""
         confirmed = self.unit.sure and not self.options.depth_scale
         if not self.posed or confirmed:
             return ()
-        found = misfit(len(self), self._pose_as_written, self.read, self.camera, self.unit.scale, self._reading)
+        images = Images(len(self), self._pose_as_written, cache(self.read), self.camera)
+        found = misfit(
+            images, self.unit.scale, self.unit.scale if self.options.depth_scale else expected, self._reading
+        )
         return (found,) if found else ()
 
     def _has_own_poses(self) -> bool:

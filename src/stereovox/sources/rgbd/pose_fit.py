@@ -33,6 +33,8 @@ BETTER, CLOSER, ENOUGH = 1.5, 2.0, 0.2
 be, and the least share of all points that must agree."""
 MIN_PAIRS = 2
 """Pairs of images that must speak for another reading."""
+SURELY = 0.4
+"""Share of the points that agree under a reading that needs no other unit."""
 SAME = 0.5
 """Share of the points that stay where they are in images of a camera that does not move."""
 
@@ -61,6 +63,23 @@ class Reading(NamedTuple):
         return "&".join(f"{key}={text}" for key, text in changes.items() if getattr(self, key) != getattr(other, key))
 
 
+class Images(NamedTuple):
+    """The images of a recording.
+
+    count: their number. pose: pose (4, 4) by number as it is in the file; read: image by number; both may raise
+    FrameRefused. camera: the camera of all.
+    """
+
+    count: int
+    pose: Callable[[int], Transform]
+    read: Callable[[int], Depth]
+    camera: PinholeCamera
+
+    def pairs(self, reading: Reading) -> list[tuple[View, View]]:
+        """Return pairs of images at their poses, see `pairs_of`."""
+        return pairs_of(self.count, lambda i: reading.pose(self.pose(i)), self.read)
+
+
 class Agreement(NamedTuple):
     """How images agree with each other.
 
@@ -73,40 +92,33 @@ class Agreement(NamedTuple):
     seen: float
 
 
-def misfit(
-    count: int,
-    pose: Callable[[int], Transform],
-    read: Callable[[int], Depth],
-    camera: PinholeCamera,
-    unit: float,
-    now: Reading,
-) -> str:
+def misfit(images: Images, unit: float, expected: float, now: Reading) -> str:
     """Say that poses do not fit the images, and how to read them so that they do.
 
     Args:
-        count: Number of images.
-        pose: Pose (4, 4) by number as it is in the file; may raise FrameRefused.
-        read: Image by number; may raise FrameRefused.
-        camera: The camera of all.
-        unit: Metres per unit of the images.
+        images: The images and their poses.
+        unit: Metres per unit of the images, as it was found.
+        expected: The same by convention.
         now: How the poses are read.
 
     Returns:
         What is wrong and what to try, in words; empty where nothing speaks against the poses.
     """
-    views = _pairs(count, pose, read, now)
-    if not views:
-        return _standing(count, pose, read, camera, unit, now)
-    as_it_is = agreement(views, camera, unit)
-    if as_it_is.share * BETTER > 1:
+    pairs = images.pairs(now)
+    if not pairs:
+        return _standing(images, unit, now)
+    usual = agreement(pairs, images.camera, expected)
+    if usual.share * BETTER > 1:
         return ""
+    as_it_is = usual if unit == expected else agreement(pairs, images.camera, unit)
     words = f"poses do not fit the images: only {100 * as_it_is.share:.0f} % of the points agree from image to image"
-    better = _better(count, pose, read, camera, unit, now)
+    better = _better(images, expected, now)
     if better is not None:
         reading, scale, found = better
-        if found.share > BETTER * as_it_is.share and as_it_is.median > CLOSER * max(found.median, 1e-4):
-            options = [now.options(reading), *([] if scale == unit else [f"depth_scale={1 / scale:g}"])]
-            return f"{words}; try ?{'&'.join(options)}, with which {100 * found.share:.0f} % agree"
+        same = usual if reading == now else agreement(pairs, images.camera, scale)
+        if found.share > max(as_it_is.share, BETTER * same.share) and same.median > CLOSER * found.median:
+            options = [now.options(reading), "" if scale == expected else f"depth_scale={1 / scale:g}"]
+            return f"{words}; try ?{'&'.join(filter(None, options))}, with which {100 * found.share:.0f} % agree"
     if as_it_is.median > FAR_OFF and as_it_is.share < FEW and as_it_is.seen > SEEN_TWICE:
         return f"{words}; check that poses, camera and depth unit belong to these images"
     return ""
@@ -125,53 +137,43 @@ def agreement(pairs: Sequence[tuple[View, View]], camera: PinholeCamera, unit: f
     return Agreement(float(np.sum(differ < AGREES)) / max(points, 1), median, len(differ) / max(points, 1))
 
 
-def _better(
-    count: int,
-    pose: Callable[[int], Transform],
-    read: Callable[[int], Depth],
-    camera: PinholeCamera,
-    expected: float,
-    now: Reading,
-) -> tuple[Reading, float, Agreement] | None:
+def _better(images: Images, expected: float, now: Reading) -> tuple[Reading, float, Agreement] | None:
     """Return the other reading of the poses, and unit of the images, under which these agree best; None without any.
 
-    Another unit than the `expected` one counts only where the images confirm it.
+    Another unit than the `expected` one is tried where that fits hardly, and counts where the images confirm it.
     """
+    readings = [Reading(*names) for names in product(AXES, (False, True), POSE_SCALES)]
+    found = [(reading, expected, images.pairs(reading)) for reading in readings if reading != now]
+    best = _best(images.camera, found)
+    if best is None or best[2].share < SURELY:
+        units = [(reading, find_unit(pairs, images.camera, expected), pairs) for reading, _, pairs in found if pairs]
+        units += [(now, find_unit(images.pairs(now), images.camera, expected), images.pairs(now))]
+        others = _best(images.camera, [(reading, unit.scale, pairs) for reading, unit, pairs in units if unit.sure])
+        best = max((one for one in (best, others) if one is not None), key=lambda one: one[2].share, default=None)
+    return best
+
+
+def _best(
+    camera: PinholeCamera, tried: Sequence[tuple[Reading, float, list[tuple[View, View]]]]
+) -> tuple[Reading, float, Agreement] | None:
     best: tuple[Reading, float, Agreement] | None = None
-    for invert, axes, scale in product((False, True), AXES, POSE_SCALES):
-        reading = Reading(axes, invert, scale)
-        pairs = [] if reading == now else _pairs(count, pose, read, reading)
-        if len(pairs) < MIN_PAIRS:
-            continue
-        unit = find_unit(pairs, camera, expected).scale if scale == 1 else expected
+    for reading, unit, pairs in tried:
         found = agreement(pairs, camera, unit)
-        fits = found.median < AGREES and found.share > ENOUGH and is_likely(pairs, unit)
+        fits = len(pairs) >= MIN_PAIRS and found.median < AGREES and found.share > ENOUGH and is_likely(pairs, unit)
         if fits and (best is None or found.share > best[2].share):
             best = reading, unit, found
     return best
 
 
-def _pairs(
-    count: int, pose: Callable[[int], Transform], read: Callable[[int], Depth], reading: Reading
-) -> list[tuple[View, View]]:
-    return pairs_of(count, lambda i: reading.pose(pose(i)), read)
-
-
-def _standing(
-    count: int,
-    pose: Callable[[int], Transform],
-    read: Callable[[int], Depth],
-    camera: PinholeCamera,
-    unit: float,
-    now: Reading,
-) -> str:
+def _standing(images: Images, unit: float, now: Reading) -> str:
     """Say that poses stand still while the images change; empty where they do not."""
+    last = images.count - 1
     try:
-        first, *others = [View(read(i), now.pose(pose(i))) for i in sorted({0, count // 2, count - 1})]
+        first, *others = [View(images.read(i), now.pose(images.pose(i))) for i in sorted({0, last // 2, last})]
     except FrameRefused:
         return ""
     alike = [np.allclose(first.T_world_camera, view.T_world_camera, atol=1e-6) for view in others]
-    found = agreement([(first, view) for view in others], camera, unit)
+    found = agreement([(first, view) for view in others], images.camera, unit)
     if not others or not all(alike) or not found.seen or found.share > SAME * found.seen:
         return ""
     return (

@@ -70,6 +70,8 @@ ROBOTS = {
 """Recordings of ground robots, asked in this order, then those of other packages (entry points `stereovox.robots`)."""
 
 
+AMBIGUOUS = (".txt", ".csv", ".bin")
+"""Endings of clouds that may be anything else: poses, a camera."""
 MAX_BELOW, MAX_LISTED = 50, 10_000
 """Most folders that are tried, and most entries that are counted, to explain why a folder cannot be opened."""
 
@@ -268,7 +270,7 @@ def file_cure(file: str) -> str:
     ending = os.path.splitext(file)[1].lower()
     if cure_of(file):
         return cure_of(file)
-    if ending in registry.names("import", IMPORTS):
+    if ending in registry.names("import", IMPORTS) and ending not in AMBIGUOUS:
         name = shlex.quote(file) if len(file) <= MAX_SHOWN else "FILE"
         return f"is a map or cloud, no recording; import it with: stereovox import {name} map.svox"
     return f"is no recording: {UNREADABLE[ending]}" if ending in UNREADABLE else ""

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What `stereovox info` says: no digits that mean nothing, nothing twice, and commands that can work."""
 
+import json
+
 import numpy as np
 import pytest
 
@@ -55,3 +57,9 @@ def test_describe_stays_a_function():
     """A module of that name would take its place once it is imported."""
     for _ in range(2):
         assert sv.describe("sim:floor").kind == "robot"
+
+
+def test_facts_are_plain_numbers():
+    """A NumPy bool in them ended `info --json` in a traceback."""
+    found = sv.describe("sim:box?image_width=160")
+    assert json.loads(json.dumps(found.facts))["up_sure"] is True

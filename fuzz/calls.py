@@ -97,8 +97,8 @@ def run(folder: Path, arguments: argparse.Namespace) -> tuple[dict[str, Counter[
         words = call(files.names(dice), dice)
         outcome = attempt(words, folder / "printed")
         counts["status"][str(outcome.status)] += 1
-        counts["command"][words[0]] += 1
-        counts["done"][words[0]] += outcome.status == 0
+        counts["command"]["".join(words[:1])] += 1
+        counts["done"]["".join(words[:1])] += outcome.status == 0
         problem = outcome.problem()
         last = (outcome.printed.splitlines() or [""])[-1]
         if arguments.show or outcome.seconds > MAX_SECONDS / 3:

@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
 import ast
-from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -66,12 +65,14 @@ def test_fixed_parts_are_counted_with_constants_and_the_longer_branch():
 
 
 def constants(tree):
+    """Names and values of the texts of a module."""
     for node in tree.body:
-        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name):
-            with suppress(ValueError, TypeError):
-                value = ast.literal_eval(node.value)
-                if isinstance(value, str):
-                    yield node.targets[0].id, value
+        if isinstance(node, ast.Assign):
+            names, value = node.targets[0], node.value
+            pairs = zip(names.elts, value.elts, strict=False) if isinstance(names, ast.Tuple) else [(names, value)]
+            for name, text in pairs:
+                if isinstance(name, ast.Name) and isinstance(text, ast.Constant) and isinstance(text.value, str):
+                    yield name.id, text.value
 
 
 def fixed(node, texts):

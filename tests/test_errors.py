@@ -69,7 +69,8 @@ def constants(tree):
     for node in tree.body:
         if isinstance(node, ast.Assign):
             names, value = node.targets[0], node.value
-            pairs = zip(names.elts, value.elts, strict=False) if isinstance(names, ast.Tuple) else [(names, value)]
+            several = isinstance(names, ast.Tuple) and isinstance(value, ast.Tuple)
+            pairs = zip(names.elts, value.elts, strict=True) if several else [(names, value)]
             for name, text in pairs:
                 if isinstance(name, ast.Name) and isinstance(text, ast.Constant) and isinstance(text.value, str):
                     yield name.id, text.value

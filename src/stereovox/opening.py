@@ -70,6 +70,7 @@ ROBOTS = {
 """Recordings of ground robots, asked in this order, then those of other packages (entry points `stereovox.robots`)."""
 
 
+UNKNOWN_FILE = "is a file, but no recording that is known"
 MAX_BELOW, MAX_LISTED = 50, 10_000
 """Most folders that are tried, and most entries that are counted, to explain why a folder cannot be opened."""
 
@@ -269,7 +270,7 @@ def _file_problem(file: str) -> str:
         return f"is a map or cloud, no recording; import it with: stereovox import {name} map.svox"
     if ending in UNREADABLE:
         return f"is no recording: {UNREADABLE[ending]}"
-    return f"is a file, but no recording that is known; see: stereovox info {name}"
+    return f"{UNKNOWN_FILE}; see: stereovox info {name}"
 
 
 def _missing(folder: str, kinds: list[Any]) -> str:

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from importlib import import_module
 
 from stereovox.contents.description import Description as Description
+from stereovox.errors import SourceError, shortened
 
 KINDS = (
     "stereovox.contents.maps:describe_map",
@@ -35,7 +36,7 @@ def describe(path: str | os.PathLike[str]) -> Description:
         StereovoxError: There is nothing, or nothing that any command uses: one line that says what it seems to be, what
             is missing, and the cure.
     """
-    from stereovox.opening import open_source
+    from stereovox.opening import UNKNOWN_FILE, open_source
 
     text = os.fspath(path)
     for name in KINDS:
@@ -44,5 +45,11 @@ def describe(path: str | os.PathLike[str]) -> Description:
         found = known(text)
         if found is not None:
             return found
-    open_source(text)  # which says what is missing
+    try:
+        open_source(text)  # which says what is missing
+    except SourceError as error:
+        if UNKNOWN_FILE not in str(error):
+            raise
+        kinds = "what can be read is listed in docs/recordings.md and docs/formats.md"
+        raise SourceError(f"{shortened(text)}: is of no known kind, by name or content; {kinds}") from None
     raise AssertionError(f"{text}: a recording that is not described")

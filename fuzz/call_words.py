@@ -52,8 +52,8 @@ SETTINGS = ("voxel_size=0.1", "voxel_size=nan", "up=-y", "up=w", "sensor.model=a
             "max_range=1e9", "steps=[0.1]", "steps=x", "window.size=[1,2]", "a.b.c=1", "=", "x", "map.cell=int8",
             "map.memory_mb=1", "threads=99999999", "prior=2", "up_direction=[0,0,0]", "sensor=1")  # fmt: skip
 OPTIONS = ("depth_scale=1000", "depth_scale=0", "depth_scale=x", "depth_scale=inf", "depth_scale=1e-300", "fps=15",
-           "fps=nan", "fps=1e300", "poses=poses.txt", "poses=gone", "poses=", "poses=../tum/groundtruth.txt", "axes=ros",
-           "axes=opengl", "axes=left", "invert=1", "invert=maybe", "camera=camera.toml", "camera=floor.yaml", "x=1", "",
+           "fps=nan", "fps=1e300", "poses=poses.txt", "poses=gone", "poses=", "poses=../tum/groundtruth.txt",
+           "axes=ros", "poses_scale=0.001", "poses_scale=-1", "axes=opengl", "axes=left", "invert=1", "invert=maybe", "camera=camera.toml", "camera=floor.yaml", "x=1", "",
            "=", "&&", "depth_scale", "poses=/dev/zero", "unit=3", "topic=/a", "stride=0")  # fmt: skip
 PLACES = ("gone", "/dev/null", "/dev/zero", "", ".", "empty/pipe", "/proc/self/mem", "gone/deep/er", "~", "x" * 300,
           "d/" * 600, "http://example.com/a.bag", "-", "-h", "--", "con\nfused", "a?b?c")  # fmt: skip

@@ -56,8 +56,9 @@ class Outcome(NamedTuple):
         return "" if self._is_named(errors[0]) else "names nothing of the call"
 
     def _is_named(self, line: str) -> bool:
-        parts = [part for word in self.words for part in re.split(r"[=?/,]", word.strip("-"))]
+        parts = [part for word in self.words for part in (word, *re.split(r"[=?/,]", word.strip("-")))]
         parts += [part.replace("-", "_") for part in parts]  # a setting of that name
+        parts += [Path(part).stem for part in parts]  # a recording in a file of that name
         parts += os.listdir()  # a message may name a file that an option names, or that lies beside
         named = any(repr(part[:12])[1:-1] in line for part in parts if part)
         other_file = re.match(r"stereovox: \S+\.\w+: ", line)  # which one of these names

@@ -89,3 +89,8 @@ def fixed(node, texts):
     if isinstance(node, ast.IfExp):
         return max(fixed(node.body, texts), fixed(node.orelse, texts))
     return len(texts.get(node.id, "")) if isinstance(node, ast.Name) else 0
+
+
+def test_an_option_without_a_value_is_one_line(capsys):
+    assert main(["truth", "a", "--out=--"]) == 2
+    assert "'--out=--': '--' is no value" in capsys.readouterr().err

@@ -13,8 +13,9 @@ from stereovox.sources.rgbd.icl_nuim import INTRINSICS, IclNuim, IclNuimScene
 from stereovox.sources.rgbd.tum import TumRgbd
 
 
-def icl(folder, poses="livingRoom2.gt.freiburg", places=posed()):
+def icl(folder, poses="livingRoom2.gt.freiburg", places=None):
     """Images at T_world_camera (4, 4); the data set has no pose for image 0."""
+    places = places or posed()
     count = len(places)
     for k, T in enumerate(places):
         write(folder / f"depth/{k}.png", units(render(T, INTRINSICS, VGA), 5000))

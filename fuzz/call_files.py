@@ -55,12 +55,15 @@ MAX_CHANGED = 200_000
 COPIES = 40
 """Damaged copies of the sound files, each time the files are made anew."""
 STRANGE = ("a name with spaces", "what?depth_scale=1&x", "R&D [old] (2)", "naïve-поза-🗺", "-minus",
-           "new\nline", "%s{0}", "'quoted' \"twice\"", "x" * 200, "non-utf8-\udcff\udcfe", "\x1b[31mred", "a=b,c;d", ".hidden")  # fmt: skip
-CONTENTS = (b"", b"\0" * 100, b"\xff" * 3000, b"hello\n", b"{}", b"[]", b"{" * 5000, b"\x89PNG\r\n\x1a\n",
-            b"ply\n", b"1 2 3\n" * 50, b"nan nan nan\n" * 9, b"#ROSBAG V2.0\n", b"SQLite format 3\0", b"\x89MCAP0\r\n")  # fmt: skip
-SUFFIXES = ("", ".txt", ".ply", ".pcd", ".png", ".pgm", ".npy", ".npz", ".bag", ".db3", ".db", ".mcap", ".toml",
-            ".yaml", ".json", ".svox", ".bt", ".ot", ".clf", ".log", ".sens", ".klg", ".raw", ".las", ".xyz", ".graph",
-            ".exr", ".tiff", ".tum", ".csv", ".obj", ".vdb", ".gz", ".log.bz2")  # fmt: skip
+           "new\nline", "%s{0}", "'quoted' \"twice\"", "x" * 200, "non-utf8-\udcff\udcfe",
+           "\x1b[31mred", "a=b,c;d", ".hidden")  # fmt: skip
+CONTENTS = (b"", b"\0" * 100, b"\xff" * 3000, b"hello\n", b"{}", b"[]", b"{" * 5000,
+            b"\x89PNG\r\n\x1a\n", b"ply\n", b"1 2 3\n" * 50, b"nan nan nan\n" * 9, b"#ROSBAG V2.0\n",
+            b"SQLite format 3\0", b"\x89MCAP0\r\n")  # fmt: skip
+SUFFIXES = ("", ".txt", ".ply", ".pcd", ".png", ".pgm", ".npy", ".npz", ".bag", ".db3", ".db", ".mcap",
+            ".toml", ".yaml", ".json", ".svox", ".bt", ".ot", ".clf", ".log", ".sens", ".klg", ".raw",
+            ".las", ".xyz", ".graph", ".exr", ".tiff", ".tum", ".csv", ".obj", ".vdb", ".gz",
+            ".log.bz2")  # fmt: skip
 
 
 class Files:

@@ -66,7 +66,7 @@ def test_what_the_nearest_layout_lacks_is_named_with_the_cure(tmp_path):
     (tmp_path / "depth").mkdir()
     for stamp in ("1.0", "2.0"):
         write_png(tmp_path / "depth" / f"{stamp}.png", depth_image(0))
-    with pytest.raises(SourceError, match=r"has depth images \(2\) but no poses; write groundtruth\.txt") as caught:
+    with pytest.raises(SourceError, match=r"has depth images \(2\) but no poses; write poses\.txt") as caught:
         open_source(tmp_path)
     assert len(str(caught.value)) <= 300
 

@@ -247,6 +247,9 @@ def _problem(where: str, kinds: list[Any]) -> str:
     likely = next((folder for folder in below for kind in kinds if kind.recognises(folder)), None)
     if likely:
         return f"no recording itself; did you mean {likely}?"
+    likely = next((folder for folder in below if os.path.isfile(os.path.join(folder, "manifest.json"))), None)
+    if likely:
+        return f"no recording, but it holds a map (did you mean {likely}?)"
     return _missing(place, kinds) or f"no recording: {_contents(place)}; layouts: see docs/recordings.md"
 
 

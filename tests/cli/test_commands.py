@@ -165,9 +165,9 @@ def test_ctrl_c_saves_what_there_is(recording, tmp_path, capsys, monkeypatch):
 MISTAKES = [
     ("did you mean 'map'", ["mpa"]),
     ("--help", []),
-    ("required: MAP", ["info"]),
+    ("required: PATH", ["info"]),
     ("no such folder", ["map", "/no/such/recording", "--out", "m"]),
-    ("not a recording", ["map", "{tmp}", "--out", "{tmp}/m"]),
+    ("no recording itself; did you mean", ["map", "{tmp}", "--out", "{tmp}/m"]),
     ("did you mean 'voxel_size'", ["map", "{rec}", "--out", "{tmp}/m", "--set", "voxel_sise=1"]),
     ("write KEY=VALUE", ["map", "{rec}", "--out", "{tmp}/m", "--set", "voxel_size"]),
     ("use --profile", ["map", "{rec}", "--out", "{tmp}/m", "--set", "profile=x"]),
@@ -193,8 +193,8 @@ MISTAKES = [
     ("min_range 0.1 must be smaller than max_range 0.05", ["map", "{rec}", "--out", "{tmp}/m", "--max-range", "0.05"]),
     ("stereovox: voxel_size -1.0: ", ["map", "{rec}", "--out", "{tmp}/m", "--voxel-size=-1"]),
     ("give a list of 3 numbers, [x, y, z]", ["map", "{rec}", "--out", "{tmp}/m", "--set", "window.size=20"]),
-    ("a recording; make a map of it with: stereovox map ", ["info", "{rec}"]),
-    ("no stereovox map here, nor anything else", ["info", "{tmp}/gone"]),
+    ("a recording; make a map of it with: stereovox map ", ["view", "{rec}"]),
+    ("no such folder or file", ["info", "{tmp}/gone"]),
     ("a_file", ["map", "{rec}", "--out", "{tmp}/a_file/m"]),
     ("a_file", ["demo", "--out", "{tmp}/a_file"]),
     ("a_file", ["export", "{map}", "{tmp}/a_file/x.bt"]),
@@ -206,7 +206,6 @@ MISTAKES = [
     ("unknown peer 'octomp' (did you mean 'octomap'?)", ["bench", "{rec}", "--peers", "octomp"]),
     ("greater than 0", ["bench", "{rec}", "--voxel-size", "0"]),
     ("threads 0", ["bench", "{rec}", "--threads", "0"]),
-    ("no stereovox map here", ["info", "{rec}"]),
     ("no stereovox map here", ["export", "{tmp}/gone", "{tmp}/x.bt"]),
     ("written as .png", ["picture", "{tmp}/gone", "x.jpg"]),
     ("must be smaller", ["map", "{rec}", "--out", "{tmp}/m", "--set", "map.free_below=0.9"]),
@@ -228,7 +227,7 @@ def test_mistakes_end_in_one_line(said, words, recording, tmp_path, capsys):
 
 def test_a_source_that_is_not_there_is_told_without_a_list_of_formats(tmp_path, capsys):
     assert run("map", tmp_path / "gone", "--out", tmp_path / "m") == 2
-    assert capsys.readouterr().err == f"stereovox: {tmp_path / 'gone'}: no such folder or file\n"
+    assert capsys.readouterr().err == f"stereovox: {tmp_path / 'gone'}: no such folder or file; check the name\n"
 
 
 def test_the_map_in_a_folder_is_suggested(tmp_path, capsys):
@@ -263,11 +262,11 @@ def test_memory_of_a_window_is_told_apart(recording, tmp_path, capsys):
     assert run("map", recording, "--out", tmp_path / "m", "--voxel-size", 0.1, *window) == 0
     assert ", reserved for the window" in capsys.readouterr().err
     assert run("info", tmp_path / "m") == 0
-    assert "in memory once loaded, whatever its window took" in capsys.readouterr().err
+    assert "in memory once loaded, besides what its window reserved" in capsys.readouterr().err
     assert run("map", recording, "--out", tmp_path / "n", "--voxel-size", 0.1) == 0
     assert "reserved" not in capsys.readouterr().err
     assert run("info", tmp_path / "n") == 0
-    assert "whatever its window took" not in capsys.readouterr().err
+    assert "window reserved" not in capsys.readouterr().err
 
 
 def test_bench_without_peers_installed_times_stereovox_and_says_what_to_install(recording, capsys, monkeypatch):

@@ -15,7 +15,7 @@ from stereovox.sources.rgbd.tum import TumRgbd
 
 def icl(folder, poses="livingRoom2.gt.freiburg", places=None):
     """Images at T_world_camera (4, 4); the data set has no pose for image 0."""
-    places = places or posed()
+    places = posed() if places is None else places
     count = len(places)
     for k, T in enumerate(places):
         write(folder / f"depth/{k}.png", units(render(T, INTRINSICS, VGA), 5000))

@@ -44,7 +44,7 @@ def test_images_without_a_pose_nearby_are_faulty_frames(tmp_path):
     early, late = "1305031102.050000", "1305031109.000000"
     frames = list(TumRgbd(tum(tmp_path, [early, *STAMPS, late], STRAIGHT)))
     assert [frame.fault for frame in frames] == ["no_pose", None, None, None, "no_pose"]
-    assert f"before {late}" in frames[-1].fault_detail
+    assert f"before {late[:14]}" in frames[-1].fault_detail
     assert frames[0].stamp_ns == 1_305_031_102_050_000_000
 
 
@@ -140,7 +140,7 @@ def test_a_list_of_pairs_names_the_depth_images(tmp_path, line):
 def test_a_folder_without_poses_names_them_as_what_is_missing(tmp_path):
     folder = tum(tmp_path, STAMPS, STRAIGHT)
     (folder / "groundtruth.txt").unlink()
-    with pytest.raises(SourceError, match=r"but no poses; write groundtruth\.txt .*\?poses=FILE"):
+    with pytest.raises(SourceError, match=r"but no poses; write poses\.txt .*\?poses=FILE"):
         open_source(folder)
 
 

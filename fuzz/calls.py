@@ -62,7 +62,7 @@ class Outcome(NamedTuple):
         parts += os.listdir()  # a message may name a file that an option names, or that lies beside
         named = any(part[:12] in line or repr(part[:12])[1:-1] in line for part in parts if part)
         other_file = re.match(r"stereovox: \S+\.\w+: ", line)  # which one of these names
-        return named or other_file is not None or "" in self.words or not self.words
+        return named or other_file is not None or "" in self.words or not self.words or "pip install" in line
 
 
 def main() -> int:

@@ -66,18 +66,18 @@ class Reading(NamedTuple):
 class Images(NamedTuple):
     """The images of a recording.
 
-    count: their number. pose: pose (4, 4) by number as it is in the file; read: image by number; both may raise
+    frames: their number. pose: pose (4, 4) by number as it is in the file; read: image by number; both may raise
     FrameRefused. camera: the camera of all.
     """
 
-    count: int
+    frames: int
     pose: Callable[[int], Transform]
     read: Callable[[int], Depth]
     camera: PinholeCamera
 
     def pairs(self, reading: Reading) -> list[tuple[View, View]]:
         """Return pairs of images at their poses, see `pairs_of`."""
-        return pairs_of(self.count, lambda i: reading.pose(self.pose(i)), self.read)
+        return pairs_of(self.frames, lambda i: reading.pose(self.pose(i)), self.read)
 
     def mirrored(self) -> Images:
         """Return the same with poses of a camera whose y points up, in a left-handed world (or the other way round)."""
@@ -175,7 +175,7 @@ def _best(
 
 def _standing(images: Images, unit: float, now: Reading) -> str:
     """Say that poses stand still while the images change; empty where they do not."""
-    last = images.count - 1
+    last = images.frames - 1
     try:
         first, *others = [View(images.read(i), now.pose(images.pose(i))) for i in sorted({0, last // 2, last})]
     except FrameRefused:

@@ -131,3 +131,11 @@ def test_a_live_camera_that_delivers_nothing_ends(tmp_path):
     with pytest.raises(KeyboardInterrupt):
         sv.map_recording(Live(2), tmp_path / "a.svox", voxel_size=0.2, observers=[Seen(stop=150)])
     assert sv.load_map(tmp_path / "a.svox").frames == 2
+
+
+def test_a_map_made_level_with_a_profile(tmp_path):
+    """A profile keeps its sizes; which way is up is found all the same."""
+    box = "sim:box?image_width=160"
+    result = sv.map_recording(box, tmp_path / "a.svox", profile="default", level=True, voxel_size=0.4)
+    assert result.map.config.up == "z"
+    np.testing.assert_allclose(result.map.config.levelled_from, [0, 0, 1], atol=0.1)

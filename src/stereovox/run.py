@@ -252,7 +252,11 @@ class MapRun:
         if not named or (self._profile is not None and not self._level):
             return {}, []
         found = survey(source, SURVEYED)  # pyright: ignore[reportArgumentType]
-        return found.settings(self._overrides) if self._profile is None else found.up_settings(self._overrides)
+        settings = found.settings if self._profile is None else found.up_settings
+        chosen, lines = settings(self._overrides)
+        if self._level and found.up is not None and found.up.sure:
+            chosen.setdefault("up", found.up.axis)  # where it is z, nothing had to be chosen
+        return chosen, lines
 
     def _level_direction(self, settings: Mapping[str, Any]) -> tuple[float, float, float] | None:
         """Return what is up in the recording's world, None where it is not to be levelled.

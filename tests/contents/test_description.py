@@ -65,7 +65,7 @@ def test_a_file_of_no_kind_is_not_sent_in_a_circle(tmp_path, capsys):
     (tmp_path / "notes.xyzzy").write_text("nothing here can read this")
     assert main(["info", str(tmp_path / "notes.xyzzy")]) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert "is of no known kind" in line
+    assert "is of no kind" in line
     assert "stereovox info" not in line
 
 
@@ -86,3 +86,9 @@ def test_what_a_quick_look_found_goes_into_json(tmp_path, capsys):
     assert main(["info", str(folder), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert (found["unit"], found["unit_sure"], found["up"], found["up_sure"]) == ("millimetres", True, "z", True)
+
+
+def test_facts_are_plain_numbers():
+    """A NumPy bool in them ended `info --json` in a traceback."""
+    found = sv.describe("sim:box?image_width=160")
+    assert json.loads(json.dumps(found.facts))["up_sure"] is True

@@ -14,7 +14,6 @@ import os
 import random
 import re
 import resource
-import shutil
 import signal
 import sys
 import tempfile
@@ -150,11 +149,6 @@ def attempt(words: Sequence[str], captured: Path) -> Outcome:
 
 def _too_long(*_: Any) -> None:
     raise TooLong
-
-
-def remove(folder: Path) -> None:
-    """Remove a folder, whatever is in it."""
-    shutil.rmtree(folder, ignore_errors=True)
 
 
 if __name__ == "__main__":

@@ -66,6 +66,16 @@ PLACES = ("gone", "/dev/null", "/dev/zero", "", ".", "empty/pipe", "/proc/self/m
 ENDINGS = {"localize": ".tum", "slam": ".yaml", "grid": ".yaml", "ground": ".yaml", "calibrate": ".toml",
            "simulate": ".mcap", "distance": ".npz", "picture": ".png"}  # fmt: skip
 """Ending of what a command writes, where it is not a map."""
+FITTING = {
+    "SOURCE": ("7scenes", "tum", "icl", "sun3d", "rig", "asl", "kitti_raw", "scan.sens", "log.klg", "bench.raw",
+               "replica", "open3d", "nerf", "colmap", "tartanair", "stray", "plain", "pair", "rtabmap", "rtabmap.db",
+               "ros.bag", "realsense.bag", "kitti_tracking/training", "kitti2015/training"),
+    "ROBOT": ("robot.bag", "robot2/robot2.db3", "walk.clf"),
+    "FILE": ("cloud.ply", "cloud.pcd", "cloud.bt", "cloud.ot", "points.graph", "floor.yaml", "kalibr.yaml"),
+    "MAP": ("map.svox", "map.svox", "out0.svox", "out1.svox", "cloud.svox", "floor.yaml"),
+    "PATH": ("map.svox", "floor.yaml", "depth.npy", "poses.txt", "camera.toml", "profile.toml", "kalibr.yaml", "pair"),
+}  # fmt: skip
+"""Names of sound files by what an argument wants."""
 SUFFIXES = (".svox", ".ply", ".pcd", ".bt", ".npz", ".png", ".yaml", ".toml", ".bag", ".tum", ".rrd",
             ".glb", ".gz", "")  # fmt: skip
 
@@ -106,7 +116,7 @@ def _words_of(command: str, action: Any, draw: Draw, dice: random.Random) -> lis
         many = dice.choice((1, 1, 2)) if action.nargs in ("+", "*", "...") else 1
         return [_value(command, action, draw, dice) for _ in range(many)]
     option = action.option_strings[-1]
-    if not (action.required or dice.random() < 0.07) or option in ("--view", "--help") or dice.random() < 0.01:
+    if not (action.required or dice.random() < 0.05) or option in ("--view", "--help") or dice.random() < 0.01:
         return []
     if action.nargs == 0:
         return [option]
@@ -122,13 +132,14 @@ def _value(command: str, action: Any, draw: Draw, dice: random.Random) -> str:
     if action.choices and dice.random() < 0.9:
         return str(dice.choice(list(action.choices)))
     if action.type in (int, float):
-        return dice.choice(NUMBERS)
+        return dice.choice(("1", "2", "3", "0.5") if dice.random() < 0.6 else NUMBERS)
     if "frames" in what:
         return dice.choice(RANGES)
     if "KEY=VALUE" in what:
         return dice.choice(SETTINGS)
     if "," in what or "box" in what:
-        return dice.choice(LISTS)
+        fitting = [text for text in LISTS if text.count(",") == what.count(",")]
+        return dice.choice(fitting if fitting and dice.random() < 0.8 else LISTS)
     if "out" in what.split() or (action.dest == "file" and command in ("export", "distance", "picture", "ground")):
         ending = ENDINGS.get(command, dice.choice(SUFFIXES) if command == "export" else ".svox")
         return f"out{dice.randrange(3)}{dice.choice((*[ending] * 9, *SUFFIXES))}"
@@ -136,8 +147,9 @@ def _value(command: str, action: Any, draw: Draw, dice: random.Random) -> str:
         return f"out{dice.randrange(3)}{action.metavar[4:]}"
     if command == "import" and action.dest == "map":
         return f"out{dice.randrange(3)}.svox"
-    if (action.metavar in ("MAP", "A", "B") or action.dest == "map") and dice.random() < 0.5:
-        return dice.choice(("map.svox", "out0.svox", "out1.svox", "floor.yaml", "cloud.ply"))
+    wanted = {"RECORDING": "SOURCE", "A": "MAP", "B": "MAP", "TRUTH": "MAP"}.get(action.metavar, action.metavar)
+    if wanted in FITTING and dice.random() < 0.6:
+        return dice.choice(FITTING[wanted])
     if any(
         word in what for word in ("SOURCE", "RECORDING", "PATH", "ROBOT", "FILE", "MAP", "FOLDER", "TRUTH", " A", " B")
     ):
@@ -150,5 +162,5 @@ def _place(draw: Draw, dice: random.Random) -> str:
         return dice.choice((*PLACES, *SIMULATIONS))
     if dice.random() < 0.15:
         return f"map{dice.choice(SUFFIXES)}"
-    name = draw("sound" if dice.random() < 0.3 else "")
+    name = draw("sound" if dice.random() < 0.5 else "")
     return f"{name}?{'&'.join(dice.sample(OPTIONS, dice.choice((1, 1, 2))))}" if dice.random() < 0.2 else name

@@ -14,7 +14,6 @@ import os
 import random
 import re
 import resource
-import shutil
 import signal
 import sys
 import tempfile
@@ -60,9 +59,9 @@ class Outcome(NamedTuple):
         parts += [part.replace("-", "_") for part in parts]  # a setting of that name
         parts += [Path(part).stem for part in parts]  # a recording in a file of that name
         parts += os.listdir()  # a message may name a file that an option names, or that lies beside
-        named = any(repr(part[:12])[1:-1] in line for part in parts if part)
+        named = any(part[:12] in line or repr(part[:12])[1:-1] in line for part in parts if part)
         other_file = re.match(r"stereovox: \S+\.\w+: ", line)  # which one of these names
-        return named or other_file is not None or "" in self.words or not self.words
+        return named or other_file is not None or "" in self.words or not self.words or "pip install" in line
 
 
 def main() -> int:
@@ -150,11 +149,6 @@ def attempt(words: Sequence[str], captured: Path) -> Outcome:
 
 def _too_long(*_: Any) -> None:
     raise TooLong
-
-
-def remove(folder: Path) -> None:
-    """Remove a folder, whatever is in it."""
-    shutil.rmtree(folder, ignore_errors=True)
 
 
 if __name__ == "__main__":

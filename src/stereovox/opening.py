@@ -240,7 +240,8 @@ def _problem(where: str, kinds: list[Any]) -> str:
     if os.path.isfile(os.path.join(place, "manifest.json")):
         return f"is a map, not a recording; see what it was made of with: stereovox info {shlex.quote(place)}"
     if not os.path.isdir(place):
-        return _file_problem(place)
+        name = shlex.quote(place) if len(place) <= MAX_SHOWN else "FILE"
+        return file_cure(place) or f"is a file, but no recording that is known; see: stereovox info {name}"
     try:
         below = _below(place)
     except OSError as error:
@@ -264,17 +265,15 @@ def _below(folder: str) -> list[str]:
     return [*inside, *deeper][: 2 * MAX_BELOW]
 
 
-def _file_problem(file: str) -> str:
-    """Say what a file is, and name the cure, by its ending."""
+def file_cure(file: str) -> str:
+    """Say what a file is that is no recording, and name the cure, by its ending; empty where that says nothing."""
     ending = os.path.splitext(file)[1].lower()
-    name = shlex.quote(file) if len(file) <= MAX_SHOWN else "FILE"
     if cure_of(file):
         return cure_of(file)
     if ending in registry.names("import", IMPORTS) and ending not in AMBIGUOUS:
+        name = shlex.quote(file) if len(file) <= MAX_SHOWN else "FILE"
         return f"is a map or cloud, no recording; import it with: stereovox import {name} map.svox"
-    if ending in UNREADABLE:
-        return f"is no recording: {UNREADABLE[ending]}"
-    return f"is a file, but no recording that is known; see: stereovox info {name}"
+    return f"is no recording: {UNREADABLE[ending]}" if ending in UNREADABLE else ""
 
 
 def _missing(folder: str, kinds: list[Any]) -> str:

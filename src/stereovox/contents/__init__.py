@@ -8,6 +8,7 @@ from collections.abc import Callable
 from importlib import import_module
 
 from stereovox.contents.description import Description as Description
+from stereovox.errors import StereovoxError
 
 KINDS = (
     "stereovox.contents.maps:describe_map",
@@ -18,8 +19,10 @@ KINDS = (
     "stereovox.contents.files:describe_calibration",
     "stereovox.contents.files:describe_poses",
     "stereovox.contents.files:describe_image",
+    "stereovox.contents.files:describe_points",
 )
 """Asked in this order; each returns None for what is not of its kind."""
+UNKNOWN = "is of no kind that any command uses; recordings and files that are read: docs/recordings.md, docs/formats.md"
 
 
 def describe(path: str | os.PathLike[str]) -> Description:
@@ -35,7 +38,7 @@ def describe(path: str | os.PathLike[str]) -> Description:
         StereovoxError: There is nothing, or nothing that any command uses: one line that says what it seems to be, what
             is missing, and the cure.
     """
-    from stereovox.opening import open_source
+    from stereovox.opening import file_cure, open_source
 
     text = os.fspath(path)
     for name in KINDS:
@@ -44,5 +47,7 @@ def describe(path: str | os.PathLike[str]) -> Description:
         found = known(text)
         if found is not None:
             return found
+    if os.path.isfile(text):
+        raise StereovoxError(f"{text}: {file_cure(text) or UNKNOWN}")
     open_source(text)  # which says what is missing
     raise AssertionError(f"{text}: a recording that is not described")

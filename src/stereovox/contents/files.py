@@ -16,6 +16,9 @@ from stereovox.sources.rgbd.depth_files import SUFFIXES, depth_size, read_depth
 PICTURE_SUFFIXES = (".jpg", ".jpeg", ".bmp", ".webp", ".ppm", ".pgm")
 IMAGE_SUFFIXES = (*SUFFIXES, *PICTURE_SUFFIXES)
 TEXT_SUFFIXES = (".txt", ".json", ".yaml", ".yml", ".toml", ".ini", ".cfg", ".xml", ".csv", ".log", ".tum", ".freiburg")
+LOOSE = (".txt", ".csv", ".bin", ".npz")
+"""Endings of clouds and cells that are those of many other things too."""
+SEE = "what each may hold: docs/recordings.md, docs/formats.md"
 MAX_TEXT = 1 << 24
 """Largest file in bytes that is tried as poses or a calibration."""
 UNITS = {0.001: "millimetres", 1 / 5000: "1/5000 m (TUM)"}
@@ -26,12 +29,27 @@ def describe_cloud(path: str) -> Description | None:
 
     Raises MapFileError for a damaged one.
     """
-    from stereovox.formats import CLOUDS, import_map
+    from stereovox.formats import CLOUDS
 
     ending = Path(path).suffix.lower()
-    known = {*CLOUDS, ".bt", ".ot", ".graph", ".npz"} - {".txt", ".csv", ".bin", ".npz"}
-    if not os.path.isfile(path) or ending not in known:
+    known = {*CLOUDS, ".bt", ".ot", ".graph"} - set(LOOSE)
+    return _cloud(path) if os.path.isfile(path) and ending in known else None
+
+
+def describe_points(path: str) -> Description | None:
+    """Describe a file that may hold anything and does hold points or cells; None for anything else."""
+    if not os.path.isfile(path) or Path(path).suffix.lower() not in LOOSE:
         return None
+    try:
+        return _cloud(path)
+    except StereovoxError:
+        raise SourceError(f"{path}: holds no poses, calibration, image or points that can be read; {SEE}") from None
+
+
+def _cloud(path: str) -> Description:
+    """Describe what an import of the file gives; raises MapFileError."""
+    from stereovox.formats import import_map
+
     out = f"{Path(path).stem}.svox"
     voxel_map = import_map(path)
     counts, bounds = voxel_map.counts(), voxel_map.bounds()

@@ -203,14 +203,15 @@ def _unit_line(middle: float, whole: bool) -> str:
 
 
 def _picture(path: str, refused: str) -> Description:
-    """Describe a picture that was refused as a depth image; raises SourceError with that reason where it is none."""
+    """Describe a picture that was refused as a depth image; raises SourceError where it is none."""
     from PIL import Image, UnidentifiedImageError
 
     try:
         with Image.open(path) as image:
             width, height, mode = *image.size, image.mode
     except (UnidentifiedImageError, OSError, ValueError, Image.DecompressionBombError):
-        raise SourceError(refused) from None
+        known = Path(path).suffix.lower() in SUFFIXES  # as depth, so that the reason is about what is in it
+        raise SourceError(refused if known else f"{path}: is no image that can be read; copy it again") from None
     kind = {"L": "8-bit grey", "RGB": "colour", "RGBA": "colour"}.get(mode, mode)
     lines = [
         f"a {kind} picture of {width}x{height}: no depth, so it makes no map by itself",

@@ -54,13 +54,16 @@ MAX_CHANGED = 200_000
 """Bytes of the largest file that is damaged."""
 COPIES = 40
 """Damaged copies of the sound files, each time the files are made anew."""
-STRANGE = ("a name with spaces", "what?depth_scale=1&x", "R&D [old] (2)", "naïve-поза-🗺", "-minus", "new\nline", "%s{0}",
-           "'quoted' \"twice\"", "x" * 200, "non-utf8-\udcff\udcfe", "\x1b[31mred", "a=b,c;d", ".hidden")  # fmt: skip
-CONTENTS = (b"", b"\0" * 100, b"\xff" * 3000, b"hello\n", b"{}", b"[]", b"{" * 5000, b"\x89PNG\r\n\x1a\n", b"ply\n",
-            b"1 2 3\n" * 50, b"nan nan nan\n" * 9, b"#ROSBAG V2.0\n", b"SQLite format 3\0", b"\x89MCAP0\r\n")  # fmt: skip
-SUFFIXES = ("", ".txt", ".ply", ".pcd", ".png", ".pgm", ".npy", ".npz", ".bag", ".db3", ".db", ".mcap", ".toml",
-            ".yaml", ".json", ".svox", ".bt", ".ot", ".clf", ".log", ".sens", ".klg", ".raw", ".las", ".xyz", ".graph",
-            ".exr", ".tiff", ".tum", ".csv", ".obj", ".vdb", ".gz", ".log.bz2")  # fmt: skip
+STRANGE = ("a name with spaces", "what?depth_scale=1&x", "R&D [old] (2)", "naïve-поза-🗺", "-minus",
+           "new\nline", "%s{0}", "'quoted' \"twice\"", "x" * 200, "non-utf8-\udcff\udcfe",
+           "\x1b[31mred", "a=b,c;d", ".hidden")  # fmt: skip
+CONTENTS = (b"", b"\0" * 100, b"\xff" * 3000, b"hello\n", b"{}", b"[]", b"{" * 5000,
+            b"\x89PNG\r\n\x1a\n", b"ply\n", b"1 2 3\n" * 50, b"nan nan nan\n" * 9, b"#ROSBAG V2.0\n",
+            b"SQLite format 3\0", b"\x89MCAP0\r\n")  # fmt: skip
+SUFFIXES = ("", ".txt", ".ply", ".pcd", ".png", ".pgm", ".npy", ".npz", ".bag", ".db3", ".db", ".mcap",
+            ".toml", ".yaml", ".json", ".svox", ".bt", ".ot", ".clf", ".log", ".sens", ".klg", ".raw",
+            ".las", ".xyz", ".graph", ".exr", ".tiff", ".tum", ".csv", ".obj", ".vdb", ".gz",
+            ".log.bz2")  # fmt: skip
 
 
 class Files:
@@ -180,7 +183,8 @@ def _text(text: str | bytes) -> Callable[[Path], object]:
 
 
 MAKERS: dict[str, Callable[[Path], object]] = {
-    "7scenes": seven_scenes, "tum": _tum, "icl": test_icl_nuim.icl, "sun3d": lambda folder: _made(test_sun3d.sun3d, folder),
+    "7scenes": seven_scenes, "tum": _tum, "icl": test_icl_nuim.icl,
+    "sun3d": lambda folder: _made(test_sun3d.sun3d, folder),
     "rig": recorded, "asl": lambda folder: asl(folder), "kitti_raw": lambda folder: raw(folder),
     "kitti_tracking": lambda folder: tracking(folder), "kitti_odometry": lambda folder: odometry(folder),
     "kitti2015": lambda folder: stereo2015(folder), "rtabmap.db": test_rtabmap_db.database,

@@ -17,7 +17,8 @@ WEIGHTS = {"info": 8, "map": 8, "import": 5, "calibrate": 3, "picture": 3, "expo
 SLOW = ("demo", "bench", "reproduce", "ros2", "view")
 """Commands that run for long, or until they are stopped, where nothing is wrong: each call gets a wrong word."""
 SIMULATIONS = ("sim:nothing", "sim:", "realsense:", "sim:room?noise=x", "sim:room?seed=1&fx=0")
-NUMBERS = ("0", "1", "-1", "0.05", "0.5", "3", "nan", "inf", "-inf", "1e308", "1e-320", "1e-9", "x", "", "٣", "1_0")
+NUMBERS = ("0", "1", "-1", "0.05", "0.5", "3", "nan", "inf", "-inf", "1e308", "1e-320", "1e-9", "x", "",
+           "٣", "1_0")  # fmt: skip
 LISTS = (
     "0,0,0",
     "1,2,3",
@@ -30,7 +31,8 @@ LISTS = (
     "0.5,0.5,90",
     "1,2,3,4",
 )
-RANGES = (":2", "::2", "1:", "0:0", "5:1", "-2:", "::0", "a:b", "1:2:3:4", "9999999999999999999:", "::-1", "7")
+RANGES = (":2", "::2", "1:", "0:0", "5:1", "-2:", "::0", "a:b", "1:2:3:4", "9999999999999999999:",
+          "::-1", "7")  # fmt: skip
 WORDS = (
     "z",
     "-y",
@@ -48,19 +50,24 @@ WORDS = (
     "1:0",
     "/topic",
 )
-SETTINGS = ("voxel_size=0.1", "voxel_size=nan", "up=-y", "up=w", "sensor.model=andert", "sensor.model=", "max_range=-1",
-            "max_range=1e9", "steps=[0.1]", "steps=x", "window.size=[1,2]", "a.b.c=1", "=", "x", "map.cell=int8",
-            "map.memory_mb=1", "threads=99999999", "prior=2", "up_direction=[0,0,0]", "sensor=1")  # fmt: skip
-OPTIONS = ("depth_scale=1000", "depth_scale=0", "depth_scale=x", "depth_scale=inf", "depth_scale=1e-300", "fps=15",
-           "fps=nan", "fps=1e300", "poses=poses.txt", "poses=gone", "poses=", "poses=../tum/groundtruth.txt", "axes=ros",
-           "axes=opengl", "axes=left", "invert=1", "invert=maybe", "camera=camera.toml", "camera=floor.yaml", "x=1", "",
-           "=", "&&", "depth_scale", "poses=/dev/zero", "unit=3", "topic=/a", "stride=0")  # fmt: skip
-PLACES = ("gone", "/dev/null", "/dev/zero", "", ".", "empty/pipe", "/proc/self/mem", "gone/deep/er", "~", "x" * 300,
-          "d/" * 600, "http://example.com/a.bag", "-", "-h", "--", "con\nfused", "a?b?c")  # fmt: skip
+SETTINGS = ("voxel_size=0.1", "voxel_size=nan", "up=-y", "up=w", "sensor.model=andert", "sensor.model=",
+            "max_range=-1", "max_range=1e9", "steps=[0.1]", "steps=x", "window.size=[1,2]", "a.b.c=1",
+            "=", "x", "map.cell=int8", "map.memory_mb=1", "threads=99999999", "prior=2",
+            "up_direction=[0,0,0]", "sensor=1")  # fmt: skip
+OPTIONS = ("depth_scale=1000", "depth_scale=0", "depth_scale=x", "depth_scale=inf",
+           "depth_scale=1e-300", "fps=15", "fps=nan", "fps=1e300", "poses=poses.txt", "poses=gone",
+           "poses=", "poses=../tum/groundtruth.txt", "axes=ros", "poses_scale=0.001", "poses_scale=-1",
+           "axes=opengl", "axes=left", "invert=1", "invert=maybe", "camera=camera.toml",
+           "camera=floor.yaml", "x=1", "", "=", "&&", "depth_scale", "poses=/dev/zero", "unit=3",
+           "topic=/a", "stride=0")  # fmt: skip
+PLACES = ("gone", "/dev/null", "/dev/zero", "", ".", "empty/pipe", "/proc/self/mem", "gone/deep/er",
+          "~", "x" * 300, "d/" * 600, "http://example.com/a.bag", "-", "-h", "--", "con\nfused",
+          "a?b?c")  # fmt: skip
 ENDINGS = {"localize": ".tum", "slam": ".yaml", "grid": ".yaml", "ground": ".yaml", "calibrate": ".toml",
            "simulate": ".mcap", "distance": ".npz", "picture": ".png"}  # fmt: skip
 """Ending of what a command writes, where it is not a map."""
-SUFFIXES = (".svox", ".ply", ".pcd", ".bt", ".npz", ".png", ".yaml", ".toml", ".bag", ".tum", ".rrd", ".glb", ".gz", "")
+SUFFIXES = (".svox", ".ply", ".pcd", ".bt", ".npz", ".png", ".yaml", ".toml", ".bag", ".tum", ".rrd",
+            ".glb", ".gz", "")  # fmt: skip
 
 
 def call(draw: Draw, dice: random.Random) -> list[str]:

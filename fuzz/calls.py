@@ -12,6 +12,7 @@ import argparse
 import json
 import os
 import random
+import re
 import resource
 import shutil
 import signal
@@ -55,10 +56,13 @@ class Outcome(NamedTuple):
         return "" if self._is_named(errors[0]) else "names nothing of the call"
 
     def _is_named(self, line: str) -> bool:
-        parts = [part for word in self.words for part in word.replace("=", "/").replace("?", "/").split("/")]
+        parts = [part for word in self.words for part in (word, *re.split(r"[=?/,]", word.strip("-")))]
         parts += [part.replace("-", "_") for part in parts]  # a setting of that name
+        parts += [Path(part).stem for part in parts]  # a recording in a file of that name
         parts += os.listdir()  # a message may name a file that an option names, or that lies beside
-        return any(repr(part[:12])[1:-1] in line for part in parts if part) or "" in self.words
+        named = any(repr(part[:12])[1:-1] in line for part in parts if part)
+        other_file = re.match(r"stereovox: \S+\.\w+: ", line)  # which one of these names
+        return named or other_file is not None or "" in self.words or not self.words
 
 
 def main() -> int:
@@ -97,8 +101,8 @@ def run(folder: Path, arguments: argparse.Namespace) -> tuple[dict[str, Counter[
         words = call(files.names(dice), dice)
         outcome = attempt(words, folder / "printed")
         counts["status"][str(outcome.status)] += 1
-        counts["command"][words[0]] += 1
-        counts["done"][words[0]] += outcome.status == 0
+        counts["command"]["".join(words[:1])] += 1
+        counts["done"]["".join(words[:1])] += outcome.status == 0
         problem = outcome.problem()
         last = (outcome.printed.splitlines() or [""])[-1]
         if arguments.show or outcome.seconds > MAX_SECONDS / 3:

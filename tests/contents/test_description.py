@@ -5,8 +5,10 @@ import json
 
 import numpy as np
 import pytest
+from made_depth import camera_text, matrix_line, posed, render, units, write
 
 import stereovox as sv
+from stereovox.cli import main
 from stereovox.contents.description import many, metres
 from stereovox.survey import Up
 
@@ -63,3 +65,30 @@ def test_facts_are_plain_numbers():
     """A NumPy bool in them ended `info --json` in a traceback."""
     found = sv.describe("sim:box?image_width=160")
     assert json.loads(json.dumps(found.facts))["up_sure"] is True
+
+
+def test_a_file_of_no_kind_is_not_sent_in_a_circle(tmp_path, capsys):
+    (tmp_path / "notes.xyzzy").write_text("nothing here can read this")
+    assert main(["info", str(tmp_path / "notes.xyzzy")]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "is of no known kind" in line
+    assert "stereovox info" not in line
+
+
+@pytest.mark.parametrize("command", ["info", "map", "picture"])
+def test_a_link_to_itself_is_one_line(tmp_path, capsys, command):
+    (tmp_path / "loop").symlink_to("loop")
+    assert main([command, f"{tmp_path / 'loop'}?fps=5"]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "loop" in line
+
+
+def test_what_a_quick_look_found_goes_into_json(tmp_path, capsys):
+    folder = tmp_path / "walk"
+    for k, T in enumerate(posed()):
+        write(folder / f"depth/{k}.png", units(render(T), 1000))
+    (folder / "camera-intrinsics.txt").write_text(camera_text())
+    (folder / "poses.txt").write_text("".join(map(matrix_line, posed())))
+    assert main(["info", str(folder), "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["unit"], found["unit_sure"], found["up"], found["up_sure"]) == ("millimetres", True, "z", True)

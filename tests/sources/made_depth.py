@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from stereovox.simulate.scene import Scene, box
-from stereovox.sources.rgbd.folder import MIRROR_CAMERA, MIRROR_WORLD
+from stereovox.sources.rgbd.pose_files import MIRROR_CAMERA, MIRROR_WORLD
 
 SMALL, VGA = (64, 48), (640, 480)
 K = (52.0, 51.0, 31.0, 24.0)

@@ -154,6 +154,9 @@ def _check_command(words: Sequence[str]) -> None:
     if words and words[0].startswith("-") and words[0] not in GLOBAL_OPTIONS:
         option, command = words[0].partition("=")[0], next((word for word in words if word in COMMANDS), "COMMAND")
         raise StereovoxError(f"'{option}' stands before the command; write it after: stereovox {command} ... {option}")
+    empty = next((word for word in words if word.startswith("--") and word.endswith("=--")), None)
+    if empty is not None:  # argparse takes the value for the end of all options
+        raise StereovoxError(f"'{empty}': '--' is no value; give another")
     if words and not words[0].startswith("-") and words[0] not in COMMANDS:
         raise StereovoxError(f"unknown command '{words[0]}'{did_you_mean(words[0], COMMANDS)}; see: stereovox --help")
 

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from importlib import import_module
 
 from stereovox.contents.description import Description as Description
-from stereovox.errors import StereovoxError
+from stereovox.errors import SourceError, shortened
 
 KINDS = (
     "stereovox.contents.maps:describe_map",
@@ -22,7 +22,7 @@ KINDS = (
     "stereovox.contents.files:describe_points",
 )
 """Asked in this order; each returns None for what is not of its kind."""
-UNKNOWN = "is of no kind that any command uses; recordings and files that are read: docs/recordings.md, docs/formats.md"
+UNKNOWN = "is of no known kind, by name or content; what can be read: docs/recordings.md and docs/formats.md"
 
 
 def describe(path: str | os.PathLike[str]) -> Description:
@@ -48,6 +48,6 @@ def describe(path: str | os.PathLike[str]) -> Description:
         if found is not None:
             return found
     if os.path.isfile(text):
-        raise StereovoxError(f"{text}: {file_cure(text) or UNKNOWN}")
+        raise SourceError(f"{shortened(text)}: {file_cure(text) or UNKNOWN}")
     open_source(text)  # which says what is missing
     raise AssertionError(f"{text}: a recording that is not described")

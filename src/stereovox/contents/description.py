@@ -67,12 +67,12 @@ def map_name(source: str, ending: str = ".svox") -> str:
     kind, colon, rest = place.partition(":")
     if colon and not os.path.exists(place):
         return f"{rest or kind}{ending}"
-    name = Path(place).resolve().name
+    name = os.path.basename(os.path.realpath(place))  # which bears loops of links
     packed = name.lower().endswith((".bz2", ".gz"))
     return f"{Path(Path(name).stem if packed else name).stem or 'map'}{ending}"
 
 
 def picture_name(path: str) -> str:
     """Return the usual name of the picture of a map; the image of a floor's map may have the shorter name."""
-    place = Path(path).resolve()
+    place = Path(os.path.realpath(path))
     return f"{place.stem}{'-picture' if place.suffix.lower() in FLOOR_READABLE else ''}.png"

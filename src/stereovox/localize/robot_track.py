@@ -37,7 +37,12 @@ def slam_robot(robot: Robot, config: Config, progress: Progress = no_progress) -
         raise MissingExtra("gtsam", "slam")  # not after an hour, when the first loop is found
     if not len(robot.scans):
         raise StereovoxError(f"{robot.name}: holds no lidar scans to make a map of; give a bag with a LaserScan topic")
-    return map_scans(robot.scans, config, progress)
+    try:
+        return map_scans(robot.scans, config, progress)
+    except MissingExtra:
+        raise
+    except StereovoxError as error:
+        raise StereovoxError(f"{robot.name}: {error}") from None
 
 
 def localise_robot(

@@ -96,8 +96,7 @@ class Subscriptions:
         kind = optional_message("tf2_msgs", "TFMessage")
         if kind is None and not other_poses:
             raise StereovoxError(
-                f"no poses: tf2_msgs is not installed, so /tf cannot be heard. {TF2_MSGS}, or give --odometry TOPIC or "
-                "--pose TOPIC=FRAME (ros.odometry, ros.pose)"
+                f"no poses: tf2_msgs is not installed, so /tf cannot be heard. {TF2_MSGS}, or give --odometry or --pose"
             )
         if kind is None:
             self._node.get_logger().warning(

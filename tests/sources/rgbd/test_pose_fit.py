@@ -3,7 +3,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from made_depth import camera_text, check, matrix_line, posed, render, units, write
+from made_depth import camera_text, check, left_handed, matrix_line, posed, render, units, write
 
 from stereovox.errors import SourceError
 from stereovox.opening import open_source
@@ -104,3 +104,20 @@ def test_millimetres_everywhere_are_not_taken_for_metres(tmp_path):
 def test_a_scale_of_no_use_is_one_line(tmp_path, text):
     with pytest.raises(SourceError, match="poses_scale"):
         open_source(f"{recording(tmp_path, posed(6))}?poses_scale={text}")
+
+
+def test_poses_of_a_left_handed_world_need_a_negative_fy(tmp_path):
+    nodding = [T @ turned_down(0.15 * k) for k, T in enumerate(posed(6))]
+    folder = recording(tmp_path, [left_handed(T) for T in nodding], nodding)
+    (note,) = fit_notes(open_source(folder))
+    assert "fy below 0" in note
+    (folder / "camera-intrinsics.txt").write_text(camera_text((52.0, -51.0, 31.0, 24.0)))
+    source = open_source(folder)
+    check(source, nodding, 1000)
+    assert (source.unit.sure, fit_notes(source)) == (True, [])
+
+
+def turned_down(angle):
+    T = np.eye(4)
+    T[1:3, 1:3] = [[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]]
+    return T

@@ -26,15 +26,12 @@ from stereovox.sources.intrinsics import NAMES, metres_per_unit
 from stereovox.sources.poses import Poses
 from stereovox.sources.rgbd.depth_files import SUFFIXES, Depth, common_depth_size, read_depth
 from stereovox.sources.rgbd.depth_unit import DepthUnit, find_unit, pairs_of, unit_words
-from stereovox.sources.rgbd.pose_files import ImagePoses, image_numbers, in_order, number_in, read_poses
+from stereovox.sources.rgbd.pose_files import ImagePoses, image_numbers, in_order, in_other_hand, number_in, read_poses
 from stereovox.sources.rgbd.pose_fit import Images, Reading, misfit
 from stereovox.sources.tracker import AXES
 from stereovox.sources.trajectory import ns_from_seconds
 
 SECOND = 1_000_000_000
-MIRROR_CAMERA, MIRROR_WORLD = np.diag([1.0, -1, 1, 1]), np.diag([1.0, 1, -1, 1])
-"""Turn the poses of a camera whose second axis points up, a left-handed frame, into rigid ones of optical axes: the
-image is right as it is, so the world is mirrored, along its third axis."""
 
 
 class ImageFile(NamedTuple):
@@ -194,7 +191,7 @@ class DepthFolder(DepthSource, ABC):
     def _pose_as_written(self, i: int) -> Transform:
         """Return the pose of frame `i` in a right-handed world; raises FrameRefused where there is none."""
         T = self.pose_in_file(i)
-        return MIRROR_WORLD @ T @ MIRROR_CAMERA if self._mirrored else T
+        return in_other_hand(T) if self._mirrored else T
 
     def camera_of(self, i: int) -> PinholeCamera:
         """Return the camera of frame `i` (0 to len - 1); a layout may have one for each image, of the same size."""

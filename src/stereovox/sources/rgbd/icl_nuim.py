@@ -2,7 +2,7 @@
 """Renderings of ICL-NUIM (living room, office), as SLAMBench and TUM's tools use them.
 
 Their camera is left-handed: x right, y up, z forward, so its fy is negative (481.2 -480 319.5 239.5), and so is their
-world. Both are mirrored here (see `folder.MIRROR_WORLD`), so the room comes out as its images show it.
+world. Both are mirrored here (see `in_other_hand`), so the room comes out as its images show it.
 """
 
 from __future__ import annotations

@@ -34,6 +34,8 @@ from stereovox.sources.tracker import AXES
 from stereovox.sources.trajectory import Trajectory
 
 FORMS = "TUM lines 'stamp tx ty tz qx qy qz qw', KITTI's 12 numbers a line, 4x4 matrices, or Open3D's .log"
+MIRROR_CAMERA, MIRROR_WORLD = np.diag([1.0, -1, 1, 1]), np.diag([1.0, 1, -1, 1])
+"""What turns left-handed poses into right-handed ones, see `in_other_hand`."""
 SECOND = 1_000_000_000
 MAX_NUMBER = 10_000_000
 """Whole stamps in seconds below this may be numbers of images; times since 1970 are larger."""
@@ -132,6 +134,13 @@ def in_optical_axes(T: Transform, axes: str, inverted: bool) -> Transform:
     C = np.eye(4)
     C[:3, :3] = AXES[axes].T
     return (inverse(T) if inverted else T) @ C
+
+
+def in_other_hand(T: Transform) -> Transform:
+    """Return the pose (4, 4) of a camera whose second axis points up, a left-handed frame, as a rigid one of optical
+    axes. The image is right as it is, so the world is mirrored, along its third axis.
+    """
+    return MIRROR_WORLD @ T @ MIRROR_CAMERA
 
 
 def number_in(name: str) -> tuple[int, str]:

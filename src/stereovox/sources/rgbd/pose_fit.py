@@ -18,7 +18,7 @@ from stereovox.errors import FrameRefused
 from stereovox.se3 import Transform, inverse
 from stereovox.sources.rgbd.depth_files import Depth
 from stereovox.sources.rgbd.depth_unit import View, difference, find_unit, is_likely, pairs_of
-from stereovox.sources.rgbd.pose_files import in_optical_axes
+from stereovox.sources.rgbd.pose_files import in_optical_axes, in_other_hand
 from stereovox.sources.tracker import AXES
 
 POSE_SCALES = (1.0, 0.001, 0.01)
@@ -66,18 +66,22 @@ class Reading(NamedTuple):
 class Images(NamedTuple):
     """The images of a recording.
 
-    count: their number. pose: pose (4, 4) by number as it is in the file; read: image by number; both may raise
+    number: how many there are. pose: pose (4, 4) by number as it is in the file; read: image by number; both may raise
     FrameRefused. camera: the camera of all.
     """
 
-    count: int
+    number: int
     pose: Callable[[int], Transform]
     read: Callable[[int], Depth]
     camera: PinholeCamera
 
     def pairs(self, reading: Reading) -> list[tuple[View, View]]:
         """Return pairs of images at their poses, see `pairs_of`."""
-        return pairs_of(self.count, lambda i: reading.pose(self.pose(i)), self.read)
+        return pairs_of(self.number, lambda i: reading.pose(self.pose(i)), self.read)
+
+    def mirrored(self) -> Images:
+        """Return the same with poses of a camera whose y points up, in a left-handed world (or the other way round)."""
+        return self._replace(pose=lambda i: in_other_hand(self.pose(i)))
 
 
 class Agreement(NamedTuple):
@@ -119,6 +123,10 @@ def misfit(images: Images, unit: float, expected: float, now: Reading) -> str:
         if found.share > max(as_it_is.share, BETTER * same.share) and same.median > CLOSER * found.median:
             options = [now.options(reading), "" if scale == expected else f"depth_scale={1 / scale:g}"]
             return f"{words}; try ?{'&'.join(filter(None, options))}, with which {100 * found.share:.0f} % agree"
+    mirrored = _best(images.camera, [(now, expected, images.mirrored().pairs(now))])
+    if mirrored is not None and mirrored[2].share > max(as_it_is.share, BETTER * usual.share):
+        share = f"{100 * mirrored[2].share:.0f} %"
+        return f"{words}; try a camera file with fy below 0, for poses of a left-handed world, with which {share} agree"
     if as_it_is.median > FAR_OFF and as_it_is.share < FEW and as_it_is.seen > SEEN_TWICE:
         return f"{words}; check that poses, camera and depth unit belong to these images"
     return ""
@@ -167,7 +175,7 @@ def _best(
 
 def _standing(images: Images, unit: float, now: Reading) -> str:
     """Say that poses stand still while the images change; empty where they do not."""
-    last = images.count - 1
+    last = images.number - 1
     try:
         first, *others = [View(images.read(i), now.pose(images.pose(i))) for i in sorted({0, last // 2, last})]
     except FrameRefused:

@@ -170,15 +170,8 @@ def describe_image(path: str) -> Description | None:
     except MissingExtra:
         raise
     except FrameRefused as refused:
-        if refused.reason == "bad_dtype" or Path(path).suffix.lower() in (
-            ".jpg",
-            ".jpeg",
-            ".bmp",
-            ".webp",
-            ".ppm",
-            ".pgm",
-        ):
-            return _picture(path)
+        if refused.reason == "bad_dtype" or Path(path).suffix.lower() in PICTURE_SUFFIXES:
+            return _picture(path, str(refused))
         raise
     valid = depth[np.isfinite(depth) & (depth > 0)]
     if depth.dtype == np.uint16:
@@ -209,14 +202,16 @@ def _unit_line(middle: float, whole: bool) -> str:
     return f"the unit may be {' or '.join(fitting)}" if fitting else "the unit is none of the usual ones"
 
 
-def _picture(path: str) -> Description:
+def _picture(path: str, refused: str) -> Description:
+    """Describe a picture that was refused as a depth image; raises SourceError where it is none."""
     from PIL import Image, UnidentifiedImageError
 
     try:
         with Image.open(path) as image:
             width, height, mode = *image.size, image.mode
     except (UnidentifiedImageError, OSError, ValueError, Image.DecompressionBombError):
-        raise SourceError(f"{path}: is no image that can be read; copy it again") from None
+        known = Path(path).suffix.lower() in SUFFIXES  # as depth, so that the reason is about what is in it
+        raise SourceError(refused if known else f"{path}: is no image that can be read; copy it again") from None
     kind = {"L": "8-bit grey", "RGB": "colour", "RGBA": "colour"}.get(mode, mode)
     lines = [
         f"a {kind} picture of {width}x{height}: no depth, so it makes no map by itself",

@@ -240,6 +240,8 @@ def _problem(where: str, kinds: list[Any]) -> str:
     if os.path.isfile(os.path.join(place, "manifest.json")):
         return f"is a map, not a recording; see what it was made of with: stereovox info {shlex.quote(place)}"
     if not os.path.isdir(place):
+        if not os.path.isfile(place):  # a pipe or a device, which may never end
+            return "is neither a file nor a folder; copy what it gives into a file"
         name = shlex.quote(place) if len(place) <= MAX_SHOWN else "FILE"
         return file_cure(place) or f"is a file, but no recording that is known; see: stereovox info {name}"
     try:

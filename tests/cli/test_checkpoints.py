@@ -244,7 +244,7 @@ def test_the_end_tells_what_was_refused_and_when_frames_were_believed_again(tmp_
 @pytest.mark.parametrize("resume", [False, True])
 def test_a_second_writer_is_refused_before_any_work(tmp_path, monkeypatch, capsys, resume):
     assert mapped(tmp_path / "m", "--frames", ":2") == 0
-    monkeypatch.setattr(run.MapRun, "_open_source", lambda _: pytest.fail("worked"))
+    monkeypatch.setattr(run.MapRun, "_prepare", lambda *_: pytest.fail("worked"))
     refused = []
 
     def second():

@@ -110,11 +110,11 @@ def test_a_query_that_does_not_end(tmp_path, monkeypatch):
     path = database(tmp_path)
     file = Db3File(path)
     assert file.stamps("/camera/depth/image").size == 2
-    rows = file._rows("WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n LIMIT 9) SELECT i FROM n")
+    rows = file._file.rows("WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n LIMIT 9) SELECT i FROM n")
     assert len(rows) == 9
     with pytest.raises(sqlite3.OperationalError, match="interrupted"):
-        file._rows("WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) SELECT count(*) FROM n")
-    assert len(file._rows("SELECT 1")) == 1  # patience begins anew
+        file._file.rows("WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n) SELECT count(*) FROM n")
+    assert len(file._file.rows("SELECT 1")) == 1  # patience begins anew
 
 
 def test_a_scan_of_absurdly_many_beams():

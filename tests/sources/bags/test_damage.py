@@ -328,7 +328,7 @@ def test_a_topic_without_a_number_is_none(tmp_path):
 
 def test_a_named_pipe_is_not_waited_for(tmp_path):
     os.mkfifo(tmp_path / "walk.db3")
-    with pytest.raises(SourceError, match="no recording that is known"):
+    with pytest.raises(SourceError, match="is neither a file nor a folder"):
         open_source(tmp_path / "walk.db3")
 
 

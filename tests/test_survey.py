@@ -90,6 +90,14 @@ def test_a_camera_that_looks_straight_down_does_not_take_its_way_for_up(tmp_path
     assert any("which way is up is not certain" in line for line in lines)
 
 
+def test_a_camera_held_on_its_side_does_not_take_walls_for_floors(tmp_path):
+    aside = np.eye(4)
+    aside[:3, :3] = rotation_matrix([0, 0, np.pi / 2])  # about the optical axis
+    found = survey(recording(tmp_path, poses=[T @ aside for T in posed(8)]))
+    assert degrees(found.up.direction, (0, 0, 1)) > 80
+    assert not found.up.sure
+
+
 def test_a_camera_that_was_turned_over_says_nothing_about_up(tmp_path):
     upright, over = looking((1, 0, 0), (0, 0, 1)), looking((1, 0, 0), (0, 0, -1))
     found = survey(recording(tmp_path, poses=[*upright, *over]))

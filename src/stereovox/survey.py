@@ -4,8 +4,9 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.frame import AnyFrame, Frame, StereoFrame
 from stereovox.products.floor_axes import nearest_axis, upright_axes
-from stereovox.se3 import rigidity_error
+from stereovox.se3 import rigidity_error, rotation_vector
 from stereovox.sources.base import Source
 
 RIGID = 0.05
@@ -39,6 +40,8 @@ LEVEL, UPRIGHT = np.radians(15.0), np.radians(40.0)
 """A surface counts as horizontal within the first angle; an axis points up within the second."""
 STEADY = 0.75
 """Length of the mean of the cameras' own up directions; less means that the camera was turned over."""
+TURNED, UPRIGHT_SHARE = 0.5, 0.4
+"""Radians that a camera must turn for its turns to say something, and the share that is about the vertical then."""
 HORIZONTAL_SHARE = 0.06
 """Share of the surface that must be horizontal (floor, tables, ceiling) to confirm which way is up."""
 
@@ -252,9 +255,22 @@ def find_up(source: Any, frames: list[AnyFrame]) -> Up:
     off = float(np.arccos(np.clip(direction @ upright_axes(axis)[2], -1, 1)))
     if not len(normals):  # the mean attitude alone is good for the axis, not for the angle
         return Up(axis, upright_axes(axis)[2], 0.0, bool(off < UPRIGHT), "by how the camera was held")
+    if _turns_level(frames, direction):
+        return Up(axis, direction, off, False, "the camera hardly turned about what is up in its images")
     sure = bool(share >= HORIZONTAL_SHARE and off < UPRIGHT)
     why = f"by how the camera was held; {100 * share:.0f} % of what it saw is level"
     return Up(axis, direction, off, sure, why)
+
+
+def _turns_level(frames: Sequence[AnyFrame], up: NDArray[np.float64]) -> bool:
+    """Return whether a camera turned mostly about axes that are level if `up` (3,) is right.
+
+    People and robots look round about the vertical: then it was held on its side.
+    """
+    R = [frame.T_world_sensor[:3, :3] for frame in frames]
+    turns = np.array([before @ rotation_vector(before.T @ after) for before, after in pairwise(R)]).reshape(-1, 3)
+    whole = float(np.linalg.norm(turns, axis=1).sum())
+    return whole > TURNED and float(np.abs(turns @ up).sum()) < UPRIGHT_SHARE * whole
 
 
 def suggest_range(depths: NDArray[np.float64], camera: PinholeCamera, stereo: bool) -> Suggestion:

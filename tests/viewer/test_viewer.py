@@ -259,9 +259,15 @@ def test_the_first_look_is_from_behind_and_above(up):
     voxel_map = box_map(up)
     look_from, look_at = first_look(voxel_map, up)
     away = look_from - look_at
-    assert away @ up_vector(up) > 0.3
+    assert away @ up_vector(voxel_map, up) > 0.3
     if up[-1] != "x":  # there the camera looks straight up or down
         assert away @ LOOKS_ALONG_X[:3, 2] < -0.3
+
+
+def test_a_map_whose_up_lies_between_the_axes_is_shown_upright():
+    tilted = VoxelMap(load_config(voxel_size=0.1, up="-y", up_direction=(0.0, -0.8, -0.6)))
+    assert up_vector(tilted, "-y").tolist() == [0.0, -0.8, -0.6]
+    assert up_vector(tilted, "z").tolist() == [0.0, 0.0, 1.0]  # the user said otherwise
 
 
 def test_statistics_count_what_is_there():

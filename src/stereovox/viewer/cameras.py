@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from stereovox.frame import Viewpoint
 from stereovox.maps import State, VoxelMap
 from stereovox.products.floor_axes import upright_axes
-from stereovox.view.drawn import UPS
+from stereovox.view.drawn import UPS, checked_up
 from stereovox.view.panels import PATH_COLOUR
 from stereovox.view.space import ABOVE_DEG, BEHIND_DEG
 from stereovox.view.viewpoint import field_of_view
@@ -116,7 +116,7 @@ def first_look(voxel_map: VoxelMap, up: str) -> tuple[NDArray[np.float64], NDArr
     if not len(centres):
         return np.array([3.0, 3.0, 3.0]), np.zeros(3)
     low, high = np.percentile(centres, [0.5, 99.5], axis=0)
-    upwards = up_vector(up)
+    upwards = up_vector(voxel_map, up)
     back = -np.eye(3)[UPS[up][1]]
     if voxel_map.viewpoint is not None:
         T = voxel_map.viewpoint.T_world_camera
@@ -130,8 +130,11 @@ def first_look(voxel_map: VoxelMap, up: str) -> tuple[NDArray[np.float64], NDArr
     return look_at + distance * (np.cos(above) * level + np.sin(above) * upwards), look_at
 
 
-def up_vector(up: str) -> NDArray[np.float64]:
-    """Return the unit vector (3,) of an axis name such as `z` or `-y`."""
+def up_vector(voxel_map: VoxelMap, up: str) -> NDArray[np.float64]:
+    """Return the unit vector (3,) that points up: the map's own where it is nearest to the axis `up`, else the axis."""
+    config = voxel_map.config
+    if config.up_direction is not None and checked_up(config.up) == up:
+        return np.array(config.up_direction)
     return upright_axes(up)[2]
 
 

@@ -67,7 +67,7 @@ class Viewer:
         self.url, self.server = url, server
         self._name, self._map, self._up = name, voxel_map, up
         _dress(server)
-        server.scene.set_up_direction(as_tuple(up_vector(up)))
+        server.scene.set_up_direction(as_tuple(up_vector(voxel_map, up)))
         _light(server, up)
         self._eye, self._middle, self._distance = np.zeros(3), np.zeros(3), 0.0
         self.follow()

@@ -126,6 +126,8 @@ class DepthFolder(DepthSource, ABC):
     def __init__(self, where: str | os.PathLike[str], posed: bool = True):
         self.folder, self.options = folder_options(where)
         self.name = self.folder.resolve().name
+        if self.options.poses or self.options.axes or self.options.invert:
+            self.up = None  # what the layout says is about its own poses
         self.axes, self.fps = self.options.axes or self.axes, self.options.fps or self.fps
         self._reading = Reading(self.axes, self.options.invert, self.options.poses_scale)
         self._images = self.list_images()

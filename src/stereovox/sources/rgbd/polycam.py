@@ -31,6 +31,7 @@ class Polycam(DepthFolder):
     Times are in the names, in microseconds.
     """
 
+    up = "y"
     layout = "Polycam's raw data (keyframes/depth/, keyframes/corrected_cameras/)"
     parts = (
         Part(("keyframes/depth/*.png", "depth/*.png"), "depth images"),

@@ -27,6 +27,7 @@ class Record3D(DepthFolder):
     `K`, column by column, for pictures of `w` by `h`; scaled to the depth images. Times: number / `fps`.
     """
 
+    up = "y"
     layout = "a Record3D export (depth/*.exr with metadata.json)"
     parts = (
         Part(("depth/*.exr", "EXR_RGBD/depth/*.exr"), "depth images"),

@@ -30,6 +30,7 @@ class RtabmapExport(DepthFolder):
     combined with `local_transform` of each calibration. World: that of the graph, z up. Each image has a camera.
     """
 
+    up = "z"
     layout = "a folder of rtabmap-export (rtabmap_depth/, rtabmap_calib/, rtabmap_camera_poses.txt)"
     parts = (
         Part(("*_depth/*.png",), "depth images"),

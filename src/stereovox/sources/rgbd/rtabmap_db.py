@@ -62,6 +62,7 @@ class RtabmapDatabase(DepthFolder):
     graph only the longest session counts, as each has a frame of its own, and a note says that loops are left open.
     """
 
+    up = "z"
     layout = "an RTAB-Map database (rtabmap.db)"
     certain = True
 

@@ -37,6 +37,7 @@ class StrayScanner(DepthFolder):
     is low (0 of 0, 1, 2) have no value. An image without a line in odometry.csv has no pose.
     """
 
+    up = "y"
     layout = "a Stray Scanner folder (depth/*.png with odometry.csv and camera_matrix.csv)"
     parts = (
         Part((f"{IMAGES}/*.png", f"{IMAGES}/*.npy"), "depth images"),

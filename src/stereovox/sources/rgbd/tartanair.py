@@ -23,6 +23,7 @@ class TartanAir(DepthFolder):
     The sky is thousands of metres away. Where both eyes are there, the left counts.
     """
 
+    up = "-z"
     layout = "a TartanAir folder (depth_left/*.npy with pose_left.txt)"
     parts = (
         Part(tuple(f"depth_{side}/[0-9]*" for side in SIDES), "depth images"),

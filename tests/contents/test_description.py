@@ -71,7 +71,7 @@ def test_a_file_of_no_kind_is_not_sent_in_a_circle(tmp_path, capsys):
     (tmp_path / "notes.xyzzy").write_text("nothing here can read this")
     assert main(["info", str(tmp_path / "notes.xyzzy")]) == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert "is of no kind" in line
+    assert "is of no known kind" in line
     assert "stereovox info" not in line
 
 

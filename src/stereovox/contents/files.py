@@ -170,6 +170,8 @@ def describe_image(path: str) -> Description | None:
     except MissingExtra:
         raise
     except FrameRefused as refused:
+        if Path(path).suffix.lower() in LOOSE:  # cells or points, see `describe_points`
+            return None
         if refused.reason == "bad_dtype" or Path(path).suffix.lower() in PICTURE_SUFFIXES:
             return _picture(path, str(refused))
         raise

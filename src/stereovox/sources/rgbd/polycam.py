@@ -66,7 +66,10 @@ class Polycam(DepthFolder):
     def find_camera(self, size: tuple[int, int]) -> FoundCamera:
         """Return the camera of the first image that has one."""
         self._size = size
-        return FoundCamera(self._pinhole(next(table for table in self._tables if not isinstance(table, str))))
+        table = next((table for table in self._tables if not isinstance(table, str)), None)
+        if table is None:
+            raise SourceError(f"{self._tables[0]}; no other camera can be read either, add ?camera=FILE")
+        return FoundCamera(self._pinhole(table))
 
     def camera_of(self, i: int) -> PinholeCamera:
         """Return the camera of frame `i`."""

@@ -101,3 +101,16 @@ def test_level_needs_to_know_which_way_is_up(recording, tmp_path):
         run(recording, tmp_path / "m.svox", level=True)
     made, _ = run(recording, tmp_path / "m.svox", level=True, up="-y")
     assert made.config.levelled_from == (0, -1, 0)
+
+
+def test_a_map_that_is_not_level_is_not_resumed_with_level(recording, tmp_path):
+    run(recording, tmp_path / "m.svox", frames=":4")
+    with pytest.raises(StereovoxError, match="begun without"):
+        run(recording, tmp_path / "m.svox", level=True, resume=True)
+
+
+def test_level_takes_the_direction_that_the_user_gives(recording, tmp_path):
+    made, _ = run(recording, tmp_path / "m.svox", level=True, up="-y", up_direction=(0.0, -0.8, 0.6))
+    assert made.config.levelled_from == (0.0, -0.8, 0.6)
+    with pytest.raises(StereovoxError, match="up_direction"):
+        run(recording, tmp_path / "n.svox", level=True, up="-y", up_direction="up")

@@ -33,5 +33,11 @@ class Turned(Stream):
         return Turned(self._stream.after(count), self._T_new_world)
 
     def __iter__(self) -> Iterator[AnyFrame]:
-        for frame in self._stream:
-            yield replace(frame, T_world_sensor=self._T_new_world @ frame.T_world_sensor)
+        frames = iter(self._stream)
+        try:
+            for frame in frames:
+                yield replace(frame, T_world_sensor=self._T_new_world @ frame.T_world_sensor)
+        finally:
+            close = getattr(frames, "close", None)
+            if close:  # a generator: a live camera is to stop now
+                close()

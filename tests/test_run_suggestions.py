@@ -3,14 +3,19 @@
 
 from __future__ import annotations
 
+from argparse import Namespace
+
 import numpy as np
 import pytest
 from made_depth import camera_text, matrix_line, posed, render, units, write
 
 import stereovox as sv
+from stereovox.cli.view import _recording
 from stereovox.errors import StereovoxError
-from stereovox.products.moved import levelled
+from stereovox.opening import open_source
+from stereovox.products.moved import level_transform, levelled
 from stereovox.products.projection import project
+from stereovox.products.side_by_side import check_alike
 from stereovox.se3 import rotation_matrix
 
 TILT = rotation_matrix([0.4, 0.15, 0.0]) @ np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
@@ -101,3 +106,29 @@ def test_level_needs_to_know_which_way_is_up(recording, tmp_path):
         run(recording, tmp_path / "m.svox", level=True)
     made, _ = run(recording, tmp_path / "m.svox", level=True, up="-y")
     assert made.config.levelled_from == (0, -1, 0)
+
+
+def test_a_map_that_is_not_level_is_not_resumed_with_level(recording, tmp_path):
+    run(recording, tmp_path / "m.svox", frames=":4")
+    with pytest.raises(StereovoxError, match="begun without"):
+        run(recording, tmp_path / "m.svox", level=True, resume=True)
+
+
+def test_level_takes_the_direction_that_the_user_gives(recording, tmp_path):
+    made, _ = run(recording, tmp_path / "m.svox", level=True, up="-y", up_direction=(0.0, -0.8, 0.6))
+    assert made.config.levelled_from == (0.0, -0.8, 0.6)
+    with pytest.raises(StereovoxError, match="up_direction"):
+        run(recording, tmp_path / "n.svox", level=True, up="-y", up_direction="up")
+
+
+def test_a_levelled_map_is_replayed_in_its_own_world_and_not_merged_with_another(recording, tmp_path):
+    level, _ = run(recording, tmp_path / "l.svox", level=True)
+    tilted, _ = run(recording, tmp_path / "m.svox", up="z")
+    arguments = Namespace(recording=str(recording), frames=None)
+    source = _recording(arguments, level.config)
+    T = level_transform(level.config.levelled_from)
+    np.testing.assert_allclose(source.frame(3).T_world_sensor, T @ open_source(recording).frame(3).T_world_sensor)
+    assert len(source) == len(open_source(recording))
+    with pytest.raises(StereovoxError, match="levelled differently"):
+        check_alike(level, tilted, None)
+    check_alike(level, tilted, T)

@@ -20,7 +20,7 @@ from types import TracebackType
 from typing import Any, Generic, Protocol, TypeVar
 
 from stereovox import opening
-from stereovox.config import Config
+from stereovox.config import Config, load_config
 from stereovox.errors import MapFileError, SourceError, StereovoxError, one_line
 from stereovox.evaluate.summary import summarise
 from stereovox.frame import UpdateReport
@@ -239,6 +239,8 @@ class MapRun:
         if isinstance(source, str | Path):
             source = opening.open_stream(str(source), self._frames)
         self.source = source if self._camera is None else with_camera(source, str(self._camera))
+        if saved and self._level and saved.config.levelled_from is None:
+            raise StereovoxError(f"level: {self.out} was begun without; go on without it, or begin a new map")
         settings, lines = ({}, []) if saved else self._suggested(source)
         direction = saved.config.levelled_from if saved else self._level_direction(settings)
         if direction is not None:
@@ -268,10 +270,9 @@ class MapRun:
         chosen = {**settings, **self._overrides}
         if "up" not in chosen:
             raise StereovoxError("level: which way is up in this recording is not certain; say it: --set up=AXIS")
-        direction = chosen.get("up_direction")
-        if direction is None or "up" in self._overrides:
-            direction = tuple(upright_axes(chosen["up"])[2].tolist())
-        return direction
+        if chosen.get("up_direction") is None:
+            return tuple(upright_axes(chosen["up"])[2].tolist())
+        return load_config(up=chosen["up"], up_direction=chosen["up_direction"]).up_direction
 
     def _make_mapper(self, saved: VoxelMap | None, suggested: Mapping[str, Any]) -> Mapper:
         settings = self._profile

@@ -253,10 +253,10 @@ def find_up(source: Any, frames: list[AnyFrame]) -> Up:
     direction, share = _level_direction(mean / steady, normals)
     axis = nearest_axis(direction)
     off = float(np.arccos(np.clip(direction @ upright_axes(axis)[2], -1, 1)))
-    if not len(normals):  # the mean attitude alone is good for the axis, not for the angle
-        return Up(axis, upright_axes(axis)[2], 0.0, bool(off < UPRIGHT), "by how the camera was held")
     if _turns_level(frames, direction):
         return Up(axis, direction, off, False, "the camera hardly turned about what is up in its images")
+    if not len(normals):  # the mean attitude alone is good for the axis, not for the angle
+        return Up(axis, upright_axes(axis)[2], 0.0, bool(off < UPRIGHT), "by how the camera was held")
     sure = bool(share >= HORIZONTAL_SHARE and off < UPRIGHT)
     why = f"by how the camera was held; {100 * share:.0f} % of what it saw is level"
     return Up(axis, direction, off, sure, why)

@@ -146,3 +146,15 @@ def test_what_is_nothing_ends_in_one_line_with_a_cure(tmp_path, make):
 def filled(path, content):
     path.write_bytes(content)
     return path
+
+
+def test_cells_of_our_own_npz(tmp_path):
+    voxel_map = VoxelMap.from_cells(load_config(), [[0, 0, 0], [1, 2, 3]], [1.0, 2.0])
+    sv.export(voxel_map, tmp_path / "m.npz")
+    found = sv.describe(tmp_path / "m.npz")
+    assert (found.kind, found.facts["occupied"]) == ("cloud", voxel_map.counts()["occupied"])
+
+
+def test_the_depth_image_in_an_npz(tmp_path):
+    np.savez(tmp_path / "d.npz", depth=np.full((48, 64), 1500, np.uint16))
+    assert sv.describe(tmp_path / "d.npz").kind == "depth image"

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Clouds and meshes of other programs: kinds, units, origins, what the map remembers, and mistakes in one line."""
 
+import os
 import struct
 
 import numpy as np
@@ -10,6 +11,8 @@ import trimesh
 import stereovox as sv
 from stereovox.errors import MapFileError, StereovoxError
 from stereovox.formats import UNREADABLE, import_map
+from stereovox.maps import VoxelMap
+from stereovox.trust.history import Imported
 
 WALL = np.stack(np.meshgrid(np.arange(0, 2, 0.02), [0.31], np.arange(0, 1, 0.02), indexing="ij"), -1).reshape(-1, 3)
 UTM = np.array([512_345.0, 5_403_210.0, 100.0])
@@ -266,3 +269,25 @@ def test_big_and_small_numbers_of_floats(tmp_path):
     head += "property double x\nproperty double y\nproperty double z\nend_header\n"
     (tmp_path / "a.ply").write_bytes(head.encode() + body)
     size_and_bounds(import_map(tmp_path / "a.ply"), 0.05)
+
+
+def test_long_words_of_a_file_do_not_spoil_the_map(tmp_path):
+    made = VoxelMap.from_cells(sv.load_config(), [[0, 0, 0]], [1.0])
+    made.history.imported = Imported("a\nb.las", "LAS", ("unit: " + "foot " * 200,))
+    made.save(tmp_path / "m.svox")
+    loaded = sv.load_map(tmp_path / "m.svox").history.imported
+    assert loaded.notes[0].startswith("unit: foot")
+    assert loaded.file == "a\\nb.las"
+
+
+def test_a_doubtful_unit_is_told_also_where_the_cells_are_given(tmp_path):
+    trimesh.creation.box((40, 40, 40)).export(tmp_path / "a.stl")
+    assert "unit unsure: 40 long" in notes(import_map(tmp_path / "a.stl", voxel_size=1.0))
+    assert notes(import_map(tmp_path / "a.stl", voxel_size=1.0, unit="m")) == ""
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs pipes")
+def test_a_pipe_is_refused_at_once(tmp_path):
+    os.mkfifo(tmp_path / "a.ply")
+    with pytest.raises(sv.StereovoxError, match="cannot be read"):
+        import_map(tmp_path / "a.ply")

@@ -14,6 +14,7 @@ from stereovox.cli.maps import open_map, refuse_options
 from stereovox.cli.terminal import say
 
 if TYPE_CHECKING:
+    from stereovox.config import Config
     from stereovox.opening import Source
 
 TOKEN = "STEREOVOX_TOKEN"
@@ -56,7 +57,8 @@ def run(arguments: Namespace) -> dict[str, Any]:
     from stereovox.viewer.viewer import open_viewer
 
     silence_server_log()
-    voxel_map, source = open_map(arguments.map), _recording(arguments)
+    voxel_map = open_map(arguments.map)
+    source = _recording(arguments, voxel_map.config)
     name, place = Path(arguments.map).stem, (arguments.host, arguments.port)
     token = arguments.token if arguments.token is not None else os.environ.get(TOKEN) or None
     viewer = open_viewer(in_cubes(voxel_map), name, *place, arguments.up, token, arguments.most_cells)
@@ -78,11 +80,19 @@ def silence_server_log() -> None:
     logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
 
 
-def _recording(arguments: Namespace) -> Source | None:
-    """Return the recording to replay, None without --recording; raises StereovoxError for a live camera."""
+def _recording(arguments: Namespace, config: Config) -> Source | None:
+    """Return the recording to replay, in the world of a levelled map; None without --recording.
+
+    Raises StereovoxError for a live camera.
+    """
     if arguments.recording is None:
         refuse_options(arguments, ("frames",), "picks frames of --recording, which is not given")
         return None
     from stereovox.opening import open_source
+    from stereovox.products.moved import level_transform
+    from stereovox.sources.turned import TurnedRecording
 
-    return open_source(arguments.recording, arguments.frames)
+    source = open_source(arguments.recording, arguments.frames)
+    if config.levelled_from is None:
+        return source
+    return TurnedRecording(source, level_transform(config.levelled_from))

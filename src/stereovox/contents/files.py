@@ -12,6 +12,7 @@ import numpy as np
 from stereovox.contents.description import Description, command_line, many, metres, size, thousands
 from stereovox.errors import FrameRefused, MissingExtra, SourceError, StereovoxError
 from stereovox.sources.rgbd.depth_files import SUFFIXES, depth_size, read_depth
+from stereovox.sources.rgbd.depth_unit import unit_words
 
 PICTURE_SUFFIXES = (".jpg", ".jpeg", ".bmp", ".webp", ".ppm", ".pgm")
 IMAGE_SUFFIXES = (*SUFFIXES, *PICTURE_SUFFIXES)
@@ -21,7 +22,8 @@ LOOSE = (".txt", ".csv", ".bin", ".npz")
 SEE = "what each may hold: docs/recordings.md, docs/formats.md"
 MAX_TEXT = 1 << 24
 """Largest file in bytes that is tried as poses or a calibration."""
-UNITS = {0.001: "millimetres", 1 / 5000: "1/5000 m (TUM)"}
+USUAL_UNITS = 0.001, 1 / 5000
+"""Metres per unit of whole numbers in nearly all depth images."""
 
 
 def describe_cloud(path: str) -> Description | None:
@@ -120,7 +122,7 @@ def describe_calibration(path: str) -> Description | None:
     of = "" if numbers.size is None else f" of {numbers.size[0]}x{numbers.size[1]} images"
     lines = [f"the calibration of one camera{of}: fx {fx:g}, fy {fy:g}, cx {cx:g}, cy {cy:g}"]
     if numbers.depth_scale is not None:
-        lines.append(f"its depth images are in {UNITS.get(numbers.depth_scale, f'1/{1 / numbers.depth_scale:g} m')}")
+        lines.append(f"its depth images are in {unit_words(numbers.depth_scale)}")
     facts = {"kind": "calibration", "fx": fx, "fy": fy, "cx": cx, "cy": cy, "size": numbers.size,
              "depth_scale": numbers.depth_scale, "stereo": stereo}  # fmt: skip
     return Description(
@@ -170,6 +172,8 @@ def describe_image(path: str) -> Description | None:
     except MissingExtra:
         raise
     except FrameRefused as refused:
+        if Path(path).suffix.lower() in LOOSE:  # cells or points, see `describe_points`
+            return None
         if refused.reason == "bad_dtype" or Path(path).suffix.lower() in PICTURE_SUFFIXES:
             return _picture(path, str(refused))
         raise
@@ -195,8 +199,8 @@ def _unit_line(middle: float, whole: bool) -> str:
     if not whole and 0.1 < middle < 60:
         return "the unit is likely metres"
     fitting = [
-        f"{words} (then half is below {middle * unit:.2f} m)"
-        for unit, words in UNITS.items()
+        f"{unit_words(unit)} (then half is below {middle * unit:.2f} m)"
+        for unit in USUAL_UNITS
         if 0.2 < middle * unit < 20
     ]
     return f"the unit may be {' or '.join(fitting)}" if fitting else "the unit is none of the usual ones"

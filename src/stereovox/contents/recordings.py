@@ -257,4 +257,4 @@ def _bag_maps(path: str, file: BagFile, lines: list[str], facts: dict[str, Any],
     for topic, kind in sorted(file.types.items()):
         if kind in MAPS_IN_BAGS:
             out = map_name(path, ".yaml" if kind == "nav_msgs/OccupancyGrid" else ".svox")
-            commands.append(command_line("import", path, out, "--topic", topic))
+            commands.append(command_line("import", file_part(path), out, "--topic", topic))

@@ -175,8 +175,10 @@ def _cure(ending: str, known: Sequence[str]) -> str:
 def _check_content(path: Path) -> None:
     """Raise StereovoxError where git left a pointer in place of a large file."""
     try:
+        if not path.is_file():  # a pipe would block
+            return
         with path.open("rb") as file:
-            pointer = path.is_file() and file.read(len(LFS)) == LFS
+            pointer = file.read(len(LFS)) == LFS
     except OSError:
         return  # the reader says what is wrong
     if pointer:

@@ -28,7 +28,7 @@ OUTLIERS = 0.1
 STEPS = (1, 2, 5, 10)
 
 
-class Suggestion(NamedTuple):
+class SuggestedCell(NamedTuple):
     """voxel_size: metres, 1, 2 or 5 times a power of ten. why: in a few words. spacing: metres between neighbours."""
 
     voxel_size: float
@@ -36,7 +36,7 @@ class Suggestion(NamedTuple):
     spacing: float | None = None
 
 
-def suggested_cell(xyz: NDArray[np.float64]) -> Suggestion | None:
+def suggested_cell(xyz: NDArray[np.float64]) -> SuggestedCell | None:
     """Return the cell size for finite points (N, 3) in metres; None where they tell none: too few, or all in one place.
 
     Twice the typical distance of neighbouring points, so that a surface has no holes; larger where the longest side
@@ -47,20 +47,20 @@ def suggested_cell(xyz: NDArray[np.float64]) -> Suggestion | None:
         return None
     extent = float(extents(xyz).max())
     if extent / MOST_ALONG > PER_CELL * spacing:
-        return Suggestion(_allowed(extent / MOST_ALONG), f"since it is {extent:.3g} m long", spacing)
-    return Suggestion(
+        return SuggestedCell(_allowed(extent / MOST_ALONG), f"since it is {extent:.3g} m long", spacing)
+    return SuggestedCell(
         _allowed(PER_CELL * spacing),
         f"since its points lie about {spacing if spacing < 10 else round(spacing):.3g} m apart",
         spacing,
     )
 
 
-def suggested_for_mesh(vertices: NDArray[np.float64]) -> Suggestion | None:
+def suggested_for_mesh(vertices: NDArray[np.float64]) -> SuggestedCell | None:
     """Return the cell size for a mesh with vertices (N, 3) in metres; None where all are in one place."""
     extent = float(np.ptp(vertices, axis=0).max()) if len(vertices) else 0.0
     if not extent > 0:
         return None
-    return Suggestion(_allowed(extent / MESH_ALONG), f"since it is {extent:.3g} m long")
+    return SuggestedCell(_allowed(extent / MESH_ALONG), f"since it is {extent:.3g} m long")
 
 
 def typical_spacing(xyz: NDArray[np.float64]) -> float | None:

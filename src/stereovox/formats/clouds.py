@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.errors import MapFileError, StereovoxError
-from stereovox.formats.cell_size import extents, suggested_cell, suggested_for_mesh
+from stereovox.formats.cell_size import SuggestedCell, extents, suggested_cell, suggested_for_mesh
 from stereovox.formats.las import read_las
 from stereovox.formats.read_points import MAX_BYTES, cells_of_points, read_points
 from stereovox.formats.text_points import read_text_points
@@ -174,22 +174,29 @@ def _sized(
 ) -> tuple[float, tuple[str, ...]]:
     """Return the side of a cell, and notes: why it was chosen, and where the unit is doubtful."""
     finite = xyz[np.isfinite(xyz).all(axis=1)]
-    if voxel_size is not None:
-        return voxel_size, ()
     if cloud.voxel_size is not None:
-        return cloud.voxel_size, ()
+        return cloud.voxel_size if voxel_size is None else voxel_size, ()
     suggested = suggested_cell(finite) if cloud.faces is None else suggested_for_mesh(finite)
+    if voxel_size is not None:
+        return voxel_size, _unit_notes(finite, cloud, unit, suggested)
     if suggested is None:
         raise StereovoxError(
             f"{len(finite)} points do not tell a size of cells; type: stereovox import {name} MAP --voxel-size 0.05"
         )
     notes = (f"cells of {suggested.voxel_size:g} m, {suggested.why} (--voxel-size overrides)",)
-    length = float(extents(finite).max())
-    sparse = suggested.spacing is not None and suggested.spacing > SPARSE
-    if unit is None and cloud.metres is None and (sparse or length < TINY or cloud.faces is not None):
-        long = f"{length:.3g}" if length < 1000 else f"{length:.0f}"
-        notes += (f"unit unsure: {long} long, taken as metres (else --unit mm, cm or ft)",)
-    return suggested.voxel_size, notes
+    return suggested.voxel_size, notes + _unit_notes(finite, cloud, unit, suggested)
+
+
+def _unit_notes(
+    xyz: NDArray[np.float64], cloud: Cloud, unit: str | None, suggested: SuggestedCell | None
+) -> tuple[str, ...]:
+    """Return a note where nobody says the unit of points (N, 3) and metres may be the wrong one."""
+    length = float(extents(xyz).max())
+    sparse = suggested is not None and suggested.spacing is not None and suggested.spacing > SPARSE
+    if unit is not None or cloud.metres is not None or not (sparse or length < TINY or cloud.faces is not None):
+        return ()
+    long = f"{length:.3g}" if length < 1000 else f"{length:.0f}"
+    return (f"unit unsure: {long} long, taken as metres (else --unit mm, cm or ft)",)
 
 
 def _on_surface(xyz: NDArray[np.float64], faces: NDArray[np.integer], voxel_size: float) -> NDArray[np.float64]:

@@ -49,11 +49,11 @@ def moved(voxel_map: VoxelMap, T_a_b: ArrayLike) -> VoxelMap:
 
     Raises StereovoxError where T_a_b is no rigid motion, or leads too far away.
     """
-    config = voxel_map.config
+    T, config = rigid(T_a_b), voxel_map.config
     if config.up_direction is not None:
-        direction = np.asarray(T_a_b, float)[:3, :3] @ config.up_direction
+        direction = T[:3, :3] @ config.up_direction
         config = config.model_copy(update={"up": nearest_axis(direction), "up_direction": tuple(direction.tolist())})
-    return _resampled(voxel_map, rigid(T_a_b), config)
+    return _resampled(voxel_map, T, config)
 
 
 def _resampled(voxel_map: VoxelMap, T: Transform, config: Config) -> VoxelMap:

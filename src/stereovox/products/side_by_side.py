@@ -44,10 +44,14 @@ def side_by_side(a: VoxelMap, b: VoxelMap) -> Iterator[Blocks]:
 
 
 def check_alike(a: VoxelMap, b: VoxelMap, T_a_b: ArrayLike | None) -> None:
-    """Raise StereovoxError where two maps differ in cell size, or, without a transform, in `up`."""
+    """Raise StereovoxError where two maps differ in cell size, or, without a transform, in what is up."""
     if T_a_b is None and a.config.up != b.config.up:
         raise StereovoxError(
             f"up is {a.config.up} in one map and {b.config.up} in the other; give the transform between them"
+        )
+    if T_a_b is None and a.config.levelled_from != b.config.levelled_from:
+        raise StereovoxError(
+            "the maps were levelled differently, so their worlds differ; give the transform between them"
         )
     if not np.allclose(a.config.cell, b.config.cell, rtol=1e-9, atol=0):
         sizes = " and ".join(" x ".join(f"{side:g}" for side in _short(one)) for one in (a, b))

@@ -17,11 +17,12 @@ from stereovox.sources.base import Part
 from stereovox.sources.calibration_files import read_calibration
 from stereovox.sources.calibration_values import StereoCalibration, read_yaml, rigid
 from stereovox.sources.images import file_names
+from stereovox.sources.parameters import file_of
 from stereovox.sources.poses import Poses, seconds_from_ns
 from stereovox.sources.rgbd.folder import folder_part
 from stereovox.sources.rig import RigSource, Shot
 from stereovox.sources.rig_file import Rig, RigPair, Virtual, usual_virtual
-from stereovox.sources.rig_options import POSES, as_body, file_of, folder_and_options, poses_of_images
+from stereovox.sources.rig_options import POSES, as_body, folder_and_options, poses_of_images
 from stereovox.sources.trajectory import Trajectory, inside, transforms
 
 ROOT, EYES, DATA, SENSOR = "mav0", ("cam0", "cam1"), "data.csv", "sensor.yaml"

@@ -14,7 +14,7 @@ from stereovox.errors import SourceError, StereovoxError, did_you_mean
 from stereovox.frame import Frame, StereoFrame
 from stereovox.safe_io import is_number, read_table, shown, toml_text
 from stereovox.sources.base import Stream
-from stereovox.sources.intrinsics import NAMES, Intrinsics, read_camera_numbers
+from stereovox.sources.intrinsics import NAMES, Intrinsics, read_camera_numbers, scaled
 
 FILE = "camera.toml"
 SIZES = ("width", "height")
@@ -265,7 +265,7 @@ def _foreign(path: Path, size: tuple[int, int], baseline: float | None) -> Found
         if abs(size[0] / width - size[1] / height) > 0.01 * size[0] / width:
             raise SourceError(f"{path}: is for {width}x{height} images, these have {size[0]}x{size[1]}; {OTHER}")
         factor = size[0] / width
-        fx, fy, cx, cy = factor * fx, factor * fy, factor * (cx + 0.5) - 0.5, factor * (cy + 0.5) - 0.5
+        fx, fy, cx, cy = scaled(numbers.intrinsics, factor)
         notes = (f"{path} is for {width}x{height} images; its numbers are scaled to {size[0]}x{size[1]}",)
     try:
         camera = pinhole(size, (fx, abs(fy), cx, cy), baseline)

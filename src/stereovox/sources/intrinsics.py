@@ -91,6 +91,16 @@ def read_camera_numbers(path: Path) -> CameraNumbers:
     return _of_numbers(path, _numbers(path))
 
 
+def scaled(intrinsics: Sequence[float], x: float, y: float | None = None) -> Intrinsics:
+    """Return fx, fy, cx, cy in pixels of images `x` times as wide and `y` times as high (None: as `x`).
+
+    Pixel centres are at whole numbers, so the edge of the first pixel lies at -0.5.
+    """
+    fx, fy, cx, cy = intrinsics
+    y = x if y is None else y
+    return x * fx, y * fy, x * (cx + 0.5) - 0.5, y * (cy + 0.5) - 0.5
+
+
 def metres_per_unit(scale: float) -> float:
     """Return metres per unit of a depth scale in either notation: 1000 and 0.001 both stand for millimetres."""
     return 1 / scale if scale > 1 else scale

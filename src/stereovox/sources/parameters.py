@@ -5,7 +5,9 @@ from __future__ import annotations
 
 import inspect
 import math
+import os
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 from stereovox.errors import SourceError, did_you_mean
@@ -30,6 +32,14 @@ def split(location: str) -> tuple[str, dict[str, str]]:
             raise SourceError(f"'{key}' is given twice; give it once")
         texts[key] = value
     return name, texts
+
+
+def file_of(text: str, folder: Path) -> Path:
+    """Return the file or folder that a parameter names: as it stands, else inside `folder`; raises SourceError."""
+    found = next((path for path in (Path(text), folder / text) if os.path.exists(path)), None)
+    if found is None:
+        raise SourceError(f"{text}: no such file, nor in {folder}; check the name")
+    return found
 
 
 def defaults(function: Callable[..., Any]) -> dict[str, Any]:

@@ -19,11 +19,12 @@ from stereovox.frame import StereoFrame
 from stereovox.se3 import Transform
 from stereovox.sources.base import Part, Source
 from stereovox.sources.images import EYE_KINDS, file_names, png_size, read_picture_png
+from stereovox.sources.parameters import file_of
 from stereovox.sources.poses import Poses
 from stereovox.sources.rgbd.folder import SECOND, folder_part
 from stereovox.sources.rgbd.pose_files import number_in
 from stereovox.sources.rig_file import FILE, Rig, RigPair, read_rig
-from stereovox.sources.rig_options import POSES, as_body, file_of, folder_and_options, poses_of_images
+from stereovox.sources.rig_options import POSES, as_body, folder_and_options, poses_of_images
 from stereovox.sources.trajectory import Trajectory, by_time, inside, stamped_lines
 
 SHORTEST_NS = 1_000_000

@@ -41,14 +41,6 @@ def folder_and_options(where: str | os.PathLike[str], known: Mapping[str, Any]) 
     return Path(folder), {**known, **given}
 
 
-def file_of(text: str, folder: Path) -> Path:
-    """Return the file or folder that an option names: as it stands, else inside `folder`; raises SourceError."""
-    found = next((path for path in (Path(text), folder / text) if os.path.exists(path)), None)
-    if found is None:
-        raise SourceError(f"{text}: no such file, nor in {folder}; check the name")
-    return found
-
-
 def poses_of_images(path: Path, stamps_ns: Sequence[int]) -> Poses:
     """Return the poses in a file or folder of any form (see `rgbd.pose_files`), over time.
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 from stereovox.frame import AnyFrame
 from stereovox.se3 import Transform
-from stereovox.sources.base import Stream
+from stereovox.sources.base import Source, Stream
 
 
 class Turned(Stream):
@@ -33,5 +33,27 @@ class Turned(Stream):
         return Turned(self._stream.after(count), self._T_new_world)
 
     def __iter__(self) -> Iterator[AnyFrame]:
-        for frame in self._stream:
-            yield replace(frame, T_world_sensor=self._T_new_world @ frame.T_world_sensor)
+        frames = iter(self._stream)
+        try:
+            for frame in frames:
+                yield replace(frame, T_world_sensor=self._T_new_world @ frame.T_world_sensor)
+        finally:
+            close = getattr(frames, "close", None)
+            if close:  # a generator: a live camera is to stop now
+                close()
+
+
+class TurnedRecording(Source):
+    """The same of a recording, whose frames can still be read in any order."""
+
+    def __init__(self, source: Source, T_new_world: Transform):
+        self._source, self._T_new_world = source, T_new_world
+        self.name, self.camera, self.notes = source.name, source.camera, source.notes
+
+    def __len__(self) -> int:
+        return len(self._source)
+
+    def frame(self, i: int) -> AnyFrame:
+        """Return frame `i` in the new world."""
+        frame = self._source.frame(i)
+        return replace(frame, T_world_sensor=self._T_new_world @ frame.T_world_sensor)

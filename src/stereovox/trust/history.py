@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from stereovox.errors import one_line
+from stereovox.errors import one_line, shortened
 from stereovox.trust.camera_path import FARTHEST, CameraPath
 from stereovox.trust.camera_path import Seen as Seen
 
@@ -95,6 +95,13 @@ class Imported(NamedTuple):
         """Return lines for people: `imported from cloud.ply (PLY, 12,345 points)`, then the notes, one a line."""
         return "\n  ".join((f"imported from {self.file} ({self.holds})", *self.notes))
 
+    def saved(self) -> dict[str, Any]:
+        """Return what a file holds of it: texts from another program's file may be longer than what can be loaded."""
+        file, holds, *notes = (
+            shortened(one_line(text), MAX_NAME_LENGTH) for text in (self.file, self.holds, *self.notes[:MAX_NOTES])
+        )
+        return {"file": file, "holds": holds, "notes": notes}
+
 
 @dataclass
 class History:
@@ -160,7 +167,7 @@ class History:
             "frames_refused": self.refused.total(),
             "last_frame": self._last_frame(),
             "recording": self.recording,
-            "imported": None if self.imported is None else self.imported._asdict(),
+            "imported": None if self.imported is None else self.imported.saved(),
             "history": {
                 "refused": dict(self.refused),
                 "settled": dict(self.settled),

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from stereovox.errors import SourceError
-from stereovox.opening import open_source
+from stereovox.opening import open_images, open_source
 from stereovox.sources.rgbd.polycam import Polycam
 
 OPENGL = np.diag([1.0, -1, -1, 1])
@@ -61,3 +61,5 @@ def test_no_camera_at_all_is_one_line(tmp_path):
         path.write_text("{")
     with pytest.raises(SourceError, match="corrected_cameras: holds no pose that can be used"):
         open_source(tmp_path)
+    with pytest.raises(SourceError, match=r"add \?camera=FILE"):
+        open_images(tmp_path)

@@ -16,7 +16,7 @@ from stereovox.se3 import inverse, transform_points
 from stereovox.sources.base import Part
 from stereovox.sources.camera_file import FoundCamera, pinhole
 from stereovox.sources.images import spread
-from stereovox.sources.intrinsics import metres_per_unit
+from stereovox.sources.intrinsics import metres_per_unit, scaled
 from stereovox.sources.rgbd.colmap_model import UNDISTORT, ColmapImage, ColmapModel, read_model
 from stereovox.sources.rgbd.depth_files import SUFFIXES, Depth, depth_size, read_depth
 from stereovox.sources.rgbd.depth_unit import unit_words
@@ -141,9 +141,8 @@ class Colmap(DepthFolder):
                 f"{self.folder}: camera {number} is for {camera.size[0]}x{camera.size[1]} images, depth has "
                 f"{size[0]}x{size[1]}; if it is of undistorted ones, {UNDISTORT}"
             )
-        fx, fy, cx, cy = camera.intrinsics
         try:
-            return pinhole(size, (x * fx, y * fy, x * (cx + 0.5) - 0.5, y * (cy + 0.5) - 0.5), None)
+            return pinhole(size, scaled(camera.intrinsics, x, y), None)
         except SourceError as error:
             raise SourceError(f"{self.folder}: camera {number}: {error}") from None
 

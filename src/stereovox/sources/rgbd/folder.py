@@ -293,12 +293,8 @@ class DepthFolder(DepthSource, ABC):
         return np.dtype(np.uint16)
 
     def _file(self, text: str) -> Path:
-        """Return the file that an option names: as it stands, else inside the folder; raises SourceError."""
-        inside = self.folder if os.path.isdir(self.folder) else self.folder.parent
-        found = next((path for path in (Path(text), inside / text) if os.path.exists(path)), None)
-        if found is None:
-            raise SourceError(f"{text}: no such file, nor in {inside}; check the name")
-        return found
+        """Return the file that an option names, see `parameters.file_of`."""
+        return parameters.file_of(text, self.folder if os.path.isdir(self.folder) else self.folder.parent)
 
 
 def images_in(folder: Path, pattern: str, fps: float) -> list[ImageFile]:

@@ -13,7 +13,7 @@ from stereovox.sources.camera_file import FoundCamera, find_camera
 from stereovox.sources.poses import Poses
 from stereovox.sources.rgbd.folder import ImageFile, folder_part
 from stereovox.sources.rgbd.packed import MAX_FRAMES, PackedDepth, Piece
-from stereovox.sources.rgbd.pose_files import ImagePoses, read_poses
+from stereovox.sources.rgbd.pose_files import ImagePoses
 
 HEAD = struct.Struct("<qii")
 """Time in microseconds, bytes of depth and of the picture."""
@@ -72,14 +72,10 @@ class KlgLog(PackedDepth):
 
     def read_poses(self) -> Poses | ImagePoses:
         """Return the poses beside the file."""
-        beside = sorted(self.file.parent.glob("*.freiburg"))
-        same = [path for path in beside if path.name.startswith(self.file.stem)] or beside
-        if len(same) != 1:
-            raise SourceError(
-                f"{self.file}: a .klg log holds depth but no poses, nor is one .freiburg beside it; add ?poses=FILE "
-                "(ElasticFusion writes one at its end)"
-            )
-        return self.fitted(read_poses(same[0]))
+        return self.poses_beside(
+            "a .klg log holds depth but no poses, nor is one .freiburg beside it; add ?poses=FILE (ElasticFusion "
+            "writes one at its end)"
+        )
 
     def find_camera(self, size: tuple[int, int]) -> FoundCamera:
         """Return the camera of a file beside it, else ElasticFusion's."""

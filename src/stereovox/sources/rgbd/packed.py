@@ -114,6 +114,17 @@ class PackedDepth(DepthFolder):
         """Return the bytes of a depth image; raises zlib.error."""
         return data
 
+    def poses_beside(self, missing: str) -> Poses | ImagePoses:
+        """Return the poses of the `.freiburg` of the same name beside the file, or of the only one there.
+
+        Raises SourceError, which says what is `missing`, where there is none.
+        """
+        beside = sorted(self.file.parent.glob(ICL_POSES))
+        same = [path for path in beside if path.name.startswith(self.file.stem)] or beside
+        if len(same) != 1:
+            raise SourceError(f"{self.file}: {missing}")
+        return self.fitted(read_poses(same[0]))
+
 
 class SensFile(PackedDepth):
     """A ScanNet `.sens` file, or a folder with one: depth raw or zlib, camera to world for each frame.
@@ -185,11 +196,7 @@ class SlambenchRaw(PackedDepth):
 
     def read_poses(self) -> Poses | ImagePoses:
         """Return the poses beside the file."""
-        beside = sorted(self.file.parent.glob(ICL_POSES))
-        same = [path for path in beside if path.name.startswith(self.file.stem)] or beside
-        if len(same) != 1:
-            raise SourceError(f"{self.file}: has no poses, nor is one .freiburg beside it; add ?poses=FILE")
-        return self.fitted(read_poses(same[0]))
+        return self.poses_beside("has no poses, nor is one .freiburg beside it; add ?poses=FILE")
 
     def find_camera(self, size: tuple[int, int]) -> FoundCamera:
         """Return the camera of a file beside it, else ICL-NUIM's."""

@@ -15,6 +15,7 @@ from stereovox.safe_io import is_number, json_value, read_text
 from stereovox.se3 import Transform
 from stereovox.sources.base import Part
 from stereovox.sources.camera_file import FoundCamera, pinhole
+from stereovox.sources.intrinsics import scaled
 from stereovox.sources.rgbd.confidence import without_low
 from stereovox.sources.rgbd.depth_files import Depth
 from stereovox.sources.rgbd.folder import DepthFolder, ImageFile, folder_part, images_in
@@ -66,7 +67,10 @@ class Polycam(DepthFolder):
     def find_camera(self, size: tuple[int, int]) -> FoundCamera:
         """Return the camera of the first image that has one."""
         self._size = size
-        return FoundCamera(self._pinhole(next(table for table in self._tables if not isinstance(table, str))))
+        table = next((table for table in self._tables if not isinstance(table, str)), None)
+        if table is None:
+            raise SourceError(f"{self._tables[0]}; no other camera can be read either, add ?camera=FILE")
+        return FoundCamera(self._pinhole(table))
 
     def camera_of(self, i: int) -> PinholeCamera:
         """Return the camera of frame `i`."""
@@ -89,9 +93,8 @@ class Polycam(DepthFolder):
 
     def _pinhole(self, table: dict[str, float]) -> PinholeCamera:
         x, y = self._size[0] / table["width"], self._size[1] / table["height"]
-        cx, cy = x * (table["cx"] + 0.5) - 0.5, y * (table["cy"] + 0.5) - 0.5
         try:
-            return pinhole(self._size, (x * table["fx"], y * table["fy"], cx, cy), None)
+            return pinhole(self._size, scaled([table[key] for key in NUMBERS[:4]], x, y), None)
         except SourceError as error:
             raise SourceError(f"{self._files}: {error}") from None
 

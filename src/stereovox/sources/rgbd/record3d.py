@@ -14,6 +14,7 @@ from stereovox.safe_io import MAX_LIST, is_number, json_value, read_text
 from stereovox.se3 import Transform, from_quaternion
 from stereovox.sources.base import Part
 from stereovox.sources.camera_file import FoundCamera, pinhole
+from stereovox.sources.intrinsics import scaled
 from stereovox.sources.rgbd.folder import DepthFolder, ImageFile, folder_part, images_in
 from stereovox.sources.rgbd.pose_files import ImagePoses
 
@@ -66,9 +67,8 @@ class Record3D(DepthFolder):
         x, y = size[0] / width, size[1] / height
         if abs(x / y - 1) > 0.02:
             raise SourceError(f"{self._path}: is for {width:g}x{height:g} pictures, depth has {size[0]}x{size[1]}")
-        fx, fy, cx, cy = (float(K[n]) for n in (0, 4, 6, 7))
         try:
-            return FoundCamera(pinhole(size, (x * fx, y * fy, x * (cx + 0.5) - 0.5, y * (cy + 0.5) - 0.5), None))
+            return FoundCamera(pinhole(size, scaled([float(K[n]) for n in (0, 4, 6, 7)], x, y), None))
         except SourceError as error:
             raise SourceError(f"{self._path}: {error}") from None
 

@@ -14,6 +14,7 @@ from stereovox.se3 import Transform, from_quaternion
 from stereovox.sources.base import Part
 from stereovox.sources.calibration_files import read_yaml
 from stereovox.sources.camera_file import FoundCamera, pinhole
+from stereovox.sources.intrinsics import scaled
 from stereovox.sources.rgbd.folder import DepthFolder, ImageFile, folder_part, image_pattern, images_in
 from stereovox.sources.rgbd.pose_files import ImagePoses
 from stereovox.sources.trajectory import ns_from_seconds
@@ -102,9 +103,8 @@ class _Calibration:
     def camera(self, size: tuple[int, int]) -> PinholeCamera:
         """Return the camera, scaled to images of (width, height) = `size`."""
         factor = size[0] / self._width if self._width else 1.0
-        fx, fy, cx, cy = self._numbers
         try:
-            return pinhole(size, (factor * fx, factor * fy, factor * (cx + 0.5) - 0.5, factor * (cy + 0.5) - 0.5), None)
+            return pinhole(size, scaled(self._numbers, factor), None)
         except SourceError as error:
             raise SourceError(f"{self.path}: {error}") from None
 

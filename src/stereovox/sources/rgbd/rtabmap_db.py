@@ -20,6 +20,7 @@ from stereovox.errors import FrameRefused, SourceError, one_line
 from stereovox.se3 import Transform
 from stereovox.sources.camera_file import FoundCamera, pinhole
 from stereovox.sources.images import MAX_BYTES, size_text
+from stereovox.sources.intrinsics import scaled
 from stereovox.sources.rgbd import _rvl
 from stereovox.sources.rgbd.depth_files import Depth, decode_depth
 from stereovox.sources.rgbd.folder import DepthFolder, ImageFile, folder_part
@@ -210,10 +211,8 @@ class RtabmapDatabase(DepthFolder):
         node, k = self._views[i]
         numbers, size, _ = node.cameras[k]
         factor = self._size[0] / size[0] if size else 1.0
-        fx, fy, cx, cy = numbers
-        scaled = factor * fx, factor * fy, factor * (cx + 0.5) - 0.5, factor * (cy + 0.5) - 0.5
         try:
-            return pinhole(self._size, scaled, None)
+            return pinhole(self._size, scaled(numbers, factor), None)
         except SourceError as error:
             raise SourceError(f"{self.folder}: node {node.id}: {error}") from None
 

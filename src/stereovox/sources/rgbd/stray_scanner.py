@@ -12,7 +12,7 @@ from stereovox.se3 import Transform, from_quaternion
 from stereovox.sources.base import Part
 from stereovox.sources.camera_file import FoundCamera, pinhole
 from stereovox.sources.images import file_names
-from stereovox.sources.intrinsics import read_intrinsics
+from stereovox.sources.intrinsics import read_intrinsics, scaled
 from stereovox.sources.rgbd.confidence import without_low
 from stereovox.sources.rgbd.depth_files import Depth
 from stereovox.sources.rgbd.folder import DepthFolder, ImageFile, folder_part
@@ -81,7 +81,7 @@ class StrayScanner(DepthFolder):
             raise SourceError(
                 f"{path}: cy = {cy:g} is not the middle of pictures shaped as the depth images; add ?camera=FILE"
             )
-        numbers = (factor * fx, factor * fy, factor * (cx + 0.5) - 0.5, factor * (cy + 0.5) - 0.5)
+        numbers = scaled((fx, fy, cx, cy), factor)
         note = f"{path} is taken to be for {width} columns; its numbers are scaled to {size[0]}x{size[1]}"
         return FoundCamera(pinhole(size, numbers, None), (note,))
 

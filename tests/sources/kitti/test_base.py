@@ -337,7 +337,7 @@ def test_what_spoils_the_whole_recording_is_one_line_with_the_file(tmp_path, mak
         ("?camra=grey", r"unknown parameter 'camra' \(did you mean 'camera'\?\)"),
         ("?camera=gray", r"did you mean 'grey'"),
         ("?camera=colour", r"has only grey images; leave camera= out"),
-        ("?poses=nowhere.txt", r"nowhere\.txt: No such file"),
+        ("?poses=nowhere.txt", r"nowhere\.txt: no such file"),
     ],
 )
 def test_bad_parameters_are_one_line(tmp_path, query, says):

@@ -151,8 +151,3 @@ def numbers_in(folder: Path, pattern: re.Pattern[str]) -> list[str]:
     """Return the numbers (first group of `pattern`) of the files in `folder`, in ascending order, as written."""
     names = file_names(folder) if os.path.isdir(folder) else []
     return sorted({match[1] for name in names if (match := pattern.fullmatch(name))}, key=int)
-
-
-def named_file(text: str, folder: Path) -> Path:
-    """Return the file that a parameter names: as a path of its own, else inside `folder`."""
-    return Path(text) if os.path.isfile(text) else folder / text

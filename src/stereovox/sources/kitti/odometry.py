@@ -13,12 +13,12 @@ from stereovox.sources.kitti.base import (
     PAIRS,
     KittiSource,
     choose_pair,
-    named_file,
     numbers_in,
     time_lines,
 )
 from stereovox.sources.kitti.calibration import KittiCalibration, read_calibration
 from stereovox.sources.kitti.poses import read_named_poses
+from stereovox.sources.parameters import file_of
 from stereovox.sources.rgbd.folder import folder_part
 from stereovox.sources.rig_options import POSES, folder_and_options
 from stereovox.sources.trajectory import ns_from_seconds
@@ -59,7 +59,7 @@ class KittiOdometry(KittiSource):
         self._check_numbers()
         self.camera = self.calibration.camera(*self.eyes, self._size())
         usual = self.folder.resolve().parents[1] / "poses" / f"{sequence}.txt"
-        path = named_file(options["poses"], self.folder) if options["poses"] else usual
+        path = file_of(options["poses"], self.folder) if options["poses"] else usual
         self.poses = read_named_poses(path, self._stamps, options["axes"], options["invert"])
 
     @classmethod

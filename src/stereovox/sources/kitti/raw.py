@@ -15,12 +15,12 @@ from stereovox.sources.kitti.base import (
     PAIRS,
     KittiSource,
     choose_pair,
-    named_file,
     numbers_in,
     time_lines,
 )
 from stereovox.sources.kitti.calibration import CAM_TO_CAM, KittiCalibration, read_raw_calibration
 from stereovox.sources.kitti.poses import FramePoses, read_named_poses, read_oxts_files
+from stereovox.sources.parameters import file_of
 from stereovox.sources.rgbd.folder import folder_part
 from stereovox.sources.rig_options import POSES, folder_and_options
 
@@ -95,7 +95,7 @@ class KittiRaw(KittiSource):
             choice = there[0] if there else OXTS
         if choice == OXTS:
             return self._oxts()
-        path = self.folder / POSE_FILES[choice] if choice in POSE_FILES else named_file(choice, self.folder)
+        path = self.folder / POSE_FILES[choice] if choice in POSE_FILES else file_of(choice, self.folder)
         return read_named_poses(path, self._stamps, axes, inverted)
 
     def _oxts(self) -> FramePoses:

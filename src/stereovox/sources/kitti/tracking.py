@@ -15,10 +15,11 @@ import numpy as np
 from stereovox.errors import SourceError
 from stereovox.safe_io import MAX_LIST, read_text
 from stereovox.se3 import Transform
-from stereovox.sources.kitti.base import KittiSource, named_file, numbers_in
+from stereovox.sources.kitti.base import KittiSource, numbers_in
 from stereovox.sources.kitti.calibration import KittiCalibration, read_calibration
 from stereovox.sources.kitti.poses import FramePoses, read_named_poses, read_oxts_file
 from stereovox.sources.lidar import Box
+from stereovox.sources.parameters import file_of
 from stereovox.sources.rgbd.folder import folder_part
 from stereovox.sources.rig_options import POSES, folder_and_options
 
@@ -94,7 +95,7 @@ class KittiTracking(KittiSource):
     def _poses(self, choice: str, axes: str, inverted: bool) -> FramePoses:
         if choice and choice != OXTS:
             stamps = [self.stamp_ns(i) for i in range(len(self))]
-            return read_named_poses(named_file(choice, self.folder), stamps, axes, inverted)
+            return read_named_poses(file_of(choice, self.folder), stamps, axes, inverted)
         c = self.calibration
         if c.T_cam0_velo is None or c.T_velo_imu is None:
             missing = "R_rect and Tr_velo_cam" if c.T_cam0_velo is None else "Tr_imu_velo"

@@ -13,6 +13,7 @@ import stereovox as sv
 from stereovox.cli.view import _recording
 from stereovox.errors import StereovoxError
 from stereovox.opening import open_source
+from stereovox.products.live_projection import LiveProjection
 from stereovox.products.moved import level_transform, levelled
 from stereovox.products.projection import project
 from stereovox.products.side_by_side import check_alike
@@ -73,6 +74,8 @@ def test_a_tilted_map_is_no_floor_and_a_levelled_picture_is(recording, tmp_path)
     made, _ = run(recording, tmp_path / "m.svox")
     with pytest.raises(StereovoxError, match="--level"):
         project(made)
+    with pytest.raises(StereovoxError, match="--level"):
+        LiveProjection(made)
     level = levelled(made)
     assert (level.config.up, level.config.up_direction) == ("z", None)
     assert project(level, (-9.0, 9.0)).cells.size
@@ -95,6 +98,20 @@ def test_a_level_map_is_resumed_in_its_own_world(recording, tmp_path):
     assert resumed.frames == whole.frames == 8
     assert degrees(resumed.config.levelled_from, TILT[:, 2]) < 8
     assert np.abs(resumed.path - whole.path).max() < 0.1  # one world for all, found from the first four
+
+
+def test_a_profile_that_says_which_way_is_up_counts_for_level(recording, tmp_path):
+    (tmp_path / "mine.toml").write_text('up = "-y"\n[map]\nprior = 0.3\n')
+    made = sv.map_recording(recording, tmp_path / "m.svox", profile=tmp_path / "mine.toml", level=True).map
+    assert made.config.levelled_from == (0, -1, 0)
+    assert made.config.up == "z"
+
+
+def test_a_level_map_that_is_moved_is_in_another_world(recording, tmp_path):
+    level, _ = run(recording, tmp_path / "l.svox", level=True)
+    there = moved(level, np.eye(4))
+    assert level.config.levelled_from is not None
+    assert there.config.levelled_from is None
 
 
 def test_level_needs_to_know_which_way_is_up(recording, tmp_path):

@@ -267,12 +267,17 @@ class MapRun:
         """
         if not self._level:
             return None
-        chosen = {**settings, **self._overrides}
+        chosen = {**settings, **self._profile_up(), **self._overrides}
         if "up" not in chosen:
             raise StereovoxError("level: which way is up in this recording is not certain; say it: --set up=AXIS")
         if chosen.get("up_direction") is None:
             return tuple(upright_axes(chosen["up"])[2].tolist())
         return load_config(up=chosen["up"], up_direction=chosen["up_direction"]).up_direction
+
+    def _profile_up(self) -> dict[str, Any]:
+        """Return which way is up by the profile, where it says anything but the usual z."""
+        config = load_config("default" if self._profile is None else self._profile)
+        return {} if config.up == "z" else {"up": config.up, "up_direction": config.up_direction}
 
     def _make_mapper(self, saved: VoxelMap | None, suggested: Mapping[str, Any]) -> Mapper:
         settings = self._profile

@@ -17,7 +17,7 @@ from stereovox.maps.occupancy import UNKNOWN, OccupancyGrid, Percent
 from stereovox.maps.rolling import RollingMap
 from stereovox.maps.storage import EVERYWHERE
 from stereovox.products.floor_axes import Heights, floor_axes
-from stereovox.products.projection import EMPTY, Patch, layers_of, patch_of
+from stereovox.products.projection import EMPTY, Patch, check_level, layers_of, patch_of
 
 STEP = 8 * SIDE
 """The grid grows by this many cells, so that planners need not reallocate with each frame."""
@@ -30,10 +30,11 @@ class LiveProjection:
 
     heights: as for `project`. The grid covers what is known, in steps of 64 cells. Of a map in a window only the cells
     in memory count; such a map, and one that forgets, is projected as a whole each time. Raises StereovoxError where
-    the heights hold no cell, and where cells are not as long as wide.
+    the heights hold no cell, where cells are not as long as wide, and for a map that is not level.
     """
 
     def __init__(self, voxel_map: VoxelMap, heights: Heights | None = None):
+        check_level(voxel_map)
         self._map, config = voxel_map, voxel_map.config
         self._order = list(floor_axes(config.up)[:3])
         across, along, up = self._order

@@ -53,6 +53,8 @@ def moved(voxel_map: VoxelMap, T_a_b: ArrayLike) -> VoxelMap:
     if config.up_direction is not None:
         direction = T[:3, :3] @ config.up_direction
         config = config.model_copy(update={"up": nearest_axis(direction), "up_direction": tuple(direction.tolist())})
+    if config.levelled_from is not None:  # no longer the world that `map --level` made
+        config = config.model_copy(update={"levelled_from": None})
     return _resampled(voxel_map, T, config)
 
 

@@ -14,7 +14,7 @@ from stereovox.cli.view import _recording
 from stereovox.errors import StereovoxError
 from stereovox.opening import open_source
 from stereovox.products.live_projection import LiveProjection
-from stereovox.products.moved import level_transform, levelled
+from stereovox.products.moved import level_transform, levelled, moved
 from stereovox.products.projection import project
 from stereovox.products.side_by_side import check_alike
 from stereovox.se3 import rotation_matrix

@@ -228,7 +228,7 @@ def survey(source: Source, frames: int = FRAMES) -> Survey:
 
 
 def find_up(source: Any, frames: list[AnyFrame]) -> Up:
-    """Find out which way is up: as the layout defines it (`source.up`), else by the cameras and by flat surfaces.
+    """Find out which way is up: as the layout defines it (`source.up`), by an accelerometer, else by what was seen.
 
     A camera is mostly held with its image upright, so the mean of what is up in the images is nearly what is up in the
     world; horizontal surfaces near it, such as floors and tables, then give the direction and confirm it.
@@ -243,6 +243,11 @@ def find_up(source: Any, frames: list[AnyFrame]) -> Up:
     known = getattr(source, "up", None)
     if known:
         return Up(known, upright_axes(known)[2], 0.0, True, "as this kind of recording defines it")
+    gravity = source.gravity() if hasattr(source, "gravity") else None
+    if gravity is not None:
+        axis = nearest_axis(gravity)
+        off = float(np.arccos(np.clip(gravity @ upright_axes(axis)[2], -1, 1)))
+        return Up(axis, gravity, off, True, "by the accelerometer")
     mean = np.mean([-frame.T_world_sensor[:3, 1] for frame in frames], axis=0)
     steady = float(np.linalg.norm(mean))
     if steady < STEADY:

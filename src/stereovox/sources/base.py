@@ -12,6 +12,9 @@ from itertools import islice
 from pathlib import Path
 from typing import NamedTuple, Protocol, TypeVar, overload
 
+import numpy as np
+from numpy.typing import NDArray
+
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.errors import SourceError
 from stereovox.frame import AnyFrame, Frame
@@ -126,6 +129,14 @@ class Source(Stream, Protocol):
         """Return the frames from number `count` on; raises SourceError if there are none."""
         return Selection(self, f"{count}:")
 
+    def gravity(self) -> NDArray[np.float64] | None:
+        """Measure which way is up by an accelerometer.
+
+        Returns:
+            Unit vector (3,) in the world of the poses; None where the recording has nothing that tells.
+        """
+        return None
+
     def __len__(self) -> int: ...
 
     def frame(self, i: int) -> AnyFrame:
@@ -187,6 +198,11 @@ class Selection(Source):
             raise SourceError(f"frames '{frames}' picks none of the {len(source)} frames of {source.name}; widen it")
         self.name, self.camera = source.name, source.camera
         self.notes, self.up = getattr(source, "notes", ()), getattr(source, "up", None)
+
+    def gravity(self) -> NDArray[np.float64] | None:
+        """Return which way is up in the whole recording."""
+        measure = getattr(self._source, "gravity", None)  # a class of another package may lack it
+        return measure() if measure else None
 
     def __len__(self) -> int:
         return len(self._picked)

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.errors import FrameRefused, SourceError
@@ -17,6 +18,7 @@ from stereovox.se3 import Transform
 from stereovox.sources import parameters
 from stereovox.sources.bags import open_bag, suffix_of
 from stereovox.sources.bags.depth_topic import DepthTopic, find_depth
+from stereovox.sources.bags.imu import up_by_gravity
 from stereovox.sources.bags.poses import find_poses
 from stereovox.sources.bags.tf import TfPoses
 from stereovox.sources.base import DepthSource
@@ -117,6 +119,13 @@ class Bag(DepthSource):
 
     def __len__(self) -> int:
         return len(self._depth)
+
+    def gravity(self) -> NDArray[np.float64] | None:
+        """Return the unit vector (3,) that points up in the world of the poses by an IMU; None where nothing tells."""
+        found = self._poses
+        if not isinstance(found, TurnedTf) or found.world != "file":
+            return None
+        return up_by_gravity(self._file, found.poses.tf, found.poses.world)
 
     def frame(self, i: int) -> Frame:
         """Return frame `i`; depth is (0, 0) where the image has a `fault`, the pose NaN where there is none."""

@@ -43,7 +43,7 @@ def test_options_reach_the_truth(tmp_path, capsys):
 
 @pytest.mark.parametrize(
     ("source", "says"),
-    [("sim:room", "has no lidar scans"), ("nowhere", "no such folder"), ("DRIVE?poses=x.txt", "x.txt: No such file")],
+    [("sim:room", "has no lidar scans"), ("nowhere", "no such folder"), ("DRIVE?poses=x.txt", "x.txt: no such file")],
 )
 def test_a_mistake_is_one_line(tmp_path, capsys, source, says):
     drive = str(made.raw(tmp_path))

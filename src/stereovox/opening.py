@@ -133,9 +133,10 @@ def open_images(path_or_name: str | os.PathLike[str], frames: str | None = None)
     if _live_class(where):
         return open_stream(where, frames)
     kind = next((kind for kind in _classes() if kind.recognises(where)), None)
-    source = (
-        _images_alone(where) if kind is None else _open(kind, where) if _is_composite(kind) else kind.depth_only(where)
-    )
+    if kind is None:
+        source = _images_alone(where)
+    else:
+        source = _open(kind, where) if _is_composite(kind) else kind.depth_only(where)
     return source if frames is None else Selection(source, frames)
 
 

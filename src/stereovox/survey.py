@@ -245,8 +245,7 @@ def find_up(source: Any, frames: list[AnyFrame]) -> Up:
         return Up(known, upright_axes(known)[2], 0.0, True, "as this kind of recording defines it")
     gravity = source.gravity() if hasattr(source, "gravity") else None
     if gravity is not None:
-        axis = nearest_axis(gravity)
-        off = float(np.arccos(np.clip(gravity @ upright_axes(axis)[2], -1, 1)))
+        axis, off = _axis_near(gravity)
         return Up(axis, gravity, off, True, "by the accelerometer")
     mean = np.mean([-frame.T_world_sensor[:3, 1] for frame in frames], axis=0)
     steady = float(np.linalg.norm(mean))
@@ -256,8 +255,7 @@ def find_up(source: Any, frames: list[AnyFrame]) -> Up:
     normals = [_normals(frame) for frame in frames if isinstance(frame, Frame) and frame.depth.size]
     normals = np.concatenate([np.empty((0, 3)), *normals])
     direction, share = _level_direction(mean / steady, normals)
-    axis = nearest_axis(direction)
-    off = float(np.arccos(np.clip(direction @ upright_axes(axis)[2], -1, 1)))
+    axis, off = _axis_near(direction)
     if _turns_level(frames, direction):
         return Up(axis, direction, off, False, "the camera hardly turned about what is up in its images")
     if not len(normals):  # the mean attitude alone is good for the axis, not for the angle
@@ -265,6 +263,12 @@ def find_up(source: Any, frames: list[AnyFrame]) -> Up:
     sure = bool(share >= HORIZONTAL_SHARE and off < UPRIGHT)
     why = f"by how the camera was held; {100 * share:.0f} % of what it saw is level"
     return Up(axis, direction, off, sure, why)
+
+
+def _axis_near(direction: NDArray[np.float64]) -> tuple[str, float]:
+    """Return the axis nearest to a unit vector (3,), and the angle between both in radians."""
+    axis = nearest_axis(direction)
+    return axis, float(np.arccos(np.clip(direction @ upright_axes(axis)[2], -1, 1)))
 
 
 def _turns_level(frames: Sequence[AnyFrame], up: NDArray[np.float64]) -> bool:

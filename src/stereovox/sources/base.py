@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import copy
 import os
 import sys
 from collections import deque
@@ -183,6 +184,43 @@ class DepthSource(Source, Protocol):
 
     def __iter__(self) -> Iterator[Frame]:
         return prefetch(self.frame, len(self))
+
+
+class Changed(Stream):
+    """The frames of `stream`, each as `change` returns it; a class of this kind sets what else differs."""
+
+    def __init__(self, stream: Stream):
+        self._stream = stream
+        self.name, self.camera, self.notes = stream.name, stream.camera, tuple(getattr(stream, "notes", ()))
+
+    def change(self, frame: AnyFrame) -> AnyFrame:
+        """Return a frame of the stream as it is to be delivered."""
+        raise NotImplementedError
+
+    @property
+    def length(self) -> int | None:
+        """Number of frames of the stream."""
+        return self._stream.length
+
+    @property
+    def dropped(self) -> int:
+        """Frames dropped by the stream."""
+        return self._stream.dropped
+
+    def after(self, count: int) -> Stream:
+        """Return the remaining frames after `count`, changed in the same way."""
+        rest = copy.copy(self)
+        rest._stream = self._stream.after(count)
+        return rest
+
+    def __iter__(self) -> Iterator[AnyFrame]:
+        frames = iter(self._stream)
+        try:
+            yield from map(self.change, frames)
+        finally:
+            close = getattr(frames, "close", None)
+            if close:  # a generator: a live camera is to stop now
+                close()
 
 
 class Selection(Source):

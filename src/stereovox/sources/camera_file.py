@@ -4,16 +4,16 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from stereovox.cameras.pinhole import DepthCorrection, PinholeCamera
 from stereovox.errors import SourceError, StereovoxError, did_you_mean
-from stereovox.frame import Frame, StereoFrame
+from stereovox.frame import AnyFrame, Frame, StereoFrame
 from stereovox.safe_io import is_number, read_table, shown, toml_text
-from stereovox.sources.base import Stream
+from stereovox.sources.base import Changed, Stream
 from stereovox.sources.intrinsics import NAMES, Intrinsics, read_camera_numbers, scaled
 
 FILE = "camera.toml"
@@ -144,38 +144,18 @@ def with_camera(stream: Stream, file: str | os.PathLike[str]) -> Stream:
     return WithCamera(stream, camera if camera.baseline else replace(camera, baseline=own.baseline), (note,))
 
 
-class WithCamera(Stream):
+class WithCamera(Changed):
     """A stream whose frames get another `camera` of the same size; `notes` follow the stream's own."""
 
     def __init__(self, stream: Stream, camera: PinholeCamera, notes: tuple[str, ...] = ()):
-        self._stream, self.camera, self._notes = stream, camera, notes
-        self.name, self.notes = stream.name, (*getattr(stream, "notes", ()), *notes)
+        super().__init__(stream)
+        self.camera, self.notes = camera, (*self.notes, *notes)
 
-    @property
-    def length(self) -> int | None:
-        """Number of frames of the stream."""
-        return self._stream.length
-
-    @property
-    def dropped(self) -> int:
-        """Frames dropped by the stream."""
-        return self._stream.dropped
-
-    def after(self, count: int) -> Stream:
-        """Return the remaining frames after `count`, with the same camera."""
-        return WithCamera(self._stream.after(count), self.camera, self._notes)
-
-    def __iter__(self) -> Iterator[Frame]:
-        frames = iter(self._stream)
-        try:
-            for frame in frames:
-                if isinstance(frame, StereoFrame):
-                    raise SourceError(f"{self.name}: has stereo pairs, which no camera file fits; correct its rig file")
-                yield replace(frame, camera=self.camera)
-        finally:
-            close = getattr(frames, "close", None)
-            if close:  # a generator: a live camera is to stop now
-                close()
+    def change(self, frame: AnyFrame) -> Frame:
+        """Return a depth frame with the camera; raises SourceError for a stereo pair."""
+        if isinstance(frame, StereoFrame):
+            raise SourceError(f"{self.name}: has stereo pairs, which no camera file fits; correct its rig file")
+        return replace(frame, camera=self.camera)
 
 
 def describe_correction(camera: PinholeCamera) -> str:

@@ -228,6 +228,16 @@ def read_table(path: Path) -> dict[str, Any]:
         raise SourceError(f"{path}: {error}; correct it") from None
 
 
+def read_json(path: Path) -> Any:
+    """Return the value in a JSON file. Raises SourceError for a file that cannot be read or is no JSON."""
+    try:
+        return json_value(read_text(path, MAX_LIST))
+    except OSError as error:
+        raise SourceError(f"{path}: {error.strerror}; make it readable") from None
+    except ValueError as error:  # bad JSON, bad UTF-8
+        raise SourceError(f"{path}: no JSON that can be read ({error}); write it again") from None
+
+
 def is_number(value: Any) -> bool:
     """Return whether a value is a finite number that a float can hold."""
     return isinstance(value, int | float) and not isinstance(value, bool) and -MAX_NUMBER < value < MAX_NUMBER

@@ -3,14 +3,13 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from stereovox.errors import SourceError
-from stereovox.safe_io import MAX_LIST, is_number, json_value, read_text
+from stereovox.safe_io import MAX_LIST, is_number, read_json, read_text
 
 Intrinsics = tuple[float, float, float, float]
 """fx, fy, cx, cy in pixels."""
@@ -77,7 +76,7 @@ def read_camera_numbers(path: Path) -> CameraNumbers:
         SourceError: One line with the file and what is wrong.
     """
     if path.suffix.lower() == ".json":
-        return _of_table(path, _json(path))
+        return _of_table(path, read_json(path))
     if path.suffix.lower() in (".yaml", ".yml"):
         from stereovox.sources.calibration_files import read_yaml
 
@@ -200,13 +199,6 @@ def _assignments(text: str) -> Iterator[tuple[str, Any]]:
             continue
         if equals and numbers:
             yield key.strip(), numbers if len(numbers) > 1 else numbers[0]
-
-
-def _json(path: Path) -> Any:
-    try:
-        return json_value(_text(path))
-    except (ValueError, json.JSONDecodeError) as error:
-        raise SourceError(f"{path}: no JSON that can be read ({error}); write it again") from None
 
 
 def _text(path: Path) -> str:

@@ -12,7 +12,7 @@ import numpy as np
 
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.errors import SourceError
-from stereovox.safe_io import MAX_LIST, is_number, json_value, read_bounded
+from stereovox.safe_io import MAX_LIST, is_number, read_bounded, read_json
 from stereovox.se3 import Transform
 from stereovox.sources.base import Part
 from stereovox.sources.camera_file import FoundCamera, pinhole
@@ -119,12 +119,7 @@ class NerfTransforms(DepthFolder):
 
 def _read(path: Path) -> Table:
     """Return the table of a transforms.json with at least one frame; raises SourceError."""
-    try:
-        table = json_value(read_bounded(path, MAX_LIST))
-    except OSError as error:
-        raise SourceError(f"{path}: {error.strerror}; make it readable") from None
-    except ValueError as error:
-        raise SourceError(f"{path}: no JSON that can be read ({error}); write it again") from None
+    table = read_json(path)
     frames = table.get("frames") if isinstance(table, dict) else None
     if not isinstance(frames, list) or not frames or not all(isinstance(frame, dict) for frame in frames):
         raise SourceError(f"{path}: has no list of frames; it must be as nerfstudio or instant-ngp writes it")

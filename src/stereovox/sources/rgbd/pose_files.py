@@ -27,7 +27,7 @@ from pathlib import Path
 import numpy as np
 
 from stereovox.errors import FrameRefused, SourceError
-from stereovox.safe_io import MAX_LIST, is_number, json_value, read_bounded, read_text
+from stereovox.safe_io import MAX_LIST, is_number, read_bounded, read_json, read_text
 from stereovox.se3 import Transform, from_quaternion, inverse
 from stereovox.sources.poses import Poses
 from stereovox.sources.tracker import AXES
@@ -191,10 +191,7 @@ def read_pose_folder(path: Path, pattern: str = r".*\.(txt|pose)") -> ImagePoses
 
 def _of_json(path: Path) -> ImagePoses:
     """Return the poses of Open3D's PinholeCameraTrajectory; matrices are column by column, world to camera."""
-    try:
-        table = json_value(read_text(path, MAX_LIST))
-    except (OSError, ValueError) as error:
-        raise SourceError(f"{path}: no JSON that can be read ({error}); write it again") from None
+    table = read_json(path)
     cameras = table.get("parameters") if isinstance(table, dict) else None
     matrices = [_extrinsic(camera) for camera in cameras] if isinstance(cameras, list) else []
     if not matrices or not all(matrices):

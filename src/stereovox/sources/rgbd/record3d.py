@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from stereovox.errors import SourceError
-from stereovox.safe_io import MAX_LIST, is_number, json_value, read_text
+from stereovox.safe_io import is_number, read_json
 from stereovox.se3 import Transform, from_quaternion
 from stereovox.sources.base import Part
 from stereovox.sources.camera_file import FoundCamera, pinhole
@@ -80,12 +80,7 @@ class Record3D(DepthFolder):
 
 
 def _read(path: Path) -> dict[str, Any]:
-    try:
-        table = json_value(read_text(path, MAX_LIST))
-    except OSError as error:
-        raise SourceError(f"{path}: {error.strerror}; export again") from None
-    except ValueError as error:
-        raise SourceError(f"{path}: no JSON that can be read ({error}); export again") from None
+    table = read_json(path)
     if not isinstance(table, dict):
         raise SourceError(f"{path}: holds no table; export again")
     return table

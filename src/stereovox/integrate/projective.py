@@ -247,7 +247,8 @@ class WindowBuilder:
         size = pitch * (2 * h + -(-h // 2))
         self._scratch = np.zeros(size, np.float32), np.zeros((4, pitch), np.float32), *np.zeros((4, pitch), np.float32)
         lows, highs = np.zeros((2, tiles.prod(axis=2).sum()), np.float32)
-        image = np.append(np.zeros(size, np.float32), _projective.UNSEEN)
+        image = np.zeros(size + 1, np.float32)
+        image[size] = _projective.UNSEEN
         self._windows = Windows(
             image, np.int32(pitch), np.int32(h), lows, highs,
             tile_offset, np.ascontiguousarray(tiles[:, :, 1], np.int32), np.int32(0),

@@ -36,6 +36,19 @@ LANES = 64
 
 
 @kernel
+def find(depth_m, view, table, full_share, scratch, listed, pool_table, coords, count, values, lanes):
+    """Write the evidence of a hit to every cell that holds a measured point; return how many there are.
+
+    -1 when the block pool is full. Arguments: see `scatter`, whose scratch is `HitScratch`, and `weigh`.
+    """
+    keys, news, fresh, seen = scratch
+    n = scatter(depth_m, view, keys, news, fresh, seen, listed, pool_table, coords, count, values)
+    if n > 0:
+        weigh(depth_m, view, table, full_share, listed, n, coords, values, lanes)
+    return n
+
+
+@kernel
 def scatter(depth_m, view, keys, news, fresh, seen, listed, pool_table, coords, count, values):
     """Set every cell that holds a measured point to 1; return how many there are, -1 when the block pool is full.
 

@@ -207,6 +207,11 @@ class Views:
             steps=np.zeros((3, SIDE**3), np.float32),
         )
 
+    @property
+    def spread(self) -> np.float32:
+        """Size of the tiles of a cell's window image in pixels, times depth."""
+        return self._view.spread
+
     def at(self, T_world_camera: Transform) -> View:
         """Return the view from this pose; `block` is then the block (3,) the camera stands in."""
         view = self._view

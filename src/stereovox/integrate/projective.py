@@ -45,6 +45,8 @@ ROOM = 4096
 """Initial capacity of a camera's block lists."""
 WORTH_A_THREAD = 256
 """Blocks whose evaluation takes longer than waking a thread."""
+WEIGHED_BY_A_THREAD = 2048
+"""Cells with hits whose weighing does."""
 
 
 class Projective:
@@ -67,10 +69,14 @@ class Projective:
         depth_m = image.depth_m
         view = eye.views.at(image.T_world_sensor)
         threads = self._config.threads if eye.mixed_before >= 2 * WORTH_A_THREAD else 1
-        _, (windows, n_free, n_mixed) = run_both(
+        n_hits, (windows, n_free, n_mixed) = run_both(
             threads,
-            lambda: eye.hits.find(depth_m, view),
+            lambda: eye.hits.scatter(depth_m, view),
             lambda: eye.candidates(depth_m, ends, view),
+        )
+        in_shards(
+            lambda part: eye.hits.weigh(depth_m, view, part),
+            shards(n_hits, min(threads, n_hits // WEIGHED_BY_A_THREAD or 1)),
         )
         free, free_values, mixed, hit_of = eye.with_hits(view, n_free, n_mixed)
         eye.mixed_before = len(mixed)
@@ -160,8 +166,8 @@ def _eyes_of_faces(sensor: InverseSensorModel, config: Config, camera: WideCamer
 class HitFinder:
     """Finds the hits of one camera, and keeps the memory for them.
 
-    blocks: the result of `find`: evidence in thousandths on each cell that holds a point, 0 elsewhere; blocks count
-    from the one the camera stands in.
+    blocks: the result, once `scatter` has found the cells and `weigh` has weighed them all: evidence in thousandths
+    on each cell that holds a point, 0 elsewhere; blocks count from the one the camera stands in.
     """
 
     def __init__(self, camera: PinholeCamera, table: KernelTable, config: Config):
@@ -175,33 +181,40 @@ class HitFinder:
             np.zeros(_hits.SEEN, kind),
         )  # fmt: skip
         self._listed = np.zeros(camera.height * camera.width, np.int32)
-        floats, ints = np.zeros((11, _hits.LANES), np.float32), np.zeros(_hits.LANES, np.int32)
-        self._lanes = HitLanes._make([*floats, ints])
 
-    def find(self, depth_m: NDArray[np.float32], view: View) -> None:
-        """Fill `blocks` from a REP 117 depth image."""
+    def scatter(self, depth_m: NDArray[np.float32], view: View) -> int:
+        """Find the cells that hold points of a REP 117 depth image; return how many there are."""
         blocks = self.blocks
         blocks.clear()
-        while self._find(depth_m, view) < 0:
+        while (n := self._scatter(depth_m, view)) < 0:
             check_blocks(2 * len(blocks.coords), self._camera)
             blocks.clear()
             blocks.reserve(2 * len(blocks.coords))
+        return n
 
-    def _find(self, depth_m: NDArray[np.float32], view: View) -> int:
-        pool = self.blocks
-        return _hits.find(
-            depth_m, view, self._table, self._full_share, self._scratch, self._listed, pool.table, pool.coords,
-            pool.count, pool.values, self._lanes,
+    def weigh(self, depth_m: NDArray[np.float32], view: View, part: slice) -> None:
+        """Write the evidence of a part of the cells that were found."""
+        listed, blocks = self._listed[part], self.blocks
+        _hits.weigh(
+            depth_m, view, self._table, self._full_share, listed, blocks.coords, blocks.values, _hit_lanes()
         )  # fmt: skip
+
+    def _scatter(self, depth_m: NDArray[np.float32], view: View) -> int:
+        blocks = self.blocks
+        return _hits.scatter(
+            depth_m, view, self._scratch, self._listed, blocks.table, blocks.coords, blocks.count, blocks.values
+        )
 
 
 class HitScratch(NamedTuple):
     """Memory of `_hits.scatter`."""
 
-    keys: NDArray[np.signedinteger]  # (2, w + 1) cells of the pixels of two rows
+    keys: NDArray[
+        np.signedinteger
+    ]  # (2, w + 1); int32 serves cells within 2^9 of the camera, int64 the rest
     news: NDArray[np.uint8]  # (w rounded up to GROUP,) whether a pixel's cell is none of those beside it
     fresh: NDArray[np.int32]  # one longer: the pixels with such cells
-    seen: NDArray[np.signedinteger]  # (SEEN,) recently entered cells
+    seen: NDArray[np.signedinteger]  # (SEEN,) keys of recently entered cells
 
 
 class HitLanes(NamedTuple):
@@ -219,6 +232,11 @@ class HitLanes(NamedTuple):
     depth: NDArray[np.float32]  # measured at the present sample
     counts: NDArray[np.float32]  # whether that lies inside the image, 0 or 1
     at: NDArray[np.int32]  # its pixel
+
+
+def _hit_lanes() -> HitLanes:
+    floats, ints = np.empty((11, _hits.LANES), np.float32), np.empty(_hits.LANES, np.int32)
+    return HitLanes._make([*floats, ints])
 
 
 class Windows(NamedTuple):

@@ -37,7 +37,7 @@ from stereovox.maps.blocks import CELLS, BlockPool
 from stereovox.maps.evidence import Evidence
 from stereovox.sensors import make_sensor
 from stereovox.sensors.model import InverseSensorModel
-from stereovox.threads import in_shards, run_both, shards
+from stereovox.threads import Scratch, in_shards, run_both, shards
 
 LEVELS = _windows.COARSEST + 1
 """Number of window sizes: one pixel, and three tiles of 1 to 128 pixels."""
@@ -84,9 +84,8 @@ class Projective:
         hits = eye.hits.blocks.values
 
         def one_shard(part: slice) -> None:
-            _projective.evaluate(
-                depth_m, view, eye.table, windows, mixed[part], hit_of[part], hits, values[part], _layer_scratch()
-            )  # fmt: skip
+            blocks = mixed[part], hit_of[part], hits, values[part]
+            eye.layers.lend(lambda layer: _projective.evaluate(depth_m, view, eye.table, windows, *blocks, layer))
 
         in_shards(one_shard, shards(len(mixed), min(threads, len(mixed) // WORTH_A_THREAD or 1)))
         origin = eye.views.block
@@ -120,6 +119,7 @@ class _Eye:
         self._windows = make_windows(camera, float(self.views.spread) / config.max_range)
         self._free, self._mixed = (np.empty((ROOM, 3), np.int32) for _ in range(2))
         self._stack = np.empty((_projective.STACK, 4), np.int32)
+        self.layers = Scratch(_layer_scratch)
 
     def candidates(
         self, depth_m: NDArray[np.float32], ends: NDArray[np.float32], view: View
@@ -181,6 +181,7 @@ class HitFinder:
             np.zeros(_hits.SEEN, kind),
         )  # fmt: skip
         self._listed = np.zeros(camera.height * camera.width, np.int32)
+        self._lanes = Scratch(_hit_lanes)
 
     def scatter(self, depth_m: NDArray[np.float32], view: View) -> int:
         """Find the cells that hold points of a REP 117 depth image; return how many there are."""
@@ -194,10 +195,8 @@ class HitFinder:
 
     def weigh(self, depth_m: NDArray[np.float32], view: View, part: slice) -> None:
         """Write the evidence of a part of the cells that were found."""
-        listed, blocks = self._listed[part], self.blocks
-        _hits.weigh(
-            depth_m, view, self._table, self._full_share, listed, blocks.coords, blocks.values, _hit_lanes()
-        )  # fmt: skip
+        hits = self._listed[part], self.blocks.coords, self.blocks.values
+        self._lanes.lend(lambda lanes: _hits.weigh(depth_m, view, self._table, self._full_share, *hits, lanes))
 
     def _scatter(self, depth_m: NDArray[np.float32], view: View) -> int:
         blocks = self.blocks
@@ -209,9 +208,7 @@ class HitFinder:
 class HitScratch(NamedTuple):
     """Memory of `_hits.scatter`."""
 
-    keys: NDArray[
-        np.signedinteger
-    ]  # (2, w + 1); int32 serves cells within 2^9 of the camera, int64 the rest
+    keys: NDArray[np.signedinteger]  # (2, w + 1); int32 serves cells within 2^9 of the camera, int64 the rest
     news: NDArray[np.uint8]  # (w rounded up to GROUP,) whether a pixel's cell is none of those beside it
     fresh: NDArray[np.int32]  # one longer: the pixels with such cells
     seen: NDArray[np.signedinteger]  # (SEEN,) keys of recently entered cells

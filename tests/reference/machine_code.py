@@ -165,7 +165,7 @@ class _OtherProcessor(codegen.CPUCodegen):
     def _init(self, llvm_module: llvm.ModuleRef) -> None:
         target = llvm.Target.from_triple(self._triple)
         self._tm: Any = target.create_target_machine(
-            cpu=self._cpu, features="", opt=config.OPT, reloc="static", codemodel="jitdefault", jit=True
+            cpu=self._cpu, features="", opt=vars(config)["OPT"], reloc="static", codemodel="jitdefault", jit=True
         )
         self._data_layout: Any = str(self._tm.target_data)
         self._loopvect, self._opt_level = False, 0  # of the first, cheap pass, as in numba's own

@@ -139,11 +139,13 @@ def _eye(sensor: InverseSensorModel, config: Config, camera: VirtualCamera) -> _
 class Lanes(NamedTuple):
     """State of the lanes, one number each. Depths along the optical axis in metres, places in cells from its block."""
 
+    column: Floats  # x/z of the ray
     depth: Floats  # measured depth, NO_RETURN for nothing up to the maximum range
     end: Floats  # depth at which the ray ends, negative for a lane without a ray
     entered: Floats  # depth at which the ray entered its present cell (or the depth of the sample)
     row: Ints  # row of the sensor table
     columns: Floats  # table columns a metre
+    reach: Floats  # half width of the sensor table's row
     x: Floats  # the face at which the ray leaves its cell along x: whole numbers, as floats because they meet floats
     y: Floats
     z: Floats
@@ -153,6 +155,9 @@ class Lanes(NamedTuple):
     hit: Keys  # key of the cell that holds the measured point, -1 without one
     cell: Keys  # key of the cell the ray goes into next
     key: Keys  # key of the cell that is given evidence in this step
+    middle: Floats  # depth in the middle of the ray's way through it, NOWHERE for no evidence
+    place: Ints  # where this stands in the sensor table, then the number there
+    passed: Ints  # the same for the largest loss
     gain: Ints  # and the evidence
     last: Ints  # whether the next lane differs
     run_key: Keys  # cells and gains of runs of neighbouring lanes

@@ -27,6 +27,8 @@ from stereovox.maps._cells import find_or_insert
 
 LANES = 32
 """Neighbouring pixels of a row that are walked in step."""
+GROUP_BITS = 3
+"""Binary logarithm of the lanes whose gains are summed one after the other."""
 MEMORY_BITS = 9
 """Binary logarithm of the blocks whose places are cached beside the pool's hash: 8 along each axis."""
 NOWHERE = np.float32(-1e30)
@@ -161,7 +163,7 @@ def weighted(e, depth, weight):
 
 @cell
 def aim_at_hits(lanes, table, weight):
-    """Select the measured points' cells to be given evidence; return runs and total for `give`."""
+    """Select the measured points' cells to be given evidence; return starts and total for `give`."""
     for i in range(LANES):
         lanes.gain[i] = table.hit[np.uint32(lanes.row[i])]
     total = np.int32(0)
@@ -170,67 +172,71 @@ def aim_at_hits(lanes, table, weight):
         gain = weighted(lanes.gain[i], lanes.depth[i], weight) if hit >= 0 else np.int32(0)
         lanes.key[i], lanes.gain[i] = hit, gain
         total = np.int32(total + gain)
-    return mark_runs(lanes), total
+    return starts_of_runs(lanes), total
 
 
 @cell
-def mark_runs(lanes):
-    """Mark the last of each run of lanes in one cell; return how many runs there are."""
-    lanes.key[LANES] = -1
-    runs = np.int32(0)
+def starts_of_runs(lanes):
+    """Return which lanes begin a run of lanes in one cell, one bit each; the first may lack."""
+    starts, before = np.int32(0), lanes.key[0]
     for i in range(LANES):
-        last = np.int32(lanes.key[i] != lanes.key[i + 1])
-        lanes.last[i] = last
-        runs = np.int32(runs + last)
-    return runs
+        key = lanes.key[i]
+        starts = np.int32(starts | (lanes.bit[i] if key != before else np.int32(0)))
+        before = key
+    return starts
 
 
 @cell
-def give(lanes, runs, total, plain, weight, memory, pool_table, coords, count, values):
+def give(lanes, starts, total, plain, weight, memory, pool_table, coords, count, values):
     """Give the gains of all lanes to their cells; return False when the block pool is full.
 
-    weight: gains of one cell add up; None: the strongest counts. runs: see `mark_runs`. total: sum of all gains. plain:
-    the largest loss that any lane may give, where none gives positive evidence; 0 where lanes differ.
+    weight: gains of one cell add up; None: the strongest counts. starts: see `starts_of_runs`. total: sum of all gains.
+    plain: the largest loss that any lane may give, where none gives positive evidence; 0 where lanes differ.
     """
     b = np.int64(bits(lanes.key))
-    if weight is None:
-        if (plain == 0) | (total != np.int32(LANES * plain)):
-            runs = _mark_unlike(lanes)
-        total = lanes.gain[0]
-    if runs <= 1:
-        return _enter(lanes.key[0], b, total, weight, memory, pool_table, coords, count, values)
-    room, before = True, np.int32(0)
-    for r in range(_gather(lanes, weight)):
-        run_gain = lanes.run_gain[r]
-        gain = np.int32(run_gain - before)
-        room &= _enter(lanes.run_key[r], b, gain, weight, memory, pool_table, coords, count, values)
-        if weight is not None:
-            before = run_gain
-    return room
+    if weight is None and (plain == 0) | (total != np.int32(LANES * plain)):
+        starts = _starts_of_unlike(lanes)
+    rest = np.int64(starts) & np.int64(0xFFFFFFFE)
+    if weight is not None and rest != 0:
+        _add_up(lanes)
+    room, at, before = True, np.uint32(0), np.int32(0)
+    while rest != 0:
+        low = rest & -rest
+        rest ^= low
+        following = np.uint32((bits_of(np.float32(low)) >> np.int32(23)) - np.int32(127))  # the exponent: its place
+        if weight is None:
+            gain = lanes.gain[at]
+        else:
+            sums = np.int32(lanes.within[following] + lanes.groups[following >> np.uint32(GROUP_BITS)])
+            gain = np.int32(sums - before)
+            before = sums
+        room &= _enter(lanes.key[at], b, gain, weight, memory, pool_table, coords, count, values)
+        at = following
+    gain = lanes.gain[at] if weight is None else np.int32(total - before)
+    return _enter(lanes.key[at], b, gain, weight, memory, pool_table, coords, count, values) & room
 
 
 @cell
-def _mark_unlike(lanes):
-    """Mark the last of each run of lanes with the same cell and gain; return how many runs there are."""
-    lanes.key[LANES] = -1
-    runs = np.int32(0)
+def _starts_of_unlike(lanes):
+    """Return which lanes begin a run of lanes with the same cell and gain, as `starts_of_runs` does."""
+    starts, before, other = np.int32(0), lanes.key[0], lanes.gain[0]
     for i in range(LANES):
-        last = np.int32((lanes.key[i] != lanes.key[i + 1]) | (lanes.gain[i] != lanes.gain[i + 1]))
-        lanes.last[i] = last
-        runs = np.int32(runs + last)
-    return runs
+        key, gain = lanes.key[i], lanes.gain[i]
+        starts = np.int32(starts | (lanes.bit[i] if (key != before) | (gain != other) else np.int32(0)))
+        before, other = key, gain
+    return starts
 
 
 @cell
-def _gather(lanes, weight):
-    """List the gains of the runs of lanes; return how many there are. Sums run on from one to the next. No branches."""
-    runs, total = np.uint64(0), np.int32(0)  # unsigned: no check for indices that count from the end
-    for i in range(LANES):
-        total = lanes.gain[i] if weight is None else np.int32(total + lanes.gain[i])
-        lanes.run_key[runs] = lanes.key[i]
-        lanes.run_gain[runs] = total
-        runs += np.uint64(lanes.last[i])
-    return np.int64(runs)
+def _add_up(lanes):
+    """Sum the gains of the lanes before each one: those `within` its group, and all of earlier `groups`."""
+    total = np.int32(0)
+    for g in range(LANES >> GROUP_BITS):  # short chains, which the processor follows at the same time
+        lanes.groups[g], within = total, np.int32(0)
+        for i in range(g << GROUP_BITS, (g + 1) << GROUP_BITS):
+            lanes.within[i] = within
+            within = np.int32(within + lanes.gain[i])
+        total = np.int32(total + within)
 
 
 @cell

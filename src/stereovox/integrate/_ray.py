@@ -20,7 +20,7 @@ from stereovox.integrate._lanes import (
     free_space,
     give,
     in_step,
-    mark_runs,
+    starts_of_runs,
 )
 
 OFF_FACE = np.float32(1e-3)
@@ -55,12 +55,12 @@ def cast(depth_m, view, table, look_up, weight, lanes, memory, pool_table, coord
             while going:
                 plain = table.free if reached < free_to else np.int32(0)
                 tableless = reached < min(free_to, even)
-                reached, going, runs = _step(lanes, position, signs)
+                reached, going, starts = _step(lanes, position, signs)
                 total = free_space(lanes, table, weight) if tableless else evidence(lanes, look_up, table, weight)
-                if not give(lanes, runs, total, plain, weight, memory, pool_table, coords, count, values):
+                if not give(lanes, starts, total, plain, weight, memory, pool_table, coords, count, values):
                     return False
-            runs, total = aim_at_hits(lanes, table, weight)
-            if not give(lanes, runs, total, np.int32(0), weight, memory, pool_table, coords, count, values):
+            starts, total = aim_at_hits(lanes, table, weight)
+            if not give(lanes, starts, total, np.int32(0), weight, memory, pool_table, coords, count, values):
                 return False
     return True
 
@@ -82,15 +82,14 @@ def _start(ray, position, signs, lanes):
 
 @cell
 def _step(lanes, position, signs):
-    """Fill key, middle and last of the lanes for the cells they are in and move to the next ones.
+    """Fill key and middle of the lanes for the cells they are in and move to the next ones.
 
-    Return the depth that the farthest ray has reached, whether any goes on, and the runs for `give`.
+    Return the depth that the farthest ray has reached, whether any goes on, and the starts for `give`.
     """
     px, py, pz = position
     sx, sy, sz = signs
     by_x, by_y, by_z = strides(signs, lanes.cell)
-    lanes.cell[LANES] = -1
-    runs = np.int32(0)
+    starts, before = np.int32(0), lanes.cell[0]
     reached = np.int32(0)  # the bits of a float that is not negative: those can be compared many at once
     for i in range(LANES):
         x, y, z = lanes.x[i], lanes.y[i], lanes.z[i]
@@ -100,9 +99,9 @@ def _step(lanes, position, signs):
         left = min(min(tx, ty), tz)
         entered, end = lanes.entered[i], lanes.end[i]
         key = lanes.cell[i]
-        last = np.int32(key != lanes.cell[i + 1])
-        lanes.key[i], lanes.last[i] = key, last
-        runs = np.int32(runs + last)
+        lanes.key[i] = key
+        starts = np.int32(starts | (lanes.bit[i] if key != before else np.int32(0)))
+        before = key
         lanes.middle[i] = HALF * (entered + min(left, end)) if (entered <= end) & (key != lanes.hit[i]) else NOWHERE
         along_x = tx <= left
         along_y = (ty <= left) & (not along_x)
@@ -113,7 +112,7 @@ def _step(lanes, position, signs):
         lanes.cell[i] = key + (by_x if along_x else by_yz)
         lanes.entered[i] = left if left < end else BEYOND
         reached = max(reached, bits_of(max(left, TINY) if left < end else ZERO))  # the first cell may end at depth zero
-    return float_of(reached), reached > 0, runs
+    return float_of(reached), reached > 0, starts
 
 
 @cell
@@ -150,11 +149,11 @@ def draw(depth_m, view, table, look_up, weight, lanes, memory, pool_table, coord
                 reached, going = _line_step(lanes, number, start)
                 total = free_space(lanes, table, weight) if tableless else evidence(lanes, look_up, table, weight)
                 number += ONE
-                runs = mark_runs(lanes)
-                if not give(lanes, runs, total, plain, weight, memory, pool_table, coords, count, values):
+                starts = starts_of_runs(lanes)
+                if not give(lanes, starts, total, plain, weight, memory, pool_table, coords, count, values):
                     return False
-            runs, total = aim_at_hits(lanes, table, weight)
-            if not give(lanes, runs, total, np.int32(0), weight, memory, pool_table, coords, count, values):
+            starts, total = aim_at_hits(lanes, table, weight)
+            if not give(lanes, starts, total, np.int32(0), weight, memory, pool_table, coords, count, values):
                 return False
     return True
 

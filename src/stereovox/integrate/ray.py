@@ -159,9 +159,9 @@ class Lanes(NamedTuple):
     place: Ints  # where this stands in the sensor table, then the number there
     passed: Ints  # the same for the largest loss
     gain: Ints  # and the evidence
-    last: Ints  # whether the next lane differs
-    run_key: Keys  # cells and gains of runs of neighbouring lanes
-    run_gain: Ints
+    within: Ints  # sums of gains of earlier lanes of the same group
+    groups: Ints  # sums of gains of earlier groups
+    bit: Ints  # the lane's own bit: 1, 2, 4
 
 
 class Memory(NamedTuple):
@@ -175,7 +175,8 @@ def make_lanes(wide: bool) -> Lanes:
     """Return scratch with keys of 64 bits (`wide`) or 32 bits, which serve cells within 2^9 of the camera."""
     types = {"Floats": np.float32, "Ints": np.int32, "Keys": np.int64 if wide else np.int32}
     kinds = {name: getattr(kind, "__forward_arg__", kind) for name, kind in Lanes.__annotations__.items()}
-    arrays: dict[str, Any] = {name: np.full(LANES + 1, -2, types[kind]) for name, kind in kinds.items()}
+    arrays: dict[str, Any] = {name: np.full(LANES, -2, types[kind]) for name, kind in kinds.items()}
+    arrays["bit"] = (1 << np.arange(LANES, dtype=np.uint32)).view(np.int32)
     return Lanes(**arrays)
 
 

@@ -31,18 +31,19 @@ TINY = np.float32(1e-30)
 
 
 @kernel
-def cast(depth_m, view, table, look_up, weight, lanes, memory, pool_table, coords, count, values, first_row, last_row):
-    """Add the evidence of all rays of rows first_row..last_row to an empty pool; return False when it is too small.
+def cast(depth_m, view, table, look_up, weight, lanes, memory, pool_table, coords, count, values, first, stop, step):
+    """Add the evidence of all rays of some rows to an empty pool; return False when it is too small.
 
     depth_m: (h, w) REP 117 depth image. look_up: the sensor table (rows * columns,), both signs together.
     weight: every ray adds its evidence to every cell it crosses, times min(1, weight * depth^2) (Chien 2020, Eq 3.21),
     in units of 1/1024 thousandths; None: a cell keeps the strongest. Blocks count from the camera's own.
+    first, stop, step: every `step`-th row from `first` on, up to `stop`.
     """
     size = ONE / view.voxel_size
     position = view.position[0] * size, view.position[1] * size, view.position[2] * size
     memory.block[:] = -1
     even = even_to(table, view)
-    for v in range(first_row, last_row):
+    for v in range(first, stop, step):
         ray, u = _row_rays(view.forward, view.rows[v], size), 0
         while u < depth_m.shape[1]:
             n, signs = in_step(view.columns[u : u + LANES], ray)
@@ -127,14 +128,14 @@ def _inverse(direction):
 
 
 @kernel
-def draw(depth_m, view, table, look_up, weight, lanes, memory, pool_table, coords, count, values, first_row, last_row):
-    """Add the evidence of all lines of rows first_row..last_row to an empty pool; arguments as in `cast`."""
+def draw(depth_m, view, table, look_up, weight, lanes, memory, pool_table, coords, count, values, first, stop, step):
+    """Add the evidence of all lines of some rows to an empty pool; arguments as in `cast`."""
     size = ONE / view.voxel_size
     position = view.position[0] * size, view.position[1] * size, view.position[2] * size
     start = _off_faces(position[0]), _off_faces(position[1]), _off_faces(position[2])
     memory.block[:] = -1
     even = even_to(table, view)
-    for v in range(first_row, last_row):
+    for v in range(first, stop, step):
         ray = _row_rays(view.forward, view.rows[v], size)
         for u in range(0, depth_m.shape[1], LANES):
             columns = view.columns[u : u + LANES]

@@ -166,31 +166,23 @@ def aim_at_hits(lanes, table, weight):
     """Select the measured points' cells to be given evidence; return starts and total for `give`."""
     for i in range(LANES):
         lanes.gain[i] = table.hit[np.uint32(lanes.row[i])]
-    total = np.int32(0)
+    total, starts, before = np.int32(0), np.int32(0), lanes.hit[0]
     for i in range(LANES):
         hit = lanes.hit[i]
         gain = weighted(lanes.gain[i], lanes.depth[i], weight) if hit >= 0 else np.int32(0)
         lanes.key[i], lanes.gain[i] = hit, gain
         total = np.int32(total + gain)
-    return starts_of_runs(lanes), total
-
-
-@cell
-def starts_of_runs(lanes):
-    """Return which lanes begin a run of lanes in one cell, one bit each; the first may lack."""
-    starts, before = np.int32(0), lanes.key[0]
-    for i in range(LANES):
-        key = lanes.key[i]
-        starts = np.int32(starts | (lanes.bit[i] if key != before else np.int32(0)))
-        before = key
-    return starts
+        starts = np.int32(starts | (lanes.bit[i] if hit != before else np.int32(0)))
+        before = hit
+    return starts, total
 
 
 @cell
 def give(lanes, starts, total, plain, weight, memory, pool_table, coords, count, values):
     """Give the gains of all lanes to their cells; return False when the block pool is full.
 
-    weight: gains of one cell add up; None: the strongest counts. starts: see `starts_of_runs`. total: sum of all gains.
+    starts: lanes in another cell than the one before, a bit each; that of the first says nothing. total: of all gains.
+    weight: gains of one cell add up; None: the strongest counts.
     plain: the largest loss that any lane may give, where none gives positive evidence; 0 where lanes differ.
     """
     b = np.int64(bits(lanes.key))
@@ -218,7 +210,7 @@ def give(lanes, starts, total, plain, weight, memory, pool_table, coords, count,
 
 @cell
 def _starts_of_unlike(lanes):
-    """Return which lanes begin a run of lanes with the same cell and gain, as `starts_of_runs` does."""
+    """Return which lanes begin a run of lanes with the same cell and gain, as in `give`."""
     starts, before, other = np.int32(0), lanes.key[0], lanes.gain[0]
     for i in range(LANES):
         key, gain = lanes.key[i], lanes.gain[i]

@@ -20,7 +20,6 @@ from stereovox.integrate._lanes import (
     free_space,
     give,
     in_step,
-    starts_of_runs,
 )
 
 OFF_FACE = np.float32(1e-3)
@@ -147,10 +146,9 @@ def draw(depth_m, view, table, look_up, weight, lanes, memory, pool_table, coord
             while going:
                 plain = table.free if reached < free_to else np.int32(0)
                 tableless = reached < min(free_to, even)
-                reached, going = _line_step(lanes, number, start)
+                reached, going, starts = _line_step(lanes, number, start)
                 total = free_space(lanes, table, weight) if tableless else evidence(lanes, look_up, table, weight)
                 number += ONE
-                starts = starts_of_runs(lanes)
                 if not give(lanes, starts, total, plain, weight, memory, pool_table, coords, count, values):
                     return False
             starts, total = aim_at_hits(lanes, table, weight)
@@ -180,9 +178,10 @@ def _line_start(ray, lanes):
 def _line_step(lanes, number, start):
     """Fill key and middle of the lanes at sample `number`.
 
-    Return the depth of the farthest ray's next sample, and whether there is any.
+    Return the depth of the farthest ray's next sample, whether there is any, and the starts for `give`.
     """
     px, py, pz = start
+    starts, before = np.int32(0), lanes.key.dtype.type(-1)
     reached = np.int32(0)  # the bits of a float that is not negative: those can be compared many at once
     for i in range(LANES):
         depth, end = number * lanes.entered[i], lanes.end[i]
@@ -191,7 +190,9 @@ def _line_step(lanes, number, start):
         z = np.int32(np.floor(depth * lanes.per_z[i] + pz))
         key = pack(x, y, z, lanes.key)
         lanes.key[i] = key
+        starts = np.int32(starts | (lanes.bit[i] if key != before else np.int32(0)))
+        before = key
         lanes.middle[i] = depth if (depth <= end) & (key != lanes.hit[i]) else NOWHERE
         following = depth + lanes.entered[i]
         reached = max(reached, bits_of(following if following <= end else ZERO))
-    return float_of(reached), reached > 0
+    return float_of(reached), reached > 0, starts

@@ -78,10 +78,7 @@ def aim(depths, columns, ray, position, view, table, lanes):
 
     depths, columns: REP 117 depth and x/z of at most LANES pixels of one image row. ray: see `_row_rays`.
     """
-    rows = table.hit.size
-    _take(depths, columns, lanes)
-    for i in range(LANES):
-        lanes.row[i] = table_row(min(lanes.depth[i], view.max_range), table.rows_per_metre, rows)
+    _take(depths, columns, view, table, lanes)
     for i in range(LANES):
         row = np.uint32(lanes.row[i])
         lanes.columns[i], lanes.reach[i] = table.columns_per_metre[row], table.reach[row]
@@ -102,13 +99,15 @@ def aim(depths, columns, ray, position, view, table, lanes):
 
 
 @cell
-def _take(depths, columns, lanes):
-    """Put a run of pixels into the lanes. Those left over follow the last pixel without a ray of their own."""
+def _take(depths, columns, view, table, lanes):
+    """Fill depth, row and column of the lanes. Those left over go along with the last pixel, and end at once."""
     n = depths.size
     for i in range(n):
-        lanes.depth[i], lanes.column[i] = usable(depths[i]), columns[i]
+        d = usable(depths[i])
+        row = table_row(min(d, view.max_range), table.rows_per_metre, table.hit.size)
+        lanes.depth[i], lanes.row[i], lanes.column[i] = d, row, columns[i]
     for i in range(n, LANES):
-        lanes.depth[i], lanes.column[i] = ZERO, columns[n - 1]
+        lanes.depth[i], lanes.row[i], lanes.column[i] = ZERO, np.int32(0), columns[n - 1]
 
 
 @cell
@@ -172,9 +171,15 @@ def aim_at_hits(lanes, table, weight):
         gain = weighted(lanes.gain[i], lanes.depth[i], weight) if hit >= 0 else np.int32(0)
         lanes.key[i], lanes.gain[i] = hit, gain
         total = np.int32(total + gain)
-        starts = np.int32(starts | (lanes.bit[i] if hit != before else np.int32(0)))
+        starts = np.int32(starts | bit_if(hit != before, lanes.bit[i]))
         before = hit
     return starts, total
+
+
+@cell
+def bit_if(differs, bit):
+    """Return `bit` where something differs, 0 elsewhere; never a branch, which would end the vectors of some processors."""
+    return np.int32(bit & np.int32(-np.int32(differs)))
 
 
 @cell
@@ -214,7 +219,7 @@ def _starts_of_unlike(lanes):
     starts, before, other = np.int32(0), lanes.key[0], lanes.gain[0]
     for i in range(LANES):
         key, gain = lanes.key[i], lanes.gain[i]
-        starts = np.int32(starts | (lanes.bit[i] if (key != before) | (gain != other) else np.int32(0)))
+        starts = np.int32(starts | bit_if((key != before) | (gain != other), lanes.bit[i]))
         before, other = key, gain
     return starts
 

@@ -15,6 +15,7 @@ from stereovox.integrate._lanes import (
     NOWHERE,
     aim,
     aim_at_hits,
+    bit_if,
     even_to,
     evidence,
     free_space,
@@ -100,7 +101,7 @@ def _step(lanes, position, signs):
         entered, end = lanes.entered[i], lanes.end[i]
         key = lanes.cell[i]
         lanes.key[i] = key
-        starts = np.int32(starts | (lanes.bit[i] if key != before else np.int32(0)))
+        starts = np.int32(starts | bit_if(key != before, lanes.bit[i]))
         before = key
         lanes.middle[i] = HALF * (entered + min(left, end)) if (entered <= end) & (key != lanes.hit[i]) else NOWHERE
         along_x = tx <= left
@@ -190,7 +191,7 @@ def _line_step(lanes, number, start):
         z = np.int32(np.floor(depth * lanes.per_z[i] + pz))
         key = pack(x, y, z, lanes.key)
         lanes.key[i] = key
-        starts = np.int32(starts | (lanes.bit[i] if key != before else np.int32(0)))
+        starts = np.int32(starts | bit_if(key != before, lanes.bit[i]))
         before = key
         lanes.middle[i] = depth if (depth <= end) & (key != lanes.hit[i]) else NOWHERE
         following = depth + lanes.entered[i]

@@ -20,7 +20,7 @@ for integrator in ("ray", "line"):
 DIVISIONS_A_CALL = 2
 """Cells a metre, and the depth where `passed` changes."""
 PRODUCTS_A_ROW = 40
-"""And a few more, of each row's rays; a loop over 32 lanes that is not wide has at least as many again, or is a loop."""
+"""Those of each row's rays; a loop over 32 lanes that is not wide has as many again, or remains a loop."""
 PRODUCTS_IN_STEP = 3
 """The directions of one ray in `in_step`, which goes on where signs differ."""
 

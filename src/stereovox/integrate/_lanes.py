@@ -178,7 +178,7 @@ def aim_at_hits(lanes, table, weight):
 
 @cell
 def bit_if(differs, bit):
-    """Return `bit` where something differs, 0 elsewhere; never a branch, which would end the vectors of some processors."""
+    """Return `bit` where something differs, 0 elsewhere; no branch, which some processors have no vectors for."""
     return np.int32(bit & np.int32(-np.int32(differs)))
 
 

@@ -182,7 +182,7 @@ def make_lanes(wide: bool) -> Lanes:
 
 
 def _whole_lines(length: int, dtype: DTypeLike) -> NDArray[Any]:
-    """Return zeros that begin with a line of the processor's cache: vectors that cross into another take twice as long."""
+    """Return zeros that begin with a line of the processor's cache: vectors across two take twice as long."""
     room = np.zeros(length * np.dtype(dtype).itemsize + CACHE_LINE, np.uint8)
     start = -room.ctypes.data % CACHE_LINE
     return room[start : start + length * np.dtype(dtype).itemsize].view(dtype)

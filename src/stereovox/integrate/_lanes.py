@@ -112,19 +112,25 @@ def _take(depths, columns, view, table, lanes):
 
 @cell
 def free_space(lanes, table, weight):
-    """Take the evidence of all lanes, none near its measurement nor where `table.passed` changes; return its sum."""
-    total = np.int32(0)
+    """Take the evidence of all lanes, none near its measurement nor where `table.passed` changes.
+
+    Return its sum, and as bits which lanes take other evidence than the one before, where `weight` is None.
+    """
+    total, unlike, before = np.int32(0), np.int32(0), table.free
     for i in range(LANES):
         middle = lanes.middle[i]
         gain = weighted(table.free if middle > table.blind else np.int32(0), middle, weight)
         lanes.gain[i] = gain
         total = np.int32(total + gain)
-    return total
+        if weight is None:
+            unlike = np.int32(unlike | bit_if(gain != before, lanes.bit[i]))
+            before = gain
+    return total, unlike
 
 
 @cell
 def evidence(lanes, look_up, table, weight):
-    """Take the evidence of all lanes at `middle`, weighted unless `weight` is None; return its sum.
+    """Take the evidence of all lanes at `middle`, weighted unless `weight` is None; return as `free_space` does.
 
     look_up: the sensor table (rows * width,), negative and positive evidence together. Places in tables first, then
     what stands there, then arithmetic: most processors have no vectors for all three at once.
@@ -141,14 +147,17 @@ def evidence(lanes, look_up, table, weight):
     for i in range(LANES):
         lanes.place[i] = look_up[np.uint32(lanes.place[i])]
         lanes.passed[i] = table.passed[np.uint32(lanes.passed[i])]
-    total = np.int32(0)
+    total, unlike, before = np.int32(0), np.int32(0), table.free
     for i in range(LANES):
         middle = lanes.middle[i]
         e = max(lanes.place[i], lanes.passed[i] if middle > table.blind else np.int32(0))
         gain = weighted(e, middle, weight)
         lanes.gain[i] = gain
         total = np.int32(total + gain)
-    return total
+        if weight is None:
+            unlike = np.int32(unlike | bit_if(gain != before, lanes.bit[i]))
+            before = gain
+    return total, unlike
 
 
 @cell
@@ -165,14 +174,14 @@ def aim_at_hits(lanes, table, weight):
     """Select the measured points' cells to be given evidence; return starts and total for `give`."""
     for i in range(LANES):
         lanes.gain[i] = table.hit[np.uint32(lanes.row[i])]
-    total, starts, before = np.int32(0), np.int32(0), lanes.hit[0]
+    total, starts, before, other = np.int32(0), np.int32(0), lanes.hit[0], np.int32(0)
     for i in range(LANES):
         hit = lanes.hit[i]
         gain = weighted(lanes.gain[i], lanes.depth[i], weight) if hit >= 0 else np.int32(0)
         lanes.key[i], lanes.gain[i] = hit, gain
         total = np.int32(total + gain)
-        starts = np.int32(starts | bit_if(hit != before, lanes.bit[i]))
-        before = hit
+        starts = np.int32(starts | bit_if((hit != before) | (gain != other), lanes.bit[i]))
+        before, other = hit, gain
     return starts, total
 
 
@@ -183,16 +192,13 @@ def bit_if(differs, bit):
 
 
 @cell
-def give(lanes, starts, total, plain, weight, memory, pool_table, coords, count, values):
+def give(lanes, starts, total, weight, memory, pool_table, coords, count, values):
     """Give the gains of all lanes to their cells; return False when the block pool is full.
 
-    starts: lanes in another cell than the one before, a bit each; that of the first says nothing. total: of all gains.
-    weight: gains of one cell add up; None: the strongest counts.
-    plain: the largest loss that any lane may give, where none gives positive evidence; 0 where lanes differ.
+    starts: lanes with another cell than the one before, a bit each; the first says nothing. total: of all gains.
+    weight: gains of one cell add up; None: the strongest counts, and other gains start a run as well.
     """
     b = np.int64(bits(lanes.key))
-    if weight is None and (plain == 0) | (total != np.int32(LANES * plain)):
-        starts = _starts_of_unlike(lanes)
     rest = np.int64(starts) & np.int64(0xFFFFFFFE)
     if weight is not None and rest != 0:
         _add_up(lanes)
@@ -211,17 +217,6 @@ def give(lanes, starts, total, plain, weight, memory, pool_table, coords, count,
         at = following
     gain = lanes.gain[at] if weight is None else np.int32(total - before)
     return _enter(lanes.key[at], b, gain, weight, memory, pool_table, coords, count, values) & room
-
-
-@cell
-def _starts_of_unlike(lanes):
-    """Return which lanes begin a run of lanes with the same cell and gain, as in `give`."""
-    starts, before, other = np.int32(0), lanes.key[0], lanes.gain[0]
-    for i in range(LANES):
-        key, gain = lanes.key[i], lanes.gain[i]
-        starts = np.int32(starts | bit_if((key != before) | (gain != other), lanes.bit[i]))
-        before, other = key, gain
-    return starts
 
 
 @cell

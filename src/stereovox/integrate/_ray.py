@@ -54,14 +54,16 @@ def cast(depth_m, view, table, look_up, weight, lanes, memory, pool_table, coord
             _start(ray, position, signs, lanes)
             reached, going = ZERO, True
             while going:
-                plain = table.free if reached < free_to else np.int32(0)
                 tableless = reached < min(free_to, even)
                 reached, going, starts = _step(lanes, position, signs)
-                total = free_space(lanes, table, weight) if tableless else evidence(lanes, look_up, table, weight)
-                if not give(lanes, starts, total, plain, weight, memory, pool_table, coords, count, values):
+                if tableless:
+                    total, unlike = free_space(lanes, table, weight)
+                else:
+                    total, unlike = evidence(lanes, look_up, table, weight)
+                if not give(lanes, starts | unlike, total, weight, memory, pool_table, coords, count, values):
                     return False
             starts, total = aim_at_hits(lanes, table, weight)
-            if not give(lanes, starts, total, np.int32(0), weight, memory, pool_table, coords, count, values):
+            if not give(lanes, starts, total, weight, memory, pool_table, coords, count, values):
                 return False
     return True
 
@@ -145,15 +147,17 @@ def draw(depth_m, view, table, look_up, weight, lanes, memory, pool_table, coord
             _line_start(ray, lanes)
             number, reached, going = ZERO, ZERO, True
             while going:
-                plain = table.free if reached < free_to else np.int32(0)
                 tableless = reached < min(free_to, even)
                 reached, going, starts = _line_step(lanes, number, start)
-                total = free_space(lanes, table, weight) if tableless else evidence(lanes, look_up, table, weight)
+                if tableless:
+                    total, unlike = free_space(lanes, table, weight)
+                else:
+                    total, unlike = evidence(lanes, look_up, table, weight)
                 number += ONE
-                if not give(lanes, starts, total, plain, weight, memory, pool_table, coords, count, values):
+                if not give(lanes, starts | unlike, total, weight, memory, pool_table, coords, count, values):
                     return False
             starts, total = aim_at_hits(lanes, table, weight)
-            if not give(lanes, starts, total, np.int32(0), weight, memory, pool_table, coords, count, values):
+            if not give(lanes, starts, total, weight, memory, pool_table, coords, count, values):
                 return False
     return True
 

@@ -151,6 +151,7 @@ def evidence(lanes, look_up, table, weight):
     for i in range(LANES):
         middle = lanes.middle[i]
         e = max(lanes.place[i], lanes.passed[i] if middle > table.blind else np.int32(0))
+        e = e if middle >= ZERO else np.int32(0)  # a table may mark from its first column on
         gain = weighted(e, middle, weight)
         lanes.gain[i] = gain
         total = np.int32(total + gain)

@@ -86,30 +86,33 @@ def weigh(depth_m, view, table, full_share, listed, coords, values, lanes):
     listed: (n,) cells that `scatter` set. lanes: a `HitLanes`, scratch.
     """
     flat, values_flat = depth_m.reshape(depth_m.size), values.reshape(values.size)
-    x, y, z, share = lanes.x, lanes.y, lanes.z, lanes.share
     for start in range(0, listed.size, LANES):
         some = listed[start : min(start + LANES, listed.size)]
-        _centres(view, coords, some, x, y, z)
+        _centres(view, coords, some, lanes)
         for i in range(some.size):
-            share[i] = full_share
+            lanes.share[i] = full_share
         if full_share > ZERO:
             _share(flat, view, some.size, lanes)
-        _evidence(view, table, full_share, some, z, share, values_flat)
+        _evidence(view, table, full_share, some, lanes, values_flat)
 
 
 @cell
-def _centres(view, coords, listed, x, y, z):
+def _centres(view, coords, listed, lanes):
     """Write where the centres of listed cells stand, camera axes, x and y times the focal length."""
+    x, y, z, px, py, pz = lanes.x, lanes.y, lanes.z, lanes.u, lanes.v, lanes.step
     side = np.float32(8) * view.voxel_size
-    R = view.rotation
-    for i in range(listed.size):
-        block, c = listed[i] >> 9, listed[i] & 511
-        px = np.float32(coords[block, 0]) * side - view.position[0]
-        py = np.float32(coords[block, 1]) * side - view.position[1]
-        pz = np.float32(coords[block, 2]) * side - view.position[2]
-        x[i] = (R[0, 0] * px + R[0, 1] * py + R[0, 2] * pz) * view.intrinsics[0] + view.steps[0, c]
-        y[i] = (R[1, 0] * px + R[1, 1] * py + R[1, 2] * pz) * view.intrinsics[1] + view.steps[1, c]
-        z[i] = max(R[2, 0] * px + R[2, 1] * py + R[2, 2] * pz + view.steps[2, c], NEAR_PLANE)
+    R, n = view.rotation, listed.size
+    for i in range(n):  # by itself: see `_projective._aim`
+        block, c = np.uint32(listed[i] >> 9), np.uint32(listed[i] & 511)
+        px[i] = np.float32(coords[block, 0])
+        py[i] = np.float32(coords[block, 1])
+        pz[i] = np.float32(coords[block, 2])
+        x[i], y[i], z[i] = view.steps[0, c], view.steps[1, c], view.steps[2, c]
+    for i in range(n):
+        qx, qy, qz = px[i] * side - view.position[0], py[i] * side - view.position[1], pz[i] * side - view.position[2]
+        x[i] = (R[0, 0] * qx + R[0, 1] * qy + R[0, 2] * qz) * view.intrinsics[0] + x[i]
+        y[i] = (R[1, 0] * qx + R[1, 1] * qy + R[1, 2] * qz) * view.intrinsics[1] + y[i]
+        z[i] = max(R[2, 0] * qx + R[2, 1] * qy + R[2, 2] * qz + z[i], NEAR_PLANE)
 
 
 @cell
@@ -159,13 +162,20 @@ def _share(depth_m, view, n, lanes):
 
 
 @cell
-def _evidence(view, table, full_share, listed, z, share, values):
+def _evidence(view, table, full_share, listed, lanes, values):
+    """Write the evidence of the hits on listed cells."""
+    z, share, hits, at, n = lanes.z, lanes.share, lanes.depth, lanes.at, listed.size
     rows = np.int32(table.hit.size)
-    for i in range(listed.size):
-        hit = np.float32(table.hit[table_row(min(z[i], view.max_range), table.rows_per_metre, rows)])
+    for i in range(n):
+        at[i] = table_row(min(z[i], view.max_range), table.rows_per_metre, rows)
+    for i in range(n):
+        hits[i] = np.float32(table.hit[index(at[i])])
+    for i in range(n):
         part = min(ONE, share[i] / full_share) if full_share > ZERO else ONE
-        weighed = max(np.floor(hit * np.sqrt(part) + HALF), ONE)
-        values[index(listed[i])] = np.int16(weighed if hit > ZERO else ZERO)
+        weighed = max(np.floor(hits[i] * np.sqrt(part) + HALF), ONE)
+        at[i] = np.int32(weighed if hits[i] > ZERO else ZERO)
+    for i in range(n):
+        values[index(listed[i])] = np.int16(at[i])
 
 
 @cell

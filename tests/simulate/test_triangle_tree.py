@@ -58,7 +58,7 @@ def test_a_mesh_of_many_triangles_far_from_the_origin():
     triangles, directions = np.array(sphere.triangles) + centre, some_directions(5000)
     assert len(triangles) > 100_000
     tree = TriangleTree(triangles)
-    eye = centre + [0.5, 0.4, -0.3]
+    eye = centre + np.array([0.5, 0.4, -0.3])
     share, number = tree.nearest(eye, directions)
     reached = eye - centre + directions * share[:, None]
     np.testing.assert_allclose(np.linalg.norm(reached, axis=1), 2.0, atol=2e-4)  # triangles lie a little within

@@ -5,8 +5,9 @@
     STEREOVOX_PEERS=BUILT stereovox bench RECORDING --peers octomap-cpp,bonxai,ufomap,wavemap-cpp
 
 FOLDER holds checkouts of any of OctoMap/octomap, facontidavide/Bonxai, UnknownFreeOccupied/ufomap and ethz-asl/wavemap,
-in folders of these names. What they need beside a compiler, on Debian: libeigen3-dev (Bonxai, wavemap), libgoogle-glog-dev
-and libboost-dev (wavemap), liblz4-dev and libtbb-dev (UFOMap). Nothing of theirs becomes part of stereovox.
+in folders of these names. What they need beside a compiler, on Debian: libeigen3-dev (Bonxai, wavemap),
+libgoogle-glog-dev and libboost-dev (wavemap), liblz4-dev and libtbb-dev (UFOMap). Nothing of theirs becomes part of
+stereovox.
 """
 
 from __future__ import annotations
@@ -43,8 +44,10 @@ LIBRARIES = {
         "octomap.cpp",
         "octomap",
         ("octomap/include",),
-        tuple(f"octomap/src/{name}.cpp" for name in ("Abstract*", "OcTree", "OcTreeNode", "Pointcloud", "ScanGraph"))
-        + ("octomap/src/math/*.cpp",),
+        (
+            *(f"octomap/src/{name}.cpp" for name in ("Abstract*", "OcTree", "OcTreeNode", "Pointcloud", "ScanGraph")),
+            "octomap/src/math/*.cpp",
+        ),
     ),
     "bonxai": Library(
         "bonxai.cpp",
@@ -96,7 +99,7 @@ def main() -> int:
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="where built libraries go")
     parser.add_argument("--march", default="native", help="processor to build for, as GCC names it (%(default)s)")
     parser.add_argument("--compiler", default=os.environ.get("CXX", "g++"), help="(%(default)s)")
-    arguments = parser.parse_args()
+    arguments = parser.parse_intermixed_args()
     unknown = [name for name in arguments.names if name not in LIBRARIES]
     if unknown:
         parser.error(f"unknown: {', '.join(unknown)}; known: {', '.join(LIBRARIES)}")
@@ -148,7 +151,9 @@ def _run(words: list[str]) -> None:
     try:
         done = subprocess.run(words, capture_output=True, text=True)
     except OSError as error:
-        raise CannotBuildError(f"{words[0]}: {error.strerror}; install a C++ compiler, or name one: --compiler") from None
+        raise CannotBuildError(
+            f"{words[0]}: {error.strerror}; install a C++ compiler, or name one: --compiler"
+        ) from None
     if done.returncode:
         said = [line for line in done.stderr.splitlines() if "error" in line or "undefined" in line]
         raise CannotBuildError("\n  ".join([f"{words[0]} failed:", *(said or done.stderr.splitlines())[:ERROR_LINES]]))

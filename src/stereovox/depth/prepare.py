@@ -219,7 +219,8 @@ def _sample_depths(frame: Frame) -> NDArray[np.float64]:
 
 def _run(depth_m: NDArray[np.float32], noise: RangeNoise, fine: float, config: Config) -> None:
     margin = int(STEPS.max())
-    rings = np.empty((len(STEPS) + 1, 2 * margin + 1, depth_m.shape[1] + 2 * margin), np.float32)
+    width = -(-depth_m.shape[1] // _images.SEGMENT) * _images.SEGMENT
+    rings = np.empty((len(STEPS) + 1, 2 * margin + 1, width + 2 * margin), np.float32)
     coefficients, least = np.array([noise.s0, noise.s1, noise.s2], np.float32), (fine * FROM).astype(np.float32)
     low, high, limit = (np.float32(x) for x in (config.min_range, config.max_range, LIMIT * config.voxel_size))
     _images.denoise(depth_m, coefficients, STEPS, least, WIDTHS, limit, low, high, rings)

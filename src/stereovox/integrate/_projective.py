@@ -89,11 +89,11 @@ def with_hits(hit_table, hit_coords, n_hits, free, n_free, mixed, n_mixed, hit_o
 
 
 @kernel
-def evaluate(depth_m, view, table, windows, blocks, hit_of, hit_values, values, depths, measured):
+def evaluate(depth_m, view, table, windows, blocks, hit_of, hit_values, values, scratch):
     """Fill `values` (n, 512) int16 with the evidence on the cells of `blocks` (n, 3), hits included.
 
     depth_m: (h, w) REP 117 depth image, from which `windows` was made. hit_of: (n,) place of each block among the hits,
-    -1 for none. depths, measured: (LAYER,) float32 scratch.
+    -1 for none. scratch: a `LayerScratch`.
     """
     side = np.float32(8) * view.voxel_size
     for i in range(blocks.shape[0]):
@@ -106,7 +106,7 @@ def evaluate(depth_m, view, table, windows, blocks, hit_of, hit_values, values, 
         cy = (R[1, 0] * px + R[1, 1] * py + R[1, 2] * pz) * view.intrinsics[1]
         cz = R[2, 0] * px + R[2, 1] * py + R[2, 2] * pz
         out = values[i]
-        _clear(view, table, windows, cx, cy, cz, _passed(view, table, cz), depths, measured, out)
+        _clear(view, table, windows, cx, cy, cz, _passed(view, table, cz), scratch, out)
         if table.marks:
             _mark(depth_m, view, table, cx, cy, cz, out)
         if hit_of[i] >= 0:
@@ -288,11 +288,12 @@ def _passed(view, table, cz):
 
 
 @cell
-def _clear(view, table, windows, cx, cy, cz, lowest, depths, measured, out):
+def _clear(view, table, windows, cx, cy, cz, lowest, scratch, out):
     """Write the negative evidence of the farthest pixel in a window of about the cell's size, never below `lowest`.
 
-    depths, measured: (LAYER,) scratch.
+    scratch: see `evaluate`.
     """
+    depths, measured, _, at, _ = scratch
     R = view.rotation
     farther = max(R[2, 0], ZERO) + max(R[2, 1], ZERO) + max(R[2, 2], ZERO)
     z_most = max(cz + np.float32(8) * view.voxel_size * farther, ZERO)
@@ -300,14 +301,20 @@ def _clear(view, table, windows, cx, cy, cz, lowest, depths, measured, out):
     for layer in range(0, 512, LAYER):
         cells = slice(layer, layer + LAYER)
         steps = view.steps[0, cells], view.steps[1, cells], view.steps[2, cells]
-        _measure(view, windows, max(NEAR_PLANE, table.blind), cx, cy, cz, steps, depths, measured)
+        _aim(view, windows, max(NEAR_PLANE, table.blind), cx, cy, cz, steps, depths, at)
+        _load(windows.image, at, measured)
         if _write_free_layer(depths, measured, before, table.behind, lowest, out[cells]):
-            _look_up(view, table, depths, measured, lowest, out[cells])
+            _look_up(view, table, scratch, lowest, out[cells])
+
+
+# Finding the places, loading from them and computing with what was loaded are loops of their own, here and below: most
+# processors have no fast instruction that loads from many places, and for them the compiler then takes a whole loop one
+# cell at a time.
 
 
 @cell
-def _measure(view, windows, nearest, cx, cy, cz, steps, depths, measured):
-    """Fill `depths` with the depth of each cell's centre and `measured` with what was measured there.
+def _aim(view, windows, nearest, cx, cy, cz, steps, depths, at):
+    """Fill `depths` with the depth of each cell's centre and `at` with where its window value stands.
 
     nearest: depth up to which cells are skipped.
     """
@@ -316,6 +323,7 @@ def _measure(view, windows, nearest, cx, cy, cz, steps, depths, measured):
     right, bottom = np.float32(view.width - 1), np.float32(view.height - 1)
     u_end, v_end = np.float32(view.width), np.float32(view.height)
     first, last = np.int32(windows.first), np.int32(COARSEST)
+    unseen = np.int32(windows.image.size - 1)
     for c in range(LAYER):
         z = cz + z_steps[c]
         ahead = (z > nearest) & (z <= view.max_range)
@@ -326,9 +334,14 @@ def _measure(view, windows, nearest, cx, cy, cz, steps, depths, measured):
         seen = ahead & (u >= -u_rim) & (v >= -v_rim) & (u < u_end + u_rim) & (v < v_end + v_rim)
         level = min(max(window_level(view.spread * inverse), first), last)
         i = place(level, min(max(v, ZERO), bottom), min(max(u, ZERO), right), windows.pitch, windows.height)
-        d = windows.image[index(i)]
         depths[c] = z
-        measured[c] = d if seen else UNSEEN
+        at[c] = i if seen else unseen
+
+
+@cell
+def _load(values, at, out):
+    for c in range(LAYER):
+        out[c] = values[index(at[c])]
 
 
 @cell
@@ -343,18 +356,21 @@ def _write_free_layer(depths, measured, before, behind, lowest, out):
 
 
 @cell
-def _look_up(view, table, depths, measured, lowest, out):
+def _look_up(view, table, scratch, lowest, out):
     """Write the sensor table's evidence on cells that are not wholly before their measurement, never below `lowest`."""
+    depths, measured, scale, at, row = scratch
     last_row = np.int32(table.hit.size - 1)
     columns, clear = np.int32(table.clear.shape[1]), table.clear.reshape(table.clear.size)
     last_column, middle_column = np.float32(columns - 1), np.float32(columns) * HALF
     for c in range(LAYER):
-        d = measured[c]
-        row = min(np.int32(min(max(d, ZERO), view.max_range) * table.rows_per_metre), last_row)
-        t = (depths[c] - d) * table.columns_per_metre[index(row)] + middle_column
-        k = np.int32(min(max(t, ZERO), last_column))
-        e = max(clear[index(np.int32(np.int32(row * columns) + k))], lowest)
-        out[c] = np.int16(e if d > ZERO else np.int32(0))
+        row[c] = min(np.int32(min(max(measured[c], ZERO), view.max_range) * table.rows_per_metre), last_row)
+    _load(table.columns_per_metre, row, scale)
+    for c in range(LAYER):
+        t = (depths[c] - measured[c]) * scale[c] + middle_column
+        at[c] = np.int32(np.int32(row[c] * columns) + np.int32(min(max(t, ZERO), last_column)))
+    _load(clear, at, row)
+    for c in range(LAYER):
+        out[c] = np.int16(max(row[c], lowest) if measured[c] > ZERO else np.int32(0))
 
 
 @cell

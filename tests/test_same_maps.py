@@ -19,7 +19,6 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from hashlib import sha256
-from importlib.metadata import version
 from itertools import islice
 from math import log1p
 from pathlib import Path
@@ -158,7 +157,7 @@ def toolchain() -> dict[str, str | bool]:
     """
     fused = bool(llvmlite.binding.get_host_cpu_features().get("fma")) and "NUMBA_CPU_NAME" not in os.environ
     libraries = {module.__name__: module.__version__ for module in (np, numba, llvmlite, cv2)}
-    return {"machine": platform.machine(), "fma": fused, **libraries, "embreex": version("embreex")}
+    return {"machine": platform.machine(), "fma": fused, **libraries}
 
 
 def problem(now: Digest, before: Digest, exact: bool) -> str | None:

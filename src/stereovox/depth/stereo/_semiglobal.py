@@ -1,128 +1,155 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernels of semi-global matching in 8 bits: all arithmetic is in whole numbers, the same on every processor.
+"""Kernels of semi-global matching in 8 bits. All arithmetic is in whole numbers: the same on every processor.
 
-Arrays whose last axis is the disparity d hold the costs of one pixel side by side, so that a vector register takes 32
-of them. The right image lies mirrored: what left pixel u shows at disparity d, it has at width - 1 - u + d.
+Arrays whose last axis is the disparity d hold the costs of one pixel side by side, so that a vector register takes
+many of them. The right image lies mirrored: what left pixel u shows at disparity d, it has at width - 1 - u + d.
+
+How it is written, the compiler dictates: loops over a block of a length that it knows become straight vector code, but
+only with unsigned indices (others may count from the end) and with every result cut to its bytes at once. A comparison
+becomes a mask by arithmetic, as in `_claim`; as a choice it would become a branch, and the loop one pixel at a time.
 """
 
+from typing import NamedTuple
+
 import numpy as np
+from numpy.typing import NDArray
 
 from stereovox._jit import cell, kernel
 
-PLANES = 6
-"""Bytes a pixel is compared by: gradient, its least and largest value within half a pixel, three of the census."""
+PLANES = 9
+"""Bytes by which a pixel is compared: its gradient with the least and the most within half a pixel, the same of its
+grey value, and the census in three."""
 RIM = 3
 """Rows and columns that an image needs beyond its own: half the census window of 7 by 7 pixels."""
 CAP = np.int32(63)
 """Largest gradient along the row, as in OpenCV's matcher."""
-MAX_COST = 63 + 24
-"""Largest cost of a pixel: half of the gradients' difference, and the bits of the census that differ."""
-PAD, ALL, NEXT, WAS = np.uint64(32), np.uint64(64), np.uint64(33), np.uint64(31)
-"""Bytes before and behind the path costs of a pixel; those beside them never are the least."""
-LANES = np.uint64(64)
-"""Disparities of a block: loops of a length that the compiler knows become straight vector code."""
-COUNTS = np.int32(16)
-NONE = np.int16(-16)
+MAX_COST = 63 + 63 + 24
+"""Largest cost of a pixel: of its gradient, its grey value, and its census."""
+BLOCK = 64
+"""Disparities of a block; they come in whole blocks."""
+MARGIN = 32
+"""Bytes before and behind the path costs of a pixel."""
 CENSUS = tuple((y, x) for y in range(-RIM, RIM + 1) for x in range(-RIM, RIM + 1) if (x + y) % 2 == 0 and (x or y))
 """Where the 24 bits of the census look: the pixels of one colour of a chess board of 7 by 7."""
-FULL, ZERO, ONE, TWO, FOUR = np.uint8(255), np.uint8(0), np.uint8(1), np.uint8(2), np.uint8(4)
+NONE = np.int16(-16)
+"""No disparity, as OpenCV's matchers say it."""
+LANES, PAD, BEFORE_PAD, BEHIND_PAD = np.uint64(BLOCK), np.uint64(MARGIN), np.uint64(MARGIN - 1), np.uint64(MARGIN + 1)
+LEFT, RIGHT, ONE_ON, TWO_ON = np.uint64(RIM - 2), np.uint64(RIM), np.uint64(1), np.uint64(2)
+ZERO, ONE, TWO, FOUR, FULL = np.uint8(0), np.uint8(1), np.uint8(2), np.uint8(4), np.uint8(255)
 PAIRS, QUADS, LOW = np.uint8(0x55), np.uint8(0x33), np.uint8(0x0F)
-FAR, NOTHING, NEXT_ONE, NEXT_TWO, WORD = np.uint16(65535), np.uint16(0), np.uint16(1), np.uint16(2), np.uint32(16)
+NOTHING, SINGLE, DOUBLE, FAR, WORD = np.uint16(0), np.uint16(1), np.uint16(2), np.uint16(65535), np.uint32(16)
+
+
+class Settings(NamedTuple):
+    """What `match` is told, in whole numbers.
+
+    radius: half of the window's side. p1, p2: cost of a step of one disparity and of more. unique: per cent by which
+    the second best match must be worse. left_right: most by which the disparities of both images may differ, in
+    pixels; negative: any. share: a window's sum of costs times this, without its lower 16 bits, is the pixel's cost,
+    at most 255 - p1 - p2. disparities: those that may be chosen.
+    """
+
+    radius: int
+    p1: int
+    p2: int
+    unique: int
+    left_right: int
+    share: int
+    disparities: int
+
+
+class Scratch(NamedTuple):
+    """Room for a strip of images of width w, n disparities; nothing in it outlives a strip but the margins.
+
+    rows: (2 radius + 2, w, n) uint8, costs of single pixels, of the rows in the window. sums: (w, n) uint16 of the
+    window's columns. window: (n,) uint16. costs: (w, n) uint8. across, down: (2, w, MARGIN + n + MARGIN) uint8, path
+    costs; their margins hold 255 - p1, which never is the least. lows: (w,) uint8. total: (n,) uint16. index: (n,)
+    uint16, 0 to n - 1. rival, owner: (w + n,) uint16: of pixels of the right image, the least cost and its disparity.
+    """
+
+    rows: NDArray[np.uint8]
+    sums: NDArray[np.uint16]
+    window: NDArray[np.uint16]
+    costs: NDArray[np.uint8]
+    across: NDArray[np.uint8]
+    down: NDArray[np.uint8]
+    lows: NDArray[np.uint8]
+    total: NDArray[np.uint16]
+    index: NDArray[np.uint16]
+    rival: NDArray[np.uint16]
+    owner: NDArray[np.uint16]
 
 
 @kernel
-def describe(image, first, end, mirrored, line, planes):
+def describe(image, first, end, sign, line, planes):
     """Fill rows `first` to `end` of `planes` (PLANES, h, w) uint8: what the pixels of an image are compared by.
 
-    image: (h + 2 RIM, w + 2 RIM) uint8, its rim included. mirrored: columns are written from right to left.
+    image: (h + 2 RIM, w + 2 RIM) uint8, its rim included. sign: 1, or -1 for an image that is mirrored.
     line: (w + 2,) uint8, scratch.
     """
-    width = planes.shape[2]
     for v in range(first, end):
-        above, here, below = image[v + RIM - 1], image[v + RIM], image[v + RIM + 1]
-        for u in range(width + 2):
-            slope = np.int32(above[u + 3]) - np.int32(above[u + 1]) + np.int32(below[u + 3]) - np.int32(below[u + 1])
-            slope += np.int32(2) * (np.int32(here[u + 3]) - np.int32(here[u + 1]))
-            line[u] = np.uint8(min(max(slope, -CAP), CAP) + CAP)
+        _gradients(image[v + RIM - 1], image[v + RIM], image[v + RIM + 1], np.int32(sign), line)
         _ranges(line, planes[0, v], planes[1, v], planes[2, v])
-        for part in range(3):
-            _census(image, v, part, planes[3 + part, v])
-        if mirrored:
-            for plane in range(PLANES):
-                _turn(planes[plane, v])
+        _ranges(image[v + RIM, RIM - 1 :], planes[3, v], planes[4, v], planes[5, v])
+        for plane in range(6, PLANES):
+            planes[plane, v, :] = ZERO
+        for bit in range(len(CENSUS)):
+            y, x = CENSUS[bit]
+            there, weight = image[v + RIM + y], np.uint8(1 << (bit & 7))
+            _darker(there[RIM + sign * x :], image[v + RIM, RIM:], weight, planes[6 + (bit >> 3), v])
+
+
+@cell
+def _gradients(above, here, below, sign, line):
+    for u in range(np.uint64(line.size)):
+        left, right = u + LEFT, u + RIGHT
+        slope = np.int32(above[right]) - np.int32(above[left]) + np.int32(below[right]) - np.int32(below[left])
+        slope = np.int32(slope + np.int32(2) * (np.int32(here[right]) - np.int32(here[left])))
+        line[u] = np.uint8(min(max(np.int32(sign * slope), -CAP), CAP) + CAP)
 
 
 @cell
 def _ranges(line, middle, least, most):
-    for u in range(middle.size):
-        here = np.int32(line[u + 1])
-        before, after = (here + np.int32(line[u])) >> 1, (here + np.int32(line[u + 2])) >> 1
+    for u in range(np.uint64(middle.size)):
+        here, before, after = np.uint16(line[u + ONE_ON]), np.uint16(line[u]), np.uint16(line[u + TWO_ON])
+        before, after = np.uint8(np.uint16(here + before) >> SINGLE), np.uint8(np.uint16(here + after) >> SINGLE)
         middle[u] = np.uint8(here)
-        least[u] = np.uint8(min(here, min(before, after)))
-        most[u] = np.uint8(max(here, max(before, after)))
+        least[u] = min(np.uint8(here), min(before, after))
+        most[u] = max(np.uint8(here), max(before, after))
 
 
 @cell
-def _census(image, v, part, bits):
-    bits[:] = ZERO
-    here = image[v + RIM]
-    for bit in range(8):
-        y, x = CENSUS[8 * part + bit]
-        there, weight = image[v + RIM + y], np.uint8(1 << bit)
-        for u in range(bits.size):
-            bits[u] |= weight if there[u + RIM + x] < here[u + RIM] else ZERO
-
-
-@cell
-def _turn(row):
-    for u in range(row.size // 2):
-        other = row.size - 1 - u
-        row[u], row[other] = row[other], row[u]
+def _darker(there, here, weight, bits):
+    for u in range(np.uint64(bits.size)):
+        bits[u] = np.uint8(bits[u] | np.uint8(weight & np.uint8(ZERO - np.uint8(there[u] < here[u]))))
 
 
 @kernel
-def match(left, right, rows, settings, ring, sums, window, costs, across, down, total, index, rival, owner, raw):
-    """Fill rows of `raw` (h, w) int16 with disparities in 1/16 px, -16: none, by three paths: right, left and down.
+def match(left, right, start, first, end, settings, scratch, raw):
+    """Fill rows `first` to `end` of `raw` (h, w) int16 with disparities in 1/16 px by paths right, left and down.
 
-    left: (PLANES, h, w); right: (PLANES, h, w + n), mirrored, both of `describe`; n disparities, a multiple of LANES.
-    rows: (3,) int32: the first whose costs go down, the first and the end of those written. settings: (7,) int32: half
-    the window's side, p1, p2, uniqueness in per cent, most by which the disparities of both images may differ in
-    pixels (negative: any), the number by which a sum of costs is multiplied before the lower 16 bits are dropped,
-    and the number of disparities that may be chosen.
-    Scratch: ring (side + 1, w, n) uint8, sums (w, n) and window (n,) uint16, costs (w, n) uint8, across (2, w, n + 2
-    PAD) and down (2, w, n + 2 PAD) uint8, total and index (n,) uint16, rival and owner (w + n,) uint16.
+    left: (PLANES, h, w); right: (PLANES, h, w + n), mirrored; both of `describe`. start: the row from which on costs
+    go down. settings: Settings; scratch: Scratch. Without a value: NONE.
     """
-    height, width = raw.shape
-    start, first, end = np.int64(rows[0]), np.int64(rows[1]), np.int64(rows[2])
-    radius, p1, p2 = np.int64(settings[0]), np.uint8(settings[1]), np.uint8(settings[2])
-    slots = 2 * radius + 2
-    blocks = np.uint64(window.size) // LANES
-    _border(across, p1)
-    _border(down, p1)
-    sums[:] = np.uint16(0)
-    for d in range(window.size):
-        index[d] = np.uint16(d)
+    height, radius = raw.shape[0], np.int64(settings.radius)
+    p1, p2, share = np.uint8(settings.p1), np.uint8(settings.p2), np.uint32(settings.share)
+    rows, sums, costs, down = scratch.rows, scratch.sums, scratch.costs, scratch.down
+    slots, blocks = 2 * radius + 2, np.uint64(costs.shape[1]) // LANES
+    sums[:] = NOTHING
     for v in range(start - radius, start + radius):
-        enter(left, right, min(max(v, 0), height - 1), ring[(v + slots) % slots], sums, blocks)
+        enter(left, right, min(max(v, 0), height - 1), rows[(v + slots) % slots], sums, blocks)
     for v in range(start, end):
-        enter(left, right, min(v + radius, height - 1), ring[(v + radius) % slots], sums, blocks)
-        smooth(sums, radius, np.uint32(settings[5]), window, costs, blocks)
-        leave(ring[(v - radius + slots) % slots], sums, blocks)
+        enter(left, right, min(v + radius, height - 1), rows[(v + radius) % slots], sums, blocks)
+        smooth(sums, radius, share, scratch.window, costs, blocks)
+        leave(rows[(v - radius + slots) % slots], sums, blocks)
         into, of = down[v & 1], down[1 - (v & 1)]
-        downward(costs, of, v == start, p1, p2, into, blocks)
+        downward(costs, of, v == start, p1, p2, scratch.lows, into, blocks)
         if v >= first:
-            sideways(costs, p1, p2, across, blocks)
-            choose(across, into, settings, total, index, rival, owner, raw[v], blocks)
-
-
-@cell
-def _border(paths, p1):
-    beyond, last = np.uint8(FULL - p1), paths.shape[2] - 1
-    for path in range(paths.shape[0]):
-        for u in range(paths.shape[1]):
-            for i in range(PAD):
-                paths[path, u, i] = beyond
-                paths[path, u, last - np.int64(i)] = beyond
+            sideways(costs, p1, p2, scratch.across, blocks)
+            choose(
+                scratch.across, into, settings, scratch.total, scratch.index, scratch.rival, scratch.owner, raw[v],
+                blocks,
+            )  # fmt: skip
 
 
 @kernel
@@ -130,25 +157,42 @@ def enter(left, right, v, costs, sums, blocks):
     """Fill `costs` (w, n) with those of single pixels, and add them to `sums` (w, n) of the rows in the window."""
     width = sums.shape[0]
     for u in range(width):
-        at = width - 1 - u
-        _compare(left, v, u, right[0, v, at:], right[1, v, at:], right[2, v, at:], right[3, v, at:], right[4, v, at:], right[5, v, at:], costs[u], sums[u], blocks)
+        here, there = left[:, v, u], right[:, v, width - 1 - u :]
+        _unlike(here, there[0], there[1], there[2], there[3], there[4], there[5], costs[u], blocks)
+        _census_unlike(here, there[6], there[7], there[8], costs[u], sums[u], blocks)
 
 
 @cell
-def _compare(left, v, u, middle, least, most, first, second, third, costs, sums, blocks):
-    l, l_least, l_most = left[0, v, u], left[1, v, u], left[2, v, u]
-    a, b, c = left[3, v, u], left[4, v, u], left[5, v, u]
+def _unlike(here, slope, slope_least, slope_most, grey, grey_least, grey_most, costs, blocks):
+    """Fill `costs` with what gradients and grey values differ by (Birchfield and Tomasi 1998), weighed 2 to 1."""
+    l, l_least, l_most, g, g_least, g_most = here[0], here[1], here[2], here[3], here[4], here[5]
     for block in range(blocks):
         for i in range(LANES):
             d = block * LANES + i
-            r = middle[d]
-            one = max(_less(l, most[d]), _less(least[d], l))
-            two = max(_less(r, l_most), _less(l_least, r))
-            cost = np.uint8(np.uint8(min(one, two) >> ONE) + _ones(np.uint8(a ^ first[d]), np.uint8(b ^ second[d]), np.uint8(c ^ third[d])))
-            costs[d] = cost
+            slopes = _apart(l, l_least, l_most, slope[d], slope_least[d], slope_most[d])
+            greys = _apart(g, g_least, g_most, grey[d], grey_least[d], grey_most[d])
+            costs[d] = np.uint8(np.uint8(slopes >> ONE) + np.uint8(greys >> TWO))
+
+
+@cell
+def _census_unlike(here, first, second, third, costs, sums, blocks):
+    """Add the bits of the census that differ to `costs`, and these to `sums`."""
+    a, b, c = here[6], here[7], here[8]
+    for block in range(blocks):
+        for i in range(LANES):
+            d = block * LANES + i
+            bits = _ones(np.uint8(a ^ first[d]), np.uint8(b ^ second[d]), np.uint8(c ^ third[d]))
+            costs[d] = np.uint8(costs[d] + bits)
         for i in range(LANES):
             d = block * LANES + i
             sums[d] = np.uint16(sums[d] + np.uint16(costs[d]))
+
+
+@cell
+def _apart(l, l_least, l_most, r, r_least, r_most):
+    one = max(_less(l, r_most), _less(r_least, l))
+    two = max(_less(r, l_most), _less(l_least, r))
+    return min(one, two)
 
 
 @cell
@@ -217,12 +261,12 @@ def _begin(costs, path, blocks):
 
 
 @kernel
-def downward(costs, of, begins, p1, p2, into, blocks):
+def downward(costs, of, begins, p1, p2, lows, into, blocks):
     for u in range(costs.shape[0]):
         if begins:
-            _begin(costs[u], into[u], blocks)
+            lows[u] = _begin(costs[u], into[u], blocks)
         else:
-            _step(costs[u], of[u], _least(of[u], blocks), p1, p2, into[u], blocks)
+            lows[u] = _step(costs[u], of[u], lows[u], p1, p2, into[u], blocks)
 
 
 @kernel
@@ -244,7 +288,7 @@ def _step(costs, before, low, p1, p2, after, blocks):
         here = FULL
         for i in range(LANES):
             d = block * LANES + i
-            beside = np.uint8(min(before[d + WAS], before[d + NEXT]) + p1)
+            beside = np.uint8(min(before[d + BEFORE_PAD], before[d + BEHIND_PAD]) + p1)
             best = min(min(before[d + PAD], beside), jump)
             cost = np.uint8(costs[d] + np.uint8(best - low))
             after[d + PAD] = cost
@@ -253,22 +297,11 @@ def _step(costs, before, low, p1, p2, after, blocks):
     return least
 
 
-@cell
-def _least(path, blocks):
-    least = FULL
-    for block in range(blocks):
-        here = FULL
-        for i in range(LANES):
-            here = min(here, path[block * LANES + i + PAD])
-        least = min(least, here)
-    return least
-
-
 @kernel
 def choose(across, down, settings, total, index, rival, owner, raw, blocks):
     """Fill a row of disparities from the costs of its paths."""
-    width, n = raw.size, np.int64(settings[6])
-    unique, most = np.int64(100 - settings[3]), np.int64(settings[4])
+    width, n = raw.size, np.int64(settings.disparities)
+    unique, most = np.int64(100 - settings.unique), np.int64(settings.left_right)
     rival[:] = FAR
     for u in range(width):
         at = width - 1 - u
@@ -335,12 +368,12 @@ def _claim(total, index, least, rival, owner, blocks):
 @cell
 def _second(total, index, best, blocks):
     """Return the least cost of all disparities but `best` and those beside it."""
-    least, before = FAR, np.uint16(best - NEXT_ONE)
+    least, before = FAR, np.uint16(best - SINGLE)
     for block in range(blocks):
         here = FAR
         for i in range(LANES):
             d = block * LANES + i
-            near = np.uint16(NOTHING - np.uint16(np.uint16(index[d] - before) <= NEXT_TWO))
+            near = np.uint16(NOTHING - np.uint16(np.uint16(index[d] - before) <= DOUBLE))
             here = min(here, max(near, total[d]))
         least = min(least, here)
     return least

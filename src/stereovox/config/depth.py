@@ -77,7 +77,7 @@ class StereoConfig(Section):
     threads: threads of the matcher; the disparity does not depend on it.
     """
 
-    method: str = "sgm"
+    method: str = "census"
     model: str | None = None
     disparities: int = Field(128, ge=16, le=1024, multiple_of=16)
     block_size: int = Field(5, ge=1, le=51)

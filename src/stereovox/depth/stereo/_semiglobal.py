@@ -165,11 +165,11 @@ def enter(left, right, v, costs, sums, blocks):
 @cell
 def _unlike(here, slope, slope_least, slope_most, grey, grey_least, grey_most, costs, blocks):
     """Fill `costs` with what gradients and grey values differ by (Birchfield and Tomasi 1998), weighed 2 to 1."""
-    l, l_least, l_most, g, g_least, g_most = here[0], here[1], here[2], here[3], here[4], here[5]
+    s, s_least, s_most, g, g_least, g_most = here[0], here[1], here[2], here[3], here[4], here[5]
     for block in range(blocks):
         for i in range(LANES):
             d = block * LANES + i
-            slopes = _apart(l, l_least, l_most, slope[d], slope_least[d], slope_most[d])
+            slopes = _apart(s, s_least, s_most, slope[d], slope_least[d], slope_most[d])
             greys = _apart(g, g_least, g_most, grey[d], grey_least[d], grey_most[d])
             costs[d] = np.uint8(np.uint8(slopes >> ONE) + np.uint8(greys >> TWO))
 
@@ -189,10 +189,9 @@ def _census_unlike(here, first, second, third, costs, sums, blocks):
 
 
 @cell
-def _apart(l, l_least, l_most, r, r_least, r_most):
-    one = max(_less(l, r_most), _less(r_least, l))
-    two = max(_less(r, l_most), _less(l_least, r))
-    return min(one, two)
+def _apart(a, a_least, a_most, b, b_least, b_most):
+    """Return how far two values are from all that the other takes within half a pixel, the less of both ways."""
+    return min(max(_less(a, b_most), _less(b_least, a)), max(_less(b, a_most), _less(a_least, b)))
 
 
 @cell

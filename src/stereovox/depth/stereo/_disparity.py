@@ -82,10 +82,10 @@ def cross_check(disparity, side, most, seen):
 
 @kernel
 def confidence(disparity, radius, first, end, columns, filled, line, line_filled, out):
-    """Fill rows of `out` with the share of a window that has a disparity, less where the pixel is off the window's mean.
+    """Fill `out` with the share of a window that has a disparity, less where the pixel is off the window's mean.
 
-    first, end: the rows filled. radius: the window spans so many pixels to each side. columns, filled: (w,) int32; line, line_filled: (w + 1,)
-    int32, scratch. No value: 0.
+    radius: the window spans so many pixels to each side. first, end: the rows that are filled. columns, filled: (w,)
+    int32; line, line_filled: (w + 1,) int32, scratch. No value: 0.
     """
     height, width = disparity.shape
     columns[:] = np.int32(0)
@@ -113,10 +113,10 @@ def confidence(disparity, radius, first, end, columns, filled, line, line_filled
 
 @kernel
 def texture(image, down, across, first, end, columns, line, out):
-    """Fill rows `first` to `end` of `out` (h, w) with the mean of |image[v, u + 1] - image[v, u - 1]| over a window.
+    """Fill `out` (h, w) with the mean of |image[v, u + 1] - image[v, u - 1]| over a window.
 
     The window spans `down` rows and `across` columns to each side; at the image's sides there is no step, so 0 counts.
-    columns: (w,) and line: (w + 1,) int32, scratch.
+    first, end: the rows that are filled. columns: (w,) and line: (w + 1,) int32, scratch.
     """
     height, width = image.shape
     columns[:] = np.int32(0)

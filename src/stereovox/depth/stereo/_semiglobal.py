@@ -63,8 +63,9 @@ class Scratch(NamedTuple):
 
     rows: (2 radius + 2, w, n) uint8, costs of single pixels, of the rows in the window. sums: (w, n) uint16 of the
     window's columns. window: (n,) uint16. costs: (w, n) uint8. across, down: (2, w, MARGIN + n + MARGIN) uint8, path
-    costs; their margins hold 255 - p1, which never is the least. lows: (w,) uint8. total: (n,) uint16. index: (n,)
-    uint16, 0 to n - 1. rival, owner: (w + n,) uint16: of pixels of the right image, the least cost and its disparity.
+    costs; their margins hold 255 - p1, which never is the least. lows: (w,) uint8. total: (n,) uint16. numbers:
+    (n,) uint16, 0 to n - 1. rival, owner: (w + n,) uint16, of pixels of the right image the least cost and its
+    disparity.
     """
 
     rows: NDArray[np.uint8]
@@ -75,7 +76,7 @@ class Scratch(NamedTuple):
     down: NDArray[np.uint8]
     lows: NDArray[np.uint8]
     total: NDArray[np.uint16]
-    index: NDArray[np.uint16]
+    numbers: NDArray[np.uint16]
     rival: NDArray[np.uint16]
     owner: NDArray[np.uint16]
 
@@ -147,7 +148,7 @@ def match(left, right, start, first, end, settings, scratch, raw):
         if v >= first:
             sideways(costs, p1, p2, scratch.across, blocks)
             choose(
-                scratch.across, into, settings, scratch.total, scratch.index, scratch.rival, scratch.owner, raw[v],
+                scratch.across, into, settings, scratch.total, scratch.numbers, scratch.rival, scratch.owner, raw[v],
                 blocks,
             )  # fmt: skip
 
@@ -297,8 +298,8 @@ def _step(costs, before, low, p1, p2, after, blocks):
 
 
 @kernel
-def choose(across, down, settings, total, index, rival, owner, raw, blocks):
-    """Fill a row of disparities from the costs of its paths."""
+def choose(across, down, settings, total, numbers, rival, owner, raw, blocks):
+    """Fill a row of disparities from the costs of its paths (`Scratch`)."""
     width, n = raw.size, np.int64(settings.disparities)
     unique, most = np.int64(100 - settings.unique), np.int64(settings.left_right)
     rival[:] = FAR
@@ -307,8 +308,8 @@ def choose(across, down, settings, total, index, rival, owner, raw, blocks):
         least = _add(across[0, u], across[1, u], down[u], total, blocks)
         if n < total.size:
             least = _drop(total, n)
-        best = _claim(total, index, least, rival[at:], owner[at:], blocks)
-        second = _second(total, index, best, blocks)
+        best = _claim(total, numbers, least, rival[at:], owner[at:], blocks)
+        second = _second(total, numbers, best, blocks)
         certain = np.int64(second) * unique >= np.int64(least) * 100
         raw[u] = _fraction(total, np.int64(best), n) if certain else NONE
     for u in range(width):
@@ -346,7 +347,7 @@ def _drop(total, n):
 
 
 @cell
-def _claim(total, index, least, rival, owner, blocks):
+def _claim(total, numbers, least, rival, owner, blocks):
     """Return the first disparity of least cost; note which one each pixel of the right image likes best."""
     best = FAR
     for block in range(blocks):
@@ -354,10 +355,10 @@ def _claim(total, index, least, rival, owner, blocks):
         for i in range(LANES):
             d = block * LANES + i
             others = np.uint16(NOTHING - np.uint16(total[d] != least))
-            first = min(first, max(others, index[d]))
+            first = min(first, max(others, numbers[d]))
         for i in range(LANES):
             d = block * LANES + i
-            here, there, it, whose = total[d], rival[d], index[d], owner[d]
+            here, there, it, whose = total[d], rival[d], numbers[d], owner[d]
             owner[d] = it if here < there else whose
             rival[d] = min(here, there)
         best = min(best, first)
@@ -365,14 +366,14 @@ def _claim(total, index, least, rival, owner, blocks):
 
 
 @cell
-def _second(total, index, best, blocks):
+def _second(total, numbers, best, blocks):
     """Return the least cost of all disparities but `best` and those beside it."""
     least, before = FAR, np.uint16(best - SINGLE)
     for block in range(blocks):
         here = FAR
         for i in range(LANES):
             d = block * LANES + i
-            near = np.uint16(NOTHING - np.uint16(np.uint16(index[d] - before) <= DOUBLE))
+            near = np.uint16(NOTHING - np.uint16(np.uint16(numbers[d] - before) <= DOUBLE))
             here = min(here, max(near, total[d]))
         least = min(least, here)
     return least

@@ -126,18 +126,19 @@ def _settings(config: StereoConfig) -> Settings:
 
 
 def _scratch(settings: Settings, width: int, n: int) -> Scratch:
-    paths = (np.full((2, width, MARGIN + n + MARGIN), 255 - settings.p1, np.uint8) for _ in range(2))
+    across, down = (np.full((2, width, MARGIN + n + MARGIN), 255 - settings.p1, np.uint8) for _ in range(2))
     return Scratch(
-        np.empty((2 * settings.radius + 2, width, n), np.uint8),
-        np.empty((width, n), np.uint16),
-        np.empty(n, np.uint16),
-        np.empty((width, n), np.uint8),
-        *paths,
-        np.empty(width, np.uint8),
-        np.empty(n, np.uint16),
-        np.arange(n, dtype=np.uint16),
-        np.empty(width + n, np.uint16),
-        np.empty(width + n, np.uint16),
+        rows=np.empty((2 * settings.radius + 2, width, n), np.uint8),
+        sums=np.empty((width, n), np.uint16),
+        window=np.empty(n, np.uint16),
+        costs=np.empty((width, n), np.uint8),
+        across=across,
+        down=down,
+        lows=np.empty(width, np.uint8),
+        total=np.empty(n, np.uint16),
+        numbers=np.arange(n, dtype=np.uint16),
+        rival=np.empty(width + n, np.uint16),
+        owner=np.empty(width + n, np.uint16),
     )
 
 

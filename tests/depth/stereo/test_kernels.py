@@ -184,7 +184,7 @@ def slow_doubled(half, shape):
     full = np.empty(shape)
     for v, u in np.ndindex(shape):
         y, x = (np.clip((i + 0.5) / 2 - 0.5, 0, n - 1) for i, n in zip((v, u), half.shape, strict=True))
-        rows, columns = (np.array([int(i), min(int(i) + 1, n - 1)]) for i, n in ((y, len(half)), (x, half.shape[1])))
+        rows, columns = ([int(np.floor(i)), int(np.ceil(i))] for i in (y, x))
         (a, b), (c, d) = half[rows][:, columns].astype(float)
         linear = 2 * ((a * (1 - x % 1) + b * (x % 1)) * (1 - y % 1) + (c * (1 - x % 1) + d * (x % 1)) * (y % 1))
         nearest = 2 * float(half[v // 2, u // 2])

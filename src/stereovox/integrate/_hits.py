@@ -36,14 +36,13 @@ LANES = 64
 
 
 @kernel
-def scatter(depth_m, view, keys, news, fresh, seen, listed, pool_table, coords, count, values):
+def scatter(depth_m, view, scratch, listed, pool_table, coords, count, values):
     """Set every cell that holds a measured point to 1; return how many there are, -1 when the block pool is full.
 
-    depth_m: (h, w) REP 117 depth image. keys: (2, w + 1) scratch; int32 serves cells within 2^9 of the camera, int64
-    the rest. news: (w rounded up to GROUP,) uint8 zeros, scratch; fresh: int32 scratch, one longer.
-    seen: (SEEN,) scratch of the keys' kind. Blocks count from the camera's own.
+    depth_m: (h, w) REP 117 depth image. scratch: `HitScratch`. Blocks count from the camera's own.
     listed: (pixels,) int32, written: the cells that were set, as 512 * their place in the pool + their number there.
     """
+    keys, news, fresh, seen = scratch
     size = np.float32(1) / view.voxel_size
     position = view.position[0] * size, view.position[1] * size, view.position[2] * size
     last, place = (np.int32(0), np.int32(0), np.int32(0)), np.int64(-1)
@@ -79,22 +78,22 @@ def scatter(depth_m, view, keys, news, fresh, seen, listed, pool_table, coords, 
 
 
 @kernel
-def weigh(depth_m, view, table, full_share, listed, n, coords, values, lanes):
+def weigh(depth_m, view, table, full_share, listed, coords, values, lanes):
     """Replace the ones that `scatter` set by evidence: that of a hit at the depth of the cell's centre.
 
     It counts in full where at least `full_share` of the cell's footprint in the image measures a depth within the cell;
     with less, by the square root of the part: a few pixels may be a slip of the matcher. full_share 0: always in full.
-    listed: the cells that `scatter` set, in its first `n` entries. lanes: (9, LANES) float32 scratch.
+    listed: (n,) cells that `scatter` set. lanes: a `HitLanes`, scratch.
     """
     flat, values_flat = depth_m.reshape(depth_m.size), values.reshape(values.size)
-    x, y, z, share = lanes[0], lanes[1], lanes[2], lanes[3]
-    for start in range(0, n, LANES):
-        some = listed[start : min(start + LANES, n)]
+    x, y, z, share = lanes.x, lanes.y, lanes.z, lanes.share
+    for start in range(0, listed.size, LANES):
+        some = listed[start : min(start + LANES, listed.size)]
         _centres(view, coords, some, x, y, z)
         for i in range(some.size):
             share[i] = full_share
         if full_share > ZERO:
-            _share(flat, view, some.size, x, y, z, share, lanes[4], lanes[5], lanes[6], lanes[7], lanes[8])
+            _share(flat, view, some.size, lanes)
         _evidence(view, table, full_share, some, z, share, values_flat)
 
 
@@ -114,11 +113,12 @@ def _centres(view, coords, listed, x, y, z):
 
 
 @cell
-def _share(depth_m, view, n, x, y, z, share, u, v, samples, step, looked):
+def _share(depth_m, view, n, lanes):
     """Write the part of each cell's footprint whose pixels measure a depth within half a cell of its centre.
 
-    Samples stand at even distances, up to SIDE_SAMPLES a side; at least half of one counts. The last five are scratch.
+    Samples stand at even distances, up to SIDE_SAMPLES a side; at least half of one counts.
     """
+    x, y, z, share, u, v, samples, step, looked, depth, counts, at = lanes
     width, height = np.float32(view.width), np.float32(view.height)
     limit = HALF * view.voxel_size
     for i in range(n):
@@ -130,9 +130,12 @@ def _share(depth_m, view, n, x, y, z, share, u, v, samples, step, looked):
         v[i] = y[i] * inverse + view.intrinsics[3] + HALF - HALF * wide
         share[i] = ZERO
         looked[i] = ZERO
-    for j in range(SIDE_SAMPLES):
+    most = np.int32(1)
+    for i in range(n):
+        most = max(most, np.int32(samples[i]))
+    for j in range(most):
         row = np.float32(j) + HALF
-        for k in range(SIDE_SAMPLES):
+        for k in range(most):
             column = np.float32(k) + HALF
             for i in range(n):
                 su, sv = u[i] + column * step[i], v[i] + row * step[i]
@@ -144,10 +147,13 @@ def _share(depth_m, view, n, x, y, z, share, u, v, samples, step, looked):
                     & (sv >= ZERO)
                     & (sv < height)
                 )
-                at = np.int32(np.int32(sv if inside else ZERO) * view.width) + np.int32(su if inside else ZERO)
-                d = depth_m[index(np.int32(at))]
-                share[i] += ONE if inside & (abs(d - z[i]) <= limit) else ZERO
-                looked[i] += ONE if inside else ZERO
+                counts[i] = ONE if inside else ZERO
+                at[i] = np.int32(np.int32(sv if inside else ZERO) * view.width) + np.int32(su if inside else ZERO)
+            for i in range(n):  # by itself: see `_projective._aim`
+                depth[i] = depth_m[index(at[i])]
+            for i in range(n):
+                share[i] += counts[i] if abs(depth[i] - z[i]) <= limit else ZERO
+                looked[i] += counts[i]
     for i in range(n):
         share[i] = max(share[i], HALF) / max(looked[i], ONE)
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from stereovox._jit import cell, kernel
 from stereovox.integrate._cells import HALF, NEAR_PLANE, NO_RETURN, ONE, ZERO, index, table_row, window_level
-from stereovox.integrate._windows import COARSEST, place
+from stereovox.integrate._windows import COARSEST, build, nearest_tiles, place
 from stereovox.maps._cells import find
 
 SKIP, FREE, MIXED = 0, 1, 2
@@ -18,6 +18,7 @@ SLACK = np.float32(1e-3)
 """Pixels, and share of a depth, by which boxes are enlarged: culling may err only on the safe side."""
 COARSE = 4
 """Blocks along each side of a coarse box; between it and a block stand boxes of two blocks."""
+TEN = np.float32(10)
 STACK = 32
 """Most boxes on the stack: eight of each of two sizes."""
 LAYER = 64
@@ -27,12 +28,35 @@ UNSEEN = np.float32(-1e9)
 
 
 @kernel
-def candidates(view, table, windows, nearest, end, stack, free, mixed):
-    """List the blocks that are wholly free and those that must be evaluated cell by cell; return both numbers.
+def survey(depth_m, ends, view, table, windows, scratch, nearest, stack, free, mixed):
+    """Build the window images, and list the blocks that are wholly free and those that must be evaluated cell by cell.
 
-    Both are -1 when a list is too short.
-    end: depth in metres beyond which the image says nothing. stack: (STACK, 4) int32 scratch.
-    free, mixed: (capacity, 3) int32 block coordinates from the camera's block.
+    Return both numbers; -1 when a list is too short.
+
+    depth_m: (h, w) REP 117 depth image. ends: the same, but for pixels that see nothing: the depth up to which that is
+    so. windows, scratch, nearest: `Windows`, `WindowScratch` and tiles, written. stack: (STACK, 4) int32 scratch.
+    free, mixed: (capacity, 3) int32, written: block coordinates from the camera's block.
+    """
+    farthest = build(ends.reshape(ends.size), windows, scratch)
+    if table.marks:
+        nearest_tiles(depth_m, nearest[0], nearest[1])
+    return candidates(view, table, windows, nearest, _end_of_view(view, table, farthest), stack, free, mixed)
+
+
+@cell
+def _end_of_view(view, table, farthest):
+    """Return the depth in metres beyond which an image whose farthest depth is `farthest` gives no evidence."""
+    if farthest >= NO_RETURN:
+        return view.max_range
+    behind = table.reach[table.reach.size - 1] if table.marks else table.behind
+    return min(view.max_range, max(farthest, TEN * NEAR_PLANE) * (ONE + SLACK) + behind)
+
+
+@kernel
+def candidates(view, table, windows, nearest, end, stack, free, mixed):
+    """List the blocks that are wholly free and those that must be evaluated; see `survey`.
+
+    end: depth in metres beyond which the image says nothing.
     """
     n_free, n_mixed = 0, 0
     low_x, high_x = _touched(view, end, 0)
@@ -62,11 +86,12 @@ def candidates(view, table, windows, nearest, end, stack, free, mixed):
 
 
 @kernel
-def with_hits(hit_table, hit_coords, n_hits, free, n_free, mixed, n_mixed, hit_of, listed):
+def with_hits(view, table, hit_table, hit_coords, n_hits, free, n_free, mixed, n_mixed, hit_of, listed, free_values):
     """Put all blocks that hold hits among the mixed ones; return the numbers of free and of mixed blocks.
 
     `mixed` must have room for `n_hits` more. hit_of: as long as `mixed`, written: the place of each mixed block among
-    the hits, -1 for none. listed: (n_hits,) uint8 zeros, scratch.
+    the hits, -1 for none. listed: (n_hits,) uint8 zeros, scratch. free_values: (n_free,) int16, written: the evidence
+    on all cells of each free block.
     """
     for i in range(n_mixed):
         h = find(hit_table, hit_coords, mixed[i, 0], mixed[i, 1], mixed[i, 2])
@@ -85,15 +110,16 @@ def with_hits(hit_table, hit_coords, n_hits, free, n_free, mixed, n_mixed, hit_o
                 mixed[n_mixed, axis] = hit_coords[h, axis]
             hit_of[n_mixed] = h
             n_mixed += 1
+    _pass(view, table, free[:kept], free_values)
     return kept, n_mixed
 
 
 @kernel
-def evaluate(depth_m, view, table, windows, blocks, hit_of, hit_values, values, depths, measured):
+def evaluate(depth_m, view, table, windows, blocks, hit_of, hit_values, values, scratch):
     """Fill `values` (n, 512) int16 with the evidence on the cells of `blocks` (n, 3), hits included.
 
     depth_m: (h, w) REP 117 depth image, from which `windows` was made. hit_of: (n,) place of each block among the hits,
-    -1 for none. depths, measured: (LAYER,) float32 scratch.
+    -1 for none. scratch: a `LayerScratch`.
     """
     side = np.float32(8) * view.voxel_size
     for i in range(blocks.shape[0]):
@@ -106,7 +132,7 @@ def evaluate(depth_m, view, table, windows, blocks, hit_of, hit_values, values, 
         cy = (R[1, 0] * px + R[1, 1] * py + R[1, 2] * pz) * view.intrinsics[1]
         cz = R[2, 0] * px + R[2, 1] * py + R[2, 2] * pz
         out = values[i]
-        _clear(view, table, windows, cx, cy, cz, _passed(view, table, cz), depths, measured, out)
+        _clear(view, table, windows, cx, cy, cz, _passed(view, table, cz), scratch, out)
         if table.marks:
             _mark(depth_m, view, table, cx, cy, cz, out)
         if hit_of[i] >= 0:
@@ -115,9 +141,9 @@ def evaluate(depth_m, view, table, windows, blocks, hit_of, hit_values, values, 
                 out[c] = max(out[c], hits[c]) if hits[c] > 0 else out[c]
 
 
-@kernel
-def passed(view, table, blocks, out):
-    """Fill `out` (n,) int16 with the evidence on all cells of each of `blocks` (n, 3), which are wholly free."""
+@cell
+def _pass(view, table, blocks, out):
+    """Write the evidence (n,) on all cells of each of `blocks` (n, 3), which are wholly free."""
     side = np.float32(8) * view.voxel_size
     R = view.rotation
     for i in range(blocks.shape[0]):
@@ -288,11 +314,12 @@ def _passed(view, table, cz):
 
 
 @cell
-def _clear(view, table, windows, cx, cy, cz, lowest, depths, measured, out):
+def _clear(view, table, windows, cx, cy, cz, lowest, scratch, out):
     """Write the negative evidence of the farthest pixel in a window of about the cell's size, never below `lowest`.
 
-    depths, measured: (LAYER,) scratch.
+    scratch: see `evaluate`.
     """
+    depths, measured, _, at, _ = scratch
     R = view.rotation
     farther = max(R[2, 0], ZERO) + max(R[2, 1], ZERO) + max(R[2, 2], ZERO)
     z_most = max(cz + np.float32(8) * view.voxel_size * farther, ZERO)
@@ -300,14 +327,20 @@ def _clear(view, table, windows, cx, cy, cz, lowest, depths, measured, out):
     for layer in range(0, 512, LAYER):
         cells = slice(layer, layer + LAYER)
         steps = view.steps[0, cells], view.steps[1, cells], view.steps[2, cells]
-        _measure(view, windows, max(NEAR_PLANE, table.blind), cx, cy, cz, steps, depths, measured)
+        _aim(view, windows, max(NEAR_PLANE, table.blind), cx, cy, cz, steps, depths, at)
+        _load(windows.image, at, measured)
         if _write_free_layer(depths, measured, before, table.behind, lowest, out[cells]):
-            _look_up(view, table, depths, measured, lowest, out[cells])
+            _look_up(view, table, scratch, lowest, out[cells])
+
+
+# Finding the places, loading from them and computing with what was loaded are loops of their own, here and below: most
+# processors have no fast instruction that loads from many places, and for them the compiler then takes a whole loop one
+# cell at a time.
 
 
 @cell
-def _measure(view, windows, nearest, cx, cy, cz, steps, depths, measured):
-    """Fill `depths` with the depth of each cell's centre and `measured` with what was measured there.
+def _aim(view, windows, nearest, cx, cy, cz, steps, depths, at):
+    """Fill `depths` with the depth of each cell's centre and `at` with where its window value stands.
 
     nearest: depth up to which cells are skipped.
     """
@@ -316,6 +349,7 @@ def _measure(view, windows, nearest, cx, cy, cz, steps, depths, measured):
     right, bottom = np.float32(view.width - 1), np.float32(view.height - 1)
     u_end, v_end = np.float32(view.width), np.float32(view.height)
     first, last = np.int32(windows.first), np.int32(COARSEST)
+    unseen = np.int32(windows.image.size - 1)
     for c in range(LAYER):
         z = cz + z_steps[c]
         ahead = (z > nearest) & (z <= view.max_range)
@@ -326,9 +360,14 @@ def _measure(view, windows, nearest, cx, cy, cz, steps, depths, measured):
         seen = ahead & (u >= -u_rim) & (v >= -v_rim) & (u < u_end + u_rim) & (v < v_end + v_rim)
         level = min(max(window_level(view.spread * inverse), first), last)
         i = place(level, min(max(v, ZERO), bottom), min(max(u, ZERO), right), windows.pitch, windows.height)
-        d = windows.image[index(i)]
         depths[c] = z
-        measured[c] = d if seen else UNSEEN
+        at[c] = i if seen else unseen
+
+
+@cell
+def _load(values, at, out):
+    for c in range(LAYER):
+        out[c] = values[index(at[c])]
 
 
 @cell
@@ -343,18 +382,21 @@ def _write_free_layer(depths, measured, before, behind, lowest, out):
 
 
 @cell
-def _look_up(view, table, depths, measured, lowest, out):
+def _look_up(view, table, scratch, lowest, out):
     """Write the sensor table's evidence on cells that are not wholly before their measurement, never below `lowest`."""
+    depths, measured, scale, at, row = scratch
     last_row = np.int32(table.hit.size - 1)
     columns, clear = np.int32(table.clear.shape[1]), table.clear.reshape(table.clear.size)
     last_column, middle_column = np.float32(columns - 1), np.float32(columns) * HALF
     for c in range(LAYER):
-        d = measured[c]
-        row = min(np.int32(min(max(d, ZERO), view.max_range) * table.rows_per_metre), last_row)
-        t = (depths[c] - d) * table.columns_per_metre[index(row)] + middle_column
-        k = np.int32(min(max(t, ZERO), last_column))
-        e = max(clear[index(np.int32(np.int32(row * columns) + k))], lowest)
-        out[c] = np.int16(e if d > ZERO else np.int32(0))
+        row[c] = min(np.int32(min(max(measured[c], ZERO), view.max_range) * table.rows_per_metre), last_row)
+    _load(table.columns_per_metre, row, scale)
+    for c in range(LAYER):
+        t = (depths[c] - measured[c]) * scale[c] + middle_column
+        at[c] = np.int32(np.int32(row[c] * columns) + np.int32(min(max(t, ZERO), last_column)))
+    _load(clear, at, row)
+    for c in range(LAYER):
+        out[c] = np.int16(max(row[c], lowest) if measured[c] > ZERO else np.int32(0))
 
 
 @cell

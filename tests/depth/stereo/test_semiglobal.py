@@ -78,11 +78,17 @@ def window_costs(costs, side, share):
     return total * share >> 16
 
 
-def one_path(costs, p1, p2):
-    """Return the path costs along the first axis of (length, n) or (length, w, n)."""
+def jump(p1, p2, grey, before):
+    """Return what a jump costs between neighbours: less than p2 in proportion where they differ by more than 16."""
+    return max(p1, p2 * 16 // max(16, abs(int(grey) - int(before))))
+
+
+def one_path(costs, image, p1, most):
+    """Return the path costs along the first axis of (length, w, n); image: (length, w)."""
     found = [costs[0]]
-    for here in costs[1:]:
+    for i, here in enumerate(costs[1:], 1):
         before = found[-1]
+        p2 = np.array([[jump(p1, most, *greys)] for greys in zip(image[i], image[i - 1], strict=True)])
         low = before.min(axis=-1, keepdims=True)
         beyond = np.full_like(low, 10**6)
         fewer = np.concatenate([beyond, before[..., :-1]], axis=-1)
@@ -132,10 +138,10 @@ def slow(left, right, config):
     for strip in range(strips):
         first, end = height * strip // strips, height * (strip + 1) // strips
         start = max(0, first - WARM)
-        down[first:end] = one_path(costs[start:end], p1, p2)[first - start :]
+        down[first:end] = one_path(costs[start:end], left[start:end], p1, p2)[first - start :]
     across = costs.swapaxes(0, 1)
-    to_right = one_path(across, p1, p2).swapaxes(0, 1)
-    to_left = one_path(across[::-1], p1, p2)[::-1].swapaxes(0, 1)
+    to_right = one_path(across, left.T, p1, p2).swapaxes(0, 1)
+    to_left = one_path(across[::-1], left.T[::-1], p1, p2)[::-1].swapaxes(0, 1)
     assert max(path.max() for path in (down, to_right, to_left)) <= 255 - p1
     most = max(1, round(config.left_right)) if config.left_right else -1
     return choose((down + to_right + to_left)[..., :n], round(config.uniqueness * 2 / 3), most)

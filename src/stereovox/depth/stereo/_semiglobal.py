@@ -21,6 +21,8 @@ PLANES = 9
 grey value, and the census in three."""
 RIM = 3
 """Rows and columns that an image needs beyond its own: half the census window of 7 by 7 pixels."""
+GREY = 3
+"""The plane of the grey values themselves."""
 CAP = np.int32(63)
 """Largest gradient along the row, as in OpenCV's matcher."""
 MAX_COST = 63 + 63 + 24
@@ -43,7 +45,8 @@ NOTHING, SINGLE, DOUBLE, FAR, WORD = np.uint16(0), np.uint16(1), np.uint16(2), n
 class Settings(NamedTuple):
     """What `match` is told, in whole numbers.
 
-    radius: half of the window's side. p1, p2: cost of a step of one disparity and of more. unique: per cent by which
+    radius: half of the window's side. p1: cost of a step of one disparity. jumps: (256,) that of more, by the step of grey between
+    both pixels. unique: per cent by which
     the second best match must be worse. left_right: most by which the disparities of both images may differ, in
     pixels; negative: any. share: a window's sum of costs times this, without its lower 16 bits, is the pixel's cost,
     at most 255 - p1 - p2. disparities: those that may be chosen.
@@ -51,7 +54,7 @@ class Settings(NamedTuple):
 
     radius: int
     p1: int
-    p2: int
+    jumps: NDArray[np.uint8]
     unique: int
     left_right: int
     share: int
@@ -133,7 +136,7 @@ def match(left, right, start, first, end, settings, scratch, raw):
     go down. settings: Settings; scratch: Scratch. Without a value: NONE.
     """
     height, radius = raw.shape[0], np.int64(settings.radius)
-    p1, p2, share = np.uint8(settings.p1), np.uint8(settings.p2), np.uint32(settings.share)
+    p1, jumps, share = np.uint8(settings.p1), settings.jumps, np.uint32(settings.share)
     rows, sums, costs, down = scratch.rows, scratch.sums, scratch.costs, scratch.down
     slots, blocks = 2 * radius + 2, np.uint64(costs.shape[1]) // LANES
     sums[:] = NOTHING
@@ -144,9 +147,9 @@ def match(left, right, start, first, end, settings, scratch, raw):
         smooth(sums, radius, share, scratch.window, costs, blocks)
         leave(rows[(v - radius + slots) % slots], sums, blocks)
         into, of = down[v & 1], down[1 - (v & 1)]
-        downward(costs, of, v == start, p1, p2, scratch.lows, into, blocks)
+        downward(costs, of, v == start, p1, jumps, left[GREY, max(v - 1, 0)], left[GREY, v], scratch.lows, into, blocks)
         if v >= first:
-            sideways(costs, p1, p2, scratch.across, blocks)
+            sideways(costs, p1, jumps, left[GREY, v], scratch.across, blocks)
             choose(
                 scratch.across, into, settings, scratch.total, scratch.numbers, scratch.rival, scratch.owner, raw[v],
                 blocks,
@@ -261,23 +264,31 @@ def _begin(costs, path, blocks):
 
 
 @kernel
-def downward(costs, of, begins, p1, p2, lows, into, blocks):
+def downward(costs, of, begins, p1, jumps, above, grey, lows, into, blocks):
     for u in range(costs.shape[0]):
         if begins:
             lows[u] = _begin(costs[u], into[u], blocks)
         else:
-            lows[u] = _step(costs[u], of[u], lows[u], p1, p2, into[u], blocks)
+            jump = _jump(jumps, above[u], grey[u])
+            lows[u] = _step(costs[u], of[u], lows[u], p1, jump, into[u], blocks)
 
 
 @kernel
-def sideways(costs, p1, p2, across, blocks):
+def sideways(costs, p1, jumps, grey, across, blocks):
     """Fill both paths along the row: across[0] goes right, across[1] left."""
     last = costs.shape[0] - 1
     right, left = _begin(costs[0], across[0, 0], blocks), _begin(costs[last], across[1, last], blocks)
     for u in range(1, last + 1):
         v = last - u
-        right = _step(costs[u], across[0, u - 1], right, p1, p2, across[0, u], blocks)
-        left = _step(costs[v], across[1, v + 1], left, p1, p2, across[1, v], blocks)
+        to_right, to_left = _jump(jumps, grey[u - 1], grey[u]), _jump(jumps, grey[v + 1], grey[v])
+        right = _step(costs[u], across[0, u - 1], right, p1, to_right, across[0, u], blocks)
+        left = _step(costs[v], across[1, v + 1], left, p1, to_left, across[1, v], blocks)
+
+
+@cell
+def _jump(jumps, before, here):
+    """Return the cost of a jump between two pixels of these grey values."""
+    return jumps[max(before, here) - min(before, here)]
 
 
 @cell

@@ -30,6 +30,12 @@ def at(image, v, u):
     return int(image[min(max(v, 0), image.shape[0] - 1), min(max(u, 0), image.shape[1] - 1)])
 
 
+def soft(image, v, u):
+    """Return the mean of 3 by 3 pixels, those in the middle counted twice along both axes."""
+    around = [(y, x) for y in (-1, 0, 1) for x in (-1, 0, 1)]
+    return (8 + sum((2 - abs(y)) * (2 - abs(x)) * at(image, v + y, u + x) for y, x in around)) // 16
+
+
 def slope(image, v, u):
     total = sum(weight * (at(image, v + y, u + 1) - at(image, v + y, u - 1)) for y, weight in ((-1, 1), (0, 2), (1, 1)))
     return min(max(total, -63), 63)
@@ -50,12 +56,14 @@ def unlike(a, b):
 def described(image, columns):
     """Return of each row and column what it is compared by; columns may lie beyond the image."""
     found = {}
+    rows, wider = range(-3, image.shape[0] + 3), range(columns.start - 3, columns.stop + 3)
+    softer = {(v, u): soft(image, v, u) for v in rows for u in wider}
     steps = [(y, x) for y in range(-3, 4) for x in range(-3, 4) if (y + x) % 2 == 0 and (y, x) != (0, 0)]
     for v in range(image.shape[0]):
         for u in columns:
             slopes = half_a_pixel([slope(image, v, u + x) + 63 for x in (-1, 0, 1)])
             greys = half_a_pixel([at(image, v, u + x) for x in (-1, 0, 1)])
-            found[v, u] = slopes, greys, [at(image, v + y, u + x) < at(image, v, u) for y, x in steps]
+            found[v, u] = slopes, greys, [softer[v + y, u + x] < softer[v, u] for y, x in steps]
     return found
 
 

@@ -39,6 +39,7 @@ LANES, PAD, BEFORE_PAD, BEHIND_PAD = np.uint64(BLOCK), np.uint64(MARGIN), np.uin
 LEFT, RIGHT, ONE_ON, TWO_ON = np.uint64(RIM - 2), np.uint64(RIM), np.uint64(1), np.uint64(2)
 ZERO, ONE, TWO, FOUR, FULL = np.uint8(0), np.uint8(1), np.uint8(2), np.uint8(4), np.uint8(255)
 PAIRS, QUADS, LOW = np.uint8(0x55), np.uint8(0x33), np.uint8(0x0F)
+HALF, QUARTERS = np.uint16(8), np.uint16(4)
 NOTHING, SINGLE, DOUBLE, FAR, WORD = np.uint16(0), np.uint16(1), np.uint16(2), np.uint16(65535), np.uint32(16)
 
 
@@ -85,10 +86,41 @@ class Scratch(NamedTuple):
 
 
 @kernel
-def describe(image, first, end, sign, line, planes):
+def soften(image, first, end, soft):
+    """Fill rows `first` to `end` of `soft` (h, w) uint8 with weighed means of 3 by 3 pixels of `image` (h, w) uint8.
+
+    Its census changes less with noise, and where one eye's rows lie lower; gradients are as soft along columns.
+    image: with its rim, in which the edge is repeated.
+    """
+    last = image.shape[0] - 1
+    for v in range(first, end):
+        _soften(image[max(v - 1, 0)], image[v], image[min(v + 1, last)], soft[v])
+
+
+@cell
+def _soften(above, here, below, soft):
+    last = np.uint64(soft.size - 1)
+    for u in range(np.uint64(1), last):
+        before, after = _column(above, here, below, u - ONE_ON), _column(above, here, below, u + ONE_ON)
+        soft[u] = _mean(before, _column(above, here, below, u), after)
+    soft[0], soft[last] = soft[1], soft[last - ONE_ON]  # in the rim, neighbours are alike
+
+
+@cell
+def _column(above, here, below, u):
+    return np.uint16(np.uint16(np.uint16(above[u]) + np.uint16(below[u])) + np.uint16(np.uint16(here[u]) << SINGLE))
+
+
+@cell
+def _mean(before, here, after):
+    return np.uint8(np.uint16(np.uint16(before + after) + np.uint16(np.uint16(here << SINGLE) + HALF)) >> QUARTERS)
+
+
+@kernel
+def describe(image, soft, first, end, sign, line, planes):
     """Fill rows `first` to `end` of `planes` (PLANES, h, w) uint8: what the pixels of an image are compared by.
 
-    image: (h + 2 RIM, w + 2 RIM) uint8, its rim included. sign: 1, or -1 for an image that is mirrored.
+    image, soft: (h + 2 RIM, w + 2 RIM) uint8, its rim included, and what `soften` makes of it. sign: 1, or -1 for an image that is mirrored.
     line: (w + 2,) uint8, scratch.
     """
     for v in range(first, end):
@@ -99,8 +131,8 @@ def describe(image, first, end, sign, line, planes):
             planes[plane, v, :] = ZERO
         for bit in range(len(CENSUS)):
             y, x = CENSUS[bit]
-            there, weight = image[v + RIM + y], np.uint8(1 << (bit & 7))
-            _darker(there[RIM + sign * x :], image[v + RIM, RIM:], weight, planes[6 + (bit >> 3), v])
+            there, weight = soft[v + RIM + y], np.uint8(1 << (bit & 7))
+            _darker(there[RIM + sign * x :], soft[v + RIM, RIM:], weight, planes[6 + (bit >> 3), v])
 
 
 @cell

@@ -90,12 +90,16 @@ class Census:
         wide = cv2.copyMakeBorder(
             np.ascontiguousarray(image), RIM, RIM, RIM, RIM + beyond, cv2.BORDER_REPLICATE
         )  # fmt: skip
-        planes = np.empty((PLANES, height, width + beyond), np.uint8)
+        soft, planes = np.empty_like(wide), np.empty((PLANES, height, width + beyond), np.uint8)
+
+        def soften(rows: slice) -> None:
+            _semiglobal.soften(wide, rows.start, rows.stop, soft)
 
         def describe(rows: slice) -> None:
             line = np.empty(width + beyond + 2, np.uint8)
-            _semiglobal.describe(wide, rows.start, rows.stop, sign, line, planes)
+            _semiglobal.describe(wide, soft, rows.start, rows.stop, sign, line, planes)
 
+        in_shards(soften, shards(len(wide), self._config.threads))
         in_shards(describe, shards(height, self._config.threads))
         return planes
 

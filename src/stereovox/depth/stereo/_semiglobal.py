@@ -277,7 +277,7 @@ def _slide(window, entering, leaving, share, costs, blocks):
         for i in range(LANES):
             d = block * LANES + i
             full = np.uint16(window[d] + entering[d])
-            costs[d] = np.uint8((np.uint32(full) * share) >> WORD)
+            costs[d] = np.uint8(np.uint32(np.uint32(full) * share) >> WORD)
             window[d] = np.uint16(full - leaving[d])
 
 

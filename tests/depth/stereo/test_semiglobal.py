@@ -213,6 +213,20 @@ def test_eyes_may_be_exposed_differently(gain, offset):
         assert np.mean(np.abs(found[kept] - 12) < 1) > 0.97
 
 
+def test_bright_lines_are_not_taken_for_what_is_behind_them():
+    import cv2
+
+    random, lines = np.random.default_rng(3), np.arange(60, 300, 20)
+    smooth = cv2.GaussianBlur(random.normal(size=(100, 330)), (0, 0), 1.5)
+    wall = 120 + 20 * smooth / smooth.std()
+    left, right = wall[:, :320].copy(), wall[:, 5:325].copy()
+    left[:, lines], right[:, lines - 20] = 200, 200
+    eyes = (np.clip(eye + random.normal(0, 2, eye.shape), 0, 255).astype(np.uint8) for eye in (left, right))
+    found = Census(stereo(disparities=64))(*eyes)
+    assert np.mean(np.abs(found[:, lines - 10] - 5) < 1) > 0.9
+    assert np.mean(found[:, lines] < 12) < 0.3  # 0.97 where every jump costs the same
+
+
 def test_small_patches_are_dropped():
     left, right = pair(60, 120, shift=12)
     right[20:30, 60:70] = pair(60, 120, seed=9)[1][20:30, 60:70]

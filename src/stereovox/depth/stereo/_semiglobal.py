@@ -46,11 +46,11 @@ NOTHING, SINGLE, DOUBLE, FAR, WORD = np.uint16(0), np.uint16(1), np.uint16(2), n
 class Settings(NamedTuple):
     """What `match` is told, in whole numbers.
 
-    radius: half of the window's side. p1: cost of a step of one disparity. jumps: (256,) that of more, by the step of grey between
-    both pixels. unique: per cent by which
-    the second best match must be worse. left_right: most by which the disparities of both images may differ, in
-    pixels; negative: any. share: a window's sum of costs times this, without its lower 16 bits, is the pixel's cost,
-    at most 255 - p1 - p2. disparities: those that may be chosen.
+    radius: half of the window's side. p1: cost of a step of one disparity. jumps: (256,) that of more, by the step of
+    grey between both pixels. unique: per cent by which the second best match must be worse. left_right: most by which
+    the disparities of both images may differ, in pixels; negative: any. share: a window's sum of costs times this,
+    without its lower 16 bits, is the pixel's cost, at most 255 - p1 - the greatest of `jumps`. disparities: those that
+    may be chosen.
     """
 
     radius: int
@@ -120,7 +120,8 @@ def _mean(before, here, after):
 def describe(image, soft, first, end, sign, line, planes):
     """Fill rows `first` to `end` of `planes` (PLANES, h, w) uint8: what the pixels of an image are compared by.
 
-    image, soft: (h + 2 RIM, w + 2 RIM) uint8, its rim included, and what `soften` makes of it. sign: 1, or -1 for an image that is mirrored.
+    image, soft: (h + 2 RIM, w + 2 RIM) uint8, its rim included, and what `soften` makes of it. sign: 1, or -1 for an
+    image that is mirrored.
     line: (w + 2,) uint8, scratch.
     """
     for v in range(first, end):

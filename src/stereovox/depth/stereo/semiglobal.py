@@ -33,8 +33,8 @@ UNIQUE = 2 / 3
 class Census:
     """Own matcher: three paths, costs of Birchfield and Tomasi on gradients and grey values, and of a census.
 
-    It is as good as OpenCV's along three paths in half the time (docs/stereo.md). With gains or offsets between the
-    eyes the census keeps it so. Not for concurrent use by several threads.
+    It errs less than OpenCV's along three paths in 0.6 to 0.7 of the time, except where one eye stands a row lower
+    (docs/stereo.md). Not for concurrent use by several threads.
     """
 
     def __init__(self, config: StereoConfig) -> None:

@@ -40,7 +40,7 @@ def survey(depth_m, ends, view, table, windows, scratch, nearest, stack, free, m
     farthest = build(ends.reshape(ends.size), windows, scratch)
     if table.marks:
         nearest_tiles(depth_m, nearest[0], nearest[1])
-    return candidates(view, table, windows, nearest, _end_of_view(view, table, farthest), stack, free, mixed)
+    return _candidates(view, table, windows, nearest, _end_of_view(view, table, farthest), stack, free, mixed)
 
 
 @cell
@@ -52,16 +52,16 @@ def _end_of_view(view, table, farthest):
     return min(view.max_range, max(farthest, TEN * NEAR_PLANE) * (ONE + SLACK) + behind)
 
 
-@kernel
-def candidates(view, table, windows, nearest, end, stack, free, mixed):
+@cell
+def _candidates(view, table, windows, nearest, end, stack, free, mixed):
     """List the blocks that are wholly free and those that must be evaluated; see `survey`.
 
     end: depth in metres beyond which the image says nothing.
     """
     n_free, n_mixed = 0, 0
-    low_x, high_x = _touched(view, end, 0)
-    low_y, high_y = _touched(view, end, 1)
-    low_z, high_z = _touched(view, end, 2)
+    low_x, high_x = _touched(view, end, np.int64(0))  # of one type: literal numbers would each compile it again
+    low_y, high_y = _touched(view, end, np.int64(1))
+    low_z, high_z = _touched(view, end, np.int64(2))
     for bx in range(low_x, high_x + 1, COARSE):
         for by in range(low_y, high_y + 1, COARSE):
             for bz in range(low_z, high_z + 1, COARSE):

@@ -8,6 +8,7 @@ pixels whose number differs from their neighbours' go on; groups without any cos
 import numpy as np
 
 from stereovox._jit import cell, kernel
+from stereovox._math import floor, square_root
 from stereovox.integrate._cells import (
     HALF,
     NARROW,
@@ -158,7 +159,7 @@ def _evidence(view, table, full_share, listed, z, share, values):
     for i in range(listed.size):
         hit = np.float32(table.hit[table_row(min(z[i], view.max_range), table.rows_per_metre, rows)])
         part = min(ONE, share[i] / full_share) if full_share > ZERO else ONE
-        weighed = max(np.floor(hit * np.sqrt(part) + HALF), ONE)
+        weighed = max(floor(hit * square_root(part) + HALF), ONE)
         values[index(listed[i])] = np.int16(weighed if hit > ZERO else ZERO)
 
 
@@ -187,9 +188,9 @@ def _row_rays(forward, row, size):
 def _point_cell(d, column, ray, position):
     """Return the cell that holds the point at depth `d` of the pixel with x/z `column`."""
     return (
-        np.int32(np.floor(d * (ray[0] * column + ray[1]) + position[0])),
-        np.int32(np.floor(d * (ray[2] * column + ray[3]) + position[1])),
-        np.int32(np.floor(d * (ray[4] * column + ray[5]) + position[2])),
+        np.int32(floor(d * (ray[0] * column + ray[1]) + position[0])),
+        np.int32(floor(d * (ray[2] * column + ray[3]) + position[1])),
+        np.int32(floor(d * (ray[4] * column + ray[5]) + position[2])),
     )
 
 

@@ -8,6 +8,7 @@ classified by two comparisons, and only a layer with cells near a measurement is
 import numpy as np
 
 from stereovox._jit import cell, kernel
+from stereovox._math import floor
 from stereovox.integrate._cells import HALF, NEAR_PLANE, NO_RETURN, ONE, ZERO, index, table_row, window_level
 from stereovox.integrate._windows import COARSEST, place
 from stereovox.maps._cells import find
@@ -158,8 +159,8 @@ def _touched(view, end, axis):
         reached = end * (x * view.forward[0, axis] + y * view.forward[1, axis] + view.forward[2, axis])
         low, high = min(low, reached), max(high, reached)
     side = np.float32(8 * COARSE) * view.voxel_size
-    first = np.int64(np.floor((view.position[axis] + low - view.voxel_size) / side))
-    last = np.int64(np.floor((view.position[axis] + high + view.voxel_size) / side))
+    first = np.int64(floor((view.position[axis] + low - view.voxel_size) / side))
+    last = np.int64(floor((view.position[axis] + high + view.voxel_size) / side))
     return first * COARSE, last * COARSE
 
 

@@ -85,82 +85,110 @@ def weigh(depth_m, view, table, full_share, listed, n, coords, values, lanes):
 
     It counts in full where at least `full_share` of the cell's footprint in the image measures a depth within the cell;
     with less, by the square root of the part: a few pixels may be a slip of the matcher. full_share 0: always in full.
-    listed: the cells that `scatter` set, in its first `n` entries. lanes: (9, LANES) float32 scratch.
+    listed: the cells that `scatter` set, in its first `n` entries. lanes: a `HitLanes`, scratch.
     """
     flat, values_flat = depth_m.reshape(depth_m.size), values.reshape(values.size)
-    x, y, z, share = lanes[0], lanes[1], lanes[2], lanes[3]
+    x, y, z, share = lanes.x, lanes.y, lanes.z, lanes.share
     for start in range(0, n, LANES):
         some = listed[start : min(start + LANES, n)]
         _centres(view, coords, some, x, y, z)
         for i in range(some.size):
             share[i] = full_share
         if full_share > ZERO:
-            _share(flat, view, some.size, x, y, z, share, lanes[4], lanes[5], lanes[6], lanes[7], lanes[8])
+            _share(flat, view, some.size, lanes)
         _evidence(view, table, full_share, some, z, share, values_flat)
 
 
 @cell
 def _centres(view, coords, listed, x, y, z):
     """Write where the centres of listed cells stand, camera axes, x and y times the focal length."""
-    side = np.float32(8) * view.voxel_size
-    R = view.rotation
     for i in range(listed.size):
         block, c = listed[i] >> 9, listed[i] & 511
-        px = np.float32(coords[block, 0]) * side - view.position[0]
-        py = np.float32(coords[block, 1]) * side - view.position[1]
-        pz = np.float32(coords[block, 2]) * side - view.position[2]
-        x[i] = (R[0, 0] * px + R[0, 1] * py + R[0, 2] * pz) * view.intrinsics[0] + view.steps[0, c]
-        y[i] = (R[1, 0] * px + R[1, 1] * py + R[1, 2] * pz) * view.intrinsics[1] + view.steps[1, c]
-        z[i] = max(R[2, 0] * px + R[2, 1] * py + R[2, 2] * pz + view.steps[2, c], NEAR_PLANE)
+        x[i], y[i], z[i] = centre(view, coords[block, 0], coords[block, 1], coords[block, 2], c)
 
 
 @cell
-def _share(depth_m, view, n, x, y, z, share, u, v, samples, step, looked):
+def centre(view, bx, by, bz, c):
+    """Return where the centre of cell `c` of a block stands, camera axes, x and y times the focal length."""
+    side = np.float32(8) * view.voxel_size
+    R = view.rotation
+    px = np.float32(bx) * side - view.position[0]
+    py = np.float32(by) * side - view.position[1]
+    pz = np.float32(bz) * side - view.position[2]
+    x = (R[0, 0] * px + R[0, 1] * py + R[0, 2] * pz) * view.intrinsics[0] + view.steps[0, c]
+    y = (R[1, 0] * px + R[1, 1] * py + R[1, 2] * pz) * view.intrinsics[1] + view.steps[1, c]
+    return x, y, max(R[2, 0] * px + R[2, 1] * py + R[2, 2] * pz + view.steps[2, c], NEAR_PLANE)
+
+
+@cell
+def _share(depth_m, view, n, lanes):
     """Write the part of each cell's footprint whose pixels measure a depth within half a cell of its centre.
 
-    Samples stand at even distances, up to SIDE_SAMPLES a side; at least half of one counts. The last five are scratch.
+    Samples stand at even distances, up to SIDE_SAMPLES a side; at least half of one counts.
     """
-    width, height = np.float32(view.width), np.float32(view.height)
+    x, y, z, share, u, v, samples, step, looked, depth, counts, at = lanes
     limit = HALF * view.voxel_size
+    most = np.int32(1)
     for i in range(n):
-        inverse = ONE / z[i]
-        wide = min(view.voxel_size * view.intrinsics[0] * inverse, width)
-        samples[i] = np.float32(np.int32(min(max(wide, ONE), np.float32(SIDE_SAMPLES))))
-        step[i] = wide / samples[i]
-        u[i] = x[i] * inverse + view.intrinsics[2] + HALF - HALF * wide
-        v[i] = y[i] * inverse + view.intrinsics[3] + HALF - HALF * wide
+        side, step[i], u[i], v[i] = footprint(view, x[i], y[i], z[i])
+        most = max(most, side)
+        samples[i] = np.float32(side)
         share[i] = ZERO
         looked[i] = ZERO
-    for j in range(SIDE_SAMPLES):
+    for j in range(most):
         row = np.float32(j) + HALF
-        for k in range(SIDE_SAMPLES):
+        for k in range(most):
             column = np.float32(k) + HALF
             for i in range(n):
-                su, sv = u[i] + column * step[i], v[i] + row * step[i]
-                inside = (
-                    (row < samples[i])
-                    & (column < samples[i])
-                    & (su >= ZERO)
-                    & (su < width)
-                    & (sv >= ZERO)
-                    & (sv < height)
-                )
-                at = np.int32(np.int32(sv if inside else ZERO) * view.width) + np.int32(su if inside else ZERO)
-                d = depth_m[index(np.int32(at))]
-                share[i] += ONE if inside & (abs(d - z[i]) <= limit) else ZERO
-                looked[i] += ONE if inside else ZERO
+                counts[i], at[i] = sample(view, u[i] + column * step[i], v[i] + row * step[i])
+                counts[i] = counts[i] if (row < samples[i]) & (column < samples[i]) else ZERO
+            for i in range(n):  # by itself: see `_projective._aim`
+                depth[i] = depth_m[index(at[i])]
+            for i in range(n):
+                share[i] += counts[i] if abs(depth[i] - z[i]) <= limit else ZERO
+                looked[i] += counts[i]
     for i in range(n):
-        share[i] = max(share[i], HALF) / max(looked[i], ONE)
+        share[i] = share_of(share[i], looked[i])
+
+
+@cell
+def footprint(view, x, y, z):
+    """Return the samples along each side of a cell's footprint, the pixels between them, and its upper left corner."""
+    inverse = ONE / z
+    wide = min(view.voxel_size * view.intrinsics[0] * inverse, np.float32(view.width))
+    side = np.int32(min(max(wide, ONE), np.float32(SIDE_SAMPLES)))
+    u = x * inverse + view.intrinsics[2] + HALF - HALF * wide
+    v = y * inverse + view.intrinsics[3] + HALF - HALF * wide
+    return side, wide / np.float32(side), u, v
+
+
+@cell
+def sample(view, u, v):
+    """Return whether a point lies in the image, 1 or 0, and the number of its pixel, 0 if it does not."""
+    inside = (u >= ZERO) & (u < np.float32(view.width)) & (v >= ZERO) & (v < np.float32(view.height))
+    at = np.int32(np.int32(v if inside else ZERO) * view.width) + np.int32(u if inside else ZERO)
+    return ONE if inside else ZERO, np.int32(at)
+
+
+@cell
+def share_of(share, looked):
+    """Return the part of a footprint whose samples measure the cell: so many of those that were looked at."""
+    return max(share, HALF) / max(looked, ONE)
 
 
 @cell
 def _evidence(view, table, full_share, listed, z, share, values):
-    rows = np.int32(table.hit.size)
     for i in range(listed.size):
-        hit = np.float32(table.hit[table_row(min(z[i], view.max_range), table.rows_per_metre, rows)])
-        part = min(ONE, share[i] / full_share) if full_share > ZERO else ONE
-        weighed = max(floor(hit * square_root(part) + HALF), ONE)
-        values[index(listed[i])] = np.int16(weighed if hit > ZERO else ZERO)
+        values[index(listed[i])] = hit_evidence(view, table, full_share, z[i], share[i])
+
+
+@cell
+def hit_evidence(view, table, full_share, z, share):
+    """Return the evidence of a hit on a cell at depth `z`, of whose footprint a `share` measures it."""
+    hit = np.float32(table.hit[table_row(min(z, view.max_range), table.rows_per_metre, np.int32(table.hit.size))])
+    part = min(ONE, share / full_share) if full_share > ZERO else ONE
+    weighed = max(floor(hit * square_root(part) + HALF), ONE)
+    return np.int16(weighed if hit > ZERO else ZERO)
 
 
 @cell
@@ -200,34 +228,50 @@ def _narrow_row(depths, columns, ray, position, now, before, news):
 
     Offsets keep all numbers positive, so that cutting off digits is the floor.
     """
-    middle = np.float32(1 << (NARROW - 1))
-    x0, y0, z0 = position[0] + middle, position[1] + middle, position[2] + middle
+    offset = narrow_offset(position)
     last = np.int32(NOTHING)
     for u in range(depths.size):
-        d, column = depths[u], columns[u]
-        x = np.int32(d * (ray[0] * column + ray[1]) + x0)
-        y = np.int32(d * (ray[2] * column + ray[3]) + y0)
-        z = np.int32(d * (ray[4] * column + ray[5]) + z0)
-        key = np.int32((x << np.int32(2 * NARROW)) | (y << np.int32(NARROW)) | z)
-        key = key if (d > ZERO) & (d < NO_RETURN) else np.int32(NOTHING)
+        key = narrow_key(depths[u], columns[u], ray, offset)
         now[u] = key
         news[u] = _is_new(key, last, before[u], before[u + 1])
         last = key
 
 
 @cell
+def narrow_offset(position):
+    """Return the camera's position in cells, shifted to keep all cells within reach of an int32 key positive."""
+    middle = np.float32(1 << (NARROW - 1))
+    return position[0] + middle, position[1] + middle, position[2] + middle
+
+
+@cell
+def narrow_key(d, column, ray, offset):
+    """Return the int32 key of the cell that holds the point at depth `d` of a pixel; NOTHING without a depth."""
+    x = np.int32(d * (ray[0] * column + ray[1]) + offset[0])
+    y = np.int32(d * (ray[2] * column + ray[3]) + offset[1])
+    z = np.int32(d * (ray[4] * column + ray[5]) + offset[2])
+    key = np.int32((x << np.int32(2 * NARROW)) | (y << np.int32(NARROW)) | z)
+    return key if (d > ZERO) & (d < NO_RETURN) else np.int32(NOTHING)
+
+
+@cell
 def _wide_row(depths, columns, ray, position, now, before, news):
     """Pack each pixel's cell into an int64 and mark news."""
-    middle = np.int64(1 << (WIDE - 1))
     last = np.int64(NOTHING)
     for u in range(depths.size):
-        d = depths[u]
-        x, y, z = _point_cell(d, columns[u], ray, position)
-        key = ((np.int64(x) + middle) << (2 * WIDE)) | ((np.int64(y) + middle) << WIDE) | (np.int64(z) + middle)
-        key = key if (d > ZERO) & (d < NO_RETURN) else np.int64(NOTHING)
+        key = wide_key(depths[u], columns[u], ray, position)
         now[u] = key
         news[u] = _is_new(key, last, before[u], before[u + 1])
         last = key
+
+
+@cell
+def wide_key(d, column, ray, position):
+    """Return the int64 key of the cell that holds the point at depth `d` of a pixel; NOTHING without a depth."""
+    middle = np.int64(1 << (WIDE - 1))
+    x, y, z = _point_cell(d, column, ray, position)
+    key = ((np.int64(x) + middle) << (2 * WIDE)) | ((np.int64(y) + middle) << WIDE) | (np.int64(z) + middle)
+    return key if (d > ZERO) & (d < NO_RETURN) else np.int64(NOTHING)
 
 
 @cell

@@ -90,42 +90,51 @@ def with_hits(hit_table, hit_coords, n_hits, free, n_free, mixed, n_mixed, hit_o
 
 
 @kernel
-def evaluate(depth_m, view, table, windows, blocks, hit_of, hit_values, values, depths, measured):
+def evaluate(depth_m, view, table, windows, blocks, hit_of, hit_values, values, scratch):
     """Fill `values` (n, 512) int16 with the evidence on the cells of `blocks` (n, 3), hits included.
 
     depth_m: (h, w) REP 117 depth image, from which `windows` was made. hit_of: (n,) place of each block among the hits,
-    -1 for none. depths, measured: (LAYER,) float32 scratch.
+    -1 for none. scratch: a `LayerScratch`.
     """
-    side = np.float32(8) * view.voxel_size
     for i in range(blocks.shape[0]):
-        x, y, z = blocks[i, 0], blocks[i, 1], blocks[i, 2]
-        px = np.float32(x) * side - view.position[0]
-        py = np.float32(y) * side - view.position[1]
-        pz = np.float32(z) * side - view.position[2]
-        R = view.rotation
-        cx = (R[0, 0] * px + R[0, 1] * py + R[0, 2] * pz) * view.intrinsics[0]
-        cy = (R[1, 0] * px + R[1, 1] * py + R[1, 2] * pz) * view.intrinsics[1]
-        cz = R[2, 0] * px + R[2, 1] * py + R[2, 2] * pz
+        cx, cy, cz = corner(view, blocks[i, 0], blocks[i, 1], blocks[i, 2])
         out = values[i]
-        _clear(view, table, windows, cx, cy, cz, _passed(view, table, cz), depths, measured, out)
+        _clear(view, table, windows, cx, cy, cz, _passed(view, table, cz), scratch, out)
         if table.marks:
-            _mark(depth_m, view, table, cx, cy, cz, out)
+            for c in range(512):
+                mark = marked(depth_m, view, table, cx, cy, cz, c)
+                out[c] = np.int16(mark) if mark > 0 else out[c]
         if hit_of[i] >= 0:
             hits = hit_values[hit_of[i]]
             for c in range(512):
-                out[c] = max(out[c], hits[c]) if hits[c] > 0 else out[c]
+                out[c] = with_hit(out[c], hits[c])
 
 
 @kernel
 def passed(view, table, blocks, out):
     """Fill `out` (n,) int16 with the evidence on all cells of each of `blocks` (n, 3), which are wholly free."""
+    for i in range(blocks.shape[0]):
+        _, _, cz = corner(view, blocks[i, 0], blocks[i, 1], blocks[i, 2])
+        out[i] = np.int16(_passed(view, table, cz))
+
+
+@cell
+def corner(view, bx, by, bz):
+    """Return where the corner of block (bx, by, bz) stands, camera axes, x and y times the focal length."""
     side = np.float32(8) * view.voxel_size
     R = view.rotation
-    for i in range(blocks.shape[0]):
-        px = np.float32(blocks[i, 0]) * side - view.position[0]
-        py = np.float32(blocks[i, 1]) * side - view.position[1]
-        pz = np.float32(blocks[i, 2]) * side - view.position[2]
-        out[i] = np.int16(_passed(view, table, R[2, 0] * px + R[2, 1] * py + R[2, 2] * pz))
+    px = np.float32(bx) * side - view.position[0]
+    py = np.float32(by) * side - view.position[1]
+    pz = np.float32(bz) * side - view.position[2]
+    x = (R[0, 0] * px + R[0, 1] * py + R[0, 2] * pz) * view.intrinsics[0]
+    y = (R[1, 0] * px + R[1, 1] * py + R[1, 2] * pz) * view.intrinsics[1]
+    return x, y, R[2, 0] * px + R[2, 1] * py + R[2, 2] * pz
+
+
+@cell
+def with_hit(value, hit):
+    """Return the evidence on a cell that also has `hit`, 0 for none; both int16."""
+    return max(value, hit) if hit > 0 else value
 
 
 @cell
@@ -289,11 +298,12 @@ def _passed(view, table, cz):
 
 
 @cell
-def _clear(view, table, windows, cx, cy, cz, lowest, depths, measured, out):
+def _clear(view, table, windows, cx, cy, cz, lowest, scratch, out):
     """Write the negative evidence of the farthest pixel in a window of about the cell's size, never below `lowest`.
 
-    depths, measured: (LAYER,) scratch.
+    scratch: see `evaluate`.
     """
+    depths, measured, _, at, _ = scratch
     R = view.rotation
     farther = max(R[2, 0], ZERO) + max(R[2, 1], ZERO) + max(R[2, 2], ZERO)
     z_most = max(cz + np.float32(8) * view.voxel_size * farther, ZERO)
@@ -301,35 +311,55 @@ def _clear(view, table, windows, cx, cy, cz, lowest, depths, measured, out):
     for layer in range(0, 512, LAYER):
         cells = slice(layer, layer + LAYER)
         steps = view.steps[0, cells], view.steps[1, cells], view.steps[2, cells]
-        _measure(view, windows, max(NEAR_PLANE, table.blind), cx, cy, cz, steps, depths, measured)
+        _aim(view, windows, max(NEAR_PLANE, table.blind), cx, cy, cz, steps, depths, at)
+        _load(windows.image, at, measured)
         if _write_free_layer(depths, measured, before, table.behind, lowest, out[cells]):
-            _look_up(view, table, depths, measured, lowest, out[cells])
+            _look_up(view, table, scratch, lowest, out[cells])
+
+
+# Finding the places, loading from them and computing with what was loaded are loops of their own, here and below: most
+# processors have no fast instruction that loads from many places, and for them the compiler then takes a whole loop one
+# cell at a time.
 
 
 @cell
-def _measure(view, windows, nearest, cx, cy, cz, steps, depths, measured):
-    """Fill `depths` with the depth of each cell's centre and `measured` with what was measured there.
+def _aim(view, windows, nearest, cx, cy, cz, steps, depths, at):
+    """Fill `depths` with the depth of each cell's centre and `at` with where its window value stands.
 
     nearest: depth up to which cells are skipped.
     """
     fx_steps, fy_steps, z_steps = steps
+    for c in range(LAYER):
+        z = cz + z_steps[c]
+        depths[c] = z
+        at[c] = window_place(view, windows, nearest, cx + fx_steps[c], cy + fy_steps[c], z)
+
+
+@cell
+def window_place(view, windows, nearest, x, y, z):
+    """Return where the window value of a cell stands; that of one that is not looked at is UNSEEN.
+
+    x, y, z: its centre in camera axes, x and y times the focal length. nearest: depth up to which cells are skipped.
+    """
     u_centre, v_centre = view.intrinsics[2] + HALF, view.intrinsics[3] + HALF
     right, bottom = np.float32(view.width - 1), np.float32(view.height - 1)
     u_end, v_end = np.float32(view.width), np.float32(view.height)
     first, last = np.int32(windows.first), np.int32(COARSEST)
+    ahead = (z > nearest) & (z <= view.max_range)
+    inverse = ONE / (z if ahead else ONE)
+    u = x * inverse + u_centre
+    v = y * inverse + v_centre
+    u_rim, v_rim = view.rim[0] * inverse, view.rim[1] * inverse
+    seen = ahead & (u >= -u_rim) & (v >= -v_rim) & (u < u_end + u_rim) & (v < v_end + v_rim)
+    level = min(max(window_level(view.spread * inverse), first), last)
+    i = place(level, min(max(v, ZERO), bottom), min(max(u, ZERO), right), windows.pitch, windows.height)
+    return i if seen else np.int32(windows.image.size - 1)
+
+
+@cell
+def _load(values, at, out):
     for c in range(LAYER):
-        z = cz + z_steps[c]
-        ahead = (z > nearest) & (z <= view.max_range)
-        inverse = ONE / (z if ahead else ONE)
-        u = (cx + fx_steps[c]) * inverse + u_centre
-        v = (cy + fy_steps[c]) * inverse + v_centre
-        u_rim, v_rim = view.rim[0] * inverse, view.rim[1] * inverse
-        seen = ahead & (u >= -u_rim) & (v >= -v_rim) & (u < u_end + u_rim) & (v < v_end + v_rim)
-        level = min(max(window_level(view.spread * inverse), first), last)
-        i = place(level, min(max(v, ZERO), bottom), min(max(u, ZERO), right), windows.pitch, windows.height)
-        d = windows.image[index(i)]
-        depths[c] = z
-        measured[c] = d if seen else UNSEEN
+        out[c] = values[index(at[c])]
 
 
 @cell
@@ -344,41 +374,61 @@ def _write_free_layer(depths, measured, before, behind, lowest, out):
 
 
 @cell
-def _look_up(view, table, depths, measured, lowest, out):
+def _look_up(view, table, scratch, lowest, out):
     """Write the sensor table's evidence on cells that are not wholly before their measurement, never below `lowest`."""
-    last_row = np.int32(table.hit.size - 1)
-    columns, clear = np.int32(table.clear.shape[1]), table.clear.reshape(table.clear.size)
-    last_column, middle_column = np.float32(columns - 1), np.float32(columns) * HALF
+    depths, measured, scale, at, row = scratch
     for c in range(LAYER):
-        d = measured[c]
-        row = min(np.int32(min(max(d, ZERO), view.max_range) * table.rows_per_metre), last_row)
-        t = (depths[c] - d) * table.columns_per_metre[index(row)] + middle_column
-        k = np.int32(min(max(t, ZERO), last_column))
-        e = max(clear[index(np.int32(np.int32(row * columns) + k))], lowest)
-        out[c] = np.int16(e if d > ZERO else np.int32(0))
+        row[c] = measured_row(view, table, measured[c])
+    _load(table.columns_per_metre, row, scale)
+    for c in range(LAYER):
+        at[c] = table_place(table, row[c], depths[c] - measured[c], scale[c])
+    _load(table.clear.reshape(table.clear.size), at, row)
+    for c in range(LAYER):
+        out[c] = cleared(row[c], lowest, measured[c])
 
 
 @cell
-def _mark(depth_m, view, table, cx, cy, cz, out):
-    """Overwrite with the positive evidence, where there is any, of the pixel at the cell's centre."""
-    u_centre, v_centre = view.intrinsics[2] + HALF, view.intrinsics[3] + HALF
+def measured_row(view, table, measured):
+    """Return the table row of a window value."""
+    last_row = np.int32(table.hit.size - 1)
+    return min(np.int32(min(max(measured, ZERO), view.max_range) * table.rows_per_metre), last_row)
+
+
+@cell
+def table_place(table, row, behind, scale):
+    """Return where the table, as a flat array, says what a cell gets so far `behind` a measurement in metres.
+
+    scale: table columns a metre in this row.
+    """
+    columns = np.int32(table.clear.shape[1])
+    last_column, middle_column = np.float32(columns - 1), np.float32(columns) * HALF
+    t = behind * scale + middle_column
+    return np.int32(np.int32(row * columns) + np.int32(min(max(t, ZERO), last_column)))
+
+
+@cell
+def cleared(said, lowest, measured):
+    """Return what a cell gets of which the table says so, never below `lowest`: nothing where nothing was measured."""
+    return np.int16(max(said, lowest) if measured > ZERO else np.int32(0))
+
+
+@cell
+def marked(depth_m, view, table, cx, cy, cz, c):
+    """Return the positive evidence of the pixel at the centre of cell `c` of a block, 0 where there is none."""
     rows = table.hit.size
     last_column, middle_column = np.float32(table.mark.shape[1] - 1), np.float32(table.mark.shape[1]) * HALF
-    for c in range(512):
-        z = cz + view.steps[2, c]
-        if z <= NEAR_PLANE or z > view.max_range:
-            continue
-        u = (cx + view.steps[0, c]) / z + u_centre
-        v = (cy + view.steps[1, c]) / z + v_centre
-        if not (u >= ZERO and v >= ZERO and u < np.float32(view.width) and v < np.float32(view.height)):
-            continue
-        d = depth_m[np.int32(v), np.int32(u)]
-        if not (d > ZERO and d < NO_RETURN):
-            continue
-        row = table_row(d, table.rows_per_metre, rows)
-        t = (z - d) * table.columns_per_metre[row] + middle_column
-        if t < ZERO or t > last_column:
-            continue
-        e = table.mark[row, np.int32(t)]
-        if e > 0:
-            out[c] = np.int16(e)
+    z = cz + view.steps[2, c]
+    if z <= NEAR_PLANE or z > view.max_range:
+        return np.int32(0)
+    u = (cx + view.steps[0, c]) / z + (view.intrinsics[2] + HALF)
+    v = (cy + view.steps[1, c]) / z + (view.intrinsics[3] + HALF)
+    if not (u >= ZERO and v >= ZERO and u < np.float32(view.width) and v < np.float32(view.height)):
+        return np.int32(0)
+    d = depth_m[np.int32(v), np.int32(u)]
+    if not (d > ZERO and d < NO_RETURN):
+        return np.int32(0)
+    row = table_row(d, table.rows_per_metre, rows)
+    t = (z - d) * table.columns_per_metre[row] + middle_column
+    if t < ZERO or t > last_column:
+        return np.int32(0)
+    return table.mark[row, np.int32(t)]

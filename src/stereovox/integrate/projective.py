@@ -79,9 +79,8 @@ class Projective:
         hits = eye.hits.blocks.values
 
         def one_shard(part: slice) -> None:
-            scratch = np.empty((2, _projective.LAYER), np.float32)
             _projective.evaluate(
-                depth_m, view, eye.table, windows, mixed[part], hit_of[part], hits, values[part], *scratch
+                depth_m, view, eye.table, windows, mixed[part], hit_of[part], hits, values[part], _layer_scratch()
             )  # fmt: skip
 
         in_shards(one_shard, shards(len(mixed), min(threads, len(mixed) // WORTH_A_THREAD or 1)))
@@ -89,6 +88,21 @@ class Projective:
         _projective.passed(view, eye.table, free, free_values)
         origin = eye.views.block
         return Evidence(mixed + origin, values, free + origin, free_values)
+
+
+class LayerScratch(NamedTuple):
+    """Memory for one layer of cells, (LAYER,) each."""
+
+    depths: NDArray[np.float32]  # of the cells' centres
+    measured: NDArray[np.float32]  # window values there
+    scale: NDArray[np.float32]  # table columns a metre
+    at: NDArray[np.int32]  # places of window values, then of entries of the sensor table
+    row: NDArray[np.int32]  # rows of the sensor table, then its entries
+
+
+def _layer_scratch() -> LayerScratch:
+    floats, ints = np.empty((3, _projective.LAYER), np.float32), np.empty((2, _projective.LAYER), np.int32)
+    return LayerScratch(*floats, *ints)
 
 
 class _Eye:
@@ -168,7 +182,8 @@ class HitFinder:
         self._keys, self._seen = np.zeros((2, camera.width + 1), kind), np.zeros(_hits.SEEN, kind)
         self._news, self._fresh = np.zeros(pixels, np.uint8), np.zeros(pixels + 1, np.int32)
         self._listed = np.zeros(camera.height * camera.width, np.int32)
-        self._lanes = np.zeros((9, _hits.LANES), np.float32)
+        floats, ints = np.zeros((11, _hits.LANES), np.float32), np.zeros(_hits.LANES, np.int32)
+        self._lanes = HitLanes(*floats, ints)
 
     def find(self, depth_m: NDArray[np.float32], view: View) -> None:
         """Fill `blocks` from a REP 117 depth image."""
@@ -188,10 +203,27 @@ class HitFinder:
         return _hits.scatter(depth_m, view, *scratch, blocks.table, blocks.coords, blocks.count, blocks.values)
 
 
+class HitLanes(NamedTuple):
+    """Memory for the cells that are weighed together, (LANES,) each."""
+
+    x: NDArray[np.float32]  # the centre in camera axes, x and y times the focal length
+    y: NDArray[np.float32]
+    z: NDArray[np.float32]
+    share: NDArray[np.float32]  # part of the footprint that measures a depth within the cell
+    u: NDArray[np.float32]  # upper left corner of the footprint
+    v: NDArray[np.float32]
+    samples: NDArray[np.float32]  # along each side of it
+    step: NDArray[np.float32]  # pixels between samples
+    looked: NDArray[np.float32]  # samples inside the image so far
+    depth: NDArray[np.float32]  # measured at the present sample
+    counts: NDArray[np.float32]  # whether that lies inside the image, 0 or 1
+    at: NDArray[np.int32]  # its pixel
+
+
 class Windows(NamedTuple):
     """All window images in one; see `_windows.py`."""
 
-    image: NDArray[np.float32]  # flat; `_windows.place` says where a pixel stands
+    image: NDArray[np.float32]  # flat; `_windows.place` says where a pixel stands; the last entry is UNSEEN
     pitch: np.int32
     height: np.int32
     lows: NDArray[np.float32]
@@ -215,8 +247,9 @@ class WindowBuilder:
         size = pitch * (2 * h + -(-h // 2))
         self._scratch = np.zeros(size, np.float32), np.zeros((4, pitch), np.float32), *np.zeros((4, pitch), np.float32)
         lows, highs = np.zeros((2, tiles.prod(axis=2).sum()), np.float32)
+        image = np.append(np.zeros(size, np.float32), _projective.UNSEEN)
         self._windows = Windows(
-            np.zeros(size, np.float32), np.int32(pitch), np.int32(h), lows, highs,
+            image, np.int32(pitch), np.int32(h), lows, highs,
             tile_offset, np.ascontiguousarray(tiles[:, :, 1], np.int32), np.int32(0),
         )  # fmt: skip
         self.nearest = tuple(np.zeros((-(-h // size), -(-w // size)), np.float32) for size in (16, 64))

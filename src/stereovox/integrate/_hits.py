@@ -130,11 +130,11 @@ def _share(depth_m, view, n, lanes):
     limit = HALF * view.voxel_size
     most = np.int32(1)
     for i in range(n):
-        side, step[i], u[i], v[i] = footprint(view, x[i], y[i], z[i])
-        most = max(most, side)
-        samples[i] = np.float32(side)
+        samples[i], step[i], u[i], v[i] = footprint(view, x[i], y[i], z[i])
         share[i] = ZERO
         looked[i] = ZERO
+    for i in range(n):
+        most = max(most, np.int32(samples[i]))
     for j in range(most):
         row = np.float32(j) + HALF
         for k in range(most):
@@ -156,10 +156,10 @@ def footprint(view, x, y, z):
     """Return the samples along each side of a cell's footprint, the pixels between them, and its upper left corner."""
     inverse = ONE / z
     wide = min(view.voxel_size * view.intrinsics[0] * inverse, np.float32(view.width))
-    side = np.int32(min(max(wide, ONE), np.float32(SIDE_SAMPLES)))
+    side = np.float32(np.int32(min(max(wide, ONE), np.float32(SIDE_SAMPLES))))
     u = x * inverse + view.intrinsics[2] + HALF - HALF * wide
     v = y * inverse + view.intrinsics[3] + HALF - HALF * wide
-    return side, wide / np.float32(side), u, v
+    return side, wide / side, u, v
 
 
 @cell

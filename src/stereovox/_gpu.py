@@ -11,7 +11,9 @@ the number of things to do may stand on the card, and the processor need not wai
 from __future__ import annotations
 
 from collections.abc import Callable
+from dis import get_instructions
 from functools import lru_cache
+from importlib.util import find_spec
 from types import FunctionType
 from typing import Any
 
@@ -44,7 +46,8 @@ def on_gpu(cell: Function) -> Function:
     are no NaN and no infinities.
     """
     body = getattr(cell, "py_func", cell)
-    scope = {name: value for name, value in body.__globals__.items() if name in body.__code__.co_names}
+    names = {step.argval for step in get_instructions(body) if step.opname == "LOAD_GLOBAL"}
+    scope = {name: value for name, value in body.__globals__.items() if name in names}
     scope |= {name: on_gpu(value) for name, value in scope.items() if isinstance(value, Dispatcher)}
     scope["__name__"] = body.__module__
     twin = FunctionType(body.__code__, scope, body.__name__, body.__defaults__)
@@ -67,15 +70,24 @@ def to_gpu(array: Any) -> Any:
 
 
 def gpu_array(shape: int | tuple[int, ...], dtype: Any, value: int | float | None = None) -> Any:
-    """Return an array on the card, filled with `value` if there is one."""
-    array = cuda.device_array(shape, dtype)
+    """Return an array on the card, filled with `value` if there is one. Raises MemoryError where it has no room."""
+    try:
+        array = cuda.device_array(shape, dtype)
+    except Exception as error:  # numba's own class is another one in each of its versions
+        if "OUT_OF_MEMORY" not in str(error).upper().replace(" ", "_"):
+            raise
+        raise MemoryError(f"the graphics card has no room for an array of shape {shape}") from None
     if value is not None:
         launch(fill, array.reshape(array.size), np.dtype(dtype).type(value))
     return array
 
 
 def unusable() -> str | None:
-    """Return why nothing can run on a card here; None where it can."""
+    """Return why nothing can run on a card here; None where it can, and in numba's simulator."""
+    if ENABLE_CUDASIM:
+        return None
+    if find_spec("numba_cuda") is None:
+        return "numba-cuda is not installed; run: pip install 'stereovox[cuda]'"
     return None if cuda.is_available() else "no NVIDIA graphics card, or no driver for it, was found"
 
 

@@ -234,14 +234,14 @@ class Windows(NamedTuple):
 
 
 class WindowBuilder:
-    """Builds one camera's window images, and keeps the memory for them."""
+    """Builds one camera's window images, and keeps the memory for them. shape: (levels, 2) rows and columns of each."""
 
     def __init__(self, camera: PinholeCamera):
         h, w = camera.height, camera.width
         coarsest = 1 << (LEVELS - 2)
         strides = np.array([1] + [1 << level for level in range(LEVELS - 1)])
-        self._shape = np.stack([-(-h // strides), -(-w // strides)], axis=1).astype(np.int32)
-        tiles = np.stack([-(-self._shape // 16), -(-self._shape // 64)], axis=1)
+        self.shape = np.stack([-(-h // strides), -(-w // strides)], axis=1).astype(np.int32)
+        tiles = np.stack([-(-self.shape // 16), -(-self.shape // 64)], axis=1)
         tile_offset = _starts(tiles.prod(axis=2).ravel()).reshape(LEVELS, 2)
         pitch = coarsest * -(-w // coarsest)
         size = pitch * (2 * h + -(-h // 2))
@@ -254,17 +254,21 @@ class WindowBuilder:
         )  # fmt: skip
         self.nearest = tuple(np.zeros((-(-h // size), -(-w // size)), np.float32) for size in (16, 64))
 
+    def empty(self, smallest_tile: float) -> Windows:
+        """Return the window images from tiles of about `smallest_tile` pixels on, as the image before has left them."""
+        first = min(max(floor(log2(max(smallest_tile, 1e-9))) + 2, 0), LEVELS - 1)
+        return self._windows._replace(first=np.int32(first))
+
     def build(self, depth_m: NDArray[np.float32], smallest_tile: float) -> tuple[Windows, float]:
         """Return the window images of a REP 117 depth image, from tiles of about `smallest_tile` pixels on.
 
         With them the image's farthest depth in metres, `NO_RETURN` where a pixel saw nothing.
         """
-        first = min(max(floor(log2(max(smallest_tile, 1e-9))) + 2, 0), LEVELS - 1)
-        windows = self._windows._replace(first=np.int32(first))
+        windows = self.empty(smallest_tile)
         base, *rows = self._scratch
         farthest = _windows.build(
             depth_m.reshape(-1), base, windows.image, *rows, windows.lows, windows.highs,
-            self._shape, windows.tile_offset, windows.tile_width, first,
+            self.shape, windows.tile_offset, windows.tile_width, int(windows.first),
         )  # fmt: skip
         return windows, farthest
 

@@ -29,8 +29,8 @@ Function = Callable[..., Any]
 
 THREADS = 2 if ENABLE_CUDASIM else 128
 """Threads in a block of each launch."""
-BLOCKS_PER_PROCESSOR = 8
-"""Blocks of a launch for each multiprocessor of the card."""
+FEWEST_BLOCKS, BLOCKS_PER_PROCESSOR = 128, 8
+"""Blocks of a launch: at least so many, below which numba warns, and for each multiprocessor of the card."""
 
 
 def gpu_kernel(function: Function) -> Function:
@@ -100,7 +100,9 @@ def fill(array, value):
 
 @lru_cache
 def _blocks() -> int:
-    return 2 if ENABLE_CUDASIM else BLOCKS_PER_PROCESSOR * cuda.get_current_device().MULTIPROCESSOR_COUNT
+    if ENABLE_CUDASIM:
+        return 2
+    return max(FEWEST_BLOCKS, BLOCKS_PER_PROCESSOR * cuda.get_current_device().MULTIPROCESSOR_COUNT)
 
 
 if ENABLE_CUDASIM:

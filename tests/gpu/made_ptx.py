@@ -1,16 +1,18 @@
-"""Compile the kernels for graphics cards to PTX, with the types they are launched with; no card is needed.
+"""Compile the kernels for graphics cards to machine code, with the types they are launched with; no card is needed.
 
     python tests/gpu/made_ptx.py 7.5 8.7 9.0
 
-Whatever the maps and the integrator launch is compiled and not run. Prints one line for each card: kernels, and
-double-precision instructions where there should be none.
+Whatever the maps and the integrator launch is compiled and not run. Prints one line of JSON for each card: the kernels
+with their registers, stack bytes and spilled bytes, and those with double-precision instructions.
 """
 
+import json
 import re
 import sys
 from types import SimpleNamespace
 
 import numpy as np
+from cuda.bindings import nvjitlink
 from numba import cuda, typeof, types
 from numba.cuda import dispatcher
 
@@ -50,7 +52,22 @@ def typed(value):
 
 def launch(kernel, *arguments):
     ptx, _ = cuda.compile_ptx(kernel.py_func, tuple(map(typed, arguments)), cc=card)
-    found.setdefault(kernel.py_func.__module__ + "." + kernel.py_func.__name__, []).append(ptx)
+    name = kernel.py_func.__module__ + "." + kernel.py_func.__name__
+    found.setdefault(name, []).append({"double": ".f64" in ptx, **machine_code(ptx)})
+
+
+def machine_code(ptx):
+    """Return what the assembler says of a kernel; it raises where it does not take it."""
+    linker = nvjitlink.create(2, [f"-arch=sm_{card[0]}{card[1]}", "-verbose"])
+    nvjitlink.add_data(linker, nvjitlink.InputType.PTX, ptx.encode(), len(ptx.encode()), "kernel")
+    nvjitlink.complete(linker)
+    log = bytearray(nvjitlink.get_info_log_size(linker))
+    nvjitlink.get_info_log(linker, log)
+    size = nvjitlink.get_linked_cubin_size(linker)
+    nvjitlink.destroy(linker)
+    said = log.decode()
+    numbers = {"registers": r"Used (\d+) registers", "stack": r"(\d+) bytes stack", "spilled": r"(\d+) bytes spill"}
+    return {"bytes": size, **{name: int(re.findall(pattern, said)[-1]) for name, pattern in numbers.items()}}
 
 
 def run():
@@ -80,7 +97,4 @@ for text in sys.argv[1:]:
     card, found = tuple(map(int, text.split("."))), {}
     dispatcher.get_current_device = lambda: SimpleNamespace(compute_capability=card)  # noqa: B023
     run()
-    doubles = sorted(name for name, codes in found.items() if any(re.search(r"\.f64", code) for code in codes))
-    size = sum(len(code) for codes in found.values() for code in codes)
-    print(f"{text}: {len(found)} kernels, {size} bytes; double precision in {', '.join(doubles) or 'none'}")
-    print(" ".join(sorted(found)))
+    print(json.dumps({"card": text, "kernels": found}))

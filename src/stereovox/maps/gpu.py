@@ -96,22 +96,22 @@ def from_gpu(array: Any, n: int) -> NDArray[Any]:
 class GpuPool:
     """All blocks of a map on the card, for reading as in `CellPool`; each has a row of numbers, also one at the floor.
 
-    Rows that are not in use hold `unknown`.
+    Rows that are not in use hold `unknown`. rows: for how many there is room at the start.
     """
 
-    def __init__(self, rules: CellRules, rows: int = ROOM):
+    def __init__(self, rules: CellRules, rows: int):
         self._rules = rules
         self._limits = tuple(map(np.int16, (rules.format.unknown, rules.prior, rules.lowest, rules.highest)))
         self._used = 0
         self._host: CellPool | None = CellPool(rules)
         self._counts = gpu_array(_gpu.COUNTS, np.int32, 0)
-        self._places = gpu_array(1, np.int32), gpu_array(1, np.int32)
+        self._places: tuple[Any, ...] = gpu_array(1, np.int32), gpu_array(1, np.int32)
         self._table, self._coords, self._values = self._arrays(rows)
 
     @classmethod
     def of(cls, host: CellPool) -> GpuPool:
         """Return a pool with the blocks of another."""
-        pool = cls(host.rules)
+        pool = cls(host.rules, 1)
         pool._fill(host)
         return pool
 
@@ -239,7 +239,7 @@ class GpuStorage(Storage):
 
     def __init__(self, config: Config):
         super().__init__(config)
-        self._pool = GpuPool(self.rules)
+        self._pool = GpuPool(self.rules, ROOM)
 
     def agreement(self, evidence: Evidence, firm: int) -> Agreement:
         """Return how far `evidence` agrees with what the map is sure of; see `Storage.agreement`."""

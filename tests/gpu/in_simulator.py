@@ -6,6 +6,7 @@ every operation, where processors and cards fuse some; no cell of these images l
 
 import pickle
 from copy import deepcopy
+from functools import lru_cache
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from stereovox.errors import ConfigError, FrameRefused
 from stereovox.integrate import gpu as integrate_gpu
 from stereovox.integrate import make_integrator
 from stereovox.maps import gpu as maps_gpu
+from stereovox.maps import make_map
 from stereovox.maps.evidence import Evidence
 from stereovox.maps.storage import Storage
 from stereovox.sensors import SENSORS
@@ -63,7 +65,9 @@ def test_evidence_is_that_of_the_processor(model):
 
 def test_wholly_free_blocks_are_those_of_the_processor():
     image = image_of(2)
-    image = sv.DepthImage(np.full_like(image.depth_m, np.inf), image.reason, SMALL, image.T_world_sensor)
+    upright = np.eye(4)
+    upright[:3, 3] = 0.1  # the second layer of blocks before it is nowhere beside the image
+    image = sv.DepthImage(np.full_like(image.depth_m, np.inf), image.reason, SMALL, upright)
     evidence = assert_same_evidence(image, voxel_size=0.2, max_range=6.0, blind_range=3.0)
     assert len(evidence.uniform) > 2
 
@@ -76,7 +80,7 @@ def test_cells_that_need_long_keys_are_those_of_the_processor():
 
 @pytest.mark.parametrize("full_share", [0.0, 0.5])
 def test_hits_are_weighed_as_by_the_processor(full_share):
-    settings = {"voxel_size": 0.1, "max_range": 2.2, "blind_range": 1.5, "projective.full_share": full_share}
+    settings = {"voxel_size": 0.2, "max_range": 2.2, "blind_range": 1.5, "projective.full_share": full_share}
     assert_same_evidence(image_of(4), **settings)
 
 
@@ -119,48 +123,32 @@ def assert_same_map(ours, theirs):
     assert len(ours.cells()[0])
 
 
-def mapped(device, frames=4, **settings):
-    """Return a mapper and its reports of so many frames from one place, each of them farther off every second time."""
-    mapper = sv.Mapper(voxel_size=0.25, max_range=2.5, device=device, **settings)
-    return mapper, [mapper.add(frame_of(n)) for n in range(frames)]
-
-
 def numbers(reports):
     return [(report.cells, report.refused, report.detail) for report in reports]
 
 
-@pytest.mark.parametrize(
-    "settings",
-    [
-        {},
-        {"map.cell": "int8"},
-        {"map.cell": "uint8", "map.prior": 0.5},
-        {"map.confirm_hits": 3},
-        {"map.log_odds_min": -0.4, "trust.max_disagreement": 1},
-    ],
-    ids=str,
-)
-def test_maps_are_those_of_the_processor(settings):
-    (ours, mine), (theirs, its) = mapped("cuda", **settings), mapped("cpu", **settings)
+def mapped(device, frames, **settings):
+    mapper = sv.Mapper(voxel_size=0.25, max_range=2.5, device=device, **settings)
+    return mapper, [mapper.add(frame_of(n)) for n in range(frames)]
+
+
+def test_a_mapper_maps_as_on_the_processor():
+    (ours, mine), (theirs, its) = mapped("cuda", 3), mapped("cpu", 3)
     assert numbers(mine) == numbers(its)
-    assert sum(report.cells for report in mine)
+    assert all(report.cells for report in mine)
     assert_same_map(ours.map, theirs.map)
     assert ours.map.counts() == theirs.map.counts()
 
 
-def test_a_map_outgrows_its_room(monkeypatch):
-    monkeypatch.setattr(maps_gpu, "ROOM", 1)
-    ours, mine = mapped("cuda")
-    theirs, its = mapped("cpu")
-    assert numbers(mine) == numbers(its)
-    assert_same_map(ours.map, theirs.map)
-    assert ours.map.reserved_bytes >= ours.map.memory_bytes > 512 * len(ours.map.storage.blocks()[0])
+def test_quality_levels_run_on_the_card():
+    ours, reports = mapped("cuda", 1, deadline_ms=1e6)
+    assert reports[0].refused is None
+    assert type(ours.map.storage) is maps_gpu.GpuStorage
 
 
 def test_a_full_card_refuses_the_frame_and_keeps_the_map(monkeypatch):
     monkeypatch.setattr(maps_gpu, "ROOM", 1)
-    ours, _ = mapped("cuda", frames=0)
-    theirs, its = mapped("cpu", frames=1)
+    (ours, _), (theirs, its) = mapped("cuda", 0), mapped("cpu", 1)
     with monkeypatch.context() as patched:
         patched.setattr(maps_gpu, "gpu_array", full)
         report = ours.add(frame_of(0))
@@ -179,67 +167,97 @@ def full(shape, dtype, value=None):
     return gpu_array(shape, dtype, value)
 
 
+@lru_cache
+def evidence_of(n):
+    """Return the evidence of frame `n`, made by the processor; it takes the simulator long."""
+    image = image_of(7, scale=1 + 0.2 * (n // 2 % 2))
+    return make_integrator(sv.load_config(voxel_size=0.25, max_range=2.5)).evidence(image)
+
+
+def grown(device, frames, resume=None, **settings):
+    """Return a map of frames from `frames[0]` to before `frames[1]`, and how many cells each of them changed."""
+    config = sv.load_config(voxel_size=0.25, max_range=2.5, device=device, **settings)
+    made, changed = make_map(config, resume), []
+    for n in range(*frames):
+        changed.append(made.add(evidence_of(n)))
+        made.history.frames += 1
+    return made, changed
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [
+        {"map.cell": "int16", "map.log_odds_min": -0.4},
+        {"map.cell": "int8"},
+        {"map.cell": "uint8", "map.prior": 0.5},
+        {"map.confirm_hits": 3},
+    ],
+    ids=str,
+)
+def test_all_kinds_of_cells_are_those_of_the_processor(settings):
+    (ours, mine), (theirs, its) = grown("cuda", (0, 5), **settings), grown("cpu", (0, 5), **settings)
+    assert mine == its
+    assert any(mine)
+    assert_same_map(ours, theirs)
+
+
+def test_a_map_outgrows_its_room(monkeypatch):
+    monkeypatch.setattr(maps_gpu, "ROOM", 1)
+    (ours, mine), (theirs, its) = grown("cuda", (0, 4)), grown("cpu", (0, 4))
+    assert mine == its
+    assert_same_map(ours, theirs)
+    assert ours.reserved_bytes >= ours.memory_bytes > 1024 * len(ours.storage.blocks()[0])
+
+
 def test_how_far_a_frame_agrees_with_the_map_is_as_on_the_processor(monkeypatch):
     monkeypatch.setattr("stereovox.maps.frame_agreement.SAMPLE", 3)  # so that blocks are left out
-    (ours, _), (theirs, _) = mapped("cuda"), mapped("cpu")
-    evidence = make_integrator(theirs.config).evidence(image_of(7, scale=1.3))
-    mine, its = (mapper.map.storage.agreement(evidence, 100) for mapper in (ours, theirs))
+    maps = [grown(device, (0, 2))[0] for device in ("cuda", "cpu")]
+    mine, its = (one.storage.agreement(evidence_of(2), 100) for one in maps)
     assert mine == its
     assert mine.hits > 0
     assert mine.passes > 0
 
 
 def test_the_map_is_copied_once_between_two_frames():
-    ours, _ = mapped("cuda", frames=1)
-    pool = ours.map.storage._pool
+    ours, _ = grown("cuda", (0, 1))
+    pool = ours.storage._pool
     host = pool.host
-    ours.map.occupied()
+    ours.occupied()
     assert pool.host is host
-    ours.add(frame_of(1))
+    ours.add(evidence_of(1))
     assert pool.host is not host
 
 
-def test_a_map_goes_on_on_the_other_device(tmp_path):
-    whole, _ = mapped("cpu", frames=4)
-    for first, second in (("cuda", "cpu"), ("cpu", "cuda"), ("cuda", "cuda")):
-        begun, _ = mapped(first, frames=2)
-        begun.save(tmp_path / f"{first}-{second}")
-        for resume in (sv.load_map(tmp_path / f"{first}-{second}"), begun.map):
-            ended = sv.Mapper(begun.config, resume=resume, device=second)
-            assert (type(ended.map.storage) is Storage) == (second == "cpu")
-            for n in (2, 3):
-                ended.add(frame_of(n))
-            assert ended.map.frames == 4
-            assert_same_map(ended.map, whole.map)
-            if resume is begun.map and first == second:
-                assert ended.map is resume
+@pytest.mark.parametrize(("first", "second"), [("cuda", "cpu"), ("cpu", "cuda"), ("cuda", "cuda")])
+def test_a_map_goes_on_on_the_other_device(first, second, tmp_path):
+    whole, _ = grown("cpu", (0, 3))
+    begun, _ = grown(first, (0, 2))
+    begun.save(tmp_path / "map")
+    for resume in (sv.load_map(tmp_path / "map"), begun):
+        ended, _ = grown(second, (2, 3), resume)
+        assert (type(ended.storage) is Storage) == (second == "cpu")
+        assert (ended is begun) == (resume is begun and first == second)
+        assert ended.config.device == second
+        assert ended.frames == 3
+        assert_same_map(ended, whole)
 
 
 def test_copies_are_maps_of_their_own():
-    ours, _ = mapped("cuda", frames=1)
-    theirs, _ = mapped("cpu", frames=1)
-    copies = [deepcopy(ours.map), pickle.loads(pickle.dumps(ours.map)), ours.map.snapshot()]
-    ours.add(frame_of(1))
+    (ours, _), (theirs, _) = grown("cuda", (0, 1)), grown("cpu", (0, 1))
+    copies = [deepcopy(ours), pickle.loads(pickle.dumps(ours)), ours.snapshot()]
+    ours.add(evidence_of(1))
     for copy in copies:
-        assert_same_map(copy, theirs.map)
+        assert_same_map(copy, theirs)
 
 
 def test_listeners_and_other_programs_may_read_and_write():
-    ours, _ = mapped("cuda", frames=0)
-    theirs, _ = mapped("cpu", frames=0)
-    heard = {}
-    for mapper in (ours, theirs):
-        mapper.map.listeners.append(lambda evidence, mapper=mapper: heard.update({id(mapper): cells_of(evidence)}))
-        mapper.add(frame_of(0))
-        coords, cells = mapper.map.storage.blocks()
-        mapper.map.storage.insert(coords[:1], np.full_like(cells[:1], 77))
-        mapper.map.add(Evidence(coords[:2], np.full((2, 512), 5, np.int16), coords[2:3], np.array([-9], np.int16)))
-    assert heard[id(ours)] == heard[id(theirs)]
-    assert_same_map(ours.map, theirs.map)
-    assert ours.map.add(Evidence(coords[:0], cells[:0].astype(np.int16), coords[:0], np.zeros(0, np.int16))) == 0
-
-
-def test_quality_levels_run_on_the_card():
-    ours, reports = mapped("cuda", frames=2, deadline_ms=1e6)
-    assert [report.refused for report in reports] == [None, None]
-    assert type(ours.map.storage) is maps_gpu.GpuStorage
+    heard, maps = [], [grown(device, (0, 0))[0] for device in ("cuda", "cpu")]
+    for one in maps:
+        one.listeners.append(lambda evidence: heard.append(cells_of(evidence)))
+        one.add(evidence_of(0))
+        coords, cells = one.storage.blocks()
+        one.storage.insert(coords[:1], np.full_like(cells[:1], 77))
+        one.add(Evidence(coords[:2], np.full((2, 512), 5, np.int16), coords[2:3], np.array([-9], np.int16)))
+        assert one.add(Evidence(coords[:0], cells[:0].astype(np.int16), coords[:0], np.zeros(0, np.int16))) == 0
+    assert heard[: len(heard) // 2] == heard[len(heard) // 2 :]
+    assert_same_map(*maps)

@@ -12,19 +12,22 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dis import get_instructions
-from functools import lru_cache
+from functools import cache, lru_cache
 from importlib.util import find_spec
 from types import FunctionType
 from typing import Any
 
+import numba.cuda
 import numpy as np
-from numba import cuda
-from numba.core.config import ENABLE_CUDASIM
+from numba.core import config
 from numba.core.dispatcher import Dispatcher
 
 from stereovox import _math
 from stereovox._jit import with_cache
 
+cuda: Any = numba.cuda
+"""To a type checker numba's module is full of classes that kernels call like functions."""
+ENABLE_CUDASIM: bool = vars(config)["ENABLE_CUDASIM"]
 Function = Callable[..., Any]
 
 THREADS = 2 if ENABLE_CUDASIM else 128
@@ -38,7 +41,7 @@ def gpu_kernel(function: Function) -> Function:
     return with_cache(lambda cache: cuda.jit(function, cache=cache))
 
 
-@lru_cache(maxsize=None)
+@cache
 def on_gpu(cell: Function) -> Function:
     """Return the twin of a `@cell` that kernels for the card can call. The simulator runs it as plain Python.
 

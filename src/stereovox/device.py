@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Callable
 
 from stereovox.config import Config
+from stereovox.errors import ConfigError
 
 
 def warn(line: str) -> None:
@@ -21,6 +22,19 @@ def on_usable_device(config: Config, notify: Callable[[str], None] = warn) -> Co
         return config
     notify(f'device "cuda": {reason}; this map is made on the processor (device "cpu")')
     return config.model_copy(update={"device": "cpu"})
+
+
+def check_device() -> None:
+    """Raise ConfigError where no graphics card can be used; for what is made without a mapper."""
+    reason = _no_card()
+    if reason is not None:
+        raise ConfigError(f'device "cuda": {reason}')
+
+
+def check_on_processor(config: Config) -> None:
+    """Raise ConfigError where the settings are those of a graphics card, on which there are no maps of floors."""
+    if config.device != "cpu":
+        raise ConfigError(f'device "{config.device}": maps of floors are made on the processor only; leave it out')
 
 
 def _no_card() -> str | None:

@@ -15,7 +15,7 @@ from stereovox.comparison import Comparison
 from stereovox.config import Config, load_config
 from stereovox.deadline import Deadline
 from stereovox.depth import DepthPipeline
-from stereovox.device import on_usable_device
+from stereovox.device import check_on_processor, on_usable_device
 from stereovox.errors import MapFileError
 from stereovox.frame import AnyFrame, Scan
 from stereovox.frame import UpdateReport as UpdateReport
@@ -224,6 +224,7 @@ class GridMapper:
         **overrides: Any,
     ):
         self.config = load_config(profile, **overrides)
+        check_on_processor(self.config)
         self._depth = DepthPipeline(self.config)
         self._beams = make_beams(self.config)
         self.map = _grid_map(self.config, resume)

@@ -1,15 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Kernels of the projective integrator on a graphics card: loops over the cells of `_projective.py` and `_hits.py`.
 
-Everything between the depth image and the evidence stays on the card, also how many blocks there are of each kind. Where
-a list is too short, its number goes on counting and the rest is not written; the caller looks at the numbers at the
-end, makes room, and does the frame again. The order of lists differs from run to run; what is in them does not.
+Everything between the depth image and the evidence stays on the card, also how many blocks there are of each kind.
+Where a list is too short, its number goes on counting and the rest is not written; the caller looks at the numbers at
+the end, makes room, and does the frame again. The order of lists differs from run to run; what is in them does not.
 """
 
 import numpy as np
-from numba import cuda
 
-from stereovox._gpu import gpu_kernel, on_gpu
+from stereovox._gpu import cuda, gpu_kernel, on_gpu
 from stereovox.integrate import _cells, _hits, _projective, _windows
 from stereovox.integrate._cells import HALF, NARROW, NEAR_PLANE, NO_RETURN, ONE, WIDE, ZERO
 from stereovox.integrate._hits import NOTHING
@@ -244,7 +243,7 @@ def list_blocks(listed, wide, claims, coords, counts):
 
 @gpu_kernel
 def enter_blocks(table, coords, values, taken, counts):
-    """Enter the blocks with hits into an empty hash table, with no hits in their rows of `values` (room, 512) so far."""
+    """Enter the blocks with hits into an empty hash table, their rows of `values` (room, 512) without hits so far."""
     n = min(counts[HIT_BLOCKS], coords.shape[0])
     for i in range(cuda.grid(1), n, cuda.gridsize(1)):
         slot = home_slot(coords[i, 0], coords[i, 1], coords[i, 2], table.size - 1)

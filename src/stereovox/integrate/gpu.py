@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from stereovox._gpu import gpu_array, launch, to_gpu
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.config import Config
+from stereovox.device import check_device
 from stereovox.errors import ConfigError
 from stereovox.frame import DepthImage
 from stereovox.integrate import _gpu
@@ -31,9 +32,10 @@ HIT_ROOM = 1024
 
 
 class GpuProjective:
-    """Evidence by projection on a graphics card. Raises ConfigError for a bad sensor model."""
+    """Evidence by projection on a graphics card. Raises ConfigError for a bad sensor model, and without a card."""
 
     def __init__(self, config: Config):
+        check_device()
         self._eyes = PerCamera(partial(GpuEye, make_sensor(config.sensor), config))
 
     def evidence(self, image: DepthImage) -> GpuEvidence:
@@ -96,9 +98,8 @@ class GpuEye:
             _gpu.evaluate, self._depth_m, view, self._table, self._windows.on_gpu, origin, self._mixed, self._hit_of,
             hits.values, counts, made.coords, made.values, made.said,
         )  # fmt: skip
-        launch(
-            _gpu.passed, view, self._table, origin, hits.table, hits.coords, self._free, counts, made.uniform, made.steps
-        )  # fmt: skip
+        free = self._free, counts, made.uniform, made.steps
+        launch(_gpu.passed, view, self._table, origin, hits.table, hits.coords, *free)
 
     def _has_room(self, counts: NDArray[np.int32]) -> bool:
         """Return whether all lists were long enough; where not, make them longer, for another try."""

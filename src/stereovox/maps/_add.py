@@ -232,8 +232,10 @@ def _add_to_row(block, steps, unknown, prior, lowest, highest):
 
 @cell
 def added_step(old, step, unknown, prior, lowest, highest):
-    """Return what `_cells.added` says, all in int16: twice as many cells in one instruction. The compiler makes of the first
-    clamp an addition that saturates."""
+    """Return what `_cells.added` says, all in int16: twice as many cells in one instruction.
+
+    The compiler makes of the first clamp an addition that saturates.
+    """
     start = prior if old == unknown else old
     total = np.int16(min(max(np.int64(start) + np.int64(step), LOW), HIGH))
     new = min(max(total, lowest), highest)

@@ -8,9 +8,8 @@ while others are made, so an entry that is seen has its coordinates.
 import math
 
 import numpy as np
-from numba import cuda
 
-from stereovox._gpu import gpu_kernel, on_gpu
+from stereovox._gpu import cuda, gpu_kernel, on_gpu
 from stereovox.maps import _add, _cells
 from stereovox.maps._add import MAKE, SKIP
 from stereovox.maps._cells import EMPTY

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from stereovox._gpu import gpu_array, launch, to_gpu
 from stereovox.config import Config
+from stereovox.device import check_device
 from stereovox.errors import FrameRefused
 from stereovox.maps import _gpu
 from stereovox.maps.blocks import CELLS, StoredCells, table_size
@@ -59,8 +60,8 @@ class GpuEvidence(Evidence):
         if isinstance(evidence, GpuEvidence):
             return evidence
         said = evidence.values.any(axis=1).astype(np.int16)
-        parts = evidence.coords, evidence.values, said, evidence.uniform, evidence.uniform_values
-        arrays = GpuArrays(*(to_gpu(part if len(part) else np.zeros((1, *part.shape[1:]), part.dtype)) for part in parts))
+        parts: Any = evidence.coords, evidence.values, said, evidence.uniform, evidence.uniform_values
+        arrays = GpuArrays(*(to_gpu(_not_empty(part)) for part in parts))
         return cls(arrays, len(evidence.coords), len(evidence.uniform))
 
     @cached_property
@@ -86,6 +87,11 @@ class GpuEvidence(Evidence):
     @cached_property
     def _counts(self) -> NDArray[np.bool_]:
         return from_gpu(self.arrays.steps, self.m) != 0
+
+
+def _not_empty(array: NDArray[Any]) -> NDArray[Any]:
+    """Return an array, of one zero row if it has none: the card knows no empty memory."""
+    return array if len(array) else np.zeros((1, *array.shape[1:]), array.dtype)
 
 
 def from_gpu(array: Any, n: int) -> NDArray[Any]:
@@ -233,7 +239,7 @@ class GpuPool:
 
 
 class GpuStorage(Storage):
-    """The blocks of a map without bounds, on a graphics card. Raises MemoryError where even an empty one has no room."""
+    """The blocks of a map without bounds, on a graphics card. Raises MemoryError where not even an empty one fits."""
 
     _pool: GpuPool  # pyright: ignore[reportIncompatibleVariableOverride] - set once
 
@@ -255,7 +261,7 @@ class GpuStorage(Storage):
 
     def add(self, evidence: Evidence) -> int:
         """Add the evidence of one frame, wherever it is; return the number of cells whose value changed."""
-        mine = self._in_my_units(GpuEvidence.of(evidence))
+        mine = self._in_my_units(evidence)
         if not (mine.n or mine.m):
             return 0
         changed = self._pool.add(mine)
@@ -263,7 +269,8 @@ class GpuStorage(Storage):
             listener(mine)
         return changed
 
-    def _in_my_units(self, evidence: GpuEvidence) -> GpuEvidence:
+    def _in_my_units(self, evidence: Evidence) -> GpuEvidence:
+        evidence = GpuEvidence.of(evidence)
         factor, most = self.cell_format.per_log_odds / LOG_ODDS_SCALE, self._most_rise
         if factor == 1 and most is None:
             return evidence
@@ -276,7 +283,11 @@ class GpuStorage(Storage):
 
 
 def gpu_map(config: Config, resume: VoxelMap | None) -> VoxelMap:
-    """Return a map on the card, with the cells and the history of `resume`; that itself where it is there already."""
+    """Return a map on the card, with the cells and the history of `resume`; that itself where it is there already.
+
+    Raises ConfigError without a card.
+    """
+    check_device()
     if resume is not None and type(resume.storage) is GpuStorage:
         resume.storage.continue_with(config)
         return resume

@@ -286,7 +286,7 @@ def test_kernels_for_any_processor_compute_in_float32_and_make_the_same_map(tmp_
     """An int32 times a float32 is a float64 in numba: easily written, never seen, and twice as slow."""
     made = run(MAP_A_FRAME, STEREOVOX_CACHE=str(tmp_path), **target)
     compiled = made["assembly"]
-    assert {"scatter", "weigh", "candidates", "evaluate", "build", "classify"} <= compiled.keys()
+    assert {"scatter", "weigh", "survey", "evaluate", "classify"} <= compiled.keys()
     for name, text in compiled.items():
         assert "\tret" in text, name
         doubles = set(ARITHMETIC.findall(text))

@@ -13,7 +13,7 @@ from copy import deepcopy
 from functools import lru_cache, wraps
 from inspect import isgeneratorfunction
 from types import FunctionType
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, Generic, ParamSpec, TypeVar
 
 from stereovox.errors import StereovoxError
 
@@ -55,6 +55,25 @@ def run_both(threads: int, first: Callable[[], First], second: Callable[[], Seco
     finally:
         wait([running])
     return one, running.result()
+
+
+class Scratch(Generic[T]):
+    """Memory for work that threads do at the same time: each borrows one piece, which is made when none is free."""
+
+    def __init__(self, make: Callable[[], T]):
+        self._make = make
+        self._free: list[T] = []
+
+    def lend(self, work: Callable[[T], None]) -> None:
+        """Call `work` with a piece of memory that nobody else has meanwhile."""
+        try:
+            piece = self._free.pop()
+        except IndexError:
+            piece = self._make()
+        try:
+            work(piece)
+        finally:
+            self._free.append(piece)
 
 
 def shards(length: int, threads: int) -> list[slice]:

@@ -11,7 +11,7 @@ NAN, NEAR, FAR = np.float32(np.nan), np.float32(-np.inf), np.float32(np.inf)
 ZERO, ONE, TWO = np.float32(0), np.float32(1), np.float32(2)
 CHUNK = 4096
 """Pixels that stay in the fastest cache between two passes."""
-SEGMENT = 64
+SEGMENT = 32
 """Pixels of a row that are skipped together where none of them is noisy."""
 NONE = np.float32(-1e6)
 """Inverse depth of a pixel without value: far from every other."""
@@ -130,7 +130,7 @@ def denoise(depth_m, noise, steps, fine, widths, limit, low, high, rings):
     steps: (passes,) int64, distance of its four neighbours in pixels; fine: noise in metres up to which it leaves a
     pixel unchanged; widths: difference in sigma at which a neighbour no longer counts; limit: cap of sigma, metres.
     low, high: results are kept within these depths. rings: scratch (passes + 1, 2 m + 1, w + 2 m), m the largest
-    step: inverse depths of the rows that are needed, measured and after each pass.
+    step and w rounded up to SEGMENT: inverse depths of the rows that are needed, measured and after each pass.
     """
     height, passes, rows = depth_m.shape[0], steps.size, rings.shape[1]
     margin = rows // 2
@@ -174,27 +174,26 @@ def _write(inverse, margin, noise, fine, low, high, depths):
 @cell
 def _average(above, row, below, step, margin, noise, fine, wide, limit, out):
     """Average the pixels of a row with those `step` beside them, and in the rows above and below; margins stay."""
-    end = np.uintp(row.size) - margin
-    for start in range(margin, end, np.uintp(SEGMENT)):
-        stop = min(start + np.uintp(SEGMENT), end)
-        if _any_noisy(row, start, stop, noise, fine):
-            for u in range(start, stop):
+    for start in range(margin, np.uintp(row.size) - margin, np.uintp(SEGMENT)):
+        if _any_noisy(row, start, noise, fine):
+            for i in range(np.uintp(SEGMENT)):
+                u = start + i
                 c = row[u]
                 sigma, square = _sigma(c, noise), c * c
                 reach = wide * min(sigma, limit * square)
                 total, weight = _four(c, row[u - step], row[u + step], above[u], below[u], ONE / (reach * reach))
                 out[u] = c + total / (ONE + weight) if (sigma > fine * square) & (c > ZERO) else c
         else:
-            for u in range(start, stop):
-                out[u] = row[u]
+            for i in range(np.uintp(SEGMENT)):
+                out[start + i] = row[start + i]
 
 
 @cell
-def _any_noisy(inverse, start, stop, noise, fine):
-    """Return whether any pixel has more noise than `fine`."""
+def _any_noisy(inverse, start, noise, fine):
+    """Return whether any pixel of a segment has more noise than `fine`."""
     number = np.int32(0)
-    for u in range(start, stop):
-        c = inverse[u]
+    for i in range(np.uintp(SEGMENT)):
+        c = inverse[start + i]
         number += np.int32((_sigma(c, noise) > fine * c * c) & (c > ZERO))
     return number > 0
 

@@ -6,6 +6,7 @@ Also the steps by themselves: depth correction, denoising, block minima, a short
 
 from __future__ import annotations
 
+from functools import lru_cache
 from math import isnan
 
 import numpy as np
@@ -219,7 +220,13 @@ def _sample_depths(frame: Frame) -> NDArray[np.float64]:
 
 def _run(depth_m: NDArray[np.float32], noise: RangeNoise, fine: float, config: Config) -> None:
     margin = int(STEPS.max())
-    rings = np.empty((len(STEPS) + 1, 2 * margin + 1, depth_m.shape[1] + 2 * margin), np.float32)
-    coefficients, least = np.array([noise.s0, noise.s1, noise.s2], np.float32), (fine * FROM).astype(np.float32)
-    low, high, limit = (np.float32(x) for x in (config.min_range, config.max_range, LIMIT * config.voxel_size))
-    _images.denoise(depth_m, coefficients, STEPS, least, WIDTHS, limit, low, high, rings)
+    width = -(-depth_m.shape[1] // _images.SEGMENT) * _images.SEGMENT
+    rings = np.empty((len(STEPS) + 1, 2 * margin + 1, width + 2 * margin), np.float32)
+    low, high, limit = np.float32(config.min_range), np.float32(config.max_range), np.float32(LIMIT * config.voxel_size)
+    _images.denoise(depth_m, *_numbers(noise, fine), WIDTHS, limit, low, high, rings)
+
+
+@lru_cache
+def _numbers(noise: RangeNoise, fine: float) -> tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.float32]]:
+    """Return s0, s1, s2 (3,) of the noise, and for each pass its step and the noise in metres that it leaves."""
+    return np.array([noise.s0, noise.s1, noise.s2], np.float32), STEPS, (fine * FROM).astype(np.float32)

@@ -72,7 +72,8 @@ def check_unit(frame: Frame, depth_m: NDArray[np.floating], config: Config) -> N
     depths = depth_m[np.isfinite(depth_m) & (depth_m > 0)]
     if not depths.size:
         return
-    median = float(np.median(depths))
+    depths.sort()
+    median = float(depths[(depths.size - 1) // 2] + depths[depths.size // 2]) / 2  # np.median takes ten times as long
     if median > max(FAR_RANGES * config.max_range, FAR_M):
         cure = "is it in millimetres? give depth_scale=0.001"
     elif median < min(NEAR_RANGE * config.min_range, NEAR_M):

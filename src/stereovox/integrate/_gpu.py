@@ -21,14 +21,14 @@ LARGE, MIDDLE, SEEN_FREE, SEEN_MIXED, FREE_BLOCKS, LISTED, HIT_BLOCKS = 0, 1, 2,
 """Places in `counts` (COUNTS,) int32: mixed boxes of four and of two blocks, free and mixed blocks of the view, free
 blocks without hits, cells with hits, and blocks with hits."""
 COUNTS = 7
-SLIGHTLY_MORE, LITTLE = np.float32(1.001), np.float32(10) * NEAR_PLANE
 NARROW_BLOCK, WIDE_BLOCK = (~np.int64((7 << 2 * bits) | (7 << bits) | 7) for bits in (NARROW, WIDE))
 """Masks that make the key of a cell the key of its block's first cell."""
 MIXER = np.uint64(0x9E3779B97F4A7C15)
 
 place, usable, unpack = on_gpu(_windows.place), on_gpu(_cells.usable), on_gpu(_cells.unpack)
-touched, classify, passed_by = (
+touched, classify, passed_by, end_of_view = (
     on_gpu(_projective._touched), on_gpu(_projective._classify), on_gpu(_projective._passed),
+    on_gpu(_projective._end_of_view),
 )  # fmt: skip
 enter_box, corner, window_place = (
     on_gpu(_projective._enter), on_gpu(_projective.corner), on_gpu(_projective.window_place),
@@ -45,13 +45,12 @@ find, home_slot = on_gpu(_map_cells.find), on_gpu(_map_cells.home_slot)
 
 
 @gpu_kernel
-def shrink(depth_m, base, shape, pitch, level):
+def shrink(depth_m, base, windows, level):
     """Fill `level` of `base`, from 1 on: the farthest depth in each tile of 2^(level - 1) pixels.
 
-    depth_m: flat REP 117 depth image. base: flat image of all levels as in `_windows.py`; the level before is filled.
-    shape: (levels, 2) rows and columns of each level.
+    depth_m: flat REP 117 depth image. base: like `windows.image`; the level before is filled.
     """
-    height = shape[0, 0]
+    shape, pitch, height = windows.shape, windows.pitch, windows.height
     rows, columns = shape[level, 0], shape[level, 1]
     start = place(np.int32(level), ZERO, ZERO, pitch, height)
     finer = place(np.int32(level - 1), ZERO, ZERO, pitch, height)
@@ -68,10 +67,10 @@ def shrink(depth_m, base, shape, pitch, level):
 
 
 @gpu_kernel
-def widen(base, windows, shape):
+def widen(base, windows):
     """Fill the window images of all levels from `windows.first` on: at each pixel of `base` the farthest of 3x3."""
     for level in range(windows.first, COARSEST + 1):
-        rows, columns = shape[level, 0], shape[level, 1]
+        rows, columns = windows.shape[level, 0], windows.shape[level, 1]
         start = place(np.int32(level), ZERO, ZERO, windows.pitch, windows.height)
         source = place(np.int32(max(level, 1)), ZERO, ZERO, windows.pitch, windows.height)
         reach = 0 if level == 0 else 1
@@ -85,10 +84,10 @@ def widen(base, windows, shape):
 
 
 @gpu_kernel
-def fill_tiles(windows, shape):
+def fill_tiles(windows):
     """Fill the tiles of 16 pixels of all levels from `windows.first` on."""
     for level in range(windows.first, COARSEST + 1):
-        rows, columns = shape[level, 0], shape[level, 1]
+        rows, columns = windows.shape[level, 0], windows.shape[level, 1]
         start = place(np.int32(level), ZERO, ZERO, windows.pitch, windows.height)
         across, offset = windows.tile_width[level, 0], windows.tile_offset[level, 0]
         for i in range(cuda.grid(1), across * ((rows + 15) >> 4), cuda.gridsize(1)):
@@ -102,13 +101,13 @@ def fill_tiles(windows, shape):
 
 
 @gpu_kernel
-def join_tiles(windows, shape):
+def join_tiles(windows):
     """Fill the tiles of 64 pixels from those of 16."""
     for level in range(windows.first, COARSEST + 1):
         small, offset = windows.tile_width[level, 0], windows.tile_offset[level, 0]
-        down = (shape[level, 0] + 15) >> 4
+        down = (windows.shape[level, 0] + 15) >> 4
         across, big = windows.tile_width[level, 1], windows.tile_offset[level, 1]
-        for i in range(cuda.grid(1), across * ((shape[level, 0] + 63) >> 6), cuda.gridsize(1)):
+        for i in range(cuda.grid(1), across * ((windows.shape[level, 0] + 63) >> 6), cuda.gridsize(1)):
             v, u = 4 * (i // across), 4 * (i % across)
             nearest, farthest = NO_RETURN, ZERO
             for line in range(v, min(v + 4, down)):
@@ -139,10 +138,9 @@ def find_boxes(view, table, windows, boxes):
         farthest = ZERO
         for i in range(windows.tile_offset[COARSEST, 0], windows.tile_offset[COARSEST, 1]):
             farthest = max(farthest, windows.highs[i])
-        behind = table.reach[table.reach.size - 1] if table.marks else table.behind
-        end = min(view.max_range, max(farthest, LITTLE) * SLIGHTLY_MORE + behind)  # beyond it nothing is said
+        end = end_of_view(view, table, farthest)
         for axis in range(3):
-            low, high = touched(view, view.max_range if farthest >= NO_RETURN else end, axis)
+            low, high = touched(view, end, axis)
             boxes[axis, 0], boxes[axis, 1] = low, (high - low) // COARSE + 1
 
 

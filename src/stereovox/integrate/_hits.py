@@ -37,14 +37,13 @@ LANES = 64
 
 
 @kernel
-def scatter(depth_m, view, keys, news, fresh, seen, listed, pool_table, coords, count, values):
+def scatter(depth_m, view, scratch, listed, pool_table, coords, count, values):
     """Set every cell that holds a measured point to 1; return how many there are, -1 when the block pool is full.
 
-    depth_m: (h, w) REP 117 depth image. keys: (2, w + 1) scratch; int32 serves cells within 2^9 of the camera, int64
-    the rest. news: (w rounded up to GROUP,) uint8 zeros, scratch; fresh: int32 scratch, one longer.
-    seen: (SEEN,) scratch of the keys' kind. Blocks count from the camera's own.
+    depth_m: (h, w) REP 117 depth image. scratch: `HitScratch`. Blocks count from the camera's own.
     listed: (pixels,) int32, written: the cells that were set, as 512 * their place in the pool + their number there.
     """
+    keys, news, fresh, seen = scratch
     size = np.float32(1) / view.voxel_size
     position = view.position[0] * size, view.position[1] * size, view.position[2] * size
     last, place = (np.int32(0), np.int32(0), np.int32(0)), np.int64(-1)
@@ -80,17 +79,17 @@ def scatter(depth_m, view, keys, news, fresh, seen, listed, pool_table, coords, 
 
 
 @kernel
-def weigh(depth_m, view, table, full_share, listed, n, coords, values, lanes):
+def weigh(depth_m, view, table, full_share, listed, coords, values, lanes):
     """Replace the ones that `scatter` set by evidence: that of a hit at the depth of the cell's centre.
 
     It counts in full where at least `full_share` of the cell's footprint in the image measures a depth within the cell;
     with less, by the square root of the part: a few pixels may be a slip of the matcher. full_share 0: always in full.
-    listed: the cells that `scatter` set, in its first `n` entries. lanes: a `HitLanes`, scratch.
+    listed: (n,) cells that `scatter` set. lanes: a `HitLanes`, scratch.
     """
     flat, values_flat = depth_m.reshape(depth_m.size), values.reshape(values.size)
     x, y, z, share = lanes.x, lanes.y, lanes.z, lanes.share
-    for start in range(0, n, LANES):
-        some = listed[start : min(start + LANES, n)]
+    for start in range(0, listed.size, LANES):
+        some = listed[start : min(start + LANES, listed.size)]
         _centres(view, coords, some, x, y, z)
         for i in range(some.size):
             share[i] = full_share

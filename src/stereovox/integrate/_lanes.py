@@ -27,8 +27,12 @@ from stereovox.maps._cells import find_or_insert
 
 LANES = 32
 """Neighbouring pixels of a row that are walked in step."""
+GROUP_BITS = 3
+"""Binary logarithm of the lanes whose gains are summed one after the other."""
 MEMORY_BITS = 9
 """Binary logarithm of the blocks whose places are cached beside the pool's hash: 8 along each axis."""
+NOWHERE = np.float32(-1e30)
+"""In place of the depth of a cell that a lane says nothing about."""
 FRACTION_BITS = 10
 """Weighted evidence is summed in units of 2^-10 thousandths: integers, so the order of rays does not matter."""
 FRACTION = np.float32(1 << FRACTION_BITS)
@@ -57,29 +61,37 @@ def _sign(direction):
 
 
 @cell
+def even_to(table, view):
+    """Return the depth up to which cells may begin whose passed loss is `table.free` for certain."""
+    row = 0
+    while row < table.passed.size and table.passed[row] == table.free:
+        row += 1
+    ends = NO_RETURN if row == table.passed.size else np.float32(np.int32(row - 1)) / table.rows_per_metre
+    return ends - HALF_DIAGONAL * view.voxel_size
+
+
+@cell
 def aim(depths, columns, ray, position, view, table, lanes):
-    """Fill depth, end, row, columns and hit of the lanes for a run of pixels.
+    """Fill column, depth, end, row, columns and hit of the lanes for a run of pixels.
 
     Return the depth up to which cells may begin that are plainly free for all of them; NO_RETURN without any ray.
 
     depths, columns: REP 117 depth and x/z of at most LANES pixels of one image row. ray: see `_row_rays`.
     """
-    rows = table.hit.size
+    _take(depths, columns, view, table, lanes)
+    for i in range(LANES):
+        row = np.uint32(lanes.row[i])
+        lanes.columns[i], lanes.reach[i] = table.columns_per_metre[row], table.reach[row]
     nearest = bits_of(NO_RETURN)  # whole numbers: those can be compared many at once
     half_cell = HALF_DIAGONAL * view.voxel_size  # the cell of the measured point is never "plainly free"
-    for i in range(depths.size):
-        d = usable(depths[i])
+    for i in range(LANES):
+        d, reach = lanes.depth[i], lanes.reach[i]
         real = d < NO_RETURN
-        row = table_row(min(d, view.max_range), table.rows_per_metre, rows)
-        reach = table.reach[row]
         end = (d + (reach if table.marks else ZERO)) if real else view.max_range
-        lanes.depth[i] = d
-        lanes.row[i] = row
-        lanes.columns[i] = table.columns_per_metre[row]
         lanes.end[i] = end if d > ZERO else -ONE
         plain = (d - max(reach, half_cell)) if real else view.max_range
         nearest = min(nearest, bits_of(max(plain, ZERO) if d > ZERO else NO_RETURN))
-        x, y, z = _point_cell(d if real else ZERO, columns[i], ray, position)
+        x, y, z = _point_cell(d if real else ZERO, lanes.column[i], ray, position)
         key = pack(x, y, z, lanes.hit)
         lanes.hit[i] = key if (d > ZERO) & real else lanes.hit.dtype.type(-1)
     free_to = float_of(nearest)
@@ -87,23 +99,66 @@ def aim(depths, columns, ray, position, view, table, lanes):
 
 
 @cell
-def evidence(depth, measured, row, columns, look_up, width, table, weight):
-    """Return the evidence at `depth` on a ray that measured `measured`, weighted if `weight` is above zero.
-
-    look_up: the sensor table (rows * width,), negative and positive evidence together.
-    """
-    t = (depth - measured) * columns + np.float32(width) * HALF
-    k = np.int32(min(max(t, ZERO), np.float32(width) - ONE))
-    e = max(look_up[np.uint32(row * np.int32(width) + k)], passed(table, depth))
-    return weighted(e, depth, weight)
+def _take(depths, columns, view, table, lanes):
+    """Fill depth, row and column of the lanes. Those left over go along with the last pixel, and end at once."""
+    n = depths.size
+    for i in range(n):
+        d = usable(depths[i])
+        row = table_row(min(d, view.max_range), table.rows_per_metre, table.hit.size)
+        lanes.depth[i], lanes.row[i], lanes.column[i] = d, row, columns[i]
+    for i in range(n, LANES):
+        lanes.depth[i], lanes.row[i], lanes.column[i] = ZERO, np.int32(0), columns[n - 1]
 
 
 @cell
-def passed(table, depth):
-    """Return the largest loss of a cell at `depth` that is looked through: `table.free` or weaker, 0 for too near."""
-    last = np.float32(np.int32(table.passed.size - 1))
-    most = table.passed[np.uint32(np.int32(min(max(depth * table.rows_per_metre, ZERO), last)))]
-    return most if depth > table.blind else np.int32(0)
+def free_space(lanes, table, weight):
+    """Take the evidence of all lanes, none near its measurement nor where `table.passed` changes.
+
+    Return its sum, and as bits which lanes take other evidence than the one before, where `weight` is None.
+    """
+    total, unlike, before = np.int32(0), np.int32(0), table.free
+    for i in range(LANES):
+        middle = lanes.middle[i]
+        gain = weighted(table.free if middle > table.blind else np.int32(0), middle, weight)
+        lanes.gain[i] = gain
+        total = np.int32(total + gain)
+        if weight is None:
+            unlike = np.int32(unlike | bit_if(gain != before, lanes.bit[i]))
+            before = gain
+    return total, unlike
+
+
+@cell
+def evidence(lanes, look_up, table, weight):
+    """Take the evidence of all lanes at `middle`, weighted unless `weight` is None; return as `free_space` does.
+
+    look_up: the sensor table (rows * width,), negative and positive evidence together. Places in tables first, then
+    what stands there, then arithmetic: most processors have no vectors for all three at once.
+    """
+    width = np.int32(table.clear.shape[1])
+    half, last_column = np.float32(width) * HALF, np.float32(width) - ONE
+    last_row = np.float32(np.int32(table.passed.size - 1))
+    for i in range(LANES):
+        middle = lanes.middle[i]
+        t = (middle - lanes.depth[i]) * lanes.columns[i] + half
+        k = np.int32(min(max(t, ZERO), last_column))
+        lanes.place[i] = np.int32(lanes.row[i] * width + k)
+        lanes.passed[i] = np.int32(min(max(middle * table.rows_per_metre, ZERO), last_row))
+    for i in range(LANES):
+        lanes.place[i] = look_up[np.uint32(lanes.place[i])]
+        lanes.passed[i] = table.passed[np.uint32(lanes.passed[i])]
+    total, unlike, before = np.int32(0), np.int32(0), table.free
+    for i in range(LANES):
+        middle = lanes.middle[i]
+        e = max(lanes.place[i], lanes.passed[i] if middle > table.blind else np.int32(0))
+        e = e if middle >= ZERO else np.int32(0)  # a table may mark from its first column on
+        gain = weighted(e, middle, weight)
+        lanes.gain[i] = gain
+        total = np.int32(total + gain)
+        if weight is None:
+            unlike = np.int32(unlike | bit_if(gain != before, lanes.bit[i]))
+            before = gain
+    return total, unlike
 
 
 @cell
@@ -116,73 +171,65 @@ def weighted(e, depth, weight):
 
 
 @cell
-def aim_at_hits(n, lanes, table, weight):
-    """Select the measured points' cells to be given evidence; return runs and total for `give`."""
-    for i in range(n):
+def aim_at_hits(lanes, table, weight):
+    """Select the measured points' cells to be given evidence; return starts and total for `give`."""
+    for i in range(LANES):
+        lanes.gain[i] = table.hit[np.uint32(lanes.row[i])]
+    total, starts, before, other = np.int32(0), np.int32(0), lanes.hit[0], np.int32(0)
+    for i in range(LANES):
         hit = lanes.hit[i]
-        lanes.key[i] = hit
-        lanes.gain[i] = weighted(table.hit[lanes.row[i]], lanes.depth[i], weight) if hit >= 0 else np.int32(0)
-    return mark_runs(n, lanes)
+        gain = weighted(lanes.gain[i], lanes.depth[i], weight) if hit >= 0 else np.int32(0)
+        lanes.key[i], lanes.gain[i] = hit, gain
+        total = np.int32(total + gain)
+        starts = np.int32(starts | bit_if((hit != before) | (gain != other), lanes.bit[i]))
+        before, other = hit, gain
+    return starts, total
 
 
 @cell
-def mark_runs(n, lanes):
-    """Mark the last of each run of lanes in one cell; return how many runs there are, and the sum of all gains."""
-    lanes.key[n] = -1
-    runs, total = np.int32(0), np.int32(0)
-    for i in range(n):
-        last = np.int32(lanes.key[i] != lanes.key[i + 1])
-        lanes.last[i] = last
-        runs, total = np.int32(runs + last), np.int32(total + lanes.gain[i])
-    return runs, total
+def bit_if(differs, bit):
+    """Return `bit` where something differs, 0 elsewhere; no branch, which some processors have no vectors for."""
+    return np.int32(bit & np.int32(-np.int32(differs)))
 
 
 @cell
-def give(n, lanes, runs, total, plain, weight, memory, pool_table, coords, count, values):
-    """Give the gains of the first `n` lanes to their cells; return False when the block pool is full.
+def give(lanes, starts, total, weight, memory, pool_table, coords, count, values):
+    """Give the gains of all lanes to their cells; return False when the block pool is full.
 
-    weight: gains of one cell add up; None: the strongest counts. runs, total: see `mark_runs`. plain: the largest
-    loss that any lane may give, where none gives positive evidence; 0 where lanes differ.
+    starts: lanes with another cell than the one before, a bit each; the first says nothing. total: of all gains.
+    weight: gains of one cell add up; None: the strongest counts, and other gains start a run as well.
     """
     b = np.int64(bits(lanes.key))
-    if weight is None:
-        if (plain == 0) | (total != np.int32(n * plain)):
-            runs = _mark_unlike(n, lanes)
-        total = lanes.gain[0]
-    if runs <= 1:
-        return _enter(lanes.key[0], b, total, weight, memory, pool_table, coords, count, values)
-    room, before = True, np.int32(0)
-    for r in range(_gather(n, lanes, weight)):
-        run_gain = lanes.run_gain[r]
-        gain = np.int32(run_gain - before)
-        room &= _enter(lanes.run_key[r], b, gain, weight, memory, pool_table, coords, count, values)
-        if weight is not None:
-            before = run_gain
-    return room
+    rest = np.int64(starts) & np.int64(0xFFFFFFFE)
+    if weight is not None and rest != 0:
+        _add_up(lanes)
+    room, at, before = True, np.uint32(0), np.int32(0)
+    while rest != 0:
+        low = rest & -rest
+        rest ^= low
+        following = np.uint32((bits_of(np.float32(low)) >> np.int32(23)) - np.int32(127))  # the exponent: its place
+        if weight is None:
+            gain = lanes.gain[at]
+        else:
+            sums = np.int32(lanes.within[following] + lanes.groups[following >> np.uint32(GROUP_BITS)])
+            gain = np.int32(sums - before)
+            before = sums
+        room &= _enter(lanes.key[at], b, gain, weight, memory, pool_table, coords, count, values)
+        at = following
+    gain = lanes.gain[at] if weight is None else np.int32(total - before)
+    return _enter(lanes.key[at], b, gain, weight, memory, pool_table, coords, count, values) & room
 
 
 @cell
-def _mark_unlike(n, lanes):
-    """Mark the last of each run of lanes with the same cell and gain; return how many runs there are."""
-    lanes.key[n] = -1
-    runs = np.int32(0)
-    for i in range(n):
-        last = np.int32((lanes.key[i] != lanes.key[i + 1]) | (lanes.gain[i] != lanes.gain[i + 1]))
-        lanes.last[i] = last
-        runs = np.int32(runs + last)
-    return runs
-
-
-@cell
-def _gather(n, lanes, weight):
-    """List the gains of the runs of lanes; return how many there are. Sums run on from one to the next. No branches."""
-    runs, total = np.uint64(0), np.int32(0)  # unsigned: no check for indices that count from the end
-    for i in range(n):
-        total = lanes.gain[i] if weight is None else np.int32(total + lanes.gain[i])
-        lanes.run_key[runs] = lanes.key[i]
-        lanes.run_gain[runs] = total
-        runs += np.uint64(lanes.last[i])
-    return np.int64(runs)
+def _add_up(lanes):
+    """Sum the gains of the lanes before each one: those `within` its group, and all of earlier `groups`."""
+    total = np.int32(0)
+    for g in range(LANES >> GROUP_BITS):  # short chains, which the processor follows at the same time
+        lanes.groups[g], within = total, np.int32(0)
+        for i in range(g << GROUP_BITS, (g + 1) << GROUP_BITS):
+            lanes.within[i] = within
+            within = np.int32(within + lanes.gain[i])
+        total = np.int32(total + within)
 
 
 @cell

@@ -10,7 +10,7 @@ import numpy as np
 from stereovox._jit import cell, kernel
 from stereovox._math import floor
 from stereovox.integrate._cells import HALF, NEAR_PLANE, NO_RETURN, ONE, ZERO, index, table_row, window_level
-from stereovox.integrate._windows import COARSEST, place
+from stereovox.integrate._windows import COARSEST, build, nearest_tiles, place
 from stereovox.maps._cells import find
 
 SKIP, FREE, MIXED = 0, 1, 2
@@ -19,6 +19,7 @@ SLACK = np.float32(1e-3)
 """Pixels, and share of a depth, by which boxes are enlarged: culling may err only on the safe side."""
 COARSE = 4
 """Blocks along each side of a coarse box; between it and a block stand boxes of two blocks."""
+TEN = np.float32(10)
 STACK = 32
 """Most boxes on the stack: eight of each of two sizes."""
 LAYER = 64
@@ -28,12 +29,35 @@ UNSEEN = np.float32(-1e9)
 
 
 @kernel
-def candidates(view, table, windows, nearest, end, stack, free, mixed):
-    """List the blocks that are wholly free and those that must be evaluated cell by cell; return both numbers.
+def survey(depth_m, ends, view, table, windows, scratch, nearest, stack, free, mixed):
+    """Build the window images, and list the blocks that are wholly free and those that must be evaluated cell by cell.
 
-    Both are -1 when a list is too short.
-    end: depth in metres beyond which the image says nothing. stack: (STACK, 4) int32 scratch.
-    free, mixed: (capacity, 3) int32 block coordinates from the camera's block.
+    Return both numbers; -1 when a list is too short.
+
+    depth_m: (h, w) REP 117 depth image. ends: the same, but for pixels that see nothing: the depth up to which that is
+    so. windows, scratch, nearest: `Windows`, `WindowScratch` and tiles, written. stack: (STACK, 4) int32 scratch.
+    free, mixed: (capacity, 3) int32, written: block coordinates from the camera's block.
+    """
+    farthest = build(ends.reshape(ends.size), windows, scratch)
+    if table.marks:
+        nearest_tiles(depth_m, nearest[0], nearest[1])
+    return candidates(view, table, windows, nearest, _end_of_view(view, table, farthest), stack, free, mixed)
+
+
+@cell
+def _end_of_view(view, table, farthest):
+    """Return the depth in metres beyond which an image whose farthest depth is `farthest` gives no evidence."""
+    if farthest >= NO_RETURN:
+        return view.max_range
+    behind = table.reach[table.reach.size - 1] if table.marks else table.behind
+    return min(view.max_range, max(farthest, TEN * NEAR_PLANE) * (ONE + SLACK) + behind)
+
+
+@kernel
+def candidates(view, table, windows, nearest, end, stack, free, mixed):
+    """List the blocks that are wholly free and those that must be evaluated; see `survey`.
+
+    end: depth in metres beyond which the image says nothing.
     """
     n_free, n_mixed = 0, 0
     low_x, high_x = _touched(view, end, 0)
@@ -63,11 +87,12 @@ def candidates(view, table, windows, nearest, end, stack, free, mixed):
 
 
 @kernel
-def with_hits(hit_table, hit_coords, n_hits, free, n_free, mixed, n_mixed, hit_of, listed):
+def with_hits(view, table, hit_table, hit_coords, n_hits, free, n_free, mixed, n_mixed, hit_of, listed, free_values):
     """Put all blocks that hold hits among the mixed ones; return the numbers of free and of mixed blocks.
 
     `mixed` must have room for `n_hits` more. hit_of: as long as `mixed`, written: the place of each mixed block among
-    the hits, -1 for none. listed: (n_hits,) uint8 zeros, scratch.
+    the hits, -1 for none. listed: (n_hits,) uint8 zeros, scratch. free_values: (n_free,) int16, written: the evidence
+    on all cells of each free block.
     """
     for i in range(n_mixed):
         h = find(hit_table, hit_coords, mixed[i, 0], mixed[i, 1], mixed[i, 2])
@@ -86,6 +111,7 @@ def with_hits(hit_table, hit_coords, n_hits, free, n_free, mixed, n_mixed, hit_o
                 mixed[n_mixed, axis] = hit_coords[h, axis]
             hit_of[n_mixed] = h
             n_mixed += 1
+    _pass(view, table, free[:kept], free_values)
     return kept, n_mixed
 
 
@@ -110,9 +136,9 @@ def evaluate(depth_m, view, table, windows, blocks, hit_of, hit_values, values, 
                 out[c] = with_hit(out[c], hits[c])
 
 
-@kernel
-def passed(view, table, blocks, out):
-    """Fill `out` (n,) int16 with the evidence on all cells of each of `blocks` (n, 3), which are wholly free."""
+@cell
+def _pass(view, table, blocks, out):
+    """Write the evidence (n,) on all cells of each of `blocks` (n, 3), which are wholly free."""
     for i in range(blocks.shape[0]):
         _, _, cz = corner(view, blocks[i, 0], blocks[i, 1], blocks[i, 2])
         out[i] = np.int16(_passed(view, table, cz))

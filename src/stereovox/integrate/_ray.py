@@ -10,7 +10,18 @@ import numpy as np
 from stereovox._jit import cell, kernel
 from stereovox.integrate._cells import HALF, NO_RETURN, ONE, ZERO, bits_of, float_of, pack, strides
 from stereovox.integrate._hits import _row_rays
-from stereovox.integrate._lanes import LANES, aim, aim_at_hits, evidence, give, in_step, mark_runs, passed, weighted
+from stereovox.integrate._lanes import (
+    LANES,
+    NOWHERE,
+    aim,
+    aim_at_hits,
+    bit_if,
+    even_to,
+    evidence,
+    free_space,
+    give,
+    in_step,
+)
 
 OFF_FACE = np.float32(1e-3)
 """Distance in cells that samples keep from the faces of cells, where rounding would choose the cell."""
@@ -20,70 +31,70 @@ TINY = np.float32(1e-30)
 
 
 @kernel
-def cast(depth_m, view, table, look_up, weight, lanes, memory, pool_table, coords, count, values, first_row, last_row):
-    """Add the evidence of all rays of rows first_row..last_row to an empty pool; return False when it is too small.
+def cast(depth_m, view, table, look_up, weight, lanes, memory, pool_table, coords, count, values, first, stop, step):
+    """Add the evidence of all rays of some rows to an empty pool; return False when it is too small.
 
     depth_m: (h, w) REP 117 depth image. look_up: the sensor table (rows * columns,), both signs together.
     weight: every ray adds its evidence to every cell it crosses, times min(1, weight * depth^2) (Chien 2020, Eq 3.21),
     in units of 1/1024 thousandths; None: a cell keeps the strongest. Blocks count from the camera's own.
+    first, stop, step: every `step`-th row from `first` on, up to `stop`.
     """
     size = ONE / view.voxel_size
     position = view.position[0] * size, view.position[1] * size, view.position[2] * size
     memory.block[:] = -1
-    for v in range(first_row, last_row):
+    even = even_to(table, view)
+    for v in range(first, stop, step):
         ray, u = _row_rays(view.forward, view.rows[v], size), 0
         while u < depth_m.shape[1]:
             n, signs = in_step(view.columns[u : u + LANES], ray)
-            columns = view.columns[u : u + n]
-            free_to = aim(depth_m[v, u : u + n], columns, ray, position, view, table, lanes)
+            free_to = aim(depth_m[v, u : u + n], view.columns[u : u + n], ray, position, view, table, lanes)
             u += n
             if free_to >= NO_RETURN:
                 continue
-            _start(columns, ray, position, signs, lanes)
+            _start(ray, position, signs, lanes)
             reached, going = ZERO, True
             while going:
-                plain = table.free if reached < free_to else np.int32(0)
-                if reached < free_to:  # plain free space needs no table
-                    reached, going, runs, total = _step(n, lanes, position, signs, False, table, look_up, weight)
+                tableless = reached < min(free_to, even)
+                reached, going, starts = _step(lanes, position, signs)
+                if tableless:
+                    total, unlike = free_space(lanes, table, weight)
                 else:
-                    reached, going, runs, total = _step(n, lanes, position, signs, True, table, look_up, weight)
-                if not give(n, lanes, runs, total, plain, weight, memory, pool_table, coords, count, values):
+                    total, unlike = evidence(lanes, look_up, table, weight)
+                if not give(lanes, starts | unlike, total, weight, memory, pool_table, coords, count, values):
                     return False
-            runs, total = aim_at_hits(n, lanes, table, weight)
-            if not give(n, lanes, runs, total, np.int32(0), weight, memory, pool_table, coords, count, values):
+            starts, total = aim_at_hits(lanes, table, weight)
+            if not give(lanes, starts, total, weight, memory, pool_table, coords, count, values):
                 return False
     return True
 
 
 @cell
-def _start(columns, ray, position, signs, lanes):
+def _start(ray, position, signs, lanes):
     """Put all rays into the first cell they cross."""
     x, y, z = _first(position[0], signs[0]), _first(position[1], signs[1]), _first(position[2], signs[2])
     key = pack(np.int32(x), np.int32(y), np.int32(z), lanes.cell)
     x, y, z = x + max(signs[0], ZERO), y + max(signs[1], ZERO), z + max(signs[2], ZERO)
-    for i in range(columns.size):
+    for i in range(LANES):
+        column = lanes.column[i]
         lanes.entered[i], lanes.cell[i] = ZERO, key
         lanes.x[i], lanes.y[i], lanes.z[i] = x, y, z
-        lanes.per_x[i] = _inverse(ray[0] * columns[i] + ray[1])
-        lanes.per_y[i] = _inverse(ray[2] * columns[i] + ray[3])
-        lanes.per_z[i] = _inverse(ray[4] * columns[i] + ray[5])
+        lanes.per_x[i] = _inverse(ray[0] * column + ray[1])
+        lanes.per_y[i] = _inverse(ray[2] * column + ray[3])
+        lanes.per_z[i] = _inverse(ray[4] * column + ray[5])
 
 
 @cell
-def _step(n, lanes, position, signs, near, table, look_up, weight):
-    """Take the evidence on the cells of the first `n` lanes and move to the next ones.
+def _step(lanes, position, signs):
+    """Fill key and middle of the lanes for the cells they are in and move to the next ones.
 
-    near: whether any ray may be near its measurement; otherwise all cells are plain free space.
-    Return the depth that the farthest ray has reached, whether any goes on, and the runs and total for `give`.
+    Return the depth that the farthest ray has reached, whether any goes on, and the starts for `give`.
     """
     px, py, pz = position
     sx, sy, sz = signs
     by_x, by_y, by_z = strides(signs, lanes.cell)
-    width = table.clear.shape[1]
-    lanes.cell[n] = -1
-    runs, total = np.int32(0), np.int32(0)
+    starts, before = np.int32(0), lanes.cell[0]
     reached = np.int32(0)  # the bits of a float that is not negative: those can be compared many at once
-    for i in range(n):
+    for i in range(LANES):
         x, y, z = lanes.x[i], lanes.y[i], lanes.z[i]
         tx = (x - px) * lanes.per_x[i]  # depth at which the ray leaves its cell along this axis
         ty = (y - py) * lanes.per_y[i]
@@ -91,16 +102,10 @@ def _step(n, lanes, position, signs, near, table, look_up, weight):
         left = min(min(tx, ty), tz)
         entered, end = lanes.entered[i], lanes.end[i]
         key = lanes.cell[i]
-        middle = HALF * (entered + min(left, end))
-        if near:
-            e = evidence(middle, lanes.depth[i], lanes.row[i], lanes.columns[i], look_up, width, table, weight)
-            counts = (entered <= end) & (key != lanes.hit[i])
-        else:
-            e = weighted(passed(table, middle), middle, weight)
-            counts = entered <= end
-        gain, last = e if counts else np.int32(0), np.int32(key != lanes.cell[i + 1])
-        lanes.key[i], lanes.gain[i], lanes.last[i] = key, gain, last
-        runs, total = np.int32(runs + last), np.int32(total + gain)
+        lanes.key[i] = key
+        starts = np.int32(starts | bit_if(key != before, lanes.bit[i]))
+        before = key
+        lanes.middle[i] = HALF * (entered + min(left, end)) if (entered <= end) & (key != lanes.hit[i]) else NOWHERE
         along_x = tx <= left
         along_y = (ty <= left) & (not along_x)
         lanes.x[i] = x + (sx if along_x else ZERO)
@@ -110,7 +115,7 @@ def _step(n, lanes, position, signs, near, table, look_up, weight):
         lanes.cell[i] = key + (by_x if along_x else by_yz)
         lanes.entered[i] = left if left < end else BEYOND
         reached = max(reached, bits_of(max(left, TINY) if left < end else ZERO))  # the first cell may end at depth zero
-    return float_of(reached), reached > 0, runs, total
+    return float_of(reached), reached > 0, starts
 
 
 @cell
@@ -125,34 +130,34 @@ def _inverse(direction):
 
 
 @kernel
-def draw(depth_m, view, table, look_up, weight, lanes, memory, pool_table, coords, count, values, first_row, last_row):
-    """Add the evidence of all lines of rows first_row..last_row to an empty pool; arguments as in `cast`."""
+def draw(depth_m, view, table, look_up, weight, lanes, memory, pool_table, coords, count, values, first, stop, step):
+    """Add the evidence of all lines of some rows to an empty pool; arguments as in `cast`."""
     size = ONE / view.voxel_size
     position = view.position[0] * size, view.position[1] * size, view.position[2] * size
     start = _off_faces(position[0]), _off_faces(position[1]), _off_faces(position[2])
     memory.block[:] = -1
-    for v in range(first_row, last_row):
+    even = even_to(table, view)
+    for v in range(first, stop, step):
         ray = _row_rays(view.forward, view.rows[v], size)
         for u in range(0, depth_m.shape[1], LANES):
             columns = view.columns[u : u + LANES]
-            n = columns.size
-            free_to = aim(depth_m[v, u : u + n], columns, ray, position, view, table, lanes)
+            free_to = aim(depth_m[v, u : u + LANES], columns, ray, position, view, table, lanes)
             if free_to >= NO_RETURN:
                 continue
-            _line_start(columns, ray, lanes)
+            _line_start(ray, lanes)
             number, reached, going = ZERO, ZERO, True
             while going:
-                plain = table.free if reached < free_to else np.int32(0)
-                if reached < free_to:  # plain free space needs no table
-                    reached, going = _line_step(n, lanes, number, start, False, table, look_up, weight)
+                tableless = reached < min(free_to, even)
+                reached, going, starts = _line_step(lanes, number, start)
+                if tableless:
+                    total, unlike = free_space(lanes, table, weight)
                 else:
-                    reached, going = _line_step(n, lanes, number, start, True, table, look_up, weight)
+                    total, unlike = evidence(lanes, look_up, table, weight)
                 number += ONE
-                runs, total = mark_runs(n, lanes)
-                if not give(n, lanes, runs, total, plain, weight, memory, pool_table, coords, count, values):
+                if not give(lanes, starts | unlike, total, weight, memory, pool_table, coords, count, values):
                     return False
-            runs, total = aim_at_hits(n, lanes, table, weight)
-            if not give(n, lanes, runs, total, np.int32(0), weight, memory, pool_table, coords, count, values):
+            starts, total = aim_at_hits(lanes, table, weight)
+            if not give(lanes, starts, total, weight, memory, pool_table, coords, count, values):
                 return False
     return True
 
@@ -165,35 +170,34 @@ def _off_faces(place):
 
 
 @cell
-def _line_start(columns, ray, lanes):
+def _line_start(ray, lanes):
     """Set each ray's cells per metre of depth, and the depth of one cell along its longest axis."""
-    for i in range(columns.size):
-        column = columns[i]
+    for i in range(LANES):
+        column = lanes.column[i]
         dx, dy, dz = ray[0] * column + ray[1], ray[2] * column + ray[3], ray[4] * column + ray[5]
         lanes.per_x[i], lanes.per_y[i], lanes.per_z[i] = dx, dy, dz
         lanes.entered[i] = ONE / max(max(abs(dx), abs(dy)), abs(dz))
 
 
 @cell
-def _line_step(n, lanes, number, start, near, table, look_up, weight):
-    """Take the evidence on the cells at sample `number` of the first `n` lanes; see `_step`."""
+def _line_step(lanes, number, start):
+    """Fill key and middle of the lanes at sample `number`.
+
+    Return the depth of the farthest ray's next sample, whether there is any, and the starts for `give`.
+    """
     px, py, pz = start
-    width = table.clear.shape[1]
+    starts, before = np.int32(0), lanes.key.dtype.type(-1)
     reached = np.int32(0)  # the bits of a float that is not negative: those can be compared many at once
-    for i in range(n):
+    for i in range(LANES):
         depth, end = number * lanes.entered[i], lanes.end[i]
         x = np.int32(np.floor(depth * lanes.per_x[i] + px))
         y = np.int32(np.floor(depth * lanes.per_y[i] + py))
         z = np.int32(np.floor(depth * lanes.per_z[i] + pz))
         key = pack(x, y, z, lanes.key)
-        if near:
-            e = evidence(depth, lanes.depth[i], lanes.row[i], lanes.columns[i], look_up, width, table, weight)
-            counts = (depth <= end) & (key != lanes.hit[i])
-        else:
-            e = weighted(passed(table, depth), depth, weight)
-            counts = depth <= end
         lanes.key[i] = key
-        lanes.gain[i] = e if counts else np.int32(0)
+        starts = np.int32(starts | bit_if(key != before, lanes.bit[i]))
+        before = key
+        lanes.middle[i] = depth if (depth <= end) & (key != lanes.hit[i]) else NOWHERE
         following = depth + lanes.entered[i]
         reached = max(reached, bits_of(following if following <= end else ZERO))
-    return float_of(reached), reached > 0
+    return float_of(reached), reached > 0, starts

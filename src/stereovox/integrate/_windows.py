@@ -34,15 +34,15 @@ def place(level, v, u, pitch, height):
 
 
 @kernel
-def build(
-    depth_m, base, window, ring, row, other, high_row, low_row, lows, highs, shape, tile_offset, tile_width, first
-):
-    """Fill window images and tiles of all levels from `first` on; return the farthest depth of the image.
+def build(depth_m, windows, scratch):
+    """Fill the window images and tiles (`Windows`) of all levels from `windows.first` on; return the farthest depth.
 
-    depth_m: flat REP 117 depth image. window: flat image of all levels; shape: (levels, 2) rows and columns of each.
-    base: like `window`, scratch for the images before dilation. Scratch too: ring (4, pitch), row, other, high_row,
-    low_row (pitch,). lows, highs: flat tile images, at tile_offset[level, 0] for tiles of 16 and [level, 1] for 64.
+    depth_m: flat REP 117 depth image. scratch: `WindowScratch`.
     """
+    window, lows, highs, shape = windows.image, windows.lows, windows.highs, windows.shape
+    tile_offset, tile_width, first = windows.tile_offset, windows.tile_width, windows.first
+    base, ring = scratch.base, scratch.ring
+    row, other, high_row, low_row = scratch.row, scratch.other, scratch.high_row, scratch.low_row
     height, width, pitch = shape[0, 0], shape[0, 1], np.int32(row.size)
     lowest = max(first, 1)
     for level in range(first, COARSEST + 1):
@@ -179,17 +179,16 @@ def _fill_big(lows, highs, start, number):
 
 
 @kernel
-def nearest_tiles(depth_m, height, width, lows16, lows64):
-    """Fill tiles of 16 and 64 pixels with the nearest depth in them, pixels without value left out."""
-    wide = (width + 63) // 64
-    lows64[:] = NO_RETURN
+def nearest_tiles(depth_m, lows16, lows64):
+    """Fill tiles (rows, columns) of 16 and 64 pixels with the nearest depth in them, pixels without value left out."""
+    height, width = depth_m.shape
+    lows64[:, :] = NO_RETURN
     for tv in range((height + 15) // 16):
         for tu in range((width + 15) // 16):
             low = NO_RETURN
             for v in range(16 * tv, min(16 * tv + 16, height)):
                 for u in range(16 * tu, min(16 * tu + 16, width)):
-                    d = depth_m[v * width + u]
+                    d = depth_m[v, u]
                     low = min(low, d if d > ZERO else NO_RETURN)
-            lows16[tv * ((width + 15) // 16) + tu] = low
-            big = (tv >> 2) * wide + (tu >> 2)
-            lows64[big] = min(lows64[big], low)
+            lows16[tv, tu] = low
+            lows64[tv >> 2, tu >> 2] = min(lows64[tv >> 2, tu >> 2], low)

@@ -20,7 +20,7 @@ from stereovox.device import check_device
 from stereovox.errors import ConfigError
 from stereovox.frame import DepthImage
 from stereovox.integrate import _gpu
-from stereovox.integrate.projective import ROOM, WindowBuilder
+from stereovox.integrate.projective import ROOM, make_windows
 from stereovox.integrate.views import PerCamera, View, Views, check_blocks, check_view, sensor_table, uses_wide_keys
 from stereovox.maps.blocks import CELLS, table_size
 from stereovox.maps.gpu import GpuArrays, GpuEvidence
@@ -56,7 +56,7 @@ class GpuEye:
         self._camera, self._views = camera, Views(camera, config)
         self._table = to_gpu(sensor_table(sensor, config, camera))
         self._view = GpuView(self._views.at(np.eye(4)))
-        self._windows = GpuWindows(camera, config, marks=bool(self._table.marks))
+        self._windows = GpuWindows(camera, float(self._views.spread) / config.max_range, marks=bool(self._table.marks))
         self._hits = GpuHits(camera, config)
         self._depth_m = gpu_array((camera.height, camera.width), np.float32)
         self._counts = gpu_array(_gpu.COUNTS, np.int32)
@@ -150,23 +150,21 @@ class GpuView:
 
 
 class GpuWindows:
-    """One camera's window images on the card; see `WindowBuilder`."""
+    """One camera's window images on the card; see `make_windows`."""
 
-    def __init__(self, camera: PinholeCamera, config: Config, marks: bool):
-        builder = WindowBuilder(camera)
-        spread = float(Views(camera, config).at(np.eye(4)).spread)
-        self.on_gpu = to_gpu(builder.empty(spread / config.max_range))
-        self.nearest = to_gpu(builder.nearest)
-        self._shape, self._base = to_gpu(builder.shape), gpu_array(self.on_gpu.image.size, np.float32)
-        self._levels, self._size, self._marks = range(1, len(builder.shape)), builder.shape[0].tolist(), marks
+    def __init__(self, camera: PinholeCamera, smallest_tile: float, marks: bool):
+        windows, _, nearest = make_windows(camera, smallest_tile)
+        self.on_gpu, self.nearest = to_gpu(windows), to_gpu(nearest)
+        self._base = gpu_array(windows.image.size, np.float32)
+        self._levels, self._size, self._marks = range(1, len(windows.shape)), windows.shape[0].tolist(), marks
 
     def build(self, depth_m: Any) -> None:
         """Fill the images from a flat REP 117 depth image on the card."""
         for level in self._levels:
-            launch(_gpu.shrink, depth_m, self._base, self._shape, self.on_gpu.pitch, level)
-        launch(_gpu.widen, self._base, self.on_gpu, self._shape)
-        launch(_gpu.fill_tiles, self.on_gpu, self._shape)
-        launch(_gpu.join_tiles, self.on_gpu, self._shape)
+            launch(_gpu.shrink, depth_m, self._base, self.on_gpu, level)
+        launch(_gpu.widen, self._base, self.on_gpu)
+        launch(_gpu.fill_tiles, self.on_gpu)
+        launch(_gpu.join_tiles, self.on_gpu)
         if self._marks:
             for size, tiles in zip((16, 64), self.nearest, strict=True):
                 launch(_gpu.nearest_tiles, depth_m, *self._size, size, tiles)

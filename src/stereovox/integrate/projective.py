@@ -21,7 +21,6 @@ from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.config import Config
 from stereovox.frame import DepthImage
 from stereovox.integrate import _hits, _lanes, _projective, _windows
-from stereovox.integrate._cells import NEAR_PLANE, NO_RETURN
 from stereovox.integrate.faces import Face, WideCamera, cut, faces_of
 from stereovox.integrate.views import (
     RIM_SHARE,
@@ -38,7 +37,7 @@ from stereovox.maps.blocks import CELLS, BlockPool
 from stereovox.maps.evidence import Evidence
 from stereovox.sensors import make_sensor
 from stereovox.sensors.model import InverseSensorModel
-from stereovox.threads import in_shards, run_both, shards
+from stereovox.threads import Scratch, in_shards, run_both, shards
 
 LEVELS = _windows.COARSEST + 1
 """Number of window sizes: one pixel, and three tiles of 1 to 128 pixels."""
@@ -46,6 +45,8 @@ ROOM = 4096
 """Initial capacity of a camera's block lists."""
 WORTH_A_THREAD = 256
 """Blocks whose evaluation takes longer than waking a thread."""
+WEIGHED_BY_A_THREAD = 2048
+"""Cells with hits whose weighing does."""
 
 
 class Projective:
@@ -68,24 +69,25 @@ class Projective:
         depth_m = image.depth_m
         view = eye.views.at(image.T_world_sensor)
         threads = self._config.threads if eye.mixed_before >= 2 * WORTH_A_THREAD else 1
-        _, (windows, n_free, n_mixed) = run_both(
+        n_hits, (windows, n_free, n_mixed) = run_both(
             threads,
-            lambda: eye.hits.find(depth_m, view),
+            lambda: eye.hits.scatter(depth_m, view),
             lambda: eye.candidates(depth_m, ends, view),
         )
-        free, mixed, hit_of = eye.with_hits(n_free, n_mixed)
+        in_shards(
+            lambda part: eye.hits.weigh(depth_m, view, part),
+            shards(n_hits, min(threads, n_hits // WEIGHED_BY_A_THREAD or 1)),
+        )
+        free, free_values, mixed, hit_of = eye.with_hits(view, n_free, n_mixed)
         eye.mixed_before = len(mixed)
         values = np.empty((len(mixed), CELLS), np.int16)
         hits = eye.hits.blocks.values
 
         def one_shard(part: slice) -> None:
-            _projective.evaluate(
-                depth_m, view, eye.table, windows, mixed[part], hit_of[part], hits, values[part], _layer_scratch()
-            )  # fmt: skip
+            blocks = mixed[part], hit_of[part], hits, values[part]
+            eye.layers.lend(lambda layer: _projective.evaluate(depth_m, view, eye.table, windows, *blocks, layer))
 
         in_shards(one_shard, shards(len(mixed), min(threads, len(mixed) // WORTH_A_THREAD or 1)))
-        free_values = np.empty(len(free), np.int16)
-        _projective.passed(view, eye.table, free, free_values)
         origin = eye.views.block
         return Evidence(mixed + origin, values, free + origin, free_values)
 
@@ -102,7 +104,7 @@ class LayerScratch(NamedTuple):
 
 def _layer_scratch() -> LayerScratch:
     floats, ints = np.empty((3, _projective.LAYER), np.float32), np.empty((2, _projective.LAYER), np.int32)
-    return LayerScratch(*floats, *ints)
+    return LayerScratch._make([*floats, *ints])
 
 
 class _Eye:
@@ -114,10 +116,10 @@ class _Eye:
         self.mixed_before = 0  # blocks evaluated in the frame before: the estimate for the next
         self.views = Views(camera, config, rim_share)
         self.hits = HitFinder(camera, table, config)
-        self._windows = WindowBuilder(camera)
-        self._max_range = config.max_range
+        self._windows = make_windows(camera, float(self.views.spread) / config.max_range)
         self._free, self._mixed = (np.empty((ROOM, 3), np.int32) for _ in range(2))
         self._stack = np.empty((_projective.STACK, 4), np.int32)
+        self.layers = Scratch(_layer_scratch)
 
     def candidates(
         self, depth_m: NDArray[np.float32], ends: NDArray[np.float32], view: View
@@ -126,36 +128,31 @@ class _Eye:
 
         ends: `depth_m`, but for pixels that see nothing: the depth up to which that is so.
         """
-        windows, farthest = self._windows.build(ends, float(view.spread) / self._max_range)
-        if self.table.marks:
-            self._windows.build_nearest(depth_m)
-        end, nearest = np.float32(self._end_of_view(farthest)), self._windows.nearest
+        windows, scratch, nearest = self._windows
         while True:
             lists = self._stack, self._free, self._mixed
-            n_free, n_mixed = _projective.candidates(view, self.table, windows, nearest, end, *lists)
+            n_free, n_mixed = _projective.survey(depth_m, ends, view, self.table, windows, scratch, nearest, *lists)
             if n_free >= 0:
                 return windows, n_free, n_mixed
             check_blocks(4 * len(self._free), self._camera)
             self._free, self._mixed = (np.empty((4 * len(self._free), 3), np.int32) for _ in range(2))
 
-    def with_hits(self, n_free: int, n_mixed: int) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
-        """Return the free blocks, the mixed ones, those with hits included, and where each has its hits (-1: none)."""
+    def with_hits(
+        self, view: View, n_free: int, n_mixed: int
+    ) -> tuple[NDArray[np.int32], NDArray[np.int16], NDArray[np.int32], NDArray[np.int32]]:
+        """Return the free blocks and their evidence, the mixed ones, those with hits included, and where each of these
+        has its hits (-1: none).
+        """
         hits = self.hits.blocks
         most = n_mixed + len(hits)
         if most > len(self._mixed):
             self._mixed = np.concatenate([self._mixed, np.empty((most, 3), np.int32)])
-        hit_of, listed = np.empty(most, np.int32), np.zeros(len(hits), np.uint8)
+        hit_of, listed, values = np.empty(most, np.int32), np.zeros(len(hits), np.uint8), np.empty(n_free, np.int16)
         n_free, n_mixed = _projective.with_hits(
-            hits.table, hits.coords, len(hits), self._free, n_free, self._mixed, n_mixed, hit_of, listed
-        )
-        return self._free[:n_free], self._mixed[:n_mixed], hit_of[:n_mixed]
-
-    def _end_of_view(self, farthest: float) -> float:
-        """Return the depth in metres beyond which this image gives no evidence."""
-        if farthest >= NO_RETURN:
-            return self._max_range
-        behind = float(self.table.reach[-1] if self.table.marks else self.table.behind)
-        return min(self._max_range, max(float(farthest), 10 * float(NEAR_PLANE)) * 1.001 + behind)
+            view, self.table, hits.table, hits.coords, len(hits), self._free, n_free, self._mixed, n_mixed, hit_of,
+            listed, values,
+        )  # fmt: skip
+        return self._free[:n_free], values[:n_free], self._mixed[:n_mixed], hit_of[:n_mixed]
 
 
 def _eye(sensor: InverseSensorModel, config: Config, camera: PinholeCamera, rim_share: float = RIM_SHARE) -> _Eye:
@@ -169,8 +166,8 @@ def _eyes_of_faces(sensor: InverseSensorModel, config: Config, camera: WideCamer
 class HitFinder:
     """Finds the hits of one camera, and keeps the memory for them.
 
-    blocks: the result of `find`: evidence in thousandths on each cell that holds a point, 0 elsewhere; blocks count
-    from the one the camera stands in.
+    blocks: the result, once `scatter` has found the cells and `weigh` has weighed them all: evidence in thousandths
+    on each cell that holds a point, 0 elsewhere; blocks count from the one the camera stands in.
     """
 
     def __init__(self, camera: PinholeCamera, table: KernelTable, config: Config):
@@ -179,28 +176,42 @@ class HitFinder:
         self._full_share = np.float32(config.projective.full_share)
         pixels = _hits.GROUP * -(-camera.width // _hits.GROUP)
         kind = np.int64 if uses_wide_keys(camera, config.max_range, config) else np.int32
-        self._keys, self._seen = np.zeros((2, camera.width + 1), kind), np.zeros(_hits.SEEN, kind)
-        self._news, self._fresh = np.zeros(pixels, np.uint8), np.zeros(pixels + 1, np.int32)
+        self._scratch = HitScratch(
+            np.zeros((2, camera.width + 1), kind), np.zeros(pixels, np.uint8), np.zeros(pixels + 1, np.int32),
+            np.zeros(_hits.SEEN, kind),
+        )  # fmt: skip
         self._listed = np.zeros(camera.height * camera.width, np.int32)
-        floats, ints = np.zeros((11, _hits.LANES), np.float32), np.zeros(_hits.LANES, np.int32)
-        self._lanes = HitLanes(*floats, ints)
+        self._lanes = Scratch(_hit_lanes)
 
-    def find(self, depth_m: NDArray[np.float32], view: View) -> None:
-        """Fill `blocks` from a REP 117 depth image."""
+    def scatter(self, depth_m: NDArray[np.float32], view: View) -> int:
+        """Find the cells that hold points of a REP 117 depth image; return how many there are."""
         blocks = self.blocks
         blocks.clear()
         while (n := self._scatter(depth_m, view)) < 0:
             check_blocks(2 * len(blocks.coords), self._camera)
             blocks.clear()
             blocks.reserve(2 * len(blocks.coords))
-        _hits.weigh(
-            depth_m, view, self._table, self._full_share, self._listed, n, blocks.coords, blocks.values, self._lanes
-        )
+        return n
+
+    def weigh(self, depth_m: NDArray[np.float32], view: View, part: slice) -> None:
+        """Write the evidence of a part of the cells that were found."""
+        hits = self._listed[part], self.blocks.coords, self.blocks.values
+        self._lanes.lend(lambda lanes: _hits.weigh(depth_m, view, self._table, self._full_share, *hits, lanes))
 
     def _scatter(self, depth_m: NDArray[np.float32], view: View) -> int:
-        scratch = self._keys, self._news, self._fresh, self._seen, self._listed
         blocks = self.blocks
-        return _hits.scatter(depth_m, view, *scratch, blocks.table, blocks.coords, blocks.count, blocks.values)
+        return _hits.scatter(
+            depth_m, view, self._scratch, self._listed, blocks.table, blocks.coords, blocks.count, blocks.values
+        )
+
+
+class HitScratch(NamedTuple):
+    """Memory of `_hits.scatter`."""
+
+    keys: NDArray[np.signedinteger]  # (2, w + 1); int32 serves cells within 2^9 of the camera, int64 the rest
+    news: NDArray[np.uint8]  # (w rounded up to GROUP,) whether a pixel's cell is none of those beside it
+    fresh: NDArray[np.int32]  # one longer: the pixels with such cells
+    seen: NDArray[np.signedinteger]  # (SEEN,) keys of recently entered cells
 
 
 class HitLanes(NamedTuple):
@@ -220,62 +231,63 @@ class HitLanes(NamedTuple):
     at: NDArray[np.int32]  # its pixel
 
 
+def _hit_lanes() -> HitLanes:
+    floats, ints = np.empty((11, _hits.LANES), np.float32), np.empty(_hits.LANES, np.int32)
+    return HitLanes._make([*floats, ints])
+
+
 class Windows(NamedTuple):
     """All window images in one; see `_windows.py`."""
 
     image: NDArray[np.float32]  # flat; `_windows.place` says where a pixel stands; the last entry is UNSEEN
     pitch: np.int32
     height: np.int32
-    lows: NDArray[np.float32]
-    highs: NDArray[np.float32]
+    shape: NDArray[np.int32]  # (levels, 2) rows and columns
+    lows: NDArray[np.float32]  # nearest values of tiles
+    highs: NDArray[np.float32]  # farthest
     tile_offset: NDArray[np.int32]  # (levels, 2) where tiles of 16 and of 64 start
     tile_width: NDArray[np.int32]  # (levels, 2) tiles in a row
     first: np.int32  # lowest level that is filled
 
 
-class WindowBuilder:
-    """Builds one camera's window images, and keeps the memory for them. shape: (levels, 2) rows and columns of each."""
+class WindowScratch(NamedTuple):
+    """Memory of `_windows.build`."""
 
-    def __init__(self, camera: PinholeCamera):
-        h, w = camera.height, camera.width
-        coarsest = 1 << (LEVELS - 2)
-        strides = np.array([1] + [1 << level for level in range(LEVELS - 1)])
-        self.shape = np.stack([-(-h // strides), -(-w // strides)], axis=1).astype(np.int32)
-        tiles = np.stack([-(-self.shape // 16), -(-self.shape // 64)], axis=1)
-        tile_offset = _starts(tiles.prod(axis=2).ravel()).reshape(LEVELS, 2)
-        pitch = coarsest * -(-w // coarsest)
-        size = pitch * (2 * h + -(-h // 2))
-        self._scratch = np.zeros(size, np.float32), np.zeros((4, pitch), np.float32), *np.zeros((4, pitch), np.float32)
-        lows, highs = np.zeros((2, tiles.prod(axis=2).sum()), np.float32)
-        image = np.append(np.zeros(size, np.float32), _projective.UNSEEN)
-        self._windows = Windows(
-            image, np.int32(pitch), np.int32(h), lows, highs,
-            tile_offset, np.ascontiguousarray(tiles[:, :, 1], np.int32), np.int32(0),
-        )  # fmt: skip
-        self.nearest = tuple(np.zeros((-(-h // size), -(-w // size)), np.float32) for size in (16, 64))
+    base: NDArray[np.float32]  # like `Windows.image`: the images before dilation
+    ring: NDArray[np.float32]  # (4, pitch)
+    row: NDArray[np.float32]  # (pitch,), as the rest
+    other: NDArray[np.float32]
+    high_row: NDArray[np.float32]
+    low_row: NDArray[np.float32]
 
-    def empty(self, smallest_tile: float) -> Windows:
-        """Return the window images from tiles of about `smallest_tile` pixels on, as the image before has left them."""
-        first = min(max(floor(log2(max(smallest_tile, 1e-9))) + 2, 0), LEVELS - 1)
-        return self._windows._replace(first=np.int32(first))
 
-    def build(self, depth_m: NDArray[np.float32], smallest_tile: float) -> tuple[Windows, float]:
-        """Return the window images of a REP 117 depth image, from tiles of about `smallest_tile` pixels on.
+Tiles = tuple[NDArray[np.float32], NDArray[np.float32]]
+"""Nearest depth in tiles of 16 and of 64 pixels, for sensor models that mark cells beside the hit."""
 
-        With them the image's farthest depth in metres, `NO_RETURN` where a pixel saw nothing.
-        """
-        windows = self.empty(smallest_tile)
-        base, *rows = self._scratch
-        farthest = _windows.build(
-            depth_m.reshape(-1), base, windows.image, *rows, windows.lows, windows.highs,
-            self.shape, windows.tile_offset, windows.tile_width, int(windows.first),
-        )  # fmt: skip
-        return windows, farthest
 
-    def build_nearest(self, depth_m: NDArray[np.float32]) -> None:
-        """Fill `nearest`, for sensor models that mark cells beside the hit."""
-        low16, low64 = (tiles.reshape(-1) for tiles in self.nearest)
-        _windows.nearest_tiles(depth_m.reshape(-1), *depth_m.shape, low16, low64)
+def make_windows(camera: PinholeCamera, smallest_tile: float) -> tuple[Windows, WindowScratch, Tiles]:
+    """Return a camera's window images, from tiles of about `smallest_tile` pixels on, and memory to build them."""
+    h, w = camera.height, camera.width
+    coarsest = 1 << (LEVELS - 2)
+    strides = np.array([1] + [1 << level for level in range(LEVELS - 1)])
+    shape = np.stack([-(-h // strides), -(-w // strides)], axis=1).astype(np.int32)
+    tiles = np.stack([-(-shape // 16), -(-shape // 64)], axis=1)
+    first = min(max(floor(log2(max(smallest_tile, 1e-9))) + 2, 0), LEVELS - 1)
+    pitch = coarsest * -(-w // coarsest)
+    size = pitch * (2 * h + -(-h // 2))
+    image = np.zeros(size + 1, np.float32)
+    image[size] = _projective.UNSEEN
+    lows, highs = np.zeros((2, tiles.prod(axis=2).sum()), np.float32)
+    windows = Windows(
+        image, np.int32(pitch), np.int32(h), shape, lows, highs,
+        _starts(tiles.prod(axis=2).ravel()).reshape(LEVELS, 2), np.ascontiguousarray(tiles[:, :, 1], np.int32),
+        np.int32(first),
+    )  # fmt: skip
+    scratch = WindowScratch(
+        np.zeros(size, np.float32), *(np.zeros((n, pitch), np.float32).squeeze() for n in (4, 1, 1, 1, 1))
+    )
+    near16, near64 = (np.zeros((-(-h // size), -(-w // size)), np.float32) for size in (16, 64))
+    return windows, scratch, (near16, near64)
 
 
 def _starts(sizes: NDArray[np.int64]) -> NDArray[np.int32]:

@@ -9,7 +9,7 @@ from math import ceil
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.cameras.rigs import VirtualCamera
@@ -39,6 +39,8 @@ Floats = NDArray[np.float32]
 Ints = NDArray[np.int32]
 Keys = NDArray[np.signedinteger]
 
+CACHE_LINE = 64
+"""Bytes."""
 MAX_CELL_PX = 512
 """Most pixels along a cell at a depth of one metre; with more, `_lanes` rounds the weight of one to nothing."""
 
@@ -65,10 +67,10 @@ class Ray:
         camera = image.camera
         eye, view = self._eyes[camera], rays_of(image, config)
         weight = np.float32(self._cell_px(camera) ** -2) if config.ray.update == "every" else None
-        parts = shards(camera.height, config.threads)
-        number = {part.start: n for n, part in enumerate(parts)}
-        in_shards(lambda part: self._follow(image, view, weight, eye, number[part.start], part), parts)
-        pool = self._merged(self._pools[: len(parts)], weight is not None)
+        workers = len(shards(camera.height, config.threads))
+        parts = [slice(n, camera.height, workers) for n in range(workers)]  # as many long rays for each
+        in_shards(lambda part: self._follow(image, view, weight, eye, part), parts)
+        pool = self._merged(self._pools[:workers], weight is not None)
         values = np.empty((len(pool), CELLS), np.int16)
         _lanes.to_thousandths(pool.values[: len(pool)], 0 if weight is None else _lanes.FRACTION_BITS, values)
         origin = origin_block(image.T_world_sensor, config).astype(np.int32)
@@ -91,14 +93,13 @@ class Ray:
             f"{MAX_CELL_PX}; use integrator projective or ray.update once",
         )
 
-    def _follow(
-        self, image: DepthImage, view: Rays, weight: np.float32 | None, eye: _Eye, worker: int, part: slice
-    ) -> None:
-        pool = self._pools[worker]
+    def _follow(self, image: DepthImage, view: Rays, weight: np.float32 | None, eye: _Eye, part: slice) -> None:
+        """Follow the rays of some rows; the first of them tells which thread's memory to use."""
+        pool = self._pools[part.start]
         pool.clear()
         while not self._kernel(
-            image.depth_m, view, eye.table, eye.look_up, weight, *eye.scratch[worker],
-            pool.table, pool.coords, pool.count, pool.values, part.start, part.stop,
+            image.depth_m, view, eye.table, eye.look_up, weight, *eye.scratch[part.start],
+            pool.table, pool.coords, pool.count, pool.values, part.start, part.stop, part.step,
         ):  # fmt: skip
             check_blocks(2 * len(pool.coords), image.camera)
             pool.clear()
@@ -139,11 +140,13 @@ def _eye(sensor: InverseSensorModel, config: Config, camera: VirtualCamera) -> _
 class Lanes(NamedTuple):
     """State of the lanes, one number each. Depths along the optical axis in metres, places in cells from its block."""
 
+    column: Floats  # x/z of the ray
     depth: Floats  # measured depth, NO_RETURN for nothing up to the maximum range
     end: Floats  # depth at which the ray ends, negative for a lane without a ray
     entered: Floats  # depth at which the ray entered its present cell (or the depth of the sample)
     row: Ints  # row of the sensor table
     columns: Floats  # table columns a metre
+    reach: Floats  # half width of the sensor table's row
     x: Floats  # the face at which the ray leaves its cell along x: whole numbers, as floats because they meet floats
     y: Floats
     z: Floats
@@ -153,10 +156,13 @@ class Lanes(NamedTuple):
     hit: Keys  # key of the cell that holds the measured point, -1 without one
     cell: Keys  # key of the cell the ray goes into next
     key: Keys  # key of the cell that is given evidence in this step
+    middle: Floats  # depth in the middle of the ray's way through it, NOWHERE for no evidence
+    place: Ints  # where this stands in the sensor table, then the number there
+    passed: Ints  # the same for the largest loss
     gain: Ints  # and the evidence
-    last: Ints  # whether the next lane differs
-    run_key: Keys  # cells and gains of runs of neighbouring lanes
-    run_gain: Ints
+    within: Ints  # sums of gains of earlier lanes of the same group
+    groups: Ints  # sums of gains of earlier groups
+    bit: Ints  # the lane's own bit: 1, 2, 4
 
 
 class Memory(NamedTuple):
@@ -170,8 +176,16 @@ def make_lanes(wide: bool) -> Lanes:
     """Return scratch with keys of 64 bits (`wide`) or 32 bits, which serve cells within 2^9 of the camera."""
     types = {"Floats": np.float32, "Ints": np.int32, "Keys": np.int64 if wide else np.int32}
     kinds = {name: getattr(kind, "__forward_arg__", kind) for name, kind in Lanes.__annotations__.items()}
-    arrays: dict[str, Any] = {name: np.full(LANES + 1, -2, types[kind]) for name, kind in kinds.items()}
+    arrays: dict[str, Any] = {name: _whole_lines(LANES, types[kind]) for name, kind in kinds.items()}
+    arrays["bit"][:] = (1 << np.arange(LANES, dtype=np.uint32)).view(np.int32)
     return Lanes(**arrays)
+
+
+def _whole_lines(length: int, dtype: DTypeLike) -> NDArray[Any]:
+    """Return zeros that begin with a line of the processor's cache: vectors across two take twice as long."""
+    room = np.zeros(length * np.dtype(dtype).itemsize + CACHE_LINE, np.uint8)
+    start = -room.ctypes.data % CACHE_LINE
+    return room[start : start + length * np.dtype(dtype).itemsize].view(dtype)
 
 
 def make_memory() -> Memory:

@@ -48,8 +48,15 @@ class PerCamera(Generic[Camera, Tools]):
     def __init__(self, make: Callable[[Camera], Tools]):
         self._make = make
         self._kept: dict[Camera, Tools] = {}
+        self._last: tuple[Camera, Tools] | None = None
 
     def __getitem__(self, camera: Camera) -> Tools:
+        last = self._last
+        if last is None or last[0] is not camera:  # mostly it is the same: to find its hash takes longer
+            self._last = last = camera, self._find(camera)
+        return last[1]
+
+    def _find(self, camera: Camera) -> Tools:
         tools = self._kept.get(camera)
         if tools is None:
             tools = self._make(camera)
@@ -206,6 +213,11 @@ class Views:
             rim=rim.astype(np.float32),
             steps=np.zeros((3, SIDE**3), np.float32),
         )
+
+    @property
+    def spread(self) -> np.float32:
+        """Size of the tiles of a cell's window image in pixels, times depth."""
+        return self._view.spread
 
     def at(self, T_world_camera: Transform) -> View:
         """Return the view from this pose; `block` is then the block (3,) the camera stands in."""

@@ -90,6 +90,7 @@ import stereovox  # noqa: E402
 import stereovox._gpu  # noqa: E402
 
 stereovox._gpu.launch, stereovox._gpu.to_gpu, stereovox._gpu.gpu_array = launch, to_gpu, gpu_array
+stereovox._gpu.unusable = lambda: None
 from stereovox.integrate.gpu import GpuProjective  # noqa: E402
 from stereovox.maps.gpu import GpuStorage  # noqa: E402
 

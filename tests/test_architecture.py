@@ -36,7 +36,6 @@ HOMES = {
     "builtin_interfaces": r"ros/.*",
     "cv2": r"(calibrate|depth|simulate|sources)/.*",
     "diagnostic_msgs": r"ros/.*",
-    "embreex": r"simulate/.*",
     "geometry_msgs": r"ros/.*",
     "gtsam": r"localize/.*",
     "matplotlib": r"(view|viewer|report|lab)/.*",

@@ -19,7 +19,6 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from hashlib import sha256
-from importlib.metadata import version
 from itertools import islice
 from math import log1p
 from pathlib import Path
@@ -147,7 +146,7 @@ SIMULATED: dict[str, Callable[[], Cells]] = {
     "floor depth": partial(floor, FLOOR, "frames", 1, 20, profile="ist2019"),
 }
 MATCHED = {"drive", "pairs"}
-"""Stereo pairs, which OpenCV matches, not alike in each version: with 4.14 15 % of the cells of `pairs` were others."""
+"""Stereo pairs, whose images OpenCV rectifies, halves and clears of speckles: not alike in each of its versions."""
 MAPS = {**{name: make for name, (_, make) in RECORDED.items()}, **SIMULATED}
 
 
@@ -158,7 +157,7 @@ def toolchain() -> dict[str, str | bool]:
     """
     fused = bool(llvmlite.binding.get_host_cpu_features().get("fma")) and "NUMBA_CPU_NAME" not in os.environ
     libraries = {module.__name__: module.__version__ for module in (np, numba, llvmlite, cv2)}
-    return {"machine": platform.machine(), "fma": fused, **libraries, "embreex": version("embreex")}
+    return {"machine": platform.machine(), "fma": fused, **libraries}
 
 
 def problem(now: Digest, before: Digest, exact: bool) -> str | None:
@@ -177,7 +176,7 @@ def check(name: str) -> None:
     written = json.loads(TABLE.read_text())
     here, there = toolchain(), written["toolchain"]
     if name in MATCHED and here["cv2"] != there["cv2"]:
-        pytest.skip(f"pairs were matched by OpenCV {there['cv2']}, here it is {here['cv2']}")
+        pytest.skip(f"pairs were rectified by OpenCV {there['cv2']}, here it is {here['cv2']}")
     found = problem(Digest.of(MAPS[name]()), Digest(**written["maps"][name]), here == there)
     assert found is None, f"{name}: {found}; if that is meant: python tests/{Path(__file__).name}"
 

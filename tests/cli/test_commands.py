@@ -349,6 +349,8 @@ def test_a_full_or_closed_output_is_no_traceback(recording, tmp_path):
 
 
 def test_bench_prints_rows_and_ratios(recording, capsys):
+    pytest.importorskip("octomap", reason="pip install 'stereovox[bench]'")
+    pytest.importorskip("pyoctomap", reason="pip install 'stereovox[bench]' (no wheel for ARM)")
     sizes = ["--voxel-size", 0.2, "--voxel-size", 0.1]
     assert run("bench", recording, *sizes, "--peers", "octomap, pyoctomap", "--frames", ":3", "--json") == 0
     told = last_json(capsys)

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 EXAMPLE = "stereovox bench recordings/kitchen --voxel-size 0.1 --voxel-size 0.05 --peers octomap,pyoctomap"
 VOXEL_SIZES = (0.2, 0.1, 0.05, 0.02)
+FAR = ("both", "unknown", "free")
 BUILT_IN = "sim:room?frames=60"
 
 
@@ -40,8 +41,8 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--peers",
         metavar="A,B",
-        help="other libraries: octomap, pyoctomap, wavemap, octomap-rays, or a class of yours, module:Class (default: "
-        "the first three, where installed)",
+        help="other libraries: octomap, pyoctomap, wavemap, octomap-rays; in C++, once built: octomap-cpp, bonxai, "
+        "ufomap, wavemap-cpp; or a class of yours, module:Class (default: the first three, where installed)",
     )
     parser.add_argument(
         "--integrators",
@@ -52,6 +53,13 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--threads", type=int, metavar="N", help="threads of stereovox (both 1 and all cores)")
     parser.add_argument("--max-range", type=float, metavar="M", help="largest depth in metres that is used (5)")
     parser.add_argument("--frames", metavar="A:B:S", help="only these frames, as a Python slice")
+    parser.add_argument(
+        "--far",
+        choices=FAR,
+        default="both",
+        help="pixels beyond the maximum range: without a value (unknown), clearing space up to there (free), or one "
+        "table for each (%(default)s)",
+    )
     parser.add_argument(
         "--also",
         metavar="A,B",
@@ -114,17 +122,15 @@ def _measure(arguments: Namespace, so_far: Callable[[dict[str, Any]], None]) -> 
         def show(done: int, total: int, text: str) -> None:
             bar.update(task, completed=done, total=total, description=text)
 
-        recording = read_frames(source, configs[0], tell=show)
+        read = read_frames(source, configs[0], tell=show, far=arguments.far != "unknown")
+        recording = read if arguments.far == "free" else read.without_far(configs[0])
         missed = {"not_installed": missing}
-        result = compare(
-            recording,
-            sizes,
-            kinds,
-            variants,
-            arguments.max_range,
-            show,
-            so_far=lambda found: so_far(found | missed),
-        )
+        same = sizes, kinds, variants, arguments.max_range, show
+        result = compare(recording, *same, so_far=lambda found: so_far(found | missed))
+        if read.far_share and recording is not read:
+            result["clearing"] = compare(
+                read, *same, so_far=lambda found: so_far(result | missed | {"clearing": found})
+            )
         given = Given(recording, sizes, variants[0], arguments.max_range, tell=show, **limits)
         more: dict[str, Any] = {}
         for name in measurements:

@@ -55,12 +55,14 @@ class DepthConfig(Section):
 class StereoConfig(Section):
     """How the disparity of a stereo pair is found (Valenti 2018, 5.1 and 5.2); lengths are pixels of the full image.
 
-    method: `sgm` (OpenCV's semi-global matching along three paths), `sgm8` (eight), `hh4` (four), `block`, `onnx`.
+    method: `census` (own semi-global matching along three paths), `sgm` (OpenCV's), `sgm8` (its eight paths), `hh4`
+        (four), `block`, `onnx`.
     model: the file of a network for `onnx`: two images in, a disparity out.
     disparities: number of disparities searched, from 0.
     block_size: side of the window by which two pixels are compared; odd. p1, p2: cost of a step of one disparity and of
         more, per pixel of the window. uniqueness: per cent by which the best match must beat the second.
-    from_below: the vertical path of `sgm` comes from below: better where a road fills the lower half of the view.
+    from_below: the vertical path of `census` and `sgm` comes from below: better where a road fills the lower half of
+        the view.
     unlock: spread fractions of a pixel evenly; semi-global matching pulls them towards whole pixels.
     speckle_size, speckle_range: smaller patches are dropped; a step of more disparity ends a patch. 0: none dropped.
     left_right: most by which the disparities of both images may differ; 0: not checked.
@@ -74,10 +76,10 @@ class StereoConfig(Section):
     texture: mean step of grey over two columns below which pixels have no value. 1 drops what is quite flat, 2 to 3
         also clear skies, and smooth roads with them; 0: not asked for.
     subpixel: standard deviation of the remaining disparities in pixels, which the map assumes as their noise.
-    threads: threads of the matcher; the disparity does not depend on it.
+    threads: threads from images to depth; the result does not depend on it.
     """
 
-    method: str = "sgm"
+    method: str = "census"
     model: str | None = None
     disparities: int = Field(128, ge=16, le=1024, multiple_of=16)
     block_size: int = Field(5, ge=1, le=51)

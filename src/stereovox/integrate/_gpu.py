@@ -40,7 +40,7 @@ marked, with_hit = on_gpu(_projective.marked), on_gpu(_projective.with_hit)
 row_rays, narrow_offset = on_gpu(_hits._row_rays), on_gpu(_hits.narrow_offset)
 narrow_key, wide_key = on_gpu(_hits.narrow_key), on_gpu(_hits.wide_key)
 centre, footprint, sample = on_gpu(_hits.centre), on_gpu(_hits.footprint), on_gpu(_hits.sample)
-share_of, hit_evidence = on_gpu(_hits.share_of), on_gpu(_hits.hit_evidence)
+share_of, hit_row, weighed_hit = on_gpu(_hits.share_of), on_gpu(_hits.hit_row), on_gpu(_hits.weighed_hit)
 find, home_slot = on_gpu(_map_cells.find), on_gpu(_map_cells.home_slot)
 
 
@@ -263,7 +263,8 @@ def weigh(depth_m, view, table, full_share, listed, wide, hit_table, coords, val
         row = find(hit_table, coords, bx, by, bz)
         if row < 0:
             continue  # there was no room for the block
-        x, y, z = centre(view, bx, by, bz, c)
+        block = np.float32(bx), np.float32(by), np.float32(bz)
+        x, y, z = centre(view, *block, view.steps[0, c], view.steps[1, c], view.steps[2, c])
         share = full_share
         if full_share > ZERO:
             samples, step, left, top = footprint(view, x, y, z)
@@ -275,7 +276,7 @@ def weigh(depth_m, view, table, full_share, listed, wide, hit_table, coords, val
                     found += counted if abs(depth_m[at] - z) <= limit else ZERO
                     looked += counted
             share = share_of(found, looked)
-        values[row, c] = hit_evidence(view, table, full_share, z, share)
+        values[row, c] = weighed_hit(np.float32(table.hit[hit_row(view, table, z)]), full_share, share)
 
 
 @gpu_kernel

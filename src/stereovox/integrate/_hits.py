@@ -87,36 +87,43 @@ def weigh(depth_m, view, table, full_share, listed, coords, values, lanes):
     listed: (n,) cells that `scatter` set. lanes: a `HitLanes`, scratch.
     """
     flat, values_flat = depth_m.reshape(depth_m.size), values.reshape(values.size)
-    x, y, z, share = lanes.x, lanes.y, lanes.z, lanes.share
     for start in range(0, listed.size, LANES):
         some = listed[start : min(start + LANES, listed.size)]
-        _centres(view, coords, some, x, y, z)
+        _centres(view, coords, some, lanes)
         for i in range(some.size):
-            share[i] = full_share
+            lanes.share[i] = full_share
         if full_share > ZERO:
             _share(flat, view, some.size, lanes)
-        _evidence(view, table, full_share, some, z, share, values_flat)
+        _evidence(view, table, full_share, some, lanes, values_flat)
 
 
 @cell
-def _centres(view, coords, listed, x, y, z):
+def _centres(view, coords, listed, lanes):
     """Write where the centres of listed cells stand, camera axes, x and y times the focal length."""
-    for i in range(listed.size):
-        block, c = listed[i] >> 9, listed[i] & 511
-        x[i], y[i], z[i] = centre(view, coords[block, 0], coords[block, 1], coords[block, 2], c)
+    x, y, z, px, py, pz = lanes.x, lanes.y, lanes.z, lanes.u, lanes.v, lanes.step
+    n = listed.size
+    for i in range(n):  # by itself: see `_projective._aim`
+        block, c = np.uint32(listed[i] >> 9), np.uint32(listed[i] & 511)
+        px[i] = np.float32(coords[block, 0])
+        py[i] = np.float32(coords[block, 1])
+        pz[i] = np.float32(coords[block, 2])
+        x[i], y[i], z[i] = view.steps[0, c], view.steps[1, c], view.steps[2, c]
+    for i in range(n):
+        x[i], y[i], z[i] = centre(view, px[i], py[i], pz[i], x[i], y[i], z[i])
 
 
 @cell
-def centre(view, bx, by, bz, c):
-    """Return where the centre of cell `c` of a block stands, camera axes, x and y times the focal length."""
+def centre(view, bx, by, bz, x_step, y_step, z_step):
+    """Return where the centre of a cell stands, camera axes, x and y times the focal length.
+
+    All float32: the block's coordinates, and the cell's entries of `view.steps`.
+    """
     side = np.float32(8) * view.voxel_size
     R = view.rotation
-    px = np.float32(bx) * side - view.position[0]
-    py = np.float32(by) * side - view.position[1]
-    pz = np.float32(bz) * side - view.position[2]
-    x = (R[0, 0] * px + R[0, 1] * py + R[0, 2] * pz) * view.intrinsics[0] + view.steps[0, c]
-    y = (R[1, 0] * px + R[1, 1] * py + R[1, 2] * pz) * view.intrinsics[1] + view.steps[1, c]
-    return x, y, max(R[2, 0] * px + R[2, 1] * py + R[2, 2] * pz + view.steps[2, c], NEAR_PLANE)
+    px, py, pz = bx * side - view.position[0], by * side - view.position[1], bz * side - view.position[2]
+    x = (R[0, 0] * px + R[0, 1] * py + R[0, 2] * pz) * view.intrinsics[0] + x_step
+    y = (R[1, 0] * px + R[1, 1] * py + R[1, 2] * pz) * view.intrinsics[1] + y_step
+    return x, y, max(R[2, 0] * px + R[2, 1] * py + R[2, 2] * pz + z_step, NEAR_PLANE)
 
 
 @cell
@@ -176,18 +183,31 @@ def share_of(share, looked):
 
 
 @cell
-def _evidence(view, table, full_share, listed, z, share, values):
-    for i in range(listed.size):
-        values[index(listed[i])] = hit_evidence(view, table, full_share, z[i], share[i])
+def _evidence(view, table, full_share, listed, lanes, values):
+    """Write the evidence of the hits on listed cells."""
+    z, share, hits, at, n = lanes.z, lanes.share, lanes.depth, lanes.at, listed.size
+    for i in range(n):
+        at[i] = hit_row(view, table, z[i])
+    for i in range(n):
+        hits[i] = np.float32(table.hit[index(at[i])])
+    for i in range(n):
+        at[i] = weighed_hit(hits[i], full_share, share[i])
+    for i in range(n):
+        values[index(listed[i])] = np.int16(at[i])
 
 
 @cell
-def hit_evidence(view, table, full_share, z, share):
-    """Return the evidence of a hit on a cell at depth `z`, of whose footprint a `share` measures it."""
-    hit = np.float32(table.hit[table_row(min(z, view.max_range), table.rows_per_metre, np.int32(table.hit.size))])
+def hit_row(view, table, z):
+    """Return the table row of a hit on a cell at depth `z`."""
+    return table_row(min(z, view.max_range), table.rows_per_metre, np.int32(table.hit.size))
+
+
+@cell
+def weighed_hit(hit, full_share, share):
+    """Return the evidence of a hit (float32) on a cell of whose footprint a `share` measures it."""
     part = min(ONE, share / full_share) if full_share > ZERO else ONE
     weighed = max(floor(hit * square_root(part) + HALF), ONE)
-    return np.int16(weighed if hit > ZERO else ZERO)
+    return np.int32(weighed if hit > ZERO else ZERO)
 
 
 @cell

@@ -28,6 +28,7 @@ from stereovox.integrate.views import (
     PerCamera,
     View,
     Views,
+    aligned,
     check_blocks,
     check_view,
     sensor_table,
@@ -103,8 +104,8 @@ class LayerScratch(NamedTuple):
 
 
 def _layer_scratch() -> LayerScratch:
-    floats, ints = np.empty((3, _projective.LAYER), np.float32), np.empty((2, _projective.LAYER), np.int32)
-    return LayerScratch._make([*floats, *ints])
+    size = _projective.LAYER
+    return LayerScratch(*(aligned(size, np.float32) for _ in range(3)), *(aligned(size, np.int32) for _ in range(2)))
 
 
 class _Eye:
@@ -232,8 +233,7 @@ class HitLanes(NamedTuple):
 
 
 def _hit_lanes() -> HitLanes:
-    floats, ints = np.empty((11, _hits.LANES), np.float32), np.empty(_hits.LANES, np.int32)
-    return HitLanes._make([*floats, ints])
+    return HitLanes(*(aligned(_hits.LANES, np.float32) for _ in range(11)), at=aligned(_hits.LANES, np.int32))
 
 
 class Windows(NamedTuple):

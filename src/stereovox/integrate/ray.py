@@ -9,7 +9,7 @@ from math import ceil
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import NDArray
 
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.cameras.rigs import VirtualCamera
@@ -23,6 +23,7 @@ from stereovox.integrate.views import (
     KernelTable,
     PerCamera,
     Rays,
+    aligned,
     check_blocks,
     origin_block,
     rays_of,
@@ -39,8 +40,6 @@ Floats = NDArray[np.float32]
 Ints = NDArray[np.int32]
 Keys = NDArray[np.signedinteger]
 
-CACHE_LINE = 64
-"""Bytes."""
 MAX_CELL_PX = 512
 """Most pixels along a cell at a depth of one metre; with more, `_lanes` rounds the weight of one to nothing."""
 
@@ -176,16 +175,9 @@ def make_lanes(wide: bool) -> Lanes:
     """Return scratch with keys of 64 bits (`wide`) or 32 bits, which serve cells within 2^9 of the camera."""
     types = {"Floats": np.float32, "Ints": np.int32, "Keys": np.int64 if wide else np.int32}
     kinds = {name: getattr(kind, "__forward_arg__", kind) for name, kind in Lanes.__annotations__.items()}
-    arrays: dict[str, Any] = {name: _whole_lines(LANES, types[kind]) for name, kind in kinds.items()}
+    arrays: dict[str, Any] = {name: aligned(LANES, types[kind]) for name, kind in kinds.items()}
     arrays["bit"][:] = (1 << np.arange(LANES, dtype=np.uint32)).view(np.int32)
     return Lanes(**arrays)
-
-
-def _whole_lines(length: int, dtype: DTypeLike) -> NDArray[Any]:
-    """Return zeros that begin with a line of the processor's cache: vectors across two take twice as long."""
-    room = np.zeros(length * np.dtype(dtype).itemsize + CACHE_LINE, np.uint8)
-    start = -room.ctypes.data % CACHE_LINE
-    return room[start : start + length * np.dtype(dtype).itemsize].view(dtype)
 
 
 def make_memory() -> Memory:

@@ -6,10 +6,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from stereovox.simulate.triangle_tree import TriangleTree
 
 Point = tuple[float, float, float]
 
@@ -67,31 +68,27 @@ class Scene:
 
         With directions whose component along the optical axis is 1 this is the depth. float32, releases the GIL.
         """
-        directions = np.ascontiguousarray(directions, np.float32)
-        origins = np.broadcast_to(np.asarray(origin, np.float32), directions.shape)
-        share = self._embree.run(np.ascontiguousarray(origins), directions, query="DISTANCE")
-        share[share > 1e6] = np.inf
-        return share
+        return self._tree.nearest(np.array(origin, np.float64), np.asarray(directions, np.float32))[0]
 
     def hits(
         self, origin: ArrayLike, directions: NDArray[np.floating]
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int32]]:
-        """Return what `cast` does, the unit normals (N, 3) of the surfaces met, and their triangles (N,), -1: none."""
-        directions = np.ascontiguousarray(directions, np.float32)
-        origins = np.broadcast_to(np.asarray(origin, np.float32), directions.shape)
-        found = self._embree.run(np.ascontiguousarray(origins), directions, query="INTERSECT", output=True)
-        share, normals = np.where(found["primID"] < 0, np.float32(np.inf), found["tfar"]), found["Ng"]
-        return share, normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30), found["primID"]
+        """Return what `cast` does, the unit normals (N, 3) of the surfaces met, and their triangles (N,), -1: none.
+
+        Normals are outward, 0 where there is none.
+        """
+        share, met = self._tree.nearest(np.array(origin, np.float64), np.asarray(directions, np.float32))
+        return share, np.where(met[:, None] < 0, np.float32(0), self._normals[met]), met
 
     @cached_property
-    def _embree(self) -> Any:
-        # trimesh's own ray interface copies rays to float64 and back: twice the time of the cast itself.
-        from embreex.mesh_construction import TriangleMesh
-        from embreex.rtcore_scene import EmbreeScene
+    def _tree(self) -> TriangleTree:
+        return TriangleTree(self.triangles)
 
-        embree = EmbreeScene()
-        TriangleMesh(embree, self.triangles.astype(np.float32))
-        return embree
+    @cached_property
+    def _normals(self) -> NDArray[np.float32]:
+        a, b, c = np.moveaxis(self.triangles, 1, 0)
+        normals = np.cross(b - a, c - a)
+        return (normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-30)).astype(np.float32)
 
 
 def box(

@@ -177,3 +177,30 @@ def test_halved_images_are_means_and_double_back():
     np.testing.assert_allclose(full[5, 4], 2 * (ramp[2, 2] - 0.25 / 8 + 0.25 * 5 / 8), atol=1e-6)
     assert full[6, 7] == 2 * ramp[3, 3]  # nothing in between at a step
     assert full[6, 8] == 2 * ramp[3, 4]
+
+
+def slow_doubled(half, shape):
+    """Return the bilinear disparity of full pixels, whose centres lie a quarter beside those of halved ones."""
+    full = np.empty(shape)
+    for v, u in np.ndindex(shape):
+        y, x = (np.clip((i + 0.5) / 2 - 0.5, 0, n - 1) for i, n in zip((v, u), half.shape, strict=True))
+        rows, columns = ([int(np.floor(i)), int(np.ceil(i))] for i in (y, x))
+        (a, b), (c, d) = half[rows][:, columns].astype(float)
+        linear = 2 * ((a * (1 - x % 1) + b * (x % 1)) * (1 - y % 1) + (c * (1 - x % 1) + d * (x % 1)) * (y % 1))
+        nearest = 2 * float(half[v // 2, u // 2])
+        full[v, u] = linear if abs(linear - nearest) < 1 else nearest
+    return full
+
+
+@pytest.mark.parametrize("shape", [(14, 18), (13, 17), (1, 2)])
+def test_halved_disparities_are_doubled(shape):
+    half = made(3, most=3.0)[: (shape[0] + 1) // 2, : (shape[1] + 1) // 2]
+    np.testing.assert_allclose(doubled(half, shape), slow_doubled(half, shape), atol=1e-5)
+
+
+@pytest.mark.parametrize("threads", [2, 5])
+def test_rows_may_be_shared_by_threads(threads):
+    disparity, image = made(4), np.random.default_rng(5).integers(0, 255, (HEIGHT, WIDTH), np.uint8)
+    np.testing.assert_array_equal(doubled(disparity, (73, 105), threads), doubled(disparity, (73, 105)))
+    np.testing.assert_array_equal(confidence(disparity, threads), confidence(disparity))
+    np.testing.assert_array_equal(texture(image, threads), texture(image))

@@ -241,10 +241,13 @@ def test_depth_is_what_the_camera_says():
     assert np.isfinite(wanted).mean() > 0.5
 
 
-def test_the_number_of_threads_changes_nothing():
+@pytest.mark.parametrize("method", ["census", "sgm"])
+@pytest.mark.parametrize("halve", [False, True])
+def test_the_number_of_threads_changes_nothing(method, halve):
     frame, before = plane(20.4), cv2.getNumThreads()
-    one, three = (StereoDepth(stereo(threads=n)).disparity(frame).disparity for n in (1, 3))
-    np.testing.assert_array_equal(one, three)
+    one, three = (StereoDepth(stereo(threads=n, method=method, halve=halve))(frame) for n in (1, 3))
+    np.testing.assert_array_equal(one.depth, three.depth)
+    np.testing.assert_array_equal(one.reason, three.reason)
     assert cv2.getNumThreads() == before
 
 

@@ -280,7 +280,7 @@ def test_variants_are_rows_of_their_own_and_make_the_same_map():
         assert (one["occupied"], one["free"]) == (two["occupied"], two["free"])
     lines = format_table(result).splitlines()
     block = lines[lines.index(next(line for line in lines if line.startswith("0.1 m"))) :][:4]
-    assert [line.split()[-8:-6] for line in block] == [["1", "3"], ["2", "3"], ["1", "3"], ["2", "3"]]
+    assert [line.split()[-9:-7] for line in block] == [["1", "3"], ["2", "3"], ["1", "3"], ["2", "3"]]
     assert "stereovox-ray" in block[2]
 
 

@@ -34,6 +34,7 @@ def nothing(done, total, text):
 
 
 def test_a_raw_drive_gives_a_page_and_all_numbers(tmp_path):
+    pytest.importorskip("octomap", reason="pip install 'stereovox[bench]'")
     drive, done = made_street.raw(tmp_path, 3), []
     result = reproduce(
         "valenti2018", tmp_path / "out", data=drive, quick=True, progress=lambda *step: done.append(step[:2])
@@ -80,6 +81,7 @@ def test_a_raw_drive_gives_a_page_and_all_numbers(tmp_path):
 
 
 def test_every_tracking_sequence_below_a_folder_is_found_and_its_labels_are_used(tmp_path, no_charts):
+    pytest.importorskip("octomap", reason="pip install 'stereovox[bench]'")
     for sequence in ("0000", "0003"):
         training = made_street.tracking(tmp_path / "kitti", 2, sequence)
     drives = find_drives(tmp_path)

@@ -3,9 +3,10 @@
 
 import numpy as np
 
-from stereovox._jit import cell, kernel
+from stereovox._jit import cell, exact_cell, kernel
 
 VALID, UNMATCHED, TOO_NEAR, TOO_FAR, MASKED = np.uint8(0), np.uint8(1), np.uint8(2), np.uint8(3), np.uint8(4)
+QUARTER, THREE_QUARTERS = np.float32(0.25), np.float32(0.75)
 NAN, ZERO, HALF, ONE = np.float32(np.nan), np.float32(0), np.float32(0.5), np.float32(1)
 ONE_PX, FOUR, FIFTEEN, PER_ROW = np.int32(16), np.int32(4), np.int32(15), np.float32(1 / 32)
 SLOPE = np.float32(0.1)
@@ -33,6 +34,32 @@ def pixels(raw, fractions, lag, out):
 
 
 @kernel
+def double(half, first, end, out):
+    """Fill rows `first` to `end` of `out` with twice the disparity of halved images (h, w): linear where smooth.
+
+    out: (2 h, 2 w) float32, or less by a row or a column. Smooth is where the linear one differs by less than a pixel
+    from the nearest; elsewhere the nearest stays, and with it edges.
+    """
+    height, width = half.shape
+    for v in range(first, end):
+        here = half[v >> 1]
+        beside = half[min(max((v >> 1) + (1 if v & 1 else -1), 0), height - 1)]
+        row = out[v]
+        for u in range(row.size):
+            x = u >> 1
+            aside = min(max(x + (1 if u & 1 else -1), 0), width - 1)
+            nearest = here[x] + here[x]
+            linear = _between(_between(here[x], here[aside]), _between(beside[x], beside[aside]))
+            linear = linear + linear
+            row[u] = linear if abs(linear - nearest) < ONE else nearest
+
+
+@exact_cell
+def _between(near, far):
+    return near * THREE_QUARTERS + far * QUARTER
+
+
+@kernel
 def cross_check(disparity, side, most, seen):
     """Drop pixels in place that share their partner in the other image with one nearer by more than `most` pixels.
 
@@ -54,57 +81,57 @@ def cross_check(disparity, side, most, seen):
 
 
 @kernel
-def confidence(disparity, radius, columns, filled, line, line_filled, out):
+def confidence(disparity, radius, first, end, columns, filled, line, line_filled, out):
     """Fill `out` with the share of a window that has a disparity, less where the pixel is off the window's mean.
 
-    radius: the window spans so many pixels to each side. columns, filled: (w,) int32; line, line_filled: (w + 1,)
-    int32, scratch. No value: 0.
+    radius: the window spans so many pixels to each side. first, end: the rows that are filled. columns, filled: (w,)
+    int32; line, line_filled: (w + 1,) int32, scratch. No value: 0.
     """
     height, width = disparity.shape
     columns[:] = np.int32(0)
     filled[:] = np.int32(0)
-    for v in range(min(radius, height)):
+    for v in range(max(first - radius, 0), min(first + radius, height)):
         _put(disparity[v], np.int32(1), columns, filled)
-    for v in range(height):
+    for v in range(first, end):
         if v + radius < height:
             _put(disparity[v + radius], np.int32(1), columns, filled)
-        if v - radius - 1 >= 0:
+        if v - radius - 1 >= max(first - radius, 0):
             _put(disparity[v - radius - 1], np.int32(-1), columns, filled)
         rows = min(v + radius, height - 1) - max(v - radius, 0) + 1
         _running(columns, line)
         _running(filled, line_filled)
         row, result = disparity[v], out[v]
         for u in range(width):
-            first, end = max(u - radius, 0), min(u + radius + 1, width)
-            count = np.float32(line_filled[end] - line_filled[first])
-            total = np.float32(np.int32(line[end] - line[first])) / UNITS  # sums may wrap round, differences not
+            left, right = max(u - radius, 0), min(u + radius + 1, width)
+            count = np.float32(line_filled[right] - line_filled[left])
+            total = np.float32(np.int32(line[right] - line[left])) / UNITS  # sums may wrap round, differences not
             d = row[u]
             off = abs(d - total / count) / (ONE + SLOPE * d)
-            share = count / np.float32(rows * (end - first))
+            share = count / np.float32(rows * (right - left))
             result[u] = share / (ONE + off) if d == d else ZERO
 
 
 @kernel
-def texture(image, down, across, columns, line, out):
+def texture(image, down, across, first, end, columns, line, out):
     """Fill `out` (h, w) with the mean of |image[v, u + 1] - image[v, u - 1]| over a window.
 
     The window spans `down` rows and `across` columns to each side; at the image's sides there is no step, so 0 counts.
-    columns: (w,) and line: (w + 1,) int32, scratch.
+    first, end: the rows that are filled. columns: (w,) and line: (w + 1,) int32, scratch.
     """
     height, width = image.shape
     columns[:] = np.int32(0)
-    for v in range(min(down, height)):
+    for v in range(max(first - down, 0), min(first + down, height)):
         _put_steps(image[v], np.int32(1), columns)
-    for v in range(height):
+    for v in range(first, end):
         if v + down < height:
             _put_steps(image[v + down], np.int32(1), columns)
-        if v - down - 1 >= 0:
+        if v - down - 1 >= max(first - down, 0):
             _put_steps(image[v - down - 1], np.int32(-1), columns)
         rows = min(v + down, height - 1) - max(v - down, 0) + 1
         _running(columns, line)
         for u in range(width):
-            first, end = max(u - across, 0), min(u + across + 1, width)
-            out[v, u] = np.float32(line[end] - line[first]) / np.float32(rows * (end - first))
+            left, right = max(u - across, 0), min(u + across + 1, width)
+            out[v, u] = np.float32(line[right] - line[left]) / np.float32(rows * (right - left))
 
 
 @kernel

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from stereovox.config import StereoConfig
 from stereovox.depth.stereo import _disparity
 from stereovox.depth.stereo.matchers import Matcher
+from stereovox.threads import in_shards, shards
 
 Image = NDArray[np.uint8]
 Mask = NDArray[np.bool_] | None
@@ -60,40 +61,48 @@ def halved(image: Image) -> Image:
     return np.asarray(cv2.resize(even, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), np.uint8)
 
 
-def doubled(disparity: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.float32]:
+def doubled(disparity: NDArray[np.float32], shape: tuple[int, int], threads: int = 1) -> NDArray[np.float32]:
     """Return a disparity of halved images in full pixels, cut to `shape`: linear where smooth, else each four times.
 
     Smooth is where the two differ by less than a pixel; edges stay where they are.
     """
-    import cv2
+    full = np.empty(shape, np.float32)
 
-    full = disparity * np.float32(2)
-    nearest, linear = (
-        cv2.resize(full, None, fx=2, fy=2, interpolation=how) for how in (cv2.INTER_NEAREST, cv2.INTER_LINEAR)
-    )
-    smooth = np.abs(linear - nearest) < 1
-    return np.where(smooth, linear, nearest)[: shape[0], : shape[1]].astype(np.float32)
+    def double(rows: slice) -> None:
+        _disparity.double(disparity, rows.start, rows.stop, full)
+
+    in_shards(double, shards(shape[0], threads))
+    return full
 
 
-def confidence(disparity: NDArray[np.float32]) -> NDArray[np.float32]:
+def confidence(disparity: NDArray[np.float32], threads: int = 1) -> NDArray[np.float32]:
     """Return the confidence of each disparity (height, width), 0 to 1: share / (1 + off / (1 + 0.1 disparity)).
 
     share: of the pixels in the window of 21 by 21 round it that have a disparity: where matching failed nearby, the
     rest is mostly chance. off: pixels between the disparity and the mean of the window. Both were chosen, out of
     texture, matching error, its curvature and others, for how well they rank errors (docs/stereo.md).
     """
-    width = disparity.shape[1]
-    sums = [np.empty(size, np.int32) for size in (width, width, width + 1, width + 1)]
+    height, width = disparity.shape
     sure = np.empty_like(disparity)
-    _disparity.confidence(disparity, RADIUS, *sums, sure)
+
+    def fill(rows: slice) -> None:
+        sums = [np.empty(size, np.int32) for size in (width, width, width + 1, width + 1)]
+        _disparity.confidence(disparity, RADIUS, rows.start, rows.stop, *sums, sure)
+
+    in_shards(fill, shards(height, threads))
     return sure
 
 
-def texture(image: Image) -> NDArray[np.float32]:
+def texture(image: Image, threads: int = 1) -> NDArray[np.float32]:
     """Return the mean step of grey over two columns (height, width) float32 in a window of 7 rows and 15 columns."""
-    width = image.shape[1]
+    height, width = image.shape
     steps = np.empty(image.shape, np.float32)
-    _disparity.texture(image, DOWN, ACROSS, np.empty(width, np.int32), np.empty(width + 1, np.int32), steps)
+
+    def fill(rows: slice) -> None:
+        sums = np.empty(width, np.int32), np.empty(width + 1, np.int32)
+        _disparity.texture(image, DOWN, ACROSS, rows.start, rows.stop, *sums, steps)
+
+    in_shards(fill, shards(height, threads))
     return steps
 
 
@@ -109,9 +118,14 @@ def explained(
     """
     right = config.aligned == "right"
     side = 1 if right else -1
+    parts = shards(raw.shape[0], config.threads)
+
+    def check(rows: slice) -> None:
+        _disparity.cross_check(raw[rows], side, np.float32(config.left_right), np.empty(raw.shape[1], np.float32))
+
     if config.left_right:
-        _disparity.cross_check(raw, side, np.float32(config.left_right), np.empty(raw.shape[1], np.float32))
-    sure = confidence(raw)
+        in_shards(check, parts)
+    sure, steps = confidence(raw, config.threads), texture(image, config.threads)
     reason = np.empty(raw.shape, np.uint8)
     last = config.disparities - (2 if config.halve else 1)
     crop = (0, config.rcrop) if right else (config.rcrop, 0)
@@ -119,6 +133,11 @@ def explained(
     seen = config.texture, DOUBTFUL_PX, max(SEEN, config.texture)
     limits = np.array([last - 0.1, FAR_PX, *sures, *crop, *seen], np.float32)
     none = np.empty((0, 0), np.bool_)
-    masks = (none if mask is None else np.ascontiguousarray(mask, np.bool_) for mask in (valid, valid_other))
-    _disparity.explain(raw, sure, texture(image), *masks, side, limits, reason)
+    masks = [none if mask is None else np.ascontiguousarray(mask, np.bool_) for mask in (valid, valid_other)]
+
+    def explain(rows: slice) -> None:
+        seen = (mask[rows] if mask.size else mask for mask in masks)
+        _disparity.explain(raw[rows], sure[rows], steps[rows], *seen, side, limits, reason[rows])
+
+    in_shards(explain, parts)
     return Disparity(raw, sure, reason)

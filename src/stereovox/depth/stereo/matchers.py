@@ -12,6 +12,7 @@ from stereovox import registry
 from stereovox.config import StereoConfig
 
 MATCHERS = {
+    "census": "stereovox.depth.stereo.semiglobal:Census",
     "sgm": "stereovox.depth.stereo.opencv:ThreeWay",
     "sgm8": "stereovox.depth.stereo.opencv:EightWay",
     "hh4": "stereovox.depth.stereo.opencv:FourWay",

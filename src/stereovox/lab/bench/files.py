@@ -130,7 +130,7 @@ def _plain(text: str) -> str:
 
 def tables(result: dict[str, Any]) -> list[Table]:
     """Return all tables of a result: the comparison, and those under `more`."""
-    compared = [comparison_table(result)] if result.get("rows") else []
+    compared = [comparison_table(found) for found in (result, result.get("clearing", {})) if found.get("rows")]
     return compared + [MEASUREMENTS[name].table(found) for name, found in result.get("more", {}).items()]
 
 

@@ -31,6 +31,12 @@ class Recording:
     name: str
     frames: list[Frame]
     refusals: list[str]
+    far_share: float = 0.0
+    """Share of the pixels that are beyond the maximum range, and clear space up to there."""
+
+    def without_far(self, config: Config) -> Recording:
+        """Return the same frames, all that is beyond the maximum range without a value."""
+        return Recording(self.name, [_usable_pixels(frame, config, far=False) for frame in self.frames], self.refusals)
 
     @property
     def size(self) -> str:
@@ -40,12 +46,12 @@ class Recording:
 
 
 def read_frames(
-    source: Iterable[AnyFrame], config: Config, limit: int | None = None, tell: Progress = silent
+    source: Iterable[AnyFrame], config: Config, limit: int | None = None, tell: Progress = silent, far: bool = False
 ) -> Recording:
     """Read the usable frames of `source` (at most `limit`).
 
-    Pixels without a value and beyond `config.max_range` are 0, so that no library clears space through them, and poses
-    are exactly rigid. Raises StereovoxError when no frame can be used.
+    Pixels without a value are 0, and so are those beyond `config.max_range` unless they stay (`far`), which clear space
+    up to there; poses are exactly rigid. Raises StereovoxError when no frame can be used.
     """
     total = operator.length_hint(source)
     total = total if limit is None else min(total, limit)
@@ -56,30 +62,45 @@ def read_frames(
     tell(0, total, "reading frames: compiling, if need be")
     for done, frame in enumerate(islice(source, limit), start=1):
         try:
-            frames.append(_only_valid_pixels(path.matched(frame), config))
+            frames.append(_usable_pixels(path.matched(frame), config, far))
         except FrameRefused as refused:
             refusals.append(str(refused))
         tell(done, total, "reading frames")
     if not frames:
         why = next(iter(refusals), "the source is empty")
         raise StereovoxError(f"{name}: not one frame can be used ({why})")
-    return Recording(name, frames, refusals)
+    seen = [np.mean(prepare(frame, config).reason == Reason.TOO_FAR) for frame in frames] if far else [0.0]
+    return Recording(name, frames, refusals, float(np.mean(seen)))
 
 
-def points_of(image: DepthImage) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the points (N, 3) in the world of all pixels with a value, and the camera's position (3,)."""
-    T = image.T_world_sensor
-    v, u = np.nonzero(image.reason == Reason.VALID)
+def depth_for_peers(image: DepthImage, beyond_m: float) -> NDArray[np.float32]:
+    """Return depths (height, width) float32 in metres, 0 without a value, `beyond_m` beyond the maximum range."""
+    depth_m = np.where(image.reason == Reason.VALID, image.depth_m, np.float32(0))
+    depth_m[image.reason == Reason.TOO_FAR] = beyond_m
+    return depth_m
+
+
+def points_of(image: DepthImage, beyond_m: float = 0.0) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the points (N, 3) in the world of all pixels with a value, and the camera's position (3,).
+
+    beyond_m: the depth of points in place of pixels beyond the maximum range; 0: these have none.
+    """
+    T, depth_m = image.T_world_sensor, depth_for_peers(image, beyond_m)
+    v, u = np.nonzero(depth_m)
     columns, rows = image.camera.rays()
-    points = np.column_stack([columns[u], rows[v]]) * image.depth_m[v, u, None].astype(float)
+    points = np.column_stack([columns[u], rows[v]]) * depth_m[v, u, None].astype(float)
     return np.ascontiguousarray(points @ T[:3, :3].T + T[:3, 3]), T[:3, 3].copy()
 
 
-def _only_valid_pixels(frame: Frame, config: Config) -> Frame:
-    """Return the frame in its own units, all that has no value up to the maximum range set to 0."""
+def _usable_pixels(frame: Frame, config: Config, far: bool) -> Frame:
+    """Return the frame in its own units, all that has no value (and, unless `far`, all beyond the range) set to 0."""
     image = prepare(frame, config)
-    valid = image.reason == Reason.VALID
+    valid, beyond = image.reason == Reason.VALID, image.reason == Reason.TOO_FAR
     if not valid.any():
         raise FrameRefused("no_valid_depth", f"{frame.name or 'a frame'}: no depth up to {config.max_range:g} m")
-    depth = np.where(valid, frame.depth, 0).astype(frame.depth.dtype)
-    return replace(frame, depth=depth, reason=None, T_world_sensor=image.T_world_sensor)
+    kept = valid | beyond if far else valid
+    depth = np.where(kept, frame.depth, 0).astype(frame.depth.dtype)
+    reason = None
+    if far and frame.reason is not None:
+        reason = np.select([valid, beyond], [Reason.VALID, Reason.TOO_FAR], Reason.UNKNOWN).astype(np.uint8)
+    return replace(frame, depth=depth, reason=reason, T_world_sensor=image.T_world_sensor)

@@ -5,13 +5,22 @@ from __future__ import annotations
 
 import os
 import platform
+from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+
+T = TypeVar("T")
+FEATURES = {"avx2": "AVX2", "fma": "FMA", "avx512f": "AVX-512", "neon": "NEON", "sve": "SVE"}
+"""Vector instructions worth telling, as LLVM names them."""
 
 
 def machine() -> dict[str, Any]:
-    """Return `cpu`, `cores` (that this process may use), `memory_gb`, `python`, `numpy`, `numba` and `system`."""
+    """Return `cpu`, `cores` (that this process may use), `memory_gb`, `python`, `numpy`, `numba` and `system`.
+
+    Also `features`, the vector instructions that the processor has, and `target`, the processor that kernels are
+    compiled for, as LLVM names it: this one, or what NUMBA_CPU_NAME says.
+    """
     total = _meminfo("MemTotal")
     return {
         "cpu": _cpu(),
@@ -21,6 +30,8 @@ def machine() -> dict[str, Any]:
         "numpy": version("numpy"),
         "numba": version("numba"),
         "system": f"{platform.system()} {platform.machine()}",
+        "features": _features(),
+        "target": _target(),
     }
 
 
@@ -28,7 +39,9 @@ def machine_line(facts: dict[str, Any]) -> str:
     """Format the result of `machine` as one line."""
     cores = f"{facts['cores']} core{'s' * (facts['cores'] != 1)}"
     versions = ", ".join(f"{name} {facts[name]}" for name in ("python", "numpy", "numba"))
-    return f"{facts['cpu']}, {cores}; {versions}; {facts['system']}"
+    features = f" ({', '.join(facts['features'])})" if facts.get("features") else ""
+    target = f"; kernels for {facts['target']}" if facts.get("target") else ""
+    return f"{facts['cpu']}{features}, {cores}{target}; {versions}; {facts['system']}"
 
 
 def cores() -> int:
@@ -39,6 +52,42 @@ def cores() -> int:
 def memory_left() -> int | None:
     """Return the bytes of memory that are free or can be freed; None where the system does not report it."""
     return _meminfo("MemAvailable")
+
+
+def on_one_processor(make: Callable[..., T], *arguments: Any) -> T:
+    """Call `make` while this thread may use one processor only; the threads it starts keep to that one for good."""
+    if not hasattr(os, "sched_setaffinity"):
+        return make(*arguments)
+    allowed = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {_this_processor(min(allowed))})
+    try:
+        return make(*arguments)
+    finally:
+        os.sched_setaffinity(0, allowed)
+
+
+def _this_processor(otherwise: int) -> int:
+    """Return the processor that this thread runs on: one that is busy otherwise it would have left."""
+    try:
+        return int(Path("/proc/thread-self/stat").read_text().rpartition(")")[2].split()[36])
+    except (OSError, IndexError, ValueError):
+        return otherwise
+
+
+def _features() -> list[str]:
+    from llvmlite import binding
+
+    try:
+        here = binding.get_host_cpu_features()
+    except RuntimeError:  # LLVM does not know this system's processors
+        return []
+    return [name for feature, name in FEATURES.items() if here.get(feature)]
+
+
+def _target() -> str:
+    from llvmlite import binding
+
+    return os.environ.get("NUMBA_CPU_NAME") or binding.get_host_cpu_name()
 
 
 def _cpu() -> str:

@@ -8,7 +8,6 @@ the same trees.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module
@@ -21,12 +20,17 @@ from stereovox import registry
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.cameras.rigs import VirtualCamera
 from stereovox.errors import ConfigError, MissingExtra, StereovoxError, did_you_mean
+from stereovox.lab.bench.machine import on_one_processor
 
 PEERS = {
     "octomap": "stereovox.lab.bench.peers:OctomapPython",
     "octomap-rays": "stereovox.lab.bench.peers:OctomapPythonRays",
     "pyoctomap": "stereovox.lab.bench.peers:PyOctomap",
     "wavemap": "stereovox.lab.bench.peers:Wavemap",
+    "octomap-cpp": "stereovox.lab.bench.native:OctomapCpp",
+    "bonxai": "stereovox.lab.bench.native:Bonxai",
+    "ufomap": "stereovox.lab.bench.native:Ufomap",
+    "wavemap-cpp": "stereovox.lab.bench.native:WavemapCpp",
 }
 """Libraries by name; other packages add theirs with entry points in the group `stereovox.peers`."""
 
@@ -43,6 +47,11 @@ TREE_DEPTH = 16
 
 class Peer(Protocol):
     """Map of another library, a plug-in of `stereovox bench`.
+
+    Two more methods are used where it has them. `reach(max_range)` is called once, before the first frame, where
+    what is farther than so many metres clears space up to there; a map without it is not timed on such frames.
+    `prepared(points, origin)` returns a function that inserts them, and only that function is timed (`prepared_image`
+    for depth images). A map with `one_processor` True is kept to one, with all threads that it starts.
 
     Args:
         voxel_size: Cell size in metres.
@@ -193,10 +202,15 @@ class OctomapPython:
 
     def __init__(self, voxel_size: float):
         self._tree = _library("octomap", "octomap-python").OcTree(voxel_size)
+        self._max_range = -1.0
+
+    def reach(self, max_range: float) -> None:
+        """Let points farther than `max_range` metres clear space up to there."""
+        self._max_range = max_range
 
     def insert(self, points: NDArray[np.float64], origin: NDArray[np.float64]) -> None:
         """Cast a ray to every point."""
-        self._tree.insertPointCloud(points, origin, -1.0, False, self.discretize)
+        self._tree.insertPointCloud(points, origin, self._max_range, False, self.discretize)
 
     def counts(self) -> tuple[int, int]:
         """Return occupied and free cells."""
@@ -218,10 +232,15 @@ class PyOctomap:
 
     def __init__(self, voxel_size: float):
         self._tree = _library("pyoctomap", "pyoctomap").OcTree(voxel_size)
+        self._max_range = -1.0
+
+    def reach(self, max_range: float) -> None:
+        """Let points farther than `max_range` metres clear space up to there."""
+        self._max_range = max_range
 
     def insert(self, points: NDArray[np.float64], origin: NDArray[np.float64]) -> None:
         """Cast a ray to every cell that holds a point."""
-        self._tree.insertPointCloud(points, origin, -1.0, False, True)
+        self._tree.insertPointCloud(points, origin, self._max_range, False, True)
 
     def counts(self) -> tuple[int, int]:
         """Return occupied and free cells."""
@@ -249,19 +268,24 @@ class Wavemap:
             raise MissingPackage("pywavemap", WAVEMAP_FROM) from None
         kind = {"type": "hashed_chunked_wavelet_octree", "min_cell_width": {"meters": voxel_size}}
         self._map = self._wave.Map.create(kind)
-        self._pipeline = _on_one_processor(self._wave.Pipeline, self._map)
+        self._pipeline = on_one_processor(self._wave.Pipeline, self._map)
         self._voxel_size = voxel_size
         self._camera: VirtualCamera | None = None
         self._reach = 0.0
+        self._limit = np.inf
         self._seen: list[NDArray[np.float64]] = []
+
+    def reach(self, max_range: float) -> None:
+        """Let depths farther than `max_range` metres clear space up to there."""
+        self._limit = max_range
 
     def insert_image(
         self, depth_m: NDArray[np.float32], camera: VirtualCamera, T_world_camera: NDArray[np.float64]
     ) -> None:
         """Let the pipeline integrate the image."""
-        deepest = float(depth_m.max())
+        deepest = min(float(depth_m.max()), self._limit)
         if camera is not self._camera or deepest > self._reach:
-            self._use_camera(camera, np.ceil(deepest))
+            self._use_camera(camera, min(np.ceil(deepest), self._limit))
         wave = self._wave
         posed = wave.PosedImage(wave.Pose(T_world_camera), wave.Image(depth_m.T))
         self._pipeline.run_pipeline(["camera"], posed)
@@ -301,18 +325,6 @@ class Wavemap:
                                   "scaling_free": 0.2, "scaling_occupied": 0.4},
             "integration_method": {"type": "hashed_chunked_wavelet_integrator", **limits},
         })  # fmt: skip
-
-
-def _on_one_processor(make: Any, *arguments: Any) -> Any:
-    """Call `make` while this thread may use one processor only; the threads it starts keep to that one for good."""
-    if not hasattr(os, "sched_setaffinity"):
-        return make(*arguments)
-    allowed = os.sched_getaffinity(0)
-    os.sched_setaffinity(0, {min(allowed)})
-    try:
-        return make(*arguments)
-    finally:
-        os.sched_setaffinity(0, allowed)
 
 
 class MissingPackage(MissingExtra):

@@ -56,9 +56,11 @@ def format_table(result: dict[str, Any]) -> str:
 def comparison_table(result: dict[str, Any]) -> Table:
     """Return the result of `bench` as a table: a group for each voxel size, first what peers are compared with."""
     compared = ("stereovox is",) if any(result["ratio"].values()) else ()
-    head = ("voxel", "library", "threads", "frames", "ms/frame", "p90", "p99", *compared, "occupied", "free", "map MB")
+    whole = ("whole",) if any("add_ms_median" in row for row in result["rows"]) else ()
+    times = ("ms/frame", "p90", "p99", *whole)
+    head = ("voxel", "library", "threads", "frames", *times, *compared, "occupied", "free", "map MB")
     groups = [
-        [_cells(row, i == 0, result["ratio"][size] if compared else None) for i, row in enumerate(rows)]
+        [_cells(row, i == 0, result["ratio"][size] if compared else None, bool(whole)) for i, row in enumerate(rows)]
         for size, rows in rows_by_size(result).items()
     ]
     return Table(_title(result), head, groups, _notes(result), words=2)
@@ -81,18 +83,21 @@ def rows_by_size(result: dict[str, Any]) -> dict[str, list[dict[str, Any]]]:
 
 
 def _title(result: dict[str, Any]) -> str:
-    return f"{result['source']}: {result['frames']} frames of {result['image']}, depth up to {result['max_range']:g} m"
+    up_to = f"depth up to {result['max_range']:g} m{', free where beyond' if result.get('far_share') else ''}"
+    return f"{result['source']}: {result['frames']} frames of {result['image']}, {up_to}"
 
 
-def _cells(row: dict[str, Any], first: bool, ratio: dict[str, float] | None) -> tuple[str, ...]:
+def _cells(row: dict[str, Any], first: bool, ratio: dict[str, float] | None, whole: bool) -> tuple[str, ...]:
     """Return the cells of a line; `ratio` is None where there are no peers, and so no column for it."""
     faster = () if ratio is None else (_faster(ratio.get(row["library"])),)
+    add = (f"{row['add_ms_median']:.2f}" if "add_ms_median" in row else "",) if whole else ()
     return (
         f"{row['voxel_size']:g} m" if first else "",
         row["library"],
         str(row["threads"]),
         str(row["frames"]),
         *(f"{row[f'integrate_ms_{name}']:.2f}" for name in ("median", "p90", "p99")),
+        *add,
         *faster,
         f"{row['occupied']:,}",
         f"{row['free']:,}",
@@ -116,7 +121,12 @@ def _notes(result: dict[str, Any]) -> list[str]:
     ]
     prepared = [row["depth_ms_median"] for row in result["rows"] if "depth_ms_median" in row]
     if prepared:
-        notes.append(f"stereovox makes its depth image in {_span(prepared)} ms more, which peers have done for them.")
+        notes.append(f"stereovox makes its depth image in {_span(prepared)} ms more, which peers have done for them;")
+        notes.append("whole: the median of its whole call, Mapper.add.")
+    if result.get("far_share"):
+        share, reach = result["far_share"], result["max_range"]
+        notes.append(f"{share:.1%} of the pixels are beyond {reach:g} m and clear space up to there, for all.")
+    notes += [f"{name} cannot clear along such pixels and is left out." for name in result.get("not_clearing", ())]
     if result["frames_refused"]:
         notes.append(f"{result['frames_refused']} frames were refused, first: {result['first_refusal']}")
     for row in result["rows"]:

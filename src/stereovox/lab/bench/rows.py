@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from time import perf_counter, process_time
 from typing import Any, TypeVar
 
@@ -13,9 +14,9 @@ import numpy as np
 from stereovox.config import Config, load_config
 from stereovox.depth import prepare
 from stereovox.errors import ConfigError, StereovoxError
-from stereovox.frame import AnyFrame, Frame, Reason, UpdateReport
-from stereovox.lab.bench.frames import Progress, Recording, points_of, read_frames, silent
-from stereovox.lab.bench.machine import machine
+from stereovox.frame import AnyFrame, Frame, UpdateReport
+from stereovox.lab.bench.frames import Progress, Recording, depth_for_peers, points_of, read_frames, silent
+from stereovox.lab.bench.machine import machine, on_one_processor
 from stereovox.lab.bench.peers import ImagePeer, Peer, PeerClass, blamed, find_peer
 from stereovox.lab.bench.results import LIBRARY
 from stereovox.lab.bench.results import format_table as format_table
@@ -27,6 +28,9 @@ PASSES = 3
 """stereovox maps all frames this many times, and once more after each peer, to spread the machine's variations."""
 ENOUGH_S = 5.0
 """A variant of stereovox makes no further pass once its timed frames took this many seconds."""
+
+BEYOND = 2.0
+"""Where peers get what is beyond the maximum range, in maximum ranges: they clear the first of these."""
 
 T = TypeVar("T")
 SoFar = Callable[[dict[str, Any]], None]
@@ -74,9 +78,13 @@ class _Watch:
 
 @dataclass(frozen=True)
 class _Limits:
-    """When a peer may stop: after `seconds` of inserting, but not before `MIN_FRAMES` frames."""
+    """When a peer may stop: after `seconds` of inserting, but not before `MIN_FRAMES` frames.
+
+    range_m: where rays of what is beyond the maximum range end; 0: frames have no such pixels.
+    """
 
     seconds: float
+    range_m: float = 0.0
 
     def reached(self, times_ms: Sequence[float]) -> bool:
         return len(times_ms) >= MIN_FRAMES and sum(times_ms) >= 1e3 * self.seconds
@@ -147,8 +155,13 @@ def compare(
     """Do what `bench` does with frames in memory; the first of `variants` is what peers are compared with.
 
     so_far: called with the result after each voxel size, so that a long run can be stopped.
+    Where the recording holds pixels beyond the maximum range, they clear space up to there; the result's `far_share`
+    is their share of all pixels, and peers that cannot do that are left out: `not_clearing` names them.
     """
     sizes = _configs(voxel_sizes, variants, max_range)
+    clearing = recording.far_share > 0
+    lacking = [name for name, kind in peers.items() if clearing and not hasattr(kind, "reach")]
+    peers = {name: kind for name, kind in peers.items() if name not in lacking}
     result: dict[str, Any] = {
         "source": recording.name,
         "image": recording.size,
@@ -156,6 +169,8 @@ def compare(
         "frames_refused": len(recording.refusals),
         "first_refusal": next(iter(recording.refusals), ""),
         "max_range": sizes[0][0].max_range,
+        "far_share": round(recording.far_share, 4),
+        "not_clearing": lacking,
         "budget_s": budget_s,
         "machine": machine(),
         "rows": [],
@@ -166,7 +181,8 @@ def compare(
         flights = [
             _Flights(variant, config, recording.frames, tell) for variant, config in zip(variants, configs, strict=True)
         ]
-        theirs = _timed(flights, peers, recording.frames, configs[0], _Limits(budget_s), tell)
+        limits = _Limits(budget_s, configs[0].max_range if clearing else 0.0)
+        theirs = _timed(flights, peers, recording.frames, configs[0], limits, tell)
         ours, *others = [flight.row() for flight in flights]
         result["rows"] += [ours, *theirs]
         result["variants"] += others
@@ -201,7 +217,8 @@ def _timed(
         if waiting:
             name, kind = waiting.pop(0)
             with blamed(f"peer '{name}' at {config.voxel_size:g} m"):
-                rows.append(_time_peer(name, kind, frames, config, limits, tell))
+                alone = on_one_processor if getattr(kind, "one_processor", False) else _freely
+                rows.append(alone(_time_peer, name, kind, frames, config, limits, tell))
     return rows
 
 
@@ -247,13 +264,17 @@ class _Flights:
         return row | self._map | more
 
 
+def _freely(make: Callable[..., T], *arguments: Any) -> T:
+    return make(*arguments)
+
+
 def _time_peer(
     name: str, kind: PeerClass, frames: list[Frame], config: Config, limits: _Limits, tell: Progress
 ) -> dict[str, Any]:
-    _insertion(kind(config.voxel_size), frames[0], config)()
-    peer, watch = kind(config.voxel_size), _Watch()
+    _insertion(_new(kind, config, limits), frames[0], config, limits)()
+    peer, watch = _new(kind, config, limits), _Watch()
     for done, frame in enumerate(frames, start=1):
-        watch.call(_insertion(peer, frame, config))
+        watch.call(_insertion(peer, frame, config, limits))
         tell(done, len(frames), f"{name} at {config.voxel_size:g} m")
         if limits.reached(watch.times_ms):
             break
@@ -263,14 +284,23 @@ def _time_peer(
     return _row(name, config, 1, watch.times_ms) | more
 
 
-def _insertion(peer: Peer | ImagePeer, frame: Frame, config: Config) -> Callable[[], None]:
+def _new(kind: PeerClass, config: Config, limits: _Limits) -> Peer | ImagePeer:
+    """Return an empty map, which knows where rays end if some have no surface."""
+    peer: Any = kind(config.voxel_size)
+    if limits.range_m:
+        peer.reach(limits.range_m)
+    return peer
+
+
+def _insertion(peer: Any, frame: Frame, config: Config, limits: _Limits) -> Callable[[], None]:
     """Return the call that is timed; all that it needs is made here."""
-    image = prepare(frame, config)
+    image, beyond_m = prepare(frame, config), BEYOND * limits.range_m
     if isinstance(peer, ImagePeer):
-        depth_m = np.where(image.reason == Reason.VALID, image.depth_m, np.float32(0))
-        return lambda: peer.insert_image(depth_m, image.camera, image.T_world_sensor)
-    points, origin = points_of(image)
-    return lambda: peer.insert(points, origin)
+        seen = depth_for_peers(image, beyond_m), image.camera, image.T_world_sensor
+        prepared = getattr(peer, "prepared_image", None)
+        return prepared(*seen) if prepared else partial(peer.insert_image, *seen)
+    points = points_of(image, beyond_m)
+    return peer.prepared(*points) if hasattr(peer, "prepared") else partial(peer.insert, *points)
 
 
 def _row(library: str, config: Config, threads: int, times_ms: Sequence[float]) -> dict[str, Any]:

@@ -101,6 +101,7 @@ def test_speed_is_claimed_of_default_only():
 
 
 def test_octomap_gets_hits_in_range_and_clears_the_way_to_what_is_beyond():
+    pytest.importorskip("octomap", reason="pip install 'stereovox[bench]'")
     camera = PinholeCamera(3, 1, 2.0, 2.0, 1.0, 0.0)
     depth = np.array([[np.nan, 30.0, 9.8]], np.float32)  # the right pixel looks along (0.5, 0, 1)
     reason = np.array([[Reason.TOO_FAR, Reason.VALID, Reason.VALID]], np.uint8)

@@ -39,7 +39,7 @@ measured_row, table_place, cleared = (
 marked, with_hit = on_gpu(_projective.marked), on_gpu(_projective.with_hit)
 row_rays, narrow_offset = on_gpu(_hits._row_rays), on_gpu(_hits.narrow_offset)
 narrow_key, wide_key = on_gpu(_hits.narrow_key), on_gpu(_hits.wide_key)
-centre, footprint, sample = on_gpu(_hits.centre), on_gpu(_hits.footprint), on_gpu(_hits.sample)
+centre, samples_across, sample = on_gpu(_hits.centre), on_gpu(_hits.samples_across), on_gpu(_hits.sample)
 share_of, hit_row, weighed_hit = on_gpu(_hits.share_of), on_gpu(_hits.hit_row), on_gpu(_hits.weighed_hit)
 find, home_slot = on_gpu(_map_cells.find), on_gpu(_map_cells.home_slot)
 
@@ -267,7 +267,12 @@ def weigh(depth_m, view, table, full_share, listed, wide, hit_table, coords, val
         x, y, z = centre(view, *block, view.steps[0, c], view.steps[1, c], view.steps[2, c])
         share = full_share
         if full_share > ZERO:
-            samples, step, left, top = footprint(view, x, y, z)
+            inverse = ONE / z
+            wide = min(view.voxel_size * view.intrinsics[0] * inverse, np.float32(view.width))
+            samples = samples_across(wide)
+            step = wide / samples
+            left = x * inverse + view.intrinsics[2] + HALF - HALF * wide
+            top = y * inverse + view.intrinsics[3] + HALF - HALF * wide
             found, looked = ZERO, ZERO
             for j in range(np.int32(samples)):
                 for k in range(np.int32(samples)):

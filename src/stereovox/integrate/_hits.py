@@ -135,8 +135,13 @@ def _share(depth_m, view, n, lanes):
     x, y, z, share, u, v, samples, step, looked, depth, counts, at = lanes
     limit = HALF * view.voxel_size
     most = np.int32(1)
-    for i in range(n):
-        samples[i], step[i], u[i], v[i] = footprint(view, x[i], y[i], z[i])
+    for i in range(n):  # `_gpu.weigh` has the same lines: in a cell they would be rounded otherwise, and maps change
+        inverse = ONE / z[i]
+        wide = min(view.voxel_size * view.intrinsics[0] * inverse, np.float32(view.width))
+        samples[i] = samples_across(wide)
+        step[i] = wide / samples[i]
+        u[i] = x[i] * inverse + view.intrinsics[2] + HALF - HALF * wide
+        v[i] = y[i] * inverse + view.intrinsics[3] + HALF - HALF * wide
         share[i] = ZERO
         looked[i] = ZERO
     for i in range(n):
@@ -158,14 +163,9 @@ def _share(depth_m, view, n, lanes):
 
 
 @cell
-def footprint(view, x, y, z):
-    """Return the samples along each side of a cell's footprint, the pixels between them, and its upper left corner."""
-    inverse = ONE / z
-    wide = min(view.voxel_size * view.intrinsics[0] * inverse, np.float32(view.width))
-    side = np.float32(np.int32(min(max(wide, ONE), np.float32(SIDE_SAMPLES))))
-    u = x * inverse + view.intrinsics[2] + HALF - HALF * wide
-    v = y * inverse + view.intrinsics[3] + HALF - HALF * wide
-    return side, wide / side, u, v
+def samples_across(wide):
+    """Return how many samples are taken along each side of a footprint `wide` pixels wide, a float32."""
+    return np.float32(np.int32(min(max(wide, ONE), np.float32(SIDE_SAMPLES))))
 
 
 @cell

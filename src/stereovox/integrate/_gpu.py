@@ -268,11 +268,11 @@ def weigh(depth_m, view, table, full_share, listed, wide, hit_table, coords, val
         share = full_share
         if full_share > ZERO:
             inverse = ONE / z
-            wide = min(view.voxel_size * view.intrinsics[0] * inverse, np.float32(view.width))
-            samples = samples_across(wide)
-            step = wide / samples
-            left = x * inverse + view.intrinsics[2] + HALF - HALF * wide
-            top = y * inverse + view.intrinsics[3] + HALF - HALF * wide
+            size = min(view.voxel_size * view.intrinsics[0] * inverse, np.float32(view.width))
+            samples = samples_across(size)
+            step = size / samples
+            left = x * inverse + view.intrinsics[2] + HALF - HALF * size
+            top = y * inverse + view.intrinsics[3] + HALF - HALF * size
             found, looked = ZERO, ZERO
             for j in range(np.int32(samples)):
                 for k in range(np.int32(samples)):

@@ -15,6 +15,7 @@ from stereovox.comparison import Comparison
 from stereovox.config import Config, load_config
 from stereovox.deadline import Deadline
 from stereovox.depth import DepthPipeline
+from stereovox.device import check_on_processor, on_usable_device
 from stereovox.errors import MapFileError
 from stereovox.frame import AnyFrame, Scan
 from stereovox.frame import UpdateReport as UpdateReport
@@ -102,6 +103,9 @@ class Mapper:
 
     Raises:
         ConfigError: A setting is unknown, of the wrong type or out of range.
+
+    Warns:
+        RuntimeWarning: `device` is "cuda" and there is no graphics card to use; the map is made on the processor.
     """
 
     def __init__(
@@ -113,7 +117,7 @@ class Mapper:
         clock: Callable[[], int] = monotonic_ns,
         **overrides: Any,
     ):
-        self.config = load_config(profile, **overrides)
+        self.config = on_usable_device(load_config(profile, **overrides))
         self._deadline = Deadline(self.config)
         self.map = make_map(self.config, resume, tiles)  # may leave tiles on disk, so whatever can fail comes first
         self._intake = Intake(self.config, self.map, clock)
@@ -220,6 +224,7 @@ class GridMapper:
         **overrides: Any,
     ):
         self.config = load_config(profile, **overrides)
+        check_on_processor(self.config)
         self._depth = DepthPipeline(self.config)
         self._beams = make_beams(self.config)
         self.map = _grid_map(self.config, resume)

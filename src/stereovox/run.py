@@ -21,6 +21,7 @@ from typing import Any, Generic, Protocol, TypeVar
 
 from stereovox import opening
 from stereovox.config import Config, load_config
+from stereovox.device import on_usable_device
 from stereovox.errors import MapFileError, SourceError, StereovoxError, one_line
 from stereovox.evaluate.summary import summarise
 from stereovox.frame import UpdateReport
@@ -284,7 +285,8 @@ class MapRun:
         if settings is None:
             settings = saved.config if saved else "default"
         tiles = self.out.parent / f".{self.out.name}-tiles"  # beside the map, not in a temporary folder in memory
-        return Mapper(settings, resume=saved, tiles=tiles, **{**self._overrides, **suggested})
+        config = load_config(settings, **{**self._overrides, **suggested})
+        return Mapper(on_usable_device(config, self._notify), resume=saved, tiles=tiles)
 
     def _check_recording(self) -> None:
         """Check that the map is of this recording: of another one, the first frames would be skipped."""

@@ -16,9 +16,9 @@ from stereovox.run import Checkpoints
 SOURCE = Path(__file__).resolve().parents[1] / "src/stereovox"
 LAYERS = (
     {"errors", "se3", "_jit"},
-    {"registry", "safe_io", "se2", "threads", "cameras"},
-    {"config", "frame"},
-    {"sensors", "trust"},
+    {"registry", "safe_io", "se2", "threads", "cameras", "_math"},
+    {"config", "frame", "_gpu"},
+    {"sensors", "trust", "device"},
     {"depth", "maps"},
     {"intake", "integrate", "products", "sources"},
     {"comparison", "deadline", "formats", "localize", "simulate"},

@@ -99,18 +99,26 @@ def cache_folder() -> Path | None:
     return None
 
 
-def _compile(function: Function, fastmath: set[str] | bool = FAST_MATH, **options: Any) -> Function:
-    folder, options = cache_folder(), {"no_cfunc_wrapper": True, **options}
+def with_cache(compile_it: Callable[[bool], Function]) -> Function:
+    """Return `compile_it(cache)`: whether machine code is kept on disk, in the folder of these kernels."""
+    folder = cache_folder()
     settings: Any = numba_config
     before = settings.CACHE_DIR
     settings.CACHE_DIR = str(folder or "")
     try:
-        return numba.njit(
-            function, cache=folder is not None, error_model="numpy", fastmath=fastmath, nogil=True,
-            pipeline_class=_KernelCompiler, **options,
-        )  # fmt: skip
+        return compile_it(folder is not None)
     finally:
         settings.CACHE_DIR = before
+
+
+def _compile(function: Function, fastmath: set[str] | bool = FAST_MATH, **options: Any) -> Function:
+    options = {"no_cfunc_wrapper": True, **options}
+    return with_cache(
+        lambda cache: numba.njit(
+            function, cache=cache, error_model="numpy", fastmath=fastmath, nogil=True, pipeline_class=_KernelCompiler,
+            **options,
+        )
+    )  # fmt: skip
 
 
 def _source_hash() -> str:

@@ -54,6 +54,9 @@ def add_arguments(parser: ArgumentParser) -> None:
         "--level", action="store_true", help="turn the recording's world so that z points up, for level layers"
     )
     parser.add_argument("--threads", type=int, metavar="N", help="threads (1); the map does not depend on it")
+    parser.add_argument(
+        "--device", metavar="NAME", help="cpu (default), or cuda: an NVIDIA graphics card, if there is one"
+    )
     add_settings(parser, "sensor.model=andert")
     parser.add_argument(
         "--resume",
@@ -126,7 +129,7 @@ def _grid(arguments: Namespace) -> dict[str, Any]:
     """Run `stereovox grid`, which has more options."""
     from stereovox.cli.grid import run_floor
 
-    for option in ("camera", "integrator", "level", "threads", "view", "rerun"):
+    for option in ("camera", "device", "integrator", "level", "threads", "view", "rerun"):
         if getattr(arguments, option) not in (None, False):
             raise StereovoxError(f"--{option}: has no meaning for the map of a floor; leave it out")
     return run_floor(arguments)

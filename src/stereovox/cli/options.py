@@ -19,7 +19,7 @@ MAX_FILE = 10_000
 """Largest size in bytes of a file with a transform."""
 CHECKPOINT_S = 10.0
 """Copy of `run.CHECKPOINT_S`, so that `--help` need not import `run`."""
-OWN_OPTIONS = ("voxel_size", "integrator", "max_range", "threads")
+OWN_OPTIONS = ("voxel_size", "integrator", "max_range", "threads", "device")
 """Settings that may have an option of their own."""
 
 

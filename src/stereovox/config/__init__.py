@@ -49,6 +49,8 @@ class Config(Section):
             0.3, but at most a tenth of max_range and at least min_range.
         integrator: `projective`, `ray`, `line`, or one that another package registers.
         threads: Threads of the integrator; the map does not depend on their number.
+        device: `cpu`, or `cuda` for an NVIDIA graphics card: the integrator `projective` with pinhole cameras, for maps
+            without a window, `max_memory` or `map.keep_times`. Without such a card it is `cpu`, and a line says so.
         pose_rigidity_tolerance: Largest entry of abs(R^T R - I) that counts as rounding of a pose.
         deadline_ms: Milliseconds a frame may take; `pace` sets what is left out where frames take longer. Not set:
             no limit.
@@ -84,6 +86,7 @@ class Config(Section):
     levelled_from: tuple[float, float, float] | None = None
     integrator: str = "projective"
     threads: int = Field(1, ge=1, le=256)
+    device: Literal["cpu", "cuda"] = "cpu"
     pose_rigidity_tolerance: float = Field(5e-3, gt=0, le=0.1)
     deadline_ms: float | None = Field(None, gt=0)
     max_memory: ByteSize | None = Field(None, gt=0, le=10**12)
@@ -145,6 +148,26 @@ class Config(Section):
                 raise ValueError(
                     f"up_direction {list(self.up_direction)} must be a unit vector nearest to up {self.up}"
                 )
+        return self
+
+    @model_validator(mode="after")
+    def _fit_for_device(self) -> Config:
+        if self.device == "cpu":
+            return self
+        not_there = {
+            "dimensions": self.dimensions == 2,
+            "integrator": self.integrator != "projective",
+            "threads": self.threads > 1,
+            "window.size": self.window.size is not None,
+            "max_memory": self.max_memory is not None,
+            "map.keep_times": self.map.keep_times,
+        }
+        for name, wanted in not_there.items():
+            if wanted:
+                value = self
+                for part in name.split("."):
+                    value = getattr(value, part)
+                raise ValueError(f'{name} {value} cannot be had with device "cuda"; leave it out, or use device "cpu"')
         return self
 
     @model_validator(mode="after")

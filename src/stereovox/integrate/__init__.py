@@ -15,6 +15,8 @@ INTEGRATORS = {
     "ray": "stereovox.integrate.ray:Ray",
     "line": "stereovox.integrate.ray:Line",
 }
+DEVICES = {"cpu": INTEGRATORS, "cuda": {"projective": "stereovox.integrate.gpu:GpuProjective"}}
+"""The integrators of each device; only those of the processor can come from other packages."""
 
 
 class Integrator(Protocol):
@@ -37,4 +39,4 @@ class Integrator(Protocol):
 
 def make_integrator(config: Config) -> Integrator:
     """Return the configured integrator. Raises ConfigError for an unknown name."""
-    return registry.find("integrators", INTEGRATORS, config.integrator)(config)
+    return registry.find("integrators", DEVICES[config.device], config.integrator)(config)

@@ -8,6 +8,7 @@ pixels whose number differs from their neighbours' go on; groups without any cos
 import numpy as np
 
 from stereovox._jit import cell, kernel
+from stereovox._math import floor, square_root
 from stereovox.integrate._cells import (
     HALF,
     NARROW,
@@ -100,8 +101,7 @@ def weigh(depth_m, view, table, full_share, listed, coords, values, lanes):
 def _centres(view, coords, listed, lanes):
     """Write where the centres of listed cells stand, camera axes, x and y times the focal length."""
     x, y, z, px, py, pz = lanes.x, lanes.y, lanes.z, lanes.u, lanes.v, lanes.step
-    side = np.float32(8) * view.voxel_size
-    R, n = view.rotation, listed.size
+    n = listed.size
     for i in range(n):  # by itself: see `_projective._aim`
         block, c = np.uint32(listed[i] >> 9), np.uint32(listed[i] & 511)
         px[i] = np.float32(coords[block, 0])
@@ -109,10 +109,21 @@ def _centres(view, coords, listed, lanes):
         pz[i] = np.float32(coords[block, 2])
         x[i], y[i], z[i] = view.steps[0, c], view.steps[1, c], view.steps[2, c]
     for i in range(n):
-        qx, qy, qz = px[i] * side - view.position[0], py[i] * side - view.position[1], pz[i] * side - view.position[2]
-        x[i] = (R[0, 0] * qx + R[0, 1] * qy + R[0, 2] * qz) * view.intrinsics[0] + x[i]
-        y[i] = (R[1, 0] * qx + R[1, 1] * qy + R[1, 2] * qz) * view.intrinsics[1] + y[i]
-        z[i] = max(R[2, 0] * qx + R[2, 1] * qy + R[2, 2] * qz + z[i], NEAR_PLANE)
+        x[i], y[i], z[i] = centre(view, px[i], py[i], pz[i], x[i], y[i], z[i])
+
+
+@cell
+def centre(view, bx, by, bz, x_step, y_step, z_step):
+    """Return where the centre of a cell stands, camera axes, x and y times the focal length.
+
+    All float32: the block's coordinates, and the cell's entries of `view.steps`.
+    """
+    side = np.float32(8) * view.voxel_size
+    R = view.rotation
+    px, py, pz = bx * side - view.position[0], by * side - view.position[1], bz * side - view.position[2]
+    x = (R[0, 0] * px + R[0, 1] * py + R[0, 2] * pz) * view.intrinsics[0] + x_step
+    y = (R[1, 0] * px + R[1, 1] * py + R[1, 2] * pz) * view.intrinsics[1] + y_step
+    return x, y, max(R[2, 0] * px + R[2, 1] * py + R[2, 2] * pz + z_step, NEAR_PLANE)
 
 
 @cell
@@ -122,18 +133,17 @@ def _share(depth_m, view, n, lanes):
     Samples stand at even distances, up to SIDE_SAMPLES a side; at least half of one counts.
     """
     x, y, z, share, u, v, samples, step, looked, depth, counts, at = lanes
-    width, height = np.float32(view.width), np.float32(view.height)
     limit = HALF * view.voxel_size
-    for i in range(n):
+    most = np.int32(1)
+    for i in range(n):  # `_gpu.weigh` has the same lines: in a cell they would be rounded otherwise, and maps change
         inverse = ONE / z[i]
-        wide = min(view.voxel_size * view.intrinsics[0] * inverse, width)
-        samples[i] = np.float32(np.int32(min(max(wide, ONE), np.float32(SIDE_SAMPLES))))
+        wide = min(view.voxel_size * view.intrinsics[0] * inverse, np.float32(view.width))
+        samples[i] = samples_across(wide)
         step[i] = wide / samples[i]
         u[i] = x[i] * inverse + view.intrinsics[2] + HALF - HALF * wide
         v[i] = y[i] * inverse + view.intrinsics[3] + HALF - HALF * wide
         share[i] = ZERO
         looked[i] = ZERO
-    most = np.int32(1)
     for i in range(n):
         most = max(most, np.int32(samples[i]))
     for j in range(most):
@@ -141,41 +151,63 @@ def _share(depth_m, view, n, lanes):
         for k in range(most):
             column = np.float32(k) + HALF
             for i in range(n):
-                su, sv = u[i] + column * step[i], v[i] + row * step[i]
-                inside = (
-                    (row < samples[i])
-                    & (column < samples[i])
-                    & (su >= ZERO)
-                    & (su < width)
-                    & (sv >= ZERO)
-                    & (sv < height)
-                )
-                counts[i] = ONE if inside else ZERO
-                at[i] = np.int32(np.int32(sv if inside else ZERO) * view.width) + np.int32(su if inside else ZERO)
+                counts[i], at[i] = sample(view, u[i] + column * step[i], v[i] + row * step[i])
+                counts[i] = counts[i] if (row < samples[i]) & (column < samples[i]) else ZERO
             for i in range(n):  # by itself: see `_projective._aim`
                 depth[i] = depth_m[index(at[i])]
             for i in range(n):
                 share[i] += counts[i] if abs(depth[i] - z[i]) <= limit else ZERO
                 looked[i] += counts[i]
     for i in range(n):
-        share[i] = max(share[i], HALF) / max(looked[i], ONE)
+        share[i] = share_of(share[i], looked[i])
+
+
+@cell
+def samples_across(wide):
+    """Return how many samples are taken along each side of a footprint `wide` pixels wide, a float32."""
+    return np.float32(np.int32(min(max(wide, ONE), np.float32(SIDE_SAMPLES))))
+
+
+@cell
+def sample(view, u, v):
+    """Return whether a point lies in the image, 1 or 0, and the number of its pixel, 0 if it does not."""
+    inside = (u >= ZERO) & (u < np.float32(view.width)) & (v >= ZERO) & (v < np.float32(view.height))
+    at = np.int32(np.int32(v if inside else ZERO) * view.width) + np.int32(u if inside else ZERO)
+    return ONE if inside else ZERO, np.int32(at)
+
+
+@cell
+def share_of(share, looked):
+    """Return the part of a footprint whose samples measure the cell: so many of those that were looked at."""
+    return max(share, HALF) / max(looked, ONE)
 
 
 @cell
 def _evidence(view, table, full_share, listed, lanes, values):
     """Write the evidence of the hits on listed cells."""
     z, share, hits, at, n = lanes.z, lanes.share, lanes.depth, lanes.at, listed.size
-    rows = np.int32(table.hit.size)
     for i in range(n):
-        at[i] = table_row(min(z[i], view.max_range), table.rows_per_metre, rows)
+        at[i] = hit_row(view, table, z[i])
     for i in range(n):
         hits[i] = np.float32(table.hit[index(at[i])])
     for i in range(n):
-        part = min(ONE, share[i] / full_share) if full_share > ZERO else ONE
-        weighed = max(np.floor(hits[i] * np.sqrt(part) + HALF), ONE)
-        at[i] = np.int32(weighed if hits[i] > ZERO else ZERO)
+        at[i] = weighed_hit(hits[i], full_share, share[i])
     for i in range(n):
         values[index(listed[i])] = np.int16(at[i])
+
+
+@cell
+def hit_row(view, table, z):
+    """Return the table row of a hit on a cell at depth `z`."""
+    return table_row(min(z, view.max_range), table.rows_per_metre, np.int32(table.hit.size))
+
+
+@cell
+def weighed_hit(hit, full_share, share):
+    """Return the evidence of a hit (float32) on a cell of whose footprint a `share` measures it."""
+    part = min(ONE, share / full_share) if full_share > ZERO else ONE
+    weighed = max(floor(hit * square_root(part) + HALF), ONE)
+    return np.int32(weighed if hit > ZERO else ZERO)
 
 
 @cell
@@ -203,9 +235,9 @@ def _row_rays(forward, row, size):
 def _point_cell(d, column, ray, position):
     """Return the cell that holds the point at depth `d` of the pixel with x/z `column`."""
     return (
-        np.int32(np.floor(d * (ray[0] * column + ray[1]) + position[0])),
-        np.int32(np.floor(d * (ray[2] * column + ray[3]) + position[1])),
-        np.int32(np.floor(d * (ray[4] * column + ray[5]) + position[2])),
+        np.int32(floor(d * (ray[0] * column + ray[1]) + position[0])),
+        np.int32(floor(d * (ray[2] * column + ray[3]) + position[1])),
+        np.int32(floor(d * (ray[4] * column + ray[5]) + position[2])),
     )
 
 
@@ -215,34 +247,50 @@ def _narrow_row(depths, columns, ray, position, now, before, news):
 
     Offsets keep all numbers positive, so that cutting off digits is the floor.
     """
-    middle = np.float32(1 << (NARROW - 1))
-    x0, y0, z0 = position[0] + middle, position[1] + middle, position[2] + middle
+    offset = narrow_offset(position)
     last = np.int32(NOTHING)
     for u in range(depths.size):
-        d, column = depths[u], columns[u]
-        x = np.int32(d * (ray[0] * column + ray[1]) + x0)
-        y = np.int32(d * (ray[2] * column + ray[3]) + y0)
-        z = np.int32(d * (ray[4] * column + ray[5]) + z0)
-        key = np.int32((x << np.int32(2 * NARROW)) | (y << np.int32(NARROW)) | z)
-        key = key if (d > ZERO) & (d < NO_RETURN) else np.int32(NOTHING)
+        key = narrow_key(depths[u], columns[u], ray, offset)
         now[u] = key
         news[u] = _is_new(key, last, before[u], before[u + 1])
         last = key
 
 
 @cell
+def narrow_offset(position):
+    """Return the camera's position in cells, shifted to keep all cells within reach of an int32 key positive."""
+    middle = np.float32(1 << (NARROW - 1))
+    return position[0] + middle, position[1] + middle, position[2] + middle
+
+
+@cell
+def narrow_key(d, column, ray, offset):
+    """Return the int32 key of the cell that holds the point at depth `d` of a pixel; NOTHING without a depth."""
+    x = np.int32(d * (ray[0] * column + ray[1]) + offset[0])
+    y = np.int32(d * (ray[2] * column + ray[3]) + offset[1])
+    z = np.int32(d * (ray[4] * column + ray[5]) + offset[2])
+    key = np.int32((x << np.int32(2 * NARROW)) | (y << np.int32(NARROW)) | z)
+    return key if (d > ZERO) & (d < NO_RETURN) else np.int32(NOTHING)
+
+
+@cell
 def _wide_row(depths, columns, ray, position, now, before, news):
     """Pack each pixel's cell into an int64 and mark news."""
-    middle = np.int64(1 << (WIDE - 1))
     last = np.int64(NOTHING)
     for u in range(depths.size):
-        d = depths[u]
-        x, y, z = _point_cell(d, columns[u], ray, position)
-        key = ((np.int64(x) + middle) << (2 * WIDE)) | ((np.int64(y) + middle) << WIDE) | (np.int64(z) + middle)
-        key = key if (d > ZERO) & (d < NO_RETURN) else np.int64(NOTHING)
+        key = wide_key(depths[u], columns[u], ray, position)
         now[u] = key
         news[u] = _is_new(key, last, before[u], before[u + 1])
         last = key
+
+
+@cell
+def wide_key(d, column, ray, position):
+    """Return the int64 key of the cell that holds the point at depth `d` of a pixel; NOTHING without a depth."""
+    middle = np.int64(1 << (WIDE - 1))
+    x, y, z = _point_cell(d, column, ray, position)
+    key = ((np.int64(x) + middle) << (2 * WIDE)) | ((np.int64(y) + middle) << WIDE) | (np.int64(z) + middle)
+    return key if (d > ZERO) & (d < NO_RETURN) else np.int64(NOTHING)
 
 
 @cell

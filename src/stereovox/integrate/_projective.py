@@ -8,6 +8,7 @@ classified by two comparisons, and only a layer with cells near a measurement is
 import numpy as np
 
 from stereovox._jit import cell, kernel
+from stereovox._math import floor
 from stereovox.integrate._cells import HALF, NEAR_PLANE, NO_RETURN, ONE, ZERO, index, table_row, window_level
 from stereovox.integrate._windows import COARSEST, build, nearest_tiles, place
 from stereovox.maps._cells import find
@@ -40,7 +41,7 @@ def survey(depth_m, ends, view, table, windows, scratch, nearest, stack, free, m
     farthest = build(ends.reshape(ends.size), windows, scratch)
     if table.marks:
         nearest_tiles(depth_m, nearest[0], nearest[1])
-    return candidates(view, table, windows, nearest, _end_of_view(view, table, farthest), stack, free, mixed)
+    return _candidates(view, table, windows, nearest, _end_of_view(view, table, farthest), stack, free, mixed)
 
 
 @cell
@@ -52,16 +53,16 @@ def _end_of_view(view, table, farthest):
     return min(view.max_range, max(farthest, TEN * NEAR_PLANE) * (ONE + SLACK) + behind)
 
 
-@kernel
-def candidates(view, table, windows, nearest, end, stack, free, mixed):
+@cell
+def _candidates(view, table, windows, nearest, end, stack, free, mixed):
     """List the blocks that are wholly free and those that must be evaluated; see `survey`.
 
     end: depth in metres beyond which the image says nothing.
     """
     n_free, n_mixed = 0, 0
-    low_x, high_x = _touched(view, end, 0)
-    low_y, high_y = _touched(view, end, 1)
-    low_z, high_z = _touched(view, end, 2)
+    low_x, high_x = _touched(view, end, np.int64(0))  # of one type: literal numbers would each compile it again
+    low_y, high_y = _touched(view, end, np.int64(1))
+    low_z, high_z = _touched(view, end, np.int64(2))
     for bx in range(low_x, high_x + 1, COARSE):
         for by in range(low_y, high_y + 1, COARSE):
             for bz in range(low_z, high_z + 1, COARSE):
@@ -121,36 +122,45 @@ def evaluate(depth_m, view, table, windows, blocks, hit_of, hit_values, values, 
     depth_m: (h, w) REP 117 depth image, from which `windows` was made. hit_of: (n,) place of each block among the hits,
     -1 for none. scratch: a `LayerScratch`.
     """
-    side = np.float32(8) * view.voxel_size
     for i in range(blocks.shape[0]):
-        x, y, z = blocks[i, 0], blocks[i, 1], blocks[i, 2]
-        px = np.float32(x) * side - view.position[0]
-        py = np.float32(y) * side - view.position[1]
-        pz = np.float32(z) * side - view.position[2]
-        R = view.rotation
-        cx = (R[0, 0] * px + R[0, 1] * py + R[0, 2] * pz) * view.intrinsics[0]
-        cy = (R[1, 0] * px + R[1, 1] * py + R[1, 2] * pz) * view.intrinsics[1]
-        cz = R[2, 0] * px + R[2, 1] * py + R[2, 2] * pz
+        cx, cy, cz = corner(view, blocks[i, 0], blocks[i, 1], blocks[i, 2])
         out = values[i]
         _clear(view, table, windows, cx, cy, cz, _passed(view, table, cz), scratch, out)
         if table.marks:
-            _mark(depth_m, view, table, cx, cy, cz, out)
+            for c in range(512):
+                mark = marked(depth_m, view, table, cx, cy, cz, c)
+                out[c] = np.int16(mark) if mark > 0 else out[c]
         if hit_of[i] >= 0:
             hits = hit_values[hit_of[i]]
             for c in range(512):
-                out[c] = max(out[c], hits[c]) if hits[c] > 0 else out[c]
+                out[c] = with_hit(out[c], hits[c])
 
 
 @cell
 def _pass(view, table, blocks, out):
     """Write the evidence (n,) on all cells of each of `blocks` (n, 3), which are wholly free."""
+    for i in range(blocks.shape[0]):
+        _, _, cz = corner(view, blocks[i, 0], blocks[i, 1], blocks[i, 2])
+        out[i] = np.int16(_passed(view, table, cz))
+
+
+@cell
+def corner(view, bx, by, bz):
+    """Return where the corner of block (bx, by, bz) stands, camera axes, x and y times the focal length."""
     side = np.float32(8) * view.voxel_size
     R = view.rotation
-    for i in range(blocks.shape[0]):
-        px = np.float32(blocks[i, 0]) * side - view.position[0]
-        py = np.float32(blocks[i, 1]) * side - view.position[1]
-        pz = np.float32(blocks[i, 2]) * side - view.position[2]
-        out[i] = np.int16(_passed(view, table, R[2, 0] * px + R[2, 1] * py + R[2, 2] * pz))
+    px = np.float32(bx) * side - view.position[0]
+    py = np.float32(by) * side - view.position[1]
+    pz = np.float32(bz) * side - view.position[2]
+    x = (R[0, 0] * px + R[0, 1] * py + R[0, 2] * pz) * view.intrinsics[0]
+    y = (R[1, 0] * px + R[1, 1] * py + R[1, 2] * pz) * view.intrinsics[1]
+    return x, y, R[2, 0] * px + R[2, 1] * py + R[2, 2] * pz
+
+
+@cell
+def with_hit(value, hit):
+    """Return the evidence on a cell that also has `hit`, 0 for none; both int16."""
+    return max(value, hit) if hit > 0 else value
 
 
 @cell
@@ -184,8 +194,8 @@ def _touched(view, end, axis):
         reached = end * (x * view.forward[0, axis] + y * view.forward[1, axis] + view.forward[2, axis])
         low, high = min(low, reached), max(high, reached)
     side = np.float32(8 * COARSE) * view.voxel_size
-    first = np.int64(np.floor((view.position[axis] + low - view.voxel_size) / side))
-    last = np.int64(np.floor((view.position[axis] + high + view.voxel_size) / side))
+    first = np.int64(floor((view.position[axis] + low - view.voxel_size) / side))
+    last = np.int64(floor((view.position[axis] + high + view.voxel_size) / side))
     return first * COARSE, last * COARSE
 
 
@@ -345,23 +355,31 @@ def _aim(view, windows, nearest, cx, cy, cz, steps, depths, at):
     nearest: depth up to which cells are skipped.
     """
     fx_steps, fy_steps, z_steps = steps
+    for c in range(LAYER):
+        z = cz + z_steps[c]
+        depths[c] = z
+        at[c] = window_place(view, windows, nearest, cx + fx_steps[c], cy + fy_steps[c], z)
+
+
+@cell
+def window_place(view, windows, nearest, x, y, z):
+    """Return where the window value of a cell stands; that of one that is not looked at is UNSEEN.
+
+    x, y, z: its centre in camera axes, x and y times the focal length. nearest: depth up to which cells are skipped.
+    """
     u_centre, v_centre = view.intrinsics[2] + HALF, view.intrinsics[3] + HALF
     right, bottom = np.float32(view.width - 1), np.float32(view.height - 1)
     u_end, v_end = np.float32(view.width), np.float32(view.height)
     first, last = np.int32(windows.first), np.int32(COARSEST)
-    unseen = np.int32(windows.image.size - 1)
-    for c in range(LAYER):
-        z = cz + z_steps[c]
-        ahead = (z > nearest) & (z <= view.max_range)
-        inverse = ONE / (z if ahead else ONE)
-        u = (cx + fx_steps[c]) * inverse + u_centre
-        v = (cy + fy_steps[c]) * inverse + v_centre
-        u_rim, v_rim = view.rim[0] * inverse, view.rim[1] * inverse
-        seen = ahead & (u >= -u_rim) & (v >= -v_rim) & (u < u_end + u_rim) & (v < v_end + v_rim)
-        level = min(max(window_level(view.spread * inverse), first), last)
-        i = place(level, min(max(v, ZERO), bottom), min(max(u, ZERO), right), windows.pitch, windows.height)
-        depths[c] = z
-        at[c] = i if seen else unseen
+    ahead = (z > nearest) & (z <= view.max_range)
+    inverse = ONE / (z if ahead else ONE)
+    u = x * inverse + u_centre
+    v = y * inverse + v_centre
+    u_rim, v_rim = view.rim[0] * inverse, view.rim[1] * inverse
+    seen = ahead & (u >= -u_rim) & (v >= -v_rim) & (u < u_end + u_rim) & (v < v_end + v_rim)
+    level = min(max(window_level(view.spread * inverse), first), last)
+    i = place(level, min(max(v, ZERO), bottom), min(max(u, ZERO), right), windows.pitch, windows.height)
+    return i if seen else np.int32(windows.image.size - 1)
 
 
 @cell
@@ -385,41 +403,58 @@ def _write_free_layer(depths, measured, before, behind, lowest, out):
 def _look_up(view, table, scratch, lowest, out):
     """Write the sensor table's evidence on cells that are not wholly before their measurement, never below `lowest`."""
     depths, measured, scale, at, row = scratch
-    last_row = np.int32(table.hit.size - 1)
-    columns, clear = np.int32(table.clear.shape[1]), table.clear.reshape(table.clear.size)
-    last_column, middle_column = np.float32(columns - 1), np.float32(columns) * HALF
     for c in range(LAYER):
-        row[c] = min(np.int32(min(max(measured[c], ZERO), view.max_range) * table.rows_per_metre), last_row)
+        row[c] = measured_row(view, table, measured[c])
     _load(table.columns_per_metre, row, scale)
     for c in range(LAYER):
-        t = (depths[c] - measured[c]) * scale[c] + middle_column
-        at[c] = np.int32(np.int32(row[c] * columns) + np.int32(min(max(t, ZERO), last_column)))
-    _load(clear, at, row)
+        at[c] = table_place(table, row[c], depths[c] - measured[c], scale[c])
+    _load(table.clear.reshape(table.clear.size), at, row)
     for c in range(LAYER):
-        out[c] = np.int16(max(row[c], lowest) if measured[c] > ZERO else np.int32(0))
+        out[c] = cleared(row[c], lowest, measured[c])
 
 
 @cell
-def _mark(depth_m, view, table, cx, cy, cz, out):
-    """Overwrite with the positive evidence, where there is any, of the pixel at the cell's centre."""
-    u_centre, v_centre = view.intrinsics[2] + HALF, view.intrinsics[3] + HALF
+def measured_row(view, table, measured):
+    """Return the table row of a window value."""
+    last_row = np.int32(table.hit.size - 1)
+    return min(np.int32(min(max(measured, ZERO), view.max_range) * table.rows_per_metre), last_row)
+
+
+@cell
+def table_place(table, row, behind, scale):
+    """Return where the table, as a flat array, says what a cell gets so far `behind` a measurement in metres.
+
+    scale: table columns a metre in this row.
+    """
+    columns = np.int32(table.clear.shape[1])
+    last_column, middle_column = np.float32(columns - 1), np.float32(columns) * HALF
+    t = behind * scale + middle_column
+    return np.int32(np.int32(row * columns) + np.int32(min(max(t, ZERO), last_column)))
+
+
+@cell
+def cleared(said, lowest, measured):
+    """Return what a cell gets of which the table says so, never below `lowest`: nothing where nothing was measured."""
+    return np.int16(max(said, lowest) if measured > ZERO else np.int32(0))
+
+
+@cell
+def marked(depth_m, view, table, cx, cy, cz, c):
+    """Return the positive evidence of the pixel at the centre of cell `c` of a block, 0 where there is none."""
     rows = table.hit.size
     last_column, middle_column = np.float32(table.mark.shape[1] - 1), np.float32(table.mark.shape[1]) * HALF
-    for c in range(512):
-        z = cz + view.steps[2, c]
-        if z <= NEAR_PLANE or z > view.max_range:
-            continue
-        u = (cx + view.steps[0, c]) / z + u_centre
-        v = (cy + view.steps[1, c]) / z + v_centre
-        if not (u >= ZERO and v >= ZERO and u < np.float32(view.width) and v < np.float32(view.height)):
-            continue
-        d = depth_m[np.int32(v), np.int32(u)]
-        if not (d > ZERO and d < NO_RETURN):
-            continue
-        row = table_row(d, table.rows_per_metre, rows)
-        t = (z - d) * table.columns_per_metre[row] + middle_column
-        if t < ZERO or t > last_column:
-            continue
-        e = table.mark[row, np.int32(t)]
-        if e > 0:
-            out[c] = np.int16(e)
+    z = cz + view.steps[2, c]
+    if z <= NEAR_PLANE or z > view.max_range:
+        return np.int32(0)
+    u = (cx + view.steps[0, c]) / z + (view.intrinsics[2] + HALF)
+    v = (cy + view.steps[1, c]) / z + (view.intrinsics[3] + HALF)
+    if not (u >= ZERO and v >= ZERO and u < np.float32(view.width) and v < np.float32(view.height)):
+        return np.int32(0)
+    d = depth_m[np.int32(v), np.int32(u)]
+    if not (d > ZERO and d < NO_RETURN):
+        return np.int32(0)
+    row = table_row(d, table.rows_per_metre, rows)
+    t = (z - d) * table.columns_per_metre[row] + middle_column
+    if t < ZERO or t > last_column:
+        return np.int32(0)
+    return table.mark[row, np.int32(t)]

@@ -11,7 +11,7 @@ below that; so the place of a pixel takes a few sums and no table look-up (`plac
 
 import numpy as np
 
-from stereovox._jit import cell, kernel
+from stereovox._jit import cell
 from stereovox.integrate._cells import NO_RETURN, ZERO, float_of, usable
 
 COARSEST = 8
@@ -33,7 +33,7 @@ def place(level, v, u, pitch, height):
     return np.int32(start + np.int32(np.int32(np.int32(v * scale) * pitch) + np.int32(u * scale)))
 
 
-@kernel
+@cell
 def build(depth_m, windows, scratch):
     """Fill the window images and tiles (`Windows`) of all levels from `windows.first` on; return the farthest depth.
 
@@ -178,7 +178,7 @@ def _fill_big(lows, highs, start, number):
         highs[i] = ZERO
 
 
-@kernel
+@cell
 def nearest_tiles(depth_m, lows16, lows64):
     """Fill tiles (rows, columns) of 16 and 64 pixels with the nearest depth in them, pixels without value left out."""
     height, width = depth_m.shape

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from stereovox.config import Config
 from stereovox.errors import ConfigError
+from stereovox.maps.storage import Storage
 from stereovox.maps.voxel_map import State, VoxelMap, load_map, unbounded
 
 __all__ = ["State", "VoxelMap", "load_map", "make_map", "unbounded"]
@@ -14,7 +15,7 @@ __all__ = ["State", "VoxelMap", "load_map", "make_map", "unbounded"]
 
 def make_map(config: Config, resume: VoxelMap | None = None, tiles: Path | None = None) -> VoxelMap:
     """Return the map that `config` asks for: unbounded, or in a window that moves with the camera, or within
-    `max_memory`.
+    `max_memory`, or on a graphics card.
 
     resume: a map to go on with. tiles: folder for the cells that leave a window, a temporary one by default; it is not
     there where this raises. Raises ConfigError when the settings would change what the cells of `resume` mean, and when
@@ -48,6 +49,10 @@ def _made(config: Config, resume: VoxelMap | None, tiles: Path | None) -> VoxelM
 
 
 def _without_window(config: Config, resume: VoxelMap | None) -> VoxelMap:
+    if config.device == "cuda":
+        from stereovox.maps.gpu import gpu_map
+
+        return gpu_map(config, resume)
     if config.max_memory is None:
         return VoxelMap(config) if resume is None else _continued(resume, config)
     from stereovox.maps.capped import CappedMap
@@ -59,8 +64,8 @@ def _without_window(config: Config, resume: VoxelMap | None) -> VoxelMap:
 
 
 def _continued(resume: VoxelMap, config: Config) -> VoxelMap:
-    """Return the map itself with the settings of the run that goes on; a copy of one that has bounds."""
-    if resume.storage.bounded:
+    """Return the map itself with the settings of the run that goes on; a copy of one with bounds or elsewhere."""
+    if type(resume.storage) is not Storage:
         return unbounded(resume, config)
     resume.storage.continue_with(config)
     return resume

@@ -9,6 +9,7 @@ any number of threads, and `settle` takes the rows from blocks that have sunk to
 import numpy as np
 
 from stereovox._jit import cell, kernel
+from stereovox._math import floor
 from stereovox.maps._cells import AT_FLOOR, find, row_of, says_something
 from stereovox.maps._pool import BARE, make_bare, need, new_row, with_row
 
@@ -31,27 +32,42 @@ def weigh(stored, sure, least, coords, values, uniform, steps, mask, out):
     """
     hits, passes, into, edge, every = np.int64(0), np.int64(0), np.int64(0), np.int64(0), np.int64(0)
     for i in range(coords.shape[0]):
-        if _chosen(coords, i, mask):
-            row = row_of(stored, coords[i, 0], coords[i, 1], coords[i, 2])
-            if row >= 0:
-                one = _of_row(values[i], least, stored.values[row], sure)
-                hits, passes, into, every = hits + one[0], passes + one[1], into + one[2], every + one[3]
-                if one[2]:
-                    edge += _at_edge(values[i], least, stored.values[row], stored.unknown, sure)
-            else:
-                found = _hits(values[i], least)
-                every += found
-                into += found if (row == AT_FLOOR) & (np.int16(stored.lowest) <= sure[0]) else np.int64(0)
+        if chosen(coords, i, mask):
+            one = weighed(stored, sure, least, coords, i, values[i])
+            hits, passes, into, edge, every = (
+                hits + one[0], passes + one[1], into + one[2], edge + one[3], every + one[4],
+            )  # fmt: skip
     for i in range(uniform.shape[0]):
-        if _chosen(uniform, i, mask):
-            row = row_of(stored, uniform[i, 0], uniform[i, 1], uniform[i, 2])
-            if row >= 0:
-                passes -= np.int64(steps[i]) * _occupied(stored.values[row], sure)
+        if chosen(uniform, i, mask):
+            passes += looked_through(stored, sure, uniform, i, steps[i])
     out[0], out[1], out[2], out[3], out[4] = hits, passes, into, edge, every
 
 
 @cell
-def _chosen(coords, i, mask):
+def weighed(stored, sure, least, coords, i, said):
+    """Return the five weights, as in `weigh`, of what is `said` (512,) of block `i` of `coords`."""
+    row = row_of(stored, coords[i, 0], coords[i, 1], coords[i, 2])
+    if row >= 0:
+        hits, passes, into, every = _of_row(said, least, stored.values[row], sure)
+        edge = np.int64(0)
+        if into:
+            edge = _at_edge(said, least, stored.values[row], stored.unknown, sure)
+        return hits, passes, into, edge, every
+    found = _hits(said, least)
+    into = found if (row == AT_FLOOR) & (np.int16(stored.lowest) <= sure[0]) else np.int64(0)
+    return np.int64(0), np.int64(0), into, np.int64(0), found
+
+
+@cell
+def looked_through(stored, sure, coords, i, step):
+    """Return what weighs against surely occupied cells where all cells of block `i` of `coords` get a step."""
+    row = row_of(stored, coords[i, 0], coords[i, 1], coords[i, 2])
+    return -np.int64(step) * _occupied(stored.values[row], sure) if row >= 0 else np.int64(0)
+
+
+@cell
+def chosen(coords, i, mask):
+    """Tell whether block `i` of `coords` is one of those looked at; see `weigh`."""
     mixed = np.uint32(coords[i, 0]) * MIX_X ^ np.uint32(coords[i, 1]) * MIX_Y ^ np.uint32(coords[i, 2]) * MIX_Z
     return (np.uint32(mixed >> SHIFT) & mask) == 0
 
@@ -191,8 +207,14 @@ def rescale(values, factor, shift, most, out):
     """
     for i in range(values.shape[0]):
         for c in range(512):
-            value = np.float32(values[i, c])
-            out[i, c] = np.int16(min(np.floor(value * factor + shift), most) if value != ZERO else ZERO)
+            out[i, c] = rescaled(values[i, c], factor, shift, most)
+
+
+@cell
+def rescaled(value, factor, shift, most):
+    """Return what `rescale` makes of one cell's evidence."""
+    value = np.float32(value)
+    return np.int16(min(floor(value * factor + shift), most) if value != ZERO else ZERO)
 
 
 @cell
@@ -201,7 +223,7 @@ def _add_to_row(block, steps, unknown, prior, lowest, highest):
     moved, above = NIL, NIL
     for c in range(512):
         old = np.int16(block[c])
-        new = _added(old, steps[c], unknown, prior, lowest, highest)
+        new = added_step(old, steps[c], unknown, prior, lowest, highest)
         moved = np.int16(moved + (ONE if new != old else NIL))
         above = np.int16(above | np.int16(new ^ lowest))
         block[c] = new
@@ -209,9 +231,11 @@ def _add_to_row(block, steps, unknown, prior, lowest, highest):
 
 
 @cell
-def _added(old, step, unknown, prior, lowest, highest):
-    """What `_cells.added` says, all in int16: twice as many cells in one instruction. The compiler makes of the first
-    clamp an addition that saturates."""
+def added_step(old, step, unknown, prior, lowest, highest):
+    """Return what `_cells.added` says, all in int16: twice as many cells in one instruction.
+
+    The compiler makes of the first clamp an addition that saturates.
+    """
     start = prior if old == unknown else old
     total = np.int16(min(max(np.int64(start) + np.int64(step), LOW), HIGH))
     new = min(max(total, lowest), highest)

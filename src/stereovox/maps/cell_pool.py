@@ -36,7 +36,7 @@ class CellPool:
     """
 
     def __init__(self, rules: CellRules, rows: int = 256, bare: int = 256):
-        self._rules = rules
+        self.rules = rules
         self._limits = tuple(map(np.int16, (rules.format.unknown, rules.prior, rules.lowest, rules.highest)))
         self._least = rows, bare
         self._has_settled = False
@@ -51,7 +51,7 @@ class CellPool:
     @property
     def unknown(self) -> int:
         """What a cell without evidence holds."""
-        return self._rules.format.unknown
+        return self.rules.format.unknown
 
     @property
     def memory_bytes(self) -> int:
@@ -68,8 +68,8 @@ class CellPool:
     @property
     def stored_cells(self) -> StoredCells:
         """What kernels that only read need; holds until the pool changes."""
-        unknown = np.int32(self._rules.format.unknown)
-        return StoredCells(self.table, self.coords, self.values, unknown, self._rules.lowest)
+        unknown = np.int32(self.rules.format.unknown)
+        return StoredCells(self.table, self.coords, self.values, unknown, self.rules.lowest)
 
     @property
     def arrays(self) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.integer], NDArray[np.int64]]:
@@ -192,7 +192,7 @@ class CellPool:
         return np.concatenate([np.arange(rows), len(self.values) + np.arange(bare)])
 
     def _cells_at(self, places: NDArray[np.int64], values: NDArray[np.integer]) -> NDArray[np.integer]:
-        cells = np.full((len(places), CELLS), self._rules.lowest, values.dtype)
+        cells = np.full((len(places), CELLS), self.rules.lowest, values.dtype)
         has_row = places < len(values)
         cells[has_row] = values[places[has_row]]
         return cells

@@ -3,9 +3,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stereovox.maps import _add
 from stereovox.maps.blocks import StoredCells
@@ -63,16 +65,25 @@ class Agreement(NamedTuple):
 
 
 def agreement(stored: StoredCells, rules: CellRules, evidence: Evidence, firm: int) -> Agreement:
-    """Weigh `evidence` against the cells of a map; see `Storage.agreement`.
+    """Weigh `evidence` against the cells of a map; see `Storage.agreement`."""
+
+    def weigh(least: np.int16, mask: np.uint32) -> NDArray[np.float64]:
+        weights = np.zeros(5)
+        _add.weigh(
+            stored, rules.sure, least, evidence.coords, evidence.values, evidence.uniform, evidence.uniform_values,
+            mask, weights,
+        )  # fmt: skip
+        return weights
+
+    return sampled(len(evidence.coords) + len(evidence.uniform), firm, weigh)
+
+
+def sampled(blocks: int, firm: int, weigh: Callable[[np.int16, np.uint32], NDArray[np.float64]]) -> Agreement:
+    """Return what `weigh` finds: it takes `least` and `mask` as `_add.weigh` does, and returns its five weights.
 
     Of a frame with more than SAMPLE blocks every second, fourth ... is looked at, by a hash of its coordinates: the
     same ones whatever their order.
     """
-    blocks = len(evidence.coords) + len(evidence.uniform)
     mask = (1 << max(blocks // SAMPLE, 1).bit_length() - 1) - 1
-    weights = np.zeros(5)
-    _add.weigh(
-        stored, rules.sure, np.int16(min(firm, LARGEST)), evidence.coords, evidence.values, evidence.uniform,
-        evidence.uniform_values, np.uint32(mask), weights,
-    )  # fmt: skip
+    weights = weigh(np.int16(min(firm, LARGEST)), np.uint32(mask))
     return Agreement(*((mask + 1) / LOG_ODDS_SCALE * weights).tolist())

@@ -50,7 +50,8 @@ class Config(Section):
         integrator: `projective`, `ray`, `line`, or one that another package registers.
         threads: Threads of the integrator; the map does not depend on their number.
         device: `cpu`, or `cuda` for an NVIDIA graphics card: the integrator `projective` with pinhole cameras, for maps
-            without a window, `max_memory`, `map.keep_times` or `sphere`. Without such a card it is `cpu`, and a line says so.
+            without a window, `max_memory`, `map.keep_times` or `sphere`. Without such a card it is `cpu`, and a line
+            says so.
         pose_rigidity_tolerance: Largest entry of abs(R^T R - I) that counts as rounding of a pose.
         deadline_ms: Milliseconds a frame may take; `pace` sets what is left out where frames take longer. Not set:
             no limit.

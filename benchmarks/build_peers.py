@@ -103,7 +103,10 @@ def main() -> int:
     unknown = [name for name in arguments.names if name not in LIBRARIES]
     if unknown:
         parser.error(f"unknown: {', '.join(unknown)}; known: {', '.join(LIBRARIES)}")
-    arguments.out.mkdir(parents=True, exist_ok=True)
+    try:
+        arguments.out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        parser.error(f"--out {arguments.out}: {error.strerror}; name a folder that can be written")
     failed = 0
     for name in arguments.names or LIBRARIES:
         try:

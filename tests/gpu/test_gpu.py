@@ -131,6 +131,7 @@ def test_what_needs_a_card_and_has_no_mapper_raises(missing):
         ({"window.size": [9, 9, 9]}, "window.size"),
         ({"max_memory": "1 GB"}, "max_memory"),
         ({"map.keep_times": True}, "map.keep_times True"),
+        ({"sphere.step_deg": 1.0}, "sphere.step_deg 1.0"),
         ({"profile": "ist2019"}, "dimensions 2"),
     ],
     ids=str,

@@ -50,7 +50,8 @@ class Config(Section):
         integrator: `projective`, `ray`, `line`, or one that another package registers.
         threads: Threads of the integrator; the map does not depend on their number.
         device: `cpu`, or `cuda` for an NVIDIA graphics card: the integrator `projective` with pinhole cameras, for maps
-            without a window, `max_memory` or `map.keep_times`. Without such a card it is `cpu`, and a line says so.
+            without a window, `max_memory`, `map.keep_times` or `sphere`. Without such a card it is `cpu`, and a line
+            says so.
         pose_rigidity_tolerance: Largest entry of abs(R^T R - I) that counts as rounding of a pose.
         deadline_ms: Milliseconds a frame may take; `pace` sets what is left out where frames take longer. Not set:
             no limit.
@@ -161,6 +162,7 @@ class Config(Section):
             "window.size": self.window.size is not None,
             "max_memory": self.max_memory is not None,
             "map.keep_times": self.map.keep_times,
+            "sphere.step_deg": self.sphere.step_deg is not None,
         }
         for name, wanted in not_there.items():
             if wanted:

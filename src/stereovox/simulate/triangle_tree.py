@@ -14,7 +14,7 @@ MOST_LEVELS = 64
 
 
 class TriangleTree:
-    """Triangles (M, 3, 3) float64 in metres, sorted into a balanced tree.
+    """Triangles (M, 3, 3) float64 in metres, at least one and all finite, sorted into a balanced tree.
 
     On each level a box's triangles are split into two halves of equal number along the axis that makes the halves'
     surfaces smallest (Goldsmith and Salmon 1987): rays meet a box as often as its surface is large.

@@ -214,6 +214,14 @@ def test_what_cannot_be_built_is_told_and_the_rest_is_built(tmp_path):
     assert f"ufomap: not built: no ufomap in {tmp_path}; clone it there" in done.stderr
 
 
+def test_a_folder_that_cannot_be_made_is_named(tmp_path):
+    (file := tmp_path / "file").touch()
+    words = [sys.executable, build_peers.__file__, str(tmp_path), "--out", str(file)]
+    done = subprocess.run(words, capture_output=True, text=True)
+    assert done.returncode == 2
+    assert done.stderr.splitlines()[-1].endswith(f"--out {file}: File exists; name a folder that can be written")
+
+
 def test_a_library_is_built_from_its_checkout(tmp_path, monkeypatch):
     """A made library: a header, a source, and an adapter that calls it."""
     if not COMPILER:

@@ -73,13 +73,15 @@ class Census:
         raw = np.empty((height, width), np.int16)
         count = max(1, round(height / STRIP))
 
+        parts = _parts(count, self._config.threads)
+        rooms = {part.start: self._room(part.start, width) for part in parts}  # here, where no other thread is at it
+
         def match(part: slice) -> None:
-            room = self._room(part.start, width)
             for strip in range(part.start, part.stop):
                 first, end = height * strip // count, height * (strip + 1) // count
-                _semiglobal.match(*planes, max(0, first - WARM), first, end, self._settings, room, raw)
+                _semiglobal.match(*planes, max(0, first - WARM), first, end, self._settings, rooms[part.start], raw)
 
-        in_shards(match, _parts(count, self._config.threads))
+        in_shards(match, parts)
         return raw
 
     def _described(self, image: Image, beyond: int, sign: int) -> Image:

@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from stereovox.threads import in_shards, run_both, shards
+from stereovox.threads import Scratch, in_shards, run_both, shards
 
 
 @pytest.mark.parametrize("threads", [1, 2, 3, 16])
@@ -72,3 +72,26 @@ def test_a_forked_child_has_threads_of_its_own():
     child.kill()
     assert not hangs
     assert child.exitcode == 0
+
+
+def test_scratch_is_lent_to_one_at_a_time_and_used_again():
+    made, lent = [], []
+    scratch, meeting = Scratch(lambda: made.append([]) or made[-1]), threading.Barrier(3, timeout=10)
+
+    def work(piece):
+        lent.append(id(piece))
+        meeting.wait()  # all hold theirs at the same time
+
+    for _ in range(2):
+        in_shards(lambda part: scratch.lend(work), shards(9, 3))
+    assert len(made) == 3
+    assert set(lent[:3]) == set(lent[3:]) == set(map(id, made))
+
+
+def test_scratch_comes_back_from_work_that_fails():
+    made = []
+    scratch = Scratch(lambda: made.append([]) or made[-1])
+    for _ in range(2):
+        with pytest.raises(ZeroDivisionError):
+            scratch.lend(lambda piece: 1 / 0)
+    assert len(made) == 1

@@ -178,6 +178,7 @@ def test_a_full_card_refuses_the_frame_and_keeps_the_map(monkeypatch):
     assert "graphics card" in report.detail
     assert "larger cells" in report.detail
     assert not len(ours.map.cells()[0])
+    assert ours.map.storage.viewpoint is None
     assert ours.map.history.refused == {"memory_full": 1}
     assert ours.add(frame_of(0)).cells == its[0].cells
     assert_same_map(ours.map, theirs.map)

@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import stereovox as sv
+from stereovox import deadline as deadline_module
 from stereovox import mapper as mapper_module
 from stereovox.config import load_config
 from stereovox.deadline import MAX_PATIENCE, PATIENCE, Scheduler, quality_levels
@@ -187,7 +188,8 @@ class Clock:
 
     def __init__(self, monkeypatch):
         self.now, self.frame_ms = 0.0, 0.0
-        monkeypatch.setattr(mapper_module, "perf_counter", self)
+        for module in (deadline_module, mapper_module):
+            monkeypatch.setattr(module, "perf_counter", self)
 
     def __call__(self):
         self.now += self.frame_ms / 2 / 1e3

@@ -3,6 +3,7 @@
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from threading import current_thread
 
 import numpy as np
 import pytest
@@ -11,6 +12,8 @@ import stereovox as sv
 from stereovox import run
 from stereovox.cli import main as command
 from stereovox.cli import options
+from stereovox.deadline import Quality
+from stereovox.errors import SourceError
 from stereovox.opening import open_stream
 
 SOURCE = "sim:room?image_width=160"
@@ -61,6 +64,57 @@ def test_it_makes_the_map_of_the_command(tmp_path):
     assert [report for _, report in seen.reports] == result.reports
     assert result.summary()["frames"] == result.map.frames == 12
     assert options.CHECKPOINT_S == run.CHECKPOINT_S
+
+
+class Breaking:
+    """A recording of which a frame cannot be read; another has a fault."""
+
+    def __init__(self, bad):
+        self._frames, self._bad = list(open_stream(SOURCE, ":8")), bad
+        self.length, self.dropped, self.notes, self.layout = len(self._frames), 0, (), ""
+        self.name, self.camera = "breaking", self._frames[0].camera
+
+    def after(self, count):
+        raise AssertionError("nothing to go on with")
+
+    def __iter__(self):
+        for i, frame in enumerate(self._frames):
+            if i == self._bad:
+                raise SourceError("frame 5: cannot be read")
+            yield replace(frame, T_world_sensor=None) if i == 2 else frame
+
+
+def test_frames_are_prepared_in_advance_on_two_threads_and_the_map_is_the_same(tmp_path, monkeypatch):
+    prepared_by, plain = [], Quality._prepare
+
+    def prepare(self, frame):
+        prepared_by.append(current_thread())
+        return plain(self, frame)
+
+    monkeypatch.setattr(Quality, "_prepare", prepare)
+    seen = {}
+    for threads in (1, 2):
+        seen[threads], notes = Seen(), []
+        with pytest.raises(SourceError, match="frame 5"):
+            sv.map_recording(
+                Breaking(5), tmp_path / f"{threads}.svox", voxel_size=0.1, threads=threads, observers=[seen[threads]],
+                notify=notes.append,
+            )  # fmt: skip
+        assert notes[-1].startswith("stopped after 5 frames")
+    assert [one.refused for _, one in seen[2].reports] == [None, None, "no_pose", None, None]
+    assert [one.refused for _, one in seen[1].reports] == [one.refused for _, one in seen[2].reports]
+    assert len(prepared_by) == 10
+    assert set(prepared_by[:5]) == {current_thread()}
+    assert prepared_by[5:].count(current_thread()) == 1  # the first: nothing was to be done before it
+    same_cells(tmp_path / "1.svox", tmp_path / "2.svox")
+
+
+def test_a_frame_that_was_not_expected_is_added_all_the_same():
+    mapper, (one, other) = sv.Mapper(voxel_size=0.1, threads=2), list(open_stream(SOURCE, ":2"))
+    mapper.expect(other)
+    assert mapper.add(one).refused is None
+    assert mapper.add(other).refused is None
+    assert mapper.map.frames == 2
 
 
 def test_a_run_that_was_stopped_goes_on_where_it_was(tmp_path):

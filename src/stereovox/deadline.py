@@ -10,7 +10,8 @@ from __future__ import annotations
 from contextlib import suppress
 from functools import lru_cache
 from math import sqrt
-from typing import Protocol
+from time import perf_counter
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -25,6 +26,7 @@ from stereovox.integrate import make_integrator
 from stereovox.integrate.views import MAX_CAMERAS
 from stereovox.sensors.model import REACH_SIGMA
 from stereovox.sensors.noise import RangeNoise
+from stereovox.threads import Ahead
 from stereovox.trust.health import FULL
 
 PATIENCE, MAX_PATIENCE = 8, 128
@@ -52,6 +54,11 @@ class Deadline:
             raise FrameRefused("no_time", "skipped: frames take longer than deadline_ms even at the quickest level")
         return self._levels[self._scheduler.level]
 
+    def expect(self, frame: AnyFrame) -> None:
+        """Begin to prepare the next frame, where its level is known by now."""
+        if self._scheduler is None:
+            self._levels[0].prepare.begin(frame)
+
     def record(self, milliseconds: float) -> None:
         """Record the time that a frame took at the level that `quality` returned."""
         if self._scheduler is not None:
@@ -64,7 +71,7 @@ class Deadline:
         self._warm.add(camera)
         for level in self._levels[1:]:
             with suppress(FrameRefused):
-                level.integrator.evidence(level.depth.image(level.depth.matched(frame)))
+                level.integrator.evidence(level.prepare(frame).image)
 
 
 class DepthStage(Protocol):
@@ -79,12 +86,36 @@ class DepthStage(Protocol):
         ...
 
 
+class Prepared(NamedTuple):
+    """A frame ready for the integrator, and the milliseconds that took."""
+
+    frame: Frame  # with its depth, where that had to be matched
+    image: DepthImage
+    match_ms: float
+    depth_ms: float
+
+
 class Quality:
-    """A quality level: the depth stage and the integrator that take a frame to evidence."""
+    """A quality level: the depth stage and the integrator that take a frame to evidence.
+
+    Attributes:
+        name: Its name.
+        depth: The depth stage.
+        integrator: The integrator.
+        prepare: Turns a frame into a depth image; may begin before the frame is added. Raises FrameRefused as `depth`.
+    """
 
     def __init__(self, name: str, depth: DepthStage, config: Config):
         self.name, self.depth = name, depth
         self.integrator = make_integrator(config)
+        self.prepare = Ahead(self._prepare)
+
+    def _prepare(self, frame: AnyFrame) -> Prepared:
+        started = perf_counter()
+        depth_frame = self.depth.matched(frame)
+        matched = started if depth_frame is frame else perf_counter()
+        image = self.depth.image(depth_frame)
+        return Prepared(depth_frame, image, 1e3 * (matched - started), 1e3 * (perf_counter() - matched))
 
 
 def full_quality(config: Config) -> Quality:

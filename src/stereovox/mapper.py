@@ -136,11 +136,8 @@ class Mapper:
             StereovoxError: This thread holds the map's `lock`.
         """
         with self._intake.offer(frame) as offer:  # a FrameRefused ends here and becomes the report
-            started = perf_counter()
             quality = self._deadline.quality()
-            depth_frame = quality.depth.matched(frame)
-            matched = started if depth_frame is frame else perf_counter()
-            image = quality.depth.image(depth_frame)
+            depth_frame, image, match_ms, depth_ms = quality.prepare(frame)
             prepared = perf_counter()
             passed = offer.check(image)
             evidence = quality.integrator.evidence(image)
@@ -152,14 +149,25 @@ class Mapper:
                 offer.accept(passed, quality.name)
                 self.map.history.ways[quality.name] += 1
                 self.map.history.path.walk(passed.sensor, passed.seen)
-            done = perf_counter()
-            match_ms, depth_ms, map_ms = 1e3 * (matched - started), 1e3 * (prepared - matched), 1e3 * (done - prepared)
+            map_ms = 1e3 * (perf_counter() - prepared)
             offer.report = UpdateReport(
                 depth_ms, map_ms, cells, detail=passed.note, match_ms=match_ms, quality=quality.name
             )
             self._deadline.record(match_ms + depth_ms + map_ms)
             self._deadline.warm_up(frame, depth_frame.camera)
         return offer.report
+
+    def expect(self, frame: AnyFrame) -> None:
+        """Begin to prepare the frame that will be added next, in the background, while this one is added.
+
+        Call it before `add` of the frame before; the map is the same without. Nothing happens with one thread
+        (`threads`), or with `deadline_ms`, where the time that is left decides how a frame is prepared.
+
+        Args:
+            frame: The very object that `add` will get. It must not change meanwhile.
+        """
+        if self.config.threads > 1:
+            self._deadline.expect(frame)
 
     def __repr__(self) -> str:
         return _summary(self)

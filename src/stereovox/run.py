@@ -314,6 +314,8 @@ class MapRun:
         all_observers = (*observers, *([] if length is not None else [_Patience(self, done)]))
         stopped = "stopped after {} frames; they are saved in " + f"{self.out}, go on there with resume (--resume)"
         frames = self.source.after(done) if done else self.source
+        if length is not None:  # of a live camera nobody knows when the next frame will come
+            frames = expecting(self.mapper.expect, frames)
         return add_all(
             self.mapper, frames, self._checkpoints, check, all_observers, lambda n: self._notify(stopped.format(n))
         )
@@ -359,6 +361,27 @@ def add_all(
             stopped(len(reports))
         raise
     return reports
+
+
+def expecting(expect: Callable[[SeenT], None], frames: Iterable[SeenT]) -> Iterator[SeenT]:
+    """Yield the frames, each once `expect` was called with the one after it.
+
+    What the source raises is raised after its last frame, as without this.
+    """
+    coming = iter(frames)
+    frame, failure = next(coming, None), None
+    while frame is not None:
+        following = None
+        try:
+            following = next(coming, None)
+        except SourceError as error:
+            failure = error
+        if following is not None:
+            expect(following)
+        yield frame
+        if failure is not None:
+            raise failure
+        frame = following
 
 
 def frames_offered(mapper: AnyMapper[Any]) -> int:

@@ -6,8 +6,9 @@ from __future__ import annotations
 import os
 import threading
 from _thread import RLock
+from collections import deque
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import ExitStack, contextmanager
 from copy import deepcopy
 from functools import lru_cache, wraps
@@ -55,6 +56,36 @@ def run_both(threads: int, first: Callable[[], First], second: Callable[[], Seco
     finally:
         wait([running])
     return one, running.result()
+
+
+class Ahead(Generic[First, Second]):
+    """A function, called by one thread at a time, that can begin in the background before its result is wanted."""
+
+    def __init__(self, function: Callable[[First], Second]):
+        self._function, self._alone = function, MapLock()
+        self._begun: deque[tuple[First, Future[Second]]] = deque(maxlen=2)
+
+    def begin(self, argument: First) -> None:
+        """Call the function in the background; a call with this very object will return, or raise, what comes of it.
+
+        Of calls whose results are not wanted the last two are remembered.
+        """
+        self._begun.append((argument, _pool().submit(self._call, argument)))
+
+    def __call__(self, argument: First) -> Second:
+        """Return what the function returns."""
+        for i, (known, result) in enumerate(self._begun):
+            if known is argument:
+                del self._begun[i]
+                return result.result()
+        return self._call(argument)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "_begun": deque(maxlen=2)}  # a copy begins nothing
+
+    def _call(self, argument: First) -> Second:
+        with self._alone:
+            return self._function(argument)
 
 
 class Scratch(Generic[T]):

@@ -20,30 +20,22 @@ COARSEST = np.float32(1e4)
 
 
 @kernel
-def classify(raw, scale, min_range, max_range, none, infinite, depth_m, reason):
+def classify(raw, scale, min_range, max_range, none, infinite, given, far, depth_m, reason):
     """Fill `depth_m` (float32, REP 117) and `reason` (uint8) from flat `raw`; return the number of valid pixels.
 
     none: a raw value that means "no value" beside zero, negative ones and NaN (65535 in uint16 images). -inf is too
-    near. infinite: what +inf means: itself (too far), or NaN (unknown).
+    near. infinite: what +inf means: itself (too far), or NaN (unknown). given: the source's own reasons, which come
+    first; empty: it has none. far: what a given TOO_FAR becomes: itself or UNKNOWN. A depth within the range, or too
+    near, contradicts it.
     """
     valid = np.int64(0)
     for start in range(0, raw.size, CHUNK):
         part = slice(start, start + CHUNK)
         _metres(raw[part], scale, min_range, max_range, none, infinite, depth_m[part])
-        valid += _reasons(depth_m[part], reason[part])
-    return valid
-
-
-@kernel
-def take_given(given, far, depth_m, reason):
-    """Overwrite reasons with those given by the source, where it has any; return the number of valid pixels.
-
-    far: what a given TOO_FAR becomes: itself or UNKNOWN. A depth within the range, or too near, contradicts it.
-    """
-    valid = np.int64(0)
-    for start in range(0, given.size, CHUNK):
-        part = slice(start, start + CHUNK)
-        valid += _take(given[part], far, depth_m[part], reason[part])
+        if given.size == 0:
+            valid += _reasons(depth_m[part], reason[part])
+        else:
+            valid += _reasons_given(given[part], far, depth_m[part], reason[part])
     return valid
 
 
@@ -63,32 +55,43 @@ def _metres(raw, scale, min_range, max_range, none, infinite, depth_m):
 def _reasons(depth_m, reason):
     valid = np.int32(0)
     for i in range(depth_m.size):
-        d = depth_m[i]
-        why = np.int32(VALID) if d == d else np.int32(UNKNOWN)
-        why = np.int32(TOO_NEAR) if d == NEAR else why
-        why = np.int32(TOO_FAR) if d == FAR else why
+        why = _own(depth_m[i])
         reason[i] = np.uint8(why)
         valid = np.int32(valid + (np.int32(1) if why == 0 else np.int32(0)))
     return valid
 
 
 @cell
-def _take(given, far, depth_m, reason):
-    for i in range(given.size):
-        theirs, own = given[i], reason[i]
-        why = theirs if theirs != VALID else own
-        why = far if theirs == TOO_FAR else why
-        why = UNKNOWN if (theirs == TOO_FAR) & (own == VALID) else why
-        reason[i] = TOO_NEAR if (theirs == TOO_FAR) & (own == TOO_NEAR) else why
+def _reasons_given(given, far, depth_m, reason):
     valid = np.int32(0)
-    for i in range(given.size):
-        why, d = reason[i], depth_m[i]
-        d = NAN if (why == UNMATCHED) | (why == MASKED) | (why == UNKNOWN) else d
-        d = NEAR if why == TOO_NEAR else d
-        d = FAR if why == TOO_FAR else d
-        depth_m[i] = d
-        valid = np.int32(valid + (np.int32(1) if why == VALID else np.int32(0)))
+    for i in range(given.size):  # in numbers as wide as depths: to spread what bytes compare to is slow
+        d, theirs = depth_m[i], np.int32(given[i])
+        own = _own(d)
+        far_here = np.int32(UNKNOWN) if own == np.int32(VALID) else np.int32(far)
+        far_here = np.int32(TOO_NEAR) if own == np.int32(TOO_NEAR) else far_here
+        why = _choose(theirs == np.int32(VALID), own, theirs)
+        why = _choose(theirs == np.int32(TOO_FAR), far_here, why)
+        reason[i] = np.uint8(why)
+        instead = NEAR if why == np.int32(TOO_NEAR) else NAN
+        instead = FAR if why == np.int32(TOO_FAR) else instead
+        depth_m[i] = d if why == np.int32(VALID) else instead
+        valid = np.int32(valid + np.int32(why == 0))
     return valid
+
+
+@cell
+def _choose(condition, a, b):
+    """Return `a` where the condition holds, else `b`, without a branch."""
+    mask = np.int32(-np.int32(condition))
+    return np.int32((a & mask) | (b & ~mask))
+
+
+@cell
+def _own(d):
+    """Return the reason of a pixel by its REP 117 depth alone."""
+    why = np.int32(VALID) if d == d else np.int32(UNKNOWN)
+    why = np.int32(TOO_NEAR) if d == NEAR else why
+    return np.int32(TOO_FAR) if d == FAR else why
 
 
 @kernel

@@ -184,12 +184,10 @@ def _classify(frame: Frame, config: Config, depth_m: NDArray, reason: NDArray) -
         raw, scale, none = corrected(raw, scale, none, infinite, camera), np.float32(1), np.float32(0)
     limits = (np.float32(config.min_range), np.float32(config.max_range))
     into = depth_m.reshape(-1), reason.reshape(-1)
-    usable = _images.classify(raw, scale, *limits, none, infinite, *into)
     counts = config.depth.far != "measured" and float(frame.farthest) >= config.max_range
     far = np.uint8(Reason.TOO_FAR if counts else Reason.UNKNOWN)
     given = NO_REASONS if frame.reason is None else for_kernels(frame.reason).reshape(-1)
-    taken = _images.take_given(given, far, *into)
-    return usable if frame.reason is None else taken
+    return _images.classify(raw, scale, *limits, none, infinite, given, far, *into)
 
 
 def corrected(
@@ -202,8 +200,9 @@ def corrected(
     """
     depth_m = np.empty(raw.size, np.float32)
     _images.classify(
-        raw, scale, np.float32(0), np.float32(np.inf), none, infinite, depth_m, np.empty(raw.size, np.uint8)
-    )
+        raw, scale, np.float32(0), np.float32(np.inf), none, infinite, NO_REASONS, np.uint8(Reason.TOO_FAR), depth_m,
+        np.empty(raw.size, np.uint8),
+    )  # fmt: skip
     correct(depth_m.reshape(camera.height, camera.width), camera)
     return depth_m
 

@@ -1,13 +1,14 @@
 """Work on several threads: all of it is done, slips come out when all is, and threads do not pile up."""
 
 import multiprocessing
+import pickle
 import sys
 import threading
 import time
 
 import pytest
 
-from stereovox.threads import Scratch, in_shards, run_both, shards
+from stereovox.threads import Ahead, Scratch, in_shards, run_both, shards
 
 
 @pytest.mark.parametrize("threads", [1, 2, 3, 16])
@@ -95,3 +96,32 @@ def test_scratch_comes_back_from_work_that_fails():
         with pytest.raises(ZeroDivisionError):
             scratch.lend(lambda piece: 1 / 0)
     assert len(made) == 1
+
+
+def test_what_was_begun_is_not_done_twice():
+    done = []
+    ahead = Ahead(lambda number: done.append(number) or 1 / number)
+    ahead.begin(4)
+    assert ahead(4) == 0.25
+    assert ahead(2) == 0.5
+    assert done == [4, 2]
+    ahead.begin(0)
+    with pytest.raises(ZeroDivisionError):
+        ahead(0)
+
+
+def test_only_two_calls_wait_in_the_background():
+    hold, done = threading.Event(), []
+    ahead = Ahead(lambda item: (hold.wait(10) and done.append(item)) or item)
+    items = [object() for _ in range(5)]
+    for item in items:
+        ahead.begin(item)
+    hold.set()
+    assert [ahead(item) for item in items] == items
+    assert len(done) == len(items)
+
+
+def test_a_copy_has_begun_nothing():
+    ahead = Ahead(abs)
+    ahead.begin(-1)
+    assert pickle.loads(pickle.dumps(ahead))(-1) == 1

@@ -30,6 +30,12 @@ def at(image, v, u):
     return int(image[min(max(v, 0), image.shape[0] - 1), min(max(u, 0), image.shape[1] - 1)])
 
 
+def soft(image, v, u):
+    """Return the mean of 3 by 3 pixels, those in the middle counted twice along both axes."""
+    around = [(y, x) for y in (-1, 0, 1) for x in (-1, 0, 1)]
+    return (8 + sum((2 - abs(y)) * (2 - abs(x)) * at(image, v + y, u + x) for y, x in around)) // 16
+
+
 def slope(image, v, u):
     total = sum(weight * (at(image, v + y, u + 1) - at(image, v + y, u - 1)) for y, weight in ((-1, 1), (0, 2), (1, 1)))
     return min(max(total, -63), 63)
@@ -50,12 +56,14 @@ def unlike(a, b):
 def described(image, columns):
     """Return of each row and column what it is compared by; columns may lie beyond the image."""
     found = {}
+    rows, wider = range(-3, image.shape[0] + 3), range(columns.start - 3, columns.stop + 3)
+    softer = {(v, u): soft(image, v, u) for v in rows for u in wider}
     steps = [(y, x) for y in range(-3, 4) for x in range(-3, 4) if (y + x) % 2 == 0 and (y, x) != (0, 0)]
     for v in range(image.shape[0]):
         for u in columns:
             slopes = half_a_pixel([slope(image, v, u + x) + 63 for x in (-1, 0, 1)])
             greys = half_a_pixel([at(image, v, u + x) for x in (-1, 0, 1)])
-            found[v, u] = slopes, greys, [at(image, v + y, u + x) < at(image, v, u) for y, x in steps]
+            found[v, u] = slopes, greys, [softer[v + y, u + x] < softer[v, u] for y, x in steps]
     return found
 
 
@@ -78,11 +86,17 @@ def window_costs(costs, side, share):
     return total * share >> 16
 
 
-def one_path(costs, p1, p2):
-    """Return the path costs along the first axis of (length, n) or (length, w, n)."""
+def jump(p1, p2, grey, before):
+    """Return what a jump costs between neighbours: less than p2 in proportion where they differ by more than 16."""
+    return max(p1, p2 * 16 // max(16, abs(int(grey) - int(before))))
+
+
+def one_path(costs, image, p1, most):
+    """Return the path costs along the first axis of (length, w, n); image: (length, w)."""
     found = [costs[0]]
-    for here in costs[1:]:
+    for i, here in enumerate(costs[1:], 1):
         before = found[-1]
+        p2 = np.array([[jump(p1, most, *greys)] for greys in zip(image[i], image[i - 1], strict=True)])
         low = before.min(axis=-1, keepdims=True)
         beyond = np.full_like(low, 10**6)
         fewer = np.concatenate([beyond, before[..., :-1]], axis=-1)
@@ -132,10 +146,10 @@ def slow(left, right, config):
     for strip in range(strips):
         first, end = height * strip // strips, height * (strip + 1) // strips
         start = max(0, first - WARM)
-        down[first:end] = one_path(costs[start:end], p1, p2)[first - start :]
+        down[first:end] = one_path(costs[start:end], left[start:end], p1, p2)[first - start :]
     across = costs.swapaxes(0, 1)
-    to_right = one_path(across, p1, p2).swapaxes(0, 1)
-    to_left = one_path(across[::-1], p1, p2)[::-1].swapaxes(0, 1)
+    to_right = one_path(across, left.T, p1, p2).swapaxes(0, 1)
+    to_left = one_path(across[::-1], left.T[::-1], p1, p2)[::-1].swapaxes(0, 1)
     assert max(path.max() for path in (down, to_right, to_left)) <= 255 - p1
     most = max(1, round(config.left_right)) if config.left_right else -1
     return choose((down + to_right + to_left)[..., :n], round(config.uniqueness * 2 / 3), most)
@@ -197,6 +211,20 @@ def test_eyes_may_be_exposed_differently(gain, offset):
         kept = np.isfinite(found)
         assert kept[:, 20:-20].mean() > 0.9
         assert np.mean(np.abs(found[kept] - 12) < 1) > 0.97
+
+
+def test_bright_lines_are_not_taken_for_what_is_behind_them():
+    import cv2
+
+    random, lines = np.random.default_rng(3), np.arange(60, 300, 20)
+    smooth = cv2.GaussianBlur(random.normal(size=(100, 330)), (0, 0), 1.5)
+    wall = 120 + 20 * smooth / smooth.std()
+    left, right = wall[:, :320].copy(), wall[:, 5:325].copy()
+    left[:, lines], right[:, lines - 20] = 200, 200
+    eyes = (np.clip(eye + random.normal(0, 2, eye.shape), 0, 255).astype(np.uint8) for eye in (left, right))
+    found = Census(stereo(disparities=64))(*eyes)
+    assert np.mean(np.abs(found[:, lines - 10] - 5) < 1) > 0.9
+    assert np.mean(found[:, lines] < 12) < 0.3  # 0.97 where every jump costs the same
 
 
 def test_small_patches_are_dropped():

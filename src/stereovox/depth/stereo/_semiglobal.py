@@ -21,6 +21,8 @@ PLANES = 9
 grey value, and the census in three."""
 RIM = 3
 """Rows and columns that an image needs beyond its own: half the census window of 7 by 7 pixels."""
+GREY = 3
+"""The plane of the grey values themselves."""
 CAP = np.int32(63)
 """Largest gradient along the row, as in OpenCV's matcher."""
 MAX_COST = 63 + 63 + 24
@@ -37,21 +39,23 @@ LANES, PAD, BEFORE_PAD, BEHIND_PAD = np.uint64(BLOCK), np.uint64(MARGIN), np.uin
 LEFT, RIGHT, ONE_ON, TWO_ON = np.uint64(RIM - 2), np.uint64(RIM), np.uint64(1), np.uint64(2)
 ZERO, ONE, TWO, FOUR, FULL = np.uint8(0), np.uint8(1), np.uint8(2), np.uint8(4), np.uint8(255)
 PAIRS, QUADS, LOW = np.uint8(0x55), np.uint8(0x33), np.uint8(0x0F)
+HALF, QUARTERS = np.uint16(8), np.uint16(4)
 NOTHING, SINGLE, DOUBLE, FAR, WORD = np.uint16(0), np.uint16(1), np.uint16(2), np.uint16(65535), np.uint32(16)
 
 
 class Settings(NamedTuple):
     """What `match` is told, in whole numbers.
 
-    radius: half of the window's side. p1, p2: cost of a step of one disparity and of more. unique: per cent by which
-    the second best match must be worse. left_right: most by which the disparities of both images may differ, in
-    pixels; negative: any. share: a window's sum of costs times this, without its lower 16 bits, is the pixel's cost,
-    at most 255 - p1 - p2. disparities: those that may be chosen.
+    radius: half of the window's side. p1: cost of a step of one disparity. jumps: (256,) that of more, by the step of
+    grey between both pixels. unique: per cent by which the second best match must be worse. left_right: most by which
+    the disparities of both images may differ, in pixels; negative: any. share: a window's sum of costs times this,
+    without its lower 16 bits, is the pixel's cost, at most 255 - p1 - the greatest of `jumps`. disparities: those that
+    may be chosen.
     """
 
     radius: int
     p1: int
-    p2: int
+    jumps: NDArray[np.uint8]
     unique: int
     left_right: int
     share: int
@@ -82,10 +86,42 @@ class StripScratch(NamedTuple):
 
 
 @kernel
-def describe(image, first, end, sign, line, planes):
+def soften(image, first, end, soft):
+    """Fill rows `first` to `end` of `soft` (h, w) uint8 with weighed means of 3 by 3 pixels of `image` (h, w) uint8.
+
+    Its census changes less with noise, and where one eye's rows lie lower; gradients are as soft along columns.
+    image: with its rim, in which the edge is repeated.
+    """
+    last = image.shape[0] - 1
+    for v in range(first, end):
+        _soften(image[max(v - 1, 0)], image[v], image[min(v + 1, last)], soft[v])
+
+
+@cell
+def _soften(above, here, below, soft):
+    last = np.uint64(soft.size - 1)
+    for u in range(np.uint64(1), last):
+        before, after = _column(above, here, below, u - ONE_ON), _column(above, here, below, u + ONE_ON)
+        soft[u] = _mean(before, _column(above, here, below, u), after)
+    soft[0], soft[last] = soft[1], soft[last - ONE_ON]  # in the rim, neighbours are alike
+
+
+@cell
+def _column(above, here, below, u):
+    return np.uint16(np.uint16(np.uint16(above[u]) + np.uint16(below[u])) + np.uint16(np.uint16(here[u]) << SINGLE))
+
+
+@cell
+def _mean(before, here, after):
+    return np.uint8(np.uint16(np.uint16(before + after) + np.uint16(np.uint16(here << SINGLE) + HALF)) >> QUARTERS)
+
+
+@kernel
+def describe(image, soft, first, end, sign, line, planes):
     """Fill rows `first` to `end` of `planes` (PLANES, h, w) uint8: what the pixels of an image are compared by.
 
-    image: (h + 2 RIM, w + 2 RIM) uint8, its rim included. sign: 1, or -1 for an image that is mirrored.
+    image, soft: (h + 2 RIM, w + 2 RIM) uint8, its rim included, and what `soften` makes of it. sign: 1, or -1 for an
+    image that is mirrored.
     line: (w + 2,) uint8, scratch.
     """
     for v in range(first, end):
@@ -96,8 +132,8 @@ def describe(image, first, end, sign, line, planes):
             planes[plane, v, :] = ZERO
         for bit in range(len(CENSUS)):
             y, x = CENSUS[bit]
-            there, weight = image[v + RIM + y], np.uint8(1 << (bit & 7))
-            _darker(there[RIM + sign * x :], image[v + RIM, RIM:], weight, planes[6 + (bit >> 3), v])
+            there, weight = soft[v + RIM + y], np.uint8(1 << (bit & 7))
+            _darker(there[RIM + sign * x :], soft[v + RIM, RIM:], weight, planes[6 + (bit >> 3), v])
 
 
 @cell
@@ -133,7 +169,7 @@ def match(left, right, start, first, end, settings, scratch, raw):
     go down. settings: Settings; scratch: StripScratch. Without a value: NONE.
     """
     height, radius = raw.shape[0], np.int64(settings.radius)
-    p1, p2, share = np.uint8(settings.p1), np.uint8(settings.p2), np.uint32(settings.share)
+    p1, jumps, share = np.uint8(settings.p1), settings.jumps, np.uint32(settings.share)
     rows, sums, costs, down = scratch.rows, scratch.sums, scratch.costs, scratch.down
     slots, blocks = 2 * radius + 2, np.uint64(costs.shape[1]) // LANES
     sums[:] = NOTHING
@@ -144,9 +180,9 @@ def match(left, right, start, first, end, settings, scratch, raw):
         smooth(sums, radius, share, scratch.window, costs, blocks)
         leave(rows[(v - radius + slots) % slots], sums, blocks)
         into, of = down[v & 1], down[1 - (v & 1)]
-        downward(costs, of, v == start, p1, p2, scratch.lows, into, blocks)
+        downward(costs, of, v == start, p1, jumps, left[GREY, max(v - 1, 0)], left[GREY, v], scratch.lows, into, blocks)
         if v >= first:
-            sideways(costs, p1, p2, scratch.across, blocks)
+            sideways(costs, p1, jumps, left[GREY, v], scratch.across, blocks)
             choose(
                 scratch.across, into, settings, scratch.total, scratch.numbers, scratch.rival, scratch.owner, raw[v],
                 blocks,
@@ -243,7 +279,7 @@ def _slide(window, entering, leaving, share, costs, blocks):
         for i in range(LANES):
             d = block * LANES + i
             full = np.uint16(window[d] + entering[d])
-            costs[d] = np.uint8((np.uint32(full) * share) >> WORD)
+            costs[d] = np.uint8(np.uint32(np.uint32(full) * share) >> WORD)
             window[d] = np.uint16(full - leaving[d])
 
 
@@ -262,27 +298,36 @@ def _begin(costs, path, blocks):
 
 
 @kernel
-def downward(costs, of, begins, p1, p2, lows, into, blocks):
+def downward(costs, of, begins, p1, jumps, above, grey, lows, into, blocks):
     """Fill the path down `into` (w, MARGIN + n + MARGIN) from that of the row above, unless it `begins` here.
 
-    lows: (w,) the least of each pixel's path costs, replaced.
+    above, grey: (w,) uint8, the image in that row and in this. jumps: of `Settings`. lows: (w,) the least of each
+    pixel's path costs, replaced.
     """
     for u in range(costs.shape[0]):
         if begins:
             lows[u] = _begin(costs[u], into[u], blocks)
         else:
-            lows[u] = _step(costs[u], of[u], lows[u], p1, p2, into[u], blocks)
+            jump = _jump(jumps, above[u], grey[u])
+            lows[u] = _step(costs[u], of[u], lows[u], p1, jump, into[u], blocks)
 
 
 @kernel
-def sideways(costs, p1, p2, across, blocks):
+def sideways(costs, p1, jumps, grey, across, blocks):
     """Fill both paths along the row: across[0] goes right, across[1] left."""
     last = costs.shape[0] - 1
     right, left = _begin(costs[0], across[0, 0], blocks), _begin(costs[last], across[1, last], blocks)
     for u in range(1, last + 1):
         v = last - u
-        right = _step(costs[u], across[0, u - 1], right, p1, p2, across[0, u], blocks)
-        left = _step(costs[v], across[1, v + 1], left, p1, p2, across[1, v], blocks)
+        to_right, to_left = _jump(jumps, grey[u - 1], grey[u]), _jump(jumps, grey[v + 1], grey[v])
+        right = _step(costs[u], across[0, u - 1], right, p1, to_right, across[0, u], blocks)
+        left = _step(costs[v], across[1, v + 1], left, p1, to_left, across[1, v], blocks)
+
+
+@cell
+def _jump(jumps, before, here):
+    """Return the cost of a jump between two pixels of these grey values."""
+    return jumps[max(before, here) - min(before, here)]
 
 
 @cell

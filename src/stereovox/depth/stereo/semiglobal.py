@@ -25,6 +25,9 @@ STRIP, WARM = 90, 16
 """Rows of a strip, nearly; and rows above it from which its path from above starts. Strips do not know of threads."""
 PENALTIES = 0.75
 """`p1` and `p2` are those of costs of up to 200 (OpenCV's); these are MAX_COST at most."""
+EDGE = 16
+"""Grey values between neighbours from which `p2` falls with their step: surfaces end where grey does (Hirschmueller
+2008, Eq 13). Three standard deviations of such a step where the image has noise of 4."""
 UNIQUE = 2 / 3
 """Share of `uniqueness` that is asked for: the census differs in some bits even where the match is right."""
 
@@ -32,8 +35,8 @@ UNIQUE = 2 / 3
 class Census:
     """Own matcher: three paths, costs of Birchfield and Tomasi on gradients and grey values, and of a census.
 
-    It is as good as OpenCV's along three paths in half the time (docs/stereo.md). With gains or offsets between the
-    eyes the census keeps it so. Several threads may use it at the same time.
+    It errs less than OpenCV's along three paths in 0.6 to 0.7 of the time, except where one eye stands a row lower
+    (docs/stereo.md). Several threads may use it at the same time.
     """
 
     def __init__(self, config: StereoConfig) -> None:
@@ -88,12 +91,16 @@ class Census:
         wide = cv2.copyMakeBorder(
             np.ascontiguousarray(image), RIM, RIM, RIM, RIM + beyond, cv2.BORDER_REPLICATE
         )  # fmt: skip
-        planes = np.empty((PLANES, height, width + beyond), np.uint8)
+        soft, planes = np.empty_like(wide), np.empty((PLANES, height, width + beyond), np.uint8)
+
+        def soften(rows: slice) -> None:
+            _semiglobal.soften(wide, rows.start, rows.stop, soft)
 
         def describe(rows: slice) -> None:
             line = np.empty(width + beyond + 2, np.uint8)
-            _semiglobal.describe(wide, rows.start, rows.stop, sign, line, planes)
+            _semiglobal.describe(wide, soft, rows.start, rows.stop, sign, line, planes)
 
+        in_shards(soften, shards(len(wide), self._config.threads))
         in_shards(describe, shards(height, self._config.threads))
         return planes
 
@@ -119,12 +126,18 @@ def _settings(config: StereoConfig) -> Settings:
     return Settings(
         radius=config.block_size // 2,
         p1=round(scale * p1),
-        p2=max(1, round(scale * p2)),
+        jumps=_jumps(round(scale * p1), max(1, round(scale * p2))),
         unique=round(UNIQUE * config.uniqueness),
         left_right=most,
         share=int(65536 * scale / config.block_size**2),
         disparities=config.disparities,
     )
+
+
+def _jumps(p1: int, p2: int) -> NDArray[np.uint8]:
+    """Return `p2` for each step of grey (256,), see EDGE; never less than `p1`."""
+    steps = np.maximum(np.arange(256), EDGE)
+    return np.maximum(p2 * EDGE // steps, p1).astype(np.uint8)
 
 
 def _strip_scratch(settings: Settings, width: int, n: int) -> StripScratch:

@@ -92,10 +92,10 @@ class CannotBuildError(Exception):
 
 
 def main() -> int:
-    """Build what is asked for, or all that lie in the folder; return how many failed."""
+    """Build what is asked for, or all; return how many could not be built."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("folder", type=Path, metavar="FOLDER", help="holds the libraries' checkouts")
-    parser.add_argument("names", nargs="*", metavar="NAME", help=f"{', '.join(LIBRARIES)} (all that are there)")
+    parser.add_argument("names", nargs="*", metavar="NAME", help=f"{', '.join(LIBRARIES)} (all of them)")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="where built libraries go")
     parser.add_argument("--march", default="native", help="processor to build for, as GCC names it (%(default)s)")
     parser.add_argument("--compiler", default=os.environ.get("CXX", "g++"), help="(%(default)s)")

@@ -1,13 +1,14 @@
 """Work on several threads: all of it is done, slips come out when all is, and threads do not pile up."""
 
 import multiprocessing
+import pickle
 import sys
 import threading
 import time
 
 import pytest
 
-from stereovox.threads import in_shards, run_both, shards
+from stereovox.threads import Ahead, Scratch, in_shards, run_both, shards
 
 
 @pytest.mark.parametrize("threads", [1, 2, 3, 16])
@@ -72,3 +73,55 @@ def test_a_forked_child_has_threads_of_its_own():
     child.kill()
     assert not hangs
     assert child.exitcode == 0
+
+
+def test_scratch_is_lent_to_one_at_a_time_and_used_again():
+    made, lent = [], []
+    scratch, meeting = Scratch(lambda: made.append([]) or made[-1]), threading.Barrier(3, timeout=10)
+
+    def work(piece):
+        lent.append(id(piece))
+        meeting.wait()  # all hold theirs at the same time
+
+    for _ in range(2):
+        in_shards(lambda part: scratch.lend(work), shards(9, 3))
+    assert len(made) == 3
+    assert set(lent[:3]) == set(lent[3:]) == set(map(id, made))
+
+
+def test_scratch_comes_back_from_work_that_fails():
+    made = []
+    scratch = Scratch(lambda: made.append([]) or made[-1])
+    for _ in range(2):
+        with pytest.raises(ZeroDivisionError):
+            scratch.lend(lambda piece: 1 / 0)
+    assert len(made) == 1
+
+
+def test_what_was_begun_is_not_done_twice():
+    done = []
+    ahead = Ahead(lambda number: done.append(number) or 1 / number)
+    ahead.begin(4)
+    assert ahead(4) == 0.25
+    assert ahead(2) == 0.5
+    assert done == [4, 2]
+    ahead.begin(0)
+    with pytest.raises(ZeroDivisionError):
+        ahead(0)
+
+
+def test_only_two_calls_wait_in_the_background():
+    hold, done = threading.Event(), []
+    ahead = Ahead(lambda item: (hold.wait(10) and done.append(item)) or item)
+    items = [object() for _ in range(5)]
+    for item in items:
+        ahead.begin(item)
+    hold.set()
+    assert [ahead(item) for item in items] == items
+    assert len(done) == len(items)
+
+
+def test_a_copy_has_begun_nothing():
+    ahead = Ahead(abs)
+    ahead.begin(-1)
+    assert pickle.loads(pickle.dumps(ahead))(-1) == 1

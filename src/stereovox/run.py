@@ -374,7 +374,7 @@ def expecting(expect: Callable[[SeenT], None], frames: Iterable[SeenT]) -> Itera
         following = None
         try:
             following = next(coming, None)
-        except SourceError as error:
+        except Exception as error:
             failure = error
         if following is not None:
             expect(following)

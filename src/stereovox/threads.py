@@ -9,7 +9,7 @@ from _thread import RLock
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from copy import deepcopy
 from functools import lru_cache, wraps
 from inspect import isgeneratorfunction
@@ -59,7 +59,7 @@ def run_both(threads: int, first: Callable[[], First], second: Callable[[], Seco
 
 
 class Ahead(Generic[First, Second]):
-    """A function, called by one thread at a time, that can begin in the background before its result is wanted."""
+    """A function, run by one thread at a time, that can begin in the background before its result is wanted."""
 
     def __init__(self, function: Callable[[First], Second]):
         self._function, self._alone = function, MapLock()
@@ -68,16 +68,19 @@ class Ahead(Generic[First, Second]):
     def begin(self, argument: First) -> None:
         """Call the function in the background; a call with this very object will return, or raise, what comes of it.
 
-        Of calls whose results are not wanted the last two are remembered.
+        Of calls whose results are not wanted the last two are remembered. Nothing happens while two have not ended yet:
+        many that wait for one another would take the threads that the first of them may need.
         """
-        self._begun.append((argument, _pool().submit(self._call, argument)))
+        if sum(not result.done() for _, result in tuple(self._begun)) < 2:
+            self._begun.append((argument, _pool().submit(self._call, argument)))
 
     def __call__(self, argument: First) -> Second:
         """Return what the function returns."""
-        for i, (known, result) in enumerate(self._begun):
-            if known is argument:
-                del self._begun[i]
-                return result.result()
+        for begun in tuple(self._begun):  # a copy, since another thread may begin something meanwhile
+            if begun[0] is argument:
+                with suppress(ValueError):  # two more were begun, so it is not remembered any more
+                    self._begun.remove(begun)
+                return begun[1].result()
         return self._call(argument)
 
     def __getstate__(self) -> dict[str, Any]:

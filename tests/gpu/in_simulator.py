@@ -95,6 +95,28 @@ def test_lists_that_were_too_short_lose_nothing(monkeypatch):
     assert evidence.n > 4
 
 
+@pytest.mark.parametrize("room", ["ROOM", "HIT_ROOM"])
+def test_a_frame_that_the_card_cannot_hold_is_refused_and_the_next_one_is_whole(monkeypatch, room):
+    """The last array for which there is no more room must not leave the others longer than it is."""
+    monkeypatch.setattr(integrate_gpu, room, 1)
+    last = {"ROOM": (4, np.int16), "HIT_ROOM": (2, np.uint8)}[room]
+
+    def short(shape, dtype, value=None):
+        if (shape, dtype) == last:
+            raise MemoryError("no room")
+        return gpu_array(shape, dtype, value)
+
+    config = sv.load_config(voxel_size=0.2, max_range=2.5, device="cuda")
+    ours = make_integrator(config)
+    with monkeypatch.context() as patched:
+        patched.setattr(integrate_gpu, "gpu_array", short)
+        with pytest.raises(FrameRefused, match=r"^no room; lower max_range") as refused:
+            ours.evidence(image_of(1))
+    assert refused.value.reason == "memory_full"
+    theirs = make_integrator(sv.load_config(voxel_size=0.2, max_range=2.5))
+    assert cells_of(ours.evidence(image_of(1))) == cells_of(theirs.evidence(image_of(1)))
+
+
 def test_a_frame_beyond_all_bounds_is_refused(monkeypatch):
     monkeypatch.setattr(integrate_gpu, "ROOM", 1)
     monkeypatch.setattr("stereovox.integrate.views.MAX_BLOCKS", 2)
@@ -156,6 +178,7 @@ def test_a_full_card_refuses_the_frame_and_keeps_the_map(monkeypatch):
     assert "graphics card" in report.detail
     assert "larger cells" in report.detail
     assert not len(ours.map.cells()[0])
+    assert ours.map.storage.viewpoint is None
     assert ours.map.history.refused == {"memory_full": 1}
     assert ours.add(frame_of(0)).cells == its[0].cells
     assert_same_map(ours.map, theirs.map)

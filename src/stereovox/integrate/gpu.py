@@ -17,7 +17,7 @@ from stereovox._gpu import gpu_array, launch, to_gpu
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.config import Config
 from stereovox.device import check_device
-from stereovox.errors import ConfigError
+from stereovox.errors import ConfigError, FrameRefused
 from stereovox.frame import DepthImage
 from stereovox.integrate import _gpu
 from stereovox.integrate.projective import ROOM, make_windows
@@ -41,11 +41,16 @@ class GpuProjective:
     def evidence(self, image: DepthImage) -> GpuEvidence:
         """Return the evidence of `image` on the cells it sees; its memory is reused by the next call.
 
-        Raises ConfigError for a wide camera.
+        Raises ConfigError for a wide camera, FrameRefused `memory_full` where the card has no room for it.
         """
         if not isinstance(image.camera, PinholeCamera):
             raise ConfigError('device "cuda" maps pinhole cameras only, and this one is wider; use device "cpu"')
-        return self._eyes[image.camera].evidence(image)
+        try:
+            return self._eyes[image.camera].evidence(image)
+        except MemoryError as error:
+            raise FrameRefused(
+                "memory_full", f'{error}; lower max_range, or use larger cells, smaller images or device "cpu"'
+            ) from None
 
 
 class GpuEye:
@@ -114,16 +119,17 @@ class GpuEye:
         return most <= room and hit_blocks <= hit_room
 
     def _make_room(self, blocks: int) -> None:
-        """Make lists for so many blocks of each kind."""
-        self._large, self._middle, self._free, self._mixed = (gpu_array((blocks, 3), np.int32) for _ in range(4))
-        self._hit_of = gpu_array(blocks, np.int32)
-        self._made = GpuArrays(
+        """Make lists for so many blocks of each kind: all of them, or none where there is no room."""
+        lists = [gpu_array((blocks, 3), np.int32) for _ in range(4)]
+        hit_of = gpu_array(blocks, np.int32)
+        made = GpuArrays(
             coords=gpu_array((blocks, 3), np.int32),
             values=gpu_array((blocks, CELLS), np.int16),
             said=gpu_array(blocks, np.int16),
             uniform=gpu_array((blocks, 3), np.int32),
             steps=gpu_array(blocks, np.int16),
         )
+        (self._large, self._middle, self._free, self._mixed), self._hit_of, self._made = lists, hit_of, made
 
 
 class GpuView:
@@ -188,9 +194,13 @@ class GpuHits:
         self.make_room(HIT_ROOM)
 
     def make_room(self, blocks: int) -> None:
-        """Make room for so many blocks with hits."""
-        self.coords, self.values = gpu_array((blocks, 3), np.int32), gpu_array((blocks, CELLS), np.int16)
-        self.table, self.taken = gpu_array(table_size(blocks), np.int32), gpu_array(blocks, np.uint8)
+        """Make room for so many blocks with hits: in all arrays, or in none where there is no room."""
+        self.coords, self.values, self.table, self.taken = (
+            gpu_array((blocks, 3), np.int32),
+            gpu_array((blocks, CELLS), np.int16),
+            gpu_array(table_size(blocks), np.int32),
+            gpu_array(blocks, np.uint8),
+        )
 
     def find(self, depth_m: Any, view: View, table: Any, counts: Any) -> None:
         """List the blocks with hits of a flat REP 117 depth image on the card; all tables are empty."""

@@ -173,31 +173,52 @@ class GpuPool:
         """Yield coordinates (n, 3) and cells (n, 512) of all blocks as they are now, in ascending order."""
         yield from self.host.pieces()
 
+    def make_room(self, evidence: GpuEvidence) -> None:
+        """Make room for the blocks of evidence.
+
+        Raises FrameRefused `memory_full`, and changes nothing, where the card has none.
+        """
+        sizes = evidence.n, evidence.m
+        try:
+            self._places = tuple(
+                places if len(places) >= size else gpu_array(int(GROWTH * size), np.int32)
+                for places, size in zip(self._places, sizes, strict=True)
+            )
+            if self._used + sum(sizes) > len(self._coords):
+                self._find(evidence)
+                missing = int(self._counts.copy_to_host()[_gpu.MISSING])
+                self._set_used(self._used)  # what was counted for this evidence
+                self._reserve(missing)
+        except MemoryError:
+            raise FrameRefused(
+                "memory_full",
+                f"the graphics card has no room for the blocks of a frame beside the map's {self._used}; "
+                'use larger cells, or device "cpu" with max_memory or a window',
+            ) from None
+
     def add(self, evidence: GpuEvidence) -> int:
         """Add evidence in differences of stored numbers; return the number of cells that changed.
 
-        Raises FrameRefused `memory_full`, and changes nothing, where the card has no room for more blocks.
+        Raises FrameRefused as `make_room` does.
         """
-        arrays, n, m = evidence.arrays, evidence.n, evidence.m
-        parts = (arrays.coords, arrays.said, n), (arrays.uniform, arrays.steps, m)
-        self._places = tuple(
-            places if len(places) >= size else gpu_array(int(GROWTH * size), np.int32)
-            for places, (_, _, size) in zip(self._places, parts, strict=True)
-        )
-        for places, (wanted, said, size) in zip(self._places, parts, strict=True):
-            launch(_gpu.find_places, self._table, self._coords, wanted, said, size, places, self._counts)
-        if self._used + n + m > len(self._coords):
-            self._reserve(int(self._counts.copy_to_host()[_gpu.MISSING]))
+        self.make_room(evidence)
+        self._find(evidence)
         self._host = None
-        for places, (wanted, _, size) in zip(self._places, parts, strict=True):
-            launch(_gpu.make_rows, self._table, self._coords, self._counts, wanted, size, places)
+        arrays, n, m = evidence.arrays, evidence.n, evidence.m
         blocks, uniform = self._places
+        for places, wanted, size in ((blocks, arrays.coords, n), (uniform, arrays.uniform, m)):
+            launch(_gpu.make_rows, self._table, self._coords, self._counts, wanted, size, places)
         launch(_gpu.add, self._values, blocks, arrays.values, n, self._limits, self._counts)
         launch(_gpu.add_uniform, self._values, uniform, arrays.steps, m, self._limits, self._counts)
         counts = self._counts.copy_to_host()
-        self._used = int(counts[_gpu.USED])
-        self._set_used(self._used)
+        self._set_used(int(counts[_gpu.USED]))
         return int(counts[_gpu.CHANGED])
+
+    def _find(self, evidence: GpuEvidence) -> None:
+        """Write to `_places` where the blocks of evidence are, and count those that are missing."""
+        (coords, _, said, uniform, steps), n, m = evidence.arrays, evidence.n, evidence.m
+        for places, wanted, given, size in zip(self._places, (coords, uniform), (said, steps), (n, m), strict=True):
+            launch(_gpu.find_places, self._table, self._coords, wanted, given, size, places, self._counts)
 
     def _set_used(self, used: int) -> None:
         self._used = used
@@ -209,18 +230,10 @@ class GpuPool:
         return table, gpu_array((rows, 3), np.int32), values
 
     def _reserve(self, more: int) -> None:
-        """Make room for so many more rows; all keep their place."""
+        """Make room for so many more rows; all keep their place. Raises MemoryError, and changes nothing."""
         if self._used + more <= len(self._coords):
             return
-        try:
-            table, coords, values = self._arrays(int(GROWTH * (self._used + more)))
-        except MemoryError:
-            self._set_used(self._used)  # what was counted for this evidence
-            raise FrameRefused(
-                "memory_full",
-                f"the graphics card has no room for {self._used + more} blocks of cells; "
-                'use larger cells, or device "cpu" with max_memory or a window',
-            ) from None
+        table, coords, values = self._arrays(int(GROWTH * (self._used + more)))
         for old, new in ((self._coords, coords), (self._values, values)):
             launch(_gpu.copy, old.reshape(old.size), new.reshape(new.size), self._used * (old.size // len(old)))
         launch(_gpu.enter_all, table, coords, self._used)
@@ -246,6 +259,10 @@ class GpuStorage(Storage):
     def __init__(self, config: Config):
         super().__init__(config)
         self._pool = GpuPool(self.rules, ROOM)
+
+    def check_room(self, evidence: Evidence) -> None:
+        """Make room on the card for all that `evidence` is about; raises FrameRefused `memory_full`."""
+        self._pool.make_room(GpuEvidence.of(evidence))
 
     def agreement(self, evidence: Evidence, firm: int) -> Agreement:
         """Return how far `evidence` agrees with what the map is sure of; see `Storage.agreement`."""

@@ -10,7 +10,8 @@ from stereovox.simulate import _rays
 
 LEAF = 4
 """Most triangles of a leaf."""
-MOST_LEVELS = 64
+MAX_LEVELS = 64
+"""Boxes that wait while rays go down one side of the tree: no more than it has levels."""
 
 
 class TriangleTree:
@@ -47,7 +48,7 @@ class TriangleTree:
             planes,
             np.empty((7, _rays.LANES), np.float32),
             np.empty(_rays.LANES, np.int32),
-            np.empty(MOST_LEVELS, np.int32),
+            np.empty(MAX_LEVELS, np.int32),
             share,
             number,
         )

@@ -62,7 +62,7 @@ class Settings(NamedTuple):
     disparities: int
 
 
-class Scratch(NamedTuple):
+class StripScratch(NamedTuple):
     """Room for a strip of images of width w, n disparities; nothing in it outlives a strip but the margins.
 
     rows: (2 radius + 2, w, n) uint8, costs of single pixels, of the rows in the window. sums: (w, n) uint16 of the
@@ -166,7 +166,7 @@ def match(left, right, start, first, end, settings, scratch, raw):
     """Fill rows `first` to `end` of `raw` (h, w) int16 with disparities in 1/16 px by paths right, left and down.
 
     left: (PLANES, h, w); right: (PLANES, h, w + n), mirrored; both of `describe`. start: the row from which on costs
-    go down. settings: Settings; scratch: Scratch. Without a value: NONE.
+    go down. settings: Settings; scratch: StripScratch. Without a value: NONE.
     """
     height, radius = raw.shape[0], np.int64(settings.radius)
     p1, jumps, share = np.uint8(settings.p1), settings.jumps, np.uint32(settings.share)
@@ -252,6 +252,7 @@ def _ones(x, y, z):
 
 @kernel
 def leave(costs, sums, blocks):
+    """Take the `costs` (w, n) of a row that leaves the window from `sums` (w, n)."""
     for u in range(sums.shape[0]):
         for block in range(blocks):
             for i in range(LANES):
@@ -298,6 +299,11 @@ def _begin(costs, path, blocks):
 
 @kernel
 def downward(costs, of, begins, p1, jumps, above, grey, lows, into, blocks):
+    """Fill the path down `into` (w, MARGIN + n + MARGIN) from that of the row above, unless it `begins` here.
+
+    above, grey: (w,) uint8, the image in that row and in this. jumps: of `Settings`. lows: (w,) the least of each
+    pixel's path costs, replaced.
+    """
     for u in range(costs.shape[0]):
         if begins:
             lows[u] = _begin(costs[u], into[u], blocks)
@@ -343,7 +349,7 @@ def _step(costs, before, low, p1, p2, after, blocks):
 
 @kernel
 def choose(across, down, settings, total, numbers, rival, owner, raw, blocks):
-    """Fill a row of disparities from the costs of its paths (`Scratch`)."""
+    """Fill a row of disparities from the costs of its paths (`StripScratch`)."""
     width, n = raw.size, np.int64(settings.disparities)
     unique, most = np.int64(100 - settings.unique), np.int64(settings.left_right)
     rival[:] = FAR

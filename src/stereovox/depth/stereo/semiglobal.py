@@ -3,14 +3,16 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.config import StereoConfig
 from stereovox.depth.stereo import _disparity, _semiglobal
-from stereovox.depth.stereo._semiglobal import BLOCK, MARGIN, MAX_COST, PLANES, RIM, Scratch, Settings
+from stereovox.depth.stereo._semiglobal import BLOCK, MARGIN, MAX_COST, PLANES, RIM, Settings, StripScratch
 from stereovox.errors import ConfigError
-from stereovox.threads import in_shards, shards
+from stereovox.threads import Scratch, in_shards, shards
 
 Image = NDArray[np.uint8]
 COUNTS = 16
@@ -34,7 +36,7 @@ class Census:
     """Own matcher: three paths, costs of Birchfield and Tomasi on gradients and grey values, and of a census.
 
     It errs less than OpenCV's along three paths in 0.6 to 0.7 of the time, except where one eye stands a row lower
-    (docs/stereo.md). Not for concurrent use by several threads.
+    (docs/stereo.md). Several threads may use it at the same time.
     """
 
     def __init__(self, config: StereoConfig) -> None:
@@ -47,7 +49,7 @@ class Census:
         self._config = config
         self._fractions = _fractions(LOCKING if config.unlock else 1.0)
         self._settings = _settings(config)
-        self._rooms: dict[tuple[int, int], Scratch] = {}
+        self._scratch: tuple[int, Scratch[StripScratch]] | None = None
         self.lag_rows = -LAG_ROWS if config.from_below else LAG_ROWS
 
     def __call__(self, left: Image, right: Image) -> NDArray[np.float32]:
@@ -71,17 +73,14 @@ class Census:
         height, width = left.shape
         planes = self._described(left, 0, 1), self._described(right[:, ::-1], _whole(self._config.disparities), -1)
         raw = np.empty((height, width), np.int16)
-        count = max(1, round(height / STRIP))
+        count, strips = max(1, round(height / STRIP)), self._strips(width)
 
-        parts = _parts(count, self._config.threads)
-        rooms = {part.start: self._room(part.start, width) for part in parts}  # here, where no other thread is at it
-
-        def match(part: slice) -> None:
+        def match(part: slice, scratch: StripScratch) -> None:
             for strip in range(part.start, part.stop):
                 first, end = height * strip // count, height * (strip + 1) // count
-                _semiglobal.match(*planes, max(0, first - WARM), first, end, self._settings, rooms[part.start], raw)
+                _semiglobal.match(*planes, max(0, first - WARM), first, end, self._settings, scratch, raw)
 
-        in_shards(match, parts)
+        in_shards(lambda part: strips.lend(partial(match, part)), _parts(count, self._config.threads))
         return raw
 
     def _described(self, image: Image, beyond: int, sign: int) -> Image:
@@ -105,12 +104,13 @@ class Census:
         in_shards(describe, shards(height, self._config.threads))
         return planes
 
-    def _room(self, first: int, width: int) -> Scratch:
-        """Return the scratch of the thread whose first strip this is, made anew only for another width."""
-        if (first, width) not in self._rooms:
-            self._rooms = {key: room for key, room in self._rooms.items() if key[1] == width}
-            self._rooms[first, width] = _scratch(self._settings, width, _whole(self._config.disparities))
-        return self._rooms[first, width]
+    def _strips(self, width: int) -> Scratch[StripScratch]:
+        """Return the memory for strips of images so wide; that of another width is given up."""
+        kept = self._scratch
+        if kept is None or kept[0] != width:
+            n = _whole(self._config.disparities)
+            self._scratch = kept = width, Scratch(partial(_strip_scratch, self._settings, width, n))
+        return kept[1]
 
 
 def _whole(disparities: int) -> int:
@@ -140,9 +140,9 @@ def _jumps(p1: int, p2: int) -> NDArray[np.uint8]:
     return np.maximum(p2 * EDGE // steps, p1).astype(np.uint8)
 
 
-def _scratch(settings: Settings, width: int, n: int) -> Scratch:
+def _strip_scratch(settings: Settings, width: int, n: int) -> StripScratch:
     across, down = (np.full((2, width, MARGIN + n + MARGIN), 255 - settings.p1, np.uint8) for _ in range(2))
-    return Scratch(
+    return StripScratch(
         rows=np.empty((2 * settings.radius + 2, width, n), np.uint8),
         sums=np.empty((width, n), np.uint16),
         window=np.empty(n, np.uint16),

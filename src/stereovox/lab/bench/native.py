@@ -37,10 +37,12 @@ OF_POINTS: dict[str, tuple[Any, list[Any]]] = {
     "peer_load": (ctypes.c_int, [POINTER, POINTER, INTEGER, POINTER]),
     "peer_insert": (ctypes.c_int, [POINTER]),
 }
+"""The same of those that take points."""
 OF_IMAGES: dict[str, tuple[Any, list[Any]]] = {
     "peer_load_image": (ctypes.c_int, [POINTER, POINTER, ctypes.c_int, ctypes.c_int, POINTER, POINTER]),
     "peer_insert_image": (ctypes.c_int, [POINTER]),
 }
+"""The same of those that take depth images."""
 
 
 class NotBuilt(MissingExtra):

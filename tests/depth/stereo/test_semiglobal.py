@@ -1,13 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The own matcher against semi-global matching in plain NumPy, one pixel after the other."""
 
-import threading
-
 import numpy as np
 import pytest
 
 from stereovox.config import load_config
-from stereovox.depth.stereo import semiglobal
 from stereovox.depth.stereo.disparity import match_aligned
 from stereovox.depth.stereo.semiglobal import STRIP, WARM, Census
 from stereovox.errors import ConfigError
@@ -193,15 +190,6 @@ def test_threads_and_frames_before_change_nothing():
         np.testing.assert_array_equal(four._raw(*frame), raw)
     np.testing.assert_array_equal(found[0], found[3])
     assert (found[0] != found[1]).any()
-
-
-def test_memory_is_kept_by_one_thread_for_all(monkeypatch):
-    """Threads that each added theirs to what is kept could lose that of another."""
-    makers = []
-    make = semiglobal._scratch
-    monkeypatch.setattr(semiglobal, "_scratch", lambda *sizes: (makers.append(threading.get_ident()), make(*sizes))[1])
-    Census(stereo(disparities=16, threads=3))(*pair(4 * STRIP, 9))
-    assert makers == [threading.get_ident()] * 3
 
 
 def test_the_vertical_path_may_come_from_below():

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 import stereovox as sv
-from stereovox import run
+from stereovox import deadline, run
 from stereovox.cli import main as command
 from stereovox.cli import options
-from stereovox.deadline import Quality
 from stereovox.errors import SourceError
 from stereovox.opening import open_stream
 
@@ -77,21 +76,40 @@ class Breaking:
     def after(self, count):
         raise AssertionError("nothing to go on with")
 
+    def frame(self, i):
+        if i == self._bad:
+            raise SourceError("frame 5: cannot be read")
+        return replace(self._frames[i], T_world_sensor=None) if i == 2 else self._frames[i]
+
     def __iter__(self):
-        for i, frame in enumerate(self._frames):
-            if i == self._bad:
-                raise SourceError("frame 5: cannot be read")
-            yield replace(frame, T_world_sensor=None) if i == 2 else frame
+        return map(self.frame, range(self.length))
+
+
+class Stateful:
+    """A recording that can only be read on; its readers are told what belongs to the frame that it gave last."""
+
+    def __init__(self):
+        self._frames, self.last = list(open_stream(SOURCE, ":4")), None
+        self.length, self.dropped, self.notes, self.layout = 4, 0, (), ""
+        self.name, self.camera = "stateful", self._frames[0].camera
+
+    def __iter__(self):
+        for frame in self._frames:
+            self.last = frame
+            yield frame
+
+    def after(self, frame, report):
+        assert frame is self.last
 
 
 def test_frames_are_prepared_in_advance_on_two_threads_and_the_map_is_the_same(tmp_path, monkeypatch):
-    prepared_by, plain = [], Quality._prepare
+    prepared_by, plain = [], deadline.prepared
 
-    def prepare(self, frame):
+    def prepare(depth, frame):
         prepared_by.append(current_thread())
-        return plain(self, frame)
+        return plain(depth, frame)
 
-    monkeypatch.setattr(Quality, "_prepare", prepare)
+    monkeypatch.setattr(deadline, "prepared", prepare)
     seen = {}
     for threads in (1, 2):
         seen[threads], notes = Seen(), []
@@ -107,6 +125,12 @@ def test_frames_are_prepared_in_advance_on_two_threads_and_the_map_is_the_same(t
     assert set(prepared_by[:5]) == {current_thread()}
     assert prepared_by[5:].count(current_thread()) == 1  # the first: nothing was to be done before it
     same_cells(tmp_path / "1.svox", tmp_path / "2.svox")
+
+
+def test_a_stream_is_not_read_ahead(tmp_path):
+    stream = Stateful()
+    made = sv.map_recording(stream, tmp_path / "a.svox", voxel_size=0.1, threads=2, observers=[stream])
+    assert made.map.frames == 4
 
 
 def test_a_frame_that_was_not_expected_is_added_all_the_same():

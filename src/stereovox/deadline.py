@@ -8,7 +8,7 @@ Three levels, from thorough to quick: `full`; `near`, the same evidence on what 
 from __future__ import annotations
 
 from contextlib import suppress
-from functools import lru_cache
+from functools import lru_cache, partial
 from math import sqrt
 from time import perf_counter
 from typing import NamedTuple, Protocol
@@ -108,14 +108,16 @@ class Quality:
     def __init__(self, name: str, depth: DepthStage, config: Config):
         self.name, self.depth = name, depth
         self.integrator = make_integrator(config)
-        self.prepare = Ahead(self._prepare)
+        self.prepare = Ahead(partial(prepared, depth))  # without `self`, which would keep itself alive
 
-    def _prepare(self, frame: AnyFrame) -> Prepared:
-        started = perf_counter()
-        depth_frame = self.depth.matched(frame)
-        matched = started if depth_frame is frame else perf_counter()
-        image = self.depth.image(depth_frame)
-        return Prepared(depth_frame, image, 1e3 * (matched - started), 1e3 * (perf_counter() - matched))
+
+def prepared(depth: DepthStage, frame: AnyFrame) -> Prepared:
+    """Return the depth image of a frame. Raises FrameRefused as `depth`."""
+    started = perf_counter()
+    depth_frame = depth.matched(frame)
+    matched = started if depth_frame is frame else perf_counter()
+    image = depth.image(depth_frame)
+    return Prepared(depth_frame, image, 1e3 * (matched - started), 1e3 * (perf_counter() - matched))
 
 
 def full_quality(config: Config) -> Quality:

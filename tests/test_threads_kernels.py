@@ -6,6 +6,7 @@ import sys
 import threading
 import time
 
+import numpy as np
 import pytest
 
 from stereovox.threads import Ahead, Scratch, in_shards, run_both, shards
@@ -108,6 +109,19 @@ def test_what_was_begun_is_not_done_twice():
     ahead.begin(0)
     with pytest.raises(ZeroDivisionError):
         ahead(0)
+
+
+def test_what_was_begun_is_found_by_identity_and_used_once():
+    """Arguments that hold arrays, as frames do, cannot be compared."""
+    done = []
+    ahead = Ahead(lambda one: done.append(one[0]) or one[0])
+    first, second = ("first", np.zeros(3)), ("second", np.zeros(3))
+    ahead.begin(first)
+    ahead.begin(second)
+    assert [ahead(second), ahead(first)] == ["second", "first"]
+    assert sorted(done) == ["first", "second"]
+    assert ahead(second) == "second"
+    assert sorted(done) == ["first", "second", "second"]
 
 
 def test_only_two_calls_wait_in_the_background():

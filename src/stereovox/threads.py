@@ -9,7 +9,7 @@ from _thread import RLock
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from copy import deepcopy
 from functools import lru_cache, wraps
 from inspect import isgeneratorfunction
@@ -78,8 +78,8 @@ class Ahead(Generic[First, Second]):
         """Return what the function returns."""
         for begun in tuple(self._begun):  # a copy, since another thread may begin something meanwhile
             if begun[0] is argument:
-                with suppress(ValueError):  # two more were begun, so it is not remembered any more
-                    self._begun.remove(begun)
+                # by identity: arguments, such as frames, may not be comparable
+                self._begun = deque((one for one in tuple(self._begun) if one is not begun), maxlen=2)
                 return begun[1].result()
         return self._call(argument)
 

@@ -283,10 +283,9 @@ def make_windows(camera: PinholeCamera, smallest_tile: float) -> tuple[Windows, 
         _starts(tiles.prod(axis=2).ravel()).reshape(LEVELS, 2), np.ascontiguousarray(tiles[:, :, 1], np.int32),
         np.int32(first),
     )  # fmt: skip
-    scratch = WindowScratch(
-        np.zeros(size, np.float32), *(np.zeros((n, pitch), np.float32).squeeze() for n in (4, 1, 1, 1, 1))
-    )
-    near16, near64 = (np.zeros((-(-h // size), -(-w // size)), np.float32) for size in (16, 64))
+    rows = np.zeros((8, pitch), np.float32)
+    scratch = WindowScratch._make([np.zeros(size, np.float32), rows[:4], *rows[4:]])
+    near16, near64 = (np.zeros((-(-h // tile), -(-w // tile)), np.float32) for tile in (16, 64))
     return windows, scratch, (near16, near64)
 
 

@@ -33,7 +33,8 @@ SCENES = {
 }
 """Functions that return a `Stage`; their keyword arguments and defaults are the scene's parameters."""
 AXES = ("world", "optical")
-CAMERAS = ("simple", "d435", "kinect")
+SIMPLE = "simple"
+CAMERAS = (SIMPLE, "d435", "kinect")
 OWN = -1.0
 """Stands for what the camera has by itself."""
 
@@ -55,7 +56,7 @@ class Options:
     frames: int = 0
     noise: bool = True
     seed: int = 0
-    camera: str = "simple"
+    camera: str = SIMPLE
     image_width: int = 0
     barrel: float = 0.0
     toe_in: float = 0.0

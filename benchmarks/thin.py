@@ -2,11 +2,13 @@
 """What becomes of poles and wires of 0.3 to 4 pixels: stereovox and OctoMap on the same frames.
 
     python benchmarks/thin.py [--sweep] [--seeds 3] [--only WORDS] [--alone] [--set key=value ...] [--json]
-                              [--picture thin.png]
+                              [--camera d435] [--picture thin.png]
 
 A pole stands before a wall, or before nothing, and a simulated camera looks at it while it stands, flies or turns.
 `lost`: share of the layers of cells along the pole, as far as it was seen, without one occupied cell that the pole
 touches. `free`: share of the cells that the pole touches and the map calls free. Truth is exact, a cylinder.
+The cases' own noise is independent from pixel to pixel; `--camera d435` takes all of them with a camera that errs as a
+real one does (`stereovox.simulate.honest`).
 """
 
 from __future__ import annotations
@@ -24,6 +26,7 @@ from numpy.typing import NDArray
 from stereovox import Frame, Mapper, PinholeCamera
 from stereovox.cli.options import add_settings, overrides
 from stereovox.frame import Reason
+from stereovox.simulate.honest import HonestCamera
 
 HZ = 30
 HFOV_DEG, BASELINE, SUBPIXEL = 91.2, 0.05, 0.08
@@ -34,6 +37,8 @@ ROWS = 128
 NEAREST, FARTHEST = 0.195, 10.0
 """Depths in metres that the simulated camera delivers."""
 NOISES = ("exact", "flying", "d435", "smooth")
+HONEST = "honest"
+"""The noise of `--camera d435`."""
 MOTIONS = ("still", "sideways", "up", "towards", "turning", "shaking")
 BACKGROUNDS = {"close": 0.2, "wall": 0.8, "open": np.inf}
 """Metres from the pole's axis to the wall behind it."""
@@ -134,9 +139,17 @@ def true_depth(scene: Scene, T: NDArray, du: float = 0.0, dv: float = 0.0) -> ND
     return np.minimum(pole, wall)
 
 
-def measured(scene: Scene, T: NDArray, random: np.random.Generator) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Return what the camera makes of it: depth in metres (0: none) and the reason of each pixel."""
+def measured(
+    scene: Scene, T: NDArray, random: np.random.Generator, seed: list[int]
+) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    """Return what the camera makes of it: depth in metres (0: none) and the reason of each pixel.
+
+    seed: of the run and of the frame, for a camera that draws its own numbers.
+    """
     depth = true_depth(scene, T)
+    if scene.noise == HONEST:
+        millimetres, reason = HonestCamera(scene.camera, nearest=scene.nearest).measure(depth, seed, T)
+        return millimetres.astype(np.float32) / 1000, reason
     if scene.noise == "flying":
         depth = flying(scene, T, depth, random)
     inverse = 1 / depth
@@ -186,7 +199,7 @@ def frames_of(scene: Scene, seed: int) -> list[Frame]:
     frames = []
     for i in range(scene.frames):
         T = pose(scene, i, random)
-        depth, reason = measured(scene, T, random)
+        depth, reason = measured(scene, T, random, [seed, i])
         T = start @ shaken(T, scene.pose_noise, random)
         frames.append(Frame(depth, scene.camera, T, round(i * 1e9 / HZ), 1.0, reason, f"thin {i}"))
     return frames
@@ -368,6 +381,7 @@ def main() -> None:
     parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--only", default="", help="cases whose name holds this")
     parser.add_argument("--alone", action="store_true", help="without OctoMap")
+    parser.add_argument("--camera", choices=["d435"], help="one that errs as a real one does, in all cases")
     add_settings(parser, "sensor.passes=0.25")
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--picture", type=Path)
@@ -378,6 +392,7 @@ def main() -> None:
     for name, (scene, voxel_size, settings) in (sweep() if wanted.sweep else CASES).items():
         if wanted.only not in name:
             continue
+        scene = replace(scene, noise=HONEST) if wanted.camera else scene
         rows[name] = compared(scene, voxel_size, seeds, not wanted.alone, **{**settings, **given})
         if not wanted.json:
             shown = (f"{who}: lost {row['lost']:6.1%} free {row['free']:6.1%}" for who, row in rows[name].items())

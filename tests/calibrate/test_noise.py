@@ -9,8 +9,9 @@ import pytest
 from stereovox.calibrate.noise import calibrate_noise, fit_noise, noise_at
 from stereovox.calibrate.recording import read_wall
 from stereovox.cameras.pinhole import PinholeCamera
+from stereovox.cameras.rigs import StereoPair
 from stereovox.errors import StereovoxError
-from stereovox.frame import Frame
+from stereovox.frame import Frame, StereoFrame
 from stereovox.opening import open_source
 
 CAMERA = PinholeCamera(160, 100, 120.0, 120.0, 79.5, 49.5, 0.05)
@@ -163,3 +164,19 @@ def test_without_a_baseline_there_is_no_subpixel():
     found = calibrate_noise([recorded(noisy(d, 0.01), blind) for d in (1, 2, 4)])
     assert found.subpixel is None
     assert "baseline is not known" in " ".join(found.notes)
+
+
+def test_brightness_is_that_of_the_pixels_with_a_value():
+    """As Chien 2020, 2.2.4.1, counts it, frame by frame."""
+    depths, pair = noisy(1.5, 0.004, frames=3), StereoPair(CAMERA)
+    grey = np.full((100, 160), 50, np.uint8)
+    grey[:40] = 200
+    for depth in depths:
+        depth[:40] = 0
+    stereo = [StereoFrame(grey + np.uint8(i), grey, pair, np.eye(4), name=str(i)) for i in range(3)]
+    wall = read_wall(
+        stereo, "pair", CAMERA, matched=lambda frame: Frame(depths[int(frame.name)], CAMERA, np.eye(4)), condition="dim"
+    )
+    at = noise_at(wall)
+    assert at.grey == pytest.approx(51)
+    assert at.condition == "dim"

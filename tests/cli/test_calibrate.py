@@ -73,6 +73,39 @@ def test_a_measured_profile_is_what_the_map_uses(tmp_path, capsys):
     assert (noise.s0, noise.s1, noise.s2) == (told["s0"], told["s1"], told["s2"])
 
 
+def test_correlation_goes_into_the_profile_and_the_map_uses_it(tmp_path, capsys):
+    profile, report = tmp_path / "mine.toml", tmp_path / "report"
+    walls = [QUIET.format(f"{distance}&correlation=1.5") for distance in (1, 2)]
+    options = ["--terms", "s2", "--region", "2x1.2", "--out", profile, "--report", report, "--json"]
+    assert run("calibrate", "noise", *walls, *options) == 0
+    told = last_json(capsys)
+    assert told["correlation_px"] == pytest.approx(1.5, rel=0.1)
+    assert told["points"][0]["looks"] < 5
+    assert f"{told['correlation_px']:.2f} px" in (report / "noise.html").read_text()
+    assert run("map", walls[0], "--frames", ":2", "--out", tmp_path / "m", "--profile", profile) == 0
+    assert sv.load_map(tmp_path / "m").config.noise.correlation_px == told["correlation_px"]
+
+
+def test_conditions_are_compared(tmp_path, capsys):
+    """Light is what makes noise and holes here: twice the noise, and a camera with holes."""
+    walls = [QUIET.format("1&subpixel=0.05"), QUIET.format(2), QUIET.format("1&camera=d435&subpixel=0.1")]
+    words = [word for name in ("bright", "bright", "dark & dull") for word in ("--condition", name)]
+    report = tmp_path / "report"
+    options = ["--terms", "s2", "--out", tmp_path / "p.toml", "--report", report, "--json"]
+    assert run("calibrate", "noise", *walls, *words, *options) == 0
+    out = capsys.readouterr().out
+    bright, dark = json.loads(out.splitlines()[-1])["conditions"]
+    assert (bright["condition"], dark["condition"]) == ("bright", "dark & dull")
+    assert [round(distance) for distance in bright["distances_m"]] == [1, 2]
+    assert bright["subpixel"] == pytest.approx(np.sqrt((0.05**2 + 0.08**2) / 2), rel=0.05)
+    assert dark["subpixel"] > 1.2 * bright["subpixel"]
+    assert dark["valid_share"] < bright["valid_share"]
+    assert bright["grey"] is None
+    assert "dark &amp; dull" in (report / "noise.html").read_text()
+    assert run("calibrate", "noise", *walls, *words[:2], *options) == 2
+    assert "3 recordings but 1 x --condition" in capsys.readouterr().err
+
+
 def test_options_of_noise(tmp_path, capsys):
     camera = tmp_path / "camera.toml"
     walls = [WALL.format(distance) for distance in (1, 2)]

@@ -9,13 +9,14 @@ from stereovox.config import load_config
 from stereovox.depth import prepare
 from stereovox.depth.prepare import denoise
 from stereovox.frame import Frame, Reason
+from stereovox.simulate.d435 import smooth_noise
 
 CAMERA = PinholeCamera(64, 48, 415.0, 415.0, 31.5, 23.5, baseline=0.05)
 S2 = 0.08 / (415.0 * 0.05)
 CONFIG = load_config(voxel_size=0.05, min_range=0.2, max_range=6.0)
 
 
-def slow_denoise(depth_m, s0, s1, s2, voxel_size, low, high):
+def slow_denoise(depth_m, s0, s1, s2, voxel_size, low, high, apart=1):
     """The same in plain words and float64: three passes, pixel by pixel, neighbour by neighbour."""
     inverse = {vu: 1.0 / d for vu, d in np.ndenumerate(depth_m.astype(float)) if 0 < d < np.inf}
     untouched = {vu for vu, c in inverse.items() if s0 + s1 / c + s2 / c**2 <= 0.15 * voxel_size}
@@ -25,7 +26,8 @@ def slow_denoise(depth_m, s0, s1, s2, voxel_size, low, high):
             z = 1 / centre
             noise = s0 + s1 * z + s2 * z**2
             reach = k * min(noise, 1.3 * voxel_size) / z**2
-            beside = [(v, u - far), (v, u + far), (v - far, u), (v + far, u)]
+            step = far * apart
+            beside = [(v, u - step), (v, u + step), (v - step, u), (v + step, u)]
             if noise <= least * 0.15 * voxel_size:
                 beside = []
             values = [centre, *(inverse[vu] for vu in beside if vu in inverse)]
@@ -68,6 +70,33 @@ def test_same_as_the_slow_one(shape, noise):
     depth.flat[0] = 4.0  # at least one far value, whatever the shape
     numbers = (noise.get("s0", 0.0), noise.get("s1", 0.0), noise.get("s2", S2))
     np.testing.assert_allclose(cleaned(depth, config), slow_denoise(depth, *numbers, 0.05, 0.2, 6.0), rtol=2e-5)
+
+
+@pytest.mark.parametrize(("correlation_px", "apart"), [(0.3, 1), (0.7, 2), (1.0, 2), (1.5, 4), (5.0, 4)])
+@pytest.mark.parametrize("shape", [(48, 64), (1, 9), (40, 3)])
+def test_same_as_the_slow_one_where_errors_are_alike(shape, correlation_px, apart):
+    config = load_config(CONFIG, **{"noise.correlation_px": correlation_px})
+    depth = steps_and_holes(shape, seed=sum(shape))
+    depth.flat[0] = 4.0
+    np.testing.assert_allclose(
+        cleaned(depth, config), slow_denoise(depth, 0.0, 0.0, S2, 0.05, 0.2, 6.0, apart), rtol=2e-5
+    )
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize("correlation_px", [0.7, 1.5])
+def test_correlated_noise_goes_about_as_far_as_independent_noise_does(correlation_px, seed):
+    """Told how alike errors are, the filter leaves a fifth of them; not told, up to half."""
+    camera = PinholeCamera(200, 200, 415.0, 415.0, 99.5, 99.5, baseline=0.05)
+    noise = S2 * smooth_noise((200, 200), correlation_px, np.random.default_rng(seed))
+    depth = (1 / (1 / 4.0 + noise)).astype(np.float32)
+
+    def left(told):
+        config = load_config(CONFIG, **{"noise.correlation_px": told})
+        return (1 / cleaned(depth, config, camera))[30:-30, 30:-30].std() / S2
+
+    assert left(correlation_px) < 0.23
+    assert left(correlation_px) < 0.75 * left(0.0)
 
 
 def test_a_slanted_wall_loses_its_noise_and_stays_where_it_is():

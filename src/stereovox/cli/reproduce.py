@@ -23,6 +23,9 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--data", metavar="SOURCE", help="valenti2018: folder of recordings; others: your own recording"
     )
+    parser.add_argument(
+        "--camera", metavar="NAME", help="chien2020: simulated camera: simple (default), or honest: d435, kinect"
+    )
     parser.add_argument("--quick", action="store_true", help="few frames: a trial run, not figures to quote")
 
 
@@ -38,6 +41,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
             arguments.out,
             data=arguments.data,
             quick=arguments.quick,
+            camera=arguments.camera,
             progress=lambda done, total, text: bar.update(task, completed=done, total=total, description=text),
         )
     _print_result(result)

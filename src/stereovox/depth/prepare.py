@@ -40,6 +40,10 @@ FROM = np.array([1, 1, 3])
 """A pixel takes part in a pass where its noise is more than this many times FINE cells."""
 WIDTHS = np.array([4.5, 4.5, 4.0], np.float32)
 """A neighbour counts less the more it differs, and not at all beyond this many sigma."""
+APART = 2.5
+"""Pixels so many `noise.correlation_px` apart count as independent: their errors have a correlation of 0.2."""
+FARTHEST_APART = 4
+"""Most by which steps are stretched for that: the last then reaches 16 pixels. Farther off are other things."""
 LIMIT = 1.3
 """Cap of sigma in cells: what the map can separate is not mixed, however noisy the camera."""
 
@@ -101,7 +105,9 @@ def denoise(depth_m: NDArray[np.float32], camera: VirtualCamera, config: Config)
     pixels away, then 4. So few neighbours reach far, and stereo noise, which is correlated over about the matching
     window, is removed as well. It works on inverse depth, in which stereo noise is the same everywhere and a plane is
     linear, so a mean over symmetric neighbours is true to it. sigma is that of the noise model, configured or from
-    the camera. A pixel takes part in no more passes than it needs: it is left unchanged where sigma(depth) is at most
+    the camera. Errors that are alike over more than the next pixel (`noise.correlation_px`) do not average out there:
+    all steps are stretched until the neighbours are independent looks, as the filter takes them to be.
+    A pixel takes part in no more passes than it needs: it is left unchanged where sigma(depth) is at most
     FINE cells, and by the last pass up to three times that. So near surfaces keep every detail. Nothing is done where
     even the noise at the maximum range is less than WORTH cells.
 
@@ -218,14 +224,21 @@ def _sample_depths(frame: Frame) -> NDArray[np.float64]:
 
 
 def _run(depth_m: NDArray[np.float32], noise: RangeNoise, fine: float, config: Config) -> None:
-    margin = int(STEPS.max())
+    steps = STEPS * stretched(config.noise.correlation_px)
+    margin = int(steps.max())
     width = -(-depth_m.shape[1] // _images.SEGMENT) * _images.SEGMENT
     rings = np.empty((len(STEPS) + 1, 2 * margin + 1, width + 2 * margin), np.float32)
     low, high, limit = np.float32(config.min_range), np.float32(config.max_range), np.float32(LIMIT * config.voxel_size)
-    _images.denoise(depth_m, *_numbers(noise, fine), WIDTHS, limit, low, high, rings)
+    sigma, leaves = _numbers(noise, fine)
+    _images.denoise(depth_m, sigma, steps, leaves, WIDTHS, limit, low, high, rings)
+
+
+def stretched(correlation_px: float) -> int:
+    """Return by how much neighbours must be farther apart for errors that are alike over so many pixels; 1: not."""
+    return min(max(1, round(APART * correlation_px)), FARTHEST_APART)
 
 
 @lru_cache
-def _numbers(noise: RangeNoise, fine: float) -> tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.float32]]:
-    """Return s0, s1, s2 (3,) of the noise, and for each pass its step and the noise in metres that it leaves."""
-    return np.array([noise.s0, noise.s1, noise.s2], np.float32), STEPS, (fine * FROM).astype(np.float32)
+def _numbers(noise: RangeNoise, fine: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return s0, s1, s2 (3,) of the noise, and for each pass the noise in metres that it leaves."""
+    return np.array([noise.s0, noise.s1, noise.s2], np.float32), (fine * FROM).astype(np.float32)

@@ -22,7 +22,7 @@ from stereovox.mapper import Mapper
 from stereovox.maps import VoxelMap
 from stereovox.products.slices import layer
 from stereovox.simulate.scene import Scene, Solid
-from stereovox.simulate.simulation import Simulation
+from stereovox.simulate.simulation import SIMPLE, Simulation
 from stereovox.simulate.stage import Face
 from stereovox.view.figures import labels
 from stereovox.view.panels import GREY, STATE_COLOURS, title
@@ -111,10 +111,17 @@ class AisleFound:
 
 
 def compare_aisles(
-    *, frames: int = 100, variants: Sequence[Variant] = VARIANTS, step: Callable[[], None] = lambda: None
+    *,
+    frames: int = 100,
+    variants: Sequence[Variant] = VARIANTS,
+    camera: str = SIMPLE,
+    step: Callable[[], None] = lambda: None,
 ) -> tuple[list[AisleFound], Simulation]:
-    """Map the same images of an aisle of 12 m in every way; the first variant is what all are measured by."""
-    simulation = Simulation("sim:aisle?length=12&axes=optical", frames=frames)
+    """Map the same images of an aisle of 12 m in every way; the first variant is what all are measured by.
+
+    camera: as in the simulation's options.
+    """
+    simulation = Simulation(f"sim:aisle?length=12&axes=optical&camera={camera}", frames=frames)
     mappers = [Mapper(_config(variant)) for variant in variants]
     times: list[list[float]] = [[] for _ in variants]
     for frame in simulation:

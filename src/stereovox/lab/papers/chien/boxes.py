@@ -20,7 +20,7 @@ from stereovox.maps import State, VoxelMap, make_map
 from stereovox.products.slices import layer
 from stereovox.simulate.d435 import CAMERA
 from stereovox.simulate.plain_scenes import SIZES
-from stereovox.simulate.simulation import Simulation
+from stereovox.simulate.simulation import SIMPLE, Simulation
 from stereovox.view.axis import draw_profile
 from stereovox.view.figures import labels
 from stereovox.view.landscape import draw_landscape
@@ -80,10 +80,10 @@ class Placement:
         low = (self.x - width / 2, self.y - height / 2, self.distance)
         return np.array([low, (low[0] + width, low[1] + height, low[2] + depth)])
 
-    def simulation(self, frames: int) -> Simulation:
-        """Return what a D435 sees of it, in Chien's map frame."""
+    def simulation(self, frames: int, camera: str = SIMPLE) -> Simulation:
+        """Return what a D435 sees of it, in Chien's map frame; camera: as in the simulation's options."""
         where = f"sim:box?size={self.size}&distance={self.distance}&x={self.x}&y={self.y}&wall={WALL_M}&axes=optical"
-        return Simulation(where, frames=frames)
+        return Simulation(f"{where}&camera={camera}", frames=frames)
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,16 +125,18 @@ def find_boxes(
     updates: int = UPDATES,
     integrators: Sequence[str] = INTEGRATORS,
     settings: dict[str, Any] | None = None,
+    camera: str = SIMPLE,
     step: Callable[[], None] = lambda: None,
 ) -> list[BoxFound]:
     """Map each placement with each integrator under the profile `chien2020` and find the box again.
 
-    The same images go to all integrators. settings: on top of the profile. step: called after each placement.
+    The same images go to all integrators. settings: on top of the profile. camera: as in the simulation's options.
+    step: called after each placement.
     """
     configs = [load_config("chien2020", integrator=name, **(settings or {})) for name in integrators]
 
     def find(place: Placement) -> list[BoxFound]:
-        maps = map_together(configs, place.simulation(updates))
+        maps = map_together(configs, place.simulation(updates, camera))
         step()
         return [find_box(one, place, name) for one, name in zip(maps, integrators, strict=True)]
 

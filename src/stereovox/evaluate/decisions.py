@@ -12,9 +12,6 @@ from stereovox.evaluate.metrics import ratio
 from stereovox.evaluate.truth_cells import Reading, TruthCells
 from stereovox.maps import State, VoxelMap
 
-BESIDE = 1
-"""Cells from a surface within which something tentative or occupied still warns of it."""
-
 
 @dataclass(frozen=True)
 class Decisions:
@@ -69,7 +66,7 @@ def decide(reading: Reading, truth: TruthCells, chosen: NDArray[np.bool_] | None
     is_surface = truth.occupied & counted
     surface, air = _numbers(reading.states[is_surface]), _numbers(reading.states[counted & ~truth.occupied])
     of_surface = counted[truth.occupied]  # (S,)
-    beside, near = (reading.highest_state(within)[of_surface] for within in (BESIDE, reading.tolerance))
+    beside, near = reading.beside[of_surface], reading.reached[of_surface]
     alone = int(((reading.states[is_surface] == State.FREE) & (beside < State.TENTATIVE)).sum())
     n_surface, n_air = sum(surface), sum(air)
     known = n_surface - surface[State.UNKNOWN]

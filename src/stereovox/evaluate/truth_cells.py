@@ -140,9 +140,15 @@ class Reading:
         known = np.where(self.around == 0, np.float32(-np.inf), self.around)
         return self.neighbourhood.highest(known, tolerance)
 
-    def highest_state(self, tolerance: int) -> NDArray[np.uint8]:
-        """Return for each truly occupied cell (S,) the highest `State` within `tolerance` cells."""
-        return self.neighbourhood.highest(self.around_states, tolerance)
+    @cached_property
+    def beside(self) -> NDArray[np.uint8]:
+        """For each truly occupied cell (S,) the highest `State` within one cell."""
+        return self.neighbourhood.highest(self.around_states, 1)
+
+    @cached_property
+    def reached(self) -> NDArray[np.uint8]:
+        """For each truly occupied cell (S,) the highest `State` within the tolerance."""
+        return self.neighbourhood.highest(self.around_states, self.tolerance)
 
     def marked(self, threshold: float) -> NDArray[np.bool_]:
         """Cells (N,) the map calls occupied, p > threshold (Valenti 2018, Eq 8.1); never an unobserved one."""
@@ -157,10 +163,10 @@ class TruthCells:
     """The cells of a truth map that count, and what lies within `tolerance` cells of its surfaces.
 
     truth_map: its occupied cells hold a surface, its free cells were in view and hold none; all others, tentative ones
-    too, do not count. cells: ascending keys (N,) of those that count; occupied: (N,) which of them hold a surface;
-    near: (N,) which have a surface within the tolerance; neighbourhood: the cells around the S occupied ones. Distances
-    count along each axis: diagonal neighbours are one cell away. Raises StereovoxError for a truth without such cells
-    and an invalid tolerance.
+    too, do not count. map: the same in cubes. cells: ascending keys (N,) of those that count; occupied: (N,) which of
+    them hold a surface; near: (N,) which have a surface within the tolerance; neighbourhood: the cells around the S
+    occupied ones. Distances count along each axis: diagonal neighbours are one cell away. Raises StereovoxError for a
+    truth without such cells and an invalid tolerance.
     """
 
     def __init__(self, truth_map: VoxelMap, tolerance: int = 1):
@@ -171,7 +177,8 @@ class TruthCells:
         counts = (state == State.OCCUPIED) | (state == State.FREE)
         if not counts.any():
             raise StereovoxError("the truth holds no occupied and no free cell; make it with stereovox truth")
-        self.voxel_size, self.tolerance, self.up = truth_map.voxel_size, tolerance, truth_map.config.up
+        self.map, self.tolerance = truth_map, tolerance
+        self.voxel_size, self.up = truth_map.voxel_size, truth_map.config.up
         self.cells: Keys = known[counts]
         self.occupied: NDArray[np.bool_] = state[counts] == State.OCCUPIED
         self.neighbourhood = Neighbourhood(self.cells[self.occupied], max(tolerance, _LEAST_REACH))
@@ -199,6 +206,10 @@ class TruthCells:
         states = voxel_map.storage.rules.states(stored)
         own, around = self._own, self._around
         return Reading(log_odds[own], states[own], log_odds[around], states[around], self.neighbourhood, self.tolerance)
+
+    def surface(self) -> NDArray[np.int32]:
+        """Return the indices (S, 3) of the truly occupied cells."""
+        return indices(self.cells[self.occupied])
 
     def centers(self) -> NDArray[np.float64]:
         """Return the centres (N, 3) of the cells in metres, world frame."""

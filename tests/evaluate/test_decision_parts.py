@@ -155,7 +155,7 @@ def test_the_looks_of_a_map_are_those_of_its_own_path(tmp_path):
     assert found.tolist() == views(truth, poses, frames[0].camera, mapper.map.config.max_range).tolist()
     assert 0 < found.max() <= len(poses)
     names = {part.by for part in score(mapper.map, truth).parts}
-    assert names == {"thickness", "looks"}
+    assert names == {"range", "thickness", "looks"}
     mapper.map.save(tmp_path / "box.svox")
     again = looks(sv.load_map(tmp_path / "box.svox"), truth)
     assert again is not None

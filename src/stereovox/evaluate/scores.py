@@ -79,8 +79,8 @@ class Scores(QuickScores):
     f_score_1, f_score_2: harmonic mean of precision and recall within one cell, and within two, over all cells.
     balanced: the point of `curve` where the lesser of precision and recall within the tolerance is largest.
     ece_likely: as `ece`, over cells with p >= 0.3; ece_equal_mass: in bins of as many cells.
-    decisions: what the map itself decides, at its own thresholds; parts: the same by range (where a path was given),
-    thickness and looks (where the map holds its camera's path).
+    decisions: what the map itself decides, at its own thresholds; parts: the same by range (from the path given, or the
+    map's own), thickness and looks (where the map holds its camera's path).
     reliability, equal_mass: over observed cells; roc: over all cells, None unless some are occupied and some free;
     curve: precision and recall against the threshold; distance: the same against distance, None without a path.
     """
@@ -138,6 +138,7 @@ def score(
     over_all, over_seen = roc(reading.probability, actual), roc(p, known)
     quick, even = score_reading(reading, truth, threshold, bins), equal_mass(p, known, bins)
     curve = precision_recall(reading, actual, truth.near, thresholds)
+    places = path if path is not None or not len(voxel_map.path) else voxel_map.path
     return Scores(
         **{field.name: getattr(quick, field.name) for field in fields(quick)},
         auc=over_all.auc if over_all else None,
@@ -150,7 +151,7 @@ def score(
         ece_likely=reliability(p[p >= LIKELY], known[p >= LIKELY], bins).ece,
         ece_equal_mass=even.ece,
         decisions=decide(reading, truth),
-        parts=decision_parts(reading, truth, path, edges, looks(voxel_map, truth)),
+        parts=decision_parts(reading, truth, places, edges, looks(voxel_map, truth)),
         reliability=reliability(p, known, bins),
         equal_mass=even,
         roc=over_all,

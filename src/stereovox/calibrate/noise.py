@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Noise of a depth camera, from recordings of a flat wall at several distances (Chien 2020, 2.2.4 and 3.3)."""
+"""Noise of a depth camera, from recordings of a flat wall at several distances (Chien 2020, 2.2.4 and 3.3).
+
+Recordings in other light, with another emitter power or before another texture may be named so, and are compared as in
+his 2.2.4.1, where the share of pixels with a value is the measure of quality.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stereovox.calibrate.correlation import Correlation
 from stereovox.calibrate.recording import WallRecording
 from stereovox.calibrate.surface import Array, find_wall, fit_plane, slopes
 from stereovox.calibrate.wall import distance_groups
@@ -21,6 +26,8 @@ MIN_PIXELS = 30
 MIN_RMSE = 1e-6
 """Error, as a share of the depth, below which there is nothing but rounding."""
 TERMS = ("s0", "s1", "s2")
+PATCH = 8
+"""Pixels across the patches whose independent measurements are counted."""
 
 
 @dataclass(frozen=True)
@@ -34,6 +41,9 @@ class NoiseAt:
     valid_share: share of the region's pixels that have a value, of all frames; image_share: of the whole image.
     gross_share: share of the image's values that are gross errors; they are in no other figure.
     subpixel: the disparity error in pixels that makes rmse_m (Chien 2020, Eq 3.5), None without a baseline.
+    correlation_px, falls_to_1_e_px, looks: how alike the errors of neighbouring pixels are, see `Correlation`; looks
+    are those in a patch of 8 x 8 pixels. grey: mean grey level of the pixels with a value, None where it is not known.
+    condition: in what light, with which emitter power or before which texture, in words.
     """
 
     name: str
@@ -48,6 +58,29 @@ class NoiseAt:
     subpixel: float | None
     pixels: int
     frames: int
+    correlation_px: float = 0.0
+    falls_to_1_e_px: tuple[float, float] = (0.0, 0.0)
+    looks: float = PATCH * PATCH
+    grey: float | None = None
+    condition: str = ""
+
+
+@dataclass(frozen=True)
+class ConditionNoise:
+    """What the recordings in one condition have in common (Chien 2020, 2.2.4.1).
+
+    distances_m: of the recordings. rmse_percent: root mean square over them of the error as a share of the depth.
+    subpixel: the same of the disparity error in pixels, None without a baseline. valid_share, gross_share: means.
+    grey: mean grey level, None where no image is known.
+    """
+
+    condition: str
+    distances_m: tuple[float, ...]
+    rmse_percent: float
+    subpixel: float | None
+    valid_share: float
+    gross_share: float
+    grey: float | None
 
 
 @dataclass(frozen=True)
@@ -55,7 +88,8 @@ class NoiseCalibration:
     """sigma(z) = s0 + s1 z + s2 z^2 in metres, and what it was fitted to, nearest first.
 
     subpixel: s2 * focal length * baseline in pixels, None without a baseline. worst_percent: by how much the curve
-    misses a point at most.
+    misses a point at most. correlation_px: mean of the recordings'. conditions: in the order in which they were named,
+    empty where none was.
     """
 
     s0: float
@@ -67,6 +101,8 @@ class NoiseCalibration:
     region: tuple[float, float]
     points: tuple[NoiseAt, ...]
     notes: tuple[str, ...]
+    correlation_px: float = 0.0
+    conditions: tuple[ConditionNoise, ...] = ()
 
     def sigma(self, z: Array) -> Array:
         """Return the standard deviation in metres at depths `z` in metres."""
@@ -80,9 +116,11 @@ class NoiseCalibration:
 
     def as_dict(self) -> dict[str, Any]:
         """Return all figures."""
-        fit = {name: getattr(self, name) for name in ("s0", "s1", "s2", "subpixel", "focal_px", "baseline")}
+        names = ("s0", "s1", "s2", "subpixel", "correlation_px", "focal_px", "baseline")
+        fit = {name: getattr(self, name) for name in names}
         rest = {"worst_percent": self.worst_percent, "region_m": list(self.region), "notes": list(self.notes)}
-        return {**fit, **rest, "points": [vars(point) for point in self.points]}
+        each = {"points": [vars(point) for point in self.points], "conditions": [vars(one) for one in self.conditions]}
+        return {**fit, **rest, **each}
 
 
 def calibrate_noise(
@@ -109,7 +147,33 @@ def calibrate_noise(
     focal_px = camera.fx * camera.binning
     subpixel = s[2] * focal_px * camera.baseline if camera.baseline else None
     notes = _notes(points, fitted, camera.baseline)
-    return NoiseCalibration(*s, subpixel, focal_px, camera.baseline, region, tuple(points), notes)
+    alike = float(np.mean([point.correlation_px for point in points]))
+    return NoiseCalibration(
+        *s, subpixel, focal_px, camera.baseline, region, tuple(points), notes, alike, by_condition(recordings, points)
+    )
+
+
+def by_condition(recordings: Sequence[WallRecording], points: Sequence[NoiseAt]) -> tuple[ConditionNoise, ...]:
+    """Return the noise in each condition named by the recordings, in their order; empty where none is named."""
+    named = list(dict.fromkeys(recording.condition for recording in recordings))
+    return tuple(_condition(name, [p for p in points if p.condition == name]) for name in named) if any(named) else ()
+
+
+def _condition(name: str, points: Sequence[NoiseAt]) -> ConditionNoise:
+    def rms(values: Sequence[float]) -> float:
+        return float(np.sqrt(np.mean(np.square(values))))
+
+    subpixels = [point.subpixel for point in points if point.subpixel is not None]
+    greys = [point.grey for point in points if point.grey is not None]
+    return ConditionNoise(
+        name or "not named",
+        tuple(point.distance_m for point in points),
+        100 * rms([point.rmse_m / point.distance_m for point in points]),
+        rms(subpixels) if subpixels else None,
+        float(np.mean([point.valid_share for point in points])),
+        float(np.mean([point.gross_share for point in points])),
+        float(np.mean(greys)) if greys else None,
+    )
 
 
 def noise_at(recording: WallRecording, region: tuple[float, float] = REGION) -> NoiseAt:
@@ -130,7 +194,7 @@ def noise_at(recording: WallRecording, region: tuple[float, float] = REGION) -> 
     plane = fit_plane(x[used], y[used], recording.inverse[used])
     rmse, temporal, fixed = _errors(recording.sums[:, used], 1 / (plane[0] + plane[1] * x[used] + plane[2] * y[used]))
     distance = float(1 / plane[0])
-    values = recording.count.sum()
+    values, alike = recording.count.sum(), Correlation.of(recording.products)
     return NoiseAt(
         recording.name,
         distance,
@@ -144,6 +208,11 @@ def noise_at(recording: WallRecording, region: tuple[float, float] = REGION) -> 
         rmse * camera.fx * camera.binning * camera.baseline / distance**2 if camera.baseline else None,
         int(used.sum()),
         recording.frames,
+        alike.length_px,
+        alike.falls_to_1_e_px,
+        alike.looks(PATCH),
+        grey=float(np.mean(recording.greys)) if recording.greys else None,
+        condition=recording.condition,
     )
 
 

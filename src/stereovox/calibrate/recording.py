@@ -3,17 +3,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
+from stereovox.calibrate.correlation import LAGS, add_products
 from stereovox.calibrate.surface import find_wall
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.depth.prepare import correct
 from stereovox.errors import StereovoxError
-from stereovox.frame import Frame, Reason
+from stereovox.frame import AnyFrame, Frame, Reason, StereoFrame
 
 GROSS = 0.25
 """Values off by a larger share of the depth are not noise: mismatches, or a person walking through."""
@@ -30,6 +31,9 @@ class WallRecording:
     sums (4, height, width) float64: number of values, then the sums of 1/z, z and z^2 (z in metres).
     gross: number of values left out as gross errors; skipped: frames without usable depth, first_fault: why the first
     of them was. Poses do not count.
+    products: of the errors of 1/z of neighbouring pixels, see `add_products`, against the surface in the first frame.
+    greys: mean grey level of the pixels with a value, of each frame whose image is known.
+    condition: in what light, with which emitter power or before which texture it was taken, in words.
     """
 
     name: str
@@ -40,6 +44,9 @@ class WallRecording:
     first_fault: str = ""
     gross: int = 0
     sums: NDArray[np.float64] = field(default_factory=lambda: np.zeros((4, 0, 0)))
+    products: NDArray[np.float64] = field(default_factory=lambda: np.zeros((2, LAGS + 1, 2)))
+    greys: list[float] = field(default_factory=list)
+    condition: str = ""
 
     @property
     def count(self) -> NDArray[np.float64]:
@@ -62,20 +69,31 @@ class WallRecording:
         return float(self.count.sum() / max(1, self.frames * self.count.size))
 
 
+def itself(frame: AnyFrame) -> Frame:
+    """Return the frame, which must have depth."""
+    assert isinstance(frame, Frame)
+    return frame
+
+
 def read_wall(
-    frames: Iterable[Frame],
+    frames: Iterable[AnyFrame],
     name: str,
     camera: PinholeCamera,
     distance: float | None = None,
+    matched: Callable[[AnyFrame], Frame] = itself,
+    condition: str = "",
 ) -> WallRecording:
     """Return the sums over `frames`, which may lack poses; depths are corrected where `camera` has a correction.
+
+    matched: turns stereo frames into depth frames. condition: see `WallRecording`.
 
     The first frame tells where the wall is, and so what is a gross error.
     Raises StereovoxError where not one frame has usable depth, and as `find_wall` where the first shows no wall.
     """
-    wall = WallRecording(name, camera, distance, sums=np.zeros((4, camera.height, camera.width)))
+    wall = WallRecording(name, camera, distance, sums=np.zeros((4, camera.height, camera.width)), condition=condition)
     expected, gross = None, GROSS
-    for frame in frames:
+    for seen in frames:
+        frame = matched(seen)
         depth_m = metres(frame)
         if depth_m.shape != wall.count.shape or not np.isfinite(depth_m).any():
             wall.skipped += 1
@@ -86,6 +104,8 @@ def read_wall(
             found = find_wall(1 / depth_m.astype(float), camera, name)
             expected, gross = found.inverse(camera), max(GROSS, 6 * found.noise)
         _add(wall, depth_m, expected, gross)
+        if isinstance(seen, StereoFrame) and seen.left.shape[:2] == depth_m.shape:
+            wall.greys.append(float(seen.left[np.isfinite(depth_m)].mean()))
     if not wall.frames:
         raise StereovoxError(f"{name}: no valid depth in any frame ({wall.first_fault or 'it has none'})")
     return wall
@@ -110,5 +130,7 @@ def _add(wall: WallRecording, depth_m: NDArray[np.float32], expected: NDArray[np
         usable = known & (np.abs(z * expected - 1) <= gross)
     wall.gross += int(known.sum() - usable.sum())
     z[~usable] = 0
-    wall.sums += [usable, np.divide(1, z, out=np.zeros_like(z), where=usable), z, z * z]
+    inverse = np.divide(1, z, out=np.zeros_like(z), where=usable)
+    wall.sums += [usable, inverse, z, z * z]
+    add_products(wall.products, np.where(usable, inverse - expected, np.nan))
     wall.frames += 1

@@ -3,7 +3,7 @@
 
 Record a flat, textured wall with a still camera from three or more distances, about 30 frames each, from the nearest to
 the farthest you will use. Only the middle of the image is used. Use the result with: stereovox map SOURCE --profile
-FILE.
+FILE. To compare light, emitter power or textures, name what each recording shows with --condition.
 """
 
 from __future__ import annotations
@@ -11,12 +11,12 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 from typing import TYPE_CHECKING, Any
 
-from stereovox.cli.recordings import add_recordings, check_distances, check_outputs, read_walls
+from stereovox.cli.recordings import add_recordings, check_count, check_distances, check_outputs, read_walls
 from stereovox.cli.terminal import say
 from stereovox.errors import StereovoxError
 
 if TYPE_CHECKING:
-    from stereovox.calibrate.noise import NoiseCalibration
+    from stereovox.calibrate.noise import ConditionNoise, NoiseAt, NoiseCalibration
 
 EXAMPLE = "stereovox calibrate noise wall-1m wall-2m wall-4m --out my-d435.toml --report noise-report"
 
@@ -35,6 +35,14 @@ def add_arguments(parser: ArgumentParser) -> None:
         help="metres of the wall around its middle that are used (%(default)s)",
     )
     parser.add_argument(
+        "--condition",
+        action="append",
+        default=[],
+        metavar="TEXT",
+        help="light, emitter power or texture in words, for example 'dark, 150 mW', once for each RECORDING; "
+        "prints a table of errors and valid pixels by condition",
+    )
+    parser.add_argument(
         "--terms", default="s0,s1,s2", metavar="S,...", help="coefficients to fit; each needs a distance (%(default)s)"
     )
 
@@ -45,8 +53,11 @@ def run(arguments: Namespace) -> dict[str, Any]:
 
     region, terms = _region(arguments.region), _terms(arguments.terms)
     check_distances(arguments.recordings, arguments.distance)
+    check_count(arguments.recordings, arguments.condition, "--condition")
     check_outputs(arguments.out, arguments.report)
-    walls = read_walls(arguments.recordings, arguments.distance, arguments.frames, arguments.camera)
+    walls = read_walls(
+        arguments.recordings, arguments.distance, arguments.frames, arguments.camera, conditions=arguments.condition
+    )
     found = calibrate_noise(walls, region, terms)
     _write(arguments.out, found)
     _print_result(found, arguments.out)
@@ -91,7 +102,9 @@ def profile_text(found: NoiseCalibration) -> str:
     if found.subpixel is not None:
         lines.append(f"# s2 is a disparity error of {found.subpixel:.4f} px")
     lines += [f"# {point.distance_m:.3f} m: RMSE {1000 * point.rmse_m:.2f} mm" for point in found.points]
-    lines += ["[noise]", *(f"{name} = {float(getattr(found, name))!r}" for name in ("s0", "s1", "s2"))]
+    lines += ["# correlation_px: errors of neighbouring pixels are alike as smoothed by a Gaussian of so many pixels"]
+    names = ("s0", "s1", "s2", "correlation_px")
+    lines += ["[noise]", *(f"{name} = {float(getattr(found, name))!r}" for name in names)]
     return "\n".join(lines) + "\n"
 
 
@@ -105,9 +118,22 @@ def _print_result(found: NoiseCalibration, out: str) -> None:
         subpixel = "" if point.subpixel is None else f", sub-pixel {point.subpixel:.3f}"
         say(
             f"  at {point.distance_m:.2f} m: RMSE {1000 * point.rmse_m:.2f} mm{parts}{subpixel}, "
-            f"{point.valid_share:.1%} of the pixels valid"
+            f"{point.valid_share:.1%} of the pixels valid, {_alike(point)}"
         )
+    for one in found.conditions:
+        say(f"  {_condition(one)}")
     subpixel = "" if found.subpixel is None else f"; s2 is {found.subpixel:.4f} px of disparity"
     say(f"sigma(z) = {found.s0:.3g} + {found.s1:.3g} z + {found.s2:.3g} z^2 m{subpixel}")
+    say(f"errors of neighbouring pixels are alike over a Gaussian of {found.correlation_px:.2f} px")
     say("fitted to the whole RMSE: an error that stays the same does not average out, so it belongs into sigma")
     say(f"saved {out}; use it with: stereovox map SOURCE --out MAP --profile {out}")
+
+
+def _alike(point: NoiseAt) -> str:
+    return f"8x8 of them are {point.looks:.1f} independent looks"
+
+
+def _condition(one: ConditionNoise) -> str:
+    error = f"{one.rmse_percent:.2f} %" if one.subpixel is None else f"{one.rmse_percent:.2f} % ({one.subpixel:.3f} px)"
+    grey = "" if one.grey is None else f", mean grey {one.grey:.0f}"
+    return f"{one.condition}: RMSE {error}, {one.valid_share:.1%} valid, {one.gross_share:.2%} gross errors{grey}"

@@ -55,17 +55,27 @@ def check_outputs(out: str, report: str | None = None) -> None:
 
 
 def read_walls(
-    names: Sequence[str], distances: Sequence[float], frames: str | None, camera: str | None = None, raw: bool = False
+    names: Sequence[str],
+    distances: Sequence[float],
+    frames: str | None,
+    camera: str | None = None,
+    raw: bool = False,
+    conditions: Sequence[str] = (),
 ) -> list[WallRecording]:
-    """Return the walls of the recordings; `distances` as for `check_distances`.
+    """Return the walls of the recordings; `distances` as for `check_distances`, `conditions` likewise.
 
     camera: a camera file that replaces theirs. raw: use the measured depths without any correction.
     """
-    measured = distances or [None] * len(names)
-    return [_read(name, distance, frames, camera, raw) for name, distance in zip(names, measured, strict=True)]
+    measured, named = distances or [None] * len(names), conditions or [""] * len(names)
+    return [
+        _read(name, distance, frames, camera, raw, condition)
+        for name, distance, condition in zip(names, measured, named, strict=True)
+    ]
 
 
-def _read(name: str, distance: float | None, frames: str | None, camera: str | None, raw: bool) -> WallRecording:
+def _read(
+    name: str, distance: float | None, frames: str | None, camera: str | None, raw: bool, condition: str
+) -> WallRecording:
     from stereovox.calibrate.recording import read_wall
     from stereovox.config import load_config
     from stereovox.depth import DepthPipeline
@@ -84,16 +94,20 @@ def _read(name: str, distance: float | None, frames: str | None, camera: str | N
         count = LIVE_FRAMES
     path = DepthPipeline(load_config())
     shown = tracked(islice(stream, count), count, name)
-    return read_wall(
-        map(path.matched, shown), name, replace(stream.camera, correction=None) if raw else stream.camera, distance
-    )
+    lens = replace(stream.camera, correction=None) if raw else stream.camera
+    return read_wall(shown, name, lens, distance, path.matched, condition)
+
+
+def check_count(names: Sequence[str], given: Sequence[object], option: str) -> None:
+    """Raise StereovoxError unless the option was given once for each recording, or not at all."""
+    if given and len(given) != len(names):
+        many = f"{len(names)} recording{'s' * (len(names) != 1)}"
+        raise StereovoxError(f"{many} but {len(given)} x {option}: give one for each, in the same order, or none")
 
 
 def check_distances(names: Sequence[str], distances: Sequence[float], option: str = "--distance") -> None:
     """Raise StereovoxError unless there is a valid distance for each recording, or none at all."""
-    if distances and len(distances) != len(names):
-        many = f"{len(names)} recording{'s' * (len(names) != 1)}"
-        raise StereovoxError(f"{many} but {len(distances)} x {option}: give one for each, in the same order, or none")
+    check_count(names, distances, option)
     for distance in distances:
         if not 0 < distance < 1000:
             raise StereovoxError(f"{option} {distance:g}: give metres, above 0")

@@ -18,6 +18,8 @@ class NoiseConfig(Section):
         that is missing in print).
     subpixel: standard deviation of the disparity in pixels. Not set: the camera's own (`stereo.subpixel` for images
         that are matched here), else 0.08.
+    correlation_px: errors of neighbouring pixels are alike as if smoothed by a Gaussian of this standard deviation in
+        pixels, and do not average out as independent ones do; `calibrate noise` measures it. 0: independent.
     default_baseline: metres between the two eyes, for cameras whose file does not give it.
     pose_m, pose_deg: standard deviation of the tracker's poses along and about each axis; hits and passes count as less
         sure, with models that know how wide noise is.
@@ -27,6 +29,7 @@ class NoiseConfig(Section):
     s1: float = Field(0.0, ge=0)
     s2: float | None = Field(None, ge=0)
     subpixel: float | None = Field(None, gt=0)
+    correlation_px: float = Field(0.0, ge=0, le=16)
     default_baseline: float = Field(0.05, gt=0)
     pose_m: float = Field(0.0, ge=0, le=10)
     pose_deg: float = Field(0.0, ge=0, le=90)

@@ -25,6 +25,17 @@ PERCENT = (
 )
 
 
+ALIKE = (
+    "Errors of neighbouring pixels are alike: a mean of n of them is noisier than a single one divided by the root of "
+    "n. The Gaussian is the one by which independent noise would have to be smoothed; of such noise the correlation "
+    "falls to 1/e at twice its standard deviation. Looks: independent measurements in a patch of 8 x 8 pixels."
+)
+CONDITIONS = (
+    "After Chien 2020, 2.2.4.1: the more pixels have a value the better. Errors are root mean squares over the "
+    "recordings in a condition; mean grey is that of the pixels with a value, where the image is known."
+)
+
+
 def write_wall_report(folder: str | Path, found: WallCalibration, camera_file: str) -> Path:
     """Write `wall.html` and `wall.png` into `folder`, created if missing, and return the page's path.
 
@@ -68,6 +79,7 @@ def noise_page(found: NoiseCalibration, png: bytes, profile: str) -> str:
     boxes = [(f"{found.s0:.3g}", "s0 [m]"), (f"{found.s1:.3g}", "s1"), (f"{found.s2:.3g}", "s2 [1/m]")]
     if found.subpixel is not None:
         boxes.append((f"{found.subpixel:.3f} px", "s2 as a disparity error"))
+    boxes.append((f"{found.correlation_px:.2f} px", "errors alike over a Gaussian of"))
     return page.page(
         "Depth noise on flat walls",
         f"Errors of single measurements against the plane of the wall, within the middle {width:g} x {height:g} m "
@@ -82,6 +94,8 @@ def noise_page(found: NoiseCalibration, png: bytes, profile: str) -> str:
             f"The curve misses a point by {found.worst_percent:.1f} % at most.",
             page.table(*_noise_table(found)),
         ),
+        page.section("Neighbouring pixels", ALIKE, page.table(*_alike_table(found))),
+        *([page.section("Conditions", CONDITIONS, page.table(*_condition_table(found)))] if found.conditions else []),
         *([page.section("Notes", "", *(page.code(note) for note in found.notes))] if found.notes else []),
     )
 
@@ -152,6 +166,34 @@ def _noise_table(found: NoiseCalibration) -> tuple[list[str], list[list[str]]]:
         for point in found.points
     ]
     return heads, rows
+
+
+def _alike_table(found: NoiseCalibration) -> tuple[list[str], list[list[str]]]:
+    heads = ["recording", "distance [m]", "Gaussian [px]", "1/e along rows [px]", "1/e along columns [px]", "looks"]
+    rows = [
+        [point.name, f"{point.distance_m:.3f}", f"{point.correlation_px:.2f}"]
+        + [f"{lag:.2f}" for lag in point.falls_to_1_e_px]
+        + [f"{point.looks:.1f} of 64"]
+        for point in found.points
+    ]
+    return heads, rows
+
+
+def _condition_table(found: NoiseCalibration) -> tuple[list[str], list[list[str]]]:
+    heads = ["condition", "distances [m]", "RMSE [% of the depth]", "sub-pixel [px]", "valid", "gross errors"]
+    rows = [
+        [
+            one.condition,
+            ", ".join(f"{distance:.2f}" for distance in one.distances_m),
+            f"{one.rmse_percent:.2f}",
+            "-" if one.subpixel is None else f"{one.subpixel:.3f}",
+            f"{one.valid_share:.1%}",
+            f"{one.gross_share:.2%}",
+            "-" if one.grey is None else f"{one.grey:.0f}",
+        ]
+        for one in found.conditions
+    ]
+    return [*heads, "mean grey"], rows
 
 
 def write_page(folder: Path, name: str, text: str, png: bytes) -> Path:

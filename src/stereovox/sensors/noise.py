@@ -17,6 +17,28 @@ SUBPIXEL = 0.08
 """Default disparity noise in pixels: that of a RealSense D435 (Chien 2020, 2.2.4)."""
 
 
+def kept_by_means(correlation_px: float) -> float:
+    """Return by how much correlation along an axis raises the variance of means of many pixels; 1: independent.
+
+    The noise is white noise smoothed by a Gaussian of this standard deviation; this is the sum of its correlation over
+    all lags, (sum k)^2 / sum k^2 of the kernel k, about 3.54 times a standard deviation that is not small.
+    """
+    if correlation_px <= 0:
+        return 1.0
+    reach = np.arange(-int(5 * correlation_px) - 2, int(5 * correlation_px) + 3)
+    kernel = np.exp(-0.5 * (reach / correlation_px) ** 2)
+    return float(kernel.sum() ** 2 / (kernel**2).sum())
+
+
+def looks(side: int, correlation_px: float) -> float:
+    """Return how many independent measurements a square of side x side pixels holds: its mean is as noisy as theirs."""
+    if correlation_px <= 0:
+        return float(side * side)
+    lags = np.arange(1, side)
+    along = 1 + 2 * np.sum((1 - lags / side) * np.exp(-(lags**2) / (4 * correlation_px**2)))
+    return float((side / along) ** 2)
+
+
 @dataclass(frozen=True)
 class RangeNoise:
     """Standard deviation of a depth: sigma(z) = s0 + s1 z + s2 z^2, all in metres."""

@@ -1,15 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sensor model of a RealSense D435: disparity noise, holes beside edges, near and far limits."""
+"""A simple model of a RealSense D435: disparity noise, holes beside edges, near and far limits, reasons told."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import ceil, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.frame import Reason
+from stereovox.se3 import Transform
 
 HFOV_DEG = 91.2
 CAMERA = PinholeCamera.from_field_of_view(848, 480, HFOV_DEG, baseline=0.05)
@@ -22,7 +24,9 @@ JUMP_PX = 1.0
 
 @dataclass(frozen=True)
 class D435:
-    """A stereo depth camera whose matching error is Gaussian in disparity and independent from pixel to pixel.
+    """A stereo depth camera whose matching error is Gaussian in disparity, and new in each frame.
+
+    It is kinder than real ones (`stereovox.simulate.honest`), above all with independent noise and with reasons.
 
     subpixel: standard deviation of the disparity in pixels (Chien 2020: 0.08).
     nearest, farthest: depths in metres the camera delivers.
@@ -30,6 +34,8 @@ class D435:
     edge_loss: share of the nearer surface's own border pixels that find none.
     barrel: how much too far the left and right borders of the image are seen, as a share of the depth; it grows with
         the square of the distance from the optical axis (Chien 2020, App. A: 0.1).
+    correlation_px: standard deviation in pixels of the Gaussian that smooths the error, whose size stays; 0: it is
+        independent from pixel to pixel.
     toe_in: angle in radians by which the right eye is turned without the camera knowing: a barrel as well, whose share
         grows with the depth, as Chien 2020, App. A, says of his.
     """
@@ -42,20 +48,21 @@ class D435:
     edge_loss: float = 0.25
     barrel: float = 0.0
     toe_in: float = 0.0
+    correlation_px: float = 0.0
 
     def measure(
-        self, true_depth_m: NDArray[np.floating], seed: int | list[int]
+        self, true_depth_m: NDArray[np.floating], seed: int | list[int], T_world_camera: Transform | None = None
     ) -> tuple[NDArray[np.uint16], NDArray[np.uint8]]:
         """Return depth in whole millimetres (0 = none) and the `Reason` of every pixel.
 
         true_depth_m: (height, width) along the optical axis, inf where there is nothing. Same seed, same image.
+        T_world_camera: for cameras whose errors stay with surfaces.
         """
         random = np.random.default_rng(seed)
         scale = self._disparity_at_one_metre
         disparity = scale / np.asarray(true_depth_m, np.float32)
-        noisy = self._misaligned(disparity) + np.float32(self.subpixel) * random.standard_normal(
-            disparity.shape, np.float32
-        )
+        noise = smooth_noise(disparity.shape, self.correlation_px, random)
+        noisy = self._misaligned(disparity) + np.float32(self.subpixel) * noise
         depth = scale / np.maximum(noisy, np.float32(1e-6))
         lost = hidden_from_right_eye(disparity) | beside_nearer_surface(disparity, self.edge_px)
         lost |= on_border(disparity) & (random.random(disparity.shape, np.float32) < self.edge_loss)
@@ -85,6 +92,19 @@ class D435:
         x, _ = self.camera.ray_slopes()
         too_far = 1 + np.float32(self.barrel) * (x / np.abs(x).max()) ** 2
         return disparity / too_far - np.float32(self.camera.fx * self.toe_in) * x**2
+
+
+def smooth_noise(shape: tuple[int, ...], sigma_px: float, random: np.random.Generator) -> NDArray[np.float32]:
+    """Return noise (height, width) of mean 0 and variance 1: white, smoothed by a Gaussian of `sigma_px` pixels."""
+    reach = ceil(4 * sigma_px)
+    white = random.standard_normal((shape[0] + 2 * reach, shape[1] + 2 * reach), np.float32)
+    if not reach:
+        return white
+    import cv2
+
+    kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma_px) ** 2)
+    kernel /= sqrt(float((kernel**2).sum()))
+    return np.asarray(cv2.sepFilter2D(white, cv2.CV_32F, kernel, kernel), np.float32)[reach:-reach, reach:-reach]
 
 
 def depth_camera(width: int) -> PinholeCamera:
@@ -120,15 +140,15 @@ def hidden_from_right_eye(disparity: NDArray[np.float32]) -> NDArray[np.bool_]:
 
 def beside_nearer_surface(disparity: NDArray[np.float32], radius: int) -> NDArray[np.bool_]:
     """Return which pixels have a nearer surface within `radius` pixels."""
-    return _extreme(np.maximum, disparity, radius) > disparity + JUMP_PX
+    return extreme(np.maximum, disparity, radius) > disparity + JUMP_PX
 
 
 def on_border(disparity: NDArray[np.float32]) -> NDArray[np.bool_]:
     """Return which pixels have a farther surface right beside them."""
-    return _extreme(np.minimum, disparity, 1) < disparity - JUMP_PX
+    return extreme(np.minimum, disparity, 1) < disparity - JUMP_PX
 
 
-def _extreme(choose: np.ufunc, image: NDArray[np.float32], radius: int) -> NDArray[np.float32]:
+def extreme(choose: np.ufunc, image: NDArray[np.float32], radius: int) -> NDArray[np.float32]:
     """Return the largest (smallest) value in the square of `radius` pixels around every pixel."""
     for axis in (0, 1):
         image = np.moveaxis(image, axis, 0)

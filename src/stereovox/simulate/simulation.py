@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Recordings that need no files: a simulated D435 in a built-in scene."""
+"""Recordings that need no files: a simulated depth camera in a built-in scene."""
 
 from __future__ import annotations
 
@@ -16,6 +16,8 @@ from stereovox.errors import ConfigError, SourceError
 from stereovox.frame import Frame, Reason
 from stereovox.se3 import Transform, inverse
 from stereovox.simulate.d435 import D435, classify, depth_camera
+from stereovox.simulate.floors.kinect import WIDTH
+from stereovox.simulate.honest import honest_d435, honest_kinect
 from stereovox.simulate.scene import Scene
 from stereovox.simulate.stage import Face, Stage, one_of, within
 from stereovox.sources import parameters
@@ -31,6 +33,9 @@ SCENES = {
 }
 """Functions that return a `Stage`; their keyword arguments and defaults are the scene's parameters."""
 AXES = ("world", "optical")
+CAMERAS = ("simple", "d435", "kinect")
+OWN = -1.0
+"""Stands for what the camera has by itself."""
 
 
 @dataclass(frozen=True)
@@ -39,34 +44,42 @@ class Options:
 
     axes: `world` (z up) or `optical` (Chien 2020: x right, y down, z forward, origin at the first camera).
     frames: number of frames on the same way (0: the scene's own); noise: see `Simulation`; seed: of the noise.
-    image_width: pixels (0: the scene's own, mostly 848), the height follows; the field of view stays.
-    barrel, toe_in (degrees), subpixel, farthest (metres, 0: the scene's own): see `D435`.
+    camera: `simple` (noise independent from pixel to pixel, true reasons for missing values), or one that errs as real
+        ones do: `d435`, `kinect`; see `stereovox.simulate.honest`.
+    image_width: pixels (0: the scene's own, mostly 848; of a Kinect 640), the height follows; the field of view stays.
+    barrel, toe_in (degrees), farthest (metres, 0: the scene's own): see `D435`.
+    subpixel, correlation: size of the noise, and the Gaussian that smooths it, in pixels (-1: the camera's own).
     """
 
     axes: str = "world"
     frames: int = 0
     noise: bool = True
     seed: int = 0
+    camera: str = "simple"
     image_width: int = 0
     barrel: float = 0.0
     toe_in: float = 0.0
-    subpixel: float = D435.subpixel
+    subpixel: float = OWN
+    correlation: float = OWN
     farthest: float = 0.0
 
     def __post_init__(self) -> None:
         one_of("axes", self.axes, AXES)
+        one_of("camera", self.camera, CAMERAS)
         within("frames", self.frames, 0, 10_000_000)
         within("seed", self.seed, 0, 2**63)
         if self.image_width:
             within("image_width", self.image_width, 16, 1920)
         within("barrel", self.barrel, -0.5, 1)
         within("toe_in", self.toe_in, -1, 1)
-        within("subpixel", self.subpixel, 0, 5)
+        for name in ("subpixel", "correlation"):
+            if getattr(self, name) != OWN:
+                within(name, getattr(self, name), 0, 5)
         within("farthest", self.farthest, 0, 65)
 
 
 class Simulation(DepthSource):
-    """Frames of a simulated D435 in a built-in scene.
+    """Frames of a simulated depth camera in a built-in scene.
 
     location: `sim:SCENE`, or with parameters `sim:SCENE?key=value&key=value`:
 
@@ -80,8 +93,8 @@ class Simulation(DepthSource):
     The scene functions' docstrings tell their parameters, `Options` those of every scene. World: z up, x forward, y
     left, metres; with `axes=optical` x right, y down, z forward from the first camera. Every frame can be asked for by
     itself and is always the same for the same `seed`.
-    Reasons are the true ones: TOO_NEAR, TOO_FAR (beyond the device's `farthest`, and known to be free no farther),
-    UNMATCHED beside edges and where the right eye sees nothing.
+    Reasons of the `simple` camera are the true ones: TOO_NEAR, TOO_FAR (beyond the device's `farthest`, and known to be
+    free no farther), UNMATCHED beside edges and where the right eye sees nothing. The others do not say why.
     noise: False gives exact depth in metres (float32, inf where nothing is) without noise or holes.
     frames: how many frames are taken on the whole way; None leaves it to the scene. The way takes as long all the same.
     Raises SourceError for an unknown scene or parameter and for values out of range.
@@ -147,7 +160,8 @@ class Simulation(DepthSource):
     def observe(self, i: int, true_depth_m: NDArray[np.float32]) -> Frame:
         """Return what the camera delivers as frame `i` where `true_depth_m` is the exact depth (height, width)."""
         if self.noise:
-            depth, reason = self.device.measure(true_depth_m, [self.seed, i])
+            T_world_camera = self._world.path(self._share(i))
+            depth, reason = self.device.measure(true_depth_m, [self.seed, i], T_world_camera)
             scale = 0.001
         else:
             depth, scale = self.device.distorted(true_depth_m), 1.0
@@ -196,11 +210,17 @@ def _read(text: str, texts: dict[str, Any]) -> tuple[Options, Stage]:
 
 
 def _device(own: D435, options: Options) -> D435:
+    if options.image_width and options.camera != "kinect":
+        own = replace(own, camera=depth_camera(options.image_width))
+    if options.camera == "kinect":
+        own = honest_kinect(options.image_width or WIDTH)
+    elif options.camera == "d435":
+        own = honest_d435(own)
     return replace(
         own,
-        camera=depth_camera(options.image_width) if options.image_width else own.camera,
         farthest=options.farthest or own.farthest,
-        subpixel=options.subpixel,
+        subpixel=own.subpixel if options.subpixel == OWN else options.subpixel,
+        correlation_px=own.correlation_px if options.correlation == OWN else options.correlation,
         barrel=options.barrel,
         toe_in=float(np.radians(options.toe_in)),
     )

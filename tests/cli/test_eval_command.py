@@ -52,6 +52,24 @@ def test_the_measures_are_printed_and_one_object_of_json(capsys, ours, truth):
 
 
 @pytest.mark.usefixtures("folder")
+def test_what_the_map_decides_comes_first(capsys):
+    _, out, err = run(capsys, "map.svox", "truth.svox", "--json", "--path", "path.txt")
+    found = json.loads(out)
+    decided = found["decisions"]
+    assert next(iter(found)) == "decisions"
+    assert (decided["surface"], decided["air"], decided["occupied"], decided["free"]) == (6, 30, 5, 31)
+    assert (decided["surface_occupied"], decided["surface_free"]) == pytest.approx((1 / 6, 5 / 6))
+    assert decided["surface_free_alone"] == pytest.approx(1 / 6)  # the end of the wall at y = 5
+    assert (decided["occupied_hit"], decided["occupied_near"]) == pytest.approx((1 / 5, 4 / 5))
+    assert {part["by"] for part in decided["parts"]} == {"range", "thickness"}
+    assert sum(part["surface"] for part in decided["parts"] if part["by"] == "range") == 6
+    assert err[0].split() == ["what", "is", "there", "cells", "occupied", "tentative", "free", "unknown"]
+    assert err[1].split() == ["a", "surface", "6", "16.7%", "0.0%", "83.3%", "0.0%"]
+    assert any(line.split()[:7] == ["cells", "called", "occupied", "5", "20.0%", "hold", "a"] for line in err), err
+    assert any(line.startswith("thickness: line ") for line in err), err
+
+
+@pytest.mark.usefixtures("folder")
 def test_threshold_and_tolerance_are_used(capsys):
     _, out, _ = run(capsys, "map.svox", "truth.svox", "--json", "--tolerance", "4", "--threshold", "0.02")
     found = json.loads(out)

@@ -3,6 +3,7 @@
 
 import json
 
+import made_decisions
 import made_scores
 import numpy as np
 import pytest
@@ -45,6 +46,10 @@ def made_truth(truth, config=CONFIG):
     return made({cell: 3.0 if surface else -2.0 for cell, surface in truth.items()}, config)
 
 
+def probabilities(ours):
+    return [(cell, made_scores.probability(log_odds)) for cell, log_odds in ours.items()]
+
+
 def flat(numbers, prefix=""):
     """The numbers of a nested dict; None becomes NaN, which pytest.approx can compare."""
     found = {}
@@ -59,9 +64,12 @@ def flat(numbers, prefix=""):
 @settings(max_examples=60, deadline=None)
 @given(OURS, TRUTH, st.integers(0, 3), st.sampled_from([0.2, 0.5, 0.7, 0.93]), st.sampled_from([5, 10]))
 def test_all_measures_agree_with_the_slow_reference(ours, truth, tolerance, threshold, bins):
-    found = score(made(ours), made_truth(truth), threshold, tolerance, bins=bins)
+    found = score(made(ours), made_truth(truth), threshold, tolerance, bins=bins).as_dict()
+    states = {cell: "occupied" if p > 0.7 else "free" if p < 0.3 else "tentative" for cell, p in probabilities(ours)}
     wanted = made_scores.scores(ours, truth, threshold, tolerance, bins)
-    assert flat(found.as_dict()) == pytest.approx(flat(wanted), abs=1e-6, nan_ok=True)
+    wanted["decisions"] = made_decisions.decisions(states, truth, tolerance)
+    del found["decisions"]["parts"]  # tests/evaluate/test_decision_parts.py
+    assert flat(found) == pytest.approx(flat(wanted), abs=1e-6, nan_ok=True)
 
 
 @settings(max_examples=25, deadline=None)
@@ -96,10 +104,13 @@ def test_a_perfect_and_a_silent_map():
     best = score(made({cell: 30.0 if surface else -30.0 for cell, surface in truth.items()}, WIDE), made_truth(truth))
     rates = (best.accuracy, best.precision, best.recall, best.specificity, best.npv, best.correlation, best.auc)
     assert rates == pytest.approx([1] * 7)
-    assert (best.error, best.ece) == pytest.approx((0, 0), abs=1e-9)
+    assert (best.average_precision, best.iou, best.f_score_1, best.f_score_2) == pytest.approx((1, 1, 1, 1))
+    assert (best.error, best.ece, best.ece_likely, best.ece_equal_mass) == pytest.approx((0, 0, 0, 0), abs=1e-9)
     nothing = score(sv.VoxelMap(CONFIG), made_truth(truth))
     assert (nothing.tp, nothing.fp, nothing.recall, nothing.coverage) == (0, 0, 0, 0)
     assert (nothing.precision, nothing.error, nothing.ece, nothing.correlation) == (None, None, None, None)
+    assert (nothing.f_score_1, nothing.ece_likely, nothing.ece_equal_mass) == (None, None, None)
+    assert nothing.average_precision == pytest.approx(12 / 36)
     assert (nothing.auc, nothing.observed_auc, nothing.observed.accuracy) == (pytest.approx(0.5), None, None)
 
 

@@ -10,6 +10,7 @@ from matplotlib.image import imread
 
 import stereovox as sv
 from stereovox.errors import StereovoxError
+from stereovox.evaluate.decision_words import percent
 from stereovox.evaluate.outcomes import Outcome, Outcomes, outcomes
 from stereovox.evaluate.scores import score
 from stereovox.evaluate.truth_cells import TruthCells
@@ -102,6 +103,11 @@ def test_the_page_has_every_result_and_needs_no_other_file(truth, ours):
         for name in ("precision", "recall", "correlation", "tolerance_recall", "ece"):
             value = getattr(one.scores, name)
             assert ("-" if value is None else f"{value:.3f}") in page, name
+    assert page.index("What it decides: one") < page.index("Table 8.1")
+    for one in results:
+        for share in (one.scores.decisions.surface_free, one.scores.decisions.occupied_near):
+            assert percent(share) in page
+        assert all(f"<td>{part.by}: {part.name}</td>" in page for part in one.scores.parts)
     assert page.count("data:image/png") == 5  # top view, series and three pages of charts
     assert "{{" not in page
     assert not re.search(r"""(src|href)\s*=\s*["'](?!data:)|url\(|@import""", page)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compare a map with the ground truth, cell by cell.
+"""Compare a map with the ground truth, cell by cell: first what it decides, then its probabilities.
 
 MAP and TRUTH are stereovox folders or OctoMap files (.bt, .ot) with cells of the same size; or both are floor maps
 in map_server files (.yaml), of any cell size, which are aligned first.
@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from stereovox.cli.maps import dimensions, open_grid, refuse_options
-from stereovox.cli.terminal import command_line, say, thousands
+from stereovox.cli.terminal import command_line, say, say_table, thousands
 from stereovox.errors import StereovoxError
 
 if TYPE_CHECKING:
@@ -40,12 +40,22 @@ MEASURES = {
     "accuracy": "of all cells, are called right",
     "specificity": "of the free cells, are not called occupied",
     "npv": "of the cells not called occupied, are free",
+    "iou": "intersection over union: tp / (tp + fp + fn)",
     "correlation": "of probability and truth, 1 is perfect",
 }
-AUC = "area under the ROC curve, 1 is perfect"
+AREAS = {
+    "auc": "area under the ROC curve, 1 is perfect",
+    "average_precision": "area under precision against recall, 1 is perfect",
+}
+F_SCORES = {
+    "f_score_1": "harmonic mean of precision and recall within 1 cell",
+    "f_score_2": "the same within 2 cells",
+}
 SINGLE = {
     "error": "mean squared error of the probabilities (Brier score), 0 is perfect",
     "ece": "how far probabilities lie from the true shares (ECE), 0 is perfect",
+    "ece_likely": "the same over cells with p >= 0.3",
+    "ece_equal_mass": "the same in bins of equally many cells",
 }
 
 
@@ -60,7 +70,9 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--tolerance", type=int, default=1, metavar="CELLS", help="distance that still counts as a match (default: 1)"
     )
-    parser.add_argument("--path", metavar="FILE", help="poses of the camera, for precision and recall by distance")
+    parser.add_argument(
+        "--path", metavar="FILE", help="poses of the camera, for precision, recall and decisions by distance"
+    )
     parser.add_argument("--report", metavar="DIR", help="folder for a page with charts")
     floors = parser.add_argument_group("only for floor maps")
     about = "region that does not count, metres in TRUTH's frame; repeatable"
@@ -134,6 +146,7 @@ def _compare_cells(arguments: Namespace) -> dict[str, Any]:
     result = scores.as_dict()
     if scores.distance is not None:
         result["distance"] = scores.distance.rows()
+    _print_decisions(scores)
     _print_scores(scores)
     if path is not None and not path_fits(path, truth, voxel_map.config.max_range):
         say("the path does not fit the map: is it in the map's world frame?")
@@ -151,6 +164,14 @@ def _compare_cells(arguments: Namespace) -> dict[str, Any]:
 COMPARE = {2: _compare_grids, 3: _compare_cells}
 
 
+def _print_decisions(scores: Scores) -> None:
+    from stereovox.evaluate import decision_words as words
+
+    say_table(words.HEADS, words.state_rows(scores.decisions))
+    say_table(words.ERROR_HEADS, words.error_rows(scores.decisions, scores.tolerance_cells))
+    say_table(words.PART_HEADS, words.part_rows(scores.parts))
+
+
 def _print_scores(scores: Scores) -> None:
     observed = scores.observed
     say(f"{thousands(scores.cells)} cells of the truth, {scores.coverage:.1%} of them observed by the map")
@@ -164,7 +185,14 @@ def _print_scores(scores: Scores) -> None:
     for name, text in MEASURES.items():
         values = (_number(getattr(one, name)) for one in (scores, observed))
         say(f"{name:20}  {next(values):>11}  {next(values):>11}  {text.format(within)}")
-    say(f"{'auc':20}  {_number(scores.auc):>11}  {_number(scores.observed_auc):>11}  {AUC}")
+    for name, text in AREAS.items():
+        values = _number(getattr(scores, name)), _number(getattr(scores, f"observed_{name}"))
+        say(f"{name:20}  {values[0]:>11}  {values[1]:>11}  {text}")
+    for name, text in F_SCORES.items():
+        say(f"{name:20}  {_number(getattr(scores, name)):>11}  {'':>11}  {text}")
+    best = scores.balanced
+    say(f"balanced: at p > {best['threshold']:.2f} precision and recall within {within} are "
+        f"{_number(best['tolerance_precision'])} and {_number(best['tolerance_recall'])}")  # fmt: skip
     for name, text in SINGLE.items():
         say(f"{name:20}  {'':>11}  {_number(getattr(scores, name)):>11}  {text}")
 

@@ -26,6 +26,18 @@ def say(text: str = "") -> None:
     print("\n".join(map(one_line, text.split("\n"))), file=sys.stderr, flush=True)
 
 
+def say_table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
+    """Print a table and a blank line: columns of numbers to the right, others to the left."""
+    columns = []
+    for head, *texts in zip(heads, *rows, strict=True):
+        width = max(map(len, (head, *texts)))
+        numbers = all(text[:1].isdigit() for text in texts if text.strip("-"))
+        columns.append([text.rjust(width) if numbers else text.ljust(width) for text in (head, *texts)])
+    for line in zip(*columns, strict=True):
+        say("  ".join(line).rstrip())
+    say()
+
+
 def say_about_compiling() -> bool:
     """Explain why the first run on a machine takes longer; return whether this is one."""
     from stereovox._jit import cache_folder

@@ -4,12 +4,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stereovox.evaluate.truth_cells import Reading, level
 
+EXACT, TOLERANT = ("precision", "recall"), ("tolerance_precision", "tolerance_recall")
 THRESHOLDS = np.arange(1, 100) / 100
 
 
@@ -19,11 +21,21 @@ class Roc:
 
     threshold: (M,) falling, inf first; at each, cells with p >= threshold are called occupied.
     false_positive_rate: (M,) share of the free cells that are called so; true_positive_rate: (M,) of the occupied ones.
+    surface_share: share of the cells that are occupied.
     """
 
     threshold: NDArray[np.float64]
     false_positive_rate: NDArray[np.float64]
     true_positive_rate: NDArray[np.float64]
+
+    surface_share: float
+
+    @property
+    def average_precision(self) -> float:
+        """Area below precision against recall, each step at its lower threshold's precision; cells of one p at once."""
+        occupied = self.surface_share * self.true_positive_rate[1:]
+        precision = occupied / (occupied + (1 - self.surface_share) * self.false_positive_rate[1:])
+        return float(precision @ np.diff(self.true_positive_rate))
 
     @property
     def auc(self) -> float:
@@ -38,8 +50,8 @@ def roc(p: NDArray[np.floating], actual: NDArray[np.bool_]) -> Roc | None:
     free = np.bincount(of_cell, ~actual, len(values))[::-1]
     if not occupied.sum() or not free.sum():
         return None
-    rates = [np.concatenate([[0], np.cumsum(part) / part.sum()]) for part in (free, occupied)]
-    return Roc(np.concatenate([[np.inf], values[::-1]]), *rates)
+    wrong, right = (np.concatenate([[0], np.cumsum(part) / part.sum()]) for part in (free, occupied))
+    return Roc(np.concatenate([[np.inf], values[::-1]]), wrong, right, float(actual.mean()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +63,18 @@ class PrecisionRecall:
     recall: NDArray[np.float64]
     tolerance_precision: NDArray[np.float64]
     tolerance_recall: NDArray[np.float64]
+
+    def point(self, i: int) -> dict[str, float | None]:
+        """Return all values at threshold number `i`, None instead of NaN."""
+        values = {name: float(column[i]) for name, column in vars(self).items()}
+        return {name: value if np.isfinite(value) else None for name, value in values.items()}
+
+    def best(self, names: tuple[str, str] = TOLERANT, wanted: tuple[float, float] = (0.0, 0.0)) -> dict[str, Any]:
+        """Return the point where the lesser of the two measures, each less what is wanted of it, is largest."""
+        margins = [
+            np.nan_to_num(getattr(self, name), nan=-1.0) - goal for name, goal in zip(names, wanted, strict=True)
+        ]
+        return self.point(int(np.argmax(np.minimum(*margins))))
 
 
 def precision_recall(

@@ -9,14 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 BINS = 10
+LIKELY = 0.3
+"""Probability from which a cell is more than a free one: the cells that a threshold is about."""
 
 
 @dataclass(frozen=True, eq=False)
 class Reliability:
-    """Cells binned by probability into B bins of equal width; bin i holds edges[i] <= p < edges[i + 1].
+    """Cells binned by probability into B bins; bin i holds edges[i] <= p < edges[i + 1].
 
-    edges: (B + 1,) from 0 to 1; count: (B,) cells; mean_p, occupied_share: (B,) mean probability and share of truly
-    occupied cells, NaN in an empty bin.
+    edges: (B + 1,) from 0 to 1, rising; count: (B,) cells; mean_p, occupied_share: (B,) mean probability and share of
+    truly occupied cells, NaN in an empty bin.
     """
 
     edges: NDArray[np.float64]
@@ -34,12 +36,32 @@ class Reliability:
 
 def reliability(p: NDArray[np.floating], actual: NDArray[np.bool_], bins: int = BINS) -> Reliability:
     """Compare probabilities (N,) in [0, 1] with the true state (N,). p = 1 belongs to the last bin."""
-    bin_of = np.minimum((p * bins).astype(np.int64), bins - 1)
+    return _binned(np.linspace(0, 1, bins + 1), np.minimum((p * bins).astype(np.int64), bins - 1), p, actual)
+
+
+def equal_mass(p: NDArray[np.floating], actual: NDArray[np.bool_], bins: int = BINS) -> Reliability:
+    """Compare probabilities (N,) with the true state (N,) in bins of about as many cells each.
+
+    The bin of a cell is that of the middle of its rank among all; cells of one probability share a bin, so that some
+    bins hold more cells than others, and some none.
+    """
+    values, of_cell, number = np.unique(p, return_inverse=True, return_counts=True)
+    middle = np.cumsum(number) - number / 2
+    bin_of = np.minimum((middle / max(len(p), 1) * bins).astype(np.int64), bins - 1)
+    lowest = np.searchsorted(bin_of, np.arange(1, bins))
+    edges = np.concatenate([[0], np.append(values, 1)[lowest], [1]])
+    return _binned(edges, bin_of[of_cell], p, actual)
+
+
+def _binned(
+    edges: NDArray[np.float64], bin_of: NDArray[np.int64], p: NDArray[np.floating], actual: NDArray[np.bool_]
+) -> Reliability:
+    bins = len(edges) - 1
     count = np.bincount(bin_of, minlength=bins)
     with np.errstate(invalid="ignore"):
         mean_p = np.bincount(bin_of, p, bins) / count
         share = np.bincount(bin_of, actual, bins) / count
-    return Reliability(np.linspace(0, 1, bins + 1), count, mean_p, share)
+    return Reliability(edges, count, mean_p, share)
 
 
 def brier(p: NDArray[np.floating], actual: NDArray[np.bool_]) -> float | None:

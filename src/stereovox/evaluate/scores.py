@@ -10,13 +10,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stereovox.evaluate.curves import THRESHOLDS, PrecisionRecall, Roc, precision_recall, roc
+from stereovox.evaluate.decision_parts import Part, decision_parts
+from stereovox.evaluate.decisions import Decisions, decide
 from stereovox.evaluate.distance import ByDistance, by_distance
+from stereovox.evaluate.looks import looks
 from stereovox.evaluate.metrics import Confusion, ratio
-from stereovox.evaluate.reliability import BINS, Reliability, brier, correlation, reliability
-from stereovox.evaluate.truth_cells import Reading, TruthCells
+from stereovox.evaluate.reliability import BINS, LIKELY, Reliability, brier, correlation, equal_mass, reliability
+from stereovox.evaluate.truth_cells import Reading, TruthCells, level
 from stereovox.maps import VoxelMap
 
-_NOT_NUMBERS = {"observed", "reliability", "roc", "curve", "distance"}
+_NOT_NUMBERS = {"observed", "reliability", "equal_mass", "roc", "curve", "distance", "decisions", "parts"}
 
 
 @dataclass(frozen=True)
@@ -26,7 +29,7 @@ class Tally:
     cells: how many; tp, fp, tn, fn: counts, positive = called occupied; accuracy to npv: Eq 8.2 to 8.6; correlation:
     Pearson's, of probability and truth (Eq 8.8-8.9, divided by N); tolerance_precision: share of the cells called
     occupied with a surface within the tolerance; tolerance_recall: share of the surface cells with a cell called
-    occupied within it, wherever that lies.
+    occupied within it, wherever that lies; iou: intersection over union of both sets, tp / (tp + fp + fn).
     """
 
     cells: int
@@ -42,6 +45,7 @@ class Tally:
     tolerance_precision: float | None
     tolerance_recall: float | None
     correlation: float | None
+    iou: float | None
 
 
 @dataclass(frozen=True)
@@ -69,23 +73,41 @@ class QuickScores(Tally):
 
 @dataclass(frozen=True, eq=False)
 class Scores(QuickScores):
-    """All measures. auc: area under the ROC curve, over all cells (p = 0.5 where unobserved); observed_auc likewise.
+    """All measures. auc, average_precision: areas under the ROC curve and under precision against recall, over all
+    cells (p = 0.5 where unobserved); observed_auc, observed_average_precision likewise.
 
-    reliability: over observed cells; roc: over all cells, None unless some are occupied and some free; curve: precision
-    and recall against the threshold; distance: the same against distance, None where no path was given.
+    f_score_1, f_score_2: harmonic mean of precision and recall within one cell, and within two, over all cells.
+    balanced: the point of `curve` where the lesser of precision and recall within the tolerance is largest.
+    ece_likely: as `ece`, over cells with p >= 0.3; ece_equal_mass: in bins of as many cells.
+    decisions: what the map itself decides, at its own thresholds; parts: the same by range (from the path given, or the
+    map's own), thickness and looks (where the map holds its camera's path).
+    reliability, equal_mass: over observed cells; roc: over all cells, None unless some are occupied and some free;
+    curve: precision and recall against the threshold; distance: the same against distance, None without a path.
     """
 
     auc: float | None
     observed_auc: float | None
+    average_precision: float | None
+    observed_average_precision: float | None
+    f_score_1: float | None
+    f_score_2: float | None
+    balanced: dict[str, float | None]
+    ece_likely: float | None
+    ece_equal_mass: float | None
+    decisions: Decisions
+    parts: tuple[Part, ...]
     reliability: Reliability
+    equal_mass: Reliability
     roc: Roc | None
     curve: PrecisionRecall
     distance: ByDistance | None
 
     def as_dict(self) -> dict[str, Any]:
-        """Return all single numbers for JSON, with `observed` as a dict and without NaN."""
-        numbers = super().as_dict()
-        numbers["observed"]["auc"] = numbers.pop("observed_auc")
+        """Return all numbers for JSON, `decisions` first, with `observed` as a dict and without NaN."""
+        decided = {**asdict(self.decisions), "parts": [part.as_dict() for part in self.parts]}
+        numbers = {"decisions": decided, **super().as_dict()}
+        for name in ("auc", "average_precision"):
+            numbers["observed"][name] = numbers.pop(f"observed_{name}")
         return numbers
 
 
@@ -111,18 +133,44 @@ def score(
     """
     truth = truth_map if isinstance(truth_map, TruthCells) else TruthCells(truth_map, tolerance)
     reading = truth.read(voxel_map)
-    seen, p = reading.observed, reading.probability
-    over_all, over_seen = roc(p, truth.occupied), roc(p[seen], truth.occupied[seen])
-    quick = score_reading(reading, truth, threshold, bins)
+    seen, actual = reading.observed, truth.occupied
+    p, known = reading.probability[seen], actual[seen]
+    over_all, over_seen = roc(reading.probability, actual), roc(p, known)
+    quick, even = score_reading(reading, truth, threshold, bins), equal_mass(p, known, bins)
+    curve = precision_recall(reading, actual, truth.near, thresholds)
+    places = path if path is not None or not len(voxel_map.path) else voxel_map.path
     return Scores(
         **{field.name: getattr(quick, field.name) for field in fields(quick)},
         auc=over_all.auc if over_all else None,
         observed_auc=over_seen.auc if over_seen else None,
-        reliability=reliability(p[seen], truth.occupied[seen], bins),
+        average_precision=over_all.average_precision if over_all else None,
+        observed_average_precision=over_seen.average_precision if over_seen else None,
+        f_score_1=f_score(reading, truth, threshold, 1),
+        f_score_2=f_score(reading, truth, threshold, 2),
+        balanced=curve.best(),
+        ece_likely=reliability(p[p >= LIKELY], known[p >= LIKELY], bins).ece,
+        ece_equal_mass=even.ece,
+        decisions=decide(reading, truth),
+        parts=decision_parts(reading, truth, places, edges, looks(voxel_map, truth)),
+        reliability=reliability(p, known, bins),
+        equal_mass=even,
         roc=over_all,
-        curve=precision_recall(reading, truth.occupied, truth.near, thresholds),
+        curve=curve,
         distance=None if path is None else by_distance(reading, truth, path, threshold, edges),
     )
+
+
+def f_score(reading: Reading, truth: TruthCells, threshold: float, within: int) -> float | None:
+    """Return the harmonic mean of precision and recall within `within` cells, 1 or 2, at p > `threshold`.
+
+    None where the map calls no cell occupied, and where the truth has no surface.
+    """
+    marked, found = reading.marked(threshold), reading.best_within(within) > level(threshold)
+    precision = ratio(int((marked & truth.near_within(within)).sum()), int(marked.sum()))
+    recall = ratio(int(found.sum()), len(found))
+    if precision is None or recall is None:
+        return None
+    return 2 * precision * recall / max(precision + recall, 1e-12)
 
 
 def score_reading(reading: Reading, truth: TruthCells, threshold: float = 0.7, bins: int = BINS) -> QuickScores:
@@ -164,4 +212,5 @@ def _tally(
         tolerance_precision=close,
         tolerance_recall=ratio(float(found.sum()), len(found)),
         correlation=correlation(p, actual),
+        iou=ratio(counted.tp, counted.tp + counted.fp + counted.fn),
     )

@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from math import log
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +22,8 @@ _STEPS: tuple[int, ...] = tuple((keys(np.eye(3, dtype=int)) - keys([0, 0, 0])).t
 _FARTHEST_BLOCK = 1 << 17
 """Keys cannot hold blocks beyond."""
 MAX_TOLERANCE = 20
+_LEAST_REACH = 2
+"""Cells around a surface that are always read, whatever the tolerance."""
 _ROUNDING = 1e-6
 """Log-odds are stored in steps of about a thousandth: closer to a threshold counts as equal to it."""
 
@@ -39,47 +43,82 @@ class CellReader:
 
     def log_odds(self, voxel_map: VoxelMap) -> NDArray[np.float32]:
         """Return the log-odds (N,) of the cells in the order of their keys; exactly 0 where unobserved."""
+        return voxel_map.storage.cell_format.log_odds(self.stored(voxel_map))
+
+    def stored(self, voxel_map: VoxelMap) -> NDArray[np.integer]:
+        """Return the cells (N,) in the order of their keys, as the map stores them."""
         kind = voxel_map.storage.cell_format
         stored = np.full((len(self._blocks), 512), kind.unknown, kind.dtype)
         for coords, values in voxel_map.storage.slabs():
             row = position(keys(coords), self._blocks)
             here = (row >= 0) & (np.abs(coords) < _FARTHEST_BLOCK).all(axis=1)
             stored[row[here]] = values[here]
-        return kind.log_odds(stored.ravel()[self._place])
+        return stored.ravel()[self._place]
 
 
 class Neighbourhood:
-    """All cells within `tolerance` cells, along every axis, of a fixed set of cells.
+    """All cells within `reach` cells, along every axis, of a fixed set of cells.
 
     cells: the set, ascending keys (S,); around: all cells within reach, including the set, ascending keys (D,).
     """
 
-    def __init__(self, cells: Keys, tolerance: int):
-        self.cells, self.around = cells, cells
+    def __init__(self, cells: Keys, reach: int):
+        self.cells, self.around, self.reach = cells, cells, reach
         self._tables: list[NDArray[np.int64]] = []
-        reach = np.arange(-tolerance, tolerance + 1)
-        for step in _STEPS:  # one axis after the other: three short tables instead of one of (2 tolerance + 1)^3
-            near = self.around[:, None] + step * reach
+        steps = np.arange(-reach, reach + 1)
+        for step in _STEPS:  # one axis after the other: three short tables instead of one of (2 reach + 1)^3
+            near = self.around[:, None] + step * steps
             self.around = np.unique(near)
             self._tables.append(np.searchsorted(self.around, near))
 
-    def highest(self, values: NDArray[np.floating]) -> NDArray[np.floating]:
-        """Return for each cell (S,) the highest of the `values` (D,) of the cells within its reach."""
+    def within(self, tolerance: int) -> NDArray[np.bool_]:
+        """Return which cells of `around` (D,) lie within `tolerance` cells, at most the reach, of the set."""
+        inside = np.ones(len(self.cells), bool)
+        for table in self._tables:
+            near = self._columns(table, tolerance)[inside]
+            inside = np.zeros(table.max(initial=-1) + 1, bool)
+            inside[near] = True
+        return inside
+
+    def highest(self, values: NDArray[Any], tolerance: int | None = None) -> NDArray[Any]:
+        """Return for each cell (S,) the highest of the `values` (D,) within `tolerance` cells; None: within reach."""
         for table in reversed(self._tables):
-            values = values[table].max(axis=1)
+            values = values[self._columns(table, self.reach if tolerance is None else tolerance)].max(axis=1)
         return values
+
+    def spread(self, tolerance: int) -> NDArray[np.float64]:
+        """Return the covariance (S, 3, 3), in cells squared, of those cells of the set within `tolerance` of each."""
+        inside = position(self.around, self.cells) >= 0
+        steps = np.arange(-tolerance, tolerance + 1.0)
+        sums: dict[tuple[int, ...], NDArray[np.float64]] = {(): inside.astype(float)}
+        for axis in (2, 1, 0):  # sums of 1, of each offset and of each product of two, one axis after the other
+            table = self._columns(self._tables[axis], tolerance)
+            more = [(axes, n) for axes in sums for n in range(3 - len(axes))]
+            sums = {(*[axis] * n, *axes): sums[axes][table] @ steps**n for axes, n in more}
+        count = sums[()]
+        mean = np.stack([sums[(axis,)] for axis in range(3)], axis=1) / count[:, None]
+        square = [[sums[min(i, j), max(i, j)] / count for j in range(3)] for i in range(3)]
+        return np.moveaxis(np.array(square), -1, 0) - mean[:, :, None] * mean[:, None, :]
+
+    def _columns(self, table: NDArray[np.int64], tolerance: int) -> NDArray[np.int64]:
+        return table[:, self.reach - tolerance : self.reach + tolerance + 1]
 
 
 @dataclass(frozen=True, eq=False)
 class Reading:
-    """Values of a map in the cells of the truth.
+    """Values of a map in the cells of the truth and around its surfaces.
 
-    log_odds: (N,) float32 of each cell of the truth, 0 where unobserved. best: (S,) float32, for each truly occupied
-    cell the highest log-odds of the map within the tolerance, -inf where all is unobserved.
+    log_odds: (N,) float32 of each cell of the truth, 0 where unobserved; states: (N,) uint8, the `State` that the map
+    itself gives each. around, around_states: the same (D,) of all cells near a surface. neighbourhood: which those are.
+    tolerance: of the truth.
     """
 
     log_odds: NDArray[np.float32]
-    best: NDArray[np.float32]
+    states: NDArray[np.uint8]
+    around: NDArray[np.float32]
+    around_states: NDArray[np.uint8]
+    neighbourhood: Neighbourhood
+    tolerance: int
 
     @property
     def observed(self) -> NDArray[np.bool_]:
@@ -90,6 +129,26 @@ class Reading:
     def probability(self) -> NDArray[np.float64]:
         """Probability (N,) that each cell is occupied, 0.5 where unobserved."""
         return 1 / (1 + np.exp(-self.log_odds.astype(float)))
+
+    @cached_property
+    def best(self) -> NDArray[np.float32]:
+        """For each truly occupied cell (S,) the highest log-odds within the tolerance, -inf where all is unobserved."""
+        return self.best_within(self.tolerance)
+
+    def best_within(self, tolerance: int) -> NDArray[np.float32]:
+        """Return the same within `tolerance` cells, at most the reach of the truth."""
+        known = np.where(self.around == 0, np.float32(-np.inf), self.around)
+        return self.neighbourhood.highest(known, tolerance)
+
+    @cached_property
+    def beside(self) -> NDArray[np.uint8]:
+        """For each truly occupied cell (S,) the highest `State` within one cell."""
+        return self.neighbourhood.highest(self.around_states, 1)
+
+    @cached_property
+    def reached(self) -> NDArray[np.uint8]:
+        """For each truly occupied cell (S,) the highest `State` within the tolerance."""
+        return self.neighbourhood.highest(self.around_states, self.tolerance)
 
     def marked(self, threshold: float) -> NDArray[np.bool_]:
         """Cells (N,) the map calls occupied, p > threshold (Valenti 2018, Eq 8.1); never an unobserved one."""
@@ -104,9 +163,10 @@ class TruthCells:
     """The cells of a truth map that count, and what lies within `tolerance` cells of its surfaces.
 
     truth_map: its occupied cells hold a surface, its free cells were in view and hold none; all others, tentative ones
-    too, do not count. cells: ascending keys (N,) of those that count; occupied: (N,) which of them hold a surface;
-    near: (N,) which have a surface within the tolerance. Distances count along each axis: diagonal neighbours are one
-    cell away. Raises StereovoxError for a truth without such cells and an invalid tolerance.
+    too, do not count. map: the same in cubes. cells: ascending keys (N,) of those that count; occupied: (N,) which of
+    them hold a surface; near: (N,) which have a surface within the tolerance; neighbourhood: the cells around the S
+    occupied ones. Distances count along each axis: diagonal neighbours are one cell away. Raises StereovoxError for a
+    truth without such cells and an invalid tolerance.
     """
 
     def __init__(self, truth_map: VoxelMap, tolerance: int = 1):
@@ -117,15 +177,21 @@ class TruthCells:
         counts = (state == State.OCCUPIED) | (state == State.FREE)
         if not counts.any():
             raise StereovoxError("the truth holds no occupied and no free cell; make it with stereovox truth")
-        self.voxel_size, self.tolerance, self.up = truth_map.voxel_size, tolerance, truth_map.config.up
+        self.map, self.tolerance = truth_map, tolerance
+        self.voxel_size, self.up = truth_map.voxel_size, truth_map.config.up
         self.cells: Keys = known[counts]
         self.occupied: NDArray[np.bool_] = state[counts] == State.OCCUPIED
-        self._neighbourhood = Neighbourhood(self.cells[self.occupied], tolerance)
-        around = self._neighbourhood.around
-        self.near: NDArray[np.bool_] = position(self.cells, around) >= 0
+        self.neighbourhood = Neighbourhood(self.cells[self.occupied], max(tolerance, _LEAST_REACH))
+        self.near: NDArray[np.bool_] = self.near_within(tolerance)
+        around = self.neighbourhood.around
         self._reader = CellReader(np.union1d(self.cells, around))
         self._own = np.searchsorted(self._reader.cells, self.cells)
         self._around = np.searchsorted(self._reader.cells, around)
+
+    def near_within(self, tolerance: int) -> NDArray[np.bool_]:
+        """Return which cells (N,) have a surface within `tolerance` cells: at most 2, or the truth's own if larger."""
+        around = self.neighbourhood.around[self.neighbourhood.within(tolerance)]
+        return position(self.cells, around) >= 0
 
     def read(self, voxel_map: VoxelMap) -> Reading:
         """Read `voxel_map`. Raises StereovoxError where its cells are not those of the truth."""
@@ -135,10 +201,15 @@ class TruthCells:
                 f"cells of {voxel_map.voxel_size:g} m cannot be compared with a truth of {self.voxel_size:g} m; "
                 "make both with the same --voxel-size"
             )
-        log_odds = self._reader.log_odds(voxel_map)
-        around = log_odds[self._around]
-        best = self._neighbourhood.highest(np.where(around == 0, np.float32(-np.inf), around))
-        return Reading(log_odds[self._own], best.astype(np.float32))
+        stored = self._reader.stored(voxel_map)
+        log_odds = voxel_map.storage.cell_format.log_odds(stored)
+        states = voxel_map.storage.rules.states(stored)
+        own, around = self._own, self._around
+        return Reading(log_odds[own], states[own], log_odds[around], states[around], self.neighbourhood, self.tolerance)
+
+    def surface(self) -> NDArray[np.int32]:
+        """Return the indices (S, 3) of the truly occupied cells."""
+        return indices(self.cells[self.occupied])
 
     def centers(self) -> NDArray[np.float64]:
         """Return the centres (N, 3) of the cells in metres, world frame."""

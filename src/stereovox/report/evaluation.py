@@ -11,6 +11,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from stereovox.errors import StereovoxError
+from stereovox.evaluate import decision_words as words
 from stereovox.evaluate.outcomes import Outcomes
 from stereovox.evaluate.scores import Scores
 from stereovox.report import page
@@ -19,8 +20,29 @@ from stereovox.view.outcomes import outcomes_png
 
 TABLE = ("tp", "fp", "tn", "fn", "accuracy", "precision", "recall", "specificity", "npv", "error", "correlation")
 """Columns of Table 8.1."""
-MORE = ("threshold", "tolerance_precision", "tolerance_recall", "coverage", "ece", "auc")
-HEADS = {"tolerance_precision": "precision, tolerant", "tolerance_recall": "recall, tolerant", "coverage": "observed"}
+MORE = ("threshold", "tolerance_precision", "tolerance_recall", "f_score_1", "f_score_2", "iou", "coverage")
+AS_PROBABILITIES = ("auc", "average_precision", "error", "ece", "ece_likely", "ece_equal_mass", "correlation")
+HEADS = {
+    "tolerance_precision": "precision, tolerant",
+    "tolerance_recall": "recall, tolerant",
+    "coverage": "observed",
+    "f_score_1": "F-score, 1 cell",
+    "f_score_2": "F-score, 2 cells",
+    "iou": "IoU",
+    "average_precision": "average precision",
+    "ece_likely": "ece, p >= 0.3",
+    "ece_equal_mass": "ece, equal mass",
+}
+DECIDED = (
+    "Free means that a robot may drive there. So the error that kills is a surface called free; worse, with nothing "
+    "tentative or occupied beside it. A robot stops for what is occupied, and often for what is tentative or unknown. "
+    "The map decides by its own thresholds; only cells count that the truth knows."
+)
+BY_PARTS = (
+    "Range is the distance to the nearest camera position. Thickness is that of the truth's surface: a "
+    "line is one or two cells across in two directions, like a pole or a wire; a sheet in one, like a wall; bulk in "
+    "none. Looks are the places of the map's path, at least 5 cm or 0.1 rad apart, from which the cell could be seen."
+)
 MEANINGS = {
     "tp, fp, tn, fn": "Cells the map calls occupied rightly and wrongly, and cells it calls free rightly and wrongly.",
     "accuracy": "The share of all cells the map is right about. Most cells are free, so an empty map scores high.",
@@ -39,6 +61,13 @@ MEANINGS = {
     "observed": "The share of the truth's cells about which the map says anything at all.",
     "ece": "Expected calibration error: how far, on average, a probability lies from the share of cells with it that "
     "are truly occupied.",
+    "ece, p >= 0.3": "The same over the cells with p >= 0.3. Most cells are free and surely so, which hides errors "
+    "of the others in the figure for all.",
+    "ece, equal mass": "The same in ten bins of equally many cells, in place of ten of equal width.",
+    "IoU": "Intersection over union: the cells that map and truth both call occupied, of those that either does.",
+    "F-score": "Harmonic mean of tolerant precision and recall, within one cell and within two.",
+    "average precision": "Area under precision against recall, exact, over all thresholds: 1 is perfect, the share of "
+    "surface cells is guessing.",
     "auc": "How often a surface cell has a higher probability than a free one: 0.5 is guessing, 1 is perfect.",
 }
 WHERE = (
@@ -91,6 +120,7 @@ def evaluation_page(results: Sequence[Evaluated], truth: str, heading: str = "Ho
         heading,
         f"Compared cell by cell with {truth}. A cell is called occupied where its probability is above "
         f"{first.threshold:g}; an error of at most {within} is forgiven where it says 'tolerant'.",
+        *(part for one in results for part in _decisions(one)),
         page.tiles(_boxes(first)) if len(results) == 1 else "",
         *_tables(results),
         *(part for one in results for part in _result(one, within)),
@@ -110,6 +140,20 @@ def _boxes(scores: Scores) -> list[tuple[str, str]]:
     return [(_number(getattr(scores, name)), label) for name, label in names.items()]
 
 
+def _decisions(one: Evaluated) -> Iterable[str]:
+    found, tolerance = one.scores.decisions, one.scores.tolerance_cells
+    yield page.section(
+        f"What it decides: {one.name}",
+        DECIDED,
+        page.table(words.HEADS, words.state_rows(found)),
+        "<p></p>",
+        page.table(words.ERROR_HEADS, words.error_rows(found, tolerance)),
+    )
+    if one.scores.parts:
+        rows = words.part_rows(one.scores.parts)
+        yield page.section(f"By range, thickness and looks: {one.name}", BY_PARTS, page.table(words.PART_HEADS, rows))
+
+
 def _tables(results: Sequence[Evaluated]) -> Iterable[str]:
     heads = [HEADS.get(name, name) for name in TABLE]
     yield page.section(
@@ -123,13 +167,21 @@ def _tables(results: Sequence[Evaluated]) -> Iterable[str]:
         page.table(["map", *heads], ([one.name, *_observed_row(one.scores)] for one in results)),
     )
     yield page.section(
-        "With tolerance, and as probabilities",
+        "With tolerance",
         "Exact cells are a hard test, since a surface near the border of two cells falls into either. These measures "
-        "forgive that, or ask whether the probabilities can be believed.",
-        page.table(
-            ["map", *(HEADS.get(name, name) for name in MORE)], ([r.name, *_row(r.scores, MORE)] for r in results)
-        ),
+        "forgive that.",
+        _table_of(MORE, results),
     )
+    yield page.section(
+        "As probabilities",
+        "Without a threshold: does the map order cells rightly, and can its probabilities be believed?",
+        _table_of(AS_PROBABILITIES, results),
+    )
+
+
+def _table_of(names: Sequence[str], results: Sequence[Evaluated]) -> str:
+    rows = ([one.name, *_row(one.scores, names)] for one in results)
+    return page.table(["map", *(HEADS.get(name, name) for name in names)], rows)
 
 
 def _result(one: Evaluated, within: str) -> Iterable[str]:

@@ -9,12 +9,12 @@ import pytest
 
 from stereovox import VoxelMap, load_config
 from stereovox.cameras.pinhole import PinholeCamera
-from stereovox.evaluate.curves import PrecisionRecall
+from stereovox.evaluate.curves import EXACT, TOLERANT, PrecisionRecall
 from stereovox.evaluate.scores import score
 from stereovox.frame import Frame, Reason
 from stereovox.lab.papers.valenti.chapters import PRINTED
 from stereovox.lab.papers.valenti.claims import CLAIMED, claims_of, results, speed_claim
-from stereovox.lab.papers.valenti.figures import EXACT, THRESHOLDS, TOLERANT, best
+from stereovox.lab.papers.valenti.figures import THRESHOLDS
 from stereovox.lab.papers.valenti.judge import Judged
 from stereovox.lab.papers.valenti.mappers import (
     DEFAULT,
@@ -68,9 +68,9 @@ def test_the_best_threshold_is_the_one_with_the_largest_smaller_margin():
     threshold = np.array([0.2, 0.5, 0.8])
     precision, recall = np.array([0.5, 0.7, np.nan]), np.array([0.9, 0.6, 0.1])
     curve = PrecisionRecall(threshold, precision, recall, recall, precision)
-    assert best(curve, EXACT)["threshold"] == 0.5
-    assert best(curve, EXACT, (0.2, 0.7))["threshold"] == 0.2
-    assert best(curve, TOLERANT)["tolerance_precision"] == 0.6
+    assert curve.best(EXACT)["threshold"] == 0.5
+    assert curve.best(EXACT, (0.2, 0.7))["threshold"] == 0.2
+    assert curve.best(TOLERANT)["tolerance_precision"] == 0.6
 
 
 def test_a_perfect_map_reaches_all_targets_and_a_useless_one_none():

@@ -10,10 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from stereovox.evaluate.curves import TOLERANT
 from stereovox.lab.papers.chapter import NO, YES, Chapter, Claim, Sheet, Shown
 from stereovox.lab.papers.pictures import OURS, SECOND, figure_of, png
 from stereovox.lab.papers.valenti.claims import CLAIMED, KINDS, TARGET_RANGE, TARGETS, claims_of, results, speed_claim
-from stereovox.lab.papers.valenti.figures import AT_LEAST, STRICT, TOLERANT, at, figures
+from stereovox.lab.papers.valenti.figures import AT_LEAST, STRICT, at, figures
 from stereovox.lab.papers.valenti.judge import Judged
 from stereovox.lab.papers.valenti.mappers import DEFAULT, OCTOMAP, THESIS, Setting
 from stereovox.lab.papers.valenti.speed import Speed

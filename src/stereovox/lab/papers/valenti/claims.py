@@ -6,10 +6,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
-from stereovox.evaluate.curves import PrecisionRecall
+from stereovox.evaluate.curves import EXACT, TOLERANT, PrecisionRecall
 from stereovox.evaluate.scores import Scores
 from stereovox.lab.papers.chapter import Claim
-from stereovox.lab.papers.valenti.figures import AT_LEAST, EXACT, STRICT, TOLERANT, at, best
+from stereovox.lab.papers.valenti.figures import AT_LEAST, STRICT, at
 from stereovox.lab.papers.valenti.judge import Judged
 from stereovox.lab.papers.valenti.mappers import DEFAULT, OCTOMAP, THESIS, Setting
 from stereovox.lab.papers.valenti.speed import Speed
@@ -88,7 +88,7 @@ def _against_octomap(curve: PrecisionRecall, octomap: PrecisionRecall | None) ->
     """Return (a): OctoMap's better precision and its better recall, of p > 0.7 and p >= 0.7, at once."""
     text = "exact precision and recall, at one threshold"
     if octomap is None:
-        return Result("a", text, NOT_INSTALLED, _format_point(best(curve, EXACT), EXACT), None)
+        return Result("a", text, NOT_INSTALLED, _format_point(curve.best(EXACT), EXACT), None)
     points = [at(octomap, threshold) for threshold in (STRICT, AT_LEAST)]
     precision, recall = (max(point[name] or 0.0 for point in points) for name in EXACT)
     return _pair("a", text, curve, EXACT, (precision, recall), " (OctoMap's better ones)")
@@ -97,7 +97,7 @@ def _against_octomap(curve: PrecisionRecall, octomap: PrecisionRecall | None) ->
 def _pair(
     letter: str, text: str, curve: PrecisionRecall, names: tuple[str, str], wanted: tuple[float, float], why: str
 ) -> Result:
-    point = best(curve, names, wanted)
+    point = curve.best(names, wanted)
     holds = all((point[name] or 0.0) >= goal for name, goal in zip(names, wanted, strict=True))
     goal = "at least {:.3f} and {:.3f}".format(*wanted)
     return Result(letter, text, f"{goal}{why}", _format_point(point, names), holds)
@@ -120,7 +120,7 @@ def _lesser(names: tuple[str, str]) -> Callable[[Scores], float]:
     """Return a function that tells the lesser of precision and recall where that is largest."""
 
     def measure(scores: Scores) -> float:
-        point = best(scores.curve, names)
+        point = scores.curve.best(names)
         return min(point[name] or 0.0 for name in names)
 
     return measure

@@ -18,6 +18,8 @@ from stereovox.maps import _cells
 
 BYTE_THRESHOLD = 180
 """Byte above which Chien 2020 (3.5) shows a cell as occupied; it is taken to stand for a probability of 0.7."""
+LIKELY = 0.7
+"""Probability that lies half a way or more before what is surely occupied, however low the threshold."""
 
 
 class State(IntEnum):
@@ -111,8 +113,8 @@ class CellRules:
 
     @cached_property
     def occupied_above(self) -> float:
-        """Stored numbers above it are occupied."""
-        return self._exact(self.config.occupied_above)
+        """Stored numbers above it are occupied: likely, and likelier than before the first evidence."""
+        return max(self._exact(self.config.occupied_above), float(self.prior) + 0.5)
 
     @cached_property
     def most_rise(self) -> int | None:
@@ -142,12 +144,14 @@ class CellRules:
     def sure(self) -> tuple[np.int16, np.int16, np.int16]:
         """The highest stored number that is surely free, the lowest occupied one, and the lowest surely occupied one.
 
-        Sure is what lies past the middle between its threshold and its limit. None is "unknown", nor beyond it.
+        Sure is what lies past the middle between its threshold, and at least LIKELY, and its limit. None is "unknown",
+        nor beyond it.
         """
         unknown, (free_most, occupied_least) = self.format.unknown, map(int, self.thresholds)
         surely_free = min((free_most + int(self.lowest)) // 2, unknown - 1)
         occupied = max(occupied_least, unknown + 1)
-        surely_occupied = max(-(-(occupied_least + int(self.highest)) // 2), occupied)
+        likely = max(occupied_least, int(self.format.stored(log(LIKELY / (1 - LIKELY)))))
+        surely_occupied = max(-(-(likely + int(self.highest)) // 2), occupied)
         return np.int16(surely_free), np.int16(occupied), np.int16(surely_occupied)
 
     def states(self, stored: NDArray[np.integer]) -> NDArray[np.uint8]:

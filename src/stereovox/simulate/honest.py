@@ -153,7 +153,7 @@ def honest_kinect(width: int = WIDTH) -> HonestCamera:
     size = width / WIDTH
     return HonestCamera(
         replace(kinect_camera(width), subpixel=KINECT_TOTAL_PX * size),
-        subpixel=0.056 * size, step=0.125 * size, correlation_px=1.5 * size, of_surface=0.15, of_pixel=0.6,
+        subpixel=0.056 * size, step=0.125 * size, correlation_px=1.5 * size, of_surface=0.15, of_pixel=0.25,
         nearest=0.5, farthest=6.0, edge_loss=0.0, flying=0.03,
         holes=0.005, holes_far=0.2, holes_steep=0.15, holes_dark=0.03, hole_px=5.0 * size, repetitive=0.0,
     )  # fmt: skip

@@ -104,6 +104,20 @@ def middlebury(folder: Path, scale: float) -> Iterator[Pair]:
                 yield pair, np.where(raw > 0, raw / scale, np.nan)
 
 
+def seen_by_both(truth: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return a dense truth without what the right image does not show: beyond it, or behind something nearer."""
+    out = truth.copy()
+    for row, kept in zip(truth, out, strict=True):
+        columns = np.flatnonzero(np.isfinite(row))
+        partner = np.rint(columns - row[columns]).astype(int)
+        nearest = np.full(len(row) + 2, -np.inf)
+        inside = partner >= 0
+        np.maximum.at(nearest, partner[inside] + 1, row[columns[inside]])
+        around = np.max([nearest[:-2], nearest[1:-1], nearest[2:]], axis=0)
+        kept[columns[~inside | (around[partner] > row[columns] + 1)]] = np.nan
+    return out
+
+
 def tallies(settings: dict[str, Any], pairs: list[Pair]) -> NDArray[np.int64]:
     """Return the tally of each pair with these settings."""
     depth = StereoDepth(load_config(**{"stereo.threads": 1, **settings, "stereo.min_confidence": 0}).stereo)
@@ -115,7 +129,7 @@ def line(name: str, rows: list[Outcome]) -> str:
     wrong = np.array([row.wrong for row in rows])
     shares = "   ".join(f"{m:5.2f} ± {s:4.2f}" for m, s in zip(wrong.mean(0), wrong.std(0), strict=True))
     density = np.array([row.density for row in rows])
-    return f"{name:34} {density.mean():5.1f} ± {density.std():3.1f}   {shares}   ({wrong[:, -1].max():.2f})"
+    return f"{name:43} {density.mean():5.1f} ± {density.std():3.1f}   {shares}   ({wrong[:, -1].max():.2f})"
 
 
 def settings_of(grid: list[str]) -> list[dict[str, Any]]:
@@ -146,7 +160,8 @@ def main() -> None:
     counts = np.array([tallies(settings, streets) for settings in made])
     rows, picked = compared(counts, given.density, [int(i) for i in given.choose.split(",") if i])
     if others:
-        rows |= elsewhere(made, picked, others)
+        rows |= elsewhere(made, picked, others, "the pairs")
+        rows |= elsewhere(made, picked, [(frame, seen_by_both(true)) for frame, true in others], "what both eyes see")
     for name, values in rows.items():
         print(line(name, values))
     for best, times in Counter(best for best, _ in picked).most_common(5):
@@ -179,12 +194,12 @@ def compared(counts: NDArray[np.int64], density: float, chosen: list[int]) -> tu
     return rows, picked
 
 
-def elsewhere(made: list[dict[str, Any]], picked: list[tuple[int, int]], pairs: list[Pair]) -> Rows:
-    """Return what the splits' choices and the defaults are worth on `pairs`."""
+def elsewhere(made: list[dict[str, Any]], picked: list[tuple[int, int]], pairs: list[Pair], name: str) -> Rows:
+    """Return what the splits' choices and the defaults are worth on `pairs`, that are called `name`."""
     counts = {k: tallies({**made[k], "stereo.disparities": 80}, pairs).sum(0) for k in {0, *(k for k, _ in picked)}}
     return {
-        "chosen, on the pairs": [outcome(counts[best], level) for best, level in picked],
-        "defaults as they are, on the pairs": [outcome(counts[0], DEFAULT)],
+        f"chosen, on {name}": [outcome(counts[best], level) for best, level in picked],
+        f"defaults as they are, on {name}": [outcome(counts[0], DEFAULT)],
     }
 
 

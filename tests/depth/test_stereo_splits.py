@@ -93,6 +93,16 @@ def test_pairs_are_found_and_matched(bench, tmp_path, names):
     assert found.wrong[0] < 1
 
 
+def test_what_the_right_image_does_not_show_is_left_out(bench):
+    truth = np.full((3, 40), 2.0)
+    truth[1, 15:20] = 8.0  # it covers columns 7 to 11 of the right image: 9 to 13 of the wall in the left one
+    truth[2] = np.nan
+    seen = np.isfinite(bench.seen_by_both(truth))
+    assert np.flatnonzero(~seen[0]).tolist() == [0, 1]
+    assert np.flatnonzero(~seen[1]).tolist() == [0, 1, 8, 9, 10, 11, 12, 13, 14]  # with a pixel to each side
+    assert not seen[2].any()
+
+
 def test_settings_of_a_grid(bench):
     made = bench.settings_of(["p1=8,16", "block_size=3,5"])
     assert made[0] == {}

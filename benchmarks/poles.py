@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Thin poles before a textured wall, by stereo: what becomes of their pixels.
 
-    python benchmarks/poles.py [METHODS] [--seeds 8] [--first-seed 300] [--set stereo.halve=true ...]
+    python benchmarks/poles.py [METHODS] [--widths 1,2,4] [--seeds 8] [--first-seed 300] [--set stereo.halve=true ...]
 
 Pairs of 480x200 are rendered in eighths of a pixel, with grain of all sizes on the wall, and poles of 1, 2 and 4 px
 that are brighter and darker by turns. A pole's pixel that gets the wall's disparity is the dangerous error: it clears
@@ -11,6 +11,7 @@ the pole. Settings were chosen on seeds 100 to 102.
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 
@@ -63,13 +64,15 @@ def grain(random: np.random.Generator, width: int, spread: float) -> NDArray[np.
     return spread * total / total.std()
 
 
-def rendered(random: np.random.Generator, case: Case) -> tuple[list[NDArray[np.uint8]], list[tuple[slice, float]]]:
+def rendered(
+    random: np.random.Generator, case: Case, widths: Sequence[float] = WIDTHS
+) -> tuple[list[NDArray[np.uint8]], list[tuple[slice, float]]]:
     """Return the left and right image, and of each pole its columns in the left one and its width."""
     wall = 120 + grain(random, WIDTH + 2 * MARGIN, case.wall_grain)
     start, stop, off = MARGIN * FINE, (MARGIN + WIDTH) * FINE, round(case.wall * FINE)
     sides, poles = [wall[:, start:stop].copy(), wall[:, start + off : stop + off].copy()], []
     for k, column in enumerate(range(60, WIDTH - 20, 40)):
-        width = WIDTHS[k % len(WIDTHS)]
+        width = widths[k % len(widths)]
         first, size = round((column + random.random()) * FINE), round(width * FINE)
         grey = 120 + (case.contrast if k % 2 == 0 else -case.contrast)
         pole = grey + grain(random, int(width) + 2, case.pole_grain)[:, :size]
@@ -83,9 +86,9 @@ def rendered(random: np.random.Generator, case: Case) -> tuple[list[NDArray[np.u
     return [np.clip(np.rint(image), 0, 255).astype(np.uint8) for image in images], poles
 
 
-def shares(depth: StereoDepth, case: Case, seed: int) -> dict[float, list[float]]:
+def shares(depth: StereoDepth, case: Case, seed: int, widths: Sequence[float] = WIDTHS) -> dict[float, list[float]]:
     """Return for each width which shares of the poles' pixels get the wall's disparity, their own, and none."""
-    (left, right), poles = rendered(np.random.default_rng([seed, 4242]), case)
+    (left, right), poles = rendered(np.random.default_rng([seed, 4242]), case, widths)
     found = depth.disparity(StereoFrame(left, right, StereoPair(CAMERA), np.eye(4)))
     far = found.reason == Reason.TOO_FAR
     valid, disparity = far | (found.reason == Reason.VALID), np.where(far, 0.0, found.disparity)
@@ -101,18 +104,20 @@ def shares(depth: StereoDepth, case: Case, seed: int) -> dict[float, list[float]
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("methods", nargs="?", default="census,sgm", help="names of matchers (%(default)s)")
+    parser.add_argument("--widths", default=",".join(f"{width:g}" for width in WIDTHS), help="pixels (%(default)s)")
     parser.add_argument("--seeds", type=int, default=8)
     parser.add_argument("--first-seed", type=int, default=300)
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", help="further settings")
     arguments = parser.parse_args()
+    widths = [float(width) for width in arguments.widths.split(",")]
     given = dict(one.split("=", 1) for one in arguments.set)
     print(f"{'':10} width   taken for the wall   right   no value   (% of the poles' pixels)")
     for method in arguments.methods.split(","):
         settings = {"stereo.method": method, "stereo.disparities": 64, "stereo.threads": 1, **given}
         depth = StereoDepth(load_config(**settings).stereo)
         seeds = range(arguments.first_seed, arguments.first_seed + arguments.seeds)
-        runs = [shares(depth, case, seed) for case in CASES for seed in seeds]
-        for width in WIDTHS:
+        runs = [shares(depth, case, seed, widths) for case in CASES for seed in seeds]
+        for width in widths:
             wall, right, none = (100 * np.mean([run[width] for run in runs], axis=0)).tolist()
             print(f"{method:10} {width:2.0f} px   {wall:18.1f} {right:7.1f} {none:10.1f}", flush=True)
 

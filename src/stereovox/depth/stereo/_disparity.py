@@ -10,6 +10,8 @@ QUARTER, THREE_QUARTERS = np.float32(0.25), np.float32(0.75)
 NAN, ZERO, HALF, ONE = np.float32(np.nan), np.float32(0), np.float32(0.5), np.float32(1)
 ONE_PX, FOUR, FIFTEEN, PER_ROW = np.int32(16), np.int32(4), np.int32(15), np.float32(1 / 32)
 SLOPE = np.float32(0.1)
+NOUGHT, PLUS, MINUS = np.int32(0), np.int32(1), np.int32(-1)
+NEXT, SECOND = np.uint64(1), np.uint64(2)
 UNITS = np.float32(64)
 """Sums are whole numbers of 1/64 px, so that they come and go without a trace."""
 
@@ -81,34 +83,65 @@ def cross_check(disparity, side, most, seen):
 
 
 @kernel
-def confidence(disparity, radius, first, end, columns, filled, line, line_filled, out):
-    """Fill `out` with the share of a window that has a disparity, less where the pixel is off the window's mean.
+def confidence(disparity, radius, tall, first, end, sums, out):
+    """Fill `out` with the mean of two windows' say in whether a disparity is right; no value: 0.
 
-    radius: the window spans so many pixels to each side. first, end: the rows that are filled. columns, filled: (w,)
-    int32; line, line_filled: (w + 1,) int32, scratch. No value: 0.
+    radius: the square window spans so many pixels to each side. tall: the upright one spans so many rows up and down,
+    and one column to each side. first, end: the rows that are filled. sums: (6, w + 2 radius + 1) int32, scratch: of
+    the columns of both windows and along the row the disparities and how many there are.
     """
-    height, width = disparity.shape
-    columns[:] = np.int32(0)
-    filled[:] = np.int32(0)
+    height = disparity.shape[0]
+    sums[:] = NOUGHT
     for v in range(max(first - radius, 0), min(first + radius, height)):
-        _put(disparity[v], np.int32(1), columns, filled)
+        _put(disparity[v], PLUS, sums[0], sums[1])
+    for v in range(max(first - tall, 0), min(first + tall, height)):
+        _put(disparity[v], PLUS, sums[2], sums[3])
     for v in range(first, end):
-        if v + radius < height:
-            _put(disparity[v + radius], np.int32(1), columns, filled)
-        if v - radius - 1 >= max(first - radius, 0):
-            _put(disparity[v - radius - 1], np.int32(-1), columns, filled)
-        rows = min(v + radius, height - 1) - max(v - radius, 0) + 1
-        _running(columns, line)
-        _running(filled, line_filled)
-        row, result = disparity[v], out[v]
-        for u in range(width):
-            left, right = max(u - radius, 0), min(u + radius + 1, width)
-            count = np.float32(line_filled[right] - line_filled[left])
-            total = np.float32(np.int32(line[right] - line[left])) / UNITS  # sums may wrap round, differences not
-            d = row[u]
-            off = abs(d - total / count) / (ONE + SLOPE * d)
-            share = count / np.float32(rows * (right - left))
-            result[u] = share / (ONE + off) if d == d else ZERO
+        rows = _enter(disparity, v, radius, first, sums[0], sums[1])
+        rows_tall = _enter(disparity, v, tall, first, sums[2], sums[3])
+        _running(sums[0], radius, sums[4])
+        _running(sums[1], radius, sums[5])
+        _trust(disparity[v], rows, rows_tall, radius, sums, out[v])
+
+
+@cell
+def _enter(disparity, v, radius, first, columns, filled):
+    """Move the columns' sums on to row v; return how many rows they hold."""
+    height = disparity.shape[0]
+    if v + radius < height:
+        _put(disparity[v + radius], PLUS, columns, filled)
+    if v - radius - 1 >= max(first - radius, 0):
+        _put(disparity[v - radius - 1], MINUS, columns, filled)
+    return min(v + radius, height - 1) - max(v - radius, 0) + 1
+
+
+@cell
+def _trust(row, rows, rows_tall, radius, sums, out):
+    width, reach = np.uint64(row.size), np.uint64(2 * radius + 1)
+    last, side = np.int32(row.size - 1), np.int32(radius)
+    per_row, per_tall = ONE / np.float32(rows), ONE / np.float32(rows_tall)
+    columns, filled, line, line_filled = sums[2], sums[3], sums[4], sums[5]
+    for u in range(width):
+        x, d = np.int32(u), row[u]
+        total = np.int32(line[u + reach] - line[u])  # sums may wrap round, differences not
+        count = np.int32(line_filled[u + reach] - line_filled[u])
+        square = _say(d, total, count, per_row / _columns(x, side, last))
+        upright = _say(d, _of_three(columns, u), _of_three(filled, u), per_tall / _columns(x, PLUS, last))
+        out[u] = HALF * (square + upright) if d == d else ZERO
+
+
+@cell
+def _of_three(columns, u):
+    return np.int32(np.int32(columns[u] + columns[u + NEXT]) + columns[u + SECOND])
+
+
+@cell
+def _say(d, total, count, per_pixel):
+    """Return the cube of the share of a window that has a disparity, less where d is off the window's mean."""
+    there = np.float32(count)
+    off = abs(d - np.float32(total) / (UNITS * there)) / (ONE + SLOPE * d)
+    share = there * per_pixel
+    return share * share * share / (ONE + off)
 
 
 @kernel
@@ -116,22 +149,34 @@ def texture(image, down, across, first, end, columns, line, out):
     """Fill `out` (h, w) with the mean of |image[v, u + 1] - image[v, u - 1]| over a window.
 
     The window spans `down` rows and `across` columns to each side; at the image's sides there is no step, so 0 counts.
-    first, end: the rows that are filled. columns: (w,) and line: (w + 1,) int32, scratch.
+    first, end: the rows that are filled. columns: (w + 2,) and line: (w + 2 across + 1,) int32, scratch.
     """
-    height, width = image.shape
-    columns[:] = np.int32(0)
+    height = image.shape[0]
+    columns[:] = NOUGHT
     for v in range(max(first - down, 0), min(first + down, height)):
-        _put_steps(image[v], np.int32(1), columns)
+        _put_steps(image[v], PLUS, columns)
     for v in range(first, end):
         if v + down < height:
-            _put_steps(image[v + down], np.int32(1), columns)
+            _put_steps(image[v + down], PLUS, columns)
         if v - down - 1 >= max(first - down, 0):
-            _put_steps(image[v - down - 1], np.int32(-1), columns)
+            _put_steps(image[v - down - 1], MINUS, columns)
         rows = min(v + down, height - 1) - max(v - down, 0) + 1
-        _running(columns, line)
-        for u in range(width):
-            left, right = max(u - across, 0), min(u + across + 1, width)
-            out[v, u] = np.float32(line[right] - line[left]) / np.float32(rows * (right - left))
+        _running(columns, across, line)
+        _mean(line, np.float32(rows), across, out[v])
+
+
+@cell
+def _mean(line, rows, across, out):
+    reach, last = np.uint64(2 * across + 1), np.int32(out.size - 1)
+    for u in range(np.uint64(out.size)):
+        total = np.int32(line[u + reach] - line[u])
+        out[u] = np.float32(total) / (rows * _columns(np.int32(u), np.int32(across), last))
+
+
+@cell
+def _columns(u, side, last):
+    """Return how many columns a window has that spans `side` columns to each side of u, but none beyond the image."""
+    return np.float32(np.int32(min(np.int32(u + side), last) - max(np.int32(u - side), NOUGHT)) + PLUS)
 
 
 @kernel
@@ -175,23 +220,30 @@ def _partner(u, d, side, width):
 
 @cell
 def _put(row, sign, columns, filled):
-    for u in range(row.size):
+    for u in range(np.uint64(row.size)):
         d = row[u]
         there = d == d
-        columns[u] += sign * (np.int32(d * UNITS) if there else np.int32(0))
-        filled[u] += sign if there else np.int32(0)
+        columns[u + NEXT] += sign * (np.int32(d * UNITS) if there else NOUGHT)
+        filled[u + NEXT] += sign if there else NOUGHT
 
 
 @cell
 def _put_steps(row, sign, columns):
-    for u in range(1, row.size - 1):
-        columns[u] += sign * abs(np.int32(row[u + 1]) - np.int32(row[u - 1]))
+    for u in range(np.uint64(max(row.size - 2, 0))):
+        columns[u + SECOND] += np.int32(sign * abs(np.int32(row[u + SECOND]) - np.int32(row[u])))
 
 
 @cell
-def _running(values, sums):
-    total = np.int32(0)
-    sums[0] = total
-    for u in range(values.size):
-        total += values[u]
-        sums[u + 1] = total
+def _running(columns, reach, sums):
+    """Fill `sums` (w + 2 reach + 1,) so that sums[u + 2 reach + 1] - sums[u] is the sum of a window of columns round u.
+
+    columns: (w + 2,), with a margin of one to each side. The window spans `reach` of them to each side of u.
+    """
+    total, width = NOUGHT, sums.size - 2 * reach - 1
+    for u in range(reach + 1):
+        sums[u] = total
+    for u in range(width):
+        total = np.int32(total + columns[u + 1])
+        sums[u + reach + 1] = total
+    for u in range(width + reach + 1, sums.size):
+        sums[u] = total

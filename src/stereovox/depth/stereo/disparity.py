@@ -16,7 +16,9 @@ from stereovox.threads import in_shards, shards
 Image = NDArray[np.uint8]
 Mask = NDArray[np.bool_] | None
 RADIUS = 10
-"""Half width of the confidence window, 21 by 21 pixels."""
+"""Half width of the square confidence window, 21 by 21 pixels."""
+TALL = 5
+"""Half height of the upright one, 11 rows by 3 columns."""
 FAR_PX = 0.5
 """Smaller disparities are none: the pixel is too far to have a depth."""
 SURE = 0.5
@@ -76,18 +78,19 @@ def doubled(disparity: NDArray[np.float32], shape: tuple[int, int], threads: int
 
 
 def confidence(disparity: NDArray[np.float32], threads: int = 1) -> NDArray[np.float32]:
-    """Return the confidence of each disparity (height, width), 0 to 1: share / (1 + off / (1 + 0.1 disparity)).
+    """Return the confidence of each disparity (height, width), 0 to 1: the mean of share^3 / (1 + off) in two windows.
 
-    share: of the pixels in the window of 21 by 21 round it that have a disparity: where matching failed nearby, the
-    rest is mostly chance. off: pixels between the disparity and the mean of the window. Both were chosen, out of
-    texture, matching error, its curvature and others, for how well they rank errors (docs/stereo.md).
+    One spans 21 by 21 pixels, the other 11 rows by 3 columns: a pole fills that one, and nothing else of the first.
+    share: of the window's pixels that have a disparity: where matching failed nearby, the rest is mostly chance. off:
+    between the disparity and the window's mean, in pixels / (1 + 0.1 disparity). Both were chosen, out of the matching
+    cost, its margin and curvature, texture and others, for how well they rank errors (docs/stereo.md).
     """
     height, width = disparity.shape
     sure = np.empty_like(disparity)
 
     def fill(rows: slice) -> None:
-        sums = [np.empty(size, np.int32) for size in (width, width, width + 1, width + 1)]
-        _disparity.confidence(disparity, RADIUS, rows.start, rows.stop, *sums, sure)
+        sums = np.empty((6, width + 2 * RADIUS + 1), np.int32)
+        _disparity.confidence(disparity, RADIUS, TALL, rows.start, rows.stop, sums, sure)
 
     in_shards(fill, shards(height, threads))
     return sure
@@ -99,7 +102,7 @@ def texture(image: Image, threads: int = 1) -> NDArray[np.float32]:
     steps = np.empty(image.shape, np.float32)
 
     def fill(rows: slice) -> None:
-        sums = np.empty(width, np.int32), np.empty(width + 1, np.int32)
+        sums = np.empty(width + 2, np.int32), np.empty(width + 2 * ACROSS + 1, np.int32)
         _disparity.texture(image, DOWN, ACROSS, rows.start, rows.stop, *sums, steps)
 
     in_shards(fill, shards(height, threads))

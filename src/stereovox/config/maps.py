@@ -61,7 +61,7 @@ class MapConfig(Section):
     keep_times: store when each cell got its last evidence (4 more bytes a cell).
     log_odds_min, log_odds_max: limits of a cell's log-odds.
     free_below, occupied_above: probabilities below which a cell is free, and above which it is occupied; a cell that
-        evidence made less likely than the prior never is. For floor maps see `grid.occupied_above`.
+        evidence made less likely than the prior never is.
     forget_s: a cell without evidence for so many seconds of the recording becomes unknown; needs `keep_times`.
     """
 
@@ -70,7 +70,7 @@ class MapConfig(Section):
     log_odds_max: float = Field(3.5, gt=0, le=30)
     prior: float = Field(0.1, gt=0, lt=1)
     free_below: float = Field(0.3, gt=0, lt=1)
-    occupied_above: float = Field(0.35, gt=0, lt=1)
+    occupied_above: float = Field(0.7, gt=0, lt=1)
     confirm_hits: int = Field(1, ge=1, le=100)
     keep_times: bool = False
     forget_s: float | None = Field(None, gt=0)

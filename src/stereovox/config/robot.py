@@ -42,7 +42,6 @@ class GridConfig(Section):
     p_occupied, p_free: probability after one beam of the cell it ends in, and of a cell it passes, at even odds before
         (OctoMap's numbers); see `prior`.
     prior: probability that a cell is occupied before the first evidence on it.
-    occupied_above: probability above which a cell is occupied, if `map.occupied_above` is not more.
     max_tilt_deg: scans of a sensor that leans more than this are refused: its beams meet the floor.
     """
 
@@ -52,7 +51,6 @@ class GridConfig(Section):
     p_occupied: float = Field(0.7, gt=0.5, lt=1)
     p_free: float = Field(0.4, gt=0, lt=0.5)
     prior: float = Field(0.5, gt=0, lt=1)
-    occupied_above: float = Field(0.7, gt=0, lt=1)
     max_tilt_deg: float = Field(5.0, ge=0, le=45)
 
 

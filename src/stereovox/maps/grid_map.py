@@ -49,8 +49,7 @@ class GridStorage(Guarded):
         self.lock = MapLock()
         self.config = config
         self.history = History()
-        own = {"prior": config.grid.prior, "occupied_above": max(config.map.occupied_above, config.grid.occupied_above)}
-        self.rules = CellRules(config.map.model_copy(update=own))
+        self.rules = CellRules(config.map.model_copy(update={"prior": config.grid.prior}))
         self.cell_format = self.rules.format
         self._most_rise = self.rules.most_rise
         self._pool = BlockPool(self.cell_format.dtype, capacity=64, fill=self.cell_format.unknown, cells=CELLS)

@@ -11,12 +11,13 @@ from pathlib import Path
 from typing import Any
 
 from stereovox.errors import StereovoxError
-from stereovox.lab.papers.chapter import Chapter, Progress, Sheet, Shown
+from stereovox.lab.papers.chapter import Chapter, Progress, Sheet, Shown, count
 from stereovox.report.folder import out_folder
 from stereovox.report.page import figure, page, section, table, tiles
 from stereovox.safe_io import replacing
 
 HEADS = ("claim", "thesis", "ours", "holds?")
+COUNTED = ("hold", "do not", "cannot be judged", "figures without a claim")
 
 
 def report(
@@ -32,13 +33,10 @@ def report(
 
 
 def _contents(chapters: Sequence[Chapter]) -> str:
-    rows = []
-    for n, one in enumerate(chapters, 1):
-        verdicts = [claim.holds for claim in one.claims]
-        rows.append((f"{n}. {one.title}", *(verdicts.count(verdict) for verdict in (True, False, None))))
-    heads = ("experiment", "claims that hold", "claims that do not", "figures without a claim")
+    rows = [(f"{n}. {one.title}", *count(one.claims)) for n, one in enumerate(chapters, 1)]
+    heads = ("experiment", *(f"claims that {what}" for what in COUNTED[:3]), COUNTED[3])
     broken = [f"{n}. {claim.text}" for n, one in enumerate(chapters, 1) for claim in one.claims if claim.holds is False]
-    text = f"Does not hold: {'; '.join(broken)}." if broken else "Every claim holds."
+    text = f"Does not hold: {'; '.join(broken)}." if broken else "Every claim that can be judged holds."
     return section("What holds", text, table(heads, rows))
 
 
@@ -115,6 +113,7 @@ def write_result(
         "quick": quick,
         "holds": sum(claim.holds is True for claim in claims),
         "does_not_hold": [claim.text for claim in claims if claim.holds is False],
+        "cannot_be_judged": [f"{claim.text}: {claim.unjudged}" for claim in claims if claim.unjudged],
         "seconds": round(seconds, 1),
         "files": {name: str(path) for name, path in files.items()},
     }
@@ -126,13 +125,10 @@ def write_result(
 
 
 def _facts(found: Sequence[Chapter], seconds: float) -> list[tuple[str, str]]:
-    verdicts = [claim.holds for chapter in found for claim in chapter.claims]
-    return [
-        (f"{verdicts.count(True)}", "claims hold"),
-        (f"{verdicts.count(False)}", "claims do not"),
-        (f"{verdicts.count(None)}", "figures without a claim"),
-        (f"{seconds / 60:.1f} min", "for everything"),
-    ]
+    counts = count(claim for chapter in found for claim in chapter.claims)
+    heads = (*(f"claims {what}" for what in ("hold", "do not", "cannot be judged")), COUNTED[3])
+    boxes = [(str(number), what) for number, what in zip(counts, heads, strict=True)]
+    return [*boxes, (f"{seconds / 60:.1f} min", "for everything")]
 
 
 def _write(path: Path, text: str) -> None:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
 from math import log
 
@@ -126,6 +127,19 @@ class TruthCells:
         self._reader = CellReader(np.union1d(self.cells, around))
         self._own = np.searchsorted(self._reader.cells, self.cells)
         self._around = np.searchsorted(self._reader.cells, around)
+        self._surface = np.arange(len(self._neighbourhood.cells))
+
+    def part(self, chosen: NDArray[np.bool_]) -> TruthCells:
+        """Return the truth of the `chosen` cells (N,) alone; what lies near them counts as near, chosen or not.
+
+        Raises StereovoxError where none is chosen.
+        """
+        if not chosen.any():
+            raise StereovoxError("no cell of the truth lies in this part of it; choose a larger one")
+        part = copy(self)
+        part.cells, part.occupied, part.near = self.cells[chosen], self.occupied[chosen], self.near[chosen]
+        part._own, part._surface = self._own[chosen], self._surface[chosen[self.occupied]]
+        return part
 
     def read(self, voxel_map: VoxelMap) -> Reading:
         """Read `voxel_map`. Raises StereovoxError where its cells are not those of the truth."""
@@ -138,7 +152,7 @@ class TruthCells:
         log_odds = self._reader.log_odds(voxel_map)
         around = log_odds[self._around]
         best = self._neighbourhood.highest(np.where(around == 0, np.float32(-np.inf), around))
-        return Reading(log_odds[self._own], best.astype(np.float32))
+        return Reading(log_odds[self._own], best.astype(np.float32)[self._surface])
 
     def centers(self) -> NDArray[np.float64]:
         """Return the centres (N, 3) of the cells in metres, world frame."""

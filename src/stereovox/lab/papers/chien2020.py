@@ -10,10 +10,11 @@ from typing import Any
 
 from stereovox.config import load_config
 from stereovox.lab.papers.chapter import Chapter, Progress
-from stereovox.lab.papers.chien import aisle, apartment, boxes, shifting, timing, tracers
+from stereovox.lab.papers.chien import aisle, apartment, boxes, grid, shifting, timing, tracers
 from stereovox.lab.papers.chien.aisle import compare_aisles
 from stereovox.lab.papers.chien.apartment import scan_apartment
 from stereovox.lab.papers.chien.boxes import Placement, find_boxes, random_placements
+from stereovox.lab.papers.chien.grid import CELL_M, Extent, widths_over_grid
 from stereovox.lab.papers.chien.own import map_own
 from stereovox.lab.papers.chien.shifting import OUTSIDE, fly
 from stereovox.lab.papers.chien.timing import FIRST, time_tables
@@ -43,9 +44,10 @@ class Sizes:
     timed_frames: int = 250
     tracer_frames: int = 40
     flight_m: float = 80.0
+    grid: Extent = Extent()  # noqa: RUF009 - frozen
 
 
-QUICK = Sizes(100, 6, 20, 12, 40, 25, 10, 40.0)
+QUICK = Sizes(100, 6, 20, 12, 40, 25, 10, 40.0, Extent(cells=(CELL_M,), noises=(0.08,), updates=(10,)))
 
 
 def reproduce(out: Path, data: str | Path | None, quick: bool, progress: Progress) -> dict[str, Any]:
@@ -66,6 +68,7 @@ def experiments(sizes: Sizes, steps: Steps) -> list[Chapter]:
     two = find_boxes(at_2_m, updates=sizes.box_updates, step=steps.of("two boxes"))
     placed = list(random_placements(sizes.placements))
     many = find_boxes(placed, updates=sizes.placement_updates, step=steps.of("boxes at random places"))
+    widths = widths_over_grid(sizes.grid, steps.of("boxes at many settings"))
     scanned = scan_apartment(every=sizes.apartment_every, step=steps.of("apartment"))
     aisles, simulation = compare_aisles(frames=sizes.aisle_frames, step=steps.of("aisle"))
     compared = [compare_tracers(n, frames=sizes.tracer_frames, step=steps.of("ray tracers")) for n in (8, 1)]
@@ -73,6 +76,7 @@ def experiments(sizes: Sizes, steps: Steps) -> list[Chapter]:
     times = time_tables(frames=sizes.timed_frames, step=steps.of("time tables"))  # last: all kernels are compiled
     found = [
         boxes.chapter(two, many, sizes.box_updates),
+        grid.chapter(widths),
         apartment.chapter(scanned),
         aisle.chapter(aisles, simulation.scene),
         timing.chapter(*times),
@@ -93,4 +97,4 @@ def _total(sizes: Sizes) -> int:
         + sizes.timed_frames
         + 2 * sizes.tracer_frames
     )
-    return 2 + sizes.placements + images + flight_frames
+    return 2 + sizes.placements + sizes.grid.images + images + flight_frames

@@ -18,7 +18,7 @@ from stereovox.lab.papers.chapter import Chapter, Claim, Sheet, Shown
 from stereovox.lab.papers.pictures import figure_of, png
 from stereovox.maps import State, VoxelMap, make_map
 from stereovox.products.slices import layer
-from stereovox.simulate.d435 import CAMERA
+from stereovox.simulate.d435 import CAMERA, D435
 from stereovox.simulate.plain_scenes import SIZES
 from stereovox.simulate.simulation import Simulation
 from stereovox.view.axis import draw_profile
@@ -80,10 +80,10 @@ class Placement:
         low = (self.x - width / 2, self.y - height / 2, self.distance)
         return np.array([low, (low[0] + width, low[1] + height, low[2] + depth)])
 
-    def simulation(self, frames: int) -> Simulation:
-        """Return what a D435 sees of it, in Chien's map frame."""
+    def simulation(self, frames: int, subpixel: float = D435.subpixel) -> Simulation:
+        """Return what a D435 sees of it, in Chien's map frame. subpixel: noise of its disparity in pixels."""
         where = f"sim:box?size={self.size}&distance={self.distance}&x={self.x}&y={self.y}&wall={WALL_M}&axes=optical"
-        return Simulation(where, frames=frames)
+        return Simulation(f"{where}&subpixel={subpixel}", frames=frames)
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,7 +176,7 @@ def find_box(voxel_map: VoxelMap, place: Placement, integrator: str = "") -> Box
     cells = np.floor(box / size).astype(np.int64)
     hidden = voxel_map.state(hidden_centres(place, size))
     known = int((hidden != State.UNKNOWN).sum())
-    found = (cells, _errors(cells, place, size), _width(cells))
+    found = (cells, _errors(cells, place, size), row_width(cells))
     return BoxFound(place, integrator, voxel_map, *found, len(hidden), known)
 
 
@@ -209,8 +209,8 @@ def _errors(cells: NDArray[np.int64], place: Placement, size: float) -> NDArray[
     return np.array([*sides[0], *sides[1], first[2] - found_first[2]]).astype(np.int64)
 
 
-def _width(cells: NDArray[np.int64]) -> int:
-    """Return the number of cells in the fullest row, left to right, of the layer y = 0."""
+def row_width(cells: NDArray[np.int64]) -> int:
+    """Return the number of `cells` (N, 3) in the fullest row, left to right, of the layer y = 0."""
     rows = cells[cells[:, 1] == 0, 2]
     return int(np.unique(rows, return_counts=True)[1].max()) if len(rows) else 0
 

@@ -33,9 +33,9 @@ ERROR_HEADS = ("error, Eq 7 [%]", "of it coverage", "of it contradiction")
 EQ7 = (
     "Error: IST 2019, Eq 7: cells whose state (unknown, free, occupied) differs, over the free and occupied cells of "
     "the reference. It is the sum of two things: coverage, cells that only one of the maps knows, and contradiction, "
-    "cells that both know and call by opposite states. A wall that stands one cell of 2 cm aside counts twice in it, and so does every cell of a wall "
-    "that is drawn thicker; walls within one cell and the metres between walls forgive that. Maps and reference have "
-    "one frame, that of the localisation; nothing was aligned afterwards."
+    "cells that both know and call by opposite states. A wall that stands one cell of 2 cm aside counts twice in it, "
+    "and so does every cell of a wall that is drawn thicker; walls within one cell and the metres between walls "
+    "forgive that. Maps and reference have one frame, that of the localisation; nothing was aligned afterwards."
 )
 POSES = (
     "Odometry: as the Pioneer's wheels tell it, without localisation. True poses: those of the simulation, moved as a "

@@ -31,13 +31,11 @@ def best(curve: PrecisionRecall, names: tuple[str, str], wanted: tuple[float, fl
 
 
 def figures(scores: Scores) -> dict[str, Any]:
-    """Return all that is reported of one map against one truth, fit for JSON."""
+    """Return all that is reported of one map against one truth at thresholds named beforehand, fit for JSON."""
     return {
         **scores.as_dict(),
         "strict": at(scores.curve, STRICT),
         "at_least": at(scores.curve, AT_LEAST),
-        "balanced": best(scores.curve, TOLERANT),
-        "balanced_exact": best(scores.curve, EXACT),
         "listed": [at(scores.curve, threshold) for threshold in LISTED],
     }
 

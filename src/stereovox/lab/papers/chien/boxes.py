@@ -296,10 +296,12 @@ def _width_claim(size: str, found: Sequence[BoxFound]) -> Claim:
 
 def _shadow(whose: str, found: Sequence[BoxFound]) -> Claim:
     hidden, known = sum(one.hidden for one in found), sum(one.hidden_known for one in found)
-    ours = f"{hidden - known:,} of {hidden:,} cells unknown"
-    return Claim(
-        f"What lies in the shadow of {whose}, the wall too, stays unknown", "no update results", ours, known == 0
-    )
+    text = f"What lies in the shadow of {whose}, the wall too, stays unknown"
+    if not hidden:
+        return Claim(text, "no update results", "-", None, "no cell lies wholly in the shadow")
+    lost = sum(not len(one.cells) for one in found)
+    ours = f"{hidden - known:,} of {hidden:,} cells unknown" + (f"; {lost} boxes are not in the map" if lost else "")
+    return Claim(text, "no update results", ours, known == 0 and not lost)
 
 
 def _placed(name: str, found: Sequence[BoxFound]) -> Claim:

@@ -19,6 +19,8 @@ RIGHT, AREA = 0.98, 0.03
 TARGET_PERCENT = 10.0
 WALL_M, WAY_M = 0.04, 0.10
 """Most metres, median, from a wall of the map to the reference's; most metres (RMS) that a way is off."""
+FOUND = 0.9
+"""Least share of the reference's wall cells that have one of the map within a cell."""
 HIDDEN = 0.9
 """Least share of what the reference knows behind a shut door that a map must not know."""
 DRAWN_ODOMETRY = "ist2019, odometry"
@@ -89,7 +91,14 @@ def claims_of(found: Survey, place: Place | None) -> list[Claim]:
     ]
     if place is None:
         return [*claims, *(_beside(one) for one in (middle, ours))]
-    claims += [_target(middle), _beside(ours), *_band(ours, theirs), _walls(middle), *_format_errors(found)]
+    claims += [
+        _target(middle),
+        _beside(ours),
+        *_band(ours, theirs),
+        _walls(middle),
+        _found(middle),
+        *_format_errors(found),
+    ]
     odometry = found.judged.get(DRAWN_ODOMETRY)
     if odometry is not None:
         less = theirs.scores.eq7_percent < odometry.scores.eq7_percent
@@ -159,6 +168,14 @@ def _walls(one: Judged) -> Claim:
     ours = "no walls" if there is None or back is None else f"{100 * there:.1f} and {100 * back:.1f} cm"
     text = f"{one.made.variant.name}: walls to the reference's walls and back, median"
     return Claim(text, f"at most {100 * WALL_M:g} cm", ours, holds)
+
+
+def _found(one: Judged) -> Claim:
+    """Return whether the map has the reference's walls; Eq 7 hardly tells, as few cells are walls."""
+    share = one.scores.occupied.tolerance_recall
+    ours = "no walls" if share is None else f"{100 * share:.1f}\u00a0%"
+    text = f"{one.made.variant.name}: the reference's wall cells that have one of the map within one cell"
+    return Claim(text, f"at least {100 * FOUND:g} %", ours, share is not None and share >= FOUND)
 
 
 def _format_errors(found: Survey) -> list[Claim]:

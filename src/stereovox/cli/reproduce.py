@@ -3,6 +3,7 @@
 
 All of Chien 2020 is simulated and takes some minutes. --data also maps a recording of your own under its profile.
 Valenti 2018 maps recordings with lidar: --data is a folder with KITTI tracking sequences, or a drive of KITTI raw data.
+Thresholds are chosen on other drives than they are scored on, of a single drive on the first half of its street.
 IST 2019 drives a simulated robot through two floors and maps them from the bags; --data is a bag of your own instead.
 """
 

@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from stereovox.config import load_config
+from stereovox.config import Config, load_config
 from stereovox.depth import prepare
 from stereovox.frame import DepthImage
-from stereovox.integrate import make_integrator
+from stereovox.integrate import Integrator, make_integrator
 from stereovox.lab.papers.chapter import Chapter, Claim, Sheet
 from stereovox.lab.papers.chien.boxes import CLEAR_M, NAMES, WALL_M, Placement, row_width
 from stereovox.maps import VoxelMap, make_map
@@ -104,12 +104,10 @@ class Setting:
 
 
 class _Run:
-    """One map, and where its camera stands."""
+    """One map, and where its camera stands. integrator: of these settings; several runs may share one."""
 
-    def __init__(self, model: str, cell: float, place: tuple[float, float], tracer: str):
-        self.key = (model, cell, place, tracer)
-        config = load_config("chien2020", integrator=tracer, voxel_size=cell, **MODELS[model])
-        self._map, self._integrator = make_map(config), make_integrator(config)
+    def __init__(self, config: Config, integrator: Integrator, place: tuple[float, float]):
+        self._map, self._integrator, cell = make_map(config), integrator, config.voxel_size
         self._shift = np.array([place[0], 0.0, place[1]]) * cell
 
     def add(self, image: DepthImage) -> None:
@@ -151,16 +149,19 @@ def widths_over_grid(extent: Extent, step: Callable[[], None] = lambda: None) ->
 
 
 def _widths(extent: Extent, noise: float, size: str, step: Callable[[], None]) -> list[tuple[tuple[Any, ...], int]]:
-    runs = [_Run(*key) for key in product(extent.models, extent.cells, extent.places, extent.tracers)]
+    runs = {}
+    for model, cell, tracer in product(extent.models, extent.cells, extent.tracers):
+        config = load_config("chien2020", integrator=tracer, voxel_size=cell, **MODELS[model])
+        integrator = make_integrator(config)
+        runs |= {(model, cell, place, tracer): _Run(config, integrator, place) for place in extent.places}
     simulation = Placement(size, DISTANCE_M).simulation(extent.updates[-1], noise)
     profile, told = load_config("chien2020"), []
     for i in range(len(simulation)):
         image = prepare(simulation.frame(i), profile)
-        for run in runs:
+        for run in runs.values():
             run.add(image)
         if i + 1 in extent.updates:
-            for run in runs:
-                model, cell, place, tracer = run.key
+            for (model, cell, place, tracer), run in runs.items():
                 told.append(((model, cell, place, noise, i + 1, tracer), run.width()))
         step()
     return told

@@ -48,6 +48,10 @@ def test_eval_finds_the_motion_and_tells_equation_7(capsys):
     assert [found["motion"][name] for name in ("x", "y", "yaw_deg")] == pytest.approx([0.4, -0.1, 5.73], abs=0.05)
     assert set(CONTRACT) <= set(found)
     assert any(f"error {found['eq7_percent']:.2f} % (IST 2019, Eq 7)" in line for line in err), err
+    parts = [found[f"eq7_{part}_percent"] for part in ("coverage", "contradiction")]
+    assert sum(parts) == pytest.approx(found["eq7_percent"])
+    wanted = "of it {:.2f} % coverage (only one map knows the cell) and {:.2f} % contradiction".format(*parts)
+    assert any(wanted in line for line in err), err
     assert not any("hardly match" in line for line in err)
     _, stays, doubted = run(capsys, "eval", "moved.yaml", "reference.yaml", "--no-align")
     assert stays["eq7_percent"] > 20
@@ -87,7 +91,8 @@ def test_a_report_is_written(folder, capsys):
     _, found, _ = run(capsys, "eval", "half.yaml", "reference.yaml", "--no-align", "--report", "report")
     assert found["report"] == "report/evaluation.html"
     page = (folder / "report/evaluation.html").read_text()
-    assert f"{found['eq7_percent']:.1f} %" in page
+    for part in ("", "_coverage", "_contradiction"):
+        assert f"{found[f'eq7{part}_percent']:.1f} %" in page
     assert page.count("data:image/png") == 2
     assert (folder / "report/difference.png").read_bytes().startswith(b"\x89PNG")
 

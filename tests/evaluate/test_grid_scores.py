@@ -58,6 +58,8 @@ def slow(ours, theirs, shift=(0, 0), region=None, tolerance=1):
     both = [at for at in inside if "unknown" not in (say[at], true[at])]
     return {
         "eq7_percent": 100 * len(differ) / number,
+        "eq7_coverage_percent": 100 * sum("unknown" in (say[at], true[at]) for at in differ) / number,
+        "eq7_contradiction_percent": 100 * sum("unknown" not in (say[at], true[at]) for at in differ) / number,
         "eq7_outside_percent": 100 * len(differ) / sum(true[at] != "unknown" for at in inside),
         "known_error_percent": 100 * sum(say[at] != true[at] for at in both) / len(both),
         "missed": sum(say[at] == "unknown" for at in differ),
@@ -107,7 +109,27 @@ def test_equation_7_by_hand():
     assert (errors.missed, errors.wrongly_occupied, errors.wrongly_free, errors.extra) == (2, 1, 1, 1)
     assert (errors.reference_occupied, errors.reference_free) == (3, 3)
     assert found.eq7_percent == pytest.approx(100 * 5 / 6)
+    assert errors.eq7_coverage_percent == pytest.approx(100 * 3 / 6)
+    assert errors.eq7_contradiction_percent == pytest.approx(100 * 2 / 6)
     assert errors.known_error_percent == pytest.approx(100 * 2 / 4)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_coverage_and_contradiction_add_up_to_equation_7(seed):
+    theirs, ours = random_floor(seed), random_floor(seed + 50)
+    errors = score_grids(ours, theirs, [REGION] if seed % 2 else (), align=False).errors
+    both = errors.eq7_coverage_percent + errors.eq7_contradiction_percent
+    assert both == pytest.approx(errors.eq7_percent, rel=1e-12)
+
+
+def test_what_was_never_seen_is_coverage_and_what_is_opposite_is_contradiction():
+    reference = room()
+    unseen = np.where(np.arange(reference.cells.shape[1]) < 30, -1, reference.cells).astype(np.int8)
+    opposite = np.where(reference.cells == WALL, FREE, np.where(reference.cells == FREE, WALL, -1)).astype(np.int8)
+    for cells, coverage, contradiction in ((unseen, 25, 0), (opposite, 0, 100)):
+        errors = score_grids(changed(reference, cells), reference, align=False).errors
+        assert errors.eq7_coverage_percent == pytest.approx(coverage)
+        assert errors.eq7_contradiction_percent == pytest.approx(contradiction)
 
 
 def test_an_excluded_region_counts_as_right_and_stays_in_the_number_below():

@@ -203,6 +203,8 @@ def _print_grid_scores(scores: GridScores, regions: int) -> None:
     if scores.aligned:
         say(f"the map was moved by {x:.3f}, {y:.3f} m and {np.degrees(yaw):.2f} degrees to lie on the reference")
     say(f"error {errors.eq7_percent:.2f} % (IST 2019, Eq 7): cells that differ, for 100 known to the reference")
+    say(f"  of it {errors.eq7_coverage_percent:.2f} % coverage (only one map knows the cell) and "
+        f"{errors.eq7_contradiction_percent:.2f} % contradiction (free in one, occupied in the other)")  # fmt: skip
     for kind, what in DIFFERENCES.items():
         say(f"{thousands(getattr(errors, kind)):>11} {kind.replace('_', ' ')}: {what}")
     if regions:

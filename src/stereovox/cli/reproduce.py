@@ -3,6 +3,7 @@
 
 All of Chien 2020 is simulated and takes some minutes. --data also maps a recording of your own under its profile.
 Valenti 2018 maps recordings with lidar: --data is a folder with KITTI tracking sequences, or a drive of KITTI raw data.
+Thresholds are chosen on other drives than they are scored on, of a single drive on the first half of its street.
 IST 2019 drives a simulated robot through two floors and maps them from the bags; --data is a bag of your own instead.
 """
 
@@ -49,11 +50,14 @@ def run(arguments: Namespace) -> dict[str, Any]:
 
 
 def _print_result(result: dict[str, Any]) -> None:
-    failed = result["does_not_hold"]
-    say(f"{result['holds']} claims hold, {len(failed)} do not, in {result['seconds']:.0f} s")
+    failed, unjudged = result["does_not_hold"], result["cannot_be_judged"]
+    judged = f"{result['holds']} claims hold, {len(failed)} do not, {len(unjudged)} cannot be judged"
+    say(f"{judged}, in {result['seconds']:.0f} s")
     if result["quick"] and failed:
         say("only few frames were used (--quick): a claim that fails here may hold for the whole run")
     for text in failed:
         say(f"does not hold: {text}")
+    for text in unjudged:
+        say(f"cannot be judged: {text}")
     for name, path in result["files"].items():
         say(f"{name:>8}: {path}")

@@ -5,6 +5,9 @@ As in IST 2019, IV-B, a cell is wrong where "the occupation value" differs, so t
 only one of the maps knows is wrong too: the paper says so of a corridor that its camera never saw, which is white in
 Fig 6. An excluded region is "compensated in the error formula, as being, in fact, black": its cells count as right, and
 still belong to the free and occupied cells of the reference in the denominator.
+
+So Eq 7 adds up two things: coverage, what one of the maps never saw, and contradiction, where they say the opposite. A
+camera that sees less than a lidar has much of the first, a map that is wrong has much of the second; both are told.
 """
 
 from __future__ import annotations
@@ -65,7 +68,9 @@ class CellErrors:
     """Counts of cells by how they differ.
 
     eq7_percent: IST 2019, Eq 7: all that differ / (free and occupied cells of the reference) * 100; can exceed 100.
-    eq7_outside_percent: the same without excluded cells in the denominator; never less.
+    eq7_coverage_percent, eq7_contradiction_percent: its two parts, which add up to it: cells that only one of the maps
+        knows (missed, extra), and cells that both know and call by different states (wrongly occupied, wrongly free).
+    eq7_outside_percent: the same as Eq 7 without excluded cells in the denominator; never less.
     known_error_percent: of the cells known to both maps, those that differ; None where there are none.
     missed, wrongly_occupied, wrongly_free, extra: the cells that differ, see `Difference`; forgiven: those that differ
         in excluded regions and do not count.
@@ -74,6 +79,8 @@ class CellErrors:
     """
 
     eq7_percent: float
+    eq7_coverage_percent: float
+    eq7_contradiction_percent: float
     eq7_outside_percent: float | None
     known_error_percent: float | None
     missed: int
@@ -99,6 +106,8 @@ def cell_errors(laid: Laid, found: NDArray[np.uint8]) -> CellErrors:
     differ = missed + occupied + free + extra
     return CellErrors(
         eq7_percent=100 * differ / total,
+        eq7_coverage_percent=100 * (missed + extra) / total,
+        eq7_contradiction_percent=100 * (occupied + free) / total,
         eq7_outside_percent=_percent(differ, outside),
         known_error_percent=_percent(occupied + free, both),
         missed=missed,

@@ -15,8 +15,8 @@ from stereovox.view.grid_difference import binary_png, difference_png, side_by_s
 
 LEAD = (
     "{} compared with {}, cell by cell, in cells of {:g} m of the reference. The error of IST 2019, Eq 7, counts every "
-    "cell that differs, also one that only one of the two maps knows; a wall that stands one cell aside counts twice. "
-    "The other measures tell such a wall from one that is wrong."
+    "cell that differs: what only one of the two maps knows (coverage), and what they call by opposite states "
+    "(contradiction). A wall that stands one cell aside counts twice; the other measures tell it from a wrong one."
 )
 KINDS = {
     "missed": "Known to the reference, unknown to the map: never seen, or out of the sensor's range.",
@@ -60,6 +60,8 @@ def grid_page(scores: GridScores, laid: Laid, name: str, reference: str) -> str:
 def _boxes(scores: GridScores) -> list[tuple[str, str]]:
     return [
         (_percent(scores.eq7_percent), "error, IST 2019, Eq 7"),
+        (_percent(scores.errors.eq7_coverage_percent), "of it coverage: only one of the maps knows the cell"),
+        (_percent(scores.errors.eq7_contradiction_percent), "of it contradiction: free in one, occupied in the other"),
         (_percent(scores.errors.known_error_percent), "of the cells known to both differ"),
         (_metres(scores.to_reference.mean), "from a wall of the map to one of the reference, mean"),
         (_number(scores.occupied.iou_tolerant), f"overlap (IoU) of walls within {_within(scores)}"),
@@ -76,7 +78,8 @@ def _tables(scores: GridScores) -> Iterator[str]:
     yield page.section(
         "What the error is made of",
         f"In per cent of the reference's {errors.reference_occupied:,} occupied and {errors.reference_free:,} free "
-        "cells, as in Eq 7; the first four add up to it. Cells between free and occupied count as unknown.",
+        "cells, as in Eq 7; the first four add up to it: missed and extra to its coverage, the two wrong ones to its "
+        "contradiction. Cells between free and occupied count as unknown.",
         page.table(["cells", "number", "of Eq 7", "what they are"], rows),
     )
     yield page.section("Walls", _moved(scores), page.table(["measure", "value", "what it says"], _walls(scores)))

@@ -14,11 +14,11 @@ from made_pages import Balanced
 from stereovox.cli import main
 from stereovox.formats.map_server import read_map_server
 from stereovox.lab.papers import ist2019, reproduce
-from stereovox.lab.papers.ist.claims import fan_claims
+from stereovox.lab.papers.ist.claims import claims_of, fan_claims
 from stereovox.lab.papers.ist.drives import PLACES, Drive, Extent, record
 from stereovox.lab.papers.ist.fans import DISTANCE, FEW, MANY, simulate
 from stereovox.lab.papers.ist.publish import time_publishing
-from stereovox.lab.papers.ist.survey import survey
+from stereovox.lab.papers.ist.survey import _judge, survey
 from stereovox.lab.papers.ist.variants import MIDDLE, OURS, THEIRS, VARIANTS
 from stereovox.lab.papers.ist2019 import QUICK, Sizes
 from stereovox.simulate.floors.bag import write_bag
@@ -107,9 +107,17 @@ def test_a_bag_that_will_not_do_ends_in_one_line(given, tmp_path, capsys):
     assert error.count("\n") <= 2  # a word about compiling may stand before
 
 
-def test_the_whole_chain_reaches_its_target(tmp_path):
-    drive = Drive.through(PLACES[1], Extent("speed=1.5&scan_hz=3&depth_hz=2&image_width=160"))
-    found = survey(record(drive, tmp_path), (VARIANTS[0], VARIANTS[2]), tmp_path, lambda: None)
+@pytest.fixture(scope="module")
+def surveyed(tmp_path_factory):
+    drive, folder = (
+        Drive.through(PLACES[1], Extent("speed=1.5&scan_hz=3&depth_hz=2&image_width=160")),
+        tmp_path_factory.mktemp("testbed"),
+    )
+    return survey(record(drive, folder), (*VARIANTS[:3], VARIANTS[4]), folder, lambda: None)
+
+
+def test_the_whole_chain_reaches_its_target(surveyed):
+    found = surveyed
     theirs, ours = (found.judged[name].scores for name in (THEIRS, MIDDLE))
     assert max(theirs.eq7_percent, ours.eq7_percent) < 10
     assert found.reference.way_error.position_rms_m < 0.1
@@ -117,6 +125,56 @@ def test_the_whole_chain_reaches_its_target(tmp_path):
     assert theirs.free_iou > 0.9
     assert theirs.occupied.tolerance_recall > 0.9
     assert ours.occupied.tolerance_precision > 0.7
+
+
+def unseen(cells):
+    return np.full_like(cells, -1)
+
+
+def without_walls(cells):
+    return np.where(cells > 50, 0, cells).astype(np.int8)
+
+
+def opposite(cells):
+    return np.where(cells < 0, cells, 100 - cells).astype(np.int8)
+
+
+def aside(cells):
+    return np.roll(cells, 15, axis=1)
+
+
+def test_every_claim_about_a_floor_fails_with_some_broken_map_or_way(surveyed):
+    """No claim may hold whatever the code does: each one breaks with at least one map, or way, that is wrong."""
+    place, fails = PLACES[1], {}
+    for broken in (unseen, without_walls, opposite, aside):
+        for name, one in surveyed.judged.items():
+            made = replace(one.made, grid=replace(one.made.grid, cells=broken(one.made.grid.cells)))
+            bad = _judge(made, surveyed.reference, surveyed.excluded, surveyed.recording)
+            for claim in claims_of(replace(surveyed, judged={**surveyed.judged, name: bad}), place):
+                fails.setdefault(claim.text, []).append(claim.holds is False)
+    off = replace(surveyed.way_error, position_rms_m=0.2)
+    ways = replace(surveyed, way_error=off, reference=replace(surveyed.reference, way_error=off))
+    for claim in claims_of(ways, place):
+        fails.setdefault(claim.text, []).append(claim.holds is False)
+    held = [claim for claim in claims_of(surveyed, place) if claim.holds is not None]
+    assert len(held) > 8
+    assert [claim.text for claim in held if not any(fails[claim.text])] == []
+
+
+def test_a_region_that_no_door_hides_is_told_from_one_that_a_door_does(surveyed):
+    (x0, y0), resolution = surveyed.reference.grid.origin[:2], surveyed.reference.grid.resolution
+    rows, columns = np.nonzero(surveyed.reference.grid.cells == 0)
+    middle = (float(np.median(columns)) * resolution + x0, float(np.median(rows)) * resolution + y0)
+    seen = [(middle[0] - 1, middle[1] - 1, middle[0] + 1, middle[1] + 1)]
+    good = surveyed.judged[THEIRS].made
+    cells = good.grid.cells.copy()
+    x, y = (good.grid.centres(*np.indices(cells.shape)[:, :, :].reshape(2, -1))).T
+    cells.ravel()[(np.abs(x - middle[0]) < 1.1) & (np.abs(y - middle[1]) < 1.1)] = -1
+    for grid, holds in ((good.grid, False), (replace(good.grid, cells=cells), True)):
+        judged = _judge(replace(good, grid=grid), surveyed.reference, seen, surveyed.recording)
+        found = replace(surveyed, judged={**surveyed.judged, THEIRS: judged}, excluded=seen)
+        (claim,) = [claim for claim in claims_of(found, PLACES[1]) if "door" in claim.text]
+        assert claim.holds is holds, claim.ours
 
 
 def test_synthetic_beams_mark_what_the_report_says():

@@ -8,7 +8,7 @@ from made_pages import Balanced
 
 from stereovox.errors import StereovoxError
 from stereovox.lab.papers import PAPERS, chien2020, reproduce
-from stereovox.lab.papers.chapter import NO, YES, Chapter, Claim, Sheet, Shown
+from stereovox.lab.papers.chapter import NO, UNJUDGED, YES, Chapter, Claim, Sheet, Shown, count
 from stereovox.lab.papers.chien.own import map_own
 from stereovox.lab.papers.output import report
 from stereovox.simulate.simulation import Simulation
@@ -21,6 +21,7 @@ CHAPTER = Chapter(
         Claim("wide", "2", "2 cells", True),
         Claim("late & slow", "1 ms", "3 ms", False),
         Claim("beside", "-", "7", None),
+        Claim("elsewhere", "3", "-", None, "no recording"),
     ],
     [Shown("Fig 4.6", "two cells", "ours & yours", b"png")],
     [Sheet("Rows", ("a", "b"), [(1, "<x>")])],
@@ -33,7 +34,12 @@ def test_the_page_says_what_holds_and_needs_no_other_file():
     page = report("Title <1>", "Lead", [("3", "claims")], [CHAPTER])
     for text in ("Title &lt;1&gt;", "Boxes &lt;2&gt;", YES, NO, "late &amp; slow", "cG5n", "&lt;x&gt;", "A remark."):
         assert text in page, text
-    assert "Does not hold: 1. late &amp; slow." in page
+    failed = page.partition("What does not hold")[2].partition("<h2>")[0]
+    assert "late &amp; slow" in failed
+    assert "<td>wide</td>" not in failed
+    assert f"{UNJUDGED}: no recording" in page
+    held = report("T", "L", [], [replace(CHAPTER, claims=CHAPTER.claims[:1])])
+    assert "Every claim that can be judged holds." in held
     assert not re.search(r"""(src|href)\s*=\s*["'](?!data:)|url\(|@import""", page)
     parser = Balanced()
     parser.feed(page)
@@ -42,7 +48,7 @@ def test_the_page_says_what_holds_and_needs_no_other_file():
 
 @pytest.fixture
 def one_chapter(monkeypatch):
-    monkeypatch.setattr(chien2020, "experiments", lambda sizes, steps: [CHAPTER])
+    monkeypatch.setattr(chien2020, "experiments", lambda sizes, steps, camera: [CHAPTER])
 
 
 def test_both_files_are_written_and_say_the_same(one_chapter, tmp_path):
@@ -51,7 +57,9 @@ def test_both_files_are_written_and_say_the_same(one_chapter, tmp_path):
     assert result["does_not_hold"] == ["late & slow"]
     numbers = json.loads((tmp_path / "new" / "folder" / "numbers.json").read_text())
     assert numbers["experiments"]["boxes"]["numbers"] == {"answer": 42}
-    assert [claim["holds"] for claim in numbers["experiments"]["boxes"]["claims"]] == [True, False, None]
+    assert [claim["holds"] for claim in numbers["experiments"]["boxes"]["claims"]] == [True, False, None, None]
+    assert result["cannot_be_judged"] == ["elsewhere: no recording"]
+    assert count(CHAPTER.claims) == (1, 1, 1, 1)
     page = (tmp_path / "new" / "folder" / "report.html").read_text()
     assert "do not quote it" in page
 
@@ -75,7 +83,7 @@ def test_a_recording_of_ones_own_is_mapped_under_both_profiles(one_chapter, tmp_
 
 def test_mistakes_are_told_before_the_work(monkeypatch, tmp_path):
     done = []
-    monkeypatch.setattr(chien2020, "experiments", lambda sizes, steps: done.append(1) or [CHAPTER])
+    monkeypatch.setattr(chien2020, "experiments", lambda sizes, steps, camera: done.append(1) or [CHAPTER])
     nothing = Simulation("sim:wall?image_width=16&frames=3")
     monkeypatch.setattr(nothing, "frame", lambda i: replace(Simulation.frame(nothing, i), fault="no_pose"))
     monkeypatch.setattr(chien2020, "open_source", lambda where: nothing)

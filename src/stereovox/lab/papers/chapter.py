@@ -3,28 +3,43 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
 Progress = Callable[[int, int, str], None]
 """Called with steps done, steps in all, and what is being done."""
-YES, NO = "\u2713 yes", "\u2717 no"
+YES, NO, UNJUDGED = "\u2713 yes", "\u2717 no", "? cannot be judged"
 
 
 @dataclass(frozen=True)
 class Claim:
-    """One row of "does it hold?". holds: None where nothing is claimed and the number is for comparison."""
+    """One row of "does it hold?".
+
+    holds: None where nothing is claimed and the number is for comparison, or where the claim cannot be judged here:
+    `unjudged` then says why not.
+    """
 
     text: str
     thesis: str
     ours: str
     holds: bool | None
+    unjudged: str = ""
 
     @property
     def verdict(self) -> str:
         """Whether it holds, in a word."""
+        if self.unjudged:
+            return f"{UNJUDGED}: {self.unjudged}"
         return "-" if self.holds is None else YES if self.holds else NO
+
+
+def count(claims: Iterable[Claim]) -> tuple[int, int, int, int]:
+    """Return how many claims hold, do not hold, cannot be judged, and are mere figures."""
+    claims = list(claims)
+    verdicts = [one.holds for one in claims]
+    unjudged = sum(bool(one.unjudged) for one in claims)
+    return verdicts.count(True), verdicts.count(False), unjudged, verdicts.count(None) - unjudged
 
 
 @dataclass(frozen=True)

@@ -11,12 +11,13 @@ from pathlib import Path
 from typing import Any
 
 from stereovox.errors import StereovoxError
-from stereovox.lab.papers.chapter import Chapter, Progress, Sheet, Shown
+from stereovox.lab.papers.chapter import Chapter, Claim, Progress, Sheet, Shown, count
 from stereovox.report.folder import out_folder
 from stereovox.report.page import figure, page, section, table, tiles
 from stereovox.safe_io import replacing
 
 HEADS = ("claim", "thesis", "ours", "holds?")
+COUNTED = ("hold", "do not", "cannot be judged", "figures without a claim")
 
 
 def report(
@@ -28,25 +29,29 @@ def report(
 ) -> str:
     """Return the page. facts: value and label of the boxes at the top; heads: of the four columns of claims."""
     parts = (_chapter(n, one, heads) for n, one in enumerate(chapters, 1))
-    return page(title, lead, tiles(facts), _contents(chapters), *parts)
+    return page(title, lead, tiles(facts), _contents(chapters, heads), *parts)
 
 
-def _contents(chapters: Sequence[Chapter]) -> str:
-    rows = []
-    for n, one in enumerate(chapters, 1):
-        verdicts = [claim.holds for claim in one.claims]
-        rows.append((f"{n}. {one.title}", *(verdicts.count(verdict) for verdict in (True, False, None))))
-    heads = ("experiment", "claims that hold", "claims that do not", "figures without a claim")
-    broken = [f"{n}. {claim.text}" for n, one in enumerate(chapters, 1) for claim in one.claims if claim.holds is False]
-    text = f"Does not hold: {'; '.join(broken)}." if broken else "Every claim holds."
-    return section("What holds", text, table(heads, rows))
+def _contents(chapters: Sequence[Chapter], names: Sequence[str]) -> str:
+    rows = [(f"{n}. {one.title}", *count(one.claims)) for n, one in enumerate(chapters, 1)]
+    heads = ("experiment", *(f"claims that {what}" for what in COUNTED[:3]), COUNTED[3])
+    broken = [(f"{n}.", *_row(claim)[:3]) for n, one in enumerate(chapters, 1) for claim in one.claims
+              if claim.holds is False]  # fmt: skip
+    if not broken:
+        return section("What holds", "Every claim that can be judged holds.", table(heads, rows))
+    failed = f"<h3>What does not hold</h3>\n{table(('', *names[:3]), broken)}"
+    return section("What holds", f"{len(broken)} claims do not hold.", table(heads, rows), failed)
 
 
 def _chapter(number: int, one: Chapter, heads: Sequence[str]) -> str:
-    rows = [(claim.text, claim.thesis, claim.ours, claim.verdict) for claim in one.claims]
+    rows = [_row(claim) for claim in one.claims]
     claims = [table(heads, rows)] if rows else []
     parts = [*claims, *map(_shown, one.shown), *map(_sheet, one.sheets), *map(_paragraph, one.remarks)]
     return section(f"{number}. {one.title}", one.method, *parts)
+
+
+def _row(claim: Claim) -> tuple[str, str, str, str]:
+    return claim.text, claim.thesis, claim.ours, claim.verdict
 
 
 def _shown(shown: Shown) -> str:
@@ -115,6 +120,7 @@ def write_result(
         "quick": quick,
         "holds": sum(claim.holds is True for claim in claims),
         "does_not_hold": [claim.text for claim in claims if claim.holds is False],
+        "cannot_be_judged": [f"{claim.text}: {claim.unjudged}" for claim in claims if claim.unjudged],
         "seconds": round(seconds, 1),
         "files": {name: str(path) for name, path in files.items()},
     }
@@ -126,13 +132,10 @@ def write_result(
 
 
 def _facts(found: Sequence[Chapter], seconds: float) -> list[tuple[str, str]]:
-    verdicts = [claim.holds for chapter in found for claim in chapter.claims]
-    return [
-        (f"{verdicts.count(True)}", "claims hold"),
-        (f"{verdicts.count(False)}", "claims do not"),
-        (f"{verdicts.count(None)}", "figures without a claim"),
-        (f"{seconds / 60:.1f} min", "for everything"),
-    ]
+    counts = count(claim for chapter in found for claim in chapter.claims)
+    heads = (*(f"claims {what}" for what in ("hold", "do not", "cannot be judged")), COUNTED[3])
+    boxes = [(str(number), what) for number, what in zip(counts, heads, strict=True)]
+    return [*boxes, (f"{seconds / 60:.1f} min", "for everything")]
 
 
 def _write(path: Path, text: str) -> None:

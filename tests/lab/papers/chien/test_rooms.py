@@ -46,7 +46,8 @@ def test_a_perfect_map_is_thin_straight_and_square(stage, perfect):
     found = measure_rooms("perfect", voxel_map, stage, seen)
     figures = found.figures()
     assert figures["walls"] == 24
-    assert figures["missing"] == []
+    assert figures["missing"] == {}
+    assert figures["solid_share"] == figures["found"]
     assert figures["thickness_p95"] <= 2
     assert figures["straightness_max_m"] < SIZE / 2
     assert figures["corners"] == 24
@@ -72,6 +73,17 @@ def test_the_far_side_of_an_inner_wall_is_another_rooms(stage, face_cells, perfe
         found = measure_face(both, face, perfect[1])
         assert np.percentile(found.thickness, 95) <= 2
         assert abs(found.offset) < SIZE
+
+
+def test_a_wall_that_was_seen_and_is_not_there_makes_the_walls_less_than_solid(stage, face_cells, perfect):
+    lost = "kitchen east"
+    cells = np.concatenate([cells for name, cells in face_cells.items() if name != lost])
+    found = measure_rooms("without", map_of(np.unique(cells, axis=0)), stage, perfect[1])
+    whole = measure_rooms("perfect", perfect[0], stage, perfect[1])
+    assert found.missing == {lost: whole.walls[lost].columns}
+    figures = found.figures()
+    assert figures["found"] > 0.95
+    assert figures["solid_share"] < 0.97 * whole.figures()["solid_share"]
 
 
 def test_a_map_without_walls_is_refused_in_one_line(stage, perfect):

@@ -55,6 +55,8 @@ MEASURES = (
     "corner is the angle between the planes of two walls of a room. An inner wall is 12 cm thick: cells behind its "
     "middle belong to the other room's side."
 )
+SOLID = 0.95
+"""Least share of the columns through walls that hold an occupied cell, where walls are called solid."""
 OUTER_M = 7.8
 """Length of the shortest outer wall."""
 LIMITS = (
@@ -66,9 +68,10 @@ LIMITS = (
     "does."
 )
 EXPECTED = (
-    "Two claims are expected not to hold: with the drifting tracker and cells of 5 cm walls are neither at most two "
-    "cells thick nor straight to half a cell. The tracker is off by up to two cells, so what it saw before and after "
-    "stands twice; with exact poses both hold. The thesis's cells of 0.2 m are coarser than the drift and hide it."
+    "Expected not to hold: solid walls at 0.2 m, as the 8x8 block minimum moves what is seen at a low angle nearer; "
+    "and with the drifting tracker and cells of 5 cm walls are neither at most two cells thick nor straight to half a "
+    "cell. The tracker is off by up to two cells, so what it saw before and after stands twice; with exact poses both "
+    "hold. The thesis's cells of 0.2 m are coarser than the drift and hide it."
 )
 
 
@@ -292,7 +295,7 @@ def chapter(found: Apartment) -> Chapter:
 def _claims(name: str, figures: dict[str, Any]) -> list[Claim]:
     thick = (
         f"median {figures['thickness_median']:g}, 95 % at most {figures['thickness_p95']:g}; "
-        f"{percent(figures['thin_share'])} of the columns at most 2; {percent(1 - figures['found'])} have none"
+        f"{percent(figures['thin_share'])} of the columns at most 2"
     )
     straight = (
         f"{1000 * figures['straightness_median_m']:.0f} mm (median of {figures['walls']} walls), "
@@ -300,7 +303,9 @@ def _claims(name: str, figures: dict[str, Any]) -> list[Claim]:
     )
     cell = f"{figures['voxel_size']:g} m"
     return [
-        Claim(f"{name}: walls at most 2 cells of {cell} thick", "solid", thick, figures["thickness_p95"] <= 2),
+        Claim(f"{name}: walls at most 2 cells of {cell} thick", "no figure", thick, figures["thickness_p95"] <= 2),
+        Claim(f"{name}: walls are solid: {100 * SOLID:.0f} % of the columns through them hold a cell", "solid",
+              f"{percent(figures['solid_share'])}, walls that are missing counted", figures["solid_share"] >= SOLID),
         Claim(f"{name}: every wall straight to half a cell", "straight", straight,
               figures["straightness_max_m"] <= figures["voxel_size"] / 2),
         *_corner_claims(name, figures),

@@ -13,7 +13,14 @@ from numpy.typing import NDArray
 from stereovox.errors import StereovoxError
 from stereovox.evaluate.cells import Keys, keys, occupied_cells
 from stereovox.evaluate.truth import touched_cells
-from stereovox.lab.papers.chien.walls import Wall, WallFound, corner_deg, measure_wall, thickness_figures
+from stereovox.lab.papers.chien.walls import (
+    Wall,
+    WallFound,
+    corner_deg,
+    judged_columns,
+    measure_wall,
+    thickness_figures,
+)
 from stereovox.maps import VoxelMap
 from stereovox.simulate.apartment import ROOMS
 from stereovox.simulate.scene import Solid
@@ -86,14 +93,15 @@ def _inner_walls(stage: Stage, size: float) -> NDArray[np.int64]:
 class RoomsFound:
     """The walls of one map, `name` in tables and pictures.
 
-    walls: one for each side of a room that could be measured, missing: the others; corners_deg: the rooms' angles.
+    walls: one for each side of a room that could be measured; missing: the others, each with the number of columns that
+    were seen well and in which at most two hold a cell; corners_deg: the rooms' angles.
     outer: the apartment's own four walls, along several rooms each.
     """
 
     name: str
     voxel_map: VoxelMap
     walls: dict[str, WallFound]
-    missing: list[str]
+    missing: dict[str, int]
     corners_deg: dict[str, float]
     outer: dict[str, WallFound]
 
@@ -103,6 +111,8 @@ class RoomsFound:
         outer = outer_corners(self.outer)
         offsets = np.array([wall.offset for wall in self.walls.values()])
         straight = np.array([wall.straightness for wall in self.walls.values()])
+        seen = sum(wall.columns for wall in self.walls.values()) + sum(self.missing.values())
+        filled = sum(len(wall.thickness) for wall in self.walls.values())
         return {
             "name": self.name,
             "voxel_size": self.voxel_map.voxel_size,
@@ -111,6 +121,7 @@ class RoomsFound:
             "walls": len(self.walls),
             "missing": self.missing,
             **thickness_figures(list(self.walls.values())),
+            "solid_share": filled / seen,
             "straightness_median_m": float(np.median(straight)),
             "straightness_max_m": float(straight.max()),
             "offset_rms_m": float(np.sqrt(np.mean(offsets**2))),
@@ -131,15 +142,16 @@ def measure_rooms(name: str, voxel_map: VoxelMap, stage: Stage, well_seen: Keys)
     stage: the apartment in the map's frame; well_seen: cells that its walls touch and that were seen often enough.
     Raises StereovoxError where not one wall can be measured.
     """
-    others = _other_things(stage, voxel_map.voxel_size)
+    size = voxel_map.voxel_size
+    others = _other_things(stage, size)
     occupied = _occupied(voxel_map)
     walls: dict[str, WallFound] = {}
-    missing = []
+    missing: dict[str, int] = {}
     for face in stage.faces:
         try:
             walls[face.name] = measure_face(occupied, face, well_seen, others)
         except StereovoxError:
-            missing.append(face.name)
+            missing[face.name] = seen_columns(face, size, well_seen, others)
     if not walls:
         raise StereovoxError(f"{name}: not one wall stands in the map of {voxel_map.frames} frames; map more of them")
     outer = measure_outer(occupied, stage, well_seen, others)
@@ -153,6 +165,11 @@ def measure_face(voxel_map: VoxelMap, face: Face, only: Keys | None = None, othe
     """
     behind = OUTER_M if _outer(face.name) else INNER_HALF_M
     return measure_wall(_only_near(voxel_map, face, behind), _inset(face), only=only, others=others, reach=IN_FRONT_M)
+
+
+def seen_columns(face: Face, size: float, only: Keys, others: Keys) -> int:
+    """Return how many columns through one side of a room, in cells of `size` metres, `measure_face` looks at."""
+    return len(judged_columns(_inset(face), size, only=only, others=others, reach=IN_FRONT_M))
 
 
 def _occupied(voxel_map: VoxelMap) -> VoxelMap:

@@ -81,13 +81,9 @@ def measure_wall(
     Raises StereovoxError where fewer than three columns hold an occupied cell.
     """
     size = voxel_map.voxel_size
-    axis = int(np.argmax(np.abs(wall.normal)))
     occupied = _near(occupied_cells(voxel_map), wall, size, reach)
-    face = _over(wall, size) if only is None else indices(only)
-    columns = np.unique(_column(_near(face, wall, size, size), axis))
-    if others is not None:
-        columns = np.setdiff1d(columns, _column(_near(indices(others), wall, size, reach), axis))
-    of_column = position(_column(occupied, axis), columns)
+    columns = judged_columns(wall, size, only=only, others=others, reach=reach)
+    of_column = position(_column(occupied, _through(wall)), columns)
     occupied, of_column = occupied[of_column >= 0], of_column[of_column >= 0]
     thickness = np.bincount(of_column, minlength=len(columns))
     filled = thickness > 0
@@ -98,6 +94,26 @@ def measure_wall(
     normal, residual = fit_plane(middle, wall.normal)
     offset = float((middle.mean(0) - wall.corner) @ wall.normal)
     return WallFound(wall.name, thickness[filled], len(columns), offset, float(np.sqrt(np.mean(residual**2))), normal)
+
+
+def judged_columns(
+    wall: Wall, size: float, *, only: Keys | None = None, others: Keys | None = None, reach: float = REACH
+) -> Keys:
+    """Return the columns (N,) through `wall` that `measure_wall` looks at, ascending; empty where none was seen well.
+
+    size: side of a cell in metres; the others: see `measure_wall`.
+    """
+    axis = _through(wall)
+    face = _over(wall, size) if only is None else indices(only)
+    columns = np.unique(_column(_near(face, wall, size, size), axis))
+    if others is None:
+        return columns
+    return np.setdiff1d(columns, _column(_near(indices(others), wall, size, reach), axis))
+
+
+def _through(wall: Wall) -> int:
+    """Return the world axis nearest to the wall's normal."""
+    return int(np.argmax(np.abs(wall.normal)))
 
 
 def fit_plane(points: NDArray[np.float64], towards: ArrayLike) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

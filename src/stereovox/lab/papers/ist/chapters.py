@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from stereovox.evaluate.grid_scores import GridScores
 from stereovox.lab.papers.chapter import Chapter, Claim, Sheet, Shown
-from stereovox.lab.papers.ist.claims import claims_of, fan_claims, numbers_of, update_ms
+from stereovox.lab.papers.ist.claims import claims_of, eq7, fan_claims, numbers_of, update_ms
 from stereovox.lab.papers.ist.drives import Place
 from stereovox.lab.papers.ist.fans import FEW, FIELD_DEG, MANY, UPDATES, Fan
 from stereovox.lab.papers.ist.publish import Published
@@ -29,11 +29,13 @@ HEIGHTS = {
     "above": "the same, with table tops",
 }
 MAP_DPI = 75
+ERROR_HEADS = ("error, Eq 7 [%]", "of it coverage", "of it contradiction")
 EQ7 = (
     "Error: IST 2019, Eq 7: cells whose state (unknown, free, occupied) differs, over the free and occupied cells of "
-    "the reference. A wall that stands one cell of 2 cm aside counts twice in it, and so does every cell of a wall "
-    "that is drawn thicker; walls within one cell and the metres between walls forgive that. Maps and reference have "
-    "one frame, that of the localisation; nothing was aligned afterwards."
+    "the reference. It is the sum of two things: coverage, cells that only one of the maps knows, and contradiction, "
+    "cells that both know and call by opposite states. A wall that stands one cell of 2 cm aside counts twice in it, "
+    "and so does every cell of a wall that is drawn thicker; walls within one cell and the metres between walls "
+    "forgive that. Maps and reference have one frame, that of the localisation; nothing was aligned afterwards."
 )
 POSES = (
     "Odometry: as the Pioneer's wheels tell it, without localisation. True poses: those of the simulation, moved as a "
@@ -55,7 +57,7 @@ GROWS = "The map has no frame to run out of: tiles are made where a scan says so
 
 def maps_sheet(found: Survey) -> Sheet:
     """Return each map's scores against the reference."""
-    heads = ("map", "error, Eq 7 [%]", "walls IoU", "within 1 cell", "free IoU", "known [%]",
+    heads = ("map", *ERROR_HEADS, "walls IoU", "within 1 cell", "free IoU", "known [%]",
              "walls off, median [cm]", "95 % [cm]", "and back [cm]", "ms an image")  # fmt: skip
     rows = [
         (
@@ -93,7 +95,7 @@ def building_sheet(found: Survey) -> list[Sheet]:
     """Return scores against the simulated building; none for somebody's own recording."""
     if found.of_building is None:
         return []
-    heads = ("map", "building", "error, Eq 7 [%]", "walls IoU", "within 1 cell", "free IoU", "known [%]",
+    heads = ("map", "building", *ERROR_HEADS, "walls IoU", "within 1 cell", "free IoU", "known [%]",
              "walls off, median [cm]", "95 % [cm]")  # fmt: skip
     rows = [("reference, by lidar", HEIGHTS["lidar"], *_row(found.of_building))]
     for name, one in found.judged.items():
@@ -119,6 +121,8 @@ def poses_sheet(found: Survey) -> list[Sheet]:
 def _row(scores: GridScores) -> tuple[str, ...]:
     return (
         f"{scores.eq7_percent:.1f}",
+        f"{scores.errors.eq7_coverage_percent:.1f}",
+        f"{scores.errors.eq7_contradiction_percent:.1f}",
         _share(scores.occupied.iou),
         _share(scores.occupied.iou_tolerant),
         _share(scores.free_iou),
@@ -271,4 +275,4 @@ def _shown(found: Survey, places: tuple[str, str, str], simulated: bool) -> list
 
 
 def _percent(one: Judged) -> str:
-    return f"Eq 7: {one.scores.eq7_percent:.1f}\u00a0%"
+    return f"Eq 7: {eq7(one.scores)}"

@@ -4,12 +4,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from stereovox.errors import FrameRefused
 from stereovox.evaluate.lidar_truth import FREE, lidar_truth
 from stereovox.evaluate.outcomes import Outcomes, outcomes
 from stereovox.evaluate.scores import QuickScores, Scores, score, score_reading
@@ -17,10 +19,13 @@ from stereovox.evaluate.truth_cells import TruthCells
 from stereovox.lab.papers.valenti.figures import THRESHOLDS, figures
 from stereovox.lab.papers.valenti.mappers import MAPPERS, Contestant, Matched, Setting, make_contestant
 from stereovox.lab.papers.valenti.recordings import Drive
+from stereovox.lab.papers.valenti.street import halves
 from stereovox.maps import VoxelMap
 
 TOLERANCE = 1
 """Cells."""
+Halves = Mapping[str, tuple[TruthCells, TruthCells]]
+"""By the kind of truth: that at the first and at the second half of a way."""
 
 
 @dataclass
@@ -62,6 +67,8 @@ def _flat(score: QuickScores) -> dict[str, float | None]:
 class Judged:
     """One map of one drive. scores: by the kind of truth, `view` and `rays`, see `lidar_truth`.
 
+    halves: likewise those of the street's first and second half; None where they were not asked for, or where the way
+    is too short.
     series: measures against the frame, truth `view` (Valenti 2018, Fig 8.4), and shown: cells for a picture; both None
     where they were not asked for.
     """
@@ -71,6 +78,7 @@ class Judged:
     setting: Setting
     frames: int
     scores: Mapping[str, Scores]
+    halves: Mapping[str, tuple[Scores, Scores]] | None = None
     series: Mapping[str, NDArray[Any]] | None = None
     shown: Outcomes | None = None
 
@@ -93,14 +101,17 @@ def judge(
     mappers: Iterable[str],
     *,
     every_frame: bool = False,
+    halved: bool = False,
     step: Callable[[], None] = lambda: None,
 ) -> tuple[list[Judged], dict[str, Any]]:
     """Return the result of each mapper, and the counts of the lidar's points.
 
     numbers: frames of the drive; matched: the same as depth images, by profile. every_frame: also score each map after
-    every frame. step: called after each frame of each pass: one pass for each kind of truth and each profile.
+    every frame. halved: also score both halves of the street. step: called after each frame of each pass: one pass for
+    each kind of truth and each profile.
     """
     truths, counts = _truths(drive, numbers, setting, step)
+    parts = _halves(truths, _way(drive, numbers)) if halved else None
     found = []
     for profile, frames in matched.items():
         contestants = {name: make_contestant(name, setting) for name in mappers if MAPPERS[name] == profile}
@@ -114,7 +125,7 @@ def judge(
             taken += 1
             step()
         for name, contestant in contestants.items():
-            found.append(_judged(drive.name, name, contestant, setting, taken, truths, series.get(name)))
+            found.append(_judged(drive.name, name, contestant, setting, taken, truths, parts, series.get(name)))
     order = list(MAPPERS)
     return sorted(found, key=lambda one: order.index(one.mapper)), counts
 
@@ -134,6 +145,26 @@ def _truths(
     return truths, counts
 
 
+def _way(drive: Drive, numbers: Sequence[int]) -> NDArray[np.float64]:
+    """Return where the camera was (F, 3), frames without a pose left out."""
+    way = []
+    for i in numbers:
+        with suppress(FrameRefused):
+            way.append(drive.viewpoint(i).T_world_camera[:3, 3])
+    return np.array(way).reshape(-1, 3)
+
+
+def _halves(truths: Mapping[str, TruthCells], way: NDArray[np.float64]) -> Halves | None:
+    """Return each truth at the first and at the second half of the way; None where one of them has no surface."""
+    found = {}
+    for kind, truth in truths.items():
+        parts = halves(way, truth.centers())
+        if not all(truth.occupied[part].any() for part in parts):
+            return None
+        found[kind] = (truth.part(parts[0]), truth.part(parts[1]))
+    return found
+
+
 def _judged(
     drive: str,
     name: str,
@@ -141,11 +172,18 @@ def _judged(
     setting: Setting,
     frames: int,
     truths: Mapping[str, TruthCells],
+    parts: Halves | None,
     series: ScoreSeries | None,
 ) -> Judged:
     voxel_map = contestant.map()
     scores = {kind: score(voxel_map, truth, thresholds=THRESHOLDS) for kind, truth in truths.items()}
+    both = None
+    if parts is not None:
+        both = {
+            kind: (score(voxel_map, first, thresholds=THRESHOLDS), score(voxel_map, second, thresholds=THRESHOLDS))
+            for kind, (first, second) in parts.items()
+        }
     arrays, shown = None, None
     if series is not None:
         arrays, shown = series.arrays(), outcomes(truths["view"].read(voxel_map), truths["view"])
-    return Judged(drive, name, setting, frames, scores, arrays, shown)
+    return Judged(drive, name, setting, frames, scores, both, arrays, shown)

@@ -79,7 +79,7 @@ def scores(ours, truth, threshold, tolerance, bins):
 def f_score(ours, truth, threshold, within):
     found = tally(list(truth), ours, truth, threshold, within)
     precision, recall = found["tolerance_precision"], found["tolerance_recall"]
-    if precision is None or recall is None:
+    if not any(truth.values()):
         return None
     return 2 / (1 / precision + 1 / recall) if precision and recall else 0.0
 

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -45,6 +45,8 @@ COLUMNS = {
         "image, of others their insertion alone. For time by the clock: stereovox bench."),
     "map_bytes": Column("MB", -1, 1e-6, 2, "Memory of the map as the library tells it."),
 }  # fmt: skip
+OF_PROBABILITIES = ("ece", "ece_likely", "ece_equal_mass", "brier", "ms", "map_bytes")
+"""Shown in a second table on the page."""
 TRUTHS = {
     "exact geometry": "Simulated: the cells that exact depth images of the same frames see; the "
     "scene's triangles decide what is in them.",
@@ -59,10 +61,10 @@ LEAD = (
 )
 
 
-def rows_of(result: dict[str, Any], data: str) -> list[tuple[str, ...]]:
-    """Return the rows of one data set: a library and its figures, the best of each column marked by `*`."""
-    group = [mean for mean in result["means"] if mean["data"] == data]
-    return [(mean["library"], *(_shown(name, mean, group) for name in COLUMNS)) for mean in group]
+def rows_of(result: dict[str, Any], data: str, names: Iterable[str] = COLUMNS) -> list[tuple[str, ...]]:
+    """Return the rows of one data set: a library and its figures `names`, the best of each column marked by `*`."""
+    names, group = list(names), [mean for mean in result["means"] if mean["data"] == data]
+    return [(mean["library"], *(_shown(name, mean, group) for name in names)) for mean in group]
 
 
 def _shown(name: str, mean: dict[str, Any], group: Sequence[dict[str, Any]]) -> str:
@@ -74,9 +76,9 @@ def _shown(name: str, mean: dict[str, Any], group: Sequence[dict[str, Any]]) -> 
     return text + "*" * (len(group) > 1 and column.better * value >= max(others))
 
 
-def heads() -> tuple[str, ...]:
+def heads(names: Iterable[str] = COLUMNS) -> tuple[str, ...]:
     """Return the heads above `rows_of`."""
-    return ("library", *(column.head for column in COLUMNS.values()))
+    return ("library", *(COLUMNS[name].head for name in names))
 
 
 def title_of(result: dict[str, Any], data: str) -> str:
@@ -116,7 +118,7 @@ def benchmark_page(result: dict[str, Any]) -> str:
     return page.page(
         "How accurate are the maps?",
         LEAD,
-        *(page.section(title_of(result, name), "", page.table(heads(), rows_of(result, name))) for name in names),
+        *(page.section(title_of(result, name), "", *_tables(result, name)) for name in names),
         page.section("What the figures mean", "", page.table(("figure", "what it says"), _meanings())),
         page.section("Where the truth is from", "", page.table(("truth", "how"), [(k, TRUTHS[k]) for k in kinds])),
         page.section("Libraries", "", page.table(("name", "version", "settings"), libraries)),
@@ -126,6 +128,14 @@ def benchmark_page(result: dict[str, Any]) -> str:
         ),
         page.section("Machine", "", page.table(("what", "is"), facts)),
     )
+
+
+def _tables(result: dict[str, Any], data: str) -> Iterator[str]:
+    """Yield two tables, each as wide as a page: of places, and of probabilities and costs."""
+    of_places = [name for name in COLUMNS if name not in OF_PROBABILITIES]
+    for names in (of_places, OF_PROBABILITIES):
+        yield page.table(heads(names), rows_of(result, data, names))
+        yield "<p></p>"
 
 
 RUN_HEADS = ("data", "run", "frames", "held out", "surface cells", "free cells", "contradictory", "truth")

@@ -7,6 +7,7 @@ from importlib.util import find_spec
 from types import SimpleNamespace
 
 import made_seen
+import made_street
 import numpy as np
 import pytest
 from made_frames import a_frame
@@ -15,6 +16,7 @@ import stereovox as sv
 from stereovox.cli import main
 from stereovox.errors import ConfigError, MissingExtra, SourceError, StereovoxError
 from stereovox.evaluate.cells import indices, keys, position
+from stereovox.evaluate.lidar_truth import lidar_truth
 from stereovox.evaluate.truth import exact_occupancy
 from stereovox.evaluate.truth_cells import TruthCells
 from stereovox.lab.bench.peers import find_peer
@@ -126,8 +128,8 @@ class Listed:
 def test_every_tenth_frame_judges_the_map_of_the_others(monkeypatch):
     frames = [a_frame(i, wall=4.0 if i == 15 else 2.0) for i in range(23)]
     monkeypatch.setattr(data_module, "open_source", lambda location: Listed(frames))
-    (task,) = tasks_of("listed")
-    assert (task.kind, task.held_out, len(task.frames)) == (DEPTH, 2, 21)
+    (task,) = tasks_of("some/folder")
+    assert (task.name, task.kind, task.held_out, len(task.frames)) == ("some/folder", DEPTH, 2, 21)
     assert [frame.stamp_ns for frame in task.frames] == [i for i in range(23) if i not in (5, 15)]
     # frame 5 ends at a wall at 2.05 m, where frame 15 sees through to one at 4.15 m; both end at the box at 1.6 m
     assert task.dropped > 500
@@ -144,6 +146,20 @@ def test_every_tenth_frame_judges_the_map_of_the_others(monkeypatch):
         list(tasks_of("listed", frames=":5"))
     with pytest.raises(SourceError, match="picks none"):
         list(tasks_of("listed", frames="90:"))
+
+
+def test_a_lidar_is_the_truth_where_there_is_one(tmp_path, monkeypatch):
+    made_street.sharpen(monkeypatch)
+    drive = str(made_street.raw(tmp_path, 3))
+    (task,) = tasks_of(drive, 0.5, 20.0)
+    wanted, _ = lidar_truth(sv.open_source(drive), 0.5, 20.0, "rays")  # pyright: ignore[reportArgumentType]
+    assert (task.kind, task.held_out, len(task.frames)) == (LIDAR, 0, 3)
+    cells, log_odds = wanted.cells()
+    assert np.array_equal(indices(task.truth.cells), cells)
+    assert np.array_equal(task.truth.occupied, log_odds > 0)
+    assert all(frame.depth.shape == (96, 256) for frame in task.frames)
+    ((ours,), _) = find_libraries(["stereovox"])
+    assert judged(ours, task)["auc"] > 0.8
 
 
 def test_frames_are_thinned_evenly(monkeypatch):

@@ -104,9 +104,9 @@ def tasks_of(
     matched = [*_matched(source, picked, config, tell)]
     if kind == LIDAR:
         truth, _ = lidar_truth(source, size, reach, "rays", picked)
-        yield _task(source.name, "", kind, config, [frame for _, frame in matched], truth)
+        yield _task(location, "", kind, config, [frame for _, frame in matched], truth)
     else:
-        yield _held_out(source.name, [frame for _, frame in matched], config)
+        yield _held_out(location, [frame for _, frame in matched], config)
 
 
 def _kind_of(source: Any) -> str:

@@ -49,7 +49,7 @@ def run_benchmark(
     about = [{"name": one.name, "version": one.version, "settings": one.settings} for one in found]
     result: dict[str, Any] = {"protocol": PROTOCOL, "command": command, "machine": machine()}
     result |= {"libraries": about, "not_installed": missing, "data": [], "rows": [], "means": []}
-    for location in data or BUILT_IN:
+    for location in dict.fromkeys(data or BUILT_IN):
         for task in tasks_of(location, voxel_size, max_range, frames, seeds, most_frames, tell):
             result["data"].append(task.about())
             for library in found:

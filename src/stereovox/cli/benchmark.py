@@ -34,7 +34,7 @@ def add_arguments(parser: ArgumentParser) -> None:
         "--most-frames", type=int, default=100, metavar="N", help="frames that are used, evenly chosen (%(default)s)"
     )
     parser.add_argument(
-        "--seed", type=int, action="append", metavar="N", help="of simulated noise; repeatable (101, 102 and 103)"
+        "--seed", type=int, action="append", metavar="N", help="of simulated noise; repeatable (7001, 7002 and 7003)"
     )
 
 

@@ -81,7 +81,7 @@ def scores(ours, truth, threshold, tolerance, bins, cells=None):
 def f_score(cells, ours, truth, threshold, within):
     found = tally(cells, ours, truth, threshold, within)
     precision, recall = found["tolerance_precision"], found["tolerance_recall"]
-    if precision is None or recall is None:
+    if not any(truth.values()):
         return None
     return 2 / (1 / precision + 1 / recall) if precision and recall else 0.0
 

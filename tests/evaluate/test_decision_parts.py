@@ -15,6 +15,7 @@ from made_scores import neighbours
 import stereovox as sv
 from stereovox.evaluate.cells import indices, keys
 from stereovox.evaluate.decision_parts import decision_parts
+from stereovox.evaluate.decisions import decide
 from stereovox.evaluate.looks import looks, views
 from stereovox.evaluate.scores import score
 from stereovox.evaluate.thickness import Thickness, thickness
@@ -46,6 +47,23 @@ def test_the_spread_is_the_covariance_of_what_lies_near(cells, reach, within):
     for cell, covariance in zip(sorted(cells), found, strict=True):
         near = np.array([other for other in neighbours(cell, within) if other in cells], float)
         assert covariance == pytest.approx(np.cov(near.T, bias=True) if len(near) > 1 else np.zeros((3, 3)), abs=1e-9)
+
+
+@settings(max_examples=40, deadline=None)
+@given(OURS, TRUTH, st.integers(0, 2), st.data())
+def test_a_part_of_the_truth_is_judged_as_those_cells_of_the_whole(ours, truth, tolerance, data):
+    chosen = data.draw(st.sets(st.sampled_from(sorted(truth)), min_size=1))
+    cells = made_truth(truth, tolerance)
+    mask = np.array([tuple(cell) in chosen for cell in indices(cells.cells).tolist()])
+    part, voxel_map = cells.part(mask), made({cell: LEVELS[name] for cell, name in ours.items()})
+    reading, whole = part.read(voxel_map), cells.read(voxel_map)
+    assert asdict(decide(reading, part)) == pytest.approx(made_decisions.decisions(ours, truth, tolerance, chosen))
+    assert decide(reading, part) == decide(whole, cells, mask)
+    assert np.array_equal(reading.best_within(2), whole.best_within(2)[mask[cells.occupied]])
+    assert np.array_equal(part.near_within(1), cells.near_within(1)[mask])
+    by = {(one.by, one.name): one.decisions.surface for one in decision_parts(reading, part)}
+    lines = [cell for cell in chosen if truth[cell] and naive_thickness(cell, {c for c in truth if truth[c]}) == "line"]
+    assert by.get(("thickness", "line"), 0) == len(lines)
 
 
 SHAPES = {

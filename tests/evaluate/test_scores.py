@@ -72,7 +72,7 @@ def test_a_perfect_and_a_silent_map():
     nothing = score(sv.VoxelMap(CONFIG), made_truth(truth))
     assert (nothing.tp, nothing.fp, nothing.recall, nothing.coverage) == (0, 0, 0, 0)
     assert (nothing.precision, nothing.error, nothing.ece, nothing.correlation) == (None, None, None, None)
-    assert (nothing.f_score_1, nothing.ece_likely, nothing.ece_equal_mass) == (None, None, None)
+    assert (nothing.f_score_1, nothing.ece_likely, nothing.ece_equal_mass) == (0, None, None)
     assert nothing.average_precision == pytest.approx(12 / 36)
     assert (nothing.auc, nothing.observed_auc, nothing.observed.accuracy) == (pytest.approx(0.5), None, None)
 

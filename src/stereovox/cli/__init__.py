@@ -44,6 +44,7 @@ COMMANDS = (
     "simulate",
     "ros2",
     "bench",
+    "benchmark",
     "calibrate",
     "truth",
     "eval",

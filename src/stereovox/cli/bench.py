@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Time stereovox and other mapping libraries on the same frames, in one process.
+"""Time stereovox and other mapping libraries on the same frames, in one process (how accurate: `benchmark`).
 
 Without SOURCE the frames come from the built-in room. The figures are meaningful only on an otherwise idle machine.
 """

@@ -50,7 +50,11 @@ def decision_parts(
     path: camera positions (P, 3) in metres, world frame: by distance to the nearest of them, in rings between `edges`
     (M + 1,) in metres or of a round width; None: not by range. looks: (S,) of each surface cell; None: not by looks.
     """
-    split = [*_by_surface("thickness", thickness(truth.neighbourhood), [kind.name.lower() for kind in Thickness])]
+    split = [
+        *_by_surface(
+            "thickness", thickness(truth.neighbourhood)[truth.counted], [kind.name.lower() for kind in Thickness]
+        )
+    ]
     if looks is not None:
         split += _by_surface("looks", np.searchsorted(LOOKS, looks, "right") - 1, LOOKS_NAMES)
     parts = [(by, name, _as_cells(truth, chosen)) for by, name, chosen in split]

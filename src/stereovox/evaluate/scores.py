@@ -163,14 +163,14 @@ def score(
 def f_score(reading: Reading, truth: TruthCells, threshold: float, within: int) -> float | None:
     """Return the harmonic mean of precision and recall within `within` cells, 1 or 2, at p > `threshold`.
 
-    None where the map calls no cell occupied, and where the truth has no surface.
+    0 where the map calls no cell occupied, None where the truth has no surface.
     """
     marked, found = reading.marked(threshold), reading.best_within(within) > level(threshold)
     precision = ratio(int((marked & truth.near_within(within)).sum()), int(marked.sum()))
     recall = ratio(int(found.sum()), len(found))
-    if precision is None or recall is None:
+    if recall is None:
         return None
-    return 2 * precision * recall / max(precision + recall, 1e-12)
+    return 2 * precision * recall / (precision + recall) if precision and recall else 0.0
 
 
 def score_reading(reading: Reading, truth: TruthCells, threshold: float = 0.7, bins: int = BINS) -> QuickScores:

@@ -122,8 +122,8 @@ class Reading:
     """Values of a map in the cells of the truth and around its surfaces.
 
     log_odds: (N,) float32 of each cell of the truth, 0 where unobserved; states: (N,) uint8, the `State` that the map
-    itself gives each. around, around_states: the same (D,) of all cells near a surface. neighbourhood: which those are.
-    tolerance: of the truth.
+    itself gives each. around, around_states: the same (D,) of all cells near a surface. neighbourhood: which those are;
+    surface: which of its cells are the S truly occupied ones that count. tolerance: of the truth.
     """
 
     log_odds: NDArray[np.float32]
@@ -131,6 +131,7 @@ class Reading:
     around: NDArray[np.float32]
     around_states: NDArray[np.uint8]
     neighbourhood: Neighbourhood
+    surface: NDArray[np.int64]
     tolerance: int
 
     @property
@@ -151,17 +152,17 @@ class Reading:
     def best_within(self, tolerance: int) -> NDArray[np.float32]:
         """Return the same within `tolerance` cells, at most the reach of the truth."""
         known = np.where(self.around == 0, np.float32(-np.inf), self.around)
-        return self.neighbourhood.highest(known, tolerance)
+        return self.neighbourhood.highest(known, tolerance)[self.surface]
 
     @cached_property
     def beside(self) -> NDArray[np.uint8]:
         """For each truly occupied cell (S,) the highest `State` within one cell."""
-        return self.neighbourhood.highest(self.around_states, 1)
+        return self.neighbourhood.highest(self.around_states, 1)[self.surface]
 
     @cached_property
     def reached(self) -> NDArray[np.uint8]:
         """For each truly occupied cell (S,) the highest `State` within the tolerance."""
-        return self.neighbourhood.highest(self.around_states, self.tolerance)
+        return self.neighbourhood.highest(self.around_states, self.tolerance)[self.surface]
 
     def marked(self, threshold: float) -> NDArray[np.bool_]:
         """Cells (N,) the map calls occupied, p > threshold (Valenti 2018, Eq 8.1); never an unobserved one."""
@@ -177,9 +178,10 @@ class TruthCells:
 
     truth_map: its occupied cells hold a surface, its free cells were in view and hold none; all others, tentative ones
     too, do not count. map: the same in cubes. cells: ascending keys (N,) of those that count; occupied: (N,) which of
-    them hold a surface; near: (N,) which have a surface within the tolerance; neighbourhood: the cells around the S
-    occupied ones. Distances count along each axis: diagonal neighbours are one cell away. Raises StereovoxError for a
-    truth without such cells and an invalid tolerance.
+    them hold a surface; near: (N,) which have a surface within the tolerance; neighbourhood: the cells around the
+    occupied ones; counted: (S,) which of its cells are those of `occupied`, all but in a `part`. Distances count along
+    each axis: diagonal neighbours are one cell away. Raises StereovoxError for a truth without such cells and an
+    invalid tolerance.
     """
 
     def __init__(self, truth_map: VoxelMap, tolerance: int = 1):
@@ -200,6 +202,19 @@ class TruthCells:
         self._reader = CellReader(np.union1d(self.cells, around))
         self._own = np.searchsorted(self._reader.cells, self.cells)
         self._around = np.searchsorted(self._reader.cells, around)
+        self.counted = np.arange(len(self.neighbourhood.cells))
+
+    def part(self, chosen: NDArray[np.bool_]) -> TruthCells:
+        """Return the truth of the `chosen` cells (N,) alone; what lies near them counts as near, chosen or not.
+
+        Raises StereovoxError where none is chosen.
+        """
+        if not chosen.any():
+            raise StereovoxError("no cell of the truth lies in this part of it; choose a larger one")
+        part = copy(self)
+        part.cells, part.occupied, part.near = self.cells[chosen], self.occupied[chosen], self.near[chosen]
+        part._own, part.counted = self._own[chosen], self.counted[chosen[self.occupied]]
+        return part
 
     def part(self, chosen: NDArray[np.bool_]) -> TruthCells:
         """Return the truth of the `chosen` cells (N,) alone; what lies near them counts as near, chosen or not.
@@ -230,7 +245,8 @@ class TruthCells:
         log_odds = voxel_map.storage.cell_format.log_odds(stored)
         states = voxel_map.storage.rules.states(stored)
         own, around = self._own, self._around
-        return Reading(log_odds[own], states[own], log_odds[around], states[around], self.neighbourhood, self.tolerance)
+        near = log_odds[around], states[around]
+        return Reading(log_odds[own], states[own], *near, self.neighbourhood, self.counted, self.tolerance)
 
     def surface(self) -> NDArray[np.int32]:
         """Return the indices (S, 3) of the truly occupied cells."""

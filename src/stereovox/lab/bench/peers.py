@@ -8,9 +8,12 @@ the same trees.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import os
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from importlib import import_module
+from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -20,6 +23,7 @@ from stereovox import registry
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.cameras.rigs import VirtualCamera
 from stereovox.errors import ConfigError, MissingExtra, StereovoxError, did_you_mean
+from stereovox.formats.octomap import read_octomap
 from stereovox.lab.bench.machine import on_one_processor
 
 PEERS = {
@@ -41,6 +45,7 @@ WAVEMAP_FROM = "git+https://github.com/ethz-asl/wavemap#subdirectory=library/pyt
 """Where its own pages say pip finds it; it is not on PyPI."""
 UNKNOWN = 1e-6
 """Log-odds nearer to zero than this are no evidence in wavemap's maps, whose cells are sums of wavelets."""
+OCTOMAP_SETTINGS = "OctoMap's defaults: p 0.7 for a hit, 0.4 for a miss, from 0.12 to 0.97, occupied above 0.5"
 TREE_DEPTH = 16
 """Levels of an octree of OctoMap; a leaf at this depth is one cell."""
 
@@ -130,6 +135,23 @@ class ImagePeer(Protocol):
         ...
 
 
+@runtime_checkable
+class CellsPeer(Protocol):
+    """Peer whose cells can be read, as `stereovox benchmark` needs it.
+
+    occupied_above: probability above which a cell is occupied, below which it is free. about: the library's settings.
+    package: the distribution whose version is told.
+    """
+
+    occupied_above: float
+    about: str
+    package: str
+
+    def cells(self) -> tuple[NDArray[np.integer], NDArray[np.floating]]:
+        """Return the indices (N, 3) of all known cells, of the smallest size, and their log-odds (N,)."""
+        ...
+
+
 PeerClass = type[Peer] | type[ImagePeer]
 
 
@@ -199,6 +221,9 @@ class OctomapPython:
 
     discretize = True
     """True: points that share a cell become one ray. False: one ray a point."""
+    occupied_above = 0.5
+    about = f"{OCTOMAP_SETTINGS}; points that share a cell made one ray"
+    package = "octomap-python"
 
     def __init__(self, voxel_size: float):
         self._tree = _library("octomap", "octomap-python").OcTree(voxel_size)
@@ -216,6 +241,10 @@ class OctomapPython:
         """Return occupied and free cells."""
         return _count((leaf.getDepth(), self._tree.isNodeOccupied(leaf)) for leaf in self._tree.begin_leafs())
 
+    def cells(self) -> tuple[NDArray[np.integer], NDArray[np.floating]]:
+        """Return indices and log-odds of all known cells."""
+        return _cells_of(lambda file: self._tree.write(os.fsencode(file)))
+
     def bytes(self) -> int:
         """Return what `memoryUsage` tells: the nodes and their child arrays."""
         return self._tree.memoryUsage()
@@ -225,10 +254,15 @@ class OctomapPythonRays(OctomapPython):
     """octomap-python with one ray a point: exact, and slow."""
 
     discretize = False
+    about = f"{OCTOMAP_SETTINGS}; one ray a point"
 
 
 class PyOctomap:
     """pyoctomap with the settings of `OctomapPython`, points that share a cell made one ray."""
+
+    occupied_above = 0.5
+    about = f"{OCTOMAP_SETTINGS}; points that share a cell made one ray"
+    package = "pyoctomap"
 
     def __init__(self, voxel_size: float):
         self._tree = _library("pyoctomap", "pyoctomap").OcTree(voxel_size)
@@ -247,6 +281,10 @@ class PyOctomap:
         leafs = self._tree.begin_leafs()
         return _count((leaf.getDepth(), self._tree.isNodeOccupied(leaf.current_node)) for leaf in leafs)
 
+    def cells(self) -> tuple[NDArray[np.integer], NDArray[np.floating]]:
+        """Return indices and log-odds of all known cells."""
+        return _cells_of(lambda file: self._tree.write(os.fspath(file)))
+
     def bytes(self) -> int:
         """Return what `memoryUsage` tells: the nodes and their child arrays."""
         return self._tree.memoryUsage()
@@ -258,6 +296,9 @@ class Wavemap:
     It takes depth images of a pinhole camera. A cell is occupied above p = 0.5 and free below it.
     """
 
+    occupied_above = 0.5
+    about = "its Python example: range sigma 0.01 m, scaling 0.2 free and 0.4 occupied, occupied above 0.5"
+    package = "pywavemap"
     NEAREST_M = 0.1
     """Where depths begin; nearer ones, and so zeros, have no value for wavemap."""
 
@@ -293,16 +334,25 @@ class Wavemap:
 
     def counts(self) -> tuple[int, int]:
         """Return occupied and free cells of the smallest size."""
+        occupied = free = 0
+        for _, values in self._layers():
+            occupied, free = occupied + int((values > UNKNOWN).sum()), free + int((values < -UNKNOWN).sum())
+        return occupied, free
+
+    def cells(self) -> tuple[NDArray[np.integer], NDArray[np.floating]]:
+        """Return indices and log-odds of all known cells of the smallest size."""
+        known = [(cells[np.abs(v) > UNKNOWN], v[np.abs(v) > UNKNOWN]) for cells, v in self._layers()]
+        return np.concatenate([cells for cells, _ in known]), np.concatenate([values for _, values in known])
+
+    def _layers(self) -> Iterator[tuple[NDArray[np.int32], NDArray[np.float32]]]:
+        """Yield all cells (N, 3) that can have been seen and their values (N,), a layer at a time."""
         far = self._reach * self._widest
         low = np.floor((np.min(self._seen, axis=0) - far) / self._voxel_size).astype(int)
         high = np.ceil((np.max(self._seen, axis=0) + far) / self._voxel_size).astype(int)
         layer = np.mgrid[0:1, low[1] : high[1], low[2] : high[2]].reshape(3, -1).T.astype(np.int32)
-        occupied = free = 0
         for x in range(low[0], high[0]):
             layer[:, 0] = x
-            values = self._map.get_cell_values(layer)
-            occupied, free = occupied + int((values > UNKNOWN).sum()), free + int((values < -UNKNOWN).sum())
-        return occupied, free
+            yield layer, np.asarray(self._map.get_cell_values(layer))
 
     def bytes(self) -> int:
         """Return what `memory_usage` tells."""
@@ -339,6 +389,13 @@ def _library(module: str, package: str) -> Any:
         return import_module(module)
     except ImportError:
         raise MissingExtra(package, "bench") from None
+
+
+def _cells_of(write: Callable[[Path], object]) -> tuple[NDArray[np.integer], NDArray[np.floating]]:
+    """Return indices and log-odds of the cells in the `.ot` file that `write` makes."""
+    with tempfile.TemporaryDirectory() as folder:
+        write(Path(folder) / "tree.ot")
+        return read_octomap(Path(folder) / "tree.ot").cells()
 
 
 def _count(leafs: Iterator[tuple[int, bool]]) -> tuple[int, int]:

@@ -271,10 +271,10 @@ def _freely(make: Callable[..., T], *arguments: Any) -> T:
 def _time_peer(
     name: str, kind: PeerClass, frames: list[Frame], config: Config, limits: _Limits, tell: Progress
 ) -> dict[str, Any]:
-    _insertion(_new(kind, config, limits), frames[0], config, limits)()
+    insertion(_new(kind, config, limits), frames[0], config, limits.range_m)()
     peer, watch = _new(kind, config, limits), _Watch()
     for done, frame in enumerate(frames, start=1):
-        watch.call(_insertion(peer, frame, config, limits))
+        watch.call(insertion(peer, frame, config, limits.range_m))
         tell(done, len(frames), f"{name} at {config.voxel_size:g} m")
         if limits.reached(watch.times_ms):
             break
@@ -292,9 +292,12 @@ def _new(kind: PeerClass, config: Config, limits: _Limits) -> Peer | ImagePeer:
     return peer
 
 
-def _insertion(peer: Any, frame: Frame, config: Config, limits: _Limits) -> Callable[[], None]:
-    """Return the call that is timed; all that it needs is made here."""
-    image, beyond_m = prepare(frame, config), BEYOND * limits.range_m
+def insertion(peer: Any, frame: Frame, config: Config, range_m: float) -> Callable[[], None]:
+    """Return the call that inserts a frame into a peer, and is timed; all that it needs is made here.
+
+    range_m: where the peer was told that rays end (`reach`), for pixels beyond it; 0: these have no value.
+    """
+    image, beyond_m = prepare(frame, config), BEYOND * range_m
     if isinstance(peer, ImagePeer):
         seen = depth_for_peers(image, beyond_m), image.camera, image.T_world_sensor
         prepared = getattr(peer, "prepared_image", None)

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The table of decisions again, slow and obvious: dicts of cells, their neighbours, and plain Python."""
 
-import numpy as np
 from made_scores import neighbours
 
 NAMES = ("unknown", "free", "tentative", "occupied")
@@ -45,10 +44,3 @@ def decisions(states, truth, tolerance, chosen=None):
         "occupied_air": share(sum(not truth[cell] for cell in occupied), len(occupied)),
         "free_wrong": share(sum(truth[cell] for cell in free), len(free)),
     }
-
-
-def thickness(cell, surface):
-    near = np.array([other for other in neighbours(cell, 2) if other in surface], float)
-    extents = np.sqrt(12 * np.linalg.eigvalsh(np.cov(near.T, bias=True)) + 1) if len(near) > 1 else np.ones(3)
-    wide = sum(extent >= 2.5 for extent in sorted(extents)[:2])
-    return ("line", "sheet", "bulk")[wide]

@@ -55,42 +55,40 @@ def tally(cells, ours, truth, threshold, tolerance):
     }
 
 
-def scores(ours, truth, threshold, tolerance, bins, cells=None):
-    """cells: those of the truth that count; None: all."""
-    cells = list(truth) if cells is None else cells
-    seen = [cell for cell in cells if cell in ours]
+def scores(ours, truth, threshold, tolerance, bins):
+    seen = [cell for cell in truth if cell in ours]
     pairs = [(probability(ours[cell]), truth[cell]) for cell in seen]
     error = mean([(probability(ours[cell]) - truth[cell]) ** 2 for cell in seen])
     return {
-        **tally(cells, ours, truth, threshold, tolerance),
+        **tally(list(truth), ours, truth, threshold, tolerance),
         "threshold": threshold,
         "tolerance_cells": tolerance,
-        "coverage": len(seen) / len(cells),
+        "coverage": len(seen) / len(truth),
         "error": error,
         "brier": error,
         "ece": ece(pairs, bins),
         "ece_likely": ece([(p, y) for p, y in pairs if p >= 0.3], bins),
         "ece_equal_mass": ece_equal_mass(pairs, bins),
-        "f_score_1": f_score(cells, ours, truth, threshold, 1),
-        "f_score_2": f_score(cells, ours, truth, threshold, 2),
-        "balanced": balanced(cells, ours, truth, tolerance),
+        "f_score_1": f_score(ours, truth, threshold, 1),
+        "f_score_2": f_score(ours, truth, threshold, 2),
+        "balanced": balanced(ours, truth, tolerance),
         "observed": tally(seen, ours, truth, threshold, tolerance),
     }
 
 
-def f_score(cells, ours, truth, threshold, within):
-    found = tally(cells, ours, truth, threshold, within)
+def f_score(ours, truth, threshold, within):
+    found = tally(list(truth), ours, truth, threshold, within)
     precision, recall = found["tolerance_precision"], found["tolerance_recall"]
     if not any(truth.values()):
         return None
     return 2 / (1 / precision + 1 / recall) if precision and recall else 0.0
 
 
-def balanced(cells, ours, truth, tolerance):
+def balanced(ours, truth, tolerance):
     names = ("precision", "recall", "tolerance_precision", "tolerance_recall")
     points = []
     for percent in range(1, 100):
-        found = tally(cells, ours, truth, percent / 100, tolerance)
+        found = tally(list(truth), ours, truth, percent / 100, tolerance)
         points.append({"threshold": percent / 100, **{name: found[name] for name in names}})
 
     def lesser(point):

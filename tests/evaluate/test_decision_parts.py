@@ -40,6 +40,13 @@ def made_truth(truth, tolerance=1):
     return TruthCells(made({cell: 3.0 if surface else -2.0 for cell, surface in truth.items()}), tolerance)
 
 
+def naive_thickness(cell, surface):
+    near = np.array([other for other in neighbours(cell, 2) if other in surface], float)
+    extents = np.sqrt(12 * np.linalg.eigvalsh(np.cov(near.T, bias=True)) + 1) if len(near) > 1 else np.ones(3)
+    wide = sum(extent >= 2.5 for extent in sorted(extents)[:2])
+    return ("line", "sheet", "bulk")[wide]
+
+
 @settings(max_examples=40, deadline=None)
 @given(st.sets(CELL, min_size=1, max_size=40), st.integers(2, 4), st.integers(0, 2))
 def test_the_spread_is_the_covariance_of_what_lies_near(cells, reach, within):
@@ -108,7 +115,7 @@ def test_each_part_agrees_with_the_slow_reference(ours, truth, tolerance):
     for cell, number in zip(surface, looked, strict=True):
         name = ["0", "1 to 2", "3 to 9", "10 to 29", "30 or more"][sum(number >= least for least in (1, 3, 10, 30))]
         groups.setdefault(("looks", name), set()).add(cell)
-        groups.setdefault(("thickness", made_decisions.thickness(cell, set(surface))), set()).add(cell)
+        groups.setdefault(("thickness", naive_thickness(cell, set(surface))), set()).add(cell)
     parts = decision_parts(
         cells.read(made({cell: LEVELS[name] for cell, name in ours.items()})), cells, path, edges, looked
     )

@@ -35,7 +35,7 @@ def test_a_thin_pole_stays(name):
 @pytest.mark.parametrize(
     ("name", "broken"),
     [
-        ("half a pixel, exact", {"sensor.passes": 1.0, "sensor.p_free": 0.2}),
+        ("half a pixel, exact", {"sensor.passes": 1.0}),
         ("rays", {"ray.update": "every"}),
         ("nearer than the camera sees", {"blind_range": 0.0}),
     ],

@@ -97,7 +97,7 @@ def test_point_models_mark_nothing_beside_the_hit(name):
 
 
 def test_stereo_clears_half_as_much_where_the_gaussian_is_half():
-    p = model_of("stereo", fade=1.5, p_free=0.35).probability(2.0 - 0.05 * (HALF + 1.5), 2.0, 0.05)
+    p = model_of("stereo", fade=1.5).probability(2.0 - 0.05 * (HALF + 1.5), 2.0, 0.05)
     assert p == pytest.approx(0.35 + 0.15 * 0.5)
     assert model_of("constant").probability(2.0, 2.0, 0.05) == 0.7
 
@@ -214,7 +214,7 @@ def test_prior_is_not_counted_twice():
 def test_stereo_noise_from_geometry():
     """Chien 2020, Eq 3.5 with the square: 848 px at 91.2 deg, 50 mm, 0.08 px give 15 mm at 2 m."""
     camera = PinholeCamera.from_field_of_view(848, 480, 91.2, 0.05)
-    noise = RangeNoise.of(NoiseConfig(s0=0.0), camera)
+    noise = RangeNoise.of(NoiseConfig(), camera)
     assert noise.sigma(2.0) == pytest.approx(2.0**2 * 0.08 / (camera.fx * 0.05))
     assert noise.sigma(2.0) == pytest.approx(0.0154, abs=2e-4)
     assert RangeNoise.of(NoiseConfig(s0=0.01, s2=0.002), camera).sigma(3.0) == pytest.approx(0.01 + 0.018)

@@ -24,14 +24,14 @@ def test_model_of_the_spherical_camera_as_printed(z_measured):
     z = z_measured + np.linspace(-5, 5, 101) * dz
     before = 0.3 + (a + 0.5 - 0.3) * np.exp(-0.5 * ((z - z_measured) / dz) ** 2)
     behind = 0.5 + a * np.exp(-0.5 * ((z - z_measured) / c) ** 2)
-    sigma = RangeNoise.of(NoiseConfig(s0=0.0, subpixel=0.25), FIGURE).sigma(z_measured)
+    sigma = RangeNoise.of(NoiseConfig(subpixel=0.25), FIGURE).sigma(z_measured)
     found = make_sensor(SensorConfig(model="valenti")).probability(z, z_measured, sigma)
     np.testing.assert_allclose(found, np.where(z <= z_measured, before, behind), rtol=1e-9)
 
 
 def test_table_of_a_fisheye_with_much_noise():
     """Half a metre of noise at the end of the range: the table still says what the model says."""
-    noise = RangeNoise.of(NoiseConfig(s0=0.0, subpixel=0.25), FIGURE)
+    noise = RangeNoise.of(NoiseConfig(subpixel=0.25), FIGURE)
     model = make_sensor(SensorConfig(model="valenti"))
     table = tabulate(model, noise, 10.0)
     assert table.sigma[-1] > 0.4
@@ -44,7 +44,7 @@ def test_table_of_a_fisheye_with_much_noise():
 def test_noise_of_both_wide_cameras():
     """A fisheye pixel is worth as much in both; only the spherical one is noisy at no depth at all."""
     cylinder = CylindricalCamera(1201, 3, 480.0, 2.5 / 1200, 600.0, 1.0, 0.1)
-    config = NoiseConfig(s0=0.0, subpixel=0.1, s1=0.01)
+    config = NoiseConfig(subpixel=0.1, s1=0.01)
     assert RangeNoise.of(config, cylinder) == RangeNoise(0.0, 0.01, 0.1 / 48)
     sphere = RangeNoise.of(config, FIGURE)
     assert (sphere.s0, sphere.s1) == (pytest.approx(0.1 * 0.1 / 480), 0.01)

@@ -13,7 +13,7 @@ from stereovox.config.base import Section
 class NoiseConfig(Section):
     """Range noise sigma(z) = s0 + s1 z + s2 z^2 in metres.
 
-    s0, s1: constant and linear part. No camera, calibration and pose together are better than some millimetres.
+    s0, s1: constant and linear part.
     s2: quadratic part. Not set: from the camera, `subpixel / (focal_px * baseline)` (Chien 2020, Eq 3.5 with the square
         that is missing in print).
     subpixel: standard deviation of the disparity in pixels. Not set: the camera's own (`stereo.subpixel` for images
@@ -25,7 +25,7 @@ class NoiseConfig(Section):
         sure, with models that know how wide noise is.
     """
 
-    s0: float = Field(0.005, ge=0)
+    s0: float = Field(0.0, ge=0)
     s1: float = Field(0.0, ge=0)
     s2: float | None = Field(None, ge=0)
     subpixel: float | None = Field(None, gt=0)

@@ -60,8 +60,7 @@ class MapConfig(Section):
         at most that fraction.
     keep_times: store when each cell got its last evidence (4 more bytes a cell).
     log_odds_min, log_odds_max: limits of a cell's log-odds.
-    free_below, occupied_above: probabilities below which a cell is free, and above which it is occupied; a cell that
-        evidence made less likely than the prior never is.
+    free_below, occupied_above: probabilities below which a cell is free, and above which it is occupied.
     forget_s: a cell without evidence for so many seconds of the recording becomes unknown; needs `keep_times`.
     """
 

@@ -60,13 +60,11 @@ class CellReader:
 class Neighbourhood:
     """All cells within `reach` cells, along every axis, of a fixed set of cells.
 
-    cells: the set, ascending keys (S,), or a `part` of it; around: all cells within reach of the set, which they
-    include, ascending keys (D,).
+    cells: the set, ascending keys (S,); around: all cells within reach, including the set, ascending keys (D,).
     """
 
     def __init__(self, cells: Keys, reach: int):
         self.cells, self.around, self.reach = cells, cells, reach
-        self._set, self._rows = cells, np.arange(len(cells))
         self._tables: list[NDArray[np.int64]] = []
         steps = np.arange(-reach, reach + 1)
         for step in _STEPS:  # one axis after the other: three short tables instead of one of (2 reach + 1)^3
@@ -74,15 +72,9 @@ class Neighbourhood:
             self.around = np.unique(near)
             self._tables.append(np.searchsorted(self.around, near))
 
-    def part(self, chosen: NDArray[np.bool_]) -> Neighbourhood:
-        """Return the same around the `chosen` cells (S,) alone; the others stay in the set."""
-        part = copy(self)
-        part.cells, part._rows = self.cells[chosen], self._rows[chosen]
-        return part
-
     def within(self, tolerance: int) -> NDArray[np.bool_]:
         """Return which cells of `around` (D,) lie within `tolerance` cells, at most the reach, of the set."""
-        inside = np.ones(len(self._set), bool)
+        inside = np.ones(len(self.cells), bool)
         for table in self._tables:
             near = self._columns(table, tolerance)[inside]
             inside = np.zeros(table.max(initial=-1) + 1, bool)
@@ -91,27 +83,23 @@ class Neighbourhood:
 
     def highest(self, values: NDArray[Any], tolerance: int | None = None) -> NDArray[Any]:
         """Return for each cell (S,) the highest of the `values` (D,) within `tolerance` cells; None: within reach."""
-        for table in reversed(self._asked()):
+        for table in reversed(self._tables):
             values = values[self._columns(table, self.reach if tolerance is None else tolerance)].max(axis=1)
         return values
 
     def spread(self, tolerance: int) -> NDArray[np.float64]:
         """Return the covariance (S, 3, 3), in cells squared, of those cells of the set within `tolerance` of each."""
-        inside = position(self.around, self._set) >= 0
+        inside = position(self.around, self.cells) >= 0
         steps = np.arange(-tolerance, tolerance + 1.0)
         sums: dict[tuple[int, ...], NDArray[np.float64]] = {(): inside.astype(float)}
-        tables = self._asked()
         for axis in (2, 1, 0):  # sums of 1, of each offset and of each product of two, one axis after the other
-            table = self._columns(tables[axis], tolerance)
+            table = self._columns(self._tables[axis], tolerance)
             more = [(axes, n) for axes in sums for n in range(3 - len(axes))]
             sums = {(*[axis] * n, *axes): sums[axes][table] @ steps**n for axes, n in more}
         count = sums[()]
         mean = np.stack([sums[(axis,)] for axis in range(3)], axis=1) / count[:, None]
         square = [[sums[min(i, j), max(i, j)] / count for j in range(3)] for i in range(3)]
         return np.moveaxis(np.array(square), -1, 0) - mean[:, :, None] * mean[:, None, :]
-
-    def _asked(self) -> list[NDArray[np.int64]]:
-        return [self._tables[0][self._rows], *self._tables[1:]]
 
     def _columns(self, table: NDArray[np.int64], tolerance: int) -> NDArray[np.int64]:
         return table[:, self.reach - tolerance : self.reach + tolerance + 1]
@@ -214,18 +202,6 @@ class TruthCells:
         part = copy(self)
         part.cells, part.occupied, part.near = self.cells[chosen], self.occupied[chosen], self.near[chosen]
         part._own, part.counted = self._own[chosen], self.counted[chosen[self.occupied]]
-        return part
-
-    def part(self, chosen: NDArray[np.bool_]) -> TruthCells:
-        """Return the truth of the `chosen` cells (N,) alone; what lies near them counts as near, chosen or not.
-
-        Raises StereovoxError where none is chosen.
-        """
-        if not chosen.any():
-            raise StereovoxError("no cell of the truth lies in this part of it; choose a larger one")
-        part = copy(self)
-        part.cells, part.occupied, part.near = self.cells[chosen], self.occupied[chosen], self.near[chosen]
-        part._own, part.neighbourhood = self._own[chosen], self.neighbourhood.part(chosen[self.occupied])
         return part
 
     def near_within(self, tolerance: int) -> NDArray[np.bool_]:

@@ -113,8 +113,8 @@ class CellRules:
 
     @cached_property
     def occupied_above(self) -> float:
-        """Stored numbers above it are occupied: likely, and likelier than before the first evidence."""
-        return max(self._exact(self.config.occupied_above), float(self.prior) + 0.5)
+        """Stored numbers above it are occupied."""
+        return self._exact(self.config.occupied_above)
 
     @cached_property
     def most_rise(self) -> int | None:

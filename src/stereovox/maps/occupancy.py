@@ -130,17 +130,13 @@ class Percent:
     @cached_property
     def free_below(self) -> float:
         """Probability below which cells are free: what evidence made likelier than the prior is not."""
-        return min(self._rules.config.free_below, self._just_above_prior)
+        just_above = (self._rules.prior + 0.5 - self._format.unknown) / self._format.per_log_odds
+        return min(self._rules.config.free_below, float(1 / (1 + np.exp(-just_above))))
 
-    @cached_property
+    @property
     def occupied_above(self) -> float:
-        """Probability above which cells are occupied: what evidence made less likely than the prior is not."""
-        return max(self._rules.config.occupied_above, self._just_above_prior)
-
-    @cached_property
-    def _just_above_prior(self) -> float:
-        log_odds = (self._rules.prior + 0.5 - self._format.unknown) / self._format.per_log_odds
-        return float(1 / (1 + np.exp(-log_odds)))
+        """Probability above which cells are occupied."""
+        return self._rules.config.occupied_above
 
     @cached_property
     def shown(self) -> NDArray[np.int8]:

@@ -31,7 +31,7 @@ class Stereo:
     p_right: float = 0.95
     prior: float = 0.1
     trust: float = 0.8
-    p_free: float = 0.42
+    p_free: float = 0.35
     p_unknown: float = 0.5
     p_least: float = 0.7
     fade: float = 2.0

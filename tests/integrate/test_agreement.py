@@ -40,9 +40,7 @@ def shares_of(name, voxel_size, **settings):
 
 
 def check_the_same(shares):
-    # large cells beside edges, which a ray or two clear and a whole patch of pixels does not, stay occupied
-    assert shares["precision"] >= 0.96, shares
-    assert shares["recall"] >= 0.97, shares
+    assert min(shares["precision"], shares["recall"]) >= 0.97, shares
     assert min(shares["precision_1"], shares["recall_1"]) >= 0.995, shares
     assert shares["wrongly_free"] <= 0.005, shares
 

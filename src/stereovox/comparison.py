@@ -34,6 +34,8 @@ MAX_SHIFT_M, MAX_TURN = 0.5, np.radians(15)
 """How far a knocked camera may stand from its pose."""
 DAMPING = 1e-3
 """Damping of the least squares, for motions that no surface constrains."""
+SUBCELL = (0.5, 0.25)
+"""Steps, in cells, of the search for the pose that agrees best."""
 FIRM = 0.4
 """Share of the largest hit evidence that makes a hit firm: far hits say less, their noise is wider than a cell."""
 
@@ -140,12 +142,27 @@ def _motion(points: NDArray[np.float64], normals: NDArray[np.float64], onto: NDA
 
 
 def _fits_elsewhere(image: DepthImage, integrator: Integrator, voxel_map: VoxelMap, firm: int, limit: float) -> bool:
-    """Return whether an image, registered with the map's surfaces, disagrees with the map by at most `limit`."""
+    """Return whether an image disagrees with the map by at most `limit` from where its surfaces lie on the map's.
+
+    Registered with the centres of cells it may be half a cell off; from there the pose of least disagreement is sought
+    along the world's axes.
+    """
     pose = pose_on_surfaces(voxel_map, image)
     if pose is None:
         return False
-    against = voxel_map.storage.agreement(integrator.evidence(replace(image, T_world_sensor=pose)), firm).against
-    return against is not None and against <= limit
+
+    def against_from(T: Transform) -> float:
+        against = voxel_map.storage.agreement(integrator.evidence(replace(image, T_world_sensor=T)), firm).against
+        return 1.0 if against is None else against
+
+    least = against_from(pose)
+    for step in SUBCELL:
+        for shift in step * voxel_map.voxel_size * np.vstack([np.eye(3), -np.eye(3)]):
+            moved = pose.copy()
+            moved[:3, 3] += shift
+            if (against := against_from(moved)) < least:
+                least, pose = against, moved
+    return least <= limit
 
 
 def _firm(sensor: InverseSensorModel, config: Config, camera: VirtualCamera) -> int:

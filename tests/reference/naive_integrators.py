@@ -214,20 +214,29 @@ def _pixels_at(x: NDArray, y: NDArray, z: NDArray, image: DepthImage, config: Co
 
 
 def _farthest_in_window(image: DepthImage, uv: NDArray, size_px: NDArray) -> NDArray:
-    """Return the farthest depth (N,) in 3x3 tiles about the pixel; tiles of a power of two near 0.27 cell sizes.
+    """Return the farthest (N,) of the 3x3 tiles about the pixel; tiles of a power of two near 0.27 cell sizes.
 
     Cells much smaller than a pixel take the pixel itself. Depths that see nothing are infinite; no value is 0.
     """
     depth = np.where(image.depth_m > 0, image.depth_m, 0).astype(float)
     height, width = depth.shape
+    tiles = [depth, depth]
+    for _ in range(1, MAX_LEVEL):
+        tiles.append(_seen_through(tiles[-1]))
     level = np.clip(np.floor(np.log2(WINDOW_SHARE * size_px)) + 2, 0, MAX_LEVEL).astype(int)
     u, v = np.clip(uv[:, 0], 0, width - 1).astype(int), np.clip(uv[:, 1], 0, height - 1).astype(int)
     farthest = depth[v, u]
     for i in np.flatnonzero(level > 0):
-        tile = 1 << (level[i] - 1)
-        left, top = (u[i] // tile - 1) * tile, (v[i] // tile - 1) * tile
-        farthest[i] = depth[max(top, 0) : top + 3 * tile, max(left, 0) : left + 3 * tile].max()
+        row, column = v[i] >> (level[i] - 1), u[i] >> (level[i] - 1)
+        farthest[i] = tiles[level[i]][max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2].max()
     return farthest
+
+
+def _seen_through(depth: NDArray) -> NDArray:
+    """Return the nearest of each 2x2 of an image; 0 where two of them or more are 0, which otherwise do not count."""
+    padded = np.pad(depth, [(0, size % 2) for size in depth.shape], mode="edge")
+    parts = np.sort([padded[y::2, x::2] for y in (0, 1) for x in (0, 1)], axis=0)
+    return np.where(parts[0] > 0, parts[0], parts[1])
 
 
 def _at_centre(image: DepthImage, uv: NDArray) -> NDArray:

@@ -26,6 +26,11 @@ NARROW_BLOCK, WIDE_BLOCK = (~np.int64((7 << 2 * bits) | (7 << bits) | 7) for bit
 MIXER = np.uint64(0x9E3779B97F4A7C15)
 
 place, usable, unpack = on_gpu(_windows.place), on_gpu(_cells.usable), on_gpu(_cells.unpack)
+nearness, seen_through, farthest_of = (
+    on_gpu(_windows.nearness),
+    on_gpu(_windows.seen_through),
+    on_gpu(_windows.farthest_of),
+)
 touched, classify, passed_by, end_of_view = (
     on_gpu(_projective._touched), on_gpu(_projective._classify), on_gpu(_projective._passed),
     on_gpu(_projective._end_of_view),
@@ -46,7 +51,7 @@ find, home_slot = on_gpu(_map_cells.find), on_gpu(_map_cells.home_slot)
 
 @gpu_kernel
 def shrink(depth_m, base, windows, level):
-    """Fill `level` of `base`, from 1 on: the farthest depth in each tile of 2^(level - 1) pixels.
+    """Fill `level` of `base`, from 1 on: how far one sees through each tile of 2^(level - 1) pixels; see `_windows`.
 
     depth_m: flat REP 117 depth image. base: like `windows.image`; the level before is filled.
     """
@@ -57,13 +62,17 @@ def shrink(depth_m, base, windows, level):
     for i in range(cuda.grid(1), rows * columns, cuda.gridsize(1)):
         v, u = i // columns, i % columns
         if level == 1:
-            farthest = usable(depth_m[i])
+            through = usable(depth_m[i])
         else:
-            farthest = ZERO
-            for line in range(2 * v, min(2 * v + 2, shape[level - 1, 0])):
-                for column in range(2 * u, min(2 * u + 2, shape[level - 1, 1])):
-                    farthest = max(farthest, base[finer + line * pitch + column])
-        base[start + v * pitch + u] = farthest
+            nearest, known = NO_RETURN, ZERO
+            for part in range(4):
+                line = min(2 * v + (part >> 1), shape[level - 1, 0] - 1)
+                column = min(2 * u + (part & 1), shape[level - 1, 1] - 1)
+                value = base[finer + line * pitch + column]
+                nearest = min(nearest, nearness(value))
+                known += ONE if value > ZERO else ZERO
+            through = seen_through(nearest, known)
+        base[start + v * pitch + u] = through
 
 
 @gpu_kernel
@@ -135,10 +144,7 @@ def nearest_tiles(depth_m, height, width, size, tiles):
 def find_boxes(view, table, windows, boxes):
     """Write the first coarse box along each axis, and how many there are, to `boxes` (3, 2) int32."""
     if cuda.grid(1) == 0:
-        farthest = ZERO
-        for i in range(windows.tile_offset[COARSEST, 0], windows.tile_offset[COARSEST, 1]):
-            farthest = max(farthest, windows.highs[i])
-        end = end_of_view(view, table, farthest)
+        end = end_of_view(view, table, farthest_of(windows))
         for axis in range(3):
             low, high = touched(view, end, axis)
             boxes[axis, 0], boxes[axis, 1] = low, (high - low) // COARSE + 1

@@ -232,15 +232,19 @@ def _classify(view, table, windows, nearest, tile, blocks, bx, by, bz):
     right, bottom = np.float32(view.width - 1), np.float32(view.height - 1)
     u0, u1 = _pixel(u_low, right), _pixel(u_high, right)
     v0, v1 = _pixel(v_low, bottom), _pixel(v_high, bottom)
-    level = min(max(window_level(view.spread * near), windows.first), np.int32(COARSEST))
-    farthest = _extreme(windows, windows.highs, level, tile, u0, u1, v0, v1, True)
+    finest = min(max(window_level(view.spread * far), windows.first), np.int32(COARSEST))
+    coarsest = min(max(window_level(view.spread * near), windows.first), np.int32(COARSEST))
+    farthest = ZERO
+    for level in range(finest, coarsest + 1):
+        farthest = max(farthest, _extreme(windows, windows.highs, level, tile, u0, u1, v0, v1, True))
     if z_low > (farthest + _behind(table, farthest, view.max_range)) * (ONE + SLACK):
         return SKIP
     whole = u_low >= -HALF and v_low >= -HALF and u_high <= right + HALF and v_high <= bottom + HALF
     if not whole or z_high > view.max_range:
         return MIXED
-    level = min(max(window_level(view.spread * far), windows.first), np.int32(COARSEST))
-    closest = _extreme(windows, windows.lows, level, tile, u0, u1, v0, v1, False)
+    closest = NO_RETURN
+    for level in range(finest, coarsest + 1):
+        closest = min(closest, _extreme(windows, windows.lows, level, tile, u0, u1, v0, v1, False))
     if table.marks:
         closest = min(closest, _nearest(nearest, tile, u0, u1, v0, v1))
     return FREE if z_high < _clear_to(table, closest) * (ONE - SLACK) else MIXED

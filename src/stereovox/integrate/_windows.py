@@ -1,9 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Kernels that build window images: at each pixel the farthest depth within a window, for windows of all sizes.
+"""Kernels that build window images: how far one sees through the pixels about a place, for windows of all sizes.
 
-Level 0 is the depth image itself, level l >= 1 holds, for each tile of 2^(l-1) pixels, the farthest depth in the
-3x3 tiles around it. For fast culling each level also has the nearest and farthest value of tiles of 16 and 64 of its
-own pixels. No value is 0, so it is the nearest of all and never clears anything.
+Level 0 is the depth image itself, level l >= 1 holds, for each tile of 2^(l-1) pixels, the farthest of the 3x3 tiles
+around it. A tile is seen through as far as its nearest pixel (`of_four`), so beside an edge or a hole, where depths are
+often wrong and thin things are missed, nothing is cleared that a whole patch of pixels does not see through. For fast
+culling each level also has the nearest and farthest value of tiles of 16 and 64 of its own pixels. No value is 0, so it
+is the nearest of all and never clears anything.
 
 All levels stand in one image whose rows are `pitch` long: level 1 on top, level 0 below it, the others side by side
 below that; so the place of a pixel takes a few sums and no table look-up (`place`).
@@ -12,10 +14,11 @@ below that; so the place of a pixel takes a few sums and no table look-up (`plac
 import numpy as np
 
 from stereovox._jit import cell
-from stereovox.integrate._cells import NO_RETURN, ZERO, float_of, usable
+from stereovox.integrate._cells import NO_RETURN, ONE, ZERO, float_of, usable
 
 COARSEST = 8
 """The highest level."""
+TWO = np.float32(2)
 
 
 @cell
@@ -41,84 +44,100 @@ def build(depth_m, windows, scratch):
     """
     window, lows, highs, shape = windows.image, windows.lows, windows.highs, windows.shape
     tile_offset, tile_width, first = windows.tile_offset, windows.tile_width, windows.first
-    base, ring = scratch.base, scratch.ring
-    row, other, high_row, low_row = scratch.row, scratch.other, scratch.high_row, scratch.low_row
-    height, width, pitch = shape[0, 0], shape[0, 1], np.int32(row.size)
-    lowest = max(first, 1)
+    base, ring, row, other, high_row, low_row = scratch
+    height, pitch = shape[0, 0], np.int32(row.size)
+    _shrink(depth_m, shape, base, pitch, row, other)
     for level in range(first, COARSEST + 1):
         rows, columns = shape[level, 0], shape[level, 1]
         start = place(np.int32(level), ZERO, ZERO, pitch, height)
-        coarser = place(np.int32(level + 1), ZERO, ZERO, pitch, height)
         _fill_big(lows, highs, tile_offset[level, 1], tile_width[level, 1] * ((rows + 63) >> 6))
-        for v in range(rows + 1):
-            here = ring[v & 3]
-            if v < rows:
-                if level <= lowest:
-                    _shrunk_row(depth_m, v, height, width, max(level - 1, 0), row, other, here)
-                else:
-                    _copy(base[start + v * pitch :], columns, here)
-                if 0 < level < COARSEST and (v % 2 == 1 or v == rows - 1):
-                    _halved_rows(ring[v & 2], here, columns, row, base[coarser + (v >> 1) * pitch :])
-            if v > 0:
-                out = window[start + (v - 1) * pitch :]
-                if level == 0:
-                    _copy(ring[(v - 1) & 3], columns, out)
-                else:
-                    _window_row(
-                        ring[max(v - 2, 0) & 3], ring[(v - 1) & 3], ring[min(v, rows - 1) & 3], columns, row, out
-                    )
-                _take_in(out, columns, v - 1, high_row, low_row)
-                if v % 16 == 0 or v == rows:
-                    offsets = tile_offset[level, 0] + ((v - 1) >> 4) * tile_width[level, 0]
-                    big = tile_offset[level, 1] + ((v - 1) >> 6) * tile_width[level, 1]
-                    _most_of_16(low_row, columns, other)
-                    _most_of_16(high_row, columns, other)
-                    _put(low_row, tile_width[level, 0], lows, offsets, big, False)
-                    _put(high_row, tile_width[level, 0], highs, offsets, big, True)
-    farthest = ZERO
-    for i in range(tile_offset[COARSEST, 0], tile_offset[COARSEST, 1]):
-        farthest = max(farthest, highs[i])
+        for v in range(rows):
+            out = window[start + v * pitch :]
+            if level == 0:
+                _copy_usable(depth_m[v * columns :], columns, out)
+            elif level == 1:
+                _three_rows(depth_m, v, rows, columns, ring)
+                _window_row(ring[max(v - 1, 0) & 3], ring[v & 3], ring[min(v + 1, rows - 1) & 3], columns, row, out)
+            else:
+                above, here, below = (
+                    start + max(v - 1, 0) * pitch,
+                    start + v * pitch,
+                    start + min(v + 1, rows - 1) * pitch,
+                )
+                _window_row(base[above:], base[here:], base[below:], columns, row, out)
+            _take_in(out, columns, v, high_row, low_row)
+            if v % 16 == 15 or v == rows - 1:
+                offsets = tile_offset[level, 0] + (v >> 4) * tile_width[level, 0]
+                big = tile_offset[level, 1] + (v >> 6) * tile_width[level, 1]
+                _most_of_16(low_row, columns, other)
+                _most_of_16(high_row, columns, other)
+                _put(low_row, tile_width[level, 0], lows, offsets, big, False)
+                _put(high_row, tile_width[level, 0], highs, offsets, big, True)
+    return farthest_of(windows)
+
+
+@cell
+def farthest_of(windows):
+    """Return the farthest value of all window images, which the finest one has."""
+    first, farthest = windows.first, ZERO
+    start = windows.tile_offset[first, 0]
+    for i in range(start, start + windows.tile_width[first, 0] * ((windows.shape[first, 0] + 15) >> 4)):
+        farthest = max(farthest, windows.highs[i])
     return farthest
 
 
 @cell
-def _copy(source, width, out):
-    for u in range(width):
-        out[u] = source[u]
+def _shrink(depth_m, shape, base, pitch, near, known):
+    """Write how far one sees through each tile of the levels from 2 on to `base`, laid out like the window images.
+
+    A tile has four parts, of the level before: one sees through it as far as through the nearest, and nowhere where two
+    have no value. One without is left out, since single pixels are lost everywhere. At the border tiles end with the
+    image: its last row and column count twice. near, known: (pitch,) scratch.
+    """
+    height = shape[0, 0]
+    for level in range(2, COARSEST + 1):
+        rows, columns = shape[level - 1, 0], shape[level - 1, 1]
+        source, source_pitch, start = depth_m, columns, np.int32(0)
+        if level > 2:
+            source, source_pitch, start = base, pitch, place(np.int32(level - 1), ZERO, ZERO, pitch, height)
+        target = place(np.int32(level), ZERO, ZERO, pitch, height)
+        for v in range(shape[level, 0]):
+            upper = source[start + 2 * v * source_pitch :]
+            lower = source[start + min(2 * v + 1, rows - 1) * source_pitch :]
+            out = base[target + v * pitch :]
+            for u in range(columns):
+                near[u] = min(nearness(upper[u]), nearness(lower[u]))
+                known[u] = (ONE if upper[u] > ZERO else ZERO) + (ONE if lower[u] > ZERO else ZERO)
+            for u in range(columns // 2):
+                out[u] = seen_through(min(near[2 * u], near[2 * u + 1]), known[2 * u] + known[2 * u + 1])
+            if columns % 2:
+                u = columns - 1
+                out[u // 2] = seen_through(near[u], known[u] + known[u])
 
 
 @cell
-def _shrunk_row(depth_m, v, height, width, halvings, row, other, out):
-    """Write to `out` the farthest depth in each tile of 2^halvings pixels of row v of tiles."""
-    first = v << halvings
-    if halvings == 0:
-        depths = depth_m[first * width :]
-        for u in range(width):
-            out[u] = usable(depths[u])
-        return
-    for u in range(width):
-        row[u] = ZERO
-    for line in range(first, min(first + (1 << halvings), height)):
-        depths = depth_m[line * width :]
-        for u in range(width):
-            row[u] = max(row[u], depths[u])  # what is not a number is never the larger one
-    size = width
-    for halving in range(halvings):
-        if halving % 2:
-            _halved_row(other, size, row)
-        else:
-            _halved_row(row, size, other)
-        size = (size + 1) >> 1
-    shrunk = other if halvings % 2 else row
-    for u in range(size):
-        out[u] = min(shrunk[u], NO_RETURN)
+def nearness(depth):
+    """Return a depth as a number to take the nearest of; no value is NO_RETURN."""
+    return min(depth, NO_RETURN) if depth > ZERO else NO_RETURN
 
 
 @cell
-def _halved_rows(upper, lower, width, row, out):
+def seen_through(nearest, known):
+    """Return how far one sees through a tile of which so many parts of four have a value."""
+    return nearest if known > TWO else ZERO
+
+
+@cell
+def _copy_usable(source, width, out):
     for u in range(width):
-        row[u] = max(upper[u], lower[u])
-    _halved_row(row, width, out)
+        out[u] = usable(source[u])
+
+
+@cell
+def _three_rows(depth_m, v, rows, columns, ring):
+    """Have rows v - 1 to v + 1 of the depth image in `ring` (4, pitch), where those before v + 1 already are."""
+    for line in range(v if v == 0 else v + 1, min(v + 2, rows)):
+        _copy_usable(depth_m[line * columns :], columns, ring[line & 3])
 
 
 @cell

@@ -20,8 +20,9 @@ KNOWN = 0.3
 """Share of what a frame sees that the map must be sure of."""
 SAMPLE = 512
 """Blocks that are enough to judge a frame by."""
-LOOKED_THROUGH = 2.5
-"""What is looked through tells as much as what is hit, although a sensor model gives it less evidence."""
+LOOKED_THROUGH = 4.0
+"""What is looked through tells as much as what is hit, although a sensor model gives it less evidence, and only where
+a whole patch of pixels looks through."""
 
 
 class Agreement(NamedTuple):
@@ -47,7 +48,12 @@ class Agreement(NamedTuple):
     @property
     def weight(self) -> float:
         """All log-odds that say something of the map's surfaces."""
-        return self.hits + self.passes + self.into_free
+        return self.hits + self.through + self.into_free
+
+    @property
+    def through(self) -> float:
+        """What the frame looks through, as much as if it were hit."""
+        return LOOKED_THROUGH * self.passes
 
     @property
     def against(self) -> float | None:
@@ -57,9 +63,9 @@ class Agreement(NamedTuple):
         is judged only where a good part of what it sees is known, or where it looks through much; and what is at the
         edge of the known counts no more than all else that is against the map.
         """
-        if self.weight < FEW or (self.weight < KNOWN * self.every and self.passes < FEW):
+        if self.weight < FEW or (self.weight < KNOWN * self.every and self.through < FEW):
             return None
-        within = LOOKED_THROUGH * self.passes + self.into_free - self.at_edge
+        within = self.through + self.into_free - self.at_edge
         against = within + min(self.at_edge, within)
         return against / (self.hits + against) if against else 0.0
 

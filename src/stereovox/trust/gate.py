@@ -241,8 +241,8 @@ class DisagreementMonitor:
     A frame that disagrees more is refused. Once at least MIN_FRAMES have done so for `trust.changed_s`, the world has
     changed: they are accepted until they agree again. But where they would agree from another pose, the camera was
     moved or its tracker is wrong: frames are refused until they agree again, or have disagreed for `trust.moved_s`.
-    So are frames that see nothing known then, for the next ones would agree with those. Other frames that see nothing
-    known cannot be judged, and are accepted.
+    So are frames that see nothing known while others are in doubt, for the next ones would agree with those. Other
+    frames that see nothing known cannot be judged, and are accepted.
     """
 
     def __init__(self, config: Config, history: History):
@@ -277,7 +277,7 @@ class DisagreementMonitor:
         `camera_moved`.
         """
         doubt, limit = self._history.doubts.get(sensor), self.limit(sensor, stamp_ns)
-        if against is None and not (doubt and doubt.verdict == MOVED):
+        if against is None and (doubt is None or doubt.verdict == CHANGED):
             return Agreement(None, doubt)
         if against is not None and self._agrees(doubt, sensor, stamp_ns, against):
             return Agreement(against)

@@ -40,9 +40,13 @@ def shares_of(name, voxel_size, **settings):
 
 
 def check_the_same(shares):
-    assert min(shares["precision"], shares["recall"]) >= 0.97, shares
+    """Rays clear each cell they cross, the projective map what a whole patch of pixels sees through: beside edges it
+    keeps a few occupied cells that rays clear, and loses none that they keep.
+    """
+    assert shares["precision"] >= 0.96, shares
+    assert shares["recall"] >= 0.985, shares
     assert min(shares["precision_1"], shares["recall_1"]) >= 0.995, shares
-    assert shares["wrongly_free"] <= 0.005, shares
+    assert shares["wrongly_free"] <= 0.001, shares
 
 
 kitchen = pytest.mark.skipif(not KITCHEN.is_dir(), reason=f"recording {KITCHEN.name} is not here")

@@ -233,10 +233,10 @@ def _farthest_in_window(image: DepthImage, uv: NDArray, size_px: NDArray) -> NDA
 
 
 def _seen_through(depth: NDArray) -> NDArray:
-    """Return the nearest of each 2x2 of an image; 0 where two of them or more are 0, which otherwise do not count."""
+    """Return the nearest of each 2x2 of an image; 0 where three of them or more are 0, which otherwise do not count."""
     padded = np.pad(depth, [(0, size % 2) for size in depth.shape], mode="edge")
     parts = np.sort([padded[y::2, x::2] for y in (0, 1) for x in (0, 1)], axis=0)
-    return np.where(parts[0] > 0, parts[0], parts[1])
+    return np.where(parts[0] > 0, parts[0], np.where(parts[1] > 0, parts[1], parts[2]))
 
 
 def _at_centre(image: DepthImage, uv: NDArray) -> NDArray:

@@ -124,7 +124,9 @@ def test_rectified_images_have_the_camera_of_p():
 
 
 def test_a_cloud_marks_its_points_and_clears_up_to_them():
-    points = np.array([[2.0, 0, 0], [np.nan, 0, 0], [0, 3.0, 0.5]])
+    beside = np.radians(np.arange(-3, 4))
+    y, z = 2 * np.tan(np.stack(np.meshgrid(beside, beside), axis=-1).reshape(-1, 2).T)
+    points = np.vstack([np.stack([np.full(49, 2.0), y, z], axis=1), [np.nan, 0, 0], [0, 3.0, 0.5]])
     mapper = Mapper("default", voxel_size=0.1, **{"noise.s0": 0.02})
     one = CloudInput("/points", 1.0)
     for stamp in (1, 2):
@@ -133,9 +135,9 @@ def test_a_cloud_marks_its_points_and_clears_up_to_them():
     occupied = {tuple(np.floor(p / 0.1).astype(int)) for p in mapper.map.occupied()}
     assert any(abs(x - 20) <= 1 and abs(y) <= 1 and abs(z) <= 1 for x, y, z in occupied)
     assert any(abs(x) <= 1 and abs(y - 30) <= 1 and abs(z - 5) <= 1 for x, y, z in occupied)
-    assert all(np.min(np.linalg.norm(p - np.array([[2.0, 0, 0], [0, 3, 0.5]]), axis=1)) < 0.3
-               for p in mapper.map.occupied())  # fmt: skip
+    assert all(np.nanmin(np.linalg.norm(p - points, axis=1)) < 0.3 for p in mapper.map.occupied())
     assert mapper.map.state([[1.0, 0.0, 0.0]])[0] == 1
+    assert mapper.map.state([[0.0, 1.0, 0.17]])[0] == 0  # a lone point clears nothing as wide as a cell
     assert mapper.map.state([[-1.0, 0.0, 0.0], [2.6, 0.0, 0.0]]).tolist() == [0, 0]  # no point tells of them
 
 

@@ -2,7 +2,7 @@
 """Kernels that build window images: how far one sees through the pixels about a place, for windows of all sizes.
 
 Level 0 is the depth image itself, level l >= 1 holds, for each tile of 2^(l-1) pixels, the farthest of the 3x3 tiles
-around it. A tile is seen through as far as its nearest pixel (`of_four`), so beside an edge or a hole, where depths are
+around it. A tile is seen through as far as its nearest pixel (`_shrink`), so beside an edge or a hole, where depths are
 often wrong and thin things are missed, nothing is cleared that a whole patch of pixels does not see through. For fast
 culling each level also has the nearest and farthest value of tiles of 16 and 64 of its own pixels. No value is 0, so it
 is the nearest of all and never clears anything.
@@ -90,9 +90,9 @@ def farthest_of(windows):
 def _shrink(depth_m, shape, base, pitch, near, known):
     """Write how far one sees through each tile of the levels from 2 on to `base`, laid out like the window images.
 
-    A tile has four parts, of the level before: one sees through it as far as through the nearest, and nowhere where two
-    have no value. One without is left out, since single pixels are lost everywhere. At the border tiles end with the
-    image: its last row and column count twice. near, known: (pitch,) scratch.
+    A tile has four parts, of the level before: one sees through it as far as through the nearest of those that have a
+    value, and nowhere where most have none. At the border tiles end with the image: its last row and column count
+    twice. near, known: (pitch,) scratch.
     """
     height = shape[0, 0]
     for level in range(2, COARSEST + 1):
@@ -124,7 +124,7 @@ def nearness(depth):
 @cell
 def seen_through(nearest, known):
     """Return how far one sees through a tile of which so many parts of four have a value."""
-    return nearest if known > TWO else ZERO
+    return nearest if known >= TWO else ZERO
 
 
 @cell

@@ -45,7 +45,7 @@ class ProjectiveConfig(Section):
         below that by the square root of the part, since a few pixels may be wrong; 0: every hit counts in full.
     """
 
-    full_share: float = Field(0.1, ge=0, le=1)
+    full_share: float = Field(0.0, ge=0, le=1)
 
 
 class MapConfig(Section):

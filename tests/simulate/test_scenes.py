@@ -5,7 +5,7 @@ import pytest
 from stereovox.errors import SourceError
 from stereovox.opening import open_source
 from stereovox.se3 import inverse, rigidity_error, transform_points
-from stereovox.simulate import plain_scenes
+from stereovox.simulate import plain_scenes, town
 from stereovox.simulate.simulation import SCENES, Simulation
 from stereovox.simulate.stage import Stage, rectangle
 
@@ -229,6 +229,30 @@ def test_no_two_bays_of_the_flight_are_equal_but_all_have_the_same_things():
     longer = Simulation("sim:flight?length=800").scene
     per_metre = [len(scene.solids) / np.ptp(scene.triangles[..., 0]) for scene in (simulation.scene, longer)]
     assert per_metre[0] == pytest.approx(per_metre[1], rel=0.03)
+
+
+@pytest.mark.parametrize("drive", range(4))
+def test_drives_through_the_town_stay_on_its_streets_at_even_speed(drive):
+    simulation = Simulation(f"sim:town?drive={drive}&length=600&speed=8&blocks=3")
+    poses = np.array([simulation.pose(i) for i in range(len(simulation))])
+    eyes = poses[:, :3, 3] - town.SHIFT
+    np.testing.assert_allclose(np.linalg.norm(np.diff(eyes, axis=0), axis=1), 0.8, rtol=5e-3)
+    off_street = np.abs((eyes[:, :2] + 75 + 25) % 50 - 25)  # from the middle of the nearest streets
+    assert off_street.min(axis=1).max() < 1.5 < off_street.max(axis=1).max()
+    assert np.abs(eyes[:, :2]).max() < 80
+    heading = np.diff(eyes[:, :2], axis=0) / 0.8
+    assert ((poses[:-1, :2, 2] * heading).sum(1) > 0.99).all()
+    assert len(np.unique(heading.round(3), axis=0)) > 20  # it has turned
+
+
+def test_a_town_is_the_same_for_all_drives_and_another_for_another_seed():
+    scenes = [Simulation(f"sim:town?blocks=2&{more}").scene for more in ("drive=0", "drive=5", "town=1")]
+    np.testing.assert_array_equal(scenes[0].triangles, scenes[1].triangles)
+    assert not np.array_equal(scenes[0].triangles[:900], scenes[2].triangles[:900])
+    parts = {"ground", "pavements", "houses", "lamps", "trees", "signs", "bollards", "cars"}
+    assert set(scenes[0].parts()) == parts == set(scenes[2].parts())
+    houses = np.array([solid.bounds for solid in scenes[0].part("houses")])
+    assert (np.ptp(houses, axis=1) > 0.29).all()
 
 
 def test_rectangles_face_the_way_they_should():

@@ -30,6 +30,7 @@ SCENES = {
     "apartment": "stereovox.simulate.apartment:stage",
     "wall": "stereovox.simulate.plain_scenes:wall_stage",
     "flight": "stereovox.simulate.flight:stage",
+    "town": "stereovox.simulate.town:stage",
 }
 """Functions that return a `Stage`; their keyword arguments and defaults are the scene's parameters."""
 AXES = ("world", "optical")
@@ -90,6 +91,7 @@ class Simulation(DepthSource):
         sim:apartment?speed=0.8                     six rooms, scanned by hand
         sim:wall?distance=1.4&tilt=0&turn=0         a flat wall that fills the view
         sim:flight?length=2000&speed=5              out and back along the same hall
+        sim:town?blocks=6&drive=0&length=120        streets with houses, lamps, trees and cars; a drive through them
 
     The scene functions' docstrings tell their parameters, `Options` those of every scene. World: z up, x forward, y
     left, metres; with `axes=optical` x right, y down, z forward from the first camera. Every frame can be asked for by
@@ -212,7 +214,7 @@ def _read(text: str, texts: dict[str, Any]) -> tuple[Options, Stage]:
 
 def _device(own: D435, options: Options) -> D435:
     if options.image_width and options.camera != "kinect":
-        own = replace(own, camera=depth_camera(options.image_width))
+        own = replace(own, camera=replace(depth_camera(options.image_width), baseline=own.camera.baseline))
     if options.camera == "kinect":
         own = honest_kinect(options.image_width or WIDTH)
     elif options.camera == "d435":

@@ -9,7 +9,9 @@ from stereovox import se2
 from stereovox.config.robot import SlamConfig
 from stereovox.frame import Scan
 from stereovox.localize.slam.graph import Keyframe
-from stereovox.localize.slam.line_map import Cloud, LineMap, cloud_of, joined
+from stereovox.localize.slam.line_map import Cloud, LineMap, Match, cloud_of, joined
+from stereovox.localize.slam.loops import ClosureSearch
+from stereovox.localize.slam.trust import MARGIN, SLIPPED, STUCK, Moment, Trust, through
 
 STEP_YAW = 0.01
 """Radians between the turns that the search tries."""
@@ -25,6 +27,15 @@ SEARCHED = 100
 """Points that the search looks at: it need only come near."""
 FEWEST = 10
 """Hits below which a scan is not matched: its pose is the odometry's."""
+
+LOST, FOUND = 0.5, 0.6
+"""Share of a scan's points on the map below which a match is not believed, and from which on a wide search's is."""
+WIDEST = 3.0
+"""Metres of the wide search each way."""
+SLACK = 0.3
+"""Metres by which a step that nothing but the odometry tells may be off."""
+HELD = (0.05, 0.03)
+"""Metres and radians near a place within which its fit is measured."""
 
 
 class Follower:
@@ -43,6 +54,8 @@ class Follower:
         self._travelled = 0.0
         self._start: se2.Pose = np.zeros(3)
         self._moved: dict[int, Cloud] = {}
+        self._trust, self._slack, self._lost = Trust(), 0.0, 0.0
+        self._wide = ClosureSearch(config)
 
     def add(self, scan: Scan) -> bool:
         """Find the pose of the next scan; return whether it became a keyframe."""
@@ -52,13 +65,17 @@ class Follower:
             self._start[:2] = np.floor(odometry[:2])  # float32 points stay exact far from the world's origin
         else:
             step = se2.relative(self._odometry, odometry)
-            before, self.pose = self.pose, self._matched(cloud, se2.compose(self.pose, step), step)
+            before, self.pose = self.pose, self._found(cloud, se2.compose(self.pose, step), step)
+            since = self._trust.add(odometry, before, self.pose)
+            if since is not None and self.keyframes:
+                self._judge(cloud, since)
             self._travelled += float(np.hypot(*(self.pose - before)[:2]))
         self._odometry = odometry
         if not self._is_new(cloud):
             return False
         step = se2.relative(self.keyframes[-1].pose, self.pose) if self.keyframes else np.zeros(3)
-        self.keyframes.append(Keyframe(self.pose, step, cloud, scan, self._travelled))
+        self.keyframes.append(Keyframe(self.pose, step, cloud, scan, self._travelled, self._slack))
+        self._slack = 0.0
         self._rebuild()
         return True
 
@@ -68,18 +85,52 @@ class Follower:
         self._moved.clear()
         self._rebuild()
 
-    def _matched(self, cloud: Cloud, guess: se2.Pose, step: se2.Pose) -> se2.Pose:
+    def _found(self, cloud: Cloud, guess: se2.Pose, step: se2.Pose) -> se2.Pose:
+        """Return the pose of a scan: as matched, or found by a wide search, or else by the odometry, with slack."""
         if len(cloud.points) < FEWEST or not self.keyframes:
             return guess
+        match = self._matched(cloud, guess, step)
+        if match.share >= LOST:
+            self._lost = 0.0
+            return match.pose
+        self._lost += float(np.hypot(step[0], step[1]))
+        side = min(WINDOW / 2 + 2 * self._lost, WIDEST)
+        self._wide.set_target(joined(list(self._moved.values())))
+        found = self._wide.match(cloud, guess - self._start, side, WINDOW_TURN / 3)
+        if found is not None and found.share >= FOUND:
+            self._lost = 0.0
+            return self._map.refine(cloud, found.pose + self._start, self._config.sigma).pose
+        self._slack = max(self._slack, SLACK)
+        return guess
+
+    def _judge(self, cloud: Cloud, since: Moment) -> None:
+        """Believe matching or odometry since a moment, from when on they contradict each other."""
+        there, guess = self._trust.by_odometry(since, self.pose)
+        matched, driven = self._fit(cloud, self.pose), self._fit(cloud, guess)
+        if matched > driven + MARGIN:
+            self._trust.settle(SLIPPED)
+            return
+        self.pose, self._slack = guess, SLACK
+        self._trust.settle(STUCK)
+
+    def _fit(self, cloud: Cloud, pose: se2.Pose) -> float:
+        """Return which share of a scan's points lie on the map if it is near `pose`, less that which sees through it."""
+        match = self._map.refine(cloud, pose, self._config.sigma, pose, np.diag([HELD[0]**-2, HELD[0]**-2, HELD[1]**-2]))
+        known = joined(list(self._moved.values())).points + self._start[:2]
+        at = se2.transform(se2.inverse(match.pose), known)
+        crossed, met = through(cloud, at)
+        return match.share - crossed / max(met, 1)
+
+    def _matched(self, cloud: Cloud, guess: se2.Pose, step: se2.Pose) -> Match:
         config = self._config
-        metres, radians = odometry_sigmas(config, step)
+        metres, radians = (self._trust.scale * sigma for sigma in odometry_sigmas(config, step))
         information = np.diag([metres**-2, metres**-2, radians**-2]) / LOOSER**2
         seeds = cloud.points[:: max(len(cloud.points) // SEARCHED, 1)]
         slopes = SLOPE / metres**2, SLOPE / radians**2
         window = min(max(3 * metres, MIN_WINDOW), WINDOW), min(2 * radians, WINDOW_TURN)
         start, _ = self._map.search(seeds, guess, *window, STEP_YAW, *slopes)
         start = self._map.refine(cloud, start, 2 * config.sigma, guess, information).pose
-        return self._map.refine(cloud, start, config.sigma, guess, information).pose
+        return self._map.refine(cloud, start, config.sigma, guess, information)
 
     def _is_new(self, cloud: Cloud) -> bool:
         if not self.keyframes:

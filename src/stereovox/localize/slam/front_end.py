@@ -96,7 +96,7 @@ class Follower:
         self._lost += float(np.hypot(step[0], step[1]))
         side = min(WINDOW / 2 + 2 * self._lost, WIDEST)
         self._wide.set_target(joined(list(self._moved.values())))
-        found = self._wide.match(cloud, guess - self._start, side, WINDOW_TURN / 3)
+        found = self._wide.match(cloud, guess - self._start, side, min(WINDOW_TURN / 3 + abs(float(step[2])), WINDOW_TURN))
         if found is not None and found.share >= FOUND:
             self._lost = 0.0
             return self._map.refine(cloud, found.pose + self._start, self._config.sigma).pose
@@ -105,21 +105,21 @@ class Follower:
 
     def _judge(self, cloud: Cloud, since: Moment) -> None:
         """Believe matching or odometry since a moment, from when on they contradict each other."""
-        there, guess = self._trust.by_odometry(since, self.pose)
-        matched, driven = self._fit(cloud, self.pose), self._fit(cloud, guess)
-        if matched > driven + MARGIN:
+        guess = self._trust.by_odometry(since, self.pose)
+        (pose, matched), (other, driven) = self._fit(cloud, self.pose), self._fit(cloud, guess)
+        if _nearer(other, pose, guess) or matched > driven + MARGIN:
             self._trust.settle(SLIPPED)
             return
         self.pose, self._slack = guess, SLACK
         self._trust.settle(STUCK)
 
-    def _fit(self, cloud: Cloud, pose: se2.Pose) -> float:
-        """Return which share of a scan's points lie on the map if it is near `pose`, less that which sees through it."""
-        match = self._map.refine(cloud, pose, self._config.sigma, pose, np.diag([HELD[0]**-2, HELD[0]**-2, HELD[1]**-2]))
+    def _fit(self, cloud: Cloud, pose: se2.Pose) -> tuple[se2.Pose, float]:
+        """Return the best pose near `pose`, and the share of points on the map there, less those seen through."""
+        held = np.diag([HELD[0] ** -2, HELD[0] ** -2, HELD[1] ** -2])
+        match = self._map.refine(cloud, pose, self._config.sigma, pose, held)
         known = joined(list(self._moved.values())).points + self._start[:2]
-        at = se2.transform(se2.inverse(match.pose), known)
-        crossed, met = through(cloud, at)
-        return match.share - crossed / max(met, 1)
+        crossed, met = through(cloud, se2.transform(se2.inverse(match.pose), known))
+        return match.pose, match.share - crossed / max(met, 1)
 
     def _matched(self, cloud: Cloud, guess: se2.Pose, step: se2.Pose) -> Match:
         config = self._config
@@ -160,3 +160,9 @@ def odometry_sigmas(config: SlamConfig, step: se2.Pose) -> tuple[float, float]:
     """Return by how many metres and radians (standard deviations) a step (3,) of the odometry may be off."""
     base, per_metre, base_turn, per_radian = config.odometry
     return base + per_metre * float(np.hypot(step[0], step[1])), base_turn + per_radian * abs(float(step[2]))
+
+
+def _nearer(pose: se2.Pose, one: se2.Pose, other: se2.Pose) -> bool:
+    """Return whether a pose is nearer to one than to the other, a radian counting as a metre."""
+    a, b = (se2.relative(pose, goal) for goal in (one, other))
+    return float(np.linalg.norm(a)) < float(np.linalg.norm(b))

@@ -20,11 +20,13 @@ WINDOW, SCANS = 1.0, 20
 """Metres of odometry, and scans, over which the two motions are compared."""
 LEAST, LEAST_TURN = 0.25, 0.2
 """Metres and radians by which they may always differ."""
-FAR = 6.0
-"""Times the median difference so far from which on one of the two is wrong."""
-SLIPPED, STUCK = 4.0, 0.25
-"""Factors on the odometry's errors for a while: after wheels slipped, and after matching did not follow."""
-MARGIN = 0.1
+MOST, MOST_TURN = 0.4, 0.35
+"""Metres and radians beyond which they contradict each other on any drive."""
+FAR, RATE = 6.0, 0.01
+"""Times the usual difference from which on one of the two is wrong; how fast what is usual is learned, per scan."""
+SLIPPED, STUCK, WHILE = 2.0, 0.25, 10
+"""Factors on the odometry's errors for some scans: after wheels slipped, and after matching did not follow."""
+MARGIN = 0.25
 """Share of a scan's points by which the matched place must fit better than the odometry's, to be believed."""
 THICK = 0.3
 """Metres by which a beam must pass through a wall to contradict it."""
@@ -47,7 +49,7 @@ class Trust:
 
     def __init__(self) -> None:
         self._past: deque[Moment] = deque(maxlen=SCANS)
-        self._usual: deque[tuple[float, float]] = deque(maxlen=1000)
+        self._usual = np.array([LEAST, LEAST_TURN]) / FAR
         self._scale, self._left = 1.0, 0
 
     @property
@@ -69,23 +71,23 @@ class Trust:
         matched = se2.compose(last.matched, se2.relative(before, after))
         self._past.append(Moment(odometry, matched, way))
         since = next(moment for moment in self._past if moment.way > way - WINDOW)
-        metres, radians = self._difference(since)
-        usual = np.median(self._usual, axis=0) if len(self._usual) else (0.0, 0.0)
-        self._usual.append((metres, radians))
-        return since if metres > max(LEAST, FAR * usual[0]) or radians > max(LEAST_TURN, FAR * usual[1]) else None
+        apart = np.array(self._difference(since))
+        limits = np.clip(FAR * self._usual, (LEAST, LEAST_TURN), (MOST, MOST_TURN))
+        self._usual += RATE * (np.minimum(apart, 3 * self._usual) - self._usual)
+        return since if (apart > limits).any() else None
 
     def settle(self, scale: float) -> None:
         """Compare anew from the last scan on; the odometry's errors are `scale` times as large for a while."""
         last = self._past[-1]
         self._past.clear()
         self._past.append(last)
-        self._scale, self._left = scale, SCANS
+        self._scale, self._left = scale, WHILE
 
-    def by_odometry(self, since: Moment, pose: se2.Pose) -> tuple[se2.Pose, se2.Pose]:
-        """Return where the robot stood at `since`, and where it stands now by odometry, if it was matched to `pose`."""
+    def by_odometry(self, since: Moment, pose: se2.Pose) -> se2.Pose:
+        """Return where the robot, matched to `pose` (3,), stands by the odometry since a moment."""
         last = self._past[-1]
         there = se2.compose(pose, se2.relative(last.matched, since.matched))
-        return there, se2.compose(there, se2.relative(since.odometry, last.odometry))
+        return se2.compose(there, se2.relative(since.odometry, last.odometry))
 
     def _difference(self, since: Moment) -> tuple[float, float]:
         last = self._past[-1]

@@ -123,7 +123,8 @@ class Follower:
 
     def _matched(self, cloud: Cloud, guess: se2.Pose, step: se2.Pose) -> Match:
         config = self._config
-        metres, radians = (self._trust.scale * sigma for sigma in odometry_sigmas(config, step))
+        metres, radians = odometry_sigmas(config, step)
+        metres *= self._trust.scale
         information = np.diag([metres**-2, metres**-2, radians**-2]) / LOOSER**2
         seeds = cloud.points[:: max(len(cloud.points) // SEARCHED, 1)]
         slopes = SLOPE / metres**2, SLOPE / radians**2

@@ -39,7 +39,7 @@ def main() -> None:
     for seed in range(10_000)[parse_slice(arguments.seeds)]:
         scans, truth, what = slipping_drive(seed)
         result = map_scans(scans, config)
-        error, doubts = worst_m(result.track.pose_map_base, truth), getattr(result,"doubts",[])
+        error, doubts = worst_m(result.track.pose_map_base, truth), result.doubts
         case = error > WRONG_M, bool(doubts)
         counted[case] = counted.get(case, 0) + 1
         kinds = ", ".join(f"{doubt.kind} {doubt.figure:.2f}" for doubt in doubts)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from typing import Any
 
 import numpy as np
@@ -27,6 +28,8 @@ OTHERS = 6
 """Keyframes of other visits that one is compared with."""
 FEWEST_POINTS, CONTRADICTED = 300, 0.4
 """Points to judge a block by, and the share of them seen through from which on it is doubted: people and doors move."""
+TINY = 1.0
+"""Metres of way between two steps with slack that are not a part of their own."""
 STRETCH, BENT, BENT_TURN = 20.0, 0.4, 0.09
 """Metres of way, and metres and radians by which loops may have bent them: matching is off by some 2 %."""
 
@@ -75,10 +78,28 @@ def _doubt(keyframes: Sequence[Keyframe], kind: str, first: int, last: int, figu
 
 
 def _unseen(keyframes: Sequence[Keyframe], edges: Sequence[Edge]) -> Iterator[Doubt]:
-    """Yield the steps with slack that no loop spans."""
-    for i, keyframe in enumerate(keyframes):
-        if keyframe.slack and i and not any(edge.first < i <= edge.second for edge in edges):
-            yield _doubt(keyframes, "unseen", i - 1, i, keyframe.slack)
+    """Yield the steps with slack whose two sides no loop joins: each part between such steps needs a loop of its own."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    cuts = _cuts(keyframes)
+    part = np.zeros(len(keyframes), np.int64)
+    part[cuts] = 1
+    part = np.cumsum(part)
+    ends = np.array([(part[edge.first], part[edge.second]) for edge in edges], np.int64).reshape(-1, 2)
+    size = len(cuts) + 1
+    graph = coo_matrix((np.ones(len(ends)), (ends[:, 0], ends[:, 1])), shape=(size, size))
+    _, joined = connected_components(graph, directed=False)
+    for i in cuts:
+        if joined[part[i - 1]] != joined[part[i]]:
+            yield _doubt(keyframes, "unseen", i - 1, i, keyframes[i].slack)
+
+
+def _cuts(keyframes: Sequence[Keyframe]) -> list[int]:
+    """Return the keyframes whose step has slack; of several close to each other the last."""
+    slack = [i for i, keyframe in enumerate(keyframes) if keyframe.slack and i]
+    way = [keyframe.travelled for keyframe in keyframes]
+    return [i for i, later in zip_longest(slack, slack[1:]) if later is None or way[later] - way[i] > TINY]
 
 
 def _bent(keyframes: Sequence[Keyframe]) -> Iterator[Doubt]:

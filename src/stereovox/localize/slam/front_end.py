@@ -11,7 +11,7 @@ from stereovox.frame import Scan
 from stereovox.localize.slam.graph import Keyframe
 from stereovox.localize.slam.line_map import Cloud, LineMap, Match, cloud_of, joined
 from stereovox.localize.slam.loops import ClosureSearch
-from stereovox.localize.slam.trust import MARGIN, SLIPPED, STUCK, Moment, Trust, through
+from stereovox.localize.slam.trust import SLIPPED, STUCK, Moment, Trust, through
 
 STEP_YAW = 0.01
 """Radians between the turns that the search tries."""
@@ -30,6 +30,8 @@ FEWEST = 10
 
 LOST, FOUND = 0.5, 0.6
 """Share of a scan's points on the map below which a match is not believed, and from which on a wide search's is."""
+LOST_SCAN, UNSEEN = 0.05, 0.5
+"""Metres that a lost scan counts at least, and metres after which the map goes on from where the odometry leads."""
 WIDEST = 3.0
 """Metres of the wide search each way."""
 SLACK = 0.3
@@ -74,8 +76,9 @@ class Follower:
         if not self._is_new(cloud):
             return False
         step = se2.relative(self.keyframes[-1].pose, self.pose) if self.keyframes else np.zeros(3)
+        self._slack = SLACK if self._lost else self._slack
         self.keyframes.append(Keyframe(self.pose, step, cloud, scan, self._travelled, self._slack))
-        self._slack = 0.0
+        self._slack = SLACK if self._lost else 0.0
         self._rebuild()
         return True
 
@@ -93,21 +96,20 @@ class Follower:
         if match.share >= LOST:
             self._lost = 0.0
             return match.pose
-        self._lost += float(np.hypot(step[0], step[1]))
+        self._lost += max(float(np.hypot(step[0], step[1])), LOST_SCAN)
         side = min(WINDOW / 2 + 2 * self._lost, WIDEST)
         self._wide.set_target(joined(list(self._moved.values())))
         found = self._wide.match(cloud, guess - self._start, side, min(WINDOW_TURN / 3 + abs(float(step[2])), WINDOW_TURN))
         if found is not None and found.share >= FOUND:
             self._lost = 0.0
             return self._map.refine(cloud, found.pose + self._start, self._config.sigma).pose
-        self._slack = max(self._slack, SLACK)
         return guess
 
     def _judge(self, cloud: Cloud, since: Moment) -> None:
         """Believe matching or odometry since a moment, from when on they contradict each other."""
         guess = self._trust.by_odometry(since, self.pose)
         (pose, matched), (other, driven) = self._fit(cloud, self.pose), self._fit(cloud, guess)
-        if _nearer(other, pose, guess) or matched > driven + MARGIN:
+        if _nearer(other, pose, guess) or matched > driven + self._trust.margin:
             self._trust.settle(SLIPPED)
             return
         self.pose, self._slack = guess, SLACK
@@ -136,9 +138,11 @@ class Follower:
     def _is_new(self, cloud: Cloud) -> bool:
         if not self.keyframes:
             return len(cloud.points) >= FEWEST
+        if 0 < self._lost < UNSEEN or len(cloud.points) < FEWEST:
+            return False
         way = se2.relative(self.keyframes[-1].pose, self.pose)
         far = np.hypot(way[0], way[1]) > self._config.keyframe_distance or abs(way[2]) > self._config.keyframe_turn
-        return bool(far) and len(cloud.points) >= FEWEST
+        return bool(far)
 
     def _rebuild(self) -> None:
         """Make the map of the last keyframes; clouds that are in the map's frame stay so until poses change."""

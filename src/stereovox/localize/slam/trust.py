@@ -26,8 +26,9 @@ FAR, RATE = 6.0, 0.01
 """Times the usual difference from which on one of the two is wrong; how fast what is usual is learned, per scan."""
 SLIPPED, STUCK, WHILE = 2.0, 0.25, 10
 """Factors on the odometry's errors for some scans: after wheels slipped, and after matching did not follow."""
-MARGIN = 0.25
-"""Share of a scan's points by which the matched place must fit better than the odometry's, to be believed."""
+MARGIN, MARGIN_SLIPPING = 0.25, 0.05
+"""Share of a scan's points by which the matched place must fit better than the odometry's, to be believed: at first, and
+while wheels slip."""
 THICK = 0.3
 """Metres by which a beam must pass through a wall to contradict it."""
 
@@ -56,6 +57,11 @@ class Trust:
     def scale(self) -> float:
         """The factor for the next scan."""
         return self._scale if self._left else 1.0
+
+    @property
+    def margin(self) -> float:
+        """The share by which the matched place must fit better."""
+        return MARGIN_SLIPPING if self.scale > 1 else MARGIN
 
     def add(self, odometry: se2.Pose, before: se2.Pose, after: se2.Pose) -> Moment | None:
         """Take the odometry (3,) at a scan whose match moved the robot from `before` to `after`, (3,) each.

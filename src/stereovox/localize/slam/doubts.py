@@ -35,7 +35,7 @@ STRETCH, BENT, BENT_TURN = 20.0, 0.4, 0.09
 
 
 @dataclass(frozen=True)
-class Doubt:
+class MapDoubt:
     """Why a part of a map may be wrong.
 
     kind: `unseen` (matching and odometry contradicted each other, and nothing later shows which was right), `bent`
@@ -66,18 +66,18 @@ SENTENCES = {
 }
 
 
-def doubts_of(keyframes: Sequence[Keyframe], edges: Sequence[Edge]) -> list[Doubt]:
+def doubts_of(keyframes: Sequence[Keyframe], edges: Sequence[Edge]) -> list[MapDoubt]:
     """Return what speaks against a finished map, in order of time; `edges`: the loops closed."""
     found = [*_unseen(keyframes, edges), *_bent(keyframes), *_contradicted(keyframes)]
     return sorted(found, key=lambda doubt: (doubt.begin_s, doubt.kind))
 
 
-def _doubt(keyframes: Sequence[Keyframe], kind: str, first: int, last: int, figure: float) -> Doubt:
+def _doubt(keyframes: Sequence[Keyframe], kind: str, first: int, last: int, figure: float) -> MapDoubt:
     start, begin, end = (keyframes[i].scan.stamp_ns for i in (0, first, last))
-    return Doubt(kind, 1e-9 * (begin - start), 1e-9 * (end - start), float(figure))
+    return MapDoubt(kind, 1e-9 * (begin - start), 1e-9 * (end - start), float(figure))
 
 
-def _unseen(keyframes: Sequence[Keyframe], edges: Sequence[Edge]) -> Iterator[Doubt]:
+def _unseen(keyframes: Sequence[Keyframe], edges: Sequence[Edge]) -> Iterator[MapDoubt]:
     """Yield the steps with slack whose two sides no loop joins: each part between such steps needs a loop of its own."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
@@ -102,7 +102,7 @@ def _cuts(keyframes: Sequence[Keyframe]) -> list[int]:
     return [i for i, later in zip_longest(slack, slack[1:]) if later is None or way[later] - way[i] > TINY]
 
 
-def _bent(keyframes: Sequence[Keyframe]) -> Iterator[Doubt]:
+def _bent(keyframes: Sequence[Keyframe]) -> Iterator[MapDoubt]:
     """Yield the stretch that the graph bent most against what matching said, if it is too much."""
     way = np.array([keyframe.travelled for keyframe in keyframes])
     ends = np.minimum(np.searchsorted(way, way + STRETCH), len(way) - 1)
@@ -122,7 +122,7 @@ def _chained(keyframes: Sequence[Keyframe]) -> Iterator[se2.Pose]:
         yield pose
 
 
-def _contradicted(keyframes: Sequence[Keyframe]) -> Iterator[Doubt]:
+def _contradicted(keyframes: Sequence[Keyframe]) -> Iterator[MapDoubt]:
     """Yield the block whose points are seen through most, if they are too many."""
     places = np.array([keyframe.pose for keyframe in keyframes])
     way = np.array([keyframe.travelled for keyframe in keyframes])

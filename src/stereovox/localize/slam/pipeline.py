@@ -20,7 +20,7 @@ from stereovox.config import Config, load_config
 from stereovox.errors import FrameRefused, StereovoxError
 from stereovox.frame import Scan
 from stereovox.integrate.beams import make_beams
-from stereovox.localize.slam.doubts import Doubt, doubts_of
+from stereovox.localize.slam.doubts import MapDoubt, doubts_of
 from stereovox.localize.slam.front_end import Follower
 from stereovox.localize.slam.graph import Edge, Keyframe, in_map, optimised, patch_edges, step_edges
 from stereovox.localize.slam.loops import LoopFinder
@@ -162,7 +162,7 @@ class SlamResult:
     keyframes: list[Keyframe]
     edges: list[Edge]
     refused: dict[str, int]
-    doubts: list[Doubt]
+    doubts: list[MapDoubt]
 
     @property
     def closures(self) -> int:

@@ -34,8 +34,6 @@ LOST_SCAN, UNSEEN = 0.05, 0.5
 """Metres that a lost scan counts at least, and metres after which the map goes on from where the odometry leads."""
 WIDEST = 3.0
 """Metres of the wide search each way."""
-SLACK = 0.3
-"""Metres by which a step that nothing but the odometry tells may be off."""
 HELD = (0.05, 0.03)
 """Metres and radians near a place within which its fit is measured."""
 
@@ -76,9 +74,9 @@ class Follower:
         if not self._is_new(cloud):
             return False
         step = se2.relative(self.keyframes[-1].pose, self.pose) if self.keyframes else np.zeros(3)
-        self._slack = SLACK if self._lost else self._slack
+        self._slack = max(self._slack, self._lost)
         self.keyframes.append(Keyframe(self.pose, step, cloud, scan, self._travelled, self._slack))
-        self._slack = SLACK if self._lost else 0.0
+        self._slack = self._lost
         self._rebuild()
         return True
 
@@ -112,7 +110,7 @@ class Follower:
         if _nearer(other, pose, guess) or matched > driven + self._trust.margin:
             self._trust.settle(SLIPPED)
             return
-        self.pose, self._slack = guess, SLACK
+        self.pose, self._slack = guess, float(np.hypot(*(guess - self.pose)[:2])) + HELD[0]
         self._trust.settle(STUCK)
 
     def _fit(self, cloud: Cloud, pose: se2.Pose) -> tuple[se2.Pose, float]:

@@ -8,6 +8,7 @@ A map is wrong where a pose of its track, after the best rigid fit to the true o
 
 import argparse
 import time
+from itertools import pairwise
 
 import numpy as np
 
@@ -94,7 +95,11 @@ def corridors(random: np.random.Generator) -> tuple[list, list[tuple[float, floa
     free = [(-1.0, -half, length, half)]
     stops = [(0.0, 0.0), (length - 1.2, 0.0)]
     if plan == "ring":
-        free += [(length - width, -half, length, depth), (-1.0, depth - width, length, depth), (-1.0, 0, width - 1, depth)]
+        free += [
+            (length - width, -half, length, depth),
+            (-1.0, depth - width, length, depth),
+            (-1.0, 0, width - 1, depth),
+        ]
         x0, x1, y1 = half - 1.0, length - half, depth - half
         stops = [(x0 + 1, 0.0), (x1, 0.0), (x1, y1), (x0, y1), (x0, 0.0), (x1, 0.0), (x1, y1)]
     elif plan == "branch":
@@ -140,7 +145,7 @@ def panes(walls: np.ndarray, random: np.random.Generator) -> tuple[np.ndarray, n
     for wall in walls:
         start, end = wall[:2], wall[2:]
         cuts = np.linspace(0, 1, int(np.linalg.norm(end - start) / 2) + 2)
-        pieces += [(*(start + a * (end - start)), *(start + b * (end - start))) for a, b in zip(cuts, cuts[1:])]
+        pieces += [(*(start + a * (end - start)), *(start + b * (end - start))) for a, b in pairwise(cuts)]
     made = np.array(pieces)
     glass = (random.random(len(made)) < share) & (np.hypot(*(made[:, 2:] - made[:, :2]).T) > 0.8)
     return made[~glass], made[glass]

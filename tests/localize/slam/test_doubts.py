@@ -17,7 +17,9 @@ from stereovox.localize.slam.trust import SLIPPED, Trust, through
 
 
 def worst(result, truth):
-    left = se2.relative(se2.relative(truth[0], truth), se2.relative(result.track.pose_map_base[0], result.track.pose_map_base))
+    left = se2.relative(
+        se2.relative(truth[0], truth), se2.relative(result.track.pose_map_base[0], result.track.pose_map_base)
+    )
     return np.hypot(left[:, 0], left[:, 1]).max()
 
 
@@ -25,7 +27,9 @@ def worst(result, truth):
 def loop():
     pytest.importorskip("gtsam")
     slam = Slam(load_config())
-    for scan in drive(ring(), along([(1, 1), (13, 1), (13, 9), (1, 9), (1, 1), (13, 1)], step=0.15), drift=(1.03, 0.01)):
+    for scan in drive(
+        ring(), along([(1, 1), (13, 1), (13, 9), (1, 9), (1, 1), (13, 1)], step=0.15), drift=(1.03, 0.01)
+    ):
         slam.add(scan)
     return slam.finish()
 
@@ -112,7 +116,9 @@ def test_beams_that_pass_through_points_are_counted():
     angles = np.radians(np.arange(-90, 91))
     wall = 4 * np.column_stack([np.cos(angles), np.sin(angles)])
     seen = Cloud(wall.astype(np.float32), -wall.astype(np.float32) / 4)
-    ahead = np.array([[2.0, 0.0], [3.9, 0.0], [6.0, 0.0], [-2.0, 0.0]])  # seen through, the wall, behind it, not looked at
+    ahead = np.array(
+        [[2.0, 0.0], [3.9, 0.0], [6.0, 0.0], [-2.0, 0.0]]
+    )  # seen through, the wall, behind it, not looked at
     assert through(seen, ahead) == (1, 2)
 
 

@@ -104,6 +104,8 @@ def fit(index, cells, sums, cell, radius, lines):
         if lines[slot, 6] == ZERO:
             length = np.sqrt(vx * vx + vy * vy) + TINY
             nx, ny = vx / length, vy / length
+        if n <= FEW:
+            lines[slot, 6] = -ONE
         lines[slot, 4], lines[slot, 5] = nx, ny
         lines[slot, 7] = ZERO
 

@@ -30,7 +30,7 @@ FEWEST_POINTS, CONTRADICTED = 300, 0.4
 """Points to judge a block by, and the share of them seen through from which on it is doubted: people and doors move."""
 TINY = 1.0
 """Metres of way between two steps with slack that are not a part of their own."""
-STRETCH, BENT, BENT_TURN = 20.0, 0.4, 0.09
+STRETCH, BENT, BENT_TURN = 20.0, 0.3, 0.09
 """Metres of way, and metres and radians by which loops may have bent them: matching is off by some 2 %."""
 
 
@@ -78,7 +78,7 @@ def _doubt(keyframes: Sequence[Keyframe], kind: str, first: int, last: int, figu
 
 
 def _unseen(keyframes: Sequence[Keyframe], edges: Sequence[Edge]) -> Iterator[MapDoubt]:
-    """Yield the steps with slack whose two sides no loop joins: each part between such steps needs a loop of its own."""
+    """Yield the steps with slack whose two sides no loop joins: each part between them needs one."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import connected_components
 

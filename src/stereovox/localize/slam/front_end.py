@@ -27,7 +27,6 @@ SEARCHED = 100
 """Points that the search looks at: it need only come near."""
 FEWEST = 10
 """Hits below which a scan is not matched: its pose is the odometry's."""
-
 LOST, FOUND = 0.5, 0.6
 """Share of a scan's points on the map below which a match is not believed, and from which on a wide search's is."""
 LOST_SCAN, UNSEEN = 0.05, 0.5
@@ -91,13 +90,15 @@ class Follower:
         if len(cloud.points) < FEWEST or not self.keyframes:
             return guess
         match = self._matched(cloud, guess, step)
-        if match.share >= LOST:
+        if match.share >= LOST or (not self._lost and _agree(match.pose, guess, odometry_sigmas(self._config, step))):
             self._lost = 0.0
             return match.pose
         self._lost += max(float(np.hypot(step[0], step[1])), LOST_SCAN)
         side = min(WINDOW / 2 + 2 * self._lost, WIDEST)
         self._wide.set_target(joined(list(self._moved.values())))
-        found = self._wide.match(cloud, guess - self._start, side, min(WINDOW_TURN / 3 + abs(float(step[2])), WINDOW_TURN))
+        found = self._wide.match(
+            cloud, guess - self._start, side, min(WINDOW_TURN / 3 + abs(float(step[2])), WINDOW_TURN)
+        )
         if found is not None and found.share >= FOUND:
             self._lost = 0.0
             return self._map.refine(cloud, found.pose + self._start, self._config.sigma).pose
@@ -163,6 +164,12 @@ def odometry_sigmas(config: SlamConfig, step: se2.Pose) -> tuple[float, float]:
     """Return by how many metres and radians (standard deviations) a step (3,) of the odometry may be off."""
     base, per_metre, base_turn, per_radian = config.odometry
     return base + per_metre * float(np.hypot(step[0], step[1])), base_turn + per_radian * abs(float(step[2]))
+
+
+def _agree(pose: se2.Pose, guess: se2.Pose, sigmas: tuple[float, float]) -> bool:
+    """Return whether a match is where the odometry leads: then a scan that finds few walls looks at new ones."""
+    left = se2.relative(guess, pose)
+    return float(np.hypot(left[0], left[1])) < sigmas[0] and abs(float(left[2])) < sigmas[1]
 
 
 def _nearer(pose: se2.Pose, one: se2.Pose, other: se2.Pose) -> bool:

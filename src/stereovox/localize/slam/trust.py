@@ -27,7 +27,7 @@ FAR, RATE = 6.0, 0.01
 SLIPPED, STUCK, WHILE = 2.0, 0.25, 10
 """Factors on the odometry's errors for some scans: after wheels slipped, and after matching did not follow."""
 MARGIN, MARGIN_SLIPPING = 0.25, 0.05
-"""Share of a scan's points by which the matched place must fit better than the odometry's, to be believed: at first, and
+"""Share of a scan's points by which the matched place must fit better than the odometry's, to be believed: usually, and
 while wheels slip."""
 THICK = 0.3
 """Metres by which a beam must pass through a wall to contradict it."""
@@ -97,9 +97,7 @@ class Trust:
 
     def _difference(self, since: Moment) -> tuple[float, float]:
         last = self._past[-1]
-        left = se2.relative(
-            se2.relative(since.matched, last.matched), se2.relative(since.odometry, last.odometry)
-        )
+        left = se2.relative(se2.relative(since.matched, last.matched), se2.relative(since.odometry, last.odometry))
         return float(np.hypot(left[0], left[1])), abs(float(left[2]))
 
 
@@ -109,6 +107,7 @@ def through(seen: Cloud, points: NDArray[np.floating], bins: int = 720) -> tuple
     seen: the scan, in the robot's frame; points: (N, 2) there. A point counts where the scan has a beam within half a
     degree; it is seen through where that beam ends `THICK` metres or more behind it, on both sides too.
     """
+
     def polar(p: NDArray[np.floating]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         turn = np.arctan2(p[:, 1], p[:, 0])
         return np.floor((turn + np.pi) * (bins / (2 * np.pi))).astype(np.int64) % bins, np.hypot(*p.T)

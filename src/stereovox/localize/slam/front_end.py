@@ -27,6 +27,9 @@ SEARCHED = 100
 """Points that the search looks at: it need only come near."""
 FEWEST = 10
 """Hits below which a scan is not matched: its pose is the odometry's."""
+FEWEST_NEAR = 3
+"""Points of the map that a scan's point needs near it: along a corridor lone far ones lie where beams do, and hold
+every scan where the first was."""
 LOST, FOUND = 0.5, 0.6
 """Share of a scan's points on the map below which a match is not believed, and from which on a wide search's is."""
 LOST_SCAN, UNSEEN = 0.05, 0.5
@@ -48,7 +51,7 @@ class Follower:
         self.keyframes: list[Keyframe] = []
         self.pose: se2.Pose = np.zeros(3)
         self._config = config
-        self._map = LineMap(config.voxel_size, reach=0.2)
+        self._map = LineMap(config.voxel_size, reach=0.2, fewest=FEWEST_NEAR)
         self._odometry: se2.Pose | None = None
         self._travelled = 0.0
         self._start: se2.Pose = np.zeros(3)

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """A finished map's self-check: what its own scans say against it.
 
-The limits were chosen on seeds 0 to 49 of `benchmarks/slam_drives.py` and on the logs ACES, MIT-CSAIL and fr079.
+The limits were chosen on seeds 0 to 99 of `benchmarks/slam_drives.py` and on the logs ACES, MIT-CSAIL and fr079.
 """
 
 from __future__ import annotations

@@ -10,7 +10,6 @@ from made_drives import along, box, drive, ring
 from stereovox import se2
 from stereovox.config import load_config
 from stereovox.localize.slam.doubts import BENT, CONTRADICTED, MapDoubt, doubts_of
-from stereovox.localize.slam.graph import Keyframe
 from stereovox.localize.slam.line_map import Cloud
 from stereovox.localize.slam.pipeline import Slam, map_scans
 from stereovox.localize.slam.trust import SLIPPED, Trust, through
@@ -106,7 +105,7 @@ def test_steps_that_agree_are_no_contradiction_and_far_ones_are():
         assert trust.add(np.array([0.1 * i, 0, 0]), pose, se2.compose(pose, [0.1, 0.0, 0.0])) is None
     found = [trust.add(np.array([2.9 + 0.1 * i, 0, 0]), pose, pose) for i in range(1, 6)]
     since = next(moment for moment in found if moment is not None)
-    assert found.index(since) == 2 if since in found else False
+    assert found[:2] == [None, None]  # 0.2 m may be a clock
     assert trust.by_odometry(since, pose)[0] > 0.25
     trust.settle(SLIPPED)
     assert trust.scale == SLIPPED
@@ -115,12 +114,8 @@ def test_steps_that_agree_are_no_contradiction_and_far_ones_are():
 def test_beams_that_pass_through_points_are_counted():
     angles = np.radians(np.arange(-90, 91))
     wall = 4 * np.column_stack([np.cos(angles), np.sin(angles)])
-    seen = Cloud(wall.astype(np.float32), -wall.astype(np.float32) / 4)
+    seen = Cloud(wall.astype(np.float32), (wall / -4).astype(np.float32))
     ahead = np.array(
         [[2.0, 0.0], [3.9, 0.0], [6.0, 0.0], [-2.0, 0.0]]
     )  # seen through, the wall, behind it, not looked at
     assert through(seen, ahead) == (1, 2)
-
-
-def test_a_keyframe_has_no_slack_unless_it_is_said():
-    assert Keyframe(np.zeros(3), np.zeros(3), None, None, 0.0).slack == 0

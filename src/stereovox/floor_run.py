@@ -24,12 +24,14 @@ from stereovox.frame import Frame, Scan
 from stereovox.localize.robot_track import (
     Progress,
     check_start,
+    doubt_lines,
     fit_of,
     localise_robot,
     no_progress,
     refused_line,
     slam_robot,
 )
+from stereovox.localize.slam.doubts import MapDoubt
 from stereovox.localize.track import Track
 from stereovox.mapper import GridMapper
 from stereovox.maps.grid_map import GridMap
@@ -167,6 +169,7 @@ class FloorRun:
                 lambda: self.mapper.save(self.out, self._mode), self.out, self._checkpoint_s
             )
             self._track: Track | None = None
+            self._doubts: list[MapDoubt] = []
             self._open = stack.pop_all()
         return self
 
@@ -209,7 +212,7 @@ class FloorRun:
             if not self.mapper.map.frames:
                 raise StereovoxError(f"not one reading could be used, no map is written ({first_refusal(reports)})")
             self._checkpoints.save(len(reports))
-        return MapResult(self.mapper.map, self.out, reports, track=track)
+        return MapResult(self.mapper.map, self.out, reports, track=track, doubts=self._doubts)
 
     def _stopped(self, done: int) -> None:
         saved = f"they are saved in {self.out.with_suffix('.yaml')}"
@@ -276,6 +279,9 @@ class FloorRun:
         except MissingExtra as missing:
             raise StereovoxError(f"{missing}; or go on without SLAM: poses odometry (--poses odometry)") from None
         self._notify_unless_empty(refused_line(found.refused))
+        for line in doubt_lines(found.doubts):
+            self._notify(line)
+        self._doubts = found.doubts
         return found.track
 
     def _localise(self, floor: OccupancyGrid, progress: Progress) -> Track:

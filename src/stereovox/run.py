@@ -25,6 +25,7 @@ from stereovox.device import on_usable_device
 from stereovox.errors import MapFileError, SourceError, StereovoxError, one_line
 from stereovox.evaluate.summary import summarise
 from stereovox.frame import UpdateReport
+from stereovox.localize.slam.doubts import MapDoubt
 from stereovox.localize.track import Track
 from stereovox.mapper import AnyMapper, Mapper
 from stereovox.maps import VoxelMap, load_map
@@ -75,6 +76,7 @@ class MapResult(Generic[MapT]):
         reports: One report for each frame of this run, in order.
         dropped: Number of frames that a live camera delivered while the mapper was busy.
         track: The robot's trajectory in the map, from `map_floor`; None where the odometry's poses were used.
+        doubts: Why the map may be wrong, from `map_floor` with SLAM; empty where its self-check found nothing.
     """
 
     map: MapT
@@ -82,6 +84,7 @@ class MapResult(Generic[MapT]):
     reports: list[UpdateReport]
     dropped: int = 0
     track: Track | None = None
+    doubts: Sequence[MapDoubt] = ()
 
     def _repr_html_(self) -> str:
         """Return what a notebook shows: the map's picture and facts."""
@@ -93,7 +96,8 @@ class MapResult(Generic[MapT]):
         Returns:
             The numbers of `stereovox map --json`: frames, refusals by reason, milliseconds, cells, memory.
         """
-        return summarise(self.map, self.reports)
+        summary = summarise(self.map, self.reports)
+        return summary | ({"doubts": [doubt.as_dict() for doubt in self.doubts]} if self.doubts else {})
 
 
 def map_recording(

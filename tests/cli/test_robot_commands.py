@@ -9,6 +9,7 @@ import pytest
 from stereovox.cli import main
 from stereovox.cli.slam import _pace
 from stereovox.formats.map_server import read_map_server
+from stereovox.localize.slam.doubts import MapDoubt
 from stereovox.opening import open_robot
 from stereovox.sources.bags import open_bag
 from stereovox.sources.bags.messages import read_pose
@@ -75,6 +76,19 @@ def test_slam_saves_map_and_way(bag, reference, tmp_path, capsys):
 def test_slam_says_its_pace_only_where_stamps_tell(recorded, seconds, words):
     assert _pace(recorded, seconds, False).startswith(words)
     assert bool(_pace(recorded, seconds, False)) == bool(words)
+
+
+@pytest.mark.parametrize("command", [("slam",), ("grid", "--use", "lidar"), ("map", "--set", "dimensions=2")])
+def test_a_doubted_map_is_written_with_a_warning_and_status_3(command, monkeypatch, tmp_path, capsys):
+    doubt = MapDoubt("bent", 3.0, 9.0, 0.84)
+    monkeypatch.setattr("stereovox.localize.slam.pipeline.doubts_of", lambda keyframes, edges: [doubt])
+    out, drive = tmp_path / "a.yaml", "sim:floor?plan=testbed&seconds=3&scan_hz=4&depth_hz=1&image_width=16"
+    assert main([command[0], drive, "--out", str(out), *command[1:], "--json"]) == 3
+    said = capsys.readouterr()
+    assert "warning: this map may be wrong" in said.err
+    assert "bent, 3 to 9 s: loops bent 20 m of the trajectory by 0.8 m" in said.err
+    assert json.loads(said.out.splitlines()[-1])["doubts"] == [doubt.as_dict()]
+    assert read_map_server(out).cells.size
 
 
 def test_slam_scores_relations(tmp_path, capsys):

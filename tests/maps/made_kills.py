@@ -83,7 +83,9 @@ class FloorBySlam(Floor):
 
         def found(robot, config, progress):
             stamps_ns = np.array([robot.scans[i].stamp_ns for i in range(n + 2)])
-            return SlamResult(Track(stamps_ns, np.full((n + 2, 3), float(n)), np.zeros((n + 2, 3))), grid, [], [], {})
+            return SlamResult(
+                Track(stamps_ns, np.full((n + 2, 3), float(n)), np.zeros((n + 2, 3))), grid, [], [], {}, []
+            )
 
         robot_track.slam_robot = found
         done("slam", DRIVE, "--out", self.out)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command line. Text for people goes to stderr; with --json the last line of stdout is one JSON object.
 
-Exit status: 0 ok, 2 bad usage or bad input (one line names the problem and the cure), 130 stopped by Ctrl-C,
-143 by SIGTERM.
+Exit status: 0 ok, 2 bad usage or bad input (one line names the problem and the cure), 3 the map is written but
+doubted (a result's `doubts`), 130 stopped by Ctrl-C, 143 by SIGTERM.
 """
 
 from __future__ import annotations
@@ -55,6 +55,8 @@ COMMANDS = (
 The module of a command that is a Python keyword has a trailing underscore.
 """
 
+DOUBTED = 3
+"""Exit status of a command that wrote a map which may be wrong."""
 GLOBAL_OPTIONS = ("-h", "--help", "--version")
 """Options that may stand before a command or without one."""
 
@@ -66,7 +68,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         _check_command(words)
         arguments = _parse(words)
         result = _module(arguments.command).run(arguments)
-        return _print_json(result) if arguments.json else 0
+        failed = _print_json(result) if arguments.json else 0
+        return failed or (DOUBTED if result.get("doubts") else 0)
     except StereovoxError as error:
         return _fail(" ".join(str(error).split()), 2, words)
     except OSError as error:  # not foreseen by a command: a folder without search permission, a full disk

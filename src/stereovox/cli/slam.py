@@ -2,7 +2,7 @@
 """Make a floor map from a robot's lidar and odometry by SLAM.
 
 Scans are matched, loops closed, and trajectory and map optimised together. The trajectory is saved beside the map
-(`.tum`).
+(`.tum`). A map that its own scans speak against is written too, with warnings and exit status 3.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
 def _map(arguments: Namespace, out: Path) -> dict[str, Any]:
     from stereovox.evaluate.trajectory import read_relations
     from stereovox.formats.map_server import write_map_server
-    from stereovox.localize.robot_track import slam_robot
+    from stereovox.localize.robot_track import doubt_lines, slam_robot
 
     config = settings_of(arguments)
     if arguments.relations is not None:
@@ -61,6 +61,8 @@ def _map(arguments: Namespace, out: Path) -> dict[str, Any]:
     write_map_server(found.grid, out)
     found.track.save(out.with_suffix(".tum"))
     result = {**_print_result(robot, found, seconds, compiling), **_score(found, arguments.relations)}
+    for line in doubt_lines(found.doubts):
+        say(line)
     say(f"saved in {out}, the trajectory in {out.with_suffix('.tum')}; look at it with: {picture_line(out)}")
     return result
 
@@ -75,7 +77,8 @@ def _print_result(robot: Robot, found: SlamResult, seconds: float, compiling: bo
     if found.refused:
         say(refused_line(found.refused))
     scans = {"scans": len(track.stamps_ns), "scans_refused": sum(found.refused.values()), "refused": found.refused}
-    times = {"closures": found.closures, "seconds": seconds, "recorded_s": recorded}
+    doubts = [doubt.as_dict() for doubt in found.doubts]
+    times = {"closures": found.closures, "seconds": seconds, "recorded_s": recorded, "doubts": doubts}
     return {**scans, **times, **print_trajectory_error(track, robot)}
 
 

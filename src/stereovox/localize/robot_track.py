@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from importlib.util import find_spec
 
 import numpy as np
@@ -13,6 +13,7 @@ from stereovox.config import Config
 from stereovox.errors import MissingExtra, StereovoxError
 from stereovox.localize.amcl.localise import localise
 from stereovox.localize.fit import NEAR, fit_share
+from stereovox.localize.slam.doubts import MapDoubt
 from stereovox.localize.slam.pipeline import SlamResult, map_scans
 from stereovox.localize.track import Track
 from stereovox.maps.occupancy import OccupancyGrid
@@ -82,6 +83,13 @@ def refused_line(refused: Mapping[str, int], first: str = "") -> str:
         return ""
     reasons = ", ".join(f"{number} x {reason}" for reason, number in refused.items())
     return f"{sum(refused.values())} scans refused: {reasons}" + (f", first: {first}" if first else "")
+
+
+def doubt_lines(doubts: Sequence[MapDoubt]) -> list[str]:
+    """Return what a user should read about a map by SLAM that may be wrong; empty if nothing speaks against it."""
+    if not doubts:
+        return []
+    return ["warning: this map may be wrong; look at it before you use it", *(f"  {doubt.line()}" for doubt in doubts)]
 
 
 def fit_of(robot: Robot, floor: OccupancyGrid, track: Track) -> tuple[float | None, str]:

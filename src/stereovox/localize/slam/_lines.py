@@ -63,11 +63,12 @@ def gather(points, corner, views, cell, index, cells, sums):
 
 
 @kernel
-def fit(index, cells, sums, cell, radius, lines):
+def fit(index, cells, sums, cell, radius, fewest, lines):
     """Lay a line through the points round each slot that were seen from its side.
 
-    radius: cells on each side. lines: (S, 8) float32: mean of the slot itself x, y; mean of its neighbourhood x, y; the
-    line's normal, for a mere point the direction, towards the sensor x, y; 1 for a line, 0 for a mere point; 0.
+    radius: cells on each side. fewest: points of a neighbourhood below which nothing is laid onto it.
+    lines: (S, 8) float32: mean of the slot itself x, y; mean of its neighbourhood x, y; the line's normal, for a mere
+    point the direction, towards the sensor x, y; 1 for a line, 0 for a mere point, -1 for too few points; 0.
     """
     rows, columns = index.shape
     for slot in range(len(lines)):
@@ -104,6 +105,8 @@ def fit(index, cells, sums, cell, radius, lines):
         if lines[slot, 6] == ZERO:
             length = np.sqrt(vx * vx + vy * vy) + TINY
             nx, ny = vx / length, vy / length
+        if n < fewest:
+            lines[slot, 6] = -ONE
         lines[slot, 4], lines[slot, 5] = nx, ny
         lines[slot, 7] = ZERO
 

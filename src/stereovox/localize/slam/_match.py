@@ -122,7 +122,7 @@ def refine(points, views, near, lines, cell, sigma, point_weight, prior, informa
             if row < 0 or column < 0 or row >= rows or column >= columns:
                 continue
             slot = near[row, column]
-            if slot < 0:
+            if slot < 0 or lines[slot, 6] < ZERO:
                 continue
             nx, ny = lines[slot, 4], lines[slot, 5]
             vx = cosine * views[i, 0] - sine * views[i, 1]

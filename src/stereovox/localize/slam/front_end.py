@@ -9,7 +9,9 @@ from stereovox import se2
 from stereovox.config.robot import SlamConfig
 from stereovox.frame import Scan
 from stereovox.localize.slam.graph import Keyframe
-from stereovox.localize.slam.line_map import Cloud, LineMap, cloud_of, joined
+from stereovox.localize.slam.line_map import Cloud, LineMap, Match, cloud_of, joined
+from stereovox.localize.slam.loops import ClosureSearch
+from stereovox.localize.slam.trust import SLIPPED, STUCK, Moment, Trust, through
 
 STEP_YAW = 0.01
 """Radians between the turns that the search tries."""
@@ -25,6 +27,17 @@ SEARCHED = 100
 """Points that the search looks at: it need only come near."""
 FEWEST = 10
 """Hits below which a scan is not matched: its pose is the odometry's."""
+FEWEST_NEAR = 3
+"""Points of the map that a scan's point needs near it: along a corridor lone far ones lie where beams do, and hold
+every scan where the first was."""
+LOST, FOUND = 0.5, 0.6
+"""Share of a scan's points on the map below which a match is not believed, and from which on a wide search's is."""
+LOST_SCAN, UNSEEN = 0.05, 0.5
+"""Metres that a lost scan counts at least, and metres after which the map goes on from where the odometry leads."""
+WIDEST = 3.0
+"""Metres of the wide search each way."""
+HELD = (0.05, 0.03)
+"""Metres and radians near a place within which its fit is measured."""
 
 
 class Follower:
@@ -38,11 +51,13 @@ class Follower:
         self.keyframes: list[Keyframe] = []
         self.pose: se2.Pose = np.zeros(3)
         self._config = config
-        self._map = LineMap(config.voxel_size, reach=0.2)
+        self._map = LineMap(config.voxel_size, reach=0.2, fewest=FEWEST_NEAR)
         self._odometry: se2.Pose | None = None
         self._travelled = 0.0
         self._start: se2.Pose = np.zeros(3)
         self._moved: dict[int, Cloud] = {}
+        self._trust, self._slack, self._lost = Trust(), 0.0, 0.0
+        self._wide = ClosureSearch(config)
 
     def add(self, scan: Scan) -> bool:
         """Find the pose of the next scan; return whether it became a keyframe."""
@@ -52,13 +67,18 @@ class Follower:
             self._start[:2] = np.floor(odometry[:2])  # float32 points stay exact far from the world's origin
         else:
             step = se2.relative(self._odometry, odometry)
-            before, self.pose = self.pose, self._matched(cloud, se2.compose(self.pose, step), step)
+            before, self.pose = self.pose, self._found(cloud, se2.compose(self.pose, step), step)
+            since = self._trust.add(odometry, before, self.pose)
+            if since is not None and self.keyframes:
+                self._judge(cloud, since)
             self._travelled += float(np.hypot(*(self.pose - before)[:2]))
         self._odometry = odometry
         if not self._is_new(cloud):
             return False
         step = se2.relative(self.keyframes[-1].pose, self.pose) if self.keyframes else np.zeros(3)
-        self.keyframes.append(Keyframe(self.pose, step, cloud, scan, self._travelled))
+        self._slack = max(self._slack, self._lost)
+        self.keyframes.append(Keyframe(self.pose, step, cloud, scan, self._travelled, self._slack))
+        self._slack = self._lost
         self._rebuild()
         return True
 
@@ -68,25 +88,63 @@ class Follower:
         self._moved.clear()
         self._rebuild()
 
-    def _matched(self, cloud: Cloud, guess: se2.Pose, step: se2.Pose) -> se2.Pose:
+    def _found(self, cloud: Cloud, guess: se2.Pose, step: se2.Pose) -> se2.Pose:
+        """Return the pose of a scan: as matched, or found by a wide search, or else by the odometry, with slack."""
         if len(cloud.points) < FEWEST or not self.keyframes:
             return guess
+        match = self._matched(cloud, guess, step)
+        if match.share >= LOST or (not self._lost and _agree(match.pose, guess, odometry_sigmas(self._config, step))):
+            self._lost = 0.0
+            return match.pose
+        self._lost += max(float(np.hypot(step[0], step[1])), LOST_SCAN)
+        side = min(WINDOW / 2 + 2 * self._lost, WIDEST)
+        self._wide.set_target(joined(list(self._moved.values())))
+        found = self._wide.match(
+            cloud, guess - self._start, side, min(WINDOW_TURN / 3 + abs(float(step[2])), WINDOW_TURN)
+        )
+        if found is not None and found.share >= FOUND:
+            self._lost = 0.0
+            return self._map.refine(cloud, found.pose + self._start, self._config.sigma).pose
+        return guess
+
+    def _judge(self, cloud: Cloud, since: Moment) -> None:
+        """Believe matching or odometry since a moment, from when on they contradict each other."""
+        guess = self._trust.by_odometry(since, self.pose)
+        (pose, matched), (other, driven) = self._fit(cloud, self.pose), self._fit(cloud, guess)
+        if _nearer(other, pose, guess) or matched > driven + self._trust.margin:
+            self._trust.settle(SLIPPED)
+            return
+        self.pose, self._slack = guess, float(np.hypot(*(guess - self.pose)[:2])) + HELD[0]
+        self._trust.settle(STUCK)
+
+    def _fit(self, cloud: Cloud, pose: se2.Pose) -> tuple[se2.Pose, float]:
+        """Return the best pose near `pose`, and the share of points on the map there, less those seen through."""
+        held = np.diag([HELD[0] ** -2, HELD[0] ** -2, HELD[1] ** -2])
+        match = self._map.refine(cloud, pose, self._config.sigma, pose, held)
+        known = joined(list(self._moved.values())).points + self._start[:2]
+        crossed, met = through(cloud, se2.transform(se2.inverse(match.pose), known))
+        return match.pose, match.share - crossed / max(met, 1)
+
+    def _matched(self, cloud: Cloud, guess: se2.Pose, step: se2.Pose) -> Match:
         config = self._config
         metres, radians = odometry_sigmas(config, step)
+        metres *= self._trust.scale
         information = np.diag([metres**-2, metres**-2, radians**-2]) / LOOSER**2
         seeds = cloud.points[:: max(len(cloud.points) // SEARCHED, 1)]
         slopes = SLOPE / metres**2, SLOPE / radians**2
         window = min(max(3 * metres, MIN_WINDOW), WINDOW), min(2 * radians, WINDOW_TURN)
         start, _ = self._map.search(seeds, guess, *window, STEP_YAW, *slopes)
         start = self._map.refine(cloud, start, 2 * config.sigma, guess, information).pose
-        return self._map.refine(cloud, start, config.sigma, guess, information).pose
+        return self._map.refine(cloud, start, config.sigma, guess, information)
 
     def _is_new(self, cloud: Cloud) -> bool:
         if not self.keyframes:
             return len(cloud.points) >= FEWEST
+        if 0 < self._lost < UNSEEN or len(cloud.points) < FEWEST:
+            return False
         way = se2.relative(self.keyframes[-1].pose, self.pose)
         far = np.hypot(way[0], way[1]) > self._config.keyframe_distance or abs(way[2]) > self._config.keyframe_turn
-        return bool(far) and len(cloud.points) >= FEWEST
+        return bool(far)
 
     def _rebuild(self) -> None:
         """Make the map of the last keyframes; clouds that are in the map's frame stay so until poses change."""
@@ -109,3 +167,15 @@ def odometry_sigmas(config: SlamConfig, step: se2.Pose) -> tuple[float, float]:
     """Return by how many metres and radians (standard deviations) a step (3,) of the odometry may be off."""
     base, per_metre, base_turn, per_radian = config.odometry
     return base + per_metre * float(np.hypot(step[0], step[1])), base_turn + per_radian * abs(float(step[2]))
+
+
+def _agree(pose: se2.Pose, guess: se2.Pose, sigmas: tuple[float, float]) -> bool:
+    """Return whether a match is where the odometry leads: then a scan that finds few walls looks at new ones."""
+    left = se2.relative(guess, pose)
+    return float(np.hypot(left[0], left[1])) < sigmas[0] and abs(float(left[2])) < sigmas[1]
+
+
+def _nearer(pose: se2.Pose, one: se2.Pose, other: se2.Pose) -> bool:
+    """Return whether a pose is nearer to one than to the other, a radian counting as a metre."""
+    a, b = (se2.relative(pose, goal) for goal in (one, other))
+    return float(np.linalg.norm(a)) < float(np.linalg.norm(b))

@@ -18,6 +18,8 @@ from stereovox.localize.slam.line_map import Cloud, LineMap, joined
 
 STEP_SIGMA = (0.01, 0.03, 0.003, 0.02)
 """Standard deviation of a matched step between keyframes: metres, per metre, radians, per radian."""
+SLACK_TURN = 0.3
+"""Radians for each metre of slack."""
 PATCH = 4
 """Keyframes before and after a patch's middle that belong to it: few enough to be rigid."""
 STRIDE = 3
@@ -38,6 +40,7 @@ class Keyframe:
 
     pose: (3,) pose_map_base as now believed. step: (3,) where it stood as seen from the keyframe before, as matched.
     cloud: its points in the robot's frame. travelled: metres of the robot's way until here.
+    slack: metres by which `step` may be off beyond what is usual: matching and odometry contradicted each other.
     """
 
     pose: se2.Pose
@@ -45,6 +48,7 @@ class Keyframe:
     cloud: Cloud
     scan: Scan
     travelled: float
+    slack: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,8 +70,8 @@ def step_edges(keyframes: list[Keyframe]) -> list[Edge]:
     edges = []
     for i, keyframe in enumerate(keyframes[1:]):
         way, turn = float(np.hypot(*keyframe.step[:2])), abs(float(keyframe.step[2]))
-        metres = STEP_SIGMA[0] + STEP_SIGMA[1] * way
-        radians = STEP_SIGMA[2] + STEP_SIGMA[3] * turn
+        metres = STEP_SIGMA[0] + STEP_SIGMA[1] * way + keyframe.slack
+        radians = STEP_SIGMA[2] + STEP_SIGMA[3] * turn + SLACK_TURN * keyframe.slack
         edges.append(Edge(i, i + 1, keyframe.step, np.diag([metres**-2, metres**-2, radians**-2])))
     return edges
 

@@ -70,11 +70,13 @@ class Match:
 class LineMap:
     """Points of many scans as lines in a grid of `cell` metres; made anew by `build`, the memory is kept.
 
-    reach: metres from the points within which lines attract. sigma: metres of the likelihood field.
+    reach: metres from the points within which lines attract. sigma: metres of the likelihood field. fewest: points of a
+    neighbourhood from which on scans are laid onto it.
     """
 
-    def __init__(self, cell: float, reach: float = 0.25, sigma: float = 0.08):
+    def __init__(self, cell: float, reach: float = 0.25, sigma: float = 0.08, fewest: int = 1):
         self.cell, self.sigma = cell, sigma
+        self._fewest = np.float32(fewest)
         self._reach = max(round(reach / cell), 1)
         self._radius = max(round(NEAR / cell), 1)
         self.corner = np.zeros(2)
@@ -100,7 +102,7 @@ class LineMap:
         count = _lines.gather(points, corner, cloud.views, cell, self.index, cells, sums)
         self.cells = cells[:count]
         self.lines = np.empty((count, 8), np.float32)
-        _lines.fit(self.index, self.cells, sums[:count], cell, self._radius, self.lines)
+        _lines.fit(self.index, self.cells, sums[:count], cell, self._radius, self._fewest, self.lines)
         _lines.spread(self.cells, self.lines, cell, self._reach, np.float32(self.sigma), self.near, self.score)
         return self
 

@@ -20,6 +20,7 @@ from stereovox.config import Config, load_config
 from stereovox.errors import FrameRefused, StereovoxError
 from stereovox.frame import Scan
 from stereovox.integrate.beams import make_beams
+from stereovox.localize.slam.doubts import MapDoubt, doubts_of
 from stereovox.localize.slam.front_end import Follower
 from stereovox.localize.slam.graph import Edge, Keyframe, in_map, optimised, patch_edges, step_edges
 from stereovox.localize.slam.loops import LoopFinder
@@ -115,7 +116,8 @@ class Slam:
                 progress(done, rounds, "polishing the map")
             self._solve(list(patch_edges(self.keyframes, self._config.slam)), PATCH_TRUST)
         track = self._builder.track(self.keyframes)
-        return SlamResult(track, self._grid(), self.keyframes, self._loops.edges, self.refused)
+        doubts = doubts_of(self.keyframes, self._loops.edges)
+        return SlamResult(track, self._grid(), self.keyframes, self._loops.edges, self.refused, doubts)
 
     def _refuse(self, reason: str, count: int = 1) -> None:
         if count:
@@ -152,6 +154,7 @@ class SlamResult:
 
     track: the pose of every scan that was not refused. grid: the map, built from the keyframes. keyframes: with their
     final poses. closures: number of loops closed. edges: those, between keyframes. refused: refused scans by reason.
+    doubts: what the scans say against the map; empty where the self-check found nothing.
     """
 
     track: Track
@@ -159,6 +162,7 @@ class SlamResult:
     keyframes: list[Keyframe]
     edges: list[Edge]
     refused: dict[str, int]
+    doubts: list[MapDoubt]
 
     @property
     def closures(self) -> int:

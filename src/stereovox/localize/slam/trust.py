@@ -1,0 +1,122 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether matching and odometry agree, and which of them to believe where they do not.
+
+One step says little: clocks differ, wheels jolt. So both motions are compared over the last metre, and what is usual is
+learned from the drive itself.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox import se2
+from stereovox.localize.slam.line_map import Cloud
+
+WINDOW, SCANS = 1.0, 20
+"""Metres of odometry, and scans, over which the two motions are compared."""
+LEAST, LEAST_TURN = 0.25, 0.2
+"""Metres and radians by which they may always differ."""
+MOST, MOST_TURN = 0.4, 0.35
+"""Metres and radians beyond which they contradict each other on any drive."""
+FAR, RATE = 6.0, 0.01
+"""Times the usual difference from which on one of the two is wrong; how fast what is usual is learned, per scan."""
+SLIPPED, STUCK, WHILE = 2.0, 0.25, 10
+"""Factors on the odometry's errors for some scans: after wheels slipped, and after matching did not follow."""
+MARGIN, MARGIN_SLIPPING = 0.25, 0.05
+"""Share of a scan's points by which the matched place must fit better than the odometry's, to be believed: usually, and
+while wheels slip."""
+THICK = 0.3
+"""Metres by which a beam must pass through a wall to contradict it."""
+
+
+@dataclass(frozen=True)
+class Moment:
+    """Where odometry and matching saw the robot at one scan, (3,) each in a frame of its own; metres travelled."""
+
+    odometry: se2.Pose
+    matched: se2.Pose
+    way: float
+
+
+class Trust:
+    """Compares odometry with matching.
+
+    scale: factor on what the odometry may be off by, 1 where both agreed.
+    """
+
+    def __init__(self) -> None:
+        self._past: deque[Moment] = deque(maxlen=SCANS)
+        self._usual = np.array([LEAST, LEAST_TURN]) / FAR
+        self._scale, self._left = 1.0, 0
+
+    @property
+    def scale(self) -> float:
+        """The factor for the next scan."""
+        return self._scale if self._left else 1.0
+
+    @property
+    def margin(self) -> float:
+        """The share by which the matched place must fit better."""
+        return MARGIN_SLIPPING if self.scale > 1 else MARGIN
+
+    def add(self, odometry: se2.Pose, before: se2.Pose, after: se2.Pose) -> Moment | None:
+        """Take the odometry (3,) at a scan whose match moved the robot from `before` to `after`, (3,) each.
+
+        Return the moment since when both contradict each other, None where they agree.
+        """
+        self._left = max(self._left - 1, 0)
+        if not self._past:
+            self._past.append(Moment(odometry, after, 0.0))
+            return None
+        last = self._past[-1]
+        way = last.way + float(np.hypot(*(odometry - last.odometry)[:2]))
+        matched = se2.compose(last.matched, se2.relative(before, after))
+        self._past.append(Moment(odometry, matched, way))
+        since = next(moment for moment in self._past if moment.way > way - WINDOW)
+        apart = np.array(self._difference(since))
+        limits = np.clip(FAR * self._usual, (LEAST, LEAST_TURN), (MOST, MOST_TURN))
+        self._usual += RATE * (np.minimum(apart, 3 * self._usual) - self._usual)
+        return since if (apart > limits).any() else None
+
+    def settle(self, scale: float) -> None:
+        """Compare anew from the last scan on; the odometry's errors are `scale` times as large for a while."""
+        last = self._past[-1]
+        self._past.clear()
+        self._past.append(last)
+        self._scale, self._left = scale, WHILE
+
+    def by_odometry(self, since: Moment, pose: se2.Pose) -> se2.Pose:
+        """Return where the robot, matched to `pose` (3,), stands by the odometry since a moment."""
+        last = self._past[-1]
+        there = se2.compose(pose, se2.relative(last.matched, since.matched))
+        return se2.compose(there, se2.relative(since.odometry, last.odometry))
+
+    def _difference(self, since: Moment) -> tuple[float, float]:
+        last = self._past[-1]
+        left = se2.relative(se2.relative(since.matched, last.matched), se2.relative(since.odometry, last.odometry))
+        return float(np.hypot(left[0], left[1])), abs(float(left[2]))
+
+
+def through(seen: Cloud, points: NDArray[np.floating], bins: int = 720) -> tuple[int, int]:
+    """Count how many of other points a scan sees through, and how many it could.
+
+    seen: the scan, in the robot's frame; points: (N, 2) there. A point counts where the scan has a beam within half a
+    degree; it is seen through where that beam ends `THICK` metres or more behind it, on both sides too.
+    """
+
+    def polar(p: NDArray[np.floating]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        turn = np.arctan2(p[:, 1], p[:, 0])
+        return np.floor((turn + np.pi) * (bins / (2 * np.pi))).astype(np.int64) % bins, np.hypot(*p.T)
+
+    at, away = polar(seen.points)
+    nearest = np.full(bins, np.inf)
+    np.minimum.at(nearest, at, away)
+    around = np.minimum(nearest, np.minimum(np.roll(nearest, 1), np.roll(nearest, -1)))
+    there, distance = polar(points)
+    reach = around[there]
+    known = np.isfinite(reach)
+    return int(np.sum(known & (distance < reach - THICK))), int(np.sum(known & (distance < reach + THICK)))

@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from stereovox.config import load_config as load_config
     from stereovox.contents import describe as describe
     from stereovox.errors import StereovoxError as StereovoxError
+    from stereovox.evaluate.trajectory_score import TrajectoryScore as TrajectoryScore
+    from stereovox.evaluate.trajectory_score import score_trajectory as score_trajectory
     from stereovox.floor_run import FloorRun as FloorRun
     from stereovox.floor_run import map_floor as map_floor
     from stereovox.formats import export as export
@@ -77,6 +79,8 @@ _HOMES = {
     "describe": "contents",
     "GridMap": "maps.grid_map",
     "OccupancyGrid": "maps.occupancy",
+    "TrajectoryScore": "evaluate.trajectory_score",
+    "score_trajectory": "evaluate.trajectory_score",
     "export": "formats",
     "import_map": "formats",
     "DistanceField": "products.distance",

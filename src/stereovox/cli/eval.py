@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compare a map with the ground truth, cell by cell: first what it decides, then its probabilities.
+"""Compare a map with the ground truth, cell by cell: first what it decides, then its probabilities; or trajectories.
 
 MAP and TRUTH are stereovox folders or OctoMap files (.bt, .ot) with cells of the same size; or both are floor maps
-in map_server files (.yaml), of any cell size, which are aligned first.
+in map_server files (.yaml), of any cell size, which are aligned first; or both are files of poses (TUM lines, KITTI's
+12 numbers), of which TRUTH has the true ones.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ DIFFERENCES = {
     "wrongly_free": "occupied in the reference",
     "extra": "known to the map only",
 }
+POSE_ENDINGS = (".tum", ".txt", ".csv", ".kitti", ".freiburg", ".log", ".json", ".npy")
 ALIKE = 0.3
 """IoU of walls within a cell below which two maps may be of different places."""
 EXAMPLE = "stereovox eval drive.svox truth.svox --report drive-report"
@@ -61,10 +63,9 @@ SINGLE = {
 
 def add_arguments(parser: ArgumentParser) -> None:
     """Declare the options."""
-    parser.add_argument("map", metavar="MAP", help="map to evaluate")
-    parser.add_argument(
-        "truth", metavar="TRUTH", help="map whose occupied cells hold a surface and free cells hold none"
-    )
+    parser.add_argument("map", metavar="MAP", help="map, or trajectory, to evaluate")
+    about = "map whose occupied cells hold a surface and free cells hold none, or the true trajectory"
+    parser.add_argument("truth", metavar="TRUTH", help=about)
     about = "a cell is called occupied above it (default: 0.7; for a floor map the threshold in its file)"
     parser.add_argument("--threshold", type=float, metavar="P", help=about)
     parser.add_argument(
@@ -77,13 +78,29 @@ def add_arguments(parser: ArgumentParser) -> None:
     floors = parser.add_argument_group("only for floor maps")
     about = "region that does not count, metres in TRUTH's frame; repeatable"
     floors.add_argument("--exclude", action="append", default=[], type=region, metavar="X0,Y0,X1,Y1", help=about)
-    floors.add_argument("--no-align", action="store_true", help="both maps share a frame: do not align MAP")
+    about = "MAP and TRUTH share a frame: do not align MAP (also for trajectories)"
+    floors.add_argument("--no-align", action="store_true", help=about)
+    poses = parser.add_argument_group("only for trajectories")
+    poses.add_argument("--scale", action="store_true", help="fit the scale, too, as for one camera without metres")
+    about = "poses further apart in time are no pair (default: 0.02)"
+    poses.add_argument("--max-difference", type=float, metavar="S", help=about)
+    about = (
+        "length of a segment for errors by distance; repeatable (default: 100 to 800 m as KITTI, for trajectories of "
+        "up to 100 m 1 to 50 m)"
+    )
+    poses.add_argument("--segment", action="append", default=[], type=float, metavar="M", help=about)
 
 
 def run(arguments: Namespace) -> dict[str, Any]:
-    """Load both maps, compare them, print and report the scores."""
+    """Load both maps or trajectories, compare them, print and report the scores."""
     from stereovox.maps.store import is_map
 
+    poses = [path for path in (arguments.map, arguments.truth) if _holds_poses(path)]
+    if len(poses) == 2:
+        return _compare_trajectories(arguments)
+    if poses:
+        raise StereovoxError(f"{poses[0]}: a file of poses, the other one is none; give two maps or two files of poses")
+    refuse_options(arguments, ("scale", "max_difference", "segment"), "only for trajectories")
     kinds = {dimensions(path) for path in (arguments.map, arguments.truth)}
     if len(kinds) == 2:
         space = arguments.map if dimensions(arguments.map) == 3 else arguments.truth
@@ -102,6 +119,43 @@ def region(text: str) -> tuple[float, ...]:
     if len(numbers) != 4 or not all(map(math.isfinite, numbers)):
         raise ArgumentTypeError(f"'{text}' is not a region; give X0,Y0,X1,Y1 in metres, two opposite corners")
     return numbers
+
+
+def _holds_poses(path: str) -> bool:
+    """Return whether a name is that of a file of poses, not of a map."""
+    return Path(path).suffix.lower() in POSE_ENDINGS and not Path(path).is_dir()
+
+
+def _compare_trajectories(arguments: Namespace) -> dict[str, Any]:
+    """Pair the poses of two files, print and report their differences."""
+    from stereovox.evaluate.pose_pairs import MAX_DIFFERENCE_S
+    from stereovox.evaluate.trajectory_score import score_trajectory
+    from stereovox.report import trajectory as report
+
+    refuse_options(arguments, ("threshold", "path", "exclude"), "only for maps")
+    score = score_trajectory(
+        arguments.map,
+        arguments.truth,
+        align=not arguments.no_align,
+        scale=arguments.scale,
+        max_difference_s=MAX_DIFFERENCE_S if arguments.max_difference is None else arguments.max_difference,
+        segments_m=arguments.segment or None,
+    )
+    result = score.as_dict()
+    say(f"{report.paired(score)}. {report.aligned(score)}")
+    say_table(report.ERROR_HEADS, report.error_rows(score))
+    if score.segments:
+        say_table(report.SEGMENT_HEADS, report.segment_rows(score))
+    if score.drift_percent is not None:
+        say(f"drift: laid on each other at the start, the ends are {score.drift_percent:.3f} % of the length apart")
+    for note in report.notes(score):
+        say(note)
+    if arguments.report:
+        names = Path(arguments.map).name, Path(arguments.truth).name
+        page = report.write_trajectory_report(arguments.report, score, *names)
+        say(f"report: {page}")
+        result["report"] = str(page)
+    return result
 
 
 def _compare_grids(arguments: Namespace) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Errors of an estimated trajectory: ATE, RPE, and known relations between pairs of poses.
+"""Errors of a robot's track on a floor: ATE, RPE, and known relations between pairs of poses; in space: see
+trajectory_score.py.
 
 Written by hand, because evo is GPL-3 and this is Apache-2.0.
 """
@@ -119,16 +120,17 @@ def relation_errors(
     Raises SourceError where no relation has poses.
     """
     stamps, poses = np.asarray(stamps_ns, np.int64), np.asarray(poses, float)
-    nearest = _nearest(stamps, relations.stamps_ns)
-    near = np.abs(stamps[nearest] - relations.stamps_ns).max(axis=1) <= tolerance_s * 1e9
+    closest = nearest(stamps, relations.stamps_ns)
+    near = np.abs(stamps[closest] - relations.stamps_ns).max(axis=1) <= tolerance_s * 1e9
     if not near.any():
         raise SourceError("no relation has a time that the trajectory has; are they of one recording?")
-    found = se2.relative(poses[nearest[near, 0]], poses[nearest[near, 1]])
+    found = se2.relative(poses[closest[near, 0]], poses[closest[near, 1]])
     left = se2.relative(relations.motion[near], found)
     return RelationErrors(np.hypot(left[:, 0], left[:, 1]), np.abs(left[:, 2]), int((~near).sum()))
 
 
-def _nearest(stamps: NDArray[np.int64], queries: NDArray[np.int64]) -> NDArray[np.int64]:
+def nearest(stamps: NDArray[np.int64], queries: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return for each query the index of the nearest of the rising stamps, of two equally near the earlier one."""
     after = np.clip(np.searchsorted(stamps, queries), 1, max(len(stamps) - 1, 1))
     before = after - 1
     after = np.minimum(after, len(stamps) - 1)

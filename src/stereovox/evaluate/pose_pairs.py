@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Poses of an estimated trajectory beside the true ones of the same times."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.errors import StereovoxError
+from stereovox.evaluate.trajectory import nearest
+from stereovox.se3 import rigidity_error
+from stereovox.sources.poses import Poses
+from stereovox.sources.rgbd.pose_files import ImagePoses, read_poses
+
+TrajectoryLike = str | os.PathLike[str] | Poses | ImagePoses
+"""A file of poses (TUM, KITTI, or another form of docs/recordings.md), or what was read from one."""
+MAX_DIFFERENCE_S = 0.02
+"""Poses further apart in time are no pair (TUM's associate.py)."""
+MAX_GAP_S = 1.0
+"""The time between two pairs further apart is not covered."""
+MIN_PAIRS = 3
+MAX_DEFORMATION = 5e-3
+"""Largest entry of abs(R^T R - I) that counts as rounding of a pose; the default of `pose_rigidity_tolerance`."""
+
+
+@dataclass(frozen=True, eq=False)
+class PosePairs:
+    """N pairs of an estimated and a true pose, in order.
+
+    stamps_ns: (N,) int64 nanoseconds of the estimate; None where the files have no times, and lines pair by number.
+    T_world_body, T_truth_body: (N, 4, 4) float64, estimated and true. estimate_poses, truth_poses: number of all poses
+    of each. coverage: share of the truth's time span that lies between pairs at most MAX_GAP_S apart; without times,
+    the share of its poses that have a partner. estimate, truth: what they came from, for messages.
+    """
+
+    stamps_ns: NDArray[np.int64] | None
+    T_world_body: NDArray[np.float64]
+    T_truth_body: NDArray[np.float64]
+    estimate_poses: int
+    truth_poses: int
+    coverage: float
+    estimate: str
+    truth: str
+
+    def __len__(self) -> int:
+        return len(self.T_world_body)
+
+
+def pair_poses(
+    estimate: TrajectoryLike, truth: TrajectoryLike, max_difference_s: float = MAX_DIFFERENCE_S
+) -> PosePairs:
+    """Pair each pose of the sparser trajectory with the one of the other that is nearest in time (evo's rule).
+
+    Poses without times pair by the number of their image, else by line.
+    Raises StereovoxError, one line, for a file that cannot be read, a pose that is not rigid or holds NaN, fewer than
+    MIN_PAIRS pairs, and where only one of the two has times.
+    """
+    if not max_difference_s > 0:
+        raise StereovoxError(f"max_difference_s={max_difference_s}: give seconds above 0")
+    ours, true = (one if isinstance(one, Poses | ImagePoses) else read_poses(Path(one)) for one in (estimate, truth))
+    T, T_true = _checked(ours), _checked(true)
+    if isinstance(ours, Poses) and isinstance(true, Poses):
+        i, j = _by_time(ours.stamps_ns, true.stamps_ns, round(max_difference_s * 1e9))
+        stamps_ns = ours.stamps_ns[i]
+        coverage = _covered(true.stamps_ns[j], true.stamps_ns)
+        cure = f"no more than {max_difference_s:g} s apart; are they of one recording and one clock?"
+    elif isinstance(ours, ImagePoses) and isinstance(true, ImagePoses):
+        i, j = _by_number(ours, true)
+        stamps_ns, coverage, cure = None, len(j) / len(true), "with the same number; are they of one recording?"
+    else:
+        timeless = ours if isinstance(ours, ImagePoses) else true
+        raise StereovoxError(f"{timeless.where}: has no times, the other trajectory has; give both as TUM lines")
+    if len(i) < MIN_PAIRS:
+        raise StereovoxError(f"{ours.where}: {len(i)} poses have one of {true.where} {cure} ({MIN_PAIRS} are needed)")
+    return PosePairs(stamps_ns, T[i], T_true[j], len(ours), len(true), coverage, ours.where, true.where)
+
+
+def _checked(poses: Poses | ImagePoses) -> NDArray[np.float64]:
+    """Return all poses (N, 4, 4); raises StereovoxError for the first that cannot be used."""
+    keys = poses.stamps_ns.tolist() if isinstance(poses, Poses) else range(len(poses))
+    T = np.array([poses.at(key) for key in keys])
+    for number, one in enumerate(T, 1):
+        if not rigidity_error(one) <= MAX_DEFORMATION:
+            raise StereovoxError(f"{poses.where}: pose {number} is not rigid or holds NaN; correct or delete it")
+    return T
+
+
+def _by_time(
+    ours: NDArray[np.int64], true: NDArray[np.int64], limit_ns: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the (N,) indices of pairs in both."""
+    if len(ours) > len(true):
+        return _by_time(true, ours, limit_ns)[::-1]
+    found = nearest(true, ours)
+    near = np.flatnonzero(np.abs(true[found] - ours) <= limit_ns)
+    return near, found[near]
+
+
+def _by_number(ours: ImagePoses, true: ImagePoses) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    if ours.numbers is not None and true.numbers is not None:
+        _, i, j = np.intersect1d(ours.numbers, true.numbers, return_indices=True)
+        return i, j
+    if len(ours) != len(true):
+        counts = f"{len(ours)} poses, {true.where} {len(true)}"
+        raise StereovoxError(f"{ours.where}: {counts}; without times each needs its partner in the same line")
+    return np.arange(len(ours)), np.arange(len(true))
+
+
+def _covered(stamps_ns: NDArray[np.int64], truth_ns: NDArray[np.int64]) -> float:
+    gaps = np.diff(stamps_ns)
+    return float(gaps[gaps <= MAX_GAP_S * 1e9].sum() / max(truth_ns[-1] - truth_ns[0], 1))

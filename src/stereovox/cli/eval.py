@@ -31,6 +31,7 @@ DIFFERENCES = {
     "extra": "known to the map only",
 }
 POSE_ENDINGS = (".tum", ".txt", ".csv", ".kitti", ".freiburg", ".log", ".json", ".npy")
+"""Files with these are trajectories."""
 ALIKE = 0.3
 """IoU of walls within a cell below which two maps may be of different places."""
 EXAMPLE = "stereovox eval drive.svox truth.svox --report drive-report"

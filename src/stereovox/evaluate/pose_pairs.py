@@ -15,6 +15,7 @@ from stereovox.evaluate.trajectory import nearest
 from stereovox.se3 import rigidity_error
 from stereovox.sources.poses import Poses
 from stereovox.sources.rgbd.pose_files import ImagePoses, read_poses
+from stereovox.trust.camera_path import FARTHEST
 
 TrajectoryLike = str | os.PathLike[str] | Poses | ImagePoses
 """A file of poses (TUM, KITTI, or another form of docs/recordings.md), or what was read from one."""
@@ -84,8 +85,9 @@ def _checked(poses: Poses | ImagePoses) -> NDArray[np.float64]:
     keys = poses.stamps_ns.tolist() if isinstance(poses, Poses) else range(len(poses))
     T = np.array([poses.at(key) for key in keys])
     for number, one in enumerate(T, 1):
-        if not rigidity_error(one) <= MAX_DEFORMATION:
-            raise StereovoxError(f"{poses.where}: pose {number} is not rigid or holds NaN; correct or delete it")
+        if not (rigidity_error(one) <= MAX_DEFORMATION and np.abs(one[:3, 3]).max() <= FARTHEST):
+            cure = f"holds NaN, or lies beyond {FARTHEST:g} m; correct or delete it"
+            raise StereovoxError(f"{poses.where}: pose {number} is not rigid, {cure}")
     return T
 
 
@@ -94,7 +96,8 @@ def _by_time(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return the (N,) indices of pairs in both."""
     if len(ours) > len(true):
-        return _by_time(true, ours, limit_ns)[::-1]
+        j, i = _by_time(true, ours, limit_ns)
+        return i, j
     found = nearest(true, ours)
     near = np.flatnonzero(np.abs(true[found] - ours) <= limit_ns)
     return near, found[near]

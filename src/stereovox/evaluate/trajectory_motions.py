@@ -19,7 +19,7 @@ Transforms = NDArray[np.float64]
 """(N, 4, 4) float64 rigid motions."""
 START_EVERY = 10
 """A segment starts at every tenth pose (KITTI's development kit, evaluate_odometry.cpp)."""
-SECOND_NS, SECOND_TOLERANCE = 1_000_000_000, 0.1
+SECOND_NS, TOLERANCE_NS = 1_000_000_000, 100_000_000
 
 
 @dataclass(frozen=True)
@@ -79,8 +79,9 @@ def per_second(found: Transforms, true: Transforms, stamps_ns: NDArray[np.int64]
     """
     if stamps_ns is None:
         return None
-    end = nearest(stamps_ns, stamps_ns + SECOND_NS)
-    start = np.flatnonzero(np.abs(stamps_ns[end] - stamps_ns - SECOND_NS) <= SECOND_TOLERANCE * SECOND_NS)
+    later = stamps_ns + SECOND_NS
+    end = nearest(stamps_ns, later)
+    start = np.flatnonzero((np.abs(stamps_ns[end] - later) <= TOLERANCE_NS) & (later <= stamps_ns[-1]))
     return steps(found, true, start, end[start]) if len(start) else None
 
 

@@ -184,17 +184,16 @@ def best_alignment(pairs: PosePairs, scale: bool = False) -> tuple[Transform, fl
         if np.linalg.norm(points, axis=1).max() < MIN_EXTENT_M:
             cure = "score it without alignment (--no-align) or give a recording with motion"
             raise StereovoxError(f"{where}: stands still, within {1000 * MIN_EXTENT_M:g} mm; {cure}")
-    covariance = b.T @ a / len(a)
+    covariance = weights = b.T @ a / len(a)
     widths = np.linalg.svd(covariance, compute_uv=False)
     if widths[1] <= STRAIGHT * widths[0]:
         rolls = (pairs.T_truth_body[:, :3, :3] @ pairs.T_world_body[:, :3, :3].transpose(0, 2, 1)).mean(axis=0)
-        covariance = covariance + STRAIGHT * widths[0] * rolls
-    u, d, vt = np.linalg.svd(covariance)
-    sign = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
-    factor = float((d * sign).sum() / (a**2).sum(axis=1).mean()) if scale else 1.0
+        weights = covariance + STRAIGHT * widths[0] * rolls
+    u, _, vt = np.linalg.svd(weights)
+    R = (u * [1, 1, np.sign(np.linalg.det(u) * np.linalg.det(vt))]) @ vt
+    factor = float(np.trace(R.T @ covariance) / (a**2).sum(axis=1).mean()) if scale else 1.0
     T = np.eye(4)
-    T[:3, :3] = (u * sign) @ vt
-    T[:3, 3] = true.mean(axis=0) - factor * T[:3, :3] @ ours.mean(axis=0)
+    T[:3, :3], T[:3, 3] = R, true.mean(axis=0) - factor * R @ ours.mean(axis=0)
     return T, factor
 
 

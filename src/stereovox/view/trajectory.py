@@ -68,6 +68,4 @@ def _errors(axis: Any, at: NDArray[np.float64], score: TrajectoryScore) -> None:
     for one, errors in ((axis, score.position_errors_m), (turns, score.rotation_errors_deg)):
         one.set_ylim(0, 1.06 * max(float(errors.max()), 1e-9))
     labels(turns, "", "rotation error [deg]")
-    caption(
-        axis, "Errors over time", "Blue: position (dashed: its rmse, the ATE). Orange: rotation, scale at the right."
-    )
+    caption(axis, "Errors over time", "Blue: position, dashed its rmse (ATE). Orange: rotation.")

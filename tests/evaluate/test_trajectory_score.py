@@ -158,9 +158,9 @@ def straight(metres=60.0, step=0.125, factor=1.0, turn=0.0):
 
 
 def test_a_known_drift_gives_its_per_cent():
-    found = sv.score_trajectory(timed(straight(factor=1.02)), timed(straight()), segments_m=[7.99, 31.99])
+    found = sv.score_trajectory(timed(straight(factor=1.02)), timed(straight()), segments_m=[8, 31.99])
     assert found.drift_percent == pytest.approx(2)
-    assert [one.translation_percent for one in found.segments] == pytest.approx([2 * 8 / 7.99, 2 * 32 / 31.99])
+    assert [one.translation_percent for one in found.segments] == pytest.approx([2 * 8.125 / 8, 2 * 32 / 31.99])
     assert found.per_frame.translation_m.max == pytest.approx(0.02 * 0.125)
     assert found.per_second is not None
     assert found.per_second.translation_m.mean == pytest.approx(0.02 * 1.25)
@@ -175,6 +175,15 @@ def test_rotations_decide_what_a_straight_trajectory_leaves_open():
     found = sv.score_trajectory(timed(moved() @ straight()), timed(straight()))
     assert found.rotation_deg.max == pytest.approx(0, abs=1e-5)
     assert found.position_m.max == pytest.approx(0, abs=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_trajectory_in_a_plane_is_turned_and_not_mirrored(seed):
+    flat = flight()
+    flat[:, 2, 3] = 0
+    found = sv.score_trajectory(timed(shaken(moved() @ flat, seed, metres=1e-4, radians=0)), timed(flat))
+    assert np.linalg.det(found.T_truth_world[:3, :3]) == pytest.approx(1)
+    assert found.rotation_deg.max < 0.1
 
 
 def test_other_axes_of_the_body_are_told_as_what_the_rotations_have_in_common():
@@ -212,6 +221,15 @@ def test_poses_without_a_partner_are_counted():
     found = sv.score_trajectory(timed(flight(), stamps), true)
     assert (len(found.pairs), found.as_dict()["without_truth"]) == (150, 150)
     assert len(sv.score_trajectory(timed(flight(), stamps), true, max_difference_s=0.022).pairs) == 300
+
+
+@pytest.mark.parametrize("swapped", [False, True])
+def test_each_pose_of_the_sparser_trajectory_has_one_partner(swapped):
+    sparse, dense = timed(flight()[::20], np.arange(15) * 20 * RATE_NS), timed(flight())
+    ours, true = (dense, sparse) if swapped else (sparse, dense)
+    found = sv.score_trajectory(ours, true, max_difference_s=1.0)
+    assert (len(found.pairs), found.as_dict()["without_truth"]) == (15, 285 if swapped else 0)
+    assert found.position_m.max == pytest.approx(0, abs=1e-9)
 
 
 def test_images_pair_by_their_numbers():

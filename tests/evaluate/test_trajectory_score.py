@@ -177,13 +177,12 @@ def test_rotations_decide_what_a_straight_trajectory_leaves_open():
     assert found.position_m.max == pytest.approx(0, abs=1e-6)
 
 
-@pytest.mark.parametrize("seed", range(6))
-def test_a_trajectory_in_a_plane_is_turned_and_not_mirrored(seed):
-    flat = flight()
-    flat[:, 2, 3] = 0
-    found = sv.score_trajectory(timed(shaken(moved() @ flat, seed, metres=1e-4, radians=0)), timed(flat))
+def test_the_alignment_never_mirrors():
+    mirrored = flight()
+    mirrored[:, 2, 3] *= -1
+    found = sv.score_trajectory(timed(mirrored), timed(flight()))
     assert np.linalg.det(found.T_truth_world[:3, :3]) == pytest.approx(1)
-    assert found.rotation_deg.max < 0.1
+    assert found.position_m.rmse > 0.1
 
 
 def test_other_axes_of_the_body_are_told_as_what_the_rotations_have_in_common():

@@ -15,7 +15,7 @@ def main(recording: str, frames: str = "::1", sensor: str = "stereo") -> None:
     columns = ("prec", "rec", "prec 1", "rec 1", "wr.free", "free p", "free r")
     print(" cell", *(f"{column:>7}" for column in columns), "  ms, rays ms")
     for voxel_size in (0.2, 0.1, 0.05, 0.02):
-        settings = {"voxel_size": voxel_size, "sensor.model": sensor, "projective.full_share": 0}  # rays know no shares
+        settings = {"voxel_size": voxel_size, "sensor.model": sensor}
         projective = sv.Mapper("default", **settings)
         rays = sv.Mapper("default", integrator="ray", **{"ray.update": "once"}, **settings)
         spent = [0.0, 0.0]

@@ -40,5 +40,5 @@ def test_the_first_run_on_a_machine_is_recognised(tmp_path, monkeypatch, capsys)
 def test_slam_says_whether_it_compiled(seconds, compiling, words, monkeypatch, capsys):
     monkeypatch.setattr("stereovox.cli.slam.print_trajectory_error", lambda *_: {})
     track = SimpleNamespace(stamps_ns=np.array([0, 100_000_000_000]))
-    _print_result(None, SimpleNamespace(track=track, closures=3, refused={}), seconds, compiling)
+    _print_result(None, SimpleNamespace(track=track, closures=3, refused={}, doubts=[]), seconds, compiling)
     assert words in capsys.readouterr().err

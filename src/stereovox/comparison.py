@@ -156,7 +156,7 @@ def _fits_elsewhere(image: DepthImage, integrator: Integrator, voxel_map: VoxelM
         return 1.0 if against is None else against
 
     least = against_from(pose)
-    for step in SUBCELL:
+    for step in SUBCELL if least > limit else ():
         for shift in step * voxel_map.voxel_size * np.vstack([np.eye(3), -np.eye(3)]):
             moved = pose.copy()
             moved[:3, 3] += shift

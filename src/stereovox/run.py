@@ -17,7 +17,7 @@ from math import inf, isfinite
 from pathlib import Path
 from time import monotonic
 from types import TracebackType
-from typing import Any, Generic, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
 
 from stereovox import opening
 from stereovox.config import Config, load_config
@@ -25,7 +25,6 @@ from stereovox.device import on_usable_device
 from stereovox.errors import MapFileError, SourceError, StereovoxError, one_line
 from stereovox.evaluate.summary import summarise
 from stereovox.frame import UpdateReport
-from stereovox.localize.slam.doubts import MapDoubt
 from stereovox.localize.track import Track
 from stereovox.mapper import AnyMapper, Mapper
 from stereovox.maps import VoxelMap, load_map
@@ -40,6 +39,9 @@ from stereovox.sources.camera_file import with_camera
 from stereovox.sources.turned import Turned
 from stereovox.survey import survey
 from stereovox.trust.history import MAX_NAME_LENGTH
+
+if TYPE_CHECKING:
+    from stereovox.localize.slam.doubts import MapDoubt
 
 SeenT = TypeVar("SeenT")
 MapT = TypeVar("MapT", VoxelMap, GridMap)

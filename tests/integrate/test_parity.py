@@ -54,6 +54,20 @@ def test_projective_equals_its_reference(model, voxel_size):
         assert share_that_differs(ours, theirs) < 0.02
 
 
+@pytest.mark.parametrize("model", SENSORS)
+def test_lone_far_pixels_mark_and_clear_as_in_the_reference(model):
+    """They clear nothing as wide as a patch, yet `andert` and `valenti` mark cells beside their points."""
+    config = load_config(voxel_size=0.1, max_range=4.0, **{"sensor.model": model})
+    camera = PinholeCamera.from_field_of_view(160, 120, 40, baseline=0.05)
+    depth = np.full((120, 160), 0.7, np.float32)
+    depth[1::4, 2::4] = 3.2
+    image = replace(made_image(0), depth_m=depth, camera=camera)
+    ours = cells_of(make_integrator(config).evidence(image))
+    theirs = reference_of(naive_integrators.project, image, config)
+    assert len(theirs) > 60
+    assert share_that_differs(ours, theirs, tolerance=25) < 0.002
+
+
 class Late:
     """Made up: clears up to two sigma behind what was measured, and marks behind that where `marks`."""
 

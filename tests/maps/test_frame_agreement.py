@@ -85,13 +85,13 @@ def test_a_frame_is_judged_by_what_is_known_alone():
     assert Agreement(FEW, 0.0, 0.0, 0.0, FEW).against == 0
     assert Agreement(FEW - 1, 0.0, 0.0, 0.0, FEW).against is None
     assert Agreement(FEW, 0.0, 0.0, 0.0, 1.01 * FEW / KNOWN).against is None
-    assert Agreement(300.0, 25.0, 0.0, 0.0, 300.0).against == 0.25
-    assert Agreement(0.0, FEW / LOOKED_THROUGH, 0.0, 0.0, 2 * FEW).against == 1
+    assert Agreement(300.0, 100 / LOOKED_THROUGH, 0.0, 0.0, 300.0).against == pytest.approx(0.25)
+    assert Agreement(0.0, FEW / LOOKED_THROUGH + 1, 0.0, 0.0, 2 * FEW).against == 1
     assert Agreement(0.0, FEW / LOOKED_THROUGH - 1, 0.0, 0.0, 2 * FEW).against is None
     assert Agreement(300.0, 0.0, 100.0, 0.0, 300.0).against == 0.25
 
 
 def test_what_comes_to_light_at_the_edge_counts_no_more_than_the_rest():
     assert Agreement(300.0, 0.0, 200.0, 200.0, 300.0).against == 0
-    assert Agreement(300.0, 12.5, 200.0, 200.0, 300.0).against == 0.25
-    assert Agreement(300.0, 12.5, 100.0, 50.0, 300.0).against == 1 / 3
+    assert Agreement(300.0, 50 / LOOKED_THROUGH, 200.0, 200.0, 300.0).against == pytest.approx(0.25)
+    assert Agreement(300.0, 50 / LOOKED_THROUGH, 100.0, 50.0, 300.0).against == pytest.approx(1 / 3)

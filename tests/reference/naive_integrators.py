@@ -52,8 +52,8 @@ def project(image: DepthImage, config: Config, sensor: InverseSensorModel) -> Ce
 
     Cells that hold a measured point get the hit evidence at their centre's depth: in full where `full_share` of their
     footprint measures a depth within half a cell, with less by the square root of the part. Other cells get the
-    positive evidence of the pixel at their centre where there is any, else the negative evidence of the farthest pixel
-    in a window about their own size.
+    positive evidence of the pixel at their centre where there is any, else the negative evidence of how far
+    one sees through a window about their own size.
     """
     table = _table(image, config, sensor)
     hits, hit_evidence = _weighed(np.unique(_hit_cells(image, config), axis=0), image, config, table)

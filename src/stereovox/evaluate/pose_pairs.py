@@ -60,7 +60,7 @@ def pair_poses(
     Raises StereovoxError, one line, for a file that cannot be read, a pose that is not rigid or holds NaN, fewer than
     MIN_PAIRS pairs, and where only one of the two has times.
     """
-    if not max_difference_s > 0:
+    if not 0 < max_difference_s < np.inf:
         raise StereovoxError(f"max_difference_s={max_difference_s}: give seconds above 0")
     ours, true = (one if isinstance(one, Poses | ImagePoses) else read_poses(Path(one)) for one in (estimate, truth))
     T, T_true = _checked(ours), _checked(true)

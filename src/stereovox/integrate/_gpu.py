@@ -144,7 +144,7 @@ def nearest_tiles(depth_m, height, width, size, tiles):
 def find_boxes(view, table, windows, boxes):
     """Write the first coarse box along each axis, and how many there are, to `boxes` (3, 2) int32."""
     if cuda.grid(1) == 0:
-        end = end_of_view(view, table, farthest_of(windows))
+        end = end_of_view(view, table, view.max_range if table.marks else farthest_of(windows))
         for axis in range(3):
             low, high = touched(view, end, axis)
             boxes[axis, 0], boxes[axis, 1] = low, (high - low) // COARSE + 1

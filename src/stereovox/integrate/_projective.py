@@ -41,6 +41,7 @@ def survey(depth_m, ends, view, table, windows, scratch, nearest, stack, free, m
     farthest = build(ends.reshape(ends.size), windows, scratch)
     if table.marks:
         nearest_tiles(depth_m, nearest[0], nearest[1])
+        farthest = view.max_range  # a lone pixel, which clears nothing, marks cells beside its point
     return _candidates(view, table, windows, nearest, _end_of_view(view, table, farthest), stack, free, mixed)
 
 
@@ -237,7 +238,7 @@ def _classify(view, table, windows, nearest, tile, blocks, bx, by, bz):
     farthest = ZERO
     for level in range(finest, coarsest + 1):
         farthest = max(farthest, _extreme(windows, windows.highs, level, tile, u0, u1, v0, v1, True))
-    if z_low > (farthest + _behind(table, farthest, view.max_range)) * (ONE + SLACK):
+    if not table.marks and z_low > (farthest + _behind(table, farthest, view.max_range)) * (ONE + SLACK):
         return SKIP
     whole = u_low >= -HALF and v_low >= -HALF and u_high <= right + HALF and v_high <= bottom + HALF
     if not whole or z_high > view.max_range:
@@ -329,7 +330,7 @@ def _passed(view, table, cz):
 
 @cell
 def _clear(view, table, windows, cx, cy, cz, lowest, scratch, out):
-    """Write the negative evidence of the farthest pixel in a window of about the cell's size, never below `lowest`.
+    """Write the negative evidence of how far one sees through a window of about the cell's size, never below `lowest`.
 
     scratch: see `evaluate`.
     """

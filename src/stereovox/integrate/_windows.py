@@ -2,10 +2,10 @@
 """Kernels that build window images: how far one sees through the pixels about a place, for windows of all sizes.
 
 Level 0 is the depth image itself, level l >= 1 holds, for each tile of 2^(l-1) pixels, the farthest of the 3x3 tiles
-around it. A tile is seen through as far as its nearest pixel (`_shrink`), so beside an edge or a hole, where depths are
-often wrong and thin things are missed, nothing is cleared that a whole patch of pixels does not see through. For fast
-culling each level also has the nearest and farthest value of tiles of 16 and 64 of its own pixels. No value is 0, so it
-is the nearest of all and never clears anything.
+around it. A tile is seen through as far as its nearest pixel (`_shrink`): beside an edge or a hole, where depths are
+often wrong and thin things are missed, cells from some four pixels on are cleared only by patches that see through as a
+whole, smaller ones by single pixels. For fast culling each level also has the nearest and farthest value of tiles of 16
+and 64 of its own pixels. No value is 0, so it is the nearest of all and never clears anything.
 
 All levels stand in one image whose rows are `pitch` long: level 1 on top, level 0 below it, the others side by side
 below that; so the place of a pixel takes a few sums and no table look-up (`place`).
@@ -80,8 +80,8 @@ def build(depth_m, windows, scratch):
 def farthest_of(windows):
     """Return the farthest value of all window images, which the finest one has."""
     first, farthest = windows.first, ZERO
-    start = windows.tile_offset[first, 0]
-    for i in range(start, start + windows.tile_width[first, 0] * ((windows.shape[first, 0] + 15) >> 4)):
+    start = windows.tile_offset[first, 1]
+    for i in range(start, start + windows.tile_width[first, 1] * ((windows.shape[first, 0] + 63) >> 6)):
         farthest = max(farthest, windows.highs[i])
     return farthest
 

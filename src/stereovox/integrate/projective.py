@@ -2,9 +2,9 @@
 """The projective integrator: cells are projected into the depth image, from coarse boxes to single cells.
 
 A frame updates each cell at most once. Cells that hold a measured point get its hit evidence, scattered from the
-pixels; every other cell gets the evidence of the farthest pixel in a window of about its own size. So thin near
-obstacles stay, small holes do not matter, and the result is that of exact ray casting (docs/integrators.md has
-figures).
+pixels; every other cell gets the evidence of how far one sees through a window of about its own size (`_windows`). So
+thin near obstacles stay, small holes do not matter, and the result is near that of exact ray casting, which clears more
+(docs/integrators.md has figures).
 """
 
 from __future__ import annotations

@@ -20,7 +20,7 @@ KNOWN = 0.3
 """Share of what a frame sees that the map must be sure of."""
 SAMPLE = 512
 """Blocks that are enough to judge a frame by."""
-LOOKED_THROUGH = 4.0
+LOOKED_THROUGH = 3.0
 """What is looked through tells as much as what is hit, although a sensor model gives it less evidence, and only where
 a whole patch of pixels looks through."""
 

@@ -328,6 +328,8 @@ class DisagreementMonitor:
             detail = "it would agree with the map from elsewhere; calibrate where the camera is, or reset the tracker"
         else:
             detail = f"it disagrees with the map ({against or 0:.0%} of what it says, {limit:.0%} may)"
+        if against is None:
+            detail = "nothing that it sees is known, and frames just before it disagree with the map"
         seconds = self._trust.moved_s if doubt.verdict == MOVED else self._trust.changed_s
         detail += f"; accepted once frames agree for {seconds:g} s"
         return FrameRefused(REASONS[doubt.verdict], f"{name_of(frame)}: {detail}")

@@ -8,7 +8,7 @@ import numpy as np
 from stereovox import se2
 from stereovox.config.robot import SlamConfig
 from stereovox.frame import Scan
-from stereovox.localize.slam.graph import Keyframe
+from stereovox.localize.slam.graph import SLACK_TURN, Keyframe
 from stereovox.localize.slam.line_map import Cloud, LineMap, Match, cloud_of, joined
 from stereovox.localize.slam.loops import ClosureSearch
 from stereovox.localize.slam.trust import SLIPPED, STUCK, Moment, Trust, through
@@ -114,7 +114,9 @@ class Follower:
         if _nearer(other, pose, guess) or matched > driven + self._trust.margin:
             self._trust.settle(SLIPPED)
             return
-        self.pose, self._slack = guess, float(np.hypot(*(guess - self.pose)[:2])) + HELD[0]
+        left = se2.relative(self.pose, guess)
+        slack = max(float(np.hypot(left[0], left[1])), abs(float(left[2])) / SLACK_TURN) + HELD[0]
+        self.pose, self._slack = guess, max(self._slack, slack)
         self._trust.settle(STUCK)
 
     def _fit(self, cloud: Cloud, pose: se2.Pose) -> tuple[se2.Pose, float]:

@@ -76,7 +76,8 @@ class Trust:
         way = last.way + float(np.hypot(*(odometry - last.odometry)[:2]))
         matched = se2.compose(last.matched, se2.relative(before, after))
         self._past.append(Moment(odometry, matched, way))
-        since = next(moment for moment in self._past if moment.way > way - WINDOW)
+        past = list(self._past)[:-1]
+        since = next((moment for moment in past if moment.way > way - WINDOW), past[-1])
         apart = np.array(self._difference(since))
         limits = np.clip(FAR * self._usual, (LEAST, LEAST_TURN), (MOST, MOST_TURN))
         self._usual += RATE * (np.minimum(apart, 3 * self._usual) - self._usual)
@@ -104,7 +105,7 @@ class Trust:
 def through(seen: Cloud, points: NDArray[np.floating], bins: int = 720) -> tuple[int, int]:
     """Count how many of other points a scan sees through, and how many it could.
 
-    seen: the scan, in the robot's frame; points: (N, 2) there. A point counts where the scan has a beam within half a
+    seen: the scan, in the robot's frame; points: (N, 2) there. A point counts where the scan has a beam within a
     degree; it is seen through where that beam ends `THICK` metres or more behind it, on both sides too.
     """
 

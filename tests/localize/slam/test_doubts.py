@@ -119,3 +119,14 @@ def test_beams_that_pass_through_points_are_counted():
         [[2.0, 0.0], [3.9, 0.0], [6.0, 0.0], [-2.0, 0.0]]
     )  # seen through, the wall, behind it, not looked at
     assert through(seen, ahead) == (1, 2)
+
+
+@pytest.mark.parametrize("step", [0.1, 1.2, 5.0])
+def test_odometry_that_matching_does_not_follow_is_noticed_whatever_the_step(step):
+    """Steps longer than the way over which both are compared are compared by themselves."""
+    trust, still, found = Trust(), np.zeros(3), []
+    for i in range(12):
+        found.append(trust.add(np.array([step * i, 0, 0]), still, still))
+    assert any(since is not None for since in found)
+    agreeing, there = Trust(), [np.array([step * i, 0, 0]) for i in range(12)]
+    assert all(agreeing.add(there[i], there[max(i - 1, 0)], there[i]) is None for i in range(12))

@@ -1,0 +1,191 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Surfaces seen so far, as surfels in cubic cells of several sizes, and the pose that lays a depth image onto them."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.frame import DepthImage
+from stereovox.se3 import Transform, rotation_matrix, rotation_vector
+from stereovox.track._surfels import EMPTY, FIELDS, carry, equations, normals, patches, put
+
+PATCHES_ACROSS = 80
+"""Patches along the longer side of an image."""
+SIZES = (0.3, 0.1, 0.05, 0.025)
+"""Sizes of cells in metres, from coarse to fine."""
+SLACK = (0.05, 0.015, 0.005, 0.002)
+"""Deviation in metres, for each size, of what lies in one cell without being one plane."""
+STEPS = 6
+"""Least squares at each size."""
+REACH = 3.0
+"""Standard deviations at which a patch begins to count little."""
+CONVERGED = 0.01
+"""Metres and radians of a step that is the last, as a share of the cells' size."""
+MOST = 5e3
+"""Weight at which a surfel becomes a running mean."""
+ALIKE = 4.0
+"""Patches whose errors are alike, so that they tell no more than one: neighbours see the same surfel and share the
+camera's own distortion. Chosen so that covariances hold in simulation (docs/tracking.md)."""
+QUIETEST = 0.01
+"""Least variance of residuals, as a share of the expected one, that is believed."""
+BENT = 0.03
+"""Radians by which normals of a plane may be bent together, by the camera's own distortion: that holds nothing."""
+HOLDS = 1.0
+"""Information, by that of what is expected, below which a direction is not held."""
+FIRST = 1 << 14
+"""Places in a new table."""
+
+
+class Patches(NamedTuple):
+    """Patches of an image that lie on surfaces, camera frame: points, normals (N, 3), sigma (N,) in metres; float32.
+
+    sigma: standard deviation along the ray.
+    """
+
+    points: NDArray[np.float32]
+    normals: NDArray[np.float32]
+    sigma: NDArray[np.float32]
+
+
+class Fit(NamedTuple):
+    """How an image lies on the surfels.
+
+    T_map_camera: the pose (4, 4). covariance: (6, 6), rotation about the camera (radians), then shift (metres), along
+    the map's axes. known: share of the patches that have a surfel. usual: share of those that lie on it.
+    """
+
+    T_map_camera: Transform
+    covariance: NDArray[np.float64]
+    known: float
+    usual: float
+
+
+def patches_of(image: DepthImage, sigma_of: NDArray[np.float64], rows_per_metre: float) -> Patches:
+    """Return the patches of an image. sigma_of: standard deviation of a depth, by depth times `rows_per_metre`."""
+    depth = image.depth_m
+    step = max(1, round(max(depth.shape) / PATCHES_ACROSS))
+    shape = (depth.shape[0] // step, depth.shape[1] // step, 3)
+    point, normal = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    columns, rows = (np.ascontiguousarray(rays, np.float32) for rays in image.camera.rays())
+    patches(depth, columns, rows, step, point)
+    normals(point, normal)
+    there = normal.any(axis=2)
+    away = np.linalg.norm(point, axis=2)
+    row = np.minimum(away[there] * rows_per_metre, len(sigma_of) - 1).astype(int)
+    return Patches(point[there], normal[there], sigma_of[row].astype(np.float32))
+
+
+class Surfels:
+    """Surfels of one size, in a hash table that grows."""
+
+    def __init__(self, size: float):
+        self.size, self.number = np.float32(size), 0
+        self._keys = np.full(FIRST, EMPTY)
+        self._surfels = np.zeros((FIRST, FIELDS), np.float32)
+
+    def add(self, seen: Patches, T: Transform) -> None:
+        """Add patches seen from T_map_camera."""
+        while 2 * (self.number + len(seen.points)) > len(self._keys):
+            self._rebuild(np.ones(len(self._keys), bool), 2 * len(self._keys))
+        R, t = np.ascontiguousarray(T[:3, :3]), np.ascontiguousarray(T[:3, 3])
+        self.number += put(self._keys, self._surfels, self.size, *seen[:3], R, t, np.float32(MOST))
+
+    def forget(self, centre: NDArray[np.float64], radius: float) -> None:
+        """Drop all surfels farther than `radius` metres from `centre` (3,) along an axis."""
+        cells = np.stack([_index(self._keys, shift) for shift in (42, 21, 0)], axis=1)
+        near = np.all(np.abs(cells * float(self.size) - centre) < radius, axis=1)
+        self._rebuild(near, len(self._keys))
+
+    def equations(self, seen: Patches, T: Transform, slack: float) -> tuple[NDArray, NDArray, NDArray]:
+        """Return information (6, 6), gradient (6,) and counts (3,), as `_surfels.equations`, less what bent normals hold."""
+        information, gradient, spread, counts = np.zeros((6, 6)), np.zeros(6), np.zeros(10), np.zeros(3)
+        R, t = np.ascontiguousarray(T[:3, :3]), np.ascontiguousarray(T[:3, 3])
+        equations(
+            self._keys, self._surfels, self.size, *seen[:3], R, t, np.float32(slack), REACH, information, gradient,
+            spread, counts,
+        )  # fmt: skip
+        noise = max(counts[2] / max(counts[0], 1), QUIETEST)  # variance of the residuals, by what was expected of it
+        information -= BENT**2 * _held_by_any(spread)
+        return information / (ALIKE * noise), gradient / (ALIKE * noise), counts
+
+    def _rebuild(self, keep: NDArray[np.bool_], room: int) -> None:
+        """Move the surfels to keep into a table of `room` places."""
+        keep = keep & (self._keys != EMPTY)
+        keys, surfels = np.full(room, EMPTY), np.zeros((room, FIELDS), np.float32)
+        carry(self._keys, self._surfels, keep, keys, surfels)
+        self._keys, self._surfels, self.number = keys, surfels, int(keep.sum())
+
+
+class SurfelMap:
+    """Surfels of all sizes."""
+
+    def __init__(self) -> None:
+        self._levels = [Surfels(size) for size in SIZES]
+
+    def __len__(self) -> int:
+        return sum(level.number for level in self._levels)
+
+    def add(self, seen: Patches, T_map_camera: Transform) -> None:
+        """Add the patches of an image."""
+        for level in self._levels:
+            level.add(seen, T_map_camera)
+
+    def forget(self, centre: NDArray[np.float64], radius: float) -> None:
+        """Drop all surfels farther than `radius` metres from `centre` (3,) along an axis."""
+        for level in self._levels:
+            level.forget(centre, radius)
+
+    def fit(self, seen: Patches, expected: Transform, doubt: NDArray[np.float64]) -> Fit:
+        """Return the pose that lays an image onto the surfels, near the one that is expected.
+
+        doubt: (6, 6) covariance of the expectation, as that of a `Fit`.
+        """
+        T, scale = expected, np.linalg.cholesky(doubt)
+        for level, slack in zip(self._levels, SLACK, strict=True):
+            for _ in range(STEPS):
+                information, gradient, _ = level.equations(seen, T, slack)
+                held, directions = _held(information, scale)
+                off = np.concatenate([rotation_vector(T[:3, :3] @ expected[:3, :3].T), T[:3, 3] - expected[:3, 3]])
+                asked = np.where(held > 0, directions.T @ gradient, 0.0) - np.linalg.solve(directions, off)
+                motion = directions @ (asked / (held + 1.0))
+                T = _moved(T, motion)
+                if np.abs(motion).max() < CONVERGED * level.size:
+                    break
+        information, _, counts = self._levels[-1].equations(seen, T, SLACK[-1])
+        held, directions = _held(information, scale)
+        covariance = (directions / (held + 1.0)) @ directions.T
+        return Fit(T, covariance, counts[0] / max(len(seen.points), 1), counts[1] / max(counts[0], 1))
+
+
+def _held(information: NDArray[np.float64], scale: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
+    """Return directions of motion (6, 6), columns, of one expected deviation each, and what holds them (6,), 0: nothing.
+
+    scale: (6, 6), times its transpose the covariance of what is expected.
+    """
+    held, directions = np.linalg.eigh(scale.T @ information @ scale)
+    return np.where(held > HOLDS, held, 0.0), scale @ directions
+
+
+def _moved(T: Transform, motion: NDArray[np.float64]) -> Transform:
+    moved = np.eye(4)
+    moved[:3, :3] = rotation_matrix(motion[:3]) @ T[:3, :3]
+    moved[:3, 3] = T[:3, 3] + motion[3:]
+    return moved
+
+
+def _held_by_any(spread: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the information (6, 6) that patches would hold with normals in all directions; spread as in `equations`."""
+    weight, (x, y, z) = spread[0], spread[1:4]
+    xx, xy, xz, yy, yz, zz = spread[4:]
+    across = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    turning = np.array([[yy + zz, -xy, -xz], [-xy, xx + zz, -yz], [-xz, -yz, xx + yy]])
+    return np.block([[turning, across], [across.T, weight * np.eye(3)]])
+
+
+def _index(keys: NDArray[np.int64], shift: int) -> NDArray[np.int64]:
+    """Return the indices of cells along one axis, of which `_surfels._key` made 21 bits at `shift`."""
+    index = (keys >> shift) & 0x1FFFFF
+    return index - ((index >> 20) << 21)

@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Views kept along the way, to find it again: which look alike, and whether an image belongs where it seems to fit."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.se3 import Transform, inverse, rotation_vector
+
+GRID = (30, 40)
+"""Rows and columns of a view's depths."""
+SMALL = (12, 16)
+"""Places at which views are compared by their looks."""
+NEAR = 12
+"""Views that an image is compared with: the nearest."""
+TOLERANCE = 0.04
+"""Share of the depth by which what is seen twice may differ, besides four standard deviations."""
+
+
+class View(NamedTuple):
+    """What one image saw. T: T_map_camera (4, 4). depth: GRID metres along the optical axis, NaN where there is none.
+
+    points: (N, 3) float32 metres, camera frame. sigma: (N,) their standard deviations. slope: (2,) half width and half
+    height of the grid at one metre.
+    """
+
+    T: Transform
+    depth: NDArray[np.float32]
+    points: NDArray[np.float32]
+    sigma: NDArray[np.float32]
+    slope: NDArray[np.float64]
+
+
+def view_of(points: NDArray[np.float32], sigma: NDArray[np.float32], T: Transform) -> View:
+    """Return the view of an image's patches (N, 3), (N,) from T_map_camera."""
+    ahead = points[points[:, 2] > 0]
+    slope = np.abs(ahead[:, :2] / ahead[:, 2:]).max(axis=0) + 1e-6
+    view = View(T, np.full(GRID, np.nan, np.float32), points, sigma, slope)
+    row, column, inside = _places(view, points)
+    order = np.argsort(-points[inside, 2])  # the nearest is written last
+    view.depth[row[inside][order], column[inside][order]] = points[inside, 2][order]
+    return view
+
+
+def unlike(one: View, other: View) -> float:
+    """Return how much two views differ at a few places: median metres, infinity where they share too few."""
+    rows, columns = (np.linspace(0, size - 1, small).astype(int) for size, small in zip(GRID, SMALL, strict=True))
+    apart = np.abs(one.depth - other.depth)[np.ix_(rows, columns)]
+    apart = apart[np.isfinite(apart)]
+    return float(np.median(apart)) if len(apart) > 0.3 * SMALL[0] * SMALL[1] else np.inf
+
+
+def far_apart(one: Transform, other: Transform, metres: float, radians: float) -> bool:
+    """Return whether two poses are farther apart than this."""
+    turn = np.linalg.norm(rotation_vector(one[:3, :3].T @ other[:3, :3]))
+    return bool(np.linalg.norm(one[:3, 3] - other[:3, 3]) > metres or turn > radians)
+
+
+def contradiction(seen: View, views: list[View]) -> tuple[float, int]:
+    """Return the share of what is seen twice that lies where a view looked through, and how many places are seen twice.
+
+    Each way: surfaces of the image in front of what the nearest views saw, and theirs in front of what it sees.
+    """
+    nearest = sorted(views, key=lambda view: float(np.linalg.norm(view.T[:3, 3] - seen.T[:3, 3])))[:NEAR]
+    through, same = np.sum([_seen_through(a, b) for view in nearest for a, b in ((seen, view), (view, seen))], axis=0)
+    return through / max(through + same, 1), int(through + same)
+
+
+def _seen_through(one: View, other: View) -> tuple[int, int]:
+    """Return how many points of one view the other looks through, and how many it sees as well."""
+    T = inverse(other.T) @ one.T
+    points = one.points @ T[:3, :3].T + T[:3, 3]
+    row, column, inside = _places(other, points)
+    z, seen = points[inside, 2], other.depth[row[inside], column[inside]]
+    slack = 4 * one.sigma[inside] + TOLERANCE * seen
+    return int((z < seen - slack).sum()), int((np.abs(z - seen) <= slack).sum())
+
+
+def _places(view: View, points: NDArray[np.floating]) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.bool_]]:
+    """Return row and column in a view's grid of points (N, 3) in its camera's frame, and which lie in it."""
+    ahead = points[:, 2] > 0.05
+    where = points[:, :2] / np.where(ahead, points[:, 2], 1.0)[:, None] / view.slope
+    place = np.floor((where + 1) / 2 * GRID[::-1]).astype(np.intp)
+    inside = ahead & np.all((place >= 0) & (place < GRID[::-1]), axis=1)
+    return place[:, 1], place[:, 0], inside

@@ -34,7 +34,7 @@ def patch_points(depth: NDArray[Any], columns: NDArray[Any], rows: NDArray[Any],
 
 
 def patch_normals(points: NDArray[np.floating]) -> NDArray[np.float64]:
-    """Return the unit normal (h, w, 3) of each patch, towards the camera, from the neighbours that there are; else 0."""
+    """Return the unit normal (h, w, 3) of each patch, towards the camera, by the neighbours there are; else 0."""
     height, width = points.shape[:2]
     normals = np.zeros((height, width, 3))
 

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The kernels of tracking against plain Python."""
 
+from itertools import product
+
 import naive_tracking as naive
 import numpy as np
 import pytest
@@ -209,15 +211,15 @@ def test_the_gradient_is_that_of_the_robust_cost():
     for _ in range(20):
         level.add(walls, np.eye(4))
         twin.add(*walls, np.eye(4))
-    surfels = twin.surfels()
+    surfels, off = twin.surfels(), np.array([0.01, -0.02, 0.015])
 
     def cost(motion):
-        R, t = rotation_matrix(motion[:3]), motion[3:] + (0.01, -0.02, 0.015)
+        R, t = rotation_matrix(motion[:3]), motion[3:] + off
         moved = [naive.Patch(R @ p + t, n, 0.02) for p, n in zip(points, normals, strict=True)]
         return naive.equations(surfels, 0.2, moved, t, 0.01, 3.0).cost
 
     T = np.eye(4)
-    T[:3, 3] = 0.01, -0.02, 0.015
+    T[:3, 3] = off
     information, gradient, _, counts = raw_equations(level, walls, T)
     assert counts[0] > 850
     step = 1e-5

@@ -61,6 +61,7 @@ def settled(
     Directions that nothing holds stay as expected. doubt: (6, 6) covariance of the expectation. start: where to begin
     if not there.
     """
+    covariance = doubt
     T, scale = expected if start is None else start, np.asarray(np.linalg.cholesky(doubt), np.float64)
     for stage in stages:
         for _ in range(STEPS):
@@ -68,12 +69,12 @@ def settled(
             held, directions = _held(information, scale)
             off = np.concatenate([rotation_vector(T[:3, :3] @ expected[:3, :3].T), T[:3, 3] - expected[:3, 3]])
             asked = np.where(held > 0, directions.T @ gradient, 0.0) - np.linalg.solve(directions, off)
+            covariance = (directions / (held + 1.0)) @ directions.T
             motion = directions @ (asked / (held + 1.0))
             T = _moved(T, motion)
             if np.abs(motion).max() < stage.converged:
                 break
-    held, directions = _held(stages[-1].equations(T)[0], scale)
-    return T, (directions / (held + 1.0)) @ directions.T
+    return T, covariance
 
 
 def _held(

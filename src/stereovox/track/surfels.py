@@ -20,13 +20,15 @@ SIZES = (0.3, 0.1, 0.05, 0.025)
 """Sizes of cells in metres, from coarse to fine."""
 SLACK = (0.05, 0.015, 0.005, 0.002)
 """Deviation in metres, for each size, of what lies in one cell without being one plane."""
+EVERY = (4, 4, 2, 1)
+"""Of so many patches one is used, at each size."""
 REACH = 3.0
 """Standard deviations at which a patch begins to count little."""
 CONVERGED = 0.01
 """Metres and radians of a step that is the last, as a share of the cells' size."""
 MOST = 5e3
 """Weight at which a surfel becomes a running mean."""
-ALIKE = 4.0
+ALIKE = 2.0
 """Patches whose errors are alike, so that they tell no more than one: neighbours see the same surfel and share the
 camera's own distortion. Chosen so that covariances hold in simulation (docs/tracking.md)."""
 QUIETEST = 0.01
@@ -46,6 +48,10 @@ class Patches(NamedTuple):
     points: NDArray[np.float32]
     normals: NDArray[np.float32]
     sigma: NDArray[np.float32]
+
+    def thinned(self, every: int) -> Patches:
+        """Return one of `every` patches."""
+        return self if every == 1 else Patches(*(np.ascontiguousarray(part[::every]) for part in self))
 
 
 def patches_of(image: DepthImage, sigma_of: NDArray[np.float64], rows_per_metre: float) -> Patches:
@@ -127,13 +133,13 @@ class SurfelMap:
         """Return the pose that lays an image onto the surfels, near the expected one; `doubt` as in `settled`."""
         counts = np.zeros(3)
 
-        def equations(level: Surfels, slack: float, T: Transform) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-            information, gradient, counts[:] = level.equations(seen, T, slack)
+        def equations(level: Surfels, slack: float, some: Patches, T: Transform) -> tuple[NDArray, NDArray]:
+            information, gradient, counts[:] = level.equations(some, T, slack)
             return information, gradient
 
         stages = [
-            Stage(partial(equations, level, slack), CONVERGED * float(level.size))
-            for level, slack in zip(self._levels, SLACK, strict=True)
+            Stage(partial(equations, level, slack, seen.thinned(every)), CONVERGED * float(level.size))
+            for level, slack, every in zip(self._levels, SLACK, EVERY, strict=True)
         ]
         T, covariance = settled(stages, expected, doubt)
         return Fit(T, covariance, counts[0] / max(len(seen.points), 1), counts[1] / max(counts[0], 1))

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """The kernels of tracking against plain Python."""
 
-from itertools import product
-
 import naive_tracking as naive
 import numpy as np
 import pytest

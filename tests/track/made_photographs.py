@@ -43,8 +43,8 @@ def corner(x: float = 0.0) -> Scene:
 
 def way(steps: int, x: float = 0.0) -> list[Transform]:
     """Return poses of a camera that moves evenly: 6 cm and nearly a degree from one to the next."""
-    places = [np.multiply(k, (0.03, 0.05, 0.01)) + (x - 0.5, -0.8, 0) for k in range(steps)]
-    return [look_at(p, p + (np.cos(0.015 * k), np.sin(0.015 * k), -0.1)) for k, p in enumerate(places)]
+    places = [np.array([0.03 * k + x - 0.5, 0.05 * k - 0.8, 0.01 * k]) for k in range(steps)]
+    return [look_at(p, np.add(p, (np.cos(0.015 * k), np.sin(0.015 * k), -0.1))) for k, p in enumerate(places)]
 
 
 def photographs(scene: Scene, poses: Sequence[Transform], pair: StereoPair = PAIR, seed: int = 0) -> list[StereoFrame]:

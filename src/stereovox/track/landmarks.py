@@ -244,8 +244,9 @@ class Landmarks:
     ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         there = pixels - np.column_stack([guess, np.zeros(len(guess))]).astype(np.float32)
         right, found = _flow(seen.left, seen.right, pixels, there)
-        disparity = pixels[:, 0] - right[:, 0]
-        return disparity, found & (np.abs(pixels[:, 1] - right[:, 1]) < ROWS_PX) & (disparity > MIN_DISPARITY)
+        disparity, off = pixels[:, 0] - right[:, 0], np.abs(pixels[:, 1] - right[:, 1])
+        column, row = np.clip(np.rint(pixels), 0, np.array(seen.mask.shape[::-1]) - 1).astype(int).T
+        return disparity, found & (seen.mask[row, column] > 0) & (off < ROWS_PX) & (disparity > MIN_DISPARITY)
 
     def _new(self, seen: Seen, T: Transform) -> Corners:
         """Return new landmarks, away from those that there are."""

@@ -13,6 +13,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from stereovox.cameras.lenses import Lens
+
 Cell = tuple[int, int, int]
 Vector = NDArray[np.float64]
 
@@ -161,3 +163,9 @@ def cell_of(key: int) -> Cell:
     digits = format(key, "063b")
     x, y, z = (int(digits[k : k + 21], 2) - (digits[k] == "1") * 2**21 for k in (0, 21, 42))
     return x, y, z
+
+
+def seen_at(landmark: Vector, T: NDArray[np.float64], lens: Lens, baseline: float) -> Vector:
+    """Return column, row and disparity (3,) of a point (3,) for a pair of lenses without distortion at T."""
+    x, y, z = T[:3, :3].T @ (landmark - T[:3, 3])
+    return np.array([lens.fx * x / z + lens.cx, lens.fy * y / z + lens.cy, lens.fx * baseline / z])

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,7 +10,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.cameras.rigs import VirtualCamera
 from stereovox.config import Config, load_config
 from stereovox.depth import DepthPipeline
@@ -20,12 +18,9 @@ from stereovox.frame import AnyFrame
 from stereovox.integrate.views import PerCamera
 from stereovox.se3 import Transform, inverse, orthonormalise
 from stereovox.sensors.noise import RangeNoise
-from stereovox.sources.base import Stream
 from stereovox.track.surfels import Fit, Patches, SurfelMap, patches_of
 from stereovox.track.views import View, contradiction, far_apart, unlike, view_of
 
-LOST = "tracking_lost"
-"""Reason of refusal of frames whose pose is not known."""
 LEVEL = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """Pose of the first image unless another is given: the camera looks along x, level; z is up."""
 BIAS = 3.0
@@ -217,55 +212,6 @@ class Tracker:
         if number < MIN_PATCHES:
             return f"only {number} places of it were seen before, of {MIN_PATCHES} needed"
         return f"{share:.0%} of it lies where other views looked through" if share > LOOKED_THROUGH else ""
-
-
-class TrackedStream(Stream):
-    """A recording or camera whose frames get their poses from a `Tracker`; lost ones have the fault `tracking_lost`.
-
-    Args:
-        source: The frames; poses that they have are not used.
-        tracker: Finds the poses; a new one without settings of its own.
-        skip: Frames at the start that are tracked, and not delivered.
-    """
-
-    def __init__(self, source: Stream, tracker: Tracker, skip: int = 0):
-        self.name, self.camera, self.notes = source.name, source.camera, source.notes
-        self._source, self._tracker, self._skip = source, tracker, skip
-
-    camera: PinholeCamera
-    up = "z"
-
-    @property
-    def length(self) -> int | None:
-        """Number of frames; None for a live camera."""
-        return None if self._source.length is None else self._source.length - self._skip
-
-    @property
-    def dropped(self) -> int:
-        """Frames that a live camera delivered and that were not consumed in time."""
-        return self._source.dropped
-
-    def after(self, count: int) -> Stream:
-        """Return the frames from number `count` on; those before are tracked again."""
-        return TrackedStream(self._source, self._tracker, self._skip + count)
-
-    def __iter__(self) -> Iterator[AnyFrame]:
-        for number, frame in enumerate(self._source):
-            if frame.fault and frame.fault != "no_pose":
-                tracked, frame_ = None, frame
-            else:
-                tracked = self._tracker.add(replace(frame, fault=None, fault_detail=""))
-                frame_ = posed(frame, tracked)
-            if number >= self._skip:
-                yield frame_
-
-
-def posed(frame: AnyFrame, tracked: Tracked) -> AnyFrame:
-    """Return a frame with the pose that was tracked, or with the fault `tracking_lost`."""
-    if not tracked.lost:
-        return replace(frame, T_world_sensor=tracked.T_world_sensor, pose_off_ns=0, fault=None, fault_detail="")
-    detail = f"{frame.name}: {tracked.lost}; move slower, or back to what was seen before"
-    return replace(frame, T_world_sensor=tracked.T_world_sensor, pose_off_ns=0, fault=LOST, fault_detail=detail)
 
 
 def _doubt(fit: Fit, demand: Demand) -> str:

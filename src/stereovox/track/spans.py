@@ -76,7 +76,3 @@ class LostSpans:
     def after(self, frame: AnyFrame, report: UpdateReport) -> None:
         """Take note of a frame that was offered to the map; one with a fault was not tracked."""
         self.add(frame.stamp_ns, report.detail if frame.fault else "")
-
-    def line(self) -> str:
-        """Return how many frames were tracked, in one line."""
-        return f"tracked {self.frames - self.lost} of {self.frames} frames"

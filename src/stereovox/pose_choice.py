@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from stereovox import opening
 from stereovox.errors import NoPoses, StereovoxError, did_you_mean
-from stereovox.opening import open_images, open_stream
 from stereovox.sources.base import Stream
 from stereovox.track.stream import POSE_FAULTS
 
@@ -45,9 +45,9 @@ def choose_poses(source: str | Path | Stream, frames: str | None, poses: str | N
         missing = "" if poses == GIVEN else _missing(source)
         return Choice(source, poses == TRACK or bool(missing), missing if poses is None else "")
     if poses == TRACK:
-        return Choice(open_images(source, frames), True)
+        return Choice(opening.open_images(source, frames), True)
     try:
-        found = open_stream(source, frames)
+        found = opening.open_stream(source, frames)
     except NoPoses as error:
         missing = str(error)
         if poses == GIVEN:
@@ -56,14 +56,14 @@ def choose_poses(source: str | Path | Stream, frames: str | None, poses: str | N
         missing = "" if poses == GIVEN else _missing(found)
         if not missing or found.length is None:  # a live camera is opened once
             return Choice(found, bool(missing), missing)
-    return Choice(open_images(source, frames), True, missing)
+    return Choice(opening.open_images(source, frames), True, missing)
 
 
 def _missing(source: Stream) -> str:
     """Return why a source has no poses, empty where it has some."""
     read = getattr(source, "frame", None)
     if read is None or not source.length:
-        return "" if getattr(source, "posed", True) else f"{source.name}: a camera that does not know where it is"
+        return "" if getattr(source, "posed", True) else f"{source.name}: no poses; add ?pose=fixed if the camera stands still"
     why = ""
     for i in np.unique(np.linspace(0, source.length - 1, min(LOOKED_AT, source.length)).astype(int)).tolist():
         frame = read(i)

@@ -63,7 +63,7 @@ class CameraTrack:
     @property
     def tracked(self) -> NDArray[np.bool_]:
         """Return which frames (N,) have a pose."""
-        return np.isfinite(self.T_world_sensor).all(axis=(1, 2))
+        return np.asarray(np.isfinite(self.T_world_sensor).all(axis=(1, 2)))
 
     @property
     def length_m(self) -> float:

@@ -110,8 +110,8 @@ def _map(arguments: Namespace, out: Path) -> dict[str, Any]:
 
     run = MapRun(
         arguments.source, out, profile=arguments.profile, resume=arguments.resume, frames=arguments.frames,
-        camera=arguments.camera, level=arguments.level, poses=arguments.poses, checkpoint_s=arguments.checkpoint, notify=say,
-        **overrides(arguments),
+        camera=arguments.camera, level=arguments.level, poses=arguments.poses, checkpoint_s=arguments.checkpoint,
+        notify=say, **overrides(arguments),
     )  # fmt: skip
     with run, page_of(run.mapper, out.stem, arguments.view) as page:
         say_about_compiling()

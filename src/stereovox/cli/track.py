@@ -48,16 +48,12 @@ def run(arguments: Namespace) -> dict[str, Any]:
     say_lost(found.lost)
     if found.score is not None:
         say(_score_line(found.score))
-    say(
-        f"saved in {arguments.out}; map with the same poses: {command_line('map', arguments.source, '--poses', 'track')}"
-    )
+    line = command_line("map", arguments.source, "--poses", "track")
+    say(f"saved in {arguments.out}; make a map with these poses: {line}")
     return result
 
 
 def _score_line(score: TrajectoryScore) -> str:
-    position, rotation = score.position_m.rmse, score.rotation_deg.rmse
     drift = "" if score.drift_percent is None else f"; the end is off by {score.drift_percent:.2g} % of the way"
-    return (
-        f"aligned with the recording's own poses, positions are off by {100 * position:.2g} cm and {rotation:.2g} "
-        f"degrees (RMS){drift}"
-    )
+    off = f"positions are off by {100 * score.position_m.rmse:.2g} cm (RMS)"
+    return f"aligned with the recording's own poses, {off}{drift}"

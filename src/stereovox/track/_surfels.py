@@ -59,7 +59,7 @@ def patches(depth_m, columns, rows, step, point):
 
 @kernel
 def normals(point, normal):
-    """Write the unit normals (h, w, 3), towards the camera, of patches; 0 where neighbours do not tell or it is steep."""
+    """Write unit normals (h, w, 3) of patches, towards the camera; 0 where neighbours do not tell or it is steep."""
     height, width = point.shape[0], point.shape[1]
     for y in range(height):
         for x in range(width):

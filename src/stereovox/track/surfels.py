@@ -3,14 +3,16 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.frame import DepthImage
-from stereovox.se3 import Transform, rotation_matrix, rotation_vector
+from stereovox.se3 import Transform
 from stereovox.track._surfels import EMPTY, FIELDS, carry, equations, normals, patches, put
+from stereovox.track.fit import Fit, Stage, settled
 
 PATCHES_ACROSS = 80
 """Patches along the longer side of an image."""
@@ -18,23 +20,21 @@ SIZES = (0.3, 0.1, 0.05, 0.025)
 """Sizes of cells in metres, from coarse to fine."""
 SLACK = (0.05, 0.015, 0.005, 0.002)
 """Deviation in metres, for each size, of what lies in one cell without being one plane."""
-STEPS = 6
-"""Least squares at each size."""
+EVERY = (4, 4, 2, 1)
+"""Of so many patches one is used, at each size."""
 REACH = 3.0
 """Standard deviations at which a patch begins to count little."""
 CONVERGED = 0.01
 """Metres and radians of a step that is the last, as a share of the cells' size."""
 MOST = 5e3
 """Weight at which a surfel becomes a running mean."""
-ALIKE = 4.0
+ALIKE = 2.0
 """Patches whose errors are alike, so that they tell no more than one: neighbours see the same surfel and share the
 camera's own distortion. Chosen so that covariances hold in simulation (docs/tracking.md)."""
 QUIETEST = 0.01
 """Least variance of residuals, as a share of the expected one, that is believed."""
 BENT = 0.03
 """Radians by which normals of a plane may be bent together, by the camera's own distortion: that holds nothing."""
-HOLDS = 1.0
-"""Information, by that of what is expected, below which a direction is not held."""
 FIRST = 1 << 14
 """Places in a new table."""
 
@@ -49,18 +49,9 @@ class Patches(NamedTuple):
     normals: NDArray[np.float32]
     sigma: NDArray[np.float32]
 
-
-class Fit(NamedTuple):
-    """How an image lies on the surfels.
-
-    T_map_camera: the pose (4, 4). covariance: (6, 6), rotation about the camera (radians), then shift (metres), along
-    the map's axes. known: share of the patches that have a surfel. usual: share of those that lie on it.
-    """
-
-    T_map_camera: Transform
-    covariance: NDArray[np.float64]
-    known: float
-    usual: float
+    def thinned(self, every: int) -> Patches:
+        """Return one of `every` patches."""
+        return self if every == 1 else Patches(*(np.ascontiguousarray(part[::every]) for part in self))
 
 
 def patches_of(image: DepthImage, sigma_of: NDArray[np.float64], rows_per_metre: float) -> Patches:
@@ -100,7 +91,7 @@ class Surfels:
         self._rebuild(near, len(self._keys))
 
     def equations(self, seen: Patches, T: Transform, slack: float) -> tuple[NDArray, NDArray, NDArray]:
-        """Return information (6, 6), gradient (6,) and counts (3,), as `_surfels.equations`, less what bent normals hold."""
+        """Return information (6, 6), less what bent normals hold, gradient (6,), counts (3,): `_surfels.equations`."""
         information, gradient, spread, counts = np.zeros((6, 6)), np.zeros(6), np.zeros(10), np.zeros(3)
         R, t = np.ascontiguousarray(T[:3, :3]), np.ascontiguousarray(T[:3, 3])
         equations(
@@ -139,45 +130,23 @@ class SurfelMap:
             level.forget(centre, radius)
 
     def fit(self, seen: Patches, expected: Transform, doubt: NDArray[np.float64]) -> Fit:
-        """Return the pose that lays an image onto the surfels, near the one that is expected.
+        """Return the pose that lays an image onto the surfels, near the expected one; `doubt` as in `settled`."""
+        counts = np.zeros(3)
 
-        doubt: (6, 6) covariance of the expectation, as that of a `Fit`.
-        """
-        T, scale = expected, np.linalg.cholesky(doubt)
-        for level, slack in zip(self._levels, SLACK, strict=True):
-            for _ in range(STEPS):
-                information, gradient, _ = level.equations(seen, T, slack)
-                held, directions = _held(information, scale)
-                off = np.concatenate([rotation_vector(T[:3, :3] @ expected[:3, :3].T), T[:3, 3] - expected[:3, 3]])
-                asked = np.where(held > 0, directions.T @ gradient, 0.0) - np.linalg.solve(directions, off)
-                motion = directions @ (asked / (held + 1.0))
-                T = _moved(T, motion)
-                if np.abs(motion).max() < CONVERGED * level.size:
-                    break
-        information, _, counts = self._levels[-1].equations(seen, T, SLACK[-1])
-        held, directions = _held(information, scale)
-        covariance = (directions / (held + 1.0)) @ directions.T
+        def equations(level: Surfels, slack: float, some: Patches, T: Transform) -> tuple[NDArray, NDArray]:
+            information, gradient, counts[:] = level.equations(some, T, slack)
+            return information, gradient
+
+        stages = [
+            Stage(partial(equations, level, slack, seen.thinned(every)), CONVERGED * float(level.size))
+            for level, slack, every in zip(self._levels, SLACK, EVERY, strict=True)
+        ]
+        T, covariance = settled(stages, expected, doubt)
         return Fit(T, covariance, counts[0] / max(len(seen.points), 1), counts[1] / max(counts[0], 1))
 
 
-def _held(information: NDArray[np.float64], scale: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
-    """Return directions of motion (6, 6), columns, of one expected deviation each, and what holds them (6,), 0: nothing.
-
-    scale: (6, 6), times its transpose the covariance of what is expected.
-    """
-    held, directions = np.linalg.eigh(scale.T @ information @ scale)
-    return np.where(held > HOLDS, held, 0.0), scale @ directions
-
-
-def _moved(T: Transform, motion: NDArray[np.float64]) -> Transform:
-    moved = np.eye(4)
-    moved[:3, :3] = rotation_matrix(motion[:3]) @ T[:3, :3]
-    moved[:3, 3] = T[:3, 3] + motion[3:]
-    return moved
-
-
 def _held_by_any(spread: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the information (6, 6) that patches would hold with normals in all directions; spread as in `equations`."""
+    """Return the information (6, 6) that patches with normals in all directions would hold; spread: (10,) moments."""
     weight, (x, y, z) = spread[0], spread[1:4]
     xx, xy, xz, yy, yz, zz = spread[4:]
     across = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])

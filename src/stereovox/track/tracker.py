@@ -1,59 +1,43 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Depth odometry: the pose of each depth image from the image itself, or the word that it is lost."""
+"""The pose of each image from the images themselves, or the word that it is lost."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox.cameras.rigs import VirtualCamera
+from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.config import Config, load_config
-from stereovox.depth import DepthPipeline
 from stereovox.errors import FrameRefused
-from stereovox.frame import AnyFrame
-from stereovox.integrate.views import PerCamera
-from stereovox.se3 import Transform, inverse, orthonormalise
-from stereovox.sensors.noise import RangeNoise
-from stereovox.track.surfels import Fit, Patches, SurfelMap, patches_of
-from stereovox.track.views import View, contradiction, far_apart, unlike, view_of
+from stereovox.frame import AnyFrame, StereoFrame
+from stereovox.se3 import Transform, inverse, orthonormalise, rotation_matrix, rotation_vector
+from stereovox.track.fit import Fit, Limits
+from stereovox.track.landmarks import Landmarks
+from stereovox.track.surfaces import Surfaces
+from stereovox.track.views import far_apart
 
+LOST = "tracking_lost"
+"""Reason of refusal of frames whose pose is not known."""
 LEVEL = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """Pose of the first image unless another is given: the camera looks along x, level; z is up."""
-BIAS = 3.0
-"""Errors of a real camera's depth that patches do not average out, in standard deviations of one pixel."""
-FLOOR_M = 0.002
-ROWS_PER_METRE, FARTHEST_M = 20.0, 100.0
-"""Of the table of standard deviations."""
-SPREAD = np.array([0.08, 0.08, 0.08, 0.06, 0.06, 0.06])
-"""Radians and metres by which a camera may leave its even motion from one image to the next."""
-MIN_PATCHES = 150
-"""Patches with a surface that an image needs."""
-UNSURE_M, UNSURE_RAD = 0.02, np.radians(1)
-"""Standard deviations beyond which a pose is not known: nothing in view holds it along some direction."""
-VIEW_M, VIEW_RAD = 0.3, np.radians(15)
-"""Views this far apart are kept, to find the way back from."""
-TRIED = 6
-"""Kept views that are tried when lost: those that look most like the image."""
-ADRIFT_M, ADRIFT_RAD = 0.3, np.radians(10)
-"""Standard deviations up to which a pose that is open is still followed, without being believed."""
-SEARCH = np.full(6, 0.4)
-"""As SPREAD, where the way back is sought."""
-LOOKED_THROUGH = 0.05
-"""Share of what is seen again that may lie where other views looked through: something that moved, not a wall."""
-RIVAL = 0.9
-"""Two fits of which one explains this share of what the other does, at places that differ: neither is believed."""
+GIVEN, GIVEN_SHARE = np.repeat([np.radians(0.2), 0.005], 3), 0.05
+"""Standard deviations of a given motion: radians and metres, and share of it."""
+LONGEST = 10.0
+"""Times the usual, how long after an image the next may come and motion still be taken to go on evenly."""
+RIVAL, RIVAL_M, RIVAL_RAD = 0.9, 0.3, np.radians(15)
+"""Two fits of which one explains this share of what the other does, so far apart: neither is believed."""
+FIRST = 3.0
+"""Times the usual spread, from the first image to the second: the camera may be moving."""
 CONFIRMED = 5
 """Images in a row that must be tracked after a view is found again, without teaching, until poses count."""
-KEPT_M, CHECKED = 30.0, 100
-"""Surfels farther than this along an axis are forgotten, looked for every so many images."""
 
 
 class Demand(NamedTuple):
-    """Share of the patches that must be known, and of those that must lie where they are expected."""
+    """Share of an image that must be known, and of that what must be where it is expected."""
 
     known: float
     usual: float
@@ -61,16 +45,52 @@ class Demand(NamedTuple):
 
 FOLLOWING, RETURNING = Demand(0.2, 0.6), Demand(0.5, 0.8)
 
+Seen = TypeVar("Seen")
+
+
+class Evidence(Protocol[Seen]):
+    """What a tracker learns from images: `Surfaces` of depth cameras, `Landmarks` of stereo pairs."""
+
+    limits: Limits
+
+    def see(self, frame: AnyFrame, /) -> Seen:
+        """Return what of a frame is used; raises FrameRefused where it cannot be."""
+        ...
+
+    def forget(self) -> None:
+        """Forget all that was learned."""
+        ...
+
+    def fit(self, seen: Seen, expected: Transform, doubt: NDArray[np.float64], /) -> Fit:
+        """Return how an image fits near an expected pose; `doubt` as in `settled`."""
+        ...
+
+    def advance(self, seen: Seen, T: Transform, /) -> None:
+        """Go on from an image at T_map_camera without believing it."""
+        ...
+
+    def learn(self, seen: Seen, T: Transform, /) -> None:
+        """Take in an image that is believed to be at T_map_camera."""
+        ...
+
+    def seek(self, seen: Seen, last: Transform, /) -> list[Fit]:
+        """Return how an image fits at places that were seen before; the last pose that was known."""
+        ...
+
+    def contradicted(self, seen: Seen, T: Transform, /) -> str:
+        """Return what speaks against an image having been taken from T_map_camera, "" where nothing does."""
+        ...
+
 
 @dataclass(frozen=True, eq=False)
 class Tracked:
     """The pose of one frame.
 
     Attributes:
-        T_world_sensor: (4, 4) float64, maps the optical frame into the tracker's world; of the last frame that was
-            tracked where this one is lost.
-        covariance: (6, 6) float64 of its place on the surfaces seen so far: rotation about the camera in radians, then
-            position in metres, along the world's axes. Drift since the start is not in it.
+        T_world_sensor: (4, 4) float64, maps the optical frame into the tracker's world; where this one is lost, the
+            last that was followed.
+        covariance: (6, 6) float64 of its place on what was seen so far: rotation about the camera in radians, then
+            position in metres, along the world's axes; infinite where it is lost. Drift since the start is not in it.
         lost: Why the pose is not known, in words; "" where it is.
     """
 
@@ -80,11 +100,13 @@ class Tracked:
 
 
 class Tracker:
-    """Finds the pose of each depth image or stereo pair by the surfaces that the ones before have seen.
+    """Finds the pose of each depth image or stereo pair by what the ones before have seen.
 
-    Each image is laid onto surfels, point to plane, from coarse to fine, from where even motion takes the camera. Where
-    too little is seen or known, or nothing holds the pose along some direction (a bare wall), the frame is lost and
-    teaches nothing; the way back is sought among the views that were kept. Poses that frames bring are not used.
+    Depth images, and pairs with a wide view, are laid onto surfels, point to plane, from coarse to fine; in pinhole
+    pairs corners are followed. Both begin where even motion takes the camera. Where too little is known, or nothing
+    holds the pose along some direction (a bare wall), the frame is lost and teaches nothing; a pose that is open by a
+    little is followed on, else the way back is sought among the views that were kept. A view that is found again counts
+    after some images that agree. Poses that frames bring are not used. All frames come from one camera.
 
     Args:
         profile: Profile name, TOML file or `Config`: depth, noise and range are prepared as for a map.
@@ -100,118 +122,145 @@ class Tracker:
 
     def __init__(self, profile: str | Path | Config = "default", *, start: Transform | None = None, **overrides: Any):
         self.config = load_config(profile, **overrides)
-        self._depth = DepthPipeline(self.config)
-        self._sigma: PerCamera[NDArray[np.float64]] = PerCamera(self._sigma_of)
         self._start = LEVEL if start is None else np.asarray(start, float)
-        self._map = SurfelMap()
+        self._evidence: Evidence[Any] | None = None
+        self._sensor = ""
         self._T, self._motion, self._covariance = self._start, np.eye(4), np.zeros((6, 6))
-        self._views: list[View] = []
-        self._seen = 0
+        self._stamps: list[int] = []  # of the last two images that were followed
+        self._learned = 0
         self._trial: int | None = None  # images until poses count: 0 while following, None while lost
 
-    def add(self, frame: AnyFrame) -> Tracked:
+    def add(self, frame: AnyFrame, motion: Transform | None = None) -> Tracked:
         """Return the pose of a frame. Frames come in the order they were taken.
 
         Args:
             frame: Depth image or stereo pair; its pose is not used.
+            motion: (4, 4) T_before_now, how the camera moved since the frame before by its wheels or another tracker.
+                It takes the place of even motion, and is believed along directions that nothing in view holds, and
+                where all in view is new; then a frame is lost only where what it sees contradicts what is known.
 
         Returns:
-            Its pose, or why it is lost: also where the image itself cannot be used.
+            Its pose, or why it is lost: also where the image itself cannot be used. The first image counts once the
+            next is tracked on it.
         """
+        if self._evidence is None:
+            self._evidence, self._sensor = _evidence_for(frame, self.config), frame.sensor
+        if frame.sensor != self._sensor:
+            return self._lost(f"the camera {self._sensor or 'of the first frame'} is tracked, not {frame.sensor}")
         try:
-            seen = self._patches(frame)
+            seen = self._evidence.see(frame)
         except FrameRefused as refused:
-            return self._lose(refused.reason)
-        if len(seen.points) < MIN_PATCHES:
-            return self._lose(f"only {len(seen.points)} patches of the image lie on surfaces, of {MIN_PATCHES} needed")
-        if self._seen < 2 and self._trial != 0:
-            return self._begin(seen)
-        if self._trial is None:
-            return self._seek(seen)
-        fit = self._map.fit(seen, self._T @ self._motion, self._covariance + np.diag(SPREAD**2))
-        demand = RETURNING if self._trial else FOLLOWING
-        why = _doubt(fit, demand) or _open(fit, ADRIFT_M, ADRIFT_RAD)
+            return self._lose(str(refused))
+        if self._learned < 2 and self._trial != 0:
+            return self._begin(self._evidence, seen, frame.stamp_ns)
+        if self._trial is None and motion is None:
+            return self._seek(self._evidence, seen, frame.stamp_ns)
+        if motion is not None:
+            return self._correct(self._evidence, seen, motion, frame.stamp_ns)
+        return self._follow(self._evidence, seen, frame.stamp_ns)
+
+    def _correct(self, evidence: Evidence[Seen], seen: Seen, motion: Transform, stamp_ns: int) -> Tracked:
+        """Take the pose of an image that a given motion leads to, corrected by what is held in view."""
+        expected = self._T @ motion
+        way = np.repeat([np.linalg.norm(rotation_vector(motion[:3, :3])), np.linalg.norm(motion[:3, 3])], 3)
+        doubt = np.diag((GIVEN + GIVEN_SHARE * way) ** 2)
+        fit = evidence.fit(seen, expected, doubt)
+        if fit.known < FOLLOWING.known:
+            fit = Fit(expected, doubt, fit.known, 1.0)
+        contrary = _doubt(fit, Demand(0.0, FOLLOWING.usual))
+        self._place(expected if contrary else fit.T_map_camera, fit.covariance)
+        self._motion, self._stamps = motion, [*self._stamps[-1:], stamp_ns]
+        if contrary:
+            evidence.advance(seen, self._T)
+            return self._lost(contrary)
+        evidence.learn(seen, self._T)
+        self._learned += 1
+        return Tracked(self._T, fit.covariance)
+
+    def _begin(self, evidence: Evidence[Seen], seen: Seen, stamp_ns: int) -> Tracked:
+        """Start with an image; a start counts once the next image is tracked on it."""
+        evidence.forget()
+        evidence.learn(seen, self._start)
+        self._place(self._start, np.zeros((6, 6)))
+        self._stamps, self._trial, self._learned = [stamp_ns], 0, 1
+        return self._lost("the first image; poses count from the next one that fits it")
+
+    def _follow(self, evidence: Evidence[Seen], seen: Seen, stamp_ns: int) -> Tracked:
+        """Take the pose of an image that fits, and learn from it where it is believed."""
+        expected, doubt = self._expected(evidence.limits, stamp_ns)
+        fit = evidence.fit(seen, expected, doubt)
+        why = _doubt(fit, RETURNING if self._trial else FOLLOWING) or _open(fit, evidence.limits.adrift)
         if not why and self._trial:
-            why = self._contradicted(seen, fit.T_map_camera)
+            why = evidence.contradicted(seen, fit.T_map_camera)
         if why:
-            return self._begin(seen) if self._seen < 2 else self._lose(why)
-        return self._follow(seen, fit)
-
-    def _patches(self, frame: AnyFrame) -> Patches:
-        posed = replace(frame, T_world_sensor=np.eye(4))
-        image = self._depth.image(self._depth.matched(posed))
-        return patches_of(image, self._sigma[image.camera], ROWS_PER_METRE)
-
-    def _sigma_of(self, camera: VirtualCamera) -> NDArray[np.float64]:
-        depths = np.arange(round(FARTHEST_M * ROWS_PER_METRE)) / ROWS_PER_METRE
-        return FLOOR_M + BIAS * RangeNoise.of(self.config.noise, camera).sigma(depths)
-
-    def _begin(self, seen: Patches) -> Tracked:
-        """Start the map with an image; a start counts once the next image is tracked on it."""
-        self._map, self._views = SurfelMap(), []
-        self._T, self._motion, self._trial = self._start, np.eye(4), 0
-        self._covariance = np.zeros((6, 6))
-        self._learn(seen)
-        self._seen = 1
-        return Tracked(
-            self._start, np.full((6, 6), np.inf), "the first image; poses count from the next one that fits it"
-        )
-
-    def _follow(self, seen: Patches, fit: Fit) -> Tracked:
-        """Take the pose of an image that fits, and learn from it unless the way back is still on trial."""
-        T = orthonormalise(fit.T_map_camera)
-        self._motion, self._T, self._covariance = inverse(self._T) @ T, T, fit.covariance
-        why = _open(fit, UNSURE_M, UNSURE_RAD)
+            return self._begin(evidence, seen, stamp_ns) if self._learned < 2 else self._lose(why)
+        before = self._T
+        self._place(fit.T_map_camera, fit.covariance)
+        self._motion = inverse(before) @ self._T
+        self._stamps = [*self._stamps[-1:], stamp_ns]
+        why = self._wait(_open(fit, evidence.limits.unsure))
         if why:
-            self._trial = max(self._trial, 1)
+            evidence.advance(seen, self._T)
+            return self._lost(why)
+        evidence.learn(seen, self._T)
+        self._learned += 1
+        return Tracked(self._T, fit.covariance)
+
+    def _wait(self, why: str) -> str:
+        """Return why a pose that is followed does not count yet: because it is open, or was until just before."""
+        if why:
+            self._trial = max(self._trial or 0, 1)
         elif self._trial:
             self._trial -= 1
             why = f"found again; {self._trial + 1} more images must agree"
-        if why:
-            return Tracked(T, np.full((6, 6), np.inf), why)
-        self._learn(seen)
-        return Tracked(T, fit.covariance)
+        return why
 
-    def _learn(self, seen: Patches) -> None:
-        self._map.add(seen, self._T)
-        if all(far_apart(self._T, view.T, VIEW_M, VIEW_RAD) for view in self._views):
-            self._views.append(view_of(seen.points, seen.sigma, self._T))
-        self._seen += 1
-        if self._seen % CHECKED == 0:
-            here = self._T[:3, 3]
-            self._map.forget(here, KEPT_M)
-            self._views = [view for view in self._views if np.abs(view.T[:3, 3] - here).max() < KEPT_M]
+    def _expected(self, limits: Limits, stamp_ns: int) -> tuple[Transform, NDArray[np.float64]]:
+        """Return where even motion takes the camera until a time, and the covariance (6, 6) of that."""
+        later = 1.0
+        if len(self._stamps) == 2 and stamp_ns > self._stamps[1] > self._stamps[0]:
+            later = min((stamp_ns - self._stamps[1]) / (self._stamps[1] - self._stamps[0]), LONGEST)
+        motion = np.eye(4)
+        motion[:3, :3] = rotation_matrix(later * rotation_vector(self._motion[:3, :3]))
+        motion[:3, 3] = later * self._motion[:3, 3]
+        spread = limits.spread * max(later, 1.0) * (1 if len(self._stamps) == 2 else FIRST)
+        return self._T @ motion, self._covariance + np.diag(spread**2)
 
-    def _lose(self, why: str) -> Tracked:
-        if self._trial != 0 or self._seen >= 2:
-            self._trial = None
-        return Tracked(self._T, np.full((6, 6), np.inf), why)
-
-    def _seek(self, seen: Patches) -> Tracked:
-        """Look for an image at the last pose and at the kept views that look most like it."""
-        here = view_of(seen.points, seen.sigma, self._T)
-        alike = sorted(self._views, key=lambda view: unlike(view, here))
-        starts = [self._T, *(view.T for view in alike[:TRIED])]
-        fits = sorted(
-            (self._map.fit(seen, T, np.diag(SEARCH**2)) for T in starts), key=lambda fit: -fit.known * fit.usual
-        )
+    def _seek(self, evidence: Evidence[Seen], seen: Seen, stamp_ns: int) -> Tracked:
+        """Look for an image among what was seen before."""
+        fits = sorted(evidence.seek(seen, self._T), key=lambda fit: -fit.known * fit.usual)
+        if not fits:
+            return self._lose("not found again: it looks like nothing before")
         best = fits[0]
-        why = _doubt(best, RETURNING) or _open(best, UNSURE_M, UNSURE_RAD)
+        why = _doubt(best, RETURNING) or _open(best, evidence.limits.unsure)
         rivals = (fit for fit in fits if fit.known * fit.usual > RIVAL * best.known * best.usual)
-        if not why and any(far_apart(best.T_map_camera, fit.T_map_camera, VIEW_M, VIEW_RAD) for fit in rivals):
+        if not why and any(far_apart(best.T_map_camera, fit.T_map_camera, RIVAL_M, RIVAL_RAD) for fit in rivals):
             why = "it fits at several places"
-        why = why or self._contradicted(seen, best.T_map_camera)
+        why = why or evidence.contradicted(seen, best.T_map_camera)
         if why:
             return self._lose(f"not found again: {why}")
-        self._T, self._motion, self._trial = orthonormalise(best.T_map_camera), np.eye(4), CONFIRMED
-        self._covariance = best.covariance
-        return Tracked(self._T, np.full((6, 6), np.inf), f"found again; {CONFIRMED} more images must agree")
+        self._place(best.T_map_camera, best.covariance)
+        self._motion, self._stamps, self._trial = np.eye(4), [stamp_ns], CONFIRMED
+        evidence.advance(seen, self._T)
+        return self._lost(f"found again; {CONFIRMED} more images must agree")
 
-    def _contradicted(self, seen: Patches, T: Transform) -> str:
-        share, number = contradiction(view_of(seen.points, seen.sigma, T), self._views)
-        if number < MIN_PATCHES:
-            return f"only {number} places of it were seen before, of {MIN_PATCHES} needed"
-        return f"{share:.0%} of it lies where other views looked through" if share > LOOKED_THROUGH else ""
+    def _place(self, T: Transform, covariance: NDArray[np.float64]) -> None:
+        self._T, self._covariance = orthonormalise(T), covariance
+
+    def _lose(self, why: str) -> Tracked:
+        if self._learned >= 2:
+            self._trial = None
+        return self._lost(why)
+
+    def _lost(self, why: str) -> Tracked:
+        return Tracked(self._T, np.full((6, 6), np.inf), why)
+
+
+def _evidence_for(frame: AnyFrame, config: Config) -> Evidence[Any]:
+    """Return what tracks a camera."""
+    if isinstance(frame, StereoFrame) and isinstance(frame.pair.camera, PinholeCamera):
+        return Landmarks(frame.pair)
+    return Surfaces(config)
 
 
 def _doubt(fit: Fit, demand: Demand) -> str:
@@ -223,9 +272,9 @@ def _doubt(fit: Fit, demand: Demand) -> str:
     return ""
 
 
-def _open(fit: Fit, metres: float, radians: float) -> str:
-    """Return by how much a pose is open, where it is by more than this; "" where it is not."""
+def _open(fit: Fit, limit: tuple[float, float]) -> str:
+    """Return by how much a pose is open, where it is by more than a limit in radians and metres; "" where it is not."""
     turn, shift = (np.sqrt(np.linalg.eigvalsh(part)[-1]) for part in (fit.covariance[:3, :3], fit.covariance[3:, 3:]))
-    if shift > metres or turn > radians:
+    if turn > limit[0] or shift > limit[1]:
         return f"what it sees leaves the pose open by {shift:.3f} m and {np.degrees(turn):.1f} degrees"
     return ""

@@ -73,10 +73,8 @@ class StereoDepth:
 
         Raises FrameRefused: the source's `fault`, `bad_dtype`, `bad_shape`.
         """
-        if frame.fault:
-            raise FrameRefused(frame.fault, frame.fault_detail or f"{frame.name}: {frame.fault}")
-        frame = _rectified(frame)
-        left, right = (_grey(image, frame, side) for image, side in ((frame.left, "left"), (frame.right, "right")))
+        frame = grey_rectified(frame)
+        left, right = frame.left, frame.right
         config = self._decided(left.shape)
         raw = self._raw(left, right, config)
         sides = (left, _checked(frame.pair.valid, frame)), (right, _checked(frame.pair.valid_right, frame))
@@ -120,6 +118,17 @@ def _checked(mask: NDArray[np.bool_] | None, frame: StereoFrame) -> NDArray[np.b
     if mask is not None and mask.shape != size:
         raise StereovoxError(f"stereo pair '{frame.pair.name}': mask is {mask.shape}, its camera says {size}")
     return mask
+
+
+def grey_rectified(frame: StereoFrame) -> StereoFrame:
+    """Return a stereo frame with rectified grey images (height, width) of the size of its pair's camera.
+
+    Raises FrameRefused: the source's `fault`, `bad_dtype`, `bad_shape`.
+    """
+    if frame.fault:
+        raise FrameRefused(frame.fault, frame.fault_detail or f"{frame.name}: {frame.fault}")
+    frame = _rectified(frame)
+    return replace(frame, left=_grey(frame.left, frame, "left"), right=_grey(frame.right, frame, "right"))
 
 
 def _rectified(frame: StereoFrame) -> StereoFrame:

@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Depth images laid onto the surfaces that the ones before have seen."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.cameras.rigs import VirtualCamera
+from stereovox.config import Config
+from stereovox.depth import DepthPipeline
+from stereovox.errors import FrameRefused
+from stereovox.frame import AnyFrame
+from stereovox.integrate.views import PerCamera
+from stereovox.se3 import Transform
+from stereovox.sensors.noise import RangeNoise
+from stereovox.track.fit import Fit, Limits
+from stereovox.track.surfels import Patches, SurfelMap, patches_of
+from stereovox.track.views import View, contradiction, far_apart, unlike, view_of
+
+BIAS = 3.0
+"""Errors of a real camera's depth that patches do not average out, in standard deviations of one pixel."""
+FLOOR_M = 0.002
+ROWS_PER_METRE, FARTHEST_M = 20.0, 100.0
+"""Of the table of standard deviations."""
+MIN_PATCHES = 150
+"""Patches with a surface that an image needs."""
+VIEW_M, VIEW_RAD = 0.3, np.radians(15)
+"""Views this far apart are kept, to find the way back from."""
+TRIED = 6
+"""Kept views that are tried when lost: those that look most like the image."""
+SEARCH = np.full(6, 0.4)
+"""Radians and metres around them in which the pose is sought."""
+LOOKED_THROUGH = 0.05
+"""Share of what is seen again that may lie where other views looked through: something that moved, not a wall."""
+KEPT_M, CHECKED = 30.0, 100
+"""Surfels farther than this along an axis are forgotten, looked for every so many images."""
+
+
+class Surfaces:
+    """Evidence of a depth camera: patches of its images, point to plane on surfels (see `SurfelMap`).
+
+    Args:
+        config: Depth, noise and range are prepared as for a map.
+    """
+
+    limits = Limits(
+        spread=np.array([0.08, 0.08, 0.08, 0.06, 0.06, 0.06]),
+        unsure=(np.radians(1), 0.02),
+        adrift=(np.radians(10), 0.3),
+    )
+
+    def __init__(self, config: Config):
+        self._config, self._depth = config, DepthPipeline(config)
+        self._sigma: PerCamera[VirtualCamera, NDArray[np.float64]] = PerCamera(self._sigma_of)
+        self._map, self._views, self._learned = SurfelMap(), list[View](), 0
+
+    def see(self, frame: AnyFrame) -> Patches:
+        """Return the patches of a frame; raises FrameRefused, also where too few lie on surfaces."""
+        image = self._depth.image(self._depth.matched(replace(frame, T_world_sensor=np.eye(4))))
+        seen = patches_of(image, self._sigma[image.camera], ROWS_PER_METRE)
+        if len(seen.points) < MIN_PATCHES:
+            words = f"only {len(seen.points)} patches of the image lie on surfaces, {MIN_PATCHES} are needed"
+            raise FrameRefused("tracking_lost", words)
+        return seen
+
+    def _sigma_of(self, camera: VirtualCamera) -> NDArray[np.float64]:
+        depths = np.arange(round(FARTHEST_M * ROWS_PER_METRE)) / ROWS_PER_METRE
+        return FLOOR_M + BIAS * RangeNoise.of(self._config.noise, camera).sigma(depths)
+
+    def forget(self) -> None:
+        """Forget all that was learned."""
+        self._map, self._views, self._learned = SurfelMap(), [], 0
+
+    def fit(self, seen: Patches, expected: Transform, doubt: NDArray[np.float64]) -> Fit:
+        """Return the pose that lays an image onto the surfels, near the expected one; `doubt` as in `settled`."""
+        return self._map.fit(seen, expected, doubt)
+
+    def advance(self, seen: Patches, T: Transform) -> None:
+        """Nothing follows an image that is not learned from."""
+
+    def learn(self, seen: Patches, T: Transform) -> None:
+        """Add an image that is believed to be at T_map_camera."""
+        self._map.add(seen, T)
+        if all(far_apart(T, view.T, VIEW_M, VIEW_RAD) for view in self._views):
+            self._views.append(view_of(seen.points, seen.sigma, T))
+        self._learned += 1
+        if self._learned % CHECKED == 0:
+            self._map.forget(T[:3, 3], KEPT_M)
+            self._views = [view for view in self._views if np.abs(view.T[:3, 3] - T[:3, 3]).max() < KEPT_M]
+
+    def seek(self, seen: Patches, last: Transform) -> list[Fit]:
+        """Return how an image fits at the last pose and near the kept views that look most like it."""
+        here = view_of(seen.points, seen.sigma, last)
+        alike = sorted(self._views, key=lambda view: unlike(view, here))
+        starts = [last, *(view.T for view in alike[:TRIED])]
+        return [self._map.fit(seen, T, np.diag(SEARCH**2)) for T in starts]
+
+    def contradicted(self, seen: Patches, T: Transform) -> str:
+        """Return what speaks against an image having been taken from T_map_camera, "" where nothing does."""
+        share, number = contradiction(view_of(seen.points, seen.sigma, T), self._views)
+        if number < MIN_PATCHES:
+            return f"only {number} places of it were seen before, {MIN_PATCHES} are needed"
+        return f"{share:.0%} of it lies where other views looked through" if share > LOOKED_THROUGH else ""

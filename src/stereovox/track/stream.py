@@ -110,7 +110,8 @@ def posed(frame: AnyFrame, tracked: Tracked) -> AnyFrame:
         return frame
     if not tracked.lost:
         return replace(frame, T_world_sensor=tracked.T_world_sensor, pose_off_ns=0, fault=None, fault_detail="")
-    detail = f"{name_of(frame)}: {tracked.lost}; {CURE}"
+    name = name_of(frame)
+    detail = f"{tracked.lost if name in tracked.lost else f'{name}: {tracked.lost}'}; {CURE}"
     return replace(frame, T_world_sensor=np.full((4, 4), np.nan), pose_off_ns=0, fault=LOST, fault_detail=detail)
 
 

@@ -18,17 +18,17 @@ from stereovox.sources.latest import LatestStream
 
 def test_poses_that_are_there_are_used_unless_said_otherwise(tmp_path):
     where = unposed(tmp_path, 3, poses=True)
-    assert choose_poses(where, None, None)[1:] == (False, "")
-    assert choose_poses(where, None, "given")[1:] == (False, "")
+    assert choose_poses(where, None, None)[1:] == ("given", "")
+    assert choose_poses(where, None, "given")[1:] == ("given", "")
     chosen = choose_poses(where, "1:", "track")
-    assert chosen[1:] == (True, "")
+    assert chosen[1:] == ("track", "")
     assert [bool(np.isfinite(frame.T_world_sensor).all()) for frame in chosen.source] == [False, False]
 
 
 def test_without_poses_the_camera_is_tracked_and_why_is_said(tmp_path):
     where = unposed(tmp_path, 3)
     chosen = choose_poses(str(where), ":2", None)
-    assert (chosen.tracked, chosen.source.length) == (True, 2)
+    assert (chosen.poses, chosen.source.length) == ("track", 2)
     assert "has depth images (3) but no poses" in chosen.why
     with pytest.raises(NoPoses, match="no poses; write poses"):
         choose_poses(where, None, "given")
@@ -53,7 +53,7 @@ def test_a_layout_whose_files_of_poses_are_all_missing(tmp_path):
     for file in where.glob("*.pose.txt"):
         file.unlink()
     chosen = choose_poses(where, None, None)
-    assert (chosen.tracked, "frame-000000.pose.txt: no such file" in chosen.why) == (True, True)
+    assert (chosen.poses, "frame-000000.pose.txt: no such file" in chosen.why) == ("track", True)
     assert [frame.depth.size > 0 for frame in chosen.source] == [True] * 4
 
 
@@ -67,7 +67,7 @@ def test_kitti_without_poses(tmp_path, make):
     for folder in (tmp_path / "kitti").parent.rglob("oxts"):
         folder.rename(folder.with_name("away"))
     chosen = choose_poses(where, None, None)
-    assert (chosen.tracked, "no such f" in chosen.why) == (True, True)
+    assert (chosen.poses, "no such f" in chosen.why) == ("track", True)
     for frame, left in zip(chosen.source, with_poses, strict=True):
         assert frame.fault is None
         assert np.isnan(frame.T_world_sensor).all()
@@ -90,15 +90,15 @@ def test_a_live_camera_says_whether_it_knows_where_it_is(monkeypatch, posed):
     opened = []
     monkeypatch.setattr(pose_choice.opening, "open_stream", lambda *_: opened.append(1) or LatestStream(Camera(posed)))
     chosen = choose_poses("realsense:", None, None)
-    assert (chosen.tracked, bool(chosen.why), len(opened)) == (not posed, not posed, 1)
+    assert (chosen.poses, bool(chosen.why), len(opened)) == ("given" if posed else "track", not posed, 1)
 
 
 def test_streams_of_ones_own(tmp_path):
     images, simulated = open_images(unposed(tmp_path, 2)), open_source(ROOM, ":2")
-    assert choose_poses(images, None, None).tracked
-    assert not choose_poses(simulated, None, None).tracked
-    assert choose_poses(simulated, None, "track") == (simulated, True, "")
-    assert choose_poses(images, None, "given") == (images, False, "")
+    assert choose_poses(images, None, None).poses == "track"
+    assert choose_poses(simulated, None, None).poses == "given"
+    assert choose_poses(simulated, None, "track") == (simulated, "track", "")
+    assert choose_poses(images, None, "given") == (images, "given", "")
 
 
 def test_one_frame_with_a_pose_is_enough(tmp_path):
@@ -107,11 +107,11 @@ def test_one_frame_with_a_pose_is_enough(tmp_path):
             frame = super().frame(i)
             return frame if i == 9 else replace(frame, fault="no_pose", fault_detail=f"nothing at {i}")
 
-    assert not choose_poses(Rarely(f"{ROOM.replace('=240', '=10')}"), None, None).tracked
+    assert choose_poses(Rarely(f"{ROOM.replace('=240', '=10')}"), None, None).poses == "given"
 
 
 def test_an_unknown_choice_is_one_line():
     with pytest.raises(
-        StereovoxError, match=r"^poses 'gven' is unknown \(did you mean 'given'\?\); give given or track$"
+        StereovoxError, match=r"^poses 'gven' is unknown \(did you mean 'given'\?\); give given, track or both$"
     ):
         choose_poses(ROOM, None, "gven")

@@ -13,17 +13,19 @@ from stereovox.errors import NoPoses, StereovoxError, did_you_mean
 from stereovox.sources.base import Stream
 from stereovox.track.stream import POSE_FAULTS
 
-GIVEN, TRACK = "given", "track"
-CHOICES = (GIVEN, TRACK)
+GIVEN, TRACK, BOTH = "given", "track", "both"
+CHOICES = (GIVEN, TRACK, BOTH)
+HOW = {TRACK: "tracked", BOTH: "corrected"}
+"""How poses come about that a recording does not have, behind its name."""
 LOOKED_AT = 10
 """Frames, spread over a recording, of which one must have a pose, or it has none."""
 
 
 class Choice(NamedTuple):
-    """A source, and whether its poses are to be tracked; `why` says so, for a note, where nobody chose it."""
+    """A source, and which poses are to be used: one of `CHOICES`; `why` it is `track`, where nobody chose that."""
 
     source: Stream
-    tracked: bool
+    poses: str
     why: str = ""
 
 
@@ -33,37 +35,50 @@ def choose_poses(source: str | Path | Stream, frames: str | None, poses: str | N
     Args:
         source: As for `open_stream`, or a stream that is open.
         frames: Python slice that selects frames of what is opened here.
-        poses: `given`: those of the recording. `track`: from the images; those of the recording are not read. None:
-            given where there are any, else tracked.
+        poses: `given`: those of the recording. `track`: from the images; those of the recording are not read. `both`:
+            those of the recording, corrected by the images. None: given where there are any, else tracked.
 
     Raises:
-        StereovoxError: As `open_stream`; an unknown choice; `given` where there are none.
+        StereovoxError: As `open_stream`; an unknown choice; `given` or `both` where there are none.
     """
     if poses not in (None, *CHOICES):
-        raise StereovoxError(f"poses '{poses}' is unknown{did_you_mean(str(poses), CHOICES)}; give given or track")
+        raise StereovoxError(
+            f"poses '{poses}' is unknown{did_you_mean(str(poses), CHOICES)}; give given, track or both"
+        )
     if not isinstance(source, str | Path):
-        missing = "" if poses == GIVEN else _missing(source)
-        return Choice(source, poses == TRACK or bool(missing), missing if poses is None else "")
+        return _choice(source, poses)
     if poses == TRACK:
-        return Choice(opening.open_images(source, frames), True)
+        return Choice(opening.open_images(source, frames), TRACK)
     try:
-        found = opening.open_stream(source, frames)
+        chosen = _choice(opening.open_stream(source, frames), poses)
     except NoPoses as error:
-        missing = str(error)
-        if poses == GIVEN:
+        if poses is not None:
             raise
-    else:
-        missing = "" if poses == GIVEN else _missing(found)
-        if not missing or found.length is None:  # a live camera is opened once
-            return Choice(found, bool(missing), missing)
-    return Choice(opening.open_images(source, frames), True, missing)
+        return Choice(opening.open_images(source, frames), TRACK, str(error))
+    if chosen.poses != TRACK or chosen.source.length is None:  # a live camera is opened once
+        return chosen
+    return chosen._replace(source=opening.open_images(source, frames))
+
+
+def _choice(source: Stream, poses: str | None) -> Choice:
+    """Return which poses of an open source are used; raises NoPoses for `both` where it has none."""
+    if poses in (GIVEN, TRACK):
+        return Choice(source, poses)
+    missing = _missing(source)
+    if missing and poses == BOTH:
+        raise NoPoses(f"{missing}; without poses give track")
+    return Choice(source, TRACK, missing) if missing else Choice(source, poses or GIVEN)
 
 
 def _missing(source: Stream) -> str:
     """Return why a source has no poses, empty where it has some."""
     read = getattr(source, "frame", None)
     if read is None or not source.length:
-        return "" if getattr(source, "posed", True) else f"{source.name}: no poses; add ?pose=fixed if the camera stands still"
+        return (
+            ""
+            if getattr(source, "posed", True)
+            else f"{source.name}: no poses; add ?pose=fixed if the camera stands still"
+        )
     why = ""
     for i in np.unique(np.linspace(0, source.length - 1, min(LOOKED_AT, source.length)).astype(int)).tolist():
         frame = read(i)

@@ -13,6 +13,7 @@ import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from math import inf, isfinite
 from pathlib import Path
 from time import monotonic
@@ -31,15 +32,17 @@ from stereovox.maps.grid_map import GridMap
 from stereovox.maps.lock import only_writer_in
 from stereovox.maps.store import check_target, is_map, read_manifest, remove_map, sweep
 from stereovox.opening import Stream
-from stereovox.pose_choice import GIVEN, TRACK, choose_poses
+from stereovox.pose_choice import BOTH, GIVEN, HOW, TRACK, choose_poses
 from stereovox.products.floor_axes import upright_axes
 from stereovox.products.moved import level_transform
 from stereovox.safe_io import check_in_space
 from stereovox.sources.camera_file import with_camera
 from stereovox.sources.turned import Turned
 from stereovox.survey import level_start, survey
+from stereovox.track.guided import GuidedTracker
 from stereovox.track.spans import LostSpan, LostSpans
-from stereovox.track.stream import TRACKED, TrackedStream
+from stereovox.track.stream import AnyTracker, TrackedStream
+from stereovox.track.tracker import Tracker
 from stereovox.trust.history import MAX_NAME_LENGTH
 
 if TYPE_CHECKING:
@@ -81,7 +84,7 @@ class MapResult(Generic[MapT]):
         dropped: Number of frames that a live camera delivered while the mapper was busy.
         track: The robot's trajectory in the map, from `map_floor`; None where the odometry's poses were used.
         doubts: Why the map may be wrong, from `map_floor` with SLAM; empty where its self-check found nothing.
-        poses: `given` or `track`: those of the recording, or tracked ones.
+        poses: Which were used: `given`, `track` or `both`.
         lost: Where the camera was lost, if its poses were tracked: these frames are not in the map.
     """
 
@@ -107,7 +110,7 @@ class MapResult(Generic[MapT]):
         summary = summarise(self.map, self.reports)
         if self.doubts:
             summary["doubts"] = [doubt.as_dict() for doubt in self.doubts]
-        if self.poses == TRACK:
+        if self.poses != GIVEN:
             summary["lost"] = [span.as_dict() for span in self.lost]
         return {**summary, "poses": self.poses}
 
@@ -142,7 +145,8 @@ def map_recording(
         level: Turn the recording's world so that z points up; the map is then level, but no longer in the
             coordinates of the recording's poses.
         poses: `given`: those of the recording. `track`: the camera is tracked by its own images, in a world that
-            begins at its first one; frames in which it is lost are refused (`tracking_lost`). None: given where there
+            begins at its first one; frames in which it is lost are refused (`tracking_lost`). `both`: the camera
+            moves from frame to frame as the recording says, corrected by what the images show. None: given where there
             are any, else tracked, which is passed to `notify`; with `resume` as the map was begun.
         checkpoint_s: Seconds between two saves; 0: save only at the end.
         observers: Called after each frame.
@@ -173,7 +177,7 @@ class MapRun:
     Attributes:
         mapper: The mapper, once entered.
         source: The stream of frames, once entered.
-        tracked: Whether its poses are tracked, once entered.
+        poses: Which are used: `given`, `track` or `both`, once entered.
         out: Folder of the map.
 
     Raises:
@@ -182,7 +186,7 @@ class MapRun:
 
     mapper: Mapper
     source: Stream
-    tracked: bool
+    poses: str
 
     def __init__(
         self,
@@ -218,9 +222,8 @@ class MapRun:
             self.mapper = self._make_mapper(saved, suggested)
             stack.callback(self.mapper.map.close)
             self._recorded = self.source
-            if self.tracked:
-                start = level_start(self.source, self.mapper.config)
-                self.source = TrackedStream(self.source, self.mapper.config, start)
+            if self.poses != GIVEN:
+                self.source = TrackedStream(self.source, self._make_tracker(), HOW[self.poses])
             self._checkpoints = Checkpoints(lambda: self.mapper.map.save(self.out), self.out, self._checkpoint_s)
             self._check_recording()
             if not self._resume and is_map(self.out):
@@ -248,7 +251,7 @@ class MapRun:
         """
         with interrupt_between_steps() as check, _saved_from_start(self.mapper.map, self.out):
             self._lost = LostSpans(frames_offered(self.mapper))
-            reports = self._add_all(check, (*observers, *([self._lost] if self.tracked else [])))
+            reports = self._add_all(check, (*observers, *([self._lost] if self.poses != GIVEN else [])))
             if not self.mapper.map.frames:
                 raise StereovoxError(
                     f"{self.source.name}: not one frame could be used, no map is written ({first_refusal(reports)})"
@@ -256,7 +259,7 @@ class MapRun:
             self._checkpoints.save(frames_offered(self.mapper))
         return MapResult(
             self.mapper.map, self.out, reports, self.source.dropped,
-            poses=TRACK if self.tracked else GIVEN, lost=self._lost.spans,
+            poses=self.poses, lost=self._lost.spans,
         )  # fmt: skip
 
     @property
@@ -267,7 +270,7 @@ class MapRun:
 
     def _prepare(self, saved: VoxelMap | None) -> tuple[dict[str, Any], list[str]]:
         """Open the source; return settings that it suggests, and lines about them. A levelled world is turned here."""
-        source, self.tracked, why = choose_poses(self._source, self._frames, self._poses_of(saved))
+        source, self.poses, why = choose_poses(self._source, self._frames, self._poses_of(saved))
         self._check_tracked(source)
         self.source = source if self._camera is None else with_camera(source, str(self._camera))
         if saved and self._level and saved.config.levelled_from is None:
@@ -285,13 +288,13 @@ class MapRun:
         """Return which poses to use: those that were asked for, else those that the map was begun with."""
         if self._poses is not None or saved is None or not saved.recording:
             return self._poses
-        return TRACK if saved.recording.endswith(TRACKED) else GIVEN
+        return next((poses for poses, how in HOW.items() if saved.recording.endswith(f", {how}")), GIVEN)
 
     def _check_tracked(self, source: Stream) -> None:
         """Raise StereovoxError for what cannot be had with tracked poses."""
-        if self.tracked and self._level:
+        if self.poses == TRACK and self._level:
             raise StereovoxError("level: a map with tracked poses has its own world, which is level; leave it out")
-        if self.tracked and self._resume and source.length is None:
+        if self.poses != GIVEN and self._resume and source.length is None:
             raise StereovoxError(f"{self.out}: a live camera does not know where in it it is; begin a new map")
 
     def _suggested(self, source: Stream) -> tuple[dict[str, Any], list[str]]:
@@ -300,7 +303,7 @@ class MapRun:
         if not named or (self._profile is not None and not self._level):
             return {}, []
         found = survey(source, SURVEYED)  # pyright: ignore[reportArgumentType]
-        if self.tracked:
+        if self.poses == TRACK:
             found = replace(found, up=None)  # which is that of the recording's own poses
         settings = found.settings if self._profile is None else found.up_settings
         chosen, lines = settings(self._overrides)
@@ -334,6 +337,13 @@ class MapRun:
         tiles = self.out.parent / f".{self.out.name}-tiles"  # beside the map, not in a temporary folder in memory
         config = load_config(settings, **{**self._overrides, **suggested})
         return Mapper(on_usable_device(config, self._notify), resume=saved, tiles=tiles)
+
+    def _make_tracker(self) -> Callable[[], AnyTracker]:
+        """Return what makes the tracker of this run, the same each time."""
+        config = self.mapper.config
+        if self.poses == BOTH:
+            return partial(GuidedTracker, config)
+        return partial(Tracker, config, start=level_start(self.source, config))
 
     def _check_recording(self) -> None:
         """Check that the map is of this recording: of another one, the first frames would be skipped."""

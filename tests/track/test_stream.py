@@ -7,14 +7,12 @@ import numpy as np
 import pytest
 from made_unposed import ROOM, room, unposed
 
-from stereovox.config import load_config
 from stereovox.errors import SourceError
 from stereovox.opening import open_images, open_source
 from stereovox.sources.base import Excerpt
 from stereovox.track.stream import LOST, TrackedStream, follow
 from stereovox.track.tracker import LEVEL, Tracked, Tracker
 
-CONFIG = load_config()
 BEGUN, DARK = "the first image; poses count later", "dark"
 
 
@@ -96,7 +94,7 @@ def test_a_camera_is_stopped_when_the_consumer_stops():
 
 
 def test_a_good_recording_loses_nothing_and_is_where_it_should_be(tmp_path):
-    source = TrackedStream(open_images(unposed(tmp_path)), CONFIG)
+    source = TrackedStream(open_images(unposed(tmp_path)), Tracker)
     found = list(source)
     assert [frame.fault for frame in found] == [None] * 10
     np.testing.assert_array_equal(found[0].T_world_sensor, LEVEL)
@@ -107,7 +105,7 @@ def test_a_good_recording_loses_nothing_and_is_where_it_should_be(tmp_path):
 
 
 def test_what_comes_after_some_frames_is_the_same_and_so_is_a_second_run(tmp_path):
-    source = TrackedStream(open_images(unposed(tmp_path, 8, covered=[1])), CONFIG)
+    source = TrackedStream(open_images(unposed(tmp_path, 8, covered=[1])), Tracker)
     whole, rest = list(source), source.after(2).after(1)
     assert rest.length == 5
     assert [frame.fault for frame in whole] == [LOST, LOST, *[None] * 6]
@@ -119,7 +117,7 @@ def test_what_comes_after_some_frames_is_the_same_and_so_is_a_second_run(tmp_pat
 
 
 def test_a_live_camera_has_no_past():
-    live = TrackedStream(Excerpt(open_source(ROOM), ":2"), CONFIG)
+    live = TrackedStream(Excerpt(open_source(ROOM), ":2"), Tracker)
     assert live.length is None
     with pytest.raises(SourceError, match="begin a new one"):
         live.after(1)

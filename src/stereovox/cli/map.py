@@ -55,7 +55,8 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--poses",
         metavar="WHICH",
-        help="given: those of the recording (default, where there are any); track: found from the images themselves",
+        help="given: those of the recording (default, where there are any); track: found from the images "
+        "alone; both: given ones, corrected by the images",
     )
     parser.add_argument(
         "--level", action="store_true", help="turn the recording's world so that z points up, for level layers"
@@ -168,8 +169,8 @@ def _poses_line(mapped: MapResult[VoxelMap]) -> str:
     """Return which poses were used, and how many frames were tracked."""
     if mapped.poses == "given":
         return "poses: those of the recording"
-    lost = sum(map(len, mapped.lost))
-    return f"poses: tracked, {len(mapped.reports) - lost} of {len(mapped.reports)} frames"
+    lost, how = sum(map(len, mapped.lost)), "tracked" if mapped.poses == "track" else "corrected by the images"
+    return f"poses: {how}, {len(mapped.reports) - lost} of {len(mapped.reports)} frames"
 
 
 def _why_empty(result: dict[str, Any], window: WindowConfig) -> str:

@@ -3,51 +3,55 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import closing
 from dataclasses import replace
 from itertools import islice
+from typing import Protocol
 
 import numpy as np
 
-from stereovox.config import Config
 from stereovox.errors import SourceError
 from stereovox.frame import AnyFrame, name_of
-from stereovox.se3 import Transform
 from stereovox.sources.base import Stream
-from stereovox.track.tracker import Tracked, Tracker
+from stereovox.track.guided import FIRST
+from stereovox.track.tracker import Tracked
 
 LOST = "tracking_lost"
 """Reason of refusal of frames whose pose is not known."""
 CURE = "move slower, or back to what was seen before"
-TRACKED = ", tracked"
-"""End of the name of a source whose poses are tracked: its map is not in the world of its own poses."""
 POSE_FAULTS = frozenset({"no_pose", "bad_pose_file", "low_confidence", "pose_jump"})
 """Faults of a frame's own pose, which is not used here."""
-FIRST = "the first image"
-"""Begins what `Tracker` says of an image that its map was begun with."""
+
+
+class AnyTracker(Protocol):
+    """What finds the pose of one frame after the other: `Tracker`, `GuidedTracker`."""
+
+    def add(self, frame: AnyFrame, /) -> Tracked:
+        """Return the pose of a frame."""
+        ...
 
 
 class TrackedStream(Stream):
     """The frames of a recording or camera with tracked poses; where the camera is lost they have a fault.
 
-    Poses that the frames bring are not used. The first image is held back until the next one fits it, and then has the
+    The first image is held back until the next one fits it, and then has the
     start pose. Lost frames have the fault `tracking_lost` and pose NaN. Tracking is deterministic: each iteration
     begins anew and finds the same poses.
 
     Args:
         source: The frames.
-        config: Settings by which depth is prepared, as for the map.
-        start: (4, 4) T_world_sensor of the first image; None: the camera looks along x, level, z up.
+        make: Returns a new tracker.
+        how: How poses are found, for the name.
         skip: Frames at the start that are tracked, and not delivered.
 
     Attributes:
-        name: That of the source, with `, tracked` behind it.
+        name: That of the source, with `, tracked` behind it: its map is not in the world of its own poses.
     """
 
-    def __init__(self, source: Stream, config: Config, start: Transform | None = None, skip: int = 0):
-        self.name, self.camera, self.notes = f"{source.name}{TRACKED}", source.camera, tuple(source.notes)
-        self._source, self._config, self._start, self._skip = source, config, start, skip
+    def __init__(self, source: Stream, make: Callable[[], AnyTracker], how: str = "tracked", skip: int = 0):
+        self.name, self.camera, self.notes = f"{source.name}, {how}", source.camera, tuple(source.notes)
+        self._source, self._make, self._how, self._skip = source, make, how, skip
 
     @property
     def length(self) -> int | None:
@@ -69,14 +73,14 @@ class TrackedStream(Stream):
             raise SourceError(f"{self.name}: a live camera does not know where it is in an older map; begin a new one")
         if count >= self.length:
             raise SourceError(f"{self.name}: has no more than {self.length} frames; skip fewer than {count}")
-        return TrackedStream(self._source, self._config, self._start, self._skip + count)
+        return TrackedStream(self._source, self._make, self._how, self._skip + count)
 
     def __iter__(self) -> Iterator[AnyFrame]:
-        with closing(follow(self._source, Tracker(self._config, start=self._start))) as found:
+        with closing(follow(self._source, self._make())) as found:
             yield from (frame for frame, _ in islice(found, self._skip, None))
 
 
-def follow(frames: Iterable[AnyFrame], tracker: Tracker) -> Generator[tuple[AnyFrame, Tracked]]:
+def follow(frames: Iterable[AnyFrame], tracker: AnyTracker) -> Generator[tuple[AnyFrame, Tracked]]:
     """Yield each frame with its tracked pose, or with a fault, and what the tracker said of it.
 
     The image that the tracker begins with comes once the next one is tracked too, or cannot be.
@@ -115,7 +119,7 @@ def posed(frame: AnyFrame, tracked: Tracked) -> AnyFrame:
     return replace(frame, T_world_sensor=np.full((4, 4), np.nan), pose_off_ns=0, fault=LOST, fault_detail=detail)
 
 
-def _track(frame: AnyFrame, tracker: Tracker) -> Tracked:
+def _track(frame: AnyFrame, tracker: AnyTracker) -> Tracked:
     if _is_faulty(frame):
         return Tracked(np.full((4, 4), np.nan), np.full((6, 6), np.inf), frame.fault_detail or str(frame.fault))
     return tracker.add(replace(frame, fault=None, fault_detail=""))

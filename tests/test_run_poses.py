@@ -139,3 +139,18 @@ def test_without_an_image_the_camera_is_level(tmp_path):
     T = level_start(sv.open_source(unposed(tmp_path, 2, covered=[0, 1], poses=True)), sv.load_config())
     np.testing.assert_array_equal(T[:3, :3] @ [0, -1, 0], [0, 0, 1])
     np.testing.assert_array_equal(level_start(Live(), sv.load_config()), T)
+
+
+def test_given_poses_are_corrected_in_their_own_world(tmp_path):
+    where, out = unposed(tmp_path / "a", 8, poses=True), tmp_path / "m.svox"
+    given, _ = mapped(where, tmp_path / "g.svox")
+    found, _ = mapped(where, tmp_path / "b.svox", poses="both")
+    assert (found.poses, found.lost, found.map.frames, found.map.recording) == ("both", [], 8, "a, corrected")
+    near = given.map.nearest_obstacle(found.map.occupied()).distance
+    assert np.mean(near <= 0.1) > 0.95
+    mapped(where, out, poses="both", frames=":3")
+    rest, _ = mapped(where, out, resume=True)
+    assert rest.poses == "both"
+    same_cells(found.map, rest.map)
+    with pytest.raises(StereovoxError, match="no poses; write poses"):
+        mapped(unposed(tmp_path / "c", 2), tmp_path / "c.svox", poses="both")

@@ -6,7 +6,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stereovox.config import Config
 from stereovox.frame import AnyFrame
@@ -70,6 +69,6 @@ def _own_pose(frame: AnyFrame) -> Transform | None:
 
 def _moved(tracked: Tracked, T_world_tracker: Transform) -> Tracked:
     """Return a pose, and its covariance, in another world."""
-    R: NDArray[np.float64] = np.kron(np.eye(2), T_world_tracker[:3, :3])
+    R = np.kron(np.eye(2), T_world_tracker[:3, :3])
     covariance = R @ tracked.covariance @ R.T if not tracked.lost else tracked.covariance
     return replace(tracked, T_world_sensor=T_world_tracker @ tracked.T_world_sensor, covariance=covariance)

@@ -165,10 +165,7 @@ class Landmarks:
 
     def seek(self, seen: Seen, last: Transform) -> list[Fit]:
         """Return how an image fits at the kept views that it has most corners in common with."""
-        found = cv2.goodFeaturesToTrack(seen.left, NUMBER, QUALITY, APART_PX / 2, mask=seen.mask)
-        if found is None:
-            return []
-        pixels = np.asarray(found[:, 0], np.float32)
+        pixels = _corners_of(seen.left, NUMBER, APART_PX / 2, seen.mask)
         which, descriptors = self._described(seen.left, pixels)
         pixels = pixels[which]
         disparity, good = self._disparity(seen, pixels, np.zeros(len(pixels)))
@@ -247,8 +244,9 @@ class Landmarks:
     ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         there = pixels - np.column_stack([guess, np.zeros(len(guess))]).astype(np.float32)
         right, found = _flow(seen.left, seen.right, pixels, there)
-        disparity = pixels[:, 0] - right[:, 0]
-        return disparity, found & (np.abs(pixels[:, 1] - right[:, 1]) < ROWS_PX) & (disparity > MIN_DISPARITY)
+        disparity, off = pixels[:, 0] - right[:, 0], np.abs(pixels[:, 1] - right[:, 1])
+        column, row = np.clip(np.rint(pixels), 0, np.array(seen.mask.shape[::-1]) - 1).astype(int).T
+        return disparity, found & (seen.mask[row, column] > 0) & (off < ROWS_PX) & (disparity > MIN_DISPARITY)
 
     def _new(self, seen: Seen, T: Transform) -> Corners:
         """Return new landmarks, away from those that there are."""
@@ -258,10 +256,7 @@ class Landmarks:
         mask = seen.mask.copy()
         for u, v in self._corners.pixels:
             cv2.circle(mask, (round(float(u)), round(float(v))), APART_PX, 0, -1)
-        found = cv2.goodFeaturesToTrack(seen.left, wanted, QUALITY, APART_PX, mask=mask)
-        if found is None:
-            return Corners()
-        pixels = cv2.cornerSubPix(seen.left, found, (3, 3), (-1, -1), (3, 20, 0.01))[:, 0].astype(np.float32)
+        pixels = _corners_of(seen.left, wanted, APART_PX, mask)
         disparity, good = self._disparity(seen, pixels, np.zeros(len(pixels)))
         pixels, disparity = pixels[good], disparity[good].astype(float)
         ray = (pixels - (self._camera.cx, self._camera.cy)) / (self._camera.fx, self._camera.fy)
@@ -315,6 +310,14 @@ class Landmarks:
         covariance = corners.variance[:, None, None] * by_inverse[:, :, None] * by_inverse[:, None, :]
         weight = np.linalg.inv(covariance + np.diag([2 * PIXEL**2, 2 * PIXEL**2, DISPARITY**2]))
         return np.einsum("ni,nij,nj->n", off, weight, off), off, weight, by_motion, by_inverse
+
+
+def _corners_of(image: NDArray[np.uint8], number: int, apart_px: float, mask: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Return the strongest corners (N, 2) of an image where a mask is not 0, to a part of a pixel."""
+    found = cv2.goodFeaturesToTrack(image, number, QUALITY, apart_px, mask=mask)
+    if found is None:
+        return np.empty((0, 2), np.float32)
+    return np.asarray(cv2.cornerSubPix(image, found, (3, 3), (-1, -1), (3, 20, 0.01))[:, 0], np.float32)
 
 
 def _flow(

@@ -1,0 +1,161 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tracking of small simulated depth images: right poses with honest covariances, or the word that it is lost."""
+
+from dataclasses import replace
+from functools import lru_cache
+
+import numpy as np
+import pytest
+from made_tracks import STEP_NS, aside, covered, hall, seen, simulated, track, tracker
+
+from stereovox.simulate.scene import Scene, box, cylinder
+
+METRES, DEGREES = 0.02, 0.5
+"""Bounds of the errors of 25 images."""
+BAYS = hall([(3 * k - 6, 0.12 * k) for k in range(6)])
+"""No two of which are alike."""
+
+
+@lru_cache(maxsize=8)
+def frames(scene, first=0, last=25, seed=0):
+    source = simulated(scene, seed)
+    return [source.frame(i) for i in range(first, last)]
+
+
+def at_even_times(taken):
+    """Return frames with stamps of an even rate."""
+    return [replace(frame, stamp_ns=i * STEP_NS) for i, frame in enumerate(taken)]
+
+
+@pytest.mark.parametrize("scene", ["apartment", "room"])
+def test_poses_are_right_and_errors_are_as_their_covariances_say(scene):
+    nees = []
+    for seed in range(3):
+        found = track(frames(scene, seed=seed))
+        assert found.lost == [0]
+        assert np.all(found.errors() < (METRES, DEGREES))
+        nees.extend(found.nees())
+    assert 0.1 < np.mean(nees) < 2
+    assert np.max(nees) < 6
+
+
+def test_way_and_turn_are_those_of_the_camera():
+    """Not only the errors are small: the camera did move, by far more than they."""
+    found = track(frames("apartment"))
+    first, last = found.found[1].T_world_sensor, found.found[-1].T_world_sensor
+    assert np.linalg.norm(last[:3, 3] - first[:3, 3]) > 1.0
+    assert np.degrees(np.arccos((np.trace(first[:3, :3].T @ last[:3, :3]) - 1) / 2)) > 50
+
+
+def test_the_same_frames_give_the_same_poses_and_the_poses_they_bring_are_not_used():
+    taken = frames("room")[:12]
+    one = track(taken)
+    wrong = [replace(frame, T_world_sensor=np.full((4, 4), np.nan)) for frame in taken]
+    again = [tracker(taken[0].T_world_sensor)] * 12
+    for first, other in zip(one.found, (by.add(frame) for by, frame in zip(again, wrong, strict=True)), strict=True):
+        assert np.array_equal(first.T_world_sensor, other.T_world_sensor)
+        assert np.array_equal(first.covariance, other.covariance)
+        assert first.lost == other.lost
+
+
+def test_without_a_start_the_first_camera_looks_along_x_and_level():
+    taken, by = frames("apartment")[:4], tracker()
+    T = [by.add(frame).T_world_sensor for frame in taken]
+    assert T[0][:3, :3] == pytest.approx(np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]]))
+    assert T[0][:3, 3] == pytest.approx(0)
+    moved = np.linalg.inv(taken[0].T_world_sensor) @ taken[3].T_world_sensor
+    assert np.linalg.inv(T[0]) @ T[3] == pytest.approx(moved, abs=0.01)
+
+
+def test_the_first_image_is_lost_and_lost_ones_have_no_covariance():
+    found = track(frames("apartment")[:3])
+    assert "first image" in found.found[0].lost
+    assert np.all(np.isinf(found.found[0].covariance))
+    assert np.all(np.linalg.eigvalsh(found.found[1].covariance) > 0)
+
+
+def test_frames_of_another_sensor_are_lost_and_disturb_nothing():
+    taken = frames("room")[:10]
+    other = [replace(frame, sensor="rear") for frame in frames("apartment")[:10]]
+    mixed = [frame for both in zip(taken, other, strict=True) for frame in both]
+    found = track(mixed)
+    assert found.lost == [0, *range(1, 20, 2)]
+    assert "is tracked, not rear" in found.found[1].lost
+    alone = track(taken)
+    for one, both in zip(alone.found, found.found[::2], strict=True):
+        assert np.array_equal(one.T_world_sensor, both.T_world_sensor)
+
+
+def test_behind_a_finger_it_is_lost_and_found_again_where_it_is():
+    taken = frames("apartment")
+    found = track([*taken[:6], *map(covered, taken[6:11]), *taken[11:]])
+    assert set(range(6, 11)) <= set(found.lost)
+    assert set(range(18, 25)) <= set(found.tracked)
+    assert np.all(found.errors() < (METRES, DEGREES))
+    assert all(one.lost for one in found.found[11:14])  # a view that is found again counts only after some
+
+
+@pytest.mark.parametrize("wall", ["wall", "wall?tilt=20&turn=15", "wall?distance=0.7"])
+def test_before_a_bare_wall_every_frame_is_lost(wall):
+    assert track(frames(wall, last=8)).tracked == []
+
+
+@pytest.mark.parametrize("speed", [0, 1])
+def test_in_an_endless_corridor_every_frame_is_lost(speed):
+    """No end of it is within the range of the camera."""
+    assert track(frames(f"aisle?length=60&speed={speed}", last=10)).tracked == []
+
+
+def test_along_a_bare_wall_with_a_floor_it_is_lost_after_the_last_thing():
+    """What holds the pose leaves the view; the tracker does not slide on."""
+    thing = box("box", "box", (1.8, -0.5, 0), (2.4, 0.2, 1.0))
+    bare = Scene([*hall([]).solids, thing])
+    found = track(seen(bare, aside(70, (0, 0.1, 0))))
+    assert found.tracked
+    assert found.tracked[-1] < 45
+    assert set(range(45, 70)) <= set(found.lost)
+    assert np.all(found.errors() < (0.1, 1))
+
+
+@pytest.mark.parametrize("there", [60, 150, 250, 350])
+def test_after_a_jump_to_a_place_never_seen_it_is_lost_and_stays_so(there):
+    """Rooms of one apartment are alike: rectangular, with much the same sizes."""
+    taken = at_even_times(frames("apartment")[:10] + frames("apartment", there, there + 14))
+    assert set(range(10, 24)) <= set(track(taken).lost)
+
+
+@pytest.mark.parametrize(("here", "there"), [("room", "apartment"), ("apartment", "room")])
+def test_in_another_building_it_is_lost_and_stays_so(here, there):
+    taken = at_even_times(frames(here)[:10] + frames(there)[:14])
+    assert set(range(10, 24)) <= set(track(taken).lost)
+
+
+def test_among_two_places_that_are_alike_it_finds_none():
+    """Bays of one shape, 3 m apart: when the lens is free again, the camera may stand before the one or the other."""
+    alike = seen(hall([(3 * k - 6, 0) for k in range(6)]), aside(45, (0, 0.1, 0)))
+    found = track(at_even_times([*alike, *map(covered, alike[:3]), *alike[5:10]]))
+    assert found.tracked == list(range(1, 45))
+    assert set(range(45, 53)) <= set(found.lost)
+    assert all("several places" in one.lost for one in found.found[48:])
+
+
+def test_of_places_that_differ_a_little_it_finds_the_right_one():
+    taken = seen(BAYS, aside(45, (0, 0.1, 0)))
+    found = track(at_even_times([*taken, *map(covered, taken[:3]), *taken[5:13]]))
+    assert found.tracked[:44] == list(range(1, 45))
+    assert found.tracked[-1] == 55
+    assert np.all(found.errors()[44:] < (0.05, 1))
+
+
+@pytest.mark.parametrize("speed", [0.0, 0.05])
+def test_with_a_person_over_half_the_view_the_pose_is_right_or_lost(speed):
+    def person(i):
+        y = 0.1 + speed * i
+        return Scene([cylinder("person", "person", (0.7, y, 0), (0.7, y, 1.9), 0.7, sections=16)]) if i >= 5 else None
+
+    crossed, empty = seen(BAYS, aside(20), moving=person), seen(BAYS, aside(20))
+    hidden = [np.mean(a.depth + 50.0 < b.depth) for a, b in zip(crossed, empty, strict=True)]
+    assert max(hidden) > 0.5
+    found = track(crossed)
+    assert found.tracked[:4] == [1, 2, 3, 4]
+    assert np.all(found.errors()[:, 0] < 0.1)

@@ -1,0 +1,103 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Views: whether an image belongs where it seems to fit, and which views look alike."""
+
+import numpy as np
+import pytest
+from made_tracks import CAMERA, SUBPIXEL, aside, hall, seen, simulated
+
+from stereovox.frame import DepthImage
+from stereovox.se3 import look_at, rotation_matrix
+from stereovox.simulate.scene import Scene, box
+from stereovox.track.surfaces import LOOKED_THROUGH, MIN_PATCHES
+from stereovox.track.surfels import patches_of
+from stereovox.track.views import GRID, contradiction, far_apart, unlike, view_of
+
+
+def view(frame, T=None):
+    """Return the view of a depth frame, from its true pose unless another is given."""
+    depth = np.where(frame.depth > 0, frame.depth * np.float32(0.001), np.float32(np.nan))
+    z = np.arange(200) / 20
+    sigma = 0.002 + 3 * SUBPIXEL / CAMERA.fx / 0.05 * z * z
+    patches = patches_of(DepthImage(depth, np.zeros(depth.shape, np.uint8), frame.camera, np.eye(4)), sigma, 20.0)
+    return view_of(patches.points, patches.sigma, frame.T_world_sensor if T is None else T)
+
+
+BAYS = hall([(3 * k - 6, 0.3 * k) for k in range(6)])
+FRAMES = seen(BAYS, aside(12, (0, 0.3, 0)))
+VIEWS = [view(frame) for frame in FRAMES[::2]]
+
+
+@pytest.mark.parametrize("frame", FRAMES[1::2], ids=lambda frame: frame.name)
+def test_at_its_true_place_nothing_contradicts_an_image(frame):
+    share, number = contradiction(view(frame), VIEWS)
+    assert number > 10 * MIN_PATCHES
+    assert share < LOOKED_THROUGH / 2
+
+
+@pytest.mark.parametrize(
+    "off",
+    [(0.5, 0, 0), (-0.5, 0, 0), (0, 1.0, 0), (0, -1.0, 0), (0, 0, 0.4), (0, 0, -0.4)],
+)
+def test_at_a_wrong_place_surfaces_stand_where_others_looked_through(off):
+    T = FRAMES[5].T_world_sensor.copy()
+    T[:3, 3] += off
+    share, _ = contradiction(view(FRAMES[5], T), VIEWS)
+    assert share > LOOKED_THROUGH
+
+
+@pytest.mark.parametrize("degrees", [-15, 15, 180])
+def test_turned_the_wrong_way_it_is_contradicted_or_has_nothing_in_common(degrees):
+    T = FRAMES[5].T_world_sensor.copy()
+    T[:3, :3] = rotation_matrix([0, 0, np.radians(degrees)]) @ T[:3, :3]
+    share, number = contradiction(view(FRAMES[5], T), VIEWS)
+    assert number < MIN_PATCHES or share > LOOKED_THROUGH
+
+
+def test_an_image_of_another_building_is_contradicted():
+    room = simulated("room").frame(0)
+    share, number = contradiction(view(room, FRAMES[5].T_world_sensor), VIEWS)
+    assert number < MIN_PATCHES or share > 5 * LOOKED_THROUGH
+
+
+def test_a_thing_that_was_not_there_contradicts_by_its_share_of_the_view():
+    """Both ways: what stands in front of what others saw, and what they saw where one now looks through."""
+    board = box("board", "board", (0.9, 1.2, 0.4), (1.0, 1.9, 1.6))
+    (frame,) = seen(Scene([*BAYS.solids, board]), [FRAMES[5].T_world_sensor])
+    share, _ = contradiction(view(frame), VIEWS)
+    assert share > 2 * LOOKED_THROUGH
+    share, _ = contradiction(view(FRAMES[5]), [view(frame)])
+    assert share > 2 * LOOKED_THROUGH
+
+
+def test_a_view_holds_the_nearest_depth_of_each_place():
+    """Against a loop over the points; of two in one place the nearer counts."""
+    one = view(FRAMES[3])
+    expected = np.full(GRID, np.inf)
+    for x, y, z in one.points.astype(float):
+        across, down = (1 + x / z / one.slope[0]) / 2 * GRID[1], (1 + y / z / one.slope[1]) / 2 * GRID[0]
+        place = int(np.floor(down)), int(np.floor(across))
+        expected[place] = min(expected[place], z)
+    there = np.isfinite(expected)
+    assert there.mean() > 0.5
+    differ = np.abs(one.depth[there] - expected[there]) > 1e-5
+    assert differ.mean() < 0.002  # points on the border of two places
+    assert np.all(np.isnan(one.depth[~there]))
+
+
+def test_views_are_alike_by_how_near_they_were_taken():
+    room = [view(simulated("room").frame(i)) for i in (0, 1, 4, 60)]
+    apart = [unlike(room[0], other) for other in room]
+    assert apart[0] == 0
+    assert 0 < apart[1] < apart[2] < apart[3]
+    empty = VIEWS[0]._replace(depth=np.full(GRID, np.nan, np.float32))
+    assert unlike(VIEWS[0], empty) == np.inf
+
+
+def test_poses_are_far_apart_by_metres_or_by_angle():
+    here, aside_ = look_at((0, 0, 0), (1, 0, 0)), look_at((0.2, 0, 0), (1, 0, 0))
+    turned = look_at((0, 0, 0), (np.cos(0.2), np.sin(0.2), 0))
+    assert not far_apart(here, here, 0.1, 0.1)
+    assert far_apart(here, aside_, 0.15, 3.0)
+    assert not far_apart(here, aside_, 0.25, 0.1)
+    assert far_apart(here, turned, 1.0, 0.15)
+    assert not far_apart(here, turned, 1.0, 0.25)

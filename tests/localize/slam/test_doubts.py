@@ -11,8 +11,8 @@ from stereovox import se2
 from stereovox.config import load_config
 from stereovox.localize.slam.doubts import BENT, CONTRADICTED, MapDoubt, doubts_of
 from stereovox.localize.slam.line_map import Cloud
+from stereovox.localize.slam.odometry_check import SLIPPED_SCALE, OdometryCheck, through
 from stereovox.localize.slam.pipeline import Slam, map_scans
-from stereovox.localize.slam.trust import SLIPPED, Trust, through
 
 
 def worst(result, truth):
@@ -100,15 +100,15 @@ def test_doubts_are_plain_numbers():
 
 
 def test_steps_that_agree_are_no_contradiction_and_far_ones_are():
-    trust, pose = Trust(), np.zeros(3)
+    check, pose = OdometryCheck(), np.zeros(3)
     for i in range(30):
-        assert trust.add(np.array([0.1 * i, 0, 0]), pose, se2.compose(pose, [0.1, 0.0, 0.0])) is None
-    found = [trust.add(np.array([2.9 + 0.1 * i, 0, 0]), pose, pose) for i in range(1, 6)]
+        assert check.add(np.array([0.1 * i, 0, 0]), pose, se2.compose(pose, [0.1, 0.0, 0.0])) is None
+    found = [check.add(np.array([2.9 + 0.1 * i, 0, 0]), pose, pose) for i in range(1, 6)]
     since = next(moment for moment in found if moment is not None)
     assert found[:2] == [None, None]  # 0.2 m may be a clock
-    assert trust.by_odometry(since, pose)[0] > 0.25
-    trust.settle(SLIPPED)
-    assert trust.scale == SLIPPED
+    assert check.by_odometry(since, pose)[0] > 0.25
+    check.settle(SLIPPED_SCALE)
+    assert check.scale == SLIPPED_SCALE
 
 
 def test_beams_that_pass_through_points_are_counted():
@@ -124,9 +124,9 @@ def test_beams_that_pass_through_points_are_counted():
 @pytest.mark.parametrize("step", [0.1, 1.2, 5.0])
 def test_odometry_that_matching_does_not_follow_is_noticed_whatever_the_step(step):
     """Steps longer than the way over which both are compared are compared by themselves."""
-    trust, still, found = Trust(), np.zeros(3), []
+    check, still, found = OdometryCheck(), np.zeros(3), []
     for i in range(12):
-        found.append(trust.add(np.array([step * i, 0, 0]), still, still))
+        found.append(check.add(np.array([step * i, 0, 0]), still, still))
     assert any(since is not None for since in found)
-    agreeing, there = Trust(), [np.array([step * i, 0, 0]) for i in range(12)]
+    agreeing, there = OdometryCheck(), [np.array([step * i, 0, 0]) for i in range(12)]
     assert all(agreeing.add(there[i], there[max(i - 1, 0)], there[i]) is None for i in range(12))

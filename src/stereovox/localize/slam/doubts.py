@@ -16,20 +16,21 @@ from numpy.typing import NDArray
 
 from stereovox import se2
 from stereovox.localize.slam.graph import Edge, Keyframe
-from stereovox.localize.slam.trust import through
+from stereovox.localize.slam.odometry_check import through
 
 BLOCK, EVERY = 10, 2
-"""Keyframes that are judged together, and of which each so-manieth is looked at."""
-NEAR, PASSED = 4.0, 8.0
+"""Keyframes that are judged together, and the step between those of them that are looked at."""
+VISIT_DISTANCE, VISIT_PATH = 4.0, 8.0
 """Metres between keyframes that see the same walls, and of way between them, for the two to be visits of their own."""
-REACH = 8.0
+MAX_POINT_RANGE = 8.0
 """Metres from the robot up to which its points are sure enough to speak against other scans."""
-OTHERS = 6
-"""Keyframes of other visits that one is compared with."""
-FEWEST_POINTS, CONTRADICTED = 300, 0.4
-"""Points to judge a block by, and the share of them seen through from which on it is doubted: people and doors move."""
-TINY = 1.0
-"""Metres of way between two steps with slack that are not a part of their own."""
+MAX_OTHERS = 6
+"""Keyframes of other visits that one is compared with at most."""
+MIN_POINTS, CONTRADICTED = 300, 0.4
+"""Points that judge a block at least, and the share of them seen through above which it is doubted: people and doors
+move."""
+MIN_PART_PATH = 1.0
+"""Metres of way between two steps with slack, below which they count as one."""
 STRETCH, BENT, BENT_TURN = 20.0, 0.3, 0.09
 """Metres of way, and metres and radians by which loops may have bent them: matching is off by some 2 %."""
 
@@ -99,7 +100,7 @@ def _cuts(keyframes: Sequence[Keyframe]) -> list[int]:
     """Return the keyframes whose step has slack; of several close to each other the last."""
     slack = [i for i, keyframe in enumerate(keyframes) if keyframe.slack and i]
     way = [keyframe.travelled for keyframe in keyframes]
-    return [i for i, later in zip_longest(slack, slack[1:]) if later is None or way[later] - way[i] > TINY]
+    return [i for i, later in zip_longest(slack, slack[1:]) if later is None or way[later] - way[i] > MIN_PART_PATH]
 
 
 def _bent(keyframes: Sequence[Keyframe]) -> Iterator[MapDoubt]:
@@ -134,7 +135,7 @@ def _contradicted(keyframes: Sequence[Keyframe]) -> Iterator[MapDoubt]:
             for other in _other_visits(places, way, i)
         ]
         crossed, met = np.sum(pairs, axis=0) if pairs else (0, 0)
-        if met > FEWEST_POINTS and crossed / met > worst:
+        if met > MIN_POINTS and crossed / met > worst:
             worst, where = crossed / met, first
     if where >= 0:
         yield _doubt(keyframes, "contradiction", where, min(where + BLOCK, len(keyframes)) - 1, worst)
@@ -142,14 +143,14 @@ def _contradicted(keyframes: Sequence[Keyframe]) -> Iterator[MapDoubt]:
 
 def _other_visits(places: se2.Pose, way: NDArray[np.float64], i: int) -> NDArray[np.int64]:
     """Return keyframes near keyframe i that stood there at another time, spread over all of them."""
-    near = np.hypot(*(places[:, :2] - places[i, :2]).T) < NEAR
-    others = np.flatnonzero(near & (np.abs(way - way[i]) > PASSED))
-    return others[:: max(len(others) // OTHERS, 1)][:OTHERS]
+    near = np.hypot(*(places[:, :2] - places[i, :2]).T) < VISIT_DISTANCE
+    others = np.flatnonzero(near & (np.abs(way - way[i]) > VISIT_PATH))
+    return others[:: max(len(others) // MAX_OTHERS, 1)][:MAX_OTHERS]
 
 
 def _seen_through(keyframes: Sequence[Keyframe], i: int, other: int) -> tuple[int, int]:
     """Count which points of another keyframe the scan of keyframe i sees through, and how many it could."""
     points = keyframes[other].cloud.points
-    points = points[(points**2).sum(axis=1) < REACH**2]
+    points = points[(points**2).sum(axis=1) < MAX_POINT_RANGE**2]
     between = se2.relative(keyframes[i].pose, keyframes[other].pose)
     return through(keyframes[i].cloud, se2.transform(between, points))

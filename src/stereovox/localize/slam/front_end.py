@@ -33,6 +33,11 @@ MIN_NEAR_POINTS = 3
 every scan where the first was."""
 LOST_SHARE, FOUND_SHARE = 0.5, 0.6
 """Share of a scan's points on the map below which a match is not believed, and from which on a wide search's is."""
+MIN_BACK = 0.05
+"""Metres of a step from which on it is also tried straight back."""
+BACK_MARGIN, BACK_MARGIN_SEEN = 0.05, 0.15
+"""Share of a scan's points by which it must fit better straight back: points on walls alone, and less the share of
+walls seen through."""
 MIN_LOST_STEP, MAX_LOST_PATH = 0.05, 0.5
 """Metres that a lost scan counts at least, and metres lost after which the map goes on where the odometry leads."""
 MAX_WIDE_WINDOW = 3.0
@@ -57,7 +62,9 @@ class Follower:
         self._travelled = 0.0
         self._start: se2.Pose = np.zeros(3)
         self._moved: dict[int, Cloud] = {}
-        self._check, self._slack, self._lost = OdometryCheck(), 0.0, 0.0
+        self._check = OdometryCheck()
+        self._held, self._lost, self._was_lost, self._blind = 0.0, 0.0, 0.0, 0.0
+        self._backed = False
         self._wide = ClosureSearch(config)
 
     def add(self, scan: Scan) -> bool:
@@ -69,17 +76,12 @@ class Follower:
         else:
             step = se2.relative(self._odometry, odometry)
             before, self.pose = self.pose, self._found(cloud, se2.compose(self.pose, step), step)
-            since = self._check.add(odometry, before, self.pose)
-            if since is not None and self.keyframes:
-                self._judge(cloud, since)
+            self._compare(cloud, odometry, before, step)
             self._travelled += float(np.hypot(*(self.pose - before)[:2]))
         self._odometry = odometry
         if not self._is_new(cloud):
             return False
-        step = se2.relative(self.keyframes[-1].pose, self.pose) if self.keyframes else np.zeros(3)
-        self._slack = max(self._slack, self._lost)
-        self.keyframes.append(Keyframe(self.pose, step, cloud, scan, self._travelled, self._slack))
-        self._slack = self._lost
+        self._append(cloud, scan)
         self._rebuild()
         return True
 
@@ -89,14 +91,21 @@ class Follower:
         self._moved.clear()
         self._rebuild()
 
+    def _append(self, cloud: Cloud, scan: Scan) -> None:
+        """Make a keyframe of a scan."""
+        step = se2.relative(self.keyframes[-1].pose, self.pose) if self.keyframes else np.zeros(3)
+        slack = max(self._held, self._was_lost, self._lost + self._blind)
+        self.keyframes.append(Keyframe(self.pose, step, cloud, scan, self._travelled, slack, slack > self._held))
+        self._held, self._was_lost, self._blind = 0.0, self._lost, 0.0
+
     def _found(self, cloud: Cloud, guess: se2.Pose, step: se2.Pose) -> se2.Pose:
         """Return the pose of a scan: as matched, or found by a wide search, or else by the odometry, with slack."""
+        self._backed = False
         if len(cloud.points) < MIN_HITS or not self.keyframes:
             return guess
-        match = self._matched(cloud, guess, step)
-        if match.share >= LOST_SHARE or (
-            not self._lost and _agree(match.pose, guess, odometry_sigmas(self._config, step))
-        ):
+        match = self._forth_or_back(cloud, guess, step)
+        sigmas = odometry_sigmas(self._config, step)
+        if match.share >= LOST_SHARE or (not self._lost and _agree(match.pose, guess, sigmas)):
             self._lost = 0.0
             return match.pose
         self._lost += max(float(np.hypot(step[0], step[1])), MIN_LOST_STEP)
@@ -110,6 +119,34 @@ class Follower:
             return self._map.refine(cloud, found.pose + self._start, self._config.sigma).pose
         return guess
 
+    def _forth_or_back(self, cloud: Cloud, guess: se2.Pose, step: se2.Pose) -> Match:
+        """Match near the odometry's `guess`; or straight back, where wheels turned the wrong way or a robot was pushed.
+
+        Straight back must fit far better, by points on walls and by walls seen through: what lies ahead is new, and
+        every scan seems to fit better a step behind.
+        """
+        match, metres = self._matched(cloud, guess, step), float(np.hypot(step[0], step[1]))
+        if metres < MIN_BACK or match.share > 1 - BACK_MARGIN:
+            return match
+        back = self._matched(cloud, se2.compose(self.pose, [-step[0], -step[1], step[2]]), step)
+        if back.share < match.share + BACK_MARGIN:
+            return match
+        self._backed = self._fit(cloud, back.pose)[1] > self._fit(cloud, match.pose)[1] + BACK_MARGIN_SEEN
+        return back if self._backed else match
+
+    def _compare(self, cloud: Cloud, odometry: se2.Pose, before: se2.Pose, step: se2.Pose) -> None:
+        """Compare the motion just matched from `before` (3,), with the odometry's."""
+        if len(cloud.points) < MIN_HITS:
+            metres, radians = self._check.drift(step)
+            self._blind += max(metres, radians / SLACK_TURN)
+            self._check.restart(odometry, self.pose)
+            return
+        since = self._check.add(odometry, before, self.pose)
+        if self._backed:
+            self._check.settle(SLIPPED_SCALE)
+        elif since is not None and self.keyframes:
+            self._judge(cloud, since)
+
     def _judge(self, cloud: Cloud, since: Moment) -> None:
         """Believe matching or odometry since a moment, from when on they contradict each other."""
         guess = self._check.by_odometry(since, self.pose)
@@ -119,7 +156,7 @@ class Follower:
             return
         left = se2.relative(self.pose, guess)
         slack = max(float(np.hypot(left[0], left[1])), abs(float(left[2])) / SLACK_TURN) + FIT_SIGMAS[0]
-        self.pose, self._slack = guess, max(self._slack, slack)
+        self.pose, self._held = guess, max(self._held, slack)
         self._check.settle(STUCK_SCALE)
 
     def _fit(self, cloud: Cloud, pose: se2.Pose) -> tuple[se2.Pose, float]:

@@ -29,6 +29,8 @@ SLIPPED_SCALE, STUCK_SCALE, SCALED_SCANS = 2.0, 0.25, 10
 SHARE_MARGIN, SHARE_MARGIN_SLIPPING = 0.25, 0.05
 """Share of a scan's points by which the matched place must fit better than the odometry's, to be believed: usually, and
 while wheels slip."""
+STILL = 1e-3
+"""Metres and radians of a step below which the robot stands."""
 MIN_BEHIND = 0.3
 """Metres behind a wall that a beam must end to contradict it."""
 
@@ -82,6 +84,18 @@ class OdometryCheck:
         limits = np.clip(LIMIT_FACTOR * self._usual, (MIN_LIMIT, MIN_LIMIT_TURN), (MAX_LIMIT, MAX_LIMIT_TURN))
         self._usual += LEARNING_RATE * (np.minimum(apart, 3 * self._usual) - self._usual)
         return since if (apart > limits).any() else None
+
+    def drift(self, step: se2.Pose) -> tuple[float, float]:
+        """Return the metres and radians by which odometry and matching usually come apart over a step (3,)."""
+        metres, radians = float(np.hypot(step[0], step[1])), abs(float(step[2]))
+        moved = metres + radians > STILL
+        share = max(metres / COMPARED_PATH, moved / COMPARED_SCANS)
+        return share * float(self._usual[0]), share * float(self._usual[1])
+
+    def restart(self, odometry: se2.Pose, pose: se2.Pose) -> None:
+        """Compare from here on, after a scan that was not matched: odometry (3,) and the pose (3,) it led to."""
+        self._past.clear()
+        self._past.append(Moment(odometry, pose, 0.0))
 
     def settle(self, scale: float) -> None:
         """Compare anew from the last scan on; the odometry's errors are `scale` times as large for a while."""

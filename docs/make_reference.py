@@ -31,7 +31,8 @@ COMMANDS = """# Commands
 - Options come after the command, and are written in full. A value that begins with a minus needs `=`: `--up=-y`.
 - Text and progress go to stderr. With `--json`, which every command has, the last line of stdout is one JSON object.
 - Exit status: 0 for success; 2 for bad usage or bad input, with one line that names the file or value and the remedy;
-  3 for a map that was written but may be wrong ([self-check](../robots.md#self-check)); 130 after Ctrl-C and 143 after
+  3 for a map that was written but may be wrong ([self-check](../robots.md#self-check)), and for a trajectory
+  with gaps ([tracking](../tracking.md)); 130 after Ctrl-C and 143 after
   SIGTERM. `map` and `grid` then save the map as far as it got.
 - Recordings are recognised by their contents, wherever they lie: [Recordings](../recordings.md).
 

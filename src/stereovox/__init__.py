@@ -49,6 +49,10 @@ if TYPE_CHECKING:
     from stereovox.run import MapRun as MapRun
     from stereovox.run import map_recording as map_recording
     from stereovox.sources.latest import Latest as Latest
+    from stereovox.track.tracker import Tracked as Tracked
+    from stereovox.track.tracker import Tracker as Tracker
+    from stereovox.track_run import CameraTrack as CameraTrack
+    from stereovox.track_run import track_recording as track_recording
     from stereovox.trust.health import Health as Health
     from stereovox.viewer.live import LiveView as LiveView
     from stereovox.viewer.viewer import open_viewer as open_viewer
@@ -99,6 +103,10 @@ _HOMES = {
     "map_recording": "run",
     "open_source": "opening",
     "Latest": "sources.latest",
+    "Tracked": "track.tracker",
+    "Tracker": "track.tracker",
+    "CameraTrack": "track_run",
+    "track_recording": "track_run",
     "open_viewer": "viewer.viewer",
     "LiveView": "viewer.live",
 }

@@ -36,6 +36,10 @@ class SourceError(StereovoxError):
     """A recording or device cannot be opened."""
 
 
+class NoPoses(SourceError):  # noqa: N818 - reads as what happened
+    """A recording has images that can be used, but nothing in it says where they were taken."""
+
+
 class MapFileError(StereovoxError):
     """A saved map cannot be read or written."""
 

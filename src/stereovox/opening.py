@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from stereovox import registry
-from stereovox.errors import MAX_SHOWN, MAX_WORD_LENGTH, SourceError, shortened
+from stereovox.errors import MAX_SHOWN, MAX_WORD_LENGTH, NoPoses, SourceError, shortened
 from stereovox.formats import IMPORTS, UNREADABLE
 from stereovox.sources.base import DepthSource as DepthSource
 from stereovox.sources.base import Excerpt as Excerpt
@@ -25,6 +25,7 @@ from stereovox.sources.base import parse_slice as parse_slice
 from stereovox.sources.foreign_files import cure_of
 from stereovox.sources.latest import LatestStream
 from stereovox.sources.pair_file import PairSettings
+from stereovox.sources.rgbd.folder import folder_part
 from stereovox.sources.robots.robot import Robot
 
 SOURCES = {
@@ -89,6 +90,7 @@ def open_source(path_or_name: str | os.PathLike[str], frames: str | None = None)
         The frames, which can be counted and read in any order.
 
     Raises:
+        NoPoses: There are images, but no poses.
         SourceError: Nothing there, no known layout, nothing usable in it, or `frames` selects nothing.
     """
     where = os.fspath(path_or_name)
@@ -192,14 +194,19 @@ def _depth_of(where: str) -> DepthSource:
 
 def _images_alone(where: str) -> DepthSource:
     """Return depth images without poses; raises SourceError where there are none."""
-    from stereovox.sources.rgbd.plain import DepthOnly
-    from stereovox.sources.rgbd.tum import StampedImages
-
-    for kind in (StampedImages, DepthOnly):
+    for kind in _image_classes():
         if kind.recognises(where):
             return kind(where)
     _recognise(where)  # which says what is wrong with it
     raise SourceError(f"{where}: no depth images; name a folder with depth.txt or depth/, or a recording")
+
+
+def _image_classes() -> tuple[Any, ...]:
+    """Return the classes of depth images without poses."""
+    from stereovox.sources.rgbd.plain import DepthOnly
+    from stereovox.sources.rgbd.tum import StampedImages
+
+    return StampedImages, DepthOnly
 
 
 def _classes() -> Iterator[Any]:
@@ -228,7 +235,23 @@ def _recognise(where: str) -> Any:
         kinds.append(kind)
         if kind.recognises(where):
             return kind
-    raise SourceError(f"{shortened(where)}: {_problem(where, kinds)}")
+    kind = NoPoses if _are_images(where, kinds) else SourceError
+    raise kind(f"{shortened(where)}: {_problem(where, kinds)}")
+
+
+def _are_images(where: str, kinds: list[Any]) -> bool:
+    """Return whether `where` is a folder of depth images itself, which lacks nothing but poses."""
+    return any(kind.recognises(where) for kind in _image_classes()) and not _inner(folder_part(where), kinds)
+
+
+def _inner(place: str, kinds: list[Any]) -> str:
+    """Name a recording or map that lies in a folder which is none itself, empty where there is none."""
+    below = _below(place)
+    likely = next((folder for folder in below for kind in kinds if kind.recognises(folder)), None)
+    if likely:
+        return f"no recording itself; did you mean {likely}?"
+    likely = next((folder for folder in below if os.path.isfile(os.path.join(folder, "manifest.json"))), None)
+    return f"no recording, but it holds a map (did you mean {likely}?)" if likely else ""
 
 
 def _problem(where: str, kinds: list[Any]) -> str:
@@ -246,16 +269,10 @@ def _problem(where: str, kinds: list[Any]) -> str:
         name = shlex.quote(place) if len(place) <= MAX_SHOWN else "FILE"
         return file_cure(place) or f"is a file, but no recording that is known; see: stereovox info {name}"
     try:
-        below = _below(place)
+        inner = _inner(place, kinds)
     except OSError as error:
         return f"{error.strerror}, so it cannot be listed"
-    likely = next((folder for folder in below for kind in kinds if kind.recognises(folder)), None)
-    if likely:
-        return f"no recording itself; did you mean {likely}?"
-    likely = next((folder for folder in below if os.path.isfile(os.path.join(folder, "manifest.json"))), None)
-    if likely:
-        return f"no recording, but it holds a map (did you mean {likely}?)"
-    return _missing(place, kinds) or f"no recording: {_contents(place)}; layouts: see docs/recordings.md"
+    return inner or _missing(place, kinds) or f"no recording: {_contents(place)}; layouts: see docs/recordings.md"
 
 
 def _below(folder: str) -> list[str]:

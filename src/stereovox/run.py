@@ -12,14 +12,14 @@ import signal
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from math import inf, isfinite
 from pathlib import Path
 from time import monotonic
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
 
-from stereovox import opening
 from stereovox.config import Config, load_config
 from stereovox.device import on_usable_device
 from stereovox.errors import MapFileError, SourceError, StereovoxError, one_line
@@ -32,12 +32,17 @@ from stereovox.maps.grid_map import GridMap
 from stereovox.maps.lock import only_writer_in
 from stereovox.maps.store import check_target, is_map, read_manifest, remove_map, sweep
 from stereovox.opening import Stream
+from stereovox.pose_choice import BOTH, GIVEN, HOW, TRACK, choose_poses
 from stereovox.products.floor_axes import upright_axes
 from stereovox.products.moved import level_transform
 from stereovox.safe_io import check_in_space
 from stereovox.sources.camera_file import with_camera
 from stereovox.sources.turned import Turned
-from stereovox.survey import survey
+from stereovox.survey import level_start, survey
+from stereovox.track.guided import GuidedTracker
+from stereovox.track.spans import LostSpan, LostSpans
+from stereovox.track.stream import AnyTracker, TrackedStream
+from stereovox.track.tracker import Tracker
 from stereovox.trust.history import MAX_NAME_LENGTH
 
 if TYPE_CHECKING:
@@ -79,6 +84,8 @@ class MapResult(Generic[MapT]):
         dropped: Number of frames that a live camera delivered while the mapper was busy.
         track: The robot's trajectory in the map, from `map_floor`; None where the odometry's poses were used.
         doubts: Why the map may be wrong, from `map_floor` with SLAM; empty where its self-check found nothing.
+        poses: Which were used: `given`, `track` or `both`.
+        lost: Where the camera was lost, if its poses were tracked: these frames are not in the map.
     """
 
     map: MapT
@@ -87,6 +94,8 @@ class MapResult(Generic[MapT]):
     dropped: int = 0
     track: Track | None = None
     doubts: Sequence[MapDoubt] = ()
+    poses: str = GIVEN
+    lost: Sequence[LostSpan] = ()
 
     def _repr_html_(self) -> str:
         """Return what a notebook shows: the map's picture and facts."""
@@ -99,7 +108,11 @@ class MapResult(Generic[MapT]):
             The numbers of `stereovox map --json`: frames, refusals by reason, milliseconds, cells, memory.
         """
         summary = summarise(self.map, self.reports)
-        return summary | ({"doubts": [doubt.as_dict() for doubt in self.doubts]} if self.doubts else {})
+        if self.doubts:
+            summary["doubts"] = [doubt.as_dict() for doubt in self.doubts]
+        if self.poses != GIVEN:
+            summary["lost"] = [span.as_dict() for span in self.lost]
+        return {**summary, "poses": self.poses}
 
 
 def map_recording(
@@ -111,6 +124,7 @@ def map_recording(
     frames: str | None = None,
     camera: str | Path | None = None,
     level: bool = False,
+    poses: str | None = None,
     checkpoint_s: float = CHECKPOINT_S,
     observers: Sequence[Observer] = (),
     notify: Callable[[str], None] = lambda line: None,
@@ -130,6 +144,10 @@ def map_recording(
         camera: Camera file that replaces the recording's own.
         level: Turn the recording's world so that z points up; the map is then level, but no longer in the
             coordinates of the recording's poses.
+        poses: `given`: those of the recording. `track`: the camera is tracked by its own images, in a world that
+            begins at its first one; frames in which it is lost are refused (`tracking_lost`). `both`: the camera
+            moves from frame to frame as the recording says, corrected by what the images show. None: given where there
+            are any, else tracked, which is passed to `notify`; with `resume` as the map was begun.
         checkpoint_s: Seconds between two saves; 0: save only at the end.
         observers: Called after each frame.
         notify: Called with each line that a user should see: assumptions about the source, where a run resumes.
@@ -144,7 +162,7 @@ def map_recording(
         KeyboardInterrupt: Ctrl-C, SIGTERM or SIGHUP, raised between two frames after saving the map.
     """
     settings = {"profile": profile, "resume": resume, "frames": frames, "camera": camera, "level": level}
-    with MapRun(source, out, **settings, checkpoint_s=checkpoint_s, notify=notify, **overrides) as run:
+    with MapRun(source, out, **settings, poses=poses, checkpoint_s=checkpoint_s, notify=notify, **overrides) as run:
         return run.finish(observers)
 
 
@@ -159,6 +177,7 @@ class MapRun:
     Attributes:
         mapper: The mapper, once entered.
         source: The stream of frames, once entered.
+        poses: Which are used: `given`, `track` or `both`, once entered.
         out: Folder of the map.
 
     Raises:
@@ -167,6 +186,7 @@ class MapRun:
 
     mapper: Mapper
     source: Stream
+    poses: str
 
     def __init__(
         self,
@@ -178,6 +198,7 @@ class MapRun:
         frames: str | None = None,
         camera: str | Path | None = None,
         level: bool = False,
+        poses: str | None = None,
         checkpoint_s: float = CHECKPOINT_S,
         notify: Callable[[str], None] = lambda line: None,
         **overrides: Any,
@@ -186,7 +207,7 @@ class MapRun:
         self._source, self._frames, self._camera = source, frames, camera
         self._profile, self._resume, self._overrides = profile, resume, overrides
         self._notify, self._open = notify, ExitStack()
-        self._checkpoint_s, self._level = checkpoint_s, level
+        self._checkpoint_s, self._level, self._poses = checkpoint_s, level, poses
 
     def __enter__(self) -> MapRun:
         with ExitStack() as stack:
@@ -200,6 +221,9 @@ class MapRun:
             suggested, lines = self._prepare(saved)
             self.mapper = self._make_mapper(saved, suggested)
             stack.callback(self.mapper.map.close)
+            self._recorded = self.source
+            if self.poses != GIVEN:
+                self.source = TrackedStream(self.source, self._make_tracker(), HOW[self.poses])
             self._checkpoints = Checkpoints(lambda: self.mapper.map.save(self.out), self.out, self._checkpoint_s)
             self._check_recording()
             if not self._resume and is_map(self.out):
@@ -226,13 +250,17 @@ class MapRun:
             KeyboardInterrupt: Ctrl-C, SIGTERM or SIGHUP, raised between two frames after saving the map.
         """
         with interrupt_between_steps() as check, _saved_from_start(self.mapper.map, self.out):
-            reports = self._add_all(check, observers)
+            self._lost = LostSpans(frames_offered(self.mapper))
+            reports = self._add_all(check, (*observers, *([self._lost] if self.poses != GIVEN else [])))
             if not self.mapper.map.frames:
                 raise StereovoxError(
                     f"{self.source.name}: not one frame could be used, no map is written ({first_refusal(reports)})"
                 )
             self._checkpoints.save(frames_offered(self.mapper))
-        return MapResult(self.mapper.map, self.out, reports, self.source.dropped)
+        return MapResult(
+            self.mapper.map, self.out, reports, self.source.dropped,
+            poses=self.poses, lost=self._lost.spans,
+        )  # fmt: skip
 
     @property
     def remaining(self) -> int | None:
@@ -242,18 +270,32 @@ class MapRun:
 
     def _prepare(self, saved: VoxelMap | None) -> tuple[dict[str, Any], list[str]]:
         """Open the source; return settings that it suggests, and lines about them. A levelled world is turned here."""
-        source = self._source
-        if isinstance(source, str | Path):
-            source = opening.open_stream(str(source), self._frames)
+        source, self.poses, why = choose_poses(self._source, self._frames, self._poses_of(saved))
+        self._check_tracked(source)
         self.source = source if self._camera is None else with_camera(source, str(self._camera))
         if saved and self._level and saved.config.levelled_from is None:
             raise StereovoxError(f"level: {self.out} was begun without; go on without it, or begin a new map")
         settings, lines = ({}, []) if saved else self._suggested(source)
+        if why:
+            lines = [f"the camera is tracked by its own images, without poses ({why})", *lines]
         direction = saved.config.levelled_from if saved else self._level_direction(settings)
         if direction is not None:
             self.source = Turned(self.source, level_transform(direction))
             settings = {**settings, "up": "z", "up_direction": None, "levelled_from": direction}
         return settings if saved is None else {}, lines
+
+    def _poses_of(self, saved: VoxelMap | None) -> str | None:
+        """Return which poses to use: those that were asked for, else those that the map was begun with."""
+        if self._poses is not None or saved is None or not saved.recording:
+            return self._poses
+        return next((poses for poses, how in HOW.items() if saved.recording.endswith(f", {how}")), GIVEN)
+
+    def _check_tracked(self, source: Stream) -> None:
+        """Raise StereovoxError for what cannot be had with tracked poses."""
+        if self.poses == TRACK and self._level:
+            raise StereovoxError("level: a map with tracked poses has its own world, which is level; leave it out")
+        if self.poses != GIVEN and self._resume and source.length is None:
+            raise StereovoxError(f"{self.out}: a live camera does not know where in it it is; begin a new map")
 
     def _suggested(self, source: Stream) -> tuple[dict[str, Any], list[str]]:
         """Return settings that a recording suggests where no profile chose them, and lines about them."""
@@ -261,6 +303,8 @@ class MapRun:
         if not named or (self._profile is not None and not self._level):
             return {}, []
         found = survey(source, SURVEYED)  # pyright: ignore[reportArgumentType]
+        if self.poses == TRACK:
+            found = replace(found, up=None)  # which is that of the recording's own poses
         settings = found.settings if self._profile is None else found.up_settings
         chosen, lines = settings(self._overrides)
         if self._level and found.up is not None and found.up.sure:
@@ -293,6 +337,13 @@ class MapRun:
         tiles = self.out.parent / f".{self.out.name}-tiles"  # beside the map, not in a temporary folder in memory
         config = load_config(settings, **{**self._overrides, **suggested})
         return Mapper(on_usable_device(config, self._notify), resume=saved, tiles=tiles)
+
+    def _make_tracker(self) -> Callable[[], AnyTracker]:
+        """Return what makes the tracker of this run, the same each time."""
+        config = self.mapper.config
+        if self.poses == BOTH:
+            return partial(GuidedTracker, config)
+        return partial(Tracker, config, start=level_start(self.source, config))
 
     def _check_recording(self) -> None:
         """Check that the map is of this recording: of another one, the first frames would be skipped."""
@@ -331,7 +382,7 @@ class MapRun:
         last = self.mapper.map.history.last_frame
         if self.source.length is None or last is None:  # a live camera; a map from before this was saved
             return
-        found = next(iter(self.source.after(done - 1)))
+        found = next(iter(self._recorded.after(done - 1)))
         if (one_line(found.name[:MAX_NAME_LENGTH]), found.stamp_ns) != last:
             raise StereovoxError(
                 f"{self.out}: its frame {done} was '{last[0]}', here it is '{found.name}'; choose frames as "

@@ -4,8 +4,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -13,10 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.cameras.pinhole import PinholeCamera
+from stereovox.config import Config
 from stereovox.frame import AnyFrame, Frame, StereoFrame
 from stereovox.products.floor_axes import nearest_axis, upright_axes
-from stereovox.se3 import rigidity_error, rotation_vector
-from stereovox.sources.base import Source
+from stereovox.products.moved import level_transform
+from stereovox.se3 import Transform, inverse, rigidity_error, rotation_vector
+from stereovox.sources.base import Source, Stream
+from stereovox.track.tracker import LEVEL as AHEAD
 
 RIGID = 0.05
 """Largest entry of abs(R^T R - I) of a pose that is used here."""
@@ -42,6 +45,8 @@ STEADY = 0.75
 """Length of the mean of the cameras' own up directions; less means that the camera was turned over."""
 TURNED, UPRIGHT_SHARE = 0.5, 0.4
 """Radians that a camera must turn for its turns to say something, and the share that is about the vertical then."""
+FIRST = 10
+"""Images at the start of which one must be there, to show what is level."""
 HORIZONTAL_SHARE = 0.06
 """Share of the surface that must be horizontal (floor, tables, ceiling) to confirm which way is up."""
 
@@ -280,6 +285,29 @@ def _turns_level(frames: Sequence[AnyFrame], up: NDArray[np.float64]) -> bool:
     turns = np.array([before @ rotation_vector(before.T @ after) for before, after in pairwise(R)]).reshape(-1, 3)
     whole = float(np.linalg.norm(turns, axis=1).sum())
     return whole > TURNED and float(np.abs(turns @ up).sum()) < UPRIGHT_SHARE * whole
+
+
+def level_start(source: Stream, config: Config) -> Transform:
+    """Return the pose (4, 4) of the first image of a camera that is tracked, in the world of its map.
+
+    The camera is at the origin. What is up follows from floors, tables and ceilings in the first image, where it shows
+    some near the vertical of the image; else the camera is taken to be level.
+    """
+    up = upright_axes(config.up)[2] if config.up_direction is None else config.up_direction
+    first = next(_first_images(source), None)
+    found = None if first is None else find_up(None, [first])
+    tilt = level_transform(found.direction) if found is not None and found.sure else np.eye(4)
+    return inverse(level_transform(up)) @ tilt @ AHEAD
+
+
+def _first_images(source: Stream) -> Iterator[Frame]:
+    """Yield depth images at the start of a recording with the pose of a camera that is level."""
+    if source.length is None or not hasattr(source, "frame"):
+        return
+    for i in range(min(FIRST, source.length)):
+        frame = source.frame(i)  # pyright: ignore[reportAttributeAccessIssue] - it can be read in any order
+        if isinstance(frame, Frame) and frame.depth.size:
+            yield replace(frame, T_world_sensor=AHEAD, fault=None)
 
 
 def suggest_range(depths: NDArray[np.float64], camera: PinholeCamera, stereo: bool) -> Suggestion:

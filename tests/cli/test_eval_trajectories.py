@@ -56,6 +56,17 @@ def test_options_are_used(capsys):
     assert json.loads(run(capsys, *words, "--no-align")[1])["position_m"]["rmse"] > 10
 
 
+@pytest.mark.parametrize("align", [True, False])
+def test_what_all_rotations_have_in_common_is_explained(folder, capsys, align):
+    turned = np.eye(4)
+    turned[:3, :3] = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
+    write_tum(folder / "axes.tum", timed(flight() @ turned))
+    _, _, err = run(capsys, "axes.tum", "truth.tum", *([] if align else ["--no-align"]))
+    note = next(line for line in err if line.startswith("note: 90.0 degrees"))
+    assert ("too straight" in note) is align
+    assert ("leave --no-align out" in note) is not align
+
+
 def test_a_page_and_a_picture_are_written(folder, capsys):
     status, out, err = run(capsys, "kitti.txt", "kitti.txt", "--report", "report", "--json")
     page = (folder / "report/evaluation.html").read_text()
@@ -78,7 +89,12 @@ WRONG = {
     ("none.tum", "truth.tum"): "none.tum: No such file",
     ("map.svox", "truth.tum"): "truth.tum: a file of poses, the other one is none",
     ("ours.tum", "truth.tum", "--threshold", "0.5"): "--threshold: only for maps",
+    ("ours.tum", "truth.tum", "--tolerance", "3"): "--tolerance: only for maps",
+    ("ours.tum", "truth.tum", "--tolerance", "0"): "--tolerance: only for maps",
     ("map.svox", "map.svox", "--scale"): "--scale: only for trajectories",
+    ("map.svox", "map.svox", "--max-difference", "0"): "--max-difference: only for trajectories",
+    ("map.svox", "map.svox", "--no-align"): "--no-align: only for floors' maps (.yaml) and trajectories",
+    ("kitti.txt", "kitti.txt", "--max-difference", "0.1"): "kitti.txt: has no times, poses pair by number or line",
     ("ours.tum", "truth.tum", "--no-align", "--scale"): "scale",
     ("ours.tum", "truth.tum", "--segment", "0"): "give lengths in metres above 0",
     ("ours.tum", "truth.tum", "--max-difference", "-1"): "give seconds above 0",

@@ -42,9 +42,10 @@ def test_a_recording(recording):
 def test_images_without_poses_say_what_is_missing_and_what_they_are_good_for(recording):
     (recording / "poses.txt").unlink()
     found = sv.describe(recording)
-    assert any("cannot be mapped yet" in line and "no poses" in line for line in found.lines)
-    assert "?poses=FILE" in found.commands[0]
-    assert found.facts["posed"] == 0
+    assert any("map tracks the camera by its own images" in line for line in found.lines)
+    assert found.commands[0] == f"stereovox map {recording} --out scan.svox"
+    assert "?poses=FILE" in found.commands[1]
+    assert (found.facts["posed"], "no poses" in found.facts["missing"]) == (0, True)
 
 
 def test_a_map_keeps_its_keys_and_says_which_way_is_up(tmp_path, capsys):

@@ -214,6 +214,20 @@ def test_coverage_is_the_share_of_the_truth_s_time_that_has_poses():
     assert rare.pairs.coverage == pytest.approx(29.6 / 29.9)
 
 
+@pytest.mark.parametrize(("every", "seconds"), [(20, 28.0), (50, 25.0)])
+def test_keyframes_seconds_apart_cover_what_lies_between_them(every, seconds):
+    """One pose every 2 or 5 s against a truth at 10 Hz; and the reverse: such a truth, whose span is known wholly."""
+    true, few = timed(flight()), timed(flight()[::every], np.arange(300)[::every] * RATE_NS)
+    assert sv.score_trajectory(few, true).pairs.coverage == pytest.approx(seconds / 29.9)
+    assert sv.score_trajectory(true, few).pairs.coverage == pytest.approx(1)
+
+
+def test_a_keyframe_trajectory_that_gave_up_does_not_cover_the_gap():
+    some = np.r_[0:100:20, 240:300:20]  # 8 s and 4 s of poses every 2 s, and 16 s of nothing
+    found = sv.score_trajectory(timed(flight()[some], some * RATE_NS), timed(flight()))
+    assert found.pairs.coverage == pytest.approx((8 + 4) / 29.9)
+
+
 def test_poses_without_a_partner_are_counted():
     true, stamps = timed(flight()), np.arange(300) * RATE_NS
     stamps[::2] += 21_000_000
@@ -256,6 +270,11 @@ REFUSED = {
     "scale alone": (lambda: timed(flight()), {"align": False, "scale": True}, "scale=True"),
     "no difference": (lambda: timed(flight()), {"max_difference_s": float("nan")}, "give seconds above 0"),
     "a segment of nothing": (lambda: timed(flight()), {"segments_m": [1, 0]}, "give lengths in metres above 0"),
+    "a difference without times": (
+        lambda: ImagePoses(list(flight()), "ours"),
+        {"truth": ImagePoses(list(flight()), "true"), "max_difference_s": 0.02},
+        "ours: has no times, poses pair by number or line",
+    ),
     "only one with times": (lambda: ImagePoses(list(flight()), "ours"), {}, "ours: has no times"),
 }
 
@@ -264,7 +283,7 @@ REFUSED = {
 def test_what_cannot_be_scored_is_refused_in_one_line(name):
     make, options, words = REFUSED[name]
     with pytest.raises(StereovoxError, match=words):
-        sv.score_trajectory(make(), timed(flight()), **options)
+        sv.score_trajectory(make(), **{"truth": timed(flight()), **options})
 
 
 def test_a_truth_that_stands_still_has_no_drift():

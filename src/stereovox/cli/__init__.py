@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The command line. Text for people goes to stderr; with --json the last line of stdout is one JSON object.
 
-Exit status: 0 ok, 2 bad usage or bad input (one line names the problem and the cure), 3 the map is written but
-doubted (a result's `doubts`), 130 stopped by Ctrl-C, 143 by SIGTERM.
+Exit status: 0 ok, 2 bad usage or bad input (one line names the problem and the cure), 3 the result is written but
+doubted (its `doubts`), 130 stopped by Ctrl-C, 143 by SIGTERM.
 """
 
 from __future__ import annotations
@@ -41,6 +41,7 @@ COMMANDS = (
     "grid",
     "slam",
     "localize",
+    "track",
     "simulate",
     "ros2",
     "bench",
@@ -56,7 +57,7 @@ The module of a command that is a Python keyword has a trailing underscore.
 """
 
 DOUBTED = 3
-"""Exit status of a command that wrote a map which may be wrong."""
+"""Exit status of a command that wrote a map which may be wrong, or a trajectory with gaps."""
 GLOBAL_OPTIONS = ("-h", "--help", "--version")
 """Options that may stand before a command or without one."""
 

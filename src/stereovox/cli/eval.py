@@ -34,6 +34,8 @@ POSE_ENDINGS = (".tum", ".txt", ".csv", ".kitti", ".freiburg", ".log", ".json", 
 """Files with these are trajectories."""
 ALIKE = 0.3
 """IoU of walls within a cell below which two maps may be of different places."""
+TOLERANCE = 1
+"""Cells of `--tolerance`, if it is not given."""
 EXAMPLE = "stereovox eval drive.svox truth.svox --report drive-report"
 MEASURES = {
     "precision": "of the cells called occupied, hold a surface",
@@ -67,23 +69,21 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("map", metavar="MAP", help="map, or trajectory, to evaluate")
     about = "map whose occupied cells hold a surface and free cells hold none, or the true trajectory"
     parser.add_argument("truth", metavar="TRUTH", help=about)
-    about = "a cell is called occupied above it (default: 0.7; for a floor map the threshold in its file)"
-    parser.add_argument("--threshold", type=float, metavar="P", help=about)
-    parser.add_argument(
-        "--tolerance", type=int, default=1, metavar="CELLS", help="distance that still counts as a match (default: 1)"
-    )
-    parser.add_argument(
-        "--path", metavar="FILE", help="poses of the camera, for precision, recall and decisions by distance"
-    )
     parser.add_argument("--report", metavar="DIR", help="folder for a page with charts")
-    floors = parser.add_argument_group("only for floor maps")
-    about = "region that does not count, metres in TRUTH's frame; repeatable"
-    floors.add_argument("--exclude", action="append", default=[], type=region, metavar="X0,Y0,X1,Y1", help=about)
-    about = "MAP and TRUTH share a frame: do not align MAP (also for trajectories)"
-    floors.add_argument("--no-align", action="store_true", help=about)
-    poses = parser.add_argument_group("only for trajectories")
+    maps = parser.add_argument_group("maps")
+    about = "a cell is called occupied above it (default: 0.7; for a floor map the threshold in its file)"
+    maps.add_argument("--threshold", type=float, metavar="P", help=about)
+    about = f"distance that still counts as a match (default: {TOLERANCE})"
+    maps.add_argument("--tolerance", type=int, metavar="CELLS", help=about)
+    about = "poses of the camera, for precision, recall and decisions by distance (not for floor maps)"
+    maps.add_argument("--path", metavar="FILE", help=about)
+    about = "region that does not count, metres in TRUTH's frame; repeatable (only for floor maps)"
+    maps.add_argument("--exclude", action="append", default=[], type=region, metavar="X0,Y0,X1,Y1", help=about)
+    both = parser.add_argument_group("floor maps and trajectories")
+    both.add_argument("--no-align", action="store_true", help="MAP and TRUTH share a frame: do not align MAP")
+    poses = parser.add_argument_group("trajectories")
     poses.add_argument("--scale", action="store_true", help="fit the scale, too, as for one camera without metres")
-    about = "poses further apart in time are no pair (default: 0.02)"
+    about = "poses further apart in time are no pair (default: 0.02; not for poses without times)"
     poses.add_argument("--max-difference", type=float, metavar="S", help=about)
     about = (
         "length of a segment for errors by distance; repeatable (default: 100 to 800 m as KITTI, for trajectories of "
@@ -129,17 +129,16 @@ def _holds_poses(path: str) -> bool:
 
 def _compare_trajectories(arguments: Namespace) -> dict[str, Any]:
     """Pair the poses of two files, print and report their differences."""
-    from stereovox.evaluate.pose_pairs import MAX_DIFFERENCE_S
     from stereovox.evaluate.trajectory_score import score_trajectory
     from stereovox.report import trajectory as report
 
-    refuse_options(arguments, ("threshold", "path", "exclude"), "only for maps")
+    refuse_options(arguments, ("threshold", "tolerance", "path", "exclude"), "only for maps")
     score = score_trajectory(
         arguments.map,
         arguments.truth,
         align=not arguments.no_align,
         scale=arguments.scale,
-        max_difference_s=MAX_DIFFERENCE_S if arguments.max_difference is None else arguments.max_difference,
+        max_difference_s=arguments.max_difference,
         segments_m=arguments.segment or None,
     )
     result = score.as_dict()
@@ -172,7 +171,7 @@ def _compare_grids(arguments: Namespace) -> dict[str, Any]:
         grid = replace(grid, occupied_above=arguments.threshold, free_below=min(grid.free_below, arguments.threshold))
     aligned = not arguments.no_align
     laid = laid_on(grid, reference, arguments.exclude, aligned)
-    scores = score_laid(laid, grid.resolution, aligned, arguments.tolerance)
+    scores = score_laid(laid, grid.resolution, aligned, _tolerance(arguments))
     result = scores.as_dict()
     _print_grid_scores(scores, len(arguments.exclude))
     if arguments.report:
@@ -191,11 +190,12 @@ def _compare_cells(arguments: Namespace) -> dict[str, Any]:
     from stereovox.evaluate.scores import score
     from stereovox.evaluate.truth_cells import TruthCells, level
 
-    refuse_options(arguments, ("exclude", "no_align"), "only for floors' maps (.yaml)")
+    refuse_options(arguments, ("exclude",), "only for floors' maps (.yaml)")
+    refuse_options(arguments, ("no_align",), "only for floors' maps (.yaml) and trajectories")
     threshold = 0.7 if arguments.threshold is None else arguments.threshold
     level(threshold)  # raises for a bad threshold before large maps are read
     path = None if arguments.path is None else read_camera_path(arguments.path)
-    truth = TruthCells(read_map(arguments.truth), arguments.tolerance)
+    truth = TruthCells(read_map(arguments.truth), _tolerance(arguments))
     voxel_map = read_map(arguments.map)
     scores = score(voxel_map, truth, threshold, path=path)
     result = scores.as_dict()
@@ -214,6 +214,10 @@ def _compare_cells(arguments: Namespace) -> dict[str, Any]:
         say(f"report: {page}")
         result["report"] = str(page)
     return result
+
+
+def _tolerance(arguments: Namespace) -> int:
+    return TOLERANCE if arguments.tolerance is None else arguments.tolerance
 
 
 COMPARE = {2: _compare_grids, 3: _compare_cells}

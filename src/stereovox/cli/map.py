@@ -23,6 +23,7 @@ from stereovox.cli.terminal import (
     progress_of,
     say,
     say_about_compiling,
+    say_lost,
     say_refusals,
     thousands,
 )
@@ -30,7 +31,8 @@ from stereovox.errors import StereovoxError
 
 if TYPE_CHECKING:
     from stereovox.config import Config, WindowConfig
-    from stereovox.frame import UpdateReport
+    from stereovox.maps import VoxelMap
+    from stereovox.run import MapResult
 
 PORT = 8080
 EXAMPLE = "stereovox map recordings/kitchen --out kitchen.svox"
@@ -50,6 +52,12 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--max-range", type=float, metavar="M", help="largest depth in metres that is used")
     parser.add_argument("--frames", metavar="A:B:S", help="only these frames, as a Python slice")
     parser.add_argument("--camera", metavar="FILE", help="camera file (camera.toml) that replaces the recording's own")
+    parser.add_argument(
+        "--poses",
+        metavar="WHICH",
+        help="given: those of the recording (default, where there are any); track: found from the images "
+        "alone; both: given ones, corrected by the images",
+    )
     parser.add_argument(
         "--level", action="store_true", help="turn the recording's world so that z points up, for level layers"
     )
@@ -103,8 +111,8 @@ def _map(arguments: Namespace, out: Path) -> dict[str, Any]:
 
     run = MapRun(
         arguments.source, out, profile=arguments.profile, resume=arguments.resume, frames=arguments.frames,
-        camera=arguments.camera, level=arguments.level, checkpoint_s=arguments.checkpoint, notify=say,
-        **overrides(arguments),
+        camera=arguments.camera, level=arguments.level, poses=arguments.poses, checkpoint_s=arguments.checkpoint,
+        notify=say, **overrides(arguments),
     )  # fmt: skip
     with run, page_of(run.mapper, out.stem, arguments.view) as page:
         say_about_compiling()
@@ -113,7 +121,7 @@ def _map(arguments: Namespace, out: Path) -> dict[str, Any]:
             recorded.finish()
         result = mapped.summary() | ({"dropped": mapped.dropped} if run.source.length is None else {})
         page.finish()
-        _print_result(result, mapped.reports, out, run.mapper.config)
+        _print_result(result, mapped, out, run.mapper.config)
         page.stay()
     return result
 
@@ -129,17 +137,19 @@ def _grid(arguments: Namespace) -> dict[str, Any]:
     """Run `stereovox grid`, which has more options."""
     from stereovox.cli.grid import run_floor
 
-    for option in ("camera", "device", "integrator", "level", "threads", "view", "rerun"):
+    for option in ("camera", "device", "integrator", "level", "poses", "threads", "view", "rerun"):
         if getattr(arguments, option) not in (None, False):
             raise StereovoxError(f"--{option}: has no meaning for the map of a floor; leave it out")
     return run_floor(arguments)
 
 
-def _print_result(result: dict[str, Any], reports: list[UpdateReport], out: Path, config: Config) -> None:
+def _print_result(result: dict[str, Any], mapped: MapResult[VoxelMap], out: Path, config: Config) -> None:
     from stereovox.contents.description import picture_name
     from stereovox.trust.health import FULL
 
-    say_refusals(result, reports, "frames")
+    say_refusals(result, mapped.reports, "frames")
+    say(_poses_line(mapped))
+    say_lost(mapped.lost)
     if result.get("dropped"):
         say(f"  {result['dropped']} more came while the map was busy and were dropped; see --set deadline_ms=")
     if reduced := [f"{number} {quality}" for quality, number in result["ways"].items() if quality != FULL]:
@@ -153,6 +163,14 @@ def _print_result(result: dict[str, Any], reports: list[UpdateReport], out: Path
     if not result["occupied"]:
         say(f"note: {_why_empty(result, config.window)}")
     say(f"saved in {out}; look at it with: {command_line('picture', out, picture_name(str(out)))}")
+
+
+def _poses_line(mapped: MapResult[VoxelMap]) -> str:
+    """Return which poses were used, and how many frames were tracked."""
+    if mapped.poses == "given":
+        return "poses: those of the recording"
+    lost, how = sum(map(len, mapped.lost)), "tracked" if mapped.poses == "track" else "corrected by the images"
+    return f"poses: {how}, {len(mapped.reports) - lost} of {len(mapped.reports)} frames"
 
 
 def _why_empty(result: dict[str, Any], window: WindowConfig) -> str:

@@ -78,7 +78,8 @@ def dimensions(path: str) -> int:
 def refuse_options(arguments: Namespace, names: Iterable[str], why: str) -> None:
     """Raise StereovoxError for the first of these options that was given although it does not apply."""
     for name in names:
-        if getattr(arguments, name) not in (None, False, []):
+        value = getattr(arguments, name)
+        if not (value is None or value is False or value == []):  # a 0 was given, too
             raise StereovoxError(f"--{name.replace('_', '-')}: {why}; leave the option out")
 
 

@@ -17,7 +17,10 @@ if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
     from stereovox.frame import UpdateReport
+    from stereovox.track.spans import LostSpan
 
+MAX_SPANS = 10
+"""Spans of lost frames that are printed."""
 T = TypeVar("T")
 
 
@@ -127,6 +130,15 @@ def say_refusals(result: dict[str, Any], reports: Sequence[UpdateReport], what: 
         say(f"  {number} x {reason}, first: {example}")
     for reason, number in result["settled"].items():
         say(f"  {number} x {reason}")
+
+
+def say_lost(spans: Sequence[LostSpan]) -> None:
+    """Print where the camera was lost: the longest spans, in order."""
+    shown = sorted(sorted(spans, key=len)[-MAX_SPANS:], key=lambda span: span.first)
+    for span in shown:
+        say(f"  {span.line()}")
+    if len(spans) > len(shown):
+        say(f"  and {len(spans) - len(shown)} more, which are not longer (all with --json)")
 
 
 def cells_line(result: dict[str, Any], voxel_size: float | None = None) -> str:

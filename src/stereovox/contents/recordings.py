@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from stereovox.contents.description import Description, command_line, many, map_name, metres, picture_name, thousands
-from stereovox.errors import StereovoxError
+from stereovox.errors import NoPoses, StereovoxError
 from stereovox.opening import is_recording, is_robot, open_images, open_robot, open_source
 from stereovox.sources.bags import open_bag, suffix_of
 from stereovox.sources.bags.files import BagFile
@@ -50,22 +50,28 @@ def _images(path: str) -> Description | None:
         found = survey(open_images(path))  # pyright: ignore[reportArgumentType] - it can be read in any order
     except StereovoxError:
         return None
+    missing, why, commands = _missing(path)
+    facts = survey_facts(found) | {"missing": missing}
+    return Description("recording", [*_survey_lines(found), *why], facts, commands)
+
+
+def _missing(path: str) -> tuple[str, list[str], list[str]]:
+    """Return what a folder of depth images lacks, a line about it, and commands that use it all the same."""
     try:
         open_source(path)
-        missing = ""
+    except NoPoses as error:
+        add, name = "&" if "?" in path else "?", map_name(path)
+        commands = [command_line("map", path, "--out", name)]
+        if "?poses=" in str(error):
+            commands.append(command_line("map", f"{path}{add}poses=FILE", "--out", name))
+        return str(error), [], commands
     except StereovoxError as error:
-        missing = str(error)
-    facts = survey_facts(found) | {"missing": missing}
-    add = "&" if "?" in path else "?"
-    line = command_line("map", f"{path}{add}poses=FILE", "--out", map_name(path))
-    why = f"cannot be mapped yet: {missing.removeprefix(f'{path}: ')}"
-    return Description("recording", [*_survey_lines(found), why], facts, [line] if "?poses=" in missing else [])
+        return str(error), [f"cannot be mapped yet: {str(error).removeprefix(f'{path}: ')}"], []
+    return "", [], []
 
 
 def survey_commands(path: str, found: Survey) -> list[str]:
     """Return command lines that use a recording."""
-    if not found.posed:
-        return []
     name = map_name(path)
     return [command_line("map", path, "--out", name), command_line("picture", name, picture_name(name))]
 
@@ -136,7 +142,7 @@ def _survey_lines(found: Survey) -> list[str]:
 
 def _pose_lines(found: Survey) -> list[str]:
     if not found.posed or found.extent_m is None:
-        return ["no frame looked at has a pose, which a map needs"]
+        return ["no frame looked at has a pose: map tracks the camera by its own images, as track does"]
     share = "all" if found.posed == found.read else f"{found.posed} of {found.read}"
     return [
         f"{share} frames looked at have poses; the camera moves within {metres(found.extent_m)}",

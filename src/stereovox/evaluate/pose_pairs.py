@@ -21,8 +21,9 @@ TrajectoryLike = str | os.PathLike[str] | Poses | ImagePoses
 """A file of poses (TUM, KITTI, or another form of docs/recordings.md), or what was read from one."""
 MAX_DIFFERENCE_S = 0.02
 """Poses further apart in time are no pair (TUM's associate.py)."""
-MAX_GAP_S = 1.0
-"""The time between two pairs further apart is not covered."""
+MAX_GAP_S, MAX_GAP_INTERVALS = 1.0, 3.0
+"""The time between two estimated poses is not covered where it is longer than these seconds and so many of the usual
+interval between them, the median: keyframes are seconds apart."""
 MIN_PAIRS = 3
 MAX_DEFORMATION = 5e-3
 """Largest entry of abs(R^T R - I) that counts as rounding of a pose; the default of `pose_rigidity_tolerance`."""
@@ -34,8 +35,9 @@ class PosePairs:
 
     stamps_ns: (N,) int64 nanoseconds of the estimate; None where the files have no times, and lines pair by number.
     T_world_body, T_truth_body: (N, 4, 4) float64, estimated and true. estimate_poses, truth_poses: number of all poses
-    of each. coverage: share of the truth's time span that lies between pairs at most MAX_GAP_S apart; without times,
-    the share of its poses that have a partner. estimate, truth: what they came from, for messages.
+    of each. coverage: share of the truth's time span in which there are estimated poses without a gap (see
+    MAX_GAP_S); without times, the share of the truth's poses that have a partner. estimate, truth: what they came
+    from, for messages.
     """
 
     stamps_ns: NDArray[np.int64] | None
@@ -51,25 +53,28 @@ class PosePairs:
         return len(self.T_world_body)
 
 
-def pair_poses(
-    estimate: TrajectoryLike, truth: TrajectoryLike, max_difference_s: float = MAX_DIFFERENCE_S
-) -> PosePairs:
+def pair_poses(estimate: TrajectoryLike, truth: TrajectoryLike, max_difference_s: float | None = None) -> PosePairs:
     """Pair each pose of the sparser trajectory with the one of the other that is nearest in time (evo's rule).
 
     Poses without times pair by the number of their image, else by line.
+    max_difference_s: poses further apart in time are no pair; None: MAX_DIFFERENCE_S.
     Raises StereovoxError, one line, for a file that cannot be read, a pose that is not rigid or holds NaN, fewer than
-    MIN_PAIRS pairs, and where only one of the two has times.
+    MIN_PAIRS pairs, where only one of the two has times, and where none has but `max_difference_s` is given.
     """
-    if not 0 < max_difference_s < np.inf:
-        raise StereovoxError(f"max_difference_s={max_difference_s}: give seconds above 0")
+    limit_s = MAX_DIFFERENCE_S if max_difference_s is None else max_difference_s
+    if not 0 < limit_s < np.inf:
+        raise StereovoxError(f"max_difference_s={limit_s}: give seconds above 0")
     ours, true = (one if isinstance(one, Poses | ImagePoses) else read_poses(Path(one)) for one in (estimate, truth))
     T, T_true = _checked(ours), _checked(true)
     if isinstance(ours, Poses) and isinstance(true, Poses):
-        i, j = _by_time(ours.stamps_ns, true.stamps_ns, round(max_difference_s * 1e9))
+        i, j = _by_time(ours.stamps_ns, true.stamps_ns, round(limit_s * 1e9))
         stamps_ns = ours.stamps_ns[i]
-        coverage = _covered(true.stamps_ns[j], true.stamps_ns)
-        cure = f"no more than {max_difference_s:g} s apart; are they of one recording and one clock?"
+        coverage = _covered(ours.stamps_ns, true.stamps_ns)
+        cure = f"no more than {limit_s:g} s apart; are they of one recording and one clock?"
     elif isinstance(ours, ImagePoses) and isinstance(true, ImagePoses):
+        if max_difference_s is not None:
+            cure = "leave max_difference_s (--max-difference) out"
+            raise StereovoxError(f"{ours.where}: has no times, poses pair by number or line; {cure}")
         i, j = _by_number(ours, true)
         stamps_ns, coverage, cure = None, len(j) / len(true), "with the same number; are they of one recording?"
     else:
@@ -113,6 +118,9 @@ def _by_number(ours: ImagePoses, true: ImagePoses) -> tuple[NDArray[np.int64], N
     return np.arange(len(ours)), np.arange(len(true))
 
 
-def _covered(stamps_ns: NDArray[np.int64], truth_ns: NDArray[np.int64]) -> float:
-    gaps = np.diff(stamps_ns)
-    return float(gaps[gaps <= MAX_GAP_S * 1e9].sum() / max(truth_ns[-1] - truth_ns[0], 1))
+def _covered(ours_ns: NDArray[np.int64], truth_ns: NDArray[np.int64]) -> float:
+    """Return the share of the truth's time span between poses of the estimate that have no gap between them."""
+    gaps = np.diff(ours_ns)
+    inside = np.diff(np.clip(ours_ns, truth_ns[0], truth_ns[-1]))
+    limit_ns = max(MAX_GAP_S * 1e9, MAX_GAP_INTERVALS * float(np.median(gaps)))
+    return float(inside[gaps <= limit_ns].sum() / max(truth_ns[-1] - truth_ns[0], 1))

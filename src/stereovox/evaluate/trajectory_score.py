@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.errors import StereovoxError
-from stereovox.evaluate.pose_pairs import MAX_DIFFERENCE_S, PosePairs, TrajectoryLike, pair_poses
+from stereovox.evaluate.pose_pairs import PosePairs, TrajectoryLike, pair_poses
 from stereovox.evaluate.trajectory_motions import (
     ErrorFigures,
     SegmentErrors,
@@ -111,7 +111,7 @@ def score_trajectory(
     *,
     align: bool = True,
     scale: bool = False,
-    max_difference_s: float = MAX_DIFFERENCE_S,
+    max_difference_s: float | None = None,
     segments_m: Sequence[float] | None = None,
 ) -> TrajectoryScore:
     """Compare an estimated trajectory with the true one, pose by pose and motion by motion.
@@ -122,7 +122,7 @@ def score_trajectory(
         truth: The same for the true poses of the same body.
         align: Align the estimate first, rigidly, by least squares of positions. False: both are in one frame.
         scale: Fit the scale, too (one camera without metres).
-        max_difference_s: Poses further apart in time are no pair.
+        max_difference_s: Poses further apart in time are no pair; by default 0.02 s.
         segments_m: Lengths in metres of KITTI's segments. By default 100 to 800 m where the truth is longer than
             100 m, and 1, 2, 5, 10, 20, 50 m where it is not.
 
@@ -130,7 +130,8 @@ def score_trajectory(
         The errors; position and rotation errors (ATE) after alignment, motions (RPE) independent of it but for scale.
 
     Raises:
-        StereovoxError: One line: too few pairs, a pose that cannot be used, too little motion to align.
+        StereovoxError: One line: too few pairs, a pose that cannot be used, too little motion to align, a
+            `max_difference_s` for poses without times.
     """
     if scale and not align:
         raise StereovoxError("scale=True: is fitted together with the alignment; leave align=True")

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from stereovox import se2
 from stereovox.errors import StereovoxError
 from stereovox.frame import Frame, Scan
-from stereovox.safe_io import replacing
-from stereovox.sources.poses import seconds_from_ns
+from stereovox.sources.trajectory import write_trajectory
 
 Posed = TypeVar("Posed", bound=Frame | Scan)
 
@@ -64,8 +63,5 @@ class Track:
 
         Raises MapFileError where the file cannot be written; an older one is then still there.
         """
-        with replacing(path) as file:
-            file.write(b"# stamp tx ty tz qx qy qz qw: robot in the map, on the floor\n")
-            for stamp_ns, (x, y, yaw) in zip(self.stamps_ns.tolist(), self.pose_map_base, strict=True):
-                turn = f"{np.sin(yaw / 2):.9f} {np.cos(yaw / 2):.9f}"
-                file.write(f"{seconds_from_ns(stamp_ns)} {x:.6f} {y:.6f} 0 0 0 {turn}\n".encode())
+        poses = np.array([se2.lifted(pose) for pose in self.pose_map_base]).reshape(-1, 4, 4)
+        write_trajectory(path, self.stamps_ns.tolist(), poses, "robot in the map, on the floor")

@@ -13,6 +13,9 @@ from stereovox.view.trajectory import trajectory_png
 
 OFFSET_DEG = 5.0
 """A rotation that all poses are off by is noted above this."""
+OTHER_AXES = "the two do not follow the same axes of the body (then the errors of motions are wrong, too)"
+STRAIGHT = "the trajectory is too straight for positions to align the roll about it"
+NOT_ALIGNED = "they are not in one frame (then leave --no-align out)"
 FIGURES = ("rmse", "mean", "median", "max")
 ERROR_HEADS = ("error", "pairs", *FIGURES, "unit")
 SEGMENT_HEADS = ("segments of", "number", "translation", "rotation")
@@ -67,11 +70,9 @@ def notes(score: TrajectoryScore) -> list[str]:
     """Return what a reader of the figures should know, in words."""
     found = []
     if score.rotation_offset_deg > OFFSET_DEG:
-        found.append(
-            f"note: {score.rotation_offset_deg:.1f} degrees of the rotation errors are the same everywhere: either the "
-            "two do not follow the same axes of the body (then the errors of motions are wrong, too), or the "
-            "trajectory is too straight for positions to align the roll about it"
-        )
+        why = STRAIGHT if score.aligned else NOT_ALIGNED
+        found.append(f"note: {score.rotation_offset_deg:.1f} degrees of the rotation errors are the same everywhere: "
+                     f"either {OTHER_AXES}, or {why}")  # fmt: skip
     return found
 
 

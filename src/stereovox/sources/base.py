@@ -79,6 +79,7 @@ class Stream(Protocol):
         layout: How to recognise this kind of source, for messages.
         parts: What a folder of this layout holds, to say what is missing in one that is nearly so.
         up: The world's axis that points up (`z`, `-y`), where this kind of recording defines it; else None.
+        posed: Whether anything is known about where the camera was.
         composite: The class combines other recordings; its second argument is the function that opens them (see
             `CameraPair`).
     """
@@ -89,6 +90,7 @@ class Stream(Protocol):
     layout: str = ""
     parts: tuple[Part, ...] = ()
     up: str | None = None
+    posed: bool = True
     composite: bool = False
 
     @property
@@ -192,6 +194,7 @@ class Changed(Stream):
     def __init__(self, stream: Stream):
         self._stream = stream
         self.name, self.camera, self.notes = stream.name, stream.camera, tuple(getattr(stream, "notes", ()))
+        self.posed = getattr(stream, "posed", True)
 
     def change(self, frame: AnyFrame) -> AnyFrame:
         """Return a frame of the stream as it is to be delivered."""
@@ -265,7 +268,7 @@ class Excerpt(Stream):
         if max(start, picked.stop or 0, step) > sys.maxsize:
             raise SourceError(f"frames '{frames}' of a live camera: so many never come; give smaller numbers")
         self.name, self.camera = stream.name, stream.camera
-        self.notes = getattr(stream, "notes", ())
+        self.notes, self.posed = getattr(stream, "notes", ()), getattr(stream, "posed", True)
 
     @property
     def dropped(self) -> int:

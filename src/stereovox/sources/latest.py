@@ -113,6 +113,7 @@ class LatestStream(Stream):
         self._latest: Latest[AnyFrame] = Latest(camera)
         self.name, self.camera = camera.name, camera.camera
         self.notes, self.layout = getattr(camera, "notes", ()), getattr(camera, "layout", "")
+        self.posed = getattr(camera, "posed", True)
 
     @property
     def dropped(self) -> int:

@@ -78,6 +78,7 @@ class RealSense(Stream):
         except RuntimeError as error:
             _failed(location, error)
         self.name = PREFIX + _serial(self._rs, self._device)
+        self.posed = self.options.pose == "fixed"
 
     @classmethod
     def recognises(cls, location: str) -> bool:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.errors import SourceError
-from stereovox.safe_io import MAX_LIST, read_text
+from stereovox.safe_io import MAX_LIST, read_text, replacing
 from stereovox.sources.poses import Poses
 from stereovox.sources.poses import seconds_from_ns as seconds_from_ns
 
@@ -36,6 +36,21 @@ class Trajectory(Poses):
         lines = pose_lines(path, FORMAT)
         numbers, faults = pose_numbers(lines, 7, FORMAT)
         super().__init__([line[0] for line in lines], transforms(numbers), where=str(path), faults=faults)
+
+
+def write_trajectory(path: str | Path, stamps_ns: Sequence[int], poses: NDArray[np.float64], whose: str) -> None:
+    """Write poses (N, 4, 4) as lines of the TUM format, all or nothing; `whose`: what is posed, for the first line.
+
+    Raises MapFileError where the file cannot be written; an older one is then still there.
+    """
+    from scipy.spatial.transform import Rotation
+
+    quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat(canonical=True)
+    with replacing(path) as file:
+        file.write(f"# stamp tx ty tz qx qy qz qw: {whose}\n".encode())
+        for stamp_ns, place, quaternion in zip(stamps_ns, poses[:, :3, 3], quaternions, strict=True):
+            numbers = [*(f"{x:.6f}" for x in place), *(f"{q:.9f}" for q in quaternion)]
+            file.write(f"{seconds_from_ns(stamp_ns)} {' '.join(numbers)}\n".encode())
 
 
 def pose_lines(path: Path, wanted: str) -> list[StampedLine]:

@@ -33,7 +33,7 @@ ALIKE = 2.0
 camera's own distortion. Chosen so that covariances hold in simulation (docs/tracking.md)."""
 QUIETEST = 0.01
 """Least variance of residuals, as a share of the expected one, that is believed."""
-BENT = 0.03
+BENT = 0.05
 """Radians by which normals of a plane may be bent together, by the camera's own distortion: that holds nothing."""
 FIRST = 1 << 14
 """Places in a new table."""

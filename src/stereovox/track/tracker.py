@@ -24,6 +24,8 @@ LOST = "tracking_lost"
 """Reason of refusal of frames whose pose is not known."""
 LEVEL = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """Pose of the first image unless another is given: the camera looks along x, level; z is up."""
+GIVEN, GIVEN_SHARE = np.repeat([np.radians(0.2), 0.005], 3), 0.05
+"""Standard deviations of a given motion: radians and metres, and share of it."""
 LONGEST = 10.0
 """Times the usual, how long after an image the next may come and motion still be taken to go on evenly."""
 RIVAL, RIVAL_M, RIVAL_RAD = 0.9, 0.3, np.radians(15)
@@ -128,11 +130,14 @@ class Tracker:
         self._learned = 0
         self._trial: int | None = None  # images until poses count: 0 while following, None while lost
 
-    def add(self, frame: AnyFrame) -> Tracked:
+    def add(self, frame: AnyFrame, motion: Transform | None = None) -> Tracked:
         """Return the pose of a frame. Frames come in the order they were taken.
 
         Args:
             frame: Depth image or stereo pair; its pose is not used.
+            motion: (4, 4) T_before_now, how the camera moved since the frame before by its wheels or another tracker.
+                It takes the place of even motion, and is believed along directions that nothing in view holds, and
+                where all in view is new; then a frame is lost only where what it sees contradicts what is known.
 
         Returns:
             Its pose, or why it is lost: also where the image itself cannot be used. The first image counts once the
@@ -148,9 +153,29 @@ class Tracker:
             return self._lose(str(refused))
         if self._learned < 2 and self._trial != 0:
             return self._begin(self._evidence, seen, frame.stamp_ns)
-        if self._trial is None or self._late(frame.stamp_ns):
+        if motion is None and (self._trial is None or self._late(frame.stamp_ns)):
             return self._seek(self._evidence, seen, frame.stamp_ns)
+        if motion is not None:
+            return self._correct(self._evidence, seen, motion, frame.stamp_ns)
         return self._follow(self._evidence, seen, frame.stamp_ns)
+
+    def _correct(self, evidence: Evidence[Seen], seen: Seen, motion: Transform, stamp_ns: int) -> Tracked:
+        """Take the pose of an image that a given motion leads to, corrected by what is held in view."""
+        expected = self._T @ motion
+        way = np.repeat([np.linalg.norm(rotation_vector(motion[:3, :3])), np.linalg.norm(motion[:3, 3])], 3)
+        doubt = np.diag((GIVEN + GIVEN_SHARE * way) ** 2)
+        fit = evidence.fit(seen, expected, doubt)
+        if fit.known < FOLLOWING.known:
+            fit = Fit(expected, doubt, fit.known, 1.0)
+        contrary = _doubt(fit, Demand(0.0, FOLLOWING.usual))
+        self._place(expected if contrary else fit.T_map_camera, fit.covariance)
+        self._motion, self._stamps = motion, [*self._stamps[-1:], stamp_ns]
+        if contrary:
+            evidence.advance(seen, self._T)
+            return self._lost(contrary)
+        evidence.learn(seen, self._T)
+        self._learned += 1
+        return Tracked(self._T, fit.covariance)
 
     def _begin(self, evidence: Evidence[Seen], seen: Seen, stamp_ns: int) -> Tracked:
         """Start with an image; a start counts once the next image is tracked on it."""

@@ -14,13 +14,15 @@ from made_pages import Balanced
 from stereovox.cli import main
 from stereovox.formats.map_server import read_map_server
 from stereovox.lab.papers import ist2019, reproduce
-from stereovox.lab.papers.ist.claims import claims_of, fan_claims
+from stereovox.lab.papers.ist.claims import claims_of, fan_claims, numbers_of
 from stereovox.lab.papers.ist.drives import PLACES, Drive, Extent, record
 from stereovox.lab.papers.ist.fans import DISTANCE, FEW, MANY, simulate
 from stereovox.lab.papers.ist.publish import time_publishing
 from stereovox.lab.papers.ist.survey import _judge, survey
 from stereovox.lab.papers.ist.variants import MIDDLE, OURS, THEIRS, VARIANTS
 from stereovox.lab.papers.ist2019 import QUICK, Sizes
+from stereovox.localize.slam.doubts import MapDoubt
+from stereovox.localize.slam.pipeline import SlamResult
 from stereovox.simulate.floors.bag import write_bag
 from stereovox.simulate.floors.floor import Floor
 
@@ -127,6 +129,37 @@ def test_the_whole_chain_reaches_its_target(surveyed):
     assert ours.occupied.tolerance_precision > 0.7
 
 
+def test_claims_on_a_doubted_reference_do_not_hold(surveyed):
+    good = claims_of(surveyed, PLACES[1])
+    doubt = MapDoubt("unseen", 3.0, 9.0, 0.5)
+    slam = replace(surveyed.reference.slam, doubts=[doubt])
+    doubted = replace(surveyed, reference=replace(surveyed.reference, slam=slam))
+    bad = claims_of(doubted, PLACES[1])
+    assert good[0].holds is True
+    assert (bad[0].holds, bad[0].ours) == (False, doubt.line())
+    of_reference = [(a, b) for a, b in zip(good[1:], bad[1:], strict=True) if a != b]
+    assert len(of_reference) >= 4
+    assert all(b.holds is False and b.ours.endswith("the reference is doubted") for _, b in of_reference)
+    alone = [a.text for a, b in zip(good, bad, strict=True) if a == b and a.holds is not None]
+    assert alone
+    assert all("way" in text or "building" in text or "which sees one height only" in text for text in alone)
+    assert numbers_of(doubted)["doubts"] == [{**doubt.as_dict(), "text": doubt.line()}]
+    assert {one.holds for one in claims_of(doubted, None)} == {None}
+
+
+def test_doubts_of_a_reference_are_printed_and_end_in_status_3(tmp_path, capsys, monkeypatch):
+    doubt = MapDoubt("unseen", 3.0, 9.0, 0.5)
+    monkeypatch.setattr(SlamResult, "doubts", property(lambda _: [doubt], lambda *_: None), raising=False)
+    write_bag(Floor(f"sim:floor?plan=testbed&seconds=9&{SHORT}"), tmp_path / "mine.bag")
+    words = ["reproduce", "ist2019", "--data", str(tmp_path / "mine.bag"), "--out", str(tmp_path / "out"), "--quick"]
+    assert main([*words, "--json"]) == 3
+    said = capsys.readouterr()
+    told = {"experiment": "own", **doubt.as_dict(), "text": doubt.line()}
+    assert json.loads(said.out)["doubts"] == [told]
+    assert f"warning: the reference map of own may be wrong: {doubt.line()}" in said.err.replace("\n", " ")
+    assert doubt.line() in (tmp_path / "out/report.html").read_text()
+
+
 def unseen(cells):
     return np.full_like(cells, -1)
 
@@ -154,7 +187,9 @@ def test_every_claim_about_a_floor_fails_with_some_broken_map_or_way(surveyed):
                 fails.setdefault(claim.text, []).append(claim.holds is False)
     off = replace(surveyed.way_error, position_rms_m=0.2)
     ways = replace(surveyed, way_error=off, reference=replace(surveyed.reference, way_error=off))
-    for claim in claims_of(ways, place):
+    slam = replace(surveyed.reference.slam, doubts=[MapDoubt("unseen", 3.0, 9.0, 0.5)])
+    doubted = replace(surveyed, reference=replace(surveyed.reference, slam=slam))
+    for claim in [*claims_of(ways, place), claims_of(doubted, place)[0]]:
         fails.setdefault(claim.text, []).append(claim.holds is False)
     held = [claim for claim in claims_of(surveyed, place) if claim.holds is not None]
     assert len(held) > 8

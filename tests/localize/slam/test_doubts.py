@@ -11,8 +11,8 @@ from stereovox import se2
 from stereovox.config import load_config
 from stereovox.localize.slam.doubts import BENT, CONTRADICTED, MapDoubt, doubts_of
 from stereovox.localize.slam.line_map import Cloud
+from stereovox.localize.slam.odometry_check import SLIPPED_SCALE, OdometryCheck, through
 from stereovox.localize.slam.pipeline import Slam, map_scans
-from stereovox.localize.slam.trust import SLIPPED, Trust, through
 
 
 def worst(result, truth):
@@ -96,19 +96,82 @@ def test_held_steps_are_doubted_until_a_loop_joins_both_sides(loop):
 
 
 def test_doubts_are_plain_numbers():
-    assert MapDoubt("bent", 1.0, 2.0, 0.5).as_dict() == {"kind": "bent", "begin_s": 1.0, "end_s": 2.0, "figure": 0.5}
+    found = MapDoubt("bent", 1.0, 2.0, 0.5, 6.0).as_dict()
+    assert found == {"kind": "bent", "begin_s": 1.0, "end_s": 2.0, "figure": 0.5, "turn_deg": 6.0}
+
+
+@pytest.mark.parametrize(
+    ("metres", "degrees", "words"),
+    [(0.04, 8.0, "by 8 degrees;"), (0.5, 2.0, "by 0.5 m;"), (0.5, 8.0, "by 0.5 m and 8 degrees;")],
+)
+def test_what_was_bent_is_told_in_what_is_too_much(metres, degrees, words):
+    assert words in MapDoubt("bent", 1.0, 2.0, metres, degrees).line()
+
+
+def blinded(scans, blind):
+    """The scans, of which those of a slice see nothing."""
+    return [
+        replace(scan, ranges=np.full_like(scan.ranges, np.inf)) if i in range(len(scans))[blind] else scan
+        for i, scan in enumerate(scans)
+    ]
+
+
+@pytest.mark.parametrize(("count", "doubted"), [(3, []), (60, ["lost"])])
+def test_a_step_made_blindly_has_the_slack_of_odometry_and_is_told_as_lost(count, doubted):
+    scans = drive(ring(), along([(1, 1), (13, 1)]), drift=(1.03, 0.0))
+    result = map_scans(blinded(scans, slice(30, 30 + count)), load_config())
+    far = int(np.argmax([np.hypot(*key.step[:2]) for key in result.keyframes]))
+    slack = [key.slack for key in result.keyframes]
+    assert slack[far] > 0.01 * 0.1 * count
+    assert sum(slack) == slack[far]
+    assert [doubt.kind for doubt in result.doubts] == doubted
+    for doubt in result.doubts:
+        assert "odometry alone led on" in doubt.line()
+        assert "contradict" not in doubt.line()
+
+
+def test_the_odometry_s_slack_is_what_the_drive_has_shown():
+    """A drive whose odometry is 6 % too long has more of it than one whose is right; standing adds none."""
+    step, drifts = np.array([0.1, 0.0, 0.0]), []
+    for factor in (1.0, 1.06):
+        check, pose = OdometryCheck(), np.zeros(3)
+        for i in range(400):
+            before, pose = pose, se2.compose(pose, step)
+            check.add(np.array([0.1 * factor * i, 0.0, 0.0]), before, pose)
+        drifts.append(check.drift(step)[0])
+        assert check.drift(np.zeros(3)) == (0.0, 0.0)
+    assert drifts[0] < 0.001
+    assert drifts[1] == pytest.approx(0.006, rel=0.2)
+
+
+@pytest.mark.parametrize("step", [0.2, 0.5, 2.0])
+def test_a_step_straight_back_that_odometry_counts_as_forwards_is_found(step):
+    """Farther than the search around the odometry's place reaches; the whole way would be 6 m off."""
+    there, after = along([(1, 1), (6, 1)]), along([(6, 1), (9, 1)])
+    back = np.array([(6 - step * i, 1.0, 0.0) for i in range(1, round(3 / step) + 1)])
+    after = after + (back[-1] - after[0])
+    truth = np.vstack([there, back, after[1:]])
+    wrong = there[-1] + (there[-1] - back) * [1, 1, 0]
+    believed = np.vstack([there, wrong, after[1:] + (wrong[-1] - back[-1])])
+    scans = [
+        replace(scan, T_world_sensor=se2.lifted(pose))
+        for scan, pose in zip(drive(ring(), truth, limit=20.0), believed, strict=True)
+    ]
+    result = map_scans(scans, load_config())
+    assert worst(result, truth) < 0.1
+    assert result.doubts == []
 
 
 def test_steps_that_agree_are_no_contradiction_and_far_ones_are():
-    trust, pose = Trust(), np.zeros(3)
+    check, pose = OdometryCheck(), np.zeros(3)
     for i in range(30):
-        assert trust.add(np.array([0.1 * i, 0, 0]), pose, se2.compose(pose, [0.1, 0.0, 0.0])) is None
-    found = [trust.add(np.array([2.9 + 0.1 * i, 0, 0]), pose, pose) for i in range(1, 6)]
+        assert check.add(np.array([0.1 * i, 0, 0]), pose, se2.compose(pose, [0.1, 0.0, 0.0])) is None
+    found = [check.add(np.array([2.9 + 0.1 * i, 0, 0]), pose, pose) for i in range(1, 6)]
     since = next(moment for moment in found if moment is not None)
     assert found[:2] == [None, None]  # 0.2 m may be a clock
-    assert trust.by_odometry(since, pose)[0] > 0.25
-    trust.settle(SLIPPED)
-    assert trust.scale == SLIPPED
+    assert check.by_odometry(since, pose)[0] > 0.25
+    check.settle(SLIPPED_SCALE)
+    assert check.scale == SLIPPED_SCALE
 
 
 def test_beams_that_pass_through_points_are_counted():
@@ -124,9 +187,9 @@ def test_beams_that_pass_through_points_are_counted():
 @pytest.mark.parametrize("step", [0.1, 1.2, 5.0])
 def test_odometry_that_matching_does_not_follow_is_noticed_whatever_the_step(step):
     """Steps longer than the way over which both are compared are compared by themselves."""
-    trust, still, found = Trust(), np.zeros(3), []
+    check, still, found = OdometryCheck(), np.zeros(3), []
     for i in range(12):
-        found.append(trust.add(np.array([step * i, 0, 0]), still, still))
+        found.append(check.add(np.array([step * i, 0, 0]), still, still))
     assert any(since is not None for since in found)
-    agreeing, there = Trust(), [np.array([step * i, 0, 0]) for i in range(12)]
+    agreeing, there = OdometryCheck(), [np.array([step * i, 0, 0]) for i in range(12)]
     assert all(agreeing.add(there[i], there[max(i - 1, 0)], there[i]) is None for i in range(12))

@@ -6,7 +6,7 @@ from made_drives import along, drive, ring
 
 from stereovox import se2
 from stereovox.config import load_config
-from stereovox.localize.slam.front_end import FEWEST_NEAR, Follower
+from stereovox.localize.slam.front_end import MIN_NEAR_POINTS, Follower
 from stereovox.localize.slam.line_map import LineMap, joined
 
 OUT_AND_BACK = [(1, 1), (13, 1), (2, 1)]
@@ -19,7 +19,7 @@ def expected(keyframes, config, start):
         if np.hypot(*(keyframe.pose - keyframes[-1].pose)[:2]) > config.max_range:
             break
         recent.insert(0, keyframe.cloud.moved(keyframe.pose - start))
-    return LineMap(config.voxel_size, reach=0.2, fewest=FEWEST_NEAR).build(joined(recent), start[:2]), len(recent)
+    return LineMap(config.voxel_size, reach=0.2, fewest=MIN_NEAR_POINTS).build(joined(recent), start[:2]), len(recent)
 
 
 def test_the_map_is_of_the_last_keyframes_in_sight():

@@ -9,7 +9,7 @@ from made_drives import along, drive, ring
 
 from stereovox import se2
 from stereovox.config import load_config
-from stereovox.localize.slam.pipeline import LATE, Slam, map_scans
+from stereovox.localize.slam.pipeline import MIN_LATE_SCANS, Slam, map_scans
 
 SCANS = drive(ring(), along([(1, 1), (6, 1)]), drift=(1.03, 0.01))
 FUTURE = 10**18
@@ -23,7 +23,7 @@ def stamped(scan, stamp_ns):
 @pytest.mark.parametrize("count", [1, 5])
 def test_stamps_in_the_future_do_not_end_it(at, count):
     scans = [stamped(scan, FUTURE + i) if at <= i < at + count else scan for i, scan in enumerate(SCANS)]
-    late = max(count, LATE)
+    late = max(count, MIN_LATE_SCANS)
     result = map_scans(scans, load_config())
     assert result.refused == {"not_in_order": count + late}
     kept = [*SCANS[:at], *SCANS[at + count + late :]]

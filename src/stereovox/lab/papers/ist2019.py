@@ -60,7 +60,9 @@ def reproduce(out: Path, data: str | Path | None, quick: bool, progress: Progres
     found = own(robot, out, sizes, progress) if robot else floors(out, sizes, progress)
     lead = LEAD if robot is None else OWN
     seconds = perf_counter() - start
-    return write_result(files, found, seconds, paper="ist2019", title=TITLE, lead=lead, quick=quick, heads=HEADS)
+    result = write_result(files, found, seconds, paper="ist2019", title=TITLE, lead=lead, quick=quick, heads=HEADS)
+    doubts = [{"experiment": one.name, **doubt} for one in found for doubt in one.numbers.get("doubts", ())]
+    return {**result, "doubts": doubts}
 
 
 def floors(out: Path, sizes: Sizes, progress: Progress, places: tuple[Place, ...] = PLACES) -> list[Chapter]:

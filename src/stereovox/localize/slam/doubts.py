@@ -7,7 +7,7 @@ The limits were chosen on seeds 0 to 99 of `benchmarks/slam_drives.py` and on th
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import zip_longest
 from typing import Any
 
@@ -16,20 +16,23 @@ from numpy.typing import NDArray
 
 from stereovox import se2
 from stereovox.localize.slam.graph import Edge, Keyframe
-from stereovox.localize.slam.trust import through
+from stereovox.localize.slam.odometry_check import through
 
 BLOCK, EVERY = 10, 2
-"""Keyframes that are judged together, and of which each so-manieth is looked at."""
-NEAR, PASSED = 4.0, 8.0
+"""Keyframes that are judged together, and the step between those of them that are looked at."""
+VISIT_DISTANCE, VISIT_PATH = 4.0, 8.0
 """Metres between keyframes that see the same walls, and of way between them, for the two to be visits of their own."""
-REACH = 8.0
+MAX_POINT_RANGE = 8.0
 """Metres from the robot up to which its points are sure enough to speak against other scans."""
-OTHERS = 6
-"""Keyframes of other visits that one is compared with."""
-FEWEST_POINTS, CONTRADICTED = 300, 0.4
-"""Points to judge a block by, and the share of them seen through from which on it is doubted: people and doors move."""
-TINY = 1.0
-"""Metres of way between two steps with slack that are not a part of their own."""
+MAX_OTHERS = 6
+"""Keyframes of other visits that one is compared with at most."""
+MIN_POINTS, CONTRADICTED = 300, 0.4
+"""Points that judge a block at least, and the share of them seen through above which it is doubted: people and doors
+move."""
+MIN_SLACK = 0.2
+"""Metres of slack below which a step is not doubted: odometry alone leads well over a few scans."""
+MIN_PART_PATH = 1.0
+"""Metres of way between two steps with slack, below which they count as one."""
 STRETCH, BENT, BENT_TURN = 20.0, 0.3, 0.09
 """Metres of way, and metres and radians by which loops may have bent them: matching is off by some 2 %."""
 
@@ -38,30 +41,42 @@ STRETCH, BENT, BENT_TURN = 20.0, 0.3, 0.09
 class MapDoubt:
     """Why a part of a map may be wrong.
 
-    kind: `unseen` (matching and odometry contradicted each other, and nothing later shows which was right), `bent`
-    (loops bent a stretch by more than matching can be off), `contradiction` (beams of this part pass through walls that
-    another visit saw). begin_s, end_s: seconds of the drive, from its first keyframe. figure: metres that it may be
-    off by, metres that it was bent by, or the share of points seen through.
+    kind: `unseen` (matching and odometry contradicted each other, and nothing later shows which was right), `lost`
+    (odometry alone led the robot, and nothing later shows where), `bent` (loops bent a stretch by more than matching
+    can be off), `contradiction` (beams of this part pass through walls that another visit saw). begin_s, end_s: seconds
+    of the drive, from its first keyframe. figure: metres that it may be off by, metres that it was bent by, or the
+    share of points seen through. turn_deg: degrees that it was bent by, 0 for other kinds.
     """
 
     kind: str
     begin_s: float
     end_s: float
     figure: float
+    turn_deg: float = 0.0
 
     def line(self) -> str:
         """Return one sentence for a user."""
-        return f"{self.kind}, {self.begin_s:.0f} to {self.end_s:.0f} s: {SENTENCES[self.kind].format(self.figure)}"
+        sentence = SENTENCES[self.kind].format(self.figure, bend=self._bend())
+        return f"{self.kind}, {self.begin_s:.0f} to {self.end_s:.0f} s: {sentence}"
 
     def as_dict(self) -> dict[str, Any]:
         """Return the doubt for JSON."""
-        return {"kind": self.kind, "begin_s": self.begin_s, "end_s": self.end_s, "figure": self.figure}
+        return asdict(self)
+
+    def _bend(self) -> str:
+        """Return metres and degrees, those that are beyond their limits."""
+        metres, turn = f"{self.figure:.1f} m", f"{self.turn_deg:.0f} degrees"
+        if self.turn_deg <= np.degrees(BENT_TURN):
+            return metres
+        return f"{metres} and {turn}" if self.figure > BENT else turn
 
 
 SENTENCES = {
     "unseen": "scans and odometry contradict each other by {:.1f} m and more, and the robot never came back to tell "
     "which is right; drive there again",
-    "bent": "loops bent 20 m of the trajectory by {:.1f} m; the wheels slipped there, or a loop is wrong",
+    "lost": "scans saw nothing, or nothing known; odometry alone led on, off by up to {:.1f} m, and no loop joins what "
+    "came before with what came after; drive there again",
+    "bent": "loops bent 20 m of the trajectory by {bend}; the wheels slipped there, or a loop is wrong",
     "contradiction": "{:.0%} of the walls here are seen through on another visit; one of the two is in the wrong place",
 }
 
@@ -72,9 +87,11 @@ def doubts_of(keyframes: Sequence[Keyframe], edges: Sequence[Edge]) -> list[MapD
     return sorted(found, key=lambda doubt: (doubt.begin_s, doubt.kind))
 
 
-def _doubt(keyframes: Sequence[Keyframe], kind: str, first: int, last: int, figure: float) -> MapDoubt:
+def _doubt(
+    keyframes: Sequence[Keyframe], kind: str, first: int, last: int, figure: float, turn: float = 0.0
+) -> MapDoubt:
     start, begin, end = (keyframes[i].scan.stamp_ns for i in (0, first, last))
-    return MapDoubt(kind, 1e-9 * (begin - start), 1e-9 * (end - start), float(figure))
+    return MapDoubt(kind, 1e-9 * (begin - start), 1e-9 * (end - start), float(figure), float(np.degrees(turn)))
 
 
 def _unseen(keyframes: Sequence[Keyframe], edges: Sequence[Edge]) -> Iterator[MapDoubt]:
@@ -92,14 +109,15 @@ def _unseen(keyframes: Sequence[Keyframe], edges: Sequence[Edge]) -> Iterator[Ma
     _, joined = connected_components(graph, directed=False)
     for i in cuts:
         if joined[part[i - 1]] != joined[part[i]]:
-            yield _doubt(keyframes, "unseen", i - 1, i, keyframes[i].slack)
+            kind = "lost" if keyframes[i].lost else "unseen"
+            yield _doubt(keyframes, kind, i - 1, i, keyframes[i].slack)
 
 
 def _cuts(keyframes: Sequence[Keyframe]) -> list[int]:
     """Return the keyframes whose step has slack; of several close to each other the last."""
-    slack = [i for i, keyframe in enumerate(keyframes) if keyframe.slack and i]
+    slack = [i for i, keyframe in enumerate(keyframes) if keyframe.slack > MIN_SLACK and i]
     way = [keyframe.travelled for keyframe in keyframes]
-    return [i for i, later in zip_longest(slack, slack[1:]) if later is None or way[later] - way[i] > TINY]
+    return [i for i, later in zip_longest(slack, slack[1:]) if later is None or way[later] - way[i] > MIN_PART_PATH]
 
 
 def _bent(keyframes: Sequence[Keyframe]) -> Iterator[MapDoubt]:
@@ -112,7 +130,7 @@ def _bent(keyframes: Sequence[Keyframe]) -> Iterator[MapDoubt]:
     metres, radians = np.hypot(left[:, 0], left[:, 1]), np.abs(left[:, 2])
     worst = int(np.argmax(np.maximum(metres / BENT, radians / BENT_TURN)))
     if metres[worst] > BENT or radians[worst] > BENT_TURN:
-        yield _doubt(keyframes, "bent", worst, int(ends[worst]), metres[worst])
+        yield _doubt(keyframes, "bent", worst, int(ends[worst]), metres[worst], radians[worst])
 
 
 def _chained(keyframes: Sequence[Keyframe]) -> Iterator[se2.Pose]:
@@ -134,7 +152,7 @@ def _contradicted(keyframes: Sequence[Keyframe]) -> Iterator[MapDoubt]:
             for other in _other_visits(places, way, i)
         ]
         crossed, met = np.sum(pairs, axis=0) if pairs else (0, 0)
-        if met > FEWEST_POINTS and crossed / met > worst:
+        if met > MIN_POINTS and crossed / met > worst:
             worst, where = crossed / met, first
     if where >= 0:
         yield _doubt(keyframes, "contradiction", where, min(where + BLOCK, len(keyframes)) - 1, worst)
@@ -142,14 +160,14 @@ def _contradicted(keyframes: Sequence[Keyframe]) -> Iterator[MapDoubt]:
 
 def _other_visits(places: se2.Pose, way: NDArray[np.float64], i: int) -> NDArray[np.int64]:
     """Return keyframes near keyframe i that stood there at another time, spread over all of them."""
-    near = np.hypot(*(places[:, :2] - places[i, :2]).T) < NEAR
-    others = np.flatnonzero(near & (np.abs(way - way[i]) > PASSED))
-    return others[:: max(len(others) // OTHERS, 1)][:OTHERS]
+    near = np.hypot(*(places[:, :2] - places[i, :2]).T) < VISIT_DISTANCE
+    others = np.flatnonzero(near & (np.abs(way - way[i]) > VISIT_PATH))
+    return others[:: max(len(others) // MAX_OTHERS, 1)][:MAX_OTHERS]
 
 
 def _seen_through(keyframes: Sequence[Keyframe], i: int, other: int) -> tuple[int, int]:
     """Count which points of another keyframe the scan of keyframe i sees through, and how many it could."""
     points = keyframes[other].cloud.points
-    points = points[(points**2).sum(axis=1) < REACH**2]
+    points = points[(points**2).sum(axis=1) < MAX_POINT_RANGE**2]
     between = se2.relative(keyframes[i].pose, keyframes[other].pose)
     return through(keyframes[i].cloud, se2.transform(between, points))

@@ -11,33 +11,39 @@ from stereovox.frame import Scan
 from stereovox.localize.slam.graph import SLACK_TURN, Keyframe
 from stereovox.localize.slam.line_map import Cloud, LineMap, Match, cloud_of, joined
 from stereovox.localize.slam.loops import ClosureSearch
-from stereovox.localize.slam.trust import SLIPPED, STUCK, Moment, Trust, through
+from stereovox.localize.slam.odometry_check import SLIPPED_SCALE, STUCK_SCALE, Moment, OdometryCheck, through
 
 STEP_YAW = 0.01
 """Radians between the turns that the search tries."""
-WINDOW, WINDOW_TURN = 1.0, 1.5
+MAX_WINDOW, MAX_WINDOW_TURN = 1.0, 1.5
 """Metres and radians that are searched at most, whatever the odometry says."""
 MIN_WINDOW = 0.1
+"""Metres that are searched at least."""
 SLOPE = 0.02
 """Likelihood that the search takes off at one standard deviation of the odometry: so much a scan that moves on along a
 corridor loses against one that stays where it was, as its far points fall between those of before."""
-LOOSER = 2.0
-"""By how much the last step trusts the odometry less than the search: walls know better where there are any."""
-SEARCHED = 100
-"""Points that the search looks at: it need only come near."""
-FEWEST = 10
+PRIOR_FACTOR = 2.0
+"""Factor on the odometry's errors in the last step, against the search: walls know better where there are any."""
+SEARCH_POINTS = 100
+"""Points that the search looks at, about: it need only come near."""
+MIN_HITS = 10
 """Hits below which a scan is not matched: its pose is the odometry's."""
-FEWEST_NEAR = 3
+MIN_NEAR_POINTS = 3
 """Points of the map that a scan's point needs near it: along a corridor lone far ones lie where beams do, and hold
 every scan where the first was."""
-LOST, FOUND = 0.5, 0.6
+LOST_SHARE, FOUND_SHARE = 0.5, 0.6
 """Share of a scan's points on the map below which a match is not believed, and from which on a wide search's is."""
-LOST_SCAN, UNSEEN = 0.05, 0.5
-"""Metres that a lost scan counts at least, and metres after which the map goes on from where the odometry leads."""
-WIDEST = 3.0
-"""Metres of the wide search each way."""
-HELD = (0.05, 0.03)
-"""Metres and radians near a place within which its fit is measured."""
+MIN_BACK = 0.05
+"""Metres of a step from which on it is also tried straight back."""
+BACK_MARGIN, BACK_MARGIN_SEEN = 0.05, 0.15
+"""Share of a scan's points by which it must fit better straight back: points on walls alone, and less the share of
+walls seen through."""
+MIN_LOST_STEP, MAX_LOST_PATH = 0.05, 0.5
+"""Metres that a lost scan counts at least, and metres lost after which the map goes on where the odometry leads."""
+MAX_WIDE_WINDOW = 3.0
+"""Metres of the wide search each way at most."""
+FIT_SIGMAS = (0.05, 0.03)
+"""Metres and radians (standard deviations) from a place within which its fit is measured."""
 
 
 class Follower:
@@ -51,12 +57,14 @@ class Follower:
         self.keyframes: list[Keyframe] = []
         self.pose: se2.Pose = np.zeros(3)
         self._config = config
-        self._map = LineMap(config.voxel_size, reach=0.2, fewest=FEWEST_NEAR)
+        self._map = LineMap(config.voxel_size, reach=0.2, fewest=MIN_NEAR_POINTS)
         self._odometry: se2.Pose | None = None
         self._travelled = 0.0
         self._start: se2.Pose = np.zeros(3)
         self._moved: dict[int, Cloud] = {}
-        self._trust, self._slack, self._lost = Trust(), 0.0, 0.0
+        self._check = OdometryCheck()
+        self._held, self._lost, self._was_lost, self._blind = 0.0, 0.0, 0.0, 0.0
+        self._backed = False
         self._wide = ClosureSearch(config)
 
     def add(self, scan: Scan) -> bool:
@@ -68,17 +76,12 @@ class Follower:
         else:
             step = se2.relative(self._odometry, odometry)
             before, self.pose = self.pose, self._found(cloud, se2.compose(self.pose, step), step)
-            since = self._trust.add(odometry, before, self.pose)
-            if since is not None and self.keyframes:
-                self._judge(cloud, since)
+            self._compare(cloud, odometry, before, step)
             self._travelled += float(np.hypot(*(self.pose - before)[:2]))
         self._odometry = odometry
         if not self._is_new(cloud):
             return False
-        step = se2.relative(self.keyframes[-1].pose, self.pose) if self.keyframes else np.zeros(3)
-        self._slack = max(self._slack, self._lost)
-        self.keyframes.append(Keyframe(self.pose, step, cloud, scan, self._travelled, self._slack))
-        self._slack = self._lost
+        self._append(cloud, scan)
         self._rebuild()
         return True
 
@@ -88,40 +91,77 @@ class Follower:
         self._moved.clear()
         self._rebuild()
 
+    def _append(self, cloud: Cloud, scan: Scan) -> None:
+        """Make a keyframe of a scan."""
+        step = se2.relative(self.keyframes[-1].pose, self.pose) if self.keyframes else np.zeros(3)
+        slack = max(self._held, self._was_lost, self._lost + self._blind)
+        self.keyframes.append(Keyframe(self.pose, step, cloud, scan, self._travelled, slack, slack > self._held))
+        self._held, self._was_lost, self._blind = 0.0, self._lost, 0.0
+
     def _found(self, cloud: Cloud, guess: se2.Pose, step: se2.Pose) -> se2.Pose:
         """Return the pose of a scan: as matched, or found by a wide search, or else by the odometry, with slack."""
-        if len(cloud.points) < FEWEST or not self.keyframes:
+        self._backed = False
+        if len(cloud.points) < MIN_HITS or not self.keyframes:
             return guess
-        match = self._matched(cloud, guess, step)
-        if match.share >= LOST or (not self._lost and _agree(match.pose, guess, odometry_sigmas(self._config, step))):
+        match = self._forth_or_back(cloud, guess, step)
+        sigmas = odometry_sigmas(self._config, step)
+        if match.share >= LOST_SHARE or (not self._lost and _agree(match.pose, guess, sigmas)):
             self._lost = 0.0
             return match.pose
-        self._lost += max(float(np.hypot(step[0], step[1])), LOST_SCAN)
-        side = min(WINDOW / 2 + 2 * self._lost, WIDEST)
+        self._lost += max(float(np.hypot(step[0], step[1])), MIN_LOST_STEP)
+        side = min(MAX_WINDOW / 2 + 2 * self._lost, MAX_WIDE_WINDOW)
         self._wide.set_target(joined(list(self._moved.values())))
         found = self._wide.match(
-            cloud, guess - self._start, side, min(WINDOW_TURN / 3 + abs(float(step[2])), WINDOW_TURN)
+            cloud, guess - self._start, side, min(MAX_WINDOW_TURN / 3 + abs(float(step[2])), MAX_WINDOW_TURN)
         )
-        if found is not None and found.share >= FOUND:
+        if found is not None and found.share >= FOUND_SHARE:
             self._lost = 0.0
             return self._map.refine(cloud, found.pose + self._start, self._config.sigma).pose
         return guess
 
+    def _forth_or_back(self, cloud: Cloud, guess: se2.Pose, step: se2.Pose) -> Match:
+        """Match near the odometry's `guess`; or straight back, where wheels turned the wrong way or a robot was pushed.
+
+        Straight back must fit far better, by points on walls and by walls seen through: what lies ahead is new, and
+        every scan seems to fit better a step behind.
+        """
+        match, metres = self._matched(cloud, guess, step), float(np.hypot(step[0], step[1]))
+        if metres < MIN_BACK or match.share > 1 - BACK_MARGIN:
+            return match
+        back = self._matched(cloud, se2.compose(self.pose, [-step[0], -step[1], step[2]]), step)
+        if back.share < match.share + BACK_MARGIN:
+            return match
+        self._backed = self._fit(cloud, back.pose)[1] > self._fit(cloud, match.pose)[1] + BACK_MARGIN_SEEN
+        return back if self._backed else match
+
+    def _compare(self, cloud: Cloud, odometry: se2.Pose, before: se2.Pose, step: se2.Pose) -> None:
+        """Compare the motion just matched from `before` (3,), with the odometry's."""
+        if len(cloud.points) < MIN_HITS:
+            metres, radians = self._check.drift(step)
+            self._blind += max(metres, radians / SLACK_TURN)
+            self._check.restart(odometry, self.pose)
+            return
+        since = self._check.add(odometry, before, self.pose)
+        if self._backed:
+            self._check.settle(SLIPPED_SCALE)
+        elif since is not None and self.keyframes:
+            self._judge(cloud, since)
+
     def _judge(self, cloud: Cloud, since: Moment) -> None:
         """Believe matching or odometry since a moment, from when on they contradict each other."""
-        guess = self._trust.by_odometry(since, self.pose)
+        guess = self._check.by_odometry(since, self.pose)
         (pose, matched), (other, driven) = self._fit(cloud, self.pose), self._fit(cloud, guess)
-        if _nearer(other, pose, guess) or matched > driven + self._trust.margin:
-            self._trust.settle(SLIPPED)
+        if _nearer(other, pose, guess) or matched > driven + self._check.margin:
+            self._check.settle(SLIPPED_SCALE)
             return
         left = se2.relative(self.pose, guess)
-        slack = max(float(np.hypot(left[0], left[1])), abs(float(left[2])) / SLACK_TURN) + HELD[0]
-        self.pose, self._slack = guess, max(self._slack, slack)
-        self._trust.settle(STUCK)
+        slack = max(float(np.hypot(left[0], left[1])), abs(float(left[2])) / SLACK_TURN) + FIT_SIGMAS[0]
+        self.pose, self._held = guess, max(self._held, slack)
+        self._check.settle(STUCK_SCALE)
 
     def _fit(self, cloud: Cloud, pose: se2.Pose) -> tuple[se2.Pose, float]:
         """Return the best pose near `pose`, and the share of points on the map there, less those seen through."""
-        held = np.diag([HELD[0] ** -2, HELD[0] ** -2, HELD[1] ** -2])
+        held = np.diag([FIT_SIGMAS[0] ** -2, FIT_SIGMAS[0] ** -2, FIT_SIGMAS[1] ** -2])
         match = self._map.refine(cloud, pose, self._config.sigma, pose, held)
         known = joined(list(self._moved.values())).points + self._start[:2]
         crossed, met = through(cloud, se2.transform(se2.inverse(match.pose), known))
@@ -130,19 +170,19 @@ class Follower:
     def _matched(self, cloud: Cloud, guess: se2.Pose, step: se2.Pose) -> Match:
         config = self._config
         metres, radians = odometry_sigmas(config, step)
-        metres *= self._trust.scale
-        information = np.diag([metres**-2, metres**-2, radians**-2]) / LOOSER**2
-        seeds = cloud.points[:: max(len(cloud.points) // SEARCHED, 1)]
+        metres *= self._check.scale
+        information = np.diag([metres**-2, metres**-2, radians**-2]) / PRIOR_FACTOR**2
+        seeds = cloud.points[:: max(len(cloud.points) // SEARCH_POINTS, 1)]
         slopes = SLOPE / metres**2, SLOPE / radians**2
-        window = min(max(3 * metres, MIN_WINDOW), WINDOW), min(2 * radians, WINDOW_TURN)
+        window = min(max(3 * metres, MIN_WINDOW), MAX_WINDOW), min(2 * radians, MAX_WINDOW_TURN)
         start, _ = self._map.search(seeds, guess, *window, STEP_YAW, *slopes)
         start = self._map.refine(cloud, start, 2 * config.sigma, guess, information).pose
         return self._map.refine(cloud, start, config.sigma, guess, information)
 
     def _is_new(self, cloud: Cloud) -> bool:
         if not self.keyframes:
-            return len(cloud.points) >= FEWEST
-        if 0 < self._lost < UNSEEN or len(cloud.points) < FEWEST:
+            return len(cloud.points) >= MIN_HITS
+        if 0 < self._lost < MAX_LOST_PATH or len(cloud.points) < MIN_HITS:
             return False
         way = se2.relative(self.keyframes[-1].pose, self.pose)
         far = np.hypot(way[0], way[1]) > self._config.keyframe_distance or abs(way[2]) > self._config.keyframe_turn

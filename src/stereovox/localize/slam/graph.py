@@ -40,7 +40,8 @@ class Keyframe:
 
     pose: (3,) pose_map_base as now believed. step: (3,) where it stood as seen from the keyframe before, as matched.
     cloud: its points in the robot's frame. travelled: metres of the robot's way until here.
-    slack: metres by which `step` may be off beyond what is usual: matching and odometry contradicted each other.
+    slack: metres by which `step` may be off beyond what is usual. lost: whether that is because the odometry alone led
+    here, as scans saw nothing, or nothing known; else matching and odometry contradicted each other.
     """
 
     pose: se2.Pose
@@ -49,6 +50,7 @@ class Keyframe:
     scan: Scan
     travelled: float
     slack: float = 0.0
+    lost: bool = False
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,9 +19,10 @@ COARSE = 2
 SEEDS = 400
 """Points of a submap that the search looks at."""
 LEVELS = 6
+"""Levels of the search's pyramid: its coarsest cells are 2^5 of the finest across."""
 RIVAL = 0.6
 """Metres from the best place, within which a good score is the same place's."""
-ROOM = 4.0
+MAX_APART = 4.0
 """Metres by which two submaps' middles may be apart and still show the same walls, beyond what drift explains."""
 NEAR_RANGE, FAR_RANGE = 10.0, 20.0
 """Metres from the robot up to which points of the later, and of the earlier submap are used: what is near is seen from
@@ -115,7 +116,7 @@ class LoopFinder:
         if b.travelled - a.travelled < config.closure_path:
             return None
         side = min(BASE_WINDOW + config.drift * path_m, config.closure_window)
-        if np.hypot(*(b.pose - a.pose)[:2]) > side + ROOM:
+        if np.hypot(*(b.pose - a.pose)[:2]) > side + MAX_APART:
             return None
         return side, min(BASE_WINDOW_TURN + config.drift_turn * path_m, config.closure_window_turn)
 

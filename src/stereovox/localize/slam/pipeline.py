@@ -29,17 +29,17 @@ from stereovox.maps.grid_map import GridMap
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.trust.validate import validate_upright_scan
 
-LATE = 3
+MIN_LATE_SCANS = 3
 """Scans in a row that are too late, and in order among themselves, before it is asked who is right."""
 Progress = Callable[[int, int, str], object]
-CLOSURE_TRUST, PATCH_TRUST = 0.02, 0.1
-"""What a match's information is worth: its points are not independent, nor is what they lie on exact."""
+CLOSURE_WEIGHT, PATCH_WEIGHT = 0.02, 0.1
+"""Factors on a match's information: its points are not independent, nor is what they lie on exact."""
 SCANS_PER_KEYFRAME = 2.25
 """Scans that a keyframe counts as in the map: it stands for those around it, and one is enough to know a cell."""
 MAX_CELLS = 40_000
 """Cells on a side of the finished map."""
-JUMP, JUMP_TURN = 0.05, 0.01
-"""Metres and radians that a closure must be off, before the graph is solved anew on the way."""
+MIN_JUMP, MIN_JUMP_TURN = 0.05, 0.01
+"""Metres and radians that a closure must be off for the graph to be solved anew on the way."""
 
 
 def map_scans(scans: Iterable[Scan], config: Config, progress: Progress | None = None) -> SlamResult:
@@ -95,7 +95,7 @@ class Slam:
         is_key = self._follower.add(scan)
         self._builder.add(scan, self.pose, self.keyframes)
         if is_key and any(_off(self.keyframes, edge) for edge in self._loops.update()):
-            self._solve(self._loops.edges, CLOSURE_TRUST)
+            self._solve(self._loops.edges, CLOSURE_WEIGHT)
         return self.pose
 
     def finish(self, progress: Progress | None = None) -> SlamResult:
@@ -109,12 +109,12 @@ class Slam:
                 f"not one of the scans could be used: {counted or 'none has enough hits'}{self._first}"
             )
         self._loops.update(end=True)
-        self._solve(self._loops.edges, CLOSURE_TRUST)
+        self._solve(self._loops.edges, CLOSURE_WEIGHT)
         rounds = self._config.slam.refine_rounds if self._loops.edges else 0
         for done in range(rounds):
             if progress:
                 progress(done, rounds, "polishing the map")
-            self._solve(list(patch_edges(self.keyframes, self._config.slam)), PATCH_TRUST)
+            self._solve(list(patch_edges(self.keyframes, self._config.slam)), PATCH_WEIGHT)
         track = self._builder.track(self.keyframes)
         doubts = doubts_of(self.keyframes, self._loops.edges)
         return SlamResult(track, self._grid(), self.keyframes, self._loops.edges, self.refused, doubts)
@@ -123,11 +123,11 @@ class Slam:
         if count:
             self.refused[reason] = self.refused.get(reason, 0) + count
 
-    def _solve(self, edges: list[Edge], trust: float) -> None:
+    def _solve(self, edges: list[Edge], weight: float) -> None:
         if not edges:
             return
         last = self.keyframes[-1].pose
-        poses = optimised(self._poses(), step_edges(self.keyframes), edges, trust)
+        poses = optimised(self._poses(), step_edges(self.keyframes), edges, weight)
         for keyframe, pose in zip(self.keyframes, poses, strict=True):
             keyframe.pose = pose
         self._follower.moved(last)
@@ -202,7 +202,7 @@ class TrackBuilder:
         if not self._late or stamp_ns <= self._late_ns:
             self._late, self._against = 0, ahead
         self._late, self._late_ns = self._late + 1, stamp_ns
-        if self._late <= max(self._against, LATE):
+        if self._late <= max(self._against, MIN_LATE_SCANS):
             return None
         del self._steps[-ahead:]
         self._late = 0
@@ -244,4 +244,4 @@ def _check_extent(poses: se2.Pose, cell: float) -> None:
 
 def _off(keyframes: list[Keyframe], edge: Edge) -> bool:
     left = se2.relative(edge.motion, se2.relative(keyframes[edge.first].pose, keyframes[edge.second].pose))
-    return bool(np.hypot(left[0], left[1]) > JUMP or abs(left[2]) > JUMP_TURN)
+    return bool(np.hypot(left[0], left[1]) > MIN_JUMP or abs(left[2]) > MIN_JUMP_TURN)

@@ -101,7 +101,7 @@ class Bag(DepthSource):
         if options.baseline:
             self.camera = replace(self.camera, baseline=options.baseline)
         self._scale = options.scale
-        self._standing = options.pose == "fixed" or not posed
+        self._standing, self.posed = options.pose == "fixed" or not posed, posed
         self._poses, self._missing, notes = None, "", ()
         if not self._standing:
             self._poses, self._missing, notes = read_poses(self._file, options, self._depth.frame_id)

@@ -7,7 +7,7 @@ import os
 import re
 from pathlib import Path
 
-from stereovox.errors import SourceError
+from stereovox.errors import NoPoses, SourceError
 from stereovox.sources.base import Part
 from stereovox.sources.kitti.base import (
     PAIRS,
@@ -17,7 +17,7 @@ from stereovox.sources.kitti.base import (
     time_lines,
 )
 from stereovox.sources.kitti.calibration import KittiCalibration, read_calibration
-from stereovox.sources.kitti.poses import read_named_poses
+from stereovox.sources.kitti.poses import FramePoses, UnknownPoses, read_named_poses
 from stereovox.sources.parameters import file_of
 from stereovox.sources.rgbd.folder import folder_part
 from stereovox.sources.rig_options import POSES, folder_and_options
@@ -37,6 +37,7 @@ class KittiOdometry(KittiSource):
             which the benchmark publishes for 00 to 10 only.
         axes: of the camera they are of, `optical` (without it), `opengl` or `ros`. invert: 1 for world to camera.
         fps: frames a second where there is no times.txt, 10 without it.
+    posed: without it poses are not looked for, and are NaN.
     Time: times.txt, seconds since the first frame; every line is a frame. Scans (`velodyne/`) are untwisted there.
     World and faults: see `KittiSource`. Raises SourceError for what is missing as a whole.
     """
@@ -49,7 +50,7 @@ class KittiOdometry(KittiSource):
         Part((CALIBRATION,), CALIBRATION, "copy it from the data set, with lines 'P0: 12 numbers' to 'P3:'"),
     )
 
-    def __init__(self, where: str | os.PathLike[str]):
+    def __init__(self, where: str | os.PathLike[str], posed: bool = True):
         self.folder, options = folder_and_options(where, {"camera": "", "fps": 0.0, **POSES})
         sequence = self.folder.resolve().name
         self.name = f"kitti_odometry_{sequence}"
@@ -58,9 +59,13 @@ class KittiOdometry(KittiSource):
         self._stamps = self._times(options["fps"])
         self._check_numbers()
         self.camera = self.calibration.camera(*self.eyes, self._size())
-        usual = self.folder.resolve().parents[1] / "poses" / f"{sequence}.txt"
-        path = file_of(options["poses"], self.folder) if options["poses"] else usual
-        self.poses = read_named_poses(path, self._stamps, options["axes"], options["invert"])
+        choice = (options["poses"], options["axes"], options["invert"])
+        self.poses = self._poses(*choice) if posed else UnknownPoses()
+
+    @classmethod
+    def depth_only(cls, where: str) -> KittiOdometry:
+        """Return the images without looking for poses: every pose is NaN."""
+        return cls(where, posed=False)
 
     @classmethod
     def recognises(cls, where: str) -> bool:
@@ -85,6 +90,13 @@ class KittiOdometry(KittiSource):
     def velodyne(self, i: int) -> Path:
         """Return the scan's file of frame `i`."""
         return self.folder / "velodyne" / f"{i:06d}.bin"
+
+    def _poses(self, choice: str, axes: str, inverted: bool) -> FramePoses:
+        folder = self.folder.resolve()
+        path = file_of(choice, self.folder) if choice else folder.parents[1] / "poses" / f"{folder.name}.txt"
+        if not choice and not os.path.isfile(path):
+            raise NoPoses(f"{path}: no such file; put it there or choose other poses (?poses=)")
+        return read_named_poses(path, self._stamps, axes, inverted)
 
     def _times(self, fps: float) -> list[int]:
         """Return the times of all frames in nanoseconds; from numbers where there is no list or `fps` is given."""

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from stereovox.errors import SourceError
+from stereovox.errors import NoPoses, SourceError
 from stereovox.sources.base import Part
 from stereovox.sources.kitti.base import (
     PAIRS,
@@ -19,7 +19,7 @@ from stereovox.sources.kitti.base import (
     time_lines,
 )
 from stereovox.sources.kitti.calibration import CAM_TO_CAM, KittiCalibration, read_raw_calibration
-from stereovox.sources.kitti.poses import FramePoses, read_named_poses, read_oxts_files
+from stereovox.sources.kitti.poses import FramePoses, UnknownPoses, read_named_poses, read_oxts_files
 from stereovox.sources.parameters import file_of
 from stereovox.sources.rgbd.folder import folder_part
 from stereovox.sources.rig_options import POSES, folder_and_options
@@ -38,6 +38,7 @@ class KittiRaw(KittiSource):
             packets), or a file of T_world_cam0 of any form (see `rgbd.pose_files`); without it the first of these there
             is. axes: of the camera they are of, `optical` (without it), `opengl` or `ros`. invert: 1 for world to
             camera.
+    posed: without it poses are not looked for, and are NaN.
     Time: image_0X/timestamps.txt of the left camera, exact to the nanosecond. Every line of it is a frame.
     World and faults: see `KittiSource`. Raises SourceError for what is missing as a whole.
     """
@@ -50,7 +51,7 @@ class KittiRaw(KittiSource):
         Part(("image_0?/timestamps.txt",), "image_00/timestamps.txt"),
     )
 
-    def __init__(self, where: str | os.PathLike[str]):
+    def __init__(self, where: str | os.PathLike[str], posed: bool = True):
         self.folder, options = folder_and_options(where, {"camera": "", **POSES})
         self.name = self.folder.resolve().name
         self.calibration = _calibration(self.folder)
@@ -58,7 +59,13 @@ class KittiRaw(KittiSource):
         self._stamps = _stamps(self._eye(0) / "timestamps.txt")
         self._check_numbers()
         self.camera = self.calibration.camera(*self.eyes, self._size())
-        self.poses = self._poses(options["poses"], options["axes"], options["invert"])
+        choice = (options["poses"], options["axes"], options["invert"])
+        self.poses = self._poses(*choice) if posed else UnknownPoses()
+
+    @classmethod
+    def depth_only(cls, where: str) -> KittiRaw:
+        """Return the images without looking for poses: every pose is NaN."""
+        return cls(where, posed=False)
 
     @classmethod
     def recognises(cls, where: str) -> bool:
@@ -99,13 +106,13 @@ class KittiRaw(KittiSource):
         return read_named_poses(path, self._stamps, axes, inverted)
 
     def _oxts(self) -> FramePoses:
+        data = self.folder / OXTS / "data"
+        if not os.path.isdir(data):
+            raise NoPoses(f"{data}: no such folder, and no {REFINED}; put one of them there or name ?poses=FILE")
         c = self.calibration
         if c.T_cam0_velo is None or c.T_velo_imu is None:
             missing = "calib_velo_to_cam.txt" if c.T_cam0_velo is None else "calib_imu_to_velo.txt"
             raise SourceError(f"{Path(c.where).parent / missing}: no such file, poses from oxts need it; put it there")
-        data = self.folder / OXTS / "data"
-        if not os.path.isdir(data):
-            raise SourceError(f"{data}: no such folder, and no {REFINED}; put one of them there or name ?poses=FILE")
         return read_oxts_files([data / f"{i:010d}.txt" for i in range(len(self))], c.T_cam0_velo @ c.T_velo_imu)
 
 

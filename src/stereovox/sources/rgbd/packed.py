@@ -13,7 +13,7 @@ from typing import BinaryIO, NamedTuple
 import numpy as np
 
 from stereovox.cameras.pinhole import MAX_PIXELS
-from stereovox.errors import FrameRefused, SourceError
+from stereovox.errors import FrameRefused, NoPoses, SourceError
 from stereovox.se3 import Transform
 from stereovox.sources.camera_file import FoundCamera, find_camera, pinhole
 from stereovox.sources.intrinsics import Intrinsics, metres_per_unit
@@ -117,12 +117,12 @@ class PackedDepth(DepthFolder):
     def poses_beside(self, missing: str) -> Poses | ImagePoses:
         """Return the poses of the `.freiburg` of the same name beside the file, or of the only one there.
 
-        Raises SourceError, which says what is `missing`, where there is none.
+        Raises NoPoses, which says what is `missing`, where there is none.
         """
         beside = sorted(self.file.parent.glob(ICL_POSES))
         same = [path for path in beside if path.name.startswith(self.file.stem)] or beside
         if len(same) != 1:
-            raise SourceError(f"{self.file}: {missing}")
+            raise NoPoses(f"{self.file}: {missing}")
         return self.fitted(read_poses(same[0]))
 
 

@@ -7,7 +7,7 @@ import os
 import re
 from pathlib import Path
 
-from stereovox.errors import SourceError
+from stereovox.errors import NoPoses, SourceError
 from stereovox.sources.base import Part
 from stereovox.sources.camera_file import FoundCamera, find_camera
 from stereovox.sources.intrinsics import NAMES
@@ -72,7 +72,7 @@ class DepthAndPoses(DepthFolder):
             except SourceError as refused:
                 error = error or refused
         if not found:
-            raise error or SourceError(f"{self.folder}: has depth images but no poses; {POSES.cure}")
+            raise error or NoPoses(f"{self.folder}: has depth images but no poses; {POSES.cure}")
         if len(self.pose_places()) > 1:
             self.notes += (f"poses are those of {found[0].where}; else add ?poses=FILE",)
         return found[0]

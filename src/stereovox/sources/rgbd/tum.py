@@ -8,7 +8,7 @@ import os
 import re
 from pathlib import Path
 
-from stereovox.errors import SourceError
+from stereovox.errors import NoPoses, SourceError
 from stereovox.sources.base import Part
 from stereovox.sources.camera_file import FoundCamera, find_camera
 from stereovox.sources.images import file_names
@@ -103,7 +103,7 @@ class TumRgbd(StampedImages):
             return Trajectory(self.folder / POSES)
         path = _other_poses(self.folder)
         if path is None:
-            raise SourceError(f"{self.folder}: has no {POSES}; {self.parts[-1].cure}")
+            raise NoPoses(f"{self.folder}: has no {POSES}; {self.parts[-1].cure}")
         self.notes += (f"{self.folder} has no {POSES}: poses are those of {path.name}; else add ?poses=FILE",)
         return self.fitted(Trajectory(path))
 

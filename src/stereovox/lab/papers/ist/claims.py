@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 from stereovox.evaluate.grid_lattice import three_states
@@ -35,6 +36,7 @@ def numbers_of(found: Survey) -> dict[str, Any]:
         "first_scans": len(found.recording.first.scans),
         "megabytes": found.recording.megabytes,
         "closures": slam.closures,
+        "doubts": [{**doubt.as_dict(), "text": doubt.line()} for doubt in slam.doubts],
         "slam_s": found.reference.seconds,
         "amcl_s": found.localised_s,
         "excluded": [list(one) for one in found.excluded],
@@ -90,15 +92,8 @@ def claims_of(found: Survey, place: Place | None) -> list[Claim]:
         )
     ]
     if place is None:
-        return [*claims, *(_beside(one) for one in (middle, ours))]
-    claims += [
-        _target(middle),
-        _beside(ours),
-        *_band(ours, theirs),
-        _walls(middle),
-        _found(middle),
-        *_format_errors(found),
-    ]
+        return [_doubts(found, None), *claims, *(_beside(one) for one in (middle, ours))]
+    claims += [_target(middle), _beside(ours), _walls(middle), _found(middle)]
     odometry = found.judged.get(DRAWN_ODOMETRY)
     if odometry is not None:
         less = theirs.scores.eq7_percent < odometry.scores.eq7_percent
@@ -112,7 +107,19 @@ def claims_of(found: Survey, place: Place | None) -> list[Claim]:
         )
     if found.excluded:
         claims.append(_door(theirs))
-    return claims
+    doubts = found.reference.slam.doubts
+    of_reference = [_doubted(claim) for claim in claims] if doubts else claims
+    return [_doubts(found, not doubts), *of_reference, *_band(ours, theirs), *_format_errors(found)]
+
+
+def _doubts(found: Survey, holds: bool | None) -> Claim:
+    ours = "; ".join(doubt.line() for doubt in found.reference.slam.doubts)
+    return Claim("SLAM's self-check of the reference map", "no doubts", ours or "none", holds)
+
+
+def _doubted(claim: Claim) -> Claim:
+    """Return a claim on maps beside the reference, which is doubted: so it does not hold, whatever its figure."""
+    return claim if claim.holds is None else replace(claim, holds=False, ours=f"{claim.ours}; the reference is doubted")
 
 
 def _door(one: Judged) -> Claim:

@@ -16,21 +16,23 @@ from numpy.typing import NDArray
 from stereovox import se2
 from stereovox.localize.slam.line_map import Cloud
 
-WINDOW, SCANS = 1.0, 20
-"""Metres of odometry, and scans, over which the two motions are compared."""
-LEAST, LEAST_TURN = 0.25, 0.2
-"""Metres and radians by which they may always differ."""
-MOST, MOST_TURN = 0.4, 0.35
-"""Metres and radians beyond which they contradict each other on any drive."""
-FAR, RATE = 6.0, 0.01
-"""Times the usual difference from which on one of the two is wrong; how fast what is usual is learned, per scan."""
-SLIPPED, STUCK, WHILE = 2.0, 0.25, 10
-"""Factors on the odometry's errors for some scans: after wheels slipped, and after matching did not follow."""
-MARGIN, MARGIN_SLIPPING = 0.25, 0.05
+COMPARED_PATH, COMPARED_SCANS = 1.0, 20
+"""Metres of odometry, and at most so many scans, over which the two motions are compared."""
+MIN_LIMIT, MIN_LIMIT_TURN = 0.25, 0.2
+"""Metres and radians: the limits of what they may differ by are never less."""
+MAX_LIMIT, MAX_LIMIT_TURN = 0.4, 0.35
+"""Metres and radians: the limits are never more, however bad the odometry is."""
+LIMIT_FACTOR, LEARNING_RATE = 6.0, 0.01
+"""The limits as multiples of the usual difference; the share of a scan's difference that goes into what is usual."""
+SLIPPED_SCALE, STUCK_SCALE, SCALED_SCANS = 2.0, 0.25, 10
+"""Factors on the odometry's errors after wheels slipped, and after matching stuck; number of scans that they hold."""
+SHARE_MARGIN, SHARE_MARGIN_SLIPPING = 0.25, 0.05
 """Share of a scan's points by which the matched place must fit better than the odometry's, to be believed: usually, and
 while wheels slip."""
-THICK = 0.3
-"""Metres by which a beam must pass through a wall to contradict it."""
+STILL = 1e-3
+"""Metres and radians of a step below which the robot stands."""
+MIN_BEHIND = 0.3
+"""Metres behind a wall that a beam must end to contradict it."""
 
 
 @dataclass(frozen=True)
@@ -39,18 +41,18 @@ class Moment:
 
     odometry: se2.Pose
     matched: se2.Pose
-    way: float
+    travelled: float
 
 
-class Trust:
+class OdometryCheck:
     """Compares odometry with matching.
 
     scale: factor on what the odometry may be off by, 1 where both agreed.
     """
 
     def __init__(self) -> None:
-        self._past: deque[Moment] = deque(maxlen=SCANS)
-        self._usual = np.array([LEAST, LEAST_TURN]) / FAR
+        self._past: deque[Moment] = deque(maxlen=COMPARED_SCANS)
+        self._usual = np.array([MIN_LIMIT, MIN_LIMIT_TURN]) / LIMIT_FACTOR
         self._scale, self._left = 1.0, 0
 
     @property
@@ -61,7 +63,7 @@ class Trust:
     @property
     def margin(self) -> float:
         """The share by which the matched place must fit better."""
-        return MARGIN_SLIPPING if self.scale > 1 else MARGIN
+        return SHARE_MARGIN_SLIPPING if self.scale > 1 else SHARE_MARGIN
 
     def add(self, odometry: se2.Pose, before: se2.Pose, after: se2.Pose) -> Moment | None:
         """Take the odometry (3,) at a scan whose match moved the robot from `before` to `after`, (3,) each.
@@ -73,22 +75,34 @@ class Trust:
             self._past.append(Moment(odometry, after, 0.0))
             return None
         last = self._past[-1]
-        way = last.way + float(np.hypot(*(odometry - last.odometry)[:2]))
+        travelled = last.travelled + float(np.hypot(*(odometry - last.odometry)[:2]))
         matched = se2.compose(last.matched, se2.relative(before, after))
-        self._past.append(Moment(odometry, matched, way))
+        self._past.append(Moment(odometry, matched, travelled))
         past = list(self._past)[:-1]
-        since = next((moment for moment in past if moment.way > way - WINDOW), past[-1])
+        since = next((moment for moment in past if moment.travelled > travelled - COMPARED_PATH), past[-1])
         apart = np.array(self._difference(since))
-        limits = np.clip(FAR * self._usual, (LEAST, LEAST_TURN), (MOST, MOST_TURN))
-        self._usual += RATE * (np.minimum(apart, 3 * self._usual) - self._usual)
+        limits = np.clip(LIMIT_FACTOR * self._usual, (MIN_LIMIT, MIN_LIMIT_TURN), (MAX_LIMIT, MAX_LIMIT_TURN))
+        self._usual += LEARNING_RATE * (np.minimum(apart, 3 * self._usual) - self._usual)
         return since if (apart > limits).any() else None
+
+    def drift(self, step: se2.Pose) -> tuple[float, float]:
+        """Return the metres and radians by which odometry and matching usually come apart over a step (3,)."""
+        metres, radians = float(np.hypot(step[0], step[1])), abs(float(step[2]))
+        moved = metres + radians > STILL
+        share = max(metres / COMPARED_PATH, moved / COMPARED_SCANS)
+        return share * float(self._usual[0]), share * float(self._usual[1])
+
+    def restart(self, odometry: se2.Pose, pose: se2.Pose) -> None:
+        """Compare from here on, after a scan that was not matched: odometry (3,) and the pose (3,) it led to."""
+        self._past.clear()
+        self._past.append(Moment(odometry, pose, 0.0))
 
     def settle(self, scale: float) -> None:
         """Compare anew from the last scan on; the odometry's errors are `scale` times as large for a while."""
         last = self._past[-1]
         self._past.clear()
         self._past.append(last)
-        self._scale, self._left = scale, WHILE
+        self._scale, self._left = scale, SCALED_SCANS
 
     def by_odometry(self, since: Moment, pose: se2.Pose) -> se2.Pose:
         """Return where the robot, matched to `pose` (3,), stands by the odometry since a moment."""
@@ -106,7 +120,7 @@ def through(seen: Cloud, points: NDArray[np.floating], bins: int = 720) -> tuple
     """Count how many of other points a scan sees through, and how many it could.
 
     seen: the scan, in the robot's frame; points: (N, 2) there. A point counts where the scan has a beam within a
-    degree; it is seen through where that beam ends `THICK` metres or more behind it, on both sides too.
+    degree; it is seen through where that beam ends `MIN_BEHIND` metres or more behind it, on both sides too.
     """
 
     def polar(p: NDArray[np.floating]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
@@ -120,4 +134,4 @@ def through(seen: Cloud, points: NDArray[np.floating], bins: int = 720) -> tuple
     there, distance = polar(points)
     reach = around[there]
     known = np.isfinite(reach)
-    return int(np.sum(known & (distance < reach - THICK))), int(np.sum(known & (distance < reach + THICK)))
+    return int(np.sum(known & (distance < reach - MIN_BEHIND))), int(np.sum(known & (distance < reach + MIN_BEHIND)))

@@ -1,0 +1,158 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tracking on recordings that bring poses: error, share of frames that are lost, processor time; beside peers.
+
+    python benchmarks/track.py RECORDING [RECORDING ...] [--frames A:B:S] [--peers] [--json] [setting=value ...]
+
+Peers, where they are installed (`pip install small_gicp kiss-icp`) and the recording has depth images: small_gicp's
+GICP of points on a Gaussian voxel map (points and voxels of 0.05 m, even motion as its start), and KISS-ICP as it is.
+Errors are in metres, after rigid alignment (ATE) and without (off: the first poses laid on each other, at most).
+"""
+
+import argparse
+import importlib.util
+import json
+import time
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.config import load_config, parse_value
+from stereovox.frame import AnyFrame, Frame
+from stereovox.opening import open_source
+from stereovox.se3 import inverse, orthonormalise, rotation_vector
+from stereovox.track.tracker import Tracker
+
+Track = Callable[[AnyFrame], NDArray[np.float64] | None]
+"""Takes a frame; returns its pose (4, 4) in a world of its own, None where it is lost."""
+
+
+def stereovox(settings: dict[str, Any]) -> Track:
+    """Return our tracker."""
+    tracker = Tracker(load_config(**settings))
+
+    def track(frame: AnyFrame) -> NDArray[np.float64] | None:
+        tracked = tracker.add(frame)
+        return None if tracked.lost else tracked.T_world_sensor
+
+    return track
+
+
+def small_gicp() -> Track:
+    """Return small_gicp's GICP on a Gaussian voxel map."""
+    import small_gicp as library
+
+    state: dict[str, Any] = {"map": library.GaussianVoxelMap(0.05), "T": np.eye(4), "motion": np.eye(4)}
+
+    def track(frame: AnyFrame) -> NDArray[np.float64]:
+        cloud, tree = library.preprocess_points(points_of(frame), 0.05, 10, 1)
+        del tree
+        if state["map"].size():
+            found = library.align(state["map"], cloud, state["T"] @ state["motion"], 0.2, 1, 20)
+            state["motion"] = inverse(state["T"]) @ found.T_target_source
+            state["T"] = orthonormalise(found.T_target_source)
+        state["map"].insert(cloud, state["T"])
+        return state["T"]
+
+    return track
+
+
+def kiss_icp() -> Track:
+    """Return KISS-ICP, as for a lidar of 5 m."""
+    from kiss_icp.config import KISSConfig
+    from kiss_icp.kiss_icp import KissICP
+
+    config = KISSConfig()
+    config.data.max_range, config.data.min_range, config.data.deskew = 5.0, 0.3, False
+    config.mapping.voxel_size = 0.05
+    odometry = KissICP(config)
+
+    def track(frame: AnyFrame) -> NDArray[np.float64]:
+        points = points_of(frame)
+        odometry.register_frame(points, np.zeros(len(points)))
+        return np.asarray(odometry.last_pose)
+
+    return track
+
+
+PEERS: dict[str, Callable[[], Track]] = {"small_gicp": small_gicp, "kiss_icp": kiss_icp}
+
+
+def points_of(frame: AnyFrame) -> NDArray[np.float64]:
+    """Return every fourth pixel of a depth image in both directions that has a value up to 5 m, (N, 3)."""
+    assert isinstance(frame, Frame)
+    depth = np.where((frame.depth == 0) | (frame.depth == 65535), np.nan, frame.depth * frame.depth_scale)
+    points = frame.camera.back_project(depth)[2::4, 2::4].reshape(-1, 3)
+    return points[(points[:, 2] > 0.3) & (points[:, 2] < 5)]
+
+
+def run(frames: Iterable[AnyFrame], make: Callable[[], Track]) -> dict[str, float]:
+    """Return the figures of one tracker on the frames of a recording."""
+    track, poses, truth, times, lost = make(), [], [], [], 0
+    for number, frame in enumerate(frames):
+        if frame.fault:
+            continue
+        start = time.process_time()
+        pose = track(frame)
+        times.append(1e3 * (time.process_time() - start))
+        if pose is None:
+            lost += number > 0  # the first one counts from the second on
+        else:
+            poses.append(pose)
+            truth.append(frame.T_world_sensor)
+    if len(poses) < 3:
+        return {"frames": len(times), "lost": lost}
+    found, true = np.array(poses), np.array(truth)
+    laid = true[0] @ inverse(found[0]) @ found
+    steps = np.linalg.norm(np.diff(true[:, :3, 3], axis=0), axis=1)
+    turned = [np.linalg.norm(rotation_vector(a[:3, :3].T @ b[:3, :3])) for a, b in zip(laid, true, strict=True)]
+    return {
+        "frames": len(times),
+        "lost": lost,
+        "way_m": float(steps.sum()),
+        "ate_m": aligned_error(found[:, :3, 3], true[:, :3, 3]),
+        "off_m": float(np.linalg.norm(laid[:, :3, 3] - true[:, :3, 3], axis=1).max()),
+        "off_deg": float(np.degrees(max(turned))),
+        "cpu_ms": float(np.median(times)),
+        "cpu_ms_99": float(np.percentile(times, 99)),
+    }
+
+
+def aligned_error(found: NDArray[np.float64], true: NDArray[np.float64]) -> float:
+    """Return the root mean square distance of positions (N, 3) after rigid alignment (Umeyama 1991)."""
+    a, b = found - found.mean(axis=0), true - true.mean(axis=0)
+    U, _, V = np.linalg.svd(a.T @ b)
+    R = V.T @ np.diag([1, 1, np.sign(np.linalg.det(V.T @ U.T))]) @ U.T
+    return float(np.sqrt(((a @ R.T - b) ** 2).sum(axis=1).mean()))
+
+
+def main() -> None:
+    """Run and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("words", nargs="+", metavar="RECORDING or setting=value")
+    parser.add_argument("--frames")
+    parser.add_argument("--peers", action="store_true")
+    parser.add_argument("--json", action="store_true")
+    arguments = parser.parse_args()
+    given = [w for w in arguments.words if "=" in w and not w.startswith("sim:") and "?" not in w]
+    settings = {word.partition("=")[0]: parse_value(word.partition("=")[2]) for word in given}
+    trackers: dict[str, Callable[[], Track]] = {"stereovox": lambda: stereovox(settings)}
+    if arguments.peers:
+        trackers |= {name: make for name, make in PEERS.items() if importlib.util.find_spec(name)}
+    rows = []
+    for where in arguments.words:
+        if where in given:
+            continue
+        frames = list(open_source(where, arguments.frames))
+        for name, make in trackers.items():
+            run(frames[:5], make)  # compiles
+            rows.append({"recording": where, "tracker": name, **run(frames, make)})
+            if not arguments.json:
+                print("  ".join(f"{k} {v:.4g}" if isinstance(v, float) else f"{v}" for k, v in rows[-1].items()))
+    if arguments.json:
+        print(json.dumps(rows))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which poses a run uses: those that a recording has, or tracked ones."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from stereovox import opening
+from stereovox.errors import NoPoses, StereovoxError, did_you_mean
+from stereovox.sources.base import Stream
+from stereovox.track.stream import POSE_FAULTS
+
+GIVEN, TRACK, BOTH = "given", "track", "both"
+CHOICES = (GIVEN, TRACK, BOTH)
+HOW = {TRACK: "tracked", BOTH: "corrected"}
+"""How poses come about that a recording does not have, behind its name."""
+LOOKED_AT = 10
+"""Frames, spread over a recording, of which one must have a pose, or it has none."""
+
+
+class Choice(NamedTuple):
+    """A source, and which poses are to be used: one of `CHOICES`; `why` it is `track`, where nobody chose that."""
+
+    source: Stream
+    poses: str
+    why: str = ""
+
+
+def choose_poses(source: str | Path | Stream, frames: str | None, poses: str | None) -> Choice:
+    """Open a source for the poses that were chosen.
+
+    Args:
+        source: As for `open_stream`, or a stream that is open.
+        frames: Python slice that selects frames of what is opened here.
+        poses: `given`: those of the recording. `track`: from the images; those of the recording are not read. `both`:
+            those of the recording, corrected by the images. None: given where there are any, else tracked.
+
+    Raises:
+        StereovoxError: As `open_stream`; an unknown choice; `given` or `both` where there are none.
+    """
+    if poses not in (None, *CHOICES):
+        raise StereovoxError(
+            f"poses '{poses}' is unknown{did_you_mean(str(poses), CHOICES)}; give given, track or both"
+        )
+    if not isinstance(source, str | Path):
+        return _choice(source, poses)
+    if poses == TRACK:
+        return Choice(opening.open_images(source, frames), TRACK)
+    try:
+        chosen = _choice(opening.open_stream(source, frames), poses)
+    except NoPoses as error:
+        if poses is not None:
+            raise
+        return Choice(opening.open_images(source, frames), TRACK, str(error))
+    if chosen.poses != TRACK or chosen.source.length is None:  # a live camera is opened once
+        return chosen
+    return chosen._replace(source=opening.open_images(source, frames))
+
+
+def _choice(source: Stream, poses: str | None) -> Choice:
+    """Return which poses of an open source are used; raises NoPoses for `both` where it has none."""
+    if poses in (GIVEN, TRACK):
+        return Choice(source, poses)
+    missing = _missing(source)
+    if missing and poses == BOTH:
+        raise NoPoses(f"{missing}; without poses give track")
+    return Choice(source, TRACK, missing) if missing else Choice(source, poses or GIVEN)
+
+
+def _missing(source: Stream) -> str:
+    """Return why a source has no poses, empty where it has some."""
+    read = getattr(source, "frame", None)
+    if read is None or not source.length:
+        return (
+            ""
+            if getattr(source, "posed", True)
+            else f"{source.name}: no poses; add ?pose=fixed if the camera stands still"
+        )
+    why = ""
+    for i in np.unique(np.linspace(0, source.length - 1, min(LOOKED_AT, source.length)).astype(int)).tolist():
+        frame = read(i)
+        if frame.fault is None and np.isfinite(frame.T_world_sensor).all():
+            return ""
+        if frame.fault is not None and frame.fault not in POSE_FAULTS:
+            continue
+        why = why or frame.fault_detail or f"{source.name}: has no poses"
+    return why

@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Poses that frames bring, corrected by what the images show."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from stereovox.config import Config
+from stereovox.frame import AnyFrame
+from stereovox.se3 import Transform, inverse, orthonormalise, rigidity_error
+from stereovox.track.tracker import Tracked, Tracker
+
+RIGID = 0.01
+"""Largest rigidity error of a pose that is used here."""
+NO_START = "no frame so far has a pose of its own, at which the map could begin"
+FIRST = "the first image"
+"""Begins what `Tracker` says of an image that its map was begun with."""
+
+
+class GuidedTracker:
+    """A tracker that goes from frame to frame as their own poses do, and corrects these by what is in view.
+
+    Its world is that of the frames' own poses, which it leaves as they drift. A frame without a pose of its own is
+    tracked by its image alone.
+
+    Args:
+        config: Settings by which depth is prepared, as for the map.
+    """
+
+    def __init__(self, config: Config):
+        self._config, self._tracker = config, Tracker(config)
+        self._T_world_tracker: Transform | None = None
+        self._own: Transform | None = None  # pose of its own of the frame that the tracker stands at
+        self._at = np.full((4, 4), np.nan)
+
+    def add(self, frame: AnyFrame) -> Tracked:
+        """Return the pose of a frame, as `Tracker.add`.
+
+        Args:
+            frame: Depth image or stereo pair, with a pose of its own or one that is not rigid, for none.
+        """
+        own = _own_pose(frame)
+        if own is None and self._T_world_tracker is None:
+            return Tracked(self._at, np.full((6, 6), np.inf), NO_START)
+        known = own is not None and self._own is not None
+        tracked = self._tracker.add(frame, inverse(self._own) @ own if known else None)  # pyright: ignore
+        if not np.array_equal(tracked.T_world_sensor, self._at):  # else its image could not be used
+            self._at, self._own = tracked.T_world_sensor, own
+        if tracked.lost.startswith(FIRST):
+            self._begin(own)
+        if self._T_world_tracker is None:
+            return replace(tracked, lost=NO_START)
+        return _moved(tracked, self._T_world_tracker)
+
+    def _begin(self, own: Transform | None) -> None:
+        """Take the pose of the image that the tracker's map was begun with for where its world lies."""
+        self._own = own
+        self._T_world_tracker = None if own is None else own @ inverse(self._at)
+        if own is None:
+            self._tracker, self._at = Tracker(self._config), np.full((4, 4), np.nan)
+
+
+def _own_pose(frame: AnyFrame) -> Transform | None:
+    T = frame.T_world_sensor
+    return orthonormalise(np.asarray(T, float)) if T is not None and rigidity_error(T) < RIGID else None
+
+
+def _moved(tracked: Tracked, T_world_tracker: Transform) -> Tracked:
+    """Return a pose, and its covariance, in another world."""
+    R = np.kron(np.eye(2), T_world_tracker[:3, :3])
+    covariance = R @ tracked.covariance @ R.T if not tracked.lost else tracked.covariance
+    return replace(tracked, T_world_sensor=T_world_tracker @ tracked.T_world_sensor, covariance=covariance)

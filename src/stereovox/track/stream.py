@@ -1,0 +1,136 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Recordings and cameras whose poses are tracked: the frames of a source with the poses of a `Tracker`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Generator, Iterable, Iterator
+from contextlib import closing
+from dataclasses import replace
+from itertools import islice
+from typing import Protocol
+
+import numpy as np
+
+from stereovox.errors import SourceError
+from stereovox.frame import AnyFrame, name_of
+from stereovox.sources.base import Stream
+from stereovox.track.guided import FIRST
+from stereovox.track.tracker import Tracked
+
+LOST = "tracking_lost"
+"""Reason of refusal of frames whose pose is not known."""
+CURE = "move slower, or back to what was seen before"
+POSE_FAULTS = frozenset({"no_pose", "bad_pose_file", "low_confidence", "pose_jump"})
+"""Faults of a frame's own pose, which is not used here."""
+
+
+class AnyTracker(Protocol):
+    """What finds the pose of one frame after the other: `Tracker`, `GuidedTracker`."""
+
+    def add(self, frame: AnyFrame, /) -> Tracked:
+        """Return the pose of a frame."""
+        ...
+
+
+class TrackedStream(Stream):
+    """The frames of a recording or camera with tracked poses; where the camera is lost they have a fault.
+
+    The first image is held back until the next one fits it, and then has the
+    start pose. Lost frames have the fault `tracking_lost` and pose NaN. Tracking is deterministic: each iteration
+    begins anew and finds the same poses.
+
+    Args:
+        source: The frames.
+        make: Returns a new tracker.
+        how: How poses are found, for the name.
+        skip: Frames at the start that are tracked, and not delivered.
+
+    Attributes:
+        name: That of the source, with `, tracked` behind it: its map is not in the world of its own poses.
+    """
+
+    def __init__(self, source: Stream, make: Callable[[], AnyTracker], how: str = "tracked", skip: int = 0):
+        self.name, self.camera, self.notes = f"{source.name}, {how}", source.camera, tuple(source.notes)
+        self._source, self._make, self._how, self._skip = source, make, how, skip
+
+    @property
+    def length(self) -> int | None:
+        """Number of frames; None for a live camera."""
+        return None if self._source.length is None else self._source.length - self._skip
+
+    @property
+    def dropped(self) -> int:
+        """Frames that a live camera delivered and that were not consumed in time."""
+        return self._source.dropped
+
+    def after(self, count: int) -> Stream:
+        """Return the frames from number `count` on; those before are tracked again, to know where the camera is.
+
+        Raises:
+            SourceError: There are none, or this is a live camera, whose past images are gone.
+        """
+        if self.length is None:
+            raise SourceError(f"{self.name}: a live camera does not know where it is in an older map; begin a new one")
+        if count >= self.length:
+            raise SourceError(f"{self.name}: has no more than {self.length} frames; skip fewer than {count}")
+        return TrackedStream(self._source, self._make, self._how, self._skip + count)
+
+    def __iter__(self) -> Iterator[AnyFrame]:
+        with closing(follow(self._source, self._make())) as found:
+            yield from (frame for frame, _ in islice(found, self._skip, None))
+
+
+def follow(frames: Iterable[AnyFrame], tracker: AnyTracker) -> Generator[tuple[AnyFrame, Tracked]]:
+    """Yield each frame with its tracked pose, or with a fault, and what the tracker said of it.
+
+    The image that the tracker begins with comes once the next one is tracked too, or cannot be.
+
+    Args:
+        frames: The frames, in the order they were taken; those with a fault of the image itself are handed on as they
+            are, and are lost.
+        tracker: Finds the poses.
+    """
+    images = iter(frames)
+    waiting: tuple[AnyFrame, Tracked] | None = None
+    try:
+        for frame in images:
+            tracked = _track(frame, tracker)
+            if waiting is not None:
+                yield _begun(*waiting, fits=not tracked.lost)
+            waiting = (frame, tracked) if tracked.lost.startswith(FIRST) else None
+            if waiting is None:
+                yield posed(frame, tracked), tracked
+        if waiting is not None:
+            yield _begun(*waiting, fits=False)
+    finally:
+        close = getattr(images, "close", None)
+        if close:  # a generator: a live camera is to stop now
+            close()
+
+
+def posed(frame: AnyFrame, tracked: Tracked) -> AnyFrame:
+    """Return a frame with the pose that was tracked, or with the fault `tracking_lost`; as it is where it has one."""
+    if _is_faulty(frame):
+        return frame
+    if not tracked.lost:
+        return replace(frame, T_world_sensor=tracked.T_world_sensor, pose_off_ns=0, fault=None, fault_detail="")
+    name = name_of(frame)
+    detail = f"{tracked.lost if name in tracked.lost else f'{name}: {tracked.lost}'}; {CURE}"
+    return replace(frame, T_world_sensor=np.full((4, 4), np.nan), pose_off_ns=0, fault=LOST, fault_detail=detail)
+
+
+def _track(frame: AnyFrame, tracker: AnyTracker) -> Tracked:
+    if _is_faulty(frame):
+        return Tracked(np.full((4, 4), np.nan), np.full((6, 6), np.inf), frame.fault_detail or str(frame.fault))
+    return tracker.add(replace(frame, fault=None, fault_detail=""))
+
+
+def _begun(frame: AnyFrame, tracked: Tracked, fits: bool) -> tuple[AnyFrame, Tracked]:
+    """Return the image that the map was begun with: it has the start pose where the next one fits it."""
+    found = replace(tracked, covariance=np.zeros((6, 6)), lost="") if fits else tracked
+    return posed(frame, found), found
+
+
+def _is_faulty(frame: AnyFrame) -> bool:
+    """Return whether the image itself cannot be used."""
+    return frame.fault is not None and frame.fault not in POSE_FAULTS

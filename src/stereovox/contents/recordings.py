@@ -131,6 +131,8 @@ def _survey_lines(found: Survey) -> list[str]:
         )
     lines += _pose_lines(found)
     for reason, count in found.faults.most_common():
+        if reason in POSE_FAULTS and not found.posed:  # said above
+            continue
         lines.append(f"{count} of {found.read} frames looked at cannot be used: {reason}")
     if found.posed:
         lines.append(

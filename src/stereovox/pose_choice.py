@@ -60,6 +60,11 @@ def choose_poses(source: str | Path | Stream, frames: str | None, poses: str | N
     return chosen._replace(source=opening.open_images(source, frames))
 
 
+def poses_of(recording: str) -> str:
+    """Return which poses a map was made with (one of `CHOICES`), by the name of its recording."""
+    return next((poses for poses, how in HOW.items() if recording.endswith(f", {how}")), GIVEN)
+
+
 def _choice(source: Stream, poses: str | None) -> Choice:
     """Return which poses of an open source are used; raises NoPoses for `both` where it has none."""
     if poses in (GIVEN, TRACK):

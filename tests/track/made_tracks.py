@@ -101,12 +101,10 @@ class Track:
         return [i for i, one in enumerate(self.found) if not one.lost]
 
     def errors(self) -> np.ndarray:
-        """Return (N, 2) how far off the poses are, in metres and degrees.
-
-        The tracker's start is the true pose of the first frame, and that of the image before the first tracked one.
-        """
-        off = self.truth[0] @ inverse(self.truth[self.tracked[0] - 1])
-        return np.array([_size(inverse(off @ self.truth[i]) @ self.found[i].T_world_sensor) for i in self.tracked])
+        """Return (N, 2) how far off the poses are from the image with which the map begins, in metres and degrees."""
+        begun = [i for i in self.lost if "first image" in self.found[i].lost][-1]
+        T = self.found[begun].T_world_sensor @ inverse(self.truth[begun])
+        return np.array([_size(inverse(T @ self.truth[i]) @ self.found[i].T_world_sensor) for i in self.tracked])
 
     def nees(self) -> np.ndarray:
         """Return squared errors of motions between successive poses by their covariance, over the 6 degrees of freedom.

@@ -124,6 +124,21 @@ def test_after_a_jump_to_a_place_never_seen_it_is_lost_and_stays_so(there):
     assert set(range(10, 24)) <= set(track(taken).lost)
 
 
+@pytest.mark.parametrize("there", [200, 300])
+def test_long_after_the_last_image_the_camera_may_be_anywhere(there):
+    """It is not taken for where it would be had it moved on evenly, though these rooms fit there."""
+    found = track(frames("apartment")[:10] + frames("apartment", there, there + 4))
+    assert set(range(10, 14)) <= set(found.lost)
+
+
+def test_long_after_the_last_image_it_is_found_where_it_stood():
+    taken = frames("apartment", last=18)
+    later = [replace(frame, stamp_ns=frame.stamp_ns + 10**10) for frame in taken[10:]]
+    found = track([*taken[:10], *later])
+    assert found.lost == [0, *range(10, 16)]
+    assert np.all(found.errors() < (METRES, DEGREES))
+
+
 @pytest.mark.parametrize(("here", "there"), [("room", "apartment"), ("apartment", "room")])
 def test_in_another_building_it_is_lost_and_stays_so(here, there):
     taken = at_even_times(frames(here)[:10] + frames(there)[:14])

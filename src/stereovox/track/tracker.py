@@ -153,7 +153,7 @@ class Tracker:
             return self._lose(str(refused))
         if self._learned < 2 and self._trial != 0:
             return self._begin(self._evidence, seen, frame.stamp_ns)
-        if self._trial is None and motion is None:
+        if motion is None and (self._trial is None or self._late(frame.stamp_ns)):
             return self._seek(self._evidence, seen, frame.stamp_ns)
         if motion is not None:
             return self._correct(self._evidence, seen, motion, frame.stamp_ns)
@@ -214,6 +214,11 @@ class Tracker:
             self._trial -= 1
             why = f"found again; {self._trial + 1} more images must agree"
         return why
+
+    def _late(self, stamp_ns: int) -> bool:
+        """Return whether an image comes so late that the camera may be anywhere."""
+        first, last = self._stamps[0], self._stamps[-1]
+        return last > first and stamp_ns - last > LONGEST * (last - first)
 
     def _expected(self, limits: Limits, stamp_ns: int) -> tuple[Transform, NDArray[np.float64]]:
         """Return where even motion takes the camera until a time, and the covariance (6, 6) of that."""

@@ -34,7 +34,7 @@ LAYERS = (
 LEVEL = {room: level for level, rooms in enumerate(LAYERS) for room in rooms}
 HOMES = {
     "builtin_interfaces": r"ros/.*",
-    "cv2": r"(calibrate|depth|simulate|sources)/.*",
+    "cv2": r"(calibrate|depth|simulate|sources|track)/.*",
     "diagnostic_msgs": r"ros/.*",
     "geometry_msgs": r"ros/.*",
     "gtsam": r"localize/.*",

@@ -3,7 +3,9 @@
 
 from dataclasses import replace
 
+import made_asl
 import made_kitti
+import made_rigs
 import numpy as np
 import pytest
 from made_recordings import seven_scenes
@@ -57,23 +59,27 @@ def test_a_layout_whose_files_of_poses_are_all_missing(tmp_path):
     assert [frame.depth.size > 0 for frame in chosen.source] == [True] * 4
 
 
-@pytest.mark.parametrize("make", [made_kitti.raw, made_kitti.odometry])
-def test_kitti_without_poses(tmp_path, make):
-    where = make(tmp_path / "kitti")
-    with_poses = [frame.left for frame in open_source(where)]
-    for file in sorted((tmp_path / "kitti").parent.rglob("*")):
-        if file.is_file() and ("oxts" in file.parts or "poses" in f"{file.parent.name} {file.name}"):
-            file.rename(file.with_name(f"{file.name}.away"))
-    for folder in (tmp_path / "kitti").parent.rglob("oxts"):
-        folder.rename(folder.with_name("away"))
+PAIRS = {"raw": made_kitti.raw, "odometry": made_kitti.odometry, "rig": made_rigs.recorded, "asl": made_asl.asl}
+WAYS = ("oxts", "poses", "groundtruth")
+"""What names of files and folders with poses begin with, or hold."""
+
+
+@pytest.mark.parametrize("name", PAIRS)
+def test_stereo_recordings_without_poses(tmp_path, name):
+    where = PAIRS[name](tmp_path / "drive")
+    with_poses = [frame.left for frame in open_source(where) if not frame.fault]
+    for path in sorted(tmp_path.rglob("*"), reverse=True):
+        if any(way in path.name for way in WAYS):
+            path.rename(path.with_name("away"))
     chosen = choose_poses(where, None, None)
-    assert (chosen.poses, "no such f" in chosen.why) == ("track", True)
-    for frame, left in zip(chosen.source, with_poses, strict=True):
-        assert frame.fault is None
-        assert np.isnan(frame.T_world_sensor).all()
-        np.testing.assert_array_equal(frame.left, left)
-    with pytest.raises(NoPoses):
-        choose_poses(where, None, "given")
+    assert (chosen.poses, bool(chosen.why)) == ("track", True)
+    found = [frame for frame in chosen.source if not frame.fault]
+    assert len(found) >= len(with_poses) > 0
+    assert all(np.isnan(frame.T_world_sensor).all() for frame in found)
+    assert np.array_equal(found[0].left, with_poses[0])
+    for poses in ("given", "both"):
+        with pytest.raises(NoPoses):
+            choose_poses(where, None, poses)
 
 
 class Camera:

@@ -60,6 +60,11 @@ def choose_poses(source: str | Path | Stream, frames: str | None, poses: str | N
     return chosen._replace(source=opening.open_images(source, frames))
 
 
+def poses_of(recording: str) -> str:
+    """Return which poses a map was made with (one of `CHOICES`), by the name of its recording."""
+    return next((poses for poses, how in HOW.items() if recording.endswith(f", {how}")), GIVEN)
+
+
 def _choice(source: Stream, poses: str | None) -> Choice:
     """Return which poses of an open source are used; raises NoPoses for `both` where it has none."""
     if poses in (GIVEN, TRACK):
@@ -79,12 +84,12 @@ def _missing(source: Stream) -> str:
             if getattr(source, "posed", True)
             else f"{source.name}: no poses; add ?pose=fixed if the camera stands still"
         )
-    why = ""
+    unposed = False
     for i in np.unique(np.linspace(0, source.length - 1, min(LOOKED_AT, source.length)).astype(int)).tolist():
         frame = read(i)
         if frame.fault is None and np.isfinite(frame.T_world_sensor).all():
             return ""
-        if frame.fault is not None and frame.fault not in POSE_FAULTS:
-            continue
-        why = why or frame.fault_detail or f"{source.name}: has no poses"
-    return why
+        unposed |= frame.fault is None or frame.fault in POSE_FAULTS
+    if not unposed:
+        return ""
+    return f"{source.name}: none of the frames looked at has a pose"

@@ -32,7 +32,7 @@ from stereovox.maps.grid_map import GridMap
 from stereovox.maps.lock import only_writer_in
 from stereovox.maps.store import check_target, is_map, read_manifest, remove_map, sweep
 from stereovox.opening import Stream
-from stereovox.pose_choice import BOTH, GIVEN, HOW, TRACK, choose_poses
+from stereovox.pose_choice import BOTH, GIVEN, HOW, TRACK, choose_poses, poses_of
 from stereovox.products.floor_axes import upright_axes
 from stereovox.products.moved import level_transform
 from stereovox.safe_io import check_in_space
@@ -288,7 +288,7 @@ class MapRun:
         """Return which poses to use: those that were asked for, else those that the map was begun with."""
         if self._poses is not None or saved is None or not saved.recording:
             return self._poses
-        return next((poses for poses, how in HOW.items() if saved.recording.endswith(f", {how}")), GIVEN)
+        return poses_of(saved.recording)
 
     def _check_tracked(self, source: Stream) -> None:
         """Raise StereovoxError for what cannot be had with tracked poses."""

@@ -92,3 +92,10 @@ def test_info_says_that_the_camera_is_tracked(here, capsys):
     status, _, err = run(capsys, "info", "desk")
     assert (status, "map tracks the camera by its own images" in err) == (0, True)
     assert "stereovox map desk --out desk.svox" in err
+
+
+def test_a_tracked_map_is_not_shown_with_other_poses(here, capsys):
+    unposed(here / "desk", 3, poses=True)
+    assert run(capsys, "map", "desk", "--poses", "track")[0] == 0
+    status, _, err = run(capsys, "view", "desk.svox", "--recording", "desk", "--port", "0")
+    assert (status, "the map was made of 'desk, tracked'" in err) == (2, True)

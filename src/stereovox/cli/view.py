@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from stereovox.cli.maps import open_map, refuse_options
 from stereovox.cli.terminal import say
+from stereovox.errors import StereovoxError
 
 if TYPE_CHECKING:
     from stereovox.config import Config
@@ -58,6 +59,8 @@ def run(arguments: Namespace) -> dict[str, Any]:
 
     silence_server_log()
     voxel_map = open_map(arguments.map)
+    if arguments.recording is not None:
+        _check_poses(voxel_map.recording)
     source = _recording(arguments, voxel_map.config)
     name, place = Path(arguments.map).stem, (arguments.host, arguments.port)
     token = arguments.token if arguments.token is not None else os.environ.get(TOKEN) or None
@@ -78,6 +81,14 @@ def run(arguments: Namespace) -> dict[str, Any]:
 def silence_server_log() -> None:
     """Keep the server from logging every browser that disconnects early."""
     logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
+
+
+def _check_poses(recording: str) -> None:
+    """Raise StereovoxError for a map whose poses are not those of its recording."""
+    from stereovox.pose_choice import GIVEN, poses_of
+
+    if poses_of(recording) != GIVEN:
+        raise StereovoxError(f"--recording: the map was made of '{recording}', with poses that it lacks; leave it out")
 
 
 def _recording(arguments: Namespace, config: Config) -> Source | None:

@@ -18,6 +18,7 @@ from stereovox.sources.bags.recording import file_part
 from stereovox.sources.rgbd.rtabmap_db import RtabmapDatabase
 from stereovox.sources.robots.robot import Robot
 from stereovox.survey import LEVEL_ENOUGH, Survey, Up, survey
+from stereovox.track.stream import POSE_FAULTS
 
 MAX_TOPICS = 40
 """Topics of a bag that are printed."""
@@ -131,6 +132,8 @@ def _survey_lines(found: Survey) -> list[str]:
         )
     lines += _pose_lines(found)
     for reason, count in found.faults.most_common():
+        if reason in POSE_FAULTS and not found.posed:  # said above
+            continue
         lines.append(f"{count} of {found.read} frames looked at cannot be used: {reason}")
     if found.posed:
         lines.append(

@@ -6,11 +6,13 @@ from __future__ import annotations
 import os
 import re
 from bisect import bisect_left
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from stereovox.errors import SourceError
+from stereovox.errors import NoPoses, SourceError
 from stereovox.safe_io import MAX_LIST, read_text
 from stereovox.se3 import Transform, inverse
 from stereovox.sources.base import Part
@@ -18,7 +20,7 @@ from stereovox.sources.calibration_files import read_calibration
 from stereovox.sources.calibration_values import StereoCalibration, read_yaml, rigid
 from stereovox.sources.images import file_names
 from stereovox.sources.parameters import file_of
-from stereovox.sources.poses import Poses, seconds_from_ns
+from stereovox.sources.poses import Poses, UnknownPoses, seconds_from_ns
 from stereovox.sources.rgbd.folder import folder_part
 from stereovox.sources.rig import RigSource, Shot
 from stereovox.sources.rig_file import Rig, RigPair, Virtual, usual_virtual
@@ -44,6 +46,7 @@ class AslRig(RigSource):
         poses: a file or folder of poses of any form (see `rgbd.pose_files`), of the body.
         axes: the poses are those of the left eye instead, in `optical`, `opengl` or `ros` axes. invert: 1 where they
         map the world into what is posed.
+    posed: without it poses are not looked for, and are NaN.
     Images: `cam0/data.csv` (lines `ns,file`), else all `cam0/data/*.png`; those that the list names but that are not
     there are left out, with a note. The right image is that of the same time, or less than 1 ms away.
     Calibration: `sensor.yaml` of both cameras, else a camchain.yaml of Kalibr there, above or in `dso/`.
@@ -59,7 +62,7 @@ class AslRig(RigSource):
         Part(tuple(f"{place}{name}/{DATA}" for place in (f"{ROOT}/", "") for name in TRUTHS), "poses"),
     )
 
-    def __init__(self, where: str | os.PathLike[str]):
+    def __init__(self, where: str | os.PathLike[str], posed: bool = True):
         self.folder, options = folder_and_options(where, {"rectify": "", **POSES})
         self.name = self.folder.resolve().name
         root = _root(str(self.folder))
@@ -73,18 +76,21 @@ class AslRig(RigSource):
         virtual = Virtual(options["rectify"]) if options["rectify"] else usual_virtual(found.eyes)
         pair = RigPair("stereo", camera=found.camera, eyes=found.eyes, T_body_left=found.T_body_left, virtual=virtual)
         left, right = (_Images(root / eye) for eye in (EYES[::-1] if found.swapped else EYES))
+        poses = self._read_poses(root, left, found.T_body_left, options) if posed else UnknownPoses()
+        try:
+            self._set(Rig((pair,)), root, _shots(left, right), poses, calibration)
+        except SourceError as error:
+            raise SourceError(f"{root / EYES[0]}: {error}") from None
+        self.notes = (*self.notes, *left.notes, *right.notes)
+
+    def _read_poses(self, root: Path, left: _Images, T_body_left: Transform, options: Mapping[str, Any]) -> Poses:
         if options["poses"]:
             poses = poses_of_images(file_of(options["poses"], self.folder), left.stamps)
         else:
             poses = _poses(root)
             _check_clocks(left, poses)
             self.up = "z" if any(os.path.isfile(root / name / DATA) for name in TRUTHS) else None
-        poses = as_body(poses, found.T_body_left, options["axes"], options["invert"])
-        try:
-            self._set(Rig((pair,)), root, _shots(left, right), poses, calibration)
-        except SourceError as error:
-            raise SourceError(f"{root / EYES[0]}: {error}") from None
-        self.notes = (*self.notes, *left.notes, *right.notes)
+        return as_body(poses, T_body_left, options["axes"], options["invert"])
 
     @classmethod
     def recognises(cls, where: str) -> bool:
@@ -155,7 +161,7 @@ def _poses(root: Path) -> Poses:
         if os.path.isfile(path):
             return Trajectory(path)
     said = "leica0 has positions but no directions" if os.path.isdir(root / "leica0") else "no poses of the vehicle"
-    raise SourceError(
+    raise NoPoses(
         f"{root}: {said}; put {TRUTHS[0]}/{DATA} or {TRUTHS[1]}/{DATA} there, "
         f"or {TEXTS[0]} with lines 'stamp tx ty tz qx qy qz qw' (seconds), or add ?poses=FILE"
     )

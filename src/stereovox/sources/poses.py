@@ -99,6 +99,14 @@ class Poses:
         raise FrameRefused("bad_pose_file", said)
 
 
+class UnknownPoses:
+    """The poses of a recording whose poses were not looked for: all NaN."""
+
+    def at(self, i: int) -> Transform:
+        """Return NaN (4, 4), whatever number or time `i` is."""
+        return np.full((4, 4), np.nan)
+
+
 def seconds_from_ns(stamp_ns: int) -> str:
     """Return nanoseconds as seconds with all nine decimals."""
     return f"{Decimal(int(stamp_ns)).scaleb(-9):.9f}"

@@ -5,22 +5,22 @@ from __future__ import annotations
 
 import os
 from abc import ABC
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.cameras.rigs import StereoPair
-from stereovox.errors import FrameRefused, SourceError
+from stereovox.errors import FrameRefused, NoPoses, SourceError
 from stereovox.frame import StereoFrame
 from stereovox.se3 import Transform
 from stereovox.sources.base import Part, Source
 from stereovox.sources.images import EYE_KINDS, file_names, png_size, read_picture_png
 from stereovox.sources.parameters import file_of
-from stereovox.sources.poses import Poses
+from stereovox.sources.poses import Poses, UnknownPoses
 from stereovox.sources.rgbd.folder import SECOND, folder_part
 from stereovox.sources.rgbd.pose_files import number_in
 from stereovox.sources.rig_file import FILE, Rig, RigPair, read_rig
@@ -53,12 +53,19 @@ class RigSource(Source, ABC):
     _calibration: str
     """The file that tells the images' sizes, for messages."""
 
-    def _set(self, rig: Rig, folder: Path, shots: Iterable[Shot], poses: Poses, calibration: str) -> None:
+    def _set(
+        self, rig: Rig, folder: Path, shots: Iterable[Shot], poses: Poses | UnknownPoses, calibration: str
+    ) -> None:
         """Set the pairs and their images, which are put in order of time."""
         self.pairs = rig.stereo_pairs(folder)
         self.camera = self.pairs[0].camera.middle
         self._shots = sorted(shots, key=lambda shot: (shot.stamp_ns, shot.pair))
         self._poses, self._calibration = poses, calibration
+
+    @classmethod
+    def depth_only(cls, where: str) -> Self:
+        """Return the images without looking for poses: every pose is NaN."""
+        return cls(where, posed=False)  # pyright: ignore[reportCallIssue] - each layout is made from its place
 
     def __len__(self) -> int:
         return len(self._shots)
@@ -96,6 +103,7 @@ class RigSource(Source, ABC):
 class StereoRig(RigSource):
     """A folder with `rig.toml` (see `Rig`), images of each pair, and a file of poses T_world_body in TUM format.
 
+    posed: without it poses are not looked for, and are NaN.
     where: the folder, or with options `flight?poses=trajectory.log&fps=20`:
         poses: a file or folder of poses of any form (see `rgbd.pose_files`) in place of the rig file's.
         axes: the poses are those of the first pair's left eye, in `optical`, `opengl` or `ros` axes, not the body's.
@@ -115,7 +123,7 @@ class StereoRig(RigSource):
         Part((FILE,), FILE, f"write it with: stereovox calibrate import CALIBRATION --out {FILE} (docs/rigs.md)"),
     )
 
-    def __init__(self, where: str | os.PathLike[str]):
+    def __init__(self, where: str | os.PathLike[str], posed: bool = True):
         self.folder, options = folder_and_options(where, {**POSES, "fps": 0.0})
         self.name = self.folder.resolve().name
         file = self.folder / FILE
@@ -126,12 +134,15 @@ class StereoRig(RigSource):
             raise SourceError(f"{file}: {error}") from None
         fps = options["fps"]
         shots = [shot for number, pair in enumerate(rig.pairs) for shot in _shots(self.folder, number, pair, fps)]
+        poses = self._read_poses(rig, shots, options) if posed else UnknownPoses()
+        self._set(rig, self.folder, shots, poses, FILE)
+
+    def _read_poses(self, rig: Rig, shots: Sequence[Shot], options: Mapping[str, Any]) -> Poses:
         if options["poses"]:
             poses = poses_of_images(file_of(options["poses"], self.folder), [shot.stamp_ns for shot in shots])
         else:
             poses = _poses(self.folder, rig.poses)
-        poses = as_body(poses, rig.pairs[0].T_body_left, options["axes"], options["invert"])
-        self._set(rig, self.folder, shots, poses, FILE)
+        return as_body(poses, rig.pairs[0].T_body_left, options["axes"], options["invert"])
 
     @classmethod
     def recognises(cls, where: str) -> bool:
@@ -141,7 +152,7 @@ class StereoRig(RigSource):
 
 def _poses(folder: Path, name: str) -> Trajectory:
     if not os.path.isfile(folder / name):
-        raise SourceError(
+        raise NoPoses(
             f"{folder / name}: no such file of poses; write it, or set poses = in {folder / FILE}, or add ?poses=FILE"
         )
     return Trajectory(folder / name)

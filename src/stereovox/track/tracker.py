@@ -16,7 +16,6 @@ from stereovox.errors import FrameRefused
 from stereovox.frame import AnyFrame, StereoFrame
 from stereovox.se3 import Transform, inverse, orthonormalise, rotation_matrix, rotation_vector
 from stereovox.track.fit import Fit, Limits
-from stereovox.track.landmarks import Landmarks
 from stereovox.track.surfaces import Surfaces
 from stereovox.track.views import far_apart
 
@@ -110,7 +109,8 @@ class Tracker:
 
     Args:
         profile: Profile name, TOML file or `Config`: depth, noise and range are prepared as for a map.
-        start: (4, 4) T_world_sensor of the first image; without it the camera looks along x, level, z up.
+        start: (4, 4) T_world_sensor of the image that the map begins with, the first that the next one fits; without
+            it the camera looks along x, level, z up.
         **overrides: Settings that replace those of the profile.
 
     Attributes:
@@ -163,7 +163,7 @@ class Tracker:
         """Take the pose of an image that a given motion leads to, corrected by what is held in view."""
         expected = self._T @ motion
         way = np.repeat([np.linalg.norm(rotation_vector(motion[:3, :3])), np.linalg.norm(motion[:3, 3])], 3)
-        doubt = np.diag((GIVEN + GIVEN_SHARE * way) ** 2)
+        doubt = np.diag(np.square(GIVEN + GIVEN_SHARE * way, dtype=np.float64))
         fit = evidence.fit(seen, expected, doubt)
         if fit.known < FOLLOWING.known:
             fit = Fit(expected, doubt, fit.known, 1.0)
@@ -264,6 +264,8 @@ class Tracker:
 def _evidence_for(frame: AnyFrame, config: Config) -> Evidence[Any]:
     """Return what tracks a camera."""
     if isinstance(frame, StereoFrame) and isinstance(frame.pair.camera, PinholeCamera):
+        from stereovox.track.landmarks import Landmarks  # needs OpenCV
+
         return Landmarks(frame.pair)
     return Surfaces(config)
 

@@ -58,14 +58,6 @@ class FramePoses:
         return found.copy()
 
 
-class UnknownPoses:
-    """The poses of a recording whose poses were not looked for: all NaN."""
-
-    def at(self, i: int) -> Transform:
-        """Return NaN (4, 4), for every frame."""
-        return np.full((4, 4), np.nan)
-
-
 class StandingPoses:
     """The pose of recordings of single moments: camera 0 at the origin of an upright world, always."""
 

@@ -19,8 +19,9 @@ from stereovox.sources.kitti.base import (
     time_lines,
 )
 from stereovox.sources.kitti.calibration import CAM_TO_CAM, KittiCalibration, read_raw_calibration
-from stereovox.sources.kitti.poses import FramePoses, UnknownPoses, read_named_poses, read_oxts_files
+from stereovox.sources.kitti.poses import FramePoses, read_named_poses, read_oxts_files
 from stereovox.sources.parameters import file_of
+from stereovox.sources.poses import UnknownPoses
 from stereovox.sources.rgbd.folder import folder_part
 from stereovox.sources.rig_options import POSES, folder_and_options
 

@@ -149,7 +149,7 @@ def test_a_table_that_is_nearly_full_loses_nothing():
 
 def test_tables_grow_and_keep_what_they_hold():
     random, level, twin = np.random.default_rng(3), Surfels(0.05), naive.NaiveSurfels(0.05)
-    for _ in range(3):
+    for _ in range(2):
         seen = random_patches(5000, random.integers(1000), extent=2.0)
         level.add(seen, np.eye(4))
         twin.add(*seen, np.eye(4))

@@ -113,7 +113,7 @@ class Equations(NamedTuple):
     information: NDArray[np.float64]
     gradient: Vector
     spread: Vector
-    counts: tuple[int, int, float]
+    ratios: Vector
     cost: float
 
 
@@ -140,8 +140,7 @@ def equations(
         spread += weight * np.array([1, x, y, z, x * x, x * y, x * z, y * y, y * z, z * z])
         ratios.append(ratio)
         cost += ratio / (1 + ratio / reach**2) / 2
-    counts = len(ratios), sum(ratio < 9 for ratio in ratios), float(sum(min(ratio, 9) for ratio in ratios))
-    return Equations(information, gradient, spread, counts, cost)
+    return Equations(information, gradient, spread, np.array(ratios), cost)
 
 
 def _nearest(surfels: dict[Cell, Surfel], size: float, point: Vector, normal: Vector) -> Surfel | None:

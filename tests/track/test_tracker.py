@@ -204,3 +204,16 @@ def test_with_a_person_over_half_the_view_the_pose_is_right_or_lost(speed):
     found = track(crossed)
     assert found.tracked[:4] == [1, 2, 3, 4]
     assert np.all(found.errors()[:, 0] < 0.1)
+
+
+@pytest.mark.parametrize(("first", "speed"), [(-1.0, 0.1), (-0.5, 0.05), (-1.5, 0.05)])
+def test_somebody_who_walks_through_what_was_seen_does_not_take_the_camera_along(first, speed):
+    """A fifth of the view: what stands where it was free, and what leaves most others behind, moves."""
+
+    def person(i):
+        y = first + speed * i
+        return Scene([cylinder("person", "person", (1.2, y, 0), (1.2, y, 1.9), 0.45, sections=16)]) if i >= 5 else None
+
+    found = track(seen(BAYS, aside(30), moving=person))
+    assert len(found.tracked) > 20
+    assert np.all(found.errors()[:, 0] < METRES)

@@ -10,7 +10,7 @@ from stereovox.se3 import look_at, rotation_matrix
 from stereovox.simulate.scene import Scene, box
 from stereovox.track.surfaces import LOOKED_THROUGH, MIN_PATCHES
 from stereovox.track.surfels import patches_of
-from stereovox.track.views import GRID, contradiction, far_apart, unlike, view_of
+from stereovox.track.views import GRID, contradiction, far_apart, stood_free, unlike, view_of
 
 
 def view(frame, T=None):
@@ -101,3 +101,14 @@ def test_poses_are_far_apart_by_metres_or_by_angle():
     assert not far_apart(here, aside_, 0.25, 0.1)
     assert far_apart(here, turned, 1.0, 0.15)
     assert not far_apart(here, turned, 1.0, 0.25)
+
+
+def test_what_stands_where_views_looked_through_is_told_apart():
+    """A patch before a wall that was seen is free-standing; the wall itself, what is behind and what is beside are not."""
+    wall = np.stack(np.meshgrid(np.linspace(-1, 1, 60), np.linspace(-0.75, 0.75, 45)), -1).reshape(-1, 2)
+    points = np.column_stack([wall, np.full(len(wall), 2.0)]).astype(np.float32)
+    view = view_of(points, np.full(len(points), 0.005, np.float32), np.eye(4))
+    asked = np.array([[0, 0, 1.2], [0, 0, 2.0], [0, 0, 3.0], [5, 0, 1.2], [0.3, 0.2, 1.95]], np.float32)
+    free = stood_free(asked, np.full(5, 0.005, np.float32), np.eye(4), [view])
+    assert free.tolist() == [True, False, False, False, False]
+    assert not stood_free(asked, np.full(5, 0.005, np.float32), np.eye(4), []).any()

@@ -22,8 +22,6 @@ SAME = np.float32(0.04)
 """Share of the depth by which pixels of one patch may differ."""
 FOLD = np.float32(0.25)
 """Share of the depth by which neighbouring patches of one surface may differ."""
-USUAL = np.float32(3)
-"""Standard deviations within which a patch agrees with a surfel."""
 
 
 @kernel
@@ -131,7 +129,7 @@ def carry(keys, surfels, keep, new_keys, new_surfels):
 
 @kernel
 def equations(
-    keys, surfels, size, points, directions, sigma, R, t, slack, reach, information, gradient, spread, counts
+    keys, surfels, size, points, directions, sigma, R, t, slack, reach, information, gradient, spread, ratios
 ):
     """Fill the normal equations of a small motion (rotation about the camera, then shift, in the map's axes).
 
@@ -141,11 +139,11 @@ def equations(
     same, holds nothing: the normals are each other's instruments.
 
     information (6, 6), gradient (6,) float64. spread (10,): sums of weights, of weighted x, y, z and of xx, xy, xz, yy,
-    yz, zz of the patches, seen from the camera. counts (3,): patches with a surfel, those of them within USUAL standard
-    deviations, and the sum of their squared ratios.
+    yz, zz of the patches, seen from the camera. ratios (N,) float32: squared residuals by their variance, of the
+    patches with a surfel, whose number is returned.
     """
     mask = np.int64(keys.size - 1)
-    known, usual, squares = 0, 0, 0.0
+    known = 0
     information[:], gradient[:], spread[:] = 0.0, 0.0, 0.0
     for i in range(points.shape[0]):
         px, py, pz = _turned(R, points, i)
@@ -162,9 +160,8 @@ def equations(
         off = a0 * dx + a1 * dy + a2 * dz
         variance = sigma[i] * sigma[i] + surfel[7] / min(surfel[8], np.float32(20)) + slack * slack
         ratio = off * off / variance
+        ratios[known] = ratio
         known += 1
-        usual += 1 if ratio < USUAL * USUAL else 0
-        squares += min(ratio, USUAL * USUAL)
         weight = 1.0 / (variance * (1.0 + ratio / (reach * reach)) ** 2)
         seen = (py * nz - pz * ny, pz * nx - px * nz, px * ny - py * nx, nx, ny, nz)
         held = (py * a2 - pz * a1, pz * a0 - px * a2, px * a1 - py * a0, a0, a1, a2)
@@ -173,7 +170,7 @@ def equations(
     for j in range(6):
         for k in range(j):
             information[j, k] = information[k, j]
-    counts[0], counts[1], counts[2] = known, usual, squares
+    return known
 
 
 @cell

@@ -18,7 +18,7 @@ from stereovox.se3 import Transform
 from stereovox.sensors.noise import RangeNoise
 from stereovox.track.fit import Fit, Limits
 from stereovox.track.surfels import Patches, SurfelMap, patches_of
-from stereovox.track.views import View, contradiction, far_apart, unlike, view_of
+from stereovox.track.views import View, contradiction, far_apart, stood_free, unlike, view_of
 
 BIAS = 3.0
 """Errors of a real camera's depth that patches do not average out, in standard deviations of one pixel."""
@@ -35,6 +35,9 @@ SEARCH = np.full(6, 0.4)
 """Radians and metres around them in which the pose is sought."""
 LOOKED_THROUGH = 0.05
 """Share of what is seen again that may lie where other views looked through: something that moved, not a wall."""
+CLOSE, QUIETEST = 2.0, 0.01
+"""Where a pose is expected with less than so many times the usual variance, most of an image lies where it should; what
+is far beyond the residuals of that moves, down to this variance of theirs, by what is expected of the camera."""
 KEPT_M, CHECKED = 30.0, 100
 """Surfels farther than this along an axis are forgotten, looked for every so many images."""
 
@@ -76,14 +79,20 @@ class Surfaces:
 
     def fit(self, seen: Patches, expected: Transform, doubt: NDArray[np.float64]) -> Fit:
         """Return the pose that lays an image onto the surfels, near the expected one; `doubt` as in `settled`."""
-        return self._map.fit(seen, expected, doubt)
+        close = doubt[3:, 3:].trace() < CLOSE * float(np.sum(self.limits.spread[3:] ** 2))
+        return self._map.fit(self._lasting(seen, expected), expected, doubt, QUIETEST if close else 1.0)
+
+    def _lasting(self, seen: Patches, T: Transform) -> Patches:
+        """Return the patches of an image at T_map_camera that do not stand where views saw free space: people walk."""
+        there = ~stood_free(seen.points, seen.sigma, T, self._views)
+        return Patches(*(np.ascontiguousarray(part[there]) for part in seen))
 
     def advance(self, seen: Patches, T: Transform) -> None:
         """Nothing follows an image that is not learned from."""
 
     def learn(self, seen: Patches, T: Transform) -> None:
         """Add an image that is believed to be at T_map_camera."""
-        self._map.add(seen, T)
+        self._map.add(self._lasting(seen, T), T)
         if all(far_apart(T, view.T, VIEW_M, VIEW_RAD) for view in self._views):
             self._views.append(view_of(seen.points, seen.sigma, T))
         self._learned += 1

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -31,6 +30,10 @@ MOST = 5e3
 ALIKE = 2.0
 """Patches whose errors are alike, so that they tell no more than one: neighbours see the same surfel and share the
 camera's own distortion. Chosen so that covariances hold in simulation (docs/tracking.md)."""
+USUAL = 3.0
+"""Standard deviations within which a patch agrees with a surfel."""
+MEDIAN = 0.455
+"""Median of the square of a normal number of variance 1."""
 QUIETEST = 0.01
 """Least variance of residuals, as a share of the expected one, that is believed."""
 BENT = 0.05
@@ -90,17 +93,24 @@ class Surfels:
         near = np.all(np.abs(cells * float(self.size) - centre) < radius, axis=1)
         self._rebuild(near, len(self._keys))
 
-    def equations(self, seen: Patches, T: Transform, slack: float) -> tuple[NDArray, NDArray, NDArray]:
-        """Return information (6, 6), less what bent normals hold, gradient (6,), counts (3,): `_surfels.equations`."""
-        information, gradient, spread, counts = np.zeros((6, 6)), np.zeros(6), np.zeros(10), np.zeros(3)
+    def equations(
+        self, seen: Patches, T: Transform, slack: float, reach: float
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float32]]:
+        """Return information (6, 6), less what bent normals hold, and gradient (6,): `_surfels.equations`.
+
+        Also the squared residuals, by their variance, of the patches that have a surfel.
+        """
+        information, gradient, spread = np.zeros((6, 6)), np.zeros(6), np.zeros(10)
         R, t = np.ascontiguousarray(T[:3, :3]), np.ascontiguousarray(T[:3, 3])
-        equations(
-            self._keys, self._surfels, self.size, *seen[:3], R, t, np.float32(slack), REACH, information, gradient,
-            spread, counts,
+        ratios = np.empty(len(seen.points), np.float32)
+        known = equations(
+            self._keys, self._surfels, self.size, *seen[:3], R, t, np.float32(slack), reach, information, gradient,
+            spread, ratios,
         )  # fmt: skip
-        noise = max(counts[2] / max(counts[0], 1), QUIETEST)  # variance of the residuals, by what was expected of it
+        ratios = ratios[:known]
+        noise = max(float(np.minimum(ratios, USUAL**2).mean()), QUIETEST) if known else 1.0
         information -= BENT**2 * _held_by_any(spread)
-        return information / (ALIKE * noise), gradient / (ALIKE * noise), counts
+        return information / (ALIKE * noise), gradient / (ALIKE * noise), ratios
 
     def _rebuild(self, keep: NDArray[np.bool_], room: int) -> None:
         """Move the surfels to keep into a table of `room` places."""
@@ -129,20 +139,42 @@ class SurfelMap:
         for level in self._levels:
             level.forget(centre, radius)
 
-    def fit(self, seen: Patches, expected: Transform, doubt: NDArray[np.float64]) -> Fit:
-        """Return the pose that lays an image onto the surfels, near the expected one; `doubt` as in `settled`."""
-        counts = np.zeros(3)
+    def fit(self, seen: Patches, expected: Transform, doubt: NDArray[np.float64], quietest: float = 1.0) -> Fit:
+        """Return the pose that lays an image onto the surfels, near the expected one; `doubt` as in `settled`.
 
-        def equations(level: Surfels, slack: float, some: Patches, T: Transform) -> tuple[NDArray, NDArray]:
-            information, gradient, counts[:] = level.equations(some, T, slack)
-            return information, gradient
-
-        stages = [
-            Stage(partial(equations, level, slack, seen.thinned(every)), CONVERGED * float(level.size))
+        quietest: what is far beyond the residuals that most patches have at the expected pose counts little, down to
+            this variance of theirs, by what was expected of it. 1: only what is far beyond that.
+        """
+        levels = [
+            _Level(level, slack, seen.thinned(every), quietest)
             for level, slack, every in zip(self._levels, SLACK, EVERY, strict=True)
         ]
-        T, covariance = settled(stages, expected, doubt)
-        return Fit(T, covariance, counts[0] / max(len(seen.points), 1), counts[1] / max(counts[0], 1))
+        T, covariance = settled([Stage(level, CONVERGED * float(level.size)) for level in levels], expected, doubt)
+        ratios = levels[-1].ratios
+        if not len(ratios):
+            return Fit(T, covariance, 0.0, 0.0)
+        return Fit(T, covariance, len(ratios) / len(seen.points), float(np.mean(ratios < USUAL**2)))
+
+
+class _Level:
+    """The equations of an image on the surfels of one size."""
+
+    def __init__(self, level: Surfels, slack: float, seen: Patches, quietest: float):
+        self.size, self._level, self._slack, self._seen, self._quietest = level.size, level, slack, seen, quietest
+        self._reach = REACH
+        self.ratios = np.empty(0, np.float32)
+
+    def __call__(self, T: Transform) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        if not len(self.ratios) and self._quietest < 1:
+            ratios = self._level.equations(self._seen, T, self._slack, REACH)[2]
+            self._reach *= float(np.sqrt(max(_scale(ratios), self._quietest)))
+        information, gradient, self.ratios = self._level.equations(self._seen, T, self._slack, self._reach)
+        return information, gradient
+
+
+def _scale(ratios: NDArray[np.float32]) -> float:
+    """Return the variance of residuals, by what was expected of it, that most of them show; at most 1."""
+    return float(min(np.median(ratios) / MEDIAN, 1.0)) if len(ratios) else 1.0
 
 
 def _held_by_any(spread: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -128,6 +128,7 @@ class Tracker:
         self._T, self._motion, self._covariance = self._start, np.eye(4), np.zeros((6, 6))
         self._stamps: list[int] = []  # of the last two images that were followed
         self._learned = 0
+        self._adrift = False  # followed, though open along some direction
         self._trial: int | None = None  # images until poses count: 0 while following, None while lost
 
     def add(self, frame: AnyFrame, motion: Transform | None = None) -> Tracked:
@@ -189,8 +190,9 @@ class Tracker:
         """Take the pose of an image that fits, and learn from it where it is believed."""
         expected, doubt = self._expected(evidence.limits, stamp_ns)
         fit = evidence.fit(seen, expected, doubt)
-        why = _doubt(fit, RETURNING if self._trial else FOLLOWING) or _open(fit, evidence.limits.adrift)
-        if not why and self._trial:
+        returning = bool(self._trial) and not self._adrift
+        why = _doubt(fit, RETURNING if returning else FOLLOWING) or _open(fit, evidence.limits.adrift)
+        if not why and returning:
             why = evidence.contradicted(seen, fit.T_map_camera)
         if why:
             return self._begin(evidence, seen, stamp_ns) if self._learned < 2 else self._lose(why)
@@ -198,7 +200,7 @@ class Tracker:
         self._place(fit.T_map_camera, fit.covariance)
         self._motion = inverse(before) @ self._T
         self._stamps = [*self._stamps[-1:], stamp_ns]
-        why = self._wait(_open(fit, evidence.limits.unsure))
+        why = self._wait(evidence, seen, fit)
         if why:
             evidence.advance(seen, self._T)
             return self._lost(why)
@@ -206,8 +208,12 @@ class Tracker:
         self._learned += 1
         return Tracked(self._T, fit.covariance)
 
-    def _wait(self, why: str) -> str:
+    def _wait(self, evidence: Evidence[Seen], seen: Seen, fit: Fit) -> str:
         """Return why a pose that is followed does not count yet: because it is open, or was until just before."""
+        why = _open(fit, evidence.limits.unsure)
+        if not why and self._adrift:
+            why = _doubt(fit, RETURNING) or evidence.contradicted(seen, fit.T_map_camera)
+        self._adrift = bool(why)
         if why:
             self._trial = max(self._trial or 0, 1)
         elif self._trial:
@@ -253,6 +259,7 @@ class Tracker:
         self._T, self._covariance = orthonormalise(T), covariance
 
     def _lose(self, why: str) -> Tracked:
+        self._adrift = False
         if self._learned >= 2:
             self._trial = None
         return self._lost(why)

@@ -6,6 +6,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from stereovox.se3 import Transform, inverse, rotation_vector
@@ -14,8 +15,8 @@ GRID = (30, 40)
 """Rows and columns of a view's depths."""
 SMALL = (12, 16)
 """Places at which views are compared by their looks."""
-NEAR = 12
-"""Views that an image is compared with: the nearest."""
+FEW, NEAR = 4, 12
+"""Views that an image is compared with, the nearest: each time, and where a place must be sure."""
 TOLERANCE = 0.04
 """Share of the depth by which what is seen twice may differ, besides four standard deviations."""
 
@@ -23,12 +24,14 @@ TOLERANCE = 0.04
 class View(NamedTuple):
     """What one image saw. T: T_map_camera (4, 4). depth: GRID metres along the optical axis, NaN where there is none.
 
-    points: (N, 3) float32 metres, camera frame. sigma: (N,) their standard deviations. slope: (2,) half width and half
+    nearest: the least of each place of the grid and those around it, infinity where there is none. points: (N, 3)
+    float32 metres, camera frame. sigma: (N,) their standard deviations. slope: (2,) half width and half
     height of the grid at one metre.
     """
 
     T: Transform
     depth: NDArray[np.float32]
+    nearest: NDArray[np.float32]
     points: NDArray[np.float32]
     sigma: NDArray[np.float32]
     slope: NDArray[np.float64]
@@ -38,11 +41,33 @@ def view_of(points: NDArray[np.float32], sigma: NDArray[np.float32], T: Transfor
     """Return the view of an image's patches (N, 3), (N,) from T_map_camera."""
     ahead = points[points[:, 2] > 0]
     slope = np.abs(ahead[:, :2] / ahead[:, 2:]).max(axis=0) + 1e-6
-    view = View(T, np.full(GRID, np.nan, np.float32), points, sigma, slope)
+    view = View(T, np.full(GRID, np.nan, np.float32), np.full(GRID, np.inf, np.float32), points, sigma, slope)
     row, column, inside = _places(view, points)
     order = np.argsort(-points[inside, 2])  # the nearest is written last
     view.depth[row[inside][order], column[inside][order]] = points[inside, 2][order]
+    around = np.pad(np.nan_to_num(view.depth, nan=np.inf), 1, constant_values=np.inf)
+    view.nearest[:] = sliding_window_view(around, (3, 3)).min(axis=(2, 3))
     return view
+
+
+def stood_free(
+    points: NDArray[np.float32], sigma: NDArray[np.float32], T: Transform, views: list[View]
+) -> NDArray[np.bool_]:
+    """Return which points (N, 3) of an image at T_map_camera stand where near views saw free space.
+
+    sigma: (N,) their standard deviations.
+
+    What stands there has come since: it moves, or the pose is wrong.
+    """
+    free = np.zeros(len(points), bool)
+    for view in sorted(views, key=lambda view: float(np.linalg.norm(view.T[:3, 3] - T[:3, 3])))[:FEW]:
+        T_view_camera = inverse(view.T) @ T
+        there = points @ T_view_camera[:3, :3].T + T_view_camera[:3, 3]
+        row, column, inside = _places(view, there)
+        seen = view.nearest[row[inside], column[inside]]
+        slack = 4 * sigma[inside] + TOLERANCE * np.where(np.isfinite(seen), seen, 0)
+        free[inside] |= np.isfinite(seen) & (there[inside, 2] < seen - slack)
+    return free
 
 
 def unlike(one: View, other: View) -> float:

@@ -86,6 +86,8 @@ class MapResult(Generic[MapT]):
         doubts: Why the map may be wrong, from `map_floor` with SLAM; empty where its self-check found nothing.
         poses: Which were used: `given`, `track` or `both`.
         lost: Where the camera was lost, if its poses were tracked: these frames are not in the map.
+        believed: Of poses `both`, the number of frames in which nothing known was in view, so that the recording's own
+            motion was taken as it is.
     """
 
     map: MapT
@@ -96,6 +98,7 @@ class MapResult(Generic[MapT]):
     doubts: Sequence[MapDoubt] = ()
     poses: str = GIVEN
     lost: Sequence[LostSpan] = ()
+    believed: int = 0
 
     def _repr_html_(self) -> str:
         """Return what a notebook shows: the map's picture and facts."""
@@ -112,6 +115,7 @@ class MapResult(Generic[MapT]):
             summary["doubts"] = [doubt.as_dict() for doubt in self.doubts]
         if self.poses != GIVEN:
             summary["lost"] = [span.as_dict() for span in self.lost]
+            summary["believed"] = self.believed
         return {**summary, "poses": self.poses}
 
 
@@ -222,6 +226,7 @@ class MapRun:
             self.mapper = self._make_mapper(saved, suggested)
             stack.callback(self.mapper.map.close)
             self._recorded = self.source
+            self._guides: list[GuidedTracker] = []
             if self.poses != GIVEN:
                 self.source = TrackedStream(self.source, self._make_tracker(), HOW[self.poses])
             self._checkpoints = Checkpoints(lambda: self.mapper.map.save(self.out), self.out, self._checkpoint_s)
@@ -259,7 +264,7 @@ class MapRun:
             self._checkpoints.save(frames_offered(self.mapper))
         return MapResult(
             self.mapper.map, self.out, reports, self.source.dropped,
-            poses=self.poses, lost=self._lost.spans,
+            poses=self.poses, lost=self._lost.spans, believed=self._believed(),
         )  # fmt: skip
 
     @property
@@ -338,11 +343,14 @@ class MapRun:
         config = load_config(settings, **{**self._overrides, **suggested})
         return Mapper(on_usable_device(config, self._notify), resume=saved, tiles=tiles)
 
+    def _believed(self) -> int:
+        return self._guides[-1].believed if self._guides else 0
+
     def _make_tracker(self) -> Callable[[], AnyTracker]:
         """Return what makes the tracker of this run, the same each time."""
         config = self.mapper.config
         if self.poses == BOTH:
-            return partial(GuidedTracker, config)
+            return partial(_guide, config, self._guides)
         return partial(Tracker, config, start=level_start(self.source, config))
 
     def _check_recording(self) -> None:
@@ -568,3 +576,9 @@ def _default_signals() -> list[int]:
     if hasattr(signal, "SIGHUP"):
         usual[signal.SIGHUP] = signal.SIG_DFL
     return [number for number, handler in usual.items() if signal.getsignal(number) == handler]
+
+
+def _guide(config: Config, guides: list[GuidedTracker]) -> GuidedTracker:
+    """Return a new tracker, and keep it in a list to be asked what it believed."""
+    guides.append(GuidedTracker(config))
+    return guides[-1]

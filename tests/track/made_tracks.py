@@ -102,7 +102,7 @@ class Track:
 
     def errors(self) -> np.ndarray:
         """Return (N, 2) how far off the poses are from the image with which the map begins, in metres and degrees."""
-        begun = [i for i in self.lost if "first image" in self.found[i].lost][-1]
+        begun = [i for i in self.lost if self.found[i].begins][-1]
         T = self.found[begun].T_world_sensor @ inverse(self.truth[begun])
         return np.array([_size(inverse(T @ self.truth[i]) @ self.found[i].T_world_sensor) for i in self.tracked])
 

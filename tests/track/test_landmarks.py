@@ -10,6 +10,7 @@ import pytest
 from made_photographs import BASELINE, LENS, PAIR, STEP_NS, corner, photographs, way, with_sticker
 from made_tracks import simulated, track
 
+from stereovox.errors import StereovoxError
 from stereovox.se3 import rotation_matrix
 from stereovox.track.landmarks import DISPARITY, PIXEL, Corners, Landmarks
 from stereovox.track.tracker import Tracker
@@ -129,7 +130,7 @@ def test_the_same_pairs_give_the_same_poses_whatever_poses_they_bring():
     wrong = [replace(frame, T_world_sensor=frame.T_world_sensor + 5) for frame in taken]
     by = Tracker(start=taken[0].T_world_sensor)
     for one, other in zip(tracked(taken).found, map(by.add, wrong), strict=True):
-        assert one.T_world_sensor == pytest.approx(other.T_world_sensor, abs=1e-9)  # sums of float64 may round anew
+        assert np.array_equal(one.T_world_sensor, other.T_world_sensor)
         assert one.lost == other.lost
 
 
@@ -191,3 +192,21 @@ def test_a_depth_image_among_pairs_is_lost():
     taken = pairs()[:4]
     found = tracked([*taken[:2], simulated("room").frame(0), *taken[2:]])
     assert "no stereo pair" in found.found[2].lost
+
+
+def test_pairs_of_another_camera_and_with_a_mask_of_another_size_are_lost():
+    frames = pairs(4)
+    camera = replace(PAIR.camera, fx=1.3 * PAIR.camera.fx)
+    wider = replace(frames[2], pair=replace(PAIR, camera=camera))
+    masked_off = replace(frames[3], pair=replace(PAIR, valid=np.ones((3, 3), bool)))
+    by = Tracker()
+    said = [by.add(frame).lost for frame in (*frames[:2], wider, masked_off)]
+    assert not said[1]
+    assert "another camera" in said[2]
+    assert "mask" in said[3]
+
+
+def test_a_pair_without_a_baseline_is_refused():
+    pair = replace(PAIR, camera=replace(PAIR.camera, baseline=None))
+    with pytest.raises(StereovoxError, match="baseline"):
+        Tracker().add(replace(pairs(1)[0], pair=pair))

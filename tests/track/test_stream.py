@@ -26,7 +26,8 @@ class Script:
         self.seen.append(frame)
         T = np.eye(4)
         T[0, 3] = len(self.seen)
-        return Tracked(T, np.eye(6), self._said.pop(0))
+        said = self._said.pop(0)
+        return Tracked(T, np.eye(6), said, begins=said == BEGUN)
 
 
 def followed(*said, frames=None):
@@ -123,7 +124,5 @@ def test_a_live_camera_has_no_past():
         live.after(1)
 
 
-def test_the_tracker_begins_as_it_is_understood_here():
-    """The words by which the image is known that a map was begun with."""
-    said = Tracker().add(room(1)[0]).lost
-    assert followed(said, "") == [(None, 1.0), (None, 2.0)]
+def test_a_tracker_says_that_it_begins():
+    assert Tracker().add(room(1)[0]).begins

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from made_tracks import STEP_NS, aside, covered, hall, seen, simulated, track, tracker
 
+from stereovox.errors import StereovoxError
 from stereovox.se3 import rotation_matrix
 from stereovox.simulate.scene import Scene, box, cylinder
 from stereovox.track.fit import Fit
@@ -217,3 +218,47 @@ def test_somebody_who_walks_through_what_was_seen_does_not_take_the_camera_along
     found = track(seen(BAYS, aside(30), moving=person))
     assert len(found.tracked) > 20
     assert np.all(found.errors()[:, 0] < METRES)
+
+
+@pytest.mark.parametrize(
+    ("scene", "first"), [("room", 161), ("apartment", 216), ("apartment", 609), ("apartment", 616)]
+)
+def test_places_that_hold_little_give_no_wrong_pose(scene, first):
+    """The finest stage of least squares lost what the coarser ones had found, and claimed a few millimetres."""
+    found = track(frames(scene, first, first + 12))
+    assert not found.tracked or np.all(found.errors() < (0.06, 1))
+
+
+def test_a_jump_within_a_gap_is_not_followed():
+    taken = frames("apartment")[:10] + frames("apartment", 300, 312)
+    late = [replace(frame, stamp_ns=(i + 8 * (i > 9)) * STEP_NS) for i, frame in enumerate(taken)]
+    assert set(range(10, 22)) <= set(track(late).lost)
+
+
+def test_two_images_close_in_time_do_not_make_the_next_one_late():
+    taken = frames("apartment")[:20]
+    stamps = [i * STEP_NS - (STEP_NS - 1_000_000 if i in (8, 14) else 0) for i in range(20)]
+    found = track([replace(frame, stamp_ns=stamp) for frame, stamp in zip(taken, stamps, strict=True)])
+    assert len(found.lost) < 4
+    assert np.all(found.errors() < (METRES, DEGREES))
+
+
+@pytest.mark.parametrize("start", [np.eye(3), np.full((4, 4), np.nan), np.diag([2.0, 2, 2, 1])])
+def test_a_start_that_is_no_rigid_motion_is_refused(start):
+    with pytest.raises(StereovoxError, match="no rigid motion"):
+        tracker(start)
+
+
+def test_a_start_far_from_the_origin_is_as_good_as_any():
+    taken = frames("apartment")[:8]
+    far = np.array([[1.0, 0, 0, 5e5], [0, 1, 0, 4e6], [0, 0, 1, 100], [0, 0, 0, 1]])
+    near, away = tracker(), tracker(far)
+    for frame in taken:
+        one, other = near.add(frame), away.add(frame)
+        assert one.lost == other.lost
+    moved = np.linalg.inv(far) @ other.T_world_sensor
+    assert np.linalg.norm(moved[:3, 3]) == pytest.approx(np.linalg.norm(one.T_world_sensor[:3, 3]), abs=1e-6)
+
+
+def test_a_wall_is_named_where_the_map_begins_anew():
+    assert "leaves the pose open" in track(frames("wall", last=4)).found[3].lost

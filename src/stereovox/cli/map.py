@@ -170,7 +170,8 @@ def _poses_line(mapped: MapResult[VoxelMap]) -> str:
     if mapped.poses == "given":
         return "poses: those of the recording"
     lost, how = sum(map(len, mapped.lost)), "tracked" if mapped.poses == "track" else "corrected by the images"
-    return f"poses: {how}, {len(mapped.reports) - lost} of {len(mapped.reports)} frames"
+    believed = f"; {mapped.believed} as they were, since nothing known was in view" if mapped.believed else ""
+    return f"poses: {how}, {len(mapped.reports) - lost} of {len(mapped.reports)} frames{believed}"
 
 
 def _why_empty(result: dict[str, Any], window: WindowConfig) -> str:

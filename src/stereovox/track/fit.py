@@ -13,8 +13,13 @@ from stereovox.se3 import Transform, rotation_matrix, rotation_vector
 
 STEPS = 6
 """Steps of least squares in each stage."""
+CONTRARY = 100.0
+"""Squared deviations, of six, by which the last stage may move the pose that the one before it found."""
 HOLDS = 1.0
 """Information, by that of what is expected, below which a direction is not held."""
+
+LOST = "tracking_lost"
+"""Reason of refusal of frames whose pose is not known."""
 
 Equations = Callable[[Transform], tuple[NDArray[np.float64], NDArray[np.float64]]]
 """Normal equations at a pose: information (6, 6) and gradient (6,) of a small motion, a rotation about the camera in
@@ -58,23 +63,39 @@ def settled(
 ) -> tuple[Transform, NDArray[np.float64]]:
     """Return the pose (4, 4) that the stages lead to, and its covariance (6, 6) by the last one.
 
-    Directions that nothing holds stay as expected. doubt: (6, 6) covariance of the expectation. start: where to begin
-    if not there.
+    Directions that nothing holds stay as expected. The covariance is the widest of those that the last stage saw on its
+    way. Where that stage contradicts the one before it, the pose is that of the one before, and open: its covariance is
+    `doubt`.
+
+    doubt: (6, 6) covariance of the expectation. start: where to begin if not there.
     """
-    covariance = doubt
-    T, scale = expected if start is None else start, np.asarray(np.linalg.cholesky(doubt), np.float64)
+    scale = np.asarray(np.linalg.cholesky(doubt), np.float64)
+    T, covariance = expected if start is None else start, doubt
+    before, agreed = T, doubt
     for stage in stages:
+        before, agreed, widest = T, covariance, 0.0
         for _ in range(STEPS):
             information, gradient = stage.equations(T)
             held, directions = _held(information, scale)
-            off = np.concatenate([rotation_vector(T[:3, :3] @ expected[:3, :3].T), T[:3, 3] - expected[:3, 3]])
-            asked = np.where(held > 0, directions.T @ gradient, 0.0) - np.linalg.solve(directions, off)
-            covariance = (directions / (held + 1.0)) @ directions.T
+            if float(np.sum(1 / (held + 1.0))) > widest:
+                widest = float(np.sum(1 / (held + 1.0)))
+                covariance = (directions / (held + 1.0)) @ directions.T
+            asked = np.where(held > 0, directions.T @ gradient, 0.0) - np.linalg.solve(
+                directions, _between(expected, T)
+            )
             motion = directions @ (asked / (held + 1.0))
             T = _moved(T, motion)
             if np.abs(motion).max() < stage.converged:
                 break
+    moved = _between(before, T)
+    if len(stages) > 1 and moved @ np.linalg.solve(agreed + covariance, moved) > CONTRARY:
+        return before, doubt
     return T, covariance
+
+
+def _between(one: Transform, other: Transform) -> NDArray[np.float64]:
+    """Return the motion (6,) from one pose to another: rotation in radians, shift in metres, along the map's axes."""
+    return np.concatenate([rotation_vector(other[:3, :3] @ one[:3, :3].T), other[:3, 3] - one[:3, 3]])
 
 
 def _held(

@@ -15,8 +15,6 @@ from stereovox.track.tracker import Tracked, Tracker
 RIGID = 0.01
 """Largest rigidity error of a pose that is used here."""
 NO_START = "no frame so far has a pose of its own, at which the map could begin"
-FIRST = "the first image"
-"""Begins what `Tracker` says of an image that its map was begun with."""
 
 
 class GuidedTracker:
@@ -27,9 +25,13 @@ class GuidedTracker:
 
     Args:
         config: Settings by which depth is prepared, as for the map.
+
+    Attributes:
+        believed: Number of frames whose own motion was taken as it is, since nothing known was in view.
     """
 
     def __init__(self, config: Config):
+        self.believed = 0
         self._config, self._tracker = config, Tracker(config)
         self._T_world_tracker: Transform | None = None
         self._own: Transform | None = None  # pose of its own of the frame that the tracker stands at
@@ -48,7 +50,10 @@ class GuidedTracker:
         tracked = self._tracker.add(frame, inverse(self._own) @ own if known else None)  # pyright: ignore
         if not np.array_equal(tracked.T_world_sensor, self._at):  # else its image could not be used
             self._at, self._own = tracked.T_world_sensor, own
-        if tracked.lost.startswith(FIRST):
+            if own is None and self._T_world_tracker is not None and not tracked.lost:
+                self._own = self._T_world_tracker @ tracked.T_world_sensor
+        self.believed += tracked.believed
+        if tracked.begins:
             self._begin(own)
         if self._T_world_tracker is None:
             return replace(tracked, lost=NO_START)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.cameras.rigs import StereoPair
 from stereovox.depth.stereo.pipeline import grey_rectified
-from stereovox.errors import FrameRefused
+from stereovox.errors import FrameRefused, StereovoxError
 from stereovox.frame import AnyFrame, StereoFrame, name_of
 from stereovox.se3 import Transform, inverse
 from stereovox.track.fit import Fit, Limits, Stage, settled
@@ -113,8 +113,9 @@ class Landmarks:
     )
 
     def __init__(self, pair: StereoPair):
-        assert isinstance(pair.camera, PinholeCamera)
-        self._camera, self._base = pair.camera, pair.camera.fx * float(pair.camera.baseline or 0)
+        if not isinstance(pair.camera, PinholeCamera) or not pair.camera.baseline:
+            raise StereovoxError(f"stereo pair '{pair.name}': its camera has no baseline; give it in metres")
+        self._camera, self._base = pair.camera, pair.camera.fx * pair.camera.baseline
         self._corners, self._views = Corners(), list[View]()
         self._image = np.empty((0, 0), np.uint8)
         self._followed = Corners(), np.empty((0, 3))
@@ -124,8 +125,14 @@ class Landmarks:
         """Return a stereo frame's images; raises FrameRefused as matching does."""
         if not isinstance(frame, StereoFrame):
             raise FrameRefused("bad_form", f"{name_of(frame)}: is no stereo pair, as those before")
+        if frame.pair.camera != self._camera:
+            raise FrameRefused("bad_form", f"{name_of(frame)}: is of another camera than those before; track one alone")
         frame = grey_rectified(frame)
         valid = frame.pair.valid
+        if valid is not None and valid.shape != frame.left.shape:
+            raise FrameRefused(
+                "bad_shape", f"{name_of(frame)}: its mask is {valid.shape}, the image {frame.left.shape}"
+            )
         mask = np.full(frame.left.shape, 255, np.uint8) if valid is None else valid.astype(np.uint8) * np.uint8(255)
         return Seen(frame.left, frame.right, mask)
 
@@ -165,6 +172,7 @@ class Landmarks:
 
     def seek(self, seen: Seen, last: Transform) -> list[Fit]:
         """Return how an image fits at the kept views that it has most corners in common with."""
+        self._followed = Corners(), np.empty((0, 3))
         pixels = _corners_of(seen.left, NUMBER, APART_PX / 2, seen.mask)
         which, descriptors = self._described(seen.left, pixels)
         pixels = pixels[which]
@@ -219,7 +227,7 @@ class Landmarks:
         K = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
         R = expected[:3, :3].T
         found, turn, shift, inliers = cv2.solvePnPRansac(
-            points @ R.T, measured[near, :2], K, None, np.zeros(3), np.zeros(3), True, 100, 2.0, 0.999
+            points @ R.T, measured[near, :2], K, None, np.zeros((3, 1)), np.zeros((3, 1)), True, 100, 2.0, 0.999
         )
         if not found or inliers is None or len(inliers) < max(AGREED, 0.5 * near.sum()):
             return expected

@@ -14,11 +14,9 @@ import numpy as np
 from stereovox.errors import SourceError
 from stereovox.frame import AnyFrame, name_of
 from stereovox.sources.base import Stream
-from stereovox.track.guided import FIRST
+from stereovox.track.fit import LOST
 from stereovox.track.tracker import Tracked
 
-LOST = "tracking_lost"
-"""Reason of refusal of frames whose pose is not known."""
 CURE = "move slower, or back to what was seen before"
 POSE_FAULTS = frozenset({"no_pose", "bad_pose_file", "low_confidence", "pose_jump"})
 """Faults of a frame's own pose, which is not used here."""
@@ -97,7 +95,7 @@ def follow(frames: Iterable[AnyFrame], tracker: AnyTracker) -> Generator[tuple[A
             tracked = _track(frame, tracker)
             if waiting is not None:
                 yield _begun(*waiting, fits=not tracked.lost)
-            waiting = (frame, tracked) if tracked.lost.startswith(FIRST) else None
+            waiting = (frame, tracked) if tracked.begins else None
             if waiting is None:
                 yield posed(frame, tracked), tracked
         if waiting is not None:
@@ -127,7 +125,7 @@ def _track(frame: AnyFrame, tracker: AnyTracker) -> Tracked:
 
 def _begun(frame: AnyFrame, tracked: Tracked, fits: bool) -> tuple[AnyFrame, Tracked]:
     """Return the image that the map was begun with: it has the start pose where the next one fits it."""
-    found = replace(tracked, covariance=np.zeros((6, 6)), lost="") if fits else tracked
+    found = replace(tracked, covariance=np.zeros((6, 6)), lost="", begins=False) if fits else tracked
     return posed(frame, found), found
 
 

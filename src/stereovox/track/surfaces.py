@@ -16,9 +16,9 @@ from stereovox.frame import AnyFrame
 from stereovox.integrate.views import PerCamera
 from stereovox.se3 import Transform
 from stereovox.sensors.noise import RangeNoise
-from stereovox.track.fit import Fit, Limits
+from stereovox.track.fit import LOST, Fit, Limits
 from stereovox.track.surfels import Patches, SurfelMap, patches_of
-from stereovox.track.views import View, contradiction, far_apart, stood_free, unlike, view_of
+from stereovox.track.views import View, contradiction, is_new, stood_free, unlike, view_of
 
 BIAS = 3.0
 """Errors of a real camera's depth that patches do not average out, in standard deviations of one pixel."""
@@ -27,8 +27,10 @@ ROWS_PER_METRE, FARTHEST_M = 20.0, 100.0
 """Of the table of standard deviations."""
 MIN_PATCHES = 150
 """Patches with a surface that an image needs."""
-VIEW_M, VIEW_RAD = 0.3, np.radians(15)
-"""Views this far apart are kept, to find the way back from."""
+VIEW_M, VIEW_RAD, VIEWS = 0.3, np.radians(15), 1000
+"""Views this far apart are kept, to find the way back from; so many, the latest."""
+THINNED = 3
+"""Of so many patches of a kept view one is kept."""
 TRIED = 6
 """Kept views that are tried when lost: those that look most like the image."""
 SEARCH = np.full(6, 0.4)
@@ -38,7 +40,7 @@ LOOKED_THROUGH = 0.05
 CLOSE, QUIETEST = 2.0, 0.01
 """Where a pose is expected with less than so many times the usual variance, most of an image lies where it should; what
 is far beyond the residuals of that moves, down to this variance of theirs, by what is expected of the camera."""
-KEPT_M, CHECKED = 30.0, 100
+KEPT_M, CHECKED = 15.0, 100
 """Surfels farther than this along an axis are forgotten, looked for every so many images."""
 
 
@@ -66,7 +68,7 @@ class Surfaces:
         seen = patches_of(image, self._sigma[image.camera], ROWS_PER_METRE)
         if len(seen.points) < MIN_PATCHES:
             words = f"only {len(seen.points)} patches of the image lie on surfaces, {MIN_PATCHES} are needed"
-            raise FrameRefused("tracking_lost", words)
+            raise FrameRefused(LOST, words)
         return seen
 
     def _sigma_of(self, camera: VirtualCamera) -> NDArray[np.float64]:
@@ -93,8 +95,8 @@ class Surfaces:
     def learn(self, seen: Patches, T: Transform) -> None:
         """Add an image that is believed to be at T_map_camera."""
         self._map.add(self._lasting(seen, T), T)
-        if all(far_apart(T, view.T, VIEW_M, VIEW_RAD) for view in self._views):
-            self._views.append(view_of(seen.points, seen.sigma, T))
+        if is_new(self._views, T, VIEW_M, VIEW_RAD):
+            self._views = [*self._views[1 - VIEWS :], view_of(seen.points, seen.sigma, T, THINNED)]
         self._learned += 1
         if self._learned % CHECKED == 0:
             self._map.forget(T[:3, 3], KEPT_M)

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, TypeVar
 
@@ -12,25 +12,29 @@ from numpy.typing import NDArray
 
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.config import Config, load_config
-from stereovox.errors import FrameRefused
+from stereovox.errors import FrameRefused, StereovoxError
 from stereovox.frame import AnyFrame, StereoFrame
-from stereovox.se3 import Transform, inverse, orthonormalise, rotation_matrix, rotation_vector
+from stereovox.se3 import Transform, inverse, orthonormalise, rigidity_error, rotation_matrix, rotation_vector
 from stereovox.track.fit import Fit, Limits
 from stereovox.track.surfaces import Surfaces
 from stereovox.track.views import far_apart
 
-LOST = "tracking_lost"
-"""Reason of refusal of frames whose pose is not known."""
 LEVEL = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """Pose of the first image unless another is given: the camera looks along x, level; z is up."""
 GIVEN, GIVEN_SHARE = np.repeat([np.radians(0.2), 0.005], 3), 0.05
 """Standard deviations of a given motion: radians and metres, and share of it."""
-LONGEST = 10.0
-"""Times the usual, how long after an image the next may come and motion still be taken to go on evenly."""
+GAP, LONGEST = 2.0, 10.0
+"""Times the usual, how long after an image the next may come and be followed as any, and be followed at all."""
+SHORTEST = 0.3
+"""Times the usual, how soon after an image the next must not come if motion is to be told from them."""
 RIVAL, RIVAL_M, RIVAL_RAD = 0.9, 0.3, np.radians(15)
 """Two fits of which one explains this share of what the other does, so far apart: neither is believed."""
 FIRST = 3.0
 """Times the usual spread, from the first image to the second: the camera may be moving."""
+REMEMBERED = 8
+"""Times of images that say how far apart they usually are."""
+RIGID = 0.01
+"""Largest rigidity error of a start."""
 CONFIRMED = 5
 """Images in a row that must be tracked after a view is found again, without teaching, until poses count."""
 
@@ -91,11 +95,15 @@ class Tracked:
         covariance: (6, 6) float64 of its place on what was seen so far: rotation about the camera in radians, then
             position in metres, along the world's axes; infinite where it is lost. Drift since the start is not in it.
         lost: Why the pose is not known, in words; "" where it is.
+        begins: Whether a map is begun with this image: it is lost until the next one fits it.
+        believed: Whether the pose is that of a given motion alone, since nothing known was in view.
     """
 
     T_world_sensor: Transform
     covariance: NDArray[np.float64]
     lost: str = ""
+    begins: bool = False
+    believed: bool = False
 
 
 class Tracker:
@@ -123,10 +131,12 @@ class Tracker:
     def __init__(self, profile: str | Path | Config = "default", *, start: Transform | None = None, **overrides: Any):
         self.config = load_config(profile, **overrides)
         self._start = LEVEL if start is None else np.asarray(start, float)
+        if self._start.shape != (4, 4) or not rigidity_error(self._start) < RIGID:
+            raise StereovoxError("start is no rigid motion; give a (4, 4) T_world_sensor in metres")
         self._evidence: Evidence[Any] | None = None
         self._sensor = ""
-        self._T, self._motion, self._covariance = self._start, np.eye(4), np.zeros((6, 6))
-        self._stamps: list[int] = []  # of the last two images that were followed
+        self._T, self._motion, self._covariance = np.eye(4), np.eye(4), np.zeros((6, 6))  # from the start
+        self._stamps: list[int] = []  # of the last images that were followed
         self._learned = 0
         self._adrift = False  # followed, though open along some direction
         self._trial: int | None = None  # images until poses count: 0 while following, None while lost
@@ -154,9 +164,9 @@ class Tracker:
             return self._lose(str(refused))
         if self._learned < 2 and self._trial != 0:
             return self._begin(self._evidence, seen, frame.stamp_ns)
-        if motion is None and (self._trial is None or self._late(frame.stamp_ns)):
+        if motion is None and (self._trial is None or self._later(frame.stamp_ns) > LONGEST):
             return self._seek(self._evidence, seen, frame.stamp_ns)
-        if motion is not None:
+        if motion is not None and not self._trial:
             return self._correct(self._evidence, seen, motion, frame.stamp_ns)
         return self._follow(self._evidence, seen, frame.stamp_ns)
 
@@ -166,47 +176,51 @@ class Tracker:
         way = np.repeat([np.linalg.norm(rotation_vector(motion[:3, :3])), np.linalg.norm(motion[:3, 3])], 3)
         doubt = np.diag(np.square(GIVEN + GIVEN_SHARE * way, dtype=np.float64))
         fit = evidence.fit(seen, expected, doubt)
-        if fit.known < FOLLOWING.known:
+        believed = fit.known < FOLLOWING.known
+        if believed:
             fit = Fit(expected, doubt, fit.known, 1.0)
         contrary = _doubt(fit, Demand(0.0, FOLLOWING.usual))
         self._place(expected if contrary else fit.T_map_camera, fit.covariance)
-        self._motion, self._stamps = motion, [*self._stamps[-1:], stamp_ns]
+        self._motion, self._trial = motion, 0
+        self._stamps = [*self._stamps[1 - REMEMBERED :], stamp_ns]
         if contrary:
             evidence.advance(seen, self._T)
             return self._lost(contrary)
         evidence.learn(seen, self._T)
         self._learned += 1
-        return Tracked(self._T, fit.covariance)
+        return self._found(believed)
 
-    def _begin(self, evidence: Evidence[Seen], seen: Seen, stamp_ns: int) -> Tracked:
-        """Start with an image; a start counts once the next image is tracked on it."""
+    def _begin(self, evidence: Evidence[Seen], seen: Seen, stamp_ns: int, why: str = "") -> Tracked:
+        """Start with an image; a start counts once the next image is tracked on it. why: the one before does not."""
         evidence.forget()
-        evidence.learn(seen, self._start)
-        self._place(self._start, np.zeros((6, 6)))
+        evidence.learn(seen, np.eye(4))
+        self._place(np.eye(4), np.zeros((6, 6)))
         self._stamps, self._trial, self._learned = [stamp_ns], 0, 1
-        return self._lost("the first image; poses count from the next one that fits it")
+        words = f"the map begins anew ({why})" if why else "the first image"
+        return replace(self._lost(f"{words}; poses count from the next image that fits it"), begins=True)
 
     def _follow(self, evidence: Evidence[Seen], seen: Seen, stamp_ns: int) -> Tracked:
         """Take the pose of an image that fits, and learn from it where it is believed."""
-        expected, doubt = self._expected(evidence.limits, stamp_ns)
+        later = self._later(stamp_ns)
+        expected, doubt = self._expected(evidence.limits, stamp_ns, later)
         fit = evidence.fit(seen, expected, doubt)
-        returning = bool(self._trial) and not self._adrift
+        returning = later > GAP or (bool(self._trial) and not self._adrift)
         why = _doubt(fit, RETURNING if returning else FOLLOWING) or _open(fit, evidence.limits.adrift)
         if not why and returning:
             why = evidence.contradicted(seen, fit.T_map_camera)
         if why:
-            return self._begin(evidence, seen, stamp_ns) if self._learned < 2 else self._lose(why)
+            return self._begin(evidence, seen, stamp_ns, why) if self._learned < 2 else self._lose(why)
         before = self._T
         self._place(fit.T_map_camera, fit.covariance)
         self._motion = inverse(before) @ self._T
-        self._stamps = [*self._stamps[-1:], stamp_ns]
+        self._stamps = [*self._stamps[1 - REMEMBERED :], stamp_ns]
         why = self._wait(evidence, seen, fit)
         if why:
             evidence.advance(seen, self._T)
             return self._lost(why)
         evidence.learn(seen, self._T)
         self._learned += 1
-        return Tracked(self._T, fit.covariance)
+        return self._found()
 
     def _wait(self, evidence: Evidence[Seen], seen: Seen, fit: Fit) -> str:
         """Return why a pose that is followed does not count yet: because it is open, or was until just before."""
@@ -221,20 +235,25 @@ class Tracker:
             why = f"found again; {self._trial + 1} more images must agree"
         return why
 
-    def _late(self, stamp_ns: int) -> bool:
-        """Return whether an image comes so late that the camera may be anywhere."""
-        first, last = self._stamps[0], self._stamps[-1]
-        return last > first and stamp_ns - last > LONGEST * (last - first)
+    def _later(self, stamp_ns: int) -> float:
+        """Return how long after the last image one comes, by how far apart they usually are; before it: infinity."""
+        apart = np.diff(self._stamps)
+        usual = float(np.median(apart[apart > 0])) if np.any(apart > 0) else 0.0
+        if stamp_ns < self._stamps[-1]:
+            return np.inf
+        return (stamp_ns - self._stamps[-1]) / usual if usual else 1.0
 
-    def _expected(self, limits: Limits, stamp_ns: int) -> tuple[Transform, NDArray[np.float64]]:
+    def _expected(self, limits: Limits, stamp_ns: int, later: float) -> tuple[Transform, NDArray[np.float64]]:
         """Return where even motion takes the camera until a time, and the covariance (6, 6) of that."""
-        later = 1.0
-        if len(self._stamps) == 2 and stamp_ns > self._stamps[1] > self._stamps[0]:
-            later = min((stamp_ns - self._stamps[1]) / (self._stamps[1] - self._stamps[0]), LONGEST)
+        share = 1.0
+        if len(self._stamps) > 1 and later > 0 and stamp_ns > self._stamps[-1]:
+            last = self._stamps[-1] - self._stamps[-2]
+            usual = (stamp_ns - self._stamps[-1]) / later
+            share = (stamp_ns - self._stamps[-1]) / last if last > SHORTEST * usual else 0.0
         motion = np.eye(4)
-        motion[:3, :3] = rotation_matrix(later * rotation_vector(self._motion[:3, :3]))
-        motion[:3, 3] = later * self._motion[:3, 3]
-        spread = limits.spread * max(later, 1.0) * (1 if len(self._stamps) == 2 else FIRST)
+        motion[:3, :3] = rotation_matrix(share * rotation_vector(self._motion[:3, :3]))
+        motion[:3, 3] = share * self._motion[:3, 3]
+        spread = limits.spread * max(later, 1.0) * (1 if len(self._stamps) > 1 else FIRST)
         return self._T @ motion, self._covariance + np.diag(spread**2)
 
     def _seek(self, evidence: Evidence[Seen], seen: Seen, stamp_ns: int) -> Tracked:
@@ -264,8 +283,12 @@ class Tracker:
             self._trial = None
         return self._lost(why)
 
+    def _found(self, believed: bool = False) -> Tracked:
+        R = np.kron(np.eye(2), self._start[:3, :3])
+        return Tracked(self._start @ self._T, R @ self._covariance @ R.T, believed=believed)
+
     def _lost(self, why: str) -> Tracked:
-        return Tracked(self._T, np.full((6, 6), np.inf), why)
+        return Tracked(self._start @ self._T, np.full((6, 6), np.inf), why)
 
 
 def _evidence_for(frame: AnyFrame, config: Config) -> Evidence[Any]:

@@ -37,11 +37,12 @@ class View(NamedTuple):
     slope: NDArray[np.float64]
 
 
-def view_of(points: NDArray[np.float32], sigma: NDArray[np.float32], T: Transform) -> View:
-    """Return the view of an image's patches (N, 3), (N,) from T_map_camera."""
+def view_of(points: NDArray[np.float32], sigma: NDArray[np.float32], T: Transform, every: int = 1) -> View:
+    """Return the view of an image's patches (N, 3), (N,) from T_map_camera; one of `every` patches is kept."""
     ahead = points[points[:, 2] > 0]
     slope = np.abs(ahead[:, :2] / ahead[:, 2:]).max(axis=0) + 1e-6
-    view = View(T, np.full(GRID, np.nan, np.float32), np.full(GRID, np.inf, np.float32), points, sigma, slope)
+    kept = points[::every].copy(), sigma[::every].copy()
+    view = View(T, np.full(GRID, np.nan, np.float32), np.full(GRID, np.inf, np.float32), *kept, slope)
     row, column, inside = _places(view, points)
     order = np.argsort(-points[inside, 2])  # the nearest is written last
     view.depth[row[inside][order], column[inside][order]] = points[inside, 2][order]
@@ -60,7 +61,7 @@ def stood_free(
     What stands there has come since: it moves, or the pose is wrong.
     """
     free = np.zeros(len(points), bool)
-    for view in sorted(views, key=lambda view: float(np.linalg.norm(view.T[:3, 3] - T[:3, 3])))[:FEW]:
+    for view in nearest_views(views, T, FEW):
         T_view_camera = inverse(view.T) @ T
         there = points @ T_view_camera[:3, :3].T + T_view_camera[:3, 3]
         row, column, inside = _places(view, there)
@@ -68,6 +69,22 @@ def stood_free(
         slack = 4 * sigma[inside] + TOLERANCE * np.where(np.isfinite(seen), seen, 0)
         free[inside] |= np.isfinite(seen) & (there[inside, 2] < seen - slack)
     return free
+
+
+def nearest_views(views: list[View], T: Transform, number: int) -> list[View]:
+    """Return the views from nearest to a pose."""
+    if len(views) <= number:
+        return views
+    away = np.linalg.norm(np.array([view.T[:3, 3] for view in views]) - T[:3, 3], axis=1)
+    return [views[i] for i in np.argsort(away, kind="stable")[:number]]
+
+
+def is_new(views: list[View], T: Transform, metres: float, radians: float) -> bool:
+    """Return whether a pose is farther from those of all views than this."""
+    if not views:
+        return True
+    away = np.linalg.norm(np.array([view.T[:3, 3] for view in views]) - T[:3, 3], axis=1)
+    return all(far_apart(T, views[i].T, metres, radians) for i in np.flatnonzero(away <= metres))
 
 
 def unlike(one: View, other: View) -> float:
@@ -89,8 +106,8 @@ def contradiction(seen: View, views: list[View]) -> tuple[float, int]:
 
     Each way: surfaces of the image in front of what the nearest views saw, and theirs in front of what it sees.
     """
-    nearest = sorted(views, key=lambda view: float(np.linalg.norm(view.T[:3, 3] - seen.T[:3, 3])))[:NEAR]
-    through, same = np.sum([_seen_through(a, b) for view in nearest for a, b in ((seen, view), (view, seen))], axis=0)
+    pairs = [(a, b) for view in nearest_views(views, seen.T, NEAR) for a, b in ((seen, view), (view, seen))]
+    through, same = np.sum([_seen_through(a, b) for a, b in pairs], axis=0) if pairs else (0, 0)
     return through / max(through + same, 1), int(through + same)
 
 

@@ -29,8 +29,6 @@ MIN_PATCHES = 150
 """Patches with a surface that an image needs."""
 VIEW_M, VIEW_RAD, VIEWS = 0.3, np.radians(15), 1000
 """Views this far apart are kept, to find the way back from; so many, the latest."""
-THINNED = 3
-"""Of so many patches of a kept view one is kept."""
 TRIED = 6
 """Kept views that are tried when lost: those that look most like the image."""
 SEARCH = np.full(6, 0.4)
@@ -96,7 +94,7 @@ class Surfaces:
         """Add an image that is believed to be at T_map_camera."""
         self._map.add(self._lasting(seen, T), T)
         if is_new(self._views, T, VIEW_M, VIEW_RAD):
-            self._views = [*self._views[1 - VIEWS :], view_of(seen.points, seen.sigma, T, THINNED)]
+            self._views = [*self._views[1 - VIEWS :], view_of(seen.points, seen.sigma, T)]
         self._learned += 1
         if self._learned % CHECKED == 0:
             self._map.forget(T[:3, 3], KEPT_M)

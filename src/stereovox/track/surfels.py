@@ -21,6 +21,8 @@ SLACK = (0.05, 0.015, 0.005, 0.002)
 """Deviation in metres, for each size, of what lies in one cell without being one plane."""
 EVERY = (4, 4, 2, 1)
 """Of so many patches one is used, at each size."""
+SAMPLED = 4
+"""Of so many patches one tells how large the residuals are."""
 REACH = 3.0
 """Standard deviations at which a patch begins to count little."""
 CONVERGED = 0.01
@@ -166,7 +168,7 @@ class _Level:
 
     def __call__(self, T: Transform) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         if not len(self.ratios) and self._quietest < 1:
-            ratios = self._level.equations(self._seen, T, self._slack, REACH)[2]
+            ratios = self._level.equations(self._seen.thinned(SAMPLED), T, self._slack, REACH)[2]
             self._reach *= float(np.sqrt(max(_scale(ratios), self._quietest)))
         information, gradient, self.ratios = self._level.equations(self._seen, T, self._slack, self._reach)
         return information, gradient

@@ -226,7 +226,7 @@ class Tracker:
         """Return why a pose that is followed does not count yet: because it is open, or was until just before."""
         why = _open(fit, evidence.limits.unsure)
         if not why and self._adrift:
-            why = _doubt(fit, RETURNING) or evidence.contradicted(seen, fit.T_map_camera)
+            why = evidence.contradicted(seen, fit.T_map_camera)
         self._adrift = bool(why)
         if why:
             self._trial = max(self._trial or 0, 1)

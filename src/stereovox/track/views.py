@@ -37,12 +37,11 @@ class View(NamedTuple):
     slope: NDArray[np.float64]
 
 
-def view_of(points: NDArray[np.float32], sigma: NDArray[np.float32], T: Transform, every: int = 1) -> View:
-    """Return the view of an image's patches (N, 3), (N,) from T_map_camera; one of `every` patches is kept."""
+def view_of(points: NDArray[np.float32], sigma: NDArray[np.float32], T: Transform) -> View:
+    """Return the view of an image's patches (N, 3), (N,) from T_map_camera."""
     ahead = points[points[:, 2] > 0]
     slope = np.abs(ahead[:, :2] / ahead[:, 2:]).max(axis=0) + 1e-6
-    kept = points[::every].copy(), sigma[::every].copy()
-    view = View(T, np.full(GRID, np.nan, np.float32), np.full(GRID, np.inf, np.float32), *kept, slope)
+    view = View(T, np.full(GRID, np.nan, np.float32), np.full(GRID, np.inf, np.float32), points, sigma, slope)
     row, column, inside = _places(view, points)
     order = np.argsort(-points[inside, 2])  # the nearest is written last
     view.depth[row[inside][order], column[inside][order]] = points[inside, 2][order]

@@ -126,3 +126,8 @@ def test_a_live_camera_has_no_past():
 
 def test_a_tracker_says_that_it_begins():
     assert Tracker().add(room(1)[0]).begins
+
+
+def test_the_first_image_is_lost_for_the_reason_of_the_next():
+    (_, first), *_ = follow(room(3), Script(BEGUN, DARK, ""))
+    assert first.lost == DARK

@@ -94,12 +94,12 @@ def follow(frames: Iterable[AnyFrame], tracker: AnyTracker) -> Generator[tuple[A
         for frame in images:
             tracked = _track(frame, tracker)
             if waiting is not None:
-                yield _begun(*waiting, fits=not tracked.lost)
+                yield _begun(*waiting, why=tracked.lost)
             waiting = (frame, tracked) if tracked.begins else None
             if waiting is None:
                 yield posed(frame, tracked), tracked
         if waiting is not None:
-            yield _begun(*waiting, fits=False)
+            yield _begun(*waiting, why=waiting[1].lost)
     finally:
         close = getattr(images, "close", None)
         if close:  # a generator: a live camera is to stop now
@@ -123,9 +123,9 @@ def _track(frame: AnyFrame, tracker: AnyTracker) -> Tracked:
     return tracker.add(replace(frame, fault=None, fault_detail=""))
 
 
-def _begun(frame: AnyFrame, tracked: Tracked, fits: bool) -> tuple[AnyFrame, Tracked]:
-    """Return the image that the map was begun with: it has the start pose where the next one fits it."""
-    found = replace(tracked, covariance=np.zeros((6, 6)), lost="", begins=False) if fits else tracked
+def _begun(frame: AnyFrame, tracked: Tracked, why: str) -> tuple[AnyFrame, Tracked]:
+    """Return the image that the map was begun with; it has the start pose, unless `why` says why the next one is lost."""
+    found = replace(tracked, lost=why) if why else replace(tracked, covariance=np.zeros((6, 6)), lost="", begins=False)
     return posed(frame, found), found
 
 

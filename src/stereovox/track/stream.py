@@ -124,7 +124,7 @@ def _track(frame: AnyFrame, tracker: AnyTracker) -> Tracked:
 
 
 def _begun(frame: AnyFrame, tracked: Tracked, why: str) -> tuple[AnyFrame, Tracked]:
-    """Return the image that the map was begun with; it has the start pose, unless `why` says why the next one is lost."""
+    """Return the image that the map was begun with: with the start pose, or `why` the next one, and so it, is lost."""
     found = replace(tracked, lost=why) if why else replace(tracked, covariance=np.zeros((6, 6)), lost="", begins=False)
     return posed(frame, found), found
 

@@ -19,9 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.config import load_config, parse_value
+from stereovox.errors import StereovoxError
+from stereovox.evaluate.trajectory_motions import angles_deg
+from stereovox.evaluate.trajectory_score import score_trajectory
 from stereovox.frame import AnyFrame, Frame
 from stereovox.opening import open_source
-from stereovox.se3 import inverse, orthonormalise, rotation_vector
+from stereovox.se3 import inverse, orthonormalise
+from stereovox.sources.poses import Poses
 from stereovox.track.tracker import Tracker
 
 Track = Callable[[AnyFrame], NDArray[np.float64] | None]
@@ -105,26 +109,25 @@ def run(frames: Iterable[AnyFrame], make: Callable[[], Track]) -> dict[str, floa
         return {"frames": len(times), "lost": lost}
     found, true = np.array(poses), np.array(truth)
     laid = true[0] @ inverse(found[0]) @ found
-    steps = np.linalg.norm(np.diff(true[:, :3, 3], axis=0), axis=1)
-    turned = [np.linalg.norm(rotation_vector(a[:3, :3].T @ b[:3, :3])) for a, b in zip(laid, true, strict=True)]
+    numbers = np.arange(len(found))
+    score = score_trajectory(Poses(numbers, found), Poses(numbers, true))
     return {
         "frames": len(times),
         "lost": lost,
-        "way_m": float(steps.sum()),
-        "ate_m": aligned_error(found[:, :3, 3], true[:, :3, 3]),
+        "way_m": score.length_m,
+        "ate_m": score.position_m.rmse,
         "off_m": float(np.linalg.norm(laid[:, :3, 3] - true[:, :3, 3], axis=1).max()),
-        "off_deg": float(np.degrees(max(turned))),
+        "off_deg": float(angles_deg(np.linalg.inv(true) @ laid).max()),
         "cpu_ms": float(np.median(times)),
         "cpu_ms_99": float(np.percentile(times, 99)),
     }
 
 
-def aligned_error(found: NDArray[np.float64], true: NDArray[np.float64]) -> float:
-    """Return the root mean square distance of positions (N, 3) after rigid alignment (Umeyama 1991)."""
-    a, b = found - found.mean(axis=0), true - true.mean(axis=0)
-    U, _, V = np.linalg.svd(a.T @ b)
-    R = V.T @ np.diag([1, 1, np.sign(np.linalg.det(V.T @ U.T))]) @ U.T
-    return float(np.sqrt(((a @ R.T - b) ** 2).sum(axis=1).mean()))
+def warm_up(frames: Iterable[AnyFrame], track: Track) -> None:
+    """Track some frames, which compiles."""
+    for frame in frames:
+        if not frame.fault:
+            track(frame)
 
 
 def main() -> None:
@@ -146,7 +149,7 @@ def main() -> None:
             continue
         frames = list(open_source(where, arguments.frames))
         for name, make in trackers.items():
-            run(frames[:5], make)  # compiles
+            warm_up(frames[:5], make())
             rows.append({"recording": where, "tracker": name, **run(frames, make)})
             if not arguments.json:
                 print("  ".join(f"{k} {v:.4g}" if isinstance(v, float) else f"{v}" for k, v in rows[-1].items()))
@@ -155,4 +158,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except StereovoxError as error:
+        raise SystemExit(str(error)) from None

@@ -89,7 +89,7 @@ def rotation_matrix(vector: ArrayLike) -> NDArray[np.float64]:
 
 
 def interpolate(T_a_b0: Transform, T_a_b1: Transform, share: float) -> Transform:
-    """Return the motion at `share` (0 to 1) between two: linear in position, constant turn rate in rotation."""
+    """Return the motion at `share` between two (0 to 1; beyond, it goes on): linear in position, even in turning."""
     T = np.eye(4)
     R0 = T_a_b0[:3, :3]
     T[:3, :3] = R0 @ rotation_matrix(share * rotation_vector(R0.T @ T_a_b1[:3, :3]))

@@ -10,10 +10,8 @@ import numpy as np
 from stereovox.config import Config
 from stereovox.frame import AnyFrame
 from stereovox.se3 import Transform, inverse, orthonormalise, rigidity_error
-from stereovox.track.tracker import Tracked, Tracker
+from stereovox.track.tracker import RIGID, Tracked, Tracker
 
-RIGID = 0.01
-"""Largest rigidity error of a pose that is used here."""
 NO_START = "no frame so far has a pose of its own, at which the map could begin"
 
 
@@ -57,7 +55,7 @@ class GuidedTracker:
             self._begin(own)
         if self._T_world_tracker is None:
             return replace(tracked, lost=NO_START)
-        return _moved(tracked, self._T_world_tracker)
+        return tracked.moved(self._T_world_tracker)
 
     def _begin(self, own: Transform | None) -> None:
         """Take the pose of the image that the tracker's map was begun with for where its world lies."""
@@ -70,10 +68,3 @@ class GuidedTracker:
 def _own_pose(frame: AnyFrame) -> Transform | None:
     T = frame.T_world_sensor
     return orthonormalise(np.asarray(T, float)) if T is not None and rigidity_error(T) < RIGID else None
-
-
-def _moved(tracked: Tracked, T_world_tracker: Transform) -> Tracked:
-    """Return a pose, and its covariance, in another world."""
-    R = np.kron(np.eye(2), T_world_tracker[:3, :3])
-    covariance = R @ tracked.covariance @ R.T if not tracked.lost else tracked.covariance
-    return replace(tracked, T_world_sensor=T_world_tracker @ tracked.T_world_sensor, covariance=covariance)

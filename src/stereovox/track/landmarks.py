@@ -18,7 +18,7 @@ from stereovox.errors import FrameRefused, StereovoxError
 from stereovox.frame import AnyFrame, StereoFrame, name_of
 from stereovox.se3 import Transform, inverse
 from stereovox.track.fit import Fit, Limits, Stage, settled
-from stereovox.track.views import far_apart
+from stereovox.track.views import is_new
 
 NUMBER, APART_PX, QUALITY = 400, 12, 0.01
 """Corners that are followed at most, pixels between new ones, and their least strength by that of the strongest (Shi
@@ -166,7 +166,7 @@ class Landmarks:
     def learn(self, seen: Seen, T: Transform) -> None:
         """As `advance`, and keep the view where it is new."""
         self.advance(seen, T)
-        if all(far_apart(T, view.T, VIEW_M, VIEW_RAD) for view in self._views):
+        if is_new([view.T for view in self._views], T, VIEW_M, VIEW_RAD):
             which, descriptors = self._described(seen.left, self._corners.pixels)
             self._views = [*self._views[1 - VIEWS :], View(T, self._corners.those(which), descriptors)]
 

@@ -93,7 +93,7 @@ class Surfaces:
     def learn(self, seen: Patches, T: Transform) -> None:
         """Add an image that is believed to be at T_map_camera."""
         self._map.add(self._lasting(seen, T), T)
-        if is_new(self._views, T, VIEW_M, VIEW_RAD):
+        if is_new([view.T for view in self._views], T, VIEW_M, VIEW_RAD):
             self._views = [*self._views[1 - VIEWS :], view_of(seen.points, seen.sigma, T)]
         self._learned += 1
         if self._learned % CHECKED == 0:

@@ -128,9 +128,6 @@ class SurfelMap:
     def __init__(self) -> None:
         self._levels = [Surfels(size) for size in SIZES]
 
-    def __len__(self) -> int:
-        return sum(level.number for level in self._levels)
-
     def add(self, seen: Patches, T_map_camera: Transform) -> None:
         """Add the patches of an image."""
         for level in self._levels:

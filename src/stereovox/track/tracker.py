@@ -14,7 +14,7 @@ from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.config import Config, load_config
 from stereovox.errors import FrameRefused, StereovoxError
 from stereovox.frame import AnyFrame, StereoFrame
-from stereovox.se3 import Transform, inverse, orthonormalise, rigidity_error, rotation_matrix, rotation_vector
+from stereovox.se3 import Transform, interpolate, inverse, orthonormalise, rigidity_error, rotation_vector
 from stereovox.track.fit import Fit, Limits
 from stereovox.track.surfaces import Surfaces
 from stereovox.track.views import far_apart
@@ -34,7 +34,7 @@ FIRST = 3.0
 REMEMBERED = 8
 """Times of images that say how far apart they usually are."""
 RIGID = 0.01
-"""Largest rigidity error of a start."""
+"""Largest rigidity error of a pose that is given."""
 CONFIRMED = 5
 """Images in a row that must be tracked after a view is found again, without teaching, until poses count."""
 
@@ -104,6 +104,12 @@ class Tracked:
     lost: str = ""
     begins: bool = False
     believed: bool = False
+
+    def moved(self, T_to_world: Transform) -> Tracked:
+        """Return the same in another world; T_to_world (4, 4) maps the present one into it."""
+        R = np.kron(np.eye(2), T_to_world[:3, :3])
+        covariance = self.covariance if self.lost else R @ self.covariance @ R.T
+        return replace(self, T_world_sensor=T_to_world @ self.T_world_sensor, covariance=covariance)
 
 
 class Tracker:
@@ -250,11 +256,8 @@ class Tracker:
             last = self._stamps[-1] - self._stamps[-2]
             usual = (stamp_ns - self._stamps[-1]) / later
             share = (stamp_ns - self._stamps[-1]) / last if last > SHORTEST * usual else 0.0
-        motion = np.eye(4)
-        motion[:3, :3] = rotation_matrix(share * rotation_vector(self._motion[:3, :3]))
-        motion[:3, 3] = share * self._motion[:3, 3]
         spread = limits.spread * max(later, 1.0) * (1 if len(self._stamps) > 1 else FIRST)
-        return self._T @ motion, self._covariance + np.diag(spread**2)
+        return self._T @ interpolate(np.eye(4), self._motion, share), self._covariance + np.diag(spread**2)
 
     def _seek(self, evidence: Evidence[Seen], seen: Seen, stamp_ns: int) -> Tracked:
         """Look for an image among what was seen before."""
@@ -284,11 +287,10 @@ class Tracker:
         return self._lost(why)
 
     def _found(self, believed: bool = False) -> Tracked:
-        R = np.kron(np.eye(2), self._start[:3, :3])
-        return Tracked(self._start @ self._T, R @ self._covariance @ R.T, believed=believed)
+        return Tracked(self._T, self._covariance, believed=believed).moved(self._start)
 
     def _lost(self, why: str) -> Tracked:
-        return Tracked(self._start @ self._T, np.full((6, 6), np.inf), why)
+        return Tracked(self._T, np.full((6, 6), np.inf), why).moved(self._start)
 
 
 def _evidence_for(frame: AnyFrame, config: Config) -> Evidence[Any]:

@@ -78,12 +78,10 @@ def nearest_views(views: list[View], T: Transform, number: int) -> list[View]:
     return [views[i] for i in np.argsort(away, kind="stable")[:number]]
 
 
-def is_new(views: list[View], T: Transform, metres: float, radians: float) -> bool:
-    """Return whether a pose is farther from those of all views than this."""
-    if not views:
-        return True
-    away = np.linalg.norm(np.array([view.T[:3, 3] for view in views]) - T[:3, 3], axis=1)
-    return all(far_apart(T, views[i].T, metres, radians) for i in np.flatnonzero(away <= metres))
+def is_new(poses: list[Transform], T: Transform, metres: float, radians: float) -> bool:
+    """Return whether a pose is farther from all others than this."""
+    away = np.linalg.norm(np.array([pose[:3, 3] for pose in poses]).reshape(-1, 3) - T[:3, 3], axis=1)
+    return all(far_apart(T, poses[i], metres, radians) for i in np.flatnonzero(away <= metres))
 
 
 def unlike(one: View, other: View) -> float:

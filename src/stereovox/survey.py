@@ -293,21 +293,30 @@ def level_start(source: Stream, config: Config) -> Transform:
     The camera is at the origin. What is up follows from floors, tables and ceilings in the first image, where it shows
     some near the vertical of the image; else the camera is taken to be level.
     """
-    up = upright_axes(config.up)[2] if config.up_direction is None else config.up_direction
-    first = next(_first_images(source), None)
-    found = None if first is None else find_up(None, [first])
+    return level_pose(next(_first_images(source), None), config)
+
+
+def level_pose(first: Frame | None, config: Config) -> Transform:
+    """Return the same, (4, 4), of a first image; None: none shows what is level."""
+    found = None if first is None else find_up(None, [replace(first, T_world_sensor=AHEAD, fault=None)])
     tilt = level_transform(found.direction) if found is not None and found.sure else np.eye(4)
-    return inverse(level_transform(up)) @ tilt @ AHEAD
+    return level_world(config) @ tilt @ AHEAD
+
+
+def level_world(config: Config) -> Transform:
+    """Return the motion (4, 4) from a world whose z axis is up into one in which it is the axis of the settings."""
+    up = upright_axes(config.up)[2] if config.up_direction is None else config.up_direction
+    return inverse(level_transform(up))
 
 
 def _first_images(source: Stream) -> Iterator[Frame]:
-    """Yield depth images at the start of a recording with the pose of a camera that is level."""
+    """Yield depth images at the start of a recording."""
     if source.length is None or not hasattr(source, "frame"):
         return
     for i in range(min(FIRST, source.length)):
         frame = source.frame(i)  # pyright: ignore[reportAttributeAccessIssue] - it can be read in any order
         if isinstance(frame, Frame) and frame.depth.size:
-            yield replace(frame, T_world_sensor=AHEAD, fault=None)
+            yield frame
 
 
 def suggest_range(depths: NDArray[np.float64], camera: PinholeCamera, stereo: bool) -> Suggestion:

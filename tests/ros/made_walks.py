@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -40,6 +41,14 @@ def depth_at(k: int) -> Frame:
     depth[0] = 0
     stamp_ns = START_NS + k * FRAME_NS
     return Frame(depth, CAMERA, base_at(stamp_ns) @ T_BASE_CAMERA, stamp_ns, 0.001)
+
+
+def write_room(path: Path, frames: list[Frame]) -> Path:
+    """Write images of a camera that is tracked, without any pose."""
+    with BagWriter(path) as bag:
+        for frame in frames:
+            bag.depth(replace(frame, stamp_ns=START_NS + frame.stamp_ns), DEPTH, OPTICAL)
+    return path
 
 
 def write_walk(path: Path, frames: int = 12, odometry: bool = False) -> Path:

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -28,6 +29,9 @@ from stereovox.ros.library import optional_message  # noqa: E402
 from stereovox.ros.mapping import Mapping  # noqa: E402
 from stereovox.ros.node import MapNode  # noqa: E402
 from stereovox.ros.options import Options, freeze  # noqa: E402
+from stereovox.ros.poses import fixed_transform  # noqa: E402
+from stereovox.se3 import from_quaternion, inverse  # noqa: E402
+from stereovox.simulate.simulation import Simulation  # noqa: E402
 
 TFMessage = optional_message("tf2_msgs", "TFMessage")
 Octomap = optional_message("octomap_msgs", "Octomap")
@@ -245,3 +249,41 @@ def test_save_reset_and_load(robot, tmp_path):
     refused = robot.call(Trigger, "/stereovox/save")
     assert (refused.success, "not a stereovox map" in refused.message) == (False, True)
     assert not robot.node.set_parameters([rclpy.Parameter("voxel_size", value=0.2)])[0].successful
+
+
+def test_without_poses_the_camera_is_tracked_and_what_is_lost_is_told(robot):
+    source = Simulation("sim:room?camera=kinect&image_width=160")
+    frames = [source.frame(i) for i in range(0, 10, 2)]
+    other = rclpy.create_node("tracked")
+    options = Options(depth=(DEPTH,), fixed=(MOUNT,), poses="track", late_s=60.0)
+    mapping, reports = Mapping(load_config(voxel_size=0.1)), []
+    robot.maker = maker = MapNode(other, mapping, options, str, reports.append)
+    robot.listen(Odometry, "/tracked_odometry", 10)
+    robot.listen(DiagnosticArray, "/diagnostics", 10)
+    robot.until(lambda: robot.send[DEPTH].get_subscription_count() == 2)
+    robot.until(lambda: robot.other.count_publishers("/tracked_odometry"))
+    made = wire.messages()
+    for frame in [*frames, replace(frames[-1], depth=0 * frames[-1].depth, stamp_ns=frames[-1].stamp_ns + 10**8)]:
+        stamp_ns = START_NS + frame.stamp_ns
+        robot.publish("/camera/depth/camera_info", made.camera_info(frame.camera, stamp_ns, OPTICAL))
+        robot.publish(DEPTH, made.image(frame.depth, stamp_ns, OPTICAL))
+    robot.until(lambda: len(reports) == 6 and len(robot.came["/tracked_odometry"]) == 4)
+    assert [report.refused for report in reports] == ["tracking_lost", None, None, None, None, "tracking_lost"]
+    last = robot.came["/tracked_odometry"][-1]
+    assert (last.header.frame_id, last.child_frame_id) == ("odom", "base_link")
+    numbers = fixed_transform(MOUNT)[2]
+    T_base_camera = from_quaternion(numbers[:3], numbers[3:])
+    travelled = inverse(frames[0].T_world_sensor) @ frames[-1].T_world_sensor
+    place = last.pose.pose.position
+    expected = (T_base_camera @ travelled @ inverse(T_base_camera))[:3, 3]
+    np.testing.assert_allclose([place.x, place.y, place.z], expected, atol=0.03)
+    assert 0 < np.reshape(last.pose.covariance, (6, 6)).diagonal().max() < 1e-2
+    counts = maker.counts()
+    assert (counts["frames_tracked"], counts["frames_lost"], counts["tracking"][:5]) == (4, 2, "lost:")
+    robot.came["/diagnostics"].clear()
+    robot.until(lambda: [one for one in robot.came["/diagnostics"] if "tracked" in one.status[0].name])
+    status = next(one.status[0] for one in robot.came["/diagnostics"] if "tracked" in one.status[0].name)
+    assert {pair.key: pair.value for pair in status.values}["frames_lost"] == "2"
+    older = robot.call(LoadMap, "/tracked/load", LoadMap.Request(map_url="/"))
+    assert older.result == LoadMap.Response.RESULT_INVALID_MAP_DATA
+    other.destroy_node()

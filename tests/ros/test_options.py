@@ -71,6 +71,10 @@ def test_something_must_be_mapped_and_a_scan_only_on_a_floor():
         (["--depth", DEPTH, "--out", "/proc/x/y"], "/proc"),
         (["--scan", "/scan"], "dimensions=2"),
         ([], "--depth"),
+        (["--cloud", "/lidar", "--poses", "track"], "--poses track"),
+        (["--depth", DEPTH, "--odometry", "/odom", "--poses", "track"], "--odometry /odom"),
+        (["--depth", DEPTH, "--ros-args", "-p", "ros.poses:=trak"], "did you mean"),
+        (["--depth", DEPTH, "--poses", "track", "--load", "x.svox"], "does not know where it is"),
     ],
 )
 def test_mistakes_end_in_one_line(capsys, words, said):
@@ -90,7 +94,7 @@ def test_whatever_breaks_the_map_is_saved(monkeypatch, tmp_path, alone):
 
     monkeypatch.setenv("ROS_DOMAIN_ID", alone["ROS_DOMAIN_ID"])
     monkeypatch.setattr(MapNode, "spin_once", breaks)
-    monkeypatch.setattr("stereovox.ros.warm_up.warm_up", lambda config: None)
+    monkeypatch.setattr("stereovox.ros.warm_up.warm_up", lambda config, tracked: None)
     with pytest.raises(RuntimeError, match="foresaw"):
         main(["ros2", "--depth", DEPTH, "--odometry", "/odom", "--out", str(tmp_path / "live.svox")])
     assert load_map(tmp_path / "live.svox").frames == 1

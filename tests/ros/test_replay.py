@@ -11,11 +11,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from made_walks import DEPTH, write_walk
+from made_walks import DEPTH, write_room, write_walk
 
 from stereovox.mapper import Mapper
 from stereovox.maps import VoxelMap, load_map
 from stereovox.opening import open_source
+from stereovox.simulate.simulation import Simulation
+from stereovox.track_run import track_recording
 
 PLAYER = Path(__file__).with_name("play.py")
 PATIENCE_S = 150
@@ -71,3 +73,15 @@ def test_the_map_of_a_replay_with_odometry_is_the_map_of_the_bag(tmp_path, alone
     bag = write_walk(tmp_path / "walk.mcap", odometry=True)
     told = played(bag, tmp_path / "live.svox", alone, "no", "--odometry", "/odom", "--ros-args", *PATIENT)
     check_same(told, load_map(tmp_path / "live.svox"), mapped(f"{bag}?poses=/odom"))
+
+
+def test_a_bag_without_poses_is_tracked_as_by_itself(tmp_path, alone):
+    """All but the first image, which the node cannot hold back."""
+    source = Simulation("sim:room?camera=kinect&image_width=160")
+    bag = write_room(tmp_path / "room.mcap", [source.frame(i) for i in range(0, 16, 2)])
+    words = ["--poses", "track", "--max-range", "5", "--ros-args", *PATIENT]
+    told = played(bag, tmp_path / "live.svox", alone, "no", *words)
+    assert (told["frames"], told["refused"], told["dropped"]) == (7, {"tracking_lost": 1}, {})
+    expected = track_recording(str(bag), max_range=5.0, voxel_size=0.1)
+    live = load_map(tmp_path / "live.svox")
+    np.testing.assert_allclose(live.path, expected.T_world_sensor[1:, :3, 3], atol=1e-5)

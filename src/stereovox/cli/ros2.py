@@ -43,6 +43,8 @@ def add_arguments(parser: ArgumentParser) -> None:
     )
     for name, value, about in topics:
         parser.add_argument(f"--{name}", action="append", metavar=value, help=f"{about}; repeatable")
+    about = "those of /tf and the options above, or of the first depth camera, by its own images (given)"
+    parser.add_argument("--poses", choices=("given", "track"), help=about)
     parser.add_argument("--world-frame", metavar="FRAME", help="frame of the map (map, else odom)")
     parser.add_argument("--base-frame", metavar="FRAME", help="frame of the robot (base_footprint, else base_link)")
     parser.add_argument("--out", metavar="MAP", help="where to save the map at the end, and when the service is called")
@@ -68,19 +70,22 @@ def run(arguments: Namespace) -> dict[str, Any]:
     from stereovox.ros.library import running_node
 
     with running_node(arguments.ros_args) as node, ExitStack() as stack:
+        from stereovox.pose_choice import TRACK
         from stereovox.ros.mapping import Mapping
         from stereovox.ros.options import freeze
+        from stereovox.ros.services import check_continuable
         from stereovox.ros.warm_up import warm_up
 
         config, options = _settings(arguments, node)
         options.check_sources(config.dimensions)
         _reserve(options.out, config.dimensions, stack)
         say_about_compiling()
-        warm_up(config)
+        warm_up(config, options.poses == TRACK)
         tiles = Path(options.out).parent / f".{Path(options.out).name}-tiles" if options.out else None
         mapping = Mapping(config, options.heights, tiles)
         stack.callback(mapping.close)
         if arguments.load:
+            check_continuable(arguments.load, options.poses == TRACK)
             mapping.load(arguments.load)
         freeze(node, options.out)
         return _map(arguments, node, mapping, options)
@@ -166,7 +171,7 @@ def _settings(arguments: Namespace, node: Any) -> tuple[Config, Options]:
     profile = arguments.profile or given.settings.pop("profile", "default")
     given.settings.pop("profile", None)
     config = load_config(profile, **{**given.settings, **overrides(arguments)})
-    named = {name: getattr(arguments, name) for name in (*LISTS, "world_frame", "base_frame", "out")}
+    named = {name: getattr(arguments, name) for name in (*LISTS, "poses", "world_frame", "base_frame", "out")}
     given_options = {name: value for name, value in named.items() if value}
     return config, with_parameters(Options(), {**given.options, **given_options})
 

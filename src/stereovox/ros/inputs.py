@@ -21,7 +21,7 @@ from stereovox.depth.sphere.image import T_BODY_GRID
 from stereovox.depth.sphere.layout import SphereLayout
 from stereovox.errors import FrameRefused, StereovoxError
 from stereovox.frame import Frame, Reason, Scan
-from stereovox.ros.poses import Pose
+from stereovox.ros.poses import Pose, PoseBuffer
 from stereovox.se3 import Transform, inverse
 from stereovox.sources.bags.depth_topic import RECTIFIED, UNITS, camera_of, decoded, sibling
 from stereovox.sources.bags.messages import Wire, read_camera_info, read_compressed, read_image
@@ -83,6 +83,10 @@ class Input(Protocol):
     def ready(self) -> bool:
         """Whether everything but the pose is there to convert messages."""
         return True
+
+    def is_final(self, poses: PoseBuffer, frame_id: str, stamp_ns: int) -> bool:
+        """Return whether no later message can change the pose of a message."""
+        return poses.is_final(frame_id, stamp_ns)
 
     def frame(self, data: bytes, where: PoseLookup) -> Frame | Scan:
         """Convert a message; the `fault` of the result says why it cannot be used."""

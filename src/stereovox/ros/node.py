@@ -12,13 +12,16 @@ from time import monotonic_ns
 from typing import Any
 
 from stereovox.frame import UpdateReport
+from stereovox.pose_choice import TRACK
 from stereovox.ros.inputs import CloudInput, DepthInput, FloorCloudInput, Input, ScanInput, header
 from stereovox.ros.mapping import Mapping
+from stereovox.ros.motion import MotionPublisher
 from stereovox.ros.options import Options, split_pair
 from stereovox.ros.outputs import Outputs
 from stereovox.ros.poses import PoseBuffer, fixed_transform
 from stereovox.ros.services import Services
 from stereovox.ros.subscriptions import Silence, Subscriptions
+from stereovox.ros.tracking import TrackedDepthInput, TrackedPoses, Tracking
 from stereovox.ros.waiting import Arrival, Waiting
 
 IDLE_S, SOON_S = 0.05, 0.005
@@ -46,16 +49,16 @@ class MapNode:
         self._node, self._mapping, self._on_report = node, mapping, on_report
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(node)
-        self._poses = PoseBuffer(options.world_frame, options.base_frame, options.extrapolate_s)
+        self._poses, self.tracking = _poses(node, mapping, options)
         for text in options.fixed:
             parent, child, numbers = fixed_transform(text)
             self._poses.tf.add(parent, child, 0, numbers, fixed=True)
-        self._inputs = {one.topic: one for one in _inputs(options, mapping.config.dimensions)}
+        self._inputs = {one.topic: one for one in _inputs(options, mapping.config.dimensions, self.tracking)}
         wait_ns, late_ns = round(1e9 * options.wait_s), round(1e9 * options.late_s)
         self.waiting: Waiting[bytes] = Waiting(options.queue, wait_ns, late_ns, monotonic_ns)
         self.received: Counter[str] = Counter()
         self._outputs = Outputs(node, mapping, options, self.counts)
-        Services(node, mapping, out, self._renewed)
+        Services(node, mapping, out, self._renewed, tracked=self.tracking is not None)
         self._subscriptions = Subscriptions(node, options, self._poses, self._inputs, self._arrived)
         self._silence = Silence(node, self._inputs, self.received)
 
@@ -69,6 +72,7 @@ class MapNode:
             "frames_in_map": history.frames,
             "refused_ever": dict(history.refused),
             "transforms_unreadable": self._poses.tf.unreadable,
+            **(self.tracking.counts() if self.tracking else {}),
         }
 
     def spin_once(self) -> None:
@@ -106,7 +110,8 @@ class MapNode:
         self.waiting.put(topic, stamp_ns, frame_id, data)
 
     def _ready(self, one: Arrival[bytes]) -> bool:
-        return self._inputs[one.sensor].ready and self._poses.is_final(one.frame_id, one.stamp_ns)
+        sensor = self._inputs[one.sensor]
+        return sensor.ready and sensor.is_final(self._poses, one.frame_id, one.stamp_ns)
 
     def _map(self, one: Arrival[bytes]) -> None:
         report = self._mapping.add(self._inputs[one.sensor].frame(one.content, self._poses.pose))
@@ -121,8 +126,19 @@ class MapNode:
         self._outputs.changed(self._node.get_clock().now().nanoseconds, self._poses.world or "map")
 
 
-def _inputs(options: Options, dimensions: int) -> list[Input]:
+def _poses(node: Any, mapping: Mapping, options: Options) -> tuple[PoseBuffer, Tracking | None]:
+    """Return where poses come from, and what tracks the first depth camera, if they are tracked."""
+    names = options.world_frame, options.base_frame, options.extrapolate_s
+    if options.poses != TRACK:
+        return PoseBuffer(*names), None
+    poses = TrackedPoses(*names, base_needed=mapping.config.dimensions == 2)
+    return poses, Tracking(mapping.config, poses, MotionPublisher(node, options.publish_tf).publish)
+
+
+def _inputs(options: Options, dimensions: int, tracking: Tracking | None) -> list[Input]:
     clouds = [FloorCloudInput(topic) if dimensions == 2 else CloudInput(topic, options.cloud_step_deg)
               for topic in options.cloud]  # fmt: skip
     depth = [DepthInput(*split_pair(text)) for text in options.depth]
+    if tracking is not None:
+        depth[0] = TrackedDepthInput(*split_pair(options.depth[0]), tracking)
     return [*depth, *clouds, *map(ScanInput, options.scan)]

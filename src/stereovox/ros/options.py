@@ -14,10 +14,12 @@ from dataclasses import dataclass, fields, replace
 from typing import Any, NamedTuple
 
 from stereovox.errors import StereovoxError, did_you_mean
+from stereovox.pose_choice import GIVEN, TRACK
 
 PREFIX = "ros."
 """Prefix of the parameters that are options of the node."""
 LISTS = ("depth", "cloud", "scan", "odometry", "pose", "fixed")
+POSES = (GIVEN, TRACK)
 OUT = f"{PREFIX}out"
 """The parameter that may change while the node runs."""
 ROS_PARAMETERS = ("use_sim_time", "start_type_description_service", "qos_overrides.")
@@ -31,6 +33,8 @@ class Options:
     depth: topics of depth images; `TOPIC=INFO` where the camera_info is not beside it. cloud, scan: topics.
     odometry: topics of nav_msgs/Odometry; pose: `TOPIC=FRAME`, a topic of PoseStamped and the frame whose pose it is.
     fixed: `PARENT CHILD x y z yaw pitch roll`, fixed pose of a frame in another, metres and radians.
+    poses: `given`, those of tf and the topics above, or `track`, those of the first depth camera, by its own images.
+    publish_tf: publish tracked poses on /tf.
     world_frame: the frame of the map; "": `map`, else `odom`, whichever is connected to the sensors first.
     base_frame: frame of the robot, on the floor, for floor maps; "": `base_footprint`, else `base_link`.
     wait_s: seconds that a frame waits for its pose. extrapolate_s: seconds by which a pose may then be extrapolated.
@@ -47,6 +51,8 @@ class Options:
     odometry: tuple[str, ...] = ()
     pose: tuple[str, ...] = ()
     fixed: tuple[str, ...] = ()
+    poses: str = GIVEN
+    publish_tf: bool = True
     world_frame: str = ""
     base_frame: str = ""
     wait_s: float = 0.5
@@ -63,6 +69,8 @@ class Options:
     out: str = ""
 
     def __post_init__(self) -> None:
+        if self.poses not in POSES:
+            raise StereovoxError(f"{PREFIX}poses '{self.poses}': give given or track{did_you_mean(self.poses, POSES)}")
         for name in ("wait_s", "extrapolate_s", "late_s"):
             if not 0 <= getattr(self, name) <= 60:
                 raise StereovoxError(f"{PREFIX}{name} {getattr(self, name):g}: give seconds, 0 to 60")
@@ -87,6 +95,12 @@ class Options:
         """Return these options; raises StereovoxError for no input topic or one that this kind of map cannot use."""
         if not (self.depth or self.cloud or self.scan):
             raise StereovoxError("no topic to map; give --depth /camera/depth/image_rect_raw, --cloud or --scan")
+        if self.poses == TRACK and not self.depth:
+            raise StereovoxError("--poses track: a depth camera is tracked; give --depth, or the poses: --poses given")
+        if self.poses == TRACK and (self.odometry or self.pose):
+            given = "--odometry" if self.odometry else "--pose"
+            topic = (self.odometry or self.pose)[0]
+            raise StereovoxError(f"{given} {topic}: is not used with --poses track; leave one of them out")
         if self.scan and dimensions == 3:
             raise StereovoxError(
                 f"--scan {self.scan[0]}: a 2-D lidar maps a floor; add --set dimensions=2 or --profile ist2019"

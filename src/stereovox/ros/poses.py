@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from stereovox.errors import FrameRefused, StereovoxError
 from stereovox.se3 import Transform
 from stereovox.sources.bags.messages import Wire
-from stereovox.sources.bags.robot_messages import frame_name, read_odometry, read_transforms
+from stereovox.sources.bags.robot_messages import StampedTransform, frame_name, read_odometry, read_transforms
 from stereovox.sources.bags.tf import Edge, Limits, Tf, tf_poses
 from stereovox.sources.robots.frames import BASES
 
@@ -79,7 +79,7 @@ class PoseBuffer:
             self.tf.unreadable += 1
             return
         for one in transforms:
-            self.tf.add(one.parent, one.child, one.stamp_ns, one.numbers, fixed)
+            self._add(one, fixed)
 
     def on_odometry(self, data: bytes) -> None:
         """Add a `nav_msgs/Odometry`: the pose of its child_frame_id in its frame_id."""
@@ -88,7 +88,7 @@ class PoseBuffer:
         except ValueError:
             self.tf.unreadable += 1
             return
-        self.tf.add(one.parent, one.child, one.stamp_ns, one.numbers)
+        self._add(one)
 
     def on_pose(self, data: bytes, child: str) -> None:
         """Add a `geometry_msgs/PoseStamped`: the pose of frame `child` in its frame_id."""
@@ -98,7 +98,7 @@ class PoseBuffer:
         except ValueError:
             self.tf.unreadable += 1
             return
-        self.tf.add(parent, child, stamp_ns, numbers)
+        self._add(StampedTransform(stamp_ns, parent, child, numbers))
 
     def is_final(self, frame_id: str, stamp_ns: int) -> bool:
         """Return whether a pose is final: no later message can change it."""
@@ -115,12 +115,16 @@ class PoseBuffer:
         self.world, self._base = world, base
         return Pose(T_world_sensor, T_base_sensor, self.tf.off_ns(world, frame_id, stamp_ns))
 
+    def _add(self, one: StampedTransform, fixed: bool = False) -> None:
+        self.tf.add(one.parent, one.child, one.stamp_ns, one.numbers, fixed)
+
     def _world_of(self, frame_id: str) -> str:
         if self.world:
             return self.world
         found = tf_poses(self.tf, frame_id)
         if isinstance(found, str):
-            raise FrameRefused("no_pose", f"{found}; is the odometry running? ros.world_frame names another frame")
+            cure = "is the odometry running? ros.world_frame names another frame; without odometry give --poses track"
+            raise FrameRefused("no_pose", f"{found}; {cure}")
         return found.world
 
     def _base_of(self, frame_id: str) -> str:

@@ -13,6 +13,7 @@ from time import monotonic
 from typing import Any
 
 from stereovox.errors import StereovoxError, one_line
+from stereovox.pose_choice import TRACK
 from stereovox.ros.inputs import DepthInput, Input
 from stereovox.ros.library import optional_message
 from stereovox.ros.options import Options, split_pair
@@ -90,19 +91,19 @@ class Subscriptions:
             self._listen("nav_msgs/Odometry", topic, where.on_odometry, poses)
         for topic, child in map(split_pair, options.pose):
             self._listen("geometry_msgs/PoseStamped", topic, partial(where.on_pose, child=child), poses)
-        self._listen_to_tf(where, bool(options.odometry or options.pose or options.fixed))
+        self._listen_to_tf(where, options)
 
-    def _listen_to_tf(self, where: PoseBuffer, other_poses: bool) -> None:
+    def _listen_to_tf(self, where: PoseBuffer, options: Options) -> None:
         kind = optional_message("tf2_msgs", "TFMessage")
-        if kind is None and not other_poses:
+        tracked = options.poses == TRACK
+        if kind is None and not (tracked or options.odometry or options.pose or options.fixed):
             raise StereovoxError(
-                f"no poses: tf2_msgs is not installed, so /tf cannot be heard. {TF2_MSGS}, or give --odometry or --pose"
+                f"no poses: tf2_msgs is not installed, so /tf cannot be heard. {TF2_MSGS}, or give --odometry, --pose "
+                "or --poses track"
             )
         if kind is None:
-            self._node.get_logger().warning(
-                "tf2_msgs is not installed: /tf is not heard, poses come from ros.odometry, ros.pose and ros.fixed "
-                f"alone. {TF2_MSGS}"
-            )
+            others = "mounts come from ros.fixed" if tracked else "poses come from ros.odometry, ros.pose and ros.fixed"
+            self._node.get_logger().warning(f"tf2_msgs is not installed: /tf is not heard, {others} alone. {TF2_MSGS}")
             return
         moving, fixed = partial(where.on_tf, fixed=False), partial(where.on_tf, fixed=True)
         self._subscribe(kind, "/tf", moving, _qos(POSE_QUEUE, reliable=True))

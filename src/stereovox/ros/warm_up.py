@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Compile the kernels with an empty frame, so that the first real one does not wait for them."""
+"""Compile the kernels with made-up frames, so that the first real one does not wait for them."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 
@@ -10,10 +12,14 @@ from stereovox.config import Config, load_config
 from stereovox.frame import Frame
 from stereovox.ros.mapping import Mapping
 from stereovox.sources.tracker import AXES
+from stereovox.track.tracker import Tracker
 
 
-def warm_up(config: Config) -> None:
-    """Load or compile all kernels that depth images need under these settings; the map is discarded."""
+def warm_up(config: Config, tracked: bool = False) -> None:
+    """Load or compile all kernels that depth images need under these settings; the map is discarded.
+
+    tracked: those that tracking needs, too.
+    """
     mapping = Mapping(load_config(config, **{"window.outside": "drop"}))
     camera = PinholeCamera.from_field_of_view(64, 48, 60.0)
     T_world_camera = np.eye(4)
@@ -21,7 +27,15 @@ def warm_up(config: Config) -> None:
     T_world_camera[2, 3] = 1.0
     middle = (config.min_range + config.max_range) / 2
     depths = np.full((48, 64), middle, np.float32), np.full((48, 64), min(1000 * middle, 60000), np.uint16)
-    for stamp_ns, (depth, scale) in enumerate(zip(depths, (1.0, 0.001), strict=True)):
-        mapping.add(Frame(depth, camera, T_world_camera, stamp_ns, scale))
+    frames = [
+        Frame(depth, camera, T_world_camera, stamp_ns, scale)
+        for stamp_ns, (depth, scale) in enumerate(zip(depths, (1.0, 0.001), strict=True))
+    ]
+    for frame in frames:
+        mapping.add(frame)
     mapping.grid()
     mapping.close()
+    if tracked:
+        tracker = Tracker(config)
+        for stamp_ns, frame in enumerate([*frames, *frames]):
+            tracker.add(replace(frame, stamp_ns=stamp_ns))

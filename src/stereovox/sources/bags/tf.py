@@ -217,6 +217,11 @@ class Tf:
         chain = self._chain(frame_name(frame))
         return chain[-1].parent if chain else frame_name(frame)
 
+    def parent(self, frame: str) -> str:
+        """Return the frame above `frame`, "" at a root and for an unknown frame."""
+        edge = self._up(frame_name(frame))
+        return edge.parent if edge else ""
+
     def _edge(self, parent: str, child: str) -> Edge:
         self._paths.clear()
         parent, child = frame_name(parent), frame_name(child)

@@ -54,6 +54,7 @@ if TYPE_CHECKING:
     from stereovox.track_run import CameraTrack as CameraTrack
     from stereovox.track_run import track_recording as track_recording
     from stereovox.trust.health import Health as Health
+    from stereovox.view.trajectory import trajectory_picture as trajectory_picture
     from stereovox.viewer.live import LiveView as LiveView
     from stereovox.viewer.viewer import open_viewer as open_viewer
 
@@ -107,6 +108,7 @@ _HOMES = {
     "Tracker": "track.tracker",
     "CameraTrack": "track_run",
     "track_recording": "track_run",
+    "trajectory_picture": "view.trajectory",
     "open_viewer": "viewer.viewer",
     "LiveView": "viewer.live",
 }

@@ -92,6 +92,28 @@ class CameraTrack:
         whose = "camera (x right, y down, z forward), tracked"
         write_trajectory(path, self.stamps_ns[found].tolist(), self.T_world_sensor[found], whose)
 
+    def picture(self, file: str | Path) -> None:
+        """Draw the way: from above, its height, where the camera was lost, and errors where there is a score.
+
+        Args:
+            file: The picture to write: .png, .pdf or .svg.
+
+        Raises:
+            StereovoxError: Another suffix, a file that cannot be written, or there is no pose.
+        """
+        from stereovox.view.figures import save
+        from stereovox.view.trajectory import score_figure, way_figure
+
+        known = self.poses()
+        if self.score is not None:
+            save(score_figure(self.score), file)
+        else:
+            positions = np.where(self.tracked[:, None], self.T_world_sensor[:, :3, 3], np.nan)
+            heading = (
+                f"{known.where}: {int(self.tracked.sum()):,} of {len(self.tracked):,} frames, {self.length_m:.2f} m"
+            )
+            save(way_figure(positions, self.tracked, heading), file)
+
     def summary(self) -> dict[str, Any]:
         """Summarise the run.
 

@@ -81,6 +81,12 @@ def test_a_page_and_a_picture_are_written(folder, capsys):
     assert "data:image/png" in page
 
 
+def test_a_picture_alone_is_written(folder, capsys):
+    status, _, err = run(capsys, "kitti.txt", "kitti.txt", "--picture", "way.png")
+    assert (status, err[-1]) == (0, "saved way.png")
+    assert (folder / "way.png").read_bytes()[:4] == b"\x89PNG"
+
+
 WRONG = {
     ("later.tum", "truth.tum"): "later.tum: 0 poses have one of truth.tum no more than 0.02 s apart",
     ("still.tum", "truth.tum"): "still.tum: stands still",
@@ -92,6 +98,8 @@ WRONG = {
     ("ours.tum", "truth.tum", "--tolerance", "3"): "--tolerance: only for maps",
     ("ours.tum", "truth.tum", "--tolerance", "0"): "--tolerance: only for maps",
     ("map.svox", "map.svox", "--scale"): "--scale: only for trajectories",
+    ("map.svox", "map.svox", "--picture", "way.png"): "--picture: only for trajectories",
+    ("ours.tum", "truth.tum", "--picture", "way.jpg"): "--picture way.jpg: end the file's name with .png",
     ("map.svox", "map.svox", "--max-difference", "0"): "--max-difference: only for trajectories",
     ("map.svox", "map.svox", "--no-align"): "--no-align: only for floors' maps (.yaml) and trajectories",
     ("kitti.txt", "kitti.txt", "--max-difference", "0.1"): "kitti.txt: has no times, poses pair by number or line",

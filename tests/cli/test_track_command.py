@@ -48,11 +48,30 @@ def test_poses_of_the_recording_are_compared_with(here, capsys):
     assert json.loads(out.splitlines()[-1])["score"]["poses"] == 6
 
 
+def test_the_next_line_to_type_has_the_options_of_this_one(here, capsys):
+    unposed(here / "desk", 6)
+    options = ["--profile", "default", "--max-range", "4.0", "--frames", ":5", "--set", "noise.s0=0.002"]
+    _, _, err = run(capsys, "track", "desk", "--out", "way.tum", *options)
+    line = err.splitlines()[-1].partition("poses: stereovox ")[2]
+    assert line == f"map desk --poses track {' '.join(options)}"
+    status, _, err = run(capsys, *line.split())
+    assert (status, "poses: tracked, 5 of 5 frames" in err) == (0, True)
+
+
+def test_pictures_with_and_without_poses_to_compare_with(here, capsys):
+    unposed(here / "desk", 8, covered=[1, 6])
+    for words, picture in (((ROOM, "--frames", ":6"), "room.png"), (("desk",), "desk.png")):
+        _, _, err = run(capsys, "track", *words, "--out", "way.tum", "--picture", picture)
+        assert f"saved {picture}" in err
+        assert (here / picture).read_bytes()[:4] == b"\x89PNG"
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
         (("nowhere", "--out", "way.tum"), "no such folder"),
         ((ROOM, "--out", "way.svox"), "way.svox"),
+        ((ROOM, "--out", "way.tum", "--picture", "way.gif"), "--picture way.gif: end the file's name with .png"),
         ((ROOM, "--out", "way.tum", "--set", "max_rnge=3"), "max_range"),
         (("dark", "--out", "way.tum"), "not one frame could be tracked"),
     ],

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from stereovox.cli.maps import dimensions, open_grid, refuse_options
+from stereovox.cli.options import check_ending
 from stereovox.cli.terminal import command_line, say, say_table, thousands
 from stereovox.errors import StereovoxError
 
@@ -82,6 +83,8 @@ def add_arguments(parser: ArgumentParser) -> None:
     both = parser.add_argument_group("floor maps and trajectories")
     both.add_argument("--no-align", action="store_true", help="MAP and TRUTH share a frame: do not align MAP")
     poses = parser.add_argument_group("trajectories")
+    about = "both from above, where the estimate has no pose, and errors along the way and by length"
+    poses.add_argument("--picture", metavar="FILE.png", help=about)
     poses.add_argument("--scale", action="store_true", help="fit the scale, too, as for one camera without metres")
     about = "poses further apart in time are no pair (default: 0.02; not for poses without times)"
     poses.add_argument("--max-difference", type=float, metavar="S", help=about)
@@ -101,7 +104,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
         return _compare_trajectories(arguments)
     if poses:
         raise StereovoxError(f"{poses[0]}: a file of poses, the other one is none; give two maps or two files of poses")
-    refuse_options(arguments, ("scale", "max_difference", "segment"), "only for trajectories")
+    refuse_options(arguments, ("scale", "max_difference", "segment", "picture"), "only for trajectories")
     kinds = {dimensions(path) for path in (arguments.map, arguments.truth)}
     if len(kinds) == 2:
         space = arguments.map if dimensions(arguments.map) == 3 else arguments.truth
@@ -133,6 +136,7 @@ def _compare_trajectories(arguments: Namespace) -> dict[str, Any]:
     from stereovox.report import trajectory as report
 
     refuse_options(arguments, ("threshold", "tolerance", "path", "exclude"), "only for maps")
+    check_ending("--picture", arguments.picture, ".png")
     score = score_trajectory(
         arguments.map,
         arguments.truth,
@@ -150,6 +154,11 @@ def _compare_trajectories(arguments: Namespace) -> dict[str, Any]:
         say(f"drift: laid on each other at the start, the ends are {score.drift_percent:.3f} % of the length apart")
     for note in report.notes(score):
         say(note)
+    if arguments.picture:
+        from stereovox.view.trajectory import trajectory_picture
+
+        trajectory_picture(score, arguments.picture)
+        say(f"saved {arguments.picture}")
     if arguments.report:
         names = Path(arguments.map).name, Path(arguments.truth).name
         page = report.write_trajectory_report(arguments.report, score, *names)

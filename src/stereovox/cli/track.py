@@ -10,12 +10,14 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 from typing import TYPE_CHECKING, Any
 
-from stereovox.cli.options import add_settings, overrides
+from stereovox.cli.options import add_settings, check_ending, overrides
 from stereovox.cli.terminal import command_line, progress_of_steps, say, say_about_compiling, say_lost
 
 if TYPE_CHECKING:
     from stereovox.evaluate.trajectory_score import TrajectoryScore
 
+ALIKE = ("profile", "max_range", "frames", "camera")
+"""Options that `map` has, too, and that poses depend on."""
 EXAMPLE = "stereovox track recordings/kitchen --out way.tum"
 
 
@@ -25,6 +27,8 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--out", required=True, metavar="FILE", help="poses to write: .tum or .txt, lines 'stamp tx ty tz qx qy qz qw'"
     )
+    about = "the way from above, where the camera was lost, and errors where the recording has poses"
+    parser.add_argument("--picture", metavar="FILE.png", help=about)
     parser.add_argument("--profile", metavar="P", help="profile name or TOML file (default)")
     parser.add_argument("--max-range", type=float, metavar="M", help="largest depth in metres that is used")
     parser.add_argument("--frames", metavar="A:B:S", help="only these frames, as a Python slice")
@@ -36,6 +40,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
     """Track the source, write its poses and print a summary."""
     from stereovox.track_run import track_recording
 
+    check_ending("--picture", arguments.picture, ".png")
     say_about_compiling()
     with progress_of_steps("tracking") as progress:
         found = track_recording(
@@ -48,9 +53,19 @@ def run(arguments: Namespace) -> dict[str, Any]:
     say_lost(found.lost)
     if found.score is not None:
         say(_score_line(found.score))
-    line = command_line("map", arguments.source, "--poses", "track")
-    say(f"saved in {arguments.out}; make a map with these poses: {line}")
+    if arguments.picture:
+        found.picture(arguments.picture)
+        say(f"saved {arguments.picture}")
+    say(f"saved in {arguments.out}; make a map with these poses: {_map_line(arguments)}")
     return result
+
+
+def _map_line(arguments: Namespace) -> str:
+    """Return the command that makes a map with the same poses, so with the same options."""
+    given = [(f"--{name.replace('_', '-')}", getattr(arguments, name)) for name in ALIKE]
+    given += [("--set", setting) for setting in arguments.settings]
+    words = [word for option in given if option[1] is not None for word in option]
+    return command_line("map", arguments.source, "--poses", "track", *words)
 
 
 def _score_line(score: TrajectoryScore) -> str:

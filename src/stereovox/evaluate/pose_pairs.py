@@ -37,7 +37,9 @@ class PosePairs:
     T_world_body, T_truth_body: (N, 4, 4) float64, estimated and true. estimate_poses, truth_poses: number of all poses
     of each. coverage: share of the truth's time span in which there are estimated poses without a gap (see
     MAX_GAP_S); without times, the share of the truth's poses that have a partner. estimate, truth: what they came
-    from, for messages.
+    from, for messages. truth_positions: (K, 3) float64 metres of all true poses; truth_index: (N,) int64, which of them
+    are paired. truth_missed: (K,) bool, which of them lie where the estimate has no pose for longer than
+    MAX_GAP_INTERVALS of its usual intervals; without times, which have no partner.
     """
 
     stamps_ns: NDArray[np.int64] | None
@@ -48,6 +50,9 @@ class PosePairs:
     coverage: float
     estimate: str
     truth: str
+    truth_positions: NDArray[np.float64]
+    truth_index: NDArray[np.int64]
+    truth_missed: NDArray[np.bool_]
 
     def __len__(self) -> int:
         return len(self.T_world_body)
@@ -70,6 +75,8 @@ def pair_poses(estimate: TrajectoryLike, truth: TrajectoryLike, max_difference_s
         i, j = _by_time(ours.stamps_ns, true.stamps_ns, round(limit_s * 1e9))
         stamps_ns = ours.stamps_ns[i]
         coverage = _covered(ours.stamps_ns, true.stamps_ns)
+        missed = _missed(ours.stamps_ns, true.stamps_ns)
+        missed[j] = False
         cure = f"no more than {limit_s:g} s apart; are they of one recording and one clock?"
     elif isinstance(ours, ImagePoses) and isinstance(true, ImagePoses):
         if max_difference_s is not None:
@@ -77,12 +84,15 @@ def pair_poses(estimate: TrajectoryLike, truth: TrajectoryLike, max_difference_s
             raise StereovoxError(f"{ours.where}: has no times, poses pair by number or line; {cure}")
         i, j = _by_number(ours, true)
         stamps_ns, coverage, cure = None, len(j) / len(true), "with the same number; are they of one recording?"
+        missed = ~np.isin(np.arange(len(true)), j)
     else:
         timeless = ours if isinstance(ours, ImagePoses) else true
         raise StereovoxError(f"{timeless.where}: has no times, the other trajectory has; give both as TUM lines")
     if len(i) < MIN_PAIRS:
         raise StereovoxError(f"{ours.where}: {len(i)} poses have one of {true.where} {cure} ({MIN_PAIRS} are needed)")
-    return PosePairs(stamps_ns, T[i], T_true[j], len(ours), len(true), coverage, ours.where, true.where)
+    return PosePairs(
+        stamps_ns, T[i], T_true[j], len(ours), len(true), coverage, ours.where, true.where, T_true[:, :3, 3], j, missed
+    )
 
 
 def _checked(poses: Poses | ImagePoses) -> NDArray[np.float64]:
@@ -124,3 +134,11 @@ def _covered(ours_ns: NDArray[np.int64], truth_ns: NDArray[np.int64]) -> float:
     inside = np.diff(np.clip(ours_ns, truth_ns[0], truth_ns[-1]))
     limit_ns = max(MAX_GAP_S * 1e9, MAX_GAP_INTERVALS * float(np.median(gaps)))
     return float(inside[gaps <= limit_ns].sum() / max(truth_ns[-1] - truth_ns[0], 1))
+
+
+def _missed(ours_ns: NDArray[np.int64], truth_ns: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Return which true poses (K,) lie in a gap of the estimate, before it or after it, that is too long."""
+    limit_ns = MAX_GAP_INTERVALS * float(np.median(np.diff(ours_ns))) if len(ours_ns) > 1 else 0.0
+    ends = np.concatenate([truth_ns[:1], ours_ns, truth_ns[-1:]])
+    after = np.searchsorted(ours_ns, truth_ns) + 1
+    return ends[after] - ends[after - 1] > limit_ns

@@ -21,7 +21,7 @@ LAYERS = (
     {"sensors", "trust", "device"},
     {"depth", "maps"},
     {"intake", "integrate", "products", "sources"},
-    {"comparison", "deadline", "formats", "localize", "simulate", "track"},
+    {"comparison", "deadline", "formats", "localize", "rebuild", "simulate", "track"},
     {"mapper", "opening"},
     {"calibrate", "evaluate", "pose_choice", "survey"},
     {"run", "view"},

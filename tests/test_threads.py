@@ -19,7 +19,7 @@ from stereovox.errors import StereovoxError
 from stereovox.formats import bags, meshes, octomap, points, rerun
 from stereovox.frame import Viewpoint
 from stereovox.mapper import GridMapper
-from stereovox.maps import cell_pool, cubes
+from stereovox.maps import cell_pool, cubes, make_map
 from stereovox.maps.evidence import Evidence, GridEvidence
 from stereovox.maps.occupancy import Percent
 from stereovox.maps.storage import OnStorage, Storage
@@ -95,6 +95,7 @@ def test_threads_that_add_ask_and_save_meet_the_map_between_two_frames():
 SPACE = {
     "add": (NO_EVIDENCE,),
     "age": (PLACE,),
+    "become": "another",
     "blocks_within": ((0, 0, 0), (1, 1, 1)),
     "cast_rays": (PLACE, PLACE, 1.0),
     "cells_in": (sv.State.FREE,),
@@ -107,6 +108,7 @@ SPACE = {
     "go_on_with": "storage",
     "insert": (NO_BLOCKS, np.empty((0, 512), np.int16)),
     "log_odds": (PLACE,),
+    "make_anew": "unknown",
     "look_from": (Viewpoint(CAMERA, np.eye(4), 0),),
     "nearest_obstacle": (PLACE, 1.0),
     "probability": (PLACE,),
@@ -147,6 +149,8 @@ def test_every_call_holds_the_lock_once(kind, tmp_path):
         "config": lambda: (one.config,),
         "storage": lambda: (sv.VoxelMap(one.config).storage,),
         "blocks": lambda: (sv.VoxelMap(one.config).storage, []),
+        "another": lambda: (make_map(one.config).storage,),
+        "unknown": lambda: (NO_BLOCKS, sv.VoxelMap(one.config).storage),
         "path": lambda: (tmp_path / "m",),
         "picture": lambda: (0, 0, Percent(one.storage.rules), np.zeros((2, 2), np.int8)),
     }

@@ -143,6 +143,21 @@ def quality_levels(config: Config) -> list[Quality]:
     ]
 
 
+class Levels:
+    """All quality levels by name, made when they are first asked for; for frames that were mapped before."""
+
+    def __init__(self, config: Config):
+        self._config = config
+        self._made: dict[str, Quality] = {}
+
+    def __call__(self, name: str) -> Quality:
+        """Return the level of this name. Raises ConfigError where its settings leave nothing to see."""
+        if name not in self._made:
+            levels = [full_quality(self._config)] if name == FULL else quality_levels(self._config)
+            self._made = {level.name: level for level in levels} | self._made
+        return self._made[name]
+
+
 class NearDepth:
     """Depth images up to `near` metres, `stride` by `stride` pixels merged into one; wide cameras keep all pixels.
 

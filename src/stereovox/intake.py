@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from types import TracebackType
 
 from stereovox.config import Config
@@ -39,6 +40,10 @@ class Intake:
         arrived_ns = self.monitor.now()
         self._map.lock.refuse_holder()
         return Offer(self, frame, arrived_ns)
+
+    def closed(self) -> AbstractContextManager[object]:
+        """Return what lets no frame in while it is entered."""
+        return self._adding
 
 
 class Offer:

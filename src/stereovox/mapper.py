@@ -6,24 +6,30 @@ Read `Mapper.add` (voxel maps) or `GridMapper.add` (2-D grids) first: each step 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from time import monotonic_ns, perf_counter
 from typing import Any, Protocol, TypeVar
 
 from stereovox.comparison import Comparison
 from stereovox.config import Config, load_config
-from stereovox.deadline import Deadline
+from stereovox.deadline import Deadline, Levels
 from stereovox.depth import DepthPipeline
 from stereovox.device import check_on_processor, on_usable_device
 from stereovox.errors import MapFileError
-from stereovox.frame import AnyFrame, Scan
+from stereovox.frame import AnyFrame, Frame, Scan
 from stereovox.frame import UpdateReport as UpdateReport
 from stereovox.intake import Intake
 from stereovox.integrate.beams import make_beams
 from stereovox.maps import VoxelMap, make_map
+from stereovox.maps.evidence import Evidence
 from stereovox.maps.grid_map import GridMap
+from stereovox.maps.kept_frames import Packed, kept_frame
 from stereovox.maps.occupancy import OccupancyGrid
+from stereovox.rebuild import CorrectionReport, FrameKey, correct
+from stereovox.se3 import Transform
+from stereovox.threads import MapLock
+from stereovox.trust.gate import Passed
 from stereovox.trust.health import Health
 from stereovox.trust.validate import validate_upright_scan
 
@@ -119,6 +125,7 @@ class Mapper:
     ):
         self.config = on_usable_device(load_config(profile, **overrides))
         self._deadline = Deadline(self.config)
+        self._levels, self._tiles, self._correcting = Levels(self.config), tiles, MapLock()
         self.map = make_map(self.config, resume, tiles)  # may leave tiles on disk, so whatever can fail comes first
         self._intake = Intake(self.config, self.map, clock)
         self._comparison = Comparison(self.config, self._intake.gate)
@@ -142,10 +149,12 @@ class Mapper:
             passed = offer.check(image)
             evidence = quality.integrator.evidence(image)
             evidence, passed = self._comparison.check(frame, image, evidence, passed, quality.integrator, self.map)
+            packed = self._packed(depth_frame, passed)
             with self.map.lock:
                 self.map.storage.check_room(evidence)
                 self.map.storage.look_from(image.viewpoint)
                 cells = self.map.add(evidence)
+                self._keep(depth_frame, packed, passed, quality.name, evidence)
                 offer.accept(passed, quality.name)
                 self.map.history.ways[quality.name] += 1
                 self.map.history.path.walk(passed.sensor, passed.seen)
@@ -156,6 +165,31 @@ class Mapper:
             self._deadline.record(match_ms + depth_ms + map_ms)
             self._deadline.warm_up(frame, depth_frame.camera)
         return offer.report
+
+    def correct(self, poses: Mapping[FrameKey, Transform]) -> CorrectionReport:
+        """Give frames of the map new poses, as after a loop closure; needs `map.keep_frames`.
+
+        The map is then bit for bit the one that a new run makes of the same frames at these poses. Frames that were
+        refused are not judged again. Other threads may add frames and read the map meanwhile; it changes at once. The
+        gate compares the next frames of a sensor with the corrected pose of its last one.
+
+        Where `map.frames_budget` did not hold all frames, the map is made of those that are kept.
+
+        Args:
+            poses: T_world_sensor (4, 4) by the frame's stamp in nanoseconds, or by sensor and stamp where several
+                frames have it. Poses of frames that are not kept, such as refused ones, are ignored and counted.
+
+        Returns:
+            How many frames moved and how much was made anew.
+
+        Raises:
+            StereovoxError: No frame was kept, no pose is of one that was, a pose is no rigid motion, the corrected map
+                does not fit into `max_memory`, or this thread holds the map's `lock`. The map is then as it was.
+            MapFileError: Kept frames of a map that was loaded are gone from the disk.
+        """
+        self.map.lock.refuse_holder()
+        with self._correcting:
+            return correct(self.map.storage, self._levels, poses, self._intake.closed(), self._tiles)
 
     def expect(self, frame: AnyFrame) -> None:
         """Begin to prepare the frame that will be added next, in the background, while this one is added.
@@ -201,6 +235,16 @@ class Mapper:
     def close(self) -> None:
         """Release what the map holds outside memory: nothing, unless it keeps tiles on disk."""
         self.map.close()
+
+    def _packed(self, frame: Frame, passed: Passed) -> Packed | None:
+        """Return the frame's depth image to be kept; None where it is not."""
+        kept = self.map.storage.kept
+        return None if kept is None or not kept.wants(passed.sensor, passed.seen) else Packed.of(frame)
+
+    def _keep(self, frame: Frame, packed: Packed | None, passed: Passed, quality: str, evidence: Evidence) -> None:
+        kept = self.map.storage.kept
+        if kept is not None and packed is not None:
+            kept.keep(kept_frame(frame, packed, self.map.frames, passed.sensor, passed.seen, quality, evidence))
 
 
 class GridMapper:

@@ -48,6 +48,8 @@ MAX_COUNT = 1 << 62
 """Counts in files are smaller."""
 MAX_NODES = 100_000
 """Most values in a YAML file, each counted as often as aliases repeat it."""
+ZSTD = b"\x28\xb5\x2f\xfd"
+"""First bytes of what zstd packs."""
 MAX_NUMBER = 1e300
 """Bound of numbers in settings: TOML's integers are unbounded, floats are not."""
 
@@ -211,6 +213,21 @@ def count_in(table: dict[str, Any], key: str) -> int:
     if type(count) is not int or not 0 <= count < MAX_COUNT:
         raise ValueError(f"{key} {shown(count)} is no count")
     return count
+
+
+def zstd_size(head: bytes) -> int | None:
+    """Return the size that a zstd frame says it unpacks to (RFC 8878, 3.1.1), by its first 18 bytes.
+
+    None where it says nothing, and where it is no such frame.
+    """
+    if len(head) < 6 or head[:4] != ZSTD:
+        return None
+    flags = head[4]
+    alone, dictionary, length = flags >> 5 & 1, (0, 1, 2, 4)[flags & 3], (0, 2, 4, 8)[flags >> 6]
+    length = length or alone
+    start = 5 + (1 - alone) + dictionary
+    size = int.from_bytes(head[start : start + length], "little")
+    return (size + 256 if length == 2 else size) if length and len(head) >= start + length else None
 
 
 def shown(value: Any) -> str:

@@ -13,7 +13,7 @@ from numcodecs import Zstd
 from stereovox.config import load_config
 from stereovox.errors import MapFileError
 from stereovox.maps import VoxelMap, load_map
-from stereovox.maps.store import _announced
+from stereovox.safe_io import zstd_size
 
 CONFIG = load_config(voxel_size=0.1)
 
@@ -105,7 +105,7 @@ def test_a_chunk_that_swells(folder, size):
 
 @pytest.mark.parametrize("size", [0, 1, 255, 256, 65_791, 65_792, 4_000_000])
 def test_what_a_packed_piece_announces(size):
-    assert _announced(Zstd().encode(bytes(size))[:18].ljust(18, b"\0")) == size
+    assert zstd_size(Zstd().encode(bytes(size))[:18].ljust(18, b"\0")) == size
 
 
 def test_links_lead_nowhere(folder, tmp_path):

@@ -50,8 +50,8 @@ class Config(Section):
         integrator: `projective`, `ray`, `line`, or one that another package registers.
         threads: Threads of the integrator; the map does not depend on their number.
         device: `cpu`, or `cuda` for an NVIDIA graphics card: the integrator `projective` with pinhole cameras, for maps
-            without a window, `max_memory`, `map.keep_times` or `sphere`. Without such a card it is `cpu`, and a line
-            says so.
+            without a window, `max_memory`, `map.keep_times`, `map.keep_frames` or `sphere`. Without such a card it is
+            `cpu`, and a line says so.
         pose_rigidity_tolerance: Largest entry of abs(R^T R - I) that counts as rounding of a pose.
         deadline_ms: Milliseconds a frame may take; `pace` sets what is left out where frames take longer. Not set:
             no limit.
@@ -162,6 +162,7 @@ class Config(Section):
             "window.size": self.window.size is not None,
             "max_memory": self.max_memory is not None,
             "map.keep_times": self.map.keep_times,
+            "map.keep_frames": self.map.keep_frames,
             "sphere.step_deg": self.sphere.step_deg is not None,
         }
         for name, wanted in not_there.items():
@@ -181,6 +182,8 @@ class Config(Section):
                 raise ValueError(f"{name} {value:g} must be smaller than max_range {self.max_range:g}")
         if self.dimensions == 2 and (self.map.keep_times or (self.max_memory and self.when_full != "refuse")):
             raise ValueError('a floor\'s grid has no map.keep_times, and when_full can only be "refuse"')
+        if self.dimensions == 2 and self.map.keep_frames:
+            raise ValueError("map.keep_frames is for maps in space; leave it out for the map of a floor")
         if self.when_full != "refuse" and self.max_memory is None:
             raise ValueError(f'when_full "{self.when_full}" needs max_memory, for example max_memory="500 MB"')
         if self.dimensions == 2 and self.deadline_ms is not None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ByteSize, ConfigDict, Field, model_validator
 
 from stereovox.config.base import Section
 
@@ -62,6 +62,10 @@ class MapConfig(Section):
     log_odds_min, log_odds_max: limits of a cell's log-odds.
     free_below, occupied_above: probabilities below which a cell is free, and above which it is occupied.
     forget_s: a cell without evidence for so many seconds of the recording becomes unknown; needs `keep_times`.
+    keep_frames: keep the depth images of all frames in the map, without loss, so that their poses can be corrected
+        later (docs/corrections.md).
+    frames_budget: bytes that kept frames may take, as a number or like "500 MB"; where they need more, only those are
+        kept whose views differ most. Not set: no limit.
     """
 
     cell: Literal["int16", "int8", "uint8"] = "int16"
@@ -73,6 +77,8 @@ class MapConfig(Section):
     confirm_hits: int = Field(1, ge=1, le=100)
     keep_times: bool = False
     forget_s: float | None = Field(None, gt=0)
+    keep_frames: bool = False
+    frames_budget: ByteSize | None = Field(None, gt=0, le=10**13)
 
     @model_validator(mode="after")
     def _ordered(self) -> MapConfig:
@@ -80,6 +86,8 @@ class MapConfig(Section):
             raise ValueError("free_below must be smaller than occupied_above")
         if self.forget_s is not None and not self.keep_times:
             raise ValueError("forget_s needs keep_times = true")
+        if self.frames_budget is not None and not self.keep_frames:
+            raise ValueError("frames_budget needs keep_frames = true")
         return self
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from stereovox.config import Config
 from stereovox.errors import ConfigError
+from stereovox.maps.kept_frames import KeptFrames
 from stereovox.maps.storage import Storage
 from stereovox.maps.voxel_map import State, VoxelMap, load_map, unbounded
 
@@ -25,12 +26,26 @@ def make_map(config: Config, resume: VoxelMap | None = None, tiles: Path | None 
         raise ConfigError(
             f"profile {config.profile}: dimensions 2 is a floor's grid; use GridMapper, map_floor or `stereovox grid`"
         )
+    kept = _kept_frames(config, resume)
     if resume is not None:
         resume.storage.check_cells(config)  # before anything lies on the disk
     try:
-        return _made(config, resume, tiles)
+        made = _made(config, resume, tiles)
+        made.storage.kept = kept
+        return made
     except MemoryError:
         raise ConfigError("this machine has no room for the map; set a smaller max_memory or window.size") from None
+
+
+def _kept_frames(config: Config, resume: VoxelMap | None) -> KeptFrames | None:
+    """Return where frames are kept, those of `resume` among them. Raises ConfigError where it did not keep its own."""
+    if not config.map.keep_frames:
+        return None
+    if resume is None:
+        return KeptFrames(config.map.frames_budget)
+    if (kept := resume.storage.kept) is not None:
+        return KeptFrames(config.map.frames_budget, kept.frames, kept.spacing)
+    raise ConfigError("cannot go on: the map did not keep its frames; set map.keep_frames=false, or begin a new map")
 
 
 def _made(config: Config, resume: VoxelMap | None, tiles: Path | None) -> VoxelMap:

@@ -93,6 +93,14 @@ class RollingStorage(Storage):
             self._take_over()
             self._rehearse()
 
+    def become(self, other: Storage) -> None:
+        """Take over all cells, the window and the tiles of a map of the same settings, not to be used any more."""
+        assert isinstance(other, RollingStorage)
+        self.close()
+        super().become(other)
+        self._window, self._earlier, self._turned, self._since = other._window, None, other._turned, other._since
+        self._store, self._times_store = other._store, other._times_store
+
     def look_from(self, viewpoint: Viewpoint) -> None:
         """Remember where the camera stands and move the window after it.
 

@@ -22,12 +22,17 @@ from stereovox.maps.cell_pool import CellPool
 from stereovox.maps.cell_times import NEVER, CellTimes
 from stereovox.maps.evidence import LARGEST, LOG_ODDS_SCALE, Evidence
 from stereovox.maps.frame_agreement import Agreement, agreement
+from stereovox.maps.kept_frames import KeptFrames
 from stereovox.maps.queries import INDEX_LIMIT
+from stereovox.maps.tiles import TileStore
 from stereovox.threads import Guarded, MapLock, in_steps
 from stereovox.trust.history import History, WithHistory
 
 EVERYWHERE = np.array([[-(2**30)] * 3, [2**30] * 3])
 """Lowest block that `Storage.blocks_within` may be asked for, and the first beyond the highest."""
+
+NOT_OF_FRAMES = {"profile", "map", "threads", "trust", "deadline_ms"}
+"""Settings that do not change what a frame that was taken says; `map` is compared by itself."""
 
 Blocks = tuple[NDArray[np.int32], NDArray[np.integer]]
 """Block coordinates (n, 3), and their cells (n, 512) as they are stored."""
@@ -68,7 +73,9 @@ class Storage(Guarded):
         viewpoint: Where the camera stood last; None before the first frame.
         window_state: Where the window was, for a map that has or had one.
         listeners: Called with the evidence after every `add`, the lock held. No other block has changed, but for those
-            that a window or time took away.
+            that a window or time took away. After a correction of poses with `uniform` evidence of 0 on all blocks
+            that were made anew.
+        kept: The depth images of all frames; None where they are not kept.
         rules: What stored numbers mean.
         cell_format: How log-odds are stored.
     """
@@ -83,6 +90,7 @@ class Storage(Guarded):
         self.viewpoint: Viewpoint | None = None
         self.window_state: dict[str, Any] | None = None
         self.listeners: list[Callable[[Evidence], None]] = []
+        self.kept: KeptFrames | None = None
         self.rules = CellRules(config.map)
         self.cell_format = self.rules.format
         self._most_rise = self.rules.most_rise
@@ -90,11 +98,22 @@ class Storage(Guarded):
         self._times = CellTimes(config.map) if config.map.keep_times else None
 
     def check_cells(self, config: Config) -> None:
-        """Raise ConfigError when `config` gives cells another meaning: their size or the `map` section."""
-        for name in ("voxel_size", "steps", "map"):
-            old, new = getattr(self.config, name), getattr(config, name)
-            if old != new:
-                raise ConfigError(f"cannot go on: the map was made with {name} {old}, now {new} is wanted")
+        """Raise ConfigError when `config` gives cells another meaning: their size or the `map` section.
+
+        Where a map that kept its frames goes on keeping them, also when these would be mapped otherwise.
+        """
+        for name in ("voxel_size", "steps"):
+            self._check_same(name, getattr(self.config, name), getattr(config, name))
+        of_frames = {"keep_frames": config.map.keep_frames, "frames_budget": config.map.frames_budget}
+        self._check_same("map", self.config.map.model_copy(update=of_frames), config.map)
+        if self.kept is not None and config.map.keep_frames:
+            for name in type(config).model_fields.keys() - NOT_OF_FRAMES:
+                self._check_same(name, getattr(self.config, name), getattr(config, name))
+
+    @staticmethod
+    def _check_same(name: str, old: Any, new: Any) -> None:
+        if old != new:
+            raise ConfigError(f"cannot go on: the map was made with {name} {old}, now {new} is wanted")
 
     def continue_with(self, config: Config) -> None:
         """Take over the settings of a run that goes on with this map; raises ConfigError as `check_cells` does."""
@@ -112,6 +131,32 @@ class Storage(Guarded):
             if self._times is not None:
                 self.set_times(coords, other.times_of(coords), other.times_start_ns)
         self.take_history(other)
+
+    @property
+    def tile_store(self) -> TileStore | None:
+        """Where cells outside a window are kept, if they are: nowhere here."""
+        return None
+
+    @property
+    def coords_in_memory(self) -> NDArray[np.int32]:
+        """Coordinates (n, 3) of the blocks that are in memory, in no order."""
+        return self._pool.block_coords
+
+    def make_anew(self, coords: NDArray[np.int32], other: Storage) -> None:
+        """Take over blocks (n, 3) from a map of the same settings, with their times; unknown where it has none."""
+        coords = np.ascontiguousarray(coords, np.int32)
+        self._pool.remove(coords)
+        if self._times is not None:
+            self._times.remove(coords)
+        found, cells = other._pool.get(coords)
+        self.insert(found, cells)
+        if self._times is not None:
+            self._times.put(found, other.times_of(found))
+
+    def become(self, other: Storage) -> None:
+        """Take over all cells of a map of the same settings, which must not be used any more."""
+        self._pool, self._times = other._pool, other._times
+        self.viewpoint, self.window_state = other.viewpoint, other.window_state
 
     def insert(self, coords: NDArray[np.int32], cells: NDArray[np.integer]) -> None:
         """Set whole blocks: coordinates (n, 3), cells (n, 512) as stored; what stood there before is lost.

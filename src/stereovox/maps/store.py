@@ -35,10 +35,12 @@ from stereovox.errors import MapFileError
 from stereovox.frame import Viewpoint
 from stereovox.maps.blocks import CELLS, SIDE
 from stereovox.maps.cell_format import FORMATS
+from stereovox.maps.frame_store import FRAME_FILES, files_of_frames, read_frames, write_frames
+from stereovox.maps.kept_frames import KeptFrames
 from stereovox.maps.lock import LOCK, only_writer_in
 from stereovox.maps.queries import INDEX_LIMIT
 from stereovox.maps.storage import Storage
-from stereovox.safe_io import count_in, json_value, read_bounded, sync_folder, sync_tree
+from stereovox.safe_io import count_in, json_value, read_bounded, sync_folder, sync_tree, zstd_size
 from stereovox.trust.history import History
 
 ARRAYS = ("coords", "cells", "times")
@@ -48,21 +50,20 @@ MAX_CHUNK = 1 << 26
 SMALL, PACKED_BEST = 1 << 24, 100
 """Coordinates may unpack to so many bytes, or to so many for each of theirs on disk."""
 BYTES, LITTLE = {"name": "bytes"}, {"name": "bytes", "configuration": {"endian": "little"}}
-ZSTD = b"\x28\xb5\x2f\xfd"
 FORMAT = "stereovox-map"
 VERSION, READABLE = 2, (1, 2)
 MANIFEST = "manifest.json"
 MAX_MANIFEST = 1 << 22
 """Bytes of a manifest."""
 BLOCKS_PER_CHUNK = 4096
-UNFINISHED = re.compile(r"cells-[0-9a-f]{12}|\.manifest\.json\.new|\.lock")
+UNFINISHED = re.compile(rf"cells-[0-9a-f]{{12}}|{FRAME_FILES}|\.manifest\.json\.new|\.lock")
 """Names of what a killed save leaves."""
 Slab = tuple[NDArray, ...]
 """Block coordinates (n, 3), cells (n, 512), and times (n, 512) where they are kept."""
 
 
 class SavedMap(NamedTuple):
-    """What a saved map holds; `times` is None where none were kept."""
+    """What a saved map holds; `times` is None where none were kept, `kept` where its frames were not."""
 
     config: Config
     history: History
@@ -72,6 +73,7 @@ class SavedMap(NamedTuple):
     cells: NDArray[np.integer]
     times: NDArray[np.uint32] | None
     times_start_ns: int | None
+    kept: KeptFrames | None
 
 
 def save_map(storage: Storage, path: str | Path) -> None:
@@ -88,10 +90,11 @@ def save_map(storage: Storage, path: str | Path) -> None:
         try:
             blocks, checksum = _write_arrays(folder / data, storage)
             sync_tree(folder / data)
-            _write_manifest(folder, _manifest(storage, data, blocks, checksum))
+            frames = None if storage.kept is None else write_frames(folder, storage.kept)
+            _write_manifest(folder, {**_manifest(storage, data, blocks, checksum), "kept_frames": frames})
         except BaseException as error:
             _let_writes_end()
-            if _named(folder) != data:  # else it is the map already, whatever the disk says
+            if data not in _named(folder):  # else it is the map already, whatever the disk says
                 sweep(folder)
             if not isinstance(error, OSError):
                 raise
@@ -152,9 +155,10 @@ def _read(folder: Path, manifest: dict[str, Any]) -> SavedMap:
         coords, cells, *times = arrays = read_blocks(data, blocks, *dtypes)
         if _checksums(arrays, manifest["checksum"]) != manifest["checksum"]:
             raise ValueError("the cells do not match their checksum")
+        kept = read_frames(folder, manifest.get("kept_frames"), config.map.frames_budget)
     except (KeyError, TypeError, ValueError, OSError, RuntimeError, OverflowError, AttributeError) as error:
         raise MapFileError(f"{folder}: damaged map ({type(error).__name__}: {error}); make it anew") from None
-    return SavedMap(config, history, viewpoint, window, coords, cells, times[0] if times else None, start_ns)
+    return SavedMap(config, history, viewpoint, window, coords, cells, times[0] if times else None, start_ns, kept)
 
 
 def read_blocks(folder: Path, blocks: int, *dtypes: np.dtype[Any]) -> tuple[NDArray[Any], ...]:
@@ -229,18 +233,8 @@ def _check_chunk(path: Path, size: int, unpacked: int) -> None:
     """Raise ValueError for a chunk that does not say that it unpacks to just so many bytes."""
     with path.open("rb") as file:
         head = file.read(18)
-    if len(head) < 6 or head[:4] != ZSTD or _announced(head) != unpacked or size > 2 * unpacked + 64:
+    if zstd_size(head) != unpacked or size > 2 * unpacked + 64:
         raise ValueError(f"chunk {path.parent.name} of {path.parents[2].name} does not unpack to {unpacked} bytes")
-
-
-def _announced(head: bytes) -> int | None:
-    """Return the size that a zstd frame says it unpacks to (RFC 8878, 3.1.1); None where it says nothing."""
-    flags = head[4]
-    alone, dictionary, length = flags >> 5 & 1, (0, 1, 2, 4)[flags & 3], (0, 2, 4, 8)[flags >> 6]
-    length = length or alone
-    start = 5 + (1 - alone) + dictionary
-    size = int.from_bytes(head[start : start + length], "little")
-    return (size + 256 if length == 2 else size) if length and len(head) >= start + length else None
 
 
 def _check_coords(coords: NDArray[np.int32]) -> None:
@@ -298,11 +292,11 @@ def _is_free(folder: Path) -> bool:
 def sweep(folder: Path) -> None:
     """Remove what killed or failed saves left: all that the manifest does not name. The lock must be held."""
     named = _named(folder)
-    if named is None and is_map(folder):
+    if not named and is_map(folder):
         return  # a damaged map stays as it is
     with suppress(OSError):  # what cannot be removed does no harm
         for entry in folder.iterdir():
-            if UNFINISHED.fullmatch(entry.name) and entry.name not in (named, LOCK):
+            if UNFINISHED.fullmatch(entry.name) and entry.name not in {*named, LOCK}:
                 shutil.rmtree(entry, ignore_errors=True) if entry.is_dir() else entry.unlink()
 
 
@@ -316,11 +310,12 @@ def _let_writes_end() -> None:
     sync(the_others())
 
 
-def _named(folder: Path) -> Any:
-    """Return the name of the saved cells; None where there is no map, or a damaged one."""
-    with suppress(MapFileError):
-        return read_manifest(folder).get("data")
-    return None
+def _named(folder: Path) -> set[str]:
+    """Return the names of the saved cells and frames; none where there is no map, or a damaged one."""
+    with suppress(MapFileError, KeyError, TypeError):
+        manifest = read_manifest(folder)
+        return {str(manifest["data"]), *files_of_frames(manifest.get("kept_frames"))}
+    return set()
 
 
 def _manifest(storage: Storage, data: str, blocks: int, checksum: list[int]) -> dict[str, Any]:

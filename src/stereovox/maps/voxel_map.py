@@ -18,6 +18,7 @@ from stereovox.maps.blocks import CELLS, SIDE, blocks_of_cells
 from stereovox.maps.cell_format import State as State
 from stereovox.maps.cell_times import NEVER
 from stereovox.maps.evidence import Evidence
+from stereovox.maps.kept_frames import KeptFrames
 from stereovox.maps.queries import INDEX_LIMIT as INDEX_LIMIT
 from stereovox.maps.queries import Asked, NearestCells, RayHits
 from stereovox.maps.storage import OnStorage, Storage
@@ -39,6 +40,11 @@ class OnBlocks(OnStorage):
     @viewpoint.setter
     def viewpoint(self, viewpoint: Viewpoint | None) -> None:
         self.storage.viewpoint = viewpoint
+
+    @property
+    def kept_frames(self) -> KeptFrames | None:
+        """The depth images of its frames, where `map.keep_frames` asks for them; None where it has none."""
+        return self.storage.kept
 
     @property
     def listeners(self) -> list[Callable[[Evidence], None]]:
@@ -482,6 +488,7 @@ def load_map(path: str | Path) -> VoxelMap:
     storage = voxel_map.storage
     storage.history, storage.viewpoint, storage.window_state = saved.history, saved.viewpoint, saved.window_state
     storage.insert(saved.coords, saved.cells)
+    storage.kept = saved.kept
     if saved.times is not None:
         storage.set_times(saved.coords, saved.times, saved.times_start_ns)
     return voxel_map

@@ -1,0 +1,185 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Kept frames on disk: packs of images that never change, and an index with their poses.
+
+Files are named after what they hold. So a checkpoint writes only what is new, besides the index; whatever the manifest
+of the map names is there before it. Images are read when they are needed.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import asdict
+from math import inf, isfinite
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from stereovox.cameras.pinhole import DepthCorrection, PinholeCamera
+from stereovox.cameras.rigs import VirtualCamera
+from stereovox.cameras.wide import CylindricalCamera, SphericalCamera
+from stereovox.errors import StereovoxError
+from stereovox.maps.kept_frames import DTYPES, InFile, KeptFrame, KeptFrames, Packed, digest_of
+from stereovox.safe_io import count_in, json_value, read_bounded
+from stereovox.trust.camera_path import FARTHEST, Seen
+from stereovox.trust.health import FULL
+
+FRAME_FILES = r"frames-[0-9a-f]{12}|\.frames\.new"
+"""Names of the files, as a pattern; the last is being written."""
+IN_A_PACK = 64
+"""Frames in a file."""
+MAX_INDEX = 1 << 29
+"""Bytes of an index; a frame takes less than a kilobyte."""
+CAMERAS = {"pinhole": PinholeCamera, "spherical": SphericalCamera, "cylindrical": CylindricalCamera}
+QUALITIES = (FULL, "near", "coarse")
+MAX_NAME = 4096
+"""Letters of a frame's name."""
+
+
+def write_frames(folder: Path, kept: KeptFrames) -> dict[str, Any]:
+    """Write frames into the folder of a map, and return what its manifest must say of them. Raises OSError."""
+    frames = kept.frames
+    packs = [frames[start : start + IN_A_PACK] for start in range(0, len(frames), IN_A_PACK)]
+    names = [_name("".join(frame.packed.digest for frame in pack).encode()) for pack in packs]
+    for name, pack in zip(names, packs, strict=True):
+        if not _is_there(folder / name, pack):
+            _write(folder, name, (frame.packed.content.read() for frame in pack))
+    index = json.dumps(_index(kept.spacing, frames)).encode()
+    _write(folder, _name(index), [index])
+    return {"index": _name(index), "packs": names, "frames": len(frames), "bytes": kept.bytes}
+
+
+def files_of_frames(saved: Any) -> set[str]:
+    """Return the names of the files that a manifest says hold frames."""
+    return set() if saved is None else {str(saved["index"]), *map(str, saved["packs"])}
+
+
+def read_frames(folder: Path, saved: Any, budget: int | None) -> KeptFrames | None:
+    """Return the frames of a saved map; their images are read when they are needed.
+
+    Raises KeyError, TypeError, ValueError or OSError for what `write_frames` cannot have written.
+    """
+    if saved is None:
+        return None
+    names = [_checked(name) for name in (saved["index"], *saved["packs"])]
+    content = read_bounded(folder / names[0], MAX_INDEX)
+    if _name(content) != names[0]:
+        raise ValueError("the index of kept frames does not match its name")
+    index = json_value(content)
+    spacing = float(index["spacing"])
+    if not 0 <= spacing < inf:
+        raise ValueError(f"kept frames: spacing {spacing}")
+    cameras = [_camera_from(one) for one in index["cameras"]]
+    return KeptFrames(budget, _frames_from([folder / name for name in names[1:]], index["frames"], cameras), spacing)
+
+
+def _name(content: bytes) -> str:
+    return f"frames-{digest_of(content)[:12]}"
+
+
+def _checked(name: Any) -> str:
+    if not isinstance(name, str) or "/" in name or not name.startswith("frames-"):
+        raise ValueError(f"kept frames: '{name}' is no name of theirs")
+    return name
+
+
+def _is_there(file: Path, pack: Sequence[KeptFrame]) -> bool:
+    return file.is_file() and file.stat().st_size == sum(frame.packed.content.size for frame in pack)
+
+
+def _write(folder: Path, name: str, parts: Iterable[bytes]) -> None:
+    """Write a file so that it is whole where it has its name."""
+    temporary = folder / ".frames.new"
+    with temporary.open("wb") as file:
+        for part in parts:
+            file.write(part)
+        file.flush()
+        os.fsync(file.fileno())
+    temporary.replace(folder / name)
+
+
+def _index(spacing: float, frames: Sequence[KeptFrame]) -> dict[str, Any]:
+    cameras = list(dict.fromkeys(frame.camera for frame in frames))
+    number = {camera: n for n, camera in enumerate(cameras)}
+    return {
+        "spacing": spacing,
+        "cameras": [_camera_to(camera) for camera in cameras],
+        "frames": [_frame_to(frame, number[frame.camera]) for frame in frames],
+    }
+
+
+def _frame_to(frame: KeptFrame, camera: int) -> dict[str, Any]:
+    return {
+        "number": frame.number,
+        "sensor": frame.sensor,
+        "name": frame.name[:MAX_NAME],
+        "stamp_ns": int(frame.stamp_ns),
+        "T_world_sensor": np.asarray(frame.T_world_sensor, float).ravel().tolist(),
+        "seen": [frame.seen.stamp_ns, list(frame.seen.pose)],
+        "camera": camera,
+        "quality": frame.quality,
+        "depth_scale": float(frame.depth_scale),
+        "farthest": float(frame.farthest) if isfinite(frame.farthest) else None,
+        "blocks": frame.blocks.tolist(),
+        "dtype": frame.packed.dtype,
+        "depth_bytes": frame.packed.depth_bytes,
+        "bytes": frame.packed.content.size,
+        "digest": frame.packed.digest,
+    }
+
+
+def _frames_from(packs: Sequence[Path], saved: Any, cameras: Sequence[VirtualCamera]) -> Iterator[KeptFrame]:
+    if len(saved) > IN_A_PACK * len(packs):
+        raise ValueError(f"{len(saved)} kept frames in {len(packs)} packs")
+    start, before = 0, -1
+    for n, one in enumerate(saved):
+        start = 0 if n % IN_A_PACK == 0 else start
+        frame = _frame_from(one, cameras, packs[n // IN_A_PACK], start)
+        if frame.number <= before:
+            raise ValueError("kept frames are out of order")
+        start, before = start + frame.packed.content.size, frame.number
+        yield frame
+
+
+def _frame_from(saved: Any, cameras: Sequence[VirtualCamera], pack: Path, start: int) -> KeptFrame:
+    size, depth_bytes = count_in(saved, "bytes"), count_in(saved, "depth_bytes")
+    stamp_ns, pose = saved["seen"]
+    blocks = np.array(saved["blocks"], np.int32)
+    if not depth_bytes <= size or saved["dtype"] not in DTYPES or saved["quality"] not in QUALITIES:
+        raise ValueError("a kept frame is of no kind that is known")
+    if blocks.shape != (2, 3) or len(pose) != 12 or count_in(saved, "camera") >= len(cameras):
+        raise ValueError("a kept frame has no place or no camera")
+    digest = str(saved["digest"])
+    return KeptFrame(
+        count_in(saved, "number"), str(saved["sensor"]), str(saved["name"]), int(saved["stamp_ns"]),
+        np.array(_numbers(saved["T_world_sensor"])).reshape(4, 4), cameras[saved["camera"]],
+        saved["quality"], float(saved["depth_scale"]), inf if saved["farthest"] is None else float(saved["farthest"]),
+        Packed(saved["dtype"], depth_bytes, InFile(pack, start, size, digest), digest),
+        Seen(int(stamp_ns), tuple(_numbers(pose))), blocks,
+    )  # fmt: skip
+
+
+def _numbers(saved: Any) -> list[float]:
+    numbers = [float(number) for number in saved]
+    if not all(abs(number) <= FARTHEST for number in numbers):  # False for NaN
+        raise ValueError("kept frames: a pose that cannot be")
+    return numbers
+
+
+def _camera_to(camera: VirtualCamera) -> dict[str, Any]:
+    kind = next(kind for kind, one in CAMERAS.items() if isinstance(camera, one))
+    return {"kind": kind, **asdict(camera)}
+
+
+def _camera_from(saved: Any) -> VirtualCamera:
+    numbers = dict(saved)
+    kind = CAMERAS[numbers.pop("kind")]
+    correction = numbers.pop("correction", None)
+    if correction:
+        numbers["correction"] = DepthCorrection(correction["model"], tuple(correction["coefficients"]))
+    try:
+        return kind(**numbers)
+    except StereovoxError as error:
+        raise ValueError(str(error)) from None

@@ -1,0 +1,359 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Make the part of a map anew that corrected poses change, from the frames it kept.
+
+What a cell holds depends on the frames that see it, in their order, and on nothing else. So only blocks that a moved
+frame saw before, or sees now, are made anew, in a map of their own, from all kept frames that see them; then they take
+the place of the old ones. Bounded maps are made anew as a whole: where their window was, and what had room, depends on
+every pose. So is a map of which only some frames are kept: it then is what these frames make.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.config import Config
+from stereovox.errors import FrameRefused, StereovoxError
+from stereovox.frame import DepthImage, Frame, Viewpoint
+from stereovox.integrate import Integrator
+from stereovox.maps import _pool, make_map
+from stereovox.maps.blocks import CELLS, BlockPool
+from stereovox.maps.evidence import Evidence
+from stereovox.maps.kept_frames import KeptFrame, KeptFrames, blocks_seen
+from stereovox.maps.storage import Storage
+from stereovox.se3 import Transform, inverse
+from stereovox.threads import Ahead
+from stereovox.trust.camera_path import CameraPath, Seen
+from stereovox.trust.history import History
+from stereovox.trust.validate import rigid_pose
+
+MANY = 1 / 3
+"""Share of the frames that must move for the map to be made anew as a whole: their views cover most of it."""
+FEW, ROUNDS = 2, 20
+"""Frames that may be missing when those that come must wait, and most rounds until they must in any case."""
+FrameKey = int | tuple[str, int]
+"""Names a frame: its stamp in nanoseconds, or sensor and stamp."""
+
+
+@dataclass(frozen=True)
+class CorrectionReport:
+    """What a correction of poses did to the map.
+
+    Attributes:
+        moved: Number of frames that got another pose.
+        ignored: Number of poses for which no frame is kept.
+        mapped: Number of frames that were mapped again.
+        blocks: Number of blocks of 8x8x8 cells that were made anew.
+        all_frames: Whether all frames of the map are kept. Where not, the map now is what the kept ones make.
+    """
+
+    moved: int = 0
+    ignored: int = 0
+    mapped: int = 0
+    blocks: int = 0
+    all_frames: bool = True
+
+
+class Prepared(Protocol):
+    """A frame that is ready for the integrator."""
+
+    @property
+    def image(self) -> DepthImage:
+        """Its depth image."""
+        ...
+
+
+class Level(Protocol):
+    """A quality level; see `deadline.Quality`."""
+
+    @property
+    def prepare(self) -> Callable[[Frame], Prepared]:
+        """Turns a frame into a depth image."""
+        ...
+
+    @property
+    def integrator(self) -> Integrator:
+        """Turns a depth image into evidence."""
+        ...
+
+
+def correct(
+    storage: Storage,
+    level: Callable[[str], Level],
+    poses: Mapping[FrameKey, Transform],
+    no_frame_comes: AbstractContextManager[object],
+    tiles: Path | None,
+) -> CorrectionReport:
+    """Give frames of a map new poses; what is said in `Mapper.correct` holds.
+
+    level: returns the quality level of a name; used by this thread alone. no_frame_comes: entered while the result is
+    put into the map; before, the map may take in frames. tiles: as in `make_map`.
+    """
+    if storage.kept is None or not len(storage.kept):
+        raise StereovoxError(
+            "the map did not keep its frames, so their poses cannot be corrected; map again with map.keep_frames=true"
+        )
+    moved, ignored = moved_frames(storage.kept.frames, poses, storage.config)
+    if not moved:
+        return CorrectionReport(ignored=ignored, all_frames=storage.kept.are_all(storage.history.frames))
+    rebuild = Rebuild(storage, level, moved, tiles)
+    try:
+        for _ in range(ROUNDS):
+            if rebuild.behind > FEW:
+                rebuild.catch_up()
+        with no_frame_comes, storage.lock:
+            if rebuild.outdated:
+                rebuild.close()
+                rebuild = Rebuild(storage, level, moved, tiles)
+            rebuild.catch_up()
+            return replace(rebuild.finish(), ignored=ignored)
+    except BaseException:
+        rebuild.close()
+        raise
+
+
+def moved_frames(
+    frames: Sequence[KeptFrame], poses: Mapping[FrameKey, Transform], config: Config
+) -> tuple[dict[int, Transform], int]:
+    """Return the new poses by number of the frame, and how many poses are of no frame that is kept.
+
+    Poses that a frame already has are left out. Raises StereovoxError where none is of a kept frame, where several
+    frames have a stamp that comes without its sensor, and for poses that are no rigid motions.
+    """
+    by_key: dict[FrameKey, list[KeptFrame]] = {}
+    for frame in frames:
+        by_key.setdefault(frame.stamp_ns, []).append(frame)
+        by_key.setdefault((frame.sensor, frame.stamp_ns), []).append(frame)
+    named = {key: by_key[key] for key in poses if key in by_key}
+    if not named:
+        first, last = frames[0].stamp_ns, frames[-1].stamp_ns
+        raise StereovoxError(
+            f"none of the {len(poses)} poses has the stamp of a kept frame; these are from {first} to {last} ns"
+        )
+    moved: dict[int, Transform] = {}
+    for key, found in named.items():
+        if len(found) > 1:
+            sensors = ", ".join(f"'{frame.sensor}'" for frame in found)
+            raise StereovoxError(f"{len(found)} frames have the stamp {key} ({sensors}); name them (sensor, stamp)")
+        frame = found[0]
+        posed = Frame(np.empty((0, 0), np.float32), frame.camera, poses[key], name=frame.name)
+        rigid_pose(posed, config.pose_rigidity_tolerance)  # raises where it is none
+        if not np.array_equal(poses[key], frame.T_world_sensor):
+            moved[frame.number] = np.array(poses[key], float)
+    return moved, len(poses) - len(named)
+
+
+class Rebuild:
+    """A map whose poses are being corrected: `catch_up` maps kept frames again, `finish` puts the result into it.
+
+    Args:
+        storage: The map; it may take in frames until `finish`.
+        level: As in `correct`.
+        moved: New poses (4, 4) by number of the frame.
+        tiles: As in `correct`.
+    """
+
+    def __init__(
+        self, storage: Storage, level: Callable[[str], Level], moved: Mapping[int, Transform], tiles: Path | None
+    ):
+        assert storage.kept is not None
+        self._storage, self._level, self._moved = storage, level, moved
+        self._kept: KeptFrames = storage.kept
+        self._before, self._after, self._mapped = self._kept.frames, list[KeptFrame](), 0
+        self._is_in_place = False
+        self._loaded = Ahead(partial(_prepared, level))
+        self._dirty = None if self._is_whole() else self._seen_by_moved()
+        self._scratch = make_map(_without_frames(storage.config), None, _other_than(tiles, storage)).storage
+        if self._dirty is not None and storage.times_start_ns is not None:
+            nothing = np.empty((0, 3), np.int32), np.empty((0, CELLS), np.uint32)
+            self._scratch.set_times(*nothing, storage.times_start_ns)
+
+    @property
+    def behind(self) -> int:
+        """How many kept frames were not mapped again so far."""
+        return len(self._kept) - len(self._after)
+
+    @property
+    def outdated(self) -> bool:
+        """Whether frames that were mapped again are kept no longer, since others came."""
+        return self._kept.frames[: len(self._before)] != self._before
+
+    def catch_up(self) -> None:
+        """Map all frames again that are kept by now and were not."""
+        if self.outdated:
+            return
+        self._before = self._kept.frames
+        frames = [self._posed(frame) for frame in self._before[len(self._after) :]]
+        again = [frame for frame in frames if self._must_be_mapped(frame)]
+        coming, again = iter(again[1:]), {frame.number for frame in again}
+        for frame in frames:
+            self._scratch.history.frames = frame.number  # rounding of cells of 8 bits depends on it
+            if frame.number in again:
+                self._expect(next(coming, None))
+                frame = self._mapped_again(frame)
+            else:
+                self._scratch.look_from(_viewpoint(frame))
+            self._after.append(frame)
+
+    def finish(self) -> CorrectionReport:
+        """Put what was made into the map, tell its listeners and return what was done. The lock must be held."""
+        changed, self._is_in_place = self._swap(), True
+        _correct_history(self._storage.history, self._before, self._after)
+        self._kept.replace(self._after)
+        blocks, none = np.empty((0, 3), np.int32), np.zeros(len(changed), np.int16)
+        for listener in self._storage.listeners:
+            listener(Evidence(blocks, np.empty((0, CELLS), np.int16), changed, none))
+        all_frames = self._kept.are_all(self._storage.history.frames)
+        return CorrectionReport(len(self._moved), 0, self._mapped, len(changed), all_frames)
+
+    def close(self) -> None:
+        """Release what was made, where `finish` did not put it into the map."""
+        if not self._is_in_place:
+            self._scratch.close()
+
+    def _is_whole(self) -> bool:
+        """Return whether all blocks are made anew."""
+        storage, first = self._storage, self._before[0]
+        partly_kept = not self._kept.are_all(storage.history.frames)
+        starts_anew = storage.config.map.keep_times and (first.number in self._moved or not first.blocks.any())
+        return storage.bounded or partly_kept or starts_anew or len(self._moved) > MANY * len(self._before)
+
+    def _seen_by_moved(self) -> BlockPool:
+        """Return the blocks on which moved frames had evidence, or have it now."""
+        seen = BlockPool(np.uint8, cells=1)
+        for frame in self._before:
+            if frame.number in self._moved:
+                offered, level = frame.frame(), self._level(frame.quality)
+                for pose in (frame.T_world_sensor, self._moved[frame.number]):
+                    evidence = level.integrator.evidence(level.prepare(replace(offered, T_world_sensor=pose)).image)
+                    seen.insert(evidence.coords)
+                    seen.insert(evidence.uniform)
+        return seen
+
+    def _posed(self, frame: KeptFrame) -> KeptFrame:
+        """Return a frame at its new pose, itself where it has none."""
+        pose = self._moved.get(frame.number)
+        return frame if pose is None else replace(frame, T_world_sensor=pose)
+
+    def _must_be_mapped(self, frame: KeptFrame) -> bool:
+        """Return whether a frame may have evidence on blocks that are made anew."""
+        if self._dirty is None or frame.number in self._moved:
+            return True
+        coords, (low, high) = self._dirty.coords[: len(self._dirty)], frame.blocks
+        return bool(((coords >= low) & (coords < high)).all(axis=1).any())
+
+    def _expect(self, frame: KeptFrame | None) -> None:
+        """Begin to prepare the frame that will be mapped next, where there is a thread for it."""
+        if frame is not None and self._storage.config.threads > 1:
+            self._loaded.begin(frame)
+
+    def _mapped_again(self, frame: KeptFrame) -> KeptFrame:
+        """Map a frame, and return it with what it sees from its pose."""
+        image = self._loaded(frame).image
+        evidence = self._level(frame.quality).integrator.evidence(image)
+        seen = Seen(frame.seen.stamp_ns, tuple(image.T_world_sensor.ravel().tolist()[:12]))
+        frame = replace(frame, seen=seen, blocks=blocks_seen(evidence))
+        evidence = self._part(evidence)
+        self._check_room(evidence)
+        self._scratch.look_from(image.viewpoint)
+        self._scratch.add(evidence)
+        self._mapped += 1
+        return frame
+
+    def _part(self, evidence: Evidence) -> Evidence:
+        """Return the evidence on blocks that are made anew."""
+        if self._dirty is None:
+            return evidence
+        mixed, free = (_is_in(self._dirty, coords) for coords in (evidence.coords, evidence.uniform))
+        return Evidence(
+            evidence.coords[mixed], evidence.values[mixed], evidence.uniform[free], evidence.uniform_values[free]
+        )
+
+    def _check_room(self, evidence: Evidence) -> None:
+        try:
+            self._scratch.check_room(evidence)
+        except FrameRefused as error:
+            raise StereovoxError(f"from the corrected poses, {error}; nothing was changed") from None
+
+    def _swap(self) -> NDArray[np.int32]:
+        """Put the blocks that were made anew into the map; return their coordinates (n, 3)."""
+        storage, scratch, last = self._storage, self._scratch, self._before[-1]
+        if self._dirty is not None:
+            changed = self._dirty.coords[: len(self._dirty)].copy()
+            storage.make_anew(changed, scratch)
+            if last.number in self._moved:
+                storage.viewpoint = scratch.viewpoint
+            return changed
+        changed = np.concatenate([storage.coords_in_memory, scratch.coords_in_memory])
+        storage.become(scratch)
+        return np.unique(changed, axis=0)
+
+
+def _prepared(level: Callable[[str], Level], frame: KeptFrame) -> Prepared:
+    return level(frame.quality).prepare(frame.frame())
+
+
+def _without_frames(config: Config) -> Config:
+    """Return the settings for a map of the same cells that keeps no frames."""
+    cells = config.map.model_copy(update={"keep_frames": False, "frames_budget": None})
+    return config.model_copy(update={"map": cells})
+
+
+def _other_than(tiles: Path | None, storage: Storage) -> Path | None:
+    """Return a folder for tiles beside the one that a map uses."""
+    store = storage.tile_store
+    return tiles.with_name(f"{tiles.name}-anew") if tiles and store and store.folder == tiles else tiles
+
+
+def _viewpoint(frame: KeptFrame) -> Viewpoint:
+    return Viewpoint(frame.camera.middle, _matrix(frame.seen), frame.seen.stamp_ns)
+
+
+def _matrix(seen: Seen) -> Transform:
+    """Return T_world_sensor (4, 4)."""
+    return np.array([*seen.pose, 0, 0, 0, 1], float).reshape(4, 4)
+
+
+def _is_in(blocks: BlockPool, coords: NDArray[np.int32]) -> NDArray[np.bool_]:
+    places = np.empty(len(coords), np.int64)
+    _pool.find_all(blocks.table, blocks.coords, np.ascontiguousarray(coords), places)
+    return places >= 0
+
+
+def _correct_history(history: History, before: Sequence[KeptFrame], after: Sequence[KeptFrame]) -> None:
+    """Give a map's memory of its sensors the corrected poses, so that the next frames are compared with these.
+
+    What waited or was in doubt has seen the map before: it begins anew.
+    """
+    history.path = CameraPath()
+    for frame in after:
+        history.path.walk(frame.sensor, frame.seen)
+    last = {old.sensor: (old, new) for old, new in zip(before, after, strict=True)}
+    for sensor, (old, new) in last.items():
+        if new.seen != old.seen:
+            T_new_old = _matrix(new.seen) @ inverse(_matrix(old.seen))
+            _correct_sensor(history, sensor, T_new_old)
+            history.trusted[sensor] = _moved(history.trusted[sensor], old.seen, new.seen, T_new_old)
+
+
+def _correct_sensor(history: History, sensor: str, T_new_old: Transform) -> None:
+    history.waiting.pop(sensor, None)
+    history.doubts.pop(sensor, None)
+    if (look := history.looks.get(sensor)) is not None:
+        history.looks[sensor] = look._replace(pose=_turned(look.pose, T_new_old))
+
+
+def _moved(trusted: Seen, old: Seen, new: Seen, T_new_old: Transform) -> Seen:
+    """Return the last trusted pose of a sensor: that of its last kept frame, or moved as that was."""
+    return new if trusted == old else trusted._replace(pose=_turned(trusted.pose, T_new_old))
+
+
+def _turned(pose: tuple[float, ...], T_new_old: Transform) -> tuple[float, ...]:
+    return tuple((T_new_old @ _matrix(Seen(0, pose))).ravel().tolist()[:12])

@@ -113,7 +113,7 @@ def test_corrected_is_as_new(kind, seed, share):
 
 @pytest.mark.parametrize("seed", range(20))
 def test_twenty_random_corrections_one_after_the_other_in_a_room(seed, room):
-    frames, mapper, before = room
+    frames, mapper, _ = room
     moved, poses = shaken(frames, seed, share=(0.1, 0.3, 1.0)[seed % 3])
     mapper.correct({frame.stamp_ns: frame.T_world_sensor for frame in frames} | poses)
     assert is_as_new(mapper, moved, voxel_size=0.2)
@@ -139,7 +139,6 @@ def test_only_what_moved_frames_see_is_made_anew():
     frames = made_frames(cameras=4, each=10)
     mapper = mapped(frames)
     blocks = len(mapper.map.storage.blocks()[0])
-    moved, poses = shaken(frames, 3, share=0.0)
     last = [frame for frame in frames if frame.sensor == "camera 0" and not frame.fault][-1]
     new = last.T_world_sensor.copy()
     new[:3, 3] += 0.1
@@ -341,7 +340,7 @@ def test_stamps_of_several_sensors_need_their_name():
 
 def test_a_corrected_map_that_needs_too_much_memory_is_refused():
     frames = [frame for frame in made_frames(each=8) if not frame.fault]
-    mapper = mapped(frames, max_memory="600 kB")
+    mapper = mapped(frames, max_memory="300 kB")
     apart = {}
     for n, frame in enumerate(frames):
         T = frame.T_world_sensor.copy()

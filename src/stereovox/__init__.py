@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from stereovox.products.ground import ground as ground
     from stereovox.products.merge import merge as merge
     from stereovox.products.path_check import check_path as check_path
+    from stereovox.rebuild import CorrectionReport as CorrectionReport
     from stereovox.run import MapResult as MapResult
     from stereovox.run import MapRun as MapRun
     from stereovox.run import map_recording as map_recording
@@ -78,6 +79,7 @@ _HOMES = {
     "GridMapper": "mapper",
     "Mapper": "mapper",
     "UpdateReport": "mapper",
+    "CorrectionReport": "rebuild",
     "State": "maps",
     "VoxelMap": "maps",
     "load_map": "maps",

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import IntEnum
 from math import inf, nan
@@ -107,6 +108,23 @@ class StereoFrame:
 
 
 @dataclass(frozen=True, eq=False)
+class Photo:
+    """An image that was taken along with a depth image; its corners tell how a camera moved where depth does not.
+
+    Attributes:
+        pixels: (height, width) uint8 grey or (height, width, 3) uint8 RGB; or a function that reads them once they are
+            needed, and raises FrameRefused where it cannot.
+        camera: The camera that took it, without distortion; its size must be the image's.
+        T_sensor_camera: (4, 4) float64, maps its optical frame into that of the depth camera; the same where depth is
+            registered to the image.
+    """
+
+    pixels: NDArray[np.uint8] | Callable[[], NDArray[np.uint8]]
+    camera: PinholeCamera
+    T_sensor_camera: Transform = field(default_factory=lambda: np.eye(4))
+
+
+@dataclass(frozen=True, eq=False)
 class Frame:
     """One depth image with its camera and pose, as a source delivers it.
 
@@ -129,6 +147,7 @@ class Frame:
         pose_off_ns: How far the pose was extrapolated from the nearest measured one; 0: measured or interpolated.
         farthest: Metres that are free at least where `reason` is TOO_FAR; a positive depth there says so for that
             pixel. Where this is less than the maximum range, the pixel counts as UNKNOWN.
+        photo: An image that was taken at the same time, by which poses are tracked; maps do not need it.
     """
 
     depth: NDArray[np.generic]
@@ -143,6 +162,7 @@ class Frame:
     sensor: str = ""
     pose_off_ns: int = 0
     farthest: float = inf
+    photo: Photo | None = None
 
     def __post_init__(self) -> None:
         if self.depth_scale is NOT_GIVEN and getattr(getattr(self.depth, "dtype", None), "kind", "") == "f":

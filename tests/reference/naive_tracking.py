@@ -164,7 +164,25 @@ def cell_of(key: int) -> Cell:
     return x, y, z
 
 
-def seen_at(landmark: Vector, T: NDArray[np.float64], lens: Lens, baseline: float) -> Vector:
-    """Return column, row and disparity (3,) of a point (3,) for a pair of lenses without distortion at T."""
+def seen_at(landmark: Vector, T: NDArray[np.float64], lens: Lens) -> Vector:
+    """Return column, row and inverse depth (3,) of a point (3,) for a lens without distortion at T."""
     x, y, z = T[:3, :3].T @ (landmark - T[:3, 3])
-    return np.array([lens.fx * x / z + lens.cx, lens.fy * y / z + lens.cy, lens.fx * baseline / z])
+    return np.array([lens.fx * x / z + lens.cx, lens.fy * y / z + lens.cy, 1 / z])
+
+
+def inverse_depth_of_plane(
+    plane: Vector, T_sensor_camera: NDArray[np.float64], lens: Lens, cell_px: int, shape: tuple[int, ...]
+) -> NDArray[np.float64]:
+    """Return the inverse depths (h, w) of a plane at the middles of cells of an image; plane: 1 / z = plane . ray.
+
+    plane (3,): in the frame of the sensor, as plane . point = 1; the camera is at T_sensor_camera.
+    """
+    found = np.zeros(shape)
+    normal = T_sensor_camera[:3, :3].T @ plane
+    distance = 1 - plane @ T_sensor_camera[:3, 3]
+    for i in range(shape[0]):
+        for j in range(shape[1]):
+            u, v = (j + 0.5) * cell_px - 0.5, (i + 0.5) * cell_px - 0.5
+            ray = np.array([(u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy, 1.0])
+            found[i, j] = normal @ ray / distance
+    return found

@@ -8,9 +8,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from stereovox.frame import AnyFrame, Frame
+from stereovox.cameras.lenses import Lens
+from stereovox.cameras.pinhole import PinholeCamera
+from stereovox.frame import AnyFrame, Frame, Photo
 from stereovox.se3 import Transform, inverse, look_at, rotation_vector
 from stereovox.simulate.d435 import D435, depth_camera
+from stereovox.simulate.rendering import photograph
 from stereovox.simulate.scene import Point, Scene, box
 from stereovox.simulate.simulation import Simulation
 from stereovox.track.tracker import Tracked, Tracker
@@ -20,6 +23,10 @@ SUBPIXEL = 0.08 * WIDTH / 848
 """Of a small picture of the full camera, which errs by as many radians."""
 CAMERA = replace(depth_camera(WIDTH), baseline=0.05)
 STEP_NS = 33_000_000
+LENS = Lens.from_field_of_view("pinhole", 320, 200, 80.0)
+PHOTO_CAMERA = PinholeCamera(LENS.width, LENS.height, LENS.fx, LENS.fy, LENS.cx, LENS.cy)
+"""Of grey images that are taken along, finer than the depth images."""
+T_DEPTH_PHOTO = np.array([[1, 0, 0, 0.025], [0, 1, 0, 0.002], [0, 0, 1, -0.003], [0, 0, 0, 1.0]])
 
 
 def tracker(start: Transform | None = None) -> Tracker:
@@ -50,6 +57,18 @@ def _cast(scene: Scene, T: Transform):
     x, y = CAMERA.ray_slopes()
     rays = np.stack(np.broadcast_arrays(x[None, :], y[:, None], np.float32(1)), axis=-1).reshape(-1, 3)
     return scene.cast(T[:3, 3], rays @ T[:3, :3].T.astype(np.float32)).reshape(CAMERA.height, CAMERA.width)
+
+
+def pictured(frames: Sequence[Frame], scene: Scene, seed: int = 0, contrast: float = 0.5, moving=None) -> list[Frame]:
+    """Return frames with a grey image each, of a camera beside the depth camera; `moving` as that of `seen`."""
+    out = []
+    for i, frame in enumerate(frames):
+        other = moving(i) if moving else None
+        there = scene if other is None else Scene([*scene.solids, *other.solids])
+        T = frame.T_world_sensor @ T_DEPTH_PHOTO
+        pixels = photograph(there, LENS, T, 1.5, [seed, i], contrast)
+        out.append(replace(frame, photo=Photo(pixels, PHOTO_CAMERA, T_DEPTH_PHOTO)))
+    return out
 
 
 def covered(frame: Frame) -> Frame:

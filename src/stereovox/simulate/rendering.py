@@ -16,7 +16,7 @@ from stereovox.simulate.scene import Scene
 WAVE, OCTAVES = 0.4, 7
 """Longest wave of the pattern in metres, and how often it is halved: down to 6 mm."""
 CONTRAST = 0.5
-"""How much the pattern changes the brightness of a surface, as a share of it."""
+"""How much the pattern changes the brightness of a surface, as a share of it, where nothing else is asked for."""
 LIGHT = np.array([0.36, 0.48, 0.8], np.float32)
 """Where the light comes from."""
 SKY = 205.0
@@ -25,17 +25,20 @@ STEEPEST = 0.1
 """Cosine from which on a surface seen from its side is not blurred any more."""
 
 
-def photograph(scene: Scene, lens: Lens, T_world_lens: Transform, noise: float, seed: list[int]) -> NDArray[np.uint8]:
+def photograph(
+    scene: Scene, lens: Lens, T_world_lens: Transform, noise: float, seed: list[int], contrast: float = CONTRAST
+) -> NDArray[np.uint8]:
     """Return the grey image (height, width) uint8 that a lens takes of a scene; black where the lens sees nothing.
 
     T_world_lens: (4, 4) of its optical frame. noise: standard deviation in grey levels; same seed, same image.
+    contrast: how much the pattern changes the brightness of a surface, as a share of it.
     The pattern is fixed to the surfaces: two lenses see the same one. It is blurred as pixels blur it.
     """
     rays = _rays(lens)
     seen = np.isfinite(rays[:, 2])
     directions = rays[seen] @ T_world_lens[:3, :3].T.astype(np.float32)
     grey = np.zeros(len(rays), np.float32)
-    grey[seen] = _shade(scene, np.asarray(T_world_lens[:3, 3], np.float32), directions, 1 / lens.fx)
+    grey[seen] = _shade(scene, np.asarray(T_world_lens[:3, 3], np.float32), directions, 1 / lens.fx, contrast)
     if noise:
         grey += np.float32(noise) * np.random.default_rng(seed).standard_normal(grey.shape, np.float32)
     return np.clip(np.rint(np.where(seen, grey, 0)), 0, 255).astype(np.uint8).reshape(lens.height, lens.width)
@@ -47,7 +50,9 @@ def _rays(lens: Lens) -> NDArray[np.float32]:
     return lens.directions(np.stack([u.ravel(), v.ravel()], axis=1)).astype(np.float32)
 
 
-def _shade(scene: Scene, eye: NDArray[np.float32], directions: NDArray[np.float32], pixel: float) -> NDArray:
+def _shade(
+    scene: Scene, eye: NDArray[np.float32], directions: NDArray[np.float32], pixel: float, contrast: float
+) -> NDArray[np.float32]:
     """Return the grey (N,) float32 of what unit directions (N, 3) from `eye` meet; pixel: its width in radians."""
     distance, normals, triangles = scene.hits(eye, directions)
     there = triangles >= 0
@@ -58,7 +63,7 @@ def _shade(scene: Scene, eye: NDArray[np.float32], directions: NDArray[np.float3
     pattern = np.empty(len(points), np.float32)
     _texture.pattern(points, footprint.astype(np.float32), np.float32(WAVE), OCTAVES, pattern)
     light = 0.55 + 0.45 * np.abs(normals[there] @ LIGHT)
-    grey[there] = _albedo(scene)[triangles[there]] * light * (1 + CONTRAST * pattern)
+    grey[there] = _albedo(scene)[triangles[there]] * light * (1 + np.float32(contrast) * pattern)
     return grey
 
 

@@ -12,12 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox import registry
+from stereovox.cameras.lenses import Lens
 from stereovox.errors import ConfigError, SourceError
-from stereovox.frame import Frame, Reason
+from stereovox.frame import Frame, Photo, Reason
 from stereovox.se3 import Transform, inverse
 from stereovox.simulate.d435 import D435, classify, depth_camera
 from stereovox.simulate.floors.kinect import WIDTH
 from stereovox.simulate.honest import honest_d435, honest_kinect
+from stereovox.simulate.rendering import photograph
 from stereovox.simulate.scene import Scene
 from stereovox.simulate.stage import Face, Stage, one_of, within
 from stereovox.sources import parameters
@@ -36,6 +38,8 @@ SCENES = {
 AXES = ("world", "optical")
 SIMPLE = "simple"
 CAMERAS = (SIMPLE, "d435", "kinect")
+GREY_NOISE = 1.5
+"""Of photographs, in grey levels."""
 OWN = -1.0
 """Stands for what the camera has by itself."""
 
@@ -51,6 +55,8 @@ class Options:
     image_width: pixels (0: the scene's own, mostly 848; of a Kinect 640), the height follows; the field of view stays.
     barrel, toe_in (degrees), farthest (metres, 0: the scene's own): see `D435`.
     subpixel, correlation: size of the noise, and the Gaussian that smooths it, in pixels (-1: the camera's own).
+    photo: contrast of the pattern on all surfaces in a grey image that is taken along, registered to the depth (0.5:
+        much of it, 0.05: painted walls; 0: no image is taken).
     """
 
     axes: str = "world"
@@ -64,6 +70,7 @@ class Options:
     subpixel: float = OWN
     correlation: float = OWN
     farthest: float = 0.0
+    photo: float = 0.0
 
     def __post_init__(self) -> None:
         one_of("axes", self.axes, AXES)
@@ -78,6 +85,7 @@ class Options:
             if getattr(self, name) != OWN:
                 within(name, getattr(self, name), 0, 5)
         within("farthest", self.farthest, 0, 65)
+        within("photo", self.photo, 0, 1)
 
 
 class Simulation(DepthSource):
@@ -172,8 +180,18 @@ class Simulation(DepthSource):
             depth = np.where(reason == Reason.VALID, depth, np.float32(0))
         return Frame(
             depth, self.camera, self.pose(i), i * self.period_ns, scale, reason, f"{self.name} frame {i}",
-            farthest=self.device.farthest,
+            farthest=self.device.farthest, photo=self._photo(i),
         )  # fmt: skip
+
+    def _photo(self, i: int) -> Photo | None:
+        """Return the grey image of frame `i`, taken once it is needed; None where none is asked for."""
+        if not self.options.photo:
+            return None
+        camera = self.camera
+        lens = Lens("pinhole", camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+        T, seed = self._world.path(self._share(i)), [self.seed, i, 1]
+        contrast = self.options.photo
+        return Photo(lambda: photograph(self._world.scene, lens, T, GREY_NOISE, seed, contrast), camera)
 
     def pose(self, i: int) -> Transform:
         """Return T_world_camera (4, 4) of frame `i`; raises IndexError beyond the last."""

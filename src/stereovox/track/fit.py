@@ -14,7 +14,7 @@ from stereovox.se3 import Transform, rotation_matrix, rotation_vector
 STEPS = 6
 """Steps of least squares in each stage."""
 CONTRARY = 100.0
-"""Squared deviations, of six, by which the last stage may move the pose that the one before it found."""
+"""Squared deviations, of six, beyond which two poses contradict each other, such as those of two stages."""
 HOLDS = 1.0
 """Information, by that of what is expected, below which a direction is not held."""
 
@@ -58,6 +58,16 @@ class Limits(NamedTuple):
     adrift: tuple[float, float]
 
 
+def both(one: Equations, other: Equations) -> Equations:
+    """Return the equations of two kinds of evidence together."""
+
+    def together(T: Transform) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        (information, gradient), (more, pull) = one(T), other(T)
+        return information + more, gradient + pull
+
+    return together
+
+
 def settled(
     stages: Sequence[Stage], expected: Transform, doubt: NDArray[np.float64], start: Transform | None = None
 ) -> tuple[Transform, NDArray[np.float64]]:
@@ -87,10 +97,21 @@ def settled(
             T = _moved(T, motion)
             if np.abs(motion).max() < stage.converged:
                 break
-    moved = _between(before, T)
-    if len(stages) > 1 and moved @ np.linalg.solve(agreed + covariance, moved) > CONTRARY:
+    if len(stages) > 1 and contrary(before, T, agreed + covariance):
         return before, doubt
     return T, covariance
+
+
+def contrary(one: Transform, other: Transform, covariance: NDArray[np.float64]) -> bool:
+    """Return whether two poses are farther apart than errors of this covariance (6, 6) can be."""
+    moved = _between(one, other)
+    return bool(moved @ np.linalg.solve(covariance, moved) > CONTRARY)
+
+
+def deviations(covariance: NDArray[np.float64]) -> tuple[float, float]:
+    """Return the standard deviations of a pose along the directions that are held least: radians and metres."""
+    turn, shift = (float(np.sqrt(np.linalg.eigvalsh(part)[-1])) for part in (covariance[:3, :3], covariance[3:, 3:]))
+    return turn, shift
 
 
 def _between(one: Transform, other: Transform) -> NDArray[np.float64]:

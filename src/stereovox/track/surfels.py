@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from stereovox.frame import DepthImage
 from stereovox.se3 import Transform
 from stereovox.track._surfels import EMPTY, FIELDS, carry, equations, normals, patches, put
-from stereovox.track.fit import Fit, Stage, settled
 
 PATCHES_ACROSS = 80
 """Patches along the longer side of an image."""
@@ -138,37 +137,48 @@ class SurfelMap:
         for level in self._levels:
             level.forget(centre, radius)
 
-    def fit(self, seen: Patches, expected: Transform, doubt: NDArray[np.float64], quietest: float = 1.0) -> Fit:
-        """Return the pose that lays an image onto the surfels, near the expected one; `doubt` as in `settled`.
+    def levels(self, seen: Patches, quietest: float = 1.0) -> list[Level]:
+        """Return the equations of an image on the surfels of each size, from coarse to fine.
 
         quietest: what is far beyond the residuals that most patches have at the expected pose counts little, down to
             this variance of theirs, by what was expected of it. 1: only what is far beyond that.
         """
-        levels = [
-            _Level(level, slack, seen.thinned(every), quietest)
-            for level, slack, every in zip(self._levels, SLACK, EVERY, strict=True)
-        ]
-        T, covariance = settled([Stage(level, CONVERGED * float(level.size)) for level in levels], expected, doubt)
-        ratios = levels[-1].ratios
-        if not len(ratios):
-            return Fit(T, covariance, 0.0, 0.0)
-        return Fit(T, covariance, len(ratios) / len(seen.points), float(np.mean(ratios < USUAL**2)))
+        sizes = zip(self._levels, SLACK, EVERY, strict=True)
+        return [Level(level, slack, seen.thinned(every), quietest) for level, slack, every in sizes]
 
 
-class _Level:
-    """The equations of an image on the surfels of one size."""
+class Level:
+    """The equations of an image on the surfels of one size.
+
+    Attributes:
+        size: Of the surfels' cells, in metres.
+        seen: Patches of the image.
+        ratios: (N,) squared residuals, by their variance, of the patches that had a surfel at the latest pose.
+    """
 
     def __init__(self, level: Surfels, slack: float, seen: Patches, quietest: float):
-        self.size, self._level, self._slack, self._seen, self._quietest = level.size, level, slack, seen, quietest
+        self.size, self.seen = float(level.size), seen
+        self._level, self._slack, self._quietest = level, slack, quietest
         self._reach = REACH
         self.ratios = np.empty(0, np.float32)
 
     def __call__(self, T: Transform) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return information (6, 6) and gradient (6,) at a pose: `Equations`."""
         if not len(self.ratios) and self._quietest < 1:
-            ratios = self._level.equations(self._seen.thinned(SAMPLED), T, self._slack, REACH)[2]
+            ratios = self._level.equations(self.seen.thinned(SAMPLED), T, self._slack, REACH)[2]
             self._reach *= float(np.sqrt(max(_scale(ratios), self._quietest)))
-        information, gradient, self.ratios = self._level.equations(self._seen, T, self._slack, self._reach)
+        information, gradient, self.ratios = self._level.equations(self.seen, T, self._slack, self._reach)
         return information, gradient
+
+    @property
+    def known(self) -> float:
+        """Share of the patches that had a surfel."""
+        return len(self.ratios) / len(self.seen.points)
+
+    @property
+    def usual(self) -> float:
+        """Share of these that agree with it."""
+        return float(np.mean(self.ratios < USUAL**2)) if len(self.ratios) else 0.0
 
 
 def _scale(ratios: NDArray[np.float32]) -> float:

@@ -15,7 +15,7 @@ from stereovox.config import Config, load_config
 from stereovox.errors import FrameRefused, StereovoxError
 from stereovox.frame import AnyFrame, StereoFrame
 from stereovox.se3 import Transform, interpolate, inverse, orthonormalise, rigidity_error, rotation_vector
-from stereovox.track.fit import Fit, Limits
+from stereovox.track.fit import Fit, Limits, deviations
 from stereovox.track.surfaces import Surfaces
 from stereovox.track.views import far_apart
 
@@ -52,7 +52,7 @@ Seen = TypeVar("Seen")
 
 
 class Evidence(Protocol[Seen]):
-    """What a tracker learns from images: `Surfaces` of depth cameras, `Landmarks` of stereo pairs."""
+    """What a tracker learns from images: `Surfaces` of depth cameras, `Pairs` of stereo pairs."""
 
     limits: Limits
 
@@ -296,9 +296,9 @@ class Tracker:
 def _evidence_for(frame: AnyFrame, config: Config) -> Evidence[Any]:
     """Return what tracks a camera."""
     if isinstance(frame, StereoFrame) and isinstance(frame.pair.camera, PinholeCamera):
-        from stereovox.track.landmarks import Landmarks  # needs OpenCV
+        from stereovox.track.pairs import Pairs  # needs OpenCV
 
-        return Landmarks(frame.pair)
+        return Pairs(frame.pair)
     return Surfaces(config)
 
 
@@ -313,7 +313,7 @@ def _doubt(fit: Fit, demand: Demand) -> str:
 
 def _open(fit: Fit, limit: tuple[float, float]) -> str:
     """Return by how much a pose is open, where it is by more than a limit in radians and metres; "" where it is not."""
-    turn, shift = (np.sqrt(np.linalg.eigvalsh(part)[-1]) for part in (fit.covariance[:3, :3], fit.covariance[3:, 3:]))
+    turn, shift = deviations(fit.covariance)
     if turn > limit[0] or shift > limit[1]:
         return f"what it sees leaves the pose open by {shift:.3f} m and {np.degrees(turn):.1f} degrees"
     return ""

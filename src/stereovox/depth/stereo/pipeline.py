@@ -13,7 +13,7 @@ from stereovox.config import StereoConfig
 from stereovox.depth.stereo.disparity import FAR_PX, Disparity, doubled, explained, halved, match_aligned
 from stereovox.depth.stereo.matchers import make_matcher
 from stereovox.errors import FrameRefused, StereovoxError
-from stereovox.frame import Frame, Reason, StereoFrame
+from stereovox.frame import Frame, Reason, StereoFrame, name_of
 from stereovox.se3 import Transform
 from stereovox.threads import in_shards, shards
 from stereovox.trust.validate import matrix_of
@@ -128,7 +128,12 @@ def grey_rectified(frame: StereoFrame) -> StereoFrame:
     if frame.fault:
         raise FrameRefused(frame.fault, frame.fault_detail or f"{frame.name}: {frame.fault}")
     frame = _rectified(frame)
-    return replace(frame, left=_grey(frame.left, frame, "left"), right=_grey(frame.right, frame, "right"))
+    camera, name = frame.pair.camera, name_of(frame)
+    left, right = (
+        grey(image, (camera.width, camera.height), f"{name}: {side} image")
+        for image, side in ((frame.left, "left"), (frame.right, "right"))
+    )
+    return replace(frame, left=left, right=right)
 
 
 def _rectified(frame: StereoFrame) -> StereoFrame:
@@ -139,12 +144,15 @@ def _rectified(frame: StereoFrame) -> StereoFrame:
     return rectified(frame)
 
 
-def _grey(image: NDArray[np.uint8], frame: StereoFrame, side: str) -> NDArray[np.uint8]:
-    camera, name = frame.pair.camera, f"{frame.name or f'frame at {frame.stamp_ns} ns'}: {side} image"
+def grey(image: NDArray[np.uint8], size: tuple[int, int], name: str) -> NDArray[np.uint8]:
+    """Return a grey or RGB image (height, width[, 3]) as a grey one (height, width); `name` names it in messages.
+
+    Its size must be (width, height) = `size`. Raises FrameRefused: `bad_dtype`, `bad_shape`.
+    """
     if not isinstance(image, np.ndarray) or image.dtype != np.uint8:
         raise FrameRefused("bad_dtype", f"{name} is {getattr(image, 'dtype', type(image).__name__)}; give uint8")
-    if image.shape not in ((camera.height, camera.width), (camera.height, camera.width, 3)):
-        raise FrameRefused("bad_shape", f"{name} is {image.shape}, its camera says ({camera.height}, {camera.width})")
+    if image.shape not in (size[::-1], (*size[::-1], 3)):
+        raise FrameRefused("bad_shape", f"{name} is {image.shape}, its camera says ({size[1]}, {size[0]})")
     if image.ndim == 2:
         return np.ascontiguousarray(image)
     import cv2

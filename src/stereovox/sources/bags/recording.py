@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -19,6 +20,7 @@ from stereovox.sources import parameters
 from stereovox.sources.bags import open_bag, suffix_of
 from stereovox.sources.bags.depth_topic import DepthTopic, find_depth
 from stereovox.sources.bags.imu import up_by_gravity
+from stereovox.sources.bags.photo_topic import PhotoTopic, find_photos
 from stereovox.sources.bags.poses import find_poses
 from stereovox.sources.bags.tf import TfPoses
 from stereovox.sources.base import DepthSource
@@ -82,6 +84,7 @@ class Bag(DepthSource):
 
     Pixels without value: 0 in 16UC1, and all are UNKNOWN, none clears; 32FC1 follows REP 117: -inf is TOO_NEAR, NaN
     UNKNOWN, +inf what `depth.far` says.
+    Pictures of a camera that has the depth images' frame, or is fixed to it by /tf, help tracking.
     Time: the image's own; in RealSense files that of the frame in its own clock domain. Pose: interpolated at that
     time; what /tf tells of the images' frame comes first, at its ends held for up to 0.1 s (`pose_off_ns`). It is the
     pose of the depth camera's optical frame unless `axes` says otherwise; where the poses are those of another camera,
@@ -120,6 +123,11 @@ class Bag(DepthSource):
     def __len__(self) -> int:
         return len(self._depth)
 
+    @cached_property
+    def _photos(self) -> PhotoTopic | None:
+        """Pictures that were taken along with the depth images."""
+        return find_photos(self._file, self._depth)
+
     def gravity(self) -> NDArray[np.float64] | None:
         """Return the unit vector (3,) that points up in the world of the poses by an IMU; None where nothing tells."""
         found = self._poses
@@ -131,6 +139,8 @@ class Bag(DepthSource):
         """Return frame `i`; depth is (0, 0) where the image has a `fault`, the pose NaN where there is none."""
         i = range(len(self))[i]
         frame = depth_frame(self._depth, i, f"{self._file.path} frame {i}", self._pose, self.camera, self._scale)
+        if self._photos is not None and frame.depth.size:
+            frame = replace(frame, photo=self._photos.near(self._depth.stamp_ns(i), frame.stamp_ns))
         if frame.fault or not isinstance(self._poses, TurnedTf):
             return frame
         return replace(frame, pose_off_ns=self._poses.poses.off_ns(frame.stamp_ns))

@@ -112,6 +112,24 @@ class BagWriter:
         info = messages.camera_info(camera, stamp_ns, frame_id)
         self._write(sibling(topic, "camera_info"), "sensor_msgs/msg/CameraInfo", stamp_ns, info)
 
+    def photo(
+        self,
+        frame: Frame,
+        topic: str = "/camera/color/image_raw",
+        frame_id: str = "camera_color_optical_frame",
+    ) -> None:
+        """Write the picture that was taken with a depth image, and its camera on `camera_info` beside it.
+
+        Where it is beside the depth camera is for `fixed` to write; the same `frame_id`: depth is registered to it.
+        """
+        if frame.photo is None:
+            raise SourceError(f"{self.path}: {frame.name or topic} has no picture; leave it out")
+        pixels = frame.photo.pixels() if callable(frame.photo.pixels) else frame.photo.pixels
+        stamp_ns, messages = frame.stamp_ns, self._messages
+        self._write(topic, IMAGE, stamp_ns, messages.image(pixels, stamp_ns, frame_id))
+        info = messages.camera_info(frame.photo.camera, stamp_ns, frame_id)
+        self._write(sibling(topic, "camera_info"), "sensor_msgs/msg/CameraInfo", stamp_ns, info)
+
     def odometry(
         self,
         stamp_ns: int,

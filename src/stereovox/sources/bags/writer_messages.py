@@ -18,6 +18,8 @@ from stereovox.se3 import Transform, rotation_vector
 PLANAR = np.ix_((0, 1, 5), (0, 1, 5))
 """Rows and columns of x, y and yaw in a covariance of x, y, z, roll, pitch, yaw."""
 
+ENCODINGS = {"u2": "16UC1", "f4": "32FC1", "u1": "mono8"}
+"""What `sensor_msgs/Image` calls arrays (REP 118), by their types."""
 FLOAT32 = 7
 """What `sensor_msgs/PointField` calls such numbers."""
 
@@ -45,16 +47,20 @@ class Messages:
             intensities=np.empty(0, np.float32),
         )
 
-    def image(self, depth: NDArray[np.generic], stamp_ns: int, frame_id: str) -> Any:
-        """Return a `sensor_msgs/Image` of (height, width) uint16 millimetres or float32 metres."""
-        height, width = depth.shape
-        little = np.ascontiguousarray(depth, depth.dtype.newbyteorder("<"))
+    def image(self, pixels: NDArray[np.generic], stamp_ns: int, frame_id: str) -> Any:
+        """Return a `sensor_msgs/Image` of (height, width) uint16 millimetres, float32 metres or uint8 grey.
+
+        Also of (height, width, 3) uint8 RGB.
+        """
+        height, width = pixels.shape[:2]
+        little = np.ascontiguousarray(pixels, pixels.dtype.newbyteorder("<"))
+        kind = "rgb8" if pixels.ndim == 3 else ENCODINGS[pixels.dtype.str[1:]]
         return self._make(
             "sensor_msgs/msg/Image",
             header=self._header(stamp_ns, frame_id),
             height=height,
             width=width,
-            encoding="16UC1" if depth.dtype.kind == "u" else "32FC1",
+            encoding=kind,
             is_bigendian=0,
             step=little.strides[0],
             data=little.view(np.uint8).ravel(),

@@ -8,7 +8,7 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from functools import cache
+from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,13 +16,15 @@ import numpy as np
 
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.errors import FrameRefused, SourceError, did_you_mean
-from stereovox.frame import Frame
+from stereovox.frame import Frame, Photo
 from stereovox.se3 import Transform
 from stereovox.sources import parameters
 from stereovox.sources.base import DepthSource
 from stereovox.sources.camera_file import FoundCamera, Standard, camera_in, find_camera
 from stereovox.sources.images import file_names
 from stereovox.sources.intrinsics import NAMES, metres_per_unit
+from stereovox.sources.photos import SUFFIXES as PHOTO_SUFFIXES
+from stereovox.sources.photos import nearest_in_time, photo_size, read_photo, registered
 from stereovox.sources.poses import Poses
 from stereovox.sources.rgbd.depth_files import SUFFIXES, Depth, common_depth_size, read_depth
 from stereovox.sources.rgbd.depth_unit import DepthUnit, find_unit, pairs_of, unit_words
@@ -32,6 +34,8 @@ from stereovox.sources.tracker import AXES
 from stereovox.sources.trajectory import ns_from_seconds
 
 SECOND = 1_000_000_000
+PHOTO_NS, PHOTOS_TRIED = 20_000_000, 5
+"""How far a picture may be in time from its depth image, and how many are looked at for their size."""
 
 
 class ImageFile(NamedTuple):
@@ -171,6 +175,35 @@ class DepthFolder(DepthSource, ABC):
         """Return the camera of images of (width, height) = `size`."""
         return find_camera([self.folder], size, self.baseline, self.intrinsics, self.calibrations)
 
+    def list_photos(self) -> list[ImageFile]:
+        """Return pictures to which the depth images are registered, in any order; [] where there are none."""
+        return []
+
+    def photo_camera(self, size: tuple[int, int]) -> tuple[PinholeCamera | None, Transform]:
+        """Return the camera of pictures of (width, height) = `size`, None: unknown, and T_depth_photo (4, 4)."""
+        return registered(self.camera, size), np.eye(4)
+
+    @cached_property
+    def _photos(self) -> list[Path | None]:
+        """The picture of each depth image: the nearest in time; None where none is near."""
+        photos = self.list_photos()
+        found = nearest_in_time([i.stamp_ns for i in self._images], [p.stamp_ns for p in photos], PHOTO_NS)
+        return [None if k is None else photos[k].path for k in found]
+
+    @cached_property
+    def _photo_camera(self) -> tuple[PinholeCamera | None, Transform]:
+        """The camera of the pictures, by the first that can be read."""
+        paths = [path for path in self._photos if path is not None][:PHOTOS_TRIED]
+        size = next(filter(None, map(photo_size, paths)), None)
+        return (None, np.eye(4)) if size is None else self.photo_camera(size)
+
+    def photo(self, i: int) -> Photo | None:
+        """Return the picture that was taken with frame `i` (0 to len - 1), None where there is none."""
+        path, (camera, T_depth_photo) = self._photos[i], self._photo_camera
+        if path is None or camera is None:
+            return None
+        return Photo(partial(read_photo, path, (camera.width, camera.height)), camera, T_depth_photo)
+
     def __len__(self) -> int:
         return len(self._images)
 
@@ -214,7 +247,8 @@ class DepthFolder(DepthSource, ABC):
             no_depth, no_pose = np.empty((0, 0), np.uint16), np.full((4, 4), np.nan)
             blank = Frame(no_depth, self.camera, no_pose, stamp_ns, self.depth_scale, name=str(path))
             return replace(blank, fault=refused.reason, fault_detail=str(refused))
-        return Frame(depth, self.camera_of(i), T_world_camera, stamp_ns, self.depth_scale, name=str(path))
+        frame = Frame(depth, self.camera_of(i), T_world_camera, stamp_ns, self.depth_scale, name=str(path))
+        return replace(frame, photo=self.photo(i))
 
     def _read_poses(self) -> Poses | ImagePoses | None:
         if not self.options.poses:
@@ -316,6 +350,11 @@ def images_in(folder: Path, pattern: str, fps: float) -> list[ImageFile]:
         stamps = [int(number * SECOND / fps) for number in numbers]
     files = [ImageFile(folder / name, stamp) for name, stamp in zip(names, stamps, strict=True)]
     return sorted(files, key=lambda image: image.stamp_ns)
+
+
+def photos_in(folder: Path, fps: float) -> list[ImageFile]:
+    """Return the pictures of a folder with their times, as `images_in`; [] where there is no such folder."""
+    return images_in(folder, image_pattern(PHOTO_SUFFIXES), fps) if folder.is_dir() else []
 
 
 def image_pattern(names: Sequence[str] = SUFFIXES) -> str:

@@ -22,12 +22,12 @@ from stereovox.sources.camera_file import FoundCamera
 from stereovox.sources.intrinsics import NAMES
 from stereovox.sources.poses import Poses
 from stereovox.sources.rgbd.depth_files import SUFFIXES, Depth
-from stereovox.sources.rgbd.folder import DepthFolder, ImageFile, folder_part, image_pattern, images_in
+from stereovox.sources.rgbd.folder import DepthFolder, ImageFile, folder_part, image_pattern, images_in, photos_in
 from stereovox.sources.rgbd.pose_files import ImagePoses
 from stereovox.sources.trajectory import Trajectory
 
 INTRINSICS = (481.2, -480.0, 319.5, 239.5)
-IMAGES, POSES, RENAMED = "depth", "*.freiburg", "groundtruth.txt"
+IMAGES, PICTURES, POSES, RENAMED = "depth", "rgb", "*.freiburg", "groundtruth.txt"
 NUMBERED = re.compile(r"\d{1,6}\.\w+")
 SCENE = re.compile(r"(scene_\d+_\d+)\.depth")
 VECTOR = re.compile(r"(cam_pos|cam_dir|cam_up)\s*=\s*\[([^\]]*)\]")
@@ -49,6 +49,10 @@ class IclNuim(DepthFolder):
     def list_images(self) -> list[ImageFile]:
         """Return the depth images in the order of their numbers."""
         return images_in(self.folder / IMAGES, image_pattern(), self.fps)
+
+    def list_photos(self) -> list[ImageFile]:
+        """Return the pictures beside them."""
+        return photos_in(self.folder / PICTURES, self.fps)
 
     def read_poses(self) -> Poses | ImagePoses:
         """Return the poses by the numbers of the images."""

@@ -11,9 +11,10 @@ from stereovox.errors import NoPoses, SourceError
 from stereovox.sources.base import Part
 from stereovox.sources.camera_file import FoundCamera, find_camera
 from stereovox.sources.intrinsics import NAMES
+from stereovox.sources.photos import photo_size
 from stereovox.sources.poses import Poses
 from stereovox.sources.rgbd.depth_files import SUFFIXES, common_depth_size
-from stereovox.sources.rgbd.folder import DepthFolder, ImageFile, folder_part, image_pattern, images_in
+from stereovox.sources.rgbd.folder import DepthFolder, ImageFile, folder_part, image_pattern, images_in, photos_in
 from stereovox.sources.rgbd.pose_files import ImagePoses, read_pose_folder, read_poses
 
 POSES = Part(
@@ -24,6 +25,8 @@ POSES = Part(
     "poses",
     "write poses.txt with lines 'stamp tx ty tz qx qy qz qw' or a 4x4 matrix for each image, or add ?poses=FILE",
 )  # fmt: skip
+PHOTOS = ("rgb", "color", "colour", "image", "images")
+"""Folders of pictures."""
 POSE_FILE = r".*pose.*\d.*\.txt|.*\d.*pose.*\.txt"
 """A file with the pose of one image, beside it."""
 
@@ -59,6 +62,14 @@ class DepthAndPoses(DepthFolder):
         """Return the depth images in the order of their numbers or times."""
         folder, pattern = image_place(self.folder)
         return images_in(folder, pattern, self.fps)
+
+    def list_photos(self) -> list[ImageFile]:
+        """Return the pictures of a folder beside that of the images, if they are as large."""
+        place = self._images[0].path.parent
+        found = (photos_in(place.parent / name, self.fps) for name in PHOTOS if place != self.folder)
+        photos = next(filter(None, found), [])
+        size = self.camera.width, self.camera.height
+        return photos if photos and photo_size(photos[0].path) == size else []
 
     def read_poses(self) -> Poses | ImagePoses | None:
         """Return the poses beside the images: of the first file or folder that holds as many as there are images."""

@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 
 from stereovox.sources.base import Part
-from stereovox.sources.rgbd.folder import folder_part
+from stereovox.sources.rgbd.folder import ImageFile, folder_part, images_in
 from stereovox.sources.rgbd.plain import DepthAndPoses
 
 RESULTS, SEQUENCE = "traj.txt", "traj_w_c.txt"
@@ -34,6 +34,10 @@ class Replica(DepthAndPoses):
         if Part((SEQUENCE,), "").count(folder_part(where)) == 0:
             self.depth_scale = 1 / 6553.5
         super().__init__(where, posed)
+
+    def list_photos(self) -> list[ImageFile]:
+        """Return the pictures among the depth images, else those of a folder beside them."""
+        return images_in(self._images[0].path.parent, r"(frame|rgb_?)\d+\.(jpg|png)", self.fps) or super().list_photos()
 
     def pose_places(self) -> list[Path]:
         """Return the file of the poses."""

@@ -9,16 +9,24 @@ from pathlib import Path
 
 import numpy as np
 
+from stereovox.cameras.pinhole import PinholeCamera
+from stereovox.errors import SourceError
 from stereovox.safe_io import read_text
 from stereovox.se3 import Transform
 from stereovox.sources.base import Part
-from stereovox.sources.camera_file import FoundCamera, find_camera
+from stereovox.sources.camera_file import FoundCamera, camera_in, find_camera, pinhole
 from stereovox.sources.images import file_names
 from stereovox.sources.intrinsics import NAMES
 from stereovox.sources.rgbd.folder import SECOND, DepthFolder, ImageFile, folder_part
 from stereovox.sources.rgbd.pose_files import read_pose
 
 FILE = re.compile(r"frame-(\d+)\.(depth\.png|depth\.pgm|pose\.txt)")
+PHOTO = re.compile(r"frame-(\d+)\.color\.(?:jpg|jpeg|png|ppm)")
+COLOUR = "color-intrinsics.txt"
+KINECT_COLOUR, KINECT_BASELINE = (525.0, 525.0, 319.5, 239.5), 0.025
+"""fx, fy, cx, cy of a Kinect's colour camera for 640x480, and how far it is to the right of the depth camera, metres.
+
+These are the usual ones; single devices are some pixels and millimetres off."""
 INFO = ("info.txt", "_info.txt")
 """BundleFusion's and 3RScan's file with m_calibrationDepthIntrinsic and m_depthShift."""
 
@@ -61,6 +69,19 @@ class SevenScenes(DepthFolder):
         names = [name for name in INFO if any(_tells_camera(folder / name) for folder in folders)]
         return find_camera(folders, size, self.baseline, self.intrinsics, (*names, *NAMES))
 
+    def list_photos(self) -> list[ImageFile]:
+        """Return the colour images of a Kinect, whose place beside the depth camera is known."""
+        if any(_tells_camera(folder / name) for folder in (self.folder, self.folder.resolve().parent) for name in INFO):
+            return []
+        found = [(int(match[1]), name) for name in file_names(self.folder) if (match := PHOTO.fullmatch(name))]
+        return [ImageFile(self.folder / name, int(number * SECOND / self.fps)) for number, name in found]
+
+    def photo_camera(self, size: tuple[int, int]) -> tuple[PinholeCamera | None, Transform]:
+        """Return the camera of `color-intrinsics.txt` (3x3), else a Kinect's, and where it is, by default."""
+        T_depth_photo = np.eye(4)
+        T_depth_photo[0, 3] = KINECT_BASELINE
+        return _colour_camera(self.folder, size), T_depth_photo
+
     @classmethod
     def recognises(cls, where: str) -> bool:
         """Return whether `where` is a folder with at least one image or pose named as in 7-Scenes."""
@@ -81,6 +102,17 @@ class SevenScenes(DepthFolder):
     def depth_only(cls, where: str) -> SevenScenes:
         """Return the images without looking for poses: every pose is NaN."""
         return _Images(where)
+
+
+def _colour_camera(folder: Path, size: tuple[int, int]) -> PinholeCamera | None:
+    try:
+        return camera_in(folder / COLOUR, size, None).camera if os.path.isfile(folder / COLOUR) else _kinect(size)
+    except SourceError:
+        return None
+
+
+def _kinect(size: tuple[int, int]) -> PinholeCamera | None:
+    return pinhole(size, KINECT_COLOUR, None) if size == (640, 480) else None
 
 
 def _tells_camera(path: Path) -> bool:

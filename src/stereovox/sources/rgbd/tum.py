@@ -13,6 +13,7 @@ from stereovox.sources.base import Part
 from stereovox.sources.camera_file import FoundCamera, find_camera
 from stereovox.sources.images import file_names
 from stereovox.sources.intrinsics import NAMES
+from stereovox.sources.photos import SUFFIXES as PHOTO_SUFFIXES
 from stereovox.sources.poses import Poses
 from stereovox.sources.rgbd.depth_files import SUFFIXES
 from stereovox.sources.rgbd.folder import DepthFolder, ImageFile, folder_part
@@ -28,6 +29,7 @@ from stereovox.sources.trajectory import (
 )
 
 LIST, IMAGES, POSES = "depth.txt", "depth", "groundtruth.txt"
+PHOTO_LIST, PHOTOS = "rgb.txt", "rgb"
 PAIRED = ("associations.txt", "association.txt", "associate.txt", "associated.txt", "rgbd_assoc.txt")
 """Lists of colour and depth images with their times: `stamp file stamp file`."""
 OTHER_POSES = ("*truth*.txt", "CameraTrajectory.txt", "KeyFrameTrajectory.txt", "trajectory.txt", "poses.txt",
@@ -64,6 +66,10 @@ class StampedImages(DepthFolder):
         if not images:
             raise SourceError(f"{self.folder}: {LIST} and {IMAGES}/ name no image; give a folder that has some")
         return [ImageFile(self.folder / name, stamp_ns) for stamp_ns, name, _ in images]
+
+    def list_photos(self) -> list[ImageFile]:
+        """Return the pictures of rgb.txt, else of associations.txt, else of rgb/."""
+        return [ImageFile(self.folder / name, stamp_ns) for stamp_ns, name, _ in by_time(_photo_lines(self.folder))]
 
     def find_camera(self, size: tuple[int, int]) -> FoundCamera:
         """Return the camera from the folder."""
@@ -158,8 +164,20 @@ def _lines(folder: Path) -> list[StampedLine]:
     if os.path.isfile(folder / LIST):
         return _listed(folder / LIST)
     if paired is not None:
-        return _depth_of_pairs(paired)
-    return _named(folder)
+        return _columns(paired)[0]
+    return _named(folder, IMAGES, SUFFIXES)
+
+
+def _photo_lines(folder: Path) -> list[StampedLine]:
+    """Return the pictures of a folder, [] where their list cannot be used: maps do without them."""
+    paired = next((folder / name for name in PAIRED if os.path.isfile(folder / name)), None)
+    try:
+        if os.path.isfile(folder / PHOTO_LIST):
+            return _listed(folder / PHOTO_LIST)
+        found = _columns(paired)[1] if paired else _named(folder, PHOTOS, PHOTO_SUFFIXES)
+        return [line for line in found if inside(line[1], line[2])]
+    except SourceError:
+        return []
 
 
 def _listed(path: Path) -> list[StampedLine]:
@@ -171,28 +189,31 @@ def _listed(path: Path) -> list[StampedLine]:
     return lines
 
 
-def _depth_of_pairs(path: Path) -> list[StampedLine]:
-    """Return the depth images of lines `stamp file stamp file`: the column with `depth` in its names, else the second
-    of both.
+def _columns(path: Path) -> tuple[list[StampedLine], list[StampedLine]]:
+    """Return the depth images and the pictures of lines `stamp file stamp file`.
+
+    Depth is the column with `depth` in its names, else the second of both.
     """
-    lines = stamped_lines(path)
-    pairs = [(stamp_ns, rest.split(), where) for stamp_ns, rest, where in lines]
-    bad = next((where for _, words, where in pairs if len(words) != 3), None)
+    lines = [(stamp_ns, rest.split(), where) for stamp_ns, rest, where in stamped_lines(path)]
+    bad = next((where for _, words, where in lines if len(words) != 3), None)
     if bad:
         raise SourceError(f"{bad}: needs 'stamp file stamp file'; correct or delete the line")
-    first = bool(pairs) and "depth" in pairs[0][1][0] and "depth" not in pairs[0][1][2]
-    found = []
-    for stamp_ns, (name, stamp, other), where in pairs:
+    columns: tuple[list[StampedLine], list[StampedLine]] = [], []
+    for stamp_ns, (name, stamp, other), where in lines:
         try:
-            found.append((stamp_ns, name, where) if first else (ns_from_seconds(stamp), other, where))
+            columns[0].append((stamp_ns, name, where))
+            columns[1].append((ns_from_seconds(stamp), other, where))
         except ValueError as error:
             raise SourceError(f"{where}: {error}; correct or delete the line") from None
-        inside(found[-1][1], where)
-    return found
+    first = bool(lines) and "depth" in lines[0][1][0] and "depth" not in lines[0][1][2]
+    depth, photos = columns if first else columns[::-1]
+    for _, name, where in depth:
+        inside(name, where)
+    return depth, photos
 
 
-def _named(folder: Path) -> list[StampedLine]:
-    images = [f"{IMAGES}/{name}" for name in sorted(file_names(folder / IMAGES)) if name.lower().endswith(SUFFIXES)]
+def _named(folder: Path, inner: str, suffixes: tuple[str, ...]) -> list[StampedLine]:
+    images = [f"{inner}/{name}" for name in sorted(file_names(folder / inner)) if name.lower().endswith(suffixes)]
     return [(_stamp(folder / image), image, image) for image in images]
 
 

@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Stereo pairs: landmarks whose distances the other eye tells."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.cameras.pinhole import PinholeCamera
+from stereovox.cameras.rigs import StereoPair
+from stereovox.depth.stereo.pipeline import grey_rectified
+from stereovox.errors import FrameRefused, StereovoxError
+from stereovox.frame import AnyFrame, StereoFrame, name_of
+from stereovox.se3 import Transform
+from stereovox.track.corners import flow
+from stereovox.track.fit import Fit, Limits, Stage, settled
+from stereovox.track.landmarks import Landmarks, Sight
+from stereovox.track.sightings import AGREED, CONVERGED, REACHES, Sightings
+
+ROWS_PX, MIN_DISPARITY, DISPARITY = 1.5, 0.2, 0.3
+"""Pixels by which rows of both eyes may differ, and the least disparity and its standard deviation."""
+SEARCH = np.repeat([0.5, 3.0], 3)
+"""Radians and metres around a kept view in which the pose is sought."""
+
+
+class Eyes(NamedTuple):
+    """Rectified grey images of a pair, (height, width) uint8."""
+
+    left: NDArray[np.uint8]
+    right: NDArray[np.uint8]
+
+
+class Pairs:
+    """Evidence of a stereo pair: corners, followed from image to image and into the other eye.
+
+    The pose is that from which the landmarks are seen where they are, and at the distances that they have, by robust
+    least squares from what most of them agree on.
+
+    Args:
+        pair: The pair, with a pinhole camera.
+    """
+
+    limits = Limits(
+        spread=np.array([0.1, 0.1, 0.1, 0.5, 0.5, 0.5]),
+        unsure=(np.radians(1), 0.1),
+        adrift=(np.radians(3), 0.3),
+    )
+
+    def __init__(self, pair: StereoPair):
+        if not isinstance(pair.camera, PinholeCamera) or not pair.camera.baseline:
+            raise StereovoxError(f"stereo pair '{pair.name}': its camera has no baseline; give it in metres")
+        self._camera = pair.camera
+        self._base = pair.camera.fx * pair.camera.baseline
+        self._landmarks = Landmarks(pair.camera)
+        self._followed = Sightings(pair.camera)
+
+    def see(self, frame: AnyFrame) -> Sight:
+        """Return a stereo frame's images; raises FrameRefused as matching does."""
+        if not isinstance(frame, StereoFrame):
+            raise FrameRefused("bad_form", f"{name_of(frame)}: is no stereo pair, as those before")
+        if frame.pair.camera != self._camera:
+            raise FrameRefused("bad_form", f"{name_of(frame)}: is of another camera than those before; track one alone")
+        frame = grey_rectified(frame)
+        valid = frame.pair.valid
+        if valid is not None and valid.shape != frame.left.shape:
+            raise FrameRefused(
+                "bad_shape", f"{name_of(frame)}: its mask is {valid.shape}, the image {frame.left.shape}"
+            )
+        mask = np.full(frame.left.shape, 255, np.uint8) if valid is None else valid.astype(np.uint8) * np.uint8(255)
+        return Sight(frame.left, mask, partial(self._distances, Eyes(frame.left, frame.right)))
+
+    def forget(self) -> None:
+        """Forget all that was learned."""
+        self._landmarks.forget()
+        self._followed = Sightings(self._camera)
+
+    def fit(self, seen: Sight, expected: Transform, doubt: NDArray[np.float64]) -> Fit:
+        """Return the pose from which the landmarks are seen where they are; `doubt` as in `settled`."""
+        self._followed = self._landmarks.follow(seen, expected)
+        return _fit(self._followed, expected, doubt)
+
+    def advance(self, seen: Sight, T: Transform) -> None:
+        """Go on from an image at T_world_camera: better distances of what was followed into it, and new corners."""
+        self._landmarks.advance(seen, self._followed, T)
+        self._followed = Sightings(self._camera)
+
+    def learn(self, seen: Sight, T: Transform) -> None:
+        """As `advance`, and keep the view where it is new."""
+        self.advance(seen, T)
+        self._landmarks.keep(seen, T)
+
+    def seek(self, seen: Sight, last: Transform) -> list[Fit]:
+        """Return how an image fits at the kept views that it has most corners in common with."""
+        self._followed = Sightings(self._camera)
+        return [_fit(found, T, np.diag(SEARCH**2)) for T, found in self._landmarks.seek(seen)]
+
+    def contradicted(self, seen: Sight, T: Transform) -> str:
+        """Return "": corners that fit by their looks are seldom anywhere else."""
+        return ""
+
+    def _distances(
+        self, eyes: Eyes, pixels: NDArray[np.float32], guess: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+        """Measure corners of the left eye in the right one; see `landmarks.Distances`."""
+        there = pixels - np.column_stack([guess * self._base, np.zeros(len(guess))]).astype(np.float32)
+        right, found = flow(eyes.left, eyes.right, pixels, there)
+        disparity, off = pixels[:, 0] - right[:, 0], np.abs(pixels[:, 1] - right[:, 1])
+        good = found & (off < ROWS_PX) & (disparity > MIN_DISPARITY)
+        return disparity.astype(float) / self._base, np.full(len(pixels), DISPARITY / self._base), good
+
+
+def _fit(found: Sightings, expected: Transform, doubt: NDArray[np.float64]) -> Fit:
+    if len(found) < AGREED:
+        return Fit(expected, doubt, 0.0, 0.0)
+    stages = [Stage(found.equations(reach), CONVERGED) for reach in REACHES]
+    T, covariance = settled(stages, expected, doubt, found.agreed(expected))  # from there where they agree on none
+    return Fit(T, covariance, len(found) / max(found.sought, 1), found.usual(T))

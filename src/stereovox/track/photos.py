@@ -1,0 +1,224 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Images that depth cameras take along: where their pixels are, by the depth image."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.cameras.pinhole import PinholeCamera
+from stereovox.depth.stereo.pipeline import grey
+from stereovox.errors import FrameRefused
+from stereovox.frame import DepthImage, Photo
+from stereovox.se3 import Transform, inverse, transform_points
+from stereovox.track._photos import laid_into
+from stereovox.track.corners import WINDOW
+from stereovox.track.fit import Equations, Fit, Stage, settled
+from stereovox.track.landmarks import Landmarks, Sight
+from stereovox.track.sightings import AGREED, CONVERGED, REACHES, Sightings
+from stereovox.track.views import View, stood_free
+
+CELL, STEP = 4.0, 2
+"""Pixels of the depth image that a cell of the other image is wide, and of how many along each axis one is used."""
+FOLLOWED = 0.2
+"""Share of the landmarks that must be found in an image: corners of noise are not."""
+MOST = 0.6
+"""Share of them that must lie where they should for a pose that they agree on."""
+SMOOTH = 0.02
+"""Share by which mean inverse depths around a corner, near and in its window, may differ if noise does not more.
+
+On a plane they do not; on an edge, a corner is no fixed place.
+"""
+
+
+class Sighted(NamedTuple):
+    """An image beside a depth image; camera, T_sensor_camera: as those of `Photo`."""
+
+    sight: Sight
+    camera: PinholeCamera
+    T_sensor_camera: Transform
+
+
+class Beside(NamedTuple):
+    """Landmarks that were found in an image beside a depth image, and what they say of the depth camera's pose."""
+
+    found: Sightings
+    T_sensor_camera: Transform
+
+    def equations(self, reach: float = REACHES[-1]) -> Equations:
+        """Return the equations of the depth camera's pose; reach: as that of `Sightings.equations`."""
+        return of_sensor(self.found.equations(reach), self.T_sensor_camera)
+
+    def fit(self, expected: Transform, doubt: NDArray[np.float64]) -> Fit | None:
+        """Return the pose of the depth camera that most landmarks agree on; None where they agree on none.
+
+        expected, doubt: as those of `settled`.
+        """
+        agreed = self.found.agreed(expected @ self.T_sensor_camera)
+        if agreed is None:
+            return None
+        stages = [Stage(self.equations(reach), CONVERGED) for reach in REACHES]
+        T, covariance = settled(stages, expected, doubt, agreed @ inverse(self.T_sensor_camera))
+        found = Fit(T, covariance, len(self.found) / max(self.found.sought, 1), self.usual(T))
+        return found if found.usual > MOST else None
+
+    def usual(self, T: Transform) -> float:
+        """Return the share of the landmarks that are where they should be, seen by a depth camera at T."""
+        return self.found.usual(T @ self.T_sensor_camera)
+
+
+class Photos:
+    """Landmarks in the images that a depth camera takes along; images that cannot be used are left out."""
+
+    def __init__(self) -> None:
+        self._landmarks: Landmarks | None = None
+        self._followed: Beside | None = None
+
+    def forget(self) -> None:
+        """Forget all that was learned."""
+        self._landmarks = self._followed = None
+
+    def see(
+        self, photo: Photo | None, image: DepthImage, sigma_of: NDArray[np.float64], rows_per_metre: float
+    ) -> Sighted | None:
+        """Return what of an image is used, None where it cannot be.
+
+        sigma_of: standard deviation of a depth, by depth times `rows_per_metre`.
+        """
+        try:
+            return None if photo is None else sighted(photo, image, sigma_of, rows_per_metre)
+        except FrameRefused:
+            return None
+
+    def follow(self, seen: Sighted | None, expected: Transform, views: list[View]) -> Beside | None:
+        """Return the landmarks found in an image near T_map_sensor, less those that stand where views saw free space;
+        None where they are too few.
+        """
+        self._followed = None
+        if seen is None or self._landmarks is None or self._landmarks.camera != seen.camera:
+            return None
+        found = self._landmarks.follow(seen.sight, expected @ seen.T_sensor_camera)
+        points = transform_points(inverse(expected), found.corners.points).astype(np.float32)
+        sigma = (found.deviation / np.maximum(found.corners.inverse, 1e-3) ** 2).astype(np.float32)
+        found = found.those(~stood_free(points, sigma, expected, views))
+        enough = len(found) >= max(AGREED, FOLLOWED * found.sought)
+        self._followed = Beside(found, seen.T_sensor_camera) if enough else None
+        return self._followed
+
+    def advance(self, seen: Sighted | None, T: Transform) -> None:
+        """Go on from an image whose depth camera is at T_map_sensor."""
+        if seen is None:
+            return
+        if self._landmarks is None or self._landmarks.camera != seen.camera:
+            self._landmarks = Landmarks(seen.camera)
+        found = Sightings(seen.camera) if self._followed is None else self._followed.found
+        self._landmarks.advance(seen.sight, found, T @ seen.T_sensor_camera)
+        self._followed = None
+
+    def learn(self, seen: Sighted | None, T: Transform) -> None:
+        """As `advance`, and keep the view where it is new."""
+        self.advance(seen, T)
+        if seen is not None and self._landmarks is not None:
+            self._landmarks.keep(seen.sight, T @ seen.T_sensor_camera)
+
+    def seek(self, seen: Sighted | None) -> list[tuple[Transform, Beside]]:
+        """Return where views were taken that look like an image, and the landmarks that both have in common."""
+        self._followed = None
+        if seen is None or self._landmarks is None or self._landmarks.camera != seen.camera:
+            return []
+        found = [(T, Beside(one, seen.T_sensor_camera)) for T, one in self._landmarks.seek(seen.sight)]
+        return [(T @ inverse(seen.T_sensor_camera), one) for T, one in found if len(one.found) >= AGREED]
+
+
+def sighted(photo: Photo, image: DepthImage, sigma_of: NDArray[np.float64], rows_per_metre: float) -> Sighted:
+    """Return an image with the depths that the depth image beside it measured; the rest as `Photos.see`.
+
+    Raises FrameRefused where the image cannot be read, or is not what its camera says.
+    """
+    pixels = photo.pixels() if callable(photo.pixels) else photo.pixels
+    camera = photo.camera
+    picture = grey(pixels, (camera.width, camera.height), "the image beside the depth image")
+    cell_px, depths = inverse_depths(image, camera, photo.T_sensor_camera, sigma_of, rows_per_metre)
+    mask = cv2.resize((depths > 0).astype(np.uint8), None, fx=cell_px, fy=cell_px, interpolation=cv2.INTER_NEAREST)
+    mask = np.ascontiguousarray(mask[: camera.height, : camera.width]) * np.uint8(255)
+    sigma = sigma_of / np.square(np.maximum(np.arange(len(sigma_of)), 1) / rows_per_metre)  # of the inverse depth
+    sight = Sight(picture, mask, partial(_distances, cell_px, depths, sigma, rows_per_metre))
+    return Sighted(sight, camera, np.asarray(photo.T_sensor_camera, float))
+
+
+def of_sensor(equations: Equations, T_sensor_camera: Transform) -> Equations:
+    """Return equations of a camera's pose as those of the pose of a sensor that carries it."""
+
+    def carried(T: Transform) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        information, gradient = equations(T @ T_sensor_camera)
+        x, y, z = T[:3, :3] @ T_sensor_camera[:3, 3]
+        by_sensor = np.eye(6)  # the camera shifts by the sensor's turn times its arm
+        by_sensor[3:, :3] = [[0, z, -y], [-z, 0, x], [y, -x, 0]]
+        return by_sensor.T @ information @ by_sensor, by_sensor.T @ gradient
+
+    return carried
+
+
+def inverse_depths(
+    image: DepthImage,
+    camera: PinholeCamera,
+    T_sensor_camera: Transform,
+    sigma_of: NDArray[np.float64],
+    rows_per_metre: float,
+) -> tuple[int, NDArray[np.float32]]:
+    """Return the width of cells in pixels of another camera's image, and their inverse depths there in 1/m.
+
+    sigma_of: as that of `Photos.see`.
+
+    (h, w) float32, the mean of each cell and those around it; 0 where there is none, and beside edges.
+    """
+    cell_px = max(1, math.ceil(CELL * max(1.0, camera.focal_px / image.camera.focal_px)))
+    shape = math.ceil(camera.height / cell_px), math.ceil(camera.width / cell_px)
+    total, number = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+    T = np.asarray(inverse(T_sensor_camera), np.float32)
+    columns, rows = (np.ascontiguousarray(rays, np.float32) for rays in image.camera.rays())
+    lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)
+    R, t = np.ascontiguousarray(T[:3, :3]), np.ascontiguousarray(T[:3, 3])
+    laid_into(image.depth_m, columns, rows, R, t, lens, np.float32(cell_px), STEP, total, number)
+    own, near, window = (_mean(total, number, cells) for cells in (1, 3, 1 + 2 * round(WINDOW[0] / 2 / cell_px)))
+    depth = 1 / np.maximum(near, np.float32(1e-3))
+    sigma = sigma_of[np.minimum(depth * rows_per_metre, len(sigma_of) - 1).astype(int)]
+    unlike = np.maximum(np.abs(own - near), np.abs(window - near))
+    good = (number > 0) & (unlike <= np.maximum(SMOOTH * near, sigma / depth**2))
+    return cell_px, np.where(good, near, np.float32(0)).astype(np.float32)
+
+
+def _mean(total: NDArray[np.float32], number: NDArray[np.float32], cells: int) -> NDArray[np.float32]:
+    """Return the mean inverse depth of so many cells across around each."""
+    total, number = (cv2.boxFilter(part, -1, (cells, cells), normalize=False) for part in (total, number))
+    return total / np.maximum(number, 1)
+
+
+def _distances(
+    cell_px: int,
+    depths: NDArray[np.float32],
+    sigma: NDArray[np.float64],
+    rows_per_metre: float,
+    pixels: NDArray[np.float32],
+    guess: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+    """Measure corners by the depths of the four cells around them; see `landmarks.Distances`.
+
+    sigma: of the inverse of a depth, by depth times `rows_per_metre`.
+    """
+    place = (pixels + 0.5) / cell_px - 0.5
+    first = np.floor(place).astype(int)
+    part = place - first
+    first = np.clip(first, 0, np.array(depths.shape[::-1]) - 2)
+    columns, rows = first.T
+    corners = np.stack([depths[rows + k, columns + j] for k in (0, 1) for j in (0, 1)])
+    shares = np.stack([(1 - abs(k - part[:, 1])) * (1 - abs(j - part[:, 0])) for k in (0, 1) for j in (0, 1)])
+    inverse_depth = np.einsum("kn,kn->n", corners.astype(float), shares)
+    good = np.all(corners > 0, axis=0) & np.all((part >= 0) & (part <= 1), axis=1)
+    row = np.minimum(rows_per_metre / np.where(good, inverse_depth, 1.0), len(sigma) - 1).astype(int)
+    return inverse_depth, sigma[row], good

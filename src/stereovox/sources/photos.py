@@ -18,6 +18,8 @@ from stereovox.sources.images import MAX_BYTES, size_text
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".ppm", ".bmp")
 """Suffixes of pictures, in lower case."""
+FOLDERS = ("rgb", "color", "colour", "image", "images")
+"""Folders of pictures beside one of depth images."""
 ASPECT = 0.01
 """Share by which the ratio of sides may differ for a picture and a depth image to show the same."""
 

@@ -11,7 +11,7 @@ from stereovox.errors import NoPoses, SourceError
 from stereovox.sources.base import Part
 from stereovox.sources.camera_file import FoundCamera, find_camera
 from stereovox.sources.intrinsics import NAMES
-from stereovox.sources.photos import photo_size
+from stereovox.sources.photos import FOLDERS, photo_size
 from stereovox.sources.poses import Poses
 from stereovox.sources.rgbd.depth_files import SUFFIXES, common_depth_size
 from stereovox.sources.rgbd.folder import DepthFolder, ImageFile, folder_part, image_pattern, images_in, photos_in
@@ -25,8 +25,6 @@ POSES = Part(
     "poses",
     "write poses.txt with lines 'stamp tx ty tz qx qy qz qw' or a 4x4 matrix for each image, or add ?poses=FILE",
 )  # fmt: skip
-PHOTOS = ("rgb", "color", "colour", "image", "images")
-"""Folders of pictures."""
 POSE_FILE = r".*pose.*\d.*\.txt|.*\d.*pose.*\.txt"
 """A file with the pose of one image, beside it."""
 
@@ -66,7 +64,7 @@ class DepthAndPoses(DepthFolder):
     def list_photos(self) -> list[ImageFile]:
         """Return the pictures of a folder beside that of the images, if they are as large."""
         place = self._images[0].path.parent
-        found = (photos_in(place.parent / name, self.fps) for name in PHOTOS if place != self.folder)
+        found = (photos_in(place.parent / name, self.fps) for name in FOLDERS if place != self.folder)
         photos = next(filter(None, found), [])
         size = self.camera.width, self.camera.height
         return photos if photos and photo_size(photos[0].path) == size else []

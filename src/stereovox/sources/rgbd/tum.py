@@ -13,6 +13,7 @@ from stereovox.sources.base import Part
 from stereovox.sources.camera_file import FoundCamera, find_camera
 from stereovox.sources.images import file_names
 from stereovox.sources.intrinsics import NAMES
+from stereovox.sources.photos import FOLDERS
 from stereovox.sources.photos import SUFFIXES as PHOTO_SUFFIXES
 from stereovox.sources.poses import Poses
 from stereovox.sources.rgbd.depth_files import SUFFIXES
@@ -29,7 +30,7 @@ from stereovox.sources.trajectory import (
 )
 
 LIST, IMAGES, POSES = "depth.txt", "depth", "groundtruth.txt"
-PHOTO_LIST, PHOTOS = "rgb.txt", "rgb"
+PHOTO_LIST = "rgb.txt"
 PAIRED = ("associations.txt", "association.txt", "associate.txt", "associated.txt", "rgbd_assoc.txt")
 """Lists of colour and depth images with their times: `stamp file stamp file`."""
 OTHER_POSES = ("*truth*.txt", "CameraTrajectory.txt", "KeyFrameTrajectory.txt", "trajectory.txt", "poses.txt",
@@ -68,7 +69,7 @@ class StampedImages(DepthFolder):
         return [ImageFile(self.folder / name, stamp_ns) for stamp_ns, name, _ in images]
 
     def list_photos(self) -> list[ImageFile]:
-        """Return the pictures of rgb.txt, else of associations.txt, else of rgb/."""
+        """Return the pictures of rgb.txt, else of associations.txt, else of rgb/ or color/."""
         return [ImageFile(self.folder / name, stamp_ns) for stamp_ns, name, _ in by_time(_photo_lines(self.folder))]
 
     def find_camera(self, size: tuple[int, int]) -> FoundCamera:
@@ -174,7 +175,8 @@ def _photo_lines(folder: Path) -> list[StampedLine]:
     try:
         if os.path.isfile(folder / PHOTO_LIST):
             return _listed(folder / PHOTO_LIST)
-        found = _columns(paired)[1] if paired else _named(folder, PHOTOS, PHOTO_SUFFIXES)
+        place = next((name for name in FOLDERS if os.path.isdir(folder / name)), FOLDERS[0])
+        found = _columns(paired)[1] if paired else _named(folder, place, PHOTO_SUFFIXES)
         return [line for line in found if inside(line[1], line[2])]
     except SourceError:
         return []

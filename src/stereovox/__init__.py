@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from stereovox.formats.meshes import surface as surface
     from stereovox.frame import DepthImage as DepthImage
     from stereovox.frame import Frame as Frame
+    from stereovox.frame import Photo as Photo
     from stereovox.frame import Reason as Reason
     from stereovox.frame import Scan as Scan
     from stereovox.frame import StereoFrame as StereoFrame
@@ -68,6 +69,7 @@ _HOMES = {
     "StereovoxError": "errors",
     "DepthImage": "frame",
     "Frame": "frame",
+    "Photo": "frame",
     "Scan": "frame",
     "StereoFrame": "frame",
     "StereoPair": "cameras.rigs",

@@ -15,7 +15,7 @@ from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.depth.stereo.pipeline import grey
 from stereovox.errors import FrameRefused
 from stereovox.frame import DepthImage, Photo
-from stereovox.se3 import Transform, inverse, transform_points
+from stereovox.se3 import Transform, inverse, orthonormalise, rigidity_error, transform_points
 from stereovox.track._photos import laid_into
 from stereovox.track.corners import WINDOW
 from stereovox.track.fit import Equations, Fit, Stage, settled
@@ -23,6 +23,8 @@ from stereovox.track.landmarks import Landmarks, Sight
 from stereovox.track.sightings import AGREED, CONVERGED, REACHES, Sightings
 from stereovox.track.views import View, stood_free
 
+RIGID = 0.01
+"""Largest rigidity error of the place of a camera."""
 CELL, STEP = 4.0, 2
 """Pixels of the depth image that a cell of the other image is wide, and of how many along each axis one is used."""
 FOLLOWED = 0.2
@@ -73,9 +75,15 @@ class Beside(NamedTuple):
 
 
 class Photos:
-    """Landmarks in the images that a depth camera takes along; images that cannot be used are left out."""
+    """Landmarks in the images that a depth camera takes along; images that cannot be used are left out.
+
+    Attributes:
+        left_out: Number of images that could not be used.
+        why: What was wrong with the first of them.
+    """
 
     def __init__(self) -> None:
+        self.left_out, self.why = 0, ""
         self._landmarks: Landmarks | None = None
         self._followed: Beside | None = None
 
@@ -92,7 +100,8 @@ class Photos:
         """
         try:
             return None if photo is None else sighted(photo, image, sigma_of, rows_per_metre)
-        except FrameRefused:
+        except FrameRefused as refused:
+            self.left_out, self.why = self.left_out + 1, self.why or str(refused)
             return None
 
     def follow(self, seen: Sighted | None, expected: Transform, views: list[View]) -> Beside | None:
@@ -142,13 +151,15 @@ def sighted(photo: Photo, image: DepthImage, sigma_of: NDArray[np.float64], rows
     """
     pixels = photo.pixels() if callable(photo.pixels) else photo.pixels
     camera = photo.camera
+    if not rigidity_error(photo.T_sensor_camera) < RIGID:
+        raise FrameRefused("bad_form", "T_sensor_camera of the image beside the depth image is no rigid motion")
     picture = grey(pixels, (camera.width, camera.height), "the image beside the depth image")
     cell_px, depths = inverse_depths(image, camera, photo.T_sensor_camera, sigma_of, rows_per_metre)
     mask = cv2.resize((depths > 0).astype(np.uint8), None, fx=cell_px, fy=cell_px, interpolation=cv2.INTER_NEAREST)
     mask = np.ascontiguousarray(mask[: camera.height, : camera.width]) * np.uint8(255)
     sigma = sigma_of / np.square(np.maximum(np.arange(len(sigma_of)), 1) / rows_per_metre)  # of the inverse depth
     sight = Sight(picture, mask, partial(_distances, cell_px, depths, sigma, rows_per_metre))
-    return Sighted(sight, camera, np.asarray(photo.T_sensor_camera, float))
+    return Sighted(sight, camera, orthonormalise(np.asarray(photo.T_sensor_camera, float)))
 
 
 def of_sensor(equations: Equations, T_sensor_camera: Transform) -> Equations:

@@ -155,8 +155,8 @@ def sighted(photo: Photo, image: DepthImage, sigma_of: NDArray[np.float64], rows
         raise FrameRefused("bad_form", "T_sensor_camera of the image beside the depth image is no rigid motion")
     picture = grey(pixels, (camera.width, camera.height), "the image beside the depth image")
     cell_px, depths = inverse_depths(image, camera, photo.T_sensor_camera, sigma_of, rows_per_metre)
-    mask = cv2.resize((depths > 0).astype(np.uint8), None, fx=cell_px, fy=cell_px, interpolation=cv2.INTER_NEAREST)
-    mask = np.ascontiguousarray(mask[: camera.height, : camera.width]) * np.uint8(255)
+    known = np.where(depths > 0, np.uint8(255), np.uint8(0)).repeat(cell_px, axis=0).repeat(cell_px, axis=1)
+    mask = np.ascontiguousarray(known[: camera.height, : camera.width])
     sigma = sigma_of / np.square(np.maximum(np.arange(len(sigma_of)), 1) / rows_per_metre)  # of the inverse depth
     sight = Sight(picture, mask, partial(_distances, cell_px, depths, sigma, rows_per_metre))
     return Sighted(sight, camera, orthonormalise(np.asarray(photo.T_sensor_camera, float)))
@@ -206,8 +206,10 @@ def inverse_depths(
 
 def _mean(total: NDArray[np.float32], number: NDArray[np.float32], cells: int) -> NDArray[np.float32]:
     """Return the mean inverse depth of so many cells across around each."""
-    total, number = (cv2.boxFilter(part, -1, (cells, cells), normalize=False) for part in (total, number))
-    return total / np.maximum(number, 1)
+    sums = [
+        np.asarray(cv2.boxFilter(part, -1, (cells, cells), normalize=False), np.float32) for part in (total, number)
+    ]
+    return (sums[0] / np.maximum(sums[1], 1)).astype(np.float32)
 
 
 def _distances(

@@ -257,7 +257,8 @@ def test_without_poses_the_camera_is_tracked_and_what_is_lost_is_told(robot):
     other = rclpy.create_node("tracked")
     options = Options(depth=(DEPTH,), fixed=(MOUNT,), poses="track", late_s=60.0)
     mapping, reports = Mapping(load_config(voxel_size=0.1)), []
-    robot.maker = maker = MapNode(other, mapping, options, str, reports.append)
+    first, robot.maker = robot.maker, MapNode(other, mapping, options, str, reports.append)
+    maker = robot.maker
     robot.listen(Odometry, "/tracked_odometry", 10)
     robot.listen(DiagnosticArray, "/diagnostics", 10)
     robot.until(lambda: robot.send[DEPTH].get_subscription_count() == 2)
@@ -286,4 +287,6 @@ def test_without_poses_the_camera_is_tracked_and_what_is_lost_is_told(robot):
     assert {pair.key: pair.value for pair in status.values}["frames_lost"] == "2"
     older = robot.call(LoadMap, "/tracked/load", LoadMap.Request(map_url="/"))
     assert older.result == LoadMap.Response.RESULT_INVALID_MAP_DATA
+    maker.close()
+    robot.maker = first
     other.destroy_node()

@@ -157,3 +157,13 @@ def test_look_at_meets_its_target(eye, target):
     np.testing.assert_allclose(seen, [0, 0, np.linalg.norm(away)], atol=1e-8)
     assert T_world_camera[2, 1] < 0, "the image's y axis points down"
     assert abs(T_world_camera[2, 0]) < 1e-12, "the horizon is level"
+
+
+@pytest.mark.parametrize("one", [(0, 0, 1), (0.6, 0, 0.8), (1, 0, 0)])
+@pytest.mark.parametrize("other", [(0, 0, 1), (0, 0, -1), (0, -0.8, 0.6), (-0.6, 0, -0.8)])
+def test_the_least_rotation_between_two_directions(one, other):
+    R = se3.rotation_between(one, other)
+    np.testing.assert_allclose(R @ one, other, atol=1e-12)
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
+    angle = np.arccos(np.clip(np.dot(one, other), -1, 1))
+    assert np.linalg.norm(se3.rotation_vector(R)) == pytest.approx(angle, abs=1e-7)

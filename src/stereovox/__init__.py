@@ -50,6 +50,8 @@ if TYPE_CHECKING:
     from stereovox.run import MapResult as MapResult
     from stereovox.run import MapRun as MapRun
     from stereovox.run import map_recording as map_recording
+    from stereovox.sources.imu import ImuReadings as ImuReadings
+    from stereovox.sources.imu import LiveImu as LiveImu
     from stereovox.sources.latest import Latest as Latest
     from stereovox.track.tracker import Tracked as Tracked
     from stereovox.track.tracker import Tracker as Tracker
@@ -107,6 +109,8 @@ _HOMES = {
     "MapRun": "run",
     "map_recording": "run",
     "open_source": "opening",
+    "ImuReadings": "sources.imu",
+    "LiveImu": "sources.imu",
     "Latest": "sources.latest",
     "Tracked": "track.tracker",
     "Tracker": "track.tracker",

@@ -40,6 +40,7 @@ from stereovox.sources.camera_file import with_camera
 from stereovox.sources.turned import Turned
 from stereovox.survey import level_start, survey
 from stereovox.track.guided import GuidedTracker
+from stereovox.track.inertial import imu_and_note
 from stereovox.track.spans import LostSpan, LostSpans
 from stereovox.track.stream import AnyTracker, TrackedStream
 from stereovox.track.tracker import Tracker
@@ -88,6 +89,7 @@ class MapResult(Generic[MapT]):
         lost: Where the camera was lost, if its poses were tracked: these frames are not in the map.
         believed: Of poses `both`, the number of frames in which nothing known was in view, so that the recording's own
             motion was taken as it is.
+        imu: What was made of the IMU of a camera that was tracked, in words; "" without one.
     """
 
     map: MapT
@@ -99,6 +101,7 @@ class MapResult(Generic[MapT]):
     poses: str = GIVEN
     lost: Sequence[LostSpan] = ()
     believed: int = 0
+    imu: str = ""
 
     def _repr_html_(self) -> str:
         """Return what a notebook shows: the map's picture and facts."""
@@ -116,6 +119,8 @@ class MapResult(Generic[MapT]):
         if self.poses != GIVEN:
             summary["lost"] = [span.as_dict() for span in self.lost]
             summary["believed"] = self.believed
+        if self.imu:
+            summary["imu"] = self.imu
         return {**summary, "poses": self.poses}
 
 
@@ -226,9 +231,11 @@ class MapRun:
             self.mapper = self._make_mapper(saved, suggested)
             stack.callback(self.mapper.map.close)
             self._recorded = self.source
-            self._guides: list[GuidedTracker] = []
+            self._trackers: list[Tracker | GuidedTracker] = []
             if self.poses != GIVEN:
-                self.source = TrackedStream(self.source, self._make_tracker(), HOW[self.poses])
+                make, line = self._make_tracker()
+                self.source = TrackedStream(self.source, make, HOW[self.poses])
+                lines = [*lines, *filter(None, [line])]
             self._checkpoints = Checkpoints(lambda: self.mapper.map.save(self.out), self.out, self._checkpoint_s)
             self._check_recording()
             if not self._resume and is_map(self.out):
@@ -264,7 +271,7 @@ class MapRun:
             self._checkpoints.save(frames_offered(self.mapper))
         return MapResult(
             self.mapper.map, self.out, reports, self.source.dropped,
-            poses=self.poses, lost=self._lost.spans, believed=self._believed(),
+            poses=self.poses, lost=self._lost.spans, believed=self._believed(), imu=self._imu_use(),
         )  # fmt: skip
 
     @property
@@ -344,14 +351,19 @@ class MapRun:
         return Mapper(on_usable_device(config, self._notify), resume=saved, tiles=tiles)
 
     def _believed(self) -> int:
-        return self._guides[-1].believed if self._guides else 0
+        return sum(tracker.believed for tracker in self._trackers[-1:] if isinstance(tracker, GuidedTracker))
 
-    def _make_tracker(self) -> Callable[[], AnyTracker]:
-        """Return what makes the tracker of this run, the same each time."""
+    def _imu_use(self) -> str:
+        return "".join(tracker.imu_use for tracker in self._trackers[-1:] if isinstance(tracker, Tracker))
+
+    def _make_tracker(self) -> tuple[Callable[[], AnyTracker], str]:
+        """Return what makes the tracker of this run, the same each time, and a line about the IMU, if there is one."""
         config = self.mapper.config
         if self.poses == BOTH:
-            return partial(_guide, config, self._guides)
-        return partial(Tracker, config, start=level_start(self.source, config))
+            return partial(_kept, self._trackers, partial(GuidedTracker, config)), ""
+        imu, line = imu_and_note(self.source)
+        make = partial(Tracker, config, start=level_start(self.source, config), imu=imu)
+        return partial(_kept, self._trackers, make), line
 
     def _check_recording(self) -> None:
         """Check that the map is of this recording: of another one, the first frames would be skipped."""
@@ -578,7 +590,7 @@ def _default_signals() -> list[int]:
     return [number for number, handler in usual.items() if signal.getsignal(number) == handler]
 
 
-def _guide(config: Config, guides: list[GuidedTracker]) -> GuidedTracker:
-    """Return a new tracker, and keep it in a list to be asked what it believed."""
-    guides.append(GuidedTracker(config))
-    return guides[-1]
+def _kept(trackers: list[Tracker | GuidedTracker], make: Callable[[], Tracker | GuidedTracker]) -> AnyTracker:
+    """Return a new tracker, and keep it in a list to be asked later what it did."""
+    trackers.append(make())
+    return trackers[-1]

@@ -88,6 +88,21 @@ def rotation_matrix(vector: ArrayLike) -> NDArray[np.float64]:
     return np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * (K @ K)
 
 
+def rotation_between(one: ArrayLike, other: ArrayLike) -> NDArray[np.float64]:
+    """Return the least rotation (3, 3) that turns a unit vector (3,) into another one."""
+    a, b = np.asarray(one, float), np.asarray(other, float)
+    axis, cosine = np.cross(a, b), float(a @ b)
+    sine = float(np.linalg.norm(axis))
+    if sine < 1e-9:  # any axis across serves half a turn
+        return rotation_matrix(np.zeros(3)) if cosine > 0 else rotation_matrix(np.pi * _across(a))
+    return rotation_matrix(axis * (np.arctan2(sine, cosine) / sine))
+
+
+def _across(a: NDArray[np.float64]) -> NDArray[np.float64]:
+    axis = np.asarray(np.cross(a, np.eye(3)[np.argmin(np.abs(a))]), float)
+    return axis / np.linalg.norm(axis)
+
+
 def interpolate(T_a_b0: Transform, T_a_b1: Transform, share: float) -> Transform:
     """Return the motion at `share` between two (0 to 1; beyond, it goes on): linear in position, even in turning."""
     T = np.eye(4)

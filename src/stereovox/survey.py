@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.config import Config
 from stereovox.frame import AnyFrame, Frame, StereoFrame
-from stereovox.products.floor_axes import nearest_axis, upright_axes
+from stereovox.products.floor_axes import nearest_axis, up_of, upright_axes
 from stereovox.products.moved import level_transform
 from stereovox.se3 import Transform, inverse, rigidity_error, rotation_vector
 from stereovox.sources.base import Source, Stream
@@ -305,8 +305,7 @@ def level_pose(first: Frame | None, config: Config) -> Transform:
 
 def level_world(config: Config) -> Transform:
     """Return the motion (4, 4) from a world whose z axis is up into one in which it is the axis of the settings."""
-    up = upright_axes(config.up)[2] if config.up_direction is None else config.up_direction
-    return inverse(level_transform(up))
+    return inverse(level_transform(up_of(config)))
 
 
 def _first_images(source: Stream) -> Iterator[Frame]:

@@ -28,6 +28,7 @@ from stereovox.sources.camera_file import with_camera
 from stereovox.sources.poses import Poses
 from stereovox.sources.trajectory import write_trajectory
 from stereovox.survey import level_start, survey
+from stereovox.track.inertial import imu_and_note
 from stereovox.track.spans import LostSpan, LostSpans
 from stereovox.track.stream import LOST, follow
 from stereovox.track.tracker import Tracked, Tracker
@@ -50,6 +51,7 @@ class CameraTrack:
         lost: Where the camera was lost, and why.
         frame_ms: (N,) milliseconds that each frame took.
         score: How far off it is from the poses that the recording has; None without.
+        imu: What was made of the IMU, in words; "" without one.
     """
 
     name: str
@@ -59,6 +61,7 @@ class CameraTrack:
     lost: tuple[LostSpan, ...]
     frame_ms: NDArray[np.float64]
     score: TrajectoryScore | None = None
+    imu: str = ""
 
     @property
     def tracked(self) -> NDArray[np.bool_]:
@@ -131,6 +134,7 @@ class CameraTrack:
             "frame_ms": percentiles(self.frame_ms.tolist()),
             "lost": [span.as_dict() for span in self.lost],
             "doubts": [{"kind": LOST, **span.as_dict()} for span in self.lost],
+            **({"imu": self.imu} if self.imu else {}),
             **({} if score is None else {"score": score.as_dict()}),
         }
 
@@ -173,10 +177,11 @@ def track_recording(
     stream = choose_poses(source, frames, TRACK).source
     stream = stream if camera is None else with_camera(stream, str(camera))
     config, lines = _settings(stream, profile, overrides)
-    for note in (*getattr(stream, "notes", ()), *lines):
+    imu, line = imu_and_note(stream)
+    for note in (*getattr(stream, "notes", ()), *lines, *filter(None, [line])):
         notify(f"note: {note}")
     run = _Run(stream.name)
-    tracker = Tracker(config, start=level_start(stream, config))
+    tracker = Tracker(config, start=level_start(stream, config), imu=imu)
     try:
         with interrupt_between_steps() as check:
             for frame, tracked in follow(run.noting(stream), tracker):
@@ -187,7 +192,9 @@ def track_recording(
         if _save(run.track(), target):
             notify(f"stopped after {run.spans.frames} frames; their poses are saved in {target}")
         raise
-    found = run.track()
+    if tracker.imu_use:
+        notify(f"note: {tracker.imu_use}")
+    found = replace(run.track(), imu=tracker.imu_use)
     if not found.tracked.any():
         why = found.lost[0].why if found.lost else "it is empty"
         raise StereovoxError(f"{stream.name}: not one frame could be tracked, nothing is written ({why})")

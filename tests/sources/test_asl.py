@@ -210,3 +210,37 @@ def test_positions_alone_are_no_poses(tmp_path):
         open_source(folder)
     (folder / "poses.txt").write_text(poses_text(START, START + STEP))
     assert len(open_source(folder)) == 2
+
+
+def with_imu(folder, lines, T_BS=None):
+    place = asl(folder) / "mav0/imu0"
+    place.mkdir()
+    (place / "data.csv").write_text("#timestamp [ns],w_RS_S_x [rad s^-1],...\n" + "\n".join(lines) + "\n")
+    if T_BS is not None:
+        (place / "sensor.yaml").write_text(f"sensor_type: imu\nT_BS:\n{matrix_text(T_BS)}rate_hz: 200\n")
+    return folder
+
+
+def test_an_imu_is_read_and_mounted_as_its_file_says(tmp_path):
+    T_body_imu = inverse(FORWARD)
+    lines = [f"{START + k},{k}.5,2,3,4,5,{k}" for k in range(3)]
+    source = open_source(with_imu(tmp_path / "a", lines, T_body_imu))
+    found = source.imu()
+    np.testing.assert_array_equal(found.stamps_ns, START + np.arange(3))
+    np.testing.assert_array_equal(found.angular_rate, [[0.5, 2, 3], [1.5, 2, 3], [2.5, 2, 3]])
+    np.testing.assert_array_equal(found.specific_force, [[4, 5, 0], [4, 5, 1], [4, 5, 2]])
+    np.testing.assert_allclose(found.T_sensor_imu, inverse(source.pairs[0].T_body_camera) @ T_body_imu, atol=1e-9)
+    body = open_source(with_imu(tmp_path / "b", lines)).imu()
+    np.testing.assert_allclose(body.T_sensor_imu, inverse(source.pairs[0].T_body_camera), atol=1e-9)
+
+
+def test_an_imu_can_be_left_out_and_a_damaged_one_says_so(tmp_path):
+    lines = [f"{START},1,2,3,4,5,6", f"{START + 1},1,2,3,4,5,six", f"{START + 2},1,2,3,4,5,6"]
+    folder = with_imu(tmp_path / "a", lines)
+    assert len(open_source(folder).imu()) == 2
+    assert open_source(f"{folder}?imu=off").imu() is None
+    with pytest.raises(SourceError, match="imu=on must be off"):
+        open_source(f"{folder}?imu=on")
+    with pytest.raises(SourceError, match="is no time in whole nanoseconds"):
+        open_source(with_imu(tmp_path / "b", ["soon,1,2,3,4,5,6"])).imu()
+    assert open_source(asl(tmp_path / "c")).imu() is None

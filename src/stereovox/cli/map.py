@@ -150,6 +150,8 @@ def _print_result(result: dict[str, Any], mapped: MapResult[VoxelMap], out: Path
     say_refusals(result, mapped.reports, "frames")
     say(_poses_line(mapped))
     say_lost(mapped.lost)
+    if mapped.imu:
+        say(f"note: {mapped.imu}")
     if result.get("dropped"):
         say(f"  {result['dropped']} more came while the map was busy and were dropped; see --set deadline_ms=")
     if reduced := [f"{number} {quality}" for quality, number in result["ways"].items() if quality != FULL]:

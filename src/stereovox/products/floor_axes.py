@@ -6,6 +6,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from stereovox.config import Config
 from stereovox.errors import StereovoxError
 
 Heights = tuple[float, float]
@@ -32,6 +33,11 @@ def upright_axes(up: str) -> NDArray[np.float64]:
     x, y, upright, sign = floor_axes(up)
     unit = np.eye(3)
     return np.stack([unit[x], unit[y], sign * unit[upright]])
+
+
+def up_of(config: Config) -> NDArray[np.float64]:
+    """Return the unit vector (3,) that points up in the world of a map with these settings."""
+    return upright_axes(config.up)[2] if config.up_direction is None else np.array(config.up_direction)
 
 
 def nearest_axis(direction: NDArray[np.float64]) -> str:

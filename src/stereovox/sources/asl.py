@@ -7,6 +7,7 @@ import os
 import re
 from bisect import bisect_left
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from stereovox.sources.base import Part
 from stereovox.sources.calibration_files import read_calibration
 from stereovox.sources.calibration_values import StereoCalibration, read_yaml, rigid
 from stereovox.sources.images import file_names
+from stereovox.sources.imu import ImuReadings, checked_imu, in_order
 from stereovox.sources.parameters import file_of
 from stereovox.sources.poses import Poses, UnknownPoses, seconds_from_ns
 from stereovox.sources.rgbd.folder import folder_part
@@ -28,6 +30,7 @@ from stereovox.sources.rig_options import POSES, as_body, folder_and_options, po
 from stereovox.sources.trajectory import Trajectory, inside, transforms
 
 ROOT, EYES, DATA, SENSOR = "mav0", ("cam0", "cam1"), "data.csv", "sensor.yaml"
+IMU = "imu0"
 TRUTHS = ("state_groundtruth_estimate0", "mocap0", "vicon0")
 """Folders with poses, the best first: EuRoC's estimate, TUM VI's motion capture, EuRoC's."""
 TEXTS = ("poses.txt", "groundtruth.txt")
@@ -46,6 +49,7 @@ class AslRig(RigSource):
         poses: a file or folder of poses of any form (see `rgbd.pose_files`), of the body.
         axes: the poses are those of the left eye instead, in `optical`, `opengl` or `ros` axes. invert: 1 where they
         map the world into what is posed.
+        imu: `off` to leave imu0 out.
     posed: without it poses are not looked for, and are NaN.
     Images: `cam0/data.csv` (lines `ns,file`), else all `cam0/data/*.png`; those that the list names but that are not
     there are left out, with a note. The right image is that of the same time, or less than 1 ms away.
@@ -53,6 +57,7 @@ class AslRig(RigSource):
     Poses: data.csv of `state_groundtruth_estimate0`, `mocap0` or `vicon0` (ns, metres, quaternion w x y z, then
     anything), moved from that sensor to the body by its T_BS; else T_world_body in poses.txt or groundtruth.txt (TUM
     format).
+    IMU: `imu0/data.csv` (ns, rad/s, m/s^2), mounted as T_BS of its sensor.yaml says; the body's frame without.
     World, poses and faults: see `RigSource`. Raises SourceError for what is missing or wrong as a whole.
     """
 
@@ -63,7 +68,8 @@ class AslRig(RigSource):
     )
 
     def __init__(self, where: str | os.PathLike[str], posed: bool = True):
-        self.folder, options = folder_and_options(where, {"rectify": "", **POSES})
+        self.folder, options = folder_and_options(where, {"rectify": "", "imu": "", **POSES})
+        self._imu = None if checked_imu(str(where), options["imu"]) == "off" else IMU
         self.name = self.folder.resolve().name
         root = _root(str(self.folder))
         if root is None:
@@ -74,6 +80,7 @@ class AslRig(RigSource):
                 raise SourceError(f"{root}: has {other} but no {eye}; copy it there, stereo needs both cameras")
         found, calibration = _calibration(root)
         virtual = Virtual(options["rectify"]) if options["rectify"] else usual_virtual(found.eyes)
+        self._root = root
         pair = RigPair("stereo", camera=found.camera, eyes=found.eyes, T_body_left=found.T_body_left, virtual=virtual)
         left, right = (_Images(root / eye) for eye in (EYES[::-1] if found.swapped else EYES))
         poses = self._read_poses(root, left, found.T_body_left, options) if posed else UnknownPoses()
@@ -91,6 +98,12 @@ class AslRig(RigSource):
             _check_clocks(left, poses)
             self.up = "z" if any(os.path.isfile(root / name / DATA) for name in TRUTHS) else None
         return as_body(poses, T_body_left, options["axes"], options["invert"])
+
+    def imu(self) -> ImuReadings | None:
+        """Return the readings of imu0; raises SourceError where they are damaged."""
+        if self._imu is None or not os.path.isfile(self._root / self._imu / DATA):
+            return None
+        return _readings(self._root / self._imu, self.pairs[0].T_body_camera)
 
     @classmethod
     def recognises(cls, where: str) -> bool:
@@ -196,6 +209,18 @@ def _mount(path: Path) -> Transform:
         return rigid(table["T_BS"], "T_BS") if "T_BS" in table else np.eye(4)
     except SourceError as error:
         raise SourceError(f"{path}: {error}") from None
+
+
+def _readings(folder: Path, T_body_camera: Transform) -> ImuReadings:
+    path = folder / DATA
+    rows = _rows(path)[0]
+    numbers = np.full((len(rows), 6), np.nan)
+    for row, (words, _) in zip(numbers, rows, strict=True):
+        with suppress(ValueError):  # then it stays without a value, and is left out
+            row[:] = [float(word) for word in words[1:7]]
+    stamps = [_ns(words[0], where) for words, where in rows]
+    mount = inverse(T_body_camera) @ _mount(folder / SENSOR)
+    return in_order(stamps, numbers[:, :3], numbers[:, 3:], mount, str(path))
 
 
 def _w_column(header: list[str]) -> int:

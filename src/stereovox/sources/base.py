@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.errors import SourceError
 from stereovox.frame import AnyFrame, Frame
+from stereovox.sources.imu import Imu
 
 T = TypeVar("T")
 
@@ -117,6 +118,17 @@ class Stream(Protocol):
         """
         return self
 
+    def imu(self) -> Imu | None:
+        """Read what the IMU beside the camera says.
+
+        Returns:
+            Its readings, by the clock of the images; None where there is no IMU.
+
+        Raises:
+            SourceError: There is one that cannot be used.
+        """
+        return None
+
     def __iter__(self) -> Iterator[AnyFrame]: ...
 
 
@@ -210,6 +222,10 @@ class Changed(Stream):
         """Frames dropped by the stream."""
         return self._stream.dropped
 
+    def imu(self) -> Imu | None:
+        """Return the IMU of the stream."""
+        return imu_of(self._stream)
+
     def after(self, count: int) -> Stream:
         """Return the remaining frames after `count`, changed in the same way."""
         rest = copy.copy(self)
@@ -245,6 +261,10 @@ class Selection(Source):
         measure = getattr(self._source, "gravity", None)  # a class of another package may lack it
         return measure() if measure else None
 
+    def imu(self) -> Imu | None:
+        """Return the IMU of the whole recording."""
+        return imu_of(self._source)
+
     def __len__(self) -> int:
         return len(self._picked)
 
@@ -275,6 +295,10 @@ class Excerpt(Stream):
         """Frames that the camera delivered and that were not consumed in time."""
         return self._stream.dropped
 
+    def imu(self) -> Imu | None:
+        """Return the IMU of the camera."""
+        return imu_of(self._stream)
+
     def __iter__(self) -> Iterator[AnyFrame]:
         frames = iter(self._stream)
         try:
@@ -283,6 +307,12 @@ class Excerpt(Stream):
             close = getattr(frames, "close", None)
             if close:  # a generator: the camera is to stop now, not when it happens to be collected
                 close()
+
+
+def imu_of(stream: Stream) -> Imu | None:
+    """Return the IMU of a stream, None where it has none; a class of another package may not know of such a thing."""
+    read = getattr(stream, "imu", None)
+    return read() if read else None
 
 
 def parse_slice(text: str) -> slice:

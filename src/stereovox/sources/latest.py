@@ -9,7 +9,8 @@ from threading import Condition, Event, Thread
 from typing import Generic, TypeVar
 
 from stereovox.frame import AnyFrame
-from stereovox.sources.base import Stream
+from stereovox.sources.base import Stream, imu_of
+from stereovox.sources.imu import Imu
 
 T = TypeVar("T")
 WAITING = 2
@@ -110,6 +111,7 @@ class LatestStream(Stream):
     """A live camera read through `Latest`."""
 
     def __init__(self, camera: Stream):
+        self._camera = camera
         self._latest: Latest[AnyFrame] = Latest(camera)
         self.name, self.camera = camera.name, camera.camera
         self.notes, self.layout = getattr(camera, "notes", ()), getattr(camera, "layout", "")
@@ -119,6 +121,10 @@ class LatestStream(Stream):
     def dropped(self) -> int:
         """Frames that the camera delivered and that were not consumed in time."""
         return self._latest.dropped
+
+    def imu(self) -> Imu | None:
+        """Return the IMU of the camera."""
+        return imu_of(self._camera)
 
     def __iter__(self) -> Iterator[AnyFrame]:
         return iter(self._latest)

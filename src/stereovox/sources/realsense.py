@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import count
 from typing import Any, NoReturn
 
 import numpy as np
@@ -14,6 +15,8 @@ from stereovox.errors import MissingExtra, SourceError, StereovoxError
 from stereovox.frame import Frame
 from stereovox.sources import parameters
 from stereovox.sources.base import Stream
+from stereovox.sources.imu import LiveImu
+from stereovox.sources.realsense_imu import FIRST_IMAGES, FIRST_S, MotionSensor, find_motion, ns_from_ms
 
 PREFIX = "realsense:"
 WAITING = 2
@@ -29,7 +32,7 @@ class Options:
 
     width, height in pixels, fps in frames a second. emitter: 0 off, 1 on. laser_power in milliwatts (D435: 0 to 360).
     baseline: metres between the two infrared cameras, where the camera does not report it. pose: `fixed` for a camera
-    at rest; every pose is then the identity.
+    at rest; every pose is then the identity. imu: `off` to leave gyroscope and accelerometer out.
     """
 
     width: int = 0
@@ -39,10 +42,13 @@ class Options:
     laser_power: float = -1.0
     baseline: float = 0.0
     pose: str = ""
+    imu: str = ""
 
     def __post_init__(self) -> None:
         if self.pose not in ("", "fixed"):
             raise SourceError(f"pose={self.pose} must be fixed")
+        if self.imu not in ("", "off"):
+            raise SourceError(f"imu={self.imu} must be off, or left out")
         for key in ("width", "height", "fps", "baseline", "emitter", "laser_power"):
             unset = key in ("emitter", "laser_power") and getattr(self, key) == -1
             if getattr(self, key) < 0 and not unset:
@@ -78,7 +84,22 @@ class RealSense(Stream):
         except RuntimeError as error:
             _failed(location, error)
         self.name = PREFIX + _serial(self._rs, self._device)
+        self._motion = self._find_motion()
         self.posed = self.options.pose == "fixed"
+
+    def _find_motion(self) -> MotionSensor | None:
+        """Return the IMU, None where there is none, or where the camera does not say how it is mounted."""
+        if self.options.imu == "off" or self.options.pose == "fixed":
+            return None
+        try:
+            return find_motion(self._rs, self._device, self._profile, self.name)
+        except (RuntimeError, StereovoxError) as error:
+            self.notes = (*self.notes, f"{self.name}: its IMU is not used ({' '.join(str(error).split())})")
+            return None
+
+    def imu(self) -> LiveImu | None:
+        """Return the camera's IMU, whose readings arrive with its images."""
+        return None if self._motion is None else self._motion.imu
 
     @classmethod
     def recognises(cls, location: str) -> bool:
@@ -99,15 +120,27 @@ class RealSense(Stream):
                 self._sensor.start(queue)
             except RuntimeError as error:
                 _failed(self.name, error)
-            while True:
+            if self._motion is not None and not self._motion.start():
+                self._motion = None
+            for number in count():
                 arrived, image = queue.try_wait_for_frame(PATIENCE_MS)
                 if not arrived:
                     raise SourceError(f"{self.name}: no frame for {PATIENCE_MS / 1000:g} s; check cable and USB port")
-                yield self._frame(image)
+                if self._ready(number):
+                    yield self._frame(image)
         finally:
             self._stop()
 
+    def _ready(self, images: int) -> bool:
+        """Read the IMU; return whether it has said enough for an image to count, after so many."""
+        if self._motion is None:
+            return True
+        self._motion.read()
+        return self._motion.imu.seconds >= FIRST_S or images >= FIRST_IMAGES
+
     def _stop(self) -> None:
+        if self._motion is not None:
+            self._motion.stop()
         for end in (self._sensor.stop, self._sensor.close):
             try:
                 end()
@@ -116,7 +149,7 @@ class RealSense(Stream):
 
     def _frame(self, image: Any) -> Frame:
         depth = np.array(image.get_data())  # a copy: the library uses its memory again
-        stamp_ns = _ns_from_ms(image.get_timestamp())
+        stamp_ns = ns_from_ms(image.get_timestamp())
         name = f"{self.name} frame {image.get_frame_number()}"
         unit = float(image.as_depth_frame().get_units())
         if self.options.pose == "fixed":
@@ -127,12 +160,6 @@ class RealSense(Stream):
             depth, self.camera, np.full((4, 4), np.nan), stamp_ns, unit, name=name, sensor=self.name,
             fault="no_pose", fault_detail=detail,
         )  # fmt: skip
-
-
-def _ns_from_ms(milliseconds: float) -> int:
-    """Return whole nanoseconds; times 1e6 as a float, today's dates would be off by up to 128 ns."""
-    whole, rest = divmod(milliseconds, 1.0)
-    return int(whole) * 1_000_000 + round(rest * 1e6)
 
 
 def _library() -> Any:

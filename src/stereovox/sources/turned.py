@@ -7,7 +7,8 @@ from dataclasses import replace
 
 from stereovox.frame import AnyFrame
 from stereovox.se3 import Transform
-from stereovox.sources.base import Changed, Source, Stream
+from stereovox.sources.base import Changed, Source, Stream, imu_of
+from stereovox.sources.imu import Imu
 
 
 class Turned(Changed):
@@ -28,6 +29,10 @@ class TurnedRecording(Source):
     def __init__(self, source: Source, T_new_world: Transform):
         self._source, self._T_new_world = source, T_new_world
         self.name, self.camera, self.notes = source.name, source.camera, source.notes
+
+    def imu(self) -> Imu | None:
+        """Return the IMU of the recording."""
+        return imu_of(self._source)
 
     def __len__(self) -> int:
         return len(self._source)

@@ -14,8 +14,19 @@ from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.config import Config, load_config
 from stereovox.errors import FrameRefused, StereovoxError
 from stereovox.frame import AnyFrame, StereoFrame
-from stereovox.se3 import Transform, interpolate, inverse, orthonormalise, rigidity_error, rotation_vector
+from stereovox.products.floor_axes import up_of
+from stereovox.se3 import (
+    Transform,
+    interpolate,
+    inverse,
+    orthonormalise,
+    rigidity_error,
+    rotation_between,
+    rotation_vector,
+)
+from stereovox.sources.imu import Imu
 from stereovox.track.fit import Fit, Limits, deviations
+from stereovox.track.inertial import Gyroscope, Turn, up_by_force
 from stereovox.track.surfaces import Surfaces
 from stereovox.track.views import far_apart
 
@@ -27,6 +38,9 @@ GAP, LONGEST = 2.0, 10.0
 """Times the usual, how long after an image the next may come and be followed as any, and be followed at all."""
 SHORTEST = 0.3
 """Times the usual, how soon after an image the next must not come if motion is to be told from them."""
+TURNED_AWAY = np.radians(20)
+"""Angle between an image that is found again and what a trusted gyroscope says, beyond four times its doubt: another
+place that looks alike."""
 RIVAL, RIVAL_M, RIVAL_RAD = 0.9, 0.3, np.radians(15)
 """Two fits of which one explains this share of what the other does, so far apart: neither is believed."""
 FIRST = 3.0
@@ -49,6 +63,8 @@ class Demand(NamedTuple):
 FOLLOWING, RETURNING = Demand(0.2, 0.6), Demand(0.5, 0.8)
 
 Seen = TypeVar("Seen")
+Guess = tuple[Transform, NDArray[np.float64]]
+"""A pose (4, 4) that an image may have, and its covariance (6, 6)."""
 
 
 class Evidence(Protocol[Seen]):
@@ -121,10 +137,16 @@ class Tracker:
     little is followed on, else the way back is sought among the views that were kept. A view that is found again counts
     after some images that agree. Poses that frames bring are not used. All frames come from one camera.
 
+    With an IMU, images are expected where its gyroscope turns the camera, once its turns have been found to be those of
+    the images; where they are not, it is left out. Its accelerometer says which way is up.
+
     Args:
         profile: Profile name, TOML file or `Config`: depth, noise and range are prepared as for a map.
         start: (4, 4) T_world_sensor of the image that the map begins with, the first that the next one fits; without
             it the camera looks along x, level, z up.
+        imu: An IMU beside the camera: `ImuReadings` of a recording, or a `LiveImu` that is fed before each frame.
+            `start` is tilted to what its accelerometer says is up, where they differ by more than that may be off: 1
+            degree if the camera stood still around that image, else 5.
         **overrides: Settings that replace those of the profile.
 
     Attributes:
@@ -134,18 +156,36 @@ class Tracker:
         ConfigError: A setting is unknown, of the wrong type or out of range.
     """
 
-    def __init__(self, profile: str | Path | Config = "default", *, start: Transform | None = None, **overrides: Any):
+    def __init__(
+        self,
+        profile: str | Path | Config = "default",
+        *,
+        start: Transform | None = None,
+        imu: Imu | None = None,
+        **overrides: Any,
+    ):
         self.config = load_config(profile, **overrides)
         self._start = LEVEL if start is None else np.asarray(start, float)
         if self._start.shape != (4, 4) or not rigidity_error(self._start) < RIGID:
             raise StereovoxError("start is no rigid motion; give a (4, 4) T_world_sensor in metres")
+        self._given_start, self._felt_up = self._start, False
+        self._imu, self._gyroscope = imu, None if imu is None else Gyroscope(imu)
         self._evidence: Evidence[Any] | None = None
         self._sensor = ""
         self._T, self._motion, self._covariance = np.eye(4), np.eye(4), np.zeros((6, 6))  # from the start
         self._stamps: list[int] = []  # of the last images that were followed
         self._learned = 0
         self._adrift = False  # followed, though open along some direction
+        self._counted = False  # whether the pose of the last image that was followed did
         self._trial: int | None = None  # images until poses count: 0 while following, None while lost
+
+    @property
+    def imu_use(self) -> str:
+        """What was made of the IMU so far, in one line; "" without one."""
+        if self._imu is None or self._gyroscope is None:
+            return ""
+        up = "which way is up" if self._felt_up else "not which way is up"
+        return f"{self._imu.name}: {self._gyroscope.use}; its accelerometer said {up}"
 
     def add(self, frame: AnyFrame, motion: Transform | None = None) -> Tracked:
         """Return the pose of a frame. Frames come in the order they were taken.
@@ -171,7 +211,7 @@ class Tracker:
         if self._learned < 2 and self._trial != 0:
             return self._begin(self._evidence, seen, frame.stamp_ns)
         if motion is None and (self._trial is None or self._later(frame.stamp_ns) > LONGEST):
-            return self._seek(self._evidence, seen, frame.stamp_ns)
+            return self._return(self._evidence, seen, frame.stamp_ns)
         if motion is not None and not self._trial:
             return self._correct(self._evidence, seen, motion, frame.stamp_ns)
         return self._follow(self._evidence, seen, frame.stamp_ns)
@@ -200,20 +240,32 @@ class Tracker:
         """Start with an image; a start counts once the next image is tracked on it. why: the one before does not."""
         evidence.forget()
         evidence.learn(seen, np.eye(4))
+        self._level(stamp_ns)
         self._place(np.eye(4), np.zeros((6, 6)))
         self._stamps, self._trial, self._learned = [stamp_ns], 0, 1
         words = f"the map begins anew ({why})" if why else "the first image"
         return replace(self._lost(f"{words}; poses count from the next image that fits it"), begins=True)
 
-    def _follow(self, evidence: Evidence[Seen], seen: Seen, stamp_ns: int) -> Tracked:
+    def _level(self, stamp_ns: int) -> None:
+        """Tilt the start by what the accelerometer says of the image that the map begins with, if it is off by more."""
+        self._start = self._given_start
+        up = None if self._imu is None else up_by_force(self._imu, stamp_ns)
+        self._felt_up = up is not None
+        if up is None:
+            return
+        tilt = rotation_between(self._start[:3, :3] @ up.direction, up_of(self.config))
+        if np.linalg.norm(rotation_vector(tilt)) > up.off:
+            self._start = self._start.copy()
+            self._start[:3, :3] = tilt @ self._start[:3, :3]
+
+    def _follow(self, evidence: Evidence[Seen], seen: Seen, stamp_ns: int, demand: Demand = FOLLOWING) -> Tracked:
         """Take the pose of an image that fits, and learn from it where it is believed."""
-        later = self._later(stamp_ns)
-        expected, doubt = self._expected(evidence.limits, stamp_ns, later)
-        fit = evidence.fit(seen, expected, doubt)
-        returning = later > GAP or (bool(self._trial) and not self._adrift)
-        why = _doubt(fit, RETURNING if returning else FOLLOWING) or _open(fit, evidence.limits.adrift)
-        if not why and returning:
-            why = evidence.contradicted(seen, fit.T_map_camera)
+        later, turn = self._later(stamp_ns), self._turn(stamp_ns)
+        returning = demand is RETURNING or later > GAP or (bool(self._trial) and not self._adrift)
+        guess, *others = self._guesses(evidence.limits, stamp_ns, later, turn)
+        fit, why = _followed(evidence, seen, guess, returning)
+        if why and others:
+            fit, why = _followed(evidence, seen, others[0], returning)
         if why:
             return self._begin(evidence, seen, stamp_ns, why) if self._learned < 2 else self._lose(why)
         before = self._T
@@ -221,12 +273,35 @@ class Tracker:
         self._motion = inverse(before) @ self._T
         self._stamps = [*self._stamps[1 - REMEMBERED :], stamp_ns]
         why = self._wait(evidence, seen, fit)
+        if self._gyroscope is not None:
+            self._gyroscope.learn(None if why else turn, before[:3, :3], self._T[:3, :3], fit.covariance[:3, :3])
+        self._counted = not why
         if why:
             evidence.advance(seen, self._T)
             return self._lost(why)
         evidence.learn(seen, self._T)
         self._learned += 1
         return self._found()
+
+    def _turn(self, stamp_ns: int) -> Turn | None:
+        """Return how the camera turned by the gyroscope since the last image that was followed; None: not known."""
+        return None if self._gyroscope is None else self._gyroscope.turn(self._stamps[-1], stamp_ns)
+
+    def _guesses(self, limits: Limits, stamp_ns: int, later: float, turn: Turn | None) -> list[Guess]:
+        """Return poses that an image may have, the likeliest first, and their covariances (6, 6).
+
+        The turn of a gyroscope that is trusted takes the place of even turning; else it is what is tried next.
+        """
+        even, doubt = self._expected(limits, stamp_ns, later)
+        if self._gyroscope is None or turn is None:
+            return [(even, doubt)]
+        turned = even.copy()
+        turned[:3, :3] = R = self._T[:3, :3] @ turn.R
+        if not self._gyroscope.trusted:
+            return [(even, doubt), (turned, doubt)]
+        self._gyroscope.used += 1
+        doubt[:3, :3] = self._covariance[:3, :3] + R @ self._gyroscope.doubt(turn) @ R.T
+        return [(turned, doubt)]
 
     def _wait(self, evidence: Evidence[Seen], seen: Seen, fit: Fit) -> str:
         """Return why a pose that is followed does not count yet: because it is open, or was until just before."""
@@ -259,9 +334,19 @@ class Tracker:
         spread = limits.spread * max(later, 1.0) * (1 if len(self._stamps) > 1 else FIRST)
         return self._T @ interpolate(np.eye(4), self._motion, share), self._covariance + np.diag(spread**2)
 
+    def _return(self, evidence: Evidence[Seen], seen: Seen, stamp_ns: int) -> Tracked:
+        """Go on from the last pose after a short loss, if a trusted gyroscope says how the camera turned; else seek."""
+        if self._counted and self._later(stamp_ns) <= LONGEST and np.isfinite(self._turned(stamp_ns)[1]):
+            self._trial = 0
+            tracked = self._follow(evidence, seen, stamp_ns, RETURNING)
+            if self._trial is not None:
+                return tracked
+        return self._seek(evidence, seen, stamp_ns)
+
     def _seek(self, evidence: Evidence[Seen], seen: Seen, stamp_ns: int) -> Tracked:
         """Look for an image among what was seen before."""
-        fits = sorted(evidence.seek(seen, self._T), key=lambda fit: -fit.known * fit.usual)
+        last, reach = self._turned(stamp_ns)
+        fits = sorted(evidence.seek(seen, last), key=lambda fit: -fit.known * fit.usual)
         if not fits:
             return self._lose("not found again: it looks like nothing before")
         best = fits[0]
@@ -269,19 +354,32 @@ class Tracker:
         rivals = (fit for fit in fits if fit.known * fit.usual > RIVAL * best.known * best.usual)
         if not why and any(far_apart(best.T_map_camera, fit.T_map_camera, RIVAL_M, RIVAL_RAD) for fit in rivals):
             why = "it fits at several places"
+        if not why and far_apart(last, best.T_map_camera, np.inf, reach):
+            why = "it fits where, by the gyroscope, the camera does not look"
         why = why or evidence.contradicted(seen, best.T_map_camera)
         if why:
             return self._lose(f"not found again: {why}")
         self._place(best.T_map_camera, best.covariance)
-        self._motion, self._stamps, self._trial = np.eye(4), [stamp_ns], CONFIRMED
+        self._motion, self._stamps, self._trial, self._counted = np.eye(4), [stamp_ns], CONFIRMED, False
         evidence.advance(seen, self._T)
         return self._lost(f"found again; {CONFIRMED} more images must agree")
+
+    def _turned(self, stamp_ns: int) -> tuple[Transform, float]:
+        """Return the last pose, turned as a trusted gyroscope says, and by how many radians that may be off."""
+        turn = self._turn(stamp_ns)
+        if self._gyroscope is None or turn is None or not self._gyroscope.trusted:
+            return self._T, np.inf
+        T = self._T.copy()
+        T[:3, :3] = T[:3, :3] @ turn.R
+        return T, TURNED_AWAY + 4 * float(np.sqrt(np.trace(self._gyroscope.doubt(turn))))
 
     def _place(self, T: Transform, covariance: NDArray[np.float64]) -> None:
         self._T, self._covariance = orthonormalise(T), covariance
 
     def _lose(self, why: str) -> Tracked:
         self._adrift = False
+        if self._gyroscope is not None:
+            self._gyroscope.interrupt()
         if self._learned >= 2:
             self._trial = None
         return self._lost(why)
@@ -300,6 +398,15 @@ def _evidence_for(frame: AnyFrame, config: Config) -> Evidence[Any]:
 
         return Pairs(frame.pair)
     return Surfaces(config)
+
+
+def _followed(evidence: Evidence[Seen], seen: Seen, guess: Guess, returning: bool) -> tuple[Fit, str]:
+    """Return how an image fits near a guess, and why it does not, "" where it does."""
+    fit = evidence.fit(seen, *guess)
+    why = _doubt(fit, RETURNING if returning else FOLLOWING) or _open(fit, evidence.limits.adrift)
+    if not why and returning:
+        why = evidence.contradicted(seen, fit.T_map_camera)
+    return fit, why
 
 
 def _doubt(fit: Fit, demand: Demand) -> str:

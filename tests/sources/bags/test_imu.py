@@ -3,11 +3,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from made_robot_bags import MS, START_NS, RobotBagMaker
+from made_unposed import room
 
-from stereovox.opening import open_source
+from stereovox.errors import SourceError
+from stereovox.opening import open_images, open_source
+from stereovox.sources.bags.writer import BagWriter
 from stereovox.survey import survey
 
 ASIDE = [0.3, 0, 0, np.sqrt(0.5), 0, 0, np.sqrt(0.5)]
@@ -67,3 +72,88 @@ def test_nothing_is_said_where_that_is_not_gravity(tmp_path, force, options):
 
 def test_a_recording_without_an_imu_measures_nothing():
     assert open_source("sim:wall?image_width=160").gravity() is None
+    assert open_source("sim:wall?image_width=160").imu() is None
+
+
+RATE, FORCE = np.array([0.1, -0.2, 0.3]), np.array([0.5, 1.0, 9.7])
+MOUNT = np.array([[0.0, 0, 1, 0.1], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+OPTICAL = "camera_depth_optical_frame"
+
+
+def turning(path, write, frames=2):
+    """A bag of our own with depth images, and what `write` adds."""
+    with BagWriter(path) as made:
+        for frame in room(frames):
+            made.depth(replace(frame, stamp_ns=START_NS + frame.stamp_ns))
+        write(made)
+    return open_images(path)
+
+
+def both(made, topic="/imu", frame_id="imu"):
+    for k in range(20):
+        made.imu(START_NS + 5 * k * MS, (1 + k) * RATE, FORCE, topic, frame_id)
+
+
+@pytest.mark.parametrize("name", ["walk.bag", "walk.db3", "walk.mcap", "walk"])
+def test_readings_come_back_with_their_mount(tmp_path, name):
+    def write(made):
+        made.fixed("imu", OPTICAL, MOUNT)
+        both(made)
+
+    found = turning(tmp_path / name, write).imu()
+    np.testing.assert_array_equal(found.stamps_ns, START_NS + 5 * MS * np.arange(20))
+    np.testing.assert_allclose(found.angular_rate, np.outer(1 + np.arange(20), RATE))
+    np.testing.assert_allclose(found.specific_force, np.tile(FORCE, (20, 1)))
+    np.testing.assert_allclose(found.T_sensor_imu, np.linalg.inv(MOUNT), atol=1e-6)
+    assert found.name == f"{name} /imu"
+    assert open_images(tmp_path / name, "1:").imu() is not None
+    assert open_images(f"{tmp_path / name}?imu=off").imu() is None
+
+
+@pytest.mark.parametrize("zeros", [True, False])
+def test_gyroscope_and_accelerometer_on_topics_of_their_own(tmp_path, zeros):
+    """As realsense-ros writes them, at 200 and 100 Hz; what is not measured is zero, or said not to be."""
+    nothing = np.zeros(3) if zeros else None
+
+    def write(made):
+        for k in range(20):
+            made.imu(START_NS + 5 * k * MS, RATE, nothing, "/camera/gyro/sample", "camera_gyro_optical_frame")
+        for k in range(11):
+            force = FORCE * (1 + k)
+            made.imu(START_NS + (10 * k - 3) * MS, nothing, force, "/camera/accel/sample", "camera_accel_optical_frame")
+
+    found = turning(tmp_path / "walk.bag", write).imu()
+    assert len(found) == 20
+    np.testing.assert_allclose(found.specific_force, np.outer(1 + (5 * np.arange(20) + 3) / 10, FORCE))
+    np.testing.assert_array_equal(found.T_sensor_imu, np.eye(4))
+
+
+def test_an_imu_whose_mount_nothing_says_is_not_used(tmp_path):
+    source = turning(tmp_path / "walk.bag", both)
+    with pytest.raises(SourceError, match=r"nothing says how the IMU .* record /tf_static, or add \?imu=off"):
+        source.imu()
+
+
+def test_of_several_one_is_named(tmp_path):
+    def write(made):
+        both(made, "/imu", "imu_optical")
+        both(made, "/base/imu", "base_optical")
+
+    source = turning(tmp_path / "walk.bag", write)
+    with pytest.raises(SourceError, match=r"\?imu=/base/imu or \?imu=/imu"):
+        source.imu()
+    assert open_images(f"{tmp_path}/walk.bag?imu=/base/imu").imu().name == "walk.bag /base/imu"
+    with pytest.raises(SourceError, match="no topic /im of sensor_msgs/Imu"):
+        open_images(f"{tmp_path}/walk.bag?imu=/im").imu()
+
+
+def test_an_accelerometer_alone_is_no_imu(tmp_path):
+    source = turning(tmp_path / "walk.bag", lambda made: made.imu(START_NS, None, FORCE))
+    assert source.imu() is None
+    assert turning(tmp_path / "none.bag", lambda made: None).imu() is None
+
+
+@pytest.mark.parametrize("numbers", [(1, 2), (1, 2, np.nan)])
+def test_what_is_no_reading_is_not_written(tmp_path, numbers):
+    with pytest.raises(SourceError, match="give 3 finite numbers"), BagWriter(tmp_path / "a.bag") as made:
+        made.imu(0, numbers, None)

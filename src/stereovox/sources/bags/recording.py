@@ -19,11 +19,12 @@ from stereovox.se3 import Transform
 from stereovox.sources import parameters
 from stereovox.sources.bags import open_bag, suffix_of
 from stereovox.sources.bags.depth_topic import DepthTopic, find_depth
-from stereovox.sources.bags.imu import up_by_gravity
+from stereovox.sources.bags.imu import read_readings, up_by_gravity
 from stereovox.sources.bags.photo_topic import PhotoTopic, find_photos
 from stereovox.sources.bags.poses import find_poses
-from stereovox.sources.bags.tf import TfPoses
+from stereovox.sources.bags.tf import TfPoses, read_tf
 from stereovox.sources.base import DepthSource
+from stereovox.sources.imu import ImuReadings
 from stereovox.sources.poses import Poses
 from stereovox.sources.tracker import AXES, WORLDS, turned
 
@@ -42,6 +43,7 @@ class Options:
         and `file`.
     world_frame: the frame of /tf that is the world: `map`, else `odom`, else the root of the tree if nothing is said.
     pose: `fixed` for a camera that stood still: every pose is the identity, poses in the file do not count.
+    imu: topic of the IMU (`sensor_msgs/Imu`), where there are several; `off` for none.
     scale: metres per unit (0: as the file says, else millimetres); baseline: metres (0: as the file says).
     """
 
@@ -52,6 +54,7 @@ class Options:
     world: str = ""
     world_frame: str = ""
     pose: str = ""
+    imu: str = ""
     scale: float = 0.0
     baseline: float = 0.0
 
@@ -103,7 +106,7 @@ class Bag(DepthSource):
         self.camera = self._depth.camera
         if options.baseline:
             self.camera = replace(self.camera, baseline=options.baseline)
-        self._scale = options.scale
+        self._scale, self._imu = options.scale, options.imu
         self._standing, self.posed = options.pose == "fixed" or not posed, posed
         self._poses, self._missing, notes = None, "", ()
         if not self._standing:
@@ -134,6 +137,13 @@ class Bag(DepthSource):
         if not isinstance(found, TurnedTf) or found.world != "file":
             return None
         return up_by_gravity(self._file, found.poses.tf, found.poses.world)
+
+    def imu(self) -> ImuReadings | None:
+        """Return the readings of the IMU in the recording; see `read_readings`."""
+        if self._imu == "off":
+            return None
+        known = self._poses.poses.tf if isinstance(self._poses, TurnedTf) else read_tf(self._file)
+        return read_readings(self._file, known, self._depth.frame_id, self._imu)
 
     def frame(self, i: int) -> Frame:
         """Return frame `i`; depth is (0, 0) where the image has a `fault`, the pose NaN where there is none."""

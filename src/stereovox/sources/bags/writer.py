@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Write bags that other ROS tools play back: scans, depth images, odometry, transforms and maps."""
+"""Write bags that other ROS tools play back: scans, depth images, IMUs, odometry, transforms and maps."""
 
 from __future__ import annotations
 
@@ -129,6 +129,21 @@ class BagWriter:
         self._write(topic, IMAGE, stamp_ns, messages.image(pixels, stamp_ns, frame_id))
         info = messages.camera_info(frame.photo.camera, stamp_ns, frame_id)
         self._write(sibling(topic, "camera_info"), "sensor_msgs/msg/CameraInfo", stamp_ns, info)
+
+    def imu(
+        self,
+        stamp_ns: int,
+        angular_rate: ArrayLike | None,
+        specific_force: ArrayLike | None,
+        topic: str = "/imu",
+        frame_id: str = "imu_link",
+    ) -> None:
+        """Write a `sensor_msgs/Imu`: (3,) rad/s and (3,) m/s^2 along the axes of `frame_id`; None: not measured."""
+        for numbers in (angular_rate, specific_force):
+            if numbers is not None and not (np.shape(numbers) == (3,) and np.isfinite(numbers).all()):
+                raise SourceError(f"{self.path}: {numbers} on {topic}; give 3 finite numbers, or None")
+        message = self._messages.imu(angular_rate, specific_force, stamp_ns, frame_id)
+        self._write(topic, "sensor_msgs/msg/Imu", stamp_ns, message)
 
     def odometry(
         self,

@@ -101,6 +101,21 @@ class Messages:
             twist=self._make("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=np.zeros(36)),
         )
 
+    def imu(self, rate: ArrayLike | None, force: ArrayLike | None, stamp_ns: int, frame_id: str) -> Any:
+        """Return a `sensor_msgs/Imu` of (3,) rad/s and (3,) m/s^2; the first covariance of what is not measured is
+        -1.
+        """
+        return self._make(
+            "sensor_msgs/msg/Imu",
+            header=self._header(stamp_ns, frame_id),
+            orientation=self._rotation(np.eye(4)),
+            orientation_covariance=_not_measured(None),
+            angular_velocity=self._vector(rate),
+            angular_velocity_covariance=_not_measured(rate),
+            linear_acceleration=self._vector(force),
+            linear_acceleration_covariance=_not_measured(force),
+        )
+
     def pose(self, pose: NDArray[np.float64], covariance: ArrayLike | None, stamp_ns: int, frame_id: str) -> Any:
         """Return a `geometry_msgs/PoseWithCovarianceStamped`; covariance: (3, 3) of x, y, yaw, (6, 6) or None."""
         header = self._header(stamp_ns, frame_id)
@@ -184,6 +199,10 @@ class Messages:
     def _xyz(self, kind: str, T: Transform) -> Any:
         return self._make(f"geometry_msgs/msg/{kind}", **dict(zip("xyz", T[:3, 3].tolist(), strict=True)))
 
+    def _vector(self, numbers: ArrayLike | None) -> Any:
+        x, y, z = (0.0, 0.0, 0.0) if numbers is None else np.asarray(numbers, float).tolist()
+        return self._make("geometry_msgs/msg/Vector3", x=x, y=y, z=z)
+
     def _rotation(self, T: Transform) -> Any:
         vector = rotation_vector(T[:3, :3])
         angle = float(np.linalg.norm(vector))
@@ -198,6 +217,13 @@ class Messages:
         full[PLANAR if given.shape == (3, 3) else ...] = given
         covered = "geometry_msgs/msg/PoseWithCovariance"
         return self._make(covered, pose=self._pose(lifted(pose)), covariance=full.ravel())
+
+
+def _not_measured(numbers: ArrayLike | None) -> NDArray[np.float64]:
+    """Return a covariance (9,): unknown, or the word that nothing was measured (`sensor_msgs/Imu`)."""
+    covariance = np.zeros(9)
+    covariance[0] = -1.0 if numbers is None else 0.0
+    return covariance
 
 
 def millimetres(frame: Frame) -> NDArray[np.uint16]:

@@ -22,6 +22,8 @@ EARTH_RADIUS = 6378137.0
 """Metres, as KITTI's own development kit has it."""
 OXTS_FIELDS = 6
 """Of the 30 numbers of an oxts packet the first six count: latitude, longitude, altitude, roll, pitch, yaw."""
+OXTS_MOTION = (17, 18, 19, 11, 12, 13)
+"""Places of wx wy wz and of ax ay az in a packet."""
 UPRIGHT = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """T_world_optical: turns optical axes (x right, y down, z forward) into the world's (x forward, y left, z up)."""
 UPRIGHT.setflags(write=False)
@@ -117,6 +119,19 @@ def read_oxts_files(paths: Sequence[Path], T_cam0_imu: Transform) -> FramePoses:
     """Return the poses in files with one oxts packet each (KITTI raw); one that is missing spoils its own frame."""
     packets = [_packet_file(path) for path in paths]
     return FramePoses(camera_poses(packets, T_cam0_imu), str(paths[0].parent) if paths else "oxts")
+
+
+def read_oxts_motions(paths: Sequence[Path]) -> NDArray[np.float64]:
+    """Return wx wy wz in rad/s and ax ay az in m/s^2, (N, 6), of files with one oxts packet each.
+
+    Along the vehicle's axes, x forward, y left, z up. NaN where a file is missing or has less.
+    """
+    packets = [_packet_file(path) for path in paths]
+    found = np.full((len(packets), 6), np.nan)
+    for row, packet in zip(found, packets, strict=True):
+        if not isinstance(packet, str) and len(packet) > max(OXTS_MOTION):
+            row[:] = packet[list(OXTS_MOTION)]
+    return found
 
 
 def camera_poses(packets: Sequence[NDArray[np.float64] | str], T_cam0_imu: Transform) -> list[Transform | str]:

@@ -11,6 +11,7 @@ import numpy as np
 
 from stereovox.errors import NoPoses, SourceError
 from stereovox.sources.base import Part
+from stereovox.sources.imu import ImuReadings, checked_imu, in_order
 from stereovox.sources.kitti.base import (
     PAIRS,
     KittiSource,
@@ -19,7 +20,7 @@ from stereovox.sources.kitti.base import (
     time_lines,
 )
 from stereovox.sources.kitti.calibration import CAM_TO_CAM, KittiCalibration, read_raw_calibration
-from stereovox.sources.kitti.poses import FramePoses, read_named_poses, read_oxts_files
+from stereovox.sources.kitti.poses import FramePoses, read_named_poses, read_oxts_files, read_oxts_motions
 from stereovox.sources.parameters import file_of
 from stereovox.sources.poses import UnknownPoses
 from stereovox.sources.rgbd.folder import folder_part
@@ -38,8 +39,9 @@ class KittiRaw(KittiSource):
         poses: `refined` (`poses_refined.txt`), `ins` (`poses_ins.txt`), `oxts` (computed from the GPS and inertial
             packets), or a file of T_world_cam0 of any form (see `rgbd.pose_files`); without it the first of these there
             is. axes: of the camera they are of, `optical` (without it), `opengl` or `ros`. invert: 1 for world to
-            camera.
+            camera. imu: `off` to leave the inertial unit out.
     posed: without it poses are not looked for, and are NaN.
+    IMU: angular rates and accelerations of oxts, at oxts/timestamps.txt, as often as there are images.
     Time: image_0X/timestamps.txt of the left camera, exact to the nanosecond. Every line of it is a frame.
     World and faults: see `KittiSource`. Raises SourceError for what is missing as a whole.
     """
@@ -53,7 +55,8 @@ class KittiRaw(KittiSource):
     )
 
     def __init__(self, where: str | os.PathLike[str], posed: bool = True):
-        self.folder, options = folder_and_options(where, {"camera": "", **POSES})
+        self.folder, options = folder_and_options(where, {"camera": "", "imu": "", **POSES})
+        self._imu = checked_imu(str(where), options["imu"])
         self.name = self.folder.resolve().name
         self.calibration = _calibration(self.folder)
         self.eyes = choose_pair(self.folder, options["camera"], {name: _has(self.folder, name) for name in PAIRS})
@@ -87,6 +90,21 @@ class KittiRaw(KittiSource):
     def velodyne(self, i: int) -> Path:
         """Return the scan's file of frame `i`."""
         return self.folder / "velodyne_points" / "data" / f"{i:010d}.bin"
+
+    def imu(self) -> ImuReadings | None:
+        """Return angular rates and accelerations of oxts; None where there are none, or nothing says how it is mounted.
+
+        Raises SourceError where they are damaged.
+        """
+        data, times, c = self.folder / OXTS / "data", self.folder / OXTS / "timestamps.txt", self.calibration
+        if self._imu == "off" or not (os.path.isdir(data) and os.path.isfile(times)):
+            return None
+        if c.T_cam0_velo is None or c.T_velo_imu is None:
+            return None
+        stamps = _stamps(times)
+        numbers = read_oxts_motions([data / f"{i:010d}.txt" for i in range(len(stamps))])
+        mount = c.offset_of(self.eyes[0]) @ c.T_cam0_velo @ c.T_velo_imu
+        return in_order(stamps, numbers[:, :3], numbers[:, 3:], mount, f"{self.name} oxts")
 
     def _eye(self, side: int) -> Path:
         return self.folder / f"image_{self.eyes[side]:02d}"

@@ -67,7 +67,9 @@ def test_equations_of_a_camera_that_is_carried_lead_to_the_pose_of_what_carries_
     inverse = random.uniform(0.2, 1, 50)
     corners = Corners(np.zeros((50, 2), np.float32), np.tile(at[:3, 3], (50, 1)), ray, inverse, np.full(50, 1e-5))
     measured = np.array([(*naive.seen_at(p, at, LENS),) for p in corners.points])
-    equations = Beside(Sightings(PHOTO_CAMERA, corners, measured, np.full(50, 0.003), 50), T_sensor_camera).equations()
+    equations = Beside(
+        Sightings(PHOTO_CAMERA, corners, measured, np.full(50, 0.003), 50), T_sensor_camera, np.zeros((6, 6))
+    ).equations()
     off = T.copy()
     off[:3, :3], off[:3, 3] = rotation_matrix([0.01, -0.02, 0.01]) @ T[:3, :3], T[:3, 3] + (0.03, -0.02, 0.01)
     for _ in range(8):

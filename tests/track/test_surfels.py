@@ -194,7 +194,10 @@ def raw_equations(level, seen, T):
     """Return what the kernel fills: information, gradient, spread, and the ratios of those patches that are known."""
     filled = np.full((6, 6), 7.0), np.full(6, 7.0), np.full(10, 7.0), np.full(len(seen.points), 7.0, np.float32)
     R, t = np.ascontiguousarray(T[:3, :3]), np.ascontiguousarray(T[:3, 3])
-    known = _surfels.equations(level._keys, level._surfels, level.size, *seen, R, t, np.float32(0.01), 3.0, *filled)
+    slots = level.nearest(seen, T)
+    known = _surfels.equations(
+        level._keys, level._surfels, level.size, slots, *seen, R, t, np.float32(0.01), 3.0, *filled
+    )
     return *filled[:3], filled[3][:known]
 
 

@@ -128,13 +128,23 @@ def carry(keys, surfels, keep, new_keys, new_surfels):
 
 
 @kernel
+def nearest(keys, surfels, size, points, directions, R, t, slots):
+    """Write to `slots` (N,) int64 the surfel that is nearest to each patch and agrees with its normal; -1: none."""
+    mask = np.int64(keys.size - 1)
+    for i in range(points.shape[0]):
+        px, py, pz = _turned(R, points, i)
+        nx, ny, nz = _turned(R, directions, i)
+        slots[i] = _nearest(keys, surfels, size, px + t[0], py + t[1], pz + t[2], nx, ny, nz, mask)
+
+
+@kernel
 def equations(
-    keys, surfels, size, points, directions, sigma, R, t, slack, reach, information, gradient, spread, ratios
+    keys, surfels, size, slots, points, directions, sigma, R, t, slack, reach, information, gradient, spread, ratios
 ):
     """Fill the normal equations of a small motion (rotation about the camera, then shift, in the map's axes).
 
-    Residuals are distances of patches from the planes of the nearest surfels whose normals agree (Chen and Medioni
-    1992), weighted by their variance and `slack` metres, and by Geman and McClure's function of `reach` deviations.
+    Residuals are distances of patches from the planes of their surfels, `slots` (N,), -1: none (Chen and Medioni 1992),
+    weighted by their variance and `slack` metres, and by Geman and McClure's function of `reach` deviations.
     Each product of two normals takes one from the patch and one from the surfel, so that their noise, which is not the
     same, holds nothing: the normals are each other's instruments.
 
@@ -142,15 +152,14 @@ def equations(
     yz, zz of the patches, seen from the camera. ratios (N,) float32: squared residuals by their variance, of the
     patches with a surfel, whose number is returned.
     """
-    mask = np.int64(keys.size - 1)
     known = 0
     information[:], gradient[:], spread[:] = 0.0, 0.0, 0.0
     for i in range(points.shape[0]):
-        px, py, pz = _turned(R, points, i)
-        nx, ny, nz = _turned(R, directions, i)
-        slot = _nearest(keys, surfels, size, px + t[0], py + t[1], pz + t[2], nx, ny, nz, mask)
+        slot = slots[i]
         if slot < 0:
             continue
+        px, py, pz = _turned(R, points, i)
+        nx, ny, nz = _turned(R, directions, i)
         surfel, key = surfels[slot], keys[slot]
         length = np.sqrt(_square(surfel[4], surfel[5], surfel[6]))
         a0, a1, a2 = np.float64(surfel[4] / length), np.float64(surfel[5] / length), np.float64(surfel[6] / length)

@@ -91,7 +91,7 @@ def settled(
                 widest = float(np.sum(1 / (held + 1.0)))
                 covariance = (directions / (held + 1.0)) @ directions.T
             asked = np.where(held > 0, directions.T @ gradient, 0.0) - np.linalg.solve(
-                directions, _between(expected, T)
+                directions, motion_between(expected, T)
             )
             motion = directions @ (asked / (held + 1.0))
             T = _moved(T, motion)
@@ -104,7 +104,7 @@ def settled(
 
 def contrary(one: Transform, other: Transform, covariance: NDArray[np.float64]) -> bool:
     """Return whether two poses are farther apart than errors of this covariance (6, 6) can be."""
-    moved = _between(one, other)
+    moved = motion_between(one, other)
     return bool(moved @ np.linalg.solve(covariance, moved) > CONTRARY)
 
 
@@ -114,7 +114,7 @@ def deviations(covariance: NDArray[np.float64]) -> tuple[float, float]:
     return turn, shift
 
 
-def _between(one: Transform, other: Transform) -> NDArray[np.float64]:
+def motion_between(one: Transform, other: Transform) -> NDArray[np.float64]:
     """Return the motion (6,) from one pose to another: rotation in radians, shift in metres, along the map's axes."""
     return np.concatenate([rotation_vector(other[:3, :3] @ one[:3, :3].T), other[:3, 3] - one[:3, 3]])
 

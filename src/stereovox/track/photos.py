@@ -18,7 +18,7 @@ from stereovox.frame import DepthImage, Photo
 from stereovox.se3 import Transform, inverse, orthonormalise, rigidity_error, transform_points
 from stereovox.track._photos import laid_into
 from stereovox.track.corners import WINDOW
-from stereovox.track.fit import Equations, Fit, Stage, settled
+from stereovox.track.fit import Equations, Fit, Stage, motion_between, settled
 from stereovox.track.landmarks import Landmarks, Sight
 from stereovox.track.sightings import AGREED, CONVERGED, REACHES, Sightings
 from stereovox.track.views import View, stood_free
@@ -29,6 +29,8 @@ CELL, STEP = 4.0, 2
 """Pixels of the depth image that a cell of the other image is wide, and of how many along each axis one is used."""
 FOLLOWED = 0.2
 """Share of the landmarks that must be found in an image: corners of noise are not."""
+LAG = 0.05
+"""Share of a camera's motion since the image before by which it may have moved between a picture and the depth."""
 MOST = 0.6
 """Share of them that must lie where they should for a pose that they agree on."""
 SMOOTH = 0.02
@@ -47,10 +49,14 @@ class Sighted(NamedTuple):
 
 
 class Beside(NamedTuple):
-    """Landmarks that were found in an image beside a depth image, and what they say of the depth camera's pose."""
+    """Landmarks that were found in an image beside a depth image, and what they say of the depth camera's pose.
+
+    lag: (6, 6) covariance of how the camera may have moved between both images, as that of `Fit`.
+    """
 
     found: Sightings
     T_sensor_camera: Transform
+    lag: NDArray[np.float64]
 
     def equations(self, reach: float = REACHES[-1]) -> Equations:
         """Return the equations of the depth camera's pose; reach: as that of `Sightings.equations`."""
@@ -85,6 +91,7 @@ class Photos:
     def __init__(self) -> None:
         self.left_out, self.why = 0, ""
         self._landmarks: Landmarks | None = None
+        self._last = np.eye(4)
         self._followed: Beside | None = None
 
     def forget(self) -> None:
@@ -116,11 +123,14 @@ class Photos:
         sigma = (found.deviation / np.maximum(found.corners.inverse, 1e-3) ** 2).astype(np.float32)
         found = found.those(~stood_free(points, sigma, expected, views))
         enough = len(found) >= max(AGREED, FOLLOWED * found.sought)
-        self._followed = Beside(found, seen.T_sensor_camera) if enough else None
+        moved = np.abs(motion_between(self._last, expected))
+        lag = np.repeat([np.linalg.norm(moved[:3]), np.linalg.norm(moved[3:])], 3) * LAG
+        self._followed = Beside(found, seen.T_sensor_camera, np.diag(lag**2)) if enough else None
         return self._followed
 
     def advance(self, seen: Sighted | None, T: Transform) -> None:
         """Go on from an image whose depth camera is at T_map_sensor."""
+        self._last = T
         if seen is None:
             return
         if self._landmarks is None or self._landmarks.camera != seen.camera:
@@ -140,7 +150,9 @@ class Photos:
         self._followed = None
         if seen is None or self._landmarks is None or self._landmarks.camera != seen.camera:
             return []
-        found = [(T, Beside(one, seen.T_sensor_camera)) for T, one in self._landmarks.seek(seen.sight)]
+        found = [
+            (T, Beside(one, seen.T_sensor_camera, np.zeros((6, 6)))) for T, one in self._landmarks.seek(seen.sight)
+        ]
         return [(T @ inverse(seen.T_sensor_camera), one) for T, one in found if len(one.found) >= AGREED]
 
 

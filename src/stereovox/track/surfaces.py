@@ -40,6 +40,9 @@ LOOKED_THROUGH = 0.05
 CLOSE, QUIETEST = 2.0, 0.01
 """Where a pose is expected with less than so many times the usual variance, most of an image lies where it should; what
 is far beyond the residuals of that moves, down to this variance of theirs, by what is expected of the camera."""
+LENIENT = 1.5
+"""How many times the share of landmarks counts that are where they should be: pictures are seldom taken at the very
+moment of the depth, nor all their rows at once."""
 STRONG = 40
 """Landmarks of an image that agree with each other and count against depth that says something else."""
 KEPT_M, CHECKED = 15.0, 100
@@ -116,14 +119,15 @@ class Surfaces:
         turn, shift = deviations(covariance)
         held = turn < self.limits.unsure[0] and shift < self.limits.unsure[1]
         apart = contrary(T, seen.T_map_camera, covariance + seen.covariance)
-        if held and apart and len(beside.found) < STRONG:
+        moved = not contrary(T, seen.T_map_camera, covariance + seen.covariance + beside.lag)
+        if held and apart and (moved or len(beside.found) < STRONG):
             return alone
         together = [Stage(both(level, beside.equations()), CONVERGED * level.size) for level in levels]
         if held and not apart:
             T, covariance = settled(together[-1:], expected, doubt, T)
         else:
             T, covariance = settled(together, expected, doubt, seen.T_map_camera)
-        return Fit(T, covariance, levels[-1].known, min(levels[-1].usual, beside.usual(T)))
+        return Fit(T, covariance, levels[-1].known, min(levels[-1].usual, LENIENT * beside.usual(T)))
 
     def _lasting(self, patches: Patches, T: Transform) -> Patches:
         """Return the patches of an image at T_map_camera that do not stand where views saw free space: people walk."""
@@ -154,10 +158,10 @@ class Surfaces:
         starts = [(last, None), *((view.T, None) for view in alike[:TRIED]), *common]
         doubt = np.diag(SEARCH**2)
         fits = [self._fit(seen.patches, beside, T, doubt, 1.0) for T, beside in starts]
-        agreed = [beside for T, beside in common if beside.fit(T, doubt)]  # elsewhere it does not look so
-        return [
-            fit._replace(usual=min([fit.usual, *(one.usual(fit.T_map_camera) for one in agreed[:1])])) for fit in fits
-        ]
+        agreed = next((beside for T, beside in common if beside.fit(T, doubt)), None)
+        if agreed is None:
+            return fits
+        return [fit._replace(usual=min(fit.usual, LENIENT * agreed.usual(fit.T_map_camera))) for fit in fits]
 
     def contradicted(self, seen: Seen, T: Transform) -> str:
         """Return what speaks against an image having been taken from T_map_camera, "" where nothing does."""

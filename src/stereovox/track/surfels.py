@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from stereovox.frame import DepthImage
 from stereovox.se3 import Transform
-from stereovox.track._surfels import EMPTY, FIELDS, carry, equations, normals, patches, put
+from stereovox.track._surfels import EMPTY, FIELDS, carry, equations, nearest, normals, patches, put
 
 PATCHES_ACROSS = 80
 """Patches along the longer side of an image."""
@@ -26,6 +26,8 @@ REACH = 3.0
 """Standard deviations at which a patch begins to count little."""
 CONVERGED = 0.01
 """Metres and radians of a step that is the last, as a share of the cells' size."""
+AGAIN = 0.1
+"""Share of the cells' size by which a pose moves, in metres and radians, before nearest surfels are sought again."""
 MOST = 5e3
 """Weight at which a surfel becomes a running mean."""
 ALIKE = 2.0
@@ -94,8 +96,15 @@ class Surfels:
         near = np.all(np.abs(cells * float(self.size) - centre) < radius, axis=1)
         self._rebuild(near, len(self._keys))
 
+    def nearest(self, seen: Patches, T: Transform) -> NDArray[np.int64]:
+        """Return the number (N,) of the surfel of each patch seen from T_map_camera, -1 where there is none."""
+        slots = np.empty(len(seen.points), np.int64)
+        R, t = np.ascontiguousarray(T[:3, :3]), np.ascontiguousarray(T[:3, 3])
+        nearest(self._keys, self._surfels, self.size, seen.points, seen.normals, R, t, slots)
+        return slots
+
     def equations(
-        self, seen: Patches, T: Transform, slack: float, reach: float
+        self, seen: Patches, slots: NDArray[np.int64], T: Transform, slack: float, reach: float
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float32]]:
         """Return information (6, 6), less what bent normals hold, and gradient (6,): `_surfels.equations`.
 
@@ -105,8 +114,8 @@ class Surfels:
         R, t = np.ascontiguousarray(T[:3, :3]), np.ascontiguousarray(T[:3, 3])
         ratios = np.empty(len(seen.points), np.float32)
         known = equations(
-            self._keys, self._surfels, self.size, *seen[:3], R, t, np.float32(slack), reach, information, gradient,
-            spread, ratios,
+            self._keys, self._surfels, self.size, slots, *seen[:3], R, t, np.float32(slack), reach,
+            information, gradient, spread, ratios,
         )  # fmt: skip
         ratios = ratios[:known]
         noise = max(float(np.minimum(ratios, USUAL**2).mean()), QUIETEST) if known else 1.0
@@ -160,14 +169,18 @@ class Level:
         self.size, self.seen = float(level.size), seen
         self._level, self._slack, self._quietest = level, slack, quietest
         self._reach = REACH
+        self._slots, self._at = np.empty(0, np.int64), np.full((4, 4), np.inf)
         self.ratios = np.empty(0, np.float32)
 
     def __call__(self, T: Transform) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return information (6, 6) and gradient (6,) at a pose: `Equations`."""
+        if not np.abs(T - self._at).max() < AGAIN * self.size:
+            self._slots, self._at = self._level.nearest(self.seen, T), T
         if not len(self.ratios) and self._quietest < 1:
-            ratios = self._level.equations(self.seen.thinned(SAMPLED), T, self._slack, REACH)[2]
+            some, slots = self.seen.thinned(SAMPLED), np.ascontiguousarray(self._slots[::SAMPLED])
+            ratios = self._level.equations(some, slots, T, self._slack, REACH)[2]
             self._reach *= float(np.sqrt(max(_scale(ratios), self._quietest)))
-        information, gradient, self.ratios = self._level.equations(self.seen, T, self._slack, self._reach)
+        information, gradient, self.ratios = self._level.equations(self.seen, self._slots, T, self._slack, self._reach)
         return information, gradient
 
     @property

@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Maps with tracked poses: like those with given ones, without lost frames, the same after a resume."""
 
+from threading import current_thread
+
 import numpy as np
 import pytest
 from made_unposed import ROOM, room, unposed
 
 import stereovox as sv
+from stereovox import deadline
 from stereovox.errors import StereovoxError
 from stereovox.opening import Stream
 from stereovox.survey import level_start
@@ -34,6 +37,22 @@ def mapped(where, out, **options):
 def same_cells(a, b):
     for mine, theirs in zip(a.cells(), b.cells(), strict=True):
         np.testing.assert_array_equal(mine, theirs)
+
+
+def test_on_two_threads_the_next_frame_is_tracked_while_one_is_prepared_and_the_map_is_the_same(tmp_path, monkeypatch):
+    prepared_by, plain = [], deadline.prepared
+
+    def prepare(depth, frame):
+        prepared_by.append(current_thread())
+        return plain(depth, frame)
+
+    monkeypatch.setattr(deadline, "prepared", prepare)
+    where = unposed(tmp_path / "a", covered=[5])
+    one, two = (mapped(where, tmp_path / f"{n}.svox", threads=n)[0] for n in (1, 2))
+    same_cells(one.map, two.map)
+    assert [report.refused for report in one.reports] == [report.refused for report in two.reports]
+    background = [thread for thread in prepared_by if thread is not current_thread()]
+    assert len(background) >= two.map.frames - 1
 
 
 def test_a_folder_without_poses_gives_the_map_that_it_gives_with_them(tmp_path):

@@ -8,7 +8,9 @@ from made_unposed import ROOM, room, unposed
 import stereovox as sv
 from stereovox.errors import SourceError, StereovoxError
 from stereovox.opening import Stream
+from stereovox.sources.rgbd.folder import DepthFolder
 from stereovox.sources.trajectory import Trajectory
+from stereovox.track_run import _own_poses
 
 
 def test_the_poses_are_those_of_the_map_and_are_written(tmp_path):
@@ -98,3 +100,29 @@ def test_what_was_tracked_before_a_failure_is_saved(tmp_path):
         sv.track_recording(Falling(), tmp_path / "way.tum", notify=lines.append)
     assert len(Trajectory(tmp_path / "way.tum")) == 4
     assert lines == [f"stopped after 4 frames; their poses are saved in {tmp_path / 'way.tum'}"]
+
+
+@pytest.mark.parametrize("frames", [None, "1:7:2"])
+def test_the_recording_s_own_poses_are_read_without_its_images(tmp_path, monkeypatch, frames):
+    where, read, plain = unposed(tmp_path / "a", 8, poses=True), [], DepthFolder.read
+
+    def noted(self, i):
+        read.append(i)
+        return plain(self, i)
+
+    monkeypatch.setattr(DepthFolder, "read", noted)
+    source = sv.open_source(where, frames)
+    looks, poses = len(read), [frame.T_world_sensor for frame in source]
+    read.clear()
+    np.testing.assert_array_equal(_own_poses(source), poses)
+    assert (looks > 0, read) == (True, [])
+
+
+def test_a_frame_without_a_pose_has_none_to_compare_with(tmp_path):
+    where = unposed(tmp_path / "a", 8, poses=True)
+    lines = (where / "groundtruth.txt").read_text().splitlines()
+    (where / "groundtruth.txt").write_text("\n".join(lines[:-4]) + "\n")
+    found = _own_poses(sv.open_source(where))
+    expected = [frame.T_world_sensor for frame in sv.open_source(where)]
+    assert np.isnan(found[-1]).all()
+    np.testing.assert_array_equal(found, expected)

@@ -391,7 +391,7 @@ class MapRun:
         all_observers = (*observers, *([] if length is not None else [_Patience(self, done)]))
         stopped = "stopped after {} frames; they are saved in " + f"{self.out}, go on there with resume (--resume)"
         frames = self.source.after(done) if done else self.source
-        if self.mapper.config.threads > 1 and hasattr(self.source, "frame"):  # any frame can be had at any time
+        if self.mapper.config.threads > 1 and hasattr(self._recorded, "frame"):  # any frame can be had at any time
             frames = expecting(self.mapper.expect, frames)
         return add_all(
             self.mapper, frames, self._checkpoints, check, all_observers, lambda n: self._notify(stopped.format(n))

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.config import Config, load_config
-from stereovox.errors import SourceError, StereovoxError
+from stereovox.errors import FrameRefused, SourceError, StereovoxError
 from stereovox.evaluate.summary import percentiles
 from stereovox.evaluate.trajectory_motions import travelled_m
 from stereovox.evaluate.trajectory_score import TrajectoryScore, score_trajectory
@@ -23,7 +23,8 @@ from stereovox.opening import open_stream
 from stereovox.pose_choice import TRACK, choose_poses
 from stereovox.run import SURVEYED, interrupt_between_steps
 from stereovox.safe_io import check_file
-from stereovox.sources.base import Stream
+from stereovox.se3 import Transform
+from stereovox.sources.base import Stream, pose_reader
 from stereovox.sources.camera_file import with_camera
 from stereovox.sources.poses import Poses
 from stereovox.sources.trajectory import write_trajectory
@@ -267,8 +268,25 @@ class _Run:
             found = open_stream(source, frames)
         except StereovoxError:
             return nothing
-        own = np.array([_own_pose(frame) for frame in found]).reshape(-1, 4, 4)
+        own = _own_poses(found)
         return own if len(own) == len(given) else nothing
+
+
+def _own_poses(source: Stream) -> NDArray[np.float64]:
+    """Return the poses (N, 4, 4) of a recording, NaN where there is none; without its images where it can do so."""
+    read = pose_reader(source)
+    if read is None:
+        poses = [_own_pose(frame) for frame in source]
+    else:
+        poses = [_pose_or_none(read, i) for i in range(source.length or 0)]
+    return np.array(poses).reshape(-1, 4, 4)
+
+
+def _pose_or_none(read: Callable[[int], Transform], i: int) -> Transform:
+    try:
+        return np.asarray(read(i), float)
+    except FrameRefused:
+        return np.full((4, 4), np.nan)
 
 
 def _own_pose(frame: AnyFrame) -> NDArray[np.float64]:

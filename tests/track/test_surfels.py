@@ -147,6 +147,33 @@ def test_a_table_that_is_nearly_full_loses_nothing():
         assert np.all(surfels[used, 8] == times)
 
 
+@pytest.mark.parametrize("limit", [3.0, 5.5, 6.5])
+@pytest.mark.parametrize("seed", range(6))
+def test_what_stays_in_a_nearly_full_table_is_found_after_others_are_dropped(seed, limit):
+    """Keys that went on to the next place, round the end, move back where one before them goes."""
+    random = np.random.default_rng(seed)
+    keys, surfels = np.full(64, _surfels.EMPTY), np.zeros((64, _surfels.FIELDS), np.float32)
+    cells = random.permutation([(x, y, z) for x in range(-8, 8) for y in (-3, 4) for z in (5, -6)])[:60]
+    points, same = (cells + random.uniform(0.1, 0.9, cells.shape)).astype(np.float32), np.ones((60, 3), np.float32)
+    _surfels.put(keys, surfels, np.float32(1), points, same, same[:, 0].copy(), np.eye(3), np.zeros(3), np.float32(1e9))
+    before = {naive.cell_of(int(key)): surfels[i].copy() for i, key in enumerate(keys) if key != _surfels.EMPTY}
+    centre = np.array([1.0, 0.5, 0.0])
+    near = {cell for cell in before if np.abs(np.array(cell) - centre).max() < limit}
+    dropped = _surfels.drop(keys, surfels, 1.0, centre, limit)
+    assert dropped == len(before) - len(near)
+    assert (surfels[keys == _surfels.EMPTY] == 0).all()
+    after = {naive.cell_of(int(key)): surfels[i] for i, key in enumerate(keys) if key != _surfels.EMPTY}
+    assert set(after) == near
+    assert all(np.array_equal(after[cell], before[cell]) for cell in near)
+    again = np.array([points[i] for i, cell in enumerate(cells.tolist()) if tuple(cell) in near], np.float32)
+    one = np.ones((len(again), 3), np.float32)
+    new = _surfels.put(
+        keys, surfels, np.float32(1), again.reshape(-1, 3), one, one[:, 0].copy(), np.eye(3), np.zeros(3),
+        np.float32(1e9),
+    )  # fmt: skip
+    assert new == 0  # each is found where a search looks for it
+
+
 def test_tables_grow_and_keep_what_they_hold():
     random, level, twin = np.random.default_rng(3), Surfels(0.05), naive.NaiveSurfels(0.05)
     for _ in range(2):

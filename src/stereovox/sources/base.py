@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.errors import SourceError
 from stereovox.frame import AnyFrame, Frame
+from stereovox.se3 import Transform
 from stereovox.sources.imu import Imu
 
 T = TypeVar("T")
@@ -246,31 +247,46 @@ class Selection(Source):
     """The frames of `source` that the Python slice `frames` (`A:B:S`, as text) selects, in its order.
 
     Raises SourceError for text that is not a slice and for an empty selection.
+
+    Attributes:
+        whole: The source.
+        picked: Numbers of the frames in it.
     """
 
     def __init__(self, source: Source, frames: str):
-        self._source = source
-        self._picked = range(len(source))[parse_slice(frames)]
-        if not self._picked:
+        self.whole = source
+        self.picked = range(len(source))[parse_slice(frames)]
+        if not self.picked:
             raise SourceError(f"frames '{frames}' picks none of the {len(source)} frames of {source.name}; widen it")
         self.name, self.camera = source.name, source.camera
         self.notes, self.up = getattr(source, "notes", ()), getattr(source, "up", None)
 
     def gravity(self) -> NDArray[np.float64] | None:
         """Return which way is up in the whole recording."""
-        measure = getattr(self._source, "gravity", None)  # a class of another package may lack it
+        measure = getattr(self.whole, "gravity", None)  # a class of another package may lack it
         return measure() if measure else None
 
     def imu(self) -> Imu | None:
         """Return the IMU of the whole recording."""
-        return imu_of(self._source)
+        return imu_of(self.whole)
 
     def __len__(self) -> int:
-        return len(self._picked)
+        return len(self.picked)
 
     def frame(self, i: int) -> AnyFrame:
         """Return frame number `i` of the selection."""
-        return self._source.frame(self._picked[i])
+        return self.whole.frame(self.picked[i])
+
+
+def pose_reader(source: Stream) -> Callable[[int], Transform] | None:
+    """Return what reads the pose of a frame, by its number, without the image; None for a source that has no such.
+
+    It raises FrameRefused for a frame without a pose.
+    """
+    if not isinstance(source, Selection):
+        return getattr(source, "pose", None)
+    read, picked = pose_reader(source.whole), source.picked
+    return None if read is None else lambda i: read(picked[i])
 
 
 class Excerpt(Stream):

@@ -83,6 +83,11 @@ class RigSource(Source, ABC):
             return replace(frame, fault=refused.reason, fault_detail=str(refused))
         return replace(frame, left=left, right=right, T_world_sensor=T_world_camera)
 
+    def pose(self, i: int) -> Transform:
+        """Return T_world_sensor (4, 4) of frame `i`, without its images; raises FrameRefused where there is none."""
+        shot = self._shots[range(len(self))[i]]
+        return self._pose(shot, self.pairs[shot.pair])
+
     def _pose(self, shot: Shot, pair: StereoPair) -> Transform:
         try:
             return self._poses.at(shot.stamp_ns) @ pair.T_body_camera

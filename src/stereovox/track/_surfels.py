@@ -116,11 +116,11 @@ def put(keys, surfels, size, points, directions, sigma, R, t, most):
 
 
 @kernel
-def carry(keys, surfels, keep, new_keys, new_surfels):
-    """Copy the surfels to `keep` (2^k,) into an empty table with room for them."""
+def carry(keys, surfels, new_keys, new_surfels):
+    """Copy all surfels into an empty table with room for them."""
     mask = np.int64(new_keys.size - 1)
     for i in range(keys.size):
-        if keep[i]:
+        if keys[i] != EMPTY:
             slot = _slot(new_keys, keys[i], mask)
             new_keys[slot] = keys[i]
             for field in range(FIELDS):
@@ -135,6 +135,20 @@ def nearest(keys, surfels, size, points, directions, R, t, slots):
         px, py, pz = _turned(R, points, i)
         nx, ny, nz = _turned(R, directions, i)
         slots[i] = _nearest(keys, surfels, size, px + t[0], py + t[1], pz + t[2], nx, ny, nz, mask)
+
+
+@kernel
+def drop(keys, surfels, size, centre, radius):
+    """Drop all surfels whose cells are `radius` metres or more from `centre` (3,) along an axis; return their number.
+
+    Everything is float64: it is not done often.
+    """
+    dropped = 0
+    for i in range(keys.size):
+        while keys[i] != EMPTY and not _is_near(keys[i], size, centre, radius):  # another may have moved here
+            _free(keys, surfels, i)
+            dropped += 1
+    return dropped
 
 
 @kernel
@@ -226,10 +240,38 @@ def _nearest(keys, surfels, size, x, y, z, nx, ny, nz, mask):
 
 
 @cell
+def _is_near(key, size, centre, radius):
+    x, y, z = _part(key, 42) * size - centre[0], _part(key, 21) * size - centre[1], _part(key, 0) * size - centre[2]
+    return max(abs(x), abs(y), abs(z)) < radius
+
+
+@cell
+def _free(keys, surfels, slot):
+    """Empty a slot; surfels that would not be found any more move towards their places (backward shift)."""
+    mask = np.int64(keys.size - 1)
+    hole, look = slot, (slot + 1) & mask
+    while keys[look] != EMPTY:
+        if (look - _home(keys[look], mask)) & mask >= (look - hole) & mask:
+            keys[hole] = keys[look]
+            for field in range(FIELDS):
+                surfels[hole, field] = surfels[look, field]
+            hole = look
+        look = (look + 1) & mask
+    keys[hole] = EMPTY
+    for field in range(FIELDS):
+        surfels[hole, field] = np.float32(0)
+
+
+@cell
+def _home(key, mask):
+    """Return the slot at which the search for a key begins."""
+    return np.int64((np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)) >> np.uint64(32)) & mask
+
+
+@cell
 def _slot(keys, key, mask):
     """Return where `key` is, or the empty slot where it belongs; the table is never full."""
-    mixed = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
-    slot = np.int64(mixed >> np.uint64(32)) & mask
+    slot = _home(key, mask)
     while keys[slot] != EMPTY and keys[slot] != key:
         slot = (slot + 1) & mask
     return slot

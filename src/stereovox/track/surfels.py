@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from stereovox.frame import DepthImage
 from stereovox.se3 import Transform
-from stereovox.track._surfels import EMPTY, FIELDS, carry, equations, nearest, normals, patches, put
+from stereovox.track._surfels import EMPTY, FIELDS, carry, drop, equations, nearest, normals, patches, put
 
 PATCHES_ACROSS = 80
 """Patches along the longer side of an image."""
@@ -82,19 +82,19 @@ class Surfels:
         self.size, self.number = np.float32(size), 0
         self._keys = np.full(FIRST, EMPTY)
         self._surfels = np.zeros((FIRST, FIELDS), np.float32)
+        self.forget(np.zeros(3), 1.0)  # compiled now, not in the middle of a run
+        carry(self._keys[:0], self._surfels[:0], self._keys[:0].copy(), self._surfels[:0].copy())
 
     def add(self, seen: Patches, T: Transform) -> None:
         """Add patches seen from T_map_camera."""
         while 2 * (self.number + len(seen.points)) > len(self._keys):
-            self._rebuild(np.ones(len(self._keys), bool), 2 * len(self._keys))
+            self._grow()
         R, t = np.ascontiguousarray(T[:3, :3]), np.ascontiguousarray(T[:3, 3])
         self.number += put(self._keys, self._surfels, self.size, *seen[:3], R, t, np.float32(MOST))
 
     def forget(self, centre: NDArray[np.float64], radius: float) -> None:
         """Drop all surfels farther than `radius` metres from `centre` (3,) along an axis."""
-        cells = np.stack([_index(self._keys, shift) for shift in (42, 21, 0)], axis=1)
-        near = np.all(np.abs(cells * float(self.size) - centre) < radius, axis=1)
-        self._rebuild(near, len(self._keys))
+        self.number -= drop(self._keys, self._surfels, float(self.size), np.asarray(centre, float), float(radius))
 
     def nearest(self, seen: Patches, T: Transform) -> NDArray[np.int64]:
         """Return the number (N,) of the surfel of each patch seen from T_map_camera, -1 where there is none."""
@@ -122,12 +122,12 @@ class Surfels:
         information -= BENT**2 * _held_by_any(spread)
         return information / (ALIKE * noise), gradient / (ALIKE * noise), ratios
 
-    def _rebuild(self, keep: NDArray[np.bool_], room: int) -> None:
-        """Move the surfels to keep into a table of `room` places."""
-        keep = keep & (self._keys != EMPTY)
-        keys, surfels = np.full(room, EMPTY), np.zeros((room, FIELDS), np.float32)
-        carry(self._keys, self._surfels, keep, keys, surfels)
-        self._keys, self._surfels, self.number = keys, surfels, int(keep.sum())
+    def _grow(self) -> None:
+        """Move the surfels into a table twice as large."""
+        keys = np.full(2 * len(self._keys), EMPTY)
+        surfels = np.zeros((len(keys), FIELDS), np.float32)
+        carry(self._keys, self._surfels, keys, surfels)
+        self._keys, self._surfels = keys, surfels
 
 
 class SurfelMap:
@@ -206,9 +206,3 @@ def _held_by_any(spread: NDArray[np.float64]) -> NDArray[np.float64]:
     across = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     turning = np.array([[yy + zz, -xy, -xz], [-xy, xx + zz, -yz], [-xz, -yz, xx + yy]])
     return np.block([[turning, across], [across.T, weight * np.eye(3)]])
-
-
-def _index(keys: NDArray[np.int64], shift: int) -> NDArray[np.int64]:
-    """Return the indices of cells along one axis, of which `_surfels._key` made 21 bits at `shift`."""
-    index = (keys >> shift) & 0x1FFFFF
-    return index - ((index >> 20) << 21)

@@ -83,6 +83,10 @@ class KittiSource(Source, ABC):
             )
         return StereoFrame(left, right, pair, T_world_left, stamp_ns, str(paths[0]))
 
+    def pose(self, i: int) -> Transform:
+        """Return T_world_sensor (4, 4) of frame `i`, without its images; raises FrameRefused where there is none."""
+        return self.viewpoint(i).T_world_camera
+
     def viewpoint(self, i: int) -> Viewpoint:
         """Return the rectified left camera of frame `i`, its pose and time; FrameRefused where there is no pose."""
         i = range(len(self))[i]

@@ -125,7 +125,9 @@ class Photos:
         enough = len(found) >= max(AGREED, FOLLOWED * found.sought)
         moved = np.abs(motion_between(self._last, expected))
         lag = np.repeat([np.linalg.norm(moved[:3]), np.linalg.norm(moved[3:])], 3) * LAG
-        self._followed = Beside(found, seen.T_sensor_camera, np.diag(lag**2)) if enough else None
+        self._followed = (
+            Beside(found, seen.T_sensor_camera, np.diag(np.square(lag, dtype=np.float64))) if enough else None
+        )
         return self._followed
 
     def advance(self, seen: Sighted | None, T: Transform) -> None:

@@ -11,7 +11,7 @@ from made_tracks import STEP_NS, aside, covered, hall, seen, simulated, track, t
 from stereovox.errors import StereovoxError
 from stereovox.se3 import rotation_matrix
 from stereovox.simulate.scene import Scene, box, cylinder
-from stereovox.track.fit import Fit
+from stereovox.track.fit import Fit, Limits
 from stereovox.track.tracker import FOLLOWING, RETURNING, _doubt, _open
 
 METRES, DEGREES = 0.02, 0.5
@@ -262,3 +262,49 @@ def test_a_start_far_from_the_origin_is_as_good_as_any():
 
 def test_a_wall_is_named_where_the_map_begins_anew():
     assert "leaves the pose open" in track(frames("wall", last=4)).found[3].lost
+
+
+class Stub:
+    """Evidence that knows so much of every image, and finds it where the camera stood."""
+
+    limits = Limits(np.full(6, 0.1), (1.0, 1.0), (1.0, 1.0))
+    known = 1.0
+
+    def see(self, frame):
+        return frame
+
+    def forget(self):
+        pass
+
+    def fit(self, seen, expected, doubt):
+        return Fit(np.eye(4), 1e-6 * np.eye(6), self.known, 1.0)
+
+    def advance(self, seen, T):
+        pass
+
+    def learn(self, seen, T):
+        pass
+
+    def seek(self, seen, last):
+        return [self.fit(seen, last, np.eye(6))]
+
+    def contradicted(self, seen, T):
+        return ""
+
+
+@pytest.mark.parametrize(("away", "found"), [(5, True), (40, False)])
+def test_long_after_a_loss_two_thirds_of_an_image_are_too_little_to_be_found_again(monkeypatch, away, found):
+    """Of two stretches of an aisle that are alike, walls and floor are the same."""
+    evidence = Stub()
+    monkeypatch.setattr("stereovox.track.tracker._evidence_for", lambda frame, config: evidence)
+    frame, by = frames("apartment", last=1)[0], tracker()
+    for i in range(10):
+        assert (i == 0) == bool(by.add(replace(frame, stamp_ns=i * STEP_NS)).lost)
+    evidence.known = 0.1
+    for i in range(10, 10 + away):
+        assert by.add(replace(frame, stamp_ns=i * STEP_NS)).lost
+    evidence.known = 0.67
+    said = [by.add(replace(frame, stamp_ns=(10 + away + i) * STEP_NS)).lost for i in range(8)]
+    assert ("" in said) == found
+    evidence.known = 0.8
+    assert "" in [by.add(replace(frame, stamp_ns=(18 + away + i) * STEP_NS)).lost for i in range(8)]

@@ -60,7 +60,12 @@ class Demand(NamedTuple):
     usual: float
 
 
-FOLLOWING, RETURNING = Demand(0.2, 0.6), Demand(0.5, 0.8)
+FOLLOWING, RETURNING, FOUND = Demand(0.2, 0.6), Demand(0.5, 0.8), Demand(0.75, 0.8)
+"""Of an image that follows the one before, that comes late or soon after a loss, and that is found again later.
+
+Long after a loss the camera may be anywhere, and two stretches of an aisle that are alike share walls and floor: two
+thirds of what is seen.
+"""
 
 Seen = TypeVar("Seen")
 Guess = tuple[Transform, NDArray[np.float64]]
@@ -177,6 +182,7 @@ class Tracker:
         self._learned = 0
         self._adrift = False  # followed, though open along some direction
         self._counted = False  # whether the pose of the last image that was followed did
+        self._near_ns, self._back = -1, FOUND  # until when the camera cannot be far from its last pose; demand then
         self._trial: int | None = None  # images until poses count: 0 while following, None while lost
 
     @property
@@ -261,11 +267,14 @@ class Tracker:
     def _follow(self, evidence: Evidence[Seen], seen: Seen, stamp_ns: int, demand: Demand = FOLLOWING) -> Tracked:
         """Take the pose of an image that fits, and learn from it where it is believed."""
         later, turn = self._later(stamp_ns), self._turn(stamp_ns)
-        returning = demand is RETURNING or later > GAP or (bool(self._trial) and not self._adrift)
+        if later > GAP:
+            demand = RETURNING
+        if self._trial and not self._adrift:
+            demand = self._back
         guess, *others = self._guesses(evidence.limits, stamp_ns, later, turn)
-        fit, why = _followed(evidence, seen, guess, returning)
+        fit, why = _followed(evidence, seen, guess, demand)
         if why and others:
-            fit, why = _followed(evidence, seen, others[0], returning)
+            fit, why = _followed(evidence, seen, others[0], demand)
         if why:
             return self._begin(evidence, seen, stamp_ns, why) if self._learned < 2 else self._lose(why)
         before = self._T
@@ -281,6 +290,7 @@ class Tracker:
             return self._lost(why)
         evidence.learn(seen, self._T)
         self._learned += 1
+        self._near_ns = stamp_ns + round(LONGEST * self._usual())
         return self._found()
 
     def _turn(self, stamp_ns: int) -> Turn | None:
@@ -318,11 +328,15 @@ class Tracker:
 
     def _later(self, stamp_ns: int) -> float:
         """Return how long after the last image one comes, by how far apart they usually are; before it: infinity."""
-        apart = np.diff(self._stamps)
-        usual = float(np.median(apart[apart > 0])) if np.any(apart > 0) else 0.0
         if stamp_ns < self._stamps[-1]:
             return np.inf
+        usual = self._usual()
         return (stamp_ns - self._stamps[-1]) / usual if usual else 1.0
+
+    def _usual(self) -> float:
+        """Return how far apart images usually are, in nanoseconds; 0 where that is not known."""
+        apart = np.diff(self._stamps)
+        return float(np.median(apart[apart > 0])) if np.any(apart > 0) else 0.0
 
     def _expected(self, limits: Limits, stamp_ns: int, later: float) -> tuple[Transform, NDArray[np.float64]]:
         """Return where even motion takes the camera until a time, and the covariance (6, 6) of that."""
@@ -350,7 +364,8 @@ class Tracker:
         if not fits:
             return self._lose("not found again: it looks like nothing before")
         best = fits[0]
-        why = _doubt(best, RETURNING) or _open(best, evidence.limits.unsure)
+        self._back = RETURNING if stamp_ns <= self._near_ns else FOUND
+        why = _doubt(best, self._back) or _open(best, evidence.limits.unsure)
         rivals = (fit for fit in fits if fit.known * fit.usual > RIVAL * best.known * best.usual)
         if not why and any(far_apart(best.T_map_camera, fit.T_map_camera, RIVAL_M, RIVAL_RAD) for fit in rivals):
             why = "it fits at several places"
@@ -400,11 +415,11 @@ def _evidence_for(frame: AnyFrame, config: Config) -> Evidence[Any]:
     return Surfaces(config)
 
 
-def _followed(evidence: Evidence[Seen], seen: Seen, guess: Guess, returning: bool) -> tuple[Fit, str]:
+def _followed(evidence: Evidence[Seen], seen: Seen, guess: Guess, demand: Demand) -> tuple[Fit, str]:
     """Return how an image fits near a guess, and why it does not, "" where it does."""
     fit = evidence.fit(seen, *guess)
-    why = _doubt(fit, RETURNING if returning else FOLLOWING) or _open(fit, evidence.limits.adrift)
-    if not why and returning:
+    why = _doubt(fit, demand) or _open(fit, evidence.limits.adrift)
+    if not why and demand is not FOLLOWING:
         why = evidence.contradicted(seen, fit.T_map_camera)
     return fit, why
 

@@ -181,7 +181,7 @@ def test_what_a_mask_hides_is_not_used():
     found = tracked(masked(hidden, valid))
     assert found.lost == [0]
     assert np.all(found.errors() < (0.04, 1))
-    assert tracked(hidden).errors()[-1, 0] > 0.1  # the mask does it
+    assert tracked(hidden).errors()[-1, 0] > 0.5  # the mask does it
 
 
 def test_no_landmark_is_followed_behind_a_mask():

@@ -3,16 +3,12 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-QUALITY = 0.003
-"""Least strength of corners by that of the strongest (Shi and Tomasi 1994)."""
-BLOCK = 7
-"""Pixels across of the square by which the strength of a corner is told."""
 QUIET, NOISE = 10, 5.0
 """Percent of an image that shows no corners but noise, and how much stronger than that corners are."""
 ROUNDING = 1e-6
@@ -25,13 +21,30 @@ ALIKE_BITS = 50
 """Bits by which ORB descriptors of one corner may differ."""
 
 
-def strongest(image: NDArray[np.uint8], number: int, apart_px: float, mask: NDArray[np.uint8]) -> NDArray[np.float32]:
+class Kind(NamedTuple):
+    """Which corners are followed.
+
+    block: pixels across of the square by which their strength is told. quality: their least strength by that of the
+    strongest (Shi and Tomasi 1994). fewer: share of them that may be lost before new ones are looked for.
+    """
+
+    block: int
+    quality: float
+    fewer: float
+
+
+SHARP, SOFT = Kind(3, 0.01, 0.0), Kind(7, 0.003, 0.15)
+"""Corners of a street, which turns are told by best, and those that walls with little on them have."""
+
+
+def strongest(
+    image: NDArray[np.uint8], number: int, apart_px: float, mask: NDArray[np.uint8], kind: Kind
+) -> NDArray[np.float32]:
     """Return the strongest corners (N, 2) of an image where a mask is not 0, column and row to a part of a pixel."""
-    strength = cv2.cornerMinEigenVal(image, BLOCK)
+    strength = cv2.cornerMinEigenVal(image, kind.block)
     noise = max(float(np.percentile(strength[::4, ::4], QUIET)), ROUNDING)
-    found = cv2.goodFeaturesToTrack(
-        image, number, QUALITY, apart_px, mask=mask * (strength > NOISE * noise), blockSize=BLOCK
-    )
+    strong = mask * (strength > NOISE * noise)
+    found = cv2.goodFeaturesToTrack(image, number, kind.quality, apart_px, mask=strong, blockSize=kind.block)
     if found is None:
         return np.empty((0, 2), np.float32)
     return np.asarray(cv2.cornerSubPix(image, found, (3, 3), (-1, -1), (3, 20, 0.01))[:, 0], np.float32)

@@ -12,14 +12,12 @@ from numpy.typing import NDArray
 
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.se3 import Transform
-from stereovox.track.corners import described, flow, in_common, strongest
+from stereovox.track.corners import Kind, described, flow, in_common, strongest
 from stereovox.track.sightings import AGREED, Corners, Sightings
 from stereovox.track.views import is_new
 
 NUMBER, APART_PX = 400, 12
 """Corners that are followed at most, and pixels between new ones."""
-FEWER = 0.15
-"""Share of the corners that may be lost before new ones are looked for."""
 VIEW_M, VIEW_RAD, VIEWS = 1.0, np.radians(15), 100
 """Views this far apart are kept, to find the way back from; so many, the latest."""
 NEAREST_M = 0.3
@@ -55,10 +53,11 @@ class Landmarks:
 
     Args:
         camera: The camera that takes the images, without distortion.
+        kind: Which corners.
     """
 
-    def __init__(self, camera: PinholeCamera):
-        self.camera = camera
+    def __init__(self, camera: PinholeCamera, kind: Kind):
+        self.camera, self._kind = camera, kind
         self.forget()
 
     def forget(self) -> None:
@@ -94,7 +93,7 @@ class Landmarks:
 
     def seek(self, sight: Sight) -> list[tuple[Transform, Sightings]]:
         """Return what an image has in common with the kept views that it shares most corners with, and their poses."""
-        pixels = strongest(sight.image, NUMBER, APART_PX / 2, sight.mask)
+        pixels = strongest(sight.image, NUMBER, APART_PX / 2, sight.mask, self._kind)
         which, descriptors = described(sight.image, pixels)
         measured, deviation, good = _measured(sight, pixels[which], np.zeros(len(which)))
         measured, deviation, descriptors = measured[good], deviation[good], descriptors[good]
@@ -109,13 +108,13 @@ class Landmarks:
 
     def _new(self, sight: Sight, T: Transform) -> Corners:
         """Return new landmarks, away from those that there are."""
-        if len(self._corners) > (1 - FEWER) * self._filled:
+        if len(self._corners) > (1 - self._kind.fewer) * self._filled:
             return Corners()
         wanted = NUMBER - len(self._corners)
         mask = sight.mask.copy()
         for u, v in self._corners.pixels:
             cv2.circle(mask, (round(float(u)), round(float(v))), APART_PX, 0, -1)
-        pixels = strongest(sight.image, wanted, APART_PX, mask)
+        pixels = strongest(sight.image, wanted, APART_PX, mask, self._kind)
         measured, deviation, good = _measured(sight, pixels, np.zeros(len(pixels)))
         pixels, inverse, deviation = pixels[good], measured[good, 2], deviation[good]
         ray = (pixels - (self.camera.cx, self.camera.cy)) / (self.camera.fx, self.camera.fy)

@@ -15,7 +15,7 @@ from stereovox.depth.stereo.pipeline import grey_rectified
 from stereovox.errors import FrameRefused, StereovoxError
 from stereovox.frame import AnyFrame, StereoFrame, name_of
 from stereovox.se3 import Transform
-from stereovox.track.corners import flow
+from stereovox.track.corners import SHARP, flow
 from stereovox.track.fit import Fit, Limits, Stage, settled
 from stereovox.track.landmarks import Landmarks, Sight
 from stereovox.track.sightings import AGREED, CONVERGED, REACHES, Sightings
@@ -54,7 +54,7 @@ class Pairs:
             raise StereovoxError(f"stereo pair '{pair.name}': its camera has no baseline; give it in metres")
         self._camera = pair.camera
         self._base = pair.camera.fx * pair.camera.baseline
-        self._landmarks = Landmarks(pair.camera)
+        self._landmarks = Landmarks(pair.camera, SHARP)
         self._followed = Sightings(pair.camera)
 
     def see(self, frame: AnyFrame) -> Sight:

@@ -17,7 +17,7 @@ from stereovox.errors import FrameRefused
 from stereovox.frame import DepthImage, Photo
 from stereovox.se3 import Transform, inverse, orthonormalise, rigidity_error, transform_points
 from stereovox.track._photos import laid_into
-from stereovox.track.corners import WINDOW
+from stereovox.track.corners import SOFT, WINDOW
 from stereovox.track.fit import Equations, Fit, Stage, motion_between, settled
 from stereovox.track.landmarks import Landmarks, Sight
 from stereovox.track.sightings import AGREED, CONVERGED, REACHES, Sightings
@@ -136,7 +136,7 @@ class Photos:
         if seen is None:
             return
         if self._landmarks is None or self._landmarks.camera != seen.camera:
-            self._landmarks = Landmarks(seen.camera)
+            self._landmarks = Landmarks(seen.camera, SOFT)
         found = Sightings(seen.camera) if self._followed is None else self._followed.found
         self._landmarks.advance(seen.sight, found, T @ seen.T_sensor_camera)
         self._followed = None

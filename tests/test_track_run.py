@@ -71,6 +71,17 @@ def test_settings_and_notes(tmp_path):
     assert done == [(1, 2, "tracking"), (2, 2, "tracking")]
 
 
+def test_pictures_that_are_not_used_are_told(tmp_path):
+    lines, where = [], unposed(tmp_path / "a", 4)
+    (where / "rgb").mkdir()
+    for image in (where / "depth").iterdir():
+        (where / "rgb" / image.name).write_bytes(b"no picture")
+    sv.track_recording(where, notify=lines.append)
+    sv.map_recording(where, tmp_path / "a.svox", poses="track", notify=lines.append)
+    told = [line for line in lines if line.startswith("note: 4 of 4 pictures beside depth images are not used")]
+    assert len(told) == 2
+
+
 def test_what_is_wrong_is_one_line_and_leaves_the_file(tmp_path):
     (tmp_path / "way.tum").write_text("as it was")
     dark = unposed(tmp_path / "dark", 3, covered=range(3))

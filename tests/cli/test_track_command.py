@@ -72,6 +72,7 @@ def test_pictures_with_and_without_poses_to_compare_with(here, capsys):
         (("nowhere", "--out", "way.tum"), "no such folder"),
         ((ROOM, "--out", "way.svox"), "way.svox"),
         ((ROOM, "--out", "way.tum", "--picture", "way.gif"), "--picture way.gif: end the file's name with .png"),
+        ((ROOM, "--out", "way.tum", "--picture", "nowhere/way.png"), "nowhere/way.png: there is no folder"),
         ((ROOM, "--out", "way.tum", "--set", "max_rnge=3"), "max_range"),
         (("dark", "--out", "way.tum"), "not one frame could be tracked"),
     ],

@@ -266,6 +266,7 @@ def with_one(number):
 REFUSED = {
     "no overlap": (lambda: timed(flight(), np.arange(300) + 10**15), {}, "0 poses have one of poses no more than 0.02"),
     "two poses": (lambda: timed(flight(2)), {}, r"2 poses have .*\(3 are needed\)"),
+    "one pose": (lambda: timed(flight(1)), {}, r"1 poses have .*\(3 are needed\)"),
     "standing still": (still, {}, "stands still"),
     "scale alone": (lambda: timed(flight()), {"align": False, "scale": True}, "scale=True"),
     "no difference": (lambda: timed(flight()), {"max_difference_s": float("nan")}, "give seconds above 0"),

@@ -97,20 +97,14 @@ def test_pictures_of_twice_the_size_have_a_camera_of_twice_the_size(tmp_path):
     assert (camera.width, camera.fx, camera.cx) == (128, 2 * source.camera.fx, 2 * source.camera.cx + 0.5)
 
 
-def test_pictures_of_another_shape_are_not_used(tmp_path):
-    folder = depth_folder(tmp_path, STAMPS)
-    for k, stamp in enumerate(STAMPS):
-        save(folder / "rgb" / f"{stamp}.png", k, (100, 48))
-    assert [frame.photo for frame in open_source(folder)] == [None] * COUNT
-
-
 def test_a_seven_scenes_folder_has_a_colour_camera_beside_the_depth_camera(tmp_path):
     for k, T in enumerate(posed(COUNT)):
         write(tmp_path / f"frame-{k:06}.depth.png", units(render(T), 1000))
         save(tmp_path / f"frame-{k:06}.color.jpg", k)
         np.savetxt(tmp_path / f"frame-{k:06}.pose.txt", T)
     (tmp_path / "camera-intrinsics.txt").write_text(camera_text())
-    assert open_source(tmp_path).frame(0).photo is None  # not of 640x480: nothing is known of its camera
+    with pytest.raises(FrameRefused, match="no camera is known for its size"):  # not of 640x480
+        pixels(open_source(tmp_path).frame(0).photo)
     (tmp_path / "color-intrinsics.txt").write_text("50 0 31\n0 51 23\n0 0 1\n")
     for source in (open_source(tmp_path), open_images(tmp_path)):
         check(source)
@@ -176,12 +170,41 @@ def test_damaged_pictures_are_refused_in_one_line(tmp_path):
     for data in (b"", b"no picture", whole[: len(whole) // 2]):
         with pytest.raises(FrameRefused, match=r"a\.jpg: .*copy it again or remove it"):
             decode_photo(data, SIZE, "a.jpg")
-    with pytest.raises(FrameRefused, match="64x48 pixels, the recording has 10x10"):
+    with pytest.raises(FrameRefused, match=r"^a\.jpg: 64x48 pixels, the recording has 10x10; remove it$"):
         decode_photo(whole, (10, 10), "a.jpg")
     with pytest.raises(FrameRefused, match="put it back"):
         read_photo(tmp_path / "none.jpg", SIZE)
     assert photo_size(path) == SIZE
     assert photo_size(tmp_path / "none.jpg") is None
+
+
+def test_pictures_of_16_bits_keep_the_upper_eight(tmp_path):
+    image = np.arange(48 * 64, dtype=np.uint16).reshape(48, 64) * 21
+    Image.fromarray(image).save(tmp_path / "a.png")
+    assert np.array_equal(read_photo(tmp_path / "a.png", SIZE), image // 256)
+
+
+def test_pictures_too_large_for_pillow_say_so_in_one_line(tmp_path, monkeypatch, recwarn):
+    path = save(tmp_path / "a.png", 0)
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 2000)
+    assert photo_size(path) == SIZE
+    assert read_photo(path, SIZE).shape == SIZE[::-1]
+    assert not recwarn.list
+
+
+@pytest.mark.parametrize("wrong", ["clock", "shape", "damaged"])
+def test_pictures_of_which_none_can_be_used_say_why(tmp_path, wrong):
+    folder = depth_folder(tmp_path, STAMPS)
+    for k, stamp in enumerate(STAMPS):
+        later = f"{float(stamp) + (wrong == 'clock'):.6f}"
+        path = save(folder / "rgb" / f"{later}.png", k, (64, 20) if wrong == "shape" else SIZE)
+        if wrong == "damaged":
+            path.write_bytes(b"no picture")
+    source = open_source(folder)
+    expected = "are they of one clock" if wrong == "clock" else r"rgb/100\.0+\.png: not read, or"
+    for k in range(COUNT):
+        with pytest.raises(FrameRefused, match=expected):
+            pixels(source.frame(k).photo)
 
 
 def test_each_image_gets_the_picture_that_is_nearest_in_time():

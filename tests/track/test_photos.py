@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 from made_tracks import CAMERA, LENS, PHOTO_CAMERA, T_DEPTH_PHOTO, aside, covered, hall, pictured, seen, track
 
+from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.errors import FrameRefused
-from stereovox.frame import DepthImage
+from stereovox.frame import DepthImage, Photo
 from stereovox.se3 import rotation_matrix
 from stereovox.simulate.scene import Scene, cylinder
 from stereovox.track.photos import Beside, inverse_depths
 from stereovox.track.sightings import Corners, Sightings
+from stereovox.track.tracker import Tracker
 
 METRES, DEGREES = 0.02, 0.5
 """Bounds of the errors of 20 images."""
@@ -106,6 +108,44 @@ def test_images_that_tell_nothing_leave_poses_as_depth_alone_has_them():
 
 def unreadable():
     raise FrameRefused("unreadable", "no such file")
+
+
+FAR = np.eye(4)
+FAR[:3, 3] = 25, 0, 0  # millimetres, taken for metres
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda photo: photo.pixels,
+        lambda photo: replace(photo, camera=None),
+        lambda photo: replace(photo, T_sensor_camera=FAR),
+        lambda photo: replace(photo, T_sensor_camera=[[1, 2], [3]]),
+        lambda photo: replace(photo, T_sensor_camera=np.eye(4) * np.nan),
+        lambda photo: replace(photo, T_sensor_camera=np.eye(4).astype(str)),
+    ],
+)
+def test_what_is_no_image_with_a_camera_is_left_out_and_told(spoil):
+    frames = [replace(frame, photo=spoil(frame.photo)) for frame in pictured(seen(BAYS, aside(4)), BAYS)]
+    tracker = Tracker()
+    assert [bool(tracker.add(frame).lost) for frame in frames] == [True, False, False, False]
+    assert tracker.complaint().startswith("4 of 4 pictures beside depth images are not used; the first: ")
+
+
+def test_a_place_that_is_a_list_is_a_place():
+    frames = pictured(seen(BAYS, aside(4)), BAYS)
+    tracker = Tracker()
+    for frame in frames:
+        tracker.add(replace(frame, photo=replace(frame.photo, T_sensor_camera=frame.photo.T_sensor_camera.tolist())))
+    assert tracker.complaint() == ""
+
+
+def test_images_narrower_than_a_corner_hold_nothing():
+    frames, camera = pictured(seen(BAYS, aside(4)), BAYS), PinholeCamera(160, 3, 160, 160, 79.5, 1)
+    random = np.random.default_rng(0)
+    thin = [Photo(random.integers(0, 255, (3, 160), np.uint8), camera) for _ in frames]
+    found = track([replace(frame, photo=photo) for frame, photo in zip(frames, thin, strict=True)])
+    assert found.lost == [0]
 
 
 def test_images_that_cannot_be_used_are_left_out():

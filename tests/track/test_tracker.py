@@ -243,10 +243,19 @@ def test_two_images_close_in_time_do_not_make_the_next_one_late():
     assert np.all(found.errors() < (METRES, DEGREES))
 
 
-@pytest.mark.parametrize("start", [np.eye(3), np.full((4, 4), np.nan), np.diag([2.0, 2, 2, 1])])
+@pytest.mark.parametrize("start", [np.eye(3), np.full((4, 4), np.nan), np.diag([2.0, 2, 2, 1]), "x", [[1, 2], [3]]])
 def test_a_start_that_is_no_rigid_motion_is_refused(start):
     with pytest.raises(StereovoxError, match="no rigid motion"):
         tracker(start)
+
+
+@pytest.mark.parametrize("motion", [np.eye(3), np.full((4, 4), np.nan), np.diag([2.0, 2, 2, 1]), "x", [[1, 2], [3]]])
+def test_a_motion_that_is_not_rigid_is_refused_and_changes_nothing(motion):
+    taken, one, other = frames("apartment")[:4], tracker(), tracker()
+    for frame in taken:
+        with pytest.raises(StereovoxError, match="motion is no rigid motion"):
+            one.add(frame, motion)
+        assert np.array_equal(one.add(frame).T_world_sensor, other.add(frame).T_world_sensor)
 
 
 def test_a_start_far_from_the_origin_is_as_good_as_any():

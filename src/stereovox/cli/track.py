@@ -38,9 +38,12 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Track the source, write its poses and print a summary."""
+    from stereovox.safe_io import check_file
     from stereovox.track_run import track_recording
 
     check_ending("--picture", arguments.picture, ".png")
+    if arguments.picture:
+        check_file(arguments.picture, (".png",))
     say_about_compiling()
     with progress_of_steps("tracking") as progress:
         found = track_recording(

@@ -131,6 +131,8 @@ def _by_number(ours: ImagePoses, true: ImagePoses) -> tuple[NDArray[np.int64], N
 def _covered(ours_ns: NDArray[np.int64], truth_ns: NDArray[np.int64]) -> float:
     """Return the share of the truth's time span between poses of the estimate that have no gap between them."""
     gaps = np.diff(ours_ns)
+    if not len(gaps):
+        return 0.0
     inside = np.diff(np.clip(ours_ns, truth_ns[0], truth_ns[-1]))
     limit_ns = max(MAX_GAP_S * 1e9, MAX_GAP_INTERVALS * float(np.median(gaps)))
     return float(inside[gaps <= limit_ns].sum() / max(truth_ns[-1] - truth_ns[0], 1))

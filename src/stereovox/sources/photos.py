@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import io
+import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -35,18 +36,22 @@ def read_photo(path: Path, size: tuple[int, int]) -> NDArray[np.uint8]:
 def decode_photo(data: bytes, size: tuple[int, int], name: str) -> NDArray[np.uint8]:
     """Return the picture in the bytes of a file as a grey image (height, width) uint8.
 
-    Its size must be (width, height) = `size`. Raises FrameRefused: `unreadable`, `bad_shape`; `name` is used in
-    messages.
+    Its size must be (width, height) = `size`; images of 16 bits keep the upper eight. `name` is used in messages.
+    Raises FrameRefused: `unreadable`, `bad_shape`.
     """
     from PIL import Image
 
     try:
-        with Image.open(io.BytesIO(data)) as image:
+        with warnings.catch_warnings(action="ignore"), Image.open(io.BytesIO(data)) as image:
             if image.size != size:
                 words = f"{size_text(image.size)} pixels, the recording has {size_text(size)}"
                 raise FrameRefused("bad_shape", f"{name}: {words}; remove it")
+            if image.mode.startswith("I"):
+                return np.right_shift(np.asarray(image), 8).astype(np.uint8)
             image.draft("L", size)  # of a JPEG, grey is all that is unpacked
             return np.asarray(image.convert("L"), np.uint8)
+    except FrameRefused:  # it is a ValueError, too
+        raise
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise FrameRefused("unreadable", f"{name}: {str(error)[:80]}; copy it again or remove it") from None
 
@@ -56,7 +61,7 @@ def photo_size(path: Path) -> tuple[int, int] | None:
     from PIL import Image
 
     try:
-        with Image.open(path) as image:
+        with warnings.catch_warnings(action="ignore"), Image.open(path) as image:
             return image.size if 0 < image.size[0] * image.size[1] <= MAX_PIXELS else None
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
         return None

@@ -40,7 +40,12 @@ SHARP, SOFT = Kind(3, 0.01, 0.0), Kind(7, 0.003, 0.15)
 def strongest(
     image: NDArray[np.uint8], number: int, apart_px: float, mask: NDArray[np.uint8], kind: Kind
 ) -> NDArray[np.float32]:
-    """Return the strongest corners (N, 2) of an image where a mask is not 0, column and row to a part of a pixel."""
+    """Return the strongest corners (N, 2) of an image where a mask is not 0, column and row to a part of a pixel.
+
+    None in an image that is narrower than what is followed around a corner.
+    """
+    if min(image.shape) < max(WINDOW):
+        return np.empty((0, 2), np.float32)
     strength = cv2.cornerMinEigenVal(image, kind.block)
     noise = max(float(np.percentile(strength[::4, ::4], QUIET)), ROUNDING)
     strong = mask * (strength > NOISE * noise)

@@ -57,6 +57,10 @@ class GuidedTracker:
             return replace(tracked, lost=NO_START)
         return tracked.moved(self._T_world_tracker)
 
+    def complaint(self) -> str:
+        """Return what of the frames so far could not be used, in words; "" where nothing is amiss."""
+        return self._tracker.complaint()
+
     def _begin(self, own: Transform | None) -> None:
         """Take the pose of the image that the tracker's map was begun with for where its world lies."""
         self._own = own

@@ -22,9 +22,12 @@ from stereovox.track.fit import Equations, Fit, Stage, motion_between, settled
 from stereovox.track.landmarks import Landmarks, Sight
 from stereovox.track.sightings import AGREED, CONVERGED, REACHES, Sightings
 from stereovox.track.views import View, stood_free
+from stereovox.trust.validate import matrix_of
 
 RIGID = 0.01
 """Largest rigidity error of the place of a camera."""
+MAX_ARM_M = 10.0
+"""Farthest that a camera can be beside the depth camera."""
 CELL, STEP = 4.0, 2
 """Pixels of the depth image that a cell of the other image is wide, and of how many along each axis one is used."""
 FOLLOWED = 0.2
@@ -84,12 +87,13 @@ class Photos:
     """Landmarks in the images that a depth camera takes along; images that cannot be used are left out.
 
     Attributes:
-        left_out: Number of images that could not be used.
+        offered: Number of images so far.
+        left_out: Number of those that could not be used.
         why: What was wrong with the first of them.
     """
 
     def __init__(self) -> None:
-        self.left_out, self.why = 0, ""
+        self.offered, self.left_out, self.why = 0, 0, ""
         self._landmarks: Landmarks | None = None
         self._last = np.eye(4)
         self._followed: Beside | None = None
@@ -105,11 +109,17 @@ class Photos:
 
         sigma_of: standard deviation of a depth, by depth times `rows_per_metre`.
         """
+        self.offered += photo is not None
         try:
             return None if photo is None else sighted(photo, image, sigma_of, rows_per_metre)
         except FrameRefused as refused:
             self.left_out, self.why = self.left_out + 1, self.why or str(refused)
             return None
+
+    def complaint(self) -> str:
+        """Return how many images could not be used and why, in words; "" where all could."""
+        count = f"{self.left_out} of {self.offered} pictures beside depth images are not used"
+        return f"{count}; the first: {self.why}" if self.left_out else ""
 
     def follow(self, seen: Sighted | None, expected: Transform, views: list[View]) -> Beside | None:
         """Return the landmarks found in an image near T_map_sensor, less those that stand where views saw free space;
@@ -163,17 +173,29 @@ def sighted(photo: Photo, image: DepthImage, sigma_of: NDArray[np.float64], rows
 
     Raises FrameRefused where the image cannot be read, or is not what its camera says.
     """
+    camera, T_sensor_camera = _camera_of(photo)
     pixels = photo.pixels() if callable(photo.pixels) else photo.pixels
-    camera = photo.camera
-    if not rigidity_error(photo.T_sensor_camera) < RIGID:
-        raise FrameRefused("bad_form", "T_sensor_camera of the image beside the depth image is no rigid motion")
     picture = grey(pixels, (camera.width, camera.height), "the image beside the depth image")
-    cell_px, depths = inverse_depths(image, camera, photo.T_sensor_camera, sigma_of, rows_per_metre)
+    cell_px, depths = inverse_depths(image, camera, T_sensor_camera, sigma_of, rows_per_metre)
     known = np.where(depths > 0, np.uint8(255), np.uint8(0)).repeat(cell_px, axis=0).repeat(cell_px, axis=1)
     mask = np.ascontiguousarray(known[: camera.height, : camera.width])
     sigma = sigma_of / np.square(np.maximum(np.arange(len(sigma_of)), 1) / rows_per_metre)  # of the inverse depth
     sight = Sight(picture, mask, partial(_distances, cell_px, depths, sigma, rows_per_metre))
-    return Sighted(sight, camera, orthonormalise(np.asarray(photo.T_sensor_camera, float)))
+    return Sighted(sight, camera, T_sensor_camera)
+
+
+def _camera_of(photo: Photo) -> tuple[PinholeCamera, Transform]:
+    """Return the camera of an image beside a depth image and its T_sensor_camera; raises FrameRefused `bad_form`."""
+    if not isinstance(photo, Photo) or not isinstance(photo.camera, PinholeCamera):
+        given = getattr(photo, "camera", photo)
+        raise FrameRefused("bad_form", f"photo: {type(given).__name__} is no camera; give sv.Photo(pixels, camera)")
+    T = matrix_of(photo.T_sensor_camera)
+    if not rigidity_error(T) < RIGID:
+        raise FrameRefused("bad_form", "T_sensor_camera of the image beside the depth image is no rigid motion")
+    arm = float(np.linalg.norm(T[:3, 3]))
+    if arm > MAX_ARM_M:
+        raise FrameRefused("bad_form", f"T_sensor_camera of the image beside the depth image: {arm:g} m; give metres")
+    return photo.camera, orthonormalise(T)
 
 
 def of_sensor(equations: Equations, T_sensor_camera: Transform) -> Equations:

@@ -90,6 +90,10 @@ class Surfaces:
         depths = np.arange(round(FARTHEST_M * ROWS_PER_METRE)) / ROWS_PER_METRE
         return FLOOR_M + BIAS * RangeNoise.of(self._config.noise, camera).sigma(depths)
 
+    def complaint(self) -> str:
+        """Return what of the frames so far could not be used, in words; "" where nothing is amiss."""
+        return self._photos.complaint()
+
     def forget(self) -> None:
         """Forget all that was learned."""
         self._map, self._views, self._learned = SurfelMap(), [], 0

@@ -29,6 +29,7 @@ from stereovox.track.fit import Fit, Limits, deviations
 from stereovox.track.inertial import Gyroscope, Turn, up_by_force
 from stereovox.track.surfaces import Surfaces
 from stereovox.track.views import far_apart
+from stereovox.trust.validate import matrix_of
 
 LEVEL = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """Pose of the first image unless another is given: the camera looks along x, level; z is up."""
@@ -79,6 +80,10 @@ class Evidence(Protocol[Seen]):
 
     def see(self, frame: AnyFrame, /) -> Seen:
         """Return what of a frame is used; raises FrameRefused where it cannot be."""
+        ...
+
+    def complaint(self) -> str:
+        """Return what of the frames so far could not be used, in words; "" where nothing is amiss."""
         ...
 
     def forget(self) -> None:
@@ -170,8 +175,8 @@ class Tracker:
         **overrides: Any,
     ):
         self.config = load_config(profile, **overrides)
-        self._start = LEVEL if start is None else np.asarray(start, float)
-        if self._start.shape != (4, 4) or not rigidity_error(self._start) < RIGID:
+        self._start = LEVEL if start is None else matrix_of(start)
+        if not rigidity_error(self._start) < RIGID:
             raise StereovoxError("start is no rigid motion; give a (4, 4) T_world_sensor in metres")
         self._given_start, self._felt_up = self._start, False
         self._imu, self._gyroscope = imu, None if imu is None else Gyroscope(imu)
@@ -205,7 +210,14 @@ class Tracker:
         Returns:
             Its pose, or why it is lost: also where the image itself cannot be used. The first image counts once the
             next is tracked on it.
+
+        Raises:
+            StereovoxError: `motion` is no rigid motion.
         """
+        if motion is not None:
+            motion = matrix_of(motion)
+            if not rigidity_error(motion) < RIGID:
+                raise StereovoxError("motion is no rigid motion; give a (4, 4) T_before_now in metres, or None")
         if self._evidence is None:
             self._evidence, self._sensor = _evidence_for(frame, self.config), frame.sensor
         if frame.sensor != self._sensor:
@@ -221,6 +233,10 @@ class Tracker:
         if motion is not None and not self._trial:
             return self._correct(self._evidence, seen, motion, frame.stamp_ns)
         return self._follow(self._evidence, seen, frame.stamp_ns)
+
+    def complaint(self) -> str:
+        """Return what of the frames so far could not be used, in words; "" where nothing is amiss."""
+        return self._evidence.complaint() if self._evidence else ""
 
     def _correct(self, evidence: Evidence[Seen], seen: Seen, motion: Transform, stamp_ns: int) -> Tracked:
         """Take the pose of an image that a given motion leads to, corrected by what is held in view."""

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.errors import FrameRefused, SourceError, did_you_mean
@@ -197,9 +198,27 @@ class DepthFolder(DepthSource, ABC):
         size = next(filter(None, map(photo_size, paths)), None)
         return (None, np.eye(4)) if size is None else self.photo_camera(size)
 
+    @cached_property
+    def _no_photos(self) -> str:
+        """Why not one of the pictures that are there can be used; "" where one can, and where there are none."""
+        if not self.list_photos() or self._photo_camera[0] is not None:
+            return ""
+        path = next(filter(None, self._photos), None)
+        if path is None:
+            return f"{self.folder}: no picture within {PHOTO_NS / 1e6:g} ms of a depth image; are they of one clock?"
+        return f"{path}: not read, or no camera is known for its size; give pictures of the depth images' shape"
+
+    def _refuse_photo(self) -> NDArray[np.uint8]:
+        raise FrameRefused("no_photo", self._no_photos)
+
     def photo(self, i: int) -> Photo | None:
-        """Return the picture that was taken with frame `i` (0 to len - 1), None where there is none."""
+        """Return the picture that was taken with frame `i` (0 to len - 1), None where there is none.
+
+        Where none of the recording's can be used, its `pixels` raise FrameRefused and say why.
+        """
         path, (camera, T_depth_photo) = self._photos[i], self._photo_camera
+        if self._no_photos:
+            return Photo(self._refuse_photo, self.camera)
         if path is None or camera is None:
             return None
         return Photo(partial(read_photo, path, (camera.width, camera.height)), camera, T_depth_photo)

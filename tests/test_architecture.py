@@ -23,7 +23,7 @@ LAYERS = (
     {"intake", "integrate", "products", "sources"},
     {"comparison", "deadline", "formats", "localize", "rebuild", "simulate", "track"},
     {"mapper", "opening"},
-    {"calibrate", "evaluate", "pose_choice", "survey"},
+    {"calibrate", "evaluate", "join", "pose_choice", "remapping", "survey"},
     {"run", "view"},
     {"contents", "floor_run", "ros", "report", "track_run", "viewer"},
     {"lab"},

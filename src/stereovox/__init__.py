@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from stereovox.frame import Reason as Reason
     from stereovox.frame import Scan as Scan
     from stereovox.frame import StereoFrame as StereoFrame
+    from stereovox.join import merge as merge
     from stereovox.mapper import AnyMapper as AnyMapper
     from stereovox.mapper import GridMapper as GridMapper
     from stereovox.mapper import Mapper as Mapper
@@ -44,9 +45,10 @@ if TYPE_CHECKING:
     from stereovox.products.distance import DistanceField as DistanceField
     from stereovox.products.frontiers import frontiers as frontiers
     from stereovox.products.ground import ground as ground
-    from stereovox.products.merge import merge as merge
     from stereovox.products.path_check import check_path as check_path
     from stereovox.rebuild import CorrectionReport as CorrectionReport
+    from stereovox.remapping import Remapped as Remapped
+    from stereovox.remapping import remap as remap
     from stereovox.run import MapResult as MapResult
     from stereovox.run import MapRun as MapRun
     from stereovox.run import map_recording as map_recording
@@ -101,7 +103,9 @@ _HOMES = {
     "difference": "products.difference",
     "frontiers": "products.frontiers",
     "ground": "products.ground",
-    "merge": "products.merge",
+    "merge": "join",
+    "Remapped": "remapping",
+    "remap": "remapping",
     "surface": "formats.meshes",
     "FloorRun": "floor_run",
     "map_floor": "floor_run",

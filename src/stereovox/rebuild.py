@@ -158,10 +158,17 @@ class Rebuild:
         level: As in `correct`.
         moved: New poses (4, 4) by number of the frame.
         tiles: As in `correct`.
+        whole: Whether all blocks are made anew in any case.
     """
 
     def __init__(
-        self, storage: Storage, level: Callable[[str], Level], moved: Mapping[int, Transform], tiles: Path | None
+        self,
+        storage: Storage,
+        level: Callable[[str], Level],
+        moved: Mapping[int, Transform],
+        tiles: Path | None = None,
+        *,
+        whole: bool = False,
     ):
         assert storage.kept is not None
         self._storage, self._level, self._moved = storage, level, moved
@@ -169,7 +176,7 @@ class Rebuild:
         self._before, self._after, self._mapped = self._kept.frames, list[KeptFrame](), 0
         self._is_in_place = False
         self._loaded = Ahead(partial(_prepared, level))
-        self._dirty = None if self._is_whole() else self._seen_by_moved()
+        self._dirty = None if whole or self._is_whole() else self._seen_by_moved()
         self._scratch = make_map(_without_frames(storage.config), None, _other_than(tiles, storage)).storage
         if self._dirty is not None and storage.times_start_ns is not None:
             nothing = np.empty((0, 3), np.int32), np.empty((0, CELLS), np.uint32)
@@ -340,7 +347,8 @@ def _correct_history(history: History, before: Sequence[KeptFrame], after: Seque
         if new.seen != old.seen:
             T_new_old = _matrix(new.seen) @ inverse(_matrix(old.seen))
             _correct_sensor(history, sensor, T_new_old)
-            history.trusted[sensor] = _moved(history.trusted[sensor], old.seen, new.seen, T_new_old)
+            if (trusted := history.trusted.get(sensor)) is not None:  # a merged map trusts none so far
+                history.trusted[sensor] = _moved(trusted, old.seen, new.seen, T_new_old)
 
 
 def _correct_sensor(history: History, sensor: str, T_new_old: Transform) -> None:

@@ -34,6 +34,7 @@ COMMANDS = (
     "path",
     "crop",
     "merge",
+    "remap",
     "diff",
     "coarsen",
     "frontiers",

@@ -31,6 +31,11 @@ def check_new(out: str, *inputs: str) -> None:
 def save_new(voxel_map: VoxelMap, out: str) -> dict[str, Any]:
     """Save a map, print what it contains, and return that with the keys of `info`."""
     voxel_map.save(out)
+    return describe_saved(voxel_map, out)
+
+
+def describe_saved(voxel_map: VoxelMap, out: str) -> dict[str, Any]:
+    """Print what a map contains that was saved to `out`, and return that with the keys of `info`."""
     bounds = voxel_map.bounds()
     result = {
         "out": out,
@@ -93,11 +98,17 @@ def open_cubes(path: str) -> VoxelMap:
 def open_map(path: str) -> VoxelMap:
     """Load the map at `path`; raises MapFileError, one line that suggests the map or recording likely meant."""
     from stereovox.maps import load_map
+
+    check_there(path)
+    return load_map(path)
+
+
+def check_there(path: str) -> None:
+    """Raise MapFileError where `path` is no map: one line that suggests the map or recording likely meant."""
     from stereovox.maps.store import is_map
 
     if not is_map(path):
         raise MapFileError(f"{path}: {_what_is_there(Path(path))}")
-    return load_map(path)
 
 
 def _what_is_there(path: Path) -> str:

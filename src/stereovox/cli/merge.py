@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Merge two maps by adding up their evidence; the result has the frame and the settings of A."""
+"""Merge two maps; the result has the frame and the settings of A.
+
+Maps that kept their frames (map.keep_frames) become exactly the map of one run over both. The evidence of others is
+added up, and a line says what that cannot promise.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +12,7 @@ from typing import Any
 
 from stereovox.cli.maps import check_new, open_map, save_new
 from stereovox.cli.options import transform_of
+from stereovox.cli.terminal import say
 
 EXAMPLE = "stereovox merge kitchen.svox hall.svox --out both.svox --transform 4.2,0,0,0,0,0.7071,0.7071"
 
@@ -32,8 +37,14 @@ def add_transform(parser: ArgumentParser) -> None:
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Load both maps and save the merged one."""
-    from stereovox.products.merge import merge
+    from stereovox.join import merge, why_added
 
     T_a_b = None if arguments.transform is None else transform_of(arguments.transform)
     check_new(arguments.out, arguments.a, arguments.b)
-    return save_new(merge(open_map(arguments.a), open_map(arguments.b), T_a_b), arguments.out)
+    a, b = open_map(arguments.a), open_map(arguments.b)
+    merged, why = merge(a, b, T_a_b), why_added(a, b, T_a_b)
+    if why is not None:
+        say(
+            f"note: evidence is added up, since {why}; cells at their limits may differ from those of one run over both"
+        )
+    return {**save_new(merged, arguments.out), "exact": why is None}

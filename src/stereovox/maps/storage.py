@@ -38,6 +38,11 @@ Blocks = tuple[NDArray[np.int32], NDArray[np.integer]]
 """Block coordinates (n, 3), and their cells (n, 512) as they are stored."""
 
 
+def settings_of_frames(config: Config) -> list[str]:
+    """Return the names of the settings, but for `map`, that say what a frame means that was taken."""
+    return [name for name in type(config).model_fields if name not in NOT_OF_FRAMES]
+
+
 class OnStorage(WithHistory):
     """Attributes of a map that its storage keeps; like plain attributes they are read without the lock."""
 
@@ -107,7 +112,7 @@ class Storage(Guarded):
         of_frames = {"keep_frames": config.map.keep_frames, "frames_budget": config.map.frames_budget}
         self._check_same("map", self.config.map.model_copy(update=of_frames), config.map)
         if self.kept is not None and config.map.keep_frames:
-            for name in type(config).model_fields.keys() - NOT_OF_FRAMES:
+            for name in settings_of_frames(config):
                 self._check_same(name, getattr(self.config, name), getattr(config, name))
 
     @staticmethod

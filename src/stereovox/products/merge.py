@@ -52,7 +52,7 @@ def merge(a: VoxelMap, b: VoxelMap, T_a_b: ArrayLike | None = None) -> VoxelMap:
         merged.storage.insert(coords, _summed(a, cells_at(merged, coords), b, cells))
         if times is not None:
             merged.storage.set_times(coords, times, start_ns)
-    merged.history = _together(a.history, b.history)
+    merged.history = together(a.history, b.history)
     viewpoints = [one.viewpoint for one in (a, b) if one.viewpoint]
     merged.viewpoint = max(viewpoints, key=lambda viewpoint: viewpoint.stamp_ns, default=None)
     return merged
@@ -82,7 +82,7 @@ def _later(a: VoxelMap, b: VoxelMap, coords: NDArray[np.int32], start_ns: int | 
     return times.astype(np.uint32)
 
 
-def _together(a: History, b: History) -> History:
+def together(a: History, b: History) -> History:
     """Return the summed counts; which sensor each map trusted last does not carry over to the next frame."""
     names = dict.fromkeys(name for name in (a.recording, b.recording) if name)
     lasts = [one for one in (a.last_frame, b.last_frame) if one]

@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Give the frames of a map corrected poses, as after a loop closure, and save the map that they make.
+
+The map must have kept its frames (map --set map.keep_frames=true). The result is bit for bit the map of a new run with
+these poses. Frames between two that have a pose in the file are moved as these are; all others stay where they were.
+"""
+
+from __future__ import annotations
+
+import shlex
+from argparse import ArgumentParser, Namespace
+from pathlib import Path
+from typing import Any
+
+from stereovox.cli.maps import check_new, check_there, describe_saved
+from stereovox.cli.terminal import say, say_about_compiling
+from stereovox.errors import StereovoxError
+
+EXAMPLE = "stereovox remap kitchen.svox --poses corrected.tum"
+
+
+def add_arguments(parser: ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument("map", metavar="MAP", help="folder of a map that kept its frames")
+    parser.add_argument(
+        "--poses", required=True, metavar="FILE",
+        help="corrected poses of the camera's optical frame: lines 'stamp tx ty tz qx qy qz qw' (TUM)",
+    )  # fmt: skip
+    parser.add_argument("--out", metavar="OUT", help="folder of the new map (default: NAME-corrected.svox here)")
+    parser.add_argument("--sensor", metavar="NAME", help="which sensor the poses are of, where the map has several")
+
+
+def run(arguments: Namespace) -> dict[str, Any]:
+    """Correct the map and print what was done."""
+    from stereovox.remapping import remap
+
+    out = arguments.out or _usual_out(arguments.map)
+    check_new(out, arguments.map)
+    check_there(arguments.map)
+    say_about_compiling()
+    done = remap(arguments.map, arguments.poses, out, sensor=arguments.sensor)
+    report = done.report
+    say(f"{done.posed} frames have a pose in {arguments.poses}, {done.between} were moved as their neighbours")
+    if done.outside:
+        say(f"note: {done.outside} frames before the first or after the last of them stayed where they were")
+    if not report.all_frames:
+        say(f"note: only {report.mapped} frames were kept (map.frames_budget); the map is what these make")
+    say(f"{report.moved} frames moved, {report.mapped} were mapped again, {report.blocks} blocks made anew")
+    return {**describe_saved(done.map, out), **done.summary()}
+
+
+def _usual_out(path: str) -> str:
+    """Return the name of the new map where none is given. Raises StereovoxError where that is taken."""
+    out = f"{Path(path).resolve().stem}-corrected.svox"
+    if Path(out).exists():
+        raise StereovoxError(f"{out}: is here already; replace it with --out {shlex.quote(out)}, or give another name")
+    return out

@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""remap, and merge of maps that kept their frames: what they write and say, and how they refuse."""
+
+import json
+
+import numpy as np
+import pytest
+
+import stereovox as sv
+from stereovox.cli import main
+from stereovox.sources.trajectory import write_trajectory
+
+SETTINGS = {"voxel_size": 0.2, "map.keep_frames": True, "trust.max_disagreement": 1}
+
+
+@pytest.fixture(scope="module")
+def maps(tmp_path_factory):
+    """Folders of the first and the second half of a short recording, of all of it without frames, and its poses."""
+    folder = tmp_path_factory.mktemp("maps")
+    frames = list(sv.open_source("sim:room?image_width=96", frames=":8"))
+    for name, part, keep in (("a", frames[:4], True), ("b", frames[4:], True), ("bare", frames, False)):
+        mapper = sv.Mapper("default", **{**SETTINGS, "map.keep_frames": keep})
+        for frame in part:
+            assert mapper.add(frame).refused is None
+        mapper.save(folder / f"{name}.svox")
+    poses = np.array([frame.T_world_sensor for frame in frames])
+    poses[:, 0, 3] += 0.4
+    write_trajectory(folder / "all.tum", [frame.stamp_ns for frame in frames], poses, "camera")
+    write_trajectory(folder / "two.tum", [frames[0].stamp_ns, frames[2].stamp_ns], poses[[0, 2]], "camera")
+    return folder
+
+
+@pytest.fixture
+def told(capsys):
+    def run(*words):
+        status = main([*map(str, words), "--json"])
+        out, err = capsys.readouterr()
+        assert status == 0, err
+        return json.loads(out.splitlines()[-1]), err
+
+    return run
+
+
+def test_remap(maps, tmp_path, told, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    result, said = told("remap", maps / "a.svox", "--poses", maps / "all.tum")
+    assert (result["moved"], result["posed"], result["between"], result["outside"]) == (4, 4, 0, 0)
+    assert result["out"] == "a-corrected.svox"
+    before, after = sv.load_map(maps / "a.svox"), sv.load_map(tmp_path / "a-corrected.svox")
+    assert np.allclose(after.path[:, 0] - before.path[:, 0], 0.4, atol=1e-5)
+    assert result["frames"] == 4
+    assert "4 frames have a pose" in said
+    assert "stayed" not in said
+
+
+def test_remap_tells_of_frames_without_a_pose(maps, tmp_path, told):
+    result, said = told("remap", maps / "a.svox", "--poses", maps / "two.tum", "--out", tmp_path / "n.svox")
+    assert (result["posed"], result["between"], result["outside"]) == (2, 1, 1)
+    assert "1 frames before the first or after the last of them stayed where they were" in said
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["bare.svox", "--poses", "all.tum", "--out", "no.svox"], "map.keep_frames=true"),
+        (["a.svox", "--poses", "gone.tum", "--out", "no.svox"], "gone.tum"),
+        (["a.svox", "--poses", "all.tum", "--out", "a.svox"], "another name"),
+        (["a.svox", "--poses", "all.tum", "--out", "no.svox", "--sensor", "left"], "'camera'"),
+        (["all.tum", "--poses", "all.tum", "--out", "no.svox"], "no stereovox map"),
+    ],
+)
+def test_remap_refuses_in_one_line(maps, capsys, monkeypatch, words, said):
+    monkeypatch.chdir(maps)
+    assert main(["remap", *words]) == 2
+    err = capsys.readouterr().err
+    assert err.count("\n") == 1
+    assert said in err
+    assert not (maps / "no.svox").exists()
+
+
+def test_merge_says_whether_it_is_exact(maps, tmp_path, told):
+    result, said = told("merge", maps / "a.svox", maps / "b.svox", "--out", tmp_path / "both.svox")
+    assert result["exact"] is True
+    assert "added up" not in said
+    assert len(sv.load_map(tmp_path / "both.svox").kept_frames) == 8
+    result, said = told("merge", maps / "a.svox", maps / "bare.svox", "--out", tmp_path / "added.svox")
+    assert result["exact"] is False
+    assert "evidence is added up, since a map did not keep its frames" in said

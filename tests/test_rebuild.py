@@ -11,6 +11,7 @@ from made_threads import frames_of
 
 import stereovox as sv
 from stereovox.errors import FrameRefused, MapFileError, StereovoxError
+from stereovox.products.distance import DistanceField
 from stereovox.products.live_projection import LiveProjection
 from stereovox.products.projection import project
 from stereovox.se3 import rotation_matrix
@@ -256,6 +257,17 @@ def test_listeners_hear_what_changed():
     assert np.count_nonzero(grid.cells != -1) == np.count_nonzero(new.cells != -1)
 
 
+def test_a_distance_field_follows():
+    frames = made_frames()
+    mapper = mapped(frames)
+    field = DistanceField(mapper.map, [-1, -2, -1], [3, 2, 1])
+    moved, poses = shaken(frames, 0, 0.1)
+    mapper.correct(poses)
+    assert field.update() > 0
+    new = DistanceField(mapped(moved).map, [-1, -2, -1], [3, 2, 1])
+    assert np.array_equal(field.metres, new.metres)
+
+
 @pytest.mark.parametrize("kind", ["plain", "tiles"])
 def test_frames_may_come_while_poses_are_corrected(kind):
     frames = made_frames(each=60)
@@ -336,6 +348,8 @@ def test_stamps_of_several_sensors_need_their_name():
     assert mapper.correct({(frame.sensor, frame.stamp_ns): T}).moved == 1
     moved = [replace(f, T_world_sensor=T) if f is frame else f for f in frames]
     assert is_as_new(mapper, moved)
+    repeated = mapped([frames[0], frames[2], replace(frames[2])], **{"trust.ordered": False})
+    assert "without such" in refused(repeated, {(frame.sensor, frame.stamp_ns): T})
 
 
 def test_a_corrected_map_that_needs_too_much_memory_is_refused():

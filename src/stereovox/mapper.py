@@ -16,7 +16,7 @@ from stereovox.config import Config, load_config
 from stereovox.deadline import Deadline, Levels
 from stereovox.depth import DepthPipeline
 from stereovox.device import check_on_processor, on_usable_device
-from stereovox.errors import MapFileError
+from stereovox.errors import ConfigError, MapFileError
 from stereovox.frame import AnyFrame, Frame, Scan
 from stereovox.frame import UpdateReport as UpdateReport
 from stereovox.intake import Intake
@@ -187,7 +187,7 @@ class Mapper:
                 does not fit into `max_memory`, or this thread holds the map's `lock`. The map is then as it was.
             MapFileError: Kept frames of a map that was loaded are gone from the disk.
         """
-        self.map.lock.refuse_holder()
+        self.map.lock.refuse_holder("poses cannot be corrected")
         with self._correcting:
             return correct(self.map.storage, self._levels, poses, self._intake.closed(), self._tiles)
 
@@ -362,6 +362,8 @@ class GridMapper:
 
 
 def _grid_map(config: Config, resume: GridMap | OccupancyGrid | None) -> GridMap:
+    if config.map.keep_frames:
+        raise ConfigError("map.keep_frames is for maps in space; leave it out for the map of a floor")
     if resume is None:
         return GridMap(config)
     if isinstance(resume, OccupancyGrid):

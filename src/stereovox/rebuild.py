@@ -140,8 +140,9 @@ def moved_frames(
     moved: dict[int, Transform] = {}
     for key, found in named.items():
         if len(found) > 1:
+            cure = "name them (sensor, stamp)" if isinstance(key, int) else "only maps without such can be corrected"
             sensors = ", ".join(f"'{frame.sensor}'" for frame in found)
-            raise StereovoxError(f"{len(found)} frames have the stamp {key} ({sensors}); name them (sensor, stamp)")
+            raise StereovoxError(f"{len(found)} frames have the stamp {found[0].stamp_ns} ({sensors}); {cure}")
         frame = found[0]
         posed = Frame(np.empty((0, 0), np.float32), frame.camera, poses[key], name=frame.name)
         rigid_pose(posed, config.pose_rigidity_tolerance)  # raises where it is none

@@ -153,11 +153,14 @@ class Newest:
 class MapLock(RLock):  # pyright: ignore[reportGeneralTypeIssues] - only its stub calls it final
     """A re-entrant lock that can be copied and pickled; the copy is a new lock, not held by any thread."""
 
-    def refuse_holder(self) -> None:
-        """Raise StereovoxError where this thread holds the lock: waiting for another lock now could deadlock."""
+    def refuse_holder(self, what: str = "a frame cannot be added") -> None:
+        """Raise StereovoxError where this thread holds the lock: waiting for another lock now could deadlock.
+
+        what: begins the error.
+        """
         if self._is_owned():  # pyright: ignore[reportAttributeAccessIssue] - threading.Condition uses it too
             raise StereovoxError(
-                "a frame cannot be added by a thread that holds the map's lock, as a listener does; add it afterwards"
+                f"{what} by a thread that holds the map's lock, as a listener does; do so once it is released"
             )
 
     def __reduce__(self) -> tuple[type[MapLock], tuple[()]]:

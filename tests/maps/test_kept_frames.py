@@ -142,6 +142,19 @@ CAMERAS = [
 ]
 
 
+def test_maps_of_floors_keep_none():
+    with pytest.raises(ConfigError, match="maps in space"):
+        sv.GridMapper(**{"map.keep_frames": True})
+
+
+def test_info_tells_of_kept_frames(tmp_path):
+    mapped([wall_frame()]).save(tmp_path / "m")
+    told = sv.describe(tmp_path / "m")
+    assert told.facts["kept_frames"]["frames"] == 1
+    assert told.facts["kept_frames"]["bytes"] > 0
+    assert any("keeps 1 of its frames" in line for line in told.lines)
+
+
 def same(a, b):
     assert (a.number, a.sensor, a.name, a.stamp_ns, a.camera, a.quality) == (
         b.number, b.sensor, b.name, b.stamp_ns, b.camera, b.quality,

@@ -29,7 +29,7 @@ def describe_map(path: str) -> Description | None:
     if not is_map(path):
         return None
     voxel_map = load_map(path)
-    bounds, config = voxel_map.bounds(), voxel_map.config
+    bounds, config, kept = voxel_map.bounds(), voxel_map.config, voxel_map.kept_frames
     result = {
         "kind": "map",
         "voxel_size": voxel_map.voxel_size,
@@ -44,6 +44,7 @@ def describe_map(path: str) -> Description | None:
         "refused": dict(voxel_map.history.refused.most_common()),
         "settled": dict(voxel_map.history.settled),
         "ways": dict(voxel_map.history.ways),
+        "kept_frames": None if kept is None else {"frames": len(kept), "bytes": kept.bytes},
         "last_stamps_ns": {sensor: frame.stamp_ns for sensor, frame in voxel_map.history.trusted.items()},
         "profile": config.profile,
         "up": config.up,
@@ -114,6 +115,8 @@ def _lines(result: dict[str, Any]) -> list[str]:
     loaded = "in memory once loaded" + window
     frames = f"{result['frames']} frames ({result['frames_refused']} refused), " if of_frames else ""
     lines.append(f"{frames}{size(result['memory_bytes'])} {loaded}")
+    if kept := result["kept_frames"]:
+        lines.append(f"keeps {kept['frames']} of its frames, {size(kept['bytes'])}: poses can be corrected (remap)")
     for reason, number in result["refused"].items():
         lines.append(f"  {number} x {reason}")
     for reason, number in result["settled"].items():

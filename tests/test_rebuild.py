@@ -14,6 +14,7 @@ from stereovox.errors import FrameRefused, MapFileError, StereovoxError
 from stereovox.products.distance import DistanceField
 from stereovox.products.live_projection import LiveProjection
 from stereovox.products.projection import project
+from stereovox.rebuild import Rebuild
 from stereovox.se3 import rotation_matrix
 
 KITCHEN = Path(__file__).resolve().parents[2] / "shared/data/sevenscenes_redkitchen"
@@ -287,8 +288,6 @@ def test_frames_that_are_dropped_meanwhile_start_it_anew(monkeypatch):
     """With a budget, frames that come may push others out that were mapped again already."""
     frames = [frame for frame in made_frames(each=40) if not frame.fault]
     mapper = mapped(frames[:6], **{"map.frames_budget": "40 kB"})
-    from stereovox.rebuild import Rebuild
-
     catch_up, coming = Rebuild.catch_up, [frames[6:]]
 
     def meanwhile(self):
@@ -303,6 +302,25 @@ def test_frames_that_are_dropped_meanwhile_start_it_anew(monkeypatch):
     assert len(stamps) < len(frames)
     new = mapped([frame for frame in [*moved, *frames[6:]] if frame.stamp_ns in stamps])
     assert differing(mapper.map, new.map) == 0
+
+
+def test_frames_that_cannot_be_kept_meanwhile_start_it_anew(monkeypatch):
+    """A part made anew without a frame that came and was not kept would be of other frames than the rest."""
+    frames = [frame for frame in made_frames(each=40) if not frame.fault]
+    mapper = mapped(frames[:12])
+    mapper.map.kept_frames.spacing = 1e3  # as after many more frames
+    catch_up, coming = Rebuild.catch_up, [frames[12:]]
+
+    def meanwhile(self):
+        catch_up(self)
+        for frame in coming.pop() if coming else ():
+            mapper.add(frame)
+
+    monkeypatch.setattr(Rebuild, "catch_up", meanwhile)
+    moved, poses = shaken(frames[:12], 0, 0.2)
+    assert 0 < len(poses) < 4
+    assert not mapper.correct(poses).all_frames
+    assert differing(mapper.map, mapped(moved).map) == 0
 
 
 def test_nothing_to_do_does_nothing():

@@ -28,10 +28,10 @@ from stereovox.maps.blocks import CELLS, BlockPool
 from stereovox.maps.evidence import Evidence
 from stereovox.maps.kept_frames import KeptFrame, KeptFrames, blocks_seen
 from stereovox.maps.storage import Storage
-from stereovox.se3 import Transform, inverse
+from stereovox.se3 import Transform
 from stereovox.threads import Ahead
-from stereovox.trust.camera_path import CameraPath, Seen
-from stereovox.trust.history import History
+from stereovox.trust.camera_path import Seen
+from stereovox.trust.corrected import correct_history, matrix_of
 from stereovox.trust.validate import rigid_pose
 
 MANY = 1 / 3
@@ -190,8 +190,9 @@ class Rebuild:
 
     @property
     def outdated(self) -> bool:
-        """Whether frames that were mapped again are kept no longer, since others came."""
-        return self._kept.frames[: len(self._before)] != self._before
+        """Whether what was made is of no use, since of the frames that came not all could be kept."""
+        dropped = self._dirty is not None and not self._kept.are_all(self._storage.history.frames)
+        return dropped or self._kept.frames[: len(self._before)] != self._before
 
     def catch_up(self) -> None:
         """Map all frames again that are kept by now and were not."""
@@ -213,7 +214,8 @@ class Rebuild:
     def finish(self) -> CorrectionReport:
         """Put what was made into the map, tell its listeners and return what was done. The lock must be held."""
         changed, self._is_in_place = self._swap(), True
-        _correct_history(self._storage.history, self._before, self._after)
+        before, after = ([(frame.sensor, frame.seen) for frame in frames] for frames in (self._before, self._after))
+        correct_history(self._storage.history, before, after)
         self._kept.replace(self._after)
         blocks, none = np.empty((0, 3), np.int32), np.zeros(len(changed), np.int16)
         for listener in self._storage.listeners:
@@ -321,48 +323,10 @@ def _other_than(tiles: Path | None, storage: Storage) -> Path | None:
 
 
 def _viewpoint(frame: KeptFrame) -> Viewpoint:
-    return Viewpoint(frame.camera.middle, _matrix(frame.seen), frame.seen.stamp_ns)
-
-
-def _matrix(seen: Seen) -> Transform:
-    """Return T_world_sensor (4, 4)."""
-    return np.array([*seen.pose, 0, 0, 0, 1], float).reshape(4, 4)
+    return Viewpoint(frame.camera.middle, matrix_of(frame.seen), frame.seen.stamp_ns)
 
 
 def _is_in(blocks: BlockPool, coords: NDArray[np.int32]) -> NDArray[np.bool_]:
     places = np.empty(len(coords), np.int64)
     _pool.find_all(blocks.table, blocks.coords, np.ascontiguousarray(coords), places)
     return places >= 0
-
-
-def _correct_history(history: History, before: Sequence[KeptFrame], after: Sequence[KeptFrame]) -> None:
-    """Give a map's memory of its sensors the corrected poses, so that the next frames are compared with these.
-
-    What waited or was in doubt has seen the map before: it begins anew.
-    """
-    history.path = CameraPath()
-    for frame in after:
-        history.path.walk(frame.sensor, frame.seen)
-    last = {old.sensor: (old, new) for old, new in zip(before, after, strict=True)}
-    for sensor, (old, new) in last.items():
-        if new.seen != old.seen:
-            T_new_old = _matrix(new.seen) @ inverse(_matrix(old.seen))
-            _correct_sensor(history, sensor, T_new_old)
-            if (trusted := history.trusted.get(sensor)) is not None:  # a merged map trusts none so far
-                history.trusted[sensor] = _moved(trusted, old.seen, new.seen, T_new_old)
-
-
-def _correct_sensor(history: History, sensor: str, T_new_old: Transform) -> None:
-    history.waiting.pop(sensor, None)
-    history.doubts.pop(sensor, None)
-    if (look := history.looks.get(sensor)) is not None:
-        history.looks[sensor] = look._replace(pose=_turned(look.pose, T_new_old))
-
-
-def _moved(trusted: Seen, old: Seen, new: Seen, T_new_old: Transform) -> Seen:
-    """Return the last trusted pose of a sensor: that of its last kept frame, or moved as that was."""
-    return new if trusted == old else trusted._replace(pose=_turned(trusted.pose, T_new_old))
-
-
-def _turned(pose: tuple[float, ...], T_new_old: Transform) -> tuple[float, ...]:
-    return tuple((T_new_old @ _matrix(Seen(0, pose))).ravel().tolist()[:12])

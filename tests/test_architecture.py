@@ -41,6 +41,7 @@ HOMES = {
     "matplotlib": r"(view|viewer|report|lab)/.*",
     "nav_msgs": r"ros/.*",
     "numba": r"(.*/)?_[a-z]\w*\.py",
+    "numcodecs": r"maps/.*",
     "octomap": r"lab/.*",
     "octomap_msgs": r"ros/.*",
     "pydantic": r"config/.*",

@@ -24,7 +24,7 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 MAX_THREADS = 256
-CHANGING = ("_pool", "_times", "history")
+CHANGING = ("_pool", "_times", "history", "kept")
 """Attributes of a map that `add` changes in place."""
 
 

@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Frames that a map keeps: without loss, within their budget, and on disk as they were."""
 
+import copy
 import json
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -140,6 +142,16 @@ CAMERAS = [
     sv.SphericalCamera.from_field_of_view(80, 60, 100, 80, 0.1),
     sv.CylindricalCamera.from_field_of_view(80, 60, 100, 80, 0.1),
 ]
+
+
+def test_copies_and_pickles_of_a_map_have_frames_of_their_own():
+    mapper = mapped(wall_frame(0.01 * n, n) for n in range(3))
+    twin, pickled = copy.deepcopy(mapper.map), pickle.loads(pickle.dumps(mapper.map))
+    mapper.add(wall_frame(0.05, 5))
+    assert len(mapper.map.kept_frames) == 4
+    for one in (twin, pickled):
+        assert len(one.kept_frames) == 3
+        assert one.kept_frames.bytes == sum(frame.packed.content.size for frame in one.kept_frames.frames)
 
 
 def test_maps_of_floors_keep_none():

@@ -177,6 +177,10 @@ class KeptFrames:
     def __len__(self) -> int:
         return len(self._frames)
 
+    def __deepcopy__(self, memo: object) -> KeptFrames:
+        """Return an independent copy; the frames themselves never change."""
+        return KeptFrames(self.budget, self._frames, self.spacing)
+
     @property
     def frames(self) -> Sequence[KeptFrame]:
         """The kept frames; a copy of the list."""

@@ -41,9 +41,11 @@ MAPS = {
 }
 
 
-def made_frames(cameras=1, each=24):
+def made_frames(cameras=1, each=24, apart=0.0):
     """Frames of cameras that walk past things, in order of time; some are refused."""
     frames = [frame for n in range(cameras) for frame in frames_of(n, each)]
+    for n, frame in enumerate(frames):
+        frame.T_world_sensor[1, 3] += apart * (n // each)
     return sorted(frames, key=lambda frame: frame.stamp_ns)
 
 
@@ -136,19 +138,21 @@ def test_correcting_back_gives_the_first_map(room):
     assert differing(mapper.map, before) == 0
 
 
-def test_only_what_moved_frames_see_is_made_anew():
-    """Four cameras look away from each other: one frame of one of them does not touch what the others saw."""
-    frames = made_frames(cameras=4, each=10)
-    mapper = mapped(frames)
-    blocks = len(mapper.map.storage.blocks()[0])
-    last = [frame for frame in frames if frame.sensor == "camera 0" and not frame.fault][-1]
-    new = last.T_world_sensor.copy()
-    new[:3, 3] += 0.1
-    report = mapper.correct({last.stamp_ns: new})
-    assert report.moved == 1
-    assert report.mapped < mapper.map.frames
-    assert report.blocks < 0.7 * blocks
-    assert is_as_new(mapper, [replace(f, T_world_sensor=new) if f is last else f for f in frames])
+@pytest.mark.parametrize("kind", ["plain", "int8", "uint8", "times", "two threads", "ray", "sphere", "coarse pixels"])
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_only_what_moved_frames_see_is_made_anew(kind, seed):
+    """Of cameras in three places those of one place move: what the others saw stays as it is."""
+    frames = made_frames(cameras=3, each=16, apart=30.0)
+    mapper, heard = mapped(frames, **MAPS[kind]), []
+    mapper.map.listeners.append(heard.append)
+    some = [frame for frame in frames if frame.sensor == "camera 1"]
+    moved, poses = shaken(some, seed, 0.3)
+    report = mapper.correct(poses)
+    assert 0 < report.moved == len(poses) < report.mapped <= len(some)
+    assert len(heard[0].uniform) == report.blocks
+    assert (np.abs(0.8 * heard[0].uniform[:, 1] - 30) < 15).all()
+    others = {frame.stamp_ns: frame for frame in moved}
+    assert is_as_new(mapper, [others.get(frame.stamp_ns, frame) for frame in frames], **MAPS[kind])
 
 
 @pytest.mark.parametrize("kind", ["plain", "int8", "times", "tiles and times", "window"])
@@ -306,10 +310,10 @@ def test_frames_that_are_dropped_meanwhile_start_it_anew(monkeypatch):
 
 def test_frames_that_cannot_be_kept_meanwhile_start_it_anew(monkeypatch):
     """A part made anew without a frame that came and was not kept would be of other frames than the rest."""
-    frames = [frame for frame in made_frames(each=40) if not frame.fault]
-    mapper = mapped(frames[:12])
+    frames = [frame for frame in made_frames(cameras=3, each=20, apart=30.0) if not frame.fault]
+    mapper = mapped(frames[:30])
     mapper.map.kept_frames.spacing = 1e3  # as after many more frames
-    catch_up, coming = Rebuild.catch_up, [frames[12:]]
+    catch_up, coming = Rebuild.catch_up, [frames[30:]]
 
     def meanwhile(self):
         catch_up(self)
@@ -317,9 +321,11 @@ def test_frames_that_cannot_be_kept_meanwhile_start_it_anew(monkeypatch):
             mapper.add(frame)
 
     monkeypatch.setattr(Rebuild, "catch_up", meanwhile)
-    moved, poses = shaken(frames[:12], 0, 0.2)
-    assert 0 < len(poses) < 4
-    assert not mapper.correct(poses).all_frames
+    frame = frames[4]
+    T = frame.T_world_sensor.copy()
+    T[2, 3] += 0.1
+    assert not mapper.correct({frame.stamp_ns: T}).all_frames
+    moved = [replace(one, T_world_sensor=T) if one is frame else one for one in frames[:30]]
     assert differing(mapper.map, mapped(moved).map) == 0
 
 

@@ -3,8 +3,9 @@
 
 What a cell holds depends on the frames that see it, in their order, and on nothing else. So only blocks that a moved
 frame saw before, or sees now, are made anew, in a map of their own, from all kept frames that see them; then they take
-the place of the old ones. Bounded maps are made anew as a whole: where their window was, and what had room, depends on
-every pose. So is a map of which only some frames are kept: it then is what these frames make.
+the place of the old ones. Where nearly all frames do, the whole map is made anew without looking which. So are bounded
+maps: where their window was, and what had room, depends on every pose. So is a map of which only some frames are kept:
+it then is what these frames make.
 """
 
 from __future__ import annotations
@@ -34,8 +35,8 @@ from stereovox.trust.camera_path import Seen
 from stereovox.trust.corrected import correct_history, matrix_of
 from stereovox.trust.validate import rigid_pose
 
-MANY = 1 / 3
-"""Share of the frames that must move for the map to be made anew as a whole: their views cover most of it."""
+TO_LOOK = 2
+"""What it takes to find the blocks that a moved frame sees, before and after, in mappings of a frame."""
 FEW, ROUNDS = 2, 20
 """Frames that may be missing when those that come must wait, and most rounds until they must in any case."""
 FrameKey = int | tuple[str, int]
@@ -233,7 +234,16 @@ class Rebuild:
         storage, first = self._storage, self._before[0]
         partly_kept = not self._kept.are_all(storage.history.frames)
         starts_anew = storage.config.map.keep_times and (first.number in self._moved or not first.blocks.any())
-        return storage.bounded or partly_kept or starts_anew or len(self._moved) > MANY * len(self._before)
+        return storage.bounded or partly_kept or starts_anew or self._is_less_work()
+
+    def _is_less_work(self) -> bool:
+        """Return whether to map all frames again is likely less work than to find which must be."""
+        low, high = np.stack([frame.blocks for frame in self._before], axis=1)
+        near = np.zeros(len(low), bool)
+        for n, frame in enumerate(self._before):
+            if frame.number in self._moved:
+                near |= ((low < high[n]) & (low[n] < high)).all(axis=1)
+        return TO_LOOK * len(self._moved) + np.count_nonzero(near) >= len(near)
 
     def _seen_by_moved(self) -> BlockPool:
         """Return the blocks on which moved frames had evidence, or have it now."""

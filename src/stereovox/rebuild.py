@@ -243,7 +243,7 @@ class Rebuild:
         for n, frame in enumerate(self._before):
             if frame.number in self._moved:
                 near |= ((low < high[n]) & (low[n] < high)).all(axis=1)
-        return TO_LOOK * len(self._moved) + np.count_nonzero(near) >= len(near)
+        return TO_LOOK * len(self._moved) + int(np.count_nonzero(near)) >= len(near)
 
     def _seen_by_moved(self) -> BlockPool:
         """Return the blocks on which moved frames had evidence, or have it now."""

@@ -150,7 +150,7 @@ class KeptFrame:
     blocks: NDArray[np.int32]
 
     def frame(self) -> Frame:
-        """Return the frame as it was offered, with its present pose. Raises MapFileError where it cannot be read."""
+        """Return the frame, its photo left out, from its present pose. Raises MapFileError where it cannot be read."""
         depth, reason = self.packed.unpacked(self.camera)
         return Frame(
             depth, self.camera, self.T_world_sensor, self.stamp_ns, self.depth_scale, reason, self.name,

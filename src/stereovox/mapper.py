@@ -6,7 +6,7 @@ Read `Mapper.add` (voxel maps) or `GridMapper.add` (2-D grids) first: each step 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from time import monotonic_ns, perf_counter
 from typing import Any, Protocol, TypeVar
@@ -26,8 +26,7 @@ from stereovox.maps.evidence import Evidence
 from stereovox.maps.grid_map import GridMap
 from stereovox.maps.kept_frames import Packed, kept_frame
 from stereovox.maps.occupancy import OccupancyGrid
-from stereovox.rebuild import CorrectionReport, FrameKey, correct
-from stereovox.se3 import Transform
+from stereovox.rebuild import CorrectionReport, FramePoses, correct
 from stereovox.threads import MapLock
 from stereovox.trust.gate import Passed
 from stereovox.trust.health import Health
@@ -166,7 +165,7 @@ class Mapper:
             self._deadline.warm_up(frame, depth_frame.camera)
         return offer.report
 
-    def correct(self, poses: Mapping[FrameKey, Transform]) -> CorrectionReport:
+    def correct(self, poses: FramePoses) -> CorrectionReport:
         """Give frames of the map new poses, as after a loop closure; needs `map.keep_frames`.
 
         The map is then bit for bit the one that a new run makes of the same frames at these poses. Frames that were

@@ -41,6 +41,8 @@ FEW, ROUNDS = 2, 20
 """Frames that may be missing when those that come must wait, and most rounds until they must in any case."""
 FrameKey = int | tuple[str, int]
 """Names a frame: its stamp in nanoseconds, or sensor and stamp."""
+FramePoses = Mapping[int, Transform] | Mapping[tuple[str, int], Transform] | Mapping[FrameKey, Transform]
+"""Poses (4, 4) by frame."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +90,7 @@ class Level(Protocol):
 def correct(
     storage: Storage,
     level: Callable[[str], Level],
-    poses: Mapping[FrameKey, Transform],
+    poses: FramePoses,
     no_frame_comes: AbstractContextManager[object],
     tiles: Path | None,
 ) -> CorrectionReport:
@@ -120,19 +122,18 @@ def correct(
         raise
 
 
-def moved_frames(
-    frames: Sequence[KeptFrame], poses: Mapping[FrameKey, Transform], config: Config
-) -> tuple[dict[int, Transform], int]:
+def moved_frames(frames: Sequence[KeptFrame], poses: FramePoses, config: Config) -> tuple[dict[int, Transform], int]:
     """Return the new poses by number of the frame, and how many poses are of no frame that is kept.
 
     Poses that a frame already has are left out. Raises StereovoxError where none is of a kept frame, where several
     frames have a stamp that comes without its sensor, and for poses that are no rigid motions.
     """
+    given: dict[FrameKey, Transform] = {**poses}
     by_key: dict[FrameKey, list[KeptFrame]] = {}
     for frame in frames:
         by_key.setdefault(frame.stamp_ns, []).append(frame)
         by_key.setdefault((frame.sensor, frame.stamp_ns), []).append(frame)
-    named = {key: by_key[key] for key in poses if key in by_key}
+    named = {key: by_key[key] for key in given if key in by_key}
     if not named:
         first, last = frames[0].stamp_ns, frames[-1].stamp_ns
         raise StereovoxError(
@@ -145,10 +146,10 @@ def moved_frames(
             sensors = ", ".join(f"'{frame.sensor}'" for frame in found)
             raise StereovoxError(f"{len(found)} frames have the stamp {found[0].stamp_ns} ({sensors}); {cure}")
         frame = found[0]
-        posed = Frame(np.empty((0, 0), np.float32), frame.camera, poses[key], name=frame.name)
+        posed = Frame(np.empty((0, 0), np.float32), frame.camera, given[key], name=frame.name)
         rigid_pose(posed, config.pose_rigidity_tolerance)  # raises where it is none
-        if not np.array_equal(poses[key], frame.T_world_sensor):
-            moved[frame.number] = np.array(poses[key], float)
+        if not np.array_equal(given[key], frame.T_world_sensor):
+            moved[frame.number] = np.array(given[key], float)
     return moved, len(poses) - len(named)
 
 

@@ -128,7 +128,7 @@ def moved_frames(frames: Sequence[KeptFrame], poses: FramePoses, config: Config)
     Poses that a frame already has are left out. Raises StereovoxError where none is of a kept frame, where several
     frames have a stamp that comes without its sensor, and for poses that are no rigid motions.
     """
-    given: dict[FrameKey, Transform] = {**poses}
+    given: dict[FrameKey, Transform] = {key: pose for key, pose in poses.items()}  # noqa: C416 - a type checker refuses dict(poses)
     by_key: dict[FrameKey, list[KeptFrame]] = {}
     for frame in frames:
         by_key.setdefault(frame.stamp_ns, []).append(frame)

@@ -207,3 +207,17 @@ def test_somebody_who_comes_in_takes_the_camera_along_less_far_than_by_depth_alo
     worst = track(frames).errors()[:, 0].max()
     assert worst < 0.1
     assert track(alone).errors()[:, 0].max() > 2 * worst
+
+
+@pytest.mark.parametrize("strength", [20, 60])
+def test_a_projected_pattern_that_moves_with_the_camera_does_not_hold_it(strength):
+    """Where depth tells the pose, pictures that have never agreed with it while it moved do not contradict it."""
+    random = np.random.default_rng(1)
+    dots = strength * np.repeat(np.repeat(random.standard_normal((LENS.height // 4, LENS.width // 4)), 4, 0), 4, 1)
+    frames = [
+        replace(f, photo=replace(f.photo, pixels=np.clip(f.photo.pixels * 0.3 + 80 + dots, 0, 255).astype(np.uint8)))
+        for f in pictured(seen(BAYS, aside(20)), BAYS)
+    ]
+    found = track(frames)
+    assert len(found.tracked) > 15
+    assert np.all(found.errors()[:, 0] < 0.04)

@@ -34,6 +34,10 @@ FOLLOWED = 0.2
 """Share of the landmarks that must be found in an image: corners of noise are not."""
 LAG = 0.05
 """Share of a camera's motion since the image before by which it may have moved between a picture and the depth."""
+MOVED_M, MOVED_RAD = 0.005, np.radians(0.3)
+"""Motion from one image to the next that a picture must have seen for its agreement with the depth to count."""
+CREDIT, MOST_CREDIT = 5, 20
+"""Agreements without which pictures do not contradict depth, and how many are remembered."""
 MOST = 0.6
 """Share of them that must lie where they should for a pose that they agree on."""
 SMOOTH = 0.02
@@ -95,12 +99,13 @@ class Photos:
     def __init__(self) -> None:
         self.offered, self.left_out, self.why = 0, 0, ""
         self._landmarks: Landmarks | None = None
-        self._last = np.eye(4)
+        self._last, self._credit = np.eye(4), 0
         self._followed: Beside | None = None
 
     def forget(self) -> None:
         """Forget all that was learned."""
         self._landmarks = self._followed = None
+        self._credit = 0
 
     def see(
         self, photo: Photo | None, image: DepthImage, sigma_of: NDArray[np.float64], rows_per_metre: float
@@ -120,6 +125,22 @@ class Photos:
         """Return how many images could not be used and why, in words; "" where all could."""
         count = f"{self.left_out} of {self.offered} pictures beside depth images are not used"
         return f"{count}; the first: {self.why}" if self.left_out else ""
+
+    def agree(self, T: Transform) -> None:
+        """Take note that landmarks and depth say the same of T_map_sensor, which counts where the camera has moved."""
+        motion = motion_between(self._last, T)
+        if np.linalg.norm(motion[:3]) > MOVED_RAD or np.linalg.norm(motion[3:]) > MOVED_M:
+            self._credit = min(self._credit + 1, MOST_CREDIT)
+
+    def trusted(self) -> bool:
+        """Return whether landmarks may contradict depth, which costs them some trust: they agreed with it before.
+
+        A projected pattern, which moves with the camera, never did.
+        """
+        self._credit -= 1
+        trusted = self._credit >= CREDIT
+        self._credit = max(self._credit, 0)
+        return trusted
 
     def follow(self, seen: Sighted | None, expected: Transform, views: list[View]) -> Beside | None:
         """Return the landmarks found in an image near T_map_sensor, less those that stand where views saw free space;

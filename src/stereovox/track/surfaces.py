@@ -124,8 +124,10 @@ class Surfaces:
         held = turn < self.limits.unsure[0] and shift < self.limits.unsure[1]
         apart = contrary(T, seen.T_map_camera, covariance + seen.covariance)
         moved = not contrary(T, seen.T_map_camera, covariance + seen.covariance + beside.lag)
-        if held and apart and (moved or len(beside.found) < STRONG):
+        if held and apart and (moved or len(beside.found) < STRONG or not self._photos.trusted()):
             return alone
+        if held and not apart:
+            self._photos.agree(T)
         together = [Stage(both(level, beside.equations()), CONVERGED * level.size) for level in levels]
         if held and not apart:
             T, covariance = settled(together[-1:], expected, doubt, T)

@@ -219,6 +219,19 @@ def test_a_loaded_map_can_be_saved_elsewhere_and_gone_on_with(tmp_path):
         assert len(sv.load_map(tmp_path / name).kept_frames) == 4
 
 
+def test_a_loaded_map_is_saved_again_and_again_where_it_was(tmp_path):
+    mapped(wall_frame(0.01 * n, n) for n in range(3)).save(tmp_path / "m")
+    more = sv.Mapper("default", resume=sv.load_map(tmp_path / "m"), **KEEP)
+    copied = copy.deepcopy(more.map)
+    for n in range(3, 6):
+        assert more.add(wall_frame(0.01 * n, n)).refused is None
+        more.save(tmp_path / "m")
+    for whose in (more.map, copied, sv.load_map(tmp_path / "m")):
+        for n, frame in enumerate(whose.kept_frames.frames):
+            assert (frame.frame().depth == wall_frame(0.01 * n, n).depth).all()
+    assert len(list((tmp_path / "m").glob("frames-*"))) == 2
+
+
 def test_a_map_goes_on_only_as_its_frames_allow(tmp_path):
     mapper = mapped([wall_frame()])
     with pytest.raises(ConfigError, match="max_range"):

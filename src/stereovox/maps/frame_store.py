@@ -40,15 +40,25 @@ MAX_NAME = 4096
 
 def write_frames(folder: Path, kept: KeptFrames) -> dict[str, Any]:
     """Write frames into the folder of a map, and return what its manifest must say of them. Raises OSError."""
-    frames = kept.frames
-    packs = [frames[start : start + IN_A_PACK] for start in range(0, len(frames), IN_A_PACK)]
-    names = [_name("".join(frame.packed.digest for frame in pack).encode()) for pack in packs]
-    for name, pack in zip(names, packs, strict=True):
+    frames, packs = kept.frames, _packs(kept)
+    for name, pack in packs:
         if not _is_there(folder / name, pack):
             _write(folder, name, (frame.packed.content.read() for frame in pack))
     index = json.dumps(_index(kept.spacing, frames)).encode()
     _write(folder, _name(index), [index])
-    return {"index": _name(index), "packs": names, "frames": len(frames), "bytes": kept.bytes}
+    return {"index": _name(index), "packs": [name for name, _ in packs], "frames": len(frames), "bytes": kept.bytes}
+
+
+def move_frames(folder: Path, kept: KeptFrames) -> None:
+    """Tell frames that were read from this folder where they are now, before the files of an earlier save go."""
+    home = folder.resolve()
+    for name, pack in _packs(kept):
+        start = 0
+        for frame in pack:
+            content = frame.packed.content
+            if isinstance(content, InFile) and content.place[0].parent.resolve() == home:
+                content.place = folder / name, start
+            start += content.size
 
 
 def files_of_frames(saved: Any) -> set[str]:
@@ -73,6 +83,13 @@ def read_frames(folder: Path, saved: Any, budget: int | None) -> KeptFrames | No
         raise ValueError(f"kept frames: spacing {spacing}")
     cameras = [_camera_from(one) for one in index["cameras"]]
     return KeptFrames(budget, _frames_from([folder / name for name in names[1:]], index["frames"], cameras), spacing)
+
+
+def _packs(kept: KeptFrames) -> list[tuple[str, Sequence[KeptFrame]]]:
+    """Return the frames of each file and its name."""
+    frames = kept.frames
+    packs = [frames[start : start + IN_A_PACK] for start in range(0, len(frames), IN_A_PACK)]
+    return [(_name("".join(frame.packed.digest for frame in pack).encode()), pack) for pack in packs]
 
 
 def _name(content: bytes) -> str:
@@ -156,7 +173,7 @@ def _frame_from(saved: Any, cameras: Sequence[VirtualCamera], pack: Path, start:
         count_in(saved, "number"), str(saved["sensor"]), str(saved["name"]), int(saved["stamp_ns"]),
         np.array(_numbers(saved["T_world_sensor"])).reshape(4, 4), cameras[saved["camera"]],
         saved["quality"], float(saved["depth_scale"]), inf if saved["farthest"] is None else float(saved["farthest"]),
-        Packed(saved["dtype"], depth_bytes, InFile(pack, start, size, digest), digest),
+        Packed(saved["dtype"], depth_bytes, InFile((pack, start), size, digest), digest),
         Seen(int(stamp_ns), tuple(_numbers(pose))), blocks,
     )  # fmt: skip
 

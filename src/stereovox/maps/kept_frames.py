@@ -61,26 +61,35 @@ class InMemory(NamedTuple):
         return self.content
 
 
-class InFile(NamedTuple):
-    """Bytes in a file of a saved map, with their `digest_of`."""
+@dataclass(eq=False)
+class InFile:
+    """Bytes in a file of a saved map.
 
-    file: Path
-    start: int
+    Attributes:
+        place: The file and at which byte they begin; another one once the map was saved anew in its folder.
+        size: Number of bytes.
+        digest: Their `digest_of`.
+    """
+
+    place: tuple[Path, int]
     size: int
     digest: str
 
     def read(self) -> bytes:
         """Return the bytes. Raises MapFileError where they are gone or damaged."""
+        file, start = place = self.place
         try:
-            with self.file.open("rb") as file:
-                file.seek(self.start)
-                content = file.read(min(self.size, os.fstat(file.fileno()).st_size))
+            with file.open("rb") as opened:
+                opened.seek(start)
+                content = opened.read(min(self.size, os.fstat(opened.fileno()).st_size))
         except OSError as error:
+            if self.place != place:  # another thread has saved the map meanwhile
+                return self.read()
             raise MapFileError(
-                f"{self.file}: kept frames cannot be read ({error.strerror}); was the map saved anew? load it again"
+                f"{file}: kept frames cannot be read ({error.strerror}); was the map saved anew? load it again"
             ) from None
         if digest_of(content) != self.digest:
-            raise MapFileError(f"{self.file}: kept frames are damaged; make the map anew")
+            raise MapFileError(f"{file}: kept frames are damaged; make the map anew")
         return content
 
 

@@ -35,7 +35,7 @@ from stereovox.errors import MapFileError
 from stereovox.frame import Viewpoint
 from stereovox.maps.blocks import CELLS, SIDE
 from stereovox.maps.cell_format import FORMATS
-from stereovox.maps.frame_store import FRAME_FILES, files_of_frames, read_frames, write_frames
+from stereovox.maps.frame_store import FRAME_FILES, files_of_frames, move_frames, read_frames, write_frames
 from stereovox.maps.kept_frames import KeptFrames
 from stereovox.maps.lock import LOCK, only_writer_in
 from stereovox.maps.queries import INDEX_LIMIT
@@ -101,6 +101,8 @@ def save_map(storage: Storage, path: str | Path) -> None:
             raise MapFileError(
                 f"{folder}: cannot save the map ({error.strerror or error}); choose a writable folder that has room"
             ) from None
+        if storage.kept is not None:
+            move_frames(folder, storage.kept)
         sweep(folder)
 
 

@@ -9,7 +9,7 @@ import pytest
 from made_imu import SIDEWAYS, both, cluttered, imu_along, looking_round, tracker_with
 from made_tracks import STEP_NS, covered, seen, simulated, track
 
-from stereovox.se3 import rotation_matrix, rotation_vector
+from stereovox.se3 import inverse, rotation_matrix, rotation_vector
 from stereovox.sources.imu import ImuReadings
 from stereovox.track.tracker import LEVEL, Tracker
 
@@ -73,6 +73,15 @@ def test_a_wrong_imu_is_left_out_and_costs_nothing(wrong):
     assert "left out" in by.imu_use
     assert found.lost == without.lost
     assert np.all(found.errors()[-1] < without.errors()[-1] + (0.005, 0.1))
+
+
+def test_motions_that_are_given_now_and_then_do_not_speak_against_a_gyroscope():
+    taken = turning(1, 90.0)[:40]
+    by = tracker_with(taken, imu_along(taken))
+    for k, frame in enumerate(taken):
+        motion = inverse(taken[k - 1].T_world_sensor) @ frame.T_world_sensor if k % 3 and k > 3 else None
+        by.add(frame, motion)
+    assert by._gyroscope.trusted
 
 
 def test_an_imu_whose_clock_has_nothing_in_common_with_the_images_changes_nothing():

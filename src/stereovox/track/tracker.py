@@ -251,6 +251,8 @@ class Tracker:
         self._place(expected if contrary else fit.T_map_camera, fit.covariance)
         self._motion, self._trial = motion, 0
         self._stamps = [*self._stamps[1 - REMEMBERED :], stamp_ns]
+        if self._gyroscope is not None:
+            self._gyroscope.interrupt()  # its turn to this image is not among those that are compared
         if contrary:
             evidence.advance(seen, self._T)
             return self._lost(contrary)

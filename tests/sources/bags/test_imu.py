@@ -134,6 +134,15 @@ def test_an_imu_whose_mount_nothing_says_is_not_used(tmp_path):
         source.imu()
 
 
+def test_frames_without_a_name_are_not_the_same(tmp_path):
+    with BagWriter(tmp_path / "walk.bag") as made:
+        for frame in room(2):
+            made.depth(replace(frame, stamp_ns=START_NS + frame.stamp_ns), frame_id="")
+        both(made, frame_id="")
+    with pytest.raises(SourceError, match=r"nothing says how the IMU .* is mounted"):
+        open_images(tmp_path / "walk.bag").imu()
+
+
 def test_of_several_one_is_named(tmp_path):
     def write(made):
         both(made, "/imu", "imu_optical")

@@ -174,7 +174,8 @@ def _mount(file: BagFile, tf: Tf | None, frame_id: str, name: str, gyro: Topic) 
             return tf.lookup(frame_id, gyro.frame_id, int(gyro.stamps_ns[len(gyro.stamps_ns) // 2]))
         except FrameRefused:
             pass
-    if REALSENSE.fullmatch(name) or gyro.frame_id == frame_id or OPTICAL in gyro.frame_id:
+    same = gyro.frame_id != "" and gyro.frame_id == frame_id
+    if REALSENSE.fullmatch(name) or same or OPTICAL in gyro.frame_id:
         return np.eye(4)
     said = f"nothing says how the IMU of {name} ('{gyro.frame_id}') is mounted on the camera ('{frame_id}')"
     raise SourceError(f"{file.path}: {said}; record /tf_static, or add ?imu=off")

@@ -12,6 +12,7 @@ from stereovox import deadline
 from stereovox.errors import StereovoxError
 from stereovox.opening import Stream
 from stereovox.survey import level_start
+from stereovox.track.tracker import Tracker
 
 CELLS = {"voxel_size": 0.1}
 TRUE_START = room(1)[0].T_world_sensor
@@ -101,6 +102,15 @@ def test_a_run_that_was_stopped_goes_on_where_it_was(tmp_path, stop):
     assert [(span.first, span.last) for span in rest.lost] == [
         (max(span.first, stop), span.last) for span in whole.lost if span.last >= stop
     ]
+
+
+def test_what_could_not_be_used_is_told_when_a_run_goes_on_too(tmp_path, monkeypatch):
+    monkeypatch.setattr(Tracker, "complaint", lambda tracker: "no picture is used")
+    where, out = unposed(tmp_path / "a", 4), tmp_path / "m.svox"
+    with pytest.raises(KeyboardInterrupt):
+        mapped(where, out, observers=[Stop(2)])
+    _, lines = mapped(where, out, resume=True)
+    assert "note: no picture is used" in lines
 
 
 def test_a_map_goes_on_with_the_poses_it_was_begun_with(tmp_path):

@@ -269,8 +269,9 @@ class MapRun:
                     f"{self.source.name}: not one frame could be used, no map is written ({first_refusal(reports)})"
                 )
             self._checkpoints.save(frames_offered(self.mapper))
-        if isinstance(self.source, TrackedStream) and self.source.complaint():
-            self._notify(f"note: {self.source.complaint()}")
+        for tracker in self._trackers[-1:]:
+            if tracker.complaint():
+                self._notify(f"note: {tracker.complaint()}")
         return MapResult(
             self.mapper.map, self.out, reports, self.source.dropped,
             poses=self.poses, lost=self._lost.spans, believed=self._believed(), imu=self._imu_use(),

@@ -29,9 +29,6 @@ class Script:
         said = self._said.pop(0)
         return Tracked(T, np.eye(6), said, begins=said == BEGUN)
 
-    def complaint(self):
-        return "no picture is used" if self.seen else ""
-
 
 def followed(*said, frames=None):
     """Fault and x of each frame that comes out."""
@@ -134,10 +131,3 @@ def test_a_tracker_says_that_it_begins():
 def test_the_first_image_is_lost_for_the_reason_of_the_next():
     (_, first), *_ = follow(room(3), Script(BEGUN, DARK, ""))
     assert first.lost == DARK
-
-
-def test_a_stream_hands_on_what_its_tracker_could_not_use():
-    stream = TrackedStream(open_source(ROOM, ":2"), lambda: Script(BEGUN, ""))
-    assert stream.complaint() == ""
-    assert len(list(stream)) == 2
-    assert stream.complaint() == "no picture is used"

@@ -29,10 +29,6 @@ class AnyTracker(Protocol):
         """Return the pose of a frame."""
         ...
 
-    def complaint(self) -> str:
-        """Return what of the frames so far could not be used, in words; "" where nothing is amiss."""
-        ...
-
 
 class TrackedStream(Stream):
     """The frames of a recording or camera with tracked poses; where the camera is lost they have a fault.
@@ -54,7 +50,6 @@ class TrackedStream(Stream):
     def __init__(self, source: Stream, make: Callable[[], AnyTracker], how: str = "tracked", skip: int = 0):
         self.name, self.camera, self.notes = f"{source.name}, {how}", source.camera, tuple(source.notes)
         self._source, self._make, self._how, self._skip = source, make, how, skip
-        self._tracker: AnyTracker | None = None
 
     @property
     def length(self) -> int | None:
@@ -65,10 +60,6 @@ class TrackedStream(Stream):
     def dropped(self) -> int:
         """Frames that a live camera delivered and that were not consumed in time."""
         return self._source.dropped
-
-    def complaint(self) -> str:
-        """Return what of the frames so far the tracker could not use, in words; "" where nothing is amiss."""
-        return self._tracker.complaint() if self._tracker else ""
 
     def after(self, count: int) -> Stream:
         """Return the frames from number `count` on; those before are tracked again, to know where the camera is.
@@ -83,8 +74,7 @@ class TrackedStream(Stream):
         return TrackedStream(self._source, self._make, self._how, self._skip + count)
 
     def __iter__(self) -> Iterator[AnyFrame]:
-        self._tracker = self._make()
-        with closing(follow(self._source, self._tracker)) as found:
+        with closing(follow(self._source, self._make())) as found:
             yield from (frame for frame, _ in islice(found, self._skip, None))
 
 

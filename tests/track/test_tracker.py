@@ -12,7 +12,7 @@ from stereovox.errors import StereovoxError
 from stereovox.se3 import rotation_matrix
 from stereovox.simulate.scene import Scene, box, cylinder
 from stereovox.track.fit import Fit, Limits
-from stereovox.track.tracker import FOLLOWING, RETURNING, _doubt, _open
+from stereovox.track.tracker import FOLLOWING, FOUND, RETURNING, _doubt, _open
 
 METRES, DEGREES = 0.02, 0.5
 """Bounds of the errors of 25 images."""
@@ -29,6 +29,12 @@ def frames(scene, first=0, last=25, seed=0):
 def at_even_times(taken):
     """Return frames with stamps of an even rate."""
     return [replace(frame, stamp_ns=i * STEP_NS) for i, frame in enumerate(taken)]
+
+
+def test_a_clock_that_goes_back_does_not_say_that_a_loss_was_short():
+    taken, by = at_even_times(frames("room")[:8]), tracker(frames("room")[0].T_world_sensor)
+    track([*taken, replace(taken[-1], stamp_ns=0)], by)
+    assert by._back is FOUND
 
 
 @pytest.mark.parametrize("scene", ["apartment", "room"])

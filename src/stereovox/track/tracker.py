@@ -382,6 +382,8 @@ class Tracker:
         if not fits:
             return self._lose("not found again: it looks like nothing before")
         best = fits[0]
+        if stamp_ns < self._stamps[-1]:
+            self._near_ns = -1  # another clock, or a recording that begins again: nobody knows how long it took
         self._back = RETURNING if stamp_ns <= self._near_ns else FOUND
         why = _doubt(best, self._back) or _open(best, evidence.limits.unsure)
         rivals = (fit for fit in fits if fit.known * fit.usual > RIVAL * best.known * best.usual)

@@ -4,7 +4,8 @@
     python benchmarks/track.py RECORDING [RECORDING ...] [--frames A:B:S] [--peers] [--json] [setting=value ...]
 
 Peers, where they are installed (`pip install small_gicp kiss-icp`) and the recording has depth images: small_gicp's
-GICP of points on a Gaussian voxel map (points and voxels of 0.05 m, even motion as its start), and KISS-ICP as it is.
+GICP of points on a Gaussian voxel map (points and voxels of 0.05 m, even motion as its start), KISS-ICP as it is, and
+OpenCV's projective association from image to image (cv2).
 Errors are in metres, after rigid alignment (ATE) and without (off: the first poses laid on each other, at most).
 """
 
@@ -18,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from stereovox.cameras.pinhole import PinholeCamera
 from stereovox.config import load_config, parse_value
 from stereovox.errors import StereovoxError
 from stereovox.evaluate.trajectory_motions import angles_deg
@@ -80,7 +82,36 @@ def kiss_icp() -> Track:
     return track
 
 
-PEERS: dict[str, Callable[[], Track]] = {"small_gicp": small_gicp, "kiss_icp": kiss_icp}
+def projective() -> Track:
+    """Return OpenCV's projective association, point to plane, from image to image (OpenCV 5)."""
+    import cv2
+
+    state: dict[str, Any] = {"before": None, "T": np.eye(4), "odometry": None}
+
+    def track(frame: AnyFrame) -> NDArray[np.float64]:
+        assert isinstance(frame, Frame)
+        assert isinstance(frame.camera, PinholeCamera)
+        camera, depth = frame.camera, np.asarray(frame.depth * frame.depth_scale, np.float32)
+        depth[(frame.depth == 0) | (frame.depth == 65535)] = np.nan
+        if state["odometry"] is None:
+            settings = cv2.OdometrySettings()
+            K = [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]
+            settings.setCameraMatrix(np.array(K, np.float32))
+            settings.setMinDepth(0.3)
+            settings.setMaxDepth(5.0)
+            state["odometry"] = cv2.Odometry(cv2.OdometryType_DEPTH, settings, cv2.OdometryAlgoType_COMMON)
+        now = cv2.OdometryFrame(depth)
+        if state["before"] is not None:
+            state["odometry"].prepareFrames(now, state["before"])
+            found, motion = state["odometry"].compute(now, state["before"])
+            state["T"] = orthonormalise(state["T"] @ motion) if found else state["T"]
+        state["before"] = now
+        return state["T"]
+
+    return track
+
+
+PEERS: dict[str, Callable[[], Track]] = {"small_gicp": small_gicp, "kiss_icp": kiss_icp, "cv2": projective}
 
 
 def points_of(frame: AnyFrame) -> NDArray[np.float64]:

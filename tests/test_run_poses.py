@@ -105,7 +105,7 @@ def test_a_run_that_was_stopped_goes_on_where_it_was(tmp_path, stop):
 
 
 def test_what_could_not_be_used_is_told_when_a_run_goes_on_too(tmp_path, monkeypatch):
-    monkeypatch.setattr(Tracker, "complaint", lambda tracker: "no picture is used")
+    monkeypatch.setattr(Tracker, "picture_use", lambda tracker: "no picture is used")
     where, out = unposed(tmp_path / "a", 4), tmp_path / "m.svox"
     with pytest.raises(KeyboardInterrupt):
         mapped(where, out, observers=[Stop(2)])

@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from stereovox.maps import load_map as load_map
     from stereovox.maps.grid_map import GridMap as GridMap
     from stereovox.maps.occupancy import OccupancyGrid as OccupancyGrid
+    from stereovox.opening import open_images as open_images
     from stereovox.opening import open_source as open_source
     from stereovox.products.coarsen import coarsen as coarsen
     from stereovox.products.crop import crop as crop
@@ -112,6 +113,7 @@ _HOMES = {
     "MapResult": "run",
     "MapRun": "run",
     "map_recording": "run",
+    "open_images": "opening",
     "open_source": "opening",
     "ImuReadings": "sources.imu",
     "LiveImu": "sources.imu",

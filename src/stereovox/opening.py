@@ -127,9 +127,17 @@ def open_stream(path_or_name: str | os.PathLike[str], frames: str | None = None)
 
 
 def open_images(path_or_name: str | os.PathLike[str], frames: str | None = None) -> Stream:
-    """Open a source as `open_stream` does, but without poses where the recording can do without them.
+    """Open a source as `open_source` does, or a live camera, but without poses where it can do without them.
 
-    A folder of stamped images then needs no groundtruth.txt. Raises SourceError as `open_stream`.
+    Args:
+        path_or_name: As for `open_source`, or the name of a live camera (`realsense:`); needs no poses.
+        frames: Frames to keep, as a Python slice (`A:B:S`); None for all.
+
+    Returns:
+        The frames in time order; poses are NaN, or not to be used.
+
+    Raises:
+        SourceError: As for `open_source`.
     """
     where = os.fspath(path_or_name)
     if _live_class(where):

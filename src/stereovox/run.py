@@ -270,8 +270,8 @@ class MapRun:
                 )
             self._checkpoints.save(frames_offered(self.mapper))
         for tracker in self._trackers[-1:]:
-            if tracker.complaint():
-                self._notify(f"note: {tracker.complaint()}")
+            if tracker.picture_use():
+                self._notify(f"note: {tracker.picture_use()}")
         return MapResult(
             self.mapper.map, self.out, reports, self.source.dropped,
             poses=self.poses, lost=self._lost.spans, believed=self._believed(), imu=self._imu_use(),

@@ -193,8 +193,8 @@ def track_recording(
         if _save(run.track(), target):
             notify(f"stopped after {run.spans.frames} frames; their poses are saved in {target}")
         raise
-    if tracker.complaint():
-        notify(f"note: {tracker.complaint()}")
+    if tracker.picture_use():
+        notify(f"note: {tracker.picture_use()}")
     if tracker.imu_use:
         notify(f"note: {tracker.imu_use}")
     found = replace(run.track(), imu=tracker.imu_use)

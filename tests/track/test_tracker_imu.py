@@ -89,10 +89,8 @@ def test_an_imu_whose_clock_has_nothing_in_common_with_the_images_changes_nothin
     without, found, by = both(taken, imu_along(taken, clock_s=500.0))
     for one, other in zip(without.found, found.found, strict=True):
         np.testing.assert_array_equal(one.T_world_sensor, other.T_world_sensor)
-    assert (
-        by.imu_use
-        == "imu: not relied on: no turn to compare with that of the images; its accelerometer said not which way is up"
-    )
+    assert by.imu_use.startswith("imu: not relied on: no turn to compare with that of the images; ")
+    assert by.imu_use.endswith("its accelerometer did not tell which way is up")
 
 
 def test_one_that_is_right_is_said_to_be_used():
@@ -100,7 +98,7 @@ def test_one_that_is_right_is_said_to_be_used():
     found = tracker_with(taken, imu_along(taken, before_s=1.0))
     track(taken, found)
     assert "imu: turns of" in found.imu_use
-    assert found.imu_use.endswith("its accelerometer said which way is up")
+    assert found.imu_use.endswith("its accelerometer gave which way is up")
     assert Tracker().imu_use == ""
 
 

@@ -57,9 +57,9 @@ class GuidedTracker:
             return replace(tracked, lost=NO_START)
         return tracked.moved(self._T_world_tracker)
 
-    def complaint(self) -> str:
+    def picture_use(self) -> str:
         """Return what of the frames so far could not be used, in words; "" where nothing is amiss."""
-        return self._tracker.complaint()
+        return self._tracker.picture_use()
 
     def _begin(self, own: Transform | None) -> None:
         """Take the pose of the image that the tracker's map was begun with for where its world lies."""

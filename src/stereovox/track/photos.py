@@ -121,10 +121,12 @@ class Photos:
             self.left_out, self.why = self.left_out + 1, self.why or str(refused)
             return None
 
-    def complaint(self) -> str:
-        """Return how many images could not be used and why, in words; "" where all could."""
-        count = f"{self.left_out} of {self.offered} pictures beside depth images are not used"
-        return f"{count}; the first: {self.why}" if self.left_out else ""
+    def picture_use(self) -> str:
+        """Return how many images are used, or how many could not be and why, in words; "" where there is none."""
+        if self.left_out:
+            count = f"{self.left_out} of {self.offered} pictures beside depth images are not used"
+            return f"{count}; the first: {self.why}"
+        return f"{self.offered} pictures beside depth images are used" if self.offered else ""
 
     def agree(self, T: Transform) -> None:
         """Take note that landmarks and depth say the same of T_map_sensor, which counts where the camera has moved."""

@@ -90,9 +90,9 @@ class Surfaces:
         depths = np.arange(round(FARTHEST_M * ROWS_PER_METRE)) / ROWS_PER_METRE
         return FLOOR_M + BIAS * RangeNoise.of(self._config.noise, camera).sigma(depths)
 
-    def complaint(self) -> str:
+    def picture_use(self) -> str:
         """Return what of the frames so far could not be used, in words; "" where nothing is amiss."""
-        return self._photos.complaint()
+        return self._photos.picture_use()
 
     def forget(self) -> None:
         """Forget all that was learned."""

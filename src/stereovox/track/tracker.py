@@ -82,8 +82,8 @@ class Evidence(Protocol[Seen]):
         """Return what of a frame is used; raises FrameRefused where it cannot be."""
         ...
 
-    def complaint(self) -> str:
-        """Return what of the frames so far could not be used, in words; "" where nothing is amiss."""
+    def picture_use(self) -> str:
+        """Return what was made of the pictures beside depth images so far, in words; "" where there are none."""
         ...
 
     def forget(self) -> None:
@@ -195,8 +195,9 @@ class Tracker:
         """What was made of the IMU so far, in one line; "" without one."""
         if self._imu is None or self._gyroscope is None:
             return ""
-        up = "which way is up" if self._felt_up else "not which way is up"
-        return f"{self._imu.name}: {self._gyroscope.use}; its accelerometer said {up}"
+        up = "gave which way is up" if self._felt_up else "did not tell which way is up"
+        doubt = ", which may be as wrong" if self._felt_up and self._gyroscope.left_out else ""
+        return f"{self._imu.name}: {self._gyroscope.use}; its accelerometer {up}{doubt}"
 
     def add(self, frame: AnyFrame, motion: Transform | None = None) -> Tracked:
         """Return the pose of a frame. Frames come in the order they were taken.
@@ -234,9 +235,9 @@ class Tracker:
             return self._correct(self._evidence, seen, motion, frame.stamp_ns)
         return self._follow(self._evidence, seen, frame.stamp_ns)
 
-    def complaint(self) -> str:
-        """Return what of the frames so far could not be used, in words; "" where nothing is amiss."""
-        return self._evidence.complaint() if self._evidence else ""
+    def picture_use(self) -> str:
+        """Return what was made of the pictures beside depth images so far, in words; "" where there are none."""
+        return self._evidence.picture_use() if self._evidence else ""
 
     def _correct(self, evidence: Evidence[Seen], seen: Seen, motion: Transform, stamp_ns: int) -> Tracked:
         """Take the pose of an image that a given motion leads to, corrected by what is held in view."""

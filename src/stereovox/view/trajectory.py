@@ -101,7 +101,10 @@ def way_figure(positions: NDArray[np.float64], tracked: NDArray[np.bool_], headi
     at = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(known, axis=0), axis=1))])
     _in_pieces(charts["height"], np.column_stack([at, known[:, 2]]), spans, color=ESTIMATE)
     _shade(charts["height"], at, spans)
-    caption(charts["height"], "Height along the way", f"Red: {NO_POSE}.")
+    ends = (
+        "" if tracked[-1] else f" The last {len(tracked) - 1 - int(np.flatnonzero(tracked)[-1])} frames have no pose."
+    )
+    caption(charts["height"], "Height along the way", (f"Red: {NO_POSE}." if spans else "") + ends)
     labels(charts["height"], "metres travelled", "z [m]")
     return figure
 

@@ -98,7 +98,7 @@ class Subscriptions:
         tracked = options.poses == TRACK
         if kind is None and not (tracked or options.odometry or options.pose or options.fixed):
             raise StereovoxError(
-                f"no poses: /tf needs tf2_msgs. {TF2_MSGS}, or give --odometry, --pose or --poses track"
+                f"no poses: tf2_msgs is not installed. {TF2_MSGS}, or give --odometry, --pose or --poses track"
             )
         if kind is None:
             others = "mounts come from ros.fixed" if tracked else "poses come from ros.odometry, ros.pose and ros.fixed"

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Draw the pictures of docs/conventions.md and the one of the demo: python docs/make_pictures.py (about a minute)."""
+"""Draw the pictures of docs/conventions.md, of loops and of the demo: python docs/make_pictures.py (2 minutes)."""
 
 from __future__ import annotations
 
+from contextlib import chdir
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -25,21 +26,41 @@ OPTICAL = np.array([[0, -1, 0], [0, 0, -1], [1, 0, 0]], float)
 
 
 def main() -> None:
-    """Draw all three."""
+    """Draw all four."""
     demo()
+    loops()
     plt.rcParams.update({"font.size": 11, "text.color": INK, "svg.fonttype": "path", "svg.hashsalt": "stereovox"})
     save(frames(), "frames.svg")
     save(cells_and_pixels(), "cells.svg")
 
 
 def demo() -> None:
-    """Shrink the picture that `stereovox demo` makes; a palette fitted to it keeps the gradients in a small file."""
+    """Draw what `stereovox demo` does."""
     with TemporaryDirectory() as folder:
-        if stereovox(["demo", "--out", folder]):
-            raise SystemExit("stereovox demo failed")
-        picture = Image.open(Path(folder, "room.png")).convert("RGB")
+        run("demo", "--out", folder)
+        shrink(Path(folder, "room.png"), "demo.png")
+
+
+def loops() -> None:
+    """Draw what `stereovox loops --picture` does, as docs/corrections.md says it is made."""
+    with TemporaryDirectory() as folder, chdir(folder):
+        run("map", "sim:loop?drift=0.03&seed=1&image_width=96", *["--frames", "::2", "--set", "map.keep_frames=true"],
+            *["--voxel-size", "0.1", "--out", "loop.svox"])  # fmt: skip
+        run("loops", "loop.svox", "--picture", "loops.png")
+        shrink(Path("loops.png"), "loops.png")
+
+
+def run(*words: str) -> None:
+    """Run a command."""
+    if stereovox([*words]):
+        raise SystemExit(f"stereovox {' '.join(words)} failed")
+
+
+def shrink(file: Path, name: str) -> None:
+    """Save a smaller picture beside this file; a palette fitted to it keeps the gradients in a small file."""
+    picture = Image.open(file).convert("RGB")
     small = picture.resize((1280, round(1280 * picture.height / picture.width)), Image.Resampling.LANCZOS)
-    small.quantize(256, Image.Quantize.MEDIANCUT, kmeans=2).save(HERE / "demo.png", optimize=True)
+    small.quantize(256, Image.Quantize.MEDIANCUT, kmeans=2).save(HERE / name, optimize=True)
 
 
 def save(figure: plt.Figure, name: str) -> None:

@@ -87,6 +87,18 @@ def differing(a, b):
     return number
 
 
+def come_meanwhile(monkeypatch, mapper, frames):
+    """Let frames come while poses are corrected, once others have been mapped again."""
+    catch_up, coming = Rebuild.catch_up, [frames]
+
+    def meanwhile(self):
+        catch_up(self)
+        for frame in coming.pop() if coming else ():
+            mapper.add(frame)
+
+    monkeypatch.setattr(Rebuild, "catch_up", meanwhile)
+
+
 def is_as_new(corrected, frames, **settings):
     new = mapped(frames, **settings)
     assert sum(new.map.counts().values()) > 1000
@@ -262,11 +274,25 @@ def test_listeners_hear_what_changed():
     assert np.count_nonzero(grid.cells != -1) == np.count_nonzero(new.cells != -1)
 
 
-def test_a_distance_field_follows():
+def test_nothing_is_shown_any_longer_where_nothing_was_seen():
+    """Where all frames are moved far, blocks vanish."""
+    frames = made_frames()
+    mapper = mapped(frames)
+    live = LiveProjection(mapper.map, (0.0, 1.0))
+    live.grid()
+    far = np.eye(4)
+    far[:3, 3] = 3.0, 1.0, 0.0
+    mapper.correct({f.stamp_ns: far @ f.T_world_sensor for f in frames})
+    grid, new = live.grid(), project(mapper.map, (0.0, 1.0))
+    assert np.count_nonzero(grid.cells != -1) == np.count_nonzero(new.cells != -1) > 100
+
+
+@pytest.mark.parametrize("metres", [0.15, 2.0])
+def test_a_distance_field_follows(metres):
     frames = made_frames()
     mapper = mapped(frames)
     field = DistanceField(mapper.map, [-1, -2, -1], [3, 2, 1])
-    moved, poses = shaken(frames, 0, 0.1)
+    moved, poses = shaken(frames, 0, 0.1 if metres < 1 else 1.0, metres)
     mapper.correct(poses)
     assert field.update() > 0
     new = DistanceField(mapped(moved).map, [-1, -2, -1], [3, 2, 1])
@@ -292,14 +318,7 @@ def test_frames_that_are_dropped_meanwhile_start_it_anew(monkeypatch):
     """With a budget, frames that come may push others out that were mapped again already."""
     frames = [frame for frame in made_frames(each=40) if not frame.fault]
     mapper = mapped(frames[:6], **{"map.frames_budget": "40 kB"})
-    catch_up, coming = Rebuild.catch_up, [frames[6:]]
-
-    def meanwhile(self):
-        catch_up(self)
-        for frame in coming.pop() if coming else ():
-            mapper.add(frame)
-
-    monkeypatch.setattr(Rebuild, "catch_up", meanwhile)
+    come_meanwhile(monkeypatch, mapper, frames[6:])
     moved, poses = shaken(frames[:6], 0, 1.0)
     mapper.correct(poses)
     stamps = {frame.stamp_ns for frame in mapper.map.kept_frames.frames}
@@ -313,14 +332,7 @@ def test_frames_that_cannot_be_kept_meanwhile_start_it_anew(monkeypatch):
     frames = [frame for frame in made_frames(cameras=3, each=20, apart=30.0) if not frame.fault]
     mapper = mapped(frames[:30])
     mapper.map.kept_frames.spacing = 1e3  # as after many more frames
-    catch_up, coming = Rebuild.catch_up, [frames[30:]]
-
-    def meanwhile(self):
-        catch_up(self)
-        for frame in coming.pop() if coming else ():
-            mapper.add(frame)
-
-    monkeypatch.setattr(Rebuild, "catch_up", meanwhile)
+    come_meanwhile(monkeypatch, mapper, frames[30:])
     frame = frames[4]
     T = frame.T_world_sensor.copy()
     T[2, 3] += 0.1
@@ -369,6 +381,7 @@ def test_stamps_of_several_sensors_need_their_name():
     T = frame.T_world_sensor.copy()
     T[0, 3] += 0.1
     assert "name them (sensor, stamp)" in refused(mapper, {frame.stamp_ns: T})
+    assert "name them (sensor, stamp)" in refused(mapper, {np.int64(frame.stamp_ns): T})
     assert mapper.correct({(frame.sensor, frame.stamp_ns): T}).moved == 1
     moved = [replace(f, T_world_sensor=T) if f is frame else f for f in frames]
     assert is_as_new(mapper, moved)

@@ -11,9 +11,15 @@ if TYPE_CHECKING:
     from stereovox.cameras.rigs import StereoPair as StereoPair
     from stereovox.cameras.wide import CylindricalCamera as CylindricalCamera
     from stereovox.cameras.wide import SphericalCamera as SphericalCamera
+    from stereovox.closing import ClosedMap as ClosedMap
+    from stereovox.closing import LoopClosure as LoopClosure
+    from stereovox.closing import close_loops as close_loops
     from stereovox.config import Config as Config
     from stereovox.config import load_config as load_config
     from stereovox.contents import describe as describe
+    from stereovox.corrected_poses import CorrectedPoses as CorrectedPoses
+    from stereovox.corrected_poses import OdometryJumps as OdometryJumps
+    from stereovox.corrected_poses import poses_by_path as poses_by_path
     from stereovox.errors import StereovoxError as StereovoxError
     from stereovox.evaluate.trajectory_score import TrajectoryScore as TrajectoryScore
     from stereovox.evaluate.trajectory_score import score_trajectory as score_trajectory
@@ -28,6 +34,8 @@ if TYPE_CHECKING:
     from stereovox.frame import Reason as Reason
     from stereovox.frame import Scan as Scan
     from stereovox.frame import StereoFrame as StereoFrame
+    from stereovox.join import Joined as Joined
+    from stereovox.join import join as join
     from stereovox.join import merge as merge
     from stereovox.mapper import AnyMapper as AnyMapper
     from stereovox.mapper import GridMapper as GridMapper
@@ -56,11 +64,13 @@ if TYPE_CHECKING:
     from stereovox.sources.imu import ImuReadings as ImuReadings
     from stereovox.sources.imu import LiveImu as LiveImu
     from stereovox.sources.latest import Latest as Latest
+    from stereovox.sources.poses import Poses as Poses
     from stereovox.track.tracker import Tracked as Tracked
     from stereovox.track.tracker import Tracker as Tracker
     from stereovox.track_run import CameraTrack as CameraTrack
     from stereovox.track_run import track_recording as track_recording
     from stereovox.trust.health import Health as Health
+    from stereovox.view.loops import loops_picture as loops_picture
     from stereovox.view.trajectory import trajectory_picture as trajectory_picture
     from stereovox.viewer.live import LiveView as LiveView
     from stereovox.viewer.viewer import open_viewer as open_viewer
@@ -104,7 +114,16 @@ _HOMES = {
     "difference": "products.difference",
     "frontiers": "products.frontiers",
     "ground": "products.ground",
+    "Joined": "join",
+    "join": "join",
     "merge": "join",
+    "CorrectedPoses": "corrected_poses",
+    "OdometryJumps": "corrected_poses",
+    "poses_by_path": "corrected_poses",
+    "Poses": "sources.poses",
+    "ClosedMap": "closing",
+    "LoopClosure": "closing",
+    "close_loops": "closing",
     "Remapped": "remapping",
     "remap": "remapping",
     "surface": "formats.meshes",
@@ -122,6 +141,7 @@ _HOMES = {
     "Tracker": "track.tracker",
     "CameraTrack": "track_run",
     "track_recording": "track_run",
+    "loops_picture": "view.loops",
     "trajectory_picture": "view.trajectory",
     "open_viewer": "viewer.viewer",
     "LiveView": "viewer.live",

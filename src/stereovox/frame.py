@@ -93,6 +93,7 @@ class StereoFrame:
         fault_detail: As in `Frame`.
         sensor: As in `Frame`.
         pose_off_ns: As in `Frame`.
+        pose_sigma: As in `Frame`.
     """
 
     left: NDArray[np.uint8]
@@ -105,6 +106,7 @@ class StereoFrame:
     fault_detail: str = ""
     sensor: str = ""
     pose_off_ns: int = 0
+    pose_sigma: tuple[float, float] = (0.0, 0.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,6 +147,8 @@ class Frame:
         sensor: Which of several sensors took it (a topic, a name in a rig); each sensor's stamps are checked by
             themselves.
         pose_off_ns: How far the pose was extrapolated from the nearest measured one; 0: measured or interpolated.
+        pose_sigma: Standard deviations of the pose on what the frames before it saw, along the direction that is known
+            least: radians and metres; 0 where nobody says. Drift since the start is not in it. Loop closure uses it.
         farthest: Metres that are free at least where `reason` is TOO_FAR; a positive depth there says so for that
             pixel. Where this is less than the maximum range, the pixel counts as UNKNOWN.
         photo: An image that was taken at the same time, by which poses are tracked; maps do not need it.
@@ -163,6 +167,7 @@ class Frame:
     pose_off_ns: int = 0
     farthest: float = inf
     photo: Photo | None = None
+    pose_sigma: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
         if self.depth_scale is NOT_GIVEN and getattr(getattr(self.depth, "dtype", None), "kind", "") == "f":

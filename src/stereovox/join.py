@@ -5,13 +5,17 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from stereovox.config import Config
 from stereovox.deadline import Levels
+from stereovox.errors import StereovoxError
+from stereovox.localize.robot_track import Progress, no_progress
+from stereovox.loops.closer import LoopCloser
+from stereovox.loops.placing import placed
 from stereovox.maps import VoxelMap
 from stereovox.maps.kept_frames import KeptFrame, KeptFrames
 from stereovox.maps.storage import settings_of_frames
@@ -25,6 +29,72 @@ from stereovox.threads import one_state
 
 OF_WORLD = {"up", "up_direction", "levelled_from"}
 """Settings that may differ where a transform says how the worlds lie."""
+
+
+@dataclass(frozen=True, eq=False)
+class Joined:
+    """Result of `join`.
+
+    Attributes:
+        map: The map of the frames of both; it keeps them.
+        T_a_b: (4, 4) how the second map's world was found to lie in the first one's, before both were bent.
+        found: In how many places.
+        loops: Number of loops in both and between them that the poses now agree with.
+    """
+
+    map: VoxelMap
+    T_a_b: Transform
+    found: int
+    loops: int
+
+
+@one_state
+def join(a: VoxelMap, b: VoxelMap, progress: Progress = no_progress) -> Joined:
+    """Find where a second map lies in the first by what both saw, and make one map of both.
+
+    The ways of both cameras become one pose graph, in which loops are closed and all that sees the same is laid onto
+    each other; then all frames are mapped at the poses that this gives, in the order of their stamps. The first frame
+    of `a` stays where it is.
+
+    Args:
+        a: A map that kept all its frames, whose settings the result has.
+        b: Another one, made with the same settings; its world may lie anywhere, with the same way up.
+        progress: Called with how many are done, how many there are, and the current step.
+
+    Returns:
+        The map, and how they lie.
+
+    Raises:
+        StereovoxError: Frames were not kept, settings differ, or where the second map lies cannot be found for sure.
+        MissingExtra: gtsam is not installed.
+    """
+    check_alike(a, b, np.eye(4))
+    why = why_added(a, b, np.eye(4))
+    if why is not None or a.kept_frames is None or b.kept_frames is None:
+        raise StereovoxError(f"where one map lies in the other can be found only by frames, and {why}")
+    closers = [_closed(one, words, progress) for one, words in ((a, "first"), (b, "second"))]
+    first, second = closers
+    place = placed(first, second, lambda done, total: progress(done, total, "finding the second map in the first"))
+    count = len(first.submaps)
+    first.join(second, place.T_first_second, place.loops)
+    first.finish(lambda done, total: progress(done, total, "laying places onto each other"))
+    poses = [first.corrected(slice(0, count)), first.corrected(slice(count, None))]
+    frames = [
+        [replace(frame, T_world_sensor=found[frame.sensor, frame.stamp_ns]) for frame in kept.frames]
+        for kept, found in zip((a.kept_frames, b.kept_frames), poses, strict=True)
+    ]
+    return Joined(_of_frames(a, b, *frames), place.T_first_second, len(place.loops), len(first.loops))
+
+
+def _closed(one: VoxelMap, words: str, progress: Progress) -> LoopCloser:
+    """Return all of a recording, its loops closed."""
+    assert one.kept_frames is not None
+    closer, frames = LoopCloser(one.config), one.kept_frames.frames
+    for done, frame in enumerate(frames, 1):
+        closer.add(frame)
+        progress(done, len(frames), f"looking for loops in the {words} map")
+    closer.finish()
+    return closer
 
 
 @one_state
@@ -90,7 +160,12 @@ def _by_frames(a: VoxelMap, b: VoxelMap, T_a_b: Transform) -> VoxelMap:
     theirs = b.kept_frames.frames
     if not np.array_equal(T_a_b, np.eye(4)):
         theirs = [replace(frame, T_world_sensor=T_a_b @ frame.T_world_sensor) for frame in theirs]
-    frames = [replace(frame, number=n) for n, frame in enumerate(_in_order(a.kept_frames.frames, theirs))]
+    return _of_frames(a, b, a.kept_frames.frames, theirs)
+
+
+def _of_frames(a: VoxelMap, b: VoxelMap, ours: Sequence[KeptFrame], theirs: Sequence[KeptFrame]) -> VoxelMap:
+    """Return the map of the frames of both, at the poses given here."""
+    frames = [replace(frame, number=n) for n, frame in enumerate(_in_order(ours, theirs))]
     merged = VoxelMap(a.config)
     merged.history = together(a.history, b.history)
     merged.storage.kept = KeptFrames(a.config.map.frames_budget, frames)

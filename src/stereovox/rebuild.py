@@ -39,6 +39,8 @@ TO_LOOK = 2
 """What it takes to find the blocks that a moved frame sees, before and after, in mappings of a frame."""
 FEW, ROUNDS = 2, 20
 """Frames that may be missing when those that come must wait, and most rounds until they must in any case."""
+CORRECTED = ", poses corrected"
+"""Behind the name of the recording that a map was made of: its next frames do not have poses that fit."""
 FrameKey = int | tuple[str, int]
 """Names a frame: its stamp in nanoseconds, or sensor and stamp."""
 FramePoses = Mapping[int, Transform] | Mapping[tuple[str, int], Transform] | Mapping[FrameKey, Transform]
@@ -96,8 +98,9 @@ def correct(
 ) -> CorrectionReport:
     """Give frames of a map new poses; what is said in `Mapper.correct` holds.
 
-    level: returns the quality level of a name; used by this thread alone. no_frame_comes: entered while the result is
-    put into the map; before, the map may take in frames. tiles: as in `make_map`.
+    level: returns the quality level of a name; called by this thread, and by another one that prepares frames ahead.
+    no_frame_comes: entered while the result is put into the map; before, the map may take in frames. tiles: as in
+    `make_map`.
     """
     if storage.kept is None or not len(storage.kept):
         raise StereovoxError(
@@ -142,7 +145,7 @@ def moved_frames(frames: Sequence[KeptFrame], poses: FramePoses, config: Config)
     moved: dict[int, Transform] = {}
     for key, found in named.items():
         if len(found) > 1:
-            cure = "name them (sensor, stamp)" if isinstance(key, int) else "only maps without such can be corrected"
+            cure = "only maps without such can be corrected" if isinstance(key, tuple) else "name them (sensor, stamp)"
             sensors = ", ".join(f"'{frame.sensor}'" for frame in found)
             raise StereovoxError(f"{len(found)} frames have the stamp {found[0].stamp_ns} ({sensors}); {cure}")
         frame = found[0]

@@ -20,11 +20,13 @@ from time import monotonic
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
 
+from stereovox.closing import LoopClosure, close
 from stereovox.config import Config, load_config
 from stereovox.device import on_usable_device
 from stereovox.errors import MapFileError, SourceError, StereovoxError, one_line
 from stereovox.evaluate.summary import summarise
 from stereovox.frame import UpdateReport
+from stereovox.localize.robot_track import Progress, no_progress
 from stereovox.localize.track import Track
 from stereovox.mapper import AnyMapper, Mapper
 from stereovox.maps import VoxelMap, load_map
@@ -33,8 +35,10 @@ from stereovox.maps.lock import only_writer_in
 from stereovox.maps.store import check_target, is_map, read_manifest, remove_map, sweep
 from stereovox.opening import Stream
 from stereovox.pose_choice import BOTH, GIVEN, HOW, TRACK, choose_poses, poses_of
+from stereovox.pose_graph import need_gtsam
 from stereovox.products.floor_axes import upright_axes
 from stereovox.products.moved import level_transform
+from stereovox.rebuild import CORRECTED
 from stereovox.safe_io import check_in_space
 from stereovox.sources.camera_file import with_camera
 from stereovox.sources.turned import Turned
@@ -90,6 +94,7 @@ class MapResult(Generic[MapT]):
         believed: Of poses `both`, the number of frames in which nothing known was in view, so that the recording's own
             motion was taken as it is.
         imu: What was made of the IMU of a camera that was tracked, in words; "" without one.
+        loops: Which loops were closed; None where none were sought.
     """
 
     map: MapT
@@ -102,6 +107,7 @@ class MapResult(Generic[MapT]):
     lost: Sequence[LostSpan] = ()
     believed: int = 0
     imu: str = ""
+    loops: LoopClosure | None = None
 
     def _repr_html_(self) -> str:
         """Return what a notebook shows: the map's picture and facts."""
@@ -121,6 +127,8 @@ class MapResult(Generic[MapT]):
             summary["believed"] = self.believed
         if self.imu:
             summary["imu"] = self.imu
+        if self.loops is not None:
+            summary |= self.loops.summary()
         return {**summary, "poses": self.poses}
 
 
@@ -134,6 +142,7 @@ def map_recording(
     camera: str | Path | None = None,
     level: bool = False,
     poses: str | None = None,
+    close_loops: bool = False,
     checkpoint_s: float = CHECKPOINT_S,
     observers: Sequence[Observer] = (),
     notify: Callable[[str], None] = lambda line: None,
@@ -157,6 +166,8 @@ def map_recording(
             begins at its first one; frames in which it is lost are refused (`tracking_lost`). `both`: the camera
             moves from frame to frame as the recording says, corrected by what the images show. None: given where there
             are any, else tracked, which is passed to `notify`; with `resume` as the map was begun.
+        close_loops: Keep the frames, and at the end bend the camera's way so that what it saw again is one; see the
+            function of that name.
         checkpoint_s: Seconds between two saves; 0: save only at the end.
         observers: Called after each frame.
         notify: Called with each line that a user should see: assumptions about the source, where a run resumes.
@@ -171,7 +182,8 @@ def map_recording(
         KeyboardInterrupt: Ctrl-C, SIGTERM or SIGHUP, raised between two frames after saving the map.
     """
     settings = {"profile": profile, "resume": resume, "frames": frames, "camera": camera, "level": level}
-    with MapRun(source, out, **settings, poses=poses, checkpoint_s=checkpoint_s, notify=notify, **overrides) as run:
+    settings |= {"poses": poses, "close_loops": close_loops, "checkpoint_s": checkpoint_s}
+    with MapRun(source, out, **settings, notify=notify, **overrides) as run:
         return run.finish(observers)
 
 
@@ -208,6 +220,7 @@ class MapRun:
         camera: str | Path | None = None,
         level: bool = False,
         poses: str | None = None,
+        close_loops: bool = False,
         checkpoint_s: float = CHECKPOINT_S,
         notify: Callable[[str], None] = lambda line: None,
         **overrides: Any,
@@ -217,9 +230,14 @@ class MapRun:
         self._profile, self._resume, self._overrides = profile, resume, overrides
         self._notify, self._open = notify, ExitStack()
         self._checkpoint_s, self._level, self._poses = checkpoint_s, level, poses
+        self._close_loops = close_loops
+        if close_loops:
+            self._overrides = {**overrides, "map.keep_frames": True}
 
     def __enter__(self) -> MapRun:
         with ExitStack() as stack:
+            if self._close_loops:
+                need_gtsam()
             check_in_space(self.out)
             check_target(self.out)
             if self._resume and not is_map(self.out):
@@ -227,6 +245,10 @@ class MapRun:
             stack.enter_context(only_writer_in(self.out))
             sweep(self.out)
             saved = load_map(self.out) if self._resume else None
+            if saved is not None and saved.recording.endswith(CORRECTED):
+                raise StereovoxError(
+                    f"{self.out}: its poses were corrected, so the next frames do not fit; begin a new map"
+                )
             suggested, lines = self._prepare(saved)
             self.mapper = self._make_mapper(saved, suggested)
             stack.callback(self.mapper.map.close)
@@ -248,11 +270,12 @@ class MapRun:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         self._open.close()
 
-    def finish(self, observers: Sequence[Observer] = ()) -> MapResult[VoxelMap]:
+    def finish(self, observers: Sequence[Observer] = (), closing: Progress = no_progress) -> MapResult[VoxelMap]:
         """Map all remaining frames and save the map.
 
         Args:
             observers: Called after each frame.
+            closing: Called while loops are sought: with how many are done, how many there are, and the current step.
 
         Returns:
             The map and the report of each frame of this run.
@@ -269,12 +292,13 @@ class MapRun:
                     f"{self.source.name}: not one frame could be used, no map is written ({first_refusal(reports)})"
                 )
             self._checkpoints.save(frames_offered(self.mapper))
+            closure = self._closure(check, closing)
         for tracker in self._trackers[-1:]:
             if tracker.picture_use():
                 self._notify(f"note: {tracker.picture_use()}")
         return MapResult(
             self.mapper.map, self.out, reports, self.source.dropped,
-            poses=self.poses, lost=self._lost.spans, believed=self._believed(), imu=self._imu_use(),
+            poses=self.poses, lost=self._lost.spans, believed=self._believed(), imu=self._imu_use(), loops=closure,
         )  # fmt: skip
 
     @property
@@ -352,6 +376,20 @@ class MapRun:
         tiles = self.out.parent / f".{self.out.name}-tiles"  # beside the map, not in a temporary folder in memory
         config = load_config(settings, **{**self._overrides, **suggested})
         return Mapper(on_usable_device(config, self._notify), resume=saved, tiles=tiles)
+
+    def _closure(self, check: Callable[[], None], progress: Progress) -> LoopClosure | None:
+        """Close the loops of the map, if that is wanted, and save it again."""
+        if not self._close_loops:
+            return None
+
+        def tell(done: int, total: int, doing: str) -> None:
+            check()
+            progress(done, total, doing)
+
+        closure = close(self.mapper, tell)
+        if closure.loops:
+            self._checkpoints.save(frames_offered(self.mapper))
+        return closure
 
     def _believed(self) -> int:
         return sum(tracker.believed for tracker in self._trackers[-1:] if isinstance(tracker, GuidedTracker))

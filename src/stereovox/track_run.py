@@ -27,14 +27,13 @@ from stereovox.se3 import Transform
 from stereovox.sources.base import Stream, pose_reader
 from stereovox.sources.camera_file import with_camera
 from stereovox.sources.poses import Poses
-from stereovox.sources.trajectory import write_trajectory
+from stereovox.sources.trajectory import TRAJECTORY_ENDINGS, write_trajectory
 from stereovox.survey import level_start, survey
 from stereovox.track.inertial import imu_and_note
 from stereovox.track.spans import LostSpan, LostSpans
 from stereovox.track.stream import LOST, follow
 from stereovox.track.tracker import Tracked, Tracker
 
-ENDINGS = (".tum", ".txt")
 DOING = "tracking"
 
 
@@ -174,7 +173,7 @@ def track_recording(
         StereovoxError: One line: invalid source, settings or file, or not one frame could be tracked.
         KeyboardInterrupt: Ctrl-C, SIGTERM or SIGHUP, raised between two frames after writing what was tracked so far.
     """
-    target = None if out is None else check_file(str(out), ENDINGS)
+    target = None if out is None else check_file(str(out), TRAJECTORY_ENDINGS)
     stream = choose_poses(source, frames, TRACK).source
     stream = stream if camera is None else with_camera(stream, str(camera))
     config, lines = _settings(stream, profile, overrides)

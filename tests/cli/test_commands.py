@@ -182,7 +182,7 @@ MISTAKES = [
     ("no map to go on with", ["map", "{rec}", "--out", "{tmp}/m", "--resume"]),
     ("did you mean '--threads'", ["map", "{rec}", "--out", "{tmp}/m", "--thread", "2"]),
     (
-        "unknown option '--zebra' (known: --camera, --checkpoint, --device, --frames",
+        "unknown option '--zebra' (known: --camera, --checkpoint, --close-loops, --device, --frames",
         ["map", "{rec}", "--out", "{tmp}/m", "--zebra"],
     ),
     ("'extra' is one argument too many", ["map", "{rec}", "extra", "--out", "{tmp}/m"]),

@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """remap, and merge of maps that kept their frames: what they write and say, and how they refuse."""
 
-import json
-
 import numpy as np
 import pytest
 
@@ -30,20 +28,21 @@ def maps(tmp_path_factory):
     return folder
 
 
-@pytest.fixture
-def told(capsys):
-    def run(*words):
-        status = main([*map(str, words), "--json"])
-        out, err = capsys.readouterr()
-        assert status == 0, err
-        return json.loads(out.splitlines()[-1]), err
+def test_map_and_info_tell_of_kept_frames(tmp_path, told_with_notes, capsys):
+    """The same line, with their number and size; nothing where none are kept."""
+    out, line = tmp_path / "m.svox", "keeps 8 of its frames, "
+    words = ["map", "sim:room?image_width=96", "--frames", ":8", "--voxel-size", 0.2, "--out", out]
+    assert "keeps" not in told_with_notes(*words)[1]
+    _, said = told_with_notes(*words, "--set", "map.keep_frames=true")
+    assert main(["info", str(out)]) == 0
+    shown = "".join(capsys.readouterr())
+    (kept,) = (one for one in said.splitlines() if line in one)
+    assert kept in shown
 
-    return run
 
-
-def test_remap(maps, tmp_path, told, monkeypatch):
+def test_remap(maps, tmp_path, told_with_notes, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    result, said = told("remap", maps / "a.svox", "--poses", maps / "all.tum")
+    result, said = told_with_notes("remap", maps / "a.svox", "--poses", maps / "all.tum")
     assert (result["moved"], result["posed"], result["between"], result["outside"]) == (4, 4, 0, 0)
     assert result["out"] == "a-corrected.svox"
     before, after = sv.load_map(maps / "a.svox"), sv.load_map(tmp_path / "a-corrected.svox")
@@ -53,8 +52,8 @@ def test_remap(maps, tmp_path, told, monkeypatch):
     assert "stayed" not in said
 
 
-def test_remap_tells_of_frames_without_a_pose(maps, tmp_path, told):
-    result, said = told("remap", maps / "a.svox", "--poses", maps / "two.tum", "--out", tmp_path / "n.svox")
+def test_remap_tells_of_frames_without_a_pose(maps, tmp_path, told_with_notes):
+    result, said = told_with_notes("remap", maps / "a.svox", "--poses", maps / "two.tum", "--out", tmp_path / "n.svox")
     assert (result["posed"], result["between"], result["outside"]) == (2, 1, 1)
     assert "1 frames before the first or after the last of them stayed where they were" in said
 
@@ -78,11 +77,29 @@ def test_remap_refuses_in_one_line(maps, capsys, monkeypatch, words, said):
     assert not (maps / "no.svox").exists()
 
 
-def test_merge_says_whether_it_is_exact(maps, tmp_path, told):
-    result, said = told("merge", maps / "a.svox", maps / "b.svox", "--out", tmp_path / "both.svox")
+def test_merge_says_whether_it_is_exact(maps, tmp_path, told_with_notes):
+    result, said = told_with_notes("merge", maps / "a.svox", maps / "b.svox", "--out", tmp_path / "both.svox")
     assert result["exact"] is True
     assert "added up" not in said
     assert len(sv.load_map(tmp_path / "both.svox").kept_frames) == 8
-    result, said = told("merge", maps / "a.svox", maps / "bare.svox", "--out", tmp_path / "added.svox")
+    result, said = told_with_notes("merge", maps / "a.svox", maps / "bare.svox", "--out", tmp_path / "added.svox")
     assert result["exact"] is False
     assert "evidence is added up, since a map did not keep its frames" in said
+
+
+def test_loops_draws_what_it_did(maps, tmp_path, told_with_notes, capsys):
+    """Few frames hold no loop; the picture and the map say so."""
+    out, picture = tmp_path / "closed.svox", tmp_path / "loops.png"
+    result, said = told_with_notes("loops", maps / "a.svox", "--out", out, "--picture", picture)
+    assert result["loops"] == 0
+    assert f"saved {picture}" in said
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    assert main(["info", str(out)]) == 0
+    assert "loops: 0 closed, 0 refused" in "".join(capsys.readouterr())
+
+
+@pytest.mark.parametrize("name", ["loops.gif", "nowhere/loops.png"])
+def test_loops_refuses_a_picture_that_cannot_be_before_any_work(maps, tmp_path, capsys, name):
+    assert main(["loops", str(maps / "a.svox"), "--out", str(tmp_path / "c"), "--picture", str(tmp_path / name)]) == 2
+    assert name in capsys.readouterr().err
+    assert not (tmp_path / "c").exists()

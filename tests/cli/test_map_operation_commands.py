@@ -1,8 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """crop, merge, diff, coarsen, frontiers, ground: what they write and say, and how they refuse."""
 
-import json
-
 import numpy as np
 import pytest
 from made_maps import random_map, table
@@ -26,17 +24,6 @@ def maps(tmp_path_factory):
         folder / "floor.svox"
     )
     return folder
-
-
-@pytest.fixture
-def told(capsys):
-    def run(*words):
-        status = main([*map(str, words), "--json"])
-        out, err = capsys.readouterr()
-        assert status == 0, err
-        return json.loads(out.splitlines()[-1])
-
-    return run
 
 
 @pytest.fixture

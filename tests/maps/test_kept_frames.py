@@ -30,7 +30,7 @@ def kept(number, x=0.0, sensor="camera", size=(9, 12), camera=CAMERA):
     seen = Seen(number, tuple(T.ravel().tolist()[:12]))
     blocks = np.array([[0, 0, 0], [1, 2, 3]], np.int32)
     return KeptFrame(
-        number, sensor, frame.name, number, T, camera, "full", 0.001, np.inf, Packed.of(frame), seen, blocks
+        number, sensor, frame.name, number, T, camera, "full", (0.0, 0.0), 0.001, np.inf, Packed.of(frame), seen, blocks
     )
 
 
@@ -172,15 +172,20 @@ def same(a, b):
         b.number, b.sensor, b.name, b.stamp_ns, b.camera, b.quality,
     )  # fmt: skip
     assert (a.depth_scale, a.farthest, a.seen, a.packed.digest) == (b.depth_scale, b.farthest, b.seen, b.packed.digest)
+    assert a.pose_sigma == b.pose_sigma
     assert np.array_equal(a.T_world_sensor, b.T_world_sensor)
     assert np.array_equal(a.blocks, b.blocks)
     assert a.packed.unpacked(a.camera)[0].tobytes() == b.packed.unpacked(b.camera)[0].tobytes()
 
 
 def test_a_saved_map_brings_its_frames_back(tmp_path):
-    frames = [wall_frame(0.1 * n, n, camera, name=f"f{n}", sensor=f"eye {n}") for n, camera in enumerate(CAMERAS)]
+    frames = [
+        wall_frame(0.1 * n, n, camera, name=f"f{n}", sensor=f"eye {n}", pose_sigma=(0.001 * n, 0.01))
+        for n, camera in enumerate(CAMERAS)
+    ]
     mapper = mapped(frames, integrator="ray")
     mapper.save(tmp_path / "m")
+    assert [frame.frame().pose_sigma for frame in mapper.map.kept_frames.frames] == [f.pose_sigma for f in frames]
     loaded = sv.load_map(tmp_path / "m").kept_frames
     assert len(loaded) == 3
     for before, after in zip(mapper.map.kept_frames.frames, loaded.frames, strict=True):
@@ -278,6 +283,8 @@ def put_index(folder, index):
         lambda index: index["frames"][1].update(T_world_sensor=[float("nan")] * 16),
         lambda index: index["frames"][1].update(T_world_sensor=[0.0] * 12),
         lambda index: index["frames"][1].update(blocks=[[0, 0]]),
+        lambda index: index["frames"][1].update(pose_sigma=[0.1]),
+        lambda index: index["frames"][1].update(pose_sigma=[0.1, float("inf")]),
         lambda index: index["frames"][1].pop("seen"),
         lambda index: index["cameras"][0].update(width=10**9),
         lambda index: index["cameras"][0].update(kind="box"),

@@ -14,7 +14,8 @@ from made_walks import CAMERA, DEPTH, OPTICAL, START_NS, T_BASE_CAMERA, base_at,
 rclpy = pytest.importorskip("rclpy", reason="rclpy is not installed: pip install 'stereovox[ros2]'")
 
 from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
-from nav_msgs.msg import OccupancyGrid, Odometry  # noqa: E402
+from geometry_msgs.msg import PoseStamped  # noqa: E402
+from nav_msgs.msg import OccupancyGrid, Odometry, Path  # noqa: E402
 from nav_msgs.srv import LoadMap  # noqa: E402
 from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
@@ -79,17 +80,17 @@ class Robot:
             self.maker.spin_once()
             self.listening.spin_once(timeout_sec=0.01)
 
-    def drive(self, frames: int):
+    def drive(self, frames: int, first: int = 0):
         self.until(lambda: all(one.get_subscription_count() for one in self.send.values()))
         made = wire.messages()
         if TFMessage:
             self.publish("/tf_static", made.transforms(0, [("base_link", OPTICAL, T_BASE_CAMERA)]))
-        for k in range(frames):
+        for k in range(first, first + frames):
             frame = depth_at(k)
             self.publish("/camera/depth/camera_info", made.camera_info(CAMERA, frame.stamp_ns, OPTICAL))
             self.publish(DEPTH, made.image(frame.depth, frame.stamp_ns, OPTICAL))
             self.stand(base_at(frame.stamp_ns), frame.stamp_ns)
-        self.until(lambda: len(self.reports) == frames)
+        self.until(lambda: len(self.reports) == first + frames)
 
     def stand(self, T, stamp_ns):
         if TFMessage:
@@ -97,6 +98,14 @@ class Robot:
         else:
             pose = np.array([T[0, 3], T[1, 3], np.arctan2(T[1, 0], T[0, 0])])
             self.publish("/odom", wire.messages().odometry(pose, stamp_ns, "odom", "base_link"))
+
+    def correct(self, frames, T):
+        """Send a path of the robot on which some frames are moved."""
+        made, poses = wire.messages(), []
+        for stamp_ns in (depth_at(k).stamp_ns for k in frames):
+            pose = made._pose(T @ base_at(stamp_ns))
+            poses.append(wire.made("geometry_msgs/msg/PoseStamped", header=wire.header(stamp_ns, ""), pose=pose))
+        self.publish("/path", wire.made("nav_msgs/msg/Path", header=wire.header(0, "odom"), poses=poses))
 
     def publish(self, topic, message):
         self.send[topic].publish(wire.packed(message))
@@ -154,6 +163,12 @@ def test_what_is_published_is_what_the_map_says(robot):
     assert levels.items() <= {"waiting": b"\1", "current": b"\0", "stale": b"\3"}.items()
 
 
+def shifted(x, y, z):
+    T = np.eye(4)
+    T[:3, 3] = x, y, z
+    return T
+
+
 def check_grid(message, expected):
     cells = np.array(message.data, np.int8).reshape(message.info.height, message.info.width)
     known = np.argwhere(cells >= 0)
@@ -162,6 +177,15 @@ def check_grid(message, expected):
     side, place = message.info.resolution, message.info.origin.position
     assert side == pytest.approx(0.1)
     assert (place.x + left * side, place.y + bottom * side) == pytest.approx(expected.origin[:2], abs=1e-5)
+
+
+def shows(messages, expected):
+    """Return whether the last grid that came is as expected."""
+    try:
+        check_grid(messages[-1], expected)
+    except (AssertionError, IndexError):
+        return False
+    return True
 
 
 def check_octomap(message, voxel_map):
@@ -224,6 +248,64 @@ def test_names_that_no_topic_has_end_in_one_line(robot):
     for options in (Options(depth=("a b",)), Options(depth=("",)), Options(depth=(DEPTH,), odometry=("1x",))):
         with pytest.raises(StereovoxError, match=r"^topic '.*': Invalid topic name.*[^:]$"):
             MapNode(robot.node, robot.mapping, options, str)
+
+
+def test_a_corrected_path_changes_what_is_published_and_no_frame_is_lost(robot):
+    """The map and the grid become those of a new run at the path's poses; images go on coming meanwhile."""
+    settings = {"voxel_size": 0.1, "map.keep_frames": True, "trust.max_disagreement": 1}
+    other = rclpy.create_node("corrected")
+    options = replace(robot.options, corrected_path="/path", path_frame="base_link", out="")
+    mapping = Mapping(load_config(**settings))
+    robot.mapping.close()
+    robot.maker = MapNode(other, mapping, options, str, robot.reports.append)
+    robot.send["/path"] = robot.other.create_publisher(Path, "/path", 1)
+    robot.listen(OccupancyGrid, "/map_mapping")
+    robot.listen(DiagnosticArray, "/diagnostics", 10)
+    robot.until(lambda: robot.send["/path"].get_subscription_count())
+    robot.drive(4)
+    robot.correct(range(4), shifted(1.0, -0.3, 0.2))
+    robot.drive(3, first=4)
+    robot.until(lambda: robot.maker.counts()["corrections"] == 1)
+    shift = shifted(0.5, -0.3, 0.2)
+    robot.correct(range(4), shift)  # when no image comes any longer
+    robot.until(lambda: robot.maker.counts()["corrections"] == 2)
+    assert robot.maker.counts()["frames_in_map"] == 7
+    new = Mapping(load_config(**settings))
+    for k, kept in enumerate(mapping.mapper.map.kept_frames.frames):
+        wanted = depth_at(k).T_world_sensor
+        np.testing.assert_allclose(kept.T_world_sensor, shift @ wanted if k < 4 else wanted, atol=1e-5)
+        assert new.add(replace(depth_at(k), T_world_sensor=kept.T_world_sensor, sensor=DEPTH)).refused is None
+    for mine, theirs in zip(mapping.snapshot()().storage.blocks(), new.snapshot()().storage.blocks(), strict=True):
+        np.testing.assert_array_equal(mine, theirs)
+    robot.until(lambda: shows(robot.came["/map_mapping"], project(new.snapshot()())))
+    robot.maker.close()
+    other.destroy_node()
+
+
+def test_a_jump_of_odometry_in_the_map_is_noticed_while_it_drives(robot):
+    """Here the place of odom in the map comes as a pose; with tf2_msgs it may come by /tf as well."""
+    other = rclpy.create_node("jumping")
+    options = replace(robot.options, correct_jumps=True, world_frame="map", pose=("/slam=odom",), out="")
+    mapping = Mapping(load_config(voxel_size=0.1, **{"map.keep_frames": True, "trust.max_disagreement": 1}))
+    robot.mapping.close()
+    robot.maker = MapNode(other, mapping, options, str, robot.reports.append)
+    robot.send["/slam"] = robot.other.create_publisher(PoseStamped, "/slam", 20)
+    made = wire.messages()
+    robot.until(lambda: robot.send["/slam"].get_subscription_count())
+    for k in range(7):
+        stamp_ns = depth_at(k).stamp_ns
+        place = made._pose(shifted(0, 0.6 if k > 3 else 0.0, 0))
+        told = wire.made("geometry_msgs/msg/PoseStamped", header=wire.header(stamp_ns, "map"), pose=place)
+        robot.publish("/slam", told)
+    robot.drive(7)
+    robot.until(lambda: robot.maker.counts()["corrections"] == 1)
+    sideways = [
+        kept.T_world_sensor[1, 3] - depth_at(k).T_world_sensor[1, 3]
+        for k, kept in enumerate(mapping.mapper.map.kept_frames.frames)
+    ]
+    np.testing.assert_allclose(sideways, [0, 0.2, 0.4, 0.6, 0.6, 0.6, 0.6], atol=0.01)
+    robot.maker.close()
+    other.destroy_node()
 
 
 def test_save_reset_and_load(robot, tmp_path):

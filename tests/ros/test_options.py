@@ -74,6 +74,9 @@ def test_something_must_be_mapped_and_a_scan_only_on_a_floor():
         (["--cloud", "/lidar", "--poses", "track"], "--poses track"),
         (["--depth", DEPTH, "--odometry", "/odom", "--poses", "track"], "--odometry /odom"),
         (["--depth", DEPTH, "--ros-args", "-p", "ros.poses:=trak"], "did you mean"),
+        (["--depth", DEPTH, "--corrected-path", "/mapPath"], "add --set map.keep_frames=true"),
+        (["--depth", DEPTH, "--correct-jumps", "--set", "dimensions=2"], "needs a map in space"),
+        (["--depth", DEPTH, "--ros-args", "-p", "ros.correct_jumps:=true"], "add --set map.keep_frames=true"),
         (["--depth", DEPTH, "--poses", "track", "--load", "x.svox"], "does not know where it is"),
     ],
 )

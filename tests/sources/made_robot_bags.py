@@ -77,13 +77,26 @@ class Messages:
     def _vector(self, kind: str, numbers: Any) -> Any:
         return self.make(kind, **dict(zip("xyzw", map(float, numbers), strict=False)))
 
-    def odometry(self, stamp_ns: int, numbers: Any, parent: str = "odom", child: str = "base_link") -> Any:
-        zero, nothing = self._vector("geometry_msgs/Vector3", (0, 0, 0)), np.zeros(36)
-        pose = self.make(
+    def path(self, frame_id: str, *poses: tuple[int, Any]) -> Any:
+        return self.make(
+            "nav_msgs/Path",
+            header=self.header(0, frame_id),
+            poses=[
+                self.make("geometry_msgs/PoseStamped", header=self.header(stamp_ns, ""), pose=self._pose(numbers))
+                for stamp_ns, numbers in poses
+            ],
+        )
+
+    def _pose(self, numbers: Any) -> Any:
+        return self.make(
             "geometry_msgs/Pose",
             position=self._vector("geometry_msgs/Point", numbers[:3]),
             orientation=self._vector("geometry_msgs/Quaternion", numbers[3:]),
         )
+
+    def odometry(self, stamp_ns: int, numbers: Any, parent: str = "odom", child: str = "base_link") -> Any:
+        zero, nothing = self._vector("geometry_msgs/Vector3", (0, 0, 0)), np.zeros(36)
+        pose = self._pose(numbers)
         twist = self.make("geometry_msgs/Twist", linear=zero, angular=zero)
         return self.make(
             "nav_msgs/Odometry",

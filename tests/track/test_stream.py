@@ -61,6 +61,11 @@ def test_a_lost_frame_says_why_and_what_helps():
     assert frame.fault_detail == f"{frame.name}: dark; move slower, or back to what was seen before"
 
 
+def test_frames_tell_how_well_their_pose_is_known():
+    _, frame = (frame for frame, _ in follow(room(2), Script(BEGUN, "")))
+    assert frame.pose_sigma == (1.0, 1.0)
+
+
 def test_a_damaged_image_keeps_its_own_fault_and_is_not_tracked():
     damaged = replace(room(2)[1], fault="unreadable", fault_detail="b.png: cut off")
     tracker = Script(BEGUN, "")

@@ -7,6 +7,7 @@ from stereovox.se3 import rotation_matrix
 from stereovox.trust.camera_path import Seen
 from stereovox.trust.corrected import correct_history, matrix_of
 from stereovox.trust.history import Doubt, History, Look, Streak
+from stereovox.trust.loop_lines import LoopLines
 
 
 def seen(stamp_ns, x, turn=0.0):
@@ -29,7 +30,9 @@ def test_a_sensor_that_moved_is_remembered_where_it_is_now():
     before = [("left", seen(1, 0.0)), ("right", seen(1, 1.0)), ("left", seen(2, 0.3)), ("right", seen(2, 1.3))]
     after = [*before[:2], ("left", seen(2, 2.3, 0.5)), before[3]]
     history = history_of(before[2][1], before[3][1])
+    history.loops = LoopLines()
     correct_history(history, before, after)
+    assert history.loops is None
     assert history.trusted == {"left": after[2][1], "right": before[3][1]}
     assert list(history.waiting) == list(history.doubts) == ["right"]
     moved = matrix_of(after[2][1]) @ np.linalg.inv(matrix_of(before[2][1])) @ matrix_of(seen(0, 0.5))

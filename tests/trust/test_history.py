@@ -11,6 +11,7 @@ import stereovox as sv
 from stereovox.errors import MapFileError
 from stereovox.trust.camera_path import CameraPath
 from stereovox.trust.history import MAX_REASONS, NOT_RECORDED, OTHERS, History, Seen, Streak
+from stereovox.trust.loop_lines import LoopLines
 
 POSE = tuple(float(x) / 3 for x in range(12))
 FULL = History(
@@ -23,6 +24,7 @@ FULL = History(
     {"left": Seen(2**62, POSE), "right": Seen(-5, POSE)},
     {"left": Streak("pose_jump", 2**62 + 1, Seen(2**62 + 9, POSE))},
     CameraPath(0.1, {"left": [Seen(2**62, (0.5,) * 12)], "right": []}),
+    loops=LoopLines.between([[[0, 0, 0], [1, 2, 3]]], []),
 )
 
 
@@ -48,7 +50,7 @@ def test_a_refused_frame_may_hold_anything_as_stamp_and_name(stamp_ns):
 
 
 def test_a_map_from_before_there_was_a_history_loads():
-    old = {"frames": 4, "frames_refused": 2, "recording": "hall"}
+    old = {"frames": 4, "frames_refused": 2, "recording": "hall"}  # nor loops
     assert History.loaded(old) == History(4, Counter({NOT_RECORDED: 2}), recording="hall")
 
 
@@ -106,6 +108,10 @@ LIES = {
     "a path with NaN": lambda s: s["camera_path"]["stops"]["left"].update(poses="AADAfwAAwH8AAMB/" * 4),
     "a path without end": lambda s: s["camera_path"]["stops"]["left"].update(stamps_ns="AAAA" * 999_999),
     "a path without spacing": lambda s: s["camera_path"].update(spacing=0),
+    "loops of text": lambda s: s.update(loops="many"),
+    "loops without those that were refused": lambda s: s["loops"].pop("refused"),
+    "more loops than lines": lambda s: s["loops"]["closed"].update(number=2),
+    "a loop with half a place": lambda s: s["loops"]["closed"].update(ends="AAAA"),
     "no beginning": lambda s: s["history"]["waiting"]["left"].pop("since_ns"),
 }
 
@@ -159,8 +165,10 @@ def test_info_tells_it(saved_map, capsys):
     assert told["refused"] == {"no_pose": 2, "pose_jump": 1}
     assert told["settled"] == {"clock_reset": 1}
     assert told["ways"] == {"full": 6, "near": 1}
+    assert told["loops"] == {"closed": 1, "refused": 0}
     assert told["last_stamps_ns"] == {"left": 2**62, "right": -5}
     assert main(["info", str(saved_map)]) == 0
     text = "".join(capsys.readouterr())
     assert "2 x no_pose" in text
+    assert "loops: 1 closed, 0 refused" in text
     assert "left" in text

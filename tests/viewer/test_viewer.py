@@ -13,6 +13,7 @@ from stereovox import PinholeCamera, VoxelMap, load_config
 from stereovox.errors import MissingExtra, StereovoxError
 from stereovox.frame import Viewpoint
 from stereovox.maps import State
+from stereovox.trust.loop_lines import LoopLines
 from stereovox.view.scale import scale_of
 from stereovox.viewer.cameras import first_look, up_vector
 from stereovox.viewer.cells import CORNERS, FACES, brightness, linear
@@ -307,6 +308,31 @@ def test_up_may_be_told():
         assert viewer.cells.below.label == "below -y [m]"
     with pytest.raises(StereovoxError, match="no axis"):
         open_viewer(box_map(), port=0, up="w")
+
+
+def lines_of(viewer, kind):
+    node = viewer.server.scene.get_handle_by_name(f"/loops/{kind}")
+    return None if node is None else node.points
+
+
+def test_loops_are_lines_that_can_be_hidden_and_go_with_the_map(shown):
+    assert not shown.cameras.loops.visible
+    closed, refused = [[[0, 0, 0.5], [1, 0, 0.5]], [[0, 0, 0.5], [0, 1, 0.5]]], [[[0, 0, 0], [0, 0, 1]]]
+    with_loops = box_map()
+    with_loops.history.loops = LoopLines.between(closed, refused)
+    shown.update(with_loops)
+    assert shown.cameras.loops.visible
+    np.testing.assert_allclose(lines_of(shown, "closed"), closed)
+    np.testing.assert_allclose(lines_of(shown, "refused"), refused)
+    assert "| loops | 2 closed, 1 refused |" in statistics(with_loops)
+    root = shown.server.scene.get_handle_by_name("/loops")
+    assert root.visible
+    shown.cameras.loops.value = False
+    assert not root.visible
+    shown.update(box_map())
+    assert not shown.cameras.loops.visible
+    assert lines_of(shown, "closed") is lines_of(shown, "refused") is None
+    assert "loops" not in statistics(box_map())
 
 
 def test_names_from_a_map_are_no_program_text():

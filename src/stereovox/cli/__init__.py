@@ -34,6 +34,7 @@ COMMANDS = (
     "path",
     "crop",
     "merge",
+    "loops",
     "remap",
     "diff",
     "coarsen",

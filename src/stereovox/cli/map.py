@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from stereovox.cli.live_page import page_of, rerun_of
+from stereovox.cli.loops import say_closure
 from stereovox.cli.options import add_checkpoint, add_settings, check_ending, overrides
 from stereovox.cli.terminal import (
     cells_line,
@@ -25,6 +26,7 @@ from stereovox.cli.terminal import (
     say_about_compiling,
     say_lost,
     say_refusals,
+    size,
     thousands,
 )
 from stereovox.errors import StereovoxError
@@ -58,6 +60,10 @@ def add_arguments(parser: ArgumentParser) -> None:
         help="given: those of the recording (default, where there are any); track: found from the images "
         "alone; both: given ones, corrected by the images",
     )
+    parser.add_argument(
+        "--close-loops", action="store_true",
+        help="keep the frames, and at the end bend the camera's way so that places which it saw again are one",
+    )  # fmt: skip
     parser.add_argument(
         "--level", action="store_true", help="turn the recording's world so that z points up, for level layers"
     )
@@ -111,13 +117,14 @@ def _map(arguments: Namespace, out: Path) -> dict[str, Any]:
 
     run = MapRun(
         arguments.source, out, profile=arguments.profile, resume=arguments.resume, frames=arguments.frames,
-        camera=arguments.camera, level=arguments.level, poses=arguments.poses, checkpoint_s=arguments.checkpoint,
+        camera=arguments.camera, level=arguments.level, poses=arguments.poses,
+        close_loops=arguments.close_loops, checkpoint_s=arguments.checkpoint,
         notify=say, **overrides(arguments),
     )  # fmt: skip
     with run, page_of(run.mapper, out.stem, arguments.view) as page:
         say_about_compiling()
         with rerun_of(run.mapper, arguments.rerun) as recorded, progress_of(run.remaining, "mapping") as bar:
-            mapped = run.finish((page, recorded, bar))
+            mapped = run.finish((page, recorded, bar), bar.step)
             recorded.finish()
         result = mapped.summary() | ({"dropped": mapped.dropped} if run.source.length is None else {})
         page.finish()
@@ -137,7 +144,7 @@ def _grid(arguments: Namespace) -> dict[str, Any]:
     """Run `stereovox grid`, which has more options."""
     from stereovox.cli.grid import run_floor
 
-    for option in ("camera", "device", "integrator", "level", "poses", "threads", "view", "rerun"):
+    for option in ("camera", "close_loops", "device", "integrator", "level", "poses", "threads", "view", "rerun"):
         if getattr(arguments, option) not in (None, False):
             raise StereovoxError(f"--{option}: has no meaning for the map of a floor; leave it out")
     return run_floor(arguments)
@@ -150,6 +157,8 @@ def _print_result(result: dict[str, Any], mapped: MapResult[VoxelMap], out: Path
     say_refusals(result, mapped.reports, "frames")
     say(_poses_line(mapped))
     say_lost(mapped.lost)
+    if mapped.loops is not None:
+        say_closure(mapped.loops)
     if mapped.imu:
         say(f"note: {mapped.imu}")
     if result.get("dropped"):
@@ -162,6 +171,8 @@ def _print_result(result: dict[str, Any], mapped: MapResult[VoxelMap], out: Path
     times = f"{depth:.2g} ms to prepare the depth image, {cells:.2g} ms to map it (medians)"
     say(f"per frame: {times}{first_included(result)}")
     say(cells_line(result, config.voxel_size))
+    if (kept := mapped.map.kept_frames) is not None:
+        say(f"keeps {len(kept)} of its frames, {size(kept.bytes)}: poses can be corrected (remap)")
     if not result["occupied"]:
         say(f"note: {_why_empty(result, config.window)}")
     say(f"saved in {out}; look at it with: {command_line('picture', out, picture_name(str(out)))}")

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 from argparse import Namespace
 from collections.abc import Iterable
 from pathlib import Path
@@ -26,6 +27,14 @@ def check_new(out: str, *inputs: str) -> None:
         raise StereovoxError(f"{out}: is what the new map is made of; give the new one another name")
     check_in_space(out)
     check_target(Path(out))
+
+
+def name_beside(path: str, what: str) -> str:
+    """Return the name of a map made of another one, `NAME-what.svox` here. Raises StereovoxError where it is taken."""
+    out = f"{Path(path).resolve().stem}-{what}.svox"
+    if Path(out).exists():
+        raise StereovoxError(f"{out}: is here already; replace it with --out {shlex.quote(out)}, or give another name")
+    return out
 
 
 def save_new(voxel_map: VoxelMap, out: str) -> dict[str, Any]:

@@ -10,9 +10,13 @@ from __future__ import annotations
 from argparse import ArgumentParser, Namespace
 from typing import Any
 
+import numpy as np
+
 from stereovox.cli.maps import check_new, open_map, save_new
 from stereovox.cli.options import transform_of
-from stereovox.cli.terminal import say
+from stereovox.cli.terminal import progress_of_steps, say
+from stereovox.errors import StereovoxError
+from stereovox.se3 import rotation_vector
 
 EXAMPLE = "stereovox merge kitchen.svox hall.svox --out both.svox --transform 4.2,0,0,0,0,0.7071,0.7071"
 
@@ -23,6 +27,10 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("b", metavar="B", help="folder of another map with cells of the same size")
     parser.add_argument("--out", metavar="OUT", required=True, help="folder of the new map")
     add_transform(parser)
+    parser.add_argument(
+        "--find", action="store_true",
+        help="find where B lies in A by what both saw, and bend both so that it is one (maps that kept their frames)",
+    )  # fmt: skip
 
 
 def add_transform(parser: ArgumentParser) -> None:
@@ -39,6 +47,8 @@ def run(arguments: Namespace) -> dict[str, Any]:
     """Load both maps and save the merged one."""
     from stereovox.join import merge, why_added
 
+    if arguments.find:
+        return _joined(arguments)
     T_a_b = None if arguments.transform is None else transform_of(arguments.transform)
     check_new(arguments.out, arguments.a, arguments.b)
     a, b = open_map(arguments.a), open_map(arguments.b)
@@ -48,3 +58,22 @@ def run(arguments: Namespace) -> dict[str, Any]:
             f"note: evidence is added up, since {why}; cells at their limits may differ from those of one run over both"
         )
     return {**save_new(merged, arguments.out), "exact": why is None}
+
+
+def _joined(arguments: Namespace) -> dict[str, Any]:
+    """Find where the second map lies, and save the map of both."""
+    from stereovox.join import join
+
+    if arguments.transform is not None:
+        raise StereovoxError("--find: finds the transform; leave --transform out")
+    check_new(arguments.out, arguments.a, arguments.b)
+    a, b = open_map(arguments.a), open_map(arguments.b)
+    with progress_of_steps("looking for loops") as progress:
+        done = join(a, b, progress)
+    x, y, z = done.T_a_b[:3, 3]
+    turn = np.degrees(np.linalg.norm(rotation_vector(done.T_a_b[:3, :3])))
+    say(f"B was found in A at {done.found} places; origin at ({x:.2f}, {y:.2f}, {z:.2f}) m, turned by {turn:.0f} deg")
+    say(f"{done.loops} loops closed in and between both")
+    return {
+        **save_new(done.map, arguments.out), "exact": True, "T_a_b": done.T_a_b.round(6).tolist(), "loops": done.loops
+    }  # fmt: skip

@@ -7,14 +7,11 @@ these poses. Frames between two that have a pose in the file are moved as these 
 
 from __future__ import annotations
 
-import shlex
 from argparse import ArgumentParser, Namespace
-from pathlib import Path
 from typing import Any
 
-from stereovox.cli.maps import check_new, check_there, describe_saved
+from stereovox.cli.maps import check_new, check_there, describe_saved, name_beside
 from stereovox.cli.terminal import say, say_about_compiling
-from stereovox.errors import StereovoxError
 
 EXAMPLE = "stereovox remap kitchen.svox --poses corrected.tum"
 
@@ -34,7 +31,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
     """Correct the map and print what was done."""
     from stereovox.remapping import remap
 
-    out = arguments.out or _usual_out(arguments.map)
+    out = arguments.out or name_beside(arguments.map, "corrected")
     check_new(out, arguments.map)
     check_there(arguments.map)
     say_about_compiling()
@@ -47,11 +44,3 @@ def run(arguments: Namespace) -> dict[str, Any]:
         say(f"note: only {report.mapped} frames were kept (map.frames_budget); the map is what these make")
     say(f"{report.moved} frames moved, {report.mapped} were mapped again, {report.blocks} blocks made anew")
     return {**describe_saved(done.map, out), **done.summary()}
-
-
-def _usual_out(path: str) -> str:
-    """Return the name of the new map where none is given. Raises StereovoxError where that is taken."""
-    out = f"{Path(path).resolve().stem}-corrected.svox"
-    if Path(out).exists():
-        raise StereovoxError(f"{out}: is here already; replace it with --out {shlex.quote(out)}, or give another name")
-    return out

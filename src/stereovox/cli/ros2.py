@@ -47,6 +47,11 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--poses", choices=("given", "track"), help=about)
     parser.add_argument("--world-frame", metavar="FRAME", help="frame of the map (map, else odom)")
     parser.add_argument("--base-frame", metavar="FRAME", help="frame of the robot (base_footprint, else base_link)")
+    parser.add_argument("--corrected-path", metavar="TOPIC", help="correct the map by a SLAM program's nav_msgs/Path")
+    parser.add_argument("--path-frame", metavar="FRAME", help="the frame whose poses these are (the first sensor's)")
+    parser.add_argument(
+        "--correct-jumps", action="store_true", help="spread jumps of odom in the map over the way since the last one"
+    )
     parser.add_argument("--out", metavar="MAP", help="where to save the map at the end, and when the service is called")
     parser.add_argument("--load", metavar="MAP", help="continue this map")
     parser.add_argument("--profile", metavar="P", help="profile name or TOML file (default)")
@@ -71,6 +76,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
 
     with running_node(arguments.ros_args) as node, ExitStack() as stack:
         from stereovox.pose_choice import TRACK
+        from stereovox.ros.corrections import check_corrections
         from stereovox.ros.mapping import Mapping
         from stereovox.ros.options import freeze
         from stereovox.ros.services import check_continuable
@@ -78,6 +84,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
 
         config, options = _settings(arguments, node)
         options.check_sources(config.dimensions)
+        check_corrections(options, config)
         _reserve(options.out, config.dimensions, stack)
         say_about_compiling()
         warm_up(config, options.poses == TRACK)
@@ -171,7 +178,9 @@ def _settings(arguments: Namespace, node: Any) -> tuple[Config, Options]:
     profile = arguments.profile or given.settings.pop("profile", "default")
     given.settings.pop("profile", None)
     config = load_config(profile, **{**given.settings, **overrides(arguments)})
-    named = {name: getattr(arguments, name) for name in (*LISTS, "poses", "world_frame", "base_frame", "out")}
+    corrections = "corrected_path", "path_frame", "correct_jumps"
+    names = *LISTS, "poses", "world_frame", "base_frame", *corrections, "out"
+    named = {name: getattr(arguments, name) for name in names}
     given_options = {name: value for name, value in named.items() if value}
     return config, with_parameters(Options(), {**given.options, **given_options})
 

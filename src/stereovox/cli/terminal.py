@@ -106,6 +106,10 @@ class FrameProgress:
         """Advance by the frame that was offered to the map."""
         self.advance()
 
+    def step(self, done: int, total: int, doing: str) -> None:
+        """Show another step of the work than the frames themselves."""
+        self._bar.update(self._task, completed=done, total=total, description=doing, note="")
+
     def advance(self) -> None:
         """Advance by one step."""
         speed = self._bar.tasks[0].finished_speed or self._bar.tasks[0].speed

@@ -18,7 +18,7 @@ from pydantic import BaseModel, ByteSize, Field, ValidationError, model_validato
 from stereovox.config.base import Section
 from stereovox.config.depth import DepthConfig, NoiseConfig, SphereConfig, StereoConfig
 from stereovox.config.maps import MapConfig, ProjectiveConfig, RayConfig, SensorConfig, WindowConfig
-from stereovox.config.robot import AmclConfig, GridConfig, ScanConfig, SlamConfig
+from stereovox.config.robot import AmclConfig, GridConfig, LoopsConfig, ScanConfig, SlamConfig
 from stereovox.config.safety import PaceConfig, TrustConfig
 from stereovox.errors import ConfigError, did_you_mean
 from stereovox.safe_io import read_text, shown, toml_table
@@ -73,6 +73,7 @@ class Config(Section):
         grid: 2-D grids; see GridConfig.
         amcl: Localisation; see AmclConfig.
         slam: SLAM; see SlamConfig.
+        loops: Loop closure in space; see LoopsConfig.
     """
 
     profile: str = "default"
@@ -107,6 +108,7 @@ class Config(Section):
     grid: GridConfig = Field(default_factory=lambda: GridConfig.model_validate({}))
     amcl: AmclConfig = Field(default_factory=lambda: AmclConfig.model_validate({}))
     slam: SlamConfig = Field(default_factory=lambda: SlamConfig.model_validate({}))
+    loops: LoopsConfig = Field(default_factory=lambda: LoopsConfig.model_validate({}))
 
     @model_validator(mode="before")
     @classmethod

@@ -186,3 +186,18 @@ class SlamConfig(Section):
                 "the first and the third above 0, the others at least 0"
             )
         return self
+
+
+class LoopsConfig(Section):
+    """Loop closure in space (`loops/`).
+
+    drift: share of the way by which poses may be off, along each axis: over some metres it adds up, then grows with
+        the square root of the way.
+    drift_deg: degrees by which they may be turned after one metre; it grows with the square root of the way.
+    upright_deg: degrees by which the poses' up may be wrong; for poses levelled by gravity, as of a T265, a phone or a
+        headset. Not set: up drifts like heading.
+    """
+
+    drift: float = Field(0.015, gt=0, le=0.5)
+    drift_deg: float = Field(0.15, gt=0, le=20)
+    upright_deg: float | None = Field(None, gt=0, le=45)

@@ -45,6 +45,7 @@ def describe_map(path: str) -> Description | None:
         "settled": dict(voxel_map.history.settled),
         "ways": dict(voxel_map.history.ways),
         "kept_frames": None if kept is None else {"frames": len(kept), "bytes": kept.bytes},
+        "loops": None if voxel_map.history.loops is None else voxel_map.history.loops.counts(),
         "last_stamps_ns": {sensor: frame.stamp_ns for sensor, frame in voxel_map.history.trusted.items()},
         "profile": config.profile,
         "up": config.up,
@@ -117,6 +118,8 @@ def _lines(result: dict[str, Any]) -> list[str]:
     lines.append(f"{frames}{size(result['memory_bytes'])} {loaded}")
     if kept := result["kept_frames"]:
         lines.append(f"keeps {kept['frames']} of its frames, {size(kept['bytes'])}: poses can be corrected (remap)")
+    if loops := result["loops"]:
+        lines.append(f"loops: {thousands(loops['closed'])} closed, {thousands(loops['refused'])} refused")
     for reason, number in result["refused"].items():
         lines.append(f"  {number} x {reason}")
     for reason, number in result["settled"].items():

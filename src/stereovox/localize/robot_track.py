@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from importlib.util import find_spec
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +16,7 @@ from stereovox.localize.slam.doubts import MapDoubt
 from stereovox.localize.slam.pipeline import SlamResult, map_scans
 from stereovox.localize.track import Track
 from stereovox.maps.occupancy import OccupancyGrid
+from stereovox.pose_graph import need_gtsam
 from stereovox.sources.robots.robot import Robot
 
 Progress = Callable[[int, int, str], object]
@@ -34,8 +34,7 @@ def slam_robot(robot: Robot, config: Config, progress: Progress = no_progress) -
 
     Raises MissingExtra without gtsam, StereovoxError where there are no scans, and as `map_scans`.
     """
-    if find_spec("gtsam") is None:
-        raise MissingExtra("gtsam", "slam")  # not after an hour, when the first loop is found
+    need_gtsam()  # not after an hour, when the first loop is found
     if not len(robot.scans):
         raise StereovoxError(f"{robot.name}: holds no lidar scans to make a map of; give a bag with a LaserScan topic")
     try:

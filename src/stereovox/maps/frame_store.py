@@ -137,6 +137,7 @@ def _frame_to(frame: KeptFrame, camera: int) -> dict[str, Any]:
         "seen": [frame.seen.stamp_ns, list(frame.seen.pose)],
         "camera": camera,
         "quality": frame.quality,
+        "pose_sigma": list(frame.pose_sigma),
         "depth_scale": float(frame.depth_scale),
         "farthest": float(frame.farthest) if isfinite(frame.farthest) else None,
         "blocks": frame.blocks.tolist(),
@@ -168,11 +169,13 @@ def _frame_from(saved: Any, cameras: Sequence[VirtualCamera], pack: Path, start:
         raise ValueError("a kept frame is of no kind that is known")
     if blocks.shape != (2, 3) or len(pose) != 12 or count_in(saved, "camera") >= len(cameras):
         raise ValueError("a kept frame has no place or no camera")
+    turn, shift = _numbers(saved.get("pose_sigma", (0, 0)))  # maps from before have none
     digest = str(saved["digest"])
     return KeptFrame(
         count_in(saved, "number"), str(saved["sensor"]), str(saved["name"]), int(saved["stamp_ns"]),
         np.array(_numbers(saved["T_world_sensor"])).reshape(4, 4), cameras[saved["camera"]],
-        saved["quality"], float(saved["depth_scale"]), inf if saved["farthest"] is None else float(saved["farthest"]),
+        saved["quality"], (abs(turn), abs(shift)), float(saved["depth_scale"]),
+        inf if saved["farthest"] is None else float(saved["farthest"]),
         Packed(saved["dtype"], depth_bytes, InFile((pack, start), size, digest), digest),
         Seen(int(stamp_ns), tuple(_numbers(pose))), blocks,
     )  # fmt: skip

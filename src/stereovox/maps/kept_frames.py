@@ -138,6 +138,7 @@ class KeptFrame:
         T_world_sensor: (4, 4) float64, as the frame came with it, or as it was corrected.
         camera: As in `Frame`.
         quality: The quality level that it was mapped at.
+        pose_sigma: As in `Frame`.
         depth_scale: As in `Frame`.
         farthest: As in `Frame`.
         packed: Its depth image.
@@ -152,6 +153,7 @@ class KeptFrame:
     T_world_sensor: Transform
     camera: VirtualCamera
     quality: str
+    pose_sigma: tuple[float, float]
     depth_scale: float
     farthest: float
     packed: Packed
@@ -163,7 +165,7 @@ class KeptFrame:
         depth, reason = self.packed.unpacked(self.camera)
         return Frame(
             depth, self.camera, self.T_world_sensor, self.stamp_ns, self.depth_scale, reason, self.name,
-            sensor=self.sensor, farthest=self.farthest,
+            sensor=self.sensor, farthest=self.farthest, pose_sigma=self.pose_sigma,
         )  # fmt: skip
 
 
@@ -245,9 +247,10 @@ def kept_frame(
 ) -> KeptFrame:
     """Return a frame to be kept; what the arguments are: as in `KeptFrame`."""
     T_world_sensor = np.array(frame.T_world_sensor, float)
+    turn, shift = map(float, frame.pose_sigma)
     return KeptFrame(
         number, sensor, frame.name, int(frame.stamp_ns), T_world_sensor, frame.camera, quality,
-        float(frame.depth_scale), float(frame.farthest), packed, seen, blocks_seen(evidence),
+        (turn, shift), float(frame.depth_scale), float(frame.farthest), packed, seen, blocks_seen(evidence),
     )  # fmt: skip
 
 

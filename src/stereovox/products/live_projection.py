@@ -70,6 +70,7 @@ class LiveProjection:
         if self._whole:
             self._changed, self._canvas = EVERYWHERE.copy(), _Canvas()
         coords, cells = self._map.storage.blocks_within(*self._changed)
+        self._canvas.clear(*(SIDE * self._changed[:, self._order[:2]]))  # corrections take blocks away
         if len(coords):
             floor = SIDE * coords[:, self._order[:2]].astype(np.int64)
             self._canvas.reach(floor.min(axis=0), floor.max(axis=0) + SIDE)
@@ -103,6 +104,12 @@ class _Canvas:
         """Overwrite a part of the canvas with a patch that lies inside it."""
         left, bottom = (corner - self.corner).tolist()
         self.cells[bottom : bottom + patch.shape[0], left : left + patch.shape[1]] = patch
+
+    def clear(self, low: NDArray[np.int64], high: NDArray[np.int64]) -> None:
+        """Make columns and rows from `low` to below `high` unknown, as far as they are on the canvas."""
+        size = self.cells.shape[::-1]
+        (left, bottom), (right, top) = (np.clip(end - self.corner, 0, size).tolist() for end in (low, high))
+        self.cells[bottom:top, left:right] = UNKNOWN
 
     def reach(self, low: NDArray[np.int64], high: NDArray[np.int64]) -> None:
         """Grow by whole steps to cover columns and rows from `low` to below `high`; raises StereovoxError."""

@@ -73,9 +73,10 @@ def _resampled(voxel_map: VoxelMap, T: Transform, config: Config) -> VoxelMap:
         if there.config.map.keep_times:
             times = np.maximum(voxel_map.storage.times_at(points).reshape(-1, CELLS), pushed.storage.times_of(coords))
             there.storage.set_times(coords[known], times[known], voxel_map.storage.times_start_ns)
-    path = _moved_path(voxel_map.history.path, T)
+    history = voxel_map.history.copied()
+    path, loops = _moved_path(history.path, T), None if history.loops is None else history.loops.moved(T)
     there.history = replace(
-        voxel_map.history.copied(), trusted={}, waiting={}, looks={}, doubts={}, path=path
+        history, trusted={}, waiting={}, looks={}, doubts={}, path=path, loops=loops
     )  # no pose of frame b is left
     if voxel_map.viewpoint is not None:
         there.viewpoint = voxel_map.viewpoint._replace(T_world_camera=T @ voxel_map.viewpoint.T_world_camera)

@@ -74,10 +74,15 @@ def _eye(step_deg: float) -> tuple[SphericalCamera, NDArray[np.int64], SphereLay
 
 
 class Input(Protocol):
-    """Input topic of the map. kind: its message type as `package/Name`."""
+    """Input topic of the map.
+
+    kind: its message type as `package/Name`. T_frame_sensor: (4, 4), the axes of its frames' sensor in the frame that
+    its messages are in.
+    """
 
     topic: str
     kind: str
+    T_frame_sensor: Transform = np.eye(4)
 
     @property
     def ready(self) -> bool:
@@ -148,6 +153,7 @@ class CloudInput(Input):
     """Point clouds for a 3-D map; see `frame_of_cloud`."""
 
     kind = "sensor_msgs/PointCloud2"
+    T_frame_sensor = T_BODY_GRID
 
     def __init__(self, topic: str, step_deg: float):
         self.topic, self._step_deg = topic, step_deg

@@ -3,7 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from collections.abc import Mapping as Table
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +14,19 @@ from stereovox.formats.map_server import read_map_server
 from stereovox.frame import Frame, Scan, UpdateReport
 from stereovox.mapper import AnyMapper, GridMapper, Mapper
 from stereovox.maps import VoxelMap, load_map
+from stereovox.maps.kept_frames import KeptFrame
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.maps.storage import EVERYWHERE
 from stereovox.products.floor_axes import Heights
 from stereovox.products.live_projection import LiveProjection
+from stereovox.rebuild import CorrectionReport, FrameKey
+from stereovox.ros.background import Background
+from stereovox.se3 import Transform
 from stereovox.trust.health import Health
 from stereovox.trust.history import History
+
+PosesOf = Callable[[Sequence[KeptFrame]], Table[FrameKey, Transform]]
+"""Returns new poses of kept frames (4, 4), by sensor and stamp."""
 
 
 class Mapping:
@@ -28,12 +37,14 @@ class Mapping:
 
     Attributes:
         mapper: The current mapper; `load` and `reset` replace it.
+        corrections: Corrections in progress, in a thread of their own. Another map does not wait for those that wait.
     """
 
     mapper: AnyMapper[Any]  # the node offers it only what its options allow
 
     def __init__(self, config: Config, heights: Heights | None = None, tiles: Path | None = None):
         self._heights, self._tiles = heights, tiles
+        self.corrections: Background[CorrectionReport] = Background("stereovox-corrections")
         self._begin(config)
 
     @property
@@ -50,6 +61,15 @@ class Mapping:
         """Add a frame or scan to the map."""
         return self.mapper.add(frame)
 
+    def correct(self, poses_of: PosesOf, newest_only: bool = False) -> None:
+        """Correct the map in the background.
+
+        poses_of: called there with the kept frames, returns new poses by sensor and stamp. newest_only: in the place of
+        corrections that have not begun yet.
+        """
+        if isinstance(self.mapper, Mapper):
+            self.corrections.put(partial(_correct, self.mapper, poses_of), newest_only)
+
     def health(self) -> Health:
         """Return how current the map is."""
         return self.mapper.health()
@@ -63,7 +83,8 @@ class Mapping:
         voxel_map = self.mapper.map
         if not isinstance(voxel_map, VoxelMap):
             return None
-        coords, cells = voxel_map.storage.blocks_within(*EVERYWHERE)
+        with voxel_map.lock:  # a correction may be at work
+            coords, cells = voxel_map.storage.blocks_within(*EVERYWHERE)
 
         def copy() -> VoxelMap:
             copied = VoxelMap(voxel_map.config)
@@ -93,7 +114,8 @@ class Mapping:
         self._begin(self.config)
 
     def close(self) -> None:
-        """Release the files that the map holds open."""
+        """Release the files that the map holds open, once the correction in progress has ended."""
+        self.corrections.drop()
         self.mapper.close()
 
     def _begin(self, config: Config) -> None:
@@ -106,6 +128,12 @@ class Mapping:
     def _begin_floor(self, config: Config, saved: OccupancyGrid | None = None) -> None:
         mapper = GridMapper(config, resume=saved)
         self.mapper, self._above = mapper, lambda: _unless_empty(mapper.occupancy())
+
+
+def _correct(mapper: Mapper, poses_of: PosesOf) -> CorrectionReport:
+    kept = mapper.map.kept_frames
+    poses = poses_of(kept.frames) if kept is not None and len(kept) else {}
+    return mapper.correct(poses) if poses else CorrectionReport()
 
 
 def _unless_empty(grid: OccupancyGrid) -> OccupancyGrid | None:

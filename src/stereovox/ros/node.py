@@ -1,18 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
 """The node: messages wait for their pose, become frames and update the map, which is published.
 
-Everything runs in one thread between two waits for messages, so nothing needs a lock and services run between frames.
+Everything runs in one thread between two waits for messages, so nothing needs a lock and services run between frames;
+but the map is corrected, and large messages are made, in threads of their own.
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
+from concurrent.futures import Future
 from time import monotonic_ns
 from typing import Any
 
-from stereovox.frame import UpdateReport
+from stereovox.errors import StereovoxError
+from stereovox.frame import Frame, UpdateReport
 from stereovox.pose_choice import TRACK
+from stereovox.rebuild import CorrectionReport
+from stereovox.ros.corrections import AGAIN_S, PathCorrections, corrector_of
 from stereovox.ros.inputs import CloudInput, DepthInput, FloorCloudInput, Input, ScanInput, header
 from stereovox.ros.mapping import Mapping
 from stereovox.ros.motion import MotionPublisher
@@ -59,7 +64,10 @@ class MapNode:
         self.received: Counter[str] = Counter()
         self._outputs = Outputs(node, mapping, options, self.counts)
         Services(node, mapping, out, self._renewed, tracked=self.tracking is not None)
-        self._subscriptions = Subscriptions(node, options, self._poses, self._inputs, self._arrived)
+        self._corrector = corrector_of(node, mapping, self._poses, options)
+        on_path = self._corrector.on_path if isinstance(self._corrector, PathCorrections) else None
+        self._subscriptions = Subscriptions(node, options, self._poses, self._inputs, self._arrived, on_path)
+        self._corrections = Counter(corrections=0, corrections_failed=0) if self._corrector else Counter[str]()
         self._silence = Silence(node, self._inputs, self.received)
 
     def counts(self) -> dict[str, Any]:
@@ -73,6 +81,7 @@ class MapNode:
             "refused_ever": dict(history.refused),
             "transforms_unreadable": self._poses.tf.unreadable,
             **(self.tracking.counts() if self.tracking else {}),
+            **self._corrections,
         }
 
     def spin_once(self) -> None:
@@ -81,13 +90,17 @@ class MapNode:
         arrival = self.waiting.pop(self._ready)
         if arrival is not None:
             self._map(arrival)
+        if (ended := self._mapping.corrections.poll()) is not None:
+            self._take(ended)
         self._outputs.update()
         self._silence.update()
 
     def close(self) -> None:
-        """Map all waiting frames and publish the final map."""
+        """Map all waiting frames, correct the map as was asked, and publish the final one."""
         while (arrival := self.waiting.pop(lambda one: True)) is not None:
             self._map(arrival)
+        for ended in self._mapping.corrections.rest():
+            self._take(ended)
         self._outputs.close()
 
     def _receive(self, wait_s: float) -> None:
@@ -114,15 +127,34 @@ class MapNode:
         return sensor.ready and sensor.is_final(self._poses, one.frame_id, one.stamp_ns)
 
     def _map(self, one: Arrival[bytes]) -> None:
-        report = self._mapping.add(self._inputs[one.sensor].frame(one.content, self._poses.pose))
+        sensor = self._inputs[one.sensor]
+        frame = sensor.frame(one.content, self._poses.pose)
+        report = self._mapping.add(frame)
         self._on_report(report)
+        if self._corrector is not None and isinstance(frame, Frame) and not frame.fault:
+            self._corrector.seen(sensor, one.frame_id, frame, not report.refused)
         if report.refused:
             self._node.get_logger().warning(f"refused: {report.detail}", throttle_duration_sec=5.0)
         else:
             self._outputs.changed(one.stamp_ns, self._poses.world)
 
+    def _take(self, ended: Future[CorrectionReport]) -> None:
+        """Publish what a correction has changed, or say why it has not."""
+        try:
+            report = ended.result()
+        except StereovoxError as error:
+            self._corrections["corrections_failed"] += 1
+            self._node.get_logger().warning(f"not corrected: {error}", throttle_duration_sec=AGAIN_S)
+            return
+        if report.moved:
+            self._corrections["corrections"] += 1
+            self._outputs.corrected()
+            self._node.get_logger().info(f"corrected: {report.moved} frames moved, {report.mapped} were mapped again")
+
     def _renewed(self) -> None:
         self.waiting.clear()
+        if self._corrector is not None:
+            self._corrector.forget()
         self._outputs.changed(self._node.get_clock().now().nanoseconds, self._poses.world or "map")
 
 

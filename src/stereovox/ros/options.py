@@ -42,6 +42,8 @@ class Options:
     map_rate, cloud_rate: largest rate in messages a second: of the 2-D map, and of the cloud and the OctoMap.
     low, high: heights in metres between which obstacles mark the 2-D map; NaN: those of the settings.
     full_octomap: publish log-odds, not only occupied and free. cloud_step_deg: see `inputs.frame_of_cloud`.
+    corrected_path: topic of nav_msgs/Path by which the map is corrected. path_frame: whose poses they are; "":
+    that of the first topic. correct_jumps: spread jumps of `odom_frame` in the map over the way since the last one.
     reliable: request reliable delivery of images. out: where the map is saved; "": nowhere.
     """
 
@@ -65,6 +67,10 @@ class Options:
     high: float = math.nan
     full_octomap: bool = False
     cloud_step_deg: float = 1.0
+    corrected_path: str = ""
+    path_frame: str = ""
+    correct_jumps: bool = False
+    odom_frame: str = "odom"
     reliable: bool = False
     out: str = ""
 

@@ -140,6 +140,10 @@ class Outputs:
         self._stamp_ns, self._frame_id = stamp_ns, frame_id
         self._new_map = self._new_cloud = True
 
+    def corrected(self) -> None:
+        """Mark the map as changed by other means than a frame; its newest frame is the same."""
+        self._new_map = self._new_cloud = True
+
     def update(self) -> None:
         """Publish what is due."""
         now = self._clock()

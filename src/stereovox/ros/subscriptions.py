@@ -67,7 +67,8 @@ class Silence:
 class Subscriptions:
     """Subscribes to all topics in the options, and to /tf and /tf_static.
 
-    arrived: called with topic and bytes of a message to map. messages: number of messages received, of all kinds.
+    arrived: called with topic and bytes of a message to map. on_path: called with those of a corrected path.
+    messages: number of messages received, of all kinds.
     Raises StereovoxError, one line, for an invalid topic name, and where nothing can give a pose: no /tf, for want of
     `tf2_msgs`, and no other source of poses in the options.
     """
@@ -79,6 +80,7 @@ class Subscriptions:
         where: PoseBuffer,
         inputs: Mapping[str, Input],
         arrived: Callable[[str, bytes], None],
+        on_path: Callable[[bytes], None] | None = None,
     ):
         self._node, self.messages = node, 0
         images = _qos(options.queue, options.reliable)
@@ -91,6 +93,8 @@ class Subscriptions:
             self._listen("nav_msgs/Odometry", topic, where.on_odometry, poses)
         for topic, child in map(split_pair, options.pose):
             self._listen("geometry_msgs/PoseStamped", topic, partial(where.on_pose, child=child), poses)
+        if on_path is not None:
+            self._listen("nav_msgs/Path", options.corrected_path, on_path, _qos(1, reliable=True))
         self._listen_to_tf(where, options)
 
     def _listen_to_tf(self, where: PoseBuffer, options: Options) -> None:

@@ -7,21 +7,15 @@ exactly on a cell's face for any round cell size.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
-from numpy.typing import NDArray
 
-from stereovox.se3 import Transform, look_at, rotation_matrix, transform_points
+from stereovox.se3 import transform_points
 from stereovox.simulate.scene import Point, Scene, Solid, box, cylinder
-from stereovox.simulate.stage import Face, Stage, moved, rectangle, within
+from stereovox.simulate.stage import SHIFT, Face, Stage, moved, rectangle, within
+from stereovox.simulate.walking import walk
 
 HZ = 15.0
 """Images a second: the rate at which Chien 2020 wanted to map."""
-TURN_DEG = 70.0
-"""Degrees a second at which the camera turns."""
-EYE, PITCH_DEG = 1.35, -9.0
-"""Height above the floor in metres; how far the camera looks down, in degrees, once it is on its way."""
 WAYPOINTS = np.array([
     # x, y, yaw in degrees (0: east, 90: north; the camera never jumps from 180 to -180)
     [0.90, 1.60, 0],  # living room, once round clockwise
@@ -130,8 +124,6 @@ BOXES: dict[str, dict[str, tuple[Point, Point]]] = {
     },
 }
 """Lowest and highest corner by part and name."""
-SHIFT = np.array([0.0137, 0.0219, -0.0123])
-"""World coordinates of the plan's origin in metres."""
 HEIGHT, OUTSIDE = 2.5, 0.25
 """Of the rooms; thickness of the outer walls. Inner walls are as thick as the gaps between the rooms: 0.12 m."""
 ROOMS = {
@@ -170,32 +162,13 @@ def stage(*, speed: float = 0.8) -> Stage:
     within("speed", speed, 0.1, 5)
     T_world_plan = np.eye(4)
     T_world_plan[:3, 3] = SHIFT
-    path, seconds = walk(speed)
+    path, seconds = walk(WAYPOINTS, speed)
     faces = tuple(Face(face.name, transform_points(T_world_plan, face.corners)) for face in _sides())
 
     def build() -> Scene:
         return moved(Scene([*_shell(), *_walls(), *_frames(), *furniture()]), T_world_plan)
 
     return Stage(build, lambda share: T_world_plan @ path(share), round(seconds * HZ) + 1, HZ, faces=faces)
-
-
-def walk(speed: float) -> tuple[Callable[[float], Transform], float]:
-    """Return the path (T_plan_camera at a share of it) and how many seconds it takes at `speed` m/s.
-
-    Between waypoints the camera walks and turns at once; whichever takes longer sets the time. The first image looks
-    exactly level.
-    """
-    from scipy.interpolate import PchipInterpolator
-
-    times = _times(speed)
-    way = PchipInterpolator(times, WAYPOINTS)  # no overshoot: it would walk into walls
-
-    def path(share: float) -> Transform:
-        seconds = share * times[-1]
-        x, y, yaw_deg = way(seconds)
-        return _held(np.array([x, y, EYE]), np.radians(yaw_deg), seconds)
-
-    return path, float(times[-1])
 
 
 def furniture() -> list[Solid]:
@@ -209,32 +182,12 @@ def furniture() -> list[Solid]:
         cylinder("lamp", "lamp: stand", (4.25, 0.35, 0), (4.25, 0.35, 1.5), 0.03),
         cylinder("lamp", "lamp: shade", (4.25, 0.35, 1.5), (4.25, 0.35, 1.75), 0.3),
         cylinder("desk", "desk: leg, south", (7.68, 5.48, 0), (7.68, 5.48, 0.71), 0.05),
-        *_chair("kitchen chair", 7.1, 2.3, 0.35),
-        *_chair("desk chair", 7.35, 6.15, -0.5),
+        *chair("kitchen chair", 7.1, 2.3, 0.35),
+        *chair("desk chair", 7.35, 6.15, -0.5),
     ]
 
 
-def _times(speed: float) -> NDArray[np.float64]:
-    """Return the second (N,) at which each waypoint is reached."""
-    steps = np.diff(WAYPOINTS, axis=0)
-    walking = np.linalg.norm(steps[:, :2], axis=1) / speed
-    turning = np.abs(steps[:, 2]) / TURN_DEG
-    return np.append(0.0, np.cumsum(np.maximum(walking, turning)))
-
-
-def _held(eye: NDArray[np.float64], yaw: float, seconds: float) -> Transform:
-    """Return T_plan_camera as a hand holds it: it bobs with the steps, sways and looks a little down."""
-    beat = 2 * np.pi * seconds
-    eye = eye + np.array([0, 0, 0.012 * np.sin(1.8 * beat)])
-    pitch = np.radians(PITCH_DEG * (1 - np.exp(-seconds)) + 1.5 * np.sin(0.7 * beat))
-    roll = np.radians(1.2 * np.sin(0.9 * beat))
-    ahead = np.array([np.cos(yaw) * np.cos(pitch), np.sin(yaw) * np.cos(pitch), np.sin(pitch)])
-    T = look_at(eye, eye + ahead)
-    T[:3, :3] = T[:3, :3] @ rotation_matrix([0, 0, roll])
-    return T
-
-
-def _chair(name: str, x: float, y: float, turn: float) -> list[Solid]:
+def chair(name: str, x: float, y: float, turn: float) -> list[Solid]:
     """Return a chair whose sitter looks along +x turned by `turn` radians."""
 
     def part(label: str, low: Point, high: Point) -> Solid:

@@ -17,6 +17,7 @@ from stereovox.errors import ConfigError, SourceError
 from stereovox.frame import Frame, Photo, Reason
 from stereovox.se3 import Transform, inverse
 from stereovox.simulate.d435 import D435, classify, depth_camera
+from stereovox.simulate.drift import CameraPath, drifting
 from stereovox.simulate.floors.kinect import WIDTH
 from stereovox.simulate.honest import honest_d435, honest_kinect
 from stereovox.simulate.rendering import photograph
@@ -33,6 +34,8 @@ SCENES = {
     "wall": "stereovox.simulate.plain_scenes:wall_stage",
     "flight": "stereovox.simulate.flight:stage",
     "town": "stereovox.simulate.town:stage",
+    "loop": "stereovox.simulate.loop:stage",
+    "offices": "stereovox.simulate.offices:stage",
 }
 """Functions that return a `Stage`; their keyword arguments and defaults are the scene's parameters."""
 AXES = ("world", "optical")
@@ -57,6 +60,8 @@ class Options:
     subpixel, correlation: size of the noise, and the Gaussian that smooths it, in pixels (-1: the camera's own).
     photo: contrast of the pattern on all surfaces in a grey image that is taken along, registered to the depth (0.5:
         much of it, 0.05: painted walls; 0: no image is taken).
+    drift: how much the poses err, in metres per metre travelled (0.01 is a good tracker's), in all directions; the
+        heading drifts along, roll and pitch stay right, and no place is found again. Images are of the true poses.
     """
 
     axes: str = "world"
@@ -71,6 +76,7 @@ class Options:
     correlation: float = OWN
     farthest: float = 0.0
     photo: float = 0.0
+    drift: float = 0.0
 
     def __post_init__(self) -> None:
         one_of("axes", self.axes, AXES)
@@ -86,6 +92,7 @@ class Options:
                 within(name, getattr(self, name), 0, 5)
         within("farthest", self.farthest, 0, 65)
         within("photo", self.photo, 0, 1)
+        within("drift", self.drift, 0, 0.2)
 
 
 class Simulation(DepthSource):
@@ -100,6 +107,8 @@ class Simulation(DepthSource):
         sim:wall?distance=1.4&tilt=0&turn=0         a flat wall that fills the view
         sim:flight?length=2000&speed=5              out and back along the same hall
         sim:town?blocks=6&drive=0&length=120        streets with houses, lamps, trees and cars; a drive through them
+        sim:loop?length=60&laps=2&plan=0           a ring of corridors, walked round several times
+        sim:offices?offices=8&visits=10&walk=0      a corridor with offices of one kind, some visited again
 
     The scene functions' docstrings tell their parameters, `Options` those of every scene. World: z up, x forward, y
     left, metres; with `axes=optical` x right, y down, z forward from the first camera. Every frame can be asked for by
@@ -139,8 +148,7 @@ class Simulation(DepthSource):
     @cached_property
     def stage(self) -> Stage:
         """The scene and the way through it, in the frame of the poses."""
-        first = self._world.path(0.0)
-        return self._world if self.options.axes == "world" else self._world.moved(inverse(first))
+        return self._in_frame(self._world)
 
     @property
     def scene(self) -> Scene:
@@ -194,15 +202,41 @@ class Simulation(DepthSource):
         return Photo(lambda: photograph(self._world.scene, lens, T, GREY_NOISE, seed, contrast), camera)
 
     def pose(self, i: int) -> Transform:
-        """Return T_world_camera (4, 4) of frame `i`; raises IndexError beyond the last."""
-        if not 0 <= i < len(self):
-            raise IndexError(f"{self.name} has frames 0 to {len(self) - 1}, not {i}")
+        """Return T_world_camera (4, 4) that frame `i` comes with, drifted; raises IndexError beyond the last."""
+        self._check(i)
+        return self._reported(self._share(i))
+
+    def true_pose(self, i: int) -> Transform:
+        """Return T_world_camera (4, 4) from which frame `i` was taken; raises IndexError beyond the last."""
+        self._check(i)
         return self.stage.path(self._share(i))
 
     def upright_pose_at(self, stamp_ns: float) -> Transform:
-        """Return T_world_camera (4, 4) at any time, world z up whatever `axes` says; it stands before and after."""
+        """Return the true T_world_camera (4, 4) at any time, world z up whatever `axes` says.
+
+        The camera stands before the first frame and after the last.
+        """
         last = max(len(self) - 1, 1) * self.period_ns
         return self._world.path(min(max(stamp_ns / last, 0.0), 1.0))
+
+    @cached_property
+    def _reported(self) -> CameraPath:
+        """The poses as frames have them."""
+        if not self.options.drift:
+            return self.stage.path
+        seconds = (self._world.frames - 1) / self._world.hz
+        random = np.random.default_rng([self.seed, 0, 2])  # not the noise's
+        return self._in_frame(
+            replace(self._world, path=drifting(self._world.path, seconds, self.options.drift, random))
+        ).path
+
+    def _in_frame(self, stage: Stage) -> Stage:
+        """Return a stage, world z up, in the frame of the poses."""
+        return stage if self.options.axes == "world" else stage.moved(inverse(self._world.path(0.0)))
+
+    def _check(self, i: int) -> None:
+        if not 0 <= i < len(self):
+            raise IndexError(f"{self.name} has frames 0 to {len(self) - 1}, not {i}")
 
     def _share(self, i: int) -> float:
         return i / max(len(self) - 1, 1)

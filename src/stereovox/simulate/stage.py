@@ -15,6 +15,9 @@ from stereovox.se3 import Transform, transform_points
 from stereovox.simulate.d435 import D435
 from stereovox.simulate.scene import Point, Scene, Solid
 
+SHIFT = np.array([0.0137, 0.0219, -0.0123])
+"""Metres by which plans are moved, so that no wall lies exactly on a cell's face for any round cell size."""
+
 
 @dataclass(frozen=True, eq=False)
 class Face:

@@ -224,7 +224,7 @@ class _Places:
 
     def find(self, T: NDArray[np.float64], way: float, drift: Drift) -> NDArray[np.float64] | None:
         """Return the errors at the earliest place known again, else None."""
-        old = int(np.searchsorted(self.way, way - drift.loop_m))
+        old = int(np.searchsorted(self.way, way - drift.loop_m)) if drift.find_again_m else 0
         if not old:
             return None
         near = np.linalg.norm(np.array(self.where[:old]) - T[:3, 3], axis=1) < drift.find_again_m

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from stereovox.se3 import Transform, look_at
 from stereovox.simulate.d435 import D435, depth_camera
 from stereovox.simulate.scene import Scene, Solid, box, cylinder
-from stereovox.simulate.stage import Stage, within
+from stereovox.simulate.stage import SHIFT, Stage, within
 
 PITCH = 50.0
 """Metres from street to street."""
@@ -24,7 +24,6 @@ ROAD, STREET = 3.25, 5.5
 """Half width of the carriageway, and of the street with its pavements."""
 KERB = 0.12
 """Height of the pavements."""
-SHIFT = np.array([0.0137, 0.0219, -0.0123])
 HZ = 10.0
 EYE = 1.6
 CORNER = 5.0

@@ -20,6 +20,8 @@ KEPT = 20_000
 """Readings of a live IMU that are kept: 50 s at 400 Hz."""
 ACROSS_S = 0.1
 """Longest time between two accelerations that is bridged."""
+GRAVITY = 9.0, 10.6
+"""Length in m/s^2 that a mean specific force must have to say which way is up."""
 
 
 class Imu(Protocol):
@@ -143,6 +145,12 @@ def at_times(stamps_ns: NDArray[np.int64], values: NDArray[np.float64], wanted_n
         apart = stamps_ns[after] - stamps_ns[after - 1] > ACROSS_S * 1e9
         found[apart & ~np.isin(wanted, stamps_ns)] = np.nan
     return found
+
+
+def up_of_force(force: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """Return the unit vector (3,) along a mean force, in m/s^2; None where it has not the length of gravity."""
+    length = float(np.linalg.norm(force))
+    return force / length if GRAVITY[0] <= length <= GRAVITY[1] else None
 
 
 class LiveImu:

@@ -19,6 +19,7 @@ from stereovox.sources.poses import seconds_from_ns as seconds_from_ns
 
 LIMIT = 9_223_372_036
 """Seconds whose nanoseconds still fit into int64."""
+TRAJECTORY_ENDINGS = (".tum", ".txt")
 FORMAT = "stamp tx ty tz qx qy qz qw"
 StampedLine = tuple[int, str, str]
 """Time in nanoseconds, the rest of the line, and `file:line` for messages."""

@@ -17,6 +17,8 @@ CONTRARY = 100.0
 """Squared deviations, of six, beyond which two poses contradict each other, such as those of two stages."""
 HOLDS = 1.0
 """Information, by that of what is expected, below which a direction is not held."""
+RIGID = 0.01
+"""Largest rigidity error of a pose, motion or place of a camera that is given."""
 
 LOST = "tracking_lost"
 """Reason of refusal of frames whose pose is not known."""

@@ -10,7 +10,8 @@ import numpy as np
 from stereovox.config import Config
 from stereovox.frame import AnyFrame
 from stereovox.se3 import Transform, inverse, orthonormalise, rigidity_error
-from stereovox.track.tracker import RIGID, Tracked, Tracker
+from stereovox.track.fit import RIGID
+from stereovox.track.tracker import Tracked, Tracker
 
 NO_START = "no frame so far has a pose of its own, at which the map could begin"
 
@@ -58,7 +59,7 @@ class GuidedTracker:
         return tracked.moved(self._T_world_tracker)
 
     def picture_use(self) -> str:
-        """Return what of the frames so far could not be used, in words; "" where nothing is amiss."""
+        """Return what was made of the pictures beside depth images so far, in words; "" where there are none."""
         return self._tracker.picture_use()
 
     def _begin(self, own: Transform | None) -> None:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from stereovox.errors import SourceError
 from stereovox.se3 import rotation_matrix, rotation_vector
 from stereovox.sources.base import Stream, imu_of
-from stereovox.sources.imu import Imu, ImuReadings
+from stereovox.sources.imu import Imu, ImuReadings, up_of_force
 
 DENSITY = 5e-4
 """Noise of the angular rate in rad/s per root hertz: three times that of a small gyroscope."""
@@ -40,8 +40,6 @@ AROUND_S, AT_REST_S, LEAST_S = 3.0, 0.5, 2.0
 """Readings around an image that say what is up: within so many seconds; how long a rest is; fewest while moving."""
 REST_FORCE, REST_RATE, FEWEST = 0.15, 0.05, 5
 """Standard deviation in m/s^2 and mean rate in rad/s up to which a camera is at rest, and readings that say so."""
-GRAVITY = 9.0, 10.6
-"""Length in m/s^2 that the mean specific force must have."""
 RESTING, MOVING = np.radians(1), np.radians(5)
 """How far off up may be by an accelerometer at rest, and on the average of a moving one."""
 HALVES = np.radians(5)
@@ -251,20 +249,16 @@ def up_by_force(imu: Imu, stamp_ns: int) -> Up | None:
     force = np.einsum("nij,nj->ni", R, readings.specific_force @ readings.T_sensor_imu[:3, :3].T)
     rest = _rest(seconds[felt], force[felt], readings.angular_rate[felt])
     if rest is not None:
-        up = _up(rest)
+        up = up_of_force(rest)
         return None if up is None else Up(up, RESTING)
     if np.ptp(seconds[felt]) < LEAST_S:
         return None
     half = len(force[felt]) // 2
-    one, other, both = (_up(part.mean(axis=0)) for part in (force[felt][:half], force[felt][half:], force[felt]))
+    parts = force[felt][:half], force[felt][half:], force[felt]
+    one, other, both = (up_of_force(part.mean(axis=0)) for part in parts)
     if one is None or other is None or one @ other < np.cos(HALVES):
         return None
     return None if both is None else Up(both, MOVING)
-
-
-def _up(force: NDArray[np.float64]) -> NDArray[np.float64] | None:
-    length = float(np.linalg.norm(force))
-    return force / length if GRAVITY[0] <= length <= GRAVITY[1] else None
 
 
 def _rest(

@@ -18,14 +18,12 @@ from stereovox.frame import DepthImage, Photo
 from stereovox.se3 import Transform, inverse, orthonormalise, rigidity_error, transform_points
 from stereovox.track._photos import laid_into
 from stereovox.track.corners import SOFT, WINDOW
-from stereovox.track.fit import Equations, Fit, Stage, motion_between, settled
+from stereovox.track.fit import RIGID, Equations, Fit, Stage, motion_between, settled
 from stereovox.track.landmarks import Landmarks, Sight
 from stereovox.track.sightings import AGREED, CONVERGED, REACHES, Sightings
 from stereovox.track.views import View, stood_free
 from stereovox.trust.validate import matrix_of
 
-RIGID = 0.01
-"""Largest rigidity error of the place of a camera."""
 MAX_ARM_M = 10.0
 """Farthest that a camera can be beside the depth camera."""
 CELL, STEP = 4.0, 2
@@ -156,7 +154,7 @@ class Photos:
         sigma = (found.deviation / np.maximum(found.corners.inverse, 1e-3) ** 2).astype(np.float32)
         found = found.those(~stood_free(points, sigma, expected, views))
         enough = len(found) >= max(AGREED, FOLLOWED * found.sought)
-        moved = np.abs(motion_between(self._last, expected))
+        moved = motion_between(self._last, expected)
         lag = np.repeat([np.linalg.norm(moved[:3]), np.linalg.norm(moved[3:])], 3) * LAG
         self._followed = (
             Beside(found, seen.T_sensor_camera, np.diag(np.square(lag, dtype=np.float64))) if enough else None

@@ -14,7 +14,7 @@ import numpy as np
 from stereovox.errors import SourceError
 from stereovox.frame import AnyFrame, name_of
 from stereovox.sources.base import Stream
-from stereovox.track.fit import LOST
+from stereovox.track.fit import LOST, deviations
 from stereovox.track.tracker import Tracked
 
 CURE = "move slower, or back to what was seen before"
@@ -111,7 +111,9 @@ def posed(frame: AnyFrame, tracked: Tracked) -> AnyFrame:
     if _is_faulty(frame):
         return frame
     if not tracked.lost:
-        return replace(frame, T_world_sensor=tracked.T_world_sensor, pose_off_ns=0, fault=None, fault_detail="")
+        sigma = deviations(tracked.covariance)
+        T = tracked.T_world_sensor
+        return replace(frame, T_world_sensor=T, pose_off_ns=0, pose_sigma=sigma, fault=None, fault_detail="")
     name = name_of(frame)
     detail = f"{tracked.lost if name in tracked.lost else f'{name}: {tracked.lost}'}; {CURE}"
     return replace(frame, T_world_sensor=np.full((4, 4), np.nan), pose_off_ns=0, fault=LOST, fault_detail=detail)

@@ -91,7 +91,7 @@ class Surfaces:
         return FLOOR_M + BIAS * RangeNoise.of(self._config.noise, camera).sigma(depths)
 
     def picture_use(self) -> str:
-        """Return what of the frames so far could not be used, in words; "" where nothing is amiss."""
+        """Return what was made of the pictures beside depth images so far, in words; "" where there are none."""
         return self._photos.picture_use()
 
     def forget(self) -> None:
@@ -126,10 +126,9 @@ class Surfaces:
         moved = not contrary(T, seen.T_map_camera, covariance + seen.covariance + beside.lag)
         if held and apart and (moved or len(beside.found) < STRONG or not self._photos.trusted()):
             return alone
-        if held and not apart:
-            self._photos.agree(T)
         together = [Stage(both(level, beside.equations()), CONVERGED * level.size) for level in levels]
         if held and not apart:
+            self._photos.agree(T)
             T, covariance = settled(together[-1:], expected, doubt, T)
         else:
             T, covariance = settled(together, expected, doubt, seen.T_map_camera)

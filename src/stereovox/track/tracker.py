@@ -25,7 +25,7 @@ from stereovox.se3 import (
     rotation_vector,
 )
 from stereovox.sources.imu import Imu
-from stereovox.track.fit import Fit, Limits, deviations
+from stereovox.track.fit import RIGID, Fit, Limits, deviations
 from stereovox.track.inertial import Gyroscope, Turn, up_by_force
 from stereovox.track.surfaces import Surfaces
 from stereovox.track.views import far_apart
@@ -48,8 +48,6 @@ FIRST = 3.0
 """Times the usual spread, from the first image to the second: the camera may be moving."""
 REMEMBERED = 8
 """Times of images that say how far apart they usually are."""
-RIGID = 0.01
-"""Largest rigidity error of a pose that is given."""
 CONFIRMED = 5
 """Images in a row that must be tracked after a view is found again, without teaching, until poses count."""
 

@@ -98,23 +98,23 @@ def far_apart(one: Transform, other: Transform, metres: float, radians: float) -
     return bool(np.linalg.norm(one[:3, 3] - other[:3, 3]) > metres or turn > radians)
 
 
-def contradiction(seen: View, views: list[View]) -> tuple[float, int]:
+def contradiction(seen: View, views: list[View], deviations: float = 4.0) -> tuple[float, int]:
     """Return the share of what is seen twice that lies where a view looked through, and how many places are seen twice.
 
     Each way: surfaces of the image in front of what the nearest views saw, and theirs in front of what it sees.
     """
     pairs = [(a, b) for view in nearest_views(views, seen.T, NEAR) for a, b in ((seen, view), (view, seen))]
-    through, same = np.sum([_seen_through(a, b) for a, b in pairs], axis=0) if pairs else (0, 0)
+    through, same = np.sum([_seen_through(a, b, deviations) for a, b in pairs], axis=0) if pairs else (0, 0)
     return through / max(through + same, 1), int(through + same)
 
 
-def _seen_through(one: View, other: View) -> tuple[int, int]:
+def _seen_through(one: View, other: View, deviations: float) -> tuple[int, int]:
     """Return how many points of one view the other looks through, and how many it sees as well."""
     T = inverse(other.T) @ one.T
     points = one.points @ T[:3, :3].T + T[:3, 3]
     row, column, inside = _places(other, points)
     z, seen = points[inside, 2], other.depth[row[inside], column[inside]]
-    slack = 4 * one.sigma[inside] + TOLERANCE * seen
+    slack = deviations * one.sigma[inside] + TOLERANCE * seen
     return int((z < seen - slack).sum()), int((np.abs(z - seen) <= slack).sum())
 
 

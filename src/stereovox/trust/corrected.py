@@ -15,11 +15,12 @@ from stereovox.trust.history import History
 def correct_history(history: History, before: Sequence[tuple[str, Seen]], after: Sequence[tuple[str, Seen]]) -> None:
     """Give a history the corrected poses, so that the next frames are compared with these.
 
-    What a sensor's frames waited for, or were in doubt of, was the map of before: it begins anew.
+    What a sensor's frames waited for, or were in doubt of, was the map of before: it begins anew. So do the lines of
+    loops, whose places are elsewhere now.
 
     before, after: sensor and pose of the frames, in the order in which they entered the map.
     """
-    history.path = CameraPath()
+    history.path, history.loops = CameraPath(), None
     for sensor, seen in after:
         history.path.walk(sensor, seen)
     last = {sensor: (old, new) for (sensor, old), (_, new) in zip(before, after, strict=True)}

@@ -15,6 +15,7 @@ import numpy as np
 from stereovox.errors import one_line, shortened
 from stereovox.trust.camera_path import FARTHEST, CameraPath
 from stereovox.trust.camera_path import Seen as Seen
+from stereovox.trust.loop_lines import LoopLines
 
 MAX_SENSORS = 64
 """Sensors that one map distinguishes."""
@@ -121,6 +122,7 @@ class History:
         usual: Usual disagreement with the map of each camera's frames, 0 to 1.
         doubts: Cameras whose last frames disagree with the map more than usual.
         imported: The file of another program that the map began with; None where there was none.
+        loops: The loops that were closed; None where none were sought, or poses were corrected otherwise since.
     """
 
     frames: int = 0
@@ -136,6 +138,7 @@ class History:
     usual: dict[str, RunningMean] = field(default_factory=dict)
     doubts: dict[str, Doubt] = field(default_factory=dict)
     imported: Imported | None = None
+    loops: LoopLines | None = None
 
     def made_of(self) -> str:
         """Return lines for people: the recording, or the imported file and the notes about it, or both."""
@@ -182,6 +185,7 @@ class History:
                 "doubts": {name: doubt._asdict() for name, doubt in self.doubts.items()},
             },
             "camera_path": self.path.saved(),
+            "loops": None if self.loops is None else self.loops.saved(),
         }
 
     @classmethod
@@ -194,6 +198,7 @@ class History:
         recording, last = one_line(str(saved["recording"])), _last_frame_from(saved.get("last_frame"))
         entries, path = saved.get("history"), _path_from(saved.get("camera_path"))
         imported = _imported_from(saved.get("imported"))
+        loops = None if saved.get("loops") is None else LoopLines.loaded(saved["loops"])
         if entries is None:
             return cls(
                 frames,
@@ -202,6 +207,7 @@ class History:
                 last_frame=last,
                 path=path,
                 imported=imported,
+                loops=loops,
             )
         reasons, settled, ways = (_counts(entries[name], name) for name in ("refused", "settled", "ways"))
         trusted = {name: _seen_from(seen) for name, seen in _sensors(entries["trusted"]).items()}
@@ -214,6 +220,7 @@ class History:
         history = cls(
             frames, reasons, settled, ways, recording, last, trusted, waiting, path, looks, usual, doubts, imported
         )
+        history.loops = loops
         if history.refused.total() != refused:
             raise ValueError(f"frames_refused is {refused}, its reasons add up to {history.refused.total()}")
         return history

@@ -79,6 +79,9 @@ def validate_fields(seen: Any, *kinds: type) -> None:
     if seen.fault:  # the rest of a frame that the source could not deliver is not checked
         raise FrameRefused(seen.fault, seen.fault_detail or f"{_label(seen)}: {seen.fault}")
     _check_fields(seen, FIELDS[kind])
+    if not isinstance(seen, Scan) and not _is_sigma(seen.pose_sigma):
+        detail = "pose_sigma is not two numbers of at least 0; give (radians, metres)"
+        raise FrameRefused("bad_form", f"{_label(seen)}: {detail}")
     for name in MEASURED[kind]:
         if isinstance(getattr(seen, name), np.ma.MaskedArray):
             raise FrameRefused("bad_form", f"{_label(seen)}: {name} is a masked array; fill it, `{name}.filled(0)`")
@@ -173,6 +176,13 @@ def _check_fields(seen: object, wanted: dict[str, Field]) -> None:
             raise FrameRefused(reason, f"{_label(seen)}: {name} is {type(value).__name__}; give {what}")
         if types[0] is int and isinstance(value, WHOLE.types) and abs(int(value)) >= MAX_INT:
             raise FrameRefused(reason, f"{_label(seen)}: {name} does not fit into 64 bits; give {what}")
+
+
+def _is_sigma(given: Any) -> bool:
+    """Return whether these are two deviations."""
+    if not isinstance(given, tuple) or len(given) != 2:
+        return False
+    return all(isinstance(one, NUMBER.types) and 0 <= one <= MAX_POSITION for one in given)
 
 
 def _label(seen: object) -> str:

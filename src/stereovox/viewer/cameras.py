@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cameras in the viewer: the last one, their path, and the initial viewpoint of the page."""
+"""Cameras in the viewer: the last one, their path, closed loops, and the initial viewpoint of the page."""
 
 from __future__ import annotations
 
@@ -11,7 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 from stereovox.frame import Viewpoint
 from stereovox.maps import State, VoxelMap
 from stereovox.products.floor_axes import upright_axes
+from stereovox.trust.loop_lines import LoopLines
 from stereovox.view.drawn import UPS, checked_up
+from stereovox.view.loops import CLOSED, REFUSED
 from stereovox.view.panels import PATH_COLOUR
 from stereovox.view.space import ABOVE_DEG, BEHIND_DEG
 from stereovox.view.viewpoint import field_of_view
@@ -27,19 +29,26 @@ FRUSTUM_M = 0.15
 """Depth of the small fields of view along the path."""
 MAX_FRUSTA = 60
 FRUSTA_COLOUR = "#2a78c2"
+LOOPS_HINT = "lines between places that were recognised as one (green), or look alike and were not believed to be (red)"
 
 
 class Cameras:
-    """The last camera, the path of all cameras, fields of view along it, and their check boxes."""
+    """The last camera, the path of all cameras, fields of view along it, loops, and their check boxes.
+
+    The box of loops is there where the map remembers some.
+    """
 
     def __init__(self, server: ViserServer, voxel_map: VoxelMap):
         self._server, self._map = server, voxel_map
-        self._roots = {name: server.scene.add_frame(f"/{name}", show_axes=False) for name in ("path", "frusta")}
+        self._roots = {
+            name: server.scene.add_frame(f"/{name}", show_axes=False) for name in ("path", "frusta", "loops")
+        }
         with server.gui.add_folder("Camera"):
             self.last = server.gui.add_checkbox("last view", True)
             self.path = server.gui.add_checkbox("path", True)
             self.frusta = server.gui.add_checkbox("views along the path", False)
-        for box in (self.last, self.path, self.frusta):
+            self.loops = server.gui.add_checkbox("loops", True, hint=LOOPS_HINT)
+        for box in (self.last, self.path, self.frusta, self.loops):
             box.on_update(lambda _: self._draw())
         self._drawn: FrameHandle | None = None
         self.update(voxel_map)
@@ -51,12 +60,15 @@ class Cameras:
         if viewpoint is not None:
             self._drawn = add_camera(self._server, viewpoint, voxel_map.config.max_range)
         add_path(self._server, voxel_map)
+        self.loops.visible = voxel_map.history.loops is not None
+        add_loops(self._server, voxel_map)
         self._draw()
 
     def _draw(self) -> None:
         if self._drawn is not None:
             self._drawn.visible = self.last.value
         self._roots["path"].visible, self._roots["frusta"].visible = self.path.value, self.frusta.value
+        self._roots["loops"].visible = self.loops.value
         if self.frusta.value:
             add_frusta(self._server, self._map)
 
@@ -80,11 +92,14 @@ def add_camera(server: ViserServer, viewpoint: Viewpoint, reach_m: float) -> Fra
 def add_path(server: ViserServer, voxel_map: VoxelMap) -> None:
     """Add a line along the path of each sensor; remove those that the map no longer has."""
     lines = [np.stack([line[:-1], line[1:]], axis=1) for line in voxel_map.history.path.lines()]
-    segments = np.concatenate([np.empty((0, 2, 3)), *lines])
-    if len(segments):
-        server.scene.add_line_segments("/path/line", segments, rgb(PATH_COLOUR), thickness=3, thickness_units="screen")
-    else:
-        _remove(server, "/path/line")
+    _add_lines(server, "/path/line", np.concatenate([np.empty((0, 2, 3)), *lines]), PATH_COLOUR)
+
+
+def add_loops(server: ViserServer, voxel_map: VoxelMap) -> None:
+    """Add lines between the places of closed and of refused loops; remove those that the map no longer has."""
+    loops = voxel_map.history.loops or LoopLines()
+    for name, lines, colour in (("closed", loops.closed, CLOSED), ("refused", loops.refused, REFUSED)):
+        _add_lines(server, f"/loops/{name}", lines.ends, colour)
 
 
 def add_frusta(server: ViserServer, voxel_map: VoxelMap) -> None:
@@ -97,6 +112,14 @@ def add_frusta(server: ViserServer, voxel_map: VoxelMap) -> None:
     server.scene.add_line_segments(
         "/frusta/views", np.concatenate(lines), rgb(FRUSTA_COLOUR), thickness=1.5, thickness_units="screen"
     )
+
+
+def _add_lines(server: ViserServer, name: str, segments: NDArray[np.float64], colour: str) -> None:
+    """Add line segments (N, 2, 3), or remove them where there are none."""
+    if len(segments):
+        server.scene.add_line_segments(name, segments, rgb(colour), thickness=3, thickness_units="screen")
+    else:
+        _remove(server, name)
 
 
 def _remove(server: ViserServer, name: str) -> None:

@@ -28,6 +28,8 @@ def statistics(voxel_map: VoxelMap) -> str:
         low, high = bounds[:, axis] if bounds is not None else (0, 0)
         rows[name] = f"{low:.2f} to {high:.2f} m"
     rows["frames"] = f"{voxel_map.frames:,} ({voxel_map.frames_refused:,} refused)"
+    if (loops := voxel_map.history.loops) is not None:
+        rows["loops"] = f"{loops.closed.number:,} closed, {loops.refused.number:,} refused"
     rows["memory"] = f"{voxel_map.memory_bytes / 1e6:,.1f} MB"
     rows["profile"] = plain(voxel_map.config.profile)
     if voxel_map.recording:

@@ -12,10 +12,11 @@ from stereovox.config import load_config
 from stereovox.config.robot import SlamConfig
 from stereovox.errors import ConfigError
 from stereovox.frame import Scan
-from stereovox.localize.slam.graph import Edge, Keyframe, patch_edges
+from stereovox.localize.slam.graph import Keyframe, patch_edges
 from stereovox.localize.slam.line_map import Cloud, Match, cloud_of
 from stereovox.localize.slam.loops import ClosureSearch, LoopFinder
 from stereovox.localize.slam.pipeline import Slam, map_scans
+from stereovox.pose_graph import Edge
 
 HALL = np.vstack([box(-3, -2, 9, 3), box(1, 1, 2, 1.6), box(6, -2, 6.4, -1.5), box(-3, 0, -2.6, 1)])
 STRAIGHT = drive(HALL, along([(0, 0), (5, 0)]), limit=20.0)
@@ -69,12 +70,12 @@ def slip(config):
     return abs(slam.pose[0] - 1.4)
 
 
-def points_on_lines(config):
-    """Share of points with 3 cm of noise that lie on lines."""
+def information_of_patches(config):
+    """Mean information, all directions together, of where keyframes with 3 cm of noise stand to patches."""
     scans = drive(HALL, along([(0, 0), (3, 0)]), noise=0.03, limit=20.0)
     poses = [scan.pose_world_base for scan in scans]
     made = [Keyframe(p, p, cloud_of(s, 30.0), s, 0.0) for p, s in zip(poses, scans, strict=True)]
-    return np.mean([edge.share for edge in patch_edges(made, config.slam)] or [0.0])
+    return np.mean([np.trace(edge.information) for edge in patch_edges(made, config.slam)])
 
 
 def farthest_pair(config):
@@ -182,7 +183,7 @@ LONGEST = 18.0
 ROWS = [
     ("voxel_size", side_of_cells, {0.05: 0.05, 0.1: 0.1}),
     ("max_range", farthest_hit, {3.0: (2.5, 3.0), 7.0: (6.5, 7.0)}),
-    ("sigma", points_on_lines, {0.03: (0.4, 0.65), 0.1: (0.8, 0.95)}),
+    ("sigma", information_of_patches, {0.03: (5e5, 9e5), 0.1: (7e4, 1.1e5)}),
     ("odometry", slip, {(0.02, 0.2, 0.07, 0.5): (0.2, 0.6), (0.3, 0.2, 0.07, 0.5): (0.0, 0.03)}),
     ("keyframe_distance", gap_on_the_way, {0.25: (0.25, 0.25 + ABOUT), 0.8: (0.8, 0.8 + ABOUT)}),
     ("keyframe_turn", gap_of_turns, {0.2: (0.2, 0.2 + ABOUT), 0.6: (0.6, 0.6 + ABOUT)}),

@@ -13,7 +13,8 @@ from stereovox import se2
 from stereovox.config import load_config
 from stereovox.errors import ConfigError, MissingExtra, StereovoxError
 from stereovox.evaluate.trajectory import read_relations, relation_errors
-from stereovox.localize.slam.pipeline import Slam, map_scans
+from stereovox.localize.slam.pipeline import SCANS_PER_KEYFRAME, Slam, map_scans
+from stereovox.mapper import GridMapper
 from stereovox.maps import State
 from stereovox.sources.robots.carmen import CarmenLog
 
@@ -70,6 +71,34 @@ def test_walls_are_thin_and_where_they_are(loop):
     assert np.quantile(gap, 0.98) < 0.08
     length = np.linalg.norm(ways, axis=1).sum() / result.grid.resolution
     assert 0.6 * length < len(points) < 1.3 * length  # about one cell thick
+
+
+def grid_of(scans):
+    """The grid that a new mapper makes of keyframes' scans at the poses that they have."""
+    odds = {p: (p / (1 - p)) ** SCANS_PER_KEYFRAME for p in (0.7, 0.4)}
+    evidence = {"grid.p_occupied": odds[0.7] / (1 + odds[0.7]), "grid.p_free": odds[0.4] / (1 + odds[0.4])}
+    slam = load_config().slam
+    mapper = GridMapper(voxel_size=slam.voxel_size, max_range=slam.max_range, **evidence)
+    for scan in scans:
+        far = np.where(np.isposinf(scan.ranges), np.float32(np.nan), scan.ranges)
+        assert mapper.add(replace(scan, ranges=far)).refused is None
+    return mapper.occupancy()
+
+
+def at(keyframe, pose):
+    return replace(keyframe.scan, T_world_sensor=se2.lifted(pose) @ keyframe.scan.T_base_sensor)
+
+
+def test_the_map_is_that_of_a_new_run_with_the_keyframes_where_they_are_now(loop):
+    """Cell for cell: nothing is left of where they were before loops were closed."""
+    _, scans, live, result = loop
+    new = grid_of([at(keyframe, keyframe.pose) for keyframe in result.keyframes])
+    assert np.allclose(new.origin, result.grid.origin, rtol=0, atol=1e-9)
+    assert np.array_equal(new.cells, result.grid.cells)
+    first_seen = live[np.searchsorted([s.stamp_ns for s in scans], [k.scan.stamp_ns for k in result.keyframes])]
+    assert apart(np.array([key.pose for key in result.keyframes]), first_seen).max() > result.grid.resolution
+    old = grid_of([at(*pair) for pair in zip(result.keyframes, first_seen, strict=True)])
+    assert old.cells.shape != new.cells.shape or (old.cells != new.cells).sum() > 100
 
 
 def test_the_track_turns_odometry_into_the_map(loop):

@@ -10,10 +10,17 @@ import pytest
 from made_robot_bags import START_NS, TF, Messages
 
 from stereovox.sources.bags.messages import Wire
-from stereovox.sources.bags.robot_messages import read_laser_scan, read_odometry, read_point_cloud, read_transforms
+from stereovox.sources.bags.robot_messages import (
+    read_laser_scan,
+    read_odometry,
+    read_path,
+    read_point_cloud,
+    read_transforms,
+)
 
 INF, NAN = np.inf, np.nan
 SCAN, CLOUD, ODOMETRY = "sensor_msgs/LaserScan", "sensor_msgs/PointCloud2", "nav_msgs/Odometry"
+PATH = "nav_msgs/Path"
 WIRES = pytest.mark.parametrize(("ros", "little"), [(1, True), (2, True), (2, False)])
 STAMP = START_NS + 123_456_789
 
@@ -151,13 +158,25 @@ def test_odometry_and_transforms(ros, little):
     assert (second.stamp_ns, second.parent, second.child, second.numbers) == (STAMP + 5, "odom", "a_frame", other)
 
 
+@WIRES
+def test_a_path_and_its_poses_that_are_none(ros, little):
+    made, numbers = Messages(ros), (1.0, -2.0, 3.0, 0.1, -0.2, 0.3, 0.9)
+    told = made.path("map", (STAMP, numbers), (STAMP + 5, [np.nan] * 7), (STAMP + 9, [0.0] * 7), (STAMP + 7, numbers))
+    stamps, rows = read_path(made.wire(PATH, told, little))
+    assert stamps.tolist() == [STAMP, STAMP + 7]
+    np.testing.assert_array_equal(rows, [numbers, numbers])
+    stamps, rows = read_path(made.wire(PATH, made.path("map"), little))
+    assert (stamps.shape, rows.shape) == ((0,), (0, 7))
+
+
 CASES = {
     SCAN: (read_laser_scan, lambda made: made.scan(STAMP, [1.0, 2.0, 3.0])),
     CLOUD: (read_point_cloud, lambda made: made.cloud(STAMP, np.ones((3, 3)))),
     ODOMETRY: (read_odometry, lambda made: made.odometry(STAMP, [0, 0, 0, 0, 0, 0, 1])),
+    PATH: (read_path, lambda made: made.path("a", (STAMP, [0, 0, 0, 0, 0, 0, 1]))),
     TF: (read_transforms, lambda made: made.transforms((STAMP, "a", "b", [0, 0, 0, 0, 0, 0, 1]))),
 }
-NEEDED = {SCAN: 4, CLOUD: 1, ODOMETRY: 36 * 8 * 2 + 6 * 8, TF: 0}
+NEEDED = {SCAN: 4, CLOUD: 1, ODOMETRY: 36 * 8 * 2 + 6 * 8, PATH: 0, TF: 0}
 """Bytes behind what is read: intensities, is_dense, covariances and speeds."""
 
 

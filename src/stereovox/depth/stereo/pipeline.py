@@ -52,6 +52,7 @@ class StereoDepth:
         return Frame(
             depth_m, camera, pose, frame.stamp_ns, reason=found.reason, name=frame.name, sensor=frame.sensor,
             pose_off_ns=frame.pose_off_ns,
+            pose_sigma=frame.pose_sigma,
         )  # fmt: skip
 
     def _depth(self, found: Disparity, camera: VirtualCamera) -> NDArray[np.float32]:

@@ -143,7 +143,7 @@ def _simulated(
     exact, seen = exact_occupancy(source.scene, size), Seen(size, reach)
     for n, i in enumerate(picked):
         tell(n, len(picked), f"{location}: truth")
-        seen.add(source.true_depth(i), source.camera, source.pose(i))
+        seen.add(source.true_depth(i), source.camera, source.true_pose(i))
     ends, through = (np.union1d(seen.cells(mark), seen.cells(FREE | END)) for mark in (END, FREE))
     surface = np.intersect1d(ends, exact.surface, assume_unique=True)
     truth = truth_of(surface, without(through, exact.surface, exact.inside), size, reach)

@@ -1,20 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The pose graph of SLAM: keyframes, what is known of where two of them stand, and the last refinement."""
+"""What is known of where keyframes stand to each other, for the pose graph: steps, and the last refinement."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from stereovox import se2
 from stereovox.config.robot import SlamConfig
-from stereovox.errors import MissingExtra
 from stereovox.frame import Scan
 from stereovox.localize.slam.line_map import Cloud, LineMap, joined
+from stereovox.pose_graph import Edge
 
 STEP_SIGMA = (0.01, 0.03, 0.003, 0.02)
 """Standard deviation of a matched step between keyframes: metres, per metre, radians, per radian."""
@@ -30,8 +29,6 @@ MAX_NEIGHBOURS = 120
 """Keyframes that are laid onto a patch: a robot may pass the same place all day."""
 MIN_SHARE = 0.4
 """Share of a keyframe's points that must lie on a patch's lines."""
-OUTLIER = 3.0
-"""Standard deviations from which on a robust edge pulls less and less (Cauchy)."""
 
 
 @dataclass(eq=False)
@@ -51,20 +48,6 @@ class Keyframe:
     travelled: float
     slack: float = 0.0
     lost: bool = False
-
-
-@dataclass(frozen=True, eq=False)
-class Edge:
-    """How two keyframes stand to each other: motion (3,) is pose_first_second.
-
-    information: (3, 3) of x, y, yaw in the second's frame. share: of the points that lay on lines, 1 for a step.
-    """
-
-    first: int
-    second: int
-    motion: se2.Pose
-    information: NDArray[np.float64]
-    share: float = 1.0
 
 
 def step_edges(keyframes: list[Keyframe]) -> list[Edge]:
@@ -126,32 +109,6 @@ def patch_edges(keyframes: list[Keyframe], config: SlamConfig) -> Iterator[Edge]
                 yield edge
 
 
-def optimised(
-    poses: se2.Pose, steps: Iterable[Edge], edges: Iterable[Edge], scale: float = 1.0, outlier: float = OUTLIER
-) -> se2.Pose:
-    """Return the poses (N, 3) that explain all edges best; the first one stays.
-
-    steps: edges that are surely right. edges: edges any of which may be wrong, as their information times `scale`; they
-    are weighted by Cauchy's function.
-    Raises MissingExtra where gtsam is not installed.
-    """
-    gtsam = _gtsam()
-    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    for i, (x, y, yaw) in enumerate(poses):
-        values.insert(i, gtsam.Pose2(x, y, yaw))
-    graph.add(gtsam.PriorFactorPose2(0, values.atPose2(0), gtsam.noiseModel.Isotropic.Sigma(3, 1e-4)))
-    robust = gtsam.noiseModel.mEstimator.Cauchy.Create(outlier)
-    for edge in steps:
-        graph.add(_factor(gtsam, edge, _noise(gtsam, edge.information)))
-    for edge in edges:
-        noise = gtsam.noiseModel.Robust.Create(robust, _noise(gtsam, edge.information * scale))
-        graph.add(_factor(gtsam, edge, noise))
-    parameters = gtsam.LevenbergMarquardtParams()
-    parameters.setMaxIterations(50)
-    found = gtsam.LevenbergMarquardtOptimizer(graph, values, parameters).optimize()
-    return np.array([_numbers(found.atPose2(i)) for i in range(len(poses))])
-
-
 def _neighbours(places: se2.Pose, middle: int, first: int, last: int, config: SlamConfig) -> NDArray[np.int64]:
     far = np.hypot(*(places[:, :2] - places[middle, :2]).T)
     near = np.nonzero(far < config.refine_distance)[0]
@@ -169,24 +126,4 @@ def _edge(
     if match.share < MIN_SHARE or moved[0] ** 2 + moved[1] ** 2 > 0.1 or abs(moved[2]) > 0.1:
         return None
     information = without_weak(in_second_frame(match.information, float(match.pose[2])), WEAK)
-    return Edge(*pair, match.pose, information, match.share)
-
-
-def _gtsam() -> Any:
-    try:
-        import gtsam
-    except ImportError:
-        raise MissingExtra("gtsam", "slam") from None
-    return gtsam
-
-
-def _noise(gtsam: Any, information: NDArray[np.float64]) -> Any:
-    return gtsam.noiseModel.Gaussian.Information(information + 1e-3 * np.eye(3))
-
-
-def _factor(gtsam: Any, edge: Edge, noise: Any) -> Any:
-    return gtsam.BetweenFactorPose2(edge.first, edge.second, gtsam.Pose2(*edge.motion), noise)
-
-
-def _numbers(pose: Any) -> tuple[float, float, float]:
-    return pose.x(), pose.y(), pose.theta()
+    return Edge(*pair, match.pose, information)

@@ -11,8 +11,9 @@ from numpy.typing import ArrayLike, NDArray
 from stereovox import se2
 from stereovox.config.robot import SlamConfig
 from stereovox.localize.slam import _bound
-from stereovox.localize.slam.graph import Edge, Keyframe, in_second_frame
+from stereovox.localize.slam.graph import Keyframe, in_second_frame
 from stereovox.localize.slam.line_map import Cloud, LineMap, Match, joined
+from stereovox.pose_graph import Edge
 
 COARSE = 2
 """Cells of the map on the side of one cell of the search."""
@@ -88,8 +89,8 @@ class LoopFinder:
         along = np.linalg.eigvalsh(match.information[:2, :2])
         if along[0] < CORRIDOR * along[1]:
             return
-        found = Edge(first, second, match.pose, in_second_frame(match.information, float(match.pose[2])), match.share)
-        self._judge(found)
+        information = in_second_frame(match.information, float(match.pose[2]))
+        self._judge(Edge(first, second, match.pose, information))
 
     def _judge(self, found: Edge) -> None:
         """Accept a finding, and those it confirms, once another one agrees with it."""

@@ -22,11 +22,12 @@ from stereovox.frame import Scan
 from stereovox.integrate.beams import make_beams
 from stereovox.localize.slam.doubts import MapDoubt, doubts_of
 from stereovox.localize.slam.front_end import Follower
-from stereovox.localize.slam.graph import Edge, Keyframe, in_map, optimised, patch_edges, step_edges
+from stereovox.localize.slam.graph import Keyframe, in_map, patch_edges, step_edges
 from stereovox.localize.slam.loops import LoopFinder
 from stereovox.localize.track import Track
 from stereovox.maps.grid_map import GridMap
 from stereovox.maps.occupancy import OccupancyGrid
+from stereovox.pose_graph import Edge, PoseGraph
 from stereovox.trust.validate import validate_upright_scan
 
 MIN_LATE_SCANS = 3
@@ -127,8 +128,9 @@ class Slam:
         if not edges:
             return
         last = self.keyframes[-1].pose
-        poses = optimised(self._poses(), step_edges(self.keyframes), edges, weight)
-        for keyframe, pose in zip(self.keyframes, poses, strict=True):
+        weighted = [replace(edge, information=weight * edge.information) for edge in edges]
+        graph = PoseGraph(self._poses(), step_edges(self.keyframes), weighted)
+        for keyframe, pose in zip(self.keyframes, graph.poses, strict=True):
             keyframe.pose = pose
         self._follower.moved(last)
 

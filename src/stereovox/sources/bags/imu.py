@@ -17,7 +17,7 @@ from stereovox.sources.bags.depth_topic import Metadata
 from stereovox.sources.bags.files import BagFile
 from stereovox.sources.bags.messages import Wire, ns_from_ms
 from stereovox.sources.bags.tf import Tf
-from stereovox.sources.imu import ImuReadings, at_times, in_order
+from stereovox.sources.imu import ImuReadings, at_times, in_order, up_of_force
 
 IMU = "sensor_msgs/Imu"
 NONE = (np.nan,) * 3
@@ -29,8 +29,6 @@ MAX_READINGS = 5_000_000
 """Of one topic: more than three hours at 400 Hz."""
 SAMPLES, MIN_SAMPLES = 300, 10
 """Messages that are read, spread over the recording, and the fewest that are enough."""
-GRAVITY = 9.0, 10.6
-"""Length in m/s^2 that the mean acceleration must have."""
 
 
 class Reading(NamedTuple):
@@ -79,10 +77,9 @@ def up_by_gravity(file: BagFile, tf: Tf, world: str) -> NDArray[np.float64] | No
             except (FrameRefused, ValueError):
                 continue
         if len(found) >= MIN_SAMPLES:
-            mean = np.mean(found, axis=0)
-            length = float(np.linalg.norm(mean))
-            if GRAVITY[0] <= length <= GRAVITY[1]:
-                return mean / length
+            up = up_of_force(np.mean(found, axis=0))
+            if up is not None:
+                return up
     return None
 
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from functools import partial
 
 import numpy as np
@@ -26,7 +27,7 @@ from stereovox.sources.bags.depth_topic import (
 )
 from stereovox.sources.bags.files import BagFile
 from stereovox.sources.bags.messages import Picture, read_camera_info
-from stereovox.sources.bags.tf import read_tf
+from stereovox.sources.bags.tf import Tf
 from stereovox.sources.photos import decode_photo
 from stereovox.sources.rgbd.undistort import Undistortion
 
@@ -74,10 +75,12 @@ class PhotoTopic:
         return np.asarray(self._undistort(grey), np.uint8)  # pyright: ignore[reportArgumentType]
 
 
-def find_photos(file: BagFile, depth: DepthTopic) -> PhotoTopic | None:
+def find_photos(file: BagFile, depth: DepthTopic, transforms: Callable[[], Tf | None]) -> PhotoTopic | None:
     """Return the pictures to which depth images are registered, else those of a camera that is fixed beside theirs.
 
     None where there are none whose camera and place are known. Infrared images are left out.
+
+    transforms: reads those of the recording; called where they are needed.
     """
     if not depth.frame_id:
         return None
@@ -87,7 +90,7 @@ def find_photos(file: BagFile, depth: DepthTopic) -> PhotoTopic | None:
     try:
         if same:
             return PhotoTopic(file, same[0], np.eye(4))
-        tf = read_tf(file) if frames else None
+        tf = transforms() if frames else None
         for topic, frame in frames.items():
             if tf is not None and tf.connected(depth.frame_id, frame) and not tf.moving(depth.frame_id, frame):
                 return PhotoTopic(file, topic, tf.lookup(depth.frame_id, frame, depth.stamp_ns(0)))

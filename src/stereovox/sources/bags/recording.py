@@ -22,7 +22,7 @@ from stereovox.sources.bags.depth_topic import DepthTopic, find_depth
 from stereovox.sources.bags.imu import read_readings, up_by_gravity
 from stereovox.sources.bags.photo_topic import PhotoTopic, find_photos
 from stereovox.sources.bags.poses import find_poses
-from stereovox.sources.bags.tf import TfPoses, read_tf
+from stereovox.sources.bags.tf import Tf, TfPoses, read_tf
 from stereovox.sources.base import DepthSource
 from stereovox.sources.imu import ImuReadings
 from stereovox.sources.poses import Poses
@@ -129,7 +129,12 @@ class Bag(DepthSource):
     @cached_property
     def _photos(self) -> PhotoTopic | None:
         """Pictures that were taken along with the depth images."""
-        return find_photos(self._file, self._depth)
+        return find_photos(self._file, self._depth, lambda: self._tf)
+
+    @cached_property
+    def _tf(self) -> Tf | None:
+        """The transforms in the recording, None where there are none."""
+        return self._poses.poses.tf if isinstance(self._poses, TurnedTf) else read_tf(self._file)
 
     def gravity(self) -> NDArray[np.float64] | None:
         """Return the unit vector (3,) that points up in the world of the poses by an IMU; None where nothing tells."""
@@ -142,8 +147,7 @@ class Bag(DepthSource):
         """Return the readings of the IMU in the recording; see `read_readings`."""
         if self._imu == "off":
             return None
-        known = self._poses.poses.tf if isinstance(self._poses, TurnedTf) else read_tf(self._file)
-        return read_readings(self._file, known, self._depth.frame_id, self._imu)
+        return read_readings(self._file, self._tf, self._depth.frame_id, self._imu)
 
     def frame(self, i: int) -> Frame:
         """Return frame `i`; depth is (0, 0) where the image has a `fault`, the pose NaN where there is none."""

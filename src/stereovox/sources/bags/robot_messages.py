@@ -150,6 +150,19 @@ def read_transforms(wire: Wire) -> list[StampedTransform]:
     return [_transform(wire) for _ in range(wire.number())]
 
 
+def read_path(wire: Wire, most: int | None = None) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Return times (N,) in nanoseconds and tx ty tz qx qy qz qw (N, 7) of the poses in a `nav_msgs/Path` that are some.
+
+    The frames in the headers of the poses are left: they are those of the path. most: read so many at most.
+    """
+    wire.header()
+    count = wire.number()
+    told = [(wire.header()[0], wire.numbers("d", 7)) for _ in range(count if most is None else min(count, most))]
+    poses = [(stamp_ns, numbers) for stamp_ns, numbers in told if is_motion(numbers)]
+    stamps, rows = [stamp_ns for stamp_ns, _ in poses], [numbers for _, numbers in poses]
+    return np.array(stamps, np.int64), np.array(rows, float).reshape(-1, 7)
+
+
 def is_motion(numbers: Sequence[float]) -> bool:
     """Return whether tx ty tz qx qy qz qw are seven numbers below `LARGEST` with a non-zero quaternion."""
     return len(numbers) == 7 and all(abs(x) < LARGEST for x in numbers) and hypot(*numbers[3:]) > 1e-6

@@ -185,9 +185,14 @@ class DepthFolder(DepthSource, ABC):
         return registered(self.camera, size), np.eye(4)
 
     @cached_property
+    def _listed_photos(self) -> list[ImageFile]:
+        """The pictures, listed once."""
+        return self.list_photos()
+
+    @cached_property
     def _photos(self) -> list[Path | None]:
         """The picture of each depth image: the nearest in time; None where none is near."""
-        photos = self.list_photos()
+        photos = self._listed_photos
         found = nearest_in_time([i.stamp_ns for i in self._images], [p.stamp_ns for p in photos], PHOTO_NS)
         return [None if k is None else photos[k].path for k in found]
 
@@ -201,7 +206,7 @@ class DepthFolder(DepthSource, ABC):
     @cached_property
     def _no_photos(self) -> str:
         """Why not one of the pictures that are there can be used; "" where one can, and where there are none."""
-        if not self.list_photos() or self._photo_camera[0] is not None:
+        if not self._listed_photos or self._photo_camera[0] is not None:
             return ""
         path = next(filter(None, self._photos), None)
         if path is None:
@@ -216,9 +221,9 @@ class DepthFolder(DepthSource, ABC):
 
         Where none of the recording's can be used, its `pixels` raise FrameRefused and say why.
         """
-        path, (camera, T_depth_photo) = self._photos[i], self._photo_camera
         if self._no_photos:
             return Photo(self._refuse_photo, self.camera)
+        path, (camera, T_depth_photo) = self._photos[i], self._photo_camera
         if path is None or camera is None:
             return None
         return Photo(partial(read_photo, path, (camera.width, camera.height)), camera, T_depth_photo)

@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Loop closure: how many loops are found, how many are wrong, and how far off the way is before and after.
+
+    python benchmarks/loops.py offices --seeds 0:50 [--drift 0.02] [--visits 10] [--width 212]
+    python benchmarks/loops.py ring --seeds 0:10 [--drift 0.01] [--width 212]
+    python benchmarks/loops.py apartment --seeds 0:5 [--drift 0.01] [--width 424]
+    python benchmarks/loops.py RECORDING          # the camera is tracked; its own poses are taken for the truth
+
+Simulated walks with poses that drift, each seed with a walk and a drift of its own; every second frame. A loop is wrong
+where it is off by more than 0.5 m. A place is seen again where the camera stood within 0.7 m and 40 degrees of it, 5 m
+of way before: what share of these has a loop. The seam: by how much the relative pose of two such frames is wrong.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import stereovox as sv
+from stereovox.config import load_config, parse_value
+from stereovox.evaluate.trajectory_score import score_trajectory
+from stereovox.loops.closer import Loop, LoopCloser, difference
+from stereovox.maps.kept_frames import KeptFrame
+from stereovox.se3 import inverse
+from stereovox.simulate.simulation import Simulation
+from stereovox.sources.poses import Poses
+
+SCENES = {
+    "offices": "sim:offices?walk={seed}&",
+    "ring": "sim:loop?plan={seed}&",
+    "apartment": "sim:apartment?camera=d435&",
+}
+WRONG_M = 0.5
+NEAR_M, NEAR_RAD, AFTER_M = 0.7, np.radians(40), 5.0
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what")
+    parser.add_argument("--seeds", default="0:5")
+    parser.add_argument("--drift", type=float, default=0.01)
+    parser.add_argument("--width", type=int, default=0)
+    parser.add_argument("--visits", type=int, default=10)
+    parser.add_argument("--every", type=int, default=2)
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
+    given = parser.parse_args()
+    more = {key: parse_value(value) for key, _, value in (one.partition("=") for one in given.set)}
+    if given.what not in SCENES:
+        return recording(given.what, more)
+    totals = []
+    for seed in range(*map(int, given.seeds.split(":"))):
+        location = f"{SCENES[given.what].format(seed=seed)}seed={seed}&drift={given.drift}"
+        location += f"&image_width={given.width}" if given.width else ""
+        location += f"&visits={given.visits}" if given.what == "offices" else ""
+        totals.append(walk(location, given.every, more))
+    loops, wrong, again, found = np.sum([total[:4] for total in totals], axis=0)
+    seams = np.concatenate([total[4] for total in totals])
+    print(f"all {len(totals)}: {loops} loops, {wrong} wrong; {found} of {again} places seen again have one")
+    if len(seams):
+        median, most = 1e3 * np.median(seams), 1e3 * seams.max()
+        print(f"seam: median {median:.1f}, 95 % {1e3 * np.quantile(seams, 0.95):.1f}, most {most:.1f} mm")
+
+
+def walk(location: str, every: int, settings: dict[str, Any]) -> tuple[int, int, int, int, NDArray[np.float64]]:
+    """Close the loops of one walk and tell what came of it."""
+    simulation = Simulation(location)
+    mapper = sv.Mapper(voxel_size=0.1, threads=2, **{"map.keep_frames": True})
+    for i in range(0, len(simulation), every):
+        mapper.add(simulation.frame(i))
+    frames = mapper.map.kept_frames.frames
+    closer, seconds = closed(frames, load_config(mapper.config, **settings))
+    truth = [simulation.true_pose(round(one.stamp_ns / simulation.period_ns)) for one in closer.submaps]
+    wrong = sum(error(loop, truth) > WRONG_M for loop in closer.loops)
+    ends = {loop.second for loop in closer.loops}
+    again = [k for k in range(len(truth)) if any(True for _ in seen_before(k, truth, closer))]
+    exact = [simulation.true_pose(round(one.stamp_ns / simulation.period_ns)) for one in frames]
+    new = closer.corrected()
+    before, after = [one.T_world_sensor for one in frames], [new[one.sensor, one.stamp_ns] for one in frames]
+    seams = seam(exact, after, closer)
+    stamps = np.array([one.stamp_ns for one in frames])
+    scores = [ate(stamps, poses, exact) for poses in (before, after)]
+    print(
+        f"{location}: {len(frames)} frames, {len(truth)} submaps, {len(closer.loops)} loops, {wrong} wrong, "
+        f"{len(closer.refused)} refused; {len(ends & set(again))} of {len(again)} places seen again; "
+        f"ATE {scores[0]:.3f} to {scores[1]:.3f} m; {seconds:.0f} s",
+        flush=True,
+    )
+    return len(closer.loops), wrong, len(again), len(ends & set(again)), seams
+
+
+def closed(frames: Sequence[KeptFrame], config: sv.Config) -> tuple[LoopCloser, float]:
+    """Return what closes the loops of frames, and how long it took."""
+    start, closer = perf_counter(), LoopCloser(config)
+    for frame in frames:
+        closer.add(frame)
+    closer.finish()
+    return closer, perf_counter() - start
+
+
+def error(loop: Loop, truth: Sequence[NDArray[np.float64]]) -> float:
+    """Return by how many metres a loop is wrong."""
+    exact = inverse(truth[loop.first]) @ truth[loop.second]
+    return float(np.linalg.norm(difference(exact, loop.match.T_earlier_later)[3:]))
+
+
+def seen_before(k: int, truth: Sequence[NDArray[np.float64]], closer: LoopCloser) -> Iterable[int]:
+    """Yield the submaps, some way before submap k, that the camera took from where and as it took that."""
+    for i in range(k):
+        if closer.submaps[k].travelled - closer.submaps[i].travelled > AFTER_M:
+            moved = difference(truth[i], truth[k])
+            if np.linalg.norm(moved[3:]) < NEAR_M and np.linalg.norm(moved[:3]) < NEAR_RAD:
+                yield i
+
+
+def seam(
+    exact: Sequence[NDArray[np.float64]], poses: Sequence[NDArray[np.float64]], closer: LoopCloser
+) -> NDArray[np.float64]:
+    """Return by how many metres relative poses of frames are wrong that were taken at one place on two visits."""
+    where = np.array(exact)[:, :3, 3]
+    way = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(where, axis=0), axis=1))])
+    found = []
+    for k in range(0, len(exact), 3):
+        near = np.flatnonzero((way < way[k] - 10) & (np.linalg.norm(where - where[k], axis=1) < 0.4))
+        for i in near[:3]:
+            real = inverse(exact[i]) @ exact[k]
+            if np.linalg.norm(difference(exact[i], exact[k])[:3]) < NEAR_RAD:
+                found.append(np.linalg.norm((inverse(poses[i]) @ poses[k])[:3, 3] - real[:3, 3]))
+    return np.array(found)
+
+
+def ate(stamps: NDArray[np.int64], poses: Sequence[Any], exact: Sequence[Any]) -> float:
+    """Return the root of the mean square of the distances, after the ways are laid onto each other."""
+    score = score_trajectory(Poses(stamps, np.array(poses)), Poses(stamps, np.array(exact)))
+    return float(np.sqrt(np.mean(np.square(score.position_errors_m))))
+
+
+def recording(source: str, settings: dict[str, Any]) -> None:
+    """Track a recording, close its loops, and compare with its own poses."""
+    truth = {frame.stamp_ns: frame.T_world_sensor for frame in sv.open_source(source)}
+    with tempfile.TemporaryDirectory() as folder:
+        made = sv.map_recording(
+            source, Path(folder) / "map.svox", poses="track", threads=2, **{"map.keep_frames": True}
+        )
+        frames = made.map.kept_frames.frames
+        closer, seconds = closed(frames, load_config(made.map.config, **settings))
+        new, stamps = closer.corrected(), np.array([one.stamp_ns for one in frames])
+        exact = [truth[one.stamp_ns] for one in frames]
+        for words, poses in (("tracked", [one.T_world_sensor for one in frames]),
+                             ("closed", [new[one.sensor, one.stamp_ns] for one in frames])):  # fmt: skip
+            print(f"{words}: ATE {ate(stamps, poses, exact):.4f} m")
+        print(f"{len(frames)} frames, {len(closer.submaps)} submaps, {len(closer.loops)} loops, {seconds:.1f} s")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,221 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Close the loops of a map that kept its frames: the Python side of `stereovox loops`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from math import inf
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.config import load_config
+from stereovox.errors import StereovoxError
+from stereovox.localize.robot_track import Progress, no_progress
+from stereovox.loops.closer import Loop, LoopCloser
+from stereovox.loops.positions import Positions
+from stereovox.loops.submaps import Submap
+from stereovox.mapper import Mapper
+from stereovox.maps import VoxelMap, load_map
+from stereovox.maps.store import check_target
+from stereovox.rebuild import CorrectionReport
+from stereovox.safe_io import check_file
+from stereovox.sources.trajectory import TRAJECTORY_ENDINGS, Trajectory, write_trajectory
+from stereovox.trust.loop_lines import LoopLines
+
+
+@dataclass(frozen=True, eq=False)
+class LoopClosure:
+    """What loop closure found and did.
+
+    Attributes:
+        stamps_ns: (N,) int64, times of the map's frames in order.
+        T_world_before: (N, 4, 4) float64, their poses as they came.
+        T_world_sensor: (N, 4, 4) float64, their poses with all loops closed.
+        loops: The loops that were closed; `first` and `second` are numbers of `places`.
+        refused: Places that look the same and were not believed to be, and why.
+        anchors: (S,) int64, numbers of the frames in the middle of all places.
+        report: What the correction did to the map.
+    """
+
+    stamps_ns: NDArray[np.int64]
+    T_world_before: NDArray[np.float64]
+    T_world_sensor: NDArray[np.float64]
+    loops: Sequence[Loop]
+    refused: Sequence[Loop]
+    anchors: NDArray[np.int64]
+    report: CorrectionReport
+
+    @property
+    def moved_m(self) -> NDArray[np.float64]:
+        """Return by how many metres (N,) each frame moved."""
+        return np.linalg.norm(self.T_world_sensor[:, :3, 3] - self.T_world_before[:, :3, 3], axis=1)
+
+    @property
+    def places(self) -> NDArray[np.float64]:
+        """Return the positions (S, 3) in metres of the middles of all places, as corrected."""
+        return self.T_world_sensor[self.anchors, :3, 3]
+
+    @property
+    def lines(self) -> LoopLines:
+        """Return the closed and the refused loops as lines between their places, as the map remembers them."""
+        return LoopLines.between(*(self.ends(found, self.T_world_sensor) for found in (self.loops, self.refused)))
+
+    def ends(self, loops: Sequence[Loop], poses: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return where the two places of each loop are.
+
+        Args:
+            loops: N loops.
+            poses: (F, 4, 4) of all frames: `T_world_before` or `T_world_sensor`.
+
+        Returns:
+            (N, 2, 3) metres, world frame, the earlier place first.
+        """
+        pairs = np.reshape([(loop.first, loop.second) for loop in loops], (-1, 2)).astype(np.int64)
+        return poses[self.anchors[pairs], :3, 3]
+
+    def save(self, path: str | Path) -> None:
+        """Write the corrected poses as lines `stamp tx ty tz qx qy qz qw` (TUM), all or nothing.
+
+        Args:
+            path: The file, `.tum` or `.txt`.
+
+        Raises:
+            StereovoxError: Another ending.
+            MapFileError: It cannot be written; an older one is then still there.
+        """
+        file = check_file(str(path), TRAJECTORY_ENDINGS)
+        write_trajectory(file, self.stamps_ns.tolist(), self.T_world_sensor, "camera (x right, y down, z forward)")
+
+    def summary(self) -> dict[str, Any]:
+        """Return the numbers of `stereovox loops --json`, besides those of the map."""
+        offs = [loop.off_m for loop in self.loops]
+        return {
+            "loops": len(self.loops),
+            "loops_refused": [self._described(loop) for loop in self.refused],
+            "off_m": {"median": float(np.median(offs)), "max": max(offs)} if offs else None,
+            "moved_m": {"median": float(np.median(self.moved_m)), "max": float(self.moved_m.max())},
+            **asdict(self.report),
+        }
+
+    def _described(self, loop: Loop) -> dict[str, Any]:
+        places = {"at": self.places[loop.second].round(2).tolist(), "like": self.places[loop.first].round(2).tolist()}
+        return {**places, "off_m": round(loop.off_m, 3), "why": loop.why}
+
+
+@dataclass(frozen=True, eq=False)
+class ClosedMap:
+    """Result of `close_loops`.
+
+    Attributes:
+        map: The map with its loops closed, as saved.
+        out: Where it was saved.
+        closure: What was found and done.
+    """
+
+    map: VoxelMap
+    out: Path
+    closure: LoopClosure
+
+
+def close_loops(
+    path: str | Path,
+    out: str | Path,
+    *,
+    positions: str | Path | None = None,
+    positions_sigma: float = 1.0,
+    progress: Progress = no_progress,
+    **overrides: Any,
+) -> ClosedMap:
+    """Find the loops of a saved map, bend the way of its camera so that they close, and save the map that this makes.
+
+    Places are compared by their surfaces. A loop is believed where these fit at one place only within what the poses'
+    drift allows, and another finding agrees.
+
+    Args:
+        path: Folder of a map that kept its frames (`map.keep_frames`).
+        out: Folder of the new map.
+        positions: File of positions of the camera that do not drift, as of a GNSS receiver: lines `stamp tx ty tz qx qy
+            qz qw` (TUM; rotations are not used) in metres, in any world with the same way up.
+        positions_sigma: Their standard deviation in metres, along each axis.
+        progress: Called with how many are done, how many there are, and what is being done.
+        **overrides: Settings of `loops`, such as `**{"loops.drift": 0.05}` for poses that drift more than usual.
+
+    Returns:
+        The new map, and what was found and done. Where nothing was found it is a copy.
+
+    Raises:
+        StereovoxError: One line: the map cannot be read, or did not keep its frames; `positions` cannot be read, or are
+            too few or too close to each other.
+        MissingExtra: gtsam is not installed.
+    """
+    check_target(Path(out))
+    saved = load_map(path)
+    if saved.kept_frames is None or not len(saved.kept_frames):
+        raise StereovoxError(f"{path}: the map did not keep its frames; map again with map.keep_frames=true")
+    config = load_config(saved.config, **overrides)
+    known = None if positions is None else _positions(positions, positions_sigma)
+    mapper = Mapper(config, resume=saved, tiles=Path(out).parent / f".{Path(out).name}-tiles")
+    try:
+        closure = close(mapper, progress, known)
+        mapper.save(out)
+    finally:
+        mapper.close()
+    return ClosedMap(load_map(out), Path(out), closure)
+
+
+def _positions(file: str | Path, sigma_m: float) -> Positions:
+    if not 0 < sigma_m < inf:
+        raise StereovoxError(f"positions_sigma {sigma_m:g} must be more than 0 metres")
+    poses = Trajectory(Path(file))
+    places = poses.T_world_body[:, :3, 3]
+    usable = np.isfinite(places).all(axis=1)
+    return Positions(poses.stamps_ns[usable], places[usable], sigma_m, str(file))
+
+
+def close(mapper: Mapper, progress: Progress = no_progress, positions: Positions | None = None) -> LoopClosure:
+    """Find the loops of the map that a mapper makes, and correct it.
+
+    Args:
+        mapper: Its map must keep its frames (`map.keep_frames`).
+        progress: Called with how many are done, how many there are, and what is being done.
+        positions: Positions of the camera that do not drift.
+
+    Returns:
+        What was found and done.
+
+    Raises:
+        StereovoxError: The map did not keep its frames; `positions` are too few or too close to each other.
+        MissingExtra: gtsam is not installed.
+    """
+    kept = mapper.map.kept_frames
+    if kept is None or not len(kept):
+        raise StereovoxError("the map did not keep its frames; map again with map.keep_frames=true")
+    frames, closer = kept.frames, LoopCloser(mapper.config)
+    for done, frame in enumerate(frames, 1):
+        closer.add(frame)
+        progress(done, len(frames), "looking for loops")
+    closer.finish(lambda done, total: progress(done, total, "laying places onto each other"), positions)
+    corrected = closer.corrected()
+    report = mapper.correct(corrected) if closer.loops or positions is not None else CorrectionReport()
+    closure = LoopClosure(
+        np.array([frame.stamp_ns for frame in frames], np.int64),
+        np.array([frame.T_world_sensor for frame in frames]),
+        np.array([corrected[frame.sensor, frame.stamp_ns] for frame in frames]),
+        closer.loops,
+        closer.refused,
+        _anchors(closer.submaps),
+        report,
+    )
+    with mapper.map.lock:
+        mapper.map.history.loops = closure.lines
+    return closure
+
+
+def _anchors(submaps: Sequence[Submap]) -> NDArray[np.int64]:
+    """Return the numbers (S,) of the anchors of submaps among the frames of all."""
+    before = np.cumsum([0, *(len(submap.frames) for submap in submaps)])[:-1]
+    return before + np.array([submap.anchor for submap in submaps], np.int64)

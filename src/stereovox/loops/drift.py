@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How far the poses that frames come with may be off after some way."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.config.robot import LoopsConfig
+from stereovox.se3 import Transform, inverse, rotation_vector
+
+KEEPS_M = 5.0
+"""Metres of way over which drift keeps its direction; beyond, it grows with the square root of the way."""
+JITTER_RAD, JITTER_M = np.radians(0.1), 0.003
+"""Standard deviations of a pose besides drift."""
+TURNED = 0.01
+"""Share of a turn by which it may be wrong."""
+
+
+class Drift(NamedTuple):
+    """Drift of a recording's poses.
+
+    share: metres per metre of way, along each axis. turn: radians after a metre, about each axis.
+    """
+
+    share: float
+    turn: float
+
+    @classmethod
+    def of(cls, config: LoopsConfig) -> Drift:
+        """Return the drift that settings allow."""
+        return cls(config.drift, float(np.radians(config.drift_deg)))
+
+    def covariance(self, metres: float, radians: float = 0.0) -> NDArray[np.float64]:
+        """Return the covariance (6, 6), rotation and shift, of a motion of so many metres and radians in all."""
+        turned = JITTER_RAD**2 + self.turn**2 * metres + (TURNED * radians) ** 2
+        return np.diag(np.repeat([turned, JITTER_M**2 + self.shift_m(metres) ** 2], 3))
+
+    def shift_m(self, metres: float) -> float:
+        """Return the standard deviation of a position, along each axis, after so many metres."""
+        return self.share * float(np.sqrt(KEEPS_M * metres))
+
+
+def length(poses: Sequence[Transform]) -> tuple[float, float]:
+    """Return metres and radians of the way from pose to pose."""
+    moves = [inverse(one) @ other for one, other in pairwise(poses)]
+    metres = sum(float(np.linalg.norm(move[:3, 3])) for move in moves)
+    return metres, sum(float(np.linalg.norm(rotation_vector(move[:3, :3]))) for move in moves)

@@ -1,0 +1,163 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Walls of corridors with niches, doors, pilasters and furniture, no two of them alike.
+
+Frame of a wall: x along it, y from its surface into the corridor, z up from the floor, metres.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from stereovox.simulate.scene import Solid, box, cylinder
+
+HEIGHT = 2.6
+"""Of corridors."""
+THICKNESS = 0.6
+"""Of walls: niches fit into them."""
+DEEP = 0.46
+"""How far furniture stands out from a wall at most."""
+PLAIN = 0.8
+"""Metres of bare wall at both ends of each."""
+BAY = (2.2, 3.4)
+"""Length of a bay, from and to."""
+
+
+@dataclass(frozen=True)
+class Opening:
+    """A hole in a wall that does not go through: where it starts and ends, how high and how deep it is."""
+
+    start: float
+    end: float
+    top: float
+    deep: float
+
+
+Bay = tuple[Opening | None, list[Solid]]
+"""A hole in the wall, if there is one, and what stands in it or before it."""
+
+
+def wall(name: str, length: float, random: np.random.Generator) -> list[Solid]:
+    """Return a wall of `length` metres, which must be 2 or more, and all that is in and before it, in its frame."""
+    bays = max(1, round((length - 2 * PLAIN) / np.mean(BAY)))
+    widths = random.uniform(*BAY, bays)
+    starts = PLAIN + (length - 2 * PLAIN) * np.append(0, np.cumsum(widths)) / widths.sum()
+    solids, at = [], 0.0
+    kinds: list[Callable[[str, float, float, np.random.Generator], Bay]] = []
+    for n, (start, end) in enumerate(itertools.pairwise(starts.tolist()), 1):
+        kinds = kinds or [KINDS[k] for k in random.permutation(len(KINDS))]
+        opening, things = kinds.pop()(f"{name}, bay {n}", start, end, random)
+        solids += things
+        if opening:
+            solids += _pierced(f"{name}, bay {n}", at, opening)
+            at = opening.end
+    return [*solids, box("walls", f"{name}, end", (at, -THICKNESS, 0), (length, 0, HEIGHT))]
+
+
+def _pierced(name: str, at: float, hole: Opening) -> list[Solid]:
+    """Return the wall from `at` to the end of the hole."""
+    return [
+        box("walls", f"{name}: before the opening", (at, -THICKNESS, 0), (hole.start, 0, HEIGHT)),
+        box("walls", f"{name}: above the opening", (hole.start, -THICKNESS, hole.top), (hole.end, 0, HEIGHT)),
+        box("walls", f"{name}: behind the opening", (hole.start, -THICKNESS, 0), (hole.end, -hole.deep, hole.top)),
+    ]
+
+
+def _niche(name: str, start: float, end: float, random: np.random.Generator) -> Bay:
+    x, wide = _place(start, end, random.uniform(0.7, 1.4), random)
+    deep = random.uniform(0.2, 0.45)
+    thing, tall = random.uniform(0.2, wide - 0.2), random.uniform(0.2, 1.2)
+    inside = box("things", f"{name}: in the niche", (x + 0.1, -deep, 0), (x + 0.1 + thing, -0.1, tall))
+    return Opening(x, x + wide, random.uniform(1.6, 2.4), deep), [inside]
+
+
+def _door(name: str, start: float, end: float, random: np.random.Generator) -> Bay:
+    x, wide = _place(start, end, random.uniform(0.8, 1.2), random)
+    deep, top, jamb, out = random.uniform(0.06, 0.2), random.uniform(1.95, 2.2), random.uniform(0.05, 0.1), 0.03
+    frame = [
+        box("door frames", f"{name}: first jamb", (x - jamb, 0, 0), (x, out, top)),
+        box("door frames", f"{name}: second jamb", (x + wide, 0, 0), (x + wide + jamb, out, top)),
+        box("door frames", f"{name}: head", (x - jamb, 0, top), (x + wide + jamb, out, top + jamb)),
+    ]
+    return Opening(x, x + wide, top, deep), frame
+
+
+def _pilaster(name: str, start: float, end: float, random: np.random.Generator) -> Bay:
+    x, wide = _place(start, end, random.uniform(0.3, 0.7), random)
+    return None, [box("pilasters", f"{name}: pilaster", (x, 0, 0), (x + wide, random.uniform(0.12, 0.35), HEIGHT))]
+
+
+def _cabinet(name: str, start: float, end: float, random: np.random.Generator) -> Bay:
+    x, wide = _place(start, end, random.uniform(0.6, 1.5), random)
+    deep, top = random.uniform(0.3, 0.45), random.uniform(0.6, 1.9)
+    left, right = x + np.sort(random.uniform(0.1, wide - 0.1, 2))
+    tall = random.uniform(0.1, 0.5)
+    return None, [
+        box("furniture", f"{name}: cabinet", (x, 0, 0), (x + wide, deep, top)),
+        box("things", f"{name}: on it", (left, 0.05, top), (right, deep - 0.05, top + tall)),
+    ]
+
+
+def _shelf(name: str, start: float, end: float, random: np.random.Generator) -> Bay:
+    x, wide = _place(start, end, random.uniform(0.7, 1.4), random)
+    deep, top = random.uniform(0.25, 0.4), random.uniform(1.2, 2.0)
+    boards = np.linspace(0.1, top - 0.03, int(random.integers(3, 6)))
+    return None, [
+        box("furniture", f"{name}: shelf, first side", (x, 0, 0), (x + 0.03, deep, top)),
+        box("furniture", f"{name}: shelf, second side", (x + wide - 0.03, 0, 0), (x + wide, deep, top)),
+        *(
+            box("furniture", f"{name}: board {n}", (x + 0.03, 0, z), (x + wide - 0.03, deep, z + 0.03))
+            for n, z in enumerate(boards.tolist(), 1)
+        ),
+        *(
+            box("things", f"{name}: books {n}", (x + 0.05, 0, z + 0.03), (x + random.uniform(0.2, 0.6), 0.22, z + 0.25))
+            for n, z in enumerate(boards[:-1].tolist(), 1)
+        ),
+    ]
+
+
+def _bench(name: str, start: float, end: float, random: np.random.Generator) -> Bay:
+    x, wide = _place(start, end, random.uniform(0.9, 1.6), random)
+    deep, top = random.uniform(0.3, 0.44), random.uniform(0.4, 0.5)
+    return None, [
+        box("furniture", f"{name}: bench", (x, 0.02, top - 0.05), (x + wide, deep, top)),
+        *(
+            box("furniture", f"{name}: leg {n}", (x + at, 0.05, 0), (x + at + 0.06, deep - 0.03, top - 0.05))
+            for n, at in enumerate((0.1, wide - 0.16), 1)
+        ),
+        box("boards", f"{name}: picture", (x + 0.2, 0, 1.3), (x + random.uniform(0.5, 0.9), 0.04, 1.9)),
+    ]
+
+
+def _parcels(name: str, start: float, end: float, random: np.random.Generator) -> Bay:
+    x, _ = _place(start, end, 1.4, random)
+    solids, z = [], 0.0
+    for n, shrunk in enumerate((1.0, 0.8, 0.65)[: int(random.integers(1, 4))], 1):
+        wide, deep, tall = shrunk * random.uniform([0.35, 0.25, 0.3], [0.5, 0.33, 0.5])
+        low, high = (x + 0.3 - wide / 2, 0.23 - deep / 2, z), (x + 0.3 + wide / 2, 0.23 + deep / 2, z + tall)
+        solids.append(box("things", f"{name}: parcel {n}", low, high, turn=random.uniform(-0.25, 0.25)))
+        z += tall
+    x, thick, tall = x + random.uniform(0.8, 1.3), random.uniform(0.15, 0.4), random.uniform(0.4, 1.5)
+    return None, [*solids, cylinder("things", f"{name}: bin", (x, 0.23, 0), (x, 0.23, tall), thick)]
+
+
+def _pipe(name: str, start: float, end: float, random: np.random.Generator) -> Bay:
+    x, _ = _place(start, end, 1.2, random)
+    thick, wide = random.uniform(0.06, 0.16), random.uniform(0.4, 0.9)
+    return None, [
+        cylinder("things", f"{name}: pipe", (x, 0.12, 0), (x, 0.12, HEIGHT), thick),
+        box("boards", f"{name}: board", (x + 0.2, 0, random.uniform(0.9, 1.2)), (x + 0.2 + wide, 0.05, 1.9)),
+    ]
+
+
+def _place(start: float, end: float, wide: float, random: np.random.Generator) -> tuple[float, float]:
+    """Return where something begins that is so wide, or as wide as fits into the bay, and how wide it is."""
+    wide = min(wide, end - start - 0.4)
+    return random.uniform(start + 0.2, end - 0.2 - wide), wide
+
+
+KINDS = (_niche, _door, _pilaster, _cabinet, _shelf, _bench, _parcels, _pipe)
+"""What a bay may hold; all come before one comes again."""

@@ -1,0 +1,50 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A second recording is found in the first one's world, or it is said why it cannot be."""
+
+from copy import deepcopy
+
+import numpy as np
+import pytest
+from made_loops import ELSEWHERE, RING, closed, truths
+
+from stereovox.errors import StereovoxError
+from stereovox.loops.closer import difference
+from stereovox.loops.placing import placed
+from stereovox.se3 import inverse
+
+SECOND = RING.replace("seed=3", "seed=8")
+
+
+def test_a_second_recording_is_found_and_joined():
+    first, second = deepcopy(closed(RING, 0, 200)), deepcopy(closed(SECOND, 60, 180, elsewhere=True))
+    place = placed(first, second)
+    off = difference(inverse(ELSEWHERE), place.T_first_second)
+    assert np.linalg.norm(off[3:]) < 0.6  # both have drifted
+    assert np.linalg.norm(off[:3]) < np.radians(5)
+    count = len(first.submaps)
+    first.join(second, place.T_first_second, place.loops)
+    first.finish()
+    where = np.array([submap.T_map_anchor for submap in first.submaps])
+    exact = [*truths(closed(RING, 0, 200), RING), *truths(closed(SECOND, 60, 180, elsewhere=True), SECOND)]
+    apart = []
+    for i in range(count):
+        for k in range(count, len(where)):
+            real = inverse(exact[i]) @ exact[k]
+            if np.linalg.norm(real[:3, 3]) < 0.6:
+                apart.append(np.linalg.norm(difference(real, inverse(where[i]) @ where[k])[3:]))
+    assert len(apart) > 4
+    assert np.median(apart) < 0.06
+
+
+def test_what_was_never_seen_is_not_found():
+    first = closed(RING, 0, 90)
+    second = closed("sim:apartment?image_width=106", 300, 500)
+    with pytest.raises(StereovoxError, match=r"is not known: .* places of it were found"):
+        placed(first, second)
+
+
+def test_an_office_that_may_be_any_is_not_placed():
+    offices = "sim:offices?offices=6&visits=2&image_width=106"
+    first, second = closed(f"{offices}&walk=1", 0, 300), closed(f"{offices}&walk=2&seed=4", 60, 160, elsewhere=True)
+    with pytest.raises(StereovoxError, match=r"fits the first in two ways|is not known"):
+        placed(first, second)

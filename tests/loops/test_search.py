@@ -1,0 +1,53 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The search for where a submap lies, against a slow twin and against the truth."""
+
+import numpy as np
+import pytest
+from made_loops import RING, closed
+
+from stereovox.loops import _search
+from stereovox.loops.closer import difference
+from stereovox.loops.search import Search
+from stereovox.se3 import inverse, rotation_matrix
+
+
+def naive_scores(grid, cells, window):
+    """Return the sum of `grid` over all cells, shifted by each of a window; beyond the grid is 0."""
+    found = np.zeros(window, int)
+    for shift in np.ndindex(*window):
+        for cell in cells:
+            place = tuple(cell + np.array(shift) - np.array(window) // 2)
+            if all(0 <= i < size for i, size in zip(place, grid.shape, strict=True)):
+                found[shift] += grid[place]
+    return found
+
+
+def test_scores_are_those_of_the_slow_twin():
+    random = np.random.default_rng(0)
+    grid = random.integers(-2, 3, (7, 5, 4)).astype(np.int8)
+    cells = random.integers(-3, 9, (30, 3)).astype(np.int32)
+    found = np.empty((5, 3, 7), np.int32)
+    _search.scores(grid, cells, found)
+    np.testing.assert_array_equal(found, naive_scores(grid, cells, found.shape))
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_submap_is_found_on_itself_from_a_wrong_guess(seed):
+    closer = closed(RING)
+    submap = closer.submaps[10]
+    shape = closer.shapes[submap]
+    level = np.eye(4)
+    level[:3, :3] = submap.T_map_anchor[:3, :3]
+    random = np.random.default_rng(seed)
+    wrong = np.eye(4)
+    wrong[:3, :3] = rotation_matrix([0, 0, random.uniform(-0.4, 0.4)])
+    wrong[:3, 3] = random.uniform(-1, 1, 3) * [1.5, 1.5, 0.4]
+    guess = inverse(level) @ wrong @ level
+    search = Search(shape.points, shape.views, level[:3, :3])
+    places = search.places(shape, guess, np.array([2.0, 2.0, 0.6]), 0.6)
+    off = np.array([difference(np.eye(4), T) for T in places])
+    assert np.linalg.norm(off[0, 3:]) < 0.35
+    assert np.linalg.norm(off[0, :3]) < np.radians(8)
+    assert len(places) <= 4
+    again = [np.linalg.norm(one[3:] - other[3:]) for i, one in enumerate(off) for other in off[:i]]
+    assert not again or min(again) > 0.2  # no place is given twice

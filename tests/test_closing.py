@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Loops of a map are remembered by it, as lines between their places, until poses are corrected otherwise."""
+
+import numpy as np
+import pytest
+
+import stereovox as sv
+from stereovox import closing
+from stereovox.loops.closer import Loop, LoopCloser
+from stereovox.loops.matching import Match
+from stereovox.products.moved import moved
+from stereovox.trust.loop_lines import LoopLines
+
+MATCH = Match(np.eye(4), np.eye(6), 0.9, True)
+SHIFT_M = 0.2
+
+
+class MadeCloser(LoopCloser):
+    """Closes a loop between the first and the last place, which moves all frames, and refuses one."""
+
+    def finish(self, progress=lambda done, total: None):
+        super().finish(progress)
+        last = len(self.submaps) - 1
+        self.loops, self.refused = [Loop(0, last, MATCH, 0.5, 0.0)], [Loop(0, 1, MATCH, 2.0, 0.0, "no")]
+        for submap in self.submaps:
+            submap.T_map_anchor = submap.T_map_anchor.copy()
+            submap.T_map_anchor[1, 3] += SHIFT_M
+
+
+@pytest.fixture(scope="module")
+def frames():
+    return list(sv.open_source("sim:room?image_width=96", frames="::8"))
+
+
+@pytest.fixture
+def mapper(frames):
+    """Of a map with frames and several places."""
+    mapper = sv.Mapper(voxel_size=0.2, **{"map.keep_frames": True, "trust.max_disagreement": 1})
+    for frame in frames:
+        assert mapper.add(frame).refused is None
+    return mapper
+
+
+@pytest.fixture
+def closure(mapper, monkeypatch):
+    """What was done to the map of `mapper`."""
+    monkeypatch.setattr(closing, "LoopCloser", MadeCloser)
+    return closing.close(mapper)
+
+
+def test_places_are_those_of_the_middles_of_submaps(frames, closure):
+    assert len(closure.places) == len(closure.anchors) > 2
+    assert (np.diff(closure.anchors) > 0).all()
+    before = np.array([frame.T_world_sensor[:3, 3] for frame in frames])[closure.anchors]
+    np.testing.assert_allclose(closure.places, before + np.array([0, SHIFT_M, 0]), atol=1e-6)
+    np.testing.assert_allclose(closure.ends(closure.loops, closure.T_world_before), [before[[0, -1]]], atol=1e-9)
+    assert closure.ends([], closure.T_world_before).shape == (0, 2, 3)
+
+
+def test_the_map_remembers_its_loops(mapper, closure, tmp_path):
+    mapper.save(tmp_path / "closed.svox")
+    loops = sv.load_map(tmp_path / "closed.svox").history.loops
+    assert loops == closure.lines
+    assert loops.counts() == {"closed": 1, "refused": 1}
+    np.testing.assert_allclose(loops.closed.ends, [closure.places[[0, -1]]], atol=1e-5)
+    np.testing.assert_allclose(loops.refused.ends, [closure.places[[0, 1]]], atol=1e-5)
+
+
+def test_parts_and_moved_maps_remember_them_too(mapper, closure):
+    voxel_map = mapper.map
+    assert voxel_map.history.loops == closure.lines
+    assert sv.crop(voxel_map, [-1, -1, -1], [1, 1, 1]).history.loops == voxel_map.history.loops
+    T = np.eye(4)
+    T[0, 3] = 2.0
+    there = moved(voxel_map, T).history.loops
+    np.testing.assert_allclose(there.closed.ends, voxel_map.history.loops.closed.ends + T[:3, 3], atol=1e-5)
+
+
+def test_other_poses_and_merging_forget_them(mapper, closure):
+    assert mapper.map.history.loops == closure.lines
+    assert sv.merge(mapper.map, mapper.map).history.loops is None
+    frame = mapper.map.kept_frames.frames[-1]
+    mapper.correct({frame.stamp_ns: mapper.map.kept_frames.frames[-2].T_world_sensor})
+    assert mapper.map.history.loops is None
+
+
+def test_a_map_without_loops_says_that_none_were_found(mapper):
+    assert mapper.map.history.loops is None
+    closure = closing.close(mapper)
+    assert not closure.loops
+    assert mapper.map.history.loops == LoopLines.between([], closure.ends(closure.refused, closure.T_world_sensor))

@@ -18,8 +18,8 @@ SHIFT_M = 0.2
 class MadeCloser(LoopCloser):
     """Closes a loop between the first and the last place, which moves all frames, and refuses one."""
 
-    def finish(self, progress=lambda done, total: None):
-        super().finish(progress)
+    def finish(self, progress=lambda done, total: None, positions=None):
+        super().finish(progress, positions)
         last = len(self.submaps) - 1
         self.loops, self.refused = [Loop(0, last, MATCH, 0.5, 0.0)], [Loop(0, 1, MATCH, 2.0, 0.0, "no")]
         for submap in self.submaps:

@@ -34,7 +34,7 @@ def closer(R_world_level=None, **settings):
         T = np.eye(4)
         T[:3, :3] = rotation_matrix([0, 0, 0.2 * i]) @ rotation_matrix([0.4, 0, 0])  # a camera that looks down a bit
         T[:3, 3] = 3 * np.cos(0.2 * i), 3 * np.sin(0.2 * i), 1.5
-        made.add(SimpleNamespace(sensor="", stamp_ns=10**9 * i, T_world_sensor=turn @ T))
+        made.add(SimpleNamespace(sensor="", stamp_ns=10**9 * i, T_world_sensor=turn @ T, pose_sigma=(0, 0)))
     made.finish()
     return made
 

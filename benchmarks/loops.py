@@ -63,9 +63,7 @@ def main() -> None:
     loops, wrong, again, found = np.sum([total[:4] for total in totals], axis=0)
     seams = np.concatenate([total[4] for total in totals])
     print(f"all {len(totals)}: {loops} loops, {wrong} wrong; {found} of {again} places seen again have one")
-    if len(seams):
-        median, most = 1e3 * np.median(seams), 1e3 * seams.max()
-        print(f"seam: median {median:.1f}, 95 % {1e3 * np.quantile(seams, 0.95):.1f}, most {most:.1f} mm")
+    print(f"seam: {in_mm(seams)}")
 
 
 def walk(location: str, every: int, settings: dict[str, Any]) -> tuple[int, int, int, int, NDArray[np.float64]]:
@@ -89,7 +87,7 @@ def walk(location: str, every: int, settings: dict[str, Any]) -> tuple[int, int,
     print(
         f"{location}: {len(frames)} frames, {len(truth)} submaps, {len(closer.loops)} loops, {wrong} wrong, "
         f"{len(closer.refused)} refused; {len(ends & set(again))} of {len(again)} places seen again; "
-        f"ATE {scores[0]:.3f} to {scores[1]:.3f} m; {seconds:.0f} s",
+        f"ATE {scores[0]:.3f} to {scores[1]:.3f} m; seam {in_mm(seams)}; {seconds:.0f} s",
         flush=True,
     )
     return len(closer.loops), wrong, len(again), len(ends & set(again)), seams
@@ -133,6 +131,14 @@ def seam(
             if np.linalg.norm(difference(exact[i], exact[k])[:3]) < NEAR_RAD:
                 found.append(np.linalg.norm((inverse(poses[i]) @ poses[k])[:3, 3] - real[:3, 3]))
     return np.array(found)
+
+
+def in_mm(seams: NDArray[np.float64]) -> str:
+    """Describe the errors of relative poses."""
+    if not len(seams):
+        return "never there again"
+    median, nearly_all, most = 1e3 * np.quantile(seams, [0.5, 0.95, 1])
+    return f"median {median:.1f}, 95 % {nearly_all:.1f}, most {most:.1f} mm"
 
 
 def ate(stamps: NDArray[np.int64], poses: Sequence[Any], exact: Sequence[Any]) -> float:

@@ -4,6 +4,12 @@
 import signal
 
 import pytest
+from xdist.scheduler import WorkStealingScheduling
+
+
+def pytest_xdist_make_scheduler(config, log):
+    """Give each worker neighbouring tests, so that what the tests of a file share is made once and not by each."""
+    return WorkStealingScheduling(config, log)
 
 
 @pytest.fixture

@@ -89,3 +89,23 @@ def test_a_map_without_loops_says_that_none_were_found(mapper):
     closure = closing.close(mapper)
     assert not closure.loops
     assert mapper.map.history.loops == LoopLines.between([], closure.ends(closure.refused, closure.T_world_sensor))
+
+
+def test_a_recording_is_mapped_and_closed_and_not_gone_on_with(tmp_path, monkeypatch):
+    monkeypatch.setattr(closing, "LoopCloser", MadeCloser)
+    out, settings = tmp_path / "room.svox", {"voxel_size": 0.2, "trust.max_disagreement": 1}
+    made = sv.map_recording("sim:room?image_width=96", out, frames="::8", close_loops=True, **settings)
+    saved = sv.load_map(out)
+    assert saved.history.loops == made.loops.lines
+    np.testing.assert_allclose(
+        [frame.T_world_sensor for frame in saved.kept_frames.frames], made.loops.T_world_sensor, atol=1e-9
+    )
+    with pytest.raises(sv.StereovoxError, match="its poses were corrected"):
+        sv.map_recording("sim:room?image_width=96", out, frames="::8", close_loops=True, resume=True, **settings)
+
+
+def test_a_recording_without_loops_remembers_that_they_were_sought(tmp_path):
+    out = tmp_path / "room.svox"
+    made = sv.map_recording("sim:room?image_width=96", out, frames="::8", close_loops=True, voxel_size=0.2)
+    assert not made.loops.loops
+    assert sv.load_map(out).history.loops == made.loops.lines

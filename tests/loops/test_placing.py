@@ -21,6 +21,7 @@ def test_a_second_recording_is_found_and_joined():
     off = difference(inverse(ELSEWHERE), place.T_first_second)
     assert np.linalg.norm(off[3:]) < 0.6  # both have drifted
     assert np.linalg.norm(off[:3]) < np.radians(5)
+    assert len({(loop.first, loop.second) for loop in place.loops}) == len(place.loops) >= 3
     count = len(first.submaps)
     first.join(second, place.T_first_second, place.loops)
     first.finish()

@@ -46,7 +46,7 @@ class Placed:
 
     Attributes:
         T_first_second: (4, 4) maps its world into the first one's.
-        loops: What was found; `first` is a number of the first recording's submaps, `second` of the second's.
+        loops: What was found, once for each pair; `first` is a number of the first recording's submaps, `second` of the second's.
     """
 
     T_first_second: Transform
@@ -93,8 +93,9 @@ def placed(
             f"the second map fits the first in two ways ({_submaps(best)} and {_submaps(rivals[0])} of {len(numbers)} "
             "places); say which one (--transform)"
         )
-    middle = max(best, key=lambda vote: vote.loop.match.shared)
-    return Placed(middle.T_first_second, [vote.loop for vote in best])
+    best = sorted(best, key=lambda vote: vote.loop.match.shared)
+    pairs = {(vote.loop.first, vote.loop.second): vote.loop for vote in best}  # several places may lead to one
+    return Placed(best[-1].T_first_second, list(pairs.values()))
 
 
 def _whole(closer: LoopCloser) -> Search:

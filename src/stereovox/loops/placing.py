@@ -46,7 +46,8 @@ class Placed:
 
     Attributes:
         T_first_second: (4, 4) maps its world into the first one's.
-        loops: What was found, once for each pair; `first` is a number of the first recording's submaps, `second` of the second's.
+        loops: What was found, once for each pair; `first` is a number of the first recording's submaps,
+            `second` of the second's.
     """
 
     T_first_second: Transform

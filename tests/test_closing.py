@@ -109,3 +109,9 @@ def test_a_recording_without_loops_remembers_that_they_were_sought(tmp_path):
     made = sv.map_recording("sim:room?image_width=96", out, frames="::8", close_loops=True, voxel_size=0.2)
     assert not made.loops.loops
     assert sv.load_map(out).history.loops == made.loops.lines
+
+
+def test_frames_with_the_same_stamps_are_refused_before_any_work(mapper):
+    twice = sv.Mapper(mapper.map.config, resume=sv.merge(mapper.map, mapper.map))
+    with pytest.raises(sv.StereovoxError, match="have the same stamp"):
+        closing.close(twice)

@@ -85,3 +85,18 @@ def test_two_cameras_back_to_back_are_one_body():
     assert len(both.submaps) <= len(one.submaps) + 1
     assert both.submaps[-1].travelled < 1.1 * one.submaps[-1].travelled
     assert set(both.corrected()) == {(s, f.stamp_ns) for f in made.kept_frames.frames for s in (f.sensor, "rear")}
+
+
+def test_frames_may_come_in_any_order_of_time():
+    made = mapped(RING, 0, 60)
+    closer = LoopCloser(made.config)
+    for frame in made.kept_frames.frames:
+        closer.add(replace(frame, stamp_ns=10**12 - frame.stamp_ns))
+    closer.finish()
+    for n, submap in enumerate(closer.submaps):
+        submap.T_map_anchor = submap.T_map_anchor.copy()
+        submap.T_map_anchor[2, 3] += 0.1 * n
+    new = closer.corrected()
+    for submap in closer.submaps:
+        anchor = submap.frames[submap.anchor]
+        np.testing.assert_allclose(new[anchor.sensor, anchor.stamp_ns], submap.T_map_anchor, atol=1e-9)

@@ -165,7 +165,7 @@ class LoopCloser:
         Args:
             part: The submaps of one recording, where another one was joined.
         """
-        submaps = self.submaps[part]
+        submaps = sorted(self.submaps[part], key=lambda submap: submap.stamp_ns)
         stamps = [submap.stamp_ns for submap in submaps]
         found: dict[tuple[str, int], Transform] = {}
         for submap in submaps:

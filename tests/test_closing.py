@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Loops of a map are remembered by it, as lines between their places, until poses are corrected otherwise."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import stereovox as sv
 from stereovox import closing
+from stereovox.cli.loops import say_closure
 from stereovox.loops.closer import Loop, LoopCloser
 from stereovox.loops.matching import Match
 from stereovox.products.moved import moved
@@ -115,3 +118,10 @@ def test_frames_with_the_same_stamps_are_refused_before_any_work(mapper):
     twice = sv.Mapper(mapper.map.config, resume=sv.merge(mapper.map, mapper.map))
     with pytest.raises(sv.StereovoxError, match="have the same stamp"):
         closing.close(twice)
+
+
+def test_what_the_closed_map_is_made_of_is_said(closure, capsys):
+    say_closure(closure)
+    assert "frames_budget" not in "".join(capsys.readouterr())
+    say_closure(replace(closure, report=replace(closure.report, all_frames=False)))
+    assert "only 30 frames were kept (map.frames_budget)" in "".join(capsys.readouterr())

@@ -82,6 +82,8 @@ def say_closure(closure: LoopClosure) -> None:
         say(f"no loops were found: of {len(closure.places)} places, none is surely seen twice")
     moved = summary["moved_m"]
     say(f"frames moved by {moved['median']:.3f} m (median), at most {moved['max']:.3f} m")
+    if not closure.report.all_frames:
+        say(f"note: only {len(closure.stamps_ns)} frames were kept (map.frames_budget); the map is what these make")
     if closure.refused:
         say(f"{len(closure.refused)} places look the same and were not believed to be:")
     for one in summary["loops_refused"][:SHOWN]:

@@ -108,13 +108,16 @@ def test_two_halves_of_a_real_kitchen_are_one_run():
     assert not equal(added(a, b), mapped(every))
 
 
-def test_a_second_recording_is_found_and_the_map_is_that_of_one_run():
+def test_a_second_recording_is_found_and_the_map_is_that_of_one_run(monkeypatch):
     pytest.importorskip("gtsam")
     a, b = of_walk(RING, 0, 200), of_walk(RING.replace("seed=3", "seed=8"), 60, 180, elsewhere=True)
+    for one in (a, b):
+        monkeypatch.setattr(one, "recording", "walk")
     steps = []
     joined = sv.join(a, b, lambda done, total, doing: steps.append(doing))
     assert "finding the second map in the first" in steps
     assert joined.found >= 3
+    assert joined.map.recording == "walk, poses corrected"  # it cannot be gone on with
     assert np.linalg.norm((joined.T_a_b @ ELSEWHERE)[:3, 3]) < 0.6  # both have drifted
     kept = joined.map.kept_frames.frames
     np.testing.assert_allclose(kept[0].T_world_sensor, a.kept_frames.frames[0].T_world_sensor, atol=0.05)

@@ -49,3 +49,10 @@ def test_an_office_that_may_be_any_is_not_placed():
     first, second = closed(f"{offices}&walk=1", 0, 300), closed(f"{offices}&walk=2&seed=4", 60, 160, elsewhere=True)
     with pytest.raises(StereovoxError, match=r"fits the first in two ways|is not known"):
         placed(first, second)
+
+
+def test_one_place_alone_does_not_say_where_a_recording_lies():
+    first, second = closed(RING, 0, 90), closed(RING, 30, 34, elsewhere=True)
+    assert len(second.submaps) == 1
+    with pytest.raises(StereovoxError, match="of 1 places of it were found there, 3 must agree"):
+        placed(first, second)

@@ -81,11 +81,11 @@ def placed(
             votes += _votes(first, second, number, shape, search)
         progress(done, len(numbers))
     groups = sorted((_agreeing(vote, votes, second) for vote in votes), key=_submaps, reverse=True)
-    if not groups or _submaps(groups[0]) < min(LEAST, len(numbers)):
+    if not groups or _submaps(groups[0]) < LEAST:
         found = _submaps(groups[0]) if groups else 0
         raise StereovoxError(
             f"where the second map lies in the first is not known: {found} of {len(numbers)} places of it were found "
-            f"there, {min(LEAST, len(numbers))} must agree; say it (--transform)"
+            f"there, {LEAST} must agree; say it (--transform)"
         )
     best = groups[0]
     rivals = [group for group in groups if not set(group) & set(best)]

@@ -125,3 +125,12 @@ def test_what_the_closed_map_is_made_of_is_said(closure, capsys):
     assert "frames_budget" not in "".join(capsys.readouterr())
     say_closure(replace(closure, report=replace(closure.report, all_frames=False)))
     assert "only 30 frames were kept (map.frames_budget)" in "".join(capsys.readouterr())
+
+
+def test_loops_are_sought_with_other_drift_than_the_map_was_made_with(mapper, tmp_path):
+    mapper.save(tmp_path / "a.svox")
+    closed = sv.close_loops(tmp_path / "a.svox", tmp_path / "b.svox", **{"loops.drift": 0.05})
+    assert closed.map.config.loops.drift == 0.05
+    assert len(sv.load_map(tmp_path / "b.svox").kept_frames) == len(mapper.map.kept_frames)
+    with pytest.raises(sv.StereovoxError, match="was made with max_range"):
+        sv.close_loops(tmp_path / "a.svox", tmp_path / "b.svox", max_range=2.0)

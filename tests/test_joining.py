@@ -100,6 +100,10 @@ def test_what_cannot_be_exact_is_added_and_said(of_a, of_b, said):
     assert equal(sv.merge(a, b), added(a, b))
 
 
+def test_what_loops_may_drift_does_not_keep_maps_apart():
+    assert why_added(mapped(frames(2)), mapped(frames(2), **{"loops.drift": 0.05})) is None
+
+
 @pytest.mark.skipif(not KITCHEN.is_dir(), reason="the 7-Scenes kitchen is not here")
 def test_two_halves_of_a_real_kitchen_are_one_run():
     every = list(sv.open_source(KITCHEN, frames="::5"))

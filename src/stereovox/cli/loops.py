@@ -42,13 +42,15 @@ def run(arguments: Namespace) -> dict[str, Any]:
     """Close the loops and print what was found."""
     from stereovox.closing import close_loops
     from stereovox.safe_io import check_file
+    from stereovox.sources.trajectory import TRAJECTORY_ENDINGS
     from stereovox.view.figures import ENDINGS
 
     out = arguments.out or name_beside(arguments.map, "closed")
     check_new(out, arguments.map)
     check_there(arguments.map)
-    if arguments.picture:
-        check_file(arguments.picture, ENDINGS)
+    for file, endings in ((arguments.picture, ENDINGS), (arguments.trajectory, TRAJECTORY_ENDINGS)):
+        if file:
+            check_file(file, endings)
     say_about_compiling()
     with progress_of_steps("looking for loops") as progress:
         done = close_loops(

@@ -10,6 +10,7 @@ from time import monotonic, monotonic_ns
 
 import pytest
 
+import stereovox
 from stereovox.mapper import GridMapper, Mapper
 from stereovox.run import Checkpoints
 
@@ -23,7 +24,7 @@ LAYERS = (
     {"intake", "integrate", "products", "sources"},
     {"comparison", "deadline", "formats", "localize", "rebuild", "simulate", "track"},
     {"corrected_poses", "loops", "mapper", "opening"},
-    {"calibrate", "closing", "evaluate", "join", "pose_choice", "remapping", "survey"},
+    {"calibrate", "closing", "evaluate", "joining", "pose_choice", "remapping", "survey"},
     {"run", "view"},
     {"contents", "floor_run", "ros", "report", "track_run", "viewer"},
     {"lab"},
@@ -225,3 +226,8 @@ def test_nothing_goes_by_a_clock_that_is_set():
     assert signature(Checkpoints).parameters["clock"].default is monotonic
     assert signature(Mapper).parameters["clock"].default is signature(GridMapper).parameters["clock"].default
     assert signature(Mapper).parameters["clock"].default is monotonic_ns
+
+
+def test_no_public_name_is_hidden_by_a_module():
+    """Once such a module is imported, `stereovox.name` is the module."""
+    assert not {path.stem for path in SOURCE.iterdir()} & set(stereovox.__all__)

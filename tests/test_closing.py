@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Loops of a map are remembered by it, as lines between their places, until poses are corrected otherwise."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import stereovox as sv
 from stereovox import closing
+from stereovox.cli.loops import say_closure
 from stereovox.loops.closer import Loop, LoopCloser
 from stereovox.loops.matching import Match
 from stereovox.products.moved import moved
@@ -89,3 +92,45 @@ def test_a_map_without_loops_says_that_none_were_found(mapper):
     closure = closing.close(mapper)
     assert not closure.loops
     assert mapper.map.history.loops == LoopLines.between([], closure.ends(closure.refused, closure.T_world_sensor))
+
+
+def test_a_recording_is_mapped_and_closed_and_not_gone_on_with(tmp_path, monkeypatch):
+    monkeypatch.setattr(closing, "LoopCloser", MadeCloser)
+    out, settings = tmp_path / "room.svox", {"voxel_size": 0.2, "trust.max_disagreement": 1}
+    made = sv.map_recording("sim:room?image_width=96", out, frames="::8", close_loops=True, **settings)
+    saved = sv.load_map(out)
+    assert saved.history.loops == made.loops.lines
+    np.testing.assert_allclose(
+        [frame.T_world_sensor for frame in saved.kept_frames.frames], made.loops.T_world_sensor, atol=1e-9
+    )
+    with pytest.raises(sv.StereovoxError, match="its poses were corrected"):
+        sv.map_recording("sim:room?image_width=96", out, frames="::8", close_loops=True, resume=True, **settings)
+
+
+def test_a_recording_without_loops_remembers_that_they_were_sought(tmp_path):
+    out = tmp_path / "room.svox"
+    made = sv.map_recording("sim:room?image_width=96", out, frames="::8", close_loops=True, voxel_size=0.2)
+    assert not made.loops.loops
+    assert sv.load_map(out).history.loops == made.loops.lines
+
+
+def test_frames_with_the_same_stamps_are_refused_before_any_work(mapper):
+    twice = sv.Mapper(mapper.map.config, resume=sv.merge(mapper.map, mapper.map))
+    with pytest.raises(sv.StereovoxError, match="have the same stamp"):
+        closing.close(twice)
+
+
+def test_what_the_closed_map_is_made_of_is_said(closure, capsys):
+    say_closure(closure)
+    assert "frames_budget" not in "".join(capsys.readouterr())
+    say_closure(replace(closure, report=replace(closure.report, all_frames=False)))
+    assert "only 30 frames were kept (map.frames_budget)" in "".join(capsys.readouterr())
+
+
+def test_loops_are_sought_with_other_drift_than_the_map_was_made_with(mapper, tmp_path):
+    mapper.save(tmp_path / "a.svox")
+    closed = sv.close_loops(tmp_path / "a.svox", tmp_path / "b.svox", **{"loops.drift": 0.05})
+    assert closed.map.config.loops.drift == 0.05
+    assert len(sv.load_map(tmp_path / "b.svox").kept_frames) == len(mapper.map.kept_frames)
+    with pytest.raises(sv.StereovoxError, match="was made with max_range"):
+        sv.close_loops(tmp_path / "a.svox", tmp_path / "b.svox", max_range=2.0)

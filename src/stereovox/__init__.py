@@ -34,9 +34,9 @@ if TYPE_CHECKING:
     from stereovox.frame import Reason as Reason
     from stereovox.frame import Scan as Scan
     from stereovox.frame import StereoFrame as StereoFrame
-    from stereovox.join import Joined as Joined
-    from stereovox.join import join as join
-    from stereovox.join import merge as merge
+    from stereovox.joining import Joined as Joined
+    from stereovox.joining import join as join
+    from stereovox.joining import merge as merge
     from stereovox.mapper import AnyMapper as AnyMapper
     from stereovox.mapper import GridMapper as GridMapper
     from stereovox.mapper import Mapper as Mapper
@@ -114,9 +114,9 @@ _HOMES = {
     "difference": "products.difference",
     "frontiers": "products.frontiers",
     "ground": "products.ground",
-    "Joined": "join",
-    "join": "join",
-    "merge": "join",
+    "Joined": "joining",
+    "join": "joining",
+    "merge": "joining",
     "CorrectedPoses": "corrected_poses",
     "OdometryJumps": "corrected_poses",
     "poses_by_path": "corrected_poses",

@@ -188,13 +188,19 @@ def close(mapper: Mapper, progress: Progress = no_progress, positions: Positions
         What was found and done.
 
     Raises:
-        StereovoxError: The map did not keep its frames; `positions` are too few or too close to each other.
+        StereovoxError: The map did not keep its frames, or several of one sensor have the same stamp; `positions` are
+            too few or too close to each other.
         MissingExtra: gtsam is not installed.
     """
     kept = mapper.map.kept_frames
     if kept is None or not len(kept):
         raise StereovoxError("the map did not keep its frames; map again with map.keep_frames=true")
     frames, closer = kept.frames, LoopCloser(mapper.config)
+    if len({(frame.sensor, frame.stamp_ns) for frame in frames}) < len(frames):
+        raise StereovoxError(
+            "several frames of one sensor have the same stamp, so the map's loops cannot be closed; close those of the "
+            "maps that it was merged of, or merge them with --find"
+        )
     for done, frame in enumerate(frames, 1):
         closer.add(frame)
         progress(done, len(frames), "looking for loops")

@@ -156,6 +156,11 @@ def moved_frames(frames: Sequence[KeptFrame], poses: FramePoses, config: Config)
     return moved, len(poses) - len(named)
 
 
+def as_corrected(recording: str) -> str:
+    """Return the name of the recording of a map whose poses were corrected; "" where it has none."""
+    return f"{recording.removesuffix(CORRECTED)}{CORRECTED}" if recording else ""
+
+
 class Rebuild:
     """A map whose poses are being corrected: `catch_up` maps kept frames again, `finish` puts the result into it.
 

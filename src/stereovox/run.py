@@ -387,8 +387,7 @@ class MapRun:
             progress(done, total, doing)
 
         closure = close(self.mapper, tell)
-        if closure.loops:
-            self._checkpoints.save(frames_offered(self.mapper))
+        self._checkpoints.save(frames_offered(self.mapper))  # also which places were refused
         return closure
 
     def _believed(self) -> int:

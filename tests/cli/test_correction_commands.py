@@ -98,8 +98,11 @@ def test_loops_draws_what_it_did(maps, tmp_path, told_with_notes, capsys):
     assert "loops: 0 closed, 0 refused" in "".join(capsys.readouterr())
 
 
-@pytest.mark.parametrize("name", ["loops.gif", "nowhere/loops.png"])
-def test_loops_refuses_a_picture_that_cannot_be_before_any_work(maps, tmp_path, capsys, name):
-    assert main(["loops", str(maps / "a.svox"), "--out", str(tmp_path / "c"), "--picture", str(tmp_path / name)]) == 2
+@pytest.mark.parametrize(
+    ("option", "name"),
+    [("--picture", "loops.gif"), ("--picture", "nowhere/loops.png"), ("--trajectory", "way.csv")],
+)
+def test_loops_refuses_a_file_that_cannot_be_before_any_work(maps, tmp_path, capsys, option, name):
+    assert main(["loops", str(maps / "a.svox"), "--out", str(tmp_path / "c"), option, str(tmp_path / name)]) == 2
     assert name in capsys.readouterr().err
     assert not (tmp_path / "c").exists()

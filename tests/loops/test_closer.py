@@ -8,6 +8,7 @@ from made_loops import OFFICES, RING, closed, errors, mapped, off, truths
 
 from stereovox.config import load_config
 from stereovox.loops.closer import LoopCloser
+from stereovox.se3 import rotation_matrix
 
 
 def test_a_ring_is_closed_and_the_way_becomes_right():
@@ -69,3 +70,33 @@ def test_poses_that_are_known_badly_are_bent_more():
         whole = np.linalg.norm(bends[-1] - bends[0])
         found.append(np.linalg.norm(bends[ends[1]] - bends[ends[0]]) / whole)
     assert found[1] > 1.5 * found[0]
+
+
+def test_two_cameras_back_to_back_are_one_body():
+    made, T_front_rear = mapped(RING, 0, 60), np.eye(4)
+    T_front_rear[:3, :3], T_front_rear[:3, 3] = rotation_matrix([0, np.pi, 0]), [0.2, 0, -0.3]
+    one, both = LoopCloser(made.config), LoopCloser(made.config)
+    for frame in made.kept_frames.frames:
+        one.add(frame)
+        both.add(frame)
+        both.add(replace(frame, sensor="rear", T_world_sensor=frame.T_world_sensor @ T_front_rear))
+    one.finish()
+    both.finish()
+    assert len(both.submaps) <= len(one.submaps) + 1
+    assert both.submaps[-1].travelled < 1.1 * one.submaps[-1].travelled
+    assert set(both.corrected()) == {(s, f.stamp_ns) for f in made.kept_frames.frames for s in (f.sensor, "rear")}
+
+
+def test_frames_may_come_in_any_order_of_time():
+    made = mapped(RING, 0, 60)
+    closer = LoopCloser(made.config)
+    for frame in made.kept_frames.frames:
+        closer.add(replace(frame, stamp_ns=10**12 - frame.stamp_ns))
+    closer.finish()
+    for n, submap in enumerate(closer.submaps):
+        submap.T_map_anchor = submap.T_map_anchor.copy()
+        submap.T_map_anchor[2, 3] += 0.1 * n
+    new = closer.corrected()
+    for submap in closer.submaps:
+        anchor = submap.frames[submap.anchor]
+        np.testing.assert_allclose(new[anchor.sensor, anchor.stamp_ns], submap.T_map_anchor, atol=1e-9)

@@ -21,6 +21,7 @@ def test_a_second_recording_is_found_and_joined():
     off = difference(inverse(ELSEWHERE), place.T_first_second)
     assert np.linalg.norm(off[3:]) < 0.6  # both have drifted
     assert np.linalg.norm(off[:3]) < np.radians(5)
+    assert len({(loop.first, loop.second) for loop in place.loops}) == len(place.loops) >= 3
     count = len(first.submaps)
     first.join(second, place.T_first_second, place.loops)
     first.finish()
@@ -47,4 +48,11 @@ def test_an_office_that_may_be_any_is_not_placed():
     offices = "sim:offices?offices=6&visits=2&image_width=106"
     first, second = closed(f"{offices}&walk=1", 0, 300), closed(f"{offices}&walk=2&seed=4", 60, 160, elsewhere=True)
     with pytest.raises(StereovoxError, match=r"fits the first in two ways|is not known"):
+        placed(first, second)
+
+
+def test_one_place_alone_does_not_say_where_a_recording_lies():
+    first, second = closed(RING, 0, 90), closed(RING, 30, 34, elsewhere=True)
+    assert len(second.submaps) == 1
+    with pytest.raises(StereovoxError, match="of 1 places of it were found there, 3 must agree"):
         placed(first, second)

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from made_loops import ELSEWHERE, mapped, off, truths
 
+from stereovox.closing import _positions
 from stereovox.errors import StereovoxError
 from stereovox.loops.closer import LoopCloser
 from stereovox.loops.positions import Positions
@@ -69,3 +70,10 @@ def test_between_positions_far_apart_in_time_there_is_none():
 def test_too_few_or_too_vague_positions_are_refused(length, sigma):
     with pytest.raises(StereovoxError, match="are needed to know how they lie in the map"):
         held(measured(sigma, length=length))
+
+
+def test_positions_of_which_none_is_usable_are_refused(tmp_path):
+    file = tmp_path / "gnss.tum"
+    file.write_text("0.0 nan nan nan 0 0 0 1\n1.0 nan nan nan 0 0 0 1\n")
+    with pytest.raises(StereovoxError, match="0 places of the way have a position"):
+        held(_positions(file, 1.0))

@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """The search for where a submap lies, against a slow twin and against the truth."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from made_loops import RING, closed
 
-from stereovox.loops import _search
+from stereovox.loops import _search, search
 from stereovox.loops.closer import difference
 from stereovox.loops.search import Search
 from stereovox.se3 import inverse, rotation_matrix
@@ -51,3 +53,20 @@ def test_a_submap_is_found_on_itself_from_a_wrong_guess(seed):
     assert len(places) <= 4
     again = [np.linalg.norm(one[3:] - other[3:]) for i, one in enumerate(off) for other in off[:i]]
     assert not again or min(again) > 0.2  # no place is given twice
+
+
+def test_a_large_grid_needs_little_memory_and_its_parts_are_as_the_whole(monkeypatch):
+    closer = closed(RING)
+    shape = closer.shapes[closer.submaps[10]]
+    whole = Search(shape.points, shape.views, np.eye(3))
+    monkeypatch.setattr(search, "AT_ONCE", 500)
+    assert (whole._grid == search.THROUGH).any()
+    np.testing.assert_array_equal(Search(shape.points, shape.views, np.eye(3))._grid, whole._grid)
+    monkeypatch.undo()
+    corners = np.array([[0.0, 0, 0], [60, 60, 20]])
+    tracemalloc.start()
+    cells = Search(corners, shape.views, np.eye(3))._grid.size
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert cells > 8e6
+    assert peak < 20 * cells

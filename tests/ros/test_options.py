@@ -88,15 +88,20 @@ def test_mistakes_end_in_one_line(capsys, words, said):
     assert "Traceback" not in err
 
 
-def test_whatever_breaks_the_map_is_saved(monkeypatch, tmp_path, alone):
+@pytest.mark.parametrize("when", ["spin_once", "close"])
+def test_whatever_breaks_the_map_is_saved(monkeypatch, tmp_path, alone, when):
     from stereovox.ros.node import MapNode
+
+    def ends(node):
+        raise KeyboardInterrupt
 
     def breaks(node):
         node._mapping.add(depth_at(0))
         raise RuntimeError("nobody foresaw this")
 
     monkeypatch.setenv("ROS_DOMAIN_ID", alone["ROS_DOMAIN_ID"])
-    monkeypatch.setattr(MapNode, "spin_once", breaks)
+    monkeypatch.setattr(MapNode, "spin_once", ends)
+    monkeypatch.setattr(MapNode, when, breaks)
     monkeypatch.setattr("stereovox.ros.warm_up.warm_up", lambda config, tracked: None)
     with pytest.raises(RuntimeError, match="foresaw"):
         main(["ros2", "--depth", DEPTH, "--odometry", "/odom", "--out", str(tmp_path / "live.svox")])

@@ -112,3 +112,13 @@ def test_what_stands_where_views_looked_through_is_told_apart():
     free = stood_free(asked, np.full(5, 0.005, np.float32), np.eye(4), [view])
     assert free.tolist() == [True, False, False, False, False]
     assert not stood_free(asked, np.full(5, 0.005, np.float32), np.eye(4), []).any()
+
+
+def test_a_camera_that_sees_all_round_has_a_view_of_what_is_ahead():
+    aside = np.linspace(-np.pi, np.pi, 2000, endpoint=False)
+    points = np.stack([2 * np.sin(aside), np.linspace(-1, 1, 2000), 2 * np.cos(aside)], axis=1).astype(np.float32)
+    found = view_of(points, np.full(2000, 0.01, np.float32), np.eye(4))
+    assert np.isfinite(found.depth).sum() > 20
+    assert found.slope.max() < 5
+    behind = view_of(-np.abs(points), np.full(2000, 0.01, np.float32), np.eye(4))
+    assert not np.isfinite(behind.depth).any()

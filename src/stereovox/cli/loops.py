@@ -42,13 +42,15 @@ def run(arguments: Namespace) -> dict[str, Any]:
     """Close the loops and print what was found."""
     from stereovox.closing import close_loops
     from stereovox.safe_io import check_file
+    from stereovox.sources.trajectory import TRAJECTORY_ENDINGS
     from stereovox.view.figures import ENDINGS
 
     out = arguments.out or name_beside(arguments.map, "closed")
     check_new(out, arguments.map)
     check_there(arguments.map)
-    if arguments.picture:
-        check_file(arguments.picture, ENDINGS)
+    for file, endings in ((arguments.picture, ENDINGS), (arguments.trajectory, TRAJECTORY_ENDINGS)):
+        if file:
+            check_file(file, endings)
     say_about_compiling()
     with progress_of_steps("looking for loops") as progress:
         done = close_loops(
@@ -82,6 +84,8 @@ def say_closure(closure: LoopClosure) -> None:
         say(f"no loops were found: of {len(closure.places)} places, none is surely seen twice")
     moved = summary["moved_m"]
     say(f"frames moved by {moved['median']:.3f} m (median), at most {moved['max']:.3f} m")
+    if not closure.report.all_frames:
+        say(f"note: only {len(closure.stamps_ns)} frames were kept (map.frames_budget); the map is what these make")
     if closure.refused:
         say(f"{len(closure.refused)} places look the same and were not believed to be:")
     for one in summary["loops_refused"][:SHOWN]:

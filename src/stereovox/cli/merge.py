@@ -45,7 +45,7 @@ def add_transform(parser: ArgumentParser) -> None:
 
 def run(arguments: Namespace) -> dict[str, Any]:
     """Load both maps and save the merged one."""
-    from stereovox.join import merge, why_added
+    from stereovox.joining import merge, why_added
 
     if arguments.find:
         return _joined(arguments)
@@ -62,7 +62,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
 
 def _joined(arguments: Namespace) -> dict[str, Any]:
     """Find where the second map lies, and save the map of both."""
-    from stereovox.join import join
+    from stereovox.joining import join
 
     if arguments.transform is not None:
         raise StereovoxError("--find: finds the transform; leave --transform out")

@@ -118,10 +118,10 @@ def _map(arguments: Namespace, node: Any, mapping: Mapping, options: Options) ->
                     map_node.spin_once()
                     check()
                     _checkpoint(checkpoints, mapping.history.frames, node)
+            map_node.close()  # still under `check`: a second signal, as `timeout` sends it, must not interrupt this
         except Exception:  # whatever failed, the map so far is saved
             _save(mapping, out())
             raise
-        map_node.close()  # still under `check`: a second signal, as `timeout` sends it, must not interrupt this
         return _print_result(map_node, mapping, out(), reports)
 
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.config import Config
-from stereovox.loops.drift import Drift, length
+from stereovox.loops.drift import Drift, Way
 from stereovox.loops.matching import FLOOR, Match, matched
 from stereovox.loops.positions import Positions
 from stereovox.loops.search import SAME_M, SAME_RAD, Search
@@ -104,14 +104,17 @@ class LoopCloser:
         self._steps, self._overlaps, self._uprights = list[Edge](), list[Edge](), list[Upright]()
         self._waiting: list[Loop] = []  # for another one that agrees
         self._frames, self._poses = list[KeptFrame](), list[Transform]()  # of the next submap
+        self._ways, self._way = list[tuple[float, float]](), Way()
 
     def add(self, frame: KeptFrame) -> bool:
         """Take in the next frame, with the pose it came with; return whether loops were found."""
         pose, found = orthonormalise(frame.T_world_sensor), False
-        if is_long(self._poses, pose):
+        own = [T for one, T in zip(self._frames, self._poses, strict=True) if one.sensor == frame.sensor]
+        if is_long(own, pose):
             found = self._complete()
         self._frames.append(frame)
         self._poses.append(pose)
+        self._ways.append(self._way.add(frame.sensor, pose))
         return found
 
     def finish(
@@ -162,7 +165,7 @@ class LoopCloser:
         Args:
             part: The submaps of one recording, where another one was joined.
         """
-        submaps = self.submaps[part]
+        submaps = sorted(self.submaps[part], key=lambda submap: submap.stamp_ns)
         stamps = [submap.stamp_ns for submap in submaps]
         found: dict[tuple[str, int], Transform] = {}
         for submap in submaps:
@@ -177,8 +180,9 @@ class LoopCloser:
 
     def _complete(self) -> bool:
         """Make a submap of the frames since the last one; return whether it closes loops."""
-        submap = Submap(self._frames, self._poses, self._poses[len(self._poses) // 2])
-        self._frames, self._poses = [], []
+        middle = len(self._frames) // 2
+        submap = Submap(self._frames, self._poses, self._poses[middle], *self._ways[middle])
+        self._frames, self._poses, self._ways = [], [], []
         if self.submaps:
             self._follow(self.submaps[-1], submap)
         if self._upright_deg is not None:
@@ -196,14 +200,13 @@ class LoopCloser:
     def _follow(self, last: Submap, submap: Submap) -> None:
         """Place a submap behind the last one, as its poses say."""
         motion = inverse(last.T_odom_anchor) @ submap.T_odom_anchor
-        way = [*last.T_odom_frames[last.anchor :], *submap.T_odom_frames[: submap.anchor + 1]]
-        metres, radians = length(way)
+        metres, radians = submap.travelled - last.travelled, submap.turned - last.turned
         ends = last.frames[last.anchor], submap.frames[submap.anchor]
         variances = np.sum([np.repeat(frame.pose_sigma, 3) ** 2 for frame in ends], axis=0)
         known = information(self._drift.covariance(metres, radians) + np.diag(variances))
         number = len(self.submaps)
         self._steps.append(Edge(number - 1, number, motion, known))
-        submap.T_map_anchor, submap.travelled = last.T_map_anchor @ motion, last.travelled + metres
+        submap.T_map_anchor = last.T_map_anchor @ motion
 
     def _hold(self, positions: Positions) -> None:
         """Hold the way at positions. How their world lies in the map is what fits best; the first submap stays."""

@@ -3,8 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -45,8 +43,21 @@ class Drift(NamedTuple):
         return self.share * float(np.sqrt(KEEPS_M * metres))
 
 
-def length(poses: Sequence[Transform]) -> tuple[float, float]:
-    """Return metres and radians of the way from pose to pose."""
-    moves = [inverse(one) @ other for one, other in pairwise(poses)]
-    metres = sum(float(np.linalg.norm(move[:3, 3])) for move in moves)
-    return metres, sum(float(np.linalg.norm(rotation_vector(move[:3, :3]))) for move in moves)
+class Way:
+    """The way of a body so far, by the frames of all its sensors.
+
+    From one sensor to the next there is no way: each goes on from its own last frame.
+    """
+
+    def __init__(self) -> None:
+        self._last = dict[str, Transform]()
+        self._so_far = dict[str, NDArray[np.float64]]()
+
+    def add(self, sensor: str, T_world_sensor: Transform) -> tuple[float, float]:
+        """Take in the next frame's pose (4, 4); return metres and radians of the way until there."""
+        move = inverse(self._last.get(sensor, T_world_sensor)) @ T_world_sensor
+        step = np.array([np.linalg.norm(move[:3, 3]), np.linalg.norm(rotation_vector(move[:3, :3]))])
+        own = self._so_far.get(sensor, np.zeros(2)) + step
+        so_far = np.maximum.reduce([own, *self._so_far.values()])
+        self._last[sensor], self._so_far[sensor] = T_world_sensor, so_far
+        return float(so_far[0]), float(so_far[1])

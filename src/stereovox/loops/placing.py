@@ -46,7 +46,8 @@ class Placed:
 
     Attributes:
         T_first_second: (4, 4) maps its world into the first one's.
-        loops: What was found; `first` is a number of the first recording's submaps, `second` of the second's.
+        loops: What was found, once for each pair; `first` is a number of the first recording's submaps,
+            `second` of the second's.
     """
 
     T_first_second: Transform
@@ -80,11 +81,11 @@ def placed(
             votes += _votes(first, second, number, shape, search)
         progress(done, len(numbers))
     groups = sorted((_agreeing(vote, votes, second) for vote in votes), key=_submaps, reverse=True)
-    if not groups or _submaps(groups[0]) < min(LEAST, len(numbers)):
+    if not groups or _submaps(groups[0]) < LEAST:
         found = _submaps(groups[0]) if groups else 0
         raise StereovoxError(
             f"where the second map lies in the first is not known: {found} of {len(numbers)} places of it were found "
-            f"there, {min(LEAST, len(numbers))} must agree; say it (--transform)"
+            f"there, {LEAST} must agree; say it (--transform)"
         )
     best = groups[0]
     rivals = [group for group in groups if not set(group) & set(best)]
@@ -93,8 +94,9 @@ def placed(
             f"the second map fits the first in two ways ({_submaps(best)} and {_submaps(rivals[0])} of {len(numbers)} "
             "places); say which one (--transform)"
         )
-    middle = max(best, key=lambda vote: vote.loop.match.shared)
-    return Placed(middle.T_first_second, [vote.loop for vote in best])
+    best = sorted(best, key=lambda vote: vote.loop.match.shared)
+    pairs = {(vote.loop.first, vote.loop.second): vote.loop for vote in best}  # several places may lead to one
+    return Placed(best[-1].T_first_second, list(pairs.values()))
 
 
 def _whole(closer: LoopCloser) -> Search:

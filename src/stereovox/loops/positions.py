@@ -37,6 +37,8 @@ class Positions:
 
     def at(self, stamps_ns: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return places (M, 3) at other times, interpolated; NaN where none is near enough."""
+        if not len(self.stamps_ns):
+            return np.full((len(stamps_ns), 3), np.nan)
         after = np.searchsorted(self.stamps_ns, stamps_ns)
         one, other = np.maximum(after - 1, 0), np.minimum(after, len(self.stamps_ns) - 1)
         found = np.stack([np.interp(stamps_ns, self.stamps_ns, axis) for axis in self.places.T], axis=1)

@@ -25,6 +25,8 @@ PEAKS = 4
 """Places that are looked at closely, usually."""
 SAME_M, SAME_RAD = 0.5, np.radians(12)
 """Within which two places are one."""
+AT_ONCE = 1 << 20
+"""Cells that are looked at together, so that large grids need little memory."""
 LEAST = 0.12
 """Score, of at most 1, that a place needs."""
 
@@ -94,8 +96,15 @@ class Search:
 
     def _mark_free(self, views: Iterable[View]) -> None:
         """Mark cells that views looked through."""
-        index = np.stack(np.meshgrid(*map(np.arange, self._grid.shape), indexing="ij"), axis=-1).reshape(-1, 3)
-        middles = (index + self._low + 0.5) * self._cell
+        seen, (count, *others) = list(views), self._grid.shape
+        step = max(1, AT_ONCE // max(1, others[0] * others[1]))
+        for first in range(0, count, step):
+            self._mark_free_in(self._grid[first : first + step], first, seen)
+
+    def _mark_free_in(self, slab: NDArray[np.int8], first: int, views: Iterable[View]) -> None:
+        """Mark those of a part of the grid, from this number along its first axis."""
+        index = np.stack(np.meshgrid(*map(np.arange, slab.shape), indexing="ij"), axis=-1).reshape(-1, 3)
+        middles = (index + [first, 0, 0] + self._low + 0.5) * self._cell
         for view in views:
             T = inverse(self._T @ view.T)
             points = middles @ T[:3, :3].T + T[:3, 3]
@@ -105,7 +114,7 @@ class Search:
             column, row = np.floor(place[inside]).astype(int).T
             nearest = view.nearest[row, column]
             free = np.isfinite(nearest) & (points[inside, 2] < nearest - BEHIND_M)
-            self._grid.reshape(-1)[np.flatnonzero(inside)[free]] = THROUGH
+            slab.reshape(-1)[np.flatnonzero(inside)[free]] = THROUGH
 
     def _mark_surfaces(self, points: NDArray[np.float64]) -> None:
         """Mark cells with a surface, and those beside them."""

@@ -42,6 +42,7 @@ class Submap:
         anchor: Number of the frame whose axes are the submap's: the middle one.
         T_map_anchor: (4, 4) pose of that, as now believed.
         travelled: Metres of the way until there.
+        turned: Radians of turning until there.
         centre: (3,) mean of what it shows, in its axes.
     """
 
@@ -49,6 +50,7 @@ class Submap:
     T_odom_frames: Sequence[Transform]
     T_map_anchor: Transform
     travelled: float = 0.0
+    turned: float = 0.0
     centre: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
 
     @property
@@ -130,7 +132,7 @@ class Shapes:
 
 
 def is_long(T_odom_frames: Sequence[Transform], T_odom_next: Transform) -> bool:
-    """Return whether a submap of these frames is complete before another one."""
+    """Return whether a submap of these frames of one sensor is complete before another one of it."""
     if not T_odom_frames:
         return False
     T = inverse(T_odom_frames[0]) @ T_odom_next

@@ -31,7 +31,7 @@ from stereovox.trust.history import History, WithHistory
 EVERYWHERE = np.array([[-(2**30)] * 3, [2**30] * 3])
 """Lowest block that `Storage.blocks_within` may be asked for, and the first beyond the highest."""
 
-NOT_OF_FRAMES = {"profile", "map", "threads", "trust", "deadline_ms"}
+NOT_OF_FRAMES = {"profile", "map", "threads", "trust", "deadline_ms", "amcl", "slam", "loops"}
 """Settings that do not change what a frame that was taken says; `map` is compared by itself."""
 
 Blocks = tuple[NDArray[np.int32], NDArray[np.integer]]

@@ -17,6 +17,8 @@ SMALL = (12, 16)
 """Places at which views are compared by their looks."""
 FEW, NEAR = 4, 12
 """Views that an image is compared with, the nearest: each time, and where a place must be sure."""
+WIDEST = 4.0
+"""Half width and half height of the grid at one metre, at most: of a camera that sees farther aside, what is ahead."""
 TOLERANCE = 0.04
 """Share of the depth by which what is seen twice may differ, besides four standard deviations."""
 
@@ -40,7 +42,7 @@ class View(NamedTuple):
 def view_of(points: NDArray[np.float32], sigma: NDArray[np.float32], T: Transform) -> View:
     """Return the view of an image's patches (N, 3), (N,) from T_map_camera."""
     ahead = points[points[:, 2] > 0]
-    slope = np.abs(ahead[:, :2] / ahead[:, 2:]).max(axis=0) + 1e-6
+    slope = np.minimum(np.abs(ahead[:, :2] / ahead[:, 2:]).max(axis=0, initial=0.0), WIDEST) + 1e-6
     view = View(T, np.full(GRID, np.nan, np.float32), np.full(GRID, np.inf, np.float32), points, sigma, slope)
     row, column, inside = _places(view, points)
     order = np.argsort(-points[inside, 2])  # the nearest is written last

@@ -23,7 +23,7 @@ from stereovox.products.merge import merge as added
 from stereovox.products.merge import together
 from stereovox.products.moved import rigid
 from stereovox.products.side_by_side import check_alike
-from stereovox.rebuild import Rebuild
+from stereovox.rebuild import Rebuild, as_corrected
 from stereovox.se3 import Transform
 from stereovox.threads import one_state
 
@@ -83,7 +83,9 @@ def join(a: VoxelMap, b: VoxelMap, progress: Progress = no_progress) -> Joined:
         [replace(frame, T_world_sensor=found[frame.sensor, frame.stamp_ns]) for frame in kept.frames]
         for kept, found in zip((a.kept_frames, b.kept_frames), poses, strict=True)
     ]
-    return Joined(_of_frames(a, b, *frames), place.T_first_second, len(place.loops), len(first.loops))
+    joined = _of_frames(a, b, *frames)
+    joined.recording = as_corrected(joined.recording)
+    return Joined(joined, place.T_first_second, len(place.loops), len(first.loops))
 
 
 def _closed(one: VoxelMap, words: str, progress: Progress) -> LoopCloser:

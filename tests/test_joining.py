@@ -6,10 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from made_loops import ELSEWHERE, RING
+from made_loops import mapped as of_walk
 from made_threads import frames_of
 
 import stereovox as sv
-from stereovox.join import why_added
+from stereovox.errors import StereovoxError
+from stereovox.joining import why_added
 from stereovox.products.merge import merge as added
 from stereovox.se3 import rotation_matrix
 
@@ -97,9 +100,39 @@ def test_what_cannot_be_exact_is_added_and_said(of_a, of_b, said):
     assert equal(sv.merge(a, b), added(a, b))
 
 
+def test_what_loops_may_drift_does_not_keep_maps_apart():
+    assert why_added(mapped(frames(2)), mapped(frames(2), **{"loops.drift": 0.05})) is None
+
+
 @pytest.mark.skipif(not KITCHEN.is_dir(), reason="the 7-Scenes kitchen is not here")
 def test_two_halves_of_a_real_kitchen_are_one_run():
     every = list(sv.open_source(KITCHEN, frames="::5"))
     a, b = mapped(every[::2]), mapped(every[1::2])
     assert equal(sv.merge(a, b), mapped(every))
     assert not equal(added(a, b), mapped(every))
+
+
+def test_a_second_recording_is_found_and_the_map_is_that_of_one_run(monkeypatch):
+    pytest.importorskip("gtsam")
+    a, b = of_walk(RING, 0, 200), of_walk(RING.replace("seed=3", "seed=8"), 60, 180, elsewhere=True)
+    for one in (a, b):
+        monkeypatch.setattr(one, "recording", "walk")
+    steps = []
+    joined = sv.join(a, b, lambda done, total, doing: steps.append(doing))
+    assert "finding the second map in the first" in steps
+    assert joined.found >= 3
+    assert joined.map.recording == "walk, poses corrected"  # it cannot be gone on with
+    assert np.linalg.norm((joined.T_a_b @ ELSEWHERE)[:3, 3]) < 0.6  # both have drifted
+    kept = joined.map.kept_frames.frames
+    np.testing.assert_allclose(kept[0].T_world_sensor, a.kept_frames.frames[0].T_world_sensor, atol=0.05)
+    assert len(kept) == len(a.kept_frames) + len(b.kept_frames)
+    trusting = {"trust.max_disagreement": 1, "trust.max_speed_mps": 1e6, "trust.max_turn_dps": 1e9}
+    run = sv.Mapper(a.config, **trusting)
+    for n, one in enumerate(kept):  # their stamps are those of two walks at once
+        assert run.add(replace(one.frame(), stamp_ns=n * 10**9)).refused is None
+    assert equal(joined.map, run.map)
+
+
+def test_a_recording_that_kept_no_frames_is_not_sought():
+    with pytest.raises(StereovoxError, match="only by frames, and a map did not keep its frames"):
+        sv.join(mapped(frames()), mapped(frames(), **{"map.keep_frames": False}))

@@ -18,6 +18,7 @@ from stereovox.config import Config
 from stereovox.loops.drift import Drift, Way
 from stereovox.loops.matching import FLOOR, Match, matched
 from stereovox.loops.positions import Positions
+from stereovox.loops.repeats import Repeats
 from stereovox.loops.search import SAME_M, SAME_RAD, Search
 from stereovox.loops.submaps import Shape, Shapes, Submap, is_long
 from stereovox.maps.kept_frames import KeptFrame
@@ -35,8 +36,10 @@ NEIGHBOURS = 10
 """Earlier submaps that each is laid onto at the end, the nearest."""
 GATE = 22.5
 """Squared deviations, of six, by which a loop may be off: 99.9 % of right ones are within (chi-squared)."""
-REACH = 4.5
-"""Deviations of the poses within which a place is sought: farther than is believed, to find others that look the same.
+REACH = 4.75
+"""The same, not squared: how far a place is sought, to find others that look the same."""
+RIVALS = 7.1
+"""Deviations within which a place must not look the same elsewhere, half again as many: poses may be worse than said.
 """
 WIDEST = np.array([8.0, 8.0, 2.0]), 0.7
 """Metres across and up, and radians, beyond which it is not."""
@@ -101,6 +104,7 @@ class LoopCloser:
         self.shapes, self._drift = Shapes(config), Drift.of(config.loops)
         self._up, self._upright_deg = up_of(config), config.loops.upright_deg
         self.R_level_map = rotation_between(self._up, [0, 0, 1])
+        self._repeats = Repeats(self.shapes, self.R_level_map)
         self._steps, self._overlaps, self._uprights = list[Edge](), list[Edge](), list[Upright]()
         self._waiting: list[Loop] = []  # for another one that agrees
         self._frames, self._poses = list[KeptFrame](), list[Transform]()  # of the next submap
@@ -193,6 +197,7 @@ class LoopCloser:
         if shape is None:
             return False
         submap.centre = shape.points.mean(axis=0).astype(float)
+        self._repeats.look(self.submaps)
         before = len(self.loops)
         self._find(shape)
         return len(self.loops) > before
@@ -239,13 +244,14 @@ class LoopCloser:
         near = self._near(last)
         if not near:
             return
-        covariances = self._graph().covariances(near, last)
+        covariances, found = self._graph().covariances(near, last), list[Loop]()
         for number, covariance in zip(near, covariances, strict=True):
             earlier = self.shapes[self.submaps[number]]
             loop = None if earlier is None else self._loop(number, last, earlier, shape, covariance)
-            if loop is not None and loop.why:
-                self.refused.append(loop)
-            elif loop is not None:
+            found += [] if loop is None else [loop]
+        self.refused += [loop for loop in found if loop.why]
+        for loop in found:
+            if not loop.why:
                 self._judge(loop)
 
     def _near(self, number: int) -> list[int]:
@@ -281,7 +287,20 @@ class LoopCloser:
             why = "another place within reach looks the same"
         elif _squared(moved, covariance + best.covariance) > GATE:
             why = f"the poses cannot be off by {off_m:.2f} m and {np.degrees(off_rad):.1f} degrees (loops.drift)"
+        elif (shift_m := self._rival_m(first, second, best, covariance)) is not None:
+            why = f"it looks the same {shift_m:.2f} m away, which the poses cannot tell apart"
         return Loop(first, second, best, off_m, off_rad, why)
+
+    def _rival_m(self, first: int, second: int, match: Match, covariance: NDArray[np.float64]) -> float | None:
+        """Return how far away a submap may lie as well, where the surroundings repeat; None where it may not."""
+        guess, T_map_first = self._expected(first, second), self.submaps[first].T_map_anchor
+        for shift in self._repeats.shifts([self.submaps[first].middle, self.submaps[second].middle]):
+            for there in (shift, -shift):
+                rival = match.T_earlier_later.copy()
+                rival[:3, 3] += T_map_first[:3, :3].T @ there
+                if _squared(difference(guess, rival), covariance + match.covariance) < RIVALS**2:
+                    return float(np.linalg.norm(shift))
+        return None
 
     def _expected(self, first: int, second: int) -> Transform:
         return inverse(self.submaps[first].T_map_anchor) @ self.submaps[second].T_map_anchor

@@ -3,6 +3,7 @@
 
     python benchmarks/loops.py offices --seeds 0:50 [--drift 0.02] [--visits 10] [--width 212]
     python benchmarks/loops.py ring --seeds 0:10 [--drift 0.01] [--width 212]
+    python benchmarks/loops.py racks --seeds 0:10 [--drift 0.02] [--width 96] [--set loops.drift=0.05]
     python benchmarks/loops.py apartment --seeds 0:5 [--drift 0.01] [--width 424]
     python benchmarks/loops.py RECORDING          # the camera is tracked; its own poses are taken for the truth
 
@@ -35,6 +36,7 @@ from stereovox.sources.poses import Poses
 SCENES = {
     "offices": "sim:offices?walk={seed}&",
     "ring": "sim:loop?plan={seed}&",
+    "racks": "sim:racks?walk={seed}&",
     "apartment": "sim:apartment?camera=d435&",
 }
 WRONG_M = 0.5

@@ -122,6 +122,7 @@ def test_a_second_recording_is_found_and_the_map_is_that_of_one_run(monkeypatch)
     assert "finding the second map in the first" in steps
     assert joined.found >= 3
     assert joined.map.recording == "walk, poses corrected"  # it cannot be gone on with
+    assert joined.map.history.loops.counts()["closed"] == joined.loops
     assert np.linalg.norm((joined.T_a_b @ ELSEWHERE)[:3, 3]) < 0.6  # both have drifted
     kept = joined.map.kept_frames.frames
     np.testing.assert_allclose(kept[0].T_world_sensor, a.kept_frames.frames[0].T_world_sensor, atol=0.05)

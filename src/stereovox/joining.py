@@ -26,6 +26,7 @@ from stereovox.products.side_by_side import check_alike
 from stereovox.rebuild import Rebuild, as_corrected
 from stereovox.se3 import Transform
 from stereovox.threads import one_state
+from stereovox.trust.loop_lines import LoopLines
 
 OF_WORLD = {"up", "up_direction", "levelled_from"}
 """Settings that may differ where a transform says how the worlds lie."""
@@ -85,6 +86,7 @@ def join(a: VoxelMap, b: VoxelMap, progress: Progress = no_progress) -> Joined:
     ]
     joined = _of_frames(a, b, *frames)
     joined.recording = as_corrected(joined.recording)
+    joined.history.loops = LoopLines.between(first.ends(first.loops), first.ends(first.refused))
     return Joined(joined, place.T_first_second, len(place.loops), len(first.loops))
 
 

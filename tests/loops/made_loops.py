@@ -7,12 +7,14 @@ from functools import cache
 import numpy as np
 
 import stereovox as sv
+from stereovox.config import load_config
 from stereovox.loops.closer import LoopCloser, difference
 from stereovox.se3 import inverse, rotation_matrix
 from stereovox.simulate.simulation import Simulation
 
 RING = "sim:loop?length=30&laps=1&image_width=106&drift=0.02&seed=3"
 OFFICES = "sim:offices?offices=6&visits=3&image_width=106&drift=0.02"
+RACKS = "sim:racks?bays=8&passes=3&image_width=96&drift=0.02&seed=1"
 ELSEWHERE = np.eye(4)
 ELSEWHERE[:3, :3], ELSEWHERE[:3, 3] = rotation_matrix([0, 0, 2.1]), [5, -3, 0.4]
 
@@ -30,10 +32,10 @@ def mapped(location, start=0, end=None, *, elsewhere=False):
 
 
 @cache
-def closed(location, start=0, end=None, *, elsewhere=False):
+def closed(location, start=0, end=None, *, elsewhere=False, drift=None):
     """Return the finished closer of such a map. It must not be changed."""
     made = mapped(location, start, end, elsewhere=elsewhere)
-    closer = LoopCloser(made.config)
+    closer = LoopCloser(made.config if drift is None else load_config(made.config, **{"loops.drift": drift}))
     for frame in made.kept_frames.frames:
         closer.add(frame)
     closer.finish()

@@ -5,7 +5,7 @@ from copy import deepcopy
 
 import numpy as np
 import pytest
-from made_loops import ELSEWHERE, RING, closed, truths
+from made_loops import ELSEWHERE, RACKS, RING, closed, truths
 
 from stereovox.errors import StereovoxError
 from stereovox.loops.closer import difference
@@ -56,3 +56,9 @@ def test_one_place_alone_does_not_say_where_a_recording_lies():
     assert len(second.submaps) == 1
     with pytest.raises(StereovoxError, match="of 1 places of it were found there, 3 must agree"):
         placed(first, second)
+
+
+def test_shelves_that_may_be_any_are_not_placed():
+    again = RACKS.replace("seed=1", "seed=5&walk=2").replace("passes=3", "passes=2")
+    with pytest.raises(StereovoxError, match=r"is not known"):
+        placed(closed(RACKS, drift=0.05), closed(again, elsewhere=True))

@@ -91,6 +91,7 @@ class LoopCloser:
         refused: Places that look the same and are not believed to be.
         shapes: What submaps show; None where it is too little.
         R_level_map: (3, 3) turns the map so that z points up.
+        repeats: Where what submaps show looks the same a short way on.
 
     Raises:
         MissingExtra: gtsam is not installed.
@@ -104,7 +105,7 @@ class LoopCloser:
         self.shapes, self._drift = Shapes(config), Drift.of(config.loops)
         self._up, self._upright_deg = up_of(config), config.loops.upright_deg
         self.R_level_map = rotation_between(self._up, [0, 0, 1])
-        self._repeats = Repeats(self.shapes, self.R_level_map)
+        self.repeats = Repeats(self.shapes, self.R_level_map)
         self._steps, self._overlaps, self._uprights = list[Edge](), list[Edge](), list[Upright]()
         self._waiting: list[Loop] = []  # for another one that agrees
         self._frames, self._poses = list[KeptFrame](), list[Transform]()  # of the next submap
@@ -159,7 +160,14 @@ class LoopCloser:
         self._uprights += [replace(one, pose=one.pose + count) for one in other._uprights]
         own = [replace(loop, first=loop.first + count, second=loop.second + count) for loop in other.loops]
         self.loops += [*own, *(replace(loop, second=loop.second + count) for loop in loops)]
+        refused = (replace(loop, first=loop.first + count, second=loop.second + count) for loop in other.refused)
+        self.refused += refused
         self._solve()
+
+    def ends(self, loops: Sequence[Loop]) -> NDArray[np.float64]:
+        """Return where the two places of N loops are now believed to be: (N, 2, 3) metres, the earlier place first."""
+        places = np.array([submap.T_map_anchor[:3, 3] for submap in self.submaps])
+        return places[np.reshape([(loop.first, loop.second) for loop in loops], (-1, 2)).astype(np.int64)]
 
     def corrected(self, part: slice = slice(None)) -> dict[tuple[str, int], Transform]:
         """Return T_world_sensor (4, 4) of all frames as now believed, by sensor and stamp.
@@ -197,7 +205,7 @@ class LoopCloser:
         if shape is None:
             return False
         submap.centre = shape.points.mean(axis=0).astype(float)
-        self._repeats.look(self.submaps)
+        self.repeats.look(self.submaps)
         before = len(self.loops)
         self._find(shape)
         return len(self.loops) > before
@@ -294,7 +302,7 @@ class LoopCloser:
     def _rival_m(self, first: int, second: int, match: Match, covariance: NDArray[np.float64]) -> float | None:
         """Return how far away a submap may lie as well, where the surroundings repeat; None where it may not."""
         guess, T_map_first = self._expected(first, second), self.submaps[first].T_map_anchor
-        for shift in self._repeats.shifts([self.submaps[first].middle, self.submaps[second].middle]):
+        for shift in self.repeats.shifts([self.submaps[first].middle, self.submaps[second].middle]):
             for there in (shift, -shift):
                 rival = match.T_earlier_later.copy()
                 rival[:3, 3] += T_map_first[:3, :3].T @ there
@@ -318,8 +326,9 @@ class LoopCloser:
         return search.places(later, guess, np.minimum(shift, WIDEST[0]), min(turn, WIDEST[1]))
 
     def _judge(self, found: Loop) -> None:
-        """Accept a loop, and those it confirms, once another one agrees with it."""
-        witnesses = [other for other in (*self._waiting, *self.loops) if self._agree(found, other)]
+        """Accept a loop, and those it confirms, once one of another submap agrees with it."""
+        known = (*self._waiting, *self.loops)
+        witnesses = [other for other in known if other.second != found.second and self._agree(found, other)]
         if not witnesses:
             self._waiting.append(found)
             return

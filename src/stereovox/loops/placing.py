@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Where a second recording lies in the first one's world, by what both saw, with no guess to begin with.
 
-Some of its submaps are sought in all that the first one shows, at all headings. What fits there votes for how the two
-worlds lie; they are believed to lie so where several submaps agree, and no other way is nearly as good.
+Some of its submaps are sought in all that the first one shows, at all headings. What fits there, and does not look the
+same a short way on, votes for how the two worlds lie; they are believed to lie so where several submaps agree, and no
+other way is nearly as good.
 """
 
 from __future__ import annotations
@@ -120,7 +121,7 @@ def _votes(first: LoopCloser, second: LoopCloser, number: int, shape: Shape, sea
         away = np.linalg.norm(np.array([one.middle for one in first.submaps]) - centre, axis=1)
         for i in np.argsort(away)[:NEAREST]:
             earlier, T_map_first = first.shapes[first.submaps[i]], first.submaps[i].T_map_anchor
-            if earlier is None:
+            if earlier is None or len(first.repeats.shifts([first.submaps[i].middle])):
                 continue
             match = matched(earlier, shape, inverse(T_map_first) @ T)
             if match is not None and match.held:

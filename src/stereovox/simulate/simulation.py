@@ -36,6 +36,7 @@ SCENES = {
     "town": "stereovox.simulate.town:stage",
     "loop": "stereovox.simulate.loop:stage",
     "offices": "stereovox.simulate.offices:stage",
+    "racks": "stereovox.simulate.racks:stage",
 }
 """Functions that return a `Stage`; their keyword arguments and defaults are the scene's parameters."""
 AXES = ("world", "optical")

@@ -134,3 +134,14 @@ def test_loops_are_sought_with_other_drift_than_the_map_was_made_with(mapper, tm
     assert len(sv.load_map(tmp_path / "b.svox").kept_frames) == len(mapper.map.kept_frames)
     with pytest.raises(sv.StereovoxError, match="was made with max_range"):
         sv.close_loops(tmp_path / "a.svox", tmp_path / "b.svox", max_range=2.0)
+
+
+def test_loops_are_not_closed_without_frames(tmp_path):
+    with pytest.raises(sv.StereovoxError, match="keep_frames=false: loops are closed by the frames"):
+        sv.map_recording("sim:room", tmp_path / "room.svox", close_loops=True, **{"map.keep_frames": False})
+
+
+def test_loops_are_closed_of_as_many_frames_as_may_be_kept(tmp_path):
+    settings = {"map.frames_budget": "2 MB", "voxel_size": 0.2}
+    made = sv.map_recording("sim:room?image_width=96", tmp_path / "r.svox", frames="::16", close_loops=True, **settings)
+    assert made.map.config.map.frames_budget == 2_000_000

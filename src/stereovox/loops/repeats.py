@@ -74,7 +74,7 @@ class Repeats:
         return shifts[[len(_agreeing(near, shifts, shift)) >= needed for shift in shifts]]
 
 
-def _points(shown: Sequence[tuple[Submap, Shape]], last: Submap) -> NDArray[np.floating]:
+def _points(shown: Sequence[tuple[Submap, Shape]], last: Submap) -> NDArray[np.float64]:
     """Return points (N, 3) on all that submaps show, in the axes of the last one."""
     motions = [inverse(last.T_odom_anchor) @ one.T_odom_anchor for one, _ in shown]
     return np.concatenate([shape.points @ T[:3, :3].T + T[:3, 3] for T, (_, shape) in zip(motions, shown, strict=True)])

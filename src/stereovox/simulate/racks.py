@@ -51,7 +51,7 @@ def _waypoints(length: float, passes: int, random: np.random.Generator) -> NDArr
     ways = [forth if n % 2 == 0 else forth[::-1] for n in range(passes)]
     aside = random.uniform(-SWAY, SWAY, passes * len(forth))
     yaws = np.repeat(180.0 * np.arange(passes), len(forth))
-    return np.column_stack([np.concatenate(ways), aside, yaws])
+    return np.column_stack([np.concatenate(ways), aside, yaws]).astype(float)
 
 
 def _hall(bays: int, bay: float) -> list[Solid]:

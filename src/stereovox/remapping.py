@@ -12,7 +12,7 @@ import numpy as np
 
 from stereovox.config import Config
 from stereovox.corrected_poses import poses_by_path
-from stereovox.errors import StereovoxError
+from stereovox.errors import FrameRefused, StereovoxError
 from stereovox.mapper import Mapper
 from stereovox.maps import VoxelMap, load_map
 from stereovox.maps.kept_frames import KeptFrame
@@ -34,6 +34,8 @@ class Remapped:
         posed: Number of frames whose pose is in the file.
         between: Number of frames between them, which were moved as their neighbours before and after.
         outside: Number of frames before the first or after the last of them, which stayed where they were.
+        moved_m: Metres by which frames moved: the median and the most.
+        way_m: Largest extent in metres of where the frames were before, along an axis.
     """
 
     map: VoxelMap
@@ -42,11 +44,14 @@ class Remapped:
     posed: int
     between: int
     outside: int
+    moved_m: tuple[float, float] = (0.0, 0.0)
+    way_m: float = 0.0
 
     def summary(self) -> dict[str, Any]:
         """Return the numbers of `stereovox remap --json`, besides those of the map."""
         counts = {"posed": self.posed, "between": self.between, "outside": self.outside}
-        return {**asdict(self.report), **counts}
+        median, most = self.moved_m
+        return {**asdict(self.report), **counts, "moved_m": {"median": median, "max": most}}
 
 
 def remap(path: str | Path, poses: str | Path, out: str | Path, *, sensor: str | None = None) -> Remapped:
@@ -84,9 +89,17 @@ def remap(path: str | Path, poses: str | Path, out: str | Path, *, sensor: str |
     try:
         report = mapper.correct(new.poses)
         mapper.save(out)
+    except FrameRefused as refused:
+        raise StereovoxError(f"{poses}: a pose cannot be used ({refused})") from None
     finally:
         mapper.close()
-    return Remapped(load_map(out), Path(out), report, new.posed, new.between, new.outside)
+    before = np.array([frame.T_world_sensor[:3, 3] for frame in frames])
+    after = np.array([new.poses.get((one.sensor, one.stamp_ns), one.T_world_sensor)[:3, 3] for one in frames])
+    moved = np.linalg.norm(after - before, axis=1)
+    return Remapped(
+        load_map(out), Path(out), report, new.posed, new.between, new.outside,
+        (float(np.median(moved)), float(moved.max())), float(np.ptp(before, axis=0).max()),
+    )  # fmt: skip
 
 
 def _posed_sensor(frames: Sequence[KeptFrame], sensor: str | None, path: str | Path) -> str:

@@ -24,6 +24,8 @@ def maps(tmp_path_factory):
     poses = np.array([frame.T_world_sensor for frame in frames])
     poses[:, 0, 3] += 0.4
     write_trajectory(folder / "all.tum", [frame.stamp_ns for frame in frames], poses, "camera")
+    far = poses + 1e12 * (np.arange(16).reshape(4, 4) == 3)
+    write_trajectory(folder / "far.tum", [frame.stamp_ns for frame in frames], far, "camera")
     write_trajectory(folder / "two.tum", [frames[0].stamp_ns, frames[2].stamp_ns], poses[[0, 2]], "camera")
     return folder
 
@@ -48,6 +50,8 @@ def test_remap(maps, tmp_path, told_with_notes, monkeypatch):
     before, after = sv.load_map(maps / "a.svox"), sv.load_map(tmp_path / "a-corrected.svox")
     assert np.allclose(after.path[:, 0] - before.path[:, 0], 0.4, atol=1e-5)
     assert result["frames"] == 4
+    assert result["moved_m"] == pytest.approx({"median": 0.4, "max": 0.4})
+    assert "4 frames moved, by 0.40 m (median), at most 0.40 m" in said
     assert "4 frames have a pose" in said
     assert "stayed" not in said
 
@@ -58,10 +62,21 @@ def test_remap_tells_of_frames_without_a_pose(maps, tmp_path, told_with_notes):
     assert "1 frames before the first or after the last of them stayed where they were" in said
 
 
+@pytest.mark.parametrize(("scale", "notes"), [(1000, 1), (1, 0)])
+def test_remap_tells_of_poses_that_are_not_in_metres(maps, tmp_path, told_with_notes, scale, notes):
+    frames = sv.load_map(maps / "a.svox").kept_frames.frames
+    poses = np.array([frame.T_world_sensor for frame in frames])
+    poses[:, :3, 3] *= scale
+    write_trajectory(tmp_path / "p.tum", [frame.stamp_ns for frame in frames], poses, "camera")
+    _, said = told_with_notes("remap", maps / "a.svox", "--poses", tmp_path / "p.tum", "--out", tmp_path / "m.svox")
+    assert said.count("poses must be in metres") == notes
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
         (["bare.svox", "--poses", "all.tum", "--out", "no.svox"], "map.keep_frames=true"),
+        (["a.svox", "--poses", "far.tum", "--out", "no.svox"], "far.tum: a pose cannot be used"),
         (["a.svox", "--poses", "gone.tum", "--out", "no.svox"], "gone.tum"),
         (["a.svox", "--poses", "all.tum", "--out", "a.svox"], "another name"),
         (["a.svox", "--poses", "all.tum", "--out", "no.svox", "--sensor", "left"], "'camera'"),

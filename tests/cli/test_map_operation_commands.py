@@ -92,6 +92,7 @@ def test_merge(maps, tmp_path, told, refused):
     same = f"{maps}/../{maps.name}/b.svox"
     for one, out in ((b, b), (b, same), (same, b)):
         assert "another name" in refused("merge", a, one, "--out", out)
+    assert "would count twice" in refused("merge", b, same, "--out", tmp_path / "no.svox")
 
 
 def test_diff(maps, tmp_path, told, refused):

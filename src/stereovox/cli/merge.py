@@ -8,6 +8,7 @@ added up, and a line says what that cannot promise.
 from __future__ import annotations
 
 from argparse import ArgumentParser, Namespace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -47,6 +48,8 @@ def run(arguments: Namespace) -> dict[str, Any]:
     """Load both maps and save the merged one."""
     from stereovox.joining import merge, why_added
 
+    if Path(arguments.a).resolve() == Path(arguments.b).resolve():
+        raise StereovoxError(f"{arguments.b}: is the first map too, its frames would count twice; name another map")
     if arguments.find:
         return _joined(arguments)
     T_a_b = None if arguments.transform is None else transform_of(arguments.transform)

@@ -15,6 +15,9 @@ from stereovox.cli.terminal import say, say_about_compiling
 
 EXAMPLE = "stereovox remap kitchen.svox --poses corrected.tum"
 
+FAR = 10.0
+"""How many times the extent of their way frames may move without a note."""
+
 
 def add_arguments(parser: ArgumentParser) -> None:
     """Declare the options."""
@@ -42,5 +45,13 @@ def run(arguments: Namespace) -> dict[str, Any]:
         say(f"note: {done.outside} frames before the first or after the last of them stayed where they were")
     if not report.all_frames:
         say(f"note: only {report.mapped} frames were kept (map.frames_budget); the map is what these make")
-    say(f"{report.moved} frames moved, {report.mapped} were mapped again, {report.blocks} blocks made anew")
+    median, most = done.moved_m
+    say(
+        f"{report.moved} frames moved, by {median:.2f} m (median), at most {most:.2f} m; {report.mapped} were mapped "
+        f"again, {report.blocks} blocks made anew"
+    )
+    if most > FAR * max(done.way_m, 1.0):
+        say(
+            f"note: that is far beyond the {done.way_m:.1f} m of their way; poses must be in metres, in the map's world"
+        )
     return {**describe_saved(done.map, out), **done.summary()}

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from stereovox.config import load_config
 from stereovox.errors import StereovoxError
 from stereovox.localize.robot_track import Progress, no_progress
-from stereovox.loops.closer import Loop, LoopCloser
+from stereovox.loops.closer import Loop, LoopCloser, ends_of
 from stereovox.loops.positions import Positions
 from stereovox.loops.submaps import Submap
 from stereovox.mapper import Mapper
@@ -74,8 +74,7 @@ class LoopClosure:
         Returns:
             (N, 2, 3) metres, world frame, the earlier place first.
         """
-        pairs = np.reshape([(loop.first, loop.second) for loop in loops], (-1, 2)).astype(np.int64)
-        return poses[self.anchors[pairs], :3, 3]
+        return ends_of(loops, poses[self.anchors, :3, 3])
 
     def save(self, path: str | Path) -> None:
         """Write the corrected poses as lines `stamp tx ty tz qx qy qz qw` (TUM), all or nothing.

@@ -14,7 +14,7 @@ from stereovox.config import Config
 from stereovox.deadline import Levels
 from stereovox.errors import StereovoxError
 from stereovox.localize.robot_track import Progress, no_progress
-from stereovox.loops.closer import LoopCloser
+from stereovox.loops.closer import LoopCloser, ends_of
 from stereovox.loops.placing import placed
 from stereovox.maps import VoxelMap
 from stereovox.maps.kept_frames import KeptFrame, KeptFrames
@@ -86,7 +86,7 @@ def join(a: VoxelMap, b: VoxelMap, progress: Progress = no_progress) -> Joined:
     ]
     joined = _of_frames(a, b, *frames)
     joined.recording = as_corrected(joined.recording)
-    joined.history.loops = LoopLines.between(first.ends(first.loops), first.ends(first.refused))
+    joined.history.loops = LoopLines.between(*(ends_of(found, first.places) for found in (first.loops, first.refused)))
     return Joined(joined, place.T_first_second, len(place.loops), len(first.loops))
 
 

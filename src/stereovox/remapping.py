@@ -44,8 +44,8 @@ class Remapped:
     posed: int
     between: int
     outside: int
-    moved_m: tuple[float, float] = (0.0, 0.0)
-    way_m: float = 0.0
+    moved_m: tuple[float, float]
+    way_m: float
 
     def summary(self) -> dict[str, Any]:
         """Return the numbers of `stereovox remap --json`, besides those of the map."""

@@ -231,9 +231,9 @@ class MapRun:
         self._notify, self._open = notify, ExitStack()
         self._checkpoint_s, self._level, self._poses = checkpoint_s, level, poses
         self._close_loops = close_loops
-        if close_loops and overrides.get("map.keep_frames") is False:
-            raise StereovoxError("map.keep_frames=false: loops are closed by the frames of the map; leave it out")
         if close_loops:
+            if overrides.get("map.keep_frames") is False:
+                raise StereovoxError("map.keep_frames=false: loops are closed by the frames of the map; leave it out")
             self._overrides = {"map.keep_frames": True, **overrides}
 
     def __enter__(self) -> MapRun:

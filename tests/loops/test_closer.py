@@ -4,11 +4,12 @@
 from dataclasses import replace
 
 import numpy as np
-from made_loops import OFFICES, RING, closed, errors, mapped, off, truths
+from made_loops import OFFICES, RING, bare_closer, closed, errors, mapped, off, truths
 
 from stereovox.config import load_config
-from stereovox.loops.closer import LoopCloser
-from stereovox.se3 import rotation_matrix
+from stereovox.loops.closer import Loop, LoopCloser
+from stereovox.loops.matching import FLOOR, Match
+from stereovox.se3 import inverse, rotation_matrix
 
 
 def test_a_ring_is_closed_and_the_way_becomes_right():
@@ -100,3 +101,20 @@ def test_frames_may_come_in_any_order_of_time():
     for submap in closer.submaps:
         anchor = submap.frames[submap.anchor]
         np.testing.assert_allclose(new[anchor.sensor, anchor.stamp_ns], submap.T_map_anchor, atol=1e-9)
+
+
+def test_a_loop_is_confirmed_by_another_submap_only():
+    """Two findings of one submap may be the same mistake; the next submap's is a second look."""
+    closer = bare_closer()
+    last = len(closer.submaps) - 1
+
+    def loop(first, second):
+        between = inverse(closer.submaps[first].T_odom_anchor) @ closer.submaps[second].T_odom_anchor
+        return Loop(first, second, Match(between, FLOOR, 1.0, held=True), 0.0, 0.0)
+
+    for first in (0, 1):
+        closer._judge(loop(first, last))
+        assert not closer.loops
+    closer._judge(loop(0, last - 1))
+    assert {(one.first, one.second) for one in closer.loops} == {(0, last), (1, last), (0, last - 1)}
+    assert not closer._waiting

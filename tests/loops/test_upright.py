@@ -1,42 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Poses that are levelled by gravity stay level where loops are closed; others are bent as the loops say."""
 
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
+from made_loops import bare_closer
 
 from stereovox.config import load_config
 from stereovox.errors import ConfigError
-from stereovox.loops.closer import Loop, LoopCloser
+from stereovox.loops.closer import Loop
 from stereovox.loops.matching import FLOOR, Match
 from stereovox.se3 import inverse, rotation_matrix
 
 pytest.importorskip("gtsam")
-COUNT = 30
 SIDEWAYS = {"up": "-y"}
-
-
-class ShowNothing(dict):
-    """Stands for Shapes: no submap shows anything, so no loops are found but those that a test names."""
-
-    def __missing__(self, submap):
-        return None
-
-
-def closer(R_world_level=None, **settings):
-    """A closer that has taken in frames along a bent way, one submap each; z of the level world is up."""
-    made = LoopCloser(load_config(**settings))
-    made.shapes = ShowNothing()
-    turn = np.eye(4)
-    turn[:3, :3] = np.eye(3) if R_world_level is None else R_world_level
-    for i in range(COUNT):
-        T = np.eye(4)
-        T[:3, :3] = rotation_matrix([0, 0, 0.2 * i]) @ rotation_matrix([0.4, 0, 0])  # a camera that looks down a bit
-        T[:3, 3] = 3 * np.cos(0.2 * i), 3 * np.sin(0.2 * i), 1.5
-        made.add(SimpleNamespace(sensor="", stamp_ns=10**9 * i, T_world_sensor=turn @ T, pose_sigma=(0, 0)))
-    made.finish()
-    return made
 
 
 def closed(made, tilt_deg=3.0):
@@ -55,28 +31,28 @@ def lean_deg(before, after, up):
 
 
 def test_levelled_poses_stay_level():
-    free, held = closed(closer()), closed(closer(**{"loops.upright_deg": 0.1}))
+    free, held = closed(bare_closer()), closed(bare_closer(**{"loops.upright_deg": 0.1}))
     assert len(free) > 10
     assert max(free) > 1.0
     assert max(held) < 0.2
 
 
 def test_the_setting_says_how_level():
-    leans = [max(closed(closer(**{"loops.upright_deg": deg}))) for deg in (0.1, 0.5, 5.0)]
-    assert leans[0] < leans[1] < leans[2] < max(closed(closer()))
+    leans = [max(closed(bare_closer(**{"loops.upright_deg": deg}))) for deg in (0.1, 0.5, 5.0)]
+    assert leans[0] < leans[1] < leans[2] < max(closed(bare_closer()))
 
 
 def test_up_is_that_of_the_map():
     """A world whose -y is up: the same, turned."""
     R = rotation_matrix([np.pi / 2, 0, 0])  # level z becomes -y
     assert np.allclose(R @ [0, 0, 1], [0, -1, 0])
-    plain = closed(closer(**{"loops.upright_deg": 0.3}))
-    turned = closed(closer(R, **{"loops.upright_deg": 0.3}, **SIDEWAYS))
+    plain = closed(bare_closer(**{"loops.upright_deg": 0.3}))
+    turned = closed(bare_closer(R, **{"loops.upright_deg": 0.3}, **SIDEWAYS))
     assert np.allclose(plain, turned, atol=1e-3)
 
 
 def test_poses_are_known_to_lean_less_than_they_may_be_turned():
-    free, held = closer(), closer(**{"loops.upright_deg": 0.1})
+    free, held = bare_closer(), bare_closer(**{"loops.upright_deg": 0.1})
     for made, leaning in ((free, (0.3, 5.0)), (held, (0.0, 0.15))):
         covariance = made._graph().covariances([0], len(made.submaps) - 1)[0]
         up = made.submaps[-1].T_odom_anchor[:3, :3].T @ made._up
@@ -90,7 +66,7 @@ def test_poses_are_known_to_lean_less_than_they_may_be_turned():
 def test_a_recording_that_is_joined_keeps_its_up():
     """It came in a world of its own, whose -y is up."""
     R = rotation_matrix([np.pi / 2, 0, 0])
-    one, other = closer(**{"loops.upright_deg": 0.1}), closer(R, **{"loops.upright_deg": 0.1}, **SIDEWAYS)
+    one, other = bare_closer(**{"loops.upright_deg": 0.1}), bare_closer(R, **{"loops.upright_deg": 0.1}, **SIDEWAYS)
     T_one_other = np.eye(4)
     T_one_other[:3, :3] = R.T
     expected = [T_one_other @ submap.T_map_anchor for submap in other.submaps]

@@ -111,6 +111,11 @@ class LoopCloser:
         self._frames, self._poses = list[KeptFrame](), list[Transform]()  # of the next submap
         self._ways, self._way = list[tuple[float, float]](), Way()
 
+    @property
+    def places(self) -> NDArray[np.float64]:
+        """Return where the submaps' anchors are now believed to be: (S, 3) metres."""
+        return np.array([submap.T_map_anchor[:3, 3] for submap in self.submaps])
+
     def add(self, frame: KeptFrame) -> bool:
         """Take in the next frame, with the pose it came with; return whether loops were found."""
         pose, found = orthonormalise(frame.T_world_sensor), False
@@ -163,11 +168,6 @@ class LoopCloser:
         refused = (replace(loop, first=loop.first + count, second=loop.second + count) for loop in other.refused)
         self.refused += refused
         self._solve()
-
-    def ends(self, loops: Sequence[Loop]) -> NDArray[np.float64]:
-        """Return where the two places of N loops are now believed to be: (N, 2, 3) metres, the earlier place first."""
-        places = np.array([submap.T_map_anchor[:3, 3] for submap in self.submaps])
-        return places[np.reshape([(loop.first, loop.second) for loop in loops], (-1, 2)).astype(np.int64)]
 
     def corrected(self, part: slice = slice(None)) -> dict[tuple[str, int], Transform]:
         """Return T_world_sensor (4, 4) of all frames as now believed, by sensor and stamp.
@@ -226,8 +226,7 @@ class LoopCloser:
         found = positions.at(np.array([submap.stamp_ns for submap in self.submaps], np.int64))
         sigma = np.full(3, positions.sigma_m)
         for _ in range(TURNS):
-            anchors = np.array([submap.T_map_anchor[:3, 3] for submap in self.submaps])
-            places = positions.in_map(found, anchors, self.R_level_map)
+            places = positions.in_map(found, self.places, self.R_level_map)
             start = self.submaps[0].T_map_anchor
             self._solve([Position(n, place, sigma) for n, place in enumerate(places) if np.isfinite(place).all()])
             T_map_turned = start @ inverse(self.submaps[0].T_map_anchor)
@@ -252,11 +251,11 @@ class LoopCloser:
         near = self._near(last)
         if not near:
             return
-        covariances, found = self._graph().covariances(near, last), list[Loop]()
-        for number, covariance in zip(near, covariances, strict=True):
-            earlier = self.shapes[self.submaps[number]]
-            loop = None if earlier is None else self._loop(number, last, earlier, shape, covariance)
-            found += [] if loop is None else [loop]
+        covariances = self._graph().covariances(near, last)
+        loops = [
+            self._loop(first, last, shape, covariance) for first, covariance in zip(near, covariances, strict=True)
+        ]
+        found = [loop for loop in loops if loop is not None]
         self.refused += [loop for loop in found if loop.why]
         for loop in found:
             if not loop.why:
@@ -275,14 +274,14 @@ class LoopCloser:
         middles = np.array([submap.middle for submap in self.submaps[: number + 1]])
         return np.linalg.norm(middles[:-1] - middles[-1], axis=1)
 
-    def _loop(
-        self, first: int, second: int, earlier: Shape, later: Shape, covariance: NDArray[np.float64]
-    ) -> Loop | None:
+    def _loop(self, first: int, second: int, later: Shape, covariance: NDArray[np.float64]) -> Loop | None:
         """Return how a submap lies on an earlier one, within what the poses allow; None where it does not.
 
         covariance: (6, 6) of where it stands as seen from the earlier one.
         """
-        guess = self._expected(first, second)
+        earlier, guess = self.shapes[self.submaps[first]], self._expected(first, second)
+        if earlier is None:
+            return None
         matches = [matched(earlier, later, start) for start in self._starts(first, earlier, later, guess, covariance)]
         good = [match for match in matches if match is not None and match.held]
         if not good:
@@ -295,19 +294,22 @@ class LoopCloser:
             why = "another place within reach looks the same"
         elif _squared(moved, covariance + best.covariance) > GATE:
             why = f"the poses cannot be off by {off_m:.2f} m and {np.degrees(off_rad):.1f} degrees (loops.drift)"
-        elif (shift_m := self._rival_m(first, second, best, covariance)) is not None:
+        elif (shift_m := self._rival_m(first, second, moved, covariance + best.covariance)) is not None:
             why = f"it looks the same {shift_m:.2f} m away, which the poses cannot tell apart"
         return Loop(first, second, best, off_m, off_rad, why)
 
-    def _rival_m(self, first: int, second: int, match: Match, covariance: NDArray[np.float64]) -> float | None:
-        """Return how far away a submap may lie as well, where the surroundings repeat; None where it may not."""
-        guess, T_map_first = self._expected(first, second), self.submaps[first].T_map_anchor
-        for shift in self.repeats.shifts([self.submaps[first].middle, self.submaps[second].middle]):
-            for there in (shift, -shift):
-                rival = match.T_earlier_later.copy()
-                rival[:3, 3] += T_map_first[:3, :3].T @ there
-                if _squared(difference(guess, rival), covariance + match.covariance) < RIVALS**2:
-                    return float(np.linalg.norm(shift))
+    def _rival_m(
+        self, first: int, second: int, moved: NDArray[np.float64], covariance: NDArray[np.float64]
+    ) -> float | None:
+        """Return how far away a submap may lie as well, where the surroundings repeat; None where it may not.
+
+        moved: (6,) by how much it lies off where it is expected; covariance: (6, 6) of that.
+        """
+        one, other = self.submaps[first], self.submaps[second]
+        shifts = self.repeats.shifts([one.middle, other.middle]) @ other.T_map_anchor[:3, :3]
+        for shift in (*shifts, *-shifts):
+            if _squared(np.concatenate([moved[:3], moved[3:] + shift]), covariance) < RIVALS**2:
+                return float(np.linalg.norm(shift))
         return None
 
     def _expected(self, first: int, second: int) -> Transform:
@@ -376,6 +378,11 @@ class LoopCloser:
         if _squared(moved, covariance + match.covariance) > GATE:
             return None
         return Edge(first, second, match.T_earlier_later, information(match.covariance))
+
+
+def ends_of(loops: Sequence[Loop], places: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return the two places (N, 2, 3) of N loops, the earlier one first, of all places (S, 3)."""
+    return places[np.reshape([(loop.first, loop.second) for loop in loops], (-1, 2)).astype(np.int64)]
 
 
 def difference(one: Transform, other: Transform) -> NDArray[np.float64]:

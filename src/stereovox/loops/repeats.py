@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from stereovox.loops.matching import matched
 from stereovox.loops.search import SAME_M, Search
 from stereovox.loops.submaps import Shape, Shapes, Submap
-from stereovox.se3 import Transform, inverse
+from stereovox.se3 import Transform, inverse, transform_points
 
 RECENT_M = 0.5, 12.0
 """Metres of way, at least and at most, to the submaps that one is compared with."""
@@ -77,17 +77,17 @@ class Repeats:
 def _points(shown: Sequence[tuple[Submap, Shape]], last: Submap) -> NDArray[np.float64]:
     """Return points (N, 3) on all that submaps show, in the axes of the last one."""
     motions = [inverse(last.T_odom_anchor) @ one.T_odom_anchor for one, _ in shown]
-    return np.concatenate([shape.points @ T[:3, :3].T + T[:3, 3] for T, (_, shape) in zip(motions, shown, strict=True)])
+    return np.concatenate([transform_points(T, shape.points) for T, (_, shape) in zip(motions, shown, strict=True)])
 
 
 def _is_near(submap: Submap, places: Sequence[NDArray[np.float64]]) -> bool:
     return min(float(np.linalg.norm(submap.middle - at)) for at in places) < NEAR_M
 
 
-def _agreeing(repeats: Sequence[_Repeat], shifts: NDArray[np.float64], shift: NDArray[np.float64]) -> set[int]:
-    """Return which submaps found a shift, this way or the other."""
+def _agreeing(repeats: Sequence[_Repeat], shifts: NDArray[np.float64], shift: NDArray[np.float64]) -> set[Submap]:
+    """Return the submaps that found a shift, this way or the other."""
     away = np.minimum(np.linalg.norm(shifts - shift, axis=1), np.linalg.norm(shifts + shift, axis=1))
-    return {id(one.submap) for one, metres in zip(repeats, away, strict=True) if metres < ALIKE_M}
+    return {one.submap for one, metres in zip(repeats, away, strict=True) if metres < ALIKE_M}
 
 
 def _refined(
@@ -95,9 +95,9 @@ def _refined(
 ) -> NDArray[np.float64] | None:
     """Return by how much (3,) a submap is shifted where it fits, near T_last_place (4, 4); None where it does not."""
     T_odom_place = last.T_odom_anchor @ T
-    here = T_odom_place[:3, :3] @ last.centre + T_odom_place[:3, 3]
-    middles = [one.T_odom_anchor[:3, :3] @ one.centre + one.T_odom_anchor[:3, 3] for one, _ in shown]
-    earlier, shape = shown[int(np.argmin(np.linalg.norm(np.array(middles) - here, axis=1)))]
+    here = transform_points(T_odom_place, last.centre)
+    away = [np.linalg.norm(transform_points(one.T_odom_anchor, one.centre) - here) for one, _ in shown]
+    earlier, shape = shown[int(np.argmin(away))]
     match = matched(shape, later, inverse(earlier.T_odom_anchor) @ T_odom_place)
     if match is None or not match.held:
         return None

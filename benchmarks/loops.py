@@ -27,7 +27,8 @@ from numpy.typing import NDArray
 import stereovox as sv
 from stereovox.config import load_config, parse_value
 from stereovox.evaluate.trajectory_score import score_trajectory
-from stereovox.loops.closer import Loop, LoopCloser, difference
+from stereovox.loops.closer import Loop, LoopCloser
+from stereovox.loops.drift import difference
 from stereovox.maps.kept_frames import KeptFrame
 from stereovox.se3 import inverse
 from stereovox.simulate.simulation import Simulation

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from made_robot_bags import RobotBagMaker
 
 import stereovox as sv
 from stereovox import closing
@@ -12,6 +13,7 @@ from stereovox.cli.loops import say_closure
 from stereovox.loops.closer import Loop, LoopCloser
 from stereovox.loops.matching import Match
 from stereovox.products.moved import moved
+from stereovox.sources.trajectory import write_trajectory
 from stereovox.trust.loop_lines import LoopLines
 
 MATCH = Match(np.eye(4), np.eye(6), 0.9, True)
@@ -145,3 +147,32 @@ def test_loops_are_closed_of_as_many_frames_as_may_be_kept(tmp_path):
     settings = {"map.frames_budget": "2 MB", "voxel_size": 0.2}
     made = sv.map_recording("sim:room?image_width=96", tmp_path / "r.svox", frames="::16", close_loops=True, **settings)
     assert made.map.config.map.frames_budget == 2_000_000
+
+
+def test_a_second_odometry_and_fixes_of_a_bag_hold_the_way(tmp_path):
+    """The walk stretched by a tenth: wheels and a receiver know how long it was."""
+    out, settings = tmp_path / "room.svox", {"voxel_size": 0.2, "trust.max_disagreement": 1, "map.keep_frames": True}
+    frames = list(sv.open_source("sim:room?image_width=96", frames="::4"))
+    mapper = sv.Mapper(**settings)
+    for frame in frames:
+        stretched = frame.T_world_sensor.copy()
+        stretched[:3, 3] *= 1.1
+        mapper.add(replace(frame, T_world_sensor=stretched))
+    mapper.save(out)
+    stamps, poses = [frame.stamp_ns for frame in frames], np.array([frame.T_world_sensor for frame in frames])
+    write_trajectory(tmp_path / "wheels.tum", stamps, poses, "camera")
+    wheels = {"odometry": tmp_path / "wheels.tum", "loops.odometry_drift": 1e-3, "loops.drift": 0.1}
+    closed = sv.close_loops(out, tmp_path / "w.svox", **wheels)
+    assert closed.closure.odometry.used > 3
+    assert closed.closure.summary()["odometry"] == {"used": closed.closure.odometry.used, "contradicted": 0}
+    assert length(closed.closure.T_world_sensor) == pytest.approx(length(poses), rel=0.02)
+    with RobotBagMaker(tmp_path / "drive.bag") as made:
+        for stamp_ns, (x, y, z) in zip(stamps, poses[:, :3, 3], strict=True):
+            made.fix(stamp_ns, 47 + y / 111_178, 8 + x / 76_061, 400 + z)
+    positions = {"positions": tmp_path / "drive.bag", "positions_sigma": 0.02, "loops.drift": 0.1}
+    closed = sv.close_loops(out, tmp_path / "p.svox", **positions)
+    assert length(closed.closure.T_world_sensor) == pytest.approx(length(poses), rel=0.03)
+
+
+def length(poses):
+    return np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum()

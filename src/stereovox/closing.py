@@ -12,17 +12,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox.config import load_config
+from stereovox.config import Config, load_config
 from stereovox.errors import StereovoxError
 from stereovox.localize.robot_track import Progress, no_progress
 from stereovox.loops.closer import Loop, LoopCloser, ends_of
+from stereovox.loops.odometry import Odometry
 from stereovox.loops.positions import Positions
 from stereovox.loops.submaps import Submap
 from stereovox.mapper import Mapper
 from stereovox.maps import VoxelMap, load_map
 from stereovox.maps.store import check_target
+from stereovox.products.floor_axes import up_of
 from stereovox.rebuild import CorrectionReport
 from stereovox.safe_io import check_file
+from stereovox.se3 import rotation_between
+from stereovox.sources.bags import suffix_of
+from stereovox.sources.bags.fixes import read_fixes
+from stereovox.sources.bags.recording import file_part
 from stereovox.sources.trajectory import TRAJECTORY_ENDINGS, Trajectory, write_trajectory
 from stereovox.trust.loop_lines import LoopLines
 
@@ -39,6 +45,7 @@ class LoopClosure:
         refused: Places that look the same and were not believed to be, and why.
         anchors: (S,) int64, numbers of the frames in the middle of all places.
         report: What the correction did to the map.
+        odometry: The second odometry, and for how many steps it was of use; None where there is none.
     """
 
     stamps_ns: NDArray[np.int64]
@@ -48,6 +55,7 @@ class LoopClosure:
     refused: Sequence[Loop]
     anchors: NDArray[np.int64]
     report: CorrectionReport
+    odometry: Odometry | None = None
 
     @property
     def moved_m(self) -> NDArray[np.float64]:
@@ -97,6 +105,7 @@ class LoopClosure:
             "loops_refused": [self._described(loop) for loop in self.refused],
             "off_m": {"median": float(np.median(offs)), "max": max(offs)} if offs else None,
             "moved_m": {"median": float(np.median(self.moved_m)), "max": float(self.moved_m.max())},
+            "odometry": None if self.odometry is None else self.odometry.summary(),
             **asdict(self.report),
         }
 
@@ -126,6 +135,7 @@ def close_loops(
     *,
     positions: str | Path | None = None,
     positions_sigma: float = 1.0,
+    odometry: str | Path | None = None,
     progress: Progress = no_progress,
     **overrides: Any,
 ) -> ClosedMap:
@@ -137,9 +147,12 @@ def close_loops(
     Args:
         path: Folder of a map that kept its frames (`map.keep_frames`).
         out: Folder of the new map.
-        positions: File of positions of the camera that do not drift, as of a GNSS receiver: lines `stamp tx ty tz qx qy
-            qz qw` (TUM; rotations are not used) in metres, in any world with the same way up.
+        positions: Positions of the camera that do not drift, as of a GNSS receiver: a file of lines `stamp tx ty tz qx
+            qy qz qw` (TUM; rotations are not used) in metres, in any world with the same way up, or a bag with
+            `sensor_msgs/NavSatFix` (where there are several topics: `drive.bag?topic=/gps/fix`).
         positions_sigma: Their standard deviation in metres, along each axis.
+        odometry: A second odometry beside the map's poses, such as that of wheels: a file of such lines (TUM) with the
+            poses of the camera in any world; `loops.odometry_drift` says how far it drifts.
         progress: Called with how many are done, how many there are, and what is being done.
         **overrides: Settings of `loops`, such as `**{"loops.drift": 0.05}` for poses that drift more than usual.
 
@@ -148,7 +161,7 @@ def close_loops(
 
     Raises:
         StereovoxError: One line: the map cannot be read, or did not keep its frames; `positions` cannot be read, or are
-            too few or too close to each other.
+            too few or too close to each other; `odometry` cannot be read, or has no poses at the map's times.
         MissingExtra: gtsam is not installed.
     """
     check_target(Path(out))
@@ -156,45 +169,55 @@ def close_loops(
     if saved.kept_frames is None or not len(saved.kept_frames):
         raise StereovoxError(f"{path}: the map did not keep its frames; map again with map.keep_frames=true")
     config = load_config(saved.config, **overrides)
-    known = None if positions is None else _positions(positions, positions_sigma)
+    known = None if positions is None else _positions(str(positions), positions_sigma, config)
+    wheels = None if odometry is None else Odometry(Trajectory(Path(odometry)), config.loops)
     mapper = Mapper(config, resume=saved, tiles=Path(out).parent / f".{Path(out).name}-tiles")
     try:
-        closure = close(mapper, progress, known)
+        closure = close(mapper, progress, known, wheels)
         mapper.save(out)
     finally:
         mapper.close()
     return ClosedMap(load_map(out), Path(out), closure)
 
 
-def _positions(file: str | Path, sigma_m: float) -> Positions:
+def _positions(location: str, sigma_m: float, config: Config) -> Positions:
     if not 0 < sigma_m < inf:
         raise StereovoxError(f"positions_sigma {sigma_m:g} must be more than 0 metres")
-    poses = Trajectory(Path(file))
+    if suffix_of(file_part(location)):
+        stamps_ns, places = read_fixes(location)
+        return Positions(stamps_ns, places @ rotation_between([0, 0, 1], up_of(config)).T, sigma_m, location)
+    poses = Trajectory(Path(location))
     places = poses.T_world_body[:, :3, 3]
     usable = np.isfinite(places).all(axis=1)
-    return Positions(poses.stamps_ns[usable], places[usable], sigma_m, str(file))
+    return Positions(poses.stamps_ns[usable], places[usable], sigma_m, location)
 
 
-def close(mapper: Mapper, progress: Progress = no_progress, positions: Positions | None = None) -> LoopClosure:
+def close(
+    mapper: Mapper,
+    progress: Progress = no_progress,
+    positions: Positions | None = None,
+    odometry: Odometry | None = None,
+) -> LoopClosure:
     """Find the loops of the map that a mapper makes, and correct it.
 
     Args:
         mapper: Its map must keep its frames (`map.keep_frames`).
         progress: Called with how many are done, how many there are, and what is being done.
         positions: Positions of the camera that do not drift.
+        odometry: A second odometry beside the frames' poses.
 
     Returns:
         What was found and done.
 
     Raises:
         StereovoxError: The map did not keep its frames, or several of one sensor have the same stamp; `positions` are
-            too few or too close to each other.
+            too few or too close to each other; `odometry` has no poses at the times of the frames.
         MissingExtra: gtsam is not installed.
     """
     kept = mapper.map.kept_frames
     if kept is None or not len(kept):
         raise StereovoxError("the map did not keep its frames; map again with map.keep_frames=true")
-    frames, closer = kept.frames, LoopCloser(mapper.config)
+    frames, closer = kept.frames, LoopCloser(mapper.config, odometry)
     if len({(frame.sensor, frame.stamp_ns) for frame in frames}) < len(frames):
         raise StereovoxError(
             "several frames of one sensor have the same stamp, so the map's loops cannot be closed; close those of the "
@@ -204,8 +227,10 @@ def close(mapper: Mapper, progress: Progress = no_progress, positions: Positions
         closer.add(frame)
         progress(done, len(frames), "looking for loops")
     closer.finish(lambda done, total: progress(done, total, "laying places onto each other"), positions)
-    corrected = closer.corrected()
-    report = mapper.correct(corrected) if closer.loops or positions is not None else CorrectionReport()
+    if odometry is not None:
+        odometry.check()
+    corrected, known = closer.corrected(), (positions, odometry) != (None, None)
+    report = mapper.correct(corrected) if closer.loops or known else CorrectionReport()
     closure = LoopClosure(
         np.array([frame.stamp_ns for frame in frames], np.int64),
         np.array([frame.T_world_sensor for frame in frames]),
@@ -214,6 +239,7 @@ def close(mapper: Mapper, progress: Progress = no_progress, positions: Positions
         closer.refused,
         _anchors(closer.submaps),
         report,
+        odometry,
     )
     with mapper.map.lock:
         mapper.map.history.loops = closure.lines

@@ -121,3 +121,22 @@ def test_loops_refuses_a_file_that_cannot_be_before_any_work(maps, tmp_path, cap
     assert main(["loops", str(maps / "a.svox"), "--out", str(tmp_path / "c"), option, str(tmp_path / name)]) == 2
     assert name in capsys.readouterr().err
     assert not (tmp_path / "c").exists()
+
+
+def test_loops_joins_a_second_odometry(tmp_path, told_with_notes, monkeypatch):
+    pytest.importorskip("gtsam")
+    monkeypatch.chdir(tmp_path)
+    frames = list(sv.open_source("sim:room?image_width=96", frames="::8"))
+    mapper = sv.Mapper("default", **SETTINGS)
+    for frame in frames:
+        mapper.add(frame)
+    mapper.save(tmp_path / "room.svox")
+    poses = np.array([frame.T_world_sensor for frame in frames])
+    write_trajectory(tmp_path / "wheels.tum", [frame.stamp_ns for frame in frames], poses, "camera")
+    result, said = told_with_notes("loops", "room.svox", "--odometry", "wheels.tum")
+    assert result["odometry"]["used"] > 0
+    assert result["odometry"]["contradicted"] == 0
+    assert f"had a part in {result['odometry']['used']} steps" in said
+    write_trajectory(tmp_path / "later.tum", [10**15 + frame.stamp_ns for frame in frames], poses, "camera")
+    assert main(["loops", "room.svox", "--odometry", "later.tum", "--out", "no.svox"]) == 2
+    assert not (tmp_path / "no.svox").exists()

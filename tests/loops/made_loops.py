@@ -9,7 +9,8 @@ import numpy as np
 
 import stereovox as sv
 from stereovox.config import load_config
-from stereovox.loops.closer import LoopCloser, difference
+from stereovox.loops.closer import LoopCloser
+from stereovox.loops.drift import difference
 from stereovox.se3 import inverse, rotation_matrix
 from stereovox.simulate.simulation import Simulation
 

@@ -4,7 +4,7 @@
 import numpy as np
 from made_loops import RING, closed, truths
 
-from stereovox.loops.closer import difference
+from stereovox.loops.drift import difference
 from stereovox.loops.matching import _seen_from, matched
 from stereovox.se3 import inverse, rotation_matrix
 from stereovox.track.fit import _moved, motion_between

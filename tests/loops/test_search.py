@@ -8,7 +8,7 @@ import pytest
 from made_loops import RING, closed
 
 from stereovox.loops import _search, search
-from stereovox.loops.closer import difference
+from stereovox.loops.drift import difference
 from stereovox.loops.search import Search
 from stereovox.se3 import inverse, rotation_matrix
 

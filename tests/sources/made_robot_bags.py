@@ -176,6 +176,17 @@ class RobotBagMaker(Messages):
             message = self.scan(stamp_ns, [1.0 + k, 2, 3], frame_id)
             self.add(topic, "sensor_msgs/LaserScan", stamp_ns + 3 * MS, message)
 
+    def fix(
+        self, stamp_ns: int, latitude: float, longitude: float, height: float, status: int = 0, topic: str = "/fix"
+    ) -> None:
+        message = self.make(
+            "sensor_msgs/NavSatFix", header=self.header(stamp_ns, "gps"),
+            status=self.make("sensor_msgs/NavSatStatus", status=status, service=1),
+            latitude=latitude, longitude=longitude, altitude=height,
+            position_covariance=np.zeros(9), position_covariance_type=0,
+        )  # fmt: skip
+        self.add(topic, "sensor_msgs/NavSatFix", stamp_ns, message)
+
     def depth(self, count: int, frame_id: str = "optical", info: bool = True, topic: str = "/camera/depth") -> None:
         for k in range(count):
             stamp_ns = START_NS + k * 100 * MS

@@ -32,9 +32,12 @@ def add_arguments(parser: ArgumentParser) -> None:
     parser.add_argument("--picture", metavar="FILE", help=about)
     parser.add_argument(
         "--positions", metavar="FILE",
-        help="positions of the camera that do not drift, as of GNSS: lines as --trajectory writes, in metres",
+        help="positions of the camera that do not drift, as of GNSS: lines as --trajectory writes, in metres, or a bag "
+        "with sensor_msgs/NavSatFix",
     )  # fmt: skip
     parser.add_argument("--positions-sigma", type=float, default=1.0, metavar="M", help="their standard deviation (1)")
+    about = "a second odometry, as of wheels: poses of the camera, lines as --trajectory writes"
+    parser.add_argument("--odometry", metavar="FILE", help=about)
     add_settings(parser, "loops.drift=0.05")
 
 
@@ -55,7 +58,7 @@ def run(arguments: Namespace) -> dict[str, Any]:
     with progress_of_steps("looking for loops") as progress:
         done = close_loops(
             arguments.map, out, positions=arguments.positions, positions_sigma=arguments.positions_sigma,
-            progress=progress, **overrides(arguments),
+            odometry=arguments.odometry, progress=progress, **overrides(arguments),
         )  # fmt: skip
     say_closure(done.closure)
     if arguments.trajectory:
@@ -82,6 +85,9 @@ def say_closure(closure: LoopClosure) -> None:
         say(f"{len(closure.loops)} loops closed; there the poses were off by up to {off:.2f} m")
     else:
         say(f"no loops were found: of {len(closure.places)} places, none is surely seen twice")
+    if closure.odometry is not None:
+        used, other = closure.odometry.used, closure.odometry.contradicted
+        say(f"the second odometry had a part in {used} steps between places; in {other} it contradicts the map's poses")
     moved = summary["moved_m"]
     say(f"frames moved by {moved['median']:.3f} m (median), at most {moved['max']:.3f} m")
     if not closure.report.all_frames:

@@ -196,8 +196,11 @@ class LoopsConfig(Section):
     drift_deg: degrees by which they may be turned after one metre; it grows with the square root of the way.
     upright_deg: degrees by which the poses' up may be wrong; for poses levelled by gravity, as of a T265, a phone or a
         headset. Not set: up drifts like heading.
+    odometry_drift, odometry_drift_deg: the same as the first two of a second odometry, such as that of wheels.
     """
 
     drift: float = Field(0.015, gt=0, le=0.5)
     drift_deg: float = Field(0.15, gt=0, le=20)
     upright_deg: float | None = Field(None, gt=0, le=45)
+    odometry_drift: float = Field(0.02, gt=0, le=0.5)
+    odometry_drift_deg: float = Field(0.3, gt=0, le=20)

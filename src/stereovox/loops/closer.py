@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.config import Config
-from stereovox.loops.drift import Drift, Way
+from stereovox.loops.drift import GATE, Drift, Way, difference, squared
 from stereovox.loops.matching import FLOOR, Match, matched
+from stereovox.loops.odometry import Odometry
 from stereovox.loops.positions import Positions
 from stereovox.loops.repeats import Repeats
 from stereovox.loops.search import SAME_M, SAME_RAD, Search
@@ -24,7 +25,7 @@ from stereovox.loops.submaps import Shape, Shapes, Submap, is_long
 from stereovox.maps.kept_frames import KeptFrame
 from stereovox.pose_graph import HELD, Edge, PoseGraph, Position, Upright, information, need_gtsam
 from stereovox.products.floor_axes import up_of
-from stereovox.se3 import Transform, interpolate, inverse, orthonormalise, rotation_between, rotation_vector
+from stereovox.se3 import Transform, interpolate, inverse, orthonormalise, rotation_between
 
 LEAST_WAY_M = 3.0
 """Metres of way between two visits that can be a loop."""
@@ -34,8 +35,6 @@ TRIED = 6
 """Earlier submaps that a new one is laid onto, the nearest."""
 NEIGHBOURS = 10
 """Earlier submaps that each is laid onto at the end, the nearest."""
-GATE = 22.5
-"""Squared deviations, of six, by which a loop may be off: 99.9 % of right ones are within (chi-squared)."""
 REACH = 4.75
 """The same, not squared: how far a place is sought, to find others that look the same."""
 RIVALS = 7.1
@@ -84,6 +83,7 @@ class LoopCloser:
 
     Args:
         config: The map's settings.
+        odometry: A second odometry, if there is one.
 
     Attributes:
         submaps: The submaps so far, with their poses as now believed.
@@ -97,8 +97,9 @@ class LoopCloser:
         MissingExtra: gtsam is not installed.
     """
 
-    def __init__(self, config: Config):
+    def __init__(self, config: Config, odometry: Odometry | None = None):
         need_gtsam()
+        self._odometry = odometry
         self.submaps: list[Submap] = []
         self.loops: list[Loop] = []
         self.refused: list[Loop] = []
@@ -216,9 +217,12 @@ class LoopCloser:
         metres, radians = submap.travelled - last.travelled, submap.turned - last.turned
         ends = last.frames[last.anchor], submap.frames[submap.anchor]
         variances = np.sum([np.repeat(frame.pose_sigma, 3) ** 2 for frame in ends], axis=0)
-        known = information(self._drift.covariance(metres, radians) + np.diag(variances))
+        covariance = self._drift.covariance(metres, radians) + np.diag(variances)
+        if self._odometry is not None:
+            stamps_ns = last.stamp_ns, submap.stamp_ns
+            motion, covariance = self._odometry.joined(stamps_ns, motion, covariance, (metres, radians))
         number = len(self.submaps)
-        self._steps.append(Edge(number - 1, number, motion, known))
+        self._steps.append(Edge(number - 1, number, motion, information(covariance)))
         submap.T_map_anchor = last.T_map_anchor @ motion
 
     def _hold(self, positions: Positions) -> None:
@@ -292,7 +296,7 @@ class LoopCloser:
         why = ""
         if any(_is_elsewhere(best, match) for match in good):
             why = "another place within reach looks the same"
-        elif _squared(moved, covariance + best.covariance) > GATE:
+        elif squared(moved, covariance + best.covariance) > GATE:
             why = f"the poses cannot be off by {off_m:.2f} m and {np.degrees(off_rad):.1f} degrees (loops.drift)"
         elif (shift_m := self._rival_m(first, second, moved, covariance + best.covariance)) is not None:
             why = f"it looks the same {shift_m:.2f} m away, which the poses cannot tell apart"
@@ -308,7 +312,7 @@ class LoopCloser:
         one, other = self.submaps[first], self.submaps[second]
         shifts = self.repeats.shifts([one.middle, other.middle]) @ other.T_map_anchor[:3, :3]
         for shift in (*shifts, *-shifts):
-            if _squared(np.concatenate([moved[:3], moved[3:] + shift]), covariance) < RIVALS**2:
+            if squared(np.concatenate([moved[:3], moved[3:] + shift]), covariance) < RIVALS**2:
                 return float(np.linalg.norm(shift))
         return None
 
@@ -349,7 +353,7 @@ class LoopCloser:
         covariance = self._drift.covariance(metres) + 2 * FLOOR
         lever = float(np.linalg.norm(over[:3, 3]) + np.linalg.norm(back[:3, 3]))
         covariance[3:, 3:] += lever**2 * covariance[:3, :3]
-        return _squared(moved, covariance) < GATE
+        return squared(moved, covariance) < GATE
 
     def _found_overlaps(self, progress: Callable[[int, int], object]) -> list[Edge]:
         """Lay all submaps that see the same onto each other; return what that says."""
@@ -375,7 +379,7 @@ class LoopCloser:
         if match is None:
             return None
         moved = difference(guess, match.T_earlier_later)
-        if _squared(moved, covariance + match.covariance) > GATE:
+        if squared(moved, covariance + match.covariance) > GATE:
             return None
         return Edge(first, second, match.T_earlier_later, information(match.covariance))
 
@@ -383,17 +387,6 @@ class LoopCloser:
 def ends_of(loops: Sequence[Loop], places: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the two places (N, 2, 3) of N loops, the earlier one first, of all places (S, 3)."""
     return places[np.reshape([(loop.first, loop.second) for loop in loops], (-1, 2)).astype(np.int64)]
-
-
-def difference(one: Transform, other: Transform) -> NDArray[np.float64]:
-    """Return the motion (6,) from one pose to another in its own axes: rotation in radians, shift in metres."""
-    R = one[:3, :3].T
-    return np.concatenate([rotation_vector(R @ other[:3, :3]), R @ (other[:3, 3] - one[:3, 3])])
-
-
-def _squared(motion: NDArray[np.float64], covariance: NDArray[np.float64]) -> float:
-    """Return a motion (6,) in squared deviations."""
-    return float(motion @ np.linalg.solve(covariance, motion))
 
 
 def _is_elsewhere(one: Match, other: Match) -> bool:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How far the poses that frames come with may be off after some way."""
+"""How far the poses that frames come with may be off after some way, and motions from one pose to another."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.config.robot import LoopsConfig
-from stereovox.se3 import Transform, inverse, rotation_vector
+from stereovox.se3 import Transform, inverse, rotation_matrix, rotation_vector
 
 KEEPS_M = 5.0
 """Metres of way over which drift keeps its direction; beyond, it grows with the square root of the way."""
@@ -17,6 +17,8 @@ JITTER_RAD, JITTER_M = np.radians(0.1), 0.003
 """Standard deviations of a pose besides drift."""
 TURNED = 0.01
 """Share of a turn by which it may be wrong."""
+GATE = 22.5
+"""Squared deviations, of six, by which a motion may be off: 99.9 % of right ones are within (chi-squared)."""
 
 
 class Drift(NamedTuple):
@@ -61,3 +63,22 @@ class Way:
         so_far = np.maximum.reduce([own, *self._so_far.values()])
         self._last[sensor], self._so_far[sensor] = T_world_sensor, so_far
         return float(so_far[0]), float(so_far[1])
+
+
+def difference(one: Transform, other: Transform) -> NDArray[np.float64]:
+    """Return the motion (6,) from one pose to another in its own axes: rotation in radians, shift in metres."""
+    R = one[:3, :3].T
+    return np.concatenate([rotation_vector(R @ other[:3, :3]), R @ (other[:3, 3] - one[:3, 3])])
+
+
+def moved_by(one: Transform, motion: NDArray[np.float64]) -> Transform:
+    """Return the pose (4, 4) to which a motion (6,) leads from another, so that it is their `difference`."""
+    other = one.copy()
+    other[:3, :3] = one[:3, :3] @ rotation_matrix(motion[:3])
+    other[:3, 3] += one[:3, :3] @ motion[3:]
+    return other
+
+
+def squared(motion: NDArray[np.float64], covariance: NDArray[np.float64]) -> float:
+    """Return a motion (6,) in squared deviations."""
+    return float(motion @ np.linalg.solve(covariance, motion))

@@ -14,7 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from stereovox.errors import StereovoxError
-from stereovox.loops.closer import Loop, LoopCloser, difference
+from stereovox.loops.closer import Loop, LoopCloser
+from stereovox.loops.drift import difference
 from stereovox.loops.matching import matched
 from stereovox.loops.search import Search
 from stereovox.loops.submaps import Shape

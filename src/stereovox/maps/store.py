@@ -150,7 +150,7 @@ def _read(folder: Path, manifest: dict[str, Any]) -> SavedMap:
         if isinstance(cells_of := manifest["config"].get("map"), dict):
             cells_of.setdefault("prior", 0.5)  # that of maps from before there was one
         config, history = load_config(manifest["config"]), History.loaded(manifest)
-        viewpoint, window = _viewpoint_from(manifest.get("viewpoint")), manifest.get("window")
+        viewpoint, window = viewpoint_from(manifest.get("viewpoint")), manifest.get("window")
         start_ns = _start_ns(manifest.get("times_start_ns"))
         data, blocks = folder / str(manifest["data"]), count_in(manifest, "blocks")
         dtypes = [FORMATS[config.map.cell].dtype, np.dtype(np.uint32)][: 2 if config.map.keep_times else 1]
@@ -255,6 +255,11 @@ def _ascend(coords: NDArray[np.int32]) -> bool:
     return bool((steps > 0).all())
 
 
+def is_boxed(manifest: Any) -> bool:
+    """Tell whether a manifest is that of a map in boxes (`boxed_store`)."""
+    return isinstance(manifest, dict) and manifest.get("format") == FORMAT and "box_side" in manifest
+
+
 def is_map(path: str | Path) -> bool:
     """Tell whether a folder holds a saved map."""
     return (Path(path) / MANIFEST).is_file()
@@ -328,7 +333,7 @@ def _manifest(storage: Storage, data: str, blocks: int, checksum: list[int]) -> 
         "blocks": blocks,
         "data": data,
         "checksum": checksum,
-        "viewpoint": _viewpoint_to(storage.viewpoint),
+        "viewpoint": viewpoint_to(storage.viewpoint),
         "window": storage.window_state,
         "times_start_ns": storage.times_start_ns,
         "config": storage.config.model_dump(),
@@ -347,14 +352,16 @@ def _start_ns(saved: Any) -> int | None:
     return None if saved is None else int(saved)
 
 
-def _viewpoint_to(viewpoint: Viewpoint | None) -> dict[str, Any] | None:
+def viewpoint_to(viewpoint: Viewpoint | None) -> dict[str, Any] | None:
+    """Return a viewpoint as plain values for JSON, which `viewpoint_from` reads."""
     if viewpoint is None:
         return None
     camera, T_world_camera, stamp_ns = viewpoint
     return {"camera": asdict(camera), "T_world_camera": T_world_camera.tolist(), "stamp_ns": stamp_ns}
 
 
-def _viewpoint_from(saved: dict[str, Any] | None) -> Viewpoint | None:
+def viewpoint_from(saved: dict[str, Any] | None) -> Viewpoint | None:
+    """Return a saved viewpoint. Raises KeyError, TypeError or ValueError for what cannot have been saved."""
     if saved is None:
         return None
     numbers = dict(saved["camera"])
@@ -368,7 +375,7 @@ def _viewpoint_from(saved: dict[str, Any] | None) -> Viewpoint | None:
 def _write_manifest(folder: Path, manifest: dict[str, Any]) -> None:
     temporary = folder / f".{MANIFEST}.new"
     with temporary.open("w") as file:
-        json.dump(manifest, file, indent=2, default=_as_number)
+        json.dump(manifest, file, indent=2, default=as_number)
         file.flush()
         os.fsync(file.fileno())
     sync_folder(folder)  # whatever the new manifest names is there before it
@@ -376,7 +383,7 @@ def _write_manifest(folder: Path, manifest: dict[str, Any]) -> None:
     sync_folder(folder)
 
 
-def _as_number(number: Any) -> Any:
+def as_number(number: Any) -> Any:
     """Return Python's own number for one of NumPy, which JSON does not know: `np.int64(5)` as a time, for example."""
     if not isinstance(number, np.generic):
         raise TypeError(f"{type(number).__name__} cannot be saved")

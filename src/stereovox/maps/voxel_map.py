@@ -14,7 +14,7 @@ from stereovox.config import Config
 from stereovox.errors import StereovoxError
 from stereovox.frame import Viewpoint
 from stereovox.maps import queries
-from stereovox.maps.blocks import CELLS, SIDE, blocks_of_cells
+from stereovox.maps.blocks import CELLS, SIDE, blocks_of_cells, span_of
 from stereovox.maps.cell_format import State as State
 from stereovox.maps.cell_times import NEVER
 from stereovox.maps.evidence import Evidence
@@ -348,7 +348,7 @@ class VoxelMap(Guarded, OnBlocks):
     def bounds(self) -> NDArray[np.float64] | None:
         """Return the lowest and highest corner (2, 3) in metres of all known cells; None for an empty map."""
         unknown = self.storage.cell_format.unknown
-        pieces = (_span(coords, values != unknown) for coords, values in self.storage.slabs())
+        pieces = (span_of(coords, values != unknown) for coords, values in self.storage.slabs())
         spans = [span for span in pieces if span is not None]
         if not spans:
             return None
@@ -456,19 +456,6 @@ def _whole(cells: NDArray) -> NDArray[np.int64]:
     if cells.size and not (cells.min() >= -INDEX_LIMIT and cells.max() <= INDEX_LIMIT):
         raise StereovoxError(f"indices: from {cells.min():g} to {cells.max():g}; give at most 2^30 either way")
     return cells.astype(np.int64, copy=False)
-
-
-def _span(coords: NDArray[np.int32], known: NDArray[np.bool_]) -> tuple[list[int], list[int]] | None:
-    """Return the lowest `known` cell (n, 512) of blocks (n, 3) on each axis, and the first beyond the highest."""
-    if not known.any():
-        return None
-    known = known.reshape(-1, SIDE, SIDE, SIDE)
-    ends = []
-    for axis in range(3):
-        layers = (coords[:, axis, None] * SIDE + np.arange(SIDE))[known.any(axis=tuple({1, 2, 3} - {axis + 1}))]
-        ends.append((int(layers.min()), int(layers.max()) + 1))
-    lowest, beyond = zip(*ends, strict=True)
-    return list(lowest), list(beyond)
 
 
 def load_map(path: str | Path) -> VoxelMap:

@@ -21,7 +21,7 @@ from stereovox.frame import Viewpoint
 from stereovox.maps.boxes import BOXES, BoxEntry, BoxLayout
 from stereovox.maps.lock import only_writer_in
 from stereovox.maps.pyramid import coarser_layout
-from stereovox.maps.store import FORMAT, MANIFEST, as_number, is_boxed, viewpoint_from, viewpoint_to
+from stereovox.maps.store import FORMAT, MANIFEST, as_number, viewpoint_from, viewpoint_to
 from stereovox.places import Folder, Place
 from stereovox.safe_io import json_value
 from stereovox.trust.history import History
@@ -96,10 +96,12 @@ def read_boxed_manifest(place: Place) -> BoxedManifest:
         saved = json_value(data)
     except ValueError as error:
         raise MapFileError(f"{place}/{MANIFEST}: cannot be read ({error}); make the map anew") from None
-    if not is_boxed(saved):
-        raise MapFileError(f"{place}/{MANIFEST}: no stereovox map in boxes")
-    if saved["version"] != VERSION:
-        raise MapFileError(f"{place}: map format {saved['version']}, this program reads {VERSION}; update stereovox")
+    if not isinstance(saved, dict) or saved.get("format") != FORMAT:
+        raise MapFileError(f"{place}/{MANIFEST}: not a stereovox map")
+    if saved.get("version") != VERSION:
+        raise MapFileError(
+            f"{place}: map format {saved.get('version')}, maps in boxes have {VERSION}; update stereovox"
+        )
     try:
         return _manifest_of(saved)
     except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:

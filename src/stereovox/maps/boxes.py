@@ -206,6 +206,8 @@ def read_box(place: Place, layout: BoxLayout, entry: BoxEntry) -> BoxBlocks:
             raise ValueError(f"{entry.blocks} blocks where there are {len(shards[0])} bytes")
         coords, cells, *times = _unpacked(layout, entry.blocks, shards)
         _check_coords(layout, entry, coords)
+        if len(coords) - int((cells == layout.rules.lowest).all(axis=1).sum()) != entry.rows:
+            raise ValueError(f"not {entry.rows} blocks with numbers, as the manifest says")
     except (ValueError, TypeError, KeyError, RuntimeError, OSError, struct.error) as error:
         raise MapFileError(
             f"{place}/{entry.name}: damaged box ({type(error).__name__}: {error}); make box {entry.box} anew"

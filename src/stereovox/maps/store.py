@@ -40,6 +40,7 @@ from stereovox.maps.kept_frames import KeptFrames
 from stereovox.maps.lock import LOCK, only_writer_in
 from stereovox.maps.queries import INDEX_LIMIT
 from stereovox.maps.storage import Storage
+from stereovox.places import Place, is_url
 from stereovox.safe_io import count_in, json_value, read_bounded, sync_folder, sync_tree, zstd_size
 from stereovox.trust.history import History
 
@@ -53,6 +54,8 @@ BYTES, LITTLE = {"name": "bytes"}, {"name": "bytes", "configuration": {"endian":
 FORMAT = "stereovox-map"
 VERSION, READABLE = 2, (1, 2)
 MANIFEST = "manifest.json"
+BOXED = b'"format": "stereovox-map", "version": 3,'
+"""Begins the manifest of a map in boxes."""
 MAX_MANIFEST = 1 << 22
 """Bytes of a manifest."""
 BLOCKS_PER_CHUNK = 4096
@@ -124,6 +127,8 @@ def check_target(folder: Path) -> None:
         raise MapFileError(f"{folder}: cannot be written ({error.strerror}); choose another name") from None
     if there and not is_map(folder) and not _is_free(folder):
         raise MapFileError(f"{folder}: exists and is not a stereovox map; choose another name or remove it")
+    if is_boxed(folder):
+        raise MapFileError(f"{folder}: is a map in boxes; choose another name or remove it")
     nearest = next(parent for parent in (folder, *folder.absolute().parents) if parent.exists())
     if not nearest.is_dir() or not os.access(nearest, os.W_OK | os.X_OK):
         where = "" if nearest == folder else f"{nearest} "
@@ -255,13 +260,22 @@ def _ascend(coords: NDArray[np.int32]) -> bool:
     return bool((steps > 0).all())
 
 
-def is_boxed(manifest: Any) -> bool:
-    """Tell whether a manifest is that of a map in boxes (`boxed_store`)."""
-    return isinstance(manifest, dict) and manifest.get("format") == FORMAT and "box_side" in manifest
+def is_boxed(path: str | Path) -> bool:
+    """Tell whether a folder holds a map in boxes (`boxed_store`), by the beginning of its manifest."""
+    try:
+        with (Path(path) / MANIFEST).open("rb") as file:
+            return BOXED in file.read(100)
+    except OSError:
+        return False
 
 
 def is_map(path: str | Path) -> bool:
-    """Tell whether a folder holds a saved map."""
+    """Tell whether a folder, or a URL in an object store, holds a saved map. Raises MapFileError for a store out of reach.
+
+    In stores they are in boxes.
+    """
+    if is_url(path):
+        return MANIFEST in Place.of(path).sizes(MANIFEST)
     return (Path(path) / MANIFEST).is_file()
 
 
@@ -270,6 +284,10 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     if not is_map(folder):
         raise MapFileError(
             f"{folder}: no stereovox map here (no {MANIFEST}); make one with: stereovox map SOURCE --out {folder}"
+        )
+    if is_boxed(folder):
+        raise MapFileError(
+            f"{folder}: is a map in boxes, which this cannot use; take a part of it with: stereovox crop"
         )
     if (folder / MANIFEST).is_symlink():
         raise MapFileError(f"{folder / MANIFEST}: is a link; a map has all its files in one folder")

@@ -18,7 +18,7 @@ SOURCE = Path(__file__).resolve().parents[1] / "src/stereovox"
 LAYERS = (
     {"errors", "se3", "_jit"},
     {"registry", "safe_io", "se2", "threads", "cameras", "_math"},
-    {"config", "frame", "pose_graph", "_gpu"},
+    {"config", "frame", "places", "pose_graph", "_gpu"},
     {"sensors", "trust", "device"},
     {"depth", "maps"},
     {"intake", "integrate", "products", "sources"},
@@ -43,6 +43,7 @@ HOMES = {
     "nav_msgs": r"ros/.*",
     "numba": r"(.*/)?_[a-z]\w*\.py",
     "numcodecs": r"maps/.*",
+    "obstore": r"places\.py",
     "octomap": r"lab/.*",
     "octomap_msgs": r"ros/.*",
     "pydantic": r"config/.*",

@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from stereovox.maps import State as State
     from stereovox.maps import VoxelMap as VoxelMap
     from stereovox.maps import load_map as load_map
+    from stereovox.maps import save_boxed as save_boxed
     from stereovox.maps.grid_map import GridMap as GridMap
     from stereovox.maps.occupancy import OccupancyGrid as OccupancyGrid
     from stereovox.opening import open_images as open_images
@@ -100,6 +101,7 @@ _HOMES = {
     "State": "maps",
     "VoxelMap": "maps",
     "load_map": "maps",
+    "save_boxed": "maps",
     "describe": "contents",
     "GridMap": "maps.grid_map",
     "OccupancyGrid": "maps.occupancy",

@@ -7,11 +7,13 @@ from pathlib import Path
 
 from stereovox.config import Config
 from stereovox.errors import ConfigError
+from stereovox.maps.boxed_map import save_boxed
 from stereovox.maps.kept_frames import KeptFrames
+from stereovox.maps.loading import load_map
 from stereovox.maps.storage import Storage
-from stereovox.maps.voxel_map import State, VoxelMap, load_map, unbounded
+from stereovox.maps.voxel_map import State, VoxelMap, unbounded
 
-__all__ = ["State", "VoxelMap", "load_map", "make_map", "unbounded"]
+__all__ = ["State", "VoxelMap", "load_map", "make_map", "save_boxed", "unbounded"]
 
 
 def make_map(config: Config, resume: VoxelMap | None = None, tiles: Path | None = None) -> VoxelMap:
@@ -28,6 +30,7 @@ def make_map(config: Config, resume: VoxelMap | None = None, tiles: Path | None 
         )
     kept = _kept_frames(config, resume)
     if resume is not None:
+        resume.storage.check_can_grow()
         resume.storage.check_cells(config)  # before anything lies on the disk
     try:
         made = _made(config, resume, tiles)

@@ -41,6 +41,19 @@ def blocks_of_cells(cells: NDArray[np.integer]) -> tuple[NDArray[np.int64], NDAr
     return blocks + low, of_cell
 
 
+def span_of(coords: NDArray[np.int32], known: NDArray[np.bool_]) -> tuple[list[int], list[int]] | None:
+    """Return the lowest `known` cell (n, 512) of blocks (n, 3) on each axis, and the first beyond the highest."""
+    if not known.any():
+        return None
+    known = known.reshape(-1, SIDE, SIDE, SIDE)
+    ends = []
+    for axis in range(3):
+        layers = (coords[:, axis, None] * SIDE + np.arange(SIDE))[known.any(axis=tuple({1, 2, 3} - {axis + 1}))]
+        ends.append((int(layers.min()), int(layers.max()) + 1))
+    lowest, beyond = zip(*ends, strict=True)
+    return list(lowest), list(beyond)
+
+
 class StoredCells(NamedTuple):
     """All cells of a map as kernels read them, with `row_of` and `number_in` of `_cells.py`; never written to."""
 

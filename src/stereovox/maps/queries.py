@@ -48,6 +48,13 @@ class RayHits(NamedTuple):
     cell: NDArray[np.int32]
     state: NDArray[np.uint8]
 
+    @classmethod
+    def none(cls, number: int) -> RayHits:
+        """Return so many rays that nothing stops."""
+        return cls(
+            np.full(number, np.inf, np.float32), np.full((number, 3), NO_CELL, np.int32), np.zeros(number, np.uint8)
+        )
+
 
 class NearestCells(NamedTuple):
     """What is nearest to points.
@@ -58,6 +65,11 @@ class NearestCells(NamedTuple):
 
     distance: NDArray[np.float32]
     cell: NDArray[np.int32]
+
+    @classmethod
+    def none(cls, number: int) -> NearestCells:
+        """Return so many points that nothing is near."""
+        return cls(np.full(number, np.inf, np.float32), np.full((number, 3), NO_CELL, np.int32))
 
 
 def points_of(
@@ -100,8 +112,8 @@ def cast_rays(
     if not directions.any(axis=1).all():
         raise StereovoxError(f"direction {np.flatnonzero(~directions.any(axis=1))[0]} is (0, 0, 0) and leads nowhere")
     n, wanted = len(directions), state_bits(stop_at, "stop_at")
-    hits = RayHits(np.full(n, np.inf, np.float32), np.full((n, 3), NO_CELL, np.int32), np.zeros(n, np.uint8))
-    _query_rays.cast(*_read(asked), wanted, asked.sides, origins, directions, _distance(max_distance), *hits)
+    hits = RayHits.none(n)
+    _query_rays.cast(*_read(asked), wanted, asked.sides, origins, directions, distance_of(max_distance), *hits)
     return hits
 
 
@@ -132,8 +144,8 @@ def nearest(asked: Asked, points: ArrayLike, max_distance: float, obstacles: Ite
     """Return what is nearest to points; see `VoxelMap.nearest_obstacle`."""
     points, wanted = _within_limits(asked, _vectors(points, "points"), "points"), state_bits(obstacles, "obstacles")
     n = len(points)
-    found = NearestCells(np.full(n, np.inf, np.float32), np.full((n, 3), NO_CELL, np.int32))
-    _query_nearest.nearest(*_read(asked), wanted, asked.sides, points, _distance(max_distance), *found)
+    found = NearestCells.none(n)
+    _query_nearest.nearest(*_read(asked), wanted, asked.sides, points, distance_of(max_distance), *found)
     return found
 
 
@@ -203,7 +215,8 @@ def _lengths(values: ArrayLike, name: str) -> NDArray[np.float64]:
     return lengths
 
 
-def _distance(metres: float) -> float:
+def distance_of(metres: float) -> float:
+    """Return a largest distance as a number; raises StereovoxError for what is no length of 0 m or more."""
     lengths = _lengths(metres, "max_distance")
     if len(lengths) != 1:
         raise StereovoxError(f"max_distance: {len(lengths)} lengths; give one for all")

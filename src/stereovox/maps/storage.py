@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from stereovox.config import Config
 from stereovox.errors import ConfigError, StereovoxError
 from stereovox.frame import Viewpoint
-from stereovox.maps import _add, queries
+from stereovox.maps import _add, _pool, queries
 from stereovox.maps.blocks import CELLS, SIDE, StoredCells, blocks_of_cells
 from stereovox.maps.cell_format import CellRules
 from stereovox.maps.cell_pool import CellPool
@@ -125,6 +125,9 @@ class Storage(Guarded):
         self.check_cells(config)
         self.config = config
 
+    def check_can_grow(self) -> None:
+        """Raise StereovoxError where nothing can be added to this map; here it can."""
+
     def take_history(self, earlier: Storage) -> None:
         """Take over what `earlier` remembers of its frames."""
         self.history, self.viewpoint = earlier.history.copied(), earlier.viewpoint
@@ -208,6 +211,17 @@ class Storage(Guarded):
         """What kernels that only read need; valid until the map changes."""
         return self._pool.stored_cells
 
+    def cells_within(self, low: ArrayLike, high: ArrayLike) -> StoredCells:
+        """Return cells that hold those with indices (3,) from `low` to below `high`, as `stored_cells` does: all here.
+
+        For maps that are not all in memory, which read what is asked for.
+        """
+        return self.stored_cells
+
+    def cells_of(self, coords: NDArray[np.int32]) -> NDArray[np.integer]:
+        """Return the cells (n, 512) as stored of blocks (n, 3) in memory; all unknown where there is none."""
+        return self._cells_in(self.stored_cells, coords)
+
     def stored_at(self, points: NDArray[np.floating]) -> NDArray[np.integer]:
         """Return the stored numbers (N,) of the cells at points (N, 3) as `queries.points_of` returns them."""
         return queries.stored_at(self.stored_cells, self.config.cell, points)
@@ -224,8 +238,14 @@ class Storage(Guarded):
         """
         return self._pool.within(np.asarray(low), np.asarray(high))
 
+    def slabs_within(self, low: ArrayLike, high: ArrayLike) -> Iterator[Blocks]:
+        """Yield the blocks with coordinates (3,) from `low` to below `high`, piece by piece as `slabs` does."""
+        for coords, cells in self.slabs():
+            inside = ((coords >= np.asarray(low)) & (coords < np.asarray(high))).all(axis=1)
+            yield coords[inside], cells[inside]
+
     def slabs(self) -> Iterator[Blocks]:
-        """Yield all blocks as in `blocks`, piece by piece in ascending order.
+        """Yield all blocks as in `blocks`, piece by piece in ascending order; those of a map in boxes box by box.
 
         If the map changes meanwhile, each piece is as it is at its time; hold `lock` to read one state.
         """
@@ -292,6 +312,17 @@ class Storage(Guarded):
             times = self.times_of(coords)
             times[cells == self.cell_format.unknown] = NEVER
             yield coords, cells, times
+
+    @staticmethod
+    def _cells_in(stored: StoredCells, coords: NDArray[np.int32]) -> NDArray[np.integer]:
+        """Return the cells (n, 512) of blocks (n, 3) as kernels see them."""
+        places = np.empty(len(coords), np.int64)
+        _pool.find_all(stored.table, stored.coords, np.ascontiguousarray(coords, np.int32), places)
+        cells = np.full((len(coords), CELLS), stored.unknown, stored.values.dtype)
+        has_row = (places >= 0) & (places < len(stored.values))
+        cells[has_row] = stored.values[places[has_row]]
+        cells[places >= len(stored.values)] = stored.lowest
+        return cells
 
     def _in_my_units(self, evidence: Evidence) -> Evidence:
         """Return the evidence as differences of stored numbers; blocks that would get a uniform 0 are left out."""

@@ -40,6 +40,7 @@ from stereovox.maps.kept_frames import KeptFrames
 from stereovox.maps.lock import LOCK, only_writer_in
 from stereovox.maps.queries import INDEX_LIMIT
 from stereovox.maps.storage import Storage
+from stereovox.places import Place, is_url
 from stereovox.safe_io import count_in, json_value, read_bounded, sync_folder, sync_tree, zstd_size
 from stereovox.trust.history import History
 
@@ -53,6 +54,8 @@ BYTES, LITTLE = {"name": "bytes"}, {"name": "bytes", "configuration": {"endian":
 FORMAT = "stereovox-map"
 VERSION, READABLE = 2, (1, 2)
 MANIFEST = "manifest.json"
+BOXED = b'"format": "stereovox-map", "version": 3,'
+"""Begins the manifest of a map in boxes."""
 MAX_MANIFEST = 1 << 22
 """Bytes of a manifest."""
 BLOCKS_PER_CHUNK = 4096
@@ -124,6 +127,8 @@ def check_target(folder: Path) -> None:
         raise MapFileError(f"{folder}: cannot be written ({error.strerror}); choose another name") from None
     if there and not is_map(folder) and not _is_free(folder):
         raise MapFileError(f"{folder}: exists and is not a stereovox map; choose another name or remove it")
+    if is_boxed(folder):
+        raise MapFileError(f"{folder}: is a map in boxes; choose another name or remove it")
     nearest = next(parent for parent in (folder, *folder.absolute().parents) if parent.exists())
     if not nearest.is_dir() or not os.access(nearest, os.W_OK | os.X_OK):
         where = "" if nearest == folder else f"{nearest} "
@@ -150,7 +155,7 @@ def _read(folder: Path, manifest: dict[str, Any]) -> SavedMap:
         if isinstance(cells_of := manifest["config"].get("map"), dict):
             cells_of.setdefault("prior", 0.5)  # that of maps from before there was one
         config, history = load_config(manifest["config"]), History.loaded(manifest)
-        viewpoint, window = _viewpoint_from(manifest.get("viewpoint")), manifest.get("window")
+        viewpoint, window = viewpoint_from(manifest.get("viewpoint")), manifest.get("window")
         start_ns = _start_ns(manifest.get("times_start_ns"))
         data, blocks = folder / str(manifest["data"]), count_in(manifest, "blocks")
         dtypes = [FORMATS[config.map.cell].dtype, np.dtype(np.uint32)][: 2 if config.map.keep_times else 1]
@@ -255,8 +260,22 @@ def _ascend(coords: NDArray[np.int32]) -> bool:
     return bool((steps > 0).all())
 
 
+def is_boxed(path: str | Path) -> bool:
+    """Tell whether a folder holds a map in boxes (`boxed_store`), by the beginning of its manifest."""
+    try:
+        with (Path(path) / MANIFEST).open("rb") as file:
+            return BOXED in file.read(100)
+    except OSError:
+        return False
+
+
 def is_map(path: str | Path) -> bool:
-    """Tell whether a folder holds a saved map."""
+    """Tell whether a folder, or a URL in an object store, holds a saved map. Raises MapFileError for a store out of reach.
+
+    In stores they are in boxes.
+    """
+    if is_url(path):
+        return MANIFEST in Place.of(path).sizes(MANIFEST)
     return (Path(path) / MANIFEST).is_file()
 
 
@@ -265,6 +284,10 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     if not is_map(folder):
         raise MapFileError(
             f"{folder}: no stereovox map here (no {MANIFEST}); make one with: stereovox map SOURCE --out {folder}"
+        )
+    if is_boxed(folder):
+        raise MapFileError(
+            f"{folder}: is a map in boxes, which this cannot use; take a part of it with: stereovox crop"
         )
     if (folder / MANIFEST).is_symlink():
         raise MapFileError(f"{folder / MANIFEST}: is a link; a map has all its files in one folder")
@@ -328,7 +351,7 @@ def _manifest(storage: Storage, data: str, blocks: int, checksum: list[int]) -> 
         "blocks": blocks,
         "data": data,
         "checksum": checksum,
-        "viewpoint": _viewpoint_to(storage.viewpoint),
+        "viewpoint": viewpoint_to(storage.viewpoint),
         "window": storage.window_state,
         "times_start_ns": storage.times_start_ns,
         "config": storage.config.model_dump(),
@@ -347,14 +370,16 @@ def _start_ns(saved: Any) -> int | None:
     return None if saved is None else int(saved)
 
 
-def _viewpoint_to(viewpoint: Viewpoint | None) -> dict[str, Any] | None:
+def viewpoint_to(viewpoint: Viewpoint | None) -> dict[str, Any] | None:
+    """Return a viewpoint as plain values for JSON, which `viewpoint_from` reads."""
     if viewpoint is None:
         return None
     camera, T_world_camera, stamp_ns = viewpoint
     return {"camera": asdict(camera), "T_world_camera": T_world_camera.tolist(), "stamp_ns": stamp_ns}
 
 
-def _viewpoint_from(saved: dict[str, Any] | None) -> Viewpoint | None:
+def viewpoint_from(saved: dict[str, Any] | None) -> Viewpoint | None:
+    """Return a saved viewpoint. Raises KeyError, TypeError or ValueError for what cannot have been saved."""
     if saved is None:
         return None
     numbers = dict(saved["camera"])
@@ -368,7 +393,7 @@ def _viewpoint_from(saved: dict[str, Any] | None) -> Viewpoint | None:
 def _write_manifest(folder: Path, manifest: dict[str, Any]) -> None:
     temporary = folder / f".{MANIFEST}.new"
     with temporary.open("w") as file:
-        json.dump(manifest, file, indent=2, default=_as_number)
+        json.dump(manifest, file, indent=2, default=as_number)
         file.flush()
         os.fsync(file.fileno())
     sync_folder(folder)  # whatever the new manifest names is there before it
@@ -376,7 +401,7 @@ def _write_manifest(folder: Path, manifest: dict[str, Any]) -> None:
     sync_folder(folder)
 
 
-def _as_number(number: Any) -> Any:
+def as_number(number: Any) -> Any:
     """Return Python's own number for one of NumPy, which JSON does not know: `np.int64(5)` as a time, for example."""
     if not isinstance(number, np.generic):
         raise TypeError(f"{type(number).__name__} cannot be saved")

@@ -14,7 +14,7 @@ from stereovox.config import Config
 from stereovox.errors import StereovoxError
 from stereovox.frame import Viewpoint
 from stereovox.maps import queries
-from stereovox.maps.blocks import CELLS, SIDE, blocks_of_cells
+from stereovox.maps.blocks import CELLS, SIDE, blocks_of_cells, span_of
 from stereovox.maps.cell_format import State as State
 from stereovox.maps.cell_times import NEVER
 from stereovox.maps.evidence import Evidence
@@ -22,7 +22,7 @@ from stereovox.maps.kept_frames import KeptFrames
 from stereovox.maps.queries import INDEX_LIMIT as INDEX_LIMIT
 from stereovox.maps.queries import Asked, NearestCells, RayHits
 from stereovox.maps.storage import OnStorage, Storage
-from stereovox.maps.store import read_map, save_map
+from stereovox.maps.store import save_map
 from stereovox.threads import Guarded
 
 IN_STORAGE = frozenset({"blocks_within", "insert", "slabs", "timed"})
@@ -129,6 +129,17 @@ class VoxelMap(Guarded, OnBlocks):
             The number of cells whose value changed.
         """
         return self.storage.add(evidence)
+
+    def overview(self, most: int = 4_000_000) -> VoxelMap:
+        """Return a map in memory to draw the whole of: this one, or of a map in boxes a coarser one if it is large.
+
+        Args:
+            most: Known cells that may be loaded for it, about.
+
+        Returns:
+            The map; a cell of a coarser one has the worst state of its parts.
+        """
+        return self
 
     def log_odds(self, points: ArrayLike) -> NDArray[np.float32]:
         """Look up log-odds.
@@ -348,7 +359,7 @@ class VoxelMap(Guarded, OnBlocks):
     def bounds(self) -> NDArray[np.float64] | None:
         """Return the lowest and highest corner (2, 3) in metres of all known cells; None for an empty map."""
         unknown = self.storage.cell_format.unknown
-        pieces = (_span(coords, values != unknown) for coords, values in self.storage.slabs())
+        pieces = (span_of(coords, values != unknown) for coords, values in self.storage.slabs())
         spans = [span for span in pieces if span is not None]
         if not spans:
             return None
@@ -456,39 +467,3 @@ def _whole(cells: NDArray) -> NDArray[np.int64]:
     if cells.size and not (cells.min() >= -INDEX_LIMIT and cells.max() <= INDEX_LIMIT):
         raise StereovoxError(f"indices: from {cells.min():g} to {cells.max():g}; give at most 2^30 either way")
     return cells.astype(np.int64, copy=False)
-
-
-def _span(coords: NDArray[np.int32], known: NDArray[np.bool_]) -> tuple[list[int], list[int]] | None:
-    """Return the lowest `known` cell (n, 512) of blocks (n, 3) on each axis, and the first beyond the highest."""
-    if not known.any():
-        return None
-    known = known.reshape(-1, SIDE, SIDE, SIDE)
-    ends = []
-    for axis in range(3):
-        layers = (coords[:, axis, None] * SIDE + np.arange(SIDE))[known.any(axis=tuple({1, 2, 3} - {axis + 1}))]
-        ends.append((int(layers.min()), int(layers.max()) + 1))
-    lowest, beyond = zip(*ends, strict=True)
-    return list(lowest), list(beyond)
-
-
-def load_map(path: str | Path) -> VoxelMap:
-    """Read a map saved by `VoxelMap.save`, all of it, whatever window it was made in.
-
-    Args:
-        path: The folder of the map.
-
-    Returns:
-        The map, without bounds, in memory.
-
-    Raises:
-        MapFileError: One line with the file and what is wrong with it.
-    """
-    saved = read_map(path)
-    voxel_map = VoxelMap(saved.config)
-    storage = voxel_map.storage
-    storage.history, storage.viewpoint, storage.window_state = saved.history, saved.viewpoint, saved.window_state
-    storage.insert(saved.coords, saved.cells)
-    storage.kept = saved.kept
-    if saved.times is not None:
-        storage.set_times(saved.coords, saved.times, saved.times_start_ns)
-    return voxel_map

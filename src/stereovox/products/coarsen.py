@@ -6,10 +6,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox.config import Config, load_config
 from stereovox.errors import StereovoxError
 from stereovox.maps import State, VoxelMap
 from stereovox.maps.cell_format import CellRules
+from stereovox.maps.pyramid import coarser_config
 from stereovox.maps.voxel_map import cells_where
 from stereovox.products.side_by_side import set_times
 from stereovox.threads import one_state
@@ -37,7 +37,7 @@ def coarsen(voxel_map: VoxelMap, factor: int) -> VoxelMap:
     """
     if not 1 <= factor < 2**31 or factor != int(factor):
         raise StereovoxError(f"factor {factor}: give a whole number of cells, 1 or more")
-    settings = _coarser(voxel_map.config, int(factor))
+    settings = coarser_config(voxel_map.config, int(factor))
     parts = [_parents(voxel_map, coords, cells, int(factor)) for coords, cells in voxel_map.storage.slabs()]
     indices, number, stored, times = _grouped(*map(np.concatenate, zip(*parts, strict=True)))
     sure = (number == int(factor) ** 3) | (CellRules(voxel_map.config.map).states(stored) != State.FREE)
@@ -46,11 +46,6 @@ def coarsen(voxel_map: VoxelMap, factor: int) -> VoxelMap:
         set_times(coarse, indices[sure], times[sure], voxel_map.storage.times_start_ns)
     coarse.storage.take_history(voxel_map.storage)
     return coarse
-
-
-def _coarser(config: Config, factor: int) -> Config:
-    steps = config.steps and [float(f"{side * factor:.12g}") for side in config.steps]
-    return load_config(config, steps=steps, voxel_size=float(f"{config.voxel_size * factor:.12g}"))
 
 
 def _parents(voxel_map: VoxelMap, coords: NDArray[np.int32], cells: NDArray[np.integer], factor: int) -> Parents:

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from stereovox.errors import StereovoxError
 from stereovox.maps import VoxelMap
 from stereovox.maps.blocks import CELLS, SIDE
+from stereovox.maps.storage import EVERYWHERE
 from stereovox.products.side_by_side import add_blocks
 from stereovox.threads import one_state
 
@@ -33,9 +34,8 @@ def crop(voxel_map: VoxelMap, low: ArrayLike, high: ArrayLike) -> VoxelMap:
     sides = np.array(voxel_map.config.cell)
     first, beyond = (np.ceil(corner / sides - 0.5) for corner in corners_of(low, high))
     cropped = VoxelMap(voxel_map.config)
-    for coords, cells in voxel_map.storage.slabs():
-        touched = ((coords * SIDE < beyond) & ((coords + 1) * SIDE > first)).all(axis=1)
-        coords, cells = coords[touched], cells[touched]
+    ends = np.clip([first // SIDE, -(-beyond // SIDE)], *EVERYWHERE[:, :1]).astype(np.int64)
+    for coords, cells in voxel_map.storage.slabs_within(*ends):
         inside = _inside(coords, first, beyond)
         add_blocks(
             cropped, voxel_map, coords, np.where(inside, cells, cells.dtype.type(voxel_map.storage.cell_format.unknown))

@@ -165,8 +165,9 @@ class DistanceField:
         """Read the map; return how many cells changed, and which slabs they are in."""
         field, order = self._transform.field, np.array(self._transform.order)
         dirty = np.zeros(len(field.mask), np.uint8)
+        cells = self._map.storage.cells_within(self._low, self._low + self._shape)
         changed = _distance.refresh(
-            self._map.storage.stored_cells, CellRules(self._map.config.map).thresholds, self._wanted, self._low, order,
+            cells, CellRules(self._map.config.map).thresholds, self._wanted, self._low, order,
             self._shape[order], self._seen, field.mask, dirty,
         )  # fmt: skip
         return int(changed), dirty

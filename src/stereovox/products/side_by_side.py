@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from stereovox.errors import StereovoxError
-from stereovox.maps import VoxelMap, _pool, unbounded
+from stereovox.maps import VoxelMap, unbounded
 from stereovox.maps.blocks import CELLS, SIDE, blocks_of_cells
 from stereovox.maps.rolling import RollingStorage
 
@@ -24,13 +24,7 @@ def in_memory(voxel_map: VoxelMap) -> VoxelMap:
 
 def cells_at(voxel_map: VoxelMap, coords: NDArray[np.int32]) -> NDArray[np.integer]:
     """Return the cells (n, 512) as stored of blocks (n, 3) of a map in memory; all unknown where it has no block."""
-    stored, places = voxel_map.storage.stored_cells, np.empty(len(coords), np.int64)
-    _pool.find_all(stored.table, stored.coords, np.ascontiguousarray(coords, np.int32), places)
-    cells = np.full((len(coords), CELLS), stored.unknown, stored.values.dtype)
-    has_row = (places >= 0) & (places < len(stored.values))
-    cells[has_row] = stored.values[places[has_row]]
-    cells[places >= len(stored.values)] = stored.lowest
-    return cells
+    return voxel_map.storage.cells_of(coords)
 
 
 def side_by_side(a: VoxelMap, b: VoxelMap) -> Iterator[Blocks]:

@@ -6,6 +6,8 @@ import signal
 import pytest
 from xdist.scheduler import WorkStealingScheduling
 
+from made_bucket import s3, where  # noqa: F401 - fixtures
+
 
 def pytest_xdist_make_scheduler(config, log):
     """Give each worker neighbouring tests, so that what the tests of a file share is made once and not by each."""

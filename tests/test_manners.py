@@ -46,7 +46,7 @@ def test_objects_say_what_is_in_them():
 USED = {
     "VoxelMap": "add age ages bounds cast_rays cells cells_in centers check_boxes check_capsules close config counts "
     "frames frames_refused free from_cells history kept_frames listeners lock log_odds memory_bytes nearest_obstacle "
-    "occupied path probability recording reserved_bytes save snapshot state storage viewpoint voxel_size",
+    "occupied overview path probability recording reserved_bytes save snapshot state storage viewpoint voxel_size",
     "GridMap": "add bounds cells config counts frames frames_refused free from_occupancy history lock log_odds "
     "memory_bytes occupancy occupied origin probability recording save state storage voxel_size",
 }

@@ -189,7 +189,7 @@ class Folder(Place):
     @contextmanager
     def _unfinished(self, name: str, data: bytes) -> Iterator[tuple[Path, Path]]:
         """Yield a new file on the disk that holds `data`, and the path it is to get; it is removed at the end."""
-        path = self._path(name)
+        path = self.path / _checked(self, name)
         temporary = path.with_name(f"{UNFINISHED}{uuid.uuid4().hex[:12]}")
         with _one_line(path, "written"):
             path.parent.mkdir(parents=True, exist_ok=True)

@@ -14,7 +14,8 @@ import numpy as np
 from stereovox.config import Config, load_config, profile_names
 from stereovox.contents.description import Description, command_line, picture_name, size, thousands
 from stereovox.formats.map_server import read_map_server
-from stereovox.maps import State, load_map
+from stereovox.maps import State, VoxelMap, load_map
+from stereovox.maps.boxed_map import BoxedMap
 from stereovox.maps.store import is_map
 from stereovox.safe_io import FLOOR_READABLE
 from stereovox.trust.health import FULL
@@ -44,6 +45,7 @@ def describe_map(path: str) -> Description | None:
         "refused": dict(voxel_map.history.refused.most_common()),
         "settled": dict(voxel_map.history.settled),
         "ways": dict(voxel_map.history.ways),
+        "boxes": _boxes(voxel_map),
         "kept_frames": None if kept is None else {"frames": len(kept), "bytes": kept.bytes},
         "loops": None if voxel_map.history.loops is None else voxel_map.history.loops.counts(),
         "last_stamps_ns": {sensor: frame.stamp_ns for sensor, frame in voxel_map.history.trusted.items()},
@@ -55,6 +57,16 @@ def describe_map(path: str) -> Description | None:
     }
     commands = [command_line("picture", path, picture_name(path)), command_line("view", path)]
     return Description("map", _lines(result), result, commands)
+
+
+def _boxes(voxel_map: VoxelMap) -> dict[str, Any] | None:
+    """Return how a map in boxes is cut; None for others."""
+    if not isinstance(voxel_map, BoxedMap):
+        return None
+    manifest = voxel_map.manifest
+    stored = sum(entry.bytes for level in (manifest.boxes, *manifest.levels) for entry in level)
+    sides = manifest.layout.metres.tolist()
+    return {"number": len(manifest.boxes), "metres": sides, "bytes": stored, "levels": len(manifest.levels)}
 
 
 def describe_floor(path: str) -> Description | None:
@@ -116,6 +128,11 @@ def _lines(result: dict[str, Any]) -> list[str]:
     loaded = "in memory once loaded" + window
     frames = f"{result['frames']} frames ({result['frames_refused']} refused), " if of_frames else ""
     lines.append(f"{frames}{size(result['memory_bytes'])} {loaded}")
+    if boxes := result["boxes"]:
+        lines.append(
+            f"in {thousands(boxes['number'])} boxes of {max(boxes['metres']):g} m, {boxes['levels']} coarser levels, "
+            f"{size(boxes['bytes'])}: only those that are asked for are read"
+        )
     if kept := result["kept_frames"]:
         lines.append(f"keeps {kept['frames']} of its frames, {size(kept['bytes'])}: poses can be corrected (remap)")
     if loops := result["loops"]:

@@ -13,14 +13,14 @@ from stereovox.config import load_config
 from stereovox.errors import MapFileError, StereovoxError
 from stereovox.maps import queries
 from stereovox.maps.blocks import SIDE
-from stereovox.maps.boxed import CACHE_BYTES, BoxedStorage, Wanted, any_box
-from stereovox.maps.boxed_store import (
+from stereovox.maps.boxed_manifest import (
     BoxedManifest,
     bounds_of,
     only_writer_at,
     sweep_boxes,
     write_boxed_manifest,
 )
+from stereovox.maps.boxed_storage import CACHE_BYTES, BoxedStorage, Wanted, any_box
 from stereovox.maps.boxes import BOXES, MAX_SIDE, BoxLayout, read_box, write_box
 from stereovox.maps.cell_format import State
 from stereovox.maps.lock import LOCK
@@ -53,6 +53,11 @@ class BoxedMap(VoxelMap):
     def manifest(self) -> BoxedManifest:
         """Which boxes there are, and the levels of the pyramid."""
         return self.storage.manifest
+
+    @property
+    def memory_bytes(self) -> int:
+        """Bytes that the whole map would take in memory, about; the cache takes no more than its size."""
+        return self.storage.bytes_of_all
 
     def counts(self) -> dict[str, int]:
         """Return the number of cells in each known state: `free`, `tentative`, `occupied`."""
@@ -185,9 +190,8 @@ class BoxedMap(VoxelMap):
         cell = np.array(self.config.cell)
         first, last = np.floor(low / cell) - 1, np.floor(high / cell) + 1
         ends = -queries.INDEX_LIMIT, queries.INDEX_LIMIT
-        return self.storage.parts(
-            *(np.clip(cells, *ends).astype(np.int64) for cells in (first, last)), _holding(states)
-        )
+        first, last = (np.clip(cells, *ends).astype(np.int64) for cells in (first, last))
+        return self.storage.parts(first, last, _holding(states))
 
     def _exits(self, starts: NDArray[np.float64], units: NDArray[np.float64], through: bool) -> NDArray[np.float64]:
         """Return how far along (N,) rays can meet a known cell, and if not `through` unknown ones the next after it.

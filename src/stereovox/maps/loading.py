@@ -5,9 +5,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from stereovox.maps.boxed import CACHE_BYTES
+from stereovox.maps.boxed_manifest import read_boxed_manifest
 from stereovox.maps.boxed_map import BoxedMap
-from stereovox.maps.boxed_store import read_boxed_manifest
+from stereovox.maps.boxed_storage import CACHE_BYTES
 from stereovox.maps.store import is_boxed, read_map
 from stereovox.maps.voxel_map import VoxelMap
 from stereovox.places import Place, is_url

@@ -261,7 +261,7 @@ def _ascend(coords: NDArray[np.int32]) -> bool:
 
 
 def is_boxed(path: str | Path) -> bool:
-    """Tell whether a folder holds a map in boxes (`boxed_store`), by the beginning of its manifest."""
+    """Tell whether a folder holds a map in boxes (`boxed_manifest`), by the beginning of its manifest."""
     try:
         with (Path(path) / MANIFEST).open("rb") as file:
             return BOXED in file.read(100)
@@ -270,9 +270,9 @@ def is_boxed(path: str | Path) -> bool:
 
 
 def is_map(path: str | Path) -> bool:
-    """Tell whether a folder, or a URL in an object store, holds a saved map. Raises MapFileError for a store out of reach.
+    """Tell whether a folder, or a URL in an object store, where they are in boxes, holds a saved map.
 
-    In stores they are in boxes.
+    Raises MapFileError for a store out of reach.
     """
     if is_url(path):
         return MANIFEST in Place.of(path).sizes(MANIFEST)

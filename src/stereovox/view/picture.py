@@ -43,6 +43,7 @@ def picture(
 
 def draw(voxel_map: VoxelMap, *, heading: str, trajectory: ArrayLike | None = None, up: str = "z") -> Any:
     """Return the matplotlib figure that `picture` saves."""
+    voxel_map = voxel_map.overview()
     drawn = upright(voxel_map, camera_path(voxel_map) if trajectory is None else trajectory, up)
     if not len(drawn.cells):
         figure = _note("This map is empty: no cell is known yet.")

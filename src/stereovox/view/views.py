@@ -31,7 +31,7 @@ def draw_view(
     the camera's. axis: log-odds along the optical axis. space: cells and field of view in space. viewpoint: by default
     the map's last. Raises StereovoxError for an unknown view, or where the view needs a camera that is not known.
     """
-    up = checked_up(up)
+    up, voxel_map = checked_up(up), voxel_map.overview()
     if view == "overview":
         return draw(voxel_map, heading=heading, up=up)
     if view == "layer":

@@ -200,7 +200,7 @@ def open_viewer(
     """
     if most_cells < 1:
         raise StereovoxError(f"{most_cells} cells at once: give a number above 0, 250000 for most browsers")
-    up = checked_up(up or voxel_map.config.up)
+    up, voxel_map = checked_up(up or voxel_map.config.up), voxel_map.overview()
     address = find_address(host, port)
     token = checked_token(token) if token is not None else None if address.is_private else new_token()
     server = serve(name.encode("utf-8", "replace").decode(), address, Guard(host, token))

@@ -18,7 +18,7 @@ from stereovox.errors import StereovoxError
 from stereovox.frame import Viewpoint
 from stereovox.maps import queries
 from stereovox.maps.blocks import CELLS, SIDE, StoredCells
-from stereovox.maps.boxed_store import BoxedManifest
+from stereovox.maps.boxed_manifest import BoxedManifest
 from stereovox.maps.boxes import BoxBlocks, BoxEntry, Index, read_box
 from stereovox.maps.cell_pool import PIECE, CellPool
 from stereovox.maps.cell_times import LAST, NEVER, UNIT_NS, CellTimes
@@ -103,6 +103,11 @@ class BoxedStorage(Storage):
         yield np.concatenate(waiting)
 
     @property
+    def bytes_of_all(self) -> int:
+        """Bytes that all boxes would take in memory."""
+        return self._cost(self._entries)
+
+    @property
     def cells_here(self) -> StoredCells:
         """The cells of the boxes that are in the cache, for kernels; other cells are unknown there."""
         return self._pool.stored_cells
@@ -148,7 +153,7 @@ class BoxedStorage(Storage):
         low, high = np.asarray(low), np.asarray(high)
         side = self.manifest.layout.side // SIDE
         for box in sorted(self._within(low // side, (high - 1) // side)):
-            coords, cells, *_ = self.read(box)
+            coords, cells, *_ = self._read(box)
             inside = ((coords >= low) & (coords < high)).all(axis=1)
             yield coords[inside], cells[inside]
 
@@ -167,11 +172,6 @@ class BoxedStorage(Storage):
     def in_memory(self) -> Iterator[Blocks]:
         """Yield all blocks, as `slabs` does."""
         yield from self.slabs()
-
-    def read(self, box: Index) -> BoxBlocks:
-        """Return the blocks of one box from its files, without keeping them."""
-        entry = self._entries[box]
-        return self._as_mine(entry, read_box(self.place, self.manifest.layout, entry))
 
     def check_can_grow(self) -> None:
         """Raise StereovoxError: nothing is added to a map in boxes."""
@@ -243,7 +243,7 @@ class BoxedStorage(Storage):
         with ThreadPoolExecutor(AT_ONCE) as pool:
             for start in range(0, len(missing), AT_ONCE):  # so that few wait to be put into the cache
                 some = missing[start : start + AT_ONCE]
-                for box, blocks in zip(some, pool.map(self.read, some), strict=True):
+                for box, blocks in zip(some, pool.map(self._read, some), strict=True):
                     self._put(box, blocks)
 
     def _make_room(self, most: int) -> None:
@@ -261,6 +261,11 @@ class BoxedStorage(Storage):
         self._pool.put(blocks.coords, blocks.cells)
         if self._times is not None and blocks.times is not None:
             self._times.put(blocks.coords, blocks.times)
+
+    def _read(self, box: Index) -> BoxBlocks:
+        """Return the blocks of one box from its files, without keeping them; several threads may."""
+        entry = self._entries[box]
+        return self._as_mine(entry, read_box(self.place, self.manifest.layout, entry))
 
     def _as_mine(self, entry: BoxEntry, blocks: BoxBlocks) -> BoxBlocks:
         """Return the blocks of a box with numbers that cells can have, and times that count as those of this map."""
@@ -287,7 +292,7 @@ class BoxedStorage(Storage):
 
     def _pieces(self) -> Iterator[tuple[NDArray[np.int32], NDArray[np.integer], NDArray[np.uint32] | None]]:
         for box in sorted(self._entries):
-            coords, cells, times, _ = self.read(box)
+            coords, cells, times, _ = self._read(box)
             for start in range(0, len(coords), PIECE):
                 part = slice(start, start + PIECE)
                 yield coords[part], cells[part], None if times is None else times[part]

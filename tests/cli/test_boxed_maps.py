@@ -1,0 +1,63 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Commands say of maps in boxes, in folders and in object stores, what they say of a map in one piece."""
+
+import json
+import warnings
+
+import pytest
+
+import stereovox as sv
+from stereovox.cli import main
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """Return the folder of a map in one piece."""
+    folder = tmp_path_factory.mktemp("map") / "whole.svox"
+    mapper = sv.Mapper(voxel_size=0.1)
+    for frame in sv.open_source("sim:apartment?image_width=80", frames="::24"):
+        mapper.add(frame)
+    mapper.save(folder)
+    return folder
+
+
+@pytest.fixture
+def big(whole, where):
+    sv.save_boxed(sv.load_map(whole), where, 3.2)
+    return where
+
+
+def said(capsys, *words):
+    """Return what a command prints for programs."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert main([*map(str, words), "--json"]) == 0, capsys.readouterr().err
+    return json.loads(capsys.readouterr().out.splitlines()[-1])
+
+
+BOX = "--box=0.5,0.5,0,3,2.5,1.5"
+
+
+def test_commands_on_a_map_in_boxes(whole, big, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    counts = ("free_cells", "occupied_cells", "tentative_cells", "frames")
+    ours, theirs = (said(capsys, "info", one) for one in (big, whole))
+    assert [ours.get(name) for name in counts] == [theirs.get(name) for name in counts]
+    for name, one in (("a", big), ("b", whole)):
+        said(capsys, "crop", one, f"{name}.svox", BOX)
+        said(capsys, "export", one, f"{name}.ply")
+        said(capsys, "picture", one, f"{name}.png")
+        said(capsys, "coarsen", one, f"{name}-coarse.svox", "--factor", 2)
+        said(capsys, "distance", one, f"{name}.npz", BOX)
+    assert all((tmp_path / f"{name}.png").stat().st_size > 5000 for name in "ab")
+    assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
+    for a, b in (("a.svox", "b.svox"), ("a-coarse.svox", "b-coarse.svox"), (big, whole)):
+        changes = said(capsys, "diff", a, b)
+        assert changes["appeared"] == changes["vanished"] == changes["became_known"] == changes["became_unknown"] == 0
+    assert said(capsys, "eval", big, whole)["decisions"]["surface_occupied"] == 1.0
+
+
+def test_a_map_in_boxes_is_not_gone_on_with(big, tmp_path, capsys):
+    assert main(["map", "sim:room", "--frames", ":2", "--out", big, "--resume"]) == 2
+    error = capsys.readouterr().err.strip().splitlines()
+    assert len([line for line in error if line.startswith("stereovox:")]) == 1

@@ -23,6 +23,10 @@ if TYPE_CHECKING:
     from stereovox.errors import StereovoxError as StereovoxError
     from stereovox.evaluate.trajectory_score import TrajectoryScore as TrajectoryScore
     from stereovox.evaluate.trajectory_score import score_trajectory as score_trajectory
+    from stereovox.fleet import FleetMap as FleetMap
+    from stereovox.fleet import FleetPlan as FleetPlan
+    from stereovox.fleet import map_fleet as map_fleet
+    from stereovox.fleet import plan_fleet as plan_fleet
     from stereovox.floor_run import FloorRun as FloorRun
     from stereovox.floor_run import map_floor as map_floor
     from stereovox.formats import export as export
@@ -134,6 +138,10 @@ _HOMES = {
     "MapResult": "run",
     "MapRun": "run",
     "map_recording": "run",
+    "FleetMap": "fleet",
+    "FleetPlan": "fleet",
+    "map_fleet": "fleet",
+    "plan_fleet": "fleet",
     "open_images": "opening",
     "open_source": "opening",
     "ImuReadings": "sources.imu",

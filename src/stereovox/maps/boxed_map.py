@@ -242,7 +242,7 @@ def save_boxed(voxel_map: VoxelMap, where: str | Path | Place, box_m: float | No
     config = load_config(
         voxel_map.config, map=voxel_map.config.map.model_copy(update={"keep_frames": False}).model_dump()
     )
-    layout = BoxLayout(config, _side_of(box_m, config.cell))
+    layout = BoxLayout(config, side_of(box_m, config.cell))
     check_boxed_target(place)
     source = unbounded(voxel_map) if voxel_map.storage.tile_store is not None else voxel_map
     storage = source.storage
@@ -261,14 +261,17 @@ def save_boxed(voxel_map: VoxelMap, where: str | Path | Place, box_m: float | No
     return BoxedMap(place, manifest)
 
 
-def check_boxed_target(place: Place) -> None:
-    """Raise MapFileError where a place holds anything but a map in boxes, or what a killed writer left of one."""
-    other = next((name for name in place.names() if not name.startswith(OURS)), None)
+def check_boxed_target(place: Place, ours: tuple[str, ...] = ()) -> None:
+    """Raise MapFileError where a place holds anything but a map in boxes, or what a killed writer left of one.
+
+    ours: beginnings of the names of other files that belong to it.
+    """
+    other = next((name for name in place.names() if not name.startswith((*OURS, *ours))), None)
     if other is not None:
         raise MapFileError(f"{place}: holds {other}, which is not of a map in boxes; choose another name or remove it")
 
 
-def _side_of(box_m: float | None, cell: tuple[float, float, float]) -> int:
+def side_of(box_m: float | None, cell: tuple[float, float, float]) -> int:
     """Return the side of a box in cells; raises StereovoxError for none and for one that is too large."""
     if box_m is None:
         return USUAL_SIDE

@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Map many recordings into one map in boxes, on all cores of this machine or on a Dask cluster.
+
+RECORDING is what `map` takes, a pattern ('drives/*'), a list (@drives.txt: a recording in each line, and the file of
+its corrected poses if there is one) or an s3:// prefix. The map does not depend on workers or boxes. What is done
+stays: --resume does what is missing, and what other recordings or poses change.
+"""
+
+from __future__ import annotations
+
+from argparse import ArgumentParser, Namespace
+from typing import TYPE_CHECKING, Any
+
+from stereovox.cli.options import add_settings, overrides
+from stereovox.cli.terminal import (
+    cells_line,
+    command_line,
+    progress_of_steps,
+    say,
+    say_about_compiling,
+    size,
+    thousands,
+)
+
+if TYPE_CHECKING:
+    from stereovox.fleet import FleetMap, FleetPlan
+
+EXAMPLE = "stereovox fleet recordings/monday recordings/tuesday --out town.svox"
+SHOWN = 5
+"""Recordings with refused frames that are listed."""
+
+
+def add_arguments(parser: ArgumentParser) -> None:
+    """Declare the options."""
+    parser.add_argument(
+        "recordings", metavar="RECORDING", nargs="+", help="recordings, patterns, @lists, s3:// prefixes"
+    )
+    parser.add_argument("--out", metavar="MAP", required=True, help="folder or s3://bucket/NAME.svox of the map")
+    parser.add_argument("--profile", metavar="P", help="profile name or TOML file (default: as before, or default)")
+    parser.add_argument("--voxel-size", type=float, metavar="M", help="cell size in metres")
+    parser.add_argument("--max-range", type=float, metavar="M", help="largest depth in metres that is used")
+    parser.add_argument("--box", type=float, metavar="M", help="side of a box in metres (256 cells)")
+    parser.add_argument("--workers", type=int, metavar="N", help="processes on this machine (one for each core)")
+    parser.add_argument("--scheduler", metavar="URL", help="Dask scheduler (tcp://host:8786) in place of these")
+    parser.add_argument("--resume", action="store_true", help="go on with the map at --out, for these recordings")
+    parser.add_argument("--plan", action="store_true", help="say what it will cost, and do nothing")
+    add_settings(parser, "sensor.model=andert")
+
+
+def run(arguments: Namespace) -> dict[str, Any]:
+    """Map the recordings and print what each gave."""
+    from stereovox.fleet import map_fleet, plan_fleet
+
+    settings = {"profile": arguments.profile, "box_m": arguments.box, **overrides(arguments)}
+    say_about_compiling()
+    if arguments.plan:
+        with progress_of_steps("looking at recordings") as progress:
+            plan = plan_fleet(arguments.recordings, progress=progress, **settings)
+        _say_plan(plan)
+        return plan.summary()
+    with progress_of_steps("recordings") as progress:
+        made = map_fleet(
+            arguments.recordings, arguments.out, resume=arguments.resume, workers=arguments.workers,
+            scheduler=arguments.scheduler, progress=progress, notify=say, **settings,
+        )  # fmt: skip
+    _say_map(made)
+    return {**made.summary(), **made.map.counts(), "out": made.out}
+
+
+def _say_plan(plan: FleetPlan) -> None:
+    say(f"{thousands(plan.frames)} frames of {plan.recordings} recordings")
+    say(f"at least {plan.boxes} boxes of {plan.box_m:g} m; a frame is in {plan.overlap:.1f} of them")
+    say(f"{size(plan.bytes)} of depth images to keep; {plan.core_hours:.2g} hours of a core like one of this machine")
+    for line in plan.unreadable:
+        say(f"cannot be read: {line}")
+
+
+def _say_map(made: FleetMap) -> None:
+    boxes, mapped = made.boxes
+    for one in made.recordings:
+        if one.error:
+            say(f"left out: {one.recording}: {one.error}")
+    refused = [one for one in made.recordings if one.refused]
+    for one in refused[:SHOWN]:
+        why = ", ".join(f"{number} x {reason}" for reason, number in one.refused.items())
+        say(f"{one.recording}: {thousands(one.frames)} frames, refused: {why}")
+    if len(refused) > SHOWN:
+        say(f"and {len(refused) - SHOWN} recordings more with refused frames (--json)")
+    frames = thousands(made.map.frames)
+    say(f"{frames} frames, each in {made.overlap:.1f} of {boxes} boxes, {mapped} of which were mapped now")
+    say(cells_line({**made.map.counts(), "memory_bytes": made.map.memory_bytes}))
+    say(f"saved in {made.out}; look at it with: {command_line('view', made.out)}")

@@ -1,0 +1,13 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Many recordings, one map, many machines: Dask runs the tasks, a folder or an object store holds what they make.
+
+Space is divided, not time: what a cell holds depends on the frames that see it, in their order, and on nothing else.
+First each recording is mapped alone, which says which of its frames can be trusted; then each box of the world is
+mapped from all trusted frames that see it.
+"""
+
+from stereovox.fleet.fleet import FleetMap, map_fleet
+from stereovox.fleet.plan import FleetPlan, plan_fleet
+from stereovox.fleet.recordings import Recording, RecordingReport, recordings_of
+
+__all__ = ["FleetMap", "FleetPlan", "Recording", "RecordingReport", "map_fleet", "plan_fleet", "recordings_of"]

@@ -1,0 +1,139 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The boxes of a fleet's map: which frames each is made of, and the task that maps one."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from time import perf_counter
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.deadline import Levels
+from stereovox.fleet.recordings import digest, frames_of
+from stereovox.maps import VoxelMap
+from stereovox.maps.blocks import CELLS
+from stereovox.maps.boxes import BoxEntry, BoxLayout, Index, write_box
+from stereovox.maps.evidence import Evidence
+from stereovox.places import Place
+from stereovox.safe_io import json_value
+
+DONE = "done"
+"""Folder of the entries of boxes that no manifest names yet, by what they are made of."""
+MAX_DONE = 1 << 20
+"""Bytes of one."""
+
+
+class Piece(NamedTuple):
+    """Frames of one recording that see a box: its key, their numbers in it, and how many frames come before it."""
+
+    recording: str
+    numbers: tuple[int, ...]
+    before: int
+
+
+class Box(NamedTuple):
+    """A box to be mapped: its index, pieces in the order of their frames, and from when times of cells count."""
+
+    at: Index
+    pieces: tuple[Piece, ...]
+    start_ns: int | None
+
+    @property
+    def frames(self) -> int:
+        """Number of frames that see it."""
+        return sum(len(piece.numbers) for piece in self.pieces)
+
+    def inputs(self, layout: BoxLayout) -> str:
+        """Return a name made of all that the cells depend on; the keys of recordings hold the settings."""
+        cells = layout.config.map
+        rounded = cells.cell != "int16"  # by the number of the frame, see `Storage`
+        pieces = [(piece.recording, piece.numbers, piece.before if rounded else 0) for piece in self.pieces]
+        return digest([self.at, layout.side, pieces, self.start_ns if cells.keep_times else None])
+
+
+class DoneBox(NamedTuple):
+    """A box that is mapped: its entry, None where no cell of it is known, and the seconds it took."""
+
+    entry: BoxEntry | None
+    seconds: float
+
+
+def boxes_of(layout: BoxLayout, recordings: Sequence[tuple[str, NDArray[np.int32]]], start_ns: int | None) -> list[Box]:
+    """Return the boxes that frames see.
+
+    recordings: key of each and the blocks (n, 2, 3) that its frames see, as `bounds_of_frames` returns them.
+    """
+    found: dict[Index, list[Piece]] = {}
+    before = 0
+    for key, bounds in recordings:
+        for index, numbers in _seen(layout, bounds).items():
+            found.setdefault(index, []).append(Piece(key, numbers, before))
+        before += len(bounds)
+    return [Box(index, tuple(pieces), start_ns) for index, pieces in sorted(found.items())]
+
+
+def map_box(place: Place, layout: BoxLayout, box: Box) -> DoneBox:
+    """Map one box, write it, and then the entry that says so; a task of a worker.
+
+    Raises MapFileError where a frame is damaged or the place cannot be written.
+    """
+    started, (low, high) = perf_counter(), layout.blocks_of(box.at)
+    storage, levels = VoxelMap(layout.config).storage, Levels(layout.config)
+    if layout.config.map.keep_times:
+        nothing = np.empty((0, 3), np.int32), np.empty((0, CELLS), np.uint32)
+        storage.set_times(*nothing, box.start_ns)
+    for piece in box.pieces:
+        with frames_of(place, piece.recording, piece.numbers) as frames:
+            for frame in frames:
+                level = levels(frame.quality)
+                image = level.prepare(frame.frame()).image
+                storage.history.frames = piece.before + frame.number
+                storage.look_from(image.viewpoint)
+                storage.add(_within(level.integrator.evidence(image), low, high))
+    done = DoneBox(write_box(place, layout, box.at, storage), perf_counter() - started)
+    place.write(f"{DONE}/{box.inputs(layout)}.json", json.dumps(saved(done)).encode())
+    return done
+
+
+def done_before(place: Place, layout: BoxLayout, inputs: str) -> DoneBox | None:
+    """Return a box that a run before has mapped from the same frames, None where there is none."""
+    data = place.find(f"{DONE}/{inputs}.json", MAX_DONE)
+    try:
+        return None if data is None else loaded(json_value(data), layout)
+    except (KeyError, TypeError, ValueError):
+        return None  # it is mapped again
+
+
+def saved(done: DoneBox) -> list[object]:
+    """Return a box as plain values for JSON, which `loaded` reads."""
+    return [None if done.entry is None else done.entry.saved(), done.seconds]
+
+
+def loaded(values: list[object], layout: BoxLayout) -> DoneBox:
+    """Return a saved box. Raises KeyError, TypeError or ValueError for what cannot have been saved."""
+    entry, seconds = values
+    return DoneBox(None if entry is None else BoxEntry.loaded(entry, layout), float(seconds))  # pyright: ignore[reportArgumentType]
+
+
+def _seen(layout: BoxLayout, bounds: NDArray[np.int32]) -> dict[Index, tuple[int, ...]]:
+    """Return the boxes that frames see, and which frames each."""
+    sees = np.flatnonzero((bounds[:, 1] > bounds[:, 0]).all(axis=1))
+    first, last = layout.indices_of(bounds[sees, 0]), layout.indices_of(bounds[sees, 1] - 1)
+    found: dict[Index, list[int]] = {}
+    for number, low, high in zip(sees.tolist(), first.tolist(), last.tolist(), strict=True):
+        for i in range(low[0], high[0] + 1):
+            for j in range(low[1], high[1] + 1):
+                for k in range(low[2], high[2] + 1):
+                    found.setdefault((i, j, k), []).append(number)
+    return {index: tuple(numbers) for index, numbers in found.items()}
+
+
+def _within(evidence: Evidence, low: NDArray[np.int64], high: NDArray[np.int64]) -> Evidence:
+    """Return the evidence on blocks from `low` (3,) to below `high`."""
+    mixed, free = (((coords >= low) & (coords < high)).all(axis=1) for coords in (evidence.coords, evidence.uniform))
+    return Evidence(
+        evidence.coords[mixed], evidence.values[mixed], evidence.uniform[free], evidence.uniform_values[free]
+    )

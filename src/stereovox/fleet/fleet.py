@@ -1,0 +1,393 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The whole of a fleet's run: index the recordings, map the boxes, coarsen them, and write the manifest last."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import reduce
+from os import cpu_count
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+from stereovox.config import Config, load_config
+from stereovox.errors import ConfigError, MapFileError, MissingExtra, StereovoxError
+from stereovox.fleet.boxes import DONE, Box, DoneBox, boxes_of, done_before, loaded, map_box, saved
+from stereovox.fleet.recordings import (
+    RECORDINGS,
+    Recording,
+    RecordingReport,
+    bounds_of_frames,
+    frames_of,
+    index_recording,
+    manifest_of,
+    recordings_of,
+    report_of,
+)
+from stereovox.maps.boxed_manifest import (
+    BoxedManifest,
+    only_writer_at,
+    read_boxed_manifest,
+    sweep_boxes,
+    write_boxed_manifest,
+)
+from stereovox.maps.boxed_map import BoxedMap, check_boxed_target, side_of
+from stereovox.maps.boxes import BoxEntry, BoxLayout
+from stereovox.maps.pyramid import coarser_layout, families, is_top, write_parent
+from stereovox.maps.store import MANIFEST, viewpoint_from
+from stereovox.opening import open_source
+from stereovox.places import Place
+from stereovox.products.merge import together
+from stereovox.run import SURVEYED
+from stereovox.safe_io import json_value
+from stereovox.survey import survey
+from stereovox.trust.history import History
+
+SETTINGS = "fleet.json"
+"""The settings that a place's recordings are mapped with, written before anything else."""
+MAX_SETTINGS = 1 << 20
+LOST_WORKERS = 20
+"""Workers that may be lost with the same task before it is given up."""
+RETRIES = 2
+"""Times that a task that fails is tried again, on another worker if there is one."""
+PATIENCE_S = 10
+"""How long a scheduler may take to answer."""
+Progress = Callable[[int, int, str], object]
+"""Called with steps done, steps in all, and the current activity."""
+ONE_MACHINE = {"window.size": None, "max_memory": None, "deadline_ms": None, "map.forget_s": None}
+"""Settings under which a box can be mapped alone: others make a cell depend on more than the frames that see it."""
+
+
+@dataclass(frozen=True, eq=False)
+class FleetMap:
+    """Result of `map_fleet`.
+
+    Attributes:
+        map: The map, opened without being loaded.
+        out: Where it is.
+        recordings: What each recording gave.
+        boxes: Number of boxes, and how many of them were mapped by this run.
+        frames_read: How often a frame was mapped into a box, in all boxes.
+        seconds: Time of this run, and what its tasks took, all workers together.
+    """
+
+    map: BoxedMap
+    out: str
+    recordings: Sequence[RecordingReport]
+    boxes: tuple[int, int]
+    frames_read: int
+    seconds: tuple[float, float]
+
+    @property
+    def overlap(self) -> float:
+        """In how many boxes a trusted frame is, on the average."""
+        return self.frames_read / max(self.map.frames, 1)
+
+    def summary(self) -> dict[str, Any]:
+        """Return the numbers of `stereovox fleet --json`, besides those of the map."""
+        broken = [f"{one.recording}: {one.error}" for one in self.recordings if one.error]
+        return {
+            "recordings": [one.summary() for one in self.recordings],
+            "boxes": self.boxes[0],
+            "boxes_mapped": self.boxes[1],
+            "frames_read": self.frames_read,
+            "overlap": round(self.overlap, 3),
+            "seconds": round(self.seconds[0], 1),
+            "seconds_of_workers": round(self.seconds[1], 1),
+            **({"doubts": broken} if broken else {}),
+        }
+
+
+def map_fleet(
+    recordings: Iterable[str | Path | Recording],
+    out: str | Path,
+    *,
+    profile: str | Path | Config | None = None,
+    box_m: float | None = None,
+    resume: bool = False,
+    workers: int | None = None,
+    scheduler: str | None = None,
+    progress: Progress = lambda done, total, doing: None,
+    notify: Callable[[str], None] = lambda line: None,
+    **overrides: Any,
+) -> FleetMap:
+    """Map many recordings into one map in boxes, on all cores of this machine or on a Dask cluster.
+
+    Each recording is mapped alone first, by a mapper of its own, which decides which of its frames can be trusted. Then
+    each box of the world is mapped from all trusted frames that see it, in the order of the recordings. So the map does
+    not depend on the number of workers, the boxes or their order: of one recording it is that of `map_recording` with
+    the same settings, of several that of one mapper that gets the trusted frames one recording after the other.
+
+    What is done stays: after a kill, a full disk or a lost scheduler the same call with `resume` does what is missing.
+    With other recordings, or other poses of some, it does what these change.
+
+    Args:
+        recordings: See `recordings_of`. All workers must reach them under these names.
+        out: Folder or URL (`s3://bucket/city.svox`) of the map, which all workers must reach.
+        profile: Profile name, TOML file or `Config`; None: with `resume` as before, else what the first recording
+            suggests.
+        box_m: Side of a box in metres; None: as before, else 256 cells.
+        resume: Go on with a map that is there: it becomes the map of these recordings.
+        workers: Processes of a cluster of this machine; None: one for each core.
+        scheduler: Address of a Dask scheduler (`tcp://host:8786`) in place of that.
+        progress: Called with steps done, steps in all, and the current activity.
+        notify: Called with each line that a user should see.
+        **overrides: Settings by name, as for `Mapper`.
+
+    Returns:
+        The map, and what each recording gave; one that cannot be read is told there and left out.
+
+    Raises:
+        StereovoxError: One line: not one frame could be used, a setting cannot be had in boxes, or the cluster failed.
+        MapFileError: Something else is at `out`, another run writes it, or it cannot be written.
+        MissingExtra: Dask or obstore is not installed.
+    """
+    started, listed, place = perf_counter(), recordings_of(recordings), Place.of(out)
+    check_boxed_target(place, (SETTINGS, f"{RECORDINGS}/", f"{DONE}/"))
+    with only_writer_at(place):
+        layout = _layout(place, listed, profile, box_m, resume, notify, overrides)
+        with _cluster(scheduler, workers) as run:
+            reports = _indexed(run, place, listed, layout.config, progress)
+            used = [one for one in listed if not reports[one].error]
+            if not used:
+                first = reports[listed[0]]
+                raise StereovoxError(f"not one recording could be used, no map is written ({first.error})")
+            boxes, before = _boxes(place, layout, used), _done(place, layout)
+            done = _mapped(run, place, layout, boxes, before, progress)
+            entries = [box.entry for box in done.values() if box.entry is not None]
+            levels = _levels(run, place, layout, entries, progress)
+        inputs = {inputs: saved(box) for inputs, box in done.items()}
+        manifest = _manifest(place, layout, used, entries, levels, inputs)
+        write_boxed_manifest(place, manifest)
+        _sweep(place, manifest, {one.key(layout.config) for one in used})
+    made = [box for inputs, box in done.items() if inputs not in before]
+    return FleetMap(
+        BoxedMap(place, manifest), str(out), [reports[one] for one in listed], (len(boxes), len(made)),
+        sum(box.frames for box in boxes),
+        (perf_counter() - started, sum(one.seconds for one in (*made, *reports.values()))),
+    )  # fmt: skip
+
+
+def settings_for(
+    recordings: Sequence[Recording], profile: str | Path | Config | None, overrides: Mapping[str, Any]
+) -> tuple[Config, list[str]]:
+    """Return the settings of a fleet, what the first recording suggests where no profile is given, and lines about it.
+
+    Raises ConfigError for settings under which boxes cannot be mapped one by one.
+    """
+    chosen, lines = dict[str, Any](), list[str]()
+    if profile is None:
+        for one in recordings:
+            try:
+                chosen, lines = survey(open_source(one.where), SURVEYED).settings(overrides)
+                break
+            except StereovoxError:
+                continue  # the next one may do; what is wrong with this one is told later
+    config = load_config("default" if profile is None else profile, **{**overrides, **chosen})
+    flat = {"window.size": config.window.size, "max_memory": config.max_memory}
+    flat |= {"deadline_ms": config.deadline_ms, "map.forget_s": config.map.forget_s}
+    for name, value in flat.items():
+        if value != ONE_MACHINE[name]:
+            raise ConfigError(f"{name} {value}: cells would depend on more than the frames that see them; leave it out")
+    if config.dimensions != 3 or config.device != "cpu" or config.map.frames_budget is not None:
+        raise ConfigError("a fleet maps in space, on processors, and keeps all frames; choose a profile that does")
+    return load_config(config, **{"map.keep_frames": False}), lines
+
+
+def _layout(
+    place: Place,
+    listed: Sequence[Recording],
+    profile: str | Path | Config | None,
+    box_m: float | None,
+    resume: bool,
+    notify: Callable[[str], None],
+    overrides: Mapping[str, Any],
+) -> BoxLayout:
+    """Return settings and boxes, those of a run before where one is gone on with."""
+    known = place.find(SETTINGS, MAX_SETTINGS)
+    if not resume and (known is not None or place.find(MANIFEST) is not None):
+        raise MapFileError(f"{place}: there is a map already; go on with it with --resume, or choose another name")
+    if known is not None and profile is None and not overrides and box_m is None:
+        try:
+            values = json_value(known)
+            return BoxLayout(load_config(values["config"]), values["side"])
+        except (KeyError, TypeError, ValueError) as error:
+            raise MapFileError(f"{place}/{SETTINGS}: is damaged ({error}); give the settings again") from None
+    config, lines = settings_for(listed, profile, overrides)
+    for line in lines:
+        notify(f"note: {line}")
+    layout = BoxLayout(config, side_of(box_m, config.cell))
+    place.write(SETTINGS, json.dumps({"config": config.model_dump(mode="json"), "side": layout.side}).encode())
+    return layout
+
+
+class _Run:
+    """Runs tasks on a Dask cluster."""
+
+    def __init__(self, client: Any):
+        self._client = client
+
+    def results(
+        self,
+        function: Callable[..., Any],
+        tasks: Mapping[str, tuple[Any, ...]],
+        priority: Mapping[str, int] | None = None,
+    ) -> Iterator[tuple[str, Any]]:
+        """Yield name and result of tasks as they end, those of high priority begun first. A failure cancels the others.
+
+        Raises StereovoxError where a task fails, or cannot be done since its workers die or the scheduler is gone.
+        """
+        from distributed import KilledWorker, as_completed
+
+        submitted = {
+            self._client.submit(
+                function, *given, key=f"{function.__name__}-{name}", pure=True, retries=RETRIES,
+                priority=(priority or {}).get(name, 0),
+            ): name
+            for name, given in tasks.items()
+        }  # fmt: skip
+        try:
+            for future in as_completed(list(submitted)):
+                yield submitted[future], future.result()
+        except KilledWorker as error:
+            raise StereovoxError(
+                f"the workers that had '{error.task}' died {LOST_WORKERS} times (too little memory?); what is done "
+                "stays, go on with --resume"
+            ) from None
+        except (OSError, TimeoutError) as error:
+            raise StereovoxError(f"the cluster is lost ({error}); what is done stays, go on with --resume") from None
+        except Exception as error:
+            if type(error).__name__ not in ("CancelledError", "FutureCancelledError", "CommClosedError"):
+                raise
+            raise StereovoxError("the scheduler is lost; what is done stays, go on with --resume") from None
+        finally:
+            self._client.cancel(list(submitted), force=True)
+
+
+@contextmanager
+def _cluster(scheduler: str | None, workers: int | None) -> Iterator[_Run]:
+    """Yield what runs tasks: on the cluster of a scheduler, or on processes of this machine that end with it."""
+    try:
+        import dask.config
+        from distributed import Client, LocalCluster
+    except ImportError:
+        raise MissingExtra("dask[distributed]", "fleet") from None
+    with dask.config.set({"distributed.scheduler.allowed-failures": LOST_WORKERS}):
+        if scheduler is not None:
+            try:
+                client = Client(scheduler, timeout=PATIENCE_S)
+            except (OSError, ValueError, TimeoutError) as error:
+                raise StereovoxError(f"{scheduler}: no Dask scheduler answers ({error}); check the address") from None
+            with client:
+                yield _Run(client)
+            return
+        number = workers or cpu_count() or 1
+        with (
+            LocalCluster(
+                n_workers=number, threads_per_worker=1, processes=True, memory_limit=0, silence_logs=50,
+                dashboard_address="127.0.0.1:0",
+            ) as cluster,
+            Client(cluster) as client,
+        ):  # fmt: skip
+            yield _Run(client)
+
+
+def _indexed(
+    run: _Run, place: Place, listed: Sequence[Recording], config: Config, progress: Progress
+) -> dict[Recording, RecordingReport]:
+    """Return what each recording gave; those that were not mapped alone before are."""
+    keys = {one.key(config): one for one in listed}
+    reports = {one: report for key, one in keys.items() if (report := report_of(place, key)) is not None}
+    tasks = {key: (place, one, config) for key, one in keys.items() if one not in reports}
+    progress(len(reports), len(listed), "recordings")
+    for key, report in run.results(index_recording, tasks):
+        reports[keys[key]] = report
+        progress(len(reports), len(listed), "recordings")
+    return reports
+
+
+def _boxes(place: Place, layout: BoxLayout, used: Sequence[Recording]) -> list[Box]:
+    keys = [one.key(layout.config) for one in used]
+    start_ns = None
+    if layout.config.map.keep_times:
+        with frames_of(place, keys[0], [0]) as frames:
+            start_ns = next(frames).seen.stamp_ns
+    return boxes_of(layout, [(key, bounds_of_frames(place, key)) for key in keys], start_ns)
+
+
+def _done(place: Place, layout: BoxLayout) -> dict[str, DoneBox]:
+    """Return the boxes that a manifest names, by what they are made of."""
+    if place.find(MANIFEST) is None:
+        return {}
+    try:
+        known = read_boxed_manifest(place).extra["fleet"]["boxes"]
+        return {inputs: loaded(values, layout) for inputs, values in known.items()}
+    except (KeyError, TypeError, ValueError):
+        return {}  # of another layout, or no fleet's
+
+
+def _mapped(
+    run: _Run, place: Place, layout: BoxLayout, boxes: Sequence[Box], before: dict[str, DoneBox], progress: Progress
+) -> dict[str, DoneBox]:
+    """Return all boxes by what they are made of; those that no run before has mapped are mapped."""
+    names = {box.inputs(layout): box for box in boxes}
+    before |= {
+        inputs: box
+        for file in place.names(f"{DONE}/")
+        if (inputs := file.rpartition("/")[2].removesuffix(".json")) in names
+        and (box := done_before(place, layout, inputs)) is not None
+    }
+    done = {inputs: before[inputs] for inputs in names if inputs in before}
+    tasks = {inputs: (place, layout, box) for inputs, box in names.items() if inputs not in done}
+    progress(len(done), len(names), "boxes")
+    for inputs, box in run.results(map_box, tasks, {inputs: names[inputs].frames for inputs in tasks}):
+        done[inputs] = box
+        progress(len(done), len(names), "boxes")
+    return done
+
+
+def _levels(
+    run: _Run, place: Place, layout: BoxLayout, entries: Sequence[BoxEntry], progress: Progress
+) -> list[list[BoxEntry]]:
+    """Return the coarser levels, each made of the one before."""
+    levels: list[list[BoxEntry]] = []
+    while not is_top(entries):
+        tasks = {
+            f"{layout.level}-{'-'.join(entry.name[-16:] for entry in family)}": (place, layout, family)
+            for family in families(entries).values()
+        }
+        parents: list[BoxEntry] = []
+        for n, (_, parent) in enumerate(run.results(write_parent, tasks), 1):
+            parents += [] if parent is None else [parent]
+            progress(n, len(tasks), "coarser levels")
+        entries, layout = sorted(parents), coarser_layout(layout)
+        levels.append(list(entries))
+    return levels
+
+
+def _manifest(
+    place: Place,
+    layout: BoxLayout,
+    used: Sequence[Recording],
+    entries: list[BoxEntry],
+    levels: list[list[BoxEntry]],
+    inputs: dict[str, Any],
+) -> BoxedManifest:
+    keys = [one.key(layout.config) for one in used]
+    manifests = [manifest_of(place, key) for key in keys]
+    histories = [History.loaded(one) for one in manifests]
+    starts = [entry.times_start_ns for entry in entries if entry.times_start_ns is not None]
+    return BoxedManifest(
+        layout, entries, levels, reduce(together, histories), viewpoint_from(manifests[-1].get("viewpoint")),
+        min(starts, default=None), {"fleet": {"recordings": [one.where for one in used], "boxes": inputs}},
+    )  # fmt: skip
+
+
+def _sweep(place: Place, manifest: BoxedManifest, keys: set[str]) -> None:
+    """Remove what the map is not made of any more."""
+    sweep_boxes(place, manifest.names)
+    old = [file for file in place.names(f"{RECORDINGS}/") if file.split("/")[1] not in keys]
+    place.remove([*old, *place.names(f"{DONE}/")])

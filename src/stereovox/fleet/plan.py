@@ -1,0 +1,123 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a fleet's run will cost, by a look at a few frames of each recording; nothing is written."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+
+from stereovox.config import Config, load_config
+from stereovox.errors import StereovoxError
+from stereovox.fleet.boxes import boxes_of
+from stereovox.fleet.fleet import settings_for
+from stereovox.fleet.recordings import Recording, recordings_of
+from stereovox.mapper import Mapper
+from stereovox.maps.boxed_map import side_of
+from stereovox.maps.boxes import BoxLayout
+from stereovox.opening import open_source
+
+LOOKED_AT = 24
+"""Frames of a recording that are looked at, spread over it; the first of all compiles and does not count."""
+
+
+@dataclass(frozen=True)
+class FleetPlan:
+    """What a run will cost, about.
+
+    Attributes:
+        recordings: Number of recordings that can be read.
+        frames: Number of their frames.
+        box_m: Side of a box in metres.
+        boxes: Number of boxes that the frames that were looked at see: at least so many.
+        overlap: In how many boxes a frame is, on the average.
+        bytes: Of the depth images that are kept for adding and correcting recordings later.
+        core_hours: Hours of a core like one of this machine.
+        unreadable: Recordings that cannot be read, and why.
+    """
+
+    recordings: int
+    frames: int
+    box_m: float
+    boxes: int
+    overlap: float
+    bytes: int
+    core_hours: float
+    unreadable: tuple[str, ...] = ()
+
+    def summary(self) -> dict[str, Any]:
+        """Return the numbers of `stereovox fleet --plan --json`."""
+        return {**asdict(self), "frames_read": round(self.frames * self.overlap)}
+
+
+def plan_fleet(
+    recordings: Iterable[str | Path | Recording],
+    *,
+    profile: str | Path | Config | None = None,
+    box_m: float | None = None,
+    progress: Callable[[int, int, str], object] = lambda done, total, doing: None,
+    **overrides: Any,
+) -> FleetPlan:
+    """Estimate what `map_fleet` will cost.
+
+    Args:
+        recordings: As for `map_fleet`; those in object stores cannot be looked at.
+        profile: As for `map_fleet`.
+        box_m: As for `map_fleet`.
+        progress: Called with recordings done, their number, and the current activity.
+        **overrides: Settings by name.
+
+    Returns:
+        The estimate.
+
+    Raises:
+        StereovoxError: No recording can be read.
+    """
+    listed = recordings_of(recordings)
+    config, _ = settings_for(listed, profile, overrides)
+    layout = BoxLayout(config, side_of(box_m, config.cell))
+    frames = stored = 0
+    seconds, seen, unreadable = 0.0, [], []
+    for n, one in enumerate(listed, 1):
+        try:
+            length, bounds, each_s, each_bytes = _looked_at(one, config)
+        except StereovoxError as error:
+            unreadable.append(f"{one.where}: {error}")
+            continue
+        finally:
+            progress(n, len(listed), "looking at recordings")
+        frames, stored, seconds = frames + length, stored + length * each_bytes, seconds + length * each_s
+        seen.append((one.where, bounds, length))
+    if not seen:
+        raise StereovoxError(f"not one recording can be read ({unreadable[0]})")
+    boxes = boxes_of(layout, [(where, bounds) for where, bounds, _ in seen], None)
+    overlaps = [
+        sum(len(piece.numbers) for box in boxes for piece in box.pieces if piece.recording == where)
+        / max(len(bounds), 1)
+        for where, bounds, _ in seen
+    ]
+    overlap = float(np.average(overlaps, weights=[length for *_, length in seen]))
+    hours = seconds * (1 + overlap) / 3600
+    side_m = float(layout.metres.max())
+    return FleetPlan(len(seen), frames, side_m, len(boxes), overlap, round(stored), hours, tuple(unreadable))
+
+
+def _looked_at(recording: Recording, config: Config) -> tuple[int, np.ndarray, float, float]:
+    """Return the number of frames, the blocks (n, 2, 3) that some see, and seconds and bytes of one frame."""
+    source = open_source(recording.where)
+    step = max(1, len(source) // LOOKED_AT)
+    mapper = Mapper(load_config(config, **{"map.keep_frames": True, "trust.max_disagreement": 1}))
+    times = []
+    for i in range(0, len(source), step):
+        started = perf_counter()
+        mapper.add(source.frame(i))
+        times.append(perf_counter() - started)
+    kept = mapper.map.kept_frames
+    if kept is None or not len(kept):
+        raise StereovoxError("not one frame of those that were looked at can be used")
+    bounds = np.array([frame.blocks for frame in kept.frames], np.int32)
+    return len(source), bounds, float(np.median(times)), kept.bytes / len(kept)

@@ -1,0 +1,272 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The recordings of a fleet: their names, and each mapped alone, which says which of its frames can be trusted.
+
+What is kept of a recording lies in `recordings/KEY/`: the depth images of its trusted frames, without loss, which
+blocks each sees, and the history of the map that they made. The key is made of all that this depends on.
+"""
+
+from __future__ import annotations
+
+import glob
+import hashlib
+import io
+import json
+import os
+import shlex
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from time import perf_counter
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from stereovox.config import Config, load_config
+from stereovox.errors import MapFileError, StereovoxError
+from stereovox.maps.frame_store import IN_A_PACK, files_of_frames, read_frames
+from stereovox.maps.kept_frames import KeptFrame
+from stereovox.maps.store import MANIFEST, MAX_MANIFEST
+from stereovox.places import Folder, Place, is_url
+from stereovox.pose_choice import GIVEN
+from stereovox.remapping import remap
+from stereovox.run import MapRun
+from stereovox.safe_io import json_value
+from stereovox.sources.bags.recording import file_part
+
+VERSION = 1
+"""Of what is kept of a recording; another one is made anew."""
+RECORDINGS = "recordings"
+BOUNDS, REPORT = "bounds.npy", "report.json"
+MAX_REPORT = 1 << 24
+"""Bytes of a report."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One of many recordings.
+
+    Attributes:
+        where: Folder, file, simulation or `s3://` prefix, as `open_source` takes it.
+        poses: File with corrected poses (TUM), as `remap` takes it; None: those of the recording.
+    """
+
+    where: str
+    poses: str | None = None
+
+    def key(self, config: Config) -> str:
+        """Return a name made of all that the trusted frames depend on: the files, the poses and the settings."""
+        settings = config.model_dump(mode="json", exclude={"threads"})
+        files = [_fingerprint(self.where), None if self.poses is None else _fingerprint(self.poses)]
+        return digest([VERSION, self.where, files, settings])
+
+
+@dataclass(frozen=True)
+class RecordingReport:
+    """What a recording gave.
+
+    Attributes:
+        recording: Its name.
+        frames: Trusted frames.
+        refused: Refused frames by reason.
+        seconds: Time it took to map it alone; 0 where that was done before.
+        error: Why nothing of it is in the map, one line; "" where it is.
+        notes: What was assumed about it.
+    """
+
+    recording: str
+    frames: int = 0
+    refused: dict[str, int] = field(default_factory=dict)
+    seconds: float = 0.0
+    error: str = ""
+    notes: Sequence[str] = ()
+
+    def summary(self) -> dict[str, Any]:
+        """Return the report as plain values for JSON."""
+        return {**vars(self), "notes": list(self.notes)}
+
+
+def recordings_of(names: Iterable[str | Path | Recording]) -> list[Recording]:
+    """Return the recordings that names stand for, in their order.
+
+    Args:
+        names: Recordings, patterns (`drives/*`, sorted), lists (`@drives.txt`: in each line a recording, and the
+            file of its corrected poses if there is one; # begins a comment), or `Recording`.
+
+    Returns:
+        The recordings; none twice.
+
+    Raises:
+        StereovoxError: A pattern fits nothing, a list cannot be read, there is no recording, or one is named twice.
+    """
+    found: list[Recording] = []
+    for name in names:
+        found += [name] if isinstance(name, Recording) else _expanded(str(name))
+    if not found:
+        raise StereovoxError("no recording is named; give one or more")
+    twice = next((one.where for n, one in enumerate(found) if one.where in {other.where for other in found[:n]}), None)
+    if twice is not None:
+        raise StereovoxError(f"{twice}: is named twice; name it once")
+    return found
+
+
+def index_recording(place: Place, recording: Recording, config: Config) -> RecordingReport:
+    """Map a recording alone, and put what is kept of it into a place, the report last; a task of a worker.
+
+    What cannot be read or mapped is told in the report. Raises MapFileError where the place cannot be written.
+    """
+    key, notes, started = recording.key(config), list[str](), perf_counter()
+    home = place / f"{RECORDINGS}/{key}"
+    with TemporaryDirectory(prefix="stereovox-") as folder:
+        try:
+            made = _mapped_alone(recording, config, Path(folder), notes)
+        except StereovoxError as error:
+            return RecordingReport(recording.where, error=str(error), notes=notes)
+        manifest = json_value((made / MANIFEST).read_bytes())
+        for name in sorted(files_of_frames(manifest["kept_frames"])):
+            home.write(name, (made / name).read_bytes())
+        kept = read_frames(made, manifest["kept_frames"], None)
+        assert kept is not None
+        bounds = io.BytesIO()
+        np.save(bounds, np.array([frame.blocks for frame in kept.frames], np.int32))
+        home.write_all({MANIFEST: json.dumps(manifest).encode(), BOUNDS: bounds.getvalue()})
+        refused = {str(why): int(number) for why, number in manifest["history"]["refused"].items()}
+    report = RecordingReport(recording.where, len(kept), refused, perf_counter() - started, notes=notes)
+    home.write(REPORT, json.dumps(report.summary()).encode())
+    return report
+
+
+def report_of(place: Place, key: str) -> RecordingReport | None:
+    """Return the report of a recording that was indexed before, None where it was not."""
+    saved = (place / f"{RECORDINGS}/{key}").find(REPORT, MAX_REPORT)
+    return None if saved is None else RecordingReport(**{**json_value(saved), "seconds": 0.0})
+
+
+def bounds_of_frames(place: Place, key: str) -> NDArray[np.int32]:
+    """Return the blocks (n, 2, 3) that each trusted frame of a recording sees: the lowest, and beyond the highest."""
+    data = (place / f"{RECORDINGS}/{key}").read(BOUNDS)
+    try:
+        bounds = np.load(io.BytesIO(data), allow_pickle=False)
+    except ValueError as error:
+        raise _damaged(place, key, error) from None
+    if bounds.ndim != 3 or bounds.shape[1:] != (2, 3) or bounds.dtype != np.int32:
+        raise _damaged(place, key, f"{BOUNDS} holds {bounds.dtype} {bounds.shape}")
+    return bounds
+
+
+def manifest_of(place: Place, key: str) -> dict[str, Any]:
+    """Return the manifest of the map that a recording made alone."""
+    return json_value((place / f"{RECORDINGS}/{key}").read(MANIFEST, MAX_MANIFEST))
+
+
+@contextmanager
+def frames_of(place: Place, key: str, numbers: Sequence[int]) -> Iterator[Iterator[KeptFrame]]:
+    """Yield some of the trusted frames of a recording, ascending; of an object store each pack is fetched once."""
+    home, saved = place / f"{RECORDINGS}/{key}", manifest_of(place, key)["kept_frames"]
+    try:
+        if isinstance(home, Folder):
+            kept = read_frames(home.path, saved, None)
+            assert kept is not None
+            yield (kept.frames[n] for n in numbers)
+            return
+        with TemporaryDirectory(prefix="stereovox-") as folder:
+            (Path(folder) / saved["index"]).write_bytes(home.read(saved["index"]))
+            kept = read_frames(Path(folder), saved, None)
+            assert kept is not None
+            yield _fetched(home, Path(folder), saved["packs"], kept.frames, numbers)
+    except (KeyError, TypeError, ValueError, OSError) as error:
+        raise _damaged(place, key, error) from None
+
+
+def digest(parts: Any) -> str:
+    """Return 24 hexadecimal digits that stand for plain values."""
+    return hashlib.blake2b(json.dumps(parts, sort_keys=True).encode(), digest_size=12).hexdigest()
+
+
+def _mapped_alone(recording: Recording, config: Config, folder: Path, notes: list[str]) -> Path:
+    """Return the folder of the map of a recording, which kept its frames."""
+    keeping = load_config(config, **{"map.keep_frames": True})
+    source = _local(recording.where, folder / "recording")
+    settings: dict[str, Any] = {"profile": keeping, "poses": GIVEN, "checkpoint_s": 0}  # others' worlds are not ours
+    with MapRun(source, folder / "map", **settings, notify=notes.append) as run:
+        run.finish()
+    if recording.poses is None:
+        return folder / "map"
+    return remap(folder / "map", _local(recording.poses, folder / "poses"), folder / "remapped").out
+
+
+def _local(where: str, folder: Path) -> str:
+    """Return a recording as this machine can open it: that of an object store is copied to `folder`."""
+    if not is_url(where):
+        return where
+    above, _, name = where.rstrip("/").rpartition("/")
+    place, files = Place.of(above), list[str]()
+    for file in place.names(name):
+        if file == name or file.startswith(f"{name}/"):
+            target = folder / file
+            target.parent.mkdir(parents=True, exist_ok=True)
+            target.write_bytes(place.read(file))
+            files.append(file)
+    if not files:
+        raise MapFileError(f"{where}: no such recording in the store; check the name")
+    return str(folder / name)
+
+
+def _fetched(
+    home: Place, folder: Path, packs: Sequence[str], frames: Sequence[KeptFrame], numbers: Sequence[int]
+) -> Iterator[KeptFrame]:
+    here = ""
+    for n in numbers:
+        pack = packs[n // IN_A_PACK]
+        if pack != here:
+            if here:
+                (folder / here).unlink()
+            (folder / pack).write_bytes(home.read(pack))
+            here = pack
+        yield frames[n]
+
+
+def _expanded(name: str) -> list[Recording]:
+    if name.startswith("@"):
+        return _listed(Path(name[1:]))
+    if any(letter in name for letter in "*[") and not is_url(name) and not os.path.exists(name):
+        found = sorted(glob.glob(name, recursive=True))
+        if not found:
+            raise StereovoxError(f"{name}: nothing has such a name; check the pattern")
+        return [Recording(one) for one in found]
+    return [Recording(name)]
+
+
+def _listed(file: Path) -> list[Recording]:
+    try:
+        lines = file.read_text().splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise StereovoxError(f"{file}: the list cannot be read ({error}); write a recording in each line") from None
+    found: list[Recording] = []
+    for number, line in enumerate(lines, 1):
+        try:
+            words = shlex.split(line, comments=True)
+        except ValueError as error:
+            raise StereovoxError(f"{file}:{number}: {error}; close the quotes") from None
+        if len(words) > 2:
+            raise StereovoxError(f"{file}:{number}: {len(words)} words; give a recording, and the file of its poses")
+        if words:
+            found.append(Recording(*words))
+    return found
+
+
+def _fingerprint(where: str) -> list[Any]:
+    """Return names, sizes and times of the files of a recording; nothing for simulations."""
+    if is_url(where):
+        above, _, name = where.rstrip("/").rpartition("/")
+        return list(Place.of(above).sizes(name).items())
+    path = Path(file_part(where))
+    files = [path] if path.is_file() else sorted(one for one in path.rglob("*") if one.is_file())
+    stats = ((file, file.stat()) for file in files)
+    return [[str(file.relative_to(path)), stat.st_size, stat.st_mtime_ns] for file, stat in stats]
+
+
+def _damaged(place: Place, key: str, why: object) -> MapFileError:
+    return MapFileError(f"{place}/{RECORDINGS}/{key}: is damaged ({why}); remove it and run again with --resume")

@@ -1,0 +1,303 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Maps made by many workers are those of one machine, bit for bit, however they are cut, killed and gone on with."""
+
+import atexit
+import os
+import shutil
+import signal
+from dataclasses import replace
+from functools import cache, partial
+from pathlib import Path
+from tempfile import mkdtemp
+
+import cv2
+import numpy as np
+import pytest
+
+import stereovox as sv
+from stereovox.deadline import Levels
+from stereovox.errors import ConfigError, MapFileError, StereovoxError
+from stereovox.fleet import Recording, boxes, fleet, map_fleet, recordings_of
+from stereovox.places import Place
+from stereovox.sources.trajectory import write_trajectory
+
+distributed = pytest.importorskip("distributed")
+SETTINGS = {"profile": "default", "voxel_size": 0.2}
+
+
+def write_folder(folder, frames):
+    """Write a folder of TUM's layout."""
+    (folder / "depth").mkdir(parents=True)
+    lines, camera = [], frames[0].camera
+    for frame in frames:
+        name = f"depth/{frame.stamp_ns / 1e9:.9f}.png"
+        depth = np.nan_to_num(np.where(np.isfinite(frame.depth), frame.depth, 0) * frame.depth_scale * 5000)
+        cv2.imwrite(str(folder / name), depth.astype(np.uint16))
+        lines.append(f"{frame.stamp_ns / 1e9:.9f} {name}")
+    (folder / "depth.txt").write_text("\n".join(lines) + "\n")
+    poses = np.array([frame.T_world_sensor for frame in frames])
+    write_trajectory(folder / "groundtruth.txt", [frame.stamp_ns for frame in frames], poses, "camera")
+    names = "width", "height", "fx", "fy", "cx", "cy"
+    (folder / "camera.toml").write_text("".join(f"{name} = {getattr(camera, name)}\n" for name in names))
+
+
+@cache
+def recording(number):
+    """Return the folder of a short recording, one of several ways through the same rooms."""
+    folder = Path(mkdtemp(prefix="stereovox-test-")) / f"drive{number}"
+    atexit.register(shutil.rmtree, folder.parent)
+    frames = list(sv.open_source(f"sim:apartment?image_width=64&seed={number}", f"{20 * number}::70"))[:12]
+    write_folder(folder, frames)
+    return str(folder)
+
+
+@pytest.fixture(scope="module")
+def scheduler():
+    """Return the address of a cluster of two workers in this process, which start at once."""
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=False, dashboard_address="127.0.0.1:0", silence_logs=50
+    ) as cluster:
+        yield cluster.scheduler_address
+
+
+@pytest.fixture
+def mapped(scheduler):
+    """Return `map_fleet` on that cluster, with boxes of 3.2 m."""
+    return partial(map_fleet, **SETTINGS, box_m=3.2, scheduler=scheduler)
+
+
+@cache
+def alone(recording, **settings):
+    """Return the map of a recording by one mapper, which keeps its frames."""
+    mapper = sv.Mapper("default", voxel_size=0.2, **{"map.keep_frames": True, **settings})
+    for frame in sv.open_source(recording):
+        mapper.add(frame)
+    return mapper.map
+
+
+def of_all(*recordings, **settings):
+    """Return the blocks of one map of the frames that each recording's own mapper trusts, one after the other."""
+    config = sv.load_config("default", voxel_size=0.2, **settings)
+    storage, level = sv.VoxelMap(config).storage, Levels(config)("full")
+    for recording in recordings:
+        for frame in (alone(recording, **settings) if isinstance(recording, str) else recording).kept_frames.frames:
+            image = level.prepare(frame.frame()).image
+            storage.look_from(image.viewpoint)
+            storage.add(level.integrator.evidence(image))
+            storage.history.frames += 1
+    return storage.blocks()
+
+
+def assert_same(ours, theirs):
+    for a, b in zip(ours, theirs, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_one_recording_makes_the_map_of_one_mapper(mapped, where):
+    made, own = mapped([recording(1)], where), alone(recording(1))
+    assert made.boxes[0] > 3
+    assert_same(made.map.storage.blocks(), own.storage.blocks())
+    assert made.map.counts() == own.counts()
+    assert (made.map.frames, made.map.frames_refused) == (own.frames, own.frames_refused)
+    assert made.summary()["recordings"][0]["frames"] == own.frames
+    assert sv.load_map(where).overview().counts() == own.counts()
+
+
+@pytest.mark.parametrize("box_m", [3.2, 4.8, 12.8])
+def test_the_map_does_not_depend_on_the_boxes(mapped, tmp_path, box_m):
+    made = mapped([recording(1), recording(2)], tmp_path / "m.svox", box_m=box_m)
+    assert_same(made.map.storage.blocks(), of_all(recording(1), recording(2)))
+    other = mapped([recording(2), recording(1)], tmp_path / "n.svox", box_m=box_m)
+    assert_same(other.map.storage.blocks(), of_all(recording(2), recording(1)))
+
+
+@pytest.mark.parametrize("settings", [{"map.cell": "int8"}, {"map.keep_times": True}], ids=str)
+def test_other_cells_and_times(mapped, tmp_path, settings):
+    made = mapped([recording(1), recording(2)], tmp_path / "m.svox", **settings)
+    assert_same(made.map.storage.blocks(), of_all(recording(1), recording(2), **settings))
+    if "map.keep_times" in settings:
+        one = mapped([recording(1)], tmp_path / "n.svox", **settings).map.storage
+        coords, cells = one.blocks()
+        known = cells != one.cell_format.unknown
+        assert_same([one.times_of(coords)[known]], [alone(recording(1), **settings).storage.times_of(coords)[known]])
+
+
+def test_recordings_are_added_and_taken_away(mapped, where):
+    first = mapped([recording(1)], where)
+    both = mapped([recording(1), recording(2)], where, resume=True)
+    assert_same(both.map.storage.blocks(), of_all(recording(1), recording(2)))
+    again = mapped([recording(1), recording(2)], where, resume=True)
+    assert again.boxes == (both.boxes[0], 0)
+    less = mapped([recording(1)], where, resume=True)
+    assert_same(less.map.storage.blocks(), first.map.storage.blocks())
+    names = Place.of(where).names("recordings/")
+    assert len({name.split("/")[1] for name in names}) == 1
+
+
+def test_far_away_recordings_leave_other_boxes_alone(mapped, tmp_path):
+    """A second recording 100 m away: none of the boxes of the first one is mapped again."""
+    frames = list(sv.open_source(recording(2)))
+    far = np.array([frame.T_world_sensor for frame in frames])
+    far[:, 0, 3] += 100
+    write_trajectory(tmp_path / "far.tum", [frame.stamp_ns for frame in frames], far, "camera")
+    there = Recording(recording(2), str(tmp_path / "far.tum"))
+    first = mapped([recording(1)], tmp_path / "m.svox")
+    both = mapped([recording(1), there], tmp_path / "m.svox", resume=True)
+    assert both.boxes[1] == both.boxes[0] - first.boxes[0] > 0
+
+
+def test_corrected_poses_make_the_map_of_remap(mapped, tmp_path):
+    mapped([recording(1), recording(2)], tmp_path / "m.svox")
+    poses = np.array([frame.T_world_sensor for frame in sv.open_source(recording(2))])
+    poses[:, 0, 3] += 0.3
+    write_trajectory(tmp_path / "new.tum", [frame.stamp_ns for frame in sv.open_source(recording(2))], poses, "camera")
+    (tmp_path / "list.txt").write_text(f"'{recording(1)}'\n# moved\n'{recording(2)}' {tmp_path / 'new.tum'}\n")
+    made = mapped([f"@{tmp_path / 'list.txt'}"], tmp_path / "m.svox", resume=True)
+    alone(recording(2)).save(tmp_path / "two.svox")
+    corrected = sv.remap(tmp_path / "two.svox", tmp_path / "new.tum", tmp_path / "moved.svox").map
+    assert_same(made.map.storage.blocks(), of_all(recording(1), corrected))
+
+
+def test_what_was_done_before_a_failure_stays(mapped, where, monkeypatch):
+    """A store that is full after some boxes: the error is one line, and going on does the rest."""
+    wrote = []
+
+    def filling(place, name, data, write):
+        if name.startswith("done/"):
+            wrote.append(name)
+            if len(wrote) > 2:
+                raise MapFileError(f"{place}/{name}: cannot be written (No space left on device)")
+        write(place, name, data)
+
+    kind = type(Place.of(where))
+    with monkeypatch.context() as patch:
+        write = kind.write
+        patch.setattr(kind, "write", lambda place, name, data: filling(place, name, data, write))
+        with pytest.raises(MapFileError, match="No space left"):
+            mapped([recording(1)], where)
+    with pytest.raises(MapFileError, match="resume"):
+        mapped([recording(1)], where)
+    made = mapped([recording(1)], where, resume=True)
+    assert 0 < made.boxes[1] <= made.boxes[0] - 2
+    assert_same(made.map.storage.blocks(), alone(recording(1)).storage.blocks())
+    assert not Place.of(where).names("done/")
+
+
+def test_a_broken_recording_is_told_and_left_out(mapped, tmp_path):
+    (tmp_path / "broken").mkdir()
+    (tmp_path / "broken/depth.txt").write_text("nothing\n")
+    made = mapped([recording(1), tmp_path / "broken", "sim:nowhere"], tmp_path / "m.svox")
+    assert_same(made.map.storage.blocks(), alone(recording(1)).storage.blocks())
+    reports = made.recordings
+    assert [bool(one.error) for one in reports] == [False, True, True]
+    assert len(made.summary()["doubts"]) == 2
+    assert "\n" not in "".join(one.error for one in reports)
+    with pytest.raises(StereovoxError, match="not one recording could be used"):
+        mapped(["sim:nowhere"], tmp_path / "n.svox")
+
+
+def test_two_fleets_do_not_write_one_map(mapped, where):
+    with fleet.only_writer_at(Place.of(where)):
+        from concurrent.futures import ThreadPoolExecutor
+
+        with ThreadPoolExecutor(1) as other, pytest.raises(MapFileError, match="another"):
+            other.submit(mapped, [recording(1)], where).result()
+
+
+def test_recordings_of_an_object_store(mapped, s3, tmp_path):
+    folder = Path(recording(1))
+    local = mapped([folder], tmp_path / "m.svox")
+    place = Place.of(f"{s3}/recordings-{os.getpid()}")
+    for file in sorted(folder.rglob("*")):
+        if file.is_file():
+            place.write(f"{folder.name}/{file.relative_to(folder)}", file.read_bytes())
+    stored = mapped([f"{place}/{folder.name}"], tmp_path / "n.svox")
+    assert_same(stored.map.storage.blocks(), local.map.storage.blocks())
+    assert stored.map.frames == 12
+
+
+def test_killed_workers_change_nothing(tmp_path):
+    """Two processes, of which one after another is killed while boxes are mapped; the nannies start new ones."""
+    psutil = pytest.importorskip("psutil")
+    killed = []
+
+    def kill(done, total, doing):
+        if doing == "boxes" and done and len(killed) < 3:
+            workers = [one for one in psutil.Process().children(recursive=True) if "spawn_main" in " ".join(cmd(one))]
+            busy = sorted(workers, key=lambda one: -sum(one.cpu_times()[:2]))
+            killed.append(busy[0].pid)
+            busy[0].send_signal(signal.SIGKILL)
+
+    def cmd(process):
+        try:
+            return process.cmdline()
+        except psutil.Error:
+            return []
+
+    made = map_fleet([recording(1), recording(2)], tmp_path / "m.svox", **SETTINGS, box_m=3.2, workers=2, progress=kill)
+    assert len(killed) == 3
+    assert_same(made.map.storage.blocks(), of_all(recording(1), recording(2)))
+
+
+@pytest.mark.parametrize(
+    ("settings", "named"),
+    [
+        ({"window.size": [5, 5, 5]}, "window.size"), ({"max_memory": "1 GB"}, "max_memory"),
+        ({"deadline_ms": 20}, "deadline_ms"), ({"map.keep_times": True, "map.forget_s": 5}, "map.forget_s"),
+    ],
+    ids=str,
+)  # fmt: skip
+def test_settings_that_boxes_cannot_have_are_named(tmp_path, settings, named):
+    with pytest.raises(ConfigError, match=named):
+        map_fleet([recording(1)], tmp_path / "m.svox", **SETTINGS, **settings)
+
+
+def test_names_of_recordings(tmp_path):
+    for name in ("b", "a", "c d"):
+        (tmp_path / name).mkdir()
+    assert [one.where for one in recordings_of([f"{tmp_path}/*", recording(1)])] == [
+        *(str(tmp_path / name) for name in ("a", "b", "c d")), recording(1),
+    ]  # fmt: skip
+    for wrong, said in (
+        (["a", "a"], "twice"),
+        ([], "no recording"),
+        ([f"{tmp_path}/x*"], "nothing has"),
+        (["@no"], "list"),
+    ):
+        with pytest.raises(StereovoxError, match=said):
+            recordings_of(wrong)
+    (tmp_path / "list.txt").write_text("a b c\n")
+    with pytest.raises(StereovoxError, match=r"list\.txt:1: 3 words"):
+        recordings_of([f"@{tmp_path / 'list.txt'}"])
+
+
+def test_no_scheduler_is_one_line(tmp_path, monkeypatch):
+    monkeypatch.setattr(fleet, "PATIENCE_S", 0.5)
+    with pytest.raises(StereovoxError, match="no Dask scheduler answers"):
+        map_fleet([recording(1)], tmp_path / "m.svox", **SETTINGS, scheduler="tcp://127.0.0.1:9")
+
+
+def test_keys_know_what_frames_depend_on(tmp_path):
+    config = sv.load_config(voxel_size=0.1)
+    (tmp_path / "a.txt").write_text("1")
+    one = Recording(str(tmp_path))
+    assert one.key(config) == one.key(sv.load_config(voxel_size=0.1, threads=2))
+    assert one.key(config) != one.key(sv.load_config(voxel_size=0.2))
+    before = one.key(config)
+    (tmp_path / "a.txt").write_text("12")
+    assert one.key(config) != before
+    assert replace(one, poses=str(tmp_path / "a.txt")).key(config) != one.key(config)
+
+
+def test_frames_are_in_all_boxes_that_they_see():
+    """Against boxes of one block, by brute force."""
+    layout = boxes.BoxLayout(sv.load_config(voxel_size=0.2), 16)
+    random = np.random.default_rng(0)
+    low = random.integers(-9, 9, (20, 3))
+    bounds = np.stack([low, low + random.integers(0, 5, (20, 3))], axis=1).astype(np.int32)
+    found = {box.at: set(box.pieces[0].numbers) for box in boxes.boxes_of(layout, [("a", bounds)], None)}
+    expected = {}
+    for n, (first, beyond) in enumerate(bounds):
+        for block in np.ndindex(*(beyond - first)):
+            expected.setdefault(tuple(((first + block) // 2).tolist()), set()).add(n)
+    assert found == expected

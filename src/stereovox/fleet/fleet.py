@@ -292,6 +292,7 @@ def _cluster(scheduler: str | None, workers: int | None) -> Iterator[_Run]:
             ) as cluster,
             Client(cluster) as client,
         ):  # fmt: skip
+            cluster.adapt(minimum=number, maximum=number, interval="1s")  # also where a nanny is lost with its worker
             yield _Run(client)
 
 

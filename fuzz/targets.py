@@ -42,7 +42,7 @@ from stereovox.formats.map_server import read_map_server, write_map_server
 from stereovox.formats.raised_floor import raised
 from stereovox.formats.read_points import read_npz
 from stereovox.formats.scan_graph import read_scan_graph
-from stereovox.maps import VoxelMap, load_map
+from stereovox.maps import VoxelMap, load_map, save_boxed
 from stereovox.maps.grid_map import GridMap, load_grid
 from stereovox.maps.occupancy import OccupancyGrid
 from stereovox.opening import open_source
@@ -257,6 +257,53 @@ def read_cells(data: bytes, folder: Path) -> None:
         assert len(loaded.storage.blocks()[0]) <= len(coords)
     finally:
         (path / "manifest.json").write_text(whole)
+
+
+def boxed(folder: Path) -> Path:
+    """Return the small map in boxes, saved once in `folder`."""
+    path = folder / "boxed.svox"
+    if not path.exists():
+        save_boxed(small_map(), path, 0.8)
+    return path
+
+
+def boxed_manifests(folder: Path) -> list[bytes]:
+    return [(boxed(folder) / "manifest.json").read_bytes()]
+
+
+def read_boxed(data: bytes, folder: Path) -> None:
+    path = boxed(folder) / "manifest.json"
+    whole = path.read_bytes()
+    try:
+        path.write_bytes(data)
+        loaded = load_map(path.parent)
+        loaded.storage.blocks()
+        loaded.overview(100)
+    finally:
+        path.write_bytes(whole)
+
+
+def shards(folder: Path) -> list[bytes]:
+    files = sorted(boxed(folder).glob("boxes/0/*/*/c/0/0"))[:4]
+    return [bytes([n]) + file.read_bytes() for n, file in enumerate(files)]
+
+
+def read_shard(data: bytes, folder: Path) -> None:
+    """The first byte says which file of a box gets the others; the manifest has its right checksum and size."""
+    files = sorted(boxed(folder).glob("boxes/0/*/*/c/0/0"))
+    file, path = files[data[0] % len(files) if data else 0], boxed(folder) / "manifest.json"
+    whole, manifest = file.read_bytes(), path.read_bytes()
+    told = json.loads(manifest)
+    entry = next(one for one in told["boxes"] if one["name"].endswith(file.parts[-5]))
+    entry["checksum"][("coords", "cells").index(file.parts[-4])] = zlib.crc32(data[1:])
+    entry["bytes"] += len(data)
+    try:
+        file.write_bytes(data[1:])
+        path.write_text(json.dumps(told))
+        load_map(path.parent).storage.blocks()
+    finally:
+        file.write_bytes(whole)
+        path.write_bytes(manifest)
 
 
 def some_coords(_: Path) -> list[bytes]:
@@ -691,6 +738,8 @@ TARGETS: dict[str, Target] = {
     "map_manifest": Target(manifests, read_manifest),
     "map_arrays": Target(pieces, read_piece),
     "map_cells": Target(some_coords, read_cells),
+    "boxed_manifest": Target(boxed_manifests, read_boxed),
+    "boxed_shards": Target(shards, read_shard),
     "grid_file": Target(grids, lambda data, folder: file_target("a.npz", load_grid).read(data, folder)),
     "grid_about": Target(abouts, read_about),
     "octomap": Target(trees, lambda data, folder: file_target("a.bt", read_octomap).read(data, folder)),

@@ -252,6 +252,18 @@ def test_settings_that_boxes_cannot_have_are_named(tmp_path, settings, named):
         map_fleet([recording(1)], tmp_path / "m.svox", **SETTINGS, **settings)
 
 
+def test_a_map_is_gone_on_with_as_it_was_made(mapped, scheduler, tmp_path):
+    made = mapped([recording(1)], tmp_path / "m.svox")
+    again = map_fleet([recording(1)], tmp_path / "m.svox", resume=True, scheduler=scheduler)
+    assert again.boxes == (made.boxes[0], 0)
+    for other in ({"voxel_size": 0.1}, {"box_m": 6.4}):
+        with pytest.raises(MapFileError, match="made with other settings"):
+            mapped([recording(1)], tmp_path / "m.svox", resume=True, **other)
+    (tmp_path / "m.svox/fleet.json").write_text("{}")
+    with pytest.raises(MapFileError, match=r"fleet\.json: is damaged"):
+        mapped([recording(1)], tmp_path / "m.svox", resume=True)
+
+
 def test_names_of_recordings(tmp_path):
     for name in ("b", "a", "c d"):
         (tmp_path / name).mkdir()

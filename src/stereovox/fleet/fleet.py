@@ -15,7 +15,7 @@ from typing import Any
 
 from stereovox.config import Config, load_config
 from stereovox.errors import ConfigError, MapFileError, MissingExtra, StereovoxError
-from stereovox.fleet.boxes import DONE, Box, DoneBox, boxes_of, done_before, loaded, map_box, saved
+from stereovox.fleet.boxes import DONE, Box, DoneBox, boxes_of, done_before, map_box
 from stereovox.fleet.recordings import (
     RECORDINGS,
     Recording,
@@ -155,11 +155,11 @@ def map_fleet(
             if not used:
                 first = reports[listed[0]]
                 raise StereovoxError(f"not one recording could be used, no map is written ({first.error})")
-            boxes, before = _boxes(place, layout, used), _done(place, layout)
+            boxes, before = _boxes(place, layout, used), _done(place)
             done = _mapped(run, place, layout, boxes, before, progress)
             entries = [box.entry for box in done.values() if box.entry is not None]
             levels = _levels(run, place, layout, entries, progress)
-        inputs = {inputs: saved(box) for inputs, box in done.items()}
+        inputs = {inputs: None if box.entry is None else box.entry.box for inputs, box in done.items()}
         manifest = _manifest(place, layout, used, entries, levels, inputs)
         write_boxed_manifest(place, manifest)
         _sweep(place, manifest, {one.key(layout.config) for one in used})
@@ -207,21 +207,34 @@ def _layout(
     overrides: Mapping[str, Any],
 ) -> BoxLayout:
     """Return settings and boxes, those of a run before where one is gone on with."""
-    known = place.find(SETTINGS, MAX_SETTINGS)
+    known = _known_layout(place)
     if not resume and (known is not None or place.find(MANIFEST) is not None):
         raise MapFileError(f"{place}: there is a map already; go on with it with --resume, or choose another name")
     if known is not None and profile is None and not overrides and box_m is None:
-        try:
-            values = json_value(known)
-            return BoxLayout(load_config(values["config"]), values["side"])
-        except (KeyError, TypeError, ValueError) as error:
-            raise MapFileError(f"{place}/{SETTINGS}: is damaged ({error}); give the settings again") from None
+        return known
     config, lines = settings_for(listed, profile, overrides)
+    layout = BoxLayout(config, known.side if known is not None and box_m is None else side_of(box_m, config.cell))
+    if known is not None and (_settings(layout) != _settings(known)):
+        raise MapFileError(f"{place}: was made with other settings; leave them out to go on, or choose another name")
     for line in lines:
         notify(f"note: {line}")
-    layout = BoxLayout(config, side_of(box_m, config.cell))
-    place.write(SETTINGS, json.dumps({"config": config.model_dump(mode="json"), "side": layout.side}).encode())
+    place.write(SETTINGS, json.dumps(_settings(layout)).encode())
     return layout
+
+
+def _settings(layout: BoxLayout) -> dict[str, Any]:
+    """Return settings and boxes as plain values for JSON, but for what does not matter to cells."""
+    return {"config": layout.config.model_dump(mode="json", exclude={"threads"}), "side": layout.side}
+
+
+def _known_layout(place: Place) -> BoxLayout | None:
+    """Return settings and boxes of a run before; None where there was none."""
+    known = place.find(SETTINGS, MAX_SETTINGS)
+    try:
+        values = None if known is None else json_value(known)
+        return None if values is None else BoxLayout(load_config(values["config"]), values["side"])
+    except (KeyError, TypeError, ValueError, StereovoxError) as error:
+        raise MapFileError(f"{place}/{SETTINGS}: is damaged ({error}); choose another name for the map") from None
 
 
 class _Run:
@@ -285,13 +298,11 @@ def _cluster(scheduler: str | None, workers: int | None) -> Iterator[_Run]:
                 yield _Run(client)
             return
         number = workers or cpu_count() or 1
-        with (
-            LocalCluster(
-                n_workers=number, threads_per_worker=1, processes=True, memory_limit=0, silence_logs=50,
-                dashboard_address="127.0.0.1:0",
-            ) as cluster,
-            Client(cluster) as client,
-        ):  # fmt: skip
+        local: Any = LocalCluster(
+            n_workers=number, threads_per_worker=1, processes=True, memory_limit=0, silence_logs=50,
+            dashboard_address="127.0.0.1:0",
+        )  # fmt: skip
+        with local as cluster, Client(cluster) as client:
             cluster.adapt(minimum=number, maximum=number, interval="1s")  # also where a nanny is lost with its worker
             yield _Run(client)
 
@@ -319,15 +330,17 @@ def _boxes(place: Place, layout: BoxLayout, used: Sequence[Recording]) -> list[B
     return boxes_of(layout, [(key, bounds_of_frames(place, key)) for key in keys], start_ns)
 
 
-def _done(place: Place, layout: BoxLayout) -> dict[str, DoneBox]:
+def _done(place: Place) -> dict[str, DoneBox]:
     """Return the boxes that a manifest names, by what they are made of."""
     if place.find(MANIFEST) is None:
         return {}
+    manifest = read_boxed_manifest(place)
+    entries = {entry.box: entry for entry in manifest.boxes}
     try:
-        known = read_boxed_manifest(place).extra["fleet"]["boxes"]
-        return {inputs: loaded(values, layout) for inputs, values in known.items()}
-    except (KeyError, TypeError, ValueError):
-        return {}  # of another layout, or no fleet's
+        known = manifest.extra["fleet"]["boxes"].items()
+        return {inputs: DoneBox(None if box is None else entries[tuple(box)], 0.0) for inputs, box in known}
+    except (KeyError, TypeError, AttributeError):
+        return {}  # of no fleet: all are mapped
 
 
 def _mapped(

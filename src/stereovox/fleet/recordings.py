@@ -141,7 +141,10 @@ def index_recording(place: Place, recording: Recording, config: Config) -> Recor
 def report_of(place: Place, key: str) -> RecordingReport | None:
     """Return the report of a recording that was indexed before, None where it was not."""
     saved = (place / f"{RECORDINGS}/{key}").find(REPORT, MAX_REPORT)
-    return None if saved is None else RecordingReport(**{**json_value(saved), "seconds": 0.0})
+    try:
+        return None if saved is None else RecordingReport(**{**json_value(saved), "seconds": 0.0})
+    except (TypeError, ValueError):
+        return None  # it is mapped again
 
 
 def bounds_of_frames(place: Place, key: str) -> NDArray[np.int32]:

@@ -7,7 +7,7 @@
 same: each map against the frames that each recording's own mapper trusts, put into one map in this process without
 boxes. With --kills one worker after another is killed while boxes are mapped. speed: seconds of a run, the first of
 each number of workers not counted; efficiency is against one worker. Overlap: boxes a frame is in, measured, and by the
-mean of (1 + extent / side) over all axes, where frames lie anywhere.
+mean of the product of (1 + extent / side) over all axes, where what frames see lies anywhere and fills its extent.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ import stereovox as sv
 from stereovox.config import load_config, parse_value
 from stereovox.deadline import Levels
 from stereovox.fleet import map_fleet, recordings_of
-from stereovox.fleet.recordings import bounds_of_frames
+from stereovox.fleet.recordings import frames_of
 from stereovox.places import Place
 
 
@@ -128,10 +128,11 @@ def speed(folder: Path, recordings: Sequence[str], given: argparse.Namespace, se
 
 def predicted(place: Place, made: sv.FleetMap) -> float:
     """Return the overlap by how large what frames see is beside a box."""
-    keys = {name.split("/")[1] for name in place.names("recordings/")}
-    bounds = np.concatenate([bounds_of_frames(place, key) for key in keys])
-    extents = 8 * (bounds[:, 1] - bounds[:, 0] - 1)
-    return float((1 + extents / made.map.manifest.layout.side).prod(axis=1).mean())
+    keys, extents = {name.split("/")[1] for name in place.names("recordings/")}, []
+    for key in keys:
+        with frames_of(place, key, range(next(one.frames for one in made.recordings))) as frames:
+            extents += [8 * (frame.blocks[1] - frame.blocks[0] - 1) for frame in frames]
+    return float((1 + np.array(extents) / made.map.manifest.layout.side).prod(axis=1).mean())
 
 
 if __name__ == "__main__":

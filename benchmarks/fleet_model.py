@@ -20,13 +20,12 @@ from pathlib import Path
 from time import perf_counter
 from typing import NamedTuple
 
-import numpy as np
 from distributed import Client, LocalCluster
 
 import stereovox as sv
 from stereovox.fleet import map_fleet
 from stereovox.fleet.boxes import Box, boxes_of
-from stereovox.fleet.recordings import bounds_of_frames
+from stereovox.fleet.recordings import boxes_seen
 from stereovox.places import Place
 
 WORKERS = 1, 10, 100, 300, 1000
@@ -80,16 +79,15 @@ def measured(recording: str, box_m: float, tasks: int) -> tuple[Costs, float]:
             made = map_fleet([recording], Path(folder) / str(n), profile="default", box_m=box_m, workers=1)
         place = Place.of(Path(folder) / "1")
         (key,) = {name.split("/")[1] for name in place.names("recordings/")}
-        bounds, kept = bounds_of_frames(place, key), sum(place.sizes("recordings/").values())
+        rows, kept = boxes_seen(place, key), sum(place.sizes("recordings/").values())
     alone = made.recordings[0].seconds
     layout = made.map.manifest.layout
-    many = np.tile(bounds, (20, 1, 1))
+    frames = made.map.frames
     started = perf_counter()
-    boxes = boxes_of(layout, [(key, many)], None)
-    for box in boxes:
+    for box in boxes_of([(f"{key}{n}", rows, frames) for n in range(20)], None):
         box.inputs(layout)
-    find_s = (perf_counter() - started) / len(many)
-    box = max(boxes_of(layout, [(key, bounds)], None), key=lambda box: box.frames)
+    find_s = (perf_counter() - started) / (20 * frames)
+    box = max(boxes_of([(key, rows, frames)], None), key=lambda box: box.frames)
     task_bytes = len(pickle.dumps((place, layout, box)))
     costs = Costs(
         alone / made.map.frames, (made.seconds[1] - alone) / made.frames_read, made.overlap, kept / made.map.frames,

@@ -18,6 +18,9 @@ import stereovox as sv
 from stereovox.deadline import Levels
 from stereovox.errors import ConfigError, MapFileError, StereovoxError
 from stereovox.fleet import Recording, boxes, fleet, map_fleet, recordings_of
+from stereovox.fleet.recordings import boxes_with
+from stereovox.maps.boxes import BoxLayout
+from stereovox.maps.evidence import Evidence
 from stereovox.places import Place
 from stereovox.sources.trajectory import write_trajectory
 
@@ -290,26 +293,32 @@ def test_no_scheduler_is_one_line(tmp_path, monkeypatch):
 
 
 def test_keys_know_what_frames_depend_on(tmp_path):
-    config = sv.load_config(voxel_size=0.1)
+    def layout(side=64, **settings):
+        return BoxLayout(sv.load_config(**{"voxel_size": 0.1, **settings}), side)
+
     (tmp_path / "a.txt").write_text("1")
     one = Recording(str(tmp_path))
-    assert one.key(config) == one.key(sv.load_config(voxel_size=0.1, threads=2))
-    assert one.key(config) != one.key(sv.load_config(voxel_size=0.2))
-    before = one.key(config)
+    before = one.key(layout())
+    assert before == one.key(layout(threads=2))
+    others = {one.key(layout(voxel_size=0.2)), one.key(layout(128)), replace(one, poses="x.tum").key(layout())}
     (tmp_path / "a.txt").write_text("12")
-    assert one.key(config) != before
-    assert replace(one, poses=str(tmp_path / "a.txt")).key(config) != one.key(config)
+    assert len({before, one.key(layout())} | others) == 5
 
 
-def test_frames_are_in_all_boxes_that_they_see():
-    """Against boxes of one block, by brute force."""
-    layout = boxes.BoxLayout(sv.load_config(voxel_size=0.2), 16)
-    random = np.random.default_rng(0)
-    low = random.integers(-9, 9, (20, 3))
-    bounds = np.stack([low, low + random.integers(0, 5, (20, 3))], axis=1).astype(np.int32)
-    found = {box.at: set(box.pieces[0].numbers) for box in boxes.boxes_of(layout, [("a", bounds)], None)}
-    expected = {}
-    for n, (first, beyond) in enumerate(bounds):
-        for block in np.ndindex(*(beyond - first)):
-            expected.setdefault(tuple(((first + block) // 2).tolist()), set()).add(n)
-    assert found == expected
+def test_boxes_are_those_with_evidence():
+    """Against a plain set, and each box has the frames that see it, by number."""
+    layout, random = BoxLayout(sv.load_config(voxel_size=0.2), 16), np.random.default_rng(0)
+    parts = [[random.integers(-9, 9, (size, 3)).astype(np.int32) for size in (30, 20)] for _ in range(5)]
+    rows, expected = [], {}
+    for n, (mixed, free) in enumerate(parts):
+        evidence = Evidence(mixed, np.ones((len(mixed), 512), np.int16), free, np.int16(-1))
+        rows += [[n, *box] for box in boxes_with(layout, evidence).tolist()]
+        for block in [*mixed.tolist(), *free.tolist()]:
+            expected.setdefault(tuple(axis // 2 for axis in block), set()).add(n)
+    random.shuffle(rows)
+    found = boxes.boxes_of([("a", np.array(rows, np.int32), 5), ("b", np.array(rows, np.int32), 5)], None)
+    assert {box.at: set(box.pieces[0].numbers) for box in found} == expected
+    assert all(list(box.pieces[0].numbers) == sorted(box.pieces[0].numbers) for box in found)
+    assert [piece.before for piece in found[0].pieces] == [0, 5]
+    nothing = Evidence(parts[0][0][:0], np.ones((0, 512), np.int16), parts[0][0][:0], np.int16(-1))
+    assert boxes_with(layout, nothing).shape == (0, 3)

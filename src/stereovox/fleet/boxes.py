@@ -61,17 +61,20 @@ class DoneBox(NamedTuple):
     seconds: float
 
 
-def boxes_of(layout: BoxLayout, recordings: Sequence[tuple[str, NDArray[np.int32]]], start_ns: int | None) -> list[Box]:
+def boxes_of(recordings: Sequence[tuple[str, NDArray[np.int32], int]], start_ns: int | None) -> list[Box]:
     """Return the boxes that frames see.
 
-    recordings: key of each and the blocks (n, 2, 3) that its frames see, as `bounds_of_frames` returns them.
+    recordings: key of each, which of its frames see which boxes, as `boxes_seen` returns it, and the number of frames.
     """
     found: dict[Index, list[Piece]] = {}
     before = 0
-    for key, bounds in recordings:
-        for index, numbers in _seen(layout, bounds).items():
-            found.setdefault(index, []).append(Piece(key, numbers, before))
-        before += len(bounds)
+    for key, rows, frames in recordings:
+        rows = rows[np.lexsort(rows[:, ::-1].T[[3, 0, 1, 2]])]  # by box, then by number
+        ends = np.flatnonzero((np.diff(rows[:, 1:], axis=0) != 0).any(axis=1)) + 1
+        for part in np.split(rows, ends) if len(rows) else ():
+            i, j, k = part[0, 1:].tolist()
+            found.setdefault((i, j, k), []).append(Piece(key, tuple(part[:, 0].tolist()), before))
+        before += frames
     return [Box(index, tuple(pieces), start_ns) for index, pieces in sorted(found.items())]
 
 
@@ -116,19 +119,6 @@ def loaded(values: list[object], layout: BoxLayout) -> DoneBox:
     """Return a saved box. Raises KeyError, TypeError or ValueError for what cannot have been saved."""
     entry, seconds = values
     return DoneBox(None if entry is None else BoxEntry.loaded(entry, layout), float(seconds))  # pyright: ignore[reportArgumentType]
-
-
-def _seen(layout: BoxLayout, bounds: NDArray[np.int32]) -> dict[Index, tuple[int, ...]]:
-    """Return the boxes that frames see, and which frames each."""
-    sees = np.flatnonzero((bounds[:, 1] > bounds[:, 0]).all(axis=1))
-    first, last = layout.indices_of(bounds[sees, 0]), layout.indices_of(bounds[sees, 1] - 1)
-    found: dict[Index, list[int]] = {}
-    for number, low, high in zip(sees.tolist(), first.tolist(), last.tolist(), strict=True):
-        for i in range(low[0], high[0] + 1):
-            for j in range(low[1], high[1] + 1):
-                for k in range(low[2], high[2] + 1):
-                    found.setdefault((i, j, k), []).append(number)
-    return {index: tuple(numbers) for index, numbers in found.items()}
 
 
 def _within(evidence: Evidence, low: NDArray[np.int64], high: NDArray[np.int64]) -> Evidence:

@@ -20,7 +20,7 @@ from stereovox.fleet.recordings import (
     RECORDINGS,
     Recording,
     RecordingReport,
-    bounds_of_frames,
+    boxes_seen,
     frames_of,
     index_recording,
     manifest_of,
@@ -150,19 +150,19 @@ def map_fleet(
     with only_writer_at(place):
         layout = _layout(place, listed, profile, box_m, resume, notify, overrides)
         with _cluster(scheduler, workers) as run:
-            reports = _indexed(run, place, listed, layout.config, progress)
+            reports = _indexed(run, place, listed, layout, progress)
             used = [one for one in listed if not reports[one].error]
             if not used:
                 first = reports[listed[0]]
                 raise StereovoxError(f"not one recording could be used, no map is written ({first.error})")
-            boxes, before = _boxes(place, layout, used), _done(place)
+            boxes, before = _boxes(place, layout, [(one, reports[one].frames) for one in used]), _done(place)
             done = _mapped(run, place, layout, boxes, before, progress)
             entries = [box.entry for box in done.values() if box.entry is not None]
             levels = _levels(run, place, layout, entries, progress)
         inputs = {inputs: None if box.entry is None else box.entry.box for inputs, box in done.items()}
         manifest = _manifest(place, layout, used, entries, levels, inputs)
         write_boxed_manifest(place, manifest)
-        _sweep(place, manifest, {one.key(layout.config) for one in used})
+        _sweep(place, manifest, {one.key(layout) for one in used})
     made = [box for inputs, box in done.items() if inputs not in before]
     return FleetMap(
         BoxedMap(place, manifest), str(out), [reports[one] for one in listed], (len(boxes), len(made)),
@@ -308,12 +308,12 @@ def _cluster(scheduler: str | None, workers: int | None) -> Iterator[_Run]:
 
 
 def _indexed(
-    run: _Run, place: Place, listed: Sequence[Recording], config: Config, progress: Progress
+    run: _Run, place: Place, listed: Sequence[Recording], layout: BoxLayout, progress: Progress
 ) -> dict[Recording, RecordingReport]:
     """Return what each recording gave; those that were not mapped alone before are."""
-    keys = {one.key(config): one for one in listed}
+    keys = {one.key(layout): one for one in listed}
     reports = {one: report for key, one in keys.items() if (report := report_of(place, key)) is not None}
-    tasks = {key: (place, one, config) for key, one in keys.items() if one not in reports}
+    tasks = {key: (place, one, layout) for key, one in keys.items() if one not in reports}
     progress(len(reports), len(listed), "recordings")
     for key, report in run.results(index_recording, tasks):
         reports[keys[key]] = report
@@ -321,13 +321,13 @@ def _indexed(
     return reports
 
 
-def _boxes(place: Place, layout: BoxLayout, used: Sequence[Recording]) -> list[Box]:
-    keys = [one.key(layout.config) for one in used]
-    start_ns = None
+def _boxes(place: Place, layout: BoxLayout, used: Sequence[tuple[Recording, int]]) -> list[Box]:
+    """Return the boxes that the frames of recordings see; these come with their numbers of frames."""
+    keys, start_ns = [(one.key(layout), frames) for one, frames in used], None
     if layout.config.map.keep_times:
-        with frames_of(place, keys[0], [0]) as frames:
+        with frames_of(place, keys[0][0], [0]) as frames:
             start_ns = next(frames).seen.stamp_ns
-    return boxes_of(layout, [(key, bounds_of_frames(place, key)) for key in keys], start_ns)
+    return boxes_of([(key, boxes_seen(place, key), frames) for key, frames in keys], start_ns)
 
 
 def _done(place: Place) -> dict[str, DoneBox]:
@@ -390,8 +390,7 @@ def _manifest(
     levels: list[list[BoxEntry]],
     inputs: dict[str, Any],
 ) -> BoxedManifest:
-    keys = [one.key(layout.config) for one in used]
-    manifests = [manifest_of(place, key) for key in keys]
+    manifests = [manifest_of(place, one.key(layout)) for one in used]
     histories = [History.loaded(one) for one in manifests]
     starts = [entry.times_start_ns for entry in entries if entry.times_start_ns is not None]
     return BoxedManifest(

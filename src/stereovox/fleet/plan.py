@@ -13,9 +13,8 @@ import numpy as np
 
 from stereovox.config import Config, load_config
 from stereovox.errors import StereovoxError
-from stereovox.fleet.boxes import boxes_of
 from stereovox.fleet.fleet import settings_for
-from stereovox.fleet.recordings import Recording, recordings_of
+from stereovox.fleet.recordings import Recording, boxes_with, recordings_of
 from stereovox.mapper import Mapper
 from stereovox.maps.boxed_map import side_of
 from stereovox.maps.boxes import BoxLayout
@@ -84,34 +83,30 @@ def plan_fleet(
     seconds, seen, unreadable = 0.0, [], []
     for n, one in enumerate(listed, 1):
         try:
-            length, bounds, each_s, each_bytes = _looked_at(one, config)
+            length, rows, each_s, each_bytes = _looked_at(one, layout)
         except StereovoxError as error:
             unreadable.append(f"{one.where}: {error}")
             continue
         finally:
             progress(n, len(listed), "looking at recordings")
         frames, stored, seconds = frames + length, stored + length * each_bytes, seconds + length * each_s
-        seen.append((one.where, bounds, length))
+        seen.append((one.where, rows, length))
     if not seen:
         raise StereovoxError(f"not one recording can be read ({unreadable[0]})")
-    boxes = boxes_of(layout, [(where, bounds) for where, bounds, _ in seen], None)
-    overlaps = [
-        sum(len(piece.numbers) for box in boxes for piece in box.pieces if piece.recording == where)
-        / max(len(bounds), 1)
-        for where, bounds, _ in seen
-    ]
-    overlap = float(np.average(overlaps, weights=[length for *_, length in seen]))
+    boxes = {tuple(box) for _, rows, _ in seen for box in rows[:, 1:].tolist()}
+    overlap = sum(length * len(rows) / max(len(np.unique(rows[:, 0])), 1) for _, rows, length in seen) / frames
     hours = seconds * (1 + overlap) / 3600
     side_m = float(layout.metres.max())
     return FleetPlan(len(seen), frames, side_m, len(boxes), overlap, round(stored), hours, tuple(unreadable))
 
 
-def _looked_at(recording: Recording, config: Config) -> tuple[int, np.ndarray, float, float]:
-    """Return the number of frames, the blocks (n, 2, 3) that some see, and seconds and bytes of one frame."""
+def _looked_at(recording: Recording, layout: BoxLayout) -> tuple[int, np.ndarray, float, float]:
+    """Return the number of frames, boxes that some see (as `boxes_seen`), and seconds and bytes of one frame."""
     source = open_source(recording.where)
     step = max(1, len(source) // LOOKED_AT)
-    mapper = Mapper(load_config(config, **{"map.keep_frames": True, "trust.max_disagreement": 1}))
-    times = []
+    mapper = Mapper(load_config(layout.config, **{"map.keep_frames": True, "trust.max_disagreement": 1}))
+    times, seen = [], []
+    mapper.map.listeners.append(lambda evidence: seen.append(boxes_with(layout, evidence)))
     for i in range(0, len(source), step):
         started = perf_counter()
         mapper.add(source.frame(i))
@@ -119,5 +114,5 @@ def _looked_at(recording: Recording, config: Config) -> tuple[int, np.ndarray, f
     kept = mapper.map.kept_frames
     if kept is None or not len(kept):
         raise StereovoxError("not one frame of those that were looked at can be used")
-    bounds = np.array([frame.blocks for frame in kept.frames], np.int32)
-    return len(source), bounds, float(np.median(times)), kept.bytes / len(kept)
+    rows = np.concatenate([np.insert(boxes, 0, n, axis=1) for n, boxes in enumerate(seen)])
+    return len(source), rows, float(np.median(times)), kept.bytes / len(kept)

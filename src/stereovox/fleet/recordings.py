@@ -2,7 +2,7 @@
 """The recordings of a fleet: their names, and each mapped alone, which says which of its frames can be trusted.
 
 What is kept of a recording lies in `recordings/KEY/`: the depth images of its trusted frames, without loss, which
-blocks each sees, and the history of the map that they made. The key is made of all that this depends on.
+boxes each sees, and the history of the map that they made. The key is made of all that this depends on.
 """
 
 from __future__ import annotations
@@ -24,8 +24,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from stereovox.config import Config, load_config
+from stereovox.config import load_config
 from stereovox.errors import MapFileError, StereovoxError
+from stereovox.maps import VoxelMap
+from stereovox.maps.boxes import BoxLayout
+from stereovox.maps.evidence import Evidence
 from stereovox.maps.frame_store import IN_A_PACK, files_of_frames, read_frames
 from stereovox.maps.kept_frames import KeptFrame
 from stereovox.maps.store import MANIFEST, MAX_MANIFEST
@@ -39,7 +42,7 @@ from stereovox.sources.bags.recording import file_part
 VERSION = 1
 """Of what is kept of a recording; another one is made anew."""
 RECORDINGS = "recordings"
-BOUNDS, REPORT = "bounds.npy", "report.json"
+SEEN, REPORT = "seen.npy", "report.json"
 MAX_REPORT = 1 << 24
 """Bytes of a report."""
 
@@ -56,9 +59,9 @@ class Recording:
     where: str
     poses: str | None = None
 
-    def key(self, config: Config) -> str:
-        """Return a name made of all that the trusted frames depend on: the files, the poses and the settings."""
-        settings = config.model_dump(mode="json", exclude={"threads"})
+    def key(self, layout: BoxLayout) -> str:
+        """Return a name made of all that is kept: the files, the poses, the settings and the boxes."""
+        settings = [layout.side, layout.config.model_dump(mode="json", exclude={"threads"})]
         files = [_fingerprint(self.where), None if self.poses is None else _fingerprint(self.poses)]
         return digest([VERSION, self.where, files, settings])
 
@@ -112,28 +115,28 @@ def recordings_of(names: Iterable[str | Path | Recording]) -> list[Recording]:
     return found
 
 
-def index_recording(place: Place, recording: Recording, config: Config) -> RecordingReport:
+def index_recording(place: Place, recording: Recording, layout: BoxLayout) -> RecordingReport:
     """Map a recording alone, and put what is kept of it into a place, the report last; a task of a worker.
 
     What cannot be read or mapped is told in the report. Raises MapFileError where the place cannot be written.
     """
-    key, notes, started = recording.key(config), list[str](), perf_counter()
-    home = place / f"{RECORDINGS}/{key}"
+    notes, started = list[str](), perf_counter()
+    home = place / f"{RECORDINGS}/{recording.key(layout)}"
     with TemporaryDirectory(prefix="stereovox-") as folder:
         try:
-            made = _mapped_alone(recording, config, Path(folder), notes)
+            made, seen = _mapped_alone(recording, layout, Path(folder), notes)
         except StereovoxError as error:
             return RecordingReport(recording.where, error=str(error), notes=notes)
         manifest = json_value((made / MANIFEST).read_bytes())
         for name in sorted(files_of_frames(manifest["kept_frames"])):
             home.write(name, (made / name).read_bytes())
-        kept = read_frames(made, manifest["kept_frames"], None)
-        assert kept is not None
-        bounds = io.BytesIO()
-        np.save(bounds, np.array([frame.blocks for frame in kept.frames], np.int32))
-        home.write_all({MANIFEST: json.dumps(manifest).encode(), BOUNDS: bounds.getvalue()})
+        numbers = np.repeat(np.arange(len(seen)), [len(boxes) for boxes in seen])
+        rows = np.column_stack([numbers, np.concatenate(seen)]).astype(np.int32)
+        array = io.BytesIO()
+        np.save(array, rows)
+        home.write_all({MANIFEST: json.dumps(manifest).encode(), SEEN: array.getvalue()})
         refused = {str(why): int(number) for why, number in manifest["history"]["refused"].items()}
-    report = RecordingReport(recording.where, len(kept), refused, perf_counter() - started, notes=notes)
+    report = RecordingReport(recording.where, len(seen), refused, perf_counter() - started, notes=notes)
     home.write(REPORT, json.dumps(report.summary()).encode())
     return report
 
@@ -147,16 +150,16 @@ def report_of(place: Place, key: str) -> RecordingReport | None:
         return None  # it is mapped again
 
 
-def bounds_of_frames(place: Place, key: str) -> NDArray[np.int32]:
-    """Return the blocks (n, 2, 3) that each trusted frame of a recording sees: the lowest, and beyond the highest."""
-    data = (place / f"{RECORDINGS}/{key}").read(BOUNDS)
+def boxes_seen(place: Place, key: str) -> NDArray[np.int32]:
+    """Return which trusted frames of a recording see which boxes: (n, 4) number and index, by number."""
+    data = (place / f"{RECORDINGS}/{key}").read(SEEN)
     try:
-        bounds = np.load(io.BytesIO(data), allow_pickle=False)
+        rows = np.load(io.BytesIO(data), allow_pickle=False)
     except ValueError as error:
         raise _damaged(place, key, error) from None
-    if bounds.ndim != 3 or bounds.shape[1:] != (2, 3) or bounds.dtype != np.int32:
-        raise _damaged(place, key, f"{BOUNDS} holds {bounds.dtype} {bounds.shape}")
-    return bounds
+    if rows.ndim != 2 or rows.shape[1] != 4 or rows.dtype != np.int32:
+        raise _damaged(place, key, f"{SEEN} holds {rows.dtype} {rows.shape}")
+    return rows
 
 
 def manifest_of(place: Place, key: str) -> dict[str, Any]:
@@ -188,16 +191,62 @@ def digest(parts: Any) -> str:
     return hashlib.blake2b(json.dumps(parts, sort_keys=True).encode(), digest_size=12).hexdigest()
 
 
-def _mapped_alone(recording: Recording, config: Config, folder: Path, notes: list[str]) -> Path:
-    """Return the folder of the map of a recording, which kept its frames."""
-    keeping = load_config(config, **{"map.keep_frames": True})
+def _mapped_alone(
+    recording: Recording, layout: BoxLayout, folder: Path, notes: list[str]
+) -> tuple[Path, list[NDArray[np.int64]]]:
+    """Return the folder of the map of a recording, which kept its frames, and the boxes (n, 3) that each sees."""
+    keeping, told = load_config(layout.config, **{"map.keep_frames": True}), list[NDArray[np.int64]]()
     source = _local(recording.where, folder / "recording")
     settings: dict[str, Any] = {"profile": keeping, "poses": GIVEN, "checkpoint_s": 0}  # others' worlds are not ours
     with MapRun(source, folder / "map", **settings, notify=notes.append) as run:
-        run.finish()
+        run.mapper.map.listeners.append(lambda evidence: told.append(boxes_with(layout, evidence)))
+        made = run.finish()
     if recording.poses is None:
-        return folder / "map"
-    return remap(folder / "map", _local(recording.poses, folder / "poses"), folder / "remapped").out
+        return folder / "map", _by_frame(layout, _all_kept(made.map), told)
+    remapped = remap(folder / "map", _local(recording.poses, folder / "poses"), folder / "remapped")
+    return remapped.out, [_around(layout, frame) for frame in _all_kept(remapped.map)]
+
+
+def _all_kept(voxel_map: VoxelMap) -> Sequence[KeptFrame]:
+    kept = voxel_map.kept_frames
+    assert kept is not None
+    assert kept.are_all(voxel_map.frames)
+    return kept.frames
+
+
+def _by_frame(
+    layout: BoxLayout, frames: Sequence[KeptFrame], told: Sequence[NDArray[np.int64]]
+) -> list[NDArray[np.int64]]:
+    """Return the boxes that each frame sees, of what a map's listener was told: nothing where there was no evidence.
+
+    It was told less in cells whose rounding depends on the frame's number, which is another one among recordings.
+    """
+    if layout.config.map.cell != "int16":
+        return [_around(layout, frame) for frame in frames]
+    coming = iter(told)
+    nothing = np.empty((0, 3), np.int64)
+    seen = [next(coming) if (frame.blocks[1] > frame.blocks[0]).all() else nothing for frame in frames]
+    assert next(coming, None) is None
+    return seen
+
+
+def _around(layout: BoxLayout, frame: KeptFrame) -> NDArray[np.int64]:
+    """Return the boxes from the lowest to the highest that a frame sees; more than it does."""
+    if not (frame.blocks[1] > frame.blocks[0]).all():
+        return np.empty((0, 3), np.int64)
+    low, high = layout.indices_of(frame.blocks[0]), layout.indices_of(frame.blocks[1] - 1)
+    return low + np.column_stack(np.unravel_index(np.arange((high - low + 1).prod()), high - low + 1))
+
+
+def boxes_with(layout: BoxLayout, evidence: Evidence) -> NDArray[np.int64]:
+    """Return the boxes (n, 3) on which a frame has evidence, in ascending order."""
+    boxes = layout.indices_of(np.concatenate([evidence.coords, evidence.uniform]))
+    if not len(boxes):
+        return np.empty((0, 3), np.int64)
+    low = boxes.min(axis=0)
+    sides = boxes.max(axis=0) - low + 1
+    found = np.unique(((boxes[:, 0] - low[0]) * sides[1] + boxes[:, 1] - low[1]) * sides[2] + boxes[:, 2] - low[2])
+    return low + np.column_stack(np.unravel_index(found, sides))
 
 
 def _local(where: str, folder: Path) -> str:

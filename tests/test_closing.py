@@ -152,7 +152,7 @@ def test_loops_are_closed_of_as_many_frames_as_may_be_kept(tmp_path):
 def test_a_second_odometry_and_fixes_of_a_bag_hold_the_way(tmp_path):
     """The walk stretched by a tenth: wheels and a receiver know how long it was."""
     out, settings = tmp_path / "room.svox", {"voxel_size": 0.2, "trust.max_disagreement": 1, "map.keep_frames": True}
-    frames = list(sv.open_source("sim:room?image_width=96", frames="::4"))
+    frames = list(sv.open_source("sim:room?image_width=96", frames="::8"))
     mapper = sv.Mapper(**settings)
     for frame in frames:
         stretched = frame.T_world_sensor.copy()

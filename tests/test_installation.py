@@ -82,4 +82,4 @@ def test_a_library_without_such_wheels_is_noticed():
 def test_extras_leave_out_what_has_no_such_wheels():
     there = {Requirement(line).name for line in requirements(PROJECT["optional-dependencies"]["test"])}
     assert {"pytest", "octomap-python", "gtsam"} <= there
-    assert not there & {"pyoctomap", "pyrealsense2", "atheris", "ros-rclpy"}
+    assert not there & {"pyoctomap", "pyrealsense2", "atheris", "ros-rclpy", "obstore"}

@@ -99,6 +99,9 @@ SPACE = {
     "blocks_within": ((0, 0, 0), (1, 1, 1)),
     "cast_rays": (PLACE, PLACE, 1.0),
     "cells_in": (sv.State.FREE,),
+    "cells_of": (NO_BLOCKS,),
+    "cells_within": ((0, 0, 0), (1, 1, 1)),
+    "slabs_within": ((0, 0, 0), (1, 1, 1)),
     "centers": ([[0, 0, 0]],),
     "check_boxes": (PLACE, PLACE),
     "check_capsules": (PLACE, PLACE, 0.1),
@@ -164,7 +167,7 @@ def test_every_call_holds_the_lock_once(kind, tmp_path):
         what = makers[what]() if isinstance(what, str) else what
         before, value = lock.times, getattr(part, name)
         if inspect.isgeneratorfunction(inspect.unwrap(getattr(type(part), name))):
-            assert next(value()) is not None
+            assert next(value(*what)) is not None
         elif callable(value):
             value(*what)
         assert lock.times == before + 1, name

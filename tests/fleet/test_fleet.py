@@ -125,7 +125,8 @@ def test_other_cells_and_times(mapped, tmp_path, settings):
         assert_same([one.times_of(coords)[known]], [alone(recording(1), **settings).storage.times_of(coords)[known]])
 
 
-def test_recordings_are_added_and_taken_away(mapped, where):
+def test_recordings_are_added_and_taken_away(mapped, tmp_path):
+    where = tmp_path / "m.svox"
     first = mapped([recording(1)], where)
     both = mapped([recording(1), recording(2)], where, resume=True)
     assert_same(both.map.storage.blocks(), of_all(recording(1), recording(2)))

@@ -6,6 +6,7 @@ import pytest
 from made_loops import ELSEWHERE, mapped, off, truths
 
 from stereovox.closing import _positions
+from stereovox.config import load_config
 from stereovox.errors import StereovoxError
 from stereovox.loops.closer import LoopCloser
 from stereovox.loops.positions import Positions
@@ -76,4 +77,4 @@ def test_positions_of_which_none_is_usable_are_refused(tmp_path):
     file = tmp_path / "gnss.tum"
     file.write_text("0.0 nan nan nan 0 0 0 1\n1.0 nan nan nan 0 0 0 1\n")
     with pytest.raises(StereovoxError, match="0 places of the way have a position"):
-        held(_positions(file, 1.0))
+        held(_positions(str(file), 1.0, load_config()))

@@ -37,6 +37,14 @@ def boxed(where, cache_bytes=60 * 20**3, **settings):
     return sv.load_map(where, cache_bytes=cache_bytes)
 
 
+@pytest.fixture(scope="module")
+def saved(tmp_path_factory):
+    """Return the folder of the map in boxes; it must not be changed."""
+    folder = tmp_path_factory.mktemp("boxed") / "m.svox"
+    sv.save_boxed(flight(), folder, BOX_M)
+    return folder
+
+
 def somewhere(n, seed=0):
     """Return points in and around the map, every third on a face between boxes or cells."""
     random, (low, high) = np.random.default_rng(seed), flight().bounds()
@@ -70,8 +78,8 @@ def test_all_questions_are_answered_as_in_memory(where):
 
 
 @pytest.mark.parametrize("stop_at", STOPS, ids=str)
-def test_rays_stop_as_in_memory(tmp_path, stop_at):
-    whole, big = flight(), boxed(tmp_path / "m.svox")
+def test_rays_stop_as_in_memory(saved, stop_at):
+    whole, big = flight(), sv.load_map(saved, cache_bytes=60 * 20**3)
     ways = np.random.default_rng(2).normal(size=(400, 3))
     ways[:6] = [*np.eye(3), *-np.eye(3)]
     for origins, longest in ((somewhere(400), 30.0), (somewhere(400, 3), 2.5), ([2.0, 2.0, 1.0], np.inf)):
@@ -79,15 +87,15 @@ def test_rays_stop_as_in_memory(tmp_path, stop_at):
 
 
 @pytest.mark.parametrize("obstacles", STOPS, ids=str)
-def test_the_nearest_obstacle_is_that_in_memory(tmp_path, obstacles):
-    whole, big = flight(), boxed(tmp_path / "m.svox", cache_bytes=5_000_000)
+def test_the_nearest_obstacle_is_that_in_memory(saved, obstacles):
+    whole, big = flight(), sv.load_map(saved, cache_bytes=5_000_000)
     for longest in (1.0, np.inf):
         assert_same(big.nearest_obstacle(somewhere(300), longest, obstacles),
                     whole.nearest_obstacle(somewhere(300), longest, obstacles))  # fmt: skip
 
 
-def test_parts_differences_distances_and_clouds_are_those_in_memory(tmp_path):
-    whole, big = flight(), boxed(tmp_path / "m.svox", cache_bytes=3_000_000)
+def test_parts_differences_distances_and_clouds_are_those_in_memory(saved, tmp_path):
+    whole, big = flight(), sv.load_map(saved, cache_bytes=3_000_000)
     box = [0.05, 0.2, 0.1], [3.4, 2.9, 2.0]
     assert_same(sv.crop(big, *box).storage.blocks(), sv.crop(whole, *box).storage.blocks())
     differences = sv.difference(whole, big).counts
@@ -100,8 +108,8 @@ def test_parts_differences_distances_and_clouds_are_those_in_memory(tmp_path):
     assert (tmp_path / "a.ply").read_bytes() == (tmp_path / "b.ply").read_bytes()
 
 
-def test_only_what_is_asked_for_is_read(tmp_path, monkeypatch):
-    big, read = boxed(tmp_path / "m.svox"), []
+def test_only_what_is_asked_for_is_read(saved, monkeypatch):
+    big, read = sv.load_map(saved), []
     monkeypatch.setattr(
         "stereovox.maps.boxed_storage.read_box", lambda *given: read.append(given[-1].box) or read_box(*given)
     )
@@ -113,8 +121,8 @@ def test_only_what_is_asked_for_is_read(tmp_path, monkeypatch):
     assert read == [(0, 0, 0)]
 
 
-def test_what_needs_more_than_the_cache_is_refused_with_the_cure(tmp_path):
-    big = boxed(tmp_path / "m.svox", cache_bytes=2 * 16**3)
+def test_what_needs_more_than_the_cache_is_refused_with_the_cure(saved):
+    big = sv.load_map(saved, cache_bytes=2 * 16**3)
     with pytest.raises(StereovoxError, match="cache_bytes="):
         big.check_boxes([[-50, -50, -50]], [[50, 50, 50]])
 
@@ -203,23 +211,23 @@ def test_damage_is_told_by_the_box(where):
     ],
     ids=str,
 )  # fmt: skip
-def test_a_damaged_manifest_is_one_line(tmp_path, change):
-    boxed(tmp_path / "m.svox")
-    path = tmp_path / "m.svox/manifest.json"
-    path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
+def test_a_damaged_manifest_is_one_line(saved, tmp_path, change):
+    (tmp_path / "m.svox").mkdir()
+    text = json.dumps({**json.loads((saved / "manifest.json").read_text()), **change})
+    (tmp_path / "m.svox/manifest.json").write_text(text)
     with pytest.raises(MapFileError) as error:
         sv.load_map(tmp_path / "m.svox")
     assert "\n" not in str(error.value)
 
 
-def test_nothing_is_added_and_the_cure_is_told(tmp_path):
-    big = boxed(tmp_path / "m.svox")
+def test_nothing_is_added_and_the_cure_is_told(saved):
+    big = sv.load_map(saved)
     with pytest.raises(StereovoxError, match="stereovox crop"):
         sv.Mapper(big.config, resume=big)
     with pytest.raises(StereovoxError, match="stereovox crop"):
         big.storage.insert(*flight().storage.blocks())
     with pytest.raises(MapFileError, match="is a map in boxes"):
-        flight().save(tmp_path / "m.svox")
+        flight().save(saved)
 
 
 def test_other_things_are_not_replaced(tmp_path):

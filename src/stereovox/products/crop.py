@@ -34,7 +34,7 @@ def crop(voxel_map: VoxelMap, low: ArrayLike, high: ArrayLike) -> VoxelMap:
     sides = np.array(voxel_map.config.cell)
     first, beyond = (np.ceil(corner / sides - 0.5) for corner in corners_of(low, high))
     cropped = VoxelMap(voxel_map.config)
-    ends = np.clip([first // SIDE, -(-beyond // SIDE)], *EVERYWHERE[:, :1]).astype(np.int64)
+    ends = np.clip([np.floor(first / SIDE), np.ceil(beyond / SIDE)], *EVERYWHERE[:, :1]).astype(np.int64)
     for coords, cells in voxel_map.storage.slabs_within(*ends):
         inside = _inside(coords, first, beyond)
         add_blocks(

@@ -21,9 +21,8 @@ CORNERS = tuple((x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 
 def with_margins(voxel_map: VoxelMap) -> Iterator[tuple[NDArray[np.int32], NDArray[np.integer]]]:
     """Yield all blocks (n, 3) of a map with a margin of one cell: (n, 10, 10, 10) as stored."""
     for coords, _ in voxel_map.storage.slabs():
-        if not len(coords):
-            continue
-        stored = voxel_map.storage.cells_within(coords.min(axis=0) * SIDE - 1, (coords.max(axis=0) + 1) * SIDE + 1)
+        ends = (coords.min(axis=0), coords.max(axis=0) + 1) if len(coords) else (np.zeros(3, int),) * 2
+        stored = voxel_map.storage.cells_within(SIDE * ends[0] - 1, SIDE * ends[1] + 1)
         out = np.empty((len(coords), *(SIDE + 2,) * 3), stored.values.dtype)
         _margin.with_margin(stored, np.ascontiguousarray(coords), out)
         yield coords, out

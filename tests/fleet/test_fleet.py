@@ -5,6 +5,7 @@ import atexit
 import os
 import shutil
 import signal
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
@@ -200,12 +201,33 @@ def test_a_broken_recording_is_told_and_left_out(mapped, tmp_path):
         mapped(["sim:nowhere"], tmp_path / "n.svox")
 
 
-def test_two_fleets_do_not_write_one_map(mapped, where):
-    with fleet.only_writer_at(Place.of(where)):
-        from concurrent.futures import ThreadPoolExecutor
+def test_a_recording_that_breaks_later_is_not_taken_away_unasked(mapped, tmp_path):
+    shutil.copytree(recording(2), tmp_path / "drive")
+    made = mapped([recording(1), tmp_path / "drive"], tmp_path / "m.svox")
+    before = made.map.storage.blocks()
+    shutil.rmtree(tmp_path / "drive")
+    with pytest.raises(StereovoxError, match="is in the map and cannot be used now"):
+        mapped([recording(1), tmp_path / "drive"], tmp_path / "m.svox", resume=True)
+    assert_same(sv.load_map(tmp_path / "m.svox").storage.blocks(), before)
+    mapped([recording(1)], tmp_path / "m.svox", resume=True)
+    assert_same(sv.load_map(tmp_path / "m.svox").storage.blocks(), alone(recording(1)).storage.blocks())
 
-        with ThreadPoolExecutor(1) as other, pytest.raises(MapFileError, match="another"):
-            other.submit(mapped, [recording(1)], where).result()
+
+def test_two_fleets_of_one_cluster_write_their_own_maps(mapped, tmp_path):
+    """The same recordings at the same time: none takes the other's boxes for done."""
+    with ThreadPoolExecutor(2) as pool:
+        both = list(pool.map(lambda name: mapped([recording(1)], tmp_path / name), ["m.svox", "n.svox"]))
+    for one in both:
+        assert_same(one.map.storage.blocks(), alone(recording(1)).storage.blocks())
+
+
+def test_two_fleets_do_not_write_one_map(mapped, where):
+    with (
+        fleet.only_writer_at(Place.of(where)),
+        ThreadPoolExecutor(1) as other,
+        pytest.raises(MapFileError, match="another"),
+    ):
+        other.submit(mapped, [recording(1)], where).result()
 
 
 def test_recordings_of_an_object_store(mapped, s3, tmp_path):

@@ -12,6 +12,7 @@ from os import cpu_count
 from pathlib import Path
 from time import perf_counter
 from typing import Any
+from uuid import uuid4
 
 from stereovox.config import Config, load_config
 from stereovox.errors import ConfigError, MapFileError, MissingExtra, StereovoxError
@@ -155,6 +156,7 @@ def map_fleet(
             if not used:
                 first = reports[listed[0]]
                 raise StereovoxError(f"not one recording could be used, no map is written ({first.error})")
+            _check_still_there(place, reports)
             boxes, before = _boxes(place, layout, [(one, reports[one].frames) for one in used]), _done(place)
             done = _mapped(run, place, layout, boxes, before, progress)
             entries = [box.entry for box in done.values() if box.entry is not None]
@@ -241,7 +243,7 @@ class _Run:
     """Runs tasks on a Dask cluster."""
 
     def __init__(self, client: Any):
-        self._client = client
+        self._client, self._name = client, uuid4().hex  # another run's tasks of the same name write elsewhere
 
     def results(
         self,
@@ -257,7 +259,7 @@ class _Run:
 
         submitted = {
             self._client.submit(
-                function, *given, key=f"{function.__name__}-{name}", pure=True, retries=RETRIES,
+                function, *given, key=f"{function.__name__}-{self._name}-{name}", retries=RETRIES,
                 priority=(priority or {}).get(name, 0),
             ): name
             for name, given in tasks.items()
@@ -328,6 +330,19 @@ def _boxes(place: Place, layout: BoxLayout, used: Sequence[tuple[Recording, int]
         with frames_of(place, keys[0][0], [0]) as frames:
             start_ns = next(frames).seen.stamp_ns
     return boxes_of([(key, boxes_seen(place, key), frames) for key, frames in keys], start_ns)
+
+
+def _check_still_there(place: Place, reports: Mapping[Recording, RecordingReport]) -> None:
+    """Raise StereovoxError where a recording that the map is made of cannot be read now: it would be taken away."""
+    if place.find(MANIFEST) is None:
+        return
+    made_of = read_boxed_manifest(place).extra.get("fleet", {}).get("recordings", [])
+    for one, report in reports.items():
+        if report.error and one.where in made_of:
+            raise StereovoxError(
+                f"{one.where}: is in the map and cannot be used now ({report.error}); mend it, or leave it out to "
+                "take it away"
+            )
 
 
 def _done(place: Place) -> dict[str, DoneBox]:

@@ -12,6 +12,7 @@ from stereovox import closing
 from stereovox.cli.loops import say_closure
 from stereovox.loops.closer import Loop, LoopCloser
 from stereovox.loops.matching import Match
+from stereovox.loops.positions import Positions
 from stereovox.products.moved import moved
 from stereovox.sources.trajectory import write_trajectory
 from stereovox.trust.loop_lines import LoopLines
@@ -116,10 +117,34 @@ def test_a_recording_without_loops_remembers_that_they_were_sought(tmp_path):
     assert sv.load_map(out).history.loops == made.loops.lines
 
 
-def test_frames_with_the_same_stamps_are_refused_before_any_work(mapper):
-    twice = sv.Mapper(mapper.map.config, resume=sv.merge(mapper.map, mapper.map))
-    with pytest.raises(sv.StereovoxError, match="have the same stamp"):
-        closing.close(twice)
+def test_merged_recordings_are_no_single_way(mapper, tmp_path):
+    sv.merge(mapper.map, mapper.map).save(tmp_path / "both")
+    with pytest.raises(sv.StereovoxError, match="merged of 2 recordings"):
+        sv.close_loops(tmp_path / "both", tmp_path / "closed")
+    with pytest.raises(sv.StereovoxError, match="merged of 2 recordings"):
+        sv.join(mapper.map, sv.load_map(tmp_path / "both"))
+
+
+def test_frames_that_come_while_loops_are_sought_move_as_the_last_one(frames, mapper, monkeypatch):
+    later = replace(frames[-1], stamp_ns=frames[-1].stamp_ns + 10**8)
+
+    class Meanwhile(MadeCloser):
+        def finish(self, progress=lambda done, total: None, positions=None):
+            assert mapper.add(later).refused is None
+            super().finish(progress, positions)
+
+    monkeypatch.setattr(closing, "LoopCloser", Meanwhile)
+    closing.close(mapper)
+    last = mapper.map.kept_frames.frames[-1]
+    assert last.stamp_ns == later.stamp_ns
+    np.testing.assert_allclose(last.T_world_sensor[:3, 3] - later.T_world_sensor[:3, 3], [0, SHIFT_M, 0], atol=1e-6)
+
+
+def test_too_few_positions_are_told_before_any_work(mapper, monkeypatch):
+    monkeypatch.delattr(LoopCloser, "add")
+    stamps_ns = np.array([frame.stamp_ns for frame in mapper.map.kept_frames.frames[:2]])
+    with pytest.raises(sv.StereovoxError, match="2 places of the way have a position"):
+        closing.close(mapper, positions=Positions(stamps_ns, np.zeros((2, 3)), 1.0))
 
 
 def test_what_the_closed_map_is_made_of_is_said(closure, capsys):

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from stereovox.config import Config, load_config
 from stereovox.errors import StereovoxError
 from stereovox.localize.robot_track import Progress, no_progress
-from stereovox.loops.closer import Loop, LoopCloser, ends_of
+from stereovox.loops.closer import Loop, LoopCloser, check_one_way, ends_of
 from stereovox.loops.odometry import Odometry
 from stereovox.loops.positions import Positions
 from stereovox.loops.submaps import Submap
@@ -198,7 +198,8 @@ def close(
     positions: Positions | None = None,
     odometry: Odometry | None = None,
 ) -> LoopClosure:
-    """Find the loops of the map that a mapper makes, and correct it.
+    """Find the loops of the map that a mapper makes, and correct it. Frames that other threads add meanwhile move as
+    the last one.
 
     Args:
         mapper: Its map must keep its frames (`map.keep_frames`).
@@ -210,19 +211,17 @@ def close(
         What was found and done.
 
     Raises:
-        StereovoxError: The map did not keep its frames, or several of one sensor have the same stamp; `positions` are
-            too few or too close to each other; `odometry` has no poses at the times of the frames.
+        StereovoxError: The map did not keep its frames, or was merged of several recordings; `positions` are too few
+            or too close to each other; `odometry` has no poses at the times of the frames.
         MissingExtra: gtsam is not installed.
     """
     kept = mapper.map.kept_frames
     if kept is None or not len(kept):
         raise StereovoxError("the map did not keep its frames; map again with map.keep_frames=true")
     frames, closer = kept.frames, LoopCloser(mapper.config, odometry)
-    if len({(frame.sensor, frame.stamp_ns) for frame in frames}) < len(frames):
-        raise StereovoxError(
-            "several frames of one sensor have the same stamp, so the map's loops cannot be closed; close those of the "
-            "maps that it was merged of, or merge them with --find"
-        )
+    check_one_way(mapper.map.history)
+    if positions is not None:
+        positions.check(np.array([frame.stamp_ns for frame in frames], np.int64))
     for done, frame in enumerate(frames, 1):
         closer.add(frame)
         progress(done, len(frames), "looking for loops")
@@ -230,7 +229,10 @@ def close(
     if odometry is not None:
         odometry.check()
     corrected, known = closer.corrected(), (positions, odometry) != (None, None)
-    report = mapper.correct(corrected) if closer.loops or known else CorrectionReport()
+    later = {
+        (one.sensor, one.stamp_ns): closer.submaps[-1].bend @ one.T_world_sensor for one in kept.frames[len(frames) :]
+    }
+    report = mapper.correct(corrected | later) if closer.loops or known else CorrectionReport()
     closure = LoopClosure(
         np.array([frame.stamp_ns for frame in frames], np.int64),
         np.array([frame.T_world_sensor for frame in frames]),

@@ -14,7 +14,7 @@ from stereovox.config import Config
 from stereovox.deadline import Levels
 from stereovox.errors import StereovoxError
 from stereovox.localize.robot_track import Progress, no_progress
-from stereovox.loops.closer import LoopCloser, ends_of
+from stereovox.loops.closer import LoopCloser, check_one_way, ends_of
 from stereovox.loops.placing import placed
 from stereovox.maps import VoxelMap
 from stereovox.maps.kept_frames import KeptFrame, KeptFrames
@@ -73,6 +73,8 @@ def join(a: VoxelMap, b: VoxelMap, progress: Progress = no_progress) -> Joined:
     why = why_added(a, b, np.eye(4))
     if why is not None or a.kept_frames is None or b.kept_frames is None:
         raise StereovoxError(f"where one map lies in the other can be found only by frames, and {why}")
+    for one in (a, b):
+        check_one_way(one.history)
     closers = [_closed(one, words, progress) for one, words in ((a, "first"), (b, "second"))]
     first, second = closers
     place = placed(first, second, lambda done, total: progress(done, total, "finding the second map in the first"))
@@ -85,7 +87,7 @@ def join(a: VoxelMap, b: VoxelMap, progress: Progress = no_progress) -> Joined:
         for kept, found in zip((a.kept_frames, b.kept_frames), poses, strict=True)
     ]
     joined = _of_frames(a, b, *frames)
-    joined.recording = as_corrected(joined.recording)
+    joined.recording, joined.history.recordings = as_corrected(joined.recording), 1
     joined.history.loops = LoopLines.between(*(ends_of(found, first.places) for found in (first.loops, first.refused)))
     return Joined(joined, place.T_first_second, len(place.loops), len(first.loops))
 

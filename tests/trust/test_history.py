@@ -25,6 +25,7 @@ FULL = History(
     {"left": Streak("pose_jump", 2**62 + 1, Seen(2**62 + 9, POSE))},
     CameraPath(0.1, {"left": [Seen(2**62, (0.5,) * 12)], "right": []}),
     loops=LoopLines.between([[[0, 0, 0], [1, 2, 3]]], []),
+    recordings=2,
 )
 
 
@@ -108,6 +109,7 @@ LIES = {
     "a path with NaN": lambda s: s["camera_path"]["stops"]["left"].update(poses="AADAfwAAwH8AAMB/" * 4),
     "a path without end": lambda s: s["camera_path"]["stops"]["left"].update(stamps_ns="AAAA" * 999_999),
     "a path without spacing": lambda s: s["camera_path"].update(spacing=0),
+    "no recordings": lambda s: s.update(recordings=0),
     "loops of text": lambda s: s.update(loops="many"),
     "loops without those that were refused": lambda s: s["loops"].pop("refused"),
     "more loops than lines": lambda s: s["loops"]["closed"].update(number=2),

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stereovox.config import Config
+from stereovox.errors import StereovoxError
 from stereovox.loops.drift import GATE, Drift, Way, difference, squared
 from stereovox.loops.matching import FLOOR, Match, matched
 from stereovox.loops.odometry import Odometry
@@ -26,6 +27,7 @@ from stereovox.maps.kept_frames import KeptFrame
 from stereovox.pose_graph import HELD, Edge, PoseGraph, Position, Upright, information, need_gtsam
 from stereovox.products.floor_axes import up_of
 from stereovox.se3 import Transform, interpolate, inverse, orthonormalise, rotation_between
+from stereovox.trust.history import History
 
 LEAST_WAY_M = 3.0
 """Metres of way between two visits that can be a loop."""
@@ -382,6 +384,15 @@ class LoopCloser:
         if squared(moved, covariance + match.covariance) > GATE:
             return None
         return Edge(first, second, match.T_earlier_later, information(match.covariance))
+
+
+def check_one_way(history: History) -> None:
+    """Raise StereovoxError where a map's frames are not of a single way, so that its loops cannot be sought."""
+    if history.recordings > 1:
+        raise StereovoxError(
+            f"the map was merged of {history.recordings} recordings, which are no single way of a camera; close the "
+            "loops of each, and merge them with --find"
+        )
 
 
 def ends_of(loops: Sequence[Loop], places: NDArray[np.float64]) -> NDArray[np.float64]:

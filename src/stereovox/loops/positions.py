@@ -48,6 +48,12 @@ class Positions:
         found[~((beside & near) | exact)] = np.nan
         return found
 
+    def check(self, stamps_ns: NDArray[np.int64]) -> None:
+        """Raise StereovoxError where places at so few of these times are known, or so close, that they cannot be laid
+        into a map.
+        """
+        self._check(self.at(stamps_ns))
+
     def in_map(
         self, found: NDArray[np.float64], anchors: NDArray[np.float64], R_level_map: NDArray[np.float64]
     ) -> NDArray[np.float64]:
@@ -61,19 +67,24 @@ class Positions:
         Raises:
             StereovoxError: There are too few, or they are too close to each other.
         """
+        self._check(found)
         there = np.isfinite(found).all(axis=1)
         a, b = (points[there] @ R_level_map.T for points in (found, anchors))
-        span = float(np.ptp(a, axis=0).max()) if len(a) else 0.0
-        if len(a) < LEAST or span < WIDE * self.sigma_m:
-            raise StereovoxError(
-                f"{self.where}: {len(a)} places of the way have a position, {span:.1f} m apart; {LEAST} and "
-                f"{WIDE * self.sigma_m:.1f} m are needed to know how they lie in the map"
-            )
         R, shift = _laid(a, b, np.ones(len(a)))
         for _ in range(ROUNDS):
             away = np.linalg.norm(a @ R.T + shift - b, axis=1)
             R, shift = _laid(a, b, 1 / (1 + (away / max(float(np.median(away)), self.sigma_m)) ** 2))  # Cauchy
         return (found @ R_level_map.T @ R.T + shift) @ R_level_map
+
+    def _check(self, found: NDArray[np.float64]) -> None:
+        """Raise StereovoxError where places (M, 3), NaN where there is none, are too few or too close to each other."""
+        known = found[np.isfinite(found).all(axis=1)]
+        span = float(np.ptp(known, axis=0).max()) if len(known) else 0.0
+        if len(known) < LEAST or span < WIDE * self.sigma_m:
+            raise StereovoxError(
+                f"{self.where}: {len(known)} places of the way have a position, {span:.1f} m apart; {LEAST} and "
+                f"{WIDE * self.sigma_m:.1f} m are needed to know how they lie in the map"
+            )
 
 
 def _laid(

@@ -94,6 +94,7 @@ def together(a: History, b: History) -> History:
         recording=" + ".join(names),
         last_frame=max(lasts, key=lambda last: last[1], default=None),
         path=_both_paths(a.path, b.path),
+        recordings=a.recordings + b.recordings,
     )
 
 

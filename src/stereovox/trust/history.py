@@ -123,6 +123,8 @@ class History:
         doubts: Cameras whose last frames disagree with the map more than usual.
         imported: The file of another program that the map began with; None where there was none.
         loops: The loops that were closed; None where none were sought, or poses were corrected otherwise since.
+        recordings: Number of recordings that were merged as their poses said; 1 where none were, or `join` made one way
+            of them.
     """
 
     frames: int = 0
@@ -139,6 +141,7 @@ class History:
     doubts: dict[str, Doubt] = field(default_factory=dict)
     imported: Imported | None = None
     loops: LoopLines | None = None
+    recordings: int = 1
 
     def made_of(self) -> str:
         """Return lines for people: the recording, or the imported file and the notes about it, or both."""
@@ -170,6 +173,7 @@ class History:
             "frames_refused": self.refused.total(),
             "last_frame": self._last_frame(),
             "recording": self.recording,
+            "recordings": self.recordings,
             "imported": None if self.imported is None else self.imported.saved(),
             "history": {
                 "refused": dict(self.refused),
@@ -195,32 +199,29 @@ class History:
         Raises KeyError, TypeError or ValueError for what cannot have been saved.
         """
         frames, refused = _whole(saved["frames"], "frames"), _whole(saved["frames_refused"], "frames_refused")
-        recording, last = one_line(str(saved["recording"])), _last_frame_from(saved.get("last_frame"))
-        entries, path = saved.get("history"), _path_from(saved.get("camera_path"))
-        imported = _imported_from(saved.get("imported"))
-        loops = None if saved.get("loops") is None else LoopLines.loaded(saved["loops"])
-        if entries is None:
-            return cls(
-                frames,
-                Counter({NOT_RECORDED: refused} if refused else {}),
-                recording=recording,
-                last_frame=last,
-                path=path,
-                imported=imported,
-                loops=loops,
-            )
-        reasons, settled, ways = (_counts(entries[name], name) for name in ("refused", "settled", "ways"))
-        trusted = {name: _seen_from(seen) for name, seen in _sensors(entries["trusted"]).items()}
-        waiting = {name: _streak_from(streak) for name, streak in _sensors(entries["waiting"]).items()}
-        if not waiting.keys() <= trusted.keys():
-            raise ValueError("history.waiting names a sensor that was never trusted")
-        looks = {name: _look_from(look) for name, look in _sensors(entries.get("looks", {})).items()}
-        usual = {name: _usual_from(shares) for name, shares in _sensors(entries.get("usual", {})).items()}
-        doubts = {name: _doubt_from(doubt) for name, doubt in _sensors(entries.get("doubts", {})).items()}
         history = cls(
-            frames, reasons, settled, ways, recording, last, trusted, waiting, path, looks, usual, doubts, imported
+            frames,
+            recording=one_line(str(saved["recording"])),
+            last_frame=_last_frame_from(saved.get("last_frame")),
+            path=_path_from(saved.get("camera_path")),
+            imported=_imported_from(saved.get("imported")),
+            loops=None if saved.get("loops") is None else LoopLines.loaded(saved["loops"]),
+            recordings=_whole(saved.get("recordings", 1), "recordings", 1),
         )
-        history.loops = loops
+        entries = saved.get("history")
+        if entries is None:
+            history.refused = Counter({NOT_RECORDED: refused} if refused else {})
+            return history
+        history.refused, history.settled, history.ways = (
+            _counts(entries[name], name) for name in ("refused", "settled", "ways")
+        )
+        history.trusted = {name: _seen_from(seen) for name, seen in _sensors(entries["trusted"]).items()}
+        history.waiting = {name: _streak_from(streak) for name, streak in _sensors(entries["waiting"]).items()}
+        if not history.waiting.keys() <= history.trusted.keys():
+            raise ValueError("history.waiting names a sensor that was never trusted")
+        history.looks = {name: _look_from(look) for name, look in _sensors(entries.get("looks", {})).items()}
+        history.usual = {name: _usual_from(shares) for name, shares in _sensors(entries.get("usual", {})).items()}
+        history.doubts = {name: _doubt_from(doubt) for name, doubt in _sensors(entries.get("doubts", {})).items()}
         if history.refused.total() != refused:
             raise ValueError(f"frames_refused is {refused}, its reasons add up to {history.refused.total()}")
         return history
